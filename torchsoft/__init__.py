@@ -1,0 +1,23 @@
+"""torchsoft: a differentiable simulator of soft contact manipulation."""
+
+from torchsoft.equilibrium import NoEquilibrium, press, rest
+from torchsoft.implicit import METHOD, SimulationFailed, register
+from torchsoft.model import SoftGrasp
+from torchsoft.parameters import Parameters
+from torchsoft.simulate import Interrupted, simulate
+from torchsoft.trajectory import Trajectory
+
+register()
+
+__all__ = [
+    "METHOD",
+    "Interrupted",
+    "NoEquilibrium",
+    "Parameters",
+    "SimulationFailed",
+    "SoftGrasp",
+    "Trajectory",
+    "press",
+    "rest",
+    "simulate",
+]

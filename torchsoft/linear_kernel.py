@@ -1,0 +1,50 @@
+"""The two small linear solves of a stage, in place and without allocation."""
+
+from numba import njit
+
+from torchsoft.node_kernel import Array
+
+
+@njit(cache=True)
+def solve_dense(A: Array, b: Array, n: int, m: int) -> None:
+    """Gaussian elimination with row pivoting on the leading n x n block; b (n, m) becomes the solution."""
+    for k in range(n):
+        p = k
+        for i in range(k + 1, n):
+            if abs(A[i, k]) > abs(A[p, k]):
+                p = i
+        if p != k:
+            for j in range(k, n):
+                A[k, j], A[p, j] = A[p, j], A[k, j]
+            for j in range(m):
+                b[k, j], b[p, j] = b[p, j], b[k, j]
+        inverse = 1.0 / A[k, k]
+        for i in range(k + 1, n):
+            factor = A[i, k] * inverse
+            if factor != 0.0:
+                for j in range(k + 1, n):
+                    A[i, j] -= factor * A[k, j]
+                for j in range(m):
+                    b[i, j] -= factor * b[k, j]
+    for k in range(n - 1, -1, -1):
+        inverse = 1.0 / A[k, k]
+        for j in range(m):
+            total = b[k, j]
+            for i in range(k + 1, n):
+                total -= A[k, i] * b[i, j]
+            b[k, j] = total * inverse
+
+
+@njit(cache=True)
+def solve_banded(factor: Array, b: Array) -> None:
+    """Solve L L^T x = b in place, L in scipy's lower banded storage."""
+    band, n = factor.shape
+    for i in range(n):
+        b[i] /= factor[0, i]
+        for k in range(1, min(band, n - i)):
+            b[i + k] -= factor[k, i] * b[i]
+    for i in range(n - 1, -1, -1):
+        total = b[i]
+        for k in range(1, min(band, n - i)):
+            total -= factor[k, i] * b[i + k]
+        b[i] = total / factor[0, i]

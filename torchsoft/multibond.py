@@ -1,0 +1,125 @@
+"""Multibonds: 1-junctions, modulated transformers, ports, and the sums that make equations of motion of them.
+
+Every I field (or massless body) owns a 1-junction with a flow vector per node. A port is one multibond: its flow is
+f = sum_j T_j v_j over the junctions its transformer touches, and the efforts it sends back are T_j^T e. Because the same
+T carries flow out and effort back, power is conserved bond by bond, whatever the moduli.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import networkx as nx
+import torch
+from torch import Tensor
+
+
+class Junction(NamedTuple):
+    """A 1-junction: `nodes` flow vectors of `width` components, what stores or sets its flow, and the paper's name."""
+
+    nodes: int
+    width: int
+    element: str
+    label: str
+
+
+class Block(NamedTuple):
+    """One junction's modulus: matrix (..., bonds or 1, m, width), and the junction nodes it selects (None: all, or one)."""
+
+    matrix: Tensor
+    select: Tensor | None = None
+
+
+class Transformer:
+    """(Modulated) transformer between 1-junctions and a multibond of flows (..., bonds, m)."""
+
+    def __init__(self, blocks: Mapping[str, Block]) -> None:
+        self.blocks = dict(blocks)
+
+    def flow(self, flows: Mapping[str, Tensor]) -> Tensor:
+        """f = sum_j T_j v_j."""
+        total = 0.0
+        for name, (matrix, select) in self.blocks.items():
+            v = flows[name] if select is None else flows[name][..., select, :]
+            total = total + (matrix @ v[..., None])[..., 0]
+        assert isinstance(total, Tensor)
+        return total
+
+    def effort(self, e: Tensor, junctions: Mapping[str, Junction]) -> dict[str, Tensor]:
+        """T_j^T e for every junction j, each shaped like that junction's flow."""
+        out = {}
+        for name, (matrix, select) in self.blocks.items():
+            back = (matrix.mT @ e[..., None])[..., 0]
+            if select is not None:
+                zeros = back.new_zeros((*back.shape[:-2], junctions[name].nodes, back.shape[-1]))
+                back = zeros.index_add(-2, select, back)
+            elif junctions[name].nodes == 1:
+                back = back.sum(-2, keepdim=True)
+            out[name] = back
+        return out
+
+
+@dataclass(frozen=True)
+class Port:
+    """One multibond: its transformer, its effort (..., bonds, m), and the elements behind it, in the paper's names.
+
+    `source` ports (Se) push the junctions, the others load them. `senses` names junctions whose flow reaches the
+    element through an activated bond only, without power.
+    """
+
+    transformer: Transformer
+    effort: Tensor
+    elements: tuple[str, ...]
+    source: bool = False
+    senses: tuple[str, ...] = ()
+
+    def power(self, flows: Mapping[str, Tensor]) -> Tensor:
+        """e . f [W], shape (...): into the element, or out of it for a source."""
+        return (self.effort * self.transformer.flow(flows)).sum((-2, -1))
+
+
+def net_efforts(ports: Mapping[str, Port], junctions: Mapping[str, Junction]) -> dict[str, Tensor]:
+    """Effort left over at every 1-junction, what its I field integrates: sum of +-T^T e over the ports."""
+    total: dict[str, Tensor] = {}
+    for port in ports.values():
+        for name, effort in port.transformer.effort(port.effort, junctions).items():
+            signed = effort if port.source else -effort
+            total[name] = total[name] + signed if name in total else signed
+    return total
+
+
+def identity(width: int, like: Tensor, sign: float = 1.0) -> Tensor:
+    """A constant block: sign times the identity, for every bond."""
+    return sign * torch.eye(width, dtype=like.dtype, device=like.device)[None]
+
+
+def topology(ports: Mapping[str, Port], junctions: Mapping[str, Junction]) -> nx.DiGraph:
+    """The graph as drawn: junctions, their I fields and sources of flow, transformers, and the elements behind each port.
+
+    Node attribute `kind` is one of "1", "MTF", "I", "C", "R", "Se", "Sf"; edge attribute `activated` marks signal bonds.
+    """
+    graph = nx.DiGraph()
+    for name, junction in junctions.items():
+        graph.add_node(name, kind="1", label=junction.label)
+        graph.add_node(f"{name}: own", kind=junction.element.split(":")[0], label=junction.element)
+        graph.add_edge(name, f"{name}: own", activated=False)
+    for name, port in ports.items():
+        graph.add_node(name, kind="MTF", label=name)
+        for junction in port.transformer.blocks:
+            graph.add_edge(*((name, junction) if port.source else (junction, name)), activated=False)
+        for junction in port.senses:
+            graph.add_edge(junction, name, activated=True)
+        for element in port.elements:
+            graph.add_node(f"{name}: {element}", kind=element.split(":")[0], label=element)
+            graph.add_edge(*((f"{name}: {element}", name) if port.source else (name, f"{name}: {element}")), activated=False)
+    return graph
+
+
+def to_dot(graph: nx.DiGraph) -> str:
+    """Graphviz text of `topology`: full arrows for power bonds, dashed ones for activated (signal) bonds."""
+    lines = ["digraph multibond {", "  rankdir=LR; node [shape=plaintext];"]
+    lines += [f'  "{node}" [label="{data["label"]}"];' for node, data in graph.nodes(data=True)]
+    for tail, head, data in graph.edges(data=True):
+        style = "style=dashed, arrowhead=normal" if data["activated"] else "arrowhead=halfopen"
+        lines.append(f'  "{tail}" -> "{head}" [{style}];')
+    return "\n".join([*lines, "}"]) + "\n"

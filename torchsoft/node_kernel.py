@@ -1,0 +1,131 @@
+"""The law of one contact node as a compiled kernel, with its closed-form Jacobian.
+
+`contact` defines the physics; what stands here must equal it to rounding, and `tests/test_kernel.py` holds it to that.
+At a stage s = s* + a h s' of a diagonally implicit method the stretch is local: the law with the dashpot R + a h K in
+place of R, and s* in place of s, is the law at the end of the stage.
+
+Derivative names: `N_g` is dF_N/dg and so on; `w` is the velocity of the object's centre relative to the node.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+class Constants(NamedTuple):
+    """Scalars of the model, SI units; `coulomb` selects Eq. 12-13 to the letter."""
+
+    K_n: float
+    R_n: float
+    K_t: float
+    R_t: float
+    eta: float
+    mu_s: float
+    mu_k: float
+    v_s: float
+    epsilon: float
+    coulomb: bool
+    tau: float
+    radius: float
+    m_C: float
+    I_C: float
+    m_Br: float
+    gravity: float
+    K_81: float
+    R_80: float
+    K_98: float
+    R_99: float
+    pad_length: float
+
+
+@njit(cache=True)
+def body_distance(radius: float, x: float, y: float) -> tuple[float, float, float, float]:
+    """Signed distance, its gradient and its curvature (per length along the boundary) at a body-frame point."""
+    d = np.sqrt(x * x + y * y)
+    return d - radius, x / d, y / d, 1.0 / d
+
+
+@njit(cache=True)
+def slip(E: float, F_N: float, R: float, share: float, c: Any) -> tuple[float, float, float]:
+    """Slip rate w under the trial effort E, with dw/dE and dw/dF_N; `SmoothSlip` and `Coulomb` of `contact`."""
+    if c.mu_s * F_N >= E:
+        return 0.0, 0.0, 0.0
+    if c.coulomb:
+        return (E - c.mu_k * F_N) / R, 1.0 / R, -c.mu_k / R
+    a = share * c.eta + R
+    b = a * c.v_s - (E - c.mu_k * F_N)
+    q = c.v_s * (E - c.mu_s * F_N)
+    root = np.sqrt(b * b + 4.0 * a * q)
+    w = 2.0 * q / (b + root) if b >= 0.0 else (root - b) / (2.0 * a)
+    fall = c.v_s / (c.v_s + w)
+    mu = c.mu_k + (c.mu_s - c.mu_k) * fall
+    slope = a - (c.mu_s - c.mu_k) * F_N * fall * fall / c.v_s
+    return w, 1.0 / slope, -mu / slope
+
+
+@njit(cache=True)
+def tangential(s: float, flow: float, F_N: float, R: float, K: float, share: float, c: Any) -> tuple[float, ...]:
+    """Effort e, slip rate, and de/dflow, de/dF_N of the Voigt pair in series with the slip element.
+
+    At a stage s = s* + a h (flow - gamma'), so e = K s* + (R + a h K)(flow - gamma'): called with s* and with
+    R + a h K for R, this is the continuous law of `contact.Contact` at the end of the stage.
+    """
+    trial = K * s + R * flow
+    sign = 1.0 if trial > 0.0 else -1.0
+    w, w_E, w_N = slip(abs(trial), F_N, R, share, c)
+    return trial - R * sign * w, sign * w, R * (1.0 - R * w_E), -R * sign * w_N
+
+
+@njit(cache=True)
+def contact_node(
+    dx: float, dy: float, wx: float, wy: float, omega: float, theta: float, s: float, share: float, ah: float, c: Any,
+    G: Array, out: Array,
+) -> bool:  # fmt: skip
+    """Force of the object on one node and its Jacobian G (2, 3) with respect to (w_x, w_y, omega) at the end of a stage.
+
+    d is the node's lever about the object's centre, w = v_C - p'. `out` receives f_x, f_y, F_N, F_T, e, gamma', rho, g,
+    g', v_T. Returns whether the node touches; where it does not, nothing is written.
+    """
+    cos, sin = np.cos(theta), np.sin(theta)
+    phi, mx, my, curvature = body_distance(c.radius, cos * dx + sin * dy, cos * dy - sin * dx)
+    g = -phi
+    if g <= 0.0:
+        return False
+    nx, ny = cos * mx - sin * my, sin * mx + cos * my
+    tx, ty = -ny, nx
+    arm_n, arm_t = -nx * dy + ny * dx, -tx * dy + ty * dx  # n.(z x d), t.(z x d)
+    g_dot = nx * wx + ny * wy + omega * arm_n
+    v_T = tx * wx + ty * wy + omega * arm_t
+    rho = g / (g + c.epsilon)
+    rho_g = c.epsilon / (g + c.epsilon) ** 2
+
+    F_N = share * (c.K_n * g + c.R_n * rho * g_dot)  # (8), (9)
+    N_g, N_v = share * (c.K_n + c.R_n * rho_g * g_dot), share * c.R_n * rho
+    if F_N <= 0.0:
+        F_N, N_g, N_v = 0.0, 0.0, 0.0
+    K, R = share * c.K_t, share * (c.R_t + ah * c.K_t)
+    e, gamma_dot, e_flow, e_N = tangential(s, rho * v_T, F_N, R, K, share, c)  # (10)-(13)
+    F_T = rho * e
+    T_v = rho * e_flow * rho
+    T_gd = rho * e_N * N_v
+    T_g = rho_g * e + rho * (e_flow * rho_g * v_T + e_N * N_g)
+
+    for j in range(3):  # columns: w_x, w_y, omega; the lever and the angle move with them over a h
+        dwx, dwy, dom = (1.0, 0.0, 0.0) if j == 0 else ((0.0, 1.0, 0.0) if j == 1 else (0.0, 0.0, 1.0))
+        ddx, ddy, dth = -ah * dwx, -ah * dwy, ah * dom
+        dg = arm_n * dth - nx * ddx - ny * ddy
+        turn = curvature * (tx * ddx + ty * ddy) + (1.0 - curvature * arm_t) * dth
+        dvx, dvy = dwx - dom * dy - omega * ddy, dwy + dom * dx + omega * ddx
+        dg_dot = nx * dvx + ny * dvy + v_T * turn
+        dv_T = tx * dvx + ty * dvy - g_dot * turn
+        dN = N_g * dg + N_v * dg_dot
+        dT = T_g * dg + T_gd * dg_dot + T_v * dv_T
+        G[0, j] = dN * nx + dT * tx + (F_N * tx - F_T * nx) * turn
+        G[1, j] = dN * ny + dT * ty + (F_N * ty - F_T * ny) * turn
+
+    out[0], out[1] = F_N * nx + F_T * tx, F_N * ny + F_T * ty
+    out[2], out[3], out[4], out[5], out[6], out[7], out[8], out[9] = F_N, F_T, e, gamma_dot, rho, g, g_dot, v_T
+    return True

@@ -1,0 +1,87 @@
+"""`simulate`: run a model over given times with the implicit stepper and gather everything into a `Trajectory`."""
+
+import time as clock
+from importlib.metadata import version
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from torchsoft.equilibrium import rest
+from torchsoft.implicit import METHOD, ImplicitStepper, Progress, SimulationFailed, check_times
+from torchsoft.ledger import stored
+from torchsoft.model import SoftGrasp
+from torchsoft.run_kernel import DISSIPATED, INTEGRALS, SUPPLIED
+from torchsoft.trajectory import Stats, Trajectory
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C during a run; `trajectory` holds what was simulated until then."""
+
+    def __init__(self, trajectory: Trajectory) -> None:
+        super().__init__()
+        self.trajectory = trajectory
+
+
+def simulate(
+    model: SoftGrasp, t: Tensor, *, y0: Tensor | None = None, step: float = 2e-3, tolerance: float = 1e-9, progress: bool = False
+) -> Trajectory:
+    """Integrate `model` from y0 (size,) at t[0] through the times t (T,) [s].
+
+    y0 defaults to the disc at rest on the lower pad. `step` [s] is the largest step of the stepper, `tolerance` [N] its
+    Newton tolerance. Raises `ValueError` for times that do not increase or a state of the wrong shape or dtype,
+    `SimulationFailed` (with the trajectory so far) when the run cannot go on, and `Interrupted` (likewise) on Ctrl-C.
+    """
+    check_times(t)
+    stepper = ImplicitStepper(model, step=step, tolerance=tolerance)
+    start = rest(model) if y0 is None else y0
+    bar = tqdm(total=float(t[-1] - t[0]), unit="s", disable=not progress, bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated [{elapsed}]")
+    out, wall, began = None, 0.0, clock.perf_counter()
+    try:
+        for out in stepper.integrate(start, t):
+            wall = clock.perf_counter() - began
+            bar.n = float(t[out.rows - 1] - t[0])
+            bar.refresh()
+    except SimulationFailed as failure:
+        assert out is not None
+        failure.trajectory = gather(model, t, out, wall, step, failed=1)
+        raise
+    except KeyboardInterrupt:
+        if out is None:
+            raise
+        raise Interrupted(gather(model, t, out, wall, step)) from None
+    finally:
+        bar.close()
+    assert out is not None
+    return gather(model, t, out, wall, step)
+
+
+@torch.no_grad()
+def gather(model: SoftGrasp, t: Tensor, out: Progress, wall: float, step: float, failed: int = 0) -> Trajectory:
+    """The trajectory of the rows that the stepper has finished."""
+    rows = out.rows
+    t, y, forces, extras = t[:rows], *(torch.from_numpy(x[:rows]) for x in (out.y, out.forces, out.extras))
+    state, lower = model.layout.unpack(y), len(model.pad_L.surface)
+    want = model.reference(t)
+    column = {name: extras[:, i] for i, name in enumerate(INTEGRALS)}
+    return Trajectory(
+        t=t,
+        y=y,
+        force_L=forces[:, :lower],
+        force_U=forces[:, lower:],
+        control=torch.stack(model.controllers(want, state.r_C, state.v_C, state.r_Br, state.v_Br), -1),
+        bracket_moment=extras[:, -1],
+        desired=torch.stack(want, -1),
+        energy=stored(model, state),
+        dissipated={name: column[name] for name in DISSIPATED},
+        supplied={name: column[name] for name in SUPPLIED},
+        injected=column["injected"],
+        stats=Stats(out.steps, out.solves, failed, wall, step),
+        layout=model.layout,
+        made_by={
+            "torchsoft": version("torchsoft"),
+            "method": METHOD,
+            "parameters": {name: row["value"] for name, row in model.settings.table().items()},
+        },
+        inertia=float(model.inertia),
+    )
