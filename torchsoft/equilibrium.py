@@ -45,7 +45,10 @@ def _solve(model: SoftGrasp, bracket_height: float | None) -> State:
     names = "L" if bracket_height is None else "LU"
     reach = min(p.disc.radius, 3 * (p.disc.radius * height) ** 0.5)
     near = {
-        k: torch.nonzero((model.pads[k].positions[model.pads[k].surface, 0] + (0 if k == "L" else p.scenario.x_C0) - x).abs() < reach)[:, 0]
+        k: torch.nonzero(
+            (model.pads[k].positions[model.pads[k].surface, 0] + (0 if k == "L" else p.scenario.x_C0) - x).abs()
+            < reach
+        )[:, 0]
         for k in names
     }
     sizes = [2 * len(near[k]) for k in names]
@@ -80,7 +83,9 @@ def _solve(model: SoftGrasp, bracket_height: float | None) -> State:
     def residual(z: Tensor) -> Tensor:
         f, _ = forces(z)
         balance = weight[1] - sum(f[k][:, 1].sum() for k in names)
-        return torch.cat([soft * balance[None], *(part - C[k] @ f[k].flatten() for k, part in zip(names, z[1:].split(sizes)))])
+        return torch.cat(
+            [soft * balance[None], *(part - C[k] @ f[k].flatten() for k, part in zip(names, z[1:].split(sizes)))]
+        )
 
     upper = 2 * p.disc.radius + height if bracket_height is None else bracket_height - p.bracket.cm_height - height
     start = height + p.disc.radius - 0.1 * height if bracket_height is None else 0.5 * (height + upper)

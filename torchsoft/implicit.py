@@ -53,10 +53,14 @@ class Progress:
 def check_times(t: Tensor) -> None:
     """Raises `ValueError` unless t is a float64 vector of at least two finite, strictly increasing times."""
     if t.ndim != 1 or len(t) < 2 or t.dtype != torch.float64:
-        raise ValueError(f"`t` must be a float64 vector of two times or more, but is {t.dtype} of shape {tuple(t.shape)}")
+        raise ValueError(
+            f"`t` must be a float64 vector of two times or more, but is {t.dtype} of shape {tuple(t.shape)}"
+        )
     if not bool(torch.isfinite(t).all()) or not bool((t.diff() > 0).all()):
         bad = int((~(t.diff() > 0)).nonzero()[0, 0]) if bool(torch.isfinite(t).all()) else 0
-        raise ValueError(f"`t` must increase strictly and be finite, but t[{bad}:{bad + 2}] = {t[bad : bad + 2].tolist()}")
+        raise ValueError(
+            f"`t` must increase strictly and be finite, but t[{bad}:{bad + 2}] = {t[bad : bad + 2].tolist()}"
+        )
 
 
 class ImplicitStepper:
@@ -68,14 +72,26 @@ class ImplicitStepper:
     """
 
     def __init__(
-        self, model: SoftGrasp, *, step: float = 2e-3, tolerance: float = 1e-9, max_iterations: int = 40, window: float = 3e-4
+        self,
+        model: SoftGrasp,
+        *,
+        step: float = 2e-3,
+        tolerance: float = 1e-9,
+        max_iterations: int = 40,
+        window: float = 3e-4,
     ) -> None:
         if not (math.isfinite(step) and step > 0):
             raise ValueError(f"`step` must be a positive number of seconds, but is {step}")
         for name, value in model.named_parameters():
             if not bool(torch.isfinite(value).all()):
                 raise ValueError(f"parameter `{name}` must be finite, but is {value.tolist()}")
-        self.model, self.step, self.tolerance, self.max_iterations, self.window = model, step, tolerance, max_iterations, window
+        self.model, self.step, self.tolerance, self.max_iterations, self.window = (
+            model,
+            step,
+            tolerance,
+            max_iterations,
+            window,
+        )
         self._arrays: dict[float, tuple[PadArrays, PadArrays]] = {}
 
     def constants(self) -> Constants:
@@ -148,7 +164,9 @@ class ImplicitStepper:
         m, times = self.model, t.numpy()
         state = m.layout.unpack(y0)
         if y0.ndim != 1 or not bool(torch.isfinite(y0).all()):
-            raise ValueError(f"`y0` must be one finite state, shape ({m.layout.size},), but has shape {tuple(y0.shape)}")
+            raise ValueError(
+                f"`y0` must be one finite state, shape ({m.layout.size},), but has shape {tuple(y0.shape)}"
+            )
         surfaces = len(m.pad_L.surface) + len(m.pad_U.surface)
         out = Progress(
             np.empty((len(t), m.layout.size)), np.empty((len(t), surfaces, 2)), np.zeros((len(t), len(INTEGRALS) + 1))
@@ -206,7 +224,8 @@ class ImplicitStepper:
     def _failure(self, status: int, time: float, h: float) -> SimulationFailed:
         reasons = {
             NEWTON_FAILED: f"Newton's iteration did not converge within {self.max_iterations} iterations in the step of "
-            f"{h:.3g} s; try a smaller step, or, with the literal Coulomb law, friction = 'smooth'",
+            f"{h:.3g} s; try a smaller step, or a larger contact.v_s: where friction falls with slip faster than the pads damp, "
+            "massless pads have no unique velocity",
             OFF_THE_PAD: "the disc was lost: its contact reached the end of a pad",
             LOST: "the disc was lost: it left the space between the pads",
         }

@@ -140,7 +140,9 @@ class SoftGrasp(nn.Module):
             )
             ports[f"pad_{k}"] = self._pad_port(k, state, ports[f"contact_{k}"], junction_flows)
         weight = torch.stack((torch.zeros_like(state.theta), -self.m_C * self.gravity.expand_as(state.theta)), -1)
-        ports["weight"] = Port(Transformer({"disc": Block(identity(2, weight))}), weight[..., None, :], ("Se: mg",), True)
+        ports["weight"] = Port(
+            Transformer({"disc": Block(identity(2, weight))}), weight[..., None, :], ("Se: mg",), True
+        )
         ports |= self._control_ports(t, state)
         return Evaluation(ports, junction_flows, interfaces)
 
@@ -156,7 +158,9 @@ class SoftGrasp(nn.Module):
             p = p + state.r_Br[..., None, :]
         return moving_frame(self.shape, p, state.r_C, state.theta)
 
-    def _contact(self, which: str, state: State, frame: Frame, flow: Tensor, nodes: Tensor | None = None) -> ContactState:
+    def _contact(
+        self, which: str, state: State, frame: Frame, flow: Tensor, nodes: Tensor | None = None
+    ) -> ContactState:
         s, share = state.s_L if which == "L" else state.s_U, self.share(self.pads[which])
         if nodes is not None:
             s, share = s[..., nodes], share[nodes]
@@ -219,7 +223,9 @@ class SoftGrasp(nn.Module):
 
         def newton_step(u_dot: Tensor, r: Tensor) -> Tensor:
             ones = torch.ones_like(u_dot)
-            G = torch.stack([torch.func.jvp(force, (u_dot,), (ones * e,))[1] for e in torch.eye(2, dtype=u.dtype)], -1)
+            G = torch.stack(
+                [torch.func.jvp(force, (u_dot,), (ones * e,))[1] for e in torch.eye(2, dtype=u.dtype)], -1
+            )
             CG = torch.einsum("ikc,...kcd->...ikd", C_aa.unflatten(-1, (-1, 2)), G.detach()).flatten(-2)
             J = tau * torch.eye(len(dofs), dtype=u.dtype) - CG
             return torch.linalg.solve(J.detach(), r[..., None])[..., 0].unflatten(-1, (-1, 2))

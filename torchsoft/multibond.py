@@ -111,7 +111,9 @@ def topology(ports: Mapping[str, Port], junctions: Mapping[str, Junction]) -> nx
             graph.add_edge(junction, name, activated=True)
         for element in port.elements:
             graph.add_node(f"{name}: {element}", kind=element.split(":")[0], label=element)
-            graph.add_edge(*((f"{name}: {element}", name) if port.source else (name, f"{name}: {element}")), activated=False)
+            graph.add_edge(
+                *((f"{name}: {element}", name) if port.source else (name, f"{name}: {element}")), activated=False
+            )
     return graph
 
 

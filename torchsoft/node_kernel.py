@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+
 class Constants(NamedTuple):
     """Scalars of the model, SI units; `coulomb` selects Eq. 12-13 to the letter."""
 

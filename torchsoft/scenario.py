@@ -67,7 +67,7 @@ def find_grasp_force(model: SoftGrasp, y0: Tensor, step: float, tolerance: float
 
     try:
         force, error = 0.0, height_error(0.0)
-        gain = 2.0 * float(model.controllers.K_98)  # the pads are about as stiff as the loop
+        gain = 2.0 * float(model.controllers.K_98.detach())  # the pads are about as stiff as the loop
         for _ in range(20):
             if abs(error) <= tolerance:
                 return force

@@ -7,11 +7,12 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchsoft.equilibrium import rest
+from torchsoft.equilibrium import NoEquilibrium, rest
 from torchsoft.implicit import METHOD, ImplicitStepper, Progress, SimulationFailed, check_times
 from torchsoft.ledger import stored
 from torchsoft.model import SoftGrasp
 from torchsoft.run_kernel import DISSIPATED, INTEGRALS, SUPPLIED
+from torchsoft.stability import describe_instability
 from torchsoft.trajectory import Stats, Trajectory
 
 
@@ -24,7 +25,13 @@ class Interrupted(KeyboardInterrupt):
 
 
 def simulate(
-    model: SoftGrasp, t: Tensor, *, y0: Tensor | None = None, step: float = 2e-3, tolerance: float = 1e-9, progress: bool = False
+    model: SoftGrasp,
+    t: Tensor,
+    *,
+    y0: Tensor | None = None,
+    step: float = 2e-3,
+    tolerance: float = 1e-9,
+    progress: bool = False,
 ) -> Trajectory:
     """Integrate `model` from y0 (size,) at t[0] through the times t (T,) [s].
 
@@ -35,7 +42,12 @@ def simulate(
     check_times(t)
     stepper = ImplicitStepper(model, step=step, tolerance=tolerance)
     start = rest(model) if y0 is None else y0
-    bar = tqdm(total=float(t[-1] - t[0]), unit="s", disable=not progress, bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated [{elapsed}]")
+    bar = tqdm(
+        total=float(t[-1] - t[0]),
+        unit="s",
+        disable=not progress,
+        bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated [{elapsed}]",
+    )
     out, wall, began = None, 0.0, clock.perf_counter()
     try:
         for out in stepper.integrate(start, t):
@@ -44,8 +56,7 @@ def simulate(
             bar.refresh()
     except SimulationFailed as failure:
         assert out is not None
-        failure.trajectory = gather(model, t, out, wall, step, failed=1)
-        raise
+        raise diagnose(model, failure, gather(model, t, out, wall, step, failed=1)) from None
     except KeyboardInterrupt:
         if out is None:
             raise
@@ -54,6 +65,22 @@ def simulate(
         bar.close()
     assert out is not None
     return gather(model, t, out, wall, step)
+
+
+def diagnose(model: SoftGrasp, failure: SimulationFailed, trajectory: Trajectory) -> SimulationFailed:
+    """The failure with the run so far, and with the closed loop's instability as its cause if the loop is unstable."""
+    try:
+        cause = describe_instability(model)
+    except NoEquilibrium:  # a model that cannot grasp has no grasp to linearise
+        cause = ""
+    told = (
+        f"the disc was lost at t = {failure.time:.4f} s: {cause} (it ended with this: {failure})"
+        if cause
+        else str(failure)
+    )
+    out = SimulationFailed(told, failure.time)
+    out.trajectory = trajectory
+    return out
 
 
 @torch.no_grad()

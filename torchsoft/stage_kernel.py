@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 from torchsoft.linear_kernel import solve_banded, solve_dense
 from torchsoft.node_kernel import Array, body_distance, contact_node, tangential
 
-SHORTEN_AFTER, SHORTEN_ABOVE = 8, 0.3
-"""Newton's step is halved when, after so many iterations, the residual has not contracted by this factor."""
+SEARCH_AFTER, SHORTEST = 2, 1.0 / 64.0
+"""After so many iterations a Newton step that does not lessen the mismatch is halved, down to this part of it."""
+
 
 class PadArrays(NamedTuple):
     """A pad at one a h: node positions X (nodes, 2), surface node numbers, share, mobility P^T (2 surface, 2 nodes).
@@ -67,6 +68,10 @@ class PadWork(NamedTuple):
     d: Array
     f: Array
     f_linear: Array
+    f_old: Array
+    f_new: Array
+    v_old: Array
+    v_new: Array
     G: Array
     system: Array
     rhs: Array
@@ -80,7 +85,7 @@ def pad_work(pad: PadArrays) -> PadWork:
     index = np.full(surface, -1)
     return PadWork(
         z(2 * nodes), z(pad.M.size), z(2 * nodes), z(surface), z(2 * nodes), index, index.copy(), z(surface, 2),
-        z(surface, 2), z(surface, 2), z(surface, 2), z(surface, 2, 3), z(2 * surface, 2 * surface), z(2 * surface, 6),
+        *(z(surface, 2) for _ in range(7)), z(surface, 2, 3), z(2 * surface, 2 * surface), z(2 * surface, 6),
         z(surface, 2),
     )  # fmt: skip
 
@@ -127,12 +132,14 @@ def near(pad: Any, state: Any, work: Any, q: Array, V: Array, ah: float, c: Any,
 
 
 @njit(cache=True)
-def evaluate_window(pad: Any, state: Any, work: Any, count: int, q: Array, V: Array, ah: float, c: Any) -> tuple[int, float]:
-    """Contact law on the window; returns the number of touching nodes (in `work.active`) and the largest mismatch [N]
-    between the law and the forces that the linear relations were solved with."""
+def evaluate_window(
+    pad: Any, state: Any, work: Any, count: int, q: Array, V: Array, ah: float, c: Any
+) -> tuple[int, float, float]:
+    """Contact law on the window; returns the number of touching nodes (in `work.active`) and the mismatch between the law
+    and the forces that the linear relations were solved with: the largest [N], and the sum of squares [N2]."""
     theta = q[2] + ah * V[2]
     place, out = np.empty(4), np.empty(10)
-    active, mismatch = 0, 0.0
+    active, mismatch, squares = 0, 0.0, 0.0
     for k in range(count):
         i = work.window[k]
         lever(pad, state, work, q, V, ah, i, place)
@@ -145,8 +152,11 @@ def evaluate_window(pad: Any, state: Any, work: Any, count: int, q: Array, V: Ar
             work.f[i, 0], work.f[i, 1] = out[0], out[1]
             work.active[active] = i
             active += 1
-        mismatch = max(mismatch, abs(work.f[i, 0] - work.f_linear[i, 0]), abs(work.f[i, 1] - work.f_linear[i, 1]))
-    return active, mismatch
+        for r in range(2):
+            off = work.f[i, r] - work.f_linear[i, r]
+            mismatch = max(mismatch, abs(off))
+            squares += off * off
+    return active, mismatch, squares
 
 
 @njit(cache=True)
@@ -215,20 +225,21 @@ def eliminate_pad(pad: Any, work: Any, active: int, V: Array, V_star: Array, rig
 
 
 @njit(cache=True)
-def update_pad(pad: Any, work: Any, count: int, active: int, V: Array, V_star: Array, V_new: Array, part: float) -> None:
-    """Forces and window velocities of the new iterate, `part` of the way from the old one."""
+def propose(pad: Any, work: Any, count: int, active: int, V_star: Array, V_new: Array) -> None:
+    """Newton's forces and window velocities for the rigid velocities V_new; the present ones become the old ones."""
     for k in range(count):
         i = work.window[k]
-        work.f_linear[i, 0] *= 1.0 - part
-        work.f_linear[i, 1] *= 1.0 - part
+        n = pad.surface[i]
+        for r in range(2):
+            work.f_old[i, r], work.v_old[i, r] = work.f_linear[i, r], work.u_dot[2 * n + r]
+            work.f_new[i, r] = 0.0
     for k in range(active):
         i = work.active[k]
         for r in range(2):
             f = work.rhs[2 * k + r, 0]
             for col in range(5):
                 f += work.rhs[2 * k + r, 1 + col] * V_new[col]
-            work.f_linear[i, r] += part * f
-            work.rhs[2 * k + r, 0] = f
+            work.f_new[i, r] = f
     for k in range(count):
         n = pad.surface[work.window[k]]
         for r in range(2):
@@ -236,10 +247,21 @@ def update_pad(pad: Any, work: Any, count: int, active: int, V: Array, V_star: A
             v = work.free[row]
             for m in range(active):
                 j = work.active[m]
-                v += pad.P[2 * j, row] * work.rhs[2 * m, 0] + pad.P[2 * j + 1, row] * work.rhs[2 * m + 1, 0]
+                v += pad.P[2 * j, row] * work.f_new[j, 0] + pad.P[2 * j + 1, row] * work.f_new[j, 1]
             if pad.moving_base:
                 v -= pad.D[row, 0] * (V_new[3] - V_star[3]) + pad.D[row, 1] * (V_new[4] - V_star[4])
-            work.u_dot[row] += part * (v - work.u_dot[row])
+            work.v_new[work.window[k], r] = v
+
+
+@njit(cache=True)
+def move(pad: Any, work: Any, count: int, part: float) -> None:
+    """Go `part` of the way from the old iterate to the proposed one. Both satisfy the linear relations, so this does."""
+    for k in range(count):
+        i = work.window[k]
+        n = pad.surface[i]
+        for r in range(2):
+            work.f_linear[i, r] = work.f_old[i, r] + part * (work.f_new[i, r] - work.f_old[i, r])
+            work.u_dot[2 * n + r] = work.v_old[i, r] + part * (work.v_new[i, r] - work.v_old[i, r])
 
 
 @njit(cache=True)
@@ -284,18 +306,24 @@ def solve_stage(
     counts, actives = np.zeros(2, np.int64), np.zeros(2, np.int64)
     rigid = np.empty((5, 6))
     A, b = np.empty((5, 5)), np.empty((5, 1))
-    V_new = np.empty(5)
+    V_new, V_old = np.empty(5), np.empty(5)
     found = np.empty(max(pads[0].surface.size, pads[1].surface.size), np.int64)
     for p in range(2):
         free_rates(pads[p], states[p], works[p], V_star[3:], ah, c.tau)
         counts[p] = near(pads[p], states[p], works[p], q, V, ah, c, margin, works[p].window)
         works[p].f_linear[:] = 0.0
-    previous = np.inf
-    for iteration in range(max_iterations + 1):
-        mismatch = 0.0
+    previous, part, iteration = np.inf, 1.0, 0
+    while True:
+        mismatch, squares = 0.0, 0.0
         for p in range(2):
-            actives[p], worst = evaluate_window(pads[p], states[p], works[p], counts[p], q, V, ah, c)
-            mismatch = max(mismatch, worst)
+            actives[p], worst, total = evaluate_window(pads[p], states[p], works[p], counts[p], q, V, ah, c)
+            mismatch, squares = max(mismatch, worst), squares + total
+        if iteration > SEARCH_AFTER and squares >= previous and part > SHORTEST:
+            part *= 0.5
+            for p in range(2):
+                move(pads[p], works[p], counts[p], part)
+            V[:] = V_old + part * (V_new - V_old)
+            continue
         if iteration > 0 and mismatch <= tolerance:
             missed = False
             for p in range(2):  # a node outside the window may touch after all
@@ -329,13 +357,12 @@ def solve_stage(
             for col in range(5):
                 A[r, col] = rigid[r, 1 + col]
         solve_dense(A, b, 5, 1)
-        V_new[:] = b[:, 0]
-        part = 0.5 if iteration >= SHORTEN_AFTER and mismatch > SHORTEN_ABOVE * previous else 1.0
+        V_old[:], V_new[:] = V, b[:, 0]
         for p in range(2):
-            update_pad(pads[p], works[p], counts[p], actives[p], V, V_star, V_new, part)
-        V[:] += part * (V_new - V)
-        previous = mismatch
-    return False, max_iterations
+            propose(pads[p], works[p], counts[p], actives[p], V_star, V_new)
+            move(pads[p], works[p], counts[p], 1.0)
+        V[:] = V_new
+        previous, part, iteration = squares, 1.0, iteration + 1
 
 
 @njit(cache=True)
@@ -366,7 +393,9 @@ def finish_pad(
             n = pad.surface[i]
             work.Ku_dot[2 * n], work.Ku_dot[2 * n + 1] = work.f_linear[i]
         elif state.s[i] != 0.0:  # away from contact the stretch decays through the slip element
-            e, gamma_dot, _, _ = tangential(state.s[i], 0.0, 0.0, share * (c.R_t + ah * c.K_t), share * c.K_t, share, c)
+            e, gamma_dot, _, _ = tangential(
+                state.s[i], 0.0, 0.0, share * (c.R_t + ah * c.K_t), share * c.K_t, share, c
+            )
             work.s_dot[i] = -gamma_dot
         else:
             continue

@@ -102,7 +102,12 @@ class Trajectory:
             columns[f"normal_force_{name}"] = (nodes, force[..., 0], "N", f"normal force on the {name} pad's nodes")
             columns[f"friction_force_{name}"] = (nodes, force[..., 1], "N", f"friction on the {name} pad's nodes")
             columns[f"stretch_{name}"] = (nodes, getattr(s, f"s_{k}"), "m", "stretch of the momentary springs")
-            columns[f"displacement_{name}"] = (("time", f"{name}_node", "axis"), u, "m", f"{name} pad's displacements")
+            columns[f"displacement_{name}"] = (
+                ("time", f"{name}_node", "axis"),
+                u,
+                "m",
+                f"{name} pad's displacements",
+            )
             if getattr(s, f"v_{k}").numel():
                 nodes3 = ("time", f"{name}_node", "axis")
                 columns[f"velocity_{name}"] = (nodes3, getattr(s, f"v_{k}"), "m/s", f"{name} pad's nodal velocities")

@@ -1,0 +1,52 @@
+"""Stability of the closed loop: the linearised modes of the grasped system about its static equilibrium.
+
+The horizontal loop senses the disc and pushes the bracket, through two soft pads: non-collocated, and unstable for many
+combinations of gains, pad stiffness and pad damping.
+"""
+
+import torch
+from torch import Tensor
+
+from torchsoft.control import hold
+from torchsoft.equilibrium import press
+from torchsoft.model import SoftGrasp
+
+DISPLACEMENT, VELOCITY = 1e-9, 1e-8
+"""Perturbations [m or rad], [m/s or rad/s] of the central differences: small against penetrations, so that nodes stick."""
+
+NEUTRAL = 0.1
+"""Growth rate [1/s] up to which a mode counts as neutral; the disc's angle is one."""
+
+
+@torch.no_grad()
+def loop_modes(model: SoftGrasp) -> Tensor:
+    """Eigenvalues [1/s] of the linearised closed loop in the grasp, complex (size,), the least stable first.
+
+    The grasp is the frictionless equilibrium at the scenario's y_Br(t_g), with every touching node sticking. Raises
+    `NoEquilibrium` when that grasp does not exist.
+    """
+    y = press(model, model.settings.scenario.y_Br_grasp)
+    state, before = model.layout.unpack(y), model.reference
+    touching = model.evaluate(0.0, state).ports
+    load = touching["pad_U"].transformer.effort(touching["pad_U"].effort, model.junctions)["bracket"]
+    try:
+        model.reference = hold(float(state.r_C[0]), float(state.r_Br[1]), float(load[..., 1].sum()))
+        first_velocity = model.layout.slices["v_L"].start
+        size = torch.full((model.layout.size,), DISPLACEMENT, dtype=torch.float64)
+        size[first_velocity:] = VELOCITY
+        ahead, behind = model(0.0, y + torch.diag(size)), model(0.0, y - torch.diag(size))
+    finally:
+        model.reference = before
+    modes = torch.linalg.eigvals(((ahead - behind) / (2 * size[:, None])).mT)
+    return modes[modes.real.argsort(descending=True)]
+
+
+def describe_instability(model: SoftGrasp) -> str:
+    """A sentence on an unstable loop with its remedy; empty when the loop is stable."""
+    leading = complex(loop_modes(model)[0])
+    if leading.real <= NEUTRAL:
+        return ""
+    return (
+        f"the closed loop is unstable: its leading mode is {leading.real:+.3g} {leading.imag:+.3g}j 1/s; raise pad.tau or "
+        "pad.E, or lower control.K_81"
+    )
