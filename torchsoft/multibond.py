@@ -97,23 +97,26 @@ def topology(ports: Mapping[str, Port], junctions: Mapping[str, Junction]) -> nx
     """The graph as drawn: junctions, their I fields and sources of flow, transformers, and the elements behind each port.
 
     Node attribute `kind` is one of "1", "MTF", "I", "C", "R", "Se", "Sf"; edge attribute `activated` marks signal bonds.
+    A port that shares a junction's name stands under "<name>: field".
     """
     graph = nx.DiGraph()
     for name, junction in junctions.items():
         graph.add_node(name, kind="1", label=junction.label)
+        if junction.element.startswith("R"):  # a massless pad's flow is set by the R field that its own port shows
+            continue
         graph.add_node(f"{name}: own", kind=junction.element.split(":")[0], label=junction.element)
         graph.add_edge(name, f"{name}: own", activated=False)
     for name, port in ports.items():
-        graph.add_node(name, kind="MTF", label=name)
+        hub = f"{name}: field" if name in junctions else name
+        graph.add_node(hub, kind="MTF", label=name)
         for junction in port.transformer.blocks:
-            graph.add_edge(*((name, junction) if port.source else (junction, name)), activated=False)
+            graph.add_edge(*((hub, junction) if port.source else (junction, hub)), activated=False)
         for junction in port.senses:
-            graph.add_edge(junction, name, activated=True)
+            graph.add_edge(junction, hub, activated=True)
         for element in port.elements:
-            graph.add_node(f"{name}: {element}", kind=element.split(":")[0], label=element)
-            graph.add_edge(
-                *((f"{name}: {element}", name) if port.source else (name, f"{name}: {element}")), activated=False
-            )
+            own = f"{name}: {element}"
+            graph.add_node(own, kind=element.split(":")[0], label=element)
+            graph.add_edge(*((own, hub) if port.source else (hub, own)), activated=False)
     return graph
 
 
