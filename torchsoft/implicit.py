@@ -100,20 +100,20 @@ class ImplicitStepper:
         c, friction, control = m.contact, m.contact.friction, m.controllers
         coulomb = m.settings.contact.friction == "coulomb"
         return Constants(
-            *(float(x) for x in (c.K_n, c.R_n, c.K_t, c.R_t, c.eta, friction.mu_s, friction.mu_k)),  # pyright: ignore[reportAttributeAccessIssue]
-            v_s=math.inf if coulomb else float(friction.v_s),  # pyright: ignore[reportAttributeAccessIssue]
+            *(x.item() for x in (c.K_n, c.R_n, c.K_t, c.R_t, c.eta, friction.mu_s, friction.mu_k)),  # pyright: ignore[reportAttributeAccessIssue]
+            v_s=math.inf if coulomb else friction.v_s.item(),  # pyright: ignore[reportAttributeAccessIssue]
             epsilon=c.epsilon,
             coulomb=coulomb,
-            tau=float(m.material.tau),
-            radius=float(m.shape.radius),
-            m_C=float(m.m_C),
-            I_C=float(m.inertia),
-            m_Br=float(m.m_Br),
-            gravity=float(m.gravity),
-            K_81=float(control.K_81),
-            R_80=float(control.R_80),
-            K_98=float(control.K_98),
-            R_99=float(control.R_99),
+            tau=m.material.tau.item(),
+            radius=m.shape.radius.item(),
+            m_C=m.m_C.item(),
+            I_C=m.inertia.item(),
+            m_Br=m.m_Br.item(),
+            gravity=m.gravity.item(),
+            K_81=control.K_81.item(),
+            R_80=control.R_80.item(),
+            K_98=control.K_98.item(),
+            R_99=control.R_99.item(),
             pad_length=m.settings.pad.length,
         )
 
@@ -129,16 +129,16 @@ class ImplicitStepper:
     @torch.no_grad()
     def _pad(self, pad: Pad, ah: float, moving_base: bool) -> PadArrays:
         material, size = self.model.material, 2 * pad.nodes
-        stiff = float(material.tau) + ah
+        stiff = material.tau.item() + ah
         if pad.massless:
             P = np.ascontiguousarray((pad.compliance(material) / stiff).numpy().T)
             D, B, M, factor = np.zeros((size, 2)), np.zeros((2, 2)), np.zeros(0), np.zeros((0, 0))
         else:
             M = np.repeat(pad.masses(material).numpy(), 2)  # pyright: ignore[reportCallIssue]
             K_lambda, K_mu, _ = pad.mesh.matrices
-            lame_lambda, lame_mu = (float(x) for x in material.lame())
+            lame_lambda, lame_mu = (x.item() for x in material.lame())
             mirror = np.tile(pad.mirror.numpy(), pad.nodes)
-            K = pad.mesh.assemble(float(material.depth) * (lame_lambda * K_lambda + lame_mu * K_mu))
+            K = pad.mesh.assemble(material.depth.item() * (lame_lambda * K_lambda + lame_mu * K_mu))
             A = banded(K.multiply(mirror[:, None] * mirror[None, :]).tocsr() * stiff)
             A[0] += M / ah
             factor = linalg.cholesky_banded(A, lower=True)

@@ -110,5 +110,5 @@ def gather(model: SoftGrasp, t: Tensor, out: Progress, wall: float, step: float,
             "method": METHOD,
             "parameters": {name: row["value"] for name, row in model.settings.table().items()},
         },
-        inertia=float(model.inertia),
+        inertia=model.inertia.item(),
     )
