@@ -126,9 +126,16 @@ class Contact(nn.Module):
         self.epsilon, self.node_spacing = p.epsilon, p.node_spacing
         self.friction: FrictionLaw = SmoothSlip(p) if p.friction == "smooth" else Coulomb(p)
 
-    def forward(self, g: Tensor, g_dot: Tensor, v_T: Tensor, s: Tensor, share: Tensor) -> ContactState:
-        """Forces and rates from penetration g [m], its rate, sliding speed v_T [m/s] and stretch s [m], all (..., n)."""
+    def forward(
+        self, g: Tensor, g_dot: Tensor, v_T: Tensor, s: Tensor, share: Tensor, stage: float = 0.0
+    ) -> ContactState:
+        """Forces and rates from penetration g [m], its rate, sliding speed v_T [m/s] and stretch s [m], all (..., n).
+
+        With `stage` = a h [s] the law at the end of an implicit stage: s is then its s*, and the stretch that acts is
+        s* + a h s', which turns the dashpot R_t into R_t + a h K_t and changes nothing else.
+        """
         K_n, R_n, K_t, R_t, eta = (share * k for k in (self.K_n, self.R_n, self.K_t, self.R_t, self.eta))
+        R_t = R_t + stage * K_t
         rho = ramp(g, self.epsilon)
         F_N = normal_force(g, g_dot, rho, K_n, R_n)  # (8), (9)
         trial = K_t * s + R_t * rho * v_T  # (10), (11): the effort if nothing slipped

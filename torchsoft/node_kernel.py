@@ -69,26 +69,28 @@ def slip(E: float, F_N: float, R: float, share: float, c: Any) -> tuple[float, f
 
 @njit(cache=True)
 def tangential(s: float, flow: float, F_N: float, R: float, K: float, share: float, c: Any) -> tuple[float, ...]:
-    """Effort e, slip rate, and de/dflow, de/dF_N of the Voigt pair in series with the slip element.
+    """Effort e and slip rate gamma' of the Voigt pair in series with the slip element, with their derivatives.
 
     At a stage s = s* + a h (flow - gamma'), so e = K s* + (R + a h K)(flow - gamma'): called with s* and with
-    R + a h K for R, this is the continuous law of `contact.Contact` at the end of the stage.
+    R + a h K for R, this is the continuous law of `contact.Contact` at the end of the stage. Returns e, gamma',
+    de/dtrial, dgamma'/dtrial, de/dF_N, dgamma'/dF_N, where trial = K s + R flow.
     """
     trial = K * s + R * flow
     sign = 1.0 if trial > 0.0 else -1.0
     w, w_E, w_N = slip(abs(trial), F_N, R, share, c)
-    return trial - R * sign * w, sign * w, R * (1.0 - R * w_E), -R * sign * w_N
+    return trial - R * sign * w, sign * w, 1.0 - R * w_E, w_E, -R * sign * w_N, sign * w_N
 
 
 @njit(cache=True)
 def contact_node(
     dx: float, dy: float, wx: float, wy: float, omega: float, theta: float, s: float, share: float, ah: float, c: Any,
-    G: Array, out: Array,
+    J: Array, out: Array,
 ) -> bool:  # fmt: skip
-    """Force of the object on one node and its Jacobian G (2, 3) with respect to (w_x, w_y, omega) at the end of a stage.
+    """Force of the object on one node at the end of a stage, and its stretch rate, with their Jacobian.
 
-    d is the node's lever about the object's centre, w = v_C - p'. `out` receives f_x, f_y, F_N, F_T, e, gamma', rho, g,
-    g', v_T. Returns whether the node touches; where it does not, nothing is written.
+    d is the node's lever about the object's centre, w = v_C - p', s the stage's s*. `out` receives f_x, f_y, F_N, F_T, e,
+    gamma', rho, g, g', v_T, and J (3, 7) the derivatives of (f_x, f_y, s') with respect to (w_x, w_y, omega, d_x, d_y,
+    theta, s*), each with the others held. Returns whether the node touches; if not, nothing is written.
     """
     cos, sin = np.cos(theta), np.sin(theta)
     phi, mx, my, curvature = body_distance(c.radius, cos * dx + sin * dy, cos * dy - sin * dx)
@@ -108,24 +110,26 @@ def contact_node(
     if F_N <= 0.0:
         F_N, N_g, N_v = 0.0, 0.0, 0.0
     K, R = share * c.K_t, share * (c.R_t + ah * c.K_t)
-    e, gamma_dot, e_flow, e_N = tangential(s, rho * v_T, F_N, R, K, share, c)  # (10)-(13)
+    e, gamma_dot, e_trial, slip_trial, e_N, slip_N = tangential(s, rho * v_T, F_N, R, K, share, c)  # (10)-(13)
     F_T = rho * e
-    T_v = rho * e_flow * rho
-    T_gd = rho * e_N * N_v
-    T_g = rho_g * e + rho * (e_flow * rho_g * v_T + e_N * N_g)
 
-    for j in range(3):  # columns: w_x, w_y, omega; the lever and the angle move with them over a h
-        dwx, dwy, dom = (1.0, 0.0, 0.0) if j == 0 else ((0.0, 1.0, 0.0) if j == 1 else (0.0, 0.0, 1.0))
-        ddx, ddy, dth = -ah * dwx, -ah * dwy, ah * dom
+    for j in range(6):
+        dwx, dwy, dom = 1.0 if j == 0 else 0.0, 1.0 if j == 1 else 0.0, 1.0 if j == 2 else 0.0
+        ddx, ddy, dth = 1.0 if j == 3 else 0.0, 1.0 if j == 4 else 0.0, 1.0 if j == 5 else 0.0
         dg = arm_n * dth - nx * ddx - ny * ddy
         turn = curvature * (tx * ddx + ty * ddy) + (1.0 - curvature * arm_t) * dth
         dvx, dvy = dwx - dom * dy - omega * ddy, dwy + dom * dx + omega * ddx
         dg_dot = nx * dvx + ny * dvy + v_T * turn
         dv_T = tx * dvx + ty * dvy - g_dot * turn
         dN = N_g * dg + N_v * dg_dot
-        dT = T_g * dg + T_gd * dg_dot + T_v * dv_T
-        G[0, j] = dN * nx + dT * tx + (F_N * tx - F_T * nx) * turn
-        G[1, j] = dN * ny + dT * ty + (F_N * ty - F_T * ny) * turn
+        dflow = rho_g * dg * v_T + rho * dv_T
+        dT = rho_g * dg * e + rho * (e_trial * R * dflow + e_N * dN)
+        J[0, j] = dN * nx + dT * tx + (F_N * tx - F_T * nx) * turn
+        J[1, j] = dN * ny + dT * ty + (F_N * ty - F_T * ny) * turn
+        J[2, j] = dflow - slip_trial * R * dflow - slip_N * dN
+    J[0, 6] = rho * e_trial * K * tx
+    J[1, 6] = rho * e_trial * K * ty
+    J[2, 6] = -slip_trial * K
 
     out[0], out[1] = F_N * nx + F_T * tx, F_N * ny + F_T * ty
     out[2], out[3], out[4], out[5], out[6], out[7], out[8], out[9] = F_N, F_T, e, gamma_dot, rho, g, g_dot, v_T

@@ -138,16 +138,20 @@ def evaluate_window(
     """Contact law on the window; returns the number of touching nodes (in `work.active`) and the mismatch between the law
     and the forces that the linear relations were solved with: the largest [N], and the sum of squares [N2]."""
     theta = q[2] + ah * V[2]
-    place, out = np.empty(4), np.empty(10)
+    place, out, J = np.empty(4), np.empty(10), np.empty((3, 7))
     active, mismatch, squares = 0, 0.0, 0.0
     for k in range(count):
         i = work.window[k]
         lever(pad, state, work, q, V, ah, i, place)
         work.f[i, 0], work.f[i, 1] = 0.0, 0.0
         touches = contact_node(
-            place[0], place[1], place[2], place[3], V[2], theta, state.s[i], pad.share[i], ah, c, work.G[i], out
+            place[0], place[1], place[2], place[3], V[2], theta, state.s[i], pad.share[i], ah, c, J, out
         )
         if touches:
+            for r in range(2):  # lever and angle move with w and omega over a h
+                work.G[i, r, 0] = J[r, 0] - ah * J[r, 3]
+                work.G[i, r, 1] = J[r, 1] - ah * J[r, 4]
+                work.G[i, r, 2] = J[r, 2] + ah * J[r, 5]
             work.d[i, 0], work.d[i, 1], work.w[i, 0], work.w[i, 1] = place
             work.f[i, 0], work.f[i, 1] = out[0], out[1]
             work.active[active] = i
@@ -375,7 +379,7 @@ def finish_pad(
     nodes, because a rigid rotation of the undeformed pad costs no effort.
     """
     theta = q[2] + ah * V[2]
-    place, out, G = np.empty(4), np.empty(10), np.empty((2, 3))
+    place, out, J = np.empty(4), np.empty(10), np.empty((3, 7))
     work.forces[:] = 0.0
     work.s_dot[:] = 0.0
     work.Ku_dot[:] = 0.0
@@ -385,7 +389,7 @@ def finish_pad(
         if k < work.active.size and work.active[k] == i:
             k += 1
             lever(pad, state, work, q, V, ah, i, place)
-            contact_node(place[0], place[1], place[2], place[3], V[2], theta, state.s[i], share, ah, c, G, out)
+            contact_node(place[0], place[1], place[2], place[3], V[2], theta, state.s[i], share, ah, c, J, out)
             F_N, F_T, e, gamma_dot, rho, g, g_dot, v_T = out[2:]
             work.s_dot[i] = rho * v_T - gamma_dot
             work.forces[i, 0], work.forces[i, 1] = F_N, F_T
@@ -393,7 +397,7 @@ def finish_pad(
             n = pad.surface[i]
             work.Ku_dot[2 * n], work.Ku_dot[2 * n + 1] = work.f_linear[i]
         elif state.s[i] != 0.0:  # away from contact the stretch decays through the slip element
-            e, gamma_dot, _, _ = tangential(
+            e, gamma_dot, _, _, _, _ = tangential(
                 state.s[i], 0.0, 0.0, share * (c.R_t + ah * c.K_t), share * c.K_t, share, c
             )
             work.s_dot[i] = -gamma_dot
