@@ -104,8 +104,9 @@ def topology(ports: Mapping[str, Port], junctions: Mapping[str, Junction]) -> nx
         graph.add_node(name, kind="1", label=junction.label)
         if junction.element.startswith("R"):  # a massless pad's flow is set by the R field that its own port shows
             continue
-        graph.add_node(f"{name}: own", kind=junction.element.split(":")[0], label=junction.element)
-        graph.add_edge(name, f"{name}: own", activated=False)
+        own, kind = f"{name}: own", junction.element.split(":")[0]
+        graph.add_node(own, kind=kind, label=junction.element)
+        graph.add_edge(*((own, name) if kind == "Sf" else (name, own)), activated=False)
     for name, port in ports.items():
         hub = f"{name}: field" if name in junctions else name
         graph.add_node(hub, kind="MTF", label=name)

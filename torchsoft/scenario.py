@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchsoft.control import Profile, Reference
-from torchsoft.equilibrium import rest
+from torchsoft.equilibrium import NoEquilibrium, rest
 from torchsoft.model import SoftGrasp
 from torchsoft.simulate import simulate
 
@@ -77,4 +77,4 @@ def find_grasp_force(model: SoftGrasp, y0: Tensor, step: float, tolerance: float
             force, error = new, new_error
     finally:
         model.reference = before
-    raise RuntimeError(f"no grasping force found: the bracket is still {error:.2g} m off at {force:.4g} N")
+    raise NoEquilibrium(f"no grasping force found: the bracket is still {error:.2g} m off at {force:.4g} N")
