@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchsoft.contact import cross, moving_frame
 from torchsoft.implicit import ImplicitStepper
+from torchsoft.kernel_inputs import constants, pad_state
 from torchsoft.model import SoftGrasp
 from torchsoft.node_kernel import contact_node
 from torchsoft.run_kernel import GAMMA
@@ -54,11 +55,11 @@ def random_nodes(model: SoftGrasp, seed: int) -> list[dict[str, float]]:
 @pytest.mark.parametrize("ah", [0.0, 6e-4])
 def test_node_law_and_its_jacobian_equal_the_module(friction: str, ah: float) -> None:
     model = coarse(contact__friction=friction)
-    constants = ImplicitStepper(model).constants()
+    scalars = constants(model)
     seen = {"separated": 0, "touching": 0, "stick": 0, "slip": 0, "cut": 0}
     for node in random_nodes(model, seed=1):
         J, out, share = np.empty((3, 7)), np.empty(10), node["share"]
-        touches = contact_node(*node.values(), ah, constants, J, out)
+        touches = contact_node(*node.values(), ah, scalars, J, out)
         names = ("wx", "wy", "omega", "dx", "dy", "theta", "s")
         x = torch.tensor([node[name] for name in names], dtype=torch.float64)
 
@@ -91,17 +92,17 @@ def test_stage_rates_equal_forward(fidelity: str, seed: int) -> None:
     y = random_state(model, seed)
     state, h = model.layout.unpack(y), 1e-3
     ah = GAMMA * h
-    pads, constants = stepper.pad_arrays(h), stepper.constants()
-    parts = tuple(stepper._pad_state(k, state) for k in "LU")
+    pads, scalars = stepper.pad_arrays(h), stepper.constants
+    parts = tuple(pad_state(model, k, state) for k in "LU")
     works = tuple(pad_work(pad) for pad in pads)
     q = torch.cat((state.r_C, state.theta[None], state.r_Br)).numpy()
     V_star = torch.cat((state.v_C, state.omega[None], state.v_Br)).numpy()
     V, powers = V_star.copy(), np.zeros(8)
     want = torch.stack(model.reference(torch.tensor(0.0, dtype=torch.float64))).detach().numpy()
-    converged, _ = solve_stage(pads, parts, works, q, V_star, V, want, ah, constants, 1e-9, 40, 3e-4)
+    converged, _ = solve_stage(pads, parts, works, q, V_star, V, want, ah, scalars, 1e-9, 40, 3e-4)
     assert converged
     for p in range(2):
-        finish_pad(pads[p], parts[p], works[p], q, V, ah, constants, powers, p)
+        finish_pad(pads[p], parts[p], works[p], q, V, ah, scalars, powers, p)
     tensor = torch.from_numpy
     acceleration = tensor((V - V_star) / ah)
     k = model.layout.pack(

@@ -1,6 +1,5 @@
-"""The implicit stepper: the compiled kernel fed from a `SoftGrasp`, and its registration with torchdiffeq."""
+"""The implicit stepper: the compiled kernel fed from a `SoftGrasp`."""
 
-import importlib
 import logging
 import math
 from collections.abc import Iterator
@@ -10,13 +9,24 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy import linalg
 from torch import Tensor
 
+from torchsoft.grid import Chunk, check_times, chunks
+from torchsoft.kernel_inputs import constants, pad_arrays, pad_state
 from torchsoft.model import SoftGrasp
-from torchsoft.node_kernel import Array, Constants
-from torchsoft.pad import Pad, banded
-from torchsoft.run_kernel import CONVERGED, GAMMA, INTEGRALS, LOST, NEWTON_FAILED, OFF_THE_PAD, run
+from torchsoft.node_kernel import Array
+from torchsoft.run_kernel import (
+    CONVERGED,
+    GAMMA,
+    INTEGRALS,
+    LOST,
+    NEWTON_FAILED,
+    OFF_THE_PAD,
+    TAPE_FULL,
+    Tape,
+    empty_tape,
+    run,
+)
 from torchsoft.stage_kernel import PadArrays, PadState, pad_work
 from torchsoft.state import State
 
@@ -24,9 +34,6 @@ log = logging.getLogger("torchsoft")
 
 METHOD = "sdirk2"
 """Name under which `torchdiffeq.odeint` knows the stepper once torchsoft is imported."""
-
-CHUNK = 500
-"""Steps per compiled call: how often progress is shown and Ctrl-C is heard."""
 
 
 class SimulationFailed(RuntimeError):
@@ -50,17 +57,16 @@ class Progress:
     solves: int = 0
 
 
-def check_times(t: Tensor) -> None:
-    """Raises `ValueError` unless t is a float64 vector of at least two finite, strictly increasing times."""
-    if t.ndim != 1 or len(t) < 2 or t.dtype != torch.float64:
-        raise ValueError(
-            f"`t` must be a float64 vector of two times or more, but is {t.dtype} of shape {tuple(t.shape)}"
-        )
-    if not bool(torch.isfinite(t).all()) or not bool((t.diff() > 0).all()):
-        bad = int((~(t.diff() > 0)).nonzero()[0, 0]) if bool(torch.isfinite(t).all()) else 0
-        raise ValueError(
-            f"`t` must increase strictly and be finite, but t[{bad}:{bad + 2}] = {t[bad : bad + 2].tolist()}"
-        )
+@dataclass
+class Segment:
+    """One chunk of a taped run: where it began, and its tape, or None where it is to be made again when needed."""
+
+    chunk: Chunk
+    states: tuple[PadState, PadState]
+    q: Array
+    V: Array
+    rows: slice
+    tape: Tape | None
 
 
 class ImplicitStepper:
@@ -68,7 +74,8 @@ class ImplicitStepper:
 
     `step` [s] is the largest step; every output interval is cut into equal steps no longer than it. Newton stops when
     the contact law and the linear relations agree to `tolerance` [N] at every node. `window` [m] is how near a node has
-    to be to count as one that may touch (checked after every stage; only speed depends on it).
+    to be to count as one that may touch (checked after every stage; only speed depends on it). Parameters are read when
+    the stepper is made.
     """
 
     def __init__(
@@ -92,76 +99,35 @@ class ImplicitStepper:
             max_iterations,
             window,
         )
+        self.constants = constants(model)
         self._arrays: dict[float, tuple[PadArrays, PadArrays]] = {}
-
-    def constants(self) -> Constants:
-        """The model's scalars as the kernel takes them."""
-        m = self.model
-        c, friction, control = m.contact, m.contact.friction, m.controllers
-        coulomb = m.settings.contact.friction == "coulomb"
-        return Constants(
-            *(x.item() for x in (c.K_n, c.R_n, c.K_t, c.R_t, c.eta, friction.mu_s, friction.mu_k)),  # pyright: ignore[reportAttributeAccessIssue]
-            v_s=math.inf if coulomb else friction.v_s.item(),  # pyright: ignore[reportAttributeAccessIssue]
-            epsilon=c.epsilon,
-            coulomb=coulomb,
-            tau=m.material.tau.item(),
-            radius=m.shape.radius.item(),
-            m_C=m.m_C.item(),
-            I_C=m.inertia.item(),
-            m_Br=m.m_Br.item(),
-            gravity=m.gravity.item(),
-            K_81=control.K_81.item(),
-            R_80=control.R_80.item(),
-            K_98=control.K_98.item(),
-            R_99=control.R_99.item(),
-            pad_length=m.settings.pad.length,
-        )
+        self._cap = 24
 
     def pad_arrays(self, h: float) -> tuple[PadArrays, PadArrays]:
         """Both pads' mobilities for the step h [s]."""
         if h not in self._arrays:
             if len(self._arrays) > 8:  # an irregular output grid has many step sizes; each holds some megabytes
                 self._arrays.clear()
-            m = self.model
-            self._arrays[h] = (self._pad(m.pad_L, GAMMA * h, False), self._pad(m.pad_U, GAMMA * h, True))
+            self._arrays[h] = (pad_arrays(self.model, "L", GAMMA * h), pad_arrays(self.model, "U", GAMMA * h))
         return self._arrays[h]
 
-    @torch.no_grad()
-    def _pad(self, pad: Pad, ah: float, moving_base: bool) -> PadArrays:
-        material, size = self.model.material, 2 * pad.nodes
-        stiff = material.tau.item() + ah
-        if pad.massless:
-            P = np.ascontiguousarray((pad.compliance(material) / stiff).numpy().T)
-            D, B, M, factor = np.zeros((size, 2)), np.zeros((2, 2)), np.zeros(0), np.zeros((0, 0))
-        else:
-            M = np.repeat(pad.masses(material).numpy(), 2)  # pyright: ignore[reportCallIssue]
-            K_lambda, K_mu, _ = pad.mesh.matrices
-            lame_lambda, lame_mu = (x.item() for x in material.lame())
-            mirror = np.tile(pad.mirror.numpy(), pad.nodes)
-            K = pad.mesh.assemble(material.depth.item() * (lame_lambda * K_lambda + lame_mu * K_mu))
-            A = banded(K.multiply(mirror[:, None] * mirror[None, :]).tocsr() * stiff)
-            A[0] += M / ah
-            factor = linalg.cholesky_banded(A, lower=True)
-            dofs = (2 * pad.surface.numpy()[:, None] + np.arange(2)).ravel()
-            loads = np.zeros((size, len(dofs)))
-            loads[dofs, np.arange(len(dofs))] = 1.0
-            P = np.ascontiguousarray(linalg.cho_solve_banded((factor, True), loads).T)
-            uniform = M[:, None] * np.tile(np.eye(2), (pad.nodes, 1)) / ah
-            D = linalg.cho_solve_banded((factor, True), uniform)
-            B = np.diag(uniform.sum(0)) - uniform.T @ D
-            factor = np.ascontiguousarray(factor)
-        share = self.model.share(pad).numpy()
-        return PadArrays(pad.positions.numpy(), pad.surface.numpy(), share, P, D, B, M, factor, moving_base)
+    def setpoints(self, chunk: Chunk) -> Tensor:
+        """Set-points at the stages of a chunk (steps, 2, 5)."""
+        stage_times = torch.from_numpy(chunk.starts[:, None] + chunk.h * np.array([GAMMA, 1.0]))
+        return torch.stack(self.model.reference(stage_times), -1)
 
     @torch.no_grad()
-    def integrate(self, y0: Tensor, t: Tensor) -> Iterator[Progress]:
+    def integrate(
+        self, y0: Tensor, t: Tensor, segments: list[Segment] | None = None, tape_bytes: float = 0.0
+    ) -> Iterator[Progress]:
         """Step from y0 (size,) through t (T,), yielding the same growing `Progress` after every compiled call.
 
         `extras` holds the running integrals (`run_kernel.INTEGRALS`) and the bracket's moment. The last yield is the
-        complete run. Raises `SimulationFailed`.
+        complete run. With `segments` given, what the adjoint needs is appended to it, tapes for as long as they take
+        less than `tape_bytes`. Raises `SimulationFailed`.
         """
         check_times(t)
-        m, times = self.model, t.numpy()
+        m = self.model
         state = m.layout.unpack(y0)
         if y0.ndim != 1 or not bool(torch.isfinite(y0).all()):
             raise ValueError(
@@ -171,68 +137,89 @@ class ImplicitStepper:
         out = Progress(
             np.empty((len(t), m.layout.size)), np.empty((len(t), surfaces, 2)), np.zeros((len(t), len(INTEGRALS) + 1))
         )
-        out.y[0], out.forces[0], out.extras[0, -1] = y0.numpy(), *_start(m, times[0], state)
-        pad_states = tuple(self._pad_state(k, state) for k in "LU")
+        out.y[0], out.forces[0], out.extras[0, -1] = y0.numpy(), *_start(m, t[0], state)
+        states = (pad_state(m, "L", state), pad_state(m, "U", state))
         q = torch.cat((state.r_C, state.theta[None], state.r_Br)).numpy()
         V = torch.cat((state.v_C, state.omega[None], state.v_Br)).numpy()
-        integrals, constants = np.zeros(len(INTEGRALS)), self.constants()
-        works = None
+        integrals, taped = np.zeros(len(INTEGRALS)), 0
         announce_compilation()
-        for h, starts, keep in self._chunks(times):
-            stage_times = torch.from_numpy(starts[:, None] + h * np.array([GAMMA, 1.0]))
-            wants = torch.stack(m.reference(stage_times), -1).numpy()
-            pads = self.pad_arrays(h)
-            works = works or tuple(pad_work(pad) for pad in pads)
-            rows = slice(out.rows, out.rows + int(keep.sum()))
-            steps, status, solves = run(
-                pads, pad_states, works, q, V, wants, h, constants, self.tolerance, self.max_iterations, self.window, keep,
-                integrals, out.y[rows], out.forces[rows], out.extras[rows],
-            )  # fmt: skip
-            out.rows += int(keep[:steps].sum())
+        for chunk in chunks(t, self.step):
+            rows = slice(out.rows, out.rows + int(chunk.keep.sum()))
+            segment = Segment(chunk, _copies(states), q.copy(), V.copy(), rows, None)
+            outputs = (out.y[rows], out.forces[rows], out.extras[rows])
+            wanted = segments is not None and taped < tape_bytes
+            steps, status, solves, tape = self._run(chunk, states, q, V, integrals, outputs, wanted)
+            if segments is not None:
+                segment.tape = tape
+                segments.append(segment)
+                taped += sum(x.nbytes for x in tape) if tape is not None else 0
+            out.rows += int(chunk.keep[:steps].sum())
             out.steps += steps
             out.solves += solves
-            if status != CONVERGED:
-                yield out
-                raise self._failure(status, float(starts[steps]), h)
             yield out
+            if status != CONVERGED:
+                raise self._failure(status, float(chunk.starts[steps]), chunk.h)
 
-    def _pad_state(self, which: str, state: State) -> PadState:
-        pad, u, v, s = self.model.pads[which], *(getattr(state, f"{part}_{which}") for part in "uvs")
-        force = pad.elastic_force(self.model.material, u)  # pyright: ignore[reportCallIssue]
-        return PadState(*(x.flatten().clone().numpy() for x in (u, v, force, s)))
+    def tape(self, segment: Segment) -> Tape:
+        """The segment's tape, made again from where it began if it was not kept."""
+        if segment.tape is not None:
+            return segment.tape
+        m, n = self.model, int(segment.chunk.keep.sum())
+        surfaces = len(m.pad_L.surface) + len(m.pad_U.surface)
+        outputs = (np.empty((n, m.layout.size)), np.empty((n, surfaces, 2)), np.empty((n, len(INTEGRALS) + 1)))
+        integrals = np.zeros(len(INTEGRALS))
+        *_, tape = self._run(
+            segment.chunk, _copies(segment.states), segment.q.copy(), segment.V.copy(), integrals, outputs, True
+        )
+        assert tape is not None
+        return tape
 
-    def _chunks(self, times: Array) -> Iterator[tuple[float, Array, Any]]:
-        """(h, start times of the steps, which of them end at an output) of runs of equal steps, at most CHUNK long."""
-        spans = np.diff(times)
-        counts = np.maximum(1, np.ceil(spans / self.step * (1 - 1e-9))).astype(int)
-        sizes = spans / counts
-        first = 0
-        while first < len(spans):
-            last, total = first, 0
-            same = lambda k: counts[k] == counts[first] and abs(sizes[k] - sizes[first]) <= 1e-9 * sizes[first]
-            while last < len(spans) and same(last) and (total == 0 or total + counts[last] <= CHUNK):
-                total += counts[last]
-                last += 1
-            n, h = counts[first], float(sizes[first])
-            starts = (times[first:last, None] + h * np.arange(n)).ravel()
-            keep = np.zeros(total, np.bool_)
-            keep[n - 1 :: n] = True
-            for k in range(0, total, CHUNK):  # one interval alone may be longer than a chunk
-                yield h, starts[k : k + CHUNK], keep[k : k + CHUNK]
-            first = last
+    @torch.no_grad()
+    def _run(
+        self,
+        chunk: Chunk,
+        states: tuple[PadState, PadState],
+        q: Array,
+        V: Array,
+        integrals: Array,
+        outputs: tuple[Array, Array, Array],
+        taping: bool,
+    ) -> tuple[int, int, int, Tape | None]:
+        """One compiled call; with `taping` once more with a longer tape if more nodes touch than it has room for."""
+        pads, wants = self.pad_arrays(chunk.h), self.setpoints(chunk).numpy()
+        dofs, surface = sum(s.u.size for s in states), sum(s.s.size for s in states)
+        begin = (*_copies(states), q.copy(), V.copy(), integrals.copy())
+        while True:
+            tape = empty_tape(2 * len(wants) if taping else 0, dofs, surface, self._cap)
+            steps, status, solves = run(
+                pads, states, (pad_work(pads[0]), pad_work(pads[1])), q, V, wants, chunk.h, self.constants, self.tolerance,
+                self.max_iterations, self.window, chunk.keep, integrals, *outputs, tape,
+            )  # fmt: skip
+            if status != TAPE_FULL:
+                return steps, status, solves, tape if taping else None
+            self._cap *= 2
+            for pad, start in zip(states, begin[:2]):
+                for now, before in zip(pad, start):
+                    now[:] = before
+            q[:], V[:], integrals[:] = begin[2:]
 
     def _failure(self, status: int, time: float, h: float) -> SimulationFailed:
         reasons = {
             NEWTON_FAILED: f"Newton's iteration did not converge within {self.max_iterations} iterations in the step of "
-            f"{h:.3g} s; try a smaller step, or a larger contact.v_s: where friction falls with slip faster than the pads damp, "
-            "massless pads have no unique velocity",
+            f"{h:.3g} s; try a smaller step, or a larger contact.v_s: where friction falls with slip faster than the pads "
+            "damp, massless pads have no unique velocity",
             OFF_THE_PAD: "the disc was lost: its contact reached the end of a pad",
             LOST: "the disc was lost: it left the space between the pads",
         }
         return SimulationFailed(f"at t = {time:.4f} s {reasons[status]}", time)
 
 
-def _start(model: SoftGrasp, time: float, state: State) -> tuple[Array, float]:
+def _copies(states: tuple[PadState, PadState]) -> tuple[PadState, PadState]:
+    lower, upper = (PadState(*(x.copy() for x in state)) for state in states)
+    return lower, upper
+
+
+def _start(model: SoftGrasp, time: Tensor, state: State) -> tuple[Array, float]:
     """Nodal forces and bracket moment at the start, from the module."""
     graph = model.evaluate(time, state)
     force = torch.cat([torch.stack(graph.interfaces[k].contact[:2], -1) for k in "LU"]).numpy()
@@ -250,57 +237,3 @@ def announce_compilation() -> None:
     if not _announced and not run.signatures and not list(cache.glob("run_kernel.run-*.nbi")):
         log.warning("compiling the implicit stepper (about half a minute, once; the result is cached in %s)", cache)
     _announced = True
-
-
-class _NoGradientYet(torch.autograd.Function):
-    """Passes the solution through and refuses to differentiate it."""
-
-    @staticmethod
-    def forward(ctx: Any, solution: Tensor, *inputs: Tensor) -> Tensor:
-        return solution.clone()
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> Any:
-        raise NotImplementedError(
-            f"method='{METHOD}' has no gradient yet; differentiate short windows through an explicit method such as 'rk4'"
-        )
-
-
-class TorchdiffeqSolver:
-    """`torchdiffeq.odeint(model, y0, t, method="sdirk2", options={"step_size": 2e-3})`.
-
-    Takes batches: y0 (..., size); each sample is stepped by itself, so none depends on its neighbours. rtol and atol are
-    not used: the step is fixed and Newton's tolerance is the stepper's.
-    """
-
-    def __init__(self, func: Any, y0: Tensor, rtol: float, atol: float, norm: Any = None, **options: Any) -> None:
-        model = func
-        while not isinstance(model, SoftGrasp):
-            model = getattr(model, "base_func", None)
-            if model is None:
-                raise TypeError(f"method='{METHOD}' integrates a torchsoft.SoftGrasp, but got {type(func).__name__}")
-        if "step_size" in options:
-            options["step"] = options.pop("step_size")
-        self.model, self.y0 = model, y0
-        self.stepper = ImplicitStepper(model, **options)
-
-    def integrate(self, t: Tensor) -> Tensor:
-        samples = self.y0.detach().reshape(-1, self.y0.shape[-1])
-        runs = []
-        for sample in samples:
-            *_, last = self.stepper.integrate(sample, t)
-            runs.append(torch.from_numpy(last.y))
-        solution = torch.stack(runs, 1).reshape(len(t), *self.y0.shape)
-        return _NoGradientYet.apply(solution, self.y0, *self.model.parameters())  # pyright: ignore[reportReturnType]
-
-    @classmethod
-    def valid_callbacks(cls) -> set[str]:
-        return set()
-
-
-def register() -> None:
-    """Add the stepper to torchdiffeq's table of solvers. The table is private, hence the check of what is there."""
-    solvers = getattr(importlib.import_module("torchdiffeq._impl.odeint"), "SOLVERS", None)
-    if not isinstance(solvers, dict) or "dopri5" not in solvers:
-        raise ImportError("this torchdiffeq keeps its solvers elsewhere; torchsoft was made for torchdiffeq 0.2.5")
-    solvers[METHOD] = TorchdiffeqSolver

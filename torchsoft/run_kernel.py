@@ -4,22 +4,75 @@ SDIRK2 is Alexander's two-stage method (SIAM J. Numer. Anal. 14, 1977): L-stable
 both stages with the same a = 1 - 1/sqrt(2), so that one mobility serves both.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
+from numpy.typing import NDArray
 
 from torchsoft.node_kernel import Array
 from torchsoft.stage_kernel import finish_pad, solve_stage
 
 GAMMA = 1.0 - 1.0 / np.sqrt(2.0)
 
-CONVERGED, NEWTON_FAILED, OFF_THE_PAD, LOST = range(4)
+CONVERGED, NEWTON_FAILED, OFF_THE_PAD, LOST, TAPE_FULL = range(5)
 
 DISSIPATED = ("pad_L", "pad_U", "contact_dashpots", "slip")
 SUPPLIED = ("control_x", "control_y", "gravity")
 INTEGRALS = (*DISSIPATED, *SUPPLIED, "injected")
 """Running integrals [J]: dissipated by, supplied by, and the positive part of what each source supplies."""
+
+
+class Tape(NamedTuple):
+    """What the adjoint and the sensitivities need of every stage, stages first; no rows where nothing is to be taped.
+
+    count (., 2) touching nodes a pad, node (., 2, cap) their numbers, place (., 2, cap, 5) their d, w and s*, force
+    (., 2, cap, 2) [N]; q_star, V_star, V (., 5); u_dot (., dofs of both pads) [m/s], s_star (., surface of both) [m].
+    """
+
+    count: NDArray[np.int64]
+    node: NDArray[np.int64]
+    place: Array
+    force: Array
+    q_star: Array
+    V_star: Array
+    V: Array
+    u_dot: Array
+    s_star: Array
+
+
+def empty_tape(stages: int, dofs: int, surface: int, cap: int) -> Tape:
+    """Room for that many stages; `cap` touching nodes a pad."""
+    return Tape(
+        np.zeros((stages, 2), np.int64), np.zeros((stages, 2, cap), np.int64), np.zeros((stages, 2, cap, 5)),
+        np.zeros((stages, 2, cap, 2)), np.zeros((stages, 5)), np.zeros((stages, 5)), np.zeros((stages, 5)),
+        np.zeros((stages, dofs)), np.zeros((stages, surface)),
+    )  # fmt: skip
+
+
+@njit(cache=True)
+def write_tape(tape: Any, row: int, pads: Any, states: Any, works: Any, q: Array, V_star: Array, V: Array) -> bool:
+    """Put one solved stage on the tape; False if more nodes touch than it has room for."""
+    place, dof, node = np.empty(4), 0, 0
+    tape.q_star[row], tape.V_star[row], tape.V[row] = q, V_star, V
+    for p in range(2):
+        work, state = works[p], states[p]
+        k = 0
+        while k < work.active.size and work.active[k] >= 0:
+            if k == tape.node.shape[2]:
+                return False
+            i = work.active[k]
+            tape.node[row, p, k] = i
+            tape.place[row, p, k, :2], tape.place[row, p, k, 2:4] = work.d[i], work.w[i]
+            tape.place[row, p, k, 4] = state.s[i]
+            tape.force[row, p, k] = work.f_linear[i]
+            k += 1
+        tape.count[row, p] = k
+        tape.u_dot[row, dof : dof + work.u_dot.size] = work.u_dot
+        tape.s_star[row, node : node + state.s.size] = state.s
+        dof += work.u_dot.size
+        node += state.s.size
+    return True
 
 
 @njit(cache=True)
@@ -71,9 +124,9 @@ def gone(pads: Any, works: Any, q: Array, c: Any) -> int:
 @njit(cache=True)
 def run(
     pads: Any, states: Any, works: Any, q: Array, V: Array, wants: Array, h: float, c: Any, tolerance: float,
-    max_iterations: int, margin: float, keep: Any, integrals: Array, ys: Array, forces: Array, extras: Array,
+    max_iterations: int, margin: float, keep: Any, integrals: Array, ys: Array, forces: Array, extras: Array, tape: Any,
 ) -> tuple[int, int, int]:  # fmt: skip
-    """Take len(wants) steps of h [s]; wants (steps, 2, 5) are the set-points at the stages.
+    """Take len(wants) steps of h [s]; wants (steps, 2, 5) are the set-points at the stages; `tape` has two rows a step.
 
     After the steps marked in `keep`, the state goes to `ys`, nodal forces to `forces`, and integrals and the
     bracket's moment [N.m] to `extras`, one row each. `states`, q, V and `integrals` are advanced in place; after a failure they hold the last good
@@ -97,6 +150,8 @@ def run(
             if not converged:
                 status = NEWTON_FAILED
                 break
+            if tape.count.shape[0] > 0 and not write_tape(tape, 2 * step + stage, pads, states, works, q, V_star, V):
+                return step, TAPE_FULL, solves
             powers[:] = 0.0
             for p in range(2):
                 moment = finish_pad(pads[p], states[p], works[p], q, V, ah, c, powers, p)
