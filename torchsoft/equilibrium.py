@@ -27,9 +27,14 @@ def rest(model: SoftGrasp) -> Tensor:
 def press(model: SoftGrasp, bracket_height: float) -> Tensor:
     """State (size,): the disc between the pads with the bracket held at `bracket_height` [m], without friction.
 
-    Raises `NoEquilibrium` when the bracket is too high to touch the disc.
+    Raises `NoEquilibrium` when the bracket is too high for its pad to touch the disc, sunk in under its weight.
     """
-    return model.layout.pack(_solve(model, bracket_height))
+    p = model.settings
+    apart = bracket_height - p.bracket.cm_height >= 2 * (p.pad.height + p.disc.radius)
+    state = None if apart else _solve(model, bracket_height)
+    if state is None or not bool(state.u_U.any()):
+        raise NoEquilibrium(f"the bracket at {bracket_height} m is too high for its pad to touch the disc; lower it")
+    return model.layout.pack(state)
 
 
 def _solve(model: SoftGrasp, bracket_height: float | None) -> State:
@@ -106,7 +111,8 @@ def _solve(model: SoftGrasp, bracket_height: float | None) -> State:
             z, r = trial, r_trial
         else:
             raise NoEquilibrium(
-                f"no static equilibrium found (residual {float(r.abs().max()):.2g} m); is the bracket low enough to touch?"
+                f"no static equilibrium found (residual {float(r.abs().max()):.2g} m after 100 iterations); are the "
+                "contact springs far stiffer than the pads?"
             )
         J = torch.func.jacfwd(residual)(z)
     z = z - torch.linalg.solve(J, residual(z)[:, None])[:, 0]

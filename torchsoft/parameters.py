@@ -147,8 +147,9 @@ class Parameters(Group):
         ends = sorted((self.scenario.x_C0, self.scenario.x_C0 + self.scenario.travel))
         if ends[0] - half_width < 0 or ends[1] + half_width > self.pad.length:
             raise ValueError(
-                f"the trajectory leaves the pad: scenario takes the disc from {ends[0]} to {ends[1]} m, its contact "
-                f"is {half_width:.3g} m wide to each side, and the pad reaches from 0 to {self.pad.length} m"
+                f"the trajectory leaves the pad: scenario.x_C0 and scenario.travel take the disc from {ends[0]} to "
+                f"{ends[1]} m, its contact is {half_width:.3g} m wide to each side, and the pad reaches from 0 to "
+                f"pad.length = {self.pad.length} m"
             )
         return self
 

@@ -1,0 +1,282 @@
+"""Parameters: every impossible value is refused by name, sources are kept, files and overrides round-trip."""
+
+import math
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from torchsoft.parameters import Parameters
+
+NAN, INF = math.nan, math.inf
+
+STIFFNESSES = ["pad.E", "contact.K_n", "contact.K_t", "control.K_81", "control.K_98"]
+POSITIVE = [
+    "pad.length", "pad.height", "pad.depth", "pad.E", "pad.rho", "pad.tau", "contact.K_n", "contact.K_t", "contact.v_s",
+    "contact.epsilon", "contact.node_spacing", "disc.radius", "disc.mass", "bracket.mass", "scenario.y_Br_grasp",
+    "scenario.grasp_time", "scenario.roll_time",
+]  # fmt: skip
+NOT_NEGATIVE = [
+    "contact.R_n", "contact.R_t", "contact.mu_s", "contact.mu_k", "contact.eta", "control.K_81", "control.R_80",
+    "control.K_98", "control.R_99", "scenario.gravity", "scenario.hold_time", "scenario.rest_time",
+]  # fmt: skip
+ANY_SIGN = ["pad.nu", "bracket.cm_height", "scenario.x_C0", "scenario.travel"]
+
+
+def refusal(values: dict[str, Any]) -> str:
+    """The message with which these values are refused."""
+    with pytest.raises(ValueError, match=r".") as error:
+        Parameters().override(values)
+    assert isinstance(error.value, ValidationError)
+    return str(error.value)
+
+
+def test_the_lists_above_cover_every_number() -> None:
+    numbers = {name for name, row in Parameters().table().items() if isinstance(row["value"], float)}
+    assert numbers == {*POSITIVE, *NOT_NEGATIVE, *ANY_SIGN}
+
+
+@pytest.mark.parametrize("value", [NAN, INF, -INF])
+@pytest.mark.parametrize("name", [*POSITIVE, *NOT_NEGATIVE, *ANY_SIGN])
+def test_numbers_that_are_not_finite_are_refused(name: str, value: float) -> None:
+    assert name in refusal({name: value})
+
+
+@pytest.mark.parametrize("name", [*POSITIVE, *NOT_NEGATIVE])
+def test_negative_numbers_are_refused(name: str) -> None:
+    assert name in refusal({name: -abs(Parameters().table()[name]["value"])})
+
+
+@pytest.mark.parametrize("name", POSITIVE)
+def test_zero_is_refused_where_it_makes_no_sense(name: str) -> None:
+    assert name in refusal({name: 0.0})
+
+
+@pytest.mark.parametrize("nu", [0.5, 0.6, 1.0, -1.0, -2.0])
+def test_an_incompressible_or_impossible_pad_is_refused(nu: float) -> None:
+    assert "pad.nu" in refusal({"pad.nu": nu})
+
+
+def test_a_pad_just_short_of_incompressible_is_accepted() -> None:
+    assert Parameters().override({"pad.nu": 0.4999}).pad.nu == 0.4999
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("pad.elements_x", 3),
+        ("pad.elements_y", 0),
+        ("pad.elements_x", 120.5),
+        ("pad.enclosed", "perhaps"),
+        ("pad.fidelity", "rigid"),
+        ("contact.friction", "stribeck"),
+    ],
+)
+def test_impossible_meshes_and_choices_are_refused(name: str, value: Any) -> None:
+    assert name in refusal({name: value})
+
+
+def test_kinetic_friction_above_static_is_refused() -> None:
+    message = refusal({"contact.mu_k": 0.9})
+    assert "contact" in message
+    assert "mu_k = 0.9 > mu_s = 0.8" in message
+    assert Parameters().override({"contact.mu_k": 0.8}).contact.mu_k == 0.8  # equal is Coulomb's law
+
+
+def test_a_slip_element_without_any_viscosity_is_refused() -> None:
+    assert "eta + R_t" in refusal({"contact.eta": 0.0, "contact.R_t": 0.0})
+    assert "R_t > 0" in refusal({"contact.friction": "coulomb", "contact.R_t": 0.0})
+
+
+@pytest.mark.parametrize(
+    ("values", "word"),
+    [
+        ({"scenario.y_Br_grasp": 50.2e-3}, "apart"),  # above the disc
+        ({"disc.radius": 18.6e-3}, "apart"),
+        ({"scenario.y_Br_grasp": 45.4e-3}, "give way"),  # through the pads
+        ({"disc.radius": 21e-3}, "give way"),
+        ({"pad.height": 1e-3, "disc.radius": 22.9e-3}, "give way"),
+    ],
+)
+def test_a_disc_that_does_not_fit_is_refused(values: dict[str, float], word: str) -> None:
+    message = refusal(values)
+    assert "the disc does not fit" in message
+    assert word in message
+    assert "scenario.y_Br_grasp" in message
+    assert "disc" in message
+    assert "radius" in message
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"scenario.travel": -60e-3},
+        {"scenario.travel": 60e-3},
+        {"scenario.x_C0": 5e-3, "scenario.travel": 20e-3},
+        {"scenario.x_C0": -5e-3},
+        {"scenario.travel": -56e-3},  # the centre stays on the pad, the contact's half-width of 5.4 mm does not
+        {"pad.length": 0.06},
+    ],
+)
+def test_a_trajectory_that_leaves_the_pad_is_refused(values: dict[str, float]) -> None:
+    message = refusal(values)
+    assert "leaves the pad" in message
+    for name in ("scenario.x_C0", "scenario.travel", "pad.length"):
+        assert name in message
+
+
+def test_a_trajectory_that_just_stays_on_the_pad_is_accepted() -> None:
+    assert Parameters().override({"scenario.travel": -54e-3}).scenario.travel == -54e-3
+
+
+def test_parameters_are_frozen() -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        Parameters().pad.E = 1.0
+
+
+# the warning --------------------------------------------------------------------------------------------------------
+
+
+def test_a_slip_law_that_is_not_single_valued_is_warned_about() -> None:
+    # (mu_s - mu_k) F_N / v_s = 0.1 * 10 N / 5 mm/s = 200 N.s/m against eta + R_t
+    with pytest.warns(UserWarning, match=r"not single-valued.*contact\.v_s"):
+        Parameters().override({"contact.eta": 10.0, "contact.R_t": 189.0})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        Parameters().override({"contact.eta": 10.0, "contact.R_t": 191.0})
+        Parameters().override({"contact.eta": 10.0, "contact.R_t": 189.0, "contact.v_s": 5.1e-3})
+        Parameters().override({"contact.eta": 10.0, "contact.R_t": 189.0, "contact.mu_k": 0.8})
+        Parameters().override({"contact.friction": "coulomb", "contact.R_t": 10.0})  # not its law
+
+
+def test_default_and_paper_like_sets_do_not_warn() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert Parameters().contact.K_t == 1.2e5
+        assert Parameters.paper_like().contact.K_t == 100.0
+
+
+# override and table -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["pad.Young", "pad", "pad.", "E", "pads.E", "pad.E.x", ""])
+def test_override_refuses_an_unknown_name(name: str) -> None:
+    with pytest.raises(ValueError, match=r"is not a parameter; known names: .*pad\.E") as error:
+        Parameters().override({name: 1.0})
+    assert f"`{name}`" in str(error.value)
+
+
+def test_override_leaves_the_original_and_the_rest_alone() -> None:
+    before = Parameters()
+    after = before.override({"pad.E": 1e6}).override({"pad.nu": 0.4})
+    assert before == Parameters()
+    assert (after.pad.E, after.pad.nu) == (1e6, 0.4)
+    assert {name for name, row in after.table().items() if row["value"] != before.table()[name]["value"]} == {
+        "pad.E",
+        "pad.nu",
+    }
+
+
+def test_table_tells_published_from_assumed() -> None:
+    table = Parameters().table()
+    published = {name for name, row in table.items() if row["source"] == "published"}
+    assert published == {
+        "pad.length", "pad.height", "disc.radius", "control.K_81", "control.R_80", "control.K_98", "control.R_99",
+        "scenario.x_C0", "scenario.y_Br_grasp", "scenario.grasp_time", "scenario.travel", "scenario.roll_time",
+        "scenario.hold_time", "scenario.rest_time",
+    }  # fmt: skip
+    assert {row["source"] for row in table.values()} == {"published", "assumed"}
+    assert table["disc.radius"] == {
+        "value": 19.37e-3, "unit": "m", "source": "published", "meaning": "radius of the disc",
+    }  # fmt: skip
+    assert all(row["unit"] and row["meaning"] for row in table.values())
+
+
+def test_a_changed_value_is_assumed_and_a_restored_one_is_published_again() -> None:
+    changed = Parameters().override({"scenario.travel": -10e-3})
+    assert changed.table()["scenario.travel"]["source"] == "assumed"
+    assert changed.table()["scenario.x_C0"]["source"] == "published"
+    assert changed.override({"scenario.travel": -20e-3}).table()["scenario.travel"]["source"] == "published"
+
+
+def test_published_numbers() -> None:
+    p = Parameters()
+    assert p.compression == pytest.approx(1.5e-3, abs=1e-15)
+    assert p.scenario.duration == 30.0
+
+
+CHANGES = st.fixed_dictionaries(
+    {},
+    optional={
+        "pad.E": st.floats(1e4, 1e9),
+        "pad.nu": st.floats(-0.9, 0.4999),
+        "pad.tau": st.floats(1e-4, 1.0),
+        "pad.elements_x": st.integers(4, 1000),
+        "pad.enclosed": st.booleans(),
+        "pad.fidelity": st.sampled_from(["massless", "inertial"]),
+        "contact.K_n": st.floats(1e-3, 1e9),
+        "contact.v_s": st.floats(0.1, 10.0),
+        "scenario.travel": st.floats(-0.05, 0.05),
+        "scenario.gravity": st.floats(0.0, 30.0),
+    },
+)
+
+
+def toml(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
+@given(changes=CHANGES)
+def test_overrides_arrive_in_the_table_and_undo(changes: dict[str, Any]) -> None:
+    changed = Parameters().override(changes)
+    table, default = changed.table(), Parameters().table()
+    for name, row in table.items():
+        assert row["value"] == changes.get(name, default[name]["value"])
+        assert row["source"] == (default[name]["source"] if row["value"] == default[name]["value"] else "assumed")
+    assert changed.override({name: default[name]["value"] for name in changes}) == Parameters()
+    assert Parameters().override({name: row["value"] for name, row in table.items()}) == changed
+
+
+@given(changes=CHANGES)
+def test_a_file_holds_the_same_parameters(changes: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> None:
+    changed = Parameters().override(changes)
+    lines = [f"{name} = {toml(row['value'])}" for name, row in changed.table().items()]
+    path = tmp_path_factory.getbasetemp() / "parameters.toml"
+    path.write_text("\n".join(lines))
+    assert Parameters.from_toml(path) == changed
+
+
+# files --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("[pad]\nYoung = 1e6", "pad.Young"),
+        ("[pads]\nE = 1e6", "pads"),
+        ("E = 1e6", "\nE\n"),
+        ("[pad]\nE = -1.0", "pad.E"),
+        ("[pad]\nE = nan", "pad.E"),
+        ('[pad]\nE = "soft"', "pad.E"),
+        ("[pad]\nnu = 0.5", "pad.nu"),
+        ("[contact]\nmu_k = 0.9", "mu_k"),
+        ("[scenario]\ntravel = 0.1", "scenario.travel"),
+        ("[pad]\nE = soft", "line 2"),
+    ],
+)
+def test_a_file_that_is_wrong_is_refused_with_its_name(text: str, named: str, tmp_path: Path) -> None:
+    path = tmp_path / "soft.toml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=r"soft\.toml") as error:
+        Parameters.from_toml(path)
+    assert named in str(error.value).removeprefix(str(path))
+
+
+def test_a_file_changes_only_what_it_names(tmp_path: Path) -> None:
+    path = tmp_path / "soft.toml"
+    path.write_text("[pad]\nE = 60e3\n[contact]\nfriction = 'coulomb'\n")
+    assert Parameters.from_toml(path) == Parameters().override({"pad.E": 60e3, "contact.friction": "coulomb"})
