@@ -96,7 +96,7 @@ def motion(trajectory: Trajectory) -> Figure:
         lower.plot(timeline(lower, error, trajectory), MM * (actual - desired).numpy(), color=ACTUAL, lw=0.8)
         lower.set_title("actual less desired")
         lower.set_xlabel("time [s]")
-    axes[0, 0].legend(loc="lower right")
+    axes[0, 0].legend()
     figure.align_ylabels()
     return figure
 
@@ -230,7 +230,7 @@ def snapshots(trajectory: Trajectory, model: SoftGrasp, times: Sequence[float] =
     first = grid.flat[0]
     handles = [first.plot([], [], "o-", color=NORMAL, ms=3)[0], first.plot([], [], color=FRICTION)[0]]
     labels = ["normal force on the nodes", "friction on the pad (outwards: to the right)"]
-    figure.legend(handles, labels, loc="outside upper right", ncols=2)
+    figure.legend(handles, labels, loc="outside lower center", ncols=min(2, columns))
     return figure
 
 
@@ -276,6 +276,8 @@ def friction_comparison(runs: Mapping[str, tuple[SoftGrasp, Trajectory]]) -> Fig
     """Friction of several parameter sets: on both pads in the grasp and in rolling, its share, and the force F_x."""
     figure = new_figure("Two friction sets compared (paper: Figs. 11b, 14 and 15)", 10, 8)
     axes = figure.subplots(3, 2)
+    for panel in axes[:2].flat[1:]:
+        panel.sharey(axes[0, 0])
     styles = list(zip((FRICTION, OTHER, INK), ("o-", "s--", "^:")))
     end = min(float(trajectory.t[-1]) for _, trajectory in runs.values())
     for column, time in enumerate((0.375, 5.0)):

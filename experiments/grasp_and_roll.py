@@ -1,0 +1,296 @@
+"""Question: does the model carry out the paper's manipulation, and where does it differ from the published numbers?
+
+A disc on a soft pad is grasped by a second pad in a bracket (0 to 0.375 s), rolled 20 mm to the left within 10 s, held
+there for 5 s, rolled back within 10 s and left at rest for 5 s. References Eq. 20-30, controllers Eq. 31-34, contact
+Eq. 8-13, bracket moment Eq. 35. The paper prints no friction numbers: with the default set friction stays locked
+in, with the "paper-like" set (K_t = 100 N/m) it fades in the grasp, as the paper reports. Both are run.
+
+Command: .venv/bin/python experiments/grasp_and_roll.py [--friction paper-like] [--fidelity inertial] [--smoke]
+Expected (default set, step 2 ms; the paper's number in brackets): grasping force 80.66 N; x_C(10 s) = 40.000 mm (40);
+y_C in the grasp 23.199 mm (23.20); y_Br between 48.565 and 48.600 mm (48.6); theta(10 s) = 1.090 rad, anticlockwise,
+-0.0035 rad at the end; peak speed 4.40 mm/s; peak F_x 0.42 N; peak bracket moment 1.55 N.m; 11 nodes of each pad in
+contact; energy residual 3e-5. About 20 s on one core with figures and animation; each simulation takes 2 s of that.
+"""
+
+import json
+import shlex
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import tyro
+from matplotlib.figure import Figure
+from torch import Tensor
+from tqdm import tqdm
+
+from torchsoft import Interrupted, NoEquilibrium, Parameters, SimulationFailed, SoftGrasp, Trajectory, simulate
+from torchsoft import diagram as drawn
+from torchsoft import figures as draw
+from torchsoft.animation import animate
+from torchsoft.scenario import grasp_and_roll
+
+
+@dataclass(frozen=True)
+class Config:
+    out: Path = Path("out/grasp_and_roll")
+    """folder for everything that is written"""
+    step: float = 2e-3
+    """largest step of the stepper [s]"""
+    duration: float | None = None
+    """simulated time [s]; the whole manipulation (30 s) if not given"""
+    friction: Literal["default", "paper-like"] = "default"
+    """friction set; with the default one, the paper-like one is run as well and compared"""
+    fidelity: Literal["massless", "inertial"] | None = None
+    """of the pads; what the parameters say (massless) if not given"""
+    config: Path | None = None
+    """TOML file of parameters, a table per group"""
+    animation: bool = True
+    """write the animation"""
+    table: bool = False
+    """only print the table of the summary that is already in `out`"""
+    smoke: bool = False
+    """0.6 s on a coarse mesh"""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One manipulation, up to what ended it early in `stopped`, if anything did."""
+
+    friction: str
+    model: SoftGrasp
+    trajectory: Trajectory
+    grasp_force: float | None
+    stopped: SimulationFailed | Interrupted | None = None
+
+
+@dataclass(frozen=True)
+class Result:
+    config: Config
+    runs: dict[str, Run]
+
+    @property
+    def stopped(self) -> SimulationFailed | Interrupted | None:
+        return next((run.stopped for run in self.runs.values() if run.stopped), None)
+
+
+def parameters(config: Config, friction: str) -> Parameters:
+    changes: dict[str, Any] = {"pad.elements_x": 60, "pad.elements_y": 2} if config.smoke else {}
+    if config.fidelity:
+        changes["pad.fidelity"] = config.fidelity
+    if friction == "paper-like":
+        changes["contact.K_t"] = Parameters.paper_like().contact.K_t
+    return (Parameters.from_toml(config.config) if config.config else Parameters()).override(changes)
+
+
+def output_times(duration: float) -> Tensor:
+    """A 10 ms grid, and the instants 0.125 s and 0.375 s of Figs. 14 and 16 [s]."""
+    if not duration > 0:
+        raise ValueError(f"`duration` must be positive, but is {duration} s")
+    grid = torch.linspace(0, duration, max(2, round(duration / 0.01) + 1), dtype=torch.float64)
+    more = [t for t in (0.125, 0.375) if t < duration and (grid - t).abs().min() > 1e-6]
+    return torch.cat((grid, torch.tensor(more, dtype=torch.float64))).sort().values
+
+
+def manipulate(config: Config, friction: str) -> Run:
+    """Find the grasping force and run the manipulation with one friction set."""
+    model = SoftGrasp(parameters(config, friction))
+    t = output_times(model.settings.scenario.duration if config.duration is None else config.duration)
+    print(f"{friction} friction: finding the grasping force", flush=True)
+    try:
+        manipulation = grasp_and_roll(model, step=config.step)
+    except SimulationFailed as failure:
+        return Run(friction, model, failure.trajectory, None, failure)
+    force = manipulation.grasp_force
+    print(f"{friction} friction: {force:.3f} N hold the bracket; rolling", flush=True)
+    try:
+        return Run(friction, model, simulate(model, t, y0=manipulation.y0, step=config.step, progress=True), force)
+    except (SimulationFailed, Interrupted) as stop:
+        return Run(friction, model, stop.trajectory, force, stop)
+
+
+def run(config: Config) -> Result:
+    """The asked-for friction set, and the paper-like one beside the default. Ends with the run that stops early."""
+    if config.smoke:
+        config = replace(config, duration=0.6)
+    runs = {}
+    for friction in dict.fromkeys((config.friction, "paper-like")):
+        runs[friction] = manipulate(config, friction)
+        if runs[friction].stopped:
+            break
+    return Result(config, runs)
+
+
+def summary(run: Run) -> dict[str, Any]:
+    """The run in numbers; None for what it did not reach. F_y_hold_N counts downwards, at 5 s."""
+    r, s = run.trajectory, run.trajectory.state
+
+    def at(time: float, signal: Tensor, unit: float = 1) -> float | None:
+        return unit * signal[r.at(time)].item() if time <= r.t[-1] + 1e-9 else None
+
+    held = s.r_Br[r.t >= 0.5, 1]
+    rolling_out = (r.t >= 1) & (r.t <= 9)
+    touching = {"lower": (r.force_L[..., 0] > 0).sum(-1), "upper": (r.force_U[..., 0] > 0).sum(-1)}
+    return {
+        "x_C_mm": {str(time): at(time, s.r_C[:, 0], 1e3) for time in (0, 10, 15, 25, 30)},
+        "y_C_grasp_mm": at(0.375, s.r_C[:, 1], 1e3),
+        "y_Br_hold_mm": {
+            "min": 1e3 * held.min().item() if len(held) else None,
+            "max": 1e3 * held.max().item() if len(held) else None,
+        },
+        "theta_10_rad": at(10, s.theta),
+        "theta_30_rad": at(30, s.theta),
+        "peak_speed_mm_s": 1e3 * s.v_C[:, 0].abs().max().item(),
+        "F_y_hold_N": at(5, -r.control[:, 1]),
+        "F_x_peak_N": r.control[:, 0].abs().max().item(),
+        "M_Br_peak_Nm": r.bracket_moment.abs().max().item(),
+        "contact_nodes": {name: at(5, count) for name, count in touching.items()},
+        "angular_momentum_sign_out": int(s.omega[rolling_out].mean().sign()) if r.t[-1] >= 9 else None,
+        "energy_residual_rel": r.energy_residual_rel,
+        "steps": r.stats.steps,
+        "newton_per_step": r.stats.newton_per_step,
+        "failed_steps": r.stats.failed_steps,
+        "wall_s": r.stats.wall_s,
+        "pad": run.model.settings.pad.fidelity,
+        "friction": run.friction,
+        "grasp_force_N": run.grasp_force,
+        "parameters": run.model.settings.table(),
+    }
+
+
+def summaries(result: Result) -> dict[str, Any]:
+    """`summary.json`: the asked-for friction set at the top, the other under "paper_like", and how both were made."""
+    first, *others = map(summary, result.runs.values())
+    config = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(result.config).items()}
+    made = {"torchsoft": version("torchsoft"), "command": command(result.config), "config": config}
+    return first | {"paper_like": others[0] if others else None} | made
+
+
+def command(config: Config) -> str:
+    """The command line that makes this configuration."""
+    words = ["python", "experiments/grasp_and_roll.py"]
+    for field in fields(config):
+        value, flag = getattr(config, field.name), field.name
+        if isinstance(value, bool) and value != field.default:
+            words.append(f"--{flag}" if value else f"--no-{flag}")
+        elif value != field.default:
+            words += [f"--{flag}", str(value)]
+    return shlex.join(words)
+
+
+ROWS = (  # what, published value, key, format
+    ("x_C(0 s) [mm]", "60", "x_C_mm.0", ".3f"),
+    ("x_C(10 s) [mm]", "40", "x_C_mm.10", ".3f"),
+    ("x_C(15 s) [mm]", "40", "x_C_mm.15", ".3f"),
+    ("x_C(25 s) [mm]", "60", "x_C_mm.25", ".3f"),
+    ("x_C(30 s) [mm]", "60", "x_C_mm.30", ".3f"),
+    ("y_C in the grasp, 0.375 s [mm]", "23.20", "y_C_grasp_mm", ".3f"),
+    ("y_Br from 0.5 s on, lowest [mm]", "48.6", "y_Br_hold_mm.min", ".3f"),
+    ("y_Br from 0.5 s on, highest [mm]", "48.6", "y_Br_hold_mm.max", ".3f"),
+    ("peak speed of the disc [mm/s]", "4.375 (desired)", "peak_speed_mm_s", ".3f"),
+    ("direction of rolling out", "anticlockwise", "angular_momentum_sign_out", "turn"),
+    ("theta(10 s) [rad]", "curve only", "theta_10_rad", ".4f"),
+    ("theta(30 s) [rad]", "curve only", "theta_30_rad", ".4f"),
+    ("downward force F_y at 5 s [N]", "curve only", "F_y_hold_N", ".2f"),
+    ("peak horizontal force F_x [N]", "curve only", "F_x_peak_N", ".3f"),
+    ("peak bracket moment [N.m]", "curve only", "M_Br_peak_Nm", ".3f"),
+    ("nodes in contact at 5 s, lower pad", "curve only", "contact_nodes.lower", "d"),
+    ("nodes in contact at 5 s, upper pad", "curve only", "contact_nodes.upper", "d"),
+    ("grasping force fed forward [N]", "not given", "grasp_force_N", ".3f"),
+    ("energy residual / injected", "-", "energy_residual_rel", ".1e"),
+    ("steps (Newton iterations each)", "-", "steps", "d"),
+    ("wall time of the stepping [s]", "-", "wall_s", ".2f"),
+)
+
+
+def table(numbers: Mapping[str, Any]) -> str:
+    """The published values beside the run's, as Markdown that is also legible as it is."""
+
+    def cell(source: Mapping[str, Any], key: str, form: str) -> str:
+        value: Any = source
+        for part in key.split("."):
+            value = value[part]
+        if value is None:
+            return "-"
+        if form == "turn":
+            return {1: "anticlockwise", -1: "clockwise", 0: "none"}[value]
+        return f"{value:{form}}" + (f" ({source['newton_per_step']:.2f})" if key == "steps" else "")
+
+    columns = [numbers] + ([numbers["paper_like"]] if numbers["paper_like"] else [])
+    head = ["", "paper", *(f"{c['friction']} friction" for c in columns)]
+    rows = [[what, paper, *(cell(c, key, form) for c in columns)] for what, paper, key, form in ROWS]
+    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
+    lines = [" | ".join(text.ljust(width) for text, width in zip(row, widths)) for row in [head, *rows]]
+    lines.insert(1, " | ".join("-" * width for width in widths))
+    return "\n".join(f"| {line} |" for line in lines)
+
+
+def figures(result: Result) -> dict[str, Figure]:
+    """Every figure by its file's name."""
+    first = next(iter(result.runs.values()))
+    model, trajectory = first.model, first.trajectory
+    out = {
+        "motion": draw.motion(trajectory),
+        "control_forces": draw.control_forces(trajectory),
+        "bracket_moment": draw.bracket_moment(trajectory),
+        "snapshots": draw.snapshots(trajectory, model),
+        "angular_momentum": draw.angular_momentum(trajectory),
+        "energy": draw.energy_ledger(trajectory),
+        "multibond": drawn.multibond_graph(model),
+    }
+    for time in (0.125, 5.0):
+        if time <= trajectory.t[-1]:
+            out[f"force_distribution_{time:g}s"] = draw.force_distribution(trajectory, model, time)
+    if len(result.runs) > 1:
+        pairs = {name: (run.model, run.trajectory) for name, run in result.runs.items()}
+        out["friction_sets"] = draw.friction_comparison(pairs)
+    return out
+
+
+def write(result: Result) -> None:
+    """Everything into `out`: data first; pictures only of runs that were not stopped."""
+    config, first = result.config, next(iter(result.runs.values()))
+    config.out.mkdir(parents=True, exist_ok=True)
+    for friction, done in result.runs.items():
+        name = "trajectory.nc" if done is first else f"trajectory_{friction.replace('-', '_')}.nc"
+        done.trajectory.save(config.out / name)
+    (config.out / "summary.json").write_text(json.dumps(summaries(result), indent=2) + "\n")
+    (config.out / "multibond.dot").write_text(drawn.dot(first.model))
+    if result.stopped:
+        return
+    for name, figure in tqdm(figures(result).items(), "figures", unit="figure"):
+        draw.save(figure, config.out / f"{name}.png")
+    if config.animation:
+        frames = 12 if config.smoke else 150
+        animate(first.trajectory, first.model, config.out / "animation.gif", frames=frames)
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    config = tyro.cli(Config, description=__doc__)
+    try:
+        if config.table:
+            print(table(json.loads((config.out / "summary.json").read_text())))
+            return
+        result = run(config)
+    except KeyboardInterrupt:  # nothing was simulated yet but trials of the grasp
+        sys.exit(130)
+    except (ValueError, OSError, NoEquilibrium) as error:
+        sys.exit(f"error: {error}")
+    try:
+        write(result)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    if isinstance(result.stopped, SimulationFailed):
+        sys.exit(f"the simulation failed: {result.stopped.reason}\nwhat was simulated until then is in {config.out}")
+    print(f"\n{table(summaries(result))}\n\nwritten to {config.out}")
+    if result.stopped:
+        print("interrupted: the files hold what was simulated until then", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,42 @@
+"""Every experiment at smoke size, and the number it stands for."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+
+
+def experiment(name: str) -> ModuleType:
+    """The experiment's file as a module; the folder is not a package."""
+    spec = importlib.util.spec_from_file_location(f"experiment_{name}", EXPERIMENTS / f"{name}.py")
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_grasp_and_roll_smoke(tmp_path: Path) -> None:
+    module = experiment("grasp_and_roll")
+    result = module.run(module.Config(out=tmp_path, smoke=True))
+    module.write(result)
+    numbers = json.loads((tmp_path / "summary.json").read_text())
+    assert numbers["y_C_grasp_mm"] == pytest.approx(23.20, abs=0.01)
+    assert numbers["y_Br_hold_mm"]["max"] == pytest.approx(48.6, abs=0.002)
+    assert numbers["grasp_force_N"] > numbers["paper_like"]["grasp_force_N"] + 5  # locked-in friction stiffens the pads
+    assert numbers["x_C_mm"]["0"] == 60.0
+    assert numbers["x_C_mm"]["10"] is None
+    assert numbers["energy_residual_rel"] < 2e-4
+    assert "--smoke" in numbers["command"]
+    names = {path.name for path in tmp_path.iterdir()}
+    assert {"trajectory.nc", "multibond.dot", "animation.gif", "snapshots.png", "friction_sets.png"} <= names
+    assert not [name for name in names if "partial" in name]
+    lines = module.table(numbers).splitlines()
+    assert lines[1].startswith("| ---")
+    assert "23.20" in next(line for line in lines if "y_C in the grasp" in line)
