@@ -13,10 +13,8 @@ import torch
 from torch import Tensor
 
 from torchsoft.adjoint_kernel import Bars, Multipliers, PadGradients, backward
-from torchsoft.contact import cross, moving_frame
 from torchsoft.implicit import ImplicitStepper, Progress, Segment
-from torchsoft.model import SoftGrasp
-from torchsoft.run_kernel import GAMMA, Tape
+from torchsoft.stage_laws import decay_rate, law_rows, rigid_loads
 
 TAPE_BYTES = 1e9
 """Tapes kept of one run [bytes]; beyond that the backward sweep makes each segment's again from where it began."""
@@ -90,7 +88,7 @@ def run_adjoint(
         out = Multipliers(np.zeros(tape.force.shape), np.zeros(tape.force.shape[:3]), np.zeros(tape.V.shape))
         pads.decay[0] = 0.0
         failed = backward(
-            stepper.pad_arrays(h), h, stepper.constants, tape, keep, rows[segment.rows], bars, _decay_rate(model, h).item(),
+            stepper.pad_arrays(h), h, stepper.constants, tape, keep, rows[segment.rows], bars, decay_rate(model, h).item(),
             out, pads,
         )  # fmt: skip
         if failed >= 0:
@@ -98,8 +96,12 @@ def run_adjoint(
             where = f"node {tape.node[2 * failed + node[0][0], node[0][1], node[0][2]]}" if len(node) else "the disc"
             raise GradientFailed(f"the gradient is not finite at t = {segment.chunk.starts[failed]:.4f} s, at {where}")
         with torch.enable_grad():
-            value = _laws(model, tape, out, GAMMA * h) + _rigid(stepper, segment, tape, out)
-            value = value + pads.decay[0] * _decay_rate(model, h)
+            value = (torch.from_numpy(out.nu) * rigid_loads(model, segment.chunk, tape)).sum()
+            for p in range(2):
+                rows_p, at = law_rows(model, tape, p, h)
+                mu, s_bar = (torch.from_numpy(x[at[0], p, at[1]]) for x in (out.mu, out.s_bar))
+                value = value + (rows_p * torch.cat((mu, s_bar[:, None]), -1)).sum()
+            value = value + pads.decay[0] * decay_rate(model, h)
             parts = torch.autograd.grad(value, parameters, allow_unused=True)
         for total, part in zip(totals, parts):
             if part is not None:
@@ -114,41 +116,3 @@ def run_adjoint(
             total += part
     y0_bar = torch.from_numpy(np.concatenate((bars.u, bars.s, bars.q, bars.V))) + y_bar[0]
     return y0_bar, totals
-
-
-def _decay_rate(model: SoftGrasp, h: float) -> Tensor:
-    """r of s' = -r s away from contact at a stage, from the law itself."""
-    zero, one = (torch.full((1,), x, dtype=torch.float64) for x in (0.0, 1.0))
-    return -model.contact(zero - 1.0, zero, zero, one, one, stage=GAMMA * h).s_dot[0]
-
-
-def _laws(model: SoftGrasp, tape: Tape, out: Multipliers, ah: float) -> Tensor:
-    """Sum over all touching nodes of all stages of mu . f + s_bar s', as a function of the parameters only."""
-    total = torch.zeros((), dtype=torch.float64)
-    theta = tape.q_star[:, 2] + ah * tape.V[:, 2]
-    for p, pad in enumerate(model.pads.values()):
-        stage, slot = np.nonzero(np.arange(tape.node.shape[2]) < tape.count[:, p, None])
-        pick = lambda x, p=p, stage=stage, slot=slot: torch.from_numpy(x[stage, p, slot])
-        place, mu, s_bar = pick(tape.place), pick(out.mu), pick(out.s_bar)
-        d, w, s = place[:, :2], place[:, 2:4], place[:, 4]
-        frame = moving_frame(model.shape, d[:, None], torch.zeros_like(d), torch.from_numpy(theta[stage]))
-        n, t = frame.n[:, 0], frame.t[:, 0]
-        v = w + torch.from_numpy(tape.V[stage, 2])[:, None] * cross(d)
-        share = model.share(pad)[pick(tape.node)]
-        contact = model.contact(frame.g[:, 0], (n * v).sum(-1), (t * v).sum(-1), s, share, stage=ah)
-        total = total + (contact.F_N * (mu * n).sum(-1) + contact.F_T * (mu * t).sum(-1) + contact.s_dot * s_bar).sum()
-    return total
-
-
-def _rigid(stepper: ImplicitStepper, segment: Segment, tape: Tape, out: Multipliers) -> Tensor:
-    """Sum over the stages of nu . (weight and control forces - M V'), as a function of the parameters only."""
-    model, ah = stepper.model, GAMMA * segment.chunk.h
-    want = model.reference(
-        torch.from_numpy((segment.chunk.starts[:, None] + segment.chunk.h * np.array([GAMMA, 1.0])).ravel())
-    )
-    V, nu = torch.from_numpy(tape.V), torch.from_numpy(out.nu)
-    q, V_dot = torch.from_numpy(tape.q_star) + ah * V, (V - torch.from_numpy(tape.V_star)) / ah
-    F_x, F_y = model.controllers(want, q[:, :2], V[:, :2], q[:, 3:], V[:, 3:])
-    inertia = torch.stack((model.m_C, model.m_C, model.inertia, model.m_Br, model.m_Br))
-    power = nu[:, 3] * F_x + nu[:, 4] * F_y - nu[:, 1] * model.m_C * model.gravity
-    return power.sum() - (nu * V_dot).sum(0) @ inertia

@@ -182,7 +182,7 @@ class Pad(nn.Module):
         self.register_buffer("positions", torch.from_numpy(positions))
         self.register_buffer("tributary", torch.from_numpy(mesh.tributary))
         self.register_buffer("surface", torch.from_numpy(np.searchsorted(kept, mesh.surface)))
-        self._unit_compliance: tuple[float, Tensor, Tensor] | None = None
+        self._solved: tuple[float, Tensor, Tensor] | None = None
 
     def compliance(self, material: Material) -> Tensor:
         """Static displacement of every node in the state per surface force [m/N], shape (2 nodes, 2 surface).
@@ -190,13 +190,21 @@ class Pad(nn.Module):
         For the massless pad this is C = (K^-1)_ss. Proportional to 1 / (E depth); its derivative with respect to
         nu is exact to first order (a second derivative in nu comes out as zero).
         """
-        nu = float(material.nu.detach())
-        if self._unit_compliance is None or self._unit_compliance[0] != nu:
-            self._unit_compliance = nu, *self._solve_unit_compliance(nu)
-        _, C, dC = self._unit_compliance
+        C, dC = self._unit_compliance(material)
         if material.nu.requires_grad:
-            C = C + dC * (material.nu - nu)
+            C = C + dC * (material.nu - material.nu.detach())
         return C / (material.E * material.depth)
+
+    def compliance_by_nu(self, material: Material) -> Tensor:
+        """Derivative of `compliance` with respect to nu [m/N], shape (2 nodes, 2 surface)."""
+        return self._unit_compliance(material)[1] / (material.E * material.depth)
+
+    def _unit_compliance(self, material: Material) -> tuple[Tensor, Tensor]:
+        """C for E depth = 1 and its derivative by nu, solved for once per value of nu."""
+        nu = material.nu.detach().item()
+        if self._solved is None or self._solved[0] != nu:
+            self._solved = nu, *self._solve_unit_compliance(nu)
+        return self._solved[1:]
 
     def _solve_unit_compliance(self, nu: float) -> tuple[Tensor, Tensor]:
         """C for E depth = 1, and its derivative dC/dnu = -K^-1 (dK/dnu) K^-1, restricted."""
