@@ -1,0 +1,236 @@
+"""Question: does the grasping force against indentation converge with the mesh and with the penalty?
+
+The disc is pressed between the pads without friction, K_pad u = sum_i F_i n_i with F_i = K_n <g_i>+ per node (Eq. 8),
+at bracket heights from first touch to the paper's y_Br = 48.6 mm. Compression is how much the two pads together give
+way. K_n refers to 1 mm of surface and scales with a node's tributary length, so a finer mesh has the same springs per
+length and the force should converge to that of a continuous layer of springs, with the square of the spacing. Stiffer
+springs should converge to a rigid contact, with 1 / K_n.
+
+Command: .venv/bin/python experiments/statics.py [--smoke]
+Expected: at the full grasp 70.16 N on the upper pad with the default 1 mm nodes and K_n, 0.5 % below the limit of fine
+meshes (70.54 N), the difference falling fourfold per mesh; y_C between 23.194 and 23.197 mm on every mesh. The default
+K_n is not stiff enough to count as a mere penalty: a rigid contact takes 79.3 N, 13 % more. Light grasps, in which only
+a few nodes touch, are far less accurate: at 0.15 mm, 0.53 N on 1 mm nodes against 0.79 N on the finest. 15 s on one
+core.
+"""
+
+import json
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from matplotlib.figure import Figure
+from torch import Tensor
+from tqdm import tqdm
+
+from torchsoft import Parameters, SoftGrasp, press
+from torchsoft.contact import normal_force
+
+MILLI, MICRO = 1e3, 1e6
+
+
+@dataclass(frozen=True)
+class Config:
+    out: Path = Path("out/statics")
+    elements_x: tuple[int, ...] = (60, 120, 240, 480)
+    """elements along the pad; a thirtieth of that through it"""
+    stiffenings: tuple[float, ...] = (0.25, 1.0, 4.0, 16.0)
+    """multiples of the default K_n, on the default mesh"""
+    points: int = 10
+    """compressions, in equal steps up to the full grasp's"""
+    smoke: bool = False
+    """a size that takes seconds"""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """One mesh and penalty, each (points,): compression [m], force on the upper pad [N], half-width of its contact [m],
+    largest penetration [m], y_C [m], and nodes of the upper pad that touch."""
+
+    compression: Tensor
+    force: Tensor
+    half_width: Tensor
+    penetration: Tensor
+    y_C: Tensor
+    touching: Tensor
+
+
+@dataclass(frozen=True)
+class Family:
+    """Curves that approach a limit, how far each is from it, and the expected order of the approach."""
+
+    curves: dict[str, Curve]
+    coarseness: list[float]
+    order: int
+
+    @property
+    def limit(self) -> float:
+        """Force at the full grasp [N], extrapolated from the last two curves at the expected order."""
+        before, last = (c.force[-1].item() for c in list(self.curves.values())[-2:])
+        return last + (last - before) / ((self.coarseness[-2] / self.coarseness[-1]) ** self.order - 1)
+
+
+@dataclass(frozen=True)
+class Result:
+    config: Config
+    meshes: dict[str, Curve]
+    penalties: dict[str, Curve]
+
+    @property
+    def families(self) -> dict[str, Family]:
+        """Both families of curves: node spacing [mm], second order; default K_n over K_n, first order."""
+        length = MILLI * Parameters().pad.length
+        return {
+            "mesh": Family(self.meshes, [length / n for n in self.config.elements_x], 2),
+            "penalty": Family(self.penalties, [1 / k for k in self.config.stiffenings], 1),
+        }
+
+
+def smoke(config: Config) -> Config:
+    """The same question in two seconds."""
+    return Config(out=config.out, elements_x=(60, 120), stiffenings=(1.0, 4.0), points=3, smoke=True)
+
+
+def half_width(x: Tensor, g: Tensor) -> Tensor:
+    """Where the penetration g (nodes,) falls through zero right of the disc's centre [m], between nodes at x [m]."""
+    last = torch.nonzero(g > 0).max()
+    inside, outside = g[last], g[last + 1]
+    return x[last] + (x[last + 1] - x[last]) * inside / (inside - outside)
+
+
+@torch.no_grad()
+def indent(elements_x: int, stiffening: float, compressions: Tensor, bar: tqdm) -> Curve:
+    """Press the disc to each of the compressions (points,) [m]."""
+    K_n = stiffening * Parameters().contact.K_n
+    p = Parameters().override({"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30, "contact.K_n": K_n})
+    model = SoftGrasp(p)
+    spring, none = model.share(model.pad_U) * model.contact.K_n, torch.zeros((), dtype=torch.float64)
+    rows = []
+    for compression in compressions.tolist():
+        y = press(model, p.scenario.y_Br_grasp + p.compression - compression)
+        state = model.layout.unpack(y)
+        frame = model.frame("U", state)
+        F_N = normal_force(frame.g, none, none, spring, none)
+        force = (F_N * frame.n[:, 1]).sum()
+        rows.append((force, half_width(frame.d[:, 0], frame.g), frame.g.max(), state.r_C[1], (frame.g > 0).sum()))
+        bar.update()
+    force, width, penetration, y_C, touching = (torch.stack(column) for column in zip(*rows))
+    return Curve(compressions, force, width, penetration, y_C, touching)
+
+
+def run(config: Config) -> Result:
+    config = smoke(config) if config.smoke else config
+    fraction = torch.arange(1, config.points + 1, dtype=torch.float64) / config.points
+    compressions = fraction * Parameters().compression
+    default = Parameters().pad.elements_x
+    cases = [(n, 1.0) for n in config.elements_x] + [(default, k) for k in config.stiffenings]
+    unique = dict.fromkeys(cases)
+    with tqdm(total=len(unique) * config.points, unit="equilibrium") as bar:
+        curves = {case: indent(*case, compressions, bar) for case in unique}
+    meshes = {f"{n} x {n // 30}": curves[n, 1.0] for n in config.elements_x}
+    return Result(config, meshes, {f"{k:g}": curves[default, k] for k in config.stiffenings})
+
+
+def successive(curves: dict[str, Curve]) -> dict[str, dict[str, float]]:
+    """Relative difference of the force from the next finer (or stiffer) curve: at the full grasp, and the largest."""
+    out = {}
+    for (name, coarse), (_, fine) in pairwise(curves.items()):
+        difference = (coarse.force / fine.force - 1).abs()
+        out[name] = {"full_grasp": difference[-1].item(), "largest": difference.max().item()}
+    return out
+
+
+def full_grasp(curves: dict[str, Curve]) -> dict[str, dict[str, float]]:
+    """The last point of every curve."""
+    return {
+        name: {
+            "force_N": c.force[-1].item(),
+            "y_C_mm": MILLI * c.y_C[-1].item(),
+            "half_width_mm": MILLI * c.half_width[-1].item(),
+            "penetration_um": MICRO * c.penetration[-1].item(),
+            "nodes_touching": c.touching[-1].item(),
+        }
+        for name, c in curves.items()
+    }
+
+
+def table(title: str, curves: dict[str, Curve]) -> str:
+    """The full grasp as a Markdown table, with the relative difference from the next row."""
+    rows, steps = full_grasp(curves), successive(curves)
+    names = list(next(iter(rows.values())))
+    lines = [f"| {title} | " + " | ".join(names) + " | to the next |", "|---" * (len(names) + 2) + "|"]
+    for key, row in rows.items():
+        step = f"{steps[key]['full_grasp']:.2%}" if key in steps else ""
+        lines.append(f"| {key} | " + " | ".join(f"{row[name]:.5g}" for name in names) + f" | {step} |")
+    return "\n".join(lines)
+
+
+def figure(result: Result) -> Figure:
+    """Force, contact half-width and penetration against compression, and the force's approach to its limits."""
+    fig = Figure(figsize=(11, 8), layout="constrained")
+    (force, approach), (width, depth) = fig.subplots(2, 2)
+    meshes = {f"{name} elements": c for name, c in result.meshes.items()}
+    penalties = {f"{name} $K_n$, 1 mm nodes": c for name, c in result.penalties.items() if name != "1"}
+    colours = iter(f"C{i}" for i in range(10))
+    for curves, line in ((meshes, "-"), (penalties, "--")):
+        for name, c in curves.items():
+            style: dict[str, Any] = {"ls": line, "color": next(colours), "marker": ".", "label": name}
+            force.plot(MILLI * c.compression, c.force, **style)
+            width.plot(MILLI * c.compression, MILLI * c.half_width, **style)
+            depth.semilogy(MILLI * c.compression, MICRO * c.penetration, **style)
+    for (name, family), marker in zip(result.families.items(), ("o-", "s--")):
+        x = torch.tensor(family.coarseness)
+        error = torch.stack([(c.force[-1] / family.limit - 1).abs() for c in family.curves.values()])
+        approach.loglog(x, error, marker, label=f"{name}, limit {family.limit:.2f} N")
+        approach.loglog(x, error[-1] * (x / x[-1]) ** family.order, "k:", lw=0.8)
+    approach.set(
+        xlabel="node spacing / 1 mm, default $K_n$ / $K_n$",
+        ylabel="force from its limit, relative",
+        title="Full grasp (dotted: second and first order)",
+    )
+    approach.legend()
+    force.set(xlabel="compression [mm]", ylabel="force on the upper pad [N]", title="Force")
+    force.legend(fontsize="small")
+    width.set(xlabel="compression [mm]", ylabel="half-width [mm]", title="Contact half-width, upper pad")
+    depth.set(xlabel="compression [mm]", ylabel="largest penetration [µm]", title="Penetration, upper pad")
+    return fig
+
+
+def summary(result: Result) -> dict[str, Any]:
+    """What `summary.json` holds."""
+    out: dict[str, Any] = {
+        name: {
+            "full_grasp": full_grasp(family.curves),
+            "relative_difference_to_the_next": successive(family.curves),
+            "force_limit_N": family.limit,
+            "curves": {key: {k: v.tolist() for k, v in asdict(c).items()} for key, c in family.curves.items()},
+        }
+        for name, family in result.families.items()
+    }
+    config = {k: str(v) for k, v in asdict(result.config).items()}
+    return out | {"made_by": {"torchsoft": version("torchsoft"), "config": config}}
+
+
+def write(result: Result) -> None:
+    """`summary.json` and `statics.png` in the configured folder."""
+    out = result.config.out
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "summary.json").write_text(json.dumps(summary(result), indent=2))
+    figure(result).savefig(out / "statics.png", dpi=150)
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    result = run(tyro.cli(Config, description=__doc__))
+    write(result)
+    for name, family in result.families.items():
+        print(f"\n{table(name, family.curves)}\n\nlimit: {family.limit:.2f} N")
+    print(f"\nwritten to {result.config.out}")
+
+
+if __name__ == "__main__":
+    main()
