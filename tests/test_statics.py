@@ -1,7 +1,6 @@
 """The statics experiment at smoke size: force, height and contact of the full grasp, and how they converge."""
 
 import json
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
