@@ -50,5 +50,3 @@ def fidelity(request: pytest.FixtureRequest) -> str:
 @pytest.fixture(params=["smooth", "coulomb"])
 def friction(request: pytest.FixtureRequest) -> str:
     return request.param
-
-

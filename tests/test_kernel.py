@@ -9,10 +9,11 @@ from torch import Tensor
 from torchsoft.contact import cross, moving_frame
 from torchsoft.implicit import ImplicitStepper
 from torchsoft.kernel_inputs import constants, pad_state
+from torchsoft.kernels.node import contact_node
+from torchsoft.kernels.pad import pad_work
+from torchsoft.kernels.run import GAMMA
+from torchsoft.kernels.stage import finish_pad, solve_stage
 from torchsoft.model import SoftGrasp
-from torchsoft.node_kernel import contact_node
-from torchsoft.run_kernel import GAMMA
-from torchsoft.stage_kernel import finish_pad, pad_work, solve_stage
 from torchsoft.state import State
 
 NODES = 400

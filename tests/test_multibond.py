@@ -63,7 +63,9 @@ def test_no_resistor_supplies_power(fidelity: str, friction: str, seed: int) -> 
             assert power > -1e-12 * scale, name
         for interface in graph.interfaces.values():
             contact = interface.contact
-            assert bool((contact.e * contact.gamma_dot >= -1e-13).all())  # [W]; e of a free Coulomb node is 0 to rounding
+            assert bool(
+                (contact.e * contact.gamma_dot >= -1e-13).all()
+            )  # [W]; e of a free Coulomb node is 0 to rounding
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -1,6 +1,6 @@
 """Exact gradients of a whole run: the discrete adjoint of the implicit stepper.
 
-The backward sweep is compiled (`adjoint_kernel`); it leaves one multiplier per law evaluation. What multiplies them, the
+The backward sweep is compiled (`kernels.adjoint`); it leaves one multiplier per law evaluation. What multiplies them, the
 derivative of the laws with respect to the parameters, is one batched vector-Jacobian product through the module's own
 functions, so that no law is differentiated by hand with respect to a parameter.
 """
@@ -12,8 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.adjoint_kernel import Bars, Multipliers, PadGradients, backward
 from torchsoft.implicit import ImplicitStepper, Progress, Segment
+from torchsoft.kernels.adjoint import Bars, Multipliers, PadGradients, backward
 from torchsoft.stage_laws import decay_rate, law_rows, rigid_loads
 
 TAPE_BYTES = 1e9
@@ -80,9 +80,8 @@ def run_adjoint(
     n_u, n_s = 2 * (model.pad_L.nodes + model.pad_U.nodes), len(model.pad_L.surface) + len(model.pad_U.surface)
     bars = Bars(np.zeros(n_u), np.zeros(n_s), np.zeros(5), np.zeros(5))
     totals = [torch.zeros_like(p) for p in parameters]
-    pads = PadGradients(
-        *(np.zeros((2 * len(p.surface), 2 * p.nodes)) for p in model.pads.values()), np.zeros(1), np.zeros(1)
-    )
+    C_L, C_U = (np.zeros((2 * len(pad.surface), 2 * pad.nodes)) for pad in model.pads.values())
+    pads = PadGradients(C_L, C_U, np.zeros(1), np.zeros(1))
     for segment in reversed(segments):
         tape, h, keep = stepper.tape(segment), segment.chunk.h, segment.chunk.keep
         out = Multipliers(np.zeros(tape.force.shape), np.zeros(tape.force.shape[:3]), np.zeros(tape.V.shape))

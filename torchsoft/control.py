@@ -59,7 +59,9 @@ class Reference(nn.Module):
         self.x, self.y, self.F_y = x, y, F_y
 
     def forward(self, t: Tensor) -> Setpoint:
-        return Setpoint(*self.x(t), *self.y(t), self.F_y(t)[0])
+        x, x_dot = self.x(t)
+        y, y_dot = self.y(t)
+        return Setpoint(x, x_dot, y, y_dot, self.F_y(t)[0])
 
 
 def hold(x: float, y: float, F_y: float = 0.0) -> Reference:

@@ -51,8 +51,7 @@ def _solve(model: SoftGrasp, bracket_height: float | None) -> State:
     reach = min(p.disc.radius, 3 * (p.disc.radius * height) ** 0.5)
     near = {
         k: torch.nonzero(
-            (model.pads[k].positions[model.pads[k].surface, 0] + (0 if k == "L" else p.scenario.x_C0) - x).abs()
-            < reach
+            (model.pads[k].positions[model.pads[k].surface, 0] + (0 if k == "L" else p.scenario.x_C0) - x).abs() < reach
         )[:, 0]
         for k in names
     }

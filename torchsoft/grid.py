@@ -16,7 +16,7 @@ class Chunk(NamedTuple):
     """Equal steps of h [s], taken in one compiled call: their starting times, and which of them end at an output."""
 
     h: float
-    starts: NDArray[np.float64]
+    starts: NDArray[np.floating]
     keep: NDArray[np.bool_]
 
 
@@ -39,17 +39,11 @@ def chunks(t: Tensor, step: float) -> Iterator[Chunk]:
     spans = np.diff(times)
     counts = np.maximum(1, np.ceil(spans / step * (1 - 1e-9))).astype(int)
     sizes = spans / counts
-    first = 0
-    while first < len(spans):
-        last, total = first, 0
-        same = lambda k: counts[k] == counts[first] and abs(sizes[k] - sizes[first]) <= 1e-9 * sizes[first]
-        while last < len(spans) and same(last) and (total == 0 or total + counts[last] <= CHUNK):
-            total += counts[last]
-            last += 1
-        n, h = counts[first], float(sizes[first])
-        starts = (times[first:last, None] + h * np.arange(n)).ravel()
-        keep = np.zeros(total, np.bool_)
+    changes = (np.diff(counts) != 0) | (np.abs(np.diff(sizes)) > 1e-9 * sizes[:-1])
+    for equal in np.split(np.arange(len(spans)), np.flatnonzero(changes) + 1):
+        n, h = int(counts[equal[0]]), float(sizes[equal[0]])
+        starts = (times[equal, None] + h * np.arange(n)).ravel()
+        keep = np.zeros(len(starts), np.bool_)
         keep[n - 1 :: n] = True
-        for k in range(0, total, CHUNK):  # one interval alone may be longer than a chunk
+        for k in range(0, len(starts), CHUNK):
             yield Chunk(h, starts[k : k + CHUNK], keep[k : k + CHUNK])
-        first = last

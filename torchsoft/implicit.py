@@ -13,9 +13,9 @@ from torch import Tensor
 
 from torchsoft.grid import Chunk, check_times, chunks
 from torchsoft.kernel_inputs import constants, pad_arrays, pad_state
-from torchsoft.model import SoftGrasp
-from torchsoft.node_kernel import Array
-from torchsoft.run_kernel import (
+from torchsoft.kernels.node import Array
+from torchsoft.kernels.pad import PadArrays, PadState, pad_work
+from torchsoft.kernels.run import (
     CONVERGED,
     GAMMA,
     INTEGRALS,
@@ -27,7 +27,7 @@ from torchsoft.run_kernel import (
     empty_tape,
     run,
 )
-from torchsoft.stage_kernel import PadArrays, PadState, pad_work
+from torchsoft.model import SoftGrasp
 from torchsoft.state import State
 
 log = logging.getLogger("torchsoft")
@@ -122,7 +122,7 @@ class ImplicitStepper:
     ) -> Iterator[Progress]:
         """Step from y0 (size,) through t (T,), yielding the same growing `Progress` after every compiled call.
 
-        `extras` holds the running integrals (`run_kernel.INTEGRALS`) and the bracket's moment. The last yield is the
+        `extras` holds the running integrals (`kernels.run.INTEGRALS`) and the bracket's moment. The last yield is the
         complete run. With `segments` given, what the adjoint needs is appended to it, tapes for as long as they take
         less than `tape_bytes`. Raises `SimulationFailed`.
         """
@@ -234,6 +234,6 @@ def announce_compilation() -> None:
     """Say, once and only if nothing is cached, what the first run is waiting for."""
     global _announced
     cache = Path(run.stats.cache_path or "")
-    if not _announced and not run.signatures and not list(cache.glob("run_kernel.run-*.nbi")):
+    if not _announced and not run.signatures and not list(cache.glob("run.run-*.nbi")):
         log.warning("compiling the implicit stepper (about half a minute, once; the result is cached in %s)", cache)
     _announced = True

@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from scipy import linalg
 
+from torchsoft.kernels.node import Constants
+from torchsoft.kernels.pad import PadArrays, PadState
 from torchsoft.model import SoftGrasp
-from torchsoft.node_kernel import Constants
 from torchsoft.pad import banded
-from torchsoft.stage_kernel import PadArrays, PadState
 from torchsoft.state import State
 
 
@@ -46,7 +46,7 @@ def pad_arrays(model: SoftGrasp, which: str, ah: float) -> PadArrays:
         P = np.ascontiguousarray((pad.compliance(material) / stiff).numpy().T)
         D, B, M, factor = np.zeros((size, 2)), np.zeros((2, 2)), np.zeros(0), np.zeros((0, 0))
     else:
-        M = np.repeat(pad.masses(material).numpy(), 2)  # pyright: ignore[reportCallIssue]
+        M = np.repeat(pad.masses(material).numpy(), 2)
         K_lambda, K_mu, _ = pad.mesh.matrices
         lame_lambda, lame_mu = (x.item() for x in material.lame())
         mirror = np.tile(pad.mirror.numpy(), pad.nodes)
@@ -70,5 +70,5 @@ def pad_arrays(model: SoftGrasp, which: str, ah: float) -> PadArrays:
 def pad_state(model: SoftGrasp, which: str, state: State) -> PadState:
     """One pad's part of a single state, copied."""
     pad, u, v, s = model.pads[which], *(getattr(state, f"{part}_{which}") for part in "uvs")
-    force = pad.elastic_force(model.material, u)  # pyright: ignore[reportCallIssue]
+    force = pad.elastic_force(model.material, u)
     return PadState(*(x.flatten().clone().numpy() for x in (u, v, force, s)))

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torchsoft.contact import Contact, ContactState, Frame, contact_transformer, moving_frame
 from torchsoft.control import Controllers, Reference, hold
 from torchsoft.multibond import Block, Junction, Port, Transformer, identity, net_efforts
-from torchsoft.pad import MasslessPad, Material, Pad, build_pads
+from torchsoft.pad import Material, Pad, build_pads
 from torchsoft.parameters import Parameters
 from torchsoft.shapes import Circle
 from torchsoft.state import Layout, State
@@ -112,7 +112,7 @@ class SoftGrasp(nn.Module):
         )
 
     def nodal_masses(self, which: str) -> Tensor:
-        return self.pads[which].masses(self.material)[:, None]  # pyright: ignore[reportAttributeAccessIssue, reportCallIssue]
+        return self.pads[which].masses(self.material)[:, None]
 
     def evaluate(self, t: Tensor | float, state: State) -> Evaluation:
         """The multibond graph at time t [s] and one state: every port with its transformer and effort."""
@@ -183,7 +183,7 @@ class SoftGrasp(nn.Module):
             effort = net_efforts({"contact": contact}, self.junctions)[name]
         else:
             u, u_dot = state.u_L if which == "L" else state.u_U, transformer.flow(flows)
-            effort = pad.elastic_force(self.material, u + self.material.tau * u_dot)  # pyright: ignore[reportCallIssue]
+            effort = pad.elastic_force(self.material, u + self.material.tau * u_dot)
         return Port(transformer, effort, (f"C: [K_{which}]^-1", f"R: [R_{which}]"))
 
     def _control_ports(self, t: Tensor | float, state: State) -> dict[str, Port]:
@@ -208,8 +208,10 @@ class SoftGrasp(nn.Module):
         if len(touching) == 0:
             return -u / tau
         dofs = (2 * touching[:, None] + torch.arange(2)).flatten()
-        C_columns, part = C[:, dofs], Frame(*(x[..., touching, :] for x in frame[:3]), frame.g[..., touching])
-        C_aa, u_a = C_columns[dofs], u[..., touching, :]
+        d, n, t = (x[..., touching, :] for x in (frame.d, frame.n, frame.t))
+        part = Frame(d, n, t, frame.g[..., touching])
+        C_columns, u_a = C[:, dofs], u[..., touching, :]
+        C_aa = C_columns[dofs]
         R = torch.stack((part.n, part.t), -2)
         base = state.v_C - state.v_Br if which == "U" else state.v_C
         lever = torch.stack((-part.d[..., 1], part.d[..., 0]), -1) * state.omega[..., None, None]
@@ -225,8 +227,10 @@ class SoftGrasp(nn.Module):
 
         def linearise(u_dot: Tensor) -> tuple[Tensor, Tensor]:
             """Residual and its Jacobian, whose only non-linear part is the 2 x 2 block G of each node."""
-            axes = torch.eye(2, dtype=u.dtype).reshape(2, *([1] * (u_dot.ndim - 1)), 2).repeat(1, *u_dot.shape[:-1], 1)
-            f, df = torch.func.jvp(force, (u_dot.repeat(2, *([1] * u_dot.ndim)),), (axes,))
+            axes = torch.stack([torch.zeros_like(u_dot) + axis for axis in torch.eye(2, dtype=u.dtype)])
+            f, df = torch.func.jvp(  # pyright: ignore[reportAssignmentType]
+                force, (torch.stack((u_dot, u_dot)),), (axes,)
+            )
             CG = torch.einsum("ikc,d...kc->...ikd", C_aa.unflatten(-1, (-1, 2)), df).flatten(-2)
             return residual(u_dot, f[0]), tau * torch.eye(len(dofs), dtype=u.dtype) - CG
 

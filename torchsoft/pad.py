@@ -149,10 +149,10 @@ class PadMesh:
 def banded(matrix: sparse.csr_array) -> Array:
     """Lower banded storage of a symmetric sparse matrix: `out[i - j, j]` is entry (i, j)."""
     entries = matrix.tocoo()
-    row, col = entries.coords
+    row, col = entries.row, entries.col
     lower = row >= col
     out = np.zeros(((row - col).max() + 1, matrix.shape[0]))
-    out[(row - col)[lower], col[lower]] = entries.data[lower]
+    out[(row - col)[lower], col[lower]] = entries.data[lower]  # pyright: ignore[reportOptionalSubscript]
     return out
 
 
@@ -183,6 +183,14 @@ class Pad(nn.Module):
         self.register_buffer("tributary", torch.from_numpy(mesh.tributary))
         self.register_buffer("surface", torch.from_numpy(np.searchsorted(kept, mesh.surface)))
         self._solved: tuple[float, Tensor, Tensor] | None = None
+
+    def elastic_force(self, material: Material, u: Tensor) -> Tensor:
+        """K u: displacements u (..., nodes, 2) [m] to forces of the same shape [N]."""
+        raise NotImplementedError
+
+    def masses(self, material: Material) -> Tensor:
+        """Lumped mass of each node in the state [kg], shape (nodes,)."""
+        raise NotImplementedError
 
     def compliance(self, material: Material) -> Tensor:
         """Static displacement of every node in the state per surface force [m/N], shape (2 nodes, 2 surface).
@@ -230,9 +238,12 @@ class MasslessPad(Pad):
     massless = True
 
     def elastic_force(self, material: Material, u: Tensor) -> Tensor:
-        """K u with the condensed K = C^-1: u (..., surface, 2) [m], force of the same shape [N]."""
+        """K u with the condensed K = C^-1."""
         rows = u.reshape(-1, 2 * self.nodes)
         return torch.linalg.solve(self.compliance(material), rows.mT).mT.reshape(u.shape)
+
+    def masses(self, material: Material) -> Tensor:
+        return torch.zeros(self.nodes, dtype=torch.float64)
 
 
 class InertialPad(Pad):
@@ -241,6 +252,8 @@ class InertialPad(Pad):
     massless = False
     connectivity: Tensor
     areas: Tensor
+    K_lambda: Tensor
+    K_mu: Tensor
 
     def __init__(self, mesh: PadMesh, origin: tuple[float, float], mirrored: bool) -> None:
         super().__init__(mesh, origin, mirrored)
@@ -254,11 +267,11 @@ class InertialPad(Pad):
         self.register_buffer("K_mu", torch.from_numpy(K_mu))
 
     def masses(self, material: Material) -> Tensor:
-        """Lumped mass of each free node [kg], shape (nodes,); the bonded nodes' masses are left out, as in the paper."""
+        """The bonded nodes' masses are left out, as in the paper."""
         return material.rho * material.depth * self.areas
 
     def elastic_force(self, material: Material, u: Tensor) -> Tensor:
-        """K u, element by element: u (..., nodes, 2) [m], force of the same shape [N]."""
+        """K u, element by element."""
         lame_lambda, lame_mu = material.lame()
         K_e = material.depth * (lame_lambda * self.K_lambda + lame_mu * self.K_mu)
         padded = nn.functional.pad(u * self.mirror, (0, 0, 0, 1))

@@ -92,9 +92,7 @@ class ControlParameters(Group):
 class ScenarioParameters(Group):
     """Grasp, roll out, hold, roll back, rest."""
 
-    gravity: float = quantity(
-        9.81, "m/s2", "assumed", "gravitational acceleration, acting on the disc (Eq. 17)", ge=0
-    )
+    gravity: float = quantity(9.81, "m/s2", "assumed", "gravitational acceleration, acting on the disc (Eq. 17)", ge=0)
     x_C0: float = quantity(60e-3, "m", "published", "x_C(0), Eq. 22")
     y_Br_grasp: float = quantity(48.6e-3, "m", "published", "y_Br(t_g), Eq. 30", gt=0)
     grasp_time: float = quantity(0.375, "s", "published", "t_g", gt=0)

@@ -1,6 +1,6 @@
 """Forward sensitivities: the derivative of a whole run with respect to a handful of parameters, in one pass.
 
-The Jacobian that Gauss-Newton and Fisher information need. The tangent sweep is compiled (`sensitivity_kernel`) and uses
+The Jacobian that Gauss-Newton and Fisher information need. The tangent sweep is compiled (`kernels.sensitivity`) and uses
 one factorisation for all parameters; what the laws contribute comes from the module's own functions by forward-mode
 differentiation.
 """
@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from torchsoft.implicit import ImplicitStepper, Progress, Segment
+from torchsoft.kernels.sensitivity import Explicit, Tangent, forward
 from torchsoft.model import SoftGrasp
-from torchsoft.sensitivity_kernel import Explicit, Tangent, forward
 from torchsoft.stage_laws import decay_rate, law_rows, rigid_loads
 
 

@@ -12,9 +12,9 @@ from torchsoft.adjoint import iterate
 from torchsoft.equilibrium import NoEquilibrium, rest
 from torchsoft.grid import check_times
 from torchsoft.implicit import METHOD, ImplicitStepper, Progress, SimulationFailed
+from torchsoft.kernels.run import DISSIPATED, INTEGRALS, SUPPLIED
 from torchsoft.ledger import stored
 from torchsoft.model import SoftGrasp
-from torchsoft.run_kernel import DISSIPATED, INTEGRALS, SUPPLIED
 from torchsoft.stability import describe_instability
 from torchsoft.trajectory import Stats, Trajectory
 

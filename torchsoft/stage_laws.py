@@ -9,8 +9,8 @@ from torch import Tensor
 
 from torchsoft.contact import cross, moving_frame
 from torchsoft.grid import Chunk
+from torchsoft.kernels.run import GAMMA, Tape
 from torchsoft.model import SoftGrasp
-from torchsoft.run_kernel import GAMMA, Tape
 
 
 def law_rows(model: SoftGrasp, tape: Tape, pad_number: int, h: float) -> tuple[Tensor, tuple[np.ndarray, np.ndarray]]:

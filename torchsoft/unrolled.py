@@ -10,8 +10,8 @@ from torch import Tensor
 
 from torchsoft.contact import cross, moving_frame
 from torchsoft.grid import check_times, chunks
+from torchsoft.kernels.run import GAMMA
 from torchsoft.model import SoftGrasp
-from torchsoft.run_kernel import GAMMA
 from torchsoft.state import State
 
 WINDOW = 3e-4

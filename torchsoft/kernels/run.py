@@ -10,8 +10,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from torchsoft.node_kernel import Array
-from torchsoft.stage_kernel import finish_pad, solve_stage
+from torchsoft.kernels.node import Array
+from torchsoft.kernels.stage import finish_pad, solve_stage
 
 GAMMA = 1.0 - 1.0 / np.sqrt(2.0)
 
@@ -53,7 +53,7 @@ def empty_tape(stages: int, dofs: int, surface: int, cap: int) -> Tape:
 @njit(cache=True)
 def write_tape(tape: Any, row: int, pads: Any, states: Any, works: Any, q: Array, V_star: Array, V: Array) -> bool:
     """Put one solved stage on the tape; False if more nodes touch than it has room for."""
-    place, dof, node = np.empty(4), 0, 0
+    dof, node = 0, 0
     tape.q_star[row], tape.V_star[row], tape.V[row] = q, V_star, V
     for p in range(2):
         work, state = works[p], states[p]
@@ -128,9 +128,9 @@ def run(
 ) -> tuple[int, int, int]:  # fmt: skip
     """Take len(wants) steps of h [s]; wants (steps, 2, 5) are the set-points at the stages; `tape` has two rows a step.
 
-    After the steps marked in `keep`, the state goes to `ys`, nodal forces to `forces`, and integrals and the
-    bracket's moment [N.m] to `extras`, one row each. `states`, q, V and `integrals` are advanced in place; after a failure they hold the last good
-    step. Returns steps taken, status, and linear solves.
+    After the steps marked in `keep`, the state goes to `ys`, nodal forces to `forces`, and integrals and the bracket's
+    moment [N.m] to `extras`, one row each. `states`, q, V and `integrals` are advanced in place; after a failure they hold
+    the last good step. Returns steps taken, status, and linear solves.
     """
     ah = GAMMA * h
     V_star, powers = np.empty(5), np.empty(len(INTEGRALS))

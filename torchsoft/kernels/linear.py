@@ -2,7 +2,7 @@
 
 from numba import njit
 
-from torchsoft.node_kernel import Array
+from torchsoft.kernels.node import Array
 
 
 @njit(cache=True)

@@ -1,6 +1,6 @@
-"""The tangent stage: forward sensitivities of `run_kernel.run` for several parameters at once, massless pads.
+"""The tangent stage: forward sensitivities of `kernels.run.run` for several parameters at once, massless pads.
 
-The relations that `adjoint_kernel` transposes are differentiated here along parameter directions: one factorisation of
+The relations that `kernels.adjoint` transposes are differentiated here along parameter directions: one factorisation of
 Newton's system a stage, as many right-hand sides as there are directions. A `d` before a name is its derivative; the last
 axis counts directions.
 """
@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from torchsoft.linear_kernel import solve_dense
-from torchsoft.node_kernel import Array, contact_node
-from torchsoft.run_kernel import GAMMA
+from torchsoft.kernels.linear import solve_dense
+from torchsoft.kernels.node import Array, contact_node
+from torchsoft.kernels.run import GAMMA
 
 
 class Tangent(NamedTuple):

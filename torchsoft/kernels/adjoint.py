@@ -1,4 +1,4 @@
-"""The transposed stage: the discrete adjoint of `run_kernel.run`, massless pads.
+"""The transposed stage: the discrete adjoint of `kernels.run.run`, massless pads.
 
 A stage's relations, with u' = (C f - u*) / (tau + a h) for the pads, f = law(w, omega, d, theta, s*) at each touching
 node, s = s* + a h s', and the rigid balance M (V - V*) / (a h) = F(q, V, f), are differentiated as they stand (implicit
@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import njit
 
-from torchsoft.linear_kernel import solve_dense
-from torchsoft.node_kernel import Array, contact_node
-from torchsoft.run_kernel import GAMMA
+from torchsoft.kernels.linear import solve_dense
+from torchsoft.kernels.node import Array, contact_node
+from torchsoft.kernels.run import GAMMA
 
 
 class Bars(NamedTuple):
