@@ -151,8 +151,8 @@ def banded(matrix: sparse.csr_array) -> Array:
     entries = matrix.tocoo()
     row, col = entries.row, entries.col
     lower = row >= col
-    out = np.zeros(((row - col).max() + 1, matrix.shape[0]))
-    out[(row - col)[lower], col[lower]] = entries.data[lower]  # pyright: ignore[reportOptionalSubscript]
+    out = np.zeros(((row - col).max() + 1, matrix.shape[0]))  # pyright: ignore[reportOptionalSubscript]
+    out[(row - col)[lower], col[lower]] = entries.data[lower]
     return out
 
 
