@@ -1,42 +1,109 @@
-"""The stepper under torchdiffeq's own verbs: `odeint` and `odeint_adjoint`."""
+"""The stepper under torchdiffeq's own verbs: `odeint` and `odeint_adjoint`.
+
+`odeint(model, y0, t, method="sdirk2")` has the discrete adjoint behind it already. `odeint_adjoint` works as well: it calls
+the same method once more, backwards and interval by interval, on its augmented dynamics, which the solver recognises and
+answers with the discrete adjoint of the interval. That is exact too, but pays its overhead at every output time.
+"""
 
 import importlib
-from typing import Any
+import inspect
+from collections import deque
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
 
-from torchsoft.adjoint import differentiable_solution
-from torchsoft.implicit import METHOD, ImplicitStepper
+from torchsoft.adjoint import differentiable_solution, run_adjoint
+from torchsoft.implicit import METHOD, ImplicitStepper, Segment
 from torchsoft.model import SoftGrasp
+
+REMEMBERED = 4
+"""Runs of a model whose states are remembered for `odeint_adjoint`, which hands its solver only the later end of an interval."""
+
+
+class _Run(NamedTuple):
+    t: Tensor
+    y: Tensor
+
+
+_runs: WeakKeyDictionary[SoftGrasp, deque[_Run]] = WeakKeyDictionary()
 
 
 class TorchdiffeqSolver:
-    """`torchdiffeq.odeint(model, y0, t, method="sdirk2", options={"step_size": 2e-3})`.
+    """`torchdiffeq.odeint(model, y0, t, method="sdirk2", options={"step_size": 2e-3})`, and the same for `odeint_adjoint`.
 
     Takes batches: y0 (..., size); each sample is stepped by itself, so none depends on its neighbours. rtol and atol are
-    not used: the step is fixed and Newton's tolerance is the stepper's.
+    not used: the step is fixed and Newton's tolerance (option `tolerance` [N]) is the stepper's. Raises `TypeError` for
+    dynamics that are not a `SoftGrasp`'s.
     """
 
     def __init__(self, func: Any, y0: Tensor, rtol: float, atol: float, norm: Any = None, **options: Any) -> None:
-        model = func
-        while not isinstance(model, SoftGrasp):
-            model = getattr(model, "base_func", None)
-            if model is None:
-                raise TypeError(f"method='{METHOD}' integrates a torchsoft.SoftGrasp, but got {type(func).__name__}")
+        found = func
+        while hasattr(found, "base_func"):
+            found = found.base_func
+        augmented = {} if isinstance(found, SoftGrasp) or not inspect.isfunction(found) else _closure(found)
+        model = _innermost(augmented.get("func", found))
+        if not isinstance(model, SoftGrasp):
+            raise TypeError(f"method='{METHOD}' integrates a torchsoft.SoftGrasp, but got {type(model).__name__}")
         if "step_size" in options:
             options["step"] = options.pop("step_size")
         self.model, self.y0 = model, y0
+        self.adjoint_params: tuple[Tensor, ...] | None = augmented.get("adjoint_params")
         self.stepper = ImplicitStepper(model, **options)
 
     def integrate(self, t: Tensor) -> Tensor:
+        if self.adjoint_params is not None:
+            return self._augmented(t, self.adjoint_params)
         samples = self.y0.reshape(-1, self.y0.shape[-1])
         runs = [differentiable_solution(self.stepper, sample, t)[0] for sample in samples]
-        return torch.stack(runs, 1).reshape(len(t), *self.y0.shape)
+        solution = torch.stack(runs, 1)
+        _runs.setdefault(self.model, deque(maxlen=REMEMBERED)).append(_Run(t.detach().clone(), solution.detach()))
+        return solution.reshape(len(t), *self.y0.shape)
+
+    def _augmented(self, t: Tensor, parameters: tuple[Tensor, ...]) -> Tensor:
+        """(0, y, y_bar, *parameter_bars) carried from the end of one output interval to its start; t is negated."""
+        tail = sum(p.numel() for p in parameters)
+        size, end, start = self.model.layout.size, -t[0], -t[1]
+        count = (len(self.y0) - 1 - tail) // 2
+        y, y_bar, bars = self.y0[1:].split([count, count, tail])
+        y_start = self._state_before(start, end, y.reshape(-1, size))
+        y_bars, interval = y_bar.reshape(-1, size).clone(), torch.stack((start, end))
+        for sample in range(len(y_bars)):
+            segments: list[Segment] = []
+            for _ in self.stepper.integrate(y_start[sample], interval, segments, float("inf")):
+                pass
+            outputs = torch.stack((torch.zeros_like(y_bars[sample]), y_bars[sample]))
+            y_bars[sample], parts = run_adjoint(self.stepper, segments, outputs, parameters)
+            if parts:
+                bars = bars + torch.cat([part.flatten() for part in parts])
+        carried = torch.cat((self.y0[:1], y_start.flatten(), y_bars.flatten(), bars))
+        return torch.stack((self.y0, carried))
+
+    def _state_before(self, start: Tensor, end: Tensor, y: Tensor) -> Tensor:
+        """The remembered states (samples, size) at `start` of the run that has y (samples, size) at `end`."""
+        for run in reversed(_runs.get(self.model, deque())):
+            i = int(torch.searchsorted(run.t, end))
+            if i > 0 and run.t[i] == end and run.t[i - 1] == start and torch.equal(run.y[i], y):
+                return run.y[i - 1]
+        raise RuntimeError(
+            f"the run to differentiate is not among the last {REMEMBERED} of this model; call backward before running it "
+            "again, or use odeint, which keeps what it needs"
+        )
 
     @classmethod
     def valid_callbacks(cls) -> set[str]:
         return set()
+
+
+def _closure(function: Any) -> dict[str, Any]:
+    return dict(inspect.getclosurevars(function).nonlocals)
+
+
+def _innermost(func: Any) -> Any:
+    while hasattr(func, "base_func"):
+        func = func.base_func
+    return func
 
 
 def register() -> None:
