@@ -55,21 +55,23 @@ def test_odeint_adjoint_of_a_forgotten_run_says_so() -> None:
 
 
 def test_continuous_adjoint_agrees_on_a_short_window() -> None:
-    """2 ms of a rolling grasp by dopri5 and its continuous adjoint, against fine steps and the discrete adjoint."""
+    """1 ms of a sticking grasp by rk4 and its continuous adjoint, against fine steps and the discrete adjoint."""
     model, y0 = rolling()
-    t = torch.linspace(0.3, 0.302, 5, dtype=torch.float64)
-    weight = {"contact.K_t": 1.0, "material.E": 1.0, "m_C": 1.0}
+    start = y0[1]
+    start[model.layout.slices["v_C"]] -= torch.tensor([0.0195, 0.0], dtype=torch.float64)  # slow enough to stick
+    t = torch.linspace(0.5, 0.501, 3, dtype=torch.float64)
+    names = ("contact.K_t", "contact.R_t", "contact.K_n", "material.E", "m_C")
     results = []
     for solve in (
-        lambda y: continuous_adjoint_solution(model, y, t),
+        lambda y: continuous_adjoint_solution(model, y, t, method="rk4", options={"step_size": 2.5e-5}),
         lambda y: odeint(model, y, t, method=METHOD, options={"step_size": 2e-6}),
     ):
         model.zero_grad(set_to_none=True)
-        model.layout.unpack(solve(y0[0].clone().requires_grad_(True))).theta.sum().backward()
-        results.append({name: dict(model.named_parameters())[name].grad for name in weight})
-    for name in weight:
-        continuous, discrete = (float(result[name]) for result in results)
-        assert continuous == pytest.approx(discrete, rel=2e-3), name
+        model.layout.unpack(solve(start.clone().requires_grad_(True))).omega.sum().backward()
+        results.append({name: dict(model.named_parameters())[name].grad.item() for name in names})
+    for name in names:
+        continuous, discrete = (result[name] for result in results)
+        assert abs(continuous - discrete) < 1e-4 * abs(discrete), name
 
 
 def test_coarse_outputs_are_refused() -> None:

@@ -36,7 +36,14 @@ def stiffest_rate(model: SoftGrasp, y: Tensor, time: float = 0.0, *, iterations:
 
 
 def continuous_adjoint_solution(
-    model: SoftGrasp, y0: Tensor, t: Tensor, *, method: str = "dopri5", rtol: float = 1e-8, atol: float = 1e-11
+    model: SoftGrasp,
+    y0: Tensor,
+    t: Tensor,
+    *,
+    method: str = "dopri5",
+    rtol: float = 1e-8,
+    atol: float = 1e-11,
+    options: dict[str, float] | None = None,
 ) -> Tensor:
     """States (T, size) at t (T,) by an explicit method of torchdiffeq, with the continuous adjoint behind them.
 
@@ -49,4 +56,4 @@ def continuous_adjoint_solution(
             f"{LONGEST:g}, where the continuous adjoint loses the gradient. Ask for outputs at most {LONGEST / rate:.2g} s "
             "apart, or use method='sdirk2'"
         )
-    return odeint_adjoint(model, y0, t, method=method, rtol=rtol, atol=atol)  # pyright: ignore[reportReturnType]
+    return odeint_adjoint(model, y0, t, method=method, rtol=rtol, atol=atol, options=options)  # pyright: ignore[reportReturnType]
