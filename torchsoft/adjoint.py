@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchsoft.implicit import ImplicitStepper, Progress, Segment
 from torchsoft.kernels.adjoint import Bars, Multipliers, PadGradients, backward
-from torchsoft.stage_laws import decay_rate, law_rows, rigid_loads
+from torchsoft.stage_laws import decay_rate, law_rows, rigid_loads, touching
 
 TAPE_BYTES = 1e9
 """Tapes kept of one run [bytes]; beyond that the backward sweep makes each segment's again from where it began."""
@@ -97,9 +97,9 @@ def run_adjoint(
         with torch.enable_grad():
             value = (torch.from_numpy(out.nu) * rigid_loads(model, segment.chunk, tape)).sum()
             for p in range(2):
-                rows_p, at = law_rows(model, tape, p, h)
+                at = touching(tape, p)
                 mu, s_bar = (torch.from_numpy(x[at[0], p, at[1]]) for x in (out.mu, out.s_bar))
-                value = value + (rows_p * torch.cat((mu, s_bar[:, None]), -1)).sum()
+                value = value + (law_rows(model, tape, p, h) * torch.cat((mu, s_bar[:, None]), -1)).sum()
             value = value + pads.decay[0] * decay_rate(model, h)
             parts = torch.autograd.grad(value, parameters, allow_unused=True)
         for total, part in zip(totals, parts):

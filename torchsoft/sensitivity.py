@@ -13,9 +13,14 @@ import torch
 from torch import Tensor, nn
 
 from torchsoft.implicit import ImplicitStepper, Progress, Segment
+from torchsoft.kernels.node import Array
 from torchsoft.kernels.sensitivity import Explicit, Tangent, forward
 from torchsoft.model import SoftGrasp
-from torchsoft.stage_laws import decay_rate, law_rows, rigid_loads
+from torchsoft.stage_laws import decay_rate, law_rows, rigid_loads, touching
+
+IN_LAWS = ("contact.", "shape.")
+IN_LOADS = ("m_", "gravity", "shape.", "controllers.", "reference.")
+"""Parameters that the node law and the rigid loads contain, by the beginnings of their names."""
 
 
 class Sensitivities(NamedTuple):
@@ -38,28 +43,21 @@ class _Scope(nn.Module):
         return self.function()
 
 
-def _derivatives(model: SoftGrasp, names: Sequence[str], function: Callable[[], Tensor]) -> Tensor:
-    """d function / d parameters at the model's own values, parameters last."""
+def _derivatives(
+    model: SoftGrasp, names: Sequence[str], only: tuple[str, ...], function: Callable[[], Tensor]
+) -> Array:
+    """d function / d parameters at the model's own values, parameters last; zero for names that do not start like `only`."""
     scope, value = _Scope(model, function), dict(model.named_parameters())
+    some = [name for name in names if name.startswith(only)]
 
     def at(theta: Tensor) -> Tensor:
-        return torch.func.functional_call(scope, {f"model.{name}": x for name, x in zip(names, theta)}, ())
+        return torch.func.functional_call(scope, {f"model.{name}": x for name, x in zip(some, theta)}, ())
 
-    return torch.func.jacfwd(at)(torch.stack([value[name].detach() for name in names]))
-
-
-def _compliance_derivatives(model: SoftGrasp, names: Sequence[str], which: str) -> np.ndarray:
-    """dC/d parameters of one pad, (surface dofs, dofs, n): C is proportional to 1 / (E depth), and linear about nu."""
-    pad, material = model.pads[which], model.material
-    parameters = dict(model.named_parameters())
-    with torch.enable_grad():
-        C = pad.compliance(material)
-        out = np.zeros((*C.mT.shape, len(names)))
-        for k, name in enumerate(names):
-            if name in ("material.E", "material.depth"):
-                out[..., k] = (-C / parameters[name]).mT.detach().numpy()
-            elif name == "material.nu":
-                out[..., k] = pad.compliance_by_nu(material).mT.detach().numpy()
+    if not some:
+        return np.zeros((*function().shape, len(names)))
+    part = torch.func.jacfwd(at)(torch.stack([value[name].detach() for name in some])).numpy()
+    out = np.zeros((*part.shape[:-1], len(names)))
+    out[..., [names.index(name) for name in some]] = part
     return out
 
 
@@ -86,7 +84,7 @@ def sensitivities(
         raise ValueError(f"`names` must be scalar parameters, but holds {unknown}; known: {', '.join(known)}")
     if not model.massless:
         raise NotImplementedError("sensitivities are for massless pads; set pad.fidelity = 'massless'")
-    n, size = len(names), model.layout.size
+    names, n, size = list(names), len(names), model.layout.size
     start = torch.zeros(size, n, dtype=torch.float64) if dy0 is None else dy0
     if start.shape != (size, n):
         raise ValueError(f"`dy0` must have shape ({size}, {n}), but has {tuple(start.shape)}")
@@ -97,7 +95,12 @@ def sensitivities(
     n_s = len(model.pad_L.surface) + len(model.pad_U.surface)
     cuts = np.cumsum([n_u, n_s, 5])
     x = Tangent(*(part.copy() for part in np.split(dys[0], cuts)))
-    C_L, C_U = (_compliance_derivatives(model, names, k) for k in "LU")
+    by_nu = [pad.compliance_by_nu(model.material).mT.numpy() for pad in model.pads.values()]
+    C_L, C_U = (np.ascontiguousarray(C) if "material.nu" in names else np.zeros((0, 0)) for C in by_nu)
+    parameters = dict(model.named_parameters())  # C is proportional to 1 / (E depth)
+    scales = [name in ("material.E", "material.depth") for name in names]
+    softening = np.array([-1 / parameters[name].item() if scale else 0.0 for name, scale in zip(names, scales)])
+    nu = names.index("material.nu") if "material.nu" in names else -1
     tau = np.array([1.0 if name == "material.tau" else 0.0 for name in names])
     segments: list[Segment] = []
     run = None
@@ -106,13 +109,13 @@ def sensitivities(
         chunk, tape = segment.chunk, stepper.tape(segment)
         law = np.zeros((*tape.force.shape[:3], 3, n))
         for p in range(2):
-            at = law_rows(model, tape, p, chunk.h)[1]
+            at = touching(tape, p)
             law[at[0], p, at[1]] = _derivatives(
-                model, names, lambda p=p, tape=tape, h=chunk.h: law_rows(model, tape, p, h)[0]
-            ).numpy()
-        load = _derivatives(model, names, lambda chunk=chunk, tape=tape: rigid_loads(model, chunk, tape)).numpy()
-        decay = _derivatives(model, names, lambda h=chunk.h: decay_rate(model, h)).numpy()
-        explicit = Explicit(law, np.ascontiguousarray(load), C_L, C_U, tau, np.ascontiguousarray(decay))
+                model, names, IN_LAWS, lambda p=p, tape=tape, h=chunk.h: law_rows(model, tape, p, h)
+            )
+        load = _derivatives(model, names, IN_LOADS, lambda chunk=chunk, tape=tape: rigid_loads(model, chunk, tape))
+        decay = _derivatives(model, names, IN_LAWS, lambda h=chunk.h: decay_rate(model, h))
+        explicit = Explicit(law, load, C_L, C_U, nu, softening, tau, decay)
         rate = decay_rate(model, chunk.h).item()
         forward(
             stepper.pad_arrays(chunk.h), chunk.h, stepper.constants, tape, chunk.keep, x, explicit, rate, dys[segment.rows]

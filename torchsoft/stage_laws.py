@@ -13,10 +13,16 @@ from torchsoft.kernels.run import GAMMA, Tape
 from torchsoft.model import SoftGrasp
 
 
-def law_rows(model: SoftGrasp, tape: Tape, pad_number: int, h: float) -> tuple[Tensor, tuple[np.ndarray, np.ndarray]]:
-    """(f_x, f_y, s') of every touching node of one pad (rows, 3) [N, N, m/s], and the (stage, slot) each row belongs to."""
+def touching(tape: Tape, pad_number: int) -> tuple[np.ndarray, np.ndarray]:
+    """The (stage, slot) of every touching node of one pad on the tape, in the order of `law_rows`."""
+    stage, slot = np.nonzero(np.arange(tape.node.shape[2]) < tape.count[:, pad_number, None])
+    return stage, slot
+
+
+def law_rows(model: SoftGrasp, tape: Tape, pad_number: int, h: float) -> Tensor:
+    """(f_x, f_y, s') of every touching node of one pad (rows, 3) [N, N, m/s]."""
     p, pad, ah = pad_number, model.pads["LU"[pad_number]], GAMMA * h
-    stage, slot = np.nonzero(np.arange(tape.node.shape[2]) < tape.count[:, p, None])
+    stage, slot = touching(tape, p)
     place, node = torch.from_numpy(tape.place[stage, p, slot]), torch.from_numpy(tape.node[stage, p, slot])
     d, w, s = place[:, :2], place[:, 2:4], place[:, 4]
     theta = torch.from_numpy((tape.q_star[:, 2] + ah * tape.V[:, 2])[stage])
@@ -25,7 +31,7 @@ def law_rows(model: SoftGrasp, tape: Tape, pad_number: int, h: float) -> tuple[T
     v = w + torch.from_numpy(tape.V[stage, 2])[:, None] * cross(d)
     out = model.contact(frame.g[:, 0], (n * v).sum(-1), (t * v).sum(-1), s, model.share(pad)[node], stage=ah)
     force = out.F_N[:, None] * n + out.F_T[:, None] * t
-    return torch.cat((force, out.s_dot[:, None]), -1), (stage, slot)
+    return torch.cat((force, out.s_dot[:, None]), -1)
 
 
 def rigid_loads(model: SoftGrasp, chunk: Chunk, tape: Tape) -> Tensor:

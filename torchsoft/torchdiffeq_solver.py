@@ -19,7 +19,7 @@ from torchsoft.implicit import METHOD, ImplicitStepper, Segment
 from torchsoft.model import SoftGrasp
 
 REMEMBERED = 4
-"""Runs of a model whose states are remembered for `odeint_adjoint`, which hands its solver only the later end of an interval."""
+"""Runs of a model whose states are remembered: `odeint_adjoint` hands its solver only the later end of an interval."""
 
 
 class _Run(NamedTuple):

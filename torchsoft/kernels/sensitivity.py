@@ -28,13 +28,16 @@ class Explicit(NamedTuple):
     """Derivatives of the laws along the directions, with everything they act on held.
 
     law (stages, 2, cap, 3, n): of f_x, f_y, s' at the touching nodes; load (stages, 5, n): of F - M V' in the rigid
-    balance; C_L, C_U (surface dofs, dofs, n), transposed; tau (n) [s]; decay (n), of the rate r of free stretches.
+    balance; C_L, C_U (surface dofs, dofs), transposed, of the compliances along direction number `nu` (none if negative);
+    softening (n), of log C where that is one number; tau (n) [s]; decay (n), of the rate r of free stretches.
     """
 
     law: Array
     load: Array
     C_L: Array
     C_U: Array
+    nu: int
+    softening: Array
     tau: Array
     decay: Array
 
@@ -72,14 +75,13 @@ def stage_tangent(
             u_dot = tape.u_dot[row, first_dof + dof]
             for k in range(n_dir):
                 free[dof, k] = -(du[dof, k] + u_dot * explicit.tau[k]) / stiff
-        for m in range(n):
-            j = pad.surface[tape.node[row, p, m]]
-            for axis in range(2):
-                f = tape.force[row, p, m, axis] / stiff
-                source = C[2 * j + axis]
-                for dof in range(dofs):
-                    for k in range(n_dir):
-                        free[dof, k] += source[dof, k] * f
+        if explicit.nu >= 0:
+            for m in range(n):
+                j = pad.surface[tape.node[row, p, m]]
+                for axis in range(2):
+                    f = tape.force[row, p, m, axis] / stiff
+                    for dof in range(dofs):
+                        free[dof, explicit.nu] += C[2 * j + axis, dof] * f
         for m in range(n):
             i = tape.node[row, p, m]
             place = tape.place[row, p, m]
@@ -101,6 +103,12 @@ def stage_tangent(
                 b[p, line, 0], b[p, line, 1] = gx, gy
                 b[p, line, 2] = J[axis, 2] + ah * J[axis, 5]
                 b[p, line, 3], b[p, line, 4] = -side * gx, -side * gy
+                softer = 0.0  # the change of G w if C grew by its own size
+                for k in range(n):
+                    j = pad.surface[tape.node[row, p, k]]
+                    for col in range(2):
+                        P = pad.P[2 * j + col]
+                        softer += (gx * P[2 * i] + gy * P[2 * i + 1]) * tape.force[row, p, k, col]
                 for k in range(n_dir):
                     dx = du[2 * i, k] + side * x.q[3, k] - x.q[0, k]
                     dy = du[2 * i + 1, k] + side * x.q[4, k] - x.q[1, k]
@@ -108,6 +116,7 @@ def stage_tangent(
                         explicit.law[row, p, m, axis, k]
                         - gx * free[2 * i, k]
                         - gy * free[2 * i + 1, k]
+                        - softer * explicit.softening[k]
                         + J[axis, 3] * dx
                         + J[axis, 4] * dy
                         + J[axis, 5] * x.q[2, k]
@@ -123,8 +132,11 @@ def stage_tangent(
                 for k in range(n):
                     j = pad.surface[tape.node[row, p, k]]
                     for axis in range(2):
-                        wx -= pad.P[2 * j + axis, 2 * i] * b[p, 2 * k + axis, col]
-                        wy -= pad.P[2 * j + axis, 2 * i + 1] * b[p, 2 * k + axis, col]
+                        force = b[p, 2 * k + axis, col]
+                        if col >= 5:
+                            force += explicit.softening[col - 5] * tape.force[row, p, k, axis]
+                        wx -= pad.P[2 * j + axis, 2 * i] * force
+                        wy -= pad.P[2 * j + axis, 2 * i + 1] * force
                 if col == 0:
                     wx += 1.0
                 elif col == 1:
@@ -159,7 +171,7 @@ def stage_tangent(
             j = pad.surface[tape.node[row, p, m]]
             for axis in range(2):
                 for k in range(n_dir):
-                    df[axis, k] = b[p, 2 * m + axis, 5 + k]
+                    df[axis, k] = b[p, 2 * m + axis, 5 + k] + explicit.softening[k] * tape.force[row, p, m, axis]
                     for r in range(5):
                         df[axis, k] += b[p, 2 * m + axis, r] * dV[r, k]
             for dof in range(dofs):
