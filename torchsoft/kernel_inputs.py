@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from scipy import linalg
 
+from torchsoft.contact import Coulomb, SmoothSlip
 from torchsoft.kernels.node import Constants
 from torchsoft.kernels.pad import PadArrays, PadState
 from torchsoft.model import SoftGrasp
@@ -14,14 +15,18 @@ from torchsoft.state import State
 
 
 def constants(m: SoftGrasp) -> Constants:
-    """The model's scalars as the kernel takes them."""
+    """The model's scalars as the kernel takes them. Raises `TypeError` for a friction law that it does not have."""
     c, friction, control = m.contact, m.contact.friction, m.controllers
-    coulomb = m.settings.contact.friction == "coulomb"
+    if not isinstance(friction, SmoothSlip | Coulomb):
+        raise TypeError(
+            f"the compiled stepper knows the friction laws SmoothSlip and Coulomb, but `contact.friction` is "
+            f"{type(friction).__name__}; for a law written in torch use `torchsoft.unrolled.unrolled_solution`"
+        )
     return Constants(
-        *(x.item() for x in (c.K_n, c.R_n, c.K_t, c.R_t, c.eta, friction.mu_s, friction.mu_k)),  # pyright: ignore[reportAttributeAccessIssue]
-        v_s=math.inf if coulomb else friction.v_s.item(),  # pyright: ignore[reportAttributeAccessIssue]
+        *(x.item() for x in (c.K_n, c.R_n, c.K_t, c.R_t, c.eta, friction.mu_s, friction.mu_k)),
+        v_s=math.inf if isinstance(friction, Coulomb) else friction.v_s.item(),
         epsilon=c.epsilon,
-        coulomb=coulomb,
+        coulomb=isinstance(friction, Coulomb),
         tau=m.material.tau.item(),
         radius=m.shape.radius.item(),
         m_C=m.m_C.item(),
