@@ -40,3 +40,37 @@ def test_grasp_and_roll_smoke(tmp_path: Path) -> None:
     lines = module.table(numbers).splitlines()
     assert lines[1].startswith("| ---")
     assert "23.20" in next(line for line in lines if "y_C in the grasp" in line)
+
+
+def test_pad_fidelity_smoke(tmp_path: Path) -> None:
+    """Inertia changes the disc by nanometres and the forces by millinewtons, and more in a fast stroke."""
+    module = experiment("pad_fidelity")
+    result = module.run(module.Config(out=tmp_path, smoke=True))
+    slow, fast = result.differences.values()
+    assert slow["y_C"]["difference"] < 0.02  # [um]
+    assert slow["F_y"]["difference"] < 10  # [mN]
+    assert fast["x_C"]["difference"] > slow["x_C"]["difference"]
+    assert "| F_y | mN |" in module.table(result)
+
+
+def test_refinement_smoke(tmp_path: Path) -> None:
+    """Halving the step lessens the error of every signal; the mesh moves the grasp by little; eta not at all."""
+    module = experiment("refinement")
+    result = module.run(module.Config(out=tmp_path, smoke=True))
+    coarse, fine = result.steps.values()
+    assert all(fine[name] < coarse[name] for name in ("x_C", "y_C", "theta", "F_y", "energy_residual_rel"))
+    assert fine["F_y"] < 1e-2
+    two, one = result.meshes.values()
+    assert abs(two["y_C_grasp_mm"] - one["y_C_grasp_mm"]) < 0.03
+    smooth, limit = result.etas.values()
+    assert abs(smooth["F_y_grasp_N"] - limit["F_y_grasp_N"]) < 0.01
+    assert module.figure(result).axes
+
+
+@pytest.mark.slow
+def test_benchmark_smoke(tmp_path: Path) -> None:
+    module = experiment("benchmark")
+    config = module.Config(out=tmp_path, duration=3.0, repeats=3)
+    ratio = module.costs(config)["ratio"]
+    assert ratio["gradient"] < 3  # with the run itself
+    assert ratio["jacobian"] < 5

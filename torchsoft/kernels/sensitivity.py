@@ -166,18 +166,18 @@ def stage_tangent(
         pad, n = pads[p], tape.count[row, p]
         side, dofs = 1.0 if pad.moving_base else 0.0, pad.P.shape[1]
         du, du_dot = x.u[first_dof : first_dof + dofs], du_dots[first_dof : first_dof + dofs]
-        df = np.empty((2, n_dir))
+        df, P = np.empty((2 * n, n_dir)), np.empty((2 * n, dofs))
         for m in range(n):
             j = pad.surface[tape.node[row, p, m]]
             for axis in range(2):
+                line = 2 * m + axis
+                P[line] = pad.P[2 * j + axis]
                 for k in range(n_dir):
-                    df[axis, k] = b[p, 2 * m + axis, 5 + k] + explicit.softening[k] * tape.force[row, p, m, axis]
+                    df[line, k] = b[p, line, 5 + k] + explicit.softening[k] * tape.force[row, p, m, axis]
                     for r in range(5):
-                        df[axis, k] += b[p, 2 * m + axis, r] * dV[r, k]
-            for dof in range(dofs):
-                Px, Py = pad.P[2 * j, dof], pad.P[2 * j + 1, dof]
-                for k in range(n_dir):
-                    du_dot[dof, k] += Px * df[0, k] + Py * df[1, k]
+                        df[line, k] += b[p, line, r] * dV[r, k]
+        if n > 0:
+            du_dot += np.dot(P.T, df)
         m = 0
         for i in range(pad.surface.size):
             node = first_node + i
