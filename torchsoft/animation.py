@@ -121,7 +121,7 @@ def write_gif(pictures: Iterable[Picture], path: Path) -> None:
 
 def write_mp4(pictures: Iterable[Picture], path: Path) -> None:
     """H.264 through the ffmpeg that imageio-ffmpeg brings along."""
-    import imageio_ffmpeg  # an optional dependency
+    import imageio_ffmpeg  # pyright: ignore[reportMissingImports] -- an optional dependency
 
     writer = None
     for picture in pictures:
