@@ -1,17 +1,20 @@
 """The compiled kernel equals the module: node law, its Jacobian, and the rates of a whole stage."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from conftest import coarse, random_state
 from torch import Tensor
 
+from torchsoft import kernels
 from torchsoft.contact import cross, moving_frame
 from torchsoft.implicit import ImplicitStepper
 from torchsoft.kernel_inputs import constants, pad_state
 from torchsoft.kernels.node import contact_node
 from torchsoft.kernels.pad import pad_work
-from torchsoft.kernels.run import GAMMA
+from torchsoft.kernels.run import GAMMA, run
 from torchsoft.kernels.stage import finish_pad, solve_stage
 from torchsoft.model import SoftGrasp
 from torchsoft.state import State
@@ -126,3 +129,14 @@ def test_stage_rates_equal_forward(fidelity: str, seed: int) -> None:
         if a.numel():
             scale = float(b.abs().max()) + 1e-9
             assert float((a - b).abs().max()) / scale < 1e-7, name
+
+
+def test_no_stale_kernel_is_ever_used(tmp_path: Path) -> None:
+    """The cache's folder is named after all sources: a changed callee gives its callers another folder."""
+    assert kernels.digest(kernels.HERE) in run.stats.cache_path
+    for name, text in (("law.py", "a = 1"), ("step.py", "b = 2")):
+        (tmp_path / name).write_text(text)
+    before = kernels.digest(tmp_path)
+    assert kernels.digest(tmp_path) == before
+    (tmp_path / "law.py").write_text("a = 3")
+    assert kernels.digest(tmp_path) != before

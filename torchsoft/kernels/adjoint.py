@@ -9,8 +9,8 @@ mu (per touching node, of the law) and nu (5, of the rigid balance); both come f
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from torchsoft.kernels import compiled
 from torchsoft.kernels.linear import solve_dense
 from torchsoft.kernels.node import Array, contact_node
 from torchsoft.kernels.run import GAMMA
@@ -44,7 +44,7 @@ class PadGradients(NamedTuple):
     decay: Array
 
 
-@njit(cache=True)
+@compiled
 def stage_adjoint(
     pads: Any, h: float, c: Any, tape: Any, row: int, bars: Any, decay_rate: float, out: Any, gradients: Any,
     nodes: Any, A: Array, b: Array,
@@ -179,7 +179,7 @@ def stage_adjoint(
         bars.V[r] = mass * nu[r, 0] / ah
 
 
-@njit(cache=True)
+@compiled
 def backward(
     pads: Any,
     h: float,

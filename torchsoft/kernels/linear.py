@@ -1,11 +1,10 @@
 """The two small linear solves of a stage, in place and without allocation."""
 
-from numba import njit
-
+from torchsoft.kernels import compiled
 from torchsoft.kernels.node import Array
 
 
-@njit(cache=True)
+@compiled
 def solve_dense(A: Array, b: Array, n: int, m: int) -> None:
     """Gaussian elimination with row pivoting on the leading n x n block; b (n, m) becomes the solution."""
     for k in range(n):
@@ -35,7 +34,7 @@ def solve_dense(A: Array, b: Array, n: int, m: int) -> None:
             b[k, j] = total * inverse
 
 
-@njit(cache=True)
+@compiled
 def solve_banded(factor: Array, b: Array) -> None:
     """Solve L L^T x = b in place, L in scipy's lower banded storage."""
     band, n = factor.shape

@@ -10,8 +10,9 @@ Derivative names: `N_g` is dF_N/dg and so on; `w` is the velocity of the object'
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from torchsoft.kernels import compiled
 
 Array = NDArray[np.float64]
 
@@ -42,14 +43,14 @@ class Constants(NamedTuple):
     pad_length: float
 
 
-@njit(cache=True)
+@compiled
 def body_distance(radius: float, x: float, y: float) -> tuple[float, float, float, float]:
     """Signed distance, its gradient and its curvature (per length along the boundary) at a body-frame point."""
     d = np.sqrt(x * x + y * y)
     return d - radius, x / d, y / d, 1.0 / d
 
 
-@njit(cache=True)
+@compiled
 def slip(E: float, F_N: float, R: float, share: float, c: Any) -> tuple[float, float, float]:
     """Slip rate w under the trial effort E, with dw/dE and dw/dF_N; `SmoothSlip` and `Coulomb` of `contact`."""
     if c.mu_s * F_N >= E:
@@ -67,7 +68,7 @@ def slip(E: float, F_N: float, R: float, share: float, c: Any) -> tuple[float, f
     return w, 1.0 / slope, -mu / slope
 
 
-@njit(cache=True)
+@compiled
 def tangential(s: float, flow: float, F_N: float, R: float, K: float, share: float, c: Any) -> tuple[float, ...]:
     """Effort e and slip rate gamma' of the Voigt pair in series with the slip element, with their derivatives.
 
@@ -81,7 +82,7 @@ def tangential(s: float, flow: float, F_N: float, R: float, K: float, share: flo
     return trial - R * sign * w, sign * w, 1.0 - R * w_E, w_E, -R * sign * w_N, sign * w_N
 
 
-@njit(cache=True)
+@compiled
 def contact_node(
     dx: float, dy: float, wx: float, wy: float, omega: float, theta: float, s: float, share: float, ah: float, c: Any,
     J: Array, out: Array,

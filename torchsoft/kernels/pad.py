@@ -3,9 +3,9 @@
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from torchsoft.kernels import compiled
 from torchsoft.kernels.linear import solve_banded
 from torchsoft.kernels.node import Array, body_distance
 
@@ -78,7 +78,7 @@ def pad_work(pad: PadArrays) -> PadWork:
     return PadWork(**rates, **per_node, **system, free=z(2 * nodes), window=index, active=index.copy())
 
 
-@njit(cache=True)
+@compiled
 def free_rates(pad: Any, state: Any, work: Any, v_Br: Array, ah: float, tau: float) -> None:
     """Nodal velocities relative to the base that the stage would have without contact and bracket acceleration."""
     if pad.M.size == 0:
@@ -91,7 +91,7 @@ def free_rates(pad: Any, state: Any, work: Any, v_Br: Array, ah: float, tau: flo
         solve_banded(pad.factor, work.free)
 
 
-@njit(cache=True)
+@compiled
 def lever(pad: Any, state: Any, work: Any, q: Array, V: Array, ah: float, i: int, out: Array) -> None:
     """d (out[0:2]) and w (out[2:4]) of surface node i at the end of the stage, from the trial rates in `work` and V."""
     n = pad.surface[i]
@@ -104,7 +104,7 @@ def lever(pad: Any, state: Any, work: Any, q: Array, V: Array, ah: float, i: int
         out[k] = p - q[k] - ah * V[k]
 
 
-@njit(cache=True)
+@compiled
 def near(pad: Any, state: Any, work: Any, q: Array, V: Array, ah: float, c: Any, margin: float, found: Any) -> int:
     """Surface nodes within `margin` [m] of touching at the trial state go to `found`; returns their number."""
     place = np.empty(4)
@@ -119,7 +119,7 @@ def near(pad: Any, state: Any, work: Any, q: Array, V: Array, ah: float, c: Any,
     return count
 
 
-@njit(cache=True)
+@compiled
 def full_rates(pad: Any, work: Any, count: int, V: Array, V_star: Array) -> None:
     """u' of every node from the accepted forces."""
     work.u_dot[:] = work.free

@@ -7,9 +7,9 @@ both stages with the same a = 1 - 1/sqrt(2), so that one mobility serves both.
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from torchsoft.kernels import compiled
 from torchsoft.kernels.node import Array
 from torchsoft.kernels.stage import finish_pad, solve_stage
 
@@ -50,7 +50,7 @@ def empty_tape(stages: int, dofs: int, surface: int, cap: int) -> Tape:
     )  # fmt: skip
 
 
-@njit(cache=True)
+@compiled
 def write_tape(tape: Any, row: int, pads: Any, states: Any, works: Any, q: Array, V_star: Array, V: Array) -> bool:
     """Put one solved stage on the tape; False if more nodes touch than it has room for."""
     dof, node = 0, 0
@@ -75,7 +75,7 @@ def write_tape(tape: Any, row: int, pads: Any, states: Any, works: Any, q: Array
     return True
 
 
-@njit(cache=True)
+@compiled
 def advance(state: Any, work: Any, dt: float) -> None:
     """y += dt k for one pad."""
     state.u[:] += dt * work.u_dot
@@ -84,7 +84,7 @@ def advance(state: Any, work: Any, dt: float) -> None:
     state.s[:] += dt * work.s_dot
 
 
-@njit(cache=True)
+@compiled
 def record(states: Any, works: Any, q: Array, V: Array, y: Array, forces: Array) -> None:
     """The flat state vector (`state.Layout`) and (F_N, F_T) of every surface node."""
     k = 0
@@ -105,7 +105,7 @@ def record(states: Any, works: Any, q: Array, V: Array, y: Array, forces: Array)
     forces[lower:] = works[1].forces
 
 
-@njit(cache=True)
+@compiled
 def gone(pads: Any, works: Any, q: Array, c: Any) -> int:
     """Whether the disc has left: a contact at the end of a pad, or the bracket or the disc thrown clear."""
     for p in range(2):
@@ -121,7 +121,7 @@ def gone(pads: Any, works: Any, q: Array, c: Any) -> int:
     return CONVERGED
 
 
-@njit(cache=True)
+@compiled
 def run(
     pads: Any, states: Any, works: Any, q: Array, V: Array, wants: Array, h: float, c: Any, tolerance: float,
     max_iterations: int, margin: float, keep: Any, integrals: Array, ys: Array, forces: Array, extras: Array, tape: Any,

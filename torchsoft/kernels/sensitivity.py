@@ -8,8 +8,8 @@ axis counts directions.
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 
+from torchsoft.kernels import compiled
 from torchsoft.kernels.linear import solve_dense
 from torchsoft.kernels.node import Array, contact_node
 from torchsoft.kernels.run import GAMMA
@@ -42,7 +42,7 @@ class Explicit(NamedTuple):
     decay: Array
 
 
-@njit(cache=True)
+@compiled
 def stage_tangent(
     pads: Any, h: float, c: Any, tape: Any, row: int, x: Any, explicit: Any, decay_rate: float, nodes: Any, A: Array, b: Array
 ) -> None:  # fmt: skip
@@ -210,7 +210,7 @@ def stage_tangent(
     x.V[:] = dV
 
 
-@njit(cache=True)
+@compiled
 def forward(
     pads: Any, h: float, c: Any, tape: Any, keep: Any, x: Any, explicit: Any, decay_rate: float, dys: Array
 ) -> None:

@@ -13,8 +13,8 @@ The rigid velocities are V = (v_C, omega, v_Br) and the poses q = (r_C, theta, r
 from typing import Any
 
 import numpy as np
-from numba import njit
 
+from torchsoft.kernels import compiled
 from torchsoft.kernels.linear import solve_dense
 from torchsoft.kernels.node import Array, contact_node, tangential
 from torchsoft.kernels.pad import free_rates, full_rates, lever, near
@@ -23,7 +23,7 @@ SEARCH_AFTER, SHORTEST = 2, 1.0 / 64.0
 """After so many iterations a Newton step that does not lessen the mismatch is halved, down to this part of it."""
 
 
-@njit(cache=True)
+@compiled
 def evaluate_window(
     pad: Any, state: Any, work: Any, count: int, q: Array, V: Array, ah: float, c: Any
 ) -> tuple[int, float, float]:
@@ -55,7 +55,7 @@ def evaluate_window(
     return active, mismatch, squares
 
 
-@njit(cache=True)
+@compiled
 def eliminate_pad(pad: Any, work: Any, active: int, V: Array, V_star: Array, rigid: Array, ah: float) -> None:
     """Newton's forces as f = rhs[:, 0] + rhs[:, 1:] V, and their part in the rigid equations `rigid` (5, 6).
 
@@ -120,7 +120,7 @@ def eliminate_pad(pad: Any, work: Any, active: int, V: Array, V_star: Array, rig
             rigid[2, col] -= dx * py - dy * px - ah * (wx * fy - wy * fx)
 
 
-@njit(cache=True)
+@compiled
 def propose(pad: Any, work: Any, count: int, active: int, V_star: Array, V_new: Array) -> None:
     """Newton's forces and window velocities for the rigid velocities V_new; the present ones become the old ones."""
     for k in range(count):
@@ -149,7 +149,7 @@ def propose(pad: Any, work: Any, count: int, active: int, V_star: Array, V_new: 
             work.v_new[work.window[k], r] = v
 
 
-@njit(cache=True)
+@compiled
 def move(pad: Any, work: Any, count: int, part: float) -> None:
     """Go `part` of the way from the old iterate to the proposed one. Both satisfy the linear relations, so this does."""
     for k in range(count):
@@ -160,7 +160,7 @@ def move(pad: Any, work: Any, count: int, part: float) -> None:
             work.u_dot[2 * n + r] = work.v_old[i, r] + part * (work.v_new[i, r] - work.v_old[i, r])
 
 
-@njit(cache=True)
+@compiled
 def inertial_reaction(pad: Any, state: Any, work: Any, V_star: Array, ah: float, rigid: Array) -> None:
     """What the upper pad's own inertia adds to the bracket's equations."""
     for i in range(pad.M.size):
@@ -172,7 +172,7 @@ def inertial_reaction(pad: Any, state: Any, work: Any, V_star: Array, ah: float,
             rigid[3 + r, 0] += pad.B[r, col] * V_star[3 + col]
 
 
-@njit(cache=True)
+@compiled
 def solve_stage(
     pads: Any, states: Any, works: Any, q: Array, V_star: Array, V: Array, want: Array, ah: float, c: Any,
     tolerance: float, max_iterations: int, margin: float,
@@ -244,7 +244,7 @@ def solve_stage(
         previous, part, iteration = squares, 1.0, iteration + 1
 
 
-@njit(cache=True)
+@compiled
 def finish_pad(
     pad: Any, state: Any, work: Any, q: Array, V: Array, ah: float, c: Any, powers: Array, index: int
 ) -> float:  # fmt: skip
