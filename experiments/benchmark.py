@@ -33,6 +33,7 @@ import numpy as np
 import torch
 import tyro
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 from scipy.integrate import solve_ivp
 from torchdiffeq import odeint
 from tqdm import tqdm
@@ -250,11 +251,12 @@ def figure(result: Result) -> Figure:
     ratio = result.figures["costs"]["ratio"]
     bars = left.bar(list(ratio), list(ratio.values()), color="#0072b2")
     left.bar_label(bars, fmt="%.2f")
+    left.margins(y=0.12)
     left.set(ylabel="time over a plain run [1]", title="Run, gradient of all, Jacobian for 8")
     nodes = result.figures["growth"]["surface_nodes"]
     middle.loglog([int(n) for n in nodes], [1e3 * s for s in nodes.values()], "o-", color="#0072b2")
     middle.set_xticks([int(n) for n in nodes], list(nodes))
-    middle.minorticks_off()
+    middle.xaxis.set_minor_locator(NullLocator())
     middle.set(xlabel="surface nodes a pad", ylabel="wall time [ms] per simulated s", title="Growth with the mesh")
     others_ = result.figures["others"]
     right.barh(list(others_), [x["wall_per_simulated"] for x in others_.values()], color="#0072b2", log=True)

@@ -19,6 +19,7 @@ from typing import Any
 import torch
 import tyro
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 from torch import Tensor
 from tqdm import tqdm
 
@@ -145,7 +146,7 @@ def figure(result: Result) -> Figure:
     left.set(xlabel="step [ms]", ylabel="largest error over range [1]", title="Step refinement of the manipulation")
     left.legend()
     left.set_xticks(h, [f"{x:g}" for x in h])
-    left.minorticks_off()
+    left.xaxis.set_minor_locator(NullLocator())
     (t, exact), *others = result.traces.values()
     for key, (_, F_x) in zip(result.steps, others):
         right.semilogy(t, (F_x - exact).abs().clamp(min=1e-9), label=key, lw=0.6)
