@@ -1,0 +1,1 @@
+"""Synthetic rolling datasets: designed, simulated, written shard by shard, checked."""
