@@ -1,0 +1,630 @@
+"""Question: how exact are the four routes to a gradient, in every contact mode, and what do they cost?
+
+The loss over a window of outputs t_k is L = mean over k and i of (1/2 + (t_k - t_0)/(t_T - t_0)) (z_ki + z_ki^2 / 2), with
+z = (q - mean q) / std q of the nominal run, constants both, and q = (x_C, y_C, theta, v_C, omega, x_Br, y_Br, F_x, F_y).
+dL/dp for every scalar parameter p comes from
+  discrete     the discrete adjoint of the implicit stepper,
+  forward      forward sensitivities of the same steps, contracted with dL/dy,
+  unrolled     backpropagation through the plain torch step,
+  continuous   `torchdiffeq.odeint_adjoint` with rk4 (25 us) on the right-hand side,
+and is judged by central differences D(d) = (L(p + d) - L(p - d)) / 2d of the stepper at a Newton tolerance of 1e-10 N. Each
+neighbouring pair of relative steps d gives a Richardson value; the two that agree best are the plateau, and their
+difference is the judge's own uncertainty. No gradient is looked at to choose the step.
+
+Windows: `stick` (gentle rolling in the grasp), `slip` (a 2 mm stroke in 20 ms with mu_s = 0.3, mu_k = 0.2, v_s = 50 mm/s),
+`make-break` (rolling at 4.4 mm/s), `grasp` (the bracket coming down from 20 um above touching) and `full` (the 30 s
+manipulation). The unrolled and the continuous route are slow, so they are run over a sub-window of a few steps about
+the window's first event, against central differences over that sub-window; the continuous one solves the ODE and not the
+steps, so it is compared with the discrete adjoint at a step of 1 us.
+
+Further: the literal Coulomb law, whose force jumps at break-away unless mu_s = mu_k; dL/dp through slip as the step is
+refined; dv_C/dp before and after a node touches; and a window that starts at `rest`, where the upper pad's gap is exactly
+zero and central differences straddle the kink.
+
+Command: .venv/bin/python experiments/gradient_accuracy.py [--smoke]
+Expected: discrete and forward within 1e-6 of central differences in stick, slip and grasp, and within 1e-4 across node
+transitions; unrolled within 1e-9 of discrete; backward at 0.7 to 0.9 of the forward run. Coulomb's law with mu_s > mu_k: the
+adjoint's dL/dmu_s is off by 10 % or more, with mu_s = mu_k not. About five minutes on one core.
+"""
+
+import json
+import statistics
+import time as clock
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from matplotlib.figure import Figure
+from torch import Tensor
+from torchdiffeq import odeint, odeint_adjoint
+from tqdm import tqdm
+
+from torchsoft import Parameters, SoftGrasp, press
+from torchsoft.adjoint import differentiable_solution
+from torchsoft.control import Profile, Reference
+from torchsoft.implicit import ImplicitStepper, SimulationFailed
+from torchsoft.scenario import grasp_and_roll, reference
+from torchsoft.sensitivity import sensitivities
+from torchsoft.unrolled import unrolled_solution
+
+NEWTON = 1e-10
+"""Newton's tolerance of every run here [N]."""
+FLOOR = (1e-7, 1e-7, 1e-6, 1e-6, 1e-6, 1e-5, 1e-7, 1e-7, 1e-3, 1e-3)
+"""Smallest scale of each signal in the loss: m, m, rad, m/s, m/s, rad/s, m, m, N, N."""
+INERT = ("material.rho",)
+"""Parameters that massless pads do not use."""
+FINER = {"shape.radius": 1e-2}
+"""Factors on the relative steps of central differences."""
+INSENSITIVE = 1e-6
+"""Part of the largest p dL/dp below which the continuous adjoint's gradient is not compared in relative terms."""
+CONTINUOUS = 3e-4
+"""Length of the continuous adjoint's sub-window, with two outputs [s]: 14 / tau times their spacing is 0.2."""
+Gradient = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Config:
+    out: Path = Path("out/gradient_accuracy")
+    steps: tuple[float, ...] = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 1e-6)
+    """relative steps of the central differences; a hundredth of them for the radius, of which 1e-4 is two ramps"""
+    full_steps: tuple[float, ...] = (3e-5, 1e-5)
+    """the same over the whole manipulation, where a run takes a second"""
+    jump_steps: tuple[float, ...] = (4e-2, 2e-2, 1e-2)
+    """the same for Coulomb's law, wide enough to average over its jumps"""
+    refinement_ms: tuple[float, ...] = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125, 0.0625)
+    """steps of the convergence through slip [ms]; half the last is the reference"""
+    repeats: int = 5
+    """runs of which a time is the median (three for the continuous adjoint)"""
+    duration: float = 30.0
+    """of the full window [s]"""
+    only: tuple[str, ...] = ()
+    """scalar parameters; all of them if none is named"""
+    changes: tuple[tuple[str, float | int], ...] = ()
+    """parameter overrides, a coarser mesh for instance"""
+    smoke: bool = False
+    """a size that takes seconds"""
+
+
+def smoke(config: Config) -> Config:
+    """The same questions for three parameters on a coarse mesh."""
+    only = ("contact.K_n", "contact.friction.mu_s", "material.E")
+    return replace(
+        config, steps=(3e-4, 1e-4, 3e-5), full_steps=(1e-4, 1e-5), jump_steps=(4e-2, 2e-2), refinement_ms=(2.0, 1.0),
+        repeats=1, duration=0.6, only=only, changes=(("pad.elements_x", 60), ("pad.elements_y", 2)),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Window:
+    """A run whose gradient is wanted: from y0 (size,) through the outputs t (T,) [s] in steps of `step` [s]."""
+
+    name: str
+    model: SoftGrasp
+    y0: Tensor
+    t: Tensor
+    step: float
+
+
+@dataclass(frozen=True)
+class Result:
+    config: Config
+    windows: dict[str, dict[str, Any]]
+    coulomb: dict[str, Any]
+    refinement: dict[str, Any]
+    touch_down: dict[str, Any]
+    rest: dict[str, Any]
+
+
+def linspace(start: float, end: float, step: float) -> Tensor:
+    return torch.linspace(start, end, round((end - start) / step) + 1, dtype=torch.float64)
+
+
+def states(window: Window) -> Tensor:
+    """The run (T, size), differentiable if gradients are on."""
+    stepper = ImplicitStepper(window.model, step=window.step, tolerance=NEWTON)
+    return differentiable_solution(stepper, window.y0, window.t)[0]
+
+
+def signals(model: SoftGrasp, y: Tensor, t: Tensor) -> Tensor:
+    """(T, 10): pose and velocity of the disc, pose of the bracket, control force."""
+    s = model.layout.unpack(y)
+    force = torch.stack(model.controllers(model.reference(t), s.r_C, s.v_C, s.r_Br, s.v_Br), -1)
+    return torch.cat((s.r_C, s.theta[:, None], s.v_C, s.omega[:, None], s.r_Br, force), -1)
+
+
+@torch.no_grad()
+def make_loss(window: Window) -> Callable[[Tensor], Tensor]:
+    """The loss of the docstring as a function of the states, its constants from the nominal run."""
+    model, t = window.model, window.t
+    nominal = signals(model, states(window), t)
+    centre, scale = nominal.mean(0), torch.maximum(nominal.std(0), torch.tensor(FLOOR, dtype=torch.float64))
+    weight = (0.5 + (t - t[0]) / (t[-1] - t[0]))[:, None]
+
+    def loss(y: Tensor) -> Tensor:
+        z = (signals(model, y, t) - centre) / scale
+        return (weight * (z + 0.5 * z**2)).mean()
+
+    return loss
+
+
+def scalars(model: SoftGrasp, config: Config) -> dict[str, torch.nn.Parameter]:
+    every = {name: p for name, p in model.named_parameters() if p.ndim == 0 and name not in INERT}
+    return {name: p for name, p in every.items() if not config.only or name in config.only}
+
+
+def collect(model: SoftGrasp, names: Iterable[str]) -> Gradient:
+    """The parameters' gradients, taken away from them."""
+    parameters = dict(model.named_parameters())
+    out = {n: 0.0 if (g := parameters[n].grad) is None else g.item() for n in names}
+    model.zero_grad(set_to_none=True)
+    return out
+
+
+def richardson(values: list[float], steps: tuple[float, ...]) -> tuple[float, float]:
+    """Plateau and uncertainty of central differences at falling steps: the two extrapolations that agree best."""
+    ratios = [(a / b) ** 2 for a, b in pairwise(steps)]
+    better = [b + (b - a) / (r - 1) for a, b, r in zip(values, values[1:], ratios)]
+    better = [x for x in better if x == x]
+    if not better:
+        return float("nan"), float("nan")
+    if len(better) == 1:
+        return better[0], abs(values[1] - values[0])
+    gap, best = min((abs(b - a), b) for a, b in pairwise(better))
+    return best, gap
+
+
+@torch.no_grad()
+def central_differences(
+    window: Window, loss: Callable[[Tensor], Tensor], config: Config, steps: tuple[float, ...]
+) -> tuple[Gradient, Gradient, dict[str, list[float]]]:
+    """dL/dp by central differences, the judge's uncertainty, and the values at every relative step."""
+    value, unsure, at = {}, {}, {}
+    for name, p in scalars(window.model, config).items():
+        keep, at[name] = p.clone(), []
+        for relative in steps:
+            ends = [keep * (1 + sign * relative * FINER.get(name, 1.0)) for sign in (1, -1)]
+            got = []
+            for end in ends:
+                p.copy_(end)
+                try:
+                    got.append(loss(states(window)).item())
+                except SimulationFailed:
+                    got.append(float("nan"))
+            at[name].append((got[0] - got[1]) / (ends[0] - ends[1]).item())
+        p.copy_(keep)
+        value[name], unsure[name] = richardson(at[name], steps)
+    return value, unsure, at
+
+
+def relative_errors(got: Gradient, judge: Gradient, floor: Gradient | None = None) -> Gradient:
+    """|got - judge| / max(|judge|, floor); a gradient that both call exactly zero has no error."""
+    size = {n: max(abs(x), floor[n] if floor else 0.0) for n, x in judge.items()}
+    return {n: 0.0 if got[n] == x else abs(got[n] - x) / size[n] if size[n] else float("inf") for n, x in judge.items()}
+
+
+def timed(function: Callable[[], Any]) -> tuple[Any, float]:
+    start = clock.perf_counter()
+    out = function()
+    return out, clock.perf_counter() - start
+
+
+def by_backward(
+    window: Window, loss: Callable[[Tensor], Tensor], run: Callable[[], Tensor], config: Config
+) -> tuple[Gradient, dict[str, float]]:
+    """Gradient of a route that is a forward run and a backward pass, and its median times over its own plain run."""
+    seconds: list[tuple[float, float, float]] = []
+    gradient: Gradient = {}
+    for _ in range(config.repeats):
+        with torch.no_grad():
+            _, plain = timed(run)
+        value, forward = timed(lambda: loss(run()))
+        _, backward = timed(value.backward)
+        gradient = collect(window.model, scalars(window.model, config))
+        seconds.append((plain, backward, forward + backward))
+    plain, backward, total = (statistics.median(x) for x in zip(*seconds))
+    return gradient, {"forward_s": plain, "gradient": backward / plain, "total": total / plain}
+
+
+def by_sensitivities(
+    window: Window, loss: Callable[[Tensor], Tensor], config: Config
+) -> tuple[Gradient, dict[str, float]]:
+    """Gradient by forward sensitivities of all parameters at once, and its median times over the plain run."""
+    chosen, seconds = scalars(window.model, config), []
+    gradient: Gradient = {}
+    for _ in range(config.repeats):
+        with torch.no_grad():
+            _, plain = timed(lambda: states(window))
+
+        def contract() -> Tensor:
+            run = sensitivities(window.model, window.y0, window.t, list(chosen), step=window.step, tolerance=NEWTON)
+            y = run.y.clone().requires_grad_(True)
+            y_bar, *direct = torch.autograd.grad(loss(y), (y, *chosen.values()), allow_unused=True)
+            explicit = torch.stack([torch.zeros_like(y_bar[0, 0]) if g is None else g for g in direct])
+            return torch.einsum("ti,tin->n", y_bar, run.dy) + explicit
+
+        total, spent = timed(contract)
+        gradient = dict(zip(chosen, total.tolist()))
+        seconds.append((plain, spent - plain, spent))
+    plain, extra, spent = (statistics.median(x) for x in zip(*seconds))
+    return gradient, {"forward_s": plain, "gradient": extra / plain, "total": spent / plain}
+
+
+@torch.no_grad()
+def events(window: Window, y: Tensor) -> dict[str, Any]:
+    """Nodes that touch, leave, slip and begin to slip between the outputs, and the first row with such an event."""
+    on, slipping, fastest = [], [], 0.0
+    for rows in torch.arange(len(y)).split(200):
+        graph = window.model.evaluate(window.t[rows], window.model.layout.unpack(y[rows]))
+        contact = [interface.contact for interface in graph.interfaces.values()]
+        on.append(torch.cat([interface.frame.g > 0 for interface in graph.interfaces.values()], -1))
+        speed = torch.cat([c.gamma_dot.abs() for c in contact], -1) * on[-1]
+        slipping.append(speed > 0)
+        fastest = max(fastest, speed.max().item())
+    on, slipping = torch.cat(on), torch.cat(slipping)
+    touch, leave, onset = on[1:] & ~on[:-1], on[:-1] & ~on[1:], slipping[1:] & ~slipping[:-1]
+    first = (touch | leave | onset).any(1).nonzero()[:, 0]
+    return {
+        "steps": len(y) - 1,
+        "touching": on.sum(1).max().item(),
+        "touch": touch.sum().item(),
+        "leave": leave.sum().item(),
+        "slipping": slipping.any(0).sum().item(),
+        "slip_onsets": onset.sum().item(),
+        "fastest_slip_mm_s": 1e3 * fastest,
+        "first_row": first[0].item() if len(first) else 0,
+        "slip_rows": onset.any(1).nonzero()[:, 0].tolist(),
+        "touch_rows": touch.any(1).nonzero()[:, 0].tolist(),
+    }
+
+
+def stroke(config: Config, end: float, step: float, changes: dict[str, Any], every: float | None = None) -> Window:
+    """A 2 mm stroke in 20 ms out of a frictionless grasp, with little friction: nodes break away one after another."""
+    slippery = {"contact.v_s": 0.05, "contact.mu_s": 0.3, "contact.mu_k": 0.2}
+    model = SoftGrasp(Parameters().override({**slippery, **dict(config.changes), **changes}))
+    y0 = press(model, height := model.settings.scenario.y_Br_grasp).detach()
+    with torch.no_grad():
+        port = model.evaluate(0.0, model.layout.unpack(y0)).ports["pad_U"]
+        load = port.transformer.effort(port.effort, model.junctions)["bracket"][..., 1].sum().item()
+    x = model.layout.unpack(y0).r_C[0].item()
+    model.reference = Reference(Profile([0.0, 0.02], [x, x - 2e-3]), Profile([0.0], [height]), Profile([0.0], [load]))
+    return Window("slip", model, y0, linspace(0.0, end, every or step), step)
+
+
+def windows(config: Config) -> list[Window]:
+    """The five windows."""
+    model = SoftGrasp(Parameters().override(dict(config.changes)))
+    manipulation = grasp_and_roll(model, grasp_force=75.0 if config.smoke else None)
+    roll = 0.5 if config.smoke else 4.5
+    with torch.no_grad():
+        path = states(Window("path", model, manipulation.y0, linspace(0.0, roll, 0.01), 2e-3))
+    above = manipulation.y0.clone()
+    above[model.layout.slices["r_Br"].stop - 1] += 2e-5
+    lowered = SoftGrasp(model.settings)
+    lowered.reference = reference(lowered, above, manipulation.grasp_force)
+    stick, grasp = (0.01, 0.2) if config.smoke else (0.05, 0.4)
+    early = 0.5 if config.smoke else 0.6
+    out = [
+        Window("stick", model, path[round(100 * early)], linspace(early, early + stick, 1e-3), 1e-3),
+        stroke(config, 6e-3, 2.5e-4, {}),
+        Window("make-break", model, path[-1], linspace(roll, roll + (0.05 if config.smoke else 0.5), 2e-3), 2e-3),
+        Window("grasp", lowered, above, linspace(0.0, grasp, 2e-3), 2e-3),
+    ]
+    return [*out, Window("full", model, manipulation.y0, linspace(0.0, config.duration, 0.01), 2e-3)]
+
+
+def judge_window(window: Window, config: Config, bar: Any) -> dict[str, Any]:
+    """Errors and costs of the routes over one window, the slow routes over the few steps about its first event."""
+    full = window.name == "full"
+    loss = make_loss(window)
+    with torch.no_grad():
+        y = states(window)
+    seen = events(window, y)
+    judge, unsure, _ = central_differences(window, loss, config, config.full_steps if full else config.steps)
+    bar.update()
+    gradients, costs = {}, {}
+    gradients["discrete"], costs["discrete"] = by_backward(window, loss, lambda: states(window), config)
+    gradients["forward"], costs["forward"] = by_sensitivities(window, loss, config)
+    bar.update()
+    out: dict[str, Any] = {
+        "events": seen,
+        "gradient": judge,
+        "judge_uncertainty": {n: unsure[n] / abs(x) if x else 0.0 for n, x in judge.items()},
+        "relative_error": {route: relative_errors(g, judge) for route, g in gradients.items()},
+        "discrete_against_forward": relative_errors(gradients["forward"], gradients["discrete"]),
+        "cost_ratio": costs,
+    }
+    if full:
+        return out
+    begin = max(0, min(seen["first_row"] - 1, len(window.t) - 4))
+    part = replace(window, y0=y[begin].clone(), t=window.t[begin : begin + 4])
+    loss = make_loss(part)
+    with torch.no_grad():
+        out["sub_window_events"] = events(part, states(part))
+    judge, unsure, _ = central_differences(part, loss, config, config.steps)
+    out["judge_uncertainty_sub_window"] = {n: unsure[n] / abs(x) if x else 0.0 for n, x in judge.items()}
+    exact, _ = by_backward(part, loss, lambda: states(part), config)
+    got, costs["unrolled"] = by_backward(
+        part, loss, lambda: unrolled_solution(part.model, part.y0, part.t, step=part.step), config
+    )
+    out["relative_error"]["unrolled"] = relative_errors(got, judge)
+    out["unrolled_against_discrete"] = relative_errors(got, exact)
+    bar.update()
+    with torch.no_grad():
+        start = states(part)[1 if begin else 0].clone()
+    t = part.t[1 if begin else 0] + linspace(0.0, CONTINUOUS, CONTINUOUS / 2)
+    fine = replace(part, y0=start, t=t, step=1e-6)
+    loss = make_loss(fine)
+    exact, _ = by_backward(fine, loss, lambda: states(fine), replace(config, repeats=1))
+
+    def continuous() -> Tensor:
+        solve = odeint_adjoint if torch.is_grad_enabled() else odeint
+        return solve(fine.model, fine.y0, fine.t, method="rk4", options={"step_size": 2.5e-5})  # pyright: ignore[reportReturnType]
+
+    got, costs["continuous"] = by_backward(fine, loss, continuous, replace(config, repeats=min(config.repeats, 3)))
+    values = {n: p.item() for n, p in scalars(fine.model, config).items()}
+    largest = max(abs(values[n] * x) for n, x in exact.items())
+    floor = {n: INSENSITIVE * largest / value for n, value in values.items()}
+    out["relative_error"]["continuous"] = relative_errors(got, exact, floor)
+    with torch.no_grad():
+        out["continuous_events"] = events(fine, states(fine))
+    bar.update()
+    return out
+
+
+def coulomb(config: Config) -> dict[str, Any]:
+    """The adjoint's bias with the literal Coulomb law: none where mu_s = mu_k, and L(mu_s) about mu_s > mu_k."""
+    out: dict[str, Any] = {}
+    for label, mu_k in (("mu_s > mu_k", 0.2), ("mu_s = mu_k", 0.3)):
+        window = stroke(config, 8e-3, 2.5e-4, {"contact.friction": "coulomb", "contact.mu_k": mu_k})
+        loss = make_loss(window)
+        steps = config.jump_steps if mu_k < 0.3 else config.steps
+        differences, unsure, at = central_differences(window, loss, config, steps)
+        value = loss(states(window))
+        value.backward()
+        with torch.no_grad():
+            seen = events(window, states(window))
+        adjoint = collect(window.model, differences)
+        out[label] = {
+            "events": seen, "adjoint": adjoint, "central_differences": differences, "at_steps": at, "steps": steps,
+            "judge_uncertainty": {n: unsure[n] / abs(x) if x else 0.0 for n, x in differences.items()},
+            "relative_error": relative_errors(adjoint, differences),
+        }  # fmt: skip
+        p, scan = window.model.contact.friction.mu_s, []  # pyright: ignore[reportAttributeAccessIssue]
+        with torch.no_grad():
+            keep = p.clone()
+            changes = torch.linspace(-0.04, 0.04, 9 if config.smoke else 81, dtype=torch.float64)
+            for change in changes:
+                p.copy_(keep * (1 + change))
+                try:
+                    scan.append(loss(states(window)).item())
+                except SimulationFailed:  # Newton's method, on a law that jumps
+                    scan.append(float("nan"))
+            p.copy_(keep)
+        out[label]["scan"] = {"mu_s": (keep * (1 + changes)).tolist(), "loss": scan}
+    return out
+
+
+def refinement(config: Config) -> dict[str, Any]:
+    """dL/dp through slip, at the same outputs, as the step is refined; errors against the finest step's."""
+    steps = [1e-3 * h for h in (*config.refinement_ms, config.refinement_ms[-1] / 2)]
+    names = ("contact.friction.mu_s", "contact.friction.mu_k", "contact.K_t")
+    base = stroke(config, 16e-3, steps[-1], {}, every=4e-3)
+    loss, table = make_loss(base), {}
+    for h in steps:
+        value = loss(states(replace(base, step=h)))
+        value.backward()
+        table[f"{1e3 * h:g}"] = {"loss": value.item(), **collect(base.model, names)}
+    with torch.no_grad():
+        dense = replace(base, t=linspace(0.0, 16e-3, 2.5e-4), step=2.5e-4)
+        seen = events(dense, states(dense))
+    exact = list(table.values())[-1]
+    error = {key: {n: abs(row[n] - exact[n]) / abs(exact[n]) for n in exact} for key, row in list(table.items())[:-1]}
+    return {"events": seen, "gradient": table, "relative_error": error}
+
+
+def touch_down(config: Config, window: Window) -> dict[str, Any]:
+    """dv_C,x/dp at the end of windows that end about a node's touching, with the ramp of 1 um and with next to none."""
+    out: dict[str, Any] = {}
+    name = "contact.K_n"
+    for label, epsilon in (("1 um", 1e-6), ("20 nm", 2e-8)):
+        settings = window.model.settings
+        changed = settings.override({"contact.epsilon": epsilon})
+        model = SoftGrasp(changed)
+        model.reference = window.model.reference
+        run_ = replace(window, model=model, t=linspace(window.t[0].item(), window.t[-1].item(), 1e-3), step=1e-3)
+        dense = sensitivities(model, run_.y0, run_.t, [name], step=1e-3, tolerance=NEWTON)
+        seen = events(run_, dense.y)
+        at = model.layout.slices["v_C"].start
+        value = dense.dy[:, at, 0]
+        change = value.diff().abs()
+        rows = seen["touch_rows"]
+        row = rows[len(rows) // 2] if rows else len(change) // 2
+        quiet = torch.ones_like(change, dtype=torch.bool)
+        for k in rows:
+            quiet[max(0, k - 2) : k + 3] = False
+        # both sides judged by central differences
+        p, sides = dict(model.named_parameters())[name], {}
+        with torch.no_grad():
+            keep, got = p.clone(), []
+            for sign in (1, -1):
+                p.copy_(keep * (1 + sign * 1e-5))
+                got.append(states(run_)[:, at])
+            p.copy_(keep)
+            differences = (got[0] - got[1]) / (2e-5 * keep)
+        for k, side in ((row, "before"), (row + 1, "after")):
+            sides[side] = {
+                "gradient": value[k].item(),
+                "relative_error": ((value[k] - differences[k]).abs() / differences[k].abs()).item(),
+            }
+        lo, hi = max(0, row - 40), row + 40
+        out[label] = {
+            **sides, "touch_rows": rows, "change_at_touch": change[row].item(),
+            "largest_change_elsewhere": change[quiet].max().item(), "time_s": run_.t[lo:hi].tolist(),
+            "trace": value[lo:hi].tolist(), "differences": differences[lo:hi].tolist(), "touch_s": run_.t[row + 1].item(),
+        }  # fmt: skip
+    return out
+
+
+def from_rest(config: Config) -> dict[str, Any]:
+    """dL/dradius from `rest`, where the gap is exactly zero, and with the bracket 5 um higher."""
+    out: dict[str, Any] = {}
+    for label, offset in (("at rest", 0.0), ("5 um above", 5e-6)):
+        model = SoftGrasp(Parameters().override(dict(config.changes)))
+        manipulation = grasp_and_roll(model, grasp_force=75.0)
+        y0 = manipulation.y0.clone()
+        y0[model.layout.slices["r_Br"].stop - 1] += offset
+        model.reference = reference(model, y0, 75.0)
+        window = Window("rest", model, y0, linspace(0.0, 0.1, 2e-3), 2e-3)
+        loss, chosen = make_loss(window), replace(config, only=("shape.radius",))
+        judge, _, at = central_differences(window, loss, chosen, config.steps)
+        loss(states(window)).backward()
+        got = collect(model, judge)
+        out[label] = {
+            "adjoint": got["shape.radius"], "central_differences": at["shape.radius"], "steps": config.steps,
+            "relative_error": relative_errors(got, judge)["shape.radius"],
+        }  # fmt: skip
+    return out
+
+
+def run(config: Config) -> Result:
+    config = smoke(config) if config.smoke else config
+    bar = tqdm(total=4 * 4 + 2 + 4, unit="part")
+    every = windows(config)
+    judged = {}
+    for window in every:
+        bar.set_description(window.name)
+        judged[window.name] = judge_window(window, config, bar)
+    rest = []
+    for part in (coulomb, refinement, lambda c: touch_down(c, every[2]), from_rest):
+        rest.append(part(config))
+        bar.update()
+    bar.close()
+    return Result(config, judged, *rest)
+
+
+def table(result: Result) -> str:
+    """Markdown: per window and route the largest error and the cost; then the Coulomb bias and the convergence."""
+    lines = ["| window | touch / leave / slip onsets | route | largest error (parameter, judge's own uncertainty) | "
+             "largest where the judge knows 1e-6 | gradient / forward | total / forward |"]  # fmt: skip
+    lines.append("|---" * 7 + "|")
+    for name, window in result.windows.items():
+        for route, errors in window["relative_error"].items():
+            worst, cost = max(errors, key=lambda n: errors[n]), window["cost_ratio"][route]
+            seen = {"unrolled": "sub_window_events", "continuous": "continuous_events"}.get(route, "events")
+            e, unsure = window[seen], window["judge_uncertainty" + ("" if seen == "events" else "_sub_window")]
+            if route == "continuous":
+                unsure = dict.fromkeys(errors, 0.0)
+            known = max((errors[n] for n in errors if unsure[n] <= 1e-6), default=float("nan"))
+            lines.append(
+                f"| {name} | {e['touch']} / {e['leave']} / {e['slip_onsets']} | {route} | {errors[worst]:.1e} "
+                f"({worst}, {unsure[worst]:.0e}) | {known:.1e} | {cost['gradient']:.2f} | {cost['total']:.2f} |"
+            )
+    lines += ["", "| Coulomb, literal | adjoint dL/dmu_s | central differences | error |", "|---|---|---|---|"]
+    for label, c in result.coulomb.items():
+        n = "contact.friction.mu_s"
+        got, judge = c["adjoint"][n], c["central_differences"][n]
+        lines.append(f"| {label} | {got:.5g} | {judge:.5g} | {c['relative_error'][n]:.1e} |")
+    names = list(next(iter(result.refinement["relative_error"].values())))
+    lines += ["", "| step [ms] | " + " | ".join(names) + " |", "|---" * (1 + len(names)) + "|"]
+    for step, errors in result.refinement["relative_error"].items():
+        lines.append(f"| {step} | " + " | ".join(f"{errors[n]:.1e}" for n in names) + " |")
+    lines += [
+        "",
+        "| ramp | change of dv_C/dK_n at touch-down over the largest elsewhere | error before | error after |",
+    ]
+    lines.append("|---|---|---|---|")
+    for label, side in result.touch_down.items():
+        ratio = side["change_at_touch"] / side["largest_change_elsewhere"]
+        errors = " | ".join(f"{side[k]['relative_error']:.1e}" for k in ("before", "after"))
+        lines.append(f"| {label} | {ratio:.2f} | {errors} |")
+    lines += ["", "| start | adjoint dL/dradius | " + " | ".join(f"d = {d:g}" for d in result.config.steps) + " |"]
+    lines.append("|---" * (2 + len(result.config.steps)) + "|")
+    for label, row in result.rest.items():
+        lines.append(
+            f"| {label} | {row['adjoint']:.6g} | " + " | ".join(f"{x:.6g}" for x in row["central_differences"]) + " |"
+        )
+    return "\n".join(lines)
+
+
+def figure(result: Result) -> Figure:
+    """Errors per parameter and window; convergence through slip; Coulomb's jumps; both sides of a touch-down."""
+    fig = Figure(figsize=(13, 11), layout="constrained")
+    grid = fig.add_gridspec(2, 3, height_ratios=(1.2, 1.0))
+    top, below = fig.add_subplot(grid[0, :]), [fig.add_subplot(grid[1, k]) for k in range(3)]
+    names = list(next(iter(result.windows.values()))["gradient"])
+    smallest = 1e-16
+    markers = {"discrete": "o", "forward": "x", "unrolled": "s", "continuous": "^"}
+    for i, (window, numbers) in enumerate(result.windows.items()):
+        for route, errors in numbers["relative_error"].items():
+            x = [k + 0.16 * (i - 2) for k in range(len(names))]
+            hollow = {} if route == "forward" else {"markerfacecolor": "none"}
+            top.semilogy(
+                x, [max(errors[n], smallest) for n in names], markers[route], color=f"C{i}", ms=6, ls="none", **hollow
+            )
+        top.plot([], [], "-", color=f"C{i}", label=window, lw=4)
+    for route, marker in markers.items():
+        top.plot([], [], marker, color="k", ls="none", markerfacecolor="none" if marker != "x" else "k", label=route)
+    for k in range(len(names) - 1):
+        top.axvline(k + 0.5, color="0.9", lw=0.8, zorder=0)
+    top.set_xticks(range(len(names)), [n.split(".")[-1] for n in names], rotation=45)
+    top.set(
+        ylabel="relative error [1]", title=f"Gradient against central differences ({smallest:g}: both exactly zero)"
+    )
+    top.set_xlim(-0.6, len(names) - 0.4)
+    top.legend(ncols=9, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.16))
+    errors = result.refinement["relative_error"]
+    h = [float(key) for key in errors]
+    for (n, label), marker in zip((("contact.friction.mu_s", "mu_s"), ("contact.friction.mu_k", "mu_k"),
+                                   ("contact.K_t", "K_t"), ("loss", "the loss itself")), "osvD"):  # fmt: skip
+        below[0].loglog(h, [row[n] for row in errors.values()], marker=marker, label=label)
+    below[0].loglog(h, [errors[f"{h[0]:g}"]["loss"] * (x / h[0]) ** 2 for x in h], "k--", label="second order")
+    below[0].set(xlabel="step [ms]", ylabel="relative error [1]", title="dL/dp through slip against the finest step")
+    below[0].set_xticks(h, [f"{x:g}" for x in h])
+    below[0].minorticks_off()
+    below[0].legend()
+    for k, (label, c) in enumerate(result.coulomb.items()):
+        n, scan = "contact.friction.mu_s", c["scan"]
+        x, y = torch.tensor(scan["mu_s"]), torch.tensor(scan["loss"])
+        middle = len(x) // 2
+        below[1].plot(x, y - y[middle], f"C{k}.", ms=3, label=f"L, {label}")
+        below[1].plot(x, c["adjoint"][n] * (x - x[middle]), f"C{k}-", label="adjoint's slope")
+        below[1].plot(x, c["central_differences"][n] * (x - x[middle]), f"C{k}--", label="central differences' slope")
+    below[1].set(xlabel="mu_s [1]", ylabel="L less its value at mu_s = 0.3", title="Coulomb's law to the letter")
+    below[1].legend(fontsize=8)
+    for k, (label, side) in enumerate(result.touch_down.items()):
+        t = 1e3 * (torch.tensor(side["time_s"]) - side["touch_s"])
+        below[2].plot(t, side["trace"], f"C{k}-", label=f"sensitivity, ramp {label}")
+        below[2].plot(t, side["differences"], f"C{k}.", ms=4, label="central differences")
+    below[2].axvline(0, color="0.7", lw=0.8)
+    below[2].set(xlabel="end of the window after a node touched [ms]", ylabel="dv_C,x / dK_n [m/s per N/m]",
+                 title="Both sides of a touch-down")  # fmt: skip
+    below[2].legend(fontsize=8)
+    return fig
+
+
+def write(result: Result) -> None:
+    """summary.json, table.md and gradient_accuracy.png into the output folder."""
+    out = result.config.out
+    out.mkdir(parents=True, exist_ok=True)
+    made = {"torchsoft": version("torchsoft"), "config": {k: str(v) for k, v in asdict(result.config).items()}}
+    parts = {k: getattr(result, k) for k in ("windows", "coulomb", "refinement", "touch_down", "rest")}
+    (out / "summary.json").write_text(json.dumps({**parts, "made_by": made}, indent=2))
+    (out / "table.md").write_text(table(result) + "\n")
+    figure(result).savefig(out / "gradient_accuracy.png", dpi=150)
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    result = run(tyro.cli(Config, description=__doc__))
+    write(result)
+    print("\n" + table(result))
+    print(f"\nwritten to {result.config.out}")
+
+
+if __name__ == "__main__":
+    main()

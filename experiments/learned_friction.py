@@ -1,0 +1,191 @@
+"""Question: can a friction law that is a neural network be learned inside the simulator?
+
+`MuNetwork` is a user's law: mu(v), an unknown function of the slip speed, is a small network in
+(eta + R) |gamma'| = <E - mu(|gamma'|) F_N>+, solved by a few fixed-point sweeps. It has `slip_rate(E, F_N, R, eta)` and is
+assigned to `model.contact.friction`; nothing else of the model changes. It learns from the disc's motion alone (pose and
+velocity, a few milliseconds after a kick that makes it slip), made by the built-in law
+mu(v) = mu_k + (mu_s - mu_k) / (1 + v / v_s), by backpropagation through `unrolled_solution`.
+
+Command: .venv/bin/python experiments/learned_friction.py [--smoke]
+Expected: the loss falls by more than 100 times in 40 runs of the model, and mu is learned to 0.01 on average over the slip
+speeds that occurred, worst (0.1) at the slowest, which leave the least trace in the motion. Beyond them nothing is known
+and nothing is claimed. About one minute on one core.
+"""
+
+import json
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+import tyro
+from matplotlib.figure import Figure
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from torchsoft import Parameters, SoftGrasp, press, simulate
+from torchsoft.contact import SmoothSlip
+from torchsoft.unrolled import unrolled_solution
+
+SWEEPS = 4
+"""Fixed-point sweeps for mu(v) and v; each shrinks the error by about (mu_s - mu_k) F_N / ((eta + R) v_s), 0.1 here."""
+SCALE = (1e-5, 1e-5, 1e-3, 1e-2, 1e-2, 1.0)
+"""What counts as one unit of misfit: x, y [m], theta [rad], v_x, v_y [m/s], omega [rad/s]."""
+
+
+@dataclass(frozen=True)
+class Config:
+    out: Path = Path("out/learned_friction")
+    evaluations: int = 40
+    """runs of the model that learning may take"""
+    kick: float = 0.3
+    """speed of the disc at the start [m/s]"""
+    step_ms: float = 0.5
+    """step, and spacing of the samples [ms]"""
+    samples: int = 8
+    seed: int = 0
+    smoke: bool = False
+    """a size that takes seconds"""
+
+
+def smoke(config: Config) -> Config:
+    return replace(config, evaluations=9, samples=3)
+
+
+@dataclass(frozen=True)
+class Result:
+    config: Config
+    losses: list[float]
+    slip_speeds: Tensor
+    mu_start: Tensor
+    mu_learned: Tensor
+    mu_true: Tensor
+    seen: tuple[float, float]
+
+
+class MuNetwork(nn.Module):
+    """Friction whose coefficient is a network of the slip speed: mu(v) = 0.5 + 0.4 tanh(net(log(1 + v / v_0)))."""
+
+    def __init__(self, v_0: float = 0.01, width: int = 8) -> None:
+        super().__init__()
+        self.v_0 = v_0
+        last = nn.Linear(width, 1)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+        self.net = nn.Sequential(nn.Linear(1, width), nn.Tanh(), last).double()
+
+    def mu(self, v: Tensor) -> Tensor:
+        """Friction coefficient at the slip speed v (...) [m/s]."""
+        return 0.5 + 0.4 * torch.tanh(self.net(torch.log1p(v[..., None] / self.v_0))[..., 0])
+
+    def slip_rate(self, E: Tensor, F_N: Tensor, R: Tensor, eta: Tensor) -> Tensor:
+        v = torch.zeros_like(E + F_N)
+        for _ in range(SWEEPS):
+            v = (E - self.mu(v) * F_N).clamp(min=0.0) / (eta + R)
+        return v
+
+
+def true_mu(law: SmoothSlip, v: Tensor) -> Tensor:
+    return law.mu_k + (law.mu_s - law.mu_k) / (1 + v / law.v_s)
+
+
+def disc(model: SoftGrasp, y: Tensor) -> Tensor:
+    """(T, 6): pose and velocity of the disc, in units of `SCALE`."""
+    s = model.layout.unpack(y)
+    rows = torch.cat((s.r_C, s.theta[:, None], s.v_C, s.omega[:, None]), -1)
+    return rows / torch.tensor(SCALE, dtype=torch.float64)
+
+
+def run(config: Config) -> Result:
+    config = smoke(config) if config.smoke else config
+    torch.manual_seed(config.seed)
+    law = {"contact.mu_s": 0.8, "contact.mu_k": 0.3, "contact.v_s": 0.05}
+    model = SoftGrasp(Parameters().override({"pad.elements_x": 60, "pad.elements_y": 2, **law}))
+    y0 = press(model, model.settings.scenario.y_Br_grasp).detach()
+    y0[model.layout.slices["v_C"]] = torch.tensor([config.kick, 0.0], dtype=torch.float64)
+    step = 1e-3 * config.step_ms
+    t = step * torch.arange(config.samples + 1, dtype=torch.float64)
+
+    truth = model.contact.friction
+    assert isinstance(truth, SmoothSlip)
+    with torch.no_grad():
+        made = simulate(model, t, y0=y0, step=step)
+        data, graph = disc(model, made.y), model.evaluate(0.0, model.layout.unpack(made.y[1:]))
+        speeds = torch.cat([interface.contact.gamma_dot.abs().flatten() for interface in graph.interfaces.values()])
+    seen = speeds[speeds > 0]
+
+    student = MuNetwork()
+    v = torch.linspace(0.0, 1.3 * float(seen.max()), 100, dtype=torch.float64)
+    with torch.no_grad():
+        start, exact = student.mu(v), true_mu(truth, v)
+    model.requires_grad_(False)
+    model.contact.friction = student
+    optimiser = torch.optim.LBFGS(
+        student.parameters(), max_iter=config.evaluations, max_eval=config.evaluations, line_search_fn="strong_wolfe"
+    )
+    losses: list[float] = []
+    bar = tqdm(total=config.evaluations, desc="learning mu(v)", unit="run")
+
+    def misfit() -> Tensor:
+        optimiser.zero_grad()
+        loss = (disc(model, unrolled_solution(model, y0, t, step=step)) - data).square().mean()
+        loss.backward()
+        losses.append(loss.item())
+        bar.set_postfix(loss=f"{min(losses):.3g}")
+        bar.update()
+        return loss
+
+    optimiser.step(misfit)
+    misfit()  # where it ended
+    bar.close()
+    with torch.no_grad():
+        learned = student.mu(v)
+    return Result(config, losses, v, start, learned, exact, (float(seen.quantile(0.1)), float(seen.max())))
+
+
+def numbers(result: Result) -> dict[str, float]:
+    inside = (result.slip_speeds >= result.seen[0]) & (result.slip_speeds <= result.seen[1])
+    error = (result.mu_learned - result.mu_true).abs()[inside]
+    return {
+        "loss_start": result.losses[0],
+        "loss_end": result.losses[-1],
+        "fall": result.losses[0] / result.losses[-1],
+        "mu_error_max": float(error.max()),
+        "mu_error_mean": float(error.mean()),
+        "mu_error_start_max": float((result.mu_start - result.mu_true).abs()[inside].max()),
+        "slip_from_mm_s": 1e3 * result.seen[0],
+        "slip_to_mm_s": 1e3 * result.seen[1],
+    }
+
+
+def figure(result: Result) -> Figure:
+    """The loss, and the learned friction coefficient beside the true one."""
+    fig = Figure(figsize=(10, 4), layout="constrained")
+    left, right = fig.subplots(1, 2)
+    left.semilogy(result.losses)
+    left.set(xlabel="run of the model", ylabel="mean squared misfit [1]", title="Learning from the disc's motion")
+    mm_s = 1e3 * result.slip_speeds
+    right.axvspan(1e3 * result.seen[0], 1e3 * result.seen[1], color="0.93", label="slip speeds in the data (90 %)")
+    right.plot(mm_s, result.mu_true, "k-", label="truth")
+    right.plot(mm_s, result.mu_start, "C0:", label="before")
+    right.plot(mm_s, result.mu_learned, "C1--", label="learned")
+    right.set(xlabel="slip speed [mm/s]", ylabel="mu [1]", title="Friction coefficient", ylim=(0.0, 1.0))
+    right.legend()
+    return fig
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    result = run(tyro.cli(Config, description=__doc__))
+    out = result.config.out
+    out.mkdir(parents=True, exist_ok=True)
+    summary = {**numbers(result), "made_by": {"torchsoft": version("torchsoft"), "losses": result.losses}}
+    (out / "summary.json").write_text(json.dumps(summary, indent=2))
+    figure(result).savefig(out / "learned_friction.png", dpi=150)
+    for name, value in numbers(result).items():
+        print(f"{name}: {value:.4g}")
+    print(f"written to {out}")
+
+
+if __name__ == "__main__":
+    main()
