@@ -1,0 +1,100 @@
+"""Datasets of trajectories in a zarr store, for torch's `DataLoader` and for xarray."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+import xarray as xr
+import zarr
+import zarr.storage
+from torch import Tensor
+from torch.utils.data import Dataset
+
+
+class Trajectories(Dataset[dict[str, Tensor]]):
+    """Windows of the trajectories of one split, read when they are asked for.
+
+    Item i holds every variable of `variables`, a series as (window, ...), a number of the trajectory as (), SI units as the
+    store says, and `trajectory`, `start`: where it comes from. `window` is a number of samples, the whole run by default;
+    windows of a trajectory begin every `stride` samples, `window` by default. Unfinished shards and failed simulations are
+    left out. The object is small, can be pickled and opens the store in each process for itself.
+
+    Raises `ValueError` for an unknown variable or split, or a window that does not fit.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        variables: Sequence[str],
+        *,
+        split: str | None = None,
+        window: int | None = None,
+        stride: int | None = None,
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        self.url, self.variables, self.dtype, self._group = str(url), tuple(variables), dtype, None
+        for name in self.variables:
+            if name not in self.group or self.dims(name)[0] != "trajectory" or self.array(name).dtype.kind not in "fiu":
+                known = [k for k, a in self.group.arrays() if self.dims(k)[0] == "trajectory" and a.dtype.kind in "fiu"]
+                raise ValueError(f"`variables` has no numbers named {name!r}; known: {', '.join(sorted(known))}")
+        samples = self.array("time").shape[0]
+        self.window = samples if window is None else window
+        if not 1 <= self.window <= samples:
+            raise ValueError(f"`window` must be 1 to {samples} samples, but is {window}")
+        step = self.window if stride is None else stride
+        if step < 1:
+            raise ValueError(f"`stride` must be positive, but is {stride}")
+        self.starts = range(0, samples - self.window + 1, step)
+        self.trajectories = self._usable(split)
+
+    def _usable(self, split: str | None) -> np.ndarray[Any, Any]:
+        """Numbers of the trajectories that are finished, sound and in the split."""
+        splits = np.asarray(self.array("split")[:])
+        done = np.repeat(np.asarray(self.array("done")[:]), self.array("split").chunks[0])[: len(splits)]
+        wanted = (done == 1) & (np.asarray(self.array("failed")[:]) == 0)
+        if split is not None:
+            if split not in ("train", "validation", "test"):
+                raise ValueError(f"`split` must be 'train', 'validation' or 'test', but is {split!r}")
+            wanted &= splits == split
+        return np.flatnonzero(wanted)
+
+    @property
+    def group(self) -> zarr.Group:
+        """The store, opened on first use."""
+        if self._group is None:
+            store: Any = zarr.storage.FsspecStore.from_url(self.url, read_only=True) if "://" in self.url else self.url
+            self._group = zarr.open_group(store, mode="r")
+        return self._group
+
+    def array(self, name: str) -> zarr.Array[Any]:
+        found = self.group[name]
+        assert isinstance(found, zarr.Array)
+        return found
+
+    def dims(self, name: str) -> tuple[str | None, ...]:
+        """Names of a variable's dimensions."""
+        return tuple(getattr(self.array(name).metadata, "dimension_names", None) or (None,))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_group": None}
+
+    def __len__(self) -> int:
+        return len(self.trajectories) * len(self.starts)
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"index {index} is out of range for {len(self)} windows")
+        which, window = divmod(index % len(self), len(self.starts))
+        trajectory, start = int(self.trajectories[which]), self.starts[window]
+        item = {"trajectory": torch.tensor(trajectory), "start": torch.tensor(start)}
+        for name in self.variables:
+            array = self.array(name)
+            place = (trajectory, slice(start, start + self.window)) if array.ndim > 1 else trajectory
+            item[name] = torch.from_numpy(np.array(array[place])).to(self.dtype)
+        return item
+
+
+def open_dataset(url: str) -> xr.Dataset:
+    """The whole store, lazily, with named dimensions and units."""
+    return xr.open_zarr(url)
