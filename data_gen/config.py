@@ -234,17 +234,17 @@ class Config(Table):
                 raise ValueError(
                     f"kinds.{i}.travel reaches {travel.high} m and leaves the pad, which is {length} m long"
                 )
-        lows = {name: r.low for name, r in self.parameters.items()}
         for name, r in self.parameters.items():
             for value in (r.low, r.high):
                 if name == RATIO and not 0 <= value <= 1:
                     raise ValueError(f"parameters.{name} must lie in [0, 1], but reaches {value}")
-        pairs = [(a, b) for a, b in itertools.combinations_with_replacement(self.parameters, 2)]
+        ratio = {RATIO: self.parameters[RATIO].low} if RATIO in self.parameters else {}
+        pairs = sorted(itertools.combinations_with_replacement(self.parameters, 2), key=lambda pair: pair[0] != pair[1])
         for a, b in pairs or [("", "")]:
             for u, v, depth in itertools.product((0, 1), (0, 1), depths):
                 ends = {name: self.parameters[name].at(w) for name, w in ((a, u), (b, v)) if name}
                 try:
-                    self.physics(lows | ends, depth)
+                    self.physics(ratio | ends, depth)
                 except ValueError as error:
                     said = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
                     where = ", ".join(f"parameters.{name} = {x:g}" for name, x in ends.items())

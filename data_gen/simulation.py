@@ -33,7 +33,7 @@ def simulate_task(config: Config, task: Task) -> Row:
     t = torch.arange(config.samples, dtype=torch.float64) * config.sample_interval
     try:
         model = SoftGrasp(task.parameters)
-        y0 = torch.round(rest(model).detach(), decimals=PLACE)
+        y0 = torch.round(rest(model).detach(), decimals=PLACE) + 0.0  # no negative zeros
         force = round(grasp_force(config, model, y0), FORCE)
         start = model.layout.unpack(y0)
         model.reference = excitation(config, task, (float(start.r_C[0]), float(start.r_Br[1])), force)
