@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torchsoft.contact import Contact, ContactState, Frame, contact_transformer, moving_frame
+from torchsoft.contact import Contact, ContactState, Frame, contact_transformer, cross, moving_frame
 from torchsoft.control import Controllers, Reference, hold
 from torchsoft.multibond import Block, Junction, Port, Transformer, identity, net_efforts
 from torchsoft.pad import Material, Pad, build_pads
@@ -175,7 +175,7 @@ class SoftGrasp(nn.Module):
         if which == "L":
             blocks["ground"] = Block(identity(2, pad.positions, -1.0))
         else:
-            spin = torch.stack((-pad.positions[:, 1], pad.positions[:, 0]), -1)[..., None]
+            spin = cross(pad.positions)[..., None]
             blocks["bracket"] = Block(identity(2, pad.positions, -1.0))
             blocks["bracket_spin"] = Block(-spin)  # (35)
         transformer = Transformer(blocks)
@@ -214,8 +214,7 @@ class SoftGrasp(nn.Module):
         C_aa = C_columns[dofs]
         R = torch.stack((part.n, part.t), -2)
         base = state.v_C - state.v_Br if which == "U" else state.v_C
-        lever = torch.stack((-part.d[..., 1], part.d[..., 0]), -1) * state.omega[..., None, None]
-        gliding = (R @ (base[..., None, :] + lever)[..., None])[..., 0]
+        gliding = (R @ (base[..., None, :] + state.omega[..., None, None] * cross(part.d))[..., None])[..., 0]
 
         def force(u_dot: Tensor) -> Tensor:
             flow = gliding - (R @ u_dot[..., None])[..., 0]

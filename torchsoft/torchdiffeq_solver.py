@@ -39,9 +39,7 @@ class TorchdiffeqSolver:
     """
 
     def __init__(self, func: Any, y0: Tensor, rtol: float, atol: float, norm: Any = None, **options: Any) -> None:
-        found = func
-        while hasattr(found, "base_func"):
-            found = found.base_func
+        found = _innermost(func)
         augmented = {} if isinstance(found, SoftGrasp) or not inspect.isfunction(found) else _closure(found)
         model = _innermost(augmented.get("func", found))
         if not isinstance(model, SoftGrasp):
