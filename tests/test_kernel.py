@@ -88,10 +88,10 @@ def test_node_law_and_its_jacobian_equal_the_module(friction: str, ah: float) ->
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_stage_rates_equal_forward(fidelity: str, seed: int) -> None:
+@pytest.mark.parametrize(("seed", "senses"), [(0, "disc"), (1, "disc"), (2, "bracket")])
+def test_stage_rates_equal_forward(fidelity: str, seed: int, senses: str) -> None:
     """k of a solved stage is f(t, y + a h k): pads, contact, friction, disc, bracket and control all at once."""
-    model = coarse(pad__fidelity=fidelity)
+    model = coarse(pad__fidelity=fidelity, control__senses=senses)
     stepper = ImplicitStepper(model, tolerance=1e-9)
     y = random_state(model, seed)
     state, h = model.layout.unpack(y), 1e-3

@@ -148,3 +148,9 @@ def test_topology_names_the_papers_elements() -> None:
     signals = [(a, b) for a, b, data in graph.edges(data=True) if data["activated"]]
     assert signals == [("disc", "control_x")]  # the non-collocated loop: senses the disc, pushes the bracket
     assert "style=dashed" in to_dot(graph)
+
+
+def test_sensing_the_bracket_makes_the_horizontal_loop_collocated() -> None:
+    model = coarse(control__senses="bracket")
+    graph = topology(model.evaluate(0.0, model.layout.unpack(random_state(model, 0))).ports, model.junctions)
+    assert not [edge for *edge, data in graph.edges(data=True) if data["activated"]]

@@ -186,8 +186,8 @@ def test_table_tells_published_from_assumed() -> None:
     published = {name for name, row in table.items() if row["source"] == "published"}
     assert published == {
         "pad.length", "pad.height", "disc.radius", "control.K_81", "control.R_80", "control.K_98", "control.R_99",
-        "scenario.x_C0", "scenario.y_Br_grasp", "scenario.grasp_time", "scenario.travel", "scenario.roll_time",
-        "scenario.hold_time", "scenario.rest_time",
+        "control.senses", "scenario.x_C0", "scenario.y_Br_grasp", "scenario.grasp_time", "scenario.travel",
+        "scenario.roll_time", "scenario.hold_time", "scenario.rest_time",
     }  # fmt: skip
     assert {row["source"] for row in table.values()} == {"published", "assumed"}
     assert table["disc.radius"] == {

@@ -70,10 +70,12 @@ def hold(x: float, y: float, F_y: float = 0.0) -> Reference:
 
 
 class Controllers(nn.Module):
-    """The PD loops: the vertical one about the bracket, the horizontal one about the disc, both acting on the bracket."""
+    """The PD loops: the vertical one about the bracket, the horizontal one about the disc (or, by `senses`, about the bracket
+    as well), both acting on the bracket."""
 
     def __init__(self, p: ControlParameters) -> None:
         super().__init__()
+        self.senses = p.senses
         self.K_81, self.R_80, self.K_98, self.R_99 = (
             nn.Parameter(torch.tensor(value, dtype=torch.float64)) for value in (p.K_81, p.R_80, p.K_98, p.R_99)
         )
@@ -82,5 +84,6 @@ class Controllers(nn.Module):
         """Forces F_x, F_y [N] on the bracket, shape (...)."""
         E_v, E_v_dot = want.y - r_Br[..., 1], want.y_dot - v_Br[..., 1]  # (31)
         F_y = self.K_98 * E_v + self.R_99 * E_v_dot + want.F_y  # (32) and the feed-forward
-        E_h, E_h_dot = want.x - r_C[..., 0], want.x_dot - v_C[..., 0]  # (33)
+        r, v = (r_C, v_C) if self.senses == "disc" else (r_Br, v_Br)
+        E_h, E_h_dot = want.x - r[..., 0], want.x_dot - v[..., 0]  # (33)
         return self.K_81 * E_h + self.R_80 * E_h_dot, F_y  # (34)

@@ -37,6 +37,7 @@ def constants(m: SoftGrasp) -> Constants:
         R_80=control.R_80.item(),
         K_98=control.K_98.item(),
         R_99=control.R_99.item(),
+        sensed=0 if control.senses == "disc" else 3,
         pad_length=m.settings.pad.length,
     )
 

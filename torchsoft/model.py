@@ -190,8 +190,9 @@ class SoftGrasp(nn.Module):
         when = torch.as_tensor(t, dtype=torch.float64).expand(state.theta.shape)
         F_x, F_y = self.controllers(self.reference(when), state.r_C, state.v_C, state.r_Br, state.v_Br)
         axis = {i: Transformer({"bracket": Block(identity(2, F_x)[:, i : i + 1])}) for i in (0, 1)}
+        sensed = ("disc",) if self.controllers.senses == "disc" else ()
         return {
-            "control_x": Port(axis[0], F_x[..., None, None], ("C: K_81^-1", "R: R_80"), True, senses=("disc",)),
+            "control_x": Port(axis[0], F_x[..., None, None], ("C: K_81^-1", "R: R_80"), True, senses=sensed),
             "control_y": Port(axis[1], F_y[..., None, None], ("C: K_98^-1", "R: R_99", "Se: F_y"), True),
         }
 

@@ -87,6 +87,9 @@ class ControlParameters(Group):
     R_80: float = quantity(441.7149, "N.s/m", "published", "horizontal loop, derivative gain, Eq. 34", ge=0)
     K_98: float = quantity(1.2e5, "N/m", "published", "vertical loop, proportional gain, Eq. 32", ge=0)
     R_99: float = quantity(441.7149, "N.s/m", "published", "vertical loop, derivative gain, Eq. 32", ge=0)
+    senses: Literal["disc", "bracket"] = quantity(
+        "disc", "1", "published", "whose x the horizontal loop measures; the bracket's makes the loop collocated"
+    )
 
 
 class ScenarioParameters(Group):

@@ -62,7 +62,7 @@ def stage_adjoint(
     for r, mass in enumerate((c.m_C, c.m_C, c.I_C, c.m_Br, c.m_Br)):
         rigid[r, 0] = bars.V[r] + ah * bars.q[r]
         rigid[r, 1 + r] = -mass / ah
-    rigid[0, 4] -= c.K_81 * ah + c.R_80
+    rigid[c.sensed, 4] -= c.K_81 * ah + c.R_80
     rigid[4, 5] -= c.K_98 * ah + c.R_99
 
     first_dof, first_node = 0, 0
@@ -173,7 +173,7 @@ def stage_adjoint(
             u_bar[dof] -= zeta[dof]
         first_dof += u_bar.size
         first_node += pad.surface.size
-    bars.q[0] -= c.K_81 * nu[3, 0]
+    bars.q[c.sensed] -= c.K_81 * nu[3, 0]
     bars.q[4] -= c.K_98 * nu[4, 0]
     for r, mass in enumerate((c.m_C, c.m_C, c.I_C, c.m_Br, c.m_Br)):
         bars.V[r] = mass * nu[r, 0] / ah

@@ -18,7 +18,8 @@ Array = NDArray[np.float64]
 
 
 class Constants(NamedTuple):
-    """Scalars of the model, SI units; `coulomb` selects Eq. 12-13 to the letter."""
+    """Scalars of the model, SI units; `coulomb` selects Eq. 12-13 to the letter, `sensed` is the place in q of the coordinate
+    that the horizontal loop measures."""
 
     K_n: float
     R_n: float
@@ -40,6 +41,7 @@ class Constants(NamedTuple):
     R_80: float
     K_98: float
     R_99: float
+    sensed: int
     pad_length: float
 
 

@@ -155,7 +155,7 @@ def run(
             powers[:] = 0.0
             for p in range(2):
                 moment = finish_pad(pads[p], states[p], works[p], q, V, ah, c, powers, p)
-            F_x = c.K_81 * (want[0] - q[0] - ah * V[0]) + c.R_80 * (want[1] - V[0])
+            F_x = c.K_81 * (want[0] - q[c.sensed] - ah * V[c.sensed]) + c.R_80 * (want[1] - V[c.sensed])
             F_y = c.K_98 * (want[2] - q[4] - ah * V[4]) + c.R_99 * (want[3] - V[4]) + want[4]
             powers[4], powers[5], powers[6] = F_x * V[3], F_y * V[4], -c.m_C * c.gravity * V[1]
             powers[7] = max(powers[4], 0.0) + max(powers[5], 0.0) + max(powers[6], 0.0)

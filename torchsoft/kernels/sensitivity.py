@@ -58,10 +58,10 @@ def stage_tangent(
         rigid[r, r] = -mass / ah
         for k in range(n_dir):
             rigid[r, 5 + k] = mass / ah * x.V[r, k] + explicit.load[row, r, k]
-    rigid[3, 0] -= c.K_81 * ah + c.R_80
+    rigid[3, c.sensed] -= c.K_81 * ah + c.R_80
     rigid[4, 4] -= c.K_98 * ah + c.R_99
     for k in range(n_dir):
-        rigid[3, 5 + k] -= c.K_81 * x.q[0, k]
+        rigid[3, 5 + k] -= c.K_81 * x.q[c.sensed, k]
         rigid[4, 5 + k] -= c.K_98 * x.q[4, k]
 
     du_dots = np.empty_like(x.u)

@@ -223,8 +223,8 @@ def solve_stage(
             rigid[r, 0] = mass * V_star[r] / ah
             rigid[r, 1 + r] = -mass / ah
         rigid[1, 0] -= c.m_C * c.gravity  # (17)
-        rigid[3, 0] += c.K_81 * (want[0] - q[0]) + c.R_80 * want[1]  # (34)
-        rigid[3, 1] -= c.K_81 * ah + c.R_80
+        rigid[3, 0] += c.K_81 * (want[0] - q[c.sensed]) + c.R_80 * want[1]  # (34)
+        rigid[3, 1 + c.sensed] -= c.K_81 * ah + c.R_80
         rigid[4, 0] += c.K_98 * (want[2] - q[4]) + c.R_99 * want[3] + want[4]  # (32)
         rigid[4, 5] -= c.K_98 * ah + c.R_99
         if pads[1].M.size > 0:
