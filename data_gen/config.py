@@ -6,10 +6,11 @@ import math
 import tomllib
 import warnings
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
+from torchsoft.excitation import Table
 from torchsoft.parameters import Parameters
 
 RATIO = "contact.mu_k/contact.mu_s"
@@ -17,12 +18,6 @@ RATIO = "contact.mu_k/contact.mu_s"
 
 SHAPING = ("pad.elements_x", "pad.elements_y", "pad.length", "pad.fidelity", "pad.enclosed", "scenario.y_Br_grasp")
 """Parameters that may not differ between trajectories: the mesh is common, and the grasp has a range of its own."""
-
-
-class Table(BaseModel):
-    """A frozen table; unknown keys and non-finite numbers are errors."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class Range(Table):
@@ -57,28 +52,35 @@ class PositiveRange(Range):
         return self
 
 
-class SlowRoll(Table):
+class Drawn(Table):
+    """A kind of motion, drawn as often as `weight` says; `motion` is its name in `torchsoft.excitation`, its own by default."""
+
+    kind: str
+    weight: float = Field(1.0, gt=0)
+    motion: ClassVar[str | None] = None
+    sets: ClassVar[dict[str, Any]] = {}
+    """parameters that this kind needs"""
+
+
+class SlowRoll(Drawn):
     """Out by `travel` [m], to either side, and rest there."""
 
     kind: Literal["slow_roll"] = "slow_roll"
-    weight: float = Field(1.0, gt=0)
     travel: PositiveRange = PositiveRange(low=5e-3, high=20e-3)
 
 
-class Strokes(Table):
+class Strokes(Drawn):
     """There and back by `travel` [m], `stroke_time` [s] each way, until the end."""
 
     kind: Literal["strokes"] = "strokes"
-    weight: float = Field(1.0, gt=0)
     travel: PositiveRange = PositiveRange(low=5e-3, high=15e-3)
     stroke_time: PositiveRange = PositiveRange(low=0.4, high=1.0)
 
 
-class MultiSine(Table):
+class MultiSine(Drawn):
     """Sums of `components` sines of random phase in x and y; amplitudes [m] are of the sum's peak at most."""
 
     kind: Literal["multi_sine"] = "multi_sine"
-    weight: float = Field(1.0, gt=0)
     amplitude_x: PositiveRange = PositiveRange(low=1e-3, high=4e-3)
     amplitude_y: PositiveRange = PositiveRange(low=5e-5, high=3e-4)
     frequency: PositiveRange = PositiveRange(low=0.5, high=8.0, scale="log")
@@ -86,28 +88,38 @@ class MultiSine(Table):
     components: int = Field(5, ge=1, le=50)
 
 
-class Chirp(Table):
+class Chirp(Drawn):
     """Sweeps in x and y from `start` to `end` [Hz]; amplitudes in m."""
 
     kind: Literal["chirp"] = "chirp"
-    weight: float = Field(1.0, gt=0)
     amplitude_x: PositiveRange = PositiveRange(low=5e-4, high=2e-3)
     amplitude_y: PositiveRange = PositiveRange(low=5e-5, high=2e-4)
     start: PositiveRange = PositiveRange(low=0.2, high=0.5)
     end: PositiveRange = PositiveRange(low=4.0, high=10.0)
 
 
-class Press(Table):
+class Press(Drawn):
     """The bracket's height modulated by `amplitude` [m] at `frequency` [Hz] while the disc rolls by `travel` [m]."""
 
     kind: Literal["press"] = "press"
-    weight: float = Field(1.0, gt=0)
     amplitude: PositiveRange = PositiveRange(low=5e-5, high=4e-4)
     frequency: PositiveRange = PositiveRange(low=1.0, high=5.0)
     travel: PositiveRange = PositiveRange(low=1e-3, high=10e-3)
 
 
-Kind = SlowRoll | Strokes | MultiSine | Chirp | Press
+class Jerk(Drawn):
+    """Forced slip: strokes of the bracket, whose own x the horizontal loop measures, over a disc grasped lightly, to `depth`
+    [m] in place of the common depth."""
+
+    kind: Literal["jerk"] = "jerk"
+    motion: ClassVar[str] = "strokes"
+    sets: ClassVar[dict[str, Any]] = {"control.senses": "bracket"}
+    depth: PositiveRange = PositiveRange(low=2e-4, high=5e-4)
+    travel: PositiveRange = PositiveRange(low=20e-3, high=40e-3)
+    stroke_time: PositiveRange = PositiveRange(low=0.2, high=0.4)
+
+
+Kind = SlowRoll | Strokes | MultiSine | Chirp | Press | Jerk
 
 
 def ranges(kind: Kind) -> dict[str, Range]:
@@ -160,9 +172,9 @@ class Config(Table):
     grasp_depth: PositiveRange = PositiveRange(low=1.0e-3, high=1.6e-3)
     """compression of both pads together [m]"""
     splits: Fractions = Fractions(train=0.7, validation=0.15)
-    fixed: dict[str, Any] = {}
+    fixed: dict[str, Any] = Field(default_factory=dict)
     """parameters that differ from their defaults in every trajectory"""
-    parameters: dict[str, Range] = {}
+    parameters: dict[str, Range] = Field(default_factory=dict)
     kinds: tuple[Kind, ...] = Field(min_length=1)
 
     @property
@@ -179,7 +191,7 @@ class Config(Table):
         """Of everything in the file."""
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
 
-    def physics(self, values: dict[str, float], grasp_depth: float) -> Parameters:
+    def physics(self, values: dict[str, Any], grasp_depth: float) -> Parameters:
         """Parameters of one trajectory: defaults, then `fixed`, then `values`, the bracket lowered by `grasp_depth`."""
         tree = dict(self.fixed) | values
         ratio = tree.pop(RATIO, None)

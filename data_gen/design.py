@@ -48,9 +48,10 @@ def task(config: Config, index: int, u: NDArray[np.floating]) -> Task:
     depth = config.grasp_depth.at(float(u[n]))
     kind = choose(config.kinds, float(u[n + 1]))
     excitation = {name: r.at(float(x)) for (name, r), x in zip(ranges(kind).items(), u[n + 2 :])}
+    depth = excitation.pop("depth", depth)  # a kind may have a range of its own
     return Task(
         index,
-        config.physics(sampled, depth),
+        config.physics(sampled | kind.sets, depth),
         sampled,
         depth,
         kind,

@@ -9,7 +9,7 @@ from data_gen.config import RATIO, Config
 from data_gen.design import Task
 from data_gen.excitation import excitation
 from data_gen.schema import STORES, sizes, variables
-from torchsoft.equilibrium import press, rest
+from torchsoft.excitation import grasp_load, reference, start
 from torchsoft.implicit import SimulationFailed
 from torchsoft.kernels.run import DISSIPATED, SUPPLIED
 from torchsoft.model import SoftGrasp
@@ -33,10 +33,12 @@ def simulate_task(config: Config, task: Task) -> Row:
     t = torch.arange(config.samples, dtype=torch.float64) * config.sample_interval
     try:
         model = SoftGrasp(task.parameters)
-        y0 = torch.round(rest(model).detach(), decimals=PLACE) + 0.0  # no negative zeros
-        force = round(grasp_force(config, model, y0), FORCE)
-        start = model.layout.unpack(y0)
-        model.reference = excitation(config, task, (float(start.r_C[0]), float(start.r_Br[1])), force)
+        y0 = torch.round(start(model).detach(), decimals=PLACE) + 0.0  # no negative zeros
+        force = round(
+            find_grasp_force(model, y0, config.step) if config.feed_forward == "found" else grasp_load(model), FORCE
+        )
+        y_Br = float(model.layout.unpack(y0).r_Br[1])
+        model.reference = reference(excitation(config, task), model, y_Br, force)
         run = simulate(model, t, y0=y0, step=config.step)
     except SimulationFailed as failure:
         stats = failure.trajectory.stats if failure.trajectory is not None else None
@@ -45,16 +47,6 @@ def simulate_task(config: Config, task: Task) -> Row:
     except (np.linalg.LinAlgError, RuntimeError, ValueError) as failure:
         return out | {"failed": 1, "reason": f"{type(failure).__name__}: {failure}"}
     return out | series(model, run) | {"grasp_force": force}
-
-
-def grasp_force(config: Config, model: SoftGrasp, y0: torch.Tensor) -> float:
-    """The force [N] that is fed forward to hold the grasp."""
-    if config.feed_forward == "found":
-        return find_grasp_force(model, y0, config.step)
-    state = model.layout.unpack(press(model, model.settings.scenario.y_Br_grasp).detach())
-    with torch.no_grad():
-        port = model.evaluate(0.0, state).ports["pad_U"]
-        return -float(port.transformer.effort(port.effort, model.junctions)["bracket"][..., 1].sum())
 
 
 def blank(config: Config) -> Row:

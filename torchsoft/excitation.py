@@ -1,0 +1,223 @@
+"""Motions that make parameters visible: a grasp of a given depth, then strokes, sines, chirps, presses or jerks.
+
+An `Excitation` is plain validated data, so that it can stand in a TOML file; `begin` turns it into a model at rest with the
+reference that its controllers follow.
+"""
+
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor
+
+from torchsoft.control import Profile, Reference
+from torchsoft.equilibrium import press, rest
+from torchsoft.model import SoftGrasp
+from torchsoft.parameters import Parameters
+
+FADE = 0.15
+"""Time [s] over which waves come and go."""
+
+
+class Table(BaseModel):
+    """A frozen table; unknown keys and non-finite numbers are errors."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class Roll(Table):
+    """By `travel` [m] to the right over the whole time of the motion."""
+
+    kind: Literal["slow_roll"] = "slow_roll"
+    travel: float = 10e-3
+
+
+class Strokes(Table):
+    """There and back by `travel` [m], `stroke_time` [s] each way, until the end."""
+
+    kind: Literal["strokes"] = "strokes"
+    travel: float = 10e-3
+    stroke_time: float = Field(1.0, gt=0)
+
+
+class MultiSine(Table):
+    """Sums of `components` sines in x and y, one in each part of the band `frequency` [Hz]; amplitudes [m] are of the
+    sum's peak at most. Phases, and frequencies within their part, come from `seed`."""
+
+    kind: Literal["multi_sine"] = "multi_sine"
+    amplitude_x: float = 4e-3
+    amplitude_y: float = 2e-4
+    frequency: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = (0.5, 8.0)
+    components: int = Field(5, ge=1, le=50)
+    seed: int = Field(0, ge=0)
+
+
+class Chirp(Table):
+    """Sweeps in x and y from `start` to `end` [Hz], of amplitudes in m."""
+
+    kind: Literal["chirp"] = "chirp"
+    amplitude_x: float = 1e-3
+    amplitude_y: float = 1e-4
+    start: float = Field(0.3, gt=0)
+    end: float = Field(8.0, gt=0)
+
+
+class Press(Table):
+    """The bracket's height modulated by `amplitude` [m] at `frequency` [Hz] while the disc rolls by `travel` [m]."""
+
+    kind: Literal["press"] = "press"
+    amplitude: float = 2e-4
+    frequency: float = Field(2.0, gt=0)
+    travel: float = 5e-3
+
+
+Motion = Annotated[Roll | Strokes | MultiSine | Chirp | Press, Field(discriminator="kind")]
+
+
+class Excitation(Table):
+    """A grasp that compresses both pads together by `depth` [m] within `grasp_time` [s], a pause of `settle` [s], then the
+    motion, until `duration` [s].
+
+    `senses` is whose x the horizontal loop measures: with "bracket" the disc may slip freely, which a light grasp and hard
+    strokes make it do ("forced slip"). `x_C0` [m] is off the nodes and the middle on purpose: an exactly symmetric start
+    breaks on rounding.
+    """
+
+    motion: Motion
+    duration: float = Field(2.0, gt=0)
+    depth: float = Field(1.5e-3, gt=0)
+    senses: Literal["disc", "bracket"] = "disc"
+    grasp_time: float = Field(0.375, gt=0)
+    settle: float = Field(0.125, ge=0)
+    x_C0: float = 60.3e-3
+
+    def settings(self, p: Parameters) -> Parameters:
+        """The parameters p with this excitation's grasp. Raises `ValueError` for a grasp that is not possible."""
+        return p.override(
+            {
+                "scenario.y_Br_grasp": apart(p) - self.depth,
+                "scenario.grasp_time": self.grasp_time,
+                "scenario.travel": 0.0,
+                "scenario.x_C0": self.x_C0,
+                "control.senses": self.senses,
+            }
+        )
+
+
+class Begun(NamedTuple):
+    """A model with its reference, and its state (size,) at the start."""
+
+    model: SoftGrasp
+    y0: Tensor
+
+
+def apart(p: Parameters) -> float:
+    """Height [m] of the bracket over the ground at which undeformed pads just touch an undeformed disc."""
+    return 2 * (p.pad.height + p.disc.radius) + p.bracket.cm_height
+
+
+def start(model: SoftGrasp) -> Tensor:
+    """State (size,): the disc at rest under its weight, the bracket at `apart`, so that its pad is clear of the disc by
+    what the disc has sunk in. Differentiable in the model's parameters; the bracket's place does not depend on them."""
+    state = model.layout.unpack(rest(model))
+    return model.layout.pack(
+        state._replace(r_Br=torch.stack((state.r_C[0], torch.tensor(apart(model.settings)).double())))
+    )
+
+
+def grasp_load(model: SoftGrasp) -> float:
+    """Force [N] that holds the grasp down, of frictionless statics."""
+    state = model.layout.unpack(press(model, model.settings.scenario.y_Br_grasp).detach())
+    with torch.no_grad():
+        port = model.evaluate(0.0, state).ports["pad_U"]
+        return -float(port.transformer.effort(port.effort, model.junctions)["bracket"][..., 1].sum())
+
+
+def begin(excitation: Excitation, p: Parameters, *, grasp_force: float | None = None) -> Begun:
+    """A model with the parameters p about to be excited; `grasp_force` [N] is fed forward, that of `grasp_load` by default.
+
+    Raises `ValueError` for an impossible grasp, `NoEquilibrium` where the disc finds no rest.
+    """
+    model = SoftGrasp(excitation.settings(p))
+    y0 = start(model).detach()
+    force = grasp_load(model) if grasp_force is None else grasp_force
+    model.reference = reference(excitation, model, float(model.layout.unpack(y0).r_Br[1]), force)
+    return Begun(model, y0)
+
+
+def reference(excitation: Excitation, model: SoftGrasp, y_Br: float, grasp_force: float) -> Reference:
+    """The grasp from the height y_Br [m] with `grasp_force` [N] fed forward, then the motion."""
+    p = model.settings.scenario
+    since, until = p.grasp_time + excitation.settle, excitation.duration
+    still, grasp = ([0.0], [p.x_C0]), ([0.0, p.grasp_time], [y_Br, p.y_Br_grasp])
+    x, y = moved(excitation.motion, still, grasp, since, until)
+    return Reference(x, y, Profile([0.0, p.grasp_time], [0.0, -grasp_force]))
+
+
+Knots = tuple[list[float], list[float]]
+"""Times [s] and values."""
+
+
+def moved(motion: Motion, still: Knots, grasp: Knots, since: float, until: float) -> tuple[Profile, Profile]:
+    """x_d and y_Br,d of a motion from `since` to `until` [s], on top of a still x and the grasp."""
+    x_0 = still[1][-1]
+    match motion:
+        case Roll():
+            return Profile([since, until], [x_0, x_0 + motion.travel]), Profile(*grasp)
+        case Strokes():
+            count = max(1, int((until - since) / motion.stroke_time + 1e-9))
+            times = [since + i * motion.stroke_time for i in range(count + 1)]
+            return Profile(times, [x_0 + (i % 2) * motion.travel for i in range(count + 1)]), Profile(*grasp)
+        case MultiSine():
+            rng, n = np.random.default_rng(motion.seed), motion.components
+            low, high = np.log(motion.frequency)
+
+            def sines(amplitude: float) -> Wave:
+                frequency = np.exp(low + (np.arange(n) + rng.random(n)) / n * (high - low))
+                return wave(np.full(n, amplitude / n), frequency, np.zeros(n), rng.uniform(0, 2 * np.pi, n))
+
+            waves = sines(motion.amplitude_x), sines(motion.amplitude_y)
+            return Waves(still, since, until, waves[0]), Waves(grasp, since, until, waves[1])
+        case Chirp():
+            sweep = (motion.end - motion.start) / (until - since)
+            waves = [wave(a, motion.start, sweep, 0.0) for a in (motion.amplitude_x, motion.amplitude_y)]
+            return Waves(still, since, until, waves[0]), Waves(grasp, since, until, waves[1])
+        case Press():
+            x = Profile([since, until], [x_0, x_0 + motion.travel])
+            return x, Waves(grasp, since, until, wave(motion.amplitude, motion.frequency, 0.0, 0.0))
+
+
+class Wave(NamedTuple):
+    """Amplitudes [m], frequencies [Hz], sweeps [Hz/s] and phases [rad], each (components,)."""
+
+    amplitude: Tensor
+    frequency: Tensor
+    sweep: Tensor
+    phase: Tensor
+
+
+def wave(*columns: object) -> Wave:
+    """A `Wave` of arrays or numbers."""
+    return Wave(*(torch.from_numpy(np.atleast_1d(np.asarray(column, dtype=np.float64))) for column in columns))
+
+
+class Waves(Profile):
+    """A profile with sines on top: sum of a sin(phi + 2 pi (f tau + r tau^2 / 2)), tau [s] being the time since `since`;
+    faded in from there and out until `until` [s]."""
+
+    def __init__(self, profile: Knots, since: float, until: float, wave: Wave) -> None:
+        super().__init__(*profile)
+        self.since, self.wave = since, wave
+        self.window = Profile([since, since + FADE, until - FADE, until], [0.0, 1.0, 1.0, 0.0])
+
+    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """Value and rate at t (...)."""
+        value, rate = super().forward(t)
+        w, w_dot = self.window(t)
+        tau = (t - self.since)[..., None]
+        amplitude, frequency, sweep, phase = self.wave
+        angle = phase + 2 * torch.pi * (frequency * tau + 0.5 * sweep * tau**2)
+        angle_dot = 2 * torch.pi * (frequency + sweep * tau)
+        wave, wave_dot = (amplitude * angle.sin()).sum(-1), (amplitude * angle.cos() * angle_dot).sum(-1)
+        return value + w * wave, rate + w_dot * wave + w * wave_dot
