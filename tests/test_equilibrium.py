@@ -83,6 +83,16 @@ def test_a_weightless_disc_rests_without_sinking() -> None:
     assert float(state.u_L.abs().max()) < 1e-12
 
 
+@torch.no_grad()
+@pytest.mark.parametrize("x_C0", [60.7e-3, 61e-3])
+def test_a_weightless_disc_between_nodes_rests_on_them(x_C0: float) -> None:
+    """Nothing need press it: Newton's matrix is singular there, and any height clear of the nodes is an equilibrium."""
+    model = build(scenario__gravity=0.0, scenario__x_C0=x_C0)
+    state = model.layout.unpack(rest(model))
+    assert -1e-7 < float(model.frame("L", state).g.max()) <= 1e-15  # measured: -5e-9 m at 61 mm
+    assert float(state.u_L.abs().max()) < 1e-12
+
+
 def mirrored(u: Tensor) -> Tensor:
     """Surface displacements (surface, 2) as seen in a mirror that stands on the disc's centre line."""
     return u.flip(0) * torch.tensor([-1.0, 1.0], dtype=u.dtype)

@@ -3,9 +3,8 @@
 import torch
 from torch import Tensor
 
-from torchsoft.contact import normal_force
+from torchsoft.contact import moving_frame, normal_force
 from torchsoft.model import SoftGrasp
-from torchsoft.pad import Pad
 from torchsoft.state import State
 
 RESIDUAL = 1e-13
@@ -47,63 +46,48 @@ def _solve(model: SoftGrasp, bracket_height: float | None) -> State:
     x, height = torch.tensor(p.scenario.x_C0, dtype=torch.float64), p.pad.height
     zero = torch.zeros((), dtype=torch.float64)
     y_Br = zero + (bracket_height if bracket_height is not None else 10 * (p.disc.radius + height))
-    names = "L" if bracket_height is None else "LU"
-    reach = min(p.disc.radius, 3 * (p.disc.radius * height) ** 0.5)
-    near = {
-        k: torch.nonzero(
-            (model.pads[k].positions[model.pads[k].surface, 0] + (0 if k == "L" else p.scenario.x_C0) - x).abs() < reach
-        )[:, 0]
-        for k in names
-    }
-    sizes = [2 * len(near[k]) for k in names]
-    weight = torch.stack((zero, -model.m_C * model.gravity))
+    bases = {"L": torch.zeros(2, dtype=torch.float64)} | (
+        {} if bracket_height is None else {"U": torch.stack((x, y_Br))}
+    )
+    weight, reach = model.m_C * model.gravity, min(p.disc.radius, 3 * (p.disc.radius * height) ** 0.5)
+    sides = [_Side(model, k, base, x, reach) for k, base in bases.items()]
+    soft = sides[0].C.detach().diagonal().max()
+    sizes = [2 * len(side.near) for side in sides]
 
-    def forces(z: Tensor) -> tuple[dict[str, Tensor], State]:
-        """Frictionless force on each near node, (near, 2), and the state it belongs to (near nodes only displaced)."""
-        blank = model.layout.unpack(torch.zeros(model.layout.size, dtype=torch.float64))
-        displaced = dict(zip(names, (part.unflatten(-1, (-1, 2)) for part in z[1:].split(sizes))))
-        state = blank._replace(r_C=torch.stack((x, z[0])), r_Br=torch.stack((x, y_Br)))
-        for k in names:
-            nodes = model.pads[k].surface[near[k]]
-            u = torch.zeros_like(getattr(state, f"u_{k}")).index_add(0, nodes, displaced[k])
-            state = state._replace(**{f"u_{k}": u})
-        out = {}
-        for k in names:
-            frame, share = model.frame(k, state, near[k]), model.share(model.pads[k])[near[k]]
-            F_N = normal_force(frame.g, zero, zero, share * model.contact.K_n, zero)
-            out[k] = F_N[:, None] * frame.n
-        return out, state
+    def residual(z: Tensor, forces: list[Tensor]) -> Tensor:
+        """Of the disc's balance, by the compliance it meets, and of u = C f on each side [m]."""
+        balance = -weight - sum(f[:, 1].sum() for f in forces)
+        parts = (u - side.C @ f.flatten() for side, f, u in zip(sides, forces, z[1:].split(sizes)))
+        return torch.cat([soft * balance[None], *parts])
 
-    def compliance(pad: Pad, k: str, everywhere: bool = False) -> Tensor:
-        """Displacement of the near surface nodes, or of every node, per force on the near ones."""
-        columns = (2 * near[k][:, None] + torch.arange(2)).flatten()
-        nodes = torch.arange(pad.nodes) if everywhere else pad.surface[near[k]]
-        rows = (2 * nodes[:, None] + torch.arange(2)).flatten()
-        return pad.compliance(model.material)[rows][:, columns]
+    def forces(z: Tensor) -> list[Tensor]:
+        return [side.force(u.unflatten(0, (-1, 2)), z[0]) for side, u in zip(sides, z[1:].split(sizes))]
 
-    C = {k: compliance(model.pads[k], k) for k in names}
-    soft = C["L"].detach().diagonal().max()
-
-    def residual(z: Tensor) -> Tensor:
-        f, _ = forces(z)
-        balance = weight[1] - sum(f[k][:, 1].sum() for k in names)
-        return torch.cat(
-            [soft * balance[None], *(part - C[k] @ f[k].flatten() for k, part in zip(names, z[1:].split(sizes)))]
-        )
+    def linearise(z: Tensor) -> Tensor:
+        """Jacobian of the residual, from each node's 2 x 2 block df/du; raising the disc is lowering the nodes."""
+        blocks = [side.force_by_place(u.unflatten(0, (-1, 2)), z[0]) for side, u in zip(sides, z[1:].split(sizes))]
+        J = torch.eye(len(z), dtype=torch.float64)
+        J[0, 0], first = soft * sum(G[:, 1, 1].sum() for G in blocks), 1
+        for side, G in zip(sides, blocks):
+            here, first = slice(first, first + 2 * len(G)), first + 2 * len(G)
+            J[0, here] = -soft * G[:, 1].flatten()
+            J[here, 0] = side.C @ G[:, :, 1].flatten()
+            J[here, here] -= torch.einsum("ank,nkj->anj", side.C.unflatten(1, (-1, 2)), G).flatten(1)
+        return J
 
     upper = 2 * p.disc.radius + height if bracket_height is None else bracket_height - p.bracket.cm_height - height
     start = height + p.disc.radius - 0.1 * height if bracket_height is None else 0.5 * (height + upper)
     z = torch.cat((zero[None] + start, torch.zeros(sum(sizes), dtype=torch.float64)))
     with torch.no_grad():
-        r = residual(z)
+        r = residual(z, forces(z))
         for _ in range(100):
             if float(r.abs().max()) <= RESIDUAL:
                 break
-            step = torch.linalg.lstsq(torch.func.jacfwd(residual)(z), r[:, None]).solution[:, 0]
+            step = _newton_step(linearise(z), r)
             scale = min(1.0, 0.2 * height / float(step[0].abs().clamp(min=1e-12)))
             for _ in range(12):
                 trial = z - scale * step
-                r_trial = residual(trial)
+                r_trial = residual(trial, forces(trial))
                 if float(r_trial.norm()) < float(r.norm()):
                     break
                 scale *= 0.5
@@ -113,10 +97,49 @@ def _solve(model: SoftGrasp, bracket_height: float | None) -> State:
                 f"no static equilibrium found (residual {float(r.abs().max()):.2g} m after 100 iterations); are the "
                 "contact springs far stiffer than the pads?"
             )
-        J = torch.func.jacfwd(residual)(z)
-    z = z - torch.linalg.solve(J, residual(z)[:, None])[:, 0]
-    f, state = forces(z)
-    for k in names:
-        u = (compliance(model.pads[k], k, everywhere=True) @ f[k].flatten()).unflatten(-1, (-1, 2))
-        state = state._replace(**{f"u_{k}": u})
-    return state
+        J = linearise(z)
+    z = z - _newton_step(J, residual(z, forces(z)))
+    state = model.layout.unpack(torch.zeros(model.layout.size, dtype=torch.float64))
+    state = state._replace(r_C=torch.stack((x, z[0])), r_Br=torch.stack((x, y_Br)))
+    return state._replace(**{f"u_{side.name}": side.spread(f) for side, f in zip(sides, forces(z))})
+
+
+def _newton_step(J: Tensor, r: Tensor) -> Tensor:
+    """J^-1 r; the shortest step where no node touches and leaves the disc's height undetermined."""
+    step, singular = torch.linalg.solve_ex(J, r[:, None])
+    return (torch.linalg.lstsq(J, r[:, None]).solution if bool(singular) else step)[:, 0]
+
+
+class _Side:
+    """One pad's surface nodes within `reach` of the disc's x: their frictionless force, and what it does to the pad."""
+
+    def __init__(self, model: SoftGrasp, name: str, base: Tensor, x: Tensor, reach: float) -> None:
+        self.model, self.name, self.x = model, name, x
+        pad = model.pads[name]
+        places = pad.positions[pad.surface] + base
+        self.near = torch.nonzero((places[:, 0] - x).abs() < reach)[:, 0]
+        self.places = places[self.near]
+        self.K_n = model.share(pad)[self.near] * model.contact.K_n
+        columns, rows = (
+            (2 * nodes[:, None] + torch.arange(2)).flatten() for nodes in (self.near, pad.surface[self.near])
+        )
+        self.everywhere = pad.compliance(model.material)[:, columns]
+        """displacement of every node per force on the near ones [m/N]"""
+        self.C = self.everywhere[rows]
+
+    def force(self, u: Tensor, y_C: Tensor) -> Tensor:
+        """On each near node, (near, 2) [N], for their displacements u (near, 2) [m] and the disc's height [m]."""
+        zero = torch.zeros_like(y_C)
+        frame = moving_frame(self.model.shape, self.places + u, torch.stack((self.x, y_C)), zero)
+        return normal_force(frame.g, zero, zero, self.K_n, zero)[:, None] * frame.n
+
+    def force_by_place(self, u: Tensor, y_C: Tensor) -> Tensor:
+        """df/du of each node by itself, (near, 2, 2) [N/m]."""
+        with torch.enable_grad():
+            u = u.detach().requires_grad_()
+            rows = self.force(u, y_C).sum(0)
+            return torch.stack([torch.autograd.grad(row, u, retain_graph=True)[0] for row in rows], 1)
+
+    def spread(self, f: Tensor) -> Tensor:
+        """Displacement of every node of the pad, (nodes, 2)."""
+        return (self.everywhere @ f.flatten()).unflatten(-1, (-1, 2))
