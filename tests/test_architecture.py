@@ -12,7 +12,8 @@ FLOW = """
 parameters shapes multibond state pad contact control model ledger equilibrium stability
 kernels kernels.node kernels.linear kernels.pad kernels.stage kernels.run kernels.adjoint kernels.sensitivity
 kernel_inputs grid implicit stage_laws adjoint sensitivity unrolled torchdiffeq_solver continuous
-trajectory simulate scenario excitation dataset scene figures animation diagram
+trajectory simulate scenario excitation dataset
+reduced_rollout reduced_ode reduction_records reduction_terms reduction scene figures animation diagram
 """
 ORDER = FLOW.split()
 LONGEST = 380
