@@ -5,6 +5,8 @@ import json
 import os
 import subprocess
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -12,13 +14,14 @@ from typing import Any
 import fsspec
 import numpy as np
 import zarr
-import zarr.storage
+from fsspec.implementations.local import LocalFileSystem
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec
 
 from data_gen.config import Config
 from data_gen.schema import Variable, sizes, variables
 from data_gen.simulation import Row
+from torchsoft.dataset import place
 from torchsoft.model import SoftGrasp
 from torchsoft.parameters import Parameters
 
@@ -37,7 +40,7 @@ class Store:
 
     def __init__(self, url: str, config: Config) -> None:
         self.url, self.config = url, config
-        self.group = zarr.open_group(zarr_store(url), mode="r+", zarr_format=3)
+        self.group = zarr.open_group(place(url), mode="r+", zarr_format=3)
 
     def rows(self, shard: int) -> range:
         """The trajectories of a shard."""
@@ -58,34 +61,54 @@ class Store:
         here = self.rows(shard)
         if len(rows) != len(here):
             raise ValueError(f"shard {shard} holds {len(here)} trajectories, but {len(rows)} were given")
-        try:
+        with telling(self.url):
             for name, variable in variables(self.config).items():
                 array = self.array(name)
                 assert (array.shards or array.chunks)[0] == self.config.trajectories_per_shard, f"{name} is not aligned"
                 dtype = object if variable.dtype == "str" else variable.dtype
                 array[here.start : here.stop] = np.array([row[name] for row in rows], dtype)
             self.array("done")[shard] = 1
-        except OSError as error:
-            raise told(error, self.url) from error
+
+
+@contextmanager
+def telling(url: str) -> Iterator[None]:
+    """Turn what the operating system, or the client of an object store, has to say into a `StoreError`."""
+    try:
+        yield
+    except OSError as error:
+        raise told(error, url) from error
+    except Exception as error:
+        if isinstance(error, StoreError) or isinstance(filesystem(url)[0], LocalFileSystem):
+            raise
+        raise StoreError(f"{url}: {type(error).__name__}: {error}") from error
 
 
 def told(error: OSError, url: str) -> StoreError:
     """What an operating system's error means here."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return StoreError(f"{url}: the disk is full; make room and start again: finished shards are kept")
-    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        return StoreError(f"{url}: may not be written ({error.strerror}); choose another folder")
+    if error.errno == errno.EFBIG:
+        return StoreError(f"{url}: a file outgrew the limit on file sizes (ulimit -f); raise it or make smaller shards")
+    if error.errno in (errno.ENOTDIR, errno.EEXIST):
+        return StoreError(f"{url}: a part of this path is a file; choose another folder")
+    if isinstance(error, PermissionError) or error.errno == errno.EROFS:
+        return StoreError(f"{url}: may not be written ({error.strerror or error}); choose another folder")
     return StoreError(f"{url}: {error}")
 
 
-def zarr_store(url: str) -> Any:
-    """What zarr opens: a path as it is, anything else through fsspec."""
-    return zarr.storage.FsspecStore.from_url(url) if "://" in url else url
+def filesystem(url: str) -> tuple[Any, str]:
+    """The filesystem and the path in it, with nothing remembered of what others may have written since."""
+    try:
+        fs, root = fsspec.url_to_fs(url)
+    except ImportError as error:  # a known protocol whose package is not installed
+        raise StoreError(f"{url}: {error}") from error
+    fs.invalidate_cache()
+    return fs, root
 
 
 def read_text(url: str, name: str) -> str | None:
     """A small file of the store, or None where there is none."""
-    fs, root = fsspec.url_to_fs(url)
+    fs, root = filesystem(url)
     path = f"{root}/{name}"
     return fs.cat_file(path).decode() if fs.exists(path) else None
 
@@ -95,23 +118,22 @@ def open_or_create(url: str, config: Config) -> Store:
 
     Raises `StoreError` for a folder that holds anything else, or that cannot be written.
     """
-    try:
+    with telling(url):
         text = read_text(url, MANIFEST)
         if text is None:
             create(url, config)
         else:
-            same(url, json.loads(text), config)
-            if "://" not in url:
-                sweep(Path(url))
+            same(url, text, config)
+            sweep(url)
         return Store(url, config)
-    except OSError as error:
-        raise told(error, url) from error
+
+
+def same(url: str, text: str, config: Config) -> None:
+    """Refuse to go on with another configuration's or another version's dataset."""
+    try:
+        manifest = json.loads(text)
     except json.JSONDecodeError as error:
         raise StoreError(f"{url}/{MANIFEST} is not JSON ({error}); choose another folder") from error
-
-
-def same(url: str, manifest: dict[str, Any], config: Config) -> None:
-    """Refuse to go on with another configuration's or another version's dataset."""
     here = {"config_hash": config.hash, "torchsoft": version("torchsoft")}
     for key, value in here.items():
         if manifest.get(key) != value:
@@ -120,15 +142,17 @@ def same(url: str, manifest: dict[str, Any], config: Config) -> None:
             )
 
 
-def sweep(folder: Path) -> None:
-    """Remove the partial files that a killed run left behind."""
-    for partial in folder.rglob("*.partial"):
-        partial.unlink(missing_ok=True)
+def sweep(url: str) -> None:
+    """Remove the partial files that a killed run left behind in a local folder; object stores show whole objects only."""
+    fs, root = filesystem(url)
+    if isinstance(fs, LocalFileSystem):
+        for partial in Path(root).rglob("*.partial"):
+            partial.unlink(missing_ok=True)
 
 
 def create(url: str, config: Config) -> None:
     """Lay the whole store out; the manifest comes last, and a store without one is no store."""
-    fs, root = fsspec.url_to_fs(url)
+    fs, root = filesystem(url)
     marker = f"{root}/.creating"
     if fs.exists(root) and not fs.isdir(root):
         raise StoreError(f"{url} is a file; give a folder")
@@ -137,8 +161,8 @@ def create(url: str, config: Config) -> None:
     fs.makedirs(root, exist_ok=True)
     fs.pipe_file(marker, b"this dataset is being laid out")
     attributes: dict[str, Any] = {"title": config.title, "description": config.description, "config_hash": config.hash}
-    group = zarr.create_group(zarr_store(url), overwrite=False, zarr_format=3, attributes=attributes)\
-        if not fs.exists(f"{root}/zarr.json") else zarr.open_group(zarr_store(url), mode="r+", zarr_format=3)  # fmt: skip
+    group = zarr.create_group(place(url), overwrite=False, zarr_format=3, attributes=attributes)\
+        if not fs.exists(f"{root}/zarr.json") else zarr.open_group(place(url), mode="r+", zarr_format=3)  # fmt: skip
     for name, variable in variables(config).items():
         lay_out(group, name, variable, config)
     coordinates(group, config)
@@ -215,9 +239,9 @@ def manifest(config: Config) -> dict[str, Any]:
 
 def write_manifest(url: str, content: dict[str, Any]) -> None:
     """The file appears whole or not at all."""
-    fs, root = fsspec.url_to_fs(url)
+    fs, root = filesystem(url)
     data = (json.dumps(content, indent=2) + "\n").encode()
-    if "://" in url:
+    if not isinstance(fs, LocalFileSystem):
         fs.pipe_file(f"{root}/{MANIFEST}", data)  # object stores put whole objects
         return
     partial = Path(root) / f"{MANIFEST}.partial"

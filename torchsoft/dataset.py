@@ -1,15 +1,23 @@
 """Datasets of trajectories in a zarr store, for torch's `DataLoader` and for xarray."""
 
+import os
 from collections.abc import Sequence
 from typing import Any
 
+import fsspec
 import numpy as np
 import torch
 import xarray as xr
 import zarr
-import zarr.storage
+from fsspec.implementations.local import LocalFileSystem
 from torch import Tensor
 from torch.utils.data import Dataset
+
+
+def place(url: str) -> str:
+    """What zarr and xarray open: the path where a URL is a local one, such as `file:///data/set`, else the URL."""
+    fs, root = fsspec.url_to_fs(url)
+    return root if isinstance(fs, LocalFileSystem) else url
 
 
 class Trajectories(Dataset[dict[str, Tensor]]):
@@ -18,7 +26,7 @@ class Trajectories(Dataset[dict[str, Tensor]]):
     Item i holds every variable of `variables`, a series as (window, ...), a number of the trajectory as (), SI units as the
     store says, and `trajectory`, `start`: where it comes from. `window` is a number of samples, the whole run by default;
     windows of a trajectory begin every `stride` samples, `window` by default. Unfinished shards and failed simulations are
-    left out. The object is small, can be pickled and opens the store in each process for itself.
+    left out. The object is small, can be pickled, and opens the store in each process for itself, forked ones included.
 
     Raises `ValueError` for an unknown variable or split, or a window that does not fit.
     """
@@ -33,7 +41,9 @@ class Trajectories(Dataset[dict[str, Tensor]]):
         stride: int | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> None:
-        self.url, self.variables, self.dtype, self._group = str(url), tuple(variables), dtype, None
+        self.url, self.variables, self.dtype = str(url), tuple(variables), dtype
+        self._group: zarr.Group | None = None
+        self._opened_by = 0
         for name in self.variables:
             if name not in self.group or self.dims(name)[0] != "trajectory" or self.array(name).dtype.kind not in "fiu":
                 known = [k for k, a in self.group.arrays() if self.dims(k)[0] == "trajectory" and a.dtype.kind in "fiu"]
@@ -61,10 +71,9 @@ class Trajectories(Dataset[dict[str, Tensor]]):
 
     @property
     def group(self) -> zarr.Group:
-        """The store, opened on first use."""
-        if self._group is None:
-            store: Any = zarr.storage.FsspecStore.from_url(self.url, read_only=True) if "://" in self.url else self.url
-            self._group = zarr.open_group(store, mode="r")
+        """The store, opened on first use; once more after a fork, which connections do not survive."""
+        if self._group is None or self._opened_by != os.getpid():
+            self._group, self._opened_by = zarr.open_group(place(self.url), mode="r"), os.getpid()
         return self._group
 
     def array(self, name: str) -> zarr.Array[Any]:
@@ -97,4 +106,4 @@ class Trajectories(Dataset[dict[str, Tensor]]):
 
 def open_dataset(url: str) -> xr.Dataset:
     """The whole store, lazily, with named dimensions and units."""
-    return xr.open_zarr(url)
+    return xr.open_zarr(place(url))
