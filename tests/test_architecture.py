@@ -12,7 +12,9 @@ FLOW = """
 parameters shapes multibond state pad contact control model ledger equilibrium stability
 kernels kernels.node kernels.linear kernels.pad kernels.stage kernels.run kernels.adjoint kernels.sensitivity
 kernel_inputs grid implicit stage_laws adjoint sensitivity unrolled torchdiffeq_solver continuous
-trajectory simulate scenario excitation dataset
+trajectory simulate scenario excitation
+identify.unknowns identify.recording identify.prediction identify.workers identify.problem identify.fit identify.plan
+identify.answer identify.solve identify.synthetic identify dataset
 reduced_rollout reduced_ode reduction_records reduction_terms reduction scene figures animation diagram
 """
 ORDER = FLOW.split()
@@ -38,7 +40,7 @@ def test_every_module_has_a_place() -> None:
 
 @pytest.mark.parametrize("name", ORDER)
 def test_imports_point_upwards(name: str) -> None:
-    path = ROOT / (name.replace(".", "/") + ("/__init__.py" if name == "kernels" else ".py"))
+    path = ROOT / (name.replace(".", "/") + ("/__init__.py" if name in ("kernels", "identify") else ".py"))
     below = {other for other in imports(path) if ORDER.index(other) >= ORDER.index(name)}
     assert not below, f"{name} imports {below} from below it"
     assert len(path.read_text().splitlines()) <= LONGEST

@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import torch
+from scipy.interpolate import CubicSpline
 from torch import Tensor, nn
 
 from torchsoft.parameters import ControlParameters
@@ -49,6 +50,37 @@ class Profile(nn.Module):
         blend = u**4 * (35.0 + u * (-84.0 + u * (70.0 - 20.0 * u)))  # (20) with (22)-(24)
         rate = 140.0 * u**3 * (1.0 - u) ** 3 / span  # (21)
         return start + step * blend, step * rate
+
+
+class Sampled(Profile):
+    """A recorded set-point: the cubic through values (k,) at times (k,) [s] with the given rates (k,), or with those of the
+    natural choice, a cubic spline; constant before the first and after the last."""
+
+    rates: Tensor
+
+    def __init__(self, times: list[float], values: list[float], rates: list[float] | None = None) -> None:
+        super().__init__(times, values)
+        if rates is None:
+            rates = CubicSpline(times, values).derivative()(times).tolist() if len(times) > 1 else [0.0]
+        slope = torch.as_tensor(rates, dtype=torch.float64)
+        if slope.shape != self.times.shape or not bool(torch.isfinite(slope).all()):
+            raise ValueError(f"`rates` must hold one finite number per time ({len(self.times)}), but are {rates}")
+        self.register_buffer("rates", slope)
+
+    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """Value and rate at t (...)."""
+        if len(self.times) == 1:
+            return super().forward(t)
+        i = torch.searchsorted(self.times, t.detach().contiguous(), right=True).clamp(1, len(self.times) - 1)
+        span = self.times[i] - self.times[i - 1]
+        u = (t - self.times[i - 1]) / span
+        inside = ((u >= 0) & (u <= 1)).to(t.dtype)
+        u = u.clamp(0.0, 1.0)
+        a, step = self.values[i - 1], self.values[i] - self.values[i - 1]
+        p, q = span * self.rates[i - 1] - step, step - span * self.rates[i]
+        value = a + u * step + u * (1 - u) * ((1 - u) * p + u * q)
+        rate = (step + (1 - 2 * u) * ((1 - u) * p + u * q) + u * (1 - u) * (q - p)) / span
+        return value, rate * inside
 
 
 class Reference(nn.Module):

@@ -22,6 +22,18 @@ RATE_TOLERANCE = 1e-15
 
 RATE_ITERATIONS = 30
 
+PARAMETERS = {
+    **{f"pad.{name}": f"material.{name}" for name in ("E", "nu", "rho", "tau", "depth")},
+    **{f"contact.{name}": f"contact.{name}" for name in ("K_n", "R_n", "K_t", "R_t", "eta")},
+    **{f"contact.{name}": f"contact.friction.{name}" for name in ("mu_s", "mu_k", "v_s")},
+    **{f"control.{name}": f"controllers.{name}" for name in ("K_81", "R_80", "K_98", "R_99")},
+    "disc.radius": "shape.radius",
+    "disc.mass": "m_C",
+    "bracket.mass": "m_Br",
+    "scenario.gravity": "gravity",
+}
+"""What a number of `Parameters` is called among the module's parameters, for those that gradients reach."""
+
 PAPER_BONDS = {"L": ("28", "29", "23", "24"), "U": ("64", "65", "59", "60")}
 
 

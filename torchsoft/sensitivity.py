@@ -24,7 +24,9 @@ IN_LOADS = ("m_", "gravity", "shape.", "controllers.", "reference.")
 
 
 class Sensitivities(NamedTuple):
-    """States y (T, size), their derivatives dy (T, size, n) by the n parameters, the parameters' names, the run."""
+    """States y (T, size), their derivatives dy (T, size, n) by the n parameters, the parameters' names, the run.
+
+    With `rigid` dy is (T, 10, n): poses (x_C, y_C, theta, x_Br, y_Br) and their rates only."""
 
     y: Tensor
     dy: Tensor
@@ -43,7 +45,7 @@ class _Scope(nn.Module):
         return self.function()
 
 
-def _derivatives(
+def parameter_derivatives(
     model: SoftGrasp, names: Sequence[str], only: tuple[str, ...], function: Callable[[], Tensor]
 ) -> Array:
     """d function / d parameters at the model's own values, parameters last; zero for names that do not start like `only`."""
@@ -71,11 +73,12 @@ def sensitivities(
     step: float = 2e-3,
     tolerance: float = 1e-9,
     dy0: Tensor | None = None,
+    rigid: bool = False,
 ) -> Sensitivities:
     """Run from y0 (size,) through t (T,) [s] and differentiate every state by the scalar parameters `names`.
 
     Names are those of `model.named_parameters()`, such as "contact.K_n" or "material.E". `dy0` (size, n) is the
-    derivative of the initial state, zero by default. Raises `ValueError` for a name that is not a scalar parameter,
+    derivative of the initial state, zero by default; `rigid` leaves the pads out of the result. Raises `ValueError` for a name that is not a scalar parameter,
     `NotImplementedError` for inertial pads, `SimulationFailed` as `simulate` does.
     """
     known = {name: p for name, p in model.named_parameters() if p.ndim == 0}
@@ -89,12 +92,12 @@ def sensitivities(
     if start.shape != (size, n):
         raise ValueError(f"`dy0` must have shape ({size}, {n}), but has {tuple(start.shape)}")
     stepper = ImplicitStepper(model, step=step, tolerance=tolerance)
-    dys = np.zeros((len(t), size, n))
-    dys[0] = start.numpy()
     n_u = 2 * (model.pad_L.nodes + model.pad_U.nodes)
     n_s = len(model.pad_L.surface) + len(model.pad_U.surface)
     cuts = np.cumsum([n_u, n_s, 5])
-    x = Tangent(*(part.copy() for part in np.split(dys[0], cuts)))
+    x = Tangent(*(part.copy() for part in np.split(start.numpy(), cuts)))
+    dys = np.zeros((len(t), 10 if rigid else size, n))
+    dys[0] = start.numpy()[-dys.shape[1] :]
     by_nu = [pad.compliance_by_nu(model.material).mT.numpy() for pad in model.pads.values()]
     C_L, C_U = (np.ascontiguousarray(C) if "material.nu" in names else np.zeros((0, 0)) for C in by_nu)
     parameters = dict(model.named_parameters())  # C is proportional to 1 / (E depth)
@@ -110,11 +113,13 @@ def sensitivities(
         law = np.zeros((*tape.force.shape[:3], 3, n))
         for p in range(2):
             at = touching(tape, p)
-            law[at[0], p, at[1]] = _derivatives(
+            law[at[0], p, at[1]] = parameter_derivatives(
                 model, names, IN_LAWS, lambda p=p, tape=tape, h=chunk.h: law_rows(model, tape, p, h)
             )
-        load = _derivatives(model, names, IN_LOADS, lambda chunk=chunk, tape=tape: rigid_loads(model, chunk, tape))
-        decay = _derivatives(model, names, IN_LAWS, lambda h=chunk.h: decay_rate(model, h))
+        load = parameter_derivatives(
+            model, names, IN_LOADS, lambda chunk=chunk, tape=tape: rigid_loads(model, chunk, tape)
+        )
+        decay = parameter_derivatives(model, names, IN_LAWS, lambda h=chunk.h: decay_rate(model, h))
         explicit = Explicit(law, load, C_L, C_U, nu, softening, tau, decay)
         rate = decay_rate(model, chunk.h).item()
         forward(

@@ -214,7 +214,8 @@ def stage_tangent(
 def forward(
     pads: Any, h: float, c: Any, tape: Any, keep: Any, x: Any, explicit: Any, decay_rate: float, dys: Array
 ) -> None:
-    """Carry the tangent x through the steps of a tape, in place; after the steps that `keep` marks it goes to dys."""
+    """Carry the tangent x through the steps of a tape, in place; after the steps that `keep` marks it goes to dys, whole or,
+    where dys (outputs, 10, n) has no room for more, only q and V."""
     cap, n_dir = tape.node.shape[2], x.q.shape[1]
     nodes = np.empty((2, cap, 3, 7))
     A, b = np.empty((2, 2 * cap, 2 * cap)), np.empty((2, 2 * cap, 5 + n_dir))
@@ -229,8 +230,10 @@ def forward(
         x.V[:] = V + mix * (x.V - V)
         stage_tangent(pads, h, c, tape, 2 * step + 1, x, explicit, decay_rate, nodes, A, b)
         if keep[step]:
-            dys[row, :n_u] = x.u
-            dys[row, n_u : n_u + n_s] = x.s
-            dys[row, n_u + n_s : n_u + n_s + 5] = x.q
-            dys[row, n_u + n_s + 5 :] = x.V
+            rigid = dys.shape[1] - 10
+            if rigid > 0:
+                dys[row, :n_u] = x.u
+                dys[row, n_u : n_u + n_s] = x.s
+            dys[row, rigid : rigid + 5] = x.q
+            dys[row, rigid + 5 :] = x.V
             row += 1

@@ -1,0 +1,35 @@
+"""Recordings made by the simulator itself: a known truth to identify."""
+
+import numpy as np
+import torch
+
+from torchsoft.excitation import Excitation, begin, start
+from torchsoft.identify.prediction import TOLERANCE, Prediction, read, rigid, signals
+from torchsoft.identify.recording import SETTLE, Recording
+from torchsoft.identify.unknowns import Sensor
+from torchsoft.parameters import Parameters
+from torchsoft.simulate import simulate
+
+
+def record(
+    name: str, excitation: Excitation, truth: Parameters, nominal: Parameters, sensors: dict[str, Sensor], *,
+    rate: float = 200.0, step: float = 5e-4, noise: float = 1.0, seed: int = 0,
+) -> Recording:  # fmt: skip
+    """What a rig with the parameters `truth` gives under an excitation that was planned with the `nominal` ones.
+
+    Sampled at `rate` [Hz] from a run with the given step [s], with Gaussian noise of `noise` times each sensor's own.
+    The recording holds nothing of the truth but the samples. Raises `SimulationFailed`.
+    """
+    planned = begin(excitation, nominal)
+    real = begin(excitation, truth).model
+    real.reference = planned.model.reference
+    at = np.arange(0.0, excitation.duration + 0.5 / rate, 1.0 / rate)
+    t = torch.from_numpy(np.concatenate(([at[0] - SETTLE], at)))
+    with torch.no_grad():
+        run = simulate(real, t, y0=start(real).detach(), step=step, tolerance=TOLERANCE)
+        said = signals(real, t[1:], rigid(real, run.y[1:])).numpy()
+    rng, samples = np.random.default_rng(seed), {}
+    for channel, sensor in sensors.items():
+        exact = read(Prediction(at, said, None, 0), channel, at, 0.0).values
+        samples[channel] = (at, exact + noise * sensor.noise * rng.standard_normal(len(at)))
+    return Recording(name, planned.model.settings, planned.model.reference, samples)
