@@ -38,7 +38,7 @@ class Strokes(Table):
 
     kind: Literal["strokes"] = "strokes"
     travel: float = 10e-3
-    stroke_time: float = Field(1.0, gt=0)
+    stroke_time: float = Field(default=1.0, gt=0)
 
 
 class MultiSine(Table):
@@ -49,8 +49,8 @@ class MultiSine(Table):
     amplitude_x: float = 4e-3
     amplitude_y: float = 2e-4
     frequency: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = (0.5, 8.0)
-    components: int = Field(5, ge=1, le=50)
-    seed: int = Field(0, ge=0)
+    components: int = Field(default=5, ge=1, le=50)
+    seed: int = Field(default=0, ge=0)
 
 
 class Chirp(Table):
@@ -59,8 +59,8 @@ class Chirp(Table):
     kind: Literal["chirp"] = "chirp"
     amplitude_x: float = 1e-3
     amplitude_y: float = 1e-4
-    start: float = Field(0.3, gt=0)
-    end: float = Field(8.0, gt=0)
+    start: float = Field(default=0.3, gt=0)
+    end: float = Field(default=8.0, gt=0)
 
 
 class Press(Table):
@@ -68,7 +68,7 @@ class Press(Table):
 
     kind: Literal["press"] = "press"
     amplitude: float = 2e-4
-    frequency: float = Field(2.0, gt=0)
+    frequency: float = Field(default=2.0, gt=0)
     travel: float = 5e-3
 
 
@@ -85,11 +85,11 @@ class Excitation(Table):
     """
 
     motion: Motion
-    duration: float = Field(2.0, gt=0)
-    depth: float = Field(1.5e-3, gt=0)
+    duration: float = Field(default=2.0, gt=0)
+    depth: float = Field(default=1.5e-3, gt=0)
     senses: Literal["disc", "bracket"] = "disc"
-    grasp_time: float = Field(0.375, gt=0)
-    settle: float = Field(0.125, ge=0)
+    grasp_time: float = Field(default=0.375, gt=0)
+    settle: float = Field(default=0.125, ge=0)
     x_C0: float = 60.3e-3
 
     def settings(self, p: Parameters) -> Parameters:
@@ -103,6 +103,36 @@ class Excitation(Table):
                 "control.senses": self.senses,
             }
         )
+
+
+CATALOGUE = {
+    "slow roll": Excitation(motion=Roll(travel=16e-3), duration=4.0, senses="bracket"),
+    "strokes": Excitation(motion=Strokes(travel=20e-3, stroke_time=0.75), duration=2.0, senses="bracket"),
+    "fast strokes": Excitation(motion=Strokes(travel=20e-3, stroke_time=0.25), duration=2.0, senses="bracket"),
+    "chirp": Excitation(motion=Chirp(amplitude_x=3e-3, amplitude_y=2e-4, end=25.0), duration=2.0, senses="bracket"),
+    "press": Excitation(motion=Press(amplitude=4e-4, frequency=8.0, travel=10e-3), duration=2.0, senses="bracket"),
+    "slow shaking": Excitation(
+        motion=MultiSine(amplitude_x=16e-3, amplitude_y=2e-4, frequency=(1.0, 8.0)), duration=2.0, senses="bracket"
+    ),
+    "shaking": Excitation(
+        motion=MultiSine(amplitude_x=4e-3, amplitude_y=1e-4, frequency=(10.0, 60.0)), duration=2.0, senses="bracket"
+    ),
+    "light shaking": Excitation(
+        motion=MultiSine(amplitude_x=4e-3, amplitude_y=1e-4, frequency=(10.0, 60.0)), duration=2.0, depth=8e-4,
+        senses="bracket",
+    ),
+    "jerks, light": Excitation(
+        motion=Strokes(travel=40e-3, stroke_time=0.1), duration=1.3, depth=2e-4, senses="bracket"
+    ),
+    "long jerks, light": Excitation(
+        motion=Strokes(travel=80e-3, stroke_time=0.15), duration=1.3, depth=2e-4, senses="bracket"
+    ),
+    "jerks, deep": Excitation(motion=Strokes(travel=40e-3, stroke_time=0.1), duration=1.3, senses="bracket"),
+    "strokes, loop about the disc": Excitation(
+        motion=Strokes(travel=10e-3, stroke_time=0.75), duration=2.0, x_C0=60e-3
+    ),
+}  # fmt: skip
+"""Ready excitations by name, from gentle to hard; `experiments/experiment_design.py` ranks them."""
 
 
 class Begun(NamedTuple):

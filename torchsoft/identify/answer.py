@@ -172,12 +172,12 @@ def step_shift(J: Array, r: Array, finer: Array) -> Array:
     """How far the finite step has moved the coordinates (n,), from residuals at the step and at half of it: the method is of
     second order, so the exact residuals are finer + (finer - r) / 3."""
     error = 4.0 / 3.0 * (finer - r)
-    return np.linalg.lstsq(J, error, rcond=None)[0]
+    return np.asarray(np.linalg.lstsq(J, error, rcond=None)[0], np.float64)
 
 
 def estimates(problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shift: Array) -> list[Estimate]:
     """Parameters in physical units, then biases and delays; C (n, n) and shift (n,) are of all coordinates."""
-    c, table, q = problem.coordinates, Parameters().table(), stats.norm.ppf(0.5 + CONFIDENCE / 2)
+    c, table, q = problem.coordinates, Parameters().table(), float(stats.norm.ppf(0.5 + CONFIDENCE / 2))
     low, high = c.bounds
     edge = free & ((x - low < 1e-4 * (high - low)) | (high - x < 1e-4 * (high - low)))
     out = []
@@ -208,7 +208,7 @@ def estimates(problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shi
             spread = float(np.sqrt(C[i, i]))
             value, sd, seen = one.to_value(x[i]), spread * one.slope(x[i]), spread < UNSEEN
             unit = "s" if one.kind == "delay" else "of the channel"
-            interval = (value - q * sd, value + q * sd) if seen else None
+            interval = (value - q * float(sd), value + q * float(sd)) if seen else None
             out.append(
                 Estimate(
                     one.label, unit, None, value if seen else None, interval, sd / max(abs(value), 1e-300), value,

@@ -18,8 +18,9 @@ from torchsoft.identify.workers import Runner
 
 Array = NDArray[np.float64]
 
-SEEN = 0.3
-"""A coordinate takes part in an early stage if its predicted standard deviation [1] is below this."""
+SEEN = 0.1
+"""A coordinate takes part in the first look if its predicted standard deviation [1] is below this: one that is seen faintly
+would run off to make up for what is still wrong elsewhere."""
 
 COARSE = 4.0
 """Early stages take steps this many times the full one, on the first recording."""
@@ -95,7 +96,7 @@ def default_plan(problem: Problem, runner: Runner, step: float, which: Sequence[
         )
     ]
     if len(order) > 1 or ratios.any():
-        plan.append(Stage("all data, ratios tied", tuple(order), tuple(labels[free & ~ratios]), 2 * step, 12, 1e-2))
+        plan.append(Stage("all data, ratios tied", tuple(order), tuple(labels[free & ~ratios]), 2 * step, 15, 1e-3))
     scans = tuple((c.all[i].label, tuple(part * c.all[i].high for part in SCANNED)) for i in np.flatnonzero(ratios))
     plan.append(Stage("everything", tuple(order), tuple(labels[free]), step, 40, 1e-7, scanned=scans))
     return plan

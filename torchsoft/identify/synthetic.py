@@ -4,8 +4,8 @@ import numpy as np
 import torch
 
 from torchsoft.excitation import Excitation, begin, start
-from torchsoft.identify.prediction import TOLERANCE, Prediction, read, rigid, signals
-from torchsoft.identify.recording import SETTLE, Recording
+from torchsoft.identify.prediction import TOLERANCE, rigid, signals
+from torchsoft.identify.recording import CHANNELS, SETTLE, Recording
 from torchsoft.identify.unknowns import Sensor
 from torchsoft.parameters import Parameters
 from torchsoft.simulate import simulate
@@ -30,6 +30,6 @@ def record(
         said = signals(real, t[1:], rigid(real, run.y[1:])).numpy()
     rng, samples = np.random.default_rng(seed), {}
     for channel, sensor in sensors.items():
-        exact = read(Prediction(at, said, None, 0), channel, at, 0.0).values
+        exact = said[:, list(CHANNELS).index(channel)]
         samples[channel] = (at, exact + noise * sensor.noise * rng.standard_normal(len(at)))
     return Recording(name, planned.model.settings, planned.model.reference, samples)

@@ -56,8 +56,8 @@ class Sensor(Table):
     `delay` [s] may be; zero leaves them out, otherwise they are identified too."""
 
     noise: float = Field(gt=0)
-    bias: float = Field(0.0, ge=0)
-    delay: float = Field(0.0, ge=0)
+    bias: float = Field(default=0.0, ge=0)
+    delay: float = Field(default=0.0, ge=0)
 
 
 class Coordinate(NamedTuple):

@@ -1,0 +1,184 @@
+"""Question: which motions should a rig make, for its data to tell contact and pad parameters apart?
+
+For every excitation of `torchsoft.excitation.CATALOGUE` the Fisher matrix F = J^T J of what the sensors would say (J: exact
+sensitivities over the sensors' noise, coordinates: logarithms of the parameters) gives the Cramer-Rao standard deviation
+sqrt(diag F^-1) of each parameter; F is additive, so combinations follow by summing. Derivatives of hard slipping can be
+inconsistent: J is checked against a central difference along a random direction, and an excitation that fails is dropped.
+
+Command: .venv/bin/python experiments/experiment_design.py [--smoke]
+Expected: no gentle motion sees mu_k (above 50 %); light grasps jerked see it to about 1 %; K_t and R_t are the weakest, and
+combinations of three within 6 s of data bring the worst of the eight parameters to about 2 %. About a minute on one core.
+"""
+
+import itertools
+import json
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+import tyro
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from torchsoft import Parameters
+from torchsoft.excitation import CATALOGUE, Excitation, Strokes
+from torchsoft.identify import Problem, Sensor, Unknown, record
+from torchsoft.identify.plan import standard_deviations
+from torchsoft.identify.workers import Runner
+from torchsoft.implicit import SimulationFailed
+
+Array = NDArray[np.float64]
+
+NAMES = (
+    "contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau",
+)  # fmt: skip
+NOISE = {"x_C": 1e-5, "y_C": 1e-5, "theta": 5e-4, "x_Br": 1e-5, "y_Br": 1e-5, "F_x": 0.1, "F_y": 0.1}
+"""Sensors and their noise [m, rad, N]."""
+CONSISTENT = 0.01
+"""Difference between J and a finite difference, over their size, above which an excitation is dropped."""
+DIFFERENCE = 1e-5
+"""Step of that finite difference in the logarithms."""
+
+
+@dataclass(frozen=True)
+class Config:
+    out: Path = Path("out/experiment_design")
+    step: float = 5e-4
+    """of the stepper [s]"""
+    v_s: float = 0.05
+    """contact.v_s [m/s]; large, so that gross slip has a unique solution"""
+    longest: float = 6.0
+    """data that a combination may take [s]"""
+    most: int = 3
+    """excitations in a combination"""
+    seed: int = 0
+    smoke: bool = False
+    """two short excitations"""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Standard deviations [1] by parameter of one excitation or of several together; `inconsistency` of the derivative."""
+
+    names: tuple[str, ...]
+    seconds: float
+    sd: dict[str, float]
+    inconsistency: float
+    dropped: str = ""
+
+    @property
+    def worst(self) -> float:
+        return max(self.sd.values(), default=np.inf)
+
+
+@dataclass(frozen=True)
+class Result:
+    config: Config
+    single: list[Row]
+    together: list[Row]
+
+
+def smoke(config: Config) -> tuple[Config, dict[str, Excitation]]:
+    roll = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.3), duration=0.9, senses="bracket")
+    jerk = Excitation(motion=Strokes(travel=30e-3, stroke_time=0.1), duration=0.9, depth=3e-4, senses="bracket")
+    return Config(config.out, 2e-3, config.v_s, 2.0, 2, config.seed, True), {"strokes": roll, "jerks, light": jerk}
+
+
+def look(excitation: Excitation, p: Parameters, config: Config) -> tuple[Array, float]:
+    """Whitened Jacobian (m, parameters), and its relative difference from a central difference along one direction."""
+    sensors = {channel: Sensor(noise=sigma) for channel, sigma in NOISE.items()}
+    recording = record("one", excitation, p, p, sensors, step=config.step, noise=0.0)
+    problem = Problem([recording], sensors, {name: Unknown() for name in NAMES})
+    x, v = problem.coordinates.start, np.random.default_rng(config.seed).standard_normal(len(NAMES))
+    with Runner(problem.recordings) as runner:
+        at = problem.residuals(runner, x, ["one"], config.step, problem.coordinates.free)
+        ahead, behind = (
+            problem.residuals(runner, x + s * DIFFERENCE * v, ["one"], config.step) for s in (1.0, -1.0)
+        )  # fmt: skip
+    for part in (at, ahead, behind):
+        for lost in part.lost.values():
+            raise SimulationFailed(lost.reason, lost.time)
+    slope = (ahead.r - behind.r) / (2 * DIFFERENCE)
+    return at.J, float(np.linalg.norm(at.J @ v - slope) / np.linalg.norm(slope))
+
+
+def run(config: Config) -> Result:
+    catalogue = CATALOGUE
+    if config.smoke:
+        config, catalogue = smoke(config)
+    p = Parameters().override({"contact.v_s": config.v_s})
+    single, fishers = [], {}
+    for name, excitation in tqdm(catalogue.items(), desc="excitations"):
+        try:
+            J, wrong = look(excitation, p, config)
+        except SimulationFailed as failure:
+            single.append(Row((name,), excitation.duration, {}, np.inf, failure.reason))
+            continue
+        sd = dict(zip(NAMES, standard_deviations(J).tolist()))
+        dropped = "" if wrong < CONSISTENT else f"derivatives inconsistent by {wrong:.1%}"
+        single.append(Row((name,), excitation.duration, sd, wrong, dropped))
+        if not dropped:
+            fishers[name] = J.T @ J
+    together = []
+    for count in range(2, config.most + 1):
+        for names in itertools.combinations(fishers, count):
+            seconds = sum(catalogue[name].duration for name in names)
+            if seconds <= config.longest:
+                root = np.linalg.cholesky(sum(fishers[name] for name in names) + 1e-9 * np.eye(len(NAMES))).T
+                sd = dict(zip(NAMES, standard_deviations(root).tolist()))
+                together.append(Row(names, seconds, sd, max(r.inconsistency for r in single if r.names[0] in names)))
+    return Result(config, sorted(single, key=lambda r: r.worst), sorted(together, key=lambda r: r.worst))
+
+
+def table(rows: list[Row]) -> str:
+    short = [name.split(".")[1] for name in NAMES]
+    lines = ["| excitation | s | " + " | ".join(short) + " | derivative off by |", "|---" * (len(NAMES) + 3) + "|"]
+    for row in rows:
+        cells = [f"{100 * row.sd[name]:.2g}" if row.sd.get(name, np.inf) < 10 else "-" for name in NAMES]
+        off = row.dropped or f"{row.inconsistency:.0e}"
+        lines.append(f"| {' + '.join(row.names)} | {row.seconds:.1f} | " + " | ".join(cells) + f" | {off} |")
+    return "\n".join(lines)
+
+
+def figure(result: Result) -> Figure:
+    """Standard deviations [%] as a heat map: single excitations above, the best combinations below."""
+    best = result.together[:8]
+    groups = [group for group in (result.single, best) if group]
+    fig = Figure(figsize=(10, 1.6 + 0.36 * sum(map(len, groups))), layout="constrained")
+    axes = fig.subplots(len(groups), 1, squeeze=False, gridspec_kw={"height_ratios": [len(g) for g in groups]})[:, 0]
+    image = None
+    for ax, group, title in zip(axes, groups, ("one excitation", f"together, at most {result.config.longest:g} s")):
+        values = np.array([[100 * row.sd.get(name, np.nan) for name in NAMES] for row in group])
+        image = ax.imshow(values, norm=LogNorm(0.1, 100.0), cmap="RdYlGn_r", aspect="auto")
+        for i, j in np.ndindex(*values.shape):
+            text = "lost" if np.isnan(values[i, j]) else f"{values[i, j]:.2g}" if values[i, j] < 1000 else ">1000"
+            ax.text(j, i, text, ha="center", va="center", fontsize=8)
+        labels = [" + ".join(row.names) + (" (dropped)" if row.dropped else "") for row in group]
+        ax.set(yticks=range(len(group)), xticks=range(len(NAMES)), title=title)
+        ax.set_yticklabels(labels, fontsize=8)
+        ax.set_xticklabels([name.split(".")[1] for name in NAMES])
+        ax.tick_params(length=0)
+    assert image is not None
+    fig.colorbar(image, ax=axes, label="standard deviation [%], Cramér-Rao", shrink=0.6)
+    return fig
+
+
+def main(config: Config) -> None:
+    result = run(config)
+    print(table(result.single), "", table(result.together[:8]), sep="\n")
+    result.config.out.mkdir(parents=True, exist_ok=True)
+    figure(result).savefig(result.config.out / "experiment_design.png", dpi=150)
+    summary = {
+        "torchsoft": version("torchsoft"),
+        "config": asdict(result.config) | {"out": str(result.config.out)},
+        "single": [asdict(row) for row in result.single],
+        "together": [asdict(row) for row in result.together[:20]],
+    }
+    (result.config.out / "summary.json").write_text(json.dumps(summary, indent=1).replace("Infinity", "null"))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
