@@ -3,6 +3,7 @@
 import pickle
 from pathlib import Path
 
+import fsspec
 import numpy as np
 import pytest
 import torch
@@ -64,6 +65,19 @@ def test_it_pickles_small_and_loads_in_workers(store: str) -> None:
     got, want = torch.cat([b["disc_position"] for b in batches]), torch.stack([x["disc_position"] for x in data])
     assert got.dtype == torch.float32
     torch.testing.assert_close(got, want)
+
+
+@pytest.mark.filterwarnings("ignore:Failed to open Zarr store with consolidated metadata")
+def test_object_stores_are_read_like_folders_and_by_forked_workers(store: str) -> None:
+    url = "memory://copy/set"
+    fsspec.filesystem("memory").put(store, "/copy/set", recursive=True)
+    data, plain = (Trajectories(place, ["disc_position", "pad.E"], window=7) for place in (url, store))
+    data[0]  # opened before the fork
+    batches = list(DataLoader(data, batch_size=4, num_workers=2, multiprocessing_context="fork", timeout=60))
+    for name in data.variables:
+        torch.testing.assert_close(torch.cat([b[name] for b in batches]), torch.stack([x[name] for x in plain]))
+    assert open_dataset(url).identical(open_dataset(store))
+    assert open_dataset(Path(store).as_uri()).identical(open_dataset(store))
 
 
 def test_wrong_arguments_are_refused(store: str) -> None:
