@@ -45,7 +45,7 @@ def recursion(F: np.ndarray, f: np.ndarray, x0: np.ndarray) -> np.ndarray:
     starts[0] = x0
     for i in range(blocks - 1):
         starts[i + 1] = powers[size] @ starts[i] + x[i, size]
-    x[:, :size] += np.einsum("jab,ib->ija", powers[:size], starts)
+    x[:, :size] += (starts @ powers[:size].reshape(-1, n).T).reshape(blocks, size, n)
     return x[:, :size].reshape(-1, n)[:T]
 
 
