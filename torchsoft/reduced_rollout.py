@@ -28,25 +28,19 @@ def linear_rollout(A: np.ndarray, B: np.ndarray, h: float, y0: np.ndarray, w: np
     return recursion(F, w @ G.T, y0 - D @ w[0]) + w @ D.T
 
 
-def recursion(F: np.ndarray, f: np.ndarray, x0: np.ndarray) -> np.ndarray:
-    """x[k+1] = F x[k] + f[k] from x[0] = x0, as (T, n) with f (T, n): blocks side by side, then their starts."""
+@njit(cache=True)
+def recursion(F, f, x0):
+    """x[k+1] = F x[k] + f[k] from x[0] = x0, as (T, n) with f (T, n)."""
     T, n = f.shape
-    size = max(1, round(T**0.5))
-    blocks = -(-T // size)
-    forced = np.zeros((blocks * size, n))
-    forced[:T] = f
-    forced = forced.reshape(blocks, size, n)
-    x, powers = np.zeros((blocks, size + 1, n)), np.empty((size + 1, n, n))
-    powers[0] = np.eye(n)
-    for j in range(size):  # every block from rest
-        x[:, j + 1] = x[:, j] @ F.T + forced[:, j]
-        powers[j + 1] = F @ powers[j]
-    starts = np.empty((blocks, n))
-    starts[0] = x0
-    for i in range(blocks - 1):
-        starts[i + 1] = powers[size] @ starts[i] + x[i, size]
-    x[:, :size] += (starts @ powers[:size].reshape(-1, n).T).reshape(blocks, size, n)
-    return x[:, :size].reshape(-1, n)[:T]
+    x = np.empty((T, n))
+    x[0] = x0
+    for k in range(T - 1):
+        for i in range(n):
+            total = f[k, i]
+            for j in range(n):
+                total += F[i, j] * x[k, j]
+            x[k + 1, i] = total
+    return x
 
 
 def nonlinear_rollout(

@@ -31,7 +31,8 @@ class Recipe:
 
     form: "weak" (integrals against test functions of half-width `width` [s], `domains` a window of `window` [s]) or
     "derivative" (fourth-order differences of the velocities). models: ensemble members, 0 for none. Coefficients of an
-    ensemble are medians, their intervals the 5th and 95th percentiles.
+    ensemble are medians, their intervals the 5th and 95th percentiles: how much the fit depends on the choice of rows, which
+    overlap, and not how wrong the form of the equation may be.
     """
 
     optimizer: Literal["stlsq", "sr3"] = "stlsq"
@@ -76,7 +77,7 @@ def assemble(
     """
     states = tuple(name for name in STATES if name not in inputs)
     steps = [one.step for one in records]
-    if not records or max(steps) > min(steps) * (1 + 1e-6):
+    if not steps or max(steps) > min(steps) * (1 + 1e-6):
         raise ValueError(f"the records must have one time step, but have {sorted(set(steps))} s")
     names, kinematics = (*states, *inputs), {k: v for k, v in KINEMATICS.items() if k in states}
     every = {target: [(term, 1.0) for term in terms] for target, terms in candidates.items()}

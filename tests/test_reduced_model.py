@@ -1,0 +1,35 @@
+"""The reduced models at smoke size: what is found agrees with mechanics, and with the full model where it is used."""
+
+import json
+from pathlib import Path
+
+import pytest
+from test_experiments import experiment
+
+
+@pytest.mark.xdist_group("reduced_model")
+def test_reduced_model_smoke(tmp_path: Path) -> None:
+    module = experiment("reduced_model")
+    result = module.run(module.Config(out=tmp_path, smoke=True))
+    numbers = json.loads(json.dumps(module.summary(result)))
+    stick, slip, gain = numbers["stick"], numbers["slip"], numbers["gain_sweep"]
+    assert stick["terms"] <= 10
+    assert stick["heldout_nrmse"] < 0.02
+    assert stick["rolling_radius_mm"]["found"] == pytest.approx(stick["rolling_radius_mm"]["expected"], rel=0.03)
+    found = {(row["equation"], row["term"]): row for row in stick["coefficients"]}
+    for term in ("x_Br - 2 x_C", "v_Br - 2 v_C"):
+        row = found["v_C", term]
+        assert abs(row["error"]) < 0.1
+        assert abs(row["error_in_band"]) < 0.03
+        assert row["interval"][0] < row["value"] < row["interval"][1]
+    assert found["v_Br", "F_x"]["value"] == pytest.approx(1 / 0.4065, rel=0.05)
+    assert len(stick["noise"]) == 2
+    assert slip["heldout_nrmse"] < 0.1
+    fastest = min(slip["by_stroke"], key=lambda row: row["stroke_time_s"])
+    assert fastest["slipping"] > 0.5
+    assert fastest["nrmse_linear"] > 2 * fastest["nrmse"]  # saturation is what the faster strokes need
+    confirmed = gain["confirmed"][0]
+    assert confirmed["full_dies_out"]
+    assert confirmed["reduced"]["overshoot"] == pytest.approx(confirmed["full"]["overshoot"], abs=0.02)
+    assert len(module.figure(result).axes) == 7
+    assert "| stick |" in module.table(result)
