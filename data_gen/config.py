@@ -114,9 +114,9 @@ class Jerk(Drawn):
     kind: Literal["jerk"] = "jerk"
     motion: ClassVar[str] = "strokes"
     sets: ClassVar[dict[str, Any]] = {"control.senses": "bracket"}
-    depth: PositiveRange = PositiveRange(low=2e-4, high=5e-4)
+    depth: PositiveRange = PositiveRange(low=2e-4, high=4e-4)
     travel: PositiveRange = PositiveRange(low=20e-3, high=40e-3)
-    stroke_time: PositiveRange = PositiveRange(low=0.2, high=0.4)
+    stroke_time: PositiveRange = PositiveRange(low=0.06, high=0.12)
 
 
 Kind = SlowRoll | Strokes | MultiSine | Chirp | Press | Jerk

@@ -9,7 +9,8 @@ from data_gen.config import RATIO, Config
 from data_gen.design import Task
 from data_gen.excitation import excitation
 from data_gen.schema import STORES, sizes, variables
-from torchsoft.excitation import grasp_load, reference, start
+from torchsoft.equilibrium import rest
+from torchsoft.excitation import grasp_load, reference
 from torchsoft.implicit import SimulationFailed
 from torchsoft.kernels.run import DISSIPATED, SUPPLIED
 from torchsoft.model import SoftGrasp
@@ -33,7 +34,7 @@ def simulate_task(config: Config, task: Task) -> Row:
     t = torch.arange(config.samples, dtype=torch.float64) * config.sample_interval
     try:
         model = SoftGrasp(task.parameters)
-        y0 = torch.round(start(model).detach(), decimals=PLACE) + 0.0  # no negative zeros
+        y0 = torch.round(rest(model).detach(), decimals=PLACE) + 0.0  # no negative zeros
         force = round(
             find_grasp_force(model, y0, config.step) if config.feed_forward == "found" else grasp_load(model), FORCE
         )

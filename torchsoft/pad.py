@@ -221,9 +221,10 @@ class Pad(nn.Module):
         loads[surface, np.arange(len(surface))] = 1.0
         factor = linalg.cholesky_banded(self.mesh.banded_stiffness(*lame_moduli(1.0, nu)), lower=True)
         X = linalg.cho_solve_banded((factor, True), loads)
-        nu_ = torch.tensor(nu, dtype=torch.float64)
-        one = torch.ones((), dtype=torch.float64)
-        d_lambda, d_mu = torch.func.jacfwd(lambda n: torch.stack(lame_moduli(one, n)))(nu_).tolist()
+        with torch.enable_grad():
+            nu_ = torch.tensor(nu, dtype=torch.float64, requires_grad=True)
+            moduli = lame_moduli(torch.ones_like(nu_), nu_)
+        d_lambda, d_mu = (torch.autograd.grad(modulus, nu_, retain_graph=True)[0].item() for modulus in moduli)
         K_lambda, K_mu, _ = self.mesh.matrices
         dK = self.mesh.assemble(d_lambda * K_lambda + d_mu * K_mu)
         dX = -linalg.cho_solve_banded((factor, True), dK @ X)

@@ -78,8 +78,8 @@ def sensitivities(
     """Run from y0 (size,) through t (T,) [s] and differentiate every state by the scalar parameters `names`.
 
     Names are those of `model.named_parameters()`, such as "contact.K_n" or "material.E". `dy0` (size, n) is the
-    derivative of the initial state, zero by default; `rigid` leaves the pads out of the result. Raises `ValueError` for a name that is not a scalar parameter,
-    `NotImplementedError` for inertial pads, `SimulationFailed` as `simulate` does.
+    derivative of the initial state, zero by default; `rigid` leaves the pads out of the result. Raises `ValueError` for a
+    name that is not a scalar parameter, `NotImplementedError` for inertial pads, `SimulationFailed` as `simulate` does.
     """
     known = {name: p for name, p in model.named_parameters() if p.ndim == 0}
     unknown = [name for name in names if name not in known]
