@@ -126,7 +126,7 @@ def test_all_routes_are_one(nonlinear: bool) -> None:
     extra = {"v_C": [(friction(R, 0.01)["v_C"][1], 5.0), (product, -1e6)]} if nonlinear else None
     model = truth(extra)
     assert model.linear is not nonlinear
-    one = motion(truth(), 7, duration=0.03)
+    one = motion(truth(), 7, duration=0.01)
     t, u, y0 = one.t, 20 * one.columns(("x_d", "x_d_dot")), 20 * one.columns(STATES)[0]
     fast = model.rollout(t, y0, u).y
     model.signal = Held(torch.from_numpy(t), torch.from_numpy(u))
