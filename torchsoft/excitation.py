@@ -81,7 +81,8 @@ class Excitation(Table):
 
     `senses` is whose x the horizontal loop measures: with "bracket" the disc may slip freely, which a light grasp and hard
     strokes make it do ("forced slip"). `x_C0` [m] is off the nodes and the middle on purpose: an exactly symmetric start
-    breaks on rounding.
+    breaks on rounding. Where the loop senses the disc it should be a node's place, such as 60 mm: while the upper pad is
+    clear of the disc nothing ties the two together, and the least roll of the disc sends the bracket off.
     """
 
     motion: Motion
@@ -109,28 +110,31 @@ CATALOGUE = {
     "slow roll": Excitation(motion=Roll(travel=16e-3), duration=4.0, senses="bracket"),
     "strokes": Excitation(motion=Strokes(travel=20e-3, stroke_time=0.75), duration=2.0, senses="bracket"),
     "fast strokes": Excitation(motion=Strokes(travel=20e-3, stroke_time=0.25), duration=2.0, senses="bracket"),
-    "chirp": Excitation(motion=Chirp(amplitude_x=3e-3, amplitude_y=2e-4, end=25.0), duration=2.0, senses="bracket"),
-    "press": Excitation(motion=Press(amplitude=4e-4, frequency=8.0, travel=10e-3), duration=2.0, senses="bracket"),
-    "slow shaking": Excitation(
-        motion=MultiSine(amplitude_x=16e-3, amplitude_y=2e-4, frequency=(1.0, 8.0)), duration=2.0, senses="bracket"
-    ),
-    "shaking": Excitation(
-        motion=MultiSine(amplitude_x=4e-3, amplitude_y=1e-4, frequency=(10.0, 60.0)), duration=2.0, senses="bracket"
-    ),
-    "light shaking": Excitation(
-        motion=MultiSine(amplitude_x=4e-3, amplitude_y=1e-4, frequency=(10.0, 60.0)), duration=2.0, depth=8e-4,
-        senses="bracket",
-    ),
-    "jerks, light": Excitation(
-        motion=Strokes(travel=40e-3, stroke_time=0.1), duration=1.3, depth=2e-4, senses="bracket"
-    ),
-    "long jerks, light": Excitation(
-        motion=Strokes(travel=80e-3, stroke_time=0.15), duration=1.3, depth=2e-4, senses="bracket"
-    ),
-    "jerks, deep": Excitation(motion=Strokes(travel=40e-3, stroke_time=0.1), duration=1.3, senses="bracket"),
     "strokes, loop about the disc": Excitation(
         motion=Strokes(travel=10e-3, stroke_time=0.75), duration=2.0, x_C0=60e-3
     ),
+    "shaking": Excitation(
+        motion=MultiSine(amplitude_x=10e-3, amplitude_y=2e-4, frequency=(2.0, 15.0)), duration=2.0, senses="bracket"
+    ),
+    "pressing": Excitation(motion=Press(amplitude=4e-4, frequency=8.0, travel=10e-3), duration=2.0, senses="bracket"),
+    "deep pressing": Excitation(
+        motion=Press(amplitude=8e-4, frequency=25.0, travel=30e-3), duration=2.0, depth=2.5e-3, senses="bracket"
+    ),
+    "deep chirp": Excitation(
+        motion=Chirp(amplitude_x=5e-3, amplitude_y=5e-4, start=1.0, end=25.0), duration=2.0, depth=2.5e-3,
+        senses="bracket",
+    ),
+    "light shaking": Excitation(
+        motion=MultiSine(amplitude_x=6e-3, amplitude_y=2e-4, frequency=(4.0, 20.0)), duration=2.0, depth=3e-4,
+        senses="bracket",
+    ),
+    "light jerks": Excitation(
+        motion=Strokes(travel=80e-3, stroke_time=0.25), duration=1.4, depth=2e-4, senses="bracket"
+    ),
+    "hard light jerks": Excitation(
+        motion=Strokes(travel=80e-3, stroke_time=0.15), duration=1.3, depth=2e-4, senses="bracket"
+    ),
+    "deep jerks": Excitation(motion=Strokes(travel=40e-3, stroke_time=0.1), duration=1.3, senses="bracket"),
 }  # fmt: skip
 """Ready excitations by name, from gentle to hard; `experiments/experiment_design.py` ranks them."""
 

@@ -168,11 +168,15 @@ def nrmse(problem: Problem, r: Array, which: list[str]) -> dict[str, dict[str, f
     return out
 
 
+def step_error(r: Array, finer: Array) -> Array:
+    """Minus the error (m,) of residuals r by the finite step, from those at half of it: the method is of second order, so
+    the exact residuals are finer + (finer - r) / 3."""
+    return 4.0 / 3.0 * (finer - r)
+
+
 def step_shift(J: Array, r: Array, finer: Array) -> Array:
-    """How far the finite step has moved the coordinates (n,), from residuals at the step and at half of it: the method is of
-    second order, so the exact residuals are finer + (finer - r) / 3."""
-    error = 4.0 / 3.0 * (finer - r)
-    return np.asarray(np.linalg.lstsq(J, error, rcond=None)[0], np.float64)
+    """How far the finite step has moved the coordinates (n,)."""
+    return np.asarray(np.linalg.lstsq(J, step_error(r, finer), rcond=None)[0], np.float64)
 
 
 def estimates(problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shift: Array) -> list[Estimate]:

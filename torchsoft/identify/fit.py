@@ -18,11 +18,12 @@ Notify = Callable[[float], None]
 
 
 class Unreachable(RuntimeError):
-    """The model cannot follow a recording with the parameters that a fit starts from."""
+    """The model cannot follow a recording with the parameters that a fit starts from; `lost` says why, and when."""
 
     def __init__(self, lost: dict[str, Lost]) -> None:
         told = "; ".join(f"recording `{name}`: {loss.reason}" for name, loss in lost.items())
         super().__init__(f"the model cannot reach the data from this start: {told}")
+        self.lost = lost
 
 
 class Fit(NamedTuple):

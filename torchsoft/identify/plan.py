@@ -22,8 +22,8 @@ SEEN = 0.1
 """A coordinate takes part in the first look if its predicted standard deviation [1] is below this: one that is seen faintly
 would run off to make up for what is still wrong elsewhere."""
 
-COARSE = 4.0
-"""Early stages take steps this many times the full one, on the first recording."""
+COARSE = 2.0
+"""Early stages take steps this many times the full one."""
 
 SCANNED = (1.0, 0.85, 0.7, 0.55)
 """Parts of its upper bound at which a ratio is tried before it is set free."""
@@ -96,7 +96,9 @@ def default_plan(problem: Problem, runner: Runner, step: float, which: Sequence[
         )
     ]
     if len(order) > 1 or ratios.any():
-        plan.append(Stage("all data, ratios tied", tuple(order), tuple(labels[free & ~ratios]), 2 * step, 15, 1e-3))
+        plan.append(
+            Stage("all data, ratios tied", tuple(order), tuple(labels[free & ~ratios]), COARSE * step, 15, 1e-3)
+        )
     scans = tuple((c.all[i].label, tuple(part * c.all[i].high for part in SCANNED)) for i in np.flatnonzero(ratios))
     plan.append(Stage("everything", tuple(order), tuple(labels[free]), step, 40, 1e-7, scanned=scans))
     return plan

@@ -1,7 +1,7 @@
 """The least-squares problem: recordings, sensors and unknowns; residuals in units of the sensors' noise."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,10 +99,13 @@ class Problem:
     ) -> Residuals:
         """Residuals of some recordings at x (n,); the Jacobian's columns of `free` coordinates."""
         jobs = self.jobs(x, which, step, free)
-        results = runner.run(jobs)
+        return self.gather(x, jobs, runner.run(jobs))
+
+    def gather(self, x: Array, jobs: Sequence[Job], results: Sequence[Any]) -> Residuals:
+        """Residuals at x (n,) from the results of its jobs."""
         lost = {self.recordings[job.recording].name: got for job, got in zip(jobs, results) if isinstance(got, Lost)}
         if lost:
-            m = self.samples(which)
+            m = self.samples([self.recordings[job.recording].name for job in jobs])
             return Residuals(np.full(m, np.inf), np.full((m, len(x)), np.inf), lost)
         parts = [self._compare(x, job, got) for job, got in zip(jobs, results)]
         return Residuals(np.concatenate([r for r, _ in parts]), np.concatenate([J for _, J in parts]), {})

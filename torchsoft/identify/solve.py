@@ -30,6 +30,9 @@ Array = NDArray[np.float64]
 
 Method = Literal["gauss_newton", "lbfgs", "adam"]
 
+AUDIBLE = 0.5
+"""Residuals over the noise below which their colour does not matter: data without noise."""
+
 MISFIT = 1.2
 """chi2 above which the model, or the noise that was given, is called wrong."""
 
@@ -142,7 +145,8 @@ def sobol(problem: Problem, x: Array, free: NDArray[np.bool_], stage: Stage, see
     low, high = problem.coordinates.bounds
     reach = np.array([np.log(stage.spread) if c.scale == "log" else 0.5 for c in problem.coordinates.all])
     low, high = np.maximum(low, x - reach), np.minimum(high, x + reach)
-    points = qmc.Sobol(int(free.sum()), rng=np.random.default_rng(seed)).random(stage.starts - 1)
+    power = (stage.starts - 1).bit_length()
+    points = qmc.Sobol(int(free.sum()), rng=np.random.default_rng(seed)).random_base2(power)[: stage.starts - 1]
     out = []
     for u in points:
         start = x.copy()
@@ -232,7 +236,7 @@ def remarks(
         )
     if not converged:
         out.append("the last stage stopped before it converged: give it more evaluations")
-    coloured = [f"{r.channel} of {r.recording}" for r in channels if r.p_white < 1e-3]
+    coloured = [f"{r.channel} of {r.recording}" for r in channels if r.p_white < 1e-3 and r.rms > AUDIBLE]
     if coloured:
         out.append(f"residuals are not white in {', '.join(coloured)}: something systematic is left")
     return out

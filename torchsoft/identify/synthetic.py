@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from torchsoft.excitation import Excitation, begin, start
+from torchsoft.excitation import Excitation, begin
 from torchsoft.identify.prediction import TOLERANCE, rigid, signals
 from torchsoft.identify.recording import CHANNELS, SETTLE, Recording
 from torchsoft.identify.unknowns import Sensor
@@ -17,8 +17,9 @@ def record(
 ) -> Recording:  # fmt: skip
     """What a rig with the parameters `truth` gives under an excitation that was planned with the `nominal` ones.
 
-    Sampled at `rate` [Hz] from a run with the given step [s], with Gaussian noise of `noise` times each sensor's own.
-    The recording holds nothing of the truth but the samples. Raises `SimulationFailed`.
+    The disc is set down, as the nominal parameters would have it lie, `SETTLE` before the first sample, as
+    `Recording.begin` assumes. Sampled at `rate` [Hz] from a run with the given step [s], with Gaussian noise of `noise` times
+    each sensor's own. The recording holds nothing of the truth but the samples. Raises `SimulationFailed`.
     """
     planned = begin(excitation, nominal)
     real = begin(excitation, truth).model
@@ -26,7 +27,7 @@ def record(
     at = np.arange(0.0, excitation.duration + 0.5 / rate, 1.0 / rate)
     t = torch.from_numpy(np.concatenate(([at[0] - SETTLE], at)))
     with torch.no_grad():
-        run = simulate(real, t, y0=start(real).detach(), step=step, tolerance=TOLERANCE)
+        run = simulate(real, t, y0=planned.y0, step=step, tolerance=TOLERANCE)
         said = signals(real, t[1:], rigid(real, run.y[1:])).numpy()
     rng, samples = np.random.default_rng(seed), {}
     for channel, sensor in sensors.items():
