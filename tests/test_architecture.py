@@ -14,8 +14,9 @@ kernels kernels.node kernels.linear kernels.pad kernels.stage kernels.run kernel
 kernel_inputs grid implicit stage_laws adjoint sensitivity unrolled torchdiffeq_solver continuous
 trajectory simulate scenario excitation
 identify.unknowns identify.recording identify.prediction identify.workers identify.problem identify.fit identify.plan
-identify.answer identify.solve identify.synthetic identify dataset
+identify.answer identify.solve identify.synthetic identify.columns identify.measured identify dataset
 reduced_rollout reduced_ode reduction_records reduction_terms reduction scene figures animation diagram
+identify.pictures identify.report cli __main__
 """
 ORDER = FLOW.split()
 LONGEST = 380

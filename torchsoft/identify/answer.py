@@ -197,7 +197,8 @@ def estimates(problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shi
             sd = float(np.sqrt(max(slope @ C @ slope, 0.0)))
             seen = sd < UNSEEN
             if c.all[mine[0]].scale == "log":
-                interval = (value * float(np.exp(-q * sd)), value * float(np.exp(q * sd)))
+                reach = min(q * sd, 700.0)  # what is not seen at all would overflow
+                interval = (value * float(np.exp(-reach)), value * float(np.exp(reach)))
             else:
                 interval = (value - q * sd * abs(value), value + q * sd * abs(value))
             out.append(

@@ -1,0 +1,59 @@
+"""Make the recordings of this folder: a rig whose parameters are `TRUTH`, seen by noisy sensors. Takes some seconds.
+
+python examples/identify/make.py
+"""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from torchsoft import Parameters
+from torchsoft.excitation import Chirp, Excitation, Strokes
+from torchsoft.identify import CHANNELS, Recording, Sensor, record
+
+HERE = Path(__file__).parent
+
+NOMINAL = Parameters().override({"contact.v_s": 0.05})
+TRUTH = NOMINAL.override(
+    {"contact.K_n": 1.6e5, "contact.mu_s": 0.6, "contact.mu_k": 0.5, "contact.R_t": 300.0, "pad.E": 0.9e6, "pad.tau": 12e-3}
+)  # fmt: skip
+SENSORS = {"x_C": 10e-6, "theta": 0.5e-3, "x_Br": 10e-6, "y_Br": 10e-6, "F_x": 0.1, "F_y": 0.1}
+GRASP = {"duration": 1.2, "depth": 1.2e-3, "grasp_time": 0.25, "settle": 0.05, "senses": "bracket"}
+RECORDINGS = {
+    "rolling": Excitation(motion=Strokes(travel=12e-3, stroke_time=0.25), **GRASP),
+    "checking": Excitation(motion=Chirp(amplitude_x=3e-3, start=1.0, end=6.0), **GRASP),
+}
+UNITS = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "N": ("N", 1.0), "m/s": ("mm/s", 1e3)}
+
+
+def table(recording: Recording) -> dict[str, tuple[str, np.ndarray]]:
+    """Unit and values in SI by column: time, set-points with their rates, then what was measured."""
+    t = recording.times
+    with torch.no_grad():
+        want = recording.reference(torch.from_numpy(t))
+    asked = {"x_d": ("m", want.x), "x_d_dot": ("m/s", want.x_dot), "y_d": ("m", want.y), "y_d_dot": ("m/s", want.y_dot)}
+    out = {name: (unit, value.numpy()) for name, (unit, value) in (asked | {"F_ff": ("N", want.F_y)}).items()}
+    return out | {name: (CHANNELS[name], values) for name, (_, values) in recording.samples.items()}
+
+
+def write(recording: Recording, path: Path, digits: int = 7) -> None:
+    """A CSV file with the units of `UNITS` in the heading."""
+    columns = table(recording)
+    with path.open("w", newline="") as file:
+        out = csv.writer(file, lineterminator="\n")
+        out.writerow(["t [s]", *(f"{name} [{UNITS[unit][0]}]" for name, (unit, _) in columns.items())])
+        for i, t in enumerate(recording.times):
+            cells = [values[i] * UNITS[unit][1] for unit, values in columns.values()]
+            out.writerow([f"{t:.9g}", *(f"{cell + 0.0:.{digits}g}" for cell in cells)])
+
+
+def make(name: str, seed: int) -> Recording:
+    sensors = {channel: Sensor(noise=noise) for channel, noise in SENSORS.items()}
+    return record(name, RECORDINGS[name], TRUTH, NOMINAL, sensors, seed=seed)
+
+
+if __name__ == "__main__":
+    for seed, name in enumerate(RECORDINGS):
+        write(make(name, seed), HERE / f"{name}.csv")

@@ -1,0 +1,100 @@
+"""The command `torchsoft`: identification from files."""
+
+import argparse
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+IDENTIFY = """\
+Which parameters explain these recordings, and how sure is that?
+
+DATA are CSV files with a heading such as `t [s], x_d [mm], y_d [mm], F_ff [N], x_C [mm], theta [deg]`, or trajectory files of
+this project (.nc). CONFIG.toml says what is known, what is unknown and how good the sensors are; examples/identify has both.
+Writes answer.json and report.html. Interrupted, the same command continues where it was."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; the exit status is 0, 2 for what the user can mend, 130 for an interruption."""
+    parser = argparse.ArgumentParser(
+        prog="torchsoft", description="A differentiable simulator of soft contact manipulation."
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    one = commands.add_parser(
+        "identify", help="find parameters in recordings", description=IDENTIFY,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    one.add_argument(
+        "files", nargs="+", type=Path, metavar="DATA.csv ... CONFIG.toml", help="data files and one configuration"
+    )
+    one.add_argument("--out", type=Path, default=Path("out/identify"), help="folder for the results (%(default)s)")
+    one.add_argument("--workers", type=int, help="processes, one recording each (fit.workers)")
+    one.add_argument("--step", type=float, help="the simulation's step [s] (fit.step)")
+    one.add_argument("--checkpoint", type=Path, help="folder for what is unfinished (OUT/unfinished)")
+    one.add_argument("--no-progress", action="store_true", help="show no progress")
+    options = parser.parse_args(arguments)
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_, **__: print(f"torchsoft: note: {message}", file=sys.stderr)
+        return identify(options)
+
+
+def identify(options: argparse.Namespace) -> int:
+    configs = [file for file in options.files if file.suffix == ".toml"]
+    data = [file for file in options.files if file.suffix != ".toml"]
+    unfinished: Path = options.checkpoint or options.out / "unfinished"
+    if len(configs) != 1:
+        return failed(f"one CONFIG.toml is needed, but {len(configs)} were given")
+    try:
+        # these take seconds to import, so that `--help` does without
+        from torchsoft.identify import measured
+        from torchsoft.identify.fit import Unreachable
+        from torchsoft.identify.report import report
+        from torchsoft.identify.solve import identify
+
+        tables: dict[str, Any] = {}
+        try:
+            case = measured.load(data, configs[0])
+            fit, tables = case.config.fit, case.tables
+            changed = {"step": options.step, "workers": options.workers}
+            fit = measured.Settings.model_validate(
+                fit.model_dump() | {k: v for k, v in changed.items() if v is not None}
+            )
+            options.out.mkdir(parents=True, exist_ok=True)
+            answer = identify(
+                case.problem, heldout=case.config.heldout, checkpoint=unfinished, progress=not options.no_progress,
+                **fit.model_dump(),
+            )  # fmt: skip
+            answer.save(options.out / "answer.json")
+            report(answer, case.problem, options.out / "report.html", checkpoint=unfinished)
+        except Unreachable as error:
+            return failed(measured.unreachable(error, tables))
+        except measured.ValidationError as error:
+            return failed(measured.told(error))
+        except (ValueError, RuntimeError) as error:  # a model without equilibrium, a worker that was killed
+            return failed(str(error))
+        except OSError as error:
+            return failed(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    except KeyboardInterrupt:
+        print(f"\ninterrupted; what is done so far is in {unfinished}, and the same command continues", file=sys.stderr)
+        return 130
+    clear(unfinished)
+    print(answer.table())
+    for notice in answer.notices:
+        print(f"note: {notice}")
+    print(f"{answer.cost['wall_s']:.0f} s; written to {options.out / 'answer.json'} and {options.out / 'report.html'}")
+    return 0
+
+
+def failed(what: str) -> int:
+    print(f"torchsoft: error: {' '.join(what.split())}", file=sys.stderr)
+    return 2
+
+
+def clear(folder: Path) -> None:
+    """Remove a checkpoint: its own files, and the folder if it holds nothing else."""
+    for pattern in ("*.pickle", "*.partial"):
+        for file in folder.glob(pattern):
+            file.unlink(missing_ok=True)
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
