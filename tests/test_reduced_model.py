@@ -11,7 +11,7 @@ from test_experiments import experiment
 def test_reduced_model_smoke(tmp_path: Path) -> None:
     module = experiment("reduced_model")
     result = module.run(module.Config(out=tmp_path, smoke=True))
-    numbers = json.loads(json.dumps(module.summary(result)))
+    numbers = json.loads(json.dumps(module.summary(result), allow_nan=False))
     stick, slip, gain = numbers["stick"], numbers["slip"], numbers["gain_sweep"]
     assert stick["terms"] <= 10
     assert stick["heldout_nrmse"] < 0.02
