@@ -164,8 +164,8 @@ def plausible(table: Columns, p: Parameters, sensors: dict[str, Sensor]) -> None
             moving = np.abs(y - y[0]) > CREEP * size * (t - t[0]) + slack
         for i in np.flatnonzero(moving)[:1].tolist():
             raise ValueError(
-                f"{table.at(int(here[i]))}, column `{name}` moves already: a recording must begin at rest, the disc on the lower "
-                "pad and the bracket clear of it"
+                f"{table.at(int(here[i]))}, column `{name}` moves already: a recording must begin at rest, the disc on the "
+                "lower pad and the bracket clear of it"
             )
     if (y := table.values["y_d"][0]) < H - SUNK:
         raise ValueError(

@@ -54,6 +54,13 @@ dl{display:grid;grid-template-columns:max-content 1fr;gap:.2rem 1rem;font-size:.
 dt{color:var(--soft)}dd{margin:0}
 pre{overflow-x:auto;background:#f6f7f8;padding:.8rem;font-size:.82rem;line-height:1.4;overflow-wrap:normal}
 summary{cursor:pointer;color:var(--soft)}
+@media(max-width:34rem){
+ thead{display:none}table,caption,tbody,tr,td{display:block}
+ tr{border-bottom:1px solid var(--line);padding:.4rem 0}
+ td,td.n{display:flex;justify-content:space-between;gap:1rem;border:0;padding:.1rem 0;text-align:right;white-space:normal}
+ td::before{content:attr(data-label);color:var(--soft);flex:none}
+ td:empty{display:none}td:first-child{font-weight:600}td:first-child::before{content:none}
+}
 """
 
 
@@ -108,19 +115,26 @@ def picture(figure: Figure, alt: str, caption: str = "") -> str:
 def table(head: list[str], rows: list[list[Any]], caption: str = "") -> str:
     """Numbers to the right; a cell that is a pair brings its class along."""
 
-    def cell(value: Any) -> str:
+    def cell(label: str, value: Any) -> str:
         kind, text = value if isinstance(value, tuple) else ("n" if is_number(value) else "", value)
-        return f'<td class="{kind}">{escape(str(text))}</td>' if kind else f"<td>{escape(str(text))}</td>"
+        return f'<td class="{kind}" data-label="{escape(label)}">{escape(str(text))}</td>'
 
     numeric = [any(is_number(row[i]) for row in rows) for i in range(len(head))]
-    top = "".join(f'<th scope="col"{" class=n" if n else ""}>{escape(h)}</th>' for h, n in zip(head, numeric))
-    body = "".join(f"<tr>{''.join(cell(v) for v in row)}</tr>" for row in rows)
+    top = "".join(f'<th scope="col" class="{"n" if n else ""}">{escape(h)}</th>' for h, n in zip(head, numeric))
+    body = "".join(f"<tr>{''.join(cell(h, v) for h, v in zip(head, row))}</tr>" for row in rows)
     told = f"<caption>{escape(caption)}</caption>" if caption else ""
     return f'<div class="wide"><table>{told}<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def is_number(value: Any) -> bool:
     return isinstance(value, str) and value.strip(" −-+").replace(" … ", "")[:1].isdigit()
+
+
+def grouped(value: float) -> str:
+    """Five digits, thousands set apart, such as 159 090."""
+    text = f"{value:.5g}"
+    whole = 1e4 <= abs(value) < 1e9
+    return f"{float(text):,.0f}".replace(",", "\u202f") if whole else text
 
 
 def estimates_table(answer: Answer, start: list[float]) -> str:
@@ -130,9 +144,9 @@ def estimates_table(answer: Answer, start: list[float]) -> str:
         if e.value is None or e.ci95 is None:
             found = [("unseen", "the data do not see it"), ("unseen", "none")]
         else:
-            found = [f"{e.value:.5g}", f"{e.ci95[0]:.4g} … {e.ci95[1]:.4g}"]
+            found = [grouped(e.value), f"{grouped(e.ci95[0])} … {grouped(e.ci95[1])}"]
         rows.append(
-            [named(e), *found, unit, f"{s:.4g}", "yes" if e.seen else ("unseen", "no"), "yes" if e.at_bound else "no"]
+            [named(e), *found, unit, grouped(s), "yes" if e.seen else ("unseen", "no"), "yes" if e.at_bound else "no"]
         )
     return table(["parameter", "estimate", "95 % interval", "unit", "start", "seen", "at a bound"], rows)
 
@@ -202,7 +216,7 @@ def page(answer: Answer, problem: Problem, drawn: list[Trace], lost: dict[str, s
     count = ", ".join(
         f"{cost[k]:.0f} {name}"
         for k, name in (("simulations", "simulations"), ("jacobians", "Jacobians"), ("gradients", "gradients"),
-                        ("remembered", "of them remembered")) if cost[k]
+                        ("remembered", "of them known from before")) if cost[k]
     )  # fmt: skip
     parts += [
         "<h2>Stages and cost</h2>",
