@@ -1,5 +1,6 @@
 """The stepper: order, torchdiffeq, energy, and how runs end."""
 
+import numpy as np
 import pytest
 import torch
 from conftest import COARSE, coarse
@@ -7,6 +8,7 @@ from torchdiffeq import odeint
 
 from torchsoft import METHOD, Parameters, SimulationFailed, SoftGrasp, press, rest, simulate
 from torchsoft.control import Profile, Reference, hold
+from torchsoft.implicit import ImplicitStepper, Segment
 from torchsoft.scenario import grasp_and_roll
 from torchsoft.stability import loop_modes
 
@@ -187,3 +189,25 @@ def test_a_disc_rolled_off_the_pad_is_reported() -> None:
     model.reference = Reference(Profile([0.0, 1.0], [0.06, 0.13]), model.reference.y, feed)
     with pytest.raises(SimulationFailed, match="contact reached the end of a pad"):
         simulate(model, times(1.0, 101), y0=y0)
+
+
+def test_a_step_that_newton_does_not_solve_is_halved() -> None:
+    """Too few iterations for the hardest steps: those are cut, the others are not, and the run ends where it should."""
+    model = coarse(contact__mu_s=0.3, contact__mu_k=0.2)
+    y0, t = grasped(model), times(0.02, 11)
+    y0[model.layout.slices["v_C"]] = torch.tensor([0.15, 0.0], dtype=torch.float64)
+    runs = []
+    for iterations in (40, 10):
+        stepper = ImplicitStepper(model, step=2e-3, max_iterations=iterations)
+        segments: list[Segment] = []
+        *_, last = stepper.integrate(y0, t, segments)
+        assert sum(len(segment.chunk.starts) for segment in segments) == last.steps
+        assert last.rows == len(t)
+        runs.append(last)
+    free, cut = runs
+    assert free.failed == 0
+    assert cut.failed > 0
+    assert 10 < cut.steps < 10 + 64 * cut.failed
+    fine = simulate(model, t, y0=y0, step=6.25e-5).y.numpy()
+    off_cut, off_free = (np.abs(run.y - fine)[:, model.layout.slices["r_C"]].max() for run in (cut, free))
+    assert off_cut < 1.2 * off_free

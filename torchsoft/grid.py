@@ -19,6 +19,15 @@ class Chunk(NamedTuple):
     starts: NDArray[np.floating]
     keep: NDArray[np.bool_]
 
+    def part(self, first: int, end: int) -> "Chunk":
+        """Some of the steps."""
+        return Chunk(self.h, self.starts[first:end], self.keep[first:end])
+
+    def halved(self, step: int) -> "Chunk":
+        """One of the steps, as two of half the length."""
+        begin, h = self.starts[step], 0.5 * self.h
+        return Chunk(h, np.array([begin, begin + h]), np.array([False, self.keep[step]]))
+
 
 def check_times(t: Tensor) -> None:
     """Raises `ValueError` unless t is a float64 vector of at least two finite, strictly increasing times."""

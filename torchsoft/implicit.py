@@ -32,6 +32,9 @@ from torchsoft.state import State
 
 log = logging.getLogger("torchsoft")
 
+HALVINGS = 6
+"""How often a step that Newton does not solve is halved before the run is given up."""
+
 METHOD = "sdirk2"
 """Name under which `torchdiffeq.odeint` knows the stepper once torchsoft is imported."""
 
@@ -55,6 +58,7 @@ class Progress:
     rows: int = 1
     steps: int = 0
     solves: int = 0
+    failed: int = 0
 
 
 @dataclass
@@ -73,7 +77,8 @@ class ImplicitStepper:
     """SDIRK2 on one model: L-stable, second order, stiffly accurate.
 
     `step` [s] is the largest step; every output interval is cut into equal steps no longer than it. Newton stops when
-    the contact law and the linear relations agree to `tolerance` [N] at every node. `window` [m] is how near a node has
+    the contact law and the linear relations agree to `tolerance` [N] at every node; a step that it does not solve is taken as
+    two of half the length, and so on up to `HALVINGS` times. `window` [m] is how near a node has
     to be to count as one that may touch (checked after every stage; only speed depends on it). Parameters are read when
     the stepper is made.
     """
@@ -143,21 +148,30 @@ class ImplicitStepper:
         V = torch.cat((state.v_C, state.omega[None], state.v_Br)).numpy()
         integrals, taped = np.zeros(len(INTEGRALS)), 0
         announce_compilation()
-        for chunk in chunks(t, self.step):
+        pending = [(chunk, 0) for chunk in reversed(list(chunks(t, self.step)))]
+        while pending:
+            chunk, halvings = pending.pop()
             rows = slice(out.rows, out.rows + int(chunk.keep.sum()))
             segment = Segment(chunk, _copies(states), q.copy(), V.copy(), rows, None)
             outputs = (out.y[rows], out.forces[rows], out.extras[rows])
             wanted = segments is not None and taped < tape_bytes
             steps, status, solves, tape = self._run(chunk, states, q, V, integrals, outputs, wanted)
-            if segments is not None:
-                segment.tape = tape
+            if segments is not None and steps > 0:
+                segment.chunk = chunk.part(0, steps)
+                segment.rows = slice(rows.start, rows.start + int(segment.chunk.keep.sum()))
+                segment.tape = None if tape is None else Tape(*(x[: 2 * steps] for x in tape))
                 segments.append(segment)
                 taped += sum(x.nbytes for x in tape) if tape is not None else 0
             out.rows += int(chunk.keep[:steps].sum())
             out.steps += steps
             out.solves += solves
             yield out
-            if status != CONVERGED:
+            if status == NEWTON_FAILED and halvings < HALVINGS:
+                out.failed += 1
+                if steps + 1 < len(chunk.starts):
+                    pending.append((chunk.part(steps + 1, len(chunk.starts)), halvings))
+                pending.append((chunk.halved(steps), halvings + 1))
+            elif status != CONVERGED:
                 raise self._failure(status, float(chunk.starts[steps]), chunk.h)
 
     def tape(self, segment: Segment) -> Tape:
@@ -206,8 +220,8 @@ class ImplicitStepper:
     def _failure(self, status: int, time: float, h: float) -> SimulationFailed:
         reasons = {
             NEWTON_FAILED: f"Newton's iteration did not converge within {self.max_iterations} iterations in the step of "
-            f"{h:.3g} s; try a smaller step, or a larger contact.v_s: where friction falls with slip faster than the pads "
-            "damp, massless pads have no unique velocity",
+            f"{h:.3g} s, halved {HALVINGS} times; try a smaller step, or a larger contact.v_s: where friction falls with slip "
+            "faster than the pads damp, massless pads have no unique velocity",
             OFF_THE_PAD: "the disc was lost: its contact reached the end of a pad",
             LOST: "the disc was lost: it left the space between the pads",
         }

@@ -116,7 +116,7 @@ def gather(
         dissipated={name: column[name] for name in DISSIPATED},
         supplied={name: column[name] for name in SUPPLIED},
         injected=column["injected"],
-        stats=Stats(out.steps, out.solves, failed, wall, step),
+        stats=Stats(out.steps, out.solves, out.failed + failed, wall, step),
         layout=model.layout,
         made_by={
             "torchsoft": version("torchsoft"),

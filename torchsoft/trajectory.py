@@ -14,7 +14,7 @@ from torchsoft.state import Layout, State
 
 @dataclass(frozen=True)
 class Stats:
-    """How the run went: steps, linear solves (Newton iterations), steps that failed, and wall time [s] of the stepping."""
+    """How the run went: steps, linear solves (Newton iterations), steps that failed and were halved, and wall time [s]."""
 
     steps: int
     newton_iterations: int
