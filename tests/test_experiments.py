@@ -74,3 +74,42 @@ def test_benchmark_smoke(tmp_path: Path) -> None:
     ratio = module.costs(config)["ratio"]
     assert ratio["gradient"] < 3  # with the run itself
     assert ratio["jacobian"] < 5
+
+
+def test_experiment_design_smoke(tmp_path: Path) -> None:
+    """Jerks of a light grasp see friction and dashpots better than strokes; together they see more than either alone."""
+    module = experiment("experiment_design")
+    module.main(module.Config(out=tmp_path, smoke=True))
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    single = {row["names"][0]: row["sd"] for row in summary["single"]}
+    both = summary["together"][0]["sd"]
+    assert single["jerks, light"]["contact.R_n"] < single["strokes"]["contact.R_n"]
+    assert all(both[name] <= min(sd[name] for sd in single.values()) for name in module.NAMES)
+    assert all(row["inconsistency"] < module.CONSISTENT for row in summary["single"])
+    assert (tmp_path / "experiment_design.png").stat().st_size > 10_000
+
+
+def test_identify_contact_smoke(tmp_path: Path) -> None:
+    """Without noise the truth, with noise the truth within what was predicted, by differences the same at more runs."""
+    module = experiment("identify_contact")
+    module.main(module.Config(out=tmp_path, smoke=True))
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    cases = {case["case"]: case for case in summary["cases"]}
+    assert all(abs(p["relative_error"]) < 1e-3 for p in cases["noise-free"]["parameters"].values())
+    for name, p in cases["noisy"]["parameters"].items():
+        assert abs(p["relative_error"]) < 3.5 * p["relative_sd"], name
+        again = cases["finite differences"]["parameters"][name]
+        assert again["estimate"] == pytest.approx(p["estimate"], rel=0.1 * p["relative_sd"])
+    assert max(cases["noisy"]["heldout_nrmse"]["shaking"].values()) < 0.05
+    assert cases["finite differences"]["simulations"] > 2 * cases["noisy"]["jacobians"]
+    assert {"report.html", "identify_contact.png"} <= {path.name for path in tmp_path.iterdir()}
+
+
+def test_interval_coverage_smoke(tmp_path: Path) -> None:
+    """Errors of a few standard deviations, not of many: four seeds are too few for a share."""
+    module = experiment("interval_coverage")
+    result = module.run(module.Config(out=tmp_path, smoke=True))
+    errors = [abs(e) for some in result.errors.values() for e in some]
+    assert len(errors) == 16
+    assert 0.1 < sum(errors) / 16 < 2.5
+    assert module.figure(result).axes

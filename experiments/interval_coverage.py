@@ -1,0 +1,137 @@
+"""Question: do the 95 % intervals hold the truth in 95 % of repetitions?
+
+A small problem, many noise seeds: two short recordings, four parameters, from starts 10 % off. Each seed's intervals either
+hold the truth or not; with N seeds the share of those that do is binomial, and so is its own interval (Clopper-Pearson).
+The errors over the predicted standard deviations should be normal with mean 0 and deviation 1.
+
+Command: .venv/bin/python experiments/interval_coverage.py [--seeds 50] [--workers 2] [--smoke]
+Expected: between 88 and 100 % for every parameter with 50 seeds. About two minutes on two cores.
+"""
+
+import json
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from matplotlib.figure import Figure
+from scipy import stats
+from tqdm import tqdm
+
+from torchsoft import Parameters
+from torchsoft.excitation import Excitation, MultiSine, Strokes
+from torchsoft.identify import Problem, Recording, Sensor, Stage, Unknown, identify, record
+
+NOISE = {"x_C": 1e-5, "y_C": 1e-5, "theta": 5e-4, "x_Br": 1e-5, "y_Br": 1e-5, "F_x": 0.1, "F_y": 0.1}
+"""Sensors and their noise [m, rad, N]."""
+SENSORS = {channel: Sensor(noise=sigma) for channel, sigma in NOISE.items()}
+TRUTH = {"pad.E": 0.9e6, "pad.tau": 0.012, "contact.K_n": 1.6e5, "contact.mu_s": 0.65}
+EXCITATIONS = {
+    "strokes": Excitation(motion=Strokes(travel=12e-3, stroke_time=0.2), duration=1.0, senses="bracket"),
+    "shaking": Excitation(
+        motion=MultiSine(amplitude_x=8e-3, amplitude_y=2e-4, frequency=(2.0, 12.0)), duration=1.0, senses="bracket"
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Config:
+    out: Path = Path("out/interval_coverage")
+    seeds: int = 50
+    step: float = 2e-3
+    """[s]; data and fit alike, so that only the noise is at work"""
+    workers: int = 2
+    smoke: bool = False
+    """four seeds, one process"""
+
+
+@dataclass(frozen=True)
+class Result:
+    config: Config
+    errors: dict[str, list[float]]
+    """logarithm of estimate over truth, over the predicted standard deviation, by parameter"""
+    inside: dict[str, int]
+
+
+def exact(step: float) -> list[Recording]:
+    """What the rig gives without noise; half of the usual mesh."""
+    nominal = Parameters().override(
+        {"contact.v_s": 0.05, "contact.mu_k": 0.5, "pad.elements_x": 60, "pad.elements_y": 2}
+    )
+    rig = nominal.override(TRUTH)
+    return [record(name, e, rig, nominal, SENSORS, step=step, noise=0.0) for name, e in EXCITATIONS.items()]
+
+
+def repeat(recordings: list[Recording], step: float, seed: int) -> dict[str, tuple[float, bool]]:
+    """One repetition: by parameter its error over the predicted standard deviation, and whether its interval holds."""
+    torch.set_num_threads(1)
+    rng, noisy = np.random.default_rng(seed), []
+    for r in recordings:
+        samples = {c: (t, y + NOISE[c] * rng.standard_normal(len(t))) for c, (t, y) in r.samples.items()}
+        noisy.append(replace(r, samples=samples))
+    problem = Problem(noisy, SENSORS, {name: Unknown(nominal=1.1 * value) for name, value in TRUTH.items()})
+    answer = identify(problem, plan=[Stage("all", problem.names, problem.coordinates.labels, step)])
+    out = {}
+    for name, truth in TRUTH.items():
+        e = answer[name]
+        assert e.ci95 is not None
+        out[name] = float(np.log(e.last / truth)) / e.relative_sd, e.ci95[0] <= truth <= e.ci95[1]
+    return out
+
+
+def run(config: Config) -> Result:
+    config = replace(config, seeds=4, workers=1) if config.smoke else config
+    recordings, seeds = exact(config.step), range(config.seeds)
+    if config.workers == 1:
+        found = [repeat(recordings, config.step, seed) for seed in tqdm(seeds, desc="seeds")]
+    else:
+        with ProcessPoolExecutor(config.workers, get_context("spawn")) as pool:
+            waiting = [pool.submit(repeat, recordings, config.step, seed) for seed in seeds]
+            found = [future.result() for future in tqdm(waiting, desc="seeds")]
+    errors = {name: [one[name][0] for one in found] for name in TRUTH}
+    return Result(config, errors, {name: sum(one[name][1] for one in found) for name in TRUTH})
+
+
+def figure(result: Result) -> Figure:
+    """Errors over their predicted standard deviations, beside the normal distribution."""
+    fig = Figure(figsize=(3.0 * len(result.errors), 3.0), layout="constrained")
+    z = np.linspace(-4, 4, 200)
+    for ax, (name, errors) in zip(fig.subplots(1, len(result.errors), sharey=True), result.errors.items()):
+        ax.hist(errors, bins=np.linspace(-4, 4, 17).tolist(), density=True, color="C0", alpha=0.6)
+        ax.plot(z, stats.norm.pdf(z), "k", lw=1)
+        ax.set(title=f"{name}: {result.inside[name]} of {len(errors)} inside", xlabel="error / predicted sd")
+    return fig
+
+
+def main(config: Config) -> None:
+    result = run(config)
+    n, rows = result.config.seeds, {}
+    print(
+        "| parameter | intervals that hold the truth | share | its own 95 % interval | mean error / sd | sd of that |"
+    )
+    print("|---|---|---|---|---|---|")
+    for name, inside in result.inside.items():
+        own = stats.binomtest(inside, n).proportion_ci(0.95)
+        mean, spread = float(np.mean(result.errors[name])), float(np.std(result.errors[name], ddof=1))
+        rows[name] = {"inside": inside, "share": inside / n, "ci95": [own.low, own.high], "mean": mean, "sd": spread}
+        print(
+            f"| {name} | {inside} of {n} | {inside / n:.0%} | {own.low:.0%} .. {own.high:.0%} | {mean:+.2f} | {spread:.2f} |"
+        )
+    result.config.out.mkdir(parents=True, exist_ok=True)
+    figure(result).savefig(result.config.out / "interval_coverage.png", dpi=150)
+    summary = {
+        "torchsoft": version("torchsoft"),
+        "config": asdict(result.config) | {"out": str(result.config.out)},
+        "seeds": n,
+        "parameters": rows,
+        "errors": result.errors,
+    }
+    (result.config.out / "summary.json").write_text(json.dumps(summary, indent=1))
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config))
