@@ -13,11 +13,11 @@ from torchdiffeq import odeint
 
 from torchsoft import press, simulate
 from torchsoft.control import Profile, Reference
-from torchsoft.reduced_ode import BEYOND, Factor, Held, ReducedModel, Term
-from torchsoft.reduced_rollout import recursion
-from torchsoft.reduction import Recipe, assemble, choose, fit, score
-from torchsoft.reduction_records import KINEMATICS, STATES, Record, noisy, record, rolling_radius
-from torchsoft.reduction_terms import friction, joined, mechanics, polynomials, variable
+from torchsoft.reduction.fit import Recipe, assemble, choose, fit, score
+from torchsoft.reduction.ode import BEYOND, Factor, Held, ReducedModel, Term
+from torchsoft.reduction.records import KINEMATICS, STATES, Record, noisy, record, rolling_radius
+from torchsoft.reduction.rollout import recursion
+from torchsoft.reduction.terms import friction, joined, mechanics, polynomials, variable
 
 R = 0.0183
 TRUTH = {

@@ -69,7 +69,7 @@ def nonlinear_rollout(
 
 @njit(cache=True)
 def _rates(S, C, K, forms, shapes, y, w, f, J, slope):
-    """f(y, w) and, if `slope`, its derivative J by y: `features` of `reduced_ode` with the chain rule, in place."""
+    """f(y, w) and, if `slope`, its derivative J by y: `features` of `ode` with the chain rule, in place."""
     n, m, p = len(y), len(K), forms.shape[1]
     z, values, slopes = np.empty(n + m + 1), np.empty(p), np.empty(p)
     z[n + m] = 1.0

@@ -1,6 +1,6 @@
 """Sparse reduced models from records, with pysindy: regressions, fits, rollouts against records, the choice of thresholds.
 
-Records come from `reduction_records`, candidate terms from `reduction_terms`, the model is `reduced_ode.ReducedModel`. Nothing
+Records come from `records`, candidate terms from `terms`, the model is `ode.ReducedModel`. Nothing
 here looks into the simulator: records are data. pysindy takes seconds to import, so it is imported where it is used.
 """
 
@@ -14,9 +14,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import scipy.linalg
 
-from torchsoft.reduced_ode import ReducedModel, Rollout, Term
-from torchsoft.reduction_records import KINEMATICS, STATES, Record
-from torchsoft.reduction_terms import Candidates
+from torchsoft.reduction.ode import ReducedModel, Rollout, Term
+from torchsoft.reduction.records import KINEMATICS, STATES, Record
+from torchsoft.reduction.terms import Candidates
 
 ROWS_PER_TERM = 10
 """Fewest rows of a regression per candidate term."""

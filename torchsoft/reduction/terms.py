@@ -17,8 +17,8 @@ positions, which is why they, and not the positions, are the columns. `friction`
 from collections.abc import Mapping, Sequence
 from itertools import combinations_with_replacement
 
-from torchsoft.reduced_ode import SYMBOLS, Factor, Term
-from torchsoft.reduction_records import KINEMATICS
+from torchsoft.reduction.ode import SYMBOLS, Factor, Term
+from torchsoft.reduction.records import KINEMATICS
 
 Candidates = Mapping[str, Sequence[Term]]
 """Terms by the state whose rate they may make."""

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchsoft.reduced_rollout import linear_rollout, nonlinear_rollout
+from torchsoft.reduction.rollout import linear_rollout, nonlinear_rollout
 
 SYMBOLS = {
     "x_C": (r"x_C", "m"),
