@@ -161,6 +161,9 @@ BAD_CONFIG = {
     "unknown parameter": (CONFIG.replace("contact.K_n", "contact.K"), r"rig\.toml: `contact.K` cannot be identified"),
     "unknown setting": (CONFIG.replace("contact.v_s", "contact.vs"), r"settings of `data`: contact\.vs: is not known here"),
     "setting out of bounds": (CONFIG.replace("v_s = 0.05", "v_s = -1"), r"settings of `data`: contact\.v_s: .*greater than 0"),
+    "not a table": ("settings.disc = 3\n" + CONFIG.split("\n\n", 1)[1], r"settings of `data`: disc: Input should be a valid"),
+    "not a number": (CONFIG.replace("60.3e-3", '"here"'), r"settings of `data`: scenario\.x_C0: Input should be"),
+    "other pads": (CONFIG.replace("contact.v_s", "pad.height = 3e-3\ncontact.v_s"), r"rig\.toml touch .* at 46.92 mm"),
     "bounds": (CONFIG.replace("nominal = 1e5", "low = 2\nhigh = 1"), r"unknowns\.contact\.K_n: low = 2.0 must be below"),
     "step": (CONFIG.replace("step = 5e-3", "step = -1"), r"fit\.step: Input should be greater than 0"),
     "method": (CONFIG + 'method = "magic"\n', r"fit\.method: Input should be 'gauss_newton'"),
@@ -270,7 +273,7 @@ def test_a_trajectory_file_is_a_recording(run: Trajectory, tmp_path: Path) -> No
     table = read_table(tmp_path / "run.nc")
     settings = {"scenario": {"x_C0": 60.3e-3}, "control.senses": "bracket", "contact": {"v_s": 0.05}}
     sensors = {"x_C": Sensor(noise=1e-5)}
-    one = read_recording(tmp_path / "run.nc", "run", known(Path("c"), table, settings), sensors)
+    one = read_recording(tmp_path / "run.nc", "run", known(Path("c"), "run", table, settings), sensors)
     assert list(one.samples) == list(CHANNELS)
     s = run.state
     expected = torch.cat((s.r_C, s.theta[:, None], s.r_Br, s.v_C, s.omega[:, None], s.v_Br, run.control), 1).numpy()

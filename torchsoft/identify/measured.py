@@ -85,11 +85,11 @@ class Case:
     tables: dict[str, Columns]
 
 
-def told(error: ValidationError) -> str:
-    """pydantic's findings in one line, each with its field."""
+def told(error: ValidationError, group: str = "") -> str:
+    """pydantic's findings in one line, each with its field, in a group or by itself."""
     out = []
     for one in error.errors():
-        field = ".".join(str(part) for part in one["loc"])
+        field = ".".join(str(part) for part in (group, *one["loc"]) if part != "")
         text = one["msg"].removeprefix("Value error, ").replace("Extra inputs are not permitted", "is not known here")
         out.append(f"{field}: {text}" if field else text)
     return "; ".join(out)
@@ -105,28 +105,47 @@ def read_config(path: str | Path) -> Config:
         raise ValueError(f"{path} is not a TOML file: {error}") from None
 
 
-def known(config: Path, table: Columns, *settings: dict[str, Any]) -> Parameters:
-    """Parameters of a recording: the settings, the later ones first, with the reach of its set-points as scenario."""
-    tree: dict[str, Any] = {"scenario": {}}
+def known(config: Path, name: str, table: Columns, *settings: dict[str, Any]) -> Parameters:
+    """Parameters of the recording `name`: the settings, the later ones first, with the reach of its set-points as scenario.
+
+    Raises `ValueError` naming the configuration and the field, or the row where nothing is grasped.
+    """
+    tree: dict[str, Any] = {}
     for given in settings:
-        for name, value in given.items():
-            group, _, field = name.partition(".")
-            if field or isinstance(value, dict):
-                tree.setdefault(group, {}).update({field: value} if field else value)
-            else:
-                tree[name] = value
-    x, y = table.values["x_d"], table.values["y_d"]
-    moved = x - tree["scenario"].get("x_C0", x[0])
-    part = 0.5 if tree.get("control", {}).get("senses") == "bracket" else 1.0  # a disc rolls half as far as the bracket
-    mine = {"y_Br_grasp": float(y.min()), "travel": part * float(moved[np.abs(moved).argmax()])}
-    before = Parameters.model_validate({k: v for k, v in tree.items() if k in ("pad", "disc", "bracket")})
-    if y.min() >= apart(before):
-        lowest = f"{table.at(int(y.argmin()))}, column `y_d`: "
-        raise ValueError(
-            f"{lowest}the bracket never comes lower than {1e3 * y.min():.4g} mm, but the pads of {config} touch the disc at "
-            f"{1e3 * apart(before):.4g} mm: nothing is grasped"
-        )
-    return Parameters.model_validate(tree | {"scenario": mine | tree["scenario"]})
+        for key, value in given.items():
+            group, _, field = key.partition(".")
+            new = {field: value} if field else value
+            old = tree.get(group, {})
+            tree[group] = old | new if isinstance(old, dict) and isinstance(new, dict) else new
+    try:
+        groups: dict[str, Any] = {}
+        for group, kind in Parameters.model_fields.items():
+            assert kind.annotation is not None
+            groups[group] = validated(kind.annotation, tree.get(group, {}), group)
+        x, y = table.values["x_d"], table.values["y_d"]
+        if y.min() >= (touch := apart(Parameters.model_construct(**groups))):
+            raise ValueError(
+                f"{table.at(int(y.argmin()))}, column `y_d`: the bracket never comes lower than {1e3 * y.min():.4g} mm, but "
+                f"the pads of {config} touch the disc at {1e3 * touch:.4g} mm: nothing is grasped"
+            )
+        moved = x - (groups["scenario"].x_C0 if "x_C0" in tree.get("scenario", {}) else x[0])
+        part = 0.5 if groups["control"].senses == "bracket" else 1.0  # a disc rolls half as far as the bracket
+        mine = {"y_Br_grasp": float(y.min()), "travel": part * float(moved[np.abs(moved).argmax()])}
+        return validated(Parameters, tree | {"scenario": mine | tree.get("scenario", {})})
+    except Misfit as error:
+        raise ValueError(f"{config}, settings of `{name}`: {error}") from None
+
+
+class Misfit(ValueError):
+    """Settings that a group of parameters does not take."""
+
+
+def validated(kind: Any, tree: Any, group: str = "") -> Any:
+    """A group of parameters. Raises `Misfit` naming the field."""
+    try:
+        return kind.model_validate(tree)
+    except ValidationError as error:
+        raise Misfit(told(error, group)) from None
 
 
 def plausible(table: Columns, p: Parameters, sensors: dict[str, Sensor]) -> None:
@@ -212,10 +231,7 @@ def load(data: Sequence[str | Path], config: str | Path) -> Case:
         raise ValueError(f"{config}: there is no recording `{strange[0]}`; there are {', '.join(names)}")
     for name, path in files:
         table = tables[name] = read_table(path)
-        try:
-            p = known(config, table, told_by.settings, own[name].settings if name in own else {})
-        except ValidationError as error:
-            raise ValueError(f"{config}, settings of `{name}`: {told(error)}") from None
+        p = known(config, name, table, told_by.settings, own[name].settings if name in own else {})
         recordings.append(recording(table, name, p, told_by.sensors))
     try:
         problem = Problem(recordings, told_by.sensors, told_by.unknowns)
