@@ -12,7 +12,7 @@ from torchsoft import Parameters
 from torchsoft.control import Profile, Sampled
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
 from torchsoft.identify import Problem, Recording, Sensor, Stage, Unknown, Unreachable, identify, record
-from torchsoft.identify.answer import fisher, step_shift, whiteness
+from torchsoft.identify.answer import fisher, step_error, step_shift, whiteness
 from torchsoft.identify.fit import descend, gauss_newton
 from torchsoft.identify.plan import default_plan, standard_deviations, tie_ratios, visible
 from torchsoft.identify.solve import sobol
@@ -166,12 +166,16 @@ def test_a_step_too_coarse_for_the_data_is_said() -> None:
     )
     fine = record("shaking", hard, BASE, BASE, SENSORS, step=2.5e-4, noise=0.0)
     plan = [Stage("all", ("shaking",), ("pad.E", "pad.tau"), 2.5e-3)]
-    coarse = identify(Problem([fine], SENSORS, {"pad.E": Unknown(), "pad.tau": Unknown()}), plan=plan)
+    coarse = identify(Problem([fine], SENSORS, {"pad.E": Unknown(), "pad.tau": Unknown()}), plan=plan, polished=False)
     assert any("too coarse" in notice for notice in coarse.notices)
     tau = coarse["pad.tau"]
     error = np.log(tau.last / BASE.pad.tau)
     assert abs(error) > 3 * tau.relative_sd  # so the notice is needed
     assert tau.step_bias_sd * tau.relative_sd == pytest.approx(error, rel=0.5)  # and its size is about right
+    better = identify(Problem([fine], SENSORS, {"pad.E": Unknown(), "pad.tau": Unknown()}), plan=plan)["pad.tau"]
+    left = np.log(better.last / BASE.pad.tau)
+    assert abs(left) < 0.2 * abs(error)  # of second order, at a quarter of the step
+    assert better.step_bias_sd * better.relative_sd == pytest.approx(left, rel=0.5)
 
 
 def test_interrupted_it_continues_and_ends_the_same(
@@ -262,7 +266,7 @@ def test_fisher_and_step_shift_of_a_linear_problem() -> None:
     np.testing.assert_allclose(C, np.linalg.inv(J.T @ J), rtol=1e-10)
     assert (np.diff(values) >= 0).all()
     coarse, fine = J @ x, J @ (0.25 * x)  # a second-order error of J x at the step, a quarter of it at half the step
-    np.testing.assert_allclose(step_shift(J, coarse, fine), -x, rtol=1e-10)
+    np.testing.assert_allclose(step_shift(J, step_error(coarse, fine)), -x, rtol=1e-10)
 
 
 def test_whiteness_tells_noise_from_drift() -> None:

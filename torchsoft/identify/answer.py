@@ -174,9 +174,9 @@ def step_error(r: Array, finer: Array) -> Array:
     return 4.0 / 3.0 * (finer - r)
 
 
-def step_shift(J: Array, r: Array, finer: Array) -> Array:
-    """How far the finite step has moved the coordinates (n,)."""
-    return np.asarray(np.linalg.lstsq(J, step_error(r, finer), rcond=None)[0], np.float64)
+def step_shift(J: Array, error: Array) -> Array:
+    """How far a step's `error` (m,) has moved the coordinates (n,)."""
+    return np.asarray(np.linalg.lstsq(J, error, rcond=None)[0], np.float64)
 
 
 def estimates(problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shift: Array) -> list[Estimate]:

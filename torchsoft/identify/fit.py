@@ -73,6 +73,32 @@ def gauss_newton(
     return Fit(end, float(np.mean(out.fun**2)), int(out.nfev), out.status > 0)
 
 
+def polish(
+    problem: Problem, runner: Runner, x: Array, J: Array, *, which: Sequence[str], free: NDArray[np.bool_], step: float,
+    rounds: int = 5, notify: Notify = lambda chi2: None,
+) -> tuple[Array, Residuals]:  # fmt: skip
+    """From a fit at a coarse step to the one at a finer `step` [s]: residuals of the finer runs, and the coarse Jacobian J
+    (m, n), a chord method, until the coordinates move by less than a tenth of a standard deviation. A round costs a run, not
+    a Jacobian. Returns where that ended, and the residuals there, with J. Lost runs end it where it began.
+    """
+    low, high = problem.coordinates.bounds
+    sd = np.sqrt(np.diag(np.linalg.pinv(J[:, free].T @ J[:, free])))
+    at = problem.residuals(runner, x, which, step)
+    for _ in range(rounds):
+        if at.lost:
+            break
+        notify(float(np.mean(at.r**2)))
+        move, trial = np.linalg.lstsq(J[:, free], -at.r, rcond=None)[0], x.copy()
+        trial[free] = np.clip(x[free] + move, low[free], high[free])
+        there = problem.residuals(runner, trial, which, step)
+        if there.lost or there.r @ there.r > at.r @ at.r:
+            break
+        x, at = trial, there
+        if (np.abs(move) < 0.1 * sd).all():
+            break
+    return x, Residuals(at.r, J, at.lost)
+
+
 def descend(
     problem: Problem, runner: Runner, x: Array, *, which: Sequence[str], free: NDArray[np.bool_], step: float,
     method: Literal["lbfgs", "adam"] = "lbfgs", evaluations: int = 100, rate: float = 0.05,

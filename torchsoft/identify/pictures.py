@@ -1,5 +1,6 @@
 """Pictures of an identification: estimates, correlations, the Fisher spectrum, data against prediction."""
 
+from textwrap import fill, shorten
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,9 @@ SHOWN = {"m": ("mm", 1e3), "m/s": ("mm/s", 1e3)}
 
 WIDTH = 5.4
 """Width of a picture [in]: its text stays legible on a phone."""
+
+NAME = 24
+"""Characters in a line of a name beside an axis."""
 
 MOST_NAMES = 3
 """Parts of a direction that its name has room for."""
@@ -51,9 +55,9 @@ def direction_name(d: Direction) -> str:
     return text + (" …" if len(parts) > MOST_NAMES else "")
 
 
-def literal(text: str) -> str:
-    """Text as matplotlib must be given it, lest dollars begin a formula."""
-    return text.replace("$", r"\$")
+def literal(text: str, width: int = 200) -> str:
+    """Text as matplotlib must be given it, lest dollars begin a formula, in lines of `width` characters at most."""
+    return fill(text, width).replace("$", r"\$")
 
 
 @rc_context(STYLE)
@@ -80,8 +84,9 @@ def estimates_figure(answer: Answer, start: list[float]) -> Figure | None:
         reach += [low, high]
     axes.set_xscale("log")
     low, high = min(reach) / 1.15, max(reach) * 1.15
-    axes.set(xlim=(low, high), ylim=(len(rows) - 0.5, -0.5), xlabel="estimate over start value, 95 % interval")
-    axes.set_yticks(range(len(rows)), [literal(named(e)) for e, _ in rows])
+    axes.set(xlim=(low, high), ylim=(len(rows) - 0.5, -0.5))
+    figure.supxlabel("estimate over start value, 95 % interval", fontsize=10)
+    axes.set_yticks(range(len(rows)), [literal(named(e), NAME) for e, _ in rows])
     ticks = [v for v in (0.01, 0.03, 0.1, 0.2, 0.33, 0.5, 0.7, 1, 1.5, 2, 3, 5, 10, 30, 100) if low <= v <= high]
     while len(ticks) > 7:
         ticks = [v for i, v in enumerate(ticks) if v == 1 or (i - ticks.index(1)) % 2 == 0]
@@ -98,17 +103,17 @@ def correlation_figure(answer: Answer) -> Figure:
     n, C = len(answer.labels), np.array(answer.correlation, float)
     figure = Figure(figsize=(WIDTH, max(2.2, 0.7 + 0.42 * n)), layout="constrained")
     axes = figure.subplots()
-    image = axes.imshow(C, cmap="RdBu_r", vmin=-1, vmax=1)
-    names = [literal(label) for label in answer.labels]
+    image = axes.imshow(C, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
+    names = [literal(label, NAME) for label in answer.labels]
     axes.set_xticks(range(n), [str(i + 1) for i in range(n)])
     axes.set_yticks(range(n), [f"{name}   {i + 1}" for i, name in enumerate(names)])
     axes.tick_params(length=0, labelsize=9 if n <= 8 else 7)
     axes.grid(False)
     axes.spines[:].set_visible(False)
-    for i in range(n if n <= 10 else 0):
+    for i in range(n if n <= 8 else 0):
         for j in range(n):
             dark = abs(C[i, j]) > 0.6
-            axes.text(j, i, f"{C[i, j]:.2f}".replace("-", "−"), ha="center", va="center", fontsize=8,
+            axes.text(j, i, f"{C[i, j]:.2f}".replace("-", "−"), ha="center", va="center", fontsize=8 if n <= 6 else 6.5,
                       color="white" if dark else "#1d2329")  # fmt: skip
     figure.colorbar(image, ax=axes, shrink=0.75, ticks=[-1, 0, 1])
     return figure
@@ -124,7 +129,7 @@ def spectrum_figure(answer: Answer) -> Figure:
     low, high = 10 ** np.floor(np.log10(min(*sds, 0.1))), 10 ** np.ceil(np.log10(max(*sds, 2 * UNSEEN)))
     for row, d in enumerate(answer.directions):
         axes.barh(row + 0.18, d.sd, height=0.3, left=0, color=ACTUAL if d.seen else OTHER)
-        text = literal(direction_name(d)) + ("" if d.seen else ": not seen")
+        text = literal(shorten(direction_name(d), 60, placeholder=" …")) + ("" if d.seen else ": not seen")
         axes.text(0.01, row - 0.17, text, transform=axes.get_yaxis_transform(), va="center", fontsize=9,
                   color="#1d2329" if d.seen else "#a34400")  # fmt: skip
     axes.axvline(UNSEEN, color="#1d2329", lw=1, ls=(0, (4, 2)))

@@ -140,7 +140,7 @@ def grouped(value: float) -> str:
 def estimates_table(answer: Answer, start: list[float]) -> str:
     rows = []
     for e, s in zip(answer.estimates, start):
-        unit = "" if e.unit == "1" else e.unit
+        unit = CHANNELS.get(e.name.removeprefix("bias of "), "" if e.unit == "1" else e.unit)
         if e.value is None or e.ci95 is None:
             found = [("unseen", "the data do not see it"), ("unseen", "none")]
         else:

@@ -19,9 +19,10 @@ from torchsoft.identify.answer import (
     fisher,
     nrmse,
     residual_channels,
+    step_error,
     step_shift,
 )
-from torchsoft.identify.fit import Fit, Loss, Unreachable, descend, gauss_newton
+from torchsoft.identify.fit import Fit, Loss, Unreachable, descend, gauss_newton, polish
 from torchsoft.identify.plan import Stage, default_plan
 from torchsoft.identify.problem import Problem
 from torchsoft.identify.workers import Runner
@@ -29,6 +30,9 @@ from torchsoft.identify.workers import Runner
 Array = NDArray[np.float64]
 
 Method = Literal["gauss_newton", "lbfgs", "adam"]
+
+POLISH = 4
+"""How many times finer the step is that estimates are polished at."""
 
 AUDIBLE = 0.5
 """Residuals over the noise below which their colour does not matter: data without noise."""
@@ -40,14 +44,15 @@ MISFIT = 1.2
 def identify(
     problem: Problem, *, step: float = 5e-4, plan: Sequence[Stage] | None = None, starts: int = 1, loss: Loss = "linear",
     method: Method = "gauss_newton", heldout: Sequence[str] = (), workers: int = 1, checkpoint: str | Path | None = None,
-    progress: bool = False, seed: int = 0,
+    progress: bool = False, seed: int = 0, polished: bool = True,
 ) -> Answer:  # fmt: skip
     """Find the unknown parameters of `problem`, with intervals, and what the data cannot tell.
 
     `step` [s] is the stepper's in the last stage; `plan` the stages, `default_plan` by default, whose first stage is begun
-    from `starts` Sobol points (`seed`). `loss` is scipy's robust loss; `method` may descend on the adjoint instead.
-    Recordings named in `heldout` are predicted, not fitted. With a `checkpoint` folder every run is kept there: an
-    identification that was interrupted, called again with the same arguments, continues where it was.
+    from `starts` Sobol points (`seed`). Where that step turns out to shift an estimate by more than `STEP_BIAS` standard
+    deviations, the estimates are `polished` at a `POLISH` times finer one. `loss` is scipy's robust loss; `method` may
+    descend on the adjoint instead. Recordings named in `heldout` are predicted, not fitted. With a `checkpoint` folder every
+    run is kept there: an identification that was interrupted, called again with the same arguments, continues where it was.
 
     Raises `ValueError` for recordings that are not there, `Unreachable` where the model cannot follow the data.
     """
@@ -75,7 +80,9 @@ def identify(
             )  # fmt: skip
         if fit is None:
             raise ValueError("`plan` has no stages")
-        return conclude(problem, runner, plan[-1], fit, fitted, list(heldout), told, method, loss, seed, began)
+        return conclude(
+            problem, runner, plan[-1], fit, fitted, list(heldout), told, method, loss, seed, began, polished, progress
+        )
 
 
 class Bar:
@@ -157,31 +164,40 @@ def sobol(problem: Problem, x: Array, free: NDArray[np.bool_], stage: Stage, see
 
 def conclude(
     problem: Problem, runner: Runner, stage: Stage, fit: Fit, fitted: list[str], heldout: list[str],
-    told: list[dict[str, Any]], method: Method, loss: Loss, seed: int, began: float,
+    told: list[dict[str, Any]], method: Method, loss: Loss, seed: int, began: float, polished: bool, bar: bool,
 ) -> Answer:  # fmt: skip
     """The answer at the end of a fit."""
     c, x = problem.coordinates, fit.x
     free = np.isin(c.labels, stage.free)
     at = problem.residuals(runner, x, stage.recordings, stage.step, free)
-    finer = problem.residuals(runner, x, stage.recordings, stage.step / 2)
     C_free, values, vectors = fisher(at.J[:, free])
-    chi2 = float(at.r @ at.r) / max(len(at.r) - int(free.sum()), 1)
-    C, shift = np.zeros((len(x), len(x))), np.zeros(len(x))
-    C[np.ix_(free, free)] = C_free * max(1.0, chi2)
+    C, shift, step = np.zeros((len(x), len(x))), np.zeros(len(x)), stage.step
+    finer = problem.residuals(runner, x, stage.recordings, step / 2)
     if not finer.lost:
-        shift[free] = step_shift(at.J[:, free], at.r, finer.r)
+        shift[free] = step_shift(at.J[:, free], step_error(at.r, finer.r))
+    if polished and (np.abs(shift[free]) > STEP_BIAS * np.sqrt(np.diag(C_free))).any():
+        with Bar(f"polish at {step / POLISH:g} s", bar) as notify:
+            end, there = polish(
+                problem, runner, x, at.J, which=stage.recordings, free=free, step=step / POLISH, notify=notify
+            )  # fmt: skip
+        before = problem.residuals(runner, end, stage.recordings, 2 * step / POLISH)
+        if not there.lost and not before.lost:  # the error of the finer step, a quarter of that of the one before
+            x, at, finer, step = end, there, there, step / POLISH
+            shift[free] = step_shift(at.J[:, free], step_error(before.r, at.r) / 4)
+    chi2 = float(at.r @ at.r) / max(len(at.r) - int(free.sum()), 1)
+    C[np.ix_(free, free)] = C_free * max(1.0, chi2)
     labels = [label for label, one in zip(c.labels, free) if one]
     found = estimates(problem, x, free, C, shift)
     predicted, notices = {}, []
     if heldout:
-        held = problem.residuals(runner, x, heldout, stage.step)
+        held = problem.residuals(runner, x, heldout, step)
         if held.lost:
             notices += [f"held-out recording `{k}` could not be simulated: {v.reason}" for k, v in held.lost.items()]
         else:
             predicted = nrmse(problem, held.r, heldout)
     sd = np.sqrt(np.diag(C_free))
     channels = residual_channels(problem, at, fitted)
-    notices += remarks(found, chi2, fit.converged, stage.step, bool(finer.lost), channels)
+    notices += remarks(found, chi2, fit.converged, step, bool(finer.lost), channels)
     return Answer(
         estimates=found,
         labels=labels,
@@ -200,7 +216,7 @@ def conclude(
             "samples": len(at.r), "wall_s": clock.perf_counter() - began,
         },
         made_by={
-            "torchsoft": version("torchsoft"), "method": method, "loss": loss, "seed": seed, "step": stage.step,
+            "torchsoft": version("torchsoft"), "method": method, "loss": loss, "seed": seed, "step": step,
             "workers": runner.workers,
             "unknowns": {name: u.model_dump() for name, u in problem.unknowns.items()},
             "sensors": {name: s.model_dump() for name, s in problem.sensors.items()},
