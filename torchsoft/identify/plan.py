@@ -92,7 +92,7 @@ def default_plan(problem: Problem, runner: Runner, step: float, which: Sequence[
     first = visible(look.J, free & ~ratios)
     plan = [
         Stage(
-            f"{order[0]}: first look", (order[0],), tuple(labels[first]), COARSE * step, 12, 1e-2, ties, starts=starts
+            f"{order[0]}: first look", (order[0],), tuple(labels[first]), COARSE * step, 8, 1e-2, ties, starts=starts
         )
     ]
     if len(order) > 1 or ratios.any():
@@ -100,5 +100,5 @@ def default_plan(problem: Problem, runner: Runner, step: float, which: Sequence[
             Stage("all data, ratios tied", tuple(order), tuple(labels[free & ~ratios]), COARSE * step, 15, 1e-3)
         )
     scans = tuple((c.all[i].label, tuple(part * c.all[i].high for part in SCANNED)) for i in np.flatnonzero(ratios))
-    plan.append(Stage("everything", tuple(order), tuple(labels[free]), step, 40, 1e-7, scanned=scans))
+    plan.append(Stage("everything", tuple(order), tuple(labels[free]), step, 40, 1e-6, scanned=scans))
     return plan
