@@ -174,7 +174,8 @@ def run(config: Config) -> Result:
         print(f"\n{name}, start {seed}: off by factors of", *(f"{v / truths(config)[k]:.2f}" for k, v in begin.items()))
         folder = config.out / f"runs-{name.replace(' ', '-')}-{seed}"
         answer = identify(
-            asked, step=config.step, workers=config.workers, heldout=held, checkpoint=folder, progress=not config.smoke
+            asked, step=config.step, workers=config.workers, heldout=held, checkpoint=folder, progress=not config.smoke,
+            polished=noise > 0,
         )  # fmt: skip
         for path in (*folder.glob("*"), folder):
             path.rmdir() if path.is_dir() else path.unlink()
