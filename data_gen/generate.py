@@ -4,13 +4,10 @@ Started again on the same folder it makes what is missing. Ctrl-C and kill are s
 """
 
 import argparse
-import multiprocessing
 import os
-import signal
 import sys
-import threading
 from collections.abc import Iterator
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,8 +22,7 @@ from data_gen.config import Config
 from data_gen.design import points, task
 from data_gen.simulation import simulate_task
 from data_gen.store import Store, StoreError, open_or_create
-
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+from torchsoft.processes import local_processes
 
 
 class Serial(Executor):
@@ -85,31 +81,6 @@ def generate(config: Config, url: str, executor: Executor, workers: int = 1, pro
         for future in running:
             future.cancel()
         bar.close()
-
-
-def prepare_worker() -> None:
-    """Leave Ctrl-C to the parent, and end with it however it ends."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def follow() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=follow, daemon=True).start()
-
-
-@contextmanager
-def local_processes(workers: int) -> Iterator[Executor]:
-    """A pool of spawned processes, one thread each."""
-    for name in THREADS:
-        os.environ[name] = "1"
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), initializer=prepare_worker)
-    try:
-        yield pool
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
 
 
 @contextmanager

@@ -88,7 +88,7 @@ class Excitation(Table):
     motion: Motion
     duration: float = Field(default=2.0, gt=0)
     depth: float = Field(default=1.5e-3, gt=0)
-    senses: Literal["disc", "bracket"] = "disc"
+    senses: Literal["disc", "bracket"] = "bracket"
     grasp_time: float = Field(default=0.375, gt=0)
     settle: float = Field(default=0.125, ge=0)
     x_C0: float = 60.3e-3
@@ -107,34 +107,32 @@ class Excitation(Table):
 
 
 CATALOGUE = {
-    "slow roll": Excitation(motion=Roll(travel=16e-3), duration=4.0, senses="bracket"),
-    "strokes": Excitation(motion=Strokes(travel=20e-3, stroke_time=0.75), duration=2.0, senses="bracket"),
-    "fast strokes": Excitation(motion=Strokes(travel=20e-3, stroke_time=0.25), duration=2.0, senses="bracket"),
+    "slow roll": Excitation(motion=Roll(travel=16e-3), duration=4.0),
+    "strokes": Excitation(motion=Strokes(travel=20e-3, stroke_time=0.75), duration=2.0),
+    "fast strokes": Excitation(motion=Strokes(travel=20e-3, stroke_time=0.25), duration=2.0),
     "strokes, loop about the disc": Excitation(
-        motion=Strokes(travel=10e-3, stroke_time=0.75), duration=2.0, x_C0=60e-3
+        motion=Strokes(travel=10e-3, stroke_time=0.75), duration=2.0, senses="disc", x_C0=60e-3
     ),
     "shaking": Excitation(
-        motion=MultiSine(amplitude_x=10e-3, amplitude_y=2e-4, frequency=(2.0, 15.0)), duration=2.0, senses="bracket"
+        motion=MultiSine(amplitude_x=10e-3, amplitude_y=2e-4, frequency=(2.0, 15.0)), duration=2.0
     ),
-    "pressing": Excitation(motion=Press(amplitude=4e-4, frequency=8.0, travel=10e-3), duration=2.0, senses="bracket"),
+    "pressing": Excitation(motion=Press(amplitude=4e-4, frequency=8.0, travel=10e-3), duration=2.0),
     "deep pressing": Excitation(
-        motion=Press(amplitude=8e-4, frequency=25.0, travel=30e-3), duration=2.0, depth=2.5e-3, senses="bracket"
+        motion=Press(amplitude=8e-4, frequency=25.0, travel=30e-3), duration=2.0, depth=2.5e-3
     ),
     "deep chirp": Excitation(
         motion=Chirp(amplitude_x=5e-3, amplitude_y=5e-4, start=1.0, end=25.0), duration=2.0, depth=2.5e-3,
-        senses="bracket",
     ),
     "light shaking": Excitation(
         motion=MultiSine(amplitude_x=6e-3, amplitude_y=2e-4, frequency=(4.0, 20.0)), duration=2.0, depth=3e-4,
-        senses="bracket",
     ),
     "light jerks": Excitation(
-        motion=Strokes(travel=80e-3, stroke_time=0.25), duration=1.4, depth=2e-4, senses="bracket"
+        motion=Strokes(travel=80e-3, stroke_time=0.25), duration=1.4, depth=2e-4
     ),
     "hard light jerks": Excitation(
-        motion=Strokes(travel=80e-3, stroke_time=0.15), duration=1.3, depth=2e-4, senses="bracket"
+        motion=Strokes(travel=80e-3, stroke_time=0.15), duration=1.3, depth=2e-4
     ),
-    "deep jerks": Excitation(motion=Strokes(travel=40e-3, stroke_time=0.1), duration=1.3, senses="bracket"),
+    "deep jerks": Excitation(motion=Strokes(travel=40e-3, stroke_time=0.1), duration=1.3),
 }  # fmt: skip
 """Ready excitations by name, from gentle to hard; `experiments/experiment_design.py` ranks them."""
 

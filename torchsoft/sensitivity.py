@@ -108,6 +108,8 @@ def sensitivities(
     segments: list[Segment] = []
     run = None
     for run in stepper.integrate(y0.detach(), t, segments, tape_bytes=float("inf")):
+        if not segments:  # the first step of a chunk was not solved, and is to be halved
+            continue
         segment = segments.pop()
         chunk, tape = segment.chunk, stepper.tape(segment)
         law = np.zeros((*tape.force.shape[:3], 3, n))

@@ -9,7 +9,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft.adjoint import iterate
-from torchsoft.equilibrium import NoEquilibrium, rest
+from torchsoft.equilibrium import rest
 from torchsoft.grid import check_times
 from torchsoft.implicit import METHOD, ImplicitStepper, Progress, SimulationFailed
 from torchsoft.kernels.run import DISSIPATED, INTEGRALS, SUPPLIED
@@ -79,7 +79,7 @@ def diagnose(model: SoftGrasp, failure: SimulationFailed, trajectory: Trajectory
     """The failure with the run so far, and with the closed loop's instability as its cause if the loop is unstable."""
     try:
         cause = describe_instability(model)
-    except NoEquilibrium:  # a model that cannot grasp has no grasp to linearise
+    except RuntimeError:  # a model that cannot grasp has no grasp to linearise
         cause = ""
     told = (
         f"the disc was lost at t = {failure.time:.4f} s: {cause} (it ended with this: {failure})"

@@ -91,9 +91,7 @@ def default_plan(problem: Problem, runner: Runner, step: float, which: Sequence[
     ties = tuple((c.all[i].label, c.all[i].high) for i in np.flatnonzero(ratios))
     first = visible(look.J, free & ~ratios)
     plan = [
-        Stage(
-            f"{order[0]}: first look", (order[0],), tuple(labels[first]), COARSE * step, 8, 1e-2, ties, starts=starts
-        )
+        Stage(f"{order[0]}: first look", (order[0],), tuple(labels[first]), COARSE * step, 8, 1e-2, ties, starts=starts)
     ]
     if len(order) > 1 or ratios.any():
         plan.append(

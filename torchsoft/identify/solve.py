@@ -233,7 +233,8 @@ def remarks(
     out = []
     for e in found:
         if not e.seen:
-            out.append(f"the data do not see {e.name}: a change by {e.relative_sd:.0%} would not show")
+            change = f"a change by {e.relative_sd:.0%}" if e.relative_sd < 9 else "a change by more than its tenfold"
+            out.append(f"the data do not see {e.name}: {change} would not show")
         if e.at_bound:
             out.append(f"{e.name} ended at a bound ({e.last:.4g}): widen it, or doubt the model")
     worst = max(found, key=lambda e: abs(e.step_bias_sd), default=None)

@@ -4,26 +4,22 @@ The journal is what makes an identification resume: a fit is a deterministic fun
 what it already has, to the bit, and goes on from there.
 """
 
-import multiprocessing
-import os
 import pickle
-import signal
 from collections.abc import Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
+from contextlib import ExitStack
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
-import torch
 from threadpoolctl import threadpool_limits
 
 from torchsoft.identify.prediction import Prediction, misfit, predict, put
 from torchsoft.identify.recording import Recording
 from torchsoft.implicit import SimulationFailed
 from torchsoft.kernels import HERE, digest
-
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+from torchsoft.processes import local_processes
 
 
 class Job(NamedTuple):
@@ -52,13 +48,10 @@ _recordings: tuple[Recording, ...] = ()
 _models: dict[int, Any] = {}
 
 
-def _prepare(recordings: tuple[Recording, ...], worker: bool) -> None:
+def _prepare(recordings: tuple[Recording, ...]) -> None:
     global _recordings
     _recordings = recordings
     _models.clear()
-    if worker:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        torch.set_num_threads(1)
 
 
 def _run(job: Job) -> Any:
@@ -89,7 +82,7 @@ class Runner:
             raise ValueError(f"`workers` must be positive, but is {workers}")
         self.recordings, self.workers, self.journal = tuple(recordings), workers, journal
         self.simulations = self.jacobians = self.gradients = self.steps = self.remembered = 0
-        self._pool: ProcessPoolExecutor | None = None
+        self._open, self._pool = ExitStack(), None
         self._own = sha256(
             repr((version("torchsoft"), digest(HERE), [r.fingerprint for r in recordings])).encode()
         ).digest()
@@ -98,18 +91,13 @@ class Runner:
         if self.journal is not None:
             self.journal.mkdir(parents=True, exist_ok=True)
         if self.workers > 1:
-            for name in THREADS:
-                os.environ[name] = "1"
-            self._pool = ProcessPoolExecutor(
-                self.workers, multiprocessing.get_context("spawn"), _prepare, (self.recordings, True)
-            )
+            self._pool = self._open.enter_context(local_processes(self.workers, _prepare, self.recordings))
         else:
-            _prepare(self.recordings, False)
+            _prepare(self.recordings)
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=True)
+        self._open.close()
 
     def run(self, jobs: Sequence[Job]) -> list[Any]:
         """Results in the order of the jobs: `Prediction`, misfit or `Lost`."""
