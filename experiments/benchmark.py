@@ -21,10 +21,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
-from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -39,6 +37,7 @@ from torchdiffeq import odeint
 from tqdm import tqdm
 
 from torchsoft import Parameters, SoftGrasp, simulate
+from torchsoft.processes import local_processes
 from torchsoft.scenario import Manipulation, grasp_and_roll
 from torchsoft.sensitivity import sensitivities
 
@@ -140,7 +139,6 @@ _worker: dict[str, Any] = {}
 
 
 def _prepare_worker() -> None:
-    torch.set_num_threads(1)
     _worker["manipulation"] = prepare()
 
 
@@ -157,7 +155,7 @@ def batches(config: Config) -> dict[str, dict[str, float]]:
     """Simulated seconds per wall second of many trajectories on one and two cores, the processes already started."""
     out = {}
     for cores in (1, 2):
-        with ProcessPoolExecutor(cores, mp_context=get_context("spawn"), initializer=_prepare_worker) as pool:
+        with local_processes(cores, _prepare_worker) as pool:
             list(pool.map(_one_of_many, [(0, 0.1, config.step)] * (4 * cores)))
             for n in config.trajectories:
                 jobs = [(k, config.batch_duration, config.step) for k in range(n)]

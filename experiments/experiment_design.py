@@ -148,12 +148,24 @@ def run(config: Config) -> Result:
     return Result(config, sorted(single, key=lambda r: r.worst), sorted(together, key=lambda r: r.worst))
 
 
+def percent(value: float, sign: str = "") -> str:
+    """Two digits, without powers of ten."""
+    value *= 100
+    return (
+        f"{value:{sign}.0f}"
+        if abs(value) >= 10
+        else f"{value:{sign}.2g}"
+        if abs(value) >= 0.01
+        else f"{value:{sign}.2f}"
+    )
+
+
 def table(rows: list[Row]) -> str:
     short = [name.split(".")[1] for name in NAMES]
     lines = ["| excitation | s | " + " | ".join(short) + " | derivative off by |", "|---" * (len(NAMES) + 3) + "|"]
     for row in rows:
         cells = [
-            f"{100 * row.sd[name]:.2g} ({100 * row.shift[name]:+.1g})" if row.sd.get(name, np.inf) < 1 else "-"
+            f"{percent(row.sd[name])} ({percent(row.shift[name], sign='+')})" if row.sd.get(name, np.inf) < 1 else "-"
             for name in NAMES
         ]
         off = row.dropped or f"{row.inconsistency:.0e}"

@@ -9,14 +9,11 @@ Expected: between 88 and 100 % for every parameter with 50 seeds. About two minu
 """
 
 import json
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
-import torch
 import tyro
 from matplotlib.figure import Figure
 from scipy import stats
@@ -25,6 +22,7 @@ from tqdm import tqdm
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, MultiSine, Strokes
 from torchsoft.identify import Problem, Recording, Sensor, Stage, Unknown, identify, record
+from torchsoft.processes import local_processes
 
 NOISE = {"x_C": 1e-5, "y_C": 1e-5, "theta": 5e-4, "x_Br": 1e-5, "y_Br": 1e-5, "F_x": 0.1, "F_y": 0.1}
 """Sensors and their noise [m, rad, N]."""
@@ -68,7 +66,6 @@ def exact(step: float) -> list[Recording]:
 
 def repeat(recordings: list[Recording], step: float, seed: int) -> dict[str, tuple[float, bool]]:
     """One repetition: by parameter its error over the predicted standard deviation, and whether its interval holds."""
-    torch.set_num_threads(1)
     rng, noisy = np.random.default_rng(seed), []
     for r in recordings:
         samples = {c: (t, y + NOISE[c] * rng.standard_normal(len(t))) for c, (t, y) in r.samples.items()}
@@ -90,7 +87,7 @@ def run(config: Config) -> Result:
     if config.workers == 1:
         found = [repeat(recordings, config.step, seed) for seed in tqdm(seeds, desc="seeds")]
     else:
-        with ProcessPoolExecutor(config.workers, get_context("spawn")) as pool:
+        with local_processes(config.workers) as pool:
             waiting = [pool.submit(repeat, recordings, config.step, seed) for seed in seeds]
             found = [future.result() for future in tqdm(waiting, desc="seeds")]
     errors = {name: [one[name][0] for one in found] for name in TRUTH}

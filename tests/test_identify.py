@@ -1,6 +1,10 @@
 """Identification on a coarse mesh: Jacobians, recovery, what is not seen, nuisances, resuming."""
 
 import json
+import signal
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -346,3 +350,35 @@ def test_a_sampled_set_point_follows_the_profile_it_was_taken_from() -> None:
     assert float(sampled(torch.tensor([5.0], dtype=torch.float64))[0]) == pytest.approx(-5e-3)
     with pytest.raises(ValueError, match="`rates`"):
         Sampled([0.0, 1.0], [0.0, 1.0], [0.0])
+
+
+KILLED = """
+import sys
+from test_identify import BASE, SENSORS, STEP, STROKES, TRUE, Problem, Unknown, identify, record, rest_known
+
+data = record("strokes", STROKES, TRUE, BASE, SENSORS, step=STEP, seed=5)
+unknowns = {"pad.E": Unknown(nominal=1.4e6), "pad.tau": Unknown()} | rest_known()
+answer = identify(Problem([data], SENSORS, unknowns), step=STEP, checkpoint=sys.argv[1])
+print(int(answer.cost["remembered"]), [x.hex() for x in answer.x])
+"""
+
+
+@pytest.mark.slow
+def test_killed_in_mid_run_it_continues_and_ends_the_same(tmp_path: Path) -> None:
+    """SIGKILL as soon as three runs are kept."""
+
+    def begin(folder: Path) -> subprocess.Popen[str]:
+        command = [sys.executable, "-c", KILLED, str(folder)]
+        return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parent)
+
+    whole, _ = begin(tmp_path / "whole").communicate(timeout=200)
+    cut = begin(tmp_path / "cut")
+    while cut.poll() is None and len(list((tmp_path / "cut").glob("*.pickle"))) < 3:
+        time.sleep(0.01)
+    cut.kill()
+    cut.communicate()
+    assert cut.returncode == -signal.SIGKILL
+    again, _ = begin(tmp_path / "cut").communicate(timeout=200)
+    remembered, x = again.split(maxsplit=1)
+    assert int(remembered) >= 3
+    assert x == whole.split(maxsplit=1)[1]
