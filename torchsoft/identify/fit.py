@@ -78,7 +78,7 @@ def polish(
     rounds: int = 5, notify: Notify = lambda chi2: None,
 ) -> tuple[Array, Residuals]:  # fmt: skip
     """From a fit at a coarse step to the one at a finer `step` [s]: residuals of the finer runs, and the coarse Jacobian J
-    (m, n), a chord method, until the coordinates move by less than a tenth of a standard deviation. A round costs a run, not
+    (m, n), a chord method, until the coordinates move by less than a fifth of a standard deviation. A round costs a run, not
     a Jacobian. Returns where that ended, and the residuals there, with J. Lost runs end it where it began.
     """
     low, high = problem.coordinates.bounds
@@ -94,7 +94,7 @@ def polish(
         if there.lost or there.r @ there.r > at.r @ at.r:
             break
         x, at = trial, there
-        if (np.abs(move) < 0.1 * sd).all():
+        if (np.abs(move) < 0.2 * sd).all():
             break
     return x, Residuals(at.r, J, at.lost)
 

@@ -22,8 +22,8 @@ SEEN = 0.1
 """A coordinate takes part in the first look if its predicted standard deviation [1] is below this: one that is seen faintly
 would run off to make up for what is still wrong elsewhere."""
 
-COARSE = 2.0
-"""Early stages take steps this many times the full one."""
+COARSE = (4.0, 2.0)
+"""The first look and the second stage take steps this many times the full one."""
 
 SCANNED = (1.0, 0.85, 0.7, 0.55)
 """Parts of its upper bound at which a ratio is tried before it is set free."""
@@ -85,18 +85,20 @@ def default_plan(problem: Problem, runner: Runner, step: float, which: Sequence[
     x, labels = tie_ratios(problem, c.start), np.array(c.labels, object)
     speed = {recording.name: recording.speed for recording in problem.recordings}
     order = sorted(which, key=lambda name: speed[name])
-    look = problem.residuals(runner, x, order[:1], COARSE * step, free)
+    look = problem.residuals(runner, x, order[:1], COARSE[0] * step, free)
     if look.lost:
         raise Unreachable(look.lost)
     ties = tuple((c.all[i].label, c.all[i].high) for i in np.flatnonzero(ratios))
     first = visible(look.J, free & ~ratios)
     plan = [
-        Stage(f"{order[0]}: first look", (order[0],), tuple(labels[first]), COARSE * step, 8, 1e-2, ties, starts=starts)
+        Stage(
+            f"{order[0]}: first look", (order[0],), tuple(labels[first]), COARSE[0] * step, 8, 1e-2, ties, starts=starts
+        )
     ]
     if len(order) > 1 or ratios.any():
         plan.append(
-            Stage("all data, ratios tied", tuple(order), tuple(labels[free & ~ratios]), COARSE * step, 15, 1e-3)
+            Stage("all data, ratios tied", tuple(order), tuple(labels[free & ~ratios]), COARSE[1] * step, 15, 1e-2)
         )
     scans = tuple((c.all[i].label, tuple(part * c.all[i].high for part in SCANNED)) for i in np.flatnonzero(ratios))
-    plan.append(Stage("everything", tuple(order), tuple(labels[free]), step, 40, 1e-6, scanned=scans))
+    plan.append(Stage("everything", tuple(order), tuple(labels[free]), step, 40, 1e-5, scanned=scans))
     return plan
