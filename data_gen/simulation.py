@@ -9,8 +9,8 @@ from data_gen.config import RATIO, Config
 from data_gen.design import Task
 from data_gen.excitation import excitation
 from data_gen.schema import STORES, sizes, variables
-from torchsoft.equilibrium import rest
-from torchsoft.excitation import grasp_load, reference
+from torchsoft.equilibrium import holding_force, press, rest
+from torchsoft.excitation import reference
 from torchsoft.implicit import SimulationFailed
 from torchsoft.kernels.run import DISSIPATED, SUPPLIED
 from torchsoft.model import SoftGrasp
@@ -35,9 +35,11 @@ def simulate_task(config: Config, task: Task) -> Row:
     try:
         model = SoftGrasp(task.parameters)
         y0 = torch.round(rest(model).detach(), decimals=PLACE) + 0.0  # no negative zeros
-        force = round(
-            find_grasp_force(model, y0, config.step) if config.feed_forward == "found" else grasp_load(model), FORCE
-        )
+        if config.feed_forward == "found":
+            force = find_grasp_force(model, y0, config.step)
+        else:
+            force = holding_force(model, press(model, task.parameters.scenario.y_Br_grasp))
+        force = round(force, FORCE)
         y_Br = float(model.layout.unpack(y0).r_Br[1])
         model.reference = reference(excitation(config, task), model, y_Br, force)
         run = simulate(model, t, y0=y0, step=config.step)

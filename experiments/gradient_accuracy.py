@@ -49,6 +49,7 @@ from tqdm import tqdm
 from torchsoft import Parameters, SoftGrasp, press
 from torchsoft.adjoint import differentiable_solution
 from torchsoft.control import Profile, Reference
+from torchsoft.equilibrium import holding_force
 from torchsoft.implicit import ImplicitStepper
 from torchsoft.scenario import grasp_and_roll, reference
 from torchsoft.sensitivity import sensitivities
@@ -294,9 +295,7 @@ def stroke(config: Config, end: float, step: float, changes: dict[str, Any], eve
     slippery = {"contact.v_s": 0.05, "contact.mu_s": 0.3, "contact.mu_k": 0.2}
     model = SoftGrasp(Parameters().override({**slippery, **dict(config.changes), **changes}))
     y0 = press(model, height := model.settings.scenario.y_Br_grasp).detach()
-    with torch.no_grad():
-        port = model.evaluate(0.0, model.layout.unpack(y0)).ports["pad_U"]
-        load = port.transformer.effort(port.effort, model.junctions)["bracket"][..., 1].sum().item()
+    load = -holding_force(model, y0)
     x = model.layout.unpack(y0).r_C[0].item()
     model.reference = Reference(Profile([0.0, 0.02], [x, x - 2e-3]), Profile([0.0], [height]), Profile([0.0], [load]))
     return Window("slip", model, y0, linspace(0.0, end, every or step), step)

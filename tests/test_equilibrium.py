@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchsoft import NoEquilibrium, Parameters, SoftGrasp, press, rest
+from torchsoft.equilibrium import holding_force
 from torchsoft.multibond import net_efforts
 from torchsoft.state import State
 
@@ -216,3 +217,9 @@ def test_no_equilibrium_is_reported_when_newton_does_not_converge(monkeypatch: p
     monkeypatch.setattr("torchsoft.equilibrium.RESIDUAL", -1.0)
     with pytest.raises(NoEquilibrium, match="no static equilibrium found"):
         press(build(), GRASP)
+
+
+def test_holding_force_is_what_the_upper_contact_presses_with() -> None:
+    model = build()
+    y = press(model, GRASP)
+    assert holding_force(model, y) == pytest.approx(-float(contact_force(model, y, "U")[1].detach()), rel=1e-9)

@@ -16,6 +16,7 @@ from torchsoft import METHOD, Parameters, SoftGrasp, press
 from torchsoft.adjoint import GradientFailed, differentiable_solution
 from torchsoft.contact import Coulomb, SmoothSlip, moving_frame, normal_force, ramp
 from torchsoft.control import Controllers, Profile, Reference, Setpoint, hold
+from torchsoft.equilibrium import holding_force
 from torchsoft.implicit import ImplicitStepper
 from torchsoft.sensitivity import sensitivities
 from torchsoft.shapes import Circle
@@ -97,10 +98,7 @@ def pressed(model: SoftGrasp, velocity: tuple[float, float] = (0.0, 0.0)) -> Ten
     """The frictionless grasp, held by the controllers, the disc moving at `velocity` [m/s]."""
     y = press(model, model.settings.scenario.y_Br_grasp).detach()
     state = model.layout.unpack(y)
-    with torch.no_grad():
-        port = model.evaluate(0.0, state).ports["pad_U"]
-        load = float(port.transformer.effort(port.effort, model.junctions)["bracket"][..., 1].sum())
-    model.reference = hold(float(state.r_C[0]), float(state.r_Br[1]), load)
+    model.reference = hold(float(state.r_C[0]), float(state.r_Br[1]), -holding_force(model, y))
     y[model.layout.slices["v_C"]] = f64(*velocity)
     return y
 

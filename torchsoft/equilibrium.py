@@ -36,6 +36,14 @@ def press(model: SoftGrasp, bracket_height: float) -> Tensor:
     return model.layout.pack(state)
 
 
+@torch.no_grad()
+def holding_force(model: SoftGrasp, y: Tensor) -> float:
+    """Force [N] on the bracket, downwards, that balances the upper pad's normal forces in the frictionless state y (size,)."""
+    frame, zero = model.frame("U", model.layout.unpack(y)), torch.zeros((), dtype=torch.float64)
+    F_N = normal_force(frame.g, zero, zero, model.share(model.pad_U) * model.contact.K_n, zero)
+    return float((F_N * frame.n[:, 1]).sum())
+
+
 def _solve(model: SoftGrasp, bracket_height: float | None) -> State:
     """Unknowns: the disc's height and the displacements of the nodes under (and above) it; x_C stays at `x_C0`.
 

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from torchsoft.control import Profile, Reference
-from torchsoft.equilibrium import press, rest
+from torchsoft.equilibrium import holding_force, press, rest
 from torchsoft.model import SoftGrasp
 from torchsoft.parameters import Parameters
 
@@ -158,23 +158,16 @@ def start(model: SoftGrasp) -> Tensor:
     )
 
 
-def grasp_load(model: SoftGrasp) -> float:
-    """Force [N] that holds the grasp down, of frictionless statics."""
-    state = model.layout.unpack(press(model, model.settings.scenario.y_Br_grasp).detach())
-    with torch.no_grad():
-        port = model.evaluate(0.0, state).ports["pad_U"]
-        return -float(port.transformer.effort(port.effort, model.junctions)["bracket"][..., 1].sum())
-
-
 def begin(excitation: Excitation, p: Parameters, *, grasp_force: float | None = None) -> Begun:
-    """A model with the parameters p about to be excited; `grasp_force` [N] is fed forward, that of `grasp_load` by default.
+    """A model with the parameters p about to be excited; `grasp_force` [N] is fed forward, by default that of statics.
 
     Raises `ValueError` for an impossible grasp, `NoEquilibrium` where the disc finds no rest.
     """
     model = SoftGrasp(excitation.settings(p))
     y0 = start(model).detach()
-    force = grasp_load(model) if grasp_force is None else grasp_force
-    model.reference = reference(excitation, model, float(model.layout.unpack(y0).r_Br[1]), force)
+    if grasp_force is None:
+        grasp_force = holding_force(model, press(model, model.settings.scenario.y_Br_grasp))
+    model.reference = reference(excitation, model, float(model.layout.unpack(y0).r_Br[1]), grasp_force)
     return Begun(model, y0)
 
 

@@ -25,6 +25,7 @@ from torchsoft.kernels.run import (
     TAPE_FULL,
     Tape,
     empty_tape,
+    first_stages,
     run,
 )
 from torchsoft.model import SoftGrasp
@@ -159,7 +160,7 @@ class ImplicitStepper:
             if segments is not None and steps > 0:
                 segment.chunk = chunk.part(0, steps)
                 segment.rows = slice(rows.start, rows.start + int(segment.chunk.keep.sum()))
-                segment.tape = None if tape is None else Tape(*(x[: 2 * steps] for x in tape))
+                segment.tape = None if tape is None else first_stages(tape, 2 * steps)
                 segments.append(segment)
                 taped += sum(x.nbytes for x in tape) if tape is not None else 0
             out.rows += int(chunk.keep[:steps].sum())

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchsoft.control import hold
-from torchsoft.equilibrium import press
+from torchsoft.equilibrium import holding_force, press
 from torchsoft.model import SoftGrasp
 
 DISPLACEMENT, VELOCITY = 1e-9, 1e-8
@@ -27,10 +27,8 @@ def loop_modes(model: SoftGrasp) -> Tensor:
     """
     y = press(model, model.settings.scenario.y_Br_grasp)
     state, before = model.layout.unpack(y), model.reference
-    touching = model.evaluate(0.0, state).ports
-    load = touching["pad_U"].transformer.effort(touching["pad_U"].effort, model.junctions)["bracket"]
     try:
-        model.reference = hold(float(state.r_C[0]), float(state.r_Br[1]), float(load[..., 1].sum()))
+        model.reference = hold(float(state.r_C[0]), float(state.r_Br[1]), -holding_force(model, y))
         first_velocity = model.layout.slices["v_L"].start
         size = torch.full((model.layout.size,), DISPLACEMENT, dtype=torch.float64)
         size[first_velocity:] = VELOCITY

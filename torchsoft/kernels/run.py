@@ -50,6 +50,12 @@ def empty_tape(stages: int, dofs: int, surface: int, cap: int) -> Tape:
     )  # fmt: skip
 
 
+def first_stages(tape: Tape, stages: int) -> Tape:
+    """The beginning of a tape, of a run that ended early."""
+    parts: Any = [part[:stages] for part in tape]
+    return Tape(*parts)
+
+
 @compiled
 def write_tape(tape: Any, row: int, pads: Any, states: Any, works: Any, q: Array, V_star: Array, V: Array) -> bool:
     """Put one solved stage on the tape; False if more nodes touch than it has room for."""
