@@ -220,7 +220,7 @@ def main(config: Config) -> None:
     config = result.config
     config.out.mkdir(parents=True, exist_ok=True)
     figure(result).savefig(config.out / "identify_contact.png", dpi=150)
-    report(next(c.answer for c in result.cases if c.name == "noisy"), result.problem, config.out / "report.html")
+    report([c.answer for c in result.cases if c.name == "noisy"][-1], result.problem, config.out / "report.html")
     rows = []
     for case in result.cases:
         cost = case.answer.cost
