@@ -76,27 +76,26 @@ def gauss_newton(
 def polish(
     problem: Problem, runner: Runner, x: Array, J: Array, *, which: Sequence[str], free: NDArray[np.bool_], step: float,
     rounds: int = 5, notify: Notify = lambda chi2: None,
-) -> tuple[Array, Residuals]:  # fmt: skip
+) -> tuple[Fit, Residuals]:  # fmt: skip
     """From a fit at a coarse step to the one at a finer `step` [s]: residuals of the finer runs, and the coarse Jacobian J
     (m, n), a chord method, until the coordinates move by less than a fifth of a standard deviation. A round costs a run, not
     a Jacobian. Returns where that ended, and the residuals there, with J. Lost runs end it where it began.
     """
     low, high = problem.coordinates.bounds
     sd = np.sqrt(np.diag(np.linalg.pinv(J[:, free].T @ J[:, free])))
-    at = problem.residuals(runner, x, which, step)
-    for _ in range(rounds):
-        if at.lost:
-            break
+    at, count, converged = problem.residuals(runner, x, which, step), 1, False
+    while count <= rounds and not at.lost:
         notify(float(np.mean(at.r**2)))
         move, trial = np.linalg.lstsq(J[:, free], -at.r, rcond=None)[0], x.copy()
         trial[free] = np.clip(x[free] + move, low[free], high[free])
-        there = problem.residuals(runner, trial, which, step)
+        there, count = problem.residuals(runner, trial, which, step), count + 1
         if there.lost or there.r @ there.r > at.r @ at.r:
             break
         x, at = trial, there
-        if (np.abs(move) < 0.2 * sd).all():
+        converged = bool((np.abs(move) < 0.2 * sd).all())
+        if converged:
             break
-    return x, Residuals(at.r, J, at.lost)
+    return Fit(x, float(np.mean(at.r**2)), count, converged), Residuals(at.r, J, at.lost)
 
 
 def descend(

@@ -50,9 +50,10 @@ def identify(
 
     `step` [s] is the stepper's in the last stage; `plan` the stages, `default_plan` by default, whose first stage is begun
     from `starts` Sobol points (`seed`). Where that step turns out to shift an estimate by more than `STEP_BIAS` standard
-    deviations, the estimates are `polished` at a `POLISH` times finer one. `loss` is scipy's robust loss; `method` may
-    descend on the adjoint instead. Recordings named in `heldout` are predicted, not fitted. With a `checkpoint` folder every
-    run is kept there: an identification that was interrupted, called again with the same arguments, continues where it was.
+    deviations, the estimates are `polished` at a `POLISH` times finer one (with the linear loss). `loss` is scipy's robust
+    loss; `method` may descend on the adjoint instead. Recordings named in `heldout` are predicted, not fitted. With a
+    `checkpoint` folder every run is kept there: an identification that was interrupted, called again with the same
+    arguments, continues where it was.
 
     Raises `ValueError` for recordings that are not there, `Unreachable` where the model cannot follow the data.
     """
@@ -71,18 +72,21 @@ def identify(
             with Bar(f"{number + 1}/{len(plan)} {stage.name}", progress) as bar:
                 fit = carry_out(problem, runner, stage, x, loss, method, seed + number, bar)
             x = fit.x
-            told.append(
-                {
-                    "name": stage.name, "recordings": list(stage.recordings), "free": list(stage.free),
-                    "step": stage.step, "evaluations": fit.evaluations, "chi2": fit.chi2, "converged": fit.converged,
-                    "wall_s": clock.perf_counter() - before,
-                }
-            )  # fmt: skip
+            told.append(entry(stage.name, stage, stage.step, fit, before))
         if fit is None:
             raise ValueError("`plan` has no stages")
         return conclude(
             problem, runner, plan[-1], fit, fitted, list(heldout), told, method, loss, seed, began, polished, progress
         )
+
+
+def entry(name: str, stage: Stage, step: float, fit: Fit, began: float) -> dict[str, Any]:
+    """What the answer tells of a stage that began at `began` on the clock [s]."""
+    return {
+        "name": name, "recordings": list(stage.recordings), "free": list(stage.free), "step": step,
+        "evaluations": fit.evaluations, "chi2": fit.chi2, "converged": fit.converged,
+        "wall_s": clock.perf_counter() - began,
+    }  # fmt: skip
 
 
 class Bar:
@@ -175,14 +179,16 @@ def conclude(
     finer = problem.residuals(runner, x, stage.recordings, step / 2)
     if not finer.lost:
         shift[free] = step_shift(at.J[:, free], step_error(at.r, finer.r))
-    if polished and (np.abs(shift[free]) > STEP_BIAS * np.sqrt(np.diag(C_free))).any():
+    if polished and loss == "linear" and (np.abs(shift[free]) > STEP_BIAS * np.sqrt(np.diag(C_free))).any():
+        start = clock.perf_counter()
         with Bar(f"polish at {step / POLISH:g} s", bar) as notify:
             end, there = polish(
                 problem, runner, x, at.J, which=stage.recordings, free=free, step=step / POLISH, notify=notify
             )  # fmt: skip
-        before = problem.residuals(runner, end, stage.recordings, 2 * step / POLISH)
+        before = problem.residuals(runner, end.x, stage.recordings, 2 * step / POLISH)
         if not there.lost and not before.lost:  # the error of the finer step, a quarter of that of the one before
-            x, at, finer, step = end, there, there, step / POLISH
+            x, at, finer, step = end.x, there, there, step / POLISH
+            told = [*told, entry("polish", stage, step, end, start)]
             shift[free] = step_shift(at.J[:, free], step_error(before.r, at.r) / 4)
     chi2 = float(at.r @ at.r) / max(len(at.r) - int(free.sum()), 1)
     C[np.ix_(free, free)] = C_free * max(1.0, chi2)
