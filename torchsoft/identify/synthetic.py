@@ -13,7 +13,7 @@ from torchsoft.simulate import simulate
 
 def record(
     name: str, excitation: Excitation, truth: Parameters, nominal: Parameters, sensors: dict[str, Sensor], *,
-    rate: float = 200.0, step: float = 5e-4, noise: float = 1.0, seed: int = 0,
+    rate: float = 200.0, step: float = 1.25e-4, noise: float = 1.0, seed: int = 0,
 ) -> Recording:  # fmt: skip
     """What a rig with the parameters `truth` gives under an excitation that was planned with the `nominal` ones.
 
