@@ -7,6 +7,7 @@ from conftest import COARSE, coarse
 from torchdiffeq import odeint
 
 from torchsoft import METHOD, Parameters, SimulationFailed, SoftGrasp, press, rest, simulate
+from torchsoft.adjoint import differentiable_solution
 from torchsoft.control import Profile, Reference, hold
 from torchsoft.implicit import ImplicitStepper, Segment
 from torchsoft.scenario import grasp_and_roll
@@ -211,3 +212,25 @@ def test_a_step_that_newton_does_not_solve_is_halved() -> None:
     fine = simulate(model, t, y0=y0, step=6.25e-5).y.numpy()
     off_cut, off_free = (np.abs(run.y - fine)[:, model.layout.slices["r_C"]].max() for run in (cut, free))
     assert off_cut < 1.2 * off_free
+
+
+def test_the_adjoint_follows_halved_steps() -> None:
+    """Where steps were cut, the gradient is still that of the run; differences small enough to cut the same steps."""
+    model = coarse(contact__mu_s=0.3, contact__mu_k=0.2)
+    y0, t = grasped(model), times(0.01, 6)
+    y0[model.layout.slices["v_C"]] = torch.tensor([0.15, 0.0], dtype=torch.float64)
+    E = model.material.E
+
+    def angle() -> tuple[torch.Tensor, int]:
+        y, run = differentiable_solution(ImplicitStepper(model, step=2e-3, tolerance=1e-10, max_iterations=10), y0, t)
+        return model.layout.unpack(y).theta[-1], run.failed
+
+    theta, failed = angle()
+    (slope,) = torch.autograd.grad(theta, E)
+    assert failed > 0
+    with torch.no_grad():
+        value, h = E.clone(), 1e-5 * E.item()
+        ahead, behind = (angle() for E_near in (value + h, value - h) if E.copy_(E_near) is not None)
+        E.copy_(value)
+    assert ahead[1] == behind[1] == failed
+    assert slope.item() == pytest.approx((ahead[0] - behind[0]).item() / (2 * h), rel=1e-4)
