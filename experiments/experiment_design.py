@@ -28,9 +28,8 @@ from tqdm import tqdm
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, Strokes
-from torchsoft.identify import Problem, Sensor, Unknown, record
-from torchsoft.identify.answer import step_error
-from torchsoft.identify.plan import standard_deviations
+from torchsoft.identify import RIG, Problem, Unknown, record
+from torchsoft.identify.information import standard_deviations, step_error, step_shift
 from torchsoft.identify.workers import Runner
 from torchsoft.implicit import SimulationFailed
 
@@ -39,8 +38,6 @@ Array = NDArray[np.float64]
 NAMES: tuple[str, ...] = (
     "contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau",
 )  # fmt: skip
-NOISE = {"x_C": 1e-5, "y_C": 1e-5, "theta": 5e-4, "x_Br": 1e-5, "y_Br": 1e-5, "F_x": 0.1, "F_y": 0.1}
-"""Sensors and their noise [m, rad, N]."""
 CONSISTENT = 0.01
 """Difference between J and a finite difference, over their size, above which an excitation is dropped."""
 DIFFERENCE = 1e-5
@@ -83,7 +80,7 @@ class Row:
 
 def row(names: tuple[str, ...], seconds: float, J: Array, error: Array, inconsistency: float, dropped: str = "") -> Row:
     """What a Jacobian and the step's error (m,) say."""
-    sd, shift = standard_deviations(J), np.linalg.lstsq(J, error, rcond=None)[0]
+    sd, shift = standard_deviations(J), step_shift(J, error)
     return Row(names, seconds, dict(zip(NAMES, sd.tolist())), dict(zip(NAMES, shift.tolist())), inconsistency, dropped)
 
 
@@ -103,9 +100,8 @@ def smoke(config: Config) -> tuple[Config, dict[str, Excitation]]:
 def look(excitation: Excitation, p: Parameters, config: Config) -> tuple[Array, Array, float]:
     """Whitened Jacobian (m, parameters), error of the step (m,), and how far the Jacobian is, relatively, from a central
     difference along one direction."""
-    sensors = {channel: Sensor(noise=sigma) for channel, sigma in NOISE.items()}
-    recording = record("one", excitation, p, p, sensors, step=config.step, noise=0.0)
-    problem = Problem([recording], sensors, {name: Unknown() for name in NAMES})
+    recording = record("one", excitation, p, p, RIG, step=config.step, noise=0.0)
+    problem = Problem([recording], RIG, {name: Unknown() for name in NAMES})
     x, v = problem.coordinates.start, np.random.default_rng(config.seed).standard_normal(len(NAMES))
     with Runner(problem.recordings) as runner:
         at = problem.residuals(runner, x, ["one"], config.step, problem.coordinates.free)

@@ -25,15 +25,13 @@ from numpy.typing import NDArray
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes
-from torchsoft.identify import Answer, Problem, Recording, Sensor, Unknown, identify, record
+from torchsoft.identify import RIG, Answer, Problem, Recording, Unknown, identify, record
 from torchsoft.identify.problem import Residuals
 from torchsoft.identify.report import report
-from torchsoft.identify.workers import Runner
+from torchsoft.identify.workers import Runner, forget
 
 Array = NDArray[np.float64]
 
-NOISE = {"x_C": 1e-5, "y_C": 1e-5, "theta": 5e-4, "x_Br": 1e-5, "y_Br": 1e-5, "F_x": 0.1, "F_y": 0.1}
-"""Sensors and their noise [m, rad, N]."""
 TRUTH = {
     "contact.K_n": 1.6e5, "contact.R_n": 300.0, "contact.K_t": 0.8e5, "contact.R_t": 600.0, "contact.mu_s": 0.65,
     "contact.mu_k": 0.5, "pad.E": 0.9e6, "pad.tau": 0.012,
@@ -136,10 +134,9 @@ def record_all(config: Config, noise: float) -> list[Recording]:
     rig = nominal.override({**truths(config), **({"contact.mu_k": 0.5} if config.smoke else {})})
     if config.smoke:
         nominal = nominal.override({"contact.mu_k": 0.5})
-    sensors = {channel: Sensor(noise=sigma) for channel, sigma in NOISE.items()}
     step = config.step / (config.finer if noise else 1.0)
     return [
-        record(name, e, rig, nominal, sensors, step=step, noise=noise, seed=config.noise_seed + k)
+        record(name, e, rig, nominal, RIG, step=step, noise=noise, seed=config.noise_seed + k)
         for k, (name, e) in enumerate(excitations(config).items())
     ]
 
@@ -159,7 +156,7 @@ def problem(config: Config, recordings: list[Recording], begin: dict[str, float]
     if "contact.mu_k" in begin:
         ratio = begin["contact.mu_k"] / begin["contact.mu_s"]
         unknowns["contact.mu_k"] = Unknown(nominal=ratio, ratio_to="contact.mu_s", low=0.1, high=1.0)
-    return kind(recordings, {channel: Sensor(noise=sigma) for channel, sigma in NOISE.items()}, unknowns)
+    return kind(recordings, RIG, unknowns)
 
 
 def run(config: Config) -> Result:
@@ -177,8 +174,7 @@ def run(config: Config) -> Result:
             asked, step=config.step, workers=config.workers, heldout=held, checkpoint=folder, progress=not config.smoke,
             polished=noise > 0,
         )  # fmt: skip
-        for path in (*folder.glob("*"), folder):
-            path.rmdir() if path.is_dir() else path.unlink()
+        forget(folder)
         cases.append(Case(name, noise, begin, answer))
         print(answer.table(), *answer.notices, sep="\n")
         return asked
@@ -236,7 +232,7 @@ def main(config: Config) -> None:
     summary = {
         "torchsoft": version("torchsoft"),
         "config": asdict(config) | {"out": str(config.out)},
-        "noise": NOISE,
+        "noise": {channel: sensor.noise for channel, sensor in RIG.items()},
         "cases": rows,
         "baseline_over_exact": wall["finite differences"] / wall["noisy"] if "finite differences" in wall else None,
     }

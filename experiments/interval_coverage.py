@@ -21,12 +21,9 @@ from tqdm import tqdm
 
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, MultiSine, Strokes
-from torchsoft.identify import Problem, Recording, Sensor, Stage, Unknown, identify, record
+from torchsoft.identify import RIG, Problem, Recording, Stage, Unknown, identify, record
 from torchsoft.processes import local_processes
 
-NOISE = {"x_C": 1e-5, "y_C": 1e-5, "theta": 5e-4, "x_Br": 1e-5, "y_Br": 1e-5, "F_x": 0.1, "F_y": 0.1}
-"""Sensors and their noise [m, rad, N]."""
-SENSORS = {channel: Sensor(noise=sigma) for channel, sigma in NOISE.items()}
 TRUTH = {"pad.E": 0.9e6, "pad.tau": 0.012, "contact.K_n": 1.6e5, "contact.mu_s": 0.65}
 EXCITATIONS = {
     "strokes": Excitation(motion=Strokes(travel=12e-3, stroke_time=0.2), duration=1.0, senses="bracket"),
@@ -61,16 +58,16 @@ def exact(step: float) -> list[Recording]:
         {"contact.v_s": 0.05, "contact.mu_k": 0.5, "pad.elements_x": 60, "pad.elements_y": 2}
     )
     rig = nominal.override(TRUTH)
-    return [record(name, e, rig, nominal, SENSORS, step=step, noise=0.0) for name, e in EXCITATIONS.items()]
+    return [record(name, e, rig, nominal, RIG, step=step, noise=0.0) for name, e in EXCITATIONS.items()]
 
 
 def repeat(recordings: list[Recording], step: float, seed: int) -> dict[str, tuple[float, bool]]:
     """One repetition: by parameter its error over the predicted standard deviation, and whether its interval holds."""
     rng, noisy = np.random.default_rng(seed), []
     for r in recordings:
-        samples = {c: (t, y + NOISE[c] * rng.standard_normal(len(t))) for c, (t, y) in r.samples.items()}
+        samples = {c: (t, y + RIG[c].noise * rng.standard_normal(len(t))) for c, (t, y) in r.samples.items()}
         noisy.append(replace(r, samples=samples))
-    problem = Problem(noisy, SENSORS, {name: Unknown(nominal=1.1 * value) for name, value in TRUTH.items()})
+    problem = Problem(noisy, RIG, {name: Unknown(nominal=1.1 * value) for name, value in TRUTH.items()})
     plan = [Stage("all", problem.names, problem.coordinates.labels, step)]
     answer = identify(problem, plan=plan, polished=False)  # the data have that step's error too
     out = {}

@@ -13,7 +13,8 @@ parameters shapes multibond state pad contact control model ledger equilibrium s
 kernels kernels.node kernels.linear kernels.pad kernels.stage kernels.run kernels.adjoint kernels.sensitivity
 kernel_inputs grid implicit stage_laws adjoint sensitivity unrolled torchdiffeq_solver continuous
 trajectory simulate scenario excitation
-processes identify.unknowns identify.recording identify.prediction identify.workers identify.problem identify.fit identify.plan
+processes identify.unknowns identify.recording identify.prediction identify.workers identify.problem
+identify.information identify.fit identify.plan
 identify.answer identify.solve identify.synthetic identify.columns identify.measured identify dataset
 reduction.rollout reduction.ode reduction.records reduction.terms reduction.fit reduction scene figures animation diagram
 identify.pictures identify.report cli __main__

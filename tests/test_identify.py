@@ -16,9 +16,10 @@ from torchsoft import Parameters
 from torchsoft.control import Profile, Sampled
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
 from torchsoft.identify import Problem, Recording, Sensor, Stage, Unknown, Unreachable, identify, record
-from torchsoft.identify.answer import fisher, step_error, step_shift, whiteness
+from torchsoft.identify.answer import whiteness
 from torchsoft.identify.fit import descend, gauss_newton
-from torchsoft.identify.plan import default_plan, standard_deviations, tie_ratios, visible
+from torchsoft.identify.information import fisher, standard_deviations, step_error, step_shift
+from torchsoft.identify.plan import default_plan, tie_ratios, visible
 from torchsoft.identify.solve import sobol
 from torchsoft.identify.workers import Runner
 

@@ -51,6 +51,7 @@ def identify(options: argparse.Namespace) -> int:
         from torchsoft.identify.fit import Unreachable
         from torchsoft.identify.report import report
         from torchsoft.identify.solve import identify
+        from torchsoft.identify.workers import forget
 
         tables: dict[str, Any] = {}
         try:
@@ -78,7 +79,7 @@ def identify(options: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         print(f"\ninterrupted; what is done so far is in {unfinished}, and the same command continues", file=sys.stderr)
         return 130
-    clear(unfinished)
+    forget(unfinished)
     print(answer.table())
     for notice in answer.notices:
         print(f"note: {notice}")
@@ -89,12 +90,3 @@ def identify(options: argparse.Namespace) -> int:
 def failed(what: str) -> int:
     print(f"torchsoft: error: {' '.join(what.split())}", file=sys.stderr)
     return 2
-
-
-def clear(folder: Path) -> None:
-    """Remove a checkpoint: its own files, and the folder if it holds nothing else."""
-    for pattern in ("*.pickle", "*.partial"):
-        for file in folder.glob(pattern):
-            file.unlink(missing_ok=True)
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()

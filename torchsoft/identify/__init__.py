@@ -6,9 +6,10 @@ from torchsoft.identify.plan import Stage
 from torchsoft.identify.problem import Problem
 from torchsoft.identify.recording import CHANNELS, Recording
 from torchsoft.identify.solve import identify
-from torchsoft.identify.synthetic import record
+from torchsoft.identify.synthetic import RIG, record
 from torchsoft.identify.unknowns import Sensor, Unknown
 
 __all__ = [
-    "CHANNELS", "Answer", "Estimate", "Problem", "Recording", "Sensor", "Stage", "Unknown", "Unreachable", "identify", "record",
+    "CHANNELS", "RIG", "Answer", "Estimate", "Problem", "Recording", "Sensor", "Stage", "Unknown", "Unreachable", "identify",
+    "record",
 ]  # fmt: skip

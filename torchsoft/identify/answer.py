@@ -43,6 +43,11 @@ class Estimate:
     step_bias_sd: float
     """what the step of the simulation shifts the estimate by, in standard deviations"""
 
+    @property
+    def label(self) -> str:
+        """Its name, with the recording it belongs to."""
+        return self.name + (f" in {self.recording}" if self.recording else "")
+
 
 @dataclass(frozen=True)
 class Direction:
@@ -108,11 +113,12 @@ class Answer:
         """One line an estimate."""
         rows = [f"{'parameter':34s} {'estimate':>12s}   95 % interval"]
         for e in self.estimates:
-            name = e.name + (f" in {e.recording}" if e.recording else "")
             if e.value is None or e.ci95 is None:
-                rows.append(f"{name:34s} {'not seen':>12s}   the data do not tell it (ended at {e.last:.3g} {e.unit})")
+                rows.append(
+                    f"{e.label:34s} {'not seen':>12s}   the data do not tell it (ended at {e.last:.3g} {e.unit})"
+                )
             else:
-                rows.append(f"{name:34s} {e.value:12.5g}   {e.ci95[0]:.5g} .. {e.ci95[1]:.5g} {e.unit}")
+                rows.append(f"{e.label:34s} {e.value:12.5g}   {e.ci95[0]:.5g} .. {e.ci95[1]:.5g} {e.unit}")
         return "\n".join(rows)
 
 
@@ -123,14 +129,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(v) for v in value]
     return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def fisher(J: Array) -> tuple[Array, Array, Array]:
-    """Covariance (n, n) of the coordinates, eigenvalues (n,) and eigenvectors (n, n) of the Fisher matrix of a whitened
-    Jacobian J (m, n); directions without any information get a very large variance, not an infinite one."""
-    values, vectors = np.linalg.eigh(J.T @ J)
-    floor = np.maximum(values, 1e-12 * max(values.max(initial=0.0), 1e-300))
-    return (vectors / floor) @ vectors.T, values, vectors
 
 
 def whiteness(r: Array) -> tuple[float, float]:
@@ -166,17 +164,6 @@ def nrmse(problem: Problem, r: Array, which: list[str]) -> dict[str, dict[str, f
         rms = float(np.sqrt(np.mean(part**2))) * problem.sensors[channel].noise
         out[name][channel] = rms / max(float(np.ptp(y)), 1e-300)
     return out
-
-
-def step_error(r: Array, finer: Array) -> Array:
-    """Minus the error (m,) of residuals r by the finite step, from those at half of it: the method is of second order, so
-    the exact residuals are finer + (finer - r) / 3."""
-    return 4.0 / 3.0 * (finer - r)
-
-
-def step_shift(J: Array, error: Array) -> Array:
-    """How far a step's `error` (m,) has moved the coordinates (n,)."""
-    return np.asarray(np.linalg.lstsq(J, error, rcond=None)[0], np.float64)
 
 
 def estimates(problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shift: Array) -> list[Estimate]:

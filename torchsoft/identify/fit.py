@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from torchsoft.identify.information import standard_deviations
 from torchsoft.identify.problem import Problem, Residuals
 from torchsoft.identify.workers import Lost, Runner
 
@@ -82,7 +83,7 @@ def polish(
     a Jacobian. Returns where that ended, and the residuals there, with J. Lost runs end it where it began.
     """
     low, high = problem.coordinates.bounds
-    sd = np.sqrt(np.diag(np.linalg.pinv(J[:, free].T @ J[:, free])))
+    sd = standard_deviations(J[:, free])
     at, count, converged = problem.residuals(runner, x, which, step), 1, False
     while count <= rounds and not at.lost:
         notify(float(np.mean(at.r**2)))

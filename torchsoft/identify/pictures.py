@@ -10,7 +10,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullForm
 from numpy.typing import NDArray
 
 from torchsoft.figures import ACTUAL, OTHER, STYLE
-from torchsoft.identify.answer import LAGS, UNSEEN, Answer, Channel, Direction, Estimate
+from torchsoft.identify.answer import LAGS, UNSEEN, Answer, Channel, Direction
 from torchsoft.identify.recording import CHANNELS
 
 Array = NDArray[np.float64]
@@ -37,10 +37,6 @@ class Trace(NamedTuple):
     measured: Array
     predicted: Array
     residual: Array
-
-
-def named(e: Estimate) -> str:
-    return e.name + (f" in {e.recording}" if e.recording else "")
 
 
 def direction_name(d: Direction) -> str:
@@ -86,7 +82,7 @@ def estimates_figure(answer: Answer, start: list[float]) -> Figure | None:
     low, high = min(reach) / 1.15, max(reach) * 1.15
     axes.set(xlim=(low, high), ylim=(len(rows) - 0.5, -0.5))
     figure.supxlabel("estimate over start value, 95 % interval", fontsize=10)
-    axes.set_yticks(range(len(rows)), [literal(named(e), NAME) for e, _ in rows])
+    axes.set_yticks(range(len(rows)), [literal(e.label, NAME) for e, _ in rows])
     ticks = [v for v in (0.01, 0.03, 0.1, 0.2, 0.33, 0.5, 0.7, 1, 1.5, 2, 3, 5, 10, 30, 100) if low <= v <= high]
     while len(ticks) > 7:
         ticks = [v for i, v in enumerate(ticks) if v == 1 or (i - ticks.index(1)) % 2 == 0]

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchsoft.identify.fit import Unreachable
+from torchsoft.identify.information import standard_deviations
 from torchsoft.identify.problem import Problem
 from torchsoft.identify.workers import Runner
 
@@ -56,12 +57,6 @@ def tie_ratios(problem: Problem, x: Array) -> Array:
         if c.ratio_to and not c.fixed:
             x[i] = high[i]
     return x
-
-
-def standard_deviations(J: Array) -> Array:
-    """Cramer-Rao: standard deviations (n,) of the coordinates of a whitened Jacobian (m, n); huge where nothing is seen."""
-    values, vectors = np.linalg.eigh(J.T @ J)
-    return np.sqrt((vectors**2 / np.maximum(values, 1e-12)).sum(1))
 
 
 def visible(J: Array, candidates: NDArray[np.bool_], limit: float = SEEN) -> NDArray[np.bool_]:

@@ -18,7 +18,6 @@ from torchsoft.identify.pictures import (
     correlation_figure,
     direction_name,
     estimates_figure,
-    named,
     spectrum_figure,
     trace_figure,
 )
@@ -146,7 +145,7 @@ def estimates_table(answer: Answer, start: list[float]) -> str:
         else:
             found = [grouped(e.value), f"{grouped(e.ci95[0])} … {grouped(e.ci95[1])}"]
         rows.append(
-            [named(e), *found, unit, grouped(s), "yes" if e.seen else ("unseen", "no"), "yes" if e.at_bound else "no"]
+            [e.label, *found, unit, grouped(s), "yes" if e.seen else ("unseen", "no"), "yes" if e.at_bound else "no"]
         )
     return table(["parameter", "estimate", "95 % interval", "unit", "start", "seen", "at a bound"], rows)
 
@@ -173,7 +172,7 @@ def page(answer: Answer, problem: Problem, drawn: list[Trace], lost: dict[str, s
     ]
     if (figure := estimates_figure(answer, start)) is not None:
         told = "; ".join(
-            f"{named(e)} {f'{e.value / s:.3g} times its start' if e.value is not None else 'not seen'}"
+            f"{e.label} {f'{e.value / s:.3g} times its start' if e.value is not None else 'not seen'}"
             for e, s in zip(answer.estimates, start) if s > 0
         )  # fmt: skip
         parts.append(picture(figure, f"Estimates over their start values: {told}"))

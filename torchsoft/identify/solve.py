@@ -16,13 +16,11 @@ from torchsoft.identify.answer import (
     Answer,
     directions,
     estimates,
-    fisher,
     nrmse,
     residual_channels,
-    step_error,
-    step_shift,
 )
 from torchsoft.identify.fit import Fit, Loss, Unreachable, descend, gauss_newton, polish
+from torchsoft.identify.information import fisher, step_error, step_shift
 from torchsoft.identify.plan import Stage, default_plan
 from torchsoft.identify.problem import Problem
 from torchsoft.identify.workers import Runner

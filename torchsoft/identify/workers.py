@@ -144,3 +144,12 @@ class Runner:
             partial = path.with_suffix(".partial")
             partial.write_bytes(pickle.dumps(result))
             partial.replace(path)
+
+
+def forget(folder: Path) -> None:
+    """Remove a checkpoint: its own files, and the folder if it holds nothing else."""
+    for pattern in ("*.pickle", "*.partial"):
+        for file in folder.glob(pattern):
+            file.unlink(missing_ok=True)
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
