@@ -58,8 +58,9 @@ class ContactParameters(Group):
     epsilon: float = quantity(1e-6, "m", "assumed", "touch-down depth of the ramp g / (g + epsilon)", gt=0)
     node_spacing: float = quantity(1e-3, "m", "assumed", "spacing the per-node values refer to", gt=0)
     friction: Literal["smooth", "coulomb"] = quantity(
-        "smooth", "1", "assumed", "slip element, or Eq. 12-13 to the letter"
+        "smooth", "1", "assumed", "slip element, or Eq. 12-13 with the force's modulus and re-anchoring"
     )
+    points: int = quantity(0, "1", "assumed", "contact points an element; 0 puts one on every node, as the paper does", ge=0, le=8)
 
     @model_validator(mode="after")
     def _laws_are_well_posed(self) -> Self:

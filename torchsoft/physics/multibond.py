@@ -24,10 +24,11 @@ class Junction(NamedTuple):
 
 
 class Block(NamedTuple):
-    """One junction's modulus: matrix (..., bonds or 1, m, width), and the junction nodes it selects (None: all, or one)."""
+    """One junction's modulus: matrix (..., bonds or 1, m, width), after an interpolation of the junction's nodes at the bonds,
+    spread (bonds, nodes); None where bonds are nodes, or the junction has only one."""
 
     matrix: Tensor
-    select: Tensor | None = None
+    spread: Tensor | None = None
 
 
 class Transformer:
@@ -39,8 +40,8 @@ class Transformer:
     def flow(self, flows: Mapping[str, Tensor]) -> Tensor:
         """f = sum_j T_j v_j."""
         total = 0.0
-        for name, (matrix, select) in self.blocks.items():
-            v = flows[name] if select is None else flows[name][..., select, :]
+        for name, (matrix, spread) in self.blocks.items():
+            v = flows[name] if spread is None else spread @ flows[name]
             total = total + (matrix @ v[..., None])[..., 0]
         assert isinstance(total, Tensor)
         return total
@@ -48,11 +49,10 @@ class Transformer:
     def effort(self, e: Tensor, junctions: Mapping[str, Junction]) -> dict[str, Tensor]:
         """T_j^T e for every junction j, each shaped like that junction's flow."""
         out = {}
-        for name, (matrix, select) in self.blocks.items():
+        for name, (matrix, spread) in self.blocks.items():
             back = (matrix.mT @ e[..., None])[..., 0]
-            if select is not None:
-                zeros = back.new_zeros((*back.shape[:-2], junctions[name].nodes, back.shape[-1]))
-                back = zeros.index_add(-2, select, back)
+            if spread is not None:
+                back = spread.mT @ back
             elif junctions[name].nodes == 1:
                 back = back.sum(-2, keepdim=True)
             out[name] = back

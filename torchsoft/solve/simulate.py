@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from torchsoft.adjoint import iterate
 from torchsoft.equilibrium import rest
-from torchsoft.grid import check_times
+from torchsoft.solve.grid import check_times
 from torchsoft.implicit import METHOD, ImplicitStepper, Progress, SimulationFailed
 from torchsoft.kernels.run import DISSIPATED, INTEGRALS, SUPPLIED
 from torchsoft.ledger import stored

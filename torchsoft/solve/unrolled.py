@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchsoft.contact import cross, moving_frame
-from torchsoft.grid import check_times, chunks
+from torchsoft.solve.grid import check_times, chunks
 from torchsoft.kernels.run import GAMMA
 from torchsoft.model import SoftGrasp
 from torchsoft.state import State

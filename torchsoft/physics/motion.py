@@ -1,22 +1,10 @@
-"""Reference trajectories and the two PD controllers (Eq. 20-34)."""
+"""What a rig is asked to do: signals of time, such as the paper's 7th-order profiles (Eq. 20-29)."""
 
-from typing import NamedTuple
+from collections.abc import Sequence
 
 import torch
 from scipy.interpolate import CubicSpline
 from torch import Tensor, nn
-
-from torchsoft.parameters import ControlParameters
-
-
-class Setpoint(NamedTuple):
-    """What the controllers want at one time, each of t's shape: x_d, x_d', y_Br,d, y_Br,d' and the feed-forward F_y."""
-
-    x: Tensor
-    x_dot: Tensor
-    y: Tensor
-    y_dot: Tensor
-    F_y: Tensor
 
 
 class Profile(nn.Module):
@@ -27,17 +15,19 @@ class Profile(nn.Module):
     """
 
     times: Tensor
+    values: Tensor
 
-    def __init__(self, times: list[float], values: list[float] | Tensor) -> None:
+    def __init__(self, times: Sequence[float] | Tensor, values: Sequence[float] | Tensor) -> None:
         super().__init__()
         knots = torch.as_tensor(times, dtype=torch.float64)
         if knots.ndim != 1 or not bool(torch.all(knots.diff() > 0)) or not bool(torch.isfinite(knots).all()):
             raise ValueError(f"`times` must increase strictly, but are {times}")
-        value = torch.as_tensor(values, dtype=torch.float64)
-        if value.shape != knots.shape or not bool(torch.isfinite(value).all()):
+        many = values if isinstance(values, Tensor) else torch.stack([torch.as_tensor(v, dtype=torch.float64) for v in values])
+        if many.shape != knots.shape or not bool(torch.isfinite(many).all()):
             raise ValueError(f"`values` must hold one finite number per time ({len(knots)}), but are {values}")
         self.register_buffer("times", knots)
-        self.values = nn.Parameter(value, requires_grad=False)
+        # a tensor with a graph keeps it; anything else becomes a parameter that is not trained unless asked for
+        self.values = many.double() if many.requires_grad else nn.Parameter(many.double(), requires_grad=False)
 
     def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
         """Value and rate at t (...)."""
@@ -84,38 +74,31 @@ class Sampled(Profile):
 
 
 class Reference(nn.Module):
-    """x_d(t) of the disc, y_Br,d(t) of the bracket, and the vertical effort F_y(t) fed forward to the bracket."""
+    """What a rig is asked to do: named signals of time, setpoints, feed-forward efforts and driven coordinates.
 
-    def __init__(self, x: Profile, y: Profile, F_y: Profile) -> None:
+    Raises `ValueError` for a signal that is not a module giving (value, rate) at t.
+    """
+
+    def __init__(self, **signals: nn.Module) -> None:
         super().__init__()
-        self.x, self.y, self.F_y = x, y, F_y
+        for name, signal in signals.items():
+            if not isinstance(signal, nn.Module):
+                raise ValueError(f"the signal `{name}` must be a module such as `Profile`, but is {type(signal).__name__}")
+        self.signals = nn.ModuleDict(signals)
 
-    def forward(self, t: Tensor) -> Setpoint:
-        x, x_dot = self.x(t)
-        y, y_dot = self.y(t)
-        return Setpoint(x, x_dot, y, y_dot, self.F_y(t)[0])
+    def forward(self, t: Tensor, names: Sequence[str]) -> Tensor:
+        """Values and rates (..., names, 2) at t (...) [s]. Raises `ValueError` for a signal that is not there."""
+        rows = []
+        for name in names:
+            if name not in self.signals:
+                raise ValueError(f"the reference has no signal `{name}`; it has {', '.join(self.signals) or 'none'}")
+            rows.append(torch.stack(self.signals[name](t), -1))
+        return torch.stack(rows, -2) if rows else t.new_zeros((*t.shape, 0, 2))
+
+    def __getitem__(self, name: str) -> nn.Module:
+        return self.signals[name]
 
 
-def hold(x: float, y: float, F_y: float = 0.0) -> Reference:
+def hold(**values: float) -> Reference:
     """The reference that stays where it is."""
-    return Reference(Profile([0.0], [x]), Profile([0.0], [y]), Profile([0.0], [F_y]))
-
-
-class Controllers(nn.Module):
-    """The PD loops: the vertical one about the bracket, the horizontal one about the disc (or, by `senses`, about the bracket
-    as well), both acting on the bracket."""
-
-    def __init__(self, p: ControlParameters) -> None:
-        super().__init__()
-        self.senses = p.senses
-        self.K_81, self.R_80, self.K_98, self.R_99 = (
-            nn.Parameter(torch.tensor(value, dtype=torch.float64)) for value in (p.K_81, p.R_80, p.K_98, p.R_99)
-        )
-
-    def forward(self, want: Setpoint, r_C: Tensor, v_C: Tensor, r_Br: Tensor, v_Br: Tensor) -> tuple[Tensor, Tensor]:
-        """Forces F_x, F_y [N] on the bracket, shape (...)."""
-        E_v, E_v_dot = want.y - r_Br[..., 1], want.y_dot - v_Br[..., 1]  # (31)
-        F_y = self.K_98 * E_v + self.R_99 * E_v_dot + want.F_y  # (32) and the feed-forward
-        r, v = (r_C, v_C) if self.senses == "disc" else (r_Br, v_Br)
-        E_h, E_h_dot = want.x - r[..., 0], want.x_dot - v[..., 0]  # (33)
-        return self.K_81 * E_h + self.R_80 * E_h_dot, F_y  # (34)
+    return Reference(**{name: Profile([0.0], [value]) for name, value in values.items()})

@@ -1,7 +1,7 @@
-"""The two small linear solves of a stage, in place and without allocation."""
+"""The small linear solves of a stage, in place and without allocation."""
 
-from torchsoft.kernels import compiled
-from torchsoft.kernels.node import Array
+from torchsoft.solve.kernel import compiled
+from torchsoft.solve.kernel.arrays import Array
 
 
 @compiled
@@ -27,11 +27,12 @@ def solve_dense(A: Array, b: Array, n: int, m: int) -> None:
                     b[i, j] -= factor * b[k, j]
     for k in range(n - 1, -1, -1):
         inverse = 1.0 / A[k, k]
+        for i in range(k + 1, n):
+            factor = A[k, i]
+            for j in range(m):
+                b[k, j] -= factor * b[i, j]
         for j in range(m):
-            total = b[k, j]
-            for i in range(k + 1, n):
-                total -= A[k, i] * b[i, j]
-            b[k, j] = total * inverse
+            b[k, j] *= inverse
 
 
 @compiled

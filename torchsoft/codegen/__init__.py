@@ -1,0 +1,110 @@
+"""Machine code of physical laws that are written as torch functions: value, Jacobian, and pullback to the parameters.
+
+`compile_law` runs the function once, records its scalar expressions, differentiates them and compiles all three.
+`torchsoft.codegen.invoke` calls the result from functions that numba compiles.
+"""
+
+import itertools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchsoft.codegen import emit
+from torchsoft.codegen.derivatives import adjoints, dependent, jacobian
+from torchsoft.codegen.graph import Graph
+from torchsoft.codegen.trace import UnknownOperation, traced
+
+__all__ = ["Law", "UnknownOperation", "compile_law"]
+
+
+@dataclass(frozen=True)
+class Law:
+    """A compiled law; the addresses stay valid until the process ends, and mean nothing in another process.
+
+    value: void(x, p, out), linearise: void(x, p, out, J), pullback: void(x, p, w, p_bar), all arguments double*:
+    x (inputs,), p (parameters,), out (outputs,), J (linear, differentiated) by rows, w (linear,), and p_bar
+    (parameters,), to which Σ w[o]·∂out[o]/∂p[j] is added.
+    """
+
+    inputs: int
+    parameters: int
+    outputs: int
+    linear: int
+    differentiated: int
+    names: tuple[str, ...]
+    value: int
+    linearise: int
+    pullback: int
+    nodes: int
+
+
+def compile_law(
+    function: Callable[[Tensor, dict[str, Tensor]], Tensor],
+    x: Tensor,
+    parameters: Mapping[str, Tensor],
+    *,
+    linear: int | None = None,
+    differentiated: int | None = None,
+) -> Law:
+    """Compile function(x, parameters), which gives an (outputs,) float64 tensor for x (inputs,) and float64 parameters.
+
+    The values of `x` and `parameters` are examples: the code holds for all values, since a function that reads them
+    is refused. Every other tensor that the function uses is a constant. The flat parameter vector is the parameters'
+    entries in the order of the mapping. The first `linear` outputs are differentiated, in all parameters and in the
+    first `differentiated` inputs; None stands for all.
+
+    Raises UnknownOperation (a TypeError) naming the line of the function that cannot be compiled, and TypeError or
+    ValueError for arguments or results of another kind.
+    """
+    _check(x, parameters)
+    graph = Graph()
+    outputs = traced(graph, function, x, parameters)
+    elsewhere = {name: 0.9 * tensor.detach() + 0.01 for name, tensor in parameters.items()}
+    if traced(graph, function, 0.9 * x.detach() + 0.01, elsewhere) != outputs:
+        raise UnknownOperation(
+            "The law gives other expressions at other values, so it reads a tensor outside torch or keeps a state."
+        )
+    linear = _count("linear", linear, len(outputs))
+    differentiated = _count("differentiated", differentiated, x.numel())
+    names = tuple(itertools.chain.from_iterable(_names(name, tensor) for name, tensor in parameters.items()))
+    engine = emit.compiled(_functions(graph, outputs, linear, differentiated, len(names)))
+    addresses = [engine.get_function_address(name) for name in ("value", "linearise", "pullback")]
+    return Law(x.numel(), len(names), len(outputs), linear, differentiated, names, *addresses, nodes=len(graph.ops))
+
+
+def _functions(g: Graph, outputs: list[int], linear: int, differentiated: int, parameters: int) -> list[str]:
+    """IR of the three entry points."""
+    x = [g.leaf("x", i) for i in range(differentiated)]
+    p = [g.leaf("p", j) for j in range(parameters)]
+    seeds: dict[int, int] = {}
+    for o, node in enumerate(outputs[:linear]):
+        weight = g.leaf("w", o)
+        seeds[node] = g("add", seeds[node], weight) if node in seeds else weight
+    J = itertools.chain.from_iterable(jacobian(g, outputs[:linear], x))
+    p_bar = adjoints(g, seeds, {}, dependent(g, p), p)
+    return [
+        emit.function(g, "value", ("x", "p", "out"), {"out": outputs}),
+        emit.function(g, "linearise", ("x", "p", "out", "J"), {"out": outputs, "J": J}),
+        emit.function(g, "pullback", ("x", "p", "w", "p_bar"), {"p_bar": p_bar}, add=True),
+    ]
+
+
+def _names(name: str, tensor: Tensor) -> list[str]:
+    places = itertools.product(*(range(n) for n in tensor.shape))
+    return [f"{name}[{','.join(map(str, place))}]" if place else name for place in places]
+
+
+def _count(name: str, count: int | None, available: int) -> int:
+    if count is not None and not 0 <= count <= available:
+        raise ValueError(f"{name} must be from 0 to {available}, not {count}")
+    return available if count is None else count
+
+
+def _check(x: Tensor, parameters: Mapping[str, Tensor]) -> None:
+    if x.ndim != 1:
+        raise ValueError(f"the inputs of a law must be a 1-D tensor, not of shape {tuple(x.shape)}")
+    for name, tensor in {**parameters, "x": x}.items():
+        if tensor.dtype != torch.float64:
+            raise TypeError(f"{name} must be float64, not {tensor.dtype}")

@@ -1,0 +1,140 @@
+"""Machine code of a law's entry points: LLVM IR written as text and compiled by llvmlite's MCJIT.
+
+There is no fast-math flag and no contraction, so a sum or product rounds as torch's does. The instructions are emitted
+once each, in the order of the graph, and no optimisation pass runs over them: shared expressions are shared already.
+"""
+
+import ctypes.util
+import hashlib
+import struct
+from collections.abc import Iterable, Iterator, Mapping
+
+import llvmlite.binding as llvm
+
+from torchsoft.codegen.graph import LEAVES, NAMED, Graph
+
+POINTER = "ptr" if llvm.llvm_version_info[0] >= 17 else "double*"
+INSTRUCTIONS = {
+    "add": "fadd double {}, {}",
+    "sub": "fsub double {}, {}",
+    "mul": "fmul double {}, {}",
+    "div": "fdiv double {}, {}",
+    "neg": "fneg double {}",
+    "lt": "fcmp olt double {}, {}",
+    "le": "fcmp ole double {}, {}",
+    "gt": "fcmp ogt double {}, {}",
+    "ge": "fcmp oge double {}, {}",
+    "eq": "fcmp oeq double {}, {}",
+    "ne": "fcmp une double {}, {}",
+    "and": "and i1 {}, {}",
+    "or": "or i1 {}, {}",
+    "not": "xor i1 {}, true",
+    "select": "select i1 {}, double {}, double {}",
+}
+FUNCTIONS = {  # one argument, but for pow and atan2
+    "abs": "llvm.fabs.f64",
+    "sqrt": "llvm.sqrt.f64",
+    "floor": "llvm.floor.f64",
+    **{name: name for name in ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh")},
+    **{name: name for name in ("exp", "expm1", "log", "log1p", "erf", "pow", "atan2")},
+}
+_engines: dict[str, llvm.ExecutionEngine] = {}
+
+
+def function(
+    g: Graph, name: str, pointers: Iterable[str], results: Mapping[str, Iterable[int]], add: bool = False
+) -> str:
+    """IR of void `name`(pointers...), which stores the nodes of `results` where the pointer of that name points.
+
+    With `add` the nodes are added to what is stored there.
+    """
+    text: dict[int, str] = {}
+    lines = [f"define void @{name}({', '.join(f'{POINTER} %{p}' for p in pointers)}) nounwind {{"]
+    for letter, nodes in results.items():
+        for index, node in enumerate(nodes):
+            if add and g.value(node) == 0.0:
+                continue
+            lines += _evaluation(g, node, text)
+            place, value = f"%{letter}{index}", text[node]
+            lines.append(f"{place} = getelementptr double, {POINTER} %{letter}, i64 {index}")
+            if add:
+                lines.append(f"{place}.old = load double, {POINTER} {place}")
+                lines.append(f"{place}.new = fadd double {place}.old, {value}")
+                value = f"{place}.new"
+            lines.append(f"store double {value}, {POINTER} {place}")
+    return "\n".join([*lines, "ret void", "}"])
+
+
+def _evaluation(g: Graph, root: int, text: dict[int, str]) -> Iterator[str]:
+    """The instructions that give `root` its value, and the name of every value in `text`."""
+    pending = [root]
+    while pending:
+        node = pending.pop()
+        if node in text:
+            continue
+        op = g.ops[node]
+        needed = () if op in LEAVES or op == "constant" else g.args[node][:1] if op in NAMED else g.args[node]
+        missing = [a for a in needed if a not in text]
+        if missing:
+            pending += [node, *reversed(missing)]
+            continue
+        if op == "constant":
+            text[node] = _literal(g.args[node][0])
+        elif op in NAMED:
+            text[node] = text[g.args[node][0]]
+        else:
+            text[node] = f"%v{node}"
+            yield from _instruction(g, node, [text[a] for a in needed])
+
+
+def _instruction(g: Graph, node: int, operands: list[str]) -> Iterator[str]:
+    op = g.ops[node]
+    if op in LEAVES:
+        yield f"%a{node} = getelementptr double, {POINTER} %{op}, i64 {g.args[node][0]}"
+        yield f"%v{node} = load double, {POINTER} %a{node}"
+    elif op in INSTRUCTIONS:
+        yield f"%v{node} = {INSTRUCTIONS[op].format(*operands)}"
+    else:
+        yield f"%v{node} = call double @{FUNCTIONS[op]}({', '.join('double ' + a for a in operands)})"
+
+
+def _literal(value: float | bool) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"0x{struct.unpack('<Q', struct.pack('<d', value))[0]:016X}"
+
+
+def compiled(functions: Iterable[str]) -> llvm.ExecutionEngine:
+    """The engine that holds the functions; the same text is compiled once a process and never freed."""
+    declarations = [
+        f"declare double @{name}({'double, double' if name in ('pow', 'atan2') else 'double'}) nounwind"
+        for name in FUNCTIONS.values()
+    ]
+    source = "\n".join([*declarations, *functions])
+    key = hashlib.sha256(source.encode()).hexdigest()
+    if key not in _engines:
+        _engines[key] = _engine(source)
+    return _engines[key]
+
+
+def _engine(source: str) -> llvm.ExecutionEngine:
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    _load_libm()
+    target = llvm.Target.from_default_triple()
+    features = llvm.get_host_cpu_features().flatten()
+    level = 2 if len(source) < 500_000 else 1  # half the compile time of a large network, about the same speed
+    machine = target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=features, opt=level, jit=True)
+    module = llvm.parse_assembly(source)
+    module.triple = target.triple
+    module.data_layout = str(machine.target_data)
+    module.verify()
+    engine = llvm.create_mcjit_compiler(module, machine)
+    engine.finalize_object()
+    return engine
+
+
+def _load_libm() -> None:
+    """Make sure that the C mathematics library is among the libraries where symbols are looked up."""
+    if llvm.address_of_symbol("log1p") is None and (path := ctypes.util.find_library("m")):
+        llvm.load_library_permanently(path)

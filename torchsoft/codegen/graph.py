@@ -1,0 +1,171 @@
+"""The scalar expression graph of a law.
+
+A node is an integer; its operation and arguments stand in `Graph.ops` and `Graph.args`. Equal expressions are one node,
+and an argument always has a smaller number than the node that uses it.
+"""
+
+import math
+import operator
+from collections.abc import Callable, Iterable
+
+LEAVES = ("x", "p", "w")  # the inputs, the parameters, and the output weights of a pullback
+COMPARISONS = {
+    "lt": operator.lt,
+    "le": operator.le,
+    "gt": operator.gt,
+    "ge": operator.ge,
+    "eq": operator.eq,
+    "ne": operator.ne,
+}
+LOGIC = {"and": operator.and_, "or": operator.or_, "not": operator.not_}
+ARITHMETIC = {"add": operator.add, "sub": operator.sub, "mul": operator.mul, "neg": operator.neg}
+FOLDED = {**COMPARISONS, **LOGIC, **ARITHMETIC}
+COMMUTATIVE = {"add", "mul", "eq", "ne", "and", "or"}
+# the value is the first argument; the derivative rule speaks of the arguments after it
+NAMED = {"stop", "norm", "sigmoid", "maximum", "minimum"}
+# finite for every finite argument, overflow apart
+ENTIRE = {"add", "sub", "mul", "neg", "abs", "select", "sin", "cos", "tanh", "atan", "atan2", "erf", "floor"}
+
+
+class Graph:
+    """Scalar expressions of float64 and truth values, each held once."""
+
+    def __init__(self) -> None:
+        self.ops: list[str] = []
+        self.args: list[tuple] = []
+        self.boolean: list[bool] = []
+        self.finite: list[bool] = []
+        self._known: dict[tuple, int] = {}
+        self.zero = self.constant(0.0)  # number 0: what torch fills padding with
+        self.one = self.constant(1.0)
+
+    def __call__(self, op: str, *args: int) -> int:
+        """The node `op(*args)`, simplified where an argument is constant."""
+        args = self._typed(op, args)
+        if op in COMMUTATIVE and args[0] > args[1]:
+            args = (args[1], args[0])
+        simpler = self._simplified(op, args)
+        if simpler is not None:
+            return simpler
+        finite = op in LEAVES or op == "sigmoid" or ((op in ENTIRE or op in NAMED) and self._all_finite(op, args))
+        return self._node(op, args, (op, *args), op in COMPARISONS or op in LOGIC, finite)
+
+    def leaf(self, kind: str, index: int) -> int:
+        """Entry `index` of the inputs "x", the parameters "p" or the output weights "w"."""
+        return self._node(kind, (index,), (kind, index), False, True)
+
+    def constant(self, value: float | bool) -> int:
+        """A constant; a `bool` is a truth value, every other number a float64."""
+        if isinstance(value, bool):
+            return self._node("constant", (value,), ("constant", value, "truth"), True, True)
+        value = float(value)
+        return self._node("constant", (value,), ("constant", value.hex()), False, math.isfinite(value))
+
+    def value(self, node: int) -> float | None:
+        """The value of a constant node, and None for every other node."""
+        return self.args[node][0] if self.ops[node] == "constant" else None
+
+    def number(self, node: int) -> int:
+        """The node as a float64: 1 for true and 0 for false."""
+        return self("select", node, self.one, self.zero) if self.boolean[node] else node
+
+    def truth(self, node: int) -> int:
+        """The node as a truth value: whether a number differs from zero."""
+        return node if self.boolean[node] else self("ne", node, self.zero)
+
+    def total(self, nodes: Iterable[int]) -> int:
+        """The sum of the nodes, from the left; zero where there are none."""
+        total = self.zero
+        for node in nodes:
+            total = self("add", total, node)
+        return total
+
+    def product(self, adjoint: int, local: int) -> int:
+        """adjoint·local, and 0 where the adjoint is exactly 0, however singular the local derivative is there."""
+        if self.value(local) == 0.0:
+            return self.zero
+        result = self("mul", adjoint, local)
+        return result if self.finite[local] else self.guarded(adjoint, result)
+
+    def quotient(self, adjoint: int, divisor: int) -> int:
+        """adjoint/divisor, and 0 where the adjoint is exactly 0."""
+        return self.guarded(adjoint, self("div", adjoint, divisor))
+
+    def guarded(self, adjoint: int, result: int) -> int:
+        """`result`, and 0 where the adjoint is exactly 0."""
+        return self("select", self("eq", adjoint, self.zero), self.zero, result)
+
+    def _node(self, op: str, args: tuple, key: tuple, boolean: bool, finite: bool) -> int:
+        node = self._known.setdefault(key, len(self.ops))
+        if node == len(self.ops):
+            self.ops.append(op)
+            self.args.append(args)
+            self.boolean.append(boolean)
+            self.finite.append(finite)
+        return node
+
+    def _all_finite(self, op: str, args: tuple[int, ...]) -> bool:
+        if op in ("norm", "maximum", "minimum"):
+            args = args[1:]
+        return all(self.finite[a] for a in args)
+
+    def _typed(self, op: str, args: tuple[int, ...]) -> tuple[int, ...]:
+        """The arguments converted to numbers or truth values, as the operation takes them."""
+        if op in LOGIC:
+            return tuple(self.truth(a) for a in args)
+        if op == "select":
+            return (self.truth(args[0]), self.number(args[1]), self.number(args[2]))
+        return tuple(self.number(a) for a in args) if any(self.boolean[a] for a in args) else args
+
+    def _simplified(self, op: str, args: tuple[int, ...]) -> int | None:
+        """A node known to be equal, or None. Signed zeros count as equal; x·0 is 0 where x is certainly finite."""
+        values = [self.value(a) for a in args]
+        if op in FOLDED and None not in values:
+            return self.constant(FOLDED[op](*values))
+        match op:
+            case "select" if values[0] is not None or args[1] == args[2]:
+                return args[1] if values[0] else args[2]
+            case "neg" | "not" if self.ops[args[0]] == op:
+                return self.args[args[0]][0]
+            case "sub" | "div" if values[1] == (0.0 if op == "sub" else 1.0):
+                return args[0]
+            case "sub" if values[0] == 0.0:
+                return self("neg", args[1])
+            case "add" | "mul" | "and" | "or":
+                return self._simplified_pair(op, args, values)
+        return None
+
+    def _simplified_pair(self, op: str, args: tuple[int, ...], values: list) -> int | None:
+        for value, other in zip(values, reversed(args)):
+            if value is None:
+                continue
+            if value == {"add": 0.0, "mul": 1.0, "and": True, "or": False}[op]:
+                return other
+            if op == "mul" and value == -1.0:
+                return self("neg", other)
+            if (op == "mul" and value == 0.0 and self.finite[other]) or (op in LOGIC and value is (op == "or")):
+                return self.constant(value if op in LOGIC else 0.0)
+        return None
+
+
+def power(g: Graph, base: int, exponent: int) -> int:
+    """base**exponent, with the products and roots that torch takes for small constant exponents."""
+    square = lambda: g("mul", base, base)
+    simple: dict[float, Callable[[], int]] = {
+        0.0: lambda: g.one,
+        1.0: lambda: base,
+        2.0: square,
+        3.0: lambda: g("mul", square(), base),
+        0.5: lambda: g("sqrt", base),
+        -0.5: lambda: g("div", g.one, g("sqrt", base)),
+        -1.0: lambda: g("div", g.one, base),
+        -2.0: lambda: g("div", g.one, square()),
+    }
+    value = g.value(exponent)
+    return simple[value]() if value in simple else g("pow", base, exponent)
+
+
+def sign(g: Graph, a: int) -> int:
+    """1, 0 or -1, as constants that have no derivative."""
+    below = g("select", g("lt", a, g.zero), g.constant(-1.0), g.zero)
+    return g("select", g("gt", a, g.zero), g.one, below)

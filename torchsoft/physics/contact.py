@@ -1,0 +1,183 @@
+"""Contact at one point of a pad's surface: detection, the moving frame, penalty normal force and stick-slip friction.
+
+Equations of the paper in brackets. Everything else is generated from these functions: the compiled law with its Jacobian and
+its derivatives in every parameter. Departures from the paper keep forces and gradients continuous: the ramp
+rho = g / (g + epsilon), which takes the dashpots and the tangential branch in at touch-down, max(0, .), which removes
+adhesion, and the moving frame, which follows the point on the body nearest to the pad's instead of the first one touched.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchsoft.physics.shapes import Shape, parameter
+
+SlipLaw = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""Slip rate |gamma'| >= 0 [m/s] under a trial effort E >= 0 [N], a normal force F_N [N] and the dashpot R [N.s/m] that the slip
+relieves, each per reference spacing: a function or an `nn.Module`, in torch operations. The slip must not take more than the
+effort: R |gamma'| <= E."""
+
+
+class Frame(NamedTuple):
+    """The moving frame at points: moment arm d [m], normal n, tangent t (..., 2), penetration g [m] (...)."""
+
+    d: Tensor
+    n: Tensor
+    t: Tensor
+    g: Tensor
+
+
+class ContactState(NamedTuple):
+    """Per point, shape (...): forces [N], stretch rate s' and slip rate gamma' [m/s], effort e [N], ramp rho [1]."""
+
+    F_N: Tensor
+    F_T: Tensor
+    s_dot: Tensor
+    gamma_dot: Tensor
+    e: Tensor
+    rho: Tensor
+
+
+def cross(d: Tensor) -> Tensor:
+    """z x d, the velocity of the moment arm d (..., 2) under unit spin."""
+    return torch.stack((-d[..., 1], d[..., 0]), -1)
+
+
+def turned(v: Tensor, angle: Tensor) -> Tensor:
+    """Vectors (..., 2) turned by an angle (...)."""
+    c, s = torch.cos(angle), torch.sin(angle)
+    return torch.stack((c * v[..., 0] - s * v[..., 1], s * v[..., 0] + c * v[..., 1]), -1)
+
+
+def moving_frame(shape: Shape, d: Tensor, theta: Tensor) -> Frame:
+    """Detection and frame (Eq. 1, 3) of points at d (..., 2) [m] from the centre of a body turned by theta (...)."""
+    phi, m = shape(turned(d, -theta))
+    n = turned(m, theta)
+    return Frame(d, n, cross(n), -phi)
+
+
+def ramp(g: Tensor, epsilon: Tensor) -> Tensor:
+    """rho = g / (g + epsilon) for g > 0, else 0. Continuous; not smooth at g = 0."""
+    depth = g.clamp(min=0.0)
+    return depth / (depth + epsilon)
+
+
+def normal_force(g: Tensor, g_dot: Tensor, rho: Tensor, K_n: Tensor, R_n: Tensor) -> Tensor:
+    """F_N = max(0, K_n g + R_n g' rho) while g > 0 (Eq. 8, 9) [N]. Not smooth at g = 0 and where the max cuts."""
+    return (K_n * g.clamp(min=0.0) + R_n * rho * g_dot).clamp(min=0.0)
+
+
+class SmoothSlip(nn.Module):
+    """The slip element: (eta + R) |gamma'| = <E - mu(gamma') F_N>+, mu = mu_k + (mu_s - mu_k) / (1 + |gamma'| / v_s).
+
+    A quadratic in |gamma'|, with one positive root when E > mu_s F_N. Continuous, not smooth at slip onset; continuous
+    only if eta + R >= (mu_s - mu_k) F_N / v_s.
+    """
+
+    limits = {"mu_s": "not negative", "mu_k": "not negative", "v_s": "positive", "eta": "not negative"}
+
+    def __init__(self, mu_s: float, mu_k: float, v_s: float, eta: float) -> None:
+        super().__init__()
+        self.mu_s, self.mu_k, self.v_s, self.eta = (parameter(value) for value in (mu_s, mu_k, v_s, eta))
+
+    def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
+        a = self.eta + R
+        b = a * self.v_s - (E - self.mu_k * F_N)
+        c = (self.v_s * (E - self.mu_s * F_N)).clamp(min=0.0)
+        root = torch.sqrt(b * b + 4 * a * c)
+        rising = b >= 0  # two forms of the same root, neither of which cancels
+        rate = torch.where(rising, 2 * c / torch.where(rising, b + root, 1.0), (root - b) / (2 * a))
+        return torch.where(self.mu_s * F_N <= E, rate, 0.0)
+
+
+class Coulomb(nn.Module):
+    """Stick up to mu_s F_N, then mu_k F_N (Eq. 12-13 with the force's modulus).
+
+    The spring re-anchors so that the Voigt pair carries just mu_k F_N, |gamma'| = (E - mu_k F_N) / R. Discontinuous at slip
+    onset unless mu_s = mu_k: gradients across it are biased.
+    """
+
+    limits = {"mu_s": "not negative", "mu_k": "not negative"}
+
+    def __init__(self, mu_s: float, mu_k: float) -> None:
+        super().__init__()
+        self.mu_s, self.mu_k = parameter(mu_s), parameter(mu_k)
+
+    def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
+        return torch.where(self.mu_s * F_N <= E, (E - self.mu_k * F_N) / R, 0.0)
+
+
+class SoftContact(nn.Module):
+    """The contact elements of one point, per reference spacing: springs K_n, K_t [N/m], dashpots R_n, R_t [N.s/m], the ramp's
+    depth epsilon [m], and a friction law. `weight` scales them to the length of surface that a point stands for."""
+
+    limits = {"K_n": "positive", "R_n": "not negative", "K_t": "positive", "R_t": "not negative", "epsilon": "positive"}
+
+    def __init__(
+        self, K_n: float, R_n: float, K_t: float, R_t: float, *, friction: SlipLaw, epsilon: float = 1e-6,
+        node_spacing: float = 1e-3,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        self.K_n, self.R_n, self.K_t, self.R_t = (parameter(value) for value in (K_n, R_n, K_t, R_t))
+        self.epsilon = parameter(epsilon, trained=False)
+        self.node_spacing, self.friction = node_spacing, friction
+
+    def forward(
+        self, g: Tensor, g_dot: Tensor, v_T: Tensor, s: Tensor, weight: Tensor | float = 1.0, stage: Tensor | float = 0.0
+    ) -> ContactState:
+        """Forces and rates from penetration g [m], its rate, sliding speed v_T [m/s] and stretch s [m], all (...).
+
+        With `stage` = a h [s] the law at the end of an implicit stage: s is then its s*, and the stretch that acts is
+        s* + a h s', which turns the dashpot R_t into R_t + a h K_t and changes nothing else.
+        """
+        R = self.R_t + stage * self.K_t
+        rho = ramp(g, self.epsilon)
+        F_N = normal_force(g, g_dot, rho, self.K_n, self.R_n)  # (8), (9)
+        trial = self.K_t * s + R * rho * v_T  # (10), (11): the effort if nothing slipped
+        one = torch.ones_like(trial)
+        sign = torch.where(trial >= 0, one, -one)
+        gamma_dot = sign * self.friction(sign * trial, F_N, R)  # (12), (13)
+        s_dot = rho * v_T - gamma_dot
+        e = self.K_t * s + R * s_dot
+        return ContactState(weight * F_N, weight * rho * e, s_dot, gamma_dot, weight * e, rho)
+
+    def dissipated(self, at: ContactState, g: Tensor, g_dot: Tensor, weight: Tensor | float) -> tuple[Tensor, Tensor]:
+        """Powers [W] that dashpots and slip take out, shape (...), never negative."""
+        spring = weight * self.K_n * g.clamp(min=0.0)
+        return (at.F_N - spring) * g_dot + weight * self.R_t * at.s_dot**2, at.e * at.gamma_dot
+
+    def stored(self, g: Tensor, s: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+        """Energies [J] of the normal and the tangential springs, shape (...)."""
+        return 0.5 * weight * self.K_n * g.clamp(min=0.0) ** 2, 0.5 * weight * self.K_t * s**2
+
+
+def interface_law(contact: SoftContact, shape: Shape, x: Tensor) -> Tensor:
+    """One point's law at a stage: (f, s', F_N, F_T, power of dashpots, of slip) (..., 7) of x (..., 9).
+
+    x = (w, omega, d, theta, s*, weight, a h): the body's velocity at its centre less the point's, its spin, the point's
+    moment arm from the centre and the body's angle, all in the frame of the pad's base. f is the force on the pad [N].
+    """
+    w, omega, d, theta, s, weight, stage = x[..., :2], x[..., 2], x[..., 3:5], *x[..., 5:].unbind(-1)
+    frame = moving_frame(shape, d, theta)
+    v = w + omega[..., None] * cross(d)  # (4)-(7)
+    g_dot, v_T = (frame.n * v).sum(-1), (frame.t * v).sum(-1)
+    at = contact(frame.g, g_dot, v_T, s, weight, stage)
+    f = at.F_N[..., None] * frame.n + at.F_T[..., None] * frame.t
+    return torch.stack(
+        (f[..., 0], f[..., 1], at.s_dot, at.F_N, at.F_T, *contact.dissipated(at, frame.g, g_dot, weight)), -1
+    )
+
+
+def distance_law(shape: Shape, x: Tensor) -> Tensor:
+    """Signed distance (1,) [m] of the point of `interface_law`'s x."""
+    return -moving_frame(shape, x[3:5], x[5]).g[None]
+
+
+def free_law(contact: SoftContact, x: Tensor) -> Tensor:
+    """(s', power of dashpots, of slip) (3,) of x = (s*, weight, a h) away from contact."""
+    s, weight, stage = x.unbind(-1)
+    apart, still = torch.full_like(s, -1.0), torch.zeros_like(s)
+    at = contact(apart, still, still, s, weight, stage)
+    return torch.stack((at.s_dot, *contact.dissipated(at, apart, still, weight)))

@@ -1,0 +1,124 @@
+"""Pads: a mesh of a material, bonded to a base, massless (condensed onto its surface) or inertial.
+
+Displacements are in the frame of the base, which turns with it. A massless pad's state are the parts z_b (nodes, 2) [N] of its
+nodal forces that have set in, branch by branch of its material's chain; an inertial pad's its displacements and velocities.
+"""
+
+import numpy as np
+import torch
+from scipy import sparse
+from torch import Tensor, nn
+
+from torchsoft.physics.material import Material
+from torchsoft.physics.mesh import Array, PadMesh, unit_compliance
+
+
+class Pad(nn.Module):
+    """`base` names the body that it is bonded to, None the ground; the mesh is mirrored if wanted (y upside down), turned by
+    `angle` [rad] and put with its corner at `origin` [m] in the base's frame.
+
+    `points` contact points an element of the surface lie at Gauss places; 0 puts one on every node, as in the paper.
+    `positions` are the undeformed places of the nodes in the state (nodes, 2) [m], `surface` numbers those on the surface.
+    Raises `ValueError` for a negative number of points.
+    """
+
+    positions: Tensor
+    surface: Tensor
+    axes: Tensor
+
+    def __init__(
+        self, mesh: PadMesh, material: Material, *, base: str | None = None, origin: tuple[float, float] = (0.0, 0.0),
+        angle: float = 0.0, mirrored: bool = False, inertial: bool = False, points: int = 0,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        if points < 0:
+            raise ValueError(f"`points` must be 0 (one on every node) or a number of Gauss points, but is {points}")
+        self.mesh, self.material, self.base, self.inertial = mesh, material, base, inertial
+        kept = np.arange(len(mesh.free)) if inertial else mesh.surface
+        c, s = np.cos(angle), np.sin(angle)
+        axes = np.array([[c, -s], [s, c]]) @ np.diag([1.0, -1.0 if mirrored else 1.0])
+        self.register_buffer("axes", torch.from_numpy(axes), persistent=False)
+        self.register_buffer("origin", torch.tensor(origin, dtype=torch.float64), persistent=False)
+        self.register_buffer("positions", torch.from_numpy(self.placed(mesh.nodes[mesh.free][kept])), persistent=False)
+        self.register_buffer("surface", torch.from_numpy(np.searchsorted(kept, mesh.surface)), persistent=False)
+        self.point_nodes, self.point_shares, self.point_lengths = contact_points(mesh, points)
+        spread = np.zeros((len(self.point_nodes), len(kept)))
+        for j in (0, 1):
+            spread[np.arange(len(spread)), self.surface.numpy()[self.point_nodes[:, j]]] += self.point_shares[:, j]
+        self.register_buffer("spread", torch.from_numpy(spread), persistent=False)
+
+    spread: Tensor
+    """Shape functions of the nodes in the state at the contact points (points, nodes)."""
+
+    @property
+    def nodes(self) -> int:
+        return len(self.positions)
+
+    def placed(self, own: Array) -> Array:
+        """Places (..., 2) in the pad's own frame, in the base's."""
+        return own @ self.axes.numpy().T + self.origin.numpy()
+
+    @property
+    def point_positions(self) -> Tensor:
+        """Undeformed places of the contact points in the base's frame (points, 2) [m]."""
+        return self.spread @ self.positions
+
+    def rotated(self, blocks: Array) -> Array:
+        """A matrix of (rows, 2, columns, 2) blocks from the pad's own axes into the base's."""
+        R, n, m = self.axes.numpy(), len(blocks) // 2, blocks.shape[1] // 2
+        return np.einsum("ij,ajbk,lk->aibl", R, blocks.reshape(n, 2, m, 2), R).reshape(blocks.shape)
+
+    def unit_compliance(self) -> tuple[Tensor, Tensor]:
+        """C for E depth = 1 and its derivative by nu, at the material's own nu, in the base's frame."""
+        C, dC = unit_compliance(self.mesh, self.material.nu.item())
+        return torch.from_numpy(self.rotated(C)), torch.from_numpy(self.rotated(dC))
+
+    def compliance(self) -> Tensor:
+        """Static displacement of the surface nodes per force on them [m/N], (2 surface, 2 surface): (K^-1)_ss.
+
+        Proportional to 1 / (E depth); its derivative by nu is exact to first order (a second derivative comes out as zero).
+        """
+        C, dC = self.unit_compliance()
+        material = self.material
+        if material.nu.requires_grad:
+            C = C + dC * (material.nu - material.nu.detach())
+        return C / (material.E * material.depth)
+
+    def masses(self) -> Tensor:
+        """Lumped mass of each node that moves [kg], (nodes,); the bonded nodes' masses are left out, as in the paper."""
+        return self.material.rho * self.material.depth * torch.from_numpy(self.mesh.nodal_areas)
+
+    def stiffness(self, modulus: int) -> sparse.csr_array:
+        """ K_lambda (0) or K_mu (1) per modulus and depth, in the base's axes."""
+        turn = sparse.kron(sparse.eye_array(len(self.mesh.free)), self.axes.numpy())
+        return sparse.csr_array(turn @ self.mesh.assemble(self.mesh.matrices[modulus]) @ turn.T)
+
+    def elastic_force(self, u: Tensor) -> Tensor:
+        """K u of an inertial pad: displacements u (..., nodes, 2) [m] to forces of the same shape [N]."""
+        mesh, material = self.mesh, self.material
+        lame_lambda, lame_mu = material.lame()
+        K_lambda, K_mu = (torch.from_numpy(K) for K in mesh.matrices[:2])
+        K_e = material.depth * (lame_lambda * K_lambda + lame_mu * K_mu)
+        # bonded nodes do not move: they read, and write to, one spare slot behind the free ones
+        slot = np.full(len(mesh.nodes), len(mesh.free))
+        slot[mesh.free] = np.arange(len(mesh.free))
+        connectivity = torch.from_numpy(slot[mesh.elements])
+        padded = nn.functional.pad(u @ self.axes, (0, 0, 0, 1))
+        f_e = (padded[..., connectivity, :].flatten(-2) @ K_e).unflatten(-1, (4, 2))
+        f = torch.zeros_like(padded).index_add(-2, connectivity.flatten(), f_e.flatten(-3, -2))
+        return f[..., :-1, :] @ self.axes.mT
+
+
+def contact_points(mesh: PadMesh, points: int) -> tuple[Array, Array, Array]:
+    """Two surface nodes of every contact point (points, 2), their shape functions there, and the length of surface that the
+    point stands for [m]."""
+    count = len(mesh.surface)
+    if points == 0:
+        nodes = np.stack((np.arange(count), np.arange(count)), -1)
+        return nodes, np.tile([1.0, 0.0], (count, 1)), mesh.tributary
+    xi, weight = np.polynomial.legendre.leggauss(points)
+    spacing = np.diff(mesh.nodes[mesh.free[mesh.surface], 0])
+    left = np.repeat(np.arange(count - 1), points)
+    right = np.tile(0.5 * (1 + xi), count - 1)
+    lengths = np.repeat(spacing, points) * np.tile(0.5 * weight, count - 1)
+    return np.stack((left, left + 1), -1), np.stack((1 - right, right), -1), lengths

@@ -1,0 +1,116 @@
+"""The paper's rig from the lists: a disc between two soft pads, the upper one in a bracket under two PD controllers."""
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchsoft.parameters import Parameters
+from torchsoft.physics.contact import Coulomb, SlipLaw, SmoothSlip, SoftContact
+from torchsoft.physics.material import KelvinVoigt, Material
+from torchsoft.physics.mesh import PadMesh
+from torchsoft.physics.motion import Reference, hold
+from torchsoft.physics.pads import Pad
+from torchsoft.physics.parts import PD, Actuator, Body, Contact
+from torchsoft.physics.rig import Rig
+from torchsoft.physics.shapes import Circle, Shape
+
+NAMES = {
+    **{f"pad.{name}": f"pad.{name}" for name in ("E", "nu", "rho", "tau", "depth")},
+    **{f"contact.{name}": f"contact.{name}" for name in ("K_n", "R_n", "K_t", "R_t", "epsilon")},
+    **{f"contact.{name}": f"contact.friction.{name}" for name in ("mu_s", "mu_k", "v_s", "eta")},
+    "control.K_81": "control.x.Kp",
+    "control.R_80": "control.x.Kd",
+    "control.K_98": "control.y.Kp",
+    "control.R_99": "control.y.Kd",
+    "disc.radius": "disc.shape.radius",
+    "disc.mass": "disc.mass",
+    "bracket.mass": "bracket.mass",
+    "scenario.gravity": "gravity",
+}
+"""What a number of `Parameters` is called among the module's parameters."""
+
+
+class SoftGrasp(Rig):
+    """A rigid body between two soft pads, the upper one in a bracket; channels and signals have the paper's names.
+
+    The reference's signals are x_d of the disc (or of the bracket, `control.senses`), y_d of the bracket and F_ff, the vertical
+    effort fed forward; by default the bracket and the disc stay where they start. `friction`, `shape` and `material` replace
+    those of the settings. Parts that both pads share are `pad` (the material), `contact`, `disc`, `bracket` and `control`.
+    """
+
+    aliases = NAMES
+
+    def __init__(
+        self, settings: Parameters | None = None, reference: Reference | None = None, *, friction: SlipLaw | None = None,
+        shape: Shape | None = None, material: Material | None = None,
+    ) -> None:  # fmt: skip
+        p = settings or Parameters()
+        c, k, length, height = p.contact, p.control, p.pad.length, p.pad.height
+        if friction is None:
+            smooth = c.friction == "smooth"
+            friction = SmoothSlip(c.mu_s, c.mu_k, c.v_s, c.eta) if smooth else Coulomb(c.mu_s, c.mu_k)
+        rubber = material or KelvinVoigt(p.pad.E, p.pad.nu, p.pad.rho, p.pad.tau, p.pad.depth)
+        law = SoftContact(
+            c.K_n, c.R_n, c.K_t, c.R_t, friction=friction, epsilon=c.epsilon, node_spacing=c.node_spacing
+        )
+        disc = Body(p.disc.mass, shape or Circle(p.disc.radius))
+        bracket = Body(p.bracket.mass, theta=0.0, weighted=False)
+        control = nn.ModuleDict({"x": PD(k.K_81, k.R_80), "y": PD(k.K_98, k.R_99)})
+        mesh = PadMesh(length, height, p.pad.elements_x, p.pad.elements_y)
+        upper = PadMesh(length, height, p.pad.elements_x, p.pad.elements_y, bonded_sides=p.pad.enclosed)
+        common: dict[str, Any] = {"inertial": p.pad.fidelity == "inertial", "points": p.contact.points}
+        at_bracket = (-length / 2, -p.bracket.cm_height)
+        super().__init__(
+            groups={"pad": rubber, "contact": law, "disc": disc, "bracket": bracket, "control": control},
+            bodies={"disc": disc, "bracket": bracket},
+            pads={
+                "L": Pad(mesh, rubber, **common),
+                "U": Pad(upper, rubber, base="bracket", origin=at_bracket, mirrored=True, **common),
+            },
+            contacts={name: Contact(name, "disc", law) for name in ("L", "U")},
+            actuators={
+                "x": Actuator(
+                    f"{k.senses}.x", "bracket.x", control["x"], setpoint="x_d", elements=("C: K_81^-1", "R: R_80")
+                ),
+                "y": Actuator(
+                    "bracket.y", "bracket.y", control["y"], setpoint="y_d", feed_forward="F_ff",
+                    elements=("C: K_98^-1", "R: R_99", "Se: F_y"),
+                ),
+            },
+            reference=reference or hold(x_d=p.scenario.x_C0, y_d=apart(p), F_ff=0.0),
+            gravity=p.scenario.gravity,
+            symbols={"disc": "C", "bracket": "Br"},
+        )  # fmt: skip
+        self._settings = p
+
+    @property
+    def settings(self) -> Parameters:
+        """The numbers of this model as they are now, read from its modules; geometry and scenario as they were given."""
+        values: dict[str, dict[str, float]] = {}
+        known = dict(self.named_parameters(remove_duplicate=False))
+        for name, own in NAMES.items():
+            group, _, field = name.partition(".")
+            if own in known:
+                values.setdefault(group, {})[field] = float(known[own].detach())
+        groups = {group: getattr(self._settings, group).model_copy(update=new) for group, new in values.items()}
+        return self._settings.model_copy(update=groups)
+
+    @property
+    def shape(self) -> Shape:
+        """The shape of the object that is manipulated."""
+        shape = self.bodies["disc"].shape
+        assert shape is not None
+        return shape
+
+    def touch_height(self, y_C: Tensor | float, theta: float = 0.0) -> Tensor:
+        """Height of the bracket's centre [m] at which its undeformed pad just touches the object at the height y_C [m]."""
+        angle = torch.tensor(theta, dtype=torch.float64)
+        up = torch.stack((angle.sin(), angle.cos()))  # the world's y in the object's frame
+        p = self._settings
+        return y_C + self.shape.support(up) + p.pad.height + p.bracket.cm_height
+
+
+def apart(p: Parameters) -> float:
+    """Height [m] of the bracket over the ground at which undeformed pads just touch an undeformed disc."""
+    return 2 * (p.pad.height + p.disc.radius) + p.bracket.cm_height

@@ -1,0 +1,104 @@
+"""The parts of a rig beside its pads: rigid bodies, contacts, and actuators with their control laws."""
+
+from collections.abc import Callable, Mapping
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from torchsoft.physics.contact import SoftContact
+from torchsoft.physics.shapes import Shape, parameter
+
+COORDINATES = ("x", "y", "theta")
+"""The coordinates of a body [m, m, rad]."""
+
+Freedom = Literal["free", "driven"] | float
+"""A coordinate is free, driven by the reference's signal "body.coordinate", or fixed at a number."""
+
+
+class Body(nn.Module):
+    """A rigid body: mass [kg], moment of inertia [kg.m2] (by default that of its shape), shape (None: nothing touches it).
+
+    Each coordinate is "free", "driven" or a number at which it is fixed. Gravity acts along -y where `weighted`. Raises
+    `ValueError` for another coordinate, or a body without shape and inertia that may turn.
+    """
+
+    limits = {"mass": "positive", "own_inertia": "positive"}
+
+    def __init__(
+        self, mass: float = 1.0, shape: Shape | None = None, *, x: Freedom = "free", y: Freedom = "free",
+        theta: Freedom = "free", inertia: float | None = None, weighted: bool = True,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        self.freedom: dict[str, str] = {}
+        for name, value in zip(COORDINATES, (x, y, theta)):
+            if isinstance(value, str) and value not in ("free", "driven"):
+                raise ValueError(f"`{name}` must be 'free', 'driven' or a number, but is {value!r}")
+            self.freedom[name] = value if isinstance(value, str) else "fixed"
+        fixed = {k: v for k, v in zip(COORDINATES, (x, y, theta)) if not isinstance(v, str)}
+        self.fixed = nn.ParameterDict({name: parameter(float(value), trained=False) for name, value in fixed.items()})
+        self.mass, self.shape, self.weighted = parameter(mass), shape, weighted
+        self.own_inertia = None if inertia is None else parameter(inertia)
+        if self.freedom["theta"] == "free" and shape is None and inertia is None:
+            raise ValueError("a body that may turn needs an `inertia`, or a `shape` to compute it from")
+
+    @property
+    def inertia(self) -> Tensor:
+        """Moment of inertia about the centre of mass [kg.m2]."""
+        if self.own_inertia is not None:
+            return self.own_inertia
+        return torch.ones_like(self.mass) if self.shape is None else self.mass * self.shape.gyration()
+
+    @property
+    def masses(self) -> tuple[Tensor, Tensor, Tensor]:
+        """What the three coordinates' accelerations are multiplied with."""
+        return self.mass, self.mass, self.inertia
+
+
+class Contact(nn.Module):
+    """What may touch: a pad (by name) and a body (by name), and the law at their points.
+
+    A run ends when the body leaves the space over the pad, unless it `may_leave`.
+    """
+
+    def __init__(self, pad: str, body: str, law: SoftContact, *, may_leave: bool = False) -> None:
+        super().__init__()
+        self.pad, self.body, self.law, self.may_leave = pad, body, law, may_leave
+
+
+class PD(nn.Module):
+    """A proportional-derivative law: F = Kp (w - q) + Kd (w' - q') + feed-forward (Eq. 31-34)."""
+
+    limits = {"Kp": "not negative", "Kd": "not negative"}
+
+    def __init__(self, Kp: float, Kd: float) -> None:
+        super().__init__()
+        self.Kp, self.Kd = parameter(Kp), parameter(Kd)
+
+    def forward(self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor) -> Tensor:
+        return self.Kp * (w - q) + self.Kd * (w_dot - q_dot) + feed_forward
+
+
+class Actuator(nn.Module):
+    """Measures one coordinate, such as "disc.x", and pushes one, such as "bracket.x", by a law.
+
+    `law` (setpoint, its rate, feed-forward, coordinate, its rate) -> effort [N or N.m] is torch code: a `PD`, a function, or any
+    module. `setpoint` and `feed_forward` name signals of the reference. `elements` are the graph's names of what is behind it.
+    """
+
+    def __init__(
+        self, measures: str, pushes: str, law: Callable[..., Tensor], *, setpoint: str, feed_forward: str | None = None,
+        elements: tuple[str, ...] = ("C: Kp", "R: Kd"),
+    ) -> None:  # fmt: skip
+        super().__init__()
+        self.measures, self.pushes, self.law = measures, pushes, law
+        self.setpoint, self.feed_forward, self.elements = setpoint, feed_forward, elements
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Effort (...) of x = (setpoint, its rate, feed-forward, coordinate, its rate) (..., 5)."""
+        return self.law(*x.unbind(-1))
+
+
+def gathered(modules: Mapping[str, object]) -> nn.Module:
+    """One module with what is a module among some objects, for their parameters by name."""
+    return nn.ModuleDict({name: module for name, module in modules.items() if isinstance(module, nn.Module)})

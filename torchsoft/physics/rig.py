@@ -1,0 +1,335 @@
+"""A rig as one torch module: lists of bodies, pads, contacts and actuators; `forward(t, y)` is the right-hand side of the ODE.
+
+The equations of motion are not written down anywhere: `forward` evaluates the ports of the multibond graph at the state
+and integrates what is left over at its 1-junctions.
+"""
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchsoft.physics.condensed import point_inputs, solve_rates
+from torchsoft.physics.contact import Frame, cross, interface_law, moving_frame, turned
+from torchsoft.physics.motion import Reference
+from torchsoft.physics.multibond import Block, Junction, Port, Transformer, identity, net_efforts
+from torchsoft.physics.pads import Pad
+from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact
+from torchsoft.physics.shapes import parameter
+from torchsoft.physics.state import Layout, State
+
+GROUND = "ground"
+
+
+class Interface(NamedTuple):
+    """One contact at one state: moving frame (world axes), law outputs `out` (..., points, 7) as `contact.interface_law` has
+    them, stretches, the port's transformer, and g', v_T (..., points, 2)."""
+
+    frame: Frame
+    out: Tensor
+    transformer: Transformer
+    flow: Tensor
+
+    @property
+    def F_N(self) -> Tensor:
+        """Normal forces [N] (..., points)."""
+        return self.out[..., 3]
+
+    @property
+    def F_T(self) -> Tensor:
+        """Friction forces [N] (..., points)."""
+        return self.out[..., 4]
+
+
+class Evaluation(NamedTuple):
+    """The graph at one state: ports and junction flows by name, and the interfaces by contact."""
+
+    ports: dict[str, Port]
+    flows: dict[str, Tensor]
+    interfaces: dict[str, Interface]
+
+
+class Rig(nn.Module):
+    """Rigid bodies, soft pads, contacts between them, and actuators.
+
+    Names are the mappings' keys; contacts are ordered by their pad. Every physical parameter is an `nn.Parameter` that
+    gradients reach. `reference` gives the signals that actuators and driven coordinates follow; a run may be given another.
+    `symbols` are the suffixes of the bodies' channels, the name by default; `groups` are parts that several of the lists share,
+    whose parameters are then called by the group's name.
+
+    `forward(t, y)` follows torchdiffeq: y has shape (..., `layout.size`), float64, any batch dimensions. Not smooth where a
+    point touches, where the normal force is cut at zero and where a point begins to slip; continuous there with smooth laws.
+    Raises `ValueError` for names that do not fit together, and `NotImplementedError` for an inertial pad whose base turns.
+    """
+
+    def __init__(
+        self, *, bodies: Mapping[str, Body], pads: Mapping[str, Pad], contacts: Mapping[str, Contact],
+        actuators: Mapping[str, Actuator] | None = None, reference: Reference | None = None, gravity: float = 9.81,
+        symbols: Mapping[str, str] | None = None, groups: Mapping[str, nn.Module] | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        for name, module in (groups or {}).items():
+            self.add_module(name, module)
+        order = sorted(contacts, key=lambda name: list(pads).index(contacts[name].pad) if contacts[name].pad in pads else -1)
+        lists: Any = bodies, pads, {name: contacts[name] for name in order}, actuators or {}
+        self.bodies, self.pads, self.contacts, self.actuators = (nn.ModuleDict(parts) for parts in lists)
+        self.gravity = parameter(gravity)
+        self.reference = reference or Reference()
+        self.symbols = {name: (symbols or {}).get(name, name) for name in bodies}
+        self._check_names()
+
+    bodies: Mapping[str, Body]
+    pads: Mapping[str, Pad]
+    contacts: Mapping[str, Contact]
+    actuators: Mapping[str, Actuator]
+
+    def _check_names(self) -> None:
+        for name, pad in self.pads.items():
+            if pad.base is not None and pad.base not in self.bodies:
+                raise ValueError(f"pad `{name}` is bonded to `{pad.base}`, but the bodies are {', '.join(self.bodies)}")
+            if pad.inertial and pad.base is not None and self.bodies[pad.base].freedom["theta"] != "fixed":
+                raise NotImplementedError(
+                    f"pad `{name}` is inertial and its base `{pad.base}` may turn: nodal accelerations in a turning frame are "
+                    "not modelled; fix the base's theta or take a massless pad"
+                )
+        for name, contact in self.contacts.items():
+            if contact.pad not in self.pads or contact.body not in self.bodies:
+                raise ValueError(f"contact `{name}` is between `{contact.pad}` and `{contact.body}`, which are not both there")
+            if self.bodies[contact.body].shape is None:
+                raise ValueError(f"contact `{name}` needs a shape, but the body `{contact.body}` has none")
+            if self.pads[contact.pad].base == contact.body:
+                raise ValueError(f"contact `{name}`: the pad `{contact.pad}` is bonded to the body `{contact.body}` itself")
+        for name, actuator in self.actuators.items():
+            for coordinate in (actuator.measures, actuator.pushes):
+                self.coordinate(coordinate, f"actuator `{name}`")
+
+    def coordinate(self, name: str, owner: str = "`name`") -> int:
+        """Number of a coordinate such as "disc.x" among those of all bodies. Raises `ValueError`."""
+        body, _, axis = name.partition(".")
+        if body not in self.bodies or axis not in COORDINATES:
+            known = ", ".join(f"{b}.{axis}" for b in self.bodies for axis in COORDINATES)
+            raise ValueError(f"{owner} speaks of `{name}`, which is not a coordinate; there are {known}")
+        return 3 * list(self.bodies).index(body) + COORDINATES.index(axis)
+
+    aliases: Mapping[str, str] = {}
+    """Other names of parameters."""
+
+    def parameter(self, name: str) -> Tensor:
+        """A parameter by its name, or by another one in `aliases`. Raises `ValueError` for one that is not there."""
+        known = dict(self.named_parameters(remove_duplicate=False))
+        found = known.get(self.aliases.get(name, name), known.get(name))
+        if found is None:
+            shown = dict.fromkeys((*self.aliases, *dict(self.named_parameters())))
+            raise ValueError(f"`{name}` is not a parameter of this rig; known: {', '.join(shown)}")
+        return found
+
+    def weight(self, name: str) -> Tensor:
+        """What scales a contact's law at its points: the length of surface that each stands for over the law's spacing."""
+        contact = self.contacts[name]
+        return torch.from_numpy(self.pads[contact.pad].point_lengths / contact.law.node_spacing)
+
+    @cached_property
+    def layout(self) -> Layout:
+        """Where everything stands in the state vector."""
+        branches = {name: len(pad.material.chain()[0].detach()) for name, pad in self.pads.items()}
+        return Layout(
+            pads={name: (p.nodes, 2) if p.inertial else (branches[name], p.nodes, 2) for name, p in self.pads.items()},
+            stretch={name: len(self.pads[c.pad].point_nodes) for name, c in self.contacts.items()},
+            free={
+                name: [i for i, axis in enumerate(COORDINATES) if body.freedom[axis] == "free"]
+                for name, body in self.bodies.items()
+            },
+            inertial={name: (p.nodes, 2) for name, p in self.pads.items() if p.inertial},
+        )
+
+    @cached_property
+    def signals(self) -> tuple[str, ...]:
+        """The reference's signals that the rig follows: setpoints, feed-forward efforts, driven coordinates."""
+        names: list[str | None] = []
+        for actuator in self.actuators.values():
+            names += [actuator.setpoint, actuator.feed_forward]
+        for body_name, body in self.bodies.items():
+            names += [f"{body_name}.{axis}" for axis in COORDINATES if body.freedom[axis] == "driven"]
+        return tuple(dict.fromkeys(name for name in names if name is not None))
+
+    def follow(self, t: Tensor | float, reference: Reference | None = None) -> Tensor:
+        """The signals at t (...) [s]: values and rates (..., signals, 2)."""
+        return (reference or self.reference)(torch.as_tensor(t, dtype=torch.float64), self.signals)
+
+    def held(self, signals: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        """Fixed and driven coordinates and their rates by body (..., 3), zero where a coordinate is free."""
+        pose, velocity = {}, {}
+        for name, body in self.bodies.items():
+            rows = []
+            for axis in COORDINATES:
+                zero = signals.new_zeros(signals.shape[:-2])
+                if body.freedom[axis] == "driven":
+                    at = signals[..., self.signals.index(f"{name}.{axis}"), :]
+                    rows.append((at[..., 0], at[..., 1]))
+                else:
+                    rows.append((zero + body.fixed[axis] if axis in body.fixed else zero, zero))
+            pose[name], velocity[name] = (torch.stack(part, -1) for part in zip(*rows))
+        return pose, velocity
+
+    def unpack(self, y: Tensor, signals: Tensor | None = None, t: Tensor | float = 0.0) -> State:
+        """The state's parts by name; `signals` (..., signals, 2) place what is driven, by default the reference at t."""
+        return self.layout.unpack(y, *self.held(self.follow(t) if signals is None else signals))
+
+    def pack(self, state: State) -> Tensor:
+        """The flat vector (..., size) of a state."""
+        return self.layout.pack(state)
+
+    def base_motion(self, name: str, state: State) -> tuple[Tensor, Tensor]:
+        """Pose and velocity (..., 3) of what a pad is bonded to."""
+        base = self.pads[name].base
+        if base is None:
+            like = next(iter(state.pose.values()))
+            return torch.zeros_like(like), torch.zeros_like(like)
+        return state.pose[base], state.velocity[base]
+
+    def displacement(self, name: str, state: State) -> Tensor:
+        """Displacements of the nodes of a pad's state in its base's frame (..., nodes, 2) [m]."""
+        pad, part = self.pads[name], state.pads[name]
+        if pad.inertial:
+            return part
+        fractions, _ = pad.material.chain()
+        zeta = (fractions[:, None, None] * part).sum(-3)
+        return (zeta.flatten(-2) @ pad.compliance().mT).unflatten(-1, (-1, 2))
+
+    def forward(self, t: Tensor | float, y: Tensor) -> Tensor:
+        """dy/dt, shaped like y. Raises `ValueError` for a state of another length or dtype."""
+        signals = self.follow(torch.as_tensor(t, dtype=torch.float64).expand(y.shape[:-1]))
+        state = self.unpack(y, signals)
+        graph = self.evaluate(t, state, signals)
+        effort = net_efforts(graph.ports, self.junctions)
+        pads, rates, velocity = {}, {}, {}
+        for name, pad in self.pads.items():
+            u_dot = graph.ports[f"pad_{name}"].transformer.flow(graph.flows)
+            if pad.inertial:
+                angle = self.base_motion(name, state)[0][..., 2]
+                pads[name], rates[name] = u_dot, turned(effort[f"pad_{name}"], -angle[..., None]) / pad.masses()[:, None]
+            else:
+                f, (_, times) = graph.ports[f"pad_{name}"].effort, pad.material.chain()
+                pads[name] = (f[..., None, :, :] - state.pads[name]) / times[:, None, None]
+        for name, body in self.bodies.items():
+            load = torch.cat((effort[name][..., 0, :], effort[f"{name}_spin"][..., 0, :]), -1)
+            velocity[name] = load / torch.stack(body.masses)  # (17), (18)
+        stretch = {name: interface.out[..., 2] for name, interface in graph.interfaces.items()}
+        return self.pack(State(pads, stretch, state.velocity, rates, velocity))
+
+    @property
+    def junctions(self) -> dict[str, Junction]:
+        """The graph's 1-junctions: the nodes of every pad, the ground, every body and its spin."""
+        out = {}
+        for name, pad in self.pads.items():
+            element = f"I: [I_{name}]" if pad.inertial else "R: tau K"
+            out[f"pad_{name}"] = Junction(pad.nodes, 2, element, f"1: nodes of pad {name}")
+        out[GROUND] = Junction(1, 2, "Sf: 0", "1: ground")
+        for name, body in self.bodies.items():
+            free = [body.freedom[axis] for axis in COORDINATES]
+            source = {"driven": "Sf: drive", "fixed": "Sf: 0"}
+            flow = f"I: m_{self.symbols[name]}" if "free" in free[:2] else source[free[0]]
+            spin = f"I: I_{self.symbols[name]}" if free[2] == "free" else source[free[2]] + " "
+            out[name] = Junction(1, 2, flow, f"1: {name}")
+            out[f"{name}_spin"] = Junction(1, 1, spin, f"1: {name} spin")
+        return out
+
+    def evaluate(self, t: Tensor | float, state: State, signals: Tensor | None = None) -> Evaluation:
+        """The multibond graph at time t [s] and one state: every port with its transformer and effort, world axes."""
+        like = next(iter(state.pose.values()))
+        signals = self.follow(torch.as_tensor(t, dtype=torch.float64).expand(like.shape[:-1])) if signals is None else signals
+        flows = {GROUND: torch.zeros_like(like)[..., None, :2]}
+        for name in self.bodies:
+            flows[name] = state.velocity[name][..., None, :2]
+            flows[f"{name}_spin"] = state.velocity[name][..., None, 2:]
+        ports, interfaces = {}, {}
+        for name, pad in self.pads.items():
+            own = [key for key, contact in self.contacts.items() if contact.pad == name]
+            r_B, v_B = self.base_motion(name, state)
+            u, angle = self.displacement(name, state), r_B[..., 2, None]
+            moment_arm = turned(pad.positions + u, angle)
+            base_rate = v_B[..., None, :2] + v_B[..., None, 2:] * cross(moment_arm)
+            if pad.inertial:
+                flows[f"pad_{name}"] = turned(state.rates[name], angle)
+                u_dot = turned(flows[f"pad_{name}"] - base_rate, -angle)
+            else:
+                u_dot = solve_rates(self, name, own, state, u)
+                flows[f"pad_{name}"] = base_rate + turned(u_dot, angle)
+            for key in own:
+                interfaces[key] = self._interface(key, state, u, u_dot, flows)
+                element = (f"C: K_n,{key}", f"R: R_n,{key}", f"C: K_t,{key}", f"R: R_t,{key}", f"R: slip_{key}")
+                ports[f"contact_{key}"] = Port(interfaces[key].transformer, interfaces[key].out[..., 3:5], element)
+            ports[f"pad_{name}"] = self._pad_port(name, own, ports, u, u_dot, moment_arm, angle)
+        return Evaluation(ports | self._sources(state, signals), flows, interfaces)
+
+    def _interface(
+        self, key: str, state: State, u: Tensor, u_dot: Tensor, flows: Mapping[str, Tensor]
+    ) -> Interface:
+        contact = self.contacts[key]
+        pad, body = self.pads[contact.pad], self.bodies[contact.body]
+        assert body.shape is not None
+        r_B, _ = self.base_motion(contact.pad, state)
+        x = point_inputs(self, key, state, pad.spread @ u, pad.spread @ u_dot)
+        d, angle = x[..., 3:5], r_B[..., 2, None]
+        local = moving_frame(body.shape, d, x[..., 5])
+        n, moment_arm = turned(local.n, angle), turned(d, angle)
+        R = torch.stack((n, cross(n)), -2)  # world -> (normal, tangential), the rows of [iR0]
+        arm = torch.einsum("...ij,...j->...i", R, cross(moment_arm))[..., None]
+        transformer = Transformer(
+            {contact.body: Block(R), f"{contact.body}_spin": Block(arm), f"pad_{contact.pad}": Block(-R, pad.spread)}
+        )
+        frame = Frame(moment_arm, n, cross(n), local.g)
+        return Interface(frame, interface_law(contact.law, body.shape, x), transformer, transformer.flow(flows))
+
+    def _pad_port(
+        self, name: str, own: list[str], ports: Mapping[str, Port], u: Tensor, u_dot: Tensor, moment_arm: Tensor, angle: Tensor
+    ) -> Port:
+        """The pad's viscoelastic field on its strain rate: node velocities less those of what it is bonded to (Fig. 7)."""
+        pad, key = self.pads[name], f"pad_{name}"
+        eye = torch.eye(2, dtype=u.dtype).expand(*angle.shape, 2, 2)
+        Q_T = torch.stack((turned(eye[..., 0], -angle), turned(eye[..., 1], -angle)), -1)
+        blocks = {key: Block(Q_T)}
+        if pad.base is None:
+            blocks[GROUND] = Block(-Q_T)
+        else:
+            blocks[pad.base] = Block(-Q_T)
+            blocks[f"{pad.base}_spin"] = Block(-turned(cross(moment_arm), -angle)[..., None])  # (35)
+        if pad.inertial:
+            effort = pad.elastic_force(u + pad.material.chain()[1] * u_dot)
+        else:  # no I field: the field's effort is whatever the contacts leave at the junction
+            contacts = net_efforts({k: ports[f"contact_{k}"] for k in own}, self.junctions)
+            effort = turned(contacts[key], -angle) if own else torch.zeros_like(u)
+        return Port(Transformer(blocks), effort, (f"C: [K_{name}]^-1", f"R: [R_{name}]"))
+
+    def _sources(self, state: State, signals: Tensor) -> dict[str, Port]:
+        """Weights and actuators."""
+        out = {}
+        for name, body in self.bodies.items():
+            if body.weighted and body.freedom["y"] == "free":
+                force = -(body.mass * self.gravity).expand(signals.shape[:-2])
+                down = Transformer({name: Block(torch.eye(2, dtype=torch.float64)[None, 1:])})
+                out[f"weight_{name}"] = Port(down, force[..., None, None], (f"Se: m_{self.symbols[name]} g",), True)
+        for name, actuator in self.actuators.items():
+            body, _, axis = actuator.pushes.partition(".")
+            measured, _, _ = actuator.measures.partition(".")
+            force = self.actuator_effort(name, state, signals)
+            spin = axis == "theta"
+            row = torch.ones(1, 1, 1, dtype=torch.float64) if spin else identity(2, force)[:, COORDINATES.index(axis), None]
+            out[f"control_{name}"] = Port(
+                Transformer({f"{body}_spin" if spin else body: Block(row)}), force[..., None, None], actuator.elements, True,
+                senses=(measured,) if measured != body else (),
+            )  # fmt: skip
+        return out
+
+    def actuator_effort(self, name: str, state: State, signals: Tensor) -> Tensor:
+        """Effort (...) [N or N.m] of an actuator on the coordinate that it pushes."""
+        actuator = self.actuators[name]
+        body, _, axis = actuator.measures.partition(".")
+        i, setpoint = COORDINATES.index(axis), signals[..., self.signals.index(actuator.setpoint), :]
+        feed = torch.zeros_like(setpoint[..., 0])
+        if actuator.feed_forward is not None:
+            feed = signals[..., self.signals.index(actuator.feed_forward), 0]
+        measured = state.pose[body][..., i], state.velocity[body][..., i]
+        return actuator(torch.stack((setpoint[..., 0], setpoint[..., 1], feed, *measured), -1))

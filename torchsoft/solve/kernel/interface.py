@@ -1,0 +1,283 @@
+"""The interface between one pad and the bodies it touches: kinematics, the law at its points, and one block of equations.
+
+Everything is written in the frame of the pad's base. With u' the nodal rates, F the nodal forces, P the pad's mobility at this
+stage and f = law(u', V) at the touching points, spread over the nodes by N,
+
+    u' = free + P F,   F = N^T f,   f = f0 + H_u du' + H_V dV,
+
+eliminating f leaves A F = b + Hc dV with A = 1 - N^T H_u N P, and the bodies' equations get Rf F + Rv dV + r. Newton's
+iteration, the tangent and, transposed, the adjoint solve this one block.
+
+Derivatives of a point by (u (2), body (3), base (3)): S by positions, H = T + a h S by rates of the stage, T by velocities; G is
+what a force does to (body, base), L the derivative of that by positions at the same force.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from torchsoft.codegen.invoke import call_linearise, call_value
+from torchsoft.solve.kernel import compiled
+from torchsoft.solve.kernel.arrays import Array
+from torchsoft.solve.kernel.inertia import couple_base, couple_point, free_rates
+
+NEGLIGIBLE = 1e-14
+"""Nodal force that has set in [N] below which a node counts as never loaded: its displacements are below rounding."""
+
+
+@compiled
+def frames(contacts: Any, bases: Any, q: Array, V: Array, frame: Array) -> None:
+    """Per contact, in the base's frame: cos and sin of its angle, the body's centre, its velocity less the base's, the spin."""
+    for c in range(contacts.pad.size):
+        B, C = bases[contacts.pad[c]], contacts.body[c]
+        cos, sin = np.cos(q[B + 2]), np.sin(q[B + 2])
+        rx, ry, vx, vy = q[C] - q[B], q[C + 1] - q[B + 1], V[C] - V[B], V[C + 1] - V[B + 1]
+        frame[c, 0], frame[c, 1] = cos, sin
+        frame[c, 2], frame[c, 3] = cos * rx + sin * ry, cos * ry - sin * rx
+        frame[c, 4], frame[c, 5] = cos * vx + sin * vy, cos * vy - sin * vx
+        frame[c, 6] = V[B + 2]
+
+
+@compiled
+def kinematics(frame: Array, X: Array, ux: float, uy: float, vx: float, vy: float, spin: float, angle: float, x: Array) -> None:
+    """w, omega, d and theta of one point (Eq. 4-7) into x: the body's velocity less the point's, its spin, the moment arm from
+    its centre, its angle; (ux, uy) is the displacement and (vx, vy) its rate."""
+    px, py = X[0] + ux, X[1] + uy
+    x[0], x[1], x[2] = frame[4] + frame[6] * py - vx, frame[5] - frame[6] * px - vy, spin
+    x[3], x[4], x[5] = px - frame[2], py - frame[3], angle
+
+
+@compiled
+def mobility_scale(pads: Any, p: Array, pad: int, a: float) -> float:
+    """What the stored mobility is multiplied with: sum of J / (tau + a h) over the chain; 1 for inertial pads."""
+    if pads.v_start[pad] >= 0:
+        return 1.0
+    at, n, total = pads.chain_at[pad], pads.branches[pad], 0.0
+    for b in range(n):
+        total += p[at + b] / (p[at + n + b] + a)
+    return total
+
+
+@compiled
+def set_in(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
+    """What a stage starts from: zeta = sum of J z and sum of J z / (tau + a h) over a massless pad's chain and its support
+    (`w.low`, `w.high` come later); an inertial pad's u' without contact and motion of its base."""
+    pads, p = s.pads, s.p
+    first, last, start = pads.node_start[pad], pads.node_start[pad + 1], pads.y_start[pad]
+    if pads.v_start[pad] >= 0:
+        free_rates(s.inertia, p, pad, y, start, pads.v_start[pad], a, w.full)
+        return
+    at, n = pads.chain_at[pad], pads.branches[pad]
+    zeta, rate = w.zeta[first:last].reshape(-1), w.zeta_rate[first:last].reshape(-1)
+    for i in range(zeta.size):
+        zeta[i], rate[i] = 0.0, 0.0
+    for b in range(n):
+        J, rest = p[at + b], p[at + b] / (p[at + n + b] + a)
+        z = y[start + b * zeta.size : start + (b + 1) * zeta.size]
+        for i in range(zeta.size):
+            zeta[i] += J * z[i]
+            rate[i] += rest * z[i]
+
+
+@compiled
+def displacements(s: Any, w: Any, pad: int, y: Array, low: int, high: int) -> None:
+    """u* and the rates without contact of the surface nodes from `low` to `high`, from what `set_in` left."""
+    pads = s.pads
+    first, last, start = pads.node_start[pad], pads.node_start[pad + 1], pads.y_start[pad]
+    if pads.v_start[pad] >= 0:
+        i0 = s.inertia.dof_start[pad]
+        for i in range(2 * low, 2 * high):
+            dof = s.inertia.surface[i]
+            w.u[i // 2, i % 2], w.free[i // 2, i % 2] = y[start + dof], w.full[i0 + dof]
+        return
+    zeta, rate, size = w.zeta[first:last].reshape(-1), w.zeta_rate[first:last].reshape(-1), 2 * (last - first)
+    left, right = 0, size
+    while left < right and abs(zeta[left]) < NEGLIGIBLE:
+        left += 1
+    while right > left and abs(zeta[right - 1]) < NEGLIGIBLE:
+        right -= 1
+    C = pads.C[pads.C_start[pad] : pads.C_start[pad] + size * size].reshape(size, size)
+    for i in range(2 * low, 2 * high):
+        row, u, free = C[i - 2 * first], 0.0, 0.0
+        for j in range(left, right):
+            u += row[j] * zeta[j]
+            free -= row[j] * rate[j]
+        w.u[i // 2, i % 2], w.free[i // 2, i % 2] = u, free
+
+
+@compiled
+def scan(s: Any, w: Any, y: Array, margin: float) -> None:
+    """List the points within `margin` [m] of touching at the stage's start, w.q, in `w.window`; needs `set_in`."""
+    pads, contacts, points = s.pads, s.contacts, s.points
+    frames(contacts, pads.base, w.q, w.V, w.frame)
+    x, phi = np.zeros(9), np.zeros(1)
+    for pad in range(pads.base.size):
+        first, last = pads.node_start[pad], pads.node_start[pad + 1]
+        displacements(s, w, pad, y, first, last)
+        at = contacts.point_start[pads.contact_start[pad]]
+        count, low, high = 0, last, first
+        for c in range(pads.contact_start[pad], pads.contact_start[pad + 1]):
+            body, p = contacts.body[c], s.p[contacts.p_start[c] : contacts.p_start[c + 1]]
+            for k in range(contacts.point_start[c], contacts.point_start[c + 1]):
+                n0, n1, N0, N1 = points.node[k, 0], points.node[k, 1], points.N[k, 0], points.N[k, 1]
+                ux, uy = N0 * w.u[n0, 0] + N1 * w.u[n1, 0], N0 * w.u[n0, 1] + N1 * w.u[n1, 1]
+                kinematics(w.frame[c], points.X[k], ux, uy, 0.0, 0.0, 0.0, w.q[body + 2] - w.q[pads.base[pad] + 2], x)
+                call_value(contacts.distance[c], x, p, phi)
+                if not phi[0] > margin:
+                    w.window[at + count] = k
+                    count += 1
+                    low, high = min(low, min(n0, n1)), max(high, max(n0, n1) + 1)
+        for node in range(first, last):
+            if node < w.low[pad] or node >= w.high[pad]:
+                w.u_dot[node, 0], w.u_dot[node, 1] = w.free[node, 0], w.free[node, 1]
+        w.windows[pad], w.low[pad], w.high[pad] = count, low, max(low, high)
+    w.travelled[0], w.travelled[1] = 0.0, margin
+
+
+@compiled
+def evaluate(s: Any, w: Any, pad: int, y: Array, a: float) -> tuple[float, float]:
+    """The law at the window's points with the trial rates in `w`, its forces at the nodes, and the touching points.
+
+    Returns how far these forces are from the ones that the linear relations were solved with: the largest difference [N], and
+    the sum of squares [N2].
+    """
+    pads, contacts, points = s.pads, s.contacts, s.points
+    at, count, actives, c = contacts.point_start[pads.contact_start[pad]], w.windows[pad], 0, pads.contact_start[pad]
+    for node in range(w.low[pad], w.high[pad]):
+        w.F[node, 0], w.F[node, 1] = 0.0, 0.0
+    phi = np.empty(1)
+    for i in range(count):
+        k = w.window[at + i]
+        while k >= contacts.point_start[c + 1]:
+            c += 1
+        body = contacts.body[c]
+        n0, n1, N0, N1 = points.node[k, 0], points.node[k, 1], points.N[k, 0], points.N[k, 1]
+        vx, vy = N0 * w.u_dot[n0, 0] + N1 * w.u_dot[n1, 0], N0 * w.u_dot[n0, 1] + N1 * w.u_dot[n1, 1]
+        ux = N0 * w.u[n0, 0] + N1 * w.u[n1, 0] + a * vx
+        uy = N0 * w.u[n0, 1] + N1 * w.u[n1, 1] + a * vy
+        x, p = w.x[k], s.p[contacts.p_start[c] : contacts.p_start[c + 1]]
+        kinematics(w.frame[c], points.X[k], ux, uy, vx, vy, w.V[body + 2], w.q[body + 2] - w.q[pads.base[pad] + 2], x)
+        call_value(contacts.distance[c], x, p, phi)
+        if phi[0] >= 0.0:
+            continue
+        x[6], x[7], x[8] = y[points.y_start + k], points.weight[k], a
+        call_linearise(contacts.linearise[c], x, p, w.out[k], w.J[k])
+        for r in range(2):
+            w.F[n0, r] += N0 * w.out[k, r]
+            w.F[n1, r] += N1 * w.out[k, r]
+        w.active[at + actives] = k
+        actives += 1
+    w.actives[pad] = actives
+    mismatch, squares = 0.0, 0.0
+    for node in range(w.low[pad], w.high[pad]):
+        for r in range(2):
+            off = abs(w.F[node, r] - w.F_linear[node, r])
+            if not off <= mismatch:  # a force that is not a number is the largest
+                mismatch = off
+            squares += off * off
+    return mismatch, squares
+
+
+@compiled
+def linearise(s: Any, w: Any, pad: int, a: float) -> None:
+    """H, S, G and L of the touching points of a pad, from the law's Jacobians in `w.J`."""
+    pads, contacts = s.pads, s.contacts
+    at, c = contacts.point_start[pads.contact_start[pad]], pads.contact_start[pad]
+    for i in range(w.actives[pad]):
+        k = w.active[at + i]
+        while k >= contacts.point_start[c + 1]:
+            c += 1
+        cos, sin, rx, ry, vx, vy, spin = w.frame[c]
+        dx, dy, fx, fy = w.x[k, 3], w.x[k, 4], w.out[k, 0], w.out[k, 1]
+        px, py = dx + rx, dy + ry
+        H, S, G, L = w.H[at + i], w.S[at + i], w.G[at + i], w.L[at + i]
+        for r in range(3):
+            J = w.J[k, r]
+            S[r, 0], S[r, 1] = J[3] - spin * J[1], J[4] + spin * J[0]
+            S[r, 2], S[r, 3], S[r, 4] = J[4] * sin - J[3] * cos, -J[3] * sin - J[4] * cos, J[5]
+            S[r, 5], S[r, 6] = -S[r, 2], -S[r, 3]
+            S[r, 7] = J[4] * rx - J[3] * ry + J[0] * vy - J[1] * vx - J[5]
+            H[r, 0], H[r, 1] = a * S[r, 0] - J[0], a * S[r, 1] - J[1]
+            tx, ty = J[0] * cos - J[1] * sin, J[0] * sin + J[1] * cos
+            H[r, 2], H[r, 3], H[r, 4] = a * S[r, 2] + tx, a * S[r, 3] + ty, a * S[r, 4] + J[2]
+            H[r, 5], H[r, 6], H[r, 7] = -H[r, 2], -H[r, 3], a * S[r, 7] + J[0] * py - J[1] * px
+        G[0, 0], G[0, 1], G[1, 0], G[1, 1], G[2, 0], G[2, 1] = -cos, sin, -sin, -cos, dy, -dx  # (16), (18), (19)
+        G[3, 0], G[3, 1], G[4, 0], G[4, 1], G[5, 0], G[5, 1] = cos, -sin, sin, cos, -py, px
+        X, Y = cos * fx - sin * fy, sin * fx + cos * fy
+        L[:] = 0.0
+        L[0, 7], L[1, 7], L[3, 7], L[4, 7] = Y, -X, -Y, X
+        L[2, 0], L[2, 1], L[5, 0], L[5, 1] = -fy, fx, fy, -fx
+        L[2, 2], L[2, 3], L[2, 5], L[2, 6], L[2, 7] = Y, -X, -Y, X, fy * ry + fx * rx
+
+
+@compiled
+def assemble(s: Any, w: Any, pad: int, a: float, Rv: Array) -> int:
+    """The block of one pad: w.touched, w.slot, w.P, w.A, w.Hc, w.Rf, and its part in Rv (free, free). Returns how many nodes."""
+    pads, contacts, points, free = s.pads, s.contacts, s.points, s.bodies.free
+    at, c, first = contacts.point_start[pads.contact_start[pad]], pads.contact_start[pad], pads.node_start[pad]
+    size, column = 2 * (pads.node_start[pad + 1] - first), pads.column[pad]
+    C = pads.C[pads.C_start[pad] : pads.C_start[pad] + size * size].reshape(size, size)
+    n = 0
+    for node in range(w.low[pad], w.high[pad]):
+        w.slot[node] = -1
+    for i in range(w.actives[pad]):
+        for j in range(2):
+            node = points.node[w.active[at + i], j]
+            if points.N[w.active[at + i], j] != 0.0 and w.slot[node] < 0:
+                w.slot[node], w.touched[first + n] = n, node
+                n += 1
+    A, P, Hc, Rf, scale = w.A, w.P, w.Hc, w.Rf, mobility_scale(pads, s.p, pad, a)
+    Hc[: 2 * n, : pads.columns[pad]] = 0.0
+    Rf[: pads.columns[pad], : 2 * n] = 0.0
+    for i in range(n):
+        row = 2 * (w.touched[first + i] - first)
+        for j in range(n):
+            col = 2 * (w.touched[first + j] - first)
+            for r in range(2):
+                P[2 * i + r, 2 * j], P[2 * i + r, 2 * j + 1] = scale * C[row + r, col], scale * C[row + r, col + 1]
+    for i in range(2 * n):
+        A[i, : 2 * n] = 0.0
+        A[i, i] = 1.0
+    K, PB, number = np.empty((6, 8)), np.empty((2, 2 * n)), np.empty(6, np.int64)
+    for i in range(w.actives[pad]):
+        k = w.active[at + i]
+        while k >= contacts.point_start[c + 1]:
+            c += 1
+        H, G, L = w.H[at + i], w.G[at + i], w.L[at + i]
+        for m in range(3):
+            number[m], number[3 + m] = free[contacts.body[c] + m], free[pads.base[pad] + m]
+        PB[:] = 0.0
+        for j in range(2):
+            N = points.N[k, j]
+            if N != 0.0:
+                row = 2 * w.slot[points.node[k, j]]
+                for r in range(2):
+                    for m in range(2 * n):
+                        PB[r, m] += N * P[row + r, m]
+        for row in range(6):
+            if number[row] < 0:
+                continue
+            for m in range(8):
+                K[row, m] = G[row, 0] * H[0, m] + G[row, 1] * H[1, m] + a * L[row, m]
+            line = Rf[column[number[row]]]
+            for m in range(2 * n):
+                line[m] += K[row, 0] * PB[0, m] + K[row, 1] * PB[1, m]
+            for other in range(6):
+                if number[other] >= 0:
+                    Rv[number[row], number[other]] += K[row, 2 + other]
+        for j in range(2):
+            N = points.N[k, j]
+            if N == 0.0:
+                continue
+            row = 2 * w.slot[points.node[k, j]]
+            for r in range(2):
+                for m in range(2 * n):
+                    A[row + r, m] -= N * (H[r, 0] * PB[0, m] + H[r, 1] * PB[1, m])
+                for other in range(6):
+                    if number[other] >= 0:
+                        Hc[row + r, column[number[other]]] += N * H[r, 2 + other]
+        if pads.v_start[pad] >= 0:
+            couple_point(s, w, pad, k, c, K, H, Rv)
+    if pads.v_start[pad] >= 0:
+        couple_base(s, w, pad, n, Rv)
+    return n

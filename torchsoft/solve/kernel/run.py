@@ -1,0 +1,163 @@
+"""Many implicit steps in one compiled call: SDIRK2, its running energy integrals, and what ends a run early.
+
+SDIRK2 is Alexander's two-stage method (SIAM J. Numer. Anal. 14, 1977): L-stable, stiffly accurate, of second order,
+both stages with the same a = 1 - 1/sqrt(2), so that one mobility serves both. The second stage starts from
+y* = (1 - MIX) y + MIX Y_1 and its end is the step's.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from torchsoft.solve.kernel import compiled
+from torchsoft.solve.kernel.arrays import Array
+from torchsoft.solve.kernel.stage import actuate, finish, solve_stage
+
+GAMMA = 1.0 - 1.0 / np.sqrt(2.0)
+MIX = (1.0 - GAMMA) / GAMMA
+
+CONVERGED, NEWTON_FAILED, OFF_THE_PAD, LOST, TAPE_FULL, NOT_FINITE = range(6)
+
+TINY = 1e-60
+"""Components of the state below this are set to zero, so that what decays does not end in denormal numbers."""
+
+
+@compiled
+def write_tape(s: Any, w: Any, tape: Any, row: int, y: Array) -> bool:
+    """Put one solved stage on the tape; False if more points touch than it has room for."""
+    tape.y[row], tape.q[row], tape.V[row], tape.rate[row] = y, w.q, w.V, w.full
+    slot = 0
+    for pad in range(s.pads.base.size):
+        at = s.contacts.point_start[s.pads.contact_start[pad]]
+        tape.count[row, pad] = w.actives[pad]
+        if slot + w.actives[pad] > tape.point.shape[1]:
+            return False
+        for i in range(w.actives[pad]):
+            k = w.active[at + i]
+            tape.point[row, slot] = k
+            for r in range(2):
+                u = v = 0.0
+                for j in range(2):
+                    node, N = s.points.node[k, j], s.points.N[k, j]
+                    u += N * w.u[node, r]
+                    v += N * w.u_dot[node, r]
+                tape.state[row, slot, r], tape.state[row, slot, 2 + r], tape.state[row, slot, 4 + r] = u, v, w.out[k, r]
+            slot += 1
+    return True
+
+
+@compiled
+def gone(s: Any, w: Any) -> int:
+    """Whether a contact has reached the end of a pad, or a body has left the space over one."""
+    contacts = s.contacts
+    for c in range(contacts.pad.size):
+        at = contacts.point_start[s.pads.contact_start[contacts.pad[c]]]
+        for i in range(w.actives[contacts.pad[c]]):
+            if w.active[at + i] == contacts.point_start[c] or w.active[at + i] == contacts.point_start[c + 1] - 1:
+                return OFF_THE_PAD
+        x, y, limit = w.frame[c, 2], w.frame[c, 3], contacts.limits[c]
+        if not (limit[0] <= x <= limit[1] and limit[2] <= y <= limit[3]):
+            return LOST
+    return CONVERGED
+
+
+@compiled
+def supply(s: Any, w: Any, signals: Array, powers: Array) -> None:
+    """Powers [W] of the actuators, of gravity, of what drives the bodies, and the sum of the positive ones."""
+    bodies, act, at = s.bodies, s.actuators, s.pads.base.size + 2
+    x, out, J = np.empty(5), np.empty(1), np.empty((1, 5))
+    for i in range(act.measured.size):
+        powers[at + i] = actuate(s, i, w.q, w.V, signals, x, out, J) * w.V[act.pushed[i]]
+    at += act.measured.size
+    gravity = 0.0
+    for i in range(bodies.coordinate.size):
+        gravity -= bodies.weight[i] * s.p[bodies.mass_at[i]] * s.p[bodies.gravity_at] * w.V[bodies.coordinate[i]]
+    powers[at] = gravity
+    for b in range(bodies.free.size // 3 - 1):
+        drive = 0.0
+        for c in range(3 * b, 3 * b + 3):
+            if bodies.free[c] < 0:
+                drive -= w.load[c] * w.V[c]
+        for i in range(act.measured.size):  # what pushes a driven coordinate is held by what drives it
+            if act.pushed[i] // 3 == b and bodies.free[act.pushed[i]] < 0:
+                drive -= powers[s.pads.base.size + 2 + i]
+        powers[at + 1 + b] = drive
+    total = 0.0
+    for i in range(s.pads.base.size + 2, powers.size - 1):
+        total += max(powers[i], 0.0)
+    powers[-1] = total
+
+
+@compiled
+def run(
+    s: Any, w: Any, y: Array, signals: Array, h: float, tolerance: float, max_iterations: int, margin: float, keep: Any,
+    integrals: Array, ys: Array, forces: Array, extras: Array, tape: Any,
+) -> tuple[int, int, int]:  # fmt: skip
+    """Take len(signals) steps of h [s]; signals (steps, 2, signals, 2) hold value and rate at the stages; `tape` has two rows a
+    step, or none.
+
+    After the steps marked in `keep`, the state goes to `ys`, (F_N, F_T) of every point to `forces`, and integrals, the pads'
+    moments and the generalised contact forces to `extras`, one row each. y, `integrals` and the guesses in w are advanced in
+    place; after a failure they hold the last good step. Returns steps taken, status, and linear solves.
+    """
+    a, pads, row, solves = GAMMA * h, s.pads.base.size, 0, 0
+    powers, moments = np.empty(integrals.size), np.zeros(pads)
+    before, integrals_before, V_before = np.empty(y.size), np.empty(integrals.size), np.empty(w.V.size)
+    for step in range(len(signals)):
+        before[:], integrals_before[:], V_before[:] = y, integrals, w.V
+        status = CONVERGED
+        for stage in range(2):
+            while True:
+                converged, count = solve_stage(s, w, y, signals[step, stage], a, tolerance, max_iterations, margin)
+                solves += count
+                if not converged:
+                    break
+                speed = finish(s, w, y, a, powers, moments)
+                if w.travelled[0] + a * speed <= w.travelled[1]:
+                    break
+                if w.travelled[0] == 0.0:  # points further away may have come near within this one stage
+                    margin_now = margin + 1.5 * a * speed
+                    w.travelled[0] = np.inf
+                    converged, count = solve_stage(s, w, y, signals[step, stage], a, tolerance, max_iterations, margin_now)
+                    solves += count
+                    if not converged:
+                        break
+                    speed = finish(s, w, y, a, powers, moments)
+                    if not w.travelled[0] + a * speed <= w.travelled[1]:
+                        converged = False
+                    break
+                w.travelled[0] = np.inf
+            if not converged:
+                status = NEWTON_FAILED
+                break
+            if tape.y.shape[0] > 0 and not write_tape(s, w, tape, 2 * step + stage, y):
+                y[:], integrals[:], w.V[:], w.travelled[0] = before, integrals_before, V_before, np.inf
+                return step, TAPE_FULL, solves
+            supply(s, w, signals[step, stage], powers)
+            dt = a if stage == 1 else h - a
+            for i in range(integrals.size):
+                integrals[i] += dt * powers[i]
+            for i in range(y.size):
+                value = y[i] + dt * w.k[i]
+                y[i] = value if abs(value) > TINY else 0.0
+            w.travelled[0] += dt * speed
+        if status == CONVERGED:
+            status = gone(s, w)
+            if status == CONVERGED and not np.isfinite(y.sum()):
+                status = NOT_FINITE
+        if status != CONVERGED:
+            y[:], integrals[:], w.V[:], w.travelled[0] = before, integrals_before, V_before, np.inf
+            return step, status, solves
+        if keep[step]:
+            ys[row] = y
+            for k in range(len(forces[row])):
+                forces[row, k, 0], forces[row, k, 1] = 0.0, 0.0
+            for pad in range(pads):
+                at = s.contacts.point_start[s.pads.contact_start[pad]]
+                for i in range(w.actives[pad]):
+                    k = w.active[at + i]
+                    forces[row, k, 0], forces[row, k, 1] = w.out[k, 3], w.out[k, 4]
+            n = integrals.size
+            extras[row, :n], extras[row, n : n + pads], extras[row, n + pads :] = integrals, moments, w.load
+            row += 1
+    return len(signals), CONVERGED, solves

@@ -1,0 +1,334 @@
+"""A rig as the kernels take it: its laws compiled, its parameters as one vector, its lists as plain arrays.
+
+Everything is read from the modules when a run begins, so that what ran is what the modules were then, whatever becomes of them;
+the vector of parameters keeps its graph, and so gradients reach whatever the values were made of.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from scipy import linalg
+from torch import Tensor, nn
+
+from torchsoft.codegen import Law, compile_law
+from torchsoft.physics.contact import distance_law, free_law, interface_law
+from torchsoft.physics.mesh import banded
+from torchsoft.physics.motion import Reference
+from torchsoft.physics.parts import COORDINATES
+from torchsoft.physics.rig import Rig
+from torchsoft.solve.kernel.arrays import INPUTS, Actuators, Bodies, Contacts, Index, Inertia, Pads, Points, System
+from torchsoft.solve.kernel.run import GAMMA
+
+WIDEST_ROW = 18
+"""Entries of a stiffness row: nine nodes around one, two components each."""
+
+
+class LawSet(NamedTuple):
+    """The compiled laws of one contact, and its parameters' names and tensors in their order."""
+
+    distance: Law
+    interface: Law
+    free: Law
+    parameters: dict[str, Tensor]
+
+
+class _Called(nn.Module):
+    """Some modules, and a function of them and of x: what a compiled law is traced from."""
+
+    def __init__(self, function: Callable[..., Tensor], **modules: Any) -> None:
+        super().__init__()
+        self.function, self.names = function, tuple(modules)
+        for name, module in modules.items():
+            setattr(self, name, module)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.function(*(getattr(self, name) for name in self.names), x)
+
+
+def compiled_law(
+    parameters: Mapping[str, Tensor], function: Callable[..., Tensor], size: int, linear: int, differentiated: int, **modules: Any
+) -> Law:
+    """The law of a function of modules and x (size,), differentiable in the first inputs and in all `parameters`."""
+    called = _Called(function, **modules)
+
+    def law(x: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+        return torch.func.functional_call(called, dict(values), (x,))
+
+    own = {name: value for name, value in parameters.items() if name.split(".")[0] in modules}
+    others = [name for name in parameters if name not in own]
+    example = torch.linspace(0.01, 0.02, size, dtype=torch.float64)
+    if others:
+        return compile_law(
+            lambda x, values: law(x, {k: v for k, v in values.items() if k not in others}), example, parameters,
+            linear=linear, differentiated=differentiated,
+        )  # fmt: skip
+    return compile_law(law, example, parameters, linear=linear, differentiated=differentiated)
+
+
+def contact_laws(law: Any, shape: Any) -> LawSet:
+    """The laws of a contact of `law` on a body of `shape`."""
+    parameters = dict(_Called(interface_law, law=law, shape=shape).named_parameters())
+    return LawSet(
+        compiled_law(parameters, distance_law, INPUTS, 0, 0, shape=shape),
+        compiled_law(parameters, interface_law, INPUTS, 3, 7, law=law, shape=shape),
+        compiled_law(parameters, free_law, 3, 1, 1, law=law),
+        parameters,
+    )
+
+
+class Compiled:
+    """A rig at one moment: `p` (parameters,) with its graph, `names` of its entries, and `system(h)` for a step h [s]."""
+
+    def __init__(self, rig: Rig) -> None:
+        check_values(rig)
+        self.rig, self.size = rig, rig.layout.size
+        self._entries: list[Tensor] = []
+        self._known: dict[tuple[int, int], LawSet] = {}
+        self._count = 0
+        self._systems: dict[float, System] = {}
+        gravity_at = self._add(rig.gravity)
+        mass_at = [[self._add(mass) for mass in body.masses] for body in rig.bodies.values()]
+        self._bodies = self._make_bodies(gravity_at, mass_at)
+        self._pads, self._inertia = self._make_pads()
+        self._actuators = self._make_actuators()
+        self._contacts, self._points = self._make_contacts()
+        self.p = torch.cat([x.reshape(-1) for x in self._entries])
+        if not bool(torch.isfinite(self.p).all()):
+            raise ValueError("a parameter of the rig is not a finite number")
+
+    def _add(self, value: Tensor) -> int:
+        """Append a tensor to the vector of parameters; where it begins."""
+        at = self._count
+        self._entries.append(value.double())
+        self._count += value.numel()
+        return at
+
+    def _coordinate(self, name: str) -> int:
+        return self.rig.coordinate(name)
+
+    def _make_bodies(self, gravity_at: int, mass_at: list[list[int]]) -> Bodies:
+        rig, free, signal, coordinate, masses, weight = self.rig, [], [], [], [], []
+        fixed = len(rig.signals)
+        for b, (name, body) in enumerate(rig.bodies.items()):
+            for i, axis in enumerate(COORDINATES):
+                kind = body.freedom[axis]
+                free.append(len(coordinate) if kind == "free" else -1)
+                signal.append(rig.signals.index(f"{name}.{axis}") if kind == "driven" else fixed if kind == "fixed" else -1)
+                fixed += kind == "fixed"
+                if kind == "free":
+                    coordinate.append(3 * b + i)
+                    masses.append(mass_at[b][i])
+                    weight.append(float(axis == "y" and body.weighted))
+        slices = self.rig.layout.slices
+        starts = [min((s.start for (part, _), s in slices.items() if part == kind), default=0) for kind in ("pose", "velocity")]
+        return Bodies(
+            _ints([*free, -1, -1, -1]), _ints([*signal, -1, -1, -1]), _ints(coordinate), _ints(masses), np.array(weight),
+            gravity_at, *starts,
+        )  # fmt: skip
+
+    def signals(self, t: Tensor, reference: Reference | None = None) -> Tensor:
+        """The signals that the kernels follow, fixed coordinates last: values and rates (..., signals, 2)."""
+        fixed = [value for body in self.rig.bodies.values() for value in body.fixed.values()]
+        followed = self.rig.follow(t, reference)
+        if not bool(torch.isfinite(followed).all()):
+            bad = torch.nonzero(~torch.isfinite(followed))[0].tolist()
+            raise ValueError(f"the signal `{self.rig.signals[bad[-2]]}` of the reference is not finite at t = {float(t[tuple(bad[:-2])]):g} s")
+        if not fixed:
+            return followed
+        held = torch.stack([torch.stack(fixed), torch.zeros(len(fixed), dtype=torch.float64)], -1)
+        return torch.cat((followed, held.expand(*t.shape, -1, -1)), -2)
+
+    def _make_pads(self) -> tuple[Pads, Inertia]:
+        rig, slices = self.rig, self.rig.layout.slices
+        rows: dict[str, list[Any]] = {name: [] for name in Pads._fields}
+        node_start, C_start, dofs, material_at = [0], [0], [0], []
+        contact_pads = [list(rig.pads).index(contact.pad) for contact in rig.contacts.values()]
+        columns = np.full((len(rig.pads), len(self._bodies.coordinate)), -1, np.int64)
+        for number, (name, pad) in enumerate(rig.pads.items()):
+            material, n = pad.material, len(pad.mesh.surface)
+            fractions, times = material.chain()
+            rows["base"].append(3 * (len(rig.bodies) if pad.base is None else list(rig.bodies).index(pad.base)))
+            rows["branches"].append(len(fractions))
+            rows["chain_at"].append(self._add(fractions))
+            self._add(times)
+            if pad.inertial:
+                if len(fractions) != 1:
+                    raise NotImplementedError(f"the inertial pad `{name}` needs a Kelvin-Voigt material (one retardation time)")
+                lame_lambda, lame_mu = material.lame()
+                density = material.rho * material.depth
+                material_at.append(
+                    self._add(torch.stack((material.depth * lame_lambda, material.depth * lame_mu, times[0], density)))
+                )
+            else:
+                material_at.append(self._add(torch.stack((1 / (material.E * material.depth), material.nu))))
+            rows["y_start"].append(slices["pads", name].start)
+            rows["v_start"].append(slices["rates", name].start if pad.inertial else -1)
+            node_start.append(node_start[-1] + n)
+            C_start.append(C_start[-1] + 4 * n * n)
+            dofs.append(dofs[-1] + (2 * pad.nodes if pad.inertial else 0))
+            involved = {3 * list(rig.bodies).index(c.body) for c in rig.contacts.values() if c.pad == name} | {rows["base"][-1]}
+            mine = [i for i, c in enumerate(self._bodies.coordinate) if c // 3 * 3 in involved]
+            columns[number, mine] = np.arange(len(mine))
+        contact_start = np.searchsorted(contact_pads, np.arange(len(rig.pads) + 1))
+        C, dC, reach = np.zeros(C_start[-1]), np.zeros(C_start[-1]), []
+        for i, pad in enumerate(rig.pads.values()):
+            if pad.inertial:
+                reach.append(0.0)
+                continue
+            with torch.no_grad():
+                unit, by_nu = pad.unit_compliance()
+                scale = 1 / (pad.material.E * pad.material.depth)
+                C[C_start[i] : C_start[i + 1]] = (unit * scale).numpy().ravel()
+                dC[C_start[i] : C_start[i + 1]] = (by_nu * scale).numpy().ravel()
+            reach.append(1.5 * np.abs(C[C_start[i] : C_start[i + 1]]).max())
+        pads = Pads(
+            _ints(rows["base"]), _ints(node_start), _ints(contact_start), _ints(rows["y_start"]), _ints(rows["v_start"]),
+            _ints(rows["chain_at"]), _ints(rows["branches"]), _ints(C_start), C, dC, np.array(reach), columns,
+            (columns >= 0).sum(1),
+        )  # fmt: skip
+        return pads, self._make_inertia(dofs, node_start, material_at)
+
+    def _make_inertia(self, dofs: list[int], node_start: list[int], material_at: list[int]) -> Inertia:
+        total = dofs[-1]
+        X, area, D = np.zeros(total), np.zeros(total), np.zeros((total, 2))
+        surface, column = np.zeros(2 * node_start[-1], np.int64), np.zeros((total, WIDEST_ROW), np.int64)
+        K = [np.zeros((total, WIDEST_ROW)) for _ in range(2)]
+        for i, pad in enumerate(self.rig.pads.values()):
+            if not pad.inertial:
+                continue
+            here = slice(dofs[i], dofs[i + 1])
+            X[here], area[here] = pad.positions.numpy().ravel(), np.repeat(pad.mesh.nodal_areas, 2)
+            own = 2 * pad.surface.numpy()[:, None] + np.arange(2)
+            surface[2 * node_start[i] : 2 * node_start[i + 1]] = own.ravel()
+            stiffness = [pad.stiffness(modulus) for modulus in range(2)]
+            pattern = (abs(stiffness[0]) + abs(stiffness[1])).tocsr()
+            for row in range(pattern.shape[0]):
+                columns = pattern.indices[pattern.indptr[row] : pattern.indptr[row + 1]]
+                column[dofs[i] + row, : len(columns)] = columns
+                for k in range(2):
+                    K[k][dofs[i] + row, : len(columns)] = stiffness[k][[row]].toarray()[0, columns]
+        return Inertia(
+            _ints(dofs), surface, np.zeros((1, total)), np.ones(len(dofs) - 1, np.int64), X, area, column, *K, D,
+            np.zeros((len(dofs) - 1, 2, 2)), _ints(material_at),
+        )  # fmt: skip
+
+    def _make_actuators(self) -> Actuators:
+        rig, rows, known = self.rig, [], {}
+        starts = []
+        for actuator in rig.actuators.values():
+            parameters = {f"law.{k}": v for k, v in actuator.named_parameters()}
+            law = compiled_law(parameters, lambda module, x: module(x)[None], 5, 1, 5, law=actuator)
+            starts.append(self._add(torch.cat([v.reshape(-1) for v in parameters.values()]) if parameters else rig.gravity.new_zeros(0)))
+            feed = rig.signals.index(actuator.feed_forward) if actuator.feed_forward is not None else -1
+            rows.append(
+                (law.linearise, law.pullback, self._coordinate(actuator.measures), self._coordinate(actuator.pushes),
+                 rig.signals.index(actuator.setpoint), feed)
+            )  # fmt: skip
+        del known
+        linearise, pullback, measured, pushed, setpoint, feed_forward = _ints(rows).reshape(-1, 6).T
+        return Actuators(
+            *(np.ascontiguousarray(x) for x in (linearise, pullback)), _ints([*starts, self._count]),
+            *(np.ascontiguousarray(x) for x in (measured, pushed, setpoint, feed_forward)),
+        )  # fmt: skip
+
+    def _make_contacts(self) -> tuple[Contacts, Points]:
+        rig, rows, starts, point_start, sizes, limits = self.rig, [], [], [0], [], []
+        X, weight, node, N = [], [], [], []
+        for name, contact in rig.contacts.items():
+            pad, shape = rig.pads[contact.pad], rig.bodies[contact.body].shape
+            key = id(contact.law), id(shape)
+            laws = self._known.setdefault(key, None) or contact_laws(contact.law, shape)
+            self._known[key] = laws
+            starts.append(self._add(torch.cat([v.reshape(-1) for v in laws.parameters.values()])))
+            rows.append(
+                (list(rig.pads).index(contact.pad), 3 * list(rig.bodies).index(contact.body), laws.distance.value,
+                 laws.interface.linearise, laws.interface.pullback, laws.free.value, laws.free.linearise, laws.free.pullback)
+            )  # fmt: skip
+            first = self._pads.node_start[rows[-1][0]]
+            X.append(pad.point_positions.numpy())
+            weight.append(rig.weight(name).detach().numpy())
+            node.append(first + pad.point_nodes)
+            N.append(pad.point_shares)
+            point_start.append(point_start[-1] + len(pad.point_nodes))
+            sizes.append(shape.size())
+            length = pad.mesh.length
+            corners = pad.placed(np.array([[0.0, -length], [0.0, length], [length, -length], [length, length]]))
+            box = (*corners[:, 0][[corners[:, 0].argmin(), corners[:, 0].argmax()]], *np.sort(corners[:, 1])[[0, -1]])
+            limits.append((-np.inf, np.inf, -np.inf, np.inf) if contact.may_leave else box)
+        columns = [np.ascontiguousarray(x) for x in _ints(rows).reshape(-1, 8).T]
+        contacts = Contacts(
+            *columns, _ints([*starts, self._count]), _ints(point_start), np.array(sizes), np.array(limits).reshape(-1, 4)
+        )
+        start = min((s.start for (part, _), s in rig.layout.slices.items() if part == "stretch"), default=0)
+        points = Points(
+            np.concatenate([*X, np.zeros((0, 2))]), np.concatenate([*weight, np.zeros(0)]),
+            np.concatenate([*node, np.zeros((0, 2), np.int64)]), np.concatenate([*N, np.zeros((0, 2))]), start,
+        )  # fmt: skip
+        return contacts, points
+
+    def system(self, h: float) -> System:
+        """The arrays for steps of h [s]; only inertial pads depend on it."""
+        key = h if len(self._inertia.X) else 0.0
+        if key not in self._systems:
+            if len(self._systems) > 8:  # an irregular output grid has many step sizes; each holds some megabytes
+                self._systems.clear()
+            pads, inertia = self._mobilities(GAMMA * h) if key else (self._pads, self._inertia)
+            p = self.p.detach().numpy().copy()
+            self._systems[key] = System(self._bodies, self._actuators, pads, inertia, self._contacts, self._points, p)
+        return self._systems[key]
+
+    def _mobilities(self, a: float) -> tuple[Pads, Inertia]:
+        """Inertial pads' mobilities at the stage length a h [s]: surface rates per surface force, and per velocity of the base."""
+        pads, inertia = self._pads._replace(C=self._pads.C.copy()), self._inertia
+        parts, p = [], self.p.detach().numpy()
+        D, B = inertia.D.copy(), inertia.B.copy()
+        for i, pad in enumerate(self.rig.pads.values()):
+            here = slice(inertia.dof_start[i], inertia.dof_start[i + 1])
+            if not pad.inertial:
+                continue
+            lame_lambda, lame_mu, tau, density = p[inertia.material_at[i] : inertia.material_at[i] + 4]
+            K = lame_lambda * pad.stiffness(0) + lame_mu * pad.stiffness(1)
+            M = density * inertia.area[here]
+            A = banded((K * (tau + a)).tocsr())
+            A[0] += M / a
+            factor = linalg.cholesky_banded(A, lower=True)
+            surface = inertia.surface[2 * pads.node_start[i] : 2 * pads.node_start[i + 1]]
+            loads = np.zeros((len(M), len(surface)))
+            loads[surface, np.arange(len(surface))] = 1.0
+            P = linalg.cho_solve_banded((factor, True), loads)[surface]
+            pads.C[pads.C_start[i] : pads.C_start[i + 1]] = P.ravel()
+            uniform = M[:, None] * np.tile(np.eye(2), (len(M) // 2, 1)) / a
+            D[here] = linalg.cho_solve_banded((factor, True), uniform)
+            B[i] = np.diag(uniform.sum(0)) - uniform.T @ D[here]
+            parts.append((i, here, factor))
+        band = np.ones(len(self.rig.pads), np.int64)
+        width = max(len(factor) for *_, factor in parts)
+        factors = np.zeros((width, len(inertia.X)))
+        for i, here, factor in parts:
+            band[i] = len(factor)
+            factors[: len(factor), here] = factor
+        return pads, inertia._replace(factor=factors, band=band, D=D, B=B)
+
+
+def _ints(values: Any) -> Index:
+    return np.array(values, dtype=np.int64)
+
+
+def check_values(rig: nn.Module) -> None:
+    """Raises `ValueError` naming a parameter of the rig that is not finite or not physical, by its module's `limits`."""
+    for path, module in rig.named_modules():
+        limits: Mapping[str, str] = getattr(module, "limits", {})
+        for name, value in module.named_parameters(recurse=False):
+            where = f"{path}.{name}" if path else name
+            if not bool(torch.isfinite(value).all()):
+                raise ValueError(f"parameter `{where}` must be finite, but is {value.tolist()}")
+        for name, limit in limits.items():
+            value = getattr(module, name, None)
+            if value is None:
+                continue
+            x, where = float(torch.as_tensor(value).detach()), f"{path}.{name}" if path else name
+            fine = {"positive": x > 0, "not negative": x >= 0, "between -1 and 0.5": -1 < x < 0.5}[limit]
+            if not fine:
+                raise ValueError(f"parameter `{where}` must be {limit}, but is {x:g}")
