@@ -28,10 +28,10 @@ from tqdm import tqdm
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, Strokes
-from torchsoft.identify import RIG, Problem, Unknown, record
-from torchsoft.identify.information import standard_deviations, step_error, step_shift
-from torchsoft.identify.workers import Runner
 from torchsoft.implicit import SimulationFailed
+from torchsoft.sysid import RIG, Problem, Unknown, record
+from torchsoft.sysid.information import standard_deviations, step_error, step_shift
+from torchsoft.sysid.workers import Runner
 
 Array = NDArray[np.float64]
 

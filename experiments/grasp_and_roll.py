@@ -28,9 +28,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Interrupted, NoEquilibrium, Parameters, SimulationFailed, SoftGrasp, Trajectory, simulate
-from torchsoft import diagram as drawn
-from torchsoft import figures as draw
-from torchsoft.animation import animate
+from torchsoft.plot import diagram as drawn
+from torchsoft.plot import figures as draw
+from torchsoft.plot.animation import animate
 from torchsoft.scenario import grasp_and_roll
 
 

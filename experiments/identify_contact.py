@@ -2,7 +2,7 @@
 
 A rig with known parameters (K_n, R_n, K_t, R_t, mu_s, mu_k, E, tau) makes the three recordings that
 `experiment_design.py` ranks first, with sensor noise of 10 um, 0.5 mrad and 0.1 N at 200 Hz and a tenth of the fit's step;
-`torchsoft.identify` finds the parameters in stages, on exact sensitivities, and predicts a fourth recording. The same once
+`torchsoft.sysid` finds the parameters in stages, on exact sensitivities, and predicts a fourth recording. The same once
 more without noise (made at the fit's step, so that nothing but the fit can fail), and with the same stages on finite
 differences: `scipy.optimize.least_squares` with a Jacobian of one more run a parameter, all of them at once in the workers.
 
@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes
-from torchsoft.identify import RIG, Answer, Problem, Recording, Unknown, identify, record
-from torchsoft.identify.problem import Residuals
-from torchsoft.identify.report import report
-from torchsoft.identify.workers import Runner, forget
+from torchsoft.sysid import RIG, Answer, Problem, Recording, Unknown, identify, record
+from torchsoft.sysid.problem import Residuals
+from torchsoft.sysid.report import report
+from torchsoft.sysid.workers import Runner, forget
 
 Array = NDArray[np.float64]
 

@@ -21,8 +21,8 @@ from tqdm import tqdm
 
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, MultiSine, Strokes
-from torchsoft.identify import RIG, Problem, Recording, Stage, Unknown, identify, record
 from torchsoft.processes import local_processes
+from torchsoft.sysid import RIG, Problem, Recording, Stage, Unknown, identify, record
 
 TRUTH = {"pad.E": 0.9e6, "pad.tau": 0.012, "contact.K_n": 1.6e5, "contact.mu_s": 0.65}
 EXCITATIONS = {

@@ -1,6 +1,6 @@
 """Question: how small can an ordinary differential equation for disc and bracket be, and where does it stop being enough?
 
-Stick. Both pads stick to the disc: each is a spring k and a dashpot c on its slip (`torchsoft.reduction.terms`), so that
+Stick. Both pads stick to the disc: each is a spring k and a dashpot c on its slip (`torchsoft.reduced.terms`), so that
     m x_C''     =  k (x_Br - 2 x_C) + c (...)'
     I theta''   = -r [k (x_Br + 2 r theta) + c (...)'] - c_r theta'
     m_Br x_Br'' =  F_x - k (x_Br - x_C + r theta) - c (...)'
@@ -44,10 +44,10 @@ from tqdm import tqdm
 from torchsoft import Parameters, SimulationFailed, SoftGrasp, Trajectory, simulate
 from torchsoft.control import Profile, Reference, hold
 from torchsoft.excitation import Excitation, Strokes, Waves, begin, wave
-from torchsoft.reduction.fit import Choice, Recipe, assemble, choose, fit, rollout_of, score
-from torchsoft.reduction.ode import ReducedModel
-from torchsoft.reduction.records import STATES, Record, noisy, record, rolling_radius
-from torchsoft.reduction.terms import friction, joined, mechanics, polynomials
+from torchsoft.reduced.fit import Choice, Recipe, assemble, choose, fit, rollout_of, score
+from torchsoft.reduced.ode import ReducedModel
+from torchsoft.reduced.records import STATES, Record, noisy, record, rolling_radius
+from torchsoft.reduced.terms import friction, joined, mechanics, polynomials
 from torchsoft.scenario import grasp_and_roll
 from torchsoft.stability import DISPLACEMENT, VELOCITY
 

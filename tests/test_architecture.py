@@ -12,13 +12,19 @@ FLOW = """
 parameters shapes multibond state pad contact control model ledger equilibrium stability
 kernels kernels.node kernels.linear kernels.pad kernels.stage kernels.run kernels.adjoint kernels.sensitivity
 kernel_inputs grid implicit stage_laws adjoint sensitivity unrolled torchdiffeq_solver continuous
-trajectory simulate scenario excitation
-processes identify.unknowns identify.recording identify.prediction identify.workers identify.problem
-identify.information identify.fit identify.plan
-identify.answer identify.solve identify.synthetic identify.columns identify.measured identify dataset
-reduction.rollout reduction.ode reduction.records reduction.terms reduction.fit reduction scene figures animation diagram
-identify.pictures identify.report cli __main__
+trajectory simulate scenario excitation processes
+plot plot.scene plot.figures plot.animation plot.diagram
+sysid.unknowns sysid.recording sysid.prediction sysid.workers sysid.problem
+sysid.information sysid.fit sysid.plan
+sysid.result sysid.solve sysid.synthetic sysid.columns sysid.measured sysid sysid.figures sysid.report
+reduced.rollout reduced.ode reduced.records reduced.terms reduced.fit reduced
+datasets.reader datasets datasets.config datasets.design datasets.excitation datasets.schema datasets.simulation
+datasets.store datasets.coverage datasets.check datasets.generate
+cli __main__
 """
+FOLDERS = ("kernels", "plot", "sysid", "reduced", "datasets")
+APART = ("plot", "sysid", "reduced", "datasets")
+"""Folders over the engine; of these, only `plot` may be imported by another."""
 ORDER = FLOW.split()
 LONGEST = 380
 """Lines; a file that grows past them holds more than one idea."""
@@ -42,7 +48,13 @@ def test_every_module_has_a_place() -> None:
 
 @pytest.mark.parametrize("name", ORDER)
 def test_imports_point_upwards(name: str) -> None:
-    path = ROOT / (name.replace(".", "/") + ("/__init__.py" if name in ("kernels", "identify", "reduction") else ".py"))
+    path = ROOT / (name.replace(".", "/") + ("/__init__.py" if name in FOLDERS else ".py"))
     below = {other for other in imports(path) if ORDER.index(other) >= ORDER.index(name)}
     assert not below, f"{name} imports {below} from below it"
     assert len(path.read_text().splitlines()) <= LONGEST
+
+
+@pytest.mark.parametrize("folder", APART)
+def test_applications_do_not_know_each_other(folder: str) -> None:
+    used = {name.partition(".")[0] for path in (ROOT / folder).rglob("*.py") for name in imports(path)}
+    assert not used & (set(APART) - {folder, "plot"})

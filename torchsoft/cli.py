@@ -47,11 +47,11 @@ def identify(options: argparse.Namespace) -> int:
         return failed(f"one CONFIG.toml is needed, but {len(configs)} were given")
     try:
         # these take seconds to import, so that `--help` does without
-        from torchsoft.identify import measured
-        from torchsoft.identify.fit import Unreachable
-        from torchsoft.identify.report import report
-        from torchsoft.identify.solve import identify
-        from torchsoft.identify.workers import forget
+        from torchsoft.sysid import measured
+        from torchsoft.sysid.fit import Unreachable
+        from torchsoft.sysid.report import report
+        from torchsoft.sysid.solve import identify
+        from torchsoft.sysid.workers import forget
 
         tables: dict[str, Any] = {}
         try:

@@ -11,7 +11,7 @@ import torch
 
 from torchsoft import Parameters
 from torchsoft.excitation import Chirp, Excitation, Strokes
-from torchsoft.identify import CHANNELS, Recording, Sensor, record
+from torchsoft.sysid import CHANNELS, Recording, Sensor, record
 
 HERE = Path(__file__).parent
 

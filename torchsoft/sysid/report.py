@@ -1,0 +1,257 @@
+"""A page about an identification: one HTML file with its pictures inside, that any browser opens without a network."""
+
+import base64
+import io
+import json
+from collections.abc import Callable
+from datetime import UTC, datetime
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from torchsoft.sysid.figures import (
+    Trace,
+    correlation_figure,
+    direction_name,
+    estimates_figure,
+    spectrum_figure,
+    trace_figure,
+)
+from torchsoft.sysid.problem import Problem
+from torchsoft.sysid.recording import CHANNELS
+from torchsoft.sysid.result import Answer, split
+from torchsoft.sysid.workers import Runner
+
+STYLE_SHEET = """
+:root{color-scheme:light;--ink:#1d2329;--soft:#5d6873;--line:#dfe3e7;--blue:#0077bb;--warn:#fff4e5;--edge:#ee7733}
+*{box-sizing:border-box}
+body{margin:0;background:#fff;color:var(--ink);font:16px/1.55 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif;
+ overflow-wrap:anywhere}
+main{max-width:62rem;margin:0 auto;padding:1.5rem 1rem 4rem}
+h1{font-size:1.55rem;line-height:1.25;margin:.2rem 0 .4rem}
+h2{font-size:1.15rem;margin:2.6rem 0 .6rem;padding-top:1rem;border-top:1px solid var(--line)}
+h3{font-size:1rem;margin:1.6rem 0 .4rem}
+p{margin:.5rem 0;max-width:44rem}
+.soft,figcaption,caption{color:var(--soft);font-size:.9rem}
+.notices{background:var(--warn);border-left:4px solid var(--edge);padding:.7rem 1rem .7rem 1.1rem;margin:1rem 0}
+.notices ul{margin:.3rem 0 0;padding-left:1.1rem}
+.fine{border-left:4px solid var(--blue);background:#eef6fb;padding:.6rem 1rem;margin:1rem 0}
+.wide{overflow-x:auto;margin:.6rem 0}
+table{border-collapse:collapse;font-variant-numeric:tabular-nums;font-size:.92rem}
+caption{text-align:left;padding-bottom:.3rem}
+th,td{padding:.34rem .8rem .34rem 0;border-bottom:1px solid var(--line);text-align:left;vertical-align:top;
+ overflow-wrap:normal}
+td.n,th.n{text-align:right;white-space:nowrap}
+td.unseen{color:#a34400}
+figure{margin:.8rem 0}
+figure img{display:block;width:100%;max-width:34rem;height:auto}
+.grid{display:grid;gap:.4rem 1.6rem;grid-template-columns:repeat(auto-fit,minmax(min(100%,24rem),1fr))}
+dl{display:grid;grid-template-columns:max-content 1fr;gap:.2rem 1rem;font-size:.92rem}
+dt{color:var(--soft)}dd{margin:0}
+pre{overflow-x:auto;background:#f6f7f8;padding:.8rem;font-size:.82rem;line-height:1.4;overflow-wrap:normal}
+summary{cursor:pointer;color:var(--soft)}
+@media(max-width:34rem){
+ thead{display:none}table,caption,tbody,tr,td{display:block}
+ tr{border-bottom:1px solid var(--line);padding:.4rem 0}
+ td,td.n{display:flex;justify-content:space-between;gap:1rem;border:0;padding:.1rem 0;text-align:right;white-space:normal}
+ td::before{content:attr(data-label);color:var(--soft);flex:none}
+ td:empty{display:none}td:first-child{font-weight:600}td:first-child::before{content:none}
+}
+"""
+
+
+def report(answer: Answer, problem: Problem, path: str | Path, *, checkpoint: str | Path | None = None) -> None:
+    """Write the page about `answer`, which `identify` found for `problem`. It appears whole or not at all.
+
+    Every recording is simulated once more, unless the `checkpoint` folder has it. Raises `ValueError` where the answer is to
+    another problem.
+    """
+    if answer.made_by["recordings"] != {r.name: r.fingerprint for r in problem.recordings}:
+        raise ValueError("the answer was made from other recordings than the problem's")
+    drawn, lost = traces(answer, problem, Path(checkpoint) if checkpoint is not None else None)
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    partial.write_text(page(answer, problem, drawn, lost), encoding="utf-8")
+    partial.replace(path)
+
+
+def traces(answer: Answer, problem: Problem, journal: Path | None) -> tuple[list[Trace], dict[str, str]]:
+    """What is seen of every recording at the answer, and why others could not be simulated."""
+    x, step, out, lost = np.array(answer.x), float(answer.made_by["step"]), [], {}
+    samples = {recording.name: recording.samples for recording in problem.recordings}
+    with Runner(problem.recordings, journal=journal) as runner:
+        for name in problem.names:
+            got = problem.residuals(runner, x, [name], step)
+            lost |= {name: loss.reason for name, loss in got.lost.items()}
+            for (_, channel), r in split(problem, got.r, [name]).items() if not got.lost else ():
+                t, y = samples[name][channel]
+                out.append(Trace(name, channel, t, y, y + r * problem.sensors[channel].noise, r))
+    return out, lost
+
+
+def starts(answer: Answer, problem: Problem) -> list[float]:
+    """Value of every estimate at the start; biases and delays start at zero."""
+    out = []
+    for e in answer.estimates:
+        k = problem.names.index(e.recording) if e.recording in problem.names else 0
+        out.append(problem.values(problem.coordinates.start, k).get(e.name, 0.0))
+    return out
+
+
+def picture(figure: Figure, alt: str, caption: str = "") -> str:
+    """The figure as an element with its PNG inside."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=160)
+    inside = base64.b64encode(buffer.getvalue()).decode()
+    told = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
+    return f'<figure><img alt="{escape(alt)}" src="data:image/png;base64,{inside}">{told}</figure>'
+
+
+def table(head: list[str], rows: list[list[Any]], caption: str = "") -> str:
+    """Numbers to the right; a cell that is a pair brings its class along."""
+
+    def cell(label: str, value: Any) -> str:
+        kind, text = value if isinstance(value, tuple) else ("n" if is_number(value) else "", value)
+        return f'<td class="{kind}" data-label="{escape(label)}">{escape(str(text))}</td>'
+
+    numeric = [any(is_number(row[i]) for row in rows) for i in range(len(head))]
+    top = "".join(f'<th scope="col" class="{"n" if n else ""}">{escape(h)}</th>' for h, n in zip(head, numeric))
+    body = "".join(f"<tr>{''.join(cell(h, v) for h, v in zip(head, row))}</tr>" for row in rows)
+    told = f"<caption>{escape(caption)}</caption>" if caption else ""
+    return f'<div class="wide"><table>{told}<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def is_number(value: Any) -> bool:
+    return isinstance(value, str) and value.strip(" −-+").replace(" … ", "")[:1].isdigit()
+
+
+def grouped(value: float) -> str:
+    """Five digits, thousands set apart, such as 159 090."""
+    text = f"{value:.5g}"
+    whole = 1e4 <= abs(value) < 1e9
+    return f"{float(text):,.0f}".replace(",", "\u202f") if whole else text
+
+
+def estimates_table(answer: Answer, start: list[float]) -> str:
+    rows = []
+    for e, s in zip(answer.estimates, start):
+        unit = CHANNELS.get(e.name.removeprefix("bias of "), "" if e.unit == "1" else e.unit)
+        if e.value is None or e.ci95 is None:
+            found = [("unseen", "the data do not see it"), ("unseen", "none")]
+        else:
+            found = [grouped(e.value), f"{grouped(e.ci95[0])} … {grouped(e.ci95[1])}"]
+        rows.append(
+            [e.label, *found, unit, grouped(s), "yes" if e.seen else ("unseen", "no"), "yes" if e.at_bound else "no"]
+        )
+    return table(["parameter", "estimate", "95 % interval", "unit", "start", "seen", "at a bound"], rows)
+
+
+def page(answer: Answer, problem: Problem, drawn: list[Trace], lost: dict[str, str]) -> str:
+    """The whole HTML text."""
+    start, cost, made = starts(answer, problem), answer.cost, answer.made_by
+    seen = sum(e.seen for e in answer.estimates)
+    head = f"{seen} of {len(answer.estimates)} parameters seen, χ² = {answer.chi2:.3g}"
+    if answer.notices:
+        items = "".join(f"<li>{escape(notice)}</li>" for notice in answer.notices)
+        notices = f'<div class="notices" role="note"><strong>Read this first</strong><ul>{items}</ul></div>'
+    else:
+        notices = '<p class="fine">Converged, residuals white, step fine enough: nothing to warn of.</p>'
+    within = {(c.recording, c.channel): c for c in answer.residuals}
+    parts = [
+        f"<h1>{escape(head)}</h1>",
+        f'<p class="soft">{escape(", ".join(r for r in problem.names if r not in answer.heldout))}: '
+        f"{cost['data_seconds']:.3g} s of data, {cost['samples']:.0f} samples. χ² is the sum of squared residuals over the "
+        "noise, per degree of freedom: 1 where model and noise are right.</p>",
+        notices,
+        "<h2>Estimates</h2>",
+        estimates_table(answer, start),
+    ]
+    if (figure := estimates_figure(answer, start)) is not None:
+        told = "; ".join(
+            f"{e.label} {f'{e.value / s:.3g} times its start' if e.value is not None else 'not seen'}"
+            for e, s in zip(answer.estimates, start) if s > 0
+        )  # fmt: skip
+        parts.append(picture(figure, f"Estimates over their start values: {told}"))
+    unseen = [direction_name(d) for d in answer.directions if not d.seen]
+    parts += [
+        "<h2>What the data tell, and what they do not</h2>",
+        "<p>Each bar is a combination of parameters (of their logarithms) that the data know on its own: the shorter, the "
+        "better. Long orange bars are combinations that may change without a trace in the data.</p>",
+        '<div class="grid">',
+        picture(
+            spectrum_figure(answer),
+            "Fisher spectrum: "
+            + "; ".join(f"{direction_name(d)}: standard deviation {d.sd:.2g}" for d in answer.directions)
+            + (f". Not seen: {'; '.join(unseen)}" if unseen else ". All are seen"),
+            "Fisher spectrum",
+        ),
+        picture(correlation_figure(answer), f"Correlations: {correlations(answer)}", "Correlation of the estimates"),
+        "</div>",
+        "<h2>Data against prediction</h2>",
+    ]
+    for name in problem.names:
+        kind = "held out: predicted, not fitted" if name in answer.heldout else "fitted"
+        parts.append(f"<h3>{escape(name)} ({kind})</h3>")
+        if name in lost:
+            parts.append(f'<p class="notices">Could not be simulated: {escape(lost[name])}</p>')
+        parts.append('<div class="grid">')
+        for trace in (one for one in drawn if one.recording == name):
+            rms = float(np.sqrt(np.mean(trace.residual**2)))
+            alt = f"{trace.channel} of {name}, measured and predicted: residuals are {rms:.2f} times the noise"
+            parts.append(picture(trace_figure(trace, within.get((name, trace.channel))), alt))
+        parts.append("</div>")
+    if answer.heldout:
+        rows = [[r, c, f"{100 * v:.3g} %"] for r, channels in answer.heldout.items() for c, v in channels.items()]
+        told = "RMS error of the prediction over the range of what was measured"
+        parts += ["<h2>Held-out recordings</h2>", table(["recording", "channel", "NRMSE"], rows, told)]
+    stages = [
+        [s["name"], ", ".join(s["free"]), f"{1e3 * s['step']:g} ms", f"{s['evaluations']}", f"{s['chi2']:.4g}",
+         "yes" if s["converged"] else "no", f"{s['wall_s']:.1f} s"] for s in answer.stages
+    ]  # fmt: skip
+    count = ", ".join(
+        f"{cost[k]:.0f} {name}"
+        for k, name in (("simulations", "simulations"), ("jacobians", "Jacobians"), ("gradients", "gradients"),
+                        ("remembered", "of them known from before")) if cost[k]
+    )  # fmt: skip
+    parts += [
+        "<h2>Stages and cost</h2>",
+        table(["stage", "free", "step", "evaluations", "χ²", "converged", "time"], stages),
+        f"<p>{count}; {cost['wall_s']:.1f} s in all.</p>",
+        "<h2>How it was made</h2>",
+        made_list(made),
+        "<details><summary>Everything that decides the result</summary>"
+        f"<pre>{escape(json.dumps(made, indent=1, ensure_ascii=False))}</pre></details>",
+    ]
+    return (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta name="viewport" content="width=device-width,initial-scale=1"><title>{escape(head)}</title>'
+        f"<style>{STYLE_SHEET}</style></head><body><main>{''.join(parts)}</main></body></html>\n"
+    )
+
+
+def correlations(answer: Answer) -> str:
+    """The strong ones, in words."""
+    C, labels = answer.correlation, answer.labels
+    strong = [
+        f"{labels[i]} and {labels[j]} {C[i][j]:.2f}" for i in range(len(labels)) for j in range(i) if abs(C[i][j]) > 0.7
+    ]
+    return "; ".join(strong) or "none is beyond 0.7"
+
+
+def made_list(made: dict[str, Any]) -> str:
+    """Version, method and seed as a definition list."""
+    when = datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+    labels: dict[str, Callable[[], str]] = {
+        "torchsoft": lambda: made["torchsoft"],
+        "method": lambda: f"{made['method']}, loss {made['loss']}",
+        "step": lambda: f"{1e3 * made['step']:g} ms",
+        "seed": lambda: str(made["seed"]),
+        "sensors": lambda: ", ".join(f"{k} ± {s['noise']:g} {CHANNELS[k]}" for k, s in made["sensors"].items()),
+        "units": lambda: "SI throughout; pictures show lengths in mm",
+        "written": lambda: when,
+    }
+    return "<dl>" + "".join(f"<dt>{k}</dt><dd>{escape(text())}</dd>" for k, text in labels.items()) + "</dl>"
