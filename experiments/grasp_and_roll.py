@@ -238,7 +238,7 @@ def figures(result: Result) -> dict[str, Figure]:
         "bracket_moment": draw.bracket_moment(trajectory),
         "snapshots": draw.snapshots(trajectory, model),
         "angular_momentum": draw.angular_momentum(trajectory),
-        "energy": draw.energy_ledger(trajectory),
+        "energy": draw.energy_balance(trajectory),
         "multibond": drawn.multibond_graph(model),
     }
     for time in (0.125, 5.0):

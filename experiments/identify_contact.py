@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes
-from torchsoft.sysid import RIG, Answer, Problem, Recording, Unknown, identify, record
+from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, identify, record
 from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.report import report
 from torchsoft.sysid.workers import Runner, forget
@@ -67,7 +67,7 @@ class Case:
     name: str
     noise: float
     start: dict[str, float]
-    answer: Answer
+    answer: IdentificationResult
 
     def parameters(self, truth: dict[str, float]) -> dict[str, dict[str, object]]:
         out = {}
@@ -76,7 +76,7 @@ class Case:
             out[name] = {
                 "truth": value, "start": self.start[name], "estimate": e.value, "ci95": e.ci95,
                 "relative_sd": e.relative_sd, "relative_error": None if e.value is None else e.value / value - 1,
-                "seen": e.seen,
+                "seen": e.identifiable,
             }  # fmt: skip
         return out
 
@@ -198,7 +198,7 @@ def figure(result: Result) -> Figure:
         for i, (name, truth) in enumerate(result.truth.items()):
             e = case.answer[name]
             ax.plot(case.start[name] / truth, i, "o", mfc="none", color="0.6")
-            ax.plot(e.last / truth, i, "o", color="C0" if e.seen else "C3", ms=4)
+            ax.plot(e.last / truth, i, "o", color="C0" if e.identifiable else "C3", ms=4)
             if e.ci95:
                 ax.plot([c / truth for c in e.ci95], [i, i], color="C0", lw=2)
         ax.axvline(1.0, color="k", lw=0.5)

@@ -378,7 +378,7 @@ def study_stick(config: Config, bar: tqdm) -> tuple[dict[str, Any], dict[str, An
         "heldout_nrmse_by_state": result.nrmse,
         "heldout_over_deviation_by_state": result.over_deviation,
         "heldout_F_x_over_range": float(np.sqrt(np.mean((ours - F_x) ** 2)) / np.ptp(F_x)),
-        "validation_nrmse": choice.tried[choice.place]["nrmse"],
+        "validation_nrmse": choice.tried[choice.index]["nrmse"],
         "speedup": wall / fast,
         "wall_full_s": wall,
         "wall_reduced_s": fast,
@@ -502,7 +502,7 @@ def study_slip(config: Config, bar: tqdm) -> tuple[dict[str, Any], dict[str, Any
         library = joined(mechanics(r, alike=False), friction(r, speed))
         problem = assemble(records, library, recipe)
         choices.append((choose(problem, checks, recipe, config.thresholds, feedback, each=False), problem, library))
-    errors = [choice.tried[choice.place]["nrmse"] for choice, *_ in choices]
+    errors = [choice.tried[choice.index]["nrmse"] for choice, *_ in choices]
     good = [one for one, error in zip(choices, errors) if error <= 1.1 * min(errors)]
     choice, problem, library = min(good, key=lambda one: len(one[0].model.terms))
     model = ensemble(problem, choice.model, recipe, config.models, feedback)

@@ -9,7 +9,7 @@ import torchsoft
 
 ROOT = Path(torchsoft.__file__).parent
 FLOW = """
-parameters shapes multibond state pad contact control model ledger equilibrium stability
+channels files parameters shapes multibond state pad contact control model ledger equilibrium stability
 kernels kernels.node kernels.linear kernels.pad kernels.stage kernels.run kernels.adjoint kernels.sensitivity
 kernel_inputs grid implicit stage_laws adjoint sensitivity unrolled torchdiffeq_solver continuous
 trajectory simulate scenario excitation processes

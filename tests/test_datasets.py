@@ -96,7 +96,7 @@ def test_ready_configs_are_valid_and_their_splits_keep_the_shares(path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ('title = "Test"', 'title = "Test"\nworkers = 3', "workers"),
         ("low = 7e5", "low = 9e5", r"parameters\.pad\.E"),
@@ -110,8 +110,8 @@ def test_ready_configs_are_valid_and_their_splits_keep_the_shares(path: Path) ->
         ('kind = "slow_roll"', 'kind = "hop"', "kinds"),
     ],
 )
-def test_a_wrong_config_is_refused_with_the_field(tmp_path: Path, old: str, new: str, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_a_wrong_config_is_refused_with_the_field(tmp_path: Path, old: str, new: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         Config.from_toml(write_config(tmp_path, change=(old, new)))
 
 
@@ -276,17 +276,17 @@ def change_manifest(**changes: Any) -> Callable[[Path], None]:
 
 
 @pytest.mark.parametrize(
-    ("damage", "said"),
+    ("damage", "message"),
     [
         (change_units, "disc_angle: units are 'deg', not 'rad'"),
         (change_units_for_readers, "disc_spin: units are 'deg/s', not 'rad/s'"),
         (drop_array, "disc_spin: missing"),
-        (set_value("split", (1,), "test"), "trajectory 1: split is test, but the design says"),
+        (set_value("split", (1,), "test"), "trajectory 1: split is test, but the design has"),
         (set_value("split", (2,), "all"), "trajectory 2: split is"),
         (open_ledger, r"trajectory 1: energy residual is [\d.]+ of the energy injected, above 0\.02"),
         (set_value("energy_residual_rel", (2,), 1e-3), "trajectory 2: energy_residual_rel is 0.001, but the series"),
         (change_manifest(seed=99), r"manifest\.json: config_hash is \w+, but the configuration's is"),
-        (change_manifest(seed=99, fit=True), r"manifest\.json: tells of the configuration \w+, but the arrays"),
+        (change_manifest(seed=99, fit=True), r"manifest\.json: describes the configuration \w+, but the arrays"),
         (change_manifest(duration=-1.0), r"manifest\.json: .*duration"),
         (set_value("normal_force_upper", (4, 60, 30), -1.0), "trajectory 4: normal_force_upper pulls"),
         (set_value("disc_position", (0, 3, 1), np.inf), "trajectory 0: not finite: disc_position"),
@@ -301,11 +301,11 @@ def change_manifest(**changes: Any) -> Callable[[Path], None]:
         (lambda folder: (folder / "manifest.json").unlink(), r"manifest\.json: missing"),
     ],
 )
-def test_damage_is_found(made: tuple[Path, Config], tmp_path: Path, damage: Any, said: str) -> None:
+def test_damage_is_found(made: tuple[Path, Config], tmp_path: Path, damage: Any, message: str) -> None:
     damage(copy(made[0], tmp_path / "set"))
     findings = [x for x in check(str(tmp_path / "set")) if "no commit" not in x]
     assert len(findings) == 1, findings
-    assert re.search(said, findings[0])
+    assert re.search(message, findings[0])
     assert "\n" not in findings[0]
 
 

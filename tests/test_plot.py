@@ -15,7 +15,7 @@ from torchsoft import SoftGrasp, Trajectory, simulate
 from torchsoft.pad import lame_moduli
 from torchsoft.plot import figures
 from torchsoft.plot.animation import animate
-from torchsoft.plot.diagram import dot, graph_of, multibond_graph, places
+from torchsoft.plot.diagram import dot, graph_of, multibond_graph, positions
 from torchsoft.plot.scene import deformed_mesh, instants
 from torchsoft.scenario import grasp_and_roll
 
@@ -84,7 +84,7 @@ DRAWN: dict[str, Callable[[SoftGrasp, Trajectory], Figure]] = {
     "force_distribution": lambda m, r: figures.force_distribution(r, m, 0.125),
     "snapshots": lambda m, r: figures.snapshots(r, m, (0.05, 0.1, 0.15, 0.2)),
     "snapshots_of_the_end": lambda m, r: figures.snapshots(r, m),
-    "energy_ledger": lambda m, r: figures.energy_ledger(r),
+    "energy_balance": lambda m, r: figures.energy_balance(r),
     "friction_comparison": lambda m, r: figures.friction_comparison({"one": (m, r), "two": (m, r)}),
     "multibond_graph": lambda m, r: multibond_graph(m),
 }
@@ -103,7 +103,7 @@ def test_figure_draws_something(name: str, done: Done) -> None:
         assert axes.get_ylabel() or name == "snapshots"
     title = figure.get_suptitle()
     assert title
-    if name != "energy_ledger":
+    if name != "energy_balance":
         assert "paper: Fig" in title
 
 
@@ -118,7 +118,7 @@ def test_diagram_places_every_node_of_the_graph_by_itself() -> None:
     for fidelity in ("massless", "inertial"):
         model = coarse(pad__fidelity=fidelity)
         graph = graph_of(model)
-        at = places(graph)
+        at = positions(graph)
         assert set(at) == set(graph)
         points = np.array(list(at.values()))
         apart = np.linalg.norm(points[:, None] - points[None], axis=-1) + 9 * np.eye(len(points))

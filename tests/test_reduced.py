@@ -77,7 +77,7 @@ def test_known_equations_are_recovered(motions: list[Record], form: str, optimiz
 def test_the_choice_takes_the_true_terms_and_rolls_out(motions: list[Record]) -> None:
     choice = choose(assemble(motions, mechanics(R), RECIPE), [motion(truth(), 50)], RECIPE, (1e-4, 0.01, 0.9), LAW)
     assert len(choice.model.terms) == 8
-    assert choice.tried[choice.place]["nrmse"] < 5e-3
+    assert choice.tried[choice.index]["nrmse"] < 5e-3
     assert score(choice.model, motion(truth(), 51)).worst < 5e-3
     assert max(row["nrmse"] for row in choice.tried) > 0.05  # thresholds matter
 

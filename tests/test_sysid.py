@@ -1,4 +1,4 @@
-"""Identification on a coarse mesh: Jacobians, recovery, what is not seen, nuisances, resuming."""
+"""Identification on a coarse mesh: Jacobians, recovery, what is not identifiable, nuisances, resuming."""
 
 import json
 import signal
@@ -92,16 +92,16 @@ def test_noise_free_data_give_the_truth_back_and_intervals_hold_it(strokes: Reco
     answer = identify(Problem([strokes, shake], SENSORS, four()), step=STEP, heldout=["shake"])
     for name in FOUR:
         e = answer[name]
-        assert e.seen
+        assert e.identifiable
         assert e.value == pytest.approx(TRUTH[name], rel=1e-3)
         assert e.ci95 is not None
         assert e.ci95[0] < TRUTH[name] < e.ci95[1]
     assert answer.converged
     assert answer.chi2 < 1e-3
     assert max(answer.heldout["shake"].values()) < 1e-3
-    told = json.loads(answer.to_json())
-    assert told["made_by"]["recordings"].keys() == {"strokes", "shake"}
-    assert told["cost"]["jacobians"] > 0
+    content = json.loads(answer.to_json())
+    assert content["made_by"]["recordings"].keys() == {"strokes", "shake"}
+    assert content["cost"]["jacobians"] > 0
 
 
 def test_the_adjoint_route_ends_where_gauss_newton_does(strokes: Recording) -> None:
@@ -129,18 +129,18 @@ def test_what_the_data_do_not_see_is_not_a_number() -> None:
         plan=[Stage("all", ("gentle",), ("pad.E", "contact.mu_k"), STEP)],
     )  # fmt: skip
     mu_k, E = answer["contact.mu_k"], answer["pad.E"]
-    assert not mu_k.seen
+    assert not mu_k.identifiable
     assert mu_k.value is None
     assert mu_k.ci95 is None
-    assert E.seen
+    assert E.identifiable
     assert E.ci95 is not None
     assert E.ci95[0] < BASE.pad.E < E.ci95[1]
     assert any("contact.mu_k" in notice for notice in answer.notices)
-    assert not answer.directions[-1].seen
+    assert not answer.directions[-1].identifiable
     assert "contact.mu_k" in answer.directions[-1].components
     row = next(e for e in json.loads(answer.to_json())["estimates"] if e["name"] == "contact.mu_k")
     assert row["value"] is None
-    assert "not seen" in answer.table()
+    assert "not identifiable" in answer.table()
 
 
 def test_bias_and_delay_are_found_and_missing_samples_do_not_matter(strokes: Recording) -> None:
@@ -283,7 +283,7 @@ def test_whiteness_tells_noise_from_drift() -> None:
 
 
 @pytest.mark.parametrize(
-    ("unknowns", "said"),
+    ("unknowns", "message"),
     [
         ({}, "nothing to identify"),
         ({"pad.E": {"fixed": True}}, "nothing to identify"),
@@ -296,8 +296,8 @@ def test_whiteness_tells_noise_from_drift() -> None:
         ({"pad.E": {"young": 1.0}}, "young"),
     ],
 )
-def test_wrong_unknowns_are_refused(strokes: Recording, unknowns: dict, said: str) -> None:
-    with pytest.raises(ValueError, match=said):
+def test_wrong_unknowns_are_refused(strokes: Recording, unknowns: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
         Problem([strokes], SENSORS, {name: Unknown.model_validate(u) for name, u in unknowns.items()})
 
 
@@ -310,14 +310,14 @@ def test_wrong_recordings_and_sensors_are_refused(strokes: Recording) -> None:
     with pytest.raises(ValueError, match="no recording has samples of `omega`"):
         Problem([strokes], {"omega": Sensor(noise=1.0)}, one)
     t, y = strokes.samples["x_C"]
-    for samples, said in (
+    for samples, message in (
         ({}, "no samples"),
         ({"x": (t, y)}, "`x` is not a channel"),
         ({"x_C": (t, y[1:])}, "times and values alike"),
         ({"x_C": (t[::-1], y)}, "increasing times"),
         ({"x_C": (t, np.full_like(y, np.nan))}, "finite values"),
     ):
-        with pytest.raises(ValueError, match=said):
+        with pytest.raises(ValueError, match=message):
             Recording("one", strokes.settings, strokes.reference, samples)
     with pytest.raises(ValueError, match="`heldout`"):
         identify(Problem([strokes], SENSORS, one), heldout=["strokes"])

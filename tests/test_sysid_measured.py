@@ -18,9 +18,10 @@ import torch
 import xarray as xr
 
 from torchsoft import Parameters, Trajectory, simulate
+from torchsoft.channels import CHANNELS
 from torchsoft.cli import main
 from torchsoft.excitation import Excitation, Strokes, begin
-from torchsoft.sysid import CHANNELS, Recording, Sensor, Unreachable, record
+from torchsoft.sysid import MEASURED, Recording, Sensor, Unreachable, record
 from torchsoft.sysid.columns import COLUMNS, UNITS, read_table
 from torchsoft.sysid.measured import known, load, read_recording, unreachable
 from torchsoft.sysid.workers import Lost
@@ -199,7 +200,7 @@ def test_empty_cells_are_missing_samples(case: Callable[..., list[str]]) -> None
 
 @pytest.mark.parametrize("name", sorted(set(COLUMNS) - {"t"}))
 def test_every_unit_is_understood(tmp_path: Path, name: str) -> None:
-    dimension = COLUMNS[name]
+    dimension = CHANNELS[name].unit
     for unit, factor in UNITS[dimension].items():
         table = [["t [ms]", "x_d [m]", "y_d [m]"]] + [[str(5 * i), "0.06", "0.05"] for i in range(10)]
         if name in ("x_d", "y_d"):
@@ -218,7 +219,7 @@ def made() -> tuple[Any, Recording]:
     assert spec.loader is not None
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
-    sensors = {channel: Sensor(noise=1e-5) for channel in CHANNELS}
+    sensors = {channel: Sensor(noise=1e-5) for channel in MEASURED}
     excitation = Excitation(motion=Strokes(travel=4e-3, stroke_time=0.15), duration=0.4, depth=1.2e-3, senses="bracket",
                             grasp_time=0.15, settle=0.0)  # fmt: skip
     return script, record("short", excitation, script.TRUTH, script.NOMINAL, sensors, step=2.5e-3)
@@ -228,11 +229,11 @@ def test_a_recording_survives_the_way_through_csv(made: tuple[Any, Recording], t
     script, one = made
     script.UNITS["rad/s"] = ("deg/s", 180 / np.pi)
     script.write(one, tmp_path / "short.csv", digits=17)
-    sensors = {channel: Sensor(noise=1e-5) for channel in CHANNELS}
+    sensors = {channel: Sensor(noise=1e-5) for channel in MEASURED}
     back = read_recording(tmp_path / "short.csv", "short", one.settings, sensors)
     assert back.name == one.name
     assert back.settings == one.settings
-    assert list(back.samples) == list(one.samples) == list(CHANNELS)
+    assert list(back.samples) == list(one.samples) == list(MEASURED)
     for channel, (t, y) in one.samples.items():
         np.testing.assert_allclose(back.samples[channel][0], t, rtol=0, atol=1e-12)
         np.testing.assert_allclose(back.samples[channel][1], y, rtol=1e-13)
@@ -274,10 +275,10 @@ def test_a_trajectory_file_is_a_recording(run: Trajectory, tmp_path: Path) -> No
     settings = {"scenario": {"x_C0": 60.3e-3}, "control.senses": "bracket", "contact": {"v_s": 0.05}}
     sensors = {"x_C": Sensor(noise=1e-5)}
     one = read_recording(tmp_path / "run.nc", "run", known(Path("c"), "run", table, settings), sensors)
-    assert list(one.samples) == list(CHANNELS)
+    assert list(one.samples) == list(MEASURED)
     s = run.state
     expected = torch.cat((s.r_C, s.theta[:, None], s.r_Br, s.v_C, s.omega[:, None], s.v_Br, run.control), 1).numpy()
-    for k, channel in enumerate(CHANNELS):
+    for k, channel in enumerate(MEASURED):
         np.testing.assert_array_equal(one.samples[channel][1], expected[:, k])
     with torch.no_grad():
         got = torch.stack(one.reference(run.t), -1)
@@ -354,15 +355,15 @@ def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(
     config = CONFIG.replace('"bracket"', '"disc"').replace("60.3e-3", "60e-3").replace("5e-3", "2e-3")
     files = case(change, config.replace("[unknowns", "control.K_81 = 1e6\ncontrol.R_80 = 0\n[unknowns", 1))
     assert main(["identify", *files, "--out", str(tmp_path / "out"), "--no-progress"]) == 2
-    said = capsys.readouterr().err
+    message = capsys.readouterr().err
     found = re.search(
-        r"data\.csv, row (\d+) \(t = (\S+) s\): the model cannot follow recording `data` here: at t = (\S+) s", said
+        r"data\.csv, row (\d+) \(t = (\S+) s\): the model cannot follow recording `data` here: at t = (\S+) s", message
     )
-    assert found, said
+    assert found, message
     row, t, inside = int(found[1]), float(found[2]), float(found[3])
     assert t == pytest.approx(inside, abs=1e-3)
     assert row == 2 + np.ceil(t / 5e-3 - 1e-6)
-    assert said.count("\n") == 1
+    assert message.count("\n") == 1
     tables = load(files[:1], files[1]).tables
     assert "data.csv, before row 2 (t = -0.1 s): the model" in unreachable(
         Unreachable({"data": Lost("gone", -0.1)}), tables
@@ -407,10 +408,10 @@ def test_an_interrupted_command_continues_and_ends_the_same(answered: tuple[Path
     while len(list(out.glob("unfinished/*.pickle"))) < 3 and child.poll() is None and time.monotonic() - began < 120:
         time.sleep(0.02)
     child.send_signal(signal.SIGINT)
-    _, said = child.communicate(timeout=60)
-    assert child.returncode == 130, said
-    assert "the same command continues" in said
-    assert "Traceback" not in said
+    _, message = child.communicate(timeout=60)
+    assert child.returncode == 130, message
+    assert "the same command continues" in message
+    assert "Traceback" not in message
     kept = len(list(out.glob("unfinished/*.pickle")))
     assert kept >= 3
     assert not (out / "answer.json").exists()

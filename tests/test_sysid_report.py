@@ -1,4 +1,4 @@
-"""The report: one page that stands alone, says everything that the answer says, and no number that the data do not see."""
+"""The report: one page that stands alone, holds the whole result, and no number that the data do not determine."""
 
 import base64
 import json
@@ -16,9 +16,8 @@ from matplotlib.text import Text
 
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes
-from torchsoft.sysid import Answer, Problem, Sensor, Unknown, identify, record
+from torchsoft.sysid import IdentificationResult, Problem, Sensor, Unknown, identify, record
 from torchsoft.sysid.figures import (
-    autocorrelation,
     correlation_figure,
     direction_name,
     estimates_figure,
@@ -27,7 +26,7 @@ from torchsoft.sysid.figures import (
 )
 from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.report import report, starts, traces
-from torchsoft.sysid.result import Direction
+from torchsoft.sysid.result import Direction, autocorrelation
 from torchsoft.sysid.workers import Lost
 
 STRANGE = 'a<b> & "$x_1$"'
@@ -35,8 +34,8 @@ STRANGE = 'a<b> & "$x_1$"'
 
 
 @pytest.fixture(scope="module")
-def found() -> tuple[Answer, Problem]:
-    """A grasp, from which the viscosity of slip cannot be seen, and another one held out."""
+def found() -> tuple[IdentificationResult, Problem]:
+    """A grasp, from which the viscosity of slip is not identifiable, and another one held out."""
     p = Parameters().override({"contact.v_s": 0.05})
     truth = p.override({"contact.K_n": 1.6e5, "pad.E": 0.9e6})
     sensors = {"theta": Sensor(noise=5e-4), "y_Br": Sensor(noise=1e-5), "F_y": Sensor(noise=0.1)}
@@ -72,7 +71,7 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def page(found: tuple[Answer, Problem], tmp_path_factory: pytest.TempPathFactory) -> Page:
+def page(found: tuple[IdentificationResult, Problem], tmp_path_factory: pytest.TempPathFactory) -> Page:
     folder = tmp_path_factory.mktemp("report") / "new"
     report(*found, folder / "report.html")
     assert [path.name for path in folder.iterdir()] == ["report.html"]
@@ -99,12 +98,12 @@ def test_the_page_stands_alone(page: Page) -> None:
     assert ("meta", {"name": "viewport", "content": "width=device-width,initial-scale=1"}) in page.tags
 
 
-def test_the_page_says_what_the_answer_says(page: Page, found: tuple[Answer, Problem]) -> None:
+def test_the_page_says_what_the_answer_says(page: Page, found: tuple[IdentificationResult, Problem]) -> None:
     answer, _ = found
-    seen = [e for e in answer.estimates if e.seen]
+    seen = [e for e in answer.estimates if e.identifiable]
     assert {e.name for e in seen} >= {"pad.E"}
-    assert not answer["contact.eta"].seen
-    assert f"{len(seen)} of {len(answer.estimates)} parameters seen" in page.text
+    assert not answer["contact.eta"].identifiable
+    assert f"{len(seen)} of {len(answer.estimates)} parameters identifiable" in page.text
     assert answer.notices
     for notice in answer.notices:
         assert notice in page.text
@@ -113,8 +112,7 @@ def test_the_page_says_what_the_answer_says(page: Page, found: tuple[Answer, Pro
         for value in (e.value, *(e.ci95 or ())):
             assert value is not None
             assert f"{float(f'{value:.5g}'):.12g}" in page.text.replace("\u202f", "")
-    assert "the data do not see it" in page.text
-    assert "\ncontact.eta\nthe data do not see it\nnone\nN.s/m\n10\nno\n" in page.text
+        assert "\ncontact.eta\nnot identifiable\nnone\nN.s/m\n10\nno\n" in page.text
     for channels in answer.heldout.values():
         for value in channels.values():
             assert f"{100 * value:.3g} %" in page.text
@@ -126,7 +124,7 @@ def test_the_page_says_what_the_answer_says(page: Page, found: tuple[Answer, Pro
     assert json.loads(decided.strip()) == json.loads(json.dumps(answer.made_by))
 
 
-def test_predictions_are_the_models(found: tuple[Answer, Problem]) -> None:
+def test_predictions_are_the_models(found: tuple[IdentificationResult, Problem]) -> None:
     answer, problem = found
     drawn, lost = traces(answer, problem, None)
     assert not lost
@@ -142,13 +140,13 @@ def test_predictions_are_the_models(found: tuple[Answer, Problem]) -> None:
             assert nrmse == pytest.approx(held[trace.channel], rel=1e-6)
 
 
-def test_starts_are_the_settings_values(found: tuple[Answer, Problem]) -> None:
+def test_starts_are_the_settings_values(found: tuple[IdentificationResult, Problem]) -> None:
     answer, problem = found
     table = problem.recordings[0].settings.table()
     assert starts(answer, problem) == pytest.approx([table[e.name]["value"] for e in answer.estimates])
 
 
-def test_an_answer_to_other_data_is_refused(found: tuple[Answer, Problem], tmp_path: Path) -> None:
+def test_an_answer_to_other_data_is_refused(found: tuple[IdentificationResult, Problem], tmp_path: Path) -> None:
     answer, problem = found
     other = Problem(problem.recordings[:1], problem.sensors, problem.unknowns)
     with pytest.raises(ValueError, match="other recordings"):
@@ -157,7 +155,7 @@ def test_an_answer_to_other_data_is_refused(found: tuple[Answer, Problem], tmp_p
 
 
 def test_a_recording_that_was_lost_is_said_and_a_clean_answer_praised(
-    found: tuple[Answer, Problem], tmp_path: Path
+    found: tuple[IdentificationResult, Problem], tmp_path: Path
 ) -> None:
     answer, problem = found
 
@@ -212,7 +210,7 @@ def texts(figure: Figure) -> list[tuple[str, Any]]:
 
 
 @pytest.mark.parametrize("which", ["estimates", "correlation", "spectrum", "trace"])
-def test_no_text_of_a_picture_is_cut_or_overlaps(found: tuple[Answer, Problem], which: str) -> None:
+def test_no_text_of_a_picture_is_cut_or_overlaps(found: tuple[IdentificationResult, Problem], which: str) -> None:
     answer, problem = found
     figures = {
         "estimates": lambda: estimates_figure(answer, starts(answer, problem)),

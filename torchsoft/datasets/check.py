@@ -1,4 +1,4 @@
-"""Re-read a dataset and say what is wrong with it: `python -m data_gen.check DIR`.
+"""Re-read a dataset and list what is wrong with it: `python -m data_gen.check DIR`.
 
 One line a finding; exit status 1 if there is any. Writes `coverage.png`, what the set covers.
 """
@@ -17,10 +17,11 @@ from pydantic import ValidationError
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.coverage import figure
 from torchsoft.datasets.design import SPLITS, points, task
-from torchsoft.datasets.reader import open_dataset, place
+from torchsoft.datasets.reader import local_path, open_dataset
 from torchsoft.datasets.schema import sizes, variables
 from torchsoft.datasets.simulation import labels
 from torchsoft.datasets.store import MANIFEST, Store, filesystem, read_text
+from torchsoft.files import findings
 
 
 def check(url: str) -> Iterator[str]:
@@ -47,7 +48,7 @@ def check(url: str) -> Iterator[str]:
         return
     made_of = store.group.attrs.get("config_hash")
     if made_of != config.hash:
-        yield f"{MANIFEST}: tells of the configuration {config.hash}, but the arrays were made of {made_of}"
+        yield f"{MANIFEST}: describes the configuration {config.hash}, but the arrays were made of {made_of}"
         return
     structure = list(check_structure(store))
     yield from structure
@@ -65,7 +66,7 @@ def check(url: str) -> Iterator[str]:
 
 
 def read_manifest(url: str) -> tuple[Config, dict[str, Any]]:
-    """The configuration that the manifest tells of. Raises `ValueError`."""
+    """The configuration that the manifest describes. Raises `ValueError`."""
     text = read_text(url, MANIFEST)
     if text is None:
         raise ValueError("missing")
@@ -73,8 +74,7 @@ def read_manifest(url: str) -> tuple[Config, dict[str, Any]]:
     try:
         return Config.model_validate(manifest.get("config")), manifest
     except ValidationError as error:
-        told = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'config'}: {e['msg']}" for e in error.errors())
-        raise ValueError(f"its configuration is impossible: {told}") from error
+        raise ValueError(f"its configuration is impossible: {findings(error)}") from error
 
 
 def check_structure(store: Store) -> Iterator[str]:
@@ -82,7 +82,7 @@ def check_structure(store: Store) -> Iterator[str]:
     found: dict[str, None] = {}
     for consolidated in (False, True):
         try:
-            group = zarr.open_group(place(store.url), mode="r", use_consolidated=consolidated)
+            group = zarr.open_group(local_path(store.url), mode="r", use_consolidated=consolidated)
         except (OSError, ValueError) as error:
             found[f"the consolidated metadata cannot be read: {error}"] = None
             continue
@@ -91,7 +91,7 @@ def check_structure(store: Store) -> Iterator[str]:
 
 
 def check_arrays(group: zarr.Group, config: Config) -> Iterator[str]:
-    """What one copy of the metadata says."""
+    """Findings in one copy of the metadata."""
     length = sizes(config)
     for name, variable in variables(config).items():
         array = group.get(name)
@@ -114,27 +114,27 @@ def check_shard(store: Store, shard: int, design: np.ndarray[Any, Any]) -> Itera
     data = {name: np.asarray(store.array(name)[here.start : here.stop]) for name in schema}
     for row, index in enumerate(here):
         one = {name: values[row] for name, values in data.items()}
-        say = f"trajectory {index}: ".__add__
+        finding = f"trajectory {index}: ".__add__
         for name, value in labels(task(config, index, design[index])).items():
             if one[name] != value:
-                yield say(f"{name} is {one[name]}, but the design says {value}")
+                yield finding(f"{name} is {one[name]}, but the design has {value}")
         floats = [name for name, v in schema.items() if v.dtype.startswith("float") and len(v.dims) > 1]
         if one["failed"]:
             filled = [name for name in floats if not np.isnan(one[name]).all()]
             if not one["reason"]:
-                yield say("failed without a reason")
+                yield finding("failed without a reason")
             elif filled:
-                yield say(f"failed, but {', '.join(filled)} hold numbers")
+                yield finding(f"failed, but {', '.join(filled)} hold numbers")
             continue
         bad = [name for name in (*floats, "grasp_force", "energy_residual_rel") if not np.isfinite(one[name]).all()]
         if bad:
-            yield say(f"not finite: {', '.join(bad)}")
+            yield finding(f"not finite: {', '.join(bad)}")
             continue
-        yield from map(say, check_physics(config, one))
+        yield from map(finding, check_physics(config, one))
 
 
 def check_physics(config: Config, one: dict[str, Any]) -> Iterator[str]:
-    """The energy ledger, and contact where there is force."""
+    """The energy balance, and contact where there is force."""
     stored, dissipated, supplied = (one[f"{x}_energy"].sum(-1) for x in ("stored", "dissipated", "supplied"))
     residual = stored - stored[0] - supplied + dissipated
     scale = max(np.abs(stored).max(), one["injected_energy"][-1])
@@ -143,7 +143,7 @@ def check_physics(config: Config, one: dict[str, Any]) -> Iterator[str]:
         return
     relative = np.abs(residual).max() / one["injected_energy"][-1]
     if abs(relative - one["energy_residual_rel"]) > 1e-9:
-        yield f"energy_residual_rel is {one['energy_residual_rel']:.3g}, but the series say {relative:.3g}"
+        yield f"energy_residual_rel is {one['energy_residual_rel']:.3g}, but the series have {relative:.3g}"
     if relative > config.ledger_tolerance:
         yield f"energy residual is {relative:.2g} of the energy injected, above {config.ledger_tolerance}"
     for pad in ("lower", "upper"):

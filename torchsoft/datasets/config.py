@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from torchsoft.excitation import Table
+from torchsoft.files import findings
 from torchsoft.parameters import Parameters
 
 RATIO = "contact.mu_k/contact.mu_s"
@@ -53,7 +54,7 @@ class PositiveRange(Range):
 
 
 class Drawn(Table):
-    """A kind of motion, drawn as often as `weight` says; `motion` is its name in `torchsoft.excitation`, its own by default."""
+    """A kind of motion, drawn in proportion to `weight`; `motion` is its name in `torchsoft.excitation`, its own by default."""
 
     kind: str
     weight: float = Field(1.0, gt=0)
@@ -129,7 +130,7 @@ def ranges(kind: Kind) -> dict[str, Range]:
 
 
 class Fractions(Table):
-    """Shares of the trajectories; the rest is for testing."""
+    """Fractions of the trajectories; the rest is for testing."""
 
     train: float = Field(0.7, gt=0, lt=1)
     validation: float = Field(0.15, ge=0, lt=1)
@@ -258,9 +259,11 @@ class Config(Table):
                 try:
                     self.physics(ratio | ends, depth)
                 except ValueError as error:
-                    said = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
+                    reason = findings(error) if isinstance(error, ValidationError) else str(error)
                     where = ", ".join(f"parameters.{name} = {x:g}" for name, x in ends.items())
-                    raise ValueError(f"{where or 'fixed'} with grasp_depth = {depth:g} is impossible: {said}") from None
+                    raise ValueError(
+                        f"{where or 'fixed'} with grasp_depth = {depth:g} is impossible: {reason}"
+                    ) from None
         return self
 
     @classmethod
@@ -268,10 +271,7 @@ class Config(Table):
         """Read a TOML file. Raises `ValueError` naming the file and the field."""
         try:
             return cls.model_validate(tomllib.loads(Path(path).read_text()))
-        except OSError as error:
-            raise ValueError(f"{path}: {error.strerror}") from error
-        except tomllib.TOMLDecodeError as error:
-            raise ValueError(f"{path}: {error}") from error
+        except (OSError, tomllib.TOMLDecodeError) as error:
+            raise ValueError(f"{path}: {getattr(error, 'strerror', error)}") from error
         except ValidationError as error:
-            told = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'config'}: {e['msg']}" for e in error.errors())
-            raise ValueError(f"{path}: {told}") from error
+            raise ValueError(f"{path}: {findings(error)}") from error

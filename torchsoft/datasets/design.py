@@ -49,26 +49,18 @@ def task(config: Config, index: int, u: NDArray[np.floating]) -> Task:
     kind = choose(config.kinds, float(u[n + 1]))
     excitation = {name: r.at(float(x)) for (name, r), x in zip(ranges(kind).items(), u[n + 2 :])}
     depth = excitation.pop("depth", depth)  # a kind may have a range of its own
-    return Task(
-        index,
-        config.physics(sampled | kind.sets, depth),
-        sampled,
-        depth,
-        kind,
-        excitation,
-        (config.seed, index),
-        split(config, index),
-    )
+    p = config.physics(sampled | kind.sets, depth)
+    return Task(index, p, sampled, depth, kind, excitation, (config.seed, index), split(config, index))
 
 
 def choose(kinds: tuple[Kind, ...], u: float) -> Kind:
-    """The kind at u in [0, 1), each as often as its weight says."""
-    shares = np.cumsum([kind.weight for kind in kinds])
-    return kinds[min(int(np.searchsorted(shares, u * shares[-1], side="right")), len(kinds) - 1)]
+    """The kind at u in [0, 1), each in proportion to its weight."""
+    edges = np.cumsum([kind.weight for kind in kinds])
+    return kinds[min(int(np.searchsorted(edges, u * edges[-1], side="right")), len(kinds) - 1)]
 
 
 def split(config: Config, index: int) -> str:
-    """Train, validation or test: the golden-ratio sequence from a seeded start, so that small sets keep the shares."""
+    """Train, validation or test: the golden-ratio sequence from a seeded start, so that small sets keep the fractions."""
     start = np.random.default_rng((config.seed, 0)).random()
     u = (start + index * GOLDEN) % 1.0
     edges = (config.splits.train, config.splits.train + config.splits.validation)

@@ -14,17 +14,16 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 
-def place(url: str) -> str:
+def local_path(url: str) -> str:
     """What zarr and xarray open: the path where a URL is a local one, such as `file:///data/set`, else the URL."""
     fs, root = fsspec.url_to_fs(url)
     return root if isinstance(fs, LocalFileSystem) else url
 
 
 class Trajectories(Dataset[dict[str, Tensor]]):
-    """Windows of the trajectories of one split, read when they are asked for.
+    """Windows of the trajectories of one split, read on access.
 
-    Item i holds every variable of `variables`, a series as (window, ...), a number of the trajectory as (), SI units as the
-    store says, and `trajectory`, `start`: where it comes from. `window` is a number of samples, the whole run by default;
+    Item i holds every variable of `variables`, a series as (window, ...), a number of the trajectory as (), in SI units, and `trajectory`, `start`: where it comes from. `window` is a number of samples, the whole run by default;
     windows of a trajectory begin every `stride` samples, `window` by default. Unfinished shards and failed simulations are
     left out. The object is small, can be pickled, and opens the store in each process for itself, forked ones included.
 
@@ -32,15 +31,9 @@ class Trajectories(Dataset[dict[str, Tensor]]):
     """
 
     def __init__(
-        self,
-        url: str,
-        variables: Sequence[str],
-        *,
-        split: str | None = None,
-        window: int | None = None,
-        stride: int | None = None,
-        dtype: torch.dtype = torch.float64,
-    ) -> None:
+        self, url: str, variables: Sequence[str], *, split: str | None = None, window: int | None = None,
+        stride: int | None = None, dtype: torch.dtype = torch.float64,
+    ) -> None:  # fmt: skip
         self.url, self.variables, self.dtype = str(url), tuple(variables), dtype
         self._group: zarr.Group | None = None
         self._opened_by = 0
@@ -62,18 +55,18 @@ class Trajectories(Dataset[dict[str, Tensor]]):
         """Numbers of the trajectories that are finished, sound and in the split."""
         splits = np.asarray(self.array("split")[:])
         done = np.repeat(np.asarray(self.array("done")[:]), self.array("split").chunks[0])[: len(splits)]
-        wanted = (done == 1) & (np.asarray(self.array("failed")[:]) == 0)
+        usable = (done == 1) & (np.asarray(self.array("failed")[:]) == 0)
         if split is not None:
             if split not in ("train", "validation", "test"):
                 raise ValueError(f"`split` must be 'train', 'validation' or 'test', but is {split!r}")
-            wanted &= splits == split
-        return np.flatnonzero(wanted)
+            usable &= splits == split
+        return np.flatnonzero(usable)
 
     @property
     def group(self) -> zarr.Group:
         """The store, opened on first use; once more after a fork, which connections do not survive."""
         if self._group is None or self._opened_by != os.getpid():
-            self._group, self._opened_by = zarr.open_group(place(self.url), mode="r"), os.getpid()
+            self._group, self._opened_by = zarr.open_group(local_path(self.url), mode="r"), os.getpid()
         return self._group
 
     def array(self, name: str) -> zarr.Array[Any]:
@@ -99,11 +92,11 @@ class Trajectories(Dataset[dict[str, Tensor]]):
         item = {"trajectory": torch.tensor(trajectory), "start": torch.tensor(start)}
         for name in self.variables:
             array = self.array(name)
-            place = (trajectory, slice(start, start + self.window)) if array.ndim > 1 else trajectory
-            item[name] = torch.from_numpy(np.array(array[place])).to(self.dtype)
+            index = (trajectory, slice(start, start + self.window)) if array.ndim > 1 else trajectory
+            item[name] = torch.from_numpy(np.array(array[index])).to(self.dtype)
         return item
 
 
 def open_dataset(url: str) -> xr.Dataset:
     """The whole store, lazily, with named dimensions and units."""
-    return xr.open_zarr(place(url))
+    return xr.open_zarr(local_path(url))

@@ -2,9 +2,13 @@
 
 from dataclasses import dataclass
 
+from torchsoft.channels import VARIABLES
 from torchsoft.datasets.config import RATIO, Config
 from torchsoft.kernels.run import DISSIPATED, SUPPLIED
 from torchsoft.parameters import Parameters
+
+KEPT = tuple(name for name in VARIABLES if name not in ("time", "angular_momentum"))
+"""Variables of the rig's channels that a dataset keeps of every trajectory."""
 
 STORES = ("strain_L", "strain_U", "normal_springs", "tangential_springs", "disc", "spin", "bracket")
 
@@ -27,20 +31,9 @@ class Variable:
 def variables(config: Config) -> dict[str, Variable]:
     """Everything that is kept of a trajectory, by name."""
     out = {
-        "disc_position": Variable(MOTION, "m", "centre of mass of the disc"),
-        "disc_angle": Variable(SERIES, "rad", "rotation of the disc, anticlockwise"),
-        "disc_velocity": Variable(MOTION, "m/s", "velocity of the disc's centre"),
-        "disc_spin": Variable(SERIES, "rad/s", "angular velocity of the disc"),
-        "bracket_position": Variable(MOTION, "m", "centre of mass of the bracket; it does not turn"),
-        "bracket_velocity": Variable(MOTION, "m/s", "velocity of the bracket"),
-        "control_force": Variable(MOTION, "N", "controllers' force on the bracket, feed-forward included (Eq. 32, 34)"),
-        "bracket_moment": Variable(SERIES, "N.m", "moment on the bracket about its centre (Eq. 35)"),
-        "desired_x": Variable(SERIES, "m", "x_d of the disc"),
-        "desired_x_velocity": Variable(SERIES, "m/s", "rate of x_d"),
-        "desired_y": Variable(SERIES, "m", "y_d of the bracket"),
-        "desired_y_velocity": Variable(SERIES, "m/s", "rate of y_d"),
-        "feed_forward": Variable(SERIES, "N", "vertical force fed forward to the bracket"),
-    }
+        name: Variable(MOTION if len(v.symbols) > 1 else SERIES, v.unit, v.meaning)
+        for name, v in VARIABLES.items() if name in KEPT
+    }  # fmt: skip
     for pad in ("lower", "upper"):
         node, per = ("trajectory", "time", f"{pad}_surface"), f"each surface node of the {pad} pad"
         out[f"normal_force_{pad}"] = Variable(node, "N", f"normal force at {per}", config.node_precision)
@@ -59,7 +52,7 @@ def variables(config: Config) -> dict[str, Variable]:
     if RATIO in config.parameters:
         out["contact.mu_k"] = Variable(SINGLE, "1", f"parameter: {table['contact.mu_k']['meaning']}")
     return out | {
-        "grasp_depth": Variable(SINGLE, "m", "compression of both pads together that is asked for in the grasp"),
+        "grasp_depth": Variable(SINGLE, "m", "set-point of the compression of both pads together in the grasp"),
         "grasp_force": Variable(SINGLE, "N", "grasping force fed forward"),
         "steps": Variable(SINGLE, "1", "steps of the stepper", "int64"),
         "newton_iterations": Variable(SINGLE, "1", "Newton iterations of all steps", "int64"),

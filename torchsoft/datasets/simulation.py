@@ -8,7 +8,7 @@ import torch
 from torchsoft.datasets.config import RATIO, Config
 from torchsoft.datasets.design import Task
 from torchsoft.datasets.excitation import excitation
-from torchsoft.datasets.schema import STORES, sizes, variables
+from torchsoft.datasets.schema import KEPT, STORES, sizes, variables
 from torchsoft.equilibrium import holding_force, press, rest
 from torchsoft.excitation import reference
 from torchsoft.implicit import SimulationFailed
@@ -20,7 +20,7 @@ from torchsoft.trajectory import Trajectory
 
 Row = dict[str, Any]
 
-PLACE, FORCE = 10, 4
+POSITION, FORCE = 10, 4
 """Decimals that starting displacements [m] and grasping forces [N] are rounded to: linear solvers differ in the last bits
 with the alignment of memory, and a run may amplify that."""
 
@@ -34,7 +34,7 @@ def simulate_task(config: Config, task: Task) -> Row:
     t = torch.arange(config.samples, dtype=torch.float64) * config.sample_interval
     try:
         model = SoftGrasp(task.parameters)
-        y0 = torch.round(rest(model).detach(), decimals=PLACE) + 0.0  # no negative zeros
+        y0 = torch.round(rest(model).detach(), decimals=POSITION) + 0.0  # no negative zeros
         if config.feed_forward == "found":
             force = find_grasp_force(model, y0, config.step)
         else:
@@ -74,22 +74,10 @@ def labels(task: Task) -> Row:
 
 @torch.no_grad()
 def series(model: SoftGrasp, run: Trajectory) -> Row:
-    """What a finished run leaves in the dataset."""
-    s = run.state
+    """The series and numbers of a finished run."""
+    s, data = run.state, run.to_dataset()
     out: Row = {
-        "disc_position": s.r_C,
-        "disc_angle": s.theta,
-        "disc_velocity": s.v_C,
-        "disc_spin": s.omega,
-        "bracket_position": s.r_Br,
-        "bracket_velocity": s.v_Br,
-        "control_force": run.control,
-        "bracket_moment": run.bracket_moment,
-        "desired_x": run.desired[:, 0],
-        "desired_x_velocity": run.desired[:, 1],
-        "desired_y": run.desired[:, 2],
         "desired_y_velocity": run.desired[:, 3],
-        "feed_forward": run.desired[:, 4],
         "injected_energy": run.injected,
         "energy_residual": run.energy_residual,
         "stored_energy": torch.stack([run.energy[name] for name in STORES], -1),
@@ -101,8 +89,13 @@ def series(model: SoftGrasp, run: Trajectory) -> Row:
         out[f"normal_force_{pad}"], out[f"friction_force_{pad}"] = force.unbind(-1)
         out[f"displacement_{pad}"] = u[:, model.pads[k].surface]
         out[f"contact_{pad}"] = (model.frame(k, s).g > 0).to(torch.uint8)
-    return {name: value.numpy() for name, value in out.items()} | {
-        "steps": run.stats.steps,
-        "newton_iterations": run.stats.newton_iterations,
-        "energy_residual_rel": run.energy_residual_rel,
-    }
+    channels = {name: data[name].values for name in KEPT if name in data}
+    return (
+        channels
+        | {name: value.numpy() for name, value in out.items()}
+        | {
+            "steps": run.stats.steps,
+            "newton_iterations": run.stats.newton_iterations,
+            "energy_residual_rel": run.energy_residual_rel,
+        }
+    )

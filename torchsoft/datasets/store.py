@@ -2,7 +2,6 @@
 
 import errno
 import json
-import os
 import subprocess
 import warnings
 from collections.abc import Iterator
@@ -19,9 +18,10 @@ from numpy.typing import NDArray
 from zarr.codecs import BloscCodec
 
 from torchsoft.datasets.config import Config
-from torchsoft.datasets.reader import place
+from torchsoft.datasets.reader import local_path
 from torchsoft.datasets.schema import Variable, sizes, variables
 from torchsoft.datasets.simulation import Row
+from torchsoft.files import write_json
 from torchsoft.model import SoftGrasp
 from torchsoft.parameters import Parameters
 
@@ -40,7 +40,7 @@ class Store:
 
     def __init__(self, url: str, config: Config) -> None:
         self.url, self.config = url, config
-        self.group = zarr.open_group(place(url), mode="r+", zarr_format=3)
+        self.group = zarr.open_group(local_path(url), mode="r+", zarr_format=3)
 
     def rows(self, shard: int) -> range:
         """The trajectories of a shard."""
@@ -61,7 +61,7 @@ class Store:
         here = self.rows(shard)
         if len(rows) != len(here):
             raise ValueError(f"shard {shard} holds {len(here)} trajectories, but {len(rows)} were given")
-        with telling(self.url):
+        with store_errors(self.url):
             for name, variable in variables(self.config).items():
                 array = self.array(name)
                 assert (array.shards or array.chunks)[0] == self.config.trajectories_per_shard, f"{name} is not aligned"
@@ -71,20 +71,20 @@ class Store:
 
 
 @contextmanager
-def telling(url: str) -> Iterator[None]:
-    """Turn what the operating system, or the client of an object store, has to say into a `StoreError`."""
+def store_errors(url: str) -> Iterator[None]:
+    """Turn errors of the operating system, or of the client of an object store, into a `StoreError`."""
     try:
         yield
     except OSError as error:
-        raise told(error, url) from error
+        raise store_error(error, url) from error
     except Exception as error:
         if isinstance(error, StoreError) or isinstance(filesystem(url)[0], LocalFileSystem):
             raise
         raise StoreError(f"{url}: {type(error).__name__}: {error}") from error
 
 
-def told(error: OSError, url: str) -> StoreError:
-    """What an operating system's error means here."""
+def store_error(error: OSError, url: str) -> StoreError:
+    """An operating system's error with what to do about it."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return StoreError(f"{url}: the disk is full; make room and start again: finished shards are kept")
     if error.errno == errno.EFBIG:
@@ -118,17 +118,17 @@ def open_or_create(url: str, config: Config) -> Store:
 
     Raises `StoreError` for a folder that holds anything else, or that cannot be written.
     """
-    with telling(url):
+    with store_errors(url):
         text = read_text(url, MANIFEST)
         if text is None:
             create(url, config)
         else:
-            same(url, text, config)
-            sweep(url)
+            check_same(url, text, config)
+            remove_partials(url)
         return Store(url, config)
 
 
-def same(url: str, text: str, config: Config) -> None:
+def check_same(url: str, text: str, config: Config) -> None:
     """Refuse to go on with another configuration's or another version's dataset."""
     try:
         manifest = json.loads(text)
@@ -142,7 +142,7 @@ def same(url: str, text: str, config: Config) -> None:
             )
 
 
-def sweep(url: str) -> None:
+def remove_partials(url: str) -> None:
     """Remove the partial files that a killed run left behind in a local folder; object stores show whole objects only."""
     fs, root = filesystem(url)
     if isinstance(fs, LocalFileSystem):
@@ -161,8 +161,8 @@ def create(url: str, config: Config) -> None:
     fs.makedirs(root, exist_ok=True)
     fs.pipe_file(marker, b"this dataset is being laid out")
     attributes: dict[str, Any] = {"title": config.title, "description": config.description, "config_hash": config.hash}
-    group = zarr.create_group(place(url), overwrite=False, zarr_format=3, attributes=attributes)\
-        if not fs.exists(f"{root}/zarr.json") else zarr.open_group(place(url), mode="r+", zarr_format=3)  # fmt: skip
+    group = zarr.create_group(local_path(url), overwrite=False, zarr_format=3, attributes=attributes)\
+        if not fs.exists(f"{root}/zarr.json") else zarr.open_group(local_path(url), mode="r+", zarr_format=3)  # fmt: skip
     for name, variable in variables(config).items():
         lay_out(group, name, variable, config)
     coordinates(group, config)
@@ -202,16 +202,14 @@ def lay_out(group: zarr.Group, name: str, variable: Variable, config: Config) ->
 
 
 def coordinates(group: zarr.Group, config: Config) -> None:
-    """Time and the surface nodes' places; the axes by name."""
+    """Time and the surface nodes' positions; the axes by name."""
     pads = SoftGrasp(Parameters().override(config.fixed)).pads
-    places = {
-        f"{pad}_surface": pads[k].positions[pads[k].surface, 0].numpy() for k, pad in (("L", "lower"), ("U", "upper"))
-    }
+    x = {f"{pad}_surface": pads[k].positions[pads[k].surface, 0].numpy() for k, pad in (("L", "lower"), ("U", "upper"))}
     time = np.arange(config.samples) * config.sample_interval
     columns: dict[str, tuple[NDArray[Any], str, str]] = {
         "time": (time, "s", "time since the start"),
-        "lower_surface": (places["lower_surface"], "m", "x of the lower pad's surface nodes, undeformed"),
-        "upper_surface": (places["upper_surface"], "m", "x of the upper pad's, relative to the bracket's centre"),
+        "lower_surface": (x["lower_surface"], "m", "x of the lower pad's surface nodes, undeformed"),
+        "upper_surface": (x["upper_surface"], "m", "x of the upper pad's, relative to the bracket's centre"),
         "trajectory": (np.arange(config.trajectories), "1", "number of the trajectory in the design"),
     }
     for name, (values, unit, meaning) in columns.items():
@@ -240,13 +238,10 @@ def manifest(config: Config) -> dict[str, Any]:
 def write_manifest(url: str, content: dict[str, Any]) -> None:
     """The file appears whole or not at all."""
     fs, root = filesystem(url)
-    data = (json.dumps(content, indent=2) + "\n").encode()
-    if not isinstance(fs, LocalFileSystem):
-        fs.pipe_file(f"{root}/{MANIFEST}", data)  # object stores put whole objects
-        return
-    partial = Path(root) / f"{MANIFEST}.partial"
-    partial.write_bytes(data)
-    os.replace(partial, Path(root) / MANIFEST)
+    if isinstance(fs, LocalFileSystem):
+        write_json(f"{root}/{MANIFEST}", content)
+    else:  # object stores put whole objects
+        fs.pipe_file(f"{root}/{MANIFEST}", (json.dumps(content, indent=2) + "\n").encode())
 
 
 def commit() -> str:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
+from torchsoft.files import replacing
 from torchsoft.model import SoftGrasp
 from torchsoft.pad import Array
 from torchsoft.plot.figures import ACTUAL, DESIRED, STYLE, timeline
@@ -105,9 +106,8 @@ def animate(
         raise ModuleNotFoundError(f"{path} needs imageio-ffmpeg: pip install 'torchsoft[video]', or write a .gif")
     times = frame_times(trajectory, frames)
     bar = tqdm(render(trajectory, model, times, dpi), "animation", len(times), unit="frame", disable=not progress)
-    partial = path.with_name(path.name + ".partial")
-    (write_gif if path.suffix == ".gif" else write_mp4)(bar, partial)
-    partial.replace(path)
+    with replacing(path) as partial:
+        (write_gif if path.suffix == ".gif" else write_mp4)(bar, partial)
 
 
 def write_gif(pictures: Iterable[Picture], path: Path) -> None:

@@ -85,8 +85,8 @@ def dot(model: SoftGrasp) -> str:
     return to_dot(graph_of(model))
 
 
-def places(graph: nx.DiGraph) -> dict[str, Array]:
-    """Position of every node: hubs where `HUBS` says, elements fanned out around theirs."""
+def positions(graph: nx.DiGraph) -> dict[str, Array]:
+    """Position of every node: hubs as in `HUBS`, elements fanned out around theirs."""
     at = {name: np.array(HUBS[name][:2]) for name in graph if name in HUBS}
     for hub in list(at):
         _, _, angle, step, radius = HUBS[hub]
@@ -97,8 +97,8 @@ def places(graph: nx.DiGraph) -> dict[str, Array]:
     return at
 
 
-def written(name: str, kind: str, label: str) -> str:
-    """What is written at a node, in mathtext."""
+def node_text(name: str, kind: str, label: str) -> str:
+    """The text at a node, in mathtext."""
     if kind in ("1", "MTF"):
         caption = CAPTIONS.get(name, label.removeprefix("1: "))
         return rf"$\mathbf{{{kind}}}$" + "\n" + caption
@@ -130,10 +130,10 @@ def multibond_graph(model: SoftGrasp) -> Figure:
     for i, (label, (low, high)) in enumerate(BANDS.items()):
         axes.axhspan(low, high, color="#f4f4f1" if i % 2 else "#e9ebee", lw=0)
         axes.text(-3.4, 0.5 * (low + high), label, va="center", ha="left", fontsize=10, weight="bold", color="#555555")
-    at, half = places(graph), {}
+    at, half = positions(graph), {}
     for name, data in graph.nodes(data=True):
         hub = data["kind"] in ("1", "MTF")
-        text = written(name, data["kind"], data["label"])
+        text = node_text(name, data["kind"], data["label"])
         letters = len(text.split("\n")[1]) if hub else len(data["label"].strip().replace("_", "").replace("^", ""))
         half[name] = np.array([0.075 * letters + 0.14, 0.36 if hub else 0.22])
         x, y = at[name]

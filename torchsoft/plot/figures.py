@@ -16,6 +16,7 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchsoft.files import replacing
 from torchsoft.model import SoftGrasp
 from torchsoft.pad import Array
 from torchsoft.plot.scene import FRICTION, INK, MM, NORMAL, Instant, Scene, around_contact, force_scale, instants, reach
@@ -59,9 +60,8 @@ SNAPSHOTS = (0.375, 2.5, 5.0, 7.5, 10.0, 17.5, 20.0, 22.5, 25.0)
 
 def save(figure: Figure, path: Path, dpi: int = 150) -> None:
     """Write the figure in the format of the suffix. The file appears whole or not at all."""
-    partial = path.with_name(path.name + ".partial")
-    figure.savefig(partial, dpi=dpi, format=path.suffix[1:])
-    partial.replace(path)
+    with replacing(path) as partial:
+        figure.savefig(partial, dpi=dpi, format=path.suffix[1:])
 
 
 def new_figure(title: str, width: float, height: float) -> Figure:
@@ -241,7 +241,7 @@ def gathered(energies: Mapping[str, Tensor], groups: Mapping[str, tuple[tuple[st
 
 
 @rc_context(STYLE)
-def energy_ledger(trajectory: Trajectory) -> Figure:
+def energy_balance(trajectory: Trajectory) -> Figure:
     """Energy stored and dissipated, stacked, against what the sources supplied, and the residual of that balance."""
     figure = new_figure("Energy: stored and dissipated against supplied", 9.5, 6.2)
     stack, residual = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
@@ -264,7 +264,7 @@ def energy_ledger(trajectory: Trajectory) -> Figure:
     return figure
 
 
-def friction_share(trajectory: Trajectory) -> Array:
+def friction_ratio(trajectory: Trajectory) -> Array:
     """Sum of |F_T| over sum of F_N, both pads, in %; zero where nothing touches."""
     forces = torch.cat((trajectory.force_L, trajectory.force_U), 1)
     normal, friction = forces[..., 0].sum(-1), forces[..., 1].abs().sum(-1)
@@ -273,7 +273,7 @@ def friction_share(trajectory: Trajectory) -> Array:
 
 @rc_context(STYLE)
 def friction_comparison(runs: Mapping[str, tuple[SoftGrasp, Trajectory]]) -> Figure:
-    """Friction of several parameter sets: on both pads in the grasp and in rolling, its share, and the force F_x."""
+    """Friction of several parameter sets: on both pads in the grasp and in rolling, its ratio to the normal force, and F_x."""
     figure = new_figure("Two friction sets compared (paper: Figs. 11b, 14 and 15)", 10, 8)
     axes = figure.subplots(3, 2)
     for panel in axes[:2].flat[1:]:
@@ -290,7 +290,7 @@ def friction_comparison(runs: Mapping[str, tuple[SoftGrasp, Trajectory]]) -> Fig
                 axes[row, column].set(xlabel="x [mm]", ylabel="friction, right + [N]")
     for (name, (_, trajectory)), (colour, marker) in zip(runs.items(), styles):
         line = {"color": colour, "ls": marker[1:], "lw": 1.1, "label": name}
-        axes[2, 0].plot(timeline(axes[2, 0], "friction / normal [%]", trajectory), friction_share(trajectory), **line)
+        axes[2, 0].plot(timeline(axes[2, 0], "friction / normal [%]", trajectory), friction_ratio(trajectory), **line)
         axes[2, 1].plot(timeline(axes[2, 1], "$F_x$ [N]", trajectory), trajectory.control[:, 0].numpy(), **line)
     axes[2, 0].set_title("sum of |friction| over sum of normal force, both pads")
     axes[2, 1].set_title("horizontal control force")

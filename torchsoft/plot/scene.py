@@ -188,7 +188,7 @@ class Scene:
                 self.friction[k].set_data(x, foot + out * self.curves[0] * force[:, 1])
 
     def scale_bar(self, axes: Axes, x: float, y: float) -> None:
-        """A vertical bar at (x, y) [mm] that tells how long the scale's force is."""
+        """A vertical bar at (x, y) [mm] as long as the scale's force."""
         assert self.curves
         millimetres, force = self.curves
         axes.plot([x, x], [y, y + millimetres * force], color=INK, lw=1.5, solid_capstyle="butt")

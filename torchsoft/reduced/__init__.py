@@ -6,20 +6,6 @@ from torchsoft.reduced.records import Record, noisy, record, rolling_radius
 from torchsoft.reduced.terms import friction, joined, mechanics, polynomials
 
 __all__ = [
-    "Choice",
-    "Recipe",
-    "Record",
-    "ReducedModel",
-    "assemble",
-    "choose",
-    "fit",
-    "friction",
-    "joined",
-    "mechanics",
-    "noisy",
-    "polynomials",
-    "record",
-    "rolling_radius",
-    "rollout_of",
-    "score",
+    "Choice", "Recipe", "Record", "ReducedModel", "assemble", "choose", "fit", "friction", "joined", "mechanics", "noisy",
+    "polynomials", "record", "rolling_radius", "rollout_of", "score",
 ]  # fmt: skip

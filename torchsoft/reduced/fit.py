@@ -1,7 +1,7 @@
 """Sparse reduced models from records, with pysindy: regressions, fits, rollouts against records, the choice of thresholds.
 
 Records come from `records`, candidate terms from `terms`, the model is `ode.ReducedModel`. Nothing
-here looks into the simulator: records are data. pysindy takes seconds to import, so it is imported where it is used.
+here uses the simulator: records are data. pysindy takes seconds to import, so it is imported where it is used.
 """
 
 import contextlib
@@ -184,34 +184,28 @@ def rollout_of(model: ReducedModel, on: Record) -> Rollout:
 
 def score(model: ReducedModel, on: Record) -> Score:
     """Rollout error over the whole record, for each state."""
-    out, want = rollout_of(model, on), on.columns(model.states)
-    error = np.sqrt(((out.y - want) ** 2).mean(0))
+    out, exact = rollout_of(model, on), on.columns(model.states)
+    error = np.sqrt(((out.y - exact) ** 2).mean(0))
     error = np.where(np.isfinite(error), error, np.inf)
     over_range, over_deviation = (
-        dict(zip(model.states, (error / size).tolist())) for size in (np.ptp(want, axis=0), want.std(0))
+        dict(zip(model.states, (error / size).tolist())) for size in (np.ptp(exact, axis=0), exact.std(0))
     )
     return Score(over_range, over_deviation, out)
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The chosen model, its place among those tried, and what each came to: thresholds, terms, nrmse, diverged."""
+    """The chosen model, its index among those tried, and the results of each: thresholds, terms, nrmse, diverged."""
 
     model: ReducedModel
-    place: int
+    index: int
     tried: list[dict[str, Any]]
 
 
 def choose(
-    problem: Problem,
-    validation: Sequence[Record],
-    recipe: Recipe,
-    thresholds: Sequence[float],
-    feedback: Mapping[str, Mapping[str, float]] | None = None,
-    *,
-    slack: float = 1.1,
-    each: bool = True,
-) -> Choice:
+    problem: Problem, validation: Sequence[Record], recipe: Recipe, thresholds: Sequence[float],
+    feedback: Mapping[str, Mapping[str, float]] | None = None, *, slack: float = 1.1, each: bool = True,
+) -> Choice:  # fmt: skip
     """The fit with the fewest terms among those whose rollouts of the validation records come within `slack` of the best.
 
     Every equation has its own threshold (all combinations that differ in their terms are rolled out), or all the same with

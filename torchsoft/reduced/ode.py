@@ -13,24 +13,20 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from torchsoft.channels import CHANNELS
 from torchsoft.reduced.rollout import linear_rollout, nonlinear_rollout
 
-SYMBOLS = {
-    "x_C": (r"x_C", "m"),
-    "theta": (r"\theta", "rad"),
-    "x_Br": (r"x_{Br}", "m"),
-    "v_C": (r"\dot x_C", "m/s"),
-    "omega": (r"\dot\theta", "rad/s"),
-    "v_Br": (r"\dot x_{Br}", "m/s"),
-    "F_x": (r"F_x", "N"),
-    "x_d": (r"x_d", "m"),
-    "x_d_dot": (r"\dot x_d", "m/s"),
-    "1": ("1", "1"),
-}
-"""LaTeX and unit of every variable that a record has."""
+ALIASES = {"v_C": "v_x", "v_Br": "v_x_Br"}
+"""Channels by a reduced model's name for them, which leaves the only direction out."""
 
 BEYOND = 100.0
 """A rollout that leaves this many times the states' scale has diverged."""
+
+
+def symbol(name: str) -> tuple[str, str]:
+    """LaTeX and unit of a variable; the name itself where there is no such channel."""
+    channel = CHANNELS.get(ALIASES.get(name, name))
+    return (channel.symbol, channel.unit) if channel else (name, name)
 
 
 class Factor(NamedTuple):
@@ -100,8 +96,8 @@ class Held(nn.Module):
     def forward(self, t: Tensor | float) -> Tensor:
         when = torch.as_tensor(t, dtype=self.t.dtype)
         i = torch.searchsorted(self.t, when.detach()).clamp(1, len(self.t) - 1)
-        share = (when - self.t[i - 1]) / (self.t[i] - self.t[i - 1])
-        return torch.lerp(self.u[i - 1], self.u[i], share.clamp(0.0, 1.0))
+        fraction = (when - self.t[i - 1]) / (self.t[i] - self.t[i - 1])
+        return torch.lerp(self.u[i - 1], self.u[i], fraction.clamp(0.0, 1.0))
 
 
 @dataclass(frozen=True)
@@ -158,8 +154,8 @@ class ReducedModel(nn.Module):
         self.signal: nn.Module | None = None
         table = tabulate(self.terms, (*self.states, *self.inputs))
         self._numpy, self._torch = table, Table(*(torch.from_numpy(np.asarray(part)) for part in table))
-        places = [(self.states.index(target), i) for i, target in enumerate(self.targets)]
-        self._places = tuple(torch.tensor(index, dtype=torch.long) for index in zip(*places)) if places else None
+        entries = [(self.states.index(target), i) for i, target in enumerate(self.targets)]
+        self._entries = tuple(torch.tensor(index, dtype=torch.long) for index in zip(*entries)) if entries else None
         law = [
             (self.inputs.index(name), [*self.states, *self.outer].index(other))
             for name, gains in self.feedback.items() for other in gains
@@ -191,8 +187,8 @@ class ReducedModel(nn.Module):
         for name, rate in self.kinematics.items():
             S[self.states.index(name), self.states.index(rate)] = 1.0
         C = torch.zeros(n, len(self.terms), dtype=torch.float64)
-        if self._places is not None:
-            C = C.index_put(self._places, self.coefficients)
+        if self._entries is not None:
+            C = C.index_put(self._entries, self.coefficients)
         K = torch.zeros(m, n + len(self.outer), dtype=torch.float64)
         for i, name in enumerate(self.inputs):
             if name in self.outer:
@@ -272,14 +268,14 @@ class ReducedModel(nn.Module):
             body = " ".join(
                 f"{'+-'[value < 0]} {_power(abs(value))}\\,{_bracketed(term.latex)}" for term, value in pairs
             )
-            rows.append(rf"\frac{{d}}{{dt}} {SYMBOLS.get(target, (target, ''))[0]} &= {body.removeprefix('+ ') or '0'}")
+            rows.append(rf"\frac{{d}}{{dt}} {symbol(target)[0]} &= {body.removeprefix('+ ') or '0'}")
         return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"
 
     def coefficient_table(self) -> list[dict[str, Any]]:
         """Every coefficient with its unit and, from an ensemble, its interval."""
         rows, intervals = [], self.intervals or [None] * len(self.terms)
         for target, term, value, interval in zip(self.targets, self.terms, self.coefficients.tolist(), intervals):
-            unit = f"{SYMBOLS.get(target, ('', target))[1]}/s per {term.unit}"
+            unit = f"{symbol(target)[1]}/s per {term.unit}"
             rows.append({"equation": target, "term": term.text, "value": value, "unit": unit, "interval": interval})
         return rows
 

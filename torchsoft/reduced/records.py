@@ -1,4 +1,4 @@
-"""Records: motions as a reduced model sees them, from trajectories and datasets, with noise if wanted."""
+"""Records: the variables of a reduced model over time, from trajectories and datasets, with or without noise."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -6,22 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from torchsoft.channels import CHANNELS
+from torchsoft.reduced.ode import ALIASES
 from torchsoft.trajectory import Trajectory
 
 STATES = ("x_C", "theta", "x_Br", "v_C", "omega", "v_Br")
 KINEMATICS = {"x_C": "v_C", "theta": "omega", "x_Br": "v_Br"}
-SOURCES = {
-    "x_C": ("disc_position", 0),
-    "theta": ("disc_angle", None),
-    "x_Br": ("bracket_position", 0),
-    "v_C": ("disc_velocity", 0),
-    "omega": ("disc_spin", None),
-    "v_Br": ("bracket_velocity", 0),
-    "F_x": ("control_force", 0),
-    "x_d": ("desired_x", None),
-    "x_d_dot": ("desired_x_velocity", None),
-}
-"""Where a record's variables stand in a trajectory's or a dataset's series: name and axis."""
+VARIABLES = (*STATES, "F_x", "x_d", "x_d_dot")
+"""What a record may hold."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +41,7 @@ class Record:
 
 def record(source: Trajectory | Mapping[Any, Any], t: Any = None, *, begin: float | None = None) -> Record:
     """A record of a `Trajectory`, or of series by their names in a dataset (an `xarray.Dataset` of one trajectory or an
-    item of `torchsoft.dataset.Trajectories`) at times t [s].
+    item of `torchsoft.datasets.Trajectories`) at times t [s].
 
     Samples before `begin` [s] are left out, and positions and angle counted from the first one kept; x_d from the disc's.
     Raises `ValueError` for times that are not equally spaced and for a value that is not finite, naming the series.
@@ -60,14 +52,16 @@ def record(source: Trajectory | Mapping[Any, Any], t: Any = None, *, begin: floa
     if keep.sum() < 3 or not np.allclose(np.diff(times), times[1] - times[0], rtol=1e-6, atol=0):
         raise ValueError("`t` must hold at least three equally spaced times")
     series = {}
-    for name, (there, axis) in SOURCES.items():
-        if there not in data:
+    for name in VARIABLES:
+        channel = CHANNELS[ALIASES.get(name, name)]
+        if channel.variable not in data:
             continue
-        x = np.asarray(data[there], dtype=float)[keep]
-        x = x if axis is None else x[:, axis]
+        x = channel.of(np.asarray(data[channel.variable], dtype=float)[keep])
         if not np.isfinite(x).all():
             first = times[keep][~np.isfinite(x)][0]
-            raise ValueError(f"series {name!r} ({there}) has values that are not finite, first at t = {first:g} s")
+            raise ValueError(
+                f"series {name!r} ({channel.variable}) has values that are not finite, first at t = {first:g} s"
+            )
         series[name] = x
     origin = {name: float(series[name][0]) for name in ("x_C", "theta", "x_Br") if name in series}
     if "x_d" in series and "x_C" in origin:

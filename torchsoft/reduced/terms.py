@@ -17,7 +17,7 @@ positions, which is why they, and not the positions, are the columns. `friction`
 from collections.abc import Mapping, Sequence
 from itertools import combinations_with_replacement
 
-from torchsoft.reduced.ode import SYMBOLS, Factor, Term
+from torchsoft.reduced.ode import Factor, Term, symbol
 from torchsoft.reduced.records import KINEMATICS
 
 Candidates = Mapping[str, Sequence[Term]]
@@ -34,7 +34,7 @@ def slip(text: str, latex: str, **form: float) -> tuple[Term, Term]:
 
 def variable(name: str) -> Term:
     """The term that is a variable itself."""
-    latex, unit = SYMBOLS[name]
+    latex, unit = symbol(name)
     return Term(name, latex, unit, (Factor({name: 1.0}),))
 
 
@@ -83,8 +83,8 @@ def polynomials(names: Sequence[str], degree: int) -> list[Term]:
         for chosen in combinations_with_replacement(names, d):
             out.append(
                 Term(
-                    " ".join(chosen), " ".join(SYMBOLS[name][0] for name in chosen),
-                    " ".join(SYMBOLS[name][1] for name in chosen), tuple(Factor({name: 1.0}) for name in chosen),
+                    " ".join(chosen), " ".join(symbol(name)[0] for name in chosen),
+                    " ".join(symbol(name)[1] for name in chosen), tuple(Factor({name: 1.0}) for name in chosen),
                 )
             )  # fmt: skip
     return out

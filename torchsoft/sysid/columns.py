@@ -14,14 +14,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from torchsoft.sysid.recording import CHANNELS
+from torchsoft.channels import CHANNELS, FEED_FORWARD, MEASURED, SETPOINTS
 
 Array = NDArray[np.float64]
 
-SETPOINTS = {"x_d": "m", "y_d": "m"}
-OPTIONAL = {"x_d_dot": "m/s", "y_d_dot": "m/s", "F_ff": "N"}
-COLUMNS = {"t": "s", **SETPOINTS, **OPTIONAL, **CHANNELS}
-"""What a column may be called, with its SI unit."""
+COLUMNS = ("t", *SETPOINTS, *FEED_FORWARD, *MEASURED)
+"""Names that a column may have."""
 
 UNITS = {
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6},
@@ -32,16 +30,6 @@ UNITS = {
     "N": {"N": 1.0, "mN": 1e-3, "kN": 1e3},
 }
 """Units by dimension, and what they are in SI."""
-
-TRAJECTORY = {
-    "t": "time", "x_d": "desired_x", "x_d_dot": "desired_x_velocity", "y_d": "desired_y", "F_ff": "feed_forward",
-    "x_C": ("disc_position", 0), "y_C": ("disc_position", 1), "theta": "disc_angle",
-    "x_Br": ("bracket_position", 0), "y_Br": ("bracket_position", 1),
-    "v_x": ("disc_velocity", 0), "v_y": ("disc_velocity", 1), "omega": "disc_spin",
-    "v_x_Br": ("bracket_velocity", 0), "v_y_Br": ("bracket_velocity", 1),
-    "F_x": ("control_force", 0), "F_y": ("control_force", 1),
-}  # fmt: skip
-"""Where the columns are in a file of `Trajectory.save`."""
 
 ROWS = 10
 """A recording has at least as many rows."""
@@ -60,7 +48,7 @@ class Columns:
     row: str = "row"
 
     def at(self, i: int) -> str:
-        """Names a row for people."""
+        """The row as messages name it."""
         return f"{self.path}, {self.row} {self.rows[i]}"
 
     def near(self, time: float) -> str:
@@ -88,7 +76,7 @@ def heading(path: Path, cells: Sequence[str]) -> list[tuple[str, float]]:
             raise ValueError(
                 f"{where} is not known{hint}; columns are {', '.join(COLUMNS)}, each with its unit in brackets"
             )
-        known = UNITS[COLUMNS[name]]
+        known = UNITS[CHANNELS[name].unit]
         if unit is None:
             raise ValueError(f"{where} has no unit: write `{name} [{next(iter(known))}]`")
         if unit not in known:
@@ -141,13 +129,10 @@ def read_trajectory(path: Path) -> Columns:
     """The table in a file of `Trajectory.save`; rows are called samples, counted from 0. Raises `ValueError`."""
     try:
         with xr.open_dataset(path, engine="h5netcdf") as data:
-            missing = [at if isinstance(at, str) else at[0] for at in TRAJECTORY.values()]
-            if missing := [name for name in dict.fromkeys(missing) if name not in data]:
+            columns = {name: CHANNELS[name] for name in COLUMNS if name != "y_d_dot"}  # which such files do not have
+            if missing := [v for v in dict.fromkeys(c.variable for c in columns.values()) if v not in data]:
                 raise ValueError(f"{path} is not a trajectory file: it has no {', '.join(missing)}")
-            values = {
-                name: np.array(data[at] if isinstance(at, str) else data[at[0]][:, at[1]], float)
-                for name, at in TRAJECTORY.items()
-            }
+            values = {name: np.array(c.of(data[c.variable]), float) for name, c in columns.items()}
     except OSError as error:
         if isinstance(error, FileNotFoundError):
             raise
@@ -165,11 +150,11 @@ def checked(table: Columns) -> Columns:
     for name in ("t", *SETPOINTS):
         if name not in values:
             raise ValueError(
-                f"{path} has no column `{name}`; it needs t, x_d, y_d and at least one of {', '.join(CHANNELS)}"
+                f"{path} has no column `{name}`; it needs t, x_d, y_d and at least one of {', '.join(MEASURED)}"
             )
     if len(table.rows) < ROWS:
         raise ValueError(f"{path} has {len(table.rows)} rows of numbers, but needs at least {ROWS}")
-    for name in ("t", *SETPOINTS, *OPTIONAL):
+    for name in ("t", *SETPOINTS, *FEED_FORWARD):
         if name in values and (empty := np.flatnonzero(np.isnan(values[name]))).size:
             raise ValueError(f"{table.at(empty[0])}, column `{name}` is empty; only measured channels may have gaps")
     apart_by = np.diff(values["t"])

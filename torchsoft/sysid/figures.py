@@ -9,9 +9,16 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator
 from numpy.typing import NDArray
 
+from torchsoft.channels import CHANNELS
 from torchsoft.plot.figures import ACTUAL, OTHER, STYLE
-from torchsoft.sysid.recording import CHANNELS
-from torchsoft.sysid.result import LAGS, UNSEEN, Answer, Channel, Direction
+from torchsoft.sysid.result import (
+    IDENTIFIABLE,
+    LAGS,
+    ChannelResiduals,
+    Direction,
+    IdentificationResult,
+    autocorrelation,
+)
 
 Array = NDArray[np.float64]
 
@@ -57,9 +64,9 @@ def literal(text: str, width: int = 200) -> str:
 
 
 @rc_context(STYLE)
-def estimates_figure(answer: Answer, start: list[float]) -> Figure | None:
+def estimates_figure(result: IdentificationResult, start: list[float]) -> Figure | None:
     """Estimates over their starts, with intervals; None where there is nothing on a log scale."""
-    rows = [(e, s) for e, s in zip(answer.estimates, start) if s > 0]
+    rows = [(e, s) for e, s in zip(result.estimates, start) if s > 0]
     if not rows:
         return None
     figure = Figure(figsize=(WIDTH, 0.9 + 0.42 * len(rows)), layout="constrained")
@@ -69,7 +76,7 @@ def estimates_figure(answer: Answer, start: list[float]) -> Figure | None:
     for row, (e, s) in enumerate(rows):
         if e.value is None or e.ci95 is None:
             axes.axhspan(row - 0.32, row + 0.32, color="#f6e3d6", lw=0)
-            axes.text(0.5, row, "the data do not see it", transform=axes.get_yaxis_transform(), ha="center", va="center",
+            axes.text(0.5, row, "not identifiable", transform=axes.get_yaxis_transform(), ha="center", va="center",
                       fontsize=9, color="#a34400")  # fmt: skip
             continue
         low, value, high = (max(v / s, 1e-6) for v in (e.ci95[0], e.value, e.ci95[1]))
@@ -94,13 +101,13 @@ def estimates_figure(answer: Answer, start: list[float]) -> Figure | None:
 
 
 @rc_context(STYLE)
-def correlation_figure(answer: Answer) -> Figure:
+def correlation_figure(result: IdentificationResult) -> Figure:
     """The correlation matrix of the coordinates."""
-    n, C = len(answer.labels), np.array(answer.correlation, float)
+    n, C = len(result.labels), np.array(result.correlation, float)
     figure = Figure(figsize=(WIDTH, max(2.2, 0.7 + 0.42 * n)), layout="constrained")
     axes = figure.subplots()
     image = axes.imshow(C, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
-    names = [literal(label, NAME) for label in answer.labels]
+    names = [literal(label, NAME) for label in result.labels]
     axes.set_xticks(range(n), [str(i + 1) for i in range(n)])
     axes.set_yticks(range(n), [f"{name}   {i + 1}" for i, name in enumerate(names)])
     axes.tick_params(length=0, labelsize=9 if n <= 8 else 7)
@@ -116,22 +123,26 @@ def correlation_figure(answer: Answer) -> Figure:
 
 
 @rc_context(STYLE)
-def spectrum_figure(answer: Answer) -> Figure:
-    """Standard deviation along each eigenvector of the Fisher matrix, its name above its bar; the unseen ones in orange."""
-    n = len(answer.directions)
+def spectrum_figure(result: IdentificationResult) -> Figure:
+    """Standard deviation along each eigenvector of the Fisher matrix, its name above its bar; orange: not identifiable."""
+    n = len(result.directions)
     figure = Figure(figsize=(WIDTH, 1.0 + 0.5 * n), layout="constrained")
     axes = figure.subplots()
-    sds = [d.sd for d in answer.directions]
-    low, high = 10 ** np.floor(np.log10(min(*sds, 0.1))), 10 ** np.ceil(np.log10(max(*sds, 2 * UNSEEN)))
-    for row, d in enumerate(answer.directions):
-        axes.barh(row + 0.18, d.sd, height=0.3, left=0, color=ACTUAL if d.seen else OTHER)
-        text = literal(shorten(direction_name(d), 60, placeholder=" …")) + ("" if d.seen else ": not seen")
+    sds = [d.sd for d in result.directions]
+    low, high = 10 ** np.floor(np.log10(min(*sds, 0.1))), 10 ** np.ceil(np.log10(max(*sds, 2 * IDENTIFIABLE)))
+    for row, d in enumerate(result.directions):
+        axes.barh(row + 0.18, d.sd, height=0.3, left=0, color=ACTUAL if d.identifiable else OTHER)
+        text = literal(shorten(direction_name(d), 60, placeholder=" …")) + (
+            "" if d.identifiable else ": not identifiable"
+        )
         axes.text(0.01, row - 0.17, text, transform=axes.get_yaxis_transform(), va="center", fontsize=9,
-                  color="#1d2329" if d.seen else "#a34400")  # fmt: skip
-    axes.axvline(UNSEEN, color="#1d2329", lw=1, ls=(0, (4, 2)))
+                  color="#1d2329" if d.identifiable else "#a34400")  # fmt: skip
+    axes.axvline(IDENTIFIABLE, color="#1d2329", lw=1, ls=(0, (4, 2)))
     axes.set_xscale("log")
     axes.set(
-        xlim=(low, high), ylim=(n - 0.4, -0.6), xlabel="standard deviation (1 is a factor of e); dashed: seen below it"
+        xlim=(low, high),
+        ylim=(n - 0.4, -0.6),
+        xlabel="standard deviation (1 is a factor of e); dashed: identifiable below it",
     )
     axes.set_yticks([])
     axes.spines["left"].set_visible(False)
@@ -141,9 +152,10 @@ def spectrum_figure(answer: Answer) -> Figure:
 
 
 @rc_context(STYLE)
-def trace_figure(trace: Trace, channel: Channel | None) -> Figure:
+def trace_figure(trace: Trace, channel: ChannelResiduals | None) -> Figure:
     """Measured and predicted, residuals over the noise, and their autocorrelation with the band of white noise."""
-    unit, scale = SHOWN.get(CHANNELS[trace.channel], (CHANNELS[trace.channel], 1.0))
+    unit = CHANNELS[trace.channel].unit
+    unit, scale = SHOWN.get(unit, (unit, 1.0))
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     data, residual, correlation = figure.subplots(3, 1, height_ratios=(2.1, 1, 1))
     data.plot(trace.t, scale * trace.measured, ".", color="#999999", ms=3.5, label="measured")
@@ -163,8 +175,8 @@ def trace_figure(trace: Trace, channel: Channel | None) -> Figure:
     correlation.axhline(0, color="#1d2329", lw=0.6)
     if len(rho):
         correlation.vlines(np.arange(1, len(rho) + 1), 0, rho, color=ACTUAL, lw=2)
-    told = f" (white: p = {channel.p_white:.2g})" if channel is not None else ""
-    correlation.set_title(f"autocorrelation of the residual{told}")
+    white = f" (white: p = {channel.p_white:.2g})" if channel is not None else ""
+    correlation.set_title(f"autocorrelation of the residual{white}")
     correlation.set(xlabel="lag [samples]", xlim=(0.3, LAGS + 0.7))
     most = 1.25 * max(0.25, float(np.abs(rho).max(initial=0.0)))
     correlation.set_ylim(-most, most)
@@ -172,10 +184,3 @@ def trace_figure(trace: Trace, channel: Channel | None) -> Figure:
     for axes in (data, residual, correlation):
         axes.yaxis.set_major_locator(MaxNLocator(5 if axes is data else 3))
     return figure
-
-
-def autocorrelation(r: Array) -> Array:
-    """At lags 1, 2, ..., at most `LAGS` and a quarter of the samples."""
-    c = r - r.mean()
-    lags, power = min(LAGS, len(r) // 4), float(c @ c)
-    return np.array([c[k:] @ c[:-k] / power for k in range(1, lags + 1)]) if power > 0 else np.zeros(lags)

@@ -19,11 +19,11 @@ Notify = Callable[[float], None]
 
 
 class Unreachable(RuntimeError):
-    """The model cannot follow a recording with the parameters that a fit starts from; `lost` says why, and when."""
+    """The model cannot follow a recording with the parameters that a fit starts from; `lost` has reason and time."""
 
     def __init__(self, lost: dict[str, Lost]) -> None:
-        told = "; ".join(f"recording `{name}`: {loss.reason}" for name, loss in lost.items())
-        super().__init__(f"the model cannot reach the data from this start: {told}")
+        reasons = "; ".join(f"recording `{name}`: {loss.reason}" for name, loss in lost.items())
+        super().__init__(f"the model cannot reach the data from this start: {reasons}")
         self.lost = lost
 
 
@@ -110,16 +110,16 @@ def descend(
     fewer runs. Raises `Unreachable` where the start cannot be simulated.
     """
     low, high = (torch.from_numpy(b) for b in problem.coordinates.bounds)
-    mask, share = torch.from_numpy(free), (torch.from_numpy(x) - low) / (high - low)
-    z = torch.logit(share[mask].clamp(1e-6, 1 - 1e-6)).requires_grad_(True)
+    mask, fraction = torch.from_numpy(free), (torch.from_numpy(x) - low) / (high - low)
+    z = torch.logit(fraction[mask].clamp(1e-6, 1 - 1e-6)).requires_grad_(True)
     samples, best, count = problem.samples(which), (np.inf, x), 0
 
-    def place() -> torch.Tensor:
+    def coordinates() -> torch.Tensor:
         return torch.from_numpy(x).masked_scatter(mask, low[mask] + (high - low)[mask] * torch.sigmoid(z))
 
     def closure() -> float:
         nonlocal best, count
-        now = place()
+        now = coordinates()
         value, gradient, lost = problem.misfit(runner, now.detach().numpy(), which, step, free)
         if lost and count == 0:
             raise Unreachable(lost)

@@ -1,4 +1,4 @@
-"""What a Jacobian says of the coordinates: their covariance, and what an error of the model does to them."""
+"""The information in a Jacobian: covariance of the coordinates, and their shift by an error of the model."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ def fisher(J: Array) -> tuple[Array, Array, Array]:
 
 
 def standard_deviations(J: Array) -> Array:
-    """Cramer-Rao: standard deviations (n,) of the coordinates of a whitened Jacobian (m, n); huge where nothing is seen."""
+    """Cramer-Rao: standard deviations (n,) of the coordinates of a whitened Jacobian (m, n); huge without information."""
     return np.sqrt(np.diag(fisher(J)[0]))
 
 

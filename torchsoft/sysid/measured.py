@@ -1,4 +1,4 @@
-"""Measured data, and a TOML file that says what is known, what is unknown, and how good the sensors are.
+"""Measured data, and a TOML file that states what is known, what is unknown, and how good the sensors are.
 
 Every error is a `ValueError` in a sentence that names the file, and the row and column or the field.
 """
@@ -13,13 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
+from torchsoft.channels import CHANNELS, MEASURED, SETPOINTS
 from torchsoft.control import Reference, Sampled
 from torchsoft.excitation import Table, apart
+from torchsoft.files import findings
 from torchsoft.parameters import Parameters
-from torchsoft.sysid.columns import COLUMNS, SETPOINTS, Columns, read_table
+from torchsoft.sysid.columns import Columns, read_table
 from torchsoft.sysid.fit import Loss, Unreachable
 from torchsoft.sysid.problem import Problem
-from torchsoft.sysid.recording import CHANNELS, Recording
+from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.solve import Method
 from torchsoft.sysid.unknowns import Sensor, Unknown
 
@@ -62,7 +64,7 @@ class Entry(Table):
 
 
 class Config(Table):
-    """What a TOML file says about an identification.
+    """An identification as a TOML file states it.
 
     `settings` are known numbers, by the groups and names of `Parameters`; `unknowns` and `sensors` are tables by the dotted
     names of parameters and by channels; `heldout` names recordings that are predicted and not fitted.
@@ -85,22 +87,12 @@ class Case:
     tables: dict[str, Columns]
 
 
-def told(error: ValidationError, group: str = "") -> str:
-    """pydantic's findings in one line, each with its field, in a group or by itself."""
-    out = []
-    for one in error.errors():
-        field = ".".join(str(part) for part in (group, *one["loc"]) if part != "")
-        text = one["msg"].removeprefix("Value error, ").replace("Extra inputs are not permitted", "is not known here")
-        out.append(f"{field}: {text}" if field else text)
-    return "; ".join(out)
-
-
 def read_config(path: str | Path) -> Config:
     """Raises `ValueError` naming the file and the field."""
     try:
         return Config.model_validate(tomllib.loads(Path(path).read_text(encoding="utf-8")))
     except ValidationError as error:
-        raise ValueError(f"{path}: {told(error)}") from None
+        raise ValueError(f"{path}: {findings(error)}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is not a TOML file: {error}") from None
 
@@ -132,20 +124,20 @@ def known(config: Path, name: str, table: Columns, *settings: dict[str, Any]) ->
         part = 0.5 if groups["control"].senses == "bracket" else 1.0  # a disc rolls half as far as the bracket
         mine = {"y_Br_grasp": float(y.min()), "travel": part * float(moved[np.abs(moved).argmax()])}
         return validated(Parameters, tree | {"scenario": mine | tree.get("scenario", {})})
-    except Misfit as error:
+    except InvalidSettings as error:
         raise ValueError(f"{config}, settings of `{name}`: {error}") from None
 
 
-class Misfit(ValueError):
+class InvalidSettings(ValueError):
     """Settings that a group of parameters does not take."""
 
 
 def validated(kind: Any, tree: Any, group: str = "") -> Any:
-    """A group of parameters. Raises `Misfit` naming the field."""
+    """A group of parameters. Raises `InvalidSettings` naming the field."""
     try:
         return kind.model_validate(tree)
     except ValidationError as error:
-        raise Misfit(told(error, group)) from None
+        raise InvalidSettings(findings(error, group)) from None
 
 
 def plausible(table: Columns, p: Parameters, sensors: dict[str, Sensor]) -> None:
@@ -155,7 +147,7 @@ def plausible(table: Columns, p: Parameters, sensors: dict[str, Sensor]) -> None
     ranges = {"rad": (-100.0, 100.0), "m/s": (-10.0, 10.0), "rad/s": (-1e3, 1e3), "N": (-1e4, 1e4)}
     start = {"x_d": begin, "x_C": begin, "x_Br": begin, "theta": 0.0, "y_Br": table.values["y_d"][0]}
     for name, column in table.values.items():
-        unit = COLUMNS[name]
+        unit = CHANNELS[name].unit
         if name == "t":
             continue
         low, high = ranges.get(unit, (-L, 2 * L) if name.startswith("x") else (0.25 * H, 2 * H))
@@ -201,7 +193,7 @@ def read_recording(path: str | Path, name: str, p: Parameters, sensors: dict[str
 def recording(table: Columns, name: str, p: Parameters, sensors: dict[str, Sensor]) -> Recording:
     plausible(table, p, sensors)
     values, t, samples = table.values, table.values["t"], {}
-    for channel in (c for c in CHANNELS if c in values):
+    for channel in (c for c in MEASURED if c in values):
         here = np.isfinite(values[channel])
         if here.sum() >= 2:
             samples[channel] = (t[here], values[channel][here])
@@ -218,26 +210,26 @@ def recording(table: Columns, name: str, p: Parameters, sensors: dict[str, Senso
 def load(data: Sequence[str | Path], config: str | Path) -> Case:
     """The problem that data files and a configuration state. Raises `ValueError`, and `OSError` for what cannot be read."""
     config = Path(config)
-    told_by, tables, recordings = read_config(config), {}, []
-    own = {e.name or Path(str(e.file)).stem: e for e in told_by.recordings}
+    stated, tables, recordings = read_config(config), {}, []
+    own = {e.name or Path(str(e.file)).stem: e for e in stated.recordings}
     files = [(Path(f).stem, Path(f)) for f in data]
     files += [(name, config.parent / e.file) for name, e in own.items() if e.file is not None]
     names = [name for name, _ in files]
     if not files:
         raise ValueError(f"there is nothing to identify from: no data file, and no recording with a file in {config}")
-    if len(own) < len(told_by.recordings) or len(set(names)) < len(names):
+    if len(own) < len(stated.recordings) or len(set(names)) < len(names):
         raise ValueError(f"recordings need names of their own, but are called {', '.join(names)}")
-    if strange := [name for name in (*own, *told_by.heldout) if name not in names]:
+    if strange := [name for name in (*own, *stated.heldout) if name not in names]:
         raise ValueError(f"{config}: there is no recording `{strange[0]}`; there are {', '.join(names)}")
     for name, path in files:
         table = tables[name] = read_table(path)
-        p = known(config, name, table, told_by.settings, own[name].settings if name in own else {})
-        recordings.append(recording(table, name, p, told_by.sensors))
+        p = known(config, name, table, stated.settings, own[name].settings if name in own else {})
+        recordings.append(recording(table, name, p, stated.sensors))
     try:
-        problem = Problem(recordings, told_by.sensors, told_by.unknowns)
+        problem = Problem(recordings, stated.sensors, stated.unknowns)
     except ValueError as error:
         raise ValueError(f"{config}: {error}") from None
-    return Case(problem, told_by, tables)
+    return Case(problem, stated, tables)
 
 
 def unreachable(error: Unreachable, tables: dict[str, Columns]) -> str:

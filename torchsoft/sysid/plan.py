@@ -1,8 +1,8 @@
 """Stages: which data, which unknowns, which ties, in which order.
 
 A fit of everything at once, from far away, ends in a local minimum or in runs that cannot be simulated. So: first the
-slowest recording, at a coarse step, for what it can see; then all of them, with ratios (kinetic over static friction) tied at
-their upper bound, because friction that does not fall with slip always has a solution; then a scan over each ratio; then
+slowest recording, at a coarse step, for what it can identify; then all of them, with ratios (kinetic over static friction) tied
+at their upper bound, because friction that does not fall with slip always has a solution; then a scan over each ratio; then
 everything free, at the full step.
 """
 
@@ -19,9 +19,9 @@ from torchsoft.sysid.workers import Runner
 
 Array = NDArray[np.float64]
 
-SEEN = 0.1
-"""A coordinate takes part in the first look if its predicted standard deviation [1] is below this: one that is seen faintly
-would run off to make up for what is still wrong elsewhere."""
+FIRST_LOOK = 0.1
+"""A coordinate takes part in the first look if its predicted standard deviation [1] is below this: one that is barely
+identifiable would run off to make up for what is still wrong elsewhere."""
 
 COARSE = (4.0, 2.0)
 """The first look and the second stage take steps this many times the full one."""
@@ -59,7 +59,7 @@ def tie_ratios(problem: Problem, x: Array) -> Array:
     return x
 
 
-def visible(J: Array, candidates: NDArray[np.bool_], limit: float = SEEN) -> NDArray[np.bool_]:
+def visible(J: Array, candidates: NDArray[np.bool_], limit: float = FIRST_LOOK) -> NDArray[np.bool_]:
     """The largest set, found greedily, whose members are all known to better than `limit` when the rest is held."""
     out = candidates.copy()
     while out.any():
@@ -71,7 +71,7 @@ def visible(J: Array, candidates: NDArray[np.bool_], limit: float = SEEN) -> NDA
 
 
 def default_plan(problem: Problem, runner: Runner, step: float, which: Sequence[str], starts: int = 1) -> list[Stage]:
-    """Stages for some recordings: the slowest first, for what the Fisher matrix at the start says that it can see.
+    """Stages for some recordings: the slowest first, for what its Fisher matrix at the start makes identifiable.
 
     Raises `Unreachable` where that recording cannot be simulated from the start.
     """

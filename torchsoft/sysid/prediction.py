@@ -1,4 +1,4 @@
-"""What the sensors of one recording would say for given parameters, with the derivative: one run of the model."""
+"""Predicted samples of one recording's sensors for given parameters, with derivatives: one run of the model."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
+from torchsoft.channels import MEASURED
 from torchsoft.model import PARAMETERS, SoftGrasp
 from torchsoft.sensitivity import parameter_derivatives, sensitivities
 from torchsoft.simulate import simulate
-from torchsoft.sysid.recording import CHANNELS, Recording
+from torchsoft.sysid.recording import Recording
 
 Array = NDArray[np.float64]
 
@@ -36,7 +37,7 @@ def rigid(model: SoftGrasp, y: Tensor) -> Tensor:
 
 
 def signals(model: SoftGrasp, t: Tensor, q: Tensor) -> Tensor:
-    """Every channel of `CHANNELS` (G, channels) from poses and rates q (G, 10) at the times t (G,)."""
+    """Every channel of `MEASURED` (G, channels) from poses and rates q (G, 10) at the times t (G,)."""
     F = model.controllers(model.reference(t), q[:, 0:2], q[:, 5:7], q[:, 3:5], q[:, 8:10])
     return torch.cat((q, torch.stack(F, -1)), -1)
 
@@ -79,8 +80,8 @@ class Reading(NamedTuple):
 
 
 def read(prediction: Prediction, channel: str, times: Array, delay: float) -> Reading:
-    """What a sensor with a `delay` [s] says at `times` (k,): the cubic spline through the prediction, `delay` earlier."""
-    at, j = times - delay, list(CHANNELS).index(channel)
+    """Samples of a sensor with a `delay` [s] at `times` (k,): the cubic spline through the prediction, `delay` earlier."""
+    at, j = times - delay, MEASURED.index(channel)
     spline = CubicSpline(prediction.t, prediction.signals[:, j])
     slopes = None
     if prediction.derivatives is not None:
@@ -101,7 +102,7 @@ def misfit(
     (`names`), and by `bias` and `delay` (one entry a channel in `noise`); and the stepper's steps. Raises `SimulationFailed`.
     """
     parameters = dict(model.named_parameters())
-    wanted = [parameters[PARAMETERS[name]].requires_grad_(True) for name in names]
+    unknown = [parameters[PARAMETERS[name]].requires_grad_(True) for name in names]
     at, loss = t[1:], torch.zeros((), dtype=torch.float64)
     run = simulate(model, t, y0=y0, step=step, tolerance=TOLERANCE, gradient="discrete")
     predicted = signals(model, at, rigid(model, run.y[1:]))
@@ -111,10 +112,10 @@ def misfit(
             continue
         times, measured = recording.samples[channel]
         spline = torch.from_numpy(interpolation(at.numpy(), times - delay[channel]))
-        r = (spline @ predicted[:, list(CHANNELS).index(channel)] + bias[channel] - torch.from_numpy(measured)) / sigma
+        r = (spline @ predicted[:, MEASURED.index(channel)] + bias[channel] - torch.from_numpy(measured)) / sigma
         loss = loss + 0.5 * r.square().sum()
         rates = read(Prediction(at.numpy(), predicted.detach().numpy(), None, 0), channel, times, delay[channel]).rates
         out["bias"][k], out["delay"][k] = float(r.detach().sum()) / sigma, -float(r.detach().numpy() @ rates) / sigma
-    gradient = torch.autograd.grad(loss, wanted, allow_unused=True)
+    gradient = torch.autograd.grad(loss, unknown, allow_unused=True)
     out["parameters"] = np.array([0.0 if g is None else float(g) for g in gradient])
     return float(loss.detach()), out, run.stats.steps

@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchsoft.channels import MEASURED
 from torchsoft.sysid.prediction import Prediction, read
-from torchsoft.sysid.recording import CHANNELS, Recording
+from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.unknowns import Coordinates, Sensor, Unknown
 from torchsoft.sysid.workers import Job, Lost, Runner
 
@@ -15,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 class Residuals(NamedTuple):
-    """Residuals r (m,) over the sensors' noise, their Jacobian J (m, n) by the coordinates (zero where not asked for), and
+    """Residuals r (m,) over the sensors' noise, their Jacobian J (m, n) by the coordinates (zero where not free), and
     what was lost: recordings that could not be simulated, with the reason. With a loss r and J are infinite."""
 
     r: Array
@@ -39,8 +40,8 @@ class Problem:
         if not unknowns or all(u.fixed for u in unknowns.values()):
             raise ValueError("there is nothing to identify: no unknown is free")
         for channel in sensors:
-            if channel not in CHANNELS:
-                raise ValueError(f"`{channel}` is not a channel; known: {', '.join(CHANNELS)}")
+            if channel not in MEASURED:
+                raise ValueError(f"`{channel}` is not a channel; known: {', '.join(MEASURED)}")
             if not any(channel in recording.samples for recording in recordings):
                 raise ValueError(f"no recording has samples of `{channel}`")
         for recording in recordings:

@@ -1,4 +1,4 @@
-"""A recording: what was asked of the controllers and what the sensors said, with gaps where they said nothing."""
+"""A recording: the reference that the controllers followed and the samples of the sensors, which may have gaps."""
 
 from dataclasses import dataclass
 from hashlib import sha256
@@ -8,19 +8,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchsoft.channels import MEASURED
 from torchsoft.control import Reference
 from torchsoft.excitation import start
 from torchsoft.model import SoftGrasp
 from torchsoft.parameters import Parameters
 
 Array = NDArray[np.float64]
-
-CHANNELS = {
-    "x_C": "m", "y_C": "m", "theta": "rad", "x_Br": "m", "y_Br": "m",
-    "v_x": "m/s", "v_y": "m/s", "omega": "rad/s", "v_x_Br": "m/s", "v_y_Br": "m/s",
-    "F_x": "N", "F_y": "N",
-}  # fmt: skip
-"""Everything that can be measured, with units: poses, their rates in the same order, and the controllers' forces."""
 
 SETTLE = 0.2
 """Time [s] that the disc is given, before the first sample, to sink into the pad: twenty of the pads' own times 1/tau."""
@@ -50,8 +44,8 @@ class Recording:
         if not self.samples:
             raise ValueError(f"recording `{self.name}` has no samples")
         for channel, (t, y) in self.samples.items():
-            if channel not in CHANNELS:
-                raise ValueError(f"`{channel}` is not a channel; known: {', '.join(CHANNELS)}")
+            if channel not in MEASURED:
+                raise ValueError(f"`{channel}` is not a channel; known: {', '.join(MEASURED)}")
             if t.shape != y.shape or t.ndim != 1 or len(t) < 2:
                 raise ValueError(f"`{channel}` of `{self.name}` needs at least two samples, times and values alike")
             if not (np.isfinite(t).all() and np.isfinite(y).all() and (np.diff(t) > 0).all()):
@@ -70,7 +64,7 @@ class Recording:
 
     @property
     def speed(self) -> float:
-        """Root mean square of the horizontal speed that is asked for [m/s]: slow recordings are the easy ones."""
+        """Root mean square of the horizontal speed of the set-point [m/s]: slow recordings are the easy ones."""
         t = torch.from_numpy(np.linspace(self.times[0], self.times[-1], 2000))
         return float(self.reference(t).x_dot.detach().square().mean().sqrt())
 
@@ -78,9 +72,9 @@ class Recording:
     def fingerprint(self) -> str:
         """Names everything that decides a run or a residual of this recording."""
         t = torch.from_numpy(np.linspace(self.times[0] - SETTLE, self.times[-1], 2000))
-        asked = torch.stack(self.reference(t)).detach().numpy().tobytes()
-        said = b"".join(k.encode() + t.tobytes() + y.tobytes() for k, (t, y) in sorted(self.samples.items()))
-        return sha256(self.settings.model_dump_json().encode() + asked + said).hexdigest()
+        setpoints = torch.stack(self.reference(t)).detach().numpy().tobytes()
+        measured = b"".join(k.encode() + t.tobytes() + y.tobytes() for k, (t, y) in sorted(self.samples.items()))
+        return sha256(self.settings.model_dump_json().encode() + setpoints + measured).hexdigest()
 
     def begin(self) -> tuple[SoftGrasp, Tensor]:
         """A model with the settings and the reference, and the state (size,) from which to simulate."""
@@ -89,7 +83,7 @@ class Recording:
 
     def grid(self, step: float, interpolated: bool) -> Tensor:
         """Times (G,) [s] to simulate: `SETTLE` before the first sample, then the samples' own times, or, where they are
-        irregular or wanted between (`interpolated`), every `step` [s] from a little before the first to after the last."""
+        irregular or needed between (`interpolated`), every `step` [s] from a little before the first to after the last."""
         t = self.times
         if not interpolated and len(np.unique(np.round(np.diff(t) / SAME).astype(np.int64))) <= SPACINGS:
             return torch.from_numpy(np.concatenate(([t[0] - SETTLE], t)))

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from torchsoft.channels import CHANNELS
+from torchsoft.files import replacing
 from torchsoft.sysid.figures import (
     Trace,
     correlation_figure,
@@ -21,8 +23,7 @@ from torchsoft.sysid.figures import (
     trace_figure,
 )
 from torchsoft.sysid.problem import Problem
-from torchsoft.sysid.recording import CHANNELS
-from torchsoft.sysid.result import Answer, split
+from torchsoft.sysid.result import IdentificationResult, split
 from torchsoft.sysid.workers import Runner
 
 STYLE_SHEET = """
@@ -45,7 +46,7 @@ caption{text-align:left;padding-bottom:.3rem}
 th,td{padding:.34rem .8rem .34rem 0;border-bottom:1px solid var(--line);text-align:left;vertical-align:top;
  overflow-wrap:normal}
 td.n,th.n{text-align:right;white-space:nowrap}
-td.unseen{color:#a34400}
+td.weak{color:#a34400}
 figure{margin:.8rem 0}
 figure img{display:block;width:100%;max-width:34rem;height:auto}
 .grid{display:grid;gap:.4rem 1.6rem;grid-template-columns:repeat(auto-fit,minmax(min(100%,24rem),1fr))}
@@ -63,25 +64,24 @@ summary{cursor:pointer;color:var(--soft)}
 """
 
 
-def report(answer: Answer, problem: Problem, path: str | Path, *, checkpoint: str | Path | None = None) -> None:
-    """Write the page about `answer`, which `identify` found for `problem`. It appears whole or not at all.
+def report(
+    result: IdentificationResult, problem: Problem, path: str | Path, *, checkpoint: str | Path | None = None
+) -> None:
+    """Write the page about `result`, which `identify` found for `problem`. It appears whole or not at all.
 
-    Every recording is simulated once more, unless the `checkpoint` folder has it. Raises `ValueError` where the answer is to
-    another problem.
+    Every recording is simulated once more, unless the `checkpoint` folder has it. Raises `ValueError` where the result
+    belongs to another problem.
     """
-    if answer.made_by["recordings"] != {r.name: r.fingerprint for r in problem.recordings}:
-        raise ValueError("the answer was made from other recordings than the problem's")
-    drawn, lost = traces(answer, problem, Path(checkpoint) if checkpoint is not None else None)
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(page(answer, problem, drawn, lost), encoding="utf-8")
-    partial.replace(path)
+    if result.made_by["recordings"] != {r.name: r.fingerprint for r in problem.recordings}:
+        raise ValueError("the result was made from other recordings than the problem's")
+    drawn, lost = traces(result, problem, Path(checkpoint) if checkpoint is not None else None)
+    with replacing(path) as partial:
+        partial.write_text(page(result, problem, drawn, lost), encoding="utf-8")
 
 
-def traces(answer: Answer, problem: Problem, journal: Path | None) -> tuple[list[Trace], dict[str, str]]:
-    """What is seen of every recording at the answer, and why others could not be simulated."""
-    x, step, out, lost = np.array(answer.x), float(answer.made_by["step"]), [], {}
+def traces(result: IdentificationResult, problem: Problem, journal: Path | None) -> tuple[list[Trace], dict[str, str]]:
+    """Measured and predicted samples of every recording at the result, and why others could not be simulated."""
+    x, step, out, lost = np.array(result.x), float(result.made_by["step"]), [], {}
     samples = {recording.name: recording.samples for recording in problem.recordings}
     with Runner(problem.recordings, journal=journal) as runner:
         for name in problem.names:
@@ -93,10 +93,10 @@ def traces(answer: Answer, problem: Problem, journal: Path | None) -> tuple[list
     return out, lost
 
 
-def starts(answer: Answer, problem: Problem) -> list[float]:
+def starts(result: IdentificationResult, problem: Problem) -> list[float]:
     """Value of every estimate at the start; biases and delays start at zero."""
     out = []
-    for e in answer.estimates:
+    for e in result.estimates:
         k = problem.names.index(e.recording) if e.recording in problem.names else 0
         out.append(problem.values(problem.coordinates.start, k).get(e.name, 0.0))
     return out
@@ -107,8 +107,8 @@ def picture(figure: Figure, alt: str, caption: str = "") -> str:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=160)
     inside = base64.b64encode(buffer.getvalue()).decode()
-    told = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
-    return f'<figure><img alt="{escape(alt)}" src="data:image/png;base64,{inside}">{told}</figure>'
+    below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
+    return f'<figure><img alt="{escape(alt)}" src="data:image/png;base64,{inside}">{below}</figure>'
 
 
 def table(head: list[str], rows: list[list[Any]], caption: str = "") -> str:
@@ -121,8 +121,8 @@ def table(head: list[str], rows: list[list[Any]], caption: str = "") -> str:
     numeric = [any(is_number(row[i]) for row in rows) for i in range(len(head))]
     top = "".join(f'<th scope="col" class="{"n" if n else ""}">{escape(h)}</th>' for h, n in zip(head, numeric))
     body = "".join(f"<tr>{''.join(cell(h, v) for h, v in zip(head, row))}</tr>" for row in rows)
-    told = f"<caption>{escape(caption)}</caption>" if caption else ""
-    return f'<div class="wide"><table>{told}<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
+    above = f"<caption>{escape(caption)}</caption>" if caption else ""
+    return f'<div class="wide"><table>{above}<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def is_number(value: Any) -> bool:
@@ -136,65 +136,73 @@ def grouped(value: float) -> str:
     return f"{float(text):,.0f}".replace(",", "\u202f") if whole else text
 
 
-def estimates_table(answer: Answer, start: list[float]) -> str:
+def estimates_table(result: IdentificationResult, start: list[float]) -> str:
     rows = []
-    for e, s in zip(answer.estimates, start):
-        unit = CHANNELS.get(e.name.removeprefix("bias of "), "" if e.unit == "1" else e.unit)
+    for e, s in zip(result.estimates, start):
+        channel = CHANNELS.get(e.name.removeprefix("bias of "))
+        unit = channel.unit if channel else "" if e.unit == "1" else e.unit
         if e.value is None or e.ci95 is None:
-            found = [("unseen", "the data do not see it"), ("unseen", "none")]
+            found = [("weak", "not identifiable"), ("weak", "none")]
         else:
             found = [grouped(e.value), f"{grouped(e.ci95[0])} … {grouped(e.ci95[1])}"]
         rows.append(
-            [e.label, *found, unit, grouped(s), "yes" if e.seen else ("unseen", "no"), "yes" if e.at_bound else "no"]
+            [
+                e.label,
+                *found,
+                unit,
+                grouped(s),
+                "yes" if e.identifiable else ("weak", "no"),
+                "yes" if e.at_bound else "no",
+            ]
         )
-    return table(["parameter", "estimate", "95 % interval", "unit", "start", "seen", "at a bound"], rows)
+    return table(["parameter", "estimate", "95 % interval", "unit", "start", "identifiable", "at a bound"], rows)
 
 
-def page(answer: Answer, problem: Problem, drawn: list[Trace], lost: dict[str, str]) -> str:
+def page(result: IdentificationResult, problem: Problem, drawn: list[Trace], lost: dict[str, str]) -> str:
     """The whole HTML text."""
-    start, cost, made = starts(answer, problem), answer.cost, answer.made_by
-    seen = sum(e.seen for e in answer.estimates)
-    head = f"{seen} of {len(answer.estimates)} parameters seen, χ² = {answer.chi2:.3g}"
-    if answer.notices:
-        items = "".join(f"<li>{escape(notice)}</li>" for notice in answer.notices)
+    start, cost, made = starts(result, problem), result.cost, result.made_by
+    count = sum(e.identifiable for e in result.estimates)
+    head = f"{count} of {len(result.estimates)} parameters identifiable, χ² = {result.chi2:.3g}"
+    if result.notices:
+        items = "".join(f"<li>{escape(notice)}</li>" for notice in result.notices)
         notices = f'<div class="notices" role="note"><strong>Read this first</strong><ul>{items}</ul></div>'
     else:
-        notices = '<p class="fine">Converged, residuals white, step fine enough: nothing to warn of.</p>'
-    within = {(c.recording, c.channel): c for c in answer.residuals}
+        notices = '<p class="fine">Converged, residuals white, step fine enough: there is nothing to warn of.</p>'
+    within = {(c.recording, c.channel): c for c in result.residuals}
     parts = [
         f"<h1>{escape(head)}</h1>",
-        f'<p class="soft">{escape(", ".join(r for r in problem.names if r not in answer.heldout))}: '
+        f'<p class="soft">{escape(", ".join(r for r in problem.names if r not in result.heldout))}: '
         f"{cost['data_seconds']:.3g} s of data, {cost['samples']:.0f} samples. χ² is the sum of squared residuals over the "
         "noise, per degree of freedom: 1 where model and noise are right.</p>",
         notices,
         "<h2>Estimates</h2>",
-        estimates_table(answer, start),
+        estimates_table(result, start),
     ]
-    if (figure := estimates_figure(answer, start)) is not None:
-        told = "; ".join(
-            f"{e.label} {f'{e.value / s:.3g} times its start' if e.value is not None else 'not seen'}"
-            for e, s in zip(answer.estimates, start) if s > 0
+    if (figure := estimates_figure(result, start)) is not None:
+        ratios = "; ".join(
+            f"{e.label} {f'{e.value / s:.3g} times its start' if e.value is not None else 'not identifiable'}"
+            for e, s in zip(result.estimates, start) if s > 0
         )  # fmt: skip
-        parts.append(picture(figure, f"Estimates over their start values: {told}"))
-    unseen = [direction_name(d) for d in answer.directions if not d.seen]
+        parts.append(picture(figure, f"Estimates over their start values: {ratios}"))
+    weak = [direction_name(d) for d in result.directions if not d.identifiable]
     parts += [
-        "<h2>What the data tell, and what they do not</h2>",
-        "<p>Each bar is a combination of parameters (of their logarithms) that the data know on its own: the shorter, the "
+        "<h2>What is identifiable, and what is not</h2>",
+        "<p>Each bar is a combination of parameters (of their logarithms) that the data determine on its own: the shorter, the "
         "better. Long orange bars are combinations that may change without a trace in the data.</p>",
         '<div class="grid">',
         picture(
-            spectrum_figure(answer),
+            spectrum_figure(result),
             "Fisher spectrum: "
-            + "; ".join(f"{direction_name(d)}: standard deviation {d.sd:.2g}" for d in answer.directions)
-            + (f". Not seen: {'; '.join(unseen)}" if unseen else ". All are seen"),
+            + "; ".join(f"{direction_name(d)}: standard deviation {d.sd:.2g}" for d in result.directions)
+            + (f". Not identifiable: {'; '.join(weak)}" if weak else ". All are identifiable"),
             "Fisher spectrum",
         ),
-        picture(correlation_figure(answer), f"Correlations: {correlations(answer)}", "Correlation of the estimates"),
+        picture(correlation_figure(result), f"Correlations: {correlations(result)}", "Correlation of the estimates"),
         "</div>",
         "<h2>Data against prediction</h2>",
     ]
     for name in problem.names:
-        kind = "held out: predicted, not fitted" if name in answer.heldout else "fitted"
+        kind = "held out: predicted, not fitted" if name in result.heldout else "fitted"
         parts.append(f"<h3>{escape(name)} ({kind})</h3>")
         if name in lost:
             parts.append(f'<p class="notices">Could not be simulated: {escape(lost[name])}</p>')
@@ -204,23 +212,23 @@ def page(answer: Answer, problem: Problem, drawn: list[Trace], lost: dict[str, s
             alt = f"{trace.channel} of {name}, measured and predicted: residuals are {rms:.2f} times the noise"
             parts.append(picture(trace_figure(trace, within.get((name, trace.channel))), alt))
         parts.append("</div>")
-    if answer.heldout:
-        rows = [[r, c, f"{100 * v:.3g} %"] for r, channels in answer.heldout.items() for c, v in channels.items()]
-        told = "RMS error of the prediction over the range of what was measured"
-        parts += ["<h2>Held-out recordings</h2>", table(["recording", "channel", "NRMSE"], rows, told)]
+    if result.heldout:
+        rows = [[r, c, f"{100 * v:.3g} %"] for r, channels in result.heldout.items() for c, v in channels.items()]
+        caption = "RMS error of the prediction over the range of what was measured"
+        parts += ["<h2>Held-out recordings</h2>", table(["recording", "channel", "NRMSE"], rows, caption)]
     stages = [
         [s["name"], ", ".join(s["free"]), f"{1e3 * s['step']:g} ms", f"{s['evaluations']}", f"{s['chi2']:.4g}",
-         "yes" if s["converged"] else "no", f"{s['wall_s']:.1f} s"] for s in answer.stages
+         "yes" if s["converged"] else "no", f"{s['wall_s']:.1f} s"] for s in result.stages
     ]  # fmt: skip
-    count = ", ".join(
+    runs = ", ".join(
         f"{cost[k]:.0f} {name}"
         for k, name in (("simulations", "simulations"), ("jacobians", "Jacobians"), ("gradients", "gradients"),
-                        ("remembered", "of them known from before")) if cost[k]
+                        ("remembered", "of them read from the checkpoint")) if cost[k]
     )  # fmt: skip
     parts += [
         "<h2>Stages and cost</h2>",
         table(["stage", "free", "step", "evaluations", "χ²", "converged", "time"], stages),
-        f"<p>{count}; {cost['wall_s']:.1f} s in all.</p>",
+        f"<p>{runs}; {cost['wall_s']:.1f} s in all.</p>",
         "<h2>How it was made</h2>",
         made_list(made),
         "<details><summary>Everything that decides the result</summary>"
@@ -233,9 +241,9 @@ def page(answer: Answer, problem: Problem, drawn: list[Trace], lost: dict[str, s
     )
 
 
-def correlations(answer: Answer) -> str:
+def correlations(result: IdentificationResult) -> str:
     """The strong ones, in words."""
-    C, labels = answer.correlation, answer.labels
+    C, labels = result.correlation, result.labels
     strong = [
         f"{labels[i]} and {labels[j]} {C[i][j]:.2f}" for i in range(len(labels)) for j in range(i) if abs(C[i][j]) > 0.7
     ]
@@ -250,7 +258,7 @@ def made_list(made: dict[str, Any]) -> str:
         "method": lambda: f"{made['method']}, loss {made['loss']}",
         "step": lambda: f"{1e3 * made['step']:g} ms",
         "seed": lambda: str(made["seed"]),
-        "sensors": lambda: ", ".join(f"{k} ± {s['noise']:g} {CHANNELS[k]}" for k, s in made["sensors"].items()),
+        "sensors": lambda: ", ".join(f"{k} ± {s['noise']:g} {CHANNELS[k].unit}" for k, s in made["sensors"].items()),
         "units": lambda: "SI throughout; pictures show lengths in mm",
         "written": lambda: when,
     }

@@ -1,4 +1,4 @@
-"""What an identification has found, how sure it is, and what it could not see."""
+"""The result of an identification: estimates with intervals, what is identifiable, and the quality of the fit."""
 
 import json
 from dataclasses import asdict, dataclass, field
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from torchsoft.files import finite, replacing
 from torchsoft.parameters import Parameters
 from torchsoft.sysid.problem import Problem, Residuals
 
@@ -16,8 +17,8 @@ Array = NDArray[np.float64]
 
 CONFIDENCE = 0.95
 
-UNSEEN = 0.5
-"""Standard deviation of a coordinate [1] above which the data do not see it: its interval spans a factor of seven."""
+IDENTIFIABLE = 0.5
+"""Standard deviation of a coordinate [1] above which it counts as not identifiable: its interval spans a factor of seven."""
 
 LAGS = 20
 """Autocorrelations that the test of whiteness looks at."""
@@ -29,7 +30,7 @@ STEP_BIAS = 0.5
 @dataclass(frozen=True)
 class Estimate:
     """One parameter (or a sensor's bias or delay) in one recording or in all: value, 95 % interval, standard deviation over
-    the value. What the data cannot see has neither value nor interval, but `last`, where the search happened to end."""
+    the value. A parameter that is not identifiable has neither, but `last`, where the search happened to end."""
 
     name: str
     unit: str
@@ -38,7 +39,7 @@ class Estimate:
     ci95: tuple[float, float] | None
     relative_sd: float
     last: float
-    seen: bool
+    identifiable: bool
     at_bound: bool
     step_bias_sd: float
     """what the step of the simulation shifts the estimate by, in standard deviations"""
@@ -54,12 +55,12 @@ class Direction:
     """An eigenvector of the Fisher matrix in the coordinates: its standard deviation and its largest components by label."""
 
     sd: float
-    seen: bool
+    identifiable: bool
     components: dict[str, float]
 
 
 @dataclass(frozen=True)
-class Channel:
+class ChannelResiduals:
     """Residuals of one channel in one recording, over the noise: their rms, the first autocorrelation, and the Ljung-Box
     p-value of their whiteness."""
 
@@ -71,7 +72,7 @@ class Channel:
 
 
 @dataclass(frozen=True)
-class Answer:
+class IdentificationResult:
     """The result of `identify`: estimates, correlations, directions, residuals, predictions, and how it was made."""
 
     estimates: list[Estimate]
@@ -82,7 +83,7 @@ class Answer:
     chi2: float
     """sum of squared residuals over degrees of freedom; 1 where model and noise are right"""
     converged: bool
-    residuals: list[Channel]
+    residuals: list[ChannelResiduals]
     heldout: dict[str, dict[str, float]]
     """NRMSE of recordings that were not fitted, by recording and channel"""
     notices: list[str]
@@ -99,15 +100,16 @@ class Answer:
         raise KeyError(f"no estimate of `{name}`; there are {', '.join(e.name for e in self.estimates)}")
 
     def to_json(self) -> str:
-        return json.dumps(plain(asdict(self)), indent=1, allow_nan=False)
+        """JSON in which `identifiable` is called `seen`, its name since the first version of the file."""
+        content = finite(asdict(self))
+        for entry in (*content["estimates"], *content["directions"]):
+            entry["seen"] = entry.pop("identifiable")
+        return json.dumps(content, indent=1, allow_nan=False)
 
     def save(self, path: str | Path) -> None:
         """Write the JSON file. It appears whole or not at all."""
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(path.name + ".partial")
-        partial.write_text(self.to_json())
-        partial.replace(path)
+        with replacing(path) as partial:
+            partial.write_text(self.to_json())
 
     def table(self) -> str:
         """One line an estimate."""
@@ -115,32 +117,27 @@ class Answer:
         for e in self.estimates:
             if e.value is None or e.ci95 is None:
                 rows.append(
-                    f"{e.label:34s} {'not seen':>12s}   the data do not tell it (ended at {e.last:.3g} {e.unit})"
+                    f"{e.label:34s} {'none':>12s}   not identifiable (the search ended at {e.last:.3g} {e.unit})"
                 )
             else:
                 rows.append(f"{e.label:34s} {e.value:12.5g}   {e.ci95[0]:.5g} .. {e.ci95[1]:.5g} {e.unit}")
         return "\n".join(rows)
 
 
-def plain(value: Any) -> Any:
-    """Numbers that JSON has no word for become null."""
-    if isinstance(value, dict):
-        return {k: plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
+def autocorrelation(r: Array) -> Array:
+    """Of residuals r (m,) at lags 1, 2, ..., at most `LAGS` and a quarter of the samples."""
+    c = r - r.mean()
+    lags, power = min(LAGS, len(r) // 4), float(c @ c)
+    return np.array([c[k:] @ c[:-k] / power for k in range(1, lags + 1)]) if power > 0 else np.zeros(lags)
 
 
 def whiteness(r: Array) -> tuple[float, float]:
     """First autocorrelation and Ljung-Box p-value of one channel's residuals (m,)."""
-    m, c = len(r), r - r.mean()
-    lags = min(LAGS, m // 4)
-    power = float(c @ c)
-    if lags < 1 or power == 0.0:
+    rho, m = autocorrelation(r), len(r)
+    if not rho.any():
         return 0.0, 1.0
-    rho = np.array([c[k:] @ c[:-k] for k in range(1, lags + 1)]) / power
-    Q = m * (m + 2) * float((rho**2 / (m - np.arange(1, lags + 1))).sum())
-    return float(rho[0]), float(stats.chi2.sf(Q, lags))
+    Q = m * (m + 2) * float((rho**2 / (m - np.arange(1, len(rho) + 1))).sum())
+    return float(rho[0]), float(stats.chi2.sf(Q, len(rho)))
 
 
 def split(problem: Problem, r: Array, which: list[str]) -> dict[tuple[str, str], Array]:
@@ -182,47 +179,47 @@ def estimates(problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shi
                 continue
             slope, value = chain[row] / values[name], values[name]
             sd = float(np.sqrt(max(slope @ C @ slope, 0.0)))
-            seen = sd < UNSEEN
+            identifiable = sd < IDENTIFIABLE
             if c.all[mine[0]].scale == "log":
-                reach = min(q * sd, 700.0)  # what is not seen at all would overflow
+                reach = min(q * sd, 700.0)  # a parameter without any trace in the data would overflow
                 interval = (value * float(np.exp(-reach)), value * float(np.exp(reach)))
             else:
                 interval = (value - q * sd * abs(value), value + q * sd * abs(value))
             out.append(
                 Estimate(
-                    name, table[name]["unit"], recording.name if own else None, value if seen else None,
-                    interval if seen else None, sd, value, seen, bool(edge[mine].any()),
+                    name, table[name]["unit"], recording.name if own else None, value if identifiable else None,
+                    interval if identifiable else None, sd, value, identifiable, bool(edge[mine].any()),
                     float(slope @ shift) / sd if sd > 0 else 0.0,
                 )
             )  # fmt: skip
     for i, one in enumerate(c.all):
         if one.kind != "parameter" and free[i]:
             spread = float(np.sqrt(C[i, i]))
-            value, sd, seen = one.to_value(x[i]), spread * one.slope(x[i]), spread < UNSEEN
+            value, sd, identifiable = one.to_value(x[i]), spread * one.slope(x[i]), spread < IDENTIFIABLE
             unit = "s" if one.kind == "delay" else "of the channel"
-            interval = (value - q * float(sd), value + q * float(sd)) if seen else None
+            interval = (value - q * float(sd), value + q * float(sd)) if identifiable else None
             out.append(
                 Estimate(
-                    one.label, unit, None, value if seen else None, interval, sd / max(abs(value), 1e-300), value,
-                    seen, bool(edge[i]), float(shift[i]) / spread,
+                    one.label, unit, None, value if identifiable else None, interval, sd / max(abs(value), 1e-300), value,
+                    identifiable, bool(edge[i]), float(shift[i]) / spread,
                 )
             )  # fmt: skip
     return out
 
 
 def directions(labels: list[str], values: Array, vectors: Array) -> list[Direction]:
-    """Eigenvectors of the Fisher matrix, the best seen first."""
+    """Eigenvectors of the Fisher matrix, the best determined first."""
     out = []
     for k in np.argsort(values)[::-1]:
         sd = float(1.0 / np.sqrt(max(values[k], 1e-12)))
         order = np.argsort(-np.abs(vectors[:, k]))
         parts = {labels[i]: float(vectors[i, k]) for i in order if abs(vectors[i, k]) > 0.2}
-        out.append(Direction(sd, sd < UNSEEN, parts))
+        out.append(Direction(sd, sd < IDENTIFIABLE, parts))
     return out
 
 
-def residual_channels(problem: Problem, residuals: Residuals, which: list[str]) -> list[Channel]:
+def residual_channels(problem: Problem, residuals: Residuals, which: list[str]) -> list[ChannelResiduals]:
     return [
-        Channel(name, channel, float(np.sqrt(np.mean(r**2))), *whiteness(r))
+        ChannelResiduals(name, channel, float(np.sqrt(np.mean(r**2))), *whiteness(r))
         for (name, channel), r in split(problem, residuals.r, which).items()
     ]

@@ -1,4 +1,4 @@
-"""`identify`: carry out a plan of stages, then say how sure the result is and what it does not know."""
+"""`identify`: carry out a plan of stages, then state how certain the result is and what is not identifiable."""
 
 import time as clock
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from torchsoft.sysid.plan import Stage, default_plan
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.result import (
     STEP_BIAS,
-    Answer,
+    IdentificationResult,
     directions,
     estimates,
     nrmse,
@@ -43,8 +43,8 @@ def identify(
     problem: Problem, *, step: float = 5e-4, plan: Sequence[Stage] | None = None, starts: int = 1, loss: Loss = "linear",
     method: Method = "gauss_newton", heldout: Sequence[str] = (), workers: int = 1, checkpoint: str | Path | None = None,
     progress: bool = False, seed: int = 0, polished: bool = True,
-) -> Answer:  # fmt: skip
-    """Find the unknown parameters of `problem`, with intervals, and what the data cannot tell.
+) -> IdentificationResult:  # fmt: skip
+    """Find the unknown parameters of `problem`, with intervals, and find which of them the data do not determine.
 
     `step` [s] is the stepper's in the last stage; `plan` the stages, `default_plan` by default, whose first stage is begun
     from `starts` Sobol points (`seed`). Where that step turns out to shift an estimate by more than `STEP_BIAS` standard
@@ -64,22 +64,22 @@ def identify(
     with Runner(problem.recordings, workers, Path(checkpoint) if checkpoint is not None else None) as runner:
         if plan is None:
             plan = default_plan(problem, runner, step, fitted, starts)
-        x, fit, told = problem.coordinates.start, None, []
+        x, fit, stages = problem.coordinates.start, None, []
         for number, stage in enumerate(plan):
             before = clock.perf_counter()
             with Bar(f"{number + 1}/{len(plan)} {stage.name}", progress) as bar:
                 fit = carry_out(problem, runner, stage, x, loss, method, seed + number, bar)
             x = fit.x
-            told.append(entry(stage.name, stage, stage.step, fit, before))
+            stages.append(entry(stage.name, stage, stage.step, fit, before))
         if fit is None:
             raise ValueError("`plan` has no stages")
         return conclude(
-            problem, runner, plan[-1], fit, fitted, list(heldout), told, method, loss, seed, began, polished, progress
+            problem, runner, plan[-1], fit, fitted, list(heldout), stages, method, loss, seed, began, polished, progress
         )
 
 
 def entry(name: str, stage: Stage, step: float, fit: Fit, began: float) -> dict[str, Any]:
-    """What the answer tells of a stage that began at `began` on the clock [s]."""
+    """The result's entry on a stage that began at `began` on the clock [s]."""
     return {
         "name": name, "recordings": list(stage.recordings), "free": list(stage.free), "step": step,
         "evaluations": fit.evaluations, "chi2": fit.chi2, "converged": fit.converged,
@@ -166,9 +166,9 @@ def sobol(problem: Problem, x: Array, free: NDArray[np.bool_], stage: Stage, see
 
 def conclude(
     problem: Problem, runner: Runner, stage: Stage, fit: Fit, fitted: list[str], heldout: list[str],
-    told: list[dict[str, Any]], method: Method, loss: Loss, seed: int, began: float, polished: bool, bar: bool,
-) -> Answer:  # fmt: skip
-    """The answer at the end of a fit."""
+    stages: list[dict[str, Any]], method: Method, loss: Loss, seed: int, began: float, polished: bool, bar: bool,
+) -> IdentificationResult:  # fmt: skip
+    """The result at the end of a fit."""
     c, x = problem.coordinates, fit.x
     free = np.isin(c.labels, stage.free)
     at = problem.residuals(runner, x, stage.recordings, stage.step, free)
@@ -186,7 +186,7 @@ def conclude(
         before = problem.residuals(runner, end.x, stage.recordings, 2 * step / POLISH)
         if not there.lost and not before.lost:  # the error of the finer step, a quarter of that of the one before
             x, at, finer, step = end.x, there, there, step / POLISH
-            told = [*told, entry("polish", stage, step, end, start)]
+            stages = [*stages, entry("polish", stage, step, end, start)]
             shift[free] = step_shift(at.J[:, free], step_error(before.r, at.r) / 4)
     chi2 = float(at.r @ at.r) / max(len(at.r) - int(free.sum()), 1)
     C[np.ix_(free, free)] = C_free * max(1.0, chi2)
@@ -202,7 +202,7 @@ def conclude(
     sd = np.sqrt(np.diag(C_free))
     channels = residual_channels(problem, at, fitted)
     notices += remarks(found, chi2, fit.converged, step, bool(finer.lost), channels)
-    return Answer(
+    return IdentificationResult(
         estimates=found,
         labels=labels,
         x=[float(v) for v in x],
@@ -213,7 +213,7 @@ def conclude(
         residuals=channels,
         heldout=predicted,
         notices=notices,
-        stages=told,
+        stages=stages,
         cost={
             "simulations": runner.simulations, "jacobians": runner.jacobians, "gradients": runner.gradients,
             "remembered": runner.remembered, "data_seconds": sum(r.duration for r in problem.recordings if r.name in fitted),
@@ -236,11 +236,11 @@ def remarks(
     """Sentences on what a reader must know before using the numbers."""
     out = []
     for e in found:
-        if not e.seen:
-            change = f"a change by {e.relative_sd:.0%}" if e.relative_sd < 9 else "a change by more than its tenfold"
-            out.append(f"the data do not see {e.name}: {change} would not show")
+        if not e.identifiable:
+            change = f"a change by {e.relative_sd:.0%}" if e.relative_sd < 9 else "a change by a factor of ten"
+            out.append(f"{e.name} is not identifiable from these data: {change} would not show in them")
         if e.at_bound:
-            out.append(f"{e.name} ended at a bound ({e.last:.4g}): widen it, or doubt the model")
+            out.append(f"{e.name} ended at a bound ({e.last:.4g}): widen the bound or question the model")
     worst = max(found, key=lambda e: abs(e.step_bias_sd), default=None)
     if unchecked:
         out.append(f"the step of {step:g} s could not be checked: the runs at half of it failed")

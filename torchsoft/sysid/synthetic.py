@@ -3,11 +3,12 @@
 import numpy as np
 import torch
 
+from torchsoft.channels import MEASURED
 from torchsoft.excitation import Excitation, begin
 from torchsoft.parameters import Parameters
 from torchsoft.simulate import simulate
 from torchsoft.sysid.prediction import TOLERANCE, rigid, signals
-from torchsoft.sysid.recording import CHANNELS, SETTLE, Recording
+from torchsoft.sysid.recording import SETTLE, Recording
 from torchsoft.sysid.unknowns import Sensor
 
 RIG = {
@@ -36,9 +37,9 @@ def record(
     t = torch.from_numpy(np.concatenate(([at[0] - SETTLE], at)))
     with torch.no_grad():
         run = simulate(real, t, y0=planned.y0, step=step, tolerance=TOLERANCE)
-        said = signals(real, t[1:], rigid(real, run.y[1:])).numpy()
+        predicted = signals(real, t[1:], rigid(real, run.y[1:])).numpy()
     rng, samples = np.random.default_rng(seed), {}
     for channel, sensor in sensors.items():
-        exact = said[:, list(CHANNELS).index(channel)]
+        exact = predicted[:, MEASURED.index(channel)]
         samples[channel] = (at, exact + noise * sensor.noise * rng.standard_normal(len(at)))
     return Recording(name, planned.model.settings, planned.model.reference, samples)

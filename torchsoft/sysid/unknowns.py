@@ -75,7 +75,7 @@ class Coordinate(NamedTuple):
 
     @property
     def label(self) -> str:
-        """Name for people, such as `contact.K_n`, `contact.mu_k / contact.mu_s`, `delay of theta`."""
+        """Readable name, such as `contact.K_n`, `contact.mu_k / contact.mu_s`, `delay of theta`."""
         what = self.name if self.kind == "parameter" else f"{self.kind} of {self.name}"
         ratio = f" / {self.ratio_to}" if self.ratio_to else ""
         return f"{what}{ratio}" + (f" in {self.recording}" if self.recording else "")
@@ -166,7 +166,7 @@ class Coordinates:
         return out
 
     def nuisance(self, x: Array, channel: str, kind: str) -> tuple[float, int]:
-        """Bias [unit] or delay [s] of a channel, and its place in x (-1 if it is not there)."""
+        """Bias [unit] or delay [s] of a channel, and its index in x (-1 if it is not there)."""
         for i, c in enumerate(self.all):
             if c.kind == kind and c.name == channel:
                 return c.to_value(x[i]), i

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Self
 
 from threadpoolctl import threadpool_limits
 
+from torchsoft.files import replacing
 from torchsoft.implicit import SimulationFailed
 from torchsoft.kernels import HERE, digest
 from torchsoft.processes import local_processes
@@ -140,10 +141,8 @@ class Runner:
         if isinstance(result, Prediction):
             self.steps += result.steps
         if self.journal is not None:
-            path = self._file(job)
-            partial = path.with_suffix(".partial")
-            partial.write_bytes(pickle.dumps(result))
-            partial.replace(path)
+            with replacing(self._file(job)) as partial:
+                partial.write_bytes(pickle.dumps(result))
 
 
 def forget(folder: Path) -> None:
