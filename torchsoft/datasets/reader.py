@@ -23,9 +23,11 @@ def local_path(url: str) -> str:
 class Trajectories(Dataset[dict[str, Tensor]]):
     """Windows of the trajectories of one split, read on access.
 
-    Item i holds every variable of `variables`, a series as (window, ...), a number of the trajectory as (), in SI units, and `trajectory`, `start`: where it comes from. `window` is a number of samples, the whole run by default;
-    windows of a trajectory begin every `stride` samples, `window` by default. Unfinished shards and failed simulations are
-    left out. The object is small, can be pickled, and opens the store in each process for itself, forked ones included.
+    Item i holds every variable of `variables` in SI units, a series as (window, ...) and a number of the trajectory as (),
+    besides `trajectory` and `start`, which tell where it comes from. `window` is a number of samples, the whole run by
+    default; windows of a trajectory begin every `stride` samples, `window` by default. Unfinished shards and failed
+    simulations are left out. The object is small, can be pickled, and opens the store in each process for itself, forked
+    ones included.
 
     Raises `ValueError` for an unknown variable or split, or a window that does not fit.
     """
@@ -92,8 +94,8 @@ class Trajectories(Dataset[dict[str, Tensor]]):
         item = {"trajectory": torch.tensor(trajectory), "start": torch.tensor(start)}
         for name in self.variables:
             array = self.array(name)
-            index = (trajectory, slice(start, start + self.window)) if array.ndim > 1 else trajectory
-            item[name] = torch.from_numpy(np.array(array[index])).to(self.dtype)
+            at = (trajectory, slice(start, start + self.window)) if array.ndim > 1 else trajectory
+            item[name] = torch.from_numpy(np.array(array[at])).to(self.dtype)
         return item
 
 
