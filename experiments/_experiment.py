@@ -36,6 +36,11 @@ def made_by(config: Any, **more: Any) -> dict[str, Any]:
     return {"torchsoft": version("torchsoft"), **more, "config": {k: str(v) for k, v in asdict(config).items()}}
 
 
+def raw_config(config: Any) -> dict[str, Any]:
+    """Version and configuration as JSON values, at the top of a summary."""
+    return {"torchsoft": version("torchsoft"), "config": asdict(config) | {"out": str(config.out)}}
+
+
 def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     """A Markdown table."""
     lines = [head, ["---"] * len(head), *rows]

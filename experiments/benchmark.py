@@ -21,15 +21,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
 import torch
-import tyro
+from _experiment import grid, made_by, options, write
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 from scipy.integrate import solve_ivp
@@ -77,10 +76,6 @@ class Result:
 def prepare(elements_x: int = 120) -> Manipulation:
     changes = {"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30}
     return grasp_and_roll(SoftGrasp(Parameters().override(changes)), grasp_force=80.66)
-
-
-def grid(duration: float) -> torch.Tensor:
-    return torch.linspace(0, duration, round(duration / 0.01) + 1, dtype=torch.float64)
 
 
 def tasks(m: Manipulation, t: torch.Tensor, step: float) -> dict[str, Callable[[], object]]:
@@ -228,7 +223,7 @@ def others(config: Config) -> dict[str, dict[str, float]]:
 
 
 def profile(config: Config) -> dict[str, float]:
-    """Share of a run's time that is spent in the compiled kernel, by a deterministic profiler."""
+    """Part of a run's time that is spent in the compiled kernel, by a deterministic profiler."""
     m = prepare()
     run = tasks(m, grid(config.duration), config.step)["run"]
     profiler = cProfile.Profile()
@@ -247,8 +242,8 @@ def figure(result: Result) -> Figure:
     fig = Figure(figsize=(12, 3.6), layout="constrained")
     left, middle, right = fig.subplots(1, 3)
     ratio = result.figures["costs"]["ratio"]
-    bars = left.bar(list(ratio), list(ratio.values()), color="#0072b2")
-    left.bar_label(bars, fmt="%.2f")
+    columns = left.bar(list(ratio), list(ratio.values()), color="#0072b2")
+    left.bar_label(columns, fmt="%.2f")
     left.margins(y=0.12)
     left.set(ylabel="time over a plain run [1]", title="Run, gradient of all, Jacobian for 8")
     nodes = result.figures["growth"]["surface_nodes"]
@@ -264,8 +259,7 @@ def figure(result: Result) -> Figure:
 
 
 def main() -> None:
-    torch.set_num_threads(1)
-    config = tyro.cli(Config, description=__doc__)
+    config = options(Config, __doc__)
     if config.measure:
         peak_memory(config)
         return
@@ -274,11 +268,8 @@ def main() -> None:
             config, duration=0.5, repeats=1, trajectories=(1, 2), batch_duration=0.2, elements_x=(60, 120), window=2e-3
         )
     result = run(config)
-    config.out.mkdir(parents=True, exist_ok=True)
-    made = {"torchsoft": version("torchsoft"), "config": {k: str(v) for k, v in asdict(config).items()}}
-    (config.out / "summary.json").write_text(json.dumps(result.figures | {"made_by": made}, indent=2))
-    figure(result).savefig(config.out / "benchmark.png", dpi=150)
-    print(json.dumps(result.figures, indent=2) + f"\nwritten to {config.out}")
+    print(json.dumps(result.figures, indent=2))
+    write(config.out, result.figures | {"made_by": made_by(config)}, {"benchmark": figure(result)})
 
 
 if __name__ == "__main__":

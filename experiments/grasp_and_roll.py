@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-import tyro
+from _experiment import COARSE, options
 from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
@@ -45,7 +45,7 @@ class Config:
     friction: Literal["default", "paper-like"] = "default"
     """friction set; with the default one, the paper-like one is run as well and compared"""
     fidelity: Literal["massless", "inertial"] | None = None
-    """of the pads; what the parameters say (massless) if not given"""
+    """of the pads; as in the parameters (massless) if not given"""
     config: Path | None = None
     """TOML file of parameters, a table per group"""
     animation: bool = True
@@ -78,7 +78,7 @@ class Result:
 
 
 def parameters(config: Config, friction: str) -> Parameters:
-    changes: dict[str, Any] = {"pad.elements_x": 60, "pad.elements_y": 2} if config.smoke else {}
+    changes: dict[str, Any] = dict(COARSE) if config.smoke else {}
     if config.fidelity:
         changes["pad.fidelity"] = config.fidelity
     if friction == "paper-like":
@@ -113,7 +113,7 @@ def manipulate(config: Config, friction: str) -> Run:
 
 
 def run(config: Config) -> Result:
-    """The asked-for friction set, and the paper-like one beside the default. Ends with the run that stops early."""
+    """The chosen friction set, and the paper-like one beside the default. Ends with the run that stops early."""
     if config.smoke:
         config = replace(config, duration=0.6)
     runs = {}
@@ -162,7 +162,7 @@ def summary(run: Run) -> dict[str, Any]:
 
 
 def summaries(result: Result) -> dict[str, Any]:
-    """`summary.json`: the asked-for friction set at the top, the other under "paper_like", and how both were made."""
+    """`summary.json`: the chosen friction set at the top, the other under "paper_like", and how both were made."""
     first, *others = map(summary, result.runs.values())
     config = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(result.config).items()}
     made = {"torchsoft": version("torchsoft"), "command": command(result.config), "config": config}
@@ -269,8 +269,7 @@ def write(result: Result) -> None:
 
 
 def main() -> None:
-    torch.set_num_threads(1)
-    config = tyro.cli(Config, description=__doc__)
+    config = options(Config, __doc__)
     try:
         if config.table:
             print(table(json.loads((config.out / "summary.json").read_text())))

@@ -26,42 +26,7 @@ from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.result import IdentificationResult, split
 from torchsoft.sysid.workers import Runner
 
-STYLE_SHEET = """
-:root{color-scheme:light;--ink:#1d2329;--soft:#5d6873;--line:#dfe3e7;--blue:#0077bb;--warn:#fff4e5;--edge:#ee7733}
-*{box-sizing:border-box}
-body{margin:0;background:#fff;color:var(--ink);font:16px/1.55 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif;
- overflow-wrap:anywhere}
-main{max-width:62rem;margin:0 auto;padding:1.5rem 1rem 4rem}
-h1{font-size:1.55rem;line-height:1.25;margin:.2rem 0 .4rem}
-h2{font-size:1.15rem;margin:2.6rem 0 .6rem;padding-top:1rem;border-top:1px solid var(--line)}
-h3{font-size:1rem;margin:1.6rem 0 .4rem}
-p{margin:.5rem 0;max-width:44rem}
-.soft,figcaption,caption{color:var(--soft);font-size:.9rem}
-.notices{background:var(--warn);border-left:4px solid var(--edge);padding:.7rem 1rem .7rem 1.1rem;margin:1rem 0}
-.notices ul{margin:.3rem 0 0;padding-left:1.1rem}
-.fine{border-left:4px solid var(--blue);background:#eef6fb;padding:.6rem 1rem;margin:1rem 0}
-.wide{overflow-x:auto;margin:.6rem 0}
-table{border-collapse:collapse;font-variant-numeric:tabular-nums;font-size:.92rem}
-caption{text-align:left;padding-bottom:.3rem}
-th,td{padding:.34rem .8rem .34rem 0;border-bottom:1px solid var(--line);text-align:left;vertical-align:top;
- overflow-wrap:normal}
-td.n,th.n{text-align:right;white-space:nowrap}
-td.weak{color:#a34400}
-figure{margin:.8rem 0}
-figure img{display:block;width:100%;max-width:34rem;height:auto}
-.grid{display:grid;gap:.4rem 1.6rem;grid-template-columns:repeat(auto-fit,minmax(min(100%,24rem),1fr))}
-dl{display:grid;grid-template-columns:max-content 1fr;gap:.2rem 1rem;font-size:.92rem}
-dt{color:var(--soft)}dd{margin:0}
-pre{overflow-x:auto;background:#f6f7f8;padding:.8rem;font-size:.82rem;line-height:1.4;overflow-wrap:normal}
-summary{cursor:pointer;color:var(--soft)}
-@media(max-width:34rem){
- thead{display:none}table,caption,tbody,tr,td{display:block}
- tr{border-bottom:1px solid var(--line);padding:.4rem 0}
- td,td.n{display:flex;justify-content:space-between;gap:1rem;border:0;padding:.1rem 0;text-align:right;white-space:normal}
- td::before{content:attr(data-label);color:var(--soft);flex:none}
- td:empty{display:none}td:first-child{font-weight:600}td:first-child::before{content:none}
-}
-"""
+STYLE_SHEET = Path(__file__).with_name("report.css")
 
 
 def report(
@@ -237,7 +202,7 @@ def page(result: IdentificationResult, problem: Problem, drawn: list[Trace], los
     return (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta name="viewport" content="width=device-width,initial-scale=1"><title>{escape(head)}</title>'
-        f"<style>{STYLE_SHEET}</style></head><body><main>{''.join(parts)}</main></body></html>\n"
+        f"<style>\n{STYLE_SHEET.read_text(encoding='utf-8')}</style></head><body><main>{''.join(parts)}</main></body></html>\n"
     )
 
 

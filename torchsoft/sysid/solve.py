@@ -15,14 +15,7 @@ from torchsoft.sysid.fit import Fit, Loss, Unreachable, descend, gauss_newton, p
 from torchsoft.sysid.information import fisher, step_error, step_shift
 from torchsoft.sysid.plan import Stage, default_plan
 from torchsoft.sysid.problem import Problem
-from torchsoft.sysid.result import (
-    STEP_BIAS,
-    IdentificationResult,
-    directions,
-    estimates,
-    nrmse,
-    residual_channels,
-)
+from torchsoft.sysid.result import STEP_BIAS, IdentificationResult, directions, estimates, nrmse, residual_channels
 from torchsoft.sysid.workers import Runner
 
 Array = NDArray[np.float64]
