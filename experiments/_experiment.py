@@ -1,9 +1,10 @@
 """What experiments share around their questions: options, output times, tables, the summary and the figures."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
+from time import perf_counter
 from typing import Any, TypeVar
 
 import torch
@@ -15,6 +16,7 @@ from torchsoft.files import replacing, write_json
 from torchsoft.plot.figures import save
 
 C = TypeVar("C")
+T = TypeVar("T")
 
 COARSE: dict[str, Any] = {"pad.elements_x": 60, "pad.elements_y": 2}
 """Parameters of half the usual mesh."""
@@ -29,6 +31,13 @@ def options(config: type[C], description: str | None) -> C:
 def grid(duration: float, spacing: float = 0.01, start: float = 0.0) -> Tensor:
     """Equally spaced output times from `start` to `start + duration` [s], both included."""
     return torch.linspace(start, start + duration, round(duration / spacing) + 1, dtype=torch.float64)
+
+
+def timed(function: Callable[[], T]) -> tuple[T, float]:
+    """What a function returns, and its wall time [s]."""
+    start = perf_counter()
+    out = function()
+    return out, perf_counter() - start
 
 
 def made_by(config: Any, **more: Any) -> dict[str, Any]:

@@ -1,7 +1,6 @@
-"""Windows of motion, their loss, and the routes to its gradient, for `gradient_accuracy.py` to judge."""
+"""Windows of motion, their loss, and the routes to its gradient, judged by central differences."""
 
 import statistics
-import time as clock
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -9,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from _experiment import COARSE
+from _experiment import COARSE, timed
 from torch import Tensor
+from torchdiffeq import odeint, odeint_adjoint
 
 from torchsoft import Parameters, SoftGrasp, press
 from torchsoft.adjoint import differentiable_solution
@@ -19,6 +19,7 @@ from torchsoft.equilibrium import holding_force
 from torchsoft.implicit import ImplicitStepper
 from torchsoft.scenario import grasp_and_roll, reference
 from torchsoft.sensitivity import sensitivities
+from torchsoft.unrolled import unrolled_solution
 
 NEWTON = 1e-10
 """Newton's tolerance of every run here [N]."""
@@ -39,6 +40,8 @@ FINER = {RADIUS: 1e-2}
 """Factors on the relative steps of central differences."""
 
 
+INSENSITIVE = 1e-6
+"""Part of the largest p dL/dp below which the continuous adjoint's gradient is not compared in relative terms."""
 Gradient = dict[str, float]
 
 
@@ -176,12 +179,6 @@ def relative_errors(got: Gradient, judge: Gradient, floor: Gradient | None = Non
     return {n: 0.0 if got[n] == x else abs(got[n] - x) / size[n] if size[n] else float("inf") for n, x in judge.items()}
 
 
-def timed(function: Callable[[], Any]) -> tuple[Any, float]:
-    start = clock.perf_counter()
-    out = function()
-    return out, clock.perf_counter() - start
-
-
 def by_backward(
     window: Window, loss: Callable[[Tensor], Tensor], run: Callable[[], Tensor], config: Config
 ) -> tuple[Gradient, dict[str, float]]:
@@ -282,3 +279,62 @@ def windows(config: Config) -> list[Window]:
         Window("grasp", lowered, above, linspace(0.0, grasp, 2e-3), 2e-3),
     ]
     return [*out, Window("full", model, manipulation.y0, linspace(0.0, config.duration, 0.01), 2e-3)]
+
+
+def judge_window(window: Window, config: Config, bar: Any) -> dict[str, Any]:
+    """Errors and costs of the routes over one window, the slow routes over the few steps about its first event."""
+    full = window.name == "full"
+    loss = make_loss(window)
+    with torch.no_grad():
+        y = states(window)
+    found = events(window, y)
+    judge, unsure, _ = central_differences(window, loss, config, config.full_steps if full else config.steps)
+    bar.update()
+    gradients, costs = {}, {}
+    gradients["discrete"], costs["discrete"] = by_backward(window, loss, lambda: states(window), config)
+    gradients["forward"], costs["forward"] = by_sensitivities(window, loss, config)
+    bar.update()
+    out: dict[str, Any] = {
+        "events": found,
+        "gradient": judge,
+        "judge_uncertainty": {n: unsure[n] / abs(x) if x else 0.0 for n, x in judge.items()},
+        "relative_error": {route: relative_errors(g, judge) for route, g in gradients.items()},
+        "discrete_against_forward": relative_errors(gradients["forward"], gradients["discrete"]),
+        "cost_ratio": costs,
+    }
+    if full or (config.smoke and window.name != "slip"):
+        return out
+    begin = max(0, min(found["first_row"] - 1, len(window.t) - 4))
+    part = replace(window, y0=y[begin].clone(), t=window.t[begin : begin + 4])
+    loss = make_loss(part)
+    with torch.no_grad():
+        out["sub_window_events"] = events(part, states(part))
+    judge, unsure, _ = central_differences(part, loss, config, config.steps)
+    out["judge_uncertainty_sub_window"] = {n: unsure[n] / abs(x) if x else 0.0 for n, x in judge.items()}
+    exact, _ = by_backward(part, loss, lambda: states(part), config)
+    got, costs["unrolled"] = by_backward(
+        part, loss, lambda: unrolled_solution(part.model, part.y0, part.t, step=part.step), config
+    )
+    out["relative_error"]["unrolled"] = relative_errors(got, judge)
+    out["unrolled_against_discrete"] = relative_errors(got, exact)
+    bar.update()
+    with torch.no_grad():
+        start = states(part)[1 if begin else 0].clone()
+    t = part.t[1 if begin else 0] + 1e-3 * linspace(0.0, config.continuous_ms, config.continuous_ms / 2)
+    fine = replace(part, y0=start, t=t, step=1e-6)
+    loss = make_loss(fine)
+    exact, _ = by_backward(fine, loss, lambda: states(fine), replace(config, repeats=1))
+
+    def continuous() -> Tensor:
+        solve = odeint_adjoint if torch.is_grad_enabled() else odeint
+        return solve(fine.model, fine.y0, fine.t, method="rk4", options={"step_size": 2.5e-5})  # pyright: ignore[reportReturnType]
+
+    got, costs["continuous"] = by_backward(fine, loss, continuous, replace(config, repeats=min(config.repeats, 3)))
+    values = {n: p.item() for n, p in scalars(fine.model, config).items()}
+    largest = max(abs(values[n] * x) for n, x in exact.items())
+    floor = {n: INSENSITIVE * largest / value for n, value in values.items()}
+    out["relative_error"]["continuous"] = relative_errors(got, exact, floor)
+    with torch.no_grad():
+        out["continuous_events"] = events(fine, states(fine))
+    bar.update()
+    return out

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import torch
+from _experiment import timed
 
 from torchsoft import Parameters, SoftGrasp, Trajectory
 from torchsoft.reduced.fit import Choice, Recipe, assemble, choose, fit, rollout_of, score
@@ -105,14 +105,9 @@ def ensemble(problem: Any, model: ReducedModel, recipe: Recipe, models: int, fee
     return fit(narrow, replace(recipe, threshold=0.0, models=models), feedback)
 
 
-def timed(model: ReducedModel, on: Record, repeats: int = 9) -> float:
+def rollout_time(model: ReducedModel, on: Record, repeats: int = 9) -> float:
     """Wall time of a rollout [s], the least, which other work on the machine disturbs least."""
-    walls = []
-    for _ in range(repeats):
-        began = perf_counter()
-        rollout_of(model, on)
-        walls.append(perf_counter() - began)
-    return min(walls)
+    return min(timed(lambda: rollout_of(model, on))[1] for _ in range(repeats))
 
 
 def summary_of(choice: Choice, held: Record) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 from _experiment import COARSE, grid
-from _reduced_common import Config, attempt, compared, ensemble, law, slipping, timed
+from _reduced_common import Config, attempt, compared, ensemble, law, rollout_time, slipping
 from tqdm import tqdm
 
 from torchsoft import Parameters, simulate
@@ -99,7 +99,7 @@ def study_slip(config: Config, bar: tqdm) -> tuple[dict[str, Any], dict[str, Any
         rough = [noisy(one, level, config.seed + i) for i, one in enumerate(records)]
         row = attempt(rough, library, recipe, checks, config, feedback, held[min(held)].record, each=False)
         noise.append({"noise": level, **row})
-    fast = {T: timed(model, one.record, 3) for T, one in other.items()}
+    fast = {T: rollout_time(model, one.record, 3) for T, one in other.items()}
     settings = Parameters()
     m, inertia = settings.disc.mass, 0.5 * settings.disc.mass * settings.disc.radius**2
     pushed = 2 / (m + inertia / r**2)  # acceleration of the disc per friction above, while it rolls below

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from _experiment import COARSE, grid
-from _reduced_common import Config, attempt, compared, ensemble, law, slipping, summary_of, timed
+from _reduced_common import Config, attempt, compared, ensemble, law, rollout_time, slipping, summary_of
 from scipy.signal import cont2discrete
 from tqdm import tqdm
 
@@ -233,7 +233,7 @@ def study_stick(config: Config, bar: tqdm) -> tuple[dict[str, Any], dict[str, An
         noise.append({"noise": level, "draws": rows})
     bar.update()
 
-    fast = timed(model_, held)
+    fast = rollout_time(model_, held)
     F_x = held.series["F_x"]
     y = result.rollout.y
     made = law(p)["F_x"]

@@ -19,7 +19,6 @@ import json
 import pstats
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -28,7 +27,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from _experiment import grid, made_by, options, write
+from _experiment import grid, made_by, options, timed, write
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 from scipy.integrate import solve_ivp
@@ -93,21 +92,18 @@ def tasks(m: Manipulation, t: torch.Tensor, step: float) -> dict[str, Callable[[
     }
 
 
-def timed(task: Callable[[], object], repeats: int) -> float:
+def median_time(task: Callable[[], object], repeats: int) -> float:
     """Median wall time [s] after one warm-up."""
     task()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        task()
-        times.append(time.perf_counter() - start)
-    return median(times)
+    return median(timed(task)[1] for _ in range(repeats))
 
 
 def costs(config: Config) -> dict[str, Any]:
     """Times of the three tasks, as ratios to the run, and the peak memory of a process that does one of them."""
     m = prepare()
-    seconds = {name: timed(task, config.repeats) for name, task in tasks(m, grid(config.duration), config.step).items()}
+    seconds = {
+        name: median_time(task, config.repeats) for name, task in tasks(m, grid(config.duration), config.step).items()
+    }
     memory = {}
     for name in ("nothing", *seconds):
         flags = [f"--measure={name}", f"--duration={config.duration}", f"--step={config.step}"]
@@ -154,7 +150,9 @@ def batches(config: Config) -> dict[str, dict[str, float]]:
             list(pool.map(_one_of_many, [(0, 0.1, config.step)] * (4 * cores)))
             for n in config.trajectories:
                 jobs = [(k, config.batch_duration, config.step) for k in range(n)]
-                seconds = timed(lambda pool=pool, jobs=jobs: list(pool.map(_one_of_many, jobs)), min(config.repeats, 3))
+                seconds = median_time(
+                    lambda pool=pool, jobs=jobs: list(pool.map(_one_of_many, jobs)), min(config.repeats, 3)
+                )
                 rate = n * config.batch_duration / seconds
                 out[f"{n} on {cores}"] = {"simulated_per_wall": rate, "per_core": rate / min(cores, n)}
     return out
@@ -165,11 +163,13 @@ def growth(config: Config) -> dict[str, dict[str, float]]:
     meshes, durations = {}, {}
     for n in config.elements_x:
         m, t = prepare(n), grid(config.batch_duration)
-        meshes[str(n + 1)] = timed(tasks(m, t, config.step)["run"], min(config.repeats, 3)) / config.batch_duration
+        meshes[str(n + 1)] = (
+            median_time(tasks(m, t, config.step)["run"], min(config.repeats, 3)) / config.batch_duration
+        )
     m = prepare()
     for duration in (0.1, 0.3, 1.0):
         t = grid(duration * config.duration)
-        durations[f"{duration * config.duration:g}"] = timed(tasks(m, t, config.step)["run"], 3) / float(t[-1])
+        durations[f"{duration * config.duration:g}"] = median_time(tasks(m, t, config.step)["run"], 3) / float(t[-1])
     return {"surface_nodes": meshes, "simulated_s": durations}
 
 
@@ -212,12 +212,13 @@ def others(config: Config) -> dict[str, dict[str, float]]:
     }
     out = {}
     for name, solve in solvers.items():
-        start = time.perf_counter()
-        end = solve()
-        wall = (time.perf_counter() - start) / config.window
-        out[name] = {"wall_per_simulated": wall, "position_error_nm": 1e9 * float((end - exact)[part].norm())}
+        end, wall = timed(solve)
+        out[name] = {
+            "wall_per_simulated": wall / config.window,
+            "position_error_nm": 1e9 * float((end - exact)[part].norm()),
+        }
     longer = grid(config.batch_duration)  # a window is too short to time the stepper on
-    wall = timed(tasks(m, longer, config.step)["run"], config.repeats) / config.batch_duration
+    wall = median_time(tasks(m, longer, config.step)["run"], config.repeats) / config.batch_duration
     out["sdirk2 (this stepper)"]["wall_per_simulated"] = wall
     return out
 

@@ -21,7 +21,6 @@ import numpy as np
 from _experiment import markdown, options, raw_config, write
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from torchsoft import Parameters
@@ -29,9 +28,8 @@ from torchsoft.excitation import CATALOGUE, Excitation, Strokes
 from torchsoft.implicit import SimulationFailed
 from torchsoft.sysid import RIG, Problem, Unknown, record
 from torchsoft.sysid.information import standard_deviations, step_error, step_shift
+from torchsoft.sysid.recording import Array
 from torchsoft.sysid.workers import Runner
-
-Array = NDArray[np.float64]
 
 NAMES: tuple[str, ...] = (
     "contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau",

@@ -14,7 +14,7 @@ kernels kernels.node kernels.linear kernels.pad kernels.stage kernels.run kernel
 kernel_inputs grid implicit stage_laws adjoint sensitivity unrolled torchdiffeq_solver continuous
 trajectory simulate scenario excitation processes
 plot plot.scene plot.figures plot.animation plot.diagram
-sysid.unknowns sysid.recording sysid.prediction sysid.workers sysid.problem
+sysid.recording sysid.unknowns sysid.prediction sysid.workers sysid.problem
 sysid.information sysid.fit sysid.plan
 sysid.result sysid.solve sysid.synthetic sysid.columns sysid.measured sysid sysid.figures sysid.report
 reduced.rollout reduced.ode reduced.records reduced.terms reduced.fit reduced

@@ -69,12 +69,6 @@ def sizes(config: Config) -> dict[str, int]:
     """Length of every dimension."""
     nodes = int(config.fixed.get("pad.elements_x", Parameters().pad.elements_x)) + 1
     return {
-        "trajectory": config.trajectories,
-        "time": config.samples,
-        "axis": 2,
-        "lower_surface": nodes,
-        "upper_surface": nodes,
-        "store": len(STORES),
-        "resistor": len(DISSIPATED),
-        "source": len(SUPPLIED),
-    }
+        "trajectory": config.trajectories, "time": config.samples, "axis": 2, "lower_surface": nodes, "upper_surface": nodes,
+        "store": len(STORES), "resistor": len(DISSIPATED), "source": len(SUPPLIED),
+    }  # fmt: skip

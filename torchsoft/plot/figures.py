@@ -126,26 +126,27 @@ def control_forces(trajectory: Trajectory) -> Figure:
 
 
 @rc_context(STYLE)
+def one_curve(trajectory: Trajectory, title: str, label: str, values: Tensor) -> Figure:
+    """A single signal (T,) over time."""
+    figure = new_figure(title, 6.5, 3.6)
+    axes = figure.subplots()
+    axes.axhline(0, color=INK, lw=0.6)
+    axes.plot(timeline(axes, label, trajectory), values.numpy(), color=ACTUAL, lw=1.1)
+    axes.set_xlabel("time [s]")
+    return figure
+
+
 def bracket_moment(trajectory: Trajectory) -> Figure:
     """Moment on the bracket about its centre of mass."""
-    figure = new_figure("Moment on the bracket about its centre of mass (paper: Fig. 12)", 6.5, 3.6)
-    axes = figure.subplots()
-    t = timeline(axes, "$M_{Br}$ [N m], positive anticlockwise", trajectory)
-    axes.plot(t, trajectory.bracket_moment.numpy(), color=ACTUAL)
-    axes.set_xlabel("time [s]")
-    return figure
+    title = "Moment on the bracket about its centre of mass (paper: Fig. 12)"
+    return one_curve(trajectory, title, "$M_{Br}$ [N m], positive anticlockwise", trajectory.bracket_moment)
 
 
-@rc_context(STYLE)
 def angular_momentum(trajectory: Trajectory) -> Figure:
     """Angular momentum of the disc about its centre of mass."""
-    figure = new_figure("Angular momentum of the disc about its centre of mass (paper: Fig. 17)", 6.5, 3.6)
-    axes = figure.subplots()
-    t = timeline(axes, r"$I_C\,\omega$ [kg mm²/s], positive anticlockwise", trajectory)
-    axes.axhline(0, color=INK, lw=0.6)
-    axes.plot(t, MM**2 * trajectory.inertia * trajectory.state.omega.numpy(), color=ACTUAL, lw=1.1)
-    axes.set_xlabel("time [s]")
-    return figure
+    title = "Angular momentum of the disc about its centre of mass (paper: Fig. 17)"
+    momentum = MM**2 * trajectory.inertia * trajectory.state.omega
+    return one_curve(trajectory, title, r"$I_C\,\omega$ [kg mm²/s], positive anticlockwise", momentum)
 
 
 def contact_forces(axes: Axes, instant: Instant, which: str) -> None:

@@ -12,11 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from torchsoft.channels import CHANNELS, FEED_FORWARD, MEASURED, SETPOINTS
-
-Array = NDArray[np.float64]
+from torchsoft.sysid.recording import Array
 
 COLUMNS = ("t", *SETPOINTS, *FEED_FORWARD, *MEASURED)
 """Names that a column may have."""

@@ -7,10 +7,10 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator
-from numpy.typing import NDArray
 
 from torchsoft.channels import CHANNELS
 from torchsoft.plot.figures import ACTUAL, OTHER, STYLE
+from torchsoft.sysid.recording import Array
 from torchsoft.sysid.result import (
     IDENTIFIABLE,
     LAGS,
@@ -19,8 +19,6 @@ from torchsoft.sysid.result import (
     IdentificationResult,
     autocorrelation,
 )
-
-Array = NDArray[np.float64]
 
 SHOWN = {"m": ("mm", 1e3), "m/s": ("mm/s", 1e3)}
 """Units of pictures, and what one SI unit is in them; others stay as they are."""

@@ -10,9 +10,8 @@ from scipy.optimize import least_squares
 
 from torchsoft.sysid.information import standard_deviations
 from torchsoft.sysid.problem import Problem, Residuals
+from torchsoft.sysid.recording import Array
 from torchsoft.sysid.workers import Lost, Runner
-
-Array = NDArray[np.float64]
 
 Loss = Literal["linear", "soft_l1", "huber", "cauchy", "arctan"]
 Notify = Callable[[float], None]

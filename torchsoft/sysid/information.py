@@ -1,9 +1,8 @@
 """The information in a Jacobian: covariance of the coordinates, and their shift by an error of the model."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from torchsoft.sysid.recording import Array
 
 
 def fisher(J: Array) -> tuple[Array, Array, Array]:

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, ValidationError, model_validator
 
 from torchsoft.channels import CHANNELS, MEASURED, SETPOINTS
@@ -24,8 +23,6 @@ from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.solve import Method
 from torchsoft.sysid.unknowns import Sensor, Unknown
-
-Array = NDArray[np.float64]
 
 BEGINNING, CREEP = 10e-3, 20e-3
 """For so long [s] nothing may move faster than this [m/s]: a disc put down on a pad still settles."""

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 from torchsoft.sysid.fit import Unreachable
 from torchsoft.sysid.information import standard_deviations
 from torchsoft.sysid.problem import Problem
+from torchsoft.sysid.recording import Array
 from torchsoft.sysid.workers import Runner
-
-Array = NDArray[np.float64]
 
 FIRST_LOOK = 0.1
 """A coordinate takes part in the first look if its predicted standard deviation [1] is below this: one that is barely

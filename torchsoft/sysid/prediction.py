@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
@@ -13,9 +12,7 @@ from torchsoft.channels import MEASURED
 from torchsoft.model import PARAMETERS, SoftGrasp
 from torchsoft.sensitivity import parameter_derivatives, sensitivities
 from torchsoft.simulate import simulate
-from torchsoft.sysid.recording import Recording
-
-Array = NDArray[np.float64]
+from torchsoft.sysid.recording import Array, Recording
 
 TOLERANCE = 1e-8
 """Newton tolerance [N] of the runs that fits are made of: far below any sensor, above rounding with the largest dashpots."""

@@ -8,11 +8,9 @@ from numpy.typing import NDArray
 
 from torchsoft.channels import MEASURED
 from torchsoft.sysid.prediction import Prediction, read
-from torchsoft.sysid.recording import Recording
+from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.unknowns import Coordinates, Sensor, Unknown
 from torchsoft.sysid.workers import Job, Lost, Runner
-
-Array = NDArray[np.float64]
 
 
 class Residuals(NamedTuple):

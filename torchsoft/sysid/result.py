@@ -12,8 +12,7 @@ from scipy import stats
 from torchsoft.files import finite, replacing
 from torchsoft.parameters import Parameters
 from torchsoft.sysid.problem import Problem, Residuals
-
-Array = NDArray[np.float64]
+from torchsoft.sysid.recording import Array
 
 CONFIDENCE = 0.95
 

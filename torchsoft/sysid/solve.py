@@ -1,7 +1,8 @@
 """`identify`: carry out a plan of stages, then state how certain the result is and what is not identifiable."""
 
 import time as clock
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -11,14 +12,13 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 from tqdm import tqdm
 
-from torchsoft.sysid.fit import Fit, Loss, Unreachable, descend, gauss_newton, polish
+from torchsoft.sysid.fit import Fit, Loss, Notify, Unreachable, descend, gauss_newton, polish
 from torchsoft.sysid.information import fisher, step_error, step_shift
 from torchsoft.sysid.plan import Stage, default_plan
 from torchsoft.sysid.problem import Problem
+from torchsoft.sysid.recording import Array
 from torchsoft.sysid.result import STEP_BIAS, IdentificationResult, directions, estimates, nrmse, residual_channels
 from torchsoft.sysid.workers import Runner
-
-Array = NDArray[np.float64]
 
 Method = Literal["gauss_newton", "lbfgs", "adam"]
 
@@ -60,7 +60,7 @@ def identify(
         x, fit, stages = problem.coordinates.start, None, []
         for number, stage in enumerate(plan):
             before = clock.perf_counter()
-            with Bar(f"{number + 1}/{len(plan)} {stage.name}", progress) as bar:
+            with progress_bar(f"{number + 1}/{len(plan)} {stage.name}", progress) as bar:
                 fit = carry_out(problem, runner, stage, x, loss, method, seed + number, bar)
             x = fit.x
             stages.append(entry(stage.name, stage, stage.step, fit, before))
@@ -80,21 +80,16 @@ def entry(name: str, stage: Stage, step: float, fit: Fit, began: float) -> dict[
     }  # fmt: skip
 
 
-class Bar:
-    """Progress of one stage: evaluations so far and the latest chi2."""
+@contextmanager
+def progress_bar(label: str, shown: bool) -> Iterator[Notify]:
+    """Shows the progress of one stage: call it with chi2 after every evaluation."""
+    with tqdm(desc=label, unit=" evaluations", disable=not shown) as bar:
 
-    def __init__(self, label: str, shown: bool) -> None:
-        self._bar = tqdm(desc=label, unit=" evaluations", disable=not shown, leave=True)
+        def notify(chi2: float) -> None:
+            bar.set_postfix_str(f"chi2 = {chi2:.4g}", refresh=False)
+            bar.update()
 
-    def __enter__(self) -> "Bar":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
-
-    def __call__(self, chi2: float) -> None:
-        self._bar.set_postfix_str(f"chi2 = {chi2:.4g}", refresh=False)
-        self._bar.update()
+        yield notify
 
 
 def carry_out(
@@ -159,7 +154,7 @@ def sobol(problem: Problem, x: Array, free: NDArray[np.bool_], stage: Stage, see
 
 def conclude(
     problem: Problem, runner: Runner, stage: Stage, fit: Fit, fitted: list[str], heldout: list[str],
-    stages: list[dict[str, Any]], method: Method, loss: Loss, seed: int, began: float, polished: bool, bar: bool,
+    stages: list[dict[str, Any]], method: Method, loss: Loss, seed: int, began: float, polished: bool, progress: bool,
 ) -> IdentificationResult:  # fmt: skip
     """The result at the end of a fit."""
     c, x = problem.coordinates, fit.x
@@ -172,7 +167,7 @@ def conclude(
         shift[free] = step_shift(at.J[:, free], step_error(at.r, finer.r))
     if polished and loss == "linear" and (np.abs(shift[free]) > STEP_BIAS * np.sqrt(np.diag(C_free))).any():
         start = clock.perf_counter()
-        with Bar(f"polish at {step / POLISH:g} s", bar) as notify:
+        with progress_bar(f"polish at {step / POLISH:g} s", progress) as notify:
             end, there = polish(
                 problem, runner, x, at.J, which=stage.recordings, free=free, step=step / POLISH, notify=notify
             )  # fmt: skip

@@ -15,8 +15,7 @@ from pydantic import Field, model_validator
 from torchsoft.excitation import Table
 from torchsoft.model import PARAMETERS
 from torchsoft.parameters import Parameters
-
-Array = NDArray[np.float64]
+from torchsoft.sysid.recording import Array
 
 SPREAD = 10.0
 """Bounds of a logarithmic parameter that gives none: its nominal value divided and multiplied by this."""
