@@ -1,4 +1,4 @@
-"""Question: which motions should a rig make, for its data to tell contact and pad parameters apart?
+"""Question: which motions should a rig make, for its data to identify contact and pad parameters?
 
 For every excitation of `torchsoft.excitation.CATALOGUE` the Fisher matrix F = J^T J of the sensors' predicted samples (J: exact
 sensitivities over the sensors' noise, coordinates: logarithms of the parameters) gives the Cramer-Rao standard deviation

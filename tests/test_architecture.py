@@ -18,7 +18,7 @@ sysid.recording sysid.unknowns sysid.prediction sysid.workers sysid.problem
 sysid.information sysid.fit sysid.plan
 sysid.result sysid.solve sysid.synthetic sysid.columns sysid.measured sysid sysid.figures sysid.report
 reduced.rollout reduced.ode reduced.records reduced.terms reduced.fit reduced
-datasets.reader datasets datasets.config datasets.design datasets.excitation datasets.schema datasets.simulation
+datasets.reader datasets datasets.config datasets.design datasets.schema datasets.simulation
 datasets.store datasets.coverage datasets.check datasets.generate
 cli __main__
 """

@@ -1,4 +1,4 @@
-"""Make the recordings of this folder: a rig whose parameters are `TRUTH`, seen by noisy sensors. Takes some seconds.
+"""Make the recordings of this folder: a rig whose parameters are `TRUTH`, measured by noisy sensors. Takes some seconds.
 
 python examples/identify/make.py
 """

@@ -46,11 +46,7 @@ class Range(Table):
 class PositiveRange(Range):
     """A range of positive values."""
 
-    @model_validator(mode="after")
-    def _is_positive(self) -> Self:
-        if self.low <= 0:
-            raise ValueError(f"must be positive, but low = {self.low}")
-        return self
+    low: float = Field(gt=0)
 
 
 class Drawn(Table):

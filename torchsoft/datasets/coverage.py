@@ -94,7 +94,7 @@ def draw(ax: Axes, data: xr.Dataset, name: str, axis: int, symbol: str, factor: 
 
 
 def neighbours(names: list[str]) -> list[tuple[str, str]]:
-    """Each name with the next one, so that every one is seen twice."""
+    """Each name with the next one, so that every one is drawn twice."""
     return list(pairwise(names)) + ([(names[0], names[-1])] if len(names) > 2 else [])
 
 

@@ -1,15 +1,20 @@
-"""The design: what trajectory number `index` is, given the configuration alone."""
+"""The design: parameters and motion of trajectory number `index`, given the configuration alone."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from torchsoft.datasets.config import Config, Kind, ranges
+from torchsoft.datasets.config import Config, Kind, MultiSine, ranges
+from torchsoft.excitation import Excitation
 from torchsoft.parameters import Parameters
 
 SPLITS = ("train", "validation", "test")
+
+SIDED = ("travel",)
+"""Quantities that a task takes to either side, by a draw of its own."""
 
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
@@ -65,3 +70,19 @@ def split(config: Config, index: int) -> str:
     u = (start + index * GOLDEN) % 1.0
     edges = (config.splits.train, config.splits.train + config.splits.validation)
     return SPLITS[int(np.searchsorted(edges, u, side="right"))]
+
+
+def excitation(config: Config, task: Task) -> Excitation:
+    """The motion that the controllers of this task follow."""
+    p, rng = task.parameters, np.random.default_rng(task.seed)
+    side = float(rng.choice((-1.0, 1.0)))
+    motion: Any = {name: (side if name in SIDED else 1.0) * value for name, value in task.excitation.items()}
+    motion["kind"] = task.kind.motion or task.kind.kind
+    if isinstance(task.kind, MultiSine):
+        band = task.kind.frequency
+        motion |= {"frequency": (band.low, band.high), "components": task.kind.components}
+        motion["seed"] = int(rng.integers(2**31))
+    return Excitation(
+        motion=motion, duration=config.duration, depth=task.grasp_depth, senses=p.control.senses,
+        grasp_time=p.scenario.grasp_time, settle=config.settle, x_C0=p.scenario.x_C0,
+    )  # fmt: skip

@@ -24,7 +24,7 @@ class Trajectories(Dataset[dict[str, Tensor]]):
     """Windows of the trajectories of one split, read on access.
 
     Item i holds every variable of `variables` in SI units, a series as (window, ...) and a number of the trajectory as (),
-    besides `trajectory` and `start`, which tell where it comes from. `window` is a number of samples, the whole run by
+    besides `trajectory` and `start`, its origin. `window` is a number of samples, the whole run by
     default; windows of a trajectory begin every `stride` samples, `window` by default. Unfinished shards and failed
     simulations are left out. The object is small, can be pickled, and opens the store in each process for itself, forked
     ones included.

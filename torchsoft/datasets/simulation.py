@@ -6,8 +6,7 @@ import numpy as np
 import torch
 
 from torchsoft.datasets.config import RATIO, Config
-from torchsoft.datasets.design import Task
-from torchsoft.datasets.excitation import excitation
+from torchsoft.datasets.design import Task, excitation
 from torchsoft.datasets.schema import KEPT, STORES, sizes, variables
 from torchsoft.equilibrium import holding_force, press, rest
 from torchsoft.excitation import reference

@@ -21,7 +21,7 @@ from torchsoft.pad import Array, PadMesh, lame_moduli
 from torchsoft.trajectory import Trajectory
 
 NORMAL, FRICTION, INK = "#cc3311", "#0077bb", "#333333"
-"""Red and blue as in the paper, a pair that colour-blind readers can tell apart."""
+"""Red and blue as in the paper, a pair that colour-blind readers can distinguish."""
 
 PAD, LAYER, DISC, STEEL = "#f2e3c2", "#8a6d3b", "#dfe5ea", "#b8bec4"
 

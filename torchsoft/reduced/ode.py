@@ -230,7 +230,7 @@ class ReducedModel(nn.Module):
         """Integrate from y0 (states,) at t[0] with outer inputs u (T, outer), straight between the times t (T,) [s].
 
         Exact for linear models on equally spaced times, a compiled Rosenbrock method otherwise. A rollout that goes
-        `BEYOND` times `scale` (states,), the model's by default, has diverged: it is NaN from that time on and says so.
+        `BEYOND` times `scale` (states,), the model's by default, has diverged: it is NaN from that time on.
         """
         t, y0, u = np.asarray(t, float), np.asarray(y0, float), np.asarray(u, float).reshape(len(t), -1)
         if u.shape[1] != len(self.outer) or y0.shape != (len(self.states),):
