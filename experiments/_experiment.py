@@ -18,8 +18,7 @@ from torchsoft.plot.figures import save
 C = TypeVar("C")
 T = TypeVar("T")
 
-COARSE: dict[str, Any] = {"pad.elements_x": 60, "pad.elements_y": 2}
-"""Parameters of half the usual mesh."""
+COARSE: dict[str, Any] = {"pad.elements_x": 60, "pad.elements_y": 2}  # Parameters of half the usual mesh.
 
 
 def options(config: type[C], description: str | None) -> C:

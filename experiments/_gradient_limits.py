@@ -23,8 +23,7 @@ from torchsoft import Parameters, SoftGrasp
 from torchsoft.scenario import grasp_and_roll, reference
 from torchsoft.sensitivity import sensitivities
 
-WIDTHS = (0.04, 0.02, 0.01)
-"""Relative half-widths over which the slope of a loss with steps is averaged."""
+WIDTHS = (0.04, 0.02, 0.01)  # Relative half-widths over which the slope of a loss with steps is averaged.
 
 
 def coulomb(config: Config) -> dict[str, Any]:

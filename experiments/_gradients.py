@@ -21,23 +21,20 @@ from torchsoft.scenario import grasp_and_roll, reference
 from torchsoft.sensitivity import sensitivities
 from torchsoft.unrolled import unrolled_solution
 
-NEWTON = 1e-10
-"""Newton's tolerance of every run here [N]."""
+NEWTON = 1e-10  # Newton's tolerance of every run here [N].
 
 
 FLOOR = (1e-7, 1e-7, 1e-6, 1e-6, 1e-6, 1e-5, 1e-7, 1e-7, 1e-3, 1e-3)
 """Smallest scale of each signal in the loss: m, m, rad, m/s, m/s, rad/s, m, m, N, N."""
 
 
-INERT = ("material.rho",)
-"""Parameters that massless pads do not use."""
+INERT = ("material.rho",)  # Parameters that massless pads do not use.
 
 
 RADIUS = "shape.radius"
 
 
-FINER = {RADIUS: 1e-2}
-"""Factors on the relative steps of central differences."""
+FINER = {RADIUS: 1e-2}  # Factors on the relative steps of central differences.
 
 
 INSENSITIVE = 1e-6
@@ -50,28 +47,19 @@ class Config:
     out: Path = Path("out/gradient_accuracy")
     steps: tuple[float, ...] = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 1e-6)
     """relative steps of the central differences; a hundredth of them for the radius, of which 1e-4 is two ramps"""
-    full_steps: tuple[float, ...] = (3e-5, 1e-5)
-    """the same over the whole manipulation, where a run takes a second"""
-    coulomb_ms: float = 0.02
-    """step of the runs with Coulomb's law [ms]"""
-    coulomb_runs: int = 81
-    """runs over which the slope of its loss is averaged"""
+    full_steps: tuple[float, ...] = (3e-5, 1e-5)  # the same over the whole manipulation, where a run takes a second
+    coulomb_ms: float = 0.02  # step of the runs with Coulomb's law [ms]
+    coulomb_runs: int = 81  # runs over which the slope of its loss is averaged
     refinement_ms: tuple[float, ...] = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125, 0.0625)
     """steps of the convergence through slip [ms]; half the last is the reference"""
-    touch_ms: tuple[float, ...] = (0.4, 0.2, 0.1, 0.05, 0.025, 0.0125)
-    """steps across a touch-down [ms]"""
+    touch_ms: tuple[float, ...] = (0.4, 0.2, 0.1, 0.05, 0.025, 0.0125)  # steps across a touch-down [ms]
     continuous_ms: float = 0.3
     """length of the continuous adjoint's sub-window, with two outputs [ms]: 14 / tau times their spacing is 0.2"""
-    repeats: int = 5
-    """runs of which a time is the median (three for the continuous adjoint)"""
-    duration: float = 30.0
-    """of the full window [s]"""
-    only: tuple[str, ...] = ()
-    """scalar parameters; all of them if none is named"""
-    changes: tuple[tuple[str, float | int], ...] = ()
-    """parameter overrides, a coarser mesh for instance"""
-    smoke: bool = False
-    """a size that takes seconds"""
+    repeats: int = 5  # runs of which a time is the median (three for the continuous adjoint)
+    duration: float = 30.0  # of the full window [s]
+    only: tuple[str, ...] = ()  # scalar parameters; all of them if none is named
+    changes: tuple[tuple[str, float | int], ...] = ()  # parameter overrides, a coarser mesh for instance
+    smoke: bool = False  # a size that takes seconds
 
 
 def smoke(config: Config) -> Config:

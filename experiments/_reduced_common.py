@@ -18,40 +18,27 @@ from torchsoft.reduced.records import Record
 class Config:
     out: Path = Path("out/reduced_model")
     taps: int = 12
-    tap_time: float = 0.3
-    """length of a tap [s]"""
-    wave: float = 1e-5
-    """root mean square of a tap's multi-sine, over sqrt(2) [m]"""
-    kick: float = 2e-3
-    """root mean square of a tap's initial velocities [m/s]"""
-    band: tuple[float, float] = (3.0, 150.0)
-    """of the multi-sine [Hz]"""
-    amplitudes: tuple[float, ...] = (5e-5, 2e-4, 5e-4, 1e-3)
-    """of held-out multi-sines in the same grasp, as `wave` [m]"""
-    scenario: float = 1.0
-    """the manipulation's times, as parts of the paper's"""
+    tap_time: float = 0.3  # length of a tap [s]
+    wave: float = 1e-5  # root mean square of a tap's multi-sine, over sqrt(2) [m]
+    kick: float = 2e-3  # root mean square of a tap's initial velocities [m/s]
+    band: tuple[float, float] = (3.0, 150.0)  # of the multi-sine [Hz]
+    amplitudes: tuple[float, ...] = (5e-5, 2e-4, 5e-4, 1e-3)  # of held-out multi-sines in the same grasp, as `wave` [m]
+    scenario: float = 1.0  # the manipulation's times, as parts of the paper's
     thresholds: tuple[float, ...] = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.3)
-    models: int = 50
-    """members of an ensemble"""
+    models: int = 50  # members of an ensemble
     noise: tuple[float, ...] = (0.0, 0.005, 0.01, 0.02, 0.05)
     """standard deviations of the noise, in parts of the signals' own"""
-    draws: int = 3
-    """of the noise"""
-    depth: float = 3e-4
-    """of the light grasp [m]"""
-    stroke_times: tuple[float, ...] = (0.12, 0.08, 0.065, 0.05, 0.04, 0.03)
-    """of the training strokes of 20 mm [s]"""
+    draws: int = 3  # of the noise
+    depth: float = 3e-4  # of the light grasp [m]
+    stroke_times: tuple[float, ...] = (0.12, 0.08, 0.065, 0.05, 0.04, 0.03)  # of the training strokes of 20 mm [s]
     checking_times: tuple[float, ...] = (0.07, 0.04)
     """of the strokes of 15 mm to the other side by which thresholds are chosen [s]"""
     other_times: tuple[float, ...] = (0.15, 0.1, 0.055, 0.045, 0.035, 0.03, 0.025, 0.02)
     """of those that are held out [s]"""
-    speeds: tuple[float, ...] = (0.005, 0.01, 0.02)
-    """that tanh(s' / speed) is tried with [m/s]"""
-    gains: int = 60
-    """of the sweep"""
+    speeds: tuple[float, ...] = (0.005, 0.01, 0.02)  # that tanh(s' / speed) is tried with [m/s]
+    gains: int = 60  # of the sweep
     seed: int = 0
-    smoke: bool = False
-    """a size that takes seconds"""
+    smoke: bool = False  # a size that takes seconds
 
 
 def smoke(config: Config) -> Config:

@@ -21,8 +21,7 @@ from torchsoft.reduced.terms import mechanics, polynomials
 from torchsoft.scenario import grasp_and_roll
 from torchsoft.stability import DISPLACEMENT, VELOCITY
 
-SETTLED = 1.0
-"""Time [s] at which the grasp has settled."""
+SETTLED = 1.0  # Time [s] at which the grasp has settled.
 
 
 @dataclass(frozen=True)

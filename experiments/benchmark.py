@@ -46,24 +46,15 @@ EIGHT = ["contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.fr
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/benchmark")
-    duration: float = 30.0
-    """simulated time of the manipulation [s]"""
-    step: float = 2e-3
-    """of the stepper [s]"""
-    repeats: int = 5
-    """timings of which the median is taken"""
-    trajectories: tuple[int, ...] = (1, 8, 64)
-    """batches"""
-    batch_duration: float = 3.0
-    """simulated time of each trajectory of a batch [s]"""
-    elements_x: tuple[int, ...] = (60, 120, 240, 480)
-    """meshes, a thirtieth of that through the pad"""
-    window: float = 0.02
-    """simulated time that the other integrators get, in mid-roll [s]"""
-    measure: str = ""
-    """used by the benchmark itself: print the peak memory of one task"""
-    smoke: bool = False
-    """a size that takes seconds"""
+    duration: float = 30.0  # simulated time of the manipulation [s]
+    step: float = 2e-3  # of the stepper [s]
+    repeats: int = 5  # timings of which the median is taken
+    trajectories: tuple[int, ...] = (1, 8, 64)  # batches
+    batch_duration: float = 3.0  # simulated time of each trajectory of a batch [s]
+    elements_x: tuple[int, ...] = (60, 120, 240, 480)  # meshes, a thirtieth of that through the pad
+    window: float = 0.02  # simulated time that the other integrators get, in mid-roll [s]
+    measure: str = ""  # used by the benchmark itself: print the peak memory of one task
+    smoke: bool = False  # a size that takes seconds
 
 
 @dataclass(frozen=True)

@@ -36,24 +36,18 @@ NAMES: tuple[str, ...] = (
 )  # fmt: skip
 CONSISTENT = 0.01
 """Difference between J and a finite difference, over their size, above which an excitation is dropped."""
-DIFFERENCE = 1e-5
-"""Step of that finite difference in the logarithms."""
+DIFFERENCE = 1e-5  # Step of that finite difference in the logarithms.
 
 
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/experiment_design")
-    step: float = 5e-4
-    """of the stepper [s]"""
-    v_s: float = 0.05
-    """contact.v_s [m/s]; large, so that gross slip has a unique solution"""
-    longest: float = 6.0
-    """data that a combination may take [s]"""
-    most: int = 3
-    """excitations in a combination"""
+    step: float = 5e-4  # of the stepper [s]
+    v_s: float = 0.05  # contact.v_s [m/s]; large, so that gross slip has a unique solution
+    longest: float = 6.0  # data that a combination may take [s]
+    most: int = 3  # excitations in a combination
     seed: int = 0
-    smoke: bool = False
-    """two short excitations"""
+    smoke: bool = False  # two short excitations
 
 
 @dataclass(frozen=True)

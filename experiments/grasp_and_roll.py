@@ -36,24 +36,16 @@ from torchsoft.scenario import grasp_and_roll
 
 @dataclass(frozen=True)
 class Config:
-    out: Path = Path("out/grasp_and_roll")
-    """folder for everything that is written"""
-    step: float = 2e-3
-    """largest step of the stepper [s]"""
-    duration: float | None = None
-    """simulated time [s]; the whole manipulation (30 s) if not given"""
+    out: Path = Path("out/grasp_and_roll")  # folder for everything that is written
+    step: float = 2e-3  # largest step of the stepper [s]
+    duration: float | None = None  # simulated time [s]; the whole manipulation (30 s) if not given
     friction: Literal["default", "paper-like"] = "default"
     """friction set; with the default one, the paper-like one is run as well and compared"""
-    fidelity: Literal["massless", "inertial"] | None = None
-    """of the pads; as in the parameters (massless) if not given"""
-    config: Path | None = None
-    """TOML file of parameters, a table per group"""
-    animation: bool = True
-    """write the animation"""
-    table: bool = False
-    """only print the table of the summary that is already in `out`"""
-    smoke: bool = False
-    """0.6 s on a coarse mesh"""
+    fidelity: Literal["massless", "inertial"] | None = None  # of the pads; as in the parameters (massless) if not given
+    config: Path | None = None  # TOML file of parameters, a table per group
+    animation: bool = True  # write the animation
+    table: bool = False  # only print the table of the summary that is already in `out`
+    smoke: bool = False  # 0.6 s on a coarse mesh
 
 
 @dataclass(frozen=True)

@@ -34,27 +34,20 @@ TRUTH = {
     "contact.mu_k": 0.5, "pad.E": 0.9e6, "pad.tau": 0.012,
 }  # fmt: skip
 FITTED, HELD_OUT = ("deep pressing", "light shaking", "light jerks"), "shaking"
-DIFFERENCE = 1e-4
-"""Step of the finite differences in the logarithms."""
+DIFFERENCE = 1e-4  # Step of the finite differences in the logarithms.
 
 
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/identify_contact")
-    step: float = 5e-4
-    """of the fit [s]"""
-    finer: float = 10.0
-    """how many times finer the steps are that noisy data are made with"""
-    v_s: float = 0.05
-    """contact.v_s [m/s], known"""
-    starts: tuple[int, ...] = (0, 1)
-    """seeds of the starts: every parameter off by a factor of 2 to 3, up or down"""
+    step: float = 5e-4  # of the fit [s]
+    finer: float = 10.0  # how many times finer the steps are that noisy data are made with
+    v_s: float = 0.05  # contact.v_s [m/s], known
+    starts: tuple[int, ...] = (0, 1)  # seeds of the starts: every parameter off by a factor of 2 to 3, up or down
     workers: int = 2
     noise_seed: int = 0
-    baseline: bool = True
-    """identify by finite differences as well, from the first start"""
-    smoke: bool = False
-    """four parameters from two short recordings on a coarse mesh"""
+    baseline: bool = True  # identify by finite differences as well, from the first start
+    smoke: bool = False  # four parameters from two short recordings on a coarse mesh
 
 
 @dataclass(frozen=True)

@@ -35,11 +35,9 @@ EXCITATIONS = {
 class Config:
     out: Path = Path("out/interval_coverage")
     seeds: int = 50
-    step: float = 2e-3
-    """[s]; data and fit alike, so that only the noise is at work"""
+    step: float = 2e-3  # [s]; data and fit alike, so that only the noise is at work
     workers: int = 2
-    smoke: bool = False
-    """four seeds, one process"""
+    smoke: bool = False  # four seeds, one process
 
 
 @dataclass(frozen=True)

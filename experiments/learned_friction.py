@@ -35,16 +35,12 @@ SCALE = (1e-5, 1e-5, 1e-3, 1e-2, 1e-2, 1.0)
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/learned_friction")
-    evaluations: int = 40
-    """runs of the model that learning may take"""
-    kick: float = 0.3
-    """speed of the disc at the start [m/s]"""
-    step_ms: float = 0.5
-    """step, and spacing of the samples [ms]"""
+    evaluations: int = 40  # runs of the model that learning may take
+    kick: float = 0.3  # speed of the disc at the start [m/s]
+    step_ms: float = 0.5  # step, and spacing of the samples [ms]
     samples: int = 8
     seed: int = 0
-    smoke: bool = False
-    """a size that takes seconds"""
+    smoke: bool = False  # a size that takes seconds
 
 
 def smoke(config: Config) -> Config:
@@ -59,8 +55,7 @@ class Result:
     mu_start: Tensor
     mu_learned: Tensor
     mu_true: Tensor
-    excited: tuple[float, float]
-    """slip speeds in the data, from the 10 % quantile to the largest [m/s]"""
+    excited: tuple[float, float]  # slip speeds in the data, from the 10 % quantile to the largest [m/s]
 
 
 class MuNetwork(nn.Module):

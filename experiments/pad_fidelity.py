@@ -29,12 +29,9 @@ UNITS = {
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/pad_fidelity")
-    duration: float = 30.0
-    """of the manipulation [s]"""
-    step: float = 2e-3
-    """of the stepper [s]; the fast stroke takes a quarter of it"""
-    smoke: bool = False
-    """a size that takes seconds"""
+    duration: float = 30.0  # of the manipulation [s]
+    step: float = 2e-3  # of the stepper [s]; the fast stroke takes a quarter of it
+    smoke: bool = False  # a size that takes seconds
 
 
 @dataclass(frozen=True)

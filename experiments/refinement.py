@@ -27,20 +27,13 @@ from torchsoft.scenario import grasp_and_roll
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/refinement")
-    steps_ms: tuple[float, ...] = (5.0, 2.0, 1.0, 0.5)
-    """steps compared [ms]"""
-    reference_ms: float = 0.2
-    """step of the run they are compared with [ms]"""
-    elements_x: tuple[int, ...] = (60, 120, 240, 480)
-    """elements along the pad; a thirtieth of that through it"""
-    etas: tuple[float, ...] = (100.0, 10.0, 1.0, 0.1, 0.0)
-    """viscosities of the slip element [N.s/m]"""
-    duration: float = 30.0
-    """of the runs that the steps are compared over [s]"""
-    roll: float = 10.0
-    """of the runs on other meshes and with other viscosities [s]"""
-    smoke: bool = False
-    """a size that takes seconds"""
+    steps_ms: tuple[float, ...] = (5.0, 2.0, 1.0, 0.5)  # steps compared [ms]
+    reference_ms: float = 0.2  # step of the run they are compared with [ms]
+    elements_x: tuple[int, ...] = (60, 120, 240, 480)  # elements along the pad; a thirtieth of that through it
+    etas: tuple[float, ...] = (100.0, 10.0, 1.0, 0.1, 0.0)  # viscosities of the slip element [N.s/m]
+    duration: float = 30.0  # of the runs that the steps are compared over [s]
+    roll: float = 10.0  # of the runs on other meshes and with other viscosities [s]
+    smoke: bool = False  # a size that takes seconds
 
 
 @dataclass(frozen=True)

@@ -35,14 +35,10 @@ MILLI, MICRO = 1e3, 1e6
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/statics")
-    elements_x: tuple[int, ...] = (60, 120, 240, 480)
-    """elements along the pad; a thirtieth of that through it"""
-    stiffenings: tuple[float, ...] = (0.25, 1.0, 4.0, 16.0)
-    """multiples of the default K_n, on the default mesh"""
-    points: int = 10
-    """compressions, in equal steps up to the full grasp's"""
-    smoke: bool = False
-    """a size that takes seconds"""
+    elements_x: tuple[int, ...] = (60, 120, 240, 480)  # elements along the pad; a thirtieth of that through it
+    stiffenings: tuple[float, ...] = (0.25, 1.0, 4.0, 16.0)  # multiples of the default K_n, on the default mesh
+    points: int = 10  # compressions, in equal steps up to the full grasp's
+    smoke: bool = False  # a size that takes seconds
 
 
 @dataclass(frozen=True)

@@ -55,8 +55,7 @@ class Drawn(Table):
     kind: str
     weight: float = Field(1.0, gt=0)
     motion: ClassVar[str | None] = None
-    sets: ClassVar[dict[str, Any]] = {}
-    """parameters that this kind needs"""
+    sets: ClassVar[dict[str, Any]] = {}  # parameters that this kind needs
 
 
 class SlowRoll(Drawn):
@@ -152,22 +151,17 @@ class Config(Table):
     trajectories_per_shard: int = Field(16, ge=1)
     samples_per_chunk: int = Field(250, ge=1)
     method: Literal["sobol", "latin_hypercube"] = "sobol"
-    duration: float = Field(gt=0)
-    """of every trajectory [s]"""
-    sample_interval: float = Field(5e-3, gt=0)
-    """between samples [s]"""
-    step: float = Field(1e-3, gt=0)
-    """largest step of the stepper [s]"""
-    settle: float = Field(0.125, ge=0)
-    """time between the end of the grasp and the start of the motion [s]"""
+    duration: float = Field(gt=0)  # of every trajectory [s]
+    sample_interval: float = Field(5e-3, gt=0)  # between samples [s]
+    step: float = Field(1e-3, gt=0)  # largest step of the stepper [s]
+    settle: float = Field(0.125, ge=0)  # time between the end of the grasp and the start of the motion [s]
     feed_forward: Literal["pressed", "found"] = "pressed"
     """grasping force of the frictionless statics, or found by simulating the grasp until the bracket holds its height"""
     node_precision: Literal["float32", "float64"] = "float32"
     """of everything that is kept per node; the rest is float64"""
     ledger_tolerance: float = Field(0.02, gt=0)
     """largest energy residual over the energy injected [1] that the check accepts"""
-    grasp_depth: PositiveRange = PositiveRange(low=1.0e-3, high=1.6e-3)
-    """compression of both pads together [m]"""
+    grasp_depth: PositiveRange = PositiveRange(low=1.0e-3, high=1.6e-3)  # compression of both pads together [m]
     splits: Fractions = Fractions(train=0.7, validation=0.15)
     fixed: dict[str, Any] = Field(default_factory=dict)
     """parameters that differ from their defaults in every trajectory"""

@@ -40,8 +40,7 @@ class Estimate:
     last: float
     identifiable: bool
     at_bound: bool
-    step_bias_sd: float
-    """what the step of the simulation shifts the estimate by, in standard deviations"""
+    step_bias_sd: float  # what the step of the simulation shifts the estimate by, in standard deviations
 
     @property
     def label(self) -> str:
@@ -79,12 +78,10 @@ class IdentificationResult:
     x: list[float]
     correlation: list[list[float]]
     directions: list[Direction]
-    chi2: float
-    """sum of squared residuals over degrees of freedom; 1 where model and noise are right"""
+    chi2: float  # sum of squared residuals over degrees of freedom; 1 where model and noise are right
     converged: bool
     residuals: list[ChannelResiduals]
-    heldout: dict[str, dict[str, float]]
-    """NRMSE of recordings that were not fitted, by recording and channel"""
+    heldout: dict[str, dict[str, float]]  # NRMSE of recordings that were not fitted, by recording and channel
     notices: list[str]
     stages: list[dict[str, Any]]
     cost: dict[str, float]
@@ -168,6 +165,14 @@ def estimates(problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shi
     low, high = c.bounds
     edge = free & ((x - low < 1e-4 * (high - low)) | (high - x < 1e-4 * (high - low)))
     out = []
+
+    def add(
+        name: str, unit: str, recording: str | None, value: float, sd: float, relative_sd: float,
+        interval: tuple[float, float], at_bound: Any, bias: float,
+    ) -> None:  # fmt: skip
+        known = (value, interval) if (identifiable := sd < IDENTIFIABLE) else (None, None)
+        out.append(Estimate(name, unit, recording, *known, relative_sd, value, identifiable, bool(at_bound), bias))
+
     for k, recording in enumerate(problem.recordings):
         values = problem.values(x, k)
         chain = c.jacobian(x, recording.name, values)
@@ -178,31 +183,21 @@ def estimates(problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shi
                 continue
             slope, value = chain[row] / values[name], values[name]
             sd = float(np.sqrt(max(slope @ C @ slope, 0.0)))
-            identifiable = sd < IDENTIFIABLE
+            bias = float(slope @ shift) / sd if sd > 0 else 0.0
             if c.all[mine[0]].scale == "log":
                 reach = min(q * sd, 700.0)  # a parameter without any trace in the data would overflow
                 interval = (value * float(np.exp(-reach)), value * float(np.exp(reach)))
             else:
                 interval = (value - q * sd * abs(value), value + q * sd * abs(value))
-            out.append(
-                Estimate(
-                    name, table[name]["unit"], recording.name if own else None, value if identifiable else None,
-                    interval if identifiable else None, sd, value, identifiable, bool(edge[mine].any()),
-                    float(slope @ shift) / sd if sd > 0 else 0.0,
-                )
-            )  # fmt: skip
+            where = recording.name if own else None
+            add(name, table[name]["unit"], where, value, sd, sd, interval, edge[mine].any(), bias)
     for i, one in enumerate(c.all):
         if one.kind != "parameter" and free[i]:
             spread = float(np.sqrt(C[i, i]))
-            value, sd, identifiable = one.to_value(x[i]), spread * one.slope(x[i]), spread < IDENTIFIABLE
-            unit = "s" if one.kind == "delay" else "of the channel"
-            interval = (value - q * float(sd), value + q * float(sd)) if identifiable else None
-            out.append(
-                Estimate(
-                    one.label, unit, None, value if identifiable else None, interval, sd / max(abs(value), 1e-300), value,
-                    identifiable, bool(edge[i]), float(shift[i]) / spread,
-                )
-            )  # fmt: skip
+            value, sd = one.to_value(x[i]), spread * float(one.slope(x[i]))
+            unit, interval = "s" if one.kind == "delay" else "of the channel", (value - q * sd, value + q * sd)
+            relative = sd / max(abs(value), 1e-300)
+            add(one.label, unit, None, value, spread, relative, interval, edge[i], float(shift[i]) / spread)
     return out
 
 
