@@ -17,13 +17,7 @@ from matplotlib.text import Text
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import IdentificationResult, Problem, Sensor, Unknown, identify, record
-from torchsoft.sysid.figures import (
-    correlation_figure,
-    direction_name,
-    estimates_figure,
-    spectrum_figure,
-    trace_figure,
-)
+from torchsoft.sysid.figures import correlation_figure, direction_name, estimates_figure, spectrum_figure, trace_figure
 from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.report import report, starts, traces
 from torchsoft.sysid.result import Direction, autocorrelation

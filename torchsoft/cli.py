@@ -84,7 +84,7 @@ def identify(options: argparse.Namespace) -> int:
     print(result.table())
     for notice in result.notices:
         print(f"note: {notice}")
-    print(f"{result.cost['wall_s']:.0f} s; written to {options.out / 'result.json'} and {options.out / 'report.html'}")
+    print(f"{result.cost['wall_s']:.0f} s; written to {options.out / 'answer.json'} and {options.out / 'report.html'}")
     return 0
 
 

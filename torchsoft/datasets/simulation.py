@@ -89,12 +89,6 @@ def series(model: SoftGrasp, run: Trajectory) -> Row:
         out[f"displacement_{pad}"] = u[:, model.pads[k].surface]
         out[f"contact_{pad}"] = (model.frame(k, s).g > 0).to(torch.uint8)
     channels = {name: data[name].values for name in KEPT if name in data}
-    return (
-        channels
-        | {name: value.numpy() for name, value in out.items()}
-        | {
-            "steps": run.stats.steps,
-            "newton_iterations": run.stats.newton_iterations,
-            "energy_residual_rel": run.energy_residual_rel,
-        }
-    )
+    stats = {"steps": run.stats.steps, "newton_iterations": run.stats.newton_iterations}
+    arrays = {name: value.numpy() for name, value in out.items()}
+    return {**channels, **arrays, **stats, "energy_residual_rel": run.energy_residual_rel}

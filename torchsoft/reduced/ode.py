@@ -124,16 +124,10 @@ class ReducedModel(nn.Module):
     """
 
     def __init__(
-        self,
-        states: Sequence[str],
-        inputs: Sequence[str],
-        kinematics: Mapping[str, str],
-        equations: Mapping[str, Sequence[tuple[Term, float]]],
-        *,
-        feedback: Mapping[str, Mapping[str, float]] | None = None,
-        scale: np.ndarray | Sequence[float] | None = None,
-        intervals: Sequence[tuple[float, float]] | None = None,
-    ) -> None:
+        self, states: Sequence[str], inputs: Sequence[str], kinematics: Mapping[str, str],
+        equations: Mapping[str, Sequence[tuple[Term, float]]], *, feedback: Mapping[str, Mapping[str, float]] | None = None,
+        scale: np.ndarray | Sequence[float] | None = None, intervals: Sequence[tuple[float, float]] | None = None,
+    ) -> None:  # fmt: skip
         super().__init__()
         self.states, self.inputs, self.kinematics = tuple(states), tuple(inputs), dict(kinematics)
         missing = set(self.states) ^ (set(kinematics) | set(equations))
