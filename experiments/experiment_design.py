@@ -87,7 +87,7 @@ def smoke(config: Config) -> tuple[Config, dict[str, Excitation]]:
     return Config(config.out, 2e-3, config.v_s, 2.0, 2, config.seed, True), {"strokes": roll, "jerks, light": jerk}
 
 
-def look(excitation: Excitation, p: Parameters, config: Config) -> tuple[Array, Array, float]:
+def assess(excitation: Excitation, p: Parameters, config: Config) -> tuple[Array, Array, float]:
     """Whitened Jacobian (m, parameters), error of the step (m,), and how far the Jacobian is, relatively, from a central
     difference along one direction."""
     recording = record("one", excitation, p, p, RIG, step=config.step, noise=0.0)
@@ -115,7 +115,7 @@ def run(config: Config) -> Result:
     usable: dict[str, tuple[Array, Array]] = {}
     for name, excitation in tqdm(catalogue.items(), desc="excitations"):
         try:
-            J, error, wrong = look(excitation, p, config)
+            J, error, wrong = assess(excitation, p, config)
         except SimulationFailed as failure:
             single.append(Row((name,), excitation.duration, {}, {}, np.inf, failure.reason))
             continue

@@ -23,8 +23,8 @@ from torchsoft.cli import main
 from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.sysid import MEASURED, Recording, Sensor, Unreachable, record
 from torchsoft.sysid.columns import COLUMNS, UNITS, read_table
-from torchsoft.sysid.measured import known, load, read_recording, unreachable
-from torchsoft.sysid.workers import Lost
+from torchsoft.sysid.measured import known_parameters, load, read_recording, unreachable
+from torchsoft.sysid.workers import FailedRun
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "identify"
 
@@ -274,7 +274,7 @@ def test_a_trajectory_file_is_a_recording(run: Trajectory, tmp_path: Path) -> No
     table = read_table(tmp_path / "run.nc")
     settings = {"scenario": {"x_C0": 60.3e-3}, "control.senses": "bracket", "contact": {"v_s": 0.05}}
     sensors = {"x_C": Sensor(noise=1e-5)}
-    one = read_recording(tmp_path / "run.nc", "run", known(Path("c"), "run", table, settings), sensors)
+    one = read_recording(tmp_path / "run.nc", "run", known_parameters(Path("c"), "run", table, settings), sensors)
     assert list(one.samples) == list(MEASURED)
     s = run.state
     expected = torch.cat((s.r_C, s.theta[:, None], s.r_Br, s.v_C, s.omega[:, None], s.v_Br, run.control), 1).numpy()
@@ -366,7 +366,7 @@ def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(
     assert message.count("\n") == 1
     tables = load(files[:1], files[1]).tables
     assert "data.csv, before row 2 (t = -0.1 s): the model" in unreachable(
-        Unreachable({"data": Lost("gone", -0.1)}), tables
+        Unreachable({"data": FailedRun("gone", -0.1)}), tables
     )
 
 

@@ -21,7 +21,7 @@ from torchsoft.sysid.figures import correlation_figure, direction_name, estimate
 from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.report import report, starts, traces
 from torchsoft.sysid.result import Direction, autocorrelation
-from torchsoft.sysid.workers import Lost
+from torchsoft.sysid.workers import FailedRun
 
 STRANGE = 'a<b> & "$x_1$"'
 """A recording's name with everything in it that HTML or matplotlib would read as their own."""
@@ -156,7 +156,7 @@ def test_a_recording_that_was_lost_is_said_and_a_clean_answer_praised(
     class Losing(Problem):
         def residuals(self, runner: Any, x: Any, which: Any, step: float, free: Any = None) -> Residuals:
             got = super().residuals(runner, x, which, step, free)
-            return got._replace(lost={"held": Lost("it < went", 0.1)}) if "held" in which else got
+            return got._replace(lost={"held": FailedRun("it < went", 0.1)}) if "held" in which else got
 
     losing = Losing(problem.recordings, problem.sensors, problem.unknowns)
     report(replace(answer, notices=[]), losing, tmp_path / "report.html")

@@ -49,7 +49,7 @@ class PositiveRange(Range):
     low: float = Field(gt=0)
 
 
-class Drawn(Table):
+class RandomMotion(Table):
     """A kind of motion, drawn in proportion to `weight`; `motion` is its name in `torchsoft.excitation`, its own by default."""
 
     kind: str
@@ -58,14 +58,14 @@ class Drawn(Table):
     sets: ClassVar[dict[str, Any]] = {}  # parameters that this kind needs
 
 
-class SlowRoll(Drawn):
+class SlowRoll(RandomMotion):
     """Out by `travel` [m], to either side, and rest there."""
 
     kind: Literal["slow_roll"] = "slow_roll"
     travel: PositiveRange = PositiveRange(low=5e-3, high=20e-3)
 
 
-class Strokes(Drawn):
+class Strokes(RandomMotion):
     """There and back by `travel` [m], `stroke_time` [s] each way, until the end."""
 
     kind: Literal["strokes"] = "strokes"
@@ -73,7 +73,7 @@ class Strokes(Drawn):
     stroke_time: PositiveRange = PositiveRange(low=0.4, high=1.0)
 
 
-class MultiSine(Drawn):
+class MultiSine(RandomMotion):
     """Sums of `components` sines of random phase in x and y; amplitudes [m] are of the sum's peak at most."""
 
     kind: Literal["multi_sine"] = "multi_sine"
@@ -84,7 +84,7 @@ class MultiSine(Drawn):
     components: int = Field(5, ge=1, le=50)
 
 
-class Chirp(Drawn):
+class Chirp(RandomMotion):
     """Sweeps in x and y from `start` to `end` [Hz]; amplitudes in m."""
 
     kind: Literal["chirp"] = "chirp"
@@ -94,7 +94,7 @@ class Chirp(Drawn):
     end: PositiveRange = PositiveRange(low=4.0, high=10.0)
 
 
-class Press(Drawn):
+class Press(RandomMotion):
     """The bracket's height modulated by `amplitude` [m] at `frequency` [Hz] while the disc rolls by `travel` [m]."""
 
     kind: Literal["press"] = "press"
@@ -103,7 +103,7 @@ class Press(Drawn):
     travel: PositiveRange = PositiveRange(low=1e-3, high=10e-3)
 
 
-class Jerk(Drawn):
+class Jerk(RandomMotion):
     """Forced slip: strokes of the bracket, whose own x the horizontal loop measures, over a disc grasped lightly, to `depth`
     [m] in place of the common depth."""
 

@@ -51,14 +51,14 @@ def task(config: Config, index: int, u: NDArray[np.floating]) -> Task:
     n = len(config.parameters)
     sampled = {name: r.at(float(x)) for (name, r), x in zip(config.parameters.items(), u)}
     depth = config.grasp_depth.at(float(u[n]))
-    kind = choose(config.kinds, float(u[n + 1]))
+    kind = choose_kind(config.kinds, float(u[n + 1]))
     excitation = {name: r.at(float(x)) for (name, r), x in zip(ranges(kind).items(), u[n + 2 :])}
     depth = excitation.pop("depth", depth)  # a kind may have a range of its own
     p = config.physics(sampled | kind.sets, depth)
     return Task(index, p, sampled, depth, kind, excitation, (config.seed, index), split(config, index))
 
 
-def choose(kinds: tuple[Kind, ...], u: float) -> Kind:
+def choose_kind(kinds: tuple[Kind, ...], u: float) -> Kind:
     """The kind at u in [0, 1), each in proportion to its weight."""
     edges = np.cumsum([kind.weight for kind in kinds])
     return kinds[min(int(np.searchsorted(edges, u * edges[-1], side="right")), len(kinds) - 1)]

@@ -29,7 +29,7 @@ def simulate_task(config: Config, task: Task) -> Row:
 
     A simulation that fails leaves NaN (and no contact) in its series, and its reason.
     """
-    out = blank(config) | labels(task)
+    out = empty_row(config) | labels(task)
     t = torch.arange(config.samples, dtype=torch.float64) * config.sample_interval
     try:
         model = SoftGrasp(task.parameters)
@@ -51,7 +51,7 @@ def simulate_task(config: Config, task: Task) -> Row:
     return out | series(model, run) | {"grasp_force": force}
 
 
-def blank(config: Config) -> Row:
+def empty_row(config: Config) -> Row:
     """A trajectory of nothing: NaN, and zero where there is no NaN."""
     length, out = sizes(config), {}
     for name, variable in variables(config).items():

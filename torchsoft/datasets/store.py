@@ -164,7 +164,7 @@ def create(url: str, config: Config) -> None:
     group = zarr.create_group(local_path(url), overwrite=False, zarr_format=3, attributes=attributes)\
         if not fs.exists(f"{root}/zarr.json") else zarr.open_group(local_path(url), mode="r+", zarr_format=3)  # fmt: skip
     for name, variable in variables(config).items():
-        lay_out(group, name, variable, config)
+        create_array(group, name, variable, config)
     coordinates(group, config)
     done: dict[str, Any] = {"units": "1", "long_name": "1 where the shard is finished"}
     group.create_array(
@@ -178,7 +178,7 @@ def create(url: str, config: Config) -> None:
     fs.rm_file(marker)
 
 
-def lay_out(group: zarr.Group, name: str, variable: Variable, config: Config) -> None:
+def create_array(group: zarr.Group, name: str, variable: Variable, config: Config) -> None:
     """One empty array: a chunk is one trajectory's stretch of time, a shard is one task's."""
     length = sizes(config)
     shape = tuple(length[dim] for dim in variable.dims)

@@ -19,7 +19,18 @@ from torch import Tensor
 from torchsoft.files import replacing
 from torchsoft.model import SoftGrasp
 from torchsoft.pad import Array
-from torchsoft.plot.scene import FRICTION, INK, MM, NORMAL, Instant, Scene, around_contact, force_scale, instants, reach
+from torchsoft.plot.scene import (
+    FRICTION,
+    INK,
+    MM,
+    NORMAL,
+    Instant,
+    Scene,
+    around_contact,
+    extent,
+    force_scale,
+    instants,
+)
 from torchsoft.trajectory import Trajectory
 
 STYLE: Any = {
@@ -215,7 +226,7 @@ def snapshots(trajectory: Trajectory, model: SoftGrasp, times: Sequence[float] =
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     height = 13.0
     curves = force_scale(shown, height)
-    x_limits, y_limits = reach(model, height)
+    x_limits, y_limits = extent(model, height)
     for axes, instant, letter in zip(grid.flat, shown, "abcdefghijklmnopqrstuvwxyz"):
         scene = Scene(axes, model, columns=5, curves=curves)
         scene.show(instant)
@@ -235,7 +246,7 @@ def snapshots(trajectory: Trajectory, model: SoftGrasp, times: Sequence[float] =
     return figure
 
 
-def gathered(energies: Mapping[str, Tensor], groups: Mapping[str, tuple[tuple[str, ...], str]]) -> list[Array]:
+def grouped_energies(energies: Mapping[str, Tensor], groups: Mapping[str, tuple[tuple[str, ...], str]]) -> list[Array]:
     """Sums [mJ] of the named energies, one array a group; what a fidelity does not have counts as nothing."""
     none = torch.zeros_like(next(iter(energies.values())))
     return [MM * sum((energies[n] for n in names if n in energies), none).numpy() for names, _ in groups.values()]
@@ -247,7 +258,7 @@ def energy_balance(trajectory: Trajectory) -> Figure:
     figure = new_figure("Energy: stored and dissipated against supplied", 9.5, 6.2)
     stack, residual = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     t = timeline(stack, "energy [mJ]", trajectory)
-    parts = gathered(trajectory.energy, STORED) + gathered(trajectory.dissipated, DISSIPATED)
+    parts = grouped_energies(trajectory.energy, STORED) + grouped_energies(trajectory.dissipated, DISSIPATED)
     groups = STORED | DISSIPATED
     kinds = ["stored"] * len(STORED) + ["dissipated"] * len(DISSIPATED)
     labels = [f"{kind}: {name} (up to {part.max():.2g} mJ)" for kind, name, part in zip(kinds, groups, parts)]

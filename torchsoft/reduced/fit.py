@@ -133,7 +133,7 @@ class Equation(NamedTuple):
 def solve(problem: Problem, target: str, recipe: Recipe) -> Equation:
     """The sparse equation of one state at the recipe's threshold; candidates whose coefficient is zero are left out."""
     rows, optimizer = problem.regressions[target], _optimizer(recipe)
-    with _pysindy_calm(recipe.seed):
+    with _quiet_pysindy(recipe.seed):
         optimizer.fit(rows.columns, rows.rate[:, None])
     unit = rows.rate_size / rows.column_size
     values, intervals = np.asarray(optimizer.coef_).ravel() * unit, []
@@ -264,7 +264,7 @@ def _weak(
         starts = [(one, i) for one in series for i in range(0, len(one) - length + 1, length - 1)]
         return [pysindy.AxesArray(one[i : i + length], axes) for one, i in starts]
 
-    with _pysindy_calm(recipe.seed):
+    with _quiet_pysindy(recipe.seed):
         library = pysindy.WeakPDELibrary(
             function_library=pysindy.IdentityLibrary(), spatiotemporal_grid=step * np.arange(length),
             K=recipe.domains, H_xt=[recipe.width], p=4,
@@ -279,7 +279,7 @@ def _differences(columns: list[np.ndarray], velocities: list[np.ndarray], step: 
     import pysindy
 
     difference: Any = pysindy.FiniteDifference(order=4)
-    with _pysindy_calm(0):
+    with _quiet_pysindy(0):
         rates = [np.asarray(difference(one, step * np.arange(len(one)))) for one in velocities]
     return np.concatenate(columns), np.concatenate(rates)
 
@@ -299,7 +299,7 @@ def _optimizer(recipe: Recipe) -> Any:
 
 
 @contextlib.contextmanager
-def _pysindy_calm(seed: int) -> Iterator[None]:
+def _quiet_pysindy(seed: int) -> Iterator[None]:
     """pysindy draws from numpy's global generator: seeded here, and left as it was. Its own array class warns of itself."""
     before = np.random.get_state()  # noqa: NPY002
     np.random.seed(seed)  # noqa: NPY002

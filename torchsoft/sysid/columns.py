@@ -104,7 +104,7 @@ def read_csv(path: Path) -> Columns:
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path} is not a CSV file in UTF-8: {error}") from None
     columns = np.array(values).reshape(len(rows), len(head)).T
-    return checked(Columns(path, {name: column for (name, _), column in zip(head, columns)}, rows))
+    return check_table(Columns(path, {name: column for (name, _), column in zip(head, columns)}, rows))
 
 
 def number(path: Path, row: int, column: str, cell: str) -> float:
@@ -139,10 +139,10 @@ def read_trajectory(path: Path) -> Columns:
     for name, column in values.items():
         if (bad := np.flatnonzero(~np.isfinite(column))).size:
             raise ValueError(f"{table.at(bad[0])}, `{name}` is not a finite number")
-    return checked(table)
+    return check_table(table)
 
 
-def checked(table: Columns) -> Columns:
+def check_table(table: Columns) -> Columns:
     """The table, where its times and set-points can be used. Raises `ValueError` naming row and column."""
     path, values = table.path, table.values
     for name in ("t", *SETPOINTS):

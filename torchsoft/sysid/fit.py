@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from torchsoft.sysid.information import standard_deviations
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
-from torchsoft.sysid.workers import Lost, Runner
+from torchsoft.sysid.workers import FailedRun, Runner
 
 Loss = Literal["linear", "soft_l1", "huber", "cauchy", "arctan"]
 Notify = Callable[[float], None]
@@ -20,7 +20,7 @@ Notify = Callable[[float], None]
 class Unreachable(RuntimeError):
     """The model cannot follow a recording with the parameters that a fit starts from; `lost` has reason and time."""
 
-    def __init__(self, lost: dict[str, Lost]) -> None:
+    def __init__(self, lost: dict[str, FailedRun]) -> None:
         reasons = "; ".join(f"recording `{name}`: {loss.reason}" for name, loss in lost.items())
         super().__init__(f"the model cannot reach the data from this start: {reasons}")
         self.lost = lost
@@ -79,7 +79,7 @@ def polish(
 ) -> tuple[Fit, Residuals]:  # fmt: skip
     """From a fit at a coarse step to the one at a finer `step` [s]: residuals of the finer runs, and the coarse Jacobian J
     (m, n), a chord method, until the coordinates move by less than a fifth of a standard deviation. A round costs a run, not
-    a Jacobian. Returns where that ended, and the residuals there, with J. Lost runs end it where it began.
+    a Jacobian. Returns where that ended, and the residuals there, with J. Failed runs end it where it began.
     """
     low, high = problem.coordinates.bounds
     sd = standard_deviations(J[:, free])

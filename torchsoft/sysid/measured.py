@@ -94,7 +94,7 @@ def read_config(path: str | Path) -> Config:
         raise ValueError(f"{path} is not a TOML file: {error}") from None
 
 
-def known(config: Path, name: str, table: Columns, *settings: dict[str, Any]) -> Parameters:
+def known_parameters(config: Path, name: str, table: Columns, *settings: dict[str, Any]) -> Parameters:
     """Parameters of the recording `name`: the settings, the later ones first, with the reach of its set-points as scenario.
 
     Raises `ValueError` naming the configuration and the field, or the row where nothing is grasped.
@@ -137,7 +137,7 @@ def validated(kind: Any, tree: Any, group: str = "") -> Any:
         raise InvalidSettings(findings(error, group)) from None
 
 
-def plausible(table: Columns, p: Parameters, sensors: dict[str, Sensor]) -> None:
+def check_plausible(table: Columns, p: Parameters, sensors: dict[str, Sensor]) -> None:
     """Raises `ValueError` for values that no such rig can have, and for a run that does not begin at rest, with the disc
     where `scenario.x_C0` says and the bracket clear of it; it names row and column."""
     L, H, begin = p.pad.length, apart(p), p.scenario.x_C0
@@ -188,7 +188,7 @@ def read_recording(path: str | Path, name: str, p: Parameters, sensors: dict[str
 
 
 def recording(table: Columns, name: str, p: Parameters, sensors: dict[str, Sensor]) -> Recording:
-    plausible(table, p, sensors)
+    check_plausible(table, p, sensors)
     values, t, samples = table.values, table.values["t"], {}
     for channel in (c for c in MEASURED if c in values):
         here = np.isfinite(values[channel])
@@ -220,7 +220,7 @@ def load(data: Sequence[str | Path], config: str | Path) -> Case:
         raise ValueError(f"{config}: there is no recording `{strange[0]}`; there are {', '.join(names)}")
     for name, path in files:
         table = tables[name] = read_table(path)
-        p = known(config, name, table, stated.settings, own[name].settings if name in own else {})
+        p = known_parameters(config, name, table, stated.settings, own[name].settings if name in own else {})
         recordings.append(recording(table, name, p, stated.sensors))
     try:
         problem = Problem(recordings, stated.sensors, stated.unknowns)

@@ -27,7 +27,7 @@ class Prediction(NamedTuple):
     steps: int
 
 
-def rigid(model: SoftGrasp, y: Tensor) -> Tensor:
+def rigid_states(model: SoftGrasp, y: Tensor) -> Tensor:
     """Poses (x_C, y_C, theta, x_Br, y_Br) and their rates (..., 10) of states y (..., size)."""
     s = model.layout.unpack(y)
     return torch.cat((s.r_C, s.theta[..., None], s.r_Br, s.v_C, s.omega[..., None], s.v_Br), -1)
@@ -40,7 +40,7 @@ def signals(model: SoftGrasp, t: Tensor, q: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def put(model: SoftGrasp, values: dict[str, float]) -> None:
+def set_parameters(model: SoftGrasp, values: dict[str, float]) -> None:
     """Give the model other parameters, named as in `Parameters`."""
     known = dict(model.named_parameters())
     for name, value in values.items():
@@ -56,10 +56,10 @@ def predict(model: SoftGrasp, y0: Tensor, t: Tensor, names: Sequence[str], step:
     at = t[1:]
     if not names:
         run = simulate(model, t, y0=y0, step=step, tolerance=TOLERANCE)
-        return Prediction(at.numpy(), signals(model, at, rigid(model, run.y[1:])).numpy(), None, run.stats.steps)
+        return Prediction(at.numpy(), signals(model, at, rigid_states(model, run.y[1:])).numpy(), None, run.stats.steps)
     inner = [PARAMETERS[name] for name in names]
     run = sensitivities(model, y0, t, inner, step=step, tolerance=TOLERANCE, rigid=True)
-    q, dq = rigid(model, run.y[1:]), run.dy[1:]
+    q, dq = rigid_states(model, run.y[1:]), run.dy[1:]
     by_state = [
         torch.func.jvp(lambda q: signals(model, at, q), (q,), (dq[..., k].contiguous(),))[1] for k in range(len(inner))
     ]
@@ -102,7 +102,7 @@ def misfit(
     unknown = [parameters[PARAMETERS[name]].requires_grad_(True) for name in names]
     at, loss = t[1:], torch.zeros((), dtype=torch.float64)
     run = simulate(model, t, y0=y0, step=step, tolerance=TOLERANCE, gradient="discrete")
-    predicted = signals(model, at, rigid(model, run.y[1:]))
+    predicted = signals(model, at, rigid_states(model, run.y[1:]))
     out = {"bias": np.zeros(len(noise)), "delay": np.zeros(len(noise))}
     for k, (channel, sigma) in enumerate(noise.items()):
         if channel not in recording.samples:

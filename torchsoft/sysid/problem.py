@@ -10,7 +10,7 @@ from torchsoft.channels import MEASURED
 from torchsoft.sysid.prediction import Prediction, read
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.unknowns import Coordinates, Sensor, Unknown
-from torchsoft.sysid.workers import Job, Lost, Runner
+from torchsoft.sysid.workers import FailedRun, Job, Runner
 
 
 class Residuals(NamedTuple):
@@ -19,7 +19,7 @@ class Residuals(NamedTuple):
 
     r: Array
     J: Array
-    lost: dict[str, Lost]
+    lost: dict[str, FailedRun]
 
 
 class Problem:
@@ -102,7 +102,9 @@ class Problem:
 
     def gather(self, x: Array, jobs: Sequence[Job], results: Sequence[Any]) -> Residuals:
         """Residuals at x (n,) from the results of its jobs."""
-        lost = {self.recordings[job.recording].name: got for job, got in zip(jobs, results) if isinstance(got, Lost)}
+        lost = {
+            self.recordings[job.recording].name: got for job, got in zip(jobs, results) if isinstance(got, FailedRun)
+        }
         if lost:
             m = self.samples([self.recordings[job.recording].name for job in jobs])
             return Residuals(np.full(m, np.inf), np.full((m, len(x)), np.inf), lost)
@@ -133,13 +135,13 @@ class Problem:
 
     def misfit(
         self, runner: Runner, x: Array, which: Sequence[str], step: float, free: NDArray[np.bool_]
-    ) -> tuple[float, Array, dict[str, Lost]]:
+    ) -> tuple[float, Array, dict[str, FailedRun]]:
         """Half the sum of squares and its gradient (n,), by the discrete adjoint; infinite where a run is lost."""
         c, jobs = self.coordinates, self.jobs(x, which, step, free, adjoint=True)
         total, gradient, lost = 0.0, np.zeros(len(x)), {}
         for job, got in zip(jobs, runner.run(jobs)):
             name = self.recordings[job.recording].name
-            if isinstance(got, Lost):
+            if isinstance(got, FailedRun):
                 lost[name] = got
                 continue
             loss, parts, _ = got

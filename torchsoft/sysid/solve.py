@@ -25,7 +25,7 @@ Method = Literal["gauss_newton", "lbfgs", "adam"]
 POLISH = 4
 """How many times finer the step is that estimates are polished at."""
 
-AUDIBLE = 0.5
+COLOUR_LIMIT = 0.5
 """Residuals over the noise below which their colour does not matter: data without noise."""
 
 MISFIT = 1.2
@@ -61,17 +61,17 @@ def identify(
         for number, stage in enumerate(plan):
             before = clock.perf_counter()
             with progress_bar(f"{number + 1}/{len(plan)} {stage.name}", progress) as bar:
-                fit = carry_out(problem, runner, stage, x, loss, method, seed + number, bar)
+                fit = run_stage(problem, runner, stage, x, loss, method, seed + number, bar)
             x = fit.x
-            stages.append(entry(stage.name, stage, stage.step, fit, before))
+            stages.append(stage_entry(stage.name, stage, stage.step, fit, before))
         if fit is None:
             raise ValueError("`plan` has no stages")
-        return conclude(
+        return build_result(
             problem, runner, plan[-1], fit, fitted, list(heldout), stages, method, loss, seed, began, polished, progress
         )
 
 
-def entry(name: str, stage: Stage, step: float, fit: Fit, began: float) -> dict[str, Any]:
+def stage_entry(name: str, stage: Stage, step: float, fit: Fit, began: float) -> dict[str, Any]:
     """The result's entry on a stage that began at `began` on the clock [s]."""
     return {
         "name": name, "recordings": list(stage.recordings), "free": list(stage.free), "step": step,
@@ -92,7 +92,7 @@ def progress_bar(label: str, shown: bool) -> Iterator[Notify]:
         yield notify
 
 
-def carry_out(
+def run_stage(
     problem: Problem, runner: Runner, stage: Stage, x: Array, loss: Loss, method: Method, seed: int, notify: Any
 ) -> Fit:
     """One stage from x: ties, scans, Sobol starts, fit; the best fit. Raises `Unreachable` where no start can be simulated."""
@@ -152,7 +152,7 @@ def sobol(problem: Problem, x: Array, free: NDArray[np.bool_], stage: Stage, see
     return out
 
 
-def conclude(
+def build_result(
     problem: Problem, runner: Runner, stage: Stage, fit: Fit, fitted: list[str], heldout: list[str],
     stages: list[dict[str, Any]], method: Method, loss: Loss, seed: int, began: float, polished: bool, progress: bool,
 ) -> IdentificationResult:  # fmt: skip
@@ -174,7 +174,7 @@ def conclude(
         before = problem.residuals(runner, end.x, stage.recordings, 2 * step / POLISH)
         if not there.lost and not before.lost:  # the error of the finer step, a quarter of that of the one before
             x, at, finer, step = end.x, there, there, step / POLISH
-            stages = [*stages, entry("polish", stage, step, end, start)]
+            stages = [*stages, stage_entry("polish", stage, step, end, start)]
             shift[free] = step_shift(at.J[:, free], step_error(before.r, at.r) / 4)
     chi2 = float(at.r @ at.r) / max(len(at.r) - int(free.sum()), 1)
     C[np.ix_(free, free)] = C_free * max(1.0, chi2)
@@ -189,7 +189,7 @@ def conclude(
             predicted = nrmse(problem, held.r, heldout)
     sd = np.sqrt(np.diag(C_free))
     channels = residual_channels(problem, at, fitted)
-    notices += remarks(found, chi2, fit.converged, step, bool(finer.lost), channels)
+    notices += notices_on(found, chi2, fit.converged, step, bool(finer.lost), channels)
     return IdentificationResult(
         estimates=found,
         labels=labels,
@@ -218,7 +218,7 @@ def conclude(
     )  # fmt: skip
 
 
-def remarks(
+def notices_on(
     found: list[Any], chi2: float, converged: bool, step: float, unchecked: bool, channels: list[Any]
 ) -> list[str]:
     """Sentences on what a reader must know before using the numbers."""
@@ -245,7 +245,7 @@ def remarks(
         )
     if not converged:
         out.append("the last stage stopped before it converged: give it more evaluations")
-    coloured = [f"{r.channel} of {r.recording}" for r in channels if r.p_white < 1e-3 and r.rms > AUDIBLE]
+    coloured = [f"{r.channel} of {r.recording}" for r in channels if r.p_white < 1e-3 and r.rms > COLOUR_LIMIT]
     if coloured:
         out.append(f"residuals are not white in {', '.join(coloured)}: something systematic is left")
     return out

@@ -7,7 +7,7 @@ from torchsoft.channels import MEASURED
 from torchsoft.excitation import Excitation, begin
 from torchsoft.parameters import Parameters
 from torchsoft.simulate import simulate
-from torchsoft.sysid.prediction import TOLERANCE, rigid, signals
+from torchsoft.sysid.prediction import TOLERANCE, rigid_states, signals
 from torchsoft.sysid.recording import SETTLE, Recording
 from torchsoft.sysid.unknowns import Sensor
 
@@ -37,7 +37,7 @@ def record(
     t = torch.from_numpy(np.concatenate(([at[0] - SETTLE], at)))
     with torch.no_grad():
         run = simulate(real, t, y0=planned.y0, step=step, tolerance=TOLERANCE)
-        predicted = signals(real, t[1:], rigid(real, run.y[1:])).numpy()
+        predicted = signals(real, t[1:], rigid_states(real, run.y[1:])).numpy()
     rng, samples = np.random.default_rng(seed), {}
     for channel, sensor in sensors.items():
         exact = predicted[:, MEASURED.index(channel)]

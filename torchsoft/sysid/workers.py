@@ -19,7 +19,7 @@ from torchsoft.files import replacing
 from torchsoft.implicit import SimulationFailed
 from torchsoft.kernels import HERE, digest
 from torchsoft.processes import local_processes
-from torchsoft.sysid.prediction import Prediction, misfit, predict, put
+from torchsoft.sysid.prediction import Prediction, misfit, predict, set_parameters
 from torchsoft.sysid.recording import Recording
 
 
@@ -38,7 +38,7 @@ class Job(NamedTuple):
     nuisance: tuple[dict[str, float], dict[str, float], dict[str, float]] | None = None
 
 
-class Lost(NamedTuple):
+class FailedRun(NamedTuple):
     """A run that could not be finished, and why."""
 
     reason: str
@@ -56,12 +56,12 @@ def _prepare(recordings: tuple[Recording, ...]) -> None:
 
 
 def _run(job: Job) -> Any:
-    """A `Prediction`, a misfit with its gradient, or `Lost`."""
+    """A `Prediction`, a misfit with its gradient, or `FailedRun`."""
     recording = _recordings[job.recording]
     if job.recording not in _models:
         _models[job.recording] = recording.begin()
     model, y0 = _models[job.recording]
-    put(model, job.values)
+    set_parameters(model, job.values)
     t = recording.grid(job.step, job.interpolated)
     with threadpool_limits(1):
         try:
@@ -69,7 +69,7 @@ def _run(job: Job) -> Any:
                 return predict(model, y0, t, job.names, job.step)
             return misfit(model, y0, recording, t, job.names, job.step, *job.nuisance)
         except SimulationFailed as failure:
-            return Lost(failure.reason, failure.time)
+            return FailedRun(failure.reason, failure.time)
 
 
 class Runner:
@@ -101,7 +101,7 @@ class Runner:
         self._open.close()
 
     def run(self, jobs: Sequence[Job]) -> list[Any]:
-        """Results in the order of the jobs: `Prediction`, misfit or `Lost`."""
+        """Results in the order of the jobs: `Prediction`, misfit or `FailedRun`."""
         waiting: list[Any] = []
         for job in jobs:
             self._count(job)
