@@ -27,9 +27,9 @@ def options(config: type[C], description: str | None) -> C:
     return tyro.cli(config, description=description)
 
 
-def grid(duration: float, spacing: float = 0.01, start: float = 0.0) -> Tensor:
-    """Equally spaced output times from `start` to `start + duration` [s], both included."""
-    return torch.linspace(start, start + duration, round(duration / spacing) + 1, dtype=torch.float64)
+def grid(duration: float, spacing: float = 0.01) -> Tensor:
+    """Equally spaced output times from 0 to `duration` [s], both included."""
+    return torch.linspace(0, duration, round(duration / spacing) + 1, dtype=torch.float64)
 
 
 def timed(function: Callable[[], T]) -> tuple[T, float]:

@@ -8,20 +8,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
+from torchsoft.channels import CHANNELS
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.design import SPLITS
 
 COLOURS = {"train": "C0", "validation": "C1", "test": "C2"}
 
 SHOWN = {"m": (1e3, "mm"), "s": (1e3, "ms"), "Pa": (1e-6, "MPa"), "N/m": (1e-3, "kN/m")}
-"""Factor and unit in which parameters are drawn, where it is not the SI unit."""
+"""Factor and unit in which values are drawn, where it is not the SI unit."""
 
-MOTIONS = (
-    ("disc_position", 0, "x_C", 1e3, "mm"),
-    ("bracket_position", 1, "y_Br", 1e3, "mm"),
-    ("control_force", 1, "F_y", 1.0, "N"),
-)
-"""Variable, axis, symbol, and the factor and unit in which it is drawn."""
+MOTIONS = ("x_C", "y_Br", "F_y")
+"""Channels that are drawn over time."""
 
 
 def figure(data: xr.Dataset, config: Config) -> Figure:
@@ -49,7 +46,7 @@ def figure(data: xr.Dataset, config: Config) -> Figure:
     panels = below.subplots(1, 4)
     count(panels[0], data)
     for ax, motion in zip(panels[1:], MOTIONS):
-        draw(ax, data, *motion)
+        draw(ax, data, motion)
     panels[1].legend(fontsize=7)
     fig.suptitle(f"{config.title}: {data.sizes['trajectory']} trajectories, {int(data['failed'].sum())} failed")
     return fig
@@ -82,15 +79,16 @@ def count(ax: Axes, data: xr.Dataset) -> None:
     ax.tick_params(axis="x", rotation=30, labelsize=7)
 
 
-def draw(ax: Axes, data: xr.Dataset, name: str, axis: int, symbol: str, factor: float, unit: str) -> None:
-    """Up to three sound runs of each kind over time."""
+def draw(ax: Axes, data: xr.Dataset, key: str) -> None:
+    """A channel of up to three sound runs of each kind over time."""
+    channel = CHANNELS[key]
+    factor, unit = SHOWN.get(channel.unit, (1.0, channel.unit))
     kind, failed = np.asarray(data["kind"]), np.asarray(data["failed"])
     for colour, k in enumerate(sorted(set(kind))):
         for n, i in enumerate(np.flatnonzero((kind == k) & (failed == 0))[:3]):
-            ax.plot(
-                data["time"], factor * data[name][i, :, axis], lw=0.7, color=f"C{colour}", label=k if n == 0 else None
-            )
-    ax.set(xlabel="time [s]", ylabel=f"{symbol} [{unit}]")
+            values = factor * channel.of(data[channel.variable][i])
+            ax.plot(data["time"], values, lw=0.7, color=f"C{colour}", label=k if n == 0 else None)
+    ax.set(xlabel="time [s]", ylabel=f"${channel.symbol}$ [{unit}]")
 
 
 def neighbours(names: list[str]) -> list[tuple[str, str]]:

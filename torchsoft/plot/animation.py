@@ -20,7 +20,7 @@ from torchsoft.files import replacing
 from torchsoft.model import SoftGrasp
 from torchsoft.pad import Array
 from torchsoft.plot.figures import ACTUAL, DESIRED, STYLE, timeline
-from torchsoft.plot.scene import FRICTION, INK, MM, NORMAL, Instant, Scene, extent, force_scale, instants
+from torchsoft.plot.scene import FRICTION, INK, MM, NORMAL, Instant, Scene, force_scale, instants, span
 from torchsoft.trajectory import Trajectory
 
 FRAMES_PER_SECOND = 12
@@ -52,7 +52,7 @@ def set_stage(trajectory: Trajectory, model: SoftGrasp, shown: Sequence[Instant]
     canvas = FigureCanvasAgg(figure)
     whole, strip = figure.subplots(2, 1, height_ratios=(3.6, 1))
     height = 13.0
-    x_limits, y_limits = extent(model, height)
+    x_limits, y_limits = span(model, height)
     curves = force_scale(shown, height)
     scene = Scene(whole, model, columns=5, curves=curves)
     scene.scale_bar(whole, x_limits[1] - 6, y_limits[1] - height - 2)

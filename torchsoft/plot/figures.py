@@ -19,18 +19,7 @@ from torch import Tensor
 from torchsoft.files import replacing
 from torchsoft.model import SoftGrasp
 from torchsoft.pad import Array
-from torchsoft.plot.scene import (
-    FRICTION,
-    INK,
-    MM,
-    NORMAL,
-    Instant,
-    Scene,
-    around_contact,
-    extent,
-    force_scale,
-    instants,
-)
+from torchsoft.plot.scene import FRICTION, INK, MM, NORMAL, Instant, Scene, around_contact, force_scale, instants, span
 from torchsoft.trajectory import Trajectory
 
 STYLE: Any = {
@@ -226,7 +215,7 @@ def snapshots(trajectory: Trajectory, model: SoftGrasp, times: Sequence[float] =
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     height = 13.0
     curves = force_scale(shown, height)
-    x_limits, y_limits = extent(model, height)
+    x_limits, y_limits = span(model, height)
     for axes, instant, letter in zip(grid.flat, shown, "abcdefghijklmnopqrstuvwxyz"):
         scene = Scene(axes, model, columns=5, curves=curves)
         scene.show(instant)

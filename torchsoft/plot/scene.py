@@ -195,7 +195,7 @@ class Scene:
         axes.text(x - 2, y + 0.5 * millimetres * force, f"{force:g} N", ha="right", va="center", fontsize=8)
 
 
-def extent(model: SoftGrasp, height: float) -> tuple[tuple[float, float], tuple[float, float]]:
+def span(model: SoftGrasp, height: float) -> tuple[tuple[float, float], tuple[float, float]]:
     """Limits of x and y [mm] that hold the whole manipulation, with `height` [mm] of force curves above and below."""
     p = model.settings
     half = 0.5 * p.pad.length
