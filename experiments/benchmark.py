@@ -19,17 +19,15 @@ import json
 import pstats
 import subprocess
 import sys
-import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
 import torch
-import tyro
+from _experiment import grid, made_by, options, timed, write
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 from scipy.integrate import solve_ivp
@@ -48,24 +46,15 @@ EIGHT = ["contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.fr
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/benchmark")
-    duration: float = 30.0
-    """simulated time of the manipulation [s]"""
-    step: float = 2e-3
-    """of the stepper [s]"""
-    repeats: int = 5
-    """timings of which the median is taken"""
-    trajectories: tuple[int, ...] = (1, 8, 64)
-    """batches"""
-    batch_duration: float = 3.0
-    """simulated time of each trajectory of a batch [s]"""
-    elements_x: tuple[int, ...] = (60, 120, 240, 480)
-    """meshes, a thirtieth of that through the pad"""
-    window: float = 0.02
-    """simulated time that the other integrators get, in mid-roll [s]"""
-    measure: str = ""
-    """used by the benchmark itself: print the peak memory of one task"""
-    smoke: bool = False
-    """a size that takes seconds"""
+    duration: float = 30.0  # simulated time of the manipulation [s]
+    step: float = 2e-3  # of the stepper [s]
+    repeats: int = 5  # timings of which the median is taken
+    trajectories: tuple[int, ...] = (1, 8, 64)  # batches
+    batch_duration: float = 3.0  # simulated time of each trajectory of a batch [s]
+    elements_x: tuple[int, ...] = (60, 120, 240, 480)  # meshes, a thirtieth of that through the pad
+    window: float = 0.02  # simulated time that the other integrators get, in mid-roll [s]
+    measure: str = ""  # used by the benchmark itself: print the peak memory of one task
+    smoke: bool = False  # a size that takes seconds
 
 
 @dataclass(frozen=True)
@@ -77,10 +66,6 @@ class Result:
 def prepare(elements_x: int = 120) -> Manipulation:
     changes = {"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30}
     return grasp_and_roll(SoftGrasp(Parameters().override(changes)), grasp_force=80.66)
-
-
-def grid(duration: float) -> torch.Tensor:
-    return torch.linspace(0, duration, round(duration / 0.01) + 1, dtype=torch.float64)
 
 
 def tasks(m: Manipulation, t: torch.Tensor, step: float) -> dict[str, Callable[[], object]]:
@@ -98,21 +83,18 @@ def tasks(m: Manipulation, t: torch.Tensor, step: float) -> dict[str, Callable[[
     }
 
 
-def timed(task: Callable[[], object], repeats: int) -> float:
+def median_time(task: Callable[[], object], repeats: int) -> float:
     """Median wall time [s] after one warm-up."""
     task()
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        task()
-        times.append(time.perf_counter() - start)
-    return median(times)
+    return median(timed(task)[1] for _ in range(repeats))
 
 
 def costs(config: Config) -> dict[str, Any]:
     """Times of the three tasks, as ratios to the run, and the peak memory of a process that does one of them."""
     m = prepare()
-    seconds = {name: timed(task, config.repeats) for name, task in tasks(m, grid(config.duration), config.step).items()}
+    seconds = {
+        name: median_time(task, config.repeats) for name, task in tasks(m, grid(config.duration), config.step).items()
+    }
     memory = {}
     for name in ("nothing", *seconds):
         flags = [f"--measure={name}", f"--duration={config.duration}", f"--step={config.step}"]
@@ -159,7 +141,9 @@ def batches(config: Config) -> dict[str, dict[str, float]]:
             list(pool.map(_one_of_many, [(0, 0.1, config.step)] * (4 * cores)))
             for n in config.trajectories:
                 jobs = [(k, config.batch_duration, config.step) for k in range(n)]
-                seconds = timed(lambda pool=pool, jobs=jobs: list(pool.map(_one_of_many, jobs)), min(config.repeats, 3))
+                seconds = median_time(
+                    lambda pool=pool, jobs=jobs: list(pool.map(_one_of_many, jobs)), min(config.repeats, 3)
+                )
                 rate = n * config.batch_duration / seconds
                 out[f"{n} on {cores}"] = {"simulated_per_wall": rate, "per_core": rate / min(cores, n)}
     return out
@@ -170,11 +154,13 @@ def growth(config: Config) -> dict[str, dict[str, float]]:
     meshes, durations = {}, {}
     for n in config.elements_x:
         m, t = prepare(n), grid(config.batch_duration)
-        meshes[str(n + 1)] = timed(tasks(m, t, config.step)["run"], min(config.repeats, 3)) / config.batch_duration
+        meshes[str(n + 1)] = (
+            median_time(tasks(m, t, config.step)["run"], min(config.repeats, 3)) / config.batch_duration
+        )
     m = prepare()
     for duration in (0.1, 0.3, 1.0):
         t = grid(duration * config.duration)
-        durations[f"{duration * config.duration:g}"] = timed(tasks(m, t, config.step)["run"], 3) / float(t[-1])
+        durations[f"{duration * config.duration:g}"] = median_time(tasks(m, t, config.step)["run"], 3) / float(t[-1])
     return {"surface_nodes": meshes, "simulated_s": durations}
 
 
@@ -217,18 +203,19 @@ def others(config: Config) -> dict[str, dict[str, float]]:
     }
     out = {}
     for name, solve in solvers.items():
-        start = time.perf_counter()
-        end = solve()
-        wall = (time.perf_counter() - start) / config.window
-        out[name] = {"wall_per_simulated": wall, "position_error_nm": 1e9 * float((end - exact)[part].norm())}
+        end, wall = timed(solve)
+        out[name] = {
+            "wall_per_simulated": wall / config.window,
+            "position_error_nm": 1e9 * float((end - exact)[part].norm()),
+        }
     longer = grid(config.batch_duration)  # a window is too short to time the stepper on
-    wall = timed(tasks(m, longer, config.step)["run"], config.repeats) / config.batch_duration
+    wall = median_time(tasks(m, longer, config.step)["run"], config.repeats) / config.batch_duration
     out["sdirk2 (this stepper)"]["wall_per_simulated"] = wall
     return out
 
 
 def profile(config: Config) -> dict[str, float]:
-    """Share of a run's time that is spent in the compiled kernel, by a deterministic profiler."""
+    """Part of a run's time that is spent in the compiled kernel, by a deterministic profiler."""
     m = prepare()
     run = tasks(m, grid(config.duration), config.step)["run"]
     profiler = cProfile.Profile()
@@ -247,8 +234,8 @@ def figure(result: Result) -> Figure:
     fig = Figure(figsize=(12, 3.6), layout="constrained")
     left, middle, right = fig.subplots(1, 3)
     ratio = result.figures["costs"]["ratio"]
-    bars = left.bar(list(ratio), list(ratio.values()), color="#0072b2")
-    left.bar_label(bars, fmt="%.2f")
+    columns = left.bar(list(ratio), list(ratio.values()), color="#0072b2")
+    left.bar_label(columns, fmt="%.2f")
     left.margins(y=0.12)
     left.set(ylabel="time over a plain run [1]", title="Run, gradient of all, Jacobian for 8")
     nodes = result.figures["growth"]["surface_nodes"]
@@ -264,8 +251,7 @@ def figure(result: Result) -> Figure:
 
 
 def main() -> None:
-    torch.set_num_threads(1)
-    config = tyro.cli(Config, description=__doc__)
+    config = options(Config, __doc__)
     if config.measure:
         peak_memory(config)
         return
@@ -274,11 +260,8 @@ def main() -> None:
             config, duration=0.5, repeats=1, trajectories=(1, 2), batch_duration=0.2, elements_x=(60, 120), window=2e-3
         )
     result = run(config)
-    config.out.mkdir(parents=True, exist_ok=True)
-    made = {"torchsoft": version("torchsoft"), "config": {k: str(v) for k, v in asdict(config).items()}}
-    (config.out / "summary.json").write_text(json.dumps(result.figures | {"made_by": made}, indent=2))
-    figure(result).savefig(config.out / "benchmark.png", dpi=150)
-    print(json.dumps(result.figures, indent=2) + f"\nwritten to {config.out}")
+    print(json.dumps(result.figures, indent=2))
+    write(config.out, result.figures | {"made_by": made_by(config)}, {"benchmark": figure(result)})
 
 
 if __name__ == "__main__":

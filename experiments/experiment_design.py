@@ -1,6 +1,6 @@
-"""Question: which motions should a rig make, for its data to tell contact and pad parameters apart?
+"""Question: which motions should a rig make, for its data to identify contact and pad parameters?
 
-For every excitation of `torchsoft.excitation.CATALOGUE` the Fisher matrix F = J^T J of what the sensors would say (J: exact
+For every excitation of `torchsoft.excitation.CATALOGUE` the Fisher matrix F = J^T J of the sensors' predicted samples (J: exact
 sensitivities over the sensors' noise, coordinates: logarithms of the parameters) gives the Cramer-Rao standard deviation
 sqrt(diag F^-1) of each parameter; F is additive, so combinations follow by summing. The error of the finite step, 4/3 of the
 difference to half of it, shifts an estimate by F^-1 J^T error: what an excitation is worth is the root of both squared.
@@ -8,56 +8,46 @@ Derivatives of hard slipping can be inconsistent: J is checked against a central
 excitation that fails is dropped.
 
 Command: .venv/bin/python experiments/experiment_design.py [--smoke]
-Expected: no gentle motion sees mu_k (above 50 %); light grasps jerked see it to about 1 %; K_t and R_t are the weakest, and
-three excitations together, 5.4 s of data, bring the worst of the eight (R_t) to 3 % at a step of 0.5 ms;
-harder ones would see more, but not at that step. About two minutes on one core.
+Expected: no gentle motion identifies mu_k (above 50 %), jerks of a light grasp do to about 1 %; K_t and R_t are the weakest,
+and three excitations together, 5.4 s of data, bring the worst of the eight (R_t) to 3 % at a step of 0.5 ms;
+harder ones would identify more, but not at that step. About two minutes on one core.
 """
 
 import itertools
-import json
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
-import tyro
+from _experiment import markdown, options, raw_config, write
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from tqdm import tqdm
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, Strokes
-from torchsoft.identify import RIG, Problem, Unknown, record
-from torchsoft.identify.information import standard_deviations, step_error, step_shift
-from torchsoft.identify.workers import Runner
 from torchsoft.implicit import SimulationFailed
-
-Array = NDArray[np.float64]
+from torchsoft.sysid import RIG, Problem, Unknown, record
+from torchsoft.sysid.information import standard_deviations, step_error, step_shift
+from torchsoft.sysid.recording import Array
+from torchsoft.sysid.workers import Runner
 
 NAMES: tuple[str, ...] = (
     "contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau",
 )  # fmt: skip
 CONSISTENT = 0.01
 """Difference between J and a finite difference, over their size, above which an excitation is dropped."""
-DIFFERENCE = 1e-5
-"""Step of that finite difference in the logarithms."""
+DIFFERENCE = 1e-5  # Step of that finite difference in the logarithms.
 
 
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/experiment_design")
-    step: float = 5e-4
-    """of the stepper [s]"""
-    v_s: float = 0.05
-    """contact.v_s [m/s]; large, so that gross slip has a unique solution"""
-    longest: float = 6.0
-    """data that a combination may take [s]"""
-    most: int = 3
-    """excitations in a combination"""
+    step: float = 5e-4  # of the stepper [s]
+    v_s: float = 0.05  # contact.v_s [m/s]; large, so that gross slip has a unique solution
+    longest: float = 6.0  # data that a combination may take [s]
+    most: int = 3  # excitations in a combination
     seed: int = 0
-    smoke: bool = False
-    """two short excitations"""
+    smoke: bool = False  # two short excitations
 
 
 @dataclass(frozen=True)
@@ -79,7 +69,7 @@ class Row:
 
 
 def row(names: tuple[str, ...], seconds: float, J: Array, error: Array, inconsistency: float, dropped: str = "") -> Row:
-    """What a Jacobian and the step's error (m,) say."""
+    """The row of a Jacobian and the step's error (m,)."""
     sd, shift = standard_deviations(J), step_shift(J, error)
     return Row(names, seconds, dict(zip(NAMES, sd.tolist())), dict(zip(NAMES, shift.tolist())), inconsistency, dropped)
 
@@ -97,7 +87,7 @@ def smoke(config: Config) -> tuple[Config, dict[str, Excitation]]:
     return Config(config.out, 2e-3, config.v_s, 2.0, 2, config.seed, True), {"strokes": roll, "jerks, light": jerk}
 
 
-def look(excitation: Excitation, p: Parameters, config: Config) -> tuple[Array, Array, float]:
+def assess(excitation: Excitation, p: Parameters, config: Config) -> tuple[Array, Array, float]:
     """Whitened Jacobian (m, parameters), error of the step (m,), and how far the Jacobian is, relatively, from a central
     difference along one direction."""
     recording = record("one", excitation, p, p, RIG, step=config.step, noise=0.0)
@@ -122,23 +112,23 @@ def run(config: Config) -> Result:
         config, catalogue = smoke(config)
     p = Parameters().override({"contact.v_s": config.v_s})
     single: list[Row] = []
-    seen: dict[str, tuple[Array, Array]] = {}
+    usable: dict[str, tuple[Array, Array]] = {}
     for name, excitation in tqdm(catalogue.items(), desc="excitations"):
         try:
-            J, error, wrong = look(excitation, p, config)
+            J, error, wrong = assess(excitation, p, config)
         except SimulationFailed as failure:
             single.append(Row((name,), excitation.duration, {}, {}, np.inf, failure.reason))
             continue
         dropped = "" if wrong < CONSISTENT else f"derivatives inconsistent by {wrong:.1%}"
         single.append(row((name,), excitation.duration, J, error, wrong, dropped))
         if not dropped:
-            seen[name] = J, error
+            usable[name] = J, error
     together = []
     for count in range(2, config.most + 1):
-        for names in itertools.combinations(seen, count):
+        for names in itertools.combinations(usable, count):
             seconds = sum(catalogue[name].duration for name in names)
             if seconds <= config.longest:
-                J, error = (np.concatenate([seen[name][k] for name in names]) for k in (0, 1))
+                J, error = (np.concatenate([usable[name][k] for name in names]) for k in (0, 1))
                 off = max(r.inconsistency for r in single if r.names[0] in names)
                 together.append(row(names, seconds, J, error, off))
     return Result(config, sorted(single, key=lambda r: r.worst), sorted(together, key=lambda r: r.worst))
@@ -147,26 +137,20 @@ def run(config: Config) -> Result:
 def percent(value: float, sign: str = "") -> str:
     """Two digits, without powers of ten."""
     value *= 100
-    return (
-        f"{value:{sign}.0f}"
-        if abs(value) >= 10
-        else f"{value:{sign}.2g}"
-        if abs(value) >= 0.01
-        else f"{value:{sign}.2f}"
-    )
+    digits = ".0f" if abs(value) >= 10 else ".2g" if abs(value) >= 0.01 else ".2f"
+    return f"{value:{sign}{digits}}"
 
 
 def table(rows: list[Row]) -> str:
-    short = [name.split(".")[1] for name in NAMES]
-    lines = ["| excitation | s | " + " | ".join(short) + " | derivative off by |", "|---" * (len(NAMES) + 3) + "|"]
+    lines = []
     for row in rows:
         cells = [
             f"{percent(row.sd[name])} ({percent(row.shift[name], sign='+')})" if row.sd.get(name, np.inf) < 1 else "-"
             for name in NAMES
         ]
         off = row.dropped or f"{row.inconsistency:.0e}"
-        lines.append(f"| {' + '.join(row.names)} | {row.seconds:.1f} | " + " | ".join(cells) + f" | {off} |")
-    return "\n".join(lines)
+        lines.append((" + ".join(row.names), f"{row.seconds:.1f}", *cells, off))
+    return markdown(("excitation", "s", *(name.split(".")[1] for name in NAMES), "derivative off by"), lines)
 
 
 def figure(result: Result) -> Figure:
@@ -197,16 +181,10 @@ def figure(result: Result) -> Figure:
 def main(config: Config) -> None:
     result = run(config)
     print(table(result.single), "", table(result.together[:8]), sep="\n")
-    result.config.out.mkdir(parents=True, exist_ok=True)
-    figure(result).savefig(result.config.out / "experiment_design.png", dpi=150)
-    summary = {
-        "torchsoft": version("torchsoft"),
-        "config": asdict(result.config) | {"out": str(result.config.out)},
-        "single": [asdict(row) for row in result.single],
-        "together": [asdict(row) for row in result.together[:20]],
-    }
-    (result.config.out / "summary.json").write_text(json.dumps(summary, indent=1).replace("Infinity", "null"))
+    rows = {"single": result.single, "together": result.together[:20]}
+    summary = raw_config(result.config) | {name: [asdict(row) for row in some] for name, some in rows.items()}
+    write(result.config.out, summary, {"experiment_design": figure(result)})
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main(options(Config, __doc__))

@@ -22,38 +22,30 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-import tyro
+from _experiment import COARSE, options
 from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Interrupted, NoEquilibrium, Parameters, SimulationFailed, SoftGrasp, Trajectory, simulate
-from torchsoft import diagram as drawn
-from torchsoft import figures as draw
-from torchsoft.animation import animate
+from torchsoft.plot import diagram as drawn
+from torchsoft.plot import figures as draw
+from torchsoft.plot.animation import animate
 from torchsoft.scenario import grasp_and_roll
 
 
 @dataclass(frozen=True)
 class Config:
-    out: Path = Path("out/grasp_and_roll")
-    """folder for everything that is written"""
-    step: float = 2e-3
-    """largest step of the stepper [s]"""
-    duration: float | None = None
-    """simulated time [s]; the whole manipulation (30 s) if not given"""
+    out: Path = Path("out/grasp_and_roll")  # folder for everything that is written
+    step: float = 2e-3  # largest step of the stepper [s]
+    duration: float | None = None  # simulated time [s]; the whole manipulation (30 s) if not given
     friction: Literal["default", "paper-like"] = "default"
     """friction set; with the default one, the paper-like one is run as well and compared"""
-    fidelity: Literal["massless", "inertial"] | None = None
-    """of the pads; what the parameters say (massless) if not given"""
-    config: Path | None = None
-    """TOML file of parameters, a table per group"""
-    animation: bool = True
-    """write the animation"""
-    table: bool = False
-    """only print the table of the summary that is already in `out`"""
-    smoke: bool = False
-    """0.6 s on a coarse mesh"""
+    fidelity: Literal["massless", "inertial"] | None = None  # of the pads; as in the parameters (massless) if not given
+    config: Path | None = None  # TOML file of parameters, a table per group
+    animation: bool = True  # write the animation
+    table: bool = False  # only print the table of the summary that is already in `out`
+    smoke: bool = False  # 0.6 s on a coarse mesh
 
 
 @dataclass(frozen=True)
@@ -78,7 +70,7 @@ class Result:
 
 
 def parameters(config: Config, friction: str) -> Parameters:
-    changes: dict[str, Any] = {"pad.elements_x": 60, "pad.elements_y": 2} if config.smoke else {}
+    changes: dict[str, Any] = dict(COARSE) if config.smoke else {}
     if config.fidelity:
         changes["pad.fidelity"] = config.fidelity
     if friction == "paper-like":
@@ -113,7 +105,7 @@ def manipulate(config: Config, friction: str) -> Run:
 
 
 def run(config: Config) -> Result:
-    """The asked-for friction set, and the paper-like one beside the default. Ends with the run that stops early."""
+    """The chosen friction set, and the paper-like one beside the default. Ends with the run that stops early."""
     if config.smoke:
         config = replace(config, duration=0.6)
     runs = {}
@@ -162,7 +154,7 @@ def summary(run: Run) -> dict[str, Any]:
 
 
 def summaries(result: Result) -> dict[str, Any]:
-    """`summary.json`: the asked-for friction set at the top, the other under "paper_like", and how both were made."""
+    """`summary.json`: the chosen friction set at the top, the other under "paper_like", and how both were made."""
     first, *others = map(summary, result.runs.values())
     config = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(result.config).items()}
     made = {"torchsoft": version("torchsoft"), "command": command(result.config), "config": config}
@@ -238,7 +230,7 @@ def figures(result: Result) -> dict[str, Figure]:
         "bracket_moment": draw.bracket_moment(trajectory),
         "snapshots": draw.snapshots(trajectory, model),
         "angular_momentum": draw.angular_momentum(trajectory),
-        "energy": draw.energy_ledger(trajectory),
+        "energy": draw.energy_balance(trajectory),
         "multibond": drawn.multibond_graph(model),
     }
     for time in (0.125, 5.0):
@@ -269,8 +261,7 @@ def write(result: Result) -> None:
 
 
 def main() -> None:
-    torch.set_num_threads(1)
-    config = tyro.cli(Config, description=__doc__)
+    config = options(Config, __doc__)
     try:
         if config.table:
             print(table(json.loads((config.out / "summary.json").read_text())))

@@ -1,8 +1,8 @@
-"""Question: do 5.4 s of noisy rolling tell all eight contact and pad parameters, from starts off by factors of 2 to 3?
+"""Question: do 5.4 s of noisy rolling determine all eight contact and pad parameters, from starts off by factors of 2 to 3?
 
 A rig with known parameters (K_n, R_n, K_t, R_t, mu_s, mu_k, E, tau) makes the three recordings that
 `experiment_design.py` ranks first, with sensor noise of 10 um, 0.5 mrad and 0.1 N at 200 Hz and a tenth of the fit's step;
-`torchsoft.identify` finds the parameters in stages, on exact sensitivities, and predicts a fourth recording. The same once
+`torchsoft.sysid` finds the parameters in stages, on exact sensitivities, and predicts a fourth recording. The same once
 more without noise (made at the fit's step, so that nothing but the fit can fail), and with the same stages on finite
 differences: `scipy.optimize.least_squares` with a Jacobian of one more run a parameter, all of them at once in the workers.
 
@@ -12,52 +12,42 @@ with a standard deviation of 3 %; both starts end at the same place. Differences
 again. Each identification takes one to one and a half minutes on two cores, the whole ten minutes.
 """
 
-import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import tyro
+from _experiment import COARSE, markdown, options, raw_config, write
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes
-from torchsoft.identify import RIG, Answer, Problem, Recording, Unknown, identify, record
-from torchsoft.identify.problem import Residuals
-from torchsoft.identify.report import report
-from torchsoft.identify.workers import Runner, forget
-
-Array = NDArray[np.float64]
+from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, identify, record
+from torchsoft.sysid.problem import Residuals
+from torchsoft.sysid.recording import Array
+from torchsoft.sysid.report import report
+from torchsoft.sysid.workers import Runner, forget
 
 TRUTH = {
     "contact.K_n": 1.6e5, "contact.R_n": 300.0, "contact.K_t": 0.8e5, "contact.R_t": 600.0, "contact.mu_s": 0.65,
     "contact.mu_k": 0.5, "pad.E": 0.9e6, "pad.tau": 0.012,
 }  # fmt: skip
 FITTED, HELD_OUT = ("deep pressing", "light shaking", "light jerks"), "shaking"
-DIFFERENCE = 1e-4
-"""Step of the finite differences in the logarithms."""
+DIFFERENCE = 1e-4  # Step of the finite differences in the logarithms.
 
 
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/identify_contact")
-    step: float = 5e-4
-    """of the fit [s]"""
-    finer: float = 10.0
-    """how many times finer the steps are that noisy data are made with"""
-    v_s: float = 0.05
-    """contact.v_s [m/s], known"""
-    starts: tuple[int, ...] = (0, 1)
-    """seeds of the starts: every parameter off by a factor of 2 to 3, up or down"""
+    step: float = 5e-4  # of the fit [s]
+    finer: float = 10.0  # how many times finer the steps are that noisy data are made with
+    v_s: float = 0.05  # contact.v_s [m/s], known
+    starts: tuple[int, ...] = (0, 1)  # seeds of the starts: every parameter off by a factor of 2 to 3, up or down
     workers: int = 2
     noise_seed: int = 0
-    baseline: bool = True
-    """identify by finite differences as well, from the first start"""
-    smoke: bool = False
-    """four parameters from two short recordings on a coarse mesh"""
+    baseline: bool = True  # identify by finite differences as well, from the first start
+    smoke: bool = False  # four parameters from two short recordings on a coarse mesh
 
 
 @dataclass(frozen=True)
@@ -67,16 +57,16 @@ class Case:
     name: str
     noise: float
     start: dict[str, float]
-    answer: Answer
+    found: IdentificationResult
 
     def parameters(self, truth: dict[str, float]) -> dict[str, dict[str, object]]:
         out = {}
         for name, value in truth.items():
-            e = self.answer[name]
+            e = self.found[name]
             out[name] = {
                 "truth": value, "start": self.start[name], "estimate": e.value, "ci95": e.ci95,
                 "relative_sd": e.relative_sd, "relative_error": None if e.value is None else e.value / value - 1,
-                "seen": e.seen,
+                "seen": e.identifiable,
             }  # fmt: skip
         return out
 
@@ -129,7 +119,7 @@ def truths(config: Config) -> dict[str, float]:
 
 def record_all(config: Config, noise: float) -> list[Recording]:
     """What the rig gives; the last one is to be predicted."""
-    coarse = {"pad.elements_x": 60, "pad.elements_y": 2} if config.smoke else {}
+    coarse = COARSE if config.smoke else {}
     nominal = Parameters().override({"contact.v_s": config.v_s} | coarse)
     rig = nominal.override({**truths(config), **({"contact.mu_k": 0.5} if config.smoke else {})})
     if config.smoke:
@@ -167,17 +157,17 @@ def run(config: Config) -> Result:
 
     def case(name: str, noise: float, seed: int, kind: type[Problem] = Problem) -> Problem:
         begin = start(config, seed)
-        asked = problem(config, noisy if noise else exact, begin, kind)
+        stated = problem(config, noisy if noise else exact, begin, kind)
         print(f"\n{name}, start {seed}: off by factors of", *(f"{v / truths(config)[k]:.2f}" for k, v in begin.items()))
         folder = config.out / f"runs-{name.replace(' ', '-')}-{seed}"
-        answer = identify(
-            asked, step=config.step, workers=config.workers, heldout=held, checkpoint=folder, progress=not config.smoke,
+        found = identify(
+            stated, step=config.step, workers=config.workers, heldout=held, checkpoint=folder, progress=not config.smoke,
             polished=noise > 0,
         )  # fmt: skip
         forget(folder)
-        cases.append(Case(name, noise, begin, answer))
-        print(answer.table(), *answer.notices, sep="\n")
-        return asked
+        cases.append(Case(name, noise, begin, found))
+        print(found.table(), *found.notices, sep="\n")
+        return stated
 
     last = None
     for seed in config.starts:
@@ -196,13 +186,13 @@ def figure(result: Result) -> Figure:
     axes = fig.subplots(1, len(result.cases), sharey=True, squeeze=False)[0]
     for ax, case in zip(axes, result.cases):
         for i, (name, truth) in enumerate(result.truth.items()):
-            e = case.answer[name]
+            e = case.found[name]
             ax.plot(case.start[name] / truth, i, "o", mfc="none", color="0.6")
-            ax.plot(e.last / truth, i, "o", color="C0" if e.seen else "C3", ms=4)
+            ax.plot(e.last / truth, i, "o", color="C0" if e.identifiable else "C3", ms=4)
             if e.ci95:
                 ax.plot([c / truth for c in e.ci95], [i, i], color="C0", lw=2)
         ax.axvline(1.0, color="k", lw=0.5)
-        error = max(abs(case.answer[name].last / truth - 1) for name, truth in result.truth.items())
+        error = max(abs(case.found[name].last / truth - 1) for name, truth in result.truth.items())
         ax.set(xscale="log", xlim=(0.25, 4.0), xlabel="over the truth", title=f"{case.name}\nworst error {error:.2g}")
         ax.set_xticks([0.25, 0.5, 1, 2, 4], ["1/4", "1/2", "1", "2", "4"])
         ax.minorticks_off()
@@ -214,40 +204,36 @@ def figure(result: Result) -> Figure:
 def main(config: Config) -> None:
     result = run(config)
     config = result.config
-    config.out.mkdir(parents=True, exist_ok=True)
-    figure(result).savefig(config.out / "identify_contact.png", dpi=150)
-    report([c.answer for c in result.cases if c.name == "noisy"][-1], result.problem, config.out / "report.html")
+    report([c.found for c in result.cases if c.name == "noisy"][-1], result.problem, config.out / "report.html")
     rows = []
     for case in result.cases:
-        cost = case.answer.cost
+        cost = case.found.cost
         rows.append(
             {
                 "case": case.name, "noise": case.noise, "parameters": case.parameters(result.truth),
-                "chi2": case.answer.chi2, "heldout_nrmse": case.answer.heldout, "stages": case.answer.stages,
-                "notices": case.answer.notices,
+                "chi2": case.found.chi2, "heldout_nrmse": case.found.heldout, "stages": case.found.stages,
+                "notices": case.found.notices,
                 **{k: cost[k] for k in ("data_seconds", "simulations", "jacobians", "wall_s")},
             }
         )  # fmt: skip
     wall = {row["case"]: row["wall_s"] for row in reversed(rows)}
     summary = {
-        "torchsoft": version("torchsoft"),
-        "config": asdict(config) | {"out": str(config.out)},
+        **raw_config(config),
         "noise": {channel: sensor.noise for channel, sensor in RIG.items()},
         "cases": rows,
         "baseline_over_exact": wall["finite differences"] / wall["noisy"] if "finite differences" in wall else None,
     }
-    (config.out / "summary.json").write_text(json.dumps(summary, indent=1))
-    print(
-        "\n| case | worst error | worst predicted sd | simulations | Jacobians | wall [s] |\n|---|---|---|---|---|---|"
-    )
+    cells = []
     for case, row in zip(result.cases, rows):
-        seen = [case.answer[name] for name in result.truth]
-        error = max(abs(e.last / result.truth[e.name] - 1) for e in seen)
-        print(
-            f"| {case.name} | {error:.2%} | {max(e.relative_sd for e in seen):.2%} | {row['simulations']} | "
-            f"{row['jacobians']} | {row['wall_s']:.0f} |"
+        some = [case.found[name] for name in result.truth]
+        error, sd = max(abs(e.last / result.truth[e.name] - 1) for e in some), max(e.relative_sd for e in some)
+        cells.append(
+            (case.name, f"{error:.2%}", f"{sd:.2%}", row["simulations"], row["jacobians"], f"{row['wall_s']:.0f}")
         )
+    head = ("case", "worst error", "worst predicted sd", "simulations", "Jacobians", "wall [s]")
+    print("\n" + markdown(head, cells))
+    write(config.out, summary, {"identify_contact": figure(result)})
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main(options(Config, __doc__))

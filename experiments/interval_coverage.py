@@ -1,28 +1,26 @@
 """Question: do the 95 % intervals hold the truth in 95 % of repetitions?
 
 A small problem, many noise seeds: two short recordings, four parameters, from starts 10 % off. Each seed's intervals either
-hold the truth or not; with N seeds the share of those that do is binomial, and so is its own interval (Clopper-Pearson).
+hold the truth or not; with N seeds the fraction of those that do is binomial, and so is its own interval (Clopper-Pearson).
 The errors over the predicted standard deviations should be normal with mean 0 and deviation 1.
 
 Command: .venv/bin/python experiments/interval_coverage.py [--seeds 50] [--workers 2] [--smoke]
 Expected: between 88 and 100 % for every parameter with 50 seeds. About two minutes on two cores.
 """
 
-import json
-from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import tyro
+from _experiment import COARSE, markdown, options, raw_config, write
 from matplotlib.figure import Figure
 from scipy import stats
 from tqdm import tqdm
 
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, MultiSine, Strokes
-from torchsoft.identify import RIG, Problem, Recording, Stage, Unknown, identify, record
 from torchsoft.processes import local_processes
+from torchsoft.sysid import RIG, Problem, Recording, Stage, Unknown, identify, record
 
 TRUTH = {"pad.E": 0.9e6, "pad.tau": 0.012, "contact.K_n": 1.6e5, "contact.mu_s": 0.65}
 EXCITATIONS = {
@@ -37,11 +35,9 @@ EXCITATIONS = {
 class Config:
     out: Path = Path("out/interval_coverage")
     seeds: int = 50
-    step: float = 2e-3
-    """[s]; data and fit alike, so that only the noise is at work"""
+    step: float = 2e-3  # [s]; data and fit alike, so that only the noise is at work
     workers: int = 2
-    smoke: bool = False
-    """four seeds, one process"""
+    smoke: bool = False  # four seeds, one process
 
 
 @dataclass(frozen=True)
@@ -54,9 +50,7 @@ class Result:
 
 def exact(step: float) -> list[Recording]:
     """What the rig gives without noise; half of the usual mesh."""
-    nominal = Parameters().override(
-        {"contact.v_s": 0.05, "contact.mu_k": 0.5, "pad.elements_x": 60, "pad.elements_y": 2}
-    )
+    nominal = Parameters().override({"contact.v_s": 0.05, "contact.mu_k": 0.5} | COARSE)
     rig = nominal.override(TRUTH)
     return [record(name, e, rig, nominal, RIG, step=step, noise=0.0) for name, e in EXCITATIONS.items()]
 
@@ -69,10 +63,10 @@ def repeat(recordings: list[Recording], step: float, seed: int) -> dict[str, tup
         noisy.append(replace(r, samples=samples))
     problem = Problem(noisy, RIG, {name: Unknown(nominal=1.1 * value) for name, value in TRUTH.items()})
     plan = [Stage("all", problem.names, problem.coordinates.labels, step)]
-    answer = identify(problem, plan=plan, polished=False)  # the data have that step's error too
+    result = identify(problem, plan=plan, polished=False)  # the data have that step's error too
     out = {}
     for name, truth in TRUTH.items():
-        e = answer[name]
+        e = result[name]
         assert e.ci95 is not None
         out[name] = float(np.log(e.last / truth)) / e.relative_sd, e.ci95[0] <= truth <= e.ci95[1]
     return out
@@ -102,31 +96,27 @@ def figure(result: Result) -> Figure:
     return fig
 
 
-def main(config: Config) -> None:
-    result = run(config)
-    n, rows = result.config.seeds, {}
-    print(
-        "| parameter | intervals that hold the truth | share | its own 95 % interval | mean error / sd | sd of that |"
-    )
-    print("|---|---|---|---|---|---|")
+def main() -> None:
+    result = run(options(Config, __doc__))
+    n, rows, cells = result.config.seeds, {}, []
     for name, inside in result.inside.items():
         own = stats.binomtest(inside, n).proportion_ci(0.95)
         mean, spread = float(np.mean(result.errors[name])), float(np.std(result.errors[name], ddof=1))
         rows[name] = {"inside": inside, "share": inside / n, "ci95": [own.low, own.high], "mean": mean, "sd": spread}
-        print(
-            f"| {name} | {inside} of {n} | {inside / n:.0%} | {own.low:.0%} .. {own.high:.0%} | {mean:+.2f} | {spread:.2f} |"
-        )
-    result.config.out.mkdir(parents=True, exist_ok=True)
-    figure(result).savefig(result.config.out / "interval_coverage.png", dpi=150)
-    summary = {
-        "torchsoft": version("torchsoft"),
-        "config": asdict(result.config) | {"out": str(result.config.out)},
-        "seeds": n,
-        "parameters": rows,
-        "errors": result.errors,
-    }
-    (result.config.out / "summary.json").write_text(json.dumps(summary, indent=1))
+        interval = f"{own.low:.0%} .. {own.high:.0%}"
+        cells.append((name, f"{inside} of {n}", f"{inside / n:.0%}", interval, f"{mean:+.2f}", f"{spread:.2f}"))
+    head = (
+        "parameter",
+        "intervals that hold the truth",
+        "fraction",
+        "its own 95 % interval",
+        "mean error / sd",
+        "sd of that",
+    )
+    print(markdown(head, cells))
+    summary = {**raw_config(result.config), "seeds": n, "parameters": rows, "errors": result.errors}
+    write(result.config.out, summary, {"interval_coverage": figure(result)})
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config))
+    main()

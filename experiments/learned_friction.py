@@ -12,13 +12,12 @@ speeds that occurred, worst (0.1) at the slowest, which leave the least trace in
 and nothing is claimed. About one minute on one core.
 """
 
-import json
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 
 import torch
-import tyro
+from _experiment import COARSE, options, write
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 from tqdm import tqdm
@@ -36,16 +35,12 @@ SCALE = (1e-5, 1e-5, 1e-3, 1e-2, 1e-2, 1.0)
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/learned_friction")
-    evaluations: int = 40
-    """runs of the model that learning may take"""
-    kick: float = 0.3
-    """speed of the disc at the start [m/s]"""
-    step_ms: float = 0.5
-    """step, and spacing of the samples [ms]"""
+    evaluations: int = 40  # runs of the model that learning may take
+    kick: float = 0.3  # speed of the disc at the start [m/s]
+    step_ms: float = 0.5  # step, and spacing of the samples [ms]
     samples: int = 8
     seed: int = 0
-    smoke: bool = False
-    """a size that takes seconds"""
+    smoke: bool = False  # a size that takes seconds
 
 
 def smoke(config: Config) -> Config:
@@ -60,7 +55,7 @@ class Result:
     mu_start: Tensor
     mu_learned: Tensor
     mu_true: Tensor
-    seen: tuple[float, float]
+    excited: tuple[float, float]  # slip speeds in the data, from the 10 % quantile to the largest [m/s]
 
 
 class MuNetwork(nn.Module):
@@ -100,7 +95,7 @@ def run(config: Config) -> Result:
     config = smoke(config) if config.smoke else config
     torch.manual_seed(config.seed)
     law = {"contact.mu_s": 0.8, "contact.mu_k": 0.3, "contact.v_s": 0.05}
-    model = SoftGrasp(Parameters().override({"pad.elements_x": 60, "pad.elements_y": 2, **law}))
+    model = SoftGrasp(Parameters().override(COARSE | law))
     y0 = press(model, model.settings.scenario.y_Br_grasp).detach()
     y0[model.layout.slices["v_C"]] = torch.tensor([config.kick, 0.0], dtype=torch.float64)
     step = 1e-3 * config.step_ms
@@ -112,10 +107,10 @@ def run(config: Config) -> Result:
         made = simulate(model, t, y0=y0, step=step)
         data, graph = disc(model, made.y), model.evaluate(0.0, model.layout.unpack(made.y[1:]))
         speeds = torch.cat([interface.contact.gamma_dot.abs().flatten() for interface in graph.interfaces.values()])
-    seen = speeds[speeds > 0]
+    excited = speeds[speeds > 0]
 
     student = MuNetwork()
-    v = torch.linspace(0.0, 1.3 * float(seen.max()), 100, dtype=torch.float64)
+    v = torch.linspace(0.0, 1.3 * float(excited.max()), 100, dtype=torch.float64)
     with torch.no_grad():
         start, exact = student.mu(v), true_mu(truth, v)
     model.requires_grad_(False)
@@ -140,11 +135,11 @@ def run(config: Config) -> Result:
     bar.close()
     with torch.no_grad():
         learned = student.mu(v)
-    return Result(config, losses, v, start, learned, exact, (float(seen.quantile(0.1)), float(seen.max())))
+    return Result(config, losses, v, start, learned, exact, (float(excited.quantile(0.1)), float(excited.max())))
 
 
 def numbers(result: Result) -> dict[str, float]:
-    inside = (result.slip_speeds >= result.seen[0]) & (result.slip_speeds <= result.seen[1])
+    inside = (result.slip_speeds >= result.excited[0]) & (result.slip_speeds <= result.excited[1])
     error = (result.mu_learned - result.mu_true).abs()[inside]
     return {
         "loss_start": result.losses[0],
@@ -153,8 +148,8 @@ def numbers(result: Result) -> dict[str, float]:
         "mu_error_max": float(error.max()),
         "mu_error_mean": float(error.mean()),
         "mu_error_start_max": float((result.mu_start - result.mu_true).abs()[inside].max()),
-        "slip_from_mm_s": 1e3 * result.seen[0],
-        "slip_to_mm_s": 1e3 * result.seen[1],
+        "slip_from_mm_s": 1e3 * result.excited[0],
+        "slip_to_mm_s": 1e3 * result.excited[1],
     }
 
 
@@ -165,7 +160,9 @@ def figure(result: Result) -> Figure:
     left.semilogy(result.losses)
     left.set(xlabel="run of the model", ylabel="mean squared misfit [1]", title="Learning from the disc's motion")
     mm_s = 1e3 * result.slip_speeds
-    right.axvspan(1e3 * result.seen[0], 1e3 * result.seen[1], color="0.93", label="slip speeds in the data (90 %)")
+    right.axvspan(
+        1e3 * result.excited[0], 1e3 * result.excited[1], color="0.93", label="slip speeds in the data (90 %)"
+    )
     right.plot(mm_s, result.mu_true, "k-", label="truth")
     right.plot(mm_s, result.mu_start, "C0:", label="before")
     right.plot(mm_s, result.mu_learned, "C1--", label="learned")
@@ -175,16 +172,11 @@ def figure(result: Result) -> Figure:
 
 
 def main() -> None:
-    torch.set_num_threads(1)
-    result = run(tyro.cli(Config, description=__doc__))
-    out = result.config.out
-    out.mkdir(parents=True, exist_ok=True)
-    summary = {**numbers(result), "made_by": {"torchsoft": version("torchsoft"), "losses": result.losses}}
-    (out / "summary.json").write_text(json.dumps(summary, indent=2))
-    figure(result).savefig(out / "learned_friction.png", dpi=150)
+    result = run(options(Config, __doc__))
     for name, value in numbers(result).items():
         print(f"{name}: {value:.4g}")
-    print(f"written to {out}")
+    summary = {**numbers(result), "made_by": {"torchsoft": version("torchsoft"), "losses": result.losses}}
+    write(result.config.out, summary, {"learned_friction": figure(result)})
 
 
 if __name__ == "__main__":

@@ -8,16 +8,14 @@ Command: .venv/bin/python experiments/pad_fidelity.py [--smoke]
 Expected: on the manipulation the disc differs by some nanometres and the forces by some millinewtons. About 20 s.
 """
 
-import json
-from dataclasses import asdict, dataclass
-from importlib.metadata import version
+from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-import tyro
-from torch import Tensor
+import numpy as np
+from _experiment import grid, made_by, markdown, options, write
 
 from torchsoft import Parameters, SoftGrasp, Trajectory, simulate
+from torchsoft.channels import CHANNELS
 from torchsoft.control import Profile
 from torchsoft.scenario import grasp_and_roll
 
@@ -31,12 +29,9 @@ UNITS = {
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/pad_fidelity")
-    duration: float = 30.0
-    """of the manipulation [s]"""
-    step: float = 2e-3
-    """of the stepper [s]; the fast stroke takes a quarter of it"""
-    smoke: bool = False
-    """a size that takes seconds"""
+    duration: float = 30.0  # of the manipulation [s]
+    step: float = 2e-3  # of the stepper [s]; the fast stroke takes a quarter of it
+    smoke: bool = False  # a size that takes seconds
 
 
 @dataclass(frozen=True)
@@ -45,14 +40,12 @@ class Result:
     differences: dict[str, dict[str, dict[str, float]]]
 
 
-def signals(run: Trajectory) -> dict[str, Tensor]:
-    s = run.state
-    force = torch.cat((run.force_L, run.force_U), 1)
-    return {
-        "x_C": s.r_C[:, 0], "y_C": s.r_C[:, 1], "theta": s.theta, "x_Br": s.r_Br[:, 0], "y_Br": s.r_Br[:, 1],
-        "v_x": s.v_C[:, 0], "omega": s.omega, "F_x": run.control[:, 0], "F_y": run.control[:, 1],
-        "M_Br": run.bracket_moment, "nodal normal force": force[..., 0], "nodal friction": force[..., 1],
-    }  # fmt: skip
+def signals(run: Trajectory) -> dict[str, np.ndarray]:
+    data = run.to_dataset()
+    keys = {name: "bracket_moment" if name == "M_Br" else name for name in UNITS if not name.startswith("nodal")}
+    out = {name: CHANNELS[key].of(data[CHANNELS[key].variable].values) for name, key in keys.items()}
+    force = np.concatenate((run.force_L.numpy(), run.force_U.numpy()), 1)
+    return out | {"nodal normal force": force[..., 0], "nodal friction": force[..., 1]}
 
 
 def compare(duration: float, step: float, stroke: float | None, grasp_force: float) -> dict[str, dict[str, float]]:
@@ -66,13 +59,11 @@ def compare(duration: float, step: float, stroke: float | None, grasp_force: flo
         manipulation = grasp_and_roll(model, grasp_force=grasp_force)
         if stroke is not None:
             model.reference.x = Profile([0.6, 0.6 + stroke], [0.06, 0.04])
-        t = torch.linspace(0, duration, round(duration / 0.01) + 1, dtype=torch.float64)
-        runs[fidelity] = signals(simulate(model, t, y0=manipulation.y0, step=step, progress=True))
+        runs[fidelity] = signals(simulate(model, grid(duration), y0=manipulation.y0, step=step, progress=True))
     out = {}
     for name, (_, scale) in UNITS.items():
         massless, inertial = runs["massless"][name], runs["inertial"][name]
-        difference = (inertial - massless).abs().max().item()
-        span = (massless.max() - massless.min()).item()
+        difference, span = float(np.abs(inertial - massless).max()), float(np.ptp(massless))
         out[name] = {"difference": scale * difference, "range": scale * span, "relative": difference / span}
     return out
 
@@ -92,25 +83,20 @@ def run(config: Config) -> Result:
 def table(result: Result) -> str:
     """A Markdown table, one row an output."""
     cases = list(result.differences)
-    lines = ["| output | unit | " + " | ".join(f"{case}: difference | of range" for case in cases) + " |"]
-    lines.append("|---" * (2 + 2 * len(cases)) + "|")
+    rows = []
     for name, (unit, _) in UNITS.items():
         cells = [result.differences[case][name] for case in cases]
-        lines.append(
-            f"| {name} | {unit} | " + " | ".join(f"{c['difference']:.3g} | {c['relative']:.1e}" for c in cells) + " |"
-        )
-    return "\n".join(lines)
+        rows.append((name, unit, *(f"{c['difference']:.3g} | {c['relative']:.1e}" for c in cells)))
+    return markdown(
+        ("output", "unit", *(column for case in cases for column in (f"{case}: difference", "of range"))), rows
+    )
 
 
 def main() -> None:
-    torch.set_num_threads(1)
-    result = run(tyro.cli(Config, description=__doc__))
-    out = result.config.out
-    out.mkdir(parents=True, exist_ok=True)
-    made = {"torchsoft": version("torchsoft"), "config": {k: str(v) for k, v in asdict(result.config).items()}}
-    (out / "summary.json").write_text(json.dumps({"differences": result.differences, "made_by": made}, indent=2))
-    (out / "table.md").write_text(table(result) + "\n")
-    print(table(result) + f"\n\nwritten to {out}")
+    result = run(options(Config, __doc__))
+    print(table(result), end="\n\n")
+    summary = {"differences": result.differences, "made_by": made_by(result.config)}
+    write(result.config.out, summary, table=table(result))
 
 
 if __name__ == "__main__":

@@ -10,14 +10,11 @@ and below 0.5 % in the forces; x_C(10 s) does not depend on the mesh, y_C in the
 the peak of F_x, which rides on node transitions, falls with the mesh. About one minute on one core.
 """
 
-import json
-from dataclasses import asdict, dataclass
-from importlib.metadata import version
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-import tyro
+from _experiment import grid, made_by, markdown, options, write
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 from torch import Tensor
@@ -30,20 +27,13 @@ from torchsoft.scenario import grasp_and_roll
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/refinement")
-    steps_ms: tuple[float, ...] = (5.0, 2.0, 1.0, 0.5)
-    """steps compared [ms]"""
-    reference_ms: float = 0.2
-    """step of the run they are compared with [ms]"""
-    elements_x: tuple[int, ...] = (60, 120, 240, 480)
-    """elements along the pad; a thirtieth of that through it"""
-    etas: tuple[float, ...] = (100.0, 10.0, 1.0, 0.1, 0.0)
-    """viscosities of the slip element [N.s/m]"""
-    duration: float = 30.0
-    """of the runs that the steps are compared over [s]"""
-    roll: float = 10.0
-    """of the runs on other meshes and with other viscosities [s]"""
-    smoke: bool = False
-    """a size that takes seconds"""
+    steps_ms: tuple[float, ...] = (5.0, 2.0, 1.0, 0.5)  # steps compared [ms]
+    reference_ms: float = 0.2  # step of the run they are compared with [ms]
+    elements_x: tuple[int, ...] = (60, 120, 240, 480)  # elements along the pad; a thirtieth of that through it
+    etas: tuple[float, ...] = (100.0, 10.0, 1.0, 0.1, 0.0)  # viscosities of the slip element [N.s/m]
+    duration: float = 30.0  # of the runs that the steps are compared over [s]
+    roll: float = 10.0  # of the runs on other meshes and with other viscosities [s]
+    smoke: bool = False  # a size that takes seconds
 
 
 @dataclass(frozen=True)
@@ -67,22 +57,16 @@ def manipulate(changes: dict[str, Any], step: float, duration: float, grasp_forc
     """The paper's manipulation with some parameters changed, its first `duration` seconds on a 10 ms grid."""
     model = SoftGrasp(Parameters().override(changes))
     manipulation = grasp_and_roll(model, grasp_force=grasp_force)
-    t = torch.linspace(0, duration, round(duration / 0.01) + 1, dtype=torch.float64)
-    return simulate(model, t, y0=manipulation.y0, step=step)
+    return simulate(model, grid(duration), y0=manipulation.y0, step=step)
 
 
 def signals(run: Trajectory) -> dict[str, Tensor]:
-    return {
-        "x_C": run.state.r_C[:, 0],
-        "y_C": run.state.r_C[:, 1],
-        "theta": run.state.theta,
-        "F_x": run.control[:, 0],
-        "F_y": run.control[:, 1],
-    }
+    r_C, F = run.state.r_C.unbind(-1), run.control.unbind(-1)
+    return {"x_C": r_C[0], "y_C": r_C[1], "theta": run.state.theta, "F_x": F[0], "F_y": F[1]}
 
 
 def figures_of_merit(run: Trajectory) -> dict[str, float]:
-    """What one run of the manipulation comes to."""
+    """Numbers that sum up one run of the manipulation."""
     normal, friction = run.force_L[..., 0], run.force_L[..., 1]
     grasped = run.at(0.375)
     return {
@@ -130,9 +114,7 @@ def run(config: Config) -> Result:
 def table(title: str, rows: dict[str, dict[str, float]]) -> str:
     """A Markdown table."""
     names = list(next(iter(rows.values())))
-    lines = [f"| {title} | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
-    lines += [f"| {key} | " + " | ".join(f"{row[name]:.5g}" for name in names) + " |" for key, row in rows.items()]
-    return "\n".join(lines)
+    return markdown((title, *names), [(key, *(f"{row[name]:.5g}" for name in names)) for key, row in rows.items()])
 
 
 def figure(result: Result) -> Figure:
@@ -156,17 +138,11 @@ def figure(result: Result) -> Figure:
 
 
 def main() -> None:
-    torch.set_num_threads(1)
-    result = run(tyro.cli(Config, description=__doc__))
-    out = result.config.out
-    out.mkdir(parents=True, exist_ok=True)
-    made = {"torchsoft": version("torchsoft"), "config": {k: str(v) for k, v in asdict(result.config).items()}}
-    summary = {"steps": result.steps, "meshes": result.meshes, "etas": result.etas, "made_by": made}
-    (out / "summary.json").write_text(json.dumps(summary, indent=2))
-    figure(result).savefig(out / "refinement.png", dpi=150)
-    for title, rows in (("step", result.steps), ("mesh", result.meshes), ("eta [N.s/m]", result.etas)):
+    result = run(options(Config, __doc__))
+    parts = {"steps": result.steps, "meshes": result.meshes, "etas": result.etas}
+    for title, rows in zip(("step", "mesh", "eta [N.s/m]"), parts.values()):
         print("\n" + table(title, rows))
-    print(f"\nwritten to {out}")
+    write(result.config.out, {**parts, "made_by": made_by(result.config)}, {"refinement": figure(result)})
 
 
 if __name__ == "__main__":

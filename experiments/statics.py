@@ -14,15 +14,14 @@ a few nodes touch, are far less accurate: at 0.15 mm, 0.53 N on 1 mm nodes again
 core.
 """
 
-import json
 from dataclasses import asdict, dataclass
-from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import torch
-import tyro
+from _experiment import made_by, markdown, options
+from _experiment import write as write_files
 from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
@@ -36,14 +35,10 @@ MILLI, MICRO = 1e3, 1e6
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/statics")
-    elements_x: tuple[int, ...] = (60, 120, 240, 480)
-    """elements along the pad; a thirtieth of that through it"""
-    stiffenings: tuple[float, ...] = (0.25, 1.0, 4.0, 16.0)
-    """multiples of the default K_n, on the default mesh"""
-    points: int = 10
-    """compressions, in equal steps up to the full grasp's"""
-    smoke: bool = False
-    """a size that takes seconds"""
+    elements_x: tuple[int, ...] = (60, 120, 240, 480)  # elements along the pad; a thirtieth of that through it
+    stiffenings: tuple[float, ...] = (0.25, 1.0, 4.0, 16.0)  # multiples of the default K_n, on the default mesh
+    points: int = 10  # compressions, in equal steps up to the full grasp's
+    smoke: bool = False  # a size that takes seconds
 
 
 @dataclass(frozen=True)
@@ -162,11 +157,11 @@ def table(title: str, curves: dict[str, Curve]) -> str:
     """The full grasp as a Markdown table, with the relative difference from the next row."""
     rows, steps = full_grasp(curves), successive(curves)
     names = list(next(iter(rows.values())))
-    lines = [f"| {title} | " + " | ".join(names) + " | to the next |", "|---" * (len(names) + 2) + "|"]
+    cells = []
     for key, row in rows.items():
         step = f"{steps[key]['full_grasp']:.2%}" if key in steps else ""
-        lines.append(f"| {key} | " + " | ".join(f"{row[name]:.5g}" for name in names) + f" | {step} |")
-    return "\n".join(lines)
+        cells.append((key, *(f"{row[name]:.5g}" for name in names), step))
+    return markdown((title, *names, "to the next"), cells)
 
 
 def figure(result: Result) -> Figure:
@@ -211,25 +206,19 @@ def summary(result: Result) -> dict[str, Any]:
         }
         for name, family in result.families.items()
     }
-    config = {k: str(v) for k, v in asdict(result.config).items()}
-    return out | {"made_by": {"torchsoft": version("torchsoft"), "config": config}}
+    return out | {"made_by": made_by(result.config)}
 
 
 def write(result: Result) -> None:
     """`summary.json` and `statics.png` in the configured folder."""
-    out = result.config.out
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "summary.json").write_text(json.dumps(summary(result), indent=2))
-    figure(result).savefig(out / "statics.png", dpi=150)
+    write_files(result.config.out, summary(result), {"statics": figure(result)})
 
 
 def main() -> None:
-    torch.set_num_threads(1)
-    result = run(tyro.cli(Config, description=__doc__))
-    write(result)
+    result = run(options(Config, __doc__))
     for name, family in result.families.items():
         print(f"\n{table(name, family.curves)}\n\nlimit: {family.limit:.2f} N")
-    print(f"\nwritten to {result.config.out}")
+    write(result)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from types import ModuleType
 import pytest
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
+sys.path.insert(0, str(EXPERIMENTS))  # as for a script; what experiments share lies beside them
 
 
 def experiment(name: str) -> ModuleType:

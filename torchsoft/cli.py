@@ -11,7 +11,7 @@ IDENTIFY = """\
 Which parameters explain these recordings, and how sure is that?
 
 DATA are CSV files with a heading such as `t [s], x_d [mm], y_d [mm], F_ff [N], x_C [mm], theta [deg]`, or trajectory files of
-this project (.nc). CONFIG.toml says what is known, what is unknown and how good the sensors are; examples/identify has both.
+this project (.nc). CONFIG.toml states what is known, what is unknown and how good the sensors are; examples/identify has both.
 Writes answer.json and report.html. Interrupted, the same command continues where it was."""
 
 
@@ -47,11 +47,12 @@ def identify(options: argparse.Namespace) -> int:
         return failed(f"one CONFIG.toml is needed, but {len(configs)} were given")
     try:
         # these take seconds to import, so that `--help` does without
-        from torchsoft.identify import measured
-        from torchsoft.identify.fit import Unreachable
-        from torchsoft.identify.report import report
-        from torchsoft.identify.solve import identify
-        from torchsoft.identify.workers import forget
+        from torchsoft.files import findings
+        from torchsoft.sysid import measured
+        from torchsoft.sysid.fit import Unreachable
+        from torchsoft.sysid.report import report
+        from torchsoft.sysid.solve import identify
+        from torchsoft.sysid.workers import forget
 
         tables: dict[str, Any] = {}
         try:
@@ -62,16 +63,16 @@ def identify(options: argparse.Namespace) -> int:
                 fit.model_dump() | {k: v for k, v in changed.items() if v is not None}
             )
             options.out.mkdir(parents=True, exist_ok=True)
-            answer = identify(
+            result = identify(
                 case.problem, heldout=case.config.heldout, checkpoint=unfinished, progress=not options.no_progress,
                 **fit.model_dump(),
             )  # fmt: skip
-            answer.save(options.out / "answer.json")
-            report(answer, case.problem, options.out / "report.html", checkpoint=unfinished)
+            result.save(options.out / "answer.json")
+            report(result, case.problem, options.out / "report.html", checkpoint=unfinished)
         except Unreachable as error:
             return failed(measured.unreachable(error, tables))
         except measured.ValidationError as error:
-            return failed(measured.told(error))
+            return failed(findings(error))
         except (ValueError, RuntimeError) as error:  # a model without equilibrium, a worker that was killed
             return failed(str(error))
         except OSError as error:
@@ -80,10 +81,10 @@ def identify(options: argparse.Namespace) -> int:
         print(f"\ninterrupted; what is done so far is in {unfinished}, and the same command continues", file=sys.stderr)
         return 130
     forget(unfinished)
-    print(answer.table())
-    for notice in answer.notices:
+    print(result.table())
+    for notice in result.notices:
         print(f"note: {notice}")
-    print(f"{answer.cost['wall_s']:.0f} s; written to {options.out / 'answer.json'} and {options.out / 'report.html'}")
+    print(f"{result.cost['wall_s']:.0f} s; written to {options.out / 'answer.json'} and {options.out / 'report.html'}")
     return 0
 
 

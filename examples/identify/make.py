@@ -1,4 +1,4 @@
-"""Make the recordings of this folder: a rig whose parameters are `TRUTH`, seen by noisy sensors. Takes some seconds.
+"""Make the recordings of this folder: a rig whose parameters are `TRUTH`, measured by noisy sensors. Takes some seconds.
 
 python examples/identify/make.py
 """
@@ -10,8 +10,9 @@ import numpy as np
 import torch
 
 from torchsoft import Parameters
+from torchsoft.channels import CHANNELS
 from torchsoft.excitation import Chirp, Excitation, Strokes
-from torchsoft.identify import CHANNELS, Recording, Sensor, record
+from torchsoft.sysid import Recording, Sensor, record
 
 HERE = Path(__file__).parent
 
@@ -32,10 +33,10 @@ def table(recording: Recording) -> dict[str, tuple[str, np.ndarray]]:
     """Unit and values in SI by column: time, set-points with their rates, then what was measured."""
     t = recording.times
     with torch.no_grad():
-        want = recording.reference(torch.from_numpy(t))
-    asked = {"x_d": ("m", want.x), "x_d_dot": ("m/s", want.x_dot), "y_d": ("m", want.y), "y_d_dot": ("m/s", want.y_dot)}
-    out = {name: (unit, value.numpy()) for name, (unit, value) in (asked | {"F_ff": ("N", want.F_y)}).items()}
-    return out | {name: (CHANNELS[name], values) for name, (_, values) in recording.samples.items()}
+        d = recording.reference(torch.from_numpy(t))
+    reference = {"x_d": d.x, "x_d_dot": d.x_dot, "y_d": d.y, "y_d_dot": d.y_dot, "F_ff": d.F_y}
+    out = {name: (CHANNELS[name].unit, value.numpy()) for name, value in reference.items()}
+    return out | {name: (CHANNELS[name].unit, values) for name, (_, values) in recording.samples.items()}
 
 
 def write(recording: Recording, path: Path, digits: int = 7) -> None:

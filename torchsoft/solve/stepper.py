@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -67,7 +67,7 @@ class Segment:
     """One chunk of a taped run: where it began, its signals, and its tape, or None where it is to be made again when needed."""
 
     chunk: Chunk
-    signals: slice
+    signals: Array
     y: Array
     V: Array
     u_dot: Array
@@ -107,17 +107,15 @@ class ImplicitStepper:
         self.step, self.tolerance, self.max_iterations, self.window = step, tolerance, max_iterations, window
         self._cap = 64
 
-    def plan(self, t: Tensor) -> tuple[list[Chunk], Tensor]:
-        """The chunks of a run through t, and the signals at all their stages (stages, signals, 2), with their graph."""
-        check_times(t)
-        todo = list(chunks(t, self.step))
-        return todo, self.compiled.signals(torch.cat([stage_times(chunk) for chunk in todo]), self.reference)
+    @property
+    def signals_at_start(self) -> Tensor:
+        """The signals at one moment, to see whether they carry a graph."""
+        return self.compiled.signals(torch.zeros(1, dtype=torch.float64), self.reference)
 
     @torch.no_grad()
     def integrate(
-        self, y0: Tensor, t: Tensor, plan: tuple[list[Chunk], Tensor], segments: list[Segment] | None = None,
-        tape_bytes: float = 0.0,
-    ) -> Iterator[Progress]:  # fmt: skip
+        self, y0: Tensor, t: Tensor, segments: list[Segment] | None = None, tape_bytes: float = 0.0
+    ) -> Iterator[Progress]:
         """Step from y0 (size,) through t (T,), yielding the same growing `Progress` after every compiled call.
 
         The last yield is the complete run. With `segments` given, what the derivatives need is appended to it, tapes for as long
@@ -126,7 +124,9 @@ class ImplicitStepper:
         self.layout.check(y0)
         if y0.ndim != 1 or not bool(torch.isfinite(y0).all()):
             raise ValueError(f"`y0` must be one finite state, shape ({self.layout.size},), but has shape {tuple(y0.shape)}")
-        todo, signals = plan[0], plan[1].detach().numpy()
+        check_times(t)
+        todo = list(chunks(t, self.step))
+        signals = self.signals(todo).numpy()
         first = self.compiled.system(todo[0].h)
         points, pads, coordinates = len(first.points.X), len(first.pads.base), len(first.bodies.free)
         n = len(self.integrals.names)
@@ -139,17 +139,17 @@ class ImplicitStepper:
         set_velocities(first, work, y)
         announce_compilation()
         ends = np.cumsum([0, *(2 * len(chunk.starts) for chunk in todo)])
-        pending = [(chunk, slice(int(a), int(b)), signals[a:b], 0) for chunk, a, b in zip(todo, ends[:-1], ends[1:])][::-1]
+        pending = [(chunk, signals[a:b], 0) for chunk, a, b in zip(todo, ends[:-1], ends[1:])][::-1]
         while pending:
-            chunk, where, follow, halvings = pending.pop()
+            chunk, follow, halvings = pending.pop()
             rows = slice(out.rows, out.rows + int(chunk.keep.sum()))
-            segment = Segment(chunk, where, y.copy(), work.V.copy(), work.u_dot.copy(), rows, None)
+            segment = Segment(chunk, follow, y.copy(), work.V.copy(), work.u_dot.copy(), rows, None)
             outputs = (out.y[rows], out.forces[rows], out.extras[rows])
             wanted = segments is not None and taped < tape_bytes
             steps, status, solves, tape = self._run(chunk, follow, y, work, integrals, outputs, wanted)
             if segments is not None and steps > 0:
                 segment.chunk = chunk.part(0, steps)
-                segment.signals = slice(where.start, where.start + 2 * steps)
+                segment.signals = follow[: 2 * steps]
                 segment.rows = slice(rows.start, rows.start + int(segment.chunk.keep.sum()))
                 segment.tape = None if tape is None else first_stages(tape, 2 * steps)
                 segments.append(segment)
@@ -161,17 +161,19 @@ class ImplicitStepper:
             if status == NEWTON_FAILED and halvings < HALVINGS:
                 out.failed += 1
                 work.u_dot[:] = 0.0
-                at = where.start + 2 * steps
                 if steps + 1 < len(chunk.starts):
                     rest = chunk.part(steps + 1, len(chunk.starts))
-                    pending.append((rest, slice(at + 2, where.stop), follow[2 * steps + 2 :], halvings))
+                    pending.append((rest, follow[2 * steps + 2 :], halvings))
                 half = chunk.halved(steps)
-                added = self.compiled.signals(stage_times(half), self.reference).detach().numpy()
-                pending.append((half, slice(-1, -1), added, halvings + 1))
+                pending.append((half, self.signals([half]).numpy(), halvings + 1))
             elif status != CONVERGED:
                 raise self._failure(status, float(chunk.starts[steps]), chunk.h)
 
-    def tape(self, segment: Segment, signals: Array) -> Tape:
+    def signals(self, todo: Sequence[Chunk]) -> Tensor:
+        """The signals at all stages of some chunks (stages, signals, 2)."""
+        return self.compiled.signals(torch.cat([stage_times(chunk) for chunk in todo]), self.reference)
+
+    def tape(self, segment: Segment) -> Tape:
         """The segment's tape, made again from where it began if it was not kept."""
         if segment.tape is not None:
             return segment.tape
@@ -181,7 +183,7 @@ class ImplicitStepper:
         extras = len(self.integrals.names) + len(s.pads.base) + len(s.bodies.free)
         outputs = (np.empty((n, self.layout.size)), np.empty((n, len(s.points.X), 2)), np.empty((n, extras)))
         *_, tape = self._run(
-            segment.chunk, signals, segment.y.copy(), work, np.zeros(len(self.integrals.names)), outputs, True
+            segment.chunk, segment.signals, segment.y.copy(), work, np.zeros(len(self.integrals.names)), outputs, True
         )
         assert tape is not None
         return tape

@@ -173,9 +173,13 @@ def inertial_state(
             product = own[k] * strain[inertia.K_column[i0 + k, j]]
             p_bar[at] -= inertia.K_lambda[i0 + k, j] * product
             p_bar[at + 1] -= inertia.K_mu[i0 + k, j] * product
+    local = np.zeros(2)
     for i in range(i1 - i0):
+        local[i % 2] += y_bar[W + i] + mass * inertia.area[i0 + i] / a * (reaction[i % 2] - own[i])
         y_bar[U + i] -= back[i]
         y_bar[W + i] = mass * inertia.area[i0 + i] / a * (own[i] - reaction[i % 2])
+    V_bar[base] += cos * local[0] - sin * local[1]
+    V_bar[base + 1] += sin * local[0] + cos * local[1]
     for node in range(w.low[pad], w.high[pad]):
         for r in range(2):
             y_bar[U + inertia.surface[2 * node + r]] += u_bar[node, r]

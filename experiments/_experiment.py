@@ -1,0 +1,66 @@
+"""What experiments share around their questions: options, output times, tables, the summary and the figures."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+from time import perf_counter
+from typing import Any, TypeVar
+
+import torch
+import tyro
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from torchsoft.files import replacing, write_json
+from torchsoft.plot.figures import save
+
+C = TypeVar("C")
+T = TypeVar("T")
+
+COARSE: dict[str, Any] = {"pad.elements_x": 60, "pad.elements_y": 2}  # Parameters of half the usual mesh.
+
+
+def options(config: type[C], description: str | None) -> C:
+    """The command line as a configuration; torch computes on one thread from here on."""
+    torch.set_num_threads(1)
+    return tyro.cli(config, description=description)
+
+
+def grid(duration: float, spacing: float = 0.01) -> Tensor:
+    """Equally spaced output times from 0 to `duration` [s], both included."""
+    return torch.linspace(0, duration, round(duration / spacing) + 1, dtype=torch.float64)
+
+
+def timed(function: Callable[[], T]) -> tuple[T, float]:
+    """What a function returns, and its wall time [s]."""
+    start = perf_counter()
+    out = function()
+    return out, perf_counter() - start
+
+
+def made_by(config: Any, **more: Any) -> dict[str, Any]:
+    """Version and configuration, as text, of what has made a summary."""
+    return {"torchsoft": version("torchsoft"), **more, "config": {k: str(v) for k, v in asdict(config).items()}}
+
+
+def raw_config(config: Any) -> dict[str, Any]:
+    """Version and configuration as JSON values, at the top of a summary."""
+    return {"torchsoft": version("torchsoft"), "config": asdict(config) | {"out": str(config.out)}}
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    """A Markdown table."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
+
+
+def write(out: Path, summary: Mapping[str, Any], figures: Mapping[str, Figure] | None = None, table: str = "") -> None:
+    """`summary.json`, figures by name, and `table.md` if there is a table, each whole or not at all."""
+    write_json(out / "summary.json", summary)
+    for name, figure in (figures or {}).items():
+        save(figure, out / f"{name}.png")
+    if table:
+        with replacing(out / "table.md") as partial:
+            partial.write_text(table + "\n")
+    print(f"written to {out}")

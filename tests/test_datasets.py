@@ -1,0 +1,478 @@
+"""Datasets: the same whatever makes them, whole whatever kills them, and checked."""
+
+import json
+import os
+import random
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+import zarr
+
+from torchsoft.datasets.check import check
+from torchsoft.datasets.config import Config
+from torchsoft.datasets.design import points, split, task
+from torchsoft.datasets.generate import Serial, generate, local_processes, main
+from torchsoft.datasets.reader import Trajectories, open_dataset
+from torchsoft.datasets.simulation import simulate_task
+from torchsoft.datasets.store import Store, StoreError, open_or_create
+
+ROOT = Path(__file__).parent.parent
+CONFIGS = sorted((ROOT / "data_gen" / "configs").glob("*.toml"))
+
+TOML = """
+title = "Test"
+seed = 3
+trajectories = {trajectories}
+trajectories_per_shard = {shard}
+duration = 0.9
+sample_interval = 0.01
+step = 0.002
+samples_per_chunk = 40
+grasp_depth = {{ low = 1.3e-3, high = 1.5e-3 }}
+[fixed]
+"pad.elements_x" = 60
+"pad.elements_y" = 2
+"contact.v_s" = 0.05
+[parameters]
+"pad.E" = {{ low = 7e5, high = 8e5, scale = "log" }}
+"contact.mu_s" = {{ low = 0.7, high = 0.9 }}
+[[kinds]]
+kind = "slow_roll"
+travel = {{ low = 1e-3, high = 2e-3 }}
+[[kinds]]
+kind = "multi_sine"
+amplitude_x = {{ low = 2e-4, high = 4e-4 }}
+amplitude_y = {{ low = 1e-5, high = 3e-5 }}
+"""
+
+
+def write_config(folder: Path, trajectories: int = 5, shard: int = 2, change: tuple[str, str] = ("", "")) -> Path:
+    path = folder / f"config-{trajectories}-{shard}-{abs(hash(change))}.toml"
+    path.write_text(TOML.format(trajectories=trajectories, shard=shard).replace(*change, 1) if change[0] else
+                    TOML.format(trajectories=trajectories, shard=shard))  # fmt: skip
+    return path
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Config]:
+    """A small dataset, made in this process."""
+    folder = tmp_path_factory.mktemp("made")
+    config = Config.from_toml(write_config(folder))
+    generate(config, str(folder / "set"), Serial(), progress=False)
+    return folder / "set", config
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """Every file of a store, the manifest included, but for the commit: the repository may move on during a test."""
+    return {str(p.relative_to(folder)): same_commit(p.read_bytes()) for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+def same_commit(data: bytes) -> bytes:
+    return re.sub(rb'"commit": "\w*"', b'"commit": ""', data)
+
+
+def copy(source: Path, target: Path) -> Path:
+    shutil.copytree(source, target)
+    return target
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_ready_configs_are_valid_and_their_splits_keep_the_shares(path: Path) -> None:
+    config = Config.from_toml(path)
+    shares = [sum(split(config, i) == name for i in range(1000)) / 1000 for name in ("train", "validation", "test")]
+    np.testing.assert_allclose(shares, [0.7, 0.15, 0.15], atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('title = "Test"', 'title = "Test"\nworkers = 3', "workers"),
+        ("low = 7e5", "low = 9e5", r"parameters\.pad\.E"),
+        ("low = 7e5", "low = -1.0", r"parameters\.pad\.E"),
+        ('"pad.E"', '"pad.Young"', r"pad\.Young"),
+        ("low = 1.3e-3, high = 1.5e-3", "low = 1.3e-3, high = 0.02", r"grasp_depth = 0\.02"),
+        ("low = 0.7, high = 0.9", "low = 0.3, high = 0.9", r"contact\.mu_s = 0\.3.*mu_k"),
+        ("low = 1e-3, high = 2e-3", "low = 1e-3, high = 0.2", r"kinds\.0\.travel"),
+        ("duration = 0.9", "duration = 0.5", "duration"),
+        ("step = 0.002", "step = 0.5", "step"),
+        ('kind = "slow_roll"', 'kind = "hop"', "kinds"),
+    ],
+)
+def test_a_wrong_config_is_refused_with_the_field(tmp_path: Path, old: str, new: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Config.from_toml(write_config(tmp_path, change=(old, new)))
+
+
+def test_a_sobol_design_is_a_prefix_of_a_longer_one(tmp_path: Path) -> None:
+    short, long = (Config.from_toml(write_config(tmp_path, trajectories=n)) for n in (5, 40))
+    np.testing.assert_array_equal(points(short), points(long)[:5])
+
+
+def test_processes_make_the_same_bytes_behind_a_url(made: tuple[Path, Config], tmp_path: Path) -> None:
+    folder, config = made
+    with local_processes(2) as executor:
+        assert generate(config, (tmp_path / "set").as_uri(), executor, 2, progress=False) == 0
+    assert files(tmp_path / "set") == files(folder)
+
+
+def objects(url: str) -> dict[str, bytes]:
+    """Every object below an fsspec URL."""
+    fs, root = fsspec.url_to_fs(url)
+    fs.invalidate_cache()
+    return {name.removeprefix(f"{root}/"): same_commit(fs.cat_file(name)) for name in fs.find(root)}
+
+
+def read_everywhere(url: str, folder: Path) -> None:
+    """The check, xarray and torch see behind `url` what they see in `folder`."""
+    assert [x for x in check(url) if "commit" not in x] == []
+    assert open_dataset(url).load().identical(open_dataset(str(folder)).load())
+    here, there = (Trajectories(place, ["disc_position", "pad.E"], window=7) for place in (url, str(folder)))
+    assert len(here) == len(there) == 5 * 13
+    torch.testing.assert_close(here[20], there[20], rtol=0, atol=0)
+
+
+def test_an_object_store_holds_the_same_bytes(made: tuple[Path, Config]) -> None:
+    folder, config = made
+    url = "memory://sets/rolling"
+    generate(config, url, Serial(), progress=False)
+    assert objects(url) == files(folder)
+    read_everywhere(url, folder)
+    fs = fsspec.filesystem("memory")
+    fs.rm_file("/sets/rolling/done/c/1")
+    fs.rm_file("/sets/rolling/disc_angle/c/1/0")
+    assert Store(url, config).unfinished() == [1]
+    generate(config, url, Serial(), progress=False)
+    assert objects(url) == files(folder)
+    with pytest.raises(StoreError, match="holds another dataset"):
+        open_or_create(url, config.model_copy(update={"seed": 99}))
+    fs.pipe_file("/sets/thesis/text", b"mine")
+    with pytest.raises(StoreError, match="not empty and holds no dataset"):
+        open_or_create("memory://sets/thesis", config)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_s3_holds_the_same_bytes(made: tuple[Path, Config], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two processes over s3fs against a local server that speaks S3's protocol; `pip install s3fs 'moto[server]'`."""
+    pytest.importorskip("s3fs")
+    server = pytest.importorskip("moto.server").ThreadedMotoServer(port=0)
+    server.start()
+    try:
+        host, port = server.get_host_and_port()
+        access = {"AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": "x", "AWS_DEFAULT_REGION": "us-east-1"}
+        for name, value in (access | {"AWS_ENDPOINT_URL": f"http://{host}:{port}"}).items():
+            monkeypatch.setenv(name, value)
+        fsspec.filesystem("s3").mkdir("sets")
+        folder, config = made
+        url = "s3://sets/rolling"
+        with local_processes(2) as executor:
+            generate(config, url, executor, 2, progress=False)
+        assert objects(url) == files(folder)
+        read_everywhere(url, folder)
+    finally:
+        server.stop()
+
+
+def test_urls_that_are_refused(made: tuple[Path, Config], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(write_config(tmp_path)), "--out", "nowhere://set", "--workers", "0"]) == 2
+    assert "Protocol not known: nowhere" in capsys.readouterr().err
+
+
+def test_another_shard_size_makes_the_same_data(made: tuple[Path, Config], tmp_path: Path) -> None:
+    folder, _ = made
+    config = Config.from_toml(write_config(tmp_path, shard=3))
+    generate(config, str(tmp_path / "set"), Serial(), progress=False)
+    here, there = (xr.open_zarr(path).drop_vars("done").load() for path in (tmp_path / "set", folder))
+    assert here.equals(there)
+
+
+def test_xarray_opens_it_with_units(made: tuple[Path, Config]) -> None:
+    data = xr.open_zarr(made[0])
+    assert dict(data.normal_force_lower.sizes) == {"trajectory": 5, "time": 91, "lower_surface": 61}
+    assert data.normal_force_lower.attrs["units"] == "N"
+    assert data.displacement_upper.dims == ("trajectory", "time", "upper_surface", "axis")
+    assert all("units" in data[name].attrs for name in data.data_vars)
+    weight = float(data.normal_force_lower.isel(trajectory=0, time=50).sum())
+    assert 20 < weight < 120  # [N], the grasp
+
+
+def test_a_sound_dataset_has_no_finding(made: tuple[Path, Config]) -> None:
+    findings = [x for x in check(str(made[0])) if "commit" not in x]
+    assert findings == []
+
+
+def set_value(name: str, where: tuple[Any, ...], value: Any) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        array = zarr.open_group(str(folder), mode="r+")[name]
+        assert isinstance(array, zarr.Array)
+        array[where] = value
+
+    return change
+
+
+def truncate(folder: Path) -> None:
+    path = folder / "disc_angle/c/0/0"
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def change_units(folder: Path) -> None:
+    zarr.open_group(str(folder), mode="r+")["disc_angle"].attrs["units"] = "deg"
+
+
+def change_units_for_readers(folder: Path) -> None:
+    """In the consolidated copy only, which xarray opens."""
+    path = folder / "zarr.json"
+    group = json.loads(path.read_text())
+    group["consolidated_metadata"]["metadata"]["disc_spin"]["attributes"]["units"] = "deg/s"
+    path.write_text(json.dumps(group))
+
+
+def drop_array(folder: Path) -> None:
+    shutil.rmtree(folder / "disc_spin")
+
+
+def change_seed(folder: Path) -> None:
+    path = folder / "manifest.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"seed": 4}))
+
+
+def open_ledger(folder: Path) -> None:
+    """An energy that comes from nowhere, booked faithfully."""
+    for name, where in (("stored_energy", (1, 50, 2)), ("energy_residual", (1, 50))):
+        array = zarr.open_group(str(folder), mode="r+")[name]
+        assert isinstance(array, zarr.Array)
+        array[where] = np.asarray(array[where]) + 0.5
+    data = xr.open_zarr(folder)
+    worst = float(np.abs(data.energy_residual[1]).max() / data.injected_energy[1, -1])
+    set_value("energy_residual_rel", (1,), worst)(folder)
+
+
+def change_manifest(**changes: Any) -> Callable[[Path], None]:
+    """Other values in the configuration that the manifest tells of; its hash made to fit where `fit` is given."""
+
+    def change(folder: Path) -> None:
+        path = folder / "manifest.json"
+        manifest = json.loads(path.read_text())
+        fit = changes.pop("fit", False)
+        manifest["config"] |= changes
+        if fit:
+            config = Config.model_validate(manifest["config"])
+            manifest |= {"config_hash": config.hash, "seed": config.seed}
+        path.write_text(json.dumps(manifest))
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (change_units, "disc_angle: units are 'deg', not 'rad'"),
+        (change_units_for_readers, "disc_spin: units are 'deg/s', not 'rad/s'"),
+        (drop_array, "disc_spin: missing"),
+        (set_value("split", (1,), "test"), "trajectory 1: split is test, but the design has"),
+        (set_value("split", (2,), "all"), "trajectory 2: split is"),
+        (open_ledger, r"trajectory 1: energy residual is [\d.]+ of the energy injected, above 0\.02"),
+        (set_value("energy_residual_rel", (2,), 1e-3), "trajectory 2: energy_residual_rel is 0.001, but the series"),
+        (change_manifest(seed=99), r"manifest\.json: config_hash is \w+, but the configuration's is"),
+        (change_manifest(seed=99, fit=True), r"manifest\.json: describes the configuration \w+, but the arrays"),
+        (change_manifest(duration=-1.0), r"manifest\.json: .*duration"),
+        (set_value("normal_force_upper", (4, 60, 30), -1.0), "trajectory 4: normal_force_upper pulls"),
+        (set_value("disc_position", (0, 3, 1), np.inf), "trajectory 0: not finite: disc_position"),
+        (set_value("disc_angle", (1, 7), np.nan), "trajectory 1: not finite: disc_angle"),
+        (set_value("stored_energy", (1, 7, 2), 1.0), "trajectory 1: energy_residual is not"),
+        (set_value("contact_lower", (0, 60), 0), "acts where contact_lower is 0"),
+        (set_value("done", (1,), 0), "1 of 3 shards are not finished"),
+        (set_value("pad.E", (2,), 7.5e5), r"trajectory 2: pad\.E is 750000.0"),
+        (set_value("failed", (3,), 1), "failed without a reason"),
+        (truncate, "shard 0 cannot be read"),
+        (change_seed, "seed is 4"),
+        (lambda folder: (folder / "manifest.json").unlink(), r"manifest\.json: missing"),
+    ],
+)
+def test_damage_is_found(made: tuple[Path, Config], tmp_path: Path, damage: Any, message: str) -> None:
+    damage(copy(made[0], tmp_path / "set"))
+    findings = [x for x in check(str(tmp_path / "set")) if "no commit" not in x]
+    assert len(findings) == 1, findings
+    assert re.search(message, findings[0])
+    assert "\n" not in findings[0]
+
+
+def test_check_draws_its_picture(made: tuple[Path, Config], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from torchsoft.datasets.check import main as check_main
+
+    check_main([str(made[0]), "--picture", str(tmp_path / "coverage.png")])
+    assert "5 trajectories" in capsys.readouterr().out
+    assert (tmp_path / "coverage.png").stat().st_size > 10_000
+
+
+def test_a_failed_simulation_is_recorded(tmp_path: Path) -> None:
+    path = write_config(tmp_path, trajectories=1, change=('"contact.v_s" = 0.05', '"pad.tau" = 1e-4'))
+    config = Config.from_toml(path)
+    generate(config, str(tmp_path / "set"), Serial(), progress=False)
+    data = xr.open_zarr(tmp_path / "set").load()
+    assert data.failed.values.tolist() == [1]
+    assert "at t = " in str(data.reason.values[0])
+    assert np.isnan(data.disc_position).all()
+    assert data["pad.E"].values[0] > 0
+    assert [x for x in check(str(tmp_path / "set")) if "commit" not in x] == []
+
+
+def test_only_unfinished_shards_are_made_again(made: tuple[Path, Config], tmp_path: Path) -> None:
+    folder, config = copy(made[0], tmp_path / "set"), made[1]
+    set_value("done", (1,), 0)(folder)
+    (folder / "disc_angle/c/1/0").unlink()
+    (folder / "disc_angle/c/1/0.1234.partial").write_bytes(b"half")
+    before = {p: p.stat().st_mtime_ns for p in folder.rglob("c/**/*") if p.is_file()}
+    generate(config, str(folder), Serial(), progress=False)
+    assert files(folder) == files(made[0])
+    written = {
+        p.relative_to(folder) for p in folder.rglob("c/**/*") if p.is_file() and before.get(p) != p.stat().st_mtime_ns
+    }
+    assert written == {Path(name) for name in files(folder) if re.search(r"/c/1(/|$)", name)}
+
+
+def test_folders_that_are_refused(made: tuple[Path, Config], tmp_path: Path) -> None:
+    config = made[1]
+    (tmp_path / "thesis.txt").write_text("mine")
+    with pytest.raises(StoreError, match="not empty and holds no dataset"):
+        open_or_create(str(tmp_path), config)
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
+    with pytest.raises(StoreError, match="holds another dataset"):
+        open_or_create(str(made[0]), config.model_copy(update={"seed": 99}))
+    with pytest.raises(StoreError, match=r"thesis\.txt is a file; give a folder"):
+        open_or_create(str(tmp_path / "thesis.txt"), config)
+    with pytest.raises(StoreError, match="a part of this path is a file"):
+        open_or_create(str(tmp_path / "thesis.txt" / "set"), config)
+
+
+@pytest.mark.skipif(not Path("/sys").is_dir(), reason="needs a folder that not even root may write to")
+def test_an_unwritable_folder_is_refused(made: tuple[Path, Config]) -> None:
+    with pytest.raises(StoreError, match="may not be written"):
+        open_or_create("/sys/torchsoft-set", made[1])
+
+
+def test_a_file_size_limit_is_said_and_costs_nothing(made: tuple[Path, Config], tmp_path: Path) -> None:
+    """The operating system's own refusal, in the middle of a shard; without the limit the same command finishes."""
+    path, limit = write_config(tmp_path), max(len(data) for data in files(made[0]).values()) // 2
+    command = ["-m", "data_gen.generate", str(path), "--out", str(tmp_path / "set"), "--workers", "0"]
+    limited = f"import resource, runpy, sys; sys.argv = {command[1:]}; import torchsoft.datasets.generate as g; " + (
+        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit})); sys.exit(g.main(sys.argv[1:]))"
+    )
+    run = subprocess.run([sys.executable, "-c", limited], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert run.returncode == 2, run.stderr
+    assert "error: " in run.stderr
+    assert "a file outgrew the limit on file sizes" in run.stderr
+    assert "Traceback" not in run.stderr
+    assert Store(str(tmp_path / "set"), made[1]).unfinished() == [0, 1, 2]
+    assert main(command[2:]) == 0
+    assert files(tmp_path / "set") == files(made[0])
+
+
+FULL = """
+mount -t tmpfs -o size={size} tmpfs {disk} || exit 77
+{generate}; echo "first $?"
+{python} -c 'from torchsoft.datasets.config import Config; from torchsoft.datasets.store import Store
+print("unfinished", len(Store("{disk}/set", Config.from_toml("{config}")).unfinished()))'
+mount -o remount,size=64m {disk}
+{generate}; echo "second $?"
+cp -r {disk}/set {out}
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("unshare") is None, reason="needs Linux's mount namespaces")
+def test_a_full_disk_is_said_and_costs_nothing(made: tuple[Path, Config], tmp_path: Path) -> None:
+    """A disk of its own that is too small for the set, then made larger."""
+    path, disk = write_config(tmp_path), tmp_path / "disk"
+    disk.mkdir()
+    size = sum(-(-len(data) // 4096) * 4096 for data in files(made[0]).values())
+    done = {"done/c/2", *(name for name in files(made[0]) if re.search(r"/c/2(/|$)", name))}
+    room = size - sum(-(-len(files(made[0])[name]) // 4096) * 4096 for name in done) // 2
+    generate_it = f"{sys.executable} -m data_gen.generate {path} --out {disk}/set --workers 0"
+    script = FULL.format(
+        size=room, disk=disk, generate=generate_it, python=sys.executable, config=path, out=tmp_path / "set"
+    )
+    command = ["unshare", "--map-root-user", "--mount", "sh", "-c", script]
+    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    if run.returncode == 77 or "unshare failed" in run.stderr or "unshare:" in run.stderr:
+        pytest.skip(f"may not mount a disk: {run.stderr.strip()}")
+    assert [line for line in run.stdout.splitlines() if line.split()[0] in ("first", "unfinished", "second")] == [
+        "first 2", "unfinished 1", "second 0",
+    ]  # fmt: skip
+    assert "the disk is full; make room and start again" in run.stderr
+    assert "Traceback" not in run.stderr
+    assert files(tmp_path / "set") == files(made[0])
+
+
+def test_command_line_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([str(tmp_path / "none.toml"), "--out", str(tmp_path / "set")]) == 2
+    assert "No such file" in capsys.readouterr().err
+
+
+def kill_and_resume(folder: Path, config: Path, kills: range) -> None:
+    """Start again and again, SIGKILL after a random while past the first new file, every fifth time a random while after
+    the start; then let it finish."""
+    rng, out = random.Random(len(kills)), folder / "set"
+    command = [sys.executable, "-m", "data_gen.generate", str(config), "--out", str(out), "--workers", "1"]
+    for kill in kills:
+        before = sum(1 for _ in out.rglob("*"))
+        process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+        while process.poll() is None and kill % 5 and sum(1 for _ in out.rglob("*")) == before:
+            time.sleep(0.01)
+        time.sleep(rng.uniform(0, 6.0 if kill % 5 == 0 else 0.4))
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+    assert subprocess.run(command, cwd=ROOT, capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("kills", [range(1, 2), pytest.param(range(10), marks=pytest.mark.slow)], ids=len)
+def test_killed_runs_end_in_the_same_bytes(tmp_path: Path, kills: range) -> None:
+    path = write_config(tmp_path, trajectories=2 * len(kills) + 2, shard=1)
+    generate(Config.from_toml(path), str(tmp_path / "whole"), Serial(), progress=False)
+    kill_and_resume(tmp_path, path, kills)
+    assert files(tmp_path / "set") == files(tmp_path / "whole")
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_dask_cluster_that_loses_a_worker_makes_the_same_bytes(made: tuple[Path, Config], tmp_path: Path) -> None:
+    from distributed import Client, LocalCluster
+
+    path = write_config(tmp_path, trajectories=12, shard=1)
+    config = Config.from_toml(path)
+    generate(config, str(tmp_path / "whole"), Serial(), progress=False)
+    settings: dict[str, Any] = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+    with LocalCluster(**settings) as cluster, Client(cluster) as client:
+        pids = client.run(os.getpid)
+        executor = client.get_executor(retries=3, pure=False)
+        from threading import Thread
+
+        def kill_once_started() -> None:
+            while not list((tmp_path / "set" / "done").glob("c/*")):
+                time.sleep(0.02)
+            os.kill(next(iter(pids.values())), signal.SIGKILL)
+
+        killer = Thread(target=kill_once_started)
+        killer.start()
+        generate(config, str(tmp_path / "set"), executor, 2, progress=False)
+        killer.join()
+    assert files(tmp_path / "set") == files(tmp_path / "whole")
+
+
+def test_tasks_do_not_depend_on_each_other(made: tuple[Path, Config]) -> None:
+    config = made[1]
+    design, data = points(config), xr.open_zarr(made[0])
+    row = simulate_task(config, task(config, 4, design[4]))
+    np.testing.assert_allclose(row["disc_position"], data.disc_position[4], rtol=0, atol=1e-12)

@@ -1,0 +1,99 @@
+"""The torch dataset over a store: windows, splits, processes."""
+
+import pickle
+from pathlib import Path
+
+import fsspec
+import numpy as np
+import pytest
+import torch
+import zarr
+from torch.utils.data import DataLoader
+
+from torchsoft.datasets.reader import Trajectories, open_dataset
+
+COUNT, SAMPLES = 10, 21
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A store of known numbers, shards of four; trajectory 2 failed, the last shard is unfinished."""
+    url = str(tmp_path_factory.mktemp("store") / "set")
+    group = zarr.create_group(url, zarr_format=3)
+
+    def put(name: str, values: np.ndarray, dims: tuple[str, ...], chunk: int) -> None:
+        chunks = (chunk, *values.shape[1:])
+        dtype = "str" if values.dtype == object else values.dtype
+        array = group.create_array(name, shape=values.shape, dtype=dtype, chunks=chunks, dimension_names=dims)
+        array[:] = values
+        array.attrs["units"] = "1"
+
+    put("time", np.arange(SAMPLES) * 0.1, ("time",), SAMPLES)
+    values = np.arange(COUNT * SAMPLES * 2, dtype=float).reshape(COUNT, SAMPLES, 2)
+    put("disc_position", values, ("trajectory", "time", "axis"), 1)
+    put("pad.E", np.arange(COUNT) + 0.5, ("trajectory",), 4)
+    put("failed", (np.arange(COUNT) == 2).astype(np.uint8), ("trajectory",), 4)
+    put("split", np.array((["train", "test"] * COUNT)[:COUNT], object), ("trajectory",), 4)
+    put("done", np.array([1, 1, 0], np.uint8), ("shard",), 1)
+    return url
+
+
+def test_windows_hold_what_the_store_holds(store: str) -> None:
+    data = Trajectories(store, ["disc_position", "pad.E"], split="train", window=5, stride=8)
+    assert data.trajectories.tolist() == [0, 4, 6]  # 2 failed, 8 is unfinished
+    assert len(data) == 3 * 3
+    item = data[4]  # the second window of trajectory 4
+    assert (int(item["trajectory"]), int(item["start"])) == (4, 8)
+    torch.testing.assert_close(
+        item["disc_position"], torch.arange(10.0, dtype=torch.float64).reshape(5, 2) + 4 * 42 + 16
+    )
+    assert item["pad.E"] == 4.5
+    assert int(data[-1]["start"]) == 16
+
+
+def test_splits_are_disjoint_and_all_is_their_union(store: str) -> None:
+    train, test, everything = (set(Trajectories(store, [], split=s).trajectories) for s in ("train", "test", None))
+    assert not train & test
+    assert train | test == everything == {0, 1, 3, 4, 5, 6, 7}
+
+
+def test_it_pickles_small_and_loads_in_workers(store: str) -> None:
+    data = Trajectories(store, ["disc_position"], window=7, dtype=torch.float32)
+    data[0]
+    assert len(pickle.dumps(data)) < 2000
+    batches = list(DataLoader(data, batch_size=4, num_workers=2, multiprocessing_context="fork"))
+    got, want = torch.cat([b["disc_position"] for b in batches]), torch.stack([x["disc_position"] for x in data])
+    assert got.dtype == torch.float32
+    torch.testing.assert_close(got, want)
+
+
+@pytest.mark.filterwarnings("ignore:Failed to open Zarr store with consolidated metadata")
+def test_object_stores_are_read_like_folders_and_by_forked_workers(store: str) -> None:
+    url = "memory://copy/set"
+    fsspec.filesystem("memory").put(store, "/copy/set", recursive=True)
+    data, plain = (Trajectories(place, ["disc_position", "pad.E"], window=7) for place in (url, store))
+    data[0]  # opened before the fork
+    batches = list(DataLoader(data, batch_size=4, num_workers=2, multiprocessing_context="fork", timeout=60))
+    for name in data.variables:
+        torch.testing.assert_close(torch.cat([b[name] for b in batches]), torch.stack([x[name] for x in plain]))
+    assert open_dataset(url).identical(open_dataset(store))
+    assert open_dataset(Path(store).as_uri()).identical(open_dataset(store))
+
+
+def test_wrong_arguments_are_refused(store: str) -> None:
+    with pytest.raises(ValueError, match=r"no numbers named 'disc_pose'; known: disc_position, failed, pad\.E"):
+        Trajectories(store, ["disc_pose"])
+    with pytest.raises(ValueError, match="`window` must be 1 to 21"):
+        Trajectories(store, ["disc_position"], window=22)
+    with pytest.raises(ValueError, match="`stride`"):
+        Trajectories(store, ["disc_position"], stride=0)
+    with pytest.raises(ValueError, match="`split` must be"):
+        Trajectories(store, ["disc_position"], split="dev")
+    with pytest.raises(IndexError):
+        Trajectories(store, ["disc_position"])[100]
+
+
+@pytest.mark.filterwarnings("ignore:Failed to open Zarr store with consolidated metadata")
+def test_xarray_reads_the_same(store: str) -> None:
+    assert open_dataset(store)["pad.E"].values[3] == 3.5
+    assert Path(store).is_dir()

@@ -1,0 +1,273 @@
+"""Reduced models: known equations recovered, all routes through one list of terms equal, divergence and bad data reported."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from conftest import coarse
+from scipy.integrate import solve_ivp
+from torchdiffeq import odeint
+
+from torchsoft import press, simulate
+from torchsoft.control import Profile, Reference
+from torchsoft.reduced.fit import Recipe, assemble, choose, fit, score
+from torchsoft.reduced.ode import BEYOND, Factor, Held, ReducedModel, Term
+from torchsoft.reduced.records import KINEMATICS, STATES, Record, noisy, record, rolling_radius
+from torchsoft.reduced.rollout import recursion
+from torchsoft.reduced.terms import friction, joined, mechanics, polynomials, variable
+
+R = 0.0183
+TRUTH = {
+    "v_C": {"x_Br - 2 x_C": 1.15e5, "v_Br - 2 v_C": 1.1e3},
+    "omega": {"x_Br + 2 r theta": -1.1e7, "v_Br + 2 r omega": -1.05e5, "omega": -370.0},
+    "v_Br": {"x_Br - x_C + r theta": -1.15e5, "v_Br - v_C + r omega": -1.1e3, "F_x": 2.46},
+}
+LAW = {"F_x": {"x_d": 1.2e5, "x_d_dot": 441.7, "x_C": -1.2e5, "v_C": -441.7}}
+SCALE = np.array([1e-3, 5e-2, 2e-3, 5e-2, 3.0, 0.1])
+
+
+def truth(extra: dict[str, list[tuple[Term, float]]] | None = None) -> ReducedModel:
+    """The sticking grasp's equations with known coefficients, and further terms."""
+    equations = {
+        target: [(term, TRUTH[target][term.text]) for term in terms if term.text in TRUTH[target]]
+        for target, terms in mechanics(R).items()
+    }
+    for target, pairs in (extra or {}).items():
+        equations[target] = [*equations[target], *pairs]
+    return ReducedModel(STATES, ("F_x",), KINEMATICS, equations, feedback=LAW, scale=SCALE)
+
+
+def motion(model: ReducedModel, seed: int, duration: float = 0.3) -> Record:
+    """A record of the model, kicked and driven by eight sines."""
+    rng, t = np.random.default_rng(seed), np.linspace(0.0, duration, round(duration / 1e-4) + 1)
+    f, phase = np.geomspace(3, 150, 8) * rng.uniform(0.9, 1.1, 8), rng.uniform(0, 6, 8)
+    x_d = 3e-6 * np.sin(2 * np.pi * f * t[:, None] + phase).sum(1)
+    u = np.column_stack((x_d, np.gradient(x_d, t)))
+    y0 = np.concatenate((np.zeros(3), 2e-3 * rng.standard_normal(3) / (1, R, 1)))
+    y = model.rollout(t, y0, u).y
+    series = dict(zip(STATES, y.T)) | {"x_d": u[:, 0], "x_d_dot": u[:, 1]}
+    series["F_x"] = sum(gain * series[name] for name, gain in LAW["F_x"].items())
+    return Record(t, series)
+
+
+@pytest.fixture(scope="module")
+def motions() -> list[Record]:
+    return [motion(truth(), seed) for seed in range(6)]
+
+
+RECIPE = Recipe(width=0.004, window=0.3, threshold=0.01)
+
+
+@pytest.mark.parametrize("optimizer", ["stlsq", "sr3"])
+@pytest.mark.parametrize("form", ["weak", "derivative"])
+def test_known_equations_are_recovered(motions: list[Record], form: str, optimizer: str) -> None:
+    """Exactly the true terms, their coefficients to a few per cent (weak integrals and differences of samples at 10 kHz)."""
+    recipe = replace(RECIPE, form=form, optimizer=optimizer)
+    model = fit(assemble(motions, mechanics(R), recipe), recipe)
+    found = {target: {term.text: x for term, x in pairs} for target, pairs in model.equations().items()}
+    assert {target: set(terms) for target, terms in found.items()} == {k: set(v) for k, v in TRUTH.items()}
+    for target, terms in TRUTH.items():
+        for text, value in terms.items():
+            assert found[target][text] == pytest.approx(value, rel=0.05), text
+
+
+def test_the_choice_takes_the_true_terms_and_rolls_out(motions: list[Record]) -> None:
+    choice = choose(assemble(motions, mechanics(R), RECIPE), [motion(truth(), 50)], RECIPE, (1e-4, 0.01, 0.9), LAW)
+    assert len(choice.model.terms) == 8
+    assert choice.tried[choice.index]["nrmse"] < 5e-3
+    assert score(choice.model, motion(truth(), 51)).worst < 5e-3
+    assert max(row["nrmse"] for row in choice.tried) > 0.05  # thresholds matter
+
+
+def test_polynomials_contain_the_equations_too(motions: list[Record]) -> None:
+    """In raw variables x_C'' = k/m x_Br - 2 k/m x_C + ...: the same equation with more terms."""
+    library = {"v_C": [variable(name) for name in ("x_C", "x_Br", "v_C", "v_Br")]}
+    recipe = replace(RECIPE, threshold=0.0)
+    problem = assemble(motions, {**mechanics(R), **library}, recipe)
+    found = {term.text: x for term, x in fit(problem, recipe).equations()["v_C"]}
+    assert found["x_Br"] == pytest.approx(1.15e5, rel=0.05)
+    assert found["v_C"] == pytest.approx(-2.2e3, rel=0.05)
+    assert len(polynomials((*STATES, "F_x"), 2)) == 7 + 28
+    assert polynomials(("x_C", "theta"), 2)[3].text == "x_C theta"
+
+
+def test_saturating_friction_is_recovered() -> None:
+    """tanh(s' / v) with v known: amplitude to 5 %, and the linear terms beside it."""
+    upper = friction(R, 1e-3)["v_C"][1]
+    model = truth({"v_C": [(upper, 3.0)]})
+    records = [motion(model, seed) for seed in range(6)]
+    recipe = replace(RECIPE, threshold=0.02)
+    found = fit(assemble(records, joined(mechanics(R), {"v_C": [upper]}), recipe), recipe).equations()["v_C"]
+    assert {term.text for term, _ in found} == {*TRUTH["v_C"], upper.text}
+    assert found[-1][1] == pytest.approx(3.0, rel=0.05)
+
+
+def test_ensembles_give_intervals_and_leave_the_global_generator(motions: list[Record]) -> None:
+    rough = [noisy(one, 0.005, i) for i, one in enumerate(motions)]
+    recipe, before = replace(RECIPE, models=20, threshold=0.05), np.random.get_state()[1].copy()  # noqa: NPY002
+    model = fit(assemble(rough, mechanics(R), recipe), recipe)
+    again = fit(assemble(rough, mechanics(R), recipe), recipe)
+    assert np.array_equal(before, np.random.get_state()[1])  # noqa: NPY002
+    assert model.intervals == again.intervals
+    assert model.intervals is not None
+    for row in model.coefficient_table():
+        low, high = row["interval"]
+        assert low < row["value"] < high
+    assert model.coefficient_table()[0]["unit"] == "m/s/s per m"
+
+
+@pytest.mark.parametrize("nonlinear", [False, True])
+def test_all_routes_are_one(nonlinear: bool) -> None:
+    """Rollout, torchdiffeq and scipy through the same terms; the batched right-hand side as well."""
+    product = Term("x_C |v_C|", r"x_C |\dot x_C|", "m m/s", (Factor({"x_C": 1.0}), Factor({"v_C": 1.0}, "abs")))
+    extra = {"v_C": [(friction(R, 0.01)["v_C"][1], 5.0), (product, -1e6)]} if nonlinear else None
+    model = truth(extra)
+    assert model.linear is not nonlinear
+    one = motion(truth(), 7, duration=0.01)
+    t, u, y0 = one.t, 20 * one.columns(("x_d", "x_d_dot")), 20 * one.columns(STATES)[0]
+    fast = model.rollout(t, y0, u).y
+    model.signal = Held(torch.from_numpy(t), torch.from_numpy(u))
+    with torch.no_grad():
+        slow = odeint(
+            model, torch.from_numpy(y0), torch.from_numpy(t), method="rk4", options={"step_size": 2e-5}
+        ).numpy()  # fmt: skip
+    rates = model.numpy_rates()
+    scipys = solve_ivp(
+        lambda when, y: rates(np.concatenate((y, [np.interp(when, t, column) for column in u.T]))),
+        (t[0], t[-1]), y0, "LSODA", t, rtol=1e-9, atol=1e-12,
+    ).y.T  # fmt: skip
+    size = np.abs(scipys).max(0)
+    assert np.abs(slow - scipys).max(0) / size == pytest.approx(0, abs=1e-5)
+    assert np.abs(fast - scipys).max(0) / size == pytest.approx(0, abs=1e-3 if nonlinear else 1e-5)
+    batch = torch.from_numpy(np.array([y0, 2 * y0]))
+    assert torch.equal(model(0.01, batch)[0], model(0.01, batch[0]))
+
+
+def test_gradients_through_torchdiffeq_are_those_of_the_rollout() -> None:
+    """d x_C(0.02 s) by a coefficient, a gain and y0, against central differences of the exact rollout."""
+    model, one = truth(), motion(truth(), 3, duration=0.02)
+    t, u, y0 = one.t, one.columns(model.outer), one.columns(STATES)[0]
+    model.signal = Held(torch.from_numpy(t), torch.from_numpy(u))
+    start = torch.from_numpy(y0).requires_grad_()
+    odeint(model, start, torch.from_numpy(t), method="rk4", options={"step_size": 5e-5})[-1, 0].backward()
+    for parameter, i in ((model.coefficients, 0), (model.coefficients, 4), (model.gains, 0)):
+        value, ends = parameter[i].item(), []
+        for sign in (1, -1):
+            with torch.no_grad():
+                parameter[i] = value * (1 + sign * 1e-4)
+            ends.append(model.rollout(t, y0, u).y[-1, 0])
+            with torch.no_grad():
+                parameter[i] = value
+        slope = (ends[0] - ends[1]) / (2e-4 * value)
+        assert parameter.grad is not None
+        assert parameter.grad[i].item() == pytest.approx(slope, rel=1e-4)
+    kicked = [model.rollout(t, y0 + sign * 1e-5 * np.eye(6)[3], u).y[-1, 0] for sign in (1, -1)]
+    assert start.grad is not None
+    assert start.grad[3].item() == pytest.approx((kicked[0] - kicked[1]) / 2e-5, rel=1e-5)
+
+
+def test_the_recursion_is_the_loop() -> None:
+    rng = np.random.default_rng(0)
+    F, f, x = 0.4 * rng.standard_normal((3, 3)), rng.standard_normal((103, 3)), rng.standard_normal(3)
+    rows = []
+    for row in f:
+        rows.append(x)
+        x = F @ x + row
+    assert recursion(F, f, rows[0]) == pytest.approx(np.array(rows), rel=1e-12, abs=1e-12)
+
+
+@pytest.mark.parametrize("nonlinear", [False, True])
+def test_divergence_is_reported_with_its_time(nonlinear: bool) -> None:
+    """v' = a v from v = 1 leaves 100 times its scale at ln(100) / a; v' = v^2 blows up at t = 1."""
+    square = Term("v_C v_C", "v^2", "m2/s2", (Factor({"v_C": 1.0}), Factor({"v_C": 1.0})))
+    term, value, when = (square, 1.0, 1 - 1 / BEYOND) if nonlinear else (variable("v_C"), 5.0, np.log(BEYOND) / 5)
+    model = ReducedModel(("v_C",), (), {}, {"v_C": [(term, value)]})
+    out = model.rollout(np.linspace(0, 2, 2001), np.array([1.0]), np.empty((2001, 0)))
+    assert out.diverged_at == pytest.approx(when, abs=2e-3)
+    assert str(out) == f"diverged at t = {out.diverged_at:.4g} s"
+    assert np.isnan(out.y[-1]).all()
+    assert np.isfinite(out.y[: int(1000 * when) - 2]).all()
+
+
+def test_a_choice_of_divergent_models_fails_with_the_time(motions: list[Record]) -> None:
+    away = {"F_x": {name: -gain for name, gain in LAW["F_x"].items()}}
+    with pytest.raises(ValueError, match=r"rollouts stay bounded.*diverged at t = 0\.\d+ s"):
+        choose(assemble(motions, mechanics(R), RECIPE), [motion(truth(), 50)], RECIPE, (0.01,), away)
+
+
+def changed(one: Record, name: str, values: np.ndarray) -> Record:
+    return Record(one.t, one.series | {name: values})
+
+
+def test_bad_data_are_refused_by_name(motions: list[Record]) -> None:
+    one, library = motions[0], mechanics(R)
+    broken = one.series["omega"].copy()
+    broken[5] = np.nan
+    with pytest.raises(ValueError, match="'omega' has values that are not finite"):
+        assemble([changed(one, "omega", broken)], library, RECIPE)
+    with pytest.raises(ValueError, match=r"column `F_x` of v_Br' is constant \(3\)"):
+        assemble([changed(one, "F_x", np.full(len(one.t), 3.0))], library, RECIPE)
+    with pytest.raises(ValueError, match=r"column `.*` of v_C' is a combination of the other columns"):
+        assemble([one], {**library, "v_C": [variable("x_C"), variable("x_Br"), library["v_C"][0]]}, RECIPE)
+    with pytest.raises(ValueError, match=r"too little data for v_C'.*`v_C`; at least 10 rows"):
+        assemble([one.part(0, 40)], library, replace(RECIPE, form="derivative"))
+    with pytest.raises(ValueError, match="too little data: the shortest record is 10 samples"):
+        assemble([one, one.part(0, 10)], library, RECIPE)
+    with pytest.raises(ValueError, match="one time step"):
+        assemble([one, Record(2 * one.t, one.series)], library, RECIPE)
+    with pytest.raises(ValueError, match="no series F_x"):
+        assemble([Record(one.t, {k: v for k, v in one.series.items() if k != "F_x"})], library, RECIPE)
+    with pytest.raises(ValueError, match="needs the variable 'F_y'"):
+        ReducedModel(("v_C",), (), {}, {"v_C": [(Term("F_y", "F_y", "N", (Factor({"F_y": 1.0}),)), 1.0)]})
+    with pytest.raises(ValueError, match="set `signal`"):
+        truth()(0.0, torch.zeros(6, dtype=torch.float64))
+
+
+def test_the_bracket_may_be_the_input(motions: list[Record]) -> None:
+    """With the bracket's motion as u only the disc has equations."""
+    library = {k: v for k, v in mechanics(R).items() if k != "v_Br"}
+    model = fit(assemble(motions, library, RECIPE, inputs=("x_Br", "v_Br")), RECIPE)
+    assert model.states == ("x_C", "theta", "v_C", "omega")
+    assert model.outer == ("x_Br", "v_Br")
+    assert score(model, motion(truth(), 60)).worst < 1e-2
+
+
+def test_equations_read_in_text_and_latex() -> None:
+    model = truth()
+    assert model.text()[0] == "x_C' = v_C"
+    assert "v_C' = 1.15e+05 (x_Br - 2 x_C) + 1100 (v_Br - 2 v_C)" in model.text()
+    latex = model.latex()
+    assert r"1.15\cdot 10^{5}\,(x_{Br} - 2 x_C)" in latex
+    assert r"\frac{d}{dt} \dot\theta &= - 1.1\cdot 10^{7}" in latex
+
+
+def test_records_of_a_run_and_of_a_dataset_are_the_same() -> None:
+    model = coarse()
+    y0 = press(model, model.settings.scenario.y_Br_grasp).detach()
+    start = model.layout.unpack(y0)
+    x_0, y_Br = float(start.r_C[0]), float(start.r_Br[1])
+    model.reference = Reference(Profile([0.0, 0.2], [x_0, x_0 + 1e-3]), Profile([0.0], [y_Br]), Profile([0.0], [-60.0]))
+    run = simulate(model, torch.linspace(0, 0.2, 101, dtype=torch.float64), y0=y0)
+    one, series = record(run), run.to_dataset()
+    other = record({name: torch.from_numpy(series[name].values) for name in series}, run.t)
+    assert all(np.array_equal(one.series[name], other.series[name]) for name in one.series)
+    assert one.series["x_C"][0] == 0.0
+    assert one.series["x_d"][-1] == pytest.approx(1e-3)
+    assert rolling_radius([one]) == pytest.approx(0.0185, rel=0.05)
+    late = record(run, begin=0.1)
+    assert (late.t[0], late.series["theta"][0]) == (pytest.approx(0.1), 0.0)
+    rough = noisy(one, 0.05, 0)
+    assert np.array_equal(rough.series["x_d"], one.series["x_d"])
+    assert np.std(rough.series["v_C"] - one.series["v_C"]) == pytest.approx(0.05 * one.series["v_C"].std(), rel=0.3)
+    values = series["disc_spin"].values.copy()
+    values[50] = np.nan
+    with pytest.raises(ValueError, match=r"'omega' \(disc_spin\) .* first at t = 0.1 s"):
+        record({name: series[name].values for name in series} | {"disc_spin": values}, run.t)
+
+
+def test_pysindy_is_imported_only_when_it_is_used() -> None:
+    code = "import sys, torchsoft.reduced; sys.exit('pysindy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -1,0 +1,385 @@
+"""Identification on a coarse mesh: Jacobians, recovery, what is not identifiable, nuisances, resuming."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import COARSE
+
+from torchsoft import Parameters
+from torchsoft.control import Profile, Sampled
+from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
+from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, Unreachable, identify, record
+from torchsoft.sysid.fit import descend, gauss_newton
+from torchsoft.sysid.information import fisher, standard_deviations, step_error, step_shift
+from torchsoft.sysid.plan import default_plan, tie_ratios, visible
+from torchsoft.sysid.result import whiteness
+from torchsoft.sysid.solve import sobol
+from torchsoft.sysid.workers import Runner
+
+BASE = Parameters().override(COARSE)
+STEP = 2e-3
+NOISE = {"x_C": 1e-5, "y_C": 1e-5, "theta": 5e-4, "x_Br": 1e-5, "y_Br": 1e-5, "F_x": 0.1, "F_y": 0.1}
+SENSORS = {channel: Sensor(noise=sigma) for channel, sigma in NOISE.items()}
+STROKES = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.9, senses="bracket")
+SHAKE = Excitation(
+    motion=MultiSine(amplitude_x=6e-3, amplitude_y=1e-4, frequency=(2, 12)), duration=0.9, depth=8e-4, senses="bracket"
+)
+TRUTH = {"pad.E": 0.9e6, "pad.tau": 0.012, "contact.K_n": 1.6e5, "contact.mu_s": 0.5, "contact.mu_k": 0.4}
+TRUE = BASE.override(TRUTH)
+FOUR = ("pad.E", "pad.tau", "contact.K_n", "contact.mu_s")
+
+
+@pytest.fixture(scope="module")
+def strokes() -> Recording:
+    """Without noise, of parameters up to a half away from the nominal ones."""
+    return record("strokes", STROKES, TRUE, BASE, SENSORS, step=STEP, noise=0.0)
+
+
+@pytest.fixture(scope="module")
+def shake() -> Recording:
+    return record("shake", SHAKE, TRUE, BASE, SENSORS, step=STEP, noise=0.0)
+
+
+def four(**changes: Unknown) -> dict[str, Unknown]:
+    """E and tau from twice and half the nominal values."""
+    start = {"pad.E": 1.5e6, "pad.tau": 5e-3}
+    return {name: Unknown(nominal=start.get(name)) for name in FOUR} | {"contact.mu_k": known("contact.mu_k")} | changes
+
+
+def known(name: str) -> Unknown:
+    return Unknown(nominal=TRUTH[name], fixed=True)
+
+
+def test_jacobian_equals_central_differences_for_every_kind_of_coordinate(strokes: Recording, shake: Recording) -> None:
+    sensors = SENSORS | {"theta": Sensor(noise=5e-4, bias=5e-3, delay=4e-3)}
+    unknowns = {
+        "pad.E": Unknown(),
+        "contact.mu_s": Unknown(),
+        "contact.mu_k": Unknown(ratio_to="contact.mu_s", high=1.0, low=0.3),
+        "contact.R_n": Unknown(shared=False),
+        "disc.mass": Unknown(scale="linear", low=0.3, high=0.5),
+        "control.R_80": Unknown(),
+    }
+    problem = Problem([strokes, shake], sensors, unknowns)
+    c = problem.coordinates
+    assert c.labels == (
+        "pad.E", "contact.mu_s", "contact.mu_k / contact.mu_s", "contact.R_n in strokes", "contact.R_n in shake",
+        "disc.mass", "control.R_80", "bias of theta", "delay of theta",
+    )  # fmt: skip
+    x, both = c.start, problem.names
+    x[-2:] = 0.1, 0.13
+    with Runner(problem.recordings) as runner:
+        at = problem.residuals(runner, x, both, STEP, c.free)
+        for i, label in enumerate(c.labels):
+            h = 1e-5 * np.eye(len(x))[i]
+            ahead, behind = (problem.residuals(runner, x + s * h, both, STEP).r for s in (1, -1))
+            slope = (ahead - behind) / 2e-5
+            assert np.linalg.norm(at.J[:, i] - slope) < 2e-4 * np.linalg.norm(slope), label
+        loss, gradient, lost = problem.misfit(runner, x, both, STEP, c.free)
+    assert not lost
+    assert loss == pytest.approx(0.5 * at.r @ at.r, rel=1e-12)
+    np.testing.assert_allclose(gradient, at.J.T @ at.r, rtol=1e-8, atol=1e-8 * np.abs(gradient).max())
+
+
+def test_noise_free_data_give_the_truth_back_and_intervals_hold_it(strokes: Recording, shake: Recording) -> None:
+    answer = identify(Problem([strokes, shake], SENSORS, four()), step=STEP, heldout=["shake"])
+    for name in FOUR:
+        e = answer[name]
+        assert e.identifiable
+        assert e.value == pytest.approx(TRUTH[name], rel=1e-3)
+        assert e.ci95 is not None
+        assert e.ci95[0] < TRUTH[name] < e.ci95[1]
+    assert answer.converged
+    assert answer.chi2 < 1e-3
+    assert max(answer.heldout["shake"].values()) < 1e-3
+    content = json.loads(answer.to_json())
+    assert content["made_by"]["recordings"].keys() == {"strokes", "shake"}
+    assert content["cost"]["jacobians"] > 0
+
+
+def test_the_adjoint_route_ends_where_gauss_newton_does(strokes: Recording) -> None:
+    problem = Problem([strokes], SENSORS, {"pad.E": Unknown(nominal=1.0e6), "pad.tau": Unknown()} | rest_known())
+    with Runner(problem.recordings) as runner:
+        common = {"which": ["strokes"], "free": problem.coordinates.free, "step": STEP}
+        newton = gauss_newton(problem, runner, problem.coordinates.start, **common)
+        descent = descend(problem, runner, problem.coordinates.start, evaluations=40, **common)
+        adam = descend(problem, runner, newton.x, method="adam", evaluations=2, **common)
+    free = problem.coordinates.free
+    np.testing.assert_allclose(descent.x[free], newton.x[free], atol=2e-3)
+    assert adam.evaluations == 2
+    assert adam.chi2 <= newton.chi2 + 1e-9
+
+
+def rest_known() -> dict[str, Unknown]:
+    return {name: known(name) for name in ("contact.K_n", "contact.mu_s", "contact.mu_k")}
+
+
+def test_what_the_data_do_not_see_is_not_a_number() -> None:
+    gentle = Excitation(motion=Strokes(travel=1e-3, stroke_time=0.4), duration=0.9, senses="bracket")
+    data = record("gentle", gentle, BASE, BASE, SENSORS, step=STEP, seed=1)
+    answer = identify(
+        Problem([data], SENSORS, {"pad.E": Unknown(), "contact.mu_k": Unknown()}), step=STEP,
+        plan=[Stage("all", ("gentle",), ("pad.E", "contact.mu_k"), STEP)],
+    )  # fmt: skip
+    mu_k, E = answer["contact.mu_k"], answer["pad.E"]
+    assert not mu_k.identifiable
+    assert mu_k.value is None
+    assert mu_k.ci95 is None
+    assert E.identifiable
+    assert E.ci95 is not None
+    assert E.ci95[0] < BASE.pad.E < E.ci95[1]
+    assert any("contact.mu_k" in notice for notice in answer.notices)
+    assert not answer.directions[-1].identifiable
+    assert "contact.mu_k" in answer.directions[-1].components
+    row = next(e for e in json.loads(answer.to_json())["estimates"] if e["name"] == "contact.mu_k")
+    assert row["value"] is None
+    assert "not identifiable" in answer.table()
+
+
+def test_bias_and_delay_are_found_and_missing_samples_do_not_matter(strokes: Recording) -> None:
+    t, theta = strokes.samples["theta"]
+    late = np.interp(t - 1.5e-3, t, theta) + 2e-3
+    samples = strokes.samples | {"theta": (t[3::2], late[3::2]), "F_x": tuple(x[:60] for x in strokes.samples["F_x"])}
+    data = Recording("gaps", strokes.settings, strokes.reference, samples)
+    sensors = SENSORS | {"theta": Sensor(noise=5e-4, bias=0.02, delay=5e-3)}
+    unknowns = {"pad.E": Unknown()} | rest_known() | {"pad.tau": known("pad.tau")}
+    answer = identify(Problem([data], sensors, unknowns), step=STEP)
+    assert answer["pad.E"].value == pytest.approx(TRUTH["pad.E"], rel=2e-3)
+    assert answer["bias of theta"].value == pytest.approx(2e-3, abs=1e-4)
+    assert answer["delay of theta"].value == pytest.approx(1.5e-3, abs=1e-4)
+
+
+def test_a_regular_grid_between_the_samples_changes_nothing(strokes: Recording) -> None:
+    problem = Problem([strokes], SENSORS, four())
+    with Runner(problem.recordings) as runner:
+        exact = problem.residuals(runner, problem.coordinates.start, ["strokes"], 1e-3).r
+        problem.interpolated = True
+        between = problem.residuals(runner, problem.coordinates.start, ["strokes"], 1e-3).r
+    assert np.abs(between - exact).max() < 0.2 < np.abs(exact).max()
+
+
+def test_a_step_too_coarse_for_the_data_is_said() -> None:
+    hard = Excitation(
+        motion=MultiSine(amplitude_x=4e-3, amplitude_y=2e-4, frequency=(10, 40)), duration=0.9, senses="bracket"
+    )
+    fine = record("shaking", hard, BASE, BASE, SENSORS, step=2.5e-4, noise=0.0)
+    plan = [Stage("all", ("shaking",), ("pad.E", "pad.tau"), 2.5e-3)]
+    coarse = identify(Problem([fine], SENSORS, {"pad.E": Unknown(), "pad.tau": Unknown()}), plan=plan, polished=False)
+    assert any("too coarse" in notice for notice in coarse.notices)
+    tau = coarse["pad.tau"]
+    error = np.log(tau.last / BASE.pad.tau)
+    assert abs(error) > 3 * tau.relative_sd  # so the notice is needed
+    assert tau.step_bias_sd * tau.relative_sd == pytest.approx(error, rel=0.5)  # and its size is about right
+    better = identify(Problem([fine], SENSORS, {"pad.E": Unknown(), "pad.tau": Unknown()}), plan=plan)["pad.tau"]
+    left = np.log(better.last / BASE.pad.tau)
+    assert abs(left) < 0.2 * abs(error)  # of second order, at a quarter of the step
+    assert better.step_bias_sd * better.relative_sd == pytest.approx(left, rel=0.5)
+
+
+def test_interrupted_it_continues_and_ends_the_same(
+    strokes: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = Problem([strokes], SENSORS, {"pad.E": Unknown(nominal=1.4e6), "pad.tau": Unknown()} | rest_known())
+    whole = identify(problem, step=STEP)
+    inner, left = Runner.run, [4]
+
+    def interrupted(self: Runner, jobs: list) -> list:
+        left[0] -= 1
+        if left[0] < 0:
+            raise KeyboardInterrupt
+        return inner(self, jobs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Runner, "run", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            identify(problem, step=STEP, checkpoint=tmp_path / "runs")
+    kept = len(list((tmp_path / "runs").glob("*.pickle")))
+    assert kept >= 3  # runs asked for twice are made once
+    again = identify(problem, step=STEP, checkpoint=tmp_path / "runs")
+    assert again.cost["remembered"] >= kept
+    assert again.x == whole.x
+    third = identify(problem, step=STEP, checkpoint=tmp_path / "runs")
+    assert third.cost["remembered"] == third.cost["simulations"] + third.cost["jacobians"]
+
+
+def test_processes_give_the_same_residuals(strokes: Recording, shake: Recording) -> None:
+    problem = Problem([strokes, shake], SENSORS, four())
+    x, free = problem.coordinates.start, problem.coordinates.free
+    with Runner(problem.recordings) as one, Runner(problem.recordings, workers=2) as two:
+        a, b = (problem.residuals(runner, x, problem.names, STEP, free) for runner in (one, two))
+    np.testing.assert_allclose(a.r, b.r, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(a.J, b.J, rtol=1e-8, atol=1e-8 * np.abs(a.J).max())
+
+
+def test_data_out_of_reach_name_the_recording() -> None:
+    about_disc = STROKES.model_copy(update={"senses": "disc", "x_C0": 60e-3})
+    data = record("strokes", about_disc, BASE, BASE, SENSORS, step=STEP)
+    problem = Problem([data], SENSORS, {"pad.E": Unknown(nominal=4e4)})  # so soft that the loop is unstable
+    with pytest.raises(Unreachable, match=r"recording `strokes`: .* t = .* s"):
+        identify(problem, step=STEP)
+
+
+def test_sobol_starts_stay_within_bounds_and_the_best_end_is_kept(strokes: Recording) -> None:
+    problem = Problem([strokes], SENSORS, {"pad.E": Unknown(nominal=1.0e6, low=0.5e6, high=2e6)} | rest_known())
+    stage = Stage("all", ("strokes",), ("pad.E",), STEP, starts=4)
+    free = np.array([c.name == "pad.E" for c in problem.coordinates.all])
+    points = sobol(problem, problem.coordinates.start, free, stage, 0)
+    low, high = problem.coordinates.bounds
+    assert len(points) == 3
+    assert all((low <= p).all() and (p <= high).all() for p in points)
+    assert len({p.tobytes() for p in points}) == 3
+    answer = identify(problem, plan=[stage])
+    assert answer["pad.E"].last == pytest.approx(TRUTH["pad.E"], rel=0.05)
+
+
+def test_plan_begins_slowly_ties_ratios_and_ends_with_everything(strokes: Recording, shake: Recording) -> None:
+    unknowns = four(**{"contact.mu_k": Unknown(ratio_to="contact.mu_s", nominal=0.7, low=0.3, high=1.0)})
+    problem = Problem([shake, strokes], SENSORS, unknowns)
+    with Runner(problem.recordings) as runner:
+        plan = default_plan(problem, runner, STEP, problem.names)
+    slow = min(problem.recordings, key=lambda recording: recording.speed)
+    assert plan[0].recordings == (slow.name,)
+    ratio = "contact.mu_k / contact.mu_s"
+    assert dict(plan[0].tied) == {ratio: 1.0}
+    assert all(ratio not in stage.free for stage in plan[:-1])
+    assert set(plan[-1].free) == set(problem.coordinates.labels)
+    assert dict(plan[-1].scanned)[ratio][0] == 1.0
+    assert plan[0].step > plan[-1].step == STEP
+    tied = tie_ratios(problem, problem.coordinates.start)
+    assert problem.values(tied, 0)["contact.mu_k"] == pytest.approx(problem.values(tied, 0)["contact.mu_s"])
+
+
+def test_visible_drops_what_the_others_cannot_be_told_from() -> None:
+    a = np.random.default_rng(0).standard_normal((50, 1))
+    J = np.hstack((100 * a, 100 * a + 1e-6, 40 * np.random.default_rng(1).standard_normal((50, 1))))
+    assert visible(J, np.ones(3, bool)).sum() == 2
+    assert not visible(J, np.array([False, False, True]))[:2].any()
+    assert standard_deviations(np.eye(2) * 10.0) == pytest.approx([0.1, 0.1])
+
+
+def test_fisher_and_step_shift_of_a_linear_problem() -> None:
+    rng = np.random.default_rng(0)
+    J, x = rng.standard_normal((40, 3)), np.array([0.3, -0.2, 0.1])
+    C, values, _ = fisher(J)
+    np.testing.assert_allclose(C, np.linalg.inv(J.T @ J), rtol=1e-10)
+    assert (np.diff(values) >= 0).all()
+    coarse, fine = J @ x, J @ (0.25 * x)  # a second-order error of J x at the step, a quarter of it at half the step
+    np.testing.assert_allclose(step_shift(J, step_error(coarse, fine)), -x, rtol=1e-10)
+
+
+def test_whiteness_tells_noise_from_drift() -> None:
+    noise = np.random.default_rng(0).standard_normal(500)
+    assert whiteness(noise)[1] > 0.01
+    lag, p = whiteness(np.cumsum(noise))
+    assert lag > 0.9
+    assert p < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("unknowns", "message"),
+    [
+        ({}, "nothing to identify"),
+        ({"pad.E": {"fixed": True}}, "nothing to identify"),
+        ({"pad.length": {}}, "`pad.length` cannot be identified"),
+        ({"pad.E": {"low": 1e6, "high": 2e6}}, r"pad\.E\.nominal = 750000 is not between"),
+        ({"pad.E": {"low": 2e6, "high": 1e6}}, "low = 2000000.0 must be below"),
+        ({"pad.E": {"scale": "linear"}}, "needs `low` and `high`"),
+        ({"pad.E": {"nominal": -1.0}}, "needs nominal > 0"),
+        ({"contact.mu_k": {"ratio_to": "friction"}}, "ratio_to = 'friction'"),
+        ({"pad.E": {"young": 1.0}}, "young"),
+    ],
+)
+def test_wrong_unknowns_are_refused(strokes: Recording, unknowns: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Problem([strokes], SENSORS, {name: Unknown.model_validate(u) for name, u in unknowns.items()})
+
+
+def test_wrong_recordings_and_sensors_are_refused(strokes: Recording) -> None:
+    one = {"pad.E": Unknown()}
+    with pytest.raises(ValueError, match="names of their own"):
+        Problem([strokes, strokes], SENSORS, one)
+    with pytest.raises(ValueError, match="`z` is not a channel"):
+        Problem([strokes], {"z": Sensor(noise=1.0)}, one)
+    with pytest.raises(ValueError, match="no recording has samples of `omega`"):
+        Problem([strokes], {"omega": Sensor(noise=1.0)}, one)
+    t, y = strokes.samples["x_C"]
+    for samples, message in (
+        ({}, "no samples"),
+        ({"x": (t, y)}, "`x` is not a channel"),
+        ({"x_C": (t, y[1:])}, "times and values alike"),
+        ({"x_C": (t[::-1], y)}, "increasing times"),
+        ({"x_C": (t, np.full_like(y, np.nan))}, "finite values"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Recording("one", strokes.settings, strokes.reference, samples)
+    with pytest.raises(ValueError, match="`heldout`"):
+        identify(Problem([strokes], SENSORS, one), heldout=["strokes"])
+
+
+def test_catalogue_begins_at_rest_and_can_be_written_down() -> None:
+    for name, excitation in CATALOGUE.items():
+        assert Excitation.model_validate_json(excitation.model_dump_json()) == excitation, name
+        model, y0 = begin(excitation, BASE, grasp_force=10.0)
+        state = model.layout.unpack(y0)
+        assert not model.frame("U", state).g.gt(0).any(), name
+        assert model.frame("L", state).g.gt(0).any(), name
+        with torch.no_grad():
+            assert model(0.0, y0)[model.layout.slices["v_C"]][1].abs() < 1e-6, name
+
+
+def test_a_sampled_set_point_follows_the_profile_it_was_taken_from() -> None:
+    profile = Profile([0.0, 0.3, 0.8], [0.0, 1e-2, -5e-3])
+    t = torch.linspace(0, 0.8, 161, dtype=torch.float64)
+    between = torch.linspace(0.0, 0.8, 777, dtype=torch.float64)
+    value, rate = profile(t)
+    want, want_rate = profile(between)
+    for rates, near in ((rate.tolist(), 1e-7), (None, 1e-6)):
+        sampled = Sampled(t.tolist(), value.tolist(), rates)
+        got, got_rate = sampled(between)
+        assert float((got - want).abs().max()) < near
+        assert float((got_rate - want_rate).abs().max()) < 200 * near
+        step = 1e-6
+        slope = (sampled(between[1:-1] + step)[0] - sampled(between[1:-1] - step)[0]) / (2 * step)
+        assert float((slope - got_rate[1:-1]).abs().max()) < 1e-6
+    assert float(sampled(torch.tensor([5.0], dtype=torch.float64))[0]) == pytest.approx(-5e-3)
+    with pytest.raises(ValueError, match="`rates`"):
+        Sampled([0.0, 1.0], [0.0, 1.0], [0.0])
+
+
+KILLED = """
+import sys
+from test_identify import BASE, SENSORS, STEP, STROKES, TRUE, Problem, Unknown, identify, record, rest_known
+
+data = record("strokes", STROKES, TRUE, BASE, SENSORS, step=STEP, seed=5)
+unknowns = {"pad.E": Unknown(nominal=1.4e6), "pad.tau": Unknown()} | rest_known()
+answer = identify(Problem([data], SENSORS, unknowns), step=STEP, checkpoint=sys.argv[1])
+print(int(answer.cost["remembered"]), [x.hex() for x in answer.x])
+"""
+
+
+@pytest.mark.slow
+def test_killed_in_mid_run_it_continues_and_ends_the_same(tmp_path: Path) -> None:
+    """SIGKILL as soon as three runs are kept."""
+
+    def begin(folder: Path) -> subprocess.Popen[str]:
+        command = [sys.executable, "-c", KILLED, str(folder)]
+        return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parent)
+
+    whole, _ = begin(tmp_path / "whole").communicate(timeout=200)
+    cut = begin(tmp_path / "cut")
+    while cut.poll() is None and len(list((tmp_path / "cut").glob("*.pickle"))) < 3:
+        time.sleep(0.01)
+    cut.kill()
+    cut.communicate()
+    assert cut.returncode == -signal.SIGKILL
+    again, _ = begin(tmp_path / "cut").communicate(timeout=200)
+    remembered, x = again.split(maxsplit=1)
+    assert int(remembered) >= 3
+    assert x == whole.split(maxsplit=1)[1]

@@ -1,0 +1,424 @@
+"""Measured data: what is read is what was written, every mistake is named with its place, and the command continues."""
+
+import csv
+import importlib.util
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+
+from torchsoft import Parameters, Trajectory, simulate
+from torchsoft.channels import CHANNELS
+from torchsoft.cli import main
+from torchsoft.excitation import Excitation, Strokes, begin
+from torchsoft.sysid import MEASURED, Recording, Sensor, Unreachable, record
+from torchsoft.sysid.columns import COLUMNS, UNITS, read_table
+from torchsoft.sysid.measured import known_parameters, load, read_recording, unreachable
+from torchsoft.sysid.workers import FailedRun
+
+EXAMPLE = Path(__file__).parent.parent / "examples" / "identify"
+
+CONFIG = """
+[settings]
+contact.v_s = 0.05
+control.senses = "bracket"
+scenario.x_C0 = 60.3e-3
+
+[unknowns."contact.K_n"]
+nominal = 1e5
+[unknowns."pad.E"]
+nominal = 0.7e6
+
+[sensors]
+x_C.noise = 10e-6
+y_Br.noise = 10e-6
+F_y.noise = 0.1
+
+[fit]
+step = 5e-3
+"""
+
+Table = list[list[str]]
+Change = Callable[[Table], object]
+
+
+@pytest.fixture(scope="module")
+def example() -> Table:
+    """Cells of the first 0.3 s of the example, with its heading."""
+    with (EXAMPLE / "rolling.csv").open(newline="") as file:
+        return list(csv.reader(file))[:62]
+
+
+def write(path: Path, table: Table) -> Path:
+    path.write_text("\n".join(",".join(cells) for cells in table) + "\n")
+    return path
+
+
+@pytest.fixture
+def case(example: Table, tmp_path: Path) -> Callable[..., list[str]]:
+    """Writes the example, changed, and a configuration; gives the paths."""
+
+    def make(change: Change = lambda table: None, config: str = CONFIG) -> list[str]:
+        table = [list(cells) for cells in example]
+        change(table)
+        (tmp_path / "rig.toml").write_text(config)
+        return [str(write(tmp_path / "data.csv", table)), str(tmp_path / "rig.toml")]
+
+    return make
+
+
+def put(row: int, column: int, text: str) -> Change:
+    """Replace a cell; the heading is row 1 and the time column 0."""
+    return lambda table: table[row - 1].__setitem__(column, text)
+
+
+def scale(column: int, factor: float, offset: float = 0.0, since: int = 2) -> Change:
+    def change(table: Table) -> None:
+        for cells in table[since - 1 :]:
+            cells[column] = repr(float(cells[column]) * factor + offset)
+
+    return change
+
+
+def drop(column: int) -> Change:
+    return lambda table: [cells.pop(column) for cells in table]
+
+
+T, X_D, Y_D, Y_D_DOT, X_C, THETA, Y_BR, F_Y = 0, 1, 3, 4, 6, 7, 9, 11
+
+BAD: dict[str, tuple[Change, str]] = {
+    "no unit": (put(1, X_C, "x_C"), r"data\.csv, row 1, column `x_C` has no unit: write `x_C \[m\]`"),
+    "unknown unit": (put(1, X_C, "x_C [inch]"), r"row 1, column `x_C` cannot be in 'inch'; it can be in m, cm, mm"),
+    "wrong dimension": (put(1, THETA, "theta [mm]"), r"row 1, column `theta` cannot be in 'mm'; it can be in rad"),
+    "unknown column": (put(1, X_C, "x_c [mm]"), r"row 1, column `x_c` is not known; columns are t, x_d"),
+    "column twice": (put(1, X_C, "x_Br [mm]"), r"row 1, column `x_Br` is there twice"),
+    "no times": (drop(T), r"data\.csv has no column `t`"),
+    "no set-point": (drop(Y_D), r"data\.csv has no column `y_d`"),
+    "no sensor": (put(1, X_C, "y_C [mm]"), r"rig\.toml: no recording has samples of `x_C`"),
+    "semicolons": (
+        lambda table: table.__setitem__(slice(None), [[";".join(cells)] for cells in table]),
+        "row 1.*separate columns with commas",
+    ),
+    "a cell too many": (lambda table: table[6].append("1"), r"row 7 has 13 cells, but there are 12 columns"),
+    "text": (put(9, X_C, "n/a"), r"data\.csv, row 9, column `x_C`: 'n/a' is not a finite number; leave the cell empty"),
+    "nan": (put(9, F_Y, "NaN"), r"row 9, column `F_y`: 'NaN' is not a finite number"),
+    "infinity": (put(9, F_Y, "-inf"), r"row 9, column `F_y`: '-inf' is not a finite number"),
+    "grouped digits": (put(9, F_Y, "1_0"), r"row 9, column `F_y`: '1_0' is not a finite number"),
+    "empty time": (put(12, T, ""), r"row 12, column `t` is empty; only measured channels may have gaps"),
+    "empty set-point": (put(12, Y_D, " "), r"row 12, column `y_d` is empty"),
+    "time twice": (put(12, T, "0.045"), r"row 12, column `t`: the time 0.045 s is there twice"),
+    "time goes back": (put(12, T, "0.01"), r"row 12, column `t`: time goes back, from 0.045 to 0.01 s"),
+    "rows missing": (lambda table: table.__delitem__(slice(10, 40)), r"row 11, column `t`: 0.155 s are missing before it"),
+    "few rows": (lambda table: table.__delitem__(slice(8, None)), r"has 7 rows of numbers, but needs at least 10"),
+    "mm under m": (put(1, X_C, "x_C [m]"), r"row 2, column `x_C`: 60.54 m is not plausible, .* between -0.12 and 0.24 m"),
+    "one spike": (put(30, Y_BR, "500"), r"row 30, column `y_Br`: 0.5 m is not plausible"),
+    "another start": (scale(X_C, 1.0, 5.0), r"row 2, column `x_C`: it begins at 0.065\d* m, but scenario.x_C0 is 0.0603 m"),
+    "turned already": (scale(THETA, 1.0, 500.0), r"row 2, column `theta`: it begins at 0.48\d* rad, but the start is 0 rad"),
+    "another ground": (scale(Y_BR, 1.0, 3.0), r"row 2, column `y_Br`: it begins at .*, but the set-point y_d is 0.0501 m"),
+    "moving": (
+        lambda table: [cells.__setitem__(X_C, f"{60.3 + 0.3 * i}") for i, cells in enumerate(table[1:])],
+        r"row 3, column `x_C` moves already: a recording must begin at rest",
+    ),
+    "in the grasp": (
+        lambda table: [scale(k, 1.0, -0.6)(table) for k in (Y_D, Y_BR)],
+        r"row 2, column `y_d`: the bracket must begin clear",
+    ),
+    "no grasp": (
+        lambda table: [scale(k, 0.0, 50.2)(table) for k in (Y_D, Y_BR)],
+        r"row 2, column `y_d`: the bracket never comes lower",
+    ),
+    "one sample": (
+        lambda table: [cells.__setitem__(X_C, "") for cells in table[2:]],
+        r"column `x_C` has 1 samples, but needs at least two",
+    ),
+    "crushed": (scale(Y_D, 6.0, -250.5), r"rig\.toml, settings of `data`: the disc does not fit: scenario.y_Br_grasp"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_mistake_in_the_data_is_named_with_its_row_and_column(case: Callable[..., list[str]], name: str) -> None:
+    change, message = BAD[name]
+    data, config = case(change)
+    with pytest.raises(ValueError, match=message):
+        load([data], config)
+
+
+BAD_CONFIG = {
+    "not TOML": (CONFIG + "[[", r"rig\.toml is not a TOML file"),
+    "unknown table": (CONFIG + "[sensor]\n", r"rig\.toml: sensor: is not known here"),
+    "unknown key": (CONFIG.replace("y_Br.noise", "y_Br.sigma"), r"sensors\.y_Br\.noise: .*sensors\.y_Br\.sigma: is not known"),
+    "no noise": (CONFIG.replace("F_y.noise = 0.1", "F_y.noise = 0.0"), r"sensors\.F_y\.noise: .* greater than 0"),
+    "unknown channel": (CONFIG.replace("F_y.noise", "F_z.noise"), r"rig\.toml: `F_z` is not a channel"),
+    "unknown parameter": (CONFIG.replace("contact.K_n", "contact.K"), r"rig\.toml: `contact.K` cannot be identified"),
+    "unknown setting": (CONFIG.replace("contact.v_s", "contact.vs"), r"settings of `data`: contact\.vs: is not known here"),
+    "setting out of bounds": (CONFIG.replace("v_s = 0.05", "v_s = -1"), r"settings of `data`: contact\.v_s: .*greater than 0"),
+    "not a table": ("settings.disc = 3\n" + CONFIG.split("\n\n", 1)[1], r"settings of `data`: disc: Input should be a valid"),
+    "not a number": (CONFIG.replace("60.3e-3", '"here"'), r"settings of `data`: scenario\.x_C0: Input should be"),
+    "other pads": (CONFIG.replace("contact.v_s", "pad.height = 3e-3\ncontact.v_s"), r"rig\.toml touch .* at 46.92 mm"),
+    "bounds": (CONFIG.replace("nominal = 1e5", "low = 2\nhigh = 1"), r"unknowns\.contact\.K_n: low = 2.0 must be below"),
+    "step": (CONFIG.replace("step = 5e-3", "step = -1"), r"fit\.step: Input should be greater than 0"),
+    "method": (CONFIG + 'method = "magic"\n', r"fit\.method: Input should be 'gauss_newton'"),
+    "held out": ('heldout = ["other"]\n' + CONFIG, r"there is no recording `other`; there are data"),
+    "nameless": (CONFIG + "[[recordings]]\n", r"recordings\.0: a recording needs a `file`"),
+    "same name": (CONFIG + '[[recordings]]\nfile = "data.csv"\n', r"names of their own, but are called data, data"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD_CONFIG)
+def test_a_mistake_in_the_configuration_is_named_with_its_field(case: Callable[..., list[str]], name: str) -> None:
+    config, message = BAD_CONFIG[name]
+    files = case(config=config)
+    with pytest.raises(ValueError, match=message):
+        load(files[:1], files[1])
+
+
+def test_empty_cells_are_missing_samples(case: Callable[..., list[str]]) -> None:
+    def change(table: Table) -> None:
+        for row in (5, 6, 40):
+            table[row - 1][X_C] = ""
+        table.insert(20, [])  # a blank line counts as a row, not as data
+
+    data, config = case(change)
+    made = load([data], config)
+    (one,) = made.problem.recordings
+    t, x = one.samples["x_C"]
+    assert len(one.samples["F_y"][0]) == 61
+    assert len(x) == 58
+    assert not {0.015, 0.02} & set(t)
+    assert made.tables["data"].near(0.2) == "row 43 (t = 0.2 s)"
+
+
+@pytest.mark.parametrize("name", sorted(set(COLUMNS) - {"t"}))
+def test_every_unit_is_understood(tmp_path: Path, name: str) -> None:
+    dimension = CHANNELS[name].unit
+    for unit, factor in UNITS[dimension].items():
+        table = [["t [ms]", "x_d [m]", "y_d [m]"]] + [[str(5 * i), "0.06", "0.05"] for i in range(10)]
+        if name in ("x_d", "y_d"):
+            table = [cells[:1] + [c for c, h in zip(cells[1:], ("x_d", "y_d")) if h != name] for cells in table]
+        table = [[*cells, f"{name} [{unit}]" if i == 0 else repr(0.03 / factor)] for i, cells in enumerate(table)]
+        read = read_table(write(tmp_path / "units.csv", table))
+        np.testing.assert_allclose(read.values[name], 0.03, rtol=1e-14)
+        np.testing.assert_allclose(read.values["t"], 5e-3 * np.arange(10), rtol=1e-14)
+
+
+@pytest.fixture(scope="module")
+def made() -> tuple[Any, Recording]:
+    """The example's own script, and a short recording."""
+    spec = importlib.util.spec_from_file_location("make", EXAMPLE / "make.py")
+    assert spec is not None
+    assert spec.loader is not None
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    sensors = {channel: Sensor(noise=1e-5) for channel in MEASURED}
+    excitation = Excitation(motion=Strokes(travel=4e-3, stroke_time=0.15), duration=0.4, depth=1.2e-3, senses="bracket",
+                            grasp_time=0.15, settle=0.0)  # fmt: skip
+    return script, record("short", excitation, script.TRUTH, script.NOMINAL, sensors, step=2.5e-3)
+
+
+def test_a_recording_survives_the_way_through_csv(made: tuple[Any, Recording], tmp_path: Path) -> None:
+    script, one = made
+    script.UNITS["rad/s"] = ("deg/s", 180 / np.pi)
+    script.write(one, tmp_path / "short.csv", digits=17)
+    sensors = {channel: Sensor(noise=1e-5) for channel in MEASURED}
+    back = read_recording(tmp_path / "short.csv", "short", one.settings, sensors)
+    assert back.name == one.name
+    assert back.settings == one.settings
+    assert list(back.samples) == list(one.samples) == list(MEASURED)
+    for channel, (t, y) in one.samples.items():
+        np.testing.assert_allclose(back.samples[channel][0], t, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(back.samples[channel][1], y, rtol=1e-13)
+    t = torch.from_numpy(np.linspace(-0.1, 0.5, 1201))
+    with torch.no_grad():
+        want, got = one.reference(t), back.reference(t)
+    for exact, read, tolerance in zip(want, got, (2e-8, 2e-5, 1e-8, 1e-5, 0.02)):
+        assert float((read - exact).abs().max()) < tolerance
+
+
+def test_the_examples_files_are_what_its_script_makes(made: tuple[Any, Recording]) -> None:
+    script, _ = made
+    case = load([EXAMPLE / "rolling.csv"], EXAMPLE / "rolling.toml")
+    assert case.problem.names == ("rolling", "checking")
+    assert {k: s.noise for k, s in case.problem.sensors.items()} == script.SENSORS
+    known_by_file, truth = case.problem.recordings[0].settings.table(), script.TRUTH.table()
+    own = {"scenario.y_Br_grasp", "scenario.travel", "scenario.x_C0", "control.senses"}
+    for name, row in truth.items():  # the configuration tells the truth, but for what is unknown
+        if name not in case.problem.unknowns and name not in own:
+            assert known_by_file[name]["value"] == row["value"], name
+    text = (EXAMPLE / "README.md").read_text()
+    for name in case.problem.unknowns:
+        assert re.search(rf"`{re.escape(name)}` +\| +{truth[name]['value']:g} ", text), name
+    for file in EXAMPLE.glob("*.csv"):
+        assert file.stat().st_size < 150e3
+
+
+@pytest.fixture(scope="module")
+def run() -> Trajectory:
+    """A grasp of 60 ms."""
+    excitation = Excitation(motion=Strokes(), senses="bracket", grasp_time=0.05, settle=0.0, depth=1e-3)
+    model, y0 = begin(excitation, Parameters().override({"contact.v_s": 0.05}))
+    return simulate(model, torch.linspace(0, 0.06, 31, dtype=torch.float64), y0=y0, step=2e-3)
+
+
+def test_a_trajectory_file_is_a_recording(run: Trajectory, tmp_path: Path) -> None:
+    run.save(tmp_path / "run.nc")
+    table = read_table(tmp_path / "run.nc")
+    settings = {"scenario": {"x_C0": 60.3e-3}, "control.senses": "bracket", "contact": {"v_s": 0.05}}
+    sensors = {"x_C": Sensor(noise=1e-5)}
+    one = read_recording(tmp_path / "run.nc", "run", known_parameters(Path("c"), "run", table, settings), sensors)
+    assert list(one.samples) == list(MEASURED)
+    s = run.state
+    expected = torch.cat((s.r_C, s.theta[:, None], s.r_Br, s.v_C, s.omega[:, None], s.v_Br, run.control), 1).numpy()
+    for k, channel in enumerate(MEASURED):
+        np.testing.assert_array_equal(one.samples[channel][1], expected[:, k])
+    with torch.no_grad():
+        got = torch.stack(one.reference(run.t), -1)
+    np.testing.assert_allclose(got[:, [0, 1, 2, 4]], run.desired[:, [0, 1, 2, 4]], atol=1e-12)
+    np.testing.assert_allclose(got[:, 3], run.desired[:, 3], atol=2e-4)  # y_d' is not in the file
+    assert one.settings.scenario.y_Br_grasp == pytest.approx(float(run.desired[:, 2].min()))
+
+
+def test_a_mistake_in_a_trajectory_file_is_named(run: Trajectory, tmp_path: Path) -> None:
+    path = tmp_path / "run.nc"
+    path.write_text("not a file of this kind")
+    with pytest.raises(ValueError, match=r"run\.nc is not a NetCDF file"):
+        read_table(path)
+    xr.Dataset({"time": ("time", [0.0, 1.0])}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
+    with pytest.raises(ValueError, match=r"other\.nc is not a trajectory file: it has no desired_x, "):
+        read_table(tmp_path / "other.nc")
+    data = run.to_dataset().copy(deep=True)
+    data["disc_angle"][7] = np.nan
+    data.to_netcdf(tmp_path / "nan.nc", engine="h5netcdf")
+    with pytest.raises(ValueError, match=r"nan\.nc, sample 7, `theta` is not a finite number"):
+        read_table(tmp_path / "nan.nc")
+    run.to_dataset().isel(time=[0, 1, 2, 2, *range(3, 31)]).to_netcdf(tmp_path / "twice.nc", engine="h5netcdf")
+    with pytest.raises(ValueError, match=r"twice\.nc, sample 3, column `t`: the time 0.004 s is there twice"):
+        read_table(tmp_path / "twice.nc")
+
+
+def test_recordings_have_settings_of_their_own(case: Callable[..., list[str]], tmp_path: Path) -> None:
+    more = '[[recordings]]\nname = "data"\nsettings.disc.mass = 0.5\n[[recordings]]\nfile = "second.csv"\nname = "b"\n'
+    data, config = case(config=CONFIG + more)
+    (tmp_path / "second.csv").write_text(Path(data).read_text())
+    first, second = load([data], config).problem.recordings
+    assert (first.name, first.settings.disc.mass) == ("data", 0.5)
+    assert (second.name, second.settings.disc.mass) == ("b", Parameters().disc.mass)
+    assert first.settings.contact.v_s == second.settings.contact.v_s == 0.05
+
+
+ERRORS: dict[str, tuple[list[str], str]] = {
+    "no config": (["data.csv"], "one CONFIG.toml is needed, but 0 were given"),
+    "no such file": (["other.csv", "rig.toml"], "other.csv: No such file or directory"),
+    "no such config": (["data.csv", "other.toml"], "other.toml: No such file or directory"),
+    "no data": (["rig.toml"], "there is nothing to identify from"),
+    "step": (["data.csv", "rig.toml", "--step", "-1"], "step: Input should be greater than 0"),
+    "workers": (["data.csv", "rig.toml", "--workers", "0"], "workers: Input should be greater than or equal to 1"),
+    "out is a file": (["data.csv", "rig.toml", "--out", "data.csv"], "data.csv: File exists"),
+}
+
+
+@pytest.mark.parametrize("name", ERRORS)
+def test_an_error_of_the_command_is_one_line(
+    case: Callable[..., list[str]], name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Any
+) -> None:
+    case()
+    monkeypatch.chdir(tmp_path)
+    arguments, message = ERRORS[name]
+    assert main(["identify", *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("torchsoft: error: ")
+    assert message in err
+    assert err.count("\n") == 1
+
+
+def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(
+    case: Callable[..., list[str]], tmp_path: Path, capsys: Any, example: Table
+) -> None:
+    def change(table: Table) -> None:
+        with (EXAMPLE / "rolling.csv").open(newline="") as file:
+            table[:] = list(csv.reader(file))[:122]
+        for column in (X_D, X_C, 8):
+            scale(column, 1.0, -0.3)(table)
+        scale(X_D, 0.5, 30.0)(table)
+        drop(2)(table)
+
+    config = CONFIG.replace('"bracket"', '"disc"').replace("60.3e-3", "60e-3").replace("5e-3", "2e-3")
+    files = case(change, config.replace("[unknowns", "control.K_81 = 1e6\ncontrol.R_80 = 0\n[unknowns", 1))
+    assert main(["identify", *files, "--out", str(tmp_path / "out"), "--no-progress"]) == 2
+    message = capsys.readouterr().err
+    found = re.search(
+        r"data\.csv, row (\d+) \(t = (\S+) s\): the model cannot follow recording `data` here: at t = (\S+) s", message
+    )
+    assert found, message
+    row, t, inside = int(found[1]), float(found[2]), float(found[3])
+    assert t == pytest.approx(inside, abs=1e-3)
+    assert row == 2 + np.ceil(t / 5e-3 - 1e-6)
+    assert message.count("\n") == 1
+    tables = load(files[:1], files[1]).tables
+    assert "data.csv, before row 2 (t = -0.1 s): the model" in unreachable(
+        Unreachable({"data": FailedRun("gone", -0.1)}), tables
+    )
+
+
+@pytest.fixture(scope="module")
+def answered(tmp_path_factory: pytest.TempPathFactory, example: Table) -> tuple[Path, list[str]]:
+    """The command, carried out in this process; its folder and its data."""
+    folder = tmp_path_factory.mktemp("command")
+    (folder / "rig.toml").write_text(CONFIG)
+    files = [str(write(folder / "data.csv", example[:42])), str(folder / "rig.toml")]
+    assert main(["identify", *files, "--out", str(folder / "out"), "--no-progress"]) == 0
+    return folder, files
+
+
+@pytest.mark.xdist_group("identify-command")
+def test_the_command_writes_answer_and_page(answered: tuple[Path, list[str]]) -> None:
+    out = answered[0] / "out"
+    assert sorted(path.name for path in out.iterdir()) == ["answer.json", "report.html"]
+    answer = json.loads((out / "answer.json").read_text())
+    found = {e["name"]: e for e in answer["estimates"]}
+    assert set(found) == {"contact.K_n", "pad.E"}
+    assert answer["converged"]
+    page = (out / "report.html").read_text()
+    assert page.startswith("<!doctype html>")
+    assert all(notice in page or "&" in notice for notice in answer["notices"])
+
+
+@pytest.mark.xdist_group("identify-command")
+def test_an_interrupted_command_continues_and_ends_the_same(answered: tuple[Path, list[str]], capsys: Any) -> None:
+    folder, files = answered
+    out = folder / "again"
+    command = ["identify", *files, "--out", str(out), "--no-progress"]
+    # test runners may ignore SIGINT, which a child inherits
+    code = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        f"from torchsoft.cli import main; sys.exit(main({command!r}))"
+    )
+    child = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
+    began = time.monotonic()
+    while len(list(out.glob("unfinished/*.pickle"))) < 3 and child.poll() is None and time.monotonic() - began < 120:
+        time.sleep(0.02)
+    child.send_signal(signal.SIGINT)
+    _, message = child.communicate(timeout=60)
+    assert child.returncode == 130, message
+    assert "the same command continues" in message
+    assert "Traceback" not in message
+    kept = len(list(out.glob("unfinished/*.pickle")))
+    assert kept >= 3
+    assert not (out / "answer.json").exists()
+
+    assert main(command) == 0
+    assert "contact.K_n" in capsys.readouterr().out
+    assert not (out / "unfinished").exists()
+    first, second = (json.loads((folder / name / "answer.json").read_text()) for name in ("out", "again"))
+    assert second["estimates"] == first["estimates"]
+    assert second["cost"]["remembered"] >= first["cost"]["remembered"] + kept - 1

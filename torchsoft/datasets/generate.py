@@ -1,0 +1,128 @@
+"""Make a dataset: `python -m data_gen.generate CONFIG.toml --out DIR [--workers N] [--scheduler tcp://...]`.
+
+Started again on the same folder it makes what is missing. Ctrl-C and kill are safe at any moment.
+"""
+
+import argparse
+import os
+import sys
+from collections.abc import Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import torch
+from threadpoolctl import threadpool_limits
+from tqdm import tqdm
+
+from torchsoft.datasets.config import Config
+from torchsoft.datasets.design import points, task
+from torchsoft.datasets.simulation import simulate_task
+from torchsoft.datasets.store import Store, StoreError, open_or_create
+from torchsoft.processes import local_processes
+
+
+class Serial(Executor):
+    """Runs every call at once, in this process."""
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+def run_shard(config_json: str, url: str, shard: int, design: Any) -> tuple[int, int]:
+    """Simulate and write one shard; how many trajectories it holds and how many of them failed."""
+    config, threads = Config.model_validate_json(config_json), torch.get_num_threads()
+    store = Store(url, config)
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):  # sums taken by more threads round differently, and sticking contacts amplify it
+            rows = [simulate_task(config, task(config, i, u)) for i, u in zip(store.rows(shard), design, strict=True)]
+    finally:
+        torch.set_num_threads(threads)
+    store.write(shard, rows)
+    return len(rows), sum(int(row["failed"]) for row in rows)
+
+
+def generate(config: Config, url: str, executor: Executor, workers: int = 1, progress: bool = True) -> int:
+    """Make every unfinished shard at `url`; the number of failed simulations among them.
+
+    At most a few shards a worker are submitted at a time, so that Ctrl-C is heard and memory is bounded. Raises `StoreError`.
+    """
+    store, design = open_or_create(url, config), points(config)
+    todo = store.unfinished()
+    left, failed, running = iter(todo), 0, set[Future[tuple[int, int]]]()
+    finished = config.trajectories - sum(len(store.rows(shard)) for shard in todo)
+    bar = tqdm(total=config.trajectories, initial=finished, unit="traj", disable=not progress, smoothing=0.05)
+    began, made = perf_counter(), 0
+    try:
+        while True:
+            while len(running) < 3 * max(workers, 1) and (shard := next(left, None)) is not None:
+                here = store.rows(shard)
+                job = (config.model_dump_json(), url, shard, design[here.start : here.stop])
+                running.add(executor.submit(run_shard, *job))
+            if not running:
+                return failed
+            done, running = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                count, bad = future.result()
+                made, failed = made + count, failed + bad
+                rate = made * config.duration / (perf_counter() - began)
+                bar.set_postfix_str(f"{rate:.3g} simulated s/s, {failed} failed", refresh=False)
+                bar.update(count)
+    finally:
+        for future in running:
+            future.cancel()
+        bar.close()
+
+
+@contextmanager
+def dask_cluster(address: str) -> Iterator[Executor]:
+    """An existing Dask cluster behind the same interface; shards of a lost worker are made by the others."""
+    try:
+        from distributed import Client
+    except ImportError:
+        raise StoreError("--scheduler needs Dask: pip install 'torchsoft[scale]'") from None
+    with Client(address) as client:
+        yield client.get_executor(retries=3, pure=False)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m data_gen.generate", description=__doc__)
+    parser.add_argument("config", type=Path, help="TOML file, see data_gen/configs")
+    parser.add_argument("--out", required=True, help="folder or fsspec URL of the store")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="local processes; 0 stays in this one")
+    parser.add_argument("--scheduler", help="address of a Dask scheduler, such as tcp://host:8786")
+    given = parser.parse_args(arguments)
+    try:
+        config = Config.from_toml(given.config)
+        if given.scheduler:
+            with dask_cluster(given.scheduler) as executor:
+                failed = generate(config, given.out, executor, workers=16)
+        elif given.workers <= 0:
+            failed = generate(config, given.out, Serial())
+        else:
+            with local_processes(given.workers) as executor:
+                failed = generate(config, given.out, executor, given.workers)
+    except (ValueError, StoreError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except BrokenProcessPool:
+        print("error: a worker was killed, perhaps for memory; start again to make what is missing", file=sys.stderr)
+        return 3
+    except KeyboardInterrupt:
+        print("interrupted: finished shards are kept; start again to make what is missing", file=sys.stderr)
+        return 130
+    print(f"{config.trajectories} trajectories in {given.out}; {failed} of those made now failed, each with its reason")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,104 @@
+"""Datasets of trajectories in a zarr store, for torch's `DataLoader` and for xarray."""
+
+import os
+from collections.abc import Sequence
+from typing import Any
+
+import fsspec
+import numpy as np
+import torch
+import xarray as xr
+import zarr
+from fsspec.implementations.local import LocalFileSystem
+from torch import Tensor
+from torch.utils.data import Dataset
+
+
+def local_path(url: str) -> str:
+    """What zarr and xarray open: the path where a URL is a local one, such as `file:///data/set`, else the URL."""
+    fs, root = fsspec.url_to_fs(url)
+    return root if isinstance(fs, LocalFileSystem) else url
+
+
+class Trajectories(Dataset[dict[str, Tensor]]):
+    """Windows of the trajectories of one split, read on access.
+
+    Item i holds every variable of `variables` in SI units, a series as (window, ...) and a number of the trajectory as (),
+    besides `trajectory` and `start`, its origin. `window` is a number of samples, the whole run by
+    default; windows of a trajectory begin every `stride` samples, `window` by default. Unfinished shards and failed
+    simulations are left out. The object is small, can be pickled, and opens the store in each process for itself, forked
+    ones included.
+
+    Raises `ValueError` for an unknown variable or split, or a window that does not fit.
+    """
+
+    def __init__(
+        self, url: str, variables: Sequence[str], *, split: str | None = None, window: int | None = None,
+        stride: int | None = None, dtype: torch.dtype = torch.float64,
+    ) -> None:  # fmt: skip
+        self.url, self.variables, self.dtype = str(url), tuple(variables), dtype
+        self._group: zarr.Group | None = None
+        self._opened_by = 0
+        for name in self.variables:
+            if name not in self.group or self.dims(name)[0] != "trajectory" or self.array(name).dtype.kind not in "fiu":
+                known = [k for k, a in self.group.arrays() if self.dims(k)[0] == "trajectory" and a.dtype.kind in "fiu"]
+                raise ValueError(f"`variables` has no numbers named {name!r}; known: {', '.join(sorted(known))}")
+        samples = self.array("time").shape[0]
+        self.window = samples if window is None else window
+        if not 1 <= self.window <= samples:
+            raise ValueError(f"`window` must be 1 to {samples} samples, but is {window}")
+        step = self.window if stride is None else stride
+        if step < 1:
+            raise ValueError(f"`stride` must be positive, but is {stride}")
+        self.starts = range(0, samples - self.window + 1, step)
+        self.trajectories = self._usable(split)
+
+    def _usable(self, split: str | None) -> np.ndarray[Any, Any]:
+        """Numbers of the trajectories that are finished, sound and in the split."""
+        splits = np.asarray(self.array("split")[:])
+        done = np.repeat(np.asarray(self.array("done")[:]), self.array("split").chunks[0])[: len(splits)]
+        usable = (done == 1) & (np.asarray(self.array("failed")[:]) == 0)
+        if split is not None:
+            if split not in ("train", "validation", "test"):
+                raise ValueError(f"`split` must be 'train', 'validation' or 'test', but is {split!r}")
+            usable &= splits == split
+        return np.flatnonzero(usable)
+
+    @property
+    def group(self) -> zarr.Group:
+        """The store, opened on first use; once more after a fork, which connections do not survive."""
+        if self._group is None or self._opened_by != os.getpid():
+            self._group, self._opened_by = zarr.open_group(local_path(self.url), mode="r"), os.getpid()
+        return self._group
+
+    def array(self, name: str) -> zarr.Array[Any]:
+        found = self.group[name]
+        assert isinstance(found, zarr.Array)
+        return found
+
+    def dims(self, name: str) -> tuple[str | None, ...]:
+        """Names of a variable's dimensions."""
+        return tuple(getattr(self.array(name).metadata, "dimension_names", None) or (None,))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_group": None}
+
+    def __len__(self) -> int:
+        return len(self.trajectories) * len(self.starts)
+
+    def __getitem__(self, index: int) -> dict[str, Tensor]:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"index {index} is out of range for {len(self)} windows")
+        which, window = divmod(index % len(self), len(self.starts))
+        trajectory, start = int(self.trajectories[which]), self.starts[window]
+        item = {"trajectory": torch.tensor(trajectory), "start": torch.tensor(start)}
+        for name in self.variables:
+            array = self.array(name)
+            at = (trajectory, slice(start, start + self.window)) if array.ndim > 1 else trajectory
+            item[name] = torch.from_numpy(np.array(array[at])).to(self.dtype)
+        return item
+
+
+def open_dataset(url: str) -> xr.Dataset:
+    """The whole store, lazily, with named dimensions and units."""
+    return xr.open_zarr(local_path(url))

@@ -1,0 +1,1 @@
+"""Figures, the video and the multibond graph of a simulated run."""

@@ -1,0 +1,137 @@
+"""The paper's video: disc, deformed pads and contact forces over the whole run."""
+
+import importlib.util
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.artist import Artist
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.text import Text
+from numpy.typing import NDArray
+from PIL import Image
+from tqdm import tqdm
+
+from torchsoft.files import replacing
+from torchsoft.model import SoftGrasp
+from torchsoft.pad import Array
+from torchsoft.plot.figures import ACTUAL, DESIRED, STYLE, timeline
+from torchsoft.plot.scene import FRICTION, INK, MM, NORMAL, Instant, Scene, force_scale, instants, span
+from torchsoft.trajectory import Trajectory
+
+FRAMES_PER_SECOND = 12
+
+Picture = NDArray[np.uint8]
+
+
+def frame_times(trajectory: Trajectory, frames: int) -> Array:
+    """Times [s] of the frames: one in eight goes to the first half second, where the grasp is."""
+    start, end = float(trajectory.t[0]), float(trajectory.t[-1])
+    slow = min(start + 0.5, end)
+    grasp = frames if slow == end else max(2, frames // 8)
+    return np.concatenate((np.linspace(start, slow, grasp), np.linspace(slow, end, frames - grasp + 1)[1:]))
+
+
+class Stage(NamedTuple):
+    """The picture's canvas, and what moves on it."""
+
+    canvas: FigureCanvasAgg
+    scene: Scene
+    cursor: Line2D
+    clock: Text
+
+
+@rc_context(STYLE)
+def set_stage(trajectory: Trajectory, model: SoftGrasp, shown: Sequence[Instant], dpi: int) -> Stage:
+    """Everything that stays: axes, legend, the curve of x_C over time."""
+    figure = Figure(figsize=(8.0, 5.8), dpi=dpi, layout="constrained")
+    canvas = FigureCanvasAgg(figure)
+    whole, strip = figure.subplots(2, 1, height_ratios=(3.6, 1))
+    height = 13.0
+    x_limits, y_limits = span(model, height)
+    curves = force_scale(shown, height)
+    scene = Scene(whole, model, columns=5, curves=curves)
+    scene.scale_bar(whole, x_limits[1] - 6, y_limits[1] - height - 2)
+    whole.set(xlim=x_limits, ylim=y_limits, xlabel="x [mm]", ylabel="y [mm]")
+    whole.set_title("Disc rolled between two soft pads (paper: the video); the grasp in slow motion")
+    whole.grid(False)
+    whole.plot([], [], "o-", color=NORMAL, ms=3, label="normal force")
+    whole.plot([], [], color=FRICTION, label="friction (outwards: to the right)")
+    whole.legend(loc="lower left")
+    t = timeline(strip, "$x_C$ [mm]", trajectory)
+    strip.plot(t, MM * trajectory.desired[:, 0].numpy(), color=DESIRED, lw=3, label="desired")
+    strip.plot(t, MM * trajectory.state.r_C[:, 0].numpy(), color=ACTUAL, lw=1, label="actual")
+    strip.legend(loc="lower right", ncols=2)
+    strip.set_xlabel("time [s]")
+    (cursor,) = strip.plot([], [], "o", color=INK, ms=6)
+    clock = whole.text(0.012, 0.97, "", transform=whole.transAxes, va="top", family="monospace", fontsize=12)
+    return Stage(canvas, scene, cursor, clock)
+
+
+def render(trajectory: Trajectory, model: SoftGrasp, times: Array, dpi: int) -> Iterator[Picture]:
+    """RGB pictures (height, width, 3) at `times` [s]. The axes are drawn once; per picture only what moves."""
+    shown = instants(model, trajectory, times.tolist())
+    canvas, scene, cursor, clock = set_stage(trajectory, model, shown, dpi)
+    moving: list[Artist] = [*scene.moving, clock, cursor]
+    for artist in moving:
+        artist.set_animated(True)
+    canvas.draw()
+    background = canvas.copy_from_bbox(canvas.figure.bbox)
+    for instant in shown:
+        scene.show(instant)
+        cursor.set_data([instant.time], [instant.centre[0]])
+        clock.set_text(f"t = {instant.time:6.3f} s")
+        canvas.restore_region(background)
+        for artist in moving:
+            assert artist.axes is not None
+            artist.axes.draw_artist(artist)
+        yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def animate(
+    trajectory: Trajectory, model: SoftGrasp, path: Path, *, frames: int = 150, dpi: int = 110, progress: bool = True
+) -> None:
+    """Write `frames` pictures of the whole run as .gif, or as .mp4 where imageio-ffmpeg is installed.
+
+    The file appears whole or not at all. Raises `ValueError` for another suffix, and `ModuleNotFoundError` for .mp4
+    without imageio-ffmpeg.
+    """
+    if path.suffix not in (".gif", ".mp4"):
+        raise ValueError(f"`path` must end in .gif or .mp4, but is {path}")
+    if path.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise ModuleNotFoundError(f"{path} needs imageio-ffmpeg: pip install 'torchsoft[video]', or write a .gif")
+    times = frame_times(trajectory, frames)
+    bar = tqdm(render(trajectory, model, times, dpi), "animation", len(times), unit="frame", disable=not progress)
+    with replacing(path) as partial:
+        (write_gif if path.suffix == ".gif" else write_mp4)(bar, partial)
+
+
+def write_gif(pictures: Iterable[Picture], path: Path) -> None:
+    """All pictures on the first one's palette, which keeps still areas identical and so the file small."""
+    images = [Image.fromarray(picture) for picture in pictures]
+    palette = images[len(images) // 2].quantize(64)
+    reduced = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    pause = round(1000 / FRAMES_PER_SECOND)
+    reduced[0].save(path, "GIF", save_all=True, append_images=reduced[1:], duration=pause, loop=0)
+
+
+def write_mp4(pictures: Iterable[Picture], path: Path) -> None:
+    """H.264 through the ffmpeg that imageio-ffmpeg brings along."""
+    import imageio_ffmpeg  # pyright: ignore[reportMissingImports] -- an optional dependency
+
+    writer = None
+    for picture in pictures:
+        even = np.ascontiguousarray(picture[: len(picture) // 2 * 2, : picture.shape[1] // 2 * 2])  # H.264 asks for it
+        if writer is None:
+            size = (even.shape[1], even.shape[0])
+            writer = imageio_ffmpeg.write_frames(
+                str(path), size, fps=FRAMES_PER_SECOND, macro_block_size=2, output_params=["-f", "mp4"]
+            )
+            writer.send(None)
+        writer.send(even)
+    if writer is not None:
+        writer.close()

@@ -1,0 +1,311 @@
+"""Sparse reduced models from records, with pysindy: regressions, fits, rollouts against records, the choice of thresholds.
+
+Records come from `records`, candidate terms from `terms`, the model is `ode.ReducedModel`. Nothing
+here uses the simulator: records are data. pysindy takes seconds to import, so it is imported where it is used.
+"""
+
+import contextlib
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import scipy.linalg
+
+from torchsoft.reduced.ode import ReducedModel, Rollout, Term
+from torchsoft.reduced.records import KINEMATICS, STATES, Record
+from torchsoft.reduced.terms import Candidates
+
+ROWS_PER_TERM = 10
+"""Fewest rows of a regression per candidate term."""
+
+DEPENDENT = 1e-9
+"""Part of a scaled column that the other columns must leave unexplained."""
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How to fit. threshold: the smallest part of a rate's root mean square that a term may account for.
+
+    form: "weak" (integrals against test functions of half-width `width` [s], `domains` a window of `window` [s]) or
+    "derivative" (fourth-order differences of the velocities). models: ensemble members, 0 for none. Coefficients of an
+    ensemble are medians, their intervals the 5th and 95th percentiles: how much the fit depends on the choice of rows, which
+    overlap, and not how wrong the form of the equation may be.
+    """
+
+    optimizer: Literal["stlsq", "sr3"] = "stlsq"
+    form: Literal["weak", "derivative"] = "weak"
+    threshold: float = 0.02
+    models: int = 0
+    width: float = 0.015
+    window: float = 0.5
+    domains: int = 60
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Regression:
+    """Rows of one equation: columns (rows, terms) and rate (rows,), each of unit root mean square, and those sizes."""
+
+    terms: list[Term]
+    columns: np.ndarray
+    rate: np.ndarray
+    column_size: np.ndarray
+    rate_size: float
+
+
+@dataclass(frozen=True)
+class Problem:
+    """The regressions of all equations, which every threshold and optimizer shares."""
+
+    regressions: dict[str, Regression]
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    scale: np.ndarray
+
+
+def assemble(
+    records: Sequence[Record], candidates: Candidates, recipe: Recipe, *, inputs: Sequence[str] = ("F_x",)
+) -> Problem:
+    """Columns and rates of the records, in weak form or by differences.
+
+    States without candidates are rates of none: with inputs ("x_Br", "v_Br") and candidates for v_C and omega, the bracket
+    is what drives. Raises `ValueError` for records of different steps, values that are not finite, constant columns,
+    columns that the others already span, and too few rows, naming the column.
+    """
+    states = tuple(name for name in STATES if name not in inputs)
+    steps = [one.step for one in records]
+    if not steps or max(steps) > min(steps) * (1 + 1e-6):
+        raise ValueError(f"the records must have one time step, but have {sorted(set(steps))} s")
+    names, kinematics = (*states, *inputs), {k: v for k, v in KINEMATICS.items() if k in states}
+    every = {target: [(term, 1.0) for term in terms] for target, terms in candidates.items()}
+    model = ReducedModel(states, inputs, kinematics, every)
+    data = [one.columns(names) for one in records]
+    for one in data:
+        broken = ~np.isfinite(one).all(0)
+        if broken.any():
+            raise ValueError(f"series {names[int(broken.argmax())]!r} has values that are not finite")
+    targets = list(candidates)
+    columns = [model.phi(one) for one in data]
+    velocities = [one[:, [names.index(target) for target in targets]] for one in data]
+    for i, (target, term) in enumerate(zip(model.targets, model.terms)):
+        values = np.concatenate([column[:, i] for column in columns])
+        if np.ptp(values) <= 1e-12 * np.abs(values).max():
+            raise ValueError(
+                f"column `{term.text}` of {target}' is constant ({values[0]:g}); leave it out, or excite it"
+            )
+    if recipe.form == "weak":
+        phi, rate = _weak(columns, velocities, steps[0], recipe)
+    else:
+        phi, rate = _differences(columns, velocities, steps[0])
+    out = {}
+    for j, target in enumerate(targets):
+        mine = [i for i, name in enumerate(model.targets) if name == target]
+        terms = [model.terms[i] for i in mine]
+        if len(phi) < ROWS_PER_TERM * len(mine):
+            raise ValueError(
+                f"too little data for {target}': {len(phi)} rows for {len(mine)} candidate terms, the last of which is "
+                f"`{terms[-1].text}`; at least {ROWS_PER_TERM} rows a term are needed"
+            )
+        size, rate_size = np.sqrt((phi[:, mine] ** 2).mean(0)), float(np.sqrt((rate[:, j] ** 2).mean()))
+        scaled = phi[:, mine] / size
+        pivoted: Any = scipy.linalg.qr(scaled, mode="economic", pivoting=True)
+        _, R, order = pivoted
+        if abs(R[-1, -1]) < DEPENDENT * abs(R[0, 0]):
+            raise ValueError(
+                f"column `{terms[order[-1]].text}` of {target}' is a combination of the other columns in these data; "
+                "leave it out, or excite the system more richly"
+            )
+        out[target] = Regression(terms, scaled, rate[:, j] / rate_size, size, rate_size)
+    scale = np.max([np.abs(one[:, : len(states)]).max(0) for one in data], axis=0)
+    return Problem(out, states, tuple(inputs), scale)
+
+
+class Equation(NamedTuple):
+    """(term, coefficient) pairs of one rate, SI units, and their intervals, if there is an ensemble."""
+
+    pairs: list[tuple[Term, float]]
+    intervals: list[tuple[float, float]]
+
+
+def solve(problem: Problem, target: str, recipe: Recipe) -> Equation:
+    """The sparse equation of one state at the recipe's threshold; candidates whose coefficient is zero are left out."""
+    rows, optimizer = problem.regressions[target], _optimizer(recipe)
+    with _quiet_pysindy(recipe.seed):
+        optimizer.fit(rows.columns, rows.rate[:, None])
+    unit = rows.rate_size / rows.column_size
+    values, intervals = np.asarray(optimizer.coef_).ravel() * unit, []
+    kept = np.flatnonzero(values)
+    if recipe.models:
+        members = np.array([np.ravel(member) for member in optimizer.coef_list]) * unit
+        low, high = np.percentile(members, (5, 95), axis=0)
+        intervals = [(float(low[i]), float(high[i])) for i in kept]
+    return Equation([(rows.terms[i], float(values[i])) for i in kept], intervals)
+
+
+def build(
+    problem: Problem, equations: Mapping[str, Equation], feedback: Mapping[str, Mapping[str, float]] | None = None
+) -> ReducedModel:
+    """The model of one equation for each velocity."""
+    intervals = [interval for equation in equations.values() for interval in equation.intervals]
+    return ReducedModel(
+        problem.states, problem.inputs, {k: v for k, v in KINEMATICS.items() if k in problem.states},
+        {target: equation.pairs for target, equation in equations.items()}, feedback=feedback, scale=problem.scale,
+        intervals=intervals or None,
+    )  # fmt: skip
+
+
+def fit(problem: Problem, recipe: Recipe, feedback: Mapping[str, Mapping[str, float]] | None = None) -> ReducedModel:
+    """The sparse model of a problem at the recipe's threshold."""
+    return build(problem, {target: solve(problem, target, recipe) for target in problem.regressions}, feedback)
+
+
+@dataclass(frozen=True)
+class Score:
+    """A rollout against its record: root mean square error by state, over the record's range and over its standard deviation;
+    infinite where it diverged."""
+
+    nrmse: dict[str, float]
+    over_deviation: dict[str, float]
+    rollout: Rollout
+
+    @property
+    def worst(self) -> float:
+        return max(self.nrmse.values())
+
+
+def rollout_of(model: ReducedModel, on: Record) -> Rollout:
+    """The model let go from the record's first sample, with the record's inputs and nothing else."""
+    inputs, states = on.columns(model.outer) if model.outer else np.empty((len(on.t), 0)), on.columns(model.states)
+    return model.rollout(on.t, states[0], inputs, scale=np.abs(states).max(0))
+
+
+def score(model: ReducedModel, on: Record) -> Score:
+    """Rollout error over the whole record, for each state."""
+    out, exact = rollout_of(model, on), on.columns(model.states)
+    error = np.sqrt(((out.y - exact) ** 2).mean(0))
+    error = np.where(np.isfinite(error), error, np.inf)
+    over_range, over_deviation = (
+        dict(zip(model.states, (error / size).tolist())) for size in (np.ptp(exact, axis=0), exact.std(0))
+    )
+    return Score(over_range, over_deviation, out)
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The chosen model, its index among those tried, and the results of each: thresholds, terms, nrmse, diverged."""
+
+    model: ReducedModel
+    index: int
+    tried: list[dict[str, Any]]
+
+
+def choose(
+    problem: Problem, validation: Sequence[Record], recipe: Recipe, thresholds: Sequence[float],
+    feedback: Mapping[str, Mapping[str, float]] | None = None, *, slack: float = 1.1, each: bool = True,
+) -> Choice:  # fmt: skip
+    """The fit with the fewest terms among those whose rollouts of the validation records come within `slack` of the best.
+
+    Every equation has its own threshold (all combinations that differ in their terms are rolled out), or all the same with
+    `each` off, for models that are slow to roll out. The error of a combination is the mean over the records of the states'
+    worst NRMSE. Raises `ValueError`, with the time, when all rollouts diverge.
+    """
+    fits: dict[str, dict[tuple[str, ...], tuple[float, Equation]]] = {target: {} for target in problem.regressions}
+    levels: dict[float, dict[str, Equation]] = {}
+    for threshold in thresholds:
+        levels[threshold] = {target: solve(problem, target, replace(recipe, threshold=threshold)) for target in fits}
+        for target, equation in levels[threshold].items():
+            fits[target].setdefault(tuple(term.text for term, _ in equation.pairs), (threshold, equation))
+    if each:
+        options = [dict(zip(fits, chosen)) for chosen in product(*(one.values() for one in fits.values()))]
+    else:
+        options = [{k: (threshold, x) for k, x in one.items()} for threshold, one in levels.items()]
+    scale = np.max([problem.scale, *(np.abs(one.columns(problem.states)).max(0) for one in validation)], axis=0)
+    problem, tried, models, last = replace(problem, scale=scale), [], [], ""
+    for option in options:
+        model = build(problem, {target: equation for target, (_, equation) in option.items()}, feedback)
+        scores = [score(model, one) for one in validation]
+        diverged = [str(one.rollout) for one in scores if one.rollout.diverged_at is not None]
+        last = diverged[0] if diverged else last
+        models.append(model)
+        tried.append(
+            {
+                "thresholds": {target: float(threshold) for target, (threshold, _) in option.items()},
+                "terms": len(model.terms),
+                "nrmse": float(np.mean([one.worst for one in scores])),
+                "diverged": diverged,
+            }
+        )
+    best = min(row["nrmse"] for row in tried)
+    if not np.isfinite(best):
+        raise ValueError(f"no threshold gives a model whose rollouts stay bounded: the last one {last}")
+    good = [i for i, row in enumerate(tried) if row["nrmse"] <= slack * best]
+    chosen = min(good, key=lambda i: (tried[i]["terms"], tried[i]["nrmse"]))
+    return Choice(models[chosen], chosen, tried)
+
+
+def _weak(
+    columns: list[np.ndarray], velocities: list[np.ndarray], step: float, recipe: Recipe
+) -> tuple[np.ndarray, np.ndarray]:
+    """Integrals of columns and rates against pysindy's test functions, over windows of one length."""
+    import pysindy
+
+    length = min(round(recipe.window / step) + 1, *(len(one) for one in columns))
+    if 2 * recipe.width > 0.9 * (length - 1) * step:
+        raise ValueError(
+            f"too little data: the shortest record is {length} samples, {(length - 1) * step:g} s, shorter than the weak "
+            f"form's test functions, {2 * recipe.width:g} s"
+        )
+    axes: Any = {"ax_time": 0, "ax_coord": 1}
+
+    def windows(series: list[np.ndarray]) -> list[Any]:
+        starts = [(one, i) for one in series for i in range(0, len(one) - length + 1, length - 1)]
+        return [pysindy.AxesArray(one[i : i + length], axes) for one, i in starts]
+
+    with _quiet_pysindy(recipe.seed):
+        library = pysindy.WeakPDELibrary(
+            function_library=pysindy.IdentityLibrary(), spatiotemporal_grid=step * np.arange(length),
+            K=recipe.domains, H_xt=[recipe.width], p=4,
+        )  # fmt: skip
+        phi = library.fit_transform(windows(columns))
+        rates = [library.convert_u_dot_integral(one) for one in windows(velocities)]
+    return np.concatenate([np.asarray(x) for x in phi]), np.concatenate([np.asarray(x) for x in rates])
+
+
+def _differences(columns: list[np.ndarray], velocities: list[np.ndarray], step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Columns and differentiated velocities, sample by sample."""
+    import pysindy
+
+    difference: Any = pysindy.FiniteDifference(order=4)
+    with _quiet_pysindy(0):
+        rates = [np.asarray(difference(one, step * np.arange(len(one)))) for one in velocities]
+    return np.concatenate(columns), np.concatenate(rates)
+
+
+def _optimizer(recipe: Recipe) -> Any:
+    import pysindy
+
+    if recipe.optimizer == "stlsq":
+        one: Any = pysindy.STLSQ(threshold=recipe.threshold, alpha=1e-10)
+    else:  # its hard threshold is sqrt(2 lambda nu)
+        one = pysindy.SR3(
+            reg_weight_lam=0.5 * recipe.threshold**2, relax_coeff_nu=1.0, max_iter=2000, tol=1e-8, unbias=True
+        )
+    if recipe.models:
+        return pysindy.EnsembleOptimizer(one, bagging=True, n_models=recipe.models)
+    return one
+
+
+@contextlib.contextmanager
+def _quiet_pysindy(seed: int) -> Iterator[None]:
+    """pysindy draws from numpy's global generator: seeded here, and left as it was. Its own array class warns of itself."""
+    before = np.random.get_state()  # noqa: NPY002
+    np.random.seed(seed)  # noqa: NPY002
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module="pysindy")
+            yield
+    finally:
+        np.random.set_state(before)  # noqa: NPY002

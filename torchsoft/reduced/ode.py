@@ -1,0 +1,290 @@
+"""Small ordinary differential equations y' = S y + C phi(y, u): their text, their torch module, their fast rollout.
+
+One list of terms is all there is: `Term` holds what it is made of, and the equations in text and LaTeX, the right-hand
+side that torchdiffeq integrates and the rollout in numpy are read off it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from torchsoft.channels import CHANNELS
+from torchsoft.reduced.rollout import linear_rollout, nonlinear_rollout
+
+ALIASES = {"v_C": "v_x", "v_Br": "v_x_Br"}
+"""Channels by a reduced model's name for them, which leaves the only direction out."""
+
+BEYOND = 100.0
+"""A rollout that leaves this many times the states' scale has diverged."""
+
+
+def symbol(name: str) -> tuple[str, str]:
+    """LaTeX and unit of a variable; the name itself where there is no such channel."""
+    channel = CHANNELS.get(ALIASES.get(name, name))
+    return (channel.symbol, channel.unit) if channel else (name, name)
+
+
+class Factor(NamedTuple):
+    """shape(form / scale), the form being a linear combination of variables by name."""
+
+    form: Mapping[str, float]
+    shape: Literal["linear", "tanh", "abs"] = "linear"
+    scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class Term:
+    """A candidate term: the product of its factors, with its name, LaTeX and unit."""
+
+    text: str
+    latex: str
+    unit: str
+    factors: tuple[Factor, ...]
+
+    @property
+    def linear(self) -> bool:
+        return len(self.factors) == 1 and self.factors[0].shape == "linear"
+
+
+class Table(NamedTuple):
+    """A list of terms as arrays: forms (terms * factors, variables), and where a factor is a tanh or a modulus."""
+
+    forms: Any
+    tanh: Any
+    modulus: Any
+
+
+def tabulate(terms: Sequence[Term], variables: Sequence[str]) -> Table:
+    """Terms as arrays over `variables`, to which "1" is added. Raises `ValueError` for a variable that is not there."""
+    names, most = [*variables, "1"], max((len(term.factors) for term in terms), default=1)
+    forms = np.zeros((len(terms), most, len(names)))
+    shapes = np.full((len(terms), most), "linear", dtype=object)
+    forms[:, :, -1] = 1.0  # a factor that is not there is one
+    for i, term in enumerate(terms):
+        for j, factor in enumerate(term.factors):
+            forms[i, j] = 0.0
+            shapes[i, j] = factor.shape
+            for name, weight in factor.form.items():
+                if name not in names:
+                    raise ValueError(f"term `{term.text}` needs the variable {name!r}; known: {', '.join(names)}")
+                forms[i, j, names.index(name)] = weight / factor.scale
+    return Table(forms.reshape(-1, len(names)), shapes == "tanh", shapes == "abs")
+
+
+def features(z: Any, table: Table, xp: Any) -> Any:
+    """phi (..., terms) of the variables z (..., variables + 1); `xp` is torch or numpy, whichever z belongs to."""
+    factor = (z @ table.forms.T).reshape(*z.shape[:-1], *table.tanh.shape)
+    return xp.where(table.tanh, xp.tanh(factor), xp.where(table.modulus, abs(factor), factor)).prod(-1)
+
+
+class Held(nn.Module):
+    """Inputs u (T, inputs) sampled at t (T,) [s], straight lines between."""
+
+    t: Tensor
+    u: Tensor
+
+    def __init__(self, t: Tensor, u: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("t", t)
+        self.register_buffer("u", u)
+
+    def forward(self, t: Tensor | float) -> Tensor:
+        when = torch.as_tensor(t, dtype=self.t.dtype)
+        i = torch.searchsorted(self.t, when.detach()).clamp(1, len(self.t) - 1)
+        fraction = (when - self.t[i - 1]) / (self.t[i] - self.t[i - 1])
+        return torch.lerp(self.u[i - 1], self.u[i], fraction.clamp(0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """States y (T, states) at t (T,) [s], NaN from `diverged_at` [s] on if it diverged; wall time [s]."""
+
+    t: np.ndarray
+    y: np.ndarray
+    diverged_at: float | None
+    wall_s: float
+
+    def __str__(self) -> str:
+        return "bounded" if self.diverged_at is None else f"diverged at t = {self.diverged_at:.4g} s"
+
+
+class ReducedModel(nn.Module):
+    """y' = S y + C phi(y, u). `forward(t, y)` follows torchdiffeq, y (..., states); inputs come from `signal(t)`.
+
+    states, inputs: names. kinematics: which state is the rate of which, as in {"x_C": "v_C"}. equations: for every other
+    state the (term, coefficient) pairs of its rate, SI units. feedback: for inputs that a control law makes, its gains on
+    states and on further inputs, {"F_x": {"x_d": K, "x_C": -K}}; those further inputs are then what `signal` gives.
+    Coefficients and gains are `nn.Parameter`s. scale (states,): sizes that belong to the states, for judging divergence.
+    intervals: for every term in order its (low, high), if an ensemble has found them.
+    """
+
+    def __init__(
+        self, states: Sequence[str], inputs: Sequence[str], kinematics: Mapping[str, str],
+        equations: Mapping[str, Sequence[tuple[Term, float]]], *, feedback: Mapping[str, Mapping[str, float]] | None = None,
+        scale: np.ndarray | Sequence[float] | None = None, intervals: Sequence[tuple[float, float]] | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        self.states, self.inputs, self.kinematics = tuple(states), tuple(inputs), dict(kinematics)
+        missing = set(self.states) ^ (set(kinematics) | set(equations))
+        if missing:
+            raise ValueError(f"every state needs one equation, but these have none or are no states: {sorted(missing)}")
+        self.targets = [target for target, pairs in equations.items() for _ in pairs]
+        self.terms = [term for pairs in equations.values() for term, _ in pairs]
+        values = [value for pairs in equations.values() for _, value in pairs]
+        self.coefficients = nn.Parameter(torch.tensor(values, dtype=torch.float64))
+        self.intervals = None if intervals is None else [(float(a), float(b)) for a, b in intervals]
+        self.feedback = {name: dict(law) for name, law in (feedback or {}).items()}
+        made = [name for law in self.feedback.values() for name in law if name not in self.states]
+        self.outer = tuple(dict.fromkeys([name for name in inputs if name not in self.feedback] + made))
+        self.gains = nn.Parameter(
+            torch.tensor([gain for law in self.feedback.values() for gain in law.values()], dtype=torch.float64)
+        )
+        self.scale = np.asarray(scale if scale is not None else np.ones(len(self.states)), dtype=float)
+        self.signal: nn.Module | None = None
+        table = tabulate(self.terms, (*self.states, *self.inputs))
+        self._numpy, self._torch = table, Table(*(torch.from_numpy(np.asarray(part)) for part in table))
+        entries = [(self.states.index(target), i) for i, target in enumerate(self.targets)]
+        self._entries = tuple(torch.tensor(index, dtype=torch.long) for index in zip(*entries)) if entries else None
+        law = [
+            (self.inputs.index(name), [*self.states, *self.outer].index(other))
+            for name, gains in self.feedback.items() for other in gains
+        ]  # fmt: skip
+        self._law = tuple(torch.tensor(index, dtype=torch.long) for index in zip(*law)) if law else None
+
+    @property
+    def linear(self) -> bool:
+        return all(term.linear for term in self.terms)
+
+    def with_feedback(self, feedback: Mapping[str, Mapping[str, float]] | None) -> "ReducedModel":
+        """The same equations under another control law."""
+        return ReducedModel(
+            self.states, self.inputs, self.kinematics, self.equations(), feedback=feedback, scale=self.scale,
+            intervals=self.intervals,
+        )  # fmt: skip
+
+    def equations(self) -> dict[str, list[tuple[Term, float]]]:
+        """Terms and coefficients by the state whose rate they make."""
+        out: dict[str, list[tuple[Term, float]]] = {name: [] for name in self.states if name not in self.kinematics}
+        for target, term, value in zip(self.targets, self.terms, self.coefficients.detach().tolist()):
+            out[target].append((term, value))
+        return out
+
+    def matrices(self) -> tuple[Tensor, Tensor, Tensor]:
+        """S (states, states), C (states, terms) and the control law's K (inputs, states + outer inputs)."""
+        n, m = len(self.states), len(self.inputs)
+        S = torch.zeros(n, n, dtype=torch.float64)
+        for name, rate in self.kinematics.items():
+            S[self.states.index(name), self.states.index(rate)] = 1.0
+        C = torch.zeros(n, len(self.terms), dtype=torch.float64)
+        if self._entries is not None:
+            C = C.index_put(self._entries, self.coefficients)
+        K = torch.zeros(m, n + len(self.outer), dtype=torch.float64)
+        for i, name in enumerate(self.inputs):
+            if name in self.outer:
+                K[i, n + self.outer.index(name)] = 1.0
+        return S, C, K if self._law is None else K.index_put(self._law, self.gains)
+
+    def forward(self, t: Tensor | float, y: Tensor) -> Tensor:
+        """dy/dt, shaped like y (..., states). Raises `ValueError` when the model has inputs but no `signal`."""
+        w = y.new_zeros(*y.shape[:-1], 0)
+        if self.outer:
+            if self.signal is None:
+                raise ValueError(f"set `signal` to a module that gives {', '.join(self.outer)} at t, such as `Held`")
+            w = self.signal(t).expand(*y.shape[:-1], -1)
+        return self.rates(torch.cat((y, w), -1))
+
+    def rates(self, yw: Tensor) -> Tensor:
+        """dy/dt (..., states) from states and outer inputs (..., states + outer)."""
+        return _rates(yw, self._torch, tuple(part.mT for part in self.matrices()), torch)
+
+    def phi(self, yu: np.ndarray) -> np.ndarray:
+        """The terms (T, terms) at states and inputs (T, states + inputs)."""
+        return features(np.column_stack((yu, np.ones(len(yu)))), self._numpy, np)
+
+    def numpy_rates(self) -> Any:
+        """`rates` as a function of numpy arrays, with the present coefficients."""
+        parts = tuple(part.detach().numpy().T.copy() for part in self.matrices())
+        return lambda yw: _rates(yw, self._numpy, parts, np)
+
+    def state_space(self) -> tuple[np.ndarray, np.ndarray]:
+        """A (states, states) and B (states, outer + 1) of y' = A y + B (u, 1). Raises `ValueError` unless linear."""
+        if not self.linear:
+            raise ValueError("the model has terms that are not linear; it has no A and B")
+        n, size = len(self.states), len(self.states) + len(self.outer)
+        f = self.numpy_rates()(np.vstack((np.zeros(size), np.eye(size))))
+        slopes = (f[1:] - f[0]).T
+        return slopes[:, :n], np.column_stack((slopes[:, n:], f[0]))
+
+    def rollout(self, t: np.ndarray, y0: np.ndarray, u: np.ndarray, *, scale: np.ndarray | None = None) -> Rollout:
+        """Integrate from y0 (states,) at t[0] with outer inputs u (T, outer), straight between the times t (T,) [s].
+
+        Exact for linear models on equally spaced times, a compiled Rosenbrock method otherwise. A rollout that goes
+        `BEYOND` times `scale` (states,), the model's by default, has diverged: it is NaN from that time on.
+        """
+        t, y0, u = np.asarray(t, float), np.asarray(y0, float), np.asarray(u, float).reshape(len(t), -1)
+        if u.shape[1] != len(self.outer) or y0.shape != (len(self.states),):
+            raise ValueError(
+                f"`y0` must hold {', '.join(self.states)} and `u` one column each for {', '.join(self.outer) or 'nothing'}, "
+                f"but have shapes {y0.shape} and {u.shape}"
+            )
+        size = self.scale if scale is None else np.asarray(scale, float)
+        began, limit = perf_counter(), BEYOND * size
+        if self.linear and len(t) > 2 and np.allclose(np.diff(t), t[1] - t[0], rtol=1e-6, atol=0):
+            with np.errstate(over="ignore", invalid="ignore"):
+                y = linear_rollout(*self.state_space(), t[1] - t[0], y0, np.column_stack((u, np.ones(len(t)))))
+        else:
+            S, C, K = (part.detach().numpy() for part in self.matrices())
+            shapes = self._numpy.tanh + 2 * self._numpy.modulus
+            forms = self._numpy.forms.reshape(*shapes.shape, -1)
+            y = nonlinear_rollout((S, C, K, forms, shapes), t, y0, u, limit, size)
+        wild, ended = ~(np.abs(y) <= limit).all(-1), None
+        if wild.any():
+            y[wild.argmax() :], ended = np.nan, float(t[wild.argmax()])
+        return Rollout(t, y, ended, perf_counter() - began)
+
+    def text(self) -> list[str]:
+        """One equation a line, in SI units."""
+        lines = [f"{name}' = {rate}" for name, rate in self.kinematics.items()]
+        for target, pairs in self.equations().items():
+            body = " ".join(f"{'+-'[value < 0]} {abs(value):.4g} {_bracketed(term.text)}" for term, value in pairs)
+            lines.append(f"{target}' = {body.removeprefix('+ ') or '0'}")
+        return lines
+
+    def latex(self) -> str:
+        """The equations of the velocities as an `aligned` block."""
+        rows = []
+        for target, pairs in self.equations().items():
+            body = " ".join(
+                f"{'+-'[value < 0]} {_power(abs(value))}\\,{_bracketed(term.latex)}" for term, value in pairs
+            )
+            rows.append(rf"\frac{{d}}{{dt}} {symbol(target)[0]} &= {body.removeprefix('+ ') or '0'}")
+        return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"
+
+    def coefficient_table(self) -> list[dict[str, Any]]:
+        """Every coefficient with its unit and, from an ensemble, its interval."""
+        rows, intervals = [], self.intervals or [None] * len(self.terms)
+        for target, term, value, interval in zip(self.targets, self.terms, self.coefficients.tolist(), intervals):
+            unit = f"{symbol(target)[1]}/s per {term.unit}"
+            rows.append({"equation": target, "term": term.text, "value": value, "unit": unit, "interval": interval})
+        return rows
+
+
+def _rates(yw: Any, table: Table, parts: tuple[Any, ...], xp: Any) -> Any:
+    S_T, C_T, K_T = parts
+    n = S_T.shape[0]
+    z = xp.concatenate((yw[..., :n], yw @ K_T, xp.ones_like(yw[..., :1])), -1)
+    return yw[..., :n] @ S_T + features(z, table, xp) @ C_T
+
+
+def _bracketed(text: str) -> str:
+    return f"({text})" if " + " in text or " - " in text else text
+
+
+def _power(value: float) -> str:
+    mantissa, _, exponent = f"{value:.4g}".partition("e")
+    return rf"{mantissa}\cdot 10^{{{int(exponent)}}}" if exponent else mantissa

@@ -1,0 +1,29 @@
+"""The information in a Jacobian: covariance of the coordinates, and their shift by an error of the model."""
+
+import numpy as np
+
+from torchsoft.sysid.recording import Array
+
+
+def fisher(J: Array) -> tuple[Array, Array, Array]:
+    """Covariance (n, n) of the coordinates, eigenvalues (n,) and eigenvectors (n, n) of the Fisher matrix of a whitened
+    Jacobian J (m, n); directions without any information get a very large variance, not an infinite one."""
+    values, vectors = np.linalg.eigh(J.T @ J)
+    floor = np.maximum(values, 1e-12 * max(values.max(initial=0.0), 1e-300))
+    return (vectors / floor) @ vectors.T, values, vectors
+
+
+def standard_deviations(J: Array) -> Array:
+    """Cramer-Rao: standard deviations (n,) of the coordinates of a whitened Jacobian (m, n); huge without information."""
+    return np.sqrt(np.diag(fisher(J)[0]))
+
+
+def step_error(r: Array, finer: Array) -> Array:
+    """Minus the error (m,) of residuals r by the finite step, from those at half of it: the method is of second order, so
+    the exact residuals are finer + (finer - r) / 3."""
+    return 4.0 / 3.0 * (finer - r)
+
+
+def step_shift(J: Array, error: Array) -> Array:
+    """How far a step's `error` (m,) has moved the coordinates (n,)."""
+    return np.asarray(np.linalg.lstsq(J, error, rcond=None)[0], np.float64)

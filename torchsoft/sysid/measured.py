@@ -1,0 +1,237 @@
+"""Measured data, and a TOML file that states what is known, what is unknown, and how good the sensors are.
+
+Every error is a `ValueError` in a sentence that names the file, and the row and column or the field.
+"""
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field, ValidationError, model_validator
+
+from torchsoft.channels import CHANNELS, MEASURED, SETPOINTS
+from torchsoft.control import Reference, Sampled
+from torchsoft.excitation import Table, apart
+from torchsoft.files import findings
+from torchsoft.parameters import Parameters
+from torchsoft.sysid.columns import Columns, read_table
+from torchsoft.sysid.fit import Loss, Unreachable
+from torchsoft.sysid.problem import Problem
+from torchsoft.sysid.recording import Recording
+from torchsoft.sysid.solve import Method
+from torchsoft.sysid.unknowns import Sensor, Unknown
+
+BEGINNING, CREEP = 10e-3, 20e-3
+"""For so long [s] nothing may move faster than this [m/s]: a disc put down on a pad still settles."""
+
+APART = 1e-3
+"""How far [m] the first samples may be from where the run begins; the disc may roll into a dent while it settles."""
+
+SUNK = 3e-4
+"""How far [m] below undeformed touch the bracket may begin: a disc sinks into its pad under its weight."""
+
+
+class Settings(Table):
+    """How to fit: the arguments of `identify` by the same names."""
+
+    step: float = Field(5e-4, gt=0, le=0.02)
+    starts: int = Field(1, ge=1)
+    loss: Loss = "linear"
+    method: Method = "gauss_newton"
+    workers: int = Field(1, ge=1)
+    seed: int = Field(0, ge=0)
+
+
+class Entry(Table):
+    """One more recording (`file`, next to the configuration, called `name` or like the file), or, without a file, settings
+    of its own for the recording called `name`."""
+
+    name: str | None = None
+    file: str | None = None
+    settings: dict[str, Any] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _is_named(self) -> "Entry":
+        if self.name is None and self.file is None:
+            raise ValueError("a recording needs a `file`, or the `name` of one that is given elsewhere")
+        return self
+
+
+class Config(Table):
+    """An identification as a TOML file states it.
+
+    `settings` are known numbers, by the groups and names of `Parameters`; `unknowns` and `sensors` are tables by the dotted
+    names of parameters and by channels; `heldout` names recordings that are predicted and not fitted.
+    """
+
+    unknowns: dict[str, Unknown]
+    sensors: dict[str, Sensor]
+    settings: dict[str, Any] = Field(default_factory=dict)
+    fit: Settings = Field(default_factory=lambda: Settings.model_validate({}))
+    recordings: tuple[Entry, ...] = ()
+    heldout: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Case:
+    """A problem as its files state it; `tables` are the recordings' by name."""
+
+    problem: Problem
+    config: Config
+    tables: dict[str, Columns]
+
+
+def read_config(path: str | Path) -> Config:
+    """Raises `ValueError` naming the file and the field."""
+    try:
+        return Config.model_validate(tomllib.loads(Path(path).read_text(encoding="utf-8")))
+    except ValidationError as error:
+        raise ValueError(f"{path}: {findings(error)}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is not a TOML file: {error}") from None
+
+
+def known_parameters(config: Path, name: str, table: Columns, *settings: dict[str, Any]) -> Parameters:
+    """Parameters of the recording `name`: the settings, the later ones first, with the reach of its set-points as scenario.
+
+    Raises `ValueError` naming the configuration and the field, or the row where nothing is grasped.
+    """
+    tree: dict[str, Any] = {}
+    for given in settings:
+        for key, value in given.items():
+            group, _, field = key.partition(".")
+            new = {field: value} if field else value
+            old = tree.get(group, {})
+            tree[group] = old | new if isinstance(old, dict) and isinstance(new, dict) else new
+    try:
+        groups: dict[str, Any] = {}
+        for group, kind in Parameters.model_fields.items():
+            assert kind.annotation is not None
+            groups[group] = validated(kind.annotation, tree.get(group, {}), group)
+        x, y = table.values["x_d"], table.values["y_d"]
+        if y.min() >= (touch := apart(Parameters.model_construct(**groups))):
+            raise ValueError(
+                f"{table.at(int(y.argmin()))}, column `y_d`: the bracket never comes lower than {1e3 * y.min():.4g} mm, but "
+                f"the pads of {config} touch the disc at {1e3 * touch:.4g} mm: nothing is grasped"
+            )
+        moved = x - (groups["scenario"].x_C0 if "x_C0" in tree.get("scenario", {}) else x[0])
+        part = 0.5 if groups["control"].senses == "bracket" else 1.0  # a disc rolls half as far as the bracket
+        mine = {"y_Br_grasp": float(y.min()), "travel": part * float(moved[np.abs(moved).argmax()])}
+        return validated(Parameters, tree | {"scenario": mine | tree.get("scenario", {})})
+    except InvalidSettings as error:
+        raise ValueError(f"{config}, settings of `{name}`: {error}") from None
+
+
+class InvalidSettings(ValueError):
+    """Settings that a group of parameters does not take."""
+
+
+def validated(kind: Any, tree: Any, group: str = "") -> Any:
+    """A group of parameters. Raises `InvalidSettings` naming the field."""
+    try:
+        return kind.model_validate(tree)
+    except ValidationError as error:
+        raise InvalidSettings(findings(error, group)) from None
+
+
+def check_plausible(table: Columns, p: Parameters, sensors: dict[str, Sensor]) -> None:
+    """Raises `ValueError` for values that no such rig can have, and for a run that does not begin at rest, with the disc
+    where `scenario.x_C0` says and the bracket clear of it; it names row and column."""
+    L, H, begin = p.pad.length, apart(p), p.scenario.x_C0
+    ranges = {"rad": (-100.0, 100.0), "m/s": (-10.0, 10.0), "rad/s": (-1e3, 1e3), "N": (-1e4, 1e4)}
+    start = {"x_d": begin, "x_C": begin, "x_Br": begin, "theta": 0.0, "y_Br": table.values["y_d"][0]}
+    for name, column in table.values.items():
+        unit = CHANNELS[name].unit
+        if name == "t":
+            continue
+        low, high = ranges.get(unit, (-L, 2 * L) if name.startswith("x") else (0.25 * H, 2 * H))
+        for i in np.flatnonzero((column < low) | (column > high))[:1].tolist():
+            raise ValueError(
+                f"{table.at(i)}, column `{name}`: {column[i]:.4g} {unit} is not plausible, it should be between {low:.3g} "
+                f"and {high:.3g} {unit}; is the unit in the heading right?"
+            )
+        here = np.flatnonzero(np.isfinite(column))
+        if not here.size or name in ("F_x", "F_y", "F_ff"):
+            continue
+        sensor, size = sensors.get(name), 1 / p.disc.radius if unit.startswith("rad") else 1.0
+        slack, bias = (8 * sensor.noise, sensor.bias) if sensor else (0.0, 0.0)
+        if name in start and abs(column[here[0]] - start[name]) > APART * size + slack + bias:
+            what = "scenario.x_C0" if name.startswith("x") else "the set-point y_d" if name == "y_Br" else "the start"
+            raise ValueError(
+                f"{table.at(int(here[0]))}, column `{name}`: it begins at {column[here[0]]:.5g} {unit}, but {what} is "
+                f"{start[name]:.5g} {unit}"
+            )
+        t = table.values["t"][here] - table.values["t"][0]
+        early = (t <= BEGINNING) | (np.arange(len(t)) < 2)
+        y, t = column[here][early], t[early]
+        moving = np.abs(y) > CREEP * size + slack + bias
+        if not unit.endswith("/s"):
+            moving = np.abs(y - y[0]) > CREEP * size * (t - t[0]) + slack
+        for i in np.flatnonzero(moving)[:1].tolist():
+            raise ValueError(
+                f"{table.at(int(here[i]))}, column `{name}` moves already: a recording must begin at rest, the disc on the "
+                "lower pad and the bracket clear of it"
+            )
+    if (y := table.values["y_d"][0]) < H - SUNK:
+        raise ValueError(
+            f"{table.at(0)}, column `y_d`: the bracket must begin clear of the disc, but begins at {1e3 * y:.4g} mm, and the "
+            f"pads touch the disc at {1e3 * H:.4g} mm"
+        )
+
+
+def read_recording(path: str | Path, name: str, p: Parameters, sensors: dict[str, Sensor]) -> Recording:
+    """A recording of a CSV or NetCDF file with the given settings. Raises `ValueError` naming row and column."""
+    return recording(read_table(Path(path)), name, p, sensors)
+
+
+def recording(table: Columns, name: str, p: Parameters, sensors: dict[str, Sensor]) -> Recording:
+    check_plausible(table, p, sensors)
+    values, t, samples = table.values, table.values["t"], {}
+    for channel in (c for c in MEASURED if c in values):
+        here = np.isfinite(values[channel])
+        if here.sum() >= 2:
+            samples[channel] = (t[here], values[channel][here])
+        elif channel in sensors:
+            raise ValueError(f"{table.path}, column `{channel}` has {here.sum()} samples, but needs at least two")
+    if not set(samples) & set(sensors):
+        raise ValueError(f"{table.path} has no column for any of the sensors {', '.join(sensors)}")
+    columns = {k: column.tolist() for k, column in values.items()}
+    x, y = (Sampled(columns["t"], columns[k], columns.get(f"{k}_dot")) for k in SETPOINTS)
+    F = Sampled(columns["t"], columns.get("F_ff", [0.0] * len(t)))
+    return Recording(name, p, Reference(x, y, F), samples)
+
+
+def load(data: Sequence[str | Path], config: str | Path) -> Case:
+    """The problem that data files and a configuration state. Raises `ValueError`, and `OSError` for what cannot be read."""
+    config = Path(config)
+    stated, tables, recordings = read_config(config), {}, []
+    own = {e.name or Path(str(e.file)).stem: e for e in stated.recordings}
+    files = [(Path(f).stem, Path(f)) for f in data]
+    files += [(name, config.parent / e.file) for name, e in own.items() if e.file is not None]
+    names = [name for name, _ in files]
+    if not files:
+        raise ValueError(f"there is nothing to identify from: no data file, and no recording with a file in {config}")
+    if len(own) < len(stated.recordings) or len(set(names)) < len(names):
+        raise ValueError(f"recordings need names of their own, but are called {', '.join(names)}")
+    if strange := [name for name in (*own, *stated.heldout) if name not in names]:
+        raise ValueError(f"{config}: there is no recording `{strange[0]}`; there are {', '.join(names)}")
+    for name, path in files:
+        table = tables[name] = read_table(path)
+        p = known_parameters(config, name, table, stated.settings, own[name].settings if name in own else {})
+        recordings.append(recording(table, name, p, stated.sensors))
+    try:
+        problem = Problem(recordings, stated.sensors, stated.unknowns)
+    except ValueError as error:
+        raise ValueError(f"{config}: {error}") from None
+    return Case(problem, stated, tables)
+
+
+def unreachable(error: Unreachable, tables: dict[str, Columns]) -> str:
+    """Which recording the model could not follow, and the row of its file where the run ended."""
+    return "; ".join(
+        f"{tables[name].path}, {tables[name].near(lost.time)}: the model cannot follow recording `{name}` here: {lost.reason}"
+        for name, lost in error.lost.items()
+    )

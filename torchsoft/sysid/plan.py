@@ -1,0 +1,98 @@
+"""Stages: which data, which unknowns, which ties, in which order.
+
+A fit of everything at once, from far away, ends in a local minimum or in runs that cannot be simulated. So: first the
+slowest recording, at a coarse step, for what it can identify; then all of them, with ratios (kinetic over static friction) tied
+at their upper bound, because friction that does not fall with slip always has a solution; then a scan over each ratio; then
+everything free, at the full step.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchsoft.sysid.fit import Unreachable
+from torchsoft.sysid.information import standard_deviations
+from torchsoft.sysid.problem import Problem
+from torchsoft.sysid.recording import Array
+from torchsoft.sysid.workers import Runner
+
+FIRST_LOOK = 0.1
+"""A coordinate takes part in the first look if its predicted standard deviation [1] is below this: one that is barely
+identifiable would run off to make up for what is still wrong elsewhere."""
+
+COARSE = (4.0, 2.0)
+"""The first look and the second stage take steps this many times the full one."""
+
+SCANNED = (1.0, 0.85, 0.7, 0.55)
+"""Parts of its upper bound at which a ratio is tried before it is set free."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One fit: recordings, free coordinates by label, step [s], how long, and what is set or scanned before it.
+
+    `tied` sets coordinates to values; `scanned` tries each value, the others held, and keeps the best. With `starts` above
+    one, that many Sobol points within a factor `spread` of the start are fitted, and the best end goes on.
+    """
+
+    name: str
+    recordings: tuple[str, ...]
+    free: tuple[str, ...]
+    step: float
+    evaluations: int = 30
+    tolerance: float = 1e-6
+    tied: tuple[tuple[str, float], ...] = ()
+    scanned: tuple[tuple[str, tuple[float, ...]], ...] = ()
+    starts: int = 1
+    spread: float = 3.0
+
+
+def tie_ratios(problem: Problem, x: Array) -> Array:
+    """x with every free ratio at its upper bound."""
+    x, (_, high) = x.copy(), problem.coordinates.bounds
+    for i, c in enumerate(problem.coordinates.all):
+        if c.ratio_to and not c.fixed:
+            x[i] = high[i]
+    return x
+
+
+def visible(J: Array, candidates: NDArray[np.bool_], limit: float = FIRST_LOOK) -> NDArray[np.bool_]:
+    """The largest set, found greedily, whose members are all known to better than `limit` when the rest is held."""
+    out = candidates.copy()
+    while out.any():
+        sd = standard_deviations(J[:, out])
+        if sd.max() <= limit:
+            break
+        out[np.flatnonzero(out)[sd.argmax()]] = False
+    return out
+
+
+def default_plan(problem: Problem, runner: Runner, step: float, which: Sequence[str], starts: int = 1) -> list[Stage]:
+    """Stages for some recordings: the slowest first, for what its Fisher matrix at the start makes identifiable.
+
+    Raises `Unreachable` where that recording cannot be simulated from the start.
+    """
+    c, free = problem.coordinates, problem.coordinates.free
+    ratios = np.array([bool(one.ratio_to) for one in c.all]) & free
+    x, labels = tie_ratios(problem, c.start), np.array(c.labels, object)
+    speed = {recording.name: recording.speed for recording in problem.recordings}
+    order = sorted(which, key=lambda name: speed[name])
+    look = problem.residuals(runner, x, order[:1], COARSE[0] * step, free)
+    if look.lost:
+        raise Unreachable(look.lost)
+    ties = tuple((c.all[i].label, c.all[i].high) for i in np.flatnonzero(ratios))
+    first = visible(look.J, free & ~ratios)
+    plan = [
+        Stage(
+            f"{order[0]}: first look", (order[0],), tuple(labels[first]), COARSE[0] * step, 8, 1e-2, ties, starts=starts
+        )
+    ]
+    if len(order) > 1 or ratios.any():
+        plan.append(
+            Stage("all data, ratios tied", tuple(order), tuple(labels[free & ~ratios]), COARSE[1] * step, 15, 1e-2)
+        )
+    scans = tuple((c.all[i].label, tuple(part * c.all[i].high for part in SCANNED)) for i in np.flatnonzero(ratios))
+    plan.append(Stage("everything", tuple(order), tuple(labels[free]), step, 40, 1e-5, scanned=scans))
+    return plan

@@ -1,0 +1,45 @@
+"""Recordings made by the simulator itself: a known truth to identify."""
+
+import numpy as np
+import torch
+
+from torchsoft.channels import MEASURED
+from torchsoft.excitation import Excitation, begin
+from torchsoft.parameters import Parameters
+from torchsoft.simulate import simulate
+from torchsoft.sysid.prediction import TOLERANCE, rigid_states, signals
+from torchsoft.sysid.recording import SETTLE, Recording
+from torchsoft.sysid.unknowns import Sensor
+
+RIG = {
+    channel: Sensor(noise=noise)
+    for channel, noise in (
+        ("x_C", 1e-5), ("y_C", 1e-5), ("theta", 5e-4), ("x_Br", 1e-5), ("y_Br", 1e-5), ("F_x", 0.1), ("F_y", 0.1),
+    )
+}  # fmt: skip
+"""Sensors of a good rig: poses to 10 um and 0.5 mrad, forces to 0.1 N."""
+
+
+def record(
+    name: str, excitation: Excitation, truth: Parameters, nominal: Parameters, sensors: dict[str, Sensor], *,
+    rate: float = 200.0, step: float = 1.25e-4, noise: float = 1.0, seed: int = 0,
+) -> Recording:  # fmt: skip
+    """What a rig with the parameters `truth` gives under an excitation that was planned with the `nominal` ones.
+
+    The disc is set down, as the nominal parameters would have it lie, `SETTLE` before the first sample, as
+    `Recording.begin` assumes. Sampled at `rate` [Hz] from a run with the given step [s], with Gaussian noise of `noise` times
+    each sensor's own. The recording holds nothing of the truth but the samples. Raises `SimulationFailed`.
+    """
+    planned = begin(excitation, nominal)
+    real = begin(excitation, truth).model
+    real.reference = planned.model.reference
+    at = np.arange(0.0, excitation.duration + 0.5 / rate, 1.0 / rate)
+    t = torch.from_numpy(np.concatenate(([at[0] - SETTLE], at)))
+    with torch.no_grad():
+        run = simulate(real, t, y0=planned.y0, step=step, tolerance=TOLERANCE)
+        predicted = signals(real, t[1:], rigid_states(real, run.y[1:])).numpy()
+    rng, samples = np.random.default_rng(seed), {}
+    for channel, sensor in sensors.items():
+        exact = predicted[:, MEASURED.index(channel)]
+        samples[channel] = (at, exact + noise * sensor.noise * rng.standard_normal(len(at)))
+    return Recording(name, planned.model.settings, planned.model.reference, samples)

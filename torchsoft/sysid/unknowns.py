@@ -1,0 +1,172 @@
+"""What is unknown: parameters with bounds and scales, and the vector of coordinates that the fits move in.
+
+A coordinate is the logarithm of a value, or the value over the width of its bounds; so a coordinate's standard deviation is
+a relative one either way.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Literal, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from torchsoft.excitation import Table
+from torchsoft.model import PARAMETERS
+from torchsoft.parameters import Parameters
+from torchsoft.sysid.recording import Array
+
+SPREAD = 10.0
+"""Bounds of a logarithmic parameter that gives none: its nominal value divided and multiplied by this."""
+
+
+class Unknown(Table):
+    """One parameter to be identified, by its dotted name in `Parameters`.
+
+    `nominal` is where the search starts, by default the value of the recordings' own settings; with `ratio_to` the value,
+    nominal and bounds are those of the ratio to that other parameter. A parameter that is not `shared` has a value of its own
+    in every recording.
+    """
+
+    nominal: float | None = None
+    low: float | None = None
+    high: float | None = None
+    scale: Literal["log", "linear"] = "log"
+    ratio_to: str | None = None
+    fixed: bool = False
+    shared: bool = True
+
+    @model_validator(mode="after")
+    def _bounds_are_ordered(self) -> Self:
+        if self.low is not None and self.high is not None and self.low >= self.high:
+            raise ValueError(f"low = {self.low} must be below high = {self.high}")
+        if self.scale == "linear" and (self.low is None or self.high is None):
+            raise ValueError("a linear scale needs `low` and `high`")
+        for name in ("nominal", "low", "high"):
+            value = getattr(self, name)
+            if self.scale == "log" and value is not None and value <= 0:
+                raise ValueError(f"a logarithmic scale needs {name} > 0, but it is {value}")
+        return self
+
+
+class Sensor(Table):
+    """A measured channel: standard deviation of its noise [the channel's unit], and how large a constant `bias` [unit] and a
+    `delay` [s] may be; zero leaves them out, otherwise they are identified too."""
+
+    noise: float = Field(gt=0)
+    bias: float = Field(default=0.0, ge=0)
+    delay: float = Field(default=0.0, ge=0)
+
+
+class Coordinate(NamedTuple):
+    """One entry of the vector: what it belongs to, its bounds and start in physical units, and its scale."""
+
+    name: str
+    kind: Literal["parameter", "bias", "delay"]
+    recording: str | None
+    nominal: float
+    low: float
+    high: float
+    scale: Literal["log", "linear"]
+    ratio_to: str | None
+    fixed: bool
+
+    @property
+    def label(self) -> str:
+        """Readable name, such as `contact.K_n`, `contact.mu_k / contact.mu_s`, `delay of theta`."""
+        what = self.name if self.kind == "parameter" else f"{self.kind} of {self.name}"
+        ratio = f" / {self.ratio_to}" if self.ratio_to else ""
+        return f"{what}{ratio}" + (f" in {self.recording}" if self.recording else "")
+
+    def to_x(self, value: float) -> float:
+        return math.log(value) if self.scale == "log" else value / (self.high - self.low)
+
+    def to_value(self, x: float) -> float:
+        return math.exp(x) if self.scale == "log" else x * (self.high - self.low)
+
+    def slope(self, x: float) -> float:
+        """d value / d x."""
+        return math.exp(x) if self.scale == "log" else self.high - self.low
+
+
+class Coordinates:
+    """All coordinates of a problem, in a fixed order, and the way from their vector x (n,) to parameters of the model.
+
+    Raises `ValueError` for a name that no gradient reaches, a ratio to something that is not there, or a start out of bounds.
+    """
+
+    def __init__(
+        self, unknowns: dict[str, Unknown], sensors: dict[str, Sensor], recordings: Sequence[str], base: Parameters
+    ) -> None:
+        self.recordings, self.all, table = tuple(recordings), [], base.table()
+        for name, u in unknowns.items():
+            if name not in PARAMETERS:
+                raise ValueError(f"`{name}` cannot be identified; what can: {', '.join(PARAMETERS)}")
+            if u.ratio_to is not None and (u.ratio_to not in PARAMETERS or u.ratio_to == name):
+                raise ValueError(f"{name}.ratio_to = {u.ratio_to!r} is not another parameter of the model")
+            if u.ratio_to in unknowns and unknowns[u.ratio_to].ratio_to:
+                raise ValueError(f"{name}.ratio_to = {u.ratio_to!r} is a ratio itself")
+            own = table[name]["value"] / (table[u.ratio_to]["value"] if u.ratio_to else 1.0)
+            nominal = own if u.nominal is None else u.nominal
+            low = nominal / SPREAD if u.low is None else u.low
+            high = nominal * SPREAD if u.high is None else u.high
+            if not low <= nominal <= high:
+                raise ValueError(f"{name}.nominal = {nominal:g} is not between low = {low:g} and high = {high:g}")
+            for where in (None,) if u.shared else self.recordings:
+                self.all.append(Coordinate(name, "parameter", where, nominal, low, high, u.scale, u.ratio_to, u.fixed))
+        for channel, sensor in sensors.items():
+            limits: dict[Literal["bias", "delay"], float] = {"bias": sensor.bias, "delay": sensor.delay}
+            for kind, most in limits.items():
+                if most > 0:
+                    self.all.append(Coordinate(channel, kind, None, 0.0, -most, most, "linear", None, False))
+        self.names = tuple(dict.fromkeys(c.name for c in self.all if c.kind == "parameter"))
+
+    def __len__(self) -> int:
+        return len(self.all)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(c.label for c in self.all)
+
+    @property
+    def start(self) -> Array:
+        """x of the nominal values (n,)."""
+        return np.array([c.to_x(c.nominal) for c in self.all])
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        return np.array([c.to_x(c.low) for c in self.all]), np.array([c.to_x(c.high) for c in self.all])
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        return np.array([not c.fixed for c in self.all], bool)
+
+    def values(self, x: Array, recording: str, given: dict[str, float]) -> dict[str, float]:
+        """Values of the unknown parameters in one recording; `given` holds those that a ratio may refer to."""
+        mine = [(i, c) for i, c in enumerate(self.all) if c.kind == "parameter" and c.recording in (None, recording)]
+        out = {c.name: c.to_value(x[i]) for i, c in mine}
+        for _, c in mine:
+            if c.ratio_to:
+                out[c.name] *= out.get(c.ratio_to, given[c.ratio_to])
+        return out
+
+    def jacobian(self, x: Array, recording: str, values: dict[str, float]) -> Array:
+        """d (parameters `names`) / d x (names, n) in one recording; `values` are those of `values(x, recording)`."""
+        out = np.zeros((len(self.names), len(self.all)))
+        for i, c in enumerate(self.all):
+            if c.kind == "parameter" and c.recording in (None, recording):
+                row = self.names.index(c.name)
+                out[row, i] = c.slope(x[i]) * values[c.name] / c.to_value(x[i])
+                for other in self.all:  # a ratio moves with what it is a ratio to
+                    if other.ratio_to == c.name and other.recording in (None, recording):
+                        part = values[other.name] / values[c.name]
+                        out[self.names.index(other.name), i] += part * c.slope(x[i])
+        return out
+
+    def nuisance(self, x: Array, channel: str, kind: str) -> tuple[float, int]:
+        """Bias [unit] or delay [s] of a channel, and its index in x (-1 if it is not there)."""
+        for i, c in enumerate(self.all):
+            if c.kind == kind and c.name == channel:
+                return c.to_value(x[i]), i
+        return 0.0, -1
