@@ -1,1 +1,25 @@
 """torchsoft: a differentiable simulator of soft contact manipulation."""
+
+from torchsoft.parameters import Parameters
+from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact
+from torchsoft.physics.equilibrium import NoEquilibrium, press, rest
+from torchsoft.physics.material import KelvinVoigt, StandardLinearSolid
+from torchsoft.physics.mesh import PadMesh
+from torchsoft.physics.motion import Profile, Reference, Sampled, hold
+from torchsoft.physics.pads import Pad
+from torchsoft.physics.paper import SoftGrasp
+from torchsoft.physics.parts import PD, Actuator, Body, Contact
+from torchsoft.physics.rig import Rig
+from torchsoft.physics.shapes import Circle, Ellipse, Shape
+from torchsoft.solve.simulate import Interrupted, simulate
+from torchsoft.solve.stepper import METHOD, SimulationFailed
+from torchsoft.solve.torchdiffeq import register
+from torchsoft.solve.trajectory import Trajectory
+
+register()
+
+__all__ = [
+    "METHOD", "PD", "Actuator", "Body", "Circle", "Contact", "Coulomb", "Ellipse", "Interrupted", "KelvinVoigt", "NoEquilibrium",
+    "Pad", "PadMesh", "Parameters", "Profile", "Reference", "Rig", "Sampled", "Shape", "SimulationFailed", "SmoothSlip",
+    "SoftContact", "SoftGrasp", "StandardLinearSolid", "Trajectory", "hold", "press", "rest", "simulate",
+]  # fmt: skip

@@ -70,3 +70,6 @@ MEASURED = ("x_C", "y_C", "theta", "x_Br", "y_Br", "v_x", "v_y", "omega", "v_x_B
 SETPOINTS = ("x_d", "y_d")
 FEED_FORWARD = ("x_d_dot", "y_d_dot", "F_ff")
 """Channels of the reference: set-points, and what may be fed forward besides them."""
+
+PADS = {"L": "lower", "U": "upper"}
+"""What files call the paper's pads."""

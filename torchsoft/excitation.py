@@ -11,9 +11,9 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
-from torchsoft.control import Profile, Reference
-from torchsoft.equilibrium import holding_force, press, rest
-from torchsoft.model import SoftGrasp
+from torchsoft.physics.motion import Profile, Reference
+from torchsoft.physics.equilibrium import holding_force, press, rest
+from torchsoft.physics.paper import SoftGrasp, apart
 from torchsoft.parameters import Parameters
 
 FADE = 0.15
@@ -144,18 +144,13 @@ class Begun(NamedTuple):
     y0: Tensor
 
 
-def apart(p: Parameters) -> float:
-    """Height [m] of the bracket over the ground at which undeformed pads just touch an undeformed disc."""
-    return 2 * (p.pad.height + p.disc.radius) + p.bracket.cm_height
-
-
 def start(model: SoftGrasp) -> Tensor:
     """State (size,): the disc at rest under its weight, the bracket at `apart`, so that its pad is clear of the disc by
     what the disc has sunk in. Differentiable in the model's parameters; the bracket's place does not depend on them."""
-    state = model.layout.unpack(rest(model))
-    return model.layout.pack(
-        state._replace(r_Br=torch.stack((state.r_C[0], torch.tensor(apart(model.settings)).double())))
-    )
+    state = model.unpack(rest(model))
+    x, _, theta = state.pose["disc"]
+    clear = torch.stack((x, torch.full_like(x, apart(model.settings)), theta))
+    return model.pack(state._replace(pose=state.pose | {"bracket": clear}))
 
 
 def begin(excitation: Excitation, p: Parameters, *, grasp_force: float | None = None) -> Begun:
@@ -167,7 +162,7 @@ def begin(excitation: Excitation, p: Parameters, *, grasp_force: float | None = 
     y0 = start(model).detach()
     if grasp_force is None:
         grasp_force = holding_force(model, press(model, model.settings.scenario.y_Br_grasp))
-    model.reference = reference(excitation, model, float(model.layout.unpack(y0).r_Br[1]), grasp_force)
+    model.reference = reference(excitation, model, float(model.unpack(y0).pose["bracket"][1]), grasp_force)
     return Begun(model, y0)
 
 
@@ -177,7 +172,7 @@ def reference(excitation: Excitation, model: SoftGrasp, y_Br: float, grasp_force
     since, until = p.grasp_time + excitation.settle, excitation.duration
     still, grasp = ([0.0], [p.x_C0]), ([0.0, p.grasp_time], [y_Br, p.y_Br_grasp])
     x, y = moved(excitation.motion, still, grasp, since, until)
-    return Reference(x, y, Profile([0.0, p.grasp_time], [0.0, -grasp_force]))
+    return Reference(x_d=x, y_d=y, F_ff=Profile([0.0, p.grasp_time], [0.0, -grasp_force]))
 
 
 Knots = tuple[list[float], list[float]]

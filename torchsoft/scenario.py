@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsoft.control import Profile, Reference
-from torchsoft.equilibrium import NoEquilibrium, rest
-from torchsoft.model import SoftGrasp
-from torchsoft.simulate import simulate
+from torchsoft.physics.motion import Profile, Reference
+from torchsoft.physics.equilibrium import NoEquilibrium, rest
+from torchsoft.physics.paper import SoftGrasp
+from torchsoft.solve.simulate import simulate
 
 SETTLE = 0.5
 """Time [s] after the grasp at which the bracket is judged to be at rest."""
@@ -39,16 +39,16 @@ def grasp_and_roll(model: SoftGrasp, *, step: float = 2e-3, grasp_force: float |
 
 def reference(model: SoftGrasp, y0: Tensor, grasp_force: float) -> Reference:
     """Eq. 20-30 from the state y0, with `grasp_force` [N] fed forward to the bracket (downwards)."""
-    p, start = model.settings.scenario, model.layout.unpack(y0)
-    x_0, y_0 = float(start.r_C[0]), float(start.r_Br[1])
+    p, pose = model.settings.scenario, model.unpack(y0).pose
+    x_0, y_0 = float(pose["disc"][0]), float(pose["bracket"][1])
     times = [0.0, p.roll_time, p.roll_time + p.hold_time, 2 * p.roll_time + p.hold_time]
     if p.hold_time == 0:
         times.pop(1)
     out = [x_0 + p.travel] * (len(times) - 2)
     return Reference(
-        x=Profile(times, [x_0, *out, x_0]),  # (22)-(29)
-        y=Profile([0.0, p.grasp_time], [y_0, p.y_Br_grasp]),  # (30)
-        F_y=Profile([0.0, p.grasp_time], [0.0, -grasp_force]),
+        x_d=Profile(times, [x_0, *out, x_0]),  # (22)-(29)
+        y_d=Profile([0.0, p.grasp_time], [y_0, p.y_Br_grasp]),  # (30)
+        F_ff=Profile([0.0, p.grasp_time], [0.0, -grasp_force]),
     )
 
 
@@ -57,24 +57,20 @@ def find_grasp_force(model: SoftGrasp, y0: Tensor, step: float, tolerance: float
 
     `tolerance` [m] is on the bracket's height.
     """
-    p, before = model.settings.scenario, model.reference
+    p = model.settings.scenario
     t = torch.tensor([0.0, p.grasp_time, p.grasp_time + SETTLE], dtype=torch.float64)
 
     def height_error(force: float) -> float:
-        model.reference = reference(model, y0, force)
-        end = model.layout.unpack(simulate(model, t, y0=y0, step=step).y[-1])
-        return float(end.r_Br[1]) - p.y_Br_grasp
+        run = simulate(model, t, y0=y0, reference=reference(model, y0, force), step=step)
+        return float(run["y_Br"][-1]) - p.y_Br_grasp
 
-    try:
-        force, error = 0.0, height_error(0.0)
-        gain = 2.0 * float(model.controllers.K_98.detach())  # the pads are about as stiff as the loop
-        for _ in range(20):
-            if abs(error) <= tolerance:
-                return force
-            new = force + gain * error
-            new_error = height_error(new)
-            gain = (new - force) / (error - new_error)
-            force, error = new, new_error
-    finally:
-        model.reference = before
+    force, error = 0.0, height_error(0.0)
+    gain = 2.0 * float(model.parameter("control.K_98").detach())  # the pads are about as stiff as the loop
+    for _ in range(20):
+        if abs(error) <= tolerance:
+            return force
+        new = force + gain * error
+        new_error = height_error(new)
+        gain = (new - force) / (error - new_error)
+        force, error = new, new_error
     raise NoEquilibrium(f"no grasping force found: the bracket is still {error:.2g} m off at {force:.4g} N")

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torchsoft.physics.contact import cross, interface_law, moving_frame, turned
+from torchsoft.physics.pads import Pad
 from torchsoft.physics.state import State
 
 if TYPE_CHECKING:
@@ -44,6 +45,15 @@ def point_inputs(
     return torch.cat(columns, -1)
 
 
+def free_rates(pad: Pad, z: Tensor, stage: float) -> tuple[Tensor, Tensor]:
+    """Rates of a massless pad's nodes without contact (..., nodes, 2) [m/s] and its mobility P [m/(N.s)], for the forces
+    z (..., branches, nodes, 2) that have set in at the stage's start."""
+    fractions, times = pad.material.chain()
+    C, rest = pad.compliance(), fractions / (times + stage)
+    free = -((rest[:, None, None] * z).sum(-3).flatten(-2) @ C.mT).unflatten(-1, (-1, 2))
+    return free, rest.sum() * C
+
+
 def solve_rates(rig: Rig, name: str, own: Sequence[str], state: State, u: Tensor, stage: float = 0.0) -> Tensor:
     """Rates u' (..., nodes, 2) [m/s] of a massless pad's nodes, by semi-smooth Newton; u their displacements at stage zero.
 
@@ -51,9 +61,7 @@ def solve_rates(rig: Rig, name: str, own: Sequence[str], state: State, u: Tensor
     which makes the result's derivative the implicit function theorem's. Raises `RuntimeError` where it does not converge.
     """
     pad = rig.pads[name]
-    fractions, times = pad.material.chain()
-    C, rest = pad.compliance(), fractions / (times + stage)
-    free = -((rest[:, None, None] * state.pads[name]).sum(-3).flatten(-2) @ C.mT).unflatten(-1, (-1, 2))
+    free, P = free_rates(pad, state.pads[name], stage)
     touching = {}
     for key in own:
         contact = rig.contacts[key]
@@ -68,7 +76,7 @@ def solve_rates(rig: Rig, name: str, own: Sequence[str], state: State, u: Tensor
         return free
     loaded = torch.nonzero(sum(pad.spread[which].any(0) for which in touching.values()))[:, 0]
     dofs = (2 * loaded[:, None] + torch.arange(2)).flatten()
-    P = rest.sum() * C[:, dofs]
+    P = P[:, dofs]
     P_aa, free_a = P[dofs], free[..., loaded, :]
     spread = {key: pad.spread[which][:, loaded] for key, which in touching.items()}
 
@@ -87,24 +95,19 @@ def solve_rates(rig: Rig, name: str, own: Sequence[str], state: State, u: Tensor
         return (u_dot - free_a).flatten(-2) - F.flatten(-2) @ P_aa.mT
 
     def linearise(u_dot: Tensor) -> tuple[Tensor, Tensor]:
-        """Residual and its Jacobian. Points reach two nodes at the most, so probing every third node at once is enough."""
+        """Residual and its Jacobian. A point reaches two nodes at the most, so every third node is probed at once."""
         F, n = force(u_dot), len(loaded)
-        J = torch.eye(2 * n, dtype=u.dtype).expand(*u_dot.shape[:-2], 2 * n, 2 * n)
-        place = torch.arange(n)
-        colour = loaded % 3
         G = torch.zeros(*u_dot.shape[:-2], n, 2, n, 2, dtype=u.dtype)
-        for group in range(3):
+        for colour in range(3):
             for axis in range(2):
                 probe = torch.zeros_like(u_dot)
-                probe[..., colour == group, axis] = 1.0
+                probe[..., loaded % 3 == colour, axis] = 1.0
                 _, dF = torch.func.jvp(force, (u_dot,), (probe,))  # pyright: ignore[reportAssignmentType]
-                for offset in (-1, 0, 1):
-                    for i in range(n):
-                        near = torch.nonzero(loaded == loaded[i] + offset)[:, 0]
-                        if len(near) and colour[near[0]] == group:
-                            G[..., i, :, near[0], axis] = dF[..., i, :]
-        del place
-        return residual(u_dot, F), J - P_aa @ G.flatten(-2).flatten(-3, -2)
+                near = (loaded[:, None] - loaded).abs() <= 1  # rows that a probed node may reach
+                rows, columns = torch.nonzero(near & (loaded % 3 == colour), as_tuple=True)
+                G[..., rows, :, columns, axis] = dF[..., rows, :].movedim(-2, 0)
+        J = torch.eye(2 * n, dtype=u.dtype) - P_aa @ G.flatten(-2).flatten(-3, -2)
+        return residual(u_dot, F), J
 
     def newton_step(r: Tensor, J: Tensor) -> Tensor:
         return torch.linalg.solve(J, r[..., None])[..., 0].unflatten(-1, (-1, 2))

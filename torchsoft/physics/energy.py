@@ -1,54 +1,64 @@
-"""Power and energy of the graph: what is stored, dissipated and supplied, element by element.
+"""Energies of a rig: what its C and I fields store, element by element, at given states.
 
-Everything is read off the ports that `SoftGrasp.evaluate` made, so the ledger has no physics of its own.
+What is dissipated and supplied the stepper integrates beside the state, from the same laws; `powers` reads it off the ports of
+the multibond graph, so that the balance at one instant can be checked without any stepper.
 """
 
 import torch
 from torch import Tensor
 
-from torchsoft.model import Evaluation, SoftGrasp
-from torchsoft.state import State
+from torchsoft.physics.parts import COORDINATES
+from torchsoft.physics.rig import Evaluation, Rig
+from torchsoft.physics.state import State
 
 
-def stored(model: SoftGrasp, state: State) -> dict[str, Tensor]:
-    """Energies [J], each shaped like the batch: C fields (strain, springs) and I fields (kinetic)."""
+def stored(rig: Rig, state: State) -> dict[str, Tensor]:
+    """Energies [J], each shaped like the batch: strain of every pad, contact springs, kinetic energies of what moves freely."""
     energies = {}
-    for k, pad in model.pads.items():
-        u = state.u_L if k == "L" else state.u_U
-        energies[f"strain_{k}"] = 0.5 * (u * pad.elastic_force(model.material, u)).sum((-2, -1))
-    normal, tangential = torch.zeros_like(state.theta), torch.zeros_like(state.theta)
-    for k, pad in model.pads.items():
-        share, s = model.share(pad), state.s_L if k == "L" else state.s_U
-        depth = model.frame(k, state).g.clamp(min=0.0)
-        normal = normal + 0.5 * (share * model.contact.K_n * depth**2).sum(-1)
-        tangential = tangential + 0.5 * (share * model.contact.K_t * s**2).sum(-1)
+    for name, pad in rig.pads.items():
+        part = state.pads[name]
+        if pad.inertial:
+            energies[f"strain_{name}"] = 0.5 * (part * pad.elastic_force(part)).sum((-2, -1))
+        else:
+            z = part.flatten(-2)
+            fractions, _ = pad.material.chain()
+            energies[f"strain_{name}"] = 0.5 * (fractions * ((z @ pad.compliance()) * z).sum(-1)).sum(-1)
+    zero = torch.zeros_like(next(iter(state.pose.values()))[..., 0])
+    normal, tangential = zero, zero
+    for name, contact in rig.contacts.items():
+        parts = contact.law.stored(rig.penetration(name, state), state.stretch[name], rig.weight(name))
+        normal, tangential = normal + parts[0].sum(-1), tangential + parts[1].sum(-1)
     energies["normal_springs"], energies["tangential_springs"] = normal, tangential
-    energies["disc"] = 0.5 * model.m_C * (state.v_C**2).sum(-1)
-    energies["spin"] = 0.5 * model.inertia * state.omega**2
-    energies["bracket"] = 0.5 * model.m_Br * (state.v_Br**2).sum(-1)
-    if not model.massless:
-        for k, v in (("L", state.v_L), ("U", state.v_U)):
-            energies[f"kinetic_{k}"] = 0.5 * (model.nodal_masses(k) * v**2).sum((-2, -1))
-    return energies
+    for name, body in rig.bodies.items():
+        free = [float(body.freedom[axis] == "free") for axis in COORDINATES]
+        kinetic = [0.5 * f * m * state.velocity[name][..., i] ** 2 for i, (f, m) in enumerate(zip(free, body.masses))]
+        if any(free[:2]):
+            energies[name] = kinetic[0] + kinetic[1]
+        if free[2]:
+            energies[f"{name}_spin"] = kinetic[2]
+    for name, pad in rig.pads.items():
+        if pad.inertial:
+            energies[f"kinetic_{name}"] = 0.5 * (pad.masses()[:, None] * state.rates[name] ** 2).sum((-2, -1))
+    return {rig.renamed.get(name, name): value for name, value in energies.items()}
 
 
-def dissipated(model: SoftGrasp, state: State, graph: Evaluation) -> dict[str, Tensor]:
+def dissipated(rig: Rig, state: State, graph: Evaluation) -> dict[str, Tensor]:
     """Powers [W] that the R elements take out, each shaped like the batch and never negative."""
-    powers, dashpots, slip = {}, torch.zeros_like(state.theta), torch.zeros_like(state.theta)
-    for k, pad in model.pads.items():
-        port, u = graph.ports[f"pad_{k}"], state.u_L if k == "L" else state.u_U
-        u_dot = port.transformer.flow(graph.flows)
-        powers[f"pad_{k}"] = ((port.effort - pad.elastic_force(model.material, u)) * u_dot).sum((-2, -1))
-        frame, contact, transformer = graph.interfaces[k]
-        share, g_dot = model.share(pad), transformer.flow(graph.flows)[..., 0]
-        spring = share * model.contact.K_n * frame.g.clamp(min=0.0)
-        dashpots = dashpots + ((contact.F_N - spring) * g_dot).sum(-1)
-        dashpots = dashpots + (share * model.contact.R_t * contact.s_dot**2).sum(-1)
-        slip = slip + (contact.e * contact.gamma_dot).sum(-1)
-    return powers | {"contact_dashpots": dashpots, "slip": slip}
+    powers, dashpots, slip = {}, 0.0, 0.0
+    for name, pad in rig.pads.items():
+        port = graph.ports[f"pad_{name}"]
+        u_dot, fractions_times = port.transformer.flow(graph.flows), pad.material.chain()
+        if pad.inertial:
+            powers[f"pad_{name}"] = (fractions_times[1] * u_dot * pad.elastic_force(u_dot)).sum((-2, -1))
+        else:
+            fractions, times = fractions_times
+            rate = ((port.effort[..., None, :, :] - state.pads[name]) / times[:, None, None]).flatten(-2)
+            powers[f"pad_{name}"] = (fractions * times * ((rate @ pad.compliance()) * rate).sum(-1)).sum(-1)
+    for interface in graph.interfaces.values():
+        dashpots, slip = dashpots + interface.out[..., 5].sum(-1), slip + interface.out[..., 6].sum(-1)
+    return powers | {"contact_dashpots": torch.as_tensor(dashpots), "slip": torch.as_tensor(slip)}
 
 
 def supplied(graph: Evaluation) -> dict[str, Tensor]:
-    """Powers [W] that the sources put in, each shaped like the batch."""
-    names = {"control_x": "control_x", "control_y": "control_y", "gravity": "weight"}
-    return {name: graph.ports[port].power(graph.flows) for name, port in names.items()}
+    """Powers [W] that the sources put in, by their port, each shaped like the batch."""
+    return {name: port.power(graph.flows) for name, port in graph.ports.items() if port.source}

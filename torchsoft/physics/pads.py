@@ -7,10 +7,11 @@ nodal forces that have set in, branch by branch of its material's chain; an iner
 import numpy as np
 import torch
 from scipy import sparse
+from scipy.sparse.linalg import splu
 from torch import Tensor, nn
 
 from torchsoft.physics.material import Material
-from torchsoft.physics.mesh import Array, PadMesh, unit_compliance
+from torchsoft.physics.mesh import Array, PadMesh, lame_moduli, unit_compliance
 
 
 class Pad(nn.Module):
@@ -92,6 +93,18 @@ class Pad(nn.Module):
         """ K_lambda (0) or K_mu (1) per modulus and depth, in the base's axes."""
         turn = sparse.kron(sparse.eye_array(len(self.mesh.free)), self.axes.numpy())
         return sparse.csr_array(turn @ self.mesh.assemble(self.mesh.matrices[modulus]) @ turn.T)
+
+    def static_displacement(self, F: Tensor) -> Tensor:
+        """Displacements (nodes, 2) [m] of an inertial pad's nodes under forces F (surface, 2) [N] on its surface, with their
+        derivative by E, depth and F; the one by nu is left out."""
+        moduli = [x.item() for x in lame_moduli(1.0, self.material.nu.detach())]
+        K = (moduli[0] * self.stiffness(0) + moduli[1] * self.stiffness(1)).tocsc()
+        columns = (2 * self.surface[:, None] + torch.arange(2)).flatten()
+        loads = np.zeros((2 * self.nodes, len(columns)))
+        loads[columns.numpy(), np.arange(len(columns))] = 1.0
+        everywhere = torch.from_numpy(splu(K).solve(loads))
+        u = everywhere @ F.flatten() / (self.material.E * self.material.depth)
+        return u.unflatten(0, (-1, 2))
 
     def elastic_force(self, u: Tensor) -> Tensor:
         """K u of an inertial pad: displacements u (..., nodes, 2) [m] to forces of the same shape [N]."""

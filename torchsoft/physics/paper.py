@@ -1,5 +1,6 @@
 """The paper's rig from the lists: a disc between two soft pads, the upper one in a bracket under two PD controllers."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -40,6 +41,12 @@ class SoftGrasp(Rig):
     """
 
     aliases = NAMES
+    renamed: Mapping[str, str] = {
+        "disc_spin": "spin", "theta_C": "theta", "v_x_C": "v_x", "v_y_C": "v_y", "omega_C": "omega", "M_U": "bracket_moment",
+        "L_C": "angular_momentum",
+    }  # fmt: skip
+    disc: Body
+    bracket: Body
 
     def __init__(
         self, settings: Parameters | None = None, reference: Reference | None = None, *, friction: SlipLaw | None = None,
@@ -95,6 +102,11 @@ class SoftGrasp(Rig):
                 values.setdefault(group, {})[field] = float(known[own].detach())
         groups = {group: getattr(self._settings, group).model_copy(update=new) for group, new in values.items()}
         return self._settings.model_copy(update=groups)
+
+    def description(self) -> dict[str, Any]:
+        values = {name: row["value"] for name, row in self.settings.table().items()}
+        shape, rubber = type(self.shape).__name__, type(self.pads["L"].material).__name__
+        return super().description() | {"parameters": values, "shape": shape, "material": rubber}
 
     @property
     def shape(self) -> Shape:

@@ -116,6 +116,15 @@ class Rig(nn.Module):
     aliases: Mapping[str, str] = {}
     """Other names of parameters."""
 
+    renamed: Mapping[str, str] = {}
+    """Other names of channels and energies."""
+
+    def description(self) -> dict[str, Any]:
+        """The numbers and laws of the rig as they are now, for what is saved with a run."""
+        values = {name: value.detach().tolist() for name, value in self.named_parameters()}
+        laws = {name: type(contact.law.friction).__name__ for name, contact in self.contacts.items()}
+        return {"parameters": values, "friction": laws}
+
     def parameter(self, name: str) -> Tensor:
         """A parameter by its name, or by another one in `aliases`. Raises `ValueError` for one that is not there."""
         known = dict(self.named_parameters(remove_duplicate=False))
@@ -198,9 +207,19 @@ class Rig(nn.Module):
         zeta = (fractions[:, None, None] * part).sum(-3)
         return (zeta.flatten(-2) @ pad.compliance().mT).unflatten(-1, (-1, 2))
 
-    def forward(self, t: Tensor | float, y: Tensor) -> Tensor:
+    def penetration(self, name: str, state: State) -> Tensor:
+        """Depth of the points of a contact in the body [m], (..., points); negative where they are apart."""
+        contact = self.contacts[name]
+        spread, shape = self.pads[contact.pad].spread, self.bodies[contact.body].shape
+        assert shape is not None
+        u = spread @ self.displacement(contact.pad, state)
+        x = point_inputs(self, name, state, u, torch.zeros_like(u))
+        return moving_frame(shape, x[..., 3:5], x[..., 5]).g
+
+    def forward(self, t: Tensor | float, y: Tensor, reference: Reference | None = None) -> Tensor:
         """dy/dt, shaped like y. Raises `ValueError` for a state of another length or dtype."""
-        signals = self.follow(torch.as_tensor(t, dtype=torch.float64).expand(y.shape[:-1]))
+        self.layout.check(y)
+        signals = self.follow(torch.as_tensor(t, dtype=torch.float64).expand(y.shape[:-1]), reference)
         state = self.unpack(y, signals)
         graph = self.evaluate(t, state, signals)
         effort = net_efforts(graph.ports, self.junctions)

@@ -7,9 +7,9 @@ combinations of gains, pad stiffness and pad damping.
 import torch
 from torch import Tensor
 
-from torchsoft.control import hold
-from torchsoft.equilibrium import holding_force, press
-from torchsoft.model import SoftGrasp
+from torchsoft.physics.equilibrium import holding_force, press
+from torchsoft.physics.motion import hold
+from torchsoft.physics.paper import SoftGrasp
 
 DISPLACEMENT, VELOCITY = 1e-9, 1e-8
 """Perturbations [m or rad], [m/s or rad/s] of the central differences: small against penetrations, so that nodes stick."""
@@ -26,15 +26,15 @@ def loop_modes(model: SoftGrasp) -> Tensor:
     `NoEquilibrium` when that grasp does not exist.
     """
     y = press(model, model.settings.scenario.y_Br_grasp)
-    state, before = model.layout.unpack(y), model.reference
-    try:
-        model.reference = hold(float(state.r_C[0]), float(state.r_Br[1]), -holding_force(model, y))
-        first_velocity = model.layout.slices["v_L"].start
-        size = torch.full((model.layout.size,), DISPLACEMENT, dtype=torch.float64)
-        size[first_velocity:] = VELOCITY
-        ahead, behind = model(0.0, y + torch.diag(size)), model(0.0, y - torch.diag(size))
-    finally:
-        model.reference = before
+    pose = model.unpack(y).pose
+    reference = hold(x_d=float(pose["disc"][0]), y_d=float(pose["bracket"][1]), F_ff=-holding_force(model, y))
+    size = torch.full((model.layout.size,), DISPLACEMENT, dtype=torch.float64)
+    for (part, name), where in model.layout.slices.items():
+        if part == "pads" and not model.pads[name].inertial:  # forces, counted by the displacement they make
+            size[where] = DISPLACEMENT / float(model.pads[name].compliance().diagonal().max())
+        elif part in ("rates", "velocity"):
+            size[where] = VELOCITY
+    ahead, behind = (model(0.0, y + sign * torch.diag(size), reference) for sign in (1, -1))
     modes = torch.linalg.eigvals(((ahead - behind) / (2 * size[:, None])).mT)
     return modes[modes.real.argsort(descending=True)]
 

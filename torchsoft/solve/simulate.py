@@ -1,22 +1,29 @@
-"""`simulate`: run a model over given times with the implicit stepper and gather everything into a `Trajectory`."""
+"""`simulate`: run a rig over given times, by the route to a derivative that is wanted, into one `Trajectory`."""
 
 import time as clock
+from collections.abc import Iterator, Sequence
 from importlib.metadata import version
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchsoft.adjoint import iterate
-from torchsoft.equilibrium import rest
+from torchsoft.physics.energy import stored
+from torchsoft.physics.equilibrium import rest
+from torchsoft.physics.motion import Reference
+from torchsoft.physics.paper import SoftGrasp
+from torchsoft.physics.rig import Rig
+from torchsoft.physics.stability import describe_instability
+from torchsoft.solve import adjoint, tangent
+from torchsoft.solve.continuous import continuous_solution
 from torchsoft.solve.grid import check_times
-from torchsoft.implicit import METHOD, ImplicitStepper, Progress, SimulationFailed
-from torchsoft.kernels.run import DISSIPATED, INTEGRALS, SUPPLIED
-from torchsoft.ledger import stored
-from torchsoft.model import SoftGrasp
-from torchsoft.stability import describe_instability
-from torchsoft.trajectory import Stats, Trajectory
+from torchsoft.solve.stepper import METHOD, ImplicitStepper, Progress, SimulationFailed
+from torchsoft.solve.trajectory import Stats, Trajectory, channels
+from torchsoft.solve.unrolled import unrolled_solution
+
+Route = Literal["none", "discrete", "forward", "unrolled", "continuous"]
+"""Ways to a derivative: none; the exact adjoint of the run; sensitivities along `wrt`; plain torch steps; torchdiffeq's own."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -28,100 +35,137 @@ class Interrupted(KeyboardInterrupt):
 
 
 def simulate(
-    model: SoftGrasp,
-    t: Tensor,
-    *,
-    y0: Tensor | None = None,
-    step: float = 2e-3,
-    tolerance: float = 1e-9,
-    progress: bool = False,
-    gradient: Literal["none", "discrete"] = "none",
-) -> Trajectory:
-    """Integrate `model` from y0 (size,) at t[0] through the times t (T,) [s].
+    rig: Rig, t: Tensor, *, y0: Tensor | None = None, reference: Reference | None = None, step: float = 2e-3,
+    tolerance: float = 1e-9, gradient: Route = "none", wrt: Sequence[str] = (), dy0: Tensor | None = None,
+    rigid: bool = False, progress: bool = False,
+) -> Trajectory:  # fmt: skip
+    """Integrate `rig` from y0 (size,) at t[0] through the times t (T,) [s].
 
-    With `gradient="discrete"` the states and control forces of the result carry the exact gradient of the discrete run
-    with respect to y0 and every parameter of the model (massless pads); recorded nodal forces and energies do not.
+    y0 defaults to the paper's rig at rest. `reference` is what the rig follows, its own by default. `step` [s] is the largest
+    step of the stepper, `tolerance` [N] its Newton tolerance.
 
-    y0 defaults to the disc at rest on the lower pad. `step` [s] is the largest step of the stepper, `tolerance` [N] its
-    Newton tolerance. Raises `ValueError` for times that do not increase or a state of the wrong shape or dtype,
-    `SimulationFailed` (with the trajectory so far) when the run cannot go on, and `Interrupted` (likewise) on Ctrl-C.
+    gradient: with "discrete" the states and channels of the result carry the exact gradient of the discrete run by y0, every
+    parameter and the reference; recorded nodal forces and energies do not. With "forward" `sensitivities` holds the derivatives
+    by the scalar parameters `wrt`, dy0 (size, n) being that of the start; `rigid` keeps those of the free coordinates and their
+    rates only. "unrolled" takes the same steps in plain torch, "continuous" torchdiffeq's explicit steps and adjoint: both slow,
+    for cross checks over short windows. Under `torch.no_grad()` no route records a graph.
+
+    Raises `ValueError` for times that do not increase, a state of the wrong shape or dtype, an unknown route or parameter;
+    `SimulationFailed` (with the trajectory so far) when the run cannot go on; `Interrupted` (likewise) on Ctrl-C.
     """
+    if gradient not in get_args(Route):
+        raise ValueError(f"`gradient` must be one of {', '.join(get_args(Route))}, but is {gradient!r}")
+    if bool(wrt) != (gradient == "forward"):
+        raise ValueError("`wrt` names the parameters of gradient='forward', and of that only")
     check_times(t)
-    stepper = ImplicitStepper(model, step=step, tolerance=tolerance)
-    start = rest(model) if y0 is None else y0
+    if y0 is None:
+        if not isinstance(rig, SoftGrasp):
+            raise ValueError("`y0` is needed: only the paper's rig has a start of its own")
+        y0 = rest(rig)
+    if gradient in ("unrolled", "continuous"):
+        return _recorded(rig, t, y0, reference or rig.reference, step, gradient)
+    stepper = ImplicitStepper(rig, reference, step=step, tolerance=tolerance)
     bar = tqdm(
-        total=float(t[-1] - t[0]),
-        unit="s",
-        disable=not progress,
+        total=float(t[-1] - t[0]), unit="s", disable=not progress,
         bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated [{elapsed}]",
-    )
-    y, out, wall, began = start, None, 0.0, clock.perf_counter()
+    )  # fmt: skip
+    y, dy, out, wall, began = y0, None, None, 0.0, clock.perf_counter()
     try:
-        with torch.set_grad_enabled(gradient == "discrete"):
-            for y, out in iterate(stepper, start, t):
+        with torch.set_grad_enabled(gradient == "discrete" and torch.is_grad_enabled()):
+            for y, dy, out in _rows(stepper, y0, t, gradient, wrt, dy0, rigid):
                 wall = clock.perf_counter() - began
                 bar.n = float(t[out.rows - 1] - t[0])
                 bar.refresh()
     except SimulationFailed as failure:
         assert out is not None
-        raise diagnose(model, failure, gather(model, t, y, out, wall, step, failed=1)) from None
+        trajectory = gather(stepper, t, y, out, Stats(out.steps, out.solves, out.failed + 1, wall, step))
+        raise diagnose(rig, failure, trajectory) from None
     except KeyboardInterrupt:
         if out is None:
             raise
-        raise Interrupted(gather(model, t, y, out, wall, step)) from None
+        raise Interrupted(
+            gather(stepper, t, y.detach(), out, Stats(out.steps, out.solves, out.failed, wall, step))
+        ) from None
     finally:
         bar.close()
     assert out is not None
-    return gather(model, t, y, out, wall, step)
+    return gather(stepper, t, y, out, Stats(out.steps, out.solves, out.failed, wall, step), tuple(wrt), dy)
 
 
-def diagnose(model: SoftGrasp, failure: SimulationFailed, trajectory: Trajectory) -> SimulationFailed:
+def _rows(
+    stepper: ImplicitStepper, y0: Tensor, t: Tensor, gradient: Route, wrt: Sequence[str], dy0: Tensor | None, rigid: bool
+) -> Iterator[tuple[Tensor, Tensor | None, Progress]]:
+    """The growing run by one of the compiled routes."""
+    if gradient == "forward":
+        with torch.enable_grad():
+            wanted = [stepper.rig.parameter(name) for name in wrt]
+            for name, value in zip(wrt, wanted):
+                if value.ndim or not value.requires_grad:
+                    raise ValueError(f"`{name}` must be a scalar parameter that requires a gradient")
+            size = stepper.layout.size
+            if dy0 is not None and dy0.shape != (size, len(wrt)):
+                raise ValueError(f"`dy0` must have shape ({size}, {len(wrt)}), but has {tuple(dy0.shape)}")
+            kept = slice(size - 2 * len(stepper.compiled.system(1.0).bodies.coordinate) if rigid else 0, size)
+            yield from tangent.iterate(stepper, y0, t, wanted, dy0, kept)
+    else:
+        for y, out in adjoint.iterate(stepper, y0, t):
+            yield y, None, out
+
+
+def _recorded(rig: Rig, t: Tensor, y0: Tensor, reference: Reference, step: float, gradient: Route) -> Trajectory:
+    """The routes in torch, which record every operation: states and channels, without forces and work."""
+    began = clock.perf_counter()
+    solve = unrolled_solution if gradient == "unrolled" else continuous_solution
+    y = solve(rig, y0, t, reference, step=step)
+    signals = rig.follow(t, reference)
+    state, nothing = rig.unpack(y, signals), torch.zeros(0, dtype=torch.float64)
+    return Trajectory(
+        t, y, state, channels(rig, state, signals), {}, {}, {}, {}, {}, nothing,
+        Stats(0, 0, 0, clock.perf_counter() - began, step), rig.layout, made_by(rig, gradient),
+    )  # fmt: skip
+
+
+def diagnose(rig: Rig, failure: SimulationFailed, trajectory: Trajectory) -> SimulationFailed:
     """The failure with the run so far, and with the closed loop's instability as its cause if the loop is unstable."""
     try:
-        cause = describe_instability(model)
-    except RuntimeError:  # a model that cannot grasp has no grasp to linearise
+        cause = describe_instability(rig) if isinstance(rig, SoftGrasp) else ""
+    except RuntimeError:  # a rig that cannot grasp has no grasp to linearise
         cause = ""
-    told = (
-        f"the disc was lost at t = {failure.time:.4f} s: {cause} (it ended with this: {failure})"
-        if cause
-        else str(failure)
-    )
-    out = SimulationFailed(told, failure.time)
+    reason = f"the disc was lost at t = {failure.time:.4f} s: {cause} (the run ended with: {failure})" if cause else str(failure)
+    out = SimulationFailed(reason, failure.time)
     out.trajectory = trajectory
     return out
 
 
+def made_by(rig: Rig, method: str) -> dict[str, object]:
+    """Version, method, and the numbers and laws that ran."""
+    return {"torchsoft": version("torchsoft"), "method": method, **rig.description()}
+
+
 def gather(
-    model: SoftGrasp, t: Tensor, y: Tensor, out: Progress, wall: float, step: float, failed: int = 0
-) -> Trajectory:
+    stepper: ImplicitStepper, t: Tensor, y: Tensor, out: Progress, stats: Stats, wrt: tuple[str, ...] = (),
+    dy: Tensor | None = None,
+) -> Trajectory:  # fmt: skip
     """The trajectory of the rows that the stepper has finished; y (T, size) carries the gradient, if any is wanted."""
-    rows = out.rows
+    rig, rows = stepper.rig, out.rows
     t, y, forces, extras = t[:rows], y[:rows], *(torch.from_numpy(x[:rows]) for x in (out.forces, out.extras))
-    state, lower = model.layout.unpack(y), len(model.pad_L.surface)
+    names = stepper.integrals
+    columns = dict(zip((*names.names, *rig.pads), extras.unbind(-1)))
     with torch.set_grad_enabled(y.requires_grad):
-        want = model.reference(t)
-        control = torch.stack(model.controllers(want, state.r_C, state.v_C, state.r_Br, state.v_Br), -1)
+        signals = rig.follow(t, stepper.reference)
+        state = rig.unpack(y, signals)
+        measured = channels(rig, state, signals, {name: columns[name] for name in rig.pads})
     with torch.no_grad():
-        energy = stored(model, state)
-    column = {name: extras[:, i] for i, name in enumerate(INTEGRALS)}
+        energy = stored(rig, state)
+        displacement = {name: rig.displacement(name, state) for name in rig.pads}
+        force, at = {}, 0
+        for name, contact in rig.contacts.items():
+            count = len(rig.pads[contact.pad].point_nodes)
+            force[name], at = forces[:, at : at + count], at + count
     return Trajectory(
-        t=t,
-        y=y,
-        force_L=forces[:, :lower],
-        force_U=forces[:, lower:],
-        control=control,
-        bracket_moment=extras[:, -1],
-        desired=torch.stack(want, -1),
-        energy=energy,
-        dissipated={name: column[name] for name in DISSIPATED},
-        supplied={name: column[name] for name in SUPPLIED},
-        injected=column["injected"],
-        stats=Stats(out.steps, out.solves, out.failed + failed, wall, step),
-        layout=model.layout,
-        made_by={
-            "torchsoft": version("torchsoft"),
-            "method": METHOD,
-            "parameters": {name: row["value"] for name, row in model.settings.table().items()},
-        },
-        inertia=model.inertia.item(),
-    )
+        t=t, y=y, state=state, channels=measured, force=force, displacement=displacement, energy=energy,
+        dissipated={name: columns[name] for name in names.dissipated},
+        supplied={name: columns[name] for name in names.supplied if name in names.active},
+        injected=columns["injected"], stats=stats, layout=rig.layout, made_by=made_by(rig, METHOD), wrt=wrt,
+        sensitivities=None if dy is None else dy[:rows],
+    )  # fmt: skip

@@ -83,6 +83,8 @@ class Integrals:
         drives = tuple(f"drive_{name}" for name in rig.bodies)
         self.supplied = (*(f"control_{name}" for name in rig.actuators), "gravity", *drives)
         self.names = (*self.dissipated, *self.supplied, "injected")
+        driven = {f"drive_{name}" for name, body in rig.bodies.items() if "driven" in body.freedom.values()}
+        self.active = {name for name in self.supplied if not name.startswith("drive_")} | driven
 
 
 class ImplicitStepper:

@@ -1,8 +1,10 @@
 """The stepper under torchdiffeq's own verbs: `odeint` and `odeint_adjoint`.
 
-`odeint(model, y0, t, method="sdirk2")` has the discrete adjoint behind it already. `odeint_adjoint` works as well: it calls
-the same method once more, backwards and interval by interval, on its augmented dynamics, which the solver recognises and
-answers with the discrete adjoint of the interval. That is exact too, but pays its overhead at every output time.
+`odeint(rig, y0, t, method="sdirk2")` has the discrete adjoint behind it already. `odeint_adjoint` works as well: it calls the
+same method once more, backwards and interval by interval, on its augmented dynamics, which the solver recognises and answers
+with the discrete adjoint of the interval. That is exact too, but pays its overhead at every output time.
+
+A solver of the same name that torchdiffeq has of its own is left to everybody else's functions.
 """
 
 import importlib
@@ -14,9 +16,9 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-from torchsoft.adjoint import differentiable_solution, run_adjoint
-from torchsoft.implicit import METHOD, ImplicitStepper, Segment
-from torchsoft.model import SoftGrasp
+from torchsoft.physics.rig import Rig
+from torchsoft.solve.adjoint import iterate, run_adjoint
+from torchsoft.solve.stepper import METHOD, ImplicitStepper, Segment
 
 REMEMBERED = 4
 """Runs of a model whose states are remembered: `odeint_adjoint` hands its solver only the later end of an interval."""
@@ -27,7 +29,7 @@ class _Run(NamedTuple):
     y: Tensor
 
 
-_runs: WeakKeyDictionary[SoftGrasp, deque[_Run]] = WeakKeyDictionary()
+_runs: WeakKeyDictionary[Rig, deque[_Run]] = WeakKeyDictionary()
 
 
 class TorchdiffeqSolver:
@@ -35,17 +37,26 @@ class TorchdiffeqSolver:
 
     Takes batches: y0 (..., size); each sample is stepped by itself, so none depends on its neighbours. rtol and atol are
     not used: the step is fixed and Newton's tolerance (option `tolerance` [N]) is the stepper's. Raises `TypeError` for
-    dynamics that are not a `SoftGrasp`'s.
+    dynamics that are not a `Rig`'s.
     """
 
+    theirs: Any = None
+    """torchdiffeq's own solver of this name, for functions that are not a rig's."""
+
+    def __new__(cls, func: Any, y0: Tensor, *arguments: Any, **options: Any) -> Any:
+        if cls.theirs is not None and not isinstance(_rig_behind(func), Rig):
+            return cls.theirs(func, y0, *arguments, **options)
+        return super().__new__(cls)
+
     def __init__(self, func: Any, y0: Tensor, rtol: float, atol: float, norm: Any = None, **options: Any) -> None:
-        found = _innermost(func)
-        augmented = {} if isinstance(found, SoftGrasp) or not inspect.isfunction(found) else _closure(found)
-        model = _innermost(augmented.get("func", found))
-        if not isinstance(model, SoftGrasp):
-            raise TypeError(f"method='{METHOD}' integrates a torchsoft.SoftGrasp, but got {type(model).__name__}")
+        model, augmented = _rig_behind(func), _augmented(func)
+        if not isinstance(model, Rig):
+            raise TypeError(f"method='{METHOD}' integrates a torchsoft.Rig, but got {type(model).__name__}")
         if "step_size" in options:
             options["step"] = options.pop("step_size")
+        known = set(inspect.signature(ImplicitStepper).parameters) - {"rig", "reference"}
+        if strange := set(options) - known:
+            raise ValueError(f"method='{METHOD}' has no option {sorted(strange)}; it has step_size, {', '.join(sorted(known))}")
         self.model, self.y0 = model, y0
         self.adjoint_params: tuple[Tensor, ...] | None = augmented.get("adjoint_params")
         self.stepper = ImplicitStepper(model, **options)
@@ -54,7 +65,7 @@ class TorchdiffeqSolver:
         if self.adjoint_params is not None:
             return self._augmented(t, self.adjoint_params)
         samples = self.y0.reshape(-1, self.y0.shape[-1])
-        runs = [differentiable_solution(self.stepper, sample, t)[0] for sample in samples]
+        runs = [deque(iterate(self.stepper, sample, t), maxlen=1)[0][0] for sample in samples]
         solution = torch.stack(runs, 1)
         _runs.setdefault(self.model, deque(maxlen=REMEMBERED)).append(_Run(t.detach().clone(), solution.detach()))
         return solution.reshape(len(t), *self.y0.shape)
@@ -72,8 +83,13 @@ class TorchdiffeqSolver:
             for _ in self.stepper.integrate(y_start[sample], interval, segments, float("inf")):
                 pass
             outputs = torch.stack((torch.zeros_like(y_bars[sample]), y_bars[sample]))
-            y_bars[sample], parts = run_adjoint(self.stepper, segments, outputs, parameters)
-            if parts:
+            y_bars[sample], *cotangents = run_adjoint(self.stepper, segments, outputs)
+            if parameters:
+                with torch.enable_grad():
+                    made_of = self.stepper.compiled.p, self.stepper.signals([segment.chunk for segment in segments])
+                    value = sum((x * cotangent).sum() for x, cotangent in zip(made_of, cotangents))
+                    parts = torch.autograd.grad(value, parameters, allow_unused=True, retain_graph=True)
+                parts = [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, parts)]
                 bars = bars + torch.cat([part.flatten() for part in parts])
         carried = torch.cat((self.y0[:1], y_start.flatten(), y_bars.flatten(), bars))
         return torch.stack((self.y0, carried))
@@ -98,6 +114,17 @@ def _closure(function: Any) -> dict[str, Any]:
     return dict(inspect.getclosurevars(function).nonlocals)
 
 
+def _augmented(func: Any) -> dict[str, Any]:
+    """The variables of torchdiffeq's augmented dynamics; none where `func` is anything else."""
+    found = _innermost(func)
+    return _closure(found) if inspect.isfunction(found) else {}
+
+
+def _rig_behind(func: Any) -> Any:
+    """What is integrated, inside whatever torchdiffeq has put around it."""
+    return _innermost(_augmented(func).get("func", _innermost(func)))
+
+
 def _innermost(func: Any) -> Any:
     while hasattr(func, "base_func"):
         func = func.base_func
@@ -109,4 +136,8 @@ def register() -> None:
     solvers = getattr(importlib.import_module("torchdiffeq._impl.odeint"), "SOLVERS", None)
     if not isinstance(solvers, dict) or "dopri5" not in solvers:
         raise ImportError("this torchdiffeq keeps its solvers elsewhere; torchsoft was made for torchdiffeq 0.2.5")
-    solvers[METHOD] = TorchdiffeqSolver
+    theirs = solvers.get(METHOD)
+    if theirs is not None and not (isinstance(theirs, type) and issubclass(theirs, TorchdiffeqSolver)):
+        solvers[METHOD] = type("TorchdiffeqSolver", (TorchdiffeqSolver,), {"theirs": theirs})
+    else:
+        solvers[METHOD] = TorchdiffeqSolver

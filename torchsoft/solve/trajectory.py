@@ -1,6 +1,7 @@
-"""What a simulation leaves behind: times, states, nodal forces, controls and the energy ledger."""
+"""What a simulation leaves behind: times, states, nodal forces, efforts, energies, and how it was made."""
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,10 @@ import torch
 import xarray as xr
 from torch import Tensor
 
-from torchsoft.state import Layout, State
+from torchsoft.channels import PADS, VARIABLES
+from torchsoft.files import replacing
+from torchsoft.physics.rig import Rig
+from torchsoft.physics.state import Layout, State
 
 
 @dataclass(frozen=True)
@@ -31,45 +35,49 @@ class Stats:
 class Trajectory:
     """A run sampled at t (T,) [s]. SI units, every tensor float64 and shaped (T, ...).
 
-    y: flat states (T, size). force_L, force_U: normal and friction force (T, surface, 2) [N] on each surface node, along
-    n and t of its moving frame. control: F_x, F_y (T, 2) [N] on the bracket (Eq. 32, 34). bracket_moment (T,) [N.m]
-    (Eq. 35). desired: x_d, x_d', y_d, y_d', F_y (T, 5). energy: stored [J] and work: dissipated, supplied and
-    `injected` [J] since t[0], by name, (T,) each.
+    y: flat states (T, size). channels: what can be measured or was asked for, by key, (T,) each. force: normal and friction
+    force (T, points, 2) [N] on the points of each contact, along n and t of their moving frames. displacement: of the nodes of
+    each pad (T, nodes, 2) [m], in its base's frame. energy: stored [J]; dissipated, supplied and `injected` [J] since t[0].
+
+    sensitivities (T, components, n): derivatives of the state's last `components` by the n parameters `wrt`, where asked for.
     """
 
     t: Tensor
     y: Tensor
-    force_L: Tensor
-    force_U: Tensor
-    control: Tensor
-    bracket_moment: Tensor
-    desired: Tensor
-    energy: dict[str, Tensor]
-    dissipated: dict[str, Tensor]
-    supplied: dict[str, Tensor]
-    injected: Tensor
+    state: State = field(repr=False)
+    channels: dict[str, Tensor] = field(repr=False)
+    force: dict[str, Tensor] = field(repr=False)
+    displacement: dict[str, Tensor] = field(repr=False)
+    energy: dict[str, Tensor] = field(repr=False)
+    dissipated: dict[str, Tensor] = field(repr=False)
+    supplied: dict[str, Tensor] = field(repr=False)
+    injected: Tensor = field(repr=False)
     stats: Stats
     layout: Layout = field(repr=False)
     made_by: dict[str, Any] = field(repr=False)
-    inertia: float = field(repr=False)
+    wrt: tuple[str, ...] = ()
+    sensitivities: Tensor | None = field(default=None, repr=False)
 
-    @property
-    def state(self) -> State:
-        """The states by name, time leading."""
-        return self.layout.unpack(self.y)
+    def __getitem__(self, channel: str) -> Tensor:
+        """A channel (T,). Raises `KeyError` naming those that are there."""
+        if channel not in self.channels:
+            raise KeyError(f"the run has no channel `{channel}`; it has {', '.join(self.channels)}")
+        return self.channels[channel]
+
+    def together(self, *channels: str) -> Tensor:
+        """Channels side by side (T, channels)."""
+        return torch.stack([self[name] for name in channels], -1)
 
     @property
     def energy_residual(self) -> Tensor:
         """Stored energy gained, less supplied, plus dissipated (T,) [J]; zero but for the integration error."""
-        total = sum(self.energy.values(), torch.zeros_like(self.t))
-        flows = sum(self.supplied.values(), torch.zeros_like(self.t)) - sum(
-            self.dissipated.values(), torch.zeros_like(self.t)
-        )
-        return total - total[0] - flows
+        zero = torch.zeros_like(self.t)
+        total = sum(self.energy.values(), zero)
+        return total - total[0] - sum(self.supplied.values(), zero) + sum(self.dissipated.values(), zero)
 
     @property
     def energy_residual_rel(self) -> float:
-        """Largest ledger residual over the energy that the sources injected."""
+        """Largest energy residual over the energy that the sources injected."""
         return float(self.energy_residual.abs().max() / self.injected[-1].clamp(min=1e-300))
 
     def at(self, time: float) -> int:
@@ -78,42 +86,34 @@ class Trajectory:
 
     def to_dataset(self) -> xr.Dataset:
         """The run as an xarray Dataset with named dimensions, units, and how it was made."""
-        s, t = self.state, ("time",)
-        axis, pads = ("time", "axis"), {"L": "lower", "U": "upper"}
-        columns: dict[str, tuple[tuple[str, ...], Tensor, str, str]] = {
-            "disc_position": (axis, s.r_C, "m", "centre of mass of the disc"),
-            "disc_angle": (t, s.theta, "rad", "rotation of the disc, anticlockwise"),
-            "disc_velocity": (axis, s.v_C, "m/s", "velocity of the disc's centre"),
-            "disc_spin": (t, s.omega, "rad/s", "angular velocity of the disc"),
-            "angular_momentum": (t, self.inertia * s.omega, "kg.m2/s", "angular momentum of the disc (Fig. 17)"),
-            "bracket_position": (axis, s.r_Br, "m", "centre of mass of the bracket"),
-            "bracket_velocity": (axis, s.v_Br, "m/s", "velocity of the bracket"),
-            "bracket_moment": (t, self.bracket_moment, "N.m", "moment on the bracket about its centre (Eq. 35)"),
-            "control_force": (axis, self.control, "N", "controllers' force on the bracket (Eq. 32, 34)"),
-            "desired_x": (t, self.desired[:, 0], "m", "x_d (Eq. 20)"),
-            "desired_x_velocity": (t, self.desired[:, 1], "m/s", "x_d' (Eq. 21)"),
-            "desired_y": (t, self.desired[:, 2], "m", "y_Br,d (Eq. 30)"),
-            "feed_forward": (t, self.desired[:, 4], "N", "vertical effort fed forward"),
-            "energy_injected": (t, self.injected, "J", "positive part of the sources' work"),
-            "energy_residual": (t, self.energy_residual, "J", "stored - supplied + dissipated"),
-        }
-        for k, name in pads.items():
-            force, u, nodes = getattr(self, f"force_{k}"), getattr(s, f"u_{k}"), ("time", f"{name}_surface")
-            columns[f"normal_force_{name}"] = (nodes, force[..., 0], "N", f"normal force on the {name} pad's nodes")
-            columns[f"friction_force_{name}"] = (nodes, force[..., 1], "N", f"friction on the {name} pad's nodes")
-            columns[f"stretch_{name}"] = (nodes, getattr(s, f"s_{k}"), "m", "stretch of the momentary springs")
-            columns[f"displacement_{name}"] = (
-                ("time", f"{name}_node", "axis"),
-                u,
-                "m",
-                f"{name} pad's displacements",
-            )
-            if getattr(s, f"v_{k}").numel():
-                nodes3 = ("time", f"{name}_node", "axis")
-                columns[f"velocity_{name}"] = (nodes3, getattr(s, f"v_{k}"), "m/s", f"{name} pad's nodal velocities")
+        columns: dict[str, tuple[tuple[str, ...], Tensor, str, str]] = {}
+        left = dict(self.channels)
+        for name, variable in VARIABLES.items():
+            keys = list(variable.symbols)
+            if all(key in left for key in keys):
+                parts = [left.pop(key) for key in keys]
+                dims = ("time", "axis") if len(parts) == 2 else ("time",)
+                value = torch.stack(parts, -1) if len(parts) == 2 else parts[0]
+                columns[name] = (dims, value, variable.unit, variable.meaning)
+        columns |= {name: (("time",), value, "", "channel of the rig") for name, value in left.items()}
+        columns["energy_injected"] = (("time",), self.injected, "J", "positive part of the sources' work")
+        columns["energy_residual"] = (("time",), self.energy_residual, "J", "stored - supplied + dissipated")
+        for key, force in self.force.items():
+            name = PADS.get(key, key)
+            points = ("time", f"{name}_surface")
+            columns[f"normal_force_{name}"] = (points, force[..., 0], "N", f"normal force at the contact {name}")
+            columns[f"friction_force_{name}"] = (points, force[..., 1], "N", f"friction at the contact {name}")
+            stretch = self.state.stretch[key]
+            columns[f"stretch_{name}"] = (points, stretch, "m", "stretch of the momentary springs")
+        for key, u in self.displacement.items():
+            name = PADS.get(key, key)
+            nodes = ("time", f"{name}_node", "axis")
+            columns[f"displacement_{name}"] = (nodes, u, "m", f"displacements of the pad {name}")
+            if key in self.state.rates:
+                columns[f"velocity_{name}"] = (nodes, self.state.rates[key], "m/s", f"nodal velocities of the pad {name}")
         for kind in ("energy", "dissipated", "supplied"):
             for name, value in getattr(self, kind).items():
-                columns[f"{kind}_{name}"] = (t, value, "J", f"{kind}: {name}")
+                columns[f"{kind}_{name}"] = (("time",), value, "J", f"{kind}: {name}")
         data = {
             name: (dims, value.detach().numpy(), {"units": unit, "long_name": meaning})
             for name, (dims, value, unit, meaning) in columns.items()
@@ -124,8 +124,30 @@ class Trajectory:
 
     def save(self, path: str | Path) -> None:
         """Write NetCDF. The file appears whole or not at all."""
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_name(path.name + ".partial")
-        self.to_dataset().to_netcdf(partial, engine="h5netcdf")
-        partial.replace(path)
+        with replacing(path) as partial:
+            self.to_dataset().to_netcdf(partial, engine="h5netcdf")
+
+
+def channels(rig: Rig, state: State, signals: Tensor, moments: dict[str, Tensor] | None = None) -> dict[str, Tensor]:
+    """Every channel of states (...) by its key: coordinates and rates of the bodies, signals, efforts, moments (Eq. 35)."""
+    out: dict[str, Tensor] = {}
+    for name in rig.bodies:
+        symbol, pose, velocity = rig.symbols[name], state.pose[name], state.velocity[name]
+        for i, key in enumerate((f"x_{symbol}", f"y_{symbol}", f"theta_{symbol}")):
+            out[key] = pose[..., i]
+        for i, key in enumerate((f"v_x_{symbol}", f"v_y_{symbol}", f"omega_{symbol}")):
+            out[key] = velocity[..., i]
+        if rig.bodies[name].freedom["theta"] == "free":
+            out[f"L_{symbol}"] = rig.bodies[name].inertia.detach() * velocity[..., 2]
+    for i, name in enumerate(rig.signals):
+        out[name], out[f"{name}_dot"] = signals[..., i, 0], signals[..., i, 1]
+    for name in rig.actuators:
+        out[f"F_{name}"] = rig.actuator_effort(name, state, signals)
+    out |= {f"M_{name}": moment for name, moment in (moments or {}).items()}
+    return {rig.renamed.get(key, key): value for key, value in out.items()}
+
+
+def rigid_components(layout: Layout, names: Sequence[str]) -> slice:
+    """The state's components from the first free velocity or pose on, where these stand together at its end."""
+    first = min(where.start for (part, _), where in layout.slices.items() if part in names)
+    return slice(first, layout.size)

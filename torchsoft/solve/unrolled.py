@@ -1,126 +1,157 @@
-"""The same implicit step in plain torch: the reference of the adjoint, and the path for a law written in torch.
+"""The same implicit step in plain torch, every operation recorded by autograd: the reference of the compiled derivatives.
 
-One stage is solved by Newton's method with the Jacobian from forward-mode differentiation, and its last iteration is taken
-with the gradient on, so that backpropagation through many steps is exact. Slow (tens of milliseconds a step) and for short
-windows; massless pads, one state at a time. Any `FrictionLaw` works, a neural network's too.
+One stage is solved by Newton's method with the Jacobian from forward-mode differentiation of the rig's own laws, and its last
+iteration is taken with the gradient on, so that backpropagation through many steps is exact. Slow, for short windows; massless
+pads, one state at a time.
 """
 
 import torch
 from torch import Tensor
 
-from torchsoft.contact import cross, moving_frame
+from torchsoft.physics.condensed import free_rates, point_inputs
+from torchsoft.physics.contact import cross, free_law, interface_law, turned
+from torchsoft.physics.motion import Reference
+from torchsoft.physics.rig import Rig
+from torchsoft.physics.state import State
 from torchsoft.solve.grid import check_times, chunks
-from torchsoft.kernels.run import GAMMA
-from torchsoft.model import SoftGrasp
-from torchsoft.state import State
+from torchsoft.solve.kernel.run import GAMMA, MIX
 
 WINDOW = 3e-4
-"""How near to touching [m] a node has to be at the start of a stage to be an unknown of it."""
+"""How near to touching [m] a point has to be at the start of a stage to be an unknown of it."""
 
 
 def unrolled_solution(
-    model: SoftGrasp, y0: Tensor, t: Tensor, *, step: float = 2e-3, tolerance: float = 1e-15, max_iterations: int = 40
-) -> Tensor:
-    """States (T, size) at the times t (T,), by the steps that `simulate` takes, every operation recorded by autograd.
+    rig: Rig, y0: Tensor, t: Tensor, reference: Reference | None = None, *, step: float = 2e-3, tolerance: float = 1e-12,
+    max_iterations: int = 40,
+) -> Tensor:  # fmt: skip
+    """States (T, size) at the times t (T,), by the steps that `simulate` takes.
 
-    `tolerance` is Newton's, on the residual of the pads' rates times a h, and of the velocities times a h [m, rad].
-    Raises `NotImplementedError` for inertial pads and `RuntimeError` when Newton's method does not converge.
+    `tolerance` is Newton's, on the residuals of nodal rates and free velocities [m/s, rad/s]. Raises `NotImplementedError` for
+    inertial pads and `RuntimeError` when Newton's method does not converge.
     """
     check_times(t)
-    if not model.massless:
-        raise NotImplementedError("the unrolled step is for massless pads; set pad.fidelity = 'massless'")
+    if any(pad.inertial for pad in rig.pads.values()):
+        raise NotImplementedError("the unrolled step is for massless pads; use gradient='discrete'")
     y, out = y0, [y0]
-    mix = (1.0 - GAMMA) / GAMMA
     for h, starts, keep in chunks(t, step):
         for start, output in zip(starts, keep):
-            Y_1 = _stage(model, y, start + GAMMA * h, GAMMA * h, tolerance, max_iterations)
-            y = _stage(model, y + mix * (Y_1 - y), start + h, GAMMA * h, tolerance, max_iterations)
+            Y_1 = _stage(rig, y, start + GAMMA * h, GAMMA * h, reference, tolerance, max_iterations)
+            y = _stage(rig, y + MIX * (Y_1 - y), start + h, GAMMA * h, reference, tolerance, max_iterations)
             if output:
                 out.append(y)
     return torch.stack(out)
 
 
-def _stage(model: SoftGrasp, y_star: Tensor, time: float, ah: float, tolerance: float, max_iterations: int) -> Tensor:
-    """Y = y* + a h f(time, Y). Unknowns: u' of the nodes that may touch, and V = (v_C, omega, v_Br)."""
-    star, tau = model.layout.unpack(y_star), model.material.tau
-    stiff = tau + ah
-    V_star = torch.cat((star.v_C, star.omega[None], star.v_Br))
-    inertia = torch.stack((model.m_C, model.m_C, model.inertia, model.m_Br, model.m_Br))
-    want = model.reference(torch.tensor(time, dtype=torch.float64))
-    u_star, s_star = {"L": star.u_L, "U": star.u_U}, {"L": star.s_L, "U": star.s_U}
-    with torch.no_grad():
-        near = {k: torch.nonzero(model.frame(k, star).g > -WINDOW)[:, 0] for k in "LU"}
-    sizes = [2 * len(near["L"]), 2 * len(near["U"]), 5]
-    dofs = {k: (2 * near[k][:, None] + torch.arange(2)).flatten() for k in "LU"}
-    columns = {k: model.pads[k].compliance(model.material)[:, dofs[k]] for k in "LU"}
+def _stage(
+    rig: Rig, y_star: Tensor, time: float, a: float, reference: Reference | None, tolerance: float, max_iterations: int
+) -> Tensor:
+    """Y = y* + a f(time, Y). Unknowns: u' of the nodes that may be loaded, pad by pad, and the free velocities."""
+    signals = rig.follow(torch.tensor(time, dtype=torch.float64), reference)
+    star, free = rig.unpack(y_star, signals), rig.layout.free
+    V_star = torch.cat([star.velocity[name][axes] for name, axes in free.items()])
+    inertia = torch.cat([torch.stack(list(rig.bodies[name].masses))[axes] for name, axes in free.items()])
+    u_star = {name: rig.displacement(name, star) for name in rig.pads}
+    near, loaded, relation = {}, {}, {}
+    for key, contact in rig.contacts.items():
+        with torch.no_grad():
+            near[key] = torch.nonzero(rig.penetration(key, star) > -WINDOW)[:, 0]
+    for name, pad in rig.pads.items():
+        touched = sum((pad.spread[near[key]] != 0).any(0) for key, c in rig.contacts.items() if c.pad == name)
+        loaded[name] = torch.nonzero(touched)[:, 0] if isinstance(touched, Tensor) else torch.zeros(0, dtype=torch.long)
+        relation[name] = free_rates(pad, star.pads[name], a)
+    sizes = [*(2 * len(nodes) for nodes in loaded.values()), len(V_star)]
 
-    def interface(k: str, u_dot: Tensor, V: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Force on the near nodes of one pad, their levers, and their stretch rates, at the end of the stage."""
-        pad, nodes = model.pads[k], near[k]
-        p = pad.positions[nodes] + u_star[k][nodes] + ah * u_dot
-        w = V[:2] - u_dot
-        if k == "U":
-            p, w = p + star.r_Br + ah * V[3:], w - V[3:]
-        frame = moving_frame(model.shape, p, star.r_C + ah * V[:2], star.theta + ah * V[2])
-        v = w + V[2] * cross(frame.d)
-        flow = [(axis * v).sum(-1) for axis in (frame.n, frame.t)]
-        contact = model.contact(frame.g, *flow, s_star[k][nodes], model.share(pad)[nodes], stage=ah)
-        return contact.F_N[:, None] * frame.n + contact.F_T[:, None] * frame.t, frame.d, contact.s_dot
+    def moved(V: Tensor) -> State:
+        """Poses and velocities at the end of the stage; pads and stretches as in y*."""
+        pose, velocity = dict(star.pose), dict(star.velocity)
+        for (name, axes), own in zip(free.items(), V.split([len(axes) for axes in free.values()])):
+            index = torch.tensor(axes, dtype=torch.long)
+            velocity[name] = velocity[name].index_copy(0, index, own)
+            pose[name] = pose[name].index_copy(0, index, pose[name][index] + a * own)
+        return star._replace(pose=pose, velocity=velocity)
+
+    def interfaces(rates: dict[str, Tensor], at: State) -> dict[str, tuple[Tensor, Tensor]]:
+        """Law inputs and outputs of every contact's near points."""
+        out = {}
+        for key, contact in rig.contacts.items():
+            pad, nodes = rig.pads[contact.pad], loaded[contact.pad]
+            spread = pad.spread[near[key]]
+            u_dot = spread[:, nodes] @ rates[contact.pad]
+            shape = rig.bodies[contact.body].shape
+            assert shape is not None
+            x = point_inputs(rig, key, at, spread @ u_star[contact.pad] + a * u_dot, u_dot, near[key], a)
+            out[key] = x, interface_law(contact.law, shape, x)
+        return out
+
+    def forces(key: str, out: Tensor) -> Tensor:
+        """Nodal forces of one contact on the loaded nodes of its pad."""
+        name = rig.contacts[key].pad
+        return rig.pads[name].spread[near[key]][:, loaded[name]].mT @ out[:, :2]
 
     def residual(x: Tensor) -> Tensor:
-        *u_dots, V = x.split(sizes)
-        pads, force, torque, on_bracket = [], torch.zeros_like(V[:2]), torch.zeros_like(V[0]), torch.zeros_like(V[:2])
-        for k, part in zip("LU", u_dots):
-            f, d, _ = interface(k, part.unflatten(-1, (-1, 2)), V)
-            pads.append(ah * (part + (u_star[k][near[k]].flatten() - columns[k][dofs[k]] @ f.flatten()) / stiff))
-            force = force - f.sum(0)  # (16), (19)
-            torque = torque - (cross(d) * f).sum()  # (18)
-            on_bracket = f.sum(0)
-        r_C, r_Br = star.r_C + ah * V[:2], star.r_Br + ah * V[3:]
-        F_x, F_y = model.controllers(want, r_C, V[:2], r_Br, V[3:])
-        weight = torch.stack((torch.zeros_like(F_x), -model.m_C * model.gravity))
-        load = torch.cat((force + weight, torque[None], on_bracket + torch.stack((F_x, F_y))))
-        return torch.cat((*pads, ah * (V - V_star - ah * load / inertia)))
+        *parts, V = x.split(sizes)
+        rates = {name: part.unflatten(-1, (-1, 2)) for name, part in zip(rig.pads, parts)}
+        at = moved(V)
+        found, rows = interfaces(rates, at), []
+        loads = {name: torch.zeros(3, dtype=torch.float64) for name in rig.bodies}
+        for name, body in rig.bodies.items():
+            if body.weighted:
+                loads[name] = loads[name] - body.mass * rig.gravity * torch.tensor([0.0, 1.0, 0.0]).double()
+        for name, actuator in rig.actuators.items():
+            body, _, axis = actuator.pushes.partition(".")
+            along = torch.eye(3, dtype=torch.float64)[("x", "y", "theta").index(axis)]
+            loads[body] = loads[body] + rig.actuator_effort(name, at, signals) * along
+        for key, (inputs, out) in found.items():
+            contact = rig.contacts[key]
+            r_B, _ = rig.base_motion(contact.pad, at)
+            d, f = inputs[:, 3:5], out[:, :2]
+            total = turned(f.sum(0), r_B[2])  # (16), (19)
+            loads[contact.body] = loads[contact.body] - torch.cat((total, (cross(d) * f).sum()[None]))  # (18)
+            base = rig.pads[contact.pad].base
+            if base is not None:
+                p = d + turned(at.pose[contact.body][:2] - r_B[:2], -r_B[2])
+                loads[base] = loads[base] + torch.cat((total, (cross(p) * f).sum()[None]))
+        for name in rig.pads:
+            own, P = relation[name]
+            dofs = (2 * loaded[name][:, None] + torch.arange(2)).flatten()
+            F = sum(forces(key, out) for key, (_, out) in found.items() if rig.contacts[key].pad == name)
+            if len(dofs):
+                assert isinstance(F, Tensor)
+                rows.append(rates[name].flatten() - own[loaded[name]].flatten() - P[dofs][:, dofs] @ F.flatten())
+        load = torch.cat([loads[name][axes] for name, axes in free.items()])
+        return torch.cat((*rows, V - V_star - a * load / inertia))
 
     with torch.no_grad():
-        x = torch.cat((*(torch.zeros(n, dtype=torch.float64) for n in sizes[:2]), V_star))
+        x = torch.cat((torch.zeros(sum(sizes[:-1]), dtype=torch.float64), V_star))
         r = residual(x)
         for _ in range(max_iterations):
             J = torch.func.jacfwd(residual)(x)
             if float(r.abs().max()) <= tolerance:
                 break
-            step, part = torch.linalg.solve(J, r[:, None])[:, 0], 1.0
+            change, part = torch.linalg.solve(J, r[:, None])[:, 0], 1.0
             while True:
-                trial = residual(x - part * step)
+                trial = residual(x - part * change)
                 if float(trial.norm()) < float(r.norm()) or part < 1 / 64:
                     break
                 part *= 0.5
-            x, r = x - part * step, trial
+            x, r = x - part * change, trial
         else:
             raise RuntimeError(f"the unrolled step did not converge at t = {time:.4f} s; try a smaller step")
     x = x - torch.linalg.solve(J, residual(x)[:, None])[:, 0]  # the implicit function theorem's derivative
 
-    *u_dots, V = x.split(sizes)
-    u, s = {}, {}
-    zero = torch.zeros((), dtype=torch.float64)
-    for k, part in zip("LU", u_dots):
-        f, _, s_dot = interface(k, part.unflatten(-1, (-1, 2)), V)
-        u_dot = ((columns[k] @ f.flatten()).unflatten(-1, (-1, 2)) - u_star[k]) / stiff
-        far = model.contact(zero - 1.0, zero, zero, s_star[k], model.share(model.pads[k]), stage=ah).s_dot
-        u[k], s[k] = u_star[k] + ah * u_dot, s_star[k] + ah * far.index_copy(0, near[k], s_dot)
-    return model.layout.pack(
-        State(
-            u_L=u["L"],
-            u_U=u["U"],
-            s_L=s["L"],
-            s_U=s["U"],
-            r_C=star.r_C + ah * V[:2],
-            theta=star.theta + ah * V[2],
-            r_Br=star.r_Br + ah * V[3:],
-            v_L=star.v_L,
-            v_U=star.v_U,
-            v_C=V[:2],
-            omega=V[2],
-            v_Br=V[3:],
-        )
-    )
+    *parts, V = x.split(sizes)
+    at = moved(V)
+    found = interfaces({name: part.unflatten(-1, (-1, 2)) for name, part in zip(rig.pads, parts)}, at)
+    pads, stretch = {}, {}
+    for name, pad in rig.pads.items():
+        F = torch.zeros(pad.nodes, 2, dtype=torch.float64)
+        for key, (_, out) in found.items():
+            if rig.contacts[key].pad == name:
+                F = F + pad.spread[near[key]].mT @ out[:, :2]
+        times = pad.material.chain()[1][:, None, None]
+        pads[name] = star.pads[name] + a * (F - star.pads[name]) / (times + a)
+    for key, (_, out) in found.items():
+        s, weight = star.stretch[key], rig.weight(key)
+        far = free_law(rig.contacts[key].law, torch.stack((s, weight, torch.full_like(weight, a)), -1))[0]
+        stretch[key] = s + a * far.index_copy(0, near[key], out[:, 2])
+    return rig.pack(at._replace(pads=pads, stretch=stretch))
