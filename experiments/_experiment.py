@@ -12,6 +12,7 @@ import tyro
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from torchsoft import Rig
 from torchsoft.files import replacing, write_json
 from torchsoft.plot.figures import save
 
@@ -47,6 +48,18 @@ def made_by(config: Any, **more: Any) -> dict[str, Any]:
 def raw_config(config: Any) -> dict[str, Any]:
     """Version and configuration as JSON values, at the top of a summary."""
     return {"torchsoft": version("torchsoft"), "config": asdict(config) | {"out": str(config.out)}}
+
+
+@torch.no_grad()
+def at_the_points(rig: Rig, t: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+    """Penetration [m] and slip speed [m/s] of all contact points, (T, points) each, in the states y (T, size)."""
+    state = rig.unpack(y, rig.follow(t))
+    depths, speeds = [], []
+    for name, interface in rig.evaluate(t, state).interfaces.items():
+        depths.append(interface.frame.g)
+        at = rig.contacts[name].law(depths[-1], *interface.flow.unbind(-1), state.stretch[name], rig.weight(name))
+        speeds.append(at.gamma_dot.abs())
+    return torch.cat(depths, -1), torch.cat(speeds, -1)
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

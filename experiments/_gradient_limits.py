@@ -19,9 +19,8 @@ from _gradients import (
     stroke,
 )
 
-from torchsoft import Parameters, SoftGrasp
+from torchsoft import Parameters, SoftGrasp, simulate
 from torchsoft.scenario import grasp_and_roll, reference
-from torchsoft.sensitivity import sensitivities
 
 WIDTHS = (0.04, 0.02, 0.01)  # Relative half-widths over which the slope of a loss with steps is averaged.
 
@@ -39,7 +38,7 @@ def coulomb(config: Config) -> dict[str, Any]:
         ("mu_s = mu_k", 0.3, ("mu_s", "mu_k")),
     ):
         window = stroke(config, 8e-3, h, {"contact.friction": "coulomb", "contact.mu_k": mu_k}, every=2.5e-4)
-        loss, parameters = make_loss(window), dict(window.model.contact.friction.named_parameters())  # pyright: ignore[reportAttributeAccessIssue]
+        loss, parameters = make_loss(window), {name: window.model.parameter(f"contact.{name}") for name in varied}
         y = states(window)
         loss(y).backward()
         adjoint = sum(parameters[name].grad.item() for name in varied)  # pyright: ignore[reportOptionalMemberAccess]
@@ -68,7 +67,7 @@ def coulomb(config: Config) -> dict[str, Any]:
 def refinement(config: Config) -> dict[str, Any]:
     """dL/dp through slip, at the same outputs, as the step is refined; errors against the finest step's."""
     steps = [1e-3 * h for h in (*config.refinement_ms, config.refinement_ms[-1] / 2)]
-    names = ("contact.friction.mu_s", "contact.friction.mu_k", "contact.K_t")
+    names = ("contact.mu_s", "contact.mu_k", "contact.K_t")
     base = stroke(config, 16e-3, steps[-1], {}, every=4e-3)
     loss, table = make_loss(base), {}
     for h in steps:
@@ -97,12 +96,13 @@ def touch_down(config: Config, window: Window) -> dict[str, Any]:
     for label, epsilon in (("1 um", 1e-6), ("10 nm", 1e-8)):
         model = SoftGrasp(window.model.settings.override({"contact.epsilon": epsilon}))
         model.reference = window.model.reference
-        at, p = model.layout.slices["omega"].start, dict(model.named_parameters())[name]
+        at, p = model.layout.slices["velocity", "disc"].start + 2, model.parameter(name)
         out[label] = {"step_ms": [], "jump": [], "end": [], "before_error": [], "after_error": []}
         for h in (1e-3 * x for x in config.touch_ms):
             short = replace(window, model=model, y0=y0, t=linspace(start, start + 8e-3, h), step=h)
-            run = sensitivities(model, y0, short.t, [name], step=h, tolerance=NEWTON)
-            value, ends = run.dy[:, at, 0], []
+            run = simulate(model, short.t, y0=y0, step=h, tolerance=NEWTON, gradient="forward", wrt=[name])
+            assert run.sensitivities is not None
+            value, ends = run.sensitivities[:, at, 0], []
             touch = (events(short, run.y)["touch_rows"] or [len(value) // 2])[0]
             with torch.no_grad():
                 keep = p.clone()
@@ -128,7 +128,7 @@ def from_rest(config: Config) -> dict[str, Any]:
         model = SoftGrasp(Parameters().override(dict(config.changes)))
         manipulation = grasp_and_roll(model, grasp_force=75.0)
         y0 = manipulation.y0.clone()
-        y0[model.layout.slices["r_Br"].stop - 1] += offset
+        y0[model.layout.slices["pose", "bracket"].stop - 1] += offset
         model.reference = reference(model, y0, 75.0)
         window = Window("rest", model, y0, linspace(0.0, 0.1, 2e-3), 2e-3)
         loss, chosen = make_loss(window), replace(config, only=(RADIUS,))

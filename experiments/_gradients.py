@@ -8,18 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from _experiment import COARSE, timed
+from _experiment import COARSE, at_the_points, timed
 from torch import Tensor
-from torchdiffeq import odeint, odeint_adjoint
 
-from torchsoft import Parameters, SoftGrasp, press
-from torchsoft.adjoint import differentiable_solution
-from torchsoft.control import Profile, Reference
-from torchsoft.equilibrium import holding_force
-from torchsoft.implicit import ImplicitStepper
+from torchsoft import Parameters, Profile, Reference, SoftGrasp, press, simulate
+from torchsoft.physics.equilibrium import holding_force
 from torchsoft.scenario import grasp_and_roll, reference
-from torchsoft.sensitivity import sensitivities
-from torchsoft.unrolled import unrolled_solution
+from torchsoft.solve.simulate import Route
+from torchsoft.solve.trajectory import channels
 
 NEWTON = 1e-10  # Newton's tolerance of every run here [N].
 
@@ -28,10 +24,13 @@ FLOOR = (1e-7, 1e-7, 1e-6, 1e-6, 1e-6, 1e-5, 1e-7, 1e-7, 1e-3, 1e-3)
 """Smallest scale of each signal in the loss: m, m, rad, m/s, m/s, rad/s, m, m, N, N."""
 
 
-INERT = ("material.rho",)  # Parameters that massless pads do not use.
+CHANNELS = ("x_C", "y_C", "theta", "v_x", "v_y", "omega", "x_Br", "y_Br", "F_x", "F_y")
 
 
-RADIUS = "shape.radius"
+INERT = ("pad.rho",)  # Parameters that massless pads do not use.
+
+
+RADIUS = "disc.radius"
 
 
 FINER = {RADIUS: 1e-2}  # Factors on the relative steps of central differences.
@@ -64,7 +63,7 @@ class Config:
 
 def smoke(config: Config) -> Config:
     """The same questions for three parameters on a coarse mesh."""
-    only = ("contact.K_n", "contact.friction.mu_s", "material.E")
+    only = ("contact.K_n", "contact.mu_s", "pad.E")
     return replace(
         config, steps=(3e-4, 1e-4, 3e-5), full_steps=(1e-4, 1e-5), coulomb_ms=0.25, coulomb_runs=17, touch_ms=(0.4, 0.1),
         continuous_ms=0.1, refinement_ms=(2.0, 1.0), repeats=1, duration=0.6, only=only,
@@ -87,17 +86,17 @@ def linspace(start: float, end: float, step: float) -> Tensor:
     return torch.linspace(start, end, round((end - start) / step) + 1, dtype=torch.float64)
 
 
-def states(window: Window) -> Tensor:
+def states(window: Window, route: Route = "discrete") -> Tensor:
     """The run (T, size), differentiable if gradients are on."""
-    stepper = ImplicitStepper(window.model, step=window.step, tolerance=NEWTON)
-    return differentiable_solution(stepper, window.y0, window.t)[0]
+    w = window
+    return simulate(w.model, w.t, y0=w.y0, step=w.step, tolerance=NEWTON, gradient=route).y
 
 
 def signals(model: SoftGrasp, y: Tensor, t: Tensor) -> Tensor:
     """(T, 10): pose and velocity of the disc, pose of the bracket, control force."""
-    s = model.layout.unpack(y)
-    force = torch.stack(model.controllers(model.reference(t), s.r_C, s.v_C, s.r_Br, s.v_Br), -1)
-    return torch.cat((s.r_C, s.theta[:, None], s.v_C, s.omega[:, None], s.r_Br, force), -1)
+    follow = model.follow(t)
+    values = channels(model, model.unpack(y, follow), follow)
+    return torch.stack([values[name] for name in CHANNELS], -1)
 
 
 @torch.no_grad()
@@ -115,15 +114,17 @@ def make_loss(window: Window) -> Callable[[Tensor], Tensor]:
     return loss
 
 
-def scalars(model: SoftGrasp, config: Config) -> dict[str, torch.nn.Parameter]:
-    every = {name: p for name, p in model.named_parameters() if p.ndim == 0 and name not in INERT}
-    return {name: p for name, p in every.items() if not config.only or name in config.only}
+def scalars(model: SoftGrasp, config: Config) -> dict[str, Tensor]:
+    """The trained scalar parameters, called as in `Parameters`."""
+    own = dict(model.named_parameters())
+    every = {name: own[path] for name, path in model.aliases.items() if path in own and name not in INERT}
+    chosen = {name: p for name, p in every.items() if not config.only or name in config.only}
+    return {name: p for name, p in chosen.items() if p.requires_grad}
 
 
 def collect(model: SoftGrasp, names: Iterable[str]) -> Gradient:
     """The parameters' gradients, taken away from them."""
-    parameters = dict(model.named_parameters())
-    out = {n: 0.0 if (g := parameters[n].grad) is None else g.item() for n in names}
+    out = {n: 0.0 if (g := model.parameter(n).grad) is None else g.item() for n in names}
     model.zero_grad(set_to_none=True)
     return out
 
@@ -195,11 +196,14 @@ def by_sensitivities(
             _, plain = timed(lambda: states(window))
 
         def contract() -> Tensor:
-            run = sensitivities(window.model, window.y0, window.t, list(chosen), step=window.step, tolerance=NEWTON)
+            run = simulate(
+                window.model, window.t, y0=window.y0, step=window.step, tolerance=NEWTON, gradient="forward", wrt=list(chosen)
+            )
+            assert run.sensitivities is not None
             y = run.y.clone().requires_grad_(True)
             y_bar, *direct = torch.autograd.grad(loss(y), (y, *chosen.values()), allow_unused=True)
             explicit = torch.stack([torch.zeros_like(y_bar[0, 0]) if g is None else g for g in direct])
-            return torch.einsum("ti,tin->n", y_bar, run.dy) + explicit
+            return torch.einsum("ti,tin->n", y_bar, run.sensitivities) + explicit
 
         total, spent = timed(contract)
         gradient = dict(zip(chosen, total.tolist()))
@@ -211,15 +215,10 @@ def by_sensitivities(
 @torch.no_grad()
 def events(window: Window, y: Tensor) -> dict[str, Any]:
     """Nodes that touch, leave, slip and begin to slip between the outputs, and the first row with such an event."""
-    on, slipping, fastest = [], [], 0.0
-    for rows in torch.arange(len(y)).split(200):
-        graph = window.model.evaluate(window.t[rows], window.model.layout.unpack(y[rows]))
-        contact = [interface.contact for interface in graph.interfaces.values()]
-        on.append(torch.cat([interface.frame.g > 0 for interface in graph.interfaces.values()], -1))
-        speed = torch.cat([c.gamma_dot.abs() for c in contact], -1) * on[-1]
-        slipping.append(speed > 0)
-        fastest = max(fastest, speed.max().item())
-    on, slipping = torch.cat(on), torch.cat(slipping)
+    parts = [at_the_points(window.model, window.t[rows], y[rows]) for rows in torch.arange(len(y)).split(200)]
+    depth, speed = (torch.cat(part) for part in zip(*parts))
+    on = depth > 0
+    slipping = (speed > 0) & on
     touch, leave, onset = on[1:] & ~on[:-1], on[:-1] & ~on[1:], slipping[1:] & ~slipping[:-1]
     first = (touch | leave | onset).any(1).nonzero()[:, 0]
     return {
@@ -229,7 +228,7 @@ def events(window: Window, y: Tensor) -> dict[str, Any]:
         "leave": leave.sum().item(),
         "slipping": slipping.any(0).sum().item(),
         "slip_onsets": onset.sum().item(),
-        "fastest_slip_mm_s": 1e3 * fastest,
+        "fastest_slip_mm_s": 1e3 * (speed * on).max().item(),
         "first_row": first[0].item() if len(first) else 0,
         "slip_rows": onset.any(1).nonzero()[:, 0].tolist(),
         "touch_rows": touch.any(1).nonzero()[:, 0].tolist(),
@@ -242,8 +241,10 @@ def stroke(config: Config, end: float, step: float, changes: dict[str, Any], eve
     model = SoftGrasp(Parameters().override({**slippery, **dict(config.changes), **changes}))
     y0 = press(model, height := model.settings.scenario.y_Br_grasp).detach()
     load = -holding_force(model, y0)
-    x = model.layout.unpack(y0).r_C[0].item()
-    model.reference = Reference(Profile([0.0, 0.02], [x, x - 2e-3]), Profile([0.0], [height]), Profile([0.0], [load]))
+    x = model.unpack(y0).pose["disc"][0].item()
+    model.reference = Reference(
+        x_d=Profile([0.0, 0.02], [x, x - 2e-3]), y_d=Profile([0.0], [height]), F_ff=Profile([0.0], [load])
+    )
     return Window("slip", model, y0, linspace(0.0, end, every or step), step)
 
 
@@ -255,7 +256,7 @@ def windows(config: Config) -> list[Window]:
     with torch.no_grad():
         path = states(Window("path", model, manipulation.y0, linspace(0.0, roll, 0.01), 2e-3))
     above = manipulation.y0.clone()
-    above[model.layout.slices["r_Br"].stop - 1] += 2e-5
+    above[model.layout.slices["pose", "bracket"].stop - 1] += 2e-5
     lowered = SoftGrasp(model.settings)
     lowered.reference = reference(lowered, above, manipulation.grasp_force)
     stick, grasp = (0.01, 0.2) if config.smoke else (0.05, 0.4)
@@ -300,9 +301,7 @@ def judge_window(window: Window, config: Config, bar: Any) -> dict[str, Any]:
     judge, unsure, _ = central_differences(part, loss, config, config.steps)
     out["judge_uncertainty_sub_window"] = {n: unsure[n] / abs(x) if x else 0.0 for n, x in judge.items()}
     exact, _ = by_backward(part, loss, lambda: states(part), config)
-    got, costs["unrolled"] = by_backward(
-        part, loss, lambda: unrolled_solution(part.model, part.y0, part.t, step=part.step), config
-    )
+    got, costs["unrolled"] = by_backward(part, loss, lambda: states(part, "unrolled"), config)
     out["relative_error"]["unrolled"] = relative_errors(got, judge)
     out["unrolled_against_discrete"] = relative_errors(got, exact)
     bar.update()
@@ -313,11 +312,8 @@ def judge_window(window: Window, config: Config, bar: Any) -> dict[str, Any]:
     loss = make_loss(fine)
     exact, _ = by_backward(fine, loss, lambda: states(fine), replace(config, repeats=1))
 
-    def continuous() -> Tensor:
-        solve = odeint_adjoint if torch.is_grad_enabled() else odeint
-        return solve(fine.model, fine.y0, fine.t, method="rk4", options={"step_size": 2.5e-5})  # pyright: ignore[reportReturnType]
-
-    got, costs["continuous"] = by_backward(fine, loss, continuous, replace(config, repeats=min(config.repeats, 3)))
+    few = replace(config, repeats=min(config.repeats, 3))
+    got, costs["continuous"] = by_backward(fine, loss, lambda: states(fine, "continuous"), few)
     values = {n: p.item() for n, p in scalars(fine.model, config).items()}
     largest = max(abs(values[n] * x) for n, x in exact.items())
     floor = {n: INSENSITIVE * largest / value for n, value in values.items()}

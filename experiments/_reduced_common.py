@@ -9,6 +9,7 @@ import torch
 from _experiment import timed
 
 from torchsoft import Parameters, SoftGrasp, Trajectory
+from torchsoft.physics.contact import ramp
 from torchsoft.reduced.fit import Choice, Recipe, assemble, choose, fit, rollout_of, score
 from torchsoft.reduced.ode import ReducedModel
 from torchsoft.reduced.records import Record
@@ -59,9 +60,10 @@ def law(p: Parameters, **changed: float) -> dict[str, dict[str, float]]:
 def slipping(model: SoftGrasp, run: Trajectory, start: int = 0) -> float:
     """Part of the touching nodes of the upper pad that slip faster than 1 mm/s, over time."""
     with torch.no_grad():
-        at = model.evaluate(0.0, model.layout.unpack(run.y[start::20])).interfaces["U"]
+        at = model.evaluate(0.0, model.unpack(run.y[start::20])).interfaces["U"]
         touching = at.frame.g > 0
-        return float((touching & (at.contact.gamma_dot.abs() > 1e-3)).sum() / touching.sum())
+        slip = ramp(at.frame.g, model.contacts["U"].law.epsilon) * at.flow[..., 1] - at.out[..., 2]
+        return float((touching & (slip.abs() > 1e-3)).sum() / touching.sum())
 
 
 def compared(

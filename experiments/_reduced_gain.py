@@ -10,8 +10,7 @@ from _reduced_stick import Grasp, indices
 from scipy.optimize import brentq
 from tqdm import tqdm
 
-from torchsoft import SimulationFailed
-from torchsoft.control import Profile
+from torchsoft import Profile, SimulationFailed
 from torchsoft.reduced.ode import ReducedModel
 
 
@@ -67,7 +66,7 @@ def study_gain(config: Config, grasp: Grasp, A: np.ndarray, model: ReducedModel,
         row["growth_full_1_s"] = growth_full(R)
         try:
             run = grasp.move(x_full, 0.4, step=2.5e-4, sample=2.5e-4, R_80=R)
-            x_C = (run.state.r_C[:, 0] - run.state.r_C[0, 0]).numpy()
+            x_C = (run["x_C"] - run["x_C"][0]).numpy()
             early, late = (np.ptp(x_C[i:j]) for i, j in ((600, 1000), (1200, 1600)))
             row["full"] = step_response(t, x_C, height, begun)
             row["full_dies_out"] = bool(late < max(early, 1e-2 * height))

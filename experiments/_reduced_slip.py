@@ -40,8 +40,8 @@ def strokes(config: Config, travel: float, stroke_time: float, *, depth: float |
     t, start = grid(e.duration, 5e-4), 1000
     run = simulate(model, t[: start + 1], y0=y0, step=5e-4)
     rest = simulate(model, t[start:], y0=run.y[-1], step=5e-4)
-    peak = float(np.abs(np.gradient(rest.state.v_Br[:, 0].numpy(), 5e-4)).max())
-    normal = rest.force_U[..., 0]
+    peak = float(np.abs(np.gradient(rest["v_x_Br"].numpy(), 5e-4)).max())
+    normal = rest.force["U"][..., 0]
     load, nodes = float(normal.sum(-1).mean()), float((normal > 0).sum(-1).double().mean())
     return Stroke(record(rest), peak, slipping(model, rest), load, nodes, rest.stats.wall_s)
 

@@ -11,15 +11,14 @@ from _reduced_common import Config, attempt, compared, ensemble, law, rollout_ti
 from scipy.signal import cont2discrete
 from tqdm import tqdm
 
-from torchsoft import Parameters, SoftGrasp, Trajectory, simulate
-from torchsoft.control import Profile, Reference, hold
+from torchsoft import Parameters, Profile, Reference, SoftGrasp, Trajectory, hold, simulate
 from torchsoft.excitation import Waves, wave
+from torchsoft.physics.stability import linearised
 from torchsoft.reduced.fit import Recipe, assemble, choose, fit, score
 from torchsoft.reduced.ode import ReducedModel
 from torchsoft.reduced.records import STATES, Record, noisy, record, rolling_radius
 from torchsoft.reduced.terms import mechanics, polynomials
 from torchsoft.scenario import grasp_and_roll
-from torchsoft.stability import DISPLACEMENT, VELOCITY
 
 SETTLED = 1.0  # Time [s] at which the grasp has settled.
 
@@ -37,16 +36,17 @@ class Grasp:
 
     def move(self, x: Profile, duration: float, *, step: float, sample: float, **changed: float) -> Trajectory:
         """The run in which the disc is to follow x_d(t) from the settled grasp."""
-        model, s = self.model(**changed), self.p.scenario
-        model.reference = Reference(x, Profile([0.0], [s.y_Br_grasp]), Profile([0.0], [-self.force]))
-        return simulate(model, grid(duration, sample), y0=self.y, step=step)
+        still = {"y_d": Profile([0.0], [self.p.scenario.y_Br_grasp]), "F_ff": Profile([0.0], [-self.force])}
+        return simulate(
+            self.model(**changed), grid(duration, sample), y0=self.y, reference=Reference(x_d=x, **still), step=step
+        )
 
 
 def settle(p: Parameters) -> Grasp:
     model = SoftGrasp(p)
     whole = grasp_and_roll(model)
-    model.reference = Reference(Profile([0.0], [p.scenario.x_C0]), model.reference.y, model.reference.F_y)
-    y = simulate(model, torch.tensor([0.0, SETTLED], dtype=torch.float64), y0=whole.y0).y[-1]
+    grasped = Reference(x_d=Profile([0.0], [p.scenario.x_C0]), y_d=model.reference["y_d"], F_ff=model.reference["F_ff"])
+    y = simulate(model, torch.tensor([0.0, SETTLED], dtype=torch.float64), y0=whole.y0, reference=grasped).y[-1]
     return Grasp(p, y, whole.grasp_force)
 
 
@@ -60,42 +60,34 @@ def sines(config: Config, p: Parameters, size: float, band: tuple[float, float],
 
 def tapped(grasp: Grasp, config: Config) -> tuple[list[Record], np.ndarray]:
     """The taps, and the initial velocities of x_C, theta and x_Br that they began with (taps, 3)."""
-    rng, at, out, kicks = np.random.default_rng(config.seed), SoftGrasp(grasp.p).layout.slices, [], []
+    rng, (_, v, _), out, kicks = np.random.default_rng(config.seed), indices(grasp.model()), [], []
     for i in range(config.taps):
         kick = config.kick * rng.standard_normal(3) / (1.0, grasp.p.disc.radius, 1.0)
         y = grasp.y.clone()
-        y[at["v_C"].start] += kick[0]
-        y[at["omega"]] += kick[1]
-        y[at["v_Br"].start] += kick[2]
+        y[v] += torch.from_numpy(kick)
         x = sines(config, grasp.p, config.wave, config.band, i, config.tap_time)
         out.append(record(replace(grasp, y=y).move(x, config.tap_time, step=2.5e-4, sample=2.5e-4)))
         kicks.append(kick)
     return out, np.array(kicks)
 
 
-def linearised(grasp: Grasp) -> np.ndarray:
-    """dy'/dy of the full model in its settled grasp, contact and sticking as they are there."""
-    model, s = grasp.model(), grasp.p.scenario
-    model.reference = hold(s.x_C0, s.y_Br_grasp, -grasp.force)
-    size = torch.full((model.layout.size,), DISPLACEMENT, dtype=torch.float64)
-    size[model.layout.slices["v_L"].start :] = VELOCITY
-    with torch.no_grad():
-        ahead, behind = (model(0.0, grasp.y + sign * torch.diag(size)) for sign in (1.0, -1.0))
-    return ((ahead - behind) / (2 * size[:, None])).mT.numpy()
-
-
 def indices(model: SoftGrasp) -> tuple[list[int], list[int], int]:
     """Indices of x_C, theta, x_Br and of their rates in the state, and the number of internal states before them."""
     at = model.layout.slices
-    q = [at["r_C"].start, at["theta"].start, at["r_Br"].start]
-    return q, [at["v_C"].start, at["omega"].start, at["v_Br"].start], at["r_C"].start
+    q, v = (
+        [at[part, "disc"].start, at[part, "disc"].start + 2, at[part, "bracket"].start] for part in ("pose", "velocity")
+    )
+    return q, v, q[0]
 
 
 def expected(grasp: Grasp, A: np.ndarray, frequency: float = 1.0) -> dict[str, float]:
     """k, c, r and c_r of the linearised full model, pads and stretches condensed at a low frequency [Hz]."""
     model, w = grasp.model(), 2j * np.pi * frequency
     q, v, inner = indices(model)
-    masses, inner = np.array([model.m_C.item(), model.inertia.item(), model.m_Br.item()]), slice(0, inner)
+    masses, inner = (
+        np.array([model.disc.mass.item(), model.disc.inertia.item(), model.bracket.mass.item()]),
+        slice(0, inner),
+    )
     followed = np.linalg.solve(w * np.eye(inner.stop) - A[inner, inner], A[inner, q] + w * A[inner, v])
     Z = (A[np.ix_(v, q)] + w * A[np.ix_(v, v)] + A[v, inner] @ followed) * masses[
         :, None
@@ -199,7 +191,8 @@ def study_stick(config: Config, bar: tqdm) -> tuple[dict[str, Any], dict[str, An
     problem = assemble(taps, library, recipe)
     choice = choose(problem, tests, recipe, config.thresholds, feedback)
     model_ = ensemble(problem, choice.model, recipe, config.models, feedback)
-    A = linearised(grasp)
+    still = hold(x_d=x_0, y_d=p.scenario.y_Br_grasp, F_ff=-grasp.force)
+    A = linearised(model, grasp.y, still).numpy()
     static = expected(grasp, A)
     chosen = {target: [term for term, _ in pairs] for target, pairs in model_.equations().items()}
     banded = fit(assemble(in_band(grasp, A, taps, kicks), chosen, recipe), replace(recipe, threshold=0.0))

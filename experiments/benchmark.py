@@ -37,10 +37,8 @@ from tqdm import tqdm
 from torchsoft import Parameters, SoftGrasp, simulate
 from torchsoft.processes import local_processes
 from torchsoft.scenario import Manipulation, grasp_and_roll
-from torchsoft.sensitivity import sensitivities
 
-EIGHT = ["contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.friction.mu_s", "contact.friction.mu_k",
-         "material.E", "material.tau"]  # fmt: skip
+EIGHT = ("contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau")
 
 
 @dataclass(frozen=True)
@@ -74,12 +72,12 @@ def tasks(m: Manipulation, t: torch.Tensor, step: float) -> dict[str, Callable[[
     def gradient() -> None:
         m.model.zero_grad()
         run = simulate(m.model, t, y0=m.y0, step=step, gradient="discrete")
-        (run.state.theta.square().sum() + 1e3 * run.state.r_C.square().sum()).backward()
+        (run["theta"].square().sum() + 1e3 * run.together("x_C", "y_C").square().sum()).backward()
 
     return {
         "run": lambda: simulate(m.model, t, y0=m.y0, step=step),
         "gradient": gradient,
-        "jacobian": lambda: sensitivities(m.model, m.y0, t, EIGHT, step=step),
+        "jacobian": lambda: simulate(m.model, t, y0=m.y0, step=step, gradient="forward", wrt=EIGHT, rigid=True),
     }
 
 
@@ -129,8 +127,8 @@ def _one_of_many(job: tuple[int, float, float]) -> float:
     k, duration, step = job
     m: Manipulation = _worker["manipulation"]
     y0 = m.y0.clone()
-    y0[m.model.layout.slices["v_C"]] = 1e-5 * k
-    return simulate(m.model, grid(duration), y0=y0, step=step).state.r_C[-1, 0].item()
+    y0[m.model.layout.slices["velocity", "disc"]] = torch.tensor([1e-5 * k, 1e-5 * k, 0.0], dtype=torch.float64)
+    return simulate(m.model, grid(duration), y0=y0, step=step)["x_C"][-1].item()
 
 
 def batches(config: Config) -> dict[str, dict[str, float]]:
@@ -171,7 +169,11 @@ def others(config: Config) -> dict[str, dict[str, float]]:
     y0 = simulate(model, torch.tensor([0.0, begin], dtype=torch.float64), y0=m.y0, step=config.step).y[-1]
     t = torch.tensor([begin, begin + config.window], dtype=torch.float64)
     exact = simulate(model, t, y0=y0, step=config.window / 2000).y[-1]
-    part, shift = model.layout.slices["r_C"], 1e-9
+    part = model.layout.slices["pose", "disc"].start + torch.arange(2)
+    size = torch.ones(model.layout.size, dtype=torch.float64)
+    for name, pad in model.pads.items():  # nodal forces, counted by the displacement that they make
+        size[model.layout.slices["pads", name]] = 1 / pad.compliance().detach().diagonal().max()
+    shift, atol = 1e-9 * torch.diag(size), 1e-9 * size
 
     @torch.no_grad()
     def rhs(time: float, y: np.ndarray) -> np.ndarray:
@@ -180,17 +182,15 @@ def others(config: Config) -> dict[str, dict[str, float]]:
     @torch.no_grad()
     def jacobian(time: float, y: np.ndarray) -> np.ndarray:
         base = torch.from_numpy(y)
-        return (
-            ((model(time, base + shift * torch.eye(len(y), dtype=torch.float64)) - model(time, base)) / shift).numpy().T
-        )
+        return ((model(time, base + shift) - model(time, base)) / shift.diagonal()[:, None]).numpy().T
 
     def scipy_solver(method: str) -> torch.Tensor:
-        out = solve_ivp(rhs, t.tolist(), y0.numpy(), method=method, rtol=1e-6, atol=1e-9, jac=jacobian)
+        out = solve_ivp(rhs, t.tolist(), y0.numpy(), method=method, rtol=1e-6, atol=atol.numpy(), jac=jacobian)
         return torch.from_numpy(out.y[:, -1])
 
     @torch.no_grad()
     def dopri5() -> torch.Tensor:
-        solution = odeint(model, y0, t, rtol=1e-6, atol=1e-9)
+        solution = odeint(model, y0, t, rtol=1e-6, atol=atol)  # pyright: ignore[reportArgumentType]
         assert isinstance(solution, torch.Tensor)
         return solution[-1]
 

@@ -2,11 +2,11 @@
 
 The loss over a window of outputs t_k is L = mean over k and i of (1/2 + (t_k - t_0)/(t_T - t_0)) (z_ki + z_ki^2 / 2), with
 z = (q - mean q) / std q of the nominal run, constants both, and q = (x_C, y_C, theta, v_C, omega, x_Br, y_Br, F_x, F_y).
-dL/dp for every scalar parameter p comes from
+dL/dp for every scalar parameter p, the state at t_0 held, comes from
   discrete     the discrete adjoint of the implicit stepper,
   forward      forward sensitivities of the same steps, contracted with dL/dy,
   unrolled     backpropagation through the plain torch step,
-  continuous   `torchdiffeq.odeint_adjoint` with rk4 (25 us) on the right-hand side,
+  continuous   `torchdiffeq.odeint_adjoint` with dopri5 on the right-hand side,
 and is judged by central differences D(d) = (L(p + d) - L(p - d)) / 2d of the stepper at a Newton tolerance of 1e-10 N. Each
 neighbouring pair of relative steps d gives a Richardson value; the three in a row that agree best are the plateau, and their
 spread is the judge's own uncertainty. No gradient is looked at to choose the step.
@@ -138,7 +138,7 @@ def figure(result: Result) -> Figure:
     top.legend(ncols=9, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.16))
     errors = result.refinement["relative_error"]
     h = [float(key) for key in errors]
-    for (n, label), marker in zip((("contact.friction.mu_s", "mu_s"), ("contact.friction.mu_k", "mu_k"),
+    for (n, label), marker in zip((("contact.mu_s", "mu_s"), ("contact.mu_k", "mu_k"),
                                    ("contact.K_t", "K_t"), ("loss", "the loss itself")), "osvD"):  # fmt: skip
         below[0].loglog(h, [row[n] for row in errors.values()], marker=marker, label=label)
     below[0].loglog(h, [errors[f"{h[0]:g}"]["loss"] * (x / h[0]) ** 2 for x in h], "k--", label="second order")

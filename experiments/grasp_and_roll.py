@@ -28,6 +28,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Interrupted, NoEquilibrium, Parameters, SimulationFailed, SoftGrasp, Trajectory, simulate
+from torchsoft.channels import PADS
 from torchsoft.plot import diagram as drawn
 from torchsoft.plot import figures as draw
 from torchsoft.plot.animation import animate
@@ -118,29 +119,29 @@ def run(config: Config) -> Result:
 
 def summary(run: Run) -> dict[str, Any]:
     """The run in numbers; None for what it did not reach. F_y_hold_N counts downwards, at 5 s."""
-    r, s = run.trajectory, run.trajectory.state
+    r = run.trajectory
 
     def at(time: float, signal: Tensor, unit: float = 1) -> float | None:
         return unit * signal[r.at(time)].item() if time <= r.t[-1] + 1e-9 else None
 
-    held = s.r_Br[r.t >= 0.5, 1]
+    held = r["y_Br"][r.t >= 0.5]
     rolling_out = (r.t >= 1) & (r.t <= 9)
-    touching = {"lower": (r.force_L[..., 0] > 0).sum(-1), "upper": (r.force_U[..., 0] > 0).sum(-1)}
+    touching = {PADS[name]: (force[..., 0] > 0).sum(-1) for name, force in r.force.items()}
     return {
-        "x_C_mm": {str(time): at(time, s.r_C[:, 0], 1e3) for time in (0, 10, 15, 25, 30)},
-        "y_C_grasp_mm": at(0.375, s.r_C[:, 1], 1e3),
+        "x_C_mm": {str(time): at(time, r["x_C"], 1e3) for time in (0, 10, 15, 25, 30)},
+        "y_C_grasp_mm": at(0.375, r["y_C"], 1e3),
         "y_Br_hold_mm": {
             "min": 1e3 * held.min().item() if len(held) else None,
             "max": 1e3 * held.max().item() if len(held) else None,
         },
-        "theta_10_rad": at(10, s.theta),
-        "theta_30_rad": at(30, s.theta),
-        "peak_speed_mm_s": 1e3 * s.v_C[:, 0].abs().max().item(),
-        "F_y_hold_N": at(5, -r.control[:, 1]),
-        "F_x_peak_N": r.control[:, 0].abs().max().item(),
-        "M_Br_peak_Nm": r.bracket_moment.abs().max().item(),
+        "theta_10_rad": at(10, r["theta"]),
+        "theta_30_rad": at(30, r["theta"]),
+        "peak_speed_mm_s": 1e3 * r["v_x"].abs().max().item(),
+        "F_y_hold_N": at(5, -r["F_y"]),
+        "F_x_peak_N": r["F_x"].abs().max().item(),
+        "M_Br_peak_Nm": r["bracket_moment"].abs().max().item(),
         "contact_nodes": {name: at(5, count) for name, count in touching.items()},
-        "angular_momentum_sign_out": int(s.omega[rolling_out].mean().sign()) if r.t[-1] >= 9 else None,
+        "angular_momentum_sign_out": int(r["omega"][rolling_out].mean().sign()) if r.t[-1] >= 9 else None,
         "energy_residual_rel": r.energy_residual_rel,
         "steps": r.stats.steps,
         "newton_per_step": r.stats.newton_per_step,

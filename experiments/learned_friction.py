@@ -1,10 +1,10 @@
 """Question: can a friction law that is a neural network be learned inside the simulator?
 
 `MuNetwork` is a user's law: mu(v), an unknown function of the slip speed, is a small network in
-(eta + R) |gamma'| = <E - mu(|gamma'|) F_N>+, solved by a few fixed-point sweeps. It has `slip_rate(E, F_N, R, eta)` and is
-assigned to `model.contact.friction`; nothing else of the model changes. It learns from the disc's motion alone (pose and
-velocity, a few milliseconds after a kick that makes it slip), made by the built-in law
-mu(v) = mu_k + (mu_s - mu_k) / (1 + v / v_s), by backpropagation through `unrolled_solution`.
+(eta + R) |gamma'| = <E - mu(|gamma'|) F_N>+, solved by a few fixed-point sweeps. It is a module of (E, F_N, R) that gives the
+slip rate, and is handed to the model as its friction; nothing else of the model changes, and it runs compiled. It learns from
+the disc's motion alone (pose and velocity, a few milliseconds after a kick that makes it slip), made by the built-in law
+mu(v) = mu_k + (mu_s - mu_k) / (1 + v / v_s), by the discrete adjoint of the run.
 
 Command: .venv/bin/python experiments/learned_friction.py [--smoke]
 Expected: the loss falls by more than 100 times in 40 runs of the model, and mu is learned to 0.01 on average over the slip
@@ -17,14 +17,12 @@ from importlib.metadata import version
 from pathlib import Path
 
 import torch
-from _experiment import COARSE, options, write
+from _experiment import COARSE, at_the_points, options, write
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from torchsoft import Parameters, SoftGrasp, press, simulate
-from torchsoft.contact import SmoothSlip
-from torchsoft.unrolled import unrolled_solution
+from torchsoft import Parameters, SmoothSlip, SoftGrasp, Trajectory, press, simulate
 
 SWEEPS = 4
 """Fixed-point sweeps for mu(v) and v; each shrinks the error by about (mu_s - mu_k) F_N / ((eta + R) v_s), 0.1 here."""
@@ -61,9 +59,9 @@ class Result:
 class MuNetwork(nn.Module):
     """Friction whose coefficient is a network of the slip speed: mu(v) = 0.5 + 0.4 tanh(net(log(1 + v / v_0)))."""
 
-    def __init__(self, v_0: float = 0.01, width: int = 8) -> None:
+    def __init__(self, eta: float, v_0: float = 0.01, width: int = 8) -> None:
         super().__init__()
-        self.v_0 = v_0
+        self.eta, self.v_0 = eta, v_0
         last = nn.Linear(width, 1)
         nn.init.zeros_(last.weight)
         nn.init.zeros_(last.bias)
@@ -73,10 +71,10 @@ class MuNetwork(nn.Module):
         """Friction coefficient at the slip speed v (...) [m/s]."""
         return 0.5 + 0.4 * torch.tanh(self.net(torch.log1p(v[..., None] / self.v_0))[..., 0])
 
-    def slip_rate(self, E: Tensor, F_N: Tensor, R: Tensor, eta: Tensor) -> Tensor:
+    def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
         v = torch.zeros_like(E + F_N)
         for _ in range(SWEEPS):
-            v = (E - self.mu(v) * F_N).clamp(min=0.0) / (eta + R)
+            v = (E - self.mu(v) * F_N).clamp(min=0.0) / (self.eta + R)
         return v
 
 
@@ -84,11 +82,9 @@ def true_mu(law: SmoothSlip, v: Tensor) -> Tensor:
     return law.mu_k + (law.mu_s - law.mu_k) / (1 + v / law.v_s)
 
 
-def disc(model: SoftGrasp, y: Tensor) -> Tensor:
+def disc(run: Trajectory) -> Tensor:
     """(T, 6): pose and velocity of the disc, in units of `SCALE`."""
-    s = model.layout.unpack(y)
-    rows = torch.cat((s.r_C, s.theta[:, None], s.v_C, s.omega[:, None]), -1)
-    return rows / torch.tensor(SCALE, dtype=torch.float64)
+    return run.together("x_C", "y_C", "theta", "v_x", "v_y", "omega") / torch.tensor(SCALE, dtype=torch.float64)
 
 
 def run(config: Config) -> Result:
@@ -97,24 +93,23 @@ def run(config: Config) -> Result:
     law = {"contact.mu_s": 0.8, "contact.mu_k": 0.3, "contact.v_s": 0.05}
     model = SoftGrasp(Parameters().override(COARSE | law))
     y0 = press(model, model.settings.scenario.y_Br_grasp).detach()
-    y0[model.layout.slices["v_C"]] = torch.tensor([config.kick, 0.0], dtype=torch.float64)
+    y0[model.layout.slices["velocity", "disc"]] = torch.tensor([config.kick, 0.0, 0.0], dtype=torch.float64)
     step = 1e-3 * config.step_ms
     t = step * torch.arange(config.samples + 1, dtype=torch.float64)
 
-    truth = model.contact.friction
+    truth = model.contacts["L"].law.friction
     assert isinstance(truth, SmoothSlip)
-    with torch.no_grad():
-        made = simulate(model, t, y0=y0, step=step)
-        data, graph = disc(model, made.y), model.evaluate(0.0, model.layout.unpack(made.y[1:]))
-        speeds = torch.cat([interface.contact.gamma_dot.abs().flatten() for interface in graph.interfaces.values()])
+    made = simulate(model, t, y0=y0, step=step)
+    data, (_, speeds) = disc(made), at_the_points(model, t[1:], made.y[1:])
     excited = speeds[speeds > 0]
 
-    student = MuNetwork()
+    student = MuNetwork(truth.eta.item())
+    learner = SoftGrasp(model.settings, friction=student)
     v = torch.linspace(0.0, 1.3 * float(excited.max()), 100, dtype=torch.float64)
     with torch.no_grad():
         start, exact = student.mu(v), true_mu(truth, v)
-    model.requires_grad_(False)
-    model.contact.friction = student
+    learner.requires_grad_(False)
+    student.requires_grad_(True)
     optimiser = torch.optim.LBFGS(
         student.parameters(), max_iter=config.evaluations, max_eval=config.evaluations, line_search_fn="strong_wolfe"
     )
@@ -123,7 +118,7 @@ def run(config: Config) -> Result:
 
     def misfit() -> Tensor:
         optimiser.zero_grad()
-        loss = (disc(model, unrolled_solution(model, y0, t, step=step)) - data).square().mean()
+        loss = (disc(simulate(learner, t, y0=y0, step=step, gradient="discrete")) - data).square().mean()
         loss.backward()
         losses.append(loss.item())
         bar.set_postfix(loss=f"{min(losses):.3g}")

@@ -11,12 +11,11 @@ Expected: on the manipulation the disc differs by some nanometres and the forces
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
+import torch
 from _experiment import grid, made_by, markdown, options, write
+from torch import Tensor
 
-from torchsoft import Parameters, SoftGrasp, Trajectory, simulate
-from torchsoft.channels import CHANNELS
-from torchsoft.control import Profile
+from torchsoft import Parameters, Profile, SoftGrasp, Trajectory, simulate
 from torchsoft.scenario import grasp_and_roll
 
 UNITS = {
@@ -40,12 +39,10 @@ class Result:
     differences: dict[str, dict[str, dict[str, float]]]
 
 
-def signals(run: Trajectory) -> dict[str, np.ndarray]:
-    data = run.to_dataset()
-    keys = {name: "bracket_moment" if name == "M_Br" else name for name in UNITS if not name.startswith("nodal")}
-    out = {name: CHANNELS[key].of(data[CHANNELS[key].variable].values) for name, key in keys.items()}
-    force = np.concatenate((run.force_L.numpy(), run.force_U.numpy()), 1)
-    return out | {"nodal normal force": force[..., 0], "nodal friction": force[..., 1]}
+def signals(run: Trajectory) -> dict[str, Tensor]:
+    out = {name: run["bracket_moment" if name == "M_Br" else name] for name in UNITS if not name.startswith("nodal")}
+    normal, friction = torch.cat(list(run.force.values()), 1).unbind(-1)
+    return out | {"nodal normal force": normal, "nodal friction": friction}
 
 
 def compare(duration: float, step: float, stroke: float | None, grasp_force: float) -> dict[str, dict[str, float]]:
@@ -58,12 +55,12 @@ def compare(duration: float, step: float, stroke: float | None, grasp_force: flo
         model = SoftGrasp(Parameters().override({"pad.fidelity": fidelity}))
         manipulation = grasp_and_roll(model, grasp_force=grasp_force)
         if stroke is not None:
-            model.reference.x = Profile([0.6, 0.6 + stroke], [0.06, 0.04])
+            model.reference.signals["x_d"] = Profile([0.6, 0.6 + stroke], [0.06, 0.04])
         runs[fidelity] = signals(simulate(model, grid(duration), y0=manipulation.y0, step=step, progress=True))
     out = {}
     for name, (_, scale) in UNITS.items():
         massless, inertial = runs["massless"][name], runs["inertial"][name]
-        difference, span = float(np.abs(inertial - massless).max()), float(np.ptp(massless))
+        difference, span = float((inertial - massless).abs().max()), float(massless.max() - massless.min())
         out[name] = {"difference": scale * difference, "range": scale * span, "relative": difference / span}
     return out
 

@@ -61,20 +61,19 @@ def manipulate(changes: dict[str, Any], step: float, duration: float, grasp_forc
 
 
 def signals(run: Trajectory) -> dict[str, Tensor]:
-    r_C, F = run.state.r_C.unbind(-1), run.control.unbind(-1)
-    return {"x_C": r_C[0], "y_C": r_C[1], "theta": run.state.theta, "F_x": F[0], "F_y": F[1]}
+    return {name: run[name] for name in ("x_C", "y_C", "theta", "F_x", "F_y")}
 
 
 def figures_of_merit(run: Trajectory) -> dict[str, float]:
     """Numbers that sum up one run of the manipulation."""
-    normal, friction = run.force_L[..., 0], run.force_L[..., 1]
+    normal, friction = run.force["L"].unbind(-1)
     grasped = run.at(0.375)
     return {
-        "x_C_end_mm": 1e3 * run.state.r_C[-1, 0].item(),
-        "y_C_grasp_mm": 1e3 * run.state.r_C[grasped, 1].item(),
-        "theta_end_rad": run.state.theta[-1].item(),
-        "F_y_grasp_N": -run.control[grasped, 1].item(),
-        "F_x_peak_N": run.control[:, 0].abs().max().item(),
+        "x_C_end_mm": 1e3 * run["x_C"][-1].item(),
+        "y_C_grasp_mm": 1e3 * run["y_C"][grasped].item(),
+        "theta_end_rad": run["theta"][-1].item(),
+        "F_y_grasp_N": -run["F_y"][grasped].item(),
+        "F_x_peak_N": run["F_x"].abs().max().item(),
         "locked_friction": (friction[grasped].abs().sum() / normal[grasped].sum()).item(),
         "slip_loss_mJ": 1e3 * run.dissipated["slip"][-1].item(),
         "energy_residual_rel": run.energy_residual_rel,
@@ -90,13 +89,13 @@ def run(config: Config) -> Result:
     force = grasp_and_roll(SoftGrasp()).grasp_force
     fine = manipulate({}, 1e-3 * config.reference_ms, config.duration, force)
     bar.update()
-    steps, traces = {}, {f"{config.reference_ms} ms": (fine.t, fine.control[:, 0])}
+    steps, traces = {}, {f"{config.reference_ms} ms": (fine.t, fine["F_x"])}
     for step in config.steps_ms:
         coarse = manipulate({}, 1e-3 * step, config.duration, force)
         exact, got = signals(fine), signals(coarse)
         error = {name: ((got[name] - x).abs().max() / (x.max() - x.min())).item() for name, x in exact.items()}
         steps[f"{step} ms"] = error | {k: v for k, v in figures_of_merit(coarse).items() if k[:2] in ("en", "ne", "wa")}
-        traces[f"{step} ms"] = (coarse.t, coarse.control[:, 0])
+        traces[f"{step} ms"] = (coarse.t, coarse["F_x"])
         bar.update()
     meshes, etas = {}, {}
     for n in config.elements_x:

@@ -27,7 +27,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Parameters, SoftGrasp, press
-from torchsoft.contact import normal_force
+from torchsoft.physics.equilibrium import holding_force
 
 MILLI, MICRO = 1e3, 1e6
 
@@ -103,15 +103,14 @@ def indent(elements_x: int, stiffening: float, compressions: Tensor, bar: tqdm) 
     K_n = stiffening * Parameters().contact.K_n
     p = Parameters().override({"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30, "contact.K_n": K_n})
     model = SoftGrasp(p)
-    spring, none = model.share(model.pad_U) * model.contact.K_n, torch.zeros((), dtype=torch.float64)
-    rows = []
+    pad, rows = model.pads["U"], []
     for compression in compressions.tolist():
         y = press(model, p.scenario.y_Br_grasp + p.compression - compression)
-        state = model.layout.unpack(y)
-        frame = model.frame("U", state)
-        F_N = normal_force(frame.g, none, none, spring, none)
-        force = (F_N * frame.n[:, 1]).sum()
-        rows.append((force, half_width(frame.d[:, 0], frame.g), frame.g.max(), state.r_C[1], (frame.g > 0).sum()))
+        state = model.unpack(y)
+        disc, bracket, g = state.pose["disc"], state.pose["bracket"], model.penetration("U", state)
+        x = (pad.positions + model.displacement("U", state))[:, 0] + bracket[0] - disc[0]
+        force = torch.tensor(holding_force(model, y), dtype=torch.float64)
+        rows.append((force, half_width(x, g), g.max(), disc[1], (g > 0).sum()))
         bar.update()
     force, width, penetration, y_C, touching = (torch.stack(column) for column in zip(*rows))
     return Curve(compressions, force, width, penetration, y_C, touching)

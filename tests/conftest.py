@@ -1,11 +1,14 @@
-"""Shared states: models at rest, in the grasp, rolling, and at random."""
+"""Shared rigs and states: at rest, in the grasp, rolling, and at random."""
+
+from collections.abc import Callable
 
 import pytest
 import torch
 from torch import Tensor
 
-from torchsoft import Parameters, SoftGrasp, press
-from torchsoft.state import State
+from torchsoft import Body, Parameters, Reference, Rig, SoftGrasp, hold, press
+from torchsoft.physics.equilibrium import holding_force
+from torchsoft.physics.state import State
 
 torch.set_num_threads(1)
 
@@ -17,29 +20,67 @@ def coarse(**changes: object) -> SoftGrasp:
     return SoftGrasp(Parameters().override(COARSE | {k.replace("__", "."): v for k, v in changes.items()}))
 
 
-def random_state(model: SoftGrasp, seed: int, slip: float = 0.02) -> Tensor:
+def turning(**changes: object) -> Rig:
+    """The coarse rig with a bracket that may turn and has weight, driven as before; its pads are massless."""
+    model = coarse(**changes)
+    bracket = Body(0.4, inertia=3e-4)
+    rig = Rig(
+        bodies={"disc": model.disc, "bracket": bracket}, pads=dict(model.pads), contacts=dict(model.contacts),
+        actuators=dict(model.actuators), reference=model.reference,
+    )  # fmt: skip
+    rig.fixed = lambda: model  # the same rig with a bracket that does not turn
+    return rig
+
+
+RIGS: dict[str, Callable[..., Rig]] = {
+    "massless": coarse,
+    "inertial": lambda **changes: coarse(pad__fidelity="inertial", **changes),
+    "turning": turning,
+}
+
+
+def times(end: float, n: int) -> Tensor:
+    return torch.linspace(0, end, n, dtype=torch.float64)
+
+
+def f64(*values: float) -> Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def grasp(model: SoftGrasp, velocity: tuple[float, float] = (0.0, 0.0)) -> tuple[Tensor, Reference]:
+    """The frictionless grasp (size,) with the disc moving at `velocity` [m/s], and the reference that holds it there."""
+    y = press(model, model.settings.scenario.y_Br_grasp).detach()
+    pose = model.unpack(y).pose
+    y[model.layout.slices["velocity", "disc"]] = f64(*velocity, 0.0)
+    return y, hold(x_d=float(pose["disc"][0]), y_d=float(pose["bracket"][1]), F_ff=-holding_force(model, y))
+
+
+def grasped(model: SoftGrasp, velocity: tuple[float, float] = (0.0, 0.0)) -> Tensor:
+    """The grasp, after the model was given the reference that holds it."""
+    y, model.reference = grasp(model, velocity)
+    return y
+
+
+def random_state(rig: Rig, seed: int, slip: float = 0.02) -> Tensor:
     """A grasped state (size,) shaken about: touching and separated nodes, stick and slip, stretched springs."""
     generator = torch.Generator().manual_seed(seed)
-    state = model.layout.unpack(press(model, model.settings.scenario.y_Br_grasp).detach())
+    model = rig if isinstance(rig, SoftGrasp) else rig.fixed()
+    state = model.unpack(press(model, model.settings.scenario.y_Br_grasp).detach())
 
-    def noise(like: Tensor, scale: float) -> Tensor:
-        return scale * torch.randn(like.shape, generator=generator, dtype=torch.float64)
+    def shaken(part: dict[str, Tensor], scale: float | Tensor) -> dict[str, Tensor]:
+        noise = {name: torch.randn(x.shape, generator=generator, dtype=torch.float64) for name, x in part.items()}
+        return {name: x + scale * noise[name] for name, x in part.items()}
 
-    shaken = State(
-        u_L=state.u_L + noise(state.u_L, 2e-5),
-        u_U=state.u_U + noise(state.u_U, 2e-5),
-        s_L=noise(state.s_L, 2e-5),
-        s_U=noise(state.s_U, 2e-5),
-        r_C=state.r_C + noise(state.r_C, 1e-4),
-        theta=noise(state.theta, 0.3),
-        r_Br=state.r_Br + noise(state.r_Br, 1e-4),
-        v_L=noise(state.v_L, 0.01 * slip),
-        v_U=noise(state.v_U, 0.01 * slip),
-        v_C=noise(state.v_C, slip),
-        omega=noise(state.omega, slip / 0.02),
-        v_Br=noise(state.v_Br, slip),
+    force = 2e-5 if any(pad.inertial for pad in rig.pads.values()) else 0.5  # [m] or [N]
+    return rig.pack(
+        State(
+            pads=shaken(state.pads, force),
+            stretch=shaken(state.stretch, 2e-5),
+            pose=shaken(state.pose, f64(1e-4, 1e-4, 0.02)),
+            rates=shaken(state.rates, 0.01 * slip),
+            velocity=shaken(state.velocity, slip * f64(1.0, 1.0, 50.0)),
+        )
     )
-    return model.layout.pack(shaken)
 
 
 @pytest.fixture(params=["massless", "inertial"])
@@ -50,3 +91,9 @@ def fidelity(request: pytest.FixtureRequest) -> str:
 @pytest.fixture(params=["smooth", "coulomb"])
 def friction(request: pytest.FixtureRequest) -> str:
     return request.param
+
+
+@pytest.fixture(params=list(RIGS))
+def build(request: pytest.FixtureRequest) -> Callable[..., Rig]:
+    """Makes the paper's rig, the one with inertial pads, or the one whose bracket turns."""
+    return RIGS[request.param]

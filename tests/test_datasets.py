@@ -204,13 +204,27 @@ def test_xarray_opens_it_with_units(made: tuple[Path, Config]) -> None:
     assert data.normal_force_lower.attrs["units"] == "N"
     assert data.displacement_upper.dims == ("trajectory", "time", "upper_surface", "axis")
     assert all("units" in data[name].attrs for name in data.data_vars)
-    weight = float(data.normal_force_lower.isel(trajectory=0, time=50).sum())
-    assert 20 < weight < 120  # [N], the grasp
+    rest, grasp = (float(data.normal_force_lower.isel(trajectory=0, time=i).sum()) for i in (0, 50))
+    assert rest == pytest.approx(0.4065 * 9.81, rel=2e-3)  # [N], the disc's weight
+    assert 20 < grasp < 120
 
 
 def test_a_sound_dataset_has_no_finding(made: tuple[Path, Config]) -> None:
     findings = [x for x in check(str(made[0])) if "commit" not in x]
     assert findings == []
+
+
+@pytest.mark.parametrize(
+    ("fixed", "points", "stores"), [('"pad.fidelity" = "inertial"', 61, 9), ('"contact.points" = 2', 120, 7)]
+)
+def test_other_pads_and_contacts_are_kept_whole(tmp_path: Path, fixed: str, points: int, stores: int) -> None:
+    """The kinetic energy of inertial pads is in the balance; series of nodes are then those of all contact points."""
+    path = write_config(tmp_path, trajectories=1, change=("[parameters]", f"{fixed}\n[parameters]"))
+    generate(Config.from_toml(path), str(tmp_path / "set"), Serial(), progress=False)
+    assert [x for x in check(str(tmp_path / "set")) if "commit" not in x] == []
+    data = xr.open_zarr(tmp_path / "set")
+    assert (data.sizes["lower_surface"], data.sizes["store"]) == (points, stores)
+    assert float(data.normal_force_lower[0, 0].sum()) == pytest.approx(0.4065 * 9.81, rel=2e-3)
 
 
 def set_value(name: str, where: tuple[Any, ...], value: Any) -> Callable[[Path], None]:

@@ -1,142 +1,166 @@
-"""The compiled kernel equals the module: node law, its Jacobian, and the rates of a whole stage."""
+"""The compiled side equals the torch module: the laws of a point with their derivatives, and the stages of taken steps."""
 
+from collections.abc import Callable
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, random_state
-from torch import Tensor
+from conftest import coarse, f64, random_state, times
+from torch import Tensor, nn
 
-from torchsoft import kernels
-from torchsoft.contact import cross, moving_frame
-from torchsoft.implicit import ImplicitStepper
-from torchsoft.kernel_inputs import constants, pad_state
-from torchsoft.kernels.node import contact_node
-from torchsoft.kernels.pad import pad_work
-from torchsoft.kernels.run import GAMMA, run
-from torchsoft.kernels.stage import finish_pad, solve_stage
-from torchsoft.model import SoftGrasp
-from torchsoft.state import State
+from torchsoft import Ellipse, Rig, Shape, simulate
+from torchsoft.codegen.invoke import call_linearise, call_pullback, call_value
+from torchsoft.physics.contact import distance_law, free_law, interface_law
+from torchsoft.scenario import grasp_and_roll
+from torchsoft.solve import kernel
+from torchsoft.solve.kernel.run import GAMMA, run
+from torchsoft.solve.stepper import ImplicitStepper, Segment
+from torchsoft.solve.system import contact_laws
 
-NODES = 400
+POINTS = 300
 
 
-def module_node(model: SoftGrasp, x: Tensor, share: float, ah: float) -> tuple[Tensor, Tensor]:
-    """Force on one node at x = (w_x, w_y, omega, d_x, d_y, theta, s*), and the kernel's ten outputs, by the module."""
-    w, omega, d, theta, s = x[:2], x[2], x[3:5], x[5], x[6:]
-    frame = moving_frame(model.shape, d[None], torch.zeros(2, dtype=torch.float64), theta)
-    v = w + omega * cross(d)
-    g_dot, v_T = (frame.n[0] * v).sum(), (frame.t[0] * v).sum()
-    share_ = torch.tensor([share], dtype=torch.float64)
-    out = model.contact(frame.g, g_dot[None], v_T[None], s, share_, stage=ah)
-    force = out.F_N[0] * frame.n[0] + out.F_T[0] * frame.t[0]
-    rest = (out.F_N[0], out.F_T[0], out.e[0], out.gamma_dot[0], out.rho[0], frame.g[0], g_dot, v_T)
-    return force, torch.stack((*force, *rest))
+@numba.njit
+def call_all(value, linearise, pullback, x, p, w, out, again, J, p_bar):
+    call_value(value, x, p, out)
+    call_linearise(linearise, x, p, again, J)
+    call_pullback(pullback, x, p, w, p_bar)
 
 
-def random_nodes(model: SoftGrasp, seed: int) -> list[dict[str, float]]:
-    """Nodes that touch deeply, just touch (within a few epsilon), and do not touch; slow and fast; stretched or not."""
+def random_points(radius: float, seed: int, ah: float) -> np.ndarray:
+    """Inputs (points, 9) that touch deeply, just touch (within a few epsilon), and do not touch; slow and fast; stretched or
+    not."""
     rng = np.random.default_rng(seed)
-    R = model.settings.disc.radius
-    depth = np.where(rng.random(NODES) < 0.5, rng.uniform(-2e-6, 5e-6, NODES), rng.uniform(-1e-5, 1e-4, NODES))
-    angle, speed = rng.uniform(-np.pi, np.pi, NODES), 10.0 ** rng.uniform(-5, -0.5, NODES)
-    return [
-        {
-            "dx": (R - depth[i]) * np.cos(angle[i]),
-            "dy": (R - depth[i]) * np.sin(angle[i]),
-            "wx": speed[i] * rng.normal(),
-            "wy": speed[i] * rng.normal(),
-            "omega": speed[i] / R * rng.normal(),
-            "theta": rng.uniform(-2, 2),
-            "s": rng.choice([0.0, 1e-5, 1e-4]) * rng.normal(),
-            "share": rng.choice([0.5, 1.0, 2.0]),
-        }
-        for i in range(NODES)
-    ]
+    uniform = lambda low, high: rng.uniform(low, high, POINTS)
+    depth = np.where(rng.random(POINTS) < 0.5, uniform(-2e-6, 5e-6), uniform(-1e-5, 1e-4))
+    angle, speed = uniform(-np.pi, np.pi), 10.0 ** uniform(-5, -0.5)
+    w, spin = speed * rng.normal(size=(2, POINTS)), speed / radius * rng.normal(size=POINTS)
+    s, weight = rng.choice([0.0, 1e-5, 1e-4], POINTS) * rng.normal(size=POINTS), rng.choice([0.5, 1.0, 2.0], POINTS)
+    d = (radius - depth) * np.array([np.cos(angle), np.sin(angle)])
+    return np.stack((*w, spin, *d, uniform(-2, 2), s, weight, np.full(POINTS, ah)), -1)
+
+
+class Interface(nn.Module):
+    """The module's own law of a point, for `functional_call`."""
+
+    def __init__(self, law: nn.Module, shape: nn.Module) -> None:
+        super().__init__()
+        self.law, self.shape = law, shape
+
+    def forward(self, x: Tensor) -> Tensor:
+        return interface_law(self.law, self.shape, x)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize("ah", [0.0, 6e-4])
-def test_node_law_and_its_jacobian_equal_the_module(friction: str, ah: float) -> None:
+@pytest.mark.parametrize("shape", [None, Ellipse(19.4e-3, 19.3e-3)], ids=["circle", "ellipse"])
+def test_the_law_of_a_point_equals_the_module(friction: str, shape: Shape | None, ah: float) -> None:
+    """Values, Jacobian by the state and gradient by every parameter, at every kind of point."""
     model = coarse(contact__friction=friction)
-    scalars = constants(model)
-    seen = {"separated": 0, "touching": 0, "stick": 0, "slip": 0, "cut": 0}
-    for node in random_nodes(model, seed=1):
-        J, out, share = np.empty((3, 7)), np.empty(10), node["share"]
-        touches = contact_node(*node.values(), ah, scalars, J, out)
-        names = ("wx", "wy", "omega", "dx", "dy", "theta", "s")
-        x = torch.tensor([node[name] for name in names], dtype=torch.float64)
+    body = shape or model.shape
+    module, laws = Interface(model.contact, body), contact_laws(model.contact, body)
+    p = torch.cat([v.detach().reshape(1) for v in laws.parameters.values()])
+    names, w = list(laws.parameters), f64(0.3, -0.7, 1e3)
+    found = {"separated": 0, "touching": 0, "stick": 0, "slip": 0, "cut": 0}
+    law = laws.interface
+    for row in random_points(19.37e-3, 1, ah):
+        J, out, again, p_bar = np.empty((3, 7)), np.empty(7), np.empty(7), np.zeros(len(p))
+        call_all(law.value, law.linearise, law.pullback, row, p.numpy(), w.numpy(), out, again, J, p_bar)
+        np.testing.assert_array_equal(out, again)
+        x = torch.from_numpy(row)
+        with torch.no_grad():
+            g = -float(distance_law(body, x)[0])
+        if g <= 0:
+            found["separated"] += 1
+        else:
+            found["touching" if g < 5e-6 else "slip" if out[6] != 0 else "stick"] += 1
+            found["cut"] += int(out[3] == 0)
 
-        def force_and_rate(x: Tensor, share: float = share) -> Tensor:
-            force, rest = module_node(model, x, share, ah)
-            return torch.cat((force, rest[6:7] * rest[9:10] - rest[5:6]))  # s' = rho v_T - gamma'
+        def outputs(x: Tensor, p: Tensor, rest: Tensor = x[7:]) -> Tensor:
+            values = dict(zip(names, p.unbind()))
+            return torch.func.functional_call(module, values, (torch.cat((x, rest)),))
 
-        force, rest = module_node(model, x, share, ah)
-        if not touches:
-            seen["separated"] += 1
-            assert rest[7] <= 0
-            continue
-        seen["touching" if rest[7] < 5e-6 else "slip" if rest[5] != 0 else "stick"] += 1
-        seen["cut"] += int(rest[2] == 0)
-        np.testing.assert_allclose(out[:2], force.detach(), rtol=1e-11, atol=1e-11)
-        np.testing.assert_allclose(out[2:], rest[2:].detach(), rtol=1e-10, atol=1e-13)
-        jacobian = torch.autograd.functional.jacobian(force_and_rate, x).numpy()
-        # a slipping Coulomb node has zeros in it; g = R - |d| rounds to 4e-18 m, 4e-12 epsilon
+        with torch.no_grad():
+            expected = module(x)
+        np.testing.assert_allclose(out[:5], expected[:5], rtol=1e-10, atol=1e-11)
+        np.testing.assert_allclose(out[5:], expected[5:], rtol=1e-9, atol=1e-12)
+        pull = torch.func.vjp(outputs, x[:7], p)[1]
+        rows = [pull(torch.eye(7, dtype=torch.float64)[i]) for i in range(3)]
+        jacobian = torch.stack([by_x for by_x, _ in rows]).numpy()
+        by_p = sum(weight * row for weight, (_, row) in zip(w, rows)).numpy()
+        # a slipping Coulomb point has zeros in it; the distance from a boundary rounds to 4e-18 m, 4e-12 epsilon
         scale = np.abs(jacobian).max(0) + [441, 441, 9, 1e5, 1e5, 1e3, 1e5]
         assert np.all(np.abs(J - jacobian) <= 1e-11 * scale), (J, jacobian)
-    assert min(seen.values()) >= 10, seen
+        parts = np.abs(np.array([row.numpy() for _, row in rows])).max(0)
+        assert np.all(np.abs(p_bar - by_p) <= 1e-10 * (np.abs(by_p) + 1e3 * parts + 1e-9)), (names, p_bar, by_p)
+    assert min(found.values()) >= 10, found
+
+
+def test_the_law_away_from_contact_equals_the_module() -> None:
+    model = coarse()
+    laws = contact_laws(model.contact, model.shape)
+    p = np.array([v.item() for v in laws.parameters.values()])
+    for x in (f64(0.0, 1.0, 0.0), f64(2e-5, 0.5, 6e-4), f64(-3e-6, 2.0, 6e-4)):
+        out, again, J, p_bar = np.empty(3), np.empty(3), np.empty((1, 1)), np.zeros(len(p))
+        law = laws.free
+        call_all(law.value, law.linearise, law.pullback, x.numpy(), p, np.ones(1), out, again, J, p_bar)
+        np.testing.assert_allclose(out, free_law(model.contact, x).detach(), rtol=1e-14, atol=0)
+        rate = -1.2e5 / (10.0 + 441.7149 + x[2].item() * 1.2e5)
+        assert J[0, 0] == pytest.approx(rate, rel=1e-13)
+
+
+def taken_step(rig: Rig, y: Tensor, h: float) -> Segment:
+    segments: list[Segment] = []
+    stepper = ImplicitStepper(rig, step=h, tolerance=1e-11)
+    *_, last = stepper.integrate(y, f64(0.0, h), segments, float("inf"))
+    assert last.steps == 1
+    segments[0].tape = stepper.tape(segments[0])
+    segments[0].y = last.y[-1]
+    return segments[0]
 
 
 @torch.no_grad()
-@pytest.mark.parametrize(("seed", "senses"), [(0, "disc"), (1, "disc"), (2, "bracket")])
-def test_stage_rates_equal_forward(fidelity: str, seed: int, senses: str) -> None:
-    """k of a solved stage is f(t, y + a h k): pads, contact, friction, disc, bracket and control all at once."""
-    model = coarse(pad__fidelity=fidelity, control__senses=senses)
-    stepper = ImplicitStepper(model, tolerance=1e-9)
-    y = random_state(model, seed)
-    state, h = model.layout.unpack(y), 1e-3
-    ah = GAMMA * h
-    pads, scalars = stepper.pad_arrays(h), stepper.constants
-    parts = tuple(pad_state(model, k, state) for k in "LU")
-    works = tuple(pad_work(pad) for pad in pads)
-    q = torch.cat((state.r_C, state.theta[None], state.r_Br)).numpy()
-    V_star = torch.cat((state.v_C, state.omega[None], state.v_Br)).numpy()
-    V, powers = V_star.copy(), np.zeros(8)
-    want = torch.stack(model.reference(torch.tensor(0.0, dtype=torch.float64))).detach().numpy()
-    converged, _ = solve_stage(pads, parts, works, q, V_star, V, want, ah, scalars, 1e-9, 40, 3e-4)
-    assert converged
-    for p in range(2):
-        finish_pad(pads[p], parts[p], works[p], q, V, ah, scalars, powers, p)
-    tensor = torch.from_numpy
-    acceleration = tensor((V - V_star) / ah)
-    k = model.layout.pack(
-        State(
-            *(tensor(w.u_dot).reshape(-1, 2) for w in works),
-            *(tensor(w.s_dot) for w in works),
-            tensor(V[:2]),
-            tensor(V[2:3])[0],
-            tensor(V[3:]),
-            *(tensor(w.v_dot).reshape(-1, 2) for w in works),
-            acceleration[:2],
-            acceleration[2],
-            acceleration[3:],
-        )
-    )
-    expected = model.layout.unpack(model(0.0, y + ah * k))
-    got = model.layout.unpack(k)
-    for name in State._fields:
-        a, b = getattr(got, name), getattr(expected, name)
-        if a.numel():
-            scale = float(b.abs().max()) + 1e-9
-            assert float((a - b).abs().max()) / scale < 1e-7, name
+@pytest.mark.parametrize(("seed", "senses", "points"), [(0, "disc", 0), (1, "disc", 3), (2, "bracket", 0)])
+def test_stages_of_a_step_satisfy_the_modules_equation(
+    build: Callable[..., Rig], friction: str, seed: int, senses: str, points: int
+) -> None:
+    """Y = y* + a h f(t, Y) at both stages: pads, contacts, friction, bodies and control all at once."""
+    rig = build(contact__friction=friction, control__senses=senses, contact__points=points)
+    y, h = random_state(rig, seed, slip=0.01), 5e-4
+    step = taken_step(rig, y, h)
+    assert step.tape is not None
+    star, a = torch.from_numpy(step.tape.y), GAMMA * h
+    assert torch.equal(star[0], y)
+    first = y + a / (h - a) * (star[1] - y)
+    for begin, end, time in ((y, first, a), (star[1], torch.from_numpy(step.y), h)):
+        got, expected = (end - begin) / a, rig(time, end)
+        for (part, name), where in rig.layout.slices.items():
+            scale = float(expected[where].abs().max()) + 1e-9
+            rounding = 1e-15 * float(end[where].abs().max()) / a
+            assert float((got - expected)[where].abs().max()) < 1e-9 * scale + 4 * rounding, (part, name, time)
+
+
+def test_recorded_forces_equal_the_module() -> None:
+    """Nodal forces and the bracket's moment of a run are what `evaluate` gives at the recorded states."""
+    manipulation = grasp_and_roll(coarse(), grasp_force=75.0)
+    model, run = manipulation.model, simulate(manipulation.model, times(0.5, 11), y0=manipulation.y0)
+    for i in (0, 3, 7, 10):
+        with torch.no_grad():
+            graph = model.evaluate(run.t[i], model.unpack(run.y[i], t=run.t[i]))
+            back = graph.ports["pad_U"].transformer.effort(graph.ports["pad_U"].effort, model.junctions)
+        for k in "LU":
+            expected = graph.interfaces[k].out[..., 3:5]
+            assert float((run.force[k][i] - expected).abs().max()) < 1e-8  # [N], ten times Newton's tolerance
+        assert float(run["bracket_moment"][i] + back["bracket_spin"]) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_no_stale_kernel_is_ever_used(tmp_path: Path) -> None:
     """The cache's folder is named after all sources: a changed callee gives its callers another folder."""
-    assert kernels.digest(kernels.HERE) in run.stats.cache_path
+    assert kernel.digest(kernel.HERE, kernel.HERE.parents[1] / "codegen") in run.stats.cache_path
     for name, text in (("law.py", "a = 1"), ("step.py", "b = 2")):
         (tmp_path / name).write_text(text)
-    before = kernels.digest(tmp_path)
-    assert kernels.digest(tmp_path) == before
+    before = kernel.digest(tmp_path)
+    assert kernel.digest(tmp_path) == before
     (tmp_path / "law.py").write_text("a = 3")
-    assert kernels.digest(tmp_path) != before
+    assert kernel.digest(tmp_path) != before

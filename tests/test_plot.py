@@ -11,8 +11,24 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from torchsoft import SoftGrasp, Trajectory, simulate
-from torchsoft.pad import lame_moduli
+from torchsoft import (
+    Body,
+    Circle,
+    Contact,
+    Ellipse,
+    KelvinVoigt,
+    Pad,
+    PadMesh,
+    Profile,
+    Reference,
+    Rig,
+    SmoothSlip,
+    SoftContact,
+    SoftGrasp,
+    Trajectory,
+    simulate,
+)
+from torchsoft.physics.mesh import lame_moduli
 from torchsoft.plot import figures
 from torchsoft.plot.animation import animate
 from torchsoft.plot.diagram import dot, graph_of, multibond_graph, positions
@@ -38,15 +54,13 @@ def done() -> Done:
 @pytest.mark.parametrize("which", ["L", "U"])
 def test_deformed_mesh_is_the_surface_and_an_interior_in_equilibrium(which: str, enclosed: bool) -> None:
     model, run = manipulated(pad__enclosed=enclosed)
-    s, pad = run.state, model.pads[which]
-    u, base = (s.u_L, torch.zeros_like(s.r_Br)) if which == "L" else (s.u_U, s.r_Br)
-    mesh = deformed_mesh(model, which, u, base)
+    pad, u = model.pads[which], run.displacement[which]
+    mesh = deformed_mesh(pad, u)
     assert mesh.shape == (21, 61, 3, 2)
     nodes = mesh.reshape(21, -1, 2)
     surface = nodes[:, pad.mesh.free[pad.mesh.surface]]
-    expected = (pad.positions + u + base[:, None]).numpy()
-    np.testing.assert_allclose(surface, expected, rtol=1e-9, atol=0)
-    displacement = (nodes - base[:, None].numpy()) * pad.mirror.numpy()
+    np.testing.assert_allclose(surface, (pad.positions + u).numpy(), rtol=1e-9, atol=1e-15)
+    displacement = nodes @ pad.axes.numpy()
     displacement = displacement - displacement[:, :1] - (pad.mesh.nodes - pad.mesh.nodes[0])
     assert np.abs(displacement[:, pad.mesh.bonded]).max() < 1e-15
     K_lambda, K_mu, _ = pad.mesh.matrices
@@ -71,12 +85,89 @@ def test_friction_is_drawn_towards_the_right(done: Done) -> None:
     """In the grasp the pads are squeezed outwards, so friction on them points inwards, whichever pad."""
     (instant,) = instants(*done, [0.2])
     for k in "LU":
-        x, friction = instant.surface[k][:, 0], instant.force[k][:, 1]
+        x, friction = instant.points[k][:, 0], instant.force[k][:, 1]
         left, right = friction[x < 59], friction[x > 61]
         assert left.sum() > 0 > right.sum()
 
 
-DRAWN: dict[str, Callable[[SoftGrasp, Trajectory], Figure]] = {
+def hand() -> Rig:
+    """An egg against a wall and a ball on the floor, and a finger that comes down from above and turns."""
+    rubber = KelvinVoigt(1e6, 0.3, 1100.0, 0.05, 0.02)
+    mesh = PadMesh(0.06, 0.006, 30, 3)
+    law = SoftContact(5e4, 20.0, 2e4, 5.0, friction=SmoothSlip(0.8, 0.5, 0.05, 10.0), node_spacing=2e-3)
+    return Rig(
+        bodies={
+            "egg": Body(0.2, Ellipse(0.02, 0.014)), "ball": Body(0.1, Circle(0.01)),
+            "finger": Body(0.5, x="driven", y=0.032, theta="driven", weighted=False),
+        },
+        pads={
+            "floor": Pad(PadMesh(0.12, 0.006, 60, 3), rubber, origin=(-0.06, -0.006)),
+            "wall": Pad(mesh, rubber, angle=-np.pi / 2, origin=(-0.05, 0.06)),
+            "tip": Pad(mesh, rubber, base="finger", angle=np.pi / 2, origin=(0.008, -0.03)),
+        },
+        contacts={
+            "egg on floor": Contact("floor", "egg", law), "ball on floor": Contact("floor", "ball", law),
+            "egg at wall": Contact("wall", "egg", law), "egg at tip": Contact("tip", "egg", law),
+        },
+        reference=Reference(
+            **{"finger.x": Profile([0.0, 0.1], [-2e-3, -0.009]), "finger.theta": Profile([0.0, 0.1], [0.0, 0.08])}
+        ),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def held() -> tuple[Rig, Trajectory]:
+    """The egg between wall, floor and finger."""
+    rig = hand()
+    state = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64))
+    start = {"egg": [-0.0241, 0.0139, 0.0], "ball": [0.045, 0.0099, 0.0]}
+    pose = state.pose | {name: torch.tensor(place, dtype=torch.float64) for name, place in start.items()}
+    t = torch.linspace(0, 0.12, 13, dtype=torch.float64)
+    return rig, simulate(rig, t, y0=rig.pack(state._replace(pose=pose)), step=1e-3)
+
+
+def test_any_rig_is_drawn_where_its_bodies_are(held: tuple[Rig, Trajectory]) -> None:
+    rig, run = held
+    (instant,) = instants(rig, run, [0.12])
+    assert all(bool((force[:, 0] > 0).any()) for force in instant.force.values())
+    x, y, angle = run.state.pose["finger"][-1].tolist()
+    c, s = np.cos(angle), np.sin(angle)
+    face = rig.pads["tip"].mesh.nodes[rig.pads["tip"].mesh.bonded] @ np.array([[0.0, 1.0], [-1.0, 0.0]]) + [
+        0.008,
+        -0.03,
+    ]
+    expected = 1e3 * (face @ np.array([[c, s], [-s, c]]) + [x, y])
+    np.testing.assert_allclose(instant.mesh["tip"][:, 0], expected, atol=1e-9)
+    surface = instant.points["egg at tip"]
+    touching = instant.force["egg at tip"][:, 0] > 0
+    centre, turn = instant.pose["egg"][:2], instant.pose["egg"][2]
+    d = (surface[touching] - centre) @ np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    assert bool(((d / [20.0, 14.0]) ** 2).sum(-1).max() < 1)  # a point that is loaded is inside the egg
+    figure = figures.snapshots(run, rig, [0.0, 0.12])
+    axes = figure.axes[0]
+    (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
+    for mesh in instant.mesh.values():
+        assert left <= mesh[..., 0].min() < mesh[..., 0].max() <= right
+        assert low <= mesh[..., 1].min() < mesh[..., 1].max() <= high
+    assert len(axes.patches) == 3 + 2 + 2  # pads, bodies with a shape, plates behind floor and wall
+
+
+@pytest.mark.parametrize("name", ["snapshots", "force_distribution", "energy_balance", "multibond_graph"])
+def test_figure_of_any_rig_draws_something(name: str, held: tuple[Rig, Trajectory]) -> None:
+    figure = DRAWN[name](*held)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    assert float(np.asarray(canvas.buffer_rgba())[..., :3].std()) > 5
+
+
+def test_energies_of_any_rig_are_all_in_the_balance(held: tuple[Rig, Trajectory]) -> None:
+    _, run = held
+    drawn = sum(part for _, part, _ in figures.energy_groups(run))
+    total = sum([*run.energy.values(), *run.dissipated.values()])
+    np.testing.assert_allclose(drawn, 1e3 * total.numpy(), rtol=1e-12)
+
+
+DRAWN: dict[str, Callable[[Rig, Trajectory], Figure]] = {
     "motion": lambda m, r: figures.motion(r),
     "control_forces": lambda m, r: figures.control_forces(r),
     "bracket_moment": lambda m, r: figures.bracket_moment(r),
@@ -114,16 +205,17 @@ def test_save_writes_the_whole_file_or_none(done: Done, tmp_path: Path) -> None:
         assert picture.format == "PNG"
 
 
-def test_diagram_places_every_node_of_the_graph_by_itself() -> None:
-    for fidelity in ("massless", "inertial"):
-        model = coarse(pad__fidelity=fidelity)
-        graph = graph_of(model)
-        at = positions(graph)
-        assert set(at) == set(graph)
-        points = np.array(list(at.values()))
-        apart = np.linalg.norm(points[:, None] - points[None], axis=-1) + 9 * np.eye(len(points))
-        assert apart.min() > 0.5
-        assert dot(model).startswith("digraph")
+@pytest.mark.parametrize("build", [coarse, lambda: coarse(pad__fidelity="inertial"), hand])
+def test_diagram_places_every_node_of_the_graph_by_itself(build: Callable[[], Rig]) -> None:
+    rig = build()
+    graph = graph_of(rig)
+    assert {"egg_spin", "contact_egg at tip", "pad_tip: field"} <= set(graph) or isinstance(rig, SoftGrasp)
+    at = positions(graph)
+    assert set(at) == set(graph)
+    points = np.array(list(at.values()))
+    apart = np.linalg.norm(points[:, None] - points[None], axis=-1) + 9 * np.eye(len(points))
+    assert apart.min() > 0.5
+    assert dot(rig).startswith("digraph")
 
 
 def test_animation_moves(done: Done, tmp_path: Path) -> None:

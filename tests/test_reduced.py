@@ -11,8 +11,7 @@ from conftest import coarse
 from scipy.integrate import solve_ivp
 from torchdiffeq import odeint
 
-from torchsoft import press, simulate
-from torchsoft.control import Profile, Reference
+from torchsoft import Profile, Reference, press, simulate
 from torchsoft.reduced.fit import Recipe, assemble, choose, fit, score
 from torchsoft.reduced.ode import BEYOND, Factor, Held, ReducedModel, Term
 from torchsoft.reduced.records import KINEMATICS, STATES, Record, noisy, record, rolling_radius
@@ -247,10 +246,10 @@ def test_equations_read_in_text_and_latex() -> None:
 def test_records_of_a_run_and_of_a_dataset_are_the_same() -> None:
     model = coarse()
     y0 = press(model, model.settings.scenario.y_Br_grasp).detach()
-    start = model.layout.unpack(y0)
-    x_0, y_Br = float(start.r_C[0]), float(start.r_Br[1])
-    model.reference = Reference(Profile([0.0, 0.2], [x_0, x_0 + 1e-3]), Profile([0.0], [y_Br]), Profile([0.0], [-60.0]))
-    run = simulate(model, torch.linspace(0, 0.2, 101, dtype=torch.float64), y0=y0)
+    x_0, y_Br = (float(model.unpack(y0).pose[name][i]) for name, i in (("disc", 0), ("bracket", 1)))
+    roll = Profile([0.0, 0.2], [x_0, x_0 + 1e-3])
+    reference = Reference(x_d=roll, y_d=Profile([0.0], [y_Br]), F_ff=Profile([0.0], [-60.0]))
+    run = simulate(model, torch.linspace(0, 0.2, 101, dtype=torch.float64), y0=y0, reference=reference)
     one, series = record(run), run.to_dataset()
     other = record({name: torch.from_numpy(series[name].values) for name in series}, run.t)
     assert all(np.array_equal(one.series[name], other.series[name]) for name in one.series)

@@ -12,8 +12,7 @@ import pytest
 import torch
 from conftest import COARSE
 
-from torchsoft import Parameters
-from torchsoft.control import Profile, Sampled
+from torchsoft import Parameters, Profile, Sampled
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, Unreachable, identify, record
 from torchsoft.sysid.fit import descend, gauss_newton
@@ -88,6 +87,26 @@ def test_jacobian_equals_central_differences_for_every_kind_of_coordinate(stroke
     np.testing.assert_allclose(gradient, at.J.T @ at.r, rtol=1e-8, atol=1e-8 * np.abs(gradient).max())
 
 
+@pytest.mark.parametrize("fidelity", ["massless", "inertial"])
+def test_jacobian_of_either_kind_of_pads_at_the_start_of_a_grasp(fidelity: str) -> None:
+    """The starting displacements are held, also where a pad's elasticity changes."""
+    p = BASE.override({"pad.fidelity": fidelity})
+    short = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.1), duration=0.25, grasp_time=0.1, settle=0.0)
+    data = record("short", short, p.override({"pad.E": 0.9e6}), p, SENSORS, step=STEP)
+    problem = Problem(
+        [data], SENSORS, {"pad.E": Unknown(), "pad.nu": Unknown(low=0.4, high=0.49), "pad.tau": Unknown()}
+    )
+    x, h = problem.coordinates.start, 1e-5
+    with Runner(problem.recordings) as runner:
+        at = problem.residuals(runner, x, ["short"], STEP, problem.coordinates.free)
+        _, gradient, _ = problem.misfit(runner, x, ["short"], STEP, problem.coordinates.free)
+        for i, label in enumerate(problem.coordinates.labels):
+            ahead, behind = (problem.residuals(runner, x + s * h * np.eye(3)[i], ["short"], STEP).r for s in (1, -1))
+            slope = (ahead - behind) / (2 * h)
+            assert np.linalg.norm(at.J[:, i] - slope) < 2e-4 * np.linalg.norm(slope), label
+    np.testing.assert_allclose(gradient, at.J.T @ at.r, rtol=1e-8, atol=1e-8 * np.abs(gradient).max())
+
+
 def test_noise_free_data_give_the_truth_back_and_intervals_hold_it(strokes: Recording, shake: Recording) -> None:
     answer = identify(Problem([strokes, shake], SENSORS, four()), step=STEP, heldout=["shake"])
     for name in FOUR:
@@ -121,7 +140,7 @@ def rest_known() -> dict[str, Unknown]:
     return {name: known(name) for name in ("contact.K_n", "contact.mu_s", "contact.mu_k")}
 
 
-def test_what_the_data_do_not_see_is_not_a_number() -> None:
+def test_what_the_data_do_not_determine_is_not_a_number() -> None:
     gentle = Excitation(motion=Strokes(travel=1e-3, stroke_time=0.4), duration=0.9, senses="bracket")
     data = record("gentle", gentle, BASE, BASE, SENSORS, step=STEP, seed=1)
     answer = identify(
@@ -165,7 +184,7 @@ def test_a_regular_grid_between_the_samples_changes_nothing(strokes: Recording) 
     assert np.abs(between - exact).max() < 0.2 < np.abs(exact).max()
 
 
-def test_a_step_too_coarse_for_the_data_is_said() -> None:
+def test_a_step_too_coarse_for_the_data_is_reported() -> None:
     hard = Excitation(
         motion=MultiSine(amplitude_x=4e-3, amplitude_y=2e-4, frequency=(10, 40)), duration=0.9, senses="bracket"
     )
@@ -256,7 +275,7 @@ def test_plan_begins_slowly_ties_ratios_and_ends_with_everything(strokes: Record
     assert problem.values(tied, 0)["contact.mu_k"] == pytest.approx(problem.values(tied, 0)["contact.mu_s"])
 
 
-def test_visible_drops_what_the_others_cannot_be_told_from() -> None:
+def test_visible_drops_what_cannot_be_separated_from_the_others() -> None:
     a = np.random.default_rng(0).standard_normal((50, 1))
     J = np.hstack((100 * a, 100 * a + 1e-6, 40 * np.random.default_rng(1).standard_normal((50, 1))))
     assert visible(J, np.ones(3, bool)).sum() == 2
@@ -274,7 +293,7 @@ def test_fisher_and_step_shift_of_a_linear_problem() -> None:
     np.testing.assert_allclose(step_shift(J, step_error(coarse, fine)), -x, rtol=1e-10)
 
 
-def test_whiteness_tells_noise_from_drift() -> None:
+def test_whiteness_separates_noise_from_drift() -> None:
     noise = np.random.default_rng(0).standard_normal(500)
     assert whiteness(noise)[1] > 0.01
     lag, p = whiteness(np.cumsum(noise))
@@ -327,11 +346,11 @@ def test_catalogue_begins_at_rest_and_can_be_written_down() -> None:
     for name, excitation in CATALOGUE.items():
         assert Excitation.model_validate_json(excitation.model_dump_json()) == excitation, name
         model, y0 = begin(excitation, BASE, grasp_force=10.0)
-        state = model.layout.unpack(y0)
-        assert not model.frame("U", state).g.gt(0).any(), name
-        assert model.frame("L", state).g.gt(0).any(), name
+        state = model.unpack(y0)
+        assert not model.penetration("U", state).gt(0).any(), name
+        assert model.penetration("L", state).gt(0).any(), name
         with torch.no_grad():
-            assert model(0.0, y0)[model.layout.slices["v_C"]][1].abs() < 1e-6, name
+            assert model(0.0, y0)[model.layout.slices["velocity", "disc"]][1].abs() < 1e-6, name
 
 
 def test_a_sampled_set_point_follows_the_profile_it_was_taken_from() -> None:
@@ -355,7 +374,7 @@ def test_a_sampled_set_point_follows_the_profile_it_was_taken_from() -> None:
 
 KILLED = """
 import sys
-from test_identify import BASE, SENSORS, STEP, STROKES, TRUE, Problem, Unknown, identify, record, rest_known
+from test_sysid import BASE, SENSORS, STEP, STROKES, TRUE, Problem, Unknown, identify, record, rest_known
 
 data = record("strokes", STROKES, TRUE, BASE, SENSORS, step=STEP, seed=5)
 unknowns = {"pad.E": Unknown(nominal=1.4e6), "pad.tau": Unknown()} | rest_known()

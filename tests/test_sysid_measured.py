@@ -2,12 +2,7 @@
 
 import csv
 import importlib.util
-import json
 import re
-import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,12 +14,10 @@ import xarray as xr
 
 from torchsoft import Parameters, Trajectory, simulate
 from torchsoft.channels import CHANNELS
-from torchsoft.cli import main
 from torchsoft.excitation import Excitation, Strokes, begin
-from torchsoft.sysid import MEASURED, Recording, Sensor, Unreachable, record
+from torchsoft.sysid import MEASURED, Recording, Sensor, record
 from torchsoft.sysid.columns import COLUMNS, UNITS, read_table
-from torchsoft.sysid.measured import known_parameters, load, read_recording, unreachable
-from torchsoft.sysid.workers import FailedRun
+from torchsoft.sysid.measured import known_parameters, load, read_recording
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "identify"
 
@@ -47,6 +40,8 @@ F_y.noise = 0.1
 [fit]
 step = 5e-3
 """
+
+SIGNALS = ("x_d", "y_d", "F_ff")
 
 Table = list[list[str]]
 Change = Callable[[Table], object]
@@ -239,7 +234,7 @@ def test_a_recording_survives_the_way_through_csv(made: tuple[Any, Recording], t
         np.testing.assert_allclose(back.samples[channel][1], y, rtol=1e-13)
     t = torch.from_numpy(np.linspace(-0.1, 0.5, 1201))
     with torch.no_grad():
-        want, got = one.reference(t), back.reference(t)
+        want, got = (some.reference(t, SIGNALS).flatten(1).T for some in (one, back))
     for exact, read, tolerance in zip(want, got, (2e-8, 2e-5, 1e-8, 1e-5, 0.02)):
         assert float((read - exact).abs().max()) < tolerance
 
@@ -276,15 +271,20 @@ def test_a_trajectory_file_is_a_recording(run: Trajectory, tmp_path: Path) -> No
     sensors = {"x_C": Sensor(noise=1e-5)}
     one = read_recording(tmp_path / "run.nc", "run", known_parameters(Path("c"), "run", table, settings), sensors)
     assert list(one.samples) == list(MEASURED)
-    s = run.state
-    expected = torch.cat((s.r_C, s.theta[:, None], s.r_Br, s.v_C, s.omega[:, None], s.v_Br, run.control), 1).numpy()
-    for k, channel in enumerate(MEASURED):
-        np.testing.assert_array_equal(one.samples[channel][1], expected[:, k])
+    for channel in MEASURED:
+        np.testing.assert_array_equal(one.samples[channel][1], run[channel].detach())
+    desired = run.together("x_d", "x_d_dot", "y_d", "y_d_dot", "F_ff")
     with torch.no_grad():
-        got = torch.stack(one.reference(run.t), -1)
-    np.testing.assert_allclose(got[:, [0, 1, 2, 4]], run.desired[:, [0, 1, 2, 4]], atol=1e-12)
-    np.testing.assert_allclose(got[:, 3], run.desired[:, 3], atol=2e-4)  # y_d' is not in the file
-    assert one.settings.scenario.y_Br_grasp == pytest.approx(float(run.desired[:, 2].min()))
+        got = one.reference(run.t, SIGNALS).flatten(1)[:, :5]
+    np.testing.assert_allclose(got, desired, atol=1e-12)
+    assert one.settings.scenario.y_Br_grasp == pytest.approx(float(desired[:, 2].min()))
+    older = tmp_path / "older.nc"  # without the rate of y_d
+    run.to_dataset().drop_vars("desired_y_velocity").to_netcdf(older, engine="h5netcdf")
+    table = read_table(older)
+    assert "y_d_dot" not in table.values
+    with torch.no_grad():
+        got = read_recording(older, "older", one.settings, sensors).reference(run.t, SIGNALS)[:, 1, 1]
+    np.testing.assert_allclose(got, desired[:, 3], atol=2e-4)
 
 
 def test_a_mistake_in_a_trajectory_file_is_named(run: Trajectory, tmp_path: Path) -> None:
@@ -313,112 +313,3 @@ def test_recordings_have_settings_of_their_own(case: Callable[..., list[str]], t
     assert (first.name, first.settings.disc.mass) == ("data", 0.5)
     assert (second.name, second.settings.disc.mass) == ("b", Parameters().disc.mass)
     assert first.settings.contact.v_s == second.settings.contact.v_s == 0.05
-
-
-ERRORS: dict[str, tuple[list[str], str]] = {
-    "no config": (["data.csv"], "one CONFIG.toml is needed, but 0 were given"),
-    "no such file": (["other.csv", "rig.toml"], "other.csv: No such file or directory"),
-    "no such config": (["data.csv", "other.toml"], "other.toml: No such file or directory"),
-    "no data": (["rig.toml"], "there is nothing to identify from"),
-    "step": (["data.csv", "rig.toml", "--step", "-1"], "step: Input should be greater than 0"),
-    "workers": (["data.csv", "rig.toml", "--workers", "0"], "workers: Input should be greater than or equal to 1"),
-    "out is a file": (["data.csv", "rig.toml", "--out", "data.csv"], "data.csv: File exists"),
-}
-
-
-@pytest.mark.parametrize("name", ERRORS)
-def test_an_error_of_the_command_is_one_line(
-    case: Callable[..., list[str]], name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Any
-) -> None:
-    case()
-    monkeypatch.chdir(tmp_path)
-    arguments, message = ERRORS[name]
-    assert main(["identify", *arguments]) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.startswith("torchsoft: error: ")
-    assert message in err
-    assert err.count("\n") == 1
-
-
-def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(
-    case: Callable[..., list[str]], tmp_path: Path, capsys: Any, example: Table
-) -> None:
-    def change(table: Table) -> None:
-        with (EXAMPLE / "rolling.csv").open(newline="") as file:
-            table[:] = list(csv.reader(file))[:122]
-        for column in (X_D, X_C, 8):
-            scale(column, 1.0, -0.3)(table)
-        scale(X_D, 0.5, 30.0)(table)
-        drop(2)(table)
-
-    config = CONFIG.replace('"bracket"', '"disc"').replace("60.3e-3", "60e-3").replace("5e-3", "2e-3")
-    files = case(change, config.replace("[unknowns", "control.K_81 = 1e6\ncontrol.R_80 = 0\n[unknowns", 1))
-    assert main(["identify", *files, "--out", str(tmp_path / "out"), "--no-progress"]) == 2
-    message = capsys.readouterr().err
-    found = re.search(
-        r"data\.csv, row (\d+) \(t = (\S+) s\): the model cannot follow recording `data` here: at t = (\S+) s", message
-    )
-    assert found, message
-    row, t, inside = int(found[1]), float(found[2]), float(found[3])
-    assert t == pytest.approx(inside, abs=1e-3)
-    assert row == 2 + np.ceil(t / 5e-3 - 1e-6)
-    assert message.count("\n") == 1
-    tables = load(files[:1], files[1]).tables
-    assert "data.csv, before row 2 (t = -0.1 s): the model" in unreachable(
-        Unreachable({"data": FailedRun("gone", -0.1)}), tables
-    )
-
-
-@pytest.fixture(scope="module")
-def answered(tmp_path_factory: pytest.TempPathFactory, example: Table) -> tuple[Path, list[str]]:
-    """The command, carried out in this process; its folder and its data."""
-    folder = tmp_path_factory.mktemp("command")
-    (folder / "rig.toml").write_text(CONFIG)
-    files = [str(write(folder / "data.csv", example[:42])), str(folder / "rig.toml")]
-    assert main(["identify", *files, "--out", str(folder / "out"), "--no-progress"]) == 0
-    return folder, files
-
-
-@pytest.mark.xdist_group("identify-command")
-def test_the_command_writes_answer_and_page(answered: tuple[Path, list[str]]) -> None:
-    out = answered[0] / "out"
-    assert sorted(path.name for path in out.iterdir()) == ["answer.json", "report.html"]
-    answer = json.loads((out / "answer.json").read_text())
-    found = {e["name"]: e for e in answer["estimates"]}
-    assert set(found) == {"contact.K_n", "pad.E"}
-    assert answer["converged"]
-    page = (out / "report.html").read_text()
-    assert page.startswith("<!doctype html>")
-    assert all(notice in page or "&" in notice for notice in answer["notices"])
-
-
-@pytest.mark.xdist_group("identify-command")
-def test_an_interrupted_command_continues_and_ends_the_same(answered: tuple[Path, list[str]], capsys: Any) -> None:
-    folder, files = answered
-    out = folder / "again"
-    command = ["identify", *files, "--out", str(out), "--no-progress"]
-    # test runners may ignore SIGINT, which a child inherits
-    code = (
-        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
-        f"from torchsoft.cli import main; sys.exit(main({command!r}))"
-    )
-    child = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
-    began = time.monotonic()
-    while len(list(out.glob("unfinished/*.pickle"))) < 3 and child.poll() is None and time.monotonic() - began < 120:
-        time.sleep(0.02)
-    child.send_signal(signal.SIGINT)
-    _, message = child.communicate(timeout=60)
-    assert child.returncode == 130, message
-    assert "the same command continues" in message
-    assert "Traceback" not in message
-    kept = len(list(out.glob("unfinished/*.pickle")))
-    assert kept >= 3
-    assert not (out / "answer.json").exists()
-
-    assert main(command) == 0
-    assert "contact.K_n" in capsys.readouterr().out
-    assert not (out / "unfinished").exists()
-    first, second = (json.loads((folder / name / "answer.json").read_text()) for name in ("out", "again"))
-    assert second["estimates"] == first["estimates"]
-    assert second["cost"]["remembered"] >= first["cost"]["remembered"] + kept - 1

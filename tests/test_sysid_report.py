@@ -92,17 +92,17 @@ def test_the_page_stands_alone(page: Page) -> None:
     assert ("meta", {"name": "viewport", "content": "width=device-width,initial-scale=1"}) in page.tags
 
 
-def test_the_page_says_what_the_answer_says(page: Page, found: tuple[IdentificationResult, Problem]) -> None:
+def test_the_page_holds_what_the_answer_holds(page: Page, found: tuple[IdentificationResult, Problem]) -> None:
     answer, _ = found
-    seen = [e for e in answer.estimates if e.identifiable]
-    assert {e.name for e in seen} >= {"pad.E"}
+    known = [e for e in answer.estimates if e.identifiable]
+    assert {e.name for e in known} >= {"pad.E"}
     assert not answer["contact.eta"].identifiable
-    assert f"{len(seen)} of {len(answer.estimates)} parameters identifiable" in page.text
+    assert f"{len(known)} of {len(answer.estimates)} parameters identifiable" in page.text
     assert answer.notices
     for notice in answer.notices:
         assert notice in page.text
     assert page.text.index(answer.notices[0]) < page.text.index("Estimates")  # notices come first
-    for e in seen:
+    for e in known:
         for value in (e.value, *(e.ci95 or ())):
             assert value is not None
             assert f"{float(f'{value:.5g}'):.12g}" in page.text.replace("\u202f", "")
@@ -148,7 +148,7 @@ def test_an_answer_to_other_data_is_refused(found: tuple[IdentificationResult, P
     assert not any(tmp_path.iterdir())
 
 
-def test_a_recording_that_was_lost_is_said_and_a_clean_answer_praised(
+def test_a_lost_recording_is_named_and_a_clean_answer_has_no_warnings(
     found: tuple[IdentificationResult, Problem], tmp_path: Path
 ) -> None:
     answer, problem = found

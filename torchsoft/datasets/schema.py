@@ -2,9 +2,8 @@
 
 from dataclasses import dataclass
 
-from torchsoft.channels import VARIABLES
+from torchsoft.channels import PADS, VARIABLES
 from torchsoft.datasets.config import RATIO, Config
-from torchsoft.kernels.run import DISSIPATED, SUPPLIED
 from torchsoft.parameters import Parameters
 
 KEPT = tuple(name for name in VARIABLES if name not in ("time", "angular_momentum"))
@@ -28,21 +27,32 @@ class Variable:
     components: tuple[str, ...] = ()
 
 
+def energies(config: Config) -> dict[str, tuple[str, tuple[str, ...]]]:
+    """Dimension of each kind of energy, and its parts by their names in a run."""
+    kinetic = ("kinetic_L", "kinetic_U") if config.fixed.get("pad.fidelity") == "inertial" else ()
+    return {
+        "stored": ("store", (*STORES, *kinetic)),
+        "dissipated": ("resistor", ("pad_L", "pad_U", "contact_dashpots", "slip")),
+        "supplied": ("source", ("control_x", "control_y", "gravity")),
+    }
+
+
 def variables(config: Config) -> dict[str, Variable]:
     """Everything that is kept of a trajectory, by name."""
     out = {
         name: Variable(MOTION if len(v.symbols) > 1 else SERIES, v.unit, v.meaning)
         for name, v in VARIABLES.items() if name in KEPT
     }  # fmt: skip
-    for pad in ("lower", "upper"):
-        node, per = ("trajectory", "time", f"{pad}_surface"), f"each surface node of the {pad} pad"
+    for pad in PADS.values():
+        point = "contact point" if config.fixed.get("contact.points") else "surface node"
+        node, per = ("trajectory", "time", f"{pad}_surface"), f"each {point} of the {pad} pad"
         out[f"normal_force_{pad}"] = Variable(node, "N", f"normal force at {per}", config.node_precision)
         out[f"friction_force_{pad}"] = Variable(node, "N", f"friction force at {per}", config.node_precision)
         out[f"contact_{pad}"] = Variable(node, "1", f"1 where the disc penetrates {per}, else 0", "uint8")
         out[f"displacement_{pad}"] = Variable((*node, "axis"), "m", f"displacement of {per}", config.node_precision)
-    out["stored_energy"] = Variable((*SERIES, "store"), "J", "energy stored", components=STORES)
-    out["dissipated_energy"] = Variable((*SERIES, "resistor"), "J", "dissipated since t = 0", components=DISSIPATED)
-    out["supplied_energy"] = Variable((*SERIES, "source"), "J", "supplied since t = 0", components=SUPPLIED)
+    for kind, (dimension, parts) in energies(config).items():
+        meaning = "energy stored" if kind == "stored" else f"{kind} since t = 0"
+        out[f"{kind}_energy"] = Variable((*SERIES, dimension), "J", meaning, components=parts)
     out["injected_energy"] = Variable(SERIES, "J", "positive part of what the sources supplied since t = 0")
     out["energy_residual"] = Variable(SERIES, "J", "stored - supplied + dissipated since t = 0")
     table = Parameters().table()
@@ -67,8 +77,11 @@ def variables(config: Config) -> dict[str, Variable]:
 
 def sizes(config: Config) -> dict[str, int]:
     """Length of every dimension."""
-    nodes = int(config.fixed.get("pad.elements_x", Parameters().pad.elements_x)) + 1
+    elements, points = (
+        int(config.fixed.get(k, Parameters().table()[k]["value"])) for k in ("pad.elements_x", "contact.points")
+    )
+    nodes = elements * points or elements + 1
     return {
         "trajectory": config.trajectories, "time": config.samples, "axis": 2, "lower_surface": nodes, "upper_surface": nodes,
-        "store": len(STORES), "resistor": len(DISSIPATED), "source": len(SUPPLIED),
+        **{dimension: len(parts) for dimension, parts in energies(config).values()},
     }  # fmt: skip

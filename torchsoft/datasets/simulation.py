@@ -5,23 +5,23 @@ from typing import Any
 import numpy as np
 import torch
 
+from torchsoft.channels import PADS
 from torchsoft.datasets.config import RATIO, Config
 from torchsoft.datasets.design import Task, excitation
-from torchsoft.datasets.schema import KEPT, STORES, sizes, variables
-from torchsoft.equilibrium import holding_force, press, rest
+from torchsoft.datasets.schema import KEPT, energies, sizes, variables
 from torchsoft.excitation import reference
-from torchsoft.implicit import SimulationFailed
-from torchsoft.kernels.run import DISSIPATED, SUPPLIED
-from torchsoft.model import SoftGrasp
+from torchsoft.physics.equilibrium import holding_force, press, rest
+from torchsoft.physics.paper import SoftGrasp
 from torchsoft.scenario import find_grasp_force
-from torchsoft.simulate import simulate
-from torchsoft.trajectory import Trajectory
+from torchsoft.solve.simulate import simulate
+from torchsoft.solve.stepper import SimulationFailed
+from torchsoft.solve.trajectory import Trajectory
 
 Row = dict[str, Any]
 
-POSITION, FORCE = 10, 4
-"""Decimals that starting displacements [m] and grasping forces [N] are rounded to: linear solvers differ in the last bits
-with the alignment of memory, and a run may amplify that."""
+POSITION, NODAL_FORCE, FORCE = 10, 8, 4
+"""Decimals that starting poses and displacements [m], nodal forces [N] and grasping forces [N] are rounded to: linear solvers
+differ in the last bits with the alignment of memory, and a run may amplify that."""
 
 
 def simulate_task(config: Config, task: Task) -> Row:
@@ -33,22 +33,31 @@ def simulate_task(config: Config, task: Task) -> Row:
     t = torch.arange(config.samples, dtype=torch.float64) * config.sample_interval
     try:
         model = SoftGrasp(task.parameters)
-        y0 = torch.round(rest(model).detach(), decimals=POSITION) + 0.0  # no negative zeros
+        y0 = start(model)
         if config.feed_forward == "found":
             force = find_grasp_force(model, y0, config.step)
         else:
             force = holding_force(model, press(model, task.parameters.scenario.y_Br_grasp))
         force = round(force, FORCE)
-        y_Br = float(model.layout.unpack(y0).r_Br[1])
-        model.reference = reference(excitation(config, task), model, y_Br, force)
-        run = simulate(model, t, y0=y0, step=config.step)
+        y_Br = float(model.unpack(y0).pose["bracket"][1])
+        motion = reference(excitation(config, task), model, y_Br, force)
+        run = simulate(model, t, y0=y0, reference=motion, step=config.step)
     except SimulationFailed as failure:
         stats = failure.trajectory.stats if failure.trajectory is not None else None
         done = {"steps": stats.steps, "newton_iterations": stats.newton_iterations} if stats else {}
         return out | done | {"failed": 1, "reason": failure.reason, "failure_time": failure.time}
     except (np.linalg.LinAlgError, RuntimeError, ValueError) as failure:
         return out | {"failed": 1, "reason": f"{type(failure).__name__}: {failure}"}
-    return out | series(model, run) | {"grasp_force": force}
+    return out | series(config, model, run) | {"grasp_force": force}
+
+
+def start(model: SoftGrasp) -> torch.Tensor:
+    """The state (size,) at rest, rounded."""
+    y0 = rest(model).detach()
+    for (part, name), where in model.layout.slices.items():
+        forces = part == "pads" and not model.pads[name].inertial
+        y0[where] = torch.round(y0[where], decimals=NODAL_FORCE if forces else POSITION) + 0.0  # no negative zeros
+    return y0
 
 
 def empty_row(config: Config) -> Row:
@@ -72,23 +81,22 @@ def labels(task: Task) -> Row:
 
 
 @torch.no_grad()
-def series(model: SoftGrasp, run: Trajectory) -> Row:
+def series(config: Config, model: SoftGrasp, run: Trajectory) -> Row:
     """The series and numbers of a finished run."""
-    s, data = run.state, run.to_dataset()
-    out: Row = {
-        "desired_y_velocity": run.desired[:, 3],
-        "injected_energy": run.injected,
-        "energy_residual": run.energy_residual,
-        "stored_energy": torch.stack([run.energy[name] for name in STORES], -1),
-        "dissipated_energy": torch.stack([run.dissipated[name] for name in DISSIPATED], -1),
-        "supplied_energy": torch.stack([run.supplied[name] for name in SUPPLIED], -1),
+    data = run.to_dataset()
+    out = {name: data[name].values for name in KEPT}
+    for kind, (_, parts) in energies(config).items():
+        prefix = "energy" if kind == "stored" else kind
+        out[f"{kind}_energy"] = np.stack([data[f"{prefix}_{part}"].values for part in parts], -1)
+    for key, pad in PADS.items():
+        for name in ("normal_force", "friction_force"):
+            out[f"{name}_{pad}"] = data[f"{name}_{pad}"].values
+        out[f"displacement_{pad}"] = (model.pads[key].spread @ run.displacement[key]).numpy()
+        out[f"contact_{pad}"] = (model.penetration(key, run.state) > 0).numpy().astype(np.uint8)
+    return out | {
+        "injected_energy": run.injected.numpy(),
+        "energy_residual": run.energy_residual.numpy(),
+        "energy_residual_rel": run.energy_residual_rel,
+        "steps": run.stats.steps,
+        "newton_iterations": run.stats.newton_iterations,
     }
-    for k, pad in (("L", "lower"), ("U", "upper")):
-        force, u = getattr(run, f"force_{k}"), getattr(s, f"u_{k}")
-        out[f"normal_force_{pad}"], out[f"friction_force_{pad}"] = force.unbind(-1)
-        out[f"displacement_{pad}"] = u[:, model.pads[k].surface]
-        out[f"contact_{pad}"] = (model.frame(k, s).g > 0).to(torch.uint8)
-    channels = {name: data[name].values for name in KEPT if name in data}
-    stats = {"steps": run.stats.steps, "newton_iterations": run.stats.newton_iterations}
-    arrays = {name: value.numpy() for name, value in out.items()}
-    return {**channels, **arrays, **stats, "energy_residual_rel": run.energy_residual_rel}

@@ -17,13 +17,14 @@ from fsspec.implementations.local import LocalFileSystem
 from numpy.typing import NDArray
 from zarr.codecs import BloscCodec
 
+from torchsoft.channels import PADS
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.reader import local_path
 from torchsoft.datasets.schema import Variable, sizes, variables
 from torchsoft.datasets.simulation import Row
 from torchsoft.files import write_json
-from torchsoft.model import SoftGrasp
 from torchsoft.parameters import Parameters
+from torchsoft.physics.paper import SoftGrasp
 
 MANIFEST = "manifest.json"
 
@@ -66,7 +67,11 @@ class Store:
                 array = self.array(name)
                 assert (array.shards or array.chunks)[0] == self.config.trajectories_per_shard, f"{name} is not aligned"
                 dtype = object if variable.dtype == "str" else variable.dtype
-                array[here.start : here.stop] = np.array([row[name] for row in rows], dtype)
+                values = np.array([row[name] for row in rows], dtype)
+                assert values.shape == (len(here), *array.shape[1:]), (
+                    f"{name} has shape {values.shape}"
+                )  # zarr would cut it
+                array[here.start : here.stop] = values
             self.array("done")[shard] = 1
 
 
@@ -204,7 +209,7 @@ def create_array(group: zarr.Group, name: str, variable: Variable, config: Confi
 def coordinates(group: zarr.Group, config: Config) -> None:
     """Time and the surface nodes' positions; the axes by name."""
     pads = SoftGrasp(Parameters().override(config.fixed)).pads
-    x = {f"{pad}_surface": pads[k].positions[pads[k].surface, 0].numpy() for k, pad in (("L", "lower"), ("U", "upper"))}
+    x = {f"{pad}_surface": pads[k].point_positions[:, 0].numpy() for k, pad in PADS.items()}
     time = np.arange(config.samples) * config.sample_interval
     columns: dict[str, tuple[NDArray[Any], str, str]] = {
         "time": (time, "s", "time since the start"),

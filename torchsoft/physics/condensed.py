@@ -96,16 +96,17 @@ def solve_rates(rig: Rig, name: str, own: Sequence[str], state: State, u: Tensor
 
     def linearise(u_dot: Tensor) -> tuple[Tensor, Tensor]:
         """Residual and its Jacobian. A point reaches two nodes at the most, so every third node is probed at once."""
-        F, n = force(u_dot), len(loaded)
+        n = len(loaded)
+        F, pull = torch.func.vjp(force, u_dot)[:2]
         G = torch.zeros(*u_dot.shape[:-2], n, 2, n, 2, dtype=u.dtype)
+        near = (loaded[:, None] - loaded).abs() <= 1  # columns that may reach a probed node
         for colour in range(3):
+            rows, columns = torch.nonzero(near & (loaded[:, None] % 3 == colour), as_tuple=True)
             for axis in range(2):
                 probe = torch.zeros_like(u_dot)
                 probe[..., loaded % 3 == colour, axis] = 1.0
-                _, dF = torch.func.jvp(force, (u_dot,), (probe,))  # pyright: ignore[reportAssignmentType]
-                near = (loaded[:, None] - loaded).abs() <= 1  # rows that a probed node may reach
-                rows, columns = torch.nonzero(near & (loaded % 3 == colour), as_tuple=True)
-                G[..., rows, :, columns, axis] = dF[..., rows, :].movedim(-2, 0)
+                (by,) = pull(probe)
+                G[..., rows, axis, columns, :] = by[..., columns, :]
         J = torch.eye(2 * n, dtype=u.dtype) - P_aa @ G.flatten(-2).flatten(-3, -2)
         return residual(u_dot, F), J
 

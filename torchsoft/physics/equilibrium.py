@@ -28,7 +28,8 @@ def press(model: SoftGrasp, bracket_height: float) -> Tensor:
     Raises `NoEquilibrium` when the bracket is too high for its pad to touch the object, sunk in under its weight.
     """
     p = model.settings
-    up = float(model.touch_height(p.pad.height + float(model.shape.support(torch.tensor([0.0, -1.0]).double()))))
+    with torch.no_grad():
+        up = float(model.touch_height(p.pad.height + model.shape.support(torch.tensor([0.0, -1.0]).double())))
     state = None if bracket_height >= up else _solve(model, bracket_height)
     if state is None or not bool(state.pads["U"].any()):
         raise NoEquilibrium(f"the bracket at {bracket_height} m is too high for its pad to touch the disc; lower it")
@@ -38,7 +39,9 @@ def press(model: SoftGrasp, bracket_height: float) -> Tensor:
 @torch.no_grad()
 def holding_force(model: SoftGrasp, y: Tensor) -> float:
     """Force [N] on the bracket, downwards, that balances the upper pad's normal forces in the frictionless state y (size,)."""
-    return float(model.unpack(y).pads["U"][0, :, 1].sum())
+    pad, part = model.pads["U"], model.unpack(y).pads["U"]
+    force = pad.elastic_force(part) if pad.inertial else part[0]
+    return float(force[:, 1].sum())
 
 
 def _with_bracket(state: State, x: Tensor, y: Tensor) -> State:
@@ -54,7 +57,7 @@ def _solve(model: SoftGrasp, bracket_height: float | None) -> State:
     p = model.settings
     x, height = torch.tensor(p.scenario.x_C0, dtype=torch.float64), p.pad.height
     zero = torch.zeros((), dtype=torch.float64)
-    below, above = (float(model.shape.support(torch.tensor([0.0, s]).double())) for s in (-1.0, 1.0))
+    below, above = (float(model.shape.support(torch.tensor([0.0, s]).double()).detach()) for s in (-1.0, 1.0))
     y_Br = zero + (bracket_height if bracket_height is not None else 10 * (below + height))
     bases = {"L": torch.zeros(2, dtype=torch.float64)} | (
         {} if bracket_height is None else {"U": torch.stack((x, y_Br))}

@@ -84,19 +84,20 @@ class Reference(nn.Module):
         for name, signal in signals.items():
             if not isinstance(signal, nn.Module):
                 raise ValueError(f"the signal `{name}` must be a module such as `Profile`, but is {type(signal).__name__}")
-        self.signals = nn.ModuleDict(signals)
+        self.signals = nn.ModuleDict({name.replace(".", ":"): signal for name, signal in signals.items()})
 
     def forward(self, t: Tensor, names: Sequence[str]) -> Tensor:
         """Values and rates (..., names, 2) at t (...) [s]. Raises `ValueError` for a signal that is not there."""
         rows = []
         for name in names:
-            if name not in self.signals:
-                raise ValueError(f"the reference has no signal `{name}`; it has {', '.join(self.signals) or 'none'}")
-            rows.append(torch.stack(self.signals[name](t), -1))
+            if name.replace(".", ":") not in self.signals:
+                known = ", ".join(key.replace(":", ".") for key in self.signals) or "none"
+                raise ValueError(f"the reference has no signal `{name}`; it has {known}")
+            rows.append(torch.stack(self[name](t), -1))
         return torch.stack(rows, -2) if rows else t.new_zeros((*t.shape, 0, 2))
 
     def __getitem__(self, name: str) -> nn.Module:
-        return self.signals[name]
+        return self.signals[name.replace(".", ":")]
 
 
 def hold(**values: float) -> Reference:

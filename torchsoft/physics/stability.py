@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchsoft.physics.equilibrium import holding_force, press
-from torchsoft.physics.motion import hold
+from torchsoft.physics.motion import Reference, hold
 from torchsoft.physics.paper import SoftGrasp
 
 DISPLACEMENT, VELOCITY = 1e-9, 1e-8
@@ -16,6 +16,19 @@ DISPLACEMENT, VELOCITY = 1e-9, 1e-8
 
 NEUTRAL = 0.1
 """Growth rate [1/s] up to which a mode counts as neutral; the disc's angle is one."""
+
+
+@torch.no_grad()
+def linearised(model: SoftGrasp, y: Tensor, reference: Reference) -> Tensor:
+    """dy'/dy (size, size) at a state y (size,) of rest, with touching and sticking as they are there."""
+    size = torch.full((model.layout.size,), DISPLACEMENT, dtype=torch.float64)
+    for (part, name), where in model.layout.slices.items():
+        if part == "pads" and not model.pads[name].inertial:  # forces, counted by the displacement they make
+            size[where] = DISPLACEMENT / float(model.pads[name].compliance().diagonal().max())
+        elif part in ("rates", "velocity"):
+            size[where] = VELOCITY
+    ahead, behind = (model(0.0, y + sign * torch.diag(size), reference) for sign in (1, -1))
+    return ((ahead - behind) / (2 * size[:, None])).mT
 
 
 @torch.no_grad()
@@ -28,14 +41,7 @@ def loop_modes(model: SoftGrasp) -> Tensor:
     y = press(model, model.settings.scenario.y_Br_grasp)
     pose = model.unpack(y).pose
     reference = hold(x_d=float(pose["disc"][0]), y_d=float(pose["bracket"][1]), F_ff=-holding_force(model, y))
-    size = torch.full((model.layout.size,), DISPLACEMENT, dtype=torch.float64)
-    for (part, name), where in model.layout.slices.items():
-        if part == "pads" and not model.pads[name].inertial:  # forces, counted by the displacement they make
-            size[where] = DISPLACEMENT / float(model.pads[name].compliance().diagonal().max())
-        elif part in ("rates", "velocity"):
-            size[where] = VELOCITY
-    ahead, behind = (model(0.0, y + sign * torch.diag(size), reference) for sign in (1, -1))
-    modes = torch.linalg.eigvals(((ahead - behind) / (2 * size[:, None])).mT)
+    modes = torch.linalg.eigvals(linearised(model, y, reference))
     return modes[modes.real.argsort(descending=True)]
 
 

@@ -46,6 +46,11 @@ class Layout:
             self.slices[key] = slice(self.size, self.size + math.prod(shape))
             self.size += math.prod(shape)
 
+    @property
+    def rigid(self) -> list[int]:
+        """Components of the bodies' free coordinates, then of their rates."""
+        return [i for (part, _), s in self.slices.items() if part in ("pose", "velocity") for i in range(s.start, s.stop)]
+
     def check(self, y: Tensor) -> None:
         """Raises `ValueError` for another length or dtype than float64."""
         if y.shape[-1:] != (self.size,) or y.dtype != torch.float64:

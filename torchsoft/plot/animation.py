@@ -1,4 +1,4 @@
-"""The paper's video: disc, deformed pads and contact forces over the whole run."""
+"""The paper's video: bodies, deformed pads and contact forces over the whole run, of any rig."""
 
 import importlib.util
 from collections.abc import Iterable, Iterator, Sequence
@@ -17,11 +17,11 @@ from PIL import Image
 from tqdm import tqdm
 
 from torchsoft.files import replacing
-from torchsoft.model import SoftGrasp
-from torchsoft.pad import Array
+from torchsoft.physics.mesh import Array
+from torchsoft.physics.rig import Rig
 from torchsoft.plot.figures import ACTUAL, DESIRED, STYLE, timeline
-from torchsoft.plot.scene import FRICTION, INK, MM, NORMAL, Instant, Scene, force_scale, instants, span
-from torchsoft.trajectory import Trajectory
+from torchsoft.plot.scene import FRICTION, INK, MM, NORMAL, Instant, Scene, force_scale, instants
+from torchsoft.solve.trajectory import Trajectory
 
 FRAMES_PER_SECOND = 12
 
@@ -46,25 +46,26 @@ class Stage(NamedTuple):
 
 
 @rc_context(STYLE)
-def set_stage(trajectory: Trajectory, model: SoftGrasp, shown: Sequence[Instant], dpi: int) -> Stage:
-    """Everything that stays: axes, legend, the curve of x_C over time."""
+def set_stage(trajectory: Trajectory, rig: Rig, shown: Sequence[Instant], dpi: int) -> Stage:
+    """Everything that stays: axes, legend, the curve of the first body's x over time."""
     figure = Figure(figsize=(8.0, 5.8), dpi=dpi, layout="constrained")
     canvas = FigureCanvasAgg(figure)
     whole, strip = figure.subplots(2, 1, height_ratios=(3.6, 1))
-    height = 13.0
-    x_limits, y_limits = span(model, height)
-    curves = force_scale(shown, height)
-    scene = Scene(whole, model, columns=5, curves=curves)
-    scene.scale_bar(whole, x_limits[1] - 6, y_limits[1] - height - 2)
+    scene = Scene(whole, rig, columns=5, curves=force_scale(rig, shown))
+    x_limits, y_limits = scene.limits(shown)
     whole.set(xlim=x_limits, ylim=y_limits, xlabel="x [mm]", ylabel="y [mm]")
-    whole.set_title("Disc rolled between two soft pads (paper: the video); the grasp in slow motion")
+    scene.scale_bar(whole)
+    whole.set_title("Bodies, pads and contact forces (paper: the video); the first half second in slow motion")
     whole.grid(False)
     whole.plot([], [], "o-", color=NORMAL, ms=3, label="normal force")
     whole.plot([], [], color=FRICTION, label="friction (outwards: to the right)")
     whole.legend(loc="lower left")
-    t = timeline(strip, "$x_C$ [mm]", trajectory)
-    strip.plot(t, MM * trajectory.desired[:, 0].numpy(), color=DESIRED, lw=3, label="desired")
-    strip.plot(t, MM * trajectory.state.r_C[:, 0].numpy(), color=ACTUAL, lw=1, label="actual")
+    body, symbol = next(iter(rig.symbols.items()))
+    t = timeline(strip, f"$x_{{{symbol}}}$ [mm]", trajectory)
+    for actuator in rig.actuators.values():
+        if actuator.measures == f"{body}.x":
+            strip.plot(t, MM * trajectory[actuator.setpoint].numpy(), color=DESIRED, lw=3, label="desired")
+    strip.plot(t, MM * trajectory[f"x_{symbol}"].numpy(), color=ACTUAL, lw=1, label="actual")
     strip.legend(loc="lower right", ncols=2)
     strip.set_xlabel("time [s]")
     (cursor,) = strip.plot([], [], "o", color=INK, ms=6)
@@ -72,10 +73,10 @@ def set_stage(trajectory: Trajectory, model: SoftGrasp, shown: Sequence[Instant]
     return Stage(canvas, scene, cursor, clock)
 
 
-def render(trajectory: Trajectory, model: SoftGrasp, times: Array, dpi: int) -> Iterator[Picture]:
+def render(trajectory: Trajectory, rig: Rig, times: Array, dpi: int) -> Iterator[Picture]:
     """RGB pictures (height, width, 3) at `times` [s]. The axes are drawn once; per picture only what moves."""
-    shown = instants(model, trajectory, times.tolist())
-    canvas, scene, cursor, clock = set_stage(trajectory, model, shown, dpi)
+    shown = instants(rig, trajectory, times.tolist())
+    canvas, scene, cursor, clock = set_stage(trajectory, rig, shown, dpi)
     moving: list[Artist] = [*scene.moving, clock, cursor]
     for artist in moving:
         artist.set_animated(True)
@@ -83,7 +84,7 @@ def render(trajectory: Trajectory, model: SoftGrasp, times: Array, dpi: int) -> 
     background = canvas.copy_from_bbox(canvas.figure.bbox)
     for instant in shown:
         scene.show(instant)
-        cursor.set_data([instant.time], [instant.centre[0]])
+        cursor.set_data([instant.time], [next(iter(instant.pose.values()))[0]])
         clock.set_text(f"t = {instant.time:6.3f} s")
         canvas.restore_region(background)
         for artist in moving:
@@ -93,7 +94,7 @@ def render(trajectory: Trajectory, model: SoftGrasp, times: Array, dpi: int) -> 
 
 
 def animate(
-    trajectory: Trajectory, model: SoftGrasp, path: Path, *, frames: int = 150, dpi: int = 110, progress: bool = True
+    trajectory: Trajectory, rig: Rig, path: Path, *, frames: int = 150, dpi: int = 110, progress: bool = True
 ) -> None:
     """Write `frames` pictures of the whole run as .gif, or as .mp4 where imageio-ffmpeg is installed.
 
@@ -105,7 +106,7 @@ def animate(
     if path.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise ModuleNotFoundError(f"{path} needs imageio-ffmpeg: pip install 'torchsoft[video]', or write a .gif")
     times = frame_times(trajectory, frames)
-    bar = tqdm(render(trajectory, model, times, dpi), "animation", len(times), unit="frame", disable=not progress)
+    bar = tqdm(render(trajectory, rig, times, dpi), "animation", len(times), unit="frame", disable=not progress)
     with replacing(path) as partial:
         (write_gif if path.suffix == ".gif" else write_mp4)(bar, partial)
 

@@ -16,11 +16,26 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchsoft.channels import PADS
 from torchsoft.files import replacing
-from torchsoft.model import SoftGrasp
-from torchsoft.pad import Array
-from torchsoft.plot.scene import FRICTION, INK, MM, NORMAL, Instant, Scene, around_contact, force_scale, instants, span
-from torchsoft.trajectory import Trajectory
+from torchsoft.physics.mesh import Array
+from torchsoft.physics.rig import Rig
+from torchsoft.plot.scene import (
+    FRICTION,
+    INK,
+    MM,
+    NORMAL,
+    Instant,
+    Scene,
+    along_surface,
+    around_contact,
+    force_scale,
+    in_world,
+    instants,
+    own_axes,
+    unit,
+)
+from torchsoft.solve.trajectory import Trajectory
 
 STYLE: Any = {
     "font.size": 10,
@@ -41,21 +56,15 @@ STYLE: Any = {
 
 DESIRED, ACTUAL, OTHER = "#999999", "#0077bb", "#ee7733"
 
-STORED = {
-    "lower pad, strain": (("strain_L",), "#08519c"),
-    "upper pad, strain": (("strain_U",), "#4292c6"),
-    "contact springs": (("normal_springs", "tangential_springs"), "#9ecae1"),
-    "kinetic": (("disc", "spin", "bracket", "kinetic_L", "kinetic_U"), "#deebf7"),
-}
-DISSIPATED = {
-    "lower pad, damping": (("pad_L",), "#a63603"),
-    "upper pad, damping": (("pad_U",), "#e6550d"),
-    "contact dashpots": (("contact_dashpots",), "#fdae6b"),
-    "slip": (("slip",), "#fee6ce"),
-}
+STRAIN, DAMPING = ("#08519c", "#4292c6", "#2171b5"), ("#a63603", "#e6550d", "#d94801")
+"""Colours of the pads' energies, in turn."""
 
 SNAPSHOTS = (0.375, 2.5, 5.0, 7.5, 10.0, 17.5, 20.0, 22.5, 25.0)
 """Times [s] of the paper's Fig. 16."""
+
+
+CLOSE = 10.0
+"""How far a close-up reaches on either side, for pads like the paper's [mm]."""
 
 
 def save(figure: Figure, path: Path, dpi: int = 150) -> None:
@@ -83,10 +92,9 @@ def motion(trajectory: Trajectory) -> Figure:
     """The disc's horizontal displacement and velocity, desired and actual, and what lies between them."""
     figure = new_figure("Desired and actual motion of the disc (paper: Figs. 10 and 13)", 9, 5.6)
     axes = figure.subplots(2, 2, sharex=True, height_ratios=(2, 1))
-    s = trajectory.state
     columns = (
-        ("a) displacement", "x_C [mm]", trajectory.desired[:, 0], s.r_C[:, 0], "error [mm]"),
-        ("b) velocity", "velocity of C [mm/s]", trajectory.desired[:, 1], s.v_C[:, 0], "error [mm/s]"),
+        ("a) displacement", "x_C [mm]", trajectory["x_d"], trajectory["x_C"], "error [mm]"),
+        ("b) velocity", "velocity of C [mm/s]", trajectory["x_d_dot"], trajectory["v_x"], "error [mm/s]"),
     )
     for (upper, lower), (title, label, desired, actual, error) in zip(axes.T, columns):
         t = timeline(upper, label.replace("x_C", "$x_C$"), trajectory)
@@ -107,18 +115,18 @@ def control_forces(trajectory: Trajectory) -> Figure:
     figure = new_figure("Control forces on the bracket (paper: Fig. 11)", 9, 3.6)
     panels = figure.subplots(1, 2)
     titles = (
-        ("a) vertical, positive upwards", "$F_y$ [N]", 1),
-        ("b) horizontal, positive to the right", "$F_x$ [N]", 0),
+        ("a) vertical, positive upwards", "$F_y$ [N]", "F_y"),
+        ("b) horizontal, positive to the right", "$F_x$ [N]", "F_x"),
     )
-    for axes, (title, label, axis) in zip(panels, titles):
+    for axes, (title, label, channel) in zip(panels, titles):
         t = timeline(axes, label, trajectory)
-        axes.plot(t, trajectory.control[:, axis].numpy(), color=ACTUAL, lw=1.1)
+        axes.plot(t, trajectory[channel].numpy(), color=ACTUAL, lw=1.1)
         axes.set_title(title)
         axes.set_xlabel("time [s]")
     if trajectory.t[-1] > 2:  # the grasp takes one eightieth of the axis: show it again
         grasp = panels[0].inset_axes((0.35, 0.38, 0.55, 0.5))
         first = trajectory.t <= 1
-        grasp.plot(trajectory.t[first].numpy(), trajectory.control[first, 1].numpy(), color=ACTUAL, lw=1.1)
+        grasp.plot(trajectory.t[first].numpy(), trajectory["F_y"][first].numpy(), color=ACTUAL, lw=1.1)
         grasp.set_title("the grasp", fontsize=9)
         grasp.set_xlim(0, 1)
         grasp.tick_params(labelsize=8)
@@ -139,88 +147,107 @@ def one_curve(trajectory: Trajectory, title: str, label: str, values: Tensor) ->
 def bracket_moment(trajectory: Trajectory) -> Figure:
     """Moment on the bracket about its centre of mass."""
     title = "Moment on the bracket about its centre of mass (paper: Fig. 12)"
-    return one_curve(trajectory, title, "$M_{Br}$ [N m], positive anticlockwise", trajectory.bracket_moment)
+    return one_curve(trajectory, title, "$M_{Br}$ [N m], positive anticlockwise", trajectory["bracket_moment"])
 
 
 def angular_momentum(trajectory: Trajectory) -> Figure:
     """Angular momentum of the disc about its centre of mass."""
     title = "Angular momentum of the disc about its centre of mass (paper: Fig. 17)"
-    momentum = MM**2 * trajectory.inertia * trajectory.state.omega
-    return one_curve(trajectory, title, r"$I_C\,\omega$ [kg mm²/s], positive anticlockwise", momentum)
+    label = r"$I_C\,\omega$ [kg mm²/s], positive anticlockwise"
+    return one_curve(trajectory, title, label, MM**2 * trajectory["angular_momentum"])
 
 
-def contact_forces(axes: Axes, instant: Instant, which: str) -> None:
-    """Normal force (red, filled circles) and friction (blue) on one pad's nodes [N] against x [mm]."""
-    x, force = around_contact(instant, which)
+def contact_forces(axes: Axes, instant: Instant, contact: str) -> None:
+    """Normal force (red, filled circles) and friction (blue) at one contact's points [N] against x [mm]."""
+    x, force = around_contact(instant, contact)
     axes.axhline(0, color=INK, lw=0.6)
     axes.plot(x, force[:, 1], "s-", color=FRICTION, ms=3.5, label="friction (positive to the right)")
     axes.plot(x, force[:, 0], "o-", color=NORMAL, ms=4.5, label="normal force on the pad's nodes")
     axes.set_ylabel("force [N]")
 
 
+def close_up(axes: Axes, rig: Rig, instant: Instant, contact: str, shared: bool) -> None:
+    """The deformed pad under one contact, and the body on it; a `shared` axis of x gives way to the equal aspect in y."""
+    Scene(axes, rig, columns=1).show(instant)
+    name, body = rig.contacts[contact].pad, rig.contacts[contact].body
+    shape, pose, pad = rig.bodies[body].shape, instant.pose[body], rig.pads[name]
+    assert shape is not None
+    inwards = -own_axes(pad, instant.base[name])[1]
+    own = torch.from_numpy(in_world(inwards, np.array([0.0, 0.0, -pose[2]])))
+    reach = MM * (float(shape.support(own).detach()) + 0.5 * pad.mesh.height) - 0.5 * unit(rig)
+    x, y = pose[:2] + reach * inwards
+    axes.set_xlim(x - CLOSE * unit(rig), x + CLOSE * unit(rig))
+    axes.set_ylim(y - 3.3 * unit(rig), y + 3.3 * unit(rig), auto=True)
+    axes.set_aspect("equal", adjustable="datalim" if shared else "box")
+    axes.set_ylabel("y [mm]")
+    axes.grid(False)
+
+
 @rc_context(STYLE)
-def force_distribution(trajectory: Trajectory, model: SoftGrasp, time: float) -> Figure:
-    """Normal force and friction on both pads at the sample nearest to `time` [s], over the deformed pads."""
-    (instant,) = instants(model, trajectory, [time])
+def force_distribution(trajectory: Trajectory, rig: Rig, time: float) -> Figure:
+    """Normal force and friction at every contact at the sample nearest to `time` [s], over the deformed pads."""
+    (instant,) = instants(rig, trajectory, [time])
     source = {0.125: " (paper: Fig. 14)", 5.0: " (paper: Fig. 15)"}.get(time, "")
-    figure = new_figure(f"Contact forces on the pads at t = {instant.time:g} s{source}", 10.5, 7.4)
-    grid = figure.add_gridspec(4, 2, width_ratios=(1, 1.1), height_ratios=(1, 1.3, 1.3, 1))
-    centre, radius, half = instant.centre, MM * model.settings.disc.radius, 10.0
-    whole = figure.add_subplot(grid[:, 0])
-    Scene(whole, model, columns=2).show(instant)
-    whole.set(xlim=(centre[0] - 32, centre[0] + 32), ylim=(-10, 2 * radius + 20), title="b) disc and pads")
-    whole.set(xlabel="x [mm]", ylabel="y [mm]")
-    whole.grid(False)
-    spread = np.concatenate([around_contact(instant, k)[1].ravel() for k in "LU"])
-    low, high = float(spread.min(initial=0.0)), float(spread.max(initial=1e-3))
-    rows = (
-        ("c) forces on the upper pad", "U"),
-        ("upper interface, close up", "U"),
-        ("lower interface, close up", "L"),
-        ("a) forces on the lower pad", "L"),
+    contacts = list(rig.contacts)[::-1]
+    rows = [(key, close) for key in contacts for close in (False, True)]
+    rows[-2:] = rows[:-3:-1]  # the forces come last, over the labels of the axis
+    figure = new_figure(f"Contact forces on the pads at t = {instant.time:g} s{source}", 10.5, 3.7 * len(contacts))
+    grid = figure.add_gridspec(
+        len(rows), 2, width_ratios=(1, 1.1), height_ratios=[1.3 if close else 1 for _, close in rows]
     )
-    first = None
-    for row, (title, which) in enumerate(rows):
-        first = axes = figure.add_subplot(grid[row, 1], sharex=first)
-        axes.set_title(title)
-        if row in (0, 3):
-            contact_forces(axes, instant, which)
-            axes.set_ylim(low - 0.08 * (high - low), high + 0.12 * (high - low))
+    body = rig.bodies[rig.contacts[contacts[-1]].body]
+    centre, radius = instant.pose[rig.contacts[contacts[-1]].body], MM * body.shape.size() if body.shape else 0.0
+    whole = figure.add_subplot(grid[:, 0])
+    Scene(whole, rig, columns=2).show(instant)
+    whole.set(xlim=(centre[0] - 1.6 * radius, centre[0] + 1.6 * radius), title="b) bodies and pads")
+    whole.set(ylim=(centre[1] - 1.65 * radius, centre[1] + 1.85 * radius), xlabel="x [mm]", ylabel="y [mm]")
+    whole.grid(False)
+    spread = np.concatenate([around_contact(instant, k)[1].ravel() for k in contacts])
+    low, high = float(spread.min(initial=0.0)), float(spread.max(initial=1e-3))
+    first, shared = None, rig.contacts[contacts[0]].body
+    for row, (key, close) in enumerate(rows):
+        contact = rig.contacts[key]
+        direction = along_surface(rig.pads[contact.pad], instant.base[contact.pad])
+        level = bool(direction[0] > 0.999) and contact.body == shared
+        axes = figure.add_subplot(grid[row, 1], sharex=first if level else None)
+        if close:
+            axes.set_title(f"{PADS[key]} interface, close up" if key in PADS else f"{key}, close up")
+            close_up(axes, rig, instant, key, level)
         else:
-            Scene(axes, model, columns=1).show(instant)
-            out = 1 if which == "U" else -1
-            middle = float(centre[1]) + out * (radius + 0.5 * MM * model.settings.pad.height - 0.5)
-            axes.set_ylim(middle - 3.3, middle + 3.3, auto=True)  # give way to the equal aspect
-            axes.set_aspect("equal", adjustable="datalim")
-            axes.set_ylabel("y [mm]")
-            axes.grid(False)
-        axes.tick_params(labelbottom=row == 3)
-    assert first is not None
-    first.set(xlim=(centre[0] - half, centre[0] + half), xlabel="x [mm]")
-    first.xaxis.set_major_locator(MaxNLocator(integer=True))
-    handles, labels = first.get_legend_handles_labels()
+            letter = {"U": "c) ", "L": "a) "}.get(key, "")
+            axes.set_title(f"{letter}forces on the {PADS[key]} pad" if key in PADS else f"{key}, forces on the pad")
+            contact_forces(axes, instant, key)
+            middle = float(instant.pose[contact.body][:2] @ direction)
+            axes.set_xlim(middle - CLOSE * unit(rig), middle + CLOSE * unit(rig))
+            axes.set_ylim(low - 0.08 * (high - low), high + 0.12 * (high - low))
+        axes.tick_params(labelbottom=not level or row == len(rows) - 1)
+        first = axes if level and first is None else first
+    axes.set_xlabel("x [mm]" if direction[0] > 0.999 else "along the surface [mm]")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles[::-1], labels[::-1], loc="outside upper right", ncols=2)
     figure.align_ylabels()
     return figure
 
 
 @rc_context(STYLE)
-def snapshots(trajectory: Trajectory, model: SoftGrasp, times: Sequence[float] = SNAPSHOTS) -> Figure:
-    """Disc, deformed pads and contact forces at `times` [s]; those after the end of the run are left out."""
+def snapshots(trajectory: Trajectory, rig: Rig, times: Sequence[float] = SNAPSHOTS) -> Figure:
+    """Bodies, deformed pads and contact forces at `times` [s]; those after the end of the run are left out."""
     end = float(trajectory.t[-1]) + 1e-9
-    shown = instants(model, trajectory, [t for t in times if t <= end] or [end])
+    shown = instants(rig, trajectory, [t for t in times if t <= end] or [end])
     columns = min(3, len(shown))
     rows = -(-len(shown) // columns)
-    figure = new_figure("The disc rolled between the pads (paper: Fig. 16)", 4.6 * columns + 0.4, 2.75 * rows + 0.9)
+    figure = new_figure(
+        "Bodies, pads and contact forces over time (paper: Fig. 16)", 4.6 * columns + 0.4, 2.75 * rows + 0.9
+    )
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-    height = 13.0
-    curves = force_scale(shown, height)
-    x_limits, y_limits = span(model, height)
+    curves = force_scale(rig, shown)
     for axes, instant, letter in zip(grid.flat, shown, "abcdefghijklmnopqrstuvwxyz"):
-        scene = Scene(axes, model, columns=5, curves=curves)
+        scene = Scene(axes, rig, columns=5, curves=curves)
         scene.show(instant)
-        scene.scale_bar(axes, x_limits[1] - 6, y_limits[1] - height - 2)
+        x_limits, y_limits = scene.limits(shown)
         axes.set(xlim=x_limits, ylim=y_limits, title=f"{letter}) t = {instant.time:g} s")
+        scene.scale_bar(axes)
         axes.grid(False)
     for axes in grid.flat[len(shown) :]:
         axes.set_visible(False)
@@ -235,10 +262,29 @@ def snapshots(trajectory: Trajectory, model: SoftGrasp, times: Sequence[float] =
     return figure
 
 
-def grouped_energies(energies: Mapping[str, Tensor], groups: Mapping[str, tuple[tuple[str, ...], str]]) -> list[Array]:
-    """Sums [mJ] of the named energies, one array a group; what a fidelity does not have counts as nothing."""
-    none = torch.zeros_like(next(iter(energies.values())))
-    return [MM * sum((energies[n] for n in names if n in energies), none).numpy() for names, _ in groups.values()]
+def energy_groups(trajectory: Trajectory) -> list[tuple[str, Array, str]]:
+    """Label, energy [mJ] (T,) and colour of what is stored (pads, springs, motion) and dissipated (pads, dashpots, slip)."""
+    stored, lost = dict(trajectory.energy), dict(trajectory.dissipated)
+
+    def pads(
+        energies: dict[str, Tensor], prefix: str, what: str, colours: Sequence[str]
+    ) -> list[tuple[str, Tensor, str]]:
+        names = [name.removeprefix(prefix) for name in energies if name.startswith(prefix)]
+        return [
+            (f"{PADS.get(name, name)} pad, {what}", energies.pop(prefix + name), colours[i % len(colours)])
+            for i, name in enumerate(names)
+        ]
+
+    kept = pads(stored, "strain_", "strain", STRAIN)
+    kept.append(("contact springs", stored.pop("normal_springs") + stored.pop("tangential_springs"), "#9ecae1"))
+    kept.append(("kinetic", sum(stored.values(), torch.zeros_like(trajectory.t)), "#deebf7"))
+    gone = pads(lost, "pad_", "damping", DAMPING)
+    gone += [
+        (name.replace("_", " "), value, colour) for (name, value), colour in zip(lost.items(), ("#fdae6b", "#fee6ce"))
+    ]
+    groups = [(f"stored: {name}", value, colour) for name, value, colour in kept]
+    groups += [(f"dissipated: {name}", value, colour) for name, value, colour in gone]
+    return [(f"{name} (up to {MM * float(x.max()):.2g} mJ)", MM * x.numpy(), colour) for name, x, colour in groups]
 
 
 @rc_context(STYLE)
@@ -247,11 +293,8 @@ def energy_balance(trajectory: Trajectory) -> Figure:
     figure = new_figure("Energy: stored and dissipated against supplied", 9.5, 6.2)
     stack, residual = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     t = timeline(stack, "energy [mJ]", trajectory)
-    parts = grouped_energies(trajectory.energy, STORED) + grouped_energies(trajectory.dissipated, DISSIPATED)
-    groups = STORED | DISSIPATED
-    kinds = ["stored"] * len(STORED) + ["dissipated"] * len(DISSIPATED)
-    labels = [f"{kind}: {name} (up to {part.max():.2g} mJ)" for kind, name, part in zip(kinds, groups, parts)]
-    stack.stackplot(t, *parts, labels=labels, colors=[colour for _, colour in groups.values()], lw=0)
+    labels, parts, colours = zip(*energy_groups(trajectory))
+    stack.stackplot(t, *parts, labels=labels, colors=colours, lw=0)
     start = MM * sum(float(value[0]) for value in trajectory.energy.values())
     supplied = start + MM * sum(value.numpy() for value in trajectory.supplied.values())
     stack.plot(t, supplied, color="black", lw=1.4, ls=(0, (4, 2)), label="stored at the start + supplied")
@@ -266,15 +309,15 @@ def energy_balance(trajectory: Trajectory) -> Figure:
 
 
 def friction_ratio(trajectory: Trajectory) -> Array:
-    """Sum of |F_T| over sum of F_N, both pads, in %; zero where nothing touches."""
-    forces = torch.cat((trajectory.force_L, trajectory.force_U), 1)
+    """Sum of |F_T| over sum of F_N, all contacts, in %; zero where nothing touches."""
+    forces = torch.cat(list(trajectory.force.values()), 1)
     normal, friction = forces[..., 0].sum(-1), forces[..., 1].abs().sum(-1)
     return (100 * friction / normal.clamp(min=1e-12)).numpy()
 
 
 @rc_context(STYLE)
-def friction_comparison(runs: Mapping[str, tuple[SoftGrasp, Trajectory]]) -> Figure:
-    """Friction of several parameter sets: on both pads in the grasp and in rolling, its ratio to the normal force, and F_x."""
+def friction_comparison(runs: Mapping[str, tuple[Rig, Trajectory]]) -> Figure:
+    """Friction of several parameter sets: at two contacts in grasp and roll, its ratio to the normal force, and F_x."""
     figure = new_figure("Two friction sets compared (paper: Figs. 11b, 14 and 15)", 10, 8)
     axes = figure.subplots(3, 2)
     for panel in axes[:2].flat[1:]:
@@ -282,18 +325,18 @@ def friction_comparison(runs: Mapping[str, tuple[SoftGrasp, Trajectory]]) -> Fig
     styles = list(zip((FRICTION, OTHER, INK), ("o-", "s--", "^:")))
     end = min(float(trajectory.t[-1]) for _, trajectory in runs.values())
     for column, time in enumerate((0.375, 5.0)):
-        for (name, (model, trajectory)), (colour, marker) in zip(runs.items(), styles):
-            (instant,) = instants(model, trajectory, [min(time, end)])
-            for row, k in enumerate("UL"):
+        for (name, (rig, trajectory)), (colour, marker) in zip(runs.items(), styles):
+            (instant,) = instants(rig, trajectory, [min(time, end)])
+            for row, k in enumerate(list(rig.contacts)[1::-1]):
                 x, force = around_contact(instant, k)
                 axes[row, column].plot(x, force[:, 1], marker, color=colour, ms=3.5, label=name)
-                axes[row, column].set_title(f"{'upper' if k == 'U' else 'lower'} pad, t = {instant.time:g} s")
+                axes[row, column].set_title(f"{PADS.get(k, k)} pad, t = {instant.time:g} s")
                 axes[row, column].set(xlabel="x [mm]", ylabel="friction, right + [N]")
     for (name, (_, trajectory)), (colour, marker) in zip(runs.items(), styles):
         line = {"color": colour, "ls": marker[1:], "lw": 1.1, "label": name}
         axes[2, 0].plot(timeline(axes[2, 0], "friction / normal [%]", trajectory), friction_ratio(trajectory), **line)
-        axes[2, 1].plot(timeline(axes[2, 1], "$F_x$ [N]", trajectory), trajectory.control[:, 0].numpy(), **line)
-    axes[2, 0].set_title("sum of |friction| over sum of normal force, both pads")
+        axes[2, 1].plot(timeline(axes[2, 1], "$F_x$ [N]", trajectory), trajectory["F_x"].numpy(), **line)
+    axes[2, 0].set_title("sum of |friction| over sum of normal force")
     axes[2, 1].set_title("horizontal control force")
     for panel in axes[2]:
         panel.set_xlabel("time [s]")

@@ -1,4 +1,4 @@
-"""The picture of one instant: ground, deformed pads, bracket, disc with a spoke, and the nodal forces as curves.
+"""The picture of one instant of any rig: deformed pads on their bases, bodies with a spoke, and the contact forces as curves.
 
 Figures and animation share it. Everything on axes is in millimetres and newtons.
 """
@@ -11,14 +11,15 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.patches import Circle, Polygon, Rectangle
+from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
-from torchsoft.model import SoftGrasp
-from torchsoft.pad import Array, PadMesh, lame_moduli
-from torchsoft.trajectory import Trajectory
+from torchsoft.physics.mesh import Array, PadMesh, lame_moduli
+from torchsoft.physics.pads import Pad
+from torchsoft.physics.rig import Rig
+from torchsoft.solve.trajectory import Trajectory
 
 NORMAL, FRICTION, INK = "#cc3311", "#0077bb", "#333333"
 """Red and blue as in the paper, a pair that colour-blind readers can distinguish."""
@@ -44,164 +45,225 @@ def interior_solver(mesh: PadMesh, nu: float) -> tuple[SuperLU, NDArray[np.int64
     return splu(K[interior][:, interior]), interior, K[interior][:, surface].toarray()
 
 
-def deformed_mesh(model: SoftGrasp, which: str, u: Tensor, base: Tensor | None = None) -> Array:
-    """Positions (..., elements_x + 1, elements_y + 1, 2) [m] of all mesh nodes of pad "L" or "U", bonded ones too.
+def deformed_mesh(pad: Pad, u: Tensor) -> Array:
+    """Places (..., elements_x + 1, elements_y + 1, 2) [m] of all mesh nodes, bonded ones too, in the frame of the pad's base.
 
-    u (..., nodes, 2) [m]: the pad's displacements as the state holds them. A massless pad has only its surface there;
-    the interior is in equilibrium with it, u_i = -K_ii^-1 K_is u_s. `base` (..., 2) [m] is where the pad's origin is,
-    the bracket's centre of mass for the upper pad. The second mesh axis runs from the bonded face to the free surface.
+    u (..., nodes, 2) [m]: displacements as a run records them. A massless pad has only its surface there; the interior is
+    in equilibrium with it, u_i = -K_ii^-1 K_is u_s. The second mesh axis runs from the bonded face to the free surface.
     """
-    pad, mesh, batch = model.pads[which], model.pads[which].mesh, tuple(u.shape[:-2])
-    mirror = pad.mirror.numpy()
-    own = u.detach().reshape(-1, pad.nodes, 2).numpy() * mirror  # in the pad's own frame
+    mesh, batch = pad.mesh, tuple(u.shape[:-2])
+    own = (u.detach().reshape(-1, pad.nodes, 2) @ pad.axes).flatten(1).numpy()
     free = np.zeros((len(own), 2 * len(mesh.free)))
-    if pad.massless:
-        surface = (2 * mesh.surface[:, None] + np.arange(2)).ravel()
-        factor, interior, K_is = interior_solver(mesh, model.material.nu.item())
-        free[:, surface] = own.reshape(len(own), -1)
-        free[:, interior] = -factor.solve(K_is @ free[:, surface].T).T
+    if pad.inertial:
+        free[:] = own
     else:
-        free[:] = own.reshape(len(own), -1)
+        factor, interior, K_is = interior_solver(mesh, pad.material.nu.item())
+        free[:, (2 * mesh.surface[:, None] + np.arange(2)).ravel()] = own
+        free[:, interior] = -factor.solve(K_is @ own.T).T
     displacement = np.zeros((len(own), len(mesh.nodes), 2))
     displacement[:, mesh.free] = free.reshape(len(own), -1, 2)
-    first = pad.positions[pad.surface[0]].numpy()  # where the model puts the first surface node
-    origin = first - mesh.nodes[mesh.free[mesh.surface[0]]] * mirror
-    positions = (mesh.nodes + displacement) * mirror + origin
-    positions = positions.reshape(*batch, mesh.elements_x + 1, mesh.elements_y + 1, 2)
-    return positions if base is None else positions + base.detach().numpy()[..., None, None, :]
+    return pad.placed(mesh.nodes + displacement).reshape(*batch, mesh.elements_x + 1, mesh.elements_y + 1, 2)
+
+
+def in_world(places: Array, pose: Array) -> Array:
+    """Places (..., 2) in the frame of a body, in the world; pose (3,): the body's x, y and angle [rad]."""
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return places @ np.array([[c, s], [-s, c]]) + pose[:2]
 
 
 class Instant(NamedTuple):
-    """One sample as drawn: time [s], angle [rad], positions [mm], forces [N].
+    """One sample as drawn: time [s], poses of the bodies and of the pads' bases (3,) [mm, mm, rad], places [mm], forces [N].
 
-    mesh: pad -> (elements_x + 1, elements_y + 1, 2); surface: pad -> (surface, 2); force: pad -> (surface, 2), normal
-    force and friction on the pad, the latter positive to the right.
+    mesh: pad -> (elements_x + 1, elements_y + 1, 2); points: contact -> (points, 2); force: contact -> (points, 2), normal
+    force and friction on the pad, the latter positive along `along_surface`; along: contact -> (points,), how far the points
+    are in that direction.
     """
 
     time: float
-    centre: Array
-    angle: float
-    bracket: Array
+    pose: dict[str, Array]
+    base: dict[str, Array]
     mesh: dict[str, Array]
-    surface: dict[str, Array]
+    points: dict[str, Array]
     force: dict[str, Array]
+    along: dict[str, Array]
 
-    def touching(self, which: str) -> NDArray[np.bool_]:
-        """Surface nodes under a normal force."""
-        return self.force[which][:, 0] > 0
+    def near(self, contact: str) -> NDArray[np.int64]:
+        """Numbers of the points under a normal force, and of one more on each side."""
+        return np.flatnonzero(np.convolve(self.force[contact][:, 0] > 0, np.ones(3), "same") > 0)
 
 
-def instants(model: SoftGrasp, trajectory: Trajectory, times: Sequence[float]) -> list[Instant]:
+def instants(rig: Rig, trajectory: Trajectory, times: Sequence[float]) -> list[Instant]:
     """The samples of `trajectory` nearest to `times` [s], as drawn."""
     rows = [trajectory.at(time) for time in times]
-    s = model.layout.unpack(trajectory.y[rows])
-    mesh = {"L": MM * deformed_mesh(model, "L", s.u_L), "U": MM * deformed_mesh(model, "U", s.u_U, s.r_Br)}
-    number = {k: pad.mesh.free[pad.mesh.surface] for k, pad in model.pads.items()}
-    surface = {k: mesh[k].reshape(len(rows), -1, 2)[:, number[k]] for k in "LU"}
-    to_the_right = {"L": np.array([1.0, 1.0]), "U": np.array([1.0, -1.0])}  # t points left on the upper pad
-    force = {k: getattr(trajectory, f"force_{k}")[rows].numpy() * to_the_right[k] for k in "LU"}
-    return [
-        Instant(
-            float(trajectory.t[row]),
-            MM * s.r_C[i].numpy(),
-            s.theta[i].item(),
-            MM * s.r_Br[i].numpy(),
-            {k: mesh[k][i] for k in "LU"},
-            {k: surface[k][i] for k in "LU"},
-            {k: force[k][i] for k in "LU"},
-        )
-        for i, row in enumerate(rows)
-    ]
+    displacement = {name: trajectory.displacement[name][rows] for name in rig.pads}
+    meshes = {name: MM * deformed_mesh(pad, displacement[name]) for name, pad in rig.pads.items()}
+    shown = []
+    for i, row in enumerate(rows):
+        pose = {name: x[row].detach().numpy() * [MM, MM, 1.0] for name, x in trajectory.state.pose.items()}
+        base = {name: np.zeros(3) if pad.base is None else pose[pad.base] for name, pad in rig.pads.items()}
+        points, force, along = {}, {}, {}
+        for key, contact in rig.contacts.items():
+            pad, own = rig.pads[contact.pad], base[contact.pad]
+            points[key] = in_world(MM * (pad.spread @ (pad.positions + displacement[contact.pad][i])).numpy(), own)
+            direction, (_, y) = along_surface(pad, own), own_axes(pad, own)
+            t = np.array([y[1], -y[0]])  # of the moving frame, whose normal points into the pad
+            force[key] = trajectory.force[key][row].numpy() * [1.0, np.sign(direction @ t)]
+            along[key] = points[key] @ direction
+        mesh = {name: in_world(meshes[name][i], base[name]) for name in meshes}
+        shown.append(Instant(float(trajectory.t[row]), pose, base, mesh, points, force, along))
+    return shown
 
 
-def around_contact(instant: Instant, which: str) -> tuple[Array, Array]:
-    """x [mm] and forces [N] of the touching nodes of a pad and of one more on each side."""
-    rows = np.flatnonzero(np.convolve(instant.touching(which), np.ones(3), "same") > 0)
-    return instant.surface[which][rows, 0], instant.force[which][rows]
+def own_axes(pad: Pad, base: Array) -> Array:
+    """A pad's own x and y (2, 2) as unit vectors of the world; base (3,) is the pose of what it is bonded to."""
+    return in_world(pad.axes.numpy().T, base) - base[:2]
 
 
-def force_scale(shown: Sequence[Instant], height: float) -> tuple[float, float]:
-    """mm per N at which the largest force is `height` [mm] high, and a round force [N] for the scale bar."""
-    largest = max(float(np.abs(i.force[k]).max()) for i in shown for k in "LU")
+def along_surface(pad: Pad, base: Array) -> Array:
+    """The direction (2,) along a pad's surface that points to the right, or straight up."""
+    x = own_axes(pad, base)[0]
+    return x if x[0] + 1e-6 * x[1] > 0 else -x
+
+
+def own_places(pad: Pad, base: Array, own: Array) -> Array:
+    """Places (..., 2) [mm] in the pad's own frame, in the world [mm]."""
+    return in_world(MM * pad.placed(own / MM), base)
+
+
+def around_contact(instant: Instant, contact: str) -> tuple[Array, Array]:
+    """Places along the pad's surface [mm] and forces [N] of the touching points and of one more on each side."""
+    rows = instant.near(contact)
+    return instant.along[contact][rows], instant.force[contact][rows]
+
+
+def unit(rig: Rig) -> float:
+    """What margins and curves are measured in [mm]: one for the paper's pads of 120 mm."""
+    return MM * max((pad.mesh.length for pad in rig.pads.values()), default=0.12) / 120
+
+
+def curve_height(rig: Rig) -> float:
+    """Height [mm] of the largest force's curve."""
+    return 13.0 * unit(rig)
+
+
+def force_scale(rig: Rig, shown: Sequence[Instant]) -> tuple[float, float]:
+    """mm per N at which the largest force is as high as `curve_height`, and a round force [N] for the scale bar."""
+    largest = max((float(np.abs(force).max()) for instant in shown for force in instant.force.values()), default=0.0)
     if largest == 0:
         return 1.0, 1.0
     decade = 10.0 ** np.floor(np.log10(largest))
-    return height / largest, float(max(m * decade for m in (1, 2, 5) if m * decade <= largest))
+    return curve_height(rig) / largest, float(max(m * decade for m in (1, 2, 5) if m * decade <= largest))
+
+
+def plates(rig: Rig) -> dict[str, float]:
+    """Thickness [mm] of the plate behind each pad: symmetric about its base's centre, none on a base that has a shape."""
+    out = {}
+    for name, pad in rig.pads.items():
+        if pad.base is not None:
+            behind = 2 * MM * float((pad.origin @ pad.axes)[1])  # the face's height over the base's centre
+            out[name] = max(behind, 0.0) if rig.bodies[pad.base].shape is None else 0.0
+    thickest = max(out.values(), default=0.0) or 4 * unit(rig)
+    return {name: out.get(name, thickest) for name in rig.pads}
 
 
 class Scene:
     """The artists of one picture on `axes`; `show` moves them to another instant.
 
     `columns` is the spacing, in elements, of the vertical mesh lines; every layer is drawn. With `curves` = (mm per N,
-    scale bar in N) the nodal forces stand outside the pads, normal force red with filled circles, friction blue.
+    scale bar in N) the contact forces stand behind the pads, normal force red with filled circles, friction blue.
     """
 
     def __init__(
-        self, axes: Axes, model: SoftGrasp, *, columns: int = 5, curves: tuple[float, float] | None = None
-    ) -> None:
-        p = model.settings
-        self.columns, self.curves = columns, curves
-        self.plate = 2 * MM * p.bracket.cm_height
-        self.offset = self.plate + 5.0
-        length, radius = MM * p.pad.length, MM * p.disc.radius
-        axes.add_patch(Rectangle((0, -self.plate), length, self.plate, facecolor=STEEL, edgecolor=INK, lw=0.6))
-        self.bracket = Rectangle((0, 0), length, self.plate, facecolor=STEEL, edgecolor=INK, lw=0.6)
-        self.outline = {k: Polygon(np.zeros((3, 2)), facecolor=PAD, edgecolor="none") for k in "LU"}
-        self.layers = {k: LineCollection([], colors=LAYER, linewidths=0.5) for k in "LU"}
-        self.disc = Circle((0, 0), radius, facecolor=DISC, edgecolor=INK, lw=1.0)
-        for patch in (self.bracket, *self.outline.values()):
-            axes.add_patch(patch)
+        self, axes: Axes, rig: Rig, *, columns: int = 5, curves: tuple[float, float] | None = None
+    ) -> None:  # fmt: skip
+        self.rig, self.columns, self.curves = rig, columns, curves
+        self.thickness = plates(rig)
+        self.shapes = {
+            name: MM * body.shape.outline().numpy() for name, body in rig.bodies.items() if body.shape is not None
+        }
+
+        def polygons(names: Sequence[str], face: str, edge: str, width: float) -> dict[str, Polygon]:
+            out = {k: Polygon(np.zeros((3, 2)), facecolor=face, edgecolor=edge, lw=width) for k in names}
+            for polygon in out.values():
+                axes.add_patch(polygon)
+            return out
+
+        self.plates = polygons([name for name, size in self.thickness.items() if size], STEEL, INK, 0.6)
+        self.outlines = polygons(list(rig.pads), PAD, "none", 0.0)
+        self.layers = {k: LineCollection([], colors=LAYER, linewidths=0.5) for k in rig.pads}
         for lines in self.layers.values():
             axes.add_collection(lines, autolim=False)
-        axes.add_patch(self.disc)
-        (self.spoke,) = axes.plot([], [], color=INK, lw=1.6, solid_capstyle="butt")
-        (self.hub,) = axes.plot([], [], "o", color=INK, ms=3)
-        self.friction, self.normal = {}, {}
-        if curves:
-            for k in "LU":
-                (self.friction[k],) = axes.plot([], [], color=FRICTION, lw=1.1)
-                (self.normal[k],) = axes.plot([], [], color=NORMAL, lw=1.1, marker="o", ms=1.8)
+        self.bodies = polygons(list(self.shapes), DISC, INK, 1.0)
+        self.spokes, self.hubs, self.friction, self.normal = {}, {}, {}, {}
+        for k in self.shapes:
+            (self.spokes[k],) = axes.plot([], [], color=INK, lw=1.6, solid_capstyle="butt")
+            (self.hubs[k],) = axes.plot([], [], "o", color=INK, ms=3)
+        for k in rig.contacts if curves else ():
+            (self.friction[k],) = axes.plot([], [], color=FRICTION, lw=1.1)
+            (self.normal[k],) = axes.plot([], [], color=NORMAL, lw=1.1, marker="o", ms=1.8)
         axes.set_aspect("equal")
 
     @property
     def moving(self) -> list[Artist]:
         """The artists that `show` changes, in drawing order."""
-        curves = [*self.friction.values(), *self.normal.values()]
-        return [self.bracket, *self.outline.values(), *self.layers.values(), self.disc, self.spoke, self.hub, *curves]
+        groups = (
+            self.plates,
+            self.outlines,
+            self.layers,
+            self.bodies,
+            self.spokes,
+            self.hubs,
+            self.friction,
+            self.normal,
+        )
+        return [artist for group in groups for artist in group.values()]
 
     def show(self, instant: Instant) -> None:
         """Put everything where it is at `instant`."""
-        face = instant.mesh["U"][0, 0]
-        self.bracket.set_xy((float(face[0]), float(face[1])))
         for k, mesh in instant.mesh.items():
-            self.outline[k].set_xy(np.concatenate((mesh[:, 0], mesh[-1], mesh[::-1, -1], mesh[0, ::-1])))
+            self.outlines[k].set_xy(np.concatenate((mesh[:, 0], mesh[-1], mesh[::-1, -1], mesh[0, ::-1])))
             self.layers[k].set_segments([*mesh.swapaxes(0, 1), *mesh[:: self.columns], mesh[-1]])
-        self.disc.center = (float(instant.centre[0]), float(instant.centre[1]))
-        tip = instant.centre + self.disc.radius * np.array([-np.sin(instant.angle), np.cos(instant.angle)])
-        self.spoke.set_data(*np.stack((instant.centre, tip), -1))
-        self.hub.set_data(*instant.centre[:, None])
-        if self.curves:
-            for k, out in (("L", -1.0), ("U", 1.0)):
-                x, force = around_contact(instant, k)
-                foot = -self.offset if k == "L" else float(face[1]) + self.offset
-                self.normal[k].set_data(x, foot + out * self.curves[0] * force[:, 0])
-                self.friction[k].set_data(x, foot + out * self.curves[0] * force[:, 1])
+        for k, plate in self.plates.items():
+            plate.set_xy(self.behind(instant, k, 0.0, self.thickness[k]))
+        for k, outline in self.shapes.items():
+            pose = instant.pose[k]
+            self.bodies[k].set_xy(in_world(outline, pose))
+            top = outline[len(outline) // 4]  # the boundary's point furthest along the body's own y
+            self.spokes[k].set_data(*np.stack((pose[:2], in_world(top, pose)), -1))
+            self.hubs[k].set_data(*pose[:2, None])
+        for k in self.normal:
+            name, rows = self.rig.contacts[k].pad, instant.near(k)
+            pad, base, force = self.rig.pads[name], instant.base[name], instant.force[k][rows]
+            x = (instant.points[k][rows] - own_places(pad, base, np.zeros(2))) @ own_axes(pad, base)[0]
+            foot = -self.thickness[name] - 5.0 * unit(self.rig)
+            for line, values in ((self.normal[k], force[:, 0]), (self.friction[k], force[:, 1])):
+                assert self.curves
+                line.set_data(*own_places(pad, base, np.stack((x, foot - self.curves[0] * values), -1)).T)
 
-    def scale_bar(self, axes: Axes, x: float, y: float) -> None:
-        """A vertical bar at (x, y) [mm] as long as the scale's force."""
+    def behind(self, instant: Instant, name: str, side: float, depth: float) -> Array:
+        """Corners (4, 2) [mm] of the rectangle behind a pad's bonded face, wider than it by `side` [mm] on each side."""
+        pad = self.rig.pads[name]
+        left, right = -side, MM * pad.mesh.length + side
+        corners = np.array([[left, -depth], [right, -depth], [right, 0.0], [left, 0.0]])
+        return own_places(pad, instant.base[name], corners)
+
+    def limits(self, shown: Sequence[Instant]) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Limits of x and y [mm] that hold every instant shown, with the force curves behind the pads."""
+        step, rows = unit(self.rig), []
+        for instant in shown:
+            rows += [in_world(outline, instant.pose[k]) for k, outline in self.shapes.items()]
+            for k, mesh in instant.mesh.items():
+                depth = self.thickness[k] + (curve_height(self.rig) + 7.0 * step if self.curves else 4.0 * step)
+                rows += [mesh.reshape(-1, 2), self.behind(instant, k, 4.0 * step, depth)]
+        every = np.concatenate(rows)
+        (left, low), (right, high) = every.min(0), every.max(0)
+        return (float(left), float(right)), (float(low), float(high))
+
+    def scale_bar(self, axes: Axes) -> None:
+        """A vertical bar in the upper right corner, as long as the scale's force."""
         assert self.curves
         millimetres, force = self.curves
+        step, (_, right), (_, high) = unit(self.rig), axes.get_xlim(), axes.get_ylim()
+        x, y = right - 6.0 * step, high - curve_height(self.rig) - 2.0 * step
         axes.plot([x, x], [y, y + millimetres * force], color=INK, lw=1.5, solid_capstyle="butt")
-        axes.text(x - 2, y + 0.5 * millimetres * force, f"{force:g} N", ha="right", va="center", fontsize=8)
-
-
-def span(model: SoftGrasp, height: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Limits of x and y [mm] that hold the whole manipulation, with `height` [mm] of force curves above and below."""
-    p = model.settings
-    half = 0.5 * p.pad.length
-    middles = (p.scenario.x_C0, p.scenario.x_C0 + 2 * p.scenario.travel)  # the bracket moves twice as far as the disc
-    left, right = min(0.0, *middles, *(m - half for m in middles)), max(p.pad.length, *(m + half for m in middles))
-    plate = 2 * p.bracket.cm_height
-    top = 2 * (p.pad.height + p.disc.radius) + plate
-    margin = height + 7.0
-    return (MM * left - 4, MM * right + 4), (-MM * plate - margin, MM * top + margin)
+        axes.text(x - 2.0 * step, y + 0.5 * millimetres * force, f"{force:g} N", ha="right", va="center", fontsize=8)

@@ -8,7 +8,7 @@ import numpy as np
 
 from torchsoft.channels import CHANNELS
 from torchsoft.reduced.ode import ALIASES
-from torchsoft.trajectory import Trajectory
+from torchsoft.solve.trajectory import Trajectory
 
 STATES = ("x_C", "theta", "x_Br", "v_C", "omega", "v_Br")
 KINEMATICS = {"x_C": "v_C", "theta": "omega", "x_Br": "v_Br"}

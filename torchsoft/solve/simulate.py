@@ -105,7 +105,7 @@ def _rows(
             size = stepper.layout.size
             if dy0 is not None and dy0.shape != (size, len(wrt)):
                 raise ValueError(f"`dy0` must have shape ({size}, {len(wrt)}), but has {tuple(dy0.shape)}")
-            kept = slice(size - 2 * len(stepper.compiled.system(1.0).bodies.coordinate) if rigid else 0, size)
+            kept = stepper.layout.rigid if rigid else list(range(size))
             yield from tangent.iterate(stepper, y0, t, wanted, dy0, kept)
     else:
         for y, out in adjoint.iterate(stepper, y0, t):

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchsoft.physics.contact import cross
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.grid import Chunk, check_times, chunks
@@ -125,7 +126,9 @@ class ImplicitStepper:
         """
         self.layout.check(y0)
         if y0.ndim != 1 or not bool(torch.isfinite(y0).all()):
-            raise ValueError(f"`y0` must be one finite state, shape ({self.layout.size},), but has shape {tuple(y0.shape)}")
+            raise ValueError(
+                f"`y0` must be one finite state, shape ({self.layout.size},), but has shape {tuple(y0.shape)}"
+            )
         check_times(t)
         todo = list(chunks(t, self.step))
         signals = self.signals(todo).numpy()
@@ -133,9 +136,11 @@ class ImplicitStepper:
         points, pads, coordinates = len(first.points.X), len(first.pads.base), len(first.bodies.free)
         n = len(self.integrals.names)
         out = Progress(
-            np.empty((len(t), self.layout.size)), np.zeros((len(t), points, 2)), np.zeros((len(t), n + pads + coordinates))
+            np.empty((len(t), self.layout.size)),
+            np.zeros((len(t), points, 2)),
+            np.zeros((len(t), n + pads + coordinates)),
         )
-        out.y[0] = y0.numpy()
+        out.y[0], out.forces[0], out.extras[0, n : n + pads] = y0.numpy(), *self._start(t[0], y0)
         y, integrals, taped = y0.numpy().copy(), np.zeros(n), 0
         work = scratch(first, self.layout.size)
         set_velocities(first, work, y)
@@ -171,6 +176,19 @@ class ImplicitStepper:
             elif status != CONVERGED:
                 raise self._failure(status, float(chunk.starts[steps]), chunk.h)
 
+    def _start(self, time: Tensor, y0: Tensor) -> tuple[Array, Array]:
+        """Forces on the contact points (points, 2) and moments of the pads (pads,) at the start, from the module."""
+        signals = self.rig.follow(time, self.reference)
+        state = self.rig.unpack(y0, signals)
+        graph = self.rig.evaluate(time, state, signals)
+        forces = [interface.out[..., 3:5].flatten().numpy() for interface in graph.interfaces.values()]
+        moments = [
+            cross(pad.positions + self.rig.displacement(name, state)).flatten()
+            @ graph.ports[f"pad_{name}"].effort.flatten()
+            for name, pad in self.rig.pads.items()
+        ]
+        return np.concatenate((np.empty(0), *forces)).reshape(-1, 2), np.array(moments)
+
     def signals(self, todo: Sequence[Chunk]) -> Tensor:
         """The signals at all stages of some chunks (stages, signals, 2)."""
         return self.compiled.signals(torch.cat([stage_times(chunk) for chunk in todo]), self.reference)
@@ -197,8 +215,9 @@ class ImplicitStepper:
         """One compiled call; with `taping` once more with a longer tape if more points touch than it has room for."""
         s, steps = self.compiled.system(chunk.h), len(chunk.starts)
         begin = y.copy(), work.V.copy(), work.u_dot.copy(), integrals.copy()
-        work.travelled[0] = np.inf  # look for near points afresh, so that a segment made again gives the same bits
         while True:
+            work.travelled[0] = np.inf  # look for near points afresh, so that a segment made again gives the same bits
+            work.low[:] = work.high[:] = 0
             tape = empty_tape(s, self.layout.size, 2 * steps if taping else 0, self._cap)
             done, status, solves = run(
                 s, work, y, signals.reshape(steps, 2, *signals.shape[1:]), chunk.h, self.tolerance, self.max_iterations,

@@ -11,28 +11,28 @@ from torchsoft.solve.kernel.tangent import forward
 from torchsoft.solve.stepper import ImplicitStepper, Progress, Segment
 
 
-def directions(stepper: ImplicitStepper, wanted: Sequence[Tensor]) -> Array:
-    """d (parameters' vector) / d (scalar tensors), (parameters, n), from the vector's own graph."""
-    p = stepper.compiled.p
-    out = np.zeros((len(p), len(wanted)))
-    grown = torch.zeros_like(p, requires_grad=True)
-    pulled = torch.autograd.grad(p, wanted, grown, create_graph=True, allow_unused=True)
+def directions(value: Tensor, wanted: Sequence[Tensor]) -> Array:
+    """d value / d (scalar tensors) (..., n) from the graph of `value` (...): its pullback is linear in the weights, so
+    differentiated by them it pushes forward."""
+    out = np.zeros((*value.shape, len(wanted)))
+    weights = torch.zeros_like(value, requires_grad=True)
+    pulled = torch.autograd.grad(value, wanted, weights, create_graph=True, allow_unused=True) if value.requires_grad else ()
     for k, part in enumerate(pulled):
         if part is not None and part.requires_grad:
-            (row,) = torch.autograd.grad(part, grown, retain_graph=True)
-            out[:, k] = row.numpy()
+            (row,) = torch.autograd.grad(part, weights, retain_graph=True)
+            out[..., k] = row.numpy()
     return out
 
 
 def iterate(
-    stepper: ImplicitStepper, y0: Tensor, t: Tensor, wanted: Sequence[Tensor], dy0: Tensor | None, columns: slice
+    stepper: ImplicitStepper, y0: Tensor, t: Tensor, wanted: Sequence[Tensor], dy0: Tensor | None, columns: list[int]
 ) -> Iterator[tuple[Tensor, Tensor, Progress]]:
     """States (T, size) and their derivatives (T, components, n) by the scalar tensors `wanted`, as the run grows; `columns` are
     the components of the state that are kept. dy0 (size, n) is the derivative of the initial state, zero by default."""
     n, size = len(wanted), stepper.layout.size
-    dp = directions(stepper, wanted)
+    dp = directions(stepper.compiled.p, wanted)
     dy = np.zeros((size, n)) if dy0 is None else dy0.detach().numpy().copy()
-    kept = np.zeros((len(t), len(range(size)[columns]), n))
+    kept = np.zeros((len(t), len(columns), n))
     kept[0] = dy[columns]
     segments: list[Segment] = []
     for out in stepper.integrate(y0.detach(), t, segments, tape_bytes=float("inf")):

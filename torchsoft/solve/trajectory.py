@@ -1,7 +1,6 @@
 """What a simulation leaves behind: times, states, nodal forces, efforts, energies, and how it was made."""
 
 import json
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -145,9 +144,3 @@ def channels(rig: Rig, state: State, signals: Tensor, moments: dict[str, Tensor]
         out[f"F_{name}"] = rig.actuator_effort(name, state, signals)
     out |= {f"M_{name}": moment for name, moment in (moments or {}).items()}
     return {rig.renamed.get(key, key): value for key, value in out.items()}
-
-
-def rigid_components(layout: Layout, names: Sequence[str]) -> slice:
-    """The state's components from the first free velocity or pose on, where these stand together at its end."""
-    first = min(where.start for (part, _), where in layout.slices.items() if part in names)
-    return slice(first, layout.size)

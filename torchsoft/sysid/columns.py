@@ -127,7 +127,9 @@ def read_trajectory(path: Path) -> Columns:
     """The table in a file of `Trajectory.save`; rows are called samples, counted from 0. Raises `ValueError`."""
     try:
         with xr.open_dataset(path, engine="h5netcdf") as data:
-            columns = {name: CHANNELS[name] for name in COLUMNS if name != "y_d_dot"}  # which such files do not have
+            columns = {name: CHANNELS[name] for name in COLUMNS}
+            if CHANNELS["y_d_dot"].variable not in data:  # as in files of the first edition
+                del columns["y_d_dot"]
             if missing := [v for v in dict.fromkeys(c.variable for c in columns.values()) if v not in data]:
                 raise ValueError(f"{path} is not a trajectory file: it has no {', '.join(missing)}")
             values = {name: np.array(c.of(data[c.variable]), float) for name, c in columns.items()}

@@ -13,10 +13,11 @@ import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from torchsoft.channels import CHANNELS, MEASURED, SETPOINTS
-from torchsoft.control import Reference, Sampled
-from torchsoft.excitation import Table, apart
+from torchsoft.excitation import Table
 from torchsoft.files import findings
 from torchsoft.parameters import Parameters
+from torchsoft.physics.motion import Reference, Sampled
+from torchsoft.physics.paper import apart
 from torchsoft.sysid.columns import Columns, read_table
 from torchsoft.sysid.fit import Loss, Unreachable
 from torchsoft.sysid.problem import Problem
@@ -201,7 +202,7 @@ def recording(table: Columns, name: str, p: Parameters, sensors: dict[str, Senso
     columns = {k: column.tolist() for k, column in values.items()}
     x, y = (Sampled(columns["t"], columns[k], columns.get(f"{k}_dot")) for k in SETPOINTS)
     F = Sampled(columns["t"], columns.get("F_ff", [0.0] * len(t)))
-    return Recording(name, p, Reference(x, y, F), samples)
+    return Recording(name, p, Reference(x_d=x, y_d=y, F_ff=F), samples)
 
 
 def load(data: Sequence[str | Path], config: str | Path) -> Case:

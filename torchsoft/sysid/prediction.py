@@ -1,6 +1,6 @@
 """Predicted samples of one recording's sensors for given parameters, with derivatives: one run of the model."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,9 +9,11 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from torchsoft.channels import MEASURED
-from torchsoft.model import PARAMETERS, SoftGrasp
-from torchsoft.sensitivity import parameter_derivatives, sensitivities
-from torchsoft.simulate import simulate
+from torchsoft.physics.rig import Rig
+from torchsoft.physics.state import Layout
+from torchsoft.solve.simulate import simulate
+from torchsoft.solve.tangent import directions
+from torchsoft.solve.trajectory import Trajectory, channels
 from torchsoft.sysid.recording import Array, Recording
 
 TOLERANCE = 1e-8
@@ -27,45 +29,38 @@ class Prediction(NamedTuple):
     steps: int
 
 
-def rigid_states(model: SoftGrasp, y: Tensor) -> Tensor:
-    """Poses (x_C, y_C, theta, x_Br, y_Br) and their rates (..., 10) of states y (..., size)."""
-    s = model.layout.unpack(y)
-    return torch.cat((s.r_C, s.theta[..., None], s.r_Br, s.v_C, s.omega[..., None], s.v_Br), -1)
-
-
-def signals(model: SoftGrasp, t: Tensor, q: Tensor) -> Tensor:
-    """Every channel of `MEASURED` (G, channels) from poses and rates q (G, 10) at the times t (G,)."""
-    F = model.controllers(model.reference(t), q[:, 0:2], q[:, 5:7], q[:, 3:5], q[:, 8:10])
-    return torch.cat((q, torch.stack(F, -1)), -1)
-
-
 @torch.no_grad()
-def set_parameters(model: SoftGrasp, values: dict[str, float]) -> None:
-    """Give the model other parameters, named as in `Parameters`."""
-    known = dict(model.named_parameters())
+def set_parameters(rig: Rig, values: Mapping[str, float]) -> None:
+    """Give the rig other parameters, by the names that `Rig.parameter` knows."""
     for name, value in values.items():
-        known[PARAMETERS[name]].fill_(value)
+        rig.parameter(name).fill_(value)
 
 
-@torch.no_grad()
-def predict(model: SoftGrasp, y0: Tensor, t: Tensor, names: Sequence[str], step: float) -> Prediction:
+def derivatives(rig: Rig, run: Trajectory) -> Array:
+    """Derivatives (T, channels, n) of every channel of `MEASURED` by the run's n parameters: along the motion of the bodies,
+    and of the controllers' own parameters."""
+    assert run.sensitivities is not None
+    bodies, signals = Layout({}, {}, rig.layout.free, {}), rig.follow(run.t, rig.reference).detach()
+    along = [torch.zeros((), dtype=torch.float64, requires_grad=True) for _ in run.wrt]
+    q = run.y[:, rig.layout.rigid].detach() + run.sensitivities @ torch.stack(along)
+    known = channels(rig, bodies.unpack(q, *rig.held(signals)), signals)
+    measured = torch.stack([known[name] for name in MEASURED], -1)
+    return directions(measured, along) + directions(measured, [rig.parameter(name) for name in run.wrt])
+
+
+def predict(rig: Rig, y0: Tensor, t: Tensor, names: Sequence[str], step: float) -> Prediction:
     """Signals from the state y0 on the grid t (G,), and their derivatives by the parameters `names`, if there are any.
 
     The first time, from which the disc only settles, is left out. Raises `SimulationFailed`.
     """
-    at = t[1:]
-    if not names:
-        run = simulate(model, t, y0=y0, step=step, tolerance=TOLERANCE)
-        return Prediction(at.numpy(), signals(model, at, rigid_states(model, run.y[1:])).numpy(), None, run.stats.steps)
-    inner = [PARAMETERS[name] for name in names]
-    run = sensitivities(model, y0, t, inner, step=step, tolerance=TOLERANCE, rigid=True)
-    q, dq = rigid_states(model, run.y[1:]), run.dy[1:]
-    by_state = [
-        torch.func.jvp(lambda q: signals(model, at, q), (q,), (dq[..., k].contiguous(),))[1] for k in range(len(inner))
-    ]
-    direct = parameter_derivatives(model, inner, ("controllers.",), lambda: signals(model, at, q))
-    dy = torch.stack(by_state, -1).numpy() + direct  # pyright: ignore[reportArgumentType, reportCallIssue]
-    return Prediction(at.numpy(), signals(model, at, q).numpy(), dy, run.run.steps)
+    slopes, options = None, {"step": step, "tolerance": TOLERANCE}
+    if names:
+        dy0 = torch.from_numpy(directions(y0, [rig.parameter(name) for name in names]))
+        run = simulate(rig, t, y0=y0, gradient="forward", wrt=names, dy0=dy0, rigid=True, **options)
+        slopes = derivatives(rig, run)[1:]
+    else:
+        run = simulate(rig, t, y0=y0, **options)
+    return Prediction(t[1:].numpy(), run.together(*MEASURED)[1:].detach().numpy(), slopes, run.stats.steps)
 
 
 class Reading(NamedTuple):
@@ -92,27 +87,24 @@ def interpolation(t: Array, at: Array) -> Array:
 
 
 def misfit(
-    model: SoftGrasp, y0: Tensor, recording: Recording, t: Tensor, names: Sequence[str], step: float,
+    rig: Rig, y0: Tensor, recording: Recording, t: Tensor, names: Sequence[str], step: float,
     noise: dict[str, float], bias: dict[str, float], delay: dict[str, float],
 ) -> tuple[float, dict[str, Array], int]:  # fmt: skip
     """Half the sum of squared residuals of one recording, with its gradient by the discrete adjoint: by parameters
     (`names`), and by `bias` and `delay` (one entry a channel in `noise`); and the stepper's steps. Raises `SimulationFailed`.
     """
-    parameters = dict(model.named_parameters())
-    unknown = [parameters[PARAMETERS[name]].requires_grad_(True) for name in names]
     at, loss = t[1:], torch.zeros((), dtype=torch.float64)
-    run = simulate(model, t, y0=y0, step=step, tolerance=TOLERANCE, gradient="discrete")
-    predicted = signals(model, at, rigid_states(model, run.y[1:]))
+    run = simulate(rig, t, y0=y0, step=step, tolerance=TOLERANCE, gradient="discrete")
     out = {"bias": np.zeros(len(noise)), "delay": np.zeros(len(noise))}
     for k, (channel, sigma) in enumerate(noise.items()):
         if channel not in recording.samples:
             continue
         times, measured = recording.samples[channel]
         spline = torch.from_numpy(interpolation(at.numpy(), times - delay[channel]))
-        r = (spline @ predicted[:, MEASURED.index(channel)] + bias[channel] - torch.from_numpy(measured)) / sigma
+        r = (spline @ run[channel][1:] + bias[channel] - torch.from_numpy(measured)) / sigma
         loss = loss + 0.5 * r.square().sum()
-        rates = read(Prediction(at.numpy(), predicted.detach().numpy(), None, 0), channel, times, delay[channel]).rates
+        rates = CubicSpline(at.numpy(), run[channel][1:].detach().numpy())(times - delay[channel], 1)
         out["bias"][k], out["delay"][k] = float(r.detach().sum()) / sigma, -float(r.detach().numpy() @ rates) / sigma
-    gradient = torch.autograd.grad(loss, unknown, allow_unused=True)
+    gradient = torch.autograd.grad(loss, [rig.parameter(name) for name in names], allow_unused=True)
     out["parameters"] = np.array([0.0 if g is None else float(g) for g in gradient])
     return float(loss.detach()), out, run.stats.steps

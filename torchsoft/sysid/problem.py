@@ -46,7 +46,7 @@ class Problem:
             if not set(sensors) & set(recording.samples):
                 raise ValueError(f"recording `{recording.name}` has samples of none of the sensors {list(sensors)}")
         self.recordings, self.sensors, self.unknowns = tuple(recordings), sensors, unknowns
-        self.coordinates = Coordinates(unknowns, sensors, names, recordings[0].settings)
+        self.coordinates = Coordinates(unknowns, sensors, names, recordings[0].parameters)
         self.interpolated = any(sensor.delay > 0 for sensor in sensors.values())
 
     @property
@@ -70,8 +70,7 @@ class Problem:
     def values(self, x: Array, k: int) -> dict[str, float]:
         """Values of the unknown parameters in recording number k."""
         recording = self.recordings[k]
-        given = {name: row["value"] for name, row in recording.settings.table().items()}
-        return self.coordinates.values(x, recording.name, given)
+        return self.coordinates.values(x, recording.name, recording.parameters)
 
     def jobs(
         self, x: Array, which: Sequence[str], step: float, free: NDArray[np.bool_] | None, adjoint: bool = False

@@ -1,7 +1,12 @@
 """A recording: the reference that the controllers followed and the samples of the sensors, which may have gaps."""
 
+import inspect
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from hashlib import sha256
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -9,12 +14,17 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchsoft.channels import MEASURED
-from torchsoft.control import Reference
 from torchsoft.excitation import start
-from torchsoft.model import SoftGrasp
 from torchsoft.parameters import Parameters
+from torchsoft.physics.motion import Reference
+from torchsoft.physics.paper import NAMES, SoftGrasp
+from torchsoft.physics.state import State
 
 Array = NDArray[np.float64]
+
+Build = Callable[[Parameters, Reference], SoftGrasp]
+"""Makes the model of a recording from its settings and reference: `SoftGrasp` itself, or a function that gives it laws of the
+user's own, such as a friction law. Worker processes import it by its name, so it is a function of a module."""
 
 SETTLE = 0.2
 """Time [s] that the disc is given, before the first sample, to sink into the pad: twenty of the pads' own times 1/tau."""
@@ -26,19 +36,45 @@ SAME = 1e-9
 """Times [s] closer than this are one time."""
 
 
+class Start(NamedTuple):
+    """A model and where it starts; in the state the pads' parts are displacements (nodes, 2) [m]."""
+
+    model: SoftGrasp
+    state: State
+
+    @property
+    def y0(self) -> Tensor:
+        """The state (size,) from which to simulate, with its derivative by the model's parameters: displacements stay when
+        parameters change, and massless pads get the forces that hold them so."""
+        model, pads = self.model, {}
+        for name, u in self.state.pads.items():
+            pad, shape = model.pads[name], model.layout.shapes["pads", name]
+            f = u if pad.inertial else torch.linalg.solve(pad.compliance(), u.flatten()).unflatten(0, (-1, 2))
+            pads[name] = f.expand(shape)
+        return model.pack(self.state._replace(pads=pads))
+
+
+def lying(model: SoftGrasp) -> Start:
+    """The disc at rest on the lower pad and the bracket clear of it, by the model's own parameters."""
+    state = model.unpack(start(model).detach())
+    return Start(model, state._replace(pads={name: model.displacement(name, state).detach() for name in state.pads}))
+
+
 @dataclass(frozen=True)
 class Recording:
     """One run of the rig, begun with the disc at rest on the lower pad and the bracket clear of it.
 
     `settings` are the known numbers, and the nominal ones of what is unknown; `samples` holds times (k,) [s] and values (k,)
-    by channel, each with times of its own. The run is simulated from `SETTLE` before the first sample, at rest as nominal
-    parameters would have it: what that gets wrong has died away by then, so the start needs no derivative.
+    by channel, each with times of its own. The run is simulated from `SETTLE` before the first sample, from where
+    nominal parameters would have disc and pads at rest: most of what that gets wrong has died away at the first sample. `build`
+    makes the model.
     """
 
     name: str
     settings: Parameters
     reference: Reference
     samples: dict[str, tuple[Array, Array]]
+    build: Build = SoftGrasp
 
     def __post_init__(self) -> None:
         if not self.samples:
@@ -66,20 +102,40 @@ class Recording:
     def speed(self) -> float:
         """Root mean square of the horizontal speed of the set-point [m/s]: slow recordings are the easy ones."""
         t = torch.from_numpy(np.linspace(self.times[0], self.times[-1], 2000))
-        return float(self.reference(t).x_dot.detach().square().mean().sqrt())
+        return float(self.reference(t, ("x_d",))[..., 1].detach().square().mean().sqrt())
 
     @property
     def fingerprint(self) -> str:
         """Names everything that decides a run or a residual of this recording."""
         t = torch.from_numpy(np.linspace(self.times[0] - SETTLE, self.times[-1], 2000))
-        setpoints = torch.stack(self.reference(t)).detach().numpy().tobytes()
+        setpoints = self.reference(t, ("x_d", "y_d", "F_ff")).detach().numpy().tobytes()
         measured = b"".join(k.encode() + t.tobytes() + y.tobytes() for k, (t, y) in sorted(self.samples.items()))
-        return sha256(self.settings.model_dump_json().encode() + setpoints + measured).hexdigest()
+        return sha256(self.settings.model_dump_json().encode() + setpoints + measured + self._own_laws()).hexdigest()
 
-    def begin(self) -> tuple[SoftGrasp, Tensor]:
-        """A model with the settings and the reference, and the state (size,) from which to simulate."""
-        model = SoftGrasp(self.settings, self.reference)
-        return model, start(model).detach()
+    def _own_laws(self) -> bytes:
+        """What `build` makes: the model's numbers, and the files with the code of `build`, of its modules and functions."""
+        if self.build is SoftGrasp:
+            return b""
+        model = self.build(self.settings, self.reference)
+        modules = list(model.modules())
+        functions = [value for module in modules for value in vars(module).values() if inspect.isfunction(value)]
+        code = {getattr(self.build, "func", self.build), *map(type, modules), *functions}
+        named = {f"{one.__module__}.{one.__qualname__}": one for one in code}
+        own = {name: one for name, one in named.items() if name.split(".")[0] not in ("torch", "torchsoft")}
+        numbers = {name: value.tolist() for name, value in model.named_parameters()}
+        return repr((sorted(named), numbers)).encode() + b"".join(source(own[name]) for name in sorted(own))
+
+    @cached_property
+    def parameters(self) -> dict[str, float]:
+        """Every number of the model that can be identified, by its name in `Parameters`, or in the model where that is all."""
+        model = self.build(self.settings, self.reference)
+        names = {own: name for name, own in NAMES.items()}
+        known = {names.get(own, own): value for own, value in model.named_parameters() if value.requires_grad}
+        return {name: float(value.detach()) for name, value in known.items() if value.ndim == 0}
+
+    def begin(self) -> Start:
+        """A model with the settings and the reference, and where it starts."""
+        return lying(self.build(self.settings, self.reference))
 
     def grid(self, step: float, interpolated: bool) -> Tensor:
         """Times (G,) [s] to simulate: `SETTLE` before the first sample, then the samples' own times, or, where they are
@@ -89,3 +145,11 @@ class Recording:
             return torch.from_numpy(np.concatenate(([t[0] - SETTLE], t)))
         around = np.arange(t[0] - 10 * step, t[-1] + 11 * step, step)
         return torch.from_numpy(np.concatenate(([t[0] - SETTLE], around)))
+
+
+def source(code: Any) -> bytes:
+    """The file that a class or a function stands in; empty where it was typed in."""
+    try:
+        return Path(inspect.getfile(code)).read_bytes()
+    except (OSError, TypeError):
+        return b""

@@ -161,7 +161,8 @@ def nrmse(problem: Problem, r: Array, which: list[str]) -> dict[str, dict[str, f
 
 def estimates(problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shift: Array) -> list[Estimate]:
     """Parameters in physical units, then biases and delays; C (n, n) and shift (n,) are of all coordinates."""
-    c, table, q = problem.coordinates, Parameters().table(), float(stats.norm.ppf(0.5 + CONFIDENCE / 2))
+    c, q = problem.coordinates, float(stats.norm.ppf(0.5 + CONFIDENCE / 2))
+    units = {name: row["unit"] for name, row in Parameters().table().items()}
     low, high = c.bounds
     edge = free & ((x - low < 1e-4 * (high - low)) | (high - x < 1e-4 * (high - low)))
     out = []
@@ -190,7 +191,7 @@ def estimates(problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shi
             else:
                 interval = (value - q * sd * abs(value), value + q * sd * abs(value))
             where = recording.name if own else None
-            add(name, table[name]["unit"], where, value, sd, sd, interval, edge[mine].any(), bias)
+            add(name, units.get(name, ""), where, value, sd, sd, interval, edge[mine].any(), bias)
     for i, one in enumerate(c.all):
         if one.kind != "parameter" and free[i]:
             spread = float(np.sqrt(C[i, i]))

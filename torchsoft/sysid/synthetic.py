@@ -1,14 +1,16 @@
 """Recordings made by the simulator itself: a known truth to identify."""
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 
-from torchsoft.channels import MEASURED
 from torchsoft.excitation import Excitation, begin
 from torchsoft.parameters import Parameters
-from torchsoft.simulate import simulate
-from torchsoft.sysid.prediction import TOLERANCE, rigid_states, signals
-from torchsoft.sysid.recording import SETTLE, Recording
+from torchsoft.physics.paper import SoftGrasp
+from torchsoft.solve.simulate import simulate
+from torchsoft.sysid.prediction import TOLERANCE, set_parameters
+from torchsoft.sysid.recording import SETTLE, Build, Recording, lying
 from torchsoft.sysid.unknowns import Sensor
 
 RIG = {
@@ -22,24 +24,26 @@ RIG = {
 
 def record(
     name: str, excitation: Excitation, truth: Parameters, nominal: Parameters, sensors: dict[str, Sensor], *,
-    rate: float = 200.0, step: float = 1.25e-4, noise: float = 1.0, seed: int = 0,
+    rate: float = 200.0, step: float = 1.25e-4, noise: float = 1.0, seed: int = 0, build: Build = SoftGrasp,
+    values: Mapping[str, float] | None = None,
 ) -> Recording:  # fmt: skip
     """What a rig with the parameters `truth` gives under an excitation that was planned with the `nominal` ones.
 
     The disc is set down, as the nominal parameters would have it lie, `SETTLE` before the first sample, as
     `Recording.begin` assumes. Sampled at `rate` [Hz] from a run with the given step [s], with Gaussian noise of `noise` times
-    each sensor's own. The recording holds nothing of the truth but the samples. Raises `SimulationFailed`.
+    each sensor's own. `build` makes the model, and `values` are the truth of what `Parameters` does not have. The recording
+    holds nothing of the truth but the samples. Raises `SimulationFailed`.
     """
-    planned = begin(excitation, nominal)
-    real = begin(excitation, truth).model
-    real.reference = planned.model.reference
+    planned = begin(excitation, nominal).model
+    settings, reference = planned.settings, planned.reference
+    real = build(excitation.settings(truth), reference)
+    set_parameters(real, values or {})
     at = np.arange(0.0, excitation.duration + 0.5 / rate, 1.0 / rate)
     t = torch.from_numpy(np.concatenate(([at[0] - SETTLE], at)))
-    with torch.no_grad():
-        run = simulate(real, t, y0=planned.y0, step=step, tolerance=TOLERANCE)
-        predicted = signals(real, t[1:], rigid_states(real, run.y[1:])).numpy()
+    y0 = lying(build(settings, reference))._replace(model=real).y0.detach()
+    run = simulate(real, t, y0=y0, step=step, tolerance=TOLERANCE)
     rng, samples = np.random.default_rng(seed), {}
     for channel, sensor in sensors.items():
-        exact = predicted[:, MEASURED.index(channel)]
+        exact = run[channel][1:].detach().numpy()
         samples[channel] = (at, exact + noise * sensor.noise * rng.standard_normal(len(at)))
-    return Recording(name, planned.model.settings, planned.model.reference, samples)
+    return Recording(name, settings, reference, samples, build)

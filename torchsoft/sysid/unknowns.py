@@ -5,7 +5,7 @@ a relative one either way.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple, Self
 
 import numpy as np
@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from torchsoft.excitation import Table
-from torchsoft.model import PARAMETERS
-from torchsoft.parameters import Parameters
 from torchsoft.sysid.recording import Array
 
 SPREAD = 10.0
@@ -22,7 +20,7 @@ SPREAD = 10.0
 
 
 class Unknown(Table):
-    """One parameter to be identified, by its dotted name in `Parameters`.
+    """One parameter to be identified, by its dotted name in `Parameters`, or in the model where it is of a user's law.
 
     `nominal` is where the search starts, by default the value of the recordings' own settings; with `ratio_to` the value,
     nominal and bounds are those of the ratio to that other parameter. A parameter that is not `shared` has a value of its own
@@ -93,22 +91,28 @@ class Coordinate(NamedTuple):
 class Coordinates:
     """All coordinates of a problem, in a fixed order, and the way from their vector x (n,) to parameters of the model.
 
-    Raises `ValueError` for a name that no gradient reaches, a ratio to something that is not there, or a start out of bounds.
+    `given` holds the nominal values of what can be identified. Raises `ValueError` for other names, a ratio to something that
+    is not there, or a start out of bounds.
     """
 
     def __init__(
-        self, unknowns: dict[str, Unknown], sensors: dict[str, Sensor], recordings: Sequence[str], base: Parameters
-    ) -> None:
-        self.recordings, self.all, table = tuple(recordings), [], base.table()
+        self, unknowns: dict[str, Unknown], sensors: dict[str, Sensor], recordings: Sequence[str],
+        given: Mapping[str, float],
+    ) -> None:  # fmt: skip
+        self.recordings, self.all = tuple(recordings), []
         for name, u in unknowns.items():
-            if name not in PARAMETERS:
-                raise ValueError(f"`{name}` cannot be identified; what can: {', '.join(PARAMETERS)}")
-            if u.ratio_to is not None and (u.ratio_to not in PARAMETERS or u.ratio_to == name):
+            if name not in given:
+                raise ValueError(f"`{name}` cannot be identified; what can: {', '.join(given)}")
+            if u.ratio_to is not None and (u.ratio_to not in given or u.ratio_to == name):
                 raise ValueError(f"{name}.ratio_to = {u.ratio_to!r} is not another parameter of the model")
             if u.ratio_to in unknowns and unknowns[u.ratio_to].ratio_to:
                 raise ValueError(f"{name}.ratio_to = {u.ratio_to!r} is a ratio itself")
-            own = table[name]["value"] / (table[u.ratio_to]["value"] if u.ratio_to else 1.0)
+            own = given[name] / (given[u.ratio_to] if u.ratio_to else 1.0)
             nominal = own if u.nominal is None else u.nominal
+            if u.scale == "log" and nominal <= 0:
+                raise ValueError(
+                    f"{name} = {nominal:g} is not on a logarithmic scale: give a positive `nominal`, or scale = 'linear'"
+                )
             low = nominal / SPREAD if u.low is None else u.low
             high = nominal * SPREAD if u.high is None else u.high
             if not low <= nominal <= high:
@@ -142,7 +146,7 @@ class Coordinates:
     def free(self) -> NDArray[np.bool_]:
         return np.array([not c.fixed for c in self.all], bool)
 
-    def values(self, x: Array, recording: str, given: dict[str, float]) -> dict[str, float]:
+    def values(self, x: Array, recording: str, given: Mapping[str, float]) -> dict[str, float]:
         """Values of the unknown parameters in one recording; `given` holds those that a ratio may refer to."""
         mine = [(i, c) for i, c in enumerate(self.all) if c.kind == "parameter" and c.recording in (None, recording)]
         out = {c.name: c.to_value(x[i]) for i, c in mine}
@@ -157,7 +161,7 @@ class Coordinates:
         for i, c in enumerate(self.all):
             if c.kind == "parameter" and c.recording in (None, recording):
                 row = self.names.index(c.name)
-                out[row, i] = c.slope(x[i]) * values[c.name] / c.to_value(x[i])
+                out[row, i] = c.slope(x[i]) * (values[c.name] / c.to_value(x[i]) if c.ratio_to else 1.0)
                 for other in self.all:  # a ratio moves with what it is a ratio to
                     if other.ratio_to == c.name and other.recording in (None, recording):
                         part = values[other.name] / values[c.name]

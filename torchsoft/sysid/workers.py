@@ -16,11 +16,14 @@ from typing import Any, NamedTuple, Self
 from threadpoolctl import threadpool_limits
 
 from torchsoft.files import replacing
-from torchsoft.implicit import SimulationFailed
-from torchsoft.kernels import HERE, digest
 from torchsoft.processes import local_processes
+from torchsoft.solve.kernel import HERE, digest
+from torchsoft.solve.stepper import SimulationFailed
 from torchsoft.sysid.prediction import Prediction, misfit, predict, set_parameters
-from torchsoft.sysid.recording import Recording
+from torchsoft.sysid.recording import Recording, Start
+
+ENGINE = HERE, HERE.parent, HERE.parents[1] / "codegen", HERE.parents[1] / "physics"
+"""Folders of everything that decides a run."""
 
 
 class Job(NamedTuple):
@@ -46,7 +49,7 @@ class FailedRun(NamedTuple):
 
 
 _recordings: tuple[Recording, ...] = ()
-_models: dict[int, Any] = {}
+_models: dict[int, Start] = {}
 
 
 def _prepare(recordings: tuple[Recording, ...]) -> None:
@@ -60,8 +63,9 @@ def _run(job: Job) -> Any:
     recording = _recordings[job.recording]
     if job.recording not in _models:
         _models[job.recording] = recording.begin()
-    model, y0 = _models[job.recording]
+    model = _models[job.recording].model
     set_parameters(model, job.values)
+    y0 = _models[job.recording].y0
     t = recording.grid(job.step, job.interpolated)
     with threadpool_limits(1):
         try:
@@ -85,7 +89,7 @@ class Runner:
         self.simulations = self.jacobians = self.gradients = self.steps = self.remembered = 0
         self._open, self._pool = ExitStack(), None
         self._own = sha256(
-            repr((version("torchsoft"), digest(HERE), [r.fingerprint for r in recordings])).encode()
+            repr((version("torchsoft"), digest(*ENGINE), [r.fingerprint for r in recordings])).encode()
         ).digest()
 
     def __enter__(self) -> Self:

@@ -1,0 +1,207 @@
+"""The command `torchsoft`: help, errors in one line, one identification from files, interruption."""
+
+import csv
+import json
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from test_sysid_measured import CONFIG, EXAMPLE, X_C, X_D, Table, scale, write
+
+from torchsoft.cli import main
+from torchsoft.sysid import Unreachable
+from torchsoft.sysid.measured import load, unreachable
+from torchsoft.sysid.workers import FailedRun
+
+OPTIONS = ("--out", "--workers", "--step", "--checkpoint", "--no-progress")
+
+
+def rows(count: int) -> Table:
+    """Cells of the first `count` lines of the example, its heading among them."""
+    with (EXAMPLE / "rolling.csv").open(newline="") as file:
+        return list(csv.reader(file))[:count]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The working directory, with the first 0.3 s of the example in data.csv and their configuration in rig.toml."""
+    write(tmp_path / "data.csv", rows(62))
+    (tmp_path / "rig.toml").write_text(CONFIG)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_help_names_every_command_argument_and_option(capsys: Any) -> None:
+    for arguments, words in (
+        (["--help"], ("identify",)),
+        (["identify", "--help"], ("DATA.csv", "CONFIG.toml", *OPTIONS)),
+    ):
+        with pytest.raises(SystemExit) as end:
+            main(arguments)
+        assert end.value.code == 0
+        out, err = capsys.readouterr()
+        assert err == ""
+        assert [word for word in words if word not in out] == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "COMMAND"),
+        (["simulate"], "invalid choice: 'simulate'"),
+        (["identify"], "DATA.csv"),
+        (["identify", "rig.toml", "--steps", "1"], "unrecognized arguments: --steps"),
+        (["identify", "rig.toml", "--step", "fast"], "invalid float value: 'fast'"),
+    ],
+)
+def test_a_wrong_command_line_shows_the_usage_and_ends_with_2(arguments: list[str], message: str, capsys: Any) -> None:
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    assert end.value.code == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("usage: torchsoft")
+    assert message in err.splitlines()[-1]
+
+
+ERRORS: dict[str, tuple[list[str], str]] = {
+    "no config": (["data.csv"], "one CONFIG.toml is needed, but 0 were given"),
+    "two configs": (["data.csv", "rig.toml", "rig.toml"], "one CONFIG.toml is needed, but 2 were given"),
+    "no such file": (["other.csv", "rig.toml"], "other.csv: No such file or directory"),
+    "no such config": (["data.csv", "other.toml"], "other.toml: No such file or directory"),
+    "a folder": (["folder.csv", "rig.toml"], "folder.csv: Is a directory"),
+    "no data": (["rig.toml"], "there is nothing to identify from"),
+    "not a table": (["picture.csv", "rig.toml"], "picture.csv is not a CSV file in UTF-8"),
+    "empty": (["empty.csv", "rig.toml"], "empty.csv has no column `t`"),
+    "not TOML": (["data.csv", "broken.toml"], "broken.toml is not a TOML file"),
+    "unknown name": (
+        ["data.csv", "misspelt.toml"],
+        "misspelt.toml: `contact.K` cannot be identified; what can: ",
+    ),
+    "step": (["data.csv", "rig.toml", "--step", "-1"], "step: Input should be greater than 0"),
+    "workers": (["data.csv", "rig.toml", "--workers", "0"], "workers: Input should be greater than or equal to 1"),
+    "out is a file": (["data.csv", "rig.toml", "--out", "data.csv"], "data.csv: File exists"),
+}
+
+
+@pytest.mark.parametrize("name", ERRORS)
+def test_an_error_is_one_line_and_ends_with_2(folder: Path, name: str, capsys: Any) -> None:
+    (folder / "folder.csv").mkdir()
+    (folder / "picture.csv").write_bytes(b"\x89PNG\r\n\x1a\n")
+    (folder / "empty.csv").write_text("")
+    (folder / "broken.toml").write_text("[[")
+    (folder / "misspelt.toml").write_text(CONFIG.replace("contact.K_n", "contact.K"))
+    before = sorted(folder.rglob("*"))
+    arguments, message = ERRORS[name]
+    assert main(["identify", *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("torchsoft: error: ")
+    assert message in err
+    assert err.count("\n") == 1
+    assert sorted(folder.rglob("*")) == before  # nothing is left behind
+
+
+def test_as_a_process_it_ends_with_the_same_status_and_without_a_traceback(folder: Path) -> None:
+    command = [sys.executable, "-m", "torchsoft", "identify", "data.csv"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert ended.returncode == 2
+    assert ended.stderr == "torchsoft: error: one CONFIG.toml is needed, but 0 were given\n"
+
+
+def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(folder: Path, capsys: Any) -> None:
+    table = rows(122)
+    for column in (X_D, X_C, 8):
+        scale(column, 1.0, -0.3)(table)
+    scale(X_D, 0.5, 30.0)(table)
+    write(folder / "data.csv", [cells[:2] + cells[3:] for cells in table])  # without the rate of x_d
+    config = CONFIG.replace('"bracket"', '"disc"').replace("60.3e-3", "60e-3").replace("5e-3", "2e-3")
+    (folder / "rig.toml").write_text(config.replace("[unknowns", "control.K_81 = 1e6\ncontrol.R_80 = 0\n[unknowns", 1))
+    assert main(["identify", "data.csv", "rig.toml", "--out", "out", "--no-progress"]) == 2
+    message = capsys.readouterr().err
+    where = r"data\.csv, row (\d+) \(t = (\S+) s\): the model cannot follow recording `data` here: "
+    found = re.search(where + r"the disc was lost at t = (\S+) s: the closed loop is unstable", message)
+    assert found, message
+    row, t, inside = int(found[1]), float(found[2]), float(found[3])
+    assert t == pytest.approx(inside, abs=1e-3)
+    assert row == 2 + np.ceil(t / 5e-3 - 1e-6)
+    assert message.count("\n") == 1
+    tables = load(["data.csv"], "rig.toml").tables
+    assert "data.csv, before row 2 (t = -0.1 s): the model" in unreachable(
+        Unreachable({"data": FailedRun("gone", -0.1)}), tables
+    )
+
+
+@pytest.fixture(scope="module")
+def answered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
+    """The command, carried out in this process; its folder and its data."""
+    folder = tmp_path_factory.mktemp("command")
+    (folder / "rig.toml").write_text(CONFIG)
+    files = [str(write(folder / "data.csv", rows(42))), str(folder / "rig.toml")]
+    assert main(["identify", *files, "--out", str(folder / "out"), "--no-progress"]) == 0
+    return folder, files
+
+
+@pytest.mark.xdist_group("identify-command")
+def test_it_writes_answer_and_page(answered: tuple[Path, list[str]]) -> None:
+    out = answered[0] / "out"
+    assert sorted(path.name for path in out.iterdir()) == ["answer.json", "report.html"]
+    answer = json.loads((out / "answer.json").read_text())
+    found = {e["name"]: e for e in answer["estimates"]}
+    assert set(found) == {"contact.K_n", "pad.E"}
+    assert answer["converged"]
+    page = (out / "report.html").read_text()
+    assert page.startswith("<!doctype html>")
+    assert all(notice in page or "&" in notice for notice in answer["notices"])
+
+
+@pytest.mark.xdist_group("identify-command")
+def test_options_come_before_the_configuration(answered: tuple[Path, list[str]], capsys: Any) -> None:
+    folder, files = answered
+    out, kept = folder / "coarser", folder / "kept"
+    command = ["identify", *files, "--out", str(out), "--step", "1e-2", "--checkpoint", str(kept), "--no-progress"]
+    assert main(command) == 0
+    first, second = (json.loads((folder / name / "answer.json").read_text()) for name in ("out", "coarser"))
+    assert (first["stages"][-1]["step"], second["stages"][-1]["step"]) in [(5e-3, 1e-2), (5e-3 / 4, 1e-2 / 4)]
+    assert not kept.exists()  # a checkpoint is removed once the answer is there
+    text, err = capsys.readouterr()
+    assert str(out / "answer.json") in text
+    assert "contact.K_n" in text
+    assert err == ""
+
+
+@pytest.mark.xdist_group("identify-command")
+def test_an_interrupted_command_continues_and_ends_the_same(answered: tuple[Path, list[str]], capsys: Any) -> None:
+    folder, files = answered
+    out = folder / "again"
+    command = ["identify", *files, "--out", str(out), "--no-progress"]
+    # test runners may ignore SIGINT, which a child inherits
+    code = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        f"from torchsoft.cli import main; sys.exit(main({command!r}))"
+    )
+    child = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
+    began = time.monotonic()
+    while len(list(out.glob("unfinished/*.pickle"))) < 3 and child.poll() is None and time.monotonic() - began < 120:
+        time.sleep(0.02)
+    child.send_signal(signal.SIGINT)
+    _, message = child.communicate(timeout=60)
+    assert child.returncode == 130, message
+    assert "the same command continues" in message
+    assert "Traceback" not in message
+    kept = len(list(out.glob("unfinished/*.pickle")))
+    assert kept >= 3
+    assert not (out / "answer.json").exists()
+
+    assert main(command) == 0
+    assert "contact.K_n" in capsys.readouterr().out
+    assert not (out / "unfinished").exists()
+    first, second = (json.loads((folder / name / "answer.json").read_text()) for name in ("out", "again"))
+    assert second["estimates"] == first["estimates"]
+    assert second["cost"]["remembered"] >= first["cost"]["remembered"] + kept - 1

@@ -1,0 +1,327 @@
+"""The contact law of one point against numbers worked out by hand, its limits, its continuity, and its derivatives."""
+
+import math
+
+import pytest
+import torch
+from conftest import coarse, f64
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
+from torch.autograd import gradcheck
+
+from torchsoft import Circle, Coulomb, Ellipse, SmoothSlip, SoftContact
+from torchsoft.physics.contact import (
+    ContactState,
+    SlipLaw,
+    cross,
+    distance_law,
+    free_law,
+    interface_law,
+    moving_frame,
+    normal_force,
+    ramp,
+    turned,
+)
+
+K, R = 1e5, 400.0
+"""Springs [N/m] and dashpots [N.s/m] of the laws below."""
+
+
+def smooth(mu_s: float = 0.8, mu_k: float = 0.5, v_s: float = 0.01, eta: float = 20.0) -> SmoothSlip:
+    return SmoothSlip(mu_s, mu_k, v_s, eta)
+
+
+def law(friction: SlipLaw | None = None, epsilon: float = 1e-6) -> SoftContact:
+    return SoftContact(K, R, 2 * K, R / 2, friction=friction or smooth(), epsilon=epsilon)
+
+
+@torch.no_grad()
+def at(contact: SoftContact, g: float, g_dot: float, v_T: float, s: float, **more: float) -> ContactState:
+    return contact(*(f64(x)[0] for x in (g, g_dot, v_T, s)), **more)
+
+
+# by hand ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("g_dot", [-0.05, 0.0, 0.02])
+def test_a_separated_point_carries_nothing_and_its_spring_relaxes(g_dot: float) -> None:
+    """(eta + R_t) s' = -K_t s: nothing presses, so the spring slips home against the two viscosities."""
+    got = at(law(), g=-1e-7, g_dot=g_dot, v_T=0.3, s=1e-5)
+    assert (got.F_N, got.F_T, got.rho) == (0.0, 0.0, 0.0)
+    assert float(got.s_dot) == pytest.approx(-2 * K * 1e-5 / (20.0 + R / 2), rel=1e-14)
+    assert float(got.gamma_dot) == -float(got.s_dot)
+
+
+def test_a_point_one_epsilon_deep_has_half_its_dashpots() -> None:
+    got = at(law(), g=1e-6, g_dot=1e-3, v_T=0.0, s=0.0)
+    assert float(got.rho) == 0.5
+    assert float(got.F_N) == pytest.approx(K * 1e-6 + R * 1e-3 / 2, rel=1e-14)
+
+
+def test_a_sticking_point_is_a_spring_and_a_dashpot() -> None:
+    g, v_T, s = 9e-6, 1e-4, 2e-6
+    got = at(law(), g=g, g_dot=0.0, v_T=v_T, s=s, weight=2.0)
+    assert float(got.rho) == pytest.approx(0.9, rel=1e-15)
+    assert float(got.F_N) == pytest.approx(2 * K * g, rel=1e-15)
+    assert float(got.s_dot) == pytest.approx(0.9 * v_T, rel=1e-15)
+    assert float(got.gamma_dot) == 0.0
+    assert float(got.F_T) == pytest.approx(2 * 0.9 * (2 * K * s + R / 2 * 0.9 * v_T), rel=1e-14)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_slipping_point_solves_the_quadratic(side: float) -> None:
+    """(eta + R) x = E - (mu_k + (mu_s - mu_k)/(1 + x/v_s)) F_N at F_N = 10 N, E = 12 N: 220 x^2 + (2.2 - 7) x - 0.04 = 0."""
+    g = 1e-4
+    rho = g / (g + 1e-6)
+    s = 12.0 / (2 * K)  # the trial effort, with v_T = 0
+    got = at(law(), g=g, g_dot=0.0, v_T=0.0, s=side * s)
+    x = (4.8 + math.sqrt(4.8**2 + 4 * 220.0 * 0.04)) / 440.0
+    assert float(got.gamma_dot) == pytest.approx(side * x, rel=1e-13)
+    assert float(got.s_dot) == pytest.approx(-side * x, rel=1e-13)
+    mu = 0.5 + 0.3 / (1 + x / 0.01)
+    assert float(got.e) == pytest.approx(side * (mu * 10.0 + 20.0 * x), rel=1e-12)
+    assert float(got.F_T) == pytest.approx(rho * float(got.e), rel=1e-15)
+
+
+def test_coulomb_slips_with_kinetic_friction() -> None:
+    contact = law(Coulomb(0.8, 0.5))
+    got = at(contact, g=1e-4, g_dot=0.0, v_T=0.0, s=12.0 / (2 * K))
+    assert float(got.e) == pytest.approx(5.0, rel=1e-14)
+    assert float(got.gamma_dot) == pytest.approx((12.0 - 5.0) / (R / 2), rel=1e-14)
+    stuck = at(contact, g=1e-4, g_dot=0.0, v_T=0.0, s=7.999 / (2 * K))
+    assert float(stuck.gamma_dot) == 0.0
+
+
+def test_withdrawal_does_not_pull() -> None:
+    assert float(at(law(), g=1e-5, g_dot=-0.1, v_T=0.0, s=0.0).F_N) == 0.0
+    assert float(at(law(), g=1e-5, g_dot=-1e-3, v_T=0.0, s=0.0).F_N) == pytest.approx(1.0 - 0.4 * 10 / 11, rel=1e-14)
+
+
+def test_a_stage_acts_through_the_stretch_at_its_end() -> None:
+    """The law at a stage equals the instantaneous law at s* + a h s', stick and slip."""
+    for v_T in (1e-3, 0.5):
+        stage = at(law(), g=5e-5, g_dot=1e-3, v_T=v_T, s=1e-6, stage=6e-4)
+        now = at(law(), g=5e-5, g_dot=1e-3, v_T=v_T, s=1e-6 + 6e-4 * float(stage.s_dot))
+        for name in ContactState._fields:
+            assert float(getattr(now, name)) == pytest.approx(float(getattr(stage, name)), rel=1e-11), name
+
+
+# limits and continuity ----------------------------------------------------------------------------------------------
+
+
+def test_equal_coefficients_without_viscosity_are_coulombs_law() -> None:
+    E = torch.linspace(0, 30, 301, dtype=torch.float64)
+    F_N, dashpot = f64(10.0), f64(200.0)
+    with torch.no_grad():
+        one = smooth(mu_s=0.5, mu_k=0.5, eta=0.0)(E, F_N, dashpot)
+        assert torch.allclose(one, Coulomb(0.5, 0.5)(E, F_N, dashpot), rtol=1e-12, atol=1e-15)
+
+
+def test_fast_slip_tends_to_kinetic_friction() -> None:
+    with torch.no_grad():
+        x = smooth(v_s=1e-9)(f64(12.0), f64(10.0), f64(200.0))
+    assert float(x) == pytest.approx((12.0 - 5.0) / 220.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("s", [0.0, 1e-5])
+@pytest.mark.parametrize("friction", [smooth(), Coulomb(0.8, 0.5)])
+def test_forces_are_continuous_at_touch_down(friction: SlipLaw, s: float) -> None:
+    """They grow from zero no faster than the springs, and the dashpots over epsilon, let them."""
+    for g in (1e-9, 1e-11, 1e-13):
+        got = at(law(friction), g=g, g_dot=0.2, v_T=0.3, s=s)
+        steepest = K + R * 0.2 / 1e-6
+        assert 0.0 < float(got.F_N) <= steepest * g
+        assert abs(float(got.F_T)) <= g / 1e-6 * (2 * K * s + R / 2 * 0.3)
+        apart = at(law(friction), g=-g, g_dot=0.2, v_T=0.3, s=s)
+        assert float(apart.F_N) == 0.0
+        assert abs(float(got.s_dot - apart.s_dot)) <= (g / 1e-6) * (1.0 + steepest * 1e-6 / (R / 2))
+
+
+def test_smooth_slip_begins_continuously_and_coulombs_does_not() -> None:
+    F_N, dashpot = f64(10.0), f64(200.0)
+    with torch.no_grad():
+        for part in (1e-6, 1e-9):
+            E = 8.0 * (1 + part) * torch.ones(1, dtype=torch.float64)
+            assert 0.0 < float(smooth(v_s=0.05)(E, F_N, dashpot)) < 8.0 * part / (220.0 - 3.0 / 0.05) * 1.01
+        assert float(Coulomb(0.8, 0.5)(f64(8.0), F_N, dashpot)) == pytest.approx(3.0 / 200.0, rel=1e-14)
+
+
+FORCES, RATES, DEPTHS = st.floats(0.0, 100.0), st.floats(-1.0, 1.0), st.floats(-1e-4, 1e-3)
+
+
+@given(E=FORCES, F_N=FORCES, dashpot=st.floats(1.0, 1e4), mu_k=st.floats(0.0, 1.0), extra=st.floats(0.0, 1.0),
+       v_s=st.floats(1e-3, 1.0), eta=st.floats(0.0, 100.0))  # fmt: skip
+def test_smooth_slip_satisfies_its_equation(
+    E: float, F_N: float, dashpot: float, mu_k: float, extra: float, v_s: float, eta: float
+) -> None:
+    friction = SmoothSlip(mu_k + extra, mu_k, v_s, eta)
+    with torch.no_grad():
+        x = float(friction(f64(E), f64(F_N), f64(dashpot)))
+    assert 0.0 <= dashpot * x <= E * (1 + 1e-12)
+    if (mu_k + extra) * F_N >= E:
+        assert x == 0.0 or (mu_k + extra) * F_N == E
+    else:
+        mu = mu_k + extra / (1 + x / v_s)
+        assert (eta + dashpot) * x == pytest.approx(E - mu * F_N, rel=1e-9, abs=1e-11 * (E + F_N))
+
+
+@pytest.mark.parametrize("friction", [smooth(), smooth(eta=0.0), Coulomb(0.8, 0.5)], ids=["smooth", "no eta", "coulomb"])
+@given(g=DEPTHS, g_dot=RATES, v_T=RATES, s=st.floats(-1e-3, 1e-3), weight=st.sampled_from([0.5, 1.0, 3.0]))
+def test_dissipation_is_never_negative(
+    friction: SlipLaw, g: float, g_dot: float, v_T: float, s: float, weight: float
+) -> None:
+    contact = law(friction)
+    got = at(contact, g, g_dot, v_T, s, weight=weight)
+    with torch.no_grad():
+        dashpots, slip = contact.dissipated(got, f64(g), f64(g_dot), weight)
+    trial = weight * (2 * K * abs(s) + R * abs(v_T))
+    scale = abs(float(got.F_N * g_dot)) + trial * (abs(v_T) + abs(float(got.gamma_dot)))
+    assert float(dashpots) >= -1e-13 * scale
+    assert float(slip) >= -1e-13 * scale
+    stored = weight * K * max(g, 0.0) * g_dot + weight * 2 * K * s * float(got.s_dot)
+    taken = float(got.F_N) * g_dot + float(got.F_T) * v_T  # what the point's motion puts in
+    assert taken == pytest.approx(stored + float(dashpots) + float(slip), rel=1e-9, abs=1e-12 * (1 + abs(stored) + scale))
+
+
+@given(g=DEPTHS, g_dot=RATES, v_T=RATES, s=st.floats(-1e-3, 1e-3))
+def test_friction_knows_no_direction(g: float, g_dot: float, v_T: float, s: float) -> None:
+    one, other = at(law(), g, g_dot, v_T, s), at(law(), g, g_dot, -v_T, -s)
+    assert torch.equal(one.F_N, other.F_N)
+    assert (one.F_T, one.s_dot, one.gamma_dot) == (-other.F_T, -other.s_dot, -other.gamma_dot)
+
+
+# a point and a body -------------------------------------------------------------------------------------------------
+
+
+def test_moving_frame_of_a_circle_by_hand() -> None:
+    frame = moving_frame(Circle(0.02), f64(0.0, -0.019, 0.012, 0.016).reshape(2, 2), f64(0.3, 0.3))
+    assert torch.allclose(frame.n, f64(0.0, -1.0, 0.6, 0.8).reshape(2, 2), rtol=0, atol=1e-15)
+    assert torch.allclose(frame.t, f64(1.0, 0.0, -0.8, 0.6).reshape(2, 2), rtol=0, atol=1e-15)
+    assert torch.allclose(frame.g, f64(1e-3, 0.0), rtol=0, atol=1e-17)
+
+
+def inputs(count: int, seed: int) -> Tensor:
+    """Inputs x (count, 9) of `interface_law` near the boundary of a body about 20 mm in size."""
+    generator = torch.Generator().manual_seed(seed)
+    normal = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)
+    angle = 2 * torch.pi * torch.rand(count, generator=generator, dtype=torch.float64)
+    d = (0.02 - 5e-5 * normal(count).abs())[:, None] * torch.stack((angle.cos(), angle.sin()), -1)
+    one = torch.ones(count, 1, dtype=torch.float64)
+    return torch.cat((0.01 * normal(count, 2), normal(count, 1), d, normal(count, 1), 1e-5 * normal(count, 1), one, 0 * one), -1)
+
+
+@pytest.mark.parametrize("shape", [Circle(0.02), Ellipse(0.0205, 0.0195)], ids=["circle", "ellipse"])
+def test_the_law_turns_with_everything(shape: torch.nn.Module) -> None:
+    """Turning point, velocities and body by one angle turns the force and nothing else."""
+    x, angle = inputs(50, 0), torch.tensor(0.7, dtype=torch.float64)
+    other = torch.cat((turned(x[:, :2], angle), x[:, 2:3], turned(x[:, 3:5], angle), x[:, 5:6] + angle, x[:, 6:]), -1)
+    with torch.no_grad():
+        one, two = interface_law(law(), shape, x), interface_law(law(), shape, other)
+    scale = one.abs().amax(0)
+    assert float((turned(one[:, :2], angle) - two[:, :2]).abs().max()) < 1e-9 * float(scale[:2].max())
+    assert bool(((one[:, 2:] - two[:, 2:]).abs() <= 1e-9 * scale[2:]).all())
+    assert int((one[:, 3] > 0).sum()) > 10
+
+
+def test_the_law_of_a_point_is_the_node_law_in_the_moving_frame() -> None:
+    """Eq. 4-7 by hand: g' and v_T are the body's velocity at the point along n and t."""
+    x, contact, shape = inputs(50, 1), law(), Circle(0.02)
+    with torch.no_grad():
+        out = interface_law(contact, shape, x)
+        n = x[:, 3:5] / x[:, 3:5].norm(dim=-1, keepdim=True)
+        v = x[:, :2] + x[:, 2:3] * cross(x[:, 3:5])
+        g, t = 0.02 - x[:, 3:5].norm(dim=-1), cross(n)
+        got = contact(g, (n * v).sum(-1), (t * v).sum(-1), x[:, 6], x[:, 7])
+        assert torch.allclose(out[:, :2], got.F_N[:, None] * n + got.F_T[:, None] * t, rtol=1e-12, atol=1e-12)
+        assert torch.allclose(out[:, 2:5], torch.stack((got.s_dot, got.F_N, got.F_T), -1), rtol=1e-12, atol=1e-12)
+        assert torch.allclose(distance_law(shape, x[0]), -g[:1], rtol=1e-12)
+
+
+def test_the_law_away_from_contact_is_the_law_of_a_separated_point() -> None:
+    x = f64(2e-5, 1.5, 6e-4)
+    with torch.no_grad():
+        s_dot, dashpots, slip = free_law(law(), x)
+    got = at(law(), g=-1.0, g_dot=0.0, v_T=0.0, s=2e-5, weight=1.5, stage=6e-4)
+    assert float(s_dot) == float(got.s_dot)
+    assert float(dashpots) == pytest.approx(1.5 * R / 2 * float(s_dot) ** 2, rel=1e-14)
+    assert float(slip) == pytest.approx(float(got.e * got.gamma_dot), rel=1e-14)
+
+
+# derivatives --------------------------------------------------------------------------------------------------------
+
+
+def test_ramp_and_normal_force_by_gradcheck() -> None:
+    g, g_dot = f64(3e-6, 5e-5, -2e-5).requires_grad_(), f64(-1e-4, 2e-2, 1e-2).requires_grad_()
+    K_n, R_n, epsilon = f64(1.2e5).requires_grad_(), f64(441.0).requires_grad_(), f64(1e-6)
+    check = {"eps": 1e-9, "atol": 1e-3, "rtol": 1e-4}  # g is some micrometres, so steps are nanometres
+    assert gradcheck(lambda g: ramp(g, epsilon), (g,), **check)
+    assert gradcheck(lambda g, g_dot: normal_force(g, g_dot, ramp(g, epsilon), K_n, R_n), (g, g_dot), **check)
+    fixed = g.detach()
+    by_law = lambda K, R: normal_force(fixed, g_dot.detach(), ramp(fixed, epsilon), K, R)
+    assert gradcheck(by_law, (K_n, R_n), eps=1e-3, atol=1e-9)
+
+
+@pytest.mark.parametrize("E", [(3.0, 5.0), (9.0, 30.0)], ids=["stick", "slip"])
+def test_smooth_slip_by_gradcheck(E: tuple[float, float]) -> None:
+    """All arguments and parameters; at 10 N the cap is 8 N. Both forms of the root: 9 N and 30 N."""
+    friction = SmoothSlip(0.8, 0.7, 5e-3, 10.0)
+    arguments = (f64(*E).requires_grad_(), f64(10.0, 10.0).requires_grad_(), f64(441.0).requires_grad_())
+    rate = lambda E, F_N, R, *_: 1e3 * friction(E, F_N, R)  # [mm/s]
+    assert gradcheck(rate, (*arguments, *friction.parameters()), eps=1e-7, atol=1e-6)
+    assert bool((rate(*arguments) > 0).all()) == (E[0] > 8.0)
+
+
+@pytest.mark.parametrize("E", [3.0, 9.0], ids=["stick", "slip"])
+def test_coulomb_by_gradcheck(E: float) -> None:
+    friction = Coulomb(0.8, 0.7)
+    arguments = tuple(f64(x).requires_grad_() for x in (E, 10.0, 441.0))
+    assert gradcheck(lambda E, F_N, R, *_: 1e3 * friction(E, F_N, R), (*arguments, *friction.parameters()), atol=1e-6)
+
+
+@pytest.mark.parametrize("stage", [0.0, 6e-4])
+def test_contact_by_gradcheck(friction: str, stage: float) -> None:
+    """Forces and rates of a sticking, two slipping (either way) and a separated node, in units of um, mm/s and N."""
+    contact = coarse(contact__friction=friction).contact
+    names, scale = zip(*((name, p.item()) for name, p in contact.named_parameters() if p.requires_grad))
+    weight, units = torch.full((4,), 2.0, dtype=torch.float64), (1e-6, 1e-3, 1e-3, 1e-6)
+
+    def outputs(*x: Tensor) -> Tensor:
+        out = contact(*(a * b for a, b in zip(x, units)), weight, stage=stage)
+        return torch.stack((out.F_N, out.F_T, 1e3 * out.s_dot, 1e3 * out.gamma_dot))
+
+    x = (f64(60, 40, 40, -5), f64(5, -3, 2, 1), f64(1, 90, -80, 10), f64(3, 5, -5, 4))
+    slipping = outputs(*x)[3] != 0
+    assert slipping.tolist()[:3] == [False, True, True]
+    assert gradcheck(outputs, tuple(v.requires_grad_() for v in x), eps=1e-6, atol=1e-5, rtol=1e-5)
+    fixed = [v.detach() * unit for v, unit in zip(x, units)]
+
+    def by_parameters(*log: Tensor) -> Tensor:
+        values = dict(zip(names, (a * b.exp() for a, b in zip(scale, log))))
+        out = torch.func.functional_call(contact, values, (*fixed, weight), {"stage": stage})
+        return torch.stack((out.F_N, out.F_T, 1e3 * out.s_dot, 1e3 * out.gamma_dot))
+
+    assert gradcheck(by_parameters, tuple(f64(0.0)[0].requires_grad_() for _ in scale), eps=1e-6, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [Circle(0.019), Ellipse(0.02, 0.017)], ids=["circle", "ellipse"])
+def test_moving_frame_by_gradcheck(shape: torch.nn.Module) -> None:
+    """By place, angle and the shape's lengths, all in cm, so that gradcheck's step suits them."""
+    names = [name for name, _ in shape.named_parameters()]
+    d, theta = f64(1.15, -1.42, 0.05, -1.92).reshape(2, 2), f64(0.7)[0]
+
+    class Framed(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.shape = shape
+
+        def forward(self, d: Tensor, theta: Tensor) -> Tensor:
+            frame = moving_frame(self.shape, 1e-2 * d, theta)
+            return torch.cat((1e2 * frame.d, frame.n, frame.t, 1e2 * frame.g[..., None]), -1)
+
+    def frame(d: Tensor, theta: Tensor, *lengths: Tensor) -> Tensor:
+        changed = {f"shape.{name}": 1e-2 * length for name, length in zip(names, lengths)}
+        return torch.func.functional_call(Framed(), changed, (d, theta))
+
+    lengths = [1e2 * p.detach() for p in shape.parameters()]
+    assert gradcheck(frame, [x.requires_grad_() for x in (d, theta, *lengths)])

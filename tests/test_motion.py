@@ -1,0 +1,157 @@
+"""Signals of time: the paper's profiles, recorded set-points, references, and where their gradients go."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from conftest import f64
+from scipy.interpolate import CubicSpline
+from torch.autograd import gradcheck
+
+from torchsoft import Profile, Reference, Sampled, hold
+
+TIMES = [0.0, 0.4, 1.0, 1.5]
+VALUES = [0.06, 0.04, 0.05, 0.01]
+
+
+def test_profile_is_the_papers_seventh_order_polynomial() -> None:
+    """Ends where it should, at rest with zero acceleration and jerk; peak speed 4.375 mm/s for 20 mm in 10 s."""
+    profile = Profile([0.0, 10.0], [0.06, 0.04])
+    t = torch.linspace(0, 10, 1001, dtype=torch.float64)
+    value, rate = profile(t)
+    assert float(value[0]) == 0.06
+    assert float(value[-1]) == pytest.approx(0.04, abs=1e-15)
+    assert float(rate.abs().max()) == pytest.approx(4.375e-3, rel=1e-12)
+    for time in (0.0, 10.0):
+        derivative = lambda t: profile(t)[1].sum()
+        t0 = torch.tensor(time + (1e-9 if time == 0 else -1e-9), dtype=torch.float64)
+        acceleration = torch.func.grad(derivative)
+        assert float(profile(t0)[1].abs()) < 1e-12
+        assert float(acceleration(t0).abs()) < 1e-12
+        assert float(torch.func.grad(acceleration)(t0).abs()) < 1e-9
+    slope = torch.func.grad(lambda t: profile(t)[0].sum())(t[123])
+    assert float(slope) == pytest.approx(float(rate[123]), rel=1e-12)
+
+
+def test_profile_goes_through_its_knots_and_stays_outside_them() -> None:
+    profile = Profile(TIMES, VALUES)
+    value, rate = profile(f64(-1.0, *TIMES, 9.0))
+    assert value.tolist() == pytest.approx([VALUES[0], *VALUES, VALUES[-1]], abs=1e-16)
+    assert torch.equal(rate, torch.zeros_like(rate))
+
+
+@pytest.mark.parametrize("kind", [Profile, Sampled])
+@pytest.mark.parametrize(
+    ("times", "values", "match"),
+    [
+        ([0.0, 0.0], [1.0, 2.0], "increase strictly"),
+        ([0.0, -1.0], [1.0, 2.0], "increase strictly"),
+        ([0.0, float("nan")], [1.0, 2.0], "increase strictly"),
+        ([0.0, 1.0], [1.0], "per time"),
+        ([0.0], [float("nan")], "finite"),
+    ],
+)
+def test_bad_knots_are_refused(kind: type[Profile], times: list[float], values: list[float], match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        kind(times, values)
+
+
+def test_bad_rates_are_refused() -> None:
+    for rates in ([0.0], [0.0, float("inf")]):
+        with pytest.raises(ValueError, match="`rates` must hold one finite number per time"):
+            Sampled([0.0, 1.0], [1.0, 2.0], rates)
+
+
+def test_sampled_is_the_cubic_spline_and_stays_outside_it() -> None:
+    signal, spline = Sampled(TIMES, VALUES), CubicSpline(TIMES, VALUES)
+    t = torch.linspace(0, 1.5, 301, dtype=torch.float64)
+    value, rate = signal(t)
+    np.testing.assert_allclose(value, spline(t), rtol=0, atol=1e-15)
+    np.testing.assert_allclose(rate, spline(t, 1), rtol=0, atol=1e-13)
+    value, rate = signal(f64(-0.5, 2.0))
+    assert value.tolist() == pytest.approx([VALUES[0], VALUES[-1]], abs=1e-16)
+    assert torch.equal(rate, torch.zeros_like(rate))
+
+
+def test_sampled_with_rates_is_hermites_cubic() -> None:
+    """x^3 from its values and rates, exactly."""
+    knots = f64(0.0, 0.5, 2.0)
+    signal = Sampled(knots.tolist(), (knots**3).tolist(), (3 * knots**2).tolist())
+    t = torch.linspace(0, 2, 101, dtype=torch.float64)
+    value, rate = signal(t)
+    assert torch.allclose(value, t**3, rtol=0, atol=1e-14)
+    assert torch.allclose(rate, 3 * t**2, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("signal", [Profile([0.3], [0.05]), Sampled([0.3], [0.05])], ids=["profile", "sampled"])
+def test_one_knot_is_a_constant(signal: Profile) -> None:
+    value, rate = signal(f64(0.0, 0.3, 1.0))
+    assert value.tolist() == [0.05] * 3
+    assert rate.tolist() == [0.0] * 3
+
+
+@pytest.mark.parametrize("kind", [Profile, Sampled])
+def test_signals_by_gradcheck(kind: type[Profile]) -> None:
+    """By the values of the knots, and by time where the signal is smooth."""
+    signal = kind([0.0, 0.4, 1.0], [0.06, 0.04, 0.05])
+    signal.values.requires_grad_(True)
+    t = f64(-0.1, 0.1, 0.3, 0.4, 0.7, 1.3)
+    assert gradcheck(lambda *_: torch.stack(signal(t)), (signal.values,))
+    inside = f64(0.1, 0.3, 0.7).requires_grad_()
+    assert gradcheck(lambda t: signal(t)[0], (inside,))
+    (slope,) = torch.autograd.grad(signal(inside)[0].sum(), inside)
+    assert torch.allclose(slope, signal(inside)[1], rtol=1e-12)
+
+
+def test_a_tensor_with_a_graph_given_as_a_knot_keeps_it() -> None:
+    """One knot among numbers, and all knots at once; a plain number is a parameter that is not trained."""
+    x = f64(0.04)[0].requires_grad_()
+    value, _ = Profile([0.0, 1.0], [0.06, 2 * x])(f64(0.0, 0.5, 1.0))
+    (slope,) = torch.autograd.grad(value.sum(), x)
+    assert float(slope) == pytest.approx(2 * 1.5, rel=1e-14)
+    knots = f64(0.1, 0.2).requires_grad_()
+    (slope,) = torch.autograd.grad(Profile([0.0, 1.0], knots**2)(f64(1.0))[0].sum(), knots)
+    assert torch.allclose(slope, f64(0.0, 0.4))
+    signal = Sampled([0.0, 1.0], knots**2, [0.0, 0.0])
+    (slope,) = torch.autograd.grad(signal(f64(1.0))[0].sum(), knots)
+    assert torch.allclose(slope, f64(0.0, 0.4))
+    assert [p.requires_grad for p in Profile([0.0, 1.0], [0.06, 0.05]).parameters()] == [False]
+    assert not list(Profile([0.0, 1.0], knots**2).parameters())
+
+
+@pytest.fixture(params=[torch.float32, torch.float64])
+def default(request: pytest.FixtureRequest) -> Iterator[torch.dtype]:
+    before = torch.get_default_dtype()
+    torch.set_default_dtype(request.param)
+    yield request.param
+    torch.set_default_dtype(before)
+
+
+@pytest.mark.parametrize("kind", [Profile, Sampled])
+def test_values_do_not_depend_on_torchs_default_dtype(default: torch.dtype, kind: type[Profile]) -> None:
+    """0.1 is 0.1 in float64, whatever a tensor of Python numbers would be."""
+    signal = kind([0.1, 0.3], [0.1, 0.7])
+    value, rate = signal(torch.tensor([0.1, 0.3], dtype=torch.float64))
+    assert value.dtype == rate.dtype == torch.float64
+    assert value.tolist() == pytest.approx([0.1, 0.7], abs=1e-16)
+    assert signal.times.tolist() == [0.1, 0.3]
+    assert hold(x=0.1)["x"].values.item() == 0.1
+
+
+def test_reference_gives_named_signals_side_by_side() -> None:
+    reference = Reference(x=Profile([0.0, 1.0], [0.0, 1.0]), y=Profile([0.0], [7.0]))
+    t = torch.linspace(0, 1, 5, dtype=torch.float64)
+    got = reference(t, ("y", "x", "y"))
+    assert got.shape == (5, 3, 2)
+    assert torch.equal(got[:, 1], torch.stack(reference["x"](t), -1))
+    assert torch.equal(got[:, 0], got[:, 2])
+    assert reference(t, ()).shape == (5, 0, 2)
+    assert hold(x=1.0, y=-2.0)(f64(3.0), ("x", "y"))[0].tolist() == [[1.0, 0.0], [-2.0, 0.0]]
+
+
+def test_reference_names_what_is_wrong() -> None:
+    with pytest.raises(ValueError, match="has no signal `z`; it has x, y"):
+        hold(x=0.0, y=0.0)(f64(0.0), ("z",))
+    with pytest.raises(ValueError, match="the signal `x` must be a module such as `Profile`, but is float"):
+        Reference(x=0.1)  # pyright: ignore[reportArgumentType]

@@ -1,0 +1,93 @@
+"""Bodies, control laws and actuators."""
+
+import pytest
+import torch
+from conftest import coarse, f64, grasped, times
+from torch import Tensor
+from torch.autograd import gradcheck
+
+from torchsoft import PD, Actuator, Body, Circle, Ellipse, SoftGrasp, simulate
+
+
+def test_pd_by_hand() -> None:
+    """F = 3 (1 - 0.5) + 2 (0.1 - 0.4) + 7."""
+    assert PD(3.0, 2.0)(*f64(1.0, 0.1, 7.0, 0.5, 0.4)).item() == pytest.approx(7.9, rel=1e-15)
+
+
+def test_pd_by_gradcheck() -> None:
+    law = PD(1.2e5, 441.7149)
+    x = tuple(f64(v).requires_grad_() for v in (0.06, 0.001, -70.0, 0.0601, 0.01))
+    assert gradcheck(lambda *x: law(*x[:5]), (*x, *law.parameters()), rtol=1e-5)
+
+
+@torch.no_grad()
+def test_the_papers_controllers() -> None:
+    """Eq. 31-34: the horizontal loop measures the disc, the vertical one the bracket, and both push the bracket."""
+    model = coarse()
+    state = model.unpack(grasped(model, (0.02, -0.01)))
+    state = state._replace(pose=state.pose | {"bracket": state.pose["bracket"] + f64(1e-3, 2e-3, 0.0)})
+    t = f64(0.0)[0]
+    signals = model.follow(t)
+    F_x, F_y = (float(model.actuator_effort(name, state, signals)) for name in "xy")
+    x_d, y_d, F_ff = (float(model.reference[name](t)[0]) for name in ("x_d", "y_d", "F_ff"))
+    x, y = float(state.pose["disc"][0]), float(state.pose["bracket"][1])
+    assert F_x == pytest.approx(1.2e5 * (x_d - x) - 441.7149 * 0.02, rel=1e-13)
+    assert F_y == pytest.approx(1.2e5 * (y_d - y) + F_ff, rel=1e-13)
+
+
+def test_bodies_know_their_inertia() -> None:
+    assert Body(2.0, Circle(0.1)).inertia.item() == pytest.approx(0.5 * 2.0 * 0.01, rel=1e-15)
+    assert Body(2.0, Ellipse(0.3, 0.1)).inertia.item() == pytest.approx(0.25 * 2.0 * (0.09 + 0.01), rel=1e-15)
+    assert Body(2.0, Circle(0.1), inertia=0.7).inertia.item() == 0.7
+    radius = Body(2.0, Circle(0.1))
+    (slope,) = torch.autograd.grad(radius.inertia, radius.shape.radius)
+    assert float(slope) == pytest.approx(2.0 * 0.1, rel=1e-15)
+
+
+def test_bodies_name_what_is_wrong() -> None:
+    with pytest.raises(ValueError, match=r"`y` must be 'free', 'driven' or a number, but is 'loose'"):
+        Body(1.0, Circle(0.1), y="loose")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="needs an `inertia`, or a `shape`"):
+        Body(1.0)
+    assert Body(1.0, theta=0.0).freedom == {"x": "free", "y": "free", "theta": "fixed"}
+
+
+class Saturated(torch.nn.Module):
+    """A control law of somebody's own: PD up to an effort that it learns."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.pd, self.most = PD(1.2e5, 441.7149), torch.nn.Parameter(f64(2.0)[0])
+
+    def forward(self, *x: Tensor) -> Tensor:
+        return self.most * torch.tanh(self.pd(*x) / self.most)
+
+
+@pytest.mark.parametrize("law", [Saturated(), lambda w, w_dot, feed, q, q_dot: 5e4 * (w - q) ** 3 - 400.0 * q_dot])
+def test_any_control_law_runs_compiled_with_exact_gradients(law: torch.nn.Module) -> None:
+    """A module or a function: the effort is its own, and its parameters' gradients are those of differences."""
+    model = coarse()
+    y0 = grasped(model, (0.03, 0.0))
+    model.actuators["x"] = Actuator("disc.x", "bracket.x", law, setpoint="x_d")
+    run = simulate(model, times(0.02, 11), y0=y0, tolerance=1e-10, gradient="discrete")
+    w, w_dot = model.reference["x_d"](run.t)
+    expected = law(w, w_dot, torch.zeros_like(w), run["x_C"], run["v_x"])
+    assert torch.allclose(run["F_x"], expected, rtol=1e-12, atol=1e-12)
+    assert float(run["F_x"].detach().abs().max()) > 0.1
+    if isinstance(law, Saturated):
+        (slope,) = torch.autograd.grad(run["x_Br"][-1], law.most)
+        ends = []
+        for h in (1e-3, -1e-3):
+            with torch.no_grad():
+                law.most.fill_(2.0 + h)
+            ends.append(float(simulate(model, run.t, y0=y0, tolerance=1e-10)["x_Br"][-1]))
+        assert float(slope) == pytest.approx((ends[0] - ends[1]) / 2e-3, rel=1e-5)
+
+
+def test_actuators_name_what_is_wrong() -> None:
+    for measures in ("disc.z", "disk.x", "x"):
+        model = coarse()
+        model.actuators["x"] = Actuator(measures, "bracket.x", PD(1.0, 1.0), setpoint="x_d")
+        with pytest.raises(ValueError, match=rf"speaks of `{measures}`, which is not a coordinate; there are disc\.x"):
+            model._check_names()
+    assert isinstance(model, SoftGrasp)

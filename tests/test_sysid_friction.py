@@ -1,0 +1,116 @@
+"""A friction law of the user's own, with parameters that `Parameters` does not have, identified like any other."""
+
+import importlib.util
+import pickle
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import COARSE
+from torch import Tensor, nn
+
+from torchsoft import Parameters, Reference, SoftGrasp
+from torchsoft.excitation import Excitation, Strokes
+from torchsoft.physics.contact import SlipLaw
+from torchsoft.physics.shapes import parameter
+from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
+from torchsoft.sysid.workers import Runner
+
+BASE = Parameters().override(COARSE)
+STEP = 2e-3
+SENSORS = {"x_C": Sensor(noise=1e-5), "theta": Sensor(noise=5e-4), "F_x": Sensor(noise=0.1)}
+JERKS = Excitation(motion=Strokes(travel=30e-3, stroke_time=0.1), duration=0.6, depth=5e-4, grasp_time=0.2, settle=0.05)
+TRUTH = {"contact.friction.alpha": 0.45, "contact.friction.beta": 60.0}
+
+
+class Viscous(nn.Module):
+    """Slip under what exceeds alpha F_N, against a viscosity beta [N.s/m]."""
+
+    def __init__(self, alpha: float, beta: float) -> None:
+        super().__init__()
+        self.alpha, self.beta = parameter(alpha), parameter(beta)
+
+    def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
+        return (E - self.alpha * F_N).clamp(min=0.0) / (R + self.beta)
+
+
+def rig(settings: Parameters, reference: Reference, alpha: float = 0.6) -> SoftGrasp:
+    return SoftGrasp(settings, reference, friction=Viscous(alpha, 30.0))
+
+
+@pytest.fixture(scope="module")
+def jerks() -> Recording:
+    """Without noise, of the true law; the recording's own model has other numbers."""
+    truth = BASE.override({"pad.E": 0.9e6})
+    return record("jerks", JERKS, truth, BASE, SENSORS, step=STEP, noise=0.0, build=rig, values=TRUTH)
+
+
+def test_its_parameters_are_found_beside_those_of_the_pads(jerks: Recording) -> None:
+    problem = Problem([jerks], SENSORS, {name: Unknown() for name in (*TRUTH, "pad.E")})
+    answer = identify(problem, plan=[Stage("all", ("jerks",), problem.coordinates.labels, STEP)], polished=False)
+    assert answer.converged
+    for name, value in (*TRUTH.items(), ("pad.E", 0.9e6)):
+        assert answer[name].identifiable, name
+        assert answer[name].value == pytest.approx(value, rel=1e-3), name
+    assert answer["contact.friction.alpha"].unit == ""
+
+
+def test_its_derivatives_by_both_routes_are_those_of_differences(jerks: Recording) -> None:
+    slack = {"contact.friction.beta": Unknown(scale="linear", nominal=0.0, low=-1.0, high=100.0)}
+    ratio = {"control.K_98": Unknown(ratio_to="control.K_81")}
+    problem = Problem([jerks], SENSORS, {"contact.friction.alpha": Unknown()} | slack | ratio)
+    x, free, h = problem.coordinates.start, problem.coordinates.free, 1e-5
+    with Runner(problem.recordings) as runner:
+        at = problem.residuals(runner, x, ["jerks"], STEP, free)
+        for i, label in enumerate(problem.coordinates.labels):
+            ahead, behind = (problem.residuals(runner, x + s * h * np.eye(3)[i], ["jerks"], STEP).r for s in (1, -1))
+            slope = (ahead - behind) / (2 * h)
+            assert np.linalg.norm(at.J[:, i] - slope) < 2e-4 * np.linalg.norm(slope), label
+        loss, gradient, lost = problem.misfit(runner, x, ["jerks"], STEP, free)
+    assert not lost
+    assert loss == pytest.approx(0.5 * at.r @ at.r, rel=1e-12)
+    np.testing.assert_allclose(gradient, at.J.T @ at.r, rtol=1e-8, atol=1e-8 * np.abs(gradient).max())
+
+
+def test_worker_processes_can_be_given_it(jerks: Recording) -> None:
+    there = pickle.loads(pickle.dumps(jerks))
+    assert isinstance(there.begin().model.contact.friction, Viscous)
+    assert there.fingerprint == jerks.fingerprint
+
+
+def test_only_what_the_model_has_can_be_identified(jerks: Recording) -> None:
+    assert {*TRUTH, "pad.E", "control.R_99", "disc.radius"} <= set(jerks.parameters)
+    for name in ("contact.mu_s", "contact.friction.gamma"):
+        with pytest.raises(ValueError, match=f"`{name}` cannot be identified; .*contact.friction.alpha"):
+            Problem([jerks], SENSORS, {name: Unknown()})
+    negative = replace(jerks, build=partial(rig, alpha=-1.0))
+    with pytest.raises(ValueError, match=r"contact\.friction\.alpha = -1 is not on a logarithmic scale"):
+        Problem([negative], SENSORS, {"contact.friction.alpha": Unknown()})
+
+
+def frictionless(E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
+    return E / R
+
+
+def plain(settings: Parameters, reference: Reference, law: SlipLaw = frictionless) -> SoftGrasp:
+    return SoftGrasp(settings, reference, friction=law)
+
+
+def test_a_checkpoint_of_another_law_is_not_read(jerks: Recording, tmp_path: Path) -> None:
+    """Neither of other numbers, nor of another function, nor of a changed one."""
+    builds = [rig, SoftGrasp, partial(rig, alpha=0.61), plain]
+    for number, text in enumerate(("E / R", "E / (2 * R)")):
+        path = tmp_path / f"{number}" / "laws.py"
+        path.parent.mkdir()
+        path.write_text(f"def law(E, F_N, R):\n    return {text}\n")
+        spec = importlib.util.spec_from_file_location("laws", path)
+        assert spec is not None
+        assert spec.loader is not None
+        laws = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(laws)
+        builds.append(partial(plain, law=laws.law))
+    prints = [replace(jerks, build=build).fingerprint for build in builds]
+    assert len(set(prints)) == len(builds) == 6
+    assert prints == [replace(jerks, build=build).fingerprint for build in builds]
