@@ -133,7 +133,7 @@ class ImplicitStepper:
         todo = list(chunks(t, self.step))
         signals = self.signals(todo).numpy()
         first = self.compiled.system(todo[0].h)
-        points, pads, coordinates = len(first.points.X), len(first.pads.base), len(first.bodies.free)
+        points, pads, coordinates = len(first.point_X), len(first.pad_base), len(first.body_free)
         n = len(self.integrals.names)
         out = Progress(
             np.empty((len(t), self.layout.size)),
@@ -200,8 +200,8 @@ class ImplicitStepper:
         s, n = self.compiled.system(segment.chunk.h), int(segment.chunk.keep.sum())
         work = scratch(s, self.layout.size)
         work.V[:], work.u_dot[:] = segment.V, segment.u_dot
-        extras = len(self.integrals.names) + len(s.pads.base) + len(s.bodies.free)
-        outputs = (np.empty((n, self.layout.size)), np.empty((n, len(s.points.X), 2)), np.empty((n, extras)))
+        extras = len(self.integrals.names) + len(s.pad_base) + len(s.body_free)
+        outputs = (np.empty((n, self.layout.size)), np.empty((n, len(s.point_X), 2)), np.empty((n, extras)))
         *_, tape = self._run(
             segment.chunk, segment.signals, segment.y.copy(), work, np.zeros(len(self.integrals.names)), outputs, True
         )
@@ -247,8 +247,8 @@ def stage_times(chunk: Chunk) -> Tensor:
 
 def set_velocities(s: Any, work: Work, y: Array) -> None:
     """Newton's first guess: the velocities of the state."""
-    for i, c in enumerate(s.bodies.coordinate):
-        work.V[c] = y[s.bodies.V_start + i]
+    for i, c in enumerate(s.body_coordinate):
+        work.V[c] = y[s.body_V_start + i]
 
 
 _announced = False

@@ -18,7 +18,7 @@ from torchsoft.physics.mesh import banded
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.solve.kernel.arrays import INPUTS, Actuators, Bodies, Contacts, Index, Inertia, Pads, Points, System
+from torchsoft.solve.kernel.arrays import INPUTS, Actuators, Bodies, Contacts, Index, Inertia, Pads, Points, system
 from torchsoft.solve.kernel.run import GAMMA
 
 WIDEST_ROW = 18
@@ -87,7 +87,7 @@ class Compiled:
         self._entries: list[Tensor] = []
         self._known: dict[tuple[int, int], LawSet] = {}
         self._count = 0
-        self._systems: dict[float, System] = {}
+        self._systems: dict[float, Any] = {}
         gravity_at = self._add(rig.gravity)
         mass_at = [[self._add(mass) for mass in body.masses] for body in rig.bodies.values()]
         self._bodies = self._make_bodies(gravity_at, mass_at)
@@ -268,7 +268,7 @@ class Compiled:
         )  # fmt: skip
         return contacts, points
 
-    def system(self, h: float) -> System:
+    def system(self, h: float) -> Any:
         """The arrays for steps of h [s]; only inertial pads depend on it."""
         key = h if len(self._inertia.X) else 0.0
         if key not in self._systems:
@@ -276,7 +276,7 @@ class Compiled:
                 self._systems.clear()
             pads, inertia = self._mobilities(GAMMA * h) if key else (self._pads, self._inertia)
             p = self.p.detach().numpy().copy()
-            self._systems[key] = System(self._bodies, self._actuators, pads, inertia, self._contacts, self._points, p)
+            self._systems[key] = system(self._bodies, self._actuators, pads, inertia, self._contacts, self._points, p=p)
         return self._systems[key]
 
     def _mobilities(self, a: float) -> tuple[Pads, Inertia]:

@@ -43,12 +43,23 @@ def writable_cache() -> Path | None:
 CACHE = writable_cache()
 
 
-def compiled(function: Callable[..., Any]) -> Any:
-    """`numba.njit` without the interpreter's lock, cached in `CACHE`; numba's own setting is left as it is for others."""
+def compiled(function: Callable[..., Any], entry: bool = False) -> Any:
+    """`numba.njit` without the interpreter's lock, cached in `CACHE`; numba's own setting is left as it is for others.
+
+    Only an `entry` can be called from Python: wrappers take longer to compile than most kernels.
+    """
     settings: Any = config
     before = settings.CACHE_DIR
     settings.CACHE_DIR = str(CACHE) if CACHE is not None else before
+    options: dict[str, Any] = {} if entry else {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     try:
-        return njit(cache=CACHE is not None, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})(function)
+        return njit(
+            cache=CACHE is not None, nogil=True, error_model="numpy", fastmath={"contract", "reassoc"}, **options
+        )(function)
     finally:
         settings.CACHE_DIR = before
+
+
+def entry(function: Callable[..., Any]) -> Any:
+    """A kernel that Python calls."""
+    return compiled(function, entry=True)

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from torchsoft.codegen.invoke import call_linearise, call_pullback
-from torchsoft.solve.kernel import compiled
+from torchsoft.solve.kernel import compiled, entry
 from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
 from torchsoft.solve.kernel.interface import assemble
-from torchsoft.solve.kernel.linear import solve_dense
+from torchsoft.solve.kernel.linear import row_of, solve_dense
 from torchsoft.solve.kernel.run import GAMMA, MIX, TINY
 from torchsoft.solve.kernel.stage import actuate
 from torchsoft.solve.kernel.taped import restore
@@ -23,13 +23,12 @@ from torchsoft.solve.kernel.taped import restore
 @compiled
 def rigid_part(s: Any, w: Any, y: Array, signals: Array, a: float, Rv: Array) -> None:
     """Derivative of the free coordinates' equations by their velocities without contact."""
-    bodies, act = s.bodies, s.actuators
     Rv[:] = 0.0
-    for i in range(bodies.coordinate.size):
-        Rv[i, i] = -s.p[bodies.mass_at[i]] / a
+    for i in range(s.body_coordinate.size):
+        Rv[i, i] = -s.p[s.body_mass_at[i]] / a
     x, out, J = np.empty(5), np.empty(1), np.empty((1, 5))
-    for i in range(act.measured.size):
-        number, towards = bodies.free[act.pushed[i]], bodies.free[act.measured[i]]
+    for i in range(s.act_measured.size):
+        number, towards = s.body_free[s.act_pushed[i]], s.body_free[s.act_measured[i]]
         if number >= 0 and towards >= 0:
             actuate(s, i, w.q, w.V, signals, x, out, J)
             Rv[number, towards] += a * J[0, 3] + J[0, 4]
@@ -38,38 +37,38 @@ def rigid_part(s: Any, w: Any, y: Array, signals: Array, a: float, Rv: Array) ->
 @compiled
 def nodal_cotangent(s: Any, w: Any, pad: int, y_bar: Array, a: float, n: int, X: Array, full: Array, V_bar: Array) -> None:
     """F_bar of the touched nodes into X[:, 0], from the cotangents of the pad's state and of the touching points' stretches."""
-    pads, points, free = s.pads, s.points, s.bodies.free
-    first, at = pads.node_start[pad], s.contacts.point_start[s.pads.contact_start[pad]]
-    c, b = s.pads.contact_start[pad], np.zeros(2 * n)
+    free = s.body_free
+    first, at = s.pad_node_start[pad], s.contact_point_start[s.pad_contact_start[pad]]
+    c, b = s.pad_contact_start[pad], np.zeros(2 * n)
     for i in range(w.actives[pad]):
         k = w.active[at + i]
-        while k >= s.contacts.point_start[c + 1]:
+        while k >= s.contact_point_start[c + 1]:
             c += 1
-        s_bar = a * y_bar[points.y_start + k]
+        s_bar = a * y_bar[s.point_y_start + k]
         for j in range(2):
-            if points.N[k, j] != 0.0:
-                row = 2 * w.slot[points.node[k, j]]
-                b[row] += points.N[k, j] * w.H[at + i, 2, 0] * s_bar
-                b[row + 1] += points.N[k, j] * w.H[at + i, 2, 1] * s_bar
+            if s.point_N[k, j] != 0.0:
+                row = 2 * w.slot[s.point_node[k, j]]
+                b[row] += s.point_N[k, j] * w.H[at + i, 2, 0] * s_bar
+                b[row + 1] += s.point_N[k, j] * w.H[at + i, 2, 1] * s_bar
         for row in range(6):
-            number = free[s.contacts.body[c] + row] if row < 3 else free[pads.base[pad] + row - 3]
+            number = free[s.contact_body[c] + row] if row < 3 else free[s.pad_base[pad] + row - 3]
             if number >= 0:
                 V_bar[number] += w.H[at + i, 2, 2 + row] * s_bar
-    if pads.v_start[pad] >= 0:
-        i0, i1 = s.inertia.dof_start[pad], s.inertia.dof_start[pad + 1]
-        u_bar, v_bar = y_bar[pads.y_start[pad] :], y_bar[pads.v_start[pad] :]
+    if s.pad_v_start[pad] >= 0:
+        i0, i1 = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1]
+        u_bar, v_bar = y_bar[s.pad_y_start[pad] :], y_bar[s.pad_v_start[pad] :]
         own = full[i0:i1]
         for i in range(i1 - i0):
             own[i] = a * u_bar[i] + v_bar[i]
         for i in range(n):
             for r in range(2):
-                own[s.inertia.surface[2 * w.touched[first + i] + r]] += b[2 * i + r]
-        base = pads.base[pad]
+                own[s.inertia_surface[2 * w.touched[first + i] + r]] += b[2 * i + r]
+        base = s.pad_base[pad]
         cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
         x = z = 0.0
         for i in range(i1 - i0):
-            x -= s.inertia.D[i0 + i, 0] * own[i]
-            z -= s.inertia.D[i0 + i, 1] * own[i]
+            x -= s.inertia_D[i0 + i, 0] * own[i]
+            z -= s.inertia_D[i0 + i, 1] * own[i]
             if i % 2 == 0:
                 x += v_bar[i]
             else:
@@ -79,19 +78,19 @@ def nodal_cotangent(s: Any, w: Any, pad: int, y_bar: Array, a: float, n: int, X:
         if free[base + 1] >= 0:
             V_bar[free[base + 1]] += sin * x + cos * z
         rates = own.copy()
-        solve(s.inertia, pad, rates)
+        solve(s, pad, rates)
         for i in range(n):
             for r in range(2):
-                X[2 * i + r, 0] = rates[s.inertia.surface[2 * w.touched[first + i] + r]]
+                X[2 * i + r, 0] = rates[s.inertia_surface[2 * w.touched[first + i] + r]]
         return
-    size, chain, branches = 2 * (pads.node_start[pad + 1] - first), pads.chain_at[pad], pads.branches[pad]
+    size, chain, branches = 2 * (s.pad_node_start[pad + 1] - first), s.pad_chain_at[pad], s.pad_branches[pad]
     for i in range(n):
         for r in range(2):
             dof, total = 2 * (w.touched[first + i] - first) + r, 0.0
             for m in range(2 * n):
                 total += w.P[2 * i + r, m] * b[m]
             for branch in range(branches):
-                total += a * y_bar[pads.y_start[pad] + branch * size + dof] / (s.p[chain + branches + branch] + a)
+                total += a * y_bar[s.pad_y_start[pad] + branch * size + dof] / (s.p[chain + branches + branch] + a)
             X[2 * i + r, 0] = total
 
 
@@ -99,23 +98,23 @@ def nodal_cotangent(s: Any, w: Any, pad: int, y_bar: Array, a: float, n: int, X:
 def pad_state(s: Any, w: Any, pad: int, y: Array, y_bar: Array, a: float, rate_bar: Array, u_bar: Array, p_bar: Array) -> None:
     """Cotangents of a massless pad's state at the stage's start, and of its material, from those of its nodal rates and
     displacements (nodes, 2)."""
-    pads, p = s.pads, s.p
-    first, last, start = pads.node_start[pad], pads.node_start[pad + 1], pads.y_start[pad]
-    size, chain, branches = 2 * (last - first), pads.chain_at[pad], pads.branches[pad]
-    C = pads.C[pads.C_start[pad] : pads.C_start[pad] + size * size].reshape(size, size)
-    dC = pads.dC[pads.C_start[pad] : pads.C_start[pad] + size * size].reshape(size, size)
+    p = s.p
+    first, last, start = s.pad_node_start[pad], s.pad_node_start[pad + 1], s.pad_y_start[pad]
+    size, chain, branches = 2 * (last - first), s.pad_chain_at[pad], s.pad_branches[pad]
+    start_C = s.pad_C_start[pad]
     by_rate, by_u, nu_rate, nu_u = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
     for node in range(w.low[pad], w.high[pad]):
         for r in range(2):
             c, d = rate_bar[node, r], u_bar[node, r]
             if c != 0.0 or d != 0.0:
-                row, other = C[2 * (node - first) + r], dC[2 * (node - first) + r]
+                i = 2 * (node - first) + r
+                row, other = row_of(s.pad_C, start_C, i, size), row_of(s.pad_dC, start_C, i, size)
                 for m in range(size):
                     by_rate[m] += row[m] * c
                     by_u[m] += row[m] * d
                     nu_rate[m] += other[m] * c
                     nu_u[m] += other[m] * d
-    F = w.F.reshape(-1)
+    F = w.F.ravel()
     material = chain + 2 * branches
     scale_bar = nu_bar = 0.0
     for b in range(branches):
@@ -142,47 +141,47 @@ def inertial_state(
     nu: Array, V_bar: Array, p_bar: Array,
 ) -> None:  # fmt: skip
     """The same for an inertial pad; `rate` is its taped u', `full` what `nodal_cotangent` left, V_bar of all coordinates."""
-    inertia, pads, free, at = s.inertia, s.pads, s.bodies.free, s.inertia.material_at[pad]
-    i0, i1, base = inertia.dof_start[pad], inertia.dof_start[pad + 1], pads.base[pad]
-    U, W, mass = pads.y_start[pad], pads.v_start[pad], s.p[inertia.material_at[pad] + 3]
+    free, at = s.body_free, s.inertia_material_at[pad]
+    i0, i1, base = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1], s.pad_base[pad]
+    U, W, mass = s.pad_y_start[pad], s.pad_v_start[pad], s.p[s.inertia_material_at[pad] + 3]
     cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
     nx = nu[free[base]] if free[base] >= 0 else 0.0
     ny = nu[free[base + 1]] if free[base + 1] >= 0 else 0.0
     reaction = np.array([-(cos * nx + sin * ny), -(cos * ny - sin * nx)])
     own = np.empty(i1 - i0)  # cotangent of u'
     for i in range(i1 - i0):
-        own[i] = a * y_bar[U + i] + y_bar[W + i] + mass * inertia.area[i0 + i] / a * reaction[i % 2]
+        own[i] = a * y_bar[U + i] + y_bar[W + i] + mass * s.inertia_area[i0 + i] / a * reaction[i % 2]
     for node in range(w.low[pad], w.high[pad]):
         for r in range(2):
-            own[inertia.surface[2 * node + r]] += rate_bar[node, r]
-    solve(inertia, pad, own)  # now the multiplier of the pad's equation
+            own[s.inertia_surface[2 * node + r]] += rate_bar[node, r]
+    solve(s, pad, own)  # now the multiplier of the pad's equation
     vx, vy = base_velocity(s, pad, w.V, w.q)
     strain, force, back = np.empty(i1 - i0), np.empty(i1 - i0), np.empty(i1 - i0)
     here = rate[i0:i1]
-    stiffness_force(inertia, s.p, pad, here, force)
-    stiffness_force(inertia, s.p, pad, own, back)
+    stiffness_force(s, pad, here, force)
+    stiffness_force(s, pad, own, back)
     for i in range(i1 - i0):
         v = vx if i % 2 == 0 else vy
-        M = inertia.area[i0 + i] / a
+        M = s.inertia_area[i0 + i] / a
         change = here[i] + v - y[W + i]
         p_bar[at + 2] -= own[i] * force[i]
         p_bar[at + 3] += M * change * (reaction[i % 2] - own[i])
         strain[i] = y[U + i] + (s.p[at + 2] + a) * here[i]
     for k in range(i1 - i0):
-        for j in range(inertia.K_column.shape[1]):
-            product = own[k] * strain[inertia.K_column[i0 + k, j]]
-            p_bar[at] -= inertia.K_lambda[i0 + k, j] * product
-            p_bar[at + 1] -= inertia.K_mu[i0 + k, j] * product
+        for j in range(s.inertia_K_column.shape[1]):
+            product = own[k] * strain[s.inertia_K_column[i0 + k, j]]
+            p_bar[at] -= s.inertia_K_lambda[i0 + k, j] * product
+            p_bar[at + 1] -= s.inertia_K_mu[i0 + k, j] * product
     local = np.zeros(2)
     for i in range(i1 - i0):
-        local[i % 2] += y_bar[W + i] + mass * inertia.area[i0 + i] / a * (reaction[i % 2] - own[i])
+        local[i % 2] += y_bar[W + i] + mass * s.inertia_area[i0 + i] / a * (reaction[i % 2] - own[i])
         y_bar[U + i] -= back[i]
-        y_bar[W + i] = mass * inertia.area[i0 + i] / a * (own[i] - reaction[i % 2])
+        y_bar[W + i] = mass * s.inertia_area[i0 + i] / a * (own[i] - reaction[i % 2])
     V_bar[base] += cos * local[0] - sin * local[1]
     V_bar[base + 1] += sin * local[0] + cos * local[1]
     for node in range(w.low[pad], w.high[pad]):
         for r in range(2):
-            y_bar[U + inertia.surface[2 * node + r]] += u_bar[node, r]
+            y_bar[U + s.inertia_surface[2 * node + r]] += u_bar[node, r]
 
 
 @compiled
@@ -191,18 +190,18 @@ def stage_adjoint(
     rate_bar: Array, u_bar: Array,
 ) -> None:  # fmt: skip
     """Turn the cotangent y_bar (size,) of a stage's end into that of its y*, in place; add to p_bar and signals_bar."""
-    pads, contacts, points, bodies, p = s.pads, s.contacts, s.points, s.bodies, s.p
-    free, count, y = bodies.coordinate.size, pads.base.size, tape.y[row]
+    p = s.p
+    free, count, y = s.body_coordinate.size, s.pad_base.size, tape.y[row]
     restore(s, w, tape, row, a)
     Rv, matrix, nu = np.empty((free, free)), np.empty((free, free)), np.empty((free, 1))
     V_bar, full = np.empty(free), np.empty(w.full.size)
     rigid_part(s, w, y, signals, a, Rv)
     matrix[:] = 0.0
     for i in range(free):
-        V_bar[i] = y_bar[bodies.V_start + i] + a * y_bar[bodies.q_start + i]
+        V_bar[i] = y_bar[s.body_V_start + i] + a * y_bar[s.body_q_start + i]
     for pad in range(count):
         n = assemble(s, w, pad, a, Rv)
-        first, columns, column = pads.node_start[pad], pads.columns[pad], pads.column[pad]
+        first, columns, column = s.pad_node_start[pad], s.pad_columns[pad], s.pad_column[pad]
         X = w.X[2 * first : 2 * (first + n)]
         nodal_cotangent(s, w, pad, y_bar, a, n, X, full, V_bar)
         for i in range(2 * n):
@@ -228,8 +227,8 @@ def stage_adjoint(
 
     q_hat, V_hat, weights, by = np.zeros(w.q.size), np.zeros(w.q.size), np.empty(3), np.empty(6)
     for pad in range(count):
-        first, n, column = pads.node_start[pad], w.counts[pad], pads.column[pad]
-        at, c = contacts.point_start[pads.contact_start[pad]], pads.contact_start[pad]
+        first, n, column = s.pad_node_start[pad], w.counts[pad], s.pad_column[pad]
+        at, c = s.contact_point_start[s.pad_contact_start[pad]], s.pad_contact_start[pad]
         X = w.X[2 * first : 2 * (first + n)]
         for i in range(2 * n):
             for j in range(free):
@@ -239,22 +238,22 @@ def stage_adjoint(
             rate_bar[node, 0], rate_bar[node, 1], u_bar[node, 0], u_bar[node, 1] = 0.0, 0.0, 0.0, 0.0
         for i in range(w.actives[pad]):
             k = w.active[at + i]
-            while k >= contacts.point_start[c + 1]:
+            while k >= s.contact_point_start[c + 1]:
                 c += 1
             H, S, G, L = w.H[at + i], w.S[at + i], w.G[at + i], w.L[at + i]
             for row_ in range(6):
-                number = bodies.free[contacts.body[c] + row_] if row_ < 3 else bodies.free[pads.base[pad] + row_ - 3]
+                number = s.body_free[s.contact_body[c] + row_] if row_ < 3 else s.body_free[s.pad_base[pad] + row_ - 3]
                 by[row_] = nu[number, 0] if number >= 0 else 0.0
             for r in range(2):
                 weights[r] = 0.0
                 for j in range(2):
-                    if points.N[k, j] != 0.0:
-                        weights[r] += points.N[k, j] * X[2 * w.slot[points.node[k, j]] + r, 0]
+                    if s.point_N[k, j] != 0.0:
+                        weights[r] += s.point_N[k, j] * X[2 * w.slot[s.point_node[k, j]] + r, 0]
                 for row_ in range(6):
                     weights[r] += G[row_, r] * by[row_]
-            weights[2] = a * y_bar[points.y_start + k]
-            own = slice(contacts.p_start[c], contacts.p_start[c + 1])
-            call_pullback(contacts.pullback[c], w.x[k], p[own], weights, p_bar[own])
+            weights[2] = a * y_bar[s.point_y_start + k]
+            own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
+            call_pullback(s.contact_pullback[c], w.x[k], p[own], weights, p_bar[own])
             for m in range(8):
                 position = velocity = 0.0
                 for r in range(3):
@@ -264,73 +263,71 @@ def stage_adjoint(
                     position += L[row_, m] * by[row_]
                 if m < 2:
                     for j in range(2):
-                        rate_bar[points.node[k, j], m] += points.N[k, j] * (velocity + a * position)
-                        u_bar[points.node[k, j], m] += points.N[k, j] * position
+                        rate_bar[s.point_node[k, j], m] += s.point_N[k, j] * (velocity + a * position)
+                        u_bar[s.point_node[k, j], m] += s.point_N[k, j] * position
                 else:
-                    coordinate = contacts.body[c] + m - 2 if m < 5 else pads.base[pad] + m - 5
+                    coordinate = s.contact_body[c] + m - 2 if m < 5 else s.pad_base[pad] + m - 5
                     q_hat[coordinate] += position
                     V_hat[coordinate] += velocity
             s_bar = 0.0
             for r in range(3):
                 s_bar += w.J[k, r, 6] * weights[r]
-            y_bar[points.y_start + k] += s_bar
+            y_bar[s.point_y_start + k] += s_bar
         free_stretches(s, w, pad, y, y_bar, a, p_bar)
-        if pads.v_start[pad] >= 0:
+        if s.pad_v_start[pad] >= 0:
             inertial_state(s, w, pad, y, y_bar, a, tape.rate[row], full, rate_bar, u_bar, nu[:, 0], V_hat, p_bar)
         else:
             pad_state(s, w, pad, y, y_bar, a, rate_bar, u_bar, p_bar)
 
-    act = s.actuators
     x, out, J = np.empty(5), np.empty(1), np.empty((1, 5))
-    for i in range(act.measured.size):
-        number = bodies.free[act.pushed[i]]
+    for i in range(s.act_measured.size):
+        number = s.body_free[s.act_pushed[i]]
         if number < 0:
             continue
         actuate(s, i, w.q, w.V, signals, x, out, J)
-        own, push = slice(act.p_start[i], act.p_start[i + 1]), nu[number]
-        call_pullback(act.pullback[i], x, p[own], push, p_bar[own])
-        signals_bar[act.setpoint[i], 0] += push[0] * J[0, 0]
-        signals_bar[act.setpoint[i], 1] += push[0] * J[0, 1]
-        if act.feed_forward[i] >= 0:
-            signals_bar[act.feed_forward[i], 0] += push[0] * J[0, 2]
-        q_hat[act.measured[i]] += push[0] * J[0, 3]
-        V_hat[act.measured[i]] += push[0] * J[0, 4]
+        own, push = slice(s.act_p_start[i], s.act_p_start[i + 1]), nu[number]
+        call_pullback(s.act_pullback[i], x, p[own], push, p_bar[own])
+        signals_bar[s.act_setpoint[i], 0] += push[0] * J[0, 0]
+        signals_bar[s.act_setpoint[i], 1] += push[0] * J[0, 1]
+        if s.act_feed_forward[i] >= 0:
+            signals_bar[s.act_feed_forward[i], 0] += push[0] * J[0, 2]
+        q_hat[s.act_measured[i]] += push[0] * J[0, 3]
+        V_hat[s.act_measured[i]] += push[0] * J[0, 4]
     for i in range(free):
-        c, mass = bodies.coordinate[i], p[bodies.mass_at[i]]
-        rate = (w.V[c] - y[bodies.V_start + i]) / a
-        p_bar[bodies.mass_at[i]] -= nu[i, 0] * (rate + bodies.weight[i] * p[bodies.gravity_at])
-        p_bar[bodies.gravity_at] -= nu[i, 0] * mass * bodies.weight[i]
-        y_bar[bodies.q_start + i] += q_hat[c]
-        y_bar[bodies.V_start + i] = nu[i, 0] * mass / a
+        c, mass = s.body_coordinate[i], p[s.body_mass_at[i]]
+        rate = (w.V[c] - y[s.body_V_start + i]) / a
+        p_bar[s.body_mass_at[i]] -= nu[i, 0] * (rate + s.body_weight[i] * p[s.body_gravity_at])
+        p_bar[s.body_gravity_at] -= nu[i, 0] * mass * s.body_weight[i]
+        y_bar[s.body_q_start + i] += q_hat[c]
+        y_bar[s.body_V_start + i] = nu[i, 0] * mass / a
     for c in range(w.q.size):
-        if bodies.free[c] < 0 and bodies.signal[c] >= 0:
-            signals_bar[bodies.signal[c], 0] += q_hat[c]
-            signals_bar[bodies.signal[c], 1] += V_hat[c]
+        if s.body_free[c] < 0 and s.body_signal[c] >= 0:
+            signals_bar[s.body_signal[c], 0] += q_hat[c]
+            signals_bar[s.body_signal[c], 1] += V_hat[c]
 
 
 @compiled
 def free_stretches(s: Any, w: Any, pad: int, y: Array, y_bar: Array, a: float, p_bar: Array) -> None:
     """Cotangents of the stretches away from contact, which decay."""
-    contacts, points = s.contacts, s.points
-    at, i = contacts.point_start[s.pads.contact_start[pad]], 0
+    at, i = s.contact_point_start[s.pad_contact_start[pad]], 0
     x, out, J, weight = np.empty(3), np.empty(3), np.empty((1, 1)), np.empty(1)
-    for c in range(s.pads.contact_start[pad], s.pads.contact_start[pad + 1]):
-        own = slice(contacts.p_start[c], contacts.p_start[c + 1])
-        for k in range(contacts.point_start[c], contacts.point_start[c + 1]):
-            j = points.y_start + k
+    for c in range(s.pad_contact_start[pad], s.pad_contact_start[pad + 1]):
+        own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
+        for k in range(s.contact_point_start[c], s.contact_point_start[c + 1]):
+            j = s.point_y_start + k
             if i < w.actives[pad] and w.active[at + i] == k:
                 i += 1
             elif y_bar[j] != 0.0:
-                x[0], x[1], x[2] = y[j], points.weight[k], a
-                call_linearise(contacts.free_linearise[c], x, s.p[own], out, J)
+                x[0], x[1], x[2] = y[j], s.point_weight[k], a
+                call_linearise(s.contact_free_linearise[c], x, s.p[own], out, J)
                 weight[0] = a * y_bar[j]
-                call_pullback(contacts.free_pullback[c], x, s.p[own], weight, p_bar[own])
+                call_pullback(s.contact_free_pullback[c], x, s.p[own], weight, p_bar[own])
                 y_bar[j] += J[0, 0] * weight[0]
                 if abs(y_bar[j]) < TINY:
                     y_bar[j] = 0.0
 
 
-@compiled
+@entry
 def backward(
     s: Any, w: Any, h: float, tape: Any, signals: Array, keep: Any, outputs_bar: Array, y_bar: Array, p_bar: Array,
     signals_bar: Array,

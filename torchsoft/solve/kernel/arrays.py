@@ -5,7 +5,7 @@ free (a component of the state) or follows a signal. "At" in a name is a positio
 "start" one in another array. Nodes are the surface nodes of all pads, points the contact points of all contacts.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,16 +117,18 @@ class Points(NamedTuple):
     y_start: int
 
 
-class System(NamedTuple):
-    """Everything that stays while a run is on; p holds all law parameters, `a` is the stage length a h [s]."""
+PARTS = {"body": Bodies, "act": Actuators, "pad": Pads, "inertia": Inertia, "contact": Contacts, "point": Points}
 
-    bodies: Bodies
-    actuators: Actuators
-    pads: Pads
-    inertia: Inertia
-    contacts: Contacts
-    points: Points
-    p: Array
+System = NamedTuple(
+    "System", [*((f"{part}_{name}", Any) for part, kind in PARTS.items() for name in kind._fields), ("p", Array)]
+)
+"""Everything that stays while a run is on, flat: the fields of `PARTS` by part_field, and p, the vector of law parameters. Flat,
+because numba's compiling takes time for every array in a tuple that is taken out of another."""
+
+
+def system(*parts: Any, p: Array) -> Any:
+    """A `System` of one of each of `PARTS`, in their order."""
+    return System(*(field for part in parts for field in part), p)
 
 
 class Work(NamedTuple):
@@ -196,29 +198,29 @@ class Tape(NamedTuple):
 
 def scratch(s: System, size: int, columns: int = 1) -> Work:
     """Scratch arrays for one run, with room for so many right-hand sides."""
-    nodes, points, coordinates = int(s.pads.node_start[-1]), len(s.points.X), len(s.bodies.free)
-    pads, contacts, free = len(s.pads.base), len(s.contacts.pad), len(s.bodies.coordinate)
-    widest = 2 * int(np.diff(s.pads.node_start).max(initial=0))
+    nodes, points, coordinates = int(s.pad_node_start[-1]), len(s.point_X), len(s.body_free)
+    pads, contacts, free = len(s.pad_base), len(s.contact_pad), len(s.body_coordinate)
+    widest = 2 * int(np.diff(s.pad_node_start).max(initial=0))
     z = lambda *shape: np.zeros(shape)
     i = lambda *shape: np.zeros(shape, np.int64)
-    per_node = ("zeta", "zeta_rate", "u", "free", "u_dot", "u_dot_old", "u_dot_new", "F", "F_linear", "F_old", "F_new")
+    per_node = ("u", "free", "u_dot", "u_dot_old", "u_dot_new", "F", "F_linear", "F_old", "F_new")
     return Work(
-        q=z(coordinates), V=z(coordinates), frame=z(contacts, 7), **{name: z(nodes, 2) for name in per_node},
+        q=z(coordinates), V=z(coordinates), frame=z(contacts, 7), zeta=z(2 * nodes), zeta_rate=z(2 * nodes), **{name: z(nodes, 2) for name in per_node},
         x=z(points, INPUTS), out=z(points, OUTPUTS), J=z(points, 3, 7), H=z(points, 3, 8), S=z(points, 3, 8),
         G=z(points, 6, 2), L=z(points, 6, 8), window=i(points), windows=i(pads), active=i(points), actives=i(pads),
         low=i(pads), high=i(pads), slot=i(nodes), touched=i(nodes), counts=i(pads), A=z(widest, widest), P=z(widest, widest),
         Hc=z(widest, free), Rf=z(free, widest), X=z(2 * nodes, columns + free), k=z(size), load=z(coordinates),
-        full=z(int(s.inertia.dof_start[-1])), travelled=np.array([np.inf, 0.0]),
+        full=z(int(s.inertia_dof_start[-1])), travelled=np.array([np.inf, 0.0]),
     )  # fmt: skip
 
 
 def empty_tape(s: System, size: int, stages: int, cap: int) -> Tape:
     """Room for that many stages, with `cap` touching points in all."""
-    coordinates, i = len(s.bodies.free), np.int64
+    coordinates, i = len(s.body_free), np.int64
     return Tape(
         np.zeros((stages, size)), np.zeros((stages, coordinates)), np.zeros((stages, coordinates)),
-        np.zeros((stages, len(s.pads.base)), i), np.zeros((stages, cap), i), np.zeros((stages, cap, 6)),
-        np.zeros((stages, int(s.inertia.dof_start[-1]))),
+        np.zeros((stages, len(s.pad_base)), i), np.zeros((stages, cap), i), np.zeros((stages, cap, 6)),
+        np.zeros((stages, int(s.inertia_dof_start[-1]))),
     )  # fmt: skip
 
 

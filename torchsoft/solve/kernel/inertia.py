@@ -14,39 +14,40 @@ from torchsoft.solve.kernel.linear import solve_banded
 
 
 @compiled
-def stiffness_force(inertia: Any, p: Array, pad: int, u: Array, out: Array) -> None:
+def stiffness_force(s: Any, pad: int, u: Array, out: Array) -> None:
     """K u, (dofs,) both."""
-    at, first = inertia.material_at[pad], inertia.dof_start[pad]
+    at, first, p = s.inertia_material_at[pad], s.inertia_dof_start[pad], s.p
     for i in range(u.size):
         total = 0.0
-        for k in range(inertia.K_column.shape[1]):
-            stiffness = p[at] * inertia.K_lambda[first + i, k] + p[at + 1] * inertia.K_mu[first + i, k]
-            total += stiffness * u[inertia.K_column[first + i, k]]
+        for k in range(s.inertia_K_column.shape[1]):
+            stiffness = p[at] * s.inertia_K_lambda[first + i, k] + p[at + 1] * s.inertia_K_mu[first + i, k]
+            total += stiffness * u[s.inertia_K_column[first + i, k]]
         out[i] = total
 
 
 @compiled
-def solve(inertia: Any, pad: int, b: Array) -> None:
+def solve(s: Any, pad: int, b: Array) -> None:
     """A^-1 b in place."""
-    first, last = inertia.dof_start[pad], inertia.dof_start[pad + 1]
-    solve_banded(inertia.factor[: inertia.band[pad], first:last], b)
+    first, last = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1]
+    solve_banded(s.inertia_factor[: s.inertia_band[pad], first:last], b)
 
 
 @compiled
-def free_rates(inertia: Any, p: Array, pad: int, y: Array, u_start: int, v_start: int, a: float, full: Array) -> None:
-    """A^-1 (M v*/(a h) - K u*) of one pad into its part of `full`."""
-    first, last = inertia.dof_start[pad], inertia.dof_start[pad + 1]
-    free, mass = full[first:last], p[inertia.material_at[pad] + 3]
-    stiffness_force(inertia, p, pad, y[u_start : u_start + last - first], free)
+def free_rates(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
+    """A^-1 (M v*/(a h) - K u*) of one pad into its part of w.full."""
+    first, last = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1]
+    free, mass, v_start = w.full[first:last], s.p[s.inertia_material_at[pad] + 3], s.pad_v_start[pad]
+    u_start = s.pad_y_start[pad]
+    stiffness_force(s, pad, y[u_start : u_start + last - first], free)
     for i in range(last - first):
-        free[i] = mass * inertia.area[first + i] / a * y[v_start + i] - free[i]
-    solve(inertia, pad, free)
+        free[i] = mass * s.inertia_area[first + i] / a * y[v_start + i] - free[i]
+    solve(s, pad, free)
 
 
 @compiled
 def base_velocity(s: Any, pad: int, V: Array, q: Array) -> tuple[float, float]:
     """The base's velocity in its own axes."""
-    B = s.pads.base[pad]
+    B = s.pad_base[pad]
     cos, sin = np.cos(q[B + 2]), np.sin(q[B + 2])
     return cos * V[B] + sin * V[B + 1], cos * V[B + 1] - sin * V[B]
 
@@ -54,26 +55,26 @@ def base_velocity(s: Any, pad: int, V: Array, q: Array) -> tuple[float, float]:
 @compiled
 def couple_point(s: Any, w: Any, pad: int, k: int, c: int, K: Array, H: Array, Rv: Array) -> None:
     """What the base's velocity does to the rate of point k, in Hc and Rv."""
-    cos, sin, base, free = w.frame[c, 0], w.frame[c, 1], s.pads.base[pad], s.bodies.free
+    cos, sin, base, free = w.frame[c, 0], w.frame[c, 1], s.pad_base[pad], s.body_free
     for axis in range(2):
         towards = free[base + axis]
         if towards < 0:
             continue
-        column = s.pads.column[pad, towards]
+        column = s.pad_column[pad, towards]
         ex, ey = (cos, -sin) if axis == 0 else (sin, cos)  # the world's axis in the base's frame
         Dx, Dy = 0.0, 0.0
         for j in range(2):
-            dof = s.inertia.dof_start[pad] + s.inertia.surface[2 * s.points.node[k, j]]
-            N = s.points.N[k, j]
-            Dx += N * (s.inertia.D[dof, 0] * ex + s.inertia.D[dof, 1] * ey)
-            Dy += N * (s.inertia.D[dof + 1, 0] * ex + s.inertia.D[dof + 1, 1] * ey)
+            dof = s.inertia_dof_start[pad] + s.inertia_surface[2 * s.point_node[k, j]]
+            N = s.point_N[k, j]
+            Dx += N * (s.inertia_D[dof, 0] * ex + s.inertia_D[dof, 1] * ey)
+            Dy += N * (s.inertia_D[dof + 1, 0] * ex + s.inertia_D[dof + 1, 1] * ey)
         for j in range(2):
-            if s.points.N[k, j] != 0.0:
-                row = 2 * w.slot[s.points.node[k, j]]
+            if s.point_N[k, j] != 0.0:
+                row = 2 * w.slot[s.point_node[k, j]]
                 for r in range(2):
-                    w.Hc[row + r, column] -= s.points.N[k, j] * (H[r, 0] * Dx + H[r, 1] * Dy)
+                    w.Hc[row + r, column] -= s.point_N[k, j] * (H[r, 0] * Dx + H[r, 1] * Dy)
         for row in range(6):
-            number = free[s.contacts.body[c] + row] if row < 3 else free[base + row - 3]
+            number = free[s.contact_body[c] + row] if row < 3 else free[base + row - 3]
             if number >= 0:
                 Rv[number, towards] -= K[row, 0] * Dx + K[row, 1] * Dy
 
@@ -81,16 +82,16 @@ def couple_point(s: Any, w: Any, pad: int, k: int, c: int, K: Array, H: Array, R
 @compiled
 def couple_base(s: Any, w: Any, pad: int, n: int, Rv: Array) -> None:
     """The base's reaction to nodal forces and to its own velocity, in Rf and Rv."""
-    base, free, first = s.pads.base[pad], s.bodies.free, s.pads.node_start[pad]
-    cos, sin, B = np.cos(w.q[base + 2]), np.sin(w.q[base + 2]), s.inertia.B[pad]
+    base, free, first = s.pad_base[pad], s.body_free, s.pad_node_start[pad]
+    cos, sin, B = np.cos(w.q[base + 2]), np.sin(w.q[base + 2]), s.inertia_B[pad]
     for axis in range(2):
         number = free[base + axis]
         if number < 0:
             continue
         ex, ey = (cos, -sin) if axis == 0 else (sin, cos)
         for m in range(2 * n):
-            dof = s.inertia.dof_start[pad] + s.inertia.surface[2 * w.touched[first + m // 2] + m % 2]
-            w.Rf[s.pads.column[pad, number], m] -= ex * s.inertia.D[dof, 0] + ey * s.inertia.D[dof, 1]
+            dof = s.inertia_dof_start[pad] + s.inertia_surface[2 * w.touched[first + m // 2] + m % 2]
+            w.Rf[s.pad_column[pad, number], m] -= ex * s.inertia_D[dof, 0] + ey * s.inertia_D[dof, 1]
         for other in range(2):
             towards = free[base + other]
             if towards >= 0:
@@ -101,10 +102,10 @@ def couple_base(s: Any, w: Any, pad: int, n: int, Rv: Array) -> None:
 @compiled
 def inertia_force(s: Any, w: Any, pad: int, y: Array, a: float, rates: Array) -> tuple[float, float]:
     """Sum of M v' in the base's axes for the rates u' (dofs,) of the pad's own nodes and the base's velocity in w."""
-    first, v_start, mass = s.inertia.dof_start[pad], s.pads.v_start[pad], s.p[s.inertia.material_at[pad] + 3]
+    first, v_start, mass = s.inertia_dof_start[pad], s.pad_v_start[pad], s.p[s.inertia_material_at[pad] + 3]
     vx, vy = base_velocity(s, pad, w.V, w.q)
     x, z = 0.0, 0.0
     for i in range(0, rates.size, 2):
-        x += mass * s.inertia.area[first + i] / a * (rates[i] + vx - y[v_start + i])
-        z += mass * s.inertia.area[first + i + 1] / a * (rates[i + 1] + vy - y[v_start + i + 1])
+        x += mass * s.inertia_area[first + i] / a * (rates[i] + vx - y[v_start + i])
+        z += mass * s.inertia_area[first + i + 1] / a * (rates[i + 1] + vy - y[v_start + i + 1])
     return x, z

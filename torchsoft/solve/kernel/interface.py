@@ -20,16 +20,17 @@ from torchsoft.codegen.invoke import call_linearise, call_value
 from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.inertia import couple_base, couple_point, free_rates
+from torchsoft.solve.kernel.linear import row_of
 
 NEGLIGIBLE = 1e-14
 """Nodal force that has set in [N] below which a node counts as never loaded: its displacements are below rounding."""
 
 
 @compiled
-def frames(contacts: Any, bases: Any, q: Array, V: Array, frame: Array) -> None:
+def frames(s: Any, w: Any) -> None:
     """Per contact, in the base's frame: cos and sin of its angle, the body's centre, its velocity less the base's, the spin."""
-    for c in range(contacts.pad.size):
-        B, C = bases[contacts.pad[c]], contacts.body[c]
+    for c in range(s.contact_pad.size):
+        q, V, frame, B, C = w.q, w.V, w.frame, s.pad_base[s.contact_pad[c]], s.contact_body[c]
         cos, sin = np.cos(q[B + 2]), np.sin(q[B + 2])
         rx, ry, vx, vy = q[C] - q[B], q[C + 1] - q[B + 1], V[C] - V[B], V[C + 1] - V[B + 1]
         frame[c, 0], frame[c, 1] = cos, sin
@@ -48,11 +49,11 @@ def kinematics(frame: Array, X: Array, ux: float, uy: float, vx: float, vy: floa
 
 
 @compiled
-def mobility_scale(pads: Any, p: Array, pad: int, a: float) -> float:
+def mobility_scale(s: Any, pad: int, a: float) -> float:
     """What the stored mobility is multiplied with: sum of J / (tau + a h) over the chain; 1 for inertial pads."""
-    if pads.v_start[pad] >= 0:
+    if s.pad_v_start[pad] >= 0:
         return 1.0
-    at, n, total = pads.chain_at[pad], pads.branches[pad], 0.0
+    at, n, p, total = s.pad_chain_at[pad], s.pad_branches[pad], s.p, 0.0
     for b in range(n):
         total += p[at + b] / (p[at + n + b] + a)
     return total
@@ -62,13 +63,13 @@ def mobility_scale(pads: Any, p: Array, pad: int, a: float) -> float:
 def set_in(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
     """What a stage starts from: zeta = sum of J z and sum of J z / (tau + a h) over a massless pad's chain and its support
     (`w.low`, `w.high` come later); an inertial pad's u' without contact and motion of its base."""
-    pads, p = s.pads, s.p
-    first, last, start = pads.node_start[pad], pads.node_start[pad + 1], pads.y_start[pad]
-    if pads.v_start[pad] >= 0:
-        free_rates(s.inertia, p, pad, y, start, pads.v_start[pad], a, w.full)
+    p = s.p
+    first, last, start = s.pad_node_start[pad], s.pad_node_start[pad + 1], s.pad_y_start[pad]
+    if s.pad_v_start[pad] >= 0:
+        free_rates(s, w, pad, y, a)
         return
-    at, n = pads.chain_at[pad], pads.branches[pad]
-    zeta, rate = w.zeta[first:last].reshape(-1), w.zeta_rate[first:last].reshape(-1)
+    at, n = s.pad_chain_at[pad], s.pad_branches[pad]
+    zeta, rate = w.zeta[2 * first : 2 * last], w.zeta_rate[2 * first : 2 * last]
     for i in range(zeta.size):
         zeta[i], rate[i] = 0.0, 0.0
     for b in range(n):
@@ -82,23 +83,22 @@ def set_in(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
 @compiled
 def displacements(s: Any, w: Any, pad: int, y: Array, low: int, high: int) -> None:
     """u* and the rates without contact of the surface nodes from `low` to `high`, from what `set_in` left."""
-    pads = s.pads
-    first, last, start = pads.node_start[pad], pads.node_start[pad + 1], pads.y_start[pad]
-    if pads.v_start[pad] >= 0:
-        i0 = s.inertia.dof_start[pad]
+    first, last, start = s.pad_node_start[pad], s.pad_node_start[pad + 1], s.pad_y_start[pad]
+    if s.pad_v_start[pad] >= 0:
+        i0 = s.inertia_dof_start[pad]
         for i in range(2 * low, 2 * high):
-            dof = s.inertia.surface[i]
+            dof = s.inertia_surface[i]
             w.u[i // 2, i % 2], w.free[i // 2, i % 2] = y[start + dof], w.full[i0 + dof]
         return
-    zeta, rate, size = w.zeta[first:last].reshape(-1), w.zeta_rate[first:last].reshape(-1), 2 * (last - first)
+    zeta, rate, size = w.zeta[2 * first : 2 * last], w.zeta_rate[2 * first : 2 * last], 2 * (last - first)
     left, right = 0, size
     while left < right and abs(zeta[left]) < NEGLIGIBLE:
         left += 1
     while right > left and abs(zeta[right - 1]) < NEGLIGIBLE:
         right -= 1
-    C = pads.C[pads.C_start[pad] : pads.C_start[pad] + size * size].reshape(size, size)
     for i in range(2 * low, 2 * high):
-        row, u, free = C[i - 2 * first], 0.0, 0.0
+        u = free = 0.0
+        row = row_of(s.pad_C, s.pad_C_start[pad], i - 2 * first, size)
         for j in range(left, right):
             u += row[j] * zeta[j]
             free -= row[j] * rate[j]
@@ -108,21 +108,20 @@ def displacements(s: Any, w: Any, pad: int, y: Array, low: int, high: int) -> No
 @compiled
 def scan(s: Any, w: Any, y: Array, margin: float) -> None:
     """List the points within `margin` [m] of touching at the stage's start, w.q, in `w.window`; needs `set_in`."""
-    pads, contacts, points = s.pads, s.contacts, s.points
-    frames(contacts, pads.base, w.q, w.V, w.frame)
+    frames(s, w)
     x, phi = np.zeros(9), np.zeros(1)
-    for pad in range(pads.base.size):
-        first, last = pads.node_start[pad], pads.node_start[pad + 1]
+    for pad in range(s.pad_base.size):
+        first, last = s.pad_node_start[pad], s.pad_node_start[pad + 1]
         displacements(s, w, pad, y, first, last)
-        at = contacts.point_start[pads.contact_start[pad]]
+        at = s.contact_point_start[s.pad_contact_start[pad]]
         count, low, high = 0, last, first
-        for c in range(pads.contact_start[pad], pads.contact_start[pad + 1]):
-            body, p = contacts.body[c], s.p[contacts.p_start[c] : contacts.p_start[c + 1]]
-            for k in range(contacts.point_start[c], contacts.point_start[c + 1]):
-                n0, n1, N0, N1 = points.node[k, 0], points.node[k, 1], points.N[k, 0], points.N[k, 1]
+        for c in range(s.pad_contact_start[pad], s.pad_contact_start[pad + 1]):
+            body, p = s.contact_body[c], s.p[s.contact_p_start[c] : s.contact_p_start[c + 1]]
+            for k in range(s.contact_point_start[c], s.contact_point_start[c + 1]):
+                n0, n1, N0, N1 = s.point_node[k, 0], s.point_node[k, 1], s.point_N[k, 0], s.point_N[k, 1]
                 ux, uy = N0 * w.u[n0, 0] + N1 * w.u[n1, 0], N0 * w.u[n0, 1] + N1 * w.u[n1, 1]
-                kinematics(w.frame[c], points.X[k], ux, uy, 0.0, 0.0, 0.0, w.q[body + 2] - w.q[pads.base[pad] + 2], x)
-                call_value(contacts.distance[c], x, p, phi)
+                kinematics(w.frame[c], s.point_X[k], ux, uy, 0.0, 0.0, 0.0, w.q[body + 2] - w.q[s.pad_base[pad] + 2], x)
+                call_value(s.contact_distance[c], x, p, phi)
                 if not phi[0] > margin:
                     w.window[at + count] = k
                     count += 1
@@ -141,27 +140,26 @@ def evaluate(s: Any, w: Any, pad: int, y: Array, a: float) -> tuple[float, float
     Returns how far these forces are from the ones that the linear relations were solved with: the largest difference [N], and
     the sum of squares [N2].
     """
-    pads, contacts, points = s.pads, s.contacts, s.points
-    at, count, actives, c = contacts.point_start[pads.contact_start[pad]], w.windows[pad], 0, pads.contact_start[pad]
+    at, count, actives, c = s.contact_point_start[s.pad_contact_start[pad]], w.windows[pad], 0, s.pad_contact_start[pad]
     for node in range(w.low[pad], w.high[pad]):
         w.F[node, 0], w.F[node, 1] = 0.0, 0.0
     phi = np.empty(1)
     for i in range(count):
         k = w.window[at + i]
-        while k >= contacts.point_start[c + 1]:
+        while k >= s.contact_point_start[c + 1]:
             c += 1
-        body = contacts.body[c]
-        n0, n1, N0, N1 = points.node[k, 0], points.node[k, 1], points.N[k, 0], points.N[k, 1]
+        body = s.contact_body[c]
+        n0, n1, N0, N1 = s.point_node[k, 0], s.point_node[k, 1], s.point_N[k, 0], s.point_N[k, 1]
         vx, vy = N0 * w.u_dot[n0, 0] + N1 * w.u_dot[n1, 0], N0 * w.u_dot[n0, 1] + N1 * w.u_dot[n1, 1]
         ux = N0 * w.u[n0, 0] + N1 * w.u[n1, 0] + a * vx
         uy = N0 * w.u[n0, 1] + N1 * w.u[n1, 1] + a * vy
-        x, p = w.x[k], s.p[contacts.p_start[c] : contacts.p_start[c + 1]]
-        kinematics(w.frame[c], points.X[k], ux, uy, vx, vy, w.V[body + 2], w.q[body + 2] - w.q[pads.base[pad] + 2], x)
-        call_value(contacts.distance[c], x, p, phi)
+        x, p = w.x[k], s.p[s.contact_p_start[c] : s.contact_p_start[c + 1]]
+        kinematics(w.frame[c], s.point_X[k], ux, uy, vx, vy, w.V[body + 2], w.q[body + 2] - w.q[s.pad_base[pad] + 2], x)
+        call_value(s.contact_distance[c], x, p, phi)
         if phi[0] >= 0.0:
             continue
-        x[6], x[7], x[8] = y[points.y_start + k], points.weight[k], a
-        call_linearise(contacts.linearise[c], x, p, w.out[k], w.J[k])
+        x[6], x[7], x[8] = y[s.point_y_start + k], s.point_weight[k], a
+        call_linearise(s.contact_linearise[c], x, p, w.out[k], w.J[k])
         for r in range(2):
             w.F[n0, r] += N0 * w.out[k, r]
             w.F[n1, r] += N1 * w.out[k, r]
@@ -181,11 +179,10 @@ def evaluate(s: Any, w: Any, pad: int, y: Array, a: float) -> tuple[float, float
 @compiled
 def linearise(s: Any, w: Any, pad: int, a: float) -> None:
     """H, S, G and L of the touching points of a pad, from the law's Jacobians in `w.J`."""
-    pads, contacts = s.pads, s.contacts
-    at, c = contacts.point_start[pads.contact_start[pad]], pads.contact_start[pad]
+    at, c = s.contact_point_start[s.pad_contact_start[pad]], s.pad_contact_start[pad]
     for i in range(w.actives[pad]):
         k = w.active[at + i]
-        while k >= contacts.point_start[c + 1]:
+        while k >= s.contact_point_start[c + 1]:
             c += 1
         cos, sin, rx, ry, vx, vy, spin = w.frame[c]
         dx, dy, fx, fy = w.x[k, 3], w.x[k, 4], w.out[k, 0], w.out[k, 1]
@@ -213,44 +210,44 @@ def linearise(s: Any, w: Any, pad: int, a: float) -> None:
 @compiled
 def assemble(s: Any, w: Any, pad: int, a: float, Rv: Array) -> int:
     """The block of one pad: w.touched, w.slot, w.P, w.A, w.Hc, w.Rf, and its part in Rv (free, free). Returns how many nodes."""
-    pads, contacts, points, free = s.pads, s.contacts, s.points, s.bodies.free
-    at, c, first = contacts.point_start[pads.contact_start[pad]], pads.contact_start[pad], pads.node_start[pad]
-    size, column = 2 * (pads.node_start[pad + 1] - first), pads.column[pad]
-    C = pads.C[pads.C_start[pad] : pads.C_start[pad] + size * size].reshape(size, size)
+    free = s.body_free
+    at, c, first = s.contact_point_start[s.pad_contact_start[pad]], s.pad_contact_start[pad], s.pad_node_start[pad]
+    size, column = 2 * (s.pad_node_start[pad + 1] - first), s.pad_column[pad]
     n = 0
     for node in range(w.low[pad], w.high[pad]):
         w.slot[node] = -1
     for i in range(w.actives[pad]):
         for j in range(2):
-            node = points.node[w.active[at + i], j]
-            if points.N[w.active[at + i], j] != 0.0 and w.slot[node] < 0:
+            node = s.point_node[w.active[at + i], j]
+            if s.point_N[w.active[at + i], j] != 0.0 and w.slot[node] < 0:
                 w.slot[node], w.touched[first + n] = n, node
                 n += 1
-    A, P, Hc, Rf, scale = w.A, w.P, w.Hc, w.Rf, mobility_scale(pads, s.p, pad, a)
-    Hc[: 2 * n, : pads.columns[pad]] = 0.0
-    Rf[: pads.columns[pad], : 2 * n] = 0.0
+    A, P, Hc, Rf, scale = w.A, w.P, w.Hc, w.Rf, mobility_scale(s, pad, a)
+    Hc[: 2 * n, : s.pad_columns[pad]] = 0.0
+    Rf[: s.pad_columns[pad], : 2 * n] = 0.0
     for i in range(n):
         row = 2 * (w.touched[first + i] - first)
         for j in range(n):
             col = 2 * (w.touched[first + j] - first)
             for r in range(2):
-                P[2 * i + r, 2 * j], P[2 * i + r, 2 * j + 1] = scale * C[row + r, col], scale * C[row + r, col + 1]
+                line = s.pad_C_start[pad] + (row + r) * size + col
+                P[2 * i + r, 2 * j], P[2 * i + r, 2 * j + 1] = scale * s.pad_C[line], scale * s.pad_C[line + 1]
     for i in range(2 * n):
         A[i, : 2 * n] = 0.0
         A[i, i] = 1.0
     K, PB, number = np.empty((6, 8)), np.empty((2, 2 * n)), np.empty(6, np.int64)
     for i in range(w.actives[pad]):
         k = w.active[at + i]
-        while k >= contacts.point_start[c + 1]:
+        while k >= s.contact_point_start[c + 1]:
             c += 1
         H, G, L = w.H[at + i], w.G[at + i], w.L[at + i]
         for m in range(3):
-            number[m], number[3 + m] = free[contacts.body[c] + m], free[pads.base[pad] + m]
+            number[m], number[3 + m] = free[s.contact_body[c] + m], free[s.pad_base[pad] + m]
         PB[:] = 0.0
         for j in range(2):
-            N = points.N[k, j]
+            N = s.point_N[k, j]
             if N != 0.0:
-                row = 2 * w.slot[points.node[k, j]]
+                row = 2 * w.slot[s.point_node[k, j]]
                 for r in range(2):
                     for m in range(2 * n):
                         PB[r, m] += N * P[row + r, m]
@@ -266,18 +263,18 @@ def assemble(s: Any, w: Any, pad: int, a: float, Rv: Array) -> int:
                 if number[other] >= 0:
                     Rv[number[row], number[other]] += K[row, 2 + other]
         for j in range(2):
-            N = points.N[k, j]
+            N = s.point_N[k, j]
             if N == 0.0:
                 continue
-            row = 2 * w.slot[points.node[k, j]]
+            row = 2 * w.slot[s.point_node[k, j]]
             for r in range(2):
                 for m in range(2 * n):
                     A[row + r, m] -= N * (H[r, 0] * PB[0, m] + H[r, 1] * PB[1, m])
                 for other in range(6):
                     if number[other] >= 0:
                         Hc[row + r, column[number[other]]] += N * H[r, 2 + other]
-        if pads.v_start[pad] >= 0:
+        if s.pad_v_start[pad] >= 0:
             couple_point(s, w, pad, k, c, K, H, Rv)
-    if pads.v_start[pad] >= 0:
+    if s.pad_v_start[pad] >= 0:
         couple_base(s, w, pad, n, Rv)
     return n

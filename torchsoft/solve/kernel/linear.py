@@ -36,6 +36,12 @@ def solve_dense(A: Array, b: Array, n: int, m: int) -> None:
 
 
 @compiled
+def row_of(matrices: Array, start: int, i: int, size: int) -> Array:
+    """Row i of the (size, size) matrix that begins at `start`, a view."""
+    return matrices[start + i * size : start + (i + 1) * size]
+
+
+@compiled
 def solve_banded(factor: Array, b: Array) -> None:
     """Solve L L^T x = b in place, L in scipy's lower banded storage."""
     band, n = factor.shape

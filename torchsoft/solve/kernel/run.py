@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from torchsoft.solve.kernel import compiled
+from torchsoft.solve.kernel import compiled, entry
 from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.stage import actuate, finish, solve_stage
 
@@ -27,8 +27,8 @@ def write_tape(s: Any, w: Any, tape: Any, row: int, y: Array) -> bool:
     """Put one solved stage on the tape; False if more points touch than it has room for."""
     tape.y[row], tape.q[row], tape.V[row], tape.rate[row] = y, w.q, w.V, w.full
     slot = 0
-    for pad in range(s.pads.base.size):
-        at = s.contacts.point_start[s.pads.contact_start[pad]]
+    for pad in range(s.pad_base.size):
+        at = s.contact_point_start[s.pad_contact_start[pad]]
         tape.count[row, pad] = w.actives[pad]
         if slot + w.actives[pad] > tape.point.shape[1]:
             return False
@@ -38,7 +38,7 @@ def write_tape(s: Any, w: Any, tape: Any, row: int, y: Array) -> bool:
             for r in range(2):
                 u = v = 0.0
                 for j in range(2):
-                    node, N = s.points.node[k, j], s.points.N[k, j]
+                    node, N = s.point_node[k, j], s.point_N[k, j]
                     u += N * w.u[node, r]
                     v += N * w.u_dot[node, r]
                 tape.state[row, slot, r], tape.state[row, slot, 2 + r], tape.state[row, slot, 4 + r] = u, v, w.out[k, r]
@@ -49,13 +49,12 @@ def write_tape(s: Any, w: Any, tape: Any, row: int, y: Array) -> bool:
 @compiled
 def gone(s: Any, w: Any) -> int:
     """Whether a contact has reached the end of a pad, or a body has left the space over one."""
-    contacts = s.contacts
-    for c in range(contacts.pad.size):
-        at = contacts.point_start[s.pads.contact_start[contacts.pad[c]]]
-        for i in range(w.actives[contacts.pad[c]]):
-            if w.active[at + i] == contacts.point_start[c] or w.active[at + i] == contacts.point_start[c + 1] - 1:
+    for c in range(s.contact_pad.size):
+        at = s.contact_point_start[s.pad_contact_start[s.contact_pad[c]]]
+        for i in range(w.actives[s.contact_pad[c]]):
+            if w.active[at + i] == s.contact_point_start[c] or w.active[at + i] == s.contact_point_start[c + 1] - 1:
                 return OFF_THE_PAD
-        x, y, limit = w.frame[c, 2], w.frame[c, 3], contacts.limits[c]
+        x, y, limit = w.frame[c, 2], w.frame[c, 3], s.contact_limits[c]
         if not (limit[0] <= x <= limit[1] and limit[2] <= y <= limit[3]):
             return LOST
     return CONVERGED
@@ -64,31 +63,31 @@ def gone(s: Any, w: Any) -> int:
 @compiled
 def supply(s: Any, w: Any, signals: Array, powers: Array) -> None:
     """Powers [W] of the actuators, of gravity, of what drives the bodies, and the sum of the positive ones."""
-    bodies, act, at = s.bodies, s.actuators, s.pads.base.size + 2
+    at = s.pad_base.size + 2
     x, out, J = np.empty(5), np.empty(1), np.empty((1, 5))
-    for i in range(act.measured.size):
-        powers[at + i] = actuate(s, i, w.q, w.V, signals, x, out, J) * w.V[act.pushed[i]]
-    at += act.measured.size
+    for i in range(s.act_measured.size):
+        powers[at + i] = actuate(s, i, w.q, w.V, signals, x, out, J) * w.V[s.act_pushed[i]]
+    at += s.act_measured.size
     gravity = 0.0
-    for i in range(bodies.coordinate.size):
-        gravity -= bodies.weight[i] * s.p[bodies.mass_at[i]] * s.p[bodies.gravity_at] * w.V[bodies.coordinate[i]]
+    for i in range(s.body_coordinate.size):
+        gravity -= s.body_weight[i] * s.p[s.body_mass_at[i]] * s.p[s.body_gravity_at] * w.V[s.body_coordinate[i]]
     powers[at] = gravity
-    for b in range(bodies.free.size // 3 - 1):
+    for b in range(s.body_free.size // 3 - 1):
         drive = 0.0
         for c in range(3 * b, 3 * b + 3):
-            if bodies.free[c] < 0:
+            if s.body_free[c] < 0:
                 drive -= w.load[c] * w.V[c]
-        for i in range(act.measured.size):  # what pushes a driven coordinate is held by what drives it
-            if act.pushed[i] // 3 == b and bodies.free[act.pushed[i]] < 0:
-                drive -= powers[s.pads.base.size + 2 + i]
+        for i in range(s.act_measured.size):  # what pushes a driven coordinate is held by what drives it
+            if s.act_pushed[i] // 3 == b and s.body_free[s.act_pushed[i]] < 0:
+                drive -= powers[s.pad_base.size + 2 + i]
         powers[at + 1 + b] = drive
     total = 0.0
-    for i in range(s.pads.base.size + 2, powers.size - 1):
+    for i in range(s.pad_base.size + 2, powers.size - 1):
         total += max(powers[i], 0.0)
     powers[-1] = total
 
 
-@compiled
+@entry
 def run(
     s: Any, w: Any, y: Array, signals: Array, h: float, tolerance: float, max_iterations: int, margin: float, keep: Any,
     integrals: Array, ys: Array, forces: Array, extras: Array, tape: Any,
@@ -100,7 +99,7 @@ def run(
     moments and the generalised contact forces to `extras`, one row each. y, `integrals` and the guesses in w are advanced in
     place; after a failure they hold the last good step. Returns steps taken, status, and linear solves.
     """
-    a, pads, row, solves = GAMMA * h, s.pads.base.size, 0, 0
+    a, pads, row, solves = GAMMA * h, s.pad_base.size, 0, 0
     powers, moments = np.empty(integrals.size), np.zeros(pads)
     before, integrals_before, V_before = np.empty(y.size), np.empty(integrals.size), np.empty(w.V.size)
     for step in range(len(signals)):
@@ -153,7 +152,7 @@ def run(
             for k in range(len(forces[row])):
                 forces[row, k, 0], forces[row, k, 1] = 0.0, 0.0
             for pad in range(pads):
-                at = s.contacts.point_start[s.pads.contact_start[pad]]
+                at = s.contact_point_start[s.pad_contact_start[pad]]
                 for i in range(w.actives[pad]):
                     k = w.active[at + i]
                     forces[row, k, 0], forces[row, k, 1] = w.out[k, 3], w.out[k, 4]

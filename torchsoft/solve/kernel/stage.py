@@ -13,47 +13,47 @@ from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.inertia import base_velocity, inertia_force, solve, stiffness_force
 from torchsoft.solve.kernel.interface import assemble, evaluate, frames, linearise, mobility_scale, scan, set_in, displacements
-from torchsoft.solve.kernel.linear import solve_dense
+from torchsoft.solve.kernel.linear import row_of, solve_dense
 
 SEARCH_AFTER, SHORTEST = 2, 1.0 / 64.0
 """After so many iterations a Newton step that does not lessen the mismatch is halved, down to this part of it."""
 
 
 @compiled
-def drive(bodies: Any, y: Array, q: Array, V: Array, signals: Array, a: float) -> None:
+def drive(s: Any, w: Any, y: Array, signals: Array, a: float) -> None:
     """All coordinates at the end of the stage: those of the state for the free velocities in V, signals for the others."""
-    for c in range(bodies.free.size):
-        if bodies.free[c] >= 0:
-            q[c] = y[bodies.q_start + bodies.free[c]] + a * V[c]
-        elif bodies.signal[c] >= 0:
-            q[c], V[c] = signals[bodies.signal[c], 0], signals[bodies.signal[c], 1]
+    q, V = w.q, w.V
+    for c in range(s.body_free.size):
+        if s.body_free[c] >= 0:
+            q[c] = y[s.body_q_start + s.body_free[c]] + a * V[c]
+        elif s.body_signal[c] >= 0:
+            q[c], V[c] = signals[s.body_signal[c], 0], signals[s.body_signal[c], 1]
 
 
 @compiled
 def actuate(s: Any, i: int, q: Array, V: Array, signals: Array, x: Array, out: Array, J: Array) -> float:
     """Effort [N or N.m] of actuator i; x receives (setpoint, its rate, feed-forward, measured coordinate, its rate)."""
-    act = s.actuators
-    m, at, ff = act.measured[i], act.setpoint[i], act.feed_forward[i]
+    m, at, ff = s.act_measured[i], s.act_setpoint[i], s.act_feed_forward[i]
     x[0], x[1], x[2] = signals[at, 0], signals[at, 1], signals[ff, 0] if ff >= 0 else 0.0
     x[3], x[4] = q[m], V[m]
-    call_linearise(act.linearise[i], x, s.p[act.p_start[i] : act.p_start[i + 1]], out, J)
+    call_linearise(s.act_linearise[i], x, s.p[s.act_p_start[i] : s.act_p_start[i + 1]], out, J)
     return out[0]
 
 
 @compiled
 def balance(s: Any, w: Any, y: Array, signals: Array, a: float, r: Array, Rv: Array) -> None:
-    """Loads less M V' on the free coordinates without contact, r (free,), and their derivative by the velocities, Rv."""
-    bodies, act, p = s.bodies, s.actuators, s.p
+    """Loads less M V' on the free coordinates without contact, r (free, 1), and their derivative by the velocities, Rv."""
+    p = s.p
     Rv[:], r[:] = 0.0, 0.0
-    for i in range(bodies.coordinate.size):
-        mass = p[bodies.mass_at[i]]
-        r[i] = -mass * ((w.V[bodies.coordinate[i]] - y[bodies.V_start + i]) / a + bodies.weight[i] * p[bodies.gravity_at])
+    for i in range(s.body_coordinate.size):
+        mass = p[s.body_mass_at[i]]
+        r[i, 0] = -mass * ((w.V[s.body_coordinate[i]] - y[s.body_V_start + i]) / a + s.body_weight[i] * p[s.body_gravity_at])
         Rv[i, i] = -mass / a  # (17)
     x, out, J = np.empty(5), np.empty(1), np.empty((1, 5))
-    for i in range(act.measured.size):
-        number, towards = bodies.free[act.pushed[i]], bodies.free[act.measured[i]]
+    for i in range(s.act_measured.size):
+        number, towards = s.body_free[s.act_pushed[i]], s.body_free[s.act_measured[i]]
         if number >= 0:
-            r[number] += actuate(s, i, w.q, w.V, signals, x, out, J)  # (32), (34)
+            r[number, 0] += actuate(s, i, w.q, w.V, signals, x, out, J)  # (32), (34)
             if towards >= 0:
                 Rv[number, towards] += a * J[0, 3] + J[0, 4]
 
@@ -61,66 +61,65 @@ def balance(s: Any, w: Any, y: Array, signals: Array, a: float, r: Array, Rv: Ar
 @compiled
 def residual(s: Any, w: Any, pad: int, y: Array, a: float, n: int, r: Array) -> None:
     """Right-hand side of Newton's block in the first column of w.X, and the pad's part in r."""
-    pads, contacts, points, free = s.pads, s.contacts, s.points, s.bodies.free
-    at, c, first = contacts.point_start[pads.contact_start[pad]], pads.contact_start[pad], pads.node_start[pad]
-    inertial = pads.v_start[pad] >= 0
+    free = s.body_free
+    at, c, first = s.contact_point_start[s.pad_contact_start[pad]], s.pad_contact_start[pad], s.pad_node_start[pad]
+    inertial = s.pad_v_start[pad] >= 0
     b = w.X[2 * first : 2 * (first + n)]
     b[:, 0] = 0.0
     vx, vy = base_velocity(s, pad, w.V, w.q)
     for i in range(w.actives[pad]):
         k = w.active[at + i]
-        while k >= contacts.point_start[c + 1]:
+        while k >= s.contact_point_start[c + 1]:
             c += 1
         dx, dy, H, G, L = 0.0, 0.0, w.H[at + i], w.G[at + i], w.L[at + i]
         for j in range(2):
-            node, N = points.node[k, j], points.N[k, j]
+            node, N = s.point_node[k, j], s.point_N[k, j]
             dx += N * (w.free[node, 0] - w.u_dot[node, 0])
             dy += N * (w.free[node, 1] - w.u_dot[node, 1])
             if inertial:
-                D = s.inertia.D[s.inertia.dof_start[pad] + s.inertia.surface[2 * node] :]
+                D = s.inertia_D[s.inertia_dof_start[pad] + s.inertia_surface[2 * node] :]
                 dx -= N * (D[0, 0] * vx + D[0, 1] * vy)
                 dy -= N * (D[1, 0] * vx + D[1, 1] * vy)
         fx = w.out[k, 0] + H[0, 0] * dx + H[0, 1] * dy
         fy = w.out[k, 1] + H[1, 0] * dx + H[1, 1] * dy
         for j in range(2):
-            if points.N[k, j] != 0.0:
-                row = 2 * w.slot[points.node[k, j]]
-                b[row, 0] += points.N[k, j] * fx
-                b[row + 1, 0] += points.N[k, j] * fy
+            if s.point_N[k, j] != 0.0:
+                row = 2 * w.slot[s.point_node[k, j]]
+                b[row, 0] += s.point_N[k, j] * fx
+                b[row + 1, 0] += s.point_N[k, j] * fy
         for row in range(6):
-            number = free[contacts.body[c] + row] if row < 3 else free[pads.base[pad] + row - 3]
+            number = free[s.contact_body[c] + row] if row < 3 else free[s.pad_base[pad] + row - 3]
             if number >= 0:
-                r[number] += G[row, 0] * fx + G[row, 1] * fy + a * (L[row, 0] * dx + L[row, 1] * dy)
+                r[number, 0] += G[row, 0] * fx + G[row, 1] * fy + a * (L[row, 0] * dx + L[row, 1] * dy)
     if inertial:
-        B, base = s.inertia.B[pad], pads.base[pad]
+        B, base = s.inertia_B[pad], s.pad_base[pad]
         mx, my = reaction_without_contact(s, w, pad, y, a)
         mx, my = mx + B[0, 0] * vx + B[0, 1] * vy, my + B[1, 0] * vx + B[1, 1] * vy
         cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
         if free[base] >= 0:
-            r[free[base]] -= cos * mx - sin * my
+            r[free[base], 0] -= cos * mx - sin * my
         if free[base + 1] >= 0:
-            r[free[base + 1]] -= sin * mx + cos * my
+            r[free[base + 1], 0] -= sin * mx + cos * my
 
 
 @compiled
 def reaction_without_contact(s: Any, w: Any, pad: int, y: Array, a: float) -> tuple[float, float]:
     """Sum of M (free - v*)/(a h) of an inertial pad, in the base's axes."""
-    first, last = s.inertia.dof_start[pad], s.inertia.dof_start[pad + 1]
+    first, last = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1]
     vx, vy = base_velocity(s, pad, w.V, w.q)
     x, z = inertia_force(s, w, pad, y, a, w.full[first:last])
-    mass = s.p[s.inertia.material_at[pad] + 3] / a
+    mass = s.p[s.inertia_material_at[pad] + 3] / a
     for i in range(first, last, 2):
-        x -= mass * s.inertia.area[i] * vx
-        z -= mass * s.inertia.area[i + 1] * vy
+        x -= mass * s.inertia_area[i] * vx
+        z -= mass * s.inertia_area[i + 1] * vy
     return x, z
 
 
 @compiled
 def propose(s: Any, w: Any, pad: int, a: float, n: int, columns: int, dV: Array) -> None:
     """Newton's forces and nodal rates for the change of velocity dV; w.V holds the old velocities still."""
-    pads, first = s.pads, s.pads.node_start[pad]
-    size, scale = 2 * (pads.node_start[pad + 1] - first), mobility_scale(pads, s.p, pad, a)
-    C = pads.C[pads.C_start[pad] : pads.C_start[pad] + size * size].reshape(size, size)
+    first = s.pad_node_start[pad]
+    size, scale = 2 * (s.pad_node_start[pad + 1] - first), mobility_scale(s, pad, a)
     X = w.X[2 * first : 2 * (first + n)]
     for node in range(w.low[pad], w.high[pad]):
         for r in range(2):
@@ -131,26 +130,27 @@ def propose(s: Any, w: Any, pad: int, a: float, n: int, columns: int, dV: Array)
         for r in range(2):
             f = X[2 * i + r, 0]
             for number in range(dV.size):
-                if pads.column[pad, number] >= 0:
-                    f += X[2 * i + r, columns + pads.column[pad, number]] * dV[number]
+                if s.pad_column[pad, number] >= 0:
+                    f += X[2 * i + r, columns + s.pad_column[pad, number]] * dV[number]
             w.F_new[node, r] = f
     low, high = 2 * w.low[pad], 2 * w.high[pad]
-    rates = w.u_dot_new.reshape(-1)
+    rates = w.u_dot_new.ravel()
     for i in range(n):
         node = w.touched[first + i]
         for r in range(2):
-            row, f = C[2 * (node - first) + r], scale * w.F_new[node, r]
+            f = scale * w.F_new[node, r]
+            row = row_of(s.pad_C, s.pad_C_start[pad], 2 * (node - first) + r, size)
             for m in range(low, high):
                 rates[m] += row[m - 2 * first] * f
-    if pads.v_start[pad] >= 0:
-        base, free = pads.base[pad], s.bodies.free
+    if s.pad_v_start[pad] >= 0:
+        base, free = s.pad_base[pad], s.body_free
         cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
         Vx = w.V[base] + (dV[free[base]] if free[base] >= 0 else 0.0)
         Vy = w.V[base + 1] + (dV[free[base + 1]] if free[base + 1] >= 0 else 0.0)
         vx, vy = cos * Vx + sin * Vy, cos * Vy - sin * Vx
         for m in range(low, high):
-            dof = s.inertia.dof_start[pad] + s.inertia.surface[m]
-            rates[m] -= s.inertia.D[dof, 0] * vx + s.inertia.D[dof, 1] * vy
+            dof = s.inertia_dof_start[pad] + s.inertia_surface[m]
+            rates[m] -= s.inertia_D[dof, 0] * vx + s.inertia_D[dof, 1] * vy
 
 
 @compiled
@@ -171,8 +171,8 @@ def solve_stage(
     Newton ends when the law and the linear relations agree to `tolerance` [N] at every node. Returns success and the number
     of linear solves.
     """
-    pads, free = s.pads.base.size, s.bodies.coordinate.size
-    drive(s.bodies, y, w.q, w.V, signals, a)
+    pads, free = s.pad_base.size, s.body_coordinate.size
+    drive(s, w, y, signals, a)
     for pad in range(pads):
         set_in(s, w, pad, y, a)
     if w.travelled[0] > w.travelled[1]:
@@ -181,10 +181,10 @@ def solve_stage(
         displacements(s, w, pad, y, w.low[pad], w.high[pad])
         w.F_linear[w.low[pad] : w.high[pad]] = 0.0
     V_old, dV = np.empty(w.V.size), np.zeros(free)
-    r, Rv, b = np.empty(free), np.empty((free, free)), np.empty((free, 1))
+    r, Rv, b = np.empty((free, 1)), np.empty((free, free)), np.empty((free, 1))
     previous, part, iteration = np.inf, 1.0, 0
     while True:
-        frames(s.contacts, s.pads.base, w.q, w.V, w.frame)
+        frames(s, w)
         mismatch, squares = 0.0, 0.0
         for pad in range(pads):
             worst, total = evaluate(s, w, pad, y, a)
@@ -194,9 +194,9 @@ def solve_stage(
             for pad in range(pads):
                 move(w, pad, part)
             for i in range(free):
-                c = s.bodies.coordinate[i]
+                c = s.body_coordinate[i]
                 w.V[c] = V_old[c] + part * dV[i]
-            drive(s.bodies, y, w.q, w.V, signals, a)
+            drive(s, w, y, signals, a)
             continue
         if iteration > 0 and mismatch <= tolerance:
             return True, iteration
@@ -208,28 +208,28 @@ def solve_stage(
             linearise(s, w, pad, a)
             n = assemble(s, w, pad, a, Rv)
             residual(s, w, pad, y, a, n, r)
-            first, columns = s.pads.node_start[pad], s.pads.columns[pad]
+            first, columns = s.pad_node_start[pad], s.pad_columns[pad]
             X = w.X[2 * first : 2 * (first + n)]
             X[:, 1 : 1 + columns] = w.Hc[: 2 * n, :columns]
             solve_dense(w.A, X, 2 * n, 1 + columns)
-            eliminate(s, w, pad, n, 1, X, r.reshape(-1, 1), Rv)
+            eliminate(s, w, pad, n, 1, X, r, Rv)
             w.counts[pad] = n
-        b[:, 0] = -r
+        b[:] = -r
         solve_dense(Rv, b, free, 1)
         dV[:], V_old[:] = b[:, 0], w.V
         for pad in range(pads):
             propose(s, w, pad, a, w.counts[pad], 1, dV)
             move(w, pad, 1.0)
         for i in range(free):
-            w.V[s.bodies.coordinate[i]] += dV[i]
-        drive(s.bodies, y, w.q, w.V, signals, a)
+            w.V[s.body_coordinate[i]] += dV[i]
+        drive(s, w, y, signals, a)
         previous, part, iteration = squares, 1.0, iteration + 1
 
 
 @compiled
 def eliminate(s: Any, w: Any, pad: int, n: int, m: int, X: Array, r: Array, Rv: Array) -> None:
     """Put the pad's forces X = A^-1 (b | Hc), m right-hand sides, into the bodies' equations r (free, m) and Rv."""
-    column = s.pads.column[pad]
+    column = s.pad_column[pad]
     for number in range(column.size):
         if column[number] < 0:
             continue
@@ -246,49 +246,48 @@ def eliminate(s: Any, w: Any, pad: int, n: int, m: int, X: Array, r: Array, Rv: 
 def finish(s: Any, w: Any, y: Array, a: float, powers: Array, moments: Array) -> float:
     """All rates of the accepted stage in w.k, what the pads and contacts dissipate in `powers` (pads, dashpots, slip) [W], the
     contacts' generalised forces in w.load, the pads' moments (Eq. 35) [N.m]. Returns a bound of every surface speed [m/s]."""
-    pads, contacts, points, p, k = s.pads, s.contacts, s.points, s.p, w.k
-    count, fastest = pads.base.size, 0.0
+    p, k = s.p, w.k
+    count, fastest = s.pad_base.size, 0.0
     powers[: count + 2] = 0.0
     w.load[:] = 0.0
     out = np.empty(3)
     for pad in range(count):
-        at, c = contacts.point_start[pads.contact_start[pad]], pads.contact_start[pad]
-        first, last, start = pads.node_start[pad], pads.node_start[pad + 1], pads.y_start[pad]
+        at, c = s.contact_point_start[s.pad_contact_start[pad]], s.pad_contact_start[pad]
+        first, last, start = s.pad_node_start[pad], s.pad_node_start[pad + 1], s.pad_y_start[pad]
         linearise(s, w, pad, a)
         moments[pad] = 0.0
         for i in range(w.actives[pad]):
             n = w.active[at + i]
-            while n >= contacts.point_start[c + 1]:
+            while n >= s.contact_point_start[c + 1]:
                 c += 1
             fx, fy = w.out[n, 0], w.out[n, 1]
-            moments[pad] += points.X[n, 0] * fy - points.X[n, 1] * fx
+            moments[pad] += s.point_X[n, 0] * fy - s.point_X[n, 1] * fx
             for row in range(6):
-                coordinate = contacts.body[c] + row if row < 3 else pads.base[pad] + row - 3
+                coordinate = s.contact_body[c] + row if row < 3 else s.pad_base[pad] + row - 3
                 w.load[coordinate] += w.G[at + i, row, 0] * fx + w.G[at + i, row, 1] * fy
             powers[count] += w.out[n, 5]
             powers[count + 1] += w.out[n, 6]
         i = 0
-        for c in range(pads.contact_start[pad], pads.contact_start[pad + 1]):
-            own = p[contacts.p_start[c] : contacts.p_start[c + 1]]
-            for n in range(contacts.point_start[c], contacts.point_start[c + 1]):
-                j = points.y_start + n
+        for c in range(s.pad_contact_start[pad], s.pad_contact_start[pad + 1]):
+            own = p[s.contact_p_start[c] : s.contact_p_start[c + 1]]
+            for n in range(s.contact_point_start[c], s.contact_point_start[c + 1]):
+                j = s.point_y_start + n
                 if i < w.actives[pad] and w.active[at + i] == n:
                     k[j] = w.out[n, 2]
                     i += 1
                 elif y[j] != 0.0:  # away from contact the stretch decays through the slip element
-                    w.x[n, 6], w.x[n, 7], w.x[n, 8] = y[j], points.weight[n], a
-                    call_value(contacts.free[c], w.x[n, 6:], own, out)
+                    w.x[n, 6], w.x[n, 7], w.x[n, 8] = y[j], s.point_weight[n], a
+                    call_value(s.contact_free[c], w.x[n, 6:], own, out)
                     k[j] = out[0]
                     powers[count] += out[1]
                     powers[count + 1] += out[2]
                 else:
                     k[j] = 0.0
-        if pads.v_start[pad] >= 0:
+        if s.pad_v_start[pad] >= 0:
             fastest = max(fastest, finish_inertial(s, w, pad, y, a, powers, moments))
             continue
-        chain, branches, size = pads.chain_at[pad], pads.branches[pad], 2 * (last - first)
-        C = pads.C[pads.C_start[pad] : pads.C_start[pad] + size * size].reshape(size, size)
-        F, total = w.F_linear.reshape(-1), 0.0
+        chain, branches, size = s.pad_chain_at[pad], s.pad_branches[pad], 2 * (last - first)
+        F, total = w.F_linear.ravel(), 0.0
         for b in range(branches):
             J, tau, z = p[chain + b], p[chain + branches + b], start + b * size
             low, high = size, 0
@@ -301,21 +300,21 @@ def finish(s: Any, w: Any, y: Array, a: float, powers: Array, moments: Array) ->
                     total += J * abs(rate)
             power = 0.0
             for m in range(low, high):
-                row, u = C[m], 0.0
+                row, u = row_of(s.pad_C, s.pad_C_start[pad], m, size), 0.0
                 for other in range(low, high):
                     u += row[other] * k[z + other]
                 power += k[z + m] * u
             powers[pad] += J * tau * power
-        fastest = max(fastest, total * pads.reach[pad])
-    for i in range(s.bodies.coordinate.size):
-        c = s.bodies.coordinate[i]
-        k[s.bodies.q_start + i] = w.V[c]
-        k[s.bodies.V_start + i] = (w.V[c] - y[s.bodies.V_start + i]) / a
+        fastest = max(fastest, total * s.pad_reach[pad])
+    for i in range(s.body_coordinate.size):
+        c = s.body_coordinate[i]
+        k[s.body_q_start + i] = w.V[c]
+        k[s.body_V_start + i] = (w.V[c] - y[s.body_V_start + i]) / a
     bound = 0.0
-    for c in range(contacts.pad.size):
-        f, C_ = w.frame[c], contacts.body[c]
-        arm = abs(f[2]) + abs(f[3]) + contacts.size[c]
-        speed = np.hypot(f[4], f[5]) + abs(w.V[C_ + 2]) * contacts.size[c] + abs(f[6]) * arm
+    for c in range(s.contact_pad.size):
+        f, C_ = w.frame[c], s.contact_body[c]
+        arm = abs(f[2]) + abs(f[3]) + s.contact_size[c]
+        speed = np.hypot(f[4], f[5]) + abs(w.V[C_ + 2]) * s.contact_size[c] + abs(f[6]) * arm
         bound = max(bound, speed)
     return bound + fastest
 
@@ -327,34 +326,34 @@ NEGLIGIBLE_RATE = 1e-16
 @compiled
 def finish_inertial(s: Any, w: Any, pad: int, y: Array, a: float, powers: Array, moments: Array) -> float:
     """Rates of an inertial pad, its part in powers, load and moment; returns its largest nodal rate [m/s]."""
-    inertia, pads, p = s.inertia, s.pads, s.p
-    first, last = inertia.dof_start[pad], inertia.dof_start[pad + 1]
-    base, at = pads.base[pad], inertia.material_at[pad]
+    p = s.p
+    first, last = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1]
+    base, at = s.pad_base[pad], s.inertia_material_at[pad]
     vx, vy = base_velocity(s, pad, w.V, w.q)
     extra, effort = np.zeros(last - first), np.empty(last - first)
     for node in range(w.low[pad], w.high[pad]):
         for r in range(2):
-            extra[inertia.surface[2 * node + r]] = w.F_linear[node, r]
+            extra[s.inertia_surface[2 * node + r]] = w.F_linear[node, r]
     forces = extra.copy()
     for i in range(last - first):
-        extra[i] -= p[at + 3] * inertia.area[first + i] / a * (vx if i % 2 == 0 else vy)
-    solve(inertia, pad, extra)
+        extra[i] -= p[at + 3] * s.inertia_area[first + i] / a * (vx if i % 2 == 0 else vy)
+    solve(s, pad, extra)
     fastest = 0.0
     rates = w.full[first:last]
     for i in range(last - first):
         rates[i] += extra[i]
-        w.k[pads.y_start[pad] + i] = rates[i]
+        w.k[s.pad_y_start[pad] + i] = rates[i]
         speed = rates[i] + (vx if i % 2 == 0 else vy)
-        w.k[pads.v_start[pad] + i] = (speed - y[pads.v_start[pad] + i]) / a
+        w.k[s.pad_v_start[pad] + i] = (speed - y[s.pad_v_start[pad] + i]) / a
         fastest = max(fastest, abs(rates[i]))
     stiffness = np.empty(last - first)
-    stiffness_force(inertia, p, pad, rates, stiffness)
+    stiffness_force(s, pad, rates, stiffness)
     for i in range(0, last - first):
         powers[pad] += p[at + 2] * rates[i] * stiffness[i]
-        effort[i] = forces[i] - p[at + 3] * inertia.area[first + i] * w.k[pads.v_start[pad] + i]
+        effort[i] = forces[i] - p[at + 3] * s.inertia_area[first + i] * w.k[s.pad_v_start[pad] + i]
     moments[pad] = 0.0
     for i in range(0, last - first, 2):
-        moments[pad] += inertia.X[first + i] * effort[i + 1] - inertia.X[first + i + 1] * effort[i]
+        moments[pad] += s.inertia_X[first + i] * effort[i + 1] - s.inertia_X[first + i + 1] * effort[i]
     mx, my = inertia_force(s, w, pad, y, a, rates)
     cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
     w.load[base] -= cos * mx - sin * my

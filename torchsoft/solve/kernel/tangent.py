@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from torchsoft.codegen.invoke import call_linearise, call_pullback
-from torchsoft.solve.kernel import compiled
+from torchsoft.solve.kernel import compiled, entry
 from torchsoft.solve.kernel.adjoint import rigid_part
 from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
 from torchsoft.solve.kernel.interface import assemble
-from torchsoft.solve.kernel.linear import solve_dense
+from torchsoft.solve.kernel.linear import row_of, solve_dense
 from torchsoft.solve.kernel.run import GAMMA, MIX
 from torchsoft.solve.kernel.stage import actuate, eliminate
 from torchsoft.solve.kernel.taped import restore
@@ -42,12 +42,10 @@ def law_derivatives(address: int, x: Array, p: Array, dp: Array, rows: int, out:
 @compiled
 def massless_part(s: Any, w: Any, pad: int, y: Array, dy: Array, dp: Array, a: float, du: Array, dv: Array) -> None:
     """Derivatives of u* (du) and of u' before the forces' own change (dv) at the loaded nodes, (nodes, 2, m)."""
-    pads, p = s.pads, s.p
-    first, last, start, m = pads.node_start[pad], pads.node_start[pad + 1], pads.y_start[pad], dy.shape[1]
-    size, chain, branches = 2 * (last - first), pads.chain_at[pad], pads.branches[pad]
-    C = pads.C[pads.C_start[pad] : pads.C_start[pad] + size * size].reshape(size, size)
-    dC = pads.dC[pads.C_start[pad] : pads.C_start[pad] + size * size].reshape(size, size)
-    F, material = w.F.reshape(-1), chain + 2 * branches
+    p = s.p
+    first, last, start, m = s.pad_node_start[pad], s.pad_node_start[pad + 1], s.pad_y_start[pad], dy.shape[1]
+    size, chain, branches = 2 * (last - first), s.pad_chain_at[pad], s.pad_branches[pad]
+    F, material = w.F.ravel(), chain + 2 * branches
     zeta, rate = np.zeros(size), np.zeros(size)
     dzeta, drate, largest = np.zeros((size, m)), np.zeros((size, m)), np.zeros(m)
     for b in range(branches):
@@ -78,7 +76,7 @@ def massless_part(s: Any, w: Any, pad: int, y: Array, dy: Array, dp: Array, a: f
     for i in range(w.counts[pad]):
         node = w.touched[first + i]
         for r in range(2):
-            row = C[2 * (node - first) + r]
+            row = row_of(s.pad_C, s.pad_C_start[pad], 2 * (node - first) + r, size)
             du[node, r], dv[node, r] = 0.0, 0.0
             for j in range(left, right):
                 c = row[j]
@@ -86,7 +84,8 @@ def massless_part(s: Any, w: Any, pad: int, y: Array, dy: Array, dp: Array, a: f
                     du[node, r, k] += c * dzeta[j, k]
                     dv[node, r, k] += c * drate[j, k]
             if stiffer:
-                row, by_u, by_rate = dC[2 * (node - first) + r], 0.0, 0.0
+                row = row_of(s.pad_dC, s.pad_C_start[pad], 2 * (node - first) + r, size)
+                by_u = by_rate = 0.0
                 for j in range(size):
                     by_u += row[j] * zeta[j]
                     by_rate += row[j] * rate[j]
@@ -100,32 +99,32 @@ def inertial_part(
     s: Any, w: Any, pad: int, y: Array, dy: Array, dp: Array, a: float, rate: Array, du: Array, dv: Array, free: Array, r: Array
 ) -> None:
     """The same for an inertial pad; `free` (dofs, m) receives dv of all its dofs, and r the base's reaction."""
-    inertia, pads, at = s.inertia, s.pads, s.inertia.material_at[pad]
-    i0, i1, U, W, base = inertia.dof_start[pad], inertia.dof_start[pad + 1], pads.y_start[pad], pads.v_start[pad], pads.base[pad]
+    at = s.inertia_material_at[pad]
+    i0, i1, U, W, base = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1], s.pad_y_start[pad], s.pad_v_start[pad], s.pad_base[pad]
     n, mass, tau = i1 - i0, s.p[at + 3], s.p[at + 2]
     vx, vy = base_velocity(s, pad, w.V, w.q)
     cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
     own, force, column, strain, here = np.empty(n), np.empty(n), np.empty(n), np.empty(n), rate[i0:i1]
-    stiffness_force(inertia, s.p, pad, here, force)
+    stiffness_force(s, pad, here, force)
     for i in range(n):
         strain[i] = y[U + i] + (tau + a) * here[i]
     for k in range(dy.shape[1]):
         for i in range(n):
             column[i] = dy[U + i, k]
-        stiffness_force(inertia, s.p, pad, column, own)
+        stiffness_force(s, pad, column, own)
         for i in range(n):
             total = -own[i] - force[i] * dp[at + 2, k]
-            for j in range(inertia.K_column.shape[1]):
-                change = inertia.K_lambda[i0 + i, j] * dp[at, k] + inertia.K_mu[i0 + i, j] * dp[at + 1, k]
-                total -= change * strain[inertia.K_column[i0 + i, j]]
-            M = inertia.area[i0 + i] / a
+            for j in range(s.inertia_K_column.shape[1]):
+                change = s.inertia_K_lambda[i0 + i, j] * dp[at, k] + s.inertia_K_mu[i0 + i, j] * dp[at + 1, k]
+                total -= change * strain[s.inertia_K_column[i0 + i, j]]
+            M = s.inertia_area[i0 + i] / a
             v_dot = here[i] + (vx if i % 2 == 0 else vy) - y[W + i]
             column[i] = total + M * (mass * dy[W + i, k] - dp[at + 3, k] * v_dot)
-        solve(inertia, pad, column)
+        solve(s, pad, column)
         x = z = 0.0
         for i in range(n):
             free[i0 + i, k] = column[i]
-            M = inertia.area[i0 + i] / a
+            M = s.inertia_area[i0 + i] / a
             v_dot = here[i] + (vx if i % 2 == 0 else vy) - y[W + i]
             change = M * (mass * (column[i] - dy[W + i, k]) + dp[at + 3, k] * v_dot)
             if i % 2 == 0:
@@ -133,13 +132,13 @@ def inertial_part(
             else:
                 z += change
         for axis in range(2):
-            number = s.bodies.free[base + axis]
+            number = s.body_free[base + axis]
             if number >= 0:
                 r[number, k] -= cos * x - sin * z if axis == 0 else sin * x + cos * z
         for i in range(w.counts[pad]):
-            node = w.touched[pads.node_start[pad] + i]
+            node = w.touched[s.pad_node_start[pad] + i]
             for axis in range(2):
-                dof = inertia.surface[2 * node + axis]
+                dof = s.inertia_surface[2 * node + axis]
                 du[node, axis, k], dv[node, axis, k] = dy[U + dof, k], column[dof]
 
 
@@ -148,70 +147,69 @@ def stage_tangent(
     s: Any, w: Any, tape: Any, row: int, a: float, signals: Array, dy: Array, dp: Array, du: Array, dv: Array, free_rates: Array
 ) -> None:  # fmt: skip
     """Turn the tangent dy (size, m) of a stage's y* into that of its end, in place; dp (parameters, m)."""
-    pads, contacts, points, bodies, p = s.pads, s.contacts, s.points, s.bodies, s.p
-    free, count, y, m = bodies.coordinate.size, pads.base.size, tape.y[row], dy.shape[1]
+    p = s.p
+    free, count, y, m = s.body_coordinate.size, s.pad_base.size, tape.y[row], dy.shape[1]
     restore(s, w, tape, row, a)
     Rv, r = np.empty((free, free)), np.zeros((free, m))
     rigid_part(s, w, y, signals, a, Rv)
     for i in range(free):
-        c, mass = bodies.coordinate[i], p[bodies.mass_at[i]]
-        rate = (w.V[c] - y[bodies.V_start + i]) / a
+        c, mass = s.body_coordinate[i], p[s.body_mass_at[i]]
+        rate = (w.V[c] - y[s.body_V_start + i]) / a
         for k in range(m):
-            r[i, k] = mass * dy[bodies.V_start + i, k] / a - rate * dp[bodies.mass_at[i], k]
-            r[i, k] -= bodies.weight[i] * (dp[bodies.mass_at[i], k] * p[bodies.gravity_at] + mass * dp[bodies.gravity_at, k])
-    act = s.actuators
+            r[i, k] = mass * dy[s.body_V_start + i, k] / a - rate * dp[s.body_mass_at[i], k]
+            r[i, k] -= s.body_weight[i] * (dp[s.body_mass_at[i], k] * p[s.body_gravity_at] + mass * dp[s.body_gravity_at, k])
     x, out, J, change = np.empty(5), np.empty(1), np.empty((1, 5)), np.empty((3, m))
-    for i in range(act.measured.size):
-        number, measured = bodies.free[act.pushed[i]], bodies.free[act.measured[i]]
+    for i in range(s.act_measured.size):
+        number, measured = s.body_free[s.act_pushed[i]], s.body_free[s.act_measured[i]]
         if number < 0:
             continue
         actuate(s, i, w.q, w.V, signals, x, out, J)
-        own = slice(act.p_start[i], act.p_start[i + 1])
-        law_derivatives(act.pullback[i], x, p[own], dp[own], 1, change)
+        own = slice(s.act_p_start[i], s.act_p_start[i + 1])
+        law_derivatives(s.act_pullback[i], x, p[own], dp[own], 1, change)
         for k in range(m):
             r[number, k] += change[0, k]
             if measured >= 0:
-                r[number, k] += J[0, 3] * dy[bodies.q_start + measured, k]
+                r[number, k] += J[0, 3] * dy[s.body_q_start + measured, k]
 
-    e, known, dq = np.empty((len(points.X), 3, m)), np.empty((2, m)), np.empty((6, m))
+    e, known, dq = np.empty((len(s.point_X), 3, m)), np.empty((2, m)), np.empty((6, m))
     for pad in range(count):
         n = assemble(s, w, pad, a, Rv)
         w.counts[pad] = n
-        if pads.v_start[pad] >= 0:
+        if s.pad_v_start[pad] >= 0:
             inertial_part(s, w, pad, y, dy, dp, a, tape.rate[row], du, dv, free_rates, r)
         else:
             massless_part(s, w, pad, y, dy, dp, a, du, dv)
-        first, columns = pads.node_start[pad], pads.columns[pad]
-        at, c = contacts.point_start[pads.contact_start[pad]], pads.contact_start[pad]
+        first, columns = s.pad_node_start[pad], s.pad_columns[pad]
+        at, c = s.contact_point_start[s.pad_contact_start[pad]], s.pad_contact_start[pad]
         X = w.X[2 * first : 2 * (first + n)]
         X[:, :m] = 0.0
         for i in range(w.actives[pad]):
             k = w.active[at + i]
-            while k >= contacts.point_start[c + 1]:
+            while k >= s.contact_point_start[c + 1]:
                 c += 1
-            own = slice(contacts.p_start[c], contacts.p_start[c + 1])
-            law_derivatives(contacts.pullback[c], w.x[k], p[own], dp[own], 3, e[k])
+            own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
+            law_derivatives(s.contact_pullback[c], w.x[k], p[own], dp[own], 3, e[k])
             H, S, G, L = w.H[at + i], w.S[at + i], w.G[at + i], w.L[at + i]
             for o in range(6):
-                number = bodies.free[contacts.body[c] + o] if o < 3 else bodies.free[pads.base[pad] + o - 3]
+                number = s.body_free[s.contact_body[c] + o] if o < 3 else s.body_free[s.pad_base[pad] + o - 3]
                 for d in range(m):
-                    dq[o, d] = dy[bodies.q_start + number, d] if number >= 0 else 0.0
-            n0, n1, N0, N1 = points.node[k, 0], points.node[k, 1], points.N[k, 0], points.N[k, 1]
+                    dq[o, d] = dy[s.body_q_start + number, d] if number >= 0 else 0.0
+            n0, n1, N0, N1 = s.point_node[k, 0], s.point_node[k, 1], s.point_N[k, 0], s.point_N[k, 1]
             for d in range(m):
                 ux, uy = N0 * du[n0, 0, d] + N1 * du[n1, 0, d], N0 * du[n0, 1, d] + N1 * du[n1, 1, d]
                 vx, vy = N0 * dv[n0, 0, d] + N1 * dv[n1, 0, d], N0 * dv[n0, 1, d] + N1 * dv[n1, 1, d]
                 for o in range(3):
-                    total = S[o, 0] * ux + S[o, 1] * uy + w.J[k, o, 6] * dy[points.y_start + k, d]
+                    total = S[o, 0] * ux + S[o, 1] * uy + w.J[k, o, 6] * dy[s.point_y_start + k, d]
                     for j in range(6):
                         total += S[o, 2 + j] * dq[j, d]
                     e[k, o, d] += total + H[o, 0] * vx + H[o, 1] * vy
                 for o in range(2):
                     known[o, d] = e[k, o, d]
                     for j in range(2):
-                        if points.N[k, j] != 0.0:
-                            X[2 * w.slot[points.node[k, j]] + o, d] += points.N[k, j] * e[k, o, d]
+                        if s.point_N[k, j] != 0.0:
+                            X[2 * w.slot[s.point_node[k, j]] + o, d] += s.point_N[k, j] * e[k, o, d]
                 for o in range(6):
-                    number = bodies.free[contacts.body[c] + o] if o < 3 else bodies.free[pads.base[pad] + o - 3]
+                    number = s.body_free[s.contact_body[c] + o] if o < 3 else s.body_free[s.pad_base[pad] + o - 3]
                     if number >= 0:
                         total = G[o, 0] * known[0, d] + G[o, 1] * known[1, d]
                         total += L[o, 0] * (ux + a * vx) + L[o, 1] * (uy + a * vy)
@@ -228,8 +226,8 @@ def stage_tangent(
         advance_pad(s, w, pad, y, a, dy, dp, dV, free_rates, e)
     for i in range(free):
         for k in range(m):
-            dy[bodies.q_start + i, k] += a * dV[i, k]
-            dy[bodies.V_start + i, k] = dV[i, k]
+            dy[s.body_q_start + i, k] += a * dV[i, k]
+            dy[s.body_V_start + i, k] = dV[i, k]
 
 
 @compiled
@@ -237,13 +235,12 @@ def advance_pad(
     s: Any, w: Any, pad: int, y: Array, a: float, dy: Array, dp: Array, dV: Array, free_rates: Array, e: Array
 ) -> None:  # fmt: skip
     """Tangents of a pad's state and of its stretches at the stage's end, from Newton's solution in w.X and dV."""
-    pads, contacts, points, bodies, p = s.pads, s.contacts, s.points, s.bodies, s.p
-    first, last, n, m = pads.node_start[pad], pads.node_start[pad + 1], w.counts[pad], dy.shape[1]
-    size, column = 2 * (last - first), pads.column[pad]
-    C = pads.C[pads.C_start[pad] : pads.C_start[pad] + size * size].reshape(size, size)
-    X, at, start = w.X[2 * first : 2 * (first + n)], contacts.point_start[pads.contact_start[pad]], pads.y_start[pad]
-    inertial, scale = pads.v_start[pad] >= 0, 0.0
-    chain, branches, base = pads.chain_at[pad], pads.branches[pad], pads.base[pad]
+    p = s.p
+    first, last, n, m = s.pad_node_start[pad], s.pad_node_start[pad + 1], w.counts[pad], dy.shape[1]
+    size, column = 2 * (last - first), s.pad_column[pad]
+    X, at, start = w.X[2 * first : 2 * (first + n)], s.contact_point_start[s.pad_contact_start[pad]], s.pad_y_start[pad]
+    inertial, scale = s.pad_v_start[pad] >= 0, 0.0
+    chain, branches, base = s.pad_chain_at[pad], s.pad_branches[pad], s.pad_base[pad]
     for b in range(branches):
         scale += p[chain + b] / (p[chain + branches + b] + a)
     scale = 1.0 if inertial else scale
@@ -256,38 +253,38 @@ def advance_pad(
     cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
     if inertial:
         for axis in range(2):
-            number = bodies.free[base + axis]
+            number = s.body_free[base + axis]
             if number >= 0:
                 for k in range(m):
                     base_rate[0, k] += (cos if axis == 0 else sin) * dV[number, k]
                     base_rate[1, k] += (-sin if axis == 0 else cos) * dV[number, k]
     for i in range(n):
         for o in range(2):
-            row = C[2 * (w.touched[first + i] - first) + o]
+            row = row_of(s.pad_C, s.pad_C_start[pad], 2 * (w.touched[first + i] - first) + o, size)
             for j in range(n):
                 for q in range(2):
                     c = scale * row[2 * (w.touched[first + j] - first) + q]
                     for k in range(m):
                         own_rate[i, o, k] += c * X[2 * j + q, k]
             if inertial:
-                dof = s.inertia.dof_start[pad] + s.inertia.surface[2 * w.touched[first + i] + o]
+                dof = s.inertia_dof_start[pad] + s.inertia_surface[2 * w.touched[first + i] + o]
                 for k in range(m):
-                    own_rate[i, o, k] -= s.inertia.D[dof, 0] * base_rate[0, k] + s.inertia.D[dof, 1] * base_rate[1, k]
+                    own_rate[i, o, k] -= s.inertia_D[dof, 0] * base_rate[0, k] + s.inertia_D[dof, 1] * base_rate[1, k]
     i, x, out, J, change = 0, np.empty(3), np.empty(3), np.empty((1, 1)), np.empty((1, m))
-    for c in range(pads.contact_start[pad], pads.contact_start[pad + 1]):
-        own = slice(contacts.p_start[c], contacts.p_start[c + 1])
-        for k in range(contacts.point_start[c], contacts.point_start[c + 1]):
-            j = points.y_start + k
+    for c in range(s.pad_contact_start[pad], s.pad_contact_start[pad + 1]):
+        own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
+        for k in range(s.contact_point_start[c], s.contact_point_start[c + 1]):
+            j = s.point_y_start + k
             if i < w.actives[pad] and w.active[at + i] == k:
                 H = w.H[at + i]
                 for d in range(m):
                     total = e[k, 2, d]
                     for q in range(2):
-                        if points.N[k, q] != 0.0:
-                            slot = w.slot[points.node[k, q]]
-                            total += points.N[k, q] * (H[2, 0] * own_rate[slot, 0, d] + H[2, 1] * own_rate[slot, 1, d])
+                        if s.point_N[k, q] != 0.0:
+                            slot = w.slot[s.point_node[k, q]]
+                            total += s.point_N[k, q] * (H[2, 0] * own_rate[slot, 0, d] + H[2, 1] * own_rate[slot, 1, d])
                     for o in range(6):
-                        number = bodies.free[contacts.body[c] + o] if o < 3 else bodies.free[base + o - 3]
+                        number = s.body_free[s.contact_body[c] + o] if o < 3 else s.body_free[base + o - 3]
                         if number >= 0:
                             total += H[2, 2 + o] * dV[number, d]
                     dy[j, d] += a * total
@@ -297,16 +294,16 @@ def advance_pad(
             for d in range(m):
                 moved |= dy[j, d] != 0.0
             if moved or y[j] != 0.0:
-                x[0], x[1], x[2] = y[j], points.weight[k], a
-                call_linearise(contacts.free_linearise[c], x, p[own], out, J)
-                law_derivatives(contacts.free_pullback[c], x, p[own], dp[own], 1, change)
+                x[0], x[1], x[2] = y[j], s.point_weight[k], a
+                call_linearise(s.contact_free_linearise[c], x, p[own], out, J)
+                law_derivatives(s.contact_free_pullback[c], x, p[own], dp[own], 1, change)
                 for d in range(m):
                     new = dy[j, d] + a * (J[0, 0] * dy[j, d] + change[0, d])
                     dy[j, d] = new if abs(new) > 1e-200 else 0.0
     if inertial:
         advance_inertial(s, w, pad, a, dy, free_rates, base_rate)
         return
-    F = w.F.reshape(-1)
+    F = w.F.ravel()
     for b in range(branches):
         tau, z = p[chain + branches + b], start + b * size
         for i in range(size):
@@ -324,23 +321,22 @@ def advance_pad(
 @compiled
 def advance_inertial(s: Any, w: Any, pad: int, a: float, dy: Array, free_rates: Array, base_rate: Array) -> None:
     """u and v of an inertial pad: u' = free + A^-1 F - D V_B, v = u' + V_B."""
-    inertia, pads = s.inertia, s.pads
-    i0, i1, first = inertia.dof_start[pad], inertia.dof_start[pad + 1], pads.node_start[pad]
+    i0, i1, first = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1], s.pad_node_start[pad]
     X, column = w.X[2 * first : 2 * (first + w.counts[pad])], np.empty(i1 - i0)
     for k in range(dy.shape[1]):
         column[:] = 0.0
         for i in range(w.counts[pad]):
             for o in range(2):
-                column[inertia.surface[2 * w.touched[first + i] + o]] = X[2 * i + o, k]
-        solve(inertia, pad, column)
+                column[s.inertia_surface[2 * w.touched[first + i] + o]] = X[2 * i + o, k]
+        solve(s, pad, column)
         for i in range(i1 - i0):
             rate = free_rates[i0 + i, k] + column[i]
-            rate -= inertia.D[i0 + i, 0] * base_rate[0, k] + inertia.D[i0 + i, 1] * base_rate[1, k]
-            dy[pads.y_start[pad] + i, k] += a * rate
-            dy[pads.v_start[pad] + i, k] = rate + base_rate[i % 2, k]
+            rate -= s.inertia_D[i0 + i, 0] * base_rate[0, k] + s.inertia_D[i0 + i, 1] * base_rate[1, k]
+            dy[s.pad_y_start[pad] + i, k] += a * rate
+            dy[s.pad_v_start[pad] + i, k] = rate + base_rate[i % 2, k]
 
 
-@compiled
+@entry
 def forward(s: Any, w: Any, h: float, tape: Any, signals: Array, keep: Any, dy: Array, dp: Array, dys: Array) -> None:
     """Carry the tangent dy (size, m) through the steps of a tape, in place; after the steps that `keep` marks it goes to dys."""
     a, m, row = GAMMA * h, dy.shape[1], 0
