@@ -197,7 +197,13 @@ def by_sensitivities(
 
         def contract() -> Tensor:
             run = simulate(
-                window.model, window.t, y0=window.y0, step=window.step, tolerance=NEWTON, gradient="forward", wrt=list(chosen)
+                window.model,
+                window.t,
+                y0=window.y0,
+                step=window.step,
+                tolerance=NEWTON,
+                gradient="forward",
+                wrt=list(chosen),
             )
             assert run.sensitivities is not None
             y = run.y.clone().requires_grad_(True)

@@ -36,10 +36,9 @@ class Grasp:
 
     def move(self, x: Profile, duration: float, *, step: float, sample: float, **changed: float) -> Trajectory:
         """The run in which the disc is to follow x_d(t) from the settled grasp."""
-        still = {"y_d": Profile([0.0], [self.p.scenario.y_Br_grasp]), "F_ff": Profile([0.0], [-self.force])}
-        return simulate(
-            self.model(**changed), grid(duration, sample), y0=self.y, reference=Reference(x_d=x, **still), step=step
-        )
+        y, force = Profile([0.0], [self.p.scenario.y_Br_grasp]), Profile([0.0], [-self.force])
+        t, reference = grid(duration, sample), Reference(x_d=x, y_d=y, F_ff=force)
+        return simulate(self.model(**changed), t, y0=self.y, reference=reference, step=step)
 
 
 def settle(p: Parameters) -> Grasp:
@@ -74,9 +73,8 @@ def tapped(grasp: Grasp, config: Config) -> tuple[list[Record], np.ndarray]:
 def indices(model: SoftGrasp) -> tuple[list[int], list[int], int]:
     """Indices of x_C, theta, x_Br and of their rates in the state, and the number of internal states before them."""
     at = model.layout.slices
-    q, v = (
-        [at[part, "disc"].start, at[part, "disc"].start + 2, at[part, "bracket"].start] for part in ("pose", "velocity")
-    )
+    starts = [(at[part, "disc"].start, at[part, "bracket"].start) for part in ("pose", "velocity")]
+    q, v = ([disc, disc + 2, bracket] for disc, bracket in starts)
     return q, v, q[0]
 
 
@@ -84,10 +82,8 @@ def expected(grasp: Grasp, A: np.ndarray, frequency: float = 1.0) -> dict[str, f
     """k, c, r and c_r of the linearised full model, pads and stretches condensed at a low frequency [Hz]."""
     model, w = grasp.model(), 2j * np.pi * frequency
     q, v, inner = indices(model)
-    masses, inner = (
-        np.array([model.disc.mass.item(), model.disc.inertia.item(), model.bracket.mass.item()]),
-        slice(0, inner),
-    )
+    bodies, inner = model.bodies, slice(0, inner)
+    masses = np.array([bodies["disc"].mass.item(), bodies["disc"].inertia.item(), bodies["bracket"].mass.item()])
     followed = np.linalg.solve(w * np.eye(inner.stop) - A[inner, inner], A[inner, q] + w * A[inner, v])
     Z = (A[np.ix_(v, q)] + w * A[np.ix_(v, v)] + A[v, inner] @ followed) * masses[
         :, None

@@ -19,7 +19,10 @@ from torchsoft.solve.kernel.run import GAMMA, run
 from torchsoft.solve.stepper import ImplicitStepper, Segment
 from torchsoft.solve.system import contact_laws
 
-POINTS = 300
+POINTS = 450
+
+NEWTON = 1e-10
+"""Newton's tolerance of the steps below [N]."""
 
 
 @numba.njit
@@ -63,7 +66,7 @@ def test_the_law_of_a_point_equals_the_module(friction: str, shape: Shape | None
     p = torch.cat([v.detach().reshape(1) for v in laws.parameters.values()])
     names, w = list(laws.parameters), f64(0.3, -0.7, 1e3)
     found = {"separated": 0, "touching": 0, "stick": 0, "slip": 0, "cut": 0}
-    law = laws.interface
+    law, bars = laws.interface, []
     for row in random_points(19.37e-3, 1, ah):
         J, out, again, p_bar = np.empty((3, 7)), np.empty(7), np.empty(7), np.zeros(len(p))
         call_all(law.value, law.linearise, law.pullback, row, p.numpy(), w.numpy(), out, again, J, p_bar)
@@ -92,9 +95,12 @@ def test_the_law_of_a_point_equals_the_module(friction: str, shape: Shape | None
         # a slipping Coulomb point has zeros in it; the distance from a boundary rounds to 4e-18 m, 4e-12 epsilon
         scale = np.abs(jacobian).max(0) + [441, 441, 9, 1e5, 1e5, 1e3, 1e5]
         assert np.all(np.abs(J - jacobian) <= 1e-11 * scale), (J, jacobian)
-        parts = np.abs(np.array([row.numpy() for _, row in rows])).max(0)
-        assert np.all(np.abs(p_bar - by_p) <= 1e-10 * (np.abs(by_p) + 1e3 * parts + 1e-9)), (names, p_bar, by_p)
+        bars.append((p_bar, by_p))
     assert min(found.values()) >= 10, found
+    got, expected = np.moveaxis(np.array(bars), 1, 0)
+    assert np.all(np.abs(got - expected) <= 1e-10 * np.abs(expected) + 1e-12 * np.abs(expected).max(0))
+    idle = {names[i] for i in np.flatnonzero(np.abs(expected).max(0) == 0)}
+    assert idle == ({"law.friction.mu_s"} if friction == "coulomb" else set())  # Coulomb's mu_s only says when
 
 
 def test_the_law_away_from_contact_equals_the_module() -> None:
@@ -112,7 +118,7 @@ def test_the_law_away_from_contact_equals_the_module() -> None:
 
 def taken_step(rig: Rig, y: Tensor, h: float) -> Segment:
     segments: list[Segment] = []
-    stepper = ImplicitStepper(rig, step=h, tolerance=1e-11)
+    stepper = ImplicitStepper(rig, step=h, tolerance=NEWTON)
     *_, last = stepper.integrate(y, f64(0.0, h), segments, float("inf"))
     assert last.steps == 1
     segments[0].tape = stepper.tape(segments[0])
@@ -137,22 +143,25 @@ def test_stages_of_a_step_satisfy_the_modules_equation(
         got, expected = (end - begin) / a, rig(time, end)
         for (part, name), where in rig.layout.slices.items():
             scale = float(expected[where].abs().max()) + 1e-9
-            rounding = 1e-15 * float(end[where].abs().max()) / a
-            assert float((got - expected)[where].abs().max()) < 1e-9 * scale + 4 * rounding, (part, name, time)
+            noise = 4e-15 * float(end[where].abs().max()) / a
+            if part == "rates":
+                noise += NEWTON / float(rig.pads[name].masses().min())
+            assert float((got - expected)[where].abs().max()) < 1e-9 * scale + noise, (part, name, time)
 
 
-def test_recorded_forces_equal_the_module() -> None:
-    """Nodal forces and the bracket's moment of a run are what `evaluate` gives at the recorded states."""
-    manipulation = grasp_and_roll(coarse(), grasp_force=75.0)
+@torch.no_grad()
+def test_recorded_forces_and_moments_equal_the_module(fidelity: str) -> None:
+    """Nodal forces of a run, and the moment of the pads' efforts about the undeformed places of their nodes (Eq. 35)."""
+    manipulation = grasp_and_roll(coarse(pad__fidelity=fidelity), grasp_force=75.0)
     model, run = manipulation.model, simulate(manipulation.model, times(0.5, 11), y0=manipulation.y0)
     for i in (0, 3, 7, 10):
-        with torch.no_grad():
-            graph = model.evaluate(run.t[i], model.unpack(run.y[i], t=run.t[i]))
-            back = graph.ports["pad_U"].transformer.effort(graph.ports["pad_U"].effort, model.junctions)
+        graph = model.evaluate(run.t[i], model.unpack(run.y[i], t=run.t[i]))
         for k in "LU":
             expected = graph.interfaces[k].out[..., 3:5]
             assert float((run.force[k][i] - expected).abs().max()) < 1e-8  # [N], ten times Newton's tolerance
-        assert float(run["bracket_moment"][i] + back["bracket_spin"]) == pytest.approx(0.0, abs=1e-9)
+        X, e = model.pads["U"].positions, graph.ports["pad_U"].effort
+        moment = float((X[:, 0] * e[:, 1] - X[:, 1] * e[:, 0]).sum())
+        assert float(run["bracket_moment"][i]) == pytest.approx(moment, abs=6e-9)  # ten points' 1e-8 N
 
 
 def test_no_stale_kernel_is_ever_used(tmp_path: Path) -> None:

@@ -1,12 +1,11 @@
-"""A friction law written by the user: learned through the plain step, refused by the compiled one."""
+"""A friction law written by the user: learned through the compiled stepper, which gives its exact gradient."""
 
 import pytest
 import torch
-from conftest import coarse
+from conftest import coarse, f64, grasp, times
 from test_experiments import experiment
 
-from torchsoft import press, simulate
-from torchsoft.contact import SmoothSlip
+from torchsoft import SmoothSlip, SoftGrasp, simulate
 
 
 def test_learned_friction_smoke() -> None:
@@ -24,13 +23,12 @@ def test_the_learned_law_solves_its_own_equation() -> None:
     """(eta + R) v = E - mu(v) F_N, to the fixed-point sweeps' error, and no slip below the cap."""
     module = experiment("learned_friction")
     torch.manual_seed(0)
-    law = module.MuNetwork()
+    law = module.MuNetwork(20.0)
     torch.nn.init.normal_(law.net[2].weight, std=0.1)
     E, F_N = torch.linspace(0.0, 30.0, 31, dtype=torch.float64), torch.full((31,), 20.0, dtype=torch.float64)
-    R, eta = (torch.tensor(x, dtype=torch.float64) for x in (880.0, 20.0))
-    v = law.slip_rate(E, F_N, R, eta)
-    stuck = law.mu(torch.zeros(1, dtype=torch.float64)) * F_N  # [N], what sticking can carry
-    residual = (E - law.mu(v) * F_N).clamp(min=0.0) - (eta + R) * v
+    v = law(E, F_N, f64(880.0))
+    stuck = law.mu(f64(0.0)) * F_N  # [N], what sticking can carry
+    residual = (E - law.mu(v) * F_N).clamp(min=0.0) - 900.0 * v
     assert float(residual.detach().abs().max()) < 1e-2  # [N], of 20 N
     assert bool((v[0.9 * stuck > E] == 0).all())
 
@@ -38,17 +36,25 @@ def test_the_learned_law_solves_its_own_equation() -> None:
 def test_the_true_law_in_the_learned_one_s_place_is_the_built_in_one() -> None:
     module = experiment("learned_friction")
     model = coarse()
-    law = model.contact.friction
+    law = model.contacts["L"].law.friction
     assert isinstance(law, SmoothSlip)
     v = torch.tensor([0.0, law.v_s.item()], dtype=torch.float64)
     mu = module.true_mu(law, v)
     assert mu.tolist() == pytest.approx([0.8, 0.75])
 
 
-def test_the_compiled_stepper_refuses_a_law_that_it_does_not_have() -> None:
+def test_the_compiled_stepper_has_the_network_s_gradient() -> None:
+    """Every weight's derivative through slip is that of the same steps in plain torch."""
     module = experiment("learned_friction")
-    model = coarse()
-    y0 = press(model, model.settings.scenario.y_Br_grasp).detach()
-    model.contact.friction = module.MuNetwork()
-    with pytest.raises(TypeError, match=r"SmoothSlip and Coulomb.*MuNetwork.*unrolled_solution"):
-        simulate(model, torch.linspace(0, 0.01, 3, dtype=torch.float64), y0=y0)
+    torch.manual_seed(0)
+    law = module.MuNetwork(20.0)
+    torch.nn.init.normal_(law.net[2].weight, std=0.1)
+    model = SoftGrasp(coarse().settings, friction=law)
+    y0, reference = grasp(model, (0.3, 0.0))
+    gradients = []
+    for route in ("discrete", "unrolled"):
+        run = simulate(model, times(1e-3, 3), y0=y0, reference=reference, step=5e-4, gradient=route)
+        gradients.append(torch.autograd.grad(run["v_x"][-1] + 0.01 * run["omega"][-1], list(law.parameters())))
+    for compiled, plain in zip(*gradients):
+        assert float(plain.abs().max()) > 1e-6
+        assert torch.allclose(compiled, plain, rtol=1e-7, atol=1e-10 * float(plain.abs().max()))

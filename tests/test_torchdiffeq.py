@@ -1,15 +1,99 @@
-"""torchdiffeq's verbs: the registered method under `odeint_adjoint`, and the guard of the continuous adjoint."""
+"""torchdiffeq's verbs: the registered method under `odeint` and `odeint_adjoint`, its own methods, and the continuous adjoint."""
+
+import importlib
+from collections.abc import Iterator
 
 import pytest
 import torch
-from conftest import coarse
+from conftest import coarse, f64, grasped, times
 from torchdiffeq import odeint, odeint_adjoint
 
-from torchsoft import METHOD, SoftGrasp
-from torchsoft.continuous import LONGEST, OutputsTooCoarse, continuous_adjoint_solution, stiffest_rate
+from torchsoft import METHOD, SoftGrasp, register, simulate
 from torchsoft.scenario import grasp_and_roll
+from torchsoft.solve.continuous import LONGEST, OutputsTooCoarse, continuous_solution, stiffest_rate
+from torchsoft.solve.torchdiffeq import TorchdiffeqSolver
 
 OPTIONS = {"step_size": 2e-3, "tolerance": 1e-10}
+
+SOLVERS = importlib.import_module("torchdiffeq._impl.odeint").SOLVERS
+
+
+def test_torchdiffeq_runs_the_stepper() -> None:
+    """`odeint(model, y0, t, method="sdirk2")` is `simulate`, sample by sample."""
+    model = coarse()
+    manipulation = grasp_and_roll(model, grasp_force=75.0)
+    t = times(0.1, 6)
+    y0 = torch.stack((manipulation.y0, manipulation.y0.clone()))
+    y0[1, model.layout.slices["velocity", "disc"]] = f64(1e-3, 0.0, 0.0)
+    solution = odeint(model, y0, t, method=METHOD, options={"step_size": 2e-3})
+    assert solution.shape == (6, 2, model.layout.size)
+    assert torch.equal(solution[:, 0].detach(), simulate(model, t, y0=y0[0]).y)
+    assert torch.equal(solution[:, 1].detach(), simulate(model, t, y0=y0[1]).y)
+
+
+@pytest.mark.parametrize("method", ["rk4", "dopri5"])
+@torch.no_grad()
+def test_explicit_methods_agree(method: str) -> None:
+    """torchdiffeq's own methods integrate the same forward and meet the stepper on a short window, slip included."""
+    model = coarse()
+    y0, t = grasped(model, (0.05, -0.01)), times(1e-3, 3)
+    options = {"step_size": 2e-5} if method == "rk4" else {}
+    end = odeint(model, y0, t, method=method, rtol=1e-8, atol=1e-11, options=options)[-1]
+    implicit = simulate(model, t, y0=y0, step=5e-6)
+    assert float(implicit.dissipated["slip"][-1]) > 1e-8  # the window does contain slip
+    first, last, explicit = (model.unpack(y) for y in (implicit.y[0], implicit.y[-1], end))
+    parts = [lambda s: s.pose["disc"][:2], lambda s: s.pose["disc"][2:], lambda s: s.stretch["L"]]
+    parts += [lambda s, k=k: model.displacement(k, s) for k in "LU"]
+    for part in parts:
+        moved = (part(last) - part(first)).abs().max()
+        assert float((part(explicit) - part(last)).abs().max()) < 1e-4 * float(moved)
+
+
+def test_only_rigs_are_integrated() -> None:
+    with pytest.raises(TypeError, match=r"integrates a torchsoft\.Rig, but got Identity"):
+        odeint(torch.nn.Identity(), torch.zeros(3, dtype=torch.float64), times(1.0, 2), method=METHOD)
+    with pytest.raises(ValueError, match=r"has no option \['stepsize'\]; it has step_size"):
+        odeint(coarse(), grasped(coarse()), times(1.0, 2), method=METHOD, options={"stepsize": 1e-3})
+
+
+@pytest.fixture
+def solver_of_theirs() -> Iterator[type]:
+    """torchdiffeq with a solver of its own under the name, and the stepper registered after it."""
+
+    class Theirs:
+        """Euler's method, one step an output."""
+
+        def __init__(self, func: object, y0: torch.Tensor, rtol: float, atol: float, **options: object) -> None:
+            self.func, self.y0 = func, y0
+
+        def integrate(self, t: torch.Tensor) -> torch.Tensor:
+            rows = [self.y0]
+            for begin, end in zip(t[:-1], t[1:]):
+                rows.append(rows[-1] + (end - begin) * self.func(begin, rows[-1]))
+            return torch.stack(rows)
+
+        @classmethod
+        def valid_callbacks(cls) -> set[str]:
+            return set()
+
+    before = SOLVERS[METHOD]
+    SOLVERS[METHOD] = Theirs
+    register()
+    register()
+    yield Theirs
+    SOLVERS[METHOD] = before
+
+
+def test_a_solver_of_torchdiffeqs_own_is_left_to_other_functions(solver_of_theirs: type) -> None:
+    """A foreign function is integrated by theirs, a rig by the stepper; registering twice changes nothing."""
+    assert issubclass(SOLVERS[METHOD], TorchdiffeqSolver)
+    assert SOLVERS[METHOD].theirs is solver_of_theirs
+    y = odeint(lambda t, y: -y, torch.ones(1, dtype=torch.float64), f64(0.0, 0.5, 1.0), method=METHOD)
+    assert y[:, 0].tolist() == [1.0, 0.5, 0.25]
+    model = coarse()
+    y0, t = grasped(model, (0.01, 0.0)), times(0.01, 3)
+    got = odeint(model, y0, t, method=METHOD, options={"step_size": 2e-3})
+    assert torch.equal(got.detach(), simulate(model, t, y0=y0).y)
 
 
 def rolling() -> tuple[SoftGrasp, torch.Tensor]:
@@ -19,7 +103,7 @@ def rolling() -> tuple[SoftGrasp, torch.Tensor]:
     with torch.no_grad():
         y = odeint(model, manipulation.y0, torch.tensor([0, 0.3, 0.5], dtype=torch.float64), method=METHOD)
     y0 = torch.stack((y[1], y[2])).detach()
-    y0[:, model.layout.slices["v_C"]] += torch.tensor([0.02, 0.0], dtype=torch.float64)
+    y0[:, model.layout.slices["velocity", "disc"]] += f64(0.02, 0.0, 0.0)
     return model, y0
 
 
@@ -28,8 +112,9 @@ def gradients(model: SoftGrasp, y0: torch.Tensor, verb: object) -> tuple[torch.T
     start = y0.clone().requires_grad_(True)
     t = torch.tensor([0.3, 0.31, 0.325, 0.34], dtype=torch.float64)
     y = verb(model, start, t, method=METHOD, options=dict(OPTIONS))  # pyright: ignore[reportCallIssue]
-    state = model.layout.unpack(y)
-    (1e3 * state.r_C[..., 0] * t[:, None] + state.theta + state.v_Br[..., 1]).sum().backward()
+    state = model.unpack(y)
+    x, theta, speed = state.pose["disc"][..., 0], state.pose["disc"][..., 2], state.velocity["bracket"][..., 1]
+    (1e3 * x * t[:, None] + theta + speed).sum().backward()
     assert start.grad is not None
     return start.grad, {name: p.grad for name, p in model.named_parameters() if p.grad is not None}
 
@@ -58,17 +143,17 @@ def test_continuous_adjoint_agrees_on_a_short_window() -> None:
     """1 ms of a sticking grasp by rk4 and its continuous adjoint, against fine steps and the discrete adjoint."""
     model, y0 = rolling()
     start = y0[1]
-    start[model.layout.slices["v_C"]] -= torch.tensor([0.0195, 0.0], dtype=torch.float64)  # slow enough to stick
+    start[model.layout.slices["velocity", "disc"]] -= f64(0.0195, 0.0, 0.0)  # slow enough to stick
     t = torch.linspace(0.5, 0.501, 3, dtype=torch.float64)
-    names = ("contact.K_t", "contact.R_t", "contact.K_n", "material.E", "m_C")
+    names = ("contact.K_t", "contact.R_t", "contact.K_n", "pad.E", "disc.mass")
     results = []
     for solve in (
-        lambda y: continuous_adjoint_solution(model, y, t, method="rk4", options={"step_size": 2.5e-5}),
+        lambda y: odeint_adjoint(model, y, t, method="rk4", options={"step_size": 2.5e-5}),
         lambda y: odeint(model, y, t, method=METHOD, options={"step_size": 2e-6}),
     ):
         model.zero_grad(set_to_none=True)
-        model.layout.unpack(solve(start.clone().requires_grad_(True))).omega.sum().backward()
-        results.append({name: dict(model.named_parameters())[name].grad.item() for name in names})
+        model.unpack(solve(start.clone().requires_grad_(True))).velocity["disc"][:, 2].sum().backward()
+        results.append({name: model.parameter(name).grad.item() for name in names})
     for name in names:
         continuous, discrete = (result[name] for result in results)
         assert abs(continuous - discrete) < 1e-4 * abs(discrete), name
@@ -79,4 +164,6 @@ def test_coarse_outputs_are_refused() -> None:
     rate = stiffest_rate(model, y0[0], 0.3)
     t = torch.tensor([0.3, 0.3 + 1.2 * LONGEST / rate], dtype=torch.float64)
     with pytest.raises(OutputsTooCoarse, match="loses the gradient"):
-        continuous_adjoint_solution(model, y0[0], t)
+        continuous_solution(model, y0[0], t)
+    with pytest.raises(OutputsTooCoarse, match="loses the gradient"):
+        simulate(model, t, y0=y0[0], gradient="continuous")

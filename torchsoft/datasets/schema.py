@@ -77,10 +77,8 @@ def variables(config: Config) -> dict[str, Variable]:
 
 def sizes(config: Config) -> dict[str, int]:
     """Length of every dimension."""
-    elements, points = (
-        int(config.fixed.get(k, Parameters().table()[k]["value"])) for k in ("pad.elements_x", "contact.points")
-    )
-    nodes = elements * points or elements + 1
+    elements = int(config.fixed.get("pad.elements_x", Parameters().pad.elements_x))
+    nodes = elements * int(config.fixed.get("contact.points", 0)) or elements + 1
     return {
         "trajectory": config.trajectories, "time": config.samples, "axis": 2, "lower_surface": nodes, "upper_surface": nodes,
         **{dimension: len(parts) for dimension, parts in energies(config).values()},

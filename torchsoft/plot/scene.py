@@ -160,7 +160,9 @@ def plates(rig: Rig) -> dict[str, float]:
     out = {}
     for name, pad in rig.pads.items():
         if pad.base is not None:
-            behind = 2 * MM * float((pad.origin @ pad.axes)[1])  # the face's height over the base's centre
+            behind = (
+                2 * MM * float((pad.placed(np.zeros(2)) @ pad.axes.numpy())[1])
+            )  # the face's height over the base's centre
             out[name] = max(behind, 0.0) if rig.bodies[pad.base].shape is None else 0.0
     thickest = max(out.values(), default=0.0) or 4 * unit(rig)
     return {name: out.get(name, thickest) for name in rig.pads}

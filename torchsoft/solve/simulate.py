@@ -120,7 +120,7 @@ def _recorded(rig: Rig, t: Tensor, y0: Tensor, reference: Reference, step: float
     signals = rig.follow(t, reference)
     state, nothing = rig.unpack(y, signals), torch.zeros(0, dtype=torch.float64)
     return Trajectory(
-        t, y, state, channels(rig, state, signals), {}, {}, {}, {}, {}, nothing,
+        t, y, state, channels(rig, state, signals), {}, {}, {}, {}, {}, {}, nothing,
         Stats(0, 0, 0, clock.perf_counter() - began, step), rig.layout, made_by(rig, gradient),
     )  # fmt: skip
 
@@ -151,6 +151,7 @@ def gather(
     t, y, forces, extras = t[:rows], y[:rows], *(torch.from_numpy(x[:rows]) for x in (out.forces, out.extras))
     names = stepper.integrals
     columns = dict(zip((*names.names, *rig.pads), extras.unbind(-1)))
+    loads = extras[:, len(columns) :].unflatten(-1, (-1, 3))
     with torch.set_grad_enabled(y.requires_grad):
         signals = rig.follow(t, stepper.reference)
         state = rig.unpack(y, signals)
@@ -163,7 +164,8 @@ def gather(
             count = len(rig.pads[contact.pad].point_nodes)
             force[name], at = forces[:, at : at + count], at + count
     return Trajectory(
-        t=t, y=y, state=state, channels=measured, force=force, displacement=displacement, energy=energy,
+        t=t, y=y, state=state, channels=measured, force=force, load=dict(zip(rig.bodies, loads.unbind(1))),
+        displacement=displacement, energy=energy,
         dissipated={name: columns[name] for name in names.dissipated},
         supplied={name: columns[name] for name in names.supplied if name in names.active},
         injected=columns["injected"], stats=stats, layout=rig.layout, made_by=made_by(rig, METHOD), wrt=wrt,

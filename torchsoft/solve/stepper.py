@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchsoft.physics.contact import cross
 from torchsoft.physics.motion import Reference
-from torchsoft.physics.rig import Rig
+from torchsoft.physics.rig import GROUND, Rig
 from torchsoft.solve.grid import Chunk, check_times, chunks
 from torchsoft.solve.kernel import CACHE
 from torchsoft.solve.kernel.arrays import Array, Tape, Work, empty_tape, first_stages, scratch
@@ -140,7 +140,7 @@ class ImplicitStepper:
             np.zeros((len(t), points, 2)),
             np.zeros((len(t), n + pads + coordinates)),
         )
-        out.y[0], out.forces[0], out.extras[0, n : n + pads] = y0.numpy(), *self._start(t[0], y0)
+        out.y[0], out.forces[0], out.extras[0, n:] = y0.numpy(), *self._start(t[0], y0)
         y, integrals, taped = y0.numpy().copy(), np.zeros(n), 0
         work = scratch(first, self.layout.size)
         set_velocities(first, work, y)
@@ -177,17 +177,24 @@ class ImplicitStepper:
                 raise self._failure(status, float(chunk.starts[steps]), chunk.h)
 
     def _start(self, time: Tensor, y0: Tensor) -> tuple[Array, Array]:
-        """Forces on the contact points (points, 2) and moments of the pads (pads,) at the start, from the module."""
+        """Forces on the contact points (points, 2), and moments of the pads followed by the contacts' generalised forces on all
+        coordinates, at the start, from the module."""
         signals = self.rig.follow(time, self.reference)
         state = self.rig.unpack(y0, signals)
         graph = self.rig.evaluate(time, state, signals)
         forces = [interface.out[..., 3:5].flatten().numpy() for interface in graph.interfaces.values()]
         moments = [
-            cross(pad.positions + self.rig.displacement(name, state)).flatten()
-            @ graph.ports[f"pad_{name}"].effort.flatten()
+            cross(pad.positions).flatten() @ graph.ports[f"pad_{name}"].effort.flatten()
             for name, pad in self.rig.pads.items()
         ]
-        return np.concatenate((np.empty(0), *forces)).reshape(-1, 2), np.array(moments)
+        loads = {name: np.zeros(3) for name in (*self.rig.bodies, GROUND)}
+        for name in (*self.rig.contacts, *self.rig.pads):
+            port = graph.ports[f"contact_{name}" if name in self.rig.contacts else f"pad_{name}"]
+            for junction, effort in port.transformer.effort(port.effort, self.rig.junctions).items():
+                body = junction.removesuffix("_spin")
+                if body in loads:
+                    loads[body][slice(2, 3) if junction.endswith("_spin") else slice(0, 2)] -= effort.numpy().ravel()
+        return np.concatenate((np.empty(0), *forces)).reshape(-1, 2), np.array([*moments, *np.concatenate([*loads.values()])])
 
     def signals(self, todo: Sequence[Chunk]) -> Tensor:
         """The signals at all stages of some chunks (stages, signals, 2)."""

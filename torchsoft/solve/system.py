@@ -130,7 +130,7 @@ class Compiled:
 
     def signals(self, t: Tensor, reference: Reference | None = None) -> Tensor:
         """The signals that the kernels follow, fixed coordinates last: values and rates (..., signals, 2)."""
-        fixed = [value for body in self.rig.bodies.values() for value in body.fixed.values()]
+        fixed = [body.fixed[axis] for body in self.rig.bodies.values() for axis in COORDINATES if axis in body.fixed]
         followed = self.rig.follow(t, reference)
         if not bool(torch.isfinite(followed).all()):
             bad = torch.nonzero(~torch.isfinite(followed))[0].tolist()

@@ -35,7 +35,8 @@ class Trajectory:
     """A run sampled at t (T,) [s]. SI units, every tensor float64 and shaped (T, ...).
 
     y: flat states (T, size). channels: what can be measured or was asked for, by key, (T,) each. force: normal and friction
-    force (T, points, 2) [N] on the points of each contact, along n and t of their moving frames. displacement: of the nodes of
+    force (T, points, 2) [N] on the points of each contact, along n and t of their moving frames. load: what the contacts and
+    pads do to each body (T, 3), a force [N] and a moment about its centre [N.m], world axes. displacement: of the nodes of
     each pad (T, nodes, 2) [m], in its base's frame. energy: stored [J]; dissipated, supplied and `injected` [J] since t[0].
 
     sensitivities (T, components, n): derivatives of the state's last `components` by the n parameters `wrt`, where asked for.
@@ -46,6 +47,7 @@ class Trajectory:
     state: State = field(repr=False)
     channels: dict[str, Tensor] = field(repr=False)
     force: dict[str, Tensor] = field(repr=False)
+    load: dict[str, Tensor] = field(repr=False)
     displacement: dict[str, Tensor] = field(repr=False)
     energy: dict[str, Tensor] = field(repr=False)
     dissipated: dict[str, Tensor] = field(repr=False)

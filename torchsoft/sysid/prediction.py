@@ -53,13 +53,12 @@ def predict(rig: Rig, y0: Tensor, t: Tensor, names: Sequence[str], step: float) 
 
     The first time, from which the disc only settles, is left out. Raises `SimulationFailed`.
     """
-    slopes, options = None, {"step": step, "tolerance": TOLERANCE}
-    if names:
-        dy0 = torch.from_numpy(directions(y0, [rig.parameter(name) for name in names]))
-        run = simulate(rig, t, y0=y0, gradient="forward", wrt=names, dy0=dy0, rigid=True, **options)
-        slopes = derivatives(rig, run)[1:]
-    else:
-        run = simulate(rig, t, y0=y0, **options)
+    dy0 = torch.from_numpy(directions(y0, [rig.parameter(name) for name in names])) if names else None
+    run = simulate(
+        rig, t, y0=y0, step=step, tolerance=TOLERANCE, gradient="forward" if names else "none", wrt=names, dy0=dy0,
+        rigid=bool(names),
+    )  # fmt: skip
+    slopes = derivatives(rig, run)[1:] if names else None
     return Prediction(t[1:].numpy(), run.together(*MEASURED)[1:].detach().numpy(), slopes, run.stats.steps)
 
 

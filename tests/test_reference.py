@@ -1,0 +1,119 @@
+"""The paper's manipulation and light shaking as the first edition of the engine computed them, and their gradients."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchsoft import Parameters, SoftGrasp, Trajectory, press, rest, simulate
+from torchsoft.excitation import CATALOGUE, begin
+from torchsoft.physics.equilibrium import holding_force
+from torchsoft.physics.stability import NEUTRAL, loop_modes
+from torchsoft.scenario import grasp_and_roll
+
+REFERENCE = json.loads((Path(__file__).parent / "reference.json").read_text())
+
+OF_RANGE = 1e-9
+"""Of the range of a quantity over the run."""
+RELATIVE = 1e-8
+"""Of a gradient, where the reference itself is that good."""
+
+
+def held_displacements(model: SoftGrasp, y0: Tensor) -> Tensor:
+    """y0 as a function of E, nu and depth that leaves the pads where they are: the reference's gradients hold displacements."""
+    y = y0.clone()
+    for name, pad in model.pads.items():
+        C, where = pad.compliance(), model.layout.slices["pads", name]
+        u = C.detach() @ y0[where]
+        y = torch.cat((y[: where.start], torch.linalg.solve(C, u), y[where.stop :]))
+    return y
+
+
+def series(run: Trajectory) -> dict[str, Tensor]:
+    """Every quantity of the reference over the run."""
+    out: dict[str, Tensor] = dict(run.channels)
+    for kind in ("energy", "dissipated", "supplied"):
+        out |= {f"{kind}.{name}": value for name, value in getattr(run, kind).items()}
+    out |= {f"sum_{n}_{k}": run.force[k][..., i].sum(1) for k in "LU" for i, n in enumerate(("F_N", "F_T"))}
+    return {name: value.detach() for name, value in (out | {"injected": run.injected}).items()}
+
+
+@pytest.fixture(scope="module")
+def manipulation() -> tuple[SoftGrasp, Trajectory]:
+    """The 30 s with the gradient behind them, pads' initial displacements held."""
+    made = grasp_and_roll(SoftGrasp(), grasp_force=REFERENCE["manipulation"]["grasp_force"])
+    t = torch.linspace(0, 30, 3001, dtype=torch.float64)
+    y0 = held_displacements(made.model, made.y0)
+    return made.model, simulate(made.model, t, y0=y0, gradient="discrete")
+
+
+def test_the_manipulation_is_the_reference(manipulation: tuple[SoftGrasp, Trajectory]) -> None:
+    """Poses, rates, efforts, sums of nodal forces, energies, dissipation and work at seven moments."""
+    _, run = manipulation
+    found, reference = series(run), REFERENCE["manipulation"]
+    rows = [run.at(time) for time in reference["t"]]
+    for name, values in reference["values"].items():
+        off = (found[name][rows] - torch.tensor(values, dtype=torch.float64)).abs().max()
+        extent = found[name].max() - found[name].min()
+        assert float(off) <= OF_RANGE * float(extent), (name, float(off / extent))
+    assert run.stats.steps == 15000
+    assert run.stats.failed_steps == 0
+    assert run.energy_residual_rel == pytest.approx(2.969e-5, rel=1e-3)
+    for k in "LU":  # eleven nodes touch where the disc stands
+        touching = (run.force[k][rows, :, 0] > 0).sum(1).tolist()
+        assert touching == [9, 11, 11 if k == "L" else 10, 10, 11, 11, 11]
+
+
+def test_gradients_of_the_manipulation_are_the_references(manipulation: tuple[SoftGrasp, Trajectory]) -> None:
+    model, run = manipulation
+    reference = REFERENCE["gradient_of_theta_10s"]
+    names = list(reference["by"])
+    found = torch.autograd.grad(run["theta"][1000], [model.parameter(name) for name in names])
+    sure = [name for name in names if reference["uncertainty"][name] <= RELATIVE]
+    assert len(sure) == 18
+    for name, gradient in zip(names, found):
+        bound = RELATIVE + 2 * reference["uncertainty"][name]
+        assert gradient.item() == pytest.approx(reference["by"][name], rel=RELATIVE if name in sure else bound), name
+
+
+def test_light_shaking_is_the_reference() -> None:
+    """Nodes touch, leave and slip all along; the angle's derivatives by one pass forward, with those of the start."""
+    reference = REFERENCE["light_shaking"]
+    model, y0 = begin(CATALOGUE["light shaking"], Parameters().override({"contact.v_s": 0.05}))
+    names = list(reference["theta_end_by"])
+    columns = []
+    for name in names:
+        p = model.parameter(name)
+        keep, ones = held_displacements(model, y0), torch.zeros(model.layout.size, dtype=torch.float64, requires_grad=True)
+        (pulled,) = torch.autograd.grad((keep * ones).sum(), p, create_graph=True, allow_unused=True)
+        columns.append(torch.zeros_like(y0) if pulled is None else torch.autograd.grad(pulled, ones)[0])
+    t = torch.linspace(0, 2, 401, dtype=torch.float64)
+    run = simulate(
+        model, t, y0=y0, step=5e-4, gradient="forward", wrt=names, dy0=torch.stack(columns, -1), rigid=True
+    )
+    found = series(run)
+    for name, value in reference["end"].items():
+        extent = float(found[name].max() - found[name].min())
+        assert float(found[name][-1]) == pytest.approx(value, abs=OF_RANGE * extent), name
+    assert run.sensitivities is not None
+    for name, gradient in zip(names, run.sensitivities[-1, 2].tolist()):
+        assert gradient == pytest.approx(reference["theta_end_by"][name], rel=RELATIVE), name
+
+
+@pytest.mark.parametrize(("case", "changes"), [("default", {}), ("E = 60e3", {"pad.E": 60e3})])
+def test_statics_and_loop_modes_are_the_references(case: str, changes: dict[str, Any]) -> None:
+    expected, model = REFERENCE["statics"][case], SoftGrasp(Parameters().override(changes))
+    with torch.no_grad():
+        y = press(model, model.settings.scenario.y_Br_grasp)
+        assert float(model.unpack(rest(model)).pose["disc"][1]) == pytest.approx(expected["rest_y_C"], abs=1e-12)
+        assert float(model.unpack(y).pose["disc"][1]) == pytest.approx(expected["press_y_C"], abs=1e-12)
+    assert holding_force(model, y) == pytest.approx(expected["holding_force"], rel=1e-9)
+    modes = loop_modes(model)
+    assert int((modes.abs() < NEUTRAL).sum()) == expected["neutral_modes"]
+    creep = (modes + 1 / model.settings.pad.tau).abs() < 1e-3  # of nodes clear of the disc
+    leading = modes[(modes.abs() > NEUTRAL) & ~creep & (modes.imag >= 0)][:4]
+    got = torch.stack((leading.real, leading.imag), -1)
+    assert torch.allclose(got, torch.tensor(expected["leading_modes"], dtype=torch.float64), rtol=1e-4, atol=1e-2)

@@ -1,0 +1,336 @@
+"""`simulate` and its trajectory: what runs is what is saved, gradients reach what was put in, and nothing unphysical runs."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import xarray as xr
+from conftest import coarse, f64, grasped, times
+from torch import Tensor, nn
+from torch.nn.utils import parametrize
+
+from torchsoft import (
+    Ellipse, KelvinVoigt, Parameters, Profile, Reference, Shape, SmoothSlip, SoftGrasp, StandardLinearSolid, hold,
+    press, rest, simulate,
+)  # fmt: skip
+from torchsoft.scenario import grasp_and_roll
+from torchsoft.solve.stepper import SimulationFailed
+
+T = times(0.02, 11)
+
+
+def rolled(model: SoftGrasp, **options: object):  # noqa: ANN201
+    """A short run from the grasp, the disc moving."""
+    return simulate(model, T, y0=grasped(model, (0.05, 0.0)), **options)  # pyright: ignore[reportArgumentType]
+
+
+# what runs is what is saved -----------------------------------------------------------------------------------------
+
+
+def test_values_set_on_the_module_run_and_are_saved(tmp_path: Path) -> None:
+    """A number set in place is in the settings, in what the run says of itself, in its file, and in the run."""
+    model, other = coarse(), coarse(contact__K_n=2e5)
+    y0, reference = grasped(other, (0.05, 0.0)), other.reference
+    model.contact.K_n.data = torch.tensor(2e5, dtype=torch.float64)
+    assert model.settings.contact.K_n == 2e5
+    assert model.settings.table()["contact.K_n"]["value"] == 2e5
+    run, expected = (simulate(m, T, y0=y0, reference=reference) for m in (model, other))
+    assert torch.equal(run.y, expected.y)
+    assert run.made_by == expected.made_by
+    assert run.made_by["parameters"]["contact.K_n"] == 2e5
+    run.save(tmp_path / "run.nc")
+    with xr.open_dataset(tmp_path / "run.nc", engine="h5netcdf") as saved:
+        assert '"contact.K_n": 200000.0' in saved.attrs["parameters"]
+        np.testing.assert_array_equal(saved["disc_position"][:, 0], run["x_C"])
+        np.testing.assert_array_equal(saved["disc_angle"], run["theta"])
+
+
+def test_a_radius_set_on_the_module_is_the_radius() -> None:
+    """In statics, in what the bracket's height means, and in the run."""
+    model, other = coarse(), coarse(disc__radius=19.5e-3)
+    with torch.no_grad():
+        model.shape.radius.fill_(19.5e-3)
+        assert float(model.touch_height(0.02)) == float(other.touch_height(0.02)) != float(coarse().touch_height(0.02))
+        assert torch.equal(rest(model), rest(other))
+        assert torch.equal(press(model, 48.8e-3), press(other, 48.8e-3))
+    assert model.settings.disc.radius == 19.5e-3
+    assert torch.equal(rolled(model).y, rolled(other).y)
+    assert float(model.disc.inertia.detach()) == float(other.disc.inertia.detach())
+
+
+class Oval(Ellipse):
+    """An ellipse that also has what a circle has."""
+
+    def __init__(self) -> None:
+        super().__init__(19.8e-3, 19.1e-3)
+        self.radius = torch.tensor(19.37e-3, dtype=torch.float64)
+
+
+def test_a_shape_with_a_radius_runs_as_itself() -> None:
+    oval, ellipse = (SoftGrasp(coarse().settings, shape=shape) for shape in (Oval(), Ellipse(19.8e-3, 19.1e-3)))
+    with torch.no_grad():
+        assert torch.equal(rest(oval), rest(ellipse))
+        y0 = rest(ellipse)
+    assert not torch.allclose(y0, rest(coarse()).detach(), rtol=0, atol=1e-6)
+    runs = [simulate(model, T, y0=y0).y for model in (oval, ellipse)]
+    assert torch.equal(*runs)
+
+
+class Polygonal(Shape):
+    """A shape of somebody's own in plain torch: a circle by its support, radius and all."""
+
+    def __init__(self, radius: float) -> None:
+        super().__init__()
+        self.r = nn.Parameter(torch.tensor(radius, dtype=torch.float64))
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        d = (x * x).sum(-1).sqrt()
+        return d - self.r, x / d[..., None]
+
+    def gyration(self) -> Tensor:
+        return self.r**2 / 2
+
+    def support(self, direction: Tensor) -> Tensor:
+        return self.r * (direction * direction).sum(-1).sqrt()
+
+
+def test_a_shape_and_a_friction_law_of_ones_own_run_with_gradients() -> None:
+    """The same circle and the same law written anew: the same run, and the same gradients."""
+    built_in = coarse()
+    p = built_in.settings.contact
+    mine = SmoothSlip(p.mu_s, p.mu_k, p.v_s, p.eta)
+    own = SoftGrasp(built_in.settings, friction=lambda E, F_N, R: mine(E, F_N, R), shape=Polygonal(19.37e-3))
+    one, other = rolled(built_in, gradient="discrete"), rolled(own, gradient="discrete")
+    assert float((one.y - other.y).detach().abs().max()) < 1e-9
+    a, b = (torch.autograd.grad(run["theta"][-1], r)[0] for run, r in ((one, built_in.shape.radius), (other, own.shape.r)))
+    assert float(a) == pytest.approx(float(b), rel=1e-6)
+
+
+# gradients reach what was put in ------------------------------------------------------------------------------------
+
+
+def test_what_becomes_of_the_reference_and_the_model_does_not_change_the_gradient() -> None:
+    """Between run and backward: another reference, knots moved in place, a parameter set in place."""
+    model = coarse()
+    run = rolled(model, gradient="discrete")
+    wanted = [model.pad.E, model.parameter("contact.K_t"), model.parameter("control.R_80")]
+    before = torch.autograd.grad(run["theta"][-1], wanted, retain_graph=True)
+    with torch.no_grad():
+        model.reference["x_d"].values += 1e-3
+    model.reference = hold(x_d=0.03, y_d=0.07, F_ff=9.0)
+    after = torch.autograd.grad(run["theta"][-1], wanted, retain_graph=True)
+    model.contact.K_n.data = torch.tensor(5e5, dtype=torch.float64)
+    last = torch.autograd.grad(run["theta"][-1], wanted)
+    assert all(torch.equal(a, b) and torch.equal(a, c) for a, b, c in zip(before, after, last))
+
+
+class Simulated(nn.Module):
+    """A run as a module, for functional_call."""
+
+    def __init__(self, model: SoftGrasp, **options: object) -> None:
+        super().__init__()
+        self.model, self.options = model, options
+
+    def forward(self, y0: Tensor) -> Tensor:
+        return simulate(self.model, T, y0=y0, gradient="discrete", **self.options)["theta"][-1]  # pyright: ignore
+
+
+def test_gradients_reach_the_tensors_of_a_functional_call() -> None:
+    model = coarse()
+    y0 = grasped(model, (0.05, 0.0))
+    names = {"pad.E": 0.8e6, "contact.K_n": 1e5, "disc.shape.radius": 19.4e-3, "control.x.Kp": 1e5}
+    put_in = {f"model.{name}": f64(value)[0].requires_grad_() for name, value in names.items()}
+    theta = torch.func.functional_call(Simulated(model), put_in, (y0,))
+    got = torch.autograd.grad(theta, list(put_in.values()))
+    changed = coarse()
+    changed.reference = model.reference
+    with torch.no_grad():
+        for name, value in names.items():
+            changed.get_parameter(name).fill_(value)
+    other = Simulated(changed)(y0)
+    expected = torch.autograd.grad(other, [changed.get_parameter(name) for name in names])
+    assert torch.equal(theta.detach(), other.detach())
+    assert all(torch.equal(a, b) for a, b in zip(got, expected))
+    assert all(float(x) != 0 for x in got)
+    assert float(model.pad.E.detach()) == 0.75e6
+
+
+class Exp(nn.Module):
+    """A positive parameter by its logarithm."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x.exp()
+
+    def right_inverse(self, x: Tensor) -> Tensor:
+        return x.log()
+
+
+@pytest.mark.parametrize(
+    ("owner", "name"),
+    [
+        (lambda m: m.contact, "K_t"), (lambda m: m.contact.friction, "mu_s"), (lambda m: m.pad, "E"),
+        (lambda m: m.pad, "nu"), (lambda m: m.control["x"], "Kd"), (lambda m: m.shape, "radius"), (lambda m: m.disc, "mass"),
+    ],
+)  # fmt: skip
+def test_parametrized_parameters_get_their_gradients(owner: Callable[[SoftGrasp], nn.Module], name: str) -> None:
+    """d/d log p = p d/dp, for a parameter of every kind of part."""
+    plain, logarithmic = coarse(contact__mu_s=0.3, contact__mu_k=0.2), coarse(contact__mu_s=0.3, contact__mu_k=0.2)
+    y0 = grasped(plain, (0.08, 0.0))
+    logarithmic.reference = plain.reference
+    parametrize.register_parametrization(owner(logarithmic), name, Exp())
+    value = getattr(owner(plain), name)
+    (expected,) = torch.autograd.grad(Simulated(plain)(y0), value)
+    log = owner(logarithmic).parametrizations[name].original  # pyright: ignore
+    (got,) = torch.autograd.grad(Simulated(logarithmic)(y0), log)
+    assert float(expected) != 0
+    assert float(got) == pytest.approx(float(expected * value.detach()), rel=1e-8)
+
+
+def test_tied_parameters_get_the_sum_of_their_gradients() -> None:
+    """One tensor as two parameters of a law, and as parameters of different parts."""
+    plain, tied = coarse(), coarse()
+    y0 = grasped(plain, (0.05, 0.01))
+    tied.reference = plain.reference
+    tied.contact.R_t = tied.contact.R_n
+    tied.control["y"].Kp = tied.contact.K_n  # 1.2e5 N/m all of them
+    tied.contact.K_t = tied.contact.K_n
+    names = ("contact.R_n", "contact.R_t", "contact.K_n", "contact.K_t", "control.K_98")
+    R_n, R_t, K_n, K_t, K_98 = torch.autograd.grad(Simulated(plain)(y0), [plain.parameter(n) for n in names])
+    R, K = torch.autograd.grad(Simulated(tied)(y0), [tied.contact.R_n, tied.contact.K_n])
+    assert float(R) == pytest.approx(float(R_n + R_t), rel=1e-9)
+    assert float(K) == pytest.approx(float(K_n + K_t + K_98), rel=1e-9)
+    assert min(abs(float(x)) for x in (R_n, R_t, K_n, K_t, K_98)) > 0
+
+
+def test_a_knot_with_a_graph_receives_its_gradient() -> None:
+    model = coarse()
+    y0 = grasped(model)
+    d = f64(1e-3)[0].requires_grad_()
+    travel = Profile([0.0, 0.02], [0.06, 0.06 + d])
+    reference = Reference(x_d=travel, y_d=model.reference["y_d"], F_ff=model.reference["F_ff"])
+    theta = lambda r: simulate(model, T, y0=y0, reference=r, gradient="discrete", tolerance=1e-10)["theta"][-1]
+    (slope,) = torch.autograd.grad(theta(reference), d)
+    ends = []
+    for h in (1e-7, -1e-7):
+        moved = Profile([0.0, 0.02], [0.06, 0.061 + h])
+        with torch.no_grad():
+            ends.append(float(theta(Reference(x_d=moved, y_d=model.reference["y_d"], F_ff=model.reference["F_ff"]))))
+    assert float(slope) == pytest.approx((ends[0] - ends[1]) / 2e-7, rel=1e-5)
+
+
+# routes -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("route", ["adjoint", "", "Discrete"])
+def test_an_unknown_route_is_refused(route: str) -> None:
+    with pytest.raises(ValueError, match=r"`gradient` must be one of none, discrete, forward, unrolled, continuous, but is"):
+        simulate(coarse(), T, gradient=route)  # pyright: ignore[reportArgumentType]
+
+
+def test_no_grad_is_honoured() -> None:
+    model = coarse()
+    y0 = grasped(model, (0.01, 0.0)).requires_grad_()
+    t = times(2e-3, 3)
+    with torch.no_grad():
+        for route in ("none", "discrete", "unrolled"):
+            run = simulate(model, t, y0=y0, gradient=route)
+            assert not run.y.requires_grad, route
+            assert not any(channel.requires_grad for channel in run.channels.values()), route
+    assert simulate(model, t, y0=y0, gradient="discrete")["theta"].requires_grad
+    assert not simulate(model, t, y0=y0)["theta"].requires_grad
+
+
+def test_routes_agree_on_the_run() -> None:
+    model = coarse()
+    y0, t = grasped(model, (0.01, 0.0)), times(4e-3, 3)
+    with torch.no_grad():
+        runs = [simulate(model, t, y0=y0, gradient=route, tolerance=1e-10) for route in ("none", "discrete", "unrolled")]
+    forward = simulate(model, t, y0=y0, gradient="forward", wrt=["pad.E"], tolerance=1e-10)
+    assert torch.equal(runs[0].y, runs[1].y)
+    assert torch.equal(runs[0].y, forward.y)
+    assert float((runs[0].y - runs[2].y).abs().max()) < 1e-8  # [N]
+    assert runs[2].channels.keys() <= runs[0].channels.keys()
+
+
+# nothing unphysical runs --------------------------------------------------------------------------------------------
+
+
+class TurnsNaN(Profile):
+    """Constant until 10 ms, then not a number."""
+
+    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        value, rate = super().forward(t)
+        return torch.where(t > 0.01, torch.nan, value), rate
+
+
+def test_a_reference_that_turns_nan_is_refused() -> None:
+    model = coarse()
+    y0 = grasped(model)
+    bad = Reference(x_d=TurnsNaN([0.0], [0.06]), y_d=model.reference["y_d"], F_ff=model.reference["F_ff"])
+    for route in ("none", "discrete"):
+        with pytest.raises(ValueError, match=r"the signal `x_d` of the reference is not finite at t = 0\.01"):
+            simulate(model, T, y0=y0, reference=bad, gradient=route)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "match"),
+    [
+        ("pad.E", 0.0, r"parameter `.*\.E` must be positive, but is 0"),
+        ("contact.K_n", -1.2e5, r"parameter `.*K_n` must be positive, but is -120000"),
+        ("contact.K_n", float("nan"), r"parameter `.*K_n` must be finite, but is nan"),
+        ("contact.mu_s", -0.1, r"parameter `.*mu_s` must be not negative"),
+        ("pad.nu", 0.5, r"parameter `.*nu` must be between -1 and 0\.5"),
+        ("disc.radius", -1e-3, r"parameter `.*radius` must be positive"),
+        ("disc.mass", float("inf"), r"parameter `.*mass` must be finite"),
+        ("control.K_81", -1.0, r"parameter `.*Kp` must be not negative"),
+        ("scenario.gravity", float("nan"), r"parameter `gravity` must be finite"),
+    ],
+)
+def test_unphysical_values_set_in_place_are_refused_by_name(name: str, value: float, match: str) -> None:
+    model = coarse()
+    y0 = grasped(model)
+    with torch.no_grad():
+        model.parameter(name).fill_(value)
+    with pytest.raises(ValueError, match=match):
+        simulate(model, T, y0=y0)
+
+
+def test_a_law_that_turns_nan_never_converges() -> None:
+    """The slip rate of an effort above 20 N is not a number: the run ends there, and says so."""
+
+    def broken(E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
+        return torch.where(E > 2.0, torch.nan, torch.zeros_like(E))
+
+    model = SoftGrasp(coarse().settings, friction=broken)
+    with pytest.raises(SimulationFailed, match=r"at t = .* s Newton's iteration did not converge") as caught:
+        simulate(model, times(0.2, 21), y0=grasped(model, (0.1, 0.0)))
+    assert bool(torch.isfinite(caught.value.trajectory.y).all())
+
+
+# materials ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_solid_with_equal_moduli_is_kelvin_and_voigts() -> None:
+    """E_instant -> E leaves one branch of the chain, whose time is then tau_instant."""
+    p = Parameters()
+    numbers = {"nu": p.pad.nu, "rho": p.pad.rho, "depth": p.pad.depth}
+    solid = StandardLinearSolid(p.pad.E, p.pad.E * (1 + 1e-12), tau=0.05, tau_instant=p.pad.tau, **numbers)
+    one = SoftGrasp(coarse().settings, material=solid)
+    other = SoftGrasp(coarse().settings, material=KelvinVoigt(p.pad.E, tau=p.pad.tau, **numbers))
+    a, b = rolled(one), rolled(other)
+    assert a.state.pads["L"].shape[1] == 2
+    for name in ("x_C", "theta", "F_y"):
+        assert torch.allclose(a[name], b[name], rtol=0, atol=1e-9 * float(b[name].abs().max()))
+
+
+def test_a_standard_solid_creeps_from_its_instant_to_its_relaxed_modulus() -> None:
+    """Under a constant load the grip gives way from E_instant's depth to E's with the time tau, and energy is balanced."""
+    p = coarse().settings
+    solid = StandardLinearSolid(4e5, 8e5, 0.45, 1100.0, 0.05, 0.044, tau_instant=1e-3)
+    model = SoftGrasp(p, material=solid)
+    manipulation = grasp_and_roll(model, grasp_force=40.0)
+    run = simulate(model, times(0.8, 81), y0=manipulation.y0)
+    assert run.energy_residual_rel < 2e-3
+    assert float(run["y_Br"][45] - run["y_Br"][-1]) > 1e-5  # still sinks after the grasp

@@ -1,0 +1,189 @@
+"""The stepper: order, grids, how runs end, halved steps, driven bodies, and threads."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+import torch
+from conftest import COARSE, coarse, f64, grasped, times
+
+from torchsoft import Actuator, Body, Contact, PD, Parameters, Profile, Reference, Rig, SimulationFailed, SoftGrasp, simulate
+from torchsoft.physics.energy import stored
+from torchsoft.scenario import grasp_and_roll
+from torchsoft.solve.stepper import ImplicitStepper, Segment
+
+
+def test_second_order_on_a_smooth_motion(fidelity: str) -> None:
+    """A grasped disc set moving so gently that no node slips, touches or leaves: observed order >= 1.8."""
+    model = coarse(pad__fidelity=fidelity)
+    y0, t = grasped(model, (1e-4, 5e-5)), times(0.032, 2)
+    place = lambda h: simulate(model, t, y0=y0, step=h).state.pose["disc"][-1, :2]
+    fine = place(3.2e-2 / 2048)
+    errors = [float((place(h) - fine).norm()) for h in (2e-3, 1e-3, 5e-4)]
+    orders = [float(np.log2(errors[i] / errors[i + 1])) for i in range(2)]
+    assert min(orders) >= 1.8, (errors, orders)
+
+
+def test_same_run_twice_to_the_bit_and_in_two_threads_at_once() -> None:
+    """Nothing is shared between runs: two models, each simulated alone and beside the other."""
+    made = [grasp_and_roll(coarse(pad__E=E), grasp_force=75.0) for E in (0.75e6, 0.7e6)]
+    run = lambda m: simulate(m.model, times(0.4, 21), y0=m.y0).y
+    alone = [run(m) for m in made]
+    with ThreadPoolExecutor(2) as pool:
+        both = list(pool.map(run, [*made, *made]))
+    assert all(torch.equal(a, b) for a, b in zip(both, [*alone, *alone]))
+    assert not torch.equal(*alone)
+
+
+def test_one_model_in_two_threads_under_two_references_with_gradients() -> None:
+    """A run does not touch the model: one rig follows two references at once, and each gradient is that of its own."""
+    model = coarse()
+    y0 = grasped(model)
+    steady = model.reference
+    signals = {name: steady[name] for name in ("y_d", "F_ff")}
+    references = [Reference(x_d=Profile([0.0, 0.1], [0.06, 0.06 + d]), **signals) for d in (1e-3, -2e-3)]
+
+    def slope(reference: Reference) -> tuple[torch.Tensor, torch.Tensor]:
+        run = simulate(model, times(0.1, 11), y0=y0, reference=reference, gradient="discrete")
+        return run.y.detach(), torch.autograd.grad(run["theta"][-1], model.pad.E)[0]
+
+    alone = [slope(reference) for reference in references]
+    with ThreadPoolExecutor(2) as pool:
+        both = list(pool.map(slope, [*references, *references]))
+    for got, expected in zip(both, [*alone, *alone]):
+        assert all(torch.equal(a, b) for a, b in zip(got, expected))
+    assert model.reference is steady
+
+
+def test_irregular_output_times_do_not_matter() -> None:
+    """Outputs only cut the steps: the same instants reached with other outputs agree to the stepper's accuracy."""
+    manipulation = grasp_and_roll(coarse(), grasp_force=75.0)
+    model, y0 = manipulation.model, manipulation.y0
+    even = simulate(model, times(0.4, 5), y0=y0, step=5e-4)
+    odd = simulate(model, f64(0, 0.1003, 0.17, 0.3, 0.4), y0=y0, step=5e-4)
+    assert float((even.state.pose["disc"][-1, :2] - odd.state.pose["disc"][-1, :2]).abs().max()) < 1e-8
+
+
+@pytest.mark.parametrize(
+    ("t", "match"),
+    [
+        ([0.0, 0.1, 0.1], "increase strictly"),
+        ([0.0, 0.2, 0.1], r"t\[1:3\]"),
+        ([0.0], "two times or more"),
+        ([0.0, float("nan")], "finite"),
+    ],
+)
+def test_bad_times_are_refused(t: list[float], match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        simulate(coarse(), torch.tensor(t, dtype=torch.float64))
+
+
+def test_bad_states_and_settings_are_refused() -> None:
+    model, t = coarse(), times(0.1, 2)
+    with pytest.raises(ValueError, match="must be float64"):
+        simulate(model, t, y0=torch.zeros(model.layout.size))
+    with pytest.raises(ValueError, match="must be float64 of shape"):
+        simulate(model, t, y0=torch.zeros(3, dtype=torch.float64))
+    with pytest.raises(ValueError, match="one finite state"):
+        simulate(model, t, y0=torch.full((model.layout.size,), torch.nan, dtype=torch.float64))
+    for value in (0.0, -1e-3, float("nan")):
+        with pytest.raises(ValueError, match="`step` must be positive and finite"):
+            simulate(model, t, step=value)
+        with pytest.raises(ValueError, match="`tolerance` must be positive and finite"):
+            simulate(model, t, tolerance=value)
+
+
+def test_an_unstable_loop_ends_in_an_error_that_says_so() -> None:
+    """E = 60 kPa, tau = 5 ms with the paper's gains."""
+    model = SoftGrasp(Parameters().override(COARSE | {"pad.E": 6e4, "pad.tau": 5e-3}))
+    with pytest.raises(SimulationFailed, match=r"disc was lost at t = .* s: the closed loop is unstable") as caught:
+        grasp_and_roll(model)
+    assert 0 < caught.value.time < 1
+    assert bool(torch.isfinite(caught.value.trajectory.y).all())
+
+
+def test_a_disc_rolled_off_the_pad_is_reported() -> None:
+    """Only the reference knows the pad's length; a model driven beyond it says where the run ended."""
+    model = coarse()
+    y0 = grasped(model)
+    beyond = Reference(x_d=Profile([0.0, 1.0], [0.06, 0.13]), y_d=model.reference["y_d"], F_ff=model.reference["F_ff"])
+    with pytest.raises(SimulationFailed, match="contact reached the end of a pad") as caught:
+        simulate(model, times(1.0, 101), y0=y0, reference=beyond)
+    run = caught.value.trajectory
+    assert len(run.t) == len(run.y) == len(run["x_C"]) < 101
+    assert float(run.t[-1]) <= caught.value.time
+
+
+def test_a_step_that_newton_does_not_solve_is_halved() -> None:
+    """Too few iterations for the hardest steps: those are cut, the others are not, and the run ends where it should."""
+    model = coarse(contact__mu_s=0.3, contact__mu_k=0.2)
+    y0, t = grasped(model, (0.15, 0.0)), times(0.02, 11)
+    runs = []
+    for iterations in (40, 10):
+        stepper = ImplicitStepper(model, step=2e-3, max_iterations=iterations)
+        segments: list[Segment] = []
+        *_, last = stepper.integrate(y0, t, segments)
+        assert sum(len(segment.chunk.starts) for segment in segments) == last.steps
+        assert last.rows == len(t)
+        runs.append(last)
+    free, cut = runs
+    assert free.failed == 0
+    assert cut.failed > 0
+    assert 10 < cut.steps < 10 + 64 * cut.failed
+    fine = simulate(model, t, y0=y0, step=6.25e-5).y.numpy()
+    place = model.layout.slices["pose", "disc"]
+    off_cut, off_free = (np.abs(run.y - fine)[:, place][:, :2].max() for run in (cut, free))
+    assert off_cut < 1.2 * off_free
+
+
+def test_the_adjoint_follows_halved_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where steps were cut, the gradient is still that of the run; differences small enough to cut the same steps."""
+    model = coarse(contact__mu_s=0.3, contact__mu_k=0.2)
+    y0, t = grasped(model, (0.15, 0.0)), times(0.01, 6)
+    E = model.pad.E
+
+    class Hasty(ImplicitStepper):
+        def __init__(self, rig: Rig, reference: Reference | None = None, **options: float) -> None:
+            super().__init__(rig, reference, max_iterations=10, **options)  # pyright: ignore[reportArgumentType]
+
+    monkeypatch.setattr("torchsoft.solve.simulate.ImplicitStepper", Hasty)
+
+    def angle() -> tuple[torch.Tensor, int]:
+        run = simulate(model, t, y0=y0, step=2e-3, tolerance=1e-10, gradient="discrete")
+        return run["theta"][-1], run.stats.failed_steps
+
+    theta, failed = angle()
+    (slope,) = torch.autograd.grad(theta, E)
+    run = simulate(model, t, y0=y0, step=2e-3, tolerance=1e-10, gradient="forward", wrt=["pad.E"], rigid=True)
+    assert run.sensitivities is not None
+    assert float(run.sensitivities[-1, 2, 0]) == pytest.approx(slope.item(), rel=1e-9)
+    assert failed == run.stats.failed_steps > 0
+    with torch.no_grad():
+        value, h = E.clone(), 1e-5 * E.item()
+        ahead, behind = (angle() for E_near in (value + h, value - h) if E.copy_(E_near) is not None)
+        E.copy_(value)
+    assert ahead[1] == behind[1] == failed
+    assert slope.item() == pytest.approx((ahead[0] - behind[0]).item() / (2 * h), rel=1e-4)
+
+
+def test_a_driven_body_follows_its_signal_and_its_work_is_counted() -> None:
+    """A disc pressed by a prescribed height into one pad while an actuator rolls it: the drive pays for what is stored."""
+    model = coarse()
+    disc = Body(0.4, model.shape, y="driven", theta="free")
+    rig = Rig(
+        bodies={"disc": disc}, pads={"L": model.pads["L"]}, contacts={"L": Contact("L", "disc", model.contact)},
+        actuators={"x": Actuator("disc.x", "disc.x", PD(1e4, 400.0), setpoint="w")},
+        reference=Reference(
+            **{"disc.y": Profile([0.0, 0.05], [24.0e-3, 23.4e-3]), "w": Profile([0.05, 0.2], [0.06, 0.064])}
+        ),
+    )  # fmt: skip
+    y0 = torch.zeros(rig.layout.size, dtype=torch.float64)
+    y0[rig.layout.slices["pose", "disc"]] = f64(0.06, 0.0)
+    run = simulate(rig, times(0.2, 41), y0=y0, step=5e-4)
+    assert torch.equal(run.state.pose["disc"][:, 1], rig.reference["disc.y"](run.t)[0])
+    assert float(run["x_disc"][-1]) == pytest.approx(0.064, abs=2e-5)
+    assert float(run["theta_disc"][-1]) < -0.1  # rolls to the right, clockwise
+    work = float(run.supplied["drive_disc"][20])
+    assert work > 0.5 * float(run.energy["strain_L"][20]) > 1e-3
+    assert run.energy_residual_rel < 2e-3
+    assert set(run.energy) == set(stored(rig, run.state))
