@@ -21,7 +21,7 @@ from torchsoft.solve.system import contact_laws
 
 POINTS = 450
 
-NEWTON = 1e-10
+NEWTON = 3e-11
 """Newton's tolerance of the steps below [N]."""
 
 
@@ -86,13 +86,14 @@ def test_the_law_of_a_point_equals_the_module(friction: str, shape: Shape | None
 
         with torch.no_grad():
             expected = module(x)
-        np.testing.assert_allclose(out[:5], expected[:5], rtol=1e-10, atol=1e-11)
-        np.testing.assert_allclose(out[5:], expected[5:], rtol=1e-9, atol=1e-12)
         pull = torch.func.vjp(outputs, x[:7], p)[1]
         rows = [pull(torch.eye(7, dtype=torch.float64)[i]) for i in range(3)]
         jacobian = torch.stack([by_x for by_x, _ in rows]).numpy()
         by_p = sum(weight * row for weight, (_, row) in zip(w, rows)).numpy()
         # a slipping Coulomb point has zeros in it; the distance from a boundary rounds to 4e-18 m, 4e-12 epsilon
+        rounding = 1e-11 + 2e-17 * np.abs(jacobian[:, 3:5]).max()
+        np.testing.assert_allclose(out[:5], expected[:5], rtol=1e-11, atol=rounding)
+        np.testing.assert_allclose(out[5:], expected[5:], rtol=1e-10, atol=rounding)
         scale = np.abs(jacobian).max(0) + [441, 441, 9, 1e5, 1e5, 1e3, 1e5]
         assert np.all(np.abs(J - jacobian) <= 1e-11 * scale), (J, jacobian)
         bars.append((p_bar, by_p))
@@ -146,6 +147,8 @@ def test_stages_of_a_step_satisfy_the_modules_equation(
             noise = 4e-15 * float(end[where].abs().max()) / a
             if part == "rates":
                 noise += NEWTON / float(rig.pads[name].masses().min())
+            elif part == "velocity":  # Newton's tolerance at a node, on the disc's spin
+                noise += NEWTON * 0.02 / float(rig.bodies[name].inertia)
             assert float((got - expected)[where].abs().max()) < 1e-9 * scale + noise, (part, name, time)
 
 

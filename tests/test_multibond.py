@@ -80,7 +80,7 @@ def test_the_moment_arm_is_the_points_and_not_the_radius() -> None:
     frame = graph.interfaces["L"].frame
     arm = graph.ports["contact_L"].transformer.blocks["disc_spin"].matrix[..., 1, 0]
     assert torch.allclose(arm, frame.d.norm(dim=-1), rtol=1e-14)
-    assert float((arm - model.parameter("disc.radius").detach())[frame.g > 0].abs().max()) > 1e-5
+    assert float((arm.detach() - model.parameter("disc.radius").detach())[frame.g > 0].abs().max()) > 1e-5
 
 
 @torch.no_grad()

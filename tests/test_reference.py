@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchsoft import Parameters, SoftGrasp, Trajectory, press, rest, simulate
 from torchsoft.excitation import CATALOGUE, begin
+from torchsoft.excitation import reference as excited
 from torchsoft.physics.equilibrium import holding_force
 from torchsoft.physics.stability import NEUTRAL, loop_modes
 from torchsoft.scenario import grasp_and_roll
@@ -82,7 +83,10 @@ def test_gradients_of_the_manipulation_are_the_references(manipulation: tuple[So
 def test_light_shaking_is_the_reference() -> None:
     """Nodes touch, leave and slip all along; the angle's derivatives by one pass forward, with those of the start."""
     reference = REFERENCE["light_shaking"]
-    model, y0 = begin(CATALOGUE["light shaking"], Parameters().override({"contact.v_s": 0.05}))
+    excitation, y_Br = CATALOGUE["light shaking"], reference["y_Br_start"]  # to seven digits `apart`
+    model, y0 = begin(excitation, Parameters().override({"contact.v_s": 0.05}), grasp_force=reference["grasp_force"])
+    y0[model.layout.slices["pose", "bracket"].start + 1] = y_Br
+    model.reference = excited(excitation, model, y_Br, reference["grasp_force"])
     names = list(reference["theta_end_by"])
     columns = []
     for name in names:

@@ -10,7 +10,7 @@ from torchdiffeq import odeint, odeint_adjoint
 
 from torchsoft import METHOD, SoftGrasp, register, simulate
 from torchsoft.scenario import grasp_and_roll
-from torchsoft.solve.continuous import LONGEST, OutputsTooCoarse, continuous_solution, stiffest_rate
+from torchsoft.solve.continuous import LONGEST, OutputsTooCoarse, stiffest_rate
 from torchsoft.solve.torchdiffeq import TorchdiffeqSolver
 
 OPTIONS = {"step_size": 2e-3, "tolerance": 1e-10}
@@ -36,11 +36,11 @@ def test_torchdiffeq_runs_the_stepper() -> None:
 def test_explicit_methods_agree(method: str) -> None:
     """torchdiffeq's own methods integrate the same forward and meet the stepper on a short window, slip included."""
     model = coarse()
-    y0, t = grasped(model, (0.05, -0.01)), times(1e-3, 3)
+    y0, t = grasped(model, (0.05, -0.01)), times(2e-4, 3)
     options = {"step_size": 2e-5} if method == "rk4" else {}
     end = odeint(model, y0, t, method=method, rtol=1e-8, atol=1e-11, options=options)[-1]
-    implicit = simulate(model, t, y0=y0, step=5e-6)
-    assert float(implicit.dissipated["slip"][-1]) > 1e-8  # the window does contain slip
+    implicit = simulate(model, t, y0=y0, step=1e-6)
+    assert float(implicit.dissipated["slip"][-1]) > 2e-9  # the window does contain slip
     first, last, explicit = (model.unpack(y) for y in (implicit.y[0], implicit.y[-1], end))
     parts = [lambda s: s.pose["disc"][:2], lambda s: s.pose["disc"][2:], lambda s: s.stretch["L"]]
     parts += [lambda s, k=k: model.displacement(k, s) for k in "LU"]
@@ -140,11 +140,11 @@ def test_odeint_adjoint_of_a_forgotten_run_says_so() -> None:
 
 
 def test_continuous_adjoint_agrees_on_a_short_window() -> None:
-    """1 ms of a sticking grasp by rk4 and its continuous adjoint, against fine steps and the discrete adjoint."""
+    """0.2 ms of a sticking grasp by rk4 and its continuous adjoint, against fine steps and the discrete adjoint."""
     model, y0 = rolling()
     start = y0[1]
     start[model.layout.slices["velocity", "disc"]] -= f64(0.0195, 0.0, 0.0)  # slow enough to stick
-    t = torch.linspace(0.5, 0.501, 3, dtype=torch.float64)
+    t = torch.linspace(0.5, 0.5002, 3, dtype=torch.float64)
     names = ("contact.K_t", "contact.R_t", "contact.K_n", "pad.E", "disc.mass")
     results = []
     for solve in (
@@ -163,7 +163,5 @@ def test_coarse_outputs_are_refused() -> None:
     model, y0 = rolling()
     rate = stiffest_rate(model, y0[0], 0.3)
     t = torch.tensor([0.3, 0.3 + 1.2 * LONGEST / rate], dtype=torch.float64)
-    with pytest.raises(OutputsTooCoarse, match="loses the gradient"):
-        continuous_solution(model, y0[0], t)
     with pytest.raises(OutputsTooCoarse, match="loses the gradient"):
         simulate(model, t, y0=y0[0], gradient="continuous")

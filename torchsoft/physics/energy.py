@@ -4,6 +4,8 @@ What is dissipated and supplied the stepper integrates beside the state, from th
 the multibond graph, so that the balance at one instant can be checked without any stepper.
 """
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -12,8 +14,11 @@ from torchsoft.physics.rig import Evaluation, Rig
 from torchsoft.physics.state import State
 
 
-def stored(rig: Rig, state: State) -> dict[str, Tensor]:
-    """Energies [J], each shaped like the batch: strain of every pad, contact springs, kinetic energies of what moves freely."""
+def stored(rig: Rig, state: State, displacement: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
+    """Energies [J], each shaped like the batch: strain of every pad, contact springs, kinetic energies of what moves freely.
+
+    `displacement` are those of the pads, where they are known already."""
+    known = displacement or {}
     energies = {}
     for name, pad in rig.pads.items():
         part = state.pads[name]
@@ -26,7 +31,7 @@ def stored(rig: Rig, state: State) -> dict[str, Tensor]:
     zero = torch.zeros_like(next(iter(state.pose.values()))[..., 0])
     normal, tangential = zero, zero
     for name, contact in rig.contacts.items():
-        parts = contact.law.stored(rig.penetration(name, state), state.stretch[name], rig.weight(name))
+        parts = contact.law.stored(rig.penetration(name, state, known.get(contact.pad)), state.stretch[name], rig.weight(name))
         normal, tangential = normal + parts[0].sum(-1), tangential + parts[1].sum(-1)
     energies["normal_springs"], energies["tangential_springs"] = normal, tangential
     for name, body in rig.bodies.items():

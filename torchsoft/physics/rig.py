@@ -113,6 +113,11 @@ class Rig(nn.Module):
             raise ValueError(f"{owner} speaks of `{name}`, which is not a coordinate; there are {known}")
         return 3 * list(self.bodies).index(body) + COORDINATES.index(axis)
 
+    def named_modules(self, memo: Any = None, prefix: str = "", remove_duplicate: bool = True) -> Any:
+        """Each module once, whatever is asked for: `torch.func.functional_call` would put back the wrong tensors of a part that
+        several of the lists share."""
+        return super().named_modules(memo, prefix, True)
+
     aliases: Mapping[str, str] = {}
     """Other names of parameters."""
 
@@ -207,14 +212,16 @@ class Rig(nn.Module):
         zeta = (fractions[:, None, None] * part).sum(-3)
         return (zeta.flatten(-2) @ pad.compliance().mT).unflatten(-1, (-1, 2))
 
-    def penetration(self, name: str, state: State) -> Tensor:
-        """Depth of the points of a contact in the body [m], (..., points); negative where they are apart."""
+    def penetration(self, name: str, state: State, u: Tensor | None = None) -> Tensor:
+        """Depth of the points of a contact in the body [m], (..., points); negative where they are apart. `u` are the pad's
+        displacements, where they are known already."""
         contact = self.contacts[name]
-        spread, shape = self.pads[contact.pad].spread, self.bodies[contact.body].shape
+        pad, shape, pose = self.pads[contact.pad], self.bodies[contact.body].shape, state.pose[contact.body]
         assert shape is not None
-        u = spread @ self.displacement(contact.pad, state)
-        x = point_inputs(self, name, state, u, torch.zeros_like(u))
-        return moving_frame(shape, x[..., 3:5], x[..., 5]).g
+        (r_B, _), u = self.base_motion(contact.pad, state), self.displacement(contact.pad, state) if u is None else u
+        centre = turned(pose[..., :2] - r_B[..., :2], -r_B[..., 2])
+        d = pad.point_positions + pad.spread @ u - centre[..., None, :]
+        return -shape(turned(d, r_B[..., 2, None] - pose[..., 2, None]))[0]
 
     def forward(self, t: Tensor | float, y: Tensor, reference: Reference | None = None) -> Tensor:
         """dy/dt, shaped like y. Raises `ValueError` for a state of another length or dtype."""

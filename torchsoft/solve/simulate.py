@@ -157,8 +157,8 @@ def gather(
         state = rig.unpack(y, signals)
         measured = channels(rig, state, signals, {name: columns[name] for name in rig.pads})
     with torch.no_grad():
-        energy = stored(rig, state)
         displacement = {name: rig.displacement(name, state) for name in rig.pads}
+        energy = stored(rig, state, displacement)
         force, at = {}, 0
         for name, contact in rig.contacts.items():
             count = len(rig.pads[contact.pad].point_nodes)

@@ -34,37 +34,74 @@ class LawSet(NamedTuple):
     parameters: dict[str, Tensor]
 
 
+def _copied(module: nn.Module, known: dict[int, nn.Module]) -> nn.Module:
+    """The same modules over the same tensors: tracing puts others in their place, which other threads must not meet."""
+    if id(module) not in known:
+        out = known[id(module)] = module.__class__.__new__(module.__class__)
+        out.__dict__ = dict(module.__dict__)
+        out.__dict__ |= {"_parameters": dict(module._parameters), "_buffers": dict(module._buffers)}
+        out.__dict__["_modules"] = {k: m if m is None else _copied(m, known) for k, m in module._modules.items()}
+    return known[id(module)]
+
+
 class _Called(nn.Module):
     """Some modules, and a function of them and of x: what a compiled law is traced from."""
 
     def __init__(self, function: Callable[..., Tensor], **modules: Any) -> None:
         super().__init__()
         self.function, self.names = function, tuple(modules)
+        known: dict[int, nn.Module] = {}
         for name, module in modules.items():
-            setattr(self, name, module)
+            setattr(self, name, _copied(module, known) if isinstance(module, nn.Module) else module)
 
     def forward(self, x: Tensor) -> Tensor:
         return self.function(*(getattr(self, name) for name in self.names), x)
 
 
+def structure(module: object) -> Any:
+    """What decides a module's law beside its parameters' values, hashable: two modules of one structure have one law. None where
+    that cannot be told: functions, hooks, attributes of other kinds than numbers and text."""
+    if isinstance(module, nn.Module):
+        own = {k: v for k, v in vars(module).items() if not k.startswith("_") and k != "training"}
+        parts = tuple((k, structure(v)) for k, v in module._modules.items())
+        buffers = tuple((k, v.numpy().tobytes()) for k, v in module._buffers.items() if v is not None)
+        shapes = tuple((k, tuple(v.shape)) for k, v in module._parameters.items() if v is not None)
+        plain = all(isinstance(v, bool | int | float | str | None) for v in own.values())
+        hooked = any(v for k, v in vars(module).items() if k.endswith("_hooks"))
+        if plain and not hooked and all(part is not None for _, part in parts):
+            return type(module), tuple(sorted(own.items())), parts, buffers, shapes
+    return None
+
+
+_laws: dict[Any, Law] = {}
+"""Laws that have been compiled, by what decides them."""
+
+
 def compiled_law(
-    parameters: Mapping[str, Tensor], function: Callable[..., Tensor], size: int, linear: int, differentiated: int, **modules: Any
+    names: Mapping[str, Tensor], function: Callable[..., Tensor], size: int, linear: int, differentiated: int, **modules: Any
 ) -> Law:
-    """The law of a function of modules and x (size,), differentiable in the first inputs and in all `parameters`."""
-    called = _Called(function, **modules)
+    """The law of a function of modules and x (size,), differentiable in the first inputs and in the parameters `names`, of which
+    it may not use all. Raises `UnknownOperation` naming the line of a law that cannot be compiled."""
+    decided = tuple((name, structure(module)) for name, module in modules.items())
+    shapes = tuple((name, tuple(value.shape)) for name, value in names.items())
+    key = None if any(part is None for _, part in decided) else (function, decided, shapes, linear, differentiated)
+    if key not in _laws:
+        called = _Called(function, **modules)
 
-    def law(x: Tensor, values: Mapping[str, Tensor]) -> Tensor:
-        return torch.func.functional_call(called, dict(values), (x,))
+        def law(x: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+            own = {name: value for name, value in values.items() if name.split(".")[0] in modules}
+            return torch.func.functional_call(called, own, (x,))
 
-    own = {name: value for name, value in parameters.items() if name.split(".")[0] in modules}
-    others = [name for name in parameters if name not in own]
-    example = torch.linspace(0.01, 0.02, size, dtype=torch.float64)
-    if others:
-        return compile_law(
-            lambda x, values: law(x, {k: v for k, v in values.items() if k not in others}), example, parameters,
-            linear=linear, differentiated=differentiated,
-        )  # fmt: skip
-    return compile_law(law, example, parameters, linear=linear, differentiated=differentiated)
+        example = torch.linspace(0.01, 0.02, size, dtype=torch.float64)
+        made = compile_law(law, example, names, linear=linear, differentiated=differentiated)
+        if key is None:
+            return made
+        _laws[key] = made
+    return _laws[key]
+
+
+def _effort(actuator: nn.Module, x: Tensor) -> Tensor:
+    return actuator(x)[None]
 
 
 def contact_laws(law: Any, shape: Any) -> LawSet:
@@ -81,6 +118,7 @@ def contact_laws(law: Any, shape: Any) -> LawSet:
 class Compiled:
     """A rig at one moment: `p` (parameters,) with its graph, `names` of its entries, and `system(h)` for a step h [s]."""
 
+    @torch.enable_grad()
     def __init__(self, rig: Rig) -> None:
         check_values(rig)
         self.rig, self.size = rig, rig.layout.size
@@ -215,18 +253,16 @@ class Compiled:
         )  # fmt: skip
 
     def _make_actuators(self) -> Actuators:
-        rig, rows, known = self.rig, [], {}
-        starts = []
+        rig, rows, starts = self.rig, [], []
         for actuator in rig.actuators.values():
             parameters = {f"law.{k}": v for k, v in actuator.named_parameters()}
-            law = compiled_law(parameters, lambda module, x: module(x)[None], 5, 1, 5, law=actuator)
+            law = compiled_law(parameters, _effort, 5, 1, 5, law=actuator)
             starts.append(self._add(torch.cat([v.reshape(-1) for v in parameters.values()]) if parameters else rig.gravity.new_zeros(0)))
             feed = rig.signals.index(actuator.feed_forward) if actuator.feed_forward is not None else -1
             rows.append(
                 (law.linearise, law.pullback, self._coordinate(actuator.measures), self._coordinate(actuator.pushes),
                  rig.signals.index(actuator.setpoint), feed)
             )  # fmt: skip
-        del known
         linearise, pullback, measured, pushed, setpoint, feed_forward = _ints(rows).reshape(-1, 6).T
         return Actuators(
             *(np.ascontiguousarray(x) for x in (linearise, pullback)), _ints([*starts, self._count]),

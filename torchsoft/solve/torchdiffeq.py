@@ -59,7 +59,8 @@ class TorchdiffeqSolver:
             raise ValueError(f"method='{METHOD}' has no option {sorted(strange)}; it has step_size, {', '.join(sorted(known))}")
         self.model, self.y0 = model, y0
         self.adjoint_params: tuple[Tensor, ...] | None = augmented.get("adjoint_params")
-        self.stepper = ImplicitStepper(model, **options)
+        with torch.enable_grad():  # odeint_adjoint comes without; its parameters' gradients need the graph
+            self.stepper = ImplicitStepper(model, **options)
 
     def integrate(self, t: Tensor) -> Tensor:
         if self.adjoint_params is not None:
@@ -137,7 +138,7 @@ def register() -> None:
     if not isinstance(solvers, dict) or "dopri5" not in solvers:
         raise ImportError("this torchdiffeq keeps its solvers elsewhere; torchsoft was made for torchdiffeq 0.2.5")
     theirs = solvers.get(METHOD)
-    if theirs is not None and not (isinstance(theirs, type) and issubclass(theirs, TorchdiffeqSolver)):
-        solvers[METHOD] = type("TorchdiffeqSolver", (TorchdiffeqSolver,), {"theirs": theirs})
-    else:
+    if theirs is None:
         solvers[METHOD] = TorchdiffeqSolver
+    elif not (isinstance(theirs, type) and issubclass(theirs, TorchdiffeqSolver)):
+        solvers[METHOD] = type("TorchdiffeqSolver", (TorchdiffeqSolver,), {"theirs": theirs})
