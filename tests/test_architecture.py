@@ -39,7 +39,11 @@ def imports(path: Path, *, lazy: bool = True) -> set[str]:
     }  # fmt: skip
     found = set()
     for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("torchsoft") and (lazy or node not in inside):
+        if (
+            isinstance(node, ast.ImportFrom)
+            and (node.module or "").startswith("torchsoft")
+            and (lazy or node not in inside)
+        ):
             module = (node.module or "").removeprefix("torchsoft").removeprefix(".")
             for alias in node.names:  # `from torchsoft.solve import adjoint` imports the module
                 inner = f"{module}.{alias.name}".removeprefix(".")

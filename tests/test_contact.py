@@ -166,7 +166,9 @@ def test_smooth_slip_satisfies_its_equation(
         assert (eta + dashpot) * x == pytest.approx(E - mu * F_N, rel=1e-9, abs=1e-11 * (E + F_N))
 
 
-@pytest.mark.parametrize("friction", [smooth(), smooth(eta=0.0), Coulomb(0.8, 0.5)], ids=["smooth", "no eta", "coulomb"])
+@pytest.mark.parametrize(
+    "friction", [smooth(), smooth(eta=0.0), Coulomb(0.8, 0.5)], ids=["smooth", "no eta", "coulomb"]
+)
 @given(g=DEPTHS, g_dot=RATES, v_T=RATES, s=st.floats(-1e-3, 1e-3), weight=st.sampled_from([0.5, 1.0, 3.0]))
 def test_dissipation_is_never_negative(
     friction: SlipLaw, g: float, g_dot: float, v_T: float, s: float, weight: float
@@ -181,7 +183,9 @@ def test_dissipation_is_never_negative(
     assert float(slip) >= -1e-13 * scale
     stored = weight * K * max(g, 0.0) * g_dot + weight * 2 * K * s * float(got.s_dot)
     taken = float(got.F_N) * g_dot + float(got.F_T) * v_T  # what the point's motion puts in
-    assert taken == pytest.approx(stored + float(dashpots) + float(slip), rel=1e-9, abs=1e-12 * (1 + abs(stored) + scale))
+    assert taken == pytest.approx(
+        stored + float(dashpots) + float(slip), rel=1e-9, abs=1e-12 * (1 + abs(stored) + scale)
+    )
 
 
 @given(g=DEPTHS, g_dot=RATES, v_T=RATES, s=st.floats(-1e-3, 1e-3))
@@ -208,7 +212,9 @@ def inputs(count: int, seed: int) -> Tensor:
     angle = 2 * torch.pi * torch.rand(count, generator=generator, dtype=torch.float64)
     d = (0.02 - 5e-5 * normal(count).abs())[:, None] * torch.stack((angle.cos(), angle.sin()), -1)
     one = torch.ones(count, 1, dtype=torch.float64)
-    return torch.cat((0.01 * normal(count, 2), normal(count, 1), d, normal(count, 1), 1e-5 * normal(count, 1), one, 0 * one), -1)
+    return torch.cat(
+        (0.01 * normal(count, 2), normal(count, 1), d, normal(count, 1), 1e-5 * normal(count, 1), one, 0 * one), -1
+    )
 
 
 @pytest.mark.parametrize("shape", [Circle(0.02), Ellipse(0.0205, 0.0195)], ids=["circle", "ellipse"])

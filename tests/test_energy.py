@@ -79,7 +79,9 @@ def test_angular_momentum_balance_of_a_bracket_that_turns() -> None:
             weight = weight - body.mass * rig.gravity * r[0]
         pushed = torch.stack([graph.ports[f"control_{axis}"].effort[0, 0] for axis in "xy"])
         nodes = rig.pads["L"].positions + rig.displacement("L", state)
-        ground = moment(nodes, -graph.ports["pad_L"].effort).sum()  # the pad is massless: what holds it is what loads it
+        ground = moment(
+            nodes, -graph.ports["pad_L"].effort
+        ).sum()  # the pad is massless: what holds it is what loads it
         external = weight + moment(state.pose["bracket"][:2], pushed) + ground
     assert float(turn - external) == pytest.approx(0.0, abs=1e-10 * float(ground.abs()))
 
@@ -94,7 +96,9 @@ def test_stored_energies_by_hand() -> None:
         u = rig.displacement("U", state)
         force = torch.linalg.solve(rig.pads["U"].compliance(), u.flatten())
         depth = torch.cat([rig.penetration(k, state).clamp(min=0) for k in "LU"])
-        weights, stretch = (torch.cat([part[k] for k in "LU"]) for part in ({k: rig.weight(k) for k in "LU"}, state.stretch))
+        weights, stretch = (
+            torch.cat([part[k] for k in "LU"]) for part in ({k: rig.weight(k) for k in "LU"}, state.stretch)
+        )
     assert energy["disc"] == pytest.approx(0.5 * 0.4065 * 0.05**2, rel=1e-14)
     assert energy["bracket"] == pytest.approx(0.5 * 0.4065 * 0.1**2, rel=1e-14)
     assert energy["spin"] == pytest.approx(0.5 * 0.5 * 0.4065 * 19.37e-3**2 * 4.0, rel=1e-13)

@@ -1,4 +1,5 @@
-"""What an extension costs: shapes, laws, materials, pads and rigs that the paper does not have, each a few lines of a user's."""
+"""What an extension costs: shapes, laws, materials, pads and rigs that the paper does not have, each a few lines of a
+user's."""
 
 from functools import cache
 
@@ -7,8 +8,26 @@ import torch
 from torch import Tensor, nn
 
 from torchsoft import (
-    Body, Circle, Contact, Coulomb, Ellipse, KelvinVoigt, Pad, PadMesh, Parameters, Profile, Reference, Rig, SmoothSlip,
-    SoftContact, SoftGrasp, StandardLinearSolid, Trajectory, press, rest, simulate,
+    Body,
+    Circle,
+    Contact,
+    Coulomb,
+    Ellipse,
+    KelvinVoigt,
+    Pad,
+    PadMesh,
+    Parameters,
+    Profile,
+    Reference,
+    Rig,
+    SmoothSlip,
+    SoftContact,
+    SoftGrasp,
+    StandardLinearSolid,
+    Trajectory,
+    press,
+    rest,
+    simulate,
 )  # fmt: skip
 from torchsoft.physics.energy import dissipated, stored, supplied
 from torchsoft.physics.multibond import net_efforts
@@ -25,11 +44,13 @@ def grasp(model: SoftGrasp, y0: Tensor, travel: float = 2e-3) -> Reference:
     top = float(model.unpack(y0).pose["bracket"][1])
     x = float(model.unpack(y0).pose["disc"][0])
     return Reference(
-        x_d=Profile([0.06, 0.16], [x, x + travel]), y_d=Profile([0.0, 0.05], [top, top - 1e-3]), F_ff=Profile([0.0], [0.0])
+        x_d=Profile([0.06, 0.16], [x, x + travel]),
+        y_d=Profile([0.0, 0.05], [top, top - 1e-3]),
+        F_ff=Profile([0.0], [0.0]),
     )
 
 
-def check_gradient(build, names: list[str], value, bound: float, step: float = 1e-5) -> None:  # noqa: ANN001
+def check_gradient(build, names: list[str], value, bound: float, step: float = 1e-5) -> None:
     """dvalue/dname of a run from `build() -> (model, run)` against central differences in each parameter's logarithm."""
     model, run = build({}, "discrete")
     value(run).backward()
@@ -78,7 +99,9 @@ def test_an_ellipse_has_exact_gradients() -> None:
         y0 = rest(model).detach()
         reference = grasp(model, y0)
         set_values(model, values)
-        return model, simulate(model, times(0.12, 7), y0=y0, reference=reference, step=1e-3, tolerance=1e-10, gradient=gradient)
+        return model, simulate(
+            model, times(0.12, 7), y0=y0, reference=reference, step=1e-3, tolerance=1e-10, gradient=gradient
+        )
 
     check_gradient(build, ["disc.shape.a", "disc.shape.b", "pad.E"], lambda run: 1e3 * run["y_C"][-1], 2e-5, step=1e-7)
 
@@ -108,7 +131,9 @@ def test_a_network_inside_a_friction_law_runs_compiled_with_exact_gradients() ->
         y0 = rest(model).detach()
         reference = grasp(model, y0, travel=15e-3)
         set_values(model, values)
-        return model, simulate(model, times(0.16, 9), y0=y0, reference=reference, step=1e-3, tolerance=1e-10, gradient=gradient)
+        return model, simulate(
+            model, times(0.16, 9), y0=y0, reference=reference, step=1e-3, tolerance=1e-10, gradient=gradient
+        )
 
     check_gradient(build, ["contact.friction.level", "contact.K_t"], lambda run: 1e3 * run["x_C"][-1], 1e-4, step=1e-6)
     model, run = build({}, "discrete")
@@ -144,7 +169,9 @@ def test_a_law_that_is_a_function_runs_in_one_line() -> None:
 
 def test_a_standard_linear_solid_creeps_between_its_two_moduli() -> None:
     """Under a held force a pad's displacement goes from E_instant's to E's, as its creep function says."""
-    solid = StandardLinearSolid(E=0.75e6, E_instant=1.5e6, nu=0.45, rho=1100.0, tau=20e-3, depth=44e-3, tau_instant=1e-3)
+    solid = StandardLinearSolid(
+        E=0.75e6, E_instant=1.5e6, nu=0.45, rho=1100.0, tau=20e-3, depth=44e-3, tau_instant=1e-3
+    )
     model = SoftGrasp(COARSE, material=solid)
     z = torch.zeros(2, model.pads["L"].nodes, 2, dtype=torch.float64)
     force, t = torch.zeros_like(z[0]), torch.tensor(0.03, dtype=torch.float64)
@@ -165,7 +192,9 @@ def test_a_standard_linear_solid_keeps_its_energy_and_its_gradients() -> None:
         y0 = rest(model).detach()
         reference = grasp(model, y0)
         set_values(model, values)
-        return model, simulate(model, times(0.16, 9), y0=y0, reference=reference, step=5e-4, tolerance=1e-10, gradient=gradient)
+        return model, simulate(
+            model, times(0.16, 9), y0=y0, reference=reference, step=5e-4, tolerance=1e-10, gradient=gradient
+        )
 
     _, run = build({}, "none")
     assert run.energy_residual_rel < 1e-3
@@ -180,7 +209,9 @@ def test_a_standard_linear_solid_keeps_its_energy_and_its_gradients() -> None:
     )  # fmt: skip
     assert forward.sensitivities is not None
     for k, name in enumerate(names):
-        assert float(forward.sensitivities[-1, 1, k]) == pytest.approx(float(model.parameter(name).grad), rel=1e-8), name
+        assert float(forward.sensitivities[-1, 1, k]) == pytest.approx(float(model.parameter(name).grad), rel=1e-8), (
+            name
+        )
 
 
 # --- other rigs -------------------------------------------------------------------------------------------------------------
@@ -265,8 +296,13 @@ def test_two_driven_turning_pads_balance_energy_and_momentum() -> None:
         assert abs(float(moment)) < 1e-11 + 1e-9 * abs(float(left["lower_spin"]))
         where = rig.layout.slices["velocity", "disc"]
         disc = rig.bodies["disc"]
-        gained = rig(run.t[i], run.y[i].detach())[where] * torch.stack(disc.masses) + torch.tensor([0.0, 0.4065 * 9.81, 0.0]).double()
-        assert torch.allclose(gained.detach(), run.load["disc"][i], rtol=1e-7, atol=1e-6)  # what runs is what torch says
+        gained = (
+            rig(run.t[i], run.y[i].detach())[where] * torch.stack(disc.masses)
+            + torch.tensor([0.0, 0.4065 * 9.81, 0.0]).double()
+        )
+        assert torch.allclose(
+            gained.detach(), run.load["disc"][i], rtol=1e-7, atol=1e-6
+        )  # what runs is what torch says
 
 
 def test_power_is_balanced_where_the_bases_turn() -> None:
@@ -283,13 +319,16 @@ def test_power_is_balanced_where_the_bases_turn() -> None:
         contacts = {name: port for name, port in graph.ports.items() if not port.source}
         left = net_efforts(contacts, rig.junctions)
         drive = -sum(
-            (left[b][0] @ state.velocity[b][:2]) + left[f"{b}_spin"][0, 0] * state.velocity[b][2] for b in ("lower", "upper")
+            (left[b][0] @ state.velocity[b][:2]) + left[f"{b}_spin"][0, 0] * state.velocity[b][2]
+            for b in ("lower", "upper")
         )
         balance = sum(supplied(graph).values()) + drive - sum(dissipated(rig, state, graph).values())
         assert float(stored_rate) == pytest.approx(float(balance), rel=1e-5, abs=1e-8)
 
 
-@pytest.mark.parametrize("name", ["rubber.E", "rubber.tau", "rubber.nu", "contact.K_n", "contact.K_t", "contact.friction.mu_s"])
+@pytest.mark.parametrize(
+    "name", ["rubber.E", "rubber.tau", "rubber.nu", "contact.K_n", "contact.K_t", "contact.friction.mu_s"]
+)
 def test_gradients_of_a_final_pose_between_turning_pads(name: str) -> None:
     def pose(rig: Rig, y0: Tensor, gradient: str) -> Tensor:
         run = simulate(rig, times(0.2, 3), y0=y0, step=1e-3, tolerance=1e-10, gradient=gradient)
@@ -308,7 +347,9 @@ def test_gradients_of_a_final_pose_between_turning_pads(name: str) -> None:
 def test_gradients_reach_the_motion_of_driven_pads() -> None:
     def end(turn: float, travel: float) -> tuple[list[Tensor], Tensor]:
         knots = [torch.tensor(v, dtype=torch.float64, requires_grad=True) for v in (turn, travel)]
-        rig = hand(**{"lower.theta": Profile([0.0, 0.1], [0.0, knots[0]]), "upper.x": Profile([0.0, 0.1], [0.0, knots[1]])})
+        rig = hand(
+            **{"lower.theta": Profile([0.0, 0.1], [0.0, knots[0]]), "upper.x": Profile([0.0, 0.1], [0.0, knots[1]])}
+        )
         run = simulate(rig, times(0.1, 3), y0=grasped(), step=1e-3, tolerance=1e-10, gradient="discrete")
         return knots, run["theta_disc"][-1] + 1e2 * run["y_disc"][-1]
 
@@ -325,7 +366,11 @@ def test_a_third_pad_is_one_more_entry_of_the_lists() -> None:
     soft, contact, height = rubber(), law(), MESH.height
     jaw = {"y": RADIUS + height, "theta": 0.0, "weighted": False}
     rig = Rig(
-        bodies={"disc": Body(0.4065, Circle(RADIUS)), "left": Body(x="driven", **jaw), "right": Body(x="driven", **jaw)},
+        bodies={
+            "disc": Body(0.4065, Circle(RADIUS)),
+            "left": Body(x="driven", **jaw),
+            "right": Body(x="driven", **jaw),
+        },
         pads={
             "floor": Pad(MESH, soft, origin=(-30e-3, 0.0)),
             "left": Pad(MESH, soft, base="left", origin=(0.0, 30e-3), angle=-torch.pi / 2),
@@ -376,7 +421,9 @@ def test_contact_points_between_nodes_have_exact_gradients_and_less_ripple() -> 
         y0 = rest(model).detach()
         reference = grasp(model, y0)
         set_values(model, values)
-        return model, simulate(model, times(0.14, 8), y0=y0, reference=reference, step=1e-3, tolerance=1e-10, gradient=gradient)
+        return model, simulate(
+            model, times(0.14, 8), y0=y0, reference=reference, step=1e-3, tolerance=1e-10, gradient=gradient
+        )
 
     check_gradient(
         build, ["contact.K_n", "contact.K_t", "pad.E", "pad.tau"], lambda run: 1e2 * run["y_C"][-1] + run["theta"][-1], 2e-5,

@@ -295,7 +295,11 @@ def test_gradients_of_other_rigs_by_differences(name: str) -> None:
         p, finer = parameters[label], 1e-2 if "radius" in label else 1.0
         wide, narrow = (central_difference(loss, p, finer * h) * p.item() for h in (1e-4, 5e-5))
         judge = (4 * narrow - wide) / 3
-        assert abs(found[label] - judge) <= 1e-5 * max(abs(judge), 1e-2 * abs(found[largest[0]])), (label, found[label], judge)
+        assert abs(found[label] - judge) <= 1e-5 * max(abs(judge), 1e-2 * abs(found[largest[0]])), (
+            label,
+            found[label],
+            judge,
+        )
 
 
 def test_gradient_by_the_initial_state_and_the_reference() -> None:
@@ -387,11 +391,13 @@ def test_simulate_names_what_is_wrong_with_what_is_wanted() -> None:
         simulate(w.model, w.t, y0=w.y0, step=w.step, gradient="discrete", wrt=["contact.K_n"])
     with pytest.raises(ValueError, match=r"`dy0` must have shape \(376, 1\), but has \(3, 1\)"):
         forward(["contact.K_n"], dy0=torch.zeros(3, 1, dtype=torch.float64))
-    with pytest.raises(ValueError, match="`contact.epsilon` must be a scalar parameter that requires a gradient"):
+    with pytest.raises(ValueError, match=r"`contact\.epsilon` must be a scalar parameter that requires a gradient"):
         forward(["contact.epsilon"])
 
 
 def test_defaults_of_parameters_are_the_windows() -> None:
     """The names above are those of `Parameters`, and their values are what the model was made with."""
     model, table = coarse(), Parameters().override({"contact.v_s": 0.05}).table()
-    assert {name: p.item() for name, p in scalars(model).items()} == {name: table[name]["value"] for name in scalars(model)}
+    assert {name: p.item() for name, p in scalars(model).items()} == {
+        name: table[name]["value"] for name in scalars(model)
+    }

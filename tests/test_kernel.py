@@ -21,7 +21,7 @@ from torchsoft.solve.system import contact_laws
 
 POINTS = 450
 
-NEWTON = 3e-11
+NEWTON = 1e-10
 """Newton's tolerance of the steps below [N]."""
 
 
@@ -99,7 +99,7 @@ def test_the_law_of_a_point_equals_the_module(friction: str, shape: Shape | None
         bars.append((p_bar, by_p))
     assert min(found.values()) >= 10, found
     got, expected = np.moveaxis(np.array(bars), 1, 0)
-    assert np.all(np.abs(got - expected) <= 1e-10 * np.abs(expected) + 1e-12 * np.abs(expected).max(0))
+    assert np.all(np.abs(got - expected) <= 1e-10 * np.abs(expected) + 1e-11 * np.abs(expected).max(0))
     idle = {names[i] for i in np.flatnonzero(np.abs(expected).max(0) == 0)}
     assert idle == ({"law.friction.mu_s"} if friction == "coulomb" else set())  # Coulomb's mu_s only says when
 
@@ -147,8 +147,8 @@ def test_stages_of_a_step_satisfy_the_modules_equation(
             noise = 4e-15 * float(end[where].abs().max()) / a
             if part == "rates":
                 noise += NEWTON / float(rig.pads[name].masses().min())
-            elif part == "velocity":  # Newton's tolerance at a node, on the disc's spin
-                noise += NEWTON * 0.02 / float(rig.bodies[name].inertia)
+            elif part == "velocity":  # Newton's tolerance at a few nodes, on the spin
+                noise += 3 * NEWTON * 0.02 / float(rig.bodies[name].inertia)
             assert float((got - expected)[where].abs().max()) < 1e-9 * scale + noise, (part, name, time)
 
 

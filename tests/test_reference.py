@@ -91,13 +91,14 @@ def test_light_shaking_is_the_reference() -> None:
     columns = []
     for name in names:
         p = model.parameter(name)
-        keep, ones = held_displacements(model, y0), torch.zeros(model.layout.size, dtype=torch.float64, requires_grad=True)
+        keep, ones = (
+            held_displacements(model, y0),
+            torch.zeros(model.layout.size, dtype=torch.float64, requires_grad=True),
+        )
         (pulled,) = torch.autograd.grad((keep * ones).sum(), p, create_graph=True, allow_unused=True)
         columns.append(torch.zeros_like(y0) if pulled is None else torch.autograd.grad(pulled, ones)[0])
     t = torch.linspace(0, 2, 401, dtype=torch.float64)
-    run = simulate(
-        model, t, y0=y0, step=5e-4, gradient="forward", wrt=names, dy0=torch.stack(columns, -1), rigid=True
-    )
+    run = simulate(model, t, y0=y0, step=5e-4, gradient="forward", wrt=names, dy0=torch.stack(columns, -1), rigid=True)
     found = series(run)
     for name, value in reference["end"].items():
         extent = float(found[name].max() - found[name].min())

@@ -7,7 +7,20 @@ import torch
 from conftest import coarse, random_state
 
 from torchsoft import (
-    Actuator, Body, Circle, Contact, KelvinVoigt, Pad, PadMesh, PD, Rig, SmoothSlip, SoftContact, SoftGrasp, hold, rest,
+    PD,
+    Actuator,
+    Body,
+    Circle,
+    Contact,
+    KelvinVoigt,
+    Pad,
+    PadMesh,
+    Rig,
+    SmoothSlip,
+    SoftContact,
+    SoftGrasp,
+    hold,
+    rest,
 )  # fmt: skip
 from torchsoft.parameters import Parameters
 from torchsoft.physics.paper import NAMES
@@ -143,11 +156,23 @@ def small(**changes: object) -> Rig:
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"pads": lambda m, r, c: {"P": Pad(m, r, base="hand")}}, "pad `P` is bonded to `hand`, but the bodies are disc"),
+        (
+            {"pads": lambda m, r, c: {"P": Pad(m, r, base="hand")}},
+            "pad `P` is bonded to `hand`, but the bodies are disc",
+        ),
         ({"pads": lambda m, r, c: {"P": Pad(m, r, base="disc")}}, "is bonded to the body `disc` itself"),
-        ({"contacts": lambda m, r, c: {"d": Contact("Q", "disc", c)}}, "contact `d` is between `Q` and `disc`, which are not"),
-        ({"contacts": lambda m, r, c: {"d": Contact("P", "dish", c)}}, "contact `d` is between `P` and `dish`, which are not"),
-        ({"bodies": lambda m, r, c: {"disc": Body(0.4, theta=0.0)}}, "contact `c` needs a shape, but the body `disc` has none"),
+        (
+            {"contacts": lambda m, r, c: {"d": Contact("Q", "disc", c)}},
+            "contact `d` is between `Q` and `disc`, which are not",
+        ),
+        (
+            {"contacts": lambda m, r, c: {"d": Contact("P", "dish", c)}},
+            "contact `d` is between `P` and `dish`, which are not",
+        ),
+        (
+            {"bodies": lambda m, r, c: {"disc": Body(0.4, theta=0.0)}},
+            "contact `c` needs a shape, but the body `disc` has none",
+        ),
         (
             {"actuators": lambda m, r, c: {"a": Actuator("disc.x", "disc.up", PD(1.0, 1.0), setpoint="w")}},
             r"actuator `a` speaks of `disc\.up`, which is not a coordinate; there are disc\.x, disc\.y, disc\.theta",

@@ -7,7 +7,19 @@ import pytest
 import torch
 from conftest import COARSE, coarse, f64, grasped, times
 
-from torchsoft import Actuator, Body, Contact, PD, Parameters, Profile, Reference, Rig, SimulationFailed, SoftGrasp, simulate
+from torchsoft import (
+    PD,
+    Actuator,
+    Body,
+    Contact,
+    Parameters,
+    Profile,
+    Reference,
+    Rig,
+    SimulationFailed,
+    SoftGrasp,
+    simulate,
+)
 from torchsoft.physics.energy import stored
 from torchsoft.scenario import grasp_and_roll
 from torchsoft.solve.stepper import ImplicitStepper, Segment

@@ -19,7 +19,8 @@ from torchsoft.solve.trajectory import Trajectory
 register()
 
 __all__ = [
-    "METHOD", "PD", "Actuator", "Body", "Circle", "Contact", "Coulomb", "Ellipse", "Interrupted", "KelvinVoigt", "NoEquilibrium",
+    "METHOD", "PD", "Actuator", "Body", "Circle", "Contact", "Coulomb", "Ellipse", "Interrupted", "KelvinVoigt",
+    "NoEquilibrium",
     "Pad", "PadMesh", "Parameters", "Profile", "Reference", "Rig", "Sampled", "Shape", "SimulationFailed", "SmoothSlip",
     "SoftContact", "SoftGrasp", "StandardLinearSolid", "Trajectory", "hold", "press", "rest", "simulate",
 ]  # fmt: skip

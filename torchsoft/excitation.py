@@ -11,10 +11,10 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
-from torchsoft.physics.motion import Profile, Reference
-from torchsoft.physics.equilibrium import holding_force, press, rest
-from torchsoft.physics.paper import SoftGrasp, apart
 from torchsoft.parameters import Parameters
+from torchsoft.physics.equilibrium import holding_force, press, rest
+from torchsoft.physics.motion import Profile, Reference
+from torchsoft.physics.paper import SoftGrasp, apart
 
 FADE = 0.15
 """Time [s] over which waves come and go."""

@@ -60,7 +60,9 @@ class ContactParameters(Group):
     friction: Literal["smooth", "coulomb"] = quantity(
         "smooth", "1", "assumed", "slip element, or Eq. 12-13 with the force's modulus and re-anchoring"
     )
-    points: int = quantity(0, "1", "assumed", "contact points an element; 0 puts one on every node, as the paper does", ge=0, le=8)
+    points: int = quantity(
+        0, "1", "assumed", "contact points an element; 0 puts one on every node, as the paper does", ge=0, le=8
+    )
 
     @model_validator(mode="after")
     def _laws_are_well_posed(self) -> Self:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchsoft.physics.motion import Profile, Reference
 from torchsoft.physics.equilibrium import NoEquilibrium, rest
+from torchsoft.physics.motion import Profile, Reference
 from torchsoft.physics.paper import SoftGrasp
 from torchsoft.solve.simulate import simulate
 

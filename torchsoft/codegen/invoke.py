@@ -35,19 +35,21 @@ def _call(address: Any, *arrays: Any) -> tuple[Any, Any]:
     return types.void(address, *arrays), code
 
 
-@intrinsic
-def call_value(typingctx, address, x, p, out):
+def _value(typingctx, address, x, p, out):
     """Value of the law at `address`: out[o]."""
     return _call(address, x, p, out)
 
 
-@intrinsic
-def call_linearise(typingctx, address, x, p, out, J):
+def _linearise(typingctx, address, x, p, out, J):
     """Value out[o] and Jacobian J[o, i] of the law at `address`."""
     return _call(address, x, p, out, J)
 
 
-@intrinsic
-def call_pullback(typingctx, address, x, p, w, p_bar):
+def _pullback(typingctx, address, x, p, w, p_bar):
     """Adds Σ w[o]·∂out[o]/∂p[j] to p_bar[j]."""
     return _call(address, x, p, w, p_bar)
+
+
+call_value: Any = intrinsic(_value)
+call_linearise: Any = intrinsic(_linearise)
+call_pullback: Any = intrinsic(_pullback)

@@ -1,6 +1,7 @@
 """Massless pads: their surface rates at one state, from the relation between nodal forces and the contact law.
 
-u' = free + P F with P = C sum of J / (tau + a h) and free = -C sum of J z / (tau + a h); `stage` = a h is zero for the ODE itself.
+u' = free + P F with P = C sum of J / (tau + a h) and free = -C sum of J z / (tau + a h); `stage` = a h is zero for the
+ODE itself.
 """
 
 from __future__ import annotations
@@ -74,7 +75,7 @@ def solve_rates(rig: Rig, name: str, own: Sequence[str], state: State, u: Tensor
             touching[key] = found
     if not touching:
         return free
-    loaded = torch.nonzero(sum(pad.spread[which].any(0) for which in touching.values()))[:, 0]
+    loaded = torch.nonzero(torch.cat([pad.spread[which] for which in touching.values()]).any(0))[:, 0]
     dofs = (2 * loaded[:, None] + torch.arange(2)).flatten()
     P = P[:, dofs]
     P_aa, free_a = P[dofs], free[..., loaded, :]

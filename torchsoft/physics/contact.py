@@ -7,7 +7,7 @@ adhesion, and the moving frame, which follows the point on the body nearest to t
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -76,7 +76,7 @@ class SmoothSlip(nn.Module):
     only if eta + R >= (mu_s - mu_k) F_N / v_s.
     """
 
-    limits = {"mu_s": "not negative", "mu_k": "not negative", "v_s": "positive", "eta": "not negative"}
+    limits: ClassVar = {"mu_s": "not negative", "mu_k": "not negative", "v_s": "positive", "eta": "not negative"}
 
     def __init__(self, mu_s: float, mu_k: float, v_s: float, eta: float) -> None:
         super().__init__()
@@ -99,7 +99,7 @@ class Coulomb(nn.Module):
     onset unless mu_s = mu_k: gradients across it are biased.
     """
 
-    limits = {"mu_s": "not negative", "mu_k": "not negative"}
+    limits: ClassVar = {"mu_s": "not negative", "mu_k": "not negative"}
 
     def __init__(self, mu_s: float, mu_k: float) -> None:
         super().__init__()
@@ -113,7 +113,13 @@ class SoftContact(nn.Module):
     """The contact elements of one point, per reference spacing: springs K_n, K_t [N/m], dashpots R_n, R_t [N.s/m], the ramp's
     depth epsilon [m], and a friction law. `weight` scales them to the length of surface that a point stands for."""
 
-    limits = {"K_n": "positive", "R_n": "not negative", "K_t": "positive", "R_t": "not negative", "epsilon": "positive"}
+    limits: ClassVar = {
+        "K_n": "positive",
+        "R_n": "not negative",
+        "K_t": "positive",
+        "R_t": "not negative",
+        "epsilon": "positive",
+    }
 
     def __init__(
         self, K_n: float, R_n: float, K_t: float, R_t: float, *, friction: SlipLaw, epsilon: float = 1e-6,
@@ -125,7 +131,13 @@ class SoftContact(nn.Module):
         self.node_spacing, self.friction = node_spacing, friction
 
     def forward(
-        self, g: Tensor, g_dot: Tensor, v_T: Tensor, s: Tensor, weight: Tensor | float = 1.0, stage: Tensor | float = 0.0
+        self,
+        g: Tensor,
+        g_dot: Tensor,
+        v_T: Tensor,
+        s: Tensor,
+        weight: Tensor | float = 1.0,
+        stage: Tensor | float = 0.0,
     ) -> ContactState:
         """Forces and rates from penetration g [m], its rate, sliding speed v_T [m/s] and stretch s [m], all (...).
 

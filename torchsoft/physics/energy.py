@@ -31,7 +31,9 @@ def stored(rig: Rig, state: State, displacement: Mapping[str, Tensor] | None = N
     zero = torch.zeros_like(next(iter(state.pose.values()))[..., 0])
     normal, tangential = zero, zero
     for name, contact in rig.contacts.items():
-        parts = contact.law.stored(rig.penetration(name, state, known.get(contact.pad)), state.stretch[name], rig.weight(name))
+        parts = contact.law.stored(
+            rig.penetration(name, state, known.get(contact.pad)), state.stretch[name], rig.weight(name)
+        )
         normal, tangential = normal + parts[0].sum(-1), tangential + parts[1].sum(-1)
     energies["normal_springs"], energies["tangential_springs"] = normal, tangential
     for name, body in rig.bodies.items():

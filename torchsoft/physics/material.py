@@ -5,6 +5,8 @@ compliance of the relaxed material, J_b the fractions of it, and z_b the part of
 tau_b z_b' + z_b = f.
 """
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor, nn
 
@@ -15,7 +17,7 @@ from torchsoft.physics.shapes import parameter
 class Material(nn.Module):
     """What a pad asks of its material: E [Pa] (relaxed), nu [1], rho [kg/m3], the out-of-plane depth [m], and a chain."""
 
-    limits = {"E": "positive", "nu": "between -1 and 0.5", "rho": "positive", "depth": "positive"}
+    limits: ClassVar = {"E": "positive", "nu": "between -1 and 0.5", "rho": "positive", "depth": "positive"}
 
     def __init__(self, E: float, nu: float, rho: float, depth: float) -> None:
         super().__init__()
@@ -33,7 +35,7 @@ class Material(nn.Module):
 class KelvinVoigt(Material):
     """One retardation time tau [s]: R = tau K, the paper's constant R field."""
 
-    limits = Material.limits | {"tau": "positive"}
+    limits: ClassVar = Material.limits | {"tau": "positive"}
 
     def __init__(self, E: float, nu: float, rho: float, tau: float, depth: float) -> None:
         super().__init__(E, nu, rho, depth)
@@ -49,7 +51,7 @@ class StandardLinearSolid(Material):
     The spring's own retardation time tau_instant [s] is small, not zero, so that the rates are functions of the state.
     """
 
-    limits = Material.limits | {"E_instant": "positive", "tau": "positive", "tau_instant": "positive"}
+    limits: ClassVar = Material.limits | {"E_instant": "positive", "tau": "positive", "tau_instant": "positive"}
 
     def __init__(
         self, E: float, E_instant: float, nu: float, rho: float, tau: float, depth: float, tau_instant: float = 1e-4

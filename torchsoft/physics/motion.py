@@ -22,7 +22,11 @@ class Profile(nn.Module):
         knots = torch.as_tensor(times, dtype=torch.float64)
         if knots.ndim != 1 or not bool(torch.all(knots.diff() > 0)) or not bool(torch.isfinite(knots).all()):
             raise ValueError(f"`times` must increase strictly, but are {times}")
-        many = values if isinstance(values, Tensor) else torch.stack([torch.as_tensor(v, dtype=torch.float64) for v in values])
+        many = (
+            values
+            if isinstance(values, Tensor)
+            else torch.stack([torch.as_tensor(v, dtype=torch.float64) for v in values])
+        )
         if many.shape != knots.shape or not bool(torch.isfinite(many).all()):
             raise ValueError(f"`values` must hold one finite number per time ({len(knots)}), but are {values}")
         self.register_buffer("times", knots)
@@ -83,7 +87,9 @@ class Reference(nn.Module):
         super().__init__()
         for name, signal in signals.items():
             if not isinstance(signal, nn.Module):
-                raise ValueError(f"the signal `{name}` must be a module such as `Profile`, but is {type(signal).__name__}")
+                raise ValueError(
+                    f"the signal `{name}` must be a module such as `Profile`, but is {type(signal).__name__}"
+                )
         self.signals = nn.ModuleDict({name.replace(".", ":"): signal for name, signal in signals.items()})
 
     def forward(self, t: Tensor, names: Sequence[str]) -> Tensor:

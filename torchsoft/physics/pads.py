@@ -4,6 +4,8 @@ Displacements are in the frame of the base, which turns with it. A massless pad'
 nodal forces that have set in, branch by branch of its material's chain; an inertial pad's its displacements and velocities.
 """
 
+from typing import Any
+
 import numpy as np
 import torch
 from scipy import sparse
@@ -24,6 +26,7 @@ class Pad(nn.Module):
     """
 
     positions: Tensor
+    origin: Tensor
     surface: Tensor
     axes: Tensor
 
@@ -90,14 +93,14 @@ class Pad(nn.Module):
         return self.material.rho * self.material.depth * torch.from_numpy(self.mesh.nodal_areas)
 
     def stiffness(self, modulus: int) -> sparse.csr_array:
-        """ K_lambda (0) or K_mu (1) per modulus and depth, in the base's axes."""
+        """K_lambda (0) or K_mu (1) per modulus and depth, in the base's axes."""
         turn = sparse.kron(sparse.eye_array(len(self.mesh.free)), self.axes.numpy())
         return sparse.csr_array(turn @ self.mesh.assemble(self.mesh.matrices[modulus]) @ turn.T)
 
     def static_displacement(self, F: Tensor) -> Tensor:
         """Displacements (nodes, 2) [m] of an inertial pad's nodes under forces F (surface, 2) [N] on its surface, with their
         derivative by E, depth and F; the one by nu is left out."""
-        moduli = [x.item() for x in lame_moduli(1.0, self.material.nu.detach())]
+        moduli = lame_moduli(1.0, self.material.nu.item())
         K = (moduli[0] * self.stiffness(0) + moduli[1] * self.stiffness(1)).tocsc()
         columns = (2 * self.surface[:, None] + torch.arange(2)).flatten()
         loads = np.zeros((2 * self.nodes, len(columns)))
@@ -122,7 +125,7 @@ class Pad(nn.Module):
         return f[..., :-1, :] @ self.axes.mT
 
 
-def contact_points(mesh: PadMesh, points: int) -> tuple[Array, Array, Array]:
+def contact_points(mesh: PadMesh, points: int) -> tuple[Any, Array, Array]:
     """Two surface nodes of every contact point (points, 2), their shape functions there, and the length of surface that the
     point stands for [m]."""
     count = len(mesh.surface)

@@ -58,9 +58,7 @@ class SoftGrasp(Rig):
             smooth = c.friction == "smooth"
             friction = SmoothSlip(c.mu_s, c.mu_k, c.v_s, c.eta) if smooth else Coulomb(c.mu_s, c.mu_k)
         rubber = material or KelvinVoigt(p.pad.E, p.pad.nu, p.pad.rho, p.pad.tau, p.pad.depth)
-        law = SoftContact(
-            c.K_n, c.R_n, c.K_t, c.R_t, friction=friction, epsilon=c.epsilon, node_spacing=c.node_spacing
-        )
+        law = SoftContact(c.K_n, c.R_n, c.K_t, c.R_t, friction=friction, epsilon=c.epsilon, node_spacing=c.node_spacing)
         disc = Body(p.disc.mass, shape or Circle(p.disc.radius))
         bracket = Body(p.bracket.mass, theta=0.0, weighted=False)
         control = nn.ModuleDict({"x": PD(k.K_81, k.R_80), "y": PD(k.K_98, k.R_99)})

@@ -1,7 +1,7 @@
 """The parts of a rig beside its pads: rigid bodies, contacts, and actuators with their control laws."""
 
 from collections.abc import Callable, Mapping
-from typing import Literal
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
@@ -23,7 +23,7 @@ class Body(nn.Module):
     `ValueError` for another coordinate, or a body without shape and inertia that may turn.
     """
 
-    limits = {"mass": "positive", "own_inertia": "positive"}
+    limits: ClassVar = {"mass": "positive", "own_inertia": "positive"}
 
     def __init__(
         self, mass: float = 1.0, shape: Shape | None = None, *, x: Freedom = "free", y: Freedom = "free",
@@ -69,7 +69,7 @@ class Contact(nn.Module):
 class PD(nn.Module):
     """A proportional-derivative law: F = Kp (w - q) + Kd (w' - q') + feed-forward (Eq. 31-34)."""
 
-    limits = {"Kp": "not negative", "Kd": "not negative"}
+    limits: ClassVar = {"Kp": "not negative", "Kd": "not negative"}
 
     def __init__(self, Kp: float, Kd: float) -> None:
         super().__init__()
@@ -82,7 +82,8 @@ class PD(nn.Module):
 class Actuator(nn.Module):
     """Measures one coordinate, such as "disc.x", and pushes one, such as "bracket.x", by a law.
 
-    `law` (setpoint, its rate, feed-forward, coordinate, its rate) -> effort [N or N.m] is torch code: a `PD`, a function, or any
+    `law` (setpoint, its rate, feed-forward, coordinate, its rate) -> effort [N or N.m] is torch code: a `PD`, a
+    function, or any
     module. `setpoint` and `feed_forward` name signals of the reference. `elements` are the graph's names of what is behind it.
     """
 

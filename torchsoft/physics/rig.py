@@ -72,9 +72,12 @@ class Rig(nn.Module):
         super().__init__()
         for name, module in (groups or {}).items():
             self.add_module(name, module)
-        order = sorted(contacts, key=lambda name: list(pads).index(contacts[name].pad) if contacts[name].pad in pads else -1)
+        order = sorted(
+            contacts, key=lambda name: list(pads).index(contacts[name].pad) if contacts[name].pad in pads else -1
+        )
         lists: Any = bodies, pads, {name: contacts[name] for name in order}, actuators or {}
-        self.bodies, self.pads, self.contacts, self.actuators = (nn.ModuleDict(parts) for parts in lists)
+        for name, parts in zip(("bodies", "pads", "contacts", "actuators"), lists):
+            self.add_module(name, nn.ModuleDict(parts))
         self.gravity = parameter(gravity)
         self.reference = reference or Reference()
         self.symbols = {name: (symbols or {}).get(name, name) for name in bodies}
@@ -96,11 +99,15 @@ class Rig(nn.Module):
                 )
         for name, contact in self.contacts.items():
             if contact.pad not in self.pads or contact.body not in self.bodies:
-                raise ValueError(f"contact `{name}` is between `{contact.pad}` and `{contact.body}`, which are not both there")
+                raise ValueError(
+                    f"contact `{name}` is between `{contact.pad}` and `{contact.body}`, which are not both there"
+                )
             if self.bodies[contact.body].shape is None:
                 raise ValueError(f"contact `{name}` needs a shape, but the body `{contact.body}` has none")
             if self.pads[contact.pad].base == contact.body:
-                raise ValueError(f"contact `{name}`: the pad `{contact.pad}` is bonded to the body `{contact.body}` itself")
+                raise ValueError(
+                    f"contact `{name}`: the pad `{contact.pad}` is bonded to the body `{contact.body}` itself"
+                )
         for name, actuator in self.actuators.items():
             for coordinate in (actuator.measures, actuator.pushes):
                 self.coordinate(coordinate, f"actuator `{name}`")
@@ -235,7 +242,10 @@ class Rig(nn.Module):
             u_dot = graph.ports[f"pad_{name}"].transformer.flow(graph.flows)
             if pad.inertial:
                 angle = self.base_motion(name, state)[0][..., 2]
-                pads[name], rates[name] = u_dot, turned(effort[f"pad_{name}"], -angle[..., None]) / pad.masses()[:, None]
+                pads[name], rates[name] = (
+                    u_dot,
+                    turned(effort[f"pad_{name}"], -angle[..., None]) / pad.masses()[:, None],
+                )
             else:
                 f, (_, times) = graph.ports[f"pad_{name}"].effort, pad.material.chain()
                 pads[name] = (f[..., None, :, :] - state.pads[name]) / times[:, None, None]
@@ -265,7 +275,9 @@ class Rig(nn.Module):
     def evaluate(self, t: Tensor | float, state: State, signals: Tensor | None = None) -> Evaluation:
         """The multibond graph at time t [s] and one state: every port with its transformer and effort, world axes."""
         like = next(iter(state.pose.values()))
-        signals = self.follow(torch.as_tensor(t, dtype=torch.float64).expand(like.shape[:-1])) if signals is None else signals
+        signals = (
+            self.follow(torch.as_tensor(t, dtype=torch.float64).expand(like.shape[:-1])) if signals is None else signals
+        )
         flows = {GROUND: torch.zeros_like(like)[..., None, :2]}
         for name in self.bodies:
             flows[name] = state.velocity[name][..., None, :2]
@@ -290,9 +302,7 @@ class Rig(nn.Module):
             ports[f"pad_{name}"] = self._pad_port(name, own, ports, u, u_dot, moment_arm, angle)
         return Evaluation(ports | self._sources(state, signals), flows, interfaces)
 
-    def _interface(
-        self, key: str, state: State, u: Tensor, u_dot: Tensor, flows: Mapping[str, Tensor]
-    ) -> Interface:
+    def _interface(self, key: str, state: State, u: Tensor, u_dot: Tensor, flows: Mapping[str, Tensor]) -> Interface:
         contact = self.contacts[key]
         pad, body = self.pads[contact.pad], self.bodies[contact.body]
         assert body.shape is not None
@@ -310,7 +320,14 @@ class Rig(nn.Module):
         return Interface(frame, interface_law(contact.law, body.shape, x), transformer, transformer.flow(flows))
 
     def _pad_port(
-        self, name: str, own: list[str], ports: Mapping[str, Port], u: Tensor, u_dot: Tensor, moment_arm: Tensor, angle: Tensor
+        self,
+        name: str,
+        own: list[str],
+        ports: Mapping[str, Port],
+        u: Tensor,
+        u_dot: Tensor,
+        moment_arm: Tensor,
+        angle: Tensor,
     ) -> Port:
         """The pad's viscoelastic field on its strain rate: node velocities less those of what it is bonded to (Fig. 7)."""
         pad, key = self.pads[name], f"pad_{name}"
@@ -342,7 +359,11 @@ class Rig(nn.Module):
             measured, _, _ = actuator.measures.partition(".")
             force = self.actuator_effort(name, state, signals)
             spin = axis == "theta"
-            row = torch.ones(1, 1, 1, dtype=torch.float64) if spin else identity(2, force)[:, COORDINATES.index(axis), None]
+            row = (
+                torch.ones(1, 1, 1, dtype=torch.float64)
+                if spin
+                else identity(2, force)[:, COORDINATES.index(axis), None]
+            )
             out[f"control_{name}"] = Port(
                 Transformer({f"{body}_spin" if spin else body: Block(row)}), force[..., None, None], actuator.elements, True,
                 senses=(measured,) if measured != body else (),

@@ -4,6 +4,8 @@ The contact asks nothing else of a body, so another shape is another class here:
 `forward`.
 """
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor, nn
 
@@ -46,7 +48,7 @@ class Shape(nn.Module):
 class Circle(Shape):
     """A disc of radius R [m] about its centre of mass. Not smooth at the centre."""
 
-    limits = {"radius": "positive"}
+    limits: ClassVar = {"radius": "positive"}
 
     def __init__(self, radius: float) -> None:
         super().__init__()
@@ -71,7 +73,7 @@ class Ellipse(Shape):
     inner part of the axes, far from the boundary.
     """
 
-    limits = {"a": "positive", "b": "positive"}
+    limits: ClassVar = {"a": "positive", "b": "positive"}
     ITERATIONS = 12
 
     def __init__(self, a: float, b: float) -> None:

@@ -49,7 +49,9 @@ class Layout:
     @property
     def rigid(self) -> list[int]:
         """Components of the bodies' free coordinates, then of their rates."""
-        return [i for (part, _), s in self.slices.items() if part in ("pose", "velocity") for i in range(s.start, s.stop)]
+        return [
+            i for (part, _), s in self.slices.items() if part in ("pose", "velocity") for i in range(s.start, s.stop)
+        ]
 
     def check(self, y: Tensor) -> None:
         """Raises `ValueError` for another length or dtype than float64."""

@@ -24,7 +24,8 @@ class GradientFailed(RuntimeError):
 
 
 def iterate(stepper: ImplicitStepper, y0: Tensor, t: Tensor) -> Iterator[tuple[Tensor, Progress]]:
-    """States (T, size) at the times t (T,) as the run grows; the last yield has the discrete adjoint behind it, if anything that
+    """States (T, size) at the times t (T,) as the run grows; the last yield has the discrete adjoint behind it, if
+    anything that
     the run was made with wants a gradient and gradients are enabled: y0 (size,), parameters, signals, but not t."""
     segments: list[Segment] | None = [] if torch.is_grad_enabled() and wants_gradient(stepper, y0) else None
     out = None

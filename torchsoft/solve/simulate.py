@@ -47,7 +47,8 @@ def simulate(
     gradient: with "discrete" the states and channels of the result carry the exact gradient of the discrete run by y0, every
     parameter and the reference; recorded nodal forces and energies do not. With "forward" `sensitivities` holds the derivatives
     by the scalar parameters `wrt`, dy0 (size, n) being that of the start; `rigid` keeps those of the free coordinates and their
-    rates only. "unrolled" takes the same steps in plain torch, "continuous" torchdiffeq's explicit steps and adjoint: both slow,
+    rates only. "unrolled" takes the same steps in plain torch, "continuous" torchdiffeq's explicit steps and adjoint:
+    both slow,
     for cross checks over short windows. Under `torch.no_grad()` no route records a graph.
 
     Raises `ValueError` for times that do not increase, a state of the wrong shape or dtype, an unknown route or parameter;
@@ -93,7 +94,13 @@ def simulate(
 
 
 def _rows(
-    stepper: ImplicitStepper, y0: Tensor, t: Tensor, gradient: Route, wrt: Sequence[str], dy0: Tensor | None, rigid: bool
+    stepper: ImplicitStepper,
+    y0: Tensor,
+    t: Tensor,
+    gradient: Route,
+    wrt: Sequence[str],
+    dy0: Tensor | None,
+    rigid: bool,
 ) -> Iterator[tuple[Tensor, Tensor | None, Progress]]:
     """The growing run by one of the compiled routes."""
     if gradient == "forward":
@@ -131,7 +138,11 @@ def diagnose(rig: Rig, failure: SimulationFailed, trajectory: Trajectory) -> Sim
         cause = describe_instability(rig) if isinstance(rig, SoftGrasp) else ""
     except RuntimeError:  # a rig that cannot grasp has no grasp to linearise
         cause = ""
-    reason = f"the disc was lost at t = {failure.time:.4f} s: {cause} (the run ended with: {failure})" if cause else str(failure)
+    reason = (
+        f"the disc was lost at t = {failure.time:.4f} s: {cause} (the run ended with: {failure})"
+        if cause
+        else str(failure)
+    )
     out = SimulationFailed(reason, failure.time)
     out.trajectory = trajectory
     return out

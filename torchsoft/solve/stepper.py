@@ -93,8 +93,10 @@ class ImplicitStepper:
 
     `step` [s] is the largest step; every output interval is cut into equal steps no longer than it. Newton stops when
     the contact law and the linear relations agree to `tolerance` [N] at every node; a step that it does not solve is taken as
-    two of half the length, and so on up to `HALVINGS` times. `window` [m] is how near a point has to be to count as one that may
-    touch (checked after every stage; only speed depends on it).
+    two of half the length, and so on up to `HALVINGS` times. `window` [m] is how near a point has to be to count as one
+    that may
+    touch (checked after every stage; only speed depends on it). A tolerance below about 1e-10 N is below rounding: steps are
+    then halved for nothing.
     """
 
     def __init__(
@@ -121,7 +123,8 @@ class ImplicitStepper:
     ) -> Iterator[Progress]:
         """Step from y0 (size,) through t (T,), yielding the same growing `Progress` after every compiled call.
 
-        The last yield is the complete run. With `segments` given, what the derivatives need is appended to it, tapes for as long
+        The last yield is the complete run. With `segments` given, what the derivatives need is appended to it, tapes for
+        as long
         as they take less than `tape_bytes`. Raises `SimulationFailed`, and `ValueError` for a start that is not finite.
         """
         self.layout.check(y0)
@@ -194,7 +197,9 @@ class ImplicitStepper:
                 body = junction.removesuffix("_spin")
                 if body in loads:
                     loads[body][slice(2, 3) if junction.endswith("_spin") else slice(0, 2)] -= effort.numpy().ravel()
-        return np.concatenate((np.empty(0), *forces)).reshape(-1, 2), np.array([*moments, *np.concatenate([*loads.values()])])
+        return np.concatenate((np.empty(0), *forces)).reshape(-1, 2), np.array(
+            [*moments, *np.concatenate([*loads.values()])]
+        )
 
     def signals(self, todo: Sequence[Chunk]) -> Tensor:
         """The signals at all stages of some chunks (stages, signals, 2)."""
@@ -238,8 +243,8 @@ class ImplicitStepper:
     def _failure(self, status: int, time: float, h: float) -> SimulationFailed:
         reasons = {
             NEWTON_FAILED: f"Newton's iteration did not converge within {self.max_iterations} iterations in the step of "
-            f"{h:.3g} s, halved {HALVINGS} times; try a smaller step, or a larger v_s of the friction law: where friction falls "
-            "with slip faster than the pads damp, massless pads have no unique velocity",
+            f"{h:.3g} s, halved {HALVINGS} times; try a smaller step, or a larger v_s of the friction law: where friction "
+            "falls with slip faster than the pads damp, massless pads have no unique velocity",
             OFF_THE_PAD: "the body was lost: its contact reached the end of a pad",
             LOST: "the body was lost: it left the space over a pad",
             NOT_FINITE: "the state is not finite any more; check the parameters and the reference",

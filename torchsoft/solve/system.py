@@ -59,7 +59,8 @@ class _Called(nn.Module):
 
 
 def structure(module: object) -> Any:
-    """What decides a module's law beside its parameters' values, hashable: two modules of one structure have one law. None where
+    """What decides a module's law beside its parameters' values, hashable: two modules of one structure have one law.
+    None where
     that cannot be told: functions, hooks, attributes of other kinds than numbers and text."""
     if isinstance(module, nn.Module):
         own = {k: v for k, v in vars(module).items() if not k.startswith("_") and k != "training"}
@@ -78,9 +79,15 @@ _laws: dict[Any, Law] = {}
 
 
 def compiled_law(
-    names: Mapping[str, Tensor], function: Callable[..., Tensor], size: int, linear: int, differentiated: int, **modules: Any
+    names: Mapping[str, Tensor],
+    function: Callable[..., Tensor],
+    size: int,
+    linear: int,
+    differentiated: int,
+    **modules: Any,
 ) -> Law:
-    """The law of a function of modules and x (size,), differentiable in the first inputs and in the parameters `names`, of which
+    """The law of a function of modules and x (size,), differentiable in the first inputs and in the parameters `names`,
+    of which
     it may not use all. Raises `UnknownOperation` naming the line of a law that cannot be compiled."""
     decided = tuple((name, structure(module)) for name, module in modules.items())
     shapes = tuple((name, tuple(value.shape)) for name, value in names.items())
@@ -106,7 +113,7 @@ def _effort(actuator: nn.Module, x: Tensor) -> Tensor:
 
 def contact_laws(law: Any, shape: Any) -> LawSet:
     """The laws of a contact of `law` on a body of `shape`."""
-    parameters = dict(_Called(interface_law, law=law, shape=shape).named_parameters())
+    parameters: dict[str, Tensor] = dict(_Called(interface_law, law=law, shape=shape).named_parameters())
     return LawSet(
         compiled_law(parameters, distance_law, INPUTS, 0, 0, shape=shape),
         compiled_law(parameters, interface_law, INPUTS, 3, 7, law=law, shape=shape),
@@ -143,8 +150,9 @@ class Compiled:
         self._count += value.numel()
         return at
 
-    def _coordinate(self, name: str) -> int:
-        return self.rig.coordinate(name)
+    def _add_all(self, parameters: Mapping[str, Tensor]) -> int:
+        """Append the parameters of a law."""
+        return self._add(torch.cat([torch.zeros(0).double(), *(value.reshape(-1) for value in parameters.values())]))
 
     def _make_bodies(self, gravity_at: int, mass_at: list[list[int]]) -> Bodies:
         rig, free, signal, coordinate, masses, weight = self.rig, [], [], [], [], []
@@ -153,14 +161,19 @@ class Compiled:
             for i, axis in enumerate(COORDINATES):
                 kind = body.freedom[axis]
                 free.append(len(coordinate) if kind == "free" else -1)
-                signal.append(rig.signals.index(f"{name}.{axis}") if kind == "driven" else fixed if kind == "fixed" else -1)
+                signal.append(
+                    rig.signals.index(f"{name}.{axis}") if kind == "driven" else fixed if kind == "fixed" else -1
+                )
                 fixed += kind == "fixed"
                 if kind == "free":
                     coordinate.append(3 * b + i)
                     masses.append(mass_at[b][i])
                     weight.append(float(axis == "y" and body.weighted))
         slices = self.rig.layout.slices
-        starts = [min((s.start for (part, _), s in slices.items() if part == kind), default=0) for kind in ("pose", "velocity")]
+        starts = [
+            min((s.start for (part, _), s in slices.items() if part == kind), default=0)
+            for kind in ("pose", "velocity")
+        ]
         return Bodies(
             _ints([*free, -1, -1, -1]), _ints([*signal, -1, -1, -1]), _ints(coordinate), _ints(masses), np.array(weight),
             gravity_at, *starts,
@@ -172,7 +185,8 @@ class Compiled:
         followed = self.rig.follow(t, reference)
         if not bool(torch.isfinite(followed).all()):
             bad = torch.nonzero(~torch.isfinite(followed))[0].tolist()
-            raise ValueError(f"the signal `{self.rig.signals[bad[-2]]}` of the reference is not finite at t = {float(t[tuple(bad[:-2])]):g} s")
+            name, time = self.rig.signals[bad[-2]], float(t[tuple(bad[:-2])])
+            raise ValueError(f"the signal `{name}` of the reference is not finite at t = {time:g} s")
         if not fixed:
             return followed
         held = torch.stack([torch.stack(fixed), torch.zeros(len(fixed), dtype=torch.float64)], -1)
@@ -193,7 +207,9 @@ class Compiled:
             self._add(times)
             if pad.inertial:
                 if len(fractions) != 1:
-                    raise NotImplementedError(f"the inertial pad `{name}` needs a Kelvin-Voigt material (one retardation time)")
+                    raise NotImplementedError(
+                        f"the inertial pad `{name}` needs a Kelvin-Voigt material (one retardation time)"
+                    )
                 lame_lambda, lame_mu = material.lame()
                 density = material.rho * material.depth
                 material_at.append(
@@ -206,7 +222,9 @@ class Compiled:
             node_start.append(node_start[-1] + n)
             C_start.append(C_start[-1] + 4 * n * n)
             dofs.append(dofs[-1] + (2 * pad.nodes if pad.inertial else 0))
-            involved = {3 * list(rig.bodies).index(c.body) for c in rig.contacts.values() if c.pad == name} | {rows["base"][-1]}
+            involved = {3 * list(rig.bodies).index(c.body) for c in rig.contacts.values() if c.pad == name} | {
+                rows["base"][-1]
+            }
             mine = [i for i, c in enumerate(self._bodies.coordinate) if c // 3 * 3 in involved]
             columns[number, mine] = np.arange(len(mine))
         contact_start = np.searchsorted(contact_pads, np.arange(len(rig.pads) + 1))
@@ -247,7 +265,8 @@ class Compiled:
                 column[dofs[i] + row, : len(columns)] = columns
                 for k in range(2):
                     K[k][dofs[i] + row, : len(columns)] = stiffness[k][[row]].toarray()[0, columns]
-        return Inertia(
+        make: Any = Inertia
+        return make(
             _ints(dofs), surface, np.zeros((1, total)), np.ones(len(dofs) - 1, np.int64), X, area, column, *K, D,
             np.zeros((len(dofs) - 1, 2, 2)), _ints(material_at),
         )  # fmt: skip
@@ -257,14 +276,15 @@ class Compiled:
         for actuator in rig.actuators.values():
             parameters = {f"law.{k}": v for k, v in actuator.named_parameters()}
             law = compiled_law(parameters, _effort, 5, 1, 5, law=actuator)
-            starts.append(self._add(torch.cat([v.reshape(-1) for v in parameters.values()]) if parameters else rig.gravity.new_zeros(0)))
+            starts.append(self._add_all(parameters))
             feed = rig.signals.index(actuator.feed_forward) if actuator.feed_forward is not None else -1
             rows.append(
-                (law.linearise, law.pullback, self._coordinate(actuator.measures), self._coordinate(actuator.pushes),
+                (law.linearise, law.pullback, rig.coordinate(actuator.measures), rig.coordinate(actuator.pushes),
                  rig.signals.index(actuator.setpoint), feed)
             )  # fmt: skip
         linearise, pullback, measured, pushed, setpoint, feed_forward = _ints(rows).reshape(-1, 6).T
-        return Actuators(
+        make: Any = Actuators
+        return make(
             *(np.ascontiguousarray(x) for x in (linearise, pullback)), _ints([*starts, self._count]),
             *(np.ascontiguousarray(x) for x in (measured, pushed, setpoint, feed_forward)),
         )  # fmt: skip
@@ -274,10 +294,10 @@ class Compiled:
         X, weight, node, N = [], [], [], []
         for name, contact in rig.contacts.items():
             pad, shape = rig.pads[contact.pad], rig.bodies[contact.body].shape
+            assert shape is not None
             key = id(contact.law), id(shape)
-            laws = self._known.setdefault(key, None) or contact_laws(contact.law, shape)
-            self._known[key] = laws
-            starts.append(self._add(torch.cat([v.reshape(-1) for v in laws.parameters.values()])))
+            laws = self._known[key] = self._known.get(key) or contact_laws(contact.law, shape)
+            starts.append(self._add_all(laws.parameters))
             rows.append(
                 (list(rig.pads).index(contact.pad), 3 * list(rig.bodies).index(contact.body), laws.distance.value,
                  laws.interface.linearise, laws.interface.pullback, laws.free.value, laws.free.linearise, laws.free.pullback)
@@ -294,8 +314,13 @@ class Compiled:
             box = (*corners[:, 0][[corners[:, 0].argmin(), corners[:, 0].argmax()]], *np.sort(corners[:, 1])[[0, -1]])
             limits.append((-np.inf, np.inf, -np.inf, np.inf) if contact.may_leave else box)
         columns = [np.ascontiguousarray(x) for x in _ints(rows).reshape(-1, 8).T]
-        contacts = Contacts(
-            *columns, _ints([*starts, self._count]), _ints(point_start), np.array(sizes), np.array(limits).reshape(-1, 4)
+        make: Any = Contacts
+        contacts = make(
+            *columns,
+            _ints([*starts, self._count]),
+            _ints(point_start),
+            np.array(sizes),
+            np.array(limits).reshape(-1, 4),
         )
         start = min((s.start for (part, _), s in rig.layout.slices.items() if part == "stretch"), default=0)
         points = Points(
@@ -316,7 +341,8 @@ class Compiled:
         return self._systems[key]
 
     def _mobilities(self, a: float) -> tuple[Pads, Inertia]:
-        """Inertial pads' mobilities at the stage length a h [s]: surface rates per surface force, and per velocity of the base."""
+        """Inertial pads' mobilities at the stage length a h [s]: surface rates per surface force, and per velocity of
+        the base."""
         pads, inertia = self._pads._replace(C=self._pads.C.copy()), self._inertia
         parts, p = [], self.p.detach().numpy()
         D, B = inertia.D.copy(), inertia.B.copy()

@@ -16,7 +16,9 @@ def directions(value: Tensor, wanted: Sequence[Tensor]) -> Array:
     differentiated by them it pushes forward."""
     out = np.zeros((*value.shape, len(wanted)))
     weights = torch.zeros_like(value, requires_grad=True)
-    pulled = torch.autograd.grad(value, wanted, weights, create_graph=True, allow_unused=True) if value.requires_grad else ()
+    pulled = (
+        torch.autograd.grad(value, wanted, weights, create_graph=True, allow_unused=True) if value.requires_grad else ()
+    )
     for k, part in enumerate(pulled):
         if part is not None and part.requires_grad:
             (row,) = torch.autograd.grad(part, weights, retain_graph=True)

@@ -56,7 +56,9 @@ class TorchdiffeqSolver:
             options["step"] = options.pop("step_size")
         known = set(inspect.signature(ImplicitStepper).parameters) - {"rig", "reference"}
         if strange := set(options) - known:
-            raise ValueError(f"method='{METHOD}' has no option {sorted(strange)}; it has step_size, {', '.join(sorted(known))}")
+            raise ValueError(
+                f"method='{METHOD}' has no option {sorted(strange)}; it has step_size, {', '.join(sorted(known))}"
+            )
         self.model, self.y0 = model, y0
         self.adjoint_params: tuple[Tensor, ...] | None = augmented.get("adjoint_params")
         with torch.enable_grad():  # odeint_adjoint comes without; its parameters' gradients need the graph
@@ -88,7 +90,7 @@ class TorchdiffeqSolver:
             if parameters:
                 with torch.enable_grad():
                     made_of = self.stepper.compiled.p, self.stepper.signals([segment.chunk for segment in segments])
-                    value = sum((x * cotangent).sum() for x, cotangent in zip(made_of, cotangents))
+                    value = torch.cat([(x * cotangent).flatten() for x, cotangent in zip(made_of, cotangents)]).sum()
                     parts = torch.autograd.grad(value, parameters, allow_unused=True, retain_graph=True)
                 parts = [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, parts)]
                 bars = bars + torch.cat([part.flatten() for part in parts])

@@ -111,7 +111,12 @@ class Trajectory:
             nodes = ("time", f"{name}_node", "axis")
             columns[f"displacement_{name}"] = (nodes, u, "m", f"displacements of the pad {name}")
             if key in self.state.rates:
-                columns[f"velocity_{name}"] = (nodes, self.state.rates[key], "m/s", f"nodal velocities of the pad {name}")
+                columns[f"velocity_{name}"] = (
+                    nodes,
+                    self.state.rates[key],
+                    "m/s",
+                    f"nodal velocities of the pad {name}",
+                )
         for kind in ("energy", "dissipated", "supplied"):
             for name, value in getattr(self, kind).items():
                 columns[f"{kind}_{name}"] = (("time",), value, "J", f"{kind}: {name}")

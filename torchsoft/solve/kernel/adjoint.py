@@ -35,7 +35,9 @@ def rigid_part(s: Any, w: Any, y: Array, signals: Array, a: float, Rv: Array) ->
 
 
 @compiled
-def nodal_cotangent(s: Any, w: Any, pad: int, y_bar: Array, a: float, n: int, X: Array, full: Array, V_bar: Array) -> None:
+def nodal_cotangent(
+    s: Any, w: Any, pad: int, y_bar: Array, a: float, n: int, X: Array, full: Array, V_bar: Array
+) -> None:
     """F_bar of the touched nodes into X[:, 0], from the cotangents of the pad's state and of the touching points' stretches."""
     free = s.body_free
     first, at = s.pad_node_start[pad], s.contact_point_start[s.pad_contact_start[pad]]
@@ -95,7 +97,9 @@ def nodal_cotangent(s: Any, w: Any, pad: int, y_bar: Array, a: float, n: int, X:
 
 
 @compiled
-def pad_state(s: Any, w: Any, pad: int, y: Array, y_bar: Array, a: float, rate_bar: Array, u_bar: Array, p_bar: Array) -> None:
+def pad_state(
+    s: Any, w: Any, pad: int, y: Array, y_bar: Array, a: float, rate_bar: Array, u_bar: Array, p_bar: Array
+) -> None:
     """Cotangents of a massless pad's state at the stage's start, and of its material, from those of its nodal rates and
     displacements (nodes, 2)."""
     p = s.p

@@ -5,6 +5,7 @@ free (a component of the state) or follows a signal. "At" in a name is a positio
 "start" one in another array. Nodes are the surface nodes of all pads, points the contact points of all contacts.
 """
 
+from collections import namedtuple
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -67,7 +68,8 @@ class Pads(NamedTuple):
 
 
 class Inertia(NamedTuple):
-    """Inertial pads, dof by dof from dof_start [pad] on: X (dofs, 2) arms, M, the sparse rows of K_lambda and K_mu per depth and
+    """Inertial pads, dof by dof from dof_start [pad] on: X (dofs, 2) arms, M, the sparse rows of K_lambda and K_mu per
+    depth and
     modulus (dofs, 18), with their columns, and D, the rates per velocity of the base. surface: dof of every surface dof; factor
     (., band): the banded Cholesky factor of M/(a h) + (tau + a h) K; B (pads, 2, 2): the base's reaction per velocity.
 
@@ -107,7 +109,8 @@ class Contacts(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Per contact point: undeformed place in the base's frame, weight, two surface nodes and their shape functions there; y_start
+    """Per contact point: undeformed place in the base's frame, weight, two surface nodes and their shape functions
+    there; y_start
     of the stretches."""
 
     X: Array
@@ -119,10 +122,9 @@ class Points(NamedTuple):
 
 PARTS = {"body": Bodies, "act": Actuators, "pad": Pads, "inertia": Inertia, "contact": Contacts, "point": Points}
 
-System = NamedTuple(
-    "System", [*((f"{part}_{name}", Any) for part, kind in PARTS.items() for name in kind._fields), ("p", Array)]
-)
-"""Everything that stays while a run is on, flat: the fields of `PARTS` by part_field, and p, the vector of law parameters. Flat,
+System: Any = namedtuple("System", [*(f"{part}_{name}" for part, kind in PARTS.items() for name in kind._fields), "p"])
+"""Everything that stays while a run is on, flat: the fields of `PARTS` by part_field, and p, the vector of law
+parameters. Flat,
 because numba's compiling takes time for every array in a tuple that is taken out of another."""
 
 
@@ -132,12 +134,14 @@ def system(*parts: Any, p: Array) -> Any:
 
 
 class Work(NamedTuple):
-    """Scratch. Per node (., 2): the force that has set in, zeta, and its free rate; displacement u*, rates (without contact, now, before and after a Newton step), forces by the law
+    """Scratch. Per node (., 2): the force that has set in, zeta, and its free rate; displacement u*, rates (without
+    contact, now, before and after a Newton step), forces by the law
     and by the linear relations (now, before, after). Per point: the law's inputs, outputs and Jacobian; of the touching ones
     (in the order of `active`) H, S (3, 8), G (6, 2), L (6, 8), see `interface`. window, active: numbers of points near and
     touching, pad by pad from its first point on, `windows` and `actives` many; low, high: nodes of the window.
 
-    counts: touched nodes of every pad. A, P, Hc, Rf: one pad's share of Newton's system; X what Newton's elimination leaves, per surface dof. k: rates of the flat
+    counts: touched nodes of every pad. A, P, Hc, Rf: one pad's share of Newton's system; X what Newton's elimination
+    leaves, per surface dof. k: rates of the flat
     state; load: generalised contact forces on all coordinates; full: u' of inertial pads;
     travelled: how far [m] anything moved since the last scan for near points, and that scan's margin [m].
     """
@@ -196,7 +200,7 @@ class Tape(NamedTuple):
     rate: Array
 
 
-def scratch(s: System, size: int, columns: int = 1) -> Work:
+def scratch(s: Any, size: int, columns: int = 1) -> Work:
     """Scratch arrays for one run, with room for so many right-hand sides."""
     nodes, points, coordinates = int(s.pad_node_start[-1]), len(s.point_X), len(s.body_free)
     pads, contacts, free = len(s.pad_base), len(s.contact_pad), len(s.body_coordinate)
@@ -205,7 +209,8 @@ def scratch(s: System, size: int, columns: int = 1) -> Work:
     i = lambda *shape: np.zeros(shape, np.int64)
     per_node = ("u", "free", "u_dot", "u_dot_old", "u_dot_new", "F", "F_linear", "F_old", "F_new")
     return Work(
-        q=z(coordinates), V=z(coordinates), frame=z(contacts, 7), zeta=z(2 * nodes), zeta_rate=z(2 * nodes), **{name: z(nodes, 2) for name in per_node},
+        q=z(coordinates), V=z(coordinates), frame=z(contacts, 7), zeta=z(2 * nodes), zeta_rate=z(2 * nodes), **{name:
+        z(nodes, 2) for name in per_node},
         x=z(points, INPUTS), out=z(points, OUTPUTS), J=z(points, 3, 7), H=z(points, 3, 8), S=z(points, 3, 8),
         G=z(points, 6, 2), L=z(points, 6, 8), window=i(points), windows=i(pads), active=i(points), actives=i(pads),
         low=i(pads), high=i(pads), slot=i(nodes), touched=i(nodes), counts=i(pads), A=z(widest, widest), P=z(widest, widest),
@@ -214,7 +219,7 @@ def scratch(s: System, size: int, columns: int = 1) -> Work:
     )  # fmt: skip
 
 
-def empty_tape(s: System, size: int, stages: int, cap: int) -> Tape:
+def empty_tape(s: Any, size: int, stages: int, cap: int) -> Tape:
     """Room for that many stages, with `cap` touching points in all."""
     coordinates, i = len(s.body_free), np.int64
     return Tape(
@@ -226,4 +231,5 @@ def empty_tape(s: System, size: int, stages: int, cap: int) -> Tape:
 
 def first_stages(tape: Tape, stages: int) -> Tape:
     """The beginning of a tape, of a run that ended early."""
-    return Tape(*(part[:stages] for part in tape))
+    parts: Any = [part[:stages] for part in tape]
+    return Tape(*parts)

@@ -45,8 +45,8 @@ def free_rates(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
 
 
 @compiled
-def base_velocity(s: Any, pad: int, V: Array, q: Array) -> tuple[float, float]:
-    """The base's velocity in its own axes."""
+def base_velocity(s: Any, pad: int, V: Array, q: Array) -> Any:
+    """The base's velocity (x, y) in its own axes."""
     B = s.pad_base[pad]
     cos, sin = np.cos(q[B + 2]), np.sin(q[B + 2])
     return cos * V[B] + sin * V[B + 1], cos * V[B + 1] - sin * V[B]

@@ -8,7 +8,8 @@ stage and f = law(u', V) at the touching points, spread over the nodes by N,
 eliminating f leaves A F = b + Hc dV with A = 1 - N^T H_u N P, and the bodies' equations get Rf F + Rv dV + r. Newton's
 iteration, the tangent and, transposed, the adjoint solve this one block.
 
-Derivatives of a point by (u (2), body (3), base (3)): S by positions, H = T + a h S by rates of the stage, T by velocities; G is
+Derivatives of a point by (u (2), body (3), base (3)): S by positions, H = T + a h S by rates of the stage, T by
+velocities; G is
 what a force does to (body, base), L the derivative of that by positions at the same force.
 """
 
@@ -40,7 +41,9 @@ def frames(s: Any, w: Any) -> None:
 
 
 @compiled
-def kinematics(frame: Array, X: Array, ux: float, uy: float, vx: float, vy: float, spin: float, angle: float, x: Array) -> None:
+def kinematics(
+    frame: Array, X: Array, ux: float, uy: float, vx: float, vy: float, spin: float, angle: float, x: Array
+) -> None:
     """w, omega, d and theta of one point (Eq. 4-7) into x: the body's velocity less the point's, its spin, the moment arm from
     its centre, its angle; (ux, uy) is the displacement and (vx, vy) its rate."""
     px, py = X[0] + ux, X[1] + uy
@@ -209,7 +212,8 @@ def linearise(s: Any, w: Any, pad: int, a: float) -> None:
 
 @compiled
 def assemble(s: Any, w: Any, pad: int, a: float, Rv: Array) -> int:
-    """The block of one pad: w.touched, w.slot, w.P, w.A, w.Hc, w.Rf, and its part in Rv (free, free). Returns how many nodes."""
+    """The block of one pad: w.touched, w.slot, w.P, w.A, w.Hc, w.Rf, and its part in Rv (free, free). Returns how many
+    nodes."""
     free = s.body_free
     at, c, first = s.contact_point_start[s.pad_contact_start[pad]], s.pad_contact_start[pad], s.pad_node_start[pad]
     size, column = 2 * (s.pad_node_start[pad + 1] - first), s.pad_column[pad]

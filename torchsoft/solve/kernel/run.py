@@ -117,7 +117,9 @@ def run(
                 if w.travelled[0] == 0.0:  # points further away may have come near within this one stage
                     margin_now = margin + 1.5 * a * speed
                     w.travelled[0] = np.inf
-                    converged, count = solve_stage(s, w, y, signals[step, stage], a, tolerance, max_iterations, margin_now)
+                    converged, count = solve_stage(
+                        s, w, y, signals[step, stage], a, tolerance, max_iterations, margin_now
+                    )
                     solves += count
                     if not converged:
                         break

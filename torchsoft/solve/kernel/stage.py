@@ -12,7 +12,16 @@ from torchsoft.codegen.invoke import call_linearise, call_value
 from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.inertia import base_velocity, inertia_force, solve, stiffness_force
-from torchsoft.solve.kernel.interface import assemble, evaluate, frames, linearise, mobility_scale, scan, set_in, displacements
+from torchsoft.solve.kernel.interface import (
+    assemble,
+    displacements,
+    evaluate,
+    frames,
+    linearise,
+    mobility_scale,
+    scan,
+    set_in,
+)
 from torchsoft.solve.kernel.linear import row_of, solve_dense
 
 SEARCH_AFTER, SHORTEST = 2, 1.0 / 64.0
@@ -47,7 +56,9 @@ def balance(s: Any, w: Any, y: Array, signals: Array, a: float, r: Array, Rv: Ar
     Rv[:], r[:] = 0.0, 0.0
     for i in range(s.body_coordinate.size):
         mass = p[s.body_mass_at[i]]
-        r[i, 0] = -mass * ((w.V[s.body_coordinate[i]] - y[s.body_V_start + i]) / a + s.body_weight[i] * p[s.body_gravity_at])
+        r[i, 0] = -mass * (
+            (w.V[s.body_coordinate[i]] - y[s.body_V_start + i]) / a + s.body_weight[i] * p[s.body_gravity_at]
+        )
         Rv[i, i] = -mass / a  # (17)
     x, out, J = np.empty(5), np.empty(1), np.empty((1, 5))
     for i in range(s.act_measured.size):
@@ -254,7 +265,6 @@ def finish(s: Any, w: Any, y: Array, a: float, powers: Array, moments: Array) ->
     for pad in range(count):
         at, c = s.contact_point_start[s.pad_contact_start[pad]], s.pad_contact_start[pad]
         first, last, start = s.pad_node_start[pad], s.pad_node_start[pad + 1], s.pad_y_start[pad]
-        linearise(s, w, pad, a)
         moments[pad] = 0.0
         for i in range(w.actives[pad]):
             n = w.active[at + i]
@@ -262,9 +272,14 @@ def finish(s: Any, w: Any, y: Array, a: float, powers: Array, moments: Array) ->
                 c += 1
             fx, fy = w.out[n, 0], w.out[n, 1]
             moments[pad] += s.point_X[n, 0] * fy - s.point_X[n, 1] * fx
-            for row in range(6):
-                coordinate = s.contact_body[c] + row if row < 3 else s.pad_base[pad] + row - 3
-                w.load[coordinate] += w.G[at + i, row, 0] * fx + w.G[at + i, row, 1] * fy
+            frame, x, body, base = w.frame[c], w.x[n], s.contact_body[c], s.pad_base[pad]
+            X, Y = frame[0] * fx - frame[1] * fy, frame[1] * fx + frame[0] * fy
+            w.load[body] -= X
+            w.load[body + 1] -= Y
+            w.load[body + 2] -= x[3] * fy - x[4] * fx
+            w.load[base] += X
+            w.load[base + 1] += Y
+            w.load[base + 2] += (x[3] + frame[2]) * fy - (x[4] + frame[3]) * fx
             powers[count] += w.out[n, 5]
             powers[count + 1] += w.out[n, 6]
         i = 0

@@ -57,7 +57,9 @@ def massless_part(s: Any, w: Any, pad: int, y: Array, dy: Array, dp: Array, a: f
             rate[i] += J * z_dot
             for k in range(m):
                 dzeta[i, k] += J * dy[z + i, k] + dp[chain + b, k] * y[z + i]
-                drate[i, k] += dp[chain + b, k] * z_dot - J * (dy[z + i, k] + z_dot * dp[chain + branches + b, k]) / (tau + a)
+                drate[i, k] += dp[chain + b, k] * z_dot - J * (dy[z + i, k] + z_dot * dp[chain + branches + b, k]) / (
+                    tau + a
+                )
     for k in range(m):  # C is proportional to the material's first entry
         softer = dp[material, k] / p[material]
         for i in range(size):
@@ -96,11 +98,28 @@ def massless_part(s: Any, w: Any, pad: int, y: Array, dy: Array, dp: Array, a: f
 
 @compiled
 def inertial_part(
-    s: Any, w: Any, pad: int, y: Array, dy: Array, dp: Array, a: float, rate: Array, du: Array, dv: Array, free: Array, r: Array
+    s: Any,
+    w: Any,
+    pad: int,
+    y: Array,
+    dy: Array,
+    dp: Array,
+    a: float,
+    rate: Array,
+    du: Array,
+    dv: Array,
+    free: Array,
+    r: Array,
 ) -> None:
     """The same for an inertial pad; `free` (dofs, m) receives dv of all its dofs, and r the base's reaction."""
     at = s.inertia_material_at[pad]
-    i0, i1, U, W, base = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1], s.pad_y_start[pad], s.pad_v_start[pad], s.pad_base[pad]
+    i0, i1, U, W, base = (
+        s.inertia_dof_start[pad],
+        s.inertia_dof_start[pad + 1],
+        s.pad_y_start[pad],
+        s.pad_v_start[pad],
+        s.pad_base[pad],
+    )
     n, mass, tau = i1 - i0, s.p[at + 3], s.p[at + 2]
     vx, vy = base_velocity(s, pad, w.V, w.q)
     cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
@@ -157,7 +176,9 @@ def stage_tangent(
         rate = (w.V[c] - y[s.body_V_start + i]) / a
         for k in range(m):
             r[i, k] = mass * dy[s.body_V_start + i, k] / a - rate * dp[s.body_mass_at[i], k]
-            r[i, k] -= s.body_weight[i] * (dp[s.body_mass_at[i], k] * p[s.body_gravity_at] + mass * dp[s.body_gravity_at, k])
+            r[i, k] -= s.body_weight[i] * (
+                dp[s.body_mass_at[i], k] * p[s.body_gravity_at] + mass * dp[s.body_gravity_at, k]
+            )
     x, out, J, change = np.empty(5), np.empty(1), np.empty((1, 5)), np.empty((3, m))
     for i in range(s.act_measured.size):
         number, measured = s.body_free[s.act_pushed[i]], s.body_free[s.act_measured[i]]
@@ -338,7 +359,8 @@ def advance_inertial(s: Any, w: Any, pad: int, a: float, dy: Array, free_rates: 
 
 @entry
 def forward(s: Any, w: Any, h: float, tape: Any, signals: Array, keep: Any, dy: Array, dp: Array, dys: Array) -> None:
-    """Carry the tangent dy (size, m) through the steps of a tape, in place; after the steps that `keep` marks it goes to dys."""
+    """Carry the tangent dy (size, m) through the steps of a tape, in place; after the steps that `keep` marks it goes to
+    dys."""
     a, m, row = GAMMA * h, dy.shape[1], 0
     du, dv = np.zeros((len(w.u), 2, m)), np.zeros((len(w.u), 2, m))
     free_rates, before = np.zeros((w.full.size, m)), np.empty(dy.shape)

@@ -34,7 +34,9 @@ def restore(s: Any, w: Any, tape: Any, row: int, a: float) -> None:
             ux, uy = state[0] + a * state[2], state[1] + a * state[3]
             kinematics(w.frame[c], s.point_X[k], ux, uy, state[2], state[3], w.V[body + 2], angle, x)
             x[6], x[7], x[8] = tape.y[row, s.point_y_start + k], s.point_weight[k], a
-            call_linearise(s.contact_linearise[c], x, s.p[s.contact_p_start[c] : s.contact_p_start[c + 1]], w.out[k], w.J[k])
+            call_linearise(
+                s.contact_linearise[c], x, s.p[s.contact_p_start[c] : s.contact_p_start[c + 1]], w.out[k], w.J[k]
+            )
             w.active[at + i] = k
             for j in range(2):
                 for r in range(2):
