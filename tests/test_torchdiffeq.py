@@ -37,11 +37,11 @@ def test_torchdiffeq_runs_the_stepper() -> None:
 def test_explicit_methods_agree(method: str) -> None:
     """torchdiffeq's own methods integrate the same forward and meet the stepper on a short window, slip included."""
     model = coarse()
-    y0, t = grasped(model, (0.05, -0.01)), times(2e-4, 3)
-    options = {"step_size": 1e-5} if method == "rk4" else {}
+    y0, t = grasped(model, (0.05, -0.01)), times(4e-4, 3)
+    options = {"step_size": 2e-5} if method == "rk4" else {}
     end = odeint(model, y0, t, method=method, rtol=1e-7, atol=1e-10, options=options)[-1]
-    implicit = simulate(model, t, y0=y0, step=1e-6)
-    assert float(implicit.dissipated["slip"][-1]) > 2e-9  # the window does contain slip
+    implicit = simulate(model, t, y0=y0, step=2e-6)
+    assert float(implicit.dissipated["slip"][-1]) > 1e-8  # the window does contain slip
     first, last, explicit = (model.unpack(y) for y in (implicit.y[0], implicit.y[-1], end))
     parts = [lambda s: s.pose["disc"][:2], lambda s: s.pose["disc"][2:], lambda s: s.stretch["L"]]
     parts += [lambda s, k=k: model.displacement(k, s) for k in "LU"]
