@@ -114,3 +114,15 @@ def test_interval_coverage_smoke(tmp_path: Path) -> None:
     assert len(errors) == 16
     assert 0.1 < sum(errors) / 16 < 2.5
     assert module.figure(result).axes
+
+
+def test_contact_points_smoke(tmp_path: Path) -> None:
+    """Two points an element take most of the nodes out of the force along the pad; gradients are exact with either."""
+    module = experiment("contact_points")
+    module.main(module.Config(out=tmp_path, smoke=True))
+    cases = json.loads((tmp_path / "summary.json").read_text())["cases"]
+    nodes, between = cases["1 mm, nodes"], cases["1 mm, 2"]
+    name = "static ripple of the force along the pad [mN]"
+    assert between[name] < 0.3 * nodes[name]
+    assert max(case["gradient from differences over 1e-05"] for case in (nodes, between)) < 1e-5
+    assert (tmp_path / "contact_points.png").stat().st_size > 10_000

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 README = Path(__file__).parents[1] / "README.md"
-SHORTER = {"torch.linspace(0, 30, 3001": "torch.linspace(0, 0.5, 51", "theta[1000]": "theta[50]"}
+SHORTER = {"torch.linspace(0, 30, 3001": "torch.linspace(0, 0.5, 51", "theta\"][1000]": "theta\"][50]"}
 
 
 def test_the_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -17,5 +17,5 @@ def test_the_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     exec(code, names)
-    assert names["s"].dy.shape == (51, 736, 2)  # pyright: ignore[reportAttributeAccessIssue]
+    assert names["s"].sensitivities.shape == (51, 10, 2)  # pyright: ignore[reportAttributeAccessIssue]
     assert (tmp_path / "rolling.nc").stat().st_size > 0

@@ -44,11 +44,12 @@ def rolled(model: SoftGrasp, **options: object):
 def test_values_set_on_the_module_run_and_are_saved(tmp_path: Path) -> None:
     """A number set in place is in the settings, in what the run says of itself, in its file, and in the run."""
     model, other = coarse(), coarse(contact__K_n=2e5)
-    y0, reference = grasped(other, (0.05, 0.0)), other.reference
+    y0 = grasped(other, (0.05, 0.0))
+    model.reference = other.reference
     model.contact.K_n.data = torch.tensor(2e5, dtype=torch.float64)
     assert model.settings.contact.K_n == 2e5
     assert model.settings.table()["contact.K_n"]["value"] == 2e5
-    run, expected = (simulate(m, T, y0=y0, reference=reference) for m in (model, other))
+    run, expected = (simulate(m, T, y0=y0) for m in (model, other))
     assert torch.equal(run.y, expected.y)
     assert run.made_by == expected.made_by
     assert run.made_by["parameters"]["contact.K_n"] == 2e5

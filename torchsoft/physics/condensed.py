@@ -101,13 +101,15 @@ def solve_rates(rig: Rig, name: str, own: Sequence[str], state: State, u: Tensor
         F, pull = torch.func.vjp(force, u_dot)[:2]
         G = torch.zeros(*u_dot.shape[:-2], n, 2, n, 2, dtype=u.dtype)
         near = (loaded[:, None] - loaded).abs() <= 1  # columns that may reach a probed node
+        probes = torch.zeros(3, 2, *u_dot.shape, dtype=u.dtype)
+        for colour in range(3):
+            for axis in range(2):
+                probes[colour, axis, ..., loaded % 3 == colour, axis] = 1.0
+        (by,) = torch.func.vmap(pull)(probes.flatten(0, 1))
         for colour in range(3):
             rows, columns = torch.nonzero(near & (loaded[:, None] % 3 == colour), as_tuple=True)
             for axis in range(2):
-                probe = torch.zeros_like(u_dot)
-                probe[..., loaded % 3 == colour, axis] = 1.0
-                (by,) = pull(probe)
-                G[..., rows, axis, columns, :] = by[..., columns, :]
+                G[..., rows, axis, columns, :] = by[2 * colour + axis][..., columns, :]
         J = torch.eye(2 * n, dtype=u.dtype) - P_aa @ G.flatten(-2).flatten(-3, -2)
         return residual(u_dot, F), J
 

@@ -101,7 +101,7 @@ class ImplicitStepper:
 
     def __init__(
         self, rig: Rig, reference: Reference | None = None, *, step: float = 2e-3, tolerance: float = 1e-9,
-        max_iterations: int = 40, window: float = 3e-4,
+        max_iterations: int = 40, window: float = 2e-3,
     ) -> None:  # fmt: skip
         for name, value in (("step", step), ("tolerance", tolerance), ("window", window)):
             if not (math.isfinite(value) and value > 0):

@@ -13,7 +13,7 @@ from torchsoft.codegen.invoke import call_linearise, call_pullback
 from torchsoft.solve.kernel import compiled, entry
 from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
-from torchsoft.solve.kernel.interface import assemble
+from torchsoft.solve.kernel.interface import NEGLIGIBLE, assemble
 from torchsoft.solve.kernel.linear import row_of, solve_dense
 from torchsoft.solve.kernel.run import GAMMA, MIX, TINY
 from torchsoft.solve.kernel.stage import actuate
@@ -102,41 +102,45 @@ def pad_state(
 ) -> None:
     """Cotangents of a massless pad's state at the stage's start, and of its material, from those of its nodal rates and
     displacements (nodes, 2)."""
-    p = s.p
-    first, last, start = s.pad_node_start[pad], s.pad_node_start[pad + 1], s.pad_y_start[pad]
+    p, first, last, start = s.p, s.pad_node_start[pad], s.pad_node_start[pad + 1], s.pad_y_start[pad]
     size, chain, branches = 2 * (last - first), s.pad_chain_at[pad], s.pad_branches[pad]
-    start_C = s.pad_C_start[pad]
-    by_rate, by_u, nu_rate, nu_u = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
+    start_C, material, F = s.pad_C_start[pad], chain + 2 * branches, w.F.ravel()
+    by_rate, by_u, zeta, z_dot = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
     for node in range(w.low[pad], w.high[pad]):
         for r in range(2):
             c, d = rate_bar[node, r], u_bar[node, r]
             if c != 0.0 or d != 0.0:
-                i = 2 * (node - first) + r
-                row, other = row_of(s.pad_C, start_C, i, size), row_of(s.pad_dC, start_C, i, size)
+                row = row_of(s.pad_C, start_C, 2 * (node - first) + r, size)
                 for m in range(size):
                     by_rate[m] += row[m] * c
                     by_u[m] += row[m] * d
-                    nu_rate[m] += other[m] * c
-                    nu_u[m] += other[m] * d
-    F = w.F.ravel()
-    material = chain + 2 * branches
-    scale_bar = nu_bar = 0.0
+    scale_bar, left, right = 0.0, size, 0
     for b in range(branches):
         J, rest, z = p[chain + b], p[chain + branches + b] + a, start + b * size
         J_bar = tau_bar = 0.0
         for m in range(size):
             loaded = 2 * w.low[pad] <= 2 * first + m < 2 * w.high[pad]
-            rate = ((F[2 * first + m] if loaded else 0.0) - y[z + m]) / rest
-            J_bar += by_rate[m] * rate + by_u[m] * y[z + m]
-            nu_bar += J * (nu_rate[m] * rate + nu_u[m] * y[z + m])
             total = (a * y_bar[z + m] + J * by_rate[m]) / rest
-            tau_bar -= total * rate
+            if loaded or abs(y[z + m]) > NEGLIGIBLE:
+                rate = ((F[2 * first + m] if loaded else 0.0) - y[z + m]) / rest
+                left, right = min(left, m), m + 1 if m + 1 > right else right
+                zeta[m] += J * y[z + m]
+                z_dot[m] += J * rate
+                J_bar += by_rate[m] * rate + by_u[m] * y[z + m]
+                tau_bar -= total * rate
             y_bar[z + m] += J * by_u[m] - total
         p_bar[chain + b] += J_bar
         p_bar[chain + branches + b] += tau_bar
         scale_bar += J * J_bar
     p_bar[material] += scale_bar / p[material]
-    p_bar[material + 1] += nu_bar
+    for node in range(w.low[pad], w.high[pad]):
+        for r in range(2):
+            c, d = rate_bar[node, r], u_bar[node, r]
+            if c != 0.0 or d != 0.0:
+                row, by_nu = row_of(s.pad_dC, start_C, 2 * (node - first) + r, size), 0.0
+                for m in range(left, right):
+                    by_nu += row[m] * (c * z_dot[m] + d * zeta[m])
+                p_bar[material + 1] += by_nu
 
 
 @compiled

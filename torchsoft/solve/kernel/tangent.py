@@ -13,14 +13,17 @@ from torchsoft.solve.kernel import compiled, entry
 from torchsoft.solve.kernel.adjoint import rigid_part
 from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
-from torchsoft.solve.kernel.interface import assemble
+from torchsoft.solve.kernel.interface import NEGLIGIBLE, assemble
 from torchsoft.solve.kernel.linear import row_of, solve_dense
 from torchsoft.solve.kernel.run import GAMMA, MIX
 from torchsoft.solve.kernel.stage import actuate, eliminate
 from torchsoft.solve.kernel.taped import restore
 
-NEGLIGIBLE = 1e-17
+NEGLIGIBLE_PART = 1e-17
 """Part of the largest derivative of nodal forces below which a node's counts as none."""
+
+RESCAN = 64
+"""Steps between two looks for what has become negligible."""
 
 
 @compiled
@@ -40,60 +43,75 @@ def law_derivatives(address: int, x: Array, p: Array, dp: Array, rows: int, out:
 
 
 @compiled
-def massless_part(s: Any, w: Any, pad: int, y: Array, dy: Array, dp: Array, a: float, du: Array, dv: Array) -> None:
+def find_span(s: Any, y: Array, dy: Array, span: Array) -> None:
+    """Per pad the first and last surface dof (and one more) that is loaded or has a derivative; what is negligible becomes zero."""
+    for pad in range(s.pad_base.size):
+        size, start = 2 * (s.pad_node_start[pad + 1] - s.pad_node_start[pad]), s.pad_y_start[pad]
+        span[pad, 0], span[pad, 1] = size, 0
+        if s.pad_v_start[pad] >= 0:
+            continue
+        for b in range(s.pad_branches[pad]):
+            rows = dy[start + b * size : start + (b + 1) * size]
+            for k in range(dy.shape[1]):
+                largest = 0.0
+                for i in range(size):
+                    largest = max(largest, abs(rows[i, k]))
+                for i in range(size):
+                    if abs(rows[i, k]) > NEGLIGIBLE_PART * largest or abs(y[start + b * size + i]) > NEGLIGIBLE:
+                        span[pad, 0], span[pad, 1] = min(span[pad, 0], i), max(span[pad, 1], i + 1)
+                    else:
+                        rows[i, k] = 0.0
+
+
+@compiled
+def massless_part(
+    s: Any, w: Any, pad: int, y: Array, dy: Array, dp: Array, a: float, span: Array, du: Array, dv: Array
+) -> None:
     """Derivatives of u* (du) and of u' before the forces' own change (dv) at the loaded nodes, (nodes, 2, m)."""
-    p = s.p
-    first, last, start, m = s.pad_node_start[pad], s.pad_node_start[pad + 1], s.pad_y_start[pad], dy.shape[1]
-    size, chain, branches = 2 * (last - first), s.pad_chain_at[pad], s.pad_branches[pad]
+    p, first, start, m = s.p, s.pad_node_start[pad], s.pad_y_start[pad], dy.shape[1]
+    size, chain, branches = 2 * (s.pad_node_start[pad + 1] - first), s.pad_chain_at[pad], s.pad_branches[pad]
     F, material = w.F.ravel(), chain + 2 * branches
+    left, right = min(span[pad, 0], 2 * (w.low[pad] - first)), max(span[pad, 1], 2 * (w.high[pad] - first))
+    span[pad, 0], span[pad, 1] = left, right
     zeta, rate = np.zeros(size), np.zeros(size)
-    dzeta, drate, largest = np.zeros((size, m)), np.zeros((size, m)), np.zeros(m)
+    dzeta, drate = np.zeros((size, m)), np.zeros((size, m))
     for b in range(branches):
         J, tau, z = p[chain + b], p[chain + branches + b], start + b * size
-        for i in range(size):
+        for i in range(left, right):
             loaded = 2 * w.low[pad] <= 2 * first + i < 2 * w.high[pad]
             z_dot = ((F[2 * first + i] if loaded else 0.0) - y[z + i]) / (tau + a)
             zeta[i] += J * y[z + i]
             rate[i] += J * z_dot
             for k in range(m):
+                change = (dy[z + i, k] + z_dot * dp[chain + branches + b, k]) / (tau + a)
                 dzeta[i, k] += J * dy[z + i, k] + dp[chain + b, k] * y[z + i]
-                drate[i, k] += dp[chain + b, k] * z_dot - J * (dy[z + i, k] + z_dot * dp[chain + branches + b, k]) / (
-                    tau + a
-                )
-    for k in range(m):  # C is proportional to the material's first entry
-        softer = dp[material, k] / p[material]
-        for i in range(size):
-            dzeta[i, k] += softer * zeta[i]
-            drate[i, k] += softer * rate[i]
-            largest[k] = max(largest[k], abs(dzeta[i, k]) + a * abs(drate[i, k]))
-    left, right = size, 0
-    for i in range(size):
-        for k in range(m):
-            if abs(dzeta[i, k]) + a * abs(drate[i, k]) > NEGLIGIBLE * largest[k]:
-                left, right = min(left, i), i + 1
-                break
+                drate[i, k] += dp[chain + b, k] * z_dot - J * change
     stiffer = False
     for k in range(m):
+        softer = dp[material, k] / p[material]  # C is proportional to the material's first entry
         stiffer |= dp[material + 1, k] != 0.0
+        for i in range(left, right):
+            dzeta[i, k] += softer * zeta[i]
+            drate[i, k] += softer * rate[i]
     for i in range(w.counts[pad]):
         node = w.touched[first + i]
         for r in range(2):
-            row = row_of(s.pad_C, s.pad_C_start[pad], 2 * (node - first) + r, size)
-            du[node, r], dv[node, r] = 0.0, 0.0
+            dof = 2 * (node - first) + r
+            row, u, v = row_of(s.pad_C, s.pad_C_start[pad], dof, size), du[node, r], dv[node, r]
+            u[:], v[:] = 0.0, 0.0
             for j in range(left, right):
                 c = row[j]
                 for k in range(m):
-                    du[node, r, k] += c * dzeta[j, k]
-                    dv[node, r, k] += c * drate[j, k]
+                    u[k] += c * dzeta[j, k]
+                    v[k] += c * drate[j, k]
             if stiffer:
-                row = row_of(s.pad_dC, s.pad_C_start[pad], 2 * (node - first) + r, size)
-                by_u = by_rate = 0.0
-                for j in range(size):
+                row, by_u, by_rate = row_of(s.pad_dC, s.pad_C_start[pad], dof, size), 0.0, 0.0
+                for j in range(left, right):
                     by_u += row[j] * zeta[j]
                     by_rate += row[j] * rate[j]
                 for k in range(m):
-                    du[node, r, k] += by_u * dp[material + 1, k]
-                    dv[node, r, k] += by_rate * dp[material + 1, k]
+                    u[k] += by_u * dp[material + 1, k]
+                    v[k] += by_rate * dp[material + 1, k]
 
 
 @compiled
@@ -163,7 +181,8 @@ def inertial_part(
 
 @compiled
 def stage_tangent(
-    s: Any, w: Any, tape: Any, row: int, a: float, signals: Array, dy: Array, dp: Array, du: Array, dv: Array, free_rates: Array
+    s: Any, w: Any, tape: Any, row: int, a: float, signals: Array, dy: Array, dp: Array, span: Array, du: Array, dv: Array,
+    free_rates: Array,
 ) -> None:  # fmt: skip
     """Turn the tangent dy (size, m) of a stage's y* into that of its end, in place; dp (parameters, m)."""
     p = s.p
@@ -199,7 +218,7 @@ def stage_tangent(
         if s.pad_v_start[pad] >= 0:
             inertial_part(s, w, pad, y, dy, dp, a, tape.rate[row], du, dv, free_rates, r)
         else:
-            massless_part(s, w, pad, y, dy, dp, a, du, dv)
+            massless_part(s, w, pad, y, dy, dp, a, span, du, dv)
         first, columns = s.pad_node_start[pad], s.pad_columns[pad]
         at, c = s.contact_point_start[s.pad_contact_start[pad]], s.pad_contact_start[pad]
         X = w.X[2 * first : 2 * (first + n)]
@@ -244,7 +263,7 @@ def stage_tangent(
     solve_dense(Rv, dV, free, m)
 
     for pad in range(count):
-        advance_pad(s, w, pad, y, a, dy, dp, dV, free_rates, e)
+        advance_pad(s, w, pad, y, a, dy, dp, span, dV, free_rates, e)
     for i in range(free):
         for k in range(m):
             dy[s.body_q_start + i, k] += a * dV[i, k]
@@ -253,7 +272,7 @@ def stage_tangent(
 
 @compiled
 def advance_pad(
-    s: Any, w: Any, pad: int, y: Array, a: float, dy: Array, dp: Array, dV: Array, free_rates: Array, e: Array
+    s: Any, w: Any, pad: int, y: Array, a: float, dy: Array, dp: Array, span: Array, dV: Array, free_rates: Array, e: Array
 ) -> None:  # fmt: skip
     """Tangents of a pad's state and of its stretches at the stage's end, from Newton's solution in w.X and dV."""
     p = s.p
@@ -327,7 +346,7 @@ def advance_pad(
     F = w.F.ravel()
     for b in range(branches):
         tau, z = p[chain + branches + b], start + b * size
-        for i in range(size):
+        for i in range(span[pad, 0], span[pad, 1]):
             loaded = 2 * w.low[pad] <= 2 * first + i < 2 * w.high[pad]
             z_dot = ((F[2 * first + i] if loaded else 0.0) - y[z + i]) / (tau + a)
             for k in range(m):
@@ -364,11 +383,14 @@ def forward(s: Any, w: Any, h: float, tape: Any, signals: Array, keep: Any, dy: 
     a, m, row = GAMMA * h, dy.shape[1], 0
     du, dv = np.zeros((len(w.u), 2, m)), np.zeros((len(w.u), 2, m))
     free_rates, before = np.zeros((w.full.size, m)), np.empty(dy.shape)
+    span = np.zeros((s.pad_base.size, 2), np.int64)
     for step in range(len(keep)):
+        if step % RESCAN == 0:
+            find_span(s, tape.y[2 * step], dy, span)
         before[:] = dy
-        stage_tangent(s, w, tape, 2 * step, a, signals[2 * step], dy, dp, du, dv, free_rates)
+        stage_tangent(s, w, tape, 2 * step, a, signals[2 * step], dy, dp, span, du, dv, free_rates)
         dy[:] = before + MIX * (dy - before)
-        stage_tangent(s, w, tape, 2 * step + 1, a, signals[2 * step + 1], dy, dp, du, dv, free_rates)
+        stage_tangent(s, w, tape, 2 * step + 1, a, signals[2 * step + 1], dy, dp, span, du, dv, free_rates)
         if keep[step]:
             dys[row] = dy
             row += 1
