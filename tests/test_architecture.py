@@ -25,6 +25,14 @@ APART = ("plot", "sysid", "reduced", "datasets")
 """Folders over the engine; of these, only `plot` may be imported by another."""
 LONGEST = 350
 """Lines; a file that grows past them holds more than one idea."""
+LONGER = {
+    "physics.rig": 390,  # the lists, the state and the multibond graph are one class
+    "solve.system": 400,  # one array after another, of every list of a rig
+    "solve.kernel.stage": 380,  # one Newton iteration, of massless and of inertial pads
+    "solve.kernel.tangent": 400,  # the same stage differentiated, term by term
+    "solve.kernel.adjoint": 370,  # and the same transposed
+}
+"""Known exceptions with the lines that they may have: they must not grow."""
 COMMAND = 20
 """Lines of a command that leaves the work to the package."""
 
@@ -91,9 +99,16 @@ def test_no_imports_in_circles() -> None:
 def test_physics_does_not_know_how_it_is_solved() -> None:
     """Nor does code generation know any physics."""
     for name, path in MODULES.items():
-        if name.partition(".")[0] in ("physics", "codegen"):
-            others = {layer(other, "") for other in imports(path)} - {"parameters"}
-            assert others <= {name.partition(".")[0]}, name
+        own, others = layer(name, ""), {layer(other, "") for other in imports(path)}
+        if own in ("physics", "codegen"):
+            assert others <= ({"physics", "parameters"} if own == "physics" else {"codegen"}), name
+
+
+def test_the_kernels_know_no_law() -> None:
+    """They call compiled laws by address, and use nothing else of torchsoft."""
+    own = {name for name in MODULES if layer(name, "solve") == "kernel"}
+    for name in own:
+        assert imports(MODULES[name]) <= own | {"codegen.invoke"}, name
 
 
 @pytest.mark.parametrize("folder", APART)
@@ -104,7 +119,9 @@ def test_applications_do_not_know_each_other(folder: str) -> None:
 
 def test_files_are_short() -> None:
     top = ROOT.parent
-    for path in (*MODULES.values(), *(top / "experiments").glob("*.py")):
-        assert len(path.read_text().splitlines()) <= LONGEST, path
+    assert LONGER.keys() <= MODULES.keys()
+    files = MODULES | {path.name: path for path in (top / "experiments").glob("*.py")}
+    for name, path in files.items():
+        assert len(path.read_text().splitlines()) <= LONGER.get(name, LONGEST), path
     for path in (top / "data_gen").glob("*.py"):
         assert len(path.read_text().splitlines()) <= COMMAND, path

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 README = Path(__file__).parents[1] / "README.md"
-SHORTER = {"torch.linspace(0, 30, 3001": "torch.linspace(0, 0.5, 51", "theta\"][1000]": "theta\"][50]"}
+SHORTER = {"torch.linspace(0, 30, 3001": "torch.linspace(0, 0.5, 51", 'theta"][1000]': 'theta"][50]'}
 
 
 def test_the_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -104,7 +104,7 @@ class SoftGrasp(Rig):
     def description(self) -> dict[str, Any]:
         values = {name: row["value"] for name, row in self.settings.table().items()}
         shape, rubber = type(self.shape).__name__, type(self.pads["L"].material).__name__
-        others = {name: x.detach().tolist() for name, x in self.named_parameters() if name not in NAMES.values()}
+        others = {name: x for name, x in super().description()["parameters"].items() if name not in NAMES.values()}
         return super().description() | {"parameters": values | others, "shape": shape, "material": rubber}
 
     @property

@@ -133,7 +133,8 @@ class Rig(nn.Module):
 
     def description(self) -> dict[str, Any]:
         """The numbers and laws of the rig as they are now, for what is saved with a run."""
-        values = {name: value.detach().tolist() for name, value in self.named_parameters()}
+        mine = {name: value for name, value in self.named_parameters() if not name.startswith("reference.")}
+        values = {name: value.detach().tolist() for name, value in mine.items()}
         laws = {name: type(contact.law.friction).__name__ for name, contact in self.contacts.items()}
         return {"parameters": values, "friction": laws}
 

@@ -78,7 +78,8 @@ def simulate(
                 bar.n = float(t[out.rows - 1] - t[0])
                 bar.refresh()
     except SimulationFailed as failure:
-        assert out is not None
+        if out is None:
+            raise
         trajectory = gather(stepper, t, y, out, Stats(out.steps, out.solves, out.failed + 1, wall, step))
         raise diagnose(rig, failure, trajectory) from None
     except KeyboardInterrupt:

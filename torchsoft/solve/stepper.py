@@ -11,9 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.physics.contact import cross
 from torchsoft.physics.motion import Reference
-from torchsoft.physics.rig import GROUND, Rig
+from torchsoft.physics.rig import Rig
 from torchsoft.solve.grid import Chunk, check_times, chunks
 from torchsoft.solve.kernel import CACHE
 from torchsoft.solve.kernel.arrays import Array, Tape, Work, empty_tape, first_stages, scratch
@@ -33,6 +32,9 @@ log = logging.getLogger("torchsoft")
 
 HALVINGS = 6
 """How often a step that Newton does not solve is halved before the run is given up."""
+
+INSTANT = 1e-13
+"""Length [s] of the stage that gives the forces at the start: nothing moves in it."""
 
 METHOD = "sdirk2"
 """Name under which `torchdiffeq.odeint` knows the stepper once torchsoft is imported."""
@@ -143,9 +145,11 @@ class ImplicitStepper:
             np.zeros((len(t), points, 2)),
             np.zeros((len(t), n + pads + coordinates)),
         )
-        out.y[0], out.forces[0], out.extras[0, n:] = y0.numpy(), *self._start(t[0], y0)
+        out.y[0] = y0.numpy()
         y, integrals, taped = y0.numpy().copy(), np.zeros(n), 0
         work = scratch(first, self.layout.size)
+        set_velocities(first, work, y)
+        self._start(y, t[0], work, out.forces, out.extras)
         set_velocities(first, work, y)
         announce_compilation()
         ends = np.cumsum([0, *(2 * len(chunk.starts) for chunk in todo)])
@@ -179,27 +183,16 @@ class ImplicitStepper:
             elif status != CONVERGED:
                 raise self._failure(status, float(chunk.starts[steps]), chunk.h)
 
-    def _start(self, time: Tensor, y0: Tensor) -> tuple[Array, Array]:
-        """Forces on the contact points (points, 2), and moments of the pads followed by the contacts' generalised forces on all
-        coordinates, at the start, from the module."""
-        signals = self.rig.follow(time, self.reference)
-        state = self.rig.unpack(y0, signals)
-        graph = self.rig.evaluate(time, state, signals)
-        forces = [interface.out[..., 3:5].flatten().numpy() for interface in graph.interfaces.values()]
-        moments = [
-            cross(pad.positions).flatten() @ graph.ports[f"pad_{name}"].effort.flatten()
-            for name, pad in self.rig.pads.items()
-        ]
-        loads = {name: np.zeros(3) for name in (*self.rig.bodies, GROUND)}
-        for name in (*self.rig.contacts, *self.rig.pads):
-            port = graph.ports[f"contact_{name}" if name in self.rig.contacts else f"pad_{name}"]
-            for junction, effort in port.transformer.effort(port.effort, self.rig.junctions).items():
-                body = junction.removesuffix("_spin")
-                if body in loads:
-                    loads[body][slice(2, 3) if junction.endswith("_spin") else slice(0, 2)] -= effort.numpy().ravel()
-        return np.concatenate((np.empty(0), *forces)).reshape(-1, 2), np.array(
-            [*moments, *np.concatenate([*loads.values()])]
-        )
+    def _start(self, y0: Array, time: Tensor, work: Work, forces: Array, extras: Array) -> None:
+        """Nodal forces, moments and loads at the start, the first row of `forces` and `extras`. Raises `SimulationFailed`."""
+        s, signals = self.compiled.system(INSTANT / GAMMA), self.compiled.signals(time, self.reference).numpy()
+        nothing = empty_tape(s, self.layout.size, 0, self._cap)
+        _, status, _ = run(
+            s, work, y0, signals[None, None], INSTANT, self.tolerance, self.max_iterations, self.window, np.zeros(0, np.bool_),
+            np.zeros(len(self.integrals.names)), np.zeros((0, y0.size)), forces, extras, nothing, True,
+        )  # fmt: skip
+        if status != CONVERGED:
+            raise self._failure(status, float(time), INSTANT)
 
     def signals(self, todo: Sequence[Chunk]) -> Tensor:
         """The signals at all stages of some chunks (stages, signals, 2)."""
@@ -233,7 +226,7 @@ class ImplicitStepper:
             tape = empty_tape(s, self.layout.size, 2 * steps if taping else 0, self._cap)
             done, status, solves = run(
                 s, work, y, signals.reshape(steps, 2, *signals.shape[1:]), chunk.h, self.tolerance, self.max_iterations,
-                self.window, chunk.keep, integrals, *outputs, tape,
+                self.window, chunk.keep, integrals, *outputs, tape, False,
             )  # fmt: skip
             if status != TAPE_FULL:
                 return done, status, solves, tape if taping else None

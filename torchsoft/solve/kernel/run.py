@@ -87,21 +87,41 @@ def supply(s: Any, w: Any, signals: Array, powers: Array) -> None:
     powers[-1] = total
 
 
+@compiled
+def record(s: Any, w: Any, integrals: Array, moments: Array, forces: Array, extras: Array) -> None:
+    """One row of output: (F_N, F_T) of every point; integrals, the pads' moments and the generalised contact forces."""
+    forces[:] = 0.0
+    for pad in range(s.pad_base.size):
+        at = s.contact_point_start[s.pad_contact_start[pad]]
+        for i in range(w.actives[pad]):
+            k = w.active[at + i]
+            forces[k, 0], forces[k, 1] = w.out[k, 3], w.out[k, 4]
+    n, m = integrals.size, moments.size
+    extras[:n], extras[n : n + m], extras[n + m :] = integrals, moments, w.load
+
+
 @entry
 def run(
     s: Any, w: Any, y: Array, signals: Array, h: float, tolerance: float, max_iterations: int, margin: float, keep: Any,
-    integrals: Array, ys: Array, forces: Array, extras: Array, tape: Any,
+    integrals: Array, ys: Array, forces: Array, extras: Array, tape: Any, instant: bool,
 ) -> tuple[int, int, int]:  # fmt: skip
     """Take len(signals) steps of h [s]; signals (steps, 2, signals, 2) hold value and rate at the stages; `tape` has two rows a
     step, or none.
 
     After the steps marked in `keep`, the state goes to `ys`, (F_N, F_T) of every point to `forces`, and integrals, the pads'
     moments and the generalised contact forces to `extras`, one row each. y, `integrals` and the guesses in w are advanced in
-    place; after a failure they hold the last good step. Returns steps taken, status, and linear solves.
+    place; after a failure they hold the last good step. With `instant` nothing advances: a stage as short as h is solved for the
+    forces at one moment, which go to the first row. Returns steps taken, status, and linear solves.
     """
     a, pads, row, solves = GAMMA * h, s.pad_base.size, 0, 0
     powers, moments = np.empty(integrals.size), np.zeros(pads)
     before, integrals_before, V_before = np.empty(y.size), np.empty(integrals.size), np.empty(w.V.size)
+    if instant:
+        converged, solves = solve_stage(s, w, y, signals[0, 0], h, tolerance, max_iterations, margin)
+        if converged:
+            finish(s, w, y, h, powers, moments)
+            record(s, w, integrals, moments, forces[0], extras[0])
+        return 0, CONVERGED if converged else NEWTON_FAILED, solves
     for step in range(len(signals)):
         before[:], integrals_before[:], V_before[:] = y, integrals, w.V
         status = CONVERGED
@@ -151,14 +171,6 @@ def run(
             return step, status, solves
         if keep[step]:
             ys[row] = y
-            for k in range(len(forces[row])):
-                forces[row, k, 0], forces[row, k, 1] = 0.0, 0.0
-            for pad in range(pads):
-                at = s.contact_point_start[s.pad_contact_start[pad]]
-                for i in range(w.actives[pad]):
-                    k = w.active[at + i]
-                    forces[row, k, 0], forces[row, k, 1] = w.out[k, 3], w.out[k, 4]
-            n = integrals.size
-            extras[row, :n], extras[row, n : n + pads], extras[row, n + pads :] = integrals, moments, w.load
+            record(s, w, integrals, moments, forces[row], extras[row])
             row += 1
     return len(signals), CONVERGED, solves
