@@ -124,5 +124,5 @@ def test_contact_points_smoke(tmp_path: Path) -> None:
     nodes, between = cases["1 mm, nodes"], cases["1 mm, 2"]
     name = "static ripple of the force along the pad [mN]"
     assert between[name] < 0.3 * nodes[name]
-    assert max(case["gradient from differences over 1e-06"] for case in (nodes, between)) < 1e-5
+    assert max(case["gradient from differences over 1e-06"] for case in (nodes, between)) < 5e-5
     assert (tmp_path / "contact_points.png").stat().st_size > 10_000

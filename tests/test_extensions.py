@@ -276,6 +276,7 @@ def turning_hand(**parameters: float) -> tuple[Rig, Tensor]:
     return rig, grasped()
 
 
+@torch.no_grad()
 def test_two_driven_turning_pads_balance_energy_and_momentum() -> None:
     rig, y0 = turning_hand()
     run = simulate(rig, times(0.2, 41), y0=y0, step=5e-4)
@@ -298,13 +299,14 @@ def test_two_driven_turning_pads_balance_energy_and_momentum() -> None:
         disc = rig.bodies["disc"]
         gained = (
             rig(run.t[i], run.y[i].detach())[where] * torch.stack(disc.masses)
-            + torch.tensor([0.0, 0.4065 * 9.81, 0.0]).double()
+            + torch.tensor([0.0, 0.4065 * 9.81, 0.0], dtype=torch.float64)
         )
         assert torch.allclose(
             gained.detach(), run.load["disc"][i], rtol=1e-7, atol=1e-6
         )  # what runs is what torch says
 
 
+@torch.no_grad()
 def test_power_is_balanced_where_the_bases_turn() -> None:
     """dH/dt = supplied - dissipated - what the drives take out, at states of the run, from the torch module alone."""
     rig, y0 = turning_hand()

@@ -110,8 +110,8 @@ def run(
 
     After the steps marked in `keep`, the state goes to `ys`, (F_N, F_T) of every point to `forces`, and integrals, the pads'
     moments and the generalised contact forces to `extras`, one row each. y, `integrals` and the guesses in w are advanced in
-    place; after a failure they hold the last good step. With `instant` nothing advances: a stage as short as h is solved for the
-    forces at one moment, which go to the first row. Returns steps taken, status, and linear solves.
+    place; after a failure they hold the last good step. With `instant` nothing advances: a stage as short as h is solved for
+    the forces at one moment, which go to the first row. Returns steps taken, status, and linear solves.
     """
     a, pads, row, solves = GAMMA * h, s.pad_base.size, 0, 0
     powers, moments = np.empty(integrals.size), np.zeros(pads)

@@ -44,7 +44,7 @@ def law_derivatives(address: int, x: Array, p: Array, dp: Array, rows: int, out:
 
 @compiled
 def find_span(s: Any, y: Array, dy: Array, span: Array) -> None:
-    """Per pad the first and last surface dof (and one more) that is loaded or has a derivative; what is negligible becomes zero."""
+    """Per pad the first surface dof that is loaded or has a derivative, and the end; what is negligible becomes zero."""
     for pad in range(s.pad_base.size):
         size, start = 2 * (s.pad_node_start[pad + 1] - s.pad_node_start[pad]), s.pad_y_start[pad]
         span[pad, 0], span[pad, 1] = size, 0
