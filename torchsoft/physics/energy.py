@@ -25,9 +25,13 @@ def stored(rig: Rig, state: State, displacement: Mapping[str, Tensor] | None = N
         if pad.inertial:
             energies[f"strain_{name}"] = 0.5 * (part * pad.elastic_force(part)).sum((-2, -1))
         else:
-            z = part.flatten(-2)
             fractions, _ = pad.material.chain()
-            energies[f"strain_{name}"] = 0.5 * (fractions * ((z @ pad.compliance()) * z).sum(-1)).sum(-1)
+            if len(fractions) == 1:
+                u = known[name] if name in known else rig.displacement(name, state)
+                energies[f"strain_{name}"] = 0.5 * (part[..., 0, :, :] * u).sum((-2, -1))
+            else:
+                z = part.flatten(-2)
+                energies[f"strain_{name}"] = 0.5 * (fractions * ((z @ pad.compliance()) * z).sum(-1)).sum(-1)
     zero = torch.zeros_like(next(iter(state.pose.values()))[..., 0])
     normal, tangential = zero, zero
     for name, contact in rig.contacts.items():

@@ -37,7 +37,7 @@ class Pad(nn.Module):
         super().__init__()
         if points < 0:
             raise ValueError(f"`points` must be 0 (one on every node) or a number of Gauss points, but is {points}")
-        self.mesh, self.material, self.base, self.inertial = mesh, material, base, inertial
+        self.mesh, self.material, self.base, self.inertial, self.points = mesh, material, base, inertial, points
         kept = np.arange(len(mesh.free)) if inertial else mesh.surface
         c, s = np.cos(angle), np.sin(angle)
         axes = np.array([[c, -s], [s, c]]) @ np.diag([1.0, -1.0 if mirrored else 1.0])
@@ -53,6 +53,10 @@ class Pad(nn.Module):
 
     spread: Tensor
     """Shape functions of the nodes in the state at the contact points (points, nodes)."""
+
+    def at_points(self, x: Tensor) -> Tensor:
+        """Nodal vectors (..., nodes, 2) at the contact points (..., points, 2)."""
+        return x[..., self.surface, :] if self.points == 0 else self.spread @ x
 
     @property
     def nodes(self) -> int:

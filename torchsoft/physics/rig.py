@@ -228,7 +228,7 @@ class Rig(nn.Module):
         assert shape is not None
         (r_B, _), u = self.base_motion(contact.pad, state), self.displacement(contact.pad, state) if u is None else u
         centre = turned(pose[..., :2] - r_B[..., :2], -r_B[..., 2])
-        d = pad.point_positions + pad.spread @ u - centre[..., None, :]
+        d = pad.point_positions + pad.at_points(u) - centre[..., None, :]
         return -shape(turned(d, r_B[..., 2, None] - pose[..., 2, None]))[0]
 
     def forward(self, t: Tensor | float, y: Tensor, reference: Reference | None = None) -> Tensor:

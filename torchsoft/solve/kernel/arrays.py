@@ -141,7 +141,7 @@ class Work(NamedTuple):
     touching, pad by pad from its first point on, `windows` and `actives` many; low, high: nodes of the window.
 
     counts: touched nodes of every pad. A, P, Hc, Rf: one pad's share of Newton's system; X what Newton's elimination
-    leaves, per surface dof. k: rates of the flat
+    leaves, per surface dof. PB to effort_J: small arrays of Newton's iteration. k: rates of the flat
     state; load: generalised contact forces on all coordinates; full: u' of inertial pads;
     travelled: how far [m] anything moved since the last scan for near points, and that scan's margin [m].
     """
@@ -178,8 +178,20 @@ class Work(NamedTuple):
     counts: Index
     A: Array
     P: Array
+    PB: Array
+    K: Array
+    number: Index
     Hc: Array
     Rf: Array
+    r: Array
+    Rv: Array
+    b: Array
+    dV: Array
+    V_old: Array
+    phi: Array
+    effort_x: Array
+    effort: Array
+    effort_J: Array
     X: Array
     k: Array
     load: Array
@@ -209,13 +221,14 @@ def scratch(s: Any, size: int, columns: int = 1) -> Work:
     i = lambda *shape: np.zeros(shape, np.int64)
     per_node = ("u", "free", "u_dot", "u_dot_old", "u_dot_new", "F", "F_linear", "F_old", "F_new")
     return Work(
-        q=z(coordinates), V=z(coordinates), frame=z(contacts, 7), zeta=z(2 * nodes), zeta_rate=z(2 * nodes), **{name:
-        z(nodes, 2) for name in per_node},
-        x=z(points, INPUTS), out=z(points, OUTPUTS), J=z(points, 3, 7), H=z(points, 3, 8), S=z(points, 3, 8),
-        G=z(points, 6, 2), L=z(points, 6, 8), window=i(points), windows=i(pads), active=i(points), actives=i(pads),
-        low=i(pads), high=i(pads), slot=i(nodes), touched=i(nodes), counts=i(pads), A=z(widest, widest), P=z(widest, widest),
-        Hc=z(widest, free), Rf=z(free, widest), X=z(2 * nodes, columns + free), k=z(size), load=z(coordinates),
-        full=z(int(s.inertia_dof_start[-1])), travelled=np.array([np.inf, 0.0]),
+        q=z(coordinates), V=z(coordinates), frame=z(contacts, 7), zeta=z(2 * nodes), zeta_rate=z(2 * nodes),
+        **{name: z(nodes, 2) for name in per_node}, x=z(points, INPUTS), out=z(points, OUTPUTS), J=z(points, 3, 7),
+        H=z(points, 3, 8), S=z(points, 3, 8), G=z(points, 6, 2), L=z(points, 6, 8), window=i(points), windows=i(pads),
+        active=i(points), actives=i(pads), low=i(pads), high=i(pads), slot=i(nodes), touched=i(nodes), counts=i(pads),
+        A=z(widest, widest), P=z(widest, widest), PB=z(2, widest), K=z(6, 8), number=i(6), r=z(free, 1),
+        Rv=z(free, free), b=z(free, 1), dV=z(free), V_old=z(coordinates), phi=z(1), effort_x=z(5), effort=z(1),
+        effort_J=z(1, 5), Hc=z(widest, free), Rf=z(free, widest), X=z(2 * nodes, columns + free), k=z(size),
+        load=z(coordinates), full=z(int(s.inertia_dof_start[-1])), travelled=np.array([np.inf, 0.0]),
     )  # fmt: skip
 
 

@@ -146,7 +146,7 @@ def evaluate(s: Any, w: Any, pad: int, y: Array, a: float) -> tuple[float, float
     at, count, actives, c = s.contact_point_start[s.pad_contact_start[pad]], w.windows[pad], 0, s.pad_contact_start[pad]
     for node in range(w.low[pad], w.high[pad]):
         w.F[node, 0], w.F[node, 1] = 0.0, 0.0
-    phi = np.empty(1)
+    phi = w.phi
     for i in range(count):
         k = w.window[at + i]
         while k >= s.contact_point_start[c + 1]:
@@ -239,7 +239,7 @@ def assemble(s: Any, w: Any, pad: int, a: float, Rv: Array) -> int:
     for i in range(2 * n):
         A[i, : 2 * n] = 0.0
         A[i, i] = 1.0
-    K, PB, number = np.empty((6, 8)), np.empty((2, 2 * n)), np.empty(6, np.int64)
+    K, PB, number = w.K, w.PB, w.number
     for i in range(w.actives[pad]):
         k = w.active[at + i]
         while k >= s.contact_point_start[c + 1]:
@@ -247,7 +247,7 @@ def assemble(s: Any, w: Any, pad: int, a: float, Rv: Array) -> int:
         H, G, L = w.H[at + i], w.G[at + i], w.L[at + i]
         for m in range(3):
             number[m], number[3 + m] = free[s.contact_body[c] + m], free[s.pad_base[pad] + m]
-        PB[:] = 0.0
+        PB[:, : 2 * n] = 0.0
         for j in range(2):
             N = s.point_N[k, j]
             if N != 0.0:

@@ -64,7 +64,7 @@ def gone(s: Any, w: Any) -> int:
 def supply(s: Any, w: Any, signals: Array, powers: Array) -> None:
     """Powers [W] of the actuators, of gravity, of what drives the bodies, and the sum of the positive ones."""
     at = s.pad_base.size + 2
-    x, out, J = np.empty(5), np.empty(1), np.empty((1, 5))
+    x, out, J = w.effort_x, w.effort, w.effort_J
     for i in range(s.act_measured.size):
         powers[at + i] = actuate(s, i, w.q, w.V, signals, x, out, J) * w.V[s.act_pushed[i]]
     at += s.act_measured.size

@@ -60,7 +60,7 @@ def balance(s: Any, w: Any, y: Array, signals: Array, a: float, r: Array, Rv: Ar
             (w.V[s.body_coordinate[i]] - y[s.body_V_start + i]) / a + s.body_weight[i] * p[s.body_gravity_at]
         )
         Rv[i, i] = -mass / a  # (17)
-    x, out, J = np.empty(5), np.empty(1), np.empty((1, 5))
+    x, out, J = w.effort_x, w.effort, w.effort_J
     for i in range(s.act_measured.size):
         number, towards = s.body_free[s.act_pushed[i]], s.body_free[s.act_measured[i]]
         if number >= 0:
@@ -191,8 +191,7 @@ def solve_stage(
     for pad in range(pads):
         displacements(s, w, pad, y, w.low[pad], w.high[pad])
         w.F_linear[w.low[pad] : w.high[pad]] = 0.0
-    V_old, dV = np.empty(w.V.size), np.zeros(free)
-    r, Rv, b = np.empty((free, 1)), np.empty((free, free)), np.empty((free, 1))
+    V_old, dV, r, Rv, b = w.V_old, w.dV, w.r, w.Rv, w.b
     previous, part, iteration = np.inf, 1.0, 0
     while True:
         frames(s, w)
