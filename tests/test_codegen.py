@@ -388,3 +388,11 @@ def test_arrays_of_another_kind_are_refused_when_numba_compiles():
         _repeat(law.linearise, np.ones((3, 4))[:, ::2], np.ones(12), np.ones((3, 2)), np.ones((3, 2, 2)), 1)
     with pytest.raises(numba.TypingError, match="integer"):
         _repeat(1.5, np.ones((3, 2)), np.ones(12), np.ones((3, 2)), np.ones((3, 2, 2)), 1)
+
+
+def test_a_captured_tensor_with_a_gradient_is_refused() -> None:
+    """It would be a constant of the law, and its gradient lost without a word."""
+    outside = torch.tensor(0.5, dtype=torch.float64, requires_grad=True)
+    with pytest.raises(UnknownOperation, match="requires a gradient and is no parameter of the law"):
+        compile_law(lambda x, p: x * (2 * outside), torch.ones(2, dtype=torch.float64), {})
+    compile_law(lambda x, p: x * outside.detach(), torch.ones(2, dtype=torch.float64), {})

@@ -95,6 +95,12 @@ class Trace(TorchDispatchMode):
         name = func._schema.name.partition("::")[2]
         if torch.Tag.nondeterministic_seeded in func.tags:
             raise self.refused(f"the random operation {func}", "give random numbers as inputs or parameters")
+        for leaf in tree_leaves((args, kwargs)):
+            if isinstance(leaf, Tensor) and leaf.requires_grad and id(leaf) not in self._nodes and name != "detach":
+                raise self.refused(
+                    "a tensor that requires a gradient and is no parameter of the law",
+                    "make it an nn.Parameter of the law's module, or detach it",
+                )
         if not self.holds((args, kwargs)) or name in CONSTANT:
             return func(*args, **kwargs)
         if name in READS:

@@ -135,7 +135,11 @@ class Trajectory:
 
 
 def channels(rig: Rig, state: State, signals: Tensor, moments: dict[str, Tensor] | None = None) -> dict[str, Tensor]:
-    """Every channel of states (...) by its key: coordinates and rates of the bodies, signals, efforts, moments (Eq. 35)."""
+    """Every channel of states (...) by its key: coordinates and rates of the bodies, signals, efforts, moments.
+
+    A moment is what the bonded nodes give (Eq. 35), with undeformed arms; the graph's, which a turning base feels and which
+    conserves power, has deformed ones.
+    """
     out: dict[str, Tensor] = {}
     for name in rig.bodies:
         symbol, pose, velocity = rig.symbols[name], state.pose[name], state.velocity[name]
