@@ -17,6 +17,7 @@ from torchsoft.channels import MEASURED
 from torchsoft.excitation import start
 from torchsoft.parameters import Parameters
 from torchsoft.physics.motion import Reference
+from torchsoft.physics.pads import Pad
 from torchsoft.physics.paper import NAMES, SoftGrasp
 from torchsoft.physics.state import State
 
@@ -37,27 +38,49 @@ SAME = 1e-9
 
 
 class Start(NamedTuple):
-    """A model and where it starts; in the state the pads' parts are displacements (nodes, 2) [m]."""
+    """A model and where it starts: the state, and by massless pad the displacements (2 nodes,) [m], E depth [N/m] and nu that
+    its forces belong to."""
 
     model: SoftGrasp
     state: State
+    held: dict[str, tuple[Tensor, float, float]]
 
     @property
     def y0(self) -> Tensor:
         """The state (size,) from which to simulate, with its derivative by the model's parameters: displacements stay when
         parameters change, and massless pads get the forces that hold them so."""
-        model, pads = self.model, {}
-        for name, u in self.state.pads.items():
-            pad, shape = model.pads[name], model.layout.shapes["pads", name]
-            f = u if pad.inertial else torch.linalg.solve(pad.compliance(), u.flatten()).unflatten(0, (-1, 2))
-            pads[name] = f.expand(shape)
-        return model.pack(self.state._replace(pads=pads))
+        pads = dict(self.state.pads)
+        for name, (u, stiffness, nu) in self.held.items():
+            pads[name] = held_forces(self.model.pads[name], pads[name], u, stiffness, nu)
+        return self.model.pack(self.state._replace(pads=pads))
+
+
+def held_forces(pad: Pad, z: Tensor, u: Tensor, stiffness: float, nu: float) -> Tensor:
+    """Forces z (branches, nodes, 2) [N] for the pad's present material, at the displacements u that they made before.
+
+    They are in proportion to E depth, which needs no linear solve: a solve's last bits differ from call to call, and a run that
+    is made again must be the same.
+    """
+    material = pad.material
+    if float(material.nu.detach()) != nu:
+        f = torch.linalg.solve(pad.compliance(), u)
+        f = torch.round(f.detach(), decimals=9) + (f - f.detach())
+        return f.unflatten(0, (-1, 2)).expand(z.shape)
+    scaled = z * (material.E * material.depth / stiffness)
+    C, dC = pad.unit_compliance()
+    by_nu = -torch.linalg.solve(C, dC @ scaled.detach().flatten(-2).mT).mT.reshape(z.shape)
+    return scaled + by_nu * (material.nu - material.nu.detach())
 
 
 def lying(model: SoftGrasp) -> Start:
     """The disc at rest on the lower pad and the bracket clear of it, by the model's own parameters."""
-    state = model.unpack(start(model).detach())
-    return Start(model, state._replace(pads={name: model.displacement(name, state).detach() for name in state.pads}))
+    state, held = model.unpack(start(model).detach()), {}
+    for name, pad in model.pads.items():
+        if not pad.inertial:
+            material = pad.material
+            u = model.displacement(name, state).detach().flatten()
+            held[name] = u, float((material.E * material.depth).detach()), float(material.nu.detach())
+    return Start(model, state, held)
 
 
 @dataclass(frozen=True)
