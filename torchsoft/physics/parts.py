@@ -1,6 +1,6 @@
 """The parts of a rig beside its pads: rigid bodies, contacts, and actuators with their control laws."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import ClassVar, Literal
 
 import torch
@@ -98,8 +98,3 @@ class Actuator(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         """Effort (...) of x = (setpoint, its rate, feed-forward, coordinate, its rate) (..., 5)."""
         return self.law(*x.unbind(-1))
-
-
-def gathered(modules: Mapping[str, object]) -> nn.Module:
-    """One module with what is a module among some objects, for their parameters by name."""
-    return nn.ModuleDict({name: module for name, module in modules.items() if isinstance(module, nn.Module)})
