@@ -80,12 +80,11 @@ def test_a_weightless_disc_rests_without_sinking() -> None:
 
 
 @torch.no_grad()
-@pytest.mark.parametrize("x_C0", [60.7e-3, 61e-3])
+@pytest.mark.parametrize("x_C0", [58.1e-3, 59.4e-3, 59.7e-3, 60.1e-3, 60.7e-3, 61e-3])
 def test_a_weightless_disc_between_nodes_rests_on_them(x_C0: float) -> None:
-    """Nothing need press it: Newton's matrix is singular there, and any height clear of the nodes is an equilibrium."""
     model = build(scenario__gravity=0.0, scenario__x_C0=x_C0)
     state = model.unpack(rest(model))
-    assert -1e-7 < float(model.penetration("L", state).max()) <= 1e-15  # measured: -5e-9 m at 61 mm
+    assert abs(float(model.penetration("L", state).max())) <= 1e-15
     assert float(model.displacement("L", state).abs().max()) < 1e-12
 
 

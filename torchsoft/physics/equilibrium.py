@@ -1,9 +1,10 @@
 """Static, frictionless equilibria of the paper's rig: the object at rest under its weight, and pressed between the pads."""
 
 import torch
+from scipy.optimize import brentq
 from torch import Tensor
 
-from torchsoft.physics.contact import moving_frame, normal_force
+from torchsoft.physics.contact import Frame, moving_frame, normal_force
 from torchsoft.physics.paper import SoftGrasp
 from torchsoft.physics.state import State
 
@@ -17,7 +18,8 @@ class NoEquilibrium(RuntimeError):
 
 def rest(model: SoftGrasp) -> Tensor:
     """State (size,): the object at rest on the lower pad under its weight, the upper pad just touching it from above."""
-    state = _solve(model, bracket_height=None)
+    weightless = float((model.disc.mass * model.gravity).detach()) == 0.0
+    state = _touching(model) if weightless else _solve(model, bracket_height=None)
     x, y, _ = state.pose["disc"]
     return model.pack(_with_bracket(state, x, model.touch_height(y)))
 
@@ -46,6 +48,27 @@ def holding_force(model: SoftGrasp, y: Tensor) -> float:
 
 def _with_bracket(state: State, x: Tensor, y: Tensor) -> State:
     return state._replace(pose=state.pose | {"bracket": torch.stack((x, y, torch.zeros_like(y)))})
+
+
+def _touching(model: SoftGrasp) -> State:
+    """The object where it just touches the undeformed lower pad: what a body without weight rests like."""
+    x, top = torch.tensor(model.settings.scenario.x_C0, dtype=torch.float64), model.settings.pad.height
+    zero = torch.zeros((), dtype=torch.float64)
+    below = float(model.shape.support(torch.tensor([0.0, -1.0]).double()).detach())
+    side = _Side(model, "L", torch.zeros(2, dtype=torch.float64), x, min(below, 3 * (below * top) ** 0.5))
+
+    def deepest(height: Tensor) -> tuple[Tensor, Tensor]:
+        """Penetration of the deepest point [m], and its derivative by the height."""
+        frame = side.frame(torch.zeros(len(side.near), 2, dtype=torch.float64), height)
+        k = frame.g.argmax()
+        return frame.g[k], frame.n[k, 1]
+
+    with torch.no_grad():
+        y = brentq(lambda y: float(deepest(zero + y)[0]), top + 0.5 * below, top + 1.01 * below, xtol=1e-15, rtol=1e-15)
+    penetration, slope = deepest(zero + y)
+    height = y - penetration / slope.detach()  # its gradient is the implicit function theorem's
+    state = model.unpack(torch.zeros(model.layout.size, dtype=torch.float64))
+    return _with_bracket(state._replace(pose=state.pose | {"disc": torch.stack((x, height, zero))}), x, zero)
 
 
 def _solve(model: SoftGrasp, bracket_height: float | None) -> State:
@@ -133,11 +156,14 @@ class _Side:
         dofs = (2 * self.near[:, None] + torch.arange(2)).flatten()
         self.C = self.pad.compliance()[dofs][:, dofs]
 
+    def frame(self, u: Tensor, y_C: Tensor) -> Frame:
+        """Of each near point, for displacements u (near, 2) [m] of the near nodes and the object's height [m]."""
+        d = self.places + self.spread @ u - torch.stack((self.x, y_C))
+        return moving_frame(self.model.shape, d, torch.zeros_like(y_C).expand(len(d)))
+
     def force(self, u: Tensor, y_C: Tensor) -> Tensor:
         """On each near node, (near, 2) [N], for their displacements u (near, 2) [m] and the object's height [m]."""
-        zero = torch.zeros_like(y_C)
-        d = self.places + self.spread @ u - torch.stack((self.x, y_C))
-        frame = moving_frame(self.model.shape, d, zero.expand(len(d)))
+        frame, zero = self.frame(u, y_C), torch.zeros_like(y_C)
         return self.spread.mT @ (normal_force(frame.g, zero, zero, self.K_n, zero)[:, None] * frame.n)
 
     def everywhere(self, F: Tensor) -> Tensor:
