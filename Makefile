@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 OUT    ?= out/grasp_and_roll
 
-.PHONY: run test test-slow lint clean
+.PHONY: run test test-slow test-hostile lint clean
 
 run: $(STAMP)
 	$(BIN)/python experiments/grasp_and_roll.py --out $(OUT)
@@ -14,7 +14,11 @@ test: $(STAMP)
 	$(BIN)/python -m pytest
 
 test-slow: $(STAMP)
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python -m pytest -m slow --ignore tests/hostile
+
+test-hostile: $(STAMP)
+	rm -rf out/hostile
+	$(BIN)/python -m pytest -m slow tests/hostile --timeout 1800
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

@@ -1,5 +1,6 @@
 """Compiled laws against torch: values, Jacobians and pullbacks, conventions at kinks, and refusals."""
 
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 import torch
 from torch.nn import functional as F
 
-from torchsoft.codegen import UnknownOperation, compile_law
+from torchsoft.codegen import UnknownOperation, compile_law, emit
 from torchsoft.codegen.invoke import call_linearise, call_pullback, call_value
 
 
@@ -365,6 +366,24 @@ def test_the_same_law_is_compiled_once():
 def _repeat(address, x, p, out, J, count):
     for k in range(count):
         call_linearise(address, x[k % 3], p[1:11], out[k % 3], J[k % 3])
+
+
+def test_threads_that_compile_one_law_together_share_its_code(monkeypatch):
+    """An engine that nobody holds is freed, and its addresses lead nowhere."""
+    together, engine = threading.Barrier(8), emit._engine
+
+    def slow(source):
+        made = engine(source)
+        together.wait(30)
+        return made
+
+    monkeypatch.setattr(emit, "_engine", slow)
+    law = lambda x, p: torch.stack([x[0] * 17.25 + p["k"] * x[1]])
+    arguments = _points(2)[0], {"k": torch.tensor(3.0, dtype=torch.float64)}
+    with ThreadPoolExecutor(8) as pool:
+        laws = list(pool.map(lambda _: compile_law(law, *arguments), range(8)))
+    held = {engine.get_function_address("value") for engine in emit._engines.values()}
+    assert {law.value for law in laws} <= held
 
 
 def test_a_law_runs_in_several_threads_on_slices_of_larger_arrays():

@@ -160,7 +160,7 @@ def test_contact_points_stand_for_the_whole_surface(place: Place, points: int) -
 
 
 def test_a_negative_number_of_points_is_refused() -> None:
-    with pytest.raises(ValueError, match="`points` must be 0"):
+    with pytest.raises(ValueError, match="`points` must be a whole number from 0 on, but is -1"):
         pad_at(("L", False), inertial=False, points=-1)
 
 

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from torchsoft import (
+    Coulomb,
     Ellipse,
     KelvinVoigt,
     Parameters,
@@ -27,7 +28,8 @@ from torchsoft import (
     rest,
     simulate,
 )  # fmt: skip
-from torchsoft.excitation import start
+from torchsoft.excitation import Excitation, MultiSine, begin, start
+from torchsoft.solve.adjoint import GradientFailed
 from torchsoft.solve.stepper import SimulationFailed
 
 T = times(0.02, 11)
@@ -81,6 +83,7 @@ class Oval(Ellipse):
         self.radius = torch.tensor(19.37e-3, dtype=torch.float64)
 
 
+@pytest.mark.filterwarnings("ignore:the energies of the run")  # the bracket starts off its set-point
 def test_a_shape_with_a_radius_runs_as_itself() -> None:
     oval, ellipse = (SoftGrasp(coarse().settings, shape=shape) for shape in (Oval(), Ellipse(19.8e-3, 19.1e-3)))
     with torch.no_grad():
@@ -235,6 +238,143 @@ def test_a_knot_with_a_graph_receives_its_gradient() -> None:
     assert float(slope) == pytest.approx((ends[0] - ends[1]) / 2e-7, rel=1e-5)
 
 
+def test_values_moved_in_place_after_the_run_do_not_change_the_gradient() -> None:
+    """Also those that torch's graphs keep to multiply with, moved behind torch's back or not."""
+    model = coarse()
+    run = rolled(model, gradient="discrete")
+    wanted = [model.pad.E, model.pad.depth, model.disc.mass, model.control["x"].Kp]
+    value = run["theta"][-1] + 1e-3 * run["F_x"][-1] + 1e3 * run["angular_momentum"][-1]
+    before = torch.autograd.grad(value, wanted, retain_graph=True)
+    for parameter in wanted:
+        parameter.data.mul_(2.0)
+    after = torch.autograd.grad(value, wanted, retain_graph=True)
+    with torch.no_grad():
+        for parameter in wanted:
+            parameter.mul_(2.0)
+    last = torch.autograd.grad(value, wanted)
+    assert all(torch.equal(a, b) and torch.equal(a, c) for a, b, c in zip(before, after, last))
+
+
+def test_the_angular_momentum_has_the_gradient_of_the_inertia() -> None:
+    model = coarse()
+    run = rolled(model, gradient="discrete")
+    L, omega, m = run["angular_momentum"][-1], run["omega"][-1], model.disc.mass
+    (by_L,), (by_omega,) = (torch.autograd.grad(x, m, retain_graph=True) for x in (L, omega))
+    I = model.disc.inertia.detach()
+    assert float(by_L) == pytest.approx(float(I * by_omega + I / m.detach() * omega.detach()), rel=1e-12)
+
+
+def test_what_has_no_gradient_says_so() -> None:
+    """The recorded moments, and second derivatives; a moment of no weight in a sum is none."""
+    model = coarse()
+    run = rolled(model, gradient="discrete")
+    with pytest.raises(GradientFailed, match=r"the channel `M_U` is recorded and has no gradient"):
+        (run["theta"][-1] + run["bracket_moment"][-1]).backward(retain_graph=True)
+    (run["theta"][-1] + 0.0 * run["bracket_moment"][-1]).backward(retain_graph=True)
+    with pytest.raises(GradientFailed, match="has no second derivative"):
+        torch.autograd.grad(run["theta"][-1], model.pad.E, create_graph=True)
+    assert not rolled(model)["bracket_moment"].requires_grad
+
+
+SHARE = 0.5
+"""A number that the law below reads from its module."""
+
+
+class Sharing(nn.Module):
+    """A slip law that depends on a global number."""
+
+    def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
+        return SHARE * (E - 0.3 * F_N).clamp(min=0.0) / (R + 10.0)
+
+
+def test_a_law_is_what_its_code_is_now() -> None:
+    """A global that it reads, and the number of iterations of a shape of the package, changed between two runs."""
+    model = SoftGrasp(coarse().settings, friction=Sharing())
+    y0 = grasped(model, (0.08, 0.0))
+    first = simulate(model, T, y0=y0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(globals(), "SHARE", 0.9)
+        assert not torch.equal(simulate(model, T, y0=y0).y, first.y)
+    assert torch.equal(simulate(model, T, y0=y0).y, first.y)
+    oval = SoftGrasp(coarse().settings, shape=Ellipse(20e-3, 18.8e-3))
+    with pytest.MonkeyPatch.context() as patch:
+        exact = simulate(oval, T, y0=y0).y
+        patch.setattr(Ellipse, "ITERATIONS", 1)
+        assert not torch.equal(simulate(oval, T, y0=y0).y, exact)
+
+
+def test_what_is_saved_is_what_ran() -> None:
+    """Numbers behind parametrizations, laws and shapes that were replaced, an optimiser's step, what was loaded."""
+    model, other = coarse(), coarse(contact__K_n=2e5)
+    y0 = grasped(model, (0.05, 0.0))
+    said = lambda: simulate(model, T, y0=y0).made_by
+    parametrize.register_parametrization(model.contact, "K_t", Exp())
+    with torch.no_grad():
+        model.contact.parametrizations.K_t.original.add_(0.1)  # pyright: ignore
+    assert said()["parameters"]["contact.K_t"] == model.contact.K_t.item() != 1.2e5
+    model.load_state_dict(other.state_dict(), strict=False)
+    assert said()["parameters"]["contact.K_n"] == 2e5
+    optimiser = torch.optim.SGD([model.pad.E], lr=1e12)
+    rolled(model, gradient="discrete")["theta"][-1].backward()
+    optimiser.step()
+    assert said()["parameters"]["pad.E"] == model.pad.E.item() != 0.75e6
+    model.contact.friction = Coulomb(0.5, 0.4)
+    made_by = said()
+    assert made_by["parameters"]["contact.friction"] == "coulomb"
+    assert made_by["friction"]["L"] == "Coulomb"
+    assert "contact.v_s" not in made_by["parameters"]
+    oval = SoftGrasp(coarse().settings, shape=Ellipse(19.8e-3, 19.1e-3))
+    described = oval.description()
+    assert "disc.radius" not in described["parameters"]
+    assert described["shape"] == {"disc": "Ellipse"}
+
+
+# surroundings -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_torchs_default_dtype_does_not_matter(dtype: torch.dtype) -> None:
+    """Parts made, a motion begun and run with gradients and sensitivities: the same bits."""
+
+    def answer() -> list[Tensor]:
+        motion = MultiSine(amplitude_x=1e-3, frequency=(5.0, 20.0))
+        excitation = Excitation(motion=motion, duration=0.5, grasp_time=0.05, settle=0.02)
+        begun = begin(excitation, coarse().settings)
+        t = times(0.1, 6)
+        run = simulate(begun.model, t, y0=begun.y0, gradient="discrete")
+        forward = simulate(begun.model, t, y0=begun.y0, gradient="forward", wrt=["pad.E", "pad.nu"])
+        leaves = [p for p in begun.model.parameters() if p.requires_grad]
+        gradients = torch.autograd.grad(run["y_C"][-1], leaves, allow_unused=True)
+        oval = SoftGrasp(begun.model.settings, shape=Ellipse(19.8e-3, 19.1e-3), friction=Coulomb(0.5, 0.4))
+        with torch.no_grad():
+            parts = [rest(oval), oval(0.0, rest(oval)), run.y, *run.channels.values(), *run.energy.values()]
+        return [*parts, *(g for g in gradients if g is not None), forward.sensitivities]  # pyright: ignore
+
+    expected, before = answer(), torch.get_default_dtype()
+    torch.set_default_dtype(dtype)
+    try:
+        found = answer()
+    finally:
+        torch.set_default_dtype(before)
+    assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+
+
+def test_other_settings_of_the_process_do_not_matter() -> None:
+    """numpy's errors raised, denormal numbers flushed, inference mode."""
+    model = coarse()
+    y0 = grasped(model, (0.05, 0.0))
+    expected = simulate(model, T, y0=y0).y
+    with np.errstate(all="raise"):
+        assert torch.equal(simulate(model, T, y0=y0).y, expected)
+    torch.set_flush_denormal(True)
+    try:
+        assert torch.equal(simulate(model, T, y0=y0).y, expected)
+    finally:
+        torch.set_flush_denormal(False)
+    with torch.inference_mode():
+        assert torch.equal(simulate(model, T, y0=y0, gradient="discrete").y, expected)
+
+
 # routes -------------------------------------------------------------------------------------------------------------
 
 
@@ -314,6 +454,75 @@ def test_unphysical_values_set_in_place_are_refused_by_name(name: str, value: fl
         model.parameter(name).fill_(value)
     with pytest.raises(ValueError, match=match):
         simulate(model, T, y0=y0)
+
+
+class Noisy(Profile):
+    """Another value at every call."""
+
+    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        value, rate = super().forward(t)
+        return value + 1e-6 * torch.rand_like(t), rate
+
+
+class Single(Profile):
+    """In another dtype."""
+
+    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        value, rate = super().forward(t)
+        return value.float(), rate
+
+
+@pytest.mark.parametrize(
+    ("signal", "match"),
+    [(Noisy, "gives other values when asked again"), (Single, "the signal `x_d` must give float64")],
+)
+def test_signals_that_are_no_functions_of_time_are_refused(signal: type[Profile], match: str) -> None:
+    model = coarse()
+    y0 = grasped(model)
+    bad = Reference(x_d=signal([0.0], [0.06]), y_d=model.reference["y_d"], F_ff=model.reference["F_ff"])
+    with pytest.raises(ValueError, match=match):
+        simulate(model, T, y0=y0, reference=bad)
+
+
+def test_what_belongs_to_another_route_and_what_is_no_number_is_refused() -> None:
+    model = coarse()
+    y0 = grasped(model)
+    size = model.layout.size
+    cases: list[tuple[dict[str, object], str]] = [
+        ({"wrt": "pad.E", "gradient": "forward"}, "`wrt` must be a list of parameters' names"),
+        ({"rigid": True}, "belong to gradient='forward'"),
+        ({"dy0": torch.zeros(size, 1).double()}, "belong to gradient='forward'"),
+        ({"gradient": "forward", "wrt": ["pad.E"], "dy0": torch.zeros(size, 1)}, "`dy0` must be float64"),
+        ({"reference": {}}, "`reference` must be a Reference, but is dict"),
+        ({"step": True}, "`step` must be positive and finite, but is True"),
+        ({"step": 1e-300}, "at most 1e[+]08 can be taken"),
+        ({"tolerance": 1e-14}, "`tolerance` must be at least 1e-10 N"),
+        ({"y0": y0.numpy()}, "`y0` must be a float64 tensor, but is ndarray"),
+        ({"t": [0.0, 1.0]}, "`t` must be a float64 tensor, but is list"),
+        ({"t": T.clone().requires_grad_()}, "`t` must not require a gradient"),
+        ({"t": 1e-300 * T}, "must be further apart than 1e-12 s"),
+        ({"rig": SoftGrasp}, "`rig` must be a Rig"),
+    ]
+    for changes, match in cases:
+        with pytest.raises(ValueError, match=match):
+            simulate(**({"rig": model, "t": T, "y0": y0} | changes))  # pyright: ignore[reportArgumentType]
+    with torch.inference_mode(), pytest.raises(ValueError, match=r"torch.inference_mode\(\) has not"):
+        simulate(model, T, y0=y0, gradient="forward", wrt=["pad.E"])
+
+
+def test_parts_replaced_after_a_run_run() -> None:
+    """A material with more branches after the first run, in the group and in the pads."""
+    model = coarse()
+    simulate(model, T, y0=grasped(model))
+    p, size = model.settings.pad, model.layout.size
+    model.pad = StandardLinearSolid(p.E, 2 * p.E, p.nu, p.rho, p.tau, p.depth)
+    for pad in model.pads.values():
+        pad.material = model.pad
+    assert model.layout.size > size
+    fresh = SoftGrasp(coarse().settings, material=model.pad)
+    y0 = grasped(fresh)
+    model.reference = fresh.reference
+    assert torch.equal(simulate(model, T, y0=y0).y, simulate(fresh, T, y0=y0).y)
 
 
 def test_a_law_that_turns_nan_never_converges() -> None:

@@ -96,7 +96,7 @@ def test_bad_states_and_settings_are_refused() -> None:
         simulate(model, t, y0=torch.zeros(model.layout.size))
     with pytest.raises(ValueError, match="must be float64 of shape"):
         simulate(model, t, y0=torch.zeros(3, dtype=torch.float64))
-    with pytest.raises(ValueError, match="one finite state"):
+    with pytest.raises(ValueError, match="must be finite, but component 0"):
         simulate(model, t, y0=torch.full((model.layout.size,), torch.nan, dtype=torch.float64))
     for value in (0.0, -1e-3, float("nan")):
         with pytest.raises(ValueError, match="`step` must be positive and finite"):

@@ -1,26 +1,124 @@
-"""Files: written whole or not at all, JSON without infinities, and the findings of pydantic in one sentence."""
+"""Files: written whole or not at all and made to last, and JSON without infinities."""
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
+import os
+import re
+import secrets
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from glob import escape
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
+
+try:
+    import fcntl
+except ImportError:  # no such locks: partial files are then left where they are
+    fcntl = None
+
+SEAL, DIGEST = b"\ntorchsoft-sha256\n", 64
+"""How a file with a checksum ends, and the length of the checksum before."""
+
+PARTIAL = re.compile(r"\.[0-9a-f]{16}\.partial$")
+"""How the name of a partial file ends, after the name of the file that it becomes."""
 
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """A path beside `path` to write to, which replaces `path` at the end: the file appears whole or not at all.
+    """A path beside `path` to write to, which replaces `path` at the end: the file appears whole or not at all, and lasts.
 
-    Missing folders are made.
+    Missing folders are made. The partial file is removed when writing it fails; one that a killed process left is
+    removed by the next that writes the same file. Its writer holds a lock on it, so that nobody removes it before.
     """
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(path.name + ".partial")
-    yield partial
-    partial.replace(path)
+    make_folder(path.parent)
+    remove_partials(path.parent.glob(f"{escape(path.name)}.*.partial"))
+    partial, handle = new_partial(path)
+    try:
+        yield partial
+        flush(partial)
+        partial.replace(path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+    finally:
+        os.close(handle)
+    flush_folder(path.parent)
+
+
+def new_partial(path: Path) -> tuple[Path, int]:
+    """An empty file beside `path` under a name of its own, and a handle that holds its lock."""
+    while True:
+        partial = path.with_name(f"{path.name}.{secrets.token_hex(8)}.partial")
+        handle = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
+        with suppress(OSError):  # where the file system has no locks, nobody removes partial files either
+            if fcntl is not None:
+                fcntl.flock(handle, fcntl.LOCK_EX)
+        if partial.exists():
+            return partial, handle
+        os.close(handle)  # removed between its making and its lock
+
+
+def remove_partials(paths: Iterable[Path]) -> None:
+    """Remove those of the paths that are partial files whose writers are gone."""
+    for path in paths:
+        if fcntl is None or not PARTIAL.search(path.name):
+            continue
+        with suppress(OSError):  # gone by now, or not ours to touch
+            handle = os.open(path, os.O_RDWR)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                path.unlink(missing_ok=True)
+            finally:
+                os.close(handle)
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder that lasts, and those above it."""
+    if not path.is_dir() and path != path.parent:
+        make_folder(path.parent)
+        path.mkdir(exist_ok=True)
+        flush_folder(path.parent)
+
+
+def flush(path: Path) -> None:
+    """Have the operating system write a file to the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def flush_folder(path: Path) -> None:
+    """The same for the names in a folder, where the file system can."""
+    with suppress(OSError):
+        flush(path)
+
+
+def sealed(content: bytes | memoryview) -> bytes:
+    """The content of a file with its checksum at the end, where formats such as HDF5 do not look."""
+    return bytes(content) + sha256(content).hexdigest().encode() + SEAL
+
+
+def unsealed(path: str | Path) -> bytes:
+    """The content of such a file. Raises `ValueError` for one that does not end with the checksum of its content.
+
+    The libraries that read a format may hang or crash with a damaged file, and say nothing of it.
+    """
+    whole = Path(path).read_bytes()
+    content = whole[: -DIGEST - len(SEAL)]
+    if not whole.endswith(SEAL):
+        raise ValueError(
+            f"{path} has no checksum at its end: it is a file of another kind, or was cut or changed; save it anew"
+        )
+    if sealed(content) != whole:
+        raise ValueError(
+            f"{path} is damaged: its content is not what was saved; save it anew or restore it from a copy"
+        )
+    return content
 
 
 def finite(value: Any) -> Any:
@@ -35,14 +133,4 @@ def finite(value: Any) -> Any:
 def write_json(path: str | Path, content: Any, indent: int = 2) -> None:
     """Write a JSON file, with null for numbers that are not finite."""
     with replacing(path) as partial:
-        partial.write_text(json.dumps(finite(content), indent=indent, allow_nan=False) + "\n")
-
-
-def findings(error: ValidationError, group: str = "") -> str:
-    """pydantic's findings in one line, each with its field, which stands in `group` or by itself."""
-    out = []
-    for one in error.errors():
-        field = ".".join(str(part) for part in (group, *one["loc"]) if part != "")
-        text = one["msg"].removeprefix("Value error, ").replace("Extra inputs are not permitted", "is not known here")
-        out.append(f"{field}: {text}" if field else text)
-    return "; ".join(out)
+        partial.write_text(json.dumps(finite(content), indent=indent, allow_nan=False) + "\n", encoding="utf-8")

@@ -113,7 +113,7 @@ def compiled(functions: Iterable[str]) -> llvm.ExecutionEngine:
     source = "\n".join([*declarations, *functions])
     key = hashlib.sha256(source.encode()).hexdigest()
     if key not in _engines:
-        _engines[key] = _engine(source)
+        _engines.setdefault(key, _engine(source))  # where threads were at it together, all take the first one's
     return _engines[key]
 
 

@@ -12,6 +12,7 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torchsoft.physics.arguments import positive
 from torchsoft.physics.shapes import Shape, parameter
 
 SlipLaw = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -105,6 +106,10 @@ class Coulomb(nn.Module):
         super().__init__()
         self.mu_s, self.mu_k = parameter(mu_s), parameter(mu_k)
 
+    def well_posed(self) -> str:
+        """What is wrong with the parameters together; empty if nothing is."""
+        return "mu_k is above mu_s, so that slip would supply power" if self.mu_k.item() > self.mu_s.item() else ""
+
     def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
         return torch.where(self.mu_s * F_N <= E, (E - self.mu_k * F_N) / R, 0.0)
 
@@ -119,6 +124,7 @@ class SoftContact(nn.Module):
         "K_t": "positive",
         "R_t": "not negative",
         "epsilon": "positive",
+        "node_spacing": "positive",
     }
 
     def __init__(
@@ -128,7 +134,15 @@ class SoftContact(nn.Module):
         super().__init__()
         self.K_n, self.R_n, self.K_t, self.R_t = (parameter(value) for value in (K_n, R_n, K_t, R_t))
         self.epsilon = parameter(epsilon, trained=False)
-        self.node_spacing, self.friction = node_spacing, friction
+        self.node_spacing, self.friction = positive("node_spacing", node_spacing), friction
+
+    def well_posed(self) -> str:
+        """What is wrong with the parameters together; empty if nothing is."""
+        if isinstance(self.friction, SmoothSlip) and self.R_t.item() + self.friction.eta.item() <= 0:
+            return "eta + R_t must be positive, since the slip rate is effort / (eta + R_t)"
+        if isinstance(self.friction, Coulomb) and self.R_t.item() <= 0:
+            return "Coulomb's friction needs R_t > 0, since the stretch is re-anchored through the dashpot"
+        return ""
 
     def forward(
         self,

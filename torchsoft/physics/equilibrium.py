@@ -1,12 +1,16 @@
 """Static, frictionless equilibria of the paper's rig: the object at rest under its weight, and pressed between the pads."""
 
+from typing import Any
+
 import torch
 from scipy.optimize import brentq
 from torch import Tensor
 
+from torchsoft.physics.arguments import number
 from torchsoft.physics.contact import Frame, moving_frame, normal_force
 from torchsoft.physics.paper import SoftGrasp
 from torchsoft.physics.state import State
+from torchsoft.physics.validity import check_values
 
 RESIDUAL = 1e-13
 """Equilibrium residual [m], forces counted by the compliance they meet."""
@@ -16,8 +20,16 @@ class NoEquilibrium(RuntimeError):
     """Newton's iteration found no static equilibrium."""
 
 
+def _check(model: SoftGrasp) -> None:
+    """Raises `ValueError` for a model whose statics would be nonsense, or have no graph."""
+    if torch.is_inference_mode_enabled():
+        raise ValueError("statics need torch's graphs, which torch.inference_mode() has not; use torch.no_grad()")
+    check_values(model)
+
+
 def rest(model: SoftGrasp) -> Tensor:
     """State (size,): the object at rest on the lower pad under its weight, the upper pad just touching it from above."""
+    _check(model)
     weightless = float((model.disc.mass * model.gravity).detach()) == 0.0
     state = _touching(model) if weightless else _solve(model, bracket_height=None)
     x, y, _ = state.pose["disc"]
@@ -29,6 +41,8 @@ def press(model: SoftGrasp, bracket_height: float) -> Tensor:
 
     Raises `NoEquilibrium` when the bracket is too high for its pad to touch the object, sunk in under its weight.
     """
+    _check(model)
+    number("bracket_height", bracket_height)
     p = model.settings
     with torch.no_grad():
         up = float(model.touch_height(p.pad.height + model.shape.support(torch.tensor([0.0, -1.0]).double())))
@@ -64,7 +78,7 @@ def _touching(model: SoftGrasp) -> State:
         return frame.g[k], frame.n[k, 1]
 
     with torch.no_grad():
-        y = brentq(lambda y: float(deepest(zero + y)[0]), top + 0.5 * below, top + 1.01 * below, xtol=1e-15, rtol=1e-15)
+        y: Any = brentq(lambda y: float(deepest(zero + y)[0]), top + 0.5 * below, top + 1.01 * below, xtol=1e-15)
     penetration, slope = deepest(zero + y)
     height = y - penetration / slope.detach()  # its gradient is the implicit function theorem's
     state = model.unpack(torch.zeros(model.layout.size, dtype=torch.float64))

@@ -59,6 +59,10 @@ class StandardLinearSolid(Material):
         super().__init__(E, nu, rho, depth)
         self.E_instant, self.tau, self.tau_instant = (parameter(x) for x in (E_instant, tau, tau_instant))
 
+    def well_posed(self) -> str:
+        """What is wrong with the parameters together; empty if nothing is."""
+        return "E_instant is below E" if self.E_instant.item() < self.E.item() else ""
+
     def chain(self) -> tuple[Tensor, Tensor]:
         first = self.E / self.E_instant
         return torch.stack((first, 1 - first)), torch.stack((self.tau_instant, self.tau))

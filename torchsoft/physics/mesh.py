@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 from torch import Tensor
 
+from torchsoft.physics.arguments import positive, whole
+
 Array = NDArray[np.float64]
 
 
@@ -66,6 +68,12 @@ class PadMesh:
     elements_x: int
     elements_y: int
     bonded_sides: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("length", "height"):
+            positive(name, getattr(self, name))
+        for name in ("elements_x", "elements_y"):
+            whole(name, getattr(self, name), 1)
 
     @cached_property
     def nodes(self) -> Array:
@@ -148,7 +156,7 @@ def unit_compliance(mesh: PadMesh, nu: float) -> tuple[Array, Array]:
     loads[surface, np.arange(len(surface))] = 1.0
     factor = linalg.cholesky_banded(mesh.banded_stiffness(*lame_moduli(1.0, nu)), lower=True)
     X = linalg.cho_solve_banded((factor, True), loads)
-    with torch.enable_grad():
+    with torch.inference_mode(False), torch.enable_grad():
         nu_ = torch.tensor(nu, dtype=torch.float64, requires_grad=True)
         moduli = lame_moduli(torch.ones_like(nu_), nu_)
     d_lambda, d_mu = (torch.autograd.grad(modulus, nu_, retain_graph=True)[0].item() for modulus in moduli)

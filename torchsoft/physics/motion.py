@@ -22,11 +22,8 @@ class Profile(nn.Module):
         knots = torch.as_tensor(times, dtype=torch.float64)
         if knots.ndim != 1 or not bool(torch.all(knots.diff() > 0)) or not bool(torch.isfinite(knots).all()):
             raise ValueError(f"`times` must increase strictly, but are {times}")
-        many = (
-            values
-            if isinstance(values, Tensor)
-            else torch.stack([torch.as_tensor(v, dtype=torch.float64) for v in values])
-        )
+        listed = values if isinstance(values, Tensor) else [torch.as_tensor(v, dtype=torch.float64) for v in values]
+        many = listed if isinstance(listed, Tensor) else torch.stack(listed) if listed else torch.zeros(0)
         if many.shape != knots.shape or not bool(torch.isfinite(many).all()):
             raise ValueError(f"`values` must hold one finite number per time ({len(knots)}), but are {values}")
         self.register_buffer("times", knots)
@@ -52,7 +49,12 @@ class Sampled(Profile):
 
     rates: Tensor
 
-    def __init__(self, times: list[float], values: list[float], rates: list[float] | None = None) -> None:
+    def __init__(
+        self,
+        times: Sequence[float] | Tensor,
+        values: Sequence[float] | Tensor,
+        rates: Sequence[float] | Tensor | None = None,
+    ) -> None:
         super().__init__(times, values)
         if rates is None:
             rates = CubicSpline(times, values).derivative()(times).tolist() if len(times) > 1 else [0.0]
@@ -99,8 +101,22 @@ class Reference(nn.Module):
             if name.replace(".", ":") not in self.signals:
                 known = ", ".join(key.replace(":", ".") for key in self.signals) or "none"
                 raise ValueError(f"the reference has no signal `{name}`; it has {known}")
-            rows.append(torch.stack(self[name](t), -1))
+            rows.append(self._asked(name, t))
         return torch.stack(rows, -2) if rows else t.new_zeros((*t.shape, 0, 2))
+
+    def _asked(self, name: str, t: Tensor) -> Tensor:
+        """Value and rate (..., 2) of one signal."""
+        given = self[name](t)
+        if not isinstance(given, tuple) or len(given) != 2 or not all(isinstance(x, Tensor) for x in given):
+            raise ValueError(
+                f"the signal `{name}` must give two tensors, value and rate, but gives {type(given).__name__}"
+            )
+        for x in given:
+            if x.shape != t.shape or x.dtype != torch.float64:
+                raise ValueError(
+                    f"the signal `{name}` must give float64 of shape {tuple(t.shape)}, but gives {x.dtype} of {tuple(x.shape)}"
+                )
+        return torch.stack(given, -1)
 
     def __getitem__(self, name: str) -> nn.Module:
         return self.signals[name.replace(".", ":")]

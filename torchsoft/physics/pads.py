@@ -12,6 +12,7 @@ from scipy import sparse
 from scipy.sparse.linalg import splu
 from torch import Tensor, nn
 
+from torchsoft.physics.arguments import whole
 from torchsoft.physics.material import Material
 from torchsoft.physics.mesh import Array, PadMesh, lame_moduli, unit_compliance
 
@@ -35,9 +36,8 @@ class Pad(nn.Module):
         angle: float = 0.0, mirrored: bool = False, inertial: bool = False, points: int = 0,
     ) -> None:  # fmt: skip
         super().__init__()
-        if points < 0:
-            raise ValueError(f"`points` must be 0 (one on every node) or a number of Gauss points, but is {points}")
-        self.mesh, self.material, self.base, self.inertial, self.points = mesh, material, base, inertial, points
+        self.points = whole("points", points, 0)
+        self.mesh, self.material, self.base, self.inertial = mesh, material, base, inertial
         kept = np.arange(len(mesh.free)) if inertial else mesh.surface
         c, s = np.cos(angle), np.sin(angle)
         axes = np.array([[c, -s], [s, c]]) @ np.diag([1.0, -1.0 if mirrored else 1.0])

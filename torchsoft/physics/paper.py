@@ -89,23 +89,44 @@ class SoftGrasp(Rig):
         )  # fmt: skip
         self._settings = p
 
+    def _values(self) -> dict[str, float | int | str | bool]:
+        """The numbers of `Parameters` that stand in the modules, parametrised or not, as they are now."""
+        out: dict[str, float | int | str | bool] = {}
+        for name, own in NAMES.items():
+            owner, _, last = own.rpartition(".")
+            try:
+                out[name] = getattr(self.get_submodule(owner), last).item()
+            except AttributeError:  # a part of another kind, which has no such number
+                continue
+        pad, law = self.pads["L"], self.contacts["L"].law
+        out |= {f"pad.{name}": getattr(pad.mesh, name) for name in ("length", "height", "elements_x", "elements_y")}
+        out |= {
+            "pad.enclosed": self.pads["U"].mesh.bonded_sides,
+            "pad.fidelity": "inertial" if pad.inertial else "massless",
+        }
+        out |= {"contact.points": pad.points, "contact.node_spacing": law.node_spacing}
+        if isinstance(law.friction, SmoothSlip | Coulomb):
+            out["contact.friction"] = "coulomb" if isinstance(law.friction, Coulomb) else "smooth"
+        return out
+
     @property
     def settings(self) -> Parameters:
-        """The numbers of this model as they are now, read from its modules; geometry and scenario as they were given."""
-        values: dict[str, dict[str, float]] = {}
-        known = dict(self.named_parameters(remove_duplicate=False))
-        for name, own in NAMES.items():
+        """The numbers of this model as they are now, read from its modules; the scenario, and what other parts in the place of
+        the usual ones have not, as they were given."""
+        values: dict[str, dict[str, Any]] = {}
+        for name, value in self._values().items():
             group, _, field = name.partition(".")
-            if own in known:
-                values.setdefault(group, {})[field] = float(known[own].detach())
+            values.setdefault(group, {})[field] = value
         groups = {group: getattr(self._settings, group).model_copy(update=new) for group, new in values.items()}
         return self._settings.model_copy(update=groups)
 
     def description(self) -> dict[str, Any]:
-        values = {name: row["value"] for name, row in self.settings.table().items()}
-        shape, rubber = type(self.shape).__name__, type(self.pads["L"].material).__name__
-        others = {name: x for name, x in super().description()["parameters"].items() if name not in NAMES.values()}
-        return super().description() | {"parameters": values | others, "shape": shape, "material": rubber}
+        """The numbers and laws as they are now; numbers of `Parameters` that this model has not are left out."""
+        own, said = self._values(), super().description()
+        absent = {name for name in (*NAMES, "contact.friction") if name not in own}
+        values = {name: row["value"] for name, row in self.settings.table().items() if name not in absent}
+        others = {name: x for name, x in said["parameters"].items() if name not in NAMES.values()}
+        return said | {"parameters": values | others}
 
     @property
     def shape(self) -> Shape:

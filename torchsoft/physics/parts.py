@@ -30,6 +30,8 @@ class Body(nn.Module):
         theta: Freedom = "free", inertia: float | None = None, weighted: bool = True,
     ) -> None:  # fmt: skip
         super().__init__()
+        if shape is not None and not isinstance(shape, Shape):
+            raise ValueError(f"`shape` must be a Shape, but is {shape!r}")
         self.freedom: dict[str, str] = {}
         for name, value in zip(COORDINATES, (x, y, theta)):
             if isinstance(value, str) and value not in ("free", "driven"):
@@ -41,6 +43,11 @@ class Body(nn.Module):
         self.own_inertia = None if inertia is None else parameter(inertia)
         if self.freedom["theta"] == "free" and shape is None and inertia is None:
             raise ValueError("a body that may turn needs an `inertia`, or a `shape` to compute it from")
+
+    def well_posed(self) -> str:
+        """What is wrong with the parameters together; empty if nothing is."""
+        inertia = self.inertia.item()
+        return "" if inertia > 0 else f"the moment of inertia is {inertia:g} kg.m2, but must be positive"
 
     @property
     def inertia(self) -> Tensor:
@@ -92,6 +99,16 @@ class Actuator(nn.Module):
         elements: tuple[str, ...] = ("C: Kp", "R: Kd"),
     ) -> None:  # fmt: skip
         super().__init__()
+        for name, value in (
+            ("measures", measures),
+            ("pushes", pushes),
+            ("setpoint", setpoint),
+            ("feed_forward", feed_forward or ""),
+        ):
+            if not isinstance(value, str):
+                raise ValueError(f"`{name}` of an actuator must be a name, but is {value!r}")
+        if not callable(law):
+            raise ValueError(f"`law` of an actuator must be a function or a module, but is {law!r}")
         self.measures, self.pushes, self.law = measures, pushes, law
         self.setpoint, self.feed_forward, self.elements = setpoint, feed_forward, elements
 

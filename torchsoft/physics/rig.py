@@ -5,8 +5,7 @@ and integrates what is left over at its 1-junctions.
 """
 
 from collections.abc import Mapping
-from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -70,6 +69,7 @@ class Rig(nn.Module):
         symbols: Mapping[str, str] | None = None, groups: Mapping[str, nn.Module] | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
+        self.groups = tuple(groups or {})
         for name, module in (groups or {}).items():
             self.add_module(name, module)
         order = sorted(
@@ -81,14 +81,16 @@ class Rig(nn.Module):
         self.gravity = parameter(gravity)
         self.reference = reference or Reference()
         self.symbols = {name: (symbols or {}).get(name, name) for name in bodies}
-        self._check_names()
+        self.check_names()
 
+    limits: ClassVar = {"gravity": "not negative"}
     bodies: Mapping[str, Body]
     pads: Mapping[str, Pad]
     contacts: Mapping[str, Contact]
     actuators: Mapping[str, Actuator]
 
-    def _check_names(self) -> None:
+    def check_names(self) -> None:
+        """Raises what the class does for parts that do not fit together."""
         for name, pad in self.pads.items():
             if pad.base is not None and pad.base not in self.bodies:
                 raise ValueError(f"pad `{name}` is bonded to `{pad.base}`, but the bodies are {', '.join(self.bodies)}")
@@ -134,9 +136,13 @@ class Rig(nn.Module):
     def description(self) -> dict[str, Any]:
         """The numbers and laws of the rig as they are now, for what is saved with a run."""
         mine = {name: value for name, value in self.named_parameters() if not name.startswith("reference.")}
-        values = {name: value.detach().tolist() for name, value in mine.items()}
-        laws = {name: type(contact.law.friction).__name__ for name, contact in self.contacts.items()}
-        return {"parameters": values, "friction": laws}
+        laws = {name: contact.law.friction for name, contact in self.contacts.items()}
+        return {
+            "parameters": {name: value.detach().tolist() for name, value in mine.items()},
+            "friction": {name: getattr(law, "__qualname__", type(law).__name__) for name, law in laws.items()},
+            "shape": {name: type(body.shape).__name__ for name, body in self.bodies.items() if body.shape is not None},
+            "material": {name: type(pad.material).__name__ for name, pad in self.pads.items()},
+        }
 
     def parameter(self, name: str) -> Tensor:
         """A parameter by its name, or by another one in `aliases`. Raises `ValueError` for one that is not there."""
@@ -152,7 +158,7 @@ class Rig(nn.Module):
         contact = self.contacts[name]
         return torch.from_numpy(self.pads[contact.pad].point_lengths / contact.law.node_spacing)
 
-    @cached_property
+    @property
     def layout(self) -> Layout:
         """Where everything stands in the state vector."""
         branches = {name: len(pad.material.chain()[0].detach()) for name, pad in self.pads.items()}
@@ -166,7 +172,7 @@ class Rig(nn.Module):
             inertial={name: (p.nodes, 2) for name, p in self.pads.items() if p.inertial},
         )
 
-    @cached_property
+    @property
     def signals(self) -> tuple[str, ...]:
         """The reference's signals that the rig follows: setpoints, feed-forward efforts, driven coordinates."""
         names: list[str | None] = []
@@ -178,7 +184,8 @@ class Rig(nn.Module):
 
     def follow(self, t: Tensor | float, reference: Reference | None = None) -> Tensor:
         """The signals at t (...) [s]: values and rates (..., signals, 2)."""
-        return (reference or self.reference)(torch.as_tensor(t, dtype=torch.float64), self.signals)
+        followed = self.reference if reference is None else reference
+        return followed(torch.as_tensor(t, dtype=torch.float64), self.signals)
 
     def held(self, signals: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
         """Fixed and driven coordinates and their rates by body (..., 3), zero where a coordinate is free."""

@@ -9,10 +9,12 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
+from torchsoft.physics.arguments import number
+
 
 def parameter(value: float, trained: bool = True) -> nn.Parameter:
-    """A scalar parameter in float64, whatever torch's default is."""
-    return nn.Parameter(torch.tensor(value, dtype=torch.float64), requires_grad=trained)
+    """A scalar parameter in float64, whatever torch's default is. Raises `ValueError` for what is not a number."""
+    return nn.Parameter(torch.tensor(number("a parameter", value), dtype=torch.float64), requires_grad=trained)
 
 
 class Shape(nn.Module):
@@ -74,11 +76,16 @@ class Ellipse(Shape):
     """
 
     limits: ClassVar = {"a": "positive", "b": "positive"}
-    ITERATIONS = 12
+    ITERATIONS, SLIM = 12, 3
 
     def __init__(self, a: float, b: float) -> None:
         super().__init__()
         self.a, self.b = parameter(a), parameter(b)
+
+    def well_posed(self) -> str:
+        """What is wrong with the parameters together; empty if nothing is."""
+        low, high = sorted((self.a.item(), self.b.item()))
+        return f"the axes a and b differ by more than a factor of {self.SLIM}" if high > self.SLIM * low else ""
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         a, b = self.a, self.b

@@ -20,7 +20,7 @@ TAPE_BYTES = 1e9
 
 
 class GradientFailed(RuntimeError):
-    """A gradient that is not finite: when [s] it ceased to be."""
+    """A gradient that there is not, or that is not finite: when [s] it ceased to be."""
 
 
 def iterate(stepper: ImplicitStepper, y0: Tensor, t: Tensor) -> Iterator[tuple[Tensor, Progress]]:
@@ -56,8 +56,9 @@ class _Solution(torch.autograd.Function):
         return y.clone()
 
     @staticmethod
-    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, y_bar: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        if torch.is_grad_enabled():  # a graph of it would lack how the cotangents depend on what ran
+            raise GradientFailed("a run has no second derivative; ask for its gradient without create_graph")
         return None, None, None, *run_adjoint(ctx.stepper, ctx.segments, y_bar)
 
 
@@ -79,3 +80,23 @@ def run_adjoint(stepper: ImplicitStepper, segments: list[Segment], y_bar: Tensor
         if failed >= 0:
             raise GradientFailed(f"the gradient is not finite at t = {segment.chunk.starts[failed]:.4f} s")
     return torch.from_numpy(carried) + y_bar[0], torch.from_numpy(p_bar), torch.from_numpy(np.concatenate(signals_bar))
+
+
+class _Recorded(torch.autograd.Function):
+    """A recorded series beside the states that have a gradient: it has none, and says so when one is asked for."""
+
+    @staticmethod
+    def forward(ctx: Any, name: str, series: Tensor, y: Tensor) -> Tensor:
+        ctx.name = name
+        return series.clone()
+
+    @staticmethod
+    def backward(ctx: Any, bar: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+        if bool((bar != 0).any()):
+            raise GradientFailed(f"the channel `{ctx.name}` is recorded and has no gradient; detach() it")
+        return None, None, None
+
+
+def recorded(name: str, series: Tensor, y: Tensor) -> Tensor:
+    """A series (T,) that came out of the run of states y (T, size), whose gradient would be wrong rather than zero."""
+    return _Recorded.apply(name, series, y) if y.requires_grad else series  # pyright: ignore[reportReturnType]

@@ -8,6 +8,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchsoft.physics.validity import check_array
+
 CHUNK = 500
 """Steps per compiled call: how often progress is shown and Ctrl-C is heard."""
 
@@ -29,16 +31,38 @@ class Chunk(NamedTuple):
         return Chunk(h, np.array([begin, begin + h]), np.array([False, self.keep[step]]))
 
 
-def check_times(t: Tensor) -> None:
-    """Raises `ValueError` unless t is a float64 vector of at least two finite, strictly increasing times."""
-    if t.ndim != 1 or len(t) < 2 or t.dtype != torch.float64:
+MOST_STEPS = 100_000_000
+"""Steps that one run may take at the most."""
+
+
+SHORTEST = 1e-12
+"""Time [s] between two outputs at the least."""
+
+
+def check_times(t: Tensor, step: float | None = None) -> None:
+    """Raises `ValueError` unless t is a float64 vector of at least two finite, strictly increasing times, no more than
+    `MOST_STEPS` steps of `step` [s] apart in all."""
+    check_array("t", t)
+    if t.ndim != 1 or len(t) < 2:
         raise ValueError(
             f"`t` must be a float64 vector of two times or more, but is {t.dtype} of shape {tuple(t.shape)}"
         )
+    if t.requires_grad:
+        raise ValueError("`t` must not require a gradient, since none is computed by the times; use t.detach()")
     if not bool(torch.isfinite(t).all()) or not bool((t.diff() > 0).all()):
         bad = int((~(t.diff() > 0)).nonzero()[0, 0]) if bool(torch.isfinite(t).all()) else 0
         raise ValueError(
             f"`t` must increase strictly and be finite, but t[{bad}:{bad + 2}] = {t[bad : bad + 2].tolist()}"
+        )
+    if step is not None and float(t[-1] - t[0]) / step > MOST_STEPS:
+        count = float(t[-1] - t[0]) / step
+        raise ValueError(
+            f"`t` and `step` ask for {count:.3g} steps, but at most {MOST_STEPS:.3g} can be taken in one run"
+        )
+    finest = max(SHORTEST, 16 * torch.finfo(torch.float64).eps * float(t.abs().max()))
+    if float(t.diff().min()) < finest or (step is not None and step < finest):
+        raise ValueError(
+            f"`t` and `step` must be further apart than {finest:.1g} s, what times so long after zero resolve"
         )
 
 

@@ -1,6 +1,7 @@
 """`simulate`: run a rig over given times, by the route to a derivative that is wanted, into one `Trajectory`."""
 
 import time as clock
+import warnings
 from collections.abc import Iterator, Sequence
 from importlib.metadata import version
 from typing import Literal, get_args
@@ -15,10 +16,13 @@ from torchsoft.physics.motion import Reference
 from torchsoft.physics.paper import SoftGrasp
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.stability import describe_instability
+from torchsoft.physics.validity import check_array
 from torchsoft.solve import adjoint, tangent
 from torchsoft.solve.continuous import continuous_solution
 from torchsoft.solve.grid import check_times
+from torchsoft.solve.ledger import doubts
 from torchsoft.solve.stepper import METHOD, ImplicitStepper, Progress, SimulationFailed
+from torchsoft.solve.system import independent
 from torchsoft.solve.trajectory import Stats, Trajectory, channels
 from torchsoft.solve.unrolled import unrolled_solution
 
@@ -54,18 +58,16 @@ def simulate(
     Raises `ValueError` for times that do not increase, a state of the wrong shape or dtype, an unknown route or parameter;
     `SimulationFailed` (with the trajectory so far) when the run cannot go on; `Interrupted` (likewise) on Ctrl-C.
     """
-    if gradient not in get_args(Route):
-        raise ValueError(f"`gradient` must be one of {', '.join(get_args(Route))}, but is {gradient!r}")
-    if bool(wrt) != (gradient == "forward"):
-        raise ValueError("`wrt` names the parameters of gradient='forward', and of that only")
-    check_times(t)
+    _check_wanted(gradient, wrt, dy0, rigid)
+    stepper = ImplicitStepper(rig, reference, step=step, tolerance=tolerance)
+    check_times(t, step)
     if y0 is None:
         if not isinstance(rig, SoftGrasp):
             raise ValueError("`y0` is needed: only the paper's rig has a start of its own")
         y0 = rest(rig)
+    stepper.check_start(y0)
     if gradient in ("unrolled", "continuous"):
-        return _recorded(rig, t, y0, reference or rig.reference, step, gradient)
-    stepper = ImplicitStepper(rig, reference, step=step, tolerance=tolerance)
+        return _recorded(stepper, t, y0, gradient)
     bar = tqdm(
         total=float(t[-1] - t[0]), unit="s", disable=not progress,
         bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated [{elapsed}]",
@@ -91,7 +93,26 @@ def simulate(
     finally:
         bar.close()
     assert out is not None
-    return gather(stepper, t, y, out, Stats(out.steps, out.solves, out.failed, wall, step), tuple(wrt), dy)
+    trajectory = gather(stepper, t, y, out, Stats(out.steps, out.solves, out.failed, wall, step), tuple(wrt), dy)
+    for doubt in doubts(trajectory, rig):
+        warnings.warn(doubt, stacklevel=2)
+    return trajectory
+
+
+def _check_wanted(gradient: Route, wrt: Sequence[str], dy0: Tensor | None, rigid: bool) -> None:
+    """Raises `ValueError` for a route that there is not, and for what belongs to another route."""
+    if gradient not in get_args(Route):
+        raise ValueError(f"`gradient` must be one of {', '.join(get_args(Route))}, but is {gradient!r}")
+    if isinstance(wrt, str) or not isinstance(wrt, Sequence) or not all(isinstance(name, str) for name in wrt):
+        raise ValueError(f"`wrt` must be a list of parameters' names, but is {type(wrt).__name__}")
+    if bool(wrt) != (gradient == "forward"):
+        raise ValueError("`wrt` names the parameters of gradient='forward', and of that only")
+    if gradient != "forward" and (dy0 is not None or rigid):
+        raise ValueError("`dy0` and `rigid` belong to gradient='forward', and to that only")
+    if gradient == "forward" and torch.is_inference_mode_enabled():
+        raise ValueError(
+            "gradient='forward' needs torch's graphs, which torch.inference_mode() has not; use torch.no_grad()"
+        )
 
 
 def _rows(
@@ -111,8 +132,12 @@ def _rows(
                 if value.ndim or not value.requires_grad:
                     raise ValueError(f"`{name}` must be a scalar parameter that requires a gradient")
             size = stepper.layout.size
-            if dy0 is not None and dy0.shape != (size, len(wrt)):
-                raise ValueError(f"`dy0` must have shape ({size}, {len(wrt)}), but has {tuple(dy0.shape)}")
+            if dy0 is not None:
+                check_array("dy0", dy0)
+                if dy0.shape != (size, len(wrt)):
+                    raise ValueError(f"`dy0` must have shape ({size}, {len(wrt)}), but has {tuple(dy0.shape)}")
+                if not bool(torch.isfinite(dy0).all()):
+                    raise ValueError("`dy0` must be finite, but has a component that is not")
             kept = stepper.layout.rigid if rigid else list(range(size))
             yield from tangent.iterate(stepper, y0, t, wanted, dy0, kept)
     else:
@@ -120,16 +145,16 @@ def _rows(
             yield y, None, out
 
 
-def _recorded(rig: Rig, t: Tensor, y0: Tensor, reference: Reference, step: float, gradient: Route) -> Trajectory:
+def _recorded(stepper: ImplicitStepper, t: Tensor, y0: Tensor, gradient: Route) -> Trajectory:
     """The routes in torch, which record every operation: states and channels, without forces and work."""
-    began = clock.perf_counter()
+    began, rig, reference = clock.perf_counter(), stepper.rig, stepper.reference
     solve = unrolled_solution if gradient == "unrolled" else continuous_solution
-    y = solve(rig, y0, t, reference, step=step)
-    signals = rig.follow(t, reference)
+    y = solve(rig, y0, t, reference, step=stepper.step)
+    signals = stepper.compiled.signals(t, reference)[..., : len(rig.signals), :]
     state, nothing = rig.unpack(y, signals), torch.zeros(0, dtype=torch.float64)
     return Trajectory(
         t, y, state, channels(rig, state, signals), {}, {}, {}, {}, {}, {}, nothing,
-        Stats(0, 0, 0, clock.perf_counter() - began, step), rig.layout, made_by(rig, gradient),
+        Stats(0, 0, 0, clock.perf_counter() - began, stepper.step), rig.layout, made_by(rig, gradient),
     )  # fmt: skip
 
 
@@ -164,10 +189,11 @@ def gather(
     names = stepper.integrals
     columns = dict(zip((*names.names, *rig.pads), extras.unbind(-1)))
     loads = extras[:, len(columns) :].unflatten(-1, (-1, 3))
-    with torch.set_grad_enabled(y.requires_grad):
+    with torch.set_grad_enabled(y.requires_grad), independent():
         signals = rig.follow(t, stepper.reference)
         state = rig.unpack(y, signals)
-        measured = channels(rig, state, signals, {name: columns[name] for name in rig.pads})
+        moments = {name: adjoint.recorded(f"M_{name}", columns[name], y) for name in rig.pads}
+        measured = channels(rig, state, signals, moments)
     with torch.no_grad():
         displacement = {name: rig.displacement(name, state) for name in rig.pads}
         energy = stored(rig, state, displacement)

@@ -1,20 +1,18 @@
 """The implicit stepper: the compiled kernels fed from a rig, chunk by chunk."""
 
-import logging
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from torchsoft.physics.arguments import positive, whole
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
+from torchsoft.physics.validity import check_array
 from torchsoft.solve.grid import Chunk, check_times, chunks
-from torchsoft.solve.kernel import CACHE
 from torchsoft.solve.kernel.arrays import Array, Tape, Work, empty_tape, first_stages, scratch
 from torchsoft.solve.kernel.run import (
     CONVERGED,
@@ -28,10 +26,11 @@ from torchsoft.solve.kernel.run import (
 )
 from torchsoft.solve.system import Compiled
 
-log = logging.getLogger("torchsoft")
-
 HALVINGS = 6
 """How often a step that Newton does not solve is halved before the run is given up."""
+
+SMALLEST_TOLERANCE = 1e-10
+"""Newton tolerance [N] that the ready excitations can meet: at a tenth of it one step in ten is halved because of rounding."""
 
 INSTANT = 1e-13
 """Length [s] of the stage that gives the forces at the start: nothing moves in it."""
@@ -97,27 +96,46 @@ class ImplicitStepper:
     the contact law and the linear relations agree to `tolerance` [N] at every node; a step that it does not solve is taken as
     two of half the length, and so on up to `HALVINGS` times. `window` [m] is how near a point has to be to count as one
     that may
-    touch (checked after every stage; only speed depends on it). A tolerance below about 1e-10 N is below rounding: steps are
-    then halved for nothing.
+    touch (checked after every stage; only speed depends on it). Raises `ValueError` for a tolerance below
+    `SMALLEST_TOLERANCE`.
     """
 
     def __init__(
         self, rig: Rig, reference: Reference | None = None, *, step: float = 2e-3, tolerance: float = 1e-9,
         max_iterations: int = 40, window: float = 2e-3,
     ) -> None:  # fmt: skip
-        for name, value in (("step", step), ("tolerance", tolerance), ("window", window)):
-            if not (math.isfinite(value) and value > 0):
-                raise ValueError(f"`{name}` must be positive and finite, but is {value}")
-        self.rig, self.reference = rig, reference or rig.reference
+        if not isinstance(rig, Rig):
+            raise ValueError(f"`rig` must be a Rig, but is {rig if isinstance(rig, type) else type(rig).__name__}")
+        followed = rig.reference if reference is None else reference
+        if not isinstance(followed, Reference):
+            raise ValueError(f"`reference` must be a Reference, but is {type(followed).__name__}")
+        self.step, self.window = positive("step", step), positive("window", window)
+        self.tolerance, self.max_iterations = (
+            positive("tolerance", tolerance),
+            whole("max_iterations", max_iterations, 1),
+        )
+        if self.tolerance < SMALLEST_TOLERANCE:
+            raise ValueError(
+                f"`tolerance` must be at least {SMALLEST_TOLERANCE:g} N, but is {tolerance:g} N, which rounding hides"
+            )
+        self.rig, self.reference = rig, followed
         self.compiled = Compiled(rig)
         self.layout, self.integrals = rig.layout, Integrals(rig)
-        self.step, self.tolerance, self.max_iterations, self.window = step, tolerance, max_iterations, window
         self._cap = 64
 
     @property
     def signals_at_start(self) -> Tensor:
         """The signals at one moment, to see whether they carry a graph."""
         return self.compiled.signals(torch.zeros(1, dtype=torch.float64), self.reference)
+
+    def check_start(self, y0: Tensor) -> None:
+        """Raises `ValueError` unless y0 is one finite state of this rig."""
+        check_array("y0", y0)
+        self.layout.check(y0)
+        if y0.ndim != 1:
+            raise ValueError(f"`y0` must be one state, shape ({self.layout.size},), but has shape {tuple(y0.shape)}")
+        if not bool(torch.isfinite(y0).all()):
+            raise ValueError(f"`y0` must be finite, but component {int((~torch.isfinite(y0)).nonzero()[0, 0])} is not")
 
     @torch.no_grad()
     def integrate(
@@ -129,12 +147,8 @@ class ImplicitStepper:
         as long
         as they take less than `tape_bytes`. Raises `SimulationFailed`, and `ValueError` for a start that is not finite.
         """
-        self.layout.check(y0)
-        if y0.ndim != 1 or not bool(torch.isfinite(y0).all()):
-            raise ValueError(
-                f"`y0` must be one finite state, shape ({self.layout.size},), but has shape {tuple(y0.shape)}"
-            )
-        check_times(t)
+        self.check_start(y0)
+        check_times(t, self.step)
         todo = list(chunks(t, self.step))
         signals = self.signals(todo).numpy()
         first = self.compiled.system(todo[0].h)
@@ -151,7 +165,6 @@ class ImplicitStepper:
         set_velocities(first, work, y)
         self._start(y, t[0], work, out.forces, out.extras)
         set_velocities(first, work, y)
-        announce_compilation()
         ends = np.cumsum([0, *(2 * len(chunk.starts) for chunk in todo)])
         pending = [(chunk, signals[a:b], 0) for chunk, a, b in zip(todo, ends[:-1], ends[1:])][::-1]
         while pending:
@@ -254,14 +267,3 @@ def set_velocities(s: Any, work: Work, y: Array) -> None:
     """Newton's first guess: the velocities of the state."""
     for i, c in enumerate(s.body_coordinate):
         work.V[c] = y[s.body_V_start + i]
-
-
-_announced = False
-
-
-def announce_compilation() -> None:
-    """Say, once and only if nothing is cached, what the first run is waiting for."""
-    global _announced
-    if not _announced and not run.signatures and not (CACHE and list(Path(CACHE).glob("**/run.run-*.nbi"))):
-        log.warning("compiling the implicit stepper (about half a minute, once; the result is cached in %s)", CACHE)
-    _announced = True

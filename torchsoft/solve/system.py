@@ -4,130 +4,50 @@ Everything is read from the modules when a run begins, so that what ran is what 
 the vector of parameters keeps its graph, and so gradients reach whatever the values were made of.
 """
 
-from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import torch
 from scipy import linalg
-from torch import Tensor, nn
+from torch import Tensor
 
-from torchsoft.codegen import Law, compile_law
-from torchsoft.physics.contact import distance_law, free_law, interface_law
 from torchsoft.physics.mesh import banded
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.solve.kernel.arrays import INPUTS, Actuators, Bodies, Contacts, Index, Inertia, Pads, Points, system
+from torchsoft.physics.validity import check_array, check_groups, check_shape, check_slip, check_values
+from torchsoft.solve.kernel.arrays import Actuators, Bodies, Contacts, Index, Inertia, Pads, Points, system
 from torchsoft.solve.kernel.run import GAMMA
+from torchsoft.solve.laws import LawSet, actuator_law, contact_laws, structure
+
+NOMINAL = 1e-3
+"""Stage length a h [s] with which slip laws of one's own are tried."""
 
 WIDEST_ROW = 18
 """Entries of a stiffness row: nine nodes around one, two components each."""
 
 
-class LawSet(NamedTuple):
-    """The compiled laws of one contact, and its parameters' names and tensors in their order."""
-
-    distance: Law
-    interface: Law
-    free: Law
-    parameters: dict[str, Tensor]
-
-
-def _copied(module: nn.Module, known: dict[int, nn.Module]) -> nn.Module:
-    """The same modules over the same tensors: tracing puts others in their place, which other threads must not meet."""
-    if id(module) not in known:
-        out = known[id(module)] = module.__class__.__new__(module.__class__)
-        out.__dict__ = dict(module.__dict__)
-        out.__dict__ |= {"_parameters": dict(module._parameters), "_buffers": dict(module._buffers)}
-        out.__dict__["_modules"] = {k: m if m is None else _copied(m, known) for k, m in module._modules.items()}
-    return known[id(module)]
-
-
-class _Called(nn.Module):
-    """Some modules, and a function of them and of x: what a compiled law is traced from."""
-
-    def __init__(self, function: Callable[..., Tensor], **modules: Any) -> None:
-        super().__init__()
-        self.function, self.names = function, tuple(modules)
-        known: dict[int, nn.Module] = {}
-        for name, module in modules.items():
-            setattr(self, name, _copied(module, known) if isinstance(module, nn.Module) else module)
-
-    def forward(self, x: Tensor) -> Tensor:
-        return self.function(*(getattr(self, name) for name in self.names), x)
-
-
-def structure(module: object) -> Any:
-    """What decides a module's law beside its parameters' values, hashable: two modules of one structure have one law.
-    None where
-    that cannot be told: functions, hooks, attributes of other kinds than numbers and text."""
-    if isinstance(module, nn.Module):
-        own = {k: v for k, v in vars(module).items() if not k.startswith("_") and k != "training"}
-        parts = tuple((k, structure(v)) for k, v in module._modules.items())
-        buffers = tuple((k, v.numpy().tobytes()) for k, v in module._buffers.items() if v is not None)
-        shapes = tuple((k, tuple(v.shape)) for k, v in module._parameters.items() if v is not None)
-        plain = all(isinstance(v, bool | int | float | str | None) for v in own.values())
-        hooked = any(v for k, v in vars(module).items() if k.endswith("_hooks"))
-        if plain and not hooked and all(part is not None for _, part in parts):
-            return type(module), tuple(sorted(own.items())), parts, buffers, shapes
-    return None
-
-
-_laws: dict[Any, Law] = {}
-"""Laws that have been compiled, by what decides them."""
-
-
-def compiled_law(
-    names: Mapping[str, Tensor],
-    function: Callable[..., Tensor],
-    size: int,
-    linear: int,
-    differentiated: int,
-    **modules: Any,
-) -> Law:
-    """The law of a function of modules and x (size,), differentiable in the first inputs and in the parameters `names`,
-    of which
-    it may not use all. Raises `UnknownOperation` naming the line of a law that cannot be compiled."""
-    decided = tuple((name, structure(module)) for name, module in modules.items())
-    shapes = tuple((name, tuple(value.shape)) for name, value in names.items())
-    key = None if any(part is None for _, part in decided) else (function, decided, shapes, linear, differentiated)
-    if key not in _laws:
-        called = _Called(function, **modules)
-
-        def law(x: Tensor, values: Mapping[str, Tensor]) -> Tensor:
-            own = {name: value for name, value in values.items() if name.split(".")[0] in modules}
-            return torch.func.functional_call(called, own, (x,))
-
-        example = torch.linspace(0.01, 0.02, size, dtype=torch.float64)
-        made = compile_law(law, example, names, linear=linear, differentiated=differentiated)
-        if key is None:
-            return made
-        _laws[key] = made
-    return _laws[key]
-
-
-def _effort(actuator: nn.Module, x: Tensor) -> Tensor:
-    return actuator(x)[None]
-
-
-def contact_laws(law: Any, shape: Any) -> LawSet:
-    """The laws of a contact of `law` on a body of `shape`."""
-    parameters: dict[str, Tensor] = dict(_Called(interface_law, law=law, shape=shape).named_parameters())
-    return LawSet(
-        compiled_law(parameters, distance_law, INPUTS, 0, 0, shape=shape),
-        compiled_law(parameters, interface_law, INPUTS, 3, 7, law=law, shape=shape),
-        compiled_law(parameters, free_law, 3, 1, 1, law=law),
-        parameters,
-    )
+@contextmanager
+def independent() -> Iterator[None]:
+    """Graphs made inside keep copies of what they need backwards: what becomes of the modules does not reach them."""
+    with torch.autograd.graph.saved_tensors_hooks(lambda x: x.detach().clone(), lambda x: x):
+        yield
 
 
 class Compiled:
     """A rig at one moment: `p` (parameters,) with its graph, `names` of its entries, and `system(h)` for a step h [s]."""
 
-    @torch.enable_grad()
     def __init__(self, rig: Rig) -> None:
+        rig.check_names()
         check_values(rig)
+        check_groups(rig)
+        with torch.enable_grad(), independent():
+            self._read(rig)
+
+    def _read(self, rig: Rig) -> None:
         self.rig, self.size = rig, rig.layout.size
         self._entries: list[Tensor] = []
         self._known: dict[tuple[int, int], LawSet] = {}
@@ -140,8 +60,11 @@ class Compiled:
         self._actuators = self._make_actuators()
         self._contacts, self._points = self._make_contacts()
         self.p = torch.cat([x.reshape(-1) for x in self._entries])
+        check_array("p", self.p)
         if not bool(torch.isfinite(self.p).all()):
-            raise ValueError("a parameter of the rig is not a finite number")
+            raise ValueError(
+                "the parameters of the rig give numbers that are not finite; some are too large or too small"
+            )
 
     def _add(self, value: Tensor) -> int:
         """Append a tensor to the vector of parameters; where it begins."""
@@ -179,6 +102,7 @@ class Compiled:
             gravity_at, *starts,
         )  # fmt: skip
 
+    @independent()
     def signals(self, t: Tensor, reference: Reference | None = None) -> Tensor:
         """The signals that the kernels follow, fixed coordinates last: values and rates (..., signals, 2)."""
         fixed = [body.fixed[axis] for body in self.rig.bodies.values() for axis in COORDINATES if axis in body.fixed]
@@ -187,6 +111,10 @@ class Compiled:
             bad = torch.nonzero(~torch.isfinite(followed))[0].tolist()
             name, time = self.rig.signals[bad[-2]], float(t[tuple(bad[:-2])])
             raise ValueError(f"the signal `{name}` of the reference is not finite at t = {time:g} s")
+        if not torch.equal(followed, self.rig.follow(t, reference)):
+            raise ValueError(
+                "the reference gives other values when asked again; signals must be functions of time alone"
+            )
         if not fixed:
             return followed
         held = torch.stack([torch.stack(fixed), torch.zeros(len(fixed), dtype=torch.float64)], -1)
@@ -275,7 +203,7 @@ class Compiled:
         rig, rows, starts = self.rig, [], []
         for actuator in rig.actuators.values():
             parameters = {f"law.{k}": v for k, v in actuator.named_parameters()}
-            law = compiled_law(parameters, _effort, 5, 1, 5, law=actuator)
+            law = actuator_law(actuator, parameters)
             starts.append(self._add_all(parameters))
             feed = rig.signals.index(actuator.feed_forward) if actuator.feed_forward is not None else -1
             rows.append(
@@ -296,7 +224,13 @@ class Compiled:
             pad, shape = rig.pads[contact.pad], rig.bodies[contact.body].shape
             assert shape is not None
             key = id(contact.law), id(shape)
-            laws = self._known[key] = self._known.get(key) or contact_laws(contact.law, shape)
+            if key not in self._known:
+                check_shape(contact.body, shape)
+                self._known[key] = contact_laws(contact.law, shape)
+                stiffness = contact.law.R_t.item() + NOMINAL * contact.law.K_t.item()
+                if structure(contact.law) is None and (wrong := check_slip(name, contact.law.friction, stiffness)):
+                    warnings.warn(wrong, stacklevel=2)
+            laws = self._known[key]
             starts.append(self._add_all(laws.parameters))
             rows.append(
                 (list(rig.pads).index(contact.pad), 3 * list(rig.bodies).index(contact.body), laws.distance.value,
@@ -376,21 +310,3 @@ class Compiled:
 
 def _ints(values: Any) -> Index:
     return np.array(values, dtype=np.int64)
-
-
-def check_values(rig: nn.Module) -> None:
-    """Raises `ValueError` naming a parameter of the rig that is not finite or not physical, by its module's `limits`."""
-    for path, module in rig.named_modules():
-        limits: Mapping[str, str] = getattr(module, "limits", {})
-        for name, value in module.named_parameters(recurse=False):
-            where = f"{path}.{name}" if path else name
-            if not bool(torch.isfinite(value).all()):
-                raise ValueError(f"parameter `{where}` must be finite, but is {value.tolist()}")
-        for name, limit in limits.items():
-            value = getattr(module, name, None)
-            if value is None:
-                continue
-            x, where = float(torch.as_tensor(value).detach()), f"{path}.{name}" if path else name
-            fine = {"positive": x > 0, "not negative": x >= 0, "between -1 and 0.5": -1 < x < 0.5}[limit]
-            if not fine:
-                raise ValueError(f"parameter `{where}` must be {limit}, but is {x:g}")

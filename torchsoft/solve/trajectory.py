@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import dataclass, field
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import xarray as xr
 from torch import Tensor
 
 from torchsoft.channels import PADS, VARIABLES
-from torchsoft.files import replacing
+from torchsoft.files import replacing, sealed, unsealed
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import Layout, State
 
@@ -129,9 +130,23 @@ class Trajectory:
         return xr.Dataset(data, coords, attrs)
 
     def save(self, path: str | Path) -> None:
-        """Write NetCDF. The file appears whole or not at all."""
-        with replacing(path) as partial:
-            self.to_dataset().to_netcdf(partial, engine="h5netcdf")
+        """Write NetCDF with a checksum. The file appears whole or not at all."""
+        save(self.to_dataset(), path)
+
+
+def save(data: xr.Dataset, path: str | Path) -> None:
+    """Write a trajectory's dataset, perhaps a changed one, as NetCDF with a checksum at the end of the file."""
+    with replacing(path) as partial:
+        partial.write_bytes(sealed(data.to_netcdf(engine="h5netcdf")))
+
+
+def load(path: str | Path) -> xr.Dataset:
+    """What `save` wrote. Raises `ValueError` for any other file and for one that is damaged, and `OSError`."""
+    content = BytesIO(unsealed(path))
+    try:
+        return xr.load_dataset(content, engine="h5netcdf", decode_times=False)
+    except Exception as error:  # whatever the libraries make of other content
+        raise ValueError(f"{path} is not a NetCDF file ({type(error).__name__})") from error
 
 
 def channels(rig: Rig, state: State, signals: Tensor, moments: dict[str, Tensor] | None = None) -> dict[str, Tensor]:
@@ -148,7 +163,7 @@ def channels(rig: Rig, state: State, signals: Tensor, moments: dict[str, Tensor]
         for i, key in enumerate((f"v_x_{symbol}", f"v_y_{symbol}", f"omega_{symbol}")):
             out[key] = velocity[..., i]
         if rig.bodies[name].freedom["theta"] == "free":
-            out[f"L_{symbol}"] = rig.bodies[name].inertia.detach() * velocity[..., 2]
+            out[f"L_{symbol}"] = rig.bodies[name].inertia * velocity[..., 2]
     for i, name in enumerate(rig.signals):
         out[name], out[f"{name}_dot"] = signals[..., i, 0], signals[..., i, 1]
     for name in rig.actuators:

@@ -1,0 +1,158 @@
+"""What a rig has to be before anything is computed with it: numbers in float64 on the CPU, finite and physical, shapes that
+measure distances, slip laws that take no more than the effort. Every refusal is one sentence that names what is wrong.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch._C._functorch import is_functorch_wrapped_tensor  # private, and the only way to tell
+
+from torchsoft.physics.shapes import Circle, Ellipse, Shape
+
+LARGEST = 1e100
+"""Largest magnitude of a parameter, in SI units: squares and products of a few stay finite numbers."""
+
+DEPTHS = (1e-3, -1e-3)
+"""Distances from the boundary, over the body's size, at which a shape is tried: outside and inside."""
+
+ALIKE = 1e-3
+"""By how much a shape's normal, the slope of its distance, and its reach (over its size) may differ from what they must be."""
+
+EFFORTS, NORMALS = (1e-3, 0.1, 1.0, 10.0, 100.0), (0.0, 0.1, 1.0, 10.0)
+"""Trial efforts and normal forces [N] at which a slip law is tried."""
+
+
+def check_array(name: str, x: Any) -> None:
+    """Raises `ValueError` unless x is a dense float64 tensor on the CPU, without the tangents of forward-mode derivatives."""
+    if not isinstance(x, Tensor):
+        raise ValueError(f"`{name}` must be a float64 tensor, but is {type(x).__name__}")
+    if is_functorch_wrapped_tensor(x):
+        raise ValueError(
+            f"`{name}` is inside a transform of torch.func, which a run cannot be; use gradient='discrete'"
+        )
+    if x.dtype != torch.float64 or x.device.type != "cpu" or x.layout != torch.strided:
+        raise ValueError(f"`{name}` must be float64, dense and on the CPU, but is {x.dtype}, {x.layout}, on {x.device}")
+    if torch.autograd.forward_ad.unpack_dual(x).tangent is not None:
+        raise ValueError(f"`{name}` has a tangent of torch's forward mode, which runs drop; use gradient='forward'")
+
+
+def check_place() -> None:
+    """Raises `ValueError` where torch makes its tensors elsewhere than on the CPU."""
+    if torch.get_default_device().type != "cpu":
+        raise ValueError(
+            f"torch's default device is {torch.get_default_device()}, but rigs are computed on the CPU; "
+            "call torch.set_default_device('cpu')"
+        )
+
+
+def check_values(rig: nn.Module) -> None:
+    """Raises `ValueError` naming a parameter of the rig or a tensor of its parts that is not a float64 number on the CPU, not
+    finite, or not physical by its module's `limits` and `well_posed`."""
+    check_place()
+    for owner, module in rig.named_modules():
+        path = f"{owner}." if owner else ""
+        for name, value in module.named_parameters(recurse=False):
+            check_array(f"{path}{name}", value)
+            if value.is_inference():
+                raise ValueError(f"parameter `{path}{name}` was made under torch.inference_mode(); make it outside")
+            for must, fine in (("finite", value.isfinite()), (f"below {LARGEST:g}", value.abs() < LARGEST)):
+                if not bool(fine.all()):
+                    raise ValueError(f"parameter `{path}{name}` must be {must}, but is {value[~fine][0].item():g}")
+        for name, value in module.named_buffers(recurse=False):
+            if value.is_floating_point():
+                check_array(f"{path}{name}", value)
+        limits: Mapping[str, str] = getattr(module, "limits", {})
+        for name, limit in limits.items():
+            value = getattr(module, name, None)
+            if value is None:
+                continue
+            number = torch.as_tensor(value, dtype=torch.float64).detach()
+            if number.ndim:
+                raise ValueError(f"parameter `{path}{name}` must be one number, but has shape {tuple(number.shape)}")
+            x = float(number)
+            fine = {"positive": x > 0, "not negative": x >= 0, "between -1 and 0.5": -1 < x < 0.5}[limit]
+            if not fine or not math.isfinite(x):
+                raise ValueError(f"parameter `{path}{name}` must be {limit}, but is {x:g}")
+    for owner, module in rig.named_modules():
+        well_posed = getattr(module, "well_posed", None)
+        if well_posed is not None and (wrong := well_posed()):
+            raise ValueError(f"the parameters of `{owner}` are not physical together: {wrong}")
+
+
+def check_groups(rig: Any) -> None:
+    """Raises `ValueError` for a part of one of the rig's groups that was replaced there or in the lists, but not in both."""
+    lists = (rig.bodies, rig.pads, rig.contacts, rig.actuators)
+    known = {id(value) for parts in lists for value in parts.parameters()}
+    for group in rig.groups:
+        for name, value in getattr(rig, group).named_parameters():
+            if id(value) not in known:
+                raise ValueError(
+                    f"`{group}.{name}` belongs to no body, pad, contact or actuator; put a new part in both places, or "
+                    "remove the group's"
+                )
+
+
+def check_shape(where: str, shape: Shape) -> None:
+    """Raises `ValueError` unless phi is a distance with the normal n as its slope, and `support` and `size` are the body's.
+
+    Tried at some points near the boundary, which is looked for along rays from outside. The package's own are not tried.
+    """
+    if type(shape) in (Circle, Ellipse):
+        return
+    size = shape.size()
+    if not (math.isfinite(size) and size > 0):
+        raise ValueError(f"the shape of `{where}` has the size {size}; `support` must be the body's reach")
+    with torch.enable_grad():
+        angle = torch.linspace(0.1, 0.1 + 2 * torch.pi, 182, dtype=torch.float64)[:-1]
+        ray = torch.stack((angle.cos(), angle.sin()), -1)
+        r = torch.full_like(angle, 2 * size)
+        with torch.no_grad():
+            for _ in range(60):  # a distance never oversteps the boundary
+                r = r - shape(r[:, None] * ray)[0]
+        boundary = r[:, None] * ray
+        x = torch.cat([(r + depth * size)[:, None] * ray for depth in DEPTHS]).requires_grad_()
+        phi, n = shape(x)
+        if phi.shape != x.shape[:-1] or n.shape != x.shape:
+            raise ValueError(
+                f"the shape of `{where}` must give phi (...) and n (..., 2) at x (..., 2), but gives {tuple(phi.shape)} and "
+                f"{tuple(n.shape)} at {tuple(x.shape)}"
+            )
+        slope = torch.autograd.grad(phi.sum(), x)[0] if phi.requires_grad else torch.zeros_like(x)
+    n, support = n.detach(), shape.support(ray).detach()
+    reach = (boundary @ ray.mT).amax(0)
+    faults = {
+        "its normal is not of unit length": (n.norm(dim=-1) - 1).abs(),
+        "phi is not a distance: its slope is not 1": (slope.norm(dim=-1) - 1).abs(),
+        "its normal is not the slope of phi": (slope - n).norm(dim=-1),
+        "the boundary is not where phi is zero": shape(boundary)[0].detach().abs() / size,
+        "`support` is less than how far it reaches": (reach - support) / size,
+        "`support` is more than how far it reaches": 0.1 * (support - reach) / size,  # found at some points only
+        "`size` is smaller than it is": (boundary.norm(dim=-1).max() - size)[None] / size,
+    }
+    for fault, error in faults.items():
+        worst = float(error.max())
+        if not worst <= ALIKE:
+            raise ValueError(
+                f"the shape of `{where}` ({type(shape).__name__}) cannot be used: {fault} (off by {worst:.2g})"
+            )
+
+
+def check_slip(where: str, law: Any, R: float) -> str:
+    """What is wrong with a slip law at some efforts and normal forces, with the dashpot R [N.s/m]; empty if nothing is.
+
+    A slip that takes more than the effort, R gamma' > E, supplies power.
+    """
+    for E in EFFORTS:
+        for F_N in NORMALS:
+            numbers = (torch.tensor(x, dtype=torch.float64) for x in (E, F_N, R))
+            with torch.no_grad():
+                rate = float(law(*numbers))
+            if R * rate < 0 or R * rate > E * (1 + 1e-9):  # a run that meets what is not a number ends by itself
+                return (
+                    f"the slip law of `{where}` gives {rate:.3g} m/s at an effort of {E:g} N and a normal force of {F_N:g} N: "
+                    f"times the dashpot, {R:.3g} N.s/m, that must be from 0 to the effort, or slip supplies power"
+                )
+    return ""

@@ -1,0 +1,128 @@
+"""A rig's laws as compiled code: each is compiled once for all models that have it, whatever their parameters' values.
+
+Laws of this package are known by their structure. Somebody's own code is run once more for every run, since nothing else tells
+whether a number that it reads has changed since.
+"""
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchsoft.codegen import Law, compile_law
+from torchsoft.codegen.graph import Graph
+from torchsoft.codegen.trace import traced
+from torchsoft.physics.contact import distance_law, free_law, interface_law
+from torchsoft.solve.kernel.arrays import INPUTS
+
+
+class LawSet(NamedTuple):
+    """The compiled laws of one contact, and its parameters' names and tensors in their order."""
+
+    distance: Law
+    interface: Law
+    free: Law
+    parameters: dict[str, Tensor]
+
+
+def _copied(module: nn.Module, known: dict[int, nn.Module]) -> nn.Module:
+    """The same modules over the same tensors: tracing puts others in their place, which other threads must not meet."""
+    if id(module) not in known:
+        out = known[id(module)] = module.__class__.__new__(module.__class__)
+        out.__dict__ = dict(module.__dict__)
+        out.__dict__ |= {"_parameters": dict(module._parameters), "_buffers": dict(module._buffers)}
+        out.__dict__["_modules"] = {k: m if m is None else _copied(m, known) for k, m in module._modules.items()}
+    return known[id(module)]
+
+
+class _Called(nn.Module):
+    """Some modules, and a function of them and of x: what a compiled law is traced from."""
+
+    def __init__(self, function: Callable[..., Tensor], **modules: Any) -> None:
+        super().__init__()
+        self.function, self.names = function, tuple(modules)
+        known: dict[int, nn.Module] = {}
+        for name, module in modules.items():
+            setattr(self, name, _copied(module, known) if isinstance(module, nn.Module) else module)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.function(*(getattr(self, name) for name in self.names), x)
+
+
+def structure(module: object) -> Any:
+    """What decides a module's law beside its parameters' values, hashable: two modules of one structure have one law.
+    None where that cannot be told: code that is neither this package's nor torch's, hooks, other attributes than numbers and
+    text."""
+    if isinstance(module, nn.Module) and type(module).__module__.startswith(("torchsoft.", "torch.nn.")):
+        kind = type(module)
+        own = {k: v for k, v in vars(module).items() if not k.startswith("_")}
+        given = {k: v for base in kind.__mro__[::-1] for k, v in vars(base).items() if isinstance(v, int | float)}
+        parts = tuple((k, structure(v)) for k, v in module._modules.items())
+        buffers = tuple((k, v.dtype, v.numpy().tobytes()) for k, v in module._buffers.items() if v is not None)
+        shapes = tuple((k, tuple(v.shape)) for k, v in module._parameters.items() if v is not None)
+        plain = all(isinstance(v, bool | int | float | str | None) for v in own.values())
+        hooked = any(v for k, v in vars(module).items() if k.endswith("_hooks"))
+        if plain and not hooked and all(part is not None for _, part in parts):
+            return kind, kind.forward, tuple(sorted((given | own).items())), parts, buffers, shapes
+    return None
+
+
+_laws: dict[Any, Law] = {}
+"""Laws that have been compiled, by what decides them: the structure of their modules, else their traced expressions."""
+
+_compiling = threading.Lock()
+
+
+def compiled_law(
+    names: Mapping[str, Tensor],
+    function: Callable[..., Tensor],
+    size: int,
+    linear: int,
+    differentiated: int,
+    **modules: Any,
+) -> Law:
+    """The law of a function of modules and x (size,), differentiable in the first inputs and in the parameters `names`,
+    of which it may not use all. Raises `UnknownOperation` naming the line of a law that cannot be compiled."""
+    decided = tuple((name, structure(module)) for name, module in modules.items())
+    shapes = tuple((name, tuple(value.shape)) for name, value in names.items())
+    with _compiling:
+        known = all(part is not None for _, part in decided)
+        key = (function, decided, shapes, linear, differentiated)
+        if known and key in _laws:
+            return _laws[key]
+        called = _Called(function, **modules)
+
+        def law(x: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+            own = {name: value for name, value in values.items() if name.split(".")[0] in modules}
+            return torch.func.functional_call(called, own, (x,))
+
+        example = torch.linspace(0.01, 0.02, size, dtype=torch.float64)
+        if not known:  # what somebody's own code does is known from running it only, and may change any time
+            graph = Graph()
+            outputs = traced(graph, law, example, names)
+            key = tuple(graph.ops), repr(graph.args), tuple(outputs), shapes, linear, differentiated
+        if key not in _laws:
+            _laws[key] = compile_law(law, example, names, linear=linear, differentiated=differentiated)
+        return _laws[key]
+
+
+def _effort(actuator: nn.Module, x: Tensor) -> Tensor:
+    return actuator(x)[None]
+
+
+def actuator_law(actuator: nn.Module, parameters: Mapping[str, Tensor]) -> Law:
+    """The law of an actuator: its effort by setpoint, its rate, feed-forward, coordinate, its rate."""
+    return compiled_law(parameters, _effort, 5, 1, 5, law=actuator)
+
+
+def contact_laws(law: Any, shape: Any) -> LawSet:
+    """The laws of a contact of `law` on a body of `shape`."""
+    parameters: dict[str, Tensor] = dict(_Called(interface_law, law=law, shape=shape).named_parameters())
+    return LawSet(
+        compiled_law(parameters, distance_law, INPUTS, 0, 0, shape=shape),
+        compiled_law(parameters, interface_law, INPUTS, 3, 7, law=law, shape=shape),
+        compiled_law(parameters, free_law, 3, 1, 1, law=law),
+        parameters,
+    )

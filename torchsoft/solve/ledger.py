@@ -1,0 +1,41 @@
+"""What a finished run says of itself: whether its energies balance, and whether its pads are pressed beyond the theory."""
+
+from collections.abc import Iterator
+
+from torchsoft.physics.rig import Rig
+from torchsoft.solve.trajectory import Trajectory
+
+RESIDUAL = 0.05
+"""Energy residual over the energy at the start and injected since, up to which a run passes without a warning: fifteen times
+what the hardest of the ready excitations leaves at steps of 2 ms."""
+
+NEGLIGIBLE = 1e-9
+"""Energy [J] too small to be judged."""
+
+SUPPLIED = 1e-9
+"""Part of that energy by which what is dissipated may fall: rounding."""
+
+COMPRESSED = 0.5
+"""Part of its height by which a pad may be pressed in: linear elasticity ends well below."""
+
+
+def doubts(trajectory: Trajectory, rig: Rig) -> Iterator[str]:
+    """Sentences on what is wrong with a finished run that has a ledger; none if nothing is."""
+    run = trajectory
+    stored = sum(float(part[0].detach()) for part in run.energy.values())
+    scale = max(stored + float(run.injected[-1]), NEGLIGIBLE)
+    part = float(run.energy_residual.detach().abs().max()) / scale
+    if not part <= RESIDUAL:
+        better = 0.4 * run.stats.step_s * min(1.0, RESIDUAL / part)
+        yield (
+            f"the energies of the run do not balance: {part:.2%} of what was stored at the start and injected since is missing "
+            f"or too much, with steps of {run.stats.step_s:.3g} s; try steps of {better:.2g} s"
+        )
+    for name, work in run.dissipated.items():
+        back = -float(work.diff().min())
+        if back > SUPPLIED * scale:
+            yield f"`{name}` is to dissipate energy, but gave {back:.3g} J back between two outputs; check its law"
+    for name, u in run.displacement.items():
+        deepest, height = float(u.detach().norm(dim=-1).max()), rig.pads[name].mesh.height
+        if not deepest <= COMPRESSED * height:
+            yield f"the pad `{name}` of height {height:.3g} m gave way by {deepest:.3g} m, beyond linear elasticity"
