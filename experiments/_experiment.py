@@ -1,5 +1,6 @@
 """What experiments share around their questions: options, output times, tables, the summary and the figures."""
 
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from importlib.metadata import version
@@ -19,13 +20,31 @@ from torchsoft.plot.figures import save
 C = TypeVar("C")
 T = TypeVar("T")
 
+STEPS = (1e-6, 0.02)
+"""Shortest and longest step [s]."""
+
+SMALLEST, LARGEST = 1e-9, 1e6
+"""Of every other number; counts, seeds and entries of lists may be zero."""
+
 COARSE: dict[str, Any] = {"pad.elements_x": 60, "pad.elements_y": 2}  # Parameters of half the usual mesh.
 
 
 def options(config: type[C], description: str | None) -> C:
-    """The command line as a configuration; torch computes on one thread from here on."""
+    """The command line as a configuration; torch computes on one thread from here on.
+
+    Ends with status 2 and a sentence for a number that no experiment can use.
+    """
     torch.set_num_threads(1)
-    return tyro.cli(config, description=description)
+    given: Any = tyro.cli(config, description=description)
+    for name, value in asdict(given).items():
+        least = 0.0 if isinstance(value, tuple | int) else SMALLEST
+        for one in value if isinstance(value, tuple) else (value,):
+            low, high = STEPS if name == "step" else (least, LARGEST)
+            if isinstance(one, int | float) and not low <= one <= high:
+                option = f"--{name.replace('_', '-')}"
+                print(f"error: {option} should be from {low:g} to {high:g}, not {one!r}", file=sys.stderr)
+                raise SystemExit(2)
+    return given
 
 
 def grid(duration: float, spacing: float = 0.01) -> Tensor:
@@ -75,5 +94,5 @@ def write(out: Path, summary: Mapping[str, Any], figures: Mapping[str, Figure] |
         save(figure, out / f"{name}.png")
     if table:
         with replacing(out / "table.md") as partial:
-            partial.write_text(table + "\n")
+            partial.write_text(table + "\n", encoding="utf-8")
     print(f"written to {out}")

@@ -111,7 +111,7 @@ def peak_memory(config: Config) -> None:
     m = prepare()
     if config.measure != "nothing":
         tasks(m, grid(config.duration), config.step)[config.measure]()
-    lines = Path("/proc/self/status").read_text().splitlines()
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     print(next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024)
 
 

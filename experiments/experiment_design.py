@@ -91,7 +91,9 @@ def assess(excitation: Excitation, p: Parameters, config: Config) -> tuple[Array
     """Whitened Jacobian (m, parameters), error of the step (m,), and how far the Jacobian is, relatively, from a central
     difference along one direction."""
     recording = record("one", excitation, p, p, RIG, step=config.step, noise=0.0)
-    problem = Problem([recording], RIG, {name: Unknown() for name in NAMES})
+    friction = 0.5 * (p.contact.mu_k + p.contact.mu_s)  # bounds that do not cross; nothing is searched here
+    apart = {"contact.mu_k": Unknown(high=friction), "contact.mu_s": Unknown(low=friction)}
+    problem = Problem([recording], RIG, {name: Unknown() for name in NAMES} | apart)
     x, v = problem.coordinates.start, np.random.default_rng(config.seed).standard_normal(len(NAMES))
     with Runner(problem.recordings) as runner:
         at = problem.residuals(runner, x, ["one"], config.step, problem.coordinates.free)

@@ -250,8 +250,8 @@ def write(result: Result) -> None:
     for friction, done in result.runs.items():
         name = "trajectory.nc" if done is first else f"trajectory_{friction.replace('-', '_')}.nc"
         done.trajectory.save(config.out / name)
-    (config.out / "summary.json").write_text(json.dumps(summaries(result), indent=2) + "\n")
-    (config.out / "multibond.dot").write_text(drawn.dot(first.model))
+    (config.out / "summary.json").write_text(json.dumps(summaries(result), indent=2) + "\n", encoding="utf-8")
+    (config.out / "multibond.dot").write_text(drawn.dot(first.model), encoding="utf-8")
     if result.stopped:
         return
     for name, figure in tqdm(figures(result).items(), "figures", unit="figure"):
@@ -265,7 +265,7 @@ def main() -> None:
     config = options(Config, __doc__)
     try:
         if config.table:
-            print(table(json.loads((config.out / "summary.json").read_text())))
+            print(table(json.loads((config.out / "summary.json").read_text(encoding="utf-8"))))
             return
         result = run(config)
     except KeyboardInterrupt:  # nothing was simulated yet but trials of the grasp

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 import re
 import signal
 import subprocess
@@ -17,9 +18,9 @@ from test_sysid_measured import CONFIG, EXAMPLE, X_C, X_D, Table, scale, write
 from torchsoft.cli import main
 from torchsoft.sysid import Unreachable
 from torchsoft.sysid.measured import load, unreachable
-from torchsoft.sysid.workers import FailedRun
+from torchsoft.sysid.prediction import FailedRun
 
-OPTIONS = ("--out", "--workers", "--step", "--checkpoint", "--no-progress")
+OPTIONS = ("--out", "--workers", "--step", "--checkpoint", "--yes", "--no-progress")
 
 
 def rows(count: int) -> Table:
@@ -82,10 +83,24 @@ ERRORS: dict[str, tuple[list[str], str]] = {
     "not TOML": (["data.csv", "broken.toml"], "broken.toml is not a TOML file"),
     "unknown name": (
         ["data.csv", "misspelt.toml"],
-        "misspelt.toml: `contact.K` cannot be identified; what can: ",
+        "misspelt.toml: unknowns: `contact.K` cannot be identified; what can: ",
     ),
-    "step": (["data.csv", "rig.toml", "--step", "-1"], "step: Input should be greater than 0"),
-    "workers": (["data.csv", "rig.toml", "--workers", "0"], "workers: Input should be greater than or equal to 1"),
+    "step": (["data.csv", "rig.toml", "--step", "-1"], "step should be greater than or equal to 1e-07, not -1.0"),
+    "tiny step": (
+        ["data.csv", "rig.toml", "--step", "1e-300"],
+        "step should be greater than or equal to 1e-07, not 1e-300",
+    ),
+    "hours": (
+        ["data.csv", "rig.toml", "--step", "1e-7"],
+        "; take a larger step, fewer starts or less data, or say --yes",
+    ),
+    "many starts": (["data.csv", "many.toml"], "or say --yes to begin"),
+    "deep": (
+        ["data.csv", "deep.toml"],
+        "deep.toml is not a TOML file that can be read: its tables are nested too deeply",
+    ),
+    "another encoding": (["data.csv", "latin.toml"], "latin.toml is not a TOML file: 'utf-8' codec"),
+    "workers": (["data.csv", "rig.toml", "--workers", "0"], "workers should be greater than or equal to 1, not 0"),
     "out is a file": (["data.csv", "rig.toml", "--out", "data.csv"], "data.csv: File exists"),
 }
 
@@ -96,6 +111,9 @@ def test_an_error_is_one_line_and_ends_with_2(folder: Path, name: str, capsys: A
     (folder / "picture.csv").write_bytes(b"\x89PNG\r\n\x1a\n")
     (folder / "empty.csv").write_text("")
     (folder / "broken.toml").write_text("[[")
+    (folder / "deep.toml").write_text("a = " + "[" * 20_000)
+    (folder / "latin.toml").write_bytes("a = 'µ'".encode("latin-1"))
+    (folder / "many.toml").write_text(f"{CONFIG}starts = 1_000_000\n")
     (folder / "misspelt.toml").write_text(CONFIG.replace("contact.K_n", "contact.K"))
     before = sorted(folder.rglob("*"))
     arguments, message = ERRORS[name]
@@ -106,6 +124,27 @@ def test_an_error_is_one_line_and_ends_with_2(folder: Path, name: str, capsys: A
     assert message in err
     assert err.count("\n") == 1
     assert sorted(folder.rglob("*")) == before  # nothing is left behind
+
+
+def test_in_a_locale_without_our_signs_it_shows_their_numbers(folder: Path) -> None:
+    (folder / "µ.toml").write_text(CONFIG.replace("contact.K_n", "contact.µ"), encoding="utf-8")
+    command = [sys.executable, "-m", "torchsoft", "identify", "data.csv", "µ.toml"]
+    environment = os.environ | {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    ended = subprocess.run(command, capture_output=True, check=False, timeout=120, env=environment)
+    assert ended.returncode == 2
+    assert b"`contact.\\xb5` cannot be identified" in ended.stderr
+    assert ended.stderr.count(b"\n") == 1
+
+
+def test_a_checkpoint_folder_of_others_is_refused_and_left_alone(folder: Path, capsys: Any) -> None:
+    mine = folder / "mine"
+    mine.mkdir()
+    for name in ("a.pickle", "b.partial"):
+        (mine / name).write_text("mine", encoding="utf-8")
+    assert main(["identify", "data.csv", "rig.toml", "--checkpoint", "mine"]) == 2
+    said = capsys.readouterr().err
+    assert said == "torchsoft: error: the checkpoint mine holds other files; give a new or an empty folder\n"
+    assert sorted(path.name for path in mine.iterdir()) == ["a.pickle", "b.partial"]
 
 
 def test_as_a_process_it_ends_with_the_same_status_and_without_a_traceback(folder: Path) -> None:
@@ -188,14 +227,14 @@ def test_an_interrupted_command_continues_and_ends_the_same(answered: tuple[Path
     )
     child = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
     began = time.monotonic()
-    while len(list(out.glob("unfinished/*.pickle"))) < 3 and child.poll() is None and time.monotonic() - began < 120:
+    while len(list(out.glob("unfinished/*.run"))) < 3 and child.poll() is None and time.monotonic() - began < 120:
         time.sleep(0.02)
     child.send_signal(signal.SIGINT)
     _, message = child.communicate(timeout=60)
     assert child.returncode == 130, message
     assert "the same command continues" in message
     assert "Traceback" not in message
-    kept = len(list(out.glob("unfinished/*.pickle")))
+    kept = len(list(out.glob("unfinished/*.run")))
     assert kept >= 3
     assert not (out / "answer.json").exists()
 

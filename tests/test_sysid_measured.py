@@ -4,6 +4,7 @@ import csv
 import importlib.util
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,11 @@ import xarray as xr
 from torchsoft import Parameters, Trajectory, simulate
 from torchsoft.channels import CHANNELS
 from torchsoft.excitation import Excitation, Strokes, begin
+from torchsoft.solve.trajectory import save
 from torchsoft.sysid import MEASURED, Recording, Sensor, record
 from torchsoft.sysid.columns import COLUMNS, UNITS, read_table
-from torchsoft.sysid.measured import known_parameters, load, read_recording
+from torchsoft.sysid.cost import cost
+from torchsoft.sysid.measured import known_parameters, load, read_recording, stem
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "identify"
 
@@ -99,7 +102,7 @@ BAD: dict[str, tuple[Change, str]] = {
     "column twice": (put(1, X_C, "x_Br [mm]"), r"row 1, column `x_Br` is there twice"),
     "no times": (drop(T), r"data\.csv has no column `t`"),
     "no set-point": (drop(Y_D), r"data\.csv has no column `y_d`"),
-    "no sensor": (put(1, X_C, "y_C [mm]"), r"rig\.toml: no recording has samples of `x_C`"),
+    "no sensor": (put(1, X_C, "y_C [mm]"), r"rig\.toml: sensors: no recording has samples of `x_C`"),
     "semicolons": (
         lambda table: table.__setitem__(slice(None), [[";".join(cells)] for cells in table]),
         "row 1.*separate columns with commas",
@@ -109,6 +112,8 @@ BAD: dict[str, tuple[Change, str]] = {
     "nan": (put(9, F_Y, "NaN"), r"row 9, column `F_y`: 'NaN' is not a finite number"),
     "infinity": (put(9, F_Y, "-inf"), r"row 9, column `F_y`: '-inf' is not a finite number"),
     "grouped digits": (put(9, F_Y, "1_0"), r"row 9, column `F_y`: '1_0' is not a finite number"),
+    "digits of another script": (put(9, F_Y, "１２"), r"row 9, column `F_y`: '１２' is not a finite number"),
+    "times of a clock": (scale(T, 1.0, 1.7e9), r"row 2, column `t`: 1\.7e\+09 s is too far from zero; count times from"),
     "empty time": (put(12, T, ""), r"row 12, column `t` is empty; only measured channels may have gaps"),
     "empty set-point": (put(12, Y_D, " "), r"row 12, column `y_d` is empty"),
     "time twice": (put(12, T, "0.045"), r"row 12, column `t`: the time 0.045 s is there twice"),
@@ -150,20 +155,28 @@ def test_a_mistake_in_the_data_is_named_with_its_row_and_column(case: Callable[.
 
 BAD_CONFIG = {
     "not TOML": (CONFIG + "[[", r"rig\.toml is not a TOML file"),
-    "unknown table": (CONFIG + "[sensor]\n", r"rig\.toml: sensor: is not known here"),
-    "unknown key": (CONFIG.replace("y_Br.noise", "y_Br.sigma"), r"sensors\.y_Br\.noise: .*sensors\.y_Br\.sigma: is not known"),
-    "no noise": (CONFIG.replace("F_y.noise = 0.1", "F_y.noise = 0.0"), r"sensors\.F_y\.noise: .* greater than 0"),
-    "unknown channel": (CONFIG.replace("F_y.noise", "F_z.noise"), r"rig\.toml: `F_z` is not a channel"),
-    "unknown parameter": (CONFIG.replace("contact.K_n", "contact.K"), r"rig\.toml: `contact.K` cannot be identified"),
-    "unknown setting": (CONFIG.replace("contact.v_s", "contact.vs"), r"settings of `data`: contact\.vs: is not known here"),
-    "setting out of bounds": (CONFIG.replace("v_s = 0.05", "v_s = -1"), r"settings of `data`: contact\.v_s: .*greater than 0"),
-    "not a table": ("settings.disc = 3\n" + CONFIG.split("\n\n", 1)[1], r"settings of `data`: disc: Input should be a valid"),
-    "not a number": (CONFIG.replace("60.3e-3", '"here"'), r"settings of `data`: scenario\.x_C0: Input should be"),
-    "other pads": (CONFIG.replace("contact.v_s", "pad.height = 3e-3\ncontact.v_s"), r"rig\.toml touch .* at 46.92 mm"),
+    "unknown table": (CONFIG + "[sensor]\n", r"rig\.toml: sensor is not known here"),
+    "unknown key": (CONFIG.replace("y_Br.noise", "y_Br.sigma"), r"y_Br\.noise is missing; sensors\.y_Br\.sigma is not known"),
+    "no noise": (CONFIG.replace("F_y.noise = 0.1", "F_y.noise = 0.0"), r"sensors\.F_y\.noise should be .* 1e-15, not 0\.0"),
+    "unknown channel": (CONFIG.replace("F_y.noise", "F_z.noise"), r"rig\.toml: sensors: `F_z` is not a channel"),
+    "unknown parameter": (CONFIG.replace("contact.K_n", "contact.K"), r"rig\.toml: unknowns: `contact.K` cannot be identified"),
+    "unknown setting": (CONFIG.replace("contact.v_s", "contact.vs"), r"settings of `data`: contact\.vs is not known here"),
+    "setting out of bounds": (CONFIG.replace("v_s = 0.05", "v_s = -1"), r"of `data`: contact\.v_s should be .*, not -1"),
+    "not a table": ("settings.disc = 3\n" + CONFIG.split("\n\n", 1)[1], r"of `data`: disc should be a table, not 3"),
+    "not a number": (CONFIG.replace("60.3e-3", '"here"'), r"scenario\.x_C0 should be a valid number, not 'here'"),
+    "other pads": (CONFIG.replace("contact.v_s", "pad.height = 3e-3\ncontact.v_s"), r"touch .* at 46.92 mm \(twice pad.height"),
     "bounds": (CONFIG.replace("nominal = 1e5", "low = 2\nhigh = 1"), r"unknowns\.contact\.K_n: low = 2.0 must be below"),
-    "step": (CONFIG.replace("step = 5e-3", "step = -1"), r"fit\.step: Input should be greater than 0"),
-    "method": (CONFIG + 'method = "magic"\n', r"fit\.method: Input should be 'gauss_newton'"),
-    "held out": ('heldout = ["other"]\n' + CONFIG, r"there is no recording `other`; there are data"),
+    "step": (CONFIG.replace("step = 5e-3", "step = -1"), r"fit\.step should be greater than or equal to 1e-07, not -1"),
+    "method": (CONFIG + 'method = "magic"\n', r"fit\.method should be 'gauss_newton'"),
+    "text for a number": (CONFIG.replace("step = 5e-3", 'step = "5e-3"'), r"fit\.step should be a valid number, not '5e-3'"),
+    "truth for a number": (CONFIG.replace("nominal = 1e5", "nominal = true"), r"nominal should be a valid number, not True"),
+    "a disc that fits nowhere": (
+        CONFIG.replace('unknowns."pad.E"]\nnominal = 0.7e6', 'unknowns."disc.radius"]'),
+        r"unknowns\.disc\.radius\.low = 0\.001937 is impossible: the disc does not fit",
+    ),
+    "nothing to fit": ('heldout = ["data"]\n' + CONFIG, r"heldout: it names every recording"),
+    "a long delay": (CONFIG + "[sensors.theta]\nnoise = 1e-3\ndelay = 0.5\n", r"sensors\.theta\.delay should be less than"),
+    "held out": ('heldout = ["other"]\n' + CONFIG, r"heldout: there is no recording `other`; the recordings' names are data"),
     "nameless": (CONFIG + "[[recordings]]\n", r"recordings\.0: a recording needs a `file`"),
     "same name": (CONFIG + '[[recordings]]\nfile = "data.csv"\n', r"names of their own, but are called data, data"),
 }  # fmt: skip
@@ -279,7 +292,7 @@ def test_a_trajectory_file_is_a_recording(run: Trajectory, tmp_path: Path) -> No
     np.testing.assert_allclose(got, desired, atol=1e-12)
     assert one.settings.scenario.y_Br_grasp == pytest.approx(float(desired[:, 2].min()))
     older = tmp_path / "older.nc"  # without the rate of y_d
-    run.to_dataset().drop_vars("desired_y_velocity").to_netcdf(older, engine="h5netcdf")
+    save(run.to_dataset().drop_vars("desired_y_velocity"), older)
     table = read_table(older)
     assert "y_d_dot" not in table.values
     with torch.no_grad():
@@ -290,19 +303,56 @@ def test_a_trajectory_file_is_a_recording(run: Trajectory, tmp_path: Path) -> No
 def test_a_mistake_in_a_trajectory_file_is_named(run: Trajectory, tmp_path: Path) -> None:
     path = tmp_path / "run.nc"
     path.write_text("not a file of this kind")
-    with pytest.raises(ValueError, match=r"run\.nc is not a NetCDF file"):
+    with pytest.raises(ValueError, match=r"run\.nc has no checksum at its end"):
         read_table(path)
-    xr.Dataset({"time": ("time", [0.0, 1.0])}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
+    save(xr.Dataset({"time": ("time", [0.0, 1.0])}), tmp_path / "other.nc")
     with pytest.raises(ValueError, match=r"other\.nc is not a trajectory file: it has no desired_x, "):
         read_table(tmp_path / "other.nc")
     data = run.to_dataset().copy(deep=True)
     data["disc_angle"][7] = np.nan
-    data.to_netcdf(tmp_path / "nan.nc", engine="h5netcdf")
+    save(data, tmp_path / "nan.nc")
     with pytest.raises(ValueError, match=r"nan\.nc, sample 7, `theta` is not a finite number"):
         read_table(tmp_path / "nan.nc")
-    run.to_dataset().isel(time=[0, 1, 2, 2, *range(3, 31)]).to_netcdf(tmp_path / "twice.nc", engine="h5netcdf")
+    data = run.to_dataset()
+    data["disc_angle"].attrs["units"] = "deg"
+    save(data, tmp_path / "units.nc")
+    with pytest.raises(ValueError, match=r"units\.nc, `disc_angle` should be in rad, not 'deg'"):
+        read_table(tmp_path / "units.nc")
+    data = run.to_dataset().assign(desired_x=("time", ["here"] * 31))
+    save(data, tmp_path / "text.nc")
+    with pytest.raises(ValueError, match=r"text\.nc is not a trajectory file: `desired_x` should be float64 over time"):
+        read_table(tmp_path / "text.nc")
+    save(run.to_dataset().isel(time=[0, 1, 2, 2, *range(3, 31)]), tmp_path / "twice.nc")
     with pytest.raises(ValueError, match=r"twice\.nc, sample 3, column `t`: the time 0.004 s is there twice"):
         read_table(tmp_path / "twice.nc")
+
+
+def test_samples_much_denser_than_the_step_are_not_all_steps(case: Callable[..., list[str]]) -> None:
+    (one,) = load(*_split(case())).problem.recordings
+    t, x = one.samples["x_C"]
+    dense = np.linspace(t[0], t[-1], 20_001)
+    many = replace(one, samples={"x_C": (dense, np.interp(dense, t, x))})
+    assert many.spacing(5e-3, False) == 5e-3 / 4
+    grid = many.grid(5e-3, False).numpy()
+    assert len(grid) < 500
+    assert grid[1] <= dense[0] < dense[-1] <= grid[-1]
+    assert one.spacing(5e-3, False) is None
+    np.testing.assert_array_equal(one.grid(5e-3, False)[1:], one.times)
+    coarse = one.grid(20e-3, True).numpy()  # a grid between the samples begins after the disc has begun to settle
+    assert np.all(np.diff(coarse) > 0)
+
+
+def _split(files: list[str]) -> tuple[list[str], str]:
+    return files[:1], files[1]
+
+
+def test_a_long_identification_is_priced(case: Callable[..., list[str]]) -> None:
+    made = load(*_split(case())).problem
+    assert cost(made, 5e-3, 1, 1).seconds < 60
+    assert cost(made, 5e-3, 1_000_000, 1).seconds > 1e5
+    assert cost(made, 1e-7, 1, 1).seconds > 1e4
+    delayed = load(*_split(case(config=CONFIG + "[sensors.theta]\nnoise = 1e-3\ndelay = 2e-3\n"))).problem
+    assert cost(delayed, 1e-5, 1, 1, method="adam").memory > 10 > cost(delayed, 1e-5, 1, 1).memory
 
 
 def test_recordings_have_settings_of_their_own(case: Callable[..., list[str]], tmp_path: Path) -> None:
@@ -313,3 +363,9 @@ def test_recordings_have_settings_of_their_own(case: Callable[..., list[str]], t
     assert (first.name, first.settings.disc.mass) == ("data", 0.5)
     assert (second.name, second.settings.disc.mass) == ("b", Parameters().disc.mass)
     assert first.settings.contact.v_s == second.settings.contact.v_s == 0.05
+
+
+def test_a_name_is_the_same_where_the_system_knows_ascii_only() -> None:
+    """Which gives Python the bytes of a file's name one by one."""
+    assert stem(Path("a/größe.csv")) == stem(Path("a/gr\udcc3\udcb6\udcc3\udc9fe.csv")) == "größe"
+    assert stem(Path("a/\udcff.csv")) == "�"

@@ -1,11 +1,14 @@
 """The command `torchsoft`: identification from files."""
 
 import argparse
+import io
 import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+from torchsoft.tables import line
 
 IDENTIFY = """\
 Which parameters explain these recordings, and how sure is that?
@@ -32,7 +35,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     one.add_argument("--workers", type=int, help="processes, one recording each (fit.workers)")
     one.add_argument("--step", type=float, help="the simulation's step [s] (fit.step)")
     one.add_argument("--checkpoint", type=Path, help="folder for what is unfinished (OUT/unfinished)")
+    one.add_argument("--yes", action="store_true", help="begin even what takes hours, or much memory")
     one.add_argument("--no-progress", action="store_true", help="show no progress")
+    for stream in (sys.stdout, sys.stderr):  # a terminal that cannot show a sign gets its number
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     options = parser.parse_args(arguments)
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: print(f"torchsoft: note: {message}", file=sys.stderr)
@@ -47,12 +54,13 @@ def identify(options: argparse.Namespace) -> int:
         return failed(f"one CONFIG.toml is needed, but {len(configs)} were given")
     try:
         # these take seconds to import, so that `--help` does without
-        from torchsoft.files import findings
+        from torchsoft.cost import agree
         from torchsoft.sysid import measured
+        from torchsoft.sysid.cost import cost
         from torchsoft.sysid.fit import Unreachable
+        from torchsoft.sysid.journal import forget
         from torchsoft.sysid.report import report
         from torchsoft.sysid.solve import identify
-        from torchsoft.sysid.workers import forget
 
         tables: dict[str, Any] = {}
         try:
@@ -62,6 +70,8 @@ def identify(options: argparse.Namespace) -> int:
             fit = measured.Settings.model_validate(
                 fit.model_dump() | {k: v for k, v in changed.items() if v is not None}
             )
+            expected = cost(case.problem, fit.step, fit.starts, fit.workers, case.config.heldout, fit.method)
+            agree(expected, options.yes, "take a larger step, fewer starts or less data")
             options.out.mkdir(parents=True, exist_ok=True)
             result = identify(
                 case.problem, heldout=case.config.heldout, checkpoint=unfinished, progress=not options.no_progress,
@@ -69,10 +79,9 @@ def identify(options: argparse.Namespace) -> int:
             )  # fmt: skip
             result.save(options.out / "answer.json")
             report(result, case.problem, options.out / "report.html", checkpoint=unfinished)
+            forget(unfinished)
         except Unreachable as error:
             return failed(measured.unreachable(error, tables))
-        except measured.ValidationError as error:
-            return failed(findings(error))
         except (ValueError, RuntimeError) as error:  # a model without equilibrium, a worker that was killed
             return failed(str(error))
         except OSError as error:
@@ -80,7 +89,6 @@ def identify(options: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         print(f"\ninterrupted; what is done so far is in {unfinished}, and the same command continues", file=sys.stderr)
         return 130
-    forget(unfinished)
     print(result.table())
     for notice in result.notices:
         print(f"note: {notice}")
@@ -89,5 +97,5 @@ def identify(options: argparse.Namespace) -> int:
 
 
 def failed(what: str) -> int:
-    print(f"torchsoft: error: {' '.join(what.split())}", file=sys.stderr)
+    print(f"torchsoft: error: {line(what, 2000)}", file=sys.stderr)
     return 2

@@ -4,41 +4,49 @@ An `Excitation` is plain validated data, so that it can stand in a TOML file; `b
 reference that its controllers follow.
 """
 
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple, Self
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field, model_validator
 from torch import Tensor
 
 from torchsoft.parameters import Parameters
 from torchsoft.physics.equilibrium import holding_force, press, rest
 from torchsoft.physics.motion import Profile, Reference
 from torchsoft.physics.paper import SoftGrasp, apart
+from torchsoft.tables import LISTED, SEED, Table
 
 FADE = 0.15
 """Time [s] over which waves come and go."""
 
+MOST = 10_000
+"""Strokes in one motion."""
 
-class Table(BaseModel):
-    """A frozen table; unknown keys and non-finite numbers are errors."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+Length = Annotated[float, Field(ge=-10.0, le=10.0)]
+"""An amplitude or a distance [m]."""
+
+Time = Annotated[float, Field(ge=1e-6, le=1e5)]
+"""A time [s] that something takes."""
+
+Frequency = Annotated[float, Field(ge=1e-6, le=1e5)]
+"""A frequency [Hz]."""
 
 
 class Roll(Table):
     """By `travel` [m] to the right over the whole time of the motion."""
 
     kind: Literal["slow_roll"] = "slow_roll"
-    travel: float = 10e-3
+    travel: Length = 10e-3
 
 
 class Strokes(Table):
     """There and back by `travel` [m], `stroke_time` [s] each way, until the end."""
 
     kind: Literal["strokes"] = "strokes"
-    travel: float = 10e-3
-    stroke_time: float = Field(default=1.0, gt=0)
+    travel: Length = 10e-3
+    stroke_time: Time = 1.0
 
 
 class MultiSine(Table):
@@ -46,30 +54,30 @@ class MultiSine(Table):
     sum's peak at most. Phases, and frequencies within their part, come from `seed`."""
 
     kind: Literal["multi_sine"] = "multi_sine"
-    amplitude_x: float = 4e-3
-    amplitude_y: float = 2e-4
-    frequency: tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]] = (0.5, 8.0)
+    amplitude_x: Length = 4e-3
+    amplitude_y: Length = 2e-4
+    frequency: Annotated[tuple[Frequency, Frequency], LISTED] = (0.5, 8.0)
     components: int = Field(default=5, ge=1, le=50)
-    seed: int = Field(default=0, ge=0)
+    seed: int = Field(default=0, ge=0, le=SEED)
 
 
 class Chirp(Table):
     """Sweeps in x and y from `start` to `end` [Hz], of amplitudes in m."""
 
     kind: Literal["chirp"] = "chirp"
-    amplitude_x: float = 1e-3
-    amplitude_y: float = 1e-4
-    start: float = Field(default=0.3, gt=0)
-    end: float = Field(default=8.0, gt=0)
+    amplitude_x: Length = 1e-3
+    amplitude_y: Length = 1e-4
+    start: Frequency = 0.3
+    end: Frequency = 8.0
 
 
 class Press(Table):
     """The bracket's height modulated by `amplitude` [m] at `frequency` [Hz] while the disc rolls by `travel` [m]."""
 
     kind: Literal["press"] = "press"
-    amplitude: float = 2e-4
-    frequency: float = Field(default=2.0, gt=0)
-    travel: float = 5e-3
+    amplitude: Length = 2e-4
+    frequency: Frequency = 2.0
+    travel: Length = 5e-3
 
 
 Motion = Annotated[Roll | Strokes | MultiSine | Chirp | Press, Field(discriminator="kind")]
@@ -86,12 +94,28 @@ class Excitation(Table):
     """
 
     motion: Motion
-    duration: float = Field(default=2.0, gt=0)
-    depth: float = Field(default=1.5e-3, gt=0)
+    duration: Time = 2.0
+    depth: float = Field(default=1.5e-3, ge=1e-7, le=10.0)
     senses: Literal["disc", "bracket"] = "bracket"
-    grasp_time: float = Field(default=0.375, gt=0)
-    settle: float = Field(default=0.125, ge=0)
+    grasp_time: Time = 0.375
+    settle: float = Field(default=0.125, ge=0, le=1e5)
     x_C0: float = 60.3e-3
+
+    @model_validator(mode="after")
+    def _motion_has_time(self) -> Self:
+        since, motion = self.grasp_time + self.settle, self.motion
+        needed = {"slow_roll": 0.0, "press": 2 * FADE, "multi_sine": 2 * FADE, "chirp": 2 * FADE}.get(motion.kind)
+        if needed is not None and self.duration <= since + needed:
+            raise ValueError(
+                f"duration = {self.duration:g} s leaves no motion: grasp_time = {self.grasp_time:g} s and settle = "
+                f"{self.settle:g} s take {since:g} s, and {motion.kind} needs more than {needed:g} s after them"
+            )
+        if isinstance(motion, Strokes) and (self.duration - since) / motion.stroke_time > MOST:
+            raise ValueError(
+                f"duration = {self.duration:g} s at motion.stroke_time = {motion.stroke_time:g} s makes more than {MOST} "
+                "strokes; take fewer"
+            )
+        return self
 
     def settings(self, p: Parameters) -> Parameters:
         """The parameters p with this excitation's grasp. Raises `ValueError` for a grasp that is not possible."""
@@ -193,7 +217,7 @@ def moved(motion: Motion, still: Knots, grasp: Knots, since: float, until: float
             rng, n = np.random.default_rng(motion.seed), motion.components
             low, high = np.log(motion.frequency)
 
-            def sines(amplitude: float) -> Wave:
+            def sines(amplitude: Length) -> Wave:
                 frequency = np.exp(low + (np.arange(n) + rng.random(n)) / n * (high - low))
                 return wave(np.full(n, amplitude / n), frequency, np.zeros(n), rng.uniform(0, 2 * np.pi, n))
 

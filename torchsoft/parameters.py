@@ -5,58 +5,76 @@ it). A value that differs from its default is `assumed` whatever the default was
 """
 
 import math
-import tomllib
 import warnings
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from annotated_types import Ge, Le
+from pydantic import ConfigDict, Field, TypeAdapter, model_validator
+
+from torchsoft.tables import Table, from_toml, line, refusing
 
 Source = Literal["published", "assumed"]
 
+MEMORY = 8.0
+"""Largest memory [GiB] that the stiffness of a pad's mesh may need."""
+
+
+ORDERED = ("contact.mu_k", "contact.mu_s")
+"""The first must not exceed the second."""
+
 
 def quantity(default: Any, unit: str, source: Source, meaning: str, **bounds: Any) -> Any:
-    """A field of a parameter group: default [unit], its source, its meaning and pydantic bounds."""
+    """A field of a parameter group: default [unit], its source, its meaning and pydantic bounds.
+
+    The bounds are wide: they end where sums and products of such numbers would not be finite.
+    """
     return Field(default, description=meaning, json_schema_extra={"unit": unit, "source": source}, **bounds)
 
 
-class Group(BaseModel):
-    """A frozen group of quantities; unknown names, non-finite numbers and values out of bounds are errors."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class PadParameters(Group):
+class PadParameters(Table):
     """One soft pad; the upper one is the lower one mirrored."""
 
-    length: float = quantity(0.120, "m", "published", "L_x", gt=0)
-    height: float = quantity(4.59e-3, "m", "published", "L_y", gt=0)
-    depth: float = quantity(0.044, "m", "assumed", "out-of-plane depth; a steel disc of the assumed mass", gt=0)
-    E: float = quantity(0.75e6, "Pa", "assumed", "Young's modulus; Shore A 20 silicone", gt=0)
-    nu: float = quantity(0.45, "1", "assumed", "Poisson's ratio", gt=-1, lt=0.5)
-    rho: float = quantity(1100.0, "kg/m3", "assumed", "density (inertial pads only)", gt=0)
-    tau: float = quantity(10e-3, "s", "assumed", "Kelvin-Voigt time, R = tau K", gt=0)
-    elements_x: int = quantity(120, "1", "assumed", "elements along the pad", ge=4)
-    elements_y: int = quantity(4, "1", "assumed", "elements through the pad", ge=1)
+    length: float = quantity(0.120, "m", "published", "L_x", ge=1e-4, le=100.0)
+    height: float = quantity(4.59e-3, "m", "published", "L_y", ge=1e-5, le=10.0)
+    depth: float = quantity(
+        0.044, "m", "assumed", "out-of-plane depth; a steel disc of the assumed mass", ge=1e-5, le=100.0
+    )
+    E: float = quantity(0.75e6, "Pa", "assumed", "Young's modulus; Shore A 20 silicone", ge=1.0, le=1e13)
+    nu: float = quantity(0.45, "1", "assumed", "Poisson's ratio", ge=-0.999, le=0.4999)
+    rho: float = quantity(1100.0, "kg/m3", "assumed", "density (inertial pads only)", ge=1e-3, le=1e6)
+    tau: float = quantity(10e-3, "s", "assumed", "Kelvin-Voigt time, R = tau K", ge=1e-9, le=1e6)
+    elements_x: int = quantity(120, "1", "assumed", "elements along the pad", ge=4, le=100_000)
+    elements_y: int = quantity(4, "1", "assumed", "elements through the pad", ge=1, le=1000)
     enclosed: bool = quantity(False, "1", "assumed", "bracket bonded to the upper pad's sides as well")
     fidelity: Literal["massless", "inertial"] = quantity(
         "massless", "1", "assumed", "statically condensed surface, or the full I, C, R fields"
     )
 
+    @property
+    def memory(self) -> float:
+        """What the stiffness of the mesh and its loads take [GiB]."""
+        surface = 2 * (self.elements_x + 1)
+        dense = (
+            6 * surface**2 * self.elements_y
+        )  # displacements of all nodes under loads on the surface, and their products
+        return 8 * dense / 2**30 if self.fidelity == "massless" else 8 * surface**2 * self.elements_y / 2**30
 
-class ContactParameters(Group):
+
+class ContactParameters(Table):
     """Penalty contact per surface node at the reference spacing; other spacings scale by tributary length."""
 
-    K_n: float = quantity(1.2e5, "N/m", "assumed", "normal spring, K_28 and K_64", gt=0)
-    R_n: float = quantity(441.7149, "N.s/m", "assumed", "normal dashpot, R_29 and R_65", ge=0)
-    K_t: float = quantity(1.2e5, "N/m", "assumed", "momentary tangential spring, K_23 and K_59", gt=0)
-    R_t: float = quantity(441.7149, "N.s/m", "assumed", "tangential dashpot, R_24 and R_60", ge=0)
-    mu_s: float = quantity(0.8, "1", "assumed", "static friction coefficient", ge=0)
-    mu_k: float = quantity(0.7, "1", "assumed", "kinetic friction coefficient", ge=0)
-    eta: float = quantity(10.0, "N.s/m", "assumed", "viscosity of the slip element; 0 is Coulomb's limit", ge=0)
-    v_s: float = quantity(5e-3, "m/s", "assumed", "slip speed over which mu falls from mu_s to mu_k", gt=0)
-    epsilon: float = quantity(1e-6, "m", "assumed", "touch-down depth of the ramp g / (g + epsilon)", gt=0)
-    node_spacing: float = quantity(1e-3, "m", "assumed", "spacing the per-node values refer to", gt=0)
+    K_n: float = quantity(1.2e5, "N/m", "assumed", "normal spring, K_28 and K_64", ge=1e-3, le=1e12)
+    R_n: float = quantity(441.7149, "N.s/m", "assumed", "normal dashpot, R_29 and R_65", ge=0, le=1e9)
+    K_t: float = quantity(1.2e5, "N/m", "assumed", "momentary tangential spring, K_23 and K_59", ge=1e-3, le=1e12)
+    R_t: float = quantity(441.7149, "N.s/m", "assumed", "tangential dashpot, R_24 and R_60", ge=0, le=1e9)
+    mu_s: float = quantity(0.8, "1", "assumed", "static friction coefficient", ge=0, le=100.0)
+    mu_k: float = quantity(0.7, "1", "assumed", "kinetic friction coefficient", ge=0, le=100.0)
+    eta: float = quantity(10.0, "N.s/m", "assumed", "viscosity of the slip element; 0 is Coulomb's limit", ge=0, le=1e9)
+    v_s: float = quantity(5e-3, "m/s", "assumed", "slip speed over which mu falls from mu_s to mu_k", ge=1e-9, le=1e3)
+    epsilon: float = quantity(1e-6, "m", "assumed", "touch-down depth of the ramp g / (g + epsilon)", ge=1e-12, le=1.0)
+    node_spacing: float = quantity(1e-3, "m", "assumed", "spacing the per-node values refer to", ge=1e-7, le=1.0)
     friction: Literal["smooth", "coulomb"] = quantity(
         "smooth", "1", "assumed", "slip element, or Eq. 12-13 with the force's modulus and re-anchoring"
     )
@@ -75,37 +93,45 @@ class ContactParameters(Group):
         return self
 
 
-class DiscParameters(Group):
-    radius: float = quantity(19.37e-3, "m", "published", "radius of the disc", gt=0)
-    mass: float = quantity(0.4065, "kg", "assumed", "441.7149 = 2 sqrt(1.2e5 m): critically damped loops", gt=0)
+class DiscParameters(Table):
+    radius: float = quantity(19.37e-3, "m", "published", "radius of the disc", ge=1e-4, le=10.0)
+    mass: float = quantity(
+        0.4065, "kg", "assumed", "441.7149 = 2 sqrt(1.2e5 m): critically damped loops", ge=1e-6, le=1e5
+    )
 
 
-class BracketParameters(Group):
-    mass: float = quantity(0.4065, "kg", "assumed", "441.7149 = 2 sqrt(1.2e5 m): critically damped loops", gt=0)
-    cm_height: float = quantity(2.18e-3, "m", "assumed", "centre of mass above the pad's bonded face")
+class BracketParameters(Table):
+    mass: float = quantity(
+        0.4065, "kg", "assumed", "441.7149 = 2 sqrt(1.2e5 m): critically damped loops", ge=1e-6, le=1e5
+    )
+    cm_height: float = quantity(
+        2.18e-3, "m", "assumed", "centre of mass above the pad's bonded face", ge=-10.0, le=10.0
+    )
 
 
-class ControlParameters(Group):
-    K_81: float = quantity(1.2e5, "N/m", "published", "horizontal loop, proportional gain, Eq. 34", ge=0)
-    R_80: float = quantity(441.7149, "N.s/m", "published", "horizontal loop, derivative gain, Eq. 34", ge=0)
-    K_98: float = quantity(1.2e5, "N/m", "published", "vertical loop, proportional gain, Eq. 32", ge=0)
-    R_99: float = quantity(441.7149, "N.s/m", "published", "vertical loop, derivative gain, Eq. 32", ge=0)
+class ControlParameters(Table):
+    K_81: float = quantity(1.2e5, "N/m", "published", "horizontal loop, proportional gain, Eq. 34", ge=0, le=1e12)
+    R_80: float = quantity(441.7149, "N.s/m", "published", "horizontal loop, derivative gain, Eq. 34", ge=0, le=1e12)
+    K_98: float = quantity(1.2e5, "N/m", "published", "vertical loop, proportional gain, Eq. 32", ge=0, le=1e12)
+    R_99: float = quantity(441.7149, "N.s/m", "published", "vertical loop, derivative gain, Eq. 32", ge=0, le=1e12)
     senses: Literal["disc", "bracket"] = quantity(
         "disc", "1", "published", "whose x the horizontal loop measures; the bracket's makes the loop collocated"
     )
 
 
-class ScenarioParameters(Group):
+class ScenarioParameters(Table):
     """Grasp, roll out, hold, roll back, rest."""
 
-    gravity: float = quantity(9.81, "m/s2", "assumed", "gravitational acceleration, acting on the disc (Eq. 17)", ge=0)
-    x_C0: float = quantity(60e-3, "m", "published", "x_C(0), Eq. 22")
-    y_Br_grasp: float = quantity(48.6e-3, "m", "published", "y_Br(t_g), Eq. 30", gt=0)
-    grasp_time: float = quantity(0.375, "s", "published", "t_g", gt=0)
-    travel: float = quantity(-20e-3, "m", "published", "displacement of the disc, Eq. 23")
-    roll_time: float = quantity(10.0, "s", "published", "time of the roll, each way", gt=0)
-    hold_time: float = quantity(5.0, "s", "published", "time at the far end", ge=0)
-    rest_time: float = quantity(5.0, "s", "published", "rest at the end", ge=0)
+    gravity: float = quantity(
+        9.81, "m/s2", "assumed", "gravitational acceleration, acting on the disc (Eq. 17)", ge=0, le=1e3
+    )
+    x_C0: float = quantity(60e-3, "m", "published", "x_C(0), Eq. 22", ge=-100.0, le=100.0)
+    y_Br_grasp: float = quantity(48.6e-3, "m", "published", "y_Br(t_g), Eq. 30", ge=1e-4, le=100.0)
+    grasp_time: float = quantity(0.375, "s", "published", "t_g", ge=1e-6, le=1e5)
+    travel: float = quantity(-20e-3, "m", "published", "displacement of the disc, Eq. 23", ge=-100.0, le=100.0)
+    roll_time: float = quantity(10.0, "s", "published", "time of the roll, each way", ge=1e-6, le=1e5)
+    hold_time: float = quantity(5.0, "s", "published", "time at the far end", ge=0, le=1e5)
+    rest_time: float = quantity(5.0, "s", "published", "rest at the end", ge=0, le=1e5)
 
     @property
     def duration(self) -> float:
@@ -113,12 +139,12 @@ class ScenarioParameters(Group):
         return 2.0 * self.roll_time + self.hold_time + self.rest_time
 
 
-class Parameters(Group):
+class Parameters(Table):
     """All numbers of one simulation.
 
-    Raises `ValueError` (pydantic's `ValidationError`, naming the field) for a value out of bounds, an unknown
-    name, a disc that does not fit between the pads, or a scenario that rolls off them. Warns where the friction
-    law is not single-valued at the full grasp.
+    Raises `InvalidTable`, a `ValueError` in one sentence that names the field, for a value out of bounds, an unknown name, a
+    disc that does not fit between the pads, a scenario that rolls off them, or a mesh that would not fit in memory. Warns where
+    the friction law is not single-valued at the full grasp.
     """
 
     pad: PadParameters = PadParameters()
@@ -136,24 +162,39 @@ class Parameters(Group):
 
     @model_validator(mode="after")
     def _geometry_is_possible(self) -> Self:
+        stack = (
+            f"scenario.y_Br_grasp = {self.scenario.y_Br_grasp} m, with bracket.cm_height = {self.bracket.cm_height} m, "
+            f"pad.height = {self.pad.height} m and disc.radius = {self.disc.radius} m,"
+        )
         if self.compression <= 0:
             raise ValueError(
-                f"the disc does not fit: at scenario.y_Br_grasp = {self.scenario.y_Br_grasp} m the pads are "
-                f"{-self.compression:.3g} m apart from a disc of radius {self.disc.radius} m; lower the bracket"
+                f"the disc does not fit: {stack} leaves the pads {-self.compression:.3g} m apart from the disc; lower the "
+                "bracket"
             )
         if self.compression >= self.pad.height:
             raise ValueError(
-                f"the disc does not fit: scenario.y_Br_grasp = {self.scenario.y_Br_grasp} m asks the two pads to give "
-                f"way by {self.compression:.3g} m, but linear elasticity ends well below half of 2 x "
-                f"{self.pad.height} m; raise the bracket or take a smaller disc.radius"
+                f"the disc does not fit: {stack} asks the two pads to give way by {self.compression:.3g} m, but linear "
+                "elasticity ends well below half of both heights; raise the bracket or take a smaller disc"
             )
         half_width = math.sqrt(self.disc.radius * self.compression)
         ends = sorted((self.scenario.x_C0, self.scenario.x_C0 + self.scenario.travel))
         if ends[0] - half_width < 0 or ends[1] + half_width > self.pad.length:
             raise ValueError(
-                f"the trajectory leaves the pad: scenario.x_C0 and scenario.travel take the disc from {ends[0]} to "
-                f"{ends[1]} m, its contact is {half_width:.3g} m wide to each side, and the pad reaches from 0 to "
-                f"pad.length = {self.pad.length} m"
+                f"the trajectory leaves the pad: scenario.x_C0 = {self.scenario.x_C0} m and scenario.travel = "
+                f"{self.scenario.travel} m take the disc from {ends[0]:.6g} to {ends[1]:.6g} m, its contact is "
+                f"{half_width:.3g} m wide to each side (disc.radius = {self.disc.radius} m, scenario.y_Br_grasp = "
+                f"{self.scenario.y_Br_grasp} m, bracket.cm_height = {self.bracket.cm_height} m, pad.height = "
+                f"{self.pad.height} m), and the pad reaches from 0 to pad.length = {self.pad.length} m"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _mesh_fits_in_memory(self) -> Self:
+        pad = self.pad
+        if (need := pad.memory) > MEMORY:
+            raise ValueError(
+                f"the mesh is too fine: the stiffness of pad.elements_x = {pad.elements_x} by pad.elements_y = "
+                f"{pad.elements_y} elements takes about {need:.3g} GiB of memory, but {MEMORY:g} GiB are the most; take fewer"
             )
         return self
 
@@ -173,9 +214,9 @@ class Parameters(Group):
         """A validated copy with `values` replaced, keyed by dotted names such as `"pad.E"`."""
         tree = self.model_dump()
         for name, value in values.items():
-            group, _, field = name.partition(".")
+            group, _, field = str(name).partition(".")
             if group not in tree or field not in tree[group]:
-                raise ValueError(f"`{name}` is not a parameter; known names: {', '.join(self.table())}")
+                raise ValueError(f"`{line(name, 80)}` is not a parameter; known names: {', '.join(self.table())}")
             tree[group][field] = value
         return Parameters.model_validate(tree)
 
@@ -187,10 +228,7 @@ class Parameters(Group):
     @classmethod
     def from_toml(cls, path: str | Path) -> "Parameters":
         """Read a TOML file with a table per group. Raises `ValueError` naming the file and the field."""
-        try:
-            return cls.model_validate(tomllib.loads(Path(path).read_text()))
-        except (ValidationError, tomllib.TOMLDecodeError) as error:
-            raise ValueError(f"{path}: {error}") from error
+        return from_toml(path, cls.model_validate)
 
     def table(self) -> dict[str, dict[str, Any]]:
         """Every parameter by its dotted name: value, unit, source (`published` or `assumed`) and meaning."""
@@ -208,3 +246,37 @@ class Parameters(Group):
                     "meaning": field.description,
                 }
         return rows
+
+
+class Bounds(NamedTuple):
+    """The least and the largest value that a parameter may have."""
+
+    low: float
+    high: float
+
+
+@cache
+def _field(name: str) -> Any:
+    """The declaration of a parameter by its dotted name. Raises `KeyError` for an unknown name."""
+    group, _, field = name.partition(".")
+    return type(Parameters.model_fields[group].default).model_fields[field]
+
+
+@cache
+def _adapter(name: str) -> TypeAdapter[Any]:
+    field, config = _field(name), ConfigDict(strict=True, allow_inf_nan=False)
+    kind: Any = Annotated[field.annotation, *field.metadata, field]
+    return TypeAdapter(kind, config=config)
+
+
+def bounds(name: str) -> Bounds:
+    """Of a parameter by its dotted name, whatever the others are. Raises `KeyError` for an unknown name."""
+    stated: dict[type, Any] = {type(one): one for one in _field(name).metadata}
+    low, high = stated.get(Ge), stated.get(Le)
+    return Bounds(-math.inf if low is None else low.ge, math.inf if high is None else high.le)
+
+
+def check(name: str, value: Any, where: str) -> None:
+    """Raises `InvalidTable` naming `where` for a value that the parameter may not have, whatever the others are."""
+    with refusing(within=where):
+        _adapter(name).validate_python(value)

@@ -42,7 +42,7 @@ def table(recording: Recording) -> dict[str, tuple[str, np.ndarray]]:
 def write(recording: Recording, path: Path, digits: int = 7) -> None:
     """A CSV file with the units of `UNITS` in the heading."""
     columns = table(recording)
-    with path.open("w", newline="") as file:
+    with path.open("w", newline="", encoding="utf-8") as file:
         out = csv.writer(file, lineterminator="\n")
         out.writerow(["t [s]", *(f"{name} [{UNITS[unit][0]}]" for name, (unit, _) in columns.items())])
         for i, t in enumerate(recording.times):

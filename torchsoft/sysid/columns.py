@@ -13,8 +13,10 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from torchsoft.channels import CHANNELS, FEED_FORWARD, MEASURED, SETPOINTS
+from torchsoft.channels import CHANNELS, FEED_FORWARD, MEASURED, SETPOINTS, VARIABLES
+from torchsoft.solve.trajectory import load
 from torchsoft.sysid.recording import Array
+from torchsoft.tables import line, shown
 
 COLUMNS = ("t", *SETPOINTS, *FEED_FORWARD, *MEASURED)
 """Names that a column may have."""
@@ -31,6 +33,9 @@ UNITS = {
 
 ROWS = 10
 """A recording has at least as many rows."""
+
+LATE = 1e6
+"""Largest time [s]: later ones lose their last digits."""
 
 GAP = 0.1
 """Longest time [s] between rows: set-points are interpolated between them."""
@@ -68,7 +73,7 @@ def heading(path: Path, cells: Sequence[str]) -> list[tuple[str, float]]:
     for cell in cells:
         match = re.fullmatch(r"\s*([^\[\]]*?)\s*(?:\[\s*([^\[\]]*?)\s*\])?\s*", cell)
         name, unit = (match[1], match[2]) if match else (cell.strip(), None)
-        where = f"{path}, row 1, column `{name}`"
+        where = f"{path}, row 1, column `{line(name, 80)}`"
         if name not in COLUMNS:
             hint = "; separate columns with commas" if len(cells) == 1 else ""
             raise ValueError(
@@ -78,7 +83,7 @@ def heading(path: Path, cells: Sequence[str]) -> list[tuple[str, float]]:
         if unit is None:
             raise ValueError(f"{where} has no unit: write `{name} [{next(iter(known))}]`")
         if unit not in known:
-            raise ValueError(f"{where} cannot be in {unit!r}; it can be in {', '.join(known)}")
+            raise ValueError(f"{where} cannot be in {shown(unit)}; it can be in {', '.join(known)}")
         if name in (other for other, _ in out):
             raise ValueError(f"{where} is there twice")
         out.append((name, known[unit]))
@@ -102,7 +107,7 @@ def read_csv(path: Path) -> Columns:
                 rows.append(row)
                 values.append([number(path, row, name, cell) * unit for (name, unit), cell in zip(head, cells)])
     except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path} is not a CSV file in UTF-8: {error}") from None
+        raise ValueError(f"{path} is not a CSV file in UTF-8: {line(error)}") from None
     columns = np.array(values).reshape(len(rows), len(head)).T
     return check_table(Columns(path, {name: column for (name, _), column in zip(head, columns)}, rows))
 
@@ -112,36 +117,43 @@ def number(path: Path, row: int, column: str, cell: str) -> float:
     if not (text := cell.strip()):
         return math.nan
     try:
-        value = math.nan if "_" in text else float(text)
+        value = float(text) if text.isascii() and "_" not in text else math.nan
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
         raise ValueError(
-            f"{path}, row {row}, column `{column}`: {text!r} is not a finite number; leave the cell empty where a sample is "
-            "missing"
+            f"{path}, row {row}, column `{column}`: {shown(text)} is not a finite number; leave the cell empty "
+            "where a sample is missing"
         )
     return value
 
 
 def read_trajectory(path: Path) -> Columns:
     """The table in a file of `Trajectory.save`; rows are called samples, counted from 0. Raises `ValueError`."""
-    try:
-        with xr.open_dataset(path, engine="h5netcdf") as data:
-            columns = {name: CHANNELS[name] for name in COLUMNS}
-            if CHANNELS["y_d_dot"].variable not in data:  # as in files of the first edition
-                del columns["y_d_dot"]
-            if missing := [v for v in dict.fromkeys(c.variable for c in columns.values()) if v not in data]:
-                raise ValueError(f"{path} is not a trajectory file: it has no {', '.join(missing)}")
-            values = {name: np.array(c.of(data[c.variable]), float) for name, c in columns.items()}
-    except OSError as error:
-        if isinstance(error, FileNotFoundError):
-            raise
-        raise ValueError(f"{path} is not a NetCDF file: {error}") from None
+    data = load(path)
+    values = read_columns(data, path)
     table = Columns(path, values, list(range(len(values["t"]))), "sample")
     for name, column in values.items():
         if (bad := np.flatnonzero(~np.isfinite(column))).size:
             raise ValueError(f"{table.at(bad[0])}, `{name}` is not a finite number")
     return check_table(table)
+
+
+def read_columns(data: xr.Dataset, path: Path) -> dict[str, Array]:
+    """The columns of a trajectory. Raises `ValueError` where it has not what a trajectory has."""
+    columns = {name: CHANNELS[name] for name in COLUMNS}
+    if CHANNELS["y_d_dot"].variable not in data:  # as in files of the first edition
+        del columns["y_d_dot"]
+    variables = {c.variable: VARIABLES[c.variable] for c in columns.values()}
+    if missing := [name for name in variables if name not in data]:
+        raise ValueError(f"{path} is not a trajectory file: it has no {', '.join(missing)}")
+    for name, variable in variables.items():
+        one, axes = data[name], ("time", "axis")[: 1 if len(variable.symbols) == 1 else 2]
+        if one.dims != axes or one.dtype != np.float64 or ("axis" in axes and one.sizes["axis"] != 2):
+            raise ValueError(f"{path} is not a trajectory file: `{name}` should be float64 over {' and '.join(axes)}")
+        if one.attrs.get("units") != variable.unit:
+            raise ValueError(f"{path}, `{name}` should be in {variable.unit}, not {shown(one.attrs.get('units'))}")
+    return {name: np.array(c.of(data[c.variable].values), float) for name, c in columns.items()}
 
 
 def check_table(table: Columns) -> Columns:
@@ -167,4 +179,8 @@ def check_table(table: Columns) -> Columns:
         else:
             what = f"{t - before:.3g} s are missing before it; set-points are needed every {GAP} s or oftener"
         raise ValueError(f"{table.at(i + 1)}, column `t`: {what}")
+    if (late := np.flatnonzero(np.abs(values["t"]) > LATE)).size:
+        raise ValueError(
+            f"{table.at(late[0])}, column `t`: {values['t'][late[0]]:.9g} s is too far from zero; count times from the start"
+        )
     return table

@@ -3,18 +3,17 @@
 Every error is a `ValueError` in a sentence that names the file, and the row and column or the field.
 """
 
-import tomllib
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, ValidationError, model_validator
+import torch
+from pydantic import Field, TypeAdapter, model_validator
 
 from torchsoft.channels import CHANNELS, MEASURED, SETPOINTS
-from torchsoft.excitation import Table
-from torchsoft.files import findings
 from torchsoft.parameters import Parameters
 from torchsoft.physics.motion import Reference, Sampled
 from torchsoft.physics.paper import apart
@@ -24,6 +23,7 @@ from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.solve import Method
 from torchsoft.sysid.unknowns import Sensor, Unknown
+from torchsoft.tables import LISTED, SEED, InvalidTable, Table, from_toml, line, refusing
 
 BEGINNING, CREEP = 10e-3, 20e-3
 """For so long [s] nothing may move faster than this [m/s]: a disc put down on a pad still settles."""
@@ -38,20 +38,20 @@ SUNK = 3e-4
 class Settings(Table):
     """How to fit: the arguments of `identify` by the same names."""
 
-    step: float = Field(5e-4, gt=0, le=0.02)
-    starts: int = Field(1, ge=1)
+    step: float = Field(5e-4, ge=1e-7, le=0.02)
+    starts: int = Field(1, ge=1, le=2**20)
     loss: Loss = "linear"
     method: Method = "gauss_newton"
-    workers: int = Field(1, ge=1)
-    seed: int = Field(0, ge=0)
+    workers: int = Field(1, ge=1, le=1000)
+    seed: int = Field(0, ge=0, le=SEED)
 
 
 class Entry(Table):
     """One more recording (`file`, next to the configuration, called `name` or like the file), or, without a file, settings
     of its own for the recording called `name`."""
 
-    name: str | None = None
-    file: str | None = None
+    name: str | None = Field(None, min_length=1, max_length=100)
+    file: str | None = Field(None, min_length=1, max_length=1000)
     settings: dict[str, Any] = Field(default_factory=dict)
 
     @model_validator(mode="after")
@@ -72,8 +72,8 @@ class Config(Table):
     sensors: dict[str, Sensor]
     settings: dict[str, Any] = Field(default_factory=dict)
     fit: Settings = Field(default_factory=lambda: Settings.model_validate({}))
-    recordings: tuple[Entry, ...] = ()
-    heldout: tuple[str, ...] = ()
+    recordings: Annotated[tuple[Entry, ...], LISTED] = ()
+    heldout: Annotated[tuple[str, ...], LISTED] = ()
 
 
 @dataclass(frozen=True)
@@ -86,13 +86,8 @@ class Case:
 
 
 def read_config(path: str | Path) -> Config:
-    """Raises `ValueError` naming the file and the field."""
-    try:
-        return Config.model_validate(tomllib.loads(Path(path).read_text(encoding="utf-8")))
-    except ValidationError as error:
-        raise ValueError(f"{path}: {findings(error)}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not a TOML file: {error}") from None
+    """Raises `ValueError` naming the file and the field, `OSError` for a file that cannot be read."""
+    return from_toml(path, Config.model_validate)
 
 
 def known_parameters(config: Path, name: str, table: Columns, *settings: dict[str, Any]) -> Parameters:
@@ -107,35 +102,33 @@ def known_parameters(config: Path, name: str, table: Columns, *settings: dict[st
             new = {field: value} if field else value
             old = tree.get(group, {})
             tree[group] = old | new if isinstance(old, dict) and isinstance(new, dict) else new
+    whose = f"{config}, settings of `{name}`"
+    groups: dict[str, Any] = {}
+    for group, declared in Parameters.model_fields.items():
+        kind: Any = declared.annotation
+        with refusing(tree.get(group), f"{whose}: {group}"):
+            groups[group] = TypeAdapter(kind).validate_python(tree.get(group, {}))
+    x, y = table.values["x_d"], table.values["y_d"]
+    if y.min() >= (touch := apart(Parameters.model_construct(**groups))):
+        raise ValueError(
+            f"{table.at(int(y.argmin()))}, column `y_d`: the bracket never comes lower than {1e3 * y.min():.4g} mm, but "
+            f"the pads of {config} touch the disc at {1e3 * touch:.4g} mm ({STACK}): nothing is grasped"
+        )
+    signed = x - (groups["scenario"].x_C0 if "x_C0" in tree.get("scenario", {}) else x[0])
+    part = 0.5 if groups["control"].senses == "bracket" else 1.0  # a disc rolls half as far as the bracket
+    lowest, farthest = int(y.argmin()), int(np.abs(signed).argmax())
+    mine = {"y_Br_grasp": float(y[lowest]), "travel": part * float(signed[farthest])}
     try:
-        groups: dict[str, Any] = {}
-        for group, kind in Parameters.model_fields.items():
-            assert kind.annotation is not None
-            groups[group] = validated(kind.annotation, tree.get(group, {}), group)
-        x, y = table.values["x_d"], table.values["y_d"]
-        if y.min() >= (touch := apart(Parameters.model_construct(**groups))):
-            raise ValueError(
-                f"{table.at(int(y.argmin()))}, column `y_d`: the bracket never comes lower than {1e3 * y.min():.4g} mm, but "
-                f"the pads of {config} touch the disc at {1e3 * touch:.4g} mm: nothing is grasped"
-            )
-        moved = x - (groups["scenario"].x_C0 if "x_C0" in tree.get("scenario", {}) else x[0])
-        part = 0.5 if groups["control"].senses == "bracket" else 1.0  # a disc rolls half as far as the bracket
-        mine = {"y_Br_grasp": float(y.min()), "travel": part * float(moved[np.abs(moved).argmax()])}
-        return validated(Parameters, tree | {"scenario": mine | tree.get("scenario", {})})
-    except InvalidSettings as error:
-        raise ValueError(f"{config}, settings of `{name}`: {error}") from None
+        return Parameters.model_validate(tree | {"scenario": mine | tree.get("scenario", {})})
+    except InvalidTable as error:
+        raise ValueError(
+            f"{whose}: {error} (scenario.y_Br_grasp and scenario.travel, unless given, are those of {table.at(lowest)}, column "
+            f"`y_d`, and of {table.row} {table.rows[farthest]}, column `x_d`)"
+        ) from None
 
 
-class InvalidSettings(ValueError):
-    """Settings that a group of parameters does not take."""
-
-
-def validated(kind: Any, tree: Any, group: str = "") -> Any:
-    """A group of parameters. Raises `InvalidSettings` naming the field."""
-    try:
-        return kind.model_validate(tree)
-    except ValidationError as error:
-        raise InvalidSettings(findings(error, group)) from None
+STACK = "twice pad.height and disc.radius, and bracket.cm_height"
+"""What decides where the pads touch."""
 
 
 def check_plausible(table: Columns, p: Parameters, sensors: dict[str, Sensor]) -> None:
@@ -149,10 +142,11 @@ def check_plausible(table: Columns, p: Parameters, sensors: dict[str, Sensor]) -
         if name == "t":
             continue
         low, high = ranges.get(unit, (-L, 2 * L) if name.startswith("x") else (0.25 * H, 2 * H))
+        by = "" if unit in ranges else " (pad.length)" if name.startswith("x") else f" ({STACK})"
         for i in np.flatnonzero((column < low) | (column > high))[:1].tolist():
             raise ValueError(
                 f"{table.at(i)}, column `{name}`: {column[i]:.4g} {unit} is not plausible, it should be between {low:.3g} "
-                f"and {high:.3g} {unit}; is the unit in the heading right?"
+                f"and {high:.3g} {unit}{by}; is the unit in the heading right?"
             )
         here = np.flatnonzero(np.isfinite(column))
         if not here.size or name in ("F_x", "F_y", "F_ff"):
@@ -179,7 +173,7 @@ def check_plausible(table: Columns, p: Parameters, sensors: dict[str, Sensor]) -
     if (y := table.values["y_d"][0]) < H - SUNK:
         raise ValueError(
             f"{table.at(0)}, column `y_d`: the bracket must begin clear of the disc, but begins at {1e3 * y:.4g} mm, and the "
-            f"pads touch the disc at {1e3 * H:.4g} mm"
+            f"pads touch the disc at {1e3 * H:.4g} mm ({STACK})"
         )
 
 
@@ -199,26 +193,34 @@ def recording(table: Columns, name: str, p: Parameters, sensors: dict[str, Senso
             raise ValueError(f"{table.path}, column `{channel}` has {here.sum()} samples, but needs at least two")
     if not set(samples) & set(sensors):
         raise ValueError(f"{table.path} has no column for any of the sensors {', '.join(sensors)}")
-    columns = {k: column.tolist() for k, column in values.items()}
+    columns = {k: torch.tensor(column) for k, column in values.items()}
     x, y = (Sampled(columns["t"], columns[k], columns.get(f"{k}_dot")) for k in SETPOINTS)
-    F = Sampled(columns["t"], columns.get("F_ff", [0.0] * len(t)))
+    F = Sampled(columns["t"], columns.get("F_ff", torch.zeros(len(t), dtype=torch.float64)))
     return Recording(name, p, Reference(x_d=x, y_d=y, F_ff=F), samples)
+
+
+def stem(path: Path) -> str:
+    """The name of a file without its ending, in UTF-8 even where the system knows ASCII only."""
+    return os.fsencode(path.stem).decode("utf-8", "replace")
 
 
 def load(data: Sequence[str | Path], config: str | Path) -> Case:
     """The problem that data files and a configuration state. Raises `ValueError`, and `OSError` for what cannot be read."""
     config = Path(config)
     stated, tables, recordings = read_config(config), {}, []
-    own = {e.name or Path(str(e.file)).stem: e for e in stated.recordings}
-    files = [(Path(f).stem, Path(f)) for f in data]
+    own = {e.name or stem(Path(str(e.file))): e for e in stated.recordings}
+    files = [(stem(Path(f)), Path(f)) for f in data]
     files += [(name, config.parent / e.file) for name, e in own.items() if e.file is not None]
     names = [name for name, _ in files]
     if not files:
         raise ValueError(f"there is nothing to identify from: no data file, and no recording with a file in {config}")
     if len(own) < len(stated.recordings) or len(set(names)) < len(names):
-        raise ValueError(f"recordings need names of their own, but are called {', '.join(names)}")
+        raise ValueError(f"{config}: recordings need names of their own, but are called {line(', '.join(names))}")
     if strange := [name for name in (*own, *stated.heldout) if name not in names]:
-        raise ValueError(f"{config}: there is no recording `{strange[0]}`; there are {', '.join(names)}")
+        where = "heldout" if strange[0] in stated.heldout else "recordings"
+        raise ValueError(
+            f"{config}, {where}: there is no recording `{line(strange[0], 80)}`; the recordings' names are {', '.join(names)}"
+        )
     for name, path in files:
         table = tables[name] = read_table(path)
         p = known_parameters(config, name, table, stated.settings, own[name].settings if name in own else {})
@@ -227,6 +229,8 @@ def load(data: Sequence[str | Path], config: str | Path) -> Case:
         problem = Problem(recordings, stated.sensors, stated.unknowns)
     except ValueError as error:
         raise ValueError(f"{config}: {error}") from None
+    if stated.heldout and set(stated.heldout) == set(names):
+        raise ValueError(f"{config}, heldout: it names every recording, so that nothing is left to fit")
     return Case(problem, stated, tables)
 
 

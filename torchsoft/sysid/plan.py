@@ -25,6 +25,9 @@ identifiable would run off to make up for what is still wrong elsewhere."""
 COARSE = (4.0, 2.0)
 """The first look and the second stage take steps this many times the full one."""
 
+FIRST, ALL, LAST = 8, 15, 40
+"""Evaluations that the first look, the second stage and the last one may take."""
+
 SCANNED = (1.0, 0.85, 0.7, 0.55)
 """Parts of its upper bound at which a ratio is tried before it is set free."""
 
@@ -86,13 +89,20 @@ def default_plan(problem: Problem, runner: Runner, step: float, which: Sequence[
     first = visible(look.J, free & ~ratios)
     plan = [
         Stage(
-            f"{order[0]}: first look", (order[0],), tuple(labels[first]), COARSE[0] * step, 8, 1e-2, ties, starts=starts
+            f"{order[0]}: first look",
+            (order[0],),
+            tuple(labels[first]),
+            COARSE[0] * step,
+            FIRST,
+            1e-2,
+            ties,
+            starts=starts,
         )
     ]
     if len(order) > 1 or ratios.any():
         plan.append(
-            Stage("all data, ratios tied", tuple(order), tuple(labels[free & ~ratios]), COARSE[1] * step, 15, 1e-2)
+            Stage("all data, ratios tied", tuple(order), tuple(labels[free & ~ratios]), COARSE[1] * step, ALL, 1e-2)
         )
     scans = tuple((c.all[i].label, tuple(part * c.all[i].high for part in SCANNED)) for i in np.flatnonzero(ratios))
-    plan.append(Stage("everything", tuple(order), tuple(labels[free]), step, 40, 1e-5, scanned=scans))
+    plan.append(Stage("everything", tuple(order), tuple(labels[free]), step, LAST, 1e-5, scanned=scans))
     return plan

@@ -1,5 +1,6 @@
 """The least-squares problem: recordings, sensors and unknowns; residuals in units of the sensors' noise."""
 
+import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -7,10 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchsoft.channels import MEASURED
-from torchsoft.sysid.prediction import Prediction, read
+from torchsoft.parameters import ORDERED
+from torchsoft.physics.paper import NAMES
+from torchsoft.sysid.prediction import FailedRun, Prediction, read
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.unknowns import Coordinates, Sensor, Unknown
-from torchsoft.sysid.workers import FailedRun, Job, Runner
+from torchsoft.sysid.workers import Job, Runner
+from torchsoft.tables import line
 
 
 class Residuals(NamedTuple):
@@ -20,6 +24,21 @@ class Residuals(NamedTuple):
     r: Array
     J: Array
     lost: dict[str, FailedRun]
+
+
+def check_ends(coordinates: Coordinates, recordings: Sequence[Recording]) -> None:
+    """Raises `ValueError` where the bounds of an unknown leave no rig: a disc that does not fit between the pads, say."""
+    for c in coordinates.all:
+        if c.kind != "parameter" or c.ratio_to or c.name not in NAMES or c.name in ORDERED:
+            continue
+        for recording in recordings:
+            for field, value in (("low", c.low), ("high", c.high)):
+                try:
+                    with warnings.catch_warnings():
+                        warnings.simplefilter("ignore")  # of a steep friction law, which a search may pass through
+                        recording.settings.override({c.name: value})
+                except ValueError as error:
+                    raise ValueError(f"unknowns.{c.name}.{field} = {value:g} is impossible: {error}") from None
 
 
 class Problem:
@@ -39,14 +58,15 @@ class Problem:
             raise ValueError("there is nothing to identify: no unknown is free")
         for channel in sensors:
             if channel not in MEASURED:
-                raise ValueError(f"`{channel}` is not a channel; known: {', '.join(MEASURED)}")
+                raise ValueError(f"sensors: `{line(channel, 80)}` is not a channel; known: {', '.join(MEASURED)}")
             if not any(channel in recording.samples for recording in recordings):
-                raise ValueError(f"no recording has samples of `{channel}`")
+                raise ValueError(f"sensors: no recording has samples of `{channel}`")
         for recording in recordings:
             if not set(sensors) & set(recording.samples):
                 raise ValueError(f"recording `{recording.name}` has samples of none of the sensors {list(sensors)}")
         self.recordings, self.sensors, self.unknowns = tuple(recordings), sensors, unknowns
         self.coordinates = Coordinates(unknowns, sensors, names, recordings[0].parameters)
+        check_ends(self.coordinates, recordings)
         self.interpolated = any(sensor.delay > 0 for sensor in sensors.values())
 
     @property
@@ -143,11 +163,10 @@ class Problem:
             if isinstance(got, FailedRun):
                 lost[name] = got
                 continue
-            loss, parts, _ = got
             rows = [c.names.index(n) for n in job.names]
-            total, gradient = total + loss, gradient + parts["parameters"] @ c.jacobian(x, name, job.values)[rows]
+            total, gradient = total + got.loss, gradient + got.parameters @ c.jacobian(x, name, job.values)[rows]
             for kind in ("bias", "delay"):
-                for channel, slope in zip(self.sensors, parts[kind]):
+                for channel, slope in zip(self.sensors, getattr(got, kind)):
                     _, at = c.nuisance(x, channel, kind)
                     if at >= 0:
                         gradient[at] += slope * c.all[at].slope(x[at])

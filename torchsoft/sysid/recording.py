@@ -33,6 +33,13 @@ SETTLE = 0.2
 SPACINGS = 4
 """A recording whose samples are spaced in more ways than this is simulated on a regular grid and interpolated."""
 
+DENSE, FINER = 16.0, 4.0
+"""A recording with more samples than this in a step, whose own times would all be steps, is simulated on a regular grid this
+much finer than the step instead."""
+
+REACH = 0.1
+"""Largest delay [s] of a sensor: for so long before the first sample and after the last one runs are known."""
+
 SAME = 1e-9
 """Times [s] closer than this are one time."""
 
@@ -160,13 +167,20 @@ class Recording:
         """A model with the settings and the reference, and where it starts."""
         return lying(self.build(self.settings, self.reference))
 
+    def spacing(self, step: float, interpolated: bool) -> float | None:
+        """Of the regular grid [s] that is simulated where samples are irregular, much denser than the step, or needed between
+        (`interpolated`); None where it is the samples' own times."""
+        apart = np.diff(self.times)
+        irregular = len(np.unique(np.round(apart / SAME).astype(np.int64))) > SPACINGS
+        if DENSE * float(apart.mean()) < step:
+            return step / FINER
+        return step if interpolated or irregular else None
+
     def grid(self, step: float, interpolated: bool) -> Tensor:
-        """Times (G,) [s] to simulate: `SETTLE` before the first sample, then the samples' own times, or, where they are
-        irregular or needed between (`interpolated`), every `step` [s] from a little before the first to after the last."""
-        t = self.times
-        if not interpolated and len(np.unique(np.round(np.diff(t) / SAME).astype(np.int64))) <= SPACINGS:
-            return torch.from_numpy(np.concatenate(([t[0] - SETTLE], t)))
-        around = np.arange(t[0] - 10 * step, t[-1] + 11 * step, step)
+        """Times (G,) [s] to simulate: `SETTLE` before the first sample, then the samples' own, or every `spacing` from `REACH`
+        before the first to `REACH` after the last."""
+        t, spacing = self.times, self.spacing(step, interpolated)
+        around = t if spacing is None else np.arange(t[0] - REACH, t[-1] + REACH + spacing, spacing)
         return torch.from_numpy(np.concatenate(([t[0] - SETTLE], around)))
 
 

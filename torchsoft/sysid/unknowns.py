@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from torchsoft.excitation import Table
-from torchsoft.sysid.recording import Array
+from torchsoft.parameters import ORDERED, bounds
+from torchsoft.sysid.recording import REACH, Array
+from torchsoft.tables import Table, line, shown
 
 SPREAD = 10.0
 """Bounds of a logarithmic parameter that gives none: its nominal value divided and multiplied by this."""
@@ -23,7 +24,8 @@ class Unknown(Table):
     """One parameter to be identified, by its dotted name in `Parameters`, or in the model where it is of a user's law.
 
     `nominal` is where the search starts, by default the value of the recordings' own settings; with `ratio_to` the value,
-    nominal and bounds are those of the ratio to that other parameter. A parameter that is not `shared` has a value of its own
+    nominal and bounds are those of the ratio to that other parameter. Bounds end where the parameter's own do
+    (`torchsoft.parameters.bounds`): wider ones are errors. A parameter that is not `shared` has a value of its own
     in every recording.
     """
 
@@ -52,9 +54,9 @@ class Sensor(Table):
     """A measured channel: standard deviation of its noise [the channel's unit], and how large a constant `bias` [unit] and a
     `delay` [s] may be; zero leaves them out, otherwise they are identified too."""
 
-    noise: float = Field(gt=0)
-    bias: float = Field(default=0.0, ge=0)
-    delay: float = Field(default=0.0, ge=0)
+    noise: float = Field(ge=1e-15, le=1e6)
+    bias: float = Field(default=0.0, ge=0, le=1e6)
+    delay: float = Field(default=0.0, ge=0, le=REACH)
 
 
 class Coordinate(NamedTuple):
@@ -88,6 +90,28 @@ class Coordinate(NamedTuple):
         return math.exp(x) if self.scale == "log" else self.high - self.low
 
 
+def limits(name: str, unknowns: Mapping[str, Unknown], given: Mapping[str, float]) -> tuple[float, float]:
+    """The least and the largest value that an unknown may have whatever the others are, or that its ratio may.
+
+    The parameters declare them; those of a user's own law have the limits that its modules check when they run.
+    """
+    ratio_to = unknowns[name].ratio_to
+    if ratio_to is not None:
+        return (0.0, 1.0) if (name, ratio_to) == ORDERED else (-math.inf, math.inf)
+    try:
+        least, most = bounds(name)
+    except KeyError:
+        return -math.inf, math.inf
+    lower, upper = ORDERED
+    known = {**given, **{other: u.nominal for other, u in unknowns.items() if u.fixed and u.nominal is not None}}
+    free = {other for other, u in unknowns.items() if not u.fixed}
+    if name == lower and upper in known and upper not in free:
+        most = min(most, known[upper])
+    if name == upper and lower in known and lower not in free:
+        least = max(least, known[lower])
+    return least, most
+
+
 class Coordinates:
     """All coordinates of a problem, in a fixed order, and the way from their vector x (n,) to parameters of the model.
 
@@ -102,29 +126,52 @@ class Coordinates:
         self.recordings, self.all = tuple(recordings), []
         for name, u in unknowns.items():
             if name not in given:
-                raise ValueError(f"`{name}` cannot be identified; what can: {', '.join(given)}")
+                raise ValueError(f"unknowns: `{line(name, 80)}` cannot be identified; what can: {', '.join(given)}")
             if u.ratio_to is not None and (u.ratio_to not in given or u.ratio_to == name):
-                raise ValueError(f"{name}.ratio_to = {u.ratio_to!r} is not another parameter of the model")
+                raise ValueError(
+                    f"unknowns.{name}.ratio_to = {shown(u.ratio_to)} is not another parameter of the model"
+                )
             if u.ratio_to in unknowns and unknowns[u.ratio_to].ratio_to:
-                raise ValueError(f"{name}.ratio_to = {u.ratio_to!r} is a ratio itself")
+                raise ValueError(f"unknowns.{name}.ratio_to = {shown(u.ratio_to)} is a ratio itself")
             own = given[name] / (given[u.ratio_to] if u.ratio_to else 1.0)
             nominal = own if u.nominal is None else u.nominal
             if u.scale == "log" and nominal <= 0:
                 raise ValueError(
-                    f"{name} = {nominal:g} is not on a logarithmic scale: give a positive `nominal`, or scale = 'linear'"
+                    f"unknowns.{name} = {nominal:g} is not on a logarithmic scale: give a positive `nominal`, or "
+                    "scale = 'linear'"
                 )
-            low = nominal / SPREAD if u.low is None else u.low
-            high = nominal * SPREAD if u.high is None else u.high
-            if not low <= nominal <= high:
-                raise ValueError(f"{name}.nominal = {nominal:g} is not between low = {low:g} and high = {high:g}")
+            least, most = limits(name, unknowns, given)
+            for field in ("low", "high", "nominal"):
+                value = getattr(u, field)
+                if value is not None and not least <= value <= most:
+                    what = f"{name} / {u.ratio_to}" if u.ratio_to else name
+                    raise ValueError(
+                        f"unknowns.{name}.{field} = {value:g} is beyond what {what} may be, from {least:g} to {most:g}"
+                    )
+            low = max(nominal / SPREAD, least) if u.low is None else u.low
+            high = min(nominal * SPREAD, most) if u.high is None else u.high
+            if not low <= nominal <= high or low == high:
+                raise ValueError(
+                    f"unknowns.{name}.nominal = {nominal:g} is not between low = {low:g} and high = {high:g}"
+                )
             for where in (None,) if u.shared else self.recordings:
                 self.all.append(Coordinate(name, "parameter", where, nominal, low, high, u.scale, u.ratio_to, u.fixed))
+        self._check_order()
         for channel, sensor in sensors.items():
-            limits: dict[Literal["bias", "delay"], float] = {"bias": sensor.bias, "delay": sensor.delay}
-            for kind, most in limits.items():
+            largest: dict[Literal["bias", "delay"], float] = {"bias": sensor.bias, "delay": sensor.delay}
+            for kind, most in largest.items():
                 if most > 0:
                     self.all.append(Coordinate(channel, kind, None, 0.0, -most, most, "linear", None, False))
         self.names = tuple(dict.fromkeys(c.name for c in self.all if c.kind == "parameter"))
+
+    def _check_order(self) -> None:
+        """Raises `ValueError` where a search could take the first of `ORDERED` above the second."""
+        lower, upper = ({c.name: c for c in self.all if not c.fixed}.get(name) for name in ORDERED)
+        if lower and upper and not lower.ratio_to and lower.high > upper.low:
+            raise ValueError(
+                f"unknowns.{lower.name} must not exceed {upper.name}, but may be up to {lower.high:g} and the other down to "
+                f"{upper.low:g}: give unknowns.{lower.name}.ratio_to = '{upper.name}'"
+            )
 
     def __len__(self) -> int:
         return len(self.all)

@@ -1,0 +1,94 @@
+"""Files appear whole or not at all, last, and leave nothing behind."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from torchsoft.files import PARTIAL, remove_partials, replacing, sealed, unsealed
+
+DIE = """
+import os, sys
+from pathlib import Path
+from torchsoft.files import replacing
+with replacing(sys.argv[1]) as partial:
+    partial.write_bytes(b"half")
+    os._exit(9)
+"""
+
+
+def write(path: Path, data: bytes) -> None:
+    with replacing(path) as partial:
+        partial.write_bytes(data)
+
+
+def fail(path: Path, error: BaseException) -> None:
+    with replacing(path) as partial:
+        partial.write_bytes(b"half")
+        raise error
+
+
+def test_a_file_is_replaced_at_the_end(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "folder" / "file"
+    write(path, b"old")
+    with replacing(path) as partial:
+        partial.write_bytes(b"new")
+        assert path.read_bytes() == b"old"
+        assert PARTIAL.search(partial.name)
+    assert path.read_bytes() == b"new"
+    assert os.listdir(path.parent) == ["file"]
+
+
+@pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
+def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path: Path, error: BaseException) -> None:
+    path = tmp_path / "file"
+    write(path, b"old")
+    with pytest.raises(type(error)):
+        fail(path, error)
+    assert (path.read_bytes(), os.listdir(tmp_path)) == (b"old", ["file"])
+
+
+def test_what_a_killed_writer_left_goes_with_the_next_one(tmp_path: Path) -> None:
+    """But not the file of one that lives, nor other people's."""
+    path = tmp_path / "file"
+    assert subprocess.run([sys.executable, "-c", DIE, str(path)], check=False).returncode == 9
+    (dead,) = tmp_path.iterdir()
+    for name in ("file.partial", "file.old.partial", "other.0123456789abcdef.partial"):
+        (tmp_path / name).write_bytes(b"mine")
+    with replacing(path) as mine:
+        assert not dead.exists()
+        write(path, b"another writer")
+        remove_partials(tmp_path.iterdir())
+        assert mine.exists()
+        mine.write_bytes(b"done")
+    assert path.read_bytes() == b"done"
+    assert sorted(os.listdir(tmp_path)) == ["file", "file.old.partial", "file.partial"]
+
+
+def test_files_are_flushed_before_they_appear(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Content first, then the name, then the folder that holds it, new folders in theirs."""
+    done: list[str] = []
+    flush, rename = os.fsync, Path.replace
+
+    def name(handle: int) -> str:
+        return PARTIAL.sub(".partial", str(Path(os.readlink(f"/proc/self/fd/{handle}")).relative_to(tmp_path)))
+
+    monkeypatch.setattr(os, "fsync", lambda handle: (done.append(name(handle)), flush(handle)))
+    monkeypatch.setattr(Path, "replace", lambda self, to: (done.append("replace"), rename(self, to))[1])
+    write(tmp_path / "a" / "b" / "file", b"x")
+    assert done == [".", "a", "a/b/file.partial", "replace", "a/b"]
+
+
+def test_a_sealed_file_is_read_as_it_was_written_or_not_at_all(tmp_path: Path) -> None:
+    path, content = tmp_path / "file", bytes(range(256))
+    path.write_bytes(whole := sealed(content))
+    assert unsealed(path) == content
+    for i in range(len(whole)):
+        path.write_bytes(whole[:i] + bytes([whole[i] ^ 1]) + whole[i + 1 :])
+        with pytest.raises(ValueError, match=r"is damaged|no checksum"):
+            unsealed(path)
+        path.write_bytes(whole[:i])
+        with pytest.raises(ValueError, match=r"is damaged|no checksum"):
+            unsealed(path)

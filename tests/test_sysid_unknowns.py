@@ -1,0 +1,66 @@
+"""Unknowns: no search goes beyond what a parameter may be, whether its bounds are given or not."""
+
+from typing import Any
+
+import pytest
+
+from torchsoft.parameters import bounds
+from torchsoft.sysid.unknowns import Coordinates, Unknown
+from torchsoft.tables import InvalidTable
+
+GIVEN = {"pad.E": 0.75e6, "pad.nu": 0.45, "contact.mu_s": 0.8, "contact.mu_k": 0.7, "contact.friction.alpha": 2.0}
+
+
+def coordinates(**unknowns: dict[str, Any]) -> Coordinates:
+    tables = {name.replace("__", "."): Unknown(**table) for name, table in unknowns.items()}
+    return Coordinates(tables, {}, ["one"], GIVEN)
+
+
+def ends(found: Coordinates, name: str) -> tuple[float, float]:
+    (one,) = (c for c in found.all if c.name == name)
+    return one.low, one.high
+
+
+def test_bounds_that_are_not_given_end_where_the_parameters_do() -> None:
+    assert ends(coordinates(pad__nu={}), "pad.nu") == (0.045, bounds("pad.nu").high)
+    assert ends(coordinates(pad__E={}), "pad.E") == (0.75e5, 0.75e7)
+    assert ends(coordinates(contact__mu_k={}), "contact.mu_k")[1] == GIVEN["contact.mu_s"]
+    assert ends(coordinates(contact__mu_s={}), "contact.mu_s")[0] == GIVEN["contact.mu_k"]
+    ratio = coordinates(contact__mu_k={"ratio_to": "contact.mu_s"}, contact__mu_s={})
+    assert ends(ratio, "contact.mu_k")[1] == 1.0
+    assert ends(ratio, "contact.mu_s")[0] == pytest.approx(0.08)
+    assert ends(coordinates(contact__friction__alpha={}), "contact.friction.alpha") == (0.2, 20.0)
+
+
+@pytest.mark.parametrize(
+    ("unknowns", "message"),
+    [
+        (
+            {"pad__nu": {"high": 4.5}},
+            r"^unknowns\.pad\.nu\.high = 4\.5 is beyond what pad\.nu may be, from -0\.999 to 0\.4999$",
+        ),
+        ({"pad__nu": {"scale": "linear", "low": -2.0, "high": 0.4}}, r"unknowns\.pad\.nu\.low = -2 is beyond"),
+        ({"pad__E": {"nominal": 1e20}}, r"unknowns\.pad\.E\.nominal = 1e\+20 is beyond"),
+        ({"contact__mu_k": {"high": 0.9}}, r"unknowns\.contact\.mu_k\.high = 0\.9 is beyond"),
+        (
+            {"contact__mu_k": {"ratio_to": "contact.mu_s", "high": 1.2}},
+            r"high = 1\.2 is beyond what contact\.mu_k / contact\.mu_s",
+        ),
+        ({"contact__mu_k": {}, "contact__mu_s": {}}, r"give unknowns\.contact\.mu_k\.ratio_to = 'contact\.mu_s'"),
+        ({"pad__Young": {}}, r"^unknowns: `pad\.Young` cannot be identified; what can: pad\.E, "),
+    ],
+)
+def test_bounds_beyond_are_refused_by_their_field(unknowns: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        coordinates(**unknowns)
+
+
+def test_friction_coefficients_may_both_be_free_where_they_cannot_cross() -> None:
+    found = coordinates(contact__mu_k={"high": 0.75}, contact__mu_s={"low": 0.75})
+    assert (ends(found, "contact.mu_k")[1], ends(found, "contact.mu_s")[0]) == (0.75, 0.75)
+
+
+@pytest.mark.parametrize("field", ["nominal", "low", "high"])
+def test_text_is_no_number(field: str) -> None:
+    with pytest.raises(InvalidTable, match=f"^{field} should be a valid number, not '1e5'$"):
+        Unknown.model_validate({field: "1e5"})

@@ -1,0 +1,123 @@
+"""Tables: refusals are one sentence that names the field, what was given and what is allowed; files of TOML are read alike."""
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pytest
+from pydantic import Field, model_validator
+
+from torchsoft.tables import LISTED, InvalidTable, Table, from_toml, read_toml, shown
+
+
+class Roll(Table):
+    kind: Literal["roll"]
+    travel: float = Field(default=1.0, gt=0)
+
+
+class Press(Table):
+    kind: Literal["press"]
+    depth: float = 1.0
+
+
+Motion = Annotated[Roll | Press, Field(discriminator="kind")]
+
+
+class Run(Table):
+    step: float = Field(default=1.0, gt=0, le=10.0)
+    count: int = Field(default=1, ge=1)
+    checked: bool = False
+    motions: Annotated[tuple[Motion, ...], LISTED] = ()
+    rolls: dict[str, Roll] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _step_is_not_seven(self) -> "Run":
+        if self.step == 7.0:
+            raise ValueError("step must not be seven")
+        return self
+
+
+REFUSED: dict[str, tuple[Any, str]] = {
+    "boolean": ({"step": True}, "step should be a valid number, not True"),
+    "text": ({"step": "1_0"}, "step should be a valid number, not '1_0'"),
+    "text for a whole number": ({"count": "3"}, "count should be a valid integer, not '3'"),
+    "part of a whole number": ({"count": 3.0}, "count should be a valid integer, not 3.0"),
+    "number for a truth": ({"checked": 1}, "checked should be a valid boolean, not 1"),
+    "not finite": ({"step": float("nan")}, "step should be a finite number, not nan"),
+    "too many digits": ({"step": 10**400}, "step should be a valid number, not 1000"),
+    "bounds": ({"step": -1}, "step should be greater than 0, not -1"),
+    "unknown": ({"steps": 1.0}, "steps is not known here"),
+    "missing": ({"motions": [{"kind": "roll"}, {}]}, "motions.1.kind is missing"),
+    "another kind": ({"motions": [{"kind": "hop"}]}, "motions.0.kind should be one of 'roll', 'press', not 'hop'"),
+    "in a kind": ({"motions": [{"kind": "roll", "travel": -1}]}, "motions.0.travel should be greater than 0, not -1"),
+    "by name": (
+        {"rolls": {"a.b": {"kind": "roll", "travel": "x"}}},
+        "rolls.a.b.travel should be a valid number, not 'x'",
+    ),
+    "not a table": ({"rolls": {"a": 3}}, "rolls.a should be a table, not 3"),
+    "together": ({"step": 7.0}, "step must not be seven"),
+    "several": ({"step": -1, "count": 0, "a": 1, "b": 2}, "; and 1 more"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_refusal_is_one_sentence_that_names_the_field(name: str, tmp_path: Path) -> None:
+    tree, message = REFUSED[name]
+    for make in (lambda: Run(**tree), lambda: Run.model_validate(tree)):
+        with pytest.raises(InvalidTable) as error:
+            make()
+        assert message in str(error.value)
+        assert "\n" not in str(error.value)
+
+
+def test_what_is_right_is_taken_as_it_is() -> None:
+    run = Run.model_validate({"step": 2, "motions": [{"kind": "press", "depth": 3}]})
+    assert run == Run(step=2.0, motions=(Press(kind="press", depth=3.0),))
+    assert isinstance(run.step, float)
+    assert Run.model_validate_json(run.model_dump_json()) == run
+
+
+def test_a_table_stays_as_it_was_made() -> None:
+    with pytest.raises(InvalidTable, match=r"^step cannot be set: a table stays as it was made"):
+        Run().step = 2.0
+
+
+def test_json_is_refused_alike() -> None:
+    with pytest.raises(InvalidTable, match=r"^step should be greater than 0, not -1"):
+        Run.model_validate_json('{"step": -1}')
+
+
+def test_values_are_shown_short() -> None:
+    assert len(shown("x" * 1000)) < 60
+    assert len(shown({str(i): ["y" * 100] * 100 for i in range(100)})) <= 120
+    assert "\n" not in shown("a\nb")
+
+
+def test_a_mark_of_order_and_other_ends_of_lines_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "run.toml"
+    path.write_bytes("\ufeffstep = 2.0 # µ\r\ncount = 3\r\n".encode())
+    assert from_toml(path, Run.model_validate) == Run(step=2.0, count=3)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"step = '\xff'", "is not a TOML file: 'utf-8' codec"),
+        (b"a = " + b"[" * 20_000, "its tables are nested too deeply"),
+        (b"a = " + b"9" * 5_000, "is not a TOML file: Exceeds the limit"),
+        (b"a = 1\na = 2\n", "is not a TOML file: Cannot overwrite a value"),
+        ("step = 1.0".encode("utf-16"), "is not a TOML file"),
+        (b"step = -1.0", r"run.toml: step should be greater than 0"),
+    ],
+)
+def test_a_file_that_cannot_be_read_is_named(content: bytes, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "run.toml"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"run\.toml") as error:
+        from_toml(path, Run.model_validate)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_that_is_not_there_is_the_systems_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError):
+        read_toml(tmp_path / "none.toml")

@@ -1,0 +1,85 @@
+"""What work will cost, said before it begins: hours, and more memory than there is, need the user's word.
+
+The times are those of one core of a usual machine; they are meant to tell minutes from hours.
+"""
+
+import os
+import sys
+from typing import NamedTuple
+
+from torchsoft.parameters import Parameters
+
+LONG = 3600.0
+"""Work that takes longer than this [s] needs the user's word."""
+
+RUN = 0.05
+"""Time [s] that a run takes besides its steps."""
+
+SHARE = 0.8
+"""And so does what needs more than this part of the machine's memory."""
+
+
+class Cost(NamedTuple):
+    """Steps of the stepper, time [s], and memory and disk space [GiB]."""
+
+    steps: float
+    seconds: float
+    memory: float
+    disk: float = 0.0
+
+    @property
+    def sentence(self) -> str:
+        disk = f", and {self.disk:.3g} GiB on the disk" if self.disk >= 1 else ""
+        return (
+            f"this takes about {duration(self.seconds)} ({self.steps:.2g} steps), {self.memory:.2g} GiB of memory{disk}"
+        )
+
+
+class Costly(ValueError):
+    """Work that the user has not agreed to."""
+
+
+def agree(cost: Cost, yes: bool, help: str) -> None:
+    """Ask whether to begin where it costs much and `yes` was not said; where nobody can be asked that is `Costly`.
+
+    `help` says what makes it cost less.
+    """
+    if yes or (cost.seconds <= LONG and cost.memory <= SHARE * machine_memory()):
+        return
+    if sys.stdin.isatty() and sys.stderr.isatty():
+        print(f"{cost.sentence}; begin? [y/N] ", end="", file=sys.stderr, flush=True)
+        if sys.stdin.readline().strip().lower() in ("y", "yes"):
+            return
+    raise Costly(f"{cost.sentence}; {help}, or say --yes to begin")
+
+
+def step_seconds(p: Parameters, differentiated: bool = False) -> float:
+    """Time of one step [s]; `differentiated` with sensitivities by a few parameters."""
+    elements = p.pad.elements_x
+    points = 0.5e-6 * elements * p.contact.points
+    if p.pad.fidelity == "inertial":
+        return (2.1e-6 * (elements + 1) * p.pad.elements_y + points) * (4.0 if differentiated else 1.0)
+    return (50e-6 + 90e-6 * ((elements + 1) / 121) ** 2 + points) * (2.5 if differentiated else 1.0)
+
+
+def row_memory(p: Parameters) -> float:
+    """Memory [GiB] of one row of a run: states, forces, displacements and energies."""
+    nodes = (p.pad.elements_x + 1) * (p.pad.elements_y if p.pad.fidelity == "inertial" else 1)
+    points = p.pad.elements_x * p.contact.points or p.pad.elements_x + 1
+    return 8 * (16 * nodes + 12 * points + 100) / 2**30
+
+
+def machine_memory() -> float:
+    """Memory of this machine [GiB]; infinite where the system does not say."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30
+    except (AttributeError, ValueError, OSError):
+        return float("inf")
+
+
+def duration(seconds: float) -> str:
+    """A time as people say it."""
+    for size, unit in ((365.25 * 86400.0, "years"), (86400.0, "days"), (3600.0, "hours"), (60.0, "minutes")):
+        if seconds >= 1.5 * size:
+            return f"{seconds / size:.2g} {unit}" if seconds < 100 * size else f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.2g} seconds"

@@ -1,0 +1,149 @@
+"""Tables: validated data, from Python or from a TOML file. What a table refuses it refuses in one sentence.
+
+The sentence names every field that is wrong, what was given and what is allowed.
+"""
+
+import re
+import reprlib
+import tomllib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Strict, ValidationError
+
+T = TypeVar("T")
+
+LISTED = Strict(False)
+"""Marks a tuple that may be given as a list, as in TOML."""
+
+SHOWN = 3
+"""Findings that a sentence states; of more it gives the number."""
+
+SEED = 2**63 - 1
+"""Largest seed: the largest integer of TOML."""
+
+
+class InvalidTable(ValueError):
+    """What a table does not take, in one sentence."""
+
+
+@contextmanager
+def refusing(data: Any = None, within: str = "") -> Iterator[None]:
+    """Turns pydantic's findings on `data` into `InvalidTable`."""
+    try:
+        yield
+    except ValidationError as error:
+        raise InvalidTable(findings(error, data, within)) from None
+
+
+class Table(BaseModel):
+    """A frozen table: unknown keys, numbers that are not finite, and text or booleans for numbers are `InvalidTable`."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
+
+    if not TYPE_CHECKING:  # checkers see the fields as arguments
+
+        def __init__(self, **data: Any) -> None:
+            with refusing(data):
+                super().__init__(**data)
+
+        __init__.__pydantic_base_init__ = True  # a table in a table is validated as part of it
+
+        def __setattr__(self, name: str, value: Any) -> None:
+            with refusing():
+                super().__setattr__(name, value)
+
+    @classmethod
+    def model_validate(cls, obj: Any, **how: Any) -> Self:
+        with refusing(obj):
+            return super().model_validate(obj, **how)
+
+    @classmethod
+    def model_validate_json(cls, json_data: str | bytes | bytearray, **how: Any) -> Self:
+        with refusing():
+            return super().model_validate_json(json_data, **how)
+
+
+def findings(error: ValidationError, data: Any = None, within: str = "") -> str:
+    """pydantic's findings in one sentence, each with its field (`within` another), what was given and what is allowed."""
+    found = list(dict.fromkeys(finding(one, data, within) for one in error.errors(include_url=False)))
+    more = len(found) - SHOWN
+    return "; ".join(found[:SHOWN]) + (f"; and {more} more" if more > 0 else "")
+
+
+def finding(one: Mapping[str, Any], data: Any, within: str) -> str:
+    """One finding: `pad.E should be greater than or equal to 1, not -1.0`."""
+    kind, place = one["type"], ".".join(part for part in (within, path(one["loc"], data)) if part)
+    field, given, text = place or "what is given", shown(one["input"]), one["msg"]
+    if kind == "extra_forbidden":
+        return f"{field} is not known here"
+    if kind == "missing":
+        return f"{field} is missing"
+    if kind == "frozen_instance":
+        return f"{field} cannot be set: a table stays as it was made; make another one"
+    if kind.startswith("union_tag"):
+        tag = one["ctx"]["discriminator"].strip("'")
+        if "expected_tags" not in one["ctx"]:
+            return f"{field}.{tag} is missing"
+        return f"{field}.{tag} should be one of {one['ctx']['expected_tags']}, not {shown(one['input'][tag])}"
+    if kind in ("value_error", "assertion_error"):
+        text = line(text.removeprefix("Value error, "))
+        return f"{place}: {text}" if place else text
+    if kind in ("dict_type", "model_type", "model_attributes_type"):
+        return f"{field} should be a table, not {given}"
+    text = SMALL.sub(lambda match: f"{float(match[0]):g}", text)  # as people write it: 1e-07
+    return f"{field} {text.removeprefix('Input ')}, not {given}" if text.startswith("Input ") else f"{field}: {text}"
+
+
+def path(loc: tuple[int | str, ...], data: Any) -> str:
+    """A place in `data` as messages name it, without the names that pydantic gives to members of a union."""
+    parts = []
+    for i, part in enumerate(loc):
+        if isinstance(data, Mapping) and part not in data and i + 1 < len(loc):
+            continue
+        parts.append(str(part))
+        if isinstance(data, Mapping):
+            data = data.get(part)
+        elif isinstance(data, list | tuple):
+            data = data[part] if isinstance(part, int) and part < len(data) else None
+        else:
+            data = getattr(data, str(part), None)
+    return line(".".join(parts), 200)
+
+
+SMALL = re.compile(r"(?<![\w.'])0\.0000\d+|(?<![\w.'])\d{6,}\.0\b")
+SHORT = reprlib.Repr()
+SHORT.maxother = SHORT.maxstring = SHORT.maxlong = 40
+SHORT.maxlevel = SHORT.maxdict = SHORT.maxlist = SHORT.maxtuple = 2
+
+
+def shown(value: Any) -> str:
+    """A value as messages show it: short."""
+    return line(SHORT.repr(value), 120)
+
+
+def line(text: Any, length: int = 600) -> str:
+    """Text as one line of limited length."""
+    one = " ".join(str(text).split())
+    return one if len(one) <= length else one[: length - 3] + "..."
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """A TOML file. Raises `ValueError` naming it for what is not TOML in UTF-8, and `OSError`."""
+    try:
+        return tomllib.loads(Path(path).read_bytes().removeprefix(b"\xef\xbb\xbf").decode("utf-8"))
+    except RecursionError:
+        raise ValueError(f"{path} is not a TOML file that can be read: its tables are nested too deeply") from None
+    except ValueError as error:  # of TOML, of UTF-8, of integers with thousands of digits
+        raise ValueError(f"{path} is not a TOML file: {line(error)}") from None
+
+
+def from_toml(path: str | Path, make: Callable[[Any], T]) -> T:
+    """What `make` makes of a TOML file. Raises `ValueError` naming the file and the field."""
+    tree = read_toml(path)
+    try:
+        return make(tree)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
