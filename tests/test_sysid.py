@@ -219,7 +219,7 @@ def test_interrupted_it_continues_and_ends_the_same(
         patch.setattr(Runner, "run", interrupted)
         with pytest.raises(KeyboardInterrupt):
             identify(problem, step=STEP, checkpoint=tmp_path / "runs")
-    kept = len(list((tmp_path / "runs").glob("*.pickle")))
+    kept = len(list((tmp_path / "runs").glob("*.run")))
     assert kept >= 3  # runs asked for twice are made once
     again = identify(problem, step=STEP, checkpoint=tmp_path / "runs")
     assert again.cost["remembered"] >= kept
@@ -393,7 +393,7 @@ def test_killed_in_mid_run_it_continues_and_ends_the_same(tmp_path: Path) -> Non
 
     whole, _ = begin(tmp_path / "whole").communicate(timeout=200)
     cut = begin(tmp_path / "cut")
-    while cut.poll() is None and len(list((tmp_path / "cut").glob("*.pickle"))) < 3:
+    while cut.poll() is None and len(list((tmp_path / "cut").glob("*.run"))) < 3:
         time.sleep(0.01)
     cut.kill()
     cut.communicate()

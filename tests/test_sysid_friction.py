@@ -58,7 +58,7 @@ def test_its_parameters_are_found_beside_those_of_the_pads(jerks: Recording) -> 
 
 
 def test_its_derivatives_by_both_routes_are_those_of_differences(jerks: Recording) -> None:
-    slack = {"contact.friction.beta": Unknown(scale="linear", nominal=0.0, low=-1.0, high=100.0)}
+    slack = {"contact.friction.beta": Unknown(scale="linear", nominal=1.0, low=0.0, high=100.0)}
     ratio = {"control.K_98": Unknown(ratio_to="control.K_81")}
     problem = Problem([jerks], SENSORS, {"contact.friction.alpha": Unknown()} | slack | ratio)
     x, free, h = problem.coordinates.start, problem.coordinates.free, 1e-5

@@ -18,10 +18,10 @@ from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import IdentificationResult, Problem, Sensor, Unknown, identify, record
 from torchsoft.sysid.figures import correlation_figure, direction_name, estimates_figure, spectrum_figure, trace_figure
+from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.report import report, starts, traces
 from torchsoft.sysid.result import Direction, autocorrelation
-from torchsoft.sysid.workers import FailedRun
 
 STRANGE = 'a<b> & "$x_1$"'
 """A recording's name with everything in it that HTML or matplotlib would read as their own."""

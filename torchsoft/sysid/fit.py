@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from torchsoft.sysid.information import standard_deviations
+from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
-from torchsoft.sysid.workers import FailedRun, Runner
+from torchsoft.sysid.workers import Runner
 
 Loss = Literal["linear", "soft_l1", "huber", "cauchy", "arctan"]
 Notify = Callable[[float], None]

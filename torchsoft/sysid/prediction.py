@@ -29,6 +29,24 @@ class Prediction(NamedTuple):
     steps: int
 
 
+class Misfit(NamedTuple):
+    """Half the sum of squared residuals of one recording, its derivatives by parameters (n,), and by bias and delay of every
+    channel that has noise, and the stepper's steps."""
+
+    loss: float
+    parameters: Array
+    bias: Array
+    delay: Array
+    steps: int
+
+
+class FailedRun(NamedTuple):
+    """A run that could not be finished: why, and when [s]."""
+
+    reason: str
+    time: float
+
+
 @torch.no_grad()
 def set_parameters(rig: Rig, values: Mapping[str, float]) -> None:
     """Give the rig other parameters, by the names that `Rig.parameter` knows."""
@@ -88,13 +106,12 @@ def interpolation(t: Array, at: Array) -> Array:
 def misfit(
     rig: Rig, y0: Tensor, recording: Recording, t: Tensor, names: Sequence[str], step: float,
     noise: dict[str, float], bias: dict[str, float], delay: dict[str, float],
-) -> tuple[float, dict[str, Array], int]:  # fmt: skip
-    """Half the sum of squared residuals of one recording, with its gradient by the discrete adjoint: by parameters
-    (`names`), and by `bias` and `delay` (one entry a channel in `noise`); and the stepper's steps. Raises `SimulationFailed`.
-    """
+) -> Misfit:  # fmt: skip
+    """The misfit with its gradient by the parameters `names`, by the discrete adjoint, and by `bias` and `delay` (one entry a
+    channel in `noise`). Raises `SimulationFailed`."""
     at, loss = t[1:], torch.zeros((), dtype=torch.float64)
     run = simulate(rig, t, y0=y0, step=step, tolerance=TOLERANCE, gradient="discrete")
-    out = {"bias": np.zeros(len(noise)), "delay": np.zeros(len(noise))}
+    by_bias, by_delay = np.zeros(len(noise)), np.zeros(len(noise))
     for k, (channel, sigma) in enumerate(noise.items()):
         if channel not in recording.samples:
             continue
@@ -103,7 +120,7 @@ def misfit(
         r = (spline @ run[channel][1:] + bias[channel] - torch.from_numpy(measured)) / sigma
         loss = loss + 0.5 * r.square().sum()
         rates = CubicSpline(at.numpy(), run[channel][1:].detach().numpy())(times - delay[channel], 1)
-        out["bias"][k], out["delay"][k] = float(r.detach().sum()) / sigma, -float(r.detach().numpy() @ rates) / sigma
+        by_bias[k], by_delay[k] = float(r.detach().sum()) / sigma, -float(r.detach().numpy() @ rates) / sigma
     gradient = torch.autograd.grad(loss, [rig.parameter(name) for name in names], allow_unused=True)
-    out["parameters"] = np.array([0.0 if g is None else float(g) for g in gradient])
-    return float(loss.detach()), out, run.stats.steps
+    by_parameters = np.array([0.0 if g is None else float(g) for g in gradient])
+    return Misfit(float(loss.detach()), by_parameters, by_bias, by_delay, run.stats.steps)

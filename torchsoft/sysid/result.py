@@ -105,7 +105,7 @@ class IdentificationResult:
     def save(self, path: str | Path) -> None:
         """Write the JSON file. It appears whole or not at all."""
         with replacing(path) as partial:
-            partial.write_text(self.to_json())
+            partial.write_text(self.to_json(), encoding="utf-8")
 
     def table(self) -> str:
         """One line an estimate."""

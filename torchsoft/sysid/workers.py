@@ -1,29 +1,22 @@
 """Runs of the model, side by side in processes, each result kept on disk until the identification is done.
 
-The journal is what makes an identification resume: a fit is a deterministic function of its runs, so started again it reads
-what it already has, to the bit, and goes on from there.
+A fit is a deterministic function of its runs, so started again it reads what it already has, to the bit, and goes on from
+there.
 """
 
-import pickle
 from collections.abc import Sequence
-from concurrent.futures import Future
+from concurrent.futures import Future, as_completed
 from contextlib import ExitStack
-from hashlib import sha256
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 from threadpoolctl import threadpool_limits
 
-from torchsoft.files import replacing
 from torchsoft.processes import local_processes
-from torchsoft.solve.kernel import HERE, digest
 from torchsoft.solve.stepper import SimulationFailed
-from torchsoft.sysid.prediction import Prediction, misfit, predict, set_parameters
+from torchsoft.sysid.journal import Journal
+from torchsoft.sysid.prediction import FailedRun, Prediction, misfit, predict, set_parameters
 from torchsoft.sysid.recording import Recording, Start
-
-ENGINE = HERE, HERE.parent, HERE.parents[1] / "codegen", HERE.parents[1] / "physics"
-"""Folders of everything that decides a run."""
 
 
 class Job(NamedTuple):
@@ -41,13 +34,6 @@ class Job(NamedTuple):
     nuisance: tuple[dict[str, float], dict[str, float], dict[str, float]] | None = None
 
 
-class FailedRun(NamedTuple):
-    """A run that could not be finished, and why."""
-
-    reason: str
-    time: float
-
-
 _recordings: tuple[Recording, ...] = ()
 _models: dict[int, Start] = {}
 
@@ -59,7 +45,7 @@ def _prepare(recordings: tuple[Recording, ...]) -> None:
 
 
 def _run(job: Job) -> Any:
-    """A `Prediction`, a misfit with its gradient, or `FailedRun`."""
+    """A `Prediction`, a `Misfit`, or a `FailedRun`."""
     recording = _recordings[job.recording]
     if job.recording not in _models:
         _models[job.recording] = recording.begin()
@@ -85,16 +71,12 @@ class Runner:
     def __init__(self, recordings: Sequence[Recording], workers: int = 1, journal: Path | None = None) -> None:
         if workers < 1:
             raise ValueError(f"`workers` must be positive, but is {workers}")
-        self.recordings, self.workers, self.journal = tuple(recordings), workers, journal
+        self.recordings, self.workers = tuple(recordings), workers
         self.simulations = self.jacobians = self.gradients = self.steps = self.remembered = 0
         self._open, self._pool = ExitStack(), None
-        self._own = sha256(
-            repr((version("torchsoft"), digest(*ENGINE), [r.fingerprint for r in recordings])).encode()
-        ).digest()
+        self._journal = Journal(journal, self.recordings) if journal is not None else None
 
     def __enter__(self) -> Self:
-        if self.journal is not None:
-            self.journal.mkdir(parents=True, exist_ok=True)
         if self.workers > 1:
             self._pool = self._open.enter_context(local_processes(self.workers, _prepare, self.recordings))
         else:
@@ -105,22 +87,24 @@ class Runner:
         self._open.close()
 
     def run(self, jobs: Sequence[Job]) -> list[Any]:
-        """Results in the order of the jobs: `Prediction`, misfit or `FailedRun`."""
-        waiting: list[Any] = []
-        for job in jobs:
+        """Results in the order of the jobs: `Prediction`, `Misfit` or `FailedRun`."""
+        out: list[Any] = []
+        running: dict[Future[Any], int] = {}
+        for i, job in enumerate(jobs):
             self._count(job)
-            known = self._recall(job)
-            if known is None:
-                known = self._pool.submit(_run, job) if self._pool is not None else _run(job)
-                if self._pool is None:
-                    self._keep(job, known)
-            waiting.append(known)
-        out = []
-        for job, result in zip(jobs, waiting):
-            if isinstance(result, Future):
-                result = result.result()
-                self._keep(job, result)
-            out.append(result)
+            out.append(self._journal.recall(job) if self._journal is not None else None)
+            self.remembered += out[i] is not None
+            if out[i] is None and self._pool is not None:
+                running[self._pool.submit(_run, job)] = i
+            elif out[i] is None:
+                out[i] = self._keep(job, _run(job))
+        try:
+            for future in as_completed(running):
+                out[running[future]] = self._keep(jobs[running[future]], future.result())
+        except KeyboardInterrupt:  # what is running ends by itself, and is kept
+            for future in as_completed([future for future in running if not future.cancel()]):
+                self._keep(jobs[running[future]], future.result())
+            raise
         return out
 
     def _count(self, job: Job) -> None:
@@ -131,28 +115,9 @@ class Runner:
         else:
             self.simulations += 1
 
-    def _file(self, job: Job) -> Path:
-        assert self.journal is not None
-        return self.journal / (sha256(self._own + repr(job).encode()).hexdigest()[:32] + ".pickle")
-
-    def _recall(self, job: Job) -> Any:
-        if self.journal is None or not (path := self._file(job)).exists():
-            return None
-        self.remembered += 1
-        return pickle.loads(path.read_bytes())
-
-    def _keep(self, job: Job, result: Any) -> None:
+    def _keep(self, job: Job, result: Any) -> Any:
         if isinstance(result, Prediction):
             self.steps += result.steps
-        if self.journal is not None:
-            with replacing(self._file(job)) as partial:
-                partial.write_bytes(pickle.dumps(result))
-
-
-def forget(folder: Path) -> None:
-    """Remove a checkpoint: its own files, and the folder if it holds nothing else."""
-    for pattern in ("*.pickle", "*.partial"):
-        for file in folder.glob(pattern):
-            file.unlink(missing_ok=True)
-    if folder.is_dir() and not any(folder.iterdir()):
-        folder.rmdir()
+        if self._journal is not None:
+            self._journal.keep(job, result)
+        return result

@@ -1,0 +1,207 @@
+"""The journal of an identification: data with checksums, to the bit, in a folder of its own."""
+
+import os
+import pickle
+import struct
+from collections.abc import Callable
+from concurrent import futures
+from concurrent.futures import Future, ThreadPoolExecutor
+from hashlib import sha256
+from io import BytesIO
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from torchsoft.sysid import workers
+from torchsoft.sysid.journal import MARKER, Journal, decoded, encoded, forget
+from torchsoft.sysid.prediction import FailedRun, Misfit, Prediction
+from torchsoft.sysid.workers import Job, Runner
+
+ODD = np.array([0.0, -0.0, np.nan, np.inf, -np.inf, 5e-324, 0.1 + 0.2, 1e308])
+PREDICTION = Prediction(ODD, np.stack([ODD, -ODD], 1), np.asfortranarray(np.ones((8, 2, 3)) * ODD[:, None, None]), 12)
+RESULTS = {
+    "prediction": PREDICTION,
+    "without derivatives": PREDICTION._replace(derivatives=None),
+    "nothing": Prediction(np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2, 0)), 0),
+    "misfit": Misfit(0.1 + 0.2, ODD, np.zeros(0), -ODD, 7),
+    "infinite misfit": Misfit(float("inf"), ODD, ODD, ODD, 7),
+    "failed": FailedRun("the disc was lost at t = 0.1 s: µ_s, 'quoted'", 0.1),
+    "failed without a reason": FailedRun("", float("nan")),
+}
+RUN, OTHER = ("run", 1.0), ("run", 1.0000000000000002)
+
+
+def same(a: Any, b: Any) -> bool:
+    """To the bit, and of the same types."""
+    return type(a) is type(b) and all(
+        type(x) is type(y)
+        and (
+            (x.dtype, x.shape, x.tobytes()) == (y.dtype, y.shape, y.tobytes())
+            if isinstance(x, np.ndarray)
+            else struct.pack("d", x) == struct.pack("d", y)
+            if isinstance(x, float)
+            else x == y
+        )
+        for x, y in zip(a, b)
+    )
+
+
+def journal(folder: Path, print_: str = "a") -> Journal:
+    return Journal(folder, [SimpleNamespace(fingerprint=print_)])  # pyright: ignore[reportArgumentType]
+
+
+def files(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*.run"))
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_a_result_is_read_as_it_was_written(tmp_path: Path, name: str) -> None:
+    journal(tmp_path).keep(RUN, RESULTS[name])
+    again = journal(tmp_path)
+    assert same(again.recall(RUN), RESULTS[name])
+    assert again.recall(OTHER) is None
+    assert journal(tmp_path, "b").recall(RUN) is None
+
+
+class Trap:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return os.mkdir, (str(self.path),)
+
+
+def forged(name: bytes, content: bytes) -> bytes:
+    """With the checksum that the journal would write."""
+    return sha256(name + content).digest() + content
+
+
+DAMAGES: dict[str, Callable[[bytes, bytes, Trap], bytes]] = {
+    "empty": lambda name, content, trap: b"",
+    "cut": lambda name, content, trap: content[:-1],
+    "half of the checksum": lambda name, content, trap: content[:16],
+    "one bit": lambda name, content, trap: content[:99] + bytes([content[99] ^ 4]) + content[100:],
+    "longer": lambda name, content, trap: content + b"\0",
+    "zeros": lambda name, content, trap: bytes(len(content)),
+    "a pickle": lambda name, content, trap: pickle.dumps(trap),
+    "a pickle with a checksum": lambda name, content, trap: forged(name, pickle.dumps(trap)),
+    "an object array with a checksum": lambda name, content, trap: forged(name, objects(trap)),
+    "another archive with a checksum": lambda name, content, trap: forged(name, other_archive(kind=np.asarray("Path"))),
+    "a kind that is no name": lambda name, content, trap: forged(name, other_archive(kind=np.ones(3))),
+    "no fields": lambda name, content, trap: forged(name, other_archive(kind=np.asarray("Prediction"))),
+    "unknown fields": lambda name, content, trap: forged(
+        name, other_archive(kind=np.asarray("Prediction"), path=np.ones(2))
+    ),
+}
+
+
+def other_archive(**arrays: Any) -> bytes:
+    out = BytesIO()
+    np.savez(out, **arrays)
+    return out.getvalue()
+
+
+def objects(trap: Trap) -> bytes:
+    held = np.empty(1, dtype=object)
+    held[0] = trap
+    return other_archive(kind=np.asarray("Prediction"), t=held)
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_damaged_or_planted_file_is_noticed_and_never_executed(tmp_path: Path, damage: str) -> None:
+    folder, trap = tmp_path / "runs", Trap(tmp_path / "executed")
+    journal(folder).keep(RUN, PREDICTION)
+    (path,) = files(folder)
+    path.write_bytes(DAMAGES[damage](bytes.fromhex(path.stem), path.read_bytes(), trap))
+    again = journal(folder)
+    with pytest.warns(UserWarning, match="runs holds damaged results, whose runs are made again$"):
+        assert again.recall(RUN) is None
+    assert again.recall(RUN) is None  # says so once
+    assert not trap.path.exists()
+    again.keep(RUN, PREDICTION)
+    assert same(journal(folder).recall(RUN), PREDICTION)
+
+
+def test_a_result_of_another_run_is_noticed(tmp_path: Path) -> None:
+    one = journal(tmp_path)
+    one.keep(RUN, PREDICTION)
+    one.keep(OTHER, PREDICTION._replace(steps=13))
+    first, second = files(tmp_path)
+    content = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(content)
+    again = journal(tmp_path)
+    with pytest.warns(UserWarning, match="damaged"):
+        assert again.recall(RUN) is None
+    assert again.recall(OTHER) is None
+
+
+def test_an_archive_is_no_pickle() -> None:
+    assert same(decoded(encoded(PREDICTION)), PREDICTION)
+    content = encoded(FailedRun(np.array([{}], dtype=object), 0.0))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="allow_pickle"):
+        decoded(content)
+
+
+def test_a_folder_of_others_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "thesis.pickle").write_text("mine")
+    with pytest.raises(ValueError, match=r"the checkpoint .* holds other files; give a new or an empty folder$"):
+        journal(tmp_path)
+    with pytest.raises(ValueError, match=r"thesis.pickle is a file; give a new or an empty folder$"):
+        journal(tmp_path / "thesis.pickle")
+    forget(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.pickle"]
+
+
+def test_only_its_own_files_are_removed(tmp_path: Path) -> None:
+    folder = tmp_path / "runs"
+    journal(folder).keep(RUN, PREDICTION)
+    name = files(folder)[0].name
+    (folder / f"{name}.0123456789abcdef.partial").write_text("killed while it was written")
+    others = ["a.pickle", "b.partial", "c.run", "notes.txt", f"{name}.old"]
+    for other in others:
+        (folder / other).write_text("mine")
+    forget(folder)
+    assert sorted(path.name for path in folder.iterdir()) == sorted([*others, MARKER])
+    journal(folder)  # it is still one of ours
+    for other in others:
+        (folder / other).unlink()
+    forget(folder)
+    assert not folder.exists()
+    forget(folder)
+
+
+def test_it_goes_on_where_another_was_done_with_the_folder(tmp_path: Path) -> None:
+    one = journal(tmp_path / "runs")
+    forget(tmp_path / "runs")
+    one.keep(RUN, PREDICTION)
+    assert same(journal(tmp_path / "runs").recall(RUN), PREDICTION)
+
+
+def test_what_is_done_is_kept_at_an_interruption(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Though a run before it is not done yet; and so is what runs on until the processes end."""
+    jobs = [Job(0, {"pad.E": float(k)}, (), 1e-3) for k in range(3)]
+    interrupted: list[bool] = []
+
+    def as_completed(given: Any) -> Any:
+        last: Future[Any] = list(given)[-1]
+        if not interrupted:
+            yield last
+            interrupted.append(True)
+            raise KeyboardInterrupt
+        yield from futures.as_completed(given)
+
+    monkeypatch.setattr(workers, "as_completed", as_completed)
+    monkeypatch.setattr(workers, "_run", lambda job: PREDICTION._replace(steps=int(job.values["pad.E"])))
+    recordings: Any = [SimpleNamespace(fingerprint="a")]
+    with Runner(recordings, journal=tmp_path) as runner, ThreadPoolExecutor(1) as pool:
+        runner._pool = pool  # pyright: ignore[reportAttributeAccessIssue]
+        with pytest.raises(KeyboardInterrupt):
+            runner.run(jobs)
+    again = Journal(tmp_path, recordings)
+    assert [again.recall(job) is not None for job in jobs] == [True, True, True]
