@@ -20,13 +20,17 @@ import torch
 import xarray as xr
 import zarr
 
+from torchsoft.datasets import layout, simulation
 from torchsoft.datasets.check import check
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.design import points, split, task
 from torchsoft.datasets.generate import Serial, generate, local_processes, main
+from torchsoft.datasets.manifest import Manifest, digest, record, record_key
 from torchsoft.datasets.reader import Trajectories, open_dataset
 from torchsoft.datasets.simulation import simulate_task
-from torchsoft.datasets.store import Store, StoreError, open_or_create
+from torchsoft.datasets.storage import StoreError, write_bytes
+from torchsoft.datasets.store import Store, create, open_or_create
+from torchsoft.files import replacing
 
 ROOT = Path(__file__).parent.parent
 CONFIGS = sorted((ROOT / "data_gen" / "configs").glob("*.toml"))
@@ -75,12 +79,13 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Config]:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """Every file of a store, the manifest included, but for the commit: the repository may move on during a test."""
+    """Every file of a store, the manifest included, but for the commit and so the digest: the repository may move on during a
+    test."""
     return {str(p.relative_to(folder)): same_commit(p.read_bytes()) for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
 def same_commit(data: bytes) -> bytes:
-    return re.sub(rb'"commit": "\w*"', b'"commit": ""', data)
+    return re.sub(rb'"(commit|digest)": "\w*"', rb'"\1": ""', data)
 
 
 def copy(source: Path, target: Path) -> Path:
@@ -102,7 +107,7 @@ def test_ready_configs_are_valid_and_their_splits_keep_the_shares(path: Path) ->
         ("low = 7e5", "low = 9e5", r"parameters\.pad\.E"),
         ("low = 7e5", "low = -1.0", r"parameters\.pad\.E"),
         ('"pad.E"', '"pad.Young"', r"pad\.Young"),
-        ("low = 1.3e-3, high = 1.5e-3", "low = 1.3e-3, high = 0.02", r"grasp_depth = 0\.02"),
+        ("low = 1.3e-3, high = 1.5e-3", "low = 1.3e-3, high = 0.02", r"grasp_depth\.high = 0\.02"),
         ("low = 0.7, high = 0.9", "low = 0.3, high = 0.9", r"contact\.mu_s = 0\.3.*mu_k"),
         ("low = 1e-3, high = 2e-3", "low = 1e-3, high = 0.2", r"kinds\.0\.travel"),
         ("duration = 0.9", "duration = 0.5", "duration"),
@@ -150,7 +155,7 @@ def test_an_object_store_holds_the_same_bytes(made: tuple[Path, Config]) -> None
     assert objects(url) == files(folder)
     read_everywhere(url, folder)
     fs = fsspec.filesystem("memory")
-    fs.rm_file("/sets/rolling/done/c/1")
+    fs.rm_file("/sets/rolling/finished/1.sha256")
     fs.rm_file("/sets/rolling/disc_angle/c/1/0")
     assert Store(url, config).unfinished() == [1]
     generate(config, url, Serial(), progress=False)
@@ -194,7 +199,7 @@ def test_another_shard_size_makes_the_same_data(made: tuple[Path, Config], tmp_p
     folder, _ = made
     config = Config.from_toml(write_config(tmp_path, shard=3))
     generate(config, str(tmp_path / "set"), Serial(), progress=False)
-    here, there = (xr.open_zarr(path).drop_vars("done").load() for path in (tmp_path / "set", folder))
+    here, there = (open_dataset(str(path)).load() for path in (tmp_path / "set", folder))
     assert here.equals(there)
 
 
@@ -236,30 +241,61 @@ def set_value(name: str, where: tuple[Any, ...], value: Any) -> Callable[[Path],
     return change
 
 
-def truncate(folder: Path) -> None:
-    path = folder / "disc_angle/c/0/0"
-    path.write_bytes(path.read_bytes()[:-40])
-
-
-def change_units(folder: Path) -> None:
-    zarr.open_group(str(folder), mode="r+")["disc_angle"].attrs["units"] = "deg"
-
-
-def change_units_for_readers(folder: Path) -> None:
-    """In the consolidated copy only, which xarray opens."""
-    path = folder / "zarr.json"
-    group = json.loads(path.read_text())
-    group["consolidated_metadata"]["metadata"]["disc_spin"]["attributes"]["units"] = "deg/s"
-    path.write_text(json.dumps(group))
-
-
-def drop_array(folder: Path) -> None:
-    shutil.rmtree(folder / "disc_spin")
-
-
-def change_seed(folder: Path) -> None:
+def vouch(folder: Path) -> None:
+    """Digests of what is there now, so that something else has to find what is wrong with it."""
     path = folder / "manifest.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | {"seed": 4}))
+    manifest = Manifest.model_validate_json(path.read_bytes())
+    digests = {key: digest((folder / key).read_bytes()) for key in manifest.digests if (folder / key).exists()}
+    path.write_text(manifest.model_copy(update={"digests": digests}).text())
+    for shard in range(manifest.layout.shards):
+        (folder / record_key(shard)).write_bytes(
+            record({key: digest((folder / key).read_bytes()) for key in manifest.layout.of(shard)})
+        )
+
+
+def change_json(name: str, change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:
+    def damage(folder: Path) -> None:
+        content = json.loads((folder / name).read_text())
+        change(content)
+        (folder / name).write_text(json.dumps(content, indent=2) + "\n")
+
+    return damage
+
+
+def consolidated(name: str, change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:
+    """In the copy of the metadata that readers open."""
+    return change_json("zarr.json", lambda group: change(group["consolidated_metadata"]["metadata"][name]))
+
+
+def write(name: str, data: bytes) -> Callable[[Path], None]:
+    return lambda folder: put(folder / name, data)
+
+
+def put(path: Path, data: bytes) -> None:
+    path.write_bytes(data)
+
+
+def edit(name: str, change: Callable[[bytes], bytes]) -> Callable[[Path], None]:
+    return lambda folder: put(folder / name, change((folder / name).read_bytes()))
+
+
+def flipped(data: bytes) -> bytes:
+    """One bit in the middle."""
+    middle = len(data) // 2
+    return data[:middle] + bytes([data[middle] ^ 4]) + data[middle + 1 :]
+
+
+def remove(name: str) -> Callable[[Path], None]:
+    return lambda folder: (folder / name).unlink()
+
+
+def swap(a: str, b: str) -> Callable[[Path], None]:
+    def damage(folder: Path) -> None:
+        first, second = (folder / a).read_bytes(), (folder / b).read_bytes()
+        put(folder / a, second)
+        put(folder / b, first)
+
+    return damage
 
 
 def open_ledger(folder: Path) -> None:
@@ -273,54 +309,188 @@ def open_ledger(folder: Path) -> None:
     set_value("energy_residual_rel", (1,), worst)(folder)
 
 
-def change_manifest(**changes: Any) -> Callable[[Path], None]:
-    """Other values in the configuration that the manifest tells of; its hash made to fit where `fit` is given."""
-
-    def change(folder: Path) -> None:
-        path = folder / "manifest.json"
-        manifest = json.loads(path.read_text())
-        fit = changes.pop("fit", False)
-        manifest["config"] |= changes
-        if fit:
-            config = Config.model_validate(manifest["config"])
-            manifest |= {"config_hash": config.hash, "seed": config.seed}
-        path.write_text(json.dumps(manifest))
-
-    return change
-
-
 @pytest.mark.parametrize(
-    ("damage", "message"),
+    ("change", "message"),
     [
-        (change_units, "disc_angle: units are 'deg', not 'rad'"),
-        (change_units_for_readers, "disc_spin: units are 'deg/s', not 'rad/s'"),
-        (drop_array, "disc_spin: missing"),
+        (
+            consolidated("disc_angle", lambda a: a["attributes"].update(units="deg")),
+            "disc_angle: units are 'deg', not 'rad'",
+        ),
+        (
+            change_json("zarr.json", lambda g: g["consolidated_metadata"]["metadata"].pop("disc_spin")),
+            "disc_spin: missing",
+        ),
         (set_value("split", (1,), "test"), "trajectory 1: split is test, but the design has"),
         (set_value("split", (2,), "all"), "trajectory 2: split is"),
         (open_ledger, r"trajectory 1: energy residual is [\d.]+ of the energy injected, above 0\.02"),
         (set_value("energy_residual_rel", (2,), 1e-3), "trajectory 2: energy_residual_rel is 0.001, but the series"),
-        (change_manifest(seed=99), r"manifest\.json: config_hash is \w+, but the configuration's is"),
-        (change_manifest(seed=99, fit=True), r"manifest\.json: describes the configuration \w+, but the arrays"),
-        (change_manifest(duration=-1.0), r"manifest\.json: .*duration"),
+        (
+            change_json("manifest.json", lambda m: m["config"].update(seed=99)),
+            r"config_hash is \w+, but the configuration's",
+        ),
+        (change_json("manifest.json", lambda m: m.update(seed=4)), "seed is 4, but the configuration's is 3"),
+        (change_json("manifest.json", lambda m: m["config"].update(duration=-1.0)), r"manifest\.json: .*duration"),
         (set_value("normal_force_upper", (4, 60, 30), -1.0), "trajectory 4: normal_force_upper pulls"),
         (set_value("disc_position", (0, 3, 1), np.inf), "trajectory 0: not finite: disc_position"),
         (set_value("disc_angle", (1, 7), np.nan), "trajectory 1: not finite: disc_angle"),
         (set_value("stored_energy", (1, 7, 2), 1.0), "trajectory 1: energy_residual is not"),
         (set_value("contact_lower", (0, 60), 0), "acts where contact_lower is 0"),
-        (set_value("done", (1,), 0), "1 of 3 shards are not finished"),
         (set_value("pad.E", (2,), 7.5e5), r"trajectory 2: pad\.E is 750000.0"),
         (set_value("failed", (3,), 1), "failed without a reason"),
-        (truncate, "shard 0 cannot be read"),
-        (change_seed, "seed is 4"),
-        (lambda folder: (folder / "manifest.json").unlink(), r"manifest\.json: missing"),
     ],
 )
-def test_damage_is_found(made: tuple[Path, Config], tmp_path: Path, damage: Any, message: str) -> None:
-    damage(copy(made[0], tmp_path / "set"))
-    findings = [x for x in check(str(tmp_path / "set")) if "no commit" not in x]
+def test_wrong_content_is_found(made: tuple[Path, Config], tmp_path: Path, change: Any, message: str) -> None:
+    """By the check, though every digest fits."""
+    change(folder := copy(made[0], tmp_path / "set"))
+    vouch(folder)
+    findings = [x for x in check(str(folder)) if "no commit" not in x]
     assert len(findings) == 1, findings
     assert re.search(message, findings[0])
     assert "\n" not in findings[0]
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (edit("disc_angle/c/0/0", flipped), r"disc_angle/c/0/0 is damaged.*remove .*finished/0\.sha256 and start"),
+        (edit("disc_angle/c/0/0", lambda data: data[:-40]), "disc_angle/c/0/0 is damaged"),
+        (edit("feed_forward/c/1/0", lambda data: data[:9] + bytes(64) + data[73:]), "feed_forward/c/1/0 is damaged"),
+        (edit("grasp_force/c/2", flipped), "grasp_force/c/2 is damaged"),
+        (remove("disc_spin/c/1/0"), "disc_spin/c/1/0 is missing"),
+        (swap("disc_spin/c/0/0", "disc_spin/c/1/0"), "disc_spin/c/0/0 is damaged"),
+        (write("finished/1.sha256", b""), r"finished/1\.sha256 is damaged"),
+        (edit("finished/1.sha256", flipped), r"finished/1\.sha256 is damaged|/c/1\S* is damaged"),
+        (remove("finished/1.sha256"), "1 of 3 shards are not finished"),
+        (edit("time/c/0", flipped), "time/c/0 is damaged"),
+        (edit("zarr.json", flipped), r"zarr\.json is damaged"),
+        (edit("zarr.json", lambda data: data + b"\n"), r"zarr\.json is damaged"),
+        (remove("zarr.json"), r"zarr\.json is missing"),
+        (write("manifest.json", b"[]"), r"manifest\.json is damaged"),
+        (write("manifest.json", b"\xff\xfe{"), r"manifest\.json is damaged"),
+        (write("manifest.json", b"[" * 100_000), r"manifest\.json is damaged"),
+        (change_json("manifest.json", lambda m: m.update(layout=3)), r"manifest\.json is damaged"),
+        (change_json("manifest.json", lambda m: m["config"].update(step=1e-3)), r"manifest\.json is damaged"),
+        (edit("manifest.json", lambda data: data + b" "), r"manifest\.json is damaged"),
+        (remove("manifest.json"), r"manifest\.json is missing"),
+    ],
+)
+def test_damage_is_found(made: tuple[Path, Config], tmp_path: Path, damage: Any, message: str) -> None:
+    """By the check, and by reading."""
+    damage(folder := copy(made[0], tmp_path / "set"))
+    findings = [x for x in check(str(folder)) if "no commit" not in x]
+    assert findings
+    assert re.search(message, findings[0])
+    assert "\n" not in "".join(findings)
+    with pytest.raises(StoreError, match=r"is damaged|is missing|are not finished") as refused:
+        open_dataset(str(folder)).load()
+    assert "\n" not in str(refused.value)
+    names = ["disc_angle", "feed_forward", "grasp_force", "disc_spin"]
+    if "time" not in message:  # which it does not read
+        with pytest.raises(StoreError, match=r"is damaged|is missing|are not finished"):
+            every_window(str(folder), names)
+
+
+def every_window(url: str, names: list[str]) -> list[dict[str, torch.Tensor]]:
+    windows = Trajectories(url, names)
+    return [windows[i] for i in range(len(windows))]
+
+
+@pytest.mark.parametrize("damage", [edit("disc_spin/zarr.json", flipped), write("disc_spin/copy", b"x")])
+def test_damage_to_what_readers_do_not_open_is_found_by_the_check(
+    made: tuple[Path, Config], tmp_path: Path, damage: Any
+) -> None:
+    damage(folder := copy(made[0], tmp_path / "set"))
+    assert len([x for x in check(str(folder)) if "no commit" not in x]) == 1
+    assert open_dataset(str(folder)).load().identical(open_dataset(str(made[0])).load())
+
+
+def test_a_file_behind_the_back_of_others_is_found_by_zarr_itself(made: tuple[Path, Config], tmp_path: Path) -> None:
+    """By the checksums of the arrays, without this package's reader."""
+    folder = copy(made[0], tmp_path / "set")
+    for name in ("disc_angle/c/0/0", "grasp_force/c/1"):
+        edit(name, flipped)(folder)
+        with pytest.raises(ValueError, match="checksum"):
+            np.asarray(zarr.open_group(str(folder))[name.partition("/")[0]][:])
+
+
+def test_a_damaged_shard_is_made_anew(made: tuple[Path, Config], tmp_path: Path) -> None:
+    """As the finding says."""
+    folder = copy(made[0], tmp_path / "set")
+    edit("disc_angle/c/0/0", flipped)(folder)
+    record = re.search(r"remove (\S+) and start", next(x for x in check(str(folder)) if "no commit" not in x))
+    assert record is not None
+    Path(record[1]).unlink()
+    generate(made[1], str(folder), Serial(), progress=False)
+    assert files(folder) == files(made[0])
+
+
+def test_standard_tools_check_the_shards(made: tuple[Path, Config], tmp_path: Path) -> None:
+    if (tool := shutil.which("sha256sum")) is None:
+        pytest.skip("needs sha256sum")
+    folder = copy(made[0], tmp_path / "set")
+    command = [tool, "--check", "--quiet", *(str(path) for path in (folder / "finished").iterdir())]
+    assert subprocess.run(command, cwd=folder, capture_output=True, check=False).returncode == 0
+    edit("disc_angle/c/0/0", flipped)(folder)
+    assert subprocess.run(command, cwd=folder, capture_output=True, check=False).returncode != 0
+
+
+def test_unfinished_shards_are_refused_or_left_out(made: tuple[Path, Config], tmp_path: Path) -> None:
+    folder = copy(made[0], tmp_path / "set")
+    remove("finished/1.sha256")(folder)
+    for read in (open_dataset, lambda url: Trajectories(url, [])):
+        with pytest.raises(StoreError, match="1 of 3 shards are not finished"):
+            read(str(folder))
+    assert open_dataset(str(folder), unfinished=True).trajectory.values.tolist() == [0, 1, 4]
+    assert Trajectories(str(folder), [], unfinished=True).trajectories.tolist() == [0, 1, 4]
+
+
+def test_what_is_not_finite_is_not_written(
+    made: tuple[Path, Config], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Unless it is marked as failed; a simulation whose results are not finite has failed."""
+    config = made[1]
+    store, design = open_or_create(str(tmp_path / "set"), config), points(config)
+    row = simulate_task(config, task(config, 4, design[4]))
+    angle = row["disc_angle"].copy()
+    angle[3] = np.nan
+    with pytest.raises(ValueError, match="trajectory 4 is not marked as failed, but not finite: disc_angle"):
+        store.write(2, [row | {"disc_angle": angle}])
+    assert store.unfinished() == [0, 1, 2]
+    series = simulation.series
+    monkeypatch.setattr(simulation, "series", lambda *given: series(*given) | {"disc_angle": angle})
+    row = simulate_task(config, task(config, 4, design[4]))
+    assert (row["failed"], row["reason"]) == (1, "not finite: disc_angle")
+    assert np.isnan(row["disc_angle"]).all()
+
+
+def test_leftovers_of_the_dead_are_removed_and_files_of_the_living_are_not(
+    made: tuple[Path, Config], tmp_path: Path
+) -> None:
+    """At the next start: partial files of a killed run, in the layout too, but none that somebody is writing."""
+    config, folder = made[1], tmp_path / "set"
+    content = layout.files(config)
+    for key, data in list(content.items())[:5]:
+        write_bytes(str(folder), key, data)
+    (folder / "zarr.json.0123456789abcdef.partial").write_bytes(b"half")
+    (folder / "time/c/0.0123456789abcdef.partial").parent.mkdir(parents=True)
+    (folder / "time/c/0.0123456789abcdef.partial").write_bytes(b"half")
+    with replacing(folder / "disc_angle/zarr.json") as partial:
+        partial.write_bytes(content["disc_angle/zarr.json"])
+        open_or_create(str(folder), config)
+        assert list(folder.rglob("*.partial")) == [partial]
+    generate(config, str(folder), Serial(), progress=False)
+    assert files(folder) == files(made[0])
+
+
+def test_whoever_lays_a_folder_out_later_changes_nothing(made: tuple[Path, Config], tmp_path: Path) -> None:
+    """Two that begin at once both find no manifest; the slower one must not undo what the faster one made since."""
+    config, folder = made[1], copy(made[0], tmp_path / "set")
+    create(str(folder), config)
+    assert files(folder) == files(made[0])
+    create(str(folder), other := config.model_copy(update={"seed": 99}))
+    with pytest.raises(StoreError, match="holds another dataset"):
+        open_or_create(str(folder), other)
+    assert files(folder) == files(made[0])
 
 
 def test_check_draws_its_picture(made: tuple[Path, Config], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -345,9 +515,9 @@ def test_a_failed_simulation_is_recorded(tmp_path: Path) -> None:
 
 def test_only_unfinished_shards_are_made_again(made: tuple[Path, Config], tmp_path: Path) -> None:
     folder, config = copy(made[0], tmp_path / "set"), made[1]
-    set_value("done", (1,), 0)(folder)
+    remove("finished/1.sha256")(folder)
     (folder / "disc_angle/c/1/0").unlink()
-    (folder / "disc_angle/c/1/0.1234.partial").write_bytes(b"half")
+    (folder / "disc_angle/c/1/0.0123456789abcdef.partial").write_bytes(b"half")
     before = {p: p.stat().st_mtime_ns for p in folder.rglob("c/**/*") if p.is_file()}
     generate(config, str(folder), Serial(), progress=False)
     assert files(folder) == files(made[0])
@@ -379,7 +549,8 @@ def test_an_unwritable_folder_is_refused(made: tuple[Path, Config]) -> None:
 
 def test_a_file_size_limit_is_said_and_costs_nothing(made: tuple[Path, Config], tmp_path: Path) -> None:
     """The operating system's own refusal, in the middle of a shard; without the limit the same command finishes."""
-    path, limit = write_config(tmp_path), max(len(data) for data in files(made[0]).values()) // 2
+    path, limit = write_config(tmp_path), max(len(data) for name, data in files(made[0]).items() if "/c/" in name) // 3
+    open_or_create(str(tmp_path / "set"), made[1])
     command = ["-m", "data_gen.generate", str(path), "--out", str(tmp_path / "set"), "--workers", "0"]
     limited = f"import resource, runpy, sys; sys.argv = {command[1:]}; import torchsoft.datasets.generate as g; " + (
         f"resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit})); sys.exit(g.main(sys.argv[1:]))"
@@ -412,7 +583,7 @@ def test_a_full_disk_is_said_and_costs_nothing(made: tuple[Path, Config], tmp_pa
     path, disk = write_config(tmp_path), tmp_path / "disk"
     disk.mkdir()
     size = sum(-(-len(data) // 4096) * 4096 for data in files(made[0]).values())
-    done = {"done/c/2", *(name for name in files(made[0]) if re.search(r"/c/2(/|$)", name))}
+    done = {"finished/2.sha256", *(name for name in files(made[0]) if re.search(r"/c/2(/|$)", name))}
     room = size - sum(-(-len(files(made[0])[name]) // 4096) * 4096 for name in done) // 2
     generate_it = f"{sys.executable} -m data_gen.generate {path} --out {disk}/set --workers 0"
     script = FULL.format(
@@ -474,7 +645,7 @@ def test_a_dask_cluster_that_loses_a_worker_makes_the_same_bytes(made: tuple[Pat
         from threading import Thread
 
         def kill_once_started() -> None:
-            while not list((tmp_path / "set" / "done").glob("c/*")):
+            while not list((tmp_path / "set" / "finished").glob("*.sha256")):
                 time.sleep(0.02)
             os.kill(next(iter(pids.values())), signal.SIGKILL)
 

@@ -12,86 +12,78 @@ from typing import Any
 
 import numpy as np
 import zarr
-from pydantic import ValidationError
 
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.coverage import figure
 from torchsoft.datasets.design import SPLITS, points, task
-from torchsoft.datasets.reader import local_path, open_dataset
-from torchsoft.datasets.schema import sizes, variables
+from torchsoft.datasets.manifest import COPY, MANIFEST, Manifest, digest, finished, record_key
+from torchsoft.datasets.reader import open_dataset, opened
+from torchsoft.datasets.schema import not_finite, sizes, variables
 from torchsoft.datasets.simulation import labels
-from torchsoft.datasets.store import MANIFEST, Store, filesystem, read_text
-from torchsoft.files import findings
+from torchsoft.datasets.storage import StoreError, filesystem, keys, read_bytes
+from torchsoft.datasets.vouched import Vouched
+from torchsoft.files import PARTIAL
+from torchsoft.plot.figures import save
+from torchsoft.tables import line
 
 
 def check(url: str) -> Iterator[str]:
-    """Every finding, as a sentence."""
+    """Every finding, as a sentence. Raises nothing."""
     try:
-        config, manifest = read_manifest(url)
-    except (ValueError, OSError) as error:
-        yield f"{MANIFEST}: {error}"
+        yield from findings(url)
+    except StoreError as error:
+        yield str(error)
+    except Exception as error:  # whatever a damaged file makes a library raise is a finding
+        yield line(f"{url} cannot be checked: {type(error).__name__}: {error}")
+
+
+def findings(url: str) -> Iterator[str]:
+    """Every finding; raises what keeps it from going on."""
+    manifest = Manifest.read(url)
+    try:
+        config = Config.model_validate_json(json.dumps(manifest.config))
+    except ValueError as error:
+        yield f"{MANIFEST}: its configuration is impossible: {error}"
         return
-    for key in ("torchsoft", "seed", "config_hash", "config", "parameters", "layout"):
-        if key not in manifest:
-            yield f"{MANIFEST}: `{key}` is missing"
-    if not manifest.get("commit"):
+    if not manifest.commit:
         yield f"{MANIFEST}: no commit; the dataset was made outside a repository"
-    if manifest.get("config_hash") != config.hash:
-        yield f"{MANIFEST}: config_hash is {manifest.get('config_hash')}, but the configuration's is {config.hash}"
+    if manifest.config_hash != config.hash:
+        yield f"{MANIFEST}: config_hash is {manifest.config_hash}, but the configuration's is {config.hash}"
         return  # nothing else can be held against a configuration that was changed
-    if manifest.get("seed") != config.seed:
-        yield f"{MANIFEST}: seed is {manifest.get('seed')}, but the configuration's is {config.seed}"
-    try:
-        store = Store(url, config)
-    except (OSError, ValueError) as error:
-        yield f"the store cannot be opened: {error}"
+    if manifest.seed != config.seed:
+        yield f"{MANIFEST}: seed is {manifest.seed}, but the configuration's is {config.seed}"
+    damaged = list(check_files(url, manifest))
+    yield from damaged
+    if damaged:
         return
-    made_of = store.group.attrs.get("config_hash")
-    if made_of != config.hash:
-        yield f"{MANIFEST}: describes the configuration {config.hash}, but the arrays were made of {made_of}"
-        return
-    structure = list(check_structure(store))
+    store = Vouched(url, manifest, finished(url, manifest.layout))
+    structure = list(check_arrays(opened(store), config))
     yield from structure
     if structure:
         return
-    unfinished = store.unfinished()
-    if unfinished:
+    if unfinished := sorted(set(range(config.shards)) - store.finished):
         yield f"{len(unfinished)} of {config.shards} shards are not finished, the first is shard {unfinished[0]}"
     design = points(config)
-    for shard in sorted(set(range(config.shards)) - set(unfinished)):
-        try:
-            yield from check_shard(store, shard, design)
-        except Exception as error:  # whatever a damaged file makes the decoder raise is a finding
-            yield f"shard {shard} cannot be read: {type(error).__name__}: {error}"
+    for shard in sorted(store.finished):
+        yield from check_shard(store, config, shard, design)
 
 
-def read_manifest(url: str) -> tuple[Config, dict[str, Any]]:
-    """The configuration that the manifest describes. Raises `ValueError`."""
-    text = read_text(url, MANIFEST)
-    if text is None:
-        raise ValueError("missing")
-    manifest = json.loads(text)
-    try:
-        return Config.model_validate(manifest.get("config")), manifest
-    except ValidationError as error:
-        raise ValueError(f"its configuration is impossible: {findings(error)}") from error
-
-
-def check_structure(store: Store) -> Iterator[str]:
-    """Arrays, their shapes, dimensions and units: in each array's own metadata, and in the copy that readers open."""
-    found: dict[str, None] = {}
-    for consolidated in (False, True):
-        try:
-            group = zarr.open_group(local_path(store.url), mode="r", use_consolidated=consolidated)
-        except (OSError, ValueError) as error:
-            found[f"the consolidated metadata cannot be read: {error}"] = None
-            continue
-        found |= dict.fromkeys(check_arrays(group, store.config))
-    yield from found
+def check_files(url: str, manifest: Manifest) -> Iterator[str]:
+    """Files laid out at the start that are missing or damaged, and files that do not belong there."""
+    layout, there = manifest.layout, keys(url)
+    for key, expected in manifest.digests.items():
+        data = read_bytes(url, key)
+        if data is None or digest(data) != expected:
+            yield f"{url}/{key} is {'missing' if data is None else 'damaged'}; {COPY}"
+    known = {MANIFEST, *manifest.digests, *(record_key(shard) for shard in range(layout.shards))}
+    running = len(finished(url, layout)) < layout.shards
+    for key in there:
+        if key not in known and layout.shard(key) is None and not (running and PARTIAL.search(key)):
+            yield f"{url}/{key} does not belong to the dataset; remove it"
 
 
 def check_arrays(group: zarr.Group, config: Config) -> Iterator[str]:
-    """Findings in one copy of the metadata."""
+    """Arrays, their shapes, dimensions and units."""
     length = sizes(config)
     for name, variable in variables(config).items():
         array = group.get(name)
@@ -108,29 +100,39 @@ def check_arrays(group: zarr.Group, config: Config) -> Iterator[str]:
             yield f"{name}: its shards hold {(array.shards or array.chunks)[0]} trajectories, not one task's"
 
 
-def check_shard(store: Store, shard: int, design: np.ndarray[Any, Any]) -> Iterator[str]:
+def check_shard(store: Vouched, config: Config, shard: int, design: np.ndarray[Any, Any]) -> Iterator[str]:
     """Everything about the trajectories of one finished shard."""
-    config, here, schema = store.config, store.rows(shard), variables(store.config)
-    data = {name: np.asarray(store.array(name)[here.start : here.stop]) for name in schema}
+    schema, group, data = variables(config), opened(store), dict[str, Any]()
+    size = config.trajectories_per_shard
+    here = range(shard * size, min((shard + 1) * size, config.trajectories))
+    for name in schema:
+        try:
+            array = group[name]
+            assert isinstance(array, zarr.Array)
+            data[name] = np.asarray(array[here.start : here.stop])
+        except StoreError as error:
+            yield str(error)
+            if record_key(shard) in str(error).partition(";")[0]:
+                return  # nothing vouches for the others either
+    if len(data) < len(schema):
+        return
     for row, index in enumerate(here):
         one = {name: values[row] for name, values in data.items()}
         finding = f"trajectory {index}: ".__add__
         for name, value in labels(task(config, index, design[index])).items():
             if one[name] != value:
                 yield finding(f"{name} is {one[name]}, but the design has {value}")
-        floats = [name for name, v in schema.items() if v.dtype.startswith("float") and len(v.dims) > 1]
         if one["failed"]:
-            filled = [name for name in floats if not np.isnan(one[name]).all()]
+            series = [name for name, v in schema.items() if v.dtype.startswith("float") and len(v.dims) > 1]
+            filled = [name for name in series if not np.isnan(one[name]).all()]
             if not one["reason"]:
                 yield finding("failed without a reason")
             elif filled:
                 yield finding(f"failed, but {', '.join(filled)} hold numbers")
-            continue
-        bad = [name for name in (*floats, "grasp_force", "energy_residual_rel") if not np.isfinite(one[name]).all()]
-        if bad:
+        elif bad := not_finite(config, one):
             yield finding(f"not finite: {', '.join(bad)}")
-            continue
-        yield from map(finding, check_physics(config, one))
+        else:
+            yield from map(finding, check_physics(config, one))
 
 
 def check_physics(config: Config, one: dict[str, Any]) -> Iterator[str]:
@@ -155,7 +157,7 @@ def check_physics(config: Config, one: dict[str, Any]) -> Iterator[str]:
 
 def summary(url: str) -> str:
     """Sizes and counts."""
-    data, (fs, root) = open_dataset(url), filesystem(url)
+    data, (fs, root) = open_dataset(url, unfinished=True), filesystem(url)
     files = fs.find(root, detail=True)
     stored, failed = sum(info["size"] for info in files.values()), int(data.failed.sum())
     counts = ", ".join(f"{int((data.split == name).sum())} {name}" for name in SPLITS)
@@ -175,11 +177,12 @@ def main(arguments: list[str] | None = None) -> int:
         print(finding)
     try:
         print(summary(given.store))
-        figure(open_dataset(given.store), read_manifest(given.store)[0]).savefig(given.picture, dpi=120)
+        config = Config.model_validate_json(json.dumps(Manifest.read(given.store).config))
+        save(figure(open_dataset(given.store, unfinished=True), config), given.picture, dpi=120)
         print(f"picture in {given.picture}")
     except Exception as error:  # a damaged store has been reported above; the picture must not hide it
         count += 1
-        print(f"no summary or picture: {type(error).__name__}: {error}")
+        print(line(f"no summary or picture: {type(error).__name__}: {error}"))
     print("sound" if count == 0 else f"{count} findings")
     return int(count > 0)
 

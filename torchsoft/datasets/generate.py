@@ -18,11 +18,26 @@ import torch
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
+from torchsoft.cost import agree
 from torchsoft.datasets.config import Config
+from torchsoft.datasets.cost import cost
 from torchsoft.datasets.design import points, task
 from torchsoft.datasets.simulation import simulate_task
-from torchsoft.datasets.store import Store, StoreError, open_or_create
+from torchsoft.datasets.storage import StoreError
+from torchsoft.datasets.store import Store, open_or_create
 from torchsoft.processes import local_processes
+from torchsoft.tables import line
+
+CLUSTER = 16
+"""Workers that a cluster is taken to have."""
+
+MOST = 1000
+"""Local processes."""
+
+COARSE = 5e-3
+"""Steps longer than this [s] get a note."""
+
+HELP = "take fewer trajectories, a larger step or a shorter duration"
 
 
 class Serial(Executor):
@@ -100,19 +115,30 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", required=True, help="folder or fsspec URL of the store")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="local processes; 0 stays in this one")
     parser.add_argument("--scheduler", help="address of a Dask scheduler, such as tcp://host:8786")
+    parser.add_argument("--yes", action="store_true", help="begin even what takes hours, or much memory or disk")
     given = parser.parse_args(arguments)
+    if not 0 <= given.workers <= MOST:
+        parser.error(f"argument --workers: should be from 0 to {MOST}, not {given.workers}")
     try:
         config = Config.from_toml(given.config)
+        agree(cost(config, CLUSTER if given.scheduler else given.workers), given.yes, HELP)
+        if config.step > COARSE:
+            print(
+                f"note: step = {config.step:g} s is coarse: the energy balance may be off by percents", file=sys.stderr
+            )
         if given.scheduler:
             with dask_cluster(given.scheduler) as executor:
-                failed = generate(config, given.out, executor, workers=16)
+                failed = generate(config, given.out, executor, CLUSTER)
         elif given.workers <= 0:
             failed = generate(config, given.out, Serial())
         else:
             with local_processes(given.workers) as executor:
                 failed = generate(config, given.out, executor, given.workers)
     except (ValueError, StoreError) as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {line(error, 2000)}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        print(f"error: {f'{error.filename}: {error.strerror}' if error.filename else line(error)}", file=sys.stderr)
         return 2
     except BrokenProcessPool:
         print("error: a worker was killed, perhaps for memory; start again to make what is missing", file=sys.stderr)

@@ -1,23 +1,31 @@
-"""Datasets of trajectories in a zarr store, for torch's `DataLoader` and for xarray."""
+"""Datasets of trajectories in a zarr store, for torch's `DataLoader` and for xarray. What was not written so is refused."""
 
 import os
 from collections.abc import Sequence
 from typing import Any
 
-import fsspec
 import numpy as np
 import torch
 import xarray as xr
 import zarr
-from fsspec.implementations.local import LocalFileSystem
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from torchsoft.datasets.manifest import Manifest, finished
+from torchsoft.datasets.storage import StoreError
+from torchsoft.datasets.vouched import Vouched
 
-def local_path(url: str) -> str:
-    """What zarr and xarray open: the path where a URL is a local one, such as `file:///data/set`, else the URL."""
-    fs, root = fsspec.url_to_fs(url)
-    return root if isinstance(fs, LocalFileSystem) else url
+
+def vouched(url: str, *, unfinished: bool = False) -> Vouched:
+    """The store for reading. Raises `StoreError` for a dataset that is damaged, or not finished unless that is allowed."""
+    manifest = Manifest.read(url)
+    there = finished(url, manifest.layout)
+    if (lacking := manifest.layout.shards - len(there)) and not unfinished:
+        raise StoreError(
+            f"{url}: {lacking} of {manifest.layout.shards} shards are not finished; start `python -m data_gen.generate` "
+            "again to make them, or give `unfinished=True` to leave their trajectories out"
+        )
+    return Vouched(url, manifest, there)
 
 
 class Trajectories(Dataset[dict[str, Tensor]]):
@@ -25,18 +33,20 @@ class Trajectories(Dataset[dict[str, Tensor]]):
 
     Item i holds every variable of `variables` in SI units, a series as (window, ...) and a number of the trajectory as (),
     besides `trajectory` and `start`, its origin. `window` is a number of samples, the whole run by
-    default; windows of a trajectory begin every `stride` samples, `window` by default. Unfinished shards and failed
-    simulations are left out. The object is small, can be pickled, and opens the store in each process for itself, forked
-    ones included.
+    default; windows of a trajectory begin every `stride` samples, `window` by default. Failed simulations are left out, and
+    trajectories of unfinished shards too where `unfinished` says so. The object is small, can be pickled, and opens the store
+    in each process for itself, forked ones included. Each of these reads a file whole when it first touches it, to hold it
+    against its digest.
 
-    Raises `ValueError` for an unknown variable or split, or a window that does not fit.
+    Raises `ValueError` for an unknown variable or split, or a window that does not fit, and `StoreError` for a dataset that is
+    damaged or unfinished; the same when a damaged file is first touched.
     """
 
     def __init__(
         self, url: str, variables: Sequence[str], *, split: str | None = None, window: int | None = None,
-        stride: int | None = None, dtype: torch.dtype = torch.float64,
+        stride: int | None = None, dtype: torch.dtype = torch.float64, unfinished: bool = False,
     ) -> None:  # fmt: skip
-        self.url, self.variables, self.dtype = str(url), tuple(variables), dtype
+        self.url, self.variables, self.dtype, self.unfinished = str(url), tuple(variables), dtype, unfinished
         self._group: zarr.Group | None = None
         self._opened_by = 0
         for name in self.variables:
@@ -54,21 +64,20 @@ class Trajectories(Dataset[dict[str, Tensor]]):
         self.trajectories = self._usable(split)
 
     def _usable(self, split: str | None) -> np.ndarray[Any, Any]:
-        """Numbers of the trajectories that are finished, sound and in the split."""
-        splits = np.asarray(self.array("split")[:])
-        done = np.repeat(np.asarray(self.array("done")[:]), self.array("split").chunks[0])[: len(splits)]
-        usable = (done == 1) & (np.asarray(self.array("failed")[:]) == 0)
+        """Numbers of the trajectories that are sound and in the split; those of unfinished shards count as failed."""
+        usable = np.asarray(self.array("failed")[:]) == 0
         if split is not None:
             if split not in ("train", "validation", "test"):
                 raise ValueError(f"`split` must be 'train', 'validation' or 'test', but is {split!r}")
-            usable &= splits == split
+            usable &= np.asarray(self.array("split")[:]) == split
         return np.flatnonzero(usable)
 
     @property
     def group(self) -> zarr.Group:
         """The store, opened on first use; once more after a fork, which connections do not survive."""
         if self._group is None or self._opened_by != os.getpid():
-            self._group, self._opened_by = zarr.open_group(local_path(self.url), mode="r"), os.getpid()
+            self._group = opened(vouched(self.url, unfinished=self.unfinished))
+            self._opened_by = os.getpid()
         return self._group
 
     def array(self, name: str) -> zarr.Array[Any]:
@@ -99,6 +108,19 @@ class Trajectories(Dataset[dict[str, Tensor]]):
         return item
 
 
-def open_dataset(url: str) -> xr.Dataset:
-    """The whole store, lazily, with named dimensions and units."""
-    return xr.open_zarr(local_path(url))
+def opened(store: Vouched) -> zarr.Group:
+    """The arrays."""
+    return zarr.open_group(store, mode="r", zarr_format=3, use_consolidated=True)
+
+
+def open_dataset(url: str, *, unfinished: bool = False) -> xr.Dataset:
+    """The whole store, lazily, with named dimensions and units; without unfinished trajectories where that is allowed.
+
+    Raises `StoreError` for a dataset that is damaged or unfinished; the same when a damaged file is first touched.
+    """
+    store = vouched(url, unfinished=unfinished)
+    data = xr.open_zarr(store, consolidated=True, zarr_format=3)
+    if len(store.finished) < store.layout.shards:
+        shard = np.arange(data.sizes["trajectory"]) // store.layout.trajectories_per_shard
+        data = data.isel(trajectory=np.isin(shard, list(store.finished)))
+    return data

@@ -1,6 +1,9 @@
 """Every array of a dataset: name, dimensions, unit, meaning and type."""
 
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from torchsoft.channels import PADS, VARIABLES
 from torchsoft.datasets.config import RATIO, Config
@@ -83,3 +86,9 @@ def sizes(config: Config) -> dict[str, int]:
         "trajectory": config.trajectories, "time": config.samples, "axis": 2, "lower_surface": nodes, "upper_surface": nodes,
         **{dimension: len(parts) for dimension, parts in energies(config).values()},
     }  # fmt: skip
+
+
+def not_finite(config: Config, row: dict[str, Any]) -> list[str]:
+    """Names of the arrays that are not finite in a trajectory, unless it is marked as failed."""
+    expected = (name for name, v in variables(config).items() if v.dtype.startswith("float") and name != "failure_time")
+    return [] if row["failed"] else [name for name in expected if not np.isfinite(row[name]).all()]

@@ -8,7 +8,7 @@ import torch
 from torchsoft.channels import PADS
 from torchsoft.datasets.config import RATIO, Config
 from torchsoft.datasets.design import Task, excitation
-from torchsoft.datasets.schema import KEPT, energies, sizes, variables
+from torchsoft.datasets.schema import KEPT, energies, not_finite, sizes, variables
 from torchsoft.excitation import reference
 from torchsoft.physics.equilibrium import holding_force, press, rest
 from torchsoft.physics.paper import SoftGrasp
@@ -48,7 +48,10 @@ def simulate_task(config: Config, task: Task) -> Row:
         return out | done | {"failed": 1, "reason": failure.reason, "failure_time": failure.time}
     except (np.linalg.LinAlgError, RuntimeError, ValueError) as failure:
         return out | {"failed": 1, "reason": f"{type(failure).__name__}: {failure}"}
-    return out | series(config, model, run) | {"grasp_force": force}
+    row = out | series(config, model, run) | {"grasp_force": force}
+    if bad := not_finite(config, row):
+        return out | {"failed": 1, "reason": f"not finite: {', '.join(bad)}"}
+    return row
 
 
 def start(model: SoftGrasp) -> torch.Tensor:
