@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, Strokes
-from torchsoft.solve.stepper import SimulationFailed
+from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import RIG, Problem, Unknown, record
 from torchsoft.sysid.information import standard_deviations, step_error, step_shift
 from torchsoft.sysid.recording import Array

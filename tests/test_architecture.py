@@ -19,8 +19,11 @@ FLOWS = {
         arguments mesh shapes contact material pads motion multibond state parts condensed validity rig energy paper
         equilibrium stability .
     """,
-    "solve": "grid kernel laws system stepper adjoint tangent unrolled continuous trajectory ledger simulate torchdiffeq .",
-    "solve.kernel": "cache . arrays linear inertia interface stage taped run adjoint tangent",
+    "solve": """
+        grid kernel laws system progress tolerances stepper adjoint tangent unrolled continuous trajectory ledger simulate
+        torchdiffeq .
+    """,
+    "solve.kernel": "cache . arrays linear inertia interface stage step taped run adjoint tangent",
 }
 """For every folder with layers its modules and folders from the top down; "." is what the folder's own file imports."""
 APART = ("plot", "sysid", "reduced", "datasets")

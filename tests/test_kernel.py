@@ -13,8 +13,9 @@ from torchsoft import Ellipse, Rig, Shape, simulate
 from torchsoft.codegen.invoke import call_linearise, call_pullback, call_value
 from torchsoft.physics.contact import distance_law, free_law, interface_law
 from torchsoft.scenario import grasp_and_roll
-from torchsoft.solve.kernel.run import GAMMA
-from torchsoft.solve.stepper import ImplicitStepper, Segment
+from torchsoft.solve.kernel.step import GAMMA
+from torchsoft.solve.progress import Segment
+from torchsoft.solve.stepper import ImplicitStepper
 from torchsoft.solve.system import contact_laws
 
 POINTS = 450

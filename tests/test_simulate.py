@@ -30,7 +30,7 @@ from torchsoft import (
 )  # fmt: skip
 from torchsoft.excitation import Excitation, MultiSine, begin, start
 from torchsoft.solve.adjoint import GradientFailed
-from torchsoft.solve.stepper import SimulationFailed
+from torchsoft.solve.progress import SimulationFailed
 
 T = times(0.02, 11)
 

@@ -22,7 +22,8 @@ from torchsoft import (
 )
 from torchsoft.physics.energy import stored
 from torchsoft.scenario import grasp_and_roll
-from torchsoft.solve.stepper import ImplicitStepper, Segment
+from torchsoft.solve.progress import Segment
+from torchsoft.solve.stepper import ImplicitStepper
 
 
 def test_second_order_on_a_smooth_motion(fidelity: str) -> None:
@@ -135,7 +136,7 @@ def test_a_step_that_newton_does_not_solve_is_halved() -> None:
         stepper = ImplicitStepper(model, step=2e-3, max_iterations=iterations)
         segments: list[Segment] = []
         *_, last = stepper.integrate(y0, t, segments)
-        assert sum(len(segment.chunk.starts) for segment in segments) == last.steps
+        assert sum(len(segment.plan.h) for segment in segments) == last.steps
         assert last.rows == len(t)
         runs.append(last)
     free, cut = runs

@@ -11,8 +11,9 @@ from torchsoft.physics.paper import SoftGrasp
 from torchsoft.physics.parts import PD, Actuator, Body, Contact
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.shapes import Circle, Ellipse, Shape
+from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import Interrupted, simulate
-from torchsoft.solve.stepper import METHOD, SimulationFailed
+from torchsoft.solve.stepper import METHOD
 from torchsoft.solve.torchdiffeq import register
 from torchsoft.solve.trajectory import Trajectory
 

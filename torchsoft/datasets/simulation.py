@@ -13,8 +13,8 @@ from torchsoft.excitation import reference
 from torchsoft.physics.equilibrium import holding_force, press, rest
 from torchsoft.physics.paper import SoftGrasp
 from torchsoft.scenario import find_grasp_force
+from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import simulate
-from torchsoft.solve.stepper import SimulationFailed
 from torchsoft.solve.trajectory import Trajectory
 
 Row = dict[str, Any]

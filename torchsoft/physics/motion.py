@@ -1,15 +1,15 @@
 """What a rig is asked to do: signals of time, such as the paper's 7th-order profiles (Eq. 20-29)."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from scipy.interpolate import CubicSpline
 from torch import Tensor, nn
 
 
-class Profile(nn.Module):
-    """A signal that goes from value to value along 7th-order polynomials, at rest (rate, second and third derivative
-    zero) at every knot (Eq. 20-29); constant before the first knot and after the last.
+class Piecewise(nn.Module):
+    """A signal of polynomials between knots; constant before the first knot and after the last.
 
     times (k,) [s] strictly increasing, values (k,). Raises `ValueError` for anything else.
     """
@@ -30,20 +30,44 @@ class Profile(nn.Module):
         # a tensor with a graph keeps it; anything else becomes a parameter that is not trained unless asked for
         self.values = many.double() if many.requires_grad else nn.Parameter(many.double(), requires_grad=False)
 
-    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Value and rate at t (...)."""
+    def control(self) -> Tensor:
+        """Control points of every piece's polynomial, in Bernstein's form (k - 1, degree + 1)."""
+        raise NotImplementedError
+
+    def pieces(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Start and span [s] of every piece, and its control points; one piece at least."""
         if len(self.times) == 1:
-            return self.values[0].expand(t.shape), torch.zeros_like(t)
-        i = torch.searchsorted(self.times, t.detach().contiguous(), right=True).clamp(1, len(self.times) - 1)
-        span = self.times[i] - self.times[i - 1]
-        u = ((t - self.times[i - 1]) / span).clamp(0.0, 1.0)
-        start, step = self.values[i - 1], self.values[i] - self.values[i - 1]
-        blend = u**4 * (35.0 + u * (-84.0 + u * (70.0 - 20.0 * u)))  # (20) with (22)-(24)
-        rate = 140.0 * u**3 * (1.0 - u) ** 3 / span  # (21)
-        return start + step * blend, step * rate
+            return self.times, torch.ones_like(self.times), self.values[:, None]
+        return self.times[:-1], self.times.diff(), self.control()
+
+    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        """Value and rate at t (...), by de Casteljau's scheme, which is exact at the knots."""
+        at, span, control = self.pieces()
+        i = torch.searchsorted(at, t.detach().contiguous(), right=True).clamp(min=1) - 1
+        u = (t - at[i]) / span[i]
+        inside = ((u >= 0) & (u <= 1)).to(t.dtype)
+        u = u.clamp(0.0, 1.0)
+        points = list(control[i].unbind(-1))
+        degree, rate = len(points) - 1, torch.zeros_like(u)
+        while len(points) > 1:
+            rate = degree * (points[1] - points[0])
+            points = [(1 - u) * a + u * b for a, b in pairwise(points)]
+        return points[0], rate / span[i] * inside
 
 
-class Sampled(Profile):
+class Profile(Piecewise):
+    """A signal that goes from value to value along 7th-order polynomials, at rest (rate, second and third derivative
+    zero) at every knot (Eq. 20-29); constant before the first knot and after the last.
+
+    times (k,) [s] strictly increasing, values (k,). Raises `ValueError` for anything else.
+    """
+
+    def control(self) -> Tensor:
+        """Control points of every piece (k - 1, 8): four at either knot, which makes (20) with (22)-(24)."""
+        return torch.cat((self.values[:-1, None].expand(-1, 4), self.values[1:, None].expand(-1, 4)), -1)
+
+
+class Sampled(Piecewise):
     """A recorded set-point: the cubic through values (k,) at times (k,) [s] with the given rates (k,), or with those of the
     natural choice, a cubic spline; constant before the first and after the last."""
 
@@ -63,20 +87,11 @@ class Sampled(Profile):
             raise ValueError(f"`rates` must hold one finite number per time ({len(self.times)}), but are {rates}")
         self.register_buffer("rates", slope)
 
-    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Value and rate at t (...)."""
-        if len(self.times) == 1:
-            return super().forward(t)
-        i = torch.searchsorted(self.times, t.detach().contiguous(), right=True).clamp(1, len(self.times) - 1)
-        span = self.times[i] - self.times[i - 1]
-        u = (t - self.times[i - 1]) / span
-        inside = ((u >= 0) & (u <= 1)).to(t.dtype)
-        u = u.clamp(0.0, 1.0)
-        a, step = self.values[i - 1], self.values[i] - self.values[i - 1]
-        p, q = span * self.rates[i - 1] - step, step - span * self.rates[i]
-        value = a + u * step + u * (1 - u) * ((1 - u) * p + u * q)
-        rate = (step + (1 - 2 * u) * ((1 - u) * p + u * q) + u * (1 - u) * (q - p)) / span
-        return value, rate * inside
+    def control(self) -> Tensor:
+        """Control points of every piece (k - 1, 4)."""
+        third = self.times.diff() / 3
+        a, b = self.values[:-1], self.values[1:]
+        return torch.stack((a, a + third * self.rates[:-1], b - third * self.rates[1:], b), -1)
 
 
 class Reference(nn.Module):

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from torchsoft.solve.kernel.adjoint import backward
 from torchsoft.solve.kernel.arrays import Array, scratch
-from torchsoft.solve.stepper import ImplicitStepper, Progress, Segment
+from torchsoft.solve.progress import Progress, Segment
+from torchsoft.solve.stepper import ImplicitStepper
 
 TAPE_BYTES = 1e9
 """Tapes kept of one run [bytes]; beyond that the backward sweep makes each segment's again from where it began."""
@@ -34,7 +35,7 @@ def iterate(stepper: ImplicitStepper, y0: Tensor, t: Tensor) -> Iterator[tuple[T
     assert out is not None
     solution = torch.from_numpy(out.y)
     if segments is not None:
-        signals = stepper.signals([segment.chunk for segment in segments])
+        signals = stepper.signals([segment.plan for segment in segments])
         solution = _Solution.apply(stepper, segments, solution, y0, stepper.compiled.p, signals)
     yield solution, out  # pyright: ignore[reportReturnType]
 
@@ -72,13 +73,14 @@ def run_adjoint(stepper: ImplicitStepper, segments: list[Segment], y_bar: Tensor
     signals_bar = [np.zeros(segment.signals.shape) for segment in segments]
     for number in range(len(segments) - 1, -1, -1):
         segment = segments[number]
-        s, tape, h = stepper.compiled.system(segment.chunk.h), stepper.tape(segment), segment.chunk.h
+        plan, tape = segment.plan, stepper.tape(segment)
+        s = stepper.compiled.system(float(plan.h[0]))
         failed = backward(
-            s, scratch(s, stepper.layout.size), h, tape, segment.signals, segment.chunk.keep, rows[segment.rows], carried,
-            p_bar, signals_bar[number],
+            s, scratch(s, stepper.layout.size), plan.h, tape, segment.signals, plan.out_step, plan.out_part,
+            rows[segment.rows], carried, p_bar, signals_bar[number],
         )  # fmt: skip
         if failed >= 0:
-            raise GradientFailed(f"the gradient is not finite at t = {segment.chunk.starts[failed]:.4f} s")
+            raise GradientFailed(f"the gradient is not finite at t = {plan.starts[failed]:.4f} s")
     return torch.from_numpy(carried) + y_bar[0], torch.from_numpy(p_bar), torch.from_numpy(np.concatenate(signals_bar))
 
 

@@ -1,4 +1,4 @@
-"""The time grid of a run: output times, and the equal steps that each output interval is cut into."""
+"""The steps of a run: equal ones between output times, or those that tolerances chose, and where the outputs lie in them."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -14,21 +14,34 @@ CHUNK = 500
 """Steps per compiled call: how often progress is shown and Ctrl-C is heard."""
 
 
-class Chunk(NamedTuple):
-    """Equal steps of h [s], taken in one compiled call: their starting times, and which of them end at an output."""
+class Plan(NamedTuple):
+    """Steps taken in one compiled call: their starts and lengths h [s], and per output its step and the part of it (0 to 1)."""
 
-    h: float
-    starts: NDArray[np.floating]
-    keep: NDArray[np.bool_]
+    starts: NDArray[np.float64]
+    h: NDArray[np.float64]
+    out_step: NDArray[np.int64]
+    out_part: NDArray[np.float64]
 
-    def part(self, first: int, end: int) -> "Chunk":
+    def part(self, first: int, end: int) -> "Plan":
         """Some of the steps."""
-        return Chunk(self.h, self.starts[first:end], self.keep[first:end])
+        rows = (self.out_step >= first) & (self.out_step < end)
+        return Plan(self.starts[first:end], self.h[first:end], self.out_step[rows] - first, self.out_part[rows])
 
-    def halved(self, step: int) -> "Chunk":
+    def halved(self, step: int) -> "Plan":
         """One of the steps, as two of half the length."""
-        begin, h = self.starts[step], 0.5 * self.h
-        return Chunk(h, np.array([begin, begin + h]), np.array([False, self.keep[step]]))
+        begin, h, parts = self.starts[step], 0.5 * self.h[step], self.out_part[self.out_step == step]
+        later = parts > 0.5
+        return Plan(
+            np.array([begin, begin + h]),
+            np.array([h, h]),
+            later.astype(np.int64),
+            np.where(later, 2 * parts - 1, 2 * parts),
+        )
+
+    @property
+    def output_times(self) -> NDArray[np.float64]:
+        """Times of the outputs [s]."""
+        return self.starts[self.out_step] + self.out_part * self.h[self.out_step]
 
 
 MOST_STEPS = 100_000_000
@@ -66,8 +79,9 @@ def check_times(t: Tensor, step: float | None = None) -> None:
         )
 
 
-def chunks(t: Tensor, step: float) -> Iterator[Chunk]:
-    """Cut the intervals between the times t (T,) [s] into equal steps no longer than `step` [s], CHUNK at a time."""
+def equal_steps(t: Tensor, step: float) -> Iterator[Plan]:
+    """Cut the intervals between the times t (T,) [s] into equal steps no longer than `step` [s], CHUNK at a time; the steps of
+    one plan have one length."""
     times = t.numpy()
     spans = np.diff(times)
     counts = np.maximum(1, np.ceil(spans / step * (1 - 1e-9))).astype(int)
@@ -76,7 +90,37 @@ def chunks(t: Tensor, step: float) -> Iterator[Chunk]:
     for equal in np.split(np.arange(len(spans)), np.flatnonzero(changes) + 1):
         n, h = int(counts[equal[0]]), float(sizes[equal[0]])
         starts = (times[equal, None] + h * np.arange(n)).ravel()
-        keep = np.zeros(len(starts), np.bool_)
-        keep[n - 1 :: n] = True
         for k in range(0, len(starts), CHUNK):
-            yield Chunk(h, starts[k : k + CHUNK], keep[k : k + CHUNK])
+            here = starts[k : k + CHUNK]
+            ends = np.flatnonzero((np.arange(k, k + len(here)) + 1) % n == 0)
+            yield Plan(np.asarray(here, np.float64), np.full(len(here), h), ends, np.ones(len(ends)))
+
+
+def check_knots(knots: Tensor) -> NDArray[np.float64]:
+    """The ends of given steps (steps + 1,) [s]. Raises `ValueError` unless they are two or more, finite and increasing."""
+    check_array("knots", knots)
+    if knots.ndim != 1 or len(knots) < 2 or not bool(torch.isfinite(knots).all()) or not bool((knots.diff() > 0).all()):
+        raise ValueError(
+            f"`knots` must be two times or more [s], finite and increasing, but has shape {tuple(knots.shape)}"
+        )
+    return knots.detach().numpy()
+
+
+def given_steps(t: Tensor, knots: NDArray[np.float64]) -> Iterator[Plan]:
+    """The steps between `knots` (n + 1,) [s], of another run, with outputs at t (T,); CHUNK at a time.
+
+    Raises `ValueError` unless they cover t from its first time on.
+    """
+    times, h = t.numpy(), np.diff(knots)
+    slack = 1e-9 * h[-1]
+    if knots[0] != times[0] or knots[-1] < times[-1] - slack:
+        raise ValueError(
+            f"`knots` must go from t[0] = {times[0]:g} s to t[-1] = {times[-1]:g} s, but go from {knots[0]:g} s to "
+            f"{knots[-1]:g} s"
+        )
+    at = np.minimum(np.searchsorted(knots + slack, times[1:], side="left"), len(h)) - 1
+    parts = (times[1:] - knots[at]) / h[at]
+    parts = np.where(np.abs(parts - 1.0) < 1e-9, 1.0, parts)
+    whole = Plan(knots[:-1], h, at, parts)
+    for k in range(0, len(h), CHUNK):
+        yield whole.part(k, min(k + CHUNK, len(h)))

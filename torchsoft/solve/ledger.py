@@ -26,10 +26,11 @@ def doubts(trajectory: Trajectory, rig: Rig) -> Iterator[str]:
     scale = max(stored + float(run.injected[-1]), NEGLIGIBLE)
     part = float(run.energy_residual.detach().abs().max()) / scale
     if not part <= RESIDUAL:
-        better = 0.4 * run.stats.step_s * min(1.0, RESIDUAL / part)
+        longest = float(run.knots.diff().max())
+        better = 0.4 * longest * min(1.0, RESIDUAL / part)
         yield (
             f"the energies of the run do not balance: {part:.2%} of what was stored at the start and injected since is missing "
-            f"or too much, with steps of {run.stats.step_s:.3g} s; try steps of {better:.2g} s"
+            f"or too much, with steps of {longest:.3g} s; try steps of {better:.2g} s"
         )
     for name, work in run.dissipated.items():
         back = -float(work.diff().min())

@@ -21,13 +21,18 @@ from torchsoft.solve import adjoint, tangent
 from torchsoft.solve.continuous import continuous_solution
 from torchsoft.solve.grid import check_times
 from torchsoft.solve.ledger import doubts
-from torchsoft.solve.stepper import METHOD, ImplicitStepper, Progress, SimulationFailed
+from torchsoft.solve.progress import Progress, SimulationFailed
+from torchsoft.solve.stepper import METHOD, ImplicitStepper
 from torchsoft.solve.system import independent
 from torchsoft.solve.trajectory import Stats, Trajectory, channels
 from torchsoft.solve.unrolled import unrolled_solution
 
 Route = Literal["none", "discrete", "forward", "unrolled", "continuous"]
 """Ways to a derivative: none; the exact adjoint of the run; sensitivities along `wrt`; plain torch steps; torchdiffeq's own."""
+
+
+STEP, RTOL = 2e-3, 1e-4
+"""Step [s] that is taken where nothing else is asked for, and the relative tolerance beside an absolute one."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -39,27 +44,51 @@ class Interrupted(KeyboardInterrupt):
 
 
 def simulate(
-    rig: Rig, t: Tensor, *, y0: Tensor | None = None, reference: Reference | None = None, step: float = 2e-3,
-    tolerance: float = 1e-9, gradient: Route = "none", wrt: Sequence[str] = (), dy0: Tensor | None = None,
-    rigid: bool = False, progress: bool = False,
+    rig: Rig, t: Tensor, *, y0: Tensor | None = None, reference: Reference | None = None, rtol: float | None = None,
+    atol: float | None = None, step: float | None = None, knots: Tensor | None = None, tolerance: float = 1e-9,
+    gradient: Route = "none", wrt: Sequence[str] = (), dy0: Tensor | None = None, rigid: bool = False, progress: bool = False,
 ) -> Trajectory:  # fmt: skip
     """Integrate `rig` from y0 (size,) at t[0] through the times t (T,) [s].
 
-    y0 defaults to the paper's rig at rest. `reference` is what the rig follows, its own by default. `step` [s] is the largest
-    step of the stepper, `tolerance` [N] its Newton tolerance.
+    y0 defaults to the paper's rig at rest. `reference` is what the rig follows, its own by default.
 
-    gradient: with "discrete" the states and channels of the result carry the exact gradient of the discrete run by y0, every
-    parameter and the reference; recorded nodal forces and energies do not. With "forward" `sensitivities` holds the derivatives
-    by the scalar parameters `wrt`, dy0 (size, n) being that of the start; `rigid` keeps those of the free coordinates and their
-    rates only. "unrolled" takes the same steps in plain torch, "continuous" torchdiffeq's explicit steps and adjoint:
-    both slow,
-    for cross checks over short windows. Under `torch.no_grad()` no route records a graph.
+    Steps: by default equal ones between the times t, no longer than `step` [s] (`STEP`). With `rtol` or `atol` they are chosen
+    so that the error of each stays below rtol times the largest value so far plus atol, which counts nodal forces in N,
+    lengths in mm, angles in rad; either alone brings the other, a tenth of rtol being atol. A motion is right long before its
+    derivative is: 1e-4 holds what a step of 2 ms does, gradients within 1 % take 3e-5. `knots` are the steps of another run
+    (its `knots`), frozen: what a fit needs, whose residuals are then smooth in the parameters. `tolerance` [N] is Newton's.
 
-    Raises `ValueError` for times that do not increase, a state of the wrong shape or dtype, an unknown route or parameter;
-    `SimulationFailed` (with the trajectory so far) when the run cannot go on; `Interrupted` (likewise) on Ctrl-C.
+    gradient: with "discrete" the states and channels of the result carry the exact gradient of the discrete run (of the steps
+    that were taken, which are not differentiated) by y0, every parameter and the reference; recorded nodal forces and energies
+    do not. With "forward" `sensitivities` holds the derivatives by the scalar parameters `wrt`, dy0 (size, n) being that of the
+    start; `rigid` keeps those of the free coordinates and their rates only. "unrolled" takes given steps in plain torch,
+    "continuous" torchdiffeq's explicit steps and adjoint: both slow, for cross checks over short windows.
+    Under `torch.no_grad()` no route records a graph.
+
+    Raises `ValueError` for times that do not increase, a state of the wrong shape or dtype, an unknown route or parameter, two
+    ways to choose steps at once; `SimulationFailed` (with the trajectory so far) when the run cannot go on; `Interrupted`
+    (likewise) on Ctrl-C.
     """
     _check_wanted(gradient, wrt, dy0, rigid)
-    stepper = ImplicitStepper(rig, reference, step=step, tolerance=tolerance)
+    ways = {"step": step, "knots": knots, "rtol or atol": rtol if rtol is not None else atol}
+    given = [f"`{name}`" for name, value in ways.items() if value is not None]
+    if len(given) > 1:
+        raise ValueError(f"{' and '.join(given)} each say which steps to take; give one of them")
+    if not given:
+        step = STEP
+    if gradient in ("unrolled", "continuous") and step is None:
+        raise ValueError(f"gradient='{gradient}' takes equal steps of `step` [s] only")
+    if rtol is None:
+        rtol = RTOL if atol is None else 10 * atol
+    stepper = ImplicitStepper(
+        rig,
+        reference,
+        step=step,
+        rtol=rtol,
+        atol=0.1 * rtol if atol is None else atol,
+        knots=knots,
+        tolerance=tolerance,
+    )
     check_times(t, step)
     if y0 is None:
         if not isinstance(rig, SoftGrasp):
@@ -82,18 +111,16 @@ def simulate(
     except SimulationFailed as failure:
         if out is None:
             raise
-        trajectory = gather(stepper, t, y, out, Stats(out.steps, out.solves, out.failed + 1, wall, step))
+        trajectory = gather(stepper, t, y, out, stats(out, wall))
         raise diagnose(rig, failure, trajectory) from None
     except KeyboardInterrupt:
         if out is None:
             raise
-        raise Interrupted(
-            gather(stepper, t, y.detach(), out, Stats(out.steps, out.solves, out.failed, wall, step))
-        ) from None
+        raise Interrupted(gather(stepper, t, y.detach(), out, stats(out, wall))) from None
     finally:
         bar.close()
     assert out is not None
-    trajectory = gather(stepper, t, y, out, Stats(out.steps, out.solves, out.failed, wall, step), tuple(wrt), dy)
+    trajectory = gather(stepper, t, y, out, stats(out, wall), tuple(wrt), dy)
     for doubt in doubts(trajectory, rig):
         warnings.warn(doubt, stacklevel=2)
     return trajectory
@@ -149,12 +176,12 @@ def _recorded(stepper: ImplicitStepper, t: Tensor, y0: Tensor, gradient: Route) 
     """The routes in torch, which record every operation: states and channels, without forces and work."""
     began, rig, reference = clock.perf_counter(), stepper.rig, stepper.reference
     solve = unrolled_solution if gradient == "unrolled" else continuous_solution
-    y = solve(rig, y0, t, reference, step=stepper.step)
+    y = solve(rig, y0, t, reference, step=stepper.step or STEP)
     signals = stepper.compiled.signals(t, reference)[..., : len(rig.signals), :]
     state, nothing = rig.unpack(y, signals), torch.zeros(0, dtype=torch.float64)
     return Trajectory(
         t, y, state, channels(rig, state, signals), {}, {}, {}, {}, {}, {}, nothing,
-        Stats(0, 0, 0, clock.perf_counter() - began, stepper.step), rig.layout, made_by(rig, gradient),
+        Stats(0, 0, 0, 0, clock.perf_counter() - began), nothing, rig.layout, made_by(rig, gradient),
     )  # fmt: skip
 
 
@@ -179,6 +206,11 @@ def made_by(rig: Rig, method: str) -> dict[str, object]:
     return {"torchsoft": version("torchsoft"), "method": method, **rig.description()}
 
 
+def stats(out: Progress, wall: float) -> Stats:
+    """The counters of a run."""
+    return Stats(out.steps, out.solves, out.failed, out.refused, wall)
+
+
 def gather(
     stepper: ImplicitStepper, t: Tensor, y: Tensor, out: Progress, stats: Stats, wrt: tuple[str, ...] = (),
     dy: Tensor | None = None,
@@ -194,6 +226,8 @@ def gather(
         state = rig.unpack(y, signals)
         moments = {name: adjoint.recorded(f"M_{name}", columns[name], y) for name in rig.pads}
         measured = channels(rig, state, signals, moments)
+    given = "step_s" if stepper.step is not None else "knots" if stepper.knots is not None else ""
+    steps = {given: stepper.step} if given else {"rtol": stepper.rtol, "atol": stepper.atol}
     with torch.no_grad():
         displacement = {name: rig.displacement(name, state) for name in rig.pads}
         energy = stored(rig, state, displacement)
@@ -206,6 +240,7 @@ def gather(
         displacement=displacement, energy=energy,
         dissipated={name: columns[name] for name in names.dissipated},
         supplied={name: columns[name] for name in names.supplied if name in names.active},
-        injected=columns["injected"], stats=stats, layout=rig.layout, made_by=made_by(rig, METHOD), wrt=wrt,
+        injected=columns["injected"], stats=stats, knots=torch.from_numpy(out.knots), layout=rig.layout,
+        made_by=made_by(rig, METHOD) | {"steps": steps}, wrt=wrt,
         sensitivities=None if dy is None else dy[:rows],
     )  # fmt: skip

@@ -1,7 +1,8 @@
 """The implicit stepper: the compiled kernels fed from a rig, chunk by chunk."""
 
+import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -12,116 +13,101 @@ from torchsoft.physics.arguments import positive, whole
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
-from torchsoft.solve.grid import Chunk, check_times, chunks
-from torchsoft.solve.kernel.arrays import Array, Tape, Work, empty_tape, first_stages, scratch
-from torchsoft.solve.kernel.run import (
+from torchsoft.solve.grid import CHUNK, Plan, check_knots, check_times, equal_steps, given_steps
+from torchsoft.solve.kernel.arrays import (
+    NO_ERRORS,
+    NO_SIGNALS,
+    Array,
+    Step,
+    Tape,
+    Work,
+    empty_step,
+    empty_tape,
+    scratch,
+)
+from torchsoft.solve.kernel.run import run
+from torchsoft.solve.kernel.step import (
     CONVERGED,
     GAMMA,
+    INSTANT,
     LOST,
     NEWTON_FAILED,
     NOT_FINITE,
     OFF_THE_PAD,
+    OFF_THE_RUNG,
+    REFUSED,
     TAPE_FULL,
-    run,
 )
+from torchsoft.solve.progress import Integrals, Marching, Progress, Segment, SimulationFailed
 from torchsoft.solve.system import Compiled
+from torchsoft.solve.tolerances import Followed, error_parts, part_name
 
 HALVINGS = 6
 """How often a step that Newton does not solve is halved before the run is given up."""
 
+FIRST, SHORTEST = 1e-3, 1e-9
+"""Length [s] of the first step that tolerances try, and the shortest that they may choose."""
+
 SMALLEST_TOLERANCE = 1e-10
 """Newton tolerance [N] that the ready excitations can meet: at a tenth of it one step in ten is halved because of rounding."""
-
-INSTANT = 1e-13
-"""Length [s] of the stage that gives the forces at the start: nothing moves in it."""
 
 METHOD = "sdirk2"
 """Name under which `torchdiffeq.odeint` knows the stepper once torchsoft is imported."""
 
 
-class SimulationFailed(RuntimeError):
-    """A run that ended early: when and why. `time` [s]; `trajectory` holds what was simulated until then, if any."""
-
-    def __init__(self, reason: str, time: float) -> None:
-        super().__init__(reason)
-        self.reason, self.time = reason, time
-        self.trajectory: Any = None
-
-
-@dataclass
-class Progress:
-    """What the stepper has produced so far: rows of the output grid, and its counters.
-
-    extras: running integrals, the pads' moments, the generalised contact forces on all coordinates (`Integrals` names them).
-    """
-
-    y: Array
-    forces: Array
-    extras: Array
-    rows: int = 1
-    steps: int = 0
-    solves: int = 0
-    failed: int = 0
-
-
-@dataclass
-class Segment:
-    """One chunk of a taped run: where it began, its signals, and its tape, or None where it is to be made again when needed."""
-
-    chunk: Chunk
-    signals: Array
-    y: Array
-    V: Array
-    u_dot: Array
-    rows: slice
-    tape: Tape | None
-
-
-class Integrals:
-    """Names of the running integrals [J]: dissipated by, supplied by, and the positive part of what the sources supply."""
-
-    def __init__(self, rig: Rig) -> None:
-        self.dissipated = (*(f"pad_{name}" for name in rig.pads), "contact_dashpots", "slip")
-        drives = tuple(f"drive_{name}" for name in rig.bodies)
-        self.supplied = (*(f"control_{name}" for name in rig.actuators), "gravity", *drives)
-        self.names = (*self.dissipated, *self.supplied, "injected")
-        driven = {f"drive_{name}" for name, body in rig.bodies.items() if "driven" in body.freedom.values()}
-        self.active = {name for name in self.supplied if not name.startswith("drive_")} | driven
-
-
 class ImplicitStepper:
     """SDIRK2 on one rig and reference as they are now: L-stable, second order, stiffly accurate.
 
-    `step` [s] is the largest step; every output interval is cut into equal steps no longer than it. Newton stops when
-    the contact law and the linear relations agree to `tolerance` [N] at every node; a step that it does not solve is taken as
-    two of half the length, and so on up to `HALVINGS` times. `window` [m] is how near a point has to be to count as one
-    that may
-    touch (checked after every stage; only speed depends on it). Raises `ValueError` for a tolerance below
-    `SMALLEST_TOLERANCE`.
+    Steps are chosen by `rtol` and `atol`, or given: `step` [s] cuts every output interval into equal steps no longer than it,
+    `knots` (n + 1,) [s] are the steps of another run. Tolerances hold the error that one step makes, in every part of the
+    state (a pad's nodal forces, a contact's stretches, a body's position, its angle), below atol units (`UNITS`) plus rtol
+    times the largest value so far; no step is longer than `longest` [s] or passes a knot of the reference, and with `landing`
+    a step ends at every output.
+
+    Newton stops when the contact law and the linear relations agree to `tolerance` [N] at every node. A given step that it
+    does not solve is taken as two of half the length, and so on up to `HALVINGS` times. `window` [m] is how near a point has to
+    be to count as one that may touch (checked after every stage; only speed depends on it).
+
+    Raises `ValueError` for a tolerance below `SMALLEST_TOLERANCE`.
     """
 
     def __init__(
-        self, rig: Rig, reference: Reference | None = None, *, step: float = 2e-3, tolerance: float = 1e-9,
-        max_iterations: int = 40, window: float = 2e-3,
+        self, rig: Rig, reference: Reference | None = None, *, step: float | None = None, rtol: float = 1e-3,
+        atol: float = 1e-4, knots: Tensor | None = None, tolerance: float = 1e-9, max_iterations: int = 40,
+        window: float = 2e-3, longest: float = 0.1, landing: bool = False,
     ) -> None:  # fmt: skip
         if not isinstance(rig, Rig):
             raise ValueError(f"`rig` must be a Rig, but is {rig if isinstance(rig, type) else type(rig).__name__}")
         followed = rig.reference if reference is None else reference
         if not isinstance(followed, Reference):
             raise ValueError(f"`reference` must be a Reference, but is {type(followed).__name__}")
-        self.step, self.window = positive("step", step), positive("window", window)
-        self.tolerance, self.max_iterations = (
-            positive("tolerance", tolerance),
-            whole("max_iterations", max_iterations, 1),
-        )
+        self.step = None if step is None else positive("step", step)
+        self.rtol, self.atol = positive("rtol", rtol), positive("atol", atol)
+        self.longest = positive("longest", longest)
+        self.tolerance, self.window = positive("tolerance", tolerance), positive("window", window)
+        self.max_iterations, self.landing = whole("max_iterations", max_iterations, 1), landing
         if self.tolerance < SMALLEST_TOLERANCE:
             raise ValueError(
                 f"`tolerance` must be at least {SMALLEST_TOLERANCE:g} N, but is {tolerance:g} N, which rounding hides"
             )
+        if landing and step is None and any(pad.inertial for pad in rig.pads.values()):
+            raise ValueError("inertial pads need equal steps here: give `step_size` [s]")
+        self.knots = None if knots is None else check_knots(knots)
         self.rig, self.reference = rig, followed
         self.compiled = Compiled(rig)
         self.layout, self.integrals = rig.layout, Integrals(rig)
         self._cap = 64
+        self._still: Any = None
+
+    def along(self, knots: Array) -> "ImplicitStepper":
+        """The same with the steps between `knots` [s]."""
+        other = copy(self)
+        other.step, other.knots = None, knots
+        return other
+
+    @property
+    def _limits(self) -> tuple[float, float, float, float, int, float]:
+        return self.rtol, self.longest, SHORTEST, self.tolerance, self.max_iterations, self.window
 
     @property
     def signals_at_start(self) -> Tensor:
@@ -143,124 +129,186 @@ class ImplicitStepper:
     ) -> Iterator[Progress]:
         """Step from y0 (size,) through t (T,), yielding the same growing `Progress` after every compiled call.
 
-        The last yield is the complete run. With `segments` given, what the derivatives need is appended to it, tapes for
-        as long
-        as they take less than `tape_bytes`. Raises `SimulationFailed`, and `ValueError` for a start that is not finite.
+        The last yield is the complete run. With `segments` given, what the derivatives need is appended to it, tapes for as
+        long as they take less than `tape_bytes`. Raises `SimulationFailed`, and `ValueError` for a start that is not finite.
         """
         self.check_start(y0)
         check_times(t, self.step)
-        todo = list(chunks(t, self.step))
-        signals = self.signals(todo).numpy()
-        first = self.compiled.system(todo[0].h)
-        points, pads, coordinates = len(first.point_X), len(first.pad_base), len(first.body_free)
-        n = len(self.integrals.names)
-        out = Progress(
-            np.empty((len(t), self.layout.size)),
-            np.zeros((len(t), points, 2)),
-            np.zeros((len(t), n + pads + coordinates)),
+        self._still = self.compiled.system(INSTANT / GAMMA)
+        s, names = self._still, self.integrals.names
+        extras = len(names) + len(s.pad_base) + len(s.body_free)
+        out = Progress(np.zeros((len(t), len(y0))), np.zeros((len(t), len(s.point_X), 2)), np.zeros((len(t), extras)))
+        work, step = scratch(s, self.layout.size), empty_step(s, self.layout.size, len(names))
+        y, integrals = y0.numpy().copy(), np.zeros(len(names))
+        set_velocities(s, work, y)
+        self._start(y, t[0], work, step, out)
+        set_velocities(s, work, y)
+        state = Marching(y, work, step, integrals, out, segments, tape_bytes)
+        yield from (
+            self._by_tolerance(t, state) if self.step is None and self.knots is None else self._as_given(t, state)
         )
-        out.y[0] = y0.numpy()
-        y, integrals, taped = y0.numpy().copy(), np.zeros(n), 0
-        work = scratch(first, self.layout.size)
-        set_velocities(first, work, y)
-        self._start(y, t[0], work, out.forces, out.extras)
-        set_velocities(first, work, y)
-        ends = np.cumsum([0, *(2 * len(chunk.starts) for chunk in todo)])
-        pending = [(chunk, signals[a:b], 0) for chunk, a, b in zip(todo, ends[:-1], ends[1:])][::-1]
+
+    def _as_given(self, t: Tensor, now: "Marching") -> Iterator[Progress]:
+        """Take the steps of a plan."""
+        todo = list(given_steps(t, self.knots) if self.knots is not None else equal_steps(t, self.step or 0.0))
+        inertial = any(pad.inertial for pad in self.rig.pads.values())
+        if inertial and self.knots is not None:  # their arrays belong to one step length
+            todo = [plan.part(i, i + 1) for plan in todo for i in range(len(plan.h))]
+        signals, at_outputs = self.signals(todo).numpy(), self.signals_at_outputs(todo).numpy()
+        ends, rows = (
+            np.cumsum([0, *sizes]) for sizes in ([2 * len(x.h) for x in todo], [len(x.out_step) for x in todo])
+        )
+        pending = [
+            (plan, signals[ends[i] : ends[i + 1]], at_outputs[rows[i] : rows[i + 1]], 0) for i, plan in enumerate(todo)
+        ][::-1]
+        out = now.out
         while pending:
-            chunk, follow, halvings = pending.pop()
-            rows = slice(out.rows, out.rows + int(chunk.keep.sum()))
-            segment = Segment(chunk, follow, y.copy(), work.V.copy(), work.u_dot.copy(), rows, None)
-            outputs = (out.y[rows], out.forces[rows], out.extras[rows])
-            wanted = segments is not None and taped < tape_bytes
-            steps, status, solves, tape = self._run(chunk, follow, y, work, integrals, outputs, wanted)
-            if segments is not None and steps > 0:
-                segment.chunk = chunk.part(0, steps)
-                segment.signals = follow[: 2 * steps]
-                segment.rows = slice(rows.start, rows.start + int(segment.chunk.keep.sum()))
-                segment.tape = None if tape is None else first_stages(tape, 2 * steps)
-                segments.append(segment)
-                taped += sum(x.nbytes for x in tape) if tape is not None else 0
-            out.rows += int(chunk.keep[:steps].sum())
-            out.steps += steps
-            out.solves += solves
+            plan, follow, at_rows, halvings = pending.pop()
+            before = now.copy()
+            here = slice(out.rows, out.rows + len(plan.out_step))
+            steps, rows_done, status, solves, tape = self._run(plan, follow, at_rows, now, here, now.taping)
+            here = slice(out.rows, out.rows + rows_done)
+            now.keep(plan.part(0, steps), follow[: 2 * steps], at_rows[:rows_done], before, here, tape)
+            out.rows, out.steps, out.solves = out.rows + rows_done, out.steps + steps, out.solves + solves
             yield out
             if status == NEWTON_FAILED and halvings < HALVINGS:
                 out.failed += 1
-                work.u_dot[:] = 0.0
-                if steps + 1 < len(chunk.starts):
-                    rest = chunk.part(steps + 1, len(chunk.starts))
-                    pending.append((rest, follow[2 * steps + 2 :], halvings))
-                half = chunk.halved(steps)
-                pending.append((half, self.signals([half]).numpy(), halvings + 1))
+                now.work.u_dot[:] = 0.0
+                if steps + 1 < len(plan.h):
+                    rest = plan.part(steps + 1, len(plan.h))
+                    pending.append(
+                        (rest, follow[2 * steps + 2 :], at_rows[len(at_rows) - len(rest.out_step) :], halvings)
+                    )
+                half = plan.halved(steps)
+                new = self.signals([half]).numpy(), self.signals_at_outputs([half]).numpy()
+                pending.append((half, *new, halvings + 1))
             elif status != CONVERGED:
-                raise self._failure(status, float(chunk.starts[steps]), chunk.h)
+                raise self._failure(status, float(plan.starts[steps]), float(plan.h[steps]))
 
-    def _start(self, y0: Array, time: Tensor, work: Work, forces: Array, extras: Array) -> None:
-        """Nodal forces, moments and loads at the start, the first row of `forces` and `extras`. Raises `SimulationFailed`."""
-        s, signals = self.compiled.system(INSTANT / GAMMA), self.compiled.signals(time, self.reference).numpy()
-        nothing = empty_tape(s, self.layout.size, 0, self._cap)
-        _, status, _ = run(
-            s, work, y0, signals[None, None], INSTANT, self.tolerance, self.max_iterations, self.window, np.zeros(0, np.bool_),
-            np.zeros(len(self.integrals.names)), np.zeros((0, y0.size)), forces, extras, nothing, True,
+    def _by_tolerance(self, t: Tensor, now: "Marching") -> Iterator[Progress]:
+        """Take steps whose lengths the tolerances choose."""
+        times, out = t.numpy(), now.out
+        inertial = any(pad.inertial for pad in self.rig.pads.values())
+        followed = Followed(lambda x: self.compiled.signals(x, self.reference), self.rig, self.reference)
+        stops = np.union1d(followed.stops, times[1:] if self.landing else times[-1:])
+        stops = stops[(stops > times[0]) & (stops <= times[-1])]
+        errors = error_parts(self.rig, now.y, self.atol)
+        size = np.zeros(len(errors.first))
+        for i, (first, last) in enumerate(zip(errors.first, errors.last)):
+            size[i] = np.linalg.norm(now.y[first:last] - errors.origin[first:last])
+        errors.size[:] = size
+        clock, k = np.array([times[0], min(FIRST, times[-1] - times[0]), 1.0]), now.step.K[0].copy()
+        rung, rows, chunk = 0.0, out.rows, CHUNK
+        row_step, row_part = np.zeros(len(t), np.int64), np.zeros(len(t))
+        while rows < len(t):
+            if inertial:
+                rung = 2.0 ** math.floor(math.log2(min(clock[1], self.longest)))
+            s = self.compiled.system(rung or 1.0)
+            starts, h = np.zeros(chunk), np.zeros(chunk)
+            count = self.compiled.signal_count
+            signals, at_rows = np.zeros((chunk, 2, count, 2)), np.zeros((len(t), count, 2))
+            before = now.copy()
+            tape = empty_tape(s, self.layout.size, 2 * chunk if now.taping else 0, self._cap)
+            now.work.travelled[0] = np.inf
+            now.work.low[:] = now.work.high[:] = 0
+            steps, done, status, solves, refused, failed, which = run(
+                s, self._still, now.work, now.step, followed.arrays, errors, False, now.y, k, clock, stops, times, rows, rung,
+                *self._limits, now.integrals, out.y, out.forces, out.extras, tape, starts, h, signals, row_step, row_part,
+                at_rows,
+            )  # fmt: skip
+            if followed.error is not None:
+                raise followed.error
+            here = slice(rows, rows + done)
+            plan = Plan(starts[:steps], h[:steps], row_step[here].copy(), row_part[here].copy())
+            flat = signals[:steps].reshape(2 * steps, count, 2)
+            now.keep(plan, flat, at_rows[here], before, here, tape if now.taping else None)
+            rows += done
+            out.rows, out.steps, out.solves = rows, out.steps + steps, out.solves + solves
+            out.refused, out.failed = out.refused + refused, out.failed + failed
+            yield out
+            if status == TAPE_FULL:
+                self._cap *= 2
+            elif status not in (CONVERGED, OFF_THE_RUNG):
+                worst = part_name(self.rig, errors, which) if which >= 0 else "the state"
+                raise self._failure(status, float(clock[0]), float(clock[1]), worst)
+
+    def _start(self, y0: Array, time: Tensor, work: Work, step: Step, out: Progress) -> None:
+        """Nodal forces, moments and loads at the start, the first row, and the rates there. Raises `SimulationFailed`."""
+        signals = self.compiled.signals(time[None], self.reference).numpy()
+        none = np.zeros(0)
+        *_, status, _, _, _, _ = run(
+            self._still, self._still, work, step, NO_SIGNALS, NO_ERRORS, True, y0, none, none, none, none, 0, 0.0,
+            *self._limits, np.zeros(len(self.integrals.names)), out.y, out.forces, out.extras,
+            empty_tape(self._still, self.layout.size, 0, self._cap), none, none, np.zeros((0, 2, *signals.shape[1:])),
+            np.zeros(1, np.int64), np.zeros(1), signals,
         )  # fmt: skip
         if status != CONVERGED:
             raise self._failure(status, float(time), INSTANT)
 
-    def signals(self, todo: Sequence[Chunk]) -> Tensor:
-        """The signals at all stages of some chunks (stages, signals, 2)."""
-        return self.compiled.signals(torch.cat([stage_times(chunk) for chunk in todo]), self.reference)
+    def signals(self, todo: Sequence[Plan]) -> Tensor:
+        """The signals at all stages of some plans (stages, signals, 2)."""
+        return self.compiled.signals(torch.cat([stage_times(plan) for plan in todo]), self.reference)
+
+    def signals_at_outputs(self, todo: Sequence[Plan]) -> Tensor:
+        """The signals at all outputs of some plans (outputs, signals, 2)."""
+        times = np.concatenate([np.zeros(0), *(plan.output_times for plan in todo)])
+        return self.compiled.signals(torch.from_numpy(times), self.reference)
 
     def tape(self, segment: Segment) -> Tape:
         """The segment's tape, made again from where it began if it was not kept."""
         if segment.tape is not None:
             return segment.tape
-        s, n = self.compiled.system(segment.chunk.h), int(segment.chunk.keep.sum())
-        work = scratch(s, self.layout.size)
+        s, n = self.compiled.system(float(segment.plan.h[0])), len(segment.plan.out_step)
+        work, names = scratch(s, self.layout.size), len(self.integrals.names)
         work.V[:], work.u_dot[:] = segment.V, segment.u_dot
-        extras = len(self.integrals.names) + len(s.pad_base) + len(s.body_free)
-        outputs = (np.empty((n, self.layout.size)), np.empty((n, len(s.point_X), 2)), np.empty((n, extras)))
-        *_, tape = self._run(
-            segment.chunk, segment.signals, segment.y.copy(), work, np.zeros(len(self.integrals.names)), outputs, True
+        extras = names + len(s.pad_base) + len(s.body_free)
+        out = Progress(np.empty((n, self.layout.size)), np.empty((n, len(s.point_X), 2)), np.empty((n, extras)))
+        again = Marching(
+            segment.y.copy(), work, empty_step(s, self.layout.size, names), np.zeros(names), out, None, 0.0
         )
+        *_, tape = self._run(segment.plan, segment.signals, segment.at_outputs, again, slice(0, n), True)
         assert tape is not None
         return tape
 
     def _run(
-        self, chunk: Chunk, signals: Array, y: Array, work: Work, integrals: Array, outputs: tuple[Array, Array, Array],
-        taping: bool,
-    ) -> tuple[int, int, int, Tape | None]:  # fmt: skip
+        self, plan: Plan, signals: Array, at_outputs: Array, now: "Marching", rows: slice, taping: bool
+    ) -> tuple[int, int, int, int, Tape | None]:
         """One compiled call; with `taping` once more with a longer tape if more points touch than it has room for."""
-        s, steps = self.compiled.system(chunk.h), len(chunk.starts)
-        begin = y.copy(), work.V.copy(), work.u_dot.copy(), integrals.copy()
+        s, steps, before = self.compiled.system(float(plan.h[0])), len(plan.h), now.copy()
         while True:
-            work.travelled[0] = np.inf  # look for near points afresh, so that a segment made again gives the same bits
-            work.low[:] = work.high[:] = 0
+            now.work.travelled[0] = (
+                np.inf
+            )  # look for near points afresh, so that a segment made again has the same bits
+            now.work.low[:] = now.work.high[:] = 0
             tape = empty_tape(s, self.layout.size, 2 * steps if taping else 0, self._cap)
-            done, status, solves = run(
-                s, work, y, signals.reshape(steps, 2, *signals.shape[1:]), chunk.h, self.tolerance, self.max_iterations,
-                self.window, chunk.keep, integrals, *outputs, tape, False,
+            done, rows_done, status, solves, *_ = run(
+                s, self._still, now.work, now.step, NO_SIGNALS, NO_ERRORS, True, now.y, *[np.zeros(3)] * 4, 0, 0.0,
+                *self._limits, now.integrals, now.out.y[rows], now.out.forces[rows], now.out.extras[rows], tape, plan.starts,
+                plan.h, signals.reshape(steps, 2, *signals.shape[1:]), plan.out_step, plan.out_part, at_outputs,
             )  # fmt: skip
             if status != TAPE_FULL:
-                return done, status, solves, tape if taping else None
+                return done, rows_done, status, solves, tape if taping else None
             self._cap *= 2
-            y[:], work.V[:], work.u_dot[:], integrals[:] = begin
+            now.back(before)
 
-    def _failure(self, status: int, time: float, h: float) -> SimulationFailed:
+    def _failure(self, status: int, time: float, h: float, worst: str = "") -> SimulationFailed:
+        tried = f"steps down to {SHORTEST:g} s" if worst else f"the step of {h:.3g} s, halved {HALVINGS} times"
         reasons = {
-            NEWTON_FAILED: f"Newton's iteration did not converge within {self.max_iterations} iterations in the step of "
-            f"{h:.3g} s, halved {HALVINGS} times; try a smaller step, or a larger v_s of the friction law: where friction "
+            NEWTON_FAILED: f"Newton's iteration did not converge within {self.max_iterations} iterations in {tried}; try "
+            f"{'other tolerances' if worst else 'a smaller step'}, or a larger v_s of the friction law: where friction "
             "falls with slip faster than the pads damp, massless pads have no unique velocity",
             OFF_THE_PAD: "the body was lost: its contact reached the end of a pad",
             LOST: "the body was lost: it left the space over a pad",
+            REFUSED: f"the tolerances would need steps below {SHORTEST:g} s for {worst}; loosen rtol or atol, or look for a "
+            "jump in the reference or in a law there",
             NOT_FINITE: "the state is not finite any more; check the parameters and the reference",
         }
         return SimulationFailed(f"at t = {time:.4f} s {reasons[status]}", time)
 
 
-def stage_times(chunk: Chunk) -> Tensor:
-    """Times of the stages of a chunk (2 steps,) [s]."""
-    return torch.from_numpy((chunk.starts[:, None] + chunk.h * np.array([GAMMA, 1.0])).ravel())
+def stage_times(plan: Plan) -> Tensor:
+    """Times of the stages of a plan (2 steps,) [s]."""
+    return torch.from_numpy((plan.starts[:, None] + plan.h[:, None] * np.array([GAMMA, 1.0])).ravel())
 
 
 def set_velocities(s: Any, work: Work, y: Array) -> None:

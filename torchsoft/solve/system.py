@@ -20,7 +20,7 @@ from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array, check_groups, check_shape, check_slip, check_values
 from torchsoft.solve.kernel.arrays import Actuators, Bodies, Contacts, Index, Inertia, Pads, Points, system
-from torchsoft.solve.kernel.run import GAMMA
+from torchsoft.solve.kernel.step import GAMMA
 from torchsoft.solve.laws import LawSet, actuator_law, contact_laws, structure
 
 NOMINAL = 1e-3
@@ -101,6 +101,11 @@ class Compiled:
             _ints([*free, -1, -1, -1]), _ints([*signal, -1, -1, -1]), _ints(coordinate), _ints(masses), np.array(weight),
             gravity_at, *starts,
         )  # fmt: skip
+
+    @property
+    def signal_count(self) -> int:
+        """How many signals the kernels follow, fixed coordinates included."""
+        return len(self.rig.signals) + sum(len(body.fixed) for body in self.rig.bodies.values())
 
     @independent()
     def signals(self, t: Tensor, reference: Reference | None = None) -> Tensor:
@@ -265,11 +270,11 @@ class Compiled:
 
     def system(self, h: float) -> Any:
         """The arrays for steps of h [s]; only inertial pads depend on it."""
-        key = h if len(self._inertia.X) else 0.0
+        key = float(f"{h:.12g}") if len(self._inertia.X) else 0.0
         if key not in self._systems:
-            if len(self._systems) > 8:  # an irregular output grid has many step sizes; each holds some megabytes
+            if len(self._systems) > 32:  # an irregular output grid has many step sizes; each holds some megabytes
                 self._systems.clear()
-            pads, inertia = self._mobilities(GAMMA * h) if key else (self._pads, self._inertia)
+            pads, inertia = self._mobilities(GAMMA * key) if key else (self._pads, self._inertia)
             p = self.p.detach().numpy().copy()
             self._systems[key] = system(self._bodies, self._actuators, pads, inertia, self._contacts, self._points, p=p)
         return self._systems[key]

@@ -8,7 +8,8 @@ from torch import Tensor
 
 from torchsoft.solve.kernel.arrays import Array, scratch
 from torchsoft.solve.kernel.tangent import forward
-from torchsoft.solve.stepper import ImplicitStepper, Progress, Segment
+from torchsoft.solve.progress import Progress, Segment
+from torchsoft.solve.stepper import ImplicitStepper
 
 
 def directions(value: Tensor, wanted: Sequence[Tensor]) -> Array:
@@ -40,8 +41,8 @@ def iterate(
     for out in stepper.integrate(y0.detach(), t, segments, tape_bytes=float("inf")):
         while segments:  # none if the first step of a chunk was not solved, and is to be halved
             segment = segments.pop()
-            s, tape, h = stepper.compiled.system(segment.chunk.h), stepper.tape(segment), segment.chunk.h
-            rows = np.empty((int(segment.chunk.keep.sum()), size, n))
-            forward(s, scratch(s, size, n), h, tape, segment.signals, segment.chunk.keep, dy, dp, rows)
+            plan, tape = segment.plan, stepper.tape(segment)
+            s, rows = stepper.compiled.system(float(plan.h[0])), np.empty((len(plan.out_step), size, n))
+            forward(s, scratch(s, size, n), plan.h, tape, segment.signals, plan.out_step, plan.out_part, dy, dp, rows)
             kept[segment.rows] = rows[:, columns]
         yield torch.from_numpy(out.y), torch.from_numpy(kept), out

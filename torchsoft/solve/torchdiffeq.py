@@ -13,31 +13,38 @@ from collections import deque
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.adjoint import iterate, run_adjoint
-from torchsoft.solve.stepper import METHOD, ImplicitStepper, Segment
+from torchsoft.solve.kernel.arrays import Array
+from torchsoft.solve.progress import Segment
+from torchsoft.solve.stepper import METHOD, ImplicitStepper
 
 REMEMBERED = 4
 """Runs of a model whose states are remembered: `odeint_adjoint` hands its solver only the later end of an interval."""
 
 
 class _Run(NamedTuple):
+    """Times (T,), states (T, samples, size), and every sample's steps; a step ends at every time."""
+
     t: Tensor
     y: Tensor
+    knots: list[Array]
 
 
 _runs: WeakKeyDictionary[Rig, deque[_Run]] = WeakKeyDictionary()
 
 
 class TorchdiffeqSolver:
-    """`torchdiffeq.odeint(model, y0, t, method="sdirk2", options={"step_size": 2e-3})`, and the same for `odeint_adjoint`.
+    """`torchdiffeq.odeint(model, y0, t, method="sdirk2", rtol=1e-4, atol=1e-5)`, and the same for `odeint_adjoint`.
 
-    Takes batches: y0 (..., size); each sample is stepped by itself, so none depends on its neighbours. rtol and atol are
-    not used: the step is fixed and Newton's tolerance (option `tolerance` [N]) is the stepper's. Raises `TypeError` for
-    dynamics that are not a `Rig`'s.
+    Takes batches: y0 (..., size); each sample is stepped by itself, with steps of its own, so none depends on its neighbours.
+    rtol and atol mean what they mean in `simulate`; torchdiffeq's own defaults (1e-7, 1e-9) are strict for a motion with
+    contact. Options: `step_size` [s] for equal steps instead, and the stepper's own, such as Newton's `tolerance` [N]. Raises
+    `TypeError` for dynamics that are not a `Rig`'s.
     """
 
     theirs: Any = None
@@ -54,7 +61,14 @@ class TorchdiffeqSolver:
             raise TypeError(f"method='{METHOD}' integrates a torchsoft.Rig, but got {type(model).__name__}")
         if "step_size" in options:
             options["step"] = options.pop("step_size")
-        known = set(inspect.signature(ImplicitStepper).parameters) - {"rig", "reference"}
+        known = set(inspect.signature(ImplicitStepper).parameters) - {
+            "rig",
+            "reference",
+            "rtol",
+            "atol",
+            "knots",
+            "landing",
+        }
         if strange := set(options) - known:
             raise ValueError(
                 f"method='{METHOD}' has no option {sorted(strange)}; it has step_size, {', '.join(sorted(known))}"
@@ -62,15 +76,17 @@ class TorchdiffeqSolver:
         self.model, self.y0 = model, y0
         self.adjoint_params: tuple[Tensor, ...] | None = augmented.get("adjoint_params")
         with torch.enable_grad():  # odeint_adjoint comes without; its parameters' gradients need the graph
-            self.stepper = ImplicitStepper(model, **options)
+            self.stepper = ImplicitStepper(model, rtol=float(rtol), atol=float(atol), landing=True, **options)
 
     def integrate(self, t: Tensor) -> Tensor:
         if self.adjoint_params is not None:
             return self._augmented(t, self.adjoint_params)
         samples = self.y0.reshape(-1, self.y0.shape[-1])
-        runs = [deque(iterate(self.stepper, sample, t), maxlen=1)[0][0] for sample in samples]
-        solution = torch.stack(runs, 1)
-        _runs.setdefault(self.model, deque(maxlen=REMEMBERED)).append(_Run(t.detach().clone(), solution.detach()))
+        runs = [deque(iterate(self.stepper, sample, t), maxlen=1)[0] for sample in samples]
+        solution, knots = torch.stack([y for y, _ in runs], 1), [out.knots for _, out in runs]
+        _runs.setdefault(self.model, deque(maxlen=REMEMBERED)).append(
+            _Run(t.detach().clone(), solution.detach(), knots)
+        )
         return solution.reshape(len(t), *self.y0.shape)
 
     def _augmented(self, t: Tensor, parameters: tuple[Tensor, ...]) -> Tensor:
@@ -79,17 +95,18 @@ class TorchdiffeqSolver:
         size, end, start = self.model.layout.size, -t[0], -t[1]
         count = (len(self.y0) - 1 - tail) // 2
         y, y_bar, bars = self.y0[1:].split([count, count, tail])
-        y_start = self._state_before(start, end, y.reshape(-1, size))
+        y_start, knots = self._state_before(start, end, y.reshape(-1, size))
         y_bars, interval = y_bar.reshape(-1, size).clone(), torch.stack((start, end))
         for sample in range(len(y_bars)):
             segments: list[Segment] = []
-            for _ in self.stepper.integrate(y_start[sample], interval, segments, float("inf")):
+            again = self.stepper.along(knots[sample])
+            for _ in again.integrate(y_start[sample], interval, segments, float("inf")):
                 pass
             outputs = torch.stack((torch.zeros_like(y_bars[sample]), y_bars[sample]))
-            y_bars[sample], *cotangents = run_adjoint(self.stepper, segments, outputs)
+            y_bars[sample], *cotangents = run_adjoint(again, segments, outputs)
             if parameters:
                 with torch.enable_grad():
-                    made_of = self.stepper.compiled.p, self.stepper.signals([segment.chunk for segment in segments])
+                    made_of = again.compiled.p, again.signals([segment.plan for segment in segments])
                     value = torch.cat([(x * cotangent).flatten() for x, cotangent in zip(made_of, cotangents)]).sum()
                     parts = torch.autograd.grad(value, parameters, allow_unused=True, retain_graph=True)
                 parts = [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, parts)]
@@ -97,12 +114,16 @@ class TorchdiffeqSolver:
         carried = torch.cat((self.y0[:1], y_start.flatten(), y_bars.flatten(), bars))
         return torch.stack((self.y0, carried))
 
-    def _state_before(self, start: Tensor, end: Tensor, y: Tensor) -> Tensor:
-        """The remembered states (samples, size) at `start` of the run that has y (samples, size) at `end`."""
+    def _state_before(self, start: Tensor, end: Tensor, y: Tensor) -> tuple[Tensor, list[Array]]:
+        """The remembered states (samples, size) at `start` of the run that has y (samples, size) at `end`, and each sample's
+        steps from there to the end."""
         for run in reversed(_runs.get(self.model, deque())):
             i = int(torch.searchsorted(run.t, end))
             if i > 0 and run.t[i] == end and run.t[i - 1] == start and torch.equal(run.y[i], y):
-                return run.y[i - 1]
+                first, last = float(start), float(end)
+                slack = 1e-9 * (last - first)
+                inside = [k[(k > first + slack) & (k < last - slack)] for k in run.knots]
+                return run.y[i - 1], [np.concatenate([[first], k, [last]]) for k in inside]
         raise RuntimeError(
             f"the run to differentiate is not among the last {REMEMBERED} of this model; call backward before running it "
             "again, or use odeint, which keeps what it needs"

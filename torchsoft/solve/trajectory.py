@@ -18,13 +18,14 @@ from torchsoft.physics.state import Layout, State
 
 @dataclass(frozen=True)
 class Stats:
-    """How the run went: steps, linear solves (Newton iterations), steps that failed and were halved, and wall time [s]."""
+    """How the run went: steps, linear solves (Newton iterations), steps that Newton did not solve and that were taken shorter,
+    steps refused for their error, and wall time [s]."""
 
     steps: int
     newton_iterations: int
     failed_steps: int
+    refused_steps: int
     wall_s: float
-    step_s: float
 
     @property
     def newton_per_step(self) -> float:
@@ -39,6 +40,8 @@ class Trajectory:
     force (T, points, 2) [N] on the points of each contact, along n and t of their moving frames. load: what the contacts and
     pads do to each body (T, 3), a force [N] and a moment about its centre [N.m], world axes. displacement: of the nodes of
     each pad (T, nodes, 2) [m], in its base's frame. energy: stored [J]; dissipated, supplied and `injected` [J] since t[0].
+
+    knots (steps + 1,): where the steps began and ended [s]; given to another run, that takes the same ones.
 
     sensitivities (T, components, n): derivatives of the state's last `components` by the n parameters `wrt`, where asked for.
     """
@@ -55,6 +58,7 @@ class Trajectory:
     supplied: dict[str, Tensor] = field(repr=False)
     injected: Tensor = field(repr=False)
     stats: Stats
+    knots: Tensor = field(repr=False)
     layout: Layout = field(repr=False)
     made_by: dict[str, Any] = field(repr=False)
     wrt: tuple[str, ...] = ()

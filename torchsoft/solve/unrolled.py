@@ -5,6 +5,7 @@ iteration is taken with the gradient on, so that backpropagation through many st
 pads, one state at a time.
 """
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -13,8 +14,8 @@ from torchsoft.physics.contact import cross, free_law, interface_law, turned
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
-from torchsoft.solve.grid import check_times, chunks
-from torchsoft.solve.kernel.run import GAMMA, MIX
+from torchsoft.solve.grid import check_times, equal_steps
+from torchsoft.solve.kernel.step import GAMMA, MIX
 
 WINDOW = 3e-4
 """How near to touching [m] a point has to be at the start of a stage to be an unknown of it."""
@@ -33,7 +34,8 @@ def unrolled_solution(
     if any(pad.inertial for pad in rig.pads.values()):
         raise NotImplementedError("the unrolled step is for massless pads; use gradient='discrete'")
     y, out = y0, [y0]
-    for h, starts, keep in chunks(t, step):
+    for starts, lengths, ends, _ in equal_steps(t, step):
+        h, keep = float(lengths[0]), np.isin(np.arange(len(starts)), ends)
         for start, output in zip(starts, keep):
             Y_1 = _stage(rig, y, start + GAMMA * h, GAMMA * h, reference, tolerance, max_iterations)
             y = _stage(rig, y + MIX * (Y_1 - y), start + h, GAMMA * h, reference, tolerance, max_iterations)

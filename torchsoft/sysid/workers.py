@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Self
 from threadpoolctl import threadpool_limits
 
 from torchsoft.processes import local_processes
-from torchsoft.solve.stepper import SimulationFailed
+from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.journal import Journal
 from torchsoft.sysid.prediction import FailedRun, Prediction, misfit, predict, set_parameters
 from torchsoft.sysid.recording import Recording, Start

@@ -23,6 +23,12 @@ def compiled(function: Callable[..., Any], entry: bool = False) -> Any:
     return dispatcher
 
 
+def inlined(function: Callable[..., Any]) -> Any:
+    """A part of an entry that has a name of its own: compiled inside its callers only, since every level of calls above the
+    heavy kernels takes the compiler another seven seconds."""
+    return njit(inline="always", nogil=True, error_model="numpy", fastmath={"contract", "reassoc"})(function)
+
+
 def entry(function: Callable[..., Any]) -> Any:
     """A kernel that Python calls."""
     return compiled(function, entry=True)

@@ -15,8 +15,8 @@ from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
 from torchsoft.solve.kernel.interface import NEGLIGIBLE, assemble
 from torchsoft.solve.kernel.linear import row_of, solve_dense
-from torchsoft.solve.kernel.run import GAMMA, MIX, TINY
 from torchsoft.solve.kernel.stage import actuate
+from torchsoft.solve.kernel.step import GAMMA, MIX, TINY, dense_states
 from torchsoft.solve.kernel.taped import restore
 
 
@@ -337,26 +337,33 @@ def free_stretches(s: Any, w: Any, pad: int, y: Array, y_bar: Array, a: float, p
 
 @entry
 def backward(
-    s: Any, w: Any, h: float, tape: Any, signals: Array, keep: Any, outputs_bar: Array, y_bar: Array, p_bar: Array,
-    signals_bar: Array,
+    s: Any, w: Any, h: Array, tape: Any, signals: Array, out_step: Any, out_part: Array, outputs_bar: Array, y_bar: Array,
+    p_bar: Array, signals_bar: Array,
 ) -> int:  # fmt: skip
     """Sweep the steps of a tape backwards; y_bar goes from the end's cotangent to the start's, in place.
 
-    outputs_bar (outputs, size) are added at the steps that `keep` marks; signals and signals_bar are (stages, signals, 2).
-    Returns -1, or the step at which a cotangent stopped being finite.
+    outputs_bar (outputs, size) belong to the parts out_part of the steps out_step; signals and signals_bar are
+    (stages, signals, 2). Returns -1, or the step at which a cotangent stopped being finite.
     """
-    a, output = GAMMA * h, len(outputs_bar)
+    row = out_step.size - 1
     rate_bar, u_bar, held = np.empty(w.u.shape), np.empty(w.u.shape), np.empty(y_bar.size)
-    for step in range(len(keep) - 1, -1, -1):
-        if keep[step]:
-            output -= 1
-            y_bar += outputs_bar[output]
-        row = 2 * step + 1
-        stage_adjoint(s, w, tape, row, a, signals[row], y_bar, p_bar, signals_bar[row], rate_bar, u_bar)
-        held[:] = (1.0 - MIX) * y_bar
-        y_bar *= MIX
-        row = 2 * step
-        stage_adjoint(s, w, tape, row, a, signals[row], y_bar, p_bar, signals_bar[row], rate_bar, u_bar)
+    first_bar, start_bar = np.empty(y_bar.size), np.empty(y_bar.size)
+    for step in range(h.size - 1, -1, -1):
+        a = GAMMA * h[step]
+        first_bar[:], start_bar[:] = 0.0, 0.0
+        while row >= 0 and out_step[row] == step:
+            at_start, at_first, at_end = dense_states(out_part[row])
+            for i in range(y_bar.size):
+                y_bar[i] += at_end * outputs_bar[row, i]
+                first_bar[i] += at_first * outputs_bar[row, i]
+                start_bar[i] += at_start * outputs_bar[row, i]
+            row -= 1
+        k = 2 * step + 1
+        stage_adjoint(s, w, tape, k, a, signals[k], y_bar, p_bar, signals_bar[k], rate_bar, u_bar)
+        held[:] = (1.0 - MIX) * y_bar + start_bar
+        y_bar[:] = MIX * y_bar + first_bar
+        k = 2 * step
+        stage_adjoint(s, w, tape, k, a, signals[k], y_bar, p_bar, signals_bar[k], rate_bar, u_bar)
         y_bar += held
         if not np.isfinite(y_bar.sum()):
             return step

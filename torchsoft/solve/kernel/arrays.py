@@ -143,7 +143,7 @@ class Work(NamedTuple):
     counts: touched nodes of every pad. A, P, Hc, Rf: one pad's share of Newton's system; X what Newton's elimination
     leaves, per surface dof. PB to effort_J: small arrays of Newton's iteration. k: rates of the flat
     state; load: generalised contact forces on all coordinates; full: u' of inertial pads;
-    travelled: how far [m] anything moved since the last scan for near points, and that scan's margin [m].
+    travelled: how far [m] anything moved since the last scan for near points, that scan's margin [m], and how many there were.
     """
 
     q: Array
@@ -199,6 +199,69 @@ class Work(NamedTuple):
     travelled: Array
 
 
+class Step(NamedTuple):
+    """What one step leaves behind: its start (state, integrals, Newton's guesses V and u_dot, travelled), and of its two
+    stages the rates K, the powers and bounds of the speeds; the pads' moments of the last one. at_row, scrap, guess_V, guess:
+    scratch of the outputs before the step's end."""
+
+    y: Array
+    integrals: Array
+    V: Array
+    u_dot: Array
+    travelled: Array
+    K: Array
+    powers: Array
+    speed: Array
+    moments: Array
+    at_row: Array
+    scrap: Array
+    guess_V: Array
+    guess: Array
+
+
+def empty_step(s: Any, size: int, integrals: int) -> Step:
+    """Room for one step of a rig whose running integrals are so many."""
+    nodes, coordinates, z = int(s.pad_node_start[-1]), len(s.body_free), np.zeros
+    return Step(
+        z(size), z(integrals), z(coordinates), z((nodes, 2)), z(3), z((2, size)), z((2, integrals)), z(2),
+        z(len(s.pad_base)), z(integrals), z(integrals), z(coordinates), z((nodes, 2)),
+    )  # fmt: skip
+
+
+class Signals(NamedTuple):
+    """The reference: per signal the first of its pieces (signals + 1,) and their number of control points; per piece its start
+    and span [s] and its control points. address: of a function that gives all values and rates instead, or 0."""
+
+    start: Index
+    points: Index
+    at: Array
+    span: Array
+    control: Array
+    address: int
+
+
+NO_SIGNALS = Signals(np.zeros(1, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros((0, 1)), 0)
+"""What given steps follow: nothing."""
+
+
+class Errors(NamedTuple):
+    """Parts of the state whose error is judged together: first and last component, whether it is a rate, its absolute
+    tolerance, its largest size so far; origin (size,): what sizes are counted from."""
+
+    first: Index
+    last: Index
+    rate: Any
+    atol: Array
+    size: Array
+    origin: Array
+
+
+NO_ERRORS = Errors(
+    np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, bool), np.zeros(0), np.zeros(0), np.zeros(0)
+)
+"""What given steps are judged by: nothing."""
+
+
 class Tape(NamedTuple):
     """What the derivatives need of every stage: y* (., size), q and V of all coordinates, the number of touching points of
     every pad (., pads), their numbers (., cap), u, u' and f there (., cap, 6); of inertial pads u' of all dofs."""
@@ -228,7 +291,7 @@ def scratch(s: Any, size: int, columns: int = 1) -> Work:
         A=z(widest, widest), P=z(widest, widest), PB=z(2, widest), K=z(6, 8), number=i(6), r=z(free, 1),
         Rv=z(free, free), b=z(free, 1), dV=z(free), V_old=z(coordinates), phi=z(1), effort_x=z(5), effort=z(1),
         effort_J=z(1, 5), Hc=z(widest, free), Rf=z(free, widest), X=z(2 * nodes, columns + free), k=z(size),
-        load=z(coordinates), full=z(int(s.inertia_dof_start[-1])), travelled=np.array([np.inf, 0.0]),
+        load=z(coordinates), full=z(int(s.inertia_dof_start[-1])), travelled=np.array([np.inf, 0.0, 0.0]),
     )  # fmt: skip
 
 
@@ -244,5 +307,5 @@ def empty_tape(s: Any, size: int, stages: int, cap: int) -> Tape:
 
 def first_stages(tape: Tape, stages: int) -> Tape:
     """The beginning of a tape, of a run that ended early."""
-    parts: Any = [part[:stages] for part in tape]
+    parts: Any = [part if len(part) == stages else part[:stages].copy() for part in tape]
     return Tape(*parts)

@@ -133,7 +133,7 @@ def scan(s: Any, w: Any, y: Array, margin: float) -> None:
             if node < w.low[pad] or node >= w.high[pad]:
                 w.u_dot[node, 0], w.u_dot[node, 1] = w.free[node, 0], w.free[node, 1]
         w.windows[pad], w.low[pad], w.high[pad] = count, low, max(low, high)
-    w.travelled[0], w.travelled[1] = 0.0, margin
+    w.travelled[0], w.travelled[1], w.travelled[2] = 0.0, margin, w.travelled[2] + 1.0
 
 
 @compiled

@@ -1,176 +1,192 @@
-"""Many implicit steps in one compiled call: SDIRK2, its running energy integrals, and what ends a run early.
+"""Many steps in one compiled call, given or of lengths that tolerances choose: the error estimate and the controller.
 
-SDIRK2 is Alexander's two-stage method (SIAM J. Numer. Anal. 14, 1977): L-stable, stiffly accurate, of second order,
-both stages with the same a = 1 - 1/sqrt(2), so that one mobility serves both. The second stage starts from
-y* = (1 - MIX) y + MIX Y_1 and its end is the step's.
+The estimate is the third divided difference of the solution: the rates at the step's start and at its two stages give the
+step's leading error, C h^3 y''' where the motion is smooth. Where a law has a kink (touch-down, break-away, the onset of slip,
+a node that comes into contact) the same difference is of the order of the kink's own error, h^2 times the change of y''.
 """
 
 from typing import Any
 
 import numpy as np
 
+from torchsoft.codegen.invoke import call_value
 from torchsoft.solve.kernel import compiled, entry
 from torchsoft.solve.kernel.arrays import Array
-from torchsoft.solve.kernel.stage import actuate, finish, solve_stage
+from torchsoft.solve.kernel.step import (
+    CONVERGED,
+    GAMMA,
+    NEWTON_FAILED,
+    NOT_FINITE,
+    OFF_THE_RUNG,
+    REFUSED,
+    gone,
+    take_back,
+    take_step,
+    write_rows,
+)
 
-GAMMA = 1.0 - 1.0 / np.sqrt(2.0)
-MIX = (1.0 - GAMMA) / GAMMA
+ERROR = 2.0 * abs(3.0 * GAMMA**2 - 2.0 * GAMMA**3 - 1.0 / 6.0)
+"""Twice the coefficient of h^3 y''' in the step's error."""
 
-CONVERGED, NEWTON_FAILED, OFF_THE_PAD, LOST, TAPE_FULL, NOT_FINITE = range(6)
+SAFETY, LARGEST, SMALLEST = 0.9, 4.0, 0.2
+"""The controller aims at this part of the tolerance, and changes a step by these factors at most."""
 
-TINY = 1e-60
-"""Components of the state below this are set to zero, so that what decays does not end in denormal numbers."""
+INTEGRAL, PROPORTIONAL = 0.7 / 3.0, 0.4 / 3.0
+"""Exponents of the PI controller (Gustafsson, ACM TOMS 17, 1991)."""
 
-
-@compiled
-def write_tape(s: Any, w: Any, tape: Any, row: int, y: Array) -> bool:
-    """Put one solved stage on the tape; False if more points touch than it has room for."""
-    tape.y[row], tape.q[row], tape.V[row], tape.rate[row] = y, w.q, w.V, w.full
-    slot = 0
-    for pad in range(s.pad_base.size):
-        at = s.contact_point_start[s.pad_contact_start[pad]]
-        tape.count[row, pad] = w.actives[pad]
-        if slot + w.actives[pad] > tape.point.shape[1]:
-            return False
-        for i in range(w.actives[pad]):
-            k = w.active[at + i]
-            tape.point[row, slot] = k
-            for r in range(2):
-                u = v = 0.0
-                for j in range(2):
-                    node, N = s.point_node[k, j], s.point_N[k, j]
-                    u += N * w.u[node, r]
-                    v += N * w.u_dot[node, r]
-                tape.state[row, slot, r], tape.state[row, slot, 2 + r], tape.state[row, slot, 4 + r] = u, v, w.out[k, r]
-            slot += 1
-    return True
+LEAST_ERROR = 1e-6
+"""Errors below this part of the tolerance count as this."""
 
 
 @compiled
-def gone(s: Any, w: Any) -> int:
-    """Whether a contact has reached the end of a pad, or a body has left the space over one."""
-    for c in range(s.contact_pad.size):
-        at = s.contact_point_start[s.pad_contact_start[s.contact_pad[c]]]
-        for i in range(w.actives[s.contact_pad[c]]):
-            if w.active[at + i] == s.contact_point_start[c] or w.active[at + i] == s.contact_point_start[c + 1] - 1:
-                return OFF_THE_PAD
-        x, y, limit = w.frame[c, 2], w.frame[c, 3], s.contact_limits[c]
-        if not (limit[0] <= x <= limit[1] and limit[2] <= y <= limit[3]):
-            return LOST
-    return CONVERGED
+def follow(f: Any, t_0: float, t_1: float, out: Array) -> None:
+    """Value and rate of every signal into out (1 or 2, signals, 2): at t_0 [s], and at t_1."""
+    for row in range(len(out)):
+        t = t_0 if row == 0 else t_1
+        if f.address != 0:
+            moment, nothing = np.empty(1), np.empty(1)
+            moment[0] = t
+            call_value(f.address, moment, nothing, out[row])
+            continue
+        for i in range(f.start.size - 1):
+            piece = f.start[i] + np.searchsorted(f.at[f.start[i] : f.start[i + 1]], t, side="right") - 1
+            piece = max(piece, f.start[i])
+            u, n = (t - f.at[piece]) / f.span[piece], f.points[i]
+            inside = 0.0 <= u <= 1.0
+            u = min(max(u, 0.0), 1.0)
+            points, slope = f.control[piece].copy(), 0.0
+            for level in range(n - 1, 0, -1):  # de Casteljau
+                slope = (n - 1) * (points[1] - points[0])
+                for j in range(level):
+                    points[j] = (1.0 - u) * points[j] + u * points[j + 1]
+            out[row, i, 0], out[row, i, 1] = points[0], slope / f.span[piece] if inside else 0.0
 
 
 @compiled
-def supply(s: Any, w: Any, signals: Array, powers: Array) -> None:
-    """Powers [W] of the actuators, of gravity, of what drives the bodies, and the sum of the positive ones."""
-    at = s.pad_base.size + 2
-    x, out, J = w.effort_x, w.effort, w.effort_J
-    for i in range(s.act_measured.size):
-        powers[at + i] = actuate(s, i, w.q, w.V, signals, x, out, J) * w.V[s.act_pushed[i]]
-    at += s.act_measured.size
-    gravity = 0.0
-    for i in range(s.body_coordinate.size):
-        gravity -= s.body_weight[i] * s.p[s.body_mass_at[i]] * s.p[s.body_gravity_at] * w.V[s.body_coordinate[i]]
-    powers[at] = gravity
-    for b in range(s.body_free.size // 3 - 1):
-        drive = 0.0
-        for c in range(3 * b, 3 * b + 3):
-            if s.body_free[c] < 0:
-                drive -= w.load[c] * w.V[c]
-        for i in range(s.act_measured.size):  # what pushes a driven coordinate is held by what drives it
-            if s.act_pushed[i] // 3 == b and s.body_free[s.act_pushed[i]] < 0:
-                drive -= powers[s.pad_base.size + 2 + i]
-        powers[at + 1 + b] = drive
-    total = 0.0
-    for i in range(s.pad_base.size + 2, powers.size - 1):
-        total += max(powers[i], 0.0)
-    powers[-1] = total
+def estimate(e: Any, d: Any, y: Array, k: Array, h: float, rtol: float) -> tuple[float, int]:
+    """The step's error over what the tolerances allow, of the worst part of the state, and which part that is."""
+    worst, which = 0.0, -1
+    for part in range(e.first.size):
+        total = size = 0.0
+        for i in range(e.first[part], e.last[part]):
+            error = ERROR * h * ((d.K[1, i] - d.K[0, i]) / (1.0 - GAMMA) - (d.K[0, i] - k[i]) / GAMMA)
+            total += error * error
+            change = y[i] - e.origin[i]
+            size += change * change
+        size = max(np.sqrt(size), e.size[part])
+        if e.rate[part]:  # an error of a rate counts by what it displaces within the step
+            total *= h * h
+            size *= h
+        ratio = np.sqrt(total) / (e.atol[part] + rtol * size)
+        if not ratio <= worst:
+            worst, which = ratio, part
+    return worst, which
 
 
 @compiled
-def record(s: Any, w: Any, integrals: Array, moments: Array, forces: Array, extras: Array) -> None:
-    """One row of output: (F_N, F_T) of every point; integrals, the pads' moments and the generalised contact forces."""
-    forces[:] = 0.0
-    for pad in range(s.pad_base.size):
-        at = s.contact_point_start[s.pad_contact_start[pad]]
-        for i in range(w.actives[pad]):
-            k = w.active[at + i]
-            forces[k, 0], forces[k, 1] = w.out[k, 3], w.out[k, 4]
-    n, m = integrals.size, moments.size
-    extras[:n], extras[n : n + m], extras[n + m :] = integrals, moments, w.load
+def next_end(t: float, wanted: float, stops: Array, shift: bool) -> float:
+    """Where the next step ends: at the next stop, half way to it, or after the wanted length."""
+    if not shift:
+        return t + wanted
+    stop = np.searchsorted(stops, t, side="right")
+    left = stops[min(stop, stops.size - 1)] - t
+    if wanted >= left * (1.0 - 1e-9):
+        return stops[min(stop, stops.size - 1)]
+    return t + (0.5 * left if wanted > 0.5 * left else wanted)
 
 
 @entry
 def run(
-    s: Any, w: Any, y: Array, signals: Array, h: float, tolerance: float, max_iterations: int, margin: float, keep: Any,
-    integrals: Array, ys: Array, forces: Array, extras: Array, tape: Any, instant: bool,
-) -> tuple[int, int, int]:  # fmt: skip
-    """Take len(signals) steps of h [s]; signals (steps, 2, signals, 2) hold value and rate at the stages; `tape` has two rows a
-    step, or none.
+    s: Any, s0: Any, w: Any, d: Any, f: Any, e: Any, given: bool, y: Array, k: Array, clock: Array, stops: Array, t_out: Array,
+    row: int, rung: float, rtol: float, longest: float, shortest: float, tolerance: float, max_iterations: int,
+    margin: float, integrals: Array, ys: Array, forces: Array, extras: Array, tape: Any, starts: Array, h: Array,
+    signals: Array, out_step: Any, out_part: Array, out_signals: Array,
+) -> tuple[int, int, int, int, int, int, int]:  # fmt: skip
+    """Take up to h.size steps. `s` are the rig's arrays, `s0` those for a stage of no length.
 
-    After the steps marked in `keep`, the state goes to `ys`, (F_N, F_T) of every point to `forces`, and integrals, the pads'
-    moments and the generalised contact forces to `extras`, one row each. y, `integrals` and the guesses in w are advanced in
-    place; after a failure they hold the last good step. With `instant` nothing advances: a stage as short as h is solved for
-    the forces at one moment, which go to the first row. Returns steps taken, status, and linear solves.
+    starts, h (steps,) [s], signals (steps, 2, signals, 2), value and rate at the stages; output i lies at the part
+    out_part[i] of the step out_step[i], where the signals are out_signals[i]. With `given` these say what to do. Otherwise they
+    receive what is done, from the output `row` on, until the last of t_out; the tolerances choose: clock holds the time, the
+    next step's length and the last step's error, k the rates at y. No step passes a time of `stops`, whose last is t_out's. A
+    positive `rung` [s] is the only length allowed, for arrays `s` that belong to it: the call ends when the controller wants
+    half of it or twice.
+
+    An output's state goes to `ys`, (F_N, F_T) of every point to `forces`, and integrals, the pads' moments and the generalised
+    contact forces to `extras`; `tape` has two rows a step, or none. y, `integrals` and the guesses in w are advanced in place;
+    after a failure they hold the last good step. With no steps the one output is that of y itself.
+
+    Returns steps and outputs done, status, linear solves, steps that were refused for their error and that Newton did not
+    solve, and the part of the state whose error was largest in the last one.
     """
-    a, pads, row, solves = GAMMA * h, s.pad_base.size, 0, 0
-    powers, moments = np.empty(integrals.size), np.zeros(pads)
-    before, integrals_before, V_before = np.empty(y.size), np.empty(integrals.size), np.empty(w.V.size)
-    if instant:
-        converged, solves = solve_stage(s, w, y, signals[0, 0], h, tolerance, max_iterations, margin)
-        if converged:
-            finish(s, w, y, h, powers, moments)
-            record(s, w, integrals, moments, forces[0], extras[0])
-        return 0, CONVERGED if converged else NEWTON_FAILED, solves
-    for step in range(len(signals)):
-        before[:], integrals_before[:], V_before[:] = y, integrals, w.V
-        status = CONVERGED
-        for stage in range(2):
-            while True:
-                converged, count = solve_stage(s, w, y, signals[step, stage], a, tolerance, max_iterations, margin)
-                solves += count
-                if not converged:
+    steps, solves, refused, failed, which, first = 0, 0, 0, 0, -1, row
+    status, begin = CONVERGED, h.size == 0
+    while (steps < h.size and (given or row < t_out.size)) or begin:
+        t, wanted, end, error, last = clock[0], min(clock[1], longest), 0.0, 0.0, row
+        if begin:  # the output at the start, where nothing has moved
+            d.y[:], d.K[:], d.powers[:], d.integrals[:], now = y, 0.0, 0.0, integrals, 0.0
+            d.travelled[:], last = w.travelled, row + 1
+        else:
+            now = h[steps]
+            if not given:
+                if rung > 0.0 and not rung * (1.0 - 1e-9) <= wanted < 2.0 * rung:
+                    status = OFF_THE_RUNG
                     break
-                speed = finish(s, w, y, a, powers, moments)
-                if w.travelled[0] + a * speed <= w.travelled[1]:
-                    break
-                if w.travelled[0] == 0.0:  # points further away may have come near within this one stage
-                    margin_now = margin + 1.5 * a * speed
-                    w.travelled[0] = np.inf
-                    converged, count = solve_stage(
-                        s, w, y, signals[step, stage], a, tolerance, max_iterations, margin_now
-                    )
-                    solves += count
-                    if not converged:
-                        break
-                    speed = finish(s, w, y, a, powers, moments)
-                    if not w.travelled[0] + a * speed <= w.travelled[1]:
-                        converged = False
-                    break
-                w.travelled[0] = np.inf
-            if not converged:
-                status = NEWTON_FAILED
-                break
-            if tape.y.shape[0] > 0 and not write_tape(s, w, tape, 2 * step + stage, y):
-                y[:], integrals[:], w.V[:], w.travelled[0] = before, integrals_before, V_before, np.inf
-                return step, TAPE_FULL, solves
-            supply(s, w, signals[step, stage], powers)
-            dt = a if stage == 1 else h - a
-            for i in range(integrals.size):
-                integrals[i] += dt * powers[i]
-            for i in range(y.size):
-                value = y[i] + dt * w.k[i]
-                y[i] = value if abs(value) > TINY else 0.0
-            w.travelled[0] += dt * speed
+                end = next_end(t, rung if rung > 0.0 else wanted, stops, rung == 0.0)
+                now = rung if rung > 0.0 else end - t
+                follow(f, t + GAMMA * now, end, signals[steps])
+            status, count = take_step(
+                s, w, d, y, now, signals[steps], tolerance, max_iterations, margin, integrals, tape, 2 * steps
+            )
+            solves += count
+            if status == CONVERGED and not given:
+                error, which = estimate(e, d, y, k, now, rtol)
+                if not error <= 1.0:
+                    status = REFUSED
+            if status == CONVERGED:
+                status = gone(s, w)
+            if status == CONVERGED:
+                while last < out_step.size and (out_step[last] == steps if given else t_out[last] <= end):
+                    if not given:
+                        part = (t_out[last] - t) / now
+                        out_step[last], out_part[last] = steps, part if part < 1.0 - 1e-9 else 1.0
+                        follow(f, t_out[last], t_out[last], out_signals[last : last + 1])
+                    last += 1
         if status == CONVERGED:
-            status = gone(s, w)
-            if status == CONVERGED and not np.isfinite(y.sum()):
-                status = NOT_FINITE
-        if status != CONVERGED:
-            y[:], integrals[:], w.V[:], w.travelled[0] = before, integrals_before, V_before, np.inf
-            return step, status, solves
-        if keep[step]:
-            ys[row] = y
-            record(s, w, integrals, moments, forces[row], extras[row])
-            row += 1
-    return len(signals), CONVERGED, solves
+            status, count = write_rows(
+                s, s0, w, d, y, now, out_part, out_signals, row, last, tolerance, max_iterations, margin, integrals, ys,
+                forces, extras,
+            )  # fmt: skip
+            solves += count
+        if begin:
+            d.K[0], begin, row = w.k, False, last
+        elif status == CONVERGED:
+            if not given:
+                starts[steps], h[steps] = t, now
+                k[:] = d.K[1]
+                enlarge(e, y)
+                error = max(error, LEAST_ERROR)
+                longer = now * min(LARGEST, max(SMALLEST, SAFETY * error**-INTEGRAL * clock[2] ** PROPORTIONAL))
+                clock[0], clock[1], clock[2] = end, max(longer, wanted) if now < wanted else longer, error
+            row, steps = last, steps + 1
+        else:
+            take_back(w, d, y, integrals)
+            again = not given and now > shortest
+            if again and status == REFUSED:
+                refused, smaller = refused + 1, SAFETY * error ** (-1.0 / 3.0)
+                clock[1] = max(now * (smaller if smaller > SMALLEST else SMALLEST), shortest)
+            elif again and status in (NEWTON_FAILED, NOT_FINITE):
+                failed, clock[1] = failed + 1, max(now * SMALLEST, shortest)
+            else:
+                break
+            status = CONVERGED
+    return steps, row - first, status, solves, refused, failed, which
+
+
+@compiled
+def enlarge(e: Any, y: Array) -> None:
+    """Note how large every part of the state has become."""
+    for part in range(e.first.size):
+        size = 0.0
+        for i in range(e.first[part], e.last[part]):
+            size += (y[i] - e.origin[i]) ** 2
+        e.size[part] = max(e.size[part], np.sqrt(size))

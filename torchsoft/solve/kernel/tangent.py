@@ -15,8 +15,8 @@ from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
 from torchsoft.solve.kernel.interface import NEGLIGIBLE, assemble
 from torchsoft.solve.kernel.linear import row_of, solve_dense
-from torchsoft.solve.kernel.run import GAMMA, MIX
 from torchsoft.solve.kernel.stage import actuate, eliminate
+from torchsoft.solve.kernel.step import GAMMA, MIX, dense_states
 from torchsoft.solve.kernel.taped import restore
 
 NEGLIGIBLE_PART = 1e-17
@@ -116,19 +116,9 @@ def massless_part(
 
 @compiled
 def inertial_part(
-    s: Any,
-    w: Any,
-    pad: int,
-    y: Array,
-    dy: Array,
-    dp: Array,
-    a: float,
-    rate: Array,
-    du: Array,
-    dv: Array,
-    free: Array,
+    s: Any, w: Any, pad: int, y: Array, dy: Array, dp: Array, a: float, rate: Array, du: Array, dv: Array, free: Array,
     r: Array,
-) -> None:
+) -> None:  # fmt: skip
     """The same for an inertial pad; `free` (dofs, m) receives dv of all its dofs, and r the base's reaction."""
     at = s.inertia_material_at[pad]
     i0, i1, U, W, base = (
@@ -377,20 +367,34 @@ def advance_inertial(s: Any, w: Any, pad: int, a: float, dy: Array, free_rates: 
 
 
 @entry
-def forward(s: Any, w: Any, h: float, tape: Any, signals: Array, keep: Any, dy: Array, dp: Array, dys: Array) -> None:
-    """Carry the tangent dy (size, m) through the steps of a tape, in place; after the steps that `keep` marks it goes to
-    dys."""
-    a, m, row = GAMMA * h, dy.shape[1], 0
+def forward(
+    s: Any,
+    w: Any,
+    h: Array,
+    tape: Any,
+    signals: Array,
+    out_step: Any,
+    out_part: Array,
+    dy: Array,
+    dp: Array,
+    dys: Array,
+) -> None:
+    """Carry the tangent dy (size, m) through the steps of a tape, in place; dys (outputs, size, m) receives it at the parts
+    out_part of the steps out_step."""
+    m, row = dy.shape[1], 0
     du, dv = np.zeros((len(w.u), 2, m)), np.zeros((len(w.u), 2, m))
-    free_rates, before = np.zeros((w.full.size, m)), np.empty(dy.shape)
+    free_rates, before, first = np.zeros((w.full.size, m)), np.empty(dy.shape), np.empty(dy.shape)
     span = np.zeros((s.pad_base.size, 2), np.int64)
-    for step in range(len(keep)):
+    for step in range(h.size):
+        a = GAMMA * h[step]
         if step % RESCAN == 0:
             find_span(s, tape.y[2 * step], dy, span)
         before[:] = dy
         stage_tangent(s, w, tape, 2 * step, a, signals[2 * step], dy, dp, span, du, dv, free_rates)
+        first[:] = dy
         dy[:] = before + MIX * (dy - before)
         stage_tangent(s, w, tape, 2 * step + 1, a, signals[2 * step + 1], dy, dp, span, du, dv, free_rates)
-        if keep[step]:
-            dys[row] = dy
+        while row < out_step.size and out_step[row] == step:
+            at_start, at_first, at_end = dense_states(out_part[row])
+            dys[row] = at_start * before + at_first * first + at_end * dy
             row += 1

@@ -1,0 +1,254 @@
+"""Steps by tolerance: accuracy, dense output, frozen steps and their gradients, and what cannot be met."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from conftest import coarse, grasped, times, turning
+from torch import Tensor, nn
+from torchdiffeq import odeint, odeint_adjoint
+
+from torchsoft import Reference, SimulationFailed, SoftGrasp, Trajectory, simulate
+from torchsoft.physics.motion import Profile, Sampled
+from torchsoft.scenario import grasp_and_roll
+
+T = times(0.4, 9)
+
+
+@pytest.fixture(scope="module")
+def start() -> tuple[SoftGrasp, Tensor]:
+    """The paper's manipulation on a coarse mesh, quickened: its touch-down and grasp within 0.3 s."""
+    model = coarse(scenario__grasp_time=0.25, scenario__roll_time=0.5, scenario__hold_time=0.1, scenario__travel=4e-3)
+    made = grasp_and_roll(model, grasp_force=80.0)
+    return made.model, made.y0
+
+
+@pytest.fixture(scope="module")
+def exact(start: tuple[SoftGrasp, Tensor]) -> Trajectory:
+    return simulate(start[0], T, y0=start[1], rtol=1e-8)
+
+
+def worst(run: Trajectory, exact: Trajectory) -> float:
+    """Largest error of the motion and of the forces, over their range."""
+    return max(
+        float((run[x] - exact[x]).detach().abs().max() / np.ptp(exact[x].detach().numpy()))
+        for x in ("x_C", "y_C", "theta", "y_Br", "F_x", "F_y")
+    )
+
+
+def test_error_falls_with_the_tolerance(start: tuple[SoftGrasp, Tensor], exact: Trajectory) -> None:
+    model, y0 = start
+    errors = []
+    for rtol in (1e-3, 1e-5, 1e-7):
+        run = simulate(model, T, y0=y0, rtol=rtol)
+        errors.append(worst(run, exact))
+        assert errors[-1] < 30 * rtol**0.8
+        assert run.energy_residual_rel < 3 * rtol**0.7
+    assert errors[0] > 5 * errors[1] > 10 * errors[2]
+
+
+def test_steps_are_short_where_it_touches_down_and_long_where_it_rests(start: tuple[SoftGrasp, Tensor]) -> None:
+    model, y0 = start
+    run = simulate(model, times(2.0, 5), y0=y0, rtol=1e-4)
+    h = run.knots.diff()
+    assert run.stats.refused_steps > 0
+    assert float(h[run.knots[:-1] > 1.5].min()) > 0.02 > 2e-3 > float(h[run.knots[:-1] < 0.25].min())
+
+
+def test_outputs_do_not_change_the_run(start: tuple[SoftGrasp, Tensor], exact: Trajectory) -> None:
+    """Up to Newton's tolerance, which decides steps that are nearly refused."""
+    model, y0 = start
+    few, many = (simulate(model, times(0.4, n), y0=y0, rtol=1e-4) for n in (9, 161))
+    assert few.stats.steps == pytest.approx(many.stats.steps, rel=0.03)
+    assert torch.allclose(few.knots[:40], many.knots[:40], rtol=1e-6)
+    apart = max(float((few[x] - many[x][::20]).abs().max() / np.ptp(exact[x].numpy())) for x in ("x_C", "y_C", "F_y"))
+    assert apart < worst(few, exact)
+
+
+def test_dense_output_is_as_good_as_the_steps(start: tuple[SoftGrasp, Tensor]) -> None:
+    """Between its knots a run is as near to the exact one as at them, and the forces are those of the states."""
+    model, y0 = start
+    t = times(0.4, 161)
+    dense, fine = (simulate(model, t, y0=y0, rtol=rtol) for rtol in (1e-4, 1e-7))
+    at_knots = simulate(model, dense.knots, y0=y0, knots=dense.knots)
+    fine_there = simulate(model, dense.knots, y0=y0, rtol=1e-7)
+    for x in ("x_C", "y_C", "y_Br", "F_y"):
+        between, ends = float((dense[x] - fine[x]).abs().max()), float((at_knots[x] - fine_there[x]).abs().max())
+        assert between < 3 * ends
+    i = 121
+    alone = simulate(model, t[i:], y0=dense.y[i], step=1e-3)  # its first row is the forces that belong to that state
+    for name in "LU":
+        assert float((alone.force[name][0] - dense.force[name][i]).abs().max()) < 1e-8
+
+
+def test_steps_of_another_run_are_taken_again(start: tuple[SoftGrasp, Tensor]) -> None:
+    model, y0 = start
+    run = simulate(model, T, y0=y0, rtol=1e-4)
+    again = simulate(model, T, y0=y0, knots=run.knots)
+    assert float((again.y - run.y).abs().max()) < 1e-8
+    for name in "LU":
+        assert float((again.force[name] - run.force[name]).abs().max()) < 1e-8
+    assert torch.allclose(again.knots, run.knots, rtol=0, atol=1e-15)
+    with pytest.raises(ValueError, match=r"`knots` must go from"):
+        simulate(model, times(0.5, 3), y0=y0, knots=run.knots)
+
+
+@pytest.mark.parametrize("make", [coarse, turning])
+def test_gradients_are_those_of_the_frozen_steps(make: Callable[..., SoftGrasp]) -> None:
+    """Also of outputs between the knots, by both routes, against differences over the same steps."""
+    model = make()
+    base = model if isinstance(model, SoftGrasp) else model.fixed()
+    y0 = grasped(base, (0.03, 0.0))
+    if model is not base:
+        state = base.unpack(y0)
+        y0 = model.pack(state)
+    reference = base.reference
+    t = torch.tensor([0.0, 0.004, 0.0115, 0.02], dtype=torch.float64)
+    run = simulate(model, t, y0=y0, reference=reference, rtol=1e-4, gradient="discrete", tolerance=1e-10)
+    inside = ~torch.isin(t[1:], run.knots)
+    assert bool(inside.any())
+    weights = torch.linspace(1.0, 2.0, len(t), dtype=torch.float64)
+    stiffness = "pad.E" if model is base else "pads.L.material.E"
+    loss = lambda r: (weights[:, None] * r.state.pose["disc"] * torch.tensor([30.0, 0.0, 1.0])).sum()
+    model.zero_grad()
+    loss(run).backward()
+    forward = simulate(
+        model, t, y0=y0, reference=reference, knots=run.knots, gradient="forward", wrt=[stiffness], tolerance=1e-10
+    )
+    for name in ("pad.E", "contact.K_t", "contact.mu_s") if model is base else (stiffness,):
+        p = model.parameter(name)
+        ends, value = [], float(p.detach())
+        for sign in (1, -1):
+            with torch.no_grad():
+                p.fill_(value * (1 + sign * 1e-6))
+            frozen = simulate(model, t, y0=y0, reference=reference, knots=run.knots, tolerance=1e-10)
+            ends.append(float(loss(frozen)))
+        with torch.no_grad():
+            p.fill_(value)
+        slope = (ends[0] - ends[1]) / (2e-6 * value)
+        assert float(p.grad) == pytest.approx(slope, rel=1e-4)
+    i = run.layout.slices["pose", "disc"]
+    adjoint = torch.autograd.grad(
+        simulate(model, t, y0=y0, reference=reference, knots=run.knots, gradient="discrete", tolerance=1e-10).y[
+            1, i.start + 2
+        ],
+        [model.parameter(stiffness)],
+    )[0]
+    assert float(forward.sensitivities[1, i.start + 2, 0]) == pytest.approx(float(adjoint), rel=1e-9)
+
+
+class Wave(nn.Module):
+    """A signal that is no piecewise polynomial."""
+
+    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        return 0.06 + 1e-3 * torch.sin(20 * t), 2e-2 * torch.cos(20 * t)
+
+
+def test_a_signal_of_ones_own_is_followed() -> None:
+    model = coarse()
+    y0 = grasped(model)
+    own = Reference(**{name: model.reference[name] for name in model.signals if name != "x_d"}, x_d=Wave())
+    t = times(0.1, 6)
+    run, fine = (simulate(model, t, y0=y0, reference=own, rtol=rtol) for rtol in (1e-4, 1e-7))
+    assert float((run["x_C"] - fine["x_C"]).abs().max()) < 1e-7
+    knots = torch.linspace(0, 0.1, 2001, dtype=torch.float64)
+    value, rate = Wave()(knots)
+    pieces = Reference(
+        **{name: model.reference[name] for name in model.signals if name != "x_d"},
+        x_d=Sampled(knots.tolist(), value.tolist(), rate.tolist()),
+    )
+    same = simulate(model, t, y0=y0, reference=pieces, rtol=1e-7)
+    assert float((same["x_C"] - fine["x_C"]).abs().max()) < 1e-9
+
+
+class Broken(Wave):
+    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        if bool((t > 0.05).any()):
+            raise RuntimeError("the table of this signal ends at 0.05 s")
+        return super().forward(t)
+
+
+def test_what_a_signal_raises_is_raised() -> None:
+    model = coarse()
+    y0 = grasped(model)
+    own = Reference(**{name: model.reference[name] for name in model.signals if name != "x_d"}, x_d=Broken())
+    with pytest.raises(RuntimeError, match="the table of this signal ends"):
+        simulate(model, times(0.1, 6), y0=y0, reference=own, rtol=1e-4)
+
+
+class Jump(Wave):
+    """A setpoint that jumps by 1 mm, and whose stated rate jumps by `rate` [m/s]."""
+
+    def __init__(self, rate: float) -> None:
+        super().__init__()
+        self.rate = rate
+
+    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
+        value, rate = super().forward(t)
+        return value + torch.where(t > 0.0512345, 1e-3, 0.0), rate + torch.where(t > 0.0512345, self.rate, 0.0)
+
+
+def test_a_jump_is_stepped_over_or_said() -> None:
+    model = coarse()
+    y0 = grasped(model)
+    jump = lambda rate: Reference(
+        **{name: model.reference[name] for name in model.signals if name != "x_d"}, x_d=Jump(rate)
+    )
+    run = simulate(model, times(0.1, 6), y0=y0, reference=jump(0.0), rtol=1e-4)
+    short = run.knots.diff().argmin()
+    assert float((run.knots[short] - 0.0512345).abs()) < 1e-3 > 10 * float(run.knots.diff().min())
+    with pytest.raises(
+        SimulationFailed, match=r"at t = 0\.0512 s .* steps below 1e-09 s for the velocity of body `bracket`"
+    ):
+        simulate(model, times(0.1, 6), y0=y0, reference=jump(1e9), rtol=1e-4)
+
+
+def test_no_step_passes_a_knot_of_the_reference() -> None:
+    model = coarse()
+    y0 = grasped(model)
+    x = float(model.unpack(y0).pose["disc"][0])
+    jerk = Profile([0.0, 0.501, 0.503, 0.505], [x, x, x + 1e-4, x])
+    own = Reference(**{name: model.reference[name] for name in model.signals if name != "x_d"}, x_d=jerk)
+    run = simulate(model, times(0.6, 3), y0=y0, reference=own, rtol=1e-3)
+    for time in (0.501, 0.503, 0.505):
+        assert float((run.knots - time).abs().min()) < 1e-12
+
+
+def test_inertial_pads_take_steps_by_tolerance() -> None:
+    model = coarse(pad__fidelity="inertial", scenario__grasp_time=0.1)
+    made = grasp_and_roll(model, grasp_force=80.0)
+    t = times(0.15, 7)
+    loose, tight = (simulate(made.model, t, y0=made.y0, rtol=rtol) for rtol in (1e-3, 1e-5))
+    assert float((loose["y_C"] - tight["y_C"]).abs().max()) < 1e-6
+    h = loose.knots.diff()
+    assert np.allclose(np.log2(h.numpy()), np.round(np.log2(h.numpy())), atol=1e-6)
+    again = simulate(made.model, t, y0=made.y0, knots=loose.knots)
+    assert float((again.y - loose.y).abs().max()) < 1e-9
+
+
+def test_ways_to_choose_steps_exclude_each_other() -> None:
+    with pytest.raises(ValueError, match="`step` and `rtol or atol` each say which steps to take"):
+        simulate(coarse(), T, step=1e-3, rtol=1e-4)
+    with pytest.raises(ValueError, match="`rtol` must be positive"):
+        simulate(coarse(), T, rtol=-1.0)
+    with pytest.raises(ValueError, match="takes equal steps"):
+        simulate(coarse(), T, rtol=1e-4, gradient="unrolled")
+
+
+def test_torchdiffeqs_tolerances_are_the_steppers() -> None:
+    model = coarse()
+    y0 = grasped(model, (0.03, 0.0))
+    t = times(0.02, 4)
+    solution = odeint(model, y0, t, method="sdirk2", rtol=1e-4, atol=1e-5)
+    exact = simulate(model, t, y0=y0, rtol=1e-8).y
+    assert isinstance(solution, Tensor)
+    i = model.layout.slices["pose", "disc"]
+    assert float((solution - exact)[:, i].detach().abs().max()) < 1e-6
+    grads = []
+    for solve in (odeint, odeint_adjoint):
+        model.zero_grad()
+        y = solve(model, y0, t, method="sdirk2", rtol=1e-4, atol=1e-5)
+        y[1:].square().sum().backward()
+        grads.append(float(model.parameter("contact.K_t").grad))
+    assert grads[0] == pytest.approx(grads[1], rel=1e-7)

@@ -1,0 +1,218 @@
+"""One implicit step: SDIRK2, its running energy integrals, its dense output, and what ends a run early.
+
+SDIRK2 is Alexander's two-stage method (SIAM J. Numer. Anal. 14, 1977): L-stable, stiffly accurate, of second order,
+both stages with the same a = 1 - 1/sqrt(2), so that one mobility serves both. The second stage starts from
+y* = (1 - MIX) y + MIX Y_1 and its end is the step's.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from torchsoft.solve.kernel import compiled, inlined
+from torchsoft.solve.kernel.arrays import Array
+from torchsoft.solve.kernel.stage import actuate, finish, solve_stage
+
+GAMMA = 1.0 - 1.0 / np.sqrt(2.0)
+MIX = (1.0 - GAMMA) / GAMMA
+
+CONVERGED, NEWTON_FAILED, OFF_THE_PAD, LOST, TAPE_FULL, NOT_FINITE, REFUSED, OFF_THE_RUNG = range(8)
+
+INSTANT = 1e-13
+"""Length a h [s] of the stage that gives the forces at one moment: nothing moves in it."""
+
+TINY = 1e-60
+"""Components of the state below this are set to zero, so that what decays does not end in denormal numbers."""
+
+
+@compiled
+def write_tape(s: Any, w: Any, tape: Any, row: int, y: Array) -> bool:
+    """Put one solved stage on the tape; False if more points touch than it has room for."""
+    tape.y[row], tape.q[row], tape.V[row], tape.rate[row] = y, w.q, w.V, w.full
+    slot = 0
+    for pad in range(s.pad_base.size):
+        at = s.contact_point_start[s.pad_contact_start[pad]]
+        tape.count[row, pad] = w.actives[pad]
+        if slot + w.actives[pad] > tape.point.shape[1]:
+            return False
+        for i in range(w.actives[pad]):
+            k = w.active[at + i]
+            tape.point[row, slot] = k
+            for r in range(2):
+                u = v = 0.0
+                for j in range(2):
+                    node, N = s.point_node[k, j], s.point_N[k, j]
+                    u += N * w.u[node, r]
+                    v += N * w.u_dot[node, r]
+                tape.state[row, slot, r], tape.state[row, slot, 2 + r], tape.state[row, slot, 4 + r] = u, v, w.out[k, r]
+            slot += 1
+    return True
+
+
+@compiled
+def gone(s: Any, w: Any) -> int:
+    """Whether a contact has reached the end of a pad, or a body has left the space over one."""
+    for c in range(s.contact_pad.size):
+        at = s.contact_point_start[s.pad_contact_start[s.contact_pad[c]]]
+        for i in range(w.actives[s.contact_pad[c]]):
+            if w.active[at + i] == s.contact_point_start[c] or w.active[at + i] == s.contact_point_start[c + 1] - 1:
+                return OFF_THE_PAD
+        x, y, limit = w.frame[c, 2], w.frame[c, 3], s.contact_limits[c]
+        if not (limit[0] <= x <= limit[1] and limit[2] <= y <= limit[3]):
+            return LOST
+    return CONVERGED
+
+
+@compiled
+def supply(s: Any, w: Any, signals: Array, powers: Array) -> None:
+    """Powers [W] of the actuators, of gravity, of what drives the bodies, and the sum of the positive ones."""
+    at = s.pad_base.size + 2
+    x, out, J = w.effort_x, w.effort, w.effort_J
+    for i in range(s.act_measured.size):
+        powers[at + i] = actuate(s, i, w.q, w.V, signals, x, out, J) * w.V[s.act_pushed[i]]
+    at += s.act_measured.size
+    gravity = 0.0
+    for i in range(s.body_coordinate.size):
+        gravity -= s.body_weight[i] * s.p[s.body_mass_at[i]] * s.p[s.body_gravity_at] * w.V[s.body_coordinate[i]]
+    powers[at] = gravity
+    for b in range(s.body_free.size // 3 - 1):
+        drive = 0.0
+        for c in range(3 * b, 3 * b + 3):
+            if s.body_free[c] < 0:
+                drive -= w.load[c] * w.V[c]
+        for i in range(s.act_measured.size):  # what pushes a driven coordinate is held by what drives it
+            if s.act_pushed[i] // 3 == b and s.body_free[s.act_pushed[i]] < 0:
+                drive -= powers[s.pad_base.size + 2 + i]
+        powers[at + 1 + b] = drive
+    total = 0.0
+    for i in range(s.pad_base.size + 2, powers.size - 1):
+        total += max(powers[i], 0.0)
+    powers[-1] = total
+
+
+@compiled
+def record(s: Any, w: Any, integrals: Array, moments: Array, forces: Array, extras: Array) -> None:
+    """One row of output: (F_N, F_T) of every point; integrals, the pads' moments and the generalised contact forces."""
+    forces[:] = 0.0
+    for pad in range(s.pad_base.size):
+        at = s.contact_point_start[s.pad_contact_start[pad]]
+        for i in range(w.actives[pad]):
+            k = w.active[at + i]
+            forces[k, 0], forces[k, 1] = w.out[k, 3], w.out[k, 4]
+    n, m = integrals.size, moments.size
+    extras[:n], extras[n : n + m], extras[n + m :] = integrals, moments, w.load
+
+
+@inlined
+def solve_near(
+    s: Any, w: Any, y: Array, signals: Array, a: float, tolerance: float, max_iterations: int, margin: float, powers: Array,
+    moments: Array,
+) -> tuple[bool, int, float]:  # fmt: skip
+    """A stage from y with every point that may touch in the window: success, linear solves, a bound of all speeds [m/s]."""
+    solves, speed, reach, done, converged = 0, 0.0, margin, False, True
+    while converged and not done:
+        converged, count = solve_stage(s, w, y, signals, a, tolerance, max_iterations, reach)
+        solves += count
+        if converged:
+            speed = finish(s, w, y, a, powers, moments)
+            done = w.travelled[0] + a * speed <= w.travelled[1]
+            if not done:  # a point may have come near that was not looked at
+                converged = reach == margin  # one look further must do
+                if w.travelled[0] == 0.0:
+                    reach = margin + 1.5 * a * speed
+                w.travelled[0] = np.inf
+    return converged, solves, speed
+
+
+@inlined
+def take_step(
+    s: Any, w: Any, d: Any, y: Array, h: float, signals: Array, tolerance: float, max_iterations: int, margin: float,
+    integrals: Array, tape: Any, row: int,
+) -> tuple[int, int]:  # fmt: skip
+    """One step of h [s] from y, which goes to its end with `integrals`; signals (2, signals, 2) are those of the stages. The
+    start stays in d.y, d.integrals; d.K, d.powers and d.speed receive what the stages found. Returns status and solves."""
+    a, solves = GAMMA * h, 0
+    d.y[:], d.integrals[:], d.V[:], d.u_dot[:], d.travelled[:] = y, integrals, w.V, w.u_dot, w.travelled
+    status = CONVERGED
+    for stage in range(2):
+        powers = d.powers[stage]
+        converged, count, speed = solve_near(
+            s, w, y, signals[stage], a, tolerance, max_iterations, margin, powers, d.moments
+        )
+        solves += count
+        if not converged:
+            status = NEWTON_FAILED
+            break
+        if tape.y.shape[0] > 0 and not write_tape(s, w, tape, row + stage, y):
+            status = TAPE_FULL
+            break
+        supply(s, w, signals[stage], powers)
+        d.K[stage], d.speed[stage] = w.k, speed
+        dt = a if stage == 1 else h - a
+        for i in range(integrals.size):
+            integrals[i] += dt * powers[i]
+        for i in range(y.size):
+            value = y[i] + dt * w.k[i]
+            y[i] = value if abs(value) > TINY else 0.0
+        w.travelled[0] += dt * speed
+    if status == CONVERGED and not np.isfinite(y.sum()):
+        status = NOT_FINITE
+    return status, solves
+
+
+@compiled
+def take_back(w: Any, d: Any, y: Array, integrals: Array) -> None:
+    """Return to where `take_step` began."""
+    y[:], integrals[:], w.V[:], w.u_dot[:], w.travelled[0] = d.y, d.integrals, d.V, d.u_dot, np.inf
+
+
+@inlined
+def dense(part: float) -> tuple[float, float]:
+    """Weights b_1, b_2 of the stages' rates at a part of the step (0 to 1): the continuous extension of second order."""
+    second = part * (0.5 * part - GAMMA) / (1.0 - GAMMA)
+    return part - second, second
+
+
+@compiled
+def dense_states(part: float) -> tuple[float, float, float]:
+    """The same as weights of the states at the step's start, its first stage and its end; (0, 0, 1) at the end."""
+    if part == 1.0:
+        return 0.0, 0.0, 1.0
+    b_1, b_2 = dense(part)
+    return 1.0 - b_1 / GAMMA - b_2 * (1.0 - MIX) / GAMMA, (b_1 - b_2 * MIX) / GAMMA, b_2 / GAMMA
+
+
+@inlined
+def write_rows(
+    s: Any, s0: Any, w: Any, d: Any, y: Array, h: float, parts: Array, signals: Array, first: int, last: int,
+    tolerance: float, max_iterations: int, margin: float, integrals: Array, ys: Array, forces: Array, extras: Array,
+) -> tuple[int, int]:  # fmt: skip
+    """The outputs at parts[first:last] of the step just taken. At its end they are what the last stage found; before it, dense
+    output with the forces that belong to it, which take a stage of no length (of `s0`). Returns status and linear solves."""
+    solves, here, converged = 0, w.travelled[0], True
+    d.guess_V[:], d.guess[:] = w.V, w.u_dot
+    for i in range(last - 1, first - 1, -1):  # the end comes first: the others disturb what the last stage left
+        if parts[i] == 1.0:
+            ys[i], d.at_row[:] = y, integrals
+        else:
+            b_1, b_2 = dense(parts[i])
+            for j in range(y.size):
+                ys[i, j] = d.y[j] + h * (b_1 * d.K[0, j] + b_2 * d.K[1, j])
+            early = min(
+                parts[i], 1.0 - GAMMA
+            )  # what is dissipated never falls: a stage's power until its weight is used up
+            for j in range(integrals.size):
+                d.at_row[j] = d.integrals[j] + h * (early * d.powers[0, j] + (parts[i] - early) * d.powers[1, j])
+            way = d.travelled[0] + h * (abs(b_1) * d.speed[0] + abs(b_2) * d.speed[1])
+            scans = w.travelled[2]
+            w.travelled[0] = way if scans == d.travelled[2] else np.inf
+            converged, count, _ = solve_near(
+                s0, w, ys[i], signals[i], INSTANT, tolerance, max_iterations, margin, d.scrap, d.moments
+            )
+            solves += count
+            if not converged:
+                break
+            w.V[:], w.u_dot[:] = d.guess_V, d.guess
+            w.travelled[0] = here if w.travelled[2] == scans else np.inf
+        record(s, w, d.at_row, d.moments, forces[i], extras[i])
+    return CONVERGED if converged else NEWTON_FAILED, solves

@@ -1,0 +1,108 @@
+"""What a run of the stepper carries along and leaves behind, chunk by chunk, and how it fails."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from torchsoft.physics.rig import Rig
+from torchsoft.solve.grid import Plan
+from torchsoft.solve.kernel.arrays import Array, Step, Tape, Work, first_stages
+
+
+class SimulationFailed(RuntimeError):
+    """A run that ended early: when and why. `time` [s]; `trajectory` holds what was simulated until then, if any."""
+
+    def __init__(self, reason: str, time: float) -> None:
+        super().__init__(reason)
+        self.reason, self.time = reason, time
+        self.trajectory: Any = None
+
+
+@dataclass
+class Progress:
+    """What the stepper has produced so far: rows of the output grid, its steps, and its counters.
+
+    extras: running integrals, the pads' moments, the generalised contact forces on all coordinates (`Integrals` names them).
+    """
+
+    y: Array
+    forces: Array
+    extras: Array
+    rows: int = 1
+    steps: int = 0
+    solves: int = 0
+    failed: int = 0
+    refused: int = 0
+    starts: list[Array] = field(default_factory=list)
+    end: float = 0.0
+
+    @property
+    def knots(self) -> Array:
+        """Where the steps began and ended [s] (steps + 1,); empty without any."""
+        return np.concatenate([*self.starts, np.full(min(self.steps, 1), self.end)])
+
+
+@dataclass
+class Segment:
+    """One chunk of a taped run: where it began, the signals at its stages and outputs, and its tape, or None where it is to be
+    made again when needed."""
+
+    plan: Plan
+    signals: Array
+    at_outputs: Array
+    y: Array
+    V: Array
+    u_dot: Array
+    rows: slice
+    tape: Tape | None
+
+
+class Integrals:
+    """Names of the running integrals [J]: dissipated by, supplied by, and the positive part of what the sources supply."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.dissipated = (*(f"pad_{name}" for name in rig.pads), "contact_dashpots", "slip")
+        drives = tuple(f"drive_{name}" for name in rig.bodies)
+        self.supplied = (*(f"control_{name}" for name in rig.actuators), "gravity", *drives)
+        self.names = (*self.dissipated, *self.supplied, "injected")
+        driven = {f"drive_{name}" for name, body in rig.bodies.items() if "driven" in body.freedom.values()}
+        self.active = {name for name in self.supplied if not name.startswith("drive_")} | driven
+
+
+@dataclass
+class Marching:
+    """A run on its way: the state, Newton's scratch, the last step, the integrals, and where its results go."""
+
+    y: Array
+    work: Work
+    step: Step
+    integrals: Array
+    out: Progress
+    segments: list[Segment] | None
+    tape_bytes: float
+    taped: int = 0
+
+    @property
+    def taping(self) -> bool:
+        return self.segments is not None and self.taped < self.tape_bytes
+
+    def copy(self) -> tuple[Array, Array, Array, Array]:
+        return self.y.copy(), self.work.V.copy(), self.work.u_dot.copy(), self.integrals.copy()
+
+    def back(self, before: tuple[Array, Array, Array, Array]) -> None:
+        self.y[:], self.work.V[:], self.work.u_dot[:], self.integrals[:] = before
+
+    def keep(
+        self, plan: Plan, signals: Array, at_outputs: Array, before: tuple[Array, Array, Array, Array], rows: slice,
+        tape: Tape | None,
+    ) -> None:  # fmt: skip
+        """Note the steps that were taken, and what their derivatives need."""
+        if len(plan.h) == 0:
+            return
+        self.out.starts.append(plan.starts)
+        self.out.end = float(plan.starts[-1] + plan.h[-1])
+        if self.segments is not None:
+            kept = None if tape is None else first_stages(tape, 2 * len(plan.h))
+            self.segments.append(Segment(plan, signals, at_outputs, *before[:3], rows, kept))
+            self.taped += 0 if kept is None else sum(x.nbytes for x in kept)
