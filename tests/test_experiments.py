@@ -54,6 +54,21 @@ def test_pad_fidelity_smoke(tmp_path: Path) -> None:
     assert "| F_y | mN |" in module.table(result)
 
 
+def test_step_accuracy_smoke(tmp_path: Path) -> None:
+    """Motion, forces and gradients come nearer with the tolerance; the table and the figure hold every way."""
+    module = experiment("step_accuracy")
+    result = module.run(module.Config(out=tmp_path, smoke=True))
+    (rows,) = result.motions.values()
+    loose, tight, equal = rows.values()
+    for name in ("x_C", "F_y", "gradient"):
+        assert tight[name] < loose[name]
+    assert tight["gradient"] < 0.2
+    assert loose["steps"] < tight["steps"]
+    assert equal["refused"] == 0
+    assert module.table(rows).count("|\n") == 4
+    assert len(module.figure(result).axes) == 1
+
+
 def test_refinement_smoke(tmp_path: Path) -> None:
     """Halving the step lessens the error of every signal; the mesh moves the grasp by little; eta not at all."""
     module = experiment("refinement")

@@ -1,0 +1,155 @@
+"""Question: which tolerance, and which step, means which accuracy of motion, force and gradient, and at what cost?
+
+Three motions: the paper's grasp and roll out (10 s), light shaking (1 s), and a stroke of 2 mm in 20 ms. Each is run by
+tolerances and by equal steps against a run by a much smaller tolerance: largest errors of the disc's pose and of the forces
+over their range, and the relative errors of d theta(end) / d parameter for eight parameters, by the discrete adjoint.
+
+Command: .venv/bin/python experiments/step_accuracy.py [--smoke]
+Expected: rtol = 1e-4 holds what a step of 2 ms holds, at half its cost in the manipulation; gradients within 1 % take
+rtol = 3e-5 (a step of 2 ms leaves 10 %). About four minutes on one core.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import torch
+from _experiment import grid, made_by, markdown, options, timed, write
+from matplotlib.figure import Figure
+from torch import Tensor
+from tqdm import tqdm
+
+from torchsoft import Parameters, SoftGrasp, Trajectory, simulate
+from torchsoft.excitation import Excitation, MultiSine, Strokes, begin
+from torchsoft.scenario import grasp_and_roll
+
+EIGHT = ("contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau")
+
+
+@dataclass(frozen=True)
+class Config:
+    out: Path = Path("out/step_accuracy")
+    rtols: tuple[float, ...] = (1e-3, 3e-4, 1e-4, 3e-5, 1e-5)  # relative tolerances; a tenth of it is the absolute one
+    steps_ms: tuple[float, ...] = (2.0, 1.0, 0.5)  # equal steps [ms]
+    exact: float = 1e-7  # relative tolerance of the run they are compared with
+    roll: float = 10.0  # of the manipulation [s]
+    repeats: int = 3  # timings of which the median is taken
+    smoke: bool = False  # a size that takes seconds
+
+
+@dataclass(frozen=True)
+class Result:
+    config: Config
+    motions: dict[str, dict[str, dict[str, Any]]]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A model that follows its reference from y0 (size,) through the times t (T,)."""
+
+    model: SoftGrasp
+    y0: Tensor
+    t: Tensor
+
+
+def motions(config: Config) -> dict[str, Motion]:
+    """The three motions; with `smoke` the stroke on a coarse mesh alone."""
+    stroke = Excitation(motion=Strokes(travel=2e-3, stroke_time=0.02), duration=0.54)
+    if config.smoke:
+        begun = begin(stroke, Parameters().override({"pad.elements_x": 60, "pad.elements_y": 2}))
+        return {"stroke of 2 mm in 20 ms": Motion(begun.model, begun.y0, grid(0.54, 0.005))}
+    made = grasp_and_roll(SoftGrasp(Parameters()), grasp_force=80.66)
+    out = {"grasp and roll out": Motion(made.model, made.y0, grid(config.roll))}
+    shaking = Excitation(motion=MultiSine(amplitude_x=1e-3, amplitude_y=5e-5, frequency=(2.0, 10.0)), duration=1.0)
+    for name, excitation in (("light shaking", shaking), ("stroke of 2 mm in 20 ms", stroke)):
+        begun = begin(excitation, Parameters())
+        out[name] = Motion(begun.model, begun.y0, grid(excitation.duration, 0.005))
+    return out
+
+
+def gradient(motion: Motion, **steps: float) -> Tensor:
+    """d theta(end) / d log p of the eight parameters."""
+    run = simulate(motion.model, motion.t, y0=motion.y0, gradient="discrete", **steps)  # pyright: ignore[reportArgumentType]
+    p = [motion.model.parameter(name) for name in EIGHT]
+    parts = torch.autograd.grad(run["theta"][-1], p)
+    return torch.stack([part * value.detach() for part, value in zip(parts, p)])
+
+
+def errors(run: Trajectory, exact: Trajectory) -> dict[str, float]:
+    """Largest error of every signal over its range."""
+    pairs = {name: (run[name], exact[name]) for name in ("x_C", "y_C", "theta", "F_x", "F_y")}
+    return {name: ((x - y).abs().max() / (y.max() - y.min())).item() for name, (x, y) in pairs.items()}
+
+
+def run(config: Config) -> Result:
+    if config.smoke:
+        config = Config(out=config.out, rtols=(1e-3, 1e-4), steps_ms=(2.0,), exact=1e-6, repeats=1, smoke=True)
+    ways: dict[str, dict[str, float]] = {f"rtol = {rtol:g}": {"rtol": rtol} for rtol in config.rtols}
+    ways |= {f"step = {h:g} ms": {"step": 1e-3 * h} for h in config.steps_ms}
+    every = motions(config)
+    bar = tqdm(total=len(every) * (len(ways) + 1), unit="way")
+    out: dict[str, dict[str, dict[str, Any]]] = {}
+    for title, motion in every.items():
+        exact = simulate(motion.model, motion.t, y0=motion.y0, rtol=config.exact)
+        wanted = gradient(motion, rtol=config.exact)
+        bar.update()
+        out[title] = {}
+        for key, steps in ways.items():
+            simulated = lambda: simulate(motion.model, motion.t, y0=motion.y0, **steps)  # noqa: B023
+            runs = [simulated() for _ in range(config.repeats)]
+            got, wall = timed(lambda: gradient(motion, **steps))  # noqa: B023
+            off = ((got - wanted) / wanted).abs()
+            out[title][key] = {
+                "steps": runs[0].stats.steps,
+                "refused": runs[0].stats.refused_steps,
+                "wall_s": median(one.stats.wall_s for one in runs),
+                "with_gradient_s": wall,
+                **errors(runs[0], exact),
+                "energy_residual": runs[0].energy_residual_rel,
+                "gradient": off.max().item(),
+                "gradients": dict(zip(EIGHT, off.tolist())),
+            }
+            bar.update()
+    bar.close()
+    return Result(config, out)
+
+
+COLUMNS = ("steps", "wall_s", "with_gradient_s", "x_C", "y_C", "theta", "F_x", "F_y", "energy_residual", "gradient")
+
+
+def table(rows: dict[str, dict[str, Any]]) -> str:
+    """A Markdown table of one motion."""
+    return markdown(("", *COLUMNS), [(key, *(f"{row[name]:.3g}" for name in COLUMNS)) for key, row in rows.items()])
+
+
+def figure(result: Result) -> Figure:
+    """Accuracy against cost: of the motion, the forces and the gradients."""
+    fig = Figure(figsize=(4.5 * len(result.motions), 4), layout="constrained")
+    for ax, (title, rows) in zip(fig.subplots(1, len(result.motions), squeeze=False)[0], result.motions.items()):
+        for kind, line in (("rtol", "-"), ("step", "--")):
+            chosen = [row for key, row in rows.items() if key.startswith(kind)]
+            cost = [row["wall_s"] for row in chosen]
+            for (name, columns), colour in zip(
+                {"motion": ("x_C", "y_C", "theta"), "forces": ("F_x", "F_y"), "gradient": ("gradient",)}.items(), "kbr"
+            ):
+                worst = [max(row[c] for c in columns) for row in chosen]
+                label = f"{name}, {'by tolerance' if kind == 'rtol' else 'equal steps'}"
+                ax.loglog(cost, worst, f"{colour}o{line}", ms=3, label=label)
+        ax.set(title=title, xlabel="wall time of the run [s]", ylabel="largest relative error [1]")
+        ax.grid(alpha=0.3, which="both")
+    fig.axes[0].legend(fontsize=7)
+    return fig
+
+
+def main() -> None:
+    result = run(options(Config, __doc__))
+    for title, rows in result.motions.items():
+        print(f"\n{title}\n\n{table(rows)}")
+    content = {"motions": result.motions, "made_by": made_by(result.config)}
+    tables = "\n\n".join(f"{title}\n\n{table(rows)}" for title, rows in result.motions.items())
+    write(result.config.out, content, {"step_accuracy": figure(result)}, tables)
+
+
+if __name__ == "__main__":
+    main()
