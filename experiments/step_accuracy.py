@@ -68,9 +68,9 @@ def motions(config: Config) -> dict[str, Motion]:
     return out
 
 
-def gradient(motion: Motion, **steps: float) -> Tensor:
+def gradient(motion: Motion, **steps: Any) -> Tensor:
     """d theta(end) / d log p of the eight parameters."""
-    run = simulate(motion.model, motion.t, y0=motion.y0, gradient="discrete", **steps)  # pyright: ignore[reportArgumentType]
+    run = simulate(motion.model, motion.t, y0=motion.y0, gradient="discrete", **steps)
     p = [motion.model.parameter(name) for name in EIGHT]
     parts = torch.autograd.grad(run["theta"][-1], p)
     return torch.stack([part * value.detach() for part, value in zip(parts, p)])
@@ -85,7 +85,7 @@ def errors(run: Trajectory, exact: Trajectory) -> dict[str, float]:
 def run(config: Config) -> Result:
     if config.smoke:
         config = Config(out=config.out, rtols=(1e-3, 1e-4), steps_ms=(2.0,), exact=1e-6, repeats=1, smoke=True)
-    ways: dict[str, dict[str, float]] = {f"rtol = {rtol:g}": {"rtol": rtol} for rtol in config.rtols}
+    ways: dict[str, dict[str, Any]] = {f"rtol = {rtol:g}": {"rtol": rtol} for rtol in config.rtols}
     ways |= {f"step = {h:g} ms": {"step": 1e-3 * h} for h in config.steps_ms}
     every = motions(config)
     bar = tqdm(total=len(every) * (len(ways) + 1), unit="way")
