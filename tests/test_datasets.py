@@ -385,7 +385,7 @@ def test_damage_is_found(made: tuple[Path, Config], tmp_path: Path, damage: Any,
         open_dataset(str(folder)).load()
     assert "\n" not in str(refused.value)
     names = ["disc_angle", "feed_forward", "grasp_force", "disc_spin"]
-    if "time" not in message:  # which it does not read
+    if "time" not in message and "/c/1" not in message:  # what is damaged may be of an array that it does not read
         with pytest.raises(StoreError, match=r"is damaged|is missing|are not finished"):
             every_window(str(folder), names)
 
