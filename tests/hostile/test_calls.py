@@ -75,8 +75,10 @@ def of_simulate() -> Iterator[Call]:
         [None, 3, "model", SoftGrasp, Parameters(), nn.Linear(1, 1), model.pads["L"], model.forward]
     ):
         yield f"rig #{i}", lambda odd=odd: run(rig=odd)
-    for name in ("step", "tolerance"):
+    for name in ("step", "tolerance", "rtol", "atol"):
         for odd in (*NOT_POSITIVE, f64(1.0)[0], 1e-300):
+            if odd is None and name != "tolerance":  # which is not given then
+                continue
             yield f"{name} = {odd!r:.20}", lambda name=name, odd=odd: run(**{name: odd})
     yield "tolerance below rounding", lambda: run(tolerance=1e-14)
     for odd in (

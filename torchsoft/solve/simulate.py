@@ -55,7 +55,7 @@ def simulate(
     Steps: by default equal ones between the times t, no longer than `step` [s] (`STEP`). With `rtol` or `atol` they are chosen
     so that the error of each stays below rtol times the largest value so far plus atol, which counts nodal forces in N,
     lengths in mm, angles in rad; either alone brings the other, a tenth of rtol being atol. A motion is right long before its
-    derivative is: 1e-4 holds what a step of 2 ms does, gradients within 1 % take 3e-5. `knots` are the steps of another run
+    derivative is: 1e-4 holds what a step of 2 ms does, gradients take 3e-5 to 1e-5. `knots` are the steps of another run
     (its `knots`), frozen: what a fit needs, whose residuals are then smooth in the parameters. `tolerance` [N] is Newton's.
 
     gradient: with "discrete" the states and channels of the result carry the exact gradient of the discrete run (of the steps
