@@ -138,7 +138,8 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {line(error, 2000)}", file=sys.stderr)
         return 2
     except OSError as error:
-        print(f"error: {f'{error.filename}: {error.strerror}' if error.filename else line(error)}", file=sys.stderr)
+        where = f"{error.filename}: {error.strerror}" if error.filename else error
+        print(f"error: {line(where, 2000)}", file=sys.stderr)
         return 2
     except BrokenProcessPool:
         print("error: a worker was killed, perhaps for memory; start again to make what is missing", file=sys.stderr)
