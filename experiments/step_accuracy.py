@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from _experiment import grid, made_by, markdown, options, timed, write
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
 from torch import Tensor
 from tqdm import tqdm
 
@@ -139,7 +140,8 @@ def figure(result: Result) -> Figure:
                 ax.loglog(cost, worst, f"{colour}o{line}", ms=3, label=label)
         ax.set(title=title, xlabel="wall time of the run [s]", ylabel="largest relative error [1]")
         ax.grid(alpha=0.3, which="both")
-    fig.axes[0].legend(fontsize=7)
+        ax.xaxis.set_minor_formatter(NullFormatter())
+    fig.legend(*fig.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
     return fig
 
 

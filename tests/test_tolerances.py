@@ -12,6 +12,7 @@ from torchdiffeq import odeint, odeint_adjoint
 from torchsoft import Reference, SimulationFailed, SoftGrasp, Trajectory, simulate
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.scenario import grasp_and_roll
+from torchsoft.solve.grid import given_steps
 
 T = times(0.4, 9)
 
@@ -92,6 +93,15 @@ def test_steps_of_another_run_are_taken_again(start: tuple[SoftGrasp, Tensor]) -
     assert torch.allclose(again.knots, run.knots, rtol=0, atol=1e-15)
     with pytest.raises(ValueError, match=r"`knots` must go from"):
         simulate(model, times(0.5, 3), y0=y0, knots=run.knots)
+
+
+def test_outputs_lie_within_their_steps_however_these_differ() -> None:
+    """A last step that is longer by far must not decide where the outputs of the short ones lie."""
+    knots = np.array([0.0, 1e-9, 2e-9, 0.1])
+    t = torch.tensor([0.0, 5e-10, 1e-9, 1.05e-9, 2e-9, 0.1], dtype=torch.float64)
+    (plan,) = given_steps(t, knots)
+    assert plan.out_step.tolist() == [0, 0, 1, 1, 2]
+    assert plan.out_part.tolist() == pytest.approx([0.5, 1.0, 0.05, 1.0, 1.0])
 
 
 @pytest.mark.parametrize("make", [coarse, turning])

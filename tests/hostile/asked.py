@@ -7,11 +7,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-import numpy as np
-import torch
-
 from hostile.mutation import NOT_NUMBERS, Mutant
-from hostile.trial import Tally
+from hostile.trial import Tally, sentence
 
 LIMIT = 20.0
 """Longest time [s] that one input may take."""
@@ -33,10 +30,6 @@ def in_time(limit: float = LIMIT) -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, before)
-
-
-def sentence(text: str) -> bool:
-    return 0 < len(text) < 2000 and "\n" not in text and "Traceback" not in text and "validation error" not in text
 
 
 def names(text: str, mutant: Mutant) -> bool:
@@ -79,17 +72,11 @@ def ask(
     if follow is None:
         tally.held(True)
         return made
-    try:
+
+    def later() -> None:
         with in_time(6 * LIMIT), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             follow(made)
-    except (ValueError, RuntimeError) as refusal:
-        raw = isinstance(refusal, np.linalg.LinAlgError | torch.linalg.LinAlgError)
-        tally.held(sentence(str(refusal)) and not raw, f"{shown}, later: not one sentence: {refusal}")
-    except BaseException as error:
-        if isinstance(error, KeyboardInterrupt | SystemExit):
-            raise
-        tally.held(False, f"{shown}, later: {''.join(traceback.format_exception(error))[-1500:]}")
-    else:
-        tally.held(True)
+
+    tally.call(f"{shown}, later", later, (ValueError, RuntimeError))
     return made

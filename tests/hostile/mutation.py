@@ -3,6 +3,7 @@
 import copy
 import math
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -153,3 +154,13 @@ def encoded(data: bytes, rng: np.random.Generator) -> bytes:
 
 
 TEXTS: tuple[Callable[[bytes, np.random.Generator], bytes], ...] = (cut, flip, insert, zeroed, twice, encoded)
+
+
+def written(path: Path, tree: Any, way: str, number: int, rng: np.random.Generator) -> Mutant:
+    """Write a table to a file with one of its values changed, or (`way` other than "values") its text."""
+    if way == "values":
+        changed = mutant(tree, rng)
+        path.write_text(toml(changed.tree), encoding="utf-8")
+        return changed
+    path.write_bytes(TEXTS[number % len(TEXTS)](toml(tree).encode(), rng))
+    return Mutant(None, (), new=number)

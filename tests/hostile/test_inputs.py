@@ -13,7 +13,7 @@ from hypothesis import seed as seeded
 from hypothesis import strategies as st
 
 from hostile.asked import ask
-from hostile.mutation import TEXTS, Mutant, mutant, toml
+from hostile.mutation import Mutant, written
 from hostile.trial import SEED, Tally, count, random
 from torchsoft import Parameters, SoftGrasp, rest, simulate
 from torchsoft.cost import Costly, agree
@@ -124,12 +124,7 @@ def test_a_mutated_table_is_finite_or_refused_by_its_field(
     path = tmp_path / "mutant.toml"
     for i in range(count(number if way == "values" else number // 4)):
         tree = trees[i % len(trees)]
-        if way == "values":
-            changed = mutant(tree, rng)
-            path.write_text(toml(changed.tree), encoding="utf-8")
-        else:
-            changed = Mutant(None, (), new=i)
-            path.write_bytes(TEXTS[i % len(TEXTS)](toml(tree).encode(), rng))
+        changed = written(path, tree, way, i, rng)
         check = follow if i % every == 0 else None
         ask(line, kind, changed, lambda: from_toml(path, table.model_validate), check)
 

@@ -16,9 +16,10 @@ import numpy as np
 import pytest
 import torch
 
-from hostile.asked import LIMIT, ask, sentence
-from hostile.mutation import TEXTS, Mutant, cut, flip, mutant, toml, zeroed
-from hostile.trial import Tally, count, random
+from hostile import mutation
+from hostile.asked import LIMIT, ask
+from hostile.mutation import TEXTS, Mutant, cut, flip, toml, zeroed
+from hostile.trial import Tally, count, random, sentence
 from torchsoft import Parameters, simulate
 from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.files import sealed, unsealed
@@ -96,12 +97,7 @@ def folder(tmp_path: Path) -> Path:
 def test_a_mutated_identification(way: str, folder: Path, tally: Callable[[str], Tally]) -> None:
     line, rng, tree, path = tally(f"identifications: {way}"), random(2, len(way)), config(), folder / "rig.toml"
     for i in range(count(4000 if way == "values" else 1000)):
-        if way == "values":
-            changed = mutant(tree, rng)
-            path.write_text(toml(changed.tree), encoding="utf-8")
-        else:
-            changed = Mutant(None, (), new=i)
-            path.write_bytes(TEXTS[i % len(TEXTS)](toml(tree).encode(), rng))
+        changed = mutation.written(path, tree, way, i, rng)
         follow = one_run if i % 10 == 0 else None
         ask(line, "identification", changed, lambda: measured.load([folder / "data.csv"], path), follow)
 

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import torch
 
 SCALE = float(os.environ.get("HOSTILE_SCALE", "1"))
 SEED = int(os.environ.get("HOSTILE_SEED", "0"))
@@ -32,8 +33,8 @@ class Tally:
         try:
             result = function()
         except refusals as refusal:
-            text = str(refusal)
-            self.held(bool(text) and "\n" not in text and len(text) < 2000, f"{what}: not one sentence: {text!r}")
+            raw = isinstance(refusal, np.linalg.LinAlgError | torch.linalg.LinAlgError)
+            self.held(sentence(str(refusal)) and not raw, f"{what}: not one sentence: {str(refusal)!r}")
         except BaseException as error:
             if isinstance(error, KeyboardInterrupt | SystemExit):
                 raise
@@ -42,6 +43,11 @@ class Tally:
             self.held(True)
             return result
         return None
+
+
+def sentence(text: str) -> bool:
+    """Whether a refusal is one sentence of this project's."""
+    return 0 < len(text) < 2000 and "\n" not in text and "Traceback" not in text and "validation error" not in text
 
 
 def count(number: int) -> int:

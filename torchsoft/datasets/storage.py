@@ -10,6 +10,7 @@ import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
 from torchsoft.files import remove_partials, replacing
+from torchsoft.tables import line
 
 
 class StoreError(RuntimeError):
@@ -26,7 +27,7 @@ def store_errors(url: str) -> Iterator[None]:
     except Exception as error:
         if isinstance(error, StoreError) or isinstance(filesystem(url)[0], LocalFileSystem):
             raise
-        raise StoreError(f"{url}: {type(error).__name__}: {' '.join(str(error).split())}") from error
+        raise StoreError(f"{url}: {type(error).__name__}: {line(error, 2000)}") from error
 
 
 def store_error(error: OSError, url: str) -> StoreError:
@@ -41,7 +42,7 @@ def store_error(error: OSError, url: str) -> StoreError:
         return StoreError(f"{error.filename2 or error.filename or url} is a folder where a file should be; remove it")
     if isinstance(error, PermissionError) or error.errno == errno.EROFS:
         return StoreError(f"{url}: may not be written ({error.strerror or error}); choose another folder")
-    return StoreError(f"{url}: {' '.join(str(error).split())}")
+    return StoreError(f"{url}: {line(error, 2000)}")
 
 
 def filesystem(url: str) -> tuple[Any, str]:

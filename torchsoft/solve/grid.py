@@ -112,13 +112,12 @@ def given_steps(t: Tensor, knots: NDArray[np.float64]) -> Iterator[Plan]:
     Raises `ValueError` unless they cover t from its first time on.
     """
     times, h = t.numpy(), np.diff(knots)
-    slack = 1e-9 * h[-1]
-    if knots[0] != times[0] or knots[-1] < times[-1] - slack:
+    if knots[0] != times[0] or knots[-1] < times[-1] - 1e-9 * h[-1]:
         raise ValueError(
             f"`knots` must go from t[0] = {times[0]:g} s to t[-1] = {times[-1]:g} s, but go from {knots[0]:g} s to "
             f"{knots[-1]:g} s"
         )
-    at = np.minimum(np.searchsorted(knots + slack, times[1:], side="left"), len(h)) - 1
+    at = np.minimum(np.searchsorted(knots, times[1:], side="left"), len(h)) - 1
     parts = (times[1:] - knots[at]) / h[at]
     parts = np.where(np.abs(parts - 1.0) < 1e-9, 1.0, parts)
     whole = Plan(knots[:-1], h, at, parts)

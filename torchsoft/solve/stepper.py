@@ -90,11 +90,11 @@ class ImplicitStepper:
             raise ValueError(
                 f"`tolerance` must be at least {SMALLEST_TOLERANCE:g} N, but is {tolerance:g} N, which rounding hides"
             )
-        if landing and step is None and any(pad.inertial for pad in rig.pads.values()):
-            raise ValueError("inertial pads need equal steps here: give `step_size` [s]")
         self.knots = None if knots is None else check_knots(knots)
         self.rig, self.reference = rig, followed
         self.compiled = Compiled(rig)
+        if landing and step is None and self.compiled.inertial:
+            raise ValueError("inertial pads need equal steps here: give `step_size` [s]")
         self.layout, self.integrals = rig.layout, Integrals(rig)
         self._cap = 64
         self._still: Any = None
@@ -151,8 +151,7 @@ class ImplicitStepper:
     def _as_given(self, t: Tensor, now: "Marching") -> Iterator[Progress]:
         """Take the steps of a plan."""
         todo = list(given_steps(t, self.knots) if self.knots is not None else equal_steps(t, self.step or 0.0))
-        inertial = any(pad.inertial for pad in self.rig.pads.values())
-        if inertial and self.knots is not None:  # their arrays belong to one step length
+        if self.compiled.inertial and self.knots is not None:  # their arrays belong to one step length
             todo = [plan.part(i, i + 1) for plan in todo for i in range(len(plan.h))]
         signals, at_outputs = self.signals(todo).numpy(), self.signals_at_outputs(todo).numpy()
         ends, rows = (
@@ -188,42 +187,35 @@ class ImplicitStepper:
     def _by_tolerance(self, t: Tensor, now: "Marching") -> Iterator[Progress]:
         """Take steps whose lengths the tolerances choose."""
         times, out = t.numpy(), now.out
-        inertial = any(pad.inertial for pad in self.rig.pads.values())
         followed = Followed(lambda x: self.compiled.signals(x, self.reference), self.rig, self.reference)
         stops = np.union1d(followed.stops, times[1:] if self.landing else times[-1:])
         stops = stops[(stops > times[0]) & (stops <= times[-1])]
         errors = error_parts(self.rig, now.y, self.atol)
-        size = np.zeros(len(errors.first))
-        for i, (first, last) in enumerate(zip(errors.first, errors.last)):
-            size[i] = np.linalg.norm(now.y[first:last] - errors.origin[first:last])
-        errors.size[:] = size
         clock, k = np.array([times[0], min(FIRST, times[-1] - times[0]), 1.0]), now.step.K[0].copy()
-        rung, rows, chunk = 0.0, out.rows, CHUNK
+        rung, count = 0.0, self.compiled.signal_count
         row_step, row_part = np.zeros(len(t), np.int64), np.zeros(len(t))
-        while rows < len(t):
-            if inertial:
+        while out.rows < len(t):
+            if self.compiled.inertial:
                 rung = 2.0 ** math.floor(math.log2(min(clock[1], self.longest)))
             s = self.compiled.system(rung or 1.0)
-            starts, h = np.zeros(chunk), np.zeros(chunk)
-            count = self.compiled.signal_count
-            signals, at_rows = np.zeros((chunk, 2, count, 2)), np.zeros((len(t), count, 2))
+            starts, h = np.zeros(CHUNK), np.zeros(CHUNK)
+            signals, at_rows = np.zeros((CHUNK, 2, count, 2)), np.zeros((len(t), count, 2))
             before = now.copy()
-            tape = empty_tape(s, self.layout.size, 2 * chunk if now.taping else 0, self._cap)
+            tape = empty_tape(s, self.layout.size, 2 * CHUNK if now.taping else 0, self._cap)
             now.work.travelled[0] = np.inf
             now.work.low[:] = now.work.high[:] = 0
             steps, done, status, solves, refused, failed, which = run(
-                s, self._still, now.work, now.step, followed.arrays, errors, False, now.y, k, clock, stops, times, rows, rung,
-                *self._limits, now.integrals, out.y, out.forces, out.extras, tape, starts, h, signals, row_step, row_part,
-                at_rows,
+                s, self._still, now.work, now.step, followed.arrays, errors, False, now.y, k, clock, stops, times, out.rows,
+                rung, *self._limits, now.integrals, out.y, out.forces, out.extras, tape, starts, h, signals, row_step,
+                row_part, at_rows,
             )  # fmt: skip
             if followed.error is not None:
                 raise followed.error
-            here = slice(rows, rows + done)
+            here = slice(out.rows, out.rows + done)
             plan = Plan(starts[:steps], h[:steps], row_step[here].copy(), row_part[here].copy())
             flat = signals[:steps].reshape(2 * steps, count, 2)
             now.keep(plan, flat, at_rows[here], before, here, tape if now.taping else None)
-            rows += done
-            out.rows, out.steps, out.solves = rows, out.steps + steps, out.solves + solves
+            out.rows, out.steps, out.solves = here.stop, out.steps + steps, out.solves + solves
             out.refused, out.failed = out.refused + refused, out.failed + failed
             yield out
             if status == TAPE_FULL:

@@ -103,6 +103,11 @@ class Compiled:
         )  # fmt: skip
 
     @property
+    def inertial(self) -> bool:
+        """Whether any pad has inertia; the arrays then belong to one step."""
+        return len(self._inertia.X) > 0
+
+    @property
     def signal_count(self) -> int:
         """How many signals the kernels follow, fixed coordinates included."""
         return len(self.rig.signals) + sum(len(body.fixed) for body in self.rig.bodies.values())
@@ -270,7 +275,7 @@ class Compiled:
 
     def system(self, h: float) -> Any:
         """The arrays for steps of h [s]; only inertial pads depend on it."""
-        key = float(f"{h:.12g}") if len(self._inertia.X) else 0.0
+        key = float(f"{h:.12g}") if self.inertial else 0.0
         if key not in self._systems:
             if len(self._systems) > 32:  # an irregular output grid has many step sizes; each holds some megabytes
                 self._systems.clear()

@@ -23,7 +23,7 @@ KNOTS_PER_STEP = 4
 def error_parts(rig: Rig, y0: Array, atol: float) -> Errors:
     """Parts of the state whose error is judged together: each pad's forces, each contact's stretches, a body's position, its
     angle. A rate's error counts by what it displaces within a step. A position's size is how far it has come from y0."""
-    first, last, rate, unit, origin = [], [], [], [], np.zeros(len(y0))
+    first, last, rate, unit, size, origin = [], [], [], [], [], np.zeros(len(y0))
     for (kind, name), here in rig.layout.slices.items():
         if kind in ("pads", "stretch", "rates"):
             parts = [(here.start, here.stop, "force" if kind == "pads" and not rig.pads[name].inertial else "length")]
@@ -40,8 +40,9 @@ def error_parts(rig: Rig, y0: Array, atol: float) -> Errors:
                 last.append(end)
                 rate.append(kind in ("rates", "velocity"))
                 unit.append(UNITS[what])
+                size.append(np.linalg.norm(y0[begin:end] - origin[begin:end]))
     return Errors(
-        np.array(first, np.int64), np.array(last, np.int64), np.array(rate), atol * np.array(unit), np.zeros(len(first)),
+        np.array(first, np.int64), np.array(last, np.int64), np.array(rate), atol * np.array(unit), np.array(size),
         origin,
     )  # fmt: skip
 
