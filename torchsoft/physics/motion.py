@@ -2,6 +2,8 @@
 
 from collections.abc import Sequence
 from itertools import pairwise
+from math import perm
+from typing import ClassVar
 
 import torch
 from scipy.interpolate import CubicSpline
@@ -34,25 +36,56 @@ class Piecewise(nn.Module):
         """Control points of every piece's polynomial, in Bernstein's form (k - 1, degree + 1)."""
         raise NotImplementedError
 
-    def pieces(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Start and span [s] of every piece, and its control points; one piece at least."""
+    def pieces(self) -> "Pieces":
+        """The polynomials, one at least; constant before the first and after the last."""
         if len(self.times) == 1:
             return self.times, torch.ones_like(self.times), self.values[:, None]
         return self.times[:-1], self.times.diff(), self.control()
 
+    @property
+    def stops(self) -> Tensor:
+        """Times [s] that no step chosen by tolerances passes."""
+        return self.times
+
     def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        """Value and rate at t (...), by de Casteljau's scheme, which is exact at the knots."""
-        at, span, control = self.pieces()
-        i = torch.searchsorted(at, t.detach().contiguous(), right=True).clamp(min=1) - 1
-        u = (t - at[i]) / span[i]
-        inside = ((u >= 0) & (u <= 1)).to(t.dtype)
-        u = u.clamp(0.0, 1.0)
-        points = list(control[i].unbind(-1))
-        degree, rate = len(points) - 1, torch.zeros_like(u)
-        while len(points) > 1:
-            rate = degree * (points[1] - points[0])
-            points = [(1 - u) * a + u * b for a, b in pairwise(points)]
-        return points[0], rate / span[i] * inside
+        """Value and rate at t (...)."""
+        value, rate = evaluate(self.pieces(), t)
+        return value, rate
+
+
+Pieces = tuple[Tensor, Tensor, Tensor]
+"""Start and span [s] of every piece (k,), and its control points in Bernstein's form (k, degree + 1)."""
+
+
+def evaluate(pieces: Pieces, t: Tensor, order: int = 1) -> list[Tensor]:
+    """Value and derivatives up to `order` of polynomials at t (...), by de Casteljau's scheme, which is exact at the knots."""
+    at, span, control = pieces
+    i = torch.searchsorted(at, t.detach().contiguous(), right=True).clamp(min=1) - 1
+    u = (t - at[i]) / span[i]
+    inside = ((u >= 0) & (u <= 1)).to(t.dtype)
+    u = u.clamp(0.0, 1.0)
+    points = list(control[i].unbind(-1))
+    degree, out = len(points) - 1, [torch.zeros_like(u)] * (order + 1)
+    for left in range(degree, -1, -1):
+        if left <= order:
+            differences = points
+            for _ in range(left):
+                differences = [b - a for a, b in pairwise(differences)]
+            scale = perm(degree, left) / span[i] ** left * inside if left else 1.0
+            out[left] = differences[0] * scale
+        points = [(1 - u) * a + u * b for a, b in pairwise(points)]
+    return out
+
+
+def hermite(times: Tensor, jets: Sequence[Tensor]) -> Pieces:
+    """The pieces of degree 7 between `times` (k,) [s] with given values, rates, second and third derivatives (k,)."""
+    span = times.diff()
+    y, v, a, j = (jet * scale for jet, scale in zip(jets, (1.0, 1 / 7, 1 / 42, 1 / 210)))
+    ends = []
+    for here, h in ((slice(None, -1), span), (slice(1, None), -span)):
+        b = y[here], h * v[here], h**2 * a[here], h**3 * j[here]
+        ends.append([b[0], b[0] + b[1], b[0] + 2 * b[1] + b[2], b[0] + 3 * b[1] + 3 * b[2] + b[3]])
+    return times[:-1], span, torch.stack((*ends[0], *ends[1][::-1]), -1)
 
 
 class Profile(Piecewise):
@@ -69,8 +102,10 @@ class Profile(Piecewise):
 
 class Sampled(Piecewise):
     """A recorded set-point: the cubic through values (k,) at times (k,) [s] with the given rates (k,), or with those of the
-    natural choice, a cubic spline; constant before the first and after the last."""
+    natural choice, a cubic spline; constant before the first and after the last. A step chosen by tolerances passes
+    `KNOTS_PER_STEP` knots at most."""
 
+    KNOTS_PER_STEP: ClassVar = 4
     rates: Tensor
 
     def __init__(
@@ -86,6 +121,11 @@ class Sampled(Piecewise):
         if slope.shape != self.times.shape or not bool(torch.isfinite(slope).all()):
             raise ValueError(f"`rates` must hold one finite number per time ({len(self.times)}), but are {rates}")
         self.register_buffer("rates", slope)
+
+    @property
+    def stops(self) -> Tensor:
+        """Times [s] that no step chosen by tolerances passes."""
+        return self.times[:: self.KNOTS_PER_STEP]
 
     def control(self) -> Tensor:
         """Control points of every piece (k - 1, 4)."""

@@ -8,16 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.physics.motion import Piecewise, Reference, Sampled
+from torchsoft.physics.motion import Piecewise, Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.kernel.arrays import NO_SIGNALS, Array, Errors, Signals
 
 UNITS = {"force": 1.0, "length": 1e-3, "angle": 1.0}
 """What `atol` is counted in: nodal forces [N], displacements, stretches and positions [m], angles [rad]."""
-
-KNOTS_PER_STEP = 4
-"""Knots of a recorded setpoint that one step may span at most; a step never passes a knot of any other signal."""
 
 
 def error_parts(rig: Rig, y0: Array, atol: float) -> Errors:
@@ -62,8 +59,8 @@ def part_name(rig: Rig, errors: Errors, number: int) -> str:
 class Followed:
     """The signals of a run as the kernels evaluate them: `arrays`, and `stops` [s], times that no step may pass.
 
-    A reference of pieces (`Profile`, `Sampled`) is evaluated by the kernel, any other one by itself, called at every stage;
-    what it raises then is kept in `error`.
+    A reference of pieces (`Profile`, `Sampled`, `Waves`) is evaluated by the kernel, any other one by itself, called at every
+    stage; what it raises then is kept in `error`.
     """
 
     def __init__(self, signals: Callable[[Tensor], Tensor], rig: Rig, reference: Reference) -> None:
@@ -76,7 +73,7 @@ class Followed:
         )
         self._callback: Any = None
         if not plain:
-            self.arrays = NO_SIGNALS._replace(address=self._call(signals))
+            self.arrays = NO_SIGNALS._replace(address=self._call(signals), room=np.zeros(1))
             self.stops = np.zeros(0)
             return
         with torch.no_grad():
@@ -94,12 +91,9 @@ class Followed:
                 torch.cat([empty, *(span for _, span, _ in pieces)]).numpy(),
                 torch.cat([torch.zeros(0, widest, dtype=torch.float64), *padded]).contiguous().numpy(),
                 0,
+                np.zeros(max(widest, 1)),
             )
-        self.stops = np.unique(
-            np.concatenate(
-                [np.zeros(0), *(x.times.numpy()[:: KNOTS_PER_STEP if isinstance(x, Sampled) else 1] for x in chosen)]
-            )
-        )
+        self.stops = np.unique(np.concatenate([np.zeros(0), *(signal.stops.numpy() for signal in chosen)]))
 
     def _call(self, signals: Callable[[Tensor], Tensor]) -> int:
         """Address of a function that writes the signals at the time x[0] to out."""
