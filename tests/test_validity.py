@@ -62,6 +62,14 @@ def test_a_shape_that_is_none_is_refused(wrong: dict[str, Callable[..., Tensor]]
         simulate(model, T, y0=grasped(coarse()))
 
 
+def test_an_oval_that_is_called_round_is_refused() -> None:
+    class Oval(Ellipse):
+        round = True
+
+    with pytest.raises(ValueError, match="called `round`, but is not"):
+        check_shape("disc", Oval(0.03, 0.02))
+
+
 def test_right_shapes_pass() -> None:
     for shape in (Disc(), Circle(0.02), Ellipse(0.03, 0.02)):
         check_shape("disc", shape)

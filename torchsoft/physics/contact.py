@@ -54,8 +54,11 @@ def turned(v: Tensor, angle: Tensor) -> Tensor:
 
 def moving_frame(shape: Shape, d: Tensor, theta: Tensor) -> Frame:
     """Detection and frame (Eq. 1, 3) of points at d (..., 2) [m] from the centre of a body turned by theta (...)."""
-    phi, m = shape(turned(d, -theta))
-    n = turned(m, theta)
+    if shape.round:
+        phi, n = shape(d)
+    else:
+        phi, m = shape(turned(d, -theta))
+        n = turned(m, theta)
     return Frame(d, n, cross(n), -phi)
 
 

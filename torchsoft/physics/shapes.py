@@ -18,7 +18,10 @@ def parameter(value: float, trained: bool = True) -> nn.Parameter:
 
 
 class Shape(nn.Module):
-    """What a rig asks of a rigid body's shape; lengths are numbers in m, about the centre of mass."""
+    """What a rig asks of a rigid body's shape; lengths are numbers in m, about the centre of mass. A `round` one looks the same
+    however it is turned, and its turning is left out of the law."""
+
+    round: ClassVar[bool] = False
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Signed distance phi [m], shape (...), negative inside, and outward unit normal (..., 2), at x (..., 2) [m]."""
@@ -50,6 +53,7 @@ class Shape(nn.Module):
 class Circle(Shape):
     """A disc of radius R [m] about its centre of mass. Not smooth at the centre."""
 
+    round: ClassVar = True
     limits: ClassVar = {"radius": "positive"}
 
     def __init__(self, radius: float) -> None:

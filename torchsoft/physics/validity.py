@@ -130,6 +130,7 @@ def check_shape(where: str, shape: Shape) -> None:
         "the boundary is not where phi is zero": shape(boundary)[0].detach().abs() / size,
         "`support` is less than how far it reaches": (reach - support) / size,
         "`support` is more than how far it reaches": 0.1 * (support - reach) / size,  # found at some points only
+        "it is called `round`, but is not": (boundary.norm(dim=-1) / size - 1).abs() * float(shape.round),
         "`size` is smaller than it is": (boundary.norm(dim=-1).max() - size)[None] / size,
     }
     for fault, error in faults.items():
