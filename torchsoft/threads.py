@@ -1,0 +1,45 @@
+"""Runs side by side in threads: the compiled kernels hold no lock, so runs of one process share its cores.
+
+What is not compiled does hold one; a run of a second has some twenty milliseconds of that.
+"""
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from typing import TypeVar
+
+import torch
+from threadpoolctl import threadpool_limits
+
+T = TypeVar("T")
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def side_by_side(work: Callable[[int], T], count: int, threads: int | None = None) -> Iterator[tuple[int, T]]:
+    """`work(i)` for i below `count`, in so many threads (one a core by default), as (i, result) in the order of their ends.
+
+    The threads inherit torch's grad mode; each computes on one core. An exception ends what has not begun, and so does Ctrl-C;
+    what runs is waited for.
+    """
+    threads = min(count, cores() if threads is None else threads)
+    if threads <= 1:
+        for i in range(count):
+            yield i, work(i)
+        return
+    mode = torch.is_grad_enabled()
+
+    def begin() -> None:
+        torch.set_num_threads(1)
+        torch.set_grad_enabled(mode)
+
+    with threadpool_limits(1, "blas"), ThreadPoolExecutor(threads, "torchsoft", begin) as pool:
+        futures = {pool.submit(work, i): i for i in range(count)}
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
