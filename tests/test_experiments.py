@@ -62,7 +62,7 @@ def test_step_accuracy_smoke(tmp_path: Path) -> None:
     loose, tight, equal = rows.values()
     for name in ("x_C", "F_y", "gradient"):
         assert tight[name] < loose[name]
-    assert tight["gradient"] < 0.2
+    assert tight["gradient"] < 0.15
     assert loose["steps"] < tight["steps"]
     assert equal["refused"] == 0
     assert module.table(rows).count("|\n") == 4

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from torchsoft.solve.kernel.adjoint import backward
-from torchsoft.solve.kernel.arrays import Array, scratch
+from torchsoft.solve.kernel.arrays import Array
+from torchsoft.solve.kernel.scratch import cotangents, scratch
 from torchsoft.solve.progress import Progress, Segment
 from torchsoft.solve.stepper import ImplicitStepper
 
@@ -69,14 +70,15 @@ def run_adjoint(stepper: ImplicitStepper, segments: list[Segment], y_bar: Tensor
     rows: Array = np.ascontiguousarray(y_bar.numpy())
     if not np.isfinite(rows).all():
         raise GradientFailed(f"the cotangent of output {int(np.argwhere(~np.isfinite(rows))[0][0])} is not finite")
-    carried, p_bar = np.zeros(stepper.layout.size), np.zeros(len(stepper.compiled.p))
+    size = stepper.layout.size
+    carried, p_bar = np.zeros(size), np.zeros(len(stepper.compiled.p))
     signals_bar = [np.zeros(segment.signals.shape) for segment in segments]
     for number in range(len(segments) - 1, -1, -1):
         segment = segments[number]
         plan, tape = segment.plan, stepper.tape(segment)
         s = stepper.compiled.system(float(plan.h[0]))
         failed = backward(
-            s, scratch(s, stepper.layout.size), plan.h, tape, segment.signals, plan.out_step, plan.out_part,
+            s, scratch(s, size), cotangents(s, size), plan.h, tape, segment.signals, plan.out_step, plan.out_part,
             rows[segment.rows], carried, p_bar, signals_bar[number],
         )  # fmt: skip
         if failed >= 0:

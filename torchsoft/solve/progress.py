@@ -7,7 +7,8 @@ import numpy as np
 
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.grid import Plan
-from torchsoft.solve.kernel.arrays import Array, Step, Tape, Work, first_stages
+from torchsoft.solve.kernel.arrays import Array, Tape, first_stages
+from torchsoft.solve.kernel.scratch import Step, Work
 
 
 class SimulationFailed(RuntimeError):

@@ -14,18 +14,9 @@ from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
 from torchsoft.solve.grid import CHUNK, Plan, check_knots, check_times, equal_steps, given_steps
-from torchsoft.solve.kernel.arrays import (
-    NO_ERRORS,
-    NO_SIGNALS,
-    Array,
-    Step,
-    Tape,
-    Work,
-    empty_step,
-    empty_tape,
-    scratch,
-)
+from torchsoft.solve.kernel.arrays import NO_ERRORS, NO_SIGNALS, Array, Tape, empty_tape
 from torchsoft.solve.kernel.run import run
+from torchsoft.solve.kernel.scratch import Step, Work, empty_step, scratch
 from torchsoft.solve.kernel.step import (
     CONVERGED,
     GAMMA,

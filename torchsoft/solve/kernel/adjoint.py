@@ -11,10 +11,10 @@ import numpy as np
 
 from torchsoft.codegen.invoke import call_linearise, call_pullback
 from torchsoft.solve.kernel import compiled, entry
+from torchsoft.solve.kernel.adjoint_pads import inertial_state, nodal_cotangent, pad_state
 from torchsoft.solve.kernel.arrays import Array
-from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
-from torchsoft.solve.kernel.interface import NEGLIGIBLE, assemble
-from torchsoft.solve.kernel.linear import row_of, solve_dense
+from torchsoft.solve.kernel.interface import assemble
+from torchsoft.solve.kernel.linear import solve_dense
 from torchsoft.solve.kernel.stage import actuate
 from torchsoft.solve.kernel.step import GAMMA, MIX, TINY, dense_states
 from torchsoft.solve.kernel.taped import restore
@@ -26,7 +26,7 @@ def rigid_part(s: Any, w: Any, y: Array, signals: Array, a: float, Rv: Array) ->
     Rv[:] = 0.0
     for i in range(s.body_coordinate.size):
         Rv[i, i] = -s.p[s.body_mass_at[i]] / a
-    x, out, J = np.empty(5), np.empty(1), np.empty((1, 5))
+    x, out, J = w.effort_x, w.effort, w.effort_J
     for i in range(s.act_measured.size):
         number, towards = s.body_free[s.act_pushed[i]], s.body_free[s.act_measured[i]]
         if number >= 0 and towards >= 0:
@@ -35,174 +35,14 @@ def rigid_part(s: Any, w: Any, y: Array, signals: Array, a: float, Rv: Array) ->
 
 
 @compiled
-def nodal_cotangent(
-    s: Any, w: Any, pad: int, y_bar: Array, a: float, n: int, X: Array, full: Array, V_bar: Array
-) -> None:
-    """F_bar of the touched nodes into X[:, 0], from the cotangents of the pad's state and of the touching points' stretches."""
-    free = s.body_free
-    first, at = s.pad_node_start[pad], s.contact_point_start[s.pad_contact_start[pad]]
-    c, b = s.pad_contact_start[pad], np.zeros(2 * n)
-    for i in range(w.actives[pad]):
-        k = w.active[at + i]
-        while k >= s.contact_point_start[c + 1]:
-            c += 1
-        s_bar = a * y_bar[s.point_y_start + k]
-        for j in range(2):
-            if s.point_N[k, j] != 0.0:
-                row = 2 * w.slot[s.point_node[k, j]]
-                b[row] += s.point_N[k, j] * w.H[at + i, 2, 0] * s_bar
-                b[row + 1] += s.point_N[k, j] * w.H[at + i, 2, 1] * s_bar
-        for row in range(6):
-            number = free[s.contact_body[c] + row] if row < 3 else free[s.pad_base[pad] + row - 3]
-            if number >= 0:
-                V_bar[number] += w.H[at + i, 2, 2 + row] * s_bar
-    if s.pad_v_start[pad] >= 0:
-        i0, i1 = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1]
-        u_bar, v_bar = y_bar[s.pad_y_start[pad] :], y_bar[s.pad_v_start[pad] :]
-        own = full[i0:i1]
-        for i in range(i1 - i0):
-            own[i] = a * u_bar[i] + v_bar[i]
-        for i in range(n):
-            for r in range(2):
-                own[s.inertia_surface[2 * w.touched[first + i] + r]] += b[2 * i + r]
-        base = s.pad_base[pad]
-        cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
-        x = z = 0.0
-        for i in range(i1 - i0):
-            x -= s.inertia_D[i0 + i, 0] * own[i]
-            z -= s.inertia_D[i0 + i, 1] * own[i]
-            if i % 2 == 0:
-                x += v_bar[i]
-            else:
-                z += v_bar[i]
-        if free[base] >= 0:
-            V_bar[free[base]] += cos * x - sin * z
-        if free[base + 1] >= 0:
-            V_bar[free[base + 1]] += sin * x + cos * z
-        rates = own.copy()
-        solve(s, pad, rates)
-        for i in range(n):
-            for r in range(2):
-                X[2 * i + r, 0] = rates[s.inertia_surface[2 * w.touched[first + i] + r]]
-        return
-    size, chain, branches = 2 * (s.pad_node_start[pad + 1] - first), s.pad_chain_at[pad], s.pad_branches[pad]
-    for i in range(n):
-        for r in range(2):
-            dof, total = 2 * (w.touched[first + i] - first) + r, 0.0
-            for m in range(2 * n):
-                total += w.P[2 * i + r, m] * b[m]
-            for branch in range(branches):
-                total += a * y_bar[s.pad_y_start[pad] + branch * size + dof] / (s.p[chain + branches + branch] + a)
-            X[2 * i + r, 0] = total
-
-
-@compiled
-def pad_state(
-    s: Any, w: Any, pad: int, y: Array, y_bar: Array, a: float, rate_bar: Array, u_bar: Array, p_bar: Array
-) -> None:
-    """Cotangents of a massless pad's state at the stage's start, and of its material, from those of its nodal rates and
-    displacements (nodes, 2)."""
-    p, first, last, start = s.p, s.pad_node_start[pad], s.pad_node_start[pad + 1], s.pad_y_start[pad]
-    size, chain, branches = 2 * (last - first), s.pad_chain_at[pad], s.pad_branches[pad]
-    start_C, material, F = s.pad_C_start[pad], chain + 2 * branches, w.F.ravel()
-    by_rate, by_u, zeta, z_dot = np.zeros(size), np.zeros(size), np.zeros(size), np.zeros(size)
-    for node in range(w.low[pad], w.high[pad]):
-        for r in range(2):
-            c, d = rate_bar[node, r], u_bar[node, r]
-            if c != 0.0 or d != 0.0:
-                row = row_of(s.pad_C, start_C, 2 * (node - first) + r, size)
-                for m in range(size):
-                    by_rate[m] += row[m] * c
-                    by_u[m] += row[m] * d
-    scale_bar, left, right = 0.0, size, 0
-    for b in range(branches):
-        J, rest, z = p[chain + b], p[chain + branches + b] + a, start + b * size
-        J_bar = tau_bar = 0.0
-        for m in range(size):
-            loaded = 2 * w.low[pad] <= 2 * first + m < 2 * w.high[pad]
-            total = (a * y_bar[z + m] + J * by_rate[m]) / rest
-            if loaded or abs(y[z + m]) > NEGLIGIBLE:
-                rate = ((F[2 * first + m] if loaded else 0.0) - y[z + m]) / rest
-                left, right = min(left, m), m + 1 if m + 1 > right else right
-                zeta[m] += J * y[z + m]
-                z_dot[m] += J * rate
-                J_bar += by_rate[m] * rate + by_u[m] * y[z + m]
-                tau_bar -= total * rate
-            y_bar[z + m] += J * by_u[m] - total
-        p_bar[chain + b] += J_bar
-        p_bar[chain + branches + b] += tau_bar
-        scale_bar += J * J_bar
-    p_bar[material] += scale_bar / p[material]
-    for node in range(w.low[pad], w.high[pad]):
-        for r in range(2):
-            c, d = rate_bar[node, r], u_bar[node, r]
-            if c != 0.0 or d != 0.0:
-                row, by_nu = row_of(s.pad_dC, start_C, 2 * (node - first) + r, size), 0.0
-                for m in range(left, right):
-                    by_nu += row[m] * (c * z_dot[m] + d * zeta[m])
-                p_bar[material + 1] += by_nu
-
-
-@compiled
-def inertial_state(
-    s: Any, w: Any, pad: int, y: Array, y_bar: Array, a: float, rate: Array, full: Array, rate_bar: Array, u_bar: Array,
-    nu: Array, V_bar: Array, p_bar: Array,
-) -> None:  # fmt: skip
-    """The same for an inertial pad; `rate` is its taped u', `full` what `nodal_cotangent` left, V_bar of all coordinates."""
-    free, at = s.body_free, s.inertia_material_at[pad]
-    i0, i1, base = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1], s.pad_base[pad]
-    U, W, mass = s.pad_y_start[pad], s.pad_v_start[pad], s.p[s.inertia_material_at[pad] + 3]
-    cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
-    nx = nu[free[base]] if free[base] >= 0 else 0.0
-    ny = nu[free[base + 1]] if free[base + 1] >= 0 else 0.0
-    reaction = np.array([-(cos * nx + sin * ny), -(cos * ny - sin * nx)])
-    own = np.empty(i1 - i0)  # cotangent of u'
-    for i in range(i1 - i0):
-        own[i] = a * y_bar[U + i] + y_bar[W + i] + mass * s.inertia_area[i0 + i] / a * reaction[i % 2]
-    for node in range(w.low[pad], w.high[pad]):
-        for r in range(2):
-            own[s.inertia_surface[2 * node + r]] += rate_bar[node, r]
-    solve(s, pad, own)  # now the multiplier of the pad's equation
-    vx, vy = base_velocity(s, pad, w.V, w.q)
-    strain, force, back = np.empty(i1 - i0), np.empty(i1 - i0), np.empty(i1 - i0)
-    here = rate[i0:i1]
-    stiffness_force(s, pad, here, force)
-    stiffness_force(s, pad, own, back)
-    for i in range(i1 - i0):
-        v = vx if i % 2 == 0 else vy
-        M = s.inertia_area[i0 + i] / a
-        change = here[i] + v - y[W + i]
-        p_bar[at + 2] -= own[i] * force[i]
-        p_bar[at + 3] += M * change * (reaction[i % 2] - own[i])
-        strain[i] = y[U + i] + (s.p[at + 2] + a) * here[i]
-    for k in range(i1 - i0):
-        for j in range(s.inertia_K_column.shape[1]):
-            product = own[k] * strain[s.inertia_K_column[i0 + k, j]]
-            p_bar[at] -= s.inertia_K_lambda[i0 + k, j] * product
-            p_bar[at + 1] -= s.inertia_K_mu[i0 + k, j] * product
-    local = np.zeros(2)
-    for i in range(i1 - i0):
-        local[i % 2] += y_bar[W + i] + mass * s.inertia_area[i0 + i] / a * (reaction[i % 2] - own[i])
-        y_bar[U + i] -= back[i]
-        y_bar[W + i] = mass * s.inertia_area[i0 + i] / a * (own[i] - reaction[i % 2])
-    V_bar[base] += cos * local[0] - sin * local[1]
-    V_bar[base + 1] += sin * local[0] + cos * local[1]
-    for node in range(w.low[pad], w.high[pad]):
-        for r in range(2):
-            y_bar[U + s.inertia_surface[2 * node + r]] += u_bar[node, r]
-
-
-@compiled
 def stage_adjoint(
-    s: Any, w: Any, tape: Any, row: int, a: float, signals: Array, y_bar: Array, p_bar: Array, signals_bar: Array,
-    rate_bar: Array, u_bar: Array,
+    s: Any, w: Any, z: Any, tape: Any, row: int, a: float, signals: Array, y_bar: Array, p_bar: Array, signals_bar: Array,
 ) -> None:  # fmt: skip
     """Turn the cotangent y_bar (size,) of a stage's end into that of its y*, in place; add to p_bar and signals_bar."""
     p = s.p
     free, count, y = s.body_coordinate.size, s.pad_base.size, tape.y[row]
     restore(s, w, tape, row, a)
-    Rv, matrix, nu = np.empty((free, free)), np.empty((free, free)), np.empty((free, 1))
-    V_bar, full = np.empty(free), np.empty(w.full.size)
+    Rv, matrix, nu, V_bar, full, rate_bar, u_bar = w.Rv, z.matrix, z.nu, z.V_bar, z.full, z.rate, z.u
     rigid_part(s, w, y, signals, a, Rv)
     matrix[:] = 0.0
     for i in range(free):
@@ -211,7 +51,7 @@ def stage_adjoint(
         n = assemble(s, w, pad, a, Rv)
         first, columns, column = s.pad_node_start[pad], s.pad_columns[pad], s.pad_column[pad]
         X = w.X[2 * first : 2 * (first + n)]
-        nodal_cotangent(s, w, pad, y_bar, a, n, X, full, V_bar)
+        nodal_cotangent(s, w, z, pad, y_bar, a, n, X, full, V_bar)
         for i in range(2 * n):
             for j in range(columns):
                 X[i, 1 + j] = w.Rf[j, i]
@@ -233,7 +73,8 @@ def stage_adjoint(
             matrix[i, j] -= Rv[j, i]
     solve_dense(matrix, nu, free, 1)
 
-    q_hat, V_hat, weights, by = np.zeros(w.q.size), np.zeros(w.q.size), np.empty(3), np.empty(6)
+    q_hat, V_hat, weights, by = z.q, z.V, z.weights, z.by
+    q_hat[:], V_hat[:] = 0.0, 0.0
     for pad in range(count):
         first, n, column = s.pad_node_start[pad], w.counts[pad], s.pad_column[pad]
         at, c = s.contact_point_start[s.pad_contact_start[pad]], s.pad_contact_start[pad]
@@ -281,13 +122,13 @@ def stage_adjoint(
             for r in range(3):
                 s_bar += w.J[k, r, 6] * weights[r]
             y_bar[s.point_y_start + k] += s_bar
-        free_stretches(s, w, pad, y, y_bar, a, p_bar)
+        free_stretches(s, w, z, pad, y, y_bar, a, p_bar)
         if s.pad_v_start[pad] >= 0:
-            inertial_state(s, w, pad, y, y_bar, a, tape.rate[row], full, rate_bar, u_bar, nu[:, 0], V_hat, p_bar)
+            inertial_state(s, w, z, pad, y, y_bar, a, tape.rate[row], full, rate_bar, u_bar, nu, V_hat, p_bar)
         else:
-            pad_state(s, w, pad, y, y_bar, a, rate_bar, u_bar, p_bar)
+            pad_state(s, w, z, pad, y, y_bar, a, rate_bar, u_bar, p_bar)
 
-    x, out, J = np.empty(5), np.empty(1), np.empty((1, 5))
+    x, out, J = w.effort_x, w.effort, w.effort_J
     for i in range(s.act_measured.size):
         number = s.body_free[s.act_pushed[i]]
         if number < 0:
@@ -315,10 +156,10 @@ def stage_adjoint(
 
 
 @compiled
-def free_stretches(s: Any, w: Any, pad: int, y: Array, y_bar: Array, a: float, p_bar: Array) -> None:
+def free_stretches(s: Any, w: Any, z: Any, pad: int, y: Array, y_bar: Array, a: float, p_bar: Array) -> None:
     """Cotangents of the stretches away from contact, which decay."""
     at, i = s.contact_point_start[s.pad_contact_start[pad]], 0
-    x, out, J, weight = np.empty(3), np.empty(3), np.empty((1, 1)), np.empty(1)
+    x, out, J, weight = z.decay_x, w.decay, z.decay_J, z.weights
     for c in range(s.pad_contact_start[pad], s.pad_contact_start[pad + 1]):
         own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
         for k in range(s.contact_point_start[c], s.contact_point_start[c + 1]):
@@ -337,8 +178,8 @@ def free_stretches(s: Any, w: Any, pad: int, y: Array, y_bar: Array, a: float, p
 
 @entry
 def backward(
-    s: Any, w: Any, h: Array, tape: Any, signals: Array, out_step: Any, out_part: Array, outputs_bar: Array, y_bar: Array,
-    p_bar: Array, signals_bar: Array,
+    s: Any, w: Any, z: Any, h: Array, tape: Any, signals: Array, out_step: Any, out_part: Array, outputs_bar: Array,
+    y_bar: Array, p_bar: Array, signals_bar: Array,
 ) -> int:  # fmt: skip
     """Sweep the steps of a tape backwards; y_bar goes from the end's cotangent to the start's, in place.
 
@@ -346,8 +187,7 @@ def backward(
     (stages, signals, 2). Returns -1, or the step at which a cotangent stopped being finite.
     """
     row = out_step.size - 1
-    rate_bar, u_bar, held = np.empty(w.u.shape), np.empty(w.u.shape), np.empty(y_bar.size)
-    first_bar, start_bar = np.empty(y_bar.size), np.empty(y_bar.size)
+    held, first_bar, start_bar = z.state[0], z.state[1], z.state[2]
     for step in range(h.size - 1, -1, -1):
         a = GAMMA * h[step]
         first_bar[:], start_bar[:] = 0.0, 0.0
@@ -359,12 +199,14 @@ def backward(
                 start_bar[i] += at_start * outputs_bar[row, i]
             row -= 1
         k = 2 * step + 1
-        stage_adjoint(s, w, tape, k, a, signals[k], y_bar, p_bar, signals_bar[k], rate_bar, u_bar)
-        held[:] = (1.0 - MIX) * y_bar + start_bar
-        y_bar[:] = MIX * y_bar + first_bar
+        stage_adjoint(s, w, z, tape, k, a, signals[k], y_bar, p_bar, signals_bar[k])
+        for i in range(y_bar.size):
+            held[i] = (1.0 - MIX) * y_bar[i] + start_bar[i]
+            y_bar[i] = MIX * y_bar[i] + first_bar[i]
         k = 2 * step
-        stage_adjoint(s, w, tape, k, a, signals[k], y_bar, p_bar, signals_bar[k], rate_bar, u_bar)
-        y_bar += held
+        stage_adjoint(s, w, z, tape, k, a, signals[k], y_bar, p_bar, signals_bar[k])
+        for i in range(y_bar.size):
+            y_bar[i] += held[i]
         if not np.isfinite(y_bar.sum()):
             return step
     return -1

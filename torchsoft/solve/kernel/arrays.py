@@ -1,4 +1,4 @@
-"""The arrays that the kernels work on: what a rig is made of, scratch, and the tape of a run.
+"""The arrays that the kernels work on: what a rig is made of, what it follows, and the tape of a run.
 
 A rig has coordinates (x, y, theta) of its bodies, three each, and last those of the ground, which are zero. A coordinate is
 free (a component of the state) or follows a signal. "At" in a name is a position in the vector p of all law parameters,
@@ -133,104 +133,9 @@ def system(*parts: Any, p: Array) -> Any:
     return System(*(field for part in parts for field in part), p)
 
 
-class Work(NamedTuple):
-    """Scratch. Per node (., 2): the force that has set in, zeta, and its free rate; displacement u*, rates (without
-    contact, now, before and after a Newton step), forces by the law
-    and by the linear relations (now, before, after). Per point: the law's inputs, outputs and Jacobian; of the touching ones
-    (in the order of `active`) H, S (3, 8), G (6, 2), L (6, 8), see `interface`. window, active: numbers of points near and
-    touching, pad by pad from its first point on, `windows` and `actives` many; low, high: nodes of the window.
-
-    counts: touched nodes of every pad. A, P, Hc, Rf: one pad's share of Newton's system; X what Newton's elimination
-    leaves, per surface dof. PB to effort_J: small arrays of Newton's iteration. k: rates of the flat
-    state; load: generalised contact forces on all coordinates; full: u' of inertial pads;
-    travelled: how far [m] anything moved since the last scan for near points, that scan's margin [m], and how many there were.
-    """
-
-    q: Array
-    V: Array
-    frame: Array
-    zeta: Array
-    zeta_rate: Array
-    u: Array
-    free: Array
-    u_dot: Array
-    u_dot_old: Array
-    u_dot_new: Array
-    F: Array
-    F_linear: Array
-    F_old: Array
-    F_new: Array
-    x: Array
-    out: Array
-    J: Array
-    H: Array
-    S: Array
-    G: Array
-    L: Array
-    window: Index
-    windows: Index
-    active: Index
-    actives: Index
-    low: Index
-    high: Index
-    slot: Index
-    touched: Index
-    counts: Index
-    A: Array
-    P: Array
-    PB: Array
-    K: Array
-    number: Index
-    Hc: Array
-    Rf: Array
-    r: Array
-    Rv: Array
-    b: Array
-    dV: Array
-    V_old: Array
-    phi: Array
-    effort_x: Array
-    effort: Array
-    effort_J: Array
-    X: Array
-    k: Array
-    load: Array
-    full: Array
-    travelled: Array
-
-
-class Step(NamedTuple):
-    """What one step leaves behind: its start (state, integrals, Newton's guesses V and u_dot, travelled), and of its two
-    stages the rates K, the powers and bounds of the speeds; the pads' moments of the last one. at_row, scrap, guess_V, guess:
-    scratch of the outputs before the step's end."""
-
-    y: Array
-    integrals: Array
-    V: Array
-    u_dot: Array
-    travelled: Array
-    K: Array
-    powers: Array
-    speed: Array
-    moments: Array
-    at_row: Array
-    scrap: Array
-    guess_V: Array
-    guess: Array
-
-
-def empty_step(s: Any, size: int, integrals: int) -> Step:
-    """Room for one step of a rig whose running integrals are so many."""
-    nodes, coordinates, z = int(s.pad_node_start[-1]), len(s.body_free), np.zeros
-    return Step(
-        z(size), z(integrals), z(coordinates), z((nodes, 2)), z(3), z((2, size)), z((2, integrals)), z(2),
-        z(len(s.pad_base)), z(integrals), z(integrals), z(coordinates), z((nodes, 2)),
-    )  # fmt: skip
-
-
 class Signals(NamedTuple):
     """The reference: per signal the first of its pieces (signals + 1,) and their number of control points; per piece its start
-    and span [s] and its control points. address: of a function that gives all values and rates instead, or 0."""
+    and span [s] and its control points. address: of a function that gives all values and rates instead, or 0; room: scratch."""
 
     start: Index
     points: Index
@@ -238,9 +143,12 @@ class Signals(NamedTuple):
     span: Array
     control: Array
     address: int
+    room: Array
 
 
-NO_SIGNALS = Signals(np.zeros(1, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros((0, 1)), 0)
+NO_SIGNALS = Signals(
+    np.zeros(1, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros((0, 1)), 0, np.zeros(1)
+)
 """What given steps follow: nothing."""
 
 
@@ -273,26 +181,6 @@ class Tape(NamedTuple):
     point: Index
     state: Array
     rate: Array
-
-
-def scratch(s: Any, size: int, columns: int = 1) -> Work:
-    """Scratch arrays for one run, with room for so many right-hand sides."""
-    nodes, points, coordinates = int(s.pad_node_start[-1]), len(s.point_X), len(s.body_free)
-    pads, contacts, free = len(s.pad_base), len(s.contact_pad), len(s.body_coordinate)
-    widest = 2 * int(np.diff(s.pad_node_start).max(initial=0))
-    z = lambda *shape: np.zeros(shape)
-    i = lambda *shape: np.zeros(shape, np.int64)
-    per_node = ("u", "free", "u_dot", "u_dot_old", "u_dot_new", "F", "F_linear", "F_old", "F_new")
-    return Work(
-        q=z(coordinates), V=z(coordinates), frame=z(contacts, 7), zeta=z(2 * nodes), zeta_rate=z(2 * nodes),
-        **{name: z(nodes, 2) for name in per_node}, x=z(points, INPUTS), out=z(points, OUTPUTS), J=z(points, 3, 7),
-        H=z(points, 3, 8), S=z(points, 3, 8), G=z(points, 6, 2), L=z(points, 6, 8), window=i(points), windows=i(pads),
-        active=i(points), actives=i(pads), low=i(pads), high=i(pads), slot=i(nodes), touched=i(nodes), counts=i(pads),
-        A=z(widest, widest), P=z(widest, widest), PB=z(2, widest), K=z(6, 8), number=i(6), r=z(free, 1),
-        Rv=z(free, free), b=z(free, 1), dV=z(free), V_old=z(coordinates), phi=z(1), effort_x=z(5), effort=z(1),
-        effort_J=z(1, 5), Hc=z(widest, free), Rf=z(free, widest), X=z(2 * nodes, columns + free), k=z(size),
-        load=z(coordinates), full=z(int(s.inertia_dof_start[-1])), travelled=np.array([np.inf, 0.0, 0.0]),
-    )  # fmt: skip
 
 
 def empty_tape(s: Any, size: int, stages: int, cap: int) -> Tape:

@@ -99,10 +99,11 @@ def displacements(s: Any, w: Any, pad: int, y: Array, low: int, high: int) -> No
         left += 1
     while right > left and abs(zeta[right - 1]) < NEGLIGIBLE:
         right -= 1
+    zeta, rate = zeta[left:right], rate[left:right]
     for i in range(2 * low, 2 * high):
         u = free = 0.0
-        row = row_of(s.pad_C, s.pad_C_start[pad], i - 2 * first, size)
-        for j in range(left, right):
+        row = row_of(s.pad_C, s.pad_C_start[pad], i - 2 * first, size)[left:right]
+        for j in range(row.size):
             u += row[j] * zeta[j]
             free -= row[j] * rate[j]
         w.u[i // 2, i % 2], w.free[i // 2, i % 2] = u, free
@@ -112,7 +113,7 @@ def displacements(s: Any, w: Any, pad: int, y: Array, low: int, high: int) -> No
 def scan(s: Any, w: Any, y: Array, margin: float) -> None:
     """List the points within `margin` [m] of touching at the stage's start, w.q, in `w.window`; needs `set_in`."""
     frames(s, w)
-    x, phi = np.zeros(9), np.zeros(1)
+    x, phi = w.probe, w.phi
     for pad in range(s.pad_base.size):
         first, last = s.pad_node_start[pad], s.pad_node_start[pad + 1]
         displacements(s, w, pad, y, first, last)

@@ -1,7 +1,17 @@
-"""The small linear solves of a stage, in place and without allocation."""
+"""The small linear solves of a stage and what else is done to arrays, in place and without allocation.
 
-from torchsoft.solve.kernel import compiled
+Inner loops run over views from 0 on: an index that might be negative, as Python allows, keeps a loop from being vectorised.
+"""
+
+from torchsoft.solve.kernel import compiled, inlined
 from torchsoft.solve.kernel.arrays import Array
+
+
+@compiled
+def put(values: Array, out: Array) -> None:
+    """Copy an array into another of the same shape."""
+    for i in range(out.size):
+        out.flat[i] = values.flat[i]
 
 
 @compiled
@@ -17,25 +27,26 @@ def solve_dense(A: Array, b: Array, n: int, m: int) -> None:
                 A[k, j], A[p, j] = A[p, j], A[k, j]
             for j in range(m):
                 b[k, j], b[p, j] = b[p, j], b[k, j]
-        inverse = 1.0 / A[k, k]
+        inverse, own, right = 1.0 / A[k, k], A[k, k + 1 : n], b[k, :m]
         for i in range(k + 1, n):
             factor = A[i, k] * inverse
             if factor != 0.0:
-                for j in range(k + 1, n):
-                    A[i, j] -= factor * A[k, j]
+                row, other = A[i, k + 1 : n], b[i, :m]
+                for j in range(own.size):
+                    row[j] -= factor * own[j]
                 for j in range(m):
-                    b[i, j] -= factor * b[k, j]
+                    other[j] -= factor * right[j]
     for k in range(n - 1, -1, -1):
-        inverse = 1.0 / A[k, k]
+        inverse, right = 1.0 / A[k, k], b[k, :m]
         for i in range(k + 1, n):
-            factor = A[k, i]
+            factor, other = A[k, i], b[i, :m]
             for j in range(m):
-                b[k, j] -= factor * b[i, j]
+                right[j] -= factor * other[j]
         for j in range(m):
-            b[k, j] *= inverse
+            right[j] *= inverse
 
 
-@compiled
+@inlined
 def row_of(matrices: Array, start: int, i: int, size: int) -> Array:
     """Row i of the (size, size) matrix that begins at `start`, a view."""
     return matrices[start + i * size : start + (i + 1) * size]

@@ -12,6 +12,7 @@ import numpy as np
 from torchsoft.codegen.invoke import call_value
 from torchsoft.solve.kernel import compiled, entry
 from torchsoft.solve.kernel.arrays import Array
+from torchsoft.solve.kernel.linear import put
 from torchsoft.solve.kernel.step import (
     CONVERGED,
     GAMMA,
@@ -44,9 +45,8 @@ def follow(f: Any, t_0: float, t_1: float, out: Array) -> None:
     for row in range(len(out)):
         t = t_0 if row == 0 else t_1
         if f.address != 0:
-            moment, nothing = np.empty(1), np.empty(1)
-            moment[0] = t
-            call_value(f.address, moment, nothing, out[row])
+            f.room[0] = t
+            call_value(f.address, f.room, f.room, out[row])
             continue
         for i in range(f.start.size - 1):
             piece = f.start[i] + np.searchsorted(f.at[f.start[i] : f.start[i + 1]], t, side="right") - 1
@@ -54,7 +54,8 @@ def follow(f: Any, t_0: float, t_1: float, out: Array) -> None:
             u, n = (t - f.at[piece]) / f.span[piece], f.points[i]
             inside = 0.0 <= u <= 1.0
             u = min(max(u, 0.0), 1.0)
-            points, slope = f.control[piece].copy(), 0.0
+            points, slope = f.room, 0.0
+            put(f.control[piece], points[: f.control.shape[1]])
             for level in range(n - 1, 0, -1):  # de Casteljau
                 slope = (n - 1) * (points[1] - points[0])
                 for j in range(level):
@@ -123,8 +124,10 @@ def run(
     while (steps < h.size and (given or row < t_out.size)) or begin:
         t, wanted, end, error, last = clock[0], min(clock[1], longest), 0.0, 0.0, row
         if begin:  # the output at the start, where nothing has moved
-            d.y[:], d.K[:], d.powers[:], d.integrals[:], now = y, 0.0, 0.0, integrals, 0.0
-            d.travelled[:], last = w.travelled, row + 1
+            d.K[:], d.powers[:], now, last = 0.0, 0.0, 0.0, row + 1
+            put(y, d.y)
+            put(integrals, d.integrals)
+            put(w.travelled, d.travelled)
         else:
             now = h[steps]
             if not given:
@@ -158,11 +161,12 @@ def run(
             )  # fmt: skip
             solves += count
         if begin:
-            d.K[0], begin, row = w.k, False, last
+            put(w.k, d.K[0])
+            begin, row = False, last
         elif status == CONVERGED:
             if not given:
                 starts[steps], h[steps] = t, now
-                k[:] = d.K[1]
+                put(d.K[1], k)
                 enlarge(e, y)
                 error = max(error, LEAST_ERROR)
                 longer = now * min(LARGEST, max(SMALLEST, SAFETY * error**-INTEGRAL * clock[2] ** PROPORTIONAL))
@@ -170,7 +174,7 @@ def run(
             row, steps = last, steps + 1
         else:
             take_back(w, d, y, integrals)
-            again = not given and now > shortest
+            again = not given and wanted > shortest  # not `now`, which rounding leaves a little longer
             if again and status == REFUSED:
                 refused, smaller = refused + 1, SAFETY * error ** (-1.0 / 3.0)
                 clock[1] = max(now * (smaller if smaller > SMALLEST else SMALLEST), shortest)

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from torchsoft.codegen.invoke import call_linearise, call_value
+from torchsoft.codegen.invoke import call_linearise
 from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.arrays import Array
-from torchsoft.solve.kernel.inertia import base_velocity, inertia_force, solve, stiffness_force
+from torchsoft.solve.kernel.inertia import base_velocity, inertia_force
 from torchsoft.solve.kernel.interface import (
     assemble,
     displacements,
@@ -22,7 +22,7 @@ from torchsoft.solve.kernel.interface import (
     scan,
     set_in,
 )
-from torchsoft.solve.kernel.linear import row_of, solve_dense
+from torchsoft.solve.kernel.linear import put, row_of, solve_dense
 
 SEARCH_AFTER, SHORTEST = 2, 1.0 / 64.0
 """After so many iterations a Newton step that does not lessen the mismatch is halved, down to this part of it."""
@@ -145,14 +145,14 @@ def propose(s: Any, w: Any, pad: int, a: float, n: int, columns: int, dV: Array)
                     f += X[2 * i + r, columns + s.pad_column[pad, number]] * dV[number]
             w.F_new[node, r] = f
     low, high = 2 * w.low[pad], 2 * w.high[pad]
-    rates = w.u_dot_new.ravel()
+    rates = w.u_dot_new.reshape(w.u_dot_new.size)[low:high]
     for i in range(n):
         node = w.touched[first + i]
         for r in range(2):
             f = scale * w.F_new[node, r]
-            row = row_of(s.pad_C, s.pad_C_start[pad], 2 * (node - first) + r, size)
-            for m in range(low, high):
-                rates[m] += row[m - 2 * first] * f
+            row = row_of(s.pad_C, s.pad_C_start[pad], 2 * (node - first) + r, size)[low - 2 * first : high - 2 * first]
+            for m in range(row.size):
+                rates[m] += row[m] * f
     if s.pad_v_start[pad] >= 0:
         base, free = s.pad_base[pad], s.body_free
         cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
@@ -161,7 +161,7 @@ def propose(s: Any, w: Any, pad: int, a: float, n: int, columns: int, dV: Array)
         vx, vy = cos * Vx + sin * Vy, cos * Vy - sin * Vx
         for m in range(low, high):
             dof = s.inertia_dof_start[pad] + s.inertia_surface[m]
-            rates[m] -= s.inertia_D[dof, 0] * vx + s.inertia_D[dof, 1] * vy
+            rates[m - low] -= s.inertia_D[dof, 0] * vx + s.inertia_D[dof, 1] * vy
 
 
 @compiled
@@ -220,13 +220,18 @@ def solve_stage(
             residual(s, w, pad, y, a, n, r)
             first, columns = s.pad_node_start[pad], s.pad_columns[pad]
             X = w.X[2 * first : 2 * (first + n)]
-            X[:, 1 : 1 + columns] = w.Hc[: 2 * n, :columns]
+            for i in range(2 * n):
+                for j in range(columns):
+                    X[i, 1 + j] = w.Hc[i, j]
             solve_dense(w.A, X, 2 * n, 1 + columns)
             eliminate(s, w, pad, n, 1, X, r, Rv)
             w.counts[pad] = n
-        b[:] = -r
+        for i in range(free):
+            b[i, 0] = -r[i, 0]
         solve_dense(Rv, b, free, 1)
-        dV[:], V_old[:] = b[:, 0], w.V
+        for i in range(free):
+            dV[i] = b[i, 0]
+        put(w.V, V_old)
         for pad in range(pads):
             propose(s, w, pad, a, w.counts[pad], 1, dV)
             move(w, pad, 1.0)
@@ -250,126 +255,3 @@ def eliminate(s: Any, w: Any, pad: int, n: int, m: int, X: Array, r: Array, Rv: 
             for other in range(column.size):
                 if column[other] >= 0:
                     Rv[number, other] += line[i] * X[i, m + column[other]]
-
-
-@compiled
-def finish(s: Any, w: Any, y: Array, a: float, powers: Array, moments: Array) -> float:
-    """All rates of the accepted stage in w.k, what the pads and contacts dissipate in `powers` (pads, dashpots, slip) [W], the
-    contacts' generalised forces in w.load, the pads' moments (Eq. 35) [N.m]. Returns a bound of every surface speed [m/s]."""
-    p, k = s.p, w.k
-    count, fastest = s.pad_base.size, 0.0
-    powers[: count + 2] = 0.0
-    w.load[:] = 0.0
-    out = np.empty(3)
-    for pad in range(count):
-        at, c = s.contact_point_start[s.pad_contact_start[pad]], s.pad_contact_start[pad]
-        first, last, start = s.pad_node_start[pad], s.pad_node_start[pad + 1], s.pad_y_start[pad]
-        moments[pad] = 0.0
-        for i in range(w.actives[pad]):
-            n = w.active[at + i]
-            while n >= s.contact_point_start[c + 1]:
-                c += 1
-            fx, fy = w.out[n, 0], w.out[n, 1]
-            moments[pad] += s.point_X[n, 0] * fy - s.point_X[n, 1] * fx
-            frame, x, body, base = w.frame[c], w.x[n], s.contact_body[c], s.pad_base[pad]
-            X, Y = frame[0] * fx - frame[1] * fy, frame[1] * fx + frame[0] * fy
-            w.load[body] -= X
-            w.load[body + 1] -= Y
-            w.load[body + 2] -= x[3] * fy - x[4] * fx
-            w.load[base] += X
-            w.load[base + 1] += Y
-            w.load[base + 2] += (x[3] + frame[2]) * fy - (x[4] + frame[3]) * fx
-            powers[count] += w.out[n, 5]
-            powers[count + 1] += w.out[n, 6]
-        i = 0
-        for c in range(s.pad_contact_start[pad], s.pad_contact_start[pad + 1]):
-            own = p[s.contact_p_start[c] : s.contact_p_start[c + 1]]
-            for n in range(s.contact_point_start[c], s.contact_point_start[c + 1]):
-                j = s.point_y_start + n
-                if i < w.actives[pad] and w.active[at + i] == n:
-                    k[j] = w.out[n, 2]
-                    i += 1
-                elif y[j] != 0.0:  # away from contact the stretch decays through the slip element
-                    w.x[n, 6], w.x[n, 7], w.x[n, 8] = y[j], s.point_weight[n], a
-                    call_value(s.contact_free[c], w.x[n, 6:], own, out)
-                    k[j] = out[0]
-                    powers[count] += out[1]
-                    powers[count + 1] += out[2]
-                else:
-                    k[j] = 0.0
-        if s.pad_v_start[pad] >= 0:
-            fastest = max(fastest, finish_inertial(s, w, pad, y, a, powers, moments))
-            continue
-        chain, branches, size = s.pad_chain_at[pad], s.pad_branches[pad], 2 * (last - first)
-        F, total = w.F_linear.ravel(), 0.0
-        for b in range(branches):
-            J, tau, z = p[chain + b], p[chain + branches + b], start + b * size
-            low, high = size, 0
-            for m in range(size):
-                loaded = 2 * w.low[pad] <= 2 * first + m < 2 * w.high[pad]
-                rate = ((F[2 * first + m] if loaded else 0.0) - y[z + m]) / (tau + a)
-                k[z + m] = rate
-                if abs(rate) * a > NEGLIGIBLE_RATE:
-                    low, high = min(low, m), m + 1
-                    total += J * abs(rate)
-            power = 0.0
-            for m in range(low, high):
-                row, u = row_of(s.pad_C, s.pad_C_start[pad], m, size), 0.0
-                for other in range(low, high):
-                    u += row[other] * k[z + other]
-                power += k[z + m] * u
-            powers[pad] += J * tau * power
-        fastest = max(fastest, total * s.pad_reach[pad])
-    for i in range(s.body_coordinate.size):
-        c = s.body_coordinate[i]
-        k[s.body_q_start + i] = w.V[c]
-        k[s.body_V_start + i] = (w.V[c] - y[s.body_V_start + i]) / a
-    bound = 0.0
-    for c in range(s.contact_pad.size):
-        f, C_ = w.frame[c], s.contact_body[c]
-        arm = abs(f[2]) + abs(f[3]) + s.contact_size[c]
-        speed = np.hypot(f[4], f[5]) + abs(w.V[C_ + 2]) * s.contact_size[c] + abs(f[6]) * arm
-        bound = max(bound, speed)
-    return bound + fastest
-
-
-NEGLIGIBLE_RATE = 1e-16
-"""Change of a nodal force in a stage [N] that counts as none."""
-
-
-@compiled
-def finish_inertial(s: Any, w: Any, pad: int, y: Array, a: float, powers: Array, moments: Array) -> float:
-    """Rates of an inertial pad, its part in powers, load and moment; returns its largest nodal rate [m/s]."""
-    p = s.p
-    first, last = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1]
-    base, at = s.pad_base[pad], s.inertia_material_at[pad]
-    vx, vy = base_velocity(s, pad, w.V, w.q)
-    extra, effort = np.zeros(last - first), np.empty(last - first)
-    for node in range(w.low[pad], w.high[pad]):
-        for r in range(2):
-            extra[s.inertia_surface[2 * node + r]] = w.F_linear[node, r]
-    forces = extra.copy()
-    for i in range(last - first):
-        extra[i] -= p[at + 3] * s.inertia_area[first + i] / a * (vx if i % 2 == 0 else vy)
-    solve(s, pad, extra)
-    fastest = 0.0
-    rates = w.full[first:last]
-    for i in range(last - first):
-        rates[i] += extra[i]
-        w.k[s.pad_y_start[pad] + i] = rates[i]
-        speed = rates[i] + (vx if i % 2 == 0 else vy)
-        w.k[s.pad_v_start[pad] + i] = (speed - y[s.pad_v_start[pad] + i]) / a
-        fastest = max(fastest, abs(rates[i]))
-    stiffness = np.empty(last - first)
-    stiffness_force(s, pad, rates, stiffness)
-    for i in range(0, last - first):
-        powers[pad] += p[at + 2] * rates[i] * stiffness[i]
-        effort[i] = forces[i] - p[at + 3] * s.inertia_area[first + i] * w.k[s.pad_v_start[pad] + i]
-    moments[pad] = 0.0
-    for i in range(0, last - first, 2):
-        moments[pad] += s.inertia_X[first + i] * effort[i + 1] - s.inertia_X[first + i + 1] * effort[i]
-    mx, my = inertia_force(s, w, pad, y, a, rates)
-    cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
-    w.load[base] -= cos * mx - sin * my
-    w.load[base + 1] -= sin * mx + cos * my
-    return fastest * 1.5

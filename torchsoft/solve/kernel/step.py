@@ -11,7 +11,9 @@ import numpy as np
 
 from torchsoft.solve.kernel import compiled, inlined
 from torchsoft.solve.kernel.arrays import Array
-from torchsoft.solve.kernel.stage import actuate, finish, solve_stage
+from torchsoft.solve.kernel.finish import finish
+from torchsoft.solve.kernel.linear import put
+from torchsoft.solve.kernel.stage import actuate, solve_stage
 
 GAMMA = 1.0 - 1.0 / np.sqrt(2.0)
 MIX = (1.0 - GAMMA) / GAMMA
@@ -28,7 +30,10 @@ TINY = 1e-60
 @compiled
 def write_tape(s: Any, w: Any, tape: Any, row: int, y: Array) -> bool:
     """Put one solved stage on the tape; False if more points touch than it has room for."""
-    tape.y[row], tape.q[row], tape.V[row], tape.rate[row] = y, w.q, w.V, w.full
+    put(y, tape.y[row])
+    put(w.q, tape.q[row])
+    put(w.V, tape.V[row])
+    put(w.full, tape.rate[row])
     slot = 0
     for pad in range(s.pad_base.size):
         at = s.contact_point_start[s.pad_contact_start[pad]]
@@ -100,7 +105,9 @@ def record(s: Any, w: Any, integrals: Array, moments: Array, forces: Array, extr
             k = w.active[at + i]
             forces[k, 0], forces[k, 1] = w.out[k, 3], w.out[k, 4]
     n, m = integrals.size, moments.size
-    extras[:n], extras[n : n + m], extras[n + m :] = integrals, moments, w.load
+    put(integrals, extras[:n])
+    put(moments, extras[n : n + m])
+    put(w.load, extras[n + m :])
 
 
 @inlined
@@ -132,7 +139,11 @@ def take_step(
     """One step of h [s] from y, which goes to its end with `integrals`; signals (2, signals, 2) are those of the stages. The
     start stays in d.y, d.integrals; d.K, d.powers and d.speed receive what the stages found. Returns status and solves."""
     a, solves = GAMMA * h, 0
-    d.y[:], d.integrals[:], d.V[:], d.u_dot[:], d.travelled[:] = y, integrals, w.V, w.u_dot, w.travelled
+    put(y, d.y)
+    put(integrals, d.integrals)
+    put(w.V, d.V)
+    put(w.u_dot, d.u_dot)
+    put(w.travelled, d.travelled)
     status = CONVERGED
     for stage in range(2):
         powers = d.powers[stage]
@@ -147,7 +158,8 @@ def take_step(
             status = TAPE_FULL
             break
         supply(s, w, signals[stage], powers)
-        d.K[stage], d.speed[stage] = w.k, speed
+        put(w.k, d.K[stage])
+        d.speed[stage] = speed
         dt = a if stage == 1 else h - a
         for i in range(integrals.size):
             integrals[i] += dt * powers[i]
@@ -163,7 +175,11 @@ def take_step(
 @compiled
 def take_back(w: Any, d: Any, y: Array, integrals: Array) -> None:
     """Return to where `take_step` began."""
-    y[:], integrals[:], w.V[:], w.u_dot[:], w.travelled[0] = d.y, d.integrals, d.V, d.u_dot, np.inf
+    put(d.y, y)
+    put(d.integrals, integrals)
+    put(d.V, w.V)
+    put(d.u_dot, w.u_dot)
+    w.travelled[0] = np.inf
 
 
 @inlined
@@ -190,10 +206,12 @@ def write_rows(
     """The outputs at parts[first:last] of the step just taken. At its end they are what the last stage found; before it, dense
     output with the forces that belong to it, which take a stage of no length (of `s0`). Returns status and linear solves."""
     solves, here, converged = 0, w.travelled[0], True
-    d.guess_V[:], d.guess[:] = w.V, w.u_dot
+    put(w.V, d.guess_V)
+    put(w.u_dot, d.guess)
     for i in range(last - 1, first - 1, -1):  # the end comes first: the others disturb what the last stage left
         if parts[i] == 1.0:
-            ys[i], d.at_row[:] = y, integrals
+            put(y, ys[i])
+            put(integrals, d.at_row)
         else:
             b_1, b_2 = dense(parts[i])
             for j in range(y.size):
@@ -212,7 +230,8 @@ def write_rows(
             solves += count
             if not converged:
                 break
-            w.V[:], w.u_dot[:] = d.guess_V, d.guess
+            put(d.guess_V, w.V)
+            put(d.guess, w.u_dot)
             w.travelled[0] = here if w.travelled[2] == scans else np.inf
         record(s, w, d.at_row, d.moments, forces[i], extras[i])
     return CONVERGED if converged else NEWTON_FAILED, solves

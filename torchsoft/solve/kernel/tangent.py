@@ -14,7 +14,7 @@ from torchsoft.solve.kernel.adjoint import rigid_part
 from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
 from torchsoft.solve.kernel.interface import NEGLIGIBLE, assemble
-from torchsoft.solve.kernel.linear import row_of, solve_dense
+from torchsoft.solve.kernel.linear import put, row_of, solve_dense
 from torchsoft.solve.kernel.stage import actuate, eliminate
 from torchsoft.solve.kernel.step import GAMMA, MIX, dense_states
 from torchsoft.solve.kernel.taped import restore
@@ -27,9 +27,10 @@ RESCAN = 64
 
 
 @compiled
-def law_derivatives(address: int, x: Array, p: Array, dp: Array, rows: int, out: Array) -> None:
+def law_derivatives(z: Any, address: int, x: Array, p: Array, dp: Array, rows: int, out: Array) -> None:
     """d law / dp along dp (parameters, m), with x held, into out (rows, m)."""
-    weights, gradient = np.zeros(rows), np.empty(p.size)
+    weights, gradient = z.weights, z.gradient[: p.size]
+    weights[:] = 0.0
     for r in range(rows):
         gradient[:] = 0.0
         weights[r] = 1.0
@@ -64,27 +65,25 @@ def find_span(s: Any, y: Array, dy: Array, span: Array) -> None:
 
 
 @compiled
-def massless_part(
-    s: Any, w: Any, pad: int, y: Array, dy: Array, dp: Array, a: float, span: Array, du: Array, dv: Array
-) -> None:
+def massless_part(s: Any, w: Any, z: Any, pad: int, y: Array, dy: Array, dp: Array, a: float) -> None:
     """Derivatives of u* (du) and of u' before the forces' own change (dv) at the loaded nodes, (nodes, 2, m)."""
     p, first, start, m = s.p, s.pad_node_start[pad], s.pad_y_start[pad], dy.shape[1]
     size, chain, branches = 2 * (s.pad_node_start[pad + 1] - first), s.pad_chain_at[pad], s.pad_branches[pad]
-    F, material = w.F.ravel(), chain + 2 * branches
+    F, material, span, du, dv = w.F.reshape(w.F.size), chain + 2 * branches, z.span, z.u, z.v
     left, right = min(span[pad, 0], 2 * (w.low[pad] - first)), max(span[pad, 1], 2 * (w.high[pad] - first))
     span[pad, 0], span[pad, 1] = left, right
-    zeta, rate = np.zeros(size), np.zeros(size)
-    dzeta, drate = np.zeros((size, m)), np.zeros((size, m))
+    zeta, rate, dzeta, drate = z.zeta, z.rate, z.dzeta, z.drate
+    zeta[:], rate[:], dzeta[:], drate[:] = 0.0, 0.0, 0.0, 0.0
     for b in range(branches):
-        J, tau, z = p[chain + b], p[chain + branches + b], start + b * size
+        J, tau, at = p[chain + b], p[chain + branches + b], start + b * size
         for i in range(left, right):
             loaded = 2 * w.low[pad] <= 2 * first + i < 2 * w.high[pad]
-            z_dot = ((F[2 * first + i] if loaded else 0.0) - y[z + i]) / (tau + a)
-            zeta[i] += J * y[z + i]
+            z_dot = ((F[2 * first + i] if loaded else 0.0) - y[at + i]) / (tau + a)
+            zeta[i] += J * y[at + i]
             rate[i] += J * z_dot
             for k in range(m):
-                change = (dy[z + i, k] + z_dot * dp[chain + branches + b, k]) / (tau + a)
-                dzeta[i, k] += J * dy[z + i, k] + dp[chain + b, k] * y[z + i]
+                change = (dy[at + i, k] + z_dot * dp[chain + branches + b, k]) / (tau + a)
+                dzeta[i, k] += J * dy[at + i, k] + dp[chain + b, k] * y[at + i]
                 drate[i, k] += dp[chain + b, k] * z_dot - J * change
     stiffer = False
     for k in range(m):
@@ -116,10 +115,9 @@ def massless_part(
 
 @compiled
 def inertial_part(
-    s: Any, w: Any, pad: int, y: Array, dy: Array, dp: Array, a: float, rate: Array, du: Array, dv: Array, free: Array,
-    r: Array,
-) -> None:  # fmt: skip
-    """The same for an inertial pad; `free` (dofs, m) receives dv of all its dofs, and r the base's reaction."""
+    s: Any, w: Any, z: Any, pad: int, y: Array, dy: Array, dp: Array, a: float, rate: Array, r: Array
+) -> None:
+    """The same for an inertial pad; z.free (dofs, m) receives dv of all its dofs, and r the base's reaction."""
     at = s.inertia_material_at[pad]
     i0, i1, U, W, base = (
         s.inertia_dof_start[pad],
@@ -131,7 +129,8 @@ def inertial_part(
     n, mass, tau = i1 - i0, s.p[at + 3], s.p[at + 2]
     vx, vy = base_velocity(s, pad, w.V, w.q)
     cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
-    own, force, column, strain, here = np.empty(n), np.empty(n), np.empty(n), np.empty(n), rate[i0:i1]
+    own, force, column, strain = w.inertial[0, i0:i1], w.inertial[1, i0:i1], w.inertial[2, i0:i1], w.inertial[3, i0:i1]
+    here, du, dv, free = rate[i0:i1], z.u, z.v, z.free
     stiffness_force(s, pad, here, force)
     for i in range(n):
         strain[i] = y[U + i] + (tau + a) * here[i]
@@ -148,20 +147,20 @@ def inertial_part(
             v_dot = here[i] + (vx if i % 2 == 0 else vy) - y[W + i]
             column[i] = total + M * (mass * dy[W + i, k] - dp[at + 3, k] * v_dot)
         solve(s, pad, column)
-        x = z = 0.0
+        along = across = 0.0
         for i in range(n):
             free[i0 + i, k] = column[i]
             M = s.inertia_area[i0 + i] / a
             v_dot = here[i] + (vx if i % 2 == 0 else vy) - y[W + i]
             change = M * (mass * (column[i] - dy[W + i, k]) + dp[at + 3, k] * v_dot)
             if i % 2 == 0:
-                x += change
+                along += change
             else:
-                z += change
+                across += change
         for axis in range(2):
             number = s.body_free[base + axis]
             if number >= 0:
-                r[number, k] -= cos * x - sin * z if axis == 0 else sin * x + cos * z
+                r[number, k] -= cos * along - sin * across if axis == 0 else sin * along + cos * across
         for i in range(w.counts[pad]):
             node = w.touched[s.pad_node_start[pad] + i]
             for axis in range(2):
@@ -170,15 +169,12 @@ def inertial_part(
 
 
 @compiled
-def stage_tangent(
-    s: Any, w: Any, tape: Any, row: int, a: float, signals: Array, dy: Array, dp: Array, span: Array, du: Array, dv: Array,
-    free_rates: Array,
-) -> None:  # fmt: skip
+def stage_tangent(s: Any, w: Any, z: Any, tape: Any, row: int, a: float, signals: Array, dy: Array, dp: Array) -> None:
     """Turn the tangent dy (size, m) of a stage's y* into that of its end, in place; dp (parameters, m)."""
     p = s.p
     free, count, y, m = s.body_coordinate.size, s.pad_base.size, tape.y[row], dy.shape[1]
     restore(s, w, tape, row, a)
-    Rv, r = np.empty((free, free)), np.zeros((free, m))
+    Rv, r, du, dv = w.Rv, z.r, z.u, z.v
     rigid_part(s, w, y, signals, a, Rv)
     for i in range(free):
         c, mass = s.body_coordinate[i], p[s.body_mass_at[i]]
@@ -188,27 +184,27 @@ def stage_tangent(
             r[i, k] -= s.body_weight[i] * (
                 dp[s.body_mass_at[i], k] * p[s.body_gravity_at] + mass * dp[s.body_gravity_at, k]
             )
-    x, out, J, change = np.empty(5), np.empty(1), np.empty((1, 5)), np.empty((3, m))
+    x, out, J, change = w.effort_x, w.effort, w.effort_J, z.change
     for i in range(s.act_measured.size):
         number, measured = s.body_free[s.act_pushed[i]], s.body_free[s.act_measured[i]]
         if number < 0:
             continue
         actuate(s, i, w.q, w.V, signals, x, out, J)
         own = slice(s.act_p_start[i], s.act_p_start[i + 1])
-        law_derivatives(s.act_pullback[i], x, p[own], dp[own], 1, change)
+        law_derivatives(z, s.act_pullback[i], x, p[own], dp[own], 1, change)
         for k in range(m):
             r[number, k] += change[0, k]
             if measured >= 0:
                 r[number, k] += J[0, 3] * dy[s.body_q_start + measured, k]
 
-    e, known, dq = np.empty((len(s.point_X), 3, m)), np.empty((2, m)), np.empty((6, m))
+    e, known, dq = z.e, z.known, z.q
     for pad in range(count):
         n = assemble(s, w, pad, a, Rv)
         w.counts[pad] = n
         if s.pad_v_start[pad] >= 0:
-            inertial_part(s, w, pad, y, dy, dp, a, tape.rate[row], du, dv, free_rates, r)
+            inertial_part(s, w, z, pad, y, dy, dp, a, tape.rate[row], r)
         else:
-            massless_part(s, w, pad, y, dy, dp, a, span, du, dv)
+            massless_part(s, w, z, pad, y, dy, dp, a)
         first, columns = s.pad_node_start[pad], s.pad_columns[pad]
         at, c = s.contact_point_start[s.pad_contact_start[pad]], s.pad_contact_start[pad]
         X = w.X[2 * first : 2 * (first + n)]
@@ -218,7 +214,7 @@ def stage_tangent(
             while k >= s.contact_point_start[c + 1]:
                 c += 1
             own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
-            law_derivatives(s.contact_pullback[c], w.x[k], p[own], dp[own], 3, e[k])
+            law_derivatives(z, s.contact_pullback[c], w.x[k], p[own], dp[own], 3, e[k])
             H, S, G, L = w.H[at + i], w.S[at + i], w.G[at + i], w.L[at + i]
             for o in range(6):
                 number = s.body_free[s.contact_body[c] + o] if o < 3 else s.body_free[s.pad_base[pad] + o - 3]
@@ -246,14 +242,19 @@ def stage_tangent(
                         for j in range(6):
                             total += L[o, 2 + j] * dq[j, d]
                         r[number, d] += total
-        X[:, m : m + columns] = w.Hc[: 2 * n, :columns]
+        for i in range(2 * n):
+            for j in range(columns):
+                X[i, m + j] = w.Hc[i, j]
         solve_dense(w.A, X, 2 * n, m + columns)
         eliminate(s, w, pad, n, m, X, r, Rv)
-    dV = -r
+    dV = z.V
+    for i in range(free):
+        for k in range(m):
+            dV[i, k] = -r[i, k]
     solve_dense(Rv, dV, free, m)
 
     for pad in range(count):
-        advance_pad(s, w, pad, y, a, dy, dp, span, dV, free_rates, e)
+        advance_pad(s, w, z, pad, y, a, dy, dp)
     for i in range(free):
         for k in range(m):
             dy[s.body_q_start + i, k] += a * dV[i, k]
@@ -261,13 +262,12 @@ def stage_tangent(
 
 
 @compiled
-def advance_pad(
-    s: Any, w: Any, pad: int, y: Array, a: float, dy: Array, dp: Array, span: Array, dV: Array, free_rates: Array, e: Array
-) -> None:  # fmt: skip
+def advance_pad(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array, dp: Array) -> None:
     """Tangents of a pad's state and of its stretches at the stage's end, from Newton's solution in w.X and dV."""
     p = s.p
     first, last, n, m = s.pad_node_start[pad], s.pad_node_start[pad + 1], w.counts[pad], dy.shape[1]
     size, column = 2 * (last - first), s.pad_column[pad]
+    own_rate, base_rate, span, dV, e = z.own_rate, z.base_rate, z.span, z.V, z.e  # own_rate: of u', what is not in dv
     X, at, start = w.X[2 * first : 2 * (first + n)], s.contact_point_start[s.pad_contact_start[pad]], s.pad_y_start[pad]
     inertial, scale = s.pad_v_start[pad] >= 0, 0.0
     chain, branches, base = s.pad_chain_at[pad], s.pad_branches[pad], s.pad_base[pad]
@@ -279,7 +279,7 @@ def advance_pad(
             for i in range(2 * n):
                 for k in range(m):
                     X[i, k] += X[i, m + column[number]] * dV[number, k]
-    own_rate, base_rate = np.zeros((n, 2, m)), np.zeros((2, m))  # the part of u' that is not in dv
+    own_rate[:n], base_rate[:] = 0.0, 0.0
     cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
     if inertial:
         for axis in range(2):
@@ -300,7 +300,7 @@ def advance_pad(
                 dof = s.inertia_dof_start[pad] + s.inertia_surface[2 * w.touched[first + i] + o]
                 for k in range(m):
                     own_rate[i, o, k] -= s.inertia_D[dof, 0] * base_rate[0, k] + s.inertia_D[dof, 1] * base_rate[1, k]
-    i, x, out, J, change = 0, np.empty(3), np.empty(3), np.empty((1, 1)), np.empty((1, m))
+    i, x, out, J, change = 0, z.decay_x, w.decay, z.decay_J, z.change
     for c in range(s.pad_contact_start[pad], s.pad_contact_start[pad + 1]):
         own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
         for k in range(s.contact_point_start[c], s.contact_point_start[c + 1]):
@@ -326,33 +326,34 @@ def advance_pad(
             if moved or y[j] != 0.0:
                 x[0], x[1], x[2] = y[j], s.point_weight[k], a
                 call_linearise(s.contact_free_linearise[c], x, p[own], out, J)
-                law_derivatives(s.contact_free_pullback[c], x, p[own], dp[own], 1, change)
+                law_derivatives(z, s.contact_free_pullback[c], x, p[own], dp[own], 1, change)
                 for d in range(m):
                     new = dy[j, d] + a * (J[0, 0] * dy[j, d] + change[0, d])
                     dy[j, d] = new if abs(new) > 1e-200 else 0.0
     if inertial:
-        advance_inertial(s, w, pad, a, dy, free_rates, base_rate)
+        advance_inertial(s, w, z, pad, a, dy)
         return
-    F = w.F.ravel()
+    F = w.F.reshape(w.F.size)
     for b in range(branches):
-        tau, z = p[chain + branches + b], start + b * size
+        tau, first_z = p[chain + branches + b], start + b * size
         for i in range(span[pad, 0], span[pad, 1]):
             loaded = 2 * w.low[pad] <= 2 * first + i < 2 * w.high[pad]
-            z_dot = ((F[2 * first + i] if loaded else 0.0) - y[z + i]) / (tau + a)
+            z_dot = ((F[2 * first + i] if loaded else 0.0) - y[first_z + i]) / (tau + a)
             for k in range(m):
-                dy[z + i, k] -= a * (dy[z + i, k] + z_dot * dp[chain + branches + b, k]) / (tau + a)
+                dy[first_z + i, k] -= a * (dy[first_z + i, k] + z_dot * dp[chain + branches + b, k]) / (tau + a)
         for i in range(n):
             for o in range(2):
-                dof = z + 2 * (w.touched[first + i] - first) + o
+                dof = first_z + 2 * (w.touched[first + i] - first) + o
                 for k in range(m):
                     dy[dof, k] += a * X[2 * i + o, k] / (tau + a)
 
 
 @compiled
-def advance_inertial(s: Any, w: Any, pad: int, a: float, dy: Array, free_rates: Array, base_rate: Array) -> None:
+def advance_inertial(s: Any, w: Any, z: Any, pad: int, a: float, dy: Array) -> None:
     """u and v of an inertial pad: u' = free + A^-1 F - D V_B, v = u' + V_B."""
     i0, i1, first = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1], s.pad_node_start[pad]
-    X, column = w.X[2 * first : 2 * (first + w.counts[pad])], np.empty(i1 - i0)
+    X, column = w.X[2 * first : 2 * (first + w.counts[pad])], w.inertial[0, i0:i1]
+    free_rates, base_rate = z.free, z.base_rate
     for k in range(dy.shape[1]):
         column[:] = 0.0
         for i in range(w.counts[pad]):
@@ -368,33 +369,26 @@ def advance_inertial(s: Any, w: Any, pad: int, a: float, dy: Array, free_rates: 
 
 @entry
 def forward(
-    s: Any,
-    w: Any,
-    h: Array,
-    tape: Any,
-    signals: Array,
-    out_step: Any,
-    out_part: Array,
-    dy: Array,
-    dp: Array,
+    s: Any, w: Any, z: Any, h: Array, tape: Any, signals: Array, out_step: Any, out_part: Array, dy: Array, dp: Array,
     dys: Array,
-) -> None:
+) -> None:  # fmt: skip
     """Carry the tangent dy (size, m) through the steps of a tape, in place; dys (outputs, size, m) receives it at the parts
     out_part of the steps out_step."""
-    m, row = dy.shape[1], 0
-    du, dv = np.zeros((len(w.u), 2, m)), np.zeros((len(w.u), 2, m))
-    free_rates, before, first = np.zeros((w.full.size, m)), np.empty(dy.shape), np.empty(dy.shape)
-    span = np.zeros((s.pad_base.size, 2), np.int64)
+    m, row, before, first = dy.shape[1], 0, z.before, z.first
     for step in range(h.size):
         a = GAMMA * h[step]
         if step % RESCAN == 0:
-            find_span(s, tape.y[2 * step], dy, span)
-        before[:] = dy
-        stage_tangent(s, w, tape, 2 * step, a, signals[2 * step], dy, dp, span, du, dv, free_rates)
-        first[:] = dy
-        dy[:] = before + MIX * (dy - before)
-        stage_tangent(s, w, tape, 2 * step + 1, a, signals[2 * step + 1], dy, dp, span, du, dv, free_rates)
+            find_span(s, tape.y[2 * step], dy, z.span)
+        put(dy, before)
+        stage_tangent(s, w, z, tape, 2 * step, a, signals[2 * step], dy, dp)
+        put(dy, first)
+        for i in range(dy.shape[0]):
+            for k in range(m):
+                dy[i, k] = before[i, k] + MIX * (dy[i, k] - before[i, k])
+        stage_tangent(s, w, z, tape, 2 * step + 1, a, signals[2 * step + 1], dy, dp)
         while row < out_step.size and out_step[row] == step:
             at_start, at_first, at_end = dense_states(out_part[row])
-            dys[row] = at_start * before + at_first * first + at_end * dy
+            for i in range(dy.shape[0]):
+                for k in range(m):
+                    dys[row, i, k] = at_start * before[i, k] + at_first * first[i, k] + at_end * dy[i, k]
             row += 1

@@ -5,13 +5,15 @@ from typing import Any
 from torchsoft.codegen.invoke import call_linearise
 from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.interface import frames, kinematics, linearise
+from torchsoft.solve.kernel.linear import put
 
 
 @compiled
 def restore(s: Any, w: Any, tape: Any, row: int, a: float) -> None:
     """Coordinates, touching points with the law's Jacobians there, H, S, G, L, nodal forces (w.F), displacements at the stage's
     start (w.u) and rates (w.u_dot) of points, by point number in the first columns of w.x's scratch."""
-    w.q[:], w.V[:] = tape.q[row], tape.V[row]
+    put(tape.q[row], w.q)
+    put(tape.V[row], w.V)
     frames(s, w)
     slot = 0
     for pad in range(s.pad_base.size):
