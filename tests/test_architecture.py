@@ -11,8 +11,8 @@ import torchsoft
 ROOT = Path(torchsoft.__file__).parent
 FLOWS = {
     "": """
-        channels files tables parameters cost codegen physics solve scenario excitation processes plot sysid reduced datasets
-        cli __main__
+        channels files threads tables parameters cost codegen physics solve scenario excitation processes plot sysid
+        reduced datasets cli __main__
     """,
     "codegen": "graph derivatives operations trace emit . invoke",
     "physics": """
@@ -20,7 +20,7 @@ FLOWS = {
         equilibrium stability .
     """,
     "solve": """
-        grid kernel laws system progress tolerances stepper adjoint tangent unrolled continuous trajectory ledger simulate
+        grid kernel laws system progress tolerances stepper adjoint tangent unrolled continuous trajectory ledger simulate batch
         torchdiffeq .
     """,
     "solve.kernel": "cache . arrays scratch linear inertia interface stage finish step taped run adjoint_pads adjoint tangent",

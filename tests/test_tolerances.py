@@ -190,13 +190,13 @@ def test_what_a_signal_raises_is_raised() -> None:
 class Jump(Wave):
     """A setpoint that jumps by 1 mm, and whose stated rate jumps by `rate` [m/s]."""
 
-    def __init__(self, rate: float) -> None:
+    def __init__(self, rate: float, at: float = 0.0512345) -> None:
         super().__init__()
-        self.rate = rate
+        self.rate, self.at = rate, at
 
     def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
         value, rate = super().forward(t)
-        return value + torch.where(t > 0.0512345, 1e-3, 0.0), rate + torch.where(t > 0.0512345, self.rate, 0.0)
+        return value + torch.where(t > self.at, 1e-3, 0.0), rate + torch.where(t > self.at, self.rate, 0.0)
 
 
 def test_a_jump_is_stepped_over_or_said() -> None:
@@ -212,6 +212,17 @@ def test_a_jump_is_stepped_over_or_said() -> None:
         SimulationFailed, match=r"at t = 0\.0512 s .* steps below 1e-09 s for the velocity of body `bracket`"
     ):
         simulate(model, times(0.1, 6), y0=y0, reference=jump(1e9), rtol=1e-4)
+
+
+@pytest.mark.parametrize("at", [0.3, 1.1, 1.8, 7.3])
+def test_a_run_whose_steps_cannot_get_shorter_ends(at: float) -> None:
+    """However the shortest step is rounded at that time."""
+    model = coarse()
+    y0 = grasped(model)
+    signals = {name: model.reference[name] for name in model.signals if name != "x_d"}
+    t = torch.tensor([at - 0.1, at + 0.1], dtype=torch.float64)
+    with pytest.raises(SimulationFailed, match="steps below 1e-09 s"):
+        simulate(model, t, y0=y0, reference=Reference(**signals, x_d=Jump(1e9, at)), rtol=1e-4)
 
 
 def test_no_step_passes_a_knot_of_the_reference() -> None:

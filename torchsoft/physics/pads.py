@@ -74,6 +74,8 @@ class Pad(nn.Module):
     def rotated(self, blocks: Array) -> Array:
         """A matrix of (rows, 2, columns, 2) blocks from the pad's own axes into the base's."""
         R, n, m = self.axes.numpy(), len(blocks) // 2, blocks.shape[1] // 2
+        if R[0, 1] == R[1, 0] == 0.0:  # turned by nothing but a mirror
+            return blocks * np.outer(np.tile(np.diag(R), n), np.tile(np.diag(R), m))
         return np.einsum("ij,ajbk,lk->aibl", R, blocks.reshape(n, 2, m, 2), R).reshape(blocks.shape)
 
     def unit_compliance(self) -> tuple[Tensor, Tensor]:

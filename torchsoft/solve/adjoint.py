@@ -4,8 +4,8 @@ What a run was made with is fixed when it is made: the vector of parameters and 
 autograd function, and whatever these were computed from receives its gradient, whatever has become of the modules since.
 """
 
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -16,6 +16,7 @@ from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.scratch import cotangents, scratch
 from torchsoft.solve.progress import Progress, Segment
 from torchsoft.solve.stepper import ImplicitStepper
+from torchsoft.threads import side_by_side
 
 TAPE_BYTES = 1e9
 """Tapes kept of one run [bytes]; beyond that the backward sweep makes each segment's again from where it began."""
@@ -25,20 +26,37 @@ class GradientFailed(RuntimeError):
     """A gradient that there is not, or that is not finite: when [s] it ceased to be."""
 
 
-def iterate(stepper: ImplicitStepper, y0: Tensor, t: Tensor) -> Iterator[tuple[Tensor, Progress]]:
-    """States (T, size) at the times t (T,) as the run grows; the last yield has the discrete adjoint behind it, if
-    anything that
-    the run was made with wants a gradient and gradients are enabled: y0 (size,), parameters, signals, but not t."""
+class Solved(NamedTuple):
+    """A run, finished or growing: what it was made with, what it left, and its segments if anything wants a gradient."""
+
+    stepper: ImplicitStepper
+    y0: Tensor
+    out: Progress
+    segments: list[Segment] | None
+
+    @property
+    def y(self) -> Tensor:
+        """States (T, size), without a graph."""
+        return torch.from_numpy(self.out.y)
+
+
+def march(stepper: ImplicitStepper, y0: Tensor, t: Tensor, tape_bytes: float = TAPE_BYTES) -> Iterator[Solved]:
+    """The run from y0 (size,) through the times t (T,), after every compiled call; the last is complete."""
     segments: list[Segment] | None = [] if torch.is_grad_enabled() and wants_gradient(stepper, y0) else None
-    out = None
-    for out in stepper.integrate(y0.detach(), t, segments, TAPE_BYTES):
-        yield torch.from_numpy(out.y), out
-    assert out is not None
-    solution = torch.from_numpy(out.y)
-    if segments is not None:
-        signals = stepper.signals([segment.plan for segment in segments])
-        solution = _Solution.apply(stepper, segments, solution, y0, stepper.compiled.p, signals)
-    yield solution, out  # pyright: ignore[reportReturnType]
+    for out in stepper.integrate(y0.detach(), t, segments, tape_bytes):
+        yield Solved(stepper, y0, out, segments)
+
+
+def attached(runs: Sequence[Solved], threads: int = 1) -> list[Tensor]:
+    """The states (T, size) of finished runs with the discrete adjoint behind them, by y0, parameters and signals, but not by
+    the times, where anything wants it. The backward sweeps of several runs go side by side in so many threads."""
+    wanted = [run for run in runs if run.segments is not None]
+    inputs: list[Tensor] = []
+    for run in wanted:
+        signals = run.stepper.signals([segment.plan for segment in run.segments or []])
+        inputs += [run.y0, run.stepper.compiled.p, signals]
+    solutions = iter(_Solutions.apply(wanted, threads, *inputs) if wanted else ())
+    return [run.y if run.segments is None else next(solutions) for run in runs]
 
 
 def wants_gradient(stepper: ImplicitStepper, y0: Tensor) -> bool:
@@ -47,21 +65,29 @@ def wants_gradient(stepper: ImplicitStepper, y0: Tensor) -> bool:
     return any(tensor.requires_grad for tensor in tensors)
 
 
-class _Solution(torch.autograd.Function):
-    """Passes the solution through; its backward is the discrete adjoint."""
+class _Solutions(torch.autograd.Function):
+    """Passes the solutions through; its backward is the discrete adjoint of each."""
 
     @staticmethod
-    def forward(
-        ctx: Any, stepper: ImplicitStepper, segments: list[Segment], y: Tensor, y0: Tensor, p: Tensor, signals: Tensor
-    ) -> Tensor:
-        ctx.stepper, ctx.segments, ctx.shape = stepper, segments, signals.shape
-        return y.clone()
+    def forward(ctx: Any, runs: Sequence[Solved], threads: int, *inputs: Tensor) -> tuple[Tensor, ...]:
+        ctx.runs, ctx.threads = runs, threads
+        ctx.set_materialize_grads(False)
+        return tuple(run.y.clone() for run in runs)
 
     @staticmethod
-    def backward(ctx: Any, y_bar: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
+    def backward(ctx: Any, *y_bars: Tensor | None) -> Any:
         if torch.is_grad_enabled():  # a graph of it would lack how the cotangents depend on what ran
             raise GradientFailed("a run has no second derivative; ask for its gradient without create_graph")
-        return None, None, None, *run_adjoint(ctx.stepper, ctx.segments, y_bar)
+        bars: list[Tensor | None] = [None] * (3 * len(y_bars))
+        asked = [i for i, y_bar in enumerate(y_bars) if y_bar is not None]
+
+        def sweep(k: int) -> tuple[Tensor, Tensor, Tensor]:
+            run, y_bar = ctx.runs[asked[k]], y_bars[asked[k]]
+            return run_adjoint(run.stepper, run.segments, y_bar)
+
+        for k, result in side_by_side(sweep, len(asked), ctx.threads):
+            bars[3 * asked[k] : 3 * asked[k] + 3] = result
+        return None, None, *bars
 
 
 def run_adjoint(stepper: ImplicitStepper, segments: list[Segment], y_bar: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -62,7 +62,11 @@ def structure(module: object) -> Any:
         parts = tuple((k, structure(v)) for k, v in module._modules.items())
         buffers = tuple((k, v.dtype, v.numpy().tobytes()) for k, v in module._buffers.items() if v is not None)
         shapes = tuple((k, tuple(v.shape)) for k, v in module._parameters.items() if v is not None)
-        plain = all(isinstance(v, bool | int | float | str | None) for v in own.values())
+        plain = all(
+            isinstance(one, bool | int | float | str | None)
+            for v in own.values()
+            for one in (v if isinstance(v, tuple) else (v,))
+        )
         hooked = any(v for k, v in vars(module).items() if k.endswith("_hooks"))
         if plain and not hooked and all(part is not None for _, part in parts):
             return kind, kind.forward, tuple(sorted((given | own).items())), parts, buffers, shapes

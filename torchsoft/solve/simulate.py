@@ -4,7 +4,7 @@ import time as clock
 import warnings
 from collections.abc import Iterator, Sequence
 from importlib.metadata import version
-from typing import Literal, get_args
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
@@ -17,7 +17,8 @@ from torchsoft.physics.paper import SoftGrasp
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.stability import describe_instability
 from torchsoft.physics.validity import check_array
-from torchsoft.solve import adjoint, tangent
+from torchsoft.solve import tangent
+from torchsoft.solve.adjoint import TAPE_BYTES, Solved, attached, march, recorded
 from torchsoft.solve.continuous import continuous_solution
 from torchsoft.solve.grid import check_times
 from torchsoft.solve.ledger import doubts
@@ -69,6 +70,36 @@ def simulate(
     ways to choose steps at once; `SimulationFailed` (with the trajectory so far) when the run cannot go on; `Interrupted`
     (likewise) on Ctrl-C.
     """
+    task = prepare(
+        rig, t, y0=y0, reference=reference, rtol=rtol, atol=atol, step=step, knots=knots, tolerance=tolerance,
+        gradient=gradient, wrt=wrt, dy0=dy0, rigid=rigid,
+    )  # fmt: skip
+    if gradient in ("unrolled", "continuous"):
+        return _recorded(task.stepper, t, task.y0, gradient)
+    trajectory = run(task, TAPE_BYTES, progress).trajectory()
+    for doubt in doubts(trajectory, rig):
+        warnings.warn(doubt, stacklevel=2)
+    return trajectory
+
+
+class Task(NamedTuple):
+    """A run that may begin: what `simulate` was asked for, checked."""
+
+    stepper: ImplicitStepper
+    t: Tensor
+    y0: Tensor
+    gradient: Route
+    wrt: tuple[str, ...]
+    dy0: Tensor | None
+    rigid: bool
+
+
+def prepare(
+    rig: Rig, t: Tensor, *, y0: Tensor | None = None, reference: Reference | None = None, rtol: float | None = None,
+    atol: float | None = None, step: float | None = None, knots: Tensor | None = None, tolerance: float = 1e-9,
+    gradient: Route = "none", wrt: Sequence[str] = (), dy0: Tensor | None = None, rigid: bool = False,
+) -> Task:  # fmt: skip
+    """Checks what `simulate` is asked for; raises its `ValueError`s."""
     _check_wanted(gradient, wrt, dy0, rigid)
     ways = {"step": step, "knots": knots, "rtol or atol": rtol if rtol is not None else atol}
     given = [f"`{name}`" for name, value in ways.items() if value is not None]
@@ -95,35 +126,53 @@ def simulate(
             raise ValueError("`y0` is needed: only the paper's rig has a start of its own")
         y0 = rest(rig)
     stepper.check_start(y0)
-    if gradient in ("unrolled", "continuous"):
-        return _recorded(stepper, t, y0, gradient)
-    bar = tqdm(
-        total=float(t[-1] - t[0]), unit="s", disable=not progress,
-        bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated [{elapsed}]",
-    )  # fmt: skip
-    y, dy, out, wall, began = y0, None, None, 0.0, clock.perf_counter()
+    return Task(stepper, t, y0, gradient, tuple(wrt), dy0, rigid)
+
+
+class Done(NamedTuple):
+    """A finished run: the states with what is needed to differentiate them, sensitivities where asked for, and its time [s]."""
+
+    task: Task
+    solved: Solved
+    dy: Tensor | None
+    wall: float
+
+    def trajectory(self, y: Tensor | None = None) -> Trajectory:
+        """The trajectory of the states y (T, size), by default with the adjoint of this run behind them."""
+        y = attached([self.solved])[0] if y is None else y
+        return gather(self.task, y, self.solved.out, self.wall, self.dy)
+
+
+def run(task: Task, tape_bytes: float, progress: bool = False) -> Done:
+    """Carry out a task by one of the compiled routes. Raises `SimulationFailed` and `Interrupted` with what was simulated."""
+    stepper, t, bar = task.stepper, task.t, None
+    if progress:
+        bar = tqdm(
+            total=float(t[-1] - t[0]), unit="s", bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated [{elapsed}]"
+        )
+    done, began = None, clock.perf_counter()
     try:
-        with torch.set_grad_enabled(gradient == "discrete" and torch.is_grad_enabled()):
-            for y, dy, out in _rows(stepper, y0, t, gradient, wrt, dy0, rigid):
-                wall = clock.perf_counter() - began
-                bar.n = float(t[out.rows - 1] - t[0])
-                bar.refresh()
+        with torch.set_grad_enabled(
+            task.gradient == "forward" or (task.gradient == "discrete" and torch.is_grad_enabled())
+        ):
+            for solved, dy in _rows(task, tape_bytes):
+                done = Done(task, solved, dy, clock.perf_counter() - began)
+                if bar is not None:
+                    bar.n = float(t[solved.out.rows - 1] - t[0])
+                    bar.refresh()
     except SimulationFailed as failure:
-        if out is None:
+        if done is None:
             raise
-        trajectory = gather(stepper, t, y, out, stats(out, wall))
-        raise diagnose(rig, failure, trajectory) from None
+        raise diagnose(stepper.rig, failure, done.trajectory(done.solved.y)) from None
     except KeyboardInterrupt:
-        if out is None:
+        if done is None:
             raise
-        raise Interrupted(gather(stepper, t, y.detach(), out, stats(out, wall))) from None
+        raise Interrupted(done.trajectory(done.solved.y)) from None
     finally:
-        bar.close()
-    assert out is not None
-    trajectory = gather(stepper, t, y, out, stats(out, wall), tuple(wrt), dy)
-    for doubt in doubts(trajectory, rig):
-        warnings.warn(doubt, stacklevel=2)
-    return trajectory
+        if bar is not None:
+            bar.close()
+    assert done is not None
+    return done
 
 
 def _check_wanted(gradient: Route, wrt: Sequence[str], dy0: Tensor | None, rigid: bool) -> None:
@@ -142,34 +191,27 @@ def _check_wanted(gradient: Route, wrt: Sequence[str], dy0: Tensor | None, rigid
         )
 
 
-def _rows(
-    stepper: ImplicitStepper,
-    y0: Tensor,
-    t: Tensor,
-    gradient: Route,
-    wrt: Sequence[str],
-    dy0: Tensor | None,
-    rigid: bool,
-) -> Iterator[tuple[Tensor, Tensor | None, Progress]]:
-    """The growing run by one of the compiled routes."""
-    if gradient == "forward":
-        with torch.enable_grad():
-            wanted = [stepper.rig.parameter(name) for name in wrt]
-            for name, value in zip(wrt, wanted):
-                if value.ndim or not value.requires_grad:
-                    raise ValueError(f"`{name}` must be a scalar parameter that requires a gradient")
-            size = stepper.layout.size
-            if dy0 is not None:
-                check_array("dy0", dy0)
-                if dy0.shape != (size, len(wrt)):
-                    raise ValueError(f"`dy0` must have shape ({size}, {len(wrt)}), but has {tuple(dy0.shape)}")
-                if not bool(torch.isfinite(dy0).all()):
-                    raise ValueError("`dy0` must be finite, but has a component that is not")
-            kept = stepper.layout.rigid if rigid else list(range(size))
-            yield from tangent.iterate(stepper, y0, t, wanted, dy0, kept)
-    else:
-        for y, out in adjoint.iterate(stepper, y0, t):
-            yield y, None, out
+def _rows(task: Task, tape_bytes: float) -> Iterator[tuple[Solved, Tensor | None]]:
+    """The growing run."""
+    stepper, wrt, dy0 = task.stepper, task.wrt, task.dy0
+    if task.gradient != "forward":
+        for solved in march(stepper, task.y0, task.t, tape_bytes):
+            yield solved, None
+        return
+    wanted = [stepper.rig.parameter(name) for name in wrt]
+    for name, value in zip(wrt, wanted):
+        if value.ndim or not value.requires_grad:
+            raise ValueError(f"`{name}` must be a scalar parameter that requires a gradient")
+    size = stepper.layout.size
+    if dy0 is not None:
+        check_array("dy0", dy0)
+        if dy0.shape != (size, len(wrt)):
+            raise ValueError(f"`dy0` must have shape ({size}, {len(wrt)}), but has {tuple(dy0.shape)}")
+        if not bool(torch.isfinite(dy0).all()):
+            raise ValueError("`dy0` must be finite, but has a component that is not")
+    kept = stepper.layout.rigid if task.rigid else list(range(size))
+    for dy, out in tangent.iterate(stepper, task.y0, task.t, wanted, dy0, kept):
+        yield Solved(stepper, task.y0, out, None), dy
 
 
 def _recorded(stepper: ImplicitStepper, t: Tensor, y0: Tensor, gradient: Route) -> Trajectory:
@@ -206,16 +248,9 @@ def made_by(rig: Rig, method: str) -> dict[str, object]:
     return {"torchsoft": version("torchsoft"), "method": method, **rig.description()}
 
 
-def stats(out: Progress, wall: float) -> Stats:
-    """The counters of a run."""
-    return Stats(out.steps, out.solves, out.failed, out.refused, wall)
-
-
-def gather(
-    stepper: ImplicitStepper, t: Tensor, y: Tensor, out: Progress, stats: Stats, wrt: tuple[str, ...] = (),
-    dy: Tensor | None = None,
-) -> Trajectory:  # fmt: skip
+def gather(task: Task, y: Tensor, out: Progress, wall: float, dy: Tensor | None = None) -> Trajectory:
     """The trajectory of the rows that the stepper has finished; y (T, size) carries the gradient, if any is wanted."""
+    stepper, t = task.stepper, task.t
     rig, rows = stepper.rig, out.rows
     t, y, forces, extras = t[:rows], y[:rows], *(torch.from_numpy(x[:rows]) for x in (out.forces, out.extras))
     names = stepper.integrals
@@ -224,7 +259,7 @@ def gather(
     with torch.set_grad_enabled(y.requires_grad), independent():
         signals = rig.follow(t, stepper.reference)
         state = rig.unpack(y, signals)
-        moments = {name: adjoint.recorded(f"M_{name}", columns[name], y) for name in rig.pads}
+        moments = {name: recorded(f"M_{name}", columns[name], y) for name in rig.pads}
         measured = channels(rig, state, signals, moments)
     given = "step_s" if stepper.step is not None else "knots" if stepper.knots is not None else ""
     steps = {given: stepper.step} if given else {"rtol": stepper.rtol, "atol": stepper.atol}
@@ -240,7 +275,8 @@ def gather(
         displacement=displacement, energy=energy,
         dissipated={name: columns[name] for name in names.dissipated},
         supplied={name: columns[name] for name in names.supplied if name in names.active},
-        injected=columns["injected"], stats=stats, knots=torch.from_numpy(out.knots), layout=rig.layout,
-        made_by=made_by(rig, METHOD) | {"steps": steps}, wrt=wrt,
+        injected=columns["injected"],
+        stats=Stats(out.steps, out.solves, out.failed, out.refused, wall), knots=torch.from_numpy(out.knots), layout=rig.layout,
+        made_by=made_by(rig, METHOD) | {"steps": steps}, wrt=task.wrt,
         sensitivities=None if dy is None else dy[:rows],
     )  # fmt: skip

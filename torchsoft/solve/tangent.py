@@ -30,8 +30,8 @@ def directions(value: Tensor, wanted: Sequence[Tensor]) -> Array:
 
 def iterate(
     stepper: ImplicitStepper, y0: Tensor, t: Tensor, wanted: Sequence[Tensor], dy0: Tensor | None, columns: list[int]
-) -> Iterator[tuple[Tensor, Tensor, Progress]]:
-    """States (T, size) and their derivatives (T, components, n) by the scalar tensors `wanted`, as the run grows; `columns` are
+) -> Iterator[tuple[Tensor, Progress]]:
+    """Derivatives (T, components, n) of the states by the scalar tensors `wanted`, as the run grows; `columns` are
     the components of the state that are kept. dy0 (size, n) is the derivative of the initial state, zero by default."""
     n, size = len(wanted), stepper.layout.size
     dp = directions(stepper.compiled.p, wanted)
@@ -47,4 +47,4 @@ def iterate(
             work, room = scratch(s, size, n), tangents(s, size, n)
             forward(s, work, room, plan.h, tape, segment.signals, plan.out_step, plan.out_part, dy, dp, rows)
             kept[segment.rows] = rows[:, columns]
-        yield torch.from_numpy(out.y), torch.from_numpy(kept), out
+        yield torch.from_numpy(kept), out

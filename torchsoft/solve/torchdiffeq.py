@@ -10,6 +10,7 @@ A solver of the same name that torchdiffeq has of its own is left to everybody e
 import importlib
 import inspect
 from collections import deque
+from copy import copy
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -18,10 +19,11 @@ import torch
 from torch import Tensor
 
 from torchsoft.physics.rig import Rig
-from torchsoft.solve.adjoint import iterate, run_adjoint
+from torchsoft.solve.adjoint import Solved, attached, march, run_adjoint
 from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.progress import Segment
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
+from torchsoft.threads import cores, side_by_side
 
 REMEMBERED = 4
 """Runs of a model whose states are remembered: `odeint_adjoint` hands its solver only the later end of an interval."""
@@ -82,8 +84,15 @@ class TorchdiffeqSolver:
         if self.adjoint_params is not None:
             return self._augmented(t, self.adjoint_params)
         samples = self.y0.reshape(-1, self.y0.shape[-1])
-        runs = [deque(iterate(self.stepper, sample, t), maxlen=1)[0] for sample in samples]
-        solution, knots = torch.stack([y for y, _ in runs], 1), [out.knots for _, out in runs]
+        runs: list[Any] = [None] * len(samples)
+
+        def run(i: int) -> Solved:
+            return deque(march(copy(self.stepper), samples[i], t), maxlen=1)[0]
+
+        for i, solved in side_by_side(run, len(samples)):
+            runs[i] = solved
+        solution = torch.stack(attached(runs, cores()), 1)
+        knots = [solved.out.knots for solved in runs]
         _runs.setdefault(self.model, deque(maxlen=REMEMBERED)).append(
             _Run(t.detach().clone(), solution.detach(), knots)
         )

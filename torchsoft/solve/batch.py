@@ -1,0 +1,212 @@
+"""Many runs in one call, each with parameters, start, reference and times of its own, side by side in threads."""
+
+import time as clock
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from torchsoft.physics.motion import Reference
+from torchsoft.physics.rig import Rig
+from torchsoft.physics.validity import check_array
+from torchsoft.solve.adjoint import TAPE_BYTES, attached
+from torchsoft.solve.ledger import doubts
+from torchsoft.solve.progress import SimulationFailed
+from torchsoft.solve.simulate import Done, Route, prepare, run
+from torchsoft.solve.trajectory import Trajectory
+from torchsoft.threads import cores, side_by_side
+
+
+class SamplesFailed(UserWarning):
+    """Some runs of a batch could not be carried out."""
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The runs of a batch: their trajectories, None where a run failed, and why those failed, by number.
+
+    What is stacked has one row a run; rows of failed runs, and times behind a run's last one, are NaN. `mask` (runs, T) says
+    where there is something; take losses over it: NaN times zero is NaN, in gradients too.
+    """
+
+    trajectories: tuple[Trajectory | None, ...] = field(repr=False)
+    failures: dict[int, Exception]
+    lengths: tuple[int, ...]
+    wall_s: float
+
+    def __len__(self) -> int:
+        return len(self.trajectories)
+
+    def __getitem__(self, channel: str) -> Tensor:
+        """A channel (runs, T). Raises `KeyError` for one that a run has not."""
+        return self._stacked([None if run is None else run[channel] for run in self.trajectories])
+
+    def together(self, *channels: str) -> Tensor:
+        """Channels side by side (runs, T, channels)."""
+        return torch.stack([self[name] for name in channels], -1)
+
+    @property
+    def mask(self) -> Tensor:
+        """Where there is something (runs, T)."""
+        there = torch.tensor([0 if run is None else len(run.t) for run in self.trajectories])
+        return torch.arange(max(self.lengths)) < there[:, None]
+
+    @property
+    def t(self) -> Tensor:
+        """Times [s] (runs, T)."""
+        return self._stacked([None if run is None else run.t for run in self.trajectories])
+
+    @property
+    def y(self) -> Tensor:
+        """Flat states (runs, T, size). Raises `ValueError` where the rigs have states of different sizes."""
+        return self._stacked([None if run is None else run.y for run in self.trajectories])
+
+    @property
+    def sensitivities(self) -> Tensor:
+        """Derivatives (runs, T, components, n) of gradient="forward"."""
+        if not all(run is None or run.wrt for run in self.trajectories):
+            raise ValueError("the batch was run without sensitivities; ask for them with gradient='forward' and `wrt`")
+        return self._stacked([None if run is None else run.sensitivities for run in self.trajectories])
+
+    def _stacked(self, parts: Sequence[Tensor | None]) -> Tensor:
+        shapes = {part.shape[1:] for part in parts if part is not None}
+        if len(shapes) > 1:
+            raise ValueError(f"the runs' rows have different shapes, {' and '.join(str(tuple(s)) for s in shapes)}")
+        nothing = torch.full((max(self.lengths), *next(iter(shapes), ())), torch.nan, dtype=torch.float64)
+        rows = [nothing if part is None else torch.cat((part, nothing[len(part) :])) for part in parts]
+        return torch.stack(rows)
+
+
+def simulate_batch(
+    rig: Rig | Sequence[Rig], t: Tensor | Sequence[Tensor], *, parameters: Mapping[str, Tensor] | None = None,
+    y0: Tensor | Sequence[Tensor] | None = None, reference: Reference | Sequence[Reference] | None = None,
+    knots: Sequence[Tensor] | None = None, dy0: Tensor | Sequence[Tensor] | None = None, threads: int | None = None,
+    progress: bool = False, **options: Any,
+) -> Batch:  # fmt: skip
+    """`simulate` for many runs at once, in `threads` threads, one a core by default.
+
+    What differs from run to run has one entry for each: `parameters` by name (runs, ...), y0 (runs, size), dy0 (runs, size, n),
+    `reference`, t, `knots`, and even the rig; what they share is given once: one rig, t (T,), y0 (size,), one reference.
+    Results do not depend on the number of threads. `options` are those of `simulate`, the same for every run. With
+    gradient="discrete" what is computed from the batch has a gradient by `parameters`, y0 and whatever else went in; the
+    backward sweeps run in threads too.
+
+    A run that fails, or that cannot begin with its own parameters, is reported in `failures` and by a warning
+    (`SamplesFailed`), and leaves the others alone.
+
+    Raises `ValueError` for counts that do not agree and for options that no run could have. Ctrl-C ends the batch when the
+    runs on their way have ended.
+    """
+    rigs, ts, y0s, references, every_knots, dy0s, count = _spread(rig, t, parameters, y0, reference, knots, dy0)
+    gradient: Route = options.get("gradient", "none")
+    if gradient not in ("none", "discrete", "forward"):
+        raise ValueError(f"a batch takes gradient='none', 'discrete' or 'forward', not {gradient!r}")
+    began, threads = clock.perf_counter(), min(count, cores() if threads is None else threads)
+    budget = TAPE_BYTES / count
+
+    def work(i: int) -> Done | Exception:
+        try:
+            task = prepare(
+                _own(rigs[i], parameters or {}, i), ts[i], y0=y0s[i], reference=references[i], knots=every_knots[i],
+                dy0=dy0s[i], **options,
+            )  # fmt: skip
+            return run(task, budget)
+        except (SimulationFailed, ValueError, np.linalg.LinAlgError) as failure:
+            return failure
+
+    results: list[Done | Exception] = [ValueError("not run")] * count
+    with tqdm(total=count, unit="run", disable=not progress) as bar:
+        for i, result in side_by_side(work, count, threads):
+            results[i] = result
+            bar.update()
+    done = {i: result for i, result in enumerate(results) if isinstance(result, Done)}
+    failures = {i: result for i, result in enumerate(results) if isinstance(result, Exception)}
+    if failures:
+        first = min(failures)
+        if not done and all(
+            isinstance(one, ValueError) and str(one) == str(failures[first]) for one in failures.values()
+        ):
+            raise failures[first]  # nothing of a single run
+        message = f"{len(failures)} of {count} runs failed; run {first}: {failures[first]}"
+        warnings.warn(message, SamplesFailed, stacklevel=2)
+    states = dict(zip(done, attached([one.solved for one in done.values()], threads)))
+    numbers = list(done)
+    trajectories: list[Trajectory | None] = [None] * count
+    for k, trajectory in side_by_side(lambda k: done[numbers[k]].trajectory(states[numbers[k]]), len(numbers), threads):
+        trajectories[numbers[k]] = trajectory
+    _doubt(rigs, trajectories)
+    return Batch(tuple(trajectories), failures, tuple(len(one) for one in ts), clock.perf_counter() - began)
+
+
+def _doubt(rigs: Sequence[Rig], trajectories: Sequence[Trajectory | None]) -> None:
+    """Warn of what is doubtful in any run, once."""
+    for i, trajectory in enumerate(trajectories):
+        for doubt in doubts(trajectory, rigs[i]) if trajectory is not None else ():
+            warnings.warn(f"run {i}: {doubt}", stacklevel=3)
+            return
+
+
+def _spread(
+    rig: Any, t: Any, parameters: Mapping[str, Tensor] | None, y0: Any, reference: Any, knots: Any, dy0: Any
+) -> tuple[Any, Any, Any, Any, Any, Any, int]:
+    """Every argument as one entry a run, and the number of runs."""
+    if parameters is not None and not isinstance(parameters, Mapping):
+        raise ValueError(f"`parameters` must give tensors by name, but is {type(parameters).__name__}")
+    for name, values in (parameters or {}).items():
+        check_array(f"parameters[{name!r}]", values)
+        if values.ndim == 0:
+            raise ValueError(f"`parameters[{name!r}]` must have one entry a run, but is a single number")
+    shared = {  # a single rig is a module, single times a vector, a single start too, a single reference a module
+        "rig": (rig, isinstance(rig, nn.Module)),
+        "t": (t, isinstance(t, Tensor) and t.ndim == 1),
+        "y0": (y0, y0 is None or (isinstance(y0, Tensor) and y0.ndim == 1)),
+        "reference": (reference, reference is None or isinstance(reference, nn.Module)),
+        "knots": (knots, knots is None),
+        "dy0": (dy0, dy0 is None or (isinstance(dy0, Tensor) and dy0.ndim == 2)),
+    }
+    counts = {name: len(given) for name, (given, single) in shared.items() if not single}
+    counts |= {name: len(values) for name, values in (parameters or {}).items()}
+    if not counts:
+        raise ValueError(
+            "nothing differs from run to run: give `parameters`, y0, t, references or rigs, one entry a run"
+        )
+    if len(set(counts.values())) > 1 or 0 in counts.values():
+        listed = ", ".join(f"{name} {number}" for name, number in counts.items())
+        raise ValueError(f"every argument must have one entry a run, and one run at least, but there are: {listed}")
+    count = next(iter(counts.values()))
+    entries = [[given] * count if single else list(given) for given, single in shared.values()]
+    rigs, ts, y0s, references, every_knots, dy0s = entries
+    return rigs, ts, y0s, references, every_knots, dy0s, count
+
+
+def _own(rig: Rig, parameters: Mapping[str, Tensor], i: int) -> Rig:
+    """The rig with row i of the parameters in place of its own; everything else is shared."""
+    if not parameters:
+        return rig
+    values: dict[int, Tensor] = {}
+    for name, rows in parameters.items():
+        old = rig.parameter(name)
+        if rows[i].shape != old.shape:
+            raise ValueError(
+                f"`{name}` has shape {tuple(old.shape)}, but is given rows of shape {tuple(rows[i].shape)}"
+            )
+        values[id(old)] = rows[i].double()
+    return _replaced(rig, values, {})  # pyright: ignore[reportReturnType]
+
+
+def _replaced(module: nn.Module, values: Mapping[int, Tensor], known: dict[int, nn.Module]) -> nn.Module:
+    """The same modules with other tensors in the place of some parameters."""
+    if id(module) not in known:
+        out = known[id(module)] = module.__class__.__new__(module.__class__)
+        out.__dict__ = dict(module.__dict__)
+        own: dict[str, Any] = {k: values.get(id(p), p) for k, p in module._parameters.items()}
+        out.__dict__ |= {"_parameters": own, "_buffers": dict(module._buffers)}
+        out.__dict__["_modules"] = {
+            k: m if m is None else _replaced(m, values, known) for k, m in module._modules.items()
+        }
+    return known[id(module)]
