@@ -24,7 +24,7 @@ from torchsoft.datasets import layout, simulation
 from torchsoft.datasets.check import check
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.design import points, split, task
-from torchsoft.datasets.generate import Serial, generate, local_processes, main
+from torchsoft.datasets.generate import Serial, generate, local_processes, local_workers, main
 from torchsoft.datasets.manifest import Manifest, digest, record, record_key
 from torchsoft.datasets.reader import Trajectories, open_dataset
 from torchsoft.datasets.simulation import simulate_task
@@ -125,9 +125,12 @@ def test_a_sobol_design_is_a_prefix_of_a_longer_one(tmp_path: Path) -> None:
     np.testing.assert_array_equal(points(short), points(long)[:5])
 
 
-def test_processes_make_the_same_bytes_behind_a_url(made: tuple[Path, Config], tmp_path: Path) -> None:
+@pytest.mark.parametrize("workers", [local_workers, local_processes])
+def test_threads_and_processes_make_the_same_bytes_behind_a_url(
+    made: tuple[Path, Config], tmp_path: Path, workers: Callable[[int], Any]
+) -> None:
     folder, config = made
-    with local_processes(2) as executor:
+    with workers(2) as executor:
         assert generate(config, (tmp_path / "set").as_uri(), executor, 2, progress=False) == 0
     assert files(tmp_path / "set") == files(folder)
 

@@ -62,6 +62,11 @@ def step_seconds(p: Parameters, differentiated: bool = False) -> float:
     return (50e-6 + 90e-6 * ((elements + 1) / 121) ** 2 + points) * (2.5 if differentiated else 1.0)
 
 
+def chosen_steps(seconds: float, rtol: float) -> float:
+    """Steps of a lively motion of so many seconds that tolerances choose; a gentle one takes a tenth of them."""
+    return 1500.0 * seconds * (1e-4 / rtol) ** (1 / 3)
+
+
 def row_memory(p: Parameters) -> float:
     """Memory [GiB] of one row of a run: states, forces, displacements and energies."""
     nodes = (p.pad.elements_x + 1) * (p.pad.elements_y if p.pad.fidelity == "inertial" else 1)

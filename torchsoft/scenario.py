@@ -1,6 +1,7 @@
 """The paper's manipulation: rest, grasp, roll out, hold, roll back, rest."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -23,16 +24,17 @@ class Manipulation:
     grasp_force: float
 
 
-def grasp_and_roll(model: SoftGrasp, *, step: float = 2e-3, grasp_force: float | None = None) -> Manipulation:
+def grasp_and_roll(model: SoftGrasp, *, grasp_force: float | None = None, **steps: Any) -> Manipulation:
     """Give `model` the paper's reference, and find the grasping force that holds the bracket at y_Br(t_g).
 
     The force is fed forward along the grasp's own 7th-order profile and constant from t_g on. Friction locked in
     during the grasp stiffens the pads, so a static estimate is too low: the grasp itself is simulated, by the secant
-    method, until the vertical loop holds the bracket within 1 um. Pass `grasp_force` [N] to skip that.
+    method, until the vertical loop holds the bracket within 1 um. Pass `grasp_force` [N] to skip that; `steps` say how
+    `simulate` chooses its steps.
     """
     y0 = rest(model).detach()
     if grasp_force is None:
-        grasp_force = find_grasp_force(model, y0, step)
+        grasp_force = find_grasp_force(model, y0, **steps)
     model.reference = reference(model, y0, grasp_force)
     return Manipulation(model, y0, grasp_force)
 
@@ -52,16 +54,16 @@ def reference(model: SoftGrasp, y0: Tensor, grasp_force: float) -> Reference:
     )
 
 
-def find_grasp_force(model: SoftGrasp, y0: Tensor, step: float, tolerance: float = 1e-6) -> float:
+def find_grasp_force(model: SoftGrasp, y0: Tensor, tolerance: float = 1e-6, **steps: Any) -> float:
     """Grasping force [N] that leaves the vertical loop nothing to do once the grasp has settled.
 
-    `tolerance` [m] is on the bracket's height.
+    `tolerance` [m] is on the bracket's height; `steps` say how `simulate` chooses its steps.
     """
     p = model.settings.scenario
     t = torch.tensor([0.0, p.grasp_time, p.grasp_time + SETTLE], dtype=torch.float64)
 
     def height_error(force: float) -> float:
-        run = simulate(model, t, y0=y0, reference=reference(model, y0, force), step=step)
+        run = simulate(model, t, y0=y0, reference=reference(model, y0, force), **steps)
         return float(run["y_Br"][-1]) - p.y_Br_grasp
 
     force, error = 0.0, height_error(0.0)

@@ -4,9 +4,11 @@ What is not compiled does hold one; a run of a second has some twenty millisecon
 """
 
 import os
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from typing import TypeVar
+from contextlib import contextmanager
+from typing import Any, TypeVar
 
 import torch
 from threadpoolctl import threadpool_limits
@@ -17,6 +19,37 @@ T = TypeVar("T")
 def cores() -> int:
     """Cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+_single: list[Any] = []
+_entering = threading.Lock()
+
+
+@contextmanager
+def single_threaded() -> Iterator[None]:
+    """torch and the linear algebra libraries on one thread each, until everybody who asked for it is done.
+
+    Sums taken by more threads round differently, and contacts that stick amplify it.
+    """
+    threads = torch.get_num_threads()
+    with _entering:
+        _single.append(threadpool_limits(1) if not _single else None)
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+        with _entering:
+            if len(_single) == 1:
+                _single[0].restore_original_limits()
+                _single.clear()
+            else:
+                _single.pop()
+
+
+def executor(threads: int) -> ThreadPoolExecutor:
+    """A pool of threads that compute on one core each."""
+    return ThreadPoolExecutor(threads, "torchsoft", torch.set_num_threads, (1,))
 
 
 def side_by_side(work: Callable[[int], T], count: int, threads: int | None = None) -> Iterator[tuple[int, T]]:
@@ -32,12 +65,12 @@ def side_by_side(work: Callable[[int], T], count: int, threads: int | None = Non
         return
     mode = torch.is_grad_enabled()
 
-    def begin() -> None:
-        torch.set_num_threads(1)
-        torch.set_grad_enabled(mode)
+    def one(i: int) -> T:
+        with torch.set_grad_enabled(mode):
+            return work(i)
 
-    with threadpool_limits(1, "blas"), ThreadPoolExecutor(threads, "torchsoft", begin) as pool:
-        futures = {pool.submit(work, i): i for i in range(count)}
+    with single_threaded(), executor(threads) as pool:
+        futures = {pool.submit(one, i): i for i in range(count)}
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 
 from torchsoft.excitation import MOST
 from torchsoft.parameters import Parameters, check
+from torchsoft.solve.simulate import RTOL
 from torchsoft.tables import LISTED, SEED, Table, from_toml, line
 
 RATIO = "contact.mu_k/contact.mu_s"
@@ -179,7 +180,8 @@ class Config(Table):
     method: Literal["sobol", "latin_hypercube"] = "sobol"
     duration: float = Field(ge=1e-3, le=1e4)  # of every trajectory [s]
     sample_interval: float = Field(5e-3, ge=1e-6, le=1.0)  # between samples [s]
-    step: float = Field(1e-3, ge=1e-6, le=STEP)  # largest step of the stepper [s]
+    rtol: float | None = Field(None, ge=1e-9, le=1e-2)  # relative tolerance of the stepper, `RTOL` by default
+    step: float | None = Field(None, ge=1e-6, le=STEP)  # equal steps no longer than this [s] instead
     settle: float = Field(0.125, ge=0, le=1e4)  # time between the end of the grasp and the start of the motion [s]
     feed_forward: Literal["pressed", "found"] = "pressed"
     """grasping force of the frictionless statics, or found by simulating the grasp until the bracket holds its height"""
@@ -263,7 +265,11 @@ class Config(Table):
             raise ValueError(
                 f"duration = {self.duration} s is not a whole number of sample_interval = {self.sample_interval} s"
             )
-        if self.step > self.sample_interval:
+        if self.step is not None and self.rtol is not None:
+            raise ValueError(
+                f"rtol = {self.rtol:g} and step = {self.step:g} s each say which steps to take; give one of them"
+            )
+        if self.step is not None and self.step > self.sample_interval:
             raise ValueError(f"step = {self.step} s exceeds sample_interval = {self.sample_interval} s")
         grasp = self.ends("scenario.grasp_time")[1]
         begin = grasp + self.settle
@@ -305,6 +311,13 @@ class Config(Table):
                     values = "".join(f"parameters.{name} = {x:g}, " for name, x in ends.items())
                     raise ValueError(f"{values}{where} = {depth:g} is impossible: {error}") from None
         return self
+
+    @property
+    def steps(self) -> dict[str, float]:
+        """How `simulate` is to choose its steps."""
+        if self.step is not None:
+            return {"step": self.step}
+        return {"rtol": RTOL if self.rtol is None else self.rtol}
 
     @classmethod
     def from_toml(cls, path: str | Path) -> "Config":

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from torchsoft.cost import RUN, Cost, row_memory, step_seconds
+from torchsoft.cost import RUN, Cost, chosen_steps, row_memory, step_seconds
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.schema import sizes, variables
 from torchsoft.scenario import SETTLE
@@ -14,11 +14,15 @@ FOUND = 6
 
 
 def cost(config: Config, workers: int) -> Cost:
-    """Of the whole dataset, made by that many processes."""
+    """Of the whole dataset, made by that many workers."""
     p = config.physics({}, config.grasp_depth.low)
-    steps = (config.samples - 1) * math.ceil(config.sample_interval / config.step)
+    seconds = config.duration
     if config.feed_forward == "found":
-        steps += FOUND * (p.scenario.grasp_time + SETTLE) / config.step
+        seconds += FOUND * (p.scenario.grasp_time + SETTLE)
+    if config.step is not None:
+        steps = seconds / config.sample_interval * math.ceil(config.sample_interval / config.step)
+    else:  # an output between two steps takes half the time of a step
+        steps = chosen_steps(seconds, config.steps["rtol"]) + 0.5 * config.samples
     length = sizes(config)
     kept = 0.0  # of one trajectory [GiB]
     for variable in variables(config).values():

@@ -14,10 +14,9 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import torch
-from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
+from torchsoft import threads
 from torchsoft.cost import agree
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.cost import cost
@@ -27,17 +26,21 @@ from torchsoft.datasets.storage import StoreError
 from torchsoft.datasets.store import Store, open_or_create
 from torchsoft.processes import local_processes
 from torchsoft.tables import line
+from torchsoft.threads import single_threaded
 
 CLUSTER = 16
 """Workers that a cluster is taken to have."""
 
 MOST = 1000
-"""Local processes."""
+"""Local workers."""
+
+THREADS = 3
+"""Threads of one process at the most: a third of a trajectory's time is not compiled, and holds the interpreter's lock."""
 
 COARSE = 5e-3
 """Steps longer than this [s] get a note."""
 
-HELP = "take fewer trajectories, a larger step or a shorter duration"
+HELP = "take fewer trajectories, a looser rtol or a shorter duration"
 
 
 class Serial(Executor):
@@ -54,14 +57,10 @@ class Serial(Executor):
 
 def run_shard(config_json: str, url: str, shard: int, design: Any) -> tuple[int, int]:
     """Simulate and write one shard; how many trajectories it holds and how many of them failed."""
-    config, threads = Config.model_validate_json(config_json), torch.get_num_threads()
+    config = Config.model_validate_json(config_json)
     store = Store(url, config)
-    torch.set_num_threads(1)
-    try:
-        with threadpool_limits(1):  # sums taken by more threads round differently, and sticking contacts amplify it
-            rows = [simulate_task(config, task(config, i, u)) for i, u in zip(store.rows(shard), design, strict=True)]
-    finally:
-        torch.set_num_threads(threads)
+    with single_threaded():
+        rows = [simulate_task(config, task(config, i, u)) for i, u in zip(store.rows(shard), design, strict=True)]
     store.write(shard, rows)
     return len(rows), sum(int(row["failed"]) for row in rows)
 
@@ -99,6 +98,13 @@ def generate(config: Config, url: str, executor: Executor, workers: int = 1, pro
 
 
 @contextmanager
+def local_workers(workers: int) -> Iterator[Executor]:
+    """So many threads of this process, which begin at once; processes where there are too many for one."""
+    with local_processes(workers) if workers > THREADS else threads.executor(workers) as executor:
+        yield executor
+
+
+@contextmanager
 def dask_cluster(address: str) -> Iterator[Executor]:
     """An existing Dask cluster behind the same interface; shards of a lost worker are made by the others."""
     try:
@@ -113,7 +119,9 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m data_gen.generate", description=__doc__)
     parser.add_argument("config", type=Path, help="TOML file, see data_gen/configs")
     parser.add_argument("--out", required=True, help="folder or fsspec URL of the store")
-    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="local processes; 0 stays in this one")
+    parser.add_argument(
+        "--workers", type=int, default=os.cpu_count() or 1, help="threads, or processes if more than a few"
+    )
     parser.add_argument("--scheduler", help="address of a Dask scheduler, such as tcp://host:8786")
     parser.add_argument("--yes", action="store_true", help="begin even what takes hours, or much memory or disk")
     given = parser.parse_args(arguments)
@@ -122,7 +130,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         config = Config.from_toml(given.config)
         agree(cost(config, CLUSTER if given.scheduler else given.workers), given.yes, HELP)
-        if config.step > COARSE:
+        if config.step is not None and config.step > COARSE:
             print(
                 f"note: step = {config.step:g} s is coarse: the energy balance may be off by percents", file=sys.stderr
             )
@@ -132,7 +140,7 @@ def main(arguments: list[str] | None = None) -> int:
         elif given.workers <= 0:
             failed = generate(config, given.out, Serial())
         else:
-            with local_processes(given.workers) as executor:
+            with local_workers(given.workers) as executor:
                 failed = generate(config, given.out, executor, given.workers)
     except (ValueError, StoreError) as error:
         print(f"error: {line(error, 2000)}", file=sys.stderr)

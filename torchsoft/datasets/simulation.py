@@ -35,13 +35,13 @@ def simulate_task(config: Config, task: Task) -> Row:
         model = SoftGrasp(task.parameters)
         y0 = start(model)
         if config.feed_forward == "found":
-            force = find_grasp_force(model, y0, config.step)
+            force = find_grasp_force(model, y0, **config.steps)
         else:
             force = holding_force(model, press(model, task.parameters.scenario.y_Br_grasp))
         force = round(force, FORCE)
         y_Br = float(model.unpack(y0).pose["bracket"][1])
         motion = reference(excitation(config, task), model, y_Br, force)
-        run = simulate(model, t, y0=y0, reference=motion, step=config.step)
+        run = simulate(model, t, y0=y0, reference=motion, **config.steps)
     except SimulationFailed as failure:
         stats = failure.trajectory.stats if failure.trajectory is not None else None
         done = {"steps": stats.steps, "newton_iterations": stats.newton_iterations} if stats else {}
