@@ -48,7 +48,7 @@ def manipulation() -> tuple[SoftGrasp, Trajectory]:
     made = grasp_and_roll(SoftGrasp(), grasp_force=REFERENCE["manipulation"]["grasp_force"])
     t = torch.linspace(0, 30, 3001, dtype=torch.float64)
     y0 = held_displacements(made.model, made.y0)
-    return made.model, simulate(made.model, t, y0=y0, gradient="discrete")
+    return made.model, simulate(made.model, t, y0=y0, step=2e-3, gradient="discrete")
 
 
 def test_the_manipulation_is_the_reference(manipulation: tuple[SoftGrasp, Trajectory]) -> None:

@@ -37,7 +37,7 @@ T = times(0.02, 11)
 
 def rolled(model: SoftGrasp, **options: object):
     """A short run from the grasp, the disc moving."""
-    return simulate(model, T, y0=grasped(model, (0.05, 0.0)), **options)  # pyright: ignore[reportArgumentType]
+    return simulate(model, T, y0=grasped(model, (0.05, 0.0)), step=2e-3, **options)  # pyright: ignore[reportArgumentType]
 
 
 # what runs is what is saved -----------------------------------------------------------------------------------------
@@ -152,7 +152,7 @@ class Simulated(nn.Module):
         self.model, self.options = model, options
 
     def forward(self, y0: Tensor) -> Tensor:
-        return simulate(self.model, T, y0=y0, gradient="discrete", **self.options)["theta"][-1]  # pyright: ignore
+        return simulate(self.model, T, y0=y0, step=2e-3, gradient="discrete", **self.options)["theta"][-1]  # pyright: ignore
 
 
 def test_gradients_reach_the_tensors_of_a_functional_call() -> None:
@@ -228,7 +228,8 @@ def test_a_knot_with_a_graph_receives_its_gradient() -> None:
     d = f64(1e-3)[0].requires_grad_()
     travel = Profile([0.0, 0.02], [0.06, 0.06 + d])
     reference = Reference(x_d=travel, y_d=model.reference["y_d"], F_ff=model.reference["F_ff"])
-    theta = lambda r: simulate(model, T, y0=y0, reference=r, gradient="discrete", tolerance=1e-10)["theta"][-1]
+    run = lambda r: simulate(model, T, y0=y0, reference=r, step=2e-3, gradient="discrete", tolerance=1e-10)
+    theta = lambda r: run(r)["theta"][-1]
     (slope,) = torch.autograd.grad(theta(reference), d)
     ends = []
     for h in (1e-7, -1e-7):
@@ -404,9 +405,10 @@ def test_routes_agree_on_the_run() -> None:
     y0, t = grasped(model, (0.01, 0.0)), times(4e-3, 3)
     with torch.no_grad():
         runs = [
-            simulate(model, t, y0=y0, gradient=route, tolerance=1e-10) for route in ("none", "discrete", "unrolled")
+            simulate(model, t, y0=y0, step=2e-3, gradient=route, tolerance=1e-10)
+            for route in ("none", "discrete", "unrolled")
         ]
-    forward = simulate(model, t, y0=y0, gradient="forward", wrt=["pad.E"], tolerance=1e-10)
+    forward = simulate(model, t, y0=y0, step=2e-3, gradient="forward", wrt=["pad.E"], tolerance=1e-10)
     assert torch.equal(runs[0].y, runs[1].y)
     assert torch.equal(runs[0].y, forward.y)
     assert float((runs[0].y - runs[2].y).abs().max()) < 1e-8  # [N]
@@ -535,7 +537,7 @@ def test_a_law_that_turns_nan_never_converges() -> None:
     y0, x_d = grasped(model), Profile([0.0, 0.2], [0.06, 0.09])
     pushed = Reference(x_d=x_d, y_d=model.reference["y_d"], F_ff=model.reference["F_ff"])
     with pytest.raises(SimulationFailed, match=r"at t = .* s Newton's iteration did not converge") as caught:
-        simulate(model, times(0.2, 21), y0=y0, reference=pushed)
+        simulate(model, times(0.2, 21), y0=y0, reference=pushed, step=2e-3)
     assert bool(torch.isfinite(caught.value.trajectory.y).all())
 
 

@@ -28,8 +28,8 @@ def test_torchdiffeq_runs_the_stepper() -> None:
     y0[1, model.layout.slices["velocity", "disc"]] = f64(1e-3, 0.0, 0.0)
     solution = odeint(model, y0, t, method=METHOD, options={"step_size": 2e-3})
     assert solution.shape == (6, 2, model.layout.size)
-    assert torch.equal(solution[:, 0].detach(), simulate(model, t, y0=y0[0]).y)
-    assert torch.equal(solution[:, 1].detach(), simulate(model, t, y0=y0[1]).y)
+    assert torch.equal(solution[:, 0].detach(), simulate(model, t, y0=y0[0], step=2e-3).y)
+    assert torch.equal(solution[:, 1].detach(), simulate(model, t, y0=y0[1], step=2e-3).y)
 
 
 @pytest.mark.parametrize("method", ["rk4", "dopri5"])
@@ -94,7 +94,7 @@ def test_a_solver_of_torchdiffeqs_own_is_left_to_other_functions(solver_of_their
     model = coarse()
     y0, t = grasped(model, (0.01, 0.0)), times(0.01, 3)
     got = odeint(model, y0, t, method=METHOD, options={"step_size": 2e-3})
-    assert torch.equal(got.detach(), simulate(model, t, y0=y0).y)
+    assert torch.equal(got.detach(), simulate(model, t, y0=y0, step=2e-3).y)
 
 
 def rolling() -> tuple[SoftGrasp, torch.Tensor]:

@@ -11,7 +11,6 @@ from pydantic import Field, model_validator
 
 from torchsoft.excitation import MOST
 from torchsoft.parameters import Parameters, check
-from torchsoft.solve.simulate import RTOL
 from torchsoft.tables import LISTED, SEED, Table, from_toml, line
 
 RATIO = "contact.mu_k/contact.mu_s"
@@ -27,6 +26,9 @@ MOTION = 0.4
 """Shortest time [s] of a motion."""
 
 DEFAULTS = {name: row["value"] for name, row in Parameters().table().items()}
+
+RTOL = 1e-4
+"""Relative tolerance of the stepper where neither it nor a step is given: data are not differentiated."""
 
 STEP = 0.02
 """Largest step [s] of the stepper: twice the pads' own time, and the energy balance is off by percents."""

@@ -32,8 +32,11 @@ Route = Literal["none", "discrete", "forward", "unrolled", "continuous"]
 """Ways to a derivative: none; the exact adjoint of the run; sensitivities along `wrt`; plain torch steps; torchdiffeq's own."""
 
 
-STEP, RTOL = 2e-3, 1e-4
-"""Step [s] that is taken where nothing else is asked for, and the relative tolerance beside an absolute one."""
+RTOL = 1e-5
+"""Relative tolerance where nothing else is asked for."""
+
+STEP = 2e-3
+"""Step [s] of the routes in plain torch where no other is given."""
 
 
 class Interrupted(KeyboardInterrupt):
@@ -53,11 +56,12 @@ def simulate(
 
     y0 defaults to the paper's rig at rest. `reference` is what the rig follows, its own by default.
 
-    Steps: by default equal ones between the times t, no longer than `step` [s] (`STEP`). With `rtol` or `atol` they are chosen
-    so that the error of each stays below rtol times the largest value so far plus atol, which counts nodal forces in N,
-    lengths in mm, angles in rad; either alone brings the other, a tenth of rtol being atol. A motion is right long before its
-    derivative is: 1e-4 holds what a step of 2 ms does, gradients take 3e-5 to 1e-5. `knots` are the steps of another run
-    (its `knots`), frozen: what a fit needs, whose residuals are then smooth in the parameters. `tolerance` [N] is Newton's.
+    Steps are chosen so that the error of each stays below rtol times the largest value so far plus atol, which counts nodal
+    forces in N, lengths in mm, angles in rad; either alone brings the other, a tenth of rtol being atol. A motion is right
+    long before its derivative is: rtol = 1e-3 holds positions to 1e-4 of their range and forces to 1 %; the default, `RTOL`, ten
+    times that and most derivatives to 1 %. With `step` [s] they are equal ones between
+    the times t instead, no longer than it. `knots` are the steps of another run (its `knots`), frozen: what a fit needs, whose
+    residuals are then smooth in the parameters. `tolerance` [N] is Newton's.
 
     gradient: with "discrete" the states and channels of the result carry the exact gradient of the discrete run (of the steps
     that were taken, which are not differentiated) by y0, every parameter and the reference; recorded nodal forces and energies
@@ -105,10 +109,10 @@ def prepare(
     given = [f"`{name}`" for name, value in ways.items() if value is not None]
     if len(given) > 1:
         raise ValueError(f"{' and '.join(given)} each say which steps to take; give one of them")
-    if not given:
-        step = STEP
-    if gradient in ("unrolled", "continuous") and step is None:
-        raise ValueError(f"gradient='{gradient}' takes equal steps of `step` [s] only")
+    if gradient in ("unrolled", "continuous"):
+        if given and step is None:
+            raise ValueError(f"gradient='{gradient}' takes equal steps of `step` [s] only")
+        step = STEP if step is None else step
     if rtol is None:
         rtol = RTOL if atol is None else 10 * atol
     stepper = ImplicitStepper(
