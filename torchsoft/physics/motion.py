@@ -173,6 +173,18 @@ class Reference(nn.Module):
                 )
         return torch.stack(given, -1)
 
+    def plain(self, names: Sequence[str]) -> list[Piecewise] | None:
+        """These signals, if all of them are polynomials of this package's and nothing else decides their values; else None."""
+        chosen = [self[name] for name in names]
+        if type(self).forward is not Reference.forward or self._forward_hooks or self._forward_pre_hooks:
+            return None
+        for one in chosen:
+            if not isinstance(one, Piecewise) or not type(one).__module__.startswith("torchsoft."):
+                return None
+            if one._forward_hooks or one._forward_pre_hooks:
+                return None
+        return chosen  # pyright: ignore[reportReturnType]
+
     def __getitem__(self, name: str) -> nn.Module:
         return self.signals[name.replace(".", ":")]
 

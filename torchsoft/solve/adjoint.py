@@ -79,14 +79,14 @@ class _Solutions(torch.autograd.Function):
         if torch.is_grad_enabled():  # a graph of it would lack how the cotangents depend on what ran
             raise GradientFailed("a run has no second derivative; ask for its gradient without create_graph")
         bars: list[Tensor | None] = [None] * (3 * len(y_bars))
-        asked = [i for i, y_bar in enumerate(y_bars) if y_bar is not None]
+        asked = [(i, y_bar) for i, y_bar in enumerate(y_bars) if y_bar is not None]
 
         def sweep(k: int) -> tuple[Tensor, Tensor, Tensor]:
-            run, y_bar = ctx.runs[asked[k]], y_bars[asked[k]]
-            return run_adjoint(run.stepper, run.segments, y_bar)
+            i, y_bar = asked[k]
+            return run_adjoint(ctx.runs[i].stepper, ctx.runs[i].segments, y_bar)
 
         for k, result in side_by_side(sweep, len(asked), ctx.threads):
-            bars[3 * asked[k] : 3 * asked[k] + 3] = result
+            bars[3 * asked[k][0] : 3 * asked[k][0] + 3] = result
         return None, None, *bars
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.physics.motion import Piecewise, Reference
+from torchsoft.physics.motion import Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.kernel.arrays import NO_SIGNALS, Array, Errors, Signals
@@ -65,14 +65,9 @@ class Followed:
 
     def __init__(self, signals: Callable[[Tensor], Tensor], rig: Rig, reference: Reference) -> None:
         self.error: BaseException | None = None
-        plain = type(reference).forward is Reference.forward and not reference._forward_hooks
-        chosen: list[Any] = [reference[name] for name in rig.signals] if plain else []
-        plain = plain and all(
-            isinstance(one, Piecewise) and type(one).forward is Piecewise.forward and not one._forward_hooks
-            for one in chosen
-        )
+        chosen = reference.plain(rig.signals)
         self._callback: Any = None
-        if not plain:
+        if chosen is None:
             self.arrays = NO_SIGNALS._replace(address=self._call(signals), room=np.zeros(1))
             self.stops = np.zeros(0)
             return
