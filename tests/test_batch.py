@@ -66,7 +66,7 @@ def test_gradients_reach_what_differs_from_run_to_run(start: tuple[SoftGrasp, Te
         model, T, parameters={"contact.K_n": rows, "contact.mu_s": mu_s}, y0=starts, rtol=1e-4, gradient="discrete"
     )
     got = torch.autograd.grad((weights * batch["theta"]).sum(), [rows, starts, E])
-    by_E = 0.0
+    by_E = torch.zeros((), dtype=torch.float64)
     for i in range(3):
         one = y0[i].clone().requires_grad_()
         run = alone(model, i, one, gradient="discrete")
