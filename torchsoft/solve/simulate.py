@@ -32,6 +32,8 @@ Route = Literal["none", "discrete", "forward", "unrolled", "continuous"]
 """Ways to a derivative: none; the exact adjoint of the run; sensitivities along `wrt`; plain torch steps; torchdiffeq's own."""
 
 
+VERSION = version("torchsoft")
+
 RTOL = 1e-5
 """Relative tolerance where nothing else is asked for."""
 
@@ -249,7 +251,7 @@ def diagnose(rig: Rig, failure: SimulationFailed, trajectory: Trajectory) -> Sim
 
 def made_by(rig: Rig, method: str) -> dict[str, object]:
     """Version, method, and the numbers and laws that ran."""
-    return {"torchsoft": version("torchsoft"), "method": method, **rig.description()}
+    return {"torchsoft": VERSION, "method": method, **rig.description()}
 
 
 def gather(task: Task, y: Tensor, out: Progress, wall: float, dy: Tensor | None = None) -> Trajectory:
