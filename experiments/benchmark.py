@@ -1,252 +1,269 @@
-"""Question: what do a run, its gradient and its Jacobian cost, how do they grow, and against what?
+"""Question: what do a run, its gradient, its Jacobian and batches cost, how do they grow, and against what?
 
-All in one process and one run, medians of repeated timings, so that the ratios hold on a noisy machine:
+All in one process and one run, medians of repeated timings in turns, so that the ratios hold on a noisy machine:
 
-- the 30 s manipulation: stepping, discrete adjoint of all parameters, Jacobian for 8 parameters, peak memory of each;
-- 1, 8 and 64 trajectories on one and on two cores (processes, as the dataset generator will do it);
-- growth with the surface nodes (61 to 481) and with the simulated time;
-- the same right-hand side under scipy's LSODA, BDF and Radau (with a Jacobian from one batched call) and torchdiffeq's
-  dopri5, over a window that they finish, as wall time per simulated second;
-- where the time of a run goes.
+- the 30 s manipulation by two tolerances, by equal steps, and beside them an earlier version with `--before` a checkout of
+  it; errors against a run at rtol 1e-7; `scenario_wall_s` is that of the loosest tolerance with the accuracy of a step of 2 ms
+  (motion 3e-4, forces 0.5 % of their range);
+- over the run the sweep for the gradient of all parameters, and what the Jacobian for 8 parameters adds; peak memory;
+- 64 trajectories of 4 s and 1,000 of 0.3 s with parameters of their own, on one and two threads;
+- growth with the surface nodes, the nodes that touch, the simulated time and the size of a batch, with fitted exponents;
+- with `--peers` the same equations, compiled, under scipy's, torchdiffeq's and diffrax's integrators, equally exact.
 
-Command: .venv/bin/python experiments/benchmark.py [--smoke]
-Expected: the run under 2 s, the gradient of everything (run included) under 2 times that, the Jacobian about 3 times, 64
-trajectories at more than 10 simulated seconds per second and core. About four minutes.
+Command: .venv/bin/python experiments/benchmark.py [--peers] [--before CHECKOUT] [--smoke]
+Expected: the sweep at most 0.6 of a run and the Jacobian at most 2 by tolerances, more by equal steps; forces need rtol 1e-4 to
+be as exact as by 2 ms. About five minutes, three more with `--peers`.
 """
 
 import cProfile
 import json
+import os
 import pstats
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-import numpy as np
-import torch
-from _experiment import grid, made_by, options, timed, write
+from _benchmark_batches import batches
+from _benchmark_common import GRASP_FORCE, Config, interleaved, prepare, tasks, wall, ways
+from _benchmark_growth import Growth, growth, growth_figure, growth_table
+from _experiment import grid, made_by, markdown, options, write
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullLocator
-from scipy.integrate import solve_ivp
-from torchdiffeq import odeint
+from step_accuracy import errors
 from tqdm import tqdm
 
-from torchsoft import Parameters, SoftGrasp, simulate
-from torchsoft.processes import local_processes
-from torchsoft.scenario import Manipulation, grasp_and_roll
+from torchsoft import simulate
 
-EIGHT = ("contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau")
+ACCURACY = {"motion": 3e-4, "forces": 5e-3}
+"""Largest errors over the range of what a step of 2 ms gives."""
 
-
-@dataclass(frozen=True)
-class Config:
-    out: Path = Path("out/benchmark")
-    duration: float = 30.0  # simulated time of the manipulation [s]
-    step: float = 2e-3  # of the stepper [s]
-    repeats: int = 5  # timings of which the median is taken
-    trajectories: tuple[int, ...] = (1, 8, 64)  # batches
-    batch_duration: float = 3.0  # simulated time of each trajectory of a batch [s]
-    elements_x: tuple[int, ...] = (60, 120, 240, 480)  # meshes, a thirtieth of that through the pad
-    window: float = 0.02  # simulated time that the other integrators get, in mid-roll [s]
-    measure: str = ""  # used by the benchmark itself: print the peak memory of one task
-    smoke: bool = False  # a size that takes seconds
+MEASURED = ("nothing", "run", "gradient", "jacobian")
+"""Tasks of which the peak memory is taken."""
 
 
 @dataclass(frozen=True)
 class Result:
     config: Config
     figures: dict[str, Any]
+    growth: list[Growth]
 
 
-def prepare(elements_x: int = 120) -> Manipulation:
-    changes = {"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30}
-    return grasp_and_roll(SoftGrasp(Parameters().override(changes)), grasp_force=80.66)
+@contextmanager
+def earlier(config: Config) -> Iterator[Callable[[], float] | None]:
+    """A function that runs the manipulation once under an earlier version and returns its wall time [s]; None without one."""
+    if not config.before:
+        yield None
+        return
+    root = Path(config.before).resolve()
+    script = Path(__file__).with_name("_benchmark_before.py")
+    process = subprocess.Popen(
+        [sys.executable, str(script), *map(str, (config.duration, config.step, GRASP_FORCE))],
+        env=os.environ | {"PYTHONPATH": str(root)}, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    assert process.stdin
+    assert process.stdout
+    try:
+        if not Path(process.stdout.readline().strip()).is_relative_to(root):
+            raise ValueError(f"{root} is not a checkout of torchsoft")
 
+        def once() -> float:
+            print(file=process.stdin, flush=True)
+            return float(process.stdout.readline())  # pyright: ignore[reportOptionalMemberAccess]
 
-def tasks(m: Manipulation, t: torch.Tensor, step: float) -> dict[str, Callable[[], object]]:
-    """The run, the run with its gradient, the run with its Jacobian."""
-
-    def gradient() -> None:
-        m.model.zero_grad()
-        run = simulate(m.model, t, y0=m.y0, step=step, gradient="discrete")
-        (run["theta"].square().sum() + 1e3 * run.together("x_C", "y_C").square().sum()).backward()
-
-    return {
-        "run": lambda: simulate(m.model, t, y0=m.y0, step=step),
-        "gradient": gradient,
-        "jacobian": lambda: simulate(m.model, t, y0=m.y0, step=step, gradient="forward", wrt=EIGHT, rigid=True),
-    }
-
-
-def median_time(task: Callable[[], object], repeats: int) -> float:
-    """Median wall time [s] after one warm-up."""
-    task()
-    return median(timed(task)[1] for _ in range(repeats))
+        yield once
+    finally:
+        process.stdin.close()
+        process.wait()
 
 
 def costs(config: Config) -> dict[str, Any]:
-    """Times of the three tasks, as ratios to the run, and the peak memory of a process that does one of them."""
-    m = prepare()
-    seconds = {
-        name: median_time(task, config.repeats) for name, task in tasks(m, grid(config.duration), config.step).items()
-    }
-    memory = {}
-    for name in ("nothing", *seconds):
-        flags = [f"--measure={name}", f"--duration={config.duration}", f"--step={config.step}"]
-        out = subprocess.run([sys.executable, __file__, *flags], capture_output=True, text=True, check=True)
-        memory[name] = float(out.stdout.split()[-1])
-    return {
-        "seconds": seconds,
-        "ratio": {name: s / seconds["run"] for name, s in seconds.items()},
-        "peak_memory_MB": memory,
-        "simulated_per_wall": config.duration / seconds["run"],
-    }
+    """Times of the three tasks by every way, beside an earlier version's run, with errors and peak memory."""
+    m, t = prepare(), grid(config.duration)
+    exact = simulate(m.model, t, y0=m.y0, rtol=config.exact)
+    every = {(way, name): task for way, steps in ways(config).items() for name, task in tasks(m, t, steps).items()}
+    with earlier(config) as before:
+        named = {f"{way}, {name}": wall(task) for (way, name), task in every.items()}
+        times = interleaved(named | ({"before": before} if before else {}), config.repeats)
+    out: dict[str, Any] = {"before_s": median(times["before"]) if config.before else None, "timings": times}
+    for way, steps in ways(config).items():
+        one = simulate(m.model, t, y0=m.y0, **steps)
+        seconds = {name: median(times[f"{way}, {name}"]) for name in ("run", "gradient", "jacobian")}
+        part = lambda name, seconds=seconds: seconds[name] / seconds["run"]
+        out[way] = {
+            "seconds": seconds, "steps": one.stats.steps, "solves": one.stats.newton_iterations,
+            "errors": errors(one, exact), "gradient_total_over_run": part("gradient"),
+            "gradient_over_run": part("gradient") - 1, "jacobian8_total_over_run": part("jacobian"),
+            "jacobian8_over_run": part("jacobian") - 1,
+        }  # fmt: skip
+    return out | {"peak_memory_MB": memory(config)}
+
+
+def memory(config: Config) -> dict[str, float]:
+    """Peak memory [MB] of processes that do one task each, at the tighter tolerance."""
+    out, way = {}, list(ways(config))[1]
+    for name in MEASURED:
+        flags = [f"--measure={name}, {way}", f"--duration={config.duration}", f"--step={config.step}"]
+        done = subprocess.run([sys.executable, __file__, *flags], capture_output=True, text=True, check=True)
+        out[name] = float(done.stdout.split()[-1])
+    return out
 
 
 def peak_memory(config: Config) -> None:
     """Do one task once and print this process's peak resident memory [MB] (Linux: VmHWM, which starts anew at exec)."""
+    name, way = config.measure.split(", ")
     m = prepare()
-    if config.measure != "nothing":
-        tasks(m, grid(config.duration), config.step)[config.measure]()
+    if name != "nothing":
+        tasks(m, grid(config.duration), ways(config)[way])[name]()
     lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
     print(next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024)
 
 
-_worker: dict[str, Any] = {}
-
-
-def _prepare_worker() -> None:
-    _worker["manipulation"] = prepare()
-
-
-def _one_of_many(job: tuple[int, float, float]) -> float:
-    """Trajectory number k, which differs from the others in its start; returns where the disc ends [m]."""
-    k, duration, step = job
-    m: Manipulation = _worker["manipulation"]
-    y0 = m.y0.clone()
-    y0[m.model.layout.slices["velocity", "disc"]] = torch.tensor([1e-5 * k, 1e-5 * k, 0.0], dtype=torch.float64)
-    return simulate(m.model, grid(duration), y0=y0, step=step)["x_C"][-1].item()
-
-
-def batches(config: Config) -> dict[str, dict[str, float]]:
-    """Simulated seconds per wall second of many trajectories on one and two cores, the processes already started."""
-    out = {}
-    for cores in (1, 2):
-        with local_processes(cores, _prepare_worker) as pool:
-            list(pool.map(_one_of_many, [(0, 0.1, config.step)] * (4 * cores)))
-            for n in config.trajectories:
-                jobs = [(k, config.batch_duration, config.step) for k in range(n)]
-                seconds = median_time(
-                    lambda pool=pool, jobs=jobs: list(pool.map(_one_of_many, jobs)), min(config.repeats, 3)
-                )
-                rate = n * config.batch_duration / seconds
-                out[f"{n} on {cores}"] = {"simulated_per_wall": rate, "per_core": rate / min(cores, n)}
-    return out
-
-
-def growth(config: Config) -> dict[str, dict[str, float]]:
-    """Seconds of a run per simulated second, over meshes and over simulated times."""
-    meshes, durations = {}, {}
-    for n in config.elements_x:
-        m, t = prepare(n), grid(config.batch_duration)
-        meshes[str(n + 1)] = (
-            median_time(tasks(m, t, config.step)["run"], min(config.repeats, 3)) / config.batch_duration
-        )
-    m = prepare()
-    for duration in (0.1, 0.3, 1.0):
-        t = grid(duration * config.duration)
-        durations[f"{duration * config.duration:g}"] = median_time(tasks(m, t, config.step)["run"], 3) / float(t[-1])
-    return {"surface_nodes": meshes, "simulated_s": durations}
-
-
-def others(config: Config) -> dict[str, dict[str, float]]:
-    """Wall time per simulated second of other integrators on the module's own forward, in mid-roll, and their error."""
-    m = prepare()
-    model, begin = m.model, 2.0
-    y0 = simulate(model, torch.tensor([0.0, begin], dtype=torch.float64), y0=m.y0, step=config.step).y[-1]
-    t = torch.tensor([begin, begin + config.window], dtype=torch.float64)
-    exact = simulate(model, t, y0=y0, step=config.window / 2000).y[-1]
-    part = model.layout.slices["pose", "disc"].start + torch.arange(2)
-    size = torch.ones(model.layout.size, dtype=torch.float64)
-    for name, pad in model.pads.items():  # nodal forces, counted by the displacement that they make
-        size[model.layout.slices["pads", name]] = 1 / pad.compliance().detach().diagonal().max()
-    shift, atol = 1e-9 * torch.diag(size), 1e-9 * size
-
-    @torch.no_grad()
-    def rhs(time: float, y: np.ndarray) -> np.ndarray:
-        return model(time, torch.from_numpy(y)).numpy()
-
-    @torch.no_grad()
-    def jacobian(time: float, y: np.ndarray) -> np.ndarray:
-        base = torch.from_numpy(y)
-        return ((model(time, base + shift) - model(time, base)) / shift.diagonal()[:, None]).numpy().T
-
-    def scipy_solver(method: str) -> torch.Tensor:
-        out = solve_ivp(rhs, t.tolist(), y0.numpy(), method=method, rtol=1e-6, atol=atol.numpy(), jac=jacobian)
-        return torch.from_numpy(out.y[:, -1])
-
-    @torch.no_grad()
-    def dopri5() -> torch.Tensor:
-        solution = odeint(model, y0, t, rtol=1e-6, atol=atol)  # pyright: ignore[reportArgumentType]
-        assert isinstance(solution, torch.Tensor)
-        return solution[-1]
-
-    solvers: dict[str, Callable[[], torch.Tensor]] = {
-        "sdirk2 (this stepper)": lambda: simulate(model, t, y0=y0, step=config.step).y[-1],
-        "scipy LSODA": lambda: scipy_solver("LSODA"),
-        "scipy BDF": lambda: scipy_solver("BDF"),
-        "scipy Radau": lambda: scipy_solver("Radau"),
-        "torchdiffeq dopri5": dopri5,
-    }
-    out = {}
-    for name, solve in solvers.items():
-        end, wall = timed(solve)
-        out[name] = {
-            "wall_per_simulated": wall / config.window,
-            "position_error_nm": 1e9 * float((end - exact)[part].norm()),
-        }
-    longer = grid(config.batch_duration)  # a window is too short to time the stepper on
-    wall = median_time(tasks(m, longer, config.step)["run"], config.repeats) / config.batch_duration
-    out["sdirk2 (this stepper)"]["wall_per_simulated"] = wall
-    return out
-
-
 def profile(config: Config) -> dict[str, float]:
     """Part of a run's time that is spent in the compiled kernel, by a deterministic profiler."""
-    m = prepare()
-    run = tasks(m, grid(config.duration), config.step)["run"]
+    m, (way, *_) = prepare(), ways(config).values()
     profiler = cProfile.Profile()
-    profiler.runcall(run)
+    profiler.runcall(tasks(m, grid(config.duration), way)["run"])
     rows = pstats.Stats(profiler).get_stats_profile()
     return {"kernel_share": rows.func_profiles["run"].tottime / rows.total_tt}
 
 
 def run(config: Config) -> Result:
-    parts = {"costs": costs, "batches": batches, "growth": growth, "others": others, "profile": profile}
-    return Result(config, {name: part(config) for name, part in tqdm(parts.items(), unit="part")})
+    if config.smoke:
+        config = replace(
+            config, duration=0.5, exact=1e-5, repeats=1, trajectories=2, batch_duration=0.2, short_runs=3,
+            short_duration=0.05, elements_x=(60, 120), window=5e-3,
+        )  # fmt: skip
+    parts: dict[str, Callable[[Config], Any]] = {
+        "costs": costs, "batches": batches, "growth": growth, "profile": profile,
+    }  # fmt: skip
+    if config.peers:
+        from _benchmark_peers import peers
+
+        parts["peers"] = peers
+    done = {name: part(config) for name, part in tqdm(parts.items(), unit="part")}
+    grown: list[Growth] = done.pop("growth")
+    cost, batch = done["costs"], done["batches"]
+    loose, tight, equal = (cost[way] for way in ways(config))
+    rtol = next((r for r, one in zip(config.rtols, (loose, tight)) if exact_enough(one["errors"])), None)
+    scenario_s = None if rtol is None else cost[f"rtol = {rtol:g}"]["seconds"]["run"]
+    top = {
+        "scenario_wall_s": scenario_s, "scenario_rtol": rtol, "scenario_wall_s_loose": loose["seconds"]["run"],
+        "scenario_wall_s_tight": tight["seconds"]["run"],
+        "scenario_wall_s_equal_steps": equal["seconds"]["run"], "scenario_wall_s_before": cost["before_s"],
+        "before_over_scenario": cost["before_s"] and scenario_s and cost["before_s"] / scenario_s,
+        **{name: tight[name] for name in tight if name.endswith("over_run")},
+        **{f"{name}_equal_steps": equal[name] for name in equal if name.endswith("over_run")},
+        "batch_sim_s_per_wall_s": batch["trajectories"]["simulated_per_wall"]["2"],
+        "batch_sim_s_per_wall_s_one_thread": batch["trajectories"]["simulated_per_wall"]["1"],
+        "batch_two_threads_over_one": batch["trajectories"]["two_threads_over_one"],
+    }  # fmt: skip
+    return Result(config, top | done | {"growth": [one.summary() for one in grown]}, grown)
+
+
+def worst(errors: dict[str, float]) -> dict[str, float]:
+    """The largest errors of the motion and of the forces."""
+    parts = {"motion": ("x_C", "y_C", "theta"), "forces": ("F_x", "F_y")}
+    return {part: max(errors[name] for name in names) for part, names in parts.items()}
+
+
+def exact_enough(errors: dict[str, float]) -> bool:
+    """Whether a run is as exact as by a step of 2 ms."""
+    return all(error <= ACCURACY[part] for part, error in worst(errors).items())
+
+
+def cost_table(config: Config, numbers: dict[str, Any]) -> str:
+    """Every way with its times, errors and memory."""
+    head = (
+        "steps by", "run [s]", "error of motion [1]", "error of forces [1]", "gradient: sweep over run", "total",
+        "Jacobian for 8: added over run", "total",
+    )  # fmt: skip
+    rows: list[tuple[object, ...]] = []
+    for way in ways(config):
+        one = numbers["costs"][way]
+        motion, forces = worst(one["errors"]).values()
+        ratios = ("gradient_over_run", "gradient_total_over_run", "jacobian8_over_run", "jacobian8_total_over_run")
+        rows.append(
+            (way, f"{one['seconds']['run']:.3g}", f"{motion:.1e}", f"{forces:.1e}", *(f"{one[r]:.2f}" for r in ratios))
+        )  # fmt: skip
+    if config.before:
+        step = f"earlier version, step = {1e3 * config.step:g} ms"
+        rows.append((step, f"{numbers['costs']['before_s']:.3g}", *[""] * 6))
+    peak = ", ".join(f"{name} {one:.0f}" for name, one in numbers["costs"]["peak_memory_MB"].items())
+    return f"{markdown(head, rows)}\n\nPeak memory at {list(ways(config))[1]} [MB]: {peak}"
+
+
+def batch_table(numbers: dict[str, Any]) -> str:
+    """Both batches on one and two threads."""
+    head = ("batch", "threads", "wall time [s]", "simulated s per wall s", "runs per wall s", "failures")
+    return markdown(
+        head,
+        [
+            (
+                f"{one['runs']} runs of {one['simulated_s']:g} s", threads, f"{one['wall_s'][threads]:.3g}",
+                f"{one['simulated_per_wall'][threads]:.3g}", f"{one['runs_per_wall_s'][threads]:.3g}", one["failures"],
+            )
+            for one in numbers["batches"].values() for threads in ("1", "2")
+        ],
+    )  # fmt: skip
+
+
+def tables(result: Result) -> str:
+    """All tables."""
+    parts = [
+        cost_table(result.config, result.figures), batch_table(result.figures), growth_table(result.growth)
+    ]  # fmt: skip
+    if "peers" in result.figures:
+        from _benchmark_peers import peers_table
+
+        parts.append(peers_table(result.figures["peers"]))
+    return "\n\n".join(parts)
 
 
 def figure(result: Result) -> Figure:
-    """Costs as ratios; growth with surface nodes; the other integrators."""
-    fig = Figure(figsize=(12, 3.6), layout="constrained")
-    left, middle, right = fig.subplots(1, 3)
-    ratio = result.figures["costs"]["ratio"]
-    columns = left.bar(list(ratio), list(ratio.values()), color="#0072b2")
-    left.bar_label(columns, fmt="%.2f")
-    left.margins(y=0.12)
-    left.set(ylabel="time over a plain run [1]", title="Run, gradient of all, Jacobian for 8")
-    nodes = result.figures["growth"]["surface_nodes"]
-    middle.loglog([int(n) for n in nodes], [1e3 * s for s in nodes.values()], "o-", color="#0072b2")
-    middle.set_xticks([int(n) for n in nodes], list(nodes))
-    middle.xaxis.set_minor_locator(NullLocator())
-    middle.set(xlabel="surface nodes a pad", ylabel="wall time [ms] per simulated s", title="Growth with the mesh")
-    others_ = result.figures["others"]
-    right.barh(list(others_), [x["wall_per_simulated"] for x in others_.values()], color="#0072b2", log=True)
-    right.set(xlabel="wall time [s] per simulated s", title="Other integrators, same equations")
+    """Wall times of the tasks by every way; batches; the other integrators, if any."""
+    numbers, colours = result.figures, ("#0072b2", "#e69f00", "#009e73")
+    fig = Figure(figsize=(13, 4.2), layout="constrained")
+    left, middle, right = fig.subplots(1, 3, width_ratios=(1.4, 0.8, 1.3))
+    every = list(ways(result.config))
+    for i, (name, colour) in enumerate(zip(("run", "gradient", "jacobian"), colours)):
+        label = {"run": "run", "gradient": "with gradient of all", "jacobian": "with Jacobian for 8"}[name]
+        seconds = [numbers["costs"][way]["seconds"][name] for way in every]
+        bars = left.bar([k + 0.27 * (i - 1) for k in range(len(every))], seconds, 0.25, color=colour, label=label)
+        left.bar_label(bars, fmt="%.2g", fontsize=8)
+    names = list(every)
+    if numbers["costs"]["before_s"]:
+        bars = left.bar([len(every)], [numbers["costs"]["before_s"]], 0.25, color="0.5", label="run, earlier version")
+        left.bar_label(bars, fmt="%.2g", fontsize=8)
+        names.append(f"earlier,\nstep = {1e3 * result.config.step:g} ms")
+    left.set_xticks(range(len(names)), names)
+    left.margins(y=0.1)
+    left.set(ylabel="wall time [s]", title=f"{result.config.duration:g} s of manipulation, one core")
+    left.legend(fontsize=8)
+    batch = numbers["batches"]
+    for i, threads in enumerate(("1", "2")):
+        rates = [one["simulated_per_wall"][threads] for one in batch.values()]
+        bars = middle.bar(
+            [k + 0.36 * (i - 0.5) for k in range(2)], rates, 0.34, color=colours[i], label=f"{threads} thread{'s' * i}"
+        )
+        middle.bar_label(bars, fmt="%.3g", fontsize=8)
+    middle.set_xticks(range(2), [f"{one['runs']} runs\nof {one['simulated_s']:g} s" for one in batch.values()])
+    middle.margins(y=0.12)
+    middle.set(ylabel="simulated s per wall s [1]", title="Batches")
+    middle.legend(fontsize=8)
+    if "peers" not in numbers:
+        right.set_axis_off()
+        return fig
+    way = list(numbers["peers"]["equal"])[-1]
+    reached = {name: one["wall_per_simulated"] for name, one in numbers["peers"]["equal"][way].items() if one}
+    bars = right.barh(list(reached), list(reached.values()), color="#0072b2", log=True)
+    right.bar_label(bars, fmt="%.2g", padding=3, fontsize=8)
+    right.margins(x=0.15)
     right.invert_yaxis()
+    right.set(xlabel="wall time [s] per simulated s", title=f"Same equations, as exact as {way}")
     return fig
 
 
@@ -255,13 +272,12 @@ def main() -> None:
     if config.measure:
         peak_memory(config)
         return
-    if config.smoke:
-        config = replace(
-            config, duration=0.5, repeats=1, trajectories=(1, 2), batch_duration=0.2, elements_x=(60, 120), window=2e-3
-        )
     result = run(config)
-    print(json.dumps(result.figures, indent=2))
-    write(config.out, result.figures | {"made_by": made_by(config)}, {"benchmark": figure(result)})
+    print(json.dumps({k: v for k, v in result.figures.items() if not isinstance(v, dict | list)}, indent=2))
+    print(tables(result))
+    content = result.figures | {"made_by": made_by(config)}
+    drawn = {"benchmark": figure(result), "growth": growth_figure(result.growth)}
+    write(config.out, content, drawn, tables(result))
 
 
 if __name__ == "__main__":

@@ -20,10 +20,12 @@ FLOWS = {
         equilibrium stability .
     """,
     "solve": """
-        grid kernel laws system progress tolerances stepper adjoint tangent unrolled continuous trajectory ledger simulate batch
+        grid kernel laws system progress tolerances rates stepper adjoint tangent unrolled continuous trajectory ledger simulate batch
         torchdiffeq .
     """,
-    "solve.kernel": "cache . arrays scratch linear inertia interface stage finish step taped run adjoint_pads adjoint tangent",
+    "solve.kernel": """
+        cache . arrays scratch linear inertia interface stage finish step taped run rates adjoint_pads adjoint tangent
+    """,
 }
 """For every folder with layers its modules and folders from the top down; "." is what the folder's own file imports."""
 APART = ("plot", "sysid", "reduced", "datasets")

@@ -85,11 +85,50 @@ def test_refinement_smoke(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_benchmark_smoke(tmp_path: Path) -> None:
+    """A sweep costs less than two runs, a Jacobian less than four; every part has its place in the summary and a figure."""
     module = experiment("benchmark")
-    config = module.Config(out=tmp_path, duration=3.0, repeats=3)
-    ratio = module.costs(config)["ratio"]
-    assert ratio["gradient"] < 3  # with the run itself
-    assert ratio["jacobian"] < 5
+    config = module.Config(out=tmp_path, duration=3.0, exact=1e-5, repeats=3)
+    costs = module.costs(config)
+    for way in module.ways(config):
+        assert costs[way]["gradient_over_run"] < 2
+        assert costs[way]["jacobian8_over_run"] < 4
+    loose, tight, _ = (costs[way]["errors"]["x_C"] for way in module.ways(config))
+    assert tight < loose
+    result = module.run(module.Config(out=tmp_path, smoke=True))
+    assert result.figures["scenario_wall_s_before"] is None
+    assert result.figures["batches"]["trajectories"]["failures"] == 0
+    assert [one.over for one in result.growth][-1] == "runs of a batch"
+    assert len(module.growth_figure(result.growth).axes) == 4
+    assert "| 2 runs of 0.2 s | 2 |" in module.tables(result)
+    assert module.figure(result).axes
+
+
+@pytest.mark.slow
+def test_peers_smoke() -> None:
+    """Every integrator reaches the stepper's solution with the compiled right-hand side."""
+    pytest.importorskip("diffrax")
+    module = experiment("_benchmark_peers")
+    numbers = module.peers(experiment("benchmark").Config(window=5e-3, repeats=1, smoke=True))
+    for rows in numbers["equal"].values():
+        assert all(row is not None for row in rows.values())
+    assert "scipy LSODA" in module.peers_table(numbers)
+
+
+@pytest.mark.slow
+def test_random_runs_smoke(tmp_path: Path) -> None:
+    """Every run ends, finite or with a sentence; one that takes too much of the processor's time is ended."""
+    module = importlib.import_module("random_runs")  # by its own name, which worker processes import
+    result = module.run(module.Config(out=tmp_path, smoke=True))
+    numbers = module.summary(result)
+    for way in module.WAYS:
+        kinds = numbers[way]["kinds"]
+        assert sum(kinds.values()) == numbers["runs"] == len(result.motions)
+        assert not [kind for kind in kinds if kind in (module.NOT_FINITE, module.HUNG) or "without a sentence" in kind]
+        assert all(one.sentence for one in result.outcomes[way].values() if one.kind != module.FINISHED)
+    assert f"of {numbers['runs']} runs" in module.table(numbers)
+    assert module.figure(result).axes
+    short = module.run(module.Config(out=tmp_path, runs=1, workers=1, limit=0.01))
+    assert module.summary(short)["tolerances"]["kinds"] == {module.HUNG: 1}
 
 
 def test_experiment_design_smoke(tmp_path: Path) -> None:

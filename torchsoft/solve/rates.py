@@ -1,0 +1,61 @@
+"""The compiled right-hand side of a rig, as a function of numpy arrays: what other integrators ask for."""
+
+import numpy as np
+
+from torchsoft.physics.motion import Reference
+from torchsoft.physics.rig import Rig
+from torchsoft.solve.kernel.arrays import Array
+from torchsoft.solve.kernel.rates import rates
+from torchsoft.solve.kernel.scratch import scratch
+from torchsoft.solve.progress import Integrals, SimulationFailed
+from torchsoft.solve.system import Compiled
+from torchsoft.solve.tolerances import Followed
+
+
+class Rates:
+    """dy/dt = f(t, y) of a rig and its reference as they are now, compiled: tens of microseconds a call.
+
+    The same as `rig.forward` to Newton's `tolerance` [N], for one state y (size,) of numpy. `calls` counts. An object keeps
+    scratch of its own and the last forces as Newton's guess: one thread may call it at a time. `margin` [m] is how near a
+    point has to be to count as one that may touch.
+
+    Raises `NotImplementedError` for inertial pads.
+    """
+
+    def __init__(
+        self, rig: Rig, reference: Reference | None = None, *, tolerance: float = 1e-10, margin: float = 2e-3
+    ) -> None:
+        compiled = Compiled(rig)
+        if compiled.inertial:
+            raise NotImplementedError(
+                "the rates of inertial pads are not compiled for single states; use `rig.forward`"
+            )
+        self._system, self._limits = compiled.system(1.0), (tolerance, 40, margin)
+        self._work = scratch(self._system, compiled.size)
+        followed = rig.reference if reference is None else reference
+        self._followed = Followed(lambda t: compiled.signals(t, followed), rig, followed)
+        self._signals = np.zeros((1, compiled.signal_count, 2))
+        self._powers, self._moments = np.zeros(len(Integrals(rig).names)), np.zeros(len(rig.pads))
+        self.calls = 0
+
+    def __call__(self, t: float, y: Array) -> Array:
+        """dy/dt (size,) at t [s]. Raises `SimulationFailed` where Newton finds no forces."""
+        out, y = np.empty(len(y)), np.ascontiguousarray(y)
+        self.calls += 1
+        found = self._solve(t, y, out)
+        if not found:  # once more without the last call's guess
+            self._work.u_dot[:] = 0.0
+            found = self._solve(t, y, out)
+        if self._followed.error is not None:
+            raise self._followed.error
+        if not found:
+            self._work.u_dot[:] = 0.0
+            raise SimulationFailed(f"at t = {t:.6g} s Newton's iteration found no forces for the state", float(t))
+        return out
+
+    def _solve(self, t: float, y: Array, out: Array) -> bool:
+        """Whether Newton found the forces; the rates go to `out`."""
+        return rates(
+            self._system, self._work, self._followed.arrays, float(t), y, *self._limits, self._signals, self._powers,
+            self._moments, out,
+        )  # fmt: skip
