@@ -97,7 +97,7 @@ def simulate_batch(
     backward sweeps run in threads too.
 
     A run that fails, or that cannot begin with its own parameters, is reported in `failures` and by a warning
-    (`SamplesFailed`), and leaves the others alone.
+    (`SamplesFailed`), and leaves the others alone. `simulate` of that run alone says more, if its loop is unstable.
 
     Raises `ValueError` for counts that do not agree and for options that no run could have. Ctrl-C ends the batch when the
     runs on their way have ended.
@@ -115,7 +115,7 @@ def simulate_batch(
                 _own(rigs[i], parameters or {}, i), ts[i], y0=y0s[i], reference=references[i], knots=every_knots[i],
                 dy0=dy0s[i], **options,
             )  # fmt: skip
-            return run(task, budget)
+            return run(task, budget, explained=False)
         except (SimulationFailed, ValueError, np.linalg.LinAlgError) as failure:
             return failure
 

@@ -149,8 +149,11 @@ class Done(NamedTuple):
         return gather(self.task, y, self.solved.out, self.wall, self.dy)
 
 
-def run(task: Task, tape_bytes: float, progress: bool = False) -> Done:
-    """Carry out a task by one of the compiled routes. Raises `SimulationFailed` and `Interrupted` with what was simulated."""
+def run(task: Task, tape_bytes: float, progress: bool = False, explained: bool = True) -> Done:
+    """Carry out a task by one of the compiled routes; `explained` looks for the cause of a failure, which takes seconds.
+
+    Raises `SimulationFailed` and `Interrupted` with what was simulated.
+    """
     stepper, t, bar = task.stepper, task.t, None
     if progress:
         bar = tqdm(
@@ -169,7 +172,11 @@ def run(task: Task, tape_bytes: float, progress: bool = False) -> Done:
     except SimulationFailed as failure:
         if done is None:
             raise
-        raise diagnose(stepper.rig, failure, done.trajectory(done.solved.y)) from None
+        so_far = done.trajectory(done.solved.y)
+        if explained:
+            raise diagnose(stepper.rig, failure, so_far) from None
+        failure.trajectory = so_far
+        raise
     except KeyboardInterrupt:
         if done is None:
             raise
