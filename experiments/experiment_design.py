@@ -2,8 +2,8 @@
 
 For every excitation of `torchsoft.excitation.CATALOGUE` the Fisher matrix F = J^T J of the sensors' predicted samples (J: exact
 sensitivities over the sensors' noise, coordinates: logarithms of the parameters) gives the Cramer-Rao standard deviation
-sqrt(diag F^-1) of each parameter; F is additive, so combinations follow by summing. The error of the finite step, 4/3 of the
-difference to half of it, shifts an estimate by F^-1 J^T error: what an excitation is worth is the root of both squared.
+sqrt(diag F^-1) of each parameter; F is additive, so combinations follow by summing. What a tenth of the tolerance changes,
+shifts an estimate by F^-1 J^T of it: what an excitation is worth is the root of both squared. Steps are frozen.
 Derivatives of hard slipping can be inconsistent: J is checked against a central difference along a random direction, and an
 excitation that fails is dropped.
 
@@ -27,8 +27,10 @@ from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, Strokes
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import RIG, Problem, Unknown, record
-from torchsoft.sysid.information import standard_deviations, step_error, step_shift
+from torchsoft.sysid.information import shift, standard_deviations
+from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.recording import Array
+from torchsoft.sysid.settle import FINER
 from torchsoft.sysid.workers import Runner
 
 NAMES: tuple[str, ...] = (
@@ -42,7 +44,7 @@ DIFFERENCE = 1e-5  # Step of that finite difference in the logarithms.
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/experiment_design")
-    step: float = 5e-4  # of the stepper [s]
+    rtol: float = 1e-5  # of the runs
     v_s: float = 0.05  # contact.v_s [m/s]; large, so that gross slip has a unique solution
     longest: float = 6.0  # data that a combination may take [s]
     most: int = 3  # excitations in a combination
@@ -52,7 +54,7 @@ class Config:
 
 @dataclass(frozen=True)
 class Row:
-    """Standard deviations and shifts by the step [1] by parameter, of one excitation or of several together;
+    """Standard deviations and shifts by the steps [1] by parameter, of one excitation or of several together;
     `inconsistency` of the derivative."""
 
     names: tuple[str, ...]
@@ -69,9 +71,9 @@ class Row:
 
 
 def row(names: tuple[str, ...], seconds: float, J: Array, error: Array, inconsistency: float, dropped: str = "") -> Row:
-    """The row of a Jacobian and the step's error (m,)."""
-    sd, shift = standard_deviations(J), step_shift(J, error)
-    return Row(names, seconds, dict(zip(NAMES, sd.tolist())), dict(zip(NAMES, shift.tolist())), inconsistency, dropped)
+    """The row of a Jacobian and of what finer steps add to the residuals (m,)."""
+    sd, off = standard_deviations(J), shift(J, error)
+    return Row(names, seconds, dict(zip(NAMES, sd.tolist())), dict(zip(NAMES, off.tolist())), inconsistency, dropped)
 
 
 @dataclass(frozen=True)
@@ -84,28 +86,31 @@ class Result:
 def smoke(config: Config) -> tuple[Config, dict[str, Excitation]]:
     roll = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.3), duration=0.9, senses="bracket")
     jerk = Excitation(motion=Strokes(travel=30e-3, stroke_time=0.1), duration=0.9, depth=3e-4, senses="bracket")
-    return Config(config.out, 2e-3, config.v_s, 2.0, 2, config.seed, True), {"strokes": roll, "jerks, light": jerk}
+    return Config(config.out, 1e-4, config.v_s, 2.0, 2, config.seed, True), {"strokes": roll, "jerks, light": jerk}
+
+
+def check(part: Residuals) -> Residuals:
+    """Raises `SimulationFailed` where there are none."""
+    for lost in part.lost.values():
+        raise SimulationFailed(lost.reason, lost.time)
+    return part
 
 
 def assess(excitation: Excitation, p: Parameters, config: Config) -> tuple[Array, Array, float]:
-    """Whitened Jacobian (m, parameters), error of the step (m,), and how far the Jacobian is, relatively, from a central
-    difference along one direction."""
-    recording = record("one", excitation, p, p, RIG, step=config.step, noise=0.0)
+    """Whitened Jacobian (m, parameters), what finer steps add to the residuals (m,), and how far the Jacobian is, relatively,
+    from a central difference along one direction. Raises `SimulationFailed`."""
+    recording = record("one", excitation, p, p, RIG, rtol=config.rtol, noise=0.0)
     friction = 0.5 * (p.contact.mu_k + p.contact.mu_s)  # bounds that do not cross; nothing is searched here
     apart = {"contact.mu_k": Unknown(high=friction), "contact.mu_s": Unknown(low=friction)}
     problem = Problem([recording], RIG, {name: Unknown() for name in NAMES} | apart)
     x, v = problem.coordinates.start, np.random.default_rng(config.seed).standard_normal(len(NAMES))
-    with Runner(problem.recordings) as runner:
-        at = problem.residuals(runner, x, ["one"], config.step, problem.coordinates.free)
-        ahead, behind = (
-            problem.residuals(runner, x + s * DIFFERENCE * v, ["one"], config.step) for s in (1.0, -1.0)
-        )  # fmt: skip
-        finer = problem.residuals(runner, x, ["one"], config.step / 2)
-    for part in (at, ahead, behind, finer):
-        for lost in part.lost.values():
-            raise SimulationFailed(lost.reason, lost.time)
+    runner = Runner(problem.recordings)
+    at, steps = problem.freeze(runner, x, ["one"], config.rtol, problem.coordinates.free)
+    check(at)
+    ahead, behind = (check(problem.residuals(runner, x + s * DIFFERENCE * v, ["one"], steps)) for s in (1.0, -1.0))
+    finer = check(problem.freeze(runner, x, ["one"], FINER * config.rtol)[0])
     slope = (ahead.r - behind.r) / (2 * DIFFERENCE)
-    return at.J, step_error(at.r, finer.r), float(np.linalg.norm(at.J @ v - slope) / np.linalg.norm(slope))
+    return at.J, finer.r - at.r, float(np.linalg.norm(at.J @ v - slope) / np.linalg.norm(slope))
 
 
 def run(config: Config) -> Result:
@@ -176,7 +181,7 @@ def figure(result: Result) -> Figure:
         ax.set_xticklabels([name.split(".")[1] for name in NAMES])
         ax.tick_params(length=0)
     assert image is not None
-    fig.colorbar(image, ax=axes, label="root of (standard deviation² + step shift²) [%]", shrink=0.6)
+    fig.colorbar(image, ax=axes, label="root of (standard deviation² + shift by the steps²) [%]", shrink=0.6)
     return fig
 
 

@@ -20,7 +20,7 @@ from torchsoft.sysid import Unreachable
 from torchsoft.sysid.measured import load, unreachable
 from torchsoft.sysid.prediction import FailedRun
 
-OPTIONS = ("--out", "--workers", "--step", "--checkpoint", "--yes", "--no-progress")
+OPTIONS = ("--out", "--workers", "--rtol", "--checkpoint", "--yes", "--no-progress")
 
 
 def rows(count: int) -> Table:
@@ -57,8 +57,8 @@ def test_help_names_every_command_argument_and_option(capsys: Any) -> None:
         ([], "COMMAND"),
         (["simulate"], "invalid choice: 'simulate'"),
         (["identify"], "DATA.csv"),
-        (["identify", "rig.toml", "--steps", "1"], "unrecognized arguments: --steps"),
-        (["identify", "rig.toml", "--step", "fast"], "invalid float value: 'fast'"),
+        (["identify", "rig.toml", "--step", "1"], "unrecognized arguments: --step"),
+        (["identify", "rig.toml", "--rtol", "fast"], "invalid float value: 'fast'"),
     ],
 )
 def test_a_wrong_command_line_shows_the_usage_and_ends_with_2(arguments: list[str], message: str, capsys: Any) -> None:
@@ -85,16 +85,15 @@ ERRORS: dict[str, tuple[list[str], str]] = {
         ["data.csv", "misspelt.toml"],
         "misspelt.toml: unknowns: `contact.K` cannot be identified; what can: ",
     ),
-    "step": (["data.csv", "rig.toml", "--step", "-1"], "step should be greater than or equal to 1e-07, not -1.0"),
-    "tiny step": (
-        ["data.csv", "rig.toml", "--step", "1e-300"],
-        "step should be greater than or equal to 1e-07, not 1e-300",
+    "rtol": (["data.csv", "rig.toml", "--rtol", "-1"], "rtol should be greater than or equal to 1e-08, not -1.0"),
+    "tiny rtol": (
+        ["data.csv", "rig.toml", "--rtol", "1e-300"],
+        "rtol should be greater than or equal to 1e-08, not 1e-300",
     ),
-    "hours": (
-        ["data.csv", "rig.toml", "--step", "1e-7"],
-        "; take a larger step, fewer starts or less data, or say --yes",
+    "many starts": (
+        ["data.csv", "many.toml"],
+        "; take a larger rtol, fewer starts or less data, or say --yes to begin",
     ),
-    "many starts": (["data.csv", "many.toml"], "or say --yes to begin"),
     "deep": (
         ["data.csv", "deep.toml"],
         "deep.toml is not a TOML file that can be read: its tables are nested too deeply",
@@ -160,7 +159,7 @@ def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(folder: 
         scale(column, 1.0, -0.3)(table)
     scale(X_D, 0.5, 30.0)(table)
     write(folder / "data.csv", [cells[:2] + cells[3:] for cells in table])  # without the rate of x_d
-    config = CONFIG.replace('"bracket"', '"disc"').replace("60.3e-3", "60e-3").replace("5e-3", "2e-3")
+    config = CONFIG.replace('"bracket"', '"disc"').replace("60.3e-3", "60e-3")
     (folder / "rig.toml").write_text(config.replace("[unknowns", "control.K_81 = 1e6\ncontrol.R_80 = 0\n[unknowns", 1))
     assert main(["identify", "data.csv", "rig.toml", "--out", "out", "--no-progress"]) == 2
     message = capsys.readouterr().err
@@ -204,10 +203,10 @@ def test_it_writes_answer_and_page(answered: tuple[Path, list[str]]) -> None:
 def test_options_come_before_the_configuration(answered: tuple[Path, list[str]], capsys: Any) -> None:
     folder, files = answered
     out, kept = folder / "coarser", folder / "kept"
-    command = ["identify", *files, "--out", str(out), "--step", "1e-2", "--checkpoint", str(kept), "--no-progress"]
+    command = ["identify", *files, "--out", str(out), "--rtol", "2e-3", "--checkpoint", str(kept), "--no-progress"]
     assert main(command) == 0
     first, second = (json.loads((folder / name / "answer.json").read_text()) for name in ("out", "coarser"))
-    assert (first["stages"][-1]["step"], second["stages"][-1]["step"]) in [(5e-3, 1e-2), (5e-3 / 4, 1e-2 / 4)]
+    assert [{stage["rtol"] for stage in one["stages"]} for one in (first, second)] == [{1e-3}, {2e-3}]
     assert not kept.exists()  # a checkpoint is removed once the answer is there
     text, err = capsys.readouterr()
     assert str(out / "answer.json") in text

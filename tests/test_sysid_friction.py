@@ -19,7 +19,6 @@ from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify
 from torchsoft.sysid.workers import Runner
 
 BASE = Parameters().override(COARSE)
-STEP = 2e-3
 SENSORS = {"x_C": Sensor(noise=1e-5), "theta": Sensor(noise=5e-4), "F_x": Sensor(noise=0.1)}
 JERKS = Excitation(motion=Strokes(travel=30e-3, stroke_time=0.1), duration=0.6, depth=5e-4, grasp_time=0.2, settle=0.05)
 TRUTH = {"contact.friction.alpha": 0.45, "contact.friction.beta": 60.0}
@@ -44,16 +43,16 @@ def rig(settings: Parameters, reference: Reference, alpha: float = 0.6) -> SoftG
 def jerks() -> Recording:
     """Without noise, of the true law; the recording's own model has other numbers."""
     truth = BASE.override({"pad.E": 0.9e6})
-    return record("jerks", JERKS, truth, BASE, SENSORS, step=STEP, noise=0.0, build=rig, values=TRUTH)
+    return record("jerks", JERKS, truth, BASE, SENSORS, noise=0.0, build=rig, values=TRUTH)
 
 
 def test_its_parameters_are_found_beside_those_of_the_pads(jerks: Recording) -> None:
     problem = Problem([jerks], SENSORS, {name: Unknown() for name in (*TRUTH, "pad.E")})
-    answer = identify(problem, plan=[Stage("all", ("jerks",), problem.coordinates.labels, STEP)], polished=False)
+    answer = identify(problem, plan=[Stage("all", ("jerks",), problem.coordinates.labels, 1e-5)])
     assert answer.converged
     for name, value in (*TRUTH.items(), ("pad.E", 0.9e6)):
         assert answer[name].identifiable, name
-        assert answer[name].value == pytest.approx(value, rel=1e-3), name
+        assert abs(answer[name].last / value - 1) < 0.1 * answer[name].relative_sd, name  # of the steps, which differ
     assert answer["contact.friction.alpha"].unit == ""
 
 
@@ -62,19 +61,20 @@ def test_its_derivatives_by_both_routes_are_those_of_differences(jerks: Recordin
     ratio = {"control.K_98": Unknown(ratio_to="control.K_81")}
     problem = Problem([jerks], SENSORS, {"contact.friction.alpha": Unknown()} | slack | ratio)
     x, free, h = problem.coordinates.start, problem.coordinates.free, 1e-5
-    with Runner(problem.recordings) as runner:
-        at = problem.residuals(runner, x, ["jerks"], STEP, free)
-        for i, label in enumerate(problem.coordinates.labels):
-            ahead, behind = (problem.residuals(runner, x + s * h * np.eye(3)[i], ["jerks"], STEP).r for s in (1, -1))
-            slope = (ahead - behind) / (2 * h)
-            assert np.linalg.norm(at.J[:, i] - slope) < 2e-4 * np.linalg.norm(slope), label
-        loss, gradient, lost = problem.misfit(runner, x, ["jerks"], STEP, free)
+    runner = Runner(problem.recordings)
+    _, steps = problem.freeze(runner, x, ["jerks"], 1e-4)
+    at = problem.residuals(runner, x, ["jerks"], steps, free)
+    for i, label in enumerate(problem.coordinates.labels):
+        ahead, behind = (problem.residuals(runner, x + s * h * np.eye(3)[i], ["jerks"], steps).r for s in (1, -1))
+        slope = (ahead - behind) / (2 * h)
+        assert np.linalg.norm(at.J[:, i] - slope) < 2e-4 * np.linalg.norm(slope), label
+    loss, gradient, lost = problem.misfit(runner, x, ["jerks"], steps, free)
     assert not lost
     assert loss == pytest.approx(0.5 * at.r @ at.r, rel=1e-12)
     np.testing.assert_allclose(gradient, at.J.T @ at.r, rtol=1e-8, atol=1e-8 * np.abs(gradient).max())
 
 
-def test_worker_processes_can_be_given_it(jerks: Recording) -> None:
+def test_it_can_be_sent_to_another_process(jerks: Recording) -> None:
     there = pickle.loads(pickle.dumps(jerks))
     assert isinstance(there.begin().model.contact.friction, Viscous)
     assert there.fingerprint == jerks.fingerprint

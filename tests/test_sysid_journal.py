@@ -3,9 +3,9 @@
 import os
 import pickle
 import struct
+import threading
+import time
 from collections.abc import Callable
-from concurrent import futures
-from concurrent.futures import Future, ThreadPoolExecutor
 from hashlib import sha256
 from io import BytesIO
 from pathlib import Path
@@ -17,15 +17,18 @@ import pytest
 
 from torchsoft.sysid import workers
 from torchsoft.sysid.journal import MARKER, Journal, decoded, encoded, forget
-from torchsoft.sysid.prediction import FailedRun, Misfit, Prediction
+from torchsoft.sysid.prediction import FailedRun, Frozen, Misfit, Prediction
 from torchsoft.sysid.workers import Job, Runner
 
 ODD = np.array([0.0, -0.0, np.nan, np.inf, -np.inf, 5e-324, 0.1 + 0.2, 1e308])
-PREDICTION = Prediction(ODD, np.stack([ODD, -ODD], 1), np.asfortranarray(np.ones((8, 2, 3)) * ODD[:, None, None]), 12)
+PREDICTION = Prediction(
+    ODD, np.stack([ODD, -ODD], 1), 12, np.asfortranarray(np.ones((8, 2, 3)) * ODD[:, None, None]), ODD[5:]
+)  # fmt: skip
 RESULTS = {
     "prediction": PREDICTION,
     "without derivatives": PREDICTION._replace(derivatives=None),
-    "nothing": Prediction(np.zeros(0), np.zeros((0, 2)), np.zeros((0, 2, 0)), 0),
+    "on frozen steps": PREDICTION._replace(knots=None),
+    "nothing": Prediction(np.zeros(0), np.zeros((0, 2)), 0, np.zeros((0, 2, 0))),
     "misfit": Misfit(0.1 + 0.2, ODD, np.zeros(0), -ODD, 7),
     "infinite misfit": Misfit(float("inf"), ODD, ODD, ODD, 7),
     "failed": FailedRun("the disc was lost at t = 0.1 s: µ_s, 'quoted'", 0.1),
@@ -183,25 +186,34 @@ def test_it_goes_on_where_another_was_done_with_the_folder(tmp_path: Path) -> No
     assert same(journal(tmp_path / "runs").recall(RUN), PREDICTION)
 
 
-def test_what_is_done_is_kept_at_an_interruption(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Though a run before it is not done yet; and so is what runs on until the processes end."""
-    jobs = [Job(0, {"pad.E": float(k)}, (), 1e-3) for k in range(3)]
-    interrupted: list[bool] = []
+@pytest.mark.parametrize("count", [1, 2])
+def test_what_is_done_is_kept_at_an_interruption(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    """What was done before it, and what another thread still runs when it comes."""
+    jobs = [Job(0, {"pad.E": float(k)}, (), 1e-3) for k in range(4)]
+    running = threading.Barrier(count)
 
-    def as_completed(given: Any) -> Any:
-        last: Future[Any] = list(given)[-1]
-        if not interrupted:
-            yield last
-            interrupted.append(True)
+    def made(recording: Any, start: Any, job: Job) -> Prediction:
+        if job is jobs[0] or (job is jobs[1] and count == 2):
+            running.wait()
+        if job is jobs[count - 1]:
             raise KeyboardInterrupt
-        yield from futures.as_completed(given)
+        time.sleep(0.1)
+        return PREDICTION._replace(steps=int(job.values["pad.E"]))
 
-    monkeypatch.setattr(workers, "as_completed", as_completed)
-    monkeypatch.setattr(workers, "_run", lambda job: PREDICTION._replace(steps=int(job.values["pad.E"])))
-    recordings: Any = [SimpleNamespace(fingerprint="a")]
-    with Runner(recordings, journal=tmp_path) as runner, ThreadPoolExecutor(1) as pool:
-        runner._pool = pool  # pyright: ignore[reportAttributeAccessIssue]
-        with pytest.raises(KeyboardInterrupt):
-            runner.run(jobs)
+    monkeypatch.setattr(workers, "simulated", made)
+    recordings: Any = [SimpleNamespace(fingerprint="a", duration=1.0, begin=lambda: None)]
+    with pytest.raises(KeyboardInterrupt):
+        Runner(recordings, workers=count, journal=tmp_path).run(jobs)
     again = Journal(tmp_path, recordings)
-    assert [again.recall(job) is not None for job in jobs] == [True, True, True]
+    kept = [again.recall(job) is not None for job in jobs]
+    assert kept[:count] == [True, False][2 - count :]
+    assert not all(kept)
+
+
+def test_frozen_steps_are_named_to_the_bit(tmp_path: Path) -> None:
+    knots = np.array([0.0, 0.1, 0.3])
+    job = Job(0, {"pad.E": 1.0}, (), Frozen(knots))
+    journal(tmp_path).keep(job, PREDICTION)
+    assert same(journal(tmp_path).recall(job._replace(steps=Frozen(knots.copy()))), PREDICTION)
+    assert journal(tmp_path).recall(job._replace(steps=Frozen(np.nextafter(knots, 1.0)))) is None
+    assert journal(tmp_path).recall(job._replace(steps=1e-3)) is None

@@ -41,7 +41,7 @@ y_Br.noise = 10e-6
 F_y.noise = 0.1
 
 [fit]
-step = 5e-3
+rtol = 1e-3
 """
 
 SIGNALS = ("x_d", "y_d", "F_ff")
@@ -166,9 +166,10 @@ BAD_CONFIG = {
     "not a number": (CONFIG.replace("60.3e-3", '"here"'), r"scenario\.x_C0 should be a valid number, not 'here'"),
     "other pads": (CONFIG.replace("contact.v_s", "pad.height = 3e-3\ncontact.v_s"), r"touch .* at 46.92 mm \(twice pad.height"),
     "bounds": (CONFIG.replace("nominal = 1e5", "low = 2\nhigh = 1"), r"unknowns\.contact\.K_n: low = 2.0 must be below"),
-    "step": (CONFIG.replace("step = 5e-3", "step = -1"), r"fit\.step should be greater than or equal to 1e-07, not -1"),
+    "rtol": (CONFIG.replace("rtol = 1e-3", "rtol = -1"), r"fit\.rtol should be greater than or equal to 1e-08, not -1"),
+    "step": (CONFIG.replace("rtol = 1e-3", "step = 5e-3"), r"fit: .*tolerances choose the steps; leave it out, or give"),
     "method": (CONFIG + 'method = "magic"\n', r"fit\.method should be 'gauss_newton'"),
-    "text for a number": (CONFIG.replace("step = 5e-3", 'step = "5e-3"'), r"fit\.step should be a valid number, not '5e-3'"),
+    "text for a number": (CONFIG.replace("rtol = 1e-3", 'rtol = "1e-3"'), r"fit\.rtol should be a valid number, not '1e-3'"),
     "truth for a number": (CONFIG.replace("nominal = 1e5", "nominal = true"), r"nominal should be a valid number, not True"),
     "a disc that fits nowhere": (
         CONFIG.replace('unknowns."pad.E"]\nnominal = 0.7e6', 'unknowns."disc.radius"]'),
@@ -230,7 +231,7 @@ def made() -> tuple[Any, Recording]:
     sensors = {channel: Sensor(noise=1e-5) for channel in MEASURED}
     excitation = Excitation(motion=Strokes(travel=4e-3, stroke_time=0.15), duration=0.4, depth=1.2e-3, senses="bracket",
                             grasp_time=0.15, settle=0.0)  # fmt: skip
-    return script, record("short", excitation, script.TRUTH, script.NOMINAL, sensors, step=2.5e-3)
+    return script, record("short", excitation, script.TRUTH, script.NOMINAL, sensors, rtol=1e-4)
 
 
 def test_a_recording_survives_the_way_through_csv(made: tuple[Any, Recording], tmp_path: Path) -> None:
@@ -327,19 +328,20 @@ def test_a_mistake_in_a_trajectory_file_is_named(run: Trajectory, tmp_path: Path
         read_table(tmp_path / "twice.nc")
 
 
-def test_samples_much_denser_than_the_step_are_not_all_steps(case: Callable[..., list[str]]) -> None:
+def test_samples_much_denser_than_the_motion_are_not_all_simulated(case: Callable[..., list[str]]) -> None:
     (one,) = load(*_split(case())).problem.recordings
     t, x = one.samples["x_C"]
     dense = np.linspace(t[0], t[-1], 20_001)
     many = replace(one, samples={"x_C": (dense, np.interp(dense, t, x))})
-    assert many.spacing(5e-3, False) == 5e-3 / 4
-    grid = many.grid(5e-3, False).numpy()
-    assert len(grid) < 500
+    grid = many.grid(False).numpy()
+    assert len(grid) < 600
     assert grid[1] <= dense[0] < dense[-1] <= grid[-1]
-    assert one.spacing(5e-3, False) is None
-    np.testing.assert_array_equal(one.grid(5e-3, False)[1:], one.times)
-    coarse = one.grid(20e-3, True).numpy()  # a grid between the samples begins after the disc has begun to settle
-    assert np.all(np.diff(coarse) > 0)
+    np.testing.assert_array_equal(one.grid(False)[1:], one.times)
+    irregular = np.sort(np.random.default_rng(0).uniform(t[0], t[-1], 100))
+    few = replace(one, samples={"x_C": (irregular, np.interp(irregular, t, x))})
+    np.testing.assert_array_equal(few.grid(False)[1:], irregular)
+    between = one.grid(True).numpy()  # begins after the disc has begun to settle
+    assert np.all(np.diff(between) > 0)
 
 
 def _split(files: list[str]) -> tuple[list[str], str]:
@@ -348,11 +350,11 @@ def _split(files: list[str]) -> tuple[list[str], str]:
 
 def test_a_long_identification_is_priced(case: Callable[..., list[str]]) -> None:
     made = load(*_split(case())).problem
-    assert cost(made, 5e-3, 1, 1).seconds < 60
-    assert cost(made, 5e-3, 1_000_000, 1).seconds > 1e5
-    assert cost(made, 1e-7, 1, 1).seconds > 1e4
+    assert cost(made, 1e-3, 1, 1).seconds < 60
+    assert cost(made, 1e-3, 1_000_000, 1).seconds > 1e5
+    assert cost(made, 1e-8, 1, 1).seconds > 3 * cost(made, 1e-5, 1, 1).seconds
     delayed = load(*_split(case(config=CONFIG + "[sensors.theta]\nnoise = 1e-3\ndelay = 2e-3\n"))).problem
-    assert cost(delayed, 1e-5, 1, 1, method="adam").memory > 10 > cost(delayed, 1e-5, 1, 1).memory
+    assert cost(delayed, 1e-5, 1, 1, method="adam").memory > cost(delayed, 1e-5, 1, 1).memory
 
 
 def test_recordings_have_settings_of_their_own(case: Callable[..., list[str]], tmp_path: Path) -> None:

@@ -35,11 +35,11 @@ def found() -> tuple[IdentificationResult, Problem]:
     sensors = {"theta": Sensor(noise=5e-4), "y_Br": Sensor(noise=1e-5), "F_y": Sensor(noise=0.1)}
     grasp = Excitation(motion=Strokes(), duration=0.25, depth=1.2e-3, senses="bracket", grasp_time=0.15)
     recordings = [
-        record(name, grasp.model_copy(update={"depth": depth}), truth, p, sensors, step=5e-3, seed=seed)
+        record(name, grasp.model_copy(update={"depth": depth}), truth, p, sensors, rtol=1e-4, seed=seed)
         for seed, (name, depth) in enumerate(((STRANGE, 1.2e-3), ("held", 1e-3)))
     ]
     problem = Problem(recordings, sensors, {name: Unknown() for name in ("contact.K_n", "pad.E", "contact.eta")})
-    return identify(problem, step=5e-3, heldout=["held"]), problem
+    return identify(problem, rtol=1e-3, tightenings=0, heldout=["held"]), problem
 
 
 class Page(HTMLParser):
@@ -154,8 +154,8 @@ def test_a_lost_recording_is_named_and_a_clean_answer_has_no_warnings(
     answer, problem = found
 
     class Losing(Problem):
-        def residuals(self, runner: Any, x: Any, which: Any, step: float, free: Any = None) -> Residuals:
-            got = super().residuals(runner, x, which, step, free)
+        def residuals(self, runner: Any, x: Any, which: Any, steps: Any, free: Any = None) -> Residuals:
+            got = super().residuals(runner, x, which, steps, free)
             return got._replace(lost={"held": FailedRun("it < went", 0.1)}) if "held" in which else got
 
     losing = Losing(problem.recordings, problem.sensors, problem.unknowns)

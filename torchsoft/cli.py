@@ -32,8 +32,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "files", nargs="+", type=Path, metavar="DATA.csv ... CONFIG.toml", help="data files and one configuration"
     )
     one.add_argument("--out", type=Path, default=Path("out/identify"), help="folder for the results (%(default)s)")
-    one.add_argument("--workers", type=int, help="processes, one recording each (fit.workers)")
-    one.add_argument("--step", type=float, help="the simulation's step [s] (fit.step)")
+    one.add_argument("--workers", type=int, help="threads, one recording each (fit.workers)")
+    one.add_argument("--rtol", type=float, help="relative tolerance that chooses the simulation's steps (fit.rtol)")
     one.add_argument("--checkpoint", type=Path, help="folder for what is unfinished (OUT/unfinished)")
     one.add_argument("--yes", action="store_true", help="begin even what takes hours, or much memory")
     one.add_argument("--no-progress", action="store_true", help="show no progress")
@@ -66,12 +66,12 @@ def identify(options: argparse.Namespace) -> int:
         try:
             case = measured.load(data, configs[0])
             fit, tables = case.config.fit, case.tables
-            changed = {"step": options.step, "workers": options.workers}
+            changed = {"rtol": options.rtol, "workers": options.workers}
             fit = measured.Settings.model_validate(
                 fit.model_dump() | {k: v for k, v in changed.items() if v is not None}
             )
-            expected = cost(case.problem, fit.step, fit.starts, fit.workers, case.config.heldout, fit.method)
-            agree(expected, options.yes, "take a larger step, fewer starts or less data")
+            expected = cost(case.problem, fit.rtol, fit.starts, fit.workers, case.config.heldout, fit.method)
+            agree(expected, options.yes, "take a larger rtol, fewer starts or less data")
             options.out.mkdir(parents=True, exist_ok=True)
             result = identify(
                 case.problem, heldout=case.config.heldout, checkpoint=unfinished, progress=not options.no_progress,

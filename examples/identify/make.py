@@ -52,7 +52,7 @@ def write(recording: Recording, path: Path, digits: int = 7) -> None:
 
 def make(name: str, seed: int) -> Recording:
     sensors = {channel: Sensor(noise=noise) for channel, noise in SENSORS.items()}
-    return record(name, RECORDINGS[name], TRUTH, NOMINAL, sensors, step=5e-4, seed=seed)
+    return record(name, RECORDINGS[name], TRUTH, NOMINAL, sensors, seed=seed)
 
 
 if __name__ == "__main__":

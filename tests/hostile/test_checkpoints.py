@@ -25,7 +25,7 @@ pytestmark = pytest.mark.slow
 BASE = Parameters().override(COARSE)
 SENSORS = {"x_C": Sensor(noise=1e-5), "y_Br": Sensor(noise=1e-5), "F_y": Sensor(noise=0.1)}
 STROKES = Excitation(motion=Strokes(travel=5e-3, stroke_time=0.15), duration=0.4, senses="bracket")
-STEP = 5e-3
+RTOL = 1e-3
 
 
 class Done(NamedTuple):
@@ -39,7 +39,7 @@ class Done(NamedTuple):
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
-    recorded = record("strokes", STROKES, BASE.override({"pad.E": 0.9e6}), BASE, SENSORS, step=STEP, seed=3)
+    recorded = record("strokes", STROKES, BASE.override({"pad.E": 0.9e6}), BASE, SENSORS, rtol=RTOL, seed=3)
     problem = Problem([recorded], SENSORS, {"pad.E": Unknown(nominal=1.1e6), "contact.K_n": Unknown()})
     folder, runs = tmp_path_factory.mktemp("checkpoint") / "runs", {}
     inner = Journal.keep
@@ -50,7 +50,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Journal, "keep", noticed)
-        answer = identify(problem, step=STEP, checkpoint=folder)
+        answer = identify(problem, rtol=RTOL, checkpoint=folder)
     assert len(runs) >= 5
     return Done(problem, answer, folder, runs)
 
@@ -160,7 +160,7 @@ def test_the_answer_keeps_its_bits(
             plant(done, folder / str(name), str(rng.choice(kinds)), rng, trap)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            answer = identify(done.problem, step=STEP, checkpoint=folder)
+            answer = identify(done.problem, rtol=RTOL, checkpoint=folder)
         held = bits(answer) == bits(done.answer) and not trap.path.exists()
         for name, (run, expected) in done.runs.items():
             held = held and same(Journal(folder, done.problem.recordings).recall(run), expected)

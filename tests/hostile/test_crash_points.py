@@ -138,9 +138,9 @@ def test_results_of_an_identification(
     p = Parameters().override({"contact.v_s": 0.05, "pad.elements_x": 40, "pad.elements_y": 1})
     sensors = {"theta": Sensor(noise=5e-4), "F_y": Sensor(noise=0.1)}
     grasp = Excitation(motion=Strokes(), duration=0.25, depth=1.2e-3, senses="bracket", grasp_time=0.15)
-    recordings = [record("grasp", grasp, p.override({"pad.E": 0.9e6}), p, sensors, step=5e-3, seed=1)]
+    recordings = [record("grasp", grasp, p.override({"pad.E": 0.9e6}), p, sensors, rtol=1e-3, seed=1)]
     problem = Problem(recordings, sensors, {"pad.E": Unknown()})
-    result = identify(problem, step=5e-3)
+    result = identify(problem, rtol=1e-3)
     text = page.page(result, problem, *page.traces(result, problem, None))
     monkeypatch.setattr(page, "page", lambda *_: text)  # drawn once
     monkeypatch.setattr(page, "traces", lambda *_: ([], {}))

@@ -71,7 +71,7 @@ def test_random_arguments(folder: Path, tally: Callable[[str], Tally], capsys: p
     begun = RuntimeError("begun")
     both = ("--workers", "--out", "--yes", "--seed")
     for name, line, run, options in (
-        ("identify", tally("command lines: identify"), cli.main, (*both, "--step", "--checkpoint", "--no-progress")),
+        ("identify", tally("command lines: identify"), cli.main, (*both, "--rtol", "--checkpoint", "--no-progress")),
         ("generate", tally("command lines: generate"), generation.main, both),
     ):
         with (
@@ -102,8 +102,7 @@ def test_random_arguments(folder: Path, tally: Callable[[str], Tally], capsys: p
 
 
 COMMANDS: tuple[tuple[list[str], str], ...] = (
-    (["torchsoft", "identify", "data.csv", "rig.toml", "--step", "1e-300"], "step"),
-    (["torchsoft", "identify", "data.csv", "rig.toml", "--step", "1e-7"], "--yes"),
+    (["torchsoft", "identify", "data.csv", "rig.toml", "--rtol", "1e-300"], "rtol"),
     (["torchsoft", "identify", "data.csv", "many.toml"], "--yes"),
     (["torchsoft", "identify", "data.csv", "µ.toml"], "µ"),
     (["torchsoft", "identify", "µ.csv", "rig.toml"], "x_Ç"),

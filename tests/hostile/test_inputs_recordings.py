@@ -31,7 +31,7 @@ from torchsoft.sysid.workers import Runner
 pytestmark = pytest.mark.slow
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "identify"
-STEP = 5e-3
+RTOL = 1e-3
 
 Table = list[list[str]]
 
@@ -57,7 +57,7 @@ def config() -> dict[str, Any]:
     tree["unknowns"]["contact.mu_s"] |= {"nominal": 0.9, "low": 0.5, "high": 2.0}
     tree["unknowns"]["pad.nu"] = {"scale": "linear", "low": 0.3, "high": 0.49}
     tree["sensors"]["theta"] = {"noise": 0.5e-3, "bias": 1e-3, "delay": 2e-3}
-    tree["fit"] = {"step": STEP, "starts": 1, "loss": "linear", "method": "gauss_newton", "workers": 1, "seed": 0}
+    tree["fit"] = {"rtol": RTOL, "starts": 1, "loss": "linear", "method": "gauss_newton", "workers": 1, "seed": 0}
     tree["recordings"] = [{"file": "second.csv", "name": "second", "settings": {"contact.v_s": 0.06}}]
     tree["heldout"] = ["second"]
     return tree
@@ -72,12 +72,12 @@ def written(cells: Table, delimiter: str = ",", end: str = "\n") -> bytes:
 def one_run(case: measured.Case) -> None:
     """The estimate, and one run from the start: residuals are finite, or the reason is a sentence."""
     problem, fit = case.problem, case.config.fit
-    expected = cost(problem, fit.step, fit.starts, fit.workers, case.config.heldout)
+    expected = cost(problem, fit.rtol, fit.starts, fit.workers, case.config.heldout)
     assert np.isfinite(expected).all(), f"no estimate: {expected}"
-    if max(r.settings.pad.memory for r in problem.recordings) > 1e-3 or cost(problem, STEP, 1, 1).steps > 1e5:
+    if max(r.settings.pad.memory for r in problem.recordings) > 1e-3 or cost(problem, RTOL, 1, 1).steps > 1e5:
         return
-    with Runner(problem.recordings) as runner:
-        out = problem.residuals(runner, problem.coordinates.start, problem.names[:1], STEP, problem.coordinates.free)
+    runner = Runner(problem.recordings)
+    out = problem.residuals(runner, problem.coordinates.start, problem.names[:1], RTOL, problem.coordinates.free)
     if out.lost:
         assert all(sentence(lost.reason) for lost in out.lost.values()), out.lost
     else:

@@ -8,14 +8,17 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from torchsoft.sysid.information import standard_deviations
+from torchsoft.sysid.information import shift, standard_deviations
 from torchsoft.sysid.prediction import FailedRun
-from torchsoft.sysid.problem import Problem, Residuals
+from torchsoft.sysid.problem import Problem, Residuals, StepsByName
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.workers import Runner
 
 Loss = Literal["linear", "soft_l1", "huber", "cauchy", "arctan"]
 Notify = Callable[[float], None]
+
+SETTLED = 0.2
+"""Part of a standard deviation by which a coordinate may still move where a fit has ended."""
 
 
 class Unreachable(RuntimeError):
@@ -28,79 +31,92 @@ class Unreachable(RuntimeError):
 
 
 class Fit(NamedTuple):
-    """Where a fit ended: coordinates x (n,), chi2 (sum of squared residuals over their number), evaluations, and whether
-    it converged."""
+    """Where a fit on `steps` ended: coordinates x (n,), chi2 (sum of squared residuals over their number), evaluations, whether
+    it converged, and the residuals there with their Jacobian, if that was computed."""
 
     x: Array
     chi2: float
     evaluations: int
     converged: bool
+    steps: StepsByName
+    at: Residuals | None = None
 
 
 def gauss_newton(
-    problem: Problem, runner: Runner, x: Array, *, which: Sequence[str], free: NDArray[np.bool_], step: float,
+    problem: Problem, runner: Runner, x: Array, *, which: Sequence[str], free: NDArray[np.bool_], steps: StepsByName,
     evaluations: int = 30, tolerance: float = 1e-6, loss: Loss = "linear", notify: Notify = lambda chi2: None,
+    first: Residuals | None = None,
 ) -> Fit:  # fmt: skip
     """`scipy.optimize.least_squares` (trust-region reflective, bounded, robust `loss`) on the coordinates that are `free`.
 
-    `tolerance` is relative, on the misfit and on the coordinates. A trial that cannot be simulated shortens the step.
+    `tolerance` is relative, on the misfit and on the coordinates. A trial that cannot be simulated shortens the step. `first`
+    holds residuals and Jacobian at x, if they are known.
     Raises `Unreachable` where the start cannot be simulated.
     """
     low, high = problem.coordinates.bounds
     gap = 1e-9 * (high - low)
     begin = np.clip(x, low + gap, high - gap)
-    latest: dict[bytes, Residuals] = {}
+    zero = np.zeros(int(free.sum()))
+    seen = {zero.tobytes(): first} if first is not None and (begin == x).all() else {}  # the best and the latest
+
+    def moved(z: Array) -> Array:
+        trial = begin.copy()
+        trial[free] += z
+        return trial
 
     def at(z: Array) -> Residuals:
         key = z.tobytes()
-        if key not in latest:
-            trial = begin.copy()
-            trial[free] += z
-            latest.clear()
-            latest[key] = problem.residuals(runner, trial, which, step, free)
-            notify(float(np.mean(latest[key].r ** 2)))
-        return latest[key]
+        if key not in seen:
+            best = min(seen, key=lambda k: float(seen[k].r @ seen[k].r), default=key)
+            for old in seen.keys() - {best}:
+                del seen[old]
+            seen[key] = problem.residuals(runner, moved(z), which, steps, free)
+            notify(float(np.mean(seen[key].r ** 2)))
+        return seen[key]
 
-    zero = np.zeros(int(free.sum()))
-    if (first := at(zero)).lost:
-        raise Unreachable(first.lost)
+    if lost := at(zero).lost:
+        raise Unreachable(lost)
     solve: Any = least_squares
     out = solve(
         lambda z: at(z).r, zero, jac=lambda z: at(z).J[:, free], bounds=(low[free] - begin[free], high[free] - begin[free]),
         loss=loss, max_nfev=evaluations, ftol=tolerance, xtol=tolerance, gtol=1e-12,
     )  # fmt: skip
-    end = begin.copy()
-    end[free] += out.x
-    return Fit(end, float(np.mean(out.fun**2)), int(out.nfev), out.status > 0)
+    return Fit(moved(out.x), float(np.mean(out.fun**2)), int(out.nfev), out.status > 0, steps, at(out.x))
 
 
-def polish(
-    problem: Problem, runner: Runner, x: Array, J: Array, *, which: Sequence[str], free: NDArray[np.bool_], step: float,
-    rounds: int = 5, notify: Notify = lambda chi2: None,
-) -> tuple[Fit, Residuals]:  # fmt: skip
-    """From a fit at a coarse step to the one at a finer `step` [s]: residuals of the finer runs, and the coarse Jacobian J
-    (m, n), a chord method, until the coordinates move by less than a fifth of a standard deviation. A round costs a run, not
-    a Jacobian. Returns where that ended, and the residuals there, with J. Failed runs end it where it began.
+def chord(
+    problem: Problem, runner: Runner, x: Array, at: Residuals, *, which: Sequence[str], free: NDArray[np.bool_],
+    steps: StepsByName, rounds: int = 5, notify: Notify = lambda chi2: None,
+) -> Fit:  # fmt: skip
+    """From a fit on other steps to the one on these: `at` holds the residuals at x on these steps, and the Jacobian on the
+    others, which is kept; until a coordinate would move by less than `SETTLED` standard deviations. A round costs a run, not
+    a Jacobian. It ends where a run fails or the misfit grows.
     """
-    low, high = problem.coordinates.bounds
-    sd = standard_deviations(J[:, free])
-    at, count, converged = problem.residuals(runner, x, which, step), 1, False
-    while count <= rounds and not at.lost:
-        notify(float(np.mean(at.r**2)))
-        move, trial = np.linalg.lstsq(J[:, free], -at.r, rcond=None)[0], x.copy()
-        trial[free] = np.clip(x[free] + move, low[free], high[free])
-        there, count = problem.residuals(runner, trial, which, step), count + 1
+    count = 0
+    while not (converged := settled(problem, x, at, free)) and count < rounds:
+        trial = x.copy()
+        trial[free] = x[free] + newton_step(problem, x, at, free)
+        there, count = problem.residuals(runner, trial, which, steps), count + 1
         if there.lost or there.r @ there.r > at.r @ at.r:
             break
-        x, at = trial, there
-        converged = bool((np.abs(move) < 0.2 * sd).all())
-        if converged:
-            break
-    return Fit(x, float(np.mean(at.r**2)), count, converged), Residuals(at.r, J, at.lost)
+        x, at = trial, there._replace(J=at.J)
+        notify(float(np.mean(at.r**2)))
+    return Fit(x, float(np.mean(at.r**2)), count, converged, steps, at)
+
+
+def newton_step(problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_]) -> Array:
+    """What Gauss-Newton adds to the free coordinates at x, within their bounds."""
+    low, high = (bound[free] for bound in problem.coordinates.bounds)
+    return np.clip(x[free] - shift(at.J[:, free], at.r), low, high) - x[free]
+
+
+def settled(problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_]) -> bool:
+    """Whether that is less than `SETTLED` standard deviations for all of them."""
+    return bool((np.abs(newton_step(problem, x, at, free)) <= SETTLED * standard_deviations(at.J[:, free])).all())
 
 
 def descend(
-    problem: Problem, runner: Runner, x: Array, *, which: Sequence[str], free: NDArray[np.bool_], step: float,
+    problem: Problem, runner: Runner, x: Array, *, which: Sequence[str], free: NDArray[np.bool_], steps: StepsByName,
     method: Literal["lbfgs", "adam"] = "lbfgs", evaluations: int = 100, rate: float = 0.05,
     notify: Notify = lambda chi2: None,
 ) -> Fit:  # fmt: skip
@@ -120,7 +136,7 @@ def descend(
     def closure() -> float:
         nonlocal best, count
         now = coordinates()
-        value, gradient, lost = problem.misfit(runner, now.detach().numpy(), which, step, free)
+        value, gradient, lost = problem.misfit(runner, now.detach().numpy(), which, steps, free)
         if lost and count == 0:
             raise Unreachable(lost)
         count += 1
@@ -141,4 +157,4 @@ def descend(
         optimiser = torch.optim.Adam([z], lr=rate)
         for _ in range(evaluations):
             optimiser.step(closure)
-    return Fit(best[1], 2 * best[0] / samples, count, count < evaluations)
+    return Fit(best[1], 2 * best[0] / samples, count, count < evaluations, steps)

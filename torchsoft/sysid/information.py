@@ -18,12 +18,7 @@ def standard_deviations(J: Array) -> Array:
     return np.sqrt(np.diag(fisher(J)[0]))
 
 
-def step_error(r: Array, finer: Array) -> Array:
-    """Minus the error (m,) of residuals r by the finite step, from those at half of it: the method is of second order, so
-    the exact residuals are finer + (finer - r) / 3."""
-    return 4.0 / 3.0 * (finer - r)
-
-
-def step_shift(J: Array, error: Array) -> Array:
-    """How far a step's `error` (m,) has moved the coordinates (n,)."""
-    return np.asarray(np.linalg.lstsq(J, error, rcond=None)[0], np.float64)
+def shift(J: Array, difference: Array) -> Array:
+    """How far coordinates (n,) at a least-squares fit are from those of a finer model: `difference` (m,) is what the residuals
+    of the finer one, at the fit, have more."""
+    return np.asarray(np.linalg.lstsq(J, difference, rcond=None)[0], np.float64)

@@ -52,7 +52,7 @@ def decoded(content: bytes) -> Any:
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         fields = {name: archive[name] if archive[name].ndim else archive[name].item() for name in archive.files}
     kind: Any = KINDS[fields.pop("kind")]
-    return kind(**({"derivatives": None} if kind is Prediction else {}) | fields)
+    return kind(**fields)
 
 
 class Journal:

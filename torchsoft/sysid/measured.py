@@ -21,7 +21,7 @@ from torchsoft.sysid.columns import Columns, read_table
 from torchsoft.sysid.fit import Loss, Unreachable
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Recording
-from torchsoft.sysid.solve import Method
+from torchsoft.sysid.solve import RTOL, Method
 from torchsoft.sysid.unknowns import Sensor, Unknown
 from torchsoft.tables import LISTED, SEED, InvalidTable, Table, from_toml, line, refusing
 
@@ -38,12 +38,22 @@ SUNK = 3e-4
 class Settings(Table):
     """How to fit: the arguments of `identify` by the same names."""
 
-    step: float = Field(5e-4, ge=1e-7, le=0.02)
+    rtol: float = Field(RTOL, ge=1e-8, le=1e-2)
     starts: int = Field(1, ge=1, le=2**20)
     loss: Loss = "linear"
     method: Method = "gauss_newton"
     workers: int = Field(1, ge=1, le=1000)
     seed: int = Field(0, ge=0, le=SEED)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_no_step(cls, given: Any) -> Any:
+        if isinstance(given, dict) and "step" in given:
+            raise ValueError(
+                "there is no `step` any more: tolerances choose the steps; leave it out, or give the relative tolerance `rtol` "
+                f"({RTOL:g})"
+            )
+        return given
 
 
 class Entry(Table):

@@ -1,9 +1,9 @@
 """Stages: which data, which unknowns, which ties, in which order.
 
 A fit of everything at once, from far away, ends in a local minimum or in runs that cannot be simulated. So: first the
-slowest recording, at a coarse step, for what it can identify; then all of them, with ratios (kinetic over static friction) tied
-at their upper bound, because friction that does not fall with slip always has a solution; then a scan over each ratio; then
-everything free, at the full step.
+slowest recording, for what it can identify; then all of them, with ratios (kinetic over static friction) tied at their upper
+bound, because friction that does not fall with slip always has a solution; then a scan over each ratio, and everything free.
+Tolerances are loose in the beginning, and the last stage takes the full one.
 """
 
 from collections.abc import Sequence
@@ -22,11 +22,11 @@ FIRST_LOOK = 0.1
 """A coordinate takes part in the first look if its predicted standard deviation [1] is below this: one that is barely
 identifiable would run off to make up for what is still wrong elsewhere."""
 
-COARSE = (4.0, 2.0)
-"""The first look and the second stage take steps this many times the full one."""
+LOOSE, USUAL = 1e-3, 1e-4
+"""Relative tolerances of the stages with ratios tied, and of those before the last one."""
 
-FIRST, ALL, LAST = 8, 15, 40
-"""Evaluations that the first look, the second stage and the last one may take."""
+FIRST, ALL, FREE, LAST = 8, 15, 30, 20
+"""Evaluations that each of the stages may take."""
 
 SCANNED = (1.0, 0.85, 0.7, 0.55)
 """Parts of its upper bound at which a ratio is tried before it is set free."""
@@ -34,16 +34,17 @@ SCANNED = (1.0, 0.85, 0.7, 0.55)
 
 @dataclass(frozen=True)
 class Stage:
-    """One fit: recordings, free coordinates by label, step [s], how long, and what is set or scanned before it.
+    """One fit: recordings, free coordinates by label, the relative tolerance that chooses its steps, how long, and what is set
+    or scanned before it.
 
-    `tied` sets coordinates to values; `scanned` tries each value, the others held, and keeps the best. With `starts` above
-    one, that many Sobol points within a factor `spread` of the start are fitted, and the best end goes on.
+    `tied` sets coordinates to values; `scanned` tries each value, by `LOOSE`, the others held, and keeps the best. With
+    `starts` above one, that many Sobol points within a factor `spread` of the start are fitted, and the best end goes on.
     """
 
     name: str
     recordings: tuple[str, ...]
     free: tuple[str, ...]
-    step: float
+    rtol: float
     evaluations: int = 30
     tolerance: float = 1e-6
     tied: tuple[tuple[str, float], ...] = ()
@@ -72,7 +73,7 @@ def visible(J: Array, candidates: NDArray[np.bool_], limit: float = FIRST_LOOK) 
     return out
 
 
-def default_plan(problem: Problem, runner: Runner, step: float, which: Sequence[str], starts: int = 1) -> list[Stage]:
+def default_plan(problem: Problem, runner: Runner, rtol: float, which: Sequence[str], starts: int = 1) -> list[Stage]:
     """Stages for some recordings: the slowest first, for what its Fisher matrix at the start makes identifiable.
 
     Raises `Unreachable` where that recording cannot be simulated from the start.
@@ -82,27 +83,18 @@ def default_plan(problem: Problem, runner: Runner, step: float, which: Sequence[
     x, labels = tie_ratios(problem, c.start), np.array(c.labels, object)
     speed = {recording.name: recording.speed for recording in problem.recordings}
     order = sorted(which, key=lambda name: speed[name])
-    look = problem.residuals(runner, x, order[:1], COARSE[0] * step, free)
+    loose, usual = max(LOOSE, rtol), max(USUAL, rtol)
+    look = problem.residuals(runner, x, order[:1], loose, free)
     if look.lost:
         raise Unreachable(look.lost)
     ties = tuple((c.all[i].label, c.all[i].high) for i in np.flatnonzero(ratios))
-    first = visible(look.J, free & ~ratios)
-    plan = [
-        Stage(
-            f"{order[0]}: first look",
-            (order[0],),
-            tuple(labels[first]),
-            COARSE[0] * step,
-            FIRST,
-            1e-2,
-            ties,
-            starts=starts,
-        )
-    ]
+    slowest, first = (order[0],), tuple(labels[visible(look.J, free & ~ratios)])
+    plan = [Stage(f"{order[0]}: first look", slowest, first, loose, FIRST, 1e-2, ties, starts=starts)]
     if len(order) > 1 or ratios.any():
-        plan.append(
-            Stage("all data, ratios tied", tuple(order), tuple(labels[free & ~ratios]), COARSE[1] * step, ALL, 1e-2)
-        )
+        plan.append(Stage("all data, ratios tied", tuple(order), tuple(labels[free & ~ratios]), loose, ALL, 1e-2))
     scans = tuple((c.all[i].label, tuple(part * c.all[i].high for part in SCANNED)) for i in np.flatnonzero(ratios))
-    plan.append(Stage("everything", tuple(order), tuple(labels[free]), step, LAST, 1e-5, scanned=scans))
+    every, last = (tuple(order), tuple(labels[free])), rtol >= USUAL
+    plan.append(Stage("everything", *every, usual, FREE, 1e-3 if last else 1e-2, scanned=scans))
+    if not last:
+        plan.append(Stage("everything, full tolerance", *every, rtol, LAST, 1e-3))
     return plan

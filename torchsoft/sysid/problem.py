@@ -1,7 +1,7 @@
 """The least-squares problem: recordings, sensors and unknowns; residuals in units of the sensors' noise."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,11 +10,14 @@ from numpy.typing import NDArray
 from torchsoft.channels import MEASURED
 from torchsoft.parameters import ORDERED
 from torchsoft.physics.paper import NAMES
-from torchsoft.sysid.prediction import FailedRun, Prediction, read
+from torchsoft.sysid.prediction import FailedRun, Frozen, Prediction, read
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.unknowns import Coordinates, Sensor, Unknown
 from torchsoft.sysid.workers import Job, Runner
 from torchsoft.tables import line
+
+StepsByName = float | Mapping[str, Frozen]
+"""The steps of runs: a relative tolerance that chooses them, or frozen ones by recording."""
 
 
 class Residuals(NamedTuple):
@@ -93,7 +96,7 @@ class Problem:
         return self.coordinates.values(x, recording.name, recording.parameters)
 
     def jobs(
-        self, x: Array, which: Sequence[str], step: float, free: NDArray[np.bool_] | None, adjoint: bool = False
+        self, x: Array, which: Sequence[str], steps: StepsByName, free: NDArray[np.bool_] | None, adjoint: bool = False
     ) -> list[Job]:
         """One run a recording; with `free` they are differentiated by the parameters that free coordinates (n,) move."""
         c, out = self.coordinates, []
@@ -109,15 +112,27 @@ class Problem:
                 noise = {channel: sensor.noise for channel, sensor in self.sensors.items()}
                 bias, delay = ({ch: c.nuisance(x, ch, kind)[0] for ch in noise} for kind in ("bias", "delay"))
                 nuisance = noise, bias, delay
-            out.append(Job(k, values, names, step, self.interpolated, nuisance))
+            mine = steps[recording.name] if isinstance(steps, Mapping) else steps
+            out.append(Job(k, values, names, mine, self.interpolated, nuisance))
         return out
 
     def residuals(
-        self, runner: Runner, x: Array, which: Sequence[str], step: float, free: NDArray[np.bool_] | None = None
+        self, runner: Runner, x: Array, which: Sequence[str], steps: StepsByName, free: NDArray[np.bool_] | None = None
     ) -> Residuals:
-        """Residuals of some recordings at x (n,); the Jacobian's columns of `free` coordinates."""
-        jobs = self.jobs(x, which, step, free)
+        """Residuals of some recordings at x (n,); the Jacobian's columns of `free` coordinates. On frozen steps they are smooth
+        in x."""
+        jobs = self.jobs(x, which, steps, free)
         return self.gather(x, jobs, runner.run(jobs))
+
+    def freeze(
+        self, runner: Runner, x: Array, which: Sequence[str], rtol: float, free: NDArray[np.bool_] | None = None
+    ) -> tuple[Residuals, dict[str, Frozen]]:
+        """`residuals` by runs whose steps `rtol` chooses, and those steps by recording; none where one is lost."""
+        jobs = self.jobs(x, which, rtol, free)
+        runs = runner.run(jobs)
+        at = self.gather(x, jobs, runs)
+        names = [self.recordings[job.recording].name for job in jobs]
+        return at, {} if at.lost else {name: Frozen(run.knots) for name, run in zip(names, runs)}
 
     def gather(self, x: Array, jobs: Sequence[Job], results: Sequence[Any]) -> Residuals:
         """Residuals at x (n,) from the results of its jobs."""
@@ -153,10 +168,10 @@ class Problem:
         return np.concatenate(rs), np.concatenate(Js)
 
     def misfit(
-        self, runner: Runner, x: Array, which: Sequence[str], step: float, free: NDArray[np.bool_]
+        self, runner: Runner, x: Array, which: Sequence[str], steps: StepsByName, free: NDArray[np.bool_]
     ) -> tuple[float, Array, dict[str, FailedRun]]:
         """Half the sum of squares and its gradient (n,), by the discrete adjoint; infinite where a run is lost."""
-        c, jobs = self.coordinates, self.jobs(x, which, step, free, adjoint=True)
+        c, jobs = self.coordinates, self.jobs(x, which, steps, free, adjoint=True)
         total, gradient, lost = 0.0, np.zeros(len(x)), {}
         for job, got in zip(jobs, runner.run(jobs)):
             name = self.recordings[job.recording].name

@@ -25,17 +25,14 @@ Array = NDArray[np.float64]
 
 Build = Callable[[Parameters, Reference], SoftGrasp]
 """Makes the model of a recording from its settings and reference: `SoftGrasp` itself, or a function that gives it laws of the
-user's own, such as a friction law. Worker processes import it by its name, so it is a function of a module."""
+user's own, such as a friction law."""
 
 SETTLE = 0.2
 """Time [s] that the disc is given, before the first sample, to sink into the pad: twenty of the pads' own times 1/tau."""
 
-SPACINGS = 4
-"""A recording whose samples are spaced in more ways than this is simulated on a regular grid and interpolated."""
-
-DENSE, FINER = 16.0, 4.0
-"""A recording with more samples than this in a step, whose own times would all be steps, is simulated on a regular grid this
-much finer than the step instead."""
+BETWEEN = 1e-3
+"""Spacing [s] of the regular grid that is simulated where samples are needed between (an unknown delay), or are denser than it;
+a cubic spline lies between its points."""
 
 REACH = 0.1
 """Largest delay [s] of a sensor: for so long before the first sample and after the last one runs are known."""
@@ -167,20 +164,16 @@ class Recording:
         """A model with the settings and the reference, and where it starts."""
         return lying(self.build(self.settings, self.reference))
 
-    def spacing(self, step: float, interpolated: bool) -> float | None:
-        """Of the regular grid [s] that is simulated where samples are irregular, much denser than the step, or needed between
-        (`interpolated`); None where it is the samples' own times."""
-        apart = np.diff(self.times)
-        irregular = len(np.unique(np.round(apart / SAME).astype(np.int64))) > SPACINGS
-        if DENSE * float(apart.mean()) < step:
-            return step / FINER
-        return step if interpolated or irregular else None
+    def on_a_grid(self, interpolated: bool) -> bool:
+        """Whether a regular grid is simulated, every `BETWEEN`, in place of the samples' own times: where they are denser, or
+        values between them are needed (`interpolated`)."""
+        return interpolated or self.duration < 0.99 * BETWEEN * (len(self.times) - 1)
 
-    def grid(self, step: float, interpolated: bool) -> Tensor:
-        """Times (G,) [s] to simulate: `SETTLE` before the first sample, then the samples' own, or every `spacing` from `REACH`
+    def grid(self, interpolated: bool) -> Tensor:
+        """Times (G,) [s] to simulate: `SETTLE` before the first sample, then the samples' own, or a regular grid from `REACH`
         before the first to `REACH` after the last."""
-        t, spacing = self.times, self.spacing(step, interpolated)
-        around = t if spacing is None else np.arange(t[0] - REACH, t[-1] + REACH + spacing, spacing)
+        t = self.times
+        around = np.arange(t[0] - REACH, t[-1] + REACH + BETWEEN, BETWEEN) if self.on_a_grid(interpolated) else t
         return torch.from_numpy(np.concatenate(([t[0] - SETTLE], around)))
 
 

@@ -46,15 +46,15 @@ def report(
 
 def traces(result: IdentificationResult, problem: Problem, journal: Path | None) -> tuple[list[Trace], dict[str, str]]:
     """Measured and predicted samples of every recording at the result, and why others could not be simulated."""
-    x, step, out, lost = np.array(result.x), float(result.made_by["step"]), [], {}
+    x, rtol, out, lost = np.array(result.x), float(result.made_by["rtol"]), [], {}
     samples = {recording.name: recording.samples for recording in problem.recordings}
-    with Runner(problem.recordings, journal=journal) as runner:
-        for name in problem.names:
-            got = problem.residuals(runner, x, [name], step)
-            lost |= {name: loss.reason for name, loss in got.lost.items()}
-            for (_, channel), r in split(problem, got.r, [name]).items() if not got.lost else ():
-                t, y = samples[name][channel]
-                out.append(Trace(name, channel, t, y, y + r * problem.sensors[channel].noise, r))
+    runner = Runner(problem.recordings, journal=journal)
+    for name in problem.names:
+        got = problem.residuals(runner, x, [name], rtol)
+        lost |= {name: loss.reason for name, loss in got.lost.items()}
+        for (_, channel), r in split(problem, got.r, [name]).items() if not got.lost else ():
+            t, y = samples[name][channel]
+            out.append(Trace(name, channel, t, y, y + r * problem.sensors[channel].noise, r))
     return out, lost
 
 
@@ -132,7 +132,7 @@ def page(result: IdentificationResult, problem: Problem, drawn: list[Trace], los
         items = "".join(f"<li>{escape(notice)}</li>" for notice in result.notices)
         notices = f'<div class="notices" role="note"><strong>Read this first</strong><ul>{items}</ul></div>'
     else:
-        notices = '<p class="fine">Converged, residuals white, step fine enough: there is nothing to warn of.</p>'
+        notices = '<p class="fine">Converged, residuals white, steps fine enough: there is nothing to warn of.</p>'
     within = {(c.recording, c.channel): c for c in result.residuals}
     parts = [
         f"<h1>{escape(head)}</h1>",
@@ -182,7 +182,7 @@ def page(result: IdentificationResult, problem: Problem, drawn: list[Trace], los
         caption = "RMS error of the prediction over the range of what was measured"
         parts += ["<h2>Held-out recordings</h2>", table(["recording", "channel", "NRMSE"], rows, caption)]
     stages = [
-        [s["name"], ", ".join(s["free"]), f"{1e3 * s['step']:g} ms", f"{s['evaluations']}", f"{s['chi2']:.4g}",
+        [s["name"], ", ".join(s["free"]), f"{s['rtol']:g}", f"{s['evaluations']}", f"{s['chi2']:.4g}",
          "yes" if s["converged"] else "no", f"{s['wall_s']:.1f} s"] for s in result.stages
     ]  # fmt: skip
     runs = ", ".join(
@@ -192,7 +192,7 @@ def page(result: IdentificationResult, problem: Problem, drawn: list[Trace], los
     )  # fmt: skip
     parts += [
         "<h2>Stages and cost</h2>",
-        table(["stage", "free", "step", "evaluations", "χ²", "converged", "time"], stages),
+        table(["stage", "free", "tolerance", "evaluations", "χ²", "converged", "time"], stages),
         f"<p>{runs}; {cost['wall_s']:.1f} s in all.</p>",
         "<h2>How it was made</h2>",
         made_list(made),
@@ -221,7 +221,7 @@ def made_list(made: dict[str, Any]) -> str:
     labels: dict[str, Callable[[], str]] = {
         "torchsoft": lambda: made["torchsoft"],
         "method": lambda: f"{made['method']}, loss {made['loss']}",
-        "step": lambda: f"{1e3 * made['step']:g} ms",
+        "tolerance": lambda: f"{made['rtol']:g}",
         "seed": lambda: str(made["seed"]),
         "sensors": lambda: ", ".join(f"{k} ± {s['noise']:g} {CHANNELS[k].unit}" for k, s in made["sensors"].items()),
         "units": lambda: "SI throughout; pictures show lengths in mm",

@@ -22,9 +22,6 @@ IDENTIFIABLE = 0.5
 LAGS = 20
 """Autocorrelations that the test of whiteness looks at."""
 
-STEP_BIAS = 0.5
-"""Bias by the step, over the standard deviation, above which the step is called too coarse."""
-
 
 @dataclass(frozen=True)
 class Estimate:
@@ -40,7 +37,7 @@ class Estimate:
     last: float
     identifiable: bool
     at_bound: bool
-    step_bias_sd: float  # what the step of the simulation shifts the estimate by, in standard deviations
+    step_bias_sd: float  # what the finite steps of the simulation shift the estimate by, in standard deviations
 
     @property
     def label(self) -> str:

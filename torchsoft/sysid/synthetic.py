@@ -9,7 +9,7 @@ from torchsoft.excitation import Excitation, begin
 from torchsoft.parameters import Parameters
 from torchsoft.physics.paper import SoftGrasp
 from torchsoft.solve.simulate import simulate
-from torchsoft.sysid.prediction import TOLERANCE, set_parameters
+from torchsoft.sysid.prediction import choice, set_parameters
 from torchsoft.sysid.recording import SETTLE, Build, Recording, lying
 from torchsoft.sysid.unknowns import Sensor
 
@@ -21,18 +21,21 @@ RIG = {
 }  # fmt: skip
 """Sensors of a good rig: poses to 10 um and 0.5 mrad, forces to 0.1 N."""
 
+RTOL = 1e-6
+"""Relative tolerance of the runs that recordings are made of: a tenth of what a fit takes."""
+
 
 def record(
     name: str, excitation: Excitation, truth: Parameters, nominal: Parameters, sensors: dict[str, Sensor], *,
-    rate: float = 200.0, step: float = 1.25e-4, noise: float = 1.0, seed: int = 0, build: Build = SoftGrasp,
+    rate: float = 200.0, rtol: float = RTOL, noise: float = 1.0, seed: int = 0, build: Build = SoftGrasp,
     values: Mapping[str, float] | None = None,
 ) -> Recording:  # fmt: skip
     """What a rig with the parameters `truth` gives under an excitation that was planned with the `nominal` ones.
 
     The disc is set down, as the nominal parameters would have it lie, `SETTLE` before the first sample, as
-    `Recording.begin` assumes. Sampled at `rate` [Hz] from a run with the given step [s], with Gaussian noise of `noise` times
-    each sensor's own. `build` makes the model, and `values` are the truth of what `Parameters` does not have. The recording
-    holds nothing of the truth but the samples. Raises `SimulationFailed`.
+    `Recording.begin` assumes. Sampled at `rate` [Hz] from a run whose steps `rtol` chooses, with Gaussian noise of `noise`
+    times each sensor's own. `build` makes the model, and `values` are the truth of what `Parameters` does not have. The
+    recording holds nothing of the truth but the samples. Raises `SimulationFailed`.
     """
     planned = begin(excitation, nominal).model
     settings, reference = planned.settings, planned.reference
@@ -41,7 +44,7 @@ def record(
     at = np.arange(0.0, excitation.duration + 0.5 / rate, 1.0 / rate)
     t = torch.from_numpy(np.concatenate(([at[0] - SETTLE], at)))
     y0 = lying(build(settings, reference))._replace(model=real).y0.detach()
-    run = simulate(real, t, y0=y0, step=step, tolerance=TOLERANCE)
+    run = simulate(real, t, y0=y0, **choice(rtol))
     rng, samples = np.random.default_rng(seed), {}
     for channel, sensor in sensors.items():
         exact = run[channel][1:].detach().numpy()
