@@ -13,12 +13,12 @@ from tqdm import tqdm
 
 from torchsoft import Parameters, Profile, Reference, SoftGrasp, Trajectory, hold, simulate
 from torchsoft.excitation import Waves, wave
-from torchsoft.physics.stability import linearised
 from torchsoft.reduced.fit import Recipe, assemble, choose, fit, score
 from torchsoft.reduced.ode import ReducedModel
 from torchsoft.reduced.records import STATES, Record, noisy, record, rolling_radius
 from torchsoft.reduced.terms import mechanics, polynomials
 from torchsoft.scenario import grasp_and_roll
+from torchsoft.solve.stability import linearised
 
 SETTLED = 1.0  # Time [s] at which the grasp has settled.
 

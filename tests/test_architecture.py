@@ -17,11 +17,11 @@ FLOWS = {
     "codegen": "graph derivatives operations trace emit . invoke",
     "physics": """
         arguments mesh shapes contact material pads motion multibond state parts condensed validity rig energy paper
-        equilibrium stability .
+        equilibrium .
     """,
     "solve": """
-        grid kernel laws system progress tolerances rates stepper adjoint tangent unrolled continuous trajectory ledger simulate batch
-        torchdiffeq .
+        grid kernel laws system progress tolerances rates stability stepper adjoint tangent unrolled continuous trajectory
+        ledger simulate batch torchdiffeq .
     """,
     "solve.kernel": """
         cache . arrays scratch linear inertia interface stage finish step taped run rates adjoint_pads adjoint tangent

@@ -12,8 +12,8 @@ from torchsoft import Parameters, SoftGrasp, Trajectory, press, rest, simulate
 from torchsoft.excitation import CATALOGUE, begin
 from torchsoft.excitation import reference as excited
 from torchsoft.physics.equilibrium import holding_force
-from torchsoft.physics.stability import NEUTRAL, loop_modes
 from torchsoft.scenario import grasp_and_roll
+from torchsoft.solve.stability import NEUTRAL, loop_modes
 
 REFERENCE = json.loads((Path(__file__).parent / "reference.json").read_text())
 

@@ -15,7 +15,6 @@ from torchsoft.physics.equilibrium import rest
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.paper import SoftGrasp
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.stability import describe_instability
 from torchsoft.physics.validity import check_array
 from torchsoft.solve import tangent
 from torchsoft.solve.adjoint import TAPE_BYTES, Solved, attached, march, recorded
@@ -23,6 +22,7 @@ from torchsoft.solve.continuous import continuous_solution
 from torchsoft.solve.grid import check_times
 from torchsoft.solve.ledger import doubts
 from torchsoft.solve.progress import Progress, SimulationFailed
+from torchsoft.solve.stability import describe_instability
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
 from torchsoft.solve.system import independent
 from torchsoft.solve.trajectory import Stats, Trajectory, channels

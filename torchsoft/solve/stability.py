@@ -4,12 +4,14 @@ The horizontal loop senses the disc and pushes the bracket, through two soft pad
 combinations of gains, pad stiffness and pad damping.
 """
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from torchsoft.physics.equilibrium import holding_force, press
 from torchsoft.physics.motion import Reference, hold
 from torchsoft.physics.paper import SoftGrasp
+from torchsoft.solve.rates import Rates
 
 DISPLACEMENT, VELOCITY = 1e-9, 1e-8
 """Perturbations [m or rad], [m/s or rad/s] of the central differences: small against penetrations, so that nodes stick."""
@@ -27,8 +29,16 @@ def linearised(model: SoftGrasp, y: Tensor, reference: Reference) -> Tensor:
             size[where] = DISPLACEMENT / float(model.pads[name].compliance().diagonal().max())
         elif part in ("rates", "velocity"):
             size[where] = VELOCITY
-    ahead, behind = (model(0.0, y + sign * torch.diag(size), reference) for sign in (1, -1))
-    return ((ahead - behind) / (2 * size[:, None])).mT
+    if any(pad.inertial for pad in model.pads.values()):
+        ahead, behind = (model(0.0, y + sign * torch.diag(size), reference) for sign in (1, -1))
+        return ((ahead - behind) / (2 * size[:, None])).mT
+    rates, at, out = Rates(model, reference), y.numpy(), np.empty((len(size), len(size)))
+    for i, one in enumerate(size.tolist()):
+        there = [at.copy(), at.copy()]
+        there[0][i] += one
+        there[1][i] -= one
+        out[:, i] = (rates(0.0, there[0]) - rates(0.0, there[1])) / (2 * one)
+    return torch.from_numpy(out)
 
 
 @torch.no_grad()
