@@ -315,7 +315,7 @@ class Config(Table):
         return self
 
     @property
-    def steps(self) -> dict[str, float]:
+    def steps(self) -> dict[str, Any]:
         """How `simulate` is to choose its steps."""
         if self.step is not None:
             return {"step": self.step}
