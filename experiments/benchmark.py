@@ -228,18 +228,18 @@ def figure(result: Result) -> Figure:
     """Wall times of the tasks by every way; batches; the other integrators, if any."""
     numbers, colours = result.figures, ("#0072b2", "#e69f00", "#009e73")
     fig = Figure(figsize=(13, 4.2), layout="constrained")
-    left, middle, right = fig.subplots(1, 3, width_ratios=(1.4, 0.8, 1.3))
+    left, middle, right = fig.subplots(1, 3, width_ratios=(1.6, 0.7, 1.3))
     every = list(ways(result.config))
     for i, (name, colour) in enumerate(zip(("run", "gradient", "jacobian"), colours)):
         label = {"run": "run", "gradient": "with gradient of all", "jacobian": "with Jacobian for 8"}[name]
         seconds = [numbers["costs"][way]["seconds"][name] for way in every]
         bars = left.bar([k + 0.27 * (i - 1) for k in range(len(every))], seconds, 0.25, color=colour, label=label)
         left.bar_label(bars, fmt="%.2g", fontsize=8)
-    names = list(every)
+    names = [way.replace(" = ", "\n") for way in every]
     if numbers["costs"]["before_s"]:
         bars = left.bar([len(every)], [numbers["costs"]["before_s"]], 0.25, color="0.5", label="run, earlier version")
         left.bar_label(bars, fmt="%.2g", fontsize=8)
-        names.append(f"earlier,\nstep = {1e3 * result.config.step:g} ms")
+        names.append(f"earlier,\n{1e3 * result.config.step:g} ms")
     left.set_xticks(range(len(names)), names)
     left.margins(y=0.1)
     left.set(ylabel="wall time [s]", title=f"{result.config.duration:g} s of manipulation, one core")
@@ -262,7 +262,7 @@ def figure(result: Result) -> Figure:
     reached = {name: one["wall_per_simulated"] for name, one in numbers["peers"]["equal"][way].items() if one}
     bars = right.barh(list(reached), list(reached.values()), color="#0072b2", log=True)
     right.bar_label(bars, fmt="%.2g", padding=3, fontsize=8)
-    right.margins(x=0.15)
+    right.set_xlim(right=4 * max(reached.values()))
     right.invert_yaxis()
     right.set(xlabel="wall time [s] per simulated s", title=f"Same equations, as exact as {way}")
     return fig
