@@ -15,6 +15,7 @@ from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
 from torchsoft.solve.adjoint import TAPE_BYTES, attached
+from torchsoft.solve.laws import copied
 from torchsoft.solve.ledger import doubts
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import Done, Route, prepare, run
@@ -196,17 +197,4 @@ def _own(rig: Rig, parameters: Mapping[str, Tensor], i: int) -> Rig:
                 f"`{name}` has shape {tuple(old.shape)}, but is given rows of shape {tuple(rows[i].shape)}"
             )
         values[id(old)] = rows[i].double()
-    return _replaced(rig, values, {})  # pyright: ignore[reportReturnType]
-
-
-def _replaced(module: nn.Module, values: Mapping[int, Tensor], known: dict[int, nn.Module]) -> nn.Module:
-    """The same modules with other tensors in the place of some parameters."""
-    if id(module) not in known:
-        out = known[id(module)] = module.__class__.__new__(module.__class__)
-        out.__dict__ = dict(module.__dict__)
-        own: dict[str, Any] = {k: values.get(id(p), p) for k, p in module._parameters.items()}
-        out.__dict__ |= {"_parameters": own, "_buffers": dict(module._buffers)}
-        out.__dict__["_modules"] = {
-            k: m if m is None else _replaced(m, values, known) for k, m in module._modules.items()
-        }
-    return known[id(module)]
+    return copied(rig, {}, values)  # pyright: ignore[reportReturnType]

@@ -27,13 +27,14 @@ class LawSet(NamedTuple):
     parameters: dict[str, Tensor]
 
 
-def _copied(module: nn.Module, known: dict[int, nn.Module]) -> nn.Module:
-    """The same modules over the same tensors: tracing puts others in their place, which other threads must not meet."""
+def copied(module: nn.Module, known: dict[int, nn.Module], values: Mapping[int, Tensor] | None = None) -> nn.Module:
+    """The same modules over the same tensors, or with `values` in the place of some parameters, by their id: tracing, and
+    runs side by side, put others in their place, which other threads must not meet."""
     if id(module) not in known:
         out = known[id(module)] = module.__class__.__new__(module.__class__)
-        out.__dict__ = dict(module.__dict__)
-        out.__dict__ |= {"_parameters": dict(module._parameters), "_buffers": dict(module._buffers)}
-        out.__dict__["_modules"] = {k: m if m is None else _copied(m, known) for k, m in module._modules.items()}
+        own: dict[str, Any] = {k: (values or {}).get(id(p), p) for k, p in module._parameters.items()}
+        out.__dict__ = module.__dict__ | {"_parameters": own, "_buffers": dict(module._buffers)}
+        out.__dict__["_modules"] = {k: m if m is None else copied(m, known, values) for k, m in module._modules.items()}
     return known[id(module)]
 
 
@@ -45,7 +46,7 @@ class _Called(nn.Module):
         self.function, self.names = function, tuple(modules)
         known: dict[int, nn.Module] = {}
         for name, module in modules.items():
-            setattr(self, name, _copied(module, known) if isinstance(module, nn.Module) else module)
+            setattr(self, name, copied(module, known) if isinstance(module, nn.Module) else module)
 
     def forward(self, x: Tensor) -> Tensor:
         return self.function(*(getattr(self, name) for name in self.names), x)
