@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from torchsoft.cost import RUN, Cost, chosen_steps, row_memory, step_seconds
+from torchsoft.cost import RUN, Cost, row_memory, step_seconds, steps_per_second
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.schema import sizes, variables
 from torchsoft.scenario import SETTLE
@@ -22,7 +22,7 @@ def cost(config: Config, workers: int) -> Cost:
     if config.step is not None:
         steps = seconds / config.sample_interval * math.ceil(config.sample_interval / config.step)
     else:  # an output between two steps takes half the time of a step
-        steps = chosen_steps(seconds, config.steps["rtol"]) + 0.5 * config.samples
+        steps = seconds * steps_per_second(config.steps["rtol"]) + 0.5 * config.samples
     length = sizes(config)
     kept = 0.0  # of one trajectory [GiB]
     for variable in variables(config).values():

@@ -20,7 +20,7 @@ from torchsoft.solve.ledger import doubts
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import Done, Route, prepare, run
 from torchsoft.solve.trajectory import Trajectory
-from torchsoft.threads import cores, side_by_side
+from torchsoft.threads import cores, side_by_side, single_threaded
 
 
 class SamplesFailed(UserWarning):
@@ -121,7 +121,7 @@ def simulate_batch(
             return failure
 
     results: list[Done | Exception] = [ValueError("not run")] * count
-    with tqdm(total=count, unit="run", disable=not progress) as bar:
+    with single_threaded(), tqdm(total=count, unit="run", disable=not progress) as bar:
         for i, result in side_by_side(work, count, threads):
             results[i] = result
             bar.update()

@@ -1,8 +1,7 @@
 """What an identification will cost."""
 
-from torchsoft.cost import RUN, Cost, row_memory, step_seconds
+from torchsoft.cost import RUN, Cost, row_memory, step_seconds, steps_per_second
 from torchsoft.sysid.plan import ALL, FIRST, FREE, LAST, LOOSE, USUAL
-from torchsoft.sysid.prediction import steps_per_second
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import SETTLE, Recording
 from torchsoft.sysid.settle import FINER

@@ -83,11 +83,6 @@ def derivatives(rig: Rig, run: Trajectory) -> Array:
     return directions(measured, along) + directions(measured, [rig.parameter(name) for name in run.wrt])
 
 
-def steps_per_second(rtol: float) -> float:
-    """How many steps [1/s] a tolerance chooses where a disc is rolled and shaken, by experience."""
-    return 3700.0 * (1e-5 / rtol) ** 0.3
-
-
 def choice(steps: Steps) -> dict[str, Any]:
     """The arguments of `simulate` that say which steps to take, and how exactly."""
     chosen = {"knots": torch.from_numpy(steps.knots)} if isinstance(steps, Frozen) else {"rtol": steps}

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from threadpoolctl import threadpool_limits
-
+from torchsoft.cost import steps_per_second
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.journal import Journal
 from torchsoft.sysid.prediction import (
@@ -20,10 +19,9 @@ from torchsoft.sysid.prediction import (
     misfit,
     predict,
     set_parameters,
-    steps_per_second,
 )
 from torchsoft.sysid.recording import Recording, Start
-from torchsoft.threads import side_by_side
+from torchsoft.threads import side_by_side, single_threaded
 
 
 class Job(NamedTuple):
@@ -59,7 +57,7 @@ class Runner:
             self._count(job, result is not None)
         todo = [i for i, result in enumerate(out) if result is None]
         todo.sort(key=lambda i: self._length(jobs[i]), reverse=True)  # the longest first
-        with threadpool_limits(1):  # the last bits of linear algebra depend on its threads
+        with single_threaded():
             for i, result in side_by_side(lambda k: self._made(jobs[todo[k]]), len(todo), self.workers):
                 out[todo[i]] = result
                 self.steps += result.steps if isinstance(result, Prediction) else 0
