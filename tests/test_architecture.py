@@ -17,7 +17,7 @@ FLOWS = {
     "codegen": "graph derivatives operations trace emit . invoke",
     "physics": """
         arguments mesh shapes contact material pads motion multibond state parts condensed validity rig energy paper
-        equilibrium .
+        equilibrium settled .
     """,
     "solve": """
         grid kernel laws system progress tolerances rates stability stepper adjoint tangent unrolled continuous trajectory

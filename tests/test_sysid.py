@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +64,7 @@ def test_jacobian_equals_central_differences_for_every_kind_of_coordinate(stroke
         "pad.E": Unknown(),
         "contact.mu_s": Unknown(),
         "contact.mu_k": Unknown(ratio_to="contact.mu_s", high=1.0, low=0.3),
-        "contact.R_n": Unknown(shared=False),
+        "contact.R_n": Unknown(per="recording"),
         "disc.mass": Unknown(scale="linear", low=0.3, high=0.5),
         "control.R_80": Unknown(),
     }
@@ -175,7 +176,7 @@ def test_bias_and_delay_are_found_and_missing_samples_do_not_matter(strokes: Rec
     t, theta = strokes.samples["theta"]
     late = np.interp(t - 1.5e-3, t, theta) + 2e-3
     samples = strokes.samples | {"theta": (t[3::2], late[3::2]), "F_x": tuple(x[:60] for x in strokes.samples["F_x"])}
-    data = Recording("gaps", strokes.settings, strokes.reference, samples)
+    data = replace(strokes, name="gaps", samples=samples)
     sensors = SENSORS | {"theta": Sensor(noise=5e-4, bias=0.02, delay=5e-3)}
     unknowns = {"pad.E": Unknown()} | rest_known() | {"pad.tau": known("pad.tau")}
     answer = identify(Problem([data], sensors, unknowns), rtol=RTOL)
@@ -364,7 +365,7 @@ def test_wrong_recordings_and_sensors_are_refused(strokes: Recording) -> None:
         ({"x_C": (t, np.full_like(y, np.nan))}, "finite values"),
     ):
         with pytest.raises(ValueError, match=message):
-            Recording("one", strokes.settings, strokes.reference, samples)
+            replace(strokes, samples=samples)
     with pytest.raises(ValueError, match="`heldout`"):
         identify(Problem([strokes], SENSORS, one), heldout=["strokes"])
 

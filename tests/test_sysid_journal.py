@@ -29,8 +29,8 @@ RESULTS = {
     "without derivatives": PREDICTION._replace(derivatives=None),
     "on frozen steps": PREDICTION._replace(knots=None),
     "nothing": Prediction(np.zeros(0), np.zeros((0, 2)), 0, np.zeros((0, 2, 0))),
-    "misfit": Misfit(0.1 + 0.2, ODD, np.zeros(0), -ODD, 7),
-    "infinite misfit": Misfit(float("inf"), ODD, ODD, ODD, 7),
+    "misfit": Misfit(0.1 + 0.2, ODD, -ODD[None], 7),
+    "infinite misfit": Misfit(float("inf"), ODD, np.stack([ODD, ODD]), 7),
     "failed": FailedRun("the disc was lost at t = 0.1 s: µ_s, 'quoted'", 0.1),
     "failed without a reason": FailedRun("", float("nan")),
 }

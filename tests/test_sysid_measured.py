@@ -19,7 +19,7 @@ from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.solve.trajectory import save
 from torchsoft.sysid import MEASURED, Recording, Sensor, record
 from torchsoft.sysid.columns import COLUMNS, UNITS, read_table
-from torchsoft.sysid.cost import cost
+from torchsoft.sysid.cost import cost, paper_settings
 from torchsoft.sysid.measured import known_parameters, load, read_recording, stem
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "identify"
@@ -239,16 +239,16 @@ def test_a_recording_survives_the_way_through_csv(made: tuple[Any, Recording], t
     script.UNITS["rad/s"] = ("deg/s", 180 / np.pi)
     script.write(one, tmp_path / "short.csv", digits=17)
     sensors = {channel: Sensor(noise=1e-5) for channel in MEASURED}
-    back = read_recording(tmp_path / "short.csv", "short", one.settings, sensors)
+    back = read_recording(tmp_path / "short.csv", "short", paper_settings(one), sensors)
     assert back.name == one.name
-    assert back.settings == one.settings
+    assert paper_settings(back) == paper_settings(one)
     assert list(back.samples) == list(one.samples) == list(MEASURED)
     for channel, (t, y) in one.samples.items():
         np.testing.assert_allclose(back.samples[channel][0], t, rtol=0, atol=1e-12)
         np.testing.assert_allclose(back.samples[channel][1], y, rtol=1e-13)
     t = torch.from_numpy(np.linspace(-0.1, 0.5, 1201))
     with torch.no_grad():
-        want, got = (some.reference(t, SIGNALS).flatten(1).T for some in (one, back))
+        want, got = (some.rig.reference(t, SIGNALS).flatten(1).T for some in (one, back))
     for exact, read, tolerance in zip(want, got, (2e-8, 2e-5, 1e-8, 1e-5, 0.02)):
         assert float((read - exact).abs().max()) < tolerance
 
@@ -258,7 +258,7 @@ def test_the_examples_files_are_what_its_script_makes(made: tuple[Any, Recording
     case = load([EXAMPLE / "rolling.csv"], EXAMPLE / "rolling.toml")
     assert case.problem.names == ("rolling", "checking")
     assert {k: s.noise for k, s in case.problem.sensors.items()} == script.SENSORS
-    known_by_file, truth = case.problem.recordings[0].settings.table(), script.TRUTH.table()
+    known_by_file, truth = paper_settings(case.problem.recordings[0]).table(), script.TRUTH.table()
     own = {"scenario.y_Br_grasp", "scenario.travel", "scenario.x_C0", "control.senses"}
     for name, row in truth.items():  # the configuration tells the truth, but for what is unknown
         if name not in case.problem.unknowns and name not in own:
@@ -289,15 +289,15 @@ def test_a_trajectory_file_is_a_recording(run: Trajectory, tmp_path: Path) -> No
         np.testing.assert_array_equal(one.samples[channel][1], run[channel].detach())
     desired = run.together("x_d", "x_d_dot", "y_d", "y_d_dot", "F_ff")
     with torch.no_grad():
-        got = one.reference(run.t, SIGNALS).flatten(1)[:, :5]
+        got = one.rig.reference(run.t, SIGNALS).flatten(1)[:, :5]
     np.testing.assert_allclose(got, desired, atol=1e-12)
-    assert one.settings.scenario.y_Br_grasp == pytest.approx(float(desired[:, 2].min()))
+    assert paper_settings(one).scenario.y_Br_grasp == pytest.approx(float(desired[:, 2].min()))
     older = tmp_path / "older.nc"  # without the rate of y_d
     save(run.to_dataset().drop_vars("desired_y_velocity"), older)
     table = read_table(older)
     assert "y_d_dot" not in table.values
     with torch.no_grad():
-        got = read_recording(older, "older", one.settings, sensors).reference(run.t, SIGNALS)[:, 1, 1]
+        got = read_recording(older, "older", paper_settings(one), sensors).rig.reference(run.t, SIGNALS)[:, 1, 1]
     np.testing.assert_allclose(got, desired[:, 3], atol=2e-4)
 
 
@@ -333,14 +333,14 @@ def test_samples_much_denser_than_the_motion_are_not_all_simulated(case: Callabl
     t, x = one.samples["x_C"]
     dense = np.linspace(t[0], t[-1], 20_001)
     many = replace(one, samples={"x_C": (dense, np.interp(dense, t, x))})
-    grid = many.grid(False).numpy()
+    grid = many.grid(False).t.numpy()
     assert len(grid) < 600
     assert grid[1] <= dense[0] < dense[-1] <= grid[-1]
-    np.testing.assert_array_equal(one.grid(False)[1:], one.times)
+    np.testing.assert_array_equal(one.grid(False).t[1:], one.times)
     irregular = np.sort(np.random.default_rng(0).uniform(t[0], t[-1], 100))
     few = replace(one, samples={"x_C": (irregular, np.interp(irregular, t, x))})
-    np.testing.assert_array_equal(few.grid(False)[1:], irregular)
-    between = one.grid(True).numpy()  # begins after the disc has begun to settle
+    np.testing.assert_array_equal(few.grid(False).t[1:], irregular)
+    between = one.grid(True).t.numpy()  # begins after the disc has begun to settle
     assert np.all(np.diff(between) > 0)
 
 
@@ -362,9 +362,9 @@ def test_recordings_have_settings_of_their_own(case: Callable[..., list[str]], t
     data, config = case(config=CONFIG + more)
     (tmp_path / "second.csv").write_text(Path(data).read_text())
     first, second = load([data], config).problem.recordings
-    assert (first.name, first.settings.disc.mass) == ("data", 0.5)
-    assert (second.name, second.settings.disc.mass) == ("b", Parameters().disc.mass)
-    assert first.settings.contact.v_s == second.settings.contact.v_s == 0.05
+    assert (first.name, paper_settings(first).disc.mass) == ("data", 0.5)
+    assert (second.name, paper_settings(second).disc.mass) == ("b", Parameters().disc.mass)
+    assert paper_settings(first).contact.v_s == paper_settings(second).contact.v_s == 0.05
 
 
 def test_a_name_is_the_same_where_the_system_knows_ascii_only() -> None:

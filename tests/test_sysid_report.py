@@ -17,6 +17,7 @@ from matplotlib.text import Text
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import IdentificationResult, Problem, Sensor, Unknown, identify, record
+from torchsoft.sysid.cost import paper_settings
 from torchsoft.sysid.figures import correlation_figure, direction_name, estimates_figure, spectrum_figure, trace_figure
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Residuals
@@ -136,7 +137,7 @@ def test_predictions_are_the_models(found: tuple[IdentificationResult, Problem])
 
 def test_starts_are_the_settings_values(found: tuple[IdentificationResult, Problem]) -> None:
     answer, problem = found
-    table = problem.recordings[0].settings.table()
+    table = paper_settings(problem.recordings[0]).table()
     assert starts(answer, problem) == pytest.approx([table[e.name]["value"] for e in answer.estimates])
 
 

@@ -1,5 +1,6 @@
 """Unknowns: no search goes beyond what a parameter may be, whether its bounds are given or not."""
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,7 +14,8 @@ GIVEN = {"pad.E": 0.75e6, "pad.nu": 0.45, "contact.mu_s": 0.8, "contact.mu_k": 0
 
 def coordinates(**unknowns: dict[str, Any]) -> Coordinates:
     tables = {name.replace("__", "."): Unknown(**table) for name, table in unknowns.items()}
-    return Coordinates(tables, {}, ["one"], GIVEN)
+    one: Any = SimpleNamespace(name="one", parameters=GIVEN, start_coordinates=())
+    return Coordinates(tables, {}, [one])
 
 
 def ends(found: Coordinates, name: str) -> tuple[float, float]:

@@ -33,7 +33,7 @@ def table(recording: Recording) -> dict[str, tuple[str, np.ndarray]]:
     """Unit and values in SI by column: time, set-points with their rates, then what was measured."""
     t = recording.times
     with torch.no_grad():
-        d = recording.reference(torch.from_numpy(t), ("x_d", "y_d", "F_ff")).flatten(1).T.numpy()
+        d = recording.rig.reference(torch.from_numpy(t), ("x_d", "y_d", "F_ff")).flatten(1).T.numpy()
     reference = dict(zip(("x_d", "x_d_dot", "y_d", "y_d_dot", "F_ff"), d))
     out = {name: (CHANNELS[name].unit, value) for name, value in reference.items()}
     return out | {name: (CHANNELS[name].unit, values) for name, (_, values) in recording.samples.items()}

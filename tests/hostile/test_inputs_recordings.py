@@ -25,7 +25,7 @@ from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.files import sealed, unsealed
 from torchsoft.sysid import measured
 from torchsoft.sysid.columns import COLUMNS, read_table
-from torchsoft.sysid.cost import cost
+from torchsoft.sysid.cost import cost, paper_settings
 from torchsoft.sysid.workers import Runner
 
 pytestmark = pytest.mark.slow
@@ -74,7 +74,7 @@ def one_run(case: measured.Case) -> None:
     problem, fit = case.problem, case.config.fit
     expected = cost(problem, fit.rtol, fit.starts, fit.workers, case.config.heldout)
     assert np.isfinite(expected).all(), f"no estimate: {expected}"
-    if max(r.settings.pad.memory for r in problem.recordings) > 1e-3 or cost(problem, RTOL, 1, 1).steps > 1e5:
+    if max(paper_settings(r).pad.memory for r in problem.recordings) > 1e-3 or cost(problem, RTOL, 1, 1).steps > 1e5:
         return
     runner = Runner(problem.recordings)
     out = problem.residuals(runner, problem.coordinates.start, problem.names[:1], RTOL, problem.coordinates.free)

@@ -27,11 +27,15 @@ def _check(model: SoftGrasp) -> None:
     check_values(model)
 
 
-def rest(model: SoftGrasp) -> Tensor:
-    """State (size,): the object at rest on the lower pad under its weight, the upper pad just touching it from above."""
+def rest(model: SoftGrasp, x: Tensor | None = None) -> Tensor:
+    """State (size,): the object at rest on the lower pad under its weight, the upper pad just touching it from above.
+
+    `x` () [m] is where, by default the scenario's x_C0; the state is differentiable in it.
+    """
     _check(model)
     weightless = float((model.disc.mass * model.gravity).detach()) == 0.0
-    state = _touching(model) if weightless else _solve(model, bracket_height=None)
+    at = torch.tensor(model.settings.scenario.x_C0, dtype=torch.float64) if x is None else x
+    state = _touching(model, at) if weightless else _solve(model, None, at)
     x, y, _ = state.pose["disc"]
     return model.pack(_with_bracket(state, x, model.touch_height(y)))
 
@@ -46,7 +50,8 @@ def press(model: SoftGrasp, bracket_height: float) -> Tensor:
     p = model.settings
     with torch.no_grad():
         up = float(model.touch_height(p.pad.height + model.shape.support(torch.tensor([0.0, -1.0]).double())))
-    state = None if bracket_height >= up else _solve(model, bracket_height)
+    x = torch.tensor(p.scenario.x_C0, dtype=torch.float64)
+    state = None if bracket_height >= up else _solve(model, bracket_height, x)
     if state is None or not bool(state.pads["U"].any()):
         raise NoEquilibrium(f"the bracket at {bracket_height} m is too high for its pad to touch the disc; lower it")
     return model.pack(state)
@@ -64,9 +69,9 @@ def _with_bracket(state: State, x: Tensor, y: Tensor) -> State:
     return state._replace(pose=state.pose | {"bracket": torch.stack((x, y, torch.zeros_like(y)))})
 
 
-def _touching(model: SoftGrasp) -> State:
+def _touching(model: SoftGrasp, x: Tensor) -> State:
     """The object where it just touches the undeformed lower pad: what a body without weight rests like."""
-    x, top = torch.tensor(model.settings.scenario.x_C0, dtype=torch.float64), model.settings.pad.height
+    top = model.settings.pad.height
     zero = torch.zeros((), dtype=torch.float64)
     below = float(model.shape.support(torch.tensor([0.0, -1.0]).double()).detach())
     side = _Side(model, "L", torch.zeros(2, dtype=torch.float64), x, min(below, 3 * (below * top) ** 0.5))
@@ -85,14 +90,14 @@ def _touching(model: SoftGrasp) -> State:
     return _with_bracket(state._replace(pose=state.pose | {"disc": torch.stack((x, height, zero))}), x, zero)
 
 
-def _solve(model: SoftGrasp, bracket_height: float | None) -> State:
-    """Unknowns: the object's height and the displacements of the nodes under (and above) it; x_C stays at `x_C0`.
+def _solve(model: SoftGrasp, bracket_height: float | None, x: Tensor) -> State:
+    """Unknowns: the object's height and the displacements of the nodes under (and above) it; the object stays at x [m].
 
     Newton with the module's own normal law; the last iteration is taken with the gradient on, so that the equilibrium's
     derivative with respect to every parameter is the implicit function theorem's.
     """
     p = model.settings
-    x, height = torch.tensor(p.scenario.x_C0, dtype=torch.float64), p.pad.height
+    height = p.pad.height
     zero = torch.zeros((), dtype=torch.float64)
     below, above = (float(model.shape.support(torch.tensor([0.0, s]).double()).detach()) for s in (-1.0, 1.0))
     y_Br = zero + (bracket_height if bracket_height is not None else 10 * (below + height))
@@ -162,7 +167,7 @@ class _Side:
     def __init__(self, model: SoftGrasp, name: str, base: Tensor, x: Tensor, reach: float) -> None:
         self.model, self.name, self.x, self.pad = model, name, x, model.pads[name]
         places = self.pad.point_positions + base
-        points = torch.nonzero((places[:, 0] - x).abs() < reach)[:, 0]
+        points = torch.nonzero((places[:, 0] - x.detach()).abs() < reach)[:, 0]
         spread = self.pad.spread[points][:, self.pad.surface]
         self.near = torch.nonzero(spread.any(0))[:, 0]
         self.places, self.spread = places[points], spread[:, self.near]

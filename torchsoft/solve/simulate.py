@@ -67,8 +67,9 @@ def simulate(
 
     gradient: with "discrete" the states and channels of the result carry the exact gradient of the discrete run (of the steps
     that were taken, which are not differentiated) by y0, every parameter and the reference; recorded nodal forces and energies
-    do not. With "forward" `sensitivities` holds the derivatives by the scalar parameters `wrt`, dy0 (size, n) being that of the
-    start; `rigid` keeps those of the free coordinates and their rates only. "unrolled" takes given steps in plain torch,
+    do not. With "forward" `sensitivities` holds the derivatives by the n scalar parameters `wrt`, and dy0 (size, n) is that of the
+    start; columns of dy0 beyond the n are directions of the start alone. `rigid` keeps the derivatives of the free coordinates
+    and their rates only. "unrolled" takes given steps in plain torch,
     "continuous" torchdiffeq's explicit steps and adjoint: both slow, for cross checks over short windows.
     Under `torch.no_grad()` no route records a graph.
 
@@ -194,8 +195,10 @@ def _check_wanted(gradient: Route, wrt: Sequence[str], dy0: Tensor | None, rigid
         raise ValueError(f"`gradient` must be one of {', '.join(get_args(Route))}, but is {gradient!r}")
     if isinstance(wrt, str) or not isinstance(wrt, Sequence) or not all(isinstance(name, str) for name in wrt):
         raise ValueError(f"`wrt` must be a list of parameters' names, but is {type(wrt).__name__}")
-    if bool(wrt) != (gradient == "forward"):
+    if wrt and gradient != "forward":
         raise ValueError("`wrt` names the parameters of gradient='forward', and of that only")
+    if gradient == "forward" and not wrt and dy0 is None:
+        raise ValueError("gradient='forward' needs the parameters' names `wrt`, or directions `dy0` of the start")
     if gradient != "forward" and (dy0 is not None or rigid):
         raise ValueError("`dy0` and `rigid` belong to gradient='forward', and to that only")
     if gradient == "forward" and torch.is_inference_mode_enabled():
@@ -218,8 +221,10 @@ def _rows(task: Task, tape_bytes: float) -> Iterator[tuple[Solved, Tensor | None
     size = stepper.layout.size
     if dy0 is not None:
         check_array("dy0", dy0)
-        if dy0.shape != (size, len(wrt)):
-            raise ValueError(f"`dy0` must have shape ({size}, {len(wrt)}), but has {tuple(dy0.shape)}")
+        if dy0.ndim != 2 or len(dy0) != size or dy0.shape[1] < max(1, len(wrt)):
+            raise ValueError(
+                f"`dy0` must have shape ({size}, {max(1, len(wrt))}), or more columns, but has {tuple(dy0.shape)}"
+            )
         if not bool(torch.isfinite(dy0).all()):
             raise ValueError("`dy0` must be finite, but has a component that is not")
     kept = stepper.layout.rigid if task.rigid else list(range(size))

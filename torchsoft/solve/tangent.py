@@ -19,7 +19,9 @@ def directions(value: Tensor, wanted: Sequence[Tensor]) -> Array:
     out = np.zeros((*value.shape, len(wanted)))
     weights = torch.zeros_like(value, requires_grad=True)
     pulled = (
-        torch.autograd.grad(value, wanted, weights, create_graph=True, allow_unused=True) if value.requires_grad else ()
+        torch.autograd.grad(value, wanted, weights, create_graph=True, allow_unused=True)
+        if wanted and value.requires_grad
+        else ()
     )
     for k, part in enumerate(pulled):
         if part is not None and part.requires_grad:
@@ -32,10 +34,13 @@ def iterate(
     stepper: ImplicitStepper, y0: Tensor, t: Tensor, wanted: Sequence[Tensor], dy0: Tensor | None, columns: list[int]
 ) -> Iterator[tuple[Tensor, Progress]]:
     """Derivatives (T, components, n) of the states by the scalar tensors `wanted`, as the run grows; `columns` are
-    the components of the state that are kept. dy0 (size, n) is the derivative of the initial state, zero by default."""
-    n, size = len(wanted), stepper.layout.size
-    dp = directions(stepper.compiled.p, wanted)
-    dy = np.zeros((size, n)) if dy0 is None else dy0.detach().numpy().copy()
+    the components of the state that are kept. dy0 (size, n) is the derivative of the initial state, zero by default; its
+    columns beyond those of `wanted` are directions of the start alone."""
+    size = stepper.layout.size
+    dy = np.zeros((size, len(wanted))) if dy0 is None else dy0.detach().numpy().copy()
+    n = dy.shape[1]
+    dp = np.zeros((len(stepper.compiled.p), n))
+    dp[:, : len(wanted)] = directions(stepper.compiled.p, wanted)
     kept = np.zeros((len(t), len(columns), n))
     kept[0] = dy[columns]
     segments: list[Segment] = []

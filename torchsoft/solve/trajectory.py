@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchsoft.channels import PADS, VARIABLES
 from torchsoft.files import replacing, sealed, unsealed
+from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import Layout, State
 
@@ -43,7 +44,8 @@ class Trajectory:
 
     knots (steps + 1,): where the steps began and ended [s]; given to another run, that takes the same ones.
 
-    sensitivities (T, components, n): derivatives of the state's last `components` by the n parameters `wrt`, where asked for.
+    sensitivities (T, components, n): derivatives of the state's last `components` by the n parameters `wrt`, and along the
+    further directions of the start, where asked for.
     """
 
     t: Tensor
@@ -174,3 +176,20 @@ def channels(rig: Rig, state: State, signals: Tensor, moments: dict[str, Tensor]
         out[f"F_{name}"] = rig.actuator_effort(name, state, signals)
     out |= {f"M_{name}": moment for name, moment in (moments or {}).items()}
     return {rig.renamed.get(key, key): value for key, value in out.items()}
+
+
+def measurable(rig: Rig) -> tuple[str, ...]:
+    """Channels that a sensor can measure, whose derivatives follow from the bodies' motion: free coordinates, their rates in
+    the same order, and the actuators' efforts."""
+    poses, rates = [], []
+    for name, axes in rig.layout.free.items():
+        for axis in axes:
+            poses.append(f"{COORDINATES[axis]}_{rig.symbols[name]}")
+            rates.append(rate_channel(poses[-1]))
+    keys = (*poses, *rates, *(f"F_{name}" for name in rig.actuators))
+    return tuple(rig.renamed.get(key, key) for key in keys)
+
+
+def rate_channel(key: str) -> str:
+    """The key of a coordinate's rate by the coordinate's own, before a rig renames either."""
+    return f"omega{key.removeprefix('theta')}" if key.startswith("theta") else f"v_{key}"

@@ -7,10 +7,11 @@ from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.result import Estimate, IdentificationResult
 from torchsoft.sysid.solve import identify
+from torchsoft.sysid.start import AtRest, Known
 from torchsoft.sysid.synthetic import RIG, record
-from torchsoft.sysid.unknowns import Sensor, Unknown
+from torchsoft.sysid.unknowns import Prior, Sensor, Unknown
 
 __all__ = [
-    "MEASURED", "RIG", "Estimate", "IdentificationResult", "Problem", "Recording", "Sensor", "Stage", "Unknown",
-    "Unreachable", "identify", "record",
+    "MEASURED", "RIG", "AtRest", "Estimate", "IdentificationResult", "Known", "Prior", "Problem", "Recording", "Sensor",
+    "Stage", "Unknown", "Unreachable", "identify", "record",
 ]  # fmt: skip

@@ -16,7 +16,7 @@ from pydantic import Field, TypeAdapter, model_validator
 from torchsoft.channels import CHANNELS, MEASURED, SETPOINTS
 from torchsoft.parameters import Parameters
 from torchsoft.physics.motion import Reference, Sampled
-from torchsoft.physics.paper import apart
+from torchsoft.physics.paper import SoftGrasp, apart
 from torchsoft.sysid.columns import Columns, read_table
 from torchsoft.sysid.fit import Loss, Unreachable
 from torchsoft.sysid.problem import Problem
@@ -206,7 +206,7 @@ def recording(table: Columns, name: str, p: Parameters, sensors: dict[str, Senso
     columns = {k: torch.tensor(column) for k, column in values.items()}
     x, y = (Sampled(columns["t"], columns[k], columns.get(f"{k}_dot")) for k in SETPOINTS)
     F = Sampled(columns["t"], columns.get("F_ff", torch.zeros(len(t), dtype=torch.float64)))
-    return Recording(name, p, Reference(x_d=x, y_d=y, F_ff=F), samples)
+    return Recording(name, SoftGrasp(p, Reference(x_d=x, y_d=y, F_ff=F)), samples)
 
 
 def stem(path: Path) -> str:

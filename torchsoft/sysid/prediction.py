@@ -1,21 +1,21 @@
-"""Predicted samples of one recording's sensors for given parameters, with derivatives: one run of the model."""
+"""One run of a recording's rig for given parameters: signals with derivatives, or the misfit with its gradient."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from hashlib import sha256
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from scipy.interpolate import CubicSpline
 from torch import Tensor
 
-from torchsoft.channels import MEASURED
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import Layout
 from torchsoft.solve.simulate import simulate
 from torchsoft.solve.tangent import directions
-from torchsoft.solve.trajectory import Trajectory, channels
-from torchsoft.sysid.recording import Array, Recording
+from torchsoft.solve.trajectory import Trajectory, channels, measurable
+from torchsoft.sysid.readout import Signals
+from torchsoft.sysid.recording import Array, Begun, Grid
+from torchsoft.sysid.start import PREFIX
 
 TOLERANCE = 1e-8
 """Newton tolerance [N] of the runs that fits are made of: far below any sensor, above rounding with the largest dashpots."""
@@ -36,8 +36,8 @@ Steps = float | Frozen
 
 
 class Prediction(NamedTuple):
-    """Signals (G, channels) on a grid t (G,) [s], the number of steps, their derivatives (G, channels, n), if there are any,
-    and the steps' ends `knots` [s] where a tolerance chose them."""
+    """Signals (G, channels) of `Recording.channels` on a grid t (G,) [s], the number of steps, the signals' derivatives
+    (G, channels, n), if there are any, and the steps' ends `knots` [s] where a tolerance chose them."""
 
     t: Array
     signals: Array
@@ -47,13 +47,12 @@ class Prediction(NamedTuple):
 
 
 class Misfit(NamedTuple):
-    """Half the sum of squared residuals of one recording, its derivatives by parameters (n,), and by bias and delay of every
-    channel that has noise, and the stepper's steps."""
+    """Half the sum of squared residuals of one recording, its derivatives by the run's parameters (n,), and by every channel's
+    nuisances (channels, nuisances), and the stepper's steps."""
 
     loss: float
     parameters: Array
-    bias: Array
-    delay: Array
+    nuisances: Array
     steps: int
 
 
@@ -64,6 +63,10 @@ class FailedRun(NamedTuple):
     time: float
 
 
+Judge = Callable[[Signals], tuple[float, Array, Array]]
+"""Half the sum of squared residuals of a run's signals, its derivatives by them (G, channels), and by the nuisances."""
+
+
 @torch.no_grad()
 def set_parameters(rig: Rig, values: Mapping[str, float]) -> None:
     """Give the rig other parameters, by the names that `Rig.parameter` knows."""
@@ -71,16 +74,41 @@ def set_parameters(rig: Rig, values: Mapping[str, float]) -> None:
         rig.parameter(name).fill_(value)
 
 
-def derivatives(rig: Rig, run: Trajectory) -> Array:
-    """Derivatives (T, channels, n) of every channel of `MEASURED` by the run's n parameters: along the motion of the bodies,
-    and of the controllers' own parameters."""
+class Run(NamedTuple):
+    """What a run begins with: the state y0 (size,), and the tensors by which it is differentiated, those of parameters
+    before those of the start."""
+
+    y0: Tensor
+    parameters: tuple[str, ...]
+    wanted: list[Tensor]
+
+
+def prepared(begun: Begun, values: Mapping[str, float], names: Sequence[str]) -> Run:
+    """Gives the rig its parameters, and makes the state where it begins, with its derivatives by `names`."""
+    set_parameters(begun.rig, {name: value for name, value in values.items() if not name.startswith(PREFIX)})
+    at = {
+        name: torch.tensor(value, dtype=torch.float64, requires_grad=name in names)
+        for name, value in values.items()
+        if name.startswith(PREFIX)
+    }
+    parameters = tuple(name for name in names if name not in at)
+    assert tuple(names[: len(parameters)]) == parameters
+    wanted = [*map(begun.rig.parameter, parameters), *(at[name] for name in names if name in at)]
+    return Run(begun.y0(at), parameters, wanted)
+
+
+def derivatives(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
+    """Derivatives (T, channels, n) of the channels `names` by the run's parameters and start: along the motion of the bodies, and
+    of the controllers' own parameters."""
     assert run.sensitivities is not None
     bodies, signals = Layout({}, {}, rig.layout.free, {}), rig.follow(run.t, rig.reference).detach()
-    along = [torch.zeros((), dtype=torch.float64, requires_grad=True) for _ in run.wrt]
+    along = [torch.zeros((), dtype=torch.float64, requires_grad=True) for _ in range(run.sensitivities.shape[-1])]
     q = run.y[:, rig.layout.rigid].detach() + run.sensitivities @ torch.stack(along)
     known = channels(rig, bodies.unpack(q, *rig.held(signals)), signals)
-    measured = torch.stack([known[name] for name in MEASURED], -1)
-    return directions(measured, along) + directions(measured, [rig.parameter(name) for name in run.wrt])
+    measured = torch.stack([known[name] for name in names], -1)
+    out = directions(measured, along)
+    out[..., : len(run.wrt)] += directions(measured, [rig.parameter(name) for name in run.wrt])
+    return out
 
 
 def choice(steps: Steps) -> dict[str, Any]:
@@ -89,61 +117,32 @@ def choice(steps: Steps) -> dict[str, Any]:
     return chosen | {"tolerance": TOLERANCE}
 
 
-def predict(rig: Rig, y0: Tensor, t: Tensor, names: Sequence[str], steps: Steps) -> Prediction:
-    """Signals from the state y0 on the grid t (G,), and their derivatives by the parameters `names`, if there are any.
-
-    The first time, from which the disc only settles, is left out. Raises `SimulationFailed`.
-    """
-    dy0 = torch.from_numpy(directions(y0, [rig.parameter(name) for name in names])) if names else None
-    run = simulate(
-        rig, t, y0=y0, gradient="forward" if names else "none", wrt=names, dy0=dy0, rigid=bool(names), **choice(steps)
-    )
-    slopes = derivatives(rig, run)[1:] if names else None
-    knots = None if isinstance(steps, Frozen) else run.knots.numpy()
-    return Prediction(t[1:].numpy(), run.together(*MEASURED)[1:].detach().numpy(), run.stats.steps, slopes, knots)
-
-
-class Reading(NamedTuple):
-    """Predicted samples (k,) of one channel at its own times, their derivatives (k, n), and their rates (k,) [unit/s]."""
-
-    values: Array
-    derivatives: Array | None
-    rates: Array
-
-
-def read(prediction: Prediction, channel: str, times: Array, delay: float) -> Reading:
-    """Samples of a sensor with a `delay` [s] at `times` (k,): the cubic spline through the prediction, `delay` earlier."""
-    at, j = times - delay, MEASURED.index(channel)
-    spline = CubicSpline(prediction.t, prediction.signals[:, j])
-    slopes = None
-    if prediction.derivatives is not None:
-        slopes = CubicSpline(prediction.t, prediction.derivatives[:, j])(at)
-    return Reading(spline(at), slopes, spline(at, 1))
-
-
-def interpolation(t: Array, at: Array) -> Array:
-    """The matrix (k, G) of the same spline."""
-    return CubicSpline(t, np.eye(len(t)))(at)
+def predict(
+    begun: Begun, values: Mapping[str, float], grid: Grid, names: Sequence[str], steps: Steps
+) -> Prediction:
+    """Signals on the grid, and their derivatives by `names`, if there are any. Raises
+    `SimulationFailed`."""
+    rig, run = begun.rig, prepared(begun, values, names)
+    dy0 = torch.from_numpy(directions(run.y0, run.wanted)) if names else None
+    out = simulate(
+        rig, grid.t, y0=run.y0, gradient="forward" if names else "none", wrt=run.parameters, dy0=dy0, rigid=bool(names),
+        **choice(steps),
+    )  # fmt: skip
+    keys, rows = measurable(rig), slice(grid.early, None)
+    slopes = derivatives(rig, out, keys)[rows] if names else None
+    knots = None if isinstance(steps, Frozen) else out.knots.numpy()
+    return Prediction(grid.t[rows].numpy(), out.together(*keys)[rows].detach().numpy(), out.stats.steps, slopes, knots)
 
 
 def misfit(
-    rig: Rig, y0: Tensor, recording: Recording, t: Tensor, names: Sequence[str], steps: Steps,
-    noise: dict[str, float], bias: dict[str, float], delay: dict[str, float],
-) -> Misfit:  # fmt: skip
-    """The misfit with its gradient by the parameters `names`, by the discrete adjoint, and by `bias` and `delay` (one entry a
-    channel in `noise`). Raises `SimulationFailed`."""
-    at, loss = t[1:], torch.zeros((), dtype=torch.float64)
-    run = simulate(rig, t, y0=y0, gradient="discrete", **choice(steps))
-    by_bias, by_delay = np.zeros(len(noise)), np.zeros(len(noise))
-    for k, (channel, sigma) in enumerate(noise.items()):
-        if channel not in recording.samples:
-            continue
-        times, measured = recording.samples[channel]
-        spline = torch.from_numpy(interpolation(at.numpy(), times - delay[channel]))
-        r = (spline @ run[channel][1:] + bias[channel] - torch.from_numpy(measured)) / sigma
-        loss = loss + 0.5 * r.square().sum()
-        rates = CubicSpline(at.numpy(), run[channel][1:].detach().numpy())(times - delay[channel], 1)
-        by_bias[k], by_delay[k] = float(r.detach().sum()) / sigma, -float(r.detach().numpy() @ rates) / sigma
-    gradient = torch.autograd.grad(loss, [rig.parameter(name) for name in names], allow_unused=True)
-    by_parameters = np.array([0.0 if g is None else float(g) for g in gradient])
-    return Misfit(float(loss.detach()), by_parameters, by_bias, by_delay, run.stats.steps)
+    begun: Begun, values: Mapping[str, float], grid: Grid, names: Sequence[str], steps: Steps, judge: Judge
+) -> Misfit:
+    """The misfit that `judge` finds, with its gradient by `names`, by the discrete adjoint. Raises `SimulationFailed`."""
+    rig, run = begun.rig, prepared(begun, values, names)
+    out = simulate(rig, grid.t, y0=run.y0, gradient="discrete", **choice(steps))
+    keys, rows = measurable(rig), slice(grid.early, None)
+    signals = out.together(*keys)[rows]
+    loss, weights, nuisances = judge(Signals(grid.t[rows].numpy(), keys, signals.detach().numpy(), None))
+    gradient = torch.autograd.grad(signals, run.wanted, torch.from_numpy(weights), allow_unused=True)
+    by = np.array([0.0 if g is None else float(g) for g in gradient])
+    return Misfit(loss, by, nuisances, out.stats.steps)

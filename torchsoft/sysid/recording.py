@@ -1,8 +1,8 @@
-"""A recording: the reference that the controllers followed and the samples of the sensors, which may have gaps."""
+"""A recording: the rig that was there, where its run began, and the samples of the sensors, which may have gaps."""
 
 import inspect
-from collections.abc import Callable
-from dataclasses import dataclass
+from copy import deepcopy
+from dataclasses import dataclass, field
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
@@ -11,24 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
-from torchsoft.channels import MEASURED
-from torchsoft.excitation import start
-from torchsoft.parameters import Parameters
-from torchsoft.physics.motion import Reference
-from torchsoft.physics.pads import Pad
-from torchsoft.physics.paper import NAMES, SoftGrasp
-from torchsoft.physics.state import State
+from torchsoft.physics.rig import Rig
+from torchsoft.solve.trajectory import measurable
+from torchsoft.sysid.start import AtRest, Begin, Start, StartCoordinate
 
 Array = NDArray[np.float64]
-
-Build = Callable[[Parameters, Reference], SoftGrasp]
-"""Makes the model of a recording from its settings and reference: `SoftGrasp` itself, or a function that gives it laws of the
-user's own, such as a friction law."""
-
-SETTLE = 0.2
-"""Time [s] that the disc is given, before the first sample, to sink into the pad: twenty of the pads' own times 1/tau."""
 
 BETWEEN = 1e-3
 """Spacing [s] of the regular grid that is simulated where samples are needed between (an unknown delay), or are denser than it;
@@ -41,80 +30,53 @@ SAME = 1e-9
 """Times [s] closer than this are one time."""
 
 
-class Start(NamedTuple):
-    """A model and where it starts: the state, and by massless pad the displacements (2 nodes,) [m], E depth [N/m] and nu that
-    its forces belong to."""
+class Begun(NamedTuple):
+    """A rig of a run's own, and where the run begins."""
 
-    model: SoftGrasp
-    state: State
-    held: dict[str, tuple[Tensor, float, float]]
-
-    @property
-    def y0(self) -> Tensor:
-        """The state (size,) from which to simulate, with its derivative by the model's parameters: displacements stay when
-        parameters change, and massless pads get the forces that hold them so."""
-        pads = dict(self.state.pads)
-        for name, (u, stiffness, nu) in self.held.items():
-            pads[name] = held_forces(self.model.pads[name], pads[name], u, stiffness, nu)
-        return self.model.pack(self.state._replace(pads=pads))
+    rig: Rig
+    y0: Begin
 
 
-def held_forces(pad: Pad, z: Tensor, u: Tensor, stiffness: float, nu: float) -> Tensor:
-    """Forces z (branches, nodes, 2) [N] for the pad's present material, at the displacements u that they made before.
+class Grid(NamedTuple):
+    """Times t (G,) [s] to simulate, and how many of them come before what is looked at."""
 
-    They are in proportion to E depth, which needs no linear solve: a solve's last bits differ from call to call, and a run that
-    is made again must be the same.
-    """
-    material = pad.material
-    if float(material.nu.detach()) != nu:
-        f = torch.linalg.solve(pad.compliance(), u)
-        f = torch.round(f.detach(), decimals=9) + (f - f.detach())
-        return f.unflatten(0, (-1, 2)).expand(z.shape)
-    scaled = z * (material.E * material.depth / stiffness)
-    C, dC = pad.unit_compliance()
-    by_nu = -torch.linalg.solve(C, dC @ scaled.detach().flatten(-2).mT).mT.reshape(z.shape)
-    return scaled + by_nu * (material.nu - material.nu.detach())
-
-
-def lying(model: SoftGrasp) -> Start:
-    """The disc at rest on the lower pad and the bracket clear of it, by the model's own parameters."""
-    state, held = model.unpack(start(model).detach()), {}
-    for name, pad in model.pads.items():
-        if not pad.inertial:
-            material = pad.material
-            u = model.displacement(name, state).detach().flatten()
-            held[name] = u, float((material.E * material.depth).detach()), float(material.nu.detach())
-    return Start(model, state, held)
+    t: Tensor
+    early: int
 
 
 @dataclass(frozen=True)
 class Recording:
-    """One run of the rig, begun with the disc at rest on the lower pad and the bracket clear of it.
+    """One run of a rig, seen by sensors.
 
-    `settings` are the known numbers, and the nominal ones of what is unknown; `samples` holds times (k,) [s] and values (k,)
-    by channel, each with times of its own. The run is simulated from `SETTLE` before the first sample, from where
-    nominal parameters would have disc and pads at rest: most of what that gets wrong has died away at the first sample. `build`
-    makes the model.
+    `rig` has the known numbers and the nominal ones of what is unknown, the laws, and the reference that the run followed; runs
+    are made of copies of it. `samples` holds times (k,) [s] and values (k,) by channel, each with times of its own; channels
+    are those of the rig's trajectories that `measurable` names. `start` says where the run begins. `dataclasses.replace`
+    makes variants, with another law, say.
     """
 
     name: str
-    settings: Parameters
-    reference: Reference
-    samples: dict[str, tuple[Array, Array]]
-    build: Build = SoftGrasp
+    rig: Rig = field(repr=False)
+    samples: dict[str, tuple[Array, Array]] = field(repr=False)
+    start: Start = AtRest()
 
     def __post_init__(self) -> None:
         if not self.samples:
             raise ValueError(f"recording `{self.name}` has no samples")
+        known = measurable(self.rig)
         for channel, (t, y) in self.samples.items():
-            if channel not in MEASURED:
-                raise ValueError(f"`{channel}` is not a channel; known: {', '.join(MEASURED)}")
+            if channel not in known:
+                raise ValueError(f"`{channel}` is not a channel of the rig of `{self.name}`; known: {', '.join(known)}")
             if t.shape != y.shape or t.ndim != 1 or len(t) < 2:
                 raise ValueError(f"`{channel}` of `{self.name}` needs at least two samples, times and values alike")
             if not (np.isfinite(t).all() and np.isfinite(y).all() and (np.diff(t) > 0).all()):
                 raise ValueError(f"`{channel}` of `{self.name}` must have finite values at increasing times")
 
-    @property
+    @cached_property
+    def channels(self) -> tuple[str, ...]:
+        """What a sensor of this rig can measure."""
+        return measurable(self.rig)
+
+    @cached_property
     def times(self) -> Array:
         """Every time at which something was measured (m,) [s]."""
         every = np.unique(np.concatenate([t for t, _ in self.samples.values()]))
@@ -125,56 +87,85 @@ class Recording:
         """From the first to the last sample [s]."""
         return float(self.times[-1] - self.times[0])
 
-    @property
+    @cached_property
     def speed(self) -> float:
-        """Root mean square of the horizontal speed of the set-point [m/s]: slow recordings are the easy ones."""
+        """Root mean square of the speed of the horizontal setpoints and drives [m/s]: slow recordings are the easy ones."""
+        names = [a.setpoint for a in self.rig.actuators.values() if a.measures.endswith(".x") and a.setpoint]
+        names += [name for name in self.rig.signals if name.endswith(".x")]
+        if not names:
+            return 0.0
         t = torch.from_numpy(np.linspace(self.times[0], self.times[-1], 2000))
-        return float(self.reference(t, ("x_d",))[..., 1].detach().square().mean().sqrt())
+        return float(self.rig.reference(t, names)[..., 1].detach().square().mean().sqrt())
 
-    @property
-    def fingerprint(self) -> str:
-        """Names everything that decides a run or a residual of this recording."""
-        t = torch.from_numpy(np.linspace(self.times[0] - SETTLE, self.times[-1], 2000))
-        setpoints = self.reference(t, ("x_d", "y_d", "F_ff")).detach().numpy().tobytes()
-        measured = b"".join(k.encode() + t.tobytes() + y.tobytes() for k, (t, y) in sorted(self.samples.items()))
-        return sha256(self.settings.model_dump_json().encode() + setpoints + measured + self._own_laws()).hexdigest()
-
-    def _own_laws(self) -> bytes:
-        """What `build` makes: the model's numbers, and the files with the code of `build`, of its modules and functions."""
-        if self.build is SoftGrasp:
-            return b""
-        model = self.build(self.settings, self.reference)
-        modules = list(model.modules())
-        functions = [value for module in modules for value in vars(module).values() if inspect.isfunction(value)]
-        code = {getattr(self.build, "func", self.build), *map(type, modules), *functions}
-        named = {f"{one.__module__}.{one.__qualname__}": one for one in code}
-        own = {name: one for name, one in named.items() if name.split(".")[0] not in ("torch", "torchsoft")}
-        numbers = {name: value.tolist() for name, value in model.named_parameters()}
-        return repr((sorted(named), numbers)).encode() + b"".join(source(own[name]) for name in sorted(own))
+    @cached_property
+    def start_coordinates(self) -> tuple[StartCoordinate, ...]:
+        """What is unknown of where the run begins."""
+        return self.start.coordinates(self.rig, self.samples)
 
     @cached_property
     def parameters(self) -> dict[str, float]:
-        """Every number of the model that can be identified, by its name in `Parameters`, or in the model where that is all."""
-        model = self.build(self.settings, self.reference)
-        names = {own: name for name, own in NAMES.items()}
-        known = {names.get(own, own): value for own, value in model.named_parameters() if value.requires_grad}
-        return {name: float(value.detach()) for name, value in known.items() if value.ndim == 0}
+        """Every number that can be identified: the rig's scalar parameters, by their aliases where they have one, and the
+        start's coordinates."""
+        names = {own: name for name, own in self.rig.aliases.items()}
+        mine = [(own, value) for own, value in self.rig.named_parameters() if not own.startswith("reference.")]
+        scalars = {names.get(own, own): value for own, value in mine if value.ndim == 0}
+        numbers = {name: float(value.detach()) for name, value in scalars.items()}
+        return numbers | {c.name: c.mean for c in self.start_coordinates}
 
-    def begin(self) -> Start:
-        """A model with the settings and the reference, and where it starts."""
-        return lying(self.build(self.settings, self.reference))
+    def begin(self) -> Begun:
+        """A copy of the rig, and where its runs begin."""
+        rig = deepcopy(self.rig)
+        for name, value in rig.named_parameters():
+            value.requires_grad_(not name.startswith("reference."))
+        return Begun(rig, self.start.begin(rig, self.samples))
 
     def on_a_grid(self, interpolated: bool) -> bool:
         """Whether a regular grid is simulated, every `BETWEEN`, in place of the samples' own times: where they are denser, or
         values between them are needed (`interpolated`)."""
         return interpolated or self.duration < 0.99 * BETWEEN * (len(self.times) - 1)
 
-    def grid(self, interpolated: bool) -> Tensor:
-        """Times (G,) [s] to simulate: `SETTLE` before the first sample, then the samples' own, or a regular grid from `REACH`
-        before the first to `REACH` after the last."""
-        t = self.times
-        around = np.arange(t[0] - REACH, t[-1] + REACH + BETWEEN, BETWEEN) if self.on_a_grid(interpolated) else t
-        return torch.from_numpy(np.concatenate(([t[0] - SETTLE], around)))
+    def grid(self, interpolated: bool) -> Grid:
+        """The times to simulate: the beginning, where that is before the samples, then the samples' own times, or a regular grid
+        from `REACH` before the first, but not from before the beginning, to `REACH` after the last."""
+        t, lead = self.times, self.start.lead
+        if self.on_a_grid(interpolated):
+            t = np.arange(t[0] - min(REACH, lead), t[-1] + REACH + BETWEEN, BETWEEN)
+        begin = self.times[0] - lead
+        early = int(t[0] - begin > SAME)
+        return Grid(torch.from_numpy(np.append([begin] * early, t)), early)
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Names everything that decides a run or a residual of this recording."""
+        t = torch.from_numpy(np.linspace(self.times[0] - self.start.lead, self.times[-1], 2000))
+        signals = self.rig.follow(t).detach().numpy().tobytes()
+        measured = b"".join(k.encode() + t.tobytes() + y.tobytes() for k, (t, y) in sorted(self.samples.items()))
+        return sha256(identity(self.rig) + signals + measured + repr(self.start).encode()).hexdigest()
+
+
+def identity(rig: Rig) -> bytes:
+    """What a rig is made of: its parts' numbers and plain attributes, but for the reference, and the files with the code of
+    parts that are the user's own."""
+    parts = [(name, part) for name, part in rig.named_modules() if name.split(".")[0] != "reference"]
+    text = [f"{name} {type(part).__qualname__} {plain(part)}" for name, part in parts]
+    functions = [value for _, part in parts for value in vars(part).values() if inspect.isfunction(value)]
+    code = {f"{one.__module__}.{one.__qualname__}": one for one in (*(type(part) for _, part in parts), *functions)}
+    own = {name: one for name, one in code.items() if name.split(".")[0] not in ("torch", "torchsoft")}
+    return repr(text).encode() + b"".join(name.encode() + source(own[name]) for name in sorted(own))
+
+
+def plain(part: nn.Module) -> str:
+    """A part's own parameters and buffers, and its attributes that are numbers, text, arrays or tuples of them."""
+    tensors = {**dict(part.named_parameters(recurse=False)), **dict(part.named_buffers(recurse=False))}
+    known: dict[str, Any] = {name: value.tolist() for name, value in tensors.items()}
+    for name, value in vars(part).items():
+        if isinstance(value, np.ndarray | Tensor):
+            known[name] = sha256(np.ascontiguousarray(np.asarray(value))).hexdigest()
+        elif not name.startswith("_") and isinstance(value, int | float | str | tuple | dict | None):
+            known[name] = value
+    if hasattr(part, "mesh"):
+        known["mesh"] = part.mesh.nodes.tolist(), part.mesh.bonded_sides
+    return repr(sorted(known.items()))
 
 
 def source(code: Any) -> bytes:

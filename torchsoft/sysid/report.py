@@ -104,8 +104,7 @@ def grouped(value: float) -> str:
 def estimates_table(result: IdentificationResult, start: list[float]) -> str:
     rows = []
     for e, s in zip(result.estimates, start):
-        channel = CHANNELS.get(e.name.removeprefix("bias of "))
-        unit = channel.unit if channel else "" if e.unit == "1" else e.unit
+        unit = "" if e.unit == "1" else e.unit
         if e.value is None or e.ci95 is None:
             found = [("weak", "not identifiable"), ("weak", "none")]
         else:

@@ -9,10 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from torchsoft.channels import unit
 from torchsoft.files import finite, replacing
 from torchsoft.parameters import Parameters
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
+from torchsoft.sysid.start import PREFIX
+from torchsoft.sysid.unknowns import Coordinate
 
 CONFIDENCE = 0.95
 
@@ -174,7 +177,7 @@ def estimates(problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shi
     for k, recording in enumerate(problem.recordings):
         values = problem.values(x, k)
         chain = c.jacobian(x, recording.name, values)
-        for row, name in enumerate(c.names):
+        for row, name in enumerate(name for name in c.names if not name.startswith(PREFIX)):
             mine = [i for i in np.flatnonzero(chain[row]) if free[i]]
             own = any(c.all[i].recording is not None for i in mine)
             if not mine or (k > 0 and not own):
@@ -193,10 +196,20 @@ def estimates(problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shi
         if one.kind != "parameter" and free[i]:
             spread = float(np.sqrt(C[i, i]))
             value, sd = one.to_value(x[i]), spread * float(one.slope(x[i]))
-            unit, interval = "s" if one.kind == "delay" else "of the channel", (value - q * sd, value + q * sd)
-            relative = sd / max(abs(value), 1e-300)
-            add(one.label, unit, None, value, spread, relative, interval, edge[i], float(shift[i]) / spread)
+            interval, relative = (value - q * sd, value + q * sd), sd / max(abs(value), 1e-300)
+            name = one._replace(recording=None).label
+            add(name, nuisance_unit(one), one.recording, value, spread, relative, interval, edge[i], float(shift[i]) / spread)
     return out
+
+
+def nuisance_unit(one: Coordinate) -> str:
+    """Unit of a start's coordinate, or of what is wrong with a sensor."""
+    if one.kind == "start":
+        axis = one.name.split(".")[2]
+        return "rad/s" if axis == "v_theta" else "m/s" if axis.startswith("v_") else "rad" if axis == "theta" else "m"
+    own = unit(one.name)
+    units = {"bias": own, "drift": f"{own}/s", "delay": "s", "gain": "1", "misalignment": "rad", "inertia": "kg"}
+    return units[one.kind]
 
 
 def directions(labels: list[str], values: Array, vectors: Array) -> list[Direction]:

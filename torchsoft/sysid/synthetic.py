@@ -1,17 +1,23 @@
 """Recordings made by the simulator itself: a known truth to identify."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import torch
 
 from torchsoft.excitation import Excitation, begin
 from torchsoft.parameters import Parameters
+from torchsoft.physics.motion import Reference
 from torchsoft.physics.paper import SoftGrasp
 from torchsoft.solve.simulate import simulate
 from torchsoft.sysid.prediction import choice, set_parameters
-from torchsoft.sysid.recording import SETTLE, Build, Recording, lying
+from torchsoft.sysid.recording import Recording
+from torchsoft.sysid.start import AtRest, held_start
 from torchsoft.sysid.unknowns import Sensor
+
+Build = Callable[[Parameters, Reference], SoftGrasp]
+"""Makes a rig from settings and a reference: `SoftGrasp` itself, or a function that gives it laws of the user's own, such as a
+friction law."""
 
 RIG = {
     channel: Sensor(noise=noise)
@@ -32,21 +38,20 @@ def record(
 ) -> Recording:  # fmt: skip
     """What a rig with the parameters `truth` gives under an excitation that was planned with the `nominal` ones.
 
-    The disc is set down, as the nominal parameters would have it lie, `SETTLE` before the first sample, as
-    `Recording.begin` assumes. Sampled at `rate` [Hz] from a run whose steps `rtol` chooses, with Gaussian noise of `noise`
-    times each sensor's own. `build` makes the model, and `values` are the truth of what `Parameters` does not have. The
-    recording holds nothing of the truth but the samples. Raises `SimulationFailed`.
+    The disc is set down, as the nominal parameters would have it lie, before the first sample, as `AtRest` assumes. Sampled at
+    `rate` [Hz] from a run whose steps `rtol` chooses, with Gaussian noise of `noise` times each sensor's own. `build` makes
+    the rig, and `values` are the truth of what `Parameters` does not have. The recording holds nothing of the truth but the
+    samples. Raises `SimulationFailed`.
     """
     planned = begin(excitation, nominal).model
-    settings, reference = planned.settings, planned.reference
-    real = build(excitation.settings(truth), reference)
+    rig = build(planned.settings, planned.reference)
+    real = build(excitation.settings(truth), planned.reference)
     set_parameters(real, values or {})
-    at = np.arange(0.0, excitation.duration + 0.5 / rate, 1.0 / rate)
-    t = torch.from_numpy(np.concatenate(([at[0] - SETTLE], at)))
-    y0 = lying(build(settings, reference))._replace(model=real).y0.detach()
-    run = simulate(real, t, y0=y0, **choice(rtol))
+    at, start = np.arange(0.0, excitation.duration + 0.5 / rate, 1.0 / rate), AtRest()
+    t = torch.from_numpy(np.concatenate(([at[0] - start.lead], at)))
+    run = simulate(real, t, y0=held_start(rig, real).detach(), **choice(rtol))
     rng, samples = np.random.default_rng(seed), {}
     for channel, sensor in sensors.items():
         exact = run[channel][1:].detach().numpy()
         samples[channel] = (at, exact + noise * sensor.noise * rng.standard_normal(len(at)))
-    return Recording(name, settings, reference, samples, build)
+    return Recording(name, rig, samples, start)

@@ -6,27 +6,58 @@ a relative one either way.
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Literal, NamedTuple, Self
+from typing import Literal, NamedTuple, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from torchsoft.parameters import ORDERED, bounds
-from torchsoft.sysid.recording import REACH, Array
+from torchsoft.sysid.recording import REACH, Array, Recording
+from torchsoft.sysid.start import BOUNDS, PREFIX
 from torchsoft.tables import Table, line, shown
 
 SPREAD = 10.0
 """Bounds of a logarithmic parameter that gives none: its nominal value divided and multiplied by this."""
 
 
-class Unknown(Table):
-    """One parameter to be identified, by its dotted name in `Parameters`, or in the model where it is of a user's law.
+Per = Literal["all", "recording"]
+"""Whether one value belongs to all recordings, or each has its own."""
 
-    `nominal` is where the search starts, by default the value of the recordings' own settings; with `ratio_to` the value,
-    nominal and bounds are those of the ratio to that other parameter. Bounds end where the parameter's own do
-    (`torchsoft.parameters.bounds`): wider ones are errors. A parameter that is not `shared` has a value of its own
-    in every recording.
+
+class Prior(Table):
+    """What is known of a value beforehand: a normal distribution with standard deviation `sd` about the `median`, or
+    ("log-normal") one of the logarithm, `sd` being that of ln."""
+
+    median: float
+    sd: float = Field(gt=0, le=1e12)
+    kind: Literal["normal", "log-normal"] = "normal"
+
+    @model_validator(mode="after")
+    def _has_a_logarithm(self) -> Self:
+        if self.kind == "log-normal" and self.median <= 0:
+            raise ValueError(f"a log-normal prior needs median > 0, but it is {self.median}")
+        return self
+
+    def row(self, value: float) -> tuple[float, float]:
+        """The residual (value - median) / sd, or that of logarithms, and its derivative by the value."""
+        if self.kind == "log-normal":
+            return math.log(value / self.median) / self.sd, 1 / (value * self.sd)
+        return (value - self.median) / self.sd, 1 / self.sd
+
+    def draw(self, rng: np.random.Generator) -> float:
+        """A value from the distribution."""
+        z = self.sd * float(rng.standard_normal())
+        return self.median * math.exp(z) if self.kind == "log-normal" else self.median + z
+
+
+class Unknown(Table):
+    """One parameter to be identified: of the rig, a user's law included, by its name there, or by its alias in `Parameters`.
+
+    `nominal` is where the search starts, by default the value of the recordings' own rigs; with `ratio_to` the value,
+    nominal, bounds and prior are those of the ratio to that other parameter, and `fixed` besides ties the two. Bounds end where
+    the parameter's own do (`torchsoft.parameters.bounds`): wider ones are errors. With `per` = "recording" every recording has
+    a value of its own. A `prior` counts as one more measurement.
     """
 
     nominal: float | None = None
@@ -35,7 +66,8 @@ class Unknown(Table):
     scale: Literal["log", "linear"] = "log"
     ratio_to: str | None = None
     fixed: bool = False
-    shared: bool = True
+    per: Per = "all"
+    prior: Prior | None = None
 
     @model_validator(mode="after")
     def _bounds_are_ordered(self) -> Self:
@@ -47,35 +79,76 @@ class Unknown(Table):
             value = getattr(self, name)
             if self.scale == "log" and value is not None and value <= 0:
                 raise ValueError(f"a logarithmic scale needs {name} > 0, but it is {value}")
+        if self.fixed and self.prior is not None:
+            raise ValueError("a fixed unknown needs no prior")
         return self
 
 
+Nuisance = Literal["bias", "delay", "gain", "drift", "misalignment", "inertia"]
+NUISANCES: tuple[Nuisance, ...] = get_args(Nuisance)
+"""What may be wrong with a sensor, in the order of a problem's coordinates."""
+
+
 class Sensor(Table):
-    """A measured channel: standard deviation of its noise [the channel's unit], and how large a constant `bias` [unit] and a
-    `delay` [s] may be; zero leaves them out, otherwise they are identified too."""
+    """A measured channel: standard deviation of its noise [the channel's unit], what may be wrong with it, and where it ends.
+
+    How large may be a constant `bias` [unit], a `delay` [s], the error of its `gain` [1], a `drift` [unit/s] from the middle of
+    the recording on, its `misalignment` [rad] about the axis out of the plane; the `inertia` [kg] between a force sensor and what
+    it pushes, whose acceleration it does not feel. Zero leaves them out, otherwise they are identified too, one for all
+    recordings or one for each (`per`). Samples at `low` or `high` [unit] or beyond are saturated: they only say that the value
+    is there or beyond. `colour` says whether the noise is known to be independent ("white"), or may be an autoregression
+    ("ar"), whose order and coefficients are then found.
+    """
 
     noise: float = Field(ge=1e-15, le=1e6)
     bias: float = Field(default=0.0, ge=0, le=1e6)
     delay: float = Field(default=0.0, ge=0, le=REACH)
+    gain: float = Field(default=0.0, ge=0, le=0.5)
+    drift: float = Field(default=0.0, ge=0, le=1e6)
+    misalignment: float = Field(default=0.0, ge=0, le=0.5)
+    inertia: float = Field(default=0.0, ge=0, le=1e5)
+    per: Per = "all"
+    low: float | None = None
+    high: float | None = None
+    colour: Literal["white", "ar"] = "white"
+
+    @model_validator(mode="after")
+    def _has_a_range(self) -> Self:
+        if self.low is not None and self.high is not None and self.low >= self.high:
+            raise ValueError(f"low = {self.low} must be below high = {self.high}")
+        return self
+
+    @property
+    def nuisances(self) -> dict[Nuisance, tuple[float, float, float]]:
+        """Least, nominal and largest value of what is to be identified of it."""
+        rest: dict[Nuisance, float] = {kind: float(kind == "gain") for kind in NUISANCES}
+        reach = {kind: getattr(self, kind) for kind in NUISANCES}
+        return {kind: (rest[kind] - r, rest[kind], rest[kind] + r) for kind, r in reach.items() if r > 0}
 
 
 class Coordinate(NamedTuple):
-    """One entry of the vector: what it belongs to, its bounds and start in physical units, and its scale."""
+    """One entry of the vector: what it belongs to, its bounds and start in physical units, its scale, and its prior."""
 
     name: str
-    kind: Literal["parameter", "bias", "delay"]
+    kind: Literal["parameter", "start"] | Nuisance
     recording: str | None
     nominal: float
     low: float
     high: float
-    scale: Literal["log", "linear"]
-    ratio_to: str | None
-    fixed: bool
+    scale: Literal["log", "linear"] = "linear"
+    ratio_to: str | None = None
+    fixed: bool = False
+    prior: Prior | None = None
+
+    @property
+    def of_the_rig(self) -> bool:
+        """Whether a run depends on it, not only what sensors make of the run."""
+        return self.kind in ("parameter", "start")
 
     @property
     def label(self) -> str:
         """Readable name, such as `contact.K_n`, `contact.mu_k / contact.mu_s`, `delay of theta`."""
-        what = self.name if self.kind == "parameter" else f"{self.kind} of {self.name}"
+        what = self.name if self.of_the_rig else f"{self.kind} of {self.name}"
         ratio = f" / {self.ratio_to}" if self.ratio_to else ""
         return f"{what}{ratio}" + (f" in {self.recording}" if self.recording else "")
 
@@ -113,18 +186,21 @@ def limits(name: str, unknowns: Mapping[str, Unknown], given: Mapping[str, float
 
 
 class Coordinates:
-    """All coordinates of a problem, in a fixed order, and the way from their vector x (n,) to parameters of the model.
+    """All coordinates of a problem, in a fixed order, and the way from their vector x (n,) to parameters of the rig, of where
+    runs begin, and of the sensors.
 
-    `given` holds the nominal values of what can be identified. Raises `ValueError` for other names, a ratio to something that
-    is not there, or a start out of bounds.
+    Raises `ValueError` for unknowns that some recording's rig has not, a ratio to something that is not there, or a nominal value
+    out of bounds.
     """
 
     def __init__(
-        self, unknowns: dict[str, Unknown], sensors: dict[str, Sensor], recordings: Sequence[str],
-        given: Mapping[str, float],
-    ) -> None:  # fmt: skip
-        self.recordings, self.all = tuple(recordings), []
+        self, unknowns: dict[str, Unknown], sensors: dict[str, Sensor], recordings: Sequence[Recording]
+    ) -> None:
+        self.recordings, self.all = tuple(r.name for r in recordings), list[Coordinate]()
+        given = {name: value for name, value in recordings[0].parameters.items() if not name.startswith(PREFIX)}
         for name, u in unknowns.items():
+            if without := next((r.name for r in recordings[1:] if name in given and name not in r.parameters), None):
+                raise ValueError(f"unknowns: the rig of recording `{without}` has no `{line(name, 80)}`")
             if name not in given:
                 raise ValueError(f"unknowns: `{line(name, 80)}` cannot be identified; what can: {', '.join(given)}")
             if u.ratio_to is not None and (u.ratio_to not in given or u.ratio_to == name):
@@ -154,15 +230,21 @@ class Coordinates:
                 raise ValueError(
                     f"unknowns.{name}.nominal = {nominal:g} is not between low = {low:g} and high = {high:g}"
                 )
-            for where in (None,) if u.shared else self.recordings:
-                self.all.append(Coordinate(name, "parameter", where, nominal, low, high, u.scale, u.ratio_to, u.fixed))
+            for where in (None,) if u.per == "all" else self.recordings:
+                self.all.append(
+                    Coordinate(name, "parameter", where, nominal, low, high, u.scale, u.ratio_to, u.fixed, u.prior)
+                )
         self._check_order()
+        for r in recordings:
+            for name, mean, sd in r.start_coordinates:
+                low, high = mean - BOUNDS * sd, mean + BOUNDS * sd
+                prior = Prior(median=mean, sd=sd)
+                self.all.append(Coordinate(name, "start", r.name, mean, low, high, prior=prior))
         for channel, sensor in sensors.items():
-            largest: dict[Literal["bias", "delay"], float] = {"bias": sensor.bias, "delay": sensor.delay}
-            for kind, most in largest.items():
-                if most > 0:
-                    self.all.append(Coordinate(channel, kind, None, 0.0, -most, most, "linear", None, False))
-        self.names = tuple(dict.fromkeys(c.name for c in self.all if c.kind == "parameter"))
+            for kind, (low, nominal, high) in sensor.nuisances.items():
+                seen = [r.name for r in recordings if channel in r.samples] if sensor.per == "recording" else [None]
+                self.all += [Coordinate(channel, kind, where, nominal, low, high) for where in seen]
+        self.names = tuple(dict.fromkeys(c.name for c in self.all if c.of_the_rig))
 
     def _check_order(self) -> None:
         """Raises `ValueError` where a search could take the first of `ORDERED` above the second."""
@@ -195,7 +277,7 @@ class Coordinates:
 
     def values(self, x: Array, recording: str, given: Mapping[str, float]) -> dict[str, float]:
         """Values of the unknown parameters in one recording; `given` holds those that a ratio may refer to."""
-        mine = [(i, c) for i, c in enumerate(self.all) if c.kind == "parameter" and c.recording in (None, recording)]
+        mine = [(i, c) for i, c in enumerate(self.all) if c.of_the_rig and c.recording in (None, recording)]
         out = {c.name: c.to_value(x[i]) for i, c in mine}
         for _, c in mine:
             if c.ratio_to:
@@ -206,7 +288,7 @@ class Coordinates:
         """d (parameters `names`) / d x (names, n) in one recording; `values` are those of `values(x, recording)`."""
         out = np.zeros((len(self.names), len(self.all)))
         for i, c in enumerate(self.all):
-            if c.kind == "parameter" and c.recording in (None, recording):
+            if c.of_the_rig and c.recording in (None, recording):
                 row = self.names.index(c.name)
                 out[row, i] = c.slope(x[i]) * (values[c.name] / c.to_value(x[i]) if c.ratio_to else 1.0)
                 for other in self.all:  # a ratio moves with what it is a ratio to
@@ -215,9 +297,15 @@ class Coordinates:
                         out[self.names.index(other.name), i] += part * c.slope(x[i])
         return out
 
-    def nuisance(self, x: Array, channel: str, kind: str) -> tuple[float, int]:
-        """Bias [unit] or delay [s] of a channel, and its index in x (-1 if it is not there)."""
-        for i, c in enumerate(self.all):
-            if c.kind == kind and c.name == channel:
-                return c.to_value(x[i]), i
-        return 0.0, -1
+    def nuisances(self, x: Array, channel: str, recording: str) -> dict[Nuisance, tuple[float, int]]:
+        """Values of what is wrong with a sensor [SI] in one recording, and their places in x."""
+        return {
+            c.kind: (c.to_value(x[i]), i)
+            for i, c in enumerate(self.all)
+            if c.name == channel and not c.of_the_rig and c.recording in (None, recording)
+        }  # pyright: ignore[reportReturnType]
+
+    @property
+    def priors(self) -> list[tuple[int, Prior]]:
+        """Places of coordinates that have a prior and are free, and the priors."""
+        return [(i, c.prior) for i, c in enumerate(self.all) if c.prior is not None and not c.fixed]

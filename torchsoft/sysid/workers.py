@@ -8,27 +8,24 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from torchsoft.cost import steps_per_second
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.journal import Journal
-from torchsoft.sysid.prediction import (
-    FailedRun,
-    Frozen,
-    Prediction,
-    Steps,
-    misfit,
-    predict,
-    set_parameters,
-)
-from torchsoft.sysid.recording import Recording, Start
+from torchsoft.sysid.noise import Autoregression
+from torchsoft.sysid.prediction import FailedRun, Frozen, Prediction, Steps, misfit, predict
+from torchsoft.sysid.readout import Readout, Signals
+from torchsoft.sysid.recording import Array, Begun, Recording
+from torchsoft.sysid.unknowns import NUISANCES
 from torchsoft.threads import side_by_side, single_threaded
 
 
 class Job(NamedTuple):
-    """One run: which recording, the unknown parameters' values, the names to differentiate by, and the steps.
+    """One run: which recording, the values of what is unknown, the names to differentiate by, and the steps.
 
-    `interpolated` asks for a grid between the samples; `nuisance` (noise, bias and delay by channel) asks for the misfit and
-    its gradient in place of the signals.
+    `interpolated` asks for a grid between the samples; `judged` asks for the misfit and its gradient in place of the signals:
+    by every sensor's readout and the colour of its noise.
     """
 
     recording: int
@@ -36,7 +33,7 @@ class Job(NamedTuple):
     names: tuple[str, ...]
     steps: Steps
     interpolated: bool = False
-    nuisance: tuple[dict[str, float], dict[str, float], dict[str, float]] | None = None
+    judged: tuple[tuple[Readout, Autoregression | None], ...] | None = None
 
 
 class Runner:
@@ -48,7 +45,7 @@ class Runner:
         self.recordings, self.workers = tuple(recordings), workers
         self.simulations = self.jacobians = self.gradients = self.steps = self.remembered = 0
         self._journal = Journal(journal, self.recordings) if journal is not None else None
-        self._idle: list[list[Start]] = [[] for _ in self.recordings]  # models that no thread is using
+        self._idle: list[list[Begun]] = [[] for _ in self.recordings]  # models that no thread is using
 
     def run(self, jobs: Sequence[Job]) -> list[Any]:
         """Results in the order of the jobs: `Prediction`, `Misfit` or `FailedRun`."""
@@ -67,11 +64,11 @@ class Runner:
         """The result of a run that is made now, and kept even if an interruption is waiting for its end."""
         idle = self._idle[job.recording]
         try:
-            start = idle.pop()
+            begun = idle.pop()
         except IndexError:
-            start = self.recordings[job.recording].begin()
-        result = simulated(self.recordings[job.recording], start, job)
-        idle.append(start)
+            begun = self.recordings[job.recording].begin()
+        result = simulated(self.recordings[job.recording], begun, job)
+        idle.append(begun)
         if self._journal is not None:
             self._journal.keep(job, result)
         return result
@@ -84,7 +81,7 @@ class Runner:
 
     def _count(self, job: Job, remembered: bool) -> None:
         self.remembered += remembered
-        if job.nuisance is not None:
+        if job.judged is not None:
             self.gradients += 1
         elif job.names:
             self.jacobians += 1
@@ -92,13 +89,33 @@ class Runner:
             self.simulations += 1
 
 
-def simulated(recording: Recording, start: Start, job: Job) -> Any:
-    """A `Prediction`, a `Misfit`, or a `FailedRun`, by a model that nobody else is using."""
-    set_parameters(start.model, job.values)
-    t = recording.grid(job.interpolated)
+def simulated(recording: Recording, begun: Begun, job: Job) -> Any:
+    """A `Prediction`, a `Misfit`, or a `FailedRun`, by a rig that nobody else is using."""
+    run = begun, job.values, recording.grid(job.interpolated), job.names, job.steps
     try:
-        if job.nuisance is None:
-            return predict(start.model, start.y0, t, job.names, job.steps)
-        return misfit(start.model, start.y0, recording, t, job.names, job.steps, *job.nuisance)
+        if job.judged is None:
+            return predict(*run)
+        return misfit(*run, lambda signals: judge(recording, job.judged or (), signals))
     except SimulationFailed as failure:
         return FailedRun(failure.reason, failure.time)
+
+
+def judge(
+    recording: Recording, judged: Sequence[tuple[Readout, Autoregression | None]], signals: Signals
+) -> tuple[float, Array, Array]:
+    """Half the sum of squared residuals, its derivatives by the signals (G, channels), and by the nuisances of every readout
+    (readouts, nuisances)."""
+    loss, on_signals, on_nuisances = 0.0, np.zeros(signals.values.shape), np.zeros((len(judged), len(NUISANCES)))
+    for k, (one, noise) in enumerate(judged):
+        t, measured = recording.samples[one.channel]
+        y, _, by = one.expected(signals, t)
+        r, weight = one.residuals(y, measured)
+        if noise is not None:
+            W = noise.whitener(t)
+            r = W @ r
+            v = weight * (W.T @ r)
+        else:
+            v = weight * r
+        loss, on_signals = loss + 0.5 * float(r @ r), on_signals + one.pulled_back(signals, t, v)
+        on_nuisances[k] = [v @ by[kind] if kind in by else 0.0 for kind in NUISANCES]
+    return loss, on_signals, on_nuisances
