@@ -4,6 +4,7 @@ Displacements are in the frame of the base, which turns with it. A massless pad'
 nodal forces that have set in, branch by branch of its material's chain; an inertial pad's its displacements and velocities.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,15 @@ class Pad(nn.Module):
         for j in (0, 1):
             spread[np.arange(len(spread)), self.surface.numpy()[self.point_nodes[:, j]]] += self.point_shares[:, j]
         self.register_buffer("spread", torch.from_numpy(spread), persistent=False)
+
+    def remeshed(self, finer: int, points: int) -> "Pad":
+        """The same pad of `finer` times as many elements each way, with so many contact points an element."""
+        m, (c, s) = self.mesh, self.axes[:, 0].tolist()
+        mesh = replace(m, elements_x=finer * m.elements_x, elements_y=finer * m.elements_y)
+        return Pad(
+            mesh, self.material, base=self.base, origin=(float(self.origin[0]), float(self.origin[1])),
+            angle=float(np.arctan2(s, c)), mirrored=float(self.axes.det()) < 0, inertial=self.inertial, points=points,
+        )  # fmt: skip
 
     spread: Tensor
     """Shape functions of the nodes in the state at the contact points (points, nodes)."""

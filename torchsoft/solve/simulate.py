@@ -67,10 +67,10 @@ def simulate(
 
     gradient: with "discrete" the states and channels of the result carry the exact gradient of the discrete run (of the steps
     that were taken, which are not differentiated) by y0, every parameter and the reference; recorded nodal forces and energies
-    do not. With "forward" `sensitivities` holds the derivatives by the n scalar parameters `wrt`, and dy0 (size, n) is that of the
-    start; columns of dy0 beyond the n are directions of the start alone. `rigid` keeps the derivatives of the free coordinates
-    and their rates only. "unrolled" takes given steps in plain torch,
-    "continuous" torchdiffeq's explicit steps and adjoint: both slow, for cross checks over short windows.
+    do not. With "forward" `sensitivities` holds the derivatives by the n scalar parameters `wrt`, and dy0 (size, n) is that of
+    the start; columns of dy0 beyond the n are directions of the start alone. `rigid` keeps the derivatives of the free
+    coordinates and their rates only. "unrolled" takes given steps in plain torch, "continuous" torchdiffeq's explicit steps
+    and adjoint: both slow, for cross checks over short windows.
     Under `torch.no_grad()` no route records a graph.
 
     Raises `ValueError` for times that do not increase, a state of the wrong shape or dtype, an unknown route or parameter, two

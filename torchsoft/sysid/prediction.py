@@ -98,8 +98,8 @@ def prepared(begun: Begun, values: Mapping[str, float], names: Sequence[str]) ->
 
 
 def derivatives(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
-    """Derivatives (T, channels, n) of the channels `names` by the run's parameters and start: along the motion of the bodies, and
-    of the controllers' own parameters."""
+    """Derivatives (T, channels, n) of the channels `names` by the run's parameters and start: along the motion of the bodies,
+    and of the controllers' own parameters."""
     assert run.sensitivities is not None
     bodies, signals = Layout({}, {}, rig.layout.free, {}), rig.follow(run.t, rig.reference).detach()
     along = [torch.zeros((), dtype=torch.float64, requires_grad=True) for _ in range(run.sensitivities.shape[-1])]
@@ -117,9 +117,7 @@ def choice(steps: Steps) -> dict[str, Any]:
     return chosen | {"tolerance": TOLERANCE}
 
 
-def predict(
-    begun: Begun, values: Mapping[str, float], grid: Grid, names: Sequence[str], steps: Steps
-) -> Prediction:
+def predict(begun: Begun, values: Mapping[str, float], grid: Grid, names: Sequence[str], steps: Steps) -> Prediction:
     """Signals on the grid, and their derivatives by `names`, if there are any. Raises
     `SimulationFailed`."""
     rig, run = begun.rig, prepared(begun, values, names)

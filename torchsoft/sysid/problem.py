@@ -15,7 +15,7 @@ from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.prediction import FailedRun, Frozen, Prediction, set_parameters
 from torchsoft.sysid.readout import Readout, Signals, readout
 from torchsoft.sysid.recording import Array, Recording
-from torchsoft.sysid.unknowns import NUISANCES, Coordinates, Sensor, Unknown
+from torchsoft.sysid.unknowns import NUISANCES, Coordinates, Nuisance, Sensor, Unknown
 from torchsoft.sysid.workers import Job, Runner
 from torchsoft.tables import line
 
@@ -26,7 +26,8 @@ StepsByName = float | Mapping[str, Frozen]
 class Residuals(NamedTuple):
     """Residuals r (m,) over the sensors' noise, whitened where its colour is known, then those of the priors; their Jacobian
     J (m, n) by the coordinates (zero where not free), and what was lost: recordings that could not be simulated, with the
-    reason. With a loss r and J are infinite. |r|^2 / 2 is the negative logarithm of the posterior density, but for a constant."""
+    reason. With a loss r and J are infinite. |r|^2 / 2 is the negative logarithm of the posterior density, but for a constant.
+    """
 
     r: Array
     J: Array
@@ -135,7 +136,7 @@ class Problem:
             if channel in recording.samples:
                 at = self.coordinates.nuisances(x, channel, recording.name)
                 span = float(recording.times[0]), float(recording.times[-1])
-                values = {kind: value for kind, (value, _) in at.items()}
+                values: dict[Nuisance, float] = {kind: value for kind, (value, _) in at.items()}
                 out[channel] = readout(recording.rig, channel, sensor, values, span)
         return out
 

@@ -1,4 +1,4 @@
-"""What sensors make of a run: samples of channels with gain, bias, drift, delay, misalignment and inertia, and their derivatives.
+"""What sensors make of a run: samples with gain, bias, drift, delay, misalignment and inertia, and their derivatives.
 
 A reading is y(t) = (1 + error of the gain) * sum of a_k S_k(t - delay) + bias + drift (t - middle), where S_k are channels, or
 rates of channels, of the run.
@@ -77,8 +77,8 @@ class Readout:
         return y, None if slopes is None else self.gain * slopes, by
 
     def residuals(self, y: Array, measured: Array) -> tuple[Array, Array]:
-        """Expected less measured over the noise (k,), and its derivative by the expected; of saturated samples only what is short
-        of the sensor's range counts."""
+        """Expected less measured over the noise (k,), and its derivative by the expected; of saturated samples only what is
+        short of the sensor's range counts."""
         r, weight = (y - measured) / self.noise, np.full(len(y), 1 / self.noise)
         for limit, sign in ((self.high, 1.0), (self.low, -1.0)):
             if limit is not None:

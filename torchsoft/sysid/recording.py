@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from torchsoft.physics.pads import Pad
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.trajectory import measurable
 from torchsoft.sysid.start import AtRest, Begin, Start, StartCoordinate
@@ -44,6 +45,9 @@ class Grid(NamedTuple):
     early: int
 
 
+REST = AtRest()
+
+
 @dataclass(frozen=True)
 class Recording:
     """One run of a rig, seen by sensors.
@@ -57,7 +61,7 @@ class Recording:
     name: str
     rig: Rig = field(repr=False)
     samples: dict[str, tuple[Array, Array]] = field(repr=False)
-    start: Start = AtRest()
+    start: Start = REST
 
     def __post_init__(self) -> None:
         if not self.samples:
@@ -125,8 +129,8 @@ class Recording:
         return interpolated or self.duration < 0.99 * BETWEEN * (len(self.times) - 1)
 
     def grid(self, interpolated: bool) -> Grid:
-        """The times to simulate: the beginning, where that is before the samples, then the samples' own times, or a regular grid
-        from `REACH` before the first, but not from before the beginning, to `REACH` after the last."""
+        """The times to simulate: the beginning, where that is before the samples, then the samples' own times, or a regular
+        grid from `REACH` before the first, but not from before the beginning, to `REACH` after the last."""
         t, lead = self.times, self.start.lead
         if self.on_a_grid(interpolated):
             t = np.arange(t[0] - min(REACH, lead), t[-1] + REACH + BETWEEN, BETWEEN)
@@ -160,10 +164,10 @@ def plain(part: nn.Module) -> str:
     known: dict[str, Any] = {name: value.tolist() for name, value in tensors.items()}
     for name, value in vars(part).items():
         if isinstance(value, np.ndarray | Tensor):
-            known[name] = sha256(np.ascontiguousarray(np.asarray(value))).hexdigest()
+            known[name] = sha256(np.asarray(value).tobytes()).hexdigest()
         elif not name.startswith("_") and isinstance(value, int | float | str | tuple | dict | None):
             known[name] = value
-    if hasattr(part, "mesh"):
+    if isinstance(part, Pad):
         known["mesh"] = part.mesh.nodes.tolist(), part.mesh.bonded_sides
     return repr(sorted(known.items()))
 

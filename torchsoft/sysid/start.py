@@ -43,8 +43,8 @@ class StartCoordinate(NamedTuple):
 
 
 Begin = Callable[[Mapping[str, Tensor]], Tensor]
-"""The state (size,) at the beginning for values of the start's coordinates by name, differentiable in these and in the parameters
-of the rig that it was made for."""
+"""The state (size,) at the beginning for values of the start's coordinates by name, differentiable in these and in the
+parameters of the rig that it was made for."""
 
 
 class Start(Protocol):
@@ -65,14 +65,15 @@ class Start(Protocol):
 
 
 class AtRest(NamedTuple):
-    """The disc of the paper's rig at rest on the lower pad at `scenario.x_C0`, and the bracket clear of it.
+    """The disc of the paper's rig at rest on the lower pad at x [m], by default `scenario.x_C0`, and the bracket clear of it.
 
-    `x_sd` [m] is how well x_C0 is known: above zero the place of the disc is a coordinate, `start.disc.x`. The displacements of
+    `x_sd` [m] is how well that is known: above zero the place of the disc is a coordinate, `start.disc.x`. The displacements of
     the pads are those at the nominal parameters, whatever the others are: most of what that gets wrong has died away at the
     first sample.
     """
 
     x_sd: float = 0.0
+    x: float | None = None
     lead: float = SETTLE
 
     def coordinates(self, rig: Rig, samples: Samples) -> tuple[StartCoordinate, ...]:
@@ -80,12 +81,15 @@ class AtRest(NamedTuple):
             raise ValueError("only the paper's rig has a rest of its own: give the recording another `start`")
         if not 0 <= self.x_sd <= 0.1:
             raise ValueError(f"`x_sd` must be from 0 to 0.1 m, but is {self.x_sd}")
-        x = rig.settings.scenario.x_C0
-        return (StartCoordinate("start.disc.x", x, self.x_sd),) if self.x_sd > 0 else ()
+        return (StartCoordinate("start.disc.x", self.place(rig), self.x_sd),) if self.x_sd > 0 else ()
+
+    def place(self, rig: SoftGrasp) -> float:
+        """x of the disc [m]."""
+        return rig.settings.scenario.x_C0 if self.x is None else self.x
 
     def begin(self, rig: Rig, samples: Samples) -> Begin:
         assert isinstance(rig, SoftGrasp)
-        return Lying(rig, rig)
+        return Lying(rig, rig, self.place(rig))
 
 
 class Known(NamedTuple):
@@ -108,9 +112,9 @@ class Known(NamedTuple):
 class Lying:
     """The state of `AtRest`: displacements stay when parameters change, and massless pads get the forces that hold them so."""
 
-    def __init__(self, nominal: SoftGrasp, rig: SoftGrasp) -> None:
+    def __init__(self, nominal: SoftGrasp, rig: SoftGrasp, x: float) -> None:
         self.rig, self.nominal = rig, deepcopy(nominal).requires_grad_(False)
-        self.x0 = torch.tensor(nominal.settings.scenario.x_C0, dtype=torch.float64)
+        self.x0 = torch.tensor(x, dtype=torch.float64)
         self.x: float | None = None
 
     def __call__(self, values: Mapping[str, Tensor]) -> Tensor:
@@ -130,12 +134,12 @@ class Lying:
 
 def held_start(nominal: SoftGrasp, rig: SoftGrasp) -> Tensor:
     """The state (size,) of `AtRest` for a rig that may have other parameters than the nominal one."""
-    return Lying(nominal, rig)({})
+    return Lying(nominal, rig, AtRest().place(nominal))({})
 
 
 def held_forces(pad: Pad, z: Tensor, nominal: Pad) -> Tensor:
-    """Forces (branches, nodes, 2) [N] that make, with the pad's present material, the displacements that z makes with the nominal
-    one.
+    """Forces (branches, nodes, 2) [N] that make, with the pad's present material, the displacements that z makes with the
+    nominal one.
 
     They are in proportion to E depth, which needs no linear solve: a solve's last bits differ from call to call, and a run that
     is made again must be the same.

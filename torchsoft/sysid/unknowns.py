@@ -93,8 +93,8 @@ class Sensor(Table):
     """A measured channel: standard deviation of its noise [the channel's unit], what may be wrong with it, and where it ends.
 
     How large may be a constant `bias` [unit], a `delay` [s], the error of its `gain` [1], a `drift` [unit/s] from the middle of
-    the recording on, its `misalignment` [rad] about the axis out of the plane; the `inertia` [kg] between a force sensor and what
-    it pushes, whose acceleration it does not feel. Zero leaves them out, otherwise they are identified too, one for all
+    the recording on, its `misalignment` [rad] about the axis out of the plane; the `inertia` [kg] between a force sensor and
+    what it pushes, whose acceleration it does not feel. Zero leaves them out, otherwise they are identified too, one for all
     recordings or one for each (`per`). Samples at `low` or `high` [unit] or beyond are saturated: they only say that the value
     is there or beyond. `colour` says whether the noise is known to be independent ("white"), or may be an autoregression
     ("ar"), whose order and coefficients are then found.
@@ -121,9 +121,12 @@ class Sensor(Table):
     @property
     def nuisances(self) -> dict[Nuisance, tuple[float, float, float]]:
         """Least, nominal and largest value of what is to be identified of it."""
-        rest: dict[Nuisance, float] = {kind: float(kind == "gain") for kind in NUISANCES}
-        reach = {kind: getattr(self, kind) for kind in NUISANCES}
-        return {kind: (rest[kind] - r, rest[kind], rest[kind] + r) for kind, r in reach.items() if r > 0}
+        out: dict[Nuisance, tuple[float, float, float]] = {}
+        for kind in NUISANCES:
+            nominal, reach = float(kind == "gain"), float(getattr(self, kind))
+            if reach > 0:
+                out[kind] = nominal - reach, nominal, nominal + reach
+        return out
 
 
 class Coordinate(NamedTuple):
@@ -189,8 +192,8 @@ class Coordinates:
     """All coordinates of a problem, in a fixed order, and the way from their vector x (n,) to parameters of the rig, of where
     runs begin, and of the sensors.
 
-    Raises `ValueError` for unknowns that some recording's rig has not, a ratio to something that is not there, or a nominal value
-    out of bounds.
+    Raises `ValueError` for unknowns that some recording's rig has not, a ratio to something that is not there, or a nominal
+    value out of bounds.
     """
 
     def __init__(
