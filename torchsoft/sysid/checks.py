@@ -72,7 +72,7 @@ class Checked:
     columns: Array
     J: Array
 
-    def covariance_factor(self) -> Array:
+    def covariance(self) -> Array:
         """Covariance (n, n) of the free coordinates, which the constants of the computation enlarge."""
         k, n = self.columns.shape[1], self.J.shape[1]
         rows = np.block([[self.J, self.columns], [np.zeros((k, n)), np.eye(k)]])

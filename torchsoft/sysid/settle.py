@@ -28,13 +28,15 @@ ROUNDS = 3
 
 class Settled(NamedTuple):
     """A fit at its end: coordinates x (n,), residuals there by steps that `rtol` chooses at x, with the last Jacobian; how far
-    the steps have moved every coordinate (n,), None where that could not be checked; the fits on other steps since."""
+    the steps have moved every coordinate (n,), None where that could not be checked; the fits on other steps since; and the
+    residuals by a tenth of the tolerance, those of `at` where these could not be had."""
 
     x: Array
     at: Residuals
     rtol: float
     bias: Array | None
     fits: list[tuple[float, Fit]]
+    finer: Residuals
 
 
 def settle(
@@ -61,7 +63,7 @@ def settle(
     while True:
         fresh, steps = problem.freeze(runner, x, which, rtol)
         if fresh.lost:
-            return Settled(x, at, rtol, None, fits)
+            return Settled(x, at, rtol, None, fits, at)
         if rounds and not settled(problem, x, fresh._replace(J=at.J), free):
             rounds -= 1
             if along(fresh, steps):
@@ -75,4 +77,5 @@ def settle(
                 if along(finer, steps):
                     continue
                 rtol /= FINER
-        return Settled(x, fresh._replace(J=at.J), rtol, bias, fits)
+        end = fresh._replace(J=at.J)
+        return Settled(x, end, rtol, bias, fits, end if finer.lost else finer._replace(J=at.J))

@@ -1,0 +1,148 @@
+"""What an identification takes for granted: the data say so where it is otherwise, and intervals allow for what they cannot tell."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import COARSE
+
+from torchsoft import Parameters
+from torchsoft.excitation import Excitation, Strokes
+from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
+from torchsoft.sysid.assumptions import PLACE, Assumption, assumptions, remeshed
+from torchsoft.sysid.checks import Checked, check, notices
+from torchsoft.sysid.prediction import predict
+from torchsoft.sysid.workers import Runner
+
+BASE = Parameters().override(COARSE)
+TRUTH = {"pad.E": 0.85e6, "contact.K_n": 1.3e5}
+STROKES = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.9)
+SENSORS = {
+    "x_C": Sensor(noise=1e-5), "theta": Sensor(noise=5e-4), "y_Br": Sensor(noise=1e-5), "F_x": Sensor(noise=0.1),
+    "F_y": Sensor(noise=0.1),
+}  # fmt: skip
+RTOL = 1e-4
+
+
+def recorded(truth: Parameters = BASE, excitation: Excitation = STROKES) -> Recording:
+    return record("strokes", excitation, truth.override(TRUTH), BASE, SENSORS, rtol=1e-6, seed=4)
+
+
+def checked(data: Recording) -> Checked:
+    problem = Problem([data], SENSORS, {name: Unknown() for name in TRUTH})
+    free, runner = problem.coordinates.free, Runner(problem.recordings)
+    answer = identify(problem, plan=[Stage("all", problem.names, problem.coordinates.labels, RTOL)])
+    x = np.array(answer.x)
+    at, _ = problem.freeze(runner, x, problem.names, RTOL, free)
+    return check(problem, x, at, free, problem.names, RTOL)
+
+
+@pytest.fixture(scope="module")
+def same() -> Checked:
+    """Of data that the same model made."""
+    return checked(recorded())
+
+
+def test_nothing_is_said_of_what_is_right(same: Checked) -> None:
+    assert not notices(same)
+    names = {one.name for one in same.checks}
+    assert {"mesh", "contact points", "mesh phase", "ramp", "x_C0", "Coulomb friction", "feed-forward"} <= names
+    assert {"disc.radius", "control.K_98", "bias x_C", "delay F_x", "gain theta"} <= names
+    assert not names & set(TRUTH)
+    assert not any(one.unchecked for one in same.checks)
+
+
+def test_intervals_allow_for_what_the_data_cannot_tell_of_the_computation(same: Checked) -> None:
+    plain = np.linalg.inv(same.J.T @ same.J)
+    wider = same.covariance()
+    assert (np.diag(wider) >= np.diag(plain)).all()
+    columns = np.concatenate([same.J, same.columns], 1)
+    precision = columns.T @ columns
+    precision[2:, 2:] += np.eye(same.columns.shape[1])
+    np.testing.assert_allclose(wider, np.linalg.inv(precision)[:2, :2], rtol=1e-6)
+
+
+def elsewhere(data: Recording) -> Recording:
+    """Samples of a disc that began further right by 30 um."""
+    moved = STROKES.model_copy(update={"x_C0": STROKES.x_C0 + 1.5 * PLACE})
+    return replace(data, samples=recorded(excitation=moved).samples)
+
+
+def turned(data: Recording) -> Recording:
+    t, theta = data.samples["theta"]
+    return replace(data, samples=data.samples | {"theta": (t, theta + 2e-3)})
+
+
+def late(data: Recording) -> Recording:
+    t, x = data.samples["x_C"]
+    return replace(data, samples=data.samples | {"x_C": (t, np.interp(t - 1e-3, t, x))})
+
+
+@pytest.mark.parametrize(
+    ("made", "name", "asked", "says"),
+    [
+        (elsewhere, "x_C0", 30.0, "the data contradict that the disc begins at scenario.x_C0"),
+        (turned, "bias theta", 2e-3, "the data contradict that theta has no unknown bias"),
+        (late, "delay x_C", 1.0, "the data contradict that x_C has no unknown delay"),
+        (lambda data: replace(data, samples=recorded(BASE.override({"disc.radius": 19.39e-3})).samples), "disc.radius", 0.103,
+         "the data contradict that disc.radius is 0.01937"),
+    ],
+)  # fmt: skip
+def test_the_cause_is_named_with_its_amount(
+    made: Callable[[Recording], Recording], name: str, asked: float, says: str
+) -> None:
+    found = checked(made(recorded()))
+    (one,) = (one for one in found.checks if one.name == name)
+    assert one.wanted
+    assert one.asked == pytest.approx(asked, rel=0.1, abs=4 * one.asked_sd)
+    assert notices(found)[0].startswith(says)
+
+
+def test_a_finer_mesh_is_asked_for_by_data_that_one_made() -> None:
+    data = recorded()
+    finer = remeshed(data, 2, 0)
+    assert finer is not None
+    run, rng = predict(finer.begin(), TRUTH, finer.grid(False), (), 1e-6), np.random.default_rng(0)
+    samples = {}
+    for channel, sensor in SENSORS.items():
+        exact = run.signals[:, finer.channels.index(channel)]
+        samples[channel] = (run.t, exact + sensor.noise * rng.standard_normal(len(exact)))
+    found = checked(replace(data, samples=samples))
+    (mesh,) = (one for one in found.checks if one.name == "mesh")
+    assert mesh.wanted
+    assert mesh.asked == pytest.approx(1.0, abs=0.2)
+    assert any("elements" in sentence for sentence in notices(found))
+
+
+def test_every_pad_is_meshed_anew_where_it_was() -> None:
+    data = recorded()
+    other = remeshed(data, 2, 3)
+    assert other is not None
+    for name, pad in data.rig.pads.items():
+        new = other.rig.pads[name]
+        assert (new.mesh.elements_x, new.mesh.elements_y, new.points) == (120, 4, 3)
+        ends = [(one.positions[0] - one.positions[-1]).tolist() for one in (pad, new)]
+        np.testing.assert_allclose(*ends, atol=1e-15)
+        np.testing.assert_allclose(new.positions[0], pad.positions[0], atol=1e-15)
+        assert new.material is other.rig.pads["L"].material
+        assert new.material is not pad.material
+
+
+def test_what_is_unknown_is_not_taken_for_granted() -> None:
+    data = recorded()
+    names = {one.name for one in assumptions([data], set())}
+    left = {one.name for one in assumptions([data], {"disc.radius", "contact.epsilon", "start.disc.x"})}
+    assert names - left == {"disc.radius", "ramp", "x_C0"}
+
+
+def test_a_variation_that_cannot_be_run_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    def bare(*_: object) -> list[Assumption]:
+        return [Assumption("mesh", "numerical", "the pads have few elements", "they had more", vary=lambda r: None)]
+
+    monkeypatch.setattr("torchsoft.sysid.checks.assumptions", bare)
+    found = checked(recorded())
+    assert any(
+        sentence.startswith("it could not be checked what it does that the pads have few elements")
+        for sentence in notices(found)
+    )
