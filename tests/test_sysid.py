@@ -21,7 +21,7 @@ from torchsoft.sysid.fit import descend, gauss_newton
 from torchsoft.sysid.information import fisher, shift, standard_deviations
 from torchsoft.sysid.plan import default_plan, tie_ratios, visible
 from torchsoft.sysid.result import whiteness
-from torchsoft.sysid.solve import sobol
+from torchsoft.sysid.stages import sobol
 from torchsoft.sysid.workers import Runner
 
 BASE = Parameters().override(COARSE)
@@ -206,7 +206,7 @@ def shaking() -> Recording:
 def test_a_tolerance_too_coarse_for_the_data_is_found_and_tightened(shaking: Recording) -> None:
     problem = Problem([shaking], SENSORS, {"pad.E": Unknown(), "pad.tau": Unknown()})
     plan = [Stage("all", ("shaking",), ("pad.E", "pad.tau"), 3e-3)]
-    coarse = identify(problem, plan=plan, tightenings=0)
+    coarse = identify(problem, plan=plan, tightenings=0, assumptions="trusted")
     assert any("rtol = 0.003 is too coarse" in notice and "take rtol = 0.0003" in notice for notice in coarse.notices)
     worst = max(coarse.estimates, key=lambda e: abs(e.step_bias_sd))
     error = float(np.log(worst.last / BASE.table()[worst.name]["value"]))

@@ -1,4 +1,4 @@
-"""What an identification takes for granted: the data say so where it is otherwise, and intervals allow for what they cannot tell."""
+"""What an identification takes for granted: data say where it is otherwise; intervals allow for what they cannot tell."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -123,7 +123,7 @@ def test_every_pad_is_meshed_anew_where_it_was() -> None:
         new = other.rig.pads[name]
         assert (new.mesh.elements_x, new.mesh.elements_y, new.points) == (120, 4, 3)
         ends = [(one.positions[0] - one.positions[-1]).tolist() for one in (pad, new)]
-        np.testing.assert_allclose(*ends, atol=1e-15)
+        np.testing.assert_allclose(ends[0], ends[1], atol=1e-15)
         np.testing.assert_allclose(new.positions[0], pad.positions[0], atol=1e-15)
         assert new.material is other.rig.pads["L"].material
         assert new.material is not pad.material

@@ -8,8 +8,21 @@ import pytest
 import torch
 from conftest import COARSE
 
-from torchsoft import Body, Circle, Contact, KelvinVoigt, Pad, PadMesh, Parameters, Profile, Reference, Rig
-from torchsoft import SmoothSlip, SoftContact, simulate
+from torchsoft import (
+    Body,
+    Circle,
+    Contact,
+    KelvinVoigt,
+    Pad,
+    PadMesh,
+    Parameters,
+    Profile,
+    Reference,
+    Rig,
+    SmoothSlip,
+    SoftContact,
+    simulate,
+)
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import AtRest, Known, Prior, Problem, Recording, Sensor, Stage, Unknown, identify, record
 from torchsoft.sysid.workers import Runner
@@ -42,8 +55,8 @@ def test_every_kind_of_coordinate_has_its_derivative(strokes: Recording) -> None
     c, runner = problem.coordinates, Runner(problem.recordings)
     assert c.labels == (
         "pad.E", "contact.epsilon", "contact.R_n in strokes", "contact.R_n in moved", "start.disc.x in moved", "gain of x_C",
-        "drift of x_C", "misalignment of y_C", "bias of theta in strokes", "bias of theta in moved", "delay of theta in strokes",
-        "delay of theta in moved", "misalignment of F_x", "inertia of F_x",
+        "drift of x_C", "misalignment of y_C", "bias of theta in strokes", "bias of theta in moved",
+        "delay of theta in strokes", "delay of theta in moved", "misalignment of F_x", "inertia of F_x",
     )  # fmt: skip
     low, high = c.bounds
     x = c.start + 0.05 * np.random.default_rng(0).standard_normal(len(c)) * np.minimum(1, high - low)
@@ -83,7 +96,7 @@ def test_what_a_channel_cannot_have_is_refused(strokes: Recording, channel: str,
 
 
 def test_tables_that_make_no_sense_are_refused() -> None:
-    with pytest.raises(ValueError, match="low = 2.0 must be below high = 1.0"):
+    with pytest.raises(ValueError, match=r"low = 2\.0 must be below high = 1\.0"):
         Sensor(noise=1.0, low=2.0, high=1.0)
     with pytest.raises(ValueError, match="log-normal prior needs median > 0"):
         Prior(median=-1.0, sd=1.0, kind="log-normal")

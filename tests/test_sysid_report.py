@@ -3,6 +3,7 @@
 import base64
 import json
 import struct
+from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -10,37 +11,87 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import COARSE
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.text import Text
+from test_sysid_answer import HOSTILE, example
 
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes
-from torchsoft.sysid import IdentificationResult, Problem, Sensor, Unknown, identify, record
+from torchsoft.sysid import AtRest, IdentificationResult, Prior, Problem, Sensor, Stage, Unknown, identify, record
+from torchsoft.sysid.answer import AssumptionCheck, ChannelNoise, load_answer
+from torchsoft.sysid.comparison import Comparison
 from torchsoft.sysid.cost import paper_settings
-from torchsoft.sysid.figures import correlation_figure, direction_name, estimates_figure, spectrum_figure, trace_figure
+from torchsoft.sysid.estimate import Direction, autocorrelation
+from torchsoft.sysid.figures import (
+    contributions_figure,
+    correlation_figure,
+    direction_name,
+    estimates_figure,
+    profile_figure,
+    spectrum_figure,
+    trace_figure,
+)
+from torchsoft.sysid.information import Combination
+from torchsoft.sysid.noise import Autoregression
+from torchsoft.sysid.page import grouped, table
 from torchsoft.sysid.prediction import FailedRun
-from torchsoft.sysid.problem import Residuals
-from torchsoft.sysid.report import report, starts, traces
-from torchsoft.sysid.result import Direction, autocorrelation
+from torchsoft.sysid.profile import RISE, Profile
+from torchsoft.sysid.report import report, traces
+from torchsoft.sysid.workers import Runner
 
-STRANGE = 'a<b> & "$x_1$"'
-"""A recording's name with everything in it that HTML or matplotlib would read as their own."""
+Found = tuple[IdentificationResult, Problem]
+NOISE = Autoregression((0.8,), 0.7, 5e-3)
 
 
 @pytest.fixture(scope="module")
-def found() -> tuple[IdentificationResult, Problem]:
-    """A grasp, from which the viscosity of slip is not identifiable, and another one held out."""
-    p = Parameters().override({"contact.v_s": 0.05})
+def found() -> Found:
+    """Two grasps, from which the viscosity of slip is not identifiable, and another one held out."""
+    p = Parameters().override(COARSE)
     truth = p.override({"contact.K_n": 1.6e5, "pad.E": 0.9e6})
-    sensors = {"theta": Sensor(noise=5e-4), "y_Br": Sensor(noise=1e-5), "F_y": Sensor(noise=0.1)}
+    sensors = {"theta": Sensor(noise=5e-4), "y_Br": Sensor(noise=1e-5, bias=1e-3), "F_y": Sensor(noise=0.1)}
     grasp = Excitation(motion=Strokes(), duration=0.25, depth=1.2e-3, senses="bracket", grasp_time=0.15)
+    depths = {HOSTILE: 1.2e-3, "shallow": 0.9e-3, "held": 1e-3}
     recordings = [
-        record(name, grasp.model_copy(update={"depth": depth}), truth, p, sensors, rtol=1e-4, seed=seed)
-        for seed, (name, depth) in enumerate(((STRANGE, 1.2e-3), ("held", 1e-3)))
+        record(name, grasp.model_copy(update={"depth": depth}), truth, p, sensors, rtol=1e-3, seed=seed)
+        for seed, (name, depth) in enumerate(depths.items())
     ]
-    problem = Problem(recordings, sensors, {name: Unknown() for name in ("contact.K_n", "pad.E", "contact.eta")})
-    return identify(problem, rtol=1e-3, tightenings=0, heldout=["held"]), problem
+    recordings[1] = replace(recordings[1], start=AtRest(x_sd=2e-5))
+    unknowns = {
+        "contact.K_n": Unknown(), "pad.E": Unknown(prior=Prior(median=1e6, sd=0.5, kind="log-normal")),
+        "contact.eta": Unknown(), "contact.R_n": Unknown(per="recording"),
+    }  # fmt: skip
+    problem = Problem(recordings, sensors, unknowns)
+    plan = [Stage("all", (HOSTILE, "shallow"), problem.coordinates.labels, 1e-3, evaluations=4)]
+    return identify(problem, plan=plan, tightenings=0, heldout=["held"], assumptions="trusted"), problem
+
+
+@pytest.fixture(scope="module")
+def full(found: Found) -> IdentificationResult:
+    """The result with whatever else an answer may hold."""
+    answer, _ = found
+    E = answer["pad.E"].last
+    harmless = AssumptionCheck(
+        "a", "known", "<b> is so", "it were not", 2.0, "%", {"pad.E": 0.1}, 0.5, 0.3, 1.2, False, ""
+    )
+    checks = [
+        harmless,
+        replace(harmless, name="b", stated="the disc weighs 1 kg", moves={"pad.E": -4.2}, gain=99.0, asked=-3.1, suspected=True),
+        replace(harmless, name="c", kind="law", stated="slip is smooth", moves={}, unchecked="a run failed"),
+    ]  # fmt: skip
+    values = [E * (1 + 0.02 * k) for k in range(-4, 5)]
+    profile = Profile(
+        "pad.E", E, values, [0.5 * k * k for k in range(-4, 5)], {}, (0.94 * E, None), (0.95 * E, E / 0.95), 1.0, ["<open> end"]
+    )  # fmt: skip
+    compared: Comparison = replace(
+        example(Comparison), outcome="cannot tell", verdict="the data <cannot> tell", series=[]
+    )
+    return replace(
+        answer, assumptions=checks, profiles=[profile], noise=[ChannelNoise("F_y", NOISE, [])], comparison=compared,
+        combinations=[Combination({"pad.E": 1.0, "contact.K_n": -0.5}, {"pad.E": 0.3, "contact.K_n": 0.4}, 0.02)],
+        command="torchsoft identify '<a>.csv' rig.toml --out out",
+    )  # fmt: skip
 
 
 class Page(HTMLParser):
@@ -65,19 +116,22 @@ class Page(HTMLParser):
             self.text += data + "\n"
 
 
-@pytest.fixture(scope="module")
-def page(found: tuple[IdentificationResult, Problem], tmp_path_factory: pytest.TempPathFactory) -> Page:
-    folder = tmp_path_factory.mktemp("report") / "new"
-    report(*found, folder / "report.html")
+def written(answer: IdentificationResult, problem: Problem, folder: Path) -> Page:
+    report(answer, problem, folder / "report.html")
     assert [path.name for path in folder.iterdir()] == ["report.html"]
     return Page((folder / "report.html").read_text(encoding="utf-8"))
 
 
+@pytest.fixture(scope="module")
+def page(full: IdentificationResult, found: Found, tmp_path_factory: pytest.TempPathFactory) -> Page:
+    return written(full, found[1], tmp_path_factory.mktemp("report") / "new")
+
+
 def test_the_page_stands_alone(page: Page) -> None:
     assert page.open == []
-    assert {"script", "link", "iframe", "object"}.isdisjoint(tag for tag, _ in page.tags)
+    assert {"script", "link", "iframe", "object", "b", "a", "cannot", "open"}.isdisjoint(tag for tag, _ in page.tags)
     pictures = [attributes for tag, attributes in page.tags if tag == "img"]
-    assert len(pictures) == 3 + 2 * 3
+    assert len(pictures) == 5 + 3 * 3
     for attributes in pictures:
         source, alt = str(attributes["src"]), str(attributes["alt"])
         kind, _, data = source.partition(",")
@@ -93,55 +147,110 @@ def test_the_page_stands_alone(page: Page) -> None:
     assert ("meta", {"name": "viewport", "content": "width=device-width,initial-scale=1"}) in page.tags
 
 
-def test_the_page_holds_what_the_answer_holds(page: Page, found: tuple[IdentificationResult, Problem]) -> None:
-    answer, _ = found
-    known = [e for e in answer.estimates if e.identifiable]
-    assert {e.name for e in known} >= {"pad.E"}
-    assert not answer["contact.eta"].identifiable
-    assert f"{len(known)} of {len(answer.estimates)} parameters identifiable" in page.text
-    assert answer.notices
-    for notice in answer.notices:
-        assert notice in page.text
-    assert page.text.index(answer.notices[0]) < page.text.index("Estimates")  # notices come first
+def test_the_page_holds_what_the_answer_holds(page: Page, full: IdentificationResult) -> None:
+    parameters = [e for e in full.estimates if e.kind == "parameter"]
+    known = [e for e in full.estimates if e.identifiable]
+    assert {e.name for e in known} >= {"pad.E", "start.disc.x", "bias of y_Br"}
+    assert not full["contact.eta"].identifiable
+    assert f"{sum(e.identifiable for e in parameters)} of {len(parameters)} parameters identifiable" in page.text
     for e in known:
         for value in (e.value, *(e.ci95 or ())):
             assert value is not None
-            assert f"{float(f'{value:.5g}'):.12g}" in page.text.replace("\u202f", "")
-        assert "\ncontact.eta\nnot identifiable\nnone\nN.s/m\n10\nno\n" in page.text
-    for channels in answer.heldout.values():
+            assert f"{float(f'{value:.5g}'):.12g}" in page.text.replace("\u202f", "").replace("−", "-")
+    assert "\ncontact.eta\nnot identifiable\nnone\nN.s/m\n10\n" in page.text
+    for channels in full.heldout.values():
         for value in channels.values():
             assert f"{100 * value:.3g} %" in page.text
-    for stage in answer.stages:
+    for stage in full.stages:
         assert stage["name"] in page.text
-    assert STRANGE in page.text  # escaped once, and not twice
-    assert "b" not in {tag for tag, _ in page.tags}
+    assert HOSTILE in page.text  # escaped once, and not twice
+    assert "\ntorchsoft identify '<a>.csv' rig.toml --out out\n" in page.text
     decided = page.text[page.text.index("{\n") :]
-    assert json.loads(decided.strip()) == json.loads(json.dumps(answer.made_by))
+    assert json.loads(decided.strip()) == json.loads(json.dumps(full.made_by))
 
 
-def test_predictions_are_the_models(found: tuple[IdentificationResult, Problem]) -> None:
+def test_warnings_come_first_and_all_of_them(page: Page, full: IdentificationResult) -> None:
+    assert full.notices
+    warned = [*full.notices, "<open> end", "the data <cannot> tell"]
+    places = [page.text.index(f"\n{notice}\n") for notice in warned]
+    assert sorted(places) == places
+    assert places[-1] < page.text.index("\nEstimates\n")
+
+
+def test_starts_and_sensors_are_apart_from_parameters(page: Page) -> None:
+    order = [
+        "\nEstimates\n", "\npad.E\n", "\ncontact.eta\n", "\nParameters of which each recording has its own\n",
+        f"\ncontact.R_n\n{HOSTILE}\n", "\ncontact.R_n\nshallow\n", "\nWhere the runs began\n",
+        "\nstart.disc.x\nshallow\n", "\nWhat the sensors add\n", "\nbias of y_Br\n", "\nHow much each recording told\n",
+    ]  # fmt: skip
+    places = [page.text.index(text) for text in order]
+    assert sorted(places) == places
+    assert "×/÷ 1.65" in page.text  # the prior: a factor of exp(0.5)
+
+
+def test_what_recordings_told_is_in_the_table(page: Page, full: IdentificationResult) -> None:
+    assert [one.source for one in full.contributions] == [HOSTILE, "shallow", None]
+    for label in ("pad.E", "contact.R_n in shallow"):
+        cells = []
+        for one in full.contributions:
+            factor = one.without[label]
+            cells.append(f"{100 * one.shares[label]:.0f} % ({'only here' if factor is None else f'× {factor:.2f}'})")
+        assert "\n".join((label, *cells)) in page.text
+    assert full.contributions[1].without["contact.R_n in shallow"] is None
+    assert "the data see pad.E / contact.K_n^0.5 to 2 %, not each (pad.E 30 %, contact.K_n 40 %)." in page.text
+
+
+def test_assumptions_that_matter_stand_open_and_others_are_folded(page: Page) -> None:
+    folded = page.text.index("\n1 that move nothing by more than 0.5 standard deviations\n")
+    said = (
+        "\nthe disc weighs 1 kg\nit were not\n−4.2 sd of pad.E\nyes −3.1 ± 1.2 %: the sum of squares would fall by 99\n"
+    )
+    assert page.text.index(said) < folded
+    assert page.text.index("\nslip is smooth\nit were not\nnot checked: a run failed\n") < folded
+    assert page.text.index("\n<b> is so\nit were not\n+0.1 sd of pad.E\nno: +0.3 ± 1.2 %\n") > folded
+    assert ("details", {}) in page.tags
+
+
+def test_predictions_are_the_models(found: Found) -> None:
     answer, problem = found
     drawn, lost = traces(answer, problem, None)
     assert not lost
-    rms = {(t.recording, t.channel): float(np.sqrt(np.mean(t.residual**2))) for t in drawn}
+    assert len(drawn) == 3 * 3
+    own = problem.residuals(Runner(problem.recordings), np.array(answer.x), problem.names, answer.made_by["rtol"]).r
+    np.testing.assert_array_equal(np.concatenate([one.residual for one in drawn]), own[: problem.samples()])
+    rms = {(one.recording, one.channel): float(np.sqrt(np.mean(one.residual**2))) for one in drawn}
     for channel in answer.residuals:
         assert rms[channel.recording, channel.channel] == pytest.approx(channel.rms, rel=1e-6)
     for trace in drawn:
         noise = problem.sensors[trace.channel].noise
         np.testing.assert_allclose(trace.predicted - trace.measured, noise * trace.residual, atol=1e-12)
+        np.testing.assert_array_equal(trace.white, trace.residual)
         held = answer.heldout.get(trace.recording)
         if held is not None:
             nrmse = rms[trace.recording, trace.channel] * noise / np.ptp(trace.measured)
             assert nrmse == pytest.approx(held[trace.channel], rel=1e-6)
 
 
-def test_starts_are_the_settings_values(found: tuple[IdentificationResult, Problem]) -> None:
+def test_coloured_residuals_are_whitened_by_the_noise_of_the_result(full: IdentificationResult, found: Found) -> None:
+    drawn, _ = traces(full, found[1], None)
+    for one in drawn:
+        if one.channel == "F_y":
+            later = (one.residual[1:] - 0.8 * one.residual[:-1]) / 0.7
+            np.testing.assert_allclose(one.white[1:], later, rtol=1e-9, atol=1e-9)
+            assert one.white[0] == pytest.approx(one.residual[0] / NOISE.sd)
+        else:
+            np.testing.assert_array_equal(one.white, one.residual)
+
+
+def test_starts_are_the_settings_values(found: Found) -> None:
     answer, problem = found
-    table = paper_settings(problem.recordings[0]).table()
-    assert starts(answer, problem) == pytest.approx([table[e.name]["value"] for e in answer.estimates])
+    known = paper_settings(problem.recordings[0]).table()
+    for e in answer.estimates:
+        value = known[e.name]["value"] if e.kind == "parameter" else 60.0e-3 if e.kind == "start" else 0.0
+        assert e.start == pytest.approx(value, abs=1e-3 if e.kind == "start" else 0.0)
 
 
-def test_an_answer_to_other_data_is_refused(found: tuple[IdentificationResult, Problem], tmp_path: Path) -> None:
+def test_an_answer_to_other_data_is_refused(found: Found, tmp_path: Path) -> None:
     answer, problem = found
     other = Problem(problem.recordings[:1], problem.sensors, problem.unknowns)
     with pytest.raises(ValueError, match="other recordings"):
@@ -149,24 +258,50 @@ def test_an_answer_to_other_data_is_refused(found: tuple[IdentificationResult, P
     assert not any(tmp_path.iterdir())
 
 
+def test_a_loaded_answer_makes_the_same_page(
+    full: IdentificationResult, found: Found, page: Page, tmp_path: Path
+) -> None:
+    full.save(tmp_path / "answer.json")
+    (tmp_path / "page").mkdir()
+    again = written(load_answer(tmp_path / "answer.json"), found[1], tmp_path / "page")
+    when = page.text.index("\nwritten\n")
+    assert again.text[:when] == page.text[:when]
+
+
 def test_a_lost_recording_is_named_and_a_clean_answer_has_no_warnings(
-    found: tuple[IdentificationResult, Problem], tmp_path: Path
+    found: Found, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     answer, problem = found
+    run = Runner.run
 
-    class Losing(Problem):
-        def residuals(self, runner: Any, x: Any, which: Any, steps: Any, free: Any = None) -> Residuals:
-            got = super().residuals(runner, x, which, steps, free)
-            return got._replace(lost={"held": FailedRun("it < went", 0.1)}) if "held" in which else got
+    def losing(self: Runner, jobs: Any) -> list[Any]:
+        return [FailedRun("it < went", 0.1) if job.recording == 2 else one for job, one in zip(jobs, run(self, jobs))]
 
-    losing = Losing(problem.recordings, problem.sensors, problem.unknowns)
-    report(replace(answer, notices=[]), losing, tmp_path / "report.html")
-    page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
-    text, alts = page.text, " ".join(str(attributes.get("alt")) for _, attributes in page.tags)
-    assert "Could not be simulated: it < went" in text
-    assert f"theta of {STRANGE}" in alts
+    monkeypatch.setattr(Runner, "run", losing)
+    page = written(replace(answer, notices=[], contributions=answer.contributions[:1]), problem, tmp_path)
+    alts = " ".join(str(attributes.get("alt")) for _, attributes in page.tags)
+    assert "Could not be simulated: it < went" in page.text
+    assert f"theta of {HOSTILE}" in alts
     assert "theta of held" not in alts
-    assert "nothing to warn of" in text
+    assert "nothing to warn of" in page.text
+    for heading in ("How much each recording told", "Profiles", "What was taken for granted", "Which law"):
+        assert f"\n{heading}\n" not in page.text  # where there is nothing to say
+
+
+def test_tables_leave_out_what_is_empty_and_escape_the_rest() -> None:
+    page = Page(table(["<h>", "none", "n"], [["a&b", "", "−1.5"], [("weak", "<i>"), "", "open … 3"]], "<c>"))
+    assert page.text.split("\n")[:-1] == ["<c>", "<h>", "n", "a&b", "−1.5", "<i>", "open … 3"]
+    cells = [attributes for tag, attributes in page.tags if tag == "td"]
+    assert [one["class"] for one in cells] == ["", "n", "weak", "n"]
+    assert cells[0]["data-label"] == "<h>"
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(159090.4, "159\u202f090"), (-12345.6, "−12\u202f346"), (-1.5e-7, "−1.5e-07"), (0.0, "0"), (12.3456789, "12.346")],
+)
+def test_numbers_have_five_digits(value: float, text: str) -> None:
+    assert grouped(value) == text
 
 
 def test_directions_are_named_by_their_largest_parts() -> None:
@@ -204,16 +339,20 @@ def texts(figure: Figure) -> list[tuple[str, Any]]:
     return out
 
 
-@pytest.mark.parametrize("which", ["estimates", "correlation", "spectrum", "trace"])
-def test_no_text_of_a_picture_is_cut_or_overlaps(found: tuple[IdentificationResult, Problem], which: str) -> None:
-    answer, problem = found
-    figures = {
-        "estimates": lambda: estimates_figure(answer, starts(answer, problem)),
-        "correlation": lambda: correlation_figure(answer),
-        "spectrum": lambda: spectrum_figure(answer),
-        "trace": lambda: trace_figure(traces(answer, problem, None)[0][0], answer.residuals[0]),
-    }
-    figure = figures[which]()
+FIGURES: dict[str, Callable[[IdentificationResult, Problem], Figure | None]] = {
+    "estimates": lambda answer, _: estimates_figure(answer.estimates),
+    "contributions": lambda answer, _: contributions_figure(answer),
+    "correlation": lambda answer, _: correlation_figure(answer),
+    "spectrum": lambda answer, _: spectrum_figure(answer),
+    "profile": lambda answer, _: profile_figure(answer.profiles[0], "Pa"),
+    "trace": lambda answer, problem: trace_figure(traces(answer, problem, None)[0][0], answer.residuals[0]),
+    "coloured": lambda answer, problem: trace_figure(traces(answer, problem, None)[0][2], answer.residuals[2], NOISE),
+}
+
+
+@pytest.mark.parametrize("which", FIGURES)
+def test_no_text_of_a_picture_is_cut_or_overlaps(full: IdentificationResult, found: Found, which: str) -> None:
+    figure = FIGURES[which](full, found[1])
     assert figure is not None
     drawn, (width, height) = texts(figure), figure.canvas.get_width_height()
     assert len(drawn) > 5
@@ -225,3 +364,24 @@ def test_no_text_of_a_picture_is_cut_or_overlaps(found: tuple[IdentificationResu
         for other, its in drawn[:i]:
             apart = box.x1 <= its.x0 + 1 or its.x1 <= box.x0 + 1 or box.y1 <= its.y0 + 1 or its.y1 <= box.y0 + 1
             assert apart, f"{text!r} lies over {other!r}"
+
+
+def test_the_profile_is_drawn_beside_the_covariances_parabola(full: IdentificationResult) -> None:
+    profile = full.profiles[0]
+    wald, own = profile_figure(profile, "m").axes[0].get_lines()[1:]
+    np.testing.assert_allclose(own.get_xdata(), 1e3 * np.array(profile.values))  # in mm
+    assert list(np.asarray(own.get_ydata())) == profile.rises
+    for end in profile.wald95:
+        assert np.interp(1e3 * end, *wald.get_data()) == pytest.approx(RISE, rel=0.02)
+
+
+def test_the_weights_of_all_sources_fill_the_bars(full: IdentificationResult) -> None:
+    figure = contributions_figure(full)
+    assert figure is not None
+    labels = [e.label for e in full.estimates if e.identifiable and e.kind == "parameter"]
+    right: dict[float, float] = {}
+    for bar in figure.axes[0].patches:
+        row = round(bar.get_y() + bar.get_height() / 2)
+        right[row] = max(right.get(row, 0.0), bar.get_x() + bar.get_width())
+    assert right == pytest.approx(dict.fromkeys(range(len(labels)), 1.0))
+    assert contributions_figure(replace(full, contributions=full.contributions[:1])) is None

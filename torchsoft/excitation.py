@@ -1,10 +1,13 @@
-"""Motions that make parameters visible: a grasp of a given depth, then strokes, sines, chirps, presses or jerks.
+"""Motions that make parameters visible: a grasp of a given depth, then strokes, sines, chirps, presses, jerks or knots.
 
 An `Excitation` is plain validated data, so that it can stand in a TOML file; `begin` turns it into a model at rest with the
 reference that its controllers follow.
 """
 
+import json
 import math
+from itertools import pairwise
+from pathlib import Path
 from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
@@ -16,7 +19,7 @@ from torchsoft.parameters import Parameters
 from torchsoft.physics.equilibrium import holding_force, press, rest
 from torchsoft.physics.motion import Pieces, Profile, Reference, evaluate, hermite
 from torchsoft.physics.paper import SoftGrasp, apart
-from torchsoft.tables import LISTED, SEED, Table
+from torchsoft.tables import LISTED, SEED, Table, from_toml
 
 FADE = 0.15
 """Time [s] over which waves come and go."""
@@ -81,7 +84,28 @@ class Press(Table):
     travel: Length = 5e-3
 
 
-Motion = Annotated[Roll | Strokes | MultiSine | Chirp | Press, Field(discriminator="kind")]
+Knot = Annotated[tuple[Time, Length], LISTED]
+"""When a set-point is reached [s], and how far it is [m]."""
+
+
+class Knots(Table):
+    """From set-point to set-point along the paper's profiles, at rest at each: `x` and `y` are knots, times [s] since the
+    motion began and distances [m] from where the grasp ended."""
+
+    kind: Literal["knots"] = "knots"
+    x: Annotated[tuple[Knot, ...], LISTED] = ()
+    y: Annotated[tuple[Knot, ...], LISTED] = ()
+
+    @model_validator(mode="after")
+    def _times_increase(self) -> Self:
+        for name, knots in (("x", self.x), ("y", self.y)):
+            for (before, _), (after, _) in pairwise(knots):
+                if after <= before:
+                    raise ValueError(f"the times of motion.{name} must increase, but {after:g} s follows {before:g} s")
+        return self
+
+
+Motion = Annotated[Roll | Strokes | MultiSine | Chirp | Press | Knots, Field(discriminator="kind")]
 
 
 class Excitation(Table):
@@ -116,7 +140,27 @@ class Excitation(Table):
                 f"duration = {self.duration:g} s at motion.stroke_time = {motion.stroke_time:g} s makes more than {MOST} "
                 "strokes; take fewer"
             )
+        if isinstance(motion, Knots):
+            last = since + max((knots[-1][0] for knots in (motion.x, motion.y) if knots), default=0.0)
+            if last > self.duration * (1 + 1e-9):
+                raise ValueError(
+                    f"duration = {self.duration:g} s ends before the last knot of the motion, at {last:g} s"
+                )
         return self
+
+    @classmethod
+    def from_toml(cls, path: str | Path) -> Self:
+        """Read from a TOML file. Raises `InvalidTable` in one sentence."""
+        return from_toml(path, cls.model_validate)
+
+    def to_toml(self) -> str:
+        """The text of a TOML file that `from_toml` reads."""
+        fields = self.model_dump(mode="json")
+        motion = fields.pop("motion")
+        rows = [f"{name} = {json.dumps(value)}" for name, value in fields.items()]
+        return "\n".join(
+            [*rows, "", "[motion]", *(f"{name} = {json.dumps(value)}" for name, value in motion.items()), ""]
+        )
 
     def settings(self, p: Parameters) -> Parameters:
         """The parameters p with this excitation's grasp. Raises `ValueError` for a grasp that is not possible."""
@@ -200,11 +244,11 @@ def reference(excitation: Excitation, model: SoftGrasp, y_Br: float, grasp_force
     return Reference(x_d=x, y_d=y, F_ff=Profile([0.0, p.grasp_time], [0.0, -grasp_force]))
 
 
-Knots = tuple[list[float], list[float]]
+Points = tuple[list[float], list[float]]
 """Times [s] and values."""
 
 
-def moved(motion: Motion, still: Knots, grasp: Knots, since: float, until: float) -> tuple[Profile, Profile]:
+def moved(motion: Motion, still: Points, grasp: Points, since: float, until: float) -> tuple[Profile, Profile]:
     """x_d and y_Br,d of a motion from `since` to `until` [s], on top of a still x and the grasp."""
     x_0 = still[1][-1]
     match motion:
@@ -214,6 +258,12 @@ def moved(motion: Motion, still: Knots, grasp: Knots, since: float, until: float
             count = max(1, int((until - since) / motion.stroke_time + 1e-9))
             times = [since + i * motion.stroke_time for i in range(count + 1)]
             return Profile(times, [x_0 + (i % 2) * motion.travel for i in range(count + 1)]), Profile(*grasp)
+        case Knots():
+            x, y = ([(since + t, at) for t, at in knots] for knots in (motion.x, motion.y))
+            begin = [(since, 0.0)] if since > grasp[0][-1] else []
+            x_d = Profile([since, *(t for t, _ in x)], [x_0, *(x_0 + at for _, at in x)])
+            times = [*grasp[0], *(t for t, _ in [*begin, *y])]
+            return x_d, Profile(times, [*grasp[1], *(grasp[1][-1] + at for _, at in [*begin, *y])])
         case MultiSine():
             rng, n = np.random.default_rng(motion.seed), motion.components
             low, high = np.log(motion.frequency)
@@ -258,7 +308,7 @@ class Waves(Profile):
     PIECES: ClassVar = 24
     fine: Tensor
 
-    def __init__(self, profile: Knots, since: float, until: float, wave: Wave) -> None:
+    def __init__(self, profile: Points, since: float, until: float, wave: Wave) -> None:
         super().__init__(*profile)
         self.since, self.wave = since, wave
         self.window = Profile([since, since + FADE, until - FADE, until], [0.0, 1.0, 1.0, 0.0])

@@ -9,12 +9,14 @@ a coordinate more, with a standard normal prior on its amplitude, so that data t
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchsoft.sysid.assumptions import FAULTS, Assumption, Kind, assumptions
-from torchsoft.sysid.information import shift, standard_deviations
+from torchsoft.sysid.information import fisher, shift, standard_deviations
+from torchsoft.sysid.misfit import parts
 from torchsoft.sysid.plan import USUAL
 from torchsoft.sysid.prediction import FailedRun, Frozen
 from torchsoft.sysid.problem import Problem, Residuals
@@ -27,6 +29,16 @@ ASKED = 20.0
 """Fall of chi2, over the misfit that is left per sample, from which the data ask for a variation: four and a half standard
 deviations, for some twenty variations are looked at."""
 
+PATTERN = 0.5
+"""Part of the residuals' autocorrelation that a variation may leave and yet count as what the data ask for: a cause takes the
+pattern away with it, while coloured noise lines up with anything slow."""
+
+LAGS = 10
+"""Autocorrelations that are looked at."""
+
+BY_CHANCE = 2.0
+"""What the statistic of Box and Pierce may be by chance, over its expectation."""
+
 MOVED = 0.5
 """Standard deviations by which a constant of the computation may move an estimate without a word."""
 
@@ -36,8 +48,9 @@ class Check:
     """One thing that was taken for granted, and what a variation of it by `amount` [unit] does.
 
     `moves` is how far each coordinate would move, in its standard deviations, by label; `gain` by how much the sum of squares
-    would fall if the data could choose the amplitude, `asked` that amplitude [unit] and `asked_sd` its standard deviation.
-    `unchecked` says why there is no answer.
+    would fall if the data could choose the amplitude, `asked` that amplitude [unit] and `asked_sd` its standard deviation;
+    `significance` is the gain over the misfit per sample that would be left, `pattern` the part of the residuals'
+    autocorrelation that would be left, 0 where there is none. `unchecked` says why there is no answer.
     """
 
     name: str
@@ -51,12 +64,14 @@ class Check:
     asked: float
     asked_sd: float
     significance: float
+    pattern: float = 0.0
     unchecked: str = ""
 
     @property
     def wanted(self) -> bool:
         """Whether the data ask for it."""
-        return self.significance > ASKED and (self.kind in ("known", "sensor") or self.asked > 0)
+        either_side = self.kind in ("known", "sensor")
+        return self.significance > ASKED and self.pattern < PATTERN and (either_side or self.asked > 0)
 
     @property
     def most_moved(self) -> tuple[str, float]:
@@ -64,8 +79,7 @@ class Check:
         return max(self.moves.items(), key=lambda item: abs(item[1]), default=("", 0.0))
 
 
-@dataclass(frozen=True)
-class Checked:
+class Checked(NamedTuple):
     """All checks; columns (m, k) of the constants of the computation, and those of the free coordinates' Jacobian (m, n)."""
 
     checks: list[Check]
@@ -77,8 +91,11 @@ class Checked:
         k, n = self.columns.shape[1], self.J.shape[1]
         rows = np.block([[self.J, self.columns], [np.zeros((k, n)), np.eye(k)]])
         _, R = np.linalg.qr(rows[:, [*range(n, n + k), *range(n)]])
-        R_free = R[k:, k:]
-        return np.linalg.pinv(R_free.T @ R_free, hermitian=True)
+        return fisher(R[k:, k:])[0]
+
+    def widening(self) -> Array:
+        """What that is more than without them (n, n)."""
+        return self.covariance() - fisher(self.J)[0]
 
 
 def check(
@@ -93,7 +110,7 @@ def check(
     labels = [label for label, one in zip(problem.coordinates.labels, free) if one]
     runner = Runner(problem.recordings, workers, journal)
     base, steps = problem.freeze(runner, x, which, rtol)
-    r = at.r
+    r, places = at.r, [part.rows for part in parts(problem, at.r, which)]
     left = max(1.0, float(r @ r) / max(len(r) - int(free.sum()), 1))
     checks, columns = [], []
 
@@ -106,8 +123,9 @@ def check(
                          dict(zip(labels, moves.tolist())), 0.0, 0.0, float("inf"), 0.0)  # fmt: skip
         gain, alpha = along**2 / square, -along / square
         rest = max(1.0, (float(r @ r) - gain) / max(len(r) - int(free.sum()) - 1, 1))
+        pattern = pattern_of(places, r + alpha * across, r)
         return Check(one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, dict(zip(labels, moves.tolist())),
-                     gain, alpha * one.amount, float((left / square) ** 0.5) * one.amount, gain / rest)  # fmt: skip
+                     gain, alpha * one.amount, float((left / square) ** 0.5) * one.amount, gain / rest, pattern)  # fmt: skip
 
     recordings = [recording for recording in problem.recordings if recording.name in which]
     taken = assumptions(recordings, set(problem.coordinates.names))
@@ -117,7 +135,7 @@ def check(
         d, reason = difference(problem, x, which, one, base, steps, workers, journal)
         if d is None:
             checks.append(Check(one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, {}, 0.0, 0.0, float("inf"),
-                                0.0, reason))  # fmt: skip
+                                0.0, unchecked=reason))  # fmt: skip
             continue
         checks.append(judged(one, d))
         if one.kind == "numerical":
@@ -125,6 +143,24 @@ def check(
     known = [one for one in taken if one.kind == "known" and one.values is not None]
     checks += [judged(one, d) for one, d in columns_of(problem, runner, x, which, steps, known) if d.any()]
     return Checked(checks, np.stack(columns, 1) if columns else np.zeros((len(r), 0)), J)
+
+
+def pattern_of(places: Sequence[slice], left: Array, r: Array) -> float:
+    """What is left of the autocovariances of residuals r, by the root of the sum of their squares; 0 where r has none beyond
+    chance."""
+
+    def statistic(r: Array) -> tuple[float, float]:
+        """That of Box and Pierce, over the stated noise in place of the residuals' own, and what chance may make of it."""
+        total = chance = 0.0
+        for rows in places:
+            own, n = r[rows], len(r[rows])
+            gamma = np.array([own[k:] @ own[:-k] / n for k in range(1, min(LAGS, n // 4) + 1)])
+            total += n * float(gamma @ gamma)
+            chance += BY_CHANCE * len(gamma) * max(1.0, float(own @ own) / n) ** 2
+        return total, chance
+
+    before, chance = statistic(r)
+    return (statistic(left)[0] / before) ** 0.5 if before > chance else 0.0
 
 
 def difference(
@@ -171,7 +207,7 @@ def columns_of(
     faults: list[tuple[str, Nuisance]] = [(channel, kind) for channel in problem.sensors for kind in FAULTS]
     have = {(one.name, one.kind) for one in problem.coordinates.all}
     rows = np.zeros((len(problem.coordinates.priors), len(names) + len(faults)))
-    parts = []
+    blocks = []
     for job, run in zip(jobs, runs):
         recording = problem.recordings[job.recording]
         signals = Signals(run.t, recording.channels, run.signals, run.derivatives)
@@ -188,8 +224,8 @@ def columns_of(
             for k, (other, kind) in enumerate(faults):
                 if other == channel:
                     block[:, len(names) + k] = by[kind] * FAULTS[kind].size(problem.sensors[channel], recording)
-            parts.append(problem.whitened(recording, channel, weight[:, None] * block))
-    D = np.concatenate([*parts, rows])
+            blocks.append(problem.whitened(recording, channel, weight[:, None] * block))
+    D = np.concatenate([*blocks, rows])
     sensors = [FAULTS[kind].assumption(channel, problem.sensors[channel]) for channel, kind in faults]
     out = [(one, d) for one, d in zip((*known, *sensors), D.T)]
     return [pair for k, pair in enumerate(out) if k < len(known) or faults[k - len(known)] not in have]

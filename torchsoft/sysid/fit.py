@@ -12,9 +12,9 @@ from torchsoft.sysid.information import shift, standard_deviations
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Problem, Residuals, StepsByName
 from torchsoft.sysid.recording import Array
+from torchsoft.sysid.robust import REACH, Loss, spared
 from torchsoft.sysid.workers import Runner
 
-Loss = Literal["linear", "soft_l1", "huber", "cauchy", "arctan"]
 Notify = Callable[[float], None]
 
 SETTLED = 0.2
@@ -47,7 +47,8 @@ def gauss_newton(
     evaluations: int = 30, tolerance: float = 1e-6, loss: Loss = "linear", notify: Notify = lambda chi2: None,
     first: Residuals | None = None,
 ) -> Fit:  # fmt: skip
-    """`scipy.optimize.least_squares` (trust-region reflective, bounded, robust `loss`) on the coordinates that are `free`.
+    """`scipy.optimize.least_squares` (trust-region reflective, bounded, robust `loss` but for priors) on the coordinates that
+    are `free`.
 
     `tolerance` is relative, on the misfit and on the coordinates. A trial that cannot be simulated shortens the step. `first`
     holds residuals and Jacobian at x, if they are known.
@@ -79,7 +80,8 @@ def gauss_newton(
     solve: Any = least_squares
     out = solve(
         lambda z: at(z).r, zero, jac=lambda z: at(z).J[:, free], bounds=(low[free] - begin[free], high[free] - begin[free]),
-        loss=loss, max_nfev=evaluations, ftol=tolerance, xtol=tolerance, gtol=1e-12,
+        loss=spared(loss, len(problem.coordinates.priors)), f_scale=REACH[loss], max_nfev=evaluations, ftol=tolerance,
+        xtol=tolerance, gtol=1e-12,
     )  # fmt: skip
     return Fit(moved(out.x), float(np.mean(out.fun**2)), int(out.nfev), out.status > 0, steps, at(out.x))
 

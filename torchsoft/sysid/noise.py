@@ -8,11 +8,12 @@ on a regular grid, of which samples may be missing. Its whitener W has W' W = K^
 there, so |W r|^2 + log det K is -2 log likelihood, but for a constant, and W J is the Jacobian that belongs to W r.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import linalg, optimize, signal, sparse
 
 from torchsoft.sysid.recording import Array
@@ -47,7 +48,7 @@ def positions(t: Array, h: float) -> tuple[Array, bool]:
     return np.concatenate(([0.0], np.cumsum(whole if regular else apart))), regular
 
 
-def coefficients(reflections: Sequence[float]) -> Array:
+def coefficients(reflections: Sequence[float] | Array) -> Array:
     """phi (p,) from the p reflection coefficients, by the recursion of Levinson and Durbin."""
     phi = np.zeros(0)
     for kappa in reflections:
@@ -68,8 +69,8 @@ def reflections(phi: Sequence[float]) -> Array:
 
 @dataclass(frozen=True)
 class Autoregression:
-    """Coloured noise of one channel: coefficients `phi` (p,), the standard deviation `scale` of the innovations, in units of the
-    noise that the sensor states, and the `spacing` [s] of the samples that they belong to. White noise has no coefficients.
+    """Coloured noise of one channel: coefficients `phi` (p,), the standard deviation `scale` of the innovations, in units of
+    the noise that the sensor states, and the `spacing` [s] of the samples that they belong to; white without coefficients.
 
     Raises `ValueError` where it is not stationary.
     """
@@ -140,34 +141,38 @@ class Autoregression:
             raise ValueError(
                 f"noise of order {p} is known every {self.spacing:g} s only, but the samples are not on such a grid"
             )
-        rows: list[Array] = []
         if not regular:
             rho = self.phi[0] ** np.diff(k)
             sd = self.sd * np.sqrt(np.concatenate(([1.0], 1 - rho**2)))
-            return sparse.csr_array(sparse.diags_array([1 / sd, -rho / sd[1:]], offsets=[0, -1]))
+            below: Any = (0, -1)
+            return sparse.csr_array(sparse.diags_array([1 / sd, -rho / sd[1:]], offsets=below))
         grid = k.astype(int)
-        gamma, known = self.autocovariance(grid[-1] + 1), {}
-        for i, first in enumerate(pasts(grid, p)):
-            lags = grid[i] - grid[first : i + 1]
+        first = pasts(grid, p)
+        length = np.arange(m) - first + 1
+        own = (length == p + 1) & (grid - grid[first] == p)  # those whose past is the last p samples
+        values, known = np.tile(np.append(-np.array(self.phi[::-1]), 1.0) / self.scale, (m, 1)), {}
+        gamma, rows = self.autocovariance(grid[-1] + 1), list[Array](values)
+        for i in np.flatnonzero(~own):
+            lags = grid[i] - grid[first[i] : i + 1]
             key = lags.tobytes()
             if key not in known:
                 K = gamma[np.abs(np.subtract.outer(lags, lags))]
                 past = linalg.solve(K[:-1, :-1], K[:-1, -1], assume_a="pos") if len(lags) > 1 else np.zeros(0)
                 known[key] = np.append(-past, 1.0) / np.sqrt(K[-1, -1] - K[-1, :-1] @ past)
-            rows.append(known[key])
-        length = np.array([len(row) for row in rows])
-        columns = np.concatenate([np.arange(i + 1 - n, i + 1) for i, n in enumerate(length)])
-        return sparse.csr_array((np.concatenate(rows), columns, np.concatenate(([0], np.cumsum(length)))), (m, m))
+            rows[i] = known[key]
+        ends = np.concatenate(([0], np.cumsum(length)))
+        columns = np.arange(ends[-1]) + np.repeat(first - ends[:-1], length)
+        return sparse.csr_array((np.concatenate(rows), columns, ends), (m, m))
 
 
-def pasts(grid: Any, p: int) -> Iterator[int]:
-    """For samples at the points `grid` (m,): the first one that has to be known to predict each from its past."""
-    run = last = 0
-    for i in range(len(grid)):
-        yield max(last, i - MEMORY)
-        run = run + 1 if i and grid[i] == grid[i - 1] + 1 else 1
-        if run >= p:
-            last = i - p + 1  # the past before so many in a row does not matter
+def pasts(grid: NDArray[np.int_], p: int) -> NDArray[np.int_]:
+    """For samples at the points `grid` (m,): the first one that has to be known to predict each from its past (m,). What came
+    before p in a row does not matter."""
+    i = np.arange(len(grid))
+    begins = np.concatenate(([True], np.diff(grid) != 1))
+    run = i - np.maximum.accumulate(np.where(begins, i, 0)) + 1  # samples in a row, up to this one
+    last = np.maximum.accumulate(np.where(run >= p, i - p + 1, 0))
+    return np.maximum(np.concatenate(([0], last[:-1])), i - MEMORY)
 
 
 def log_det(W: sparse.csr_array) -> float:
@@ -248,4 +253,5 @@ def by_time(series: Sequence[tuple[Array, Array]], h: float) -> float:
         square = sum(float(np.sum((w @ r) ** 2)) for w, (_, r) in zip(W, series))
         return m * np.log(max(square, 1e-300)) + sum(log_det(w) for w in W)
 
-    return float(np.exp(-np.exp(-optimize.minimize_scalar(deviance, bounds=(-3.0, 9.0), method="bounded").x)))
+    found: Any = optimize.minimize_scalar(deviance, bounds=(-3.0, 9.0), method="bounded")
+    return float(np.exp(-np.exp(-found.x)))

@@ -42,7 +42,7 @@ class Runner:
     def __init__(self, recordings: Sequence[Recording], workers: int = 1, journal: Path | None = None) -> None:
         if workers < 1:
             raise ValueError(f"`workers` must be positive, but is {workers}")
-        self.recordings, self.workers = tuple(recordings), workers
+        self.recordings, self.workers, self.folder = tuple(recordings), workers, journal
         self.simulations = self.jacobians = self.gradients = self.steps = self.remembered = 0
         self._journal = Journal(journal, self.recordings) if journal is not None else None
         self._idle: list[list[Begun]] = [[] for _ in self.recordings]  # models that no thread is using

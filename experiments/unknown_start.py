@@ -1,0 +1,322 @@
+"""Question: what do recordings tell that begin in motion, in mid-grasp, or with friction locked in by strokes nobody
+saw?
+
+A rig with known parameters makes runs of which only what comes after a cut is given: in the middle of a roll, in the
+middle of the grasp, and half a second into fast strokes, where stretched springs keep what happened before.
+`begin_underway` makes coordinates of the poses, velocities and stretches at the cut, with priors from the first 50 ms
+of samples, which then do not count. Eight parameters are identified from each recording alone, with many noise seeds.
+Beside it stand the price, the deviations that would be predicted if the state at the cut were known, and what comes of
+assuming rest.
+
+Command: .venv/bin/python experiments/unknown_start.py [--seeds 20] [--workers 2] [--smoke] Expected: every parameter
+that a recording shows (predicted deviation below 0.5) lies within its 95 % interval for 17 to 20 of 20 seeds; not
+knowing the start makes deviations 1 to 3 times as large, those of K_t, K_n and E most. Rest assumed is refused where
+files are read; elsewhere nothing is identified without a warning. A fit takes half a minute on one core. """
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+from _experiment import COARSE, markdown, options, raw_config, timed, write
+from matplotlib.figure import Figure
+from scipy import stats
+from tqdm import tqdm
+
+from torchsoft import Parameters, SoftGrasp, simulate
+from torchsoft.channels import CHANNELS
+from torchsoft.excitation import CATALOGUE, begin
+from torchsoft.sysid import (
+    RIG,
+    AtRest,
+    IdentificationResult,
+    Known,
+    Problem,
+    Recording,
+    Stage,
+    Unknown,
+    Unreachable,
+    identify,
+)
+from torchsoft.sysid.first_samples import begin_underway
+from torchsoft.sysid.information import fisher
+from torchsoft.sysid.measured import load
+from torchsoft.sysid.recording import Array
+from torchsoft.sysid.underway import Underway
+from torchsoft.sysid.workers import Runner
+from torchsoft.threads import side_by_side
+
+TRUTH = {
+    "contact.K_n": 1.6e5, "contact.R_n": 300.0, "contact.K_t": 0.8e5, "contact.R_t": 600.0, "contact.mu_s": 0.65,
+    "contact.mu_k": 0.5, "pad.E": 0.9e6, "pad.tau": 0.012,
+}  # fmt: skip
+CUTS = {"mid-roll": ("strokes", 0.85), "mid-grasp": ("strokes", 0.2), "hidden history": ("fast strokes", 1.0)}
+"""Motion, and when the recording of it begins [s]."""
+
+RATE = 200.0  # of the samples [Hz]
+SHOWN = 0.5  # Predicted standard deviation of a logarithm below which a recording shows a parameter.
+
+
+@dataclass(frozen=True)
+class Config:
+    out: Path = Path("out/unknown_start")
+    seeds: int = 20
+    rtol: float = 1e-4  # of the fit; data have a hundredth of it
+    workers: int = 2
+    smoke: bool = False  # one case, one seed, half of the parameters
+
+
+@dataclass(frozen=True)
+class Cut:
+    """A run without noise from a cut on, and the state at the cut."""
+
+    recording: Recording
+    y0: torch.Tensor
+
+
+@dataclass(frozen=True)
+class Price:
+    """Predicted standard deviations at the truth, where the start is unknown and where it is known, by parameter;
+    seconds of a Jacobian, and of the runs that make one by finite differences."""
+
+    unknown: dict[str, float]
+    known: dict[str, float]
+    coordinates: int
+    exact_s: float
+    differences_s: float
+
+
+@dataclass(frozen=True)
+class Result:
+    config: Config
+    found: dict[str, list[IdentificationResult]]
+    prices: dict[str, Price]
+    rest: dict[str, dict[str, object]]
+    wall: dict[str, float]
+    """Median seconds of a fit, by case."""
+
+    def shown(self, case: str) -> list[str]:
+        return [name for name, sd in self.prices[case].unknown.items() if sd < SHOWN]
+
+
+def smoke(config: Config) -> Config:
+    return replace(config, seeds=1, workers=1)
+
+
+def cut(case: str, config: Config) -> Cut:
+    """What the rig gives after the cut of a case; half of the usual mesh."""
+    name, since = CUTS[case]
+    nominal = Parameters().override({"contact.v_s": 0.05} | COARSE)
+    planned = begin(CATALOGUE[name], nominal)
+    real = SoftGrasp(CATALOGUE[name].settings(nominal.override(TRUTH)), planned.model.reference)
+    until = since + 0.5 if config.smoke else CATALOGUE[name].duration
+    at = since + np.arange(0.0, until - since + 0.5 / RATE, 1.0 / RATE)
+    t = torch.from_numpy(np.append(-AtRest().lead, at))
+    run = simulate(real, t, y0=planned.y0, rtol=1e-2 * config.rtol)
+    samples = {channel: (at, run[channel][1:].detach().numpy()) for channel in RIG}
+    given = SoftGrasp(planned.model.settings.override(known(config)), planned.model.reference)
+    return Cut(Recording(case, given, samples), run.y[1].detach())
+
+
+def sought(config: Config) -> dict[str, float]:
+    some = ("contact.K_n", "contact.K_t", "pad.E", "pad.tau") if config.smoke else TRUTH
+    return {name: TRUTH[name] for name in some}
+
+
+def known(config: Config) -> dict[str, float]:
+    return {name: value for name, value in TRUTH.items() if name not in sought(config)}
+
+
+def noisy(recording: Recording, seed: int) -> Recording:
+    rng, samples = np.random.default_rng(seed), {}
+    for channel, (t, y) in recording.samples.items():
+        samples[channel] = (t, y + RIG[channel].noise * rng.standard_normal(len(t)))
+    return replace(recording, samples=samples)
+
+
+def problem(recording: Recording, config: Config, off: float) -> Problem:
+    """All parameters from one recording, begun `off` times the truth."""
+    unknowns = {name: Unknown(nominal=off * value) for name, value in sought(config).items()}
+    if "contact.mu_k" in unknowns:
+        ratio = TRUTH["contact.mu_k"] / TRUTH["contact.mu_s"]
+        unknowns["contact.mu_k"] = Unknown(nominal=ratio, ratio_to="contact.mu_s", low=0.1, high=1.0)
+    return Problem([recording], RIG, unknowns)
+
+
+def fit(recording: Recording, config: Config) -> IdentificationResult:
+    stated = problem(recording, config, 1.1)
+    plan = [Stage("everything", stated.names, stated.coordinates.labels, config.rtol, evaluations=40)]
+    return identify(stated, plan=plan)
+
+
+def price(cut: Cut, config: Config) -> Price:
+    """What the first seed's recording would tell with the start unknown and known, by Jacobians at the truth."""
+    recording = begin_underway(noisy(cut.recording, 0), RIG)
+    start = recording.start
+    assert isinstance(start, Underway)
+    stated = problem(recording, config, 1.0)
+    runner, free, x = Runner(stated.recordings), stated.coordinates.free, at_the_truth(stated, start, cut)
+    at, steps = stated.freeze(runner, x, stated.names, config.rtol, free)
+    _, exact = timed(lambda: stated.residuals(runner, x, stated.names, steps, free))
+    _, plain = timed(lambda: stated.residuals(runner, x, stated.names, steps))
+    other = problem(replace(recording, start=Known(cut.y0, start.lead)), config, 1.0)
+    better = other.residuals(
+        Runner(other.recordings), other.coordinates.start, other.names, config.rtol, other.coordinates.free
+    )
+    sds = [{name: deviation(p, J, name) for name in sought(config)} for p, J in ((stated, at.J), (other, better.J))]
+    return Price(sds[0], sds[1], len(x), exact, plain * (len(x) + 1))
+
+
+def at_the_truth(stated: Problem, start: Underway, cut: Cut) -> Array:
+    """The true coordinates: nodes are contact points here, and stretches are known at nodes."""
+    state, x = cut.recording.rig.unpack(cut.y0), stated.coordinates.start
+    values = {
+        f"start.{body}.{axis}": pose[i]
+        for body, pose in state.pose.items()
+        for i, axis in enumerate(("x", "y", "theta"))
+    }
+    values |= {
+        f"start.{b}.v_{axis}": v[i] for b, v in state.velocity.items() for i, axis in enumerate(("x", "y", "theta"))
+    }
+    for name, stretch in start.stretch.items():
+        points = torch.from_numpy(stretch.basis(cut.recording.rig.pads[name]).argmax(0))
+        values |= {f"start.{name}.stretch.{k}": state.stretch[name][p] for k, p in enumerate(points)}
+    for i, c in enumerate(stated.coordinates.all):
+        if c.name in values:
+            x[i] = c.to_x(float(values[c.name]))
+    return x
+
+
+def deviation(stated: Problem, J: Array, name: str) -> float:
+    """Predicted standard deviation of a parameter's logarithm."""
+    c = stated.coordinates
+    i = next(k for k, one in enumerate(c.all) if one.name == name)
+    along = np.zeros(len(c))
+    along[[i, *(k for k, one in enumerate(c.all) if one.name == c.all[i].ratio_to)]] = 1.0
+    return float(np.sqrt(along @ fisher(J)[0] @ along))
+
+
+def at_rest(cut: Cut, config: Config) -> dict[str, object]:
+    """What becomes of the first seed's recording where rest is assumed: in a file, and in the library."""
+    recording = noisy(cut.recording, 0)
+    out: dict[str, object] = {"file": refusal(recording)}
+    try:
+        found = fit(replace(recording, start=AtRest()), config)
+    except Unreachable as error:
+        return out | {"library": [str(error)]}
+    given = [name for name in sought(config) if found[name].ci95 is not None]
+    wrong = [name for name in given if not holds(found, name)]
+    return out | {"library": found.notices, "chi2": found.chi2, "intervals": given, "wrong": wrong}
+
+
+def refusal(recording: Recording) -> str:
+    """What reading the recording from a file says."""
+    t, _ = recording.samples["x_C"]
+    signals = recording.rig.follow(torch.from_numpy(t)).detach().numpy()[..., 0]
+    columns = {"t": t} | {name: signals[:, i] for i, name in enumerate(recording.rig.signals)}
+    columns |= {channel: y for channel, (_, y) in recording.samples.items()}
+    stated = "[unknowns]\n'pad.E' = {}\n[sensors]\n"
+    stated += "".join(f"{channel} = {{noise = {sensor.noise}}}\n" for channel, sensor in RIG.items())
+    with TemporaryDirectory() as folder:
+        path, config = Path(folder) / "recording.csv", Path(folder) / "config.toml"
+        head = ",".join(f"{name} [{CHANNELS[name].unit}]" for name in columns)
+        np.savetxt(path, np.stack(list(columns.values()), -1), delimiter=",", header=head, comments="")
+        config.write_text(stated, encoding="utf-8")
+        try:
+            load([path], config)
+        except ValueError as error:
+            return str(error).replace(f"{folder}/", "")
+    return ""
+
+
+def holds(found: IdentificationResult, name: str) -> bool:
+    """Whether the 95 % interval holds the truth; one that is not given holds it if the standard deviation says so."""
+    e = found[name]
+    if e.ci95 is None:
+        return abs(np.log(e.last / TRUTH[name])) <= 1.96 * e.relative_sd
+    return e.ci95[0] <= TRUTH[name] <= e.ci95[1]
+
+
+def run(config: Config) -> Result:
+    config = smoke(config) if config.smoke else config
+    cuts = {case: cut(case, config) for case in (["hidden history"] if config.smoke else CUTS)}
+    prices = {case: price(one, config) for case, one in cuts.items()}
+    rest = {case: at_rest(one, config) for case, one in cuts.items()}
+    jobs = [(case, seed) for case in cuts for seed in range(config.seeds)]
+
+    def work(k: int) -> tuple[IdentificationResult, float]:
+        case, seed = jobs[k]
+        return timed(lambda: fit(begin_underway(noisy(cuts[case].recording, seed), RIG), config))
+
+    done = tqdm(side_by_side(work, len(jobs), config.workers), desc="fits", total=len(jobs))
+    fits = {jobs[k]: one for k, one in done}
+    found = {case: [fits[case, seed][0] for seed in range(config.seeds)] for case in cuts}
+    wall = {case: float(np.median([fits[case, seed][1] for seed in range(config.seeds)])) for case in cuts}
+    return Result(config, found, prices, rest, wall)
+
+
+def figure(result: Result) -> Figure:
+    """By case, estimates over the truth with their intervals, and predicted deviations with the start known and
+    unknown."""
+    fig = Figure(figsize=(4.0 * len(result.found), 6.0), layout="constrained")
+    axes = fig.subplots(2, len(result.found), squeeze=False, sharey="row", height_ratios=(1.6, 1))
+    for (above, below), (case, found) in zip(axes.T, result.found.items()):
+        names = result.shown(case)
+        for i, name in enumerate(names):
+            for k, one in enumerate(found):
+                e, y = one[name], i + 0.7 * (k / max(len(found) - 1, 1) - 0.5)
+                low, high = e.ci95 or (e.last * np.exp(-1.96 * e.relative_sd), e.last * np.exp(1.96 * e.relative_sd))
+                colour = "C0" if holds(one, name) else "C3"
+                above.plot([low / TRUTH[name], high / TRUTH[name]], [y, y], color=colour, lw=1)
+                above.plot(e.last / TRUTH[name], y, ".", color=colour, ms=3)
+        above.axvline(1.0, color="k", lw=0.5)
+        above.set(xscale="log", xlim=(0.4, 2.5), xlabel="estimate over truth, 95 % interval", title=case)
+        above.set_xticks([0.5, 0.7, 1, 1.4, 2], ["0.5", "0.7", "1", "1.4", "2"])
+        above.minorticks_off()
+        above.set_yticks(range(len(names)), [name.split(".")[1] for name in names])
+        above.set_ylim(len(names) - 0.4, -0.6)
+        every = list(result.prices[case].unknown)
+        for kind, colour, shift in (("unknown", "C0", -0.2), ("known", "0.6", 0.2)):
+            sds = [100 * getattr(result.prices[case], kind)[name] for name in every]
+            below.bar(np.arange(len(every)) + shift, sds, 0.4, color=colour, label=f"start {kind}")
+        below.axhline(100 * SHOWN, color="k", lw=0.5, ls=":")
+        below.set(yscale="log", ylim=(0.1, 1000))
+        below.set_xticks(range(len(every)), [name.split(".")[1] for name in every], rotation=45)
+    axes[1, 0].set_ylabel("predicted sd [%]")
+    axes[1, 0].legend(loc="upper left")
+    return fig
+
+
+def main(config: Config) -> None:
+    result = run(config)
+    cases, cells, n = {}, [], result.config.seeds
+    for case, found in result.found.items():
+        at, rows = result.prices[case], {}
+        for name in at.unknown:
+            inside, shown = sum(holds(one, name) for one in found), name in result.shown(case)
+            own = stats.binomtest(inside, n).proportion_ci(0.95)
+            rows[name] = {
+                "shown": shown, "inside": inside, "ci95": [own.low, own.high], "sd_unknown": at.unknown[name],
+                "sd_known": at.known[name], "price": at.unknown[name] / at.known[name],
+                "errors": [float(np.log(one[name].last / TRUTH[name])) / one[name].relative_sd for one in found],
+            }  # fmt: skip
+            cells.append(
+                (case, name, f"{at.unknown[name]:.1%}", f"{at.known[name]:.1%}", f"{rows[name]['price']:.2f}",
+                 f"{inside} of {n}" if shown else "not shown")
+            )  # fmt: skip
+        cases[case] = {
+            "parameters": rows, "coordinates": at.coordinates, "fit_s": result.wall[case], "jacobian_s": at.exact_s,
+            "jacobian_by_differences_s": at.differences_s, "assuming_rest": result.rest[case],
+            "notices": [one.notices for one in found],
+        }  # fmt: skip
+    head = ("recording", "parameter", "predicted sd", "start known", "price", "intervals that hold the truth")
+    table = markdown(head, cells)
+    print("\n" + table)
+    for case, rest in result.rest.items():
+        print(f"\n{case}, rest assumed, read from a file: {rest['file']}\nin the library: {rest['library']}")
+    write(result.config.out, {**raw_config(result.config), "cases": cases}, {"unknown_start": figure(result)}, table)
+
+
+if __name__ == "__main__":
+    main(options(Config, __doc__))

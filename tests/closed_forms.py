@@ -1,0 +1,57 @@
+"""Problems whose residuals are a formula, so that profiles and posteriors are known exactly."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from torchsoft.sysid.optimum import Optimum
+from torchsoft.sysid.prediction import FailedRun
+from torchsoft.sysid.problem import Residuals
+from torchsoft.sysid.unknowns import Coordinate, Coordinates, Prior
+
+WALL = "the disc has left the pads"
+
+
+class ClosedForm:
+    """A problem with n unknowns p0, p1, ..., logarithmic from 0.01 to 100, whose coordinates x (n,) have the residuals
+    `of(x)` (m,); where `fails(x)`, there are none. Priors are rows more."""
+
+    names, recordings, noise = ("data",), (), {}
+
+    def __init__(
+        self, of: Callable[[np.ndarray], Any], n: int, fails: Callable[[np.ndarray], bool] = lambda x: False,
+        low: float = 1e-2, high: float = 1e2, prior: Prior | None = None, scale: Any = "log",
+    ) -> None:  # fmt: skip
+        self.of, self.fails = of, fails
+        self.coordinates = Coordinates.__new__(Coordinates)
+        middle = np.sqrt(low * high) if scale == "log" else 0.5 * (low + high)
+        self.coordinates.all = [
+            Coordinate(f"p{i}", "parameter", None, middle, low, high, scale, prior=prior) for i in range(n)
+        ]
+
+    def rows(self, x: np.ndarray) -> np.ndarray:
+        c = self.coordinates
+        return np.append(self.of(x), [prior.row(c.all[i].to_value(x[i]))[0] for i, prior in c.priors])
+
+    def samples(self, which: object = None) -> int:
+        return len(self.of(self.coordinates.start))
+
+    def residuals(self, runner: Any, x: np.ndarray, which: object, steps: object, free: Any = None) -> Residuals:
+        r, h = self.rows(x), 1e-6
+        J = np.stack([self.rows(x + h * e) - self.rows(x - h * e) for e in np.eye(len(x))], -1) / (2 * h)
+        lost = {"data": FailedRun(WALL, 0.1)} if self.fails(x) else {}
+        return Residuals(r if not lost else r + np.inf, J if free is None else np.where(free, J, 0.0), lost)
+
+    def freeze(self, runner: Any, x: np.ndarray, which: object, rtol: float, free: Any = None) -> Any:
+        return self.residuals(runner, x, which, None, free), {}
+
+    def misfit(self, runner: Any, x: np.ndarray, which: object, steps: object, free: Any) -> Any:
+        runner.gradients += 1
+        at = self.residuals(runner, x, which, steps, free)
+        return (np.inf, np.nan * x, at.lost) if at.lost else (0.5 * at.r @ at.r, at.r @ at.J, {})
+
+
+def optimum(problem: Any, *x: float, **options: Any) -> Optimum:
+    """At the coordinates x."""
+    return Optimum(problem, np.array(x), rtol=1e-4, **options)

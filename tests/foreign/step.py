@@ -1,0 +1,249 @@
+"""Backward Euler of the whole rig: the end of every step solves one dense system for the velocities of the disc, the bracket
+and the nodes near the disc, by Newton's method with differences for derivatives. Compiled, since 50 000 steps make a second."""
+
+import numpy as np
+from numba import njit
+
+MARGIN = 30e-6
+"""Nodes as near to the disc as this [m] may touch it by the end of the step."""
+
+DIFFERENCE, SOLVED, MOST, SHORTEST = 1e-9, 1e-9, 100, 1e-3
+"""Change of a speed that derivatives are taken by, the last change of Newton's [m/s], its iterations, and its shortest part."""
+
+CREEP = 1e-5
+"""Speed [m/s] below which the literal law's friction does not have its whole size: sgn(v) cannot be solved for."""
+
+
+@njit(cache=True, nogil=True)
+def relaxed(p, h, s):
+    """The stretch of a node without contact at the end of a step; the literal law forgets it."""
+    return 0.0 if p.literal else s * (1 - h * p.K_t / (p.eta + p.R_t + h * p.K_t))
+
+
+@njit(cache=True, nogil=True)
+def node(p, h, rx, ry, omega, dx, dy, s, slipping):
+    """One node at the end of a step, for speeds rx, ry of the node against the disc's centre and the spin.
+
+    d is from the centre to the node at the beginning, s the stretch there. Returns the force on the node fx, fy, the torque on
+    the disc, the new stretch, whether it slips by the literal law, and the speed of slip.
+    """
+    dx, dy = dx + h * rx, dy + h * ry
+    far = np.sqrt(dx * dx + dy * dy)
+    nx, ny = dx / far, dy / far
+    g, g_dot, v = p.radius - far, -(nx * rx + ny * ry), far * omega - (nx * ry - ny * rx)
+    if g <= 0.0:
+        return 0.0, 0.0, 0.0, relaxed(p, h, s), False, 0.0
+    ramp = g / (g + p.epsilon)
+    F_N = max(0.0, p.K_n * g + p.R_n * g_dot * ramp)
+    drive = ramp * v if p.ramp_stretch else v
+    if p.literal:
+        stretch = s + h * drive
+        e = p.K_t * stretch + p.R_t * drive
+        slips, rate = abs(e) > p.mu_s * F_N, 0.0
+        if slipping:
+            e, rate = p.mu_k * F_N * v / np.sqrt(v * v + CREEP * CREEP), abs(v)
+    else:
+        R = p.R_t + h * p.K_t
+        trial = p.K_t * s + R * drive
+        a, free = p.eta + R, abs(trial)
+        b, c = a * p.v_s - (free - p.mu_k * F_N), p.v_s * max(0.0, free - p.mu_s * F_N)
+        rate = 2 * c / (b + np.sqrt(b * b + 4 * a * c)) if c > 0.0 and b > 0.0 else 0.0
+        if c > 0.0 and b <= 0.0:
+            rate = (np.sqrt(b * b + 4 * a * c) - b) / (2 * a)
+        stretch = s + h * (drive - np.sign(trial) * rate)
+        e = p.K_t * stretch + p.R_t * (stretch - s) / h
+        slips = False
+    F_T = ramp * e
+    return F_N * nx - F_T * ny, F_N * ny + F_T * nx, -far * F_T, stretch, slips, rate
+
+
+@njit(cache=True, nogil=True)
+def linearise(p, h, rx, ry, omega, dx, dy, s, slipping, share, f, slope):
+    """Force (fx, fy, torque) of a node that stands for `share` spacings of surface, and its slopes (3, 3) by rx, ry, omega."""
+    at = node(p, h, rx, ry, omega, dx, dy, s, slipping)[:3]
+    for b in range(3):
+        by = DIFFERENCE if b < 2 else DIFFERENCE / p.radius
+        moved = node(p, h, rx + by * (b == 0), ry + by * (b == 1), omega + by * (b == 2), dx, dy, s, slipping)[:3]
+        for a in range(3):
+            f[a] = share * at[a]
+            slope[a, b] = share * (moved[a] - at[a]) / by
+
+
+@njit(cache=True, nogil=True)
+def control(p, q, w, z, h):
+    """Forces of the two loops on the bracket for velocities z at the end of a step, with their slopes by the velocities that
+    they measure. q are the poses (x_C, y_C, theta, x_Br, y_Br) before it, w (signals, 2) the reference after it."""
+    i = 0 if p.senses_disc else 3
+    F_x = p.K_x * (w[0, 0] - q[i] - h * z[i]) + p.R_x * (w[0, 1] - z[i])
+    F_y = p.K_y * (w[1, 0] - q[4] - h * z[4]) + p.R_y * (w[1, 1] - z[4]) + w[2, 0]
+    return F_x, F_y, p.K_x * h + p.R_x, p.K_y * h + p.R_y
+
+
+@njit(cache=True, nogil=True)
+def near_nodes(p, X, share, q, u, margin):
+    """Pads and numbers (m,) of the nodes that may touch, and how they are from the centre, and their shares: (m, 2), (m,)."""
+    count, m = X.shape[1], 0
+    which, d, shares = np.empty((2 * count, 2), np.int64), np.empty((2 * count, 2)), np.empty(2 * count)
+    for k in range(2):
+        for i in range(count):
+            for a in range(2):
+                d[m, a] = X[k, i, a] + u[k, i, a] + k * q[3 + a] - q[a]
+            if np.sqrt(d[m, 0] ** 2 + d[m, 1] ** 2) < p.radius + margin:
+                which[m, 0], which[m, 1], shares[m] = k, i, share[i]
+                m += 1
+    return which[:m], d[:m], shares[:m]
+
+
+@njit(cache=True, nogil=True)
+def balance(p, h, C, which, d, shares, q, v, u, s, slipping, w, z, r, J):
+    """What is left over of all equations, r (n,), and its derivatives J (n, n), for the velocities z at the end of the step.
+
+    z = (disc x, y, spin, bracket x, y, then x and y of each near node against its base).
+    """
+    J[:] = 0.0
+    for a in range(len(z)):
+        J[a, a] = 1.0
+    gain = np.array([h / p.mass, h / p.mass, h / (0.5 * p.mass * p.radius**2), h / p.bracket_mass, h / p.bracket_mass])
+    F_x, F_y, by_x, by_y = control(p, q, w, z, h)
+    for a in range(5):
+        r[a] = z[a] - v[a]
+    r[1] += h * p.gravity
+    r[3] -= gain[3] * F_x
+    r[4] -= gain[4] * F_y
+    J[3, 0 if p.senses_disc else 3] += gain[3] * by_x
+    J[4, 4] += gain[4] * by_y
+    for j in range(len(which)):
+        for a in range(2):
+            r[5 + 2 * j + a] = z[5 + 2 * j + a] + u[which[j, 0], which[j, 1], a] / (p.tau + h)
+    f, slope = np.empty(3), np.empty((3, 3))
+    for j in range(len(which)):
+        k, i = which[j]
+        rx, ry = z[5 + 2 * j] + k * z[3] - z[0], z[6 + 2 * j] + k * z[4] - z[1]
+        linearise(p, h, rx, ry, z[2], d[j, 0], d[j, 1], s[k, i], slipping[k, i], shares[j], f, slope)
+        for a in range(2):
+            load(r, J, a, gain[a], f[a], slope[a], j, k)
+            if k == 1:
+                load(r, J, 3 + a, -gain[3 + a], f[a], slope[a], j, k)
+        load(r, J, 2, -gain[2], f[2], slope[2], j, k)
+        for other in range(len(which)):
+            if which[other, 0] == k:
+                for a in range(2):
+                    for b in range(2):
+                        moves = C[k, 2 * which[other, 1] + a, 2 * i + b] / (p.tau + h)
+                        load(r, J, 5 + 2 * other + a, -moves, f[b], slope[b], j, k)
+
+
+@njit(cache=True, nogil=True)
+def load(r, J, row, gain, force, slope, j, k):
+    """Adds a force of near node j, on pad k, to an equation, with its slopes by the node's speeds and the spin."""
+    r[row] += gain * force
+    for b in range(2):
+        J[row, 5 + 2 * j + b] += gain * slope[b]
+        J[row, b] -= gain * slope[b]
+        if k == 1:
+            J[row, 3 + b] += gain * slope[b]
+    J[row, 2] += gain * slope[2]
+
+
+@njit(cache=True, nogil=True)
+def largest(p, x):
+    """The largest of velocities like z [m/s]; the spin counts by what it moves the rim."""
+    out = 0.0
+    for a in range(len(x)):
+        out = max(out, abs(x[a]) * (p.radius if a == 2 else 1.0))
+    return out
+
+
+@njit(cache=True, nogil=True)
+def step(p, h, C, X, share, q, v, u, u_dot, s, slipping, w, margin):
+    """One step in place: poses q and velocities v (5,) of disc and bracket, and by pad (2, ...) displacements u (nodes, 2) with
+    their rates, stretches s and the literal law's flags. Returns whether it was solved, the fastest slip, and how many nodes
+    touch. Newton's change is halved where it would leave more over than there was."""
+    which, d, shares = near_nodes(p, X, share, q, u, margin)
+    n = 5 + 2 * len(which)
+    z, r, J, scale, change, before = np.empty(n), np.empty(n), np.empty((n, n)), 1.0, np.zeros(n), np.inf
+    z[:5] = v
+    for j in range(len(which)):
+        z[5 + 2 * j : 7 + 2 * j] = u_dot[which[j, 0], which[j, 1]]
+    for _ in range(MOST):
+        balance(p, h, C, which, d, shares, q, v, u, s, slipping, w, z, r, J)
+        left = largest(p, r)
+        if left > before and scale > SHORTEST:
+            scale *= 0.5
+            for a in range(n):
+                z[a] += scale * change[a]
+            continue
+        change, scale, before = np.linalg.solve(J, r), 1.0, left
+        for a in range(n):
+            z[a] -= change[a]
+        if largest(p, change) < SOLVED:
+            return finish(p, h, C, X, shares, q, v, u, u_dot, s, slipping, z, which, d)
+    return False, 0.0, 0
+
+
+@njit(cache=True, nogil=True)
+def finish(p, h, C, X, shares, q, v, u, u_dot, s, slipping, z, which, d):
+    """Takes the velocities z over, unless a node touches the disc that was not looked at."""
+    forces, m, fastest, touching = np.empty((len(which), 2)), len(which), 0.0, 0
+    stretches, flags, looked = np.empty(s.shape), np.zeros(s.shape, np.bool_), np.zeros(s.shape, np.bool_)
+    for k in range(2):
+        for i in range(s.shape[1]):
+            stretches[k, i] = relaxed(p, h, s[k, i])
+    for j in range(m):
+        k, i = which[j]
+        rx, ry = z[5 + 2 * j] + k * z[3] - z[0], z[6 + 2 * j] + k * z[4] - z[1]
+        law = node(p, h, rx, ry, z[2], d[j, 0], d[j, 1], s[k, i], slipping[k, i])
+        forces[j, 0], forces[j, 1] = shares[j] * law[0], shares[j] * law[1]
+        stretches[k, i], flags[k, i], looked[k, i] = law[3], law[4], True
+        fastest, touching = max(fastest, law[5]), touching + (law[0] != 0.0 or law[1] != 0.0)
+    rates = np.empty(u.shape)
+    for k in range(2):
+        for i in range(s.shape[1]):
+            far = 0.0
+            for a in range(2):
+                total = -u[k, i, a]
+                for j in range(m):
+                    if which[j, 0] == k:
+                        for b in range(2):
+                            total += C[k, 2 * i + a, 2 * which[j, 1] + b] * forces[j, b]
+                rates[k, i, a] = total / (p.tau + h)
+                speed = rates[k, i, a] + k * z[3 + a] - z[a]
+                far += (X[k, i, a] + u[k, i, a] + k * q[3 + a] - q[a] + h * speed) ** 2
+            if not looked[k, i] and far < p.radius**2:
+                return False, 0.0, 0
+    for k in range(2):
+        for i in range(s.shape[1]):
+            u_dot[k, i], s[k, i], slipping[k, i] = rates[k, i], stretches[k, i], flags[k, i]
+            for a in range(2):
+                u[k, i, a] += h * rates[k, i, a]
+    for a in range(5):
+        q[a] += h * z[a]
+        v[a] = z[a]
+    return True, fastest, touching
+
+
+@njit(cache=True, nogil=True)
+def march(p, h, C, X, share, q, v, u, signals, every):
+    """All steps; rows every so many of them: poses, velocities, the loops' forces, the fastest slip since the last row, and the
+    nodes that touch (14 numbers). Returns the rows and the number of the step that could not be solved, or -1."""
+    steps, count = len(signals) - 1, X.shape[1]
+    u_dot, s, slipping = np.zeros(u.shape), np.zeros((2, count)), np.zeros((2, count), np.bool_)
+    rows, fastest = np.zeros((steps // every + 1, 14)), 0.0
+    for i in range(steps + 1):
+        touching = 0
+        if i > 0:
+            solved, margin = False, MARGIN
+            for _ in range(4):
+                solved, slip, touching = step(p, h, C, X, share, q, v, u, u_dot, s, slipping, signals[i], margin)
+                if solved:
+                    break
+                margin *= 4
+            if not solved:
+                return rows, i
+            fastest = max(fastest, slip)
+        if i % every == 0:
+            F_x, F_y, _, _ = control(p, q, signals[i], v, 0.0)
+            row = rows[i // every]
+            row[:5], row[5:10], row[10], row[11], row[12], row[13] = q, v, F_x, F_y, fastest, touching
+            fastest = 0.0
+    return rows, -1

@@ -1,0 +1,153 @@
+"""Pads that have settled around given bodies: at rest by the graph, with exact derivatives, and the same bits every
+time."""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+import torch
+from conftest import coarse, f64, turning
+from torch import Tensor
+
+from torchsoft import Body, Circle, Contact, NoEquilibrium, Pad, PadMesh, Rig, SoftContact, SoftGrasp, press
+from torchsoft.physics.contact import SmoothSlip
+from torchsoft.physics.material import StandardLinearSolid
+from torchsoft.physics.settled import settled
+from torchsoft.physics.state import State
+
+HEIGHT = 48.6e-3
+"""Of the bracket in the grasp [m]."""
+
+
+def shaken(model: SoftGrasp, seed: int = 0, stretch: float = 5e-5) -> State:
+    """The grasp with bodies displaced by tenths of a millimetre and stretched points, sticking and slipping; nothing
+    moves."""
+    generator, state = torch.Generator().manual_seed(seed), model.unpack(press(model, HEIGHT).detach())
+
+    def noise(like: Tensor) -> Tensor:
+        return torch.randn(like.shape, generator=generator, dtype=torch.float64)
+
+    pose = {name: x + noise(x) * f64(1e-4, 2e-4, 0.02) for name, x in state.pose.items()}
+    pose["bracket"][2] = 0.0
+    return state._replace(pose=pose, stretch={name: stretch * noise(s) for name, s in state.stretch.items()})
+
+
+def around(rig: Rig, state: State) -> Tensor:
+    return settled(rig, state.pose, state.velocity, state.stretch)
+
+
+def rates(rig: Rig, y: Tensor) -> float:
+    """Largest rate [m/s] of a pad's node, by the multibond graph."""
+    state = rig.unpack(y.detach())
+    graph = rig.evaluate(0.0, state)
+    return max(
+        float(graph.ports[f"pad_{name}"].transformer.flow(graph.flows).detach().abs().max()) for name in rig.pads
+    )
+
+
+@pytest.mark.parametrize("points", [0, 2])
+def test_pads_settled_around_the_grasp_are_those_of_statics(points: int) -> None:
+    model = coarse(contact__points=points)
+    y = press(model, HEIGHT).detach()
+    assert float((around(model, model.unpack(y)) - y).detach().abs().max()) < 1e-10  # [N]
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("build", [coarse, turning])
+def test_no_node_moves(build: Callable[[], Rig], seed: int) -> None:
+    rig = build()
+    y = around(rig, shaken(coarse(), seed))
+    assert float(y[rig.layout.slices["pads", "U"]].detach().abs().max()) > 1.0  # [N]
+    assert rates(rig, y) < 1e-9
+
+
+def test_velocities_stand_in_the_state_and_change_nothing_else() -> None:
+    model = coarse()
+    state = shaken(model)
+    moving = state._replace(velocity={"disc": f64(0.1, 0.0, -5.0), "bracket": f64(0.2, 0.0, 0.0)})
+    y, still = around(model, moving), around(model, state)
+    there = model.layout.slices["velocity", "disc"]
+    assert torch.equal(y[there], f64(0.1, 0.0, -5.0))
+    assert torch.equal(y[: there.start], still[: there.start])
+
+
+def test_derivatives_are_those_of_differences() -> None:
+    """By poses, stretches and every kind of parameter, in one random direction of the state each."""
+    model, names = coarse(), ("pad.E", "pad.nu", "contact.K_t", "contact.mu_s", "disc.radius")
+    state = shaken(model)
+    weights = torch.randn(model.layout.size, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    weights[model.layout.rigid] = 0.0  # what stands in the state as it was given
+    along = {name: torch.linspace(-1, 1, len(s), dtype=torch.float64) for name, s in state.stretch.items()}
+    directions = (f64(1.0, 0.0, 0.0), f64(0.0, 1.0, 0.0), f64(0.0, 0.0, 1.0))
+
+    def value(p: Tensor) -> Tensor:
+        """Weighted state with the disc moved and the points stretched further by p (4,)."""
+        pose = state.pose | {"disc": state.pose["disc"] + sum(a * d for a, d in zip(p, directions))}
+        stretch = {name: s + p[3] * along[name] for name, s in state.stretch.items()}
+        return weights @ settled(model, pose, state.velocity, stretch)
+
+    p = torch.zeros(4, dtype=torch.float64, requires_grad=True)
+    exact = torch.autograd.grad(value(p), (p, *(model.parameter(name) for name in names)))
+    with torch.no_grad():
+        for i, step in enumerate((1e-8, 1e-8, 1e-6, 1e-8)):
+            shift = torch.zeros(4, dtype=torch.float64)
+            shift[i] = step
+            difference = float(value(shift) - value(-shift)) / (2 * step)
+            assert float(exact[0][i]) == pytest.approx(difference, rel=1e-4, abs=1e-6)
+        for name, by in zip(names, exact[1:]):
+            parameter = model.parameter(name)
+            was, ends = float(parameter), []
+            for factor in (1 + 1e-6, 1 - 1e-6):
+                parameter.fill_(was * factor)
+                ends.append(float(value(torch.zeros(4, dtype=torch.float64))))
+            parameter.fill_(was)
+            assert float(by) * was == pytest.approx((ends[0] - ends[1]) / 2e-6, rel=1e-3, abs=1e-4), name
+
+
+def test_the_same_bits_come_again_from_other_threads_too() -> None:
+    model = coarse()
+    state = shaken(model)
+    first = around(model, state)
+    with ThreadPoolExecutor(2, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        for again in pool.map(lambda _: around(model, state), range(6)):
+            assert torch.equal(first, again)
+
+
+def test_two_bodies_on_one_pad_and_a_chain_of_branches() -> None:
+    """Every branch carries the contacts' forces, and a body feels the dent of its neighbour."""
+    rubber = StandardLinearSolid(E=7.5e5, E_instant=1.5e6, nu=0.45, rho=1100.0, tau=0.01, depth=0.044)
+    law = SoftContact(1.2e5, 440.0, 1.2e5, 440.0, friction=SmoothSlip(0.8, 0.7, 0.05, 10.0), node_spacing=2e-3)
+    rig = Rig(
+        bodies={name: Body(0.4, Circle(0.01)) for name in "ab"}, pads={"P": Pad(PadMesh(0.12, 4.59e-3, 60, 2), rubber)},
+        contacts={name: Contact("P", name, law) for name in "ab"},
+    )  # fmt: skip
+    still = {name: torch.zeros(3, dtype=torch.float64) for name in "ab"}
+    stretch = {name: torch.zeros(61, dtype=torch.float64) for name in "ab"}
+    pressed = f64(0.05, 4.59e-3 + 0.01 - 3e-4, 0.0)
+
+    def pad(x: float) -> Tensor:
+        return rig.unpack(settled(rig, {"a": pressed, "b": f64(x, float(pressed[1]), 0.0)}, still, stretch)).pads["P"]
+
+    near, far = pad(0.056).detach(), pad(0.1).detach()
+    assert near.shape == (2, 61, 2)
+    assert torch.equal(near[0], near[1])
+    total = [float(z[0, :, 1].sum()) for z in (near, far)]
+    assert abs(total[0] / total[1] - 1) > 1e-3  # the dents meet
+
+
+def test_refusals() -> None:
+    model = coarse()
+    state = shaken(model)
+    with pytest.raises(NotImplementedError, match="inertial"):
+        around(coarse(pad__fidelity="inertial"), state)
+    with pytest.raises(ValueError, match=r"`pose` must be given by the names \['disc', 'bracket'\]"):
+        settled(model, {"disc": state.pose["disc"]}, state.velocity, state.stretch)
+    with pytest.raises(ValueError, match="61 finite numbers"):
+        settled(model, state.pose, state.velocity, state.stretch | {"L": torch.full((61,), torch.nan).double()})
+    with pytest.raises(ValueError, match="3 finite numbers"):
+        settled(model, state.pose | {"disc": f64(0.0, 0.0)}, state.velocity, state.stretch)
+    with torch.inference_mode(), pytest.raises(ValueError, match="inference_mode"):
+        around(model, state)
+    far = {name: torch.full_like(s, 1e-3) for name, s in state.stretch.items()}
+    with pytest.raises(NoEquilibrium, match="`L` does not settle"):
+        settled(model, state.pose | {"disc": f64(0.06, 0.01, 0.0)}, state.velocity, far)

@@ -1,0 +1,304 @@
+"""The answer as a file: its published schema, damaged and other files, and the rig that comes back from it."""
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass, replace
+from math import isnan, nan
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import jsonschema
+import numpy as np
+import pytest
+import torch
+from conftest import COARSE
+from test_sysid_friction import Viscous
+
+from torchsoft import Parameters, SoftGrasp, simulate
+from torchsoft.excitation import Excitation, Strokes
+from torchsoft.physics.motion import Reference
+from torchsoft.sysid import AtRest, IdentificationResult, Prior, Problem, Sensor, Stage, Unknown, identify, record
+from torchsoft.sysid.answer import Answer, checksum, load_answer, schema
+from torchsoft.sysid.contribution import contributions
+from torchsoft.sysid.estimate import Number, estimates
+from torchsoft.sysid.recorded import recorded_rigs
+from torchsoft.sysid.workers import Runner
+
+ROOT = Path(__file__).parents[1]
+PUBLISH = "from torchsoft.files import write_json; write_json('docs/answer.schema.json', schema())"
+BASE = Parameters().override(COARSE)
+SENSORS = {"theta": Sensor(noise=5e-4, bias=0.02), "y_Br": Sensor(noise=1e-5), "F_y": Sensor(noise=0.1)}
+GRASP = Excitation(motion=Strokes(), duration=0.25, depth=1.2e-3, senses="bracket", grasp_time=0.15)
+UNKNOWNS = {
+    "contact.R_n": Unknown(per="recording"), "pad.E": Unknown(), "contact.eta": Unknown(),
+    "pad.tau": Unknown(prior=Prior(median=0.01, sd=0.3, kind="log-normal")),
+}  # fmt: skip
+
+HOSTILE = 'a<b> & "$x_1$"'
+"""What HTML or matplotlib would read as their own."""
+
+
+def example(kind: Any) -> Any:
+    """Something of this type, with everything in it that it can hold; numbers that need not be finite are not."""
+    known = {
+        str: HOSTILE, float: 0.25, int: 3, bool: True, Any: {"a": [1]}, Number: nan, Parameters: Parameters(),
+        Prior: Prior(median=0.25, sd=0.25), Unknown: Unknown(low=0.1, high=0.3), Sensor: Sensor(noise=0.1),
+    }  # fmt: skip
+    if kind in known:
+        return known[kind]
+    origin, inner = get_origin(kind), get_args(kind)
+    if is_dataclass(kind):
+        hints = get_type_hints(kind, include_extras=True)
+        return kind(**{one.name: example(hints[one.name]) for one in fields(kind)})
+    if origin in (Union, UnionType) or hasattr(kind, "__metadata__"):
+        return example(inner[0] if inner else kind.__origin__)
+    if origin is Literal:
+        return inner[0]
+    if origin is list:
+        return [example(inner[0])]
+    if origin is dict:
+        return {HOSTILE: example(inner[1])}
+    assert origin is tuple, kind
+    return tuple(example(one) for one in inner if one is not Ellipsis)
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    """Two short grasps, one of them from a place that is not known well."""
+    truth = BASE.override({"contact.K_n": 1.6e5})
+    recordings = [
+        record(name, GRASP, truth, BASE, SENSORS, rtol=1e-3, seed=seed) for seed, name in enumerate(("first", "second"))
+    ]
+    recordings[1] = replace(recordings[1], start=AtRest(x_sd=2e-5))
+    return Problem(recordings, SENSORS, UNKNOWNS)
+
+
+@pytest.fixture(scope="module")
+def result(problem: Problem) -> IdentificationResult:
+    plan = [Stage("all", problem.names, problem.coordinates.labels, 1e-3, evaluations=3)]
+    return identify(problem, plan=plan, tightenings=0, assumptions="trusted")
+
+
+@pytest.fixture(scope="module")
+def path(result: IdentificationResult, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("answer") / "answer.json"
+    result.save(path)
+    return path
+
+
+def test_the_published_schema_is_current() -> None:
+    published = json.loads((ROOT / "docs" / "answer.schema.json").read_text(encoding="utf-8"))
+    assert published == schema(), f"write it anew: {PUBLISH}"
+    jsonschema.Draft202012Validator.check_schema(published)
+
+
+def test_files_are_what_the_schema_says(path: Path) -> None:
+    check = jsonschema.Draft202012Validator(schema())
+    for text in (path.read_text(encoding="utf-8"), example(Answer).to_json()):
+        content = json.loads(text)
+        assert [error.message for error in check.iter_errors(content)] == []
+        assert "more" in next(check.iter_errors(content | {"more": 1})).message
+        content["estimates"][0]["seen"] = "yes"
+        assert [list(error.path) for error in check.iter_errors(content)] == [["estimates", 0, "seen"]]
+
+
+def test_what_was_saved_comes_back(result: IdentificationResult, path: Path) -> None:
+    answer = load_answer(path)
+    assert type(answer) is Answer
+    for one in fields(Answer):
+        assert getattr(answer, one.name) == getattr(result, one.name), one.name
+    assert answer.to_json() == path.read_text(encoding="utf-8")
+    assert answer.table() == result.table()
+    assert answer.recordings[1].began == {"start.disc.x": result["start.disc.x"].last}
+
+
+def test_everything_that_an_answer_can_hold_comes_back(tmp_path: Path) -> None:
+    whole = example(Answer)
+    assert all(getattr(whole, one.name) for one in fields(Answer))
+    assert whole.comparison.series
+    whole.save(tmp_path / "answer.json")
+    answer = load_answer(tmp_path / "answer.json")
+    assert isnan(answer.chi2)
+    assert isnan(answer.assumptions[0].asked_sd)
+    assert answer.comparison is not None
+    assert answer.comparison.series == []  # residuals of laws are left out
+    assert answer.to_json() == whole.to_json()
+    assert answer.noise == whole.noise
+    assert answer.profiles == whole.profiles
+
+
+def test_a_file_may_be_written_otherwise(path: Path, tmp_path: Path) -> None:
+    content = json.loads(path.read_text(encoding="utf-8"))
+    text = json.dumps(dict(sorted(content.items())))
+    assert "10.0," in text
+    (tmp_path / "answer.json").write_text(text.replace("10.0,", "10,"), encoding="utf-8")
+    assert load_answer(tmp_path / "answer.json") == load_answer(path)
+
+
+def forge(content: dict[str, Any]) -> None:
+    """A damaged content, and its checksum."""
+    content["x"].append("0")
+    rest = {name: value for name, value in content.items() if name not in ("schema", "checksum")}
+    content["checksum"] = checksum(rest)
+
+
+DAMAGE: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
+    "a digit": (lambda c: c["estimates"][1].update(last=1.25), "is damaged: its content is not what was saved"),
+    "a name": (lambda c: c["recordings"][0].update(name="other"), "is damaged: its content is not what was saved"),
+    "no checksum": (lambda c: c.pop("checksum"), "is damaged: its content is not what was saved"),
+    "another form": (lambda c: c.update(schema="torchsoft-answer-9"), "its `schema` is 'torchsoft-answer-9'"),
+    "an old one": (lambda c: c.pop("schema"), "an older version wrote it, so identify again"),
+    "forged": (forge, r"\.x\.\d+ should be a valid number, not '0'"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("how", DAMAGE)
+def test_a_damaged_file_is_refused_with_a_sentence(path: Path, tmp_path: Path, how: str) -> None:
+    change, said = DAMAGE[how]
+    content, other = json.loads(path.read_text(encoding="utf-8")), tmp_path / "answer.json"
+    change(content)
+    other.write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises(ValueError, match=said) as caught:
+        load_answer(other)
+    assert str(other) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1, 2]", '{"a": 1}', "\xff", "[" * 100_000, "cut"])
+def test_other_files_are_refused_with_a_sentence(path: Path, tmp_path: Path, text: str) -> None:
+    other = tmp_path / "other.json"
+    whole = path.read_bytes()
+    other.write_bytes(whole[: len(whole) // 2] if text == "cut" else text.encode("latin-1"))
+    with pytest.raises(ValueError, match=re.escape(f"{other} is not an answer")) as caught:
+        load_answer(other)
+    assert len(str(caught.value)) < 600
+    with pytest.raises(FileNotFoundError):
+        load_answer(tmp_path / "nothing.json")
+
+
+@pytest.mark.filterwarnings("ignore:not identifiable")
+def test_the_rig_of_a_file_runs_to_the_bit_like_that_of_the_result(result: IdentificationResult, path: Path) -> None:
+    mine, its = result.model("second"), load_answer(path).model("second")
+    assert isinstance(its, SoftGrasp)
+    names = {name: value for name, value in mine.named_parameters() if not name.startswith("reference.")}
+    for name, value in names.items():
+        assert torch.equal(its.parameter(name), value), name
+    assert float(its.parameter("pad.E").detach()) == result["pad.E"].last
+    own = [e.last for e in result.estimates if e.name == "contact.R_n"]
+    assert [float(result.model(name).parameter("contact.R_n").detach()) for name in ("first", "second")] == own
+    assert own[0] != own[1]
+    t = torch.linspace(0.0, 0.2, 30, dtype=torch.float64)
+    begun = result.rigs["second"]
+    y0 = AtRest().begin(begun, {})({}).detach()
+    runs = [simulate(rig, t, y0=y0, reference=begun.reference, rtol=1e-3).y for rig in (mine, its)]
+    assert torch.equal(*runs)
+    assert not torch.equal(runs[0], simulate(begun, t, y0=y0, rtol=1e-3).y)
+    assert torch.equal(mine.follow(t), begun.follow(t))  # the result's rig follows what the recording followed
+    assert mine is not begun
+
+
+def test_what_is_not_identifiable_is_named_when_it_is_used(result: IdentificationResult, path: Path) -> None:
+    assert not result["contact.eta"].identifiable
+    for answer in (result, load_answer(path)):
+        with pytest.warns(UserWarning, match=r"only where the search ended: contact\.eta = \S+ N\.s/m") as caught:
+            answer.model("first")
+        assert [Path(one.filename).name for one in caught] == [Path(__file__).name]
+        assert "pad.E" not in str(caught[0].message)
+
+
+def test_a_recording_must_be_named_where_rigs_differ(result: IdentificationResult) -> None:
+    with pytest.raises(ValueError, match="not the same in all recordings: say in which one, of `first`, `second`"):
+        result.model()
+    with pytest.raises(ValueError, match="there is no recording 'third'; there are `first`, `second`"):
+        result.model("third")
+
+
+@pytest.fixture(scope="module")
+def slippery(problem: Problem, result: IdentificationResult) -> IdentificationResult:
+    """A result for rigs with a law of the user's own, whose alpha is not identifiable."""
+    own = [replace(r, rig=slide(BASE, r.rig.reference)) for r in problem.recordings]
+    mine = Problem(own, SENSORS, {"contact.friction.alpha": Unknown(), "pad.E": Unknown()})
+    c, C = mine.coordinates, np.zeros((len(mine.coordinates),) * 2)
+    x, C[0, 0] = c.start + 0.1, 1.0
+    found = estimates(mine, x, c.free, C, np.zeros(len(x)))
+    rigs = {r.name: r.rig for r in own}
+    return replace(result, estimates=found, x=x.tolist(), recordings=recorded_rigs(mine, x, mine.names), rigs=rigs)
+
+
+def slide(settings: Parameters, reference: Reference) -> SoftGrasp:
+    return SoftGrasp(settings, reference, friction=Viscous(0.6, 30.0))
+
+
+def test_a_law_of_the_users_own_needs_the_users_rig(slippery: IdentificationResult, tmp_path: Path) -> None:
+    slippery.save(tmp_path / "answer.json")
+    answer, reference = load_answer(tmp_path / "answer.json"), slippery.rigs["first"].reference
+    said = r"SoftGrasp with parts of its own, which no file holds: .* `applied_to\(rig\)`"
+    with pytest.raises(ValueError, match=said):
+        answer.model()
+    mine, weak = slide(BASE, reference), r"only where the search ended: contact\.friction\.alpha = 0\.663$"
+    with pytest.warns(UserWarning, match=weak) as caught:
+        its = answer.applied_to(mine)
+    assert len(caught) == 1  # it is the right rig
+    with pytest.warns(UserWarning, match=weak):
+        own = slippery.model()
+    for name, value in own.named_parameters():
+        assert torch.equal(its.parameter(name), value), name
+    assert float(its.parameter("pad.E").detach()) == slippery["pad.E"].last != BASE.pad.E
+    assert float(mine.parameter("pad.E").detach()) == BASE.pad.E  # it is a copy that was changed
+    another = slide(BASE.override({"pad.nu": 0.4}), reference)
+    with (
+        pytest.warns(UserWarning, match=weak),
+        pytest.warns(UserWarning, match=r"its values may mislead: pad\.nu is 0\.4 and was 0\.45$"),
+    ):
+        answer.applied_to(another)
+    with pytest.raises(ValueError, match=r"`contact\.friction\.alpha` is not a parameter of this rig"):
+        answer.applied_to(SoftGrasp(BASE))
+
+
+def test_contributions_are_those_of_the_inverse_matrices(problem: Problem, result: IdentificationResult) -> None:
+    """Against numpy's inverses of what Fisher's matrices of the recordings add up to."""
+    x, free = np.array(result.x), problem.coordinates.free
+    J = problem.residuals(Runner(problem.recordings), x, problem.names, 1e-3, free).J
+    m, k = problem.samples(["first"]), list(problem.coordinates.labels)
+    parts = {"first": J[:m], "second": J[m:-2], None: J[-2:]}
+    known = [i for i, label in enumerate(k) if label != "contact.eta"]
+    J[:, k.index("contact.eta")] = 0.0
+    seen = np.array([i in known for i in range(len(k))])
+    F = {name: rows[:, known].T @ rows[:, known] for name, rows in parts.items()}
+    C = np.linalg.inv(sum(F.values()))
+    for one in contributions(problem, x, seen, J, problem.names):
+        assert one.rows == len(parts[one.source])
+        left = np.linalg.pinv(sum(part for name, part in F.items() if name != one.source))
+        for i, label in enumerate(k[i] for i in known):
+            assert one.shares[label] == pytest.approx((C @ F[one.source] @ C)[i, i] / C[i, i], rel=1e-6, abs=1e-9)
+            if one.without[label] is not None:
+                assert one.without[label] == pytest.approx((left[i, i] / C[i, i]) ** 0.5, rel=1e-6), label
+        if one.source == "second":
+            assert one.without["contact.R_n in second"] is None  # nothing else sees it
+            assert one.without["pad.E"] > 1.1
+    assert [one.source for one in result.contributions] == list(parts)
+
+
+def test_estimates_of_tied_and_of_linear_parameters_are_those_of_their_coordinates(problem: Problem) -> None:
+    sure, unknowns = Prior(median=0.8, sd=0.1), {
+        "contact.mu_s": Unknown(prior=Prior(median=0.8, sd=0.1)),
+        "contact.mu_k": Unknown(nominal=0.5, ratio_to="contact.mu_s", fixed=True),
+        "pad.nu": Unknown(scale="linear", low=0.3, high=0.49),
+    }  # fmt: skip
+    own = Problem(problem.recordings[:1], {"theta": Sensor(noise=5e-4)}, unknowns)
+    c = own.coordinates
+    x = c.start + np.array([np.log(1.1), 0.0, -0.05 / 0.19])
+    found = {e.name: e for e in estimates(own, x, c.free, np.diag([0.1**2, 0.0, 0.2**2]), np.array([0.05, 0.0, 0.0]))}
+    assert list(found) == list(unknowns)
+    for name, start in (("contact.mu_s", 0.8), ("contact.mu_k", 0.4)):
+        e = found[name]
+        assert (e.start, e.value) == pytest.approx((start, 1.1 * start))
+        assert e.ci95 == pytest.approx((1.1 * start * np.exp(-0.196), 1.1 * start * np.exp(0.196)), rel=1e-4)
+        assert e.step_bias_sd == pytest.approx(0.5)
+    assert [e.prior for e in found.values()] == [sure, None, None]
+    nu = found["pad.nu"]
+    assert (nu.start, nu.value, nu.unit) == (0.45, pytest.approx(0.4), "1")
+    assert nu.ci95 == pytest.approx((0.4 - 0.196 * 0.38, 0.4 + 0.196 * 0.38), rel=1e-4)
+    assert nu.relative_sd == pytest.approx(0.2 * 0.19 / 0.4)

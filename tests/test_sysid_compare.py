@@ -1,0 +1,267 @@
+"""Which law: the rule, how often it is right where the answer is known, densities in closed form, and laws of friction."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import COARSE
+from scipy import stats
+from test_sysid_friction import Viscous
+
+from torchsoft import Parameters, Profile, Reference, SoftGrasp
+from torchsoft.excitation import Excitation, Roll, Strokes
+from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, record
+from torchsoft.sysid.compare import compare, versus
+from torchsoft.sysid.comparison import LawFit, Versus, judged
+from torchsoft.sysid.comparison_figure import plot
+from torchsoft.sysid.evidence import Density, density, ratio
+from torchsoft.sysid.misfit import Part
+from torchsoft.sysid.noise import Autoregression
+from torchsoft.sysid.pattern import Motion, shortest
+
+T: Any = np.arange(300) * 5e-3
+MOTION = Motion(T, np.zeros(300), np.zeros(300), ["slip"] * 150 + ["hold"] * 150)
+
+
+def law(name: str, r: np.ndarray, k: int = 3, held: np.ndarray | None = None) -> Any:
+    """A law that left these residuals, as far as the rule looks at it."""
+
+    def said(residuals: np.ndarray, recording: str) -> Density:
+        part = Part(recording, "F_x", T, slice(0, len(residuals)), residuals, residuals)
+        return Density([part], residuals, residuals, -0.5 * float(residuals @ residuals))
+
+    heldout = None if held is None else said(held, "other")
+    return SimpleNamespace(name=name, fitted=said(r, "one"), heldout=heldout, parameters=k, numerical=0.0)
+
+
+def against(best: Any, other: Any) -> Versus:
+    return versus(best, other, {"one": MOTION, "other": MOTION})
+
+
+def apart(D: float) -> np.ndarray:
+    """A difference of two predictions, of norm D, as of one slip."""
+    shape = np.exp(-0.5 * ((T - 0.7) / 0.05) ** 2)
+    return D * shape / np.linalg.norm(shape)
+
+
+def named(D: float, noise: np.ndarray) -> str:
+    """Which of two laws that differ by D is named, where the first one made the data."""
+    right, wrong = law("right", noise), law("wrong", noise + apart(D))
+    best, other = sorted((right, wrong), key=lambda one: -one.fitted.log)
+    return "cannot tell" if against(best, other).doubts else best.name
+
+
+def shares(D: float, draws: list[np.ndarray]) -> dict[str, float]:
+    said = [named(D, noise) for noise in draws]
+    return {one: said.count(one) / len(said) for one in ("right", "wrong", "cannot tell")}
+
+
+def test_with_white_noise_a_wrong_law_is_never_named_and_the_right_one_where_predictions_differ_enough() -> None:
+    """As a normal distribution has it: z is (D / 2, 1) where the first law made the data."""
+    rng = np.random.default_rng(0)
+    draws = list(rng.standard_normal((50, len(T))))
+    near, middle, far = (shares(D, draws) for D in (0.5, 5.0, 9.0))
+    assert near["cannot tell"] == 1.0
+    assert middle["right"] == pytest.approx(stats.norm.sf(2.0 - 2.5), abs=0.2)
+    assert far["right"] > 0.97
+    assert max(one["wrong"] for one in (near, middle, far)) == 0.0
+
+
+def test_with_coloured_noise_that_was_taken_for_white_the_wrong_law_is_not_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The likelihood ratio is then some standard deviations of the stated noise from zero by chance."""
+    rng, colour = np.random.default_rng(1), Autoregression.stated((0.95,), 5e-3)
+    L = np.linalg.cholesky(colour.autocovariance(len(T))[np.abs(np.subtract.outer(*2 * [np.arange(len(T))]))])
+    draws = [L @ rng.standard_normal(len(T)) for _ in range(60)]
+    assert shares(5.0, draws)["wrong"] <= 0.02
+    monkeypatch.setattr("torchsoft.sysid.evidence.fit_noise", lambda series, most: SimpleNamespace(noise=None))
+    assert shares(5.0, draws)["wrong"] > 0.05
+
+
+def test_a_law_is_not_named_for_having_fewer_parameters_and_pays_for_more() -> None:
+    r = np.random.default_rng(2).standard_normal(len(T))
+    same = against(law("a", r, k=1), law("b", r.copy(), k=9))
+    assert same.evidence == same.z == 0.0
+    assert "these motions and sensors cannot tell them apart" in same.doubts[0]
+    fewer, more = (against(law("a", r, k=k), law("b", r + apart(6.0), k=3)) for k in (1, 6))
+    assert fewer.evidence - more.evidence == pytest.approx(1.5 * np.log(len(T)))
+
+
+def test_heldout_recordings_count_and_may_contradict() -> None:
+    rng = np.random.default_rng(3)
+    r, held = rng.standard_normal((2, len(T)))
+    alone = against(law("a", r), law("b", r + apart(3.0)))
+    both = against(law("a", r, held=held), law("b", r + apart(3.0), held=held + apart(8.0)))
+    assert both.evidence - alone.evidence == pytest.approx(both.heldout, rel=0.2)
+    assert both.heldout is not None
+    assert both.heldout_per_sample == pytest.approx((both.heldout / 300, 8.0 / 300), rel=0.2)
+    assert alone.doubts
+    assert not both.doubts
+    torn = against(law("a", r, held=held + apart(8.0)), law("b", r + apart(20.0), held=held))
+    assert torn.z_heldout is not None
+    assert torn.z_heldout < -2
+    assert "held-out recordings speak for `b`" in torn.doubts[0]
+
+
+def fitted(name: str, p: float = 0.5, converged: bool = True, heldout_p: float | None = None) -> LawFit:
+    return LawFit(name, 2, {}, 0.0, 1.0, p, 0.0, 0.0, 0.0, 0.5, None, heldout_p, 0.0, converged)
+
+
+def test_no_law_is_named_that_leaves_more_than_noise_or_before_every_fit_has_converged() -> None:
+    r = np.random.default_rng(4).standard_normal(len(T))
+    clear = against(law("a", r), law("b", r + apart(30.0)))
+    assert judged([fitted("a"), fitted("b", p=0.0)], [clear])[:2] == ("law", "a")
+    outcome, none, verdict = judged([fitted("a", p=1e-6), fitted("b")], [clear])
+    assert (outcome, none) == ("none fits", None)
+    assert "it is nearer than `b`, but that does not make it right" in verdict
+    assert judged([fitted("a", heldout_p=1e-9), fitted("b")], [clear])[0] == "none fits"
+    outcome, _, verdict = judged([fitted("a"), fitted("b", converged=False)], [clear])
+    assert outcome == "cannot tell"
+    assert "the fit of `b` has not converged" in verdict
+    rough = replace(clear, numerical=clear.evidence)
+    assert "take a tighter tolerance" in judged([fitted("a"), fitted("b")], [rough])[2]
+
+
+def test_where_the_evidence_stands() -> None:
+    r = np.random.default_rng(5).standard_normal(len(T))
+    found = against(law("a", r), law("b", r + apart(20.0))).where
+    assert found is not None
+    assert found.channels == {"F_x": pytest.approx(1.0)}
+    assert 0.6 < found.interval[0] < 0.7 < found.interval[1] < 0.8
+    assert found.phases["slip"].parting > 0.4 > 0.1 > abs(found.phases["hold"].evidence - 0.5) - 0.4
+    assert sum(one.time for one in found.phases.values()) == pytest.approx(1.0)
+    assert "`b` is off most from 0.6" in found.sentence
+    assert against(law("a", r), law("b", r)).where is None
+    few = np.where(np.abs(T - 1.0) < 0.001, 1.0, 0.0)
+    assert shortest([(T, few), (T, 1e-4 * T)]) == pytest.approx((1.0, 1.0))
+    assert MOTION.pieces == [(0.0, 0.75, "slip"), (0.75, T[-1], "hold")]
+
+
+BASE = Parameters().override(COARSE | {"contact.mu_s": 0.7, "contact.mu_k": 0.6})
+NOISE = {"x_C": 1e-5, "theta": 5e-4, "F_x": 0.1}
+SENSORS = {channel: Sensor(noise=sigma) for channel, sigma in NOISE.items()}
+STROKE = Excitation(
+    motion=Strokes(travel=25e-3, stroke_time=0.15), duration=0.4, depth=2e-4, grasp_time=0.15, settle=0.05
+)
+GENTLE = Excitation(motion=Roll(travel=1e-3), duration=0.4, depth=1e-3, grasp_time=0.15, settle=0.05)
+UNKNOWNS = {
+    "smooth": {"contact.mu_s": Unknown(low=0.4, high=1.2), "contact.mu_k": Unknown(ratio_to="contact.mu_s", low=0.4, high=0.9)},
+    "viscous": {"contact.friction.alpha": Unknown(low=0.3, high=1.2)},
+}  # fmt: skip
+
+
+def viscous(settings: Parameters, reference: Reference) -> SoftGrasp:
+    return SoftGrasp(settings, reference, friction=Viscous(0.6, 5.0))
+
+
+BUILDS = {"smooth": SoftGrasp, "viscous": viscous}
+
+
+def laws(recording: Recording, excitation: Excitation) -> dict[str, Problem]:
+    """The library's law and a user's own, given the same recording."""
+    p, reference = excitation.settings(BASE), recording.rig.reference
+    return {
+        name: Problem([replace(recording, rig=build(p, reference))], SENSORS, UNKNOWNS[name])
+        for name, build in BUILDS.items()
+    }
+
+
+def made(excitation: Excitation, build: Any, values: dict[str, float], noise: float = 1.0) -> dict[str, Problem]:
+    recording = record(
+        "one", excitation, BASE, BASE, SENSORS, build=build, values=values, rtol=1e-5, noise=noise, seed=1
+    )
+    return laws(recording, excitation)
+
+
+def stage(problem: Problem) -> list[Stage]:
+    return [Stage("all", problem.names, problem.coordinates.labels, 1e-4, tolerance=1e-3)]
+
+
+def plans(problems: dict[str, Problem]) -> dict[str, list[Stage]]:
+    return {name: stage(one) for name, one in problems.items()}
+
+
+@pytest.fixture(scope="module")
+def stroke() -> dict[str, Problem]:
+    return made(STROKE, viscous, {"contact.friction.alpha": 0.55})
+
+
+def test_a_users_own_law_is_named_where_contacts_slip(stroke: dict[str, Problem]) -> None:
+    found = compare(stroke, plans=plans(stroke))
+    assert (found.outcome, found.law) == ("law", "viscous"), found.verdict
+    assert found["viscous"].weight > 0.999 > found["viscous"].p > 1e-3
+    assert found["viscous"].estimates["contact.friction.alpha"] == pytest.approx(0.55, rel=0.02)
+    assert found["smooth"].bic - found["viscous"].bic > 20
+    (one,) = found.against
+    assert one.where is not None
+    assert one.where.phases["slip"].parting > 2 * one.where.phases["slip"].time
+    assert {phase for _, _, phase in found.phases["one"]} >= {"apart", "loading", "slip"}
+    content = json.loads(found.to_json())
+    assert content["law"] == "viscous"
+    assert len(content["series"][0]["residuals"]["smooth"]) == len(content["series"][0]["t"])
+    assert found.table().count("\n") == 2
+    assert len(plot(found).axes) == 2
+
+
+def test_gentle_rolling_cannot_tell_one_law_of_friction_from_another() -> None:
+    problems = made(GENTLE, viscous, {"contact.friction.alpha": 0.6})
+    found = compare(problems, plans=plans(problems), again=False)
+    assert (found.outcome, found.law) == ("cannot tell", None), found.verdict
+    assert found.against[0].distance < 4
+    assert "cannot tell them apart" in found.verdict
+
+
+def test_laws_that_were_not_given_the_same_data_are_refused(stroke: dict[str, Problem]) -> None:
+    one, p = stroke["viscous"], stroke["smooth"]
+    recording = p.recordings[0]
+
+    def other(**changes: Any) -> dict[str, Problem]:
+        return {"a": one, "b": Problem([replace(recording, **changes)], SENSORS, UNKNOWNS["smooth"])}
+
+    with pytest.raises(ValueError, match="needs two laws or more, not 1"):
+        compare({"a": one})
+    with pytest.raises(ValueError, match="the laws `a` and `b` have other recordings: one and two"):
+        compare(other(name="two"))
+    noisier = {channel: (t, y + 1e-9) for channel, (t, y) in recording.samples.items()}
+    with pytest.raises(ValueError, match="recording `one` of the laws `a` and `b` has other samples"):
+        compare(other(samples=noisier))
+    with pytest.raises(ValueError, match="have other sensors"):
+        compare({"a": one, "b": Problem([recording], {"x_C": SENSORS["x_C"]}, UNKNOWNS["smooth"])})
+    moved = Reference(**{n: recording.rig.reference[n] for n in ("y_d", "F_ff")}, x_d=Profile([0.0], [60e-3]))
+    with pytest.raises(ValueError, match="follow another reference in recording `one`"):
+        compare(other(rig=SoftGrasp(STROKE.settings(BASE), moved)))
+    with pytest.raises(ValueError, match=r"`heldout` must name some of \['one'\], but not all"):
+        compare({"a": one, "b": p}, heldout=["one"])
+    elsewhere = {"a": [replace(stage(one)[0], recordings=())]}
+    with pytest.raises(ValueError, match="the last stage of the plan of `a` must fit one"):
+        compare({"a": one, "b": p}, plans=elsewhere)
+
+
+def test_densities_are_those_of_the_normal_distribution() -> None:
+    """With coloured noise and uncertain estimates, as scipy has it."""
+    rng, n = np.random.default_rng(6), 40
+    t: Any = np.arange(n) * 5e-3
+    sigma, noise = 0.3, Autoregression.stated((0.6, 0.2), 5e-3)
+    problem: Any = SimpleNamespace(
+        recordings=[SimpleNamespace(name="one", samples={"F_x": (t, t)})],
+        sensors={"F_x": Sensor(noise=sigma)},
+        noise={"F_x": noise},
+        whitened=print,
+    )
+    lags = np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    J = rng.standard_normal((n, 2))
+    K: Any = sigma**2 * noise.autocovariance(n)[lags]
+    e, W = rng.standard_normal(n), noise.whitener(t)
+    plain = density(problem, ["one"], W @ e / sigma)
+    assert plain.log == pytest.approx(stats.multivariate_normal(cov=K).logpdf(e), rel=1e-12)
+    wide = density(problem, ["one"], W @ e / sigma, W @ J / sigma)
+    S: Any = K + J @ J.T
+    assert wide.log == pytest.approx(stats.multivariate_normal(cov=S).logpdf(e), rel=1e-12)
+    assert wide.p == pytest.approx(stats.chi2.sf(e @ np.linalg.solve(S, e), n))
+    white = density(SimpleNamespace(**vars(problem) | {"noise": {}}), ["one"], e / sigma)  # pyright: ignore[reportArgumentType]
+    score = white.s / sigma - np.linalg.solve(K, e)
+    assert ratio(plain, white).stated == pytest.approx(score @ K @ score, rel=1e-9)

@@ -1,0 +1,292 @@
+"""Posteriors and their calibration against closed forms and quadrature; gradients and simulated data on a rig."""
+
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from closed_forms import WALL, ClosedForm, optimum
+from conftest import COARSE
+from scipy import stats
+
+from torchsoft import Parameters
+from torchsoft.excitation import Excitation, Roll
+from torchsoft.sysid import RIG, Prior, Problem, Sensor, Unknown, Unreachable, calibration, record
+from torchsoft.sysid.calibration import calibrate, chi2_test, ecdf_test, envelope
+from torchsoft.sysid.noise import Autoregression
+from torchsoft.sysid.nuts import Whitened, nuts
+from torchsoft.sysid.optimum import Optimum
+from torchsoft.sysid.posterior import Posterior, laplace
+
+STRAIGHT = np.random.default_rng(0).standard_normal((20, 3))
+BENT = ClosedForm(lambda x: [np.sinh(x[0]) + 0.3 * x[0] ** 2], 1)
+"""One coordinate whose posterior is narrower and more skewed than the Gaussian at its optimum."""
+BANANA = ClosedForm(lambda x: [x[0] - 0.1, x[1] - x[0] ** 2], 2, low=1e-6, high=1e6)
+
+
+def exact(problem: ClosedForm, parts: tuple[float, ...]) -> np.ndarray:
+    """Quantiles of the one coordinate of a problem, by quadrature."""
+    low, high = problem.coordinates.bounds
+    x = np.linspace(low[0], high[0], 20_001)
+    p = np.exp([-0.5 * float(np.sum(problem.rows(np.array([v])) ** 2)) for v in x])
+    return np.interp(parts, np.cumsum(p) / p.sum(), x)
+
+
+def test_laplace_of_a_linear_problem_is_the_posterior() -> None:
+    o = optimum(ClosedForm(lambda x: STRAIGHT @ x, 3), 0, 0, 0, workers=2)
+    found = laplace(o, draws=1000)
+    x = np.log(found.draws[0])
+    C = np.linalg.inv(STRAIGHT.T @ STRAIGHT)
+    np.testing.assert_allclose(np.cov(x.T), C, atol=0.1 * C.max())
+    np.testing.assert_allclose(found.weights, 1e-3, rtol=1e-6)
+    assert found.notices == []
+    assert found.cost["simulations"] == 0  # of formulas
+    assert json.loads(found.to_json())["checks"]["efficiency"] == pytest.approx(1)
+    assert found.summary.marginals[0].sd == pytest.approx(np.exp(x[:, 0]).std(), rel=1e-6)
+
+
+def test_weights_correct_laplace_where_it_is_roughly_right() -> None:
+    found = laplace(optimum(BENT, 0), draws=4000)
+    (one,) = found.marginals
+    ends = exact(BENT, (0.025, 0.5, 0.975))
+    np.testing.assert_allclose(np.log([one.ci95[0], one.median, one.ci95[1]]), ends, atol=0.12)
+    assert np.log(np.quantile(found.draws, 0.975)) > ends[2] + 0.4  # without weights
+    assert found.checks["k_hat"] < 0.7
+
+
+def test_laplace_says_where_it_is_not_to_be_trusted_and_refuses_where_it_says_nothing() -> None:
+    bent = laplace(optimum(BANANA, 0.1, 0.01))
+    assert bent.checks["k_hat"] > 0.7
+    assert any("not to be trusted" in notice for notice in bent.notices)
+    with pytest.raises(ValueError, match="fewer than one in 1000 draws"):
+        laplace(optimum(ClosedForm(lambda x: [x[0], 1e-9 * x[1], 1e-9 * x[2]], 3), 0, 0, 0))
+    with pytest.raises(ValueError, match="at least 100 draws"):
+        laplace(optimum(BENT, 0), draws=50)
+
+
+def test_draws_that_cannot_be_simulated_have_no_weight() -> None:
+    found = laplace(optimum(ClosedForm(lambda x: [x[0]], 1, fails=lambda x: bool(x[0] > 0.5)), 0), draws=1000)
+    lost = found.draws[0, :, 0] > np.exp(0.5)
+    assert (found.weights[0, lost] == 0).all()
+    assert found.checks["failed"] == lost.sum()
+    assert any(f"{lost.sum()} of 1000 runs failed" in notice and WALL in notice for notice in found.notices)
+
+
+def test_residuals_too_large_for_the_noise_are_said() -> None:
+    off = ClosedForm(lambda x: np.append(STRAIGHT @ x, np.full(40, 3.0)), 3)
+    assert any("larger than the noise" in notice for notice in laplace(optimum(off, 0, 0, 0)).notices)
+
+
+@pytest.mark.parametrize("kind", ["normal", "log-normal"])
+@pytest.mark.parametrize("scale", ["log", "linear"])
+def test_the_density_that_nuts_sees_has_its_gradient(kind: Any, scale: Any) -> None:
+    prior = Prior(median=2.0, sd=0.7, kind=kind)
+    o = optimum(
+        ClosedForm(lambda x: [x[0] * x[1], np.sin(x[0])], 2, low=0.5, high=6.0, prior=prior, scale=scale), 0.3, 0.4
+    )
+    white = Whitened.of(o)
+    for z in np.random.default_rng(1).standard_normal((3, 2)):
+        _, gradient = white.density(o, z)
+        by = [(white.density(o, z + h)[0] - white.density(o, z - h)[0]) / 2e-5 for h in 1e-5 * np.eye(2)]
+        np.testing.assert_allclose(gradient, by, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", ["normal", "log-normal"])
+@pytest.mark.parametrize("scale", ["log", "linear"])
+def test_without_data_nuts_gives_the_prior_back(kind: Any, scale: Any) -> None:
+    """Whatever the coordinate's scale: densities of values, not of coordinates."""
+    pytest.importorskip("nutpie")
+    prior = Prior(median=2.0, sd=0.4, kind=kind)
+    c = ClosedForm(lambda x: [0.0], 1, low=0.05, high=40.0, prior=prior, scale=scale)
+    found = nuts(optimum(c, c.coordinates.all[0].to_x(2.0)), chains=4, draws=500)
+    own = stats.norm(2.0, 0.4) if kind == "normal" else stats.lognorm(0.4, scale=2.0)
+    u = own.cdf(found.draws[:, ::5].ravel())
+    assert stats.kstest(u, "uniform").pvalue > 1e-3
+
+
+def test_nuts_finds_the_quantiles_and_the_same_draws_by_the_same_seed() -> None:
+    pytest.importorskip("nutpie")
+    found = nuts(optimum(BENT, 0, workers=2), chains=4, draws=500)
+    ends = exact(BENT, (0.025, 0.5, 0.975))
+    (one,) = found.marginals
+    np.testing.assert_allclose(np.log([one.ci95[0], one.median, one.ci95[1]]), ends, atol=0.3)
+    assert one.r_hat is not None
+    assert one.r_hat < 1.02
+    assert one.effective > 300
+    again = nuts(optimum(BENT, 0), chains=4, draws=500)
+    np.testing.assert_array_equal(again.draws, found.draws)
+    assert found.cost["gradients"] > 2000
+
+
+def test_nuts_follows_a_banana() -> None:
+    """p1 is p0^2, give or take one: its mean is 1.01, where Laplace has 0.01."""
+    pytest.importorskip("nutpie")
+    found = nuts(optimum(BANANA, 0.1, 0.01), chains=4, draws=500, accept=0.9)
+    x = np.log(found.draws).reshape(-1, 2)
+    assert x[:, 0].mean() == pytest.approx(0.1, abs=0.15)
+    assert x[:, 1].mean() == pytest.approx(1.01, abs=0.3)
+    assert x[:, 1].std() == pytest.approx(3.04**0.5, rel=0.2)
+
+
+def test_nuts_says_where_it_has_not_arrived() -> None:
+    pytest.importorskip("nutpie")
+    thin = ClosedForm(lambda x: [x[0] - 0.1, 20 * (x[1] - x[0] ** 2)], 2, low=1e-6, high=1e6)
+    found = nuts(optimum(thin, 0.1, 0.01), chains=2, draws=100)
+    assert any("diverged" in notice for notice in found.notices)
+    assert any("have not mixed" in notice for notice in found.notices)
+
+
+def test_nuts_takes_failing_runs_for_walls_and_says_so() -> None:
+    pytest.importorskip("nutpie")
+    found = nuts(optimum(ClosedForm(lambda x: [x[0]], 1, fails=lambda x: bool(x[0] > 0.5)), 0), chains=2, draws=200)
+    assert np.log(found.draws).max() <= 0.5
+    assert found.checks["failed"] > 0
+    assert any("runs failed" in notice and WALL in notice for notice in found.notices)
+
+
+def test_an_interruption_keeps_the_draws_so_far() -> None:
+    pytest.importorskip("nutpie")
+    count, lock = 0, threading.Lock()
+
+    def slowly(x: np.ndarray) -> list[float]:
+        nonlocal count
+        with lock:
+            count += 1
+            if count == 5 * 400:
+                os.kill(os.getpid(), signal.SIGINT)
+        return [x[0]]
+
+    found = nuts(optimum(ClosedForm(slowly, 1), 0), chains=1, draws=100_000, tune=30)
+    assert 10 < found.draws.shape[1] < 2000
+    assert any("interrupted" in notice for notice in found.notices)
+    count = 5 * 400 - 30  # in the middle of the tuning
+    with pytest.raises(KeyboardInterrupt):
+        nuts(optimum(ClosedForm(slowly, 1), 0), chains=1, draws=100_000, tune=1000)
+
+
+def test_nuts_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ValueError, match="4 draws and 20 for tuning"):
+        nuts(optimum(BENT, 0), tune=5)
+    monkeypatch.setitem(sys.modules, "nutpie.compiled_pyfunc", None)
+    with pytest.raises(ImportError, match=r"pip install 'torchsoft\[nuts\]'"):
+        nuts(optimum(BENT, 0))
+
+
+def test_tests_of_ranks_know_flat_from_not_flat() -> None:
+    rng = np.random.default_rng(2)
+    p = np.array([(chi2_test(some, 99), ecdf_test(some, 99)) for some in rng.integers(0, 100, (200, 100))])
+    rejected = (p < 0.1).sum(0)  # 20 of 200 are expected
+    assert ((rejected > 6) & (rejected < 38)).all()
+    narrow, shifted = (rng.beta(a, b, 100) * 100 // 1 for a, b in ((2.2, 2.2), (1.6, 1)))
+    for ranks in (narrow, shifted):
+        assert ecdf_test(ranks.astype(int), 99) < 0.01
+    assert chi2_test(narrow.astype(int), 99) < 0.01
+    low, high = envelope(100, 99)
+    assert low[49] < 50 < high[49]
+    outside = [
+        ((np.array([(some < k).sum() for k in range(1, 100)]) - high > 0).any())
+        for some in rng.integers(0, 100, (100, 100))
+    ]
+    assert sum(outside) < 12
+    with pytest.raises(ValueError, match="equal bins"):
+        chi2_test(np.array([1, 2, 3]), 99)
+
+
+def linear(x: np.ndarray, e: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Residuals of data that x and the noise e make."""
+    return lambda z: STRAIGHT @ (z - x) - e
+
+
+@pytest.fixture
+def closed(monkeypatch: pytest.MonkeyPatch) -> ClosedForm:
+    """A linear problem with priors whose data and fits are formulas."""
+    prior = Prior(median=1.0, sd=0.5, kind="log-normal")
+
+    def simulated(problem: Any, x: np.ndarray, rtol: float, rng: Any) -> ClosedForm:
+        return ClosedForm(linear(x, rng.standard_normal(20)), 3, prior=prior)
+
+    def fitted(problem: Any, rtol: float) -> Optimum:
+        at = problem.residuals(None, np.zeros(3), None, None)
+        return optimum(problem, *-np.linalg.lstsq(at.J, at.r, rcond=None)[0])
+
+    monkeypatch.setattr(calibration, "simulated", simulated)
+    monkeypatch.setattr(calibration, "fitted", fitted)
+    return ClosedForm(lambda x: np.zeros(20), 3, prior=prior)
+
+
+def drawn(o: Optimum, seed: int, width: float = 1.0) -> Posterior:
+    found = laplace(o, draws=100, seed=seed)
+    middle = o.values(o.x)
+    return replace(found, draws=middle * (found.draws / middle) ** width)
+
+
+def test_calibration_finds_right_posteriors_flat_and_wrong_ones_not(closed: ClosedForm) -> None:
+    right = calibrate(closed, drawn, rtol=1e-4, workers=2)
+    assert right.flat, (right.p_chi2, right.p_ecdf)
+    assert np.array(right.ranks).shape == (100, 3)
+    assert np.array(right.ranks).max() <= 99
+    for width in (0.5, 2.0):
+        assert not calibrate(closed, partial(drawn, width=width), rtol=1e-4).flat
+
+
+def test_calibration_counts_what_fails(closed: ClosedForm) -> None:
+    def rarely(o: Optimum, seed: int) -> Posterior:
+        if seed % 5 == 0:
+            raise ValueError("no posterior")
+        return drawn(o, seed)
+
+    found = calibrate(closed, rarely, rtol=1e-4)
+    assert any("replications failed and are left out: no posterior" in notice for notice in found.notices)
+
+    def never(o: Optimum, seed: int) -> Posterior:
+        raise Unreachable({})
+
+    with pytest.raises(RuntimeError, match="only 0 of 20 replications"):
+        calibrate(closed, never, rtol=1e-4, runs=20)
+
+
+@pytest.fixture(scope="module")
+def rolling() -> Problem:
+    """A quarter of a second on the coarse rig, with coloured noise of the force, a bias and a saturated sensor."""
+    base = Parameters().override(COARSE)
+    roll = Excitation(motion=Roll(travel=4e-3), duration=0.25, grasp_time=0.1, settle=0.0)
+    sensors = RIG | {"F_x": Sensor(noise=0.1, bias=1.0), "F_y": Sensor(noise=0.1, low=-60.0)}
+    data = record("roll", roll, base, base, sensors, noise=0.0)
+    prior = Prior(median=0.75e6, sd=0.1, kind="log-normal")
+    unknowns = {"pad.E": Unknown(prior=prior), "pad.tau": Unknown(low=5e-3, high=20e-3)}
+    return Problem([data], sensors, unknowns, {"F_x": Autoregression.stated((0.8,), 5e-3)})
+
+
+def test_simulated_data_have_the_truth_and_the_noise_of_the_sensors(rolling: Problem) -> None:
+    rng = np.random.default_rng(0)
+    x = np.array([calibration.truth(rolling, rng) for _ in range(200)])
+    assert np.log(0.75e6) - 0.03 < x[:, 0].mean() < np.log(0.75e6) + 0.03
+    assert x[:, 0].std() == pytest.approx(0.1, rel=0.2)
+    (low, high) = rolling.coordinates.bounds
+    assert ((x >= low) & (x <= high)).all()
+    data = calibration.simulated(rolling, x[0], 1e-5, rng)
+    t, y = data.recordings[0].samples["F_y"]
+    assert y.min() == -60.0
+    at = Optimum(data, x[0], rtol=1e-5).at
+    n = len(t)
+    assert len(at.r) == 7 * n + 1
+    parts = dict(zip(data.sensors, np.split(at.r[:-1], 7)))
+    for channel in ("x_C", "theta", "F_x"):
+        assert parts[channel].std() == pytest.approx(1.0, rel=0.35), channel
+    white = parts["F_x"] - parts["F_x"].mean()
+    assert abs(white[1:] @ white[:-1]) / (white @ white) < 0.4  # whitened; the colour is 0.8
+
+
+def test_the_density_on_a_rig_has_its_gradient(rolling: Problem) -> None:
+    o = Optimum(rolling, rolling.coordinates.start, rtol=1e-4)
+    white, z = Whitened.of(o), np.array([0.4, -0.3, 0.2])
+    _, gradient = white.density(o, z)
+    by = [(white.density(o, z + h)[0] - white.density(o, z - h)[0]) / 2e-4 for h in 1e-4 * np.eye(3)]
+    np.testing.assert_allclose(gradient, by, rtol=1e-3, atol=1e-3 * np.abs(gradient).max())

@@ -1,0 +1,111 @@
+"""Profiles against closed forms, and combinations of parameters; both on a rig."""
+
+import numpy as np
+import pytest
+from closed_forms import WALL, ClosedForm, optimum
+from conftest import COARSE
+
+from torchsoft import Parameters
+from torchsoft.excitation import Excitation, Roll
+from torchsoft.sysid import RIG, Problem, Stage, Unknown, identify, record
+from torchsoft.sysid.information import Combination, combinations
+from torchsoft.sysid.optimum import Optimum
+from torchsoft.sysid.profile import RISE, profiles
+
+RNG = np.random.default_rng(0)
+STRAIGHT = RNG.standard_normal((20, 3))
+
+
+def test_of_a_linear_problem_the_profile_is_the_parabola_of_the_covariance() -> None:
+    o = optimum(ClosedForm(lambda x: STRAIGHT @ x, 3), 0, 0, 0)
+    sd = np.sqrt(np.diag(np.linalg.inv(STRAIGHT.T @ STRAIGHT)))
+    for i, one in enumerate(profiles(o)):
+        z = np.log(one.values) / sd[i]
+        np.testing.assert_allclose(one.rises, z**2, atol=1e-6)
+        np.testing.assert_allclose(one.ci95, np.exp([-(RISE**0.5) * sd[i], RISE**0.5 * sd[i]]), rtol=1e-6)
+        np.testing.assert_allclose(one.wald95, one.ci95, rtol=1e-6)
+        assert one.values == sorted(one.values)
+        assert not one.notices
+
+
+def test_variance_of_residuals_above_the_stated_one_widens_the_profile() -> None:
+    (wide,) = profiles(optimum(ClosedForm(lambda x: STRAIGHT @ x, 3), 0, 0, 0, variance=4.0), ["p1"])
+    (usual,) = profiles(optimum(ClosedForm(lambda x: STRAIGHT @ x, 3), 0, 0, 0), ["p1"])
+    np.testing.assert_allclose(np.log(wide.ci95), 2 * np.log(usual.ci95), rtol=1e-6)  # type: ignore[arg-type]
+
+
+def test_a_curved_profile_has_the_exact_ends_and_says_that_the_covariance_has_others() -> None:
+    """(e^x - 1) / 0.3 is one residual, and p1 follows x^2: the others bend, the profile of p0 is known."""
+    o = optimum(ClosedForm(lambda x: [(np.exp(x[0]) - 1) / 0.3, 5 * (x[1] - x[0] ** 2)], 2), 0, 0, workers=2)
+    one, _ = profiles(o)
+    assert one.ci95 == pytest.approx((1 - 0.3 * RISE**0.5, 1 + 0.3 * RISE**0.5), rel=2e-3)
+    np.testing.assert_allclose(one.others["p1"], np.exp(np.log(one.values) ** 2), rtol=2e-2)
+    np.testing.assert_allclose(one.rises, ((np.array(one.values) - 1) / 0.3) ** 2, atol=1e-2)
+    assert any("no parabola" in notice for notice in one.notices)
+
+
+def test_an_end_that_is_not_there_is_open_and_says_why() -> None:
+    saturating = ClosedForm(lambda x: [1.5 * np.tanh(x[0])], 1)
+    (one,) = profiles(optimum(saturating, 0))
+    assert one.ci95 == (None, None)
+    assert one.values[-1] == pytest.approx(100)
+    assert any("no upper bound of its 95 % interval within 100: p0 may not be larger" in n for n in one.notices)
+    (cut,) = profiles(optimum(ClosedForm(lambda x: [x[0]], 1, fails=lambda x: bool(x[0] > 1.2)), 0))
+    assert cut.ci95[1] is None
+    assert cut.ci95[0] == pytest.approx(np.exp(-(RISE**0.5)), rel=1e-6)
+    assert any("no upper bound" in notice and WALL in notice for notice in cut.notices)
+
+
+def test_a_fit_that_was_not_at_its_optimum_is_found_out() -> None:
+    (one,) = profiles(optimum(ClosedForm(lambda x: [x[0] - 0.5], 1), 0))
+    assert any("fit did not end at the optimum" in notice for notice in one.notices)
+    assert one.ci95[1] is None
+
+
+def test_a_profile_of_what_is_not_free_is_refused() -> None:
+    o = optimum(ClosedForm(lambda x: STRAIGHT @ x, 3), 0, 0, 0, free=np.array([True, True, False]))
+    with pytest.raises(ValueError, match="no free coordinate 'p2' to profile; there are p0, p1"):
+        profiles(o, ["p2"])
+
+
+def seen(*rows: list[float]) -> list[Combination]:
+    """Combinations in the covariance of three parameters of which only some directions are seen, each to 1 %."""
+    J = np.array([*[[100 * v for v in row] for row in rows], *np.eye(3).tolist()])
+    return combinations(["E", "K", "R"], np.linalg.inv(J.T @ J), 0.3)
+
+
+def test_a_combination_names_what_is_seen_in_place_of_its_parameters() -> None:
+    (ratio,) = seen([0, 1, -1], [1, 0, 0])
+    assert ratio.exponents == {"K": 1.0, "R": -1.0}
+    assert ratio.sd == pytest.approx(0.01, rel=1e-2)
+    assert ratio.sentence == "the data see K / R to 1 %, not each (K 71 %, R 71 %)"
+    (product,) = seen([1, 0.42, 0], [0, 0, 1])
+    assert product.formula == "E * K^0.4"
+    assert product.sds.keys() == {"E", "K"}
+    assert seen([1, 0, 0], [0, 1, 0], [0, 0, 1]) == []  # all of them are seen
+    assert seen([1, 0, 0]) == []  # K and R are not seen at all
+
+
+def test_profile_and_combination_of_stiffnesses_in_series() -> None:
+    """Pads and contacts share the load: a motion that hardly slips sees their stiffness in series."""
+    base = Parameters().override(COARSE)
+    roll = Excitation(motion=Roll(travel=4e-3), duration=0.25, grasp_time=0.1, settle=0.0)
+    sensors = {name: sensor.model_copy(update={"noise": 10 * sensor.noise}) for name, sensor in RIG.items()}
+    data = record("roll", roll, base, base, sensors, seed=1)
+    problem = Problem([data], sensors, {"pad.E": Unknown(), "contact.K_n": Unknown()})
+    result = identify(
+        problem, rtol=1e-4, plan=[Stage("all", ("roll",), problem.coordinates.labels, 1e-4)], tightenings=0
+    )
+    o = Optimum.of(problem, result)
+    np.testing.assert_allclose(o.x, result.x)
+    E, K = profiles(o)
+    for one, truth in ((E, 0.75e6), (K, 1.2e5)):
+        low, high = one.ci95
+        assert low is not None
+        assert high is None or low < truth < high
+        assert low < truth
+    assert any("no parabola" in notice or "no upper bound" in notice for notice in K.notices)
+    (both,) = combinations(o.labels, o.covariance, 0.1)
+    assert both.exponents["pad.E"] == 1.0
+    assert 0 < both.exponents["contact.K_n"] < 0.5
+    assert both.sd < 0.01

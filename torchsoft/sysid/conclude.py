@@ -1,0 +1,150 @@
+"""What is known at the end of a fit: intervals, verdicts on the misfit and on what was taken for granted, and the result."""
+
+import time as clock
+from importlib.metadata import version
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchsoft.sysid import checks, misfit, robust
+from torchsoft.sysid.colour import Coloured, colour_notices, rewhitened
+from torchsoft.sysid.information import fisher
+from torchsoft.sysid.plan import Stage
+from torchsoft.sysid.problem import Residuals
+from torchsoft.sysid.recording import Array
+from torchsoft.sysid.result import IdentificationResult, described, directions, estimates, nrmse, residual_channels
+from torchsoft.sysid.robust import Loss
+from torchsoft.sysid.settle import FINER, STEP_BIAS, Settled, settle
+from torchsoft.sysid.stages import Method, progress_bar, stage_entry
+from torchsoft.sysid.workers import Runner
+
+Assumed = Literal["checked", "trusted"]
+"""Whether what is taken for granted is varied at the end, or believed."""
+
+
+class How(NamedTuple):
+    """How an identification goes about it, beside its stages; `identify` says what the fields mean."""
+
+    fitted: list[str]
+    heldout: tuple[str, ...]
+    method: Method
+    loss: Loss
+    seed: int
+    assumptions: Assumed
+    tightenings: int
+
+
+def conclude(
+    coloured: Coloured,
+    runner: Runner,
+    stage: Stage,
+    stages: list[dict[str, Any]],
+    how: How,
+    began: float,
+    progress: bool,
+) -> IdentificationResult:
+    """The result, from the fit of the last stage with the noise that was found; `began` on the clock [s]."""
+    problem, fit = coloured.problem, coloured.fit
+    c = problem.coordinates
+    free, start = np.isin(c.labels, stage.free), clock.perf_counter()
+    with progress_bar("check of the steps", progress) as notify:
+        end = settle(problem, runner, stage, fit, free, how.tightenings, notify)
+    x, at, rtol = end.x, end.at, end.rtol
+    for number, (by, one) in enumerate(end.fits):
+        name = "steps chosen anew" if by == (end.fits[number - 1][0] if number else stage.rtol) else "tighter tolerance"
+        stages = [*stages, stage_entry(name, stage, by, one, start)]
+    J = at.J[:, free]
+    C_free, values, vectors = fisher(J)
+    chi2 = float(at.r @ at.r) / max(len(at.r) - int(free.sum()), 1)
+    checked = None
+    if how.assumptions == "checked":
+        with progress_bar("check of what is taken for granted", progress) as notify:
+            checked = taken_for_granted(coloured, runner, end, stage, free)
+            notify(chi2)
+    C, shift = np.zeros((len(x), len(x))), np.zeros(len(x)) if end.bias is None else end.bias
+    C_fit = C_free * max(1.0, chi2) if how.loss == "linear" else robust.covariance(J, at.r, how.loss, len(c.priors))
+    C[np.ix_(free, free)] = C_fit + (checked.widening() if checked is not None else 0.0)
+    labels = [label for label, one in zip(c.labels, free) if one]
+    found = estimates(problem, x, free, C, shift)
+    predicted, notices = {}, []
+    if how.heldout:
+        held = problem.with_noise({}).residuals(runner, x, how.heldout, rtol)
+        if held.lost:
+            notices += [f"held-out recording `{k}` could not be simulated: {v.reason}" for k, v in held.lost.items()]
+        else:
+            predicted = nrmse(problem, held.r, list(how.heldout))
+    sd = np.sqrt(np.diag(C_free))
+    verdicts = misfit.judge(misfit.parts(problem, at.r, stage.recordings), at.r, J, robust=how.loss != "linear")
+    notices += notices_on(found, fit.converged, rtol, end.bias is None)
+    notices += checks.notices(checked) if checked is not None else []
+    notices += misfit.notices(verdicts, max(1.0, chi2) ** 0.5 if how.loss == "linear" else 1.0)
+    notices += colour_notices(coloured.found, [name for name, s in problem.sensors.items() if s.colour == "ar"])
+    return IdentificationResult(
+        estimates=found,
+        labels=labels,
+        x=[float(v) for v in x],
+        correlation=(C_free / np.outer(sd, sd)).tolist(),
+        directions=directions(labels, values, vectors),
+        chi2=chi2,
+        converged=fit.converged,
+        residuals=residual_channels(problem, at, how.fitted),
+        heldout=predicted,
+        notices=notices,
+        stages=stages,
+        cost={
+            "simulations": runner.simulations, "jacobians": runner.jacobians, "gradients": runner.gradients,
+            "remembered": runner.remembered, "samples": len(at.r), "wall_s": clock.perf_counter() - began,
+            "data_seconds": sum(r.duration for r in problem.recordings if r.name in how.fitted),
+        },
+        made_by={
+            "torchsoft": version("torchsoft"), "method": how.method, "loss": how.loss, "seed": how.seed, "rtol": rtol,
+            "assumptions": how.assumptions, "workers": runner.workers,
+            "unknowns": {name: u.model_dump() for name, u in problem.unknowns.items()},
+            "sensors": {name: s.model_dump() for name, s in problem.sensors.items()},
+            "recordings": {r.name: r.fingerprint for r in problem.recordings},
+        },
+        covariance=C.tolist(),
+        **described(
+            problem, x, free, at.J, C, how.fitted, tried={channel: one.scores for channel, one in coloured.found.items()},
+            checks=checked.checks if checked is not None else (),
+        ),
+    )  # fmt: skip
+
+
+def taken_for_granted(
+    coloured: Coloured, runner: Runner, end: Settled, stage: Stage, free: NDArray[np.bool_]
+) -> checks.Checked:
+    """The checks at the end of a fit, on residuals with the colour that was declared and no other: what was found unasked may
+    be the very trace of a wrong assumption. Their columns then get all the noise."""
+    problem, which = coloured.problem, stage.recordings
+    declared = {channel: noise for channel, noise in problem.noise.items() if problem.sensors[channel].colour == "ar"}
+    plain = problem.with_noise(declared)
+    finer = rewhitened(plain, end.finer, misfit.parts(problem, end.finer.r, which))
+    found = checks.check(plain, end.x, finer, free, which, end.rtol, workers=runner.workers, journal=runner.folder)
+    rows = Residuals(found.columns[:, 0] if found.columns.size else finer.r, found.columns, {})
+    columns: Array = rewhitened(problem, rows, misfit.parts(plain, rows.r, which)).J
+    return found._replace(columns=columns, J=end.at.J[:, free])
+
+
+def notices_on(found: list[Any], converged: bool, rtol: float, unchecked: bool) -> list[str]:
+    """Sentences on what a reader must know before using the numbers."""
+    out = []
+    for e in found:
+        if not e.identifiable:
+            change = f"a change by {e.relative_sd:.0%}" if e.relative_sd < 9 else "a change by a factor of ten"
+            out.append(f"{e.name} is not identifiable from these data: {change} would not show in them")
+        if e.at_bound:
+            out.append(f"{e.name} ended at a bound ({e.last:.4g}): widen the bound or question the model")
+    worst = max(found, key=lambda e: abs(e.step_bias_sd), default=None)
+    if unchecked:
+        out.append(f"the tolerance rtol = {rtol:g} could not be checked: a run failed that was made to check it")
+    elif worst is not None and abs(worst.step_bias_sd) > STEP_BIAS:
+        out.append(
+            f"the tolerance rtol = {rtol:g} is too coarse for these data: it shifts {worst.name} by "
+            f"{abs(worst.step_bias_sd):.2g} standard deviations ({worst.step_bias_sd * worst.relative_sd:+.2%}); take "
+            f"rtol = {FINER * rtol:g}"
+        )
+    if not converged:
+        out.append("the last stage stopped before it converged: give it more evaluations")
+    return out

@@ -1,0 +1,212 @@
+"""Do recordings mean what the model takes them to mean? Looked at before a fit, which would give wrong numbers without a word.
+
+One run a recording, at the parameters that the fit starts from, which may be off by a factor of three: that is enough to tell a
+sign, a unit, a large delay, and the body whose place a set-point is. Set-points (`setpoints`) and control loops (`loops`) need no
+run.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+import torch
+
+from torchsoft.channels import unit
+from torchsoft.physics.paper import SoftGrasp
+from torchsoft.sysid.finding import Finding, confusions, together
+from torchsoft.sysid.loops import another_sense, channel, loop_findings
+from torchsoft.sysid.plan import LOOSE
+from torchsoft.sysid.prediction import Prediction
+from torchsoft.sysid.problem import Problem
+from torchsoft.sysid.readout import Readout, Signals
+from torchsoft.sysid.recording import REACH, Array, Recording
+from torchsoft.sysid.setpoints import setpoint_findings
+from torchsoft.sysid.start import AtRest
+from torchsoft.sysid.unknowns import Sensor
+from torchsoft.sysid.workers import Runner
+
+MOVES = 5.0
+"""Times its noise that a channel moves, where its motion says something."""
+
+OPPOSITE = -0.5
+"""Correlation with the run below which a sign is called opposite: wrong parameters do not do that."""
+
+LARGER = 8.0
+"""Factor between the sizes of motions from which parameters, off by three, do not explain it."""
+
+NEAR = math.log(4.0)
+"""How near such a factor must be to one of mistaken units, in its logarithm."""
+
+LATE = 40e-3
+"""Delay [s] from which wrong parameters do not explain it."""
+
+SAME = 0.1
+"""Part of its motion by which what follows a set-point may differ from it; what does not follow differs by three times as much."""
+
+EARLY = 10e-3
+"""Time [s] from the first sample on in which nothing moves that begins at rest."""
+
+SURE = 5.0
+"""Standard deviations from which a mean is called different."""
+
+
+def check(problem: Problem, runner: Runner, which: Sequence[str] | None = None) -> list[Finding]:
+    """What looks wrong in some recordings of a problem, or in all: one finding of every kind."""
+    found, x = list[Finding](), problem.coordinates.start
+    which = problem.names if which is None else which
+    unknown = [name for name in problem.coordinates.names if not name.startswith("start.")]
+    jobs = problem.jobs(x, which, LOOSE, None)
+    for job, got in zip(jobs, runner.run(jobs)):
+        recording = problem.recordings[job.recording]
+        mine = [*setpoint_findings(recording, problem.sensors), *loop_findings(recording, problem.sensors, unknown)]
+        expected = {}
+        if isinstance(got, Prediction):
+            signals = Signals(got.t, recording.channels, got.signals, None)
+            readouts = problem.readouts(x, job.recording)
+            expected = {name: (one, signals) for name, one in readouts.items()}
+        mine += another_body(recording, problem.sensors, expected)
+        blamed = {f.what for f in mine}
+        mine += [
+            one
+            for one in against_run(recording, problem.sensors, expected)
+            if one.what not in blamed and "control.senses" not in blamed
+        ]
+        found += mine
+    return together(found)
+
+
+Expected = Mapping[str, tuple[Readout, Signals]]
+"""The sensors of a run, with its signals."""
+
+
+def samples(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> tuple[Array, Array]:
+    """Times and values of a channel, without those that are saturated."""
+    t, y = recording.samples[name]
+    sensor = sensors[name]
+    inside = np.full(len(t), True)
+    if sensor.low is not None:
+        inside &= y > sensor.low
+    if sensor.high is not None:
+        inside &= y < sensor.high
+    return t[inside], y[inside]
+
+
+def against_run(recording: Recording, sensors: Mapping[str, Sensor], expected: Expected) -> Iterator[Finding]:
+    """Signs, units, delays and zeros of channels that cannot be what the run has."""
+    early = {}
+    for name, (one, signals) in expected.items():
+        t, y = samples(recording, sensors, name)
+        if len(t) < 2 * MOVES:
+            continue
+        p, _, _ = one.expected(signals, t)
+        if (said := shape(name, t, y, p, sensors[name], one, signals)) is not None:
+            what, words, grave = said
+            yield Finding(what, recording.name, f"recording `{recording.name}`: {words}", grave)
+        early[name] = (y - p)[t <= t[0] + EARLY]
+    if isinstance(recording.start, AtRest):
+        yield from zeros(recording, sensors, early)
+
+
+def shape(
+    name: str, t: Array, y: Array, p: Array, sensor: Sensor, one: Readout, signals: Signals
+) -> tuple[str, str, bool] | None:
+    """What is wrong with a channel's motion, if anything is: what, words, and whether that is grave."""
+    measured, run = float(np.std(y)), float(np.std(p))
+    if max(measured, run) < MOVES * sensor.noise:
+        return None
+    ratio = measured / max(run, 1e-300)
+    if not 1 / LARGER < ratio < LARGER and run > 0:
+        words = f"{name} moves {ratio:.3g} times as much as in a run with the parameters of the start"
+        known = [(abs(math.log(ratio / factor)), said) for factor, said in confusions(name)]
+        distance, said = min(known, default=(math.inf, ""))
+        if distance < NEAR and not 1 / LARGER**1.5 < ratio < LARGER**1.5:
+            return f"unit of {name}", f"{words}: {said}?", True
+        return f"size of {name}", f"{words}: is its unit right, and are these parameters?", False
+    if min(measured, run) < MOVES * sensor.noise:
+        return None
+    correlation = alike(y, p)
+    if correlation < OPPOSITE:
+        words = f"{name} looks as if its sign were opposite: its correlation with a run from the start is {correlation:.2f}"
+        return f"sign of {name}", words, True
+    shifts = np.linspace(-REACH, REACH, 41)
+    inside = (t - REACH >= signals.t[0]) & (t + REACH <= signals.t[-1])
+    if inside.sum() < 2 * MOVES:
+        return None
+    by = [alike(y[inside], one.expected(signals, t[inside] - late)[0]) for late in shifts]
+    late = float(shifts[int(np.argmax(by))])
+    if abs(late) >= LATE + sensor.delay and 1 - max(by) < 0.2 * (1 - alike(y[inside], p[inside])):
+        words = f"{name} is about {1e3 * abs(late):.0f} ms {'late' if late > 0 else 'early'}: do its times have the same beginning?"
+        return f"time of {name}", words, False
+    return None
+
+
+def alike(y: Array, p: Array) -> float:
+    """Correlation [1]."""
+    size = float(np.std(y) * np.std(p))
+    return float(np.mean((y - y.mean()) * (p - p.mean()))) / size if size > 0 else 0.0
+
+
+def zeros(recording: Recording, sensors: Mapping[str, Sensor], early: Mapping[str, Array]) -> Iterator[Finding]:
+    """Of the coordinates that controllers hold at their set-points in the beginning, and of the disc's angle: it rolls into the
+    dent that it makes, so that its angle and its place belong together."""
+    rig = recording.rig
+    for actuator in rig.actuators.values():
+        name = channel(rig, actuator.measures)
+        if name not in early or (actuator.measures != actuator.pushes):
+            continue
+        sensor, mean, count = sensors[name], float(early[name].mean()), len(early[name])
+        if abs(mean) > SURE * sensor.noise / math.sqrt(count) + sensor.bias:
+            words = f"{name} begins {mean:+.3g} {unit(name)} from its set-point {actuator.setpoint}: do both have the same zero?"
+            yield Finding(f"zero of {name}", recording.name, f"recording `{recording.name}`: {words}")
+    if isinstance(rig, SoftGrasp) and {"x_C", "theta"} <= early.keys():
+        R, (x, theta) = rig.settings.disc.radius, (sensors[name] for name in ("x_C", "theta"))
+        off = float(early["theta"].mean() + early["x_C"].mean() / R)
+        sd = math.hypot(theta.noise / math.sqrt(len(early["theta"])), x.noise / R / math.sqrt(len(early["x_C"])))
+        if abs(off) > SURE * sd + theta.bias + x.bias / R:
+            words = (
+                f"theta begins {off:+.3g} rad from where the disc, rolled to its x_C, would have it: is its zero that of the disc "
+                "as it is put down at scenario.x_C0, and is that its x?"
+            )
+            yield Finding("zero of theta", recording.name, f"recording `{recording.name}`: {words}")
+
+
+def another_body(recording: Recording, sensors: Mapping[str, Sensor], expected: Expected) -> Iterator[Finding]:
+    """A set-point that another body follows than the one whose coordinate the loop is taken to measure."""
+    rig = recording.rig
+    for actuator in rig.actuators.values():
+        body, _, axis = actuator.measures.partition(".")
+        own = channel(rig, actuator.measures)
+        for other in (name for name in rig.bodies if name != body):
+            its = channel(rig, f"{other}.{axis}")
+            if its not in recording.samples or its not in sensors:
+                continue
+            far = off(recording, sensors, actuator.setpoint, its)
+            mine = off(recording, sensors, actuator.setpoint, own) if own in sensors and own in recording.samples else None
+            follows = far is not None and far < SAME and (mine is None or mine > 3 * max(far, SAME / 3))
+            if follows and not follows_too(recording, sensors, actuator.setpoint, its, expected):
+                change = another_sense(rig, actuator, body, other, np.zeros(1))
+                words = f"recording `{recording.name}`: {change.said} ({its} follows it to {far:.1%} of its motion)"
+                yield Finding(change.what, recording.name, words, True)
+
+
+def off(recording: Recording, sensors: Mapping[str, Sensor], setpoint: str, name: str) -> float | None:
+    """How far a channel is from a set-point, over how far that moves; None where it hardly does."""
+    t, y = samples(recording, sensors, name)
+    return parted(recording, setpoint, t, y, sensors[name].noise)
+
+
+def parted(recording: Recording, setpoint: str, t: Array, y: Array, noise: float) -> float | None:
+    asked = recording.rig.reference(torch.from_numpy(t), [setpoint]).detach().numpy()[:, 0, 0]
+    moved = float(np.std(asked))
+    return float(np.std(asked - y)) / moved if moved > MOVES * noise else None
+
+
+def follows_too(
+    recording: Recording, sensors: Mapping[str, Sensor], setpoint: str, name: str, expected: Expected
+) -> bool:
+    """Whether the run from the start follows the set-point with that channel as well."""
+    if name not in expected:
+        return False
+    (one, signals), (t, _) = expected[name], samples(recording, sensors, name)
+    far = parted(recording, setpoint, t, one.expected(signals, t)[0], sensors[name].noise)
+    return far is not None and far < 2 * SAME
