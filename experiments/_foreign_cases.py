@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from _foreign_recordings import RATE, SIGNALS, TRUTH, Made, Order, Samples, excitations, planned, sampled
+from _foreign_recordings import RATE, SIGNALS, Made, Order, Samples, excitations, planned, sampled
 
 from torchsoft import Parameters, Reference, SoftGrasp
 from torchsoft.physics.motion import Profile, Sampled
@@ -74,7 +74,7 @@ def at_samples(reference: Reference, duration: float) -> Reference:
 CASES = (
     Case("same assumptions, gentle"),
     Case("same assumptions, hard", excitations=("deep chirp", "light shaking", "light jerks")),
-    Case("slip at 0.15 m/s", excitations=("deep pressing", "light shaking", "hard jerks")),
+    Case("slip at 0.15 m/s", excitations=("deep pressing", "light shaking", "hard shaking")),
     Case("mesh 240 x 6", ("mesh", "element"), differs={"across": 240, "through": 6}),
     Case("literal Coulomb", ("friction", "Coulomb", "slip law"), differs={"literal": True}),
     Case("no ramp in the stretch rate", ("ramp", "epsilon", "touch-down"), differs={"ramp_stretch": False}),

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from _experiment import markdown, options, raw_config, write
 from _foreign_cases import CASES, Case
-from _foreign_recordings import TRUTH, Made, Order, make_all
+from _foreign_recordings import SMOKE_UNKNOWNS, TRUTH, Made, Order, make_all
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
@@ -41,7 +41,6 @@ START = 1.6
 """Every parameter begins off by this factor, one up and the next one down."""
 
 SMOKE = ("same assumptions, gentle", "x_C0 off by 40 um", "sign of F_x flipped")
-SMOKE_UNKNOWNS = ("contact.mu_s", "contact.K_n", "pad.E", "pad.tau")
 
 
 @dataclass(frozen=True)
@@ -49,7 +48,7 @@ class Config:
     out: Path = Path("out/foreign_rigs")
     rtol: float = 1e-5  # of the fits' last stage
     step: float = 20e-6  # of the stranger's simulator [s]
-    seed: int = 0  # of the noise
+    seed: int = 7  # of the noise
     workers: int = 2
     only: tuple[str, ...] = ()  # names of cases; all of them by default
     smoke: bool = False  # three cases, four parameters, two short recordings on a coarse mesh
@@ -125,7 +124,9 @@ def chosen(config: Config) -> list[Case]:
     known = {case.name: case for case in CASES}
     if strange := [name for name in names if name not in known]:
         raise ValueError(f"there is no case {strange[0]!r}; the cases are {', '.join(known)}")
-    return [replace(known[name], excitations=("pressing", "shaking")) if config.smoke else known[name] for name in names]
+    return [
+        replace(known[name], excitations=("pressing", "shaking")) if config.smoke else known[name] for name in names
+    ]
 
 
 def study(case: Case, made: Mapping[Order, Made], config: Config) -> Outcome:

@@ -38,10 +38,10 @@ class ClosedForm:
         return len(self.of(self.coordinates.start))
 
     def residuals(self, runner: Any, x: np.ndarray, which: object, steps: object, free: Any = None) -> Residuals:
-        r, h = self.rows(x), 1e-6
-        J = np.stack([self.rows(x + h * e) - self.rows(x - h * e) for e in np.eye(len(x))], -1) / (2 * h)
-        lost = {"data": FailedRun(WALL, 0.1)} if self.fails(x) else {}
-        return Residuals(r if not lost else r + np.inf, J if free is None else np.where(free, J, 0.0), lost)
+        r, J, h = self.rows(x), np.zeros((len(self.rows(x)), len(x))), 1e-6
+        if free is not None:
+            J = np.stack([self.rows(x + h * e) - self.rows(x - h * e) for e in np.eye(len(x))], -1) / (2 * h) * free
+        return Residuals(r, J, {}) if not self.fails(x) else Residuals(r + np.inf, J, {"data": FailedRun(WALL, 0.1)})
 
     def freeze(self, runner: Any, x: np.ndarray, which: object, rtol: float, free: Any = None) -> Any:
         return self.residuals(runner, x, which, None, free), {}

@@ -161,13 +161,20 @@ def test_identify_contact_smoke(tmp_path: Path) -> None:
 
 
 def test_interval_coverage_smoke(tmp_path: Path) -> None:
-    """Errors of a few standard deviations, not of many: four seeds are too few for a share."""
+    """Errors of a few standard deviations, not of many: two seeds are too few for a share. Colour is found where it is."""
     module = experiment("interval_coverage")
-    result = module.run(module.Config(out=tmp_path, smoke=True))
-    errors = [abs(e) for some in result.errors.values() for e in some]
-    assert len(errors) == 16
-    assert 0.1 < sum(errors) / 16 < 2.5
-    assert module.figure(result).axes
+    module.main(module.Config(out=tmp_path, smoke=True))
+    cases = json.loads((tmp_path / "summary.json").read_text())["cases"]
+    mean = {
+        case: sum(abs(e) for one in row["parameters"].values() for e in one["errors"]) / 8
+        for case, row in cases.items()
+    }
+    assert 0.1 < mean["white"] < 2
+    assert 0.1 < mean["coloured"] < 2
+    assert mean["coloured, ignored"] > 1.5 * mean["coloured"]
+    assert cases["white"]["notices"] == cases["white"]["orders"] == {}
+    assert sum(cases["coloured"]["orders"].values()) == 14
+    assert (tmp_path / "interval_coverage.png").stat().st_size > 10_000
 
 
 def test_contact_points_smoke(tmp_path: Path) -> None:

@@ -14,18 +14,19 @@ from foreign import Numbers, Run
 from foreign.pad import compliance
 from foreign.step import CREEP, node
 
-from torchsoft import Parameters, PadMesh, Trajectory, simulate
+from torchsoft import PadMesh, Parameters, Trajectory, simulate
 from torchsoft.excitation import Begun, Excitation, MultiSine, begin
 from torchsoft.physics.mesh import unit_compliance
 
 SETTLE, STEP = 0.02, 20e-6
 SHAKEN = Excitation(
-    motion=MultiSine(amplitude_x=6e-3, amplitude_y=2e-4, frequency=(8.0, 30.0)), duration=0.36, depth=3e-4,
+    motion=MultiSine(amplitude_x=10e-3, amplitude_y=2e-4, frequency=(5.0, 20.0)), duration=0.36, depth=3e-4,
     grasp_time=0.04, settle=0.01,
 )  # fmt: skip
 RIG = {"pad.elements_x": 60, "pad.elements_y": 3, "contact.v_s": 0.05, "contact.mu_s": 0.6, "contact.mu_k": 0.4}
 OWN = Numbers(across=60, through=3, mu_s=0.6, mu_k=0.4, x_C0=SHAKEN.x_C0, senses_disc=False)
-CHANNELS = ("x_C", "y_C", "theta", "x_Br", "y_Br", "v_x", "omega", "F_x", "F_y")
+POSES = ("x_C", "y_C", "theta", "x_Br", "y_Br")
+CHANNELS = (*POSES, "v_x", "omega", "F_x", "F_y")
 
 
 @cache
@@ -36,7 +37,7 @@ def begun() -> Begun:
 @cache
 def strange(step: float, p: Numbers = OWN) -> Run:
     """The stranger's run, rows every millisecond; it begins shortly before the reference does."""
-    t = step * np.arange(round(SETTLE / step) * -1, round(SHAKEN.duration / step) + 1)
+    t = step * np.arange(-round(SETTLE / step), round(SHAKEN.duration / step) + 1)
     signals = begun().model.reference(torch.from_numpy(t), ("x_d", "y_d", "F_ff")).detach().numpy()
     return foreign.simulate(p, t, signals, round(1e-3 / step))
 
@@ -68,18 +69,17 @@ def test_pads_are_as_soft() -> None:
 
 
 def test_motions_agree_with_equal_assumptions() -> None:
-    """First order in the step: halving it halves the difference from torchsoft, and what is left when the two runs are
-    extrapolated to no step at all is below 3e-5 of every channel's range, slip of 0.1 m/s included."""
+    """Halving the step halves the difference from torchsoft; of two runs extrapolated to no step at all, poses are within 1e-4
+    of their ranges and rates and forces within 1e-3, slip of 0.1 m/s and touching and parting nodes included."""
     coarse, fine = strange(2 * STEP), strange(STEP)
     first, second = apart(coarse.channels), apart(fine.channels)
     limit = apart({c: 2 * fine.channels[c] - coarse.channels[c] for c in CHANNELS})
     assert fine.slip.max() > 0.1
-    assert fine.touching.max() >= 4
+    assert len(set(fine.touching)) > 4
     for c in CHANNELS:
-        assert second[c] < 3e-3, c
-        assert first[c] / second[c] == pytest.approx(2.0, abs=0.2), c
-        assert limit[c] < 3e-5, c
-
+        assert second[c] < 2e-3, c
+        assert first[c] / second[c] == pytest.approx(2.0, abs=0.15), c
+        assert limit[c] < (1e-4 if c in POSES else 1e-3), c
 
 
 @pytest.mark.parametrize("slipping", [False, True])
@@ -100,9 +100,16 @@ def test_the_literal_law(slipping: bool) -> None:
         assert torque == pytest.approx(-(p.radius - depth) * fx)
 
 
-@pytest.mark.parametrize(
-    "differs", [{"across": 120, "through": 6}, {"literal": True}, {"ramp_stretch": False}, {"epsilon": 1e-7}, {"x_C0": 60.34e-3}]
-)  # fmt: skip
+OTHERS = (
+    {"across": 120, "through": 6},
+    {"literal": True},
+    {"ramp_stretch": False},
+    {"epsilon": 1e-7},
+    {"x_C0": 60.34e-3},
+)
+
+
+@pytest.mark.parametrize("differs", OTHERS)
 def test_what_may_differ_makes_a_difference(differs: dict[str, float]) -> None:
     """More than sensors of 10 um and 0.1 N overlook."""
     own, other = strange(2 * STEP).channels, strange(2 * STEP, OWN._replace(**differs)).channels

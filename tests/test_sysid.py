@@ -19,8 +19,8 @@ from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begi
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, Unreachable, identify, record
 from torchsoft.sysid.fit import descend, gauss_newton
 from torchsoft.sysid.information import fisher, shift, standard_deviations
+from torchsoft.sysid.misfit import whiteness
 from torchsoft.sysid.plan import default_plan, tie_ratios, visible
-from torchsoft.sysid.result import whiteness
 from torchsoft.sysid.stages import sobol
 from torchsoft.sysid.workers import Runner
 

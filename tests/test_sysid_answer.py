@@ -20,7 +20,7 @@ from torchsoft import Parameters, SoftGrasp, simulate
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.physics.motion import Reference
 from torchsoft.sysid import AtRest, IdentificationResult, Prior, Problem, Sensor, Stage, Unknown, identify, record
-from torchsoft.sysid.answer import Answer, checksum, load_answer, schema
+from torchsoft.sysid.answer import Answer, FittedCoordinate, checksum, load_answer, schema
 from torchsoft.sysid.contribution import contributions
 from torchsoft.sysid.estimate import Number, estimates
 from torchsoft.sysid.recorded import recorded_rigs
@@ -202,10 +202,22 @@ def test_the_rig_of_a_file_runs_to_the_bit_like_that_of_the_result(result: Ident
 def test_what_is_not_identifiable_is_named_when_it_is_used(result: IdentificationResult, path: Path) -> None:
     assert not result["contact.eta"].identifiable
     for answer in (result, load_answer(path)):
-        with pytest.warns(UserWarning, match=r"only where the search ended: contact\.eta = \S+ N\.s/m") as caught:
+        with pytest.warns(UserWarning, match=r"only where the search ended: contact\.eta = \S+$") as caught:
             answer.model("first")
         assert [Path(one.filename).name for one in caught] == [Path(__file__).name]
         assert "pad.E" not in str(caught[0].message)
+
+
+def test_a_recording_that_was_not_fitted_has_no_values_of_its_own(result: IdentificationResult) -> None:
+    def left_out(c: FittedCoordinate) -> FittedCoordinate:
+        return replace(c, fixed=True) if c.recording == "second" else c
+
+    out = [e for e in result.estimates if e.recording != "second"]
+    answer = replace(result, estimates=out, coordinates=[left_out(c) for c in result.coordinates])
+    with pytest.warns(UserWarning, match=r"only where the search ended: contact\.eta = \S+, contact\.R_n = \S+$"):
+        answer.model("second")
+    with pytest.warns(UserWarning, match=r"only where the search ended: contact\.eta = \S+$"):
+        answer.model("first")
 
 
 def test_a_recording_must_be_named_where_rigs_differ(result: IdentificationResult) -> None:

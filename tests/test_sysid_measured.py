@@ -16,11 +16,15 @@ import xarray as xr
 from torchsoft import Parameters, Trajectory, simulate
 from torchsoft.channels import CHANNELS
 from torchsoft.excitation import Excitation, Strokes, begin
+from torchsoft.physics.contact import Coulomb
+from torchsoft.physics.material import StandardLinearSolid
 from torchsoft.solve.trajectory import save
 from torchsoft.sysid import MEASURED, Recording, Sensor, record
-from torchsoft.sysid.columns import COLUMNS, UNITS, read_table
-from torchsoft.sysid.cost import cost, paper_settings
-from torchsoft.sysid.measured import known_parameters, load, read_recording, stem
+from torchsoft.sysid.columns import COLUMNS, UNITS, read_table, read_tables
+from torchsoft.sysid.cost import cost, one_by_one, paper_settings
+from torchsoft.sysid.measured import STATED, known_parameters, load, read_recording, stem
+from torchsoft.sysid.start import AtRest
+from torchsoft.sysid.underway import Underway
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "identify"
 
@@ -92,13 +96,22 @@ def drop(column: int) -> Change:
     return lambda table: [cells.pop(column) for cells in table]
 
 
-T, X_D, Y_D, Y_D_DOT, X_C, THETA, Y_BR, F_Y = 0, 1, 3, 4, 6, 7, 9, 11
+T, X_D, Y_D, Y_D_DOT, F_FF, X_C, THETA, X_BR, Y_BR, F_X, F_Y = 0, 1, 3, 4, 5, 6, 7, 8, 9, 10, 11
 
 BAD: dict[str, tuple[Change, str]] = {
     "no unit": (put(1, X_C, "x_C"), r"data\.csv, row 1, column `x_C` has no unit: write `x_C \[m\]`"),
     "unknown unit": (put(1, X_C, "x_C [inch]"), r"row 1, column `x_C` cannot be in 'inch'; it can be in m, cm, mm"),
     "wrong dimension": (put(1, THETA, "theta [mm]"), r"row 1, column `theta` cannot be in 'mm'; it can be in rad"),
-    "unknown column": (put(1, X_C, "x_c [mm]"), r"row 1, column `x_c` is not known; columns are t, x_d"),
+    "unknown column": (
+        put(1, X_C, "x_c [mm]"), r"column `x_c` is not known: is it `x_C`\?.* ignore = \['x_c'\]; columns are t, x_d",
+    ),
+    "misspelt column": (put(1, F_FF, "Fff [N]"), r"column `Fff` is not known: is it `F_ff`\?"),
+    "time": (put(1, T, "Time [s]"), r"column `Time` is not known: is it `t`\?"),
+    "another column": (put(1, X_C, "Ventil"), r"column `Ventil` is not known; if it has nothing to do with the motion, say"),
+    "no feed-forward": (
+        drop(F_FF),
+        r"data\.csv has no column `F_ff`, and nothing says which force was fed forward.* missing = \{F_ff = 0\.0\} where",
+    ),
     "column twice": (put(1, X_C, "x_Br [mm]"), r"row 1, column `x_Br` is there twice"),
     "no times": (drop(T), r"data\.csv has no column `t`"),
     "no set-point": (drop(Y_D), r"data\.csv has no column `y_d`"),
@@ -123,11 +136,12 @@ BAD: dict[str, tuple[Change, str]] = {
     "mm under m": (put(1, X_C, "x_C [m]"), r"row 2, column `x_C`: 60.54 m is not plausible, .* between -0.12 and 0.24 m"),
     "one spike": (put(30, Y_BR, "500"), r"row 30, column `y_Br`: 0.5 m is not plausible"),
     "another start": (scale(X_C, 1.0, 5.0), r"row 2, column `x_C`: it begins at 0.065\d* m, but scenario.x_C0 is 0.0603 m"),
+    "another sign": (scale(X_C, -1.0), r"it begins at -0.0605\d* m, but scenario.x_C0 is 0.0603 m; is its sign opposite\?"),
     "turned already": (scale(THETA, 1.0, 500.0), r"row 2, column `theta`: it begins at 0.48\d* rad, but the start is 0 rad"),
     "another ground": (scale(Y_BR, 1.0, 3.0), r"row 2, column `y_Br`: it begins at .*, but the set-point y_d is 0.0501 m"),
     "moving": (
         lambda table: [cells.__setitem__(X_C, f"{60.3 + 0.3 * i}") for i, cells in enumerate(table[1:])],
-        r"row 3, column `x_C` moves already: a recording must begin at rest",
+        r"row 3, column `x_C` moves already: a recording must begin at rest,.* or say start = \{kind = \"underway\"\}",
     ),
     "in the grasp": (
         lambda table: [scale(k, 1.0, -0.6)(table) for k in (Y_D, Y_BR)],
@@ -177,6 +191,36 @@ BAD_CONFIG = {
     ),
     "nothing to fit": ('heldout = ["data"]\n' + CONFIG, r"heldout: it names every recording"),
     "a long delay": (CONFIG + "[sensors.theta]\nnoise = 1e-3\ndelay = 0.5\n", r"sensors\.theta\.delay should be less than"),
+    "no such column": ('ignore = ["Temp"]\n' + CONFIG, r"rig\.toml, ignore: no file has a column `Temp`"),
+    "another constant": (CONFIG + "[missing]\nF_x = 0.0\n", r"rig\.toml: missing\.F_x is not known here"),
+    "another start": (CONFIG + '[start]\nkind = "flying"\n', r"start\.kind should be one of 'rest', 'underway', not 'fl"),
+    "a start without a kind": (CONFIG + "[start]\nx_sd = 1e-4\n", r"start\.kind is missing"),
+    "a parameter by both names": (
+        CONFIG.replace('"pad.E"]\nnominal = 0.7e6', '"contact.friction.mu_s"]\n[unknowns."contact.mu_s"]'),
+        r"unknowns\.contact\.mu_s is there twice: it is contact\.mu_s too",
+    ),
+    "soft at first": (
+        CONFIG + '[pads]\nkind = "standard_linear_solid"\nE_instant = 1e5\n',
+        r"rig\.toml, recording `data`: pads\.E_instant = 100000 must be above pad\.E = 750000",
+    ),
+    "laws without likelihood": (
+        CONFIG + 'loss = "huber"\n[compare.coulomb.settings]\ncontact.friction = "coulomb"\n',
+        r"compare needs likelihoods: fit\.loss must be 'linear', not 'huber'",
+    ),
+    "without what is not there": (
+        CONFIG + '[compare.coulomb]\nwithout = ["contact.mu_s"]\n',
+        r"compare\.coulomb\.without: `contact\.mu_s` is not an unknown",
+    ),
+    "a law's own mistake": (
+        CONFIG + '[compare.coulomb.unknowns."contact.eta"]\nlow = -1.0\nscale = "linear"\nhigh = 1.0\n',
+        r"rig\.toml, compare\.coulomb: unknowns\.contact\.eta\.low = -1 is beyond what contact\.eta may be",
+    ),
+    "a law of the same name": (
+        CONFIG + '[compare."as stated"]\n', r"compare: the law of the file itself is called `as stated`",
+    ),
+    "file and files": (
+        CONFIG + '[[recordings]]\nfile = "b.csv"\nfiles = ["c.csv"]\n', r"recordings\.0: .*a `file` or `files`, not both",
+    ),
     "held out": ('heldout = ["other"]\n' + CONFIG, r"heldout: there is no recording `other`; the recordings' names are data"),
     "nameless": (CONFIG + "[[recordings]]\n", r"recordings\.0: a recording needs a `file`"),
     "same name": (CONFIG + '[[recordings]]\nfile = "data.csv"\n', r"names of their own, but are called data, data"),
@@ -204,7 +248,7 @@ def test_empty_cells_are_missing_samples(case: Callable[..., list[str]]) -> None
     assert len(one.samples["F_y"][0]) == 61
     assert len(x) == 58
     assert not {0.015, 0.02} & set(t)
-    assert made.tables["data"].near(0.2) == "row 43 (t = 0.2 s)"
+    assert made.tables["data"].near(0.2) == f"{data}, row 43 (t = 0.2 s)"
 
 
 @pytest.mark.parametrize("name", sorted(set(COLUMNS) - {"t"}))
@@ -280,10 +324,10 @@ def run() -> Trajectory:
 
 def test_a_trajectory_file_is_a_recording(run: Trajectory, tmp_path: Path) -> None:
     run.save(tmp_path / "run.nc")
-    table = read_table(tmp_path / "run.nc")
+    tables = read_tables([tmp_path / "run.nc"], (), {})
     settings = {"scenario": {"x_C0": 60.3e-3}, "control.senses": "bracket", "contact": {"v_s": 0.05}}
     sensors = {"x_C": Sensor(noise=1e-5)}
-    one = read_recording(tmp_path / "run.nc", "run", known_parameters(Path("c"), "run", table, settings), sensors)
+    one = read_recording(tmp_path / "run.nc", "run", known_parameters(Path("c"), "run", tables, settings), sensors)
     assert list(one.samples) == list(MEASURED)
     for channel in MEASURED:
         np.testing.assert_array_equal(one.samples[channel][1], run[channel].detach())
@@ -371,3 +415,130 @@ def test_a_name_is_the_same_where_the_system_knows_ascii_only() -> None:
     """Which gives Python the bytes of a file's name one by one."""
     assert stem(Path("a/größe.csv")) == stem(Path("a/gr\udcc3\udcb6\udcc3\udc9fe.csv")) == "größe"
     assert stem(Path("a/\udcff.csv")) == "�"
+
+
+def test_columns_may_stand_in_any_order_beside_others(case: Callable[..., list[str]]) -> None:
+    def change(table: Table) -> None:
+        for i, cells in enumerate(table):
+            cells.reverse()
+            cells.insert(3, "Temp [K]" if i == 0 else "warm")
+
+    plain = load(*_split(case())).problem.recordings[0]
+    one = load(*_split(case(change, 'ignore = ["Temp"]\n' + CONFIG))).problem.recordings[0]
+    assert one.fingerprint == plain.fingerprint
+
+
+def test_a_constant_stands_for_a_column_that_is_missing(case: Callable[..., list[str]], tmp_path: Path) -> None:
+    own = '[[recordings]]\nname = "data"\nmissing.F_ff = -2.5\n'
+    for text, force in (("[missing]\nF_ff = 0.0\n", 0.0), ("[missing]\nF_ff = 0.0\n" + own, -2.5)):
+        made = load(*_split(case(drop(F_FF), CONFIG + text)))
+        (one,) = made.problem.recordings
+        at = one.rig.reference(torch.tensor([0.0, 0.1], dtype=torch.float64), ("F_ff",))
+        np.testing.assert_array_equal(at[:, 0].detach(), [[force, 0.0]] * 2)
+        assert made.tables["data"].constants == ("F_ff",)
+    stated = load(*_split(case(config=CONFIG + "[missing]\nF_ff = 7.0\n")))
+    assert stated.tables["data"].constants == ()  # where there is a column, it counts
+
+
+def parts(table: Table, *columns: list[int]) -> list[Table]:
+    """Tables of some columns each."""
+    return [[[cells[i] for i in chosen] for cells in table] for chosen in columns]
+
+
+def test_a_recording_may_stand_in_several_files(example: Table, tmp_path: Path) -> None:
+    asked, camera, force = parts(example, [T, X_D, 2, Y_D, Y_D_DOT, F_FF], [T, X_C, THETA], [T, X_BR, Y_BR, F_X, F_Y])
+    slow = [camera[0], *camera[1::4]]
+    for name, one in (("asked", asked), ("camera", slow), ("force", force)):
+        write(tmp_path / f"{name}.csv", one)
+    text = CONFIG + '[[recordings]]\nname = "roll"\nfiles = ["asked.csv", "camera.csv", "force.csv"]\n'
+    (tmp_path / "rig.toml").write_text(text)
+    made = load([], tmp_path / "rig.toml")
+    (one,) = made.problem.recordings
+    assert one.name == "roll"
+    assert {channel: len(t) for channel, (t, _) in one.samples.items()} == {
+        "x_C": 16, "theta": 16, "x_Br": 61, "y_Br": 61, "F_x": 61, "F_y": 61,
+    }  # fmt: skip
+    assert made.tables["roll"].near(0.1) == f"{tmp_path / 'asked.csv'}, row 22 (t = 0.1 s)"
+
+    for cells in (late := [list(row) for row in slow])[1:]:
+        cells[0] = str(float(cells[0]) + 5.0)
+    write(tmp_path / "camera.csv", late)
+    with pytest.raises(
+        ValueError, match=r"camera\.csv, row 17, column `t`: 5\.3 s is 5 s outside the times of `x_d`, which ends"
+    ):
+        load([], tmp_path / "rig.toml")
+    write(tmp_path / "camera.csv", parts(example, [T, X_C, F_X])[0])
+    with pytest.raises(
+        ValueError, match=r"column `F_x` is in .*camera\.csv and in .*force\.csv: one recording has it once"
+    ):
+        load([], tmp_path / "rig.toml")
+    (tmp_path / "camera.csv").write_text("t [s],x_d_dot [mm/s]\n" + "".join(f"{0.01 * i},0\n" for i in range(20)))
+    write(tmp_path / "asked.csv", parts(example, [T, X_D, Y_D, F_FF])[0])
+    with pytest.raises(ValueError, match=r"the columns `x_d` and `x_d_dot` must be in one file"):
+        load([], tmp_path / "rig.toml")
+
+
+def test_a_file_may_state_everything_that_a_problem_can_have(case: Callable[..., list[str]]) -> None:
+    text = CONFIG.replace(
+        '[unknowns."contact.K_n"]\nnominal = 1e5',
+        '[unknowns."contact.K_n"]\nnominal = 1e5\nper = "recording"\nprior = {median = 1e5, sd = 0.3, kind = "log-normal"}\n'
+        '[unknowns."contact.friction.mu_k"]\nratio_to = "contact.friction.mu_s"\nnominal = 0.9\nhigh = 1.0',
+    ).replace(
+        "F_y.noise = 0.1",
+        'F_y = {noise = 0.1, gain = 0.02, drift = 0.1, inertia = 0.4, per = "recording", colour = "ar"}\n'
+        "F_x = {noise = 0.1, misalignment = 0.01, low = -50.0, high = 50.0}",
+    )
+    text = text.replace("contact.v_s = 0.05", "contact.friction.v_s = 0.05\ngravity = 9.8\ncontrol.y.Kp = 1.1e5")
+    made = load(*_split(case(config=text + '[start]\nkind = "rest"\nx_sd = 1e-4\n'))).problem
+    settings = paper_settings(made.recordings[0])
+    assert (settings.contact.v_s, settings.scenario.gravity, settings.control.K_98) == (0.05, 9.8, 1.1e5)
+    assert made.recordings[0].start == AtRest(x_sd=1e-4)
+    labels = (
+        "contact.K_n in data", "contact.mu_k / contact.mu_s", "pad.E", "start.disc.x in data", "gain of F_y in data",
+        "drift of F_y in data", "inertia of F_y in data", "misalignment of F_x",
+    )  # fmt: skip
+    assert sorted(made.coordinates.labels) == sorted(labels)
+    assert len(made.coordinates.priors) == 2
+    assert made.sensors["F_y"].colour == "ar"
+    assert made.sensors["F_x"].high == 50.0
+
+
+def test_a_recording_may_begin_anywhere_if_that_is_said(case: Callable[..., list[str]]) -> None:
+    """Cut from the middle of the grasp."""
+
+    def cut(table: Table) -> None:
+        del table[1:31]
+
+    sensors = CONFIG.replace("F_y.noise", "theta.noise = 0.5e-3\nx_Br.noise = 10e-6\nF_y.noise")
+    with pytest.raises(ValueError, match=r"data\.csv, row 2, column `\w+`.* or say start = \{kind = \"underway\"\}"):
+        load(*_split(case(cut, sensors)))
+    text = sensors + '[start]\nkind = "underway"\nlead = 40e-3\ngiven = {"disc.y" = {mean = 23.5e-3, sd = 1e-4}}\n'
+    (one,) = load(*_split(case(cut, text))).problem.recordings
+    assert isinstance(one.start, Underway)
+    assert one.start.lead == pytest.approx(0.04, abs=6e-3)
+    assert one.start.bodies["disc.y"] == (23.5e-3, 1e-4)
+    assert one.start.bodies["disc.x"][0] == pytest.approx(60.5e-3, abs=5e-4)
+    with pytest.raises(ValueError, match=r"rig\.toml, recording `data`: .*disc\.z"):
+        load(*_split(case(cut, text.replace("disc.y", "disc.z"))))
+
+
+def test_competing_laws_have_the_same_data(case: Callable[..., list[str]]) -> None:
+    text = CONFIG + (
+        '[unknowns."contact.eta"]\n[compare.coulomb]\nsettings.contact.friction = "coulomb"\nwithout = ["contact.eta"]\n'
+        '[compare.solid]\npads = {kind = "standard_linear_solid", E_instant = 2e6}\n'
+        'unknowns."pad.E_instant" = {ratio_to = "pad.E", low = 1.01, high = 20.0}\n'
+    )
+    made = load(*_split(case(config=text)))
+    assert list(made.laws) == [STATED, "coulomb", "solid"]
+    assert made.laws[STATED] is made.problem
+    assert {name: list(law.unknowns) for name, law in made.laws.items()} == {
+        STATED: ["contact.K_n", "pad.E", "contact.eta"],
+        "coulomb": ["contact.K_n", "pad.E"],
+        "solid": ["contact.K_n", "pad.E", "contact.eta", "pad.E_instant"],
+    }
+    rigs = {name: law.recordings[0].rig for name, law in made.laws.items()}
+    assert isinstance(rigs["coulomb"].contacts["L"].law.friction, Coulomb)
+    assert isinstance(rigs["solid"].pads["U"].material, StandardLinearSolid)
+    one, both = (cost(made.laws[name], 1e-3, 1, 1) for name in (STATED, "coulomb"))
+    assert one_by_one([one, both]).seconds == pytest.approx(one.seconds + both.seconds)
+    assert load(*_split(case())).laws == {}

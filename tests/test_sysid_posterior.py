@@ -213,7 +213,7 @@ def closed(monkeypatch: pytest.MonkeyPatch) -> ClosedForm:
         return ClosedForm(linear(x, rng.standard_normal(20)), 3, prior=prior)
 
     def fitted(problem: Any, rtol: float) -> Optimum:
-        at = problem.residuals(None, np.zeros(3), None, None)
+        at = problem.residuals(None, np.zeros(3), None, None, np.ones(3))
         return optimum(problem, *-np.linalg.lstsq(at.J, at.r, rcond=None)[0])
 
     monkeypatch.setattr(calibration, "simulated", simulated)

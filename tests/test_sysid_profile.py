@@ -90,7 +90,7 @@ def test_profile_and_combination_of_stiffnesses_in_series() -> None:
     """Pads and contacts share the load: a motion that hardly slips sees their stiffness in series."""
     base = Parameters().override(COARSE)
     roll = Excitation(motion=Roll(travel=4e-3), duration=0.25, grasp_time=0.1, settle=0.0)
-    sensors = {name: sensor.model_copy(update={"noise": 10 * sensor.noise}) for name, sensor in RIG.items()}
+    sensors = {name: sensor.model_copy(update={"noise": 3 * sensor.noise}) for name, sensor in RIG.items()}
     data = record("roll", roll, base, base, sensors, seed=1)
     problem = Problem([data], sensors, {"pad.E": Unknown(), "contact.K_n": Unknown()})
     result = identify(
@@ -98,14 +98,15 @@ def test_profile_and_combination_of_stiffnesses_in_series() -> None:
     )
     o = Optimum.of(problem, result)
     np.testing.assert_allclose(o.x, result.x)
-    E, K = profiles(o)
-    for one, truth in ((E, 0.75e6), (K, 1.2e5)):
-        low, high = one.ci95
-        assert low is not None
-        assert high is None or low < truth < high
-        assert low < truth
-    assert any("no parabola" in notice or "no upper bound" in notice for notice in K.notices)
+    (E,) = profiles(o, ["pad.E"])
+    low, high = E.ci95
+    assert low is not None
+    assert high is not None
+    assert low < 0.75e6 < high
+    assert high - E.best > 1.3 * (E.best - low)  # soft contacts need stiffer pads than stiff contacts need soft ones
+    assert any("no parabola" in notice for notice in E.notices)
+    K = np.array(E.others["contact.K_n"])
+    assert (np.diff(K) < 0).all()
     (both,) = combinations(o.labels, o.covariance, 0.1)
-    assert both.exponents["pad.E"] == 1.0
-    assert 0 < both.exponents["contact.K_n"] < 0.5
-    assert both.sd < 0.01
+    assert both.formula == "pad.E * contact.K_n^0.1"
+    assert both.sd < 0.2 * min(both.sds.values())

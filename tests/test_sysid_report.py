@@ -5,6 +5,7 @@ import json
 import struct
 from collections.abc import Callable
 from dataclasses import replace
+from html import escape
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -19,11 +20,22 @@ from test_sysid_answer import HOSTILE, example
 
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes
-from torchsoft.sysid import AtRest, IdentificationResult, Prior, Problem, Sensor, Stage, Unknown, identify, record
+from torchsoft.sysid import (
+    AtRest,
+    IdentificationResult,
+    Prior,
+    Problem,
+    Sensor,
+    Stage,
+    Unknown,
+    identify,
+    record,
+    sections,
+)
 from torchsoft.sysid.answer import AssumptionCheck, ChannelNoise, load_answer
 from torchsoft.sysid.comparison import Comparison
 from torchsoft.sysid.cost import paper_settings
-from torchsoft.sysid.estimate import Direction, autocorrelation
+from torchsoft.sysid.estimate import Direction
 from torchsoft.sysid.figures import (
     contributions_figure,
     correlation_figure,
@@ -34,6 +46,7 @@ from torchsoft.sysid.figures import (
     trace_figure,
 )
 from torchsoft.sysid.information import Combination
+from torchsoft.sysid.misfit import autocorrelation
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.page import grouped, table
 from torchsoft.sysid.prediction import FailedRun
@@ -77,7 +90,9 @@ def full(found: Found) -> IdentificationResult:
     )
     checks = [
         harmless,
-        replace(harmless, name="b", stated="the disc weighs 1 kg", moves={"pad.E": -4.2}, gain=99.0, asked=-3.1, suspected=True),
+        replace(
+            harmless, name="b", stated="the disc weighs 1 kg", moves={"pad.E": -4.2}, gain=99.0, asked=-3.1, suspected=True
+        ),
         replace(harmless, name="c", kind="law", stated="slip is smooth", moves={}, unchecked="a run failed"),
     ]  # fmt: skip
     values = [E * (1 + 0.02 * k) for k in range(-4, 5)]
@@ -197,7 +212,11 @@ def test_what_recordings_told_is_in_the_table(page: Page, full: IdentificationRe
             cells.append(f"{100 * one.shares[label]:.0f} % ({'only here' if factor is None else f'× {factor:.2f}'})")
         assert "\n".join((label, *cells)) in page.text
     assert full.contributions[1].without["contact.R_n in shallow"] is None
-    assert "the data see pad.E / contact.K_n^0.5 to 2 %, not each (pad.E 30 %, contact.K_n 40 %)." in page.text
+    assert "the data see pad.E / contact.K_n^0.5 to 2 %, not each (pad.E 30 %, contact.K_n 40 %)\n" in page.text
+    weak = [direction_name(d) for d in full.directions if not d.identifiable]
+    assert "contact.eta" in weak
+    for name in weak:
+        assert f"\n{name} may change without a trace in the data\n" in page.text
 
 
 def test_assumptions_that_matter_stand_open_and_others_are_folded(page: Page) -> None:
@@ -258,9 +277,15 @@ def test_an_answer_to_other_data_is_refused(found: Found, tmp_path: Path) -> Non
     assert not any(tmp_path.iterdir())
 
 
+def undrawn(figure: Figure, alt: str, caption: str = "", kind: str = "") -> str:
+    """What `picture` makes, without the pixels."""
+    return f'<figure><img alt="{escape(alt)}">{f"<figcaption>{caption}</figcaption>" if caption else ""}</figure>'
+
+
 def test_a_loaded_answer_makes_the_same_page(
-    full: IdentificationResult, found: Found, page: Page, tmp_path: Path
+    full: IdentificationResult, found: Found, page: Page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(sections, "picture", undrawn)
     full.save(tmp_path / "answer.json")
     (tmp_path / "page").mkdir()
     again = written(load_answer(tmp_path / "answer.json"), found[1], tmp_path / "page")
@@ -278,6 +303,7 @@ def test_a_lost_recording_is_named_and_a_clean_answer_has_no_warnings(
         return [FailedRun("it < went", 0.1) if job.recording == 2 else one for job, one in zip(jobs, run(self, jobs))]
 
     monkeypatch.setattr(Runner, "run", losing)
+    monkeypatch.setattr(sections, "picture", undrawn)
     page = written(replace(answer, notices=[], contributions=answer.contributions[:1]), problem, tmp_path)
     alts = " ".join(str(attributes.get("alt")) for _, attributes in page.tags)
     assert "Could not be simulated: it < went" in page.text
@@ -289,8 +315,8 @@ def test_a_lost_recording_is_named_and_a_clean_answer_has_no_warnings(
 
 
 def test_tables_leave_out_what_is_empty_and_escape_the_rest() -> None:
-    page = Page(table(["<h>", "none", "n"], [["a&b", "", "−1.5"], [("weak", "<i>"), "", "open … 3"]], "<c>"))
-    assert page.text.split("\n")[:-1] == ["<c>", "<h>", "n", "a&b", "−1.5", "<i>", "open … 3"]
+    page = Page(table(["<h>", "none", "n"], [["1&b", "", "−1.5"], [("weak", "<i>"), "", "open … 3"]], "<c>"))
+    assert page.text.split("\n")[:-1] == ["<c>", "<h>", "n", "1&b", "−1.5", "<i>", "open … 3"]
     cells = [attributes for tag, attributes in page.tags if tag == "td"]
     assert [one["class"] for one in cells] == ["", "n", "weak", "n"]
     assert cells[0]["data-label"] == "<h>"

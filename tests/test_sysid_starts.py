@@ -4,10 +4,12 @@ same."""
 from collections.abc import Mapping
 from copy import deepcopy
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from test_experiments import experiment
 from torch import Tensor
 
 from torchsoft import (
@@ -232,7 +234,7 @@ def test_parameters_are_found_from_the_middle_of_a_roll(cut: Cut) -> None:
     truth = {name: float(cut[0].rig.parameter(name).detach()) for name in ("pad.E", "pad.tau")}
     problem = Problem([out], RIG, {name: Unknown(nominal=1.1 * value) for name, value in truth.items()})
     plan = [Stage("all", problem.names, problem.coordinates.labels, 3e-4, tolerance=1e-3)]
-    found = identify(problem, plan=plan, tightenings=0)
+    found = identify(problem, plan=plan, tightenings=0, assumptions="trusted")
     for name, value in truth.items():
         e = found[name]
         assert e.ci95 is not None
@@ -268,3 +270,19 @@ def test_refusals(cut: Cut) -> None:
         begin_underway(recording, RIG, given={"disc.z": (0.0, 1.0)})
     deep = deepcopy(dict(start.bodies)) | {"disc.y": (-1.0, 1.0)}
     assert Underway(deep, {}).coordinates(rig, samples)
+
+
+def test_unknown_start_smoke(tmp_path: Path) -> None:
+    """The experiment: errors of a few standard deviations, a price for not knowing the start, and rest not assumed in
+    silence."""
+    module = experiment("unknown_start")
+    result = module.run(module.Config(out=tmp_path, smoke=True))
+    ((case, (found,)),) = result.found.items()
+    price = result.prices[case]
+    assert list(price.unknown) == ["contact.K_n", "pad.E", "pad.tau"]
+    for name, sd in price.unknown.items():
+        assert abs(np.log(found[name].last / module.TRUTH[name])) < 4 * sd, name
+        assert 1.0 < sd / price.known[name] < 5.0, name
+    assert "the bracket must begin clear of the disc" in result.rest[case]["file"]
+    assert result.rest[case]["library"]
+    assert module.figure(result).axes

@@ -5,6 +5,7 @@ import io
 import sys
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,9 @@ Which parameters explain these recordings, and how sure is that?
 
 DATA are CSV files with a heading such as `t [s], x_d [mm], y_d [mm], F_ff [N], x_C [mm], theta [deg]`, or trajectory files of
 this project (.nc). CONFIG.toml states what is known, what is unknown and how good the sensors are; examples/identify has both.
-Writes answer.json and report.html. Interrupted, the same command continues where it was."""
+Recordings that look wrong (a sign, a unit, set-points too far apart) are refused, or named, before anything is fitted.
+Writes answer.json and report.html, and comparison.json where there are competing laws. Interrupted, the same command continues
+where it was."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -56,7 +59,8 @@ def identify(options: argparse.Namespace) -> int:
         # these take seconds to import, so that `--help` does without
         from torchsoft.cost import agree
         from torchsoft.sysid import measured
-        from torchsoft.sysid.cost import cost
+        from torchsoft.sysid.configuration import Settings
+        from torchsoft.sysid.cost import cost, one_by_one
         from torchsoft.sysid.fit import Unreachable
         from torchsoft.sysid.journal import forget
         from torchsoft.sysid.report import report
@@ -67,19 +71,25 @@ def identify(options: argparse.Namespace) -> int:
             case = measured.load(data, configs[0])
             fit, tables = case.config.fit, case.tables
             changed = {"rtol": options.rtol, "workers": options.workers}
-            fit = measured.Settings.model_validate(
-                fit.model_dump() | {k: v for k, v in changed.items() if v is not None}
-            )
-            expected = cost(case.problem, fit.rtol, fit.starts, fit.workers, case.config.heldout, fit.method)
+            fit = Settings.model_validate(fit.model_dump() | {k: v for k, v in changed.items() if v is not None})
+            problems, heldout = list(case.laws.values()) or [case.problem], case.config.heldout
+            priced = (fit.rtol, fit.starts, fit.workers, heldout, fit.method)
+            expected = one_by_one(cost(problem, *priced) for problem in problems)
             agree(expected, options.yes, "take a larger rtol, fewer starts or less data")
+            seen = looked_at(case, fit.workers, not options.no_progress)
             options.out.mkdir(parents=True, exist_ok=True)
             result = identify(
-                case.problem, heldout=case.config.heldout, checkpoint=unfinished, progress=not options.no_progress,
+                case.problem,
+                heldout=heldout,
+                checkpoint=unfinished,
+                progress=not options.no_progress,
                 **fit.model_dump(),
-            )  # fmt: skip
+            )
+            result = replace(result, notices=list(dict.fromkeys((*seen, *result.notices))))
             result.save(options.out / "answer.json")
             report(result, case.problem, options.out / "report.html", checkpoint=unfinished)
             forget(unfinished)
+            verdict = compared(case, fit, options) if case.laws else ""
         except Unreachable as error:
             return failed(measured.unreachable(error, tables))
         except (ValueError, RuntimeError) as error:  # a model without equilibrium, a worker that was killed
@@ -92,8 +102,39 @@ def identify(options: argparse.Namespace) -> int:
     print(result.table())
     for notice in result.notices:
         print(f"note: {notice}")
+    print(verdict, end="")
     print(f"{result.cost['wall_s']:.0f} s; written to {options.out / 'answer.json'} and {options.out / 'report.html'}")
     return 0
+
+
+def looked_at(case: Any, workers: int, progress: bool) -> list[str]:
+    """Sentences on what looks strange in the recordings. Raises `ValueError` for what makes a fit worthless."""
+    from torchsoft.sysid.conventions import check
+    from torchsoft.sysid.finding import accepted
+    from torchsoft.sysid.workers import Runner
+
+    if progress:
+        print("looking at what the recordings mean", file=sys.stderr)
+    return accepted(check(case.problem, Runner(case.problem.recordings, workers)), case.config.meant)
+
+
+def compared(case: Any, fit: Any, options: argparse.Namespace) -> str:
+    """Fits the competing laws, and says which one made the data."""
+    from torchsoft.sysid.compare import compare
+    from torchsoft.sysid.journal import forget
+
+    unfinished: Path = options.checkpoint or options.out / "unfinished"
+    folder = unfinished.with_name(f"{unfinished.name}-laws")
+    answer = compare(
+        case.laws, heldout=case.config.heldout, rtol=fit.rtol, starts=fit.starts, workers=fit.workers,
+        checkpoint=folder, progress=not options.no_progress,
+    )  # fmt: skip
+    answer.save(options.out / "comparison.json")
+    for name in case.laws:
+        forget(folder / name)
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
+    return f"{answer.table()}\n{answer.verdict}\nwritten to {options.out / 'comparison.json'}\n"
 
 
 def failed(what: str) -> int:

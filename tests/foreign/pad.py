@@ -1,7 +1,7 @@
 """The pad's surface compliance: bilinear plane-strain elements on a regular mesh, put together from bars in x and in y.
 
 On a regular mesh every integral over the pad is a product of one over x and one over y, so that the stiffness is a sum of
-Kronecker products of two one-dimensional matrices. The volume's part takes one point an element (its midpoint), against locking.
+Kronecker products of two one-dimensional matrices. The volume's part takes one point an element (its midpoint): no locking.
 """
 
 import numpy as np

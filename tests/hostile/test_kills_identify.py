@@ -117,8 +117,11 @@ class Command:
 
 
 def answer(out: Path) -> str:
-    """The answer without what depends on how it was come by: times, and how much was remembered."""
+    """The answer without what depends on how it was come by: times, how much was remembered, the command with its folder, and
+    the checksum of all that."""
     content = json.loads((out / "answer.json").read_text(encoding="utf-8"))
+    for key in ("checksum", "command"):
+        content.pop(key)
     for entry in (content["cost"], *content["stages"]):
         entry.pop("wall_s")
     content["cost"].pop("remembered")

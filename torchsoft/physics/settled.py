@@ -2,7 +2,8 @@
 
 Without rates all branches of a massless pad carry the contact force itself, z_b = f, and its displacements are u = C f.
 At the contact points that is u = A f(u), with A the pad's compliance from point to point and f the contact law, without
-any rate, at the bodies' given poses and the points' given stretches. """
+any rate, at the bodies' given poses and the points' given stretches.
+"""
 
 from collections.abc import Mapping
 
@@ -29,9 +30,11 @@ def settled(
     The bodies move at `velocity` [m/s, rad/s], by body (3,), but the pads carry what they would if these stood still:
     under a body that rolls at v the pads lag behind by v tau only, whereas pads at rest under it would meet all of its
     dashpots. Differentiable once in all three and in the rig's parameters, by the implicit function theorem; not smooth
-    where a point touches or slips. Called again with the same numbers it gives the same bits. Raises `ValueError` for
-    other shapes or a rig with parameters that are not physical, `NotImplementedError` for inertial pads,
-    `NoEquilibrium` where Newton's method fails. """
+    where a point touches or slips. Called again with the same numbers it gives the same bits.
+
+    Raises `ValueError` for other shapes or a rig with parameters that are not physical, `NotImplementedError` for
+    inertial pads, `NoEquilibrium` where Newton's method fails.
+    """
     if torch.is_inference_mode_enabled():
         raise ValueError("settled pads need torch's graphs, which torch.inference_mode() has not; use torch.no_grad()")
     check_values(rig)

@@ -206,14 +206,18 @@ class Answer:
     def _identified(self, rig: Rig, one: RecordedRig) -> Rig:
         set_parameters(rig, one.identified)
         weak = [
-            f"{e.name} = {one.identified[e.name]:.3g} {e.unit}".strip()
+            e.name
             for e in self.estimates
             if not e.identifiable and e.kind == "parameter" and e.recording in (None, one.name)
         ]
+        weak += [  # of a recording that was held out
+            c.name
+            for c in self.coordinates
+            if c.fixed and c.kind == "parameter" and c.recording == one.name and not self.unknowns[c.name].fixed
+        ]
         if weak:
-            warnings.warn(
-                f"not identifiable from the data, and so only where the search ended: {', '.join(weak)}", stacklevel=3
-            )
+            said = ", ".join(f"{name} = {one.identified[name]:.3g}" for name in weak)
+            warnings.warn(f"not identifiable from the data, and so only where the search ended: {said}", stacklevel=3)
         return rig
 
     def to_json(self) -> str:

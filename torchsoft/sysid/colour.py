@@ -18,8 +18,8 @@ from torchsoft.sysid.noise import Autoregression, NoiseFit, fit_noise
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
 
-ROUNDS = 3
-"""How often the noise is found anew from what a fit with the last one leaves."""
+ROUNDS = 2
+"""How often noise is found: in what the fit leaves, and in what the fit with that noise leaves."""
 
 
 class Coloured(NamedTuple):
@@ -33,16 +33,16 @@ class Coloured(NamedTuple):
 
 
 def allow_for_colour(
-    problem: Problem, fit: Fit, free: NDArray[np.bool_], which: Sequence[str], refit: Callable[[Problem, Fit], Fit]
+    problem: Problem, fit: Fit, free: NDArray[np.bool_], which: Sequence[str], refit: Callable[[Problem, Fit, int], Fit]
 ) -> Coloured:
-    """Find the noise that a fit leaves in the recordings `which`, and fit again with it, by `refit`, from there, until the
-    coordinates that are `free` (n,) stay.
+    """Find the noise that a fit leaves in the recordings `which`, and fit again with it, by `refit(problem, fit, round)`, from
+    there, while coordinates that are `free` (n,) move.
 
     The fit must have its residuals, with their Jacobian. Where all noise is white nothing is changed.
     """
     declared = [channel for channel, sensor in problem.sensors.items() if sensor.colour == "ar"]
     found, fits = dict[str, NoiseFit](), list[Fit]()
-    for _ in range(ROUNDS):
+    for number in range(ROUNDS):
         assert fit.at is not None
         now = parts(problem, fit.at.r, which)
         found = colours(now, fit.at.J[:, free], declared)
@@ -53,7 +53,7 @@ def allow_for_colour(
         fit = fit._replace(at=at, chi2=float(np.mean(at.r**2)))
         if settled(problem, fit.x, at, free):
             break
-        fit = refit(problem, fit)
+        fit = refit(problem, fit, number)
         fits.append(fit)
     return Coloured(problem, fit, found, fits)
 

@@ -36,15 +36,11 @@ class How(NamedTuple):
 
 
 def conclude(
-    coloured: Coloured,
-    runner: Runner,
-    stage: Stage,
-    stages: list[dict[str, Any]],
-    how: How,
-    began: float,
-    progress: bool,
-) -> IdentificationResult:
-    """The result, from the fit of the last stage with the noise that was found; `began` on the clock [s]."""
+    coloured: Coloured, runner: Runner, stage: Stage, stages: list[dict[str, Any]], how: How, looks: list[str],
+    began: float, progress: bool,
+) -> IdentificationResult:  # fmt: skip
+    """The result, from the fit of the last stage with the noise that was found; `looks` are sentences on the recordings
+    themselves, `began` is on the clock [s]."""
     problem, fit = coloured.problem, coloured.fit
     c = problem.coordinates
     free, start = np.isin(c.labels, stage.free), clock.perf_counter()
@@ -67,7 +63,7 @@ def conclude(
     C[np.ix_(free, free)] = C_fit + (checked.widening() if checked is not None else 0.0)
     labels = [label for label, one in zip(c.labels, free) if one]
     found = estimates(problem, x, free, C, shift)
-    predicted, notices = {}, []
+    predicted, notices = {}, list(looks)
     if how.heldout:
         held = problem.with_noise({}).residuals(runner, x, how.heldout, rtol)
         if held.lost:

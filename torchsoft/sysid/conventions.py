@@ -1,8 +1,8 @@
 """Do recordings mean what the model takes them to mean? Looked at before a fit, which would give wrong numbers without a word.
 
-One run a recording, at the parameters that the fit starts from, which may be off by a factor of three: that is enough to tell a
-sign, a unit, a large delay, and the body whose place a set-point is. Set-points (`setpoints`) and control loops (`loops`) need no
-run.
+One run a recording, at the parameters that the fit starts from, which may be off by a factor of three: that is enough to
+tell a sign, a unit, a large delay, and the body whose place a set-point is. Set-points (`setpoints`) and control loops
+(`loops`) need no run.
 """
 
 import math
@@ -13,15 +13,18 @@ import torch
 
 from torchsoft.channels import unit
 from torchsoft.physics.paper import SoftGrasp
+from torchsoft.physics.parts import COORDINATES
+from torchsoft.physics.rig import Rig
+from torchsoft.sysid.closed_loop import channel
 from torchsoft.sysid.finding import Finding, confusions, together
-from torchsoft.sysid.loops import another_sense, channel, loop_findings
+from torchsoft.sysid.loops import another_sense, loop_findings
 from torchsoft.sysid.plan import LOOSE
 from torchsoft.sysid.prediction import Prediction
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.readout import Readout, Signals
 from torchsoft.sysid.recording import REACH, Array, Recording
 from torchsoft.sysid.setpoints import setpoint_findings
-from torchsoft.sysid.start import AtRest
+from torchsoft.sysid.start import PREFIX, AtRest
 from torchsoft.sysid.unknowns import Sensor
 from torchsoft.sysid.workers import Runner
 
@@ -41,7 +44,10 @@ LATE = 40e-3
 """Delay [s] from which wrong parameters do not explain it."""
 
 SAME = 0.1
-"""Part of its motion by which what follows a set-point may differ from it; what does not follow differs by three times as much."""
+"""Part of its motion by which what follows a set-point may differ from it."""
+
+APART = 0.3
+"""And by which what does not follow it differs."""
 
 EARLY = 10e-3
 """Time [s] from the first sample on in which nothing moves that begins at rest."""
@@ -54,7 +60,7 @@ def check(problem: Problem, runner: Runner, which: Sequence[str] | None = None) 
     """What looks wrong in some recordings of a problem, or in all: one finding of every kind."""
     found, x = list[Finding](), problem.coordinates.start
     which = problem.names if which is None else which
-    unknown = [name for name in problem.coordinates.names if not name.startswith("start.")]
+    unknown = [name for name in problem.coordinates.names if not name.startswith(PREFIX)]
     jobs = problem.jobs(x, which, LOOSE, None)
     for job, got in zip(jobs, runner.run(jobs)):
         recording = problem.recordings[job.recording]
@@ -66,11 +72,8 @@ def check(problem: Problem, runner: Runner, which: Sequence[str] | None = None) 
             expected = {name: (one, signals) for name, one in readouts.items()}
         mine += another_body(recording, problem.sensors, expected)
         blamed = {f.what for f in mine}
-        mine += [
-            one
-            for one in against_run(recording, problem.sensors, expected)
-            if one.what not in blamed and "control.senses" not in blamed
-        ]
+        if not any(f.grave for f in mine):
+            mine += [one for one in against_run(recording, problem.sensors, expected) if one.what not in blamed]
         found += mine
     return together(found)
 
@@ -99,10 +102,11 @@ def against_run(recording: Recording, sensors: Mapping[str, Sensor], expected: E
         if len(t) < 2 * MOVES:
             continue
         p, _, _ = one.expected(signals, t)
-        if (said := shape(name, t, y, p, sensors[name], one, signals)) is not None:
+        if (said := shape(name, t, y, p, sensors[name], one, signals)) is None:
+            early[name] = (y - p)[t <= t[0] + EARLY]
+        else:
             what, words, grave = said
             yield Finding(what, recording.name, f"recording `{recording.name}`: {words}", grave)
-        early[name] = (y - p)[t <= t[0] + EARLY]
     if isinstance(recording.start, AtRest):
         yield from zeros(recording, sensors, early)
 
@@ -126,7 +130,9 @@ def shape(
         return None
     correlation = alike(y, p)
     if correlation < OPPOSITE:
-        words = f"{name} looks as if its sign were opposite: its correlation with a run from the start is {correlation:.2f}"
+        words = (
+            f"{name} looks as if its sign were opposite: its correlation with a run from the start is {correlation:.2f}"
+        )
         return f"sign of {name}", words, True
     shifts = np.linspace(-REACH, REACH, 41)
     inside = (t - REACH >= signals.t[0]) & (t + REACH <= signals.t[-1])
@@ -135,7 +141,8 @@ def shape(
     by = [alike(y[inside], one.expected(signals, t[inside] - late)[0]) for late in shifts]
     late = float(shifts[int(np.argmax(by))])
     if abs(late) >= LATE + sensor.delay and 1 - max(by) < 0.2 * (1 - alike(y[inside], p[inside])):
-        words = f"{name} is about {1e3 * abs(late):.0f} ms {'late' if late > 0 else 'early'}: do its times have the same beginning?"
+        side = "late" if late > 0 else "early"
+        words = f"{name} is about {1e3 * abs(late):.0f} ms {side}: are its times counted from the same beginning?"
         return f"time of {name}", words, False
     return None
 
@@ -156,7 +163,7 @@ def zeros(recording: Recording, sensors: Mapping[str, Sensor], early: Mapping[st
             continue
         sensor, mean, count = sensors[name], float(early[name].mean()), len(early[name])
         if abs(mean) > SURE * sensor.noise / math.sqrt(count) + sensor.bias:
-            words = f"{name} begins {mean:+.3g} {unit(name)} from its set-point {actuator.setpoint}: do both have the same zero?"
+            words = f"{name} begins {mean:+.3g} {unit(name)} from {actuator.setpoint}: do both have the same zero?"
             yield Finding(f"zero of {name}", recording.name, f"recording `{recording.name}`: {words}")
     if isinstance(rig, SoftGrasp) and {"x_C", "theta"} <= early.keys():
         R, (x, theta) = rig.settings.disc.radius, (sensors[name] for name in ("x_C", "theta"))
@@ -164,49 +171,65 @@ def zeros(recording: Recording, sensors: Mapping[str, Sensor], early: Mapping[st
         sd = math.hypot(theta.noise / math.sqrt(len(early["theta"])), x.noise / R / math.sqrt(len(early["x_C"])))
         if abs(off) > SURE * sd + theta.bias + x.bias / R:
             words = (
-                f"theta begins {off:+.3g} rad from where the disc, rolled to its x_C, would have it: is its zero that of the disc "
-                "as it is put down at scenario.x_C0, and is that its x?"
+                f"theta begins {off:+.3g} rad from where the disc would have it that has rolled to its x_C: is zero its "
+                "angle as it is put down at scenario.x_C0, and is that its x?"
             )
             yield Finding("zero of theta", recording.name, f"recording `{recording.name}`: {words}")
 
 
 def another_body(recording: Recording, sensors: Mapping[str, Sensor], expected: Expected) -> Iterator[Finding]:
-    """A set-point that another body follows than the one whose coordinate the loop is taken to measure."""
+    """A set-point that another body follows than the one whose coordinate the loop is taken to measure; or that this one
+    does not follow, as it does in the run."""
     rig = recording.rig
     for actuator in rig.actuators.values():
         body, _, axis = actuator.measures.partition(".")
-        own = channel(rig, actuator.measures)
-        for other in (name for name in rig.bodies if name != body):
+        own, asked = channel(rig, actuator.measures), actuator.setpoint
+        mine, run = off(recording, sensors, asked, own), off_in_run(recording, sensors, asked, own, expected)
+        others = [name for name in rig.bodies if name != body and f"{name}.{axis}" in movable(rig)]
+        for other in others:
             its = channel(rig, f"{other}.{axis}")
-            if its not in recording.samples or its not in sensors:
+            far, there = off(recording, sensors, asked, its), off_in_run(recording, sensors, asked, its, expected)
+            if below(far, SAME) and not below(mine, APART) and not below(there, APART):
+                said = f"{its} follows it to {far:.1%} of its motion"
+            elif mine is not None and mine > APART and far is None and (run is None or run < SAME) and len(others) == 1:
+                said = f"{own} does not follow it, and differs by {mine:.0%} of its motion"
+            else:
                 continue
-            far = off(recording, sensors, actuator.setpoint, its)
-            mine = off(recording, sensors, actuator.setpoint, own) if own in sensors and own in recording.samples else None
-            follows = far is not None and far < SAME and (mine is None or mine > 3 * max(far, SAME / 3))
-            if follows and not follows_too(recording, sensors, actuator.setpoint, its, expected):
-                change = another_sense(rig, actuator, body, other, np.zeros(1))
-                words = f"recording `{recording.name}`: {change.said} ({its} follows it to {far:.1%} of its motion)"
-                yield Finding(change.what, recording.name, words, True)
+            change = another_sense(rig, actuator, body, other, np.zeros(1))
+            yield Finding(
+                change.what, recording.name, f"recording `{recording.name}`: {change.said} ({said})", grave=True
+            )
+
+
+def below(part: float | None, limit: float) -> bool:
+    """Whether something is known, and below a limit."""
+    return part is not None and part < limit
+
+
+def movable(rig: Rig) -> list[str]:
+    """Coordinates that are free, such as "disc.x"."""
+    return [f"{body}.{COORDINATES[axis]}" for body, axes in rig.layout.free.items() for axis in axes]
 
 
 def off(recording: Recording, sensors: Mapping[str, Sensor], setpoint: str, name: str) -> float | None:
-    """How far a channel is from a set-point, over how far that moves; None where it hardly does."""
+    """How far a channel is from a set-point, over how far that moves; None without samples, or where it hardly moves."""
+    if name not in recording.samples or name not in sensors:
+        return None
     t, y = samples(recording, sensors, name)
     return parted(recording, setpoint, t, y, sensors[name].noise)
+
+
+def off_in_run(
+    recording: Recording, sensors: Mapping[str, Sensor], setpoint: str, name: str, expected: Expected
+) -> float | None:
+    """The same of the run from the start."""
+    if name not in expected:
+        return None
+    (one, signals), (t, _) = expected[name], samples(recording, sensors, name)
+    return parted(recording, setpoint, t, one.expected(signals, t)[0], sensors[name].noise)
 
 
 def parted(recording: Recording, setpoint: str, t: Array, y: Array, noise: float) -> float | None:
     asked = recording.rig.reference(torch.from_numpy(t), [setpoint]).detach().numpy()[:, 0, 0]
     moved = float(np.std(asked))
     return float(np.std(asked - y)) / moved if moved > MOVES * noise else None
-
-
-def follows_too(
-    recording: Recording, sensors: Mapping[str, Sensor], setpoint: str, name: str, expected: Expected
-) -> bool:
-    """Whether the run from the start follows the set-point with that channel as well."""
-    if name not in expected:
-        return False
-    (one, signals), (t, _) = expected[name], samples(recording, sensors, name)
-    far = parted(recording, setpoint, t, one.expected(signals, t)[0], sensors[name].noise)
-    return far is not None and far < 2 * SAME

@@ -55,6 +55,9 @@ class Criterion:
             raise ValueError(f"`targets` has {len(self.targets)} standard deviations for the {len(names)} of {names}")
 
 
+VOLUME = Criterion()
+
+
 def chosen(problem: Problem, x: Array, names: Sequence[str] | None) -> tuple[tuple[str, ...], Array]:
     """The parameters `names`, by default every free one that all recordings share, and what their relative errors (s,) are of
     those of the coordinates x (n,): a matrix (s, n). Raises `ValueError` for others."""
@@ -89,13 +92,13 @@ class Outlook:
 
 def next_recording(
     problem: Problem, x: Array, candidates: Sequence[Recording], *, names: Sequence[str] | None = None,
-    criterion: Criterion = Criterion(), per_second: bool = False, rtol: float = 1e-4, workers: int = 1,
+    criterion: Criterion = VOLUME, per_second: bool = False, rtol: float = 1e-4, workers: int = 1,
 ) -> list[Outlook]:  # fmt: skip
     """What should be recorded after the recordings of `problem`, whose coordinates are x (n,), say at the end of a fit?
 
     Every candidate's Fisher matrix is added to theirs; of its samples only the times count. The best comes first, by what it
-    takes off the `criterion` of the parameters `names`, or off that per second. A prediction: it holds as far as the model does, and for
-    small errors. Raises `ValueError` for candidates that do not fit the problem.
+    takes off the `criterion` of the parameters `names`, or by that per second. A prediction: it holds as far as the model
+    does, and for small errors. Raises `ValueError` for candidates that do not fit the problem.
     """
     if not candidates:
         raise ValueError("there is no candidate to rank")

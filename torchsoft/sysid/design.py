@@ -19,9 +19,9 @@ from tqdm import tqdm
 from torchsoft.excitation import Excitation, Knots
 from torchsoft.solve.adjoint import GradientFailed
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.sysid.criterion import Criterion
+from torchsoft.sysid.criterion import VOLUME, Criterion
 from torchsoft.sysid.knots import Bounds, Moves, profile
-from torchsoft.sysid.planner import Look, Planner, Range
+from torchsoft.sysid.planner import PRICE, Look, Planner, Range
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array, Recording
 
@@ -52,17 +52,17 @@ class Visit:
     @property
     def score(self) -> float:
         """The criterion, and a price of excess."""
-        return self.value + 5.0 * max(0.0, self.peak - 1.0)
+        return self.value + PRICE * max(0.0, self.peak - 1.0)
 
 
 @dataclass(frozen=True)
 class Design:
     """A motion and what it is worth.
 
-    `recording` follows it, and has the samples that the rig would give at the first draw of the parameters, without noise; so has
-    `given`, the motion that the search began with. `before` and `after` are the relative standard deviations with either, of
-    other recordings and priors too. `history` has the criterion as it went, `limits` names what holds the motion back, `notices`
-    what a reader must know.
+    `recording` follows it, and has the samples that the rig would give at the first draw of the parameters, without noise; so
+    has `given`, the motion that the search began with. `before` and `after` are the relative standard deviations with either,
+    from other recordings and priors too. `history` has the criterion as it went, `limits` names what holds the motion back,
+    `notices` what a reader must know.
     """
 
     given: Recording
@@ -76,15 +76,15 @@ class Design:
 
     def excitation(self, given: Excitation) -> Excitation:
         """The motion as an excitation of the paper's rig, after the grasp of the one `given` that the search began with."""
-        since, knots = given.grasp_time + given.settle, {}
-        for axis in ("x", "y"):
-            signal = profile(self.recording.rig.reference, f"{axis}_d")
+        since = (given.grasp_time + given.settle) * (1 + 1e-9)
+
+        def course(name: str) -> tuple[tuple[float, float], ...]:
+            signal = profile(self.recording.rig.reference, name)
             t, v = signal.times.numpy(), signal.values.detach().numpy()
-            begin = v[np.searchsorted(t, since * (1 + 1e-9), side="right") - 1]
-            knots[axis] = tuple(
-                (float(at - since), float(to - begin)) for at, to in zip(t, v) if at > since * (1 + 1e-9)
-            )
-        return given.model_copy(update={"motion": Knots(**knots)})
+            first = int(np.searchsorted(t, since, side="right"))
+            return tuple((float(at - since), float(to - v[first - 1])) for at, to in zip(t[first:], v[first:]))
+
+        return given.model_copy(update={"motion": Knots(x=course("x_d"), y=course("y_d"))})
 
     def table(self) -> str:
         """One line a parameter."""
@@ -97,7 +97,8 @@ class Design:
 
 def draws(problem: Problem, count: int, *, spread: float | None = None, seed: int = 0) -> list[Array]:
     """`count` points x (n,) of the coordinates, the first the nominal one, the others drawn from their priors, or with the
-    standard deviation `spread` [1] of the logarithm of parameters that have none. Raises `ValueError` where there is neither."""
+    standard deviation `spread` [1] of the logarithm of parameters that have none. Raises `ValueError` where there is
+    neither."""
     c, rng = problem.coordinates, np.random.default_rng(seed)
     low, high = c.bounds
     out = [c.start]
@@ -117,7 +118,7 @@ def draws(problem: Problem, count: int, *, spread: float | None = None, seed: in
 
 def design(
     problem: Problem, plan: str, bounds: Mapping[str, Bounds], *, limits: Mapping[str, Range] | None = None,
-    criterion: Criterion = Criterion(), names: Sequence[str] | None = None, at: Sequence[Array] | None = None,
+    criterion: Criterion = VOLUME, names: Sequence[str] | None = None, at: Sequence[Array] | None = None,
     robust: Literal["mean", "worst"] = "mean", iterations: int = 100, starts: int = 1, rate: float = 0.03,
     smoothing: float = 0.02, rtol: float = RTOL, seed: int = 0, workers: int = 1, progress: bool = False,
 ) -> Design:  # fmt: skip
@@ -148,7 +149,9 @@ def design(
     for channel, (low, high) in (limits or {}).items():
         if channel not in recording.channels or not low < high:
             known = ", ".join(recording.channels)
-            raise ValueError(f"limits.{channel} = ({low}, {high}): a limit is (low, high) of a channel of the rig: {known}")
+            raise ValueError(
+                f"limits.{channel} = ({low}, {high}): a limit is (low, high) of a channel of the rig: {known}"
+            )
     began = clock.perf_counter()
     moves = Moves(recording.rig.reference, bounds, float(recording.times[-1]))
     planner = Planner(problem, plan, moves, limits or {}, criterion, names, rtol, workers)
@@ -166,7 +169,9 @@ def design(
             notices = [f"interrupted after {search.iteration} of {iterations} iterations"]
     last = planner.look(search.z, points[0])
     peaks = [f"{name} goes {part:.0%} of the way to its limits" for name, part in last.peaks.items() if part > 0.9]
-    notices += [f"{name} goes beyond its limits, {part:.1%} of the way to them" for name, part in last.peaks.items() if part > 1]
+    notices += [
+        f"{name} goes beyond its limits, {part:.1%} of the way to them" for name, part in last.peaks.items() if part > 1
+    ]
     if search.lost:
         notices.append(f"{search.lost} motions that the search tried could not be run")
     return Design(
@@ -243,7 +248,7 @@ class Search:
                 k = int(np.argmax([one.value for one in looks]))
                 x, there = self.points[k], looks[k]
             else:
-                x = self.points[self.rng.integers(len(self.points))]
+                x = self.points[int(self.rng.integers(len(self.points)))]
                 there = self.planner.look(shifted, x)
             slopes = self.planner.slopes(shifted, x, there)
         except (SimulationFailed, GradientFailed):

@@ -11,6 +11,7 @@ from scipy import stats
 
 from torchsoft import channels
 from torchsoft.parameters import Parameters
+from torchsoft.sysid.misfit import whiteness
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.start import PREFIX
@@ -20,9 +21,6 @@ CONFIDENCE = 0.95
 
 IDENTIFIABLE = 0.5
 """Standard deviation of a coordinate [1] above which it counts as not identifiable: its interval spans a factor of seven."""
-
-LAGS = 20
-"""Autocorrelations that the test of whiteness looks at."""
 
 Number = Annotated[
     float,
@@ -178,22 +176,6 @@ def directions(labels: list[str], values: Array, vectors: Array) -> list[Directi
     return out
 
 
-def autocorrelation(r: Array) -> Array:
-    """Of residuals r (m,) at lags 1, 2, ..., at most `LAGS` and a quarter of the samples."""
-    c = r - r.mean()
-    lags, power = min(LAGS, len(r) // 4), float(c @ c)
-    return np.array([c[k:] @ c[:-k] / power for k in range(1, lags + 1)]) if power > 0 else np.zeros(lags)
-
-
-def whiteness(r: Array) -> tuple[float, float]:
-    """First autocorrelation and Ljung-Box p-value of one channel's residuals (m,)."""
-    rho, m = autocorrelation(r), len(r)
-    if not rho.any():
-        return 0.0, 1.0
-    Q = m * (m + 2) * float((rho**2 / (m - np.arange(1, len(rho) + 1))).sum())
-    return float(rho[0]), float(stats.chi2.sf(Q, len(rho)))
-
-
 def split(problem: Problem, r: Array, which: list[str]) -> dict[tuple[str, str], Array]:
     """Rows (m, ...) of residuals, or of their Jacobian, by recording and channel, in the order of `Problem.residuals`."""
     out, at = {}, 0
@@ -218,7 +200,8 @@ def nrmse(problem: Problem, r: Array, which: list[str]) -> dict[str, dict[str, f
 
 
 def residual_channels(problem: Problem, residuals: Residuals, which: list[str]) -> list[ChannelResiduals]:
+    orders = {channel: noise.order for channel, noise in problem.noise.items()}
     return [
-        ChannelResiduals(name, channel, float(np.sqrt(np.mean(r**2))), *whiteness(r))
+        ChannelResiduals(name, channel, float(np.sqrt(np.mean(r**2))), *whiteness(r, orders.get(channel, 0)))
         for (name, channel), r in split(problem, residuals.r, which).items()
     ]

@@ -12,7 +12,8 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullForm
 from torchsoft.channels import unit
 from torchsoft.plot.figures import ACTUAL, DESIRED, OTHER, STYLE
 from torchsoft.sysid.answer import Answer
-from torchsoft.sysid.estimate import IDENTIFIABLE, LAGS, ChannelResiduals, Direction, Estimate, autocorrelation
+from torchsoft.sysid.estimate import IDENTIFIABLE, ChannelResiduals, Direction, Estimate
+from torchsoft.sysid.misfit import LAGS, autocorrelation
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.profile import RISE, Profile
 from torchsoft.sysid.recording import Array
@@ -170,7 +171,8 @@ def contributions_figure(result: Answer) -> Figure | None:
     figure = Figure(figsize=(WIDTH, 0.8 + 0.42 * len(labels) + 0.2 * len(shares)), layout="constrained")
     axes, left = figure.subplots(), np.zeros(len(labels))
     for name, colour, part in shares:
-        axes.barh(range(len(labels)), part, left=left, height=0.6, color=colour, label=literal(name, 60))
+        label = f" {literal(name, 60)}"  # matplotlib does not show those that begin with _
+        axes.barh(range(len(labels)), part, left=left, height=0.6, color=colour, label=label)
         left += part
     axes.set(xlim=(0, 1), ylim=(len(labels) - 0.4, -0.6))
     axes.set_yticks(range(len(labels)), [literal(label, NAME) for label in labels])

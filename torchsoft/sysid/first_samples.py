@@ -1,7 +1,8 @@
 """Where a run begins, from the first samples of its recording: these tell it, and then do not count.
 
 Coordinates that sensors measure, and their rates, are those of a cubic through the samples, with several times its
-error and with what may be wrong with the sensor. Stretches are anything that friction lets stand."""
+error and with what may be wrong with the sensor. Stretches are anything that friction lets stand.
+"""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -53,7 +54,8 @@ def begin_underway(
     the contacts roll.
 
     Raises `ValueError` for fewer than four early samples of a channel or two later ones, a coordinate that is neither
-    measured nor given nor can be assumed, and a delay that may be longer than `lead`."""
+    measured nor given nor can be assumed, a delay that may be longer than `lead`, and pads that cannot be settled.
+    """
     rig, first, whose = recording.rig, float(recording.times[0]), f"recording `{recording.name}`"
     late = {channel: t >= first + lead - SAME for channel, (t, _) in recording.samples.items()}
     if strange := [name for name in given or {} if name not in free_coordinates(rig)]:
@@ -185,7 +187,7 @@ def unstretched(rig: Rig, pose: dict[str, Tensor], velocity: dict[str, Tensor]) 
     none = {name: torch.zeros_like(rig.weight(name)) for name in rig.contacts}
     try:
         y = settled(rig, pose, velocity, none).detach()
-    except NoEquilibrium as error:
+    except (NoEquilibrium, NotImplementedError) as error:
         raise ValueError(f"the run cannot begin there: {error}") from None
     return rig.unpack(y)._replace(pose=pose, velocity=velocity)
 

@@ -31,12 +31,15 @@ def shift(J: Array, difference: Array) -> Array:
 CLOSER = 3.0
 """How many times better than each of its parameters a combination must be known, to be worth a sentence."""
 
-AS_GOOD, WELL = 1.3, 0.1
-"""How much larger the standard deviation of a combination may become by rounding its exponents, and the part of its parameters'
-own below which it is small enough whatever it was."""
+AS_GOOD = 1.3
+"""How much larger the standard deviation of a combination may become by rounding its exponents."""
 
-EXPONENTS = (1.0, 0.5, 0.25, 0.1)
-"""What exponents are rounded to multiples of, the roundest first."""
+MINE = 0.7
+"""Correlation of a parameter with a direction above which its uncertainty comes from there."""
+
+EXPONENTS = {1.0: 0.1, 0.5: 0.1, 0.1: 1 / CLOSER}
+"""What exponents are rounded to multiples of, the roundest first, and the part of its parameters' least standard deviation that
+a combination may then have whatever it had."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,7 @@ class Combination:
 
 def percent(sd: float) -> str:
     """A relative standard deviation."""
-    return f"{sd:.2g}" if sd >= 10 else f"{100 * sd:.2g} %"
+    return "not at all" if sd >= 10 else f"{100 * sd:.2g} %"
 
 
 def combinations(labels: Sequence[str], C: Array, blurred: float) -> list[Combination]:
@@ -78,7 +81,7 @@ def combinations(labels: Sequence[str], C: Array, blurred: float) -> list[Combin
     values, vectors = np.linalg.eigh(C)
     out: list[Combination] = []
     for k in np.argsort(values)[::-1]:
-        part = np.flatnonzero(np.abs(vectors[:, k]) > 0.2)
+        part = np.flatnonzero(np.abs(vectors[:, k]) * np.sqrt(values[k] / np.diag(C)) > MINE)
         if values[k] < blurred**2 or len(part) < 2:
             continue
         own = C[np.ix_(part, part)]
@@ -98,9 +101,9 @@ def combinations(labels: Sequence[str], C: Array, blurred: float) -> list[Combin
 def rounded(direction: Array, C: Array) -> Array:
     """A direction (n,) whose largest component is 1, the others rounded as far as the variance in C (n, n) allows."""
     exact = direction / direction[np.argmax(np.abs(direction))]
-    limit = max(AS_GOOD**2 * float(exact @ C @ exact), WELL**2 * float(np.diag(C).min()))
-    for part in EXPONENTS:
+    own, least = float(exact @ C @ exact), float(np.diag(C).min())
+    for part, small in EXPONENTS.items():
         p = part * np.round(exact / part)
-        if float(p @ C @ p) <= limit:
+        if float(p @ C @ p) <= max(AS_GOOD**2 * own, small**2 * least):
             return p
     return np.round(exact, 3)

@@ -1,7 +1,7 @@
 """What a designed motion may do: knots of a reference's profiles as variables, within bounds of travel, speed and duration.
 
-Between knots a profile is monotone and its speed peaks at `PEAK` times the mean one, so that these bounds hold everywhere when they
-hold at the knots, and are linear in values and times of the knots.
+Between knots a profile is monotone and its speed peaks at `PEAK` times the mean one: the bounds hold everywhere when they hold
+from knot to knot, and are linear in values and times of the knots.
 """
 
 from collections.abc import Mapping
@@ -112,7 +112,7 @@ class Moves:
         return Reference(**signals)
 
     def _excess(self, z: Array) -> Array:
-        """What must not be positive, over its unit: beyond the bounds, faster than allowed, closer than `shortest`, too late."""
+        """What must not be positive: beyond the bounds, faster than allowed, closer than `shortest`, too late."""
         rows = []
         for name, (times, values) in self.split(z).items():
             one, (known_times, known_values, first) = self.bounds[name], self.knots[name]

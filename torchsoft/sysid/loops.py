@@ -1,35 +1,25 @@
 """Do the measured force, the measured coordinate and the set-point of a control loop belong together?
 
-The law of an actuator is known. So a recording that has its force and the coordinate that it measures is held against it without
-a run: means over windows of time of both sides agree within the sensors' noise. Where they do not, one thing at a time is taken
-to be otherwise: the sign of the force, the body that the loop senses, a zero, a factor, a time, what is fed forward.
+The law of an actuator is known. So a recording that has its force and the coordinate that it measures is held against it
+without a run: means over windows of time of both sides agree within the sensors' noise. Where they do not, one thing at a
+time is taken to be otherwise: the sign of the force, the body that the loop senses, a zero, a factor, a time, what is fed
+forward.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from scipy.interpolate import CubicSpline, PPoly
 
 from torchsoft.channels import unit
-from torchsoft.physics.parts import Actuator
 from torchsoft.physics.paper import SoftGrasp
+from torchsoft.physics.parts import Actuator
 from torchsoft.physics.rig import Rig
+from torchsoft.sysid.closed_loop import Loop, channel, sampled, windows
 from torchsoft.sysid.finding import Finding, confusions
-from torchsoft.sysid.recording import REACH, Array, Recording
+from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.unknowns import Sensor
-
-WINDOW = 20e-3
-"""Length [s] of a window, or four samples where that is longer."""
-
-INSIDE = 16
-"""Points of a window at which the reference is evaluated."""
-
-FEWEST = 8
-"""Windows without which nothing is said."""
 
 ROUGH = 0.03
 """Part of the force by which both sides may differ besides the noise: drives are not exact."""
@@ -38,7 +28,7 @@ SURE = 5.0
 """Standard deviations from which a mean, a factor or a time is called different."""
 
 EXPLAINED = 0.15
-"""Part of a disagreement that may be left by what explains it."""
+"""Part of a disagreement, and of the force, that may be left by what explains it."""
 
 SLOW = 0.3
 """Part of a disagreement by which it may change from window to window where a force fed forward is missing."""
@@ -56,74 +46,6 @@ RESIZED = 5.0
 """Largest factor on a force that is not one of mistaken units."""
 
 
-class Signal(NamedTuple):
-    """A channel's samples: times (k,) [s], values (k,), the standard deviation of their noise, and the sensor."""
-
-    channel: str
-    t: Array
-    y: Array
-    sensor: Sensor
-
-    @property
-    def spacing(self) -> float:
-        return float(np.median(np.diff(self.t)))
-
-
-@dataclass(frozen=True)
-class Loop:
-    """An actuator with its force F and the coordinate x that it measures, over windows between `edges` (w + 1,) [s]; `keep` (w,)
-    are those n that both have samples in. `reference` gives set-point and force fed forward (..., 2) at times."""
-
-    actuator: Actuator
-    reference: Callable[[Array], Array]
-    F: Signal
-    x: Signal
-    edges: Array
-    keep: Array
-    reach: float
-
-    @cached_property
-    def width(self) -> Array:
-        return np.diff(self.edges)[self.keep]
-
-    @cached_property
-    def curves(self) -> tuple[PPoly, PPoly, PPoly]:
-        """Integral of the force, integral of the coordinate, the coordinate."""
-        F, x = (CubicSpline(one.t, one.y) for one in (self.F, self.x))
-        return F.antiderivative(), x.antiderivative(), x
-
-    def force(self, late: float = 0.0) -> Array:
-        """Mean of the force over each window (n,), if its samples are `late` [s]."""
-        return self._over(self.curves[0](self.edges + late))
-
-    def asked(self, late: float = 0.0) -> Array:
-        """Set-point, its rate, and the force fed forward (n, 3)."""
-        inside = np.linspace(self.edges[:-1], self.edges[1:], 2 * INSIDE + 1)[1::2]
-        mean, ends = self.reference(inside + late).mean(0)[self.keep], self.reference(self.edges + late)[:, 0]
-        return np.stack((mean[:, 0], self._over(ends), mean[:, 1]), -1)
-
-    def found(self, late: float = 0.0) -> Array:
-        """The coordinate and its rate (n, 2)."""
-        return np.stack([self._over(one(self.edges + late)) for one in self.curves[1:]], -1)
-
-    def _over(self, at_edges: Array) -> Array:
-        return np.diff(at_edges)[self.keep] / self.width
-
-    def given(self, asked: Array, found: Array) -> Array:
-        """The force that the law gives (n,)."""
-        return self.actuator(torch.from_numpy(np.concatenate((asked, found), -1))).detach().numpy()
-
-    @cached_property
-    def noise(self) -> tuple[float, float]:
-        """How uncertain noise makes the difference of both sides, rms [N], and how much force the law gives per coordinate."""
-        inputs = torch.from_numpy(np.concatenate((self.asked(), self.found()), -1)).requires_grad_(True)
-        (slope,) = torch.autograd.grad(self.actuator(inputs).sum(), inputs)
-        by_x, by_v = slope[:, 3].numpy(), slope[:, 4].numpy()
-        F, x = ((one.sensor.noise**2, one.spacing / self.width) for one in (self.F, self.x))
-        variance = F[0] * F[1] + x[0] * (by_x**2 * x[1] + 2 * by_v**2 / self.width**2)
-        return float(np.sqrt(variance.mean())), float(np.abs(by_x).mean())
-
-
 class Change(NamedTuple):
     """One thing that may be otherwise: what, as a clause, what is left of the disagreement [N], and whether it is grave."""
 
@@ -135,45 +57,6 @@ class Change(NamedTuple):
 
 def rms(e: Array) -> float:
     return float(np.sqrt(np.mean(e**2)))
-
-
-def channel(rig: Rig, name: str) -> str:
-    """The channel of a coordinate such as "disc.x", or of the force of an actuator such as "x"."""
-    body, _, axis = name.partition(".")
-    own = f"{axis}_{rig.symbols[body]}" if axis else f"F_{body}"
-    return rig.renamed.get(own, own)
-
-
-def sampled(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> Signal | None:
-    """The samples of a coordinate or a force whose sensor sees nothing else and is never saturated, or None."""
-    own = channel(recording.rig, name)
-    if own not in recording.samples or own not in sensors:
-        return None
-    one, (t, y) = sensors[own], recording.samples[own]
-    low, high = -np.inf if one.low is None else one.low, np.inf if one.high is None else one.high
-    clean = one.inertia == 0 and one.misalignment == 0 and low < y.min() and y.max() < high and len(t) > 3
-    return Signal(own, t, y, one) if clean else None
-
-
-def windows(recording: Recording, actuator: Actuator, F: Signal | None, x: Signal | None) -> Loop | None:
-    """The loop of two signals over windows that both have samples in; None where there are too few of them."""
-    if F is None or x is None:
-        return None
-    length = max(WINDOW, 4 * F.spacing, 4 * x.spacing)
-    first, last = max(F.t[0], x.t[0]), min(F.t[-1], x.t[-1])
-    reach = min(REACH, (last - first) / 8)
-    count = int((last - first - 2 * reach) / length)
-    if count < FEWEST:
-        return None
-    edges = first + reach + length * np.arange(count + 1)
-    keep = np.logical_and.reduce([np.diff(np.searchsorted(s.t, edges)) * s.spacing > 0.5 * length for s in (F, x)])
-    names = [actuator.setpoint, *([actuator.feed_forward] if actuator.feed_forward else [])]
-
-    def reference(t: Array) -> Array:
-        at = recording.rig.reference(torch.from_numpy(np.ascontiguousarray(t)), names).detach().numpy()[..., 0]
-        return at if actuator.feed_forward else np.stack((at[..., 0], np.zeros(t.shape)), -1)
-
-    return Loop(actuator, reference, F, x, edges, keep, reach) if keep.sum() >= FEWEST else None
 
 
 def loop_findings(
@@ -191,10 +74,8 @@ def loop_findings(
         body, _, axis = actuator.measures.partition(".")
         others = {one: f"{one}.{axis}" for one in rig.bodies if one != body}
         rivals = {o: windows(recording, actuator, F, sampled(recording, sensors, x)) for o, x in others.items()}
-        found = disagreement(
-            rig, loop, body, {k: v for k, v in rivals.items() if v is not None},
-            any(id(p) in tensors for p in actuator.parameters()),
-        )  # fmt: skip
+        loop, free = with_its_lag(loop), any(id(p) in tensors for p in actuator.parameters())
+        found = disagreement(rig, loop, body, {k: v for k, v in rivals.items() if v is not None}, free)
         if found is not None:
             e = loop.force() - loop.given(loop.asked(), loop.found())
             text = (
@@ -205,14 +86,22 @@ def loop_findings(
             yield Finding(found.what, recording.name, text, found.grave)
 
 
+def with_its_lag(loop: Loop) -> Loop:
+    """The loop with the force as late as fits best, of what its sensors declare."""
+    reach = loop.F.sensor.delay + loop.x.sensor.delay
+    given = loop.given(loop.asked(), loop.found())
+    tried = [replace(loop, lag=lag) for lag in np.linspace(-reach, reach, SHIFTS)] if reach > 0 else [loop]
+    return min(tried, key=lambda one: rms(one.beyond(one.force() - given)[one.inner]))
+
+
 def disagreement(rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop], free: bool) -> Change | None:
     """What is wrong with the loop about a body, if anything is; `free` gains tell only the sign, and what is sensed."""
     F, given = loop.force(), loop.given(loop.asked(), loop.found())
-    e, (noise, _) = F - given, loop.noise
+    e, (noise, _) = loop.beyond(F - given), loop.noise
     limit = 2 * noise + ROUGH * rms(F)
     changes = [flipped(loop, F, given), *sensed(rig, loop, body, rivals)]
     if free:
-        as_it_is, *changes = (scaled(change, F) for change in (Change("", "", e), *changes))
+        as_it_is, *changes = (scaled(change, F) for change in (Change("", "", F - given), *changes))
         best = min(changes, key=left)
         clear = left(as_it_is) > limit and left(best) < min(0.5 * left(as_it_is), 0.5 * rms(F))
         return best if clear else None
@@ -225,7 +114,7 @@ def disagreement(rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop], fr
     for more in (lambda: [], lambda: [shifted(loop)]):  # which takes longer
         changes += more()
         best = min(changes, key=left)
-        if left(best) <= max(limit, EXPLAINED * rms(e)) and left(best) < 0.5 * rms(e):
+        if left(best) <= max(limit, EXPLAINED * min(rms(e), rms(F))) and left(best) < 0.5 * rms(e):
             return best
     return missing or Change(
         f"loop of {loop.F.channel}",
@@ -245,7 +134,7 @@ def scaled(change: Change, F: Array) -> Change:
 
 def flipped(loop: Loop, F: Array, given: Array) -> Change:
     name = loop.F.channel
-    return Change(f"sign of {name}", f"{name} looks as if its sign were opposite", -F - given, True)
+    return Change(f"sign of {name}", f"{name} looks as if its sign were opposite", loop.beyond(-F - given), True)
 
 
 def sensed(rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop]) -> Iterator[Change]:
@@ -254,22 +143,28 @@ def sensed(rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop]) -> Itera
         count = min(len(its.edges), len(loop.edges))
         if count != len(its.edges) or not np.allclose(its.edges, loop.edges):
             continue
-        F = its.force()
-        yield another_sense(rig, loop.actuator, body, other, F - its.given(its.asked(), its.found()))
+        e = its.beyond(its.force() - its.given(its.asked(), its.found()))
+        yield another_sense(rig, loop.actuator, body, other, e)
 
 
 def another_sense(rig: Rig, actuator: Actuator, body: str, other: str, left: Array) -> Change:
     paper = isinstance(rig, SoftGrasp) and actuator.measures.endswith(".x")
-    remedy = f': control.senses = "{other}"' if paper else ""
-    said = f"{actuator.setpoint} looks like the set-point of the {other}, not of the {body}{remedy}"
+    axis = actuator.measures.partition(".")[2]
+    remedy = f' (say control.senses = "{other}")' if paper else ""
+    said = (
+        f"{actuator.setpoint} looks like the set-point of the {other}, not of the {body}{remedy}; or are "
+        f"{channel(rig, f'{body}.{axis}')} and {channel(rig, f'{other}.{axis}')} exchanged?"
+    )
     return Change("control.senses" if paper else f"what {actuator.setpoint} is of", said, left, True)
 
 
 def offset(loop: Loop, e: Array) -> Change:
     """A constant more of the force, or of the coordinate."""
     F, x, mean, (_, gain) = loop.F.channel, loop.x.channel, float(e.mean()), loop.noise
-    zeros = f", or {x} and {loop.actuator.setpoint} have zeros {abs(mean) / gain:.3g} {unit(x)} apart" if gain > 0 else ""
-    return Change(f"zero of {F}", f"{F} reads {mean:+.3g} {unit(F)} too much{zeros}", e - mean)
+    zeros = (
+        f", or {x} and {loop.actuator.setpoint} have zeros {abs(mean) / gain:.3g} {unit(x)} apart" if gain > 0 else ""
+    )
+    return Change(f"zero of {x}", f"{F} reads {mean:+.3g} {unit(F)} too much{zeros}", e - mean)
 
 
 def resized(loop: Loop, F: Array, given: Array) -> Iterator[Change]:
@@ -277,17 +172,17 @@ def resized(loop: Loop, F: Array, given: Array) -> Iterator[Change]:
     g, name = float(F @ given) / float(given @ given), loop.F.channel
     for factor, words in confusions(name):
         said = f"{name} looks as if it were in another unit: {words}"
-        yield Change(f"unit of {name}", said, F / factor - given, True)
+        yield Change(f"unit of {name}", said, loop.beyond(F / factor - given), True)
     if 1 / RESIZED < g < RESIZED:
         said = f"{name} is {g:.4g} times what it should be: is that its gain, or the controller's?"
-        yield Change(f"size of {name}", said, F / g - given)
+        yield Change(f"size of {name}", said, loop.beyond(F / g - given))
 
 
 def feed_flipped(loop: Loop, F: Array) -> Iterator[Change]:
     """The opposite of what is fed forward."""
     if name := loop.actuator.feed_forward:
         given = loop.given(loop.asked() * [1, 1, -1], loop.found())
-        yield Change(f"sign of {name}", f"{name} looks as if its sign were opposite", F - given, True)
+        yield Change(f"sign of {name}", f"{name} looks as if its sign were opposite", loop.beyond(F - given), True)
 
 
 def shifted(loop: Loop) -> Change:
@@ -300,12 +195,13 @@ def shifted(loop: Loop) -> Change:
     }
     made, times = [], np.linspace(-loop.reach, loop.reach, SHIFTS)
     for name, rest in tried.items():
-        square = [rms(rest(late)) ** 2 for late in times]
+        square = [rms(loop.beyond(rest(late))[loop.inner]) ** 2 for late in times]
         i = int(np.clip(np.argmin(square), 1, SHIFTS - 2))
         before, here, after = square[i - 1 : i + 2]
         bend = before - 2 * here + after
         late = float(times[i] + (0.5 * (before - after) / bend * (times[1] - times[0]) if bend > 0 else 0.0))
-        made.append(Change(name, f"{name} is {1e3 * abs(late):.3g} ms {'late' if late > 0 else 'early'}", rest(late)))
+        side = "late" if late > 0 else "early"
+        made.append(Change(name, f"{name} is {1e3 * abs(late):.3g} ms {side}", loop.beyond(rest(late))[loop.inner]))
     best = min(made, key=left)
     return best._replace(
         what=f"time of {best.what}", said=" or ".join(one.said for one in made if left(one) <= AS_GOOD * left(best))
@@ -327,17 +223,14 @@ def fed_forward(loop: Loop, e: Array) -> Change | None:
 
 def fine(loop: Loop, F: Array, given: Array) -> Change | None:
     """A zero, a factor or a time that is off by more than its own uncertainty, where both sides agree roughly."""
-    e, n, (noise, gain) = F - given, len(F), loop.noise
-    known = loop.F.sensor.bias + gain * loop.x.sensor.bias
-    if loop.F.sensor.drift or loop.x.sensor.drift or loop.x.sensor.gain:
-        return None
-    if abs(e.mean()) > SURE * noise / np.sqrt(n) + 0.02 * rms(F) + known:
+    e, n, (noise, _) = loop.beyond(F - given), len(F), loop.noise
+    if abs(e.mean()) > SURE * noise / np.sqrt(n) + 0.02 * rms(F):
         return fed_forward(loop, e) or offset(loop, e)
-    off, by_noise = float(F @ given) / float(given @ given) - 1.0, noise / max(rms(given), 1e-300)
-    if abs(off) > ROUGH + SURE * by_noise / np.sqrt(n) + 2 * by_noise**2 + loop.F.sensor.gain:
+    off, by_noise = float(e @ given) / float(given @ given), noise / max(rms(given), 1e-300)
+    if abs(off) > ROUGH + SURE * by_noise / np.sqrt(n) + 2 * by_noise**2:
         return next((one for one in resized(loop, F, given) if not one.grave), None)
-    slope = (loop.force(LATE) - loop.force(-LATE)) / (2 * LATE)
-    late, sd = float(e @ slope / (slope @ slope)), noise / max(float(np.sqrt(slope @ slope)), 1e-300)
-    if abs(late) > LATE + SURE * sd + loop.F.sensor.delay + loop.x.sensor.delay:
+    slope = ((loop.force(LATE) - loop.force(-LATE)) / (2 * LATE))[loop.inner]
+    late, sd = float(e[loop.inner] @ slope / (slope @ slope)), noise / max(float(np.sqrt(slope @ slope)), 1e-300)
+    if abs(late) > LATE + SURE * sd:
         return best if left(best := shifted(loop)) < 0.8 * rms(e) else None
     return None

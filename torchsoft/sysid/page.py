@@ -59,12 +59,13 @@ def picture(figure: Figure, alt: str, caption: str = "", kind: str = "") -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Cell]], caption: str = "") -> str:
-    """Numbers to the right; columns without anything in them are left out."""
+    """Numbers to the right, but for the first column; columns without anything in them are left out."""
     kept = [i for i in range(len(head)) if any(text_of(row[i]) for row in rows)]
-    numeric = {i for i in kept if any(kind_of(row[i]) == "n" for row in rows)}
+    numeric = {i for i in kept[1:] if any(kind_of(row[i]) == "n" for row in rows)}
 
     def cell(i: int, value: Cell) -> str:
-        return f'<td class="{kind_of(value)}" data-label="{escape(head[i])}">{escape(text_of(value))}</td>'
+        kind = "" if i == kept[0] and isinstance(value, str) else kind_of(value)
+        return f'<td class="{kind}" data-label="{escape(head[i])}">{escape(text_of(value))}</td>'
 
     top = "".join(f'<th scope="col" class="{"n" if i in numeric else ""}">{escape(head[i])}</th>' for i in kept)
     body = "".join(f"<tr>{''.join(cell(i, row[i]) for i in kept)}</tr>" for row in rows)

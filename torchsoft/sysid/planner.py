@@ -54,6 +54,7 @@ class Look(NamedTuple):
     steps: Frozen
     signals: Signals
 
+
 class Planner:
     """The criterion of motions of one recording of a problem, and its slopes by their knots."""
 

@@ -32,6 +32,9 @@ EFFICIENT = 0.5
 SAME = 1e-6
 """Difference of logarithms of weights below which they are all the same."""
 
+ALIKE = 0.9
+"""The same, above which weights are so much alike that the shape of their tail tells nothing."""
+
 LEAST = -700.0
 """Logarithm of a weight over the largest that is as good as zero."""
 
@@ -157,7 +160,7 @@ def laplace(o: Optimum, *, draws: int = 400, seed: int = 0, progress: bool = Fal
     w, k_hat = importance(log_p - log_q)
     share, limit = 1.0 / float(draws * (w @ w)), min(K_HAT, 1 - 1 / np.log10(draws))
     notices = notices_on_runs(o, lost, draws)
-    if k_hat > limit:
+    if k_hat > limit and share < ALIKE:
         notices.append(
             f"Laplace's approximation is not to be trusted here: the tail of its importance weights has k = {k_hat:.2g} "
             f"(at most {limit:.2g}); use NUTS"
@@ -191,15 +194,17 @@ def importance(log_weights: Array) -> tuple[Array, float]:
 
 def inside(rng: np.random.Generator, mean: Array, C: Array, low: Array, high: Array, count: int) -> tuple[Array, Array]:
     """Normal draws (count, n) with covariance C (n, n) that lie between bounds, and the standard normal ones behind them."""
-    noise = rng.standard_normal((round(count / WITHIN), len(mean)))
-    z = mean + noise @ np.linalg.cholesky(C).T
-    kept = np.flatnonzero(((z >= low) & (z <= high)).all(-1))[:count]
+    L, kept, tried = np.linalg.cholesky(C).T, np.zeros((0, len(mean))), 0
+    while len(kept) < count and tried < count / WITHIN:
+        noise = rng.standard_normal((4 * count, len(mean)))
+        z = mean + noise @ L
+        kept, tried = np.concatenate((kept, noise[((z >= low) & (z <= high)).all(-1)])), tried + len(noise)
     if len(kept) < count:
         raise ValueError(
             f"fewer than one in {1 / WITHIN:.0f} draws of the Gaussian at the optimum lie within the bounds: the data do not "
             "determine all coordinates, and Laplace's approximation says nothing; use NUTS, or priors"
         )
-    return z[kept], noise[kept]
+    return mean + kept[:count] @ L, kept[:count]
 
 
 def steps_off(o: Optimum, z: Array) -> float:

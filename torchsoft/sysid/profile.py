@@ -13,7 +13,7 @@ from scipy import stats
 from scipy.interpolate import PchipInterpolator
 from tqdm import tqdm
 
-from torchsoft.sysid.fit import Unreachable, gauss_newton, newton_step
+from torchsoft.sysid.fit import gauss_newton, newton_step
 from torchsoft.sysid.optimum import CHOSEN_ANEW, Optimum
 from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.recording import Array
@@ -27,6 +27,9 @@ STRIDE = 0.5
 
 POINTS = 12
 """Most points to either side."""
+
+ROUNDS = 5
+"""Most steps of Gauss-Newton to a point."""
 
 BEYOND = (RISE**0.5 + STRIDE) ** 2
 """Rise above which a point lies too far beyond the end of the interval to tell where that is."""
@@ -140,27 +143,28 @@ def refit(o: Optimum, i: int, here: Point, aim: float) -> tuple[Point | None, st
         tangent = -np.linalg.lstsq(here.at.J[:, others], here.at.J[:, i], rcond=None)[0]
         x[others] = np.clip(x[others] + tangent * (aim - x[i]), low[others], high[others])
     x[i] = aim
-    for fitted in (False, True):
-        at = o.residuals(x, derivatives=True)
+    at = o.residuals(x, derivatives=True)
+    for _ in range(ROUNDS):
         if at.lost:
             return None, next(iter(at.lost.values())).reason
-        step = newton_step(o.problem, x, at, others)
+        step, square = newton_step(o.problem, x, at, others), float(at.r @ at.r)
         predicted = at.r + at.J[:, others] @ step
-        gain = float(at.r @ at.r - predicted @ predicted)
+        gain = square - float(predicted @ predicted)
+        x = x.copy()
         if gain < FITTED:
             x[others] += step
-            return Point(x, (float(at.r @ at.r) - gain - o.square) / o.variance, at), ""
-        if fitted:
-            break
-        try:
-            fit = gauss_newton(
+            return Point(x, (square - gain - o.square) / o.variance, at), ""
+        ahead = x.copy()
+        ahead[others] += step
+        there = o.residuals(ahead, derivatives=True)
+        if there.lost or there.r @ there.r > square - 0.1 * gain:  # the Jacobian does not hold as far as that
+            ahead = gauss_newton(
                 o.problem, o.runner, x, which=o.which, free=others, steps=o.steps, first=at, evaluations=10,
-                tolerance=1e-3 * FITTED / float(at.r @ at.r),
-            )  # fmt: skip
-        except Unreachable as lost:
-            return None, str(lost)
-        x = fit.x.copy()
-        x[i] = aim
+                tolerance=0.1 * FITTED / square,
+            ).x  # fmt: skip
+            ahead[i] = aim
+            there = o.residuals(ahead, derivatives=True)
+        x, at = ahead, there
     return None, "the other coordinates could not be fitted there"
 
 

@@ -14,21 +14,7 @@ from torchsoft.physics.rig import Rig
 from torchsoft.sysid.answer import Answer, AssumptionCheck, ChannelNoise, FittedCoordinate, OrderTried
 from torchsoft.sysid.checks import Check
 from torchsoft.sysid.contribution import contributions
-from torchsoft.sysid.estimate import (
-    CONFIDENCE,
-    IDENTIFIABLE,
-    LAGS,
-    ChannelResiduals,
-    Direction,
-    Estimate,
-    autocorrelation,
-    directions,
-    estimates,
-    nrmse,
-    residual_channels,
-    split,
-    whiteness,
-)
+from torchsoft.sysid.estimate import Estimate, directions, estimates, nrmse, residual_channels
 from torchsoft.sysid.information import Combination, combinations
 from torchsoft.sysid.noise import Score
 from torchsoft.sysid.problem import Problem
@@ -36,8 +22,7 @@ from torchsoft.sysid.recorded import RecordedRig, recorded_rigs
 from torchsoft.sysid.recording import Array
 
 __all__ = [
-    "CONFIDENCE", "IDENTIFIABLE", "LAGS", "ChannelResiduals", "Direction", "Estimate", "IdentificationResult",
-    "autocorrelation", "described", "directions", "estimates", "nrmse", "residual_channels", "split", "whiteness",
+    "Estimate", "IdentificationResult", "described", "directions", "estimates", "nrmse", "residual_channels",
 ]  # fmt: skip
 
 BLURRED = 0.1

@@ -86,7 +86,7 @@ def estimates(result: Answer) -> Iterator[str]:
     for caption, group in groups.items():
         rows = [
             [
-                e.name, e.recording or "", *found(e), interval(*profiled[e.label]) if e.label in profiled else "",
+                e.name, ("", e.recording or ""), *found(e), interval(*profiled[e.label]) if e.label in profiled else "",
                 interval(*posterior[e.label]) if e.label in posterior else "", "" if e.unit == "1" else e.unit,
                 "" if e.start is None else grouped(e.start), prior(e), ("weak", "at a bound") if e.at_bound else "",
             ]
@@ -146,13 +146,16 @@ def told(result: Answer) -> Iterator[str]:
 def identifiable(result: Answer) -> Iterator[str]:
     """Directions and correlations, in words first."""
     yield heading("What is identifiable, and what is not")
-    if result.combinations:
-        yield listing(f"{one.sentence}." for one in result.combinations)
+    weak = [direction_name(d) for d in result.directions if not d.identifiable]
+    words = [one.sentence for one in result.combinations] + [
+        f"{name} may change without a trace in the data" for name in weak
+    ]
+    if words:
+        yield listing(words)
     yield paragraph(
         "Each bar is a combination of parameters (of their logarithms) that the data determine on its own: the shorter, the "
         "better. Long orange bars are combinations that may change without a trace in the data."
     )
-    weak = [direction_name(d) for d in result.directions if not d.identifiable]
     spectrum = "; ".join(f"{direction_name(d)}: standard deviation {d.sd:.2g}" for d in result.directions)
     ends = f". Not identifiable: {'; '.join(weak)}" if weak else ". All are identifiable"
     shown = picture(spectrum_figure(result), f"Fisher spectrum: {spectrum}{ends}", "Fisher spectrum")
@@ -200,10 +203,11 @@ def taken_for_granted(result: Answer) -> Iterator[str]:
     for i in np.argsort([-m for m in most], kind="stable"):
         one = result.assumptions[i]
         label = max(one.moves, key=lambda name: abs(one.moves[name]), default="")
-        amount = ""
-        if not one.unchecked and one.kind in ("known", "sensor") and np.isfinite(one.asked_sd):
-            amount = f" {signed(one.asked)} ± {grouped(one.asked_sd, 2)} {one.unit}".rstrip()
-        asks: Cell = f"no:{amount}" if amount else "no"
+        amount, measured = "", one.kind in ("known", "sensor")
+        if np.isfinite(one.asked_sd) and not one.unchecked:
+            by = one.unit if measured else "of that"
+            amount = f" {signed(one.asked)} ± {grouped(one.asked_sd, 2)} {by}".rstrip()
+        asks: Cell = f"no:{amount}" if amount else "they cannot tell"
         if one.suspected:
             asks = "weak", f"yes{amount}: the sum of squares would fall by {one.gain:.0f}"
         if one.unchecked:
@@ -295,7 +299,7 @@ def made(result: Answer) -> Iterator[str]:
     yield heading("How it was made")
     rows = [
         [one.name, "fitted" if one.fitted else "held out", f"{one.duration:.4g} s", str(one.samples), one.rig, one.start,
-         one.fingerprint[:12]] for one in result.recordings
+         ("", one.fingerprint[:12])] for one in result.recordings
     ]  # fmt: skip
     yield table(["recording", "used", "length", "samples", "rig", "begins", "fingerprint"], rows)
     by = result.made_by

@@ -1,9 +1,9 @@
 """Are recorded set-points close enough together for their motion, and are their rates theirs?
 
-A recorded signal is known at its rows only; a cubic stands between them. What that gets wrong is estimated from the rows: without
-every second one, and without three in four, the cubic gets more wrong, by an order that is observed. It is told in units of what
-it does: how far off the set-point is, against the noise of the sensor of that coordinate, and what the controller makes
-of it and of its rate, against the noise of the force.
+A recorded signal is known at its rows only; a cubic stands between them. What that gets wrong is estimated from the rows:
+without every second one, and without three in four, the cubic gets more wrong, by an order that is observed. It is told in
+units of what it does: how far off the set-point is, against the noise of the sensor of that coordinate, and what the
+controller makes of it and of its rate, against the noise of the force.
 """
 
 from collections.abc import Iterator, Mapping
@@ -17,8 +17,8 @@ from torch import Tensor, nn
 from torchsoft.channels import unit
 from torchsoft.physics.motion import Sampled
 from torchsoft.physics.parts import Actuator
+from torchsoft.sysid.closed_loop import channel
 from torchsoft.sysid.finding import Finding
-from torchsoft.sysid.loops import channel
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.unknowns import Sensor
 
@@ -36,7 +36,7 @@ BETWEEN = (0.0, 0.25, 0.5, 0.75)
 """Where between rows signals are compared."""
 
 OTHER_RATE = 0.25
-"""Part of a rate by which it may differ from that of the spline through the values."""
+"""Part of a rate by which it may differ from that of the spline through the values, which must be sure to half of it."""
 
 
 class Gap(NamedTuple):
@@ -51,7 +51,7 @@ class Gap(NamedTuple):
 def cubic(signal: Sampled, every: int, derived: bool) -> Sampled:
     """The signal by one in so many rows; rates that were `derived` from all rows are derived from these."""
     rates = None if derived else signal.rates[::every]
-    return Sampled(signal.times[::every], signal.values.detach()[::every], rates)
+    return Sampled(signal.times[::every].contiguous(), signal.values.detach()[::every], rates)
 
 
 def is_derived(signal: Sampled) -> bool:
@@ -110,8 +110,9 @@ def setpoint_findings(recording: Recording, sensors: Mapping[str, Sensor]) -> It
         signal = recording.rig.reference[actuator.setpoint]
         if not isinstance(signal, Sampled):
             continue
-        sparse = sparse_finding(recording, sensors, name)
-        yield from (one for one in (sparse, None if sparse else other_rate(recording, actuator.setpoint)) if one)
+        found = other_rate(recording, actuator.setpoint) or sparse_finding(recording, sensors, name)
+        if found is not None:
+            yield found
 
 
 def sparse_finding(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> Finding | None:
@@ -124,15 +125,13 @@ def sparse_finding(recording: Recording, sensors: Mapping[str, Sensor], name: st
     assert isinstance(signal, Sampled)
     apart = float(signal.times.diff().max())
     enough = apart * (NOTICED / worst.noises) ** (1 / worst.order)
-    rates = f" (with rates that are derived: there is no {setpoint}_dot)" if is_derived(signal) else ""
-    makes = f"what they leave open is {worst.error:.2g} {unit(worst.channel)} in {worst.channel}, {worst.noises:.2g} times its noise"
+    rates = f", and its rate is not known (no column {setpoint}_dot)" if is_derived(signal) else ""
+    size = f"{worst.error:.2g} {unit(worst.channel)}, {worst.noises:.2g} times the noise of {worst.channel}"
     text = (
-        f"recording `{recording.name}`: the set-points {setpoint} are {1e3 * apart:.3g} ms apart, too far for this motion{rates}: "
-        f"{makes}; give one every {1e3 * enough:.2g} ms"
+        f"recording `{recording.name}`: set-points {setpoint} every {1e3 * apart:.3g} ms are too sparse for this motion"
+        f"{rates}: what they leave open between them makes {size}; give them every {1e3 * enough:.2g} ms"
     )
-    return Finding(
-        f"set-points {setpoint}", recording.name, text, worst.noises > HOPELESS and worst.order <= ORDERLESS
-    )
+    return Finding(f"set-points {setpoint}", recording.name, text, worst.noises > HOPELESS and worst.order <= ORDERLESS)
 
 
 def other_rate(recording: Recording, setpoint: str) -> Finding | None:
@@ -140,14 +139,14 @@ def other_rate(recording: Recording, setpoint: str) -> Finding | None:
     signal = recording.rig.reference[setpoint]
     assert isinstance(signal, Sampled)
     given, own = signal.rates.numpy(), spline_rates(signal)
-    size = float(np.sqrt(np.mean(own**2)))
-    off = float(np.sqrt(np.mean((given - own) ** 2)))
-    if off <= OTHER_RATE * max(size, float(np.sqrt(np.mean(given**2)))):
+    fewer = spline_rates(Sampled(signal.times[::2].contiguous(), signal.values.detach()[::2]))
+    size, off, unsure = (float(np.sqrt(np.mean(e**2))) for e in (own, given - own, fewer - own[::2]))
+    if off <= OTHER_RATE * max(size, float(np.sqrt(np.mean(given**2)))) or unsure > OTHER_RATE / 2 * size:
         return None
     factor = float(given @ own) / max(float(own @ own), 1e-300)
     looks = "its sign looks opposite" if factor < 0 else f"it is {factor:.3g} times that"
     text = (
-        f"recording `{recording.name}`: {setpoint}_dot is not the rate of {setpoint}: it differs by {off:.3g} from the rate of the "
-        f"spline through it, {size:.3g} rms; {looks}"
+        f"recording `{recording.name}`: {setpoint}_dot is not the rate of {setpoint}: it differs by {off:.3g} rms from that "
+        f"of a spline through it, {size:.3g}; {looks}"
     )
     return Finding(f"rate of {setpoint}", recording.name, text, grave=True)

@@ -9,7 +9,9 @@ import numpy as np
 
 from torchsoft.sysid.colour import Coloured, allow_for_colour
 from torchsoft.sysid.conclude import Assumed, How, conclude
-from torchsoft.sysid.fit import Fit, Notify, descend, gauss_newton
+from torchsoft.sysid.conventions import check
+from torchsoft.sysid.finding import accepted
+from torchsoft.sysid.fit import Fit, Notify, chord, descend, gauss_newton
 from torchsoft.sysid.plan import Stage, default_plan
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
@@ -27,6 +29,7 @@ def identify(
     problem: Problem, *, rtol: float = RTOL, plan: Sequence[Stage] | None = None, starts: int = 1, loss: Loss = "linear",
     method: Method = "gauss_newton", heldout: Sequence[str] = (), workers: int = 1, checkpoint: str | Path | None = None,
     progress: bool = False, seed: int = 0, tightenings: int = 2, assumptions: Assumed = "checked",
+    meant: Sequence[str] = (),
 ) -> IdentificationResult:  # fmt: skip
     """Find the unknown parameters of `problem`, with intervals, and find which of them the data do not determine.
 
@@ -41,9 +44,11 @@ def identify(
 
     At the end what was taken for granted (mesh, touch-down ramp, place of the disc, numbers that are called known, faults of
     sensors, the friction law) is varied, a run each: `checks` tells what the data ask for in its place, and intervals
-    allow for constants of the computation that the data cannot tell; with `assumptions` = "trusted" that is left out.
+    allow for constants of the computation that the data cannot tell. Before the fit recordings are held against what such a
+    rig can do at all: signs, units, delays, zeros, set-points, the body that a loop senses (`conventions`); `meant` names
+    findings that are no mistakes. With `assumptions` = "trusted" both are left out.
 
-    Raises `ValueError` for recordings that are not there, `Unreachable` where the model cannot follow the data.
+    Raises `ValueError` for recordings that are not there or cannot be what they are taken for, `Unreachable` where the model cannot follow the data.
     """
     unknown = set(heldout) - set(problem.names)
     if unknown or len(set(heldout)) == len(problem.recordings):
@@ -54,6 +59,7 @@ def identify(
         )
     fitted, began = [name for name in problem.names if name not in heldout], clock.perf_counter()
     runner = Runner(problem.recordings, workers, Path(checkpoint) if checkpoint is not None else None)
+    looks = accepted(check(problem, runner, fitted), meant) if assumptions == "checked" else []
     if plan is None:
         plan = default_plan(problem, runner, rtol, fitted, starts)
     x, fit, stages = problem.coordinates.start, None, []
@@ -72,20 +78,22 @@ def identify(
         stage_entry("with the noise that was found", plan[-1], plan[-1].rtol, one, before) for one in coloured.fits
     ]
     how = How(fitted, tuple(heldout), method, loss, seed, assumptions, tightenings if loss == "linear" else 0)
-    return conclude(coloured, runner, plan[-1], stages, how, began, progress)
+    return conclude(coloured, runner, plan[-1], stages, how, looks, began, progress)
 
 
 def with_its_noise(
     problem: Problem, runner: Runner, stage: Stage, fit: Fit, loss: Loss, method: Method, notify: Notify
 ) -> Coloured:
-    """The fit of the last stage, gone on with whatever noise it leaves."""
+    """The fit of the last stage, gone on with whatever noise it leaves: by new Jacobians, then by the last one."""
     free, which = np.isin(problem.coordinates.labels, stage.free), stage.recordings
     common: dict[str, Any] = {"which": which, "free": free, "steps": fit.steps, "notify": notify}
 
     def residuals(one: Problem, x: Array) -> Residuals:
         return one.residuals(runner, x, which, fit.steps, free)
 
-    def refit(one: Problem, last: Fit) -> Fit:
+    def refit(one: Problem, last: Fit, number: int) -> Fit:
+        if number > 0 and loss == "linear" and last.at is not None:
+            return chord(one, runner, last.x, last.at, **common)
         if method == "gauss_newton":
             more: dict[str, Any] = {"evaluations": stage.evaluations, "tolerance": stage.tolerance, "loss": loss}
             return gauss_newton(one, runner, last.x, first=last.at, **more, **common)

@@ -1,8 +1,8 @@
-"""Runs that begin anywhere, in motion or in mid-grasp: the bodies' poses and velocities and the contacts' stretches are
-unknown.
+"""Runs that begin anywhere, in motion or in mid-grasp: poses, velocities and stretches are unknown.
 
 The pads follow from them. They begin settled around the bodies, and forget what that gets wrong within some of their
-own times tau: samples should count from `lead` after the beginning only."""
+own times tau: samples should count from `lead` after the beginning only.
+"""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -52,14 +52,15 @@ class Underway(NamedTuple):
     `bodies` holds mean and standard deviation of every free coordinate by its name, "disc.x" [m, or rad], and of every
     rate, "disc.v_x" [m/s, or rad/s]. What has a deviation above zero is a coordinate, "start.disc.x". `stretch` holds
     by contact what is known of stretched springs, a coordinate a place, "start.L.stretch.0"; a contact left out has
-    none. Places are not points of a mesh, so that the same start serves other meshes."""
+    none. Places are not points of a mesh, so that the same start serves other meshes.
+    """
 
     bodies: Mapping[str, Normal]
     stretch: Mapping[str, Stretch]
     lead: float = LEAD
 
     def coordinates(self, rig: Rig, samples: Samples) -> tuple[StartCoordinate, ...]:
-        named(rig, self.bodies, "bodies")
+        check_names(rig, self.bodies)
         for name in self.stretch:
             if name not in rig.contacts:
                 raise ValueError(
@@ -105,12 +106,12 @@ def free_coordinates(rig: Rig) -> tuple[str, ...]:
     return tuple(f"{name}.{v}{axis}" for v in ("", "v_") for name, axis in every)
 
 
-def named(rig: Rig, given: Mapping[str, Normal], what: str) -> None:
+def check_names(rig: Rig, bodies: Mapping[str, Normal]) -> None:
     """Raises `ValueError` unless every free coordinate and its rate is given, and nothing else."""
     known = free_coordinates(rig)
-    if wrong := [name for name in (*known, *given) if (name in known) != (name in given)]:
+    if wrong := [name for name in (*known, *bodies) if (name in known) != (name in bodies)]:
         fault = "is missing" if wrong[0] in known else "is none of them"
-        raise ValueError(f"`{what}` of a start must name {', '.join(known)}, but `{wrong[0]}` {fault}")
+        raise ValueError(f"`bodies` of a start must name {', '.join(known)}, but `{wrong[0]}` {fault}")
 
 
 def placed(

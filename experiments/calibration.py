@@ -1,0 +1,219 @@
+"""Question: are posteriors right, over everything that the prior thinks possible?
+
+Simulation-based calibration: truths from the prior, data with noise from each, a fit, draws of its posterior, and the rank of the
+truth among them, which is uniform where all of this is right. Two problems: strokes that slip, four parameters, where
+Laplace's approximation should do; and a roll that sees the stiffnesses of pads and contacts in series, where the posterior is
+bent, Laplace's Gaussian wrong, and NUTS is needed. "Gaussian" stands for Laplace's draws without their importance weights.
+Two tests by parameter, chi-squared on bins and the deviation of the distribution function; flat is what none of them rejects at
+5 %, by Bonferroni's correction. Costs by finite differences are as many runs as forward differences need, times the measured
+time of a run.
+
+Command: .venv/bin/python experiments/calibration.py [--runs 100] [--nuts 40] [--workers 2] [--smoke]
+Expected: Laplace flat for the strokes, NUTS flat for both, the Gaussian not flat in series, where nine of ten of its
+posteriors say that they are not to be trusted.
+"""
+
+import time as clock
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from _calibration_cases import CASES
+from _calibration_figures import one_posterior, rank_histograms
+from _experiment import markdown, options, raw_config, timed, write
+from matplotlib.figure import Figure
+
+from torchsoft.sysid.calibration import Calibration, calibrate, fitted, simulated
+from torchsoft.sysid.information import combinations
+from torchsoft.sysid.nuts import nuts
+from torchsoft.sysid.optimum import Optimum
+from torchsoft.sysid.posterior import Posterior, laplace
+from torchsoft.sysid.problem import Problem
+from torchsoft.sysid.profile import Profile, profiles
+
+Posteriors = Callable[[Optimum, int], Posterior]
+
+TUNE = 60
+"""Draws for tuning before those of a chain: the whitened posterior needs few."""
+
+
+@dataclass(frozen=True)
+class Config:
+    out: Path = Path("out/calibration")
+    runs: int = 100  # truths, Laplace
+    nuts: int = 40  # truths, NUTS; none leaves it out
+    draws: int = 100  # of each posterior, ranks are among one less
+    rtol: float = 1e-4  # of the fits; data have a hundredth of it
+    workers: int = 2
+    seed: int = 0
+    smoke: bool = False  # ten truths of the second problem, a short chain
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way to posteriors: its calibration, seconds by the wall, runs and gradients of all its posteriors."""
+
+    calibration: Calibration
+    wall_s: float
+    simulations: float
+    gradients: float
+
+
+@dataclass(frozen=True)
+class Look:
+    """One posterior of a problem, looked at closely: by Laplace, by NUTS, its profiles; and seconds of a run, of a gradient and
+    of a Jacobian."""
+
+    gaussian: Posterior
+    sampled: Posterior
+    profiles: list[Profile]
+    sentences: list[str]
+    truth: list[float]
+    profiles_s: float
+    jacobians: int
+    run_s: float
+    gradient_s: float
+    jacobian_s: float
+
+
+@dataclass(frozen=True)
+class Result:
+    config: Config
+    ways: dict[str, dict[str, Way]]
+    looks: dict[str, Look]
+
+
+def calibrated(problem: Problem, config: Config, runs: int, posterior: Posteriors, draws: int) -> Way:
+    costs: list[dict[str, float]] = []
+
+    def counted(o: Optimum, seed: int) -> Posterior:
+        found = posterior(o, seed)
+        costs.append(found.cost)
+        return found
+
+    found, wall = timed(
+        lambda: calibrate(
+            problem, counted, rtol=config.rtol, runs=runs, draws=draws, workers=config.workers, seed=config.seed,
+            progress=True,
+        )
+    )  # fmt: skip
+    return Way(found, wall, *(sum(one[kind] for one in costs) for kind in ("simulations", "gradients")))
+
+
+def ways(problem: Problem, config: Config) -> dict[str, Way]:
+    """Laplace with and without its weights, and NUTS."""
+    known: dict[int, Posterior] = {}
+
+    def weighted(o: Optimum, seed: int) -> Posterior:
+        known[seed] = laplace(o, draws=config.draws, seed=seed)
+        return known[seed]
+
+    def unweighted(o: Optimum, seed: int) -> Posterior:
+        one = known[seed] if seed in known else weighted(o, seed)
+        return replace(one, weights=np.full_like(one.weights, 1 / one.weights.size))
+
+    fine = config.draws - 1 if not config.smoke else 19
+    out = {
+        "Laplace": calibrated(problem, config, config.runs, weighted, fine),
+        "Gaussian": calibrated(problem, config, config.runs, unweighted, fine),
+    }
+    if config.nuts:
+        few = 19 if config.nuts < 100 else fine
+        out["NUTS"] = calibrated(
+            problem,
+            config,
+            config.nuts,
+            lambda o, seed: nuts(o, chains=1, draws=config.draws, tune=TUNE, seed=seed),
+            few,
+        )
+    return out
+
+
+def look(problem: Problem, config: Config) -> Look:
+    x, rng = problem.coordinates.start, np.random.default_rng(config.seed)
+    o = fitted(simulated(problem, x, 1e-2 * config.rtol, rng), config.rtol)
+    o.workers, before = config.workers, o.runner.jacobians
+    curves, wall = timed(lambda: profiles(o, progress=True))
+    spent = o.runner.jacobians - before
+
+    def seconds(of: Callable[[], Any]) -> float:
+        return float(np.median([timed(of)[1] for _ in range(5)]))
+
+    chains, draws = (1, 30) if config.smoke else (4, 250)
+    return Look(
+        laplace(o, draws=100 if config.smoke else 400, seed=config.seed),
+        nuts(o, chains=chains, draws=draws, tune=30 if config.smoke else 100, seed=config.seed),
+        curves, [one.sentence for one in combinations(o.labels, o.covariance, 0.1)], o.values(x).tolist(), wall, spent,
+        seconds(lambda: o.residuals(o.x)), seconds(lambda: o.misfit(o.x)), seconds(lambda: o.residuals(o.x, True)),
+    )  # fmt: skip
+
+
+def run(config: Config) -> Result:
+    config = replace(config, runs=10, nuts=0, workers=1) if config.smoke else config
+    names = ["series"] if config.smoke else list(CASES)
+    problems = {name: CASES[name].problem() for name in names}
+    looks = {name: look(problem, config) for name, problem in problems.items()}
+    return Result(config, {name: ways(problem, config) for name, problem in problems.items()}, looks)
+
+
+def summary(result: Result) -> dict[str, Any]:
+    """Ranks, tests and costs of every way, and the posteriors that were looked at."""
+    cases = {}
+    for name, found in result.ways.items():
+        one = result.looks[name]
+        n = len(one.gaussian.labels)
+        cases[name] = {
+            "ways": {
+                way: asdict(it.calibration) | {
+                    "flat": it.calibration.flat, "wall_s": it.wall_s, "simulations": it.simulations,
+                    "gradients": it.gradients, "by_differences_s": it.gradients * (n + 1) * one.run_s,
+                    "gradients_s": it.gradients * one.gradient_s,
+                }
+                for way, it in found.items()
+            },
+            "run_s": one.run_s, "gradient_s": one.gradient_s, "jacobian_s": one.jacobian_s,
+            "profiles": [asdict(profile) for profile in one.profiles], "profiles_s": one.profiles_s,
+            "profiles_jacobians": one.jacobians, "profiles_by_differences_s": one.jacobians * (n + 1) * one.run_s,
+            "combinations": one.sentences, "truth": one.truth,
+            "posteriors": [asdict(posterior.summary) | posterior.cost for posterior in (one.gaussian, one.sampled)],
+        }  # fmt: skip
+    return {**raw_config(result.config), "cases": cases}
+
+
+def table(result: Result) -> str:
+    rows = []
+    for name, found in result.ways.items():
+        for way, it in found.items():
+            c = it.calibration
+            least = min([*c.p_chi2.values(), *c.p_ecdf.values()])
+            warned = next((text.split(" ")[0] for text in c.notices if "with a warning" in text), "0")
+            rows.append(
+                (name, way, len(c.ranks), f"{least:.2g} of {2 * len(c.labels)}", "yes" if c.flat else "no",
+                 f"{warned} of {len(c.ranks)}", f"{it.wall_s:.0f}")
+            )  # fmt: skip
+    head = ("problem", "posterior", "truths", "least p", "flat", "came with a warning", "wall time [s]")
+    return markdown(head, rows)
+
+
+def figures(result: Result) -> dict[str, Figure]:
+    out = {
+        f"ranks_{name}": rank_histograms({way: it.calibration for way, it in found.items()})
+        for name, found in result.ways.items()
+    }
+    one = result.looks["series"]
+    return out | {"posterior": one_posterior(one.gaussian, one.sampled, one.profiles, one.truth)}
+
+
+def main(config: Config | None = None) -> None:
+    config = options(Config, __doc__) if config is None else config
+    began = clock.perf_counter()
+    result = run(config)
+    print(table(result))
+    content = summary(result) | {"wall_s": clock.perf_counter() - began}
+    write(config.out, content, figures(result), table(result))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,104 @@
+"""Identification under coloured noise and under outliers: what is found, what intervals allow for, and what is said."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conftest import COARSE
+from test_sysid_noise import made
+
+from torchsoft import Parameters
+from torchsoft.excitation import Excitation, Strokes
+from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
+from torchsoft.sysid.colour import rewhitened
+from torchsoft.sysid.misfit import parts
+from torchsoft.sysid.noise import Autoregression
+from torchsoft.sysid.workers import Runner
+
+BASE = Parameters().override(COARSE)
+TRUTH = {"pad.E": 0.8e6, "pad.tau": 0.011}
+NOISE = {"x_C": 1e-5, "theta": 5e-4, "F_x": 0.1}
+STROKES = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.6, senses="bracket")
+AR = Autoregression.stated((0.8,), 5e-3)
+STAGE = Stage("all", ("strokes",), ("pad.E", "pad.tau"), 1e-4)
+
+
+def sensors(colour: str = "white") -> dict[str, Sensor]:
+    return {channel: Sensor(noise=noise, colour=colour) for channel, noise in NOISE.items()}  # pyright: ignore[reportArgumentType]
+
+
+@pytest.fixture(scope="module")
+def exact() -> Recording:
+    return record("strokes", STROKES, BASE.override(TRUTH), BASE, sensors(), rtol=1e-6, noise=0.0)
+
+
+def noisy(exact: Recording, seed: int, noise: Autoregression | None, outliers: float = 0.0) -> Recording:
+    """With noise as stated, of a colour, or with so many samples that are ten times off."""
+    rng, samples = np.random.default_rng(seed), {}
+    for channel, (t, y) in exact.samples.items():
+        e = rng.standard_normal(len(t)) if noise is None else made(noise, len(t), rng)
+        e = e + 20 * rng.standard_normal(len(t)) * (rng.random(len(t)) < outliers)
+        samples[channel] = (t, y + NOISE[channel] * e)
+    return replace(exact, samples=samples)
+
+
+def problem(recording: Recording, colour: str = "white") -> Problem:
+    return Problem([recording], sensors(colour), {name: Unknown(nominal=1.01 * value) for name, value in TRUTH.items()})
+
+
+def test_colour_that_nobody_declared_widens_intervals_and_is_said(exact: Recording) -> None:
+    white = identify(problem(noisy(exact, 0, None)), plan=[STAGE], assumptions="trusted")
+    found = identify(problem(noisy(exact, 0, AR)), plan=[STAGE], assumptions="trusted")
+    declared = identify(problem(noisy(exact, 0, AR), "ar"), plan=[STAGE], assumptions="trusted")
+    assert not white.noise
+    assert not white.notices
+    assert {one.channel for one in found.noise} == set(NOISE)
+    for one in found.noise:
+        assert one.model.order in (1, 2)
+        assert one.tried[0].order == 0
+        assert min(one.tried, key=lambda score: score.bic).order == one.model.order
+    assert [stage["name"] for stage in found.stages][1] == "with the noise that was found"
+    (notice,) = found.notices
+    assert "coloured in x_C (order" in notice
+    assert not declared.notices
+    for name, truth in TRUTH.items():
+        for answer in (white, found, declared):
+            assert abs(np.log(answer[name].last / truth)) < 3 * answer[name].relative_sd, name
+    assert found["pad.tau"].relative_sd > 1.3 * white["pad.tau"].relative_sd
+
+
+def test_residuals_and_the_adjoint_agree_on_coloured_noise(exact: Recording) -> None:
+    """Rows whitened at once, and again from other noise; the gradient of half their squares."""
+    gaps = {c: (np.delete(t, slice(20, 30)), np.delete(y, slice(20, 30))) for c, (t, y) in exact.samples.items()}
+    plain = problem(replace(exact, samples=gaps))
+    coloured = plain.with_noise({"x_C": AR, "F_x": Autoregression((1.2, -0.5), 0.7, 5e-3)})
+    runner, which, x = Runner(plain.recordings), ["strokes"], plain.coordinates.start
+    free = plain.coordinates.free
+    _, steps = plain.freeze(runner, x, which, 1e-4)
+    one = plain.residuals(runner, x, which, steps, free)
+    other = coloured.residuals(runner, x, which, steps, free)
+    again = rewhitened(coloured, one, parts(plain, one.r, which))
+    back = rewhitened(plain, other, parts(coloured, other.r, which))
+    for a, b in ((again.r, other.r), (again.J, other.J), (back.r, one.r), (back.J, one.J)):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9 * np.abs(b).max())
+    loss, gradient, lost = coloured.misfit(runner, x, which, steps, free)
+    assert not lost
+    assert loss == pytest.approx(0.5 * other.r @ other.r, rel=1e-12)
+    np.testing.assert_allclose(gradient, other.J.T @ other.r, rtol=1e-8)
+
+
+def test_a_robust_loss_sees_through_outliers(exact: Recording) -> None:
+    """Every twentieth sample is off by twenty standard deviations: least squares says so, and a robust loss is as exact as the
+    rest of the samples allow."""
+    bad = problem(noisy(exact, 2, None, outliers=0.05))
+    clean, plain, robust = (
+        identify(one, plan=[STAGE], loss=loss, assumptions="trusted")
+        for one, loss in ((problem(noisy(exact, 2, None)), "linear"), (bad, "linear"), (bad, "cauchy"))
+    )
+    assert any("outliers" in notice for notice in plain.notices)
+    assert any("larger than the noise" in notice and "intervals are widened by" in notice for notice in plain.notices)
+    assert not robust.notices
+    for name, truth in TRUTH.items():
+        assert abs(np.log(robust[name].last / truth)) < 3 * robust[name].relative_sd, name
+        assert 1.0 < robust[name].relative_sd / clean[name].relative_sd < 1.25
+        assert plain[name].relative_sd > 2 * robust[name].relative_sd

@@ -1,0 +1,278 @@
+"""Recordings that do not mean what the model takes them to mean get the sentence that helps; those that do get none."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import COARSE
+from scipy.interpolate import CubicSpline
+
+from torchsoft import Parameters, Reference, SoftGrasp
+from torchsoft.excitation import Excitation, MultiSine, Press, Strokes
+from torchsoft.physics.motion import Profile, Sampled
+from torchsoft.sysid import RIG, Problem, Recording, Sensor, Unknown, record
+from torchsoft.sysid.conventions import check
+from torchsoft.sysid.cost import paper_settings
+from torchsoft.sysid.finding import Finding, accepted, together
+from torchsoft.sysid.loops import loop_findings
+from torchsoft.sysid.setpoints import gaps
+from torchsoft.sysid.workers import Runner
+
+NOMINAL = Parameters().override(COARSE)
+SENSORS = RIG | {"omega": Sensor(noise=0.02)}
+FAR = {
+    "contact.K_n": 3.0, "contact.R_n": 0.4, "contact.K_t": 0.4, "contact.R_t": 2.5, "contact.mu_s": 0.7, "contact.mu_k": 0.6,
+    "pad.E": 0.5, "pad.tau": 2.5,
+}  # fmt: skip
+"""How far the truth is from where a fit would start."""
+
+MOTIONS = {
+    "rolling": Excitation(motion=Strokes(travel=15e-3, stroke_time=0.2), duration=0.9, grasp_time=0.2, settle=0.05),
+    "shaking": Excitation(
+        motion=MultiSine(amplitude_x=6e-3, amplitude_y=2e-4, frequency=(4.0, 17.0)), duration=0.9, depth=4e-4, grasp_time=0.2
+    ),
+    "pressing": Excitation(motion=Press(amplitude=5e-4, frequency=12.0, travel=10e-3), duration=0.9, grasp_time=0.2),
+    "about the disc": Excitation(
+        motion=Strokes(travel=8e-3, stroke_time=0.25), duration=0.9, grasp_time=0.2, settle=0.05, senses="disc", x_C0=60e-3
+    ),
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def recordings() -> dict[str, Recording]:
+    """What rigs with parameters far from the nominal ones give."""
+    table = NOMINAL.table()
+    truth = NOMINAL.override({name: factor * table[name]["value"] for name, factor in FAR.items()})
+    return {
+        name: record(name, motion, truth, NOMINAL, SENSORS, seed=k, rtol=1e-4)
+        for k, (name, motion) in enumerate(MOTIONS.items())
+    }
+
+
+def looked_at(recording: Recording, sensors: Mapping[str, Sensor] = SENSORS) -> list[Finding]:
+    """What is found with the sensors that the recording has."""
+    mine = {name: sensor for name, sensor in sensors.items() if name in recording.samples}
+    problem = Problem([recording], mine, {"pad.E": Unknown()})
+    return check(problem, Runner(problem.recordings))
+
+
+def changed(recording: Recording, **channels: Callable[[Any, Any], Any] | None) -> Recording:
+    """With other values of some channels, which are functions of times and values; None leaves a channel out."""
+    samples = dict(recording.samples)
+    for name, change in channels.items():
+        t, y = samples.pop(name)
+        if change is not None:
+            samples[name] = (t, change(t, y))
+    return replace(recording, samples=samples)
+
+
+def noted(recording: Recording, settings: Mapping[str, Any] | None = None, **signals: torch.nn.Module) -> Recording:
+    """With other settings, and other signals of the reference."""
+    p, old = paper_settings(recording), recording.rig.reference
+    reference = Reference(**{name: signals.get(name, old[name]) for name in ("x_d", "y_d", "F_ff")})
+    return replace(recording, rig=SoftGrasp(p.override(dict(settings or {})), reference))
+
+
+def scaled(factor: float) -> Callable[[Any, Any], Any]:
+    return lambda t, y: factor * y
+
+
+def late(by: float) -> Callable[[Any, Any], Any]:
+    return lambda t, y: CubicSpline(t, y)(np.maximum(t - by, t[0]))
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """What is wrong with a recording of one of the motions, and what is said of it."""
+
+    motion: str
+    change: Callable[[Recording], Recording]
+    what: str
+    words: str
+    grave: bool
+
+
+NO_F = {"F_x": None, "F_y": None}
+MISTAKES = {
+    "sign of a force": Mistake(
+        "rolling", lambda r: changed(r, F_x=scaled(-1)), "sign of F_x", "F_x looks as if its sign were opposite", True
+    ),
+    "sign of a force that only a run tells": Mistake(
+        "rolling", lambda r: changed(r, F_y=scaled(-1), y_Br=None), "sign of F_y", "correlation with a run from the start is -", True
+    ),
+    "sign of an angle": Mistake(
+        "rolling", lambda r: changed(r, theta=scaled(-1)), "sign of theta", "theta looks as if its sign were opposite", True
+    ),
+    "sign of a rate": Mistake(
+        "shaking", lambda r: changed(r, omega=scaled(-1)), "sign of omega", "omega looks as if its sign were opposite", True
+    ),
+    "millinewtons": Mistake(
+        "shaking", lambda r: changed(r, F_x=scaled(1e3)), "unit of F_x", "millinewtons taken for newtons", True
+    ),
+    "degrees": Mistake(
+        "rolling", lambda r: changed(r, theta=scaled(57.3)), "unit of theta", "degrees taken for radians", True
+    ),
+    "radians": Mistake(
+        "rolling", lambda r: changed(r, theta=scaled(1 / 57.3)), "unit of theta", "radians taken for degrees", True
+    ),
+    "a sensor's gain": Mistake(
+        "pressing", lambda r: changed(r, F_y=scaled(1.15)), "size of F_y", "F_y is 1.1", False
+    ),
+    "the disc's set-point taken for the bracket's": Mistake(
+        "about the disc", lambda r: noted(r, {"control.senses": "bracket"}), "control.senses",
+        'x_d looks like the set-point of the disc, not of the bracket (say control.senses = "disc")', True,
+    ),
+    "the bracket's taken for the disc's": Mistake(
+        "rolling", lambda r: noted(r, {"control.senses": "disc"}), "control.senses", "set-point of the bracket, not of the disc", True
+    ),
+    "the bracket's taken for the disc's, no forces": Mistake(
+        "rolling", lambda r: changed(noted(r, {"control.senses": "disc"}), **NO_F), "control.senses", "x_Br follows it to", True
+    ),
+    "the bracket's taken for the disc's, the disc alone": Mistake(
+        "rolling", lambda r: changed(noted(r, {"control.senses": "disc"}), **NO_F, x_Br=None), "control.senses",
+        "x_C does not follow it", True,
+    ),
+    "exchanged columns": Mistake(
+        "rolling", lambda r: replace(r, samples=r.samples | {"x_C": r.samples["x_Br"], "x_Br": r.samples["x_C"]}), "control.senses",
+        "or are x_Br and x_C exchanged?", True,
+    ),
+    "no force fed forward": Mistake(
+        "rolling", lambda r: noted(r, F_ff=Profile([0.0], [0.0])), "F_ff", "was a force fed forward that F_ff does not have?", False
+    ),
+    "its sign": Mistake(
+        "pressing", lambda r: noted(r, F_ff=opposite(r)), "sign of F_ff", "F_ff looks as if its sign were opposite", True
+    ),
+    "a zero": Mistake(
+        "rolling", lambda r: changed(r, x_Br=lambda t, x: x + 40e-6), "zero of x_Br", "N too much, or x_Br and x_d have zeros 3.9", False
+    ),
+    "a zero, no forces": Mistake(
+        "rolling", lambda r: changed(r, x_Br=lambda t, x: x + 60e-6, **NO_F), "zero of x_Br", "do both have the same zero?", False
+    ),
+    "the zero of the angle": Mistake(
+        "rolling", lambda r: changed(r, theta=lambda t, y: y + 0.02), "zero of theta", "from where the disc would have it", False
+    ),
+    "a late force": Mistake(
+        "shaking", lambda r: changed(r, F_x=late(5e-3)), "time of F_x", "ms late", False
+    ),
+    "a late camera": Mistake(
+        "rolling", lambda r: changed(r, theta=late(60e-3)), "time of theta", "theta is about 60 ms late", False
+    ),
+    "other gains": Mistake(
+        "pressing", lambda r: noted(r, {"control.K_98": 0.7e5, "control.R_99": 900.0}), "loop of F_y",
+        "F_y is not what the controller gives", False,
+    ),
+}  # fmt: skip
+
+
+def opposite(recording: Recording) -> Profile:
+    feed = recording.rig.reference["F_ff"]
+    assert isinstance(feed, Profile)
+    return Profile(feed.times, -feed.values.detach())
+
+
+@pytest.mark.parametrize("name", MISTAKES)
+def test_a_mistake_gets_the_sentence_that_helps(recordings: dict[str, Recording], name: str) -> None:
+    mistake = MISTAKES[name]
+    found = looked_at(mistake.change(recordings[mistake.motion]))
+    assert [f.what for f in found] == [mistake.what]
+    assert mistake.words in found[0].sentence, found[0].sentence
+    assert found[0].sentence.startswith(f"recording `{mistake.motion}`: ")
+    assert found[0].grave == mistake.grave
+
+
+@pytest.mark.parametrize("motion", MOTIONS)
+def test_nothing_is_said_of_what_is_right(recordings: dict[str, Recording], motion: str) -> None:
+    """With a start that is off by a factor of three, with fewer sensors, and with faults that were declared."""
+    one = recordings[motion]
+    assert looked_at(one) == []
+    assert looked_at(changed(one, **NO_F)) == []
+    assert looked_at(changed(one, x_Br=None, y_Br=None)) == []
+    declared = SENSORS | {
+        "x_Br": Sensor(noise=1e-5, bias=1e-4), "theta": Sensor(noise=5e-4, bias=0.1, delay=0.08),
+        "F_x": Sensor(noise=0.1, delay=6e-3), "F_y": Sensor(noise=0.1, gain=0.2),
+    }  # fmt: skip
+    faulty = changed(
+        one, x_Br=lambda t, x: x + 40e-6, theta=lambda t, y: late(60e-3)(t, y) + 0.02, F_x=late(5e-3), F_y=scaled(1.15)
+    )
+    assert looked_at(faulty, declared) == []
+
+
+def test_gains_that_are_unknown_still_tell_a_sign(recordings: dict[str, Recording]) -> None:
+    one = noted(recordings["rolling"], {"control.K_98": 0.6e5, "control.R_99": 221.0})
+    assert list(loop_findings(one, SENSORS, ["control.K_98"])) == []
+    flipped = changed(one, F_y=scaled(-1))
+    assert [f.what for f in loop_findings(flipped, SENSORS, ["control.K_98"])] == ["sign of F_y"]
+
+
+def test_gaps_and_other_rates_of_samples_are_no_mistake(recordings: dict[str, Recording]) -> None:
+    """Of the force at 1 kHz with a hole in it, and a camera at 50 Hz."""
+    one, samples = recordings["rolling"], dict(recordings["rolling"].samples)
+    t, F = samples["F_x"]
+    dense = np.arange(t[0], t[-1], 1e-3)
+    dense = dense[(dense < 0.4) | (dense > 0.5)]
+    samples |= {"F_x": (dense, CubicSpline(t, F)(dense)), "x_C": tuple(x[::4] for x in samples["x_C"])}
+    assert looked_at(replace(one, samples=samples)) == []
+
+
+def at_rows(recording: Recording, rate: float, *, rates: bool = False) -> Recording:
+    """With a reference that is known at `rate` [Hz]."""
+    t = torch.arange(0.0, recording.duration + 0.5 / rate, 1 / rate, dtype=torch.float64)
+    d = recording.rig.reference(t, ("x_d", "y_d", "F_ff")).detach()
+    given = {
+        name: Sampled(t, d[:, i, 0], d[:, i, 1] if rates else None) for i, name in enumerate(("x_d", "y_d", "F_ff"))
+    }
+    return noted(recording, **given)
+
+
+@pytest.mark.parametrize("rates", [False, True])
+def test_sparse_set_points_are_told_by_what_they_do(recordings: dict[str, Recording], rates: bool) -> None:
+    """The estimate from the rows alone against what the exact set-points would have had the controller do."""
+    one, exact = recordings["shaking"], recordings["shaking"].rig.reference
+    actuator = one.rig.actuators["x"]
+    for rate in (200.0, 500.0):
+        sparse = at_rows(one, rate, rates=rates)
+        t = torch.linspace(0.05, 0.85, 4001, dtype=torch.float64)
+        signals = [d(t, ("x_d",)).detach()[:, 0] for d in (sparse.rig.reference, exact)]
+        zero = torch.zeros_like(t)
+        efforts = [actuator(torch.stack((*d.unbind(-1), zero, zero, zero), -1)).detach() for d in signals]
+        real = float((efforts[0] - efforts[1]).square().mean().sqrt())
+        told = {gap.channel: gap for gap in gaps(sparse, SENSORS, "x")}["F_x"]
+        assert 0.5 * real < told.error < 2.5 * real
+        assert told.noises == told.error / SENSORS["F_x"].noise
+        assert 2.5 < told.order <= 4.0
+    enough, few, hardly = (looked_at(at_rows(one, rate, rates=rates)) for rate in (500.0, 100.0, 30.0))
+    assert enough == []
+    (said,) = [f for f in few if f.what == "set-points x_d"]
+    assert "set-points x_d every 10 ms are too sparse for this motion" in said.sentence
+    assert ("no column x_d_dot" in said.sentence) == (not rates)
+    assert not said.grave
+    assert any(f.what == "set-points x_d" and f.grave for f in hardly)
+
+
+def test_a_rate_that_is_not_that_of_its_set_point_is_named(recordings: dict[str, Recording]) -> None:
+    one = at_rows(recordings["rolling"], 500.0, rates=True)
+    x_d = one.rig.reference["x_d"]
+    assert isinstance(x_d, Sampled)
+    for factor, words in ((-1.0, "its sign looks opposite"), (1e3, "it is 1e+03 times that")):
+        other = Sampled(x_d.times, x_d.values.detach(), factor * x_d.rates)
+        (found,) = [f for f in looked_at(noted(one, x_d=other)) if f.what == "rate of x_d"]
+        assert found.grave
+        assert "x_d_dot is not the rate of x_d" in found.sentence
+        assert words in found.sentence
+
+
+def test_findings_of_a_kind_are_said_once_and_refused_unless_they_are_meant() -> None:
+    found = together([
+        Finding("sign of F_x", "a", "F_x looks wrong", grave=True), Finding("zero of F_y", "a", "F_y is off"),
+        Finding("sign of F_x", "b", "F_x looks wrong too", grave=True),
+    ])  # fmt: skip
+    assert [f.what for f in found] == ["sign of F_x", "zero of F_y"]
+    assert found[0].sentence == "F_x looks wrong; so it is in `b`"
+    with pytest.raises(ValueError, match=r'if it is meant so, say meant = \["sign of F_x"\]'):
+        accepted(found, [])
+    first, second = accepted(found, ["sign of F_x"])
+    assert first == "F_x looks wrong; so it is in `b` (you say that it is meant so)"
+    assert second == "F_y is off"

@@ -1,0 +1,274 @@
+"""Designed motions: criteria and slopes against differences, bounds that hold everywhere, and what should be recorded next."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import COARSE
+from test_sysid_readout import jaws  # noqa: F401
+
+from torchsoft import Parameters, Rig
+from torchsoft.excitation import Excitation, Knots, Strokes, begin
+from torchsoft.solve.progress import SimulationFailed
+from torchsoft.sysid import RIG, Known, Problem, Recording, Sensor, Unknown, record
+from torchsoft.sysid.criterion import Criterion, Outlook, chosen, deviations, next_recording
+from torchsoft.sysid.design import Design, design, draws
+from torchsoft.sysid.design_figure import design_figure
+from torchsoft.sysid.information import fisher
+from torchsoft.sysid.knots import Bounds, Moves
+from torchsoft.sysid.planner import Planner
+from torchsoft.sysid.recording import Array
+from torchsoft.sysid.workers import Runner
+
+P = Parameters().override(COARSE)
+PLAN = Excitation(
+    motion=Knots(x=((0.05, 1e-3), (0.1, -0.5e-3)), y=((0.06, -2e-4), (0.1, 1e-4))),
+    duration=0.25, grasp_time=0.1, settle=0.02, depth=1e-3,
+)  # fmt: skip
+BOUNDS = {
+    "x_d": Bounds(low=0.055, high=0.065, speed=0.2, after=0.13, shortest=0.02),
+    "y_d": Bounds(low=0.048, high=0.0499, speed=0.1, after=0.13),
+}
+SENSORS = {name: RIG[name] for name in ("x_C", "theta", "y_Br", "F_x", "F_y")}
+
+
+@pytest.fixture(scope="module")
+def plan() -> Recording:
+    return record("plan", PLAN, P, P, SENSORS, rtol=1e-3, noise=0.0)
+
+
+@pytest.fixture(scope="module")
+def problem(plan: Recording) -> Problem:
+    return Problem([plan], SENSORS, {"pad.E": Unknown(), "contact.K_n": Unknown()})
+
+
+def planner(problem: Problem, criterion: Criterion, **limits: tuple[float, float]) -> Planner:
+    recording = problem.recordings[0]
+    moves = Moves(recording.rig.reference, BOUNDS, float(recording.times[-1]))
+    return Planner(problem, recording.name, moves, limits, criterion, None, 1e-4, 1)
+
+
+@pytest.mark.parametrize(
+    "criterion", [Criterion("D"), Criterion("A", (1.0, 2.0, 0.5)), Criterion("worst", (1, 2, 0.5))]
+)
+def test_a_criterion_has_the_derivative_of_its_differences(criterion: Criterion) -> None:
+    rng = np.random.default_rng(0)
+    root, direction = rng.standard_normal((2, 3, 3))
+    C, direction = root @ root.T, direction + direction.T
+    value, slope = criterion(C)
+    ahead, behind = (criterion(C + h * direction)[0] for h in (1e-6, -1e-6))
+    assert np.sum(slope * direction) == pytest.approx((ahead - behind) / 2e-6, rel=1e-6)
+    assert criterion(4 * C)[0] == pytest.approx(value + np.log(2))  # a logarithm of standard deviations
+
+
+def test_for_one_parameter_the_criteria_are_one() -> None:
+    values = [Criterion(kind)(np.array([[0.04]]))[0] for kind in ("D", "A", "worst")]
+    assert values == pytest.approx([np.log(0.2)] * 3)
+
+
+@pytest.mark.parametrize(("sensors", "rel"), [({}, 1e-3), ({"F_x": Sensor(noise=0.1, bias=1.0, gain=0.1)}, 1e-3)])
+def test_slopes_are_those_of_differences(
+    plan: Recording, sensors: dict[str, Sensor], rel: float, monkeypatch: Any
+) -> None:
+    """Of values and times of the knots, with what excess costs; a sensor's gain and bias are fitted beside the parameters."""
+    monkeypatch.setattr("torchsoft.sysid.planner.DIFFERENCE", 1e-4)
+    stated = Problem([plan], SENSORS | sensors, {"pad.E": Unknown(), "contact.K_n": Unknown()})
+    one = planner(stated, Criterion("A"), F_y=(-30.0, 30.0))
+    z, x = one.moves.start, stated.coordinates.start
+    at = one.look(z, x)
+    slopes, direction, h = one.slopes(z, x, at), np.random.default_rng(1).standard_normal(one.moves.n), 3e-5
+    assert at.peaks["F_y"] > 1
+    ahead, behind = (one.look(z + s * h * direction, x, at.steps) for s in (1, -1))
+    wanted = (ahead.value + ahead.cost - behind.value - behind.cost) / (2 * h)
+    assert slopes @ direction == pytest.approx(wanted, rel=rel)
+
+
+def test_nuisances_are_left_out_as_the_schur_complement(plan: Recording) -> None:
+    stated = Problem(
+        [plan], {**SENSORS, "F_y": Sensor(noise=0.1, bias=1.0)}, {"pad.E": Unknown(), "contact.K_n": Unknown()}
+    )
+    x, c = stated.coordinates.start, stated.coordinates
+    J = stated.residuals(Runner([plan]), x, ["plan"], 1e-3, c.free).J
+    F = J.T @ J
+    left = F[:2, :2] - np.outer(F[:2, 2], F[2, :2]) / F[2, 2]
+    names, T = chosen(stated, x, None)
+    sds = deviations(names, T, fisher(J)[0])
+    assert list(sds.values()) == pytest.approx(np.sqrt(np.diag(np.linalg.inv(left))))
+
+
+def test_a_ratio_counts_with_what_it_is_a_ratio_to(plan: Recording) -> None:
+    unknowns = {"contact.mu_s": Unknown(), "contact.mu_k": Unknown(nominal=0.5, ratio_to="contact.mu_s")}
+    stated = Problem([plan], SENSORS, unknowns)
+    names, T = chosen(stated, stated.coordinates.start, ["contact.mu_k"])
+    assert names == ("contact.mu_k",)
+    assert T.tolist() == [[1.0, 1.0]]
+
+
+def test_motions_keep_within_their_bounds_between_knots_too(plan: Recording) -> None:
+    moves, t = Moves(plan.rig.reference, BOUNDS, 0.25), torch.linspace(0.13, 0.3, 2000, dtype=torch.float64)
+    rng = np.random.default_rng(0)
+    far = moves.start + 5 * rng.standard_normal(moves.n)
+    for z in (moves.nearest(far), moves.random(rng)):
+        reference = moves.reference(torch.from_numpy(z))
+        for name, one in BOUNDS.items():
+            value, rate = reference(t, [name])[:, 0].unbind(-1)
+            assert one.low - 1e-9 <= float(value.min()) and float(value.max()) <= one.high + 1e-9
+            assert float(rate.abs().max()) <= one.speed * (1 + 1e-6)
+        times = reference["x_d"].times
+        assert float(times[1:].diff().min()) >= 0.02 * (1 - 1e-6)
+        assert float(times[-1]) <= 0.25 * (1 + 1e-9)
+    assert any("x_d at" in line for line in moves.active(moves.nearest(far)))
+    assert np.abs(moves.nearest(moves.start) - moves.start).max() == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"plan": "other"}, "`plan` must be one of the recordings"),
+        ({"bounds": {}}, "names no signal"),
+        ({"bounds": {"F_ff": Bounds(low=-9, high=0, speed=1, after=0.2)}}, "`F_ff` has no knot after 0.2 s"),
+        ({"bounds": {"z_d": Bounds(low=0, high=1, speed=1)}}, "no Profile called `z_d`"),
+        ({"bounds": {"x_d": Bounds(low=0, high=1, speed=1, after=-1)}}, "must have a knot at or before -1 s"),
+        ({"bounds": {"x_d": Bounds(low=0, high=0.001, speed=1, after=0.13)}}, "no motion of these knots"),
+        ({"limits": {"F_x": (1.0, -1.0)}}, r"limits.F_x = \(1.0, -1.0\)"),
+        ({"limits": {"Fx": (-1.0, 1.0)}}, "limits.Fx"),
+        ({"names": ["pad.nu"]}, "`names` must be some of the parameters pad.E, contact.K_n"),
+        ({"criterion": Criterion("A", (1.0,))}, "`targets` has 1 standard deviations for the 2"),
+        ({"at": [np.zeros(5)]}, "`at` must hold points of the 2 coordinates"),
+        ({"iterations": 0}, "must be positive"),
+    ],
+)
+def test_what_does_not_fit_is_refused(problem: Problem, changes: dict[str, Any], message: str) -> None:
+    given: dict[str, Any] = {"plan": "plan", "bounds": BOUNDS} | changes
+    with pytest.raises(ValueError, match=message):
+        design(problem, **given)
+
+
+def test_bounds_and_criteria_are_checked() -> None:
+    with pytest.raises(ValueError, match="low = 1 must be below high = 0"):
+        Bounds(low=1, high=0, speed=1)
+    with pytest.raises(ValueError, match="`optimality` must be one of D, A, worst"):
+        Criterion("E")  # pyright: ignore[reportArgumentType]
+    with pytest.raises(ValueError, match="`targets` must be positive"):
+        Criterion("A", (1.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def found(problem: Problem) -> Design:
+    return design(
+        problem, "plan", BOUNDS, limits={"F_y": (-60.0, 60.0)}, at=draws(problem, 2, spread=0.1), iterations=8, rate=0.3,
+    )  # fmt: skip
+
+
+def test_a_designed_motion_tells_more(found: Design, problem: Problem) -> None:
+    """What is predicted for it is what its recording's own Jacobian says."""
+    assert all(found.after[name] < 0.9 * was for name, was in found.before.items())
+    assert found.history[-1].peak < 1.05
+    assert found.made_by["gradients"] >= 8 * 4
+    again = Problem([found.recording], SENSORS, problem.unknowns)
+    x = again.coordinates.start
+    at = again.residuals(Runner([found.recording]), x, ["plan"], 1e-3, again.coordinates.free)
+    assert np.abs(at.r).max() < 0.1
+    names, T = chosen(again, x, None)
+    assert deviations(names, T, fisher(at.J)[0]) == pytest.approx(found.after, rel=0.05)
+    assert found.table().count("\n") == 2
+
+
+def test_a_design_is_an_excitation_in_a_file(found: Design, tmp_path: Path) -> None:
+    excitation, path = found.excitation(PLAN), tmp_path / "motion.toml"
+    path.write_text(excitation.to_toml(), encoding="utf-8")
+    again = begin(Excitation.from_toml(path), P).model.reference
+    t = torch.linspace(0, 0.3, 200, dtype=torch.float64)
+    wanted = found.recording.rig.reference(t, ["x_d", "y_d", "F_ff"])
+    assert float((again(t, ["x_d", "y_d", "F_ff"]) - wanted).abs().max()) < 1e-9
+
+
+def test_a_design_has_a_picture(found: Design) -> None:
+    assert len(design_figure(found).get_axes()) == 4
+
+
+def test_any_rig_with_profiles(jaws: Rig) -> None:
+    """Here knots are places of driven bodies, and what may be unknown has names of its own."""
+    y0 = torch.zeros(jaws.layout.size, dtype=torch.float64)
+    y0[jaws.layout.slices["pose", "disc"]] = torch.tensor([3e-4, 23.94e-3, 0.0], dtype=torch.float64)
+    t, sensors = np.linspace(0.0, 0.2, 41), {"x_disc": Sensor(noise=1e-5), "y_disc": Sensor(noise=1e-5)}
+    data = Recording("jaws", jaws, {name: (t, np.zeros(len(t))) for name in sensors}, Known(y0))
+    stated = Problem([data], sensors, {"rubber.E": Unknown(), "rubber.tau": Unknown()})
+    bounds = {"upper.x": Bounds(low=-10e-3, high=10e-3, speed=0.2, after=0.06, shortest=0.03)}
+    found = design(
+        stated, "jaws", bounds, names=["rubber.tau"], iterations=4, rate=0.2, limits={"x_disc": (-6e-3, 6e-3)}
+    )
+    assert found.after["rubber.tau"] < 0.9 * found.before["rubber.tau"]
+    assert found.made_by["gradients"] >= 4 * 4
+
+
+def test_what_cannot_be_run_is_left(problem: Problem, monkeypatch: Any) -> None:
+    """In the search; the motion given is refused."""
+    look, count = Planner.look, [0]
+
+    def sometimes(self: Planner, *given: Any) -> Any:
+        count[0] += 1
+        if count[0] % 3 == 0:
+            raise SimulationFailed("the disc was lost", 0.1)
+        return look(self, *given)
+
+    monkeypatch.setattr(Planner, "look", sometimes)
+    found = design(problem, "plan", BOUNDS, iterations=2, starts=3)
+    assert any("could not be run" in notice for notice in found.notices)
+    assert found.made_by["iterations"] == 2
+    monkeypatch.setattr(Planner, "look", never)
+    with pytest.raises(ValueError, match="the motion given cannot be run"):
+        design(problem, "plan", BOUNDS, iterations=3)
+
+
+def never(self: Planner, *given: Any) -> Any:
+    raise SimulationFailed("the disc was lost", 0.1)
+
+
+def test_an_interruption_leaves_the_best_so_far(problem: Problem, monkeypatch: Any) -> None:
+    slopes, count = Planner.slopes, [0]
+
+    def interrupted(self: Planner, *given: Any) -> Array:
+        count[0] += 1
+        if count[0] == 3:
+            raise KeyboardInterrupt
+        return slopes(self, *given)
+
+    monkeypatch.setattr(Planner, "slopes", interrupted)
+    found = design(problem, "plan", BOUNDS, iterations=50)
+    assert "interrupted after 2 of 50 iterations" in found.notices
+
+
+def test_draws_come_from_priors(plan: Recording, problem: Problem) -> None:
+    with pytest.raises(ValueError, match="`pad.E` has no prior"):
+        draws(problem, 2)
+    points = np.array(draws(problem, 400, spread=0.2))
+    assert (points[0] == problem.coordinates.start).all()
+    assert points[1:].std(0) == pytest.approx(0.2, rel=0.15)
+
+
+def test_the_next_recording_is_predicted(plan: Recording, problem: Problem) -> None:
+    """What a recording would add is what it does add; one that cannot be made comes last."""
+    roll = record(
+        "roll",
+        PLAN.model_copy(update={"motion": Strokes(travel=2e-3, stroke_time=0.1)}),
+        P,
+        P,
+        SENSORS,
+        rtol=1e-3,
+        noise=0.0,
+    )
+    same, x = replace(plan, name="same"), problem.coordinates.start
+    first, second = next_recording(problem, x, [roll, same], rtol=1e-3)
+    assert first.gain >= second.gain > 0
+    by_name: dict[str, Outlook] = {one.name: one for one in (first, second)}
+    assert by_name["same"].gain == pytest.approx(np.log(2) / 2)  # twice the same halves variances
+    both = Problem([plan, roll], SENSORS, problem.unknowns)
+    J = both.residuals(Runner(both.recordings), x, both.names, 1e-3, both.coordinates.free).J
+    names, T = chosen(both, x, None)
+    assert by_name["roll"].after == pytest.approx(deviations(names, T, fisher(J)[0]))
+    with pytest.raises(ValueError, match="there is no candidate"):
+        next_recording(problem, x, [])
