@@ -3,7 +3,7 @@
 Two pairs of laws: friction that falls smoothly with the speed of slip or Coulomb's with one coefficient; rubber of
 Kelvin and Voigt, or in series with a spring (the standard linear solid). Truths are drawn about the nominal
 parameters, each law by turns; both laws are fitted to the noisy recording, from the nominal parameters, with 2 to 4
-unknowns, and `torchsoft.sysid.compare` judges. Three motions show the difference, two hardly do with sensors 5 and 10
+unknowns, and `torchsoft.sysid.compare` judges. Three motions show the difference, two hardly do with sensors 4 and 5
 times worse, and two do not: gentle rolling without slip, and a slow roll with sensors 10 times worse. Whether data
 can tell is measured without their noise: the wrong law is fitted to the exact recording, and what it leaves is D
 times the noise of one sample. By the rule (`torchsoft.sysid.comparison`) the right law should be named in more than
@@ -13,7 +13,7 @@ Coulomb's law has one coefficient here: with two, efforts jump where slip begins
 law's mu_k / mu_s ends at 0.9 and the solid's E_instant / E at 4, because without such bounds either contains the
 other law.
 
-Command: .venv/bin/python experiments/law_comparison.py [--cases 40] [--workers 2] [--smoke]
+Command: .venv/bin/python experiments/law_comparison.py [--cases 100] [--workers 2] [--smoke]
 Expected: at least 95 of 100 named right where motions show the difference, none named wrong anywhere, "cannot tell"
 where they do not. A quarter of an hour on two cores.
 """
@@ -48,7 +48,7 @@ ENOUGH = 7.3
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/law_comparison")
-    cases: int = 100  # in all of the motions that show the difference; half as many in the others
+    cases: int = 100  # in all of the motions that show the difference; an eighth as many in each of the others
     seed: int = 0
     workers: int = 2
     smoke: bool = False  # two cases of two motions

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from conftest import COARSE
 from scipy import stats
+from test_experiments import experiment
 from test_sysid_friction import Viscous
 
 from torchsoft import Parameters, Profile, Reference, SoftGrasp
@@ -107,8 +109,10 @@ def test_heldout_recordings_count_and_may_contradict() -> None:
     assert "held-out recordings speak for `b`" in torn.doubts[0]
 
 
-def fitted(name: str, p: float = 0.5, converged: bool = True, heldout_p: float | None = None) -> LawFit:
-    return LawFit(name, 2, {}, 0.0, 1.0, p, 0.0, 0.0, 0.0, 0.5, None, heldout_p, 0.0, converged)
+def fitted(
+    name: str, p: float = 0.5, converged: bool = True, heldout_p: float | None = None, patterned: bool = False
+) -> LawFit:
+    return LawFit(name, 2, {}, 0.0, 1.0, p, 0.0, 0.0, 0.0, 0.5, None, heldout_p, 0.0, converged, [], patterned)
 
 
 def test_no_law_is_named_that_leaves_more_than_noise_or_before_every_fit_has_converged() -> None:
@@ -119,6 +123,7 @@ def test_no_law_is_named_that_leaves_more_than_noise_or_before_every_fit_has_con
     assert (outcome, none) == ("none fits", None)
     assert "it is nearer than `b`, but that does not make it right" in verdict
     assert judged([fitted("a", heldout_p=1e-9), fitted("b")], [clear])[0] == "none fits"
+    assert "leaves residuals that follow the motion" in judged([fitted("a", patterned=True), fitted("b")], [clear])[2]
     outcome, _, verdict = judged([fitted("a"), fitted("b", converged=False)], [clear])
     assert outcome == "cannot tell"
     assert "the fit of `b` has not converged" in verdict
@@ -205,6 +210,10 @@ def test_a_users_own_law_is_named_where_contacts_slip(stroke: dict[str, Problem]
     assert len(content["series"][0]["residuals"]["smooth"]) == len(content["series"][0]["t"])
     assert found.table().count("\n") == 2
     assert len(plot(found).axes) == 2
+    with pytest.raises(ValueError, match="was not compared with `coulomb`, but with smooth"):
+        plot(found, "coulomb")
+    with pytest.raises(ValueError, match="kept without its residuals"):
+        plot(replace(found, series=[]))
 
 
 def test_gentle_rolling_cannot_tell_one_law_of_friction_from_another() -> None:
@@ -265,3 +274,25 @@ def test_densities_are_those_of_the_normal_distribution() -> None:
     white = density(SimpleNamespace(**vars(problem) | {"noise": {}}), ["one"], e / sigma)  # pyright: ignore[reportArgumentType]
     score = white.s / sigma - np.linalg.solve(K, e)
     assert ratio(plain, white).stated == pytest.approx(score @ K @ score, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_law_comparison_smoke(tmp_path: Path) -> None:
+    """Named where contacts slip, and not where they roll."""
+    module = experiment("law_comparison")
+    module.main(module.Config(out=tmp_path, smoke=True))
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert [case["answer"] for case in summary["cases"]] == ["right", "right", "cannot tell", "cannot tell"]
+    assert min(case["D"] for case in summary["cases"][:2]) > 20 > 1 > max(case["D"] for case in summary["cases"][2:])
+    assert (tmp_path / "law_comparison.png").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_resume_after_kill_smoke(tmp_path: Path) -> None:
+    """Both answers are the undisturbed one, and the one killed in a write had kept some runs."""
+    module = experiment("resume_after_kill")
+    module.main(module.Config(out=tmp_path, smoke=True))
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert [case["wrong"] for case in summary["cases"]] == ["", ""]
+    assert summary["cases"][1]["writing"]
+    assert summary["cases"][1]["remembered"] >= summary["cases"][1]["kept"] > 0

@@ -14,11 +14,13 @@ from torchsoft import Parameters, Reference, SoftGrasp
 from torchsoft.excitation import Excitation, MultiSine, Press, Strokes
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Unknown, record
-from torchsoft.sysid.conventions import check
+from torchsoft.sysid.conventions import check, findings
 from torchsoft.sysid.cost import paper_settings
 from torchsoft.sysid.finding import Finding, accepted, together
 from torchsoft.sysid.loops import loop_findings
-from torchsoft.sysid.setpoints import gaps
+from torchsoft.sysid.plan import LOOSE
+from torchsoft.sysid.readout import Signals, readout
+from torchsoft.sysid.setpoints import gaps, setpoint_findings
 from torchsoft.sysid.workers import Runner
 
 NOMINAL = Parameters().override(COARSE)
@@ -52,11 +54,26 @@ def recordings() -> dict[str, Recording]:
     }
 
 
-def looked_at(recording: Recording, sensors: Mapping[str, Sensor] = SENSORS) -> list[Finding]:
-    """What is found with the sensors that the recording has."""
+@pytest.fixture(scope="module")
+def runs(recordings: dict[str, Recording]) -> dict[str, Signals]:
+    """Runs with the nominal parameters."""
+    problem = Problem(list(recordings.values()), SENSORS, {"pad.E": Unknown()})
+    jobs = problem.jobs(problem.coordinates.start, problem.names, LOOSE, None)
+    made = zip(recordings.items(), Runner(problem.recordings).run(jobs))
+    return {name: Signals(run.t, one.channels, run.signals, None) for (name, one), run in made}
+
+
+def looked_at(
+    recording: Recording, run: Signals | None = None, sensors: Mapping[str, Sensor] = SENSORS
+) -> list[Finding]:
+    """What is found with the sensors that the recording has, against a run that is there, or one of its own."""
     mine = {name: sensor for name, sensor in sensors.items() if name in recording.samples}
-    problem = Problem([recording], mine, {"pad.E": Unknown()})
-    return check(problem, Runner(problem.recordings))
+    if run is None:
+        problem = Problem([recording], mine, {"pad.E": Unknown()})
+        return check(problem, Runner(problem.recordings))
+    span = float(recording.times[0]), float(recording.times[-1])
+    readouts = {name: readout(recording.rig, name, sensor, {}, span) for name, sensor in mine.items()}
+    return findings(recording, mine, {name: (one, run) for name, one in readouts.items()})
 
 
 def changed(recording: Recording, **channels: Callable[[Any, Any], Any] | None) -> Recording:
@@ -101,7 +118,7 @@ MISTAKES = {
         "rolling", lambda r: changed(r, F_x=scaled(-1)), "sign of F_x", "F_x looks as if its sign were opposite", True
     ),
     "sign of a force that only a run tells": Mistake(
-        "rolling", lambda r: changed(r, F_y=scaled(-1), y_Br=None), "sign of F_y", "correlation with a run from the start is -", True
+        "rolling", lambda r: changed(r, F_y=scaled(-1), y_Br=None), "sign of F_y", "correlation with a run from the start", True
     ),
     "sign of an angle": Mistake(
         "rolling", lambda r: changed(r, theta=scaled(-1)), "sign of theta", "theta looks as if its sign were opposite", True
@@ -126,7 +143,7 @@ MISTAKES = {
         'x_d looks like the set-point of the disc, not of the bracket (say control.senses = "disc")', True,
     ),
     "the bracket's taken for the disc's": Mistake(
-        "rolling", lambda r: noted(r, {"control.senses": "disc"}), "control.senses", "set-point of the bracket, not of the disc", True
+        "rolling", lambda r: noted(r, {"control.senses": "disc"}), "control.senses", "of the bracket, not of the disc", True
     ),
     "the bracket's taken for the disc's, no forces": Mistake(
         "rolling", lambda r: changed(noted(r, {"control.senses": "disc"}), **NO_F), "control.senses", "x_Br follows it to", True
@@ -136,23 +153,23 @@ MISTAKES = {
         "x_C does not follow it", True,
     ),
     "exchanged columns": Mistake(
-        "rolling", lambda r: replace(r, samples=r.samples | {"x_C": r.samples["x_Br"], "x_Br": r.samples["x_C"]}), "control.senses",
-        "or are x_Br and x_C exchanged?", True,
+        "rolling", lambda r: changed(r, x_C=lambda t, x: r.samples["x_Br"][1], x_Br=lambda t, x: r.samples["x_C"][1]),
+        "control.senses", "or are x_Br and x_C exchanged?", True,
     ),
     "no force fed forward": Mistake(
-        "rolling", lambda r: noted(r, F_ff=Profile([0.0], [0.0])), "F_ff", "was a force fed forward that F_ff does not have?", False
+        "rolling", lambda r: noted(r, F_ff=Profile([0.0], [0.0])), "F_ff", "was a force fed forward that F_ff does", False
     ),
     "its sign": Mistake(
         "pressing", lambda r: noted(r, F_ff=opposite(r)), "sign of F_ff", "F_ff looks as if its sign were opposite", True
     ),
     "a zero": Mistake(
-        "rolling", lambda r: changed(r, x_Br=lambda t, x: x + 40e-6), "zero of x_Br", "N too much, or x_Br and x_d have zeros 3.9", False
+        "rolling", lambda r: changed(r, x_Br=lambda t, x: x + 40e-6), "zero of x_Br", "or x_Br and x_d have zeros 3.9", False
     ),
     "a zero, no forces": Mistake(
-        "rolling", lambda r: changed(r, x_Br=lambda t, x: x + 60e-6, **NO_F), "zero of x_Br", "do both have the same zero?", False
+        "rolling", lambda r: changed(r, x_Br=lambda t, x: x + 60e-6, **NO_F), "zero of x_Br", "do both have the same", False
     ),
     "the zero of the angle": Mistake(
-        "rolling", lambda r: changed(r, theta=lambda t, y: y + 0.02), "zero of theta", "from where the disc would have it", False
+        "rolling", lambda r: changed(r, theta=lambda t, y: y + 0.02), "zero of theta", "from where the disc would", False
     ),
     "a late force": Mistake(
         "shaking", lambda r: changed(r, F_x=late(5e-3)), "time of F_x", "ms late", False
@@ -174,9 +191,12 @@ def opposite(recording: Recording) -> Profile:
 
 
 @pytest.mark.parametrize("name", MISTAKES)
-def test_a_mistake_gets_the_sentence_that_helps(recordings: dict[str, Recording], name: str) -> None:
+def test_a_mistake_gets_the_sentence_that_helps(
+    recordings: dict[str, Recording], runs: dict[str, Signals], name: str
+) -> None:
     mistake = MISTAKES[name]
-    found = looked_at(mistake.change(recordings[mistake.motion]))
+    one = mistake.change(recordings[mistake.motion])
+    found = looked_at(one, runs[mistake.motion] if one.rig is recordings[mistake.motion].rig else None)
     assert [f.what for f in found] == [mistake.what]
     assert mistake.words in found[0].sentence, found[0].sentence
     assert found[0].sentence.startswith(f"recording `{mistake.motion}`: ")
@@ -184,12 +204,14 @@ def test_a_mistake_gets_the_sentence_that_helps(recordings: dict[str, Recording]
 
 
 @pytest.mark.parametrize("motion", MOTIONS)
-def test_nothing_is_said_of_what_is_right(recordings: dict[str, Recording], motion: str) -> None:
+def test_nothing_is_said_of_what_is_right(
+    recordings: dict[str, Recording], runs: dict[str, Signals], motion: str
+) -> None:
     """With a start that is off by a factor of three, with fewer sensors, and with faults that were declared."""
-    one = recordings[motion]
-    assert looked_at(one) == []
-    assert looked_at(changed(one, **NO_F)) == []
-    assert looked_at(changed(one, x_Br=None, y_Br=None)) == []
+    one, run = recordings[motion], runs[motion]
+    assert looked_at(one, run) == []
+    assert looked_at(changed(one, **NO_F), run) == []
+    assert looked_at(changed(one, x_Br=None, y_Br=None), run) == []
     declared = SENSORS | {
         "x_Br": Sensor(noise=1e-5, bias=1e-4), "theta": Sensor(noise=5e-4, bias=0.1, delay=0.08),
         "F_x": Sensor(noise=0.1, delay=6e-3), "F_y": Sensor(noise=0.1, gain=0.2),
@@ -197,7 +219,7 @@ def test_nothing_is_said_of_what_is_right(recordings: dict[str, Recording], moti
     faulty = changed(
         one, x_Br=lambda t, x: x + 40e-6, theta=lambda t, y: late(60e-3)(t, y) + 0.02, F_x=late(5e-3), F_y=scaled(1.15)
     )
-    assert looked_at(faulty, declared) == []
+    assert looked_at(faulty, run, declared) == []
 
 
 def test_gains_that_are_unknown_still_tell_a_sign(recordings: dict[str, Recording]) -> None:
@@ -207,14 +229,15 @@ def test_gains_that_are_unknown_still_tell_a_sign(recordings: dict[str, Recordin
     assert [f.what for f in loop_findings(flipped, SENSORS, ["control.K_98"])] == ["sign of F_y"]
 
 
-def test_gaps_and_other_rates_of_samples_are_no_mistake(recordings: dict[str, Recording]) -> None:
-    """Of the force at 1 kHz with a hole in it, and a camera at 50 Hz."""
+def test_gaps_and_other_rates_of_samples_are_no_mistake(
+    recordings: dict[str, Recording], runs: dict[str, Signals]
+) -> None:
+    """A force with a hole in it, and a camera at 50 Hz."""
     one, samples = recordings["rolling"], dict(recordings["rolling"].samples)
     t, F = samples["F_x"]
-    dense = np.arange(t[0], t[-1], 1e-3)
-    dense = dense[(dense < 0.4) | (dense > 0.5)]
-    samples |= {"F_x": (dense, CubicSpline(t, F)(dense)), "x_C": tuple(x[::4] for x in samples["x_C"])}
-    assert looked_at(replace(one, samples=samples)) == []
+    there = (t < 0.4) | (t > 0.5)
+    samples |= {"F_x": (t[there], F[there]), "x_C": tuple(x[::4] for x in samples["x_C"])}
+    assert looked_at(replace(one, samples=samples), runs["rolling"]) == []
 
 
 def at_rows(recording: Recording, rate: float, *, rates: bool = False) -> Recording:
@@ -243,7 +266,9 @@ def test_sparse_set_points_are_told_by_what_they_do(recordings: dict[str, Record
         assert 0.5 * real < told.error < 2.5 * real
         assert told.noises == told.error / SENSORS["F_x"].noise
         assert 2.5 < told.order <= 4.0
-    enough, few, hardly = (looked_at(at_rows(one, rate, rates=rates)) for rate in (500.0, 100.0, 30.0))
+    enough, few, hardly = (
+        list(setpoint_findings(at_rows(one, rate, rates=rates), SENSORS)) for rate in (500.0, 100.0, 30.0)
+    )
     assert enough == []
     (said,) = [f for f in few if f.what == "set-points x_d"]
     assert "set-points x_d every 10 ms are too sparse for this motion" in said.sentence
@@ -257,8 +282,9 @@ def test_a_rate_that_is_not_that_of_its_set_point_is_named(recordings: dict[str,
     x_d = one.rig.reference["x_d"]
     assert isinstance(x_d, Sampled)
     for factor, words in ((-1.0, "its sign looks opposite"), (1e3, "it is 1e+03 times that")):
-        other = Sampled(x_d.times, x_d.values.detach(), factor * x_d.rates)
-        (found,) = [f for f in looked_at(noted(one, x_d=other)) if f.what == "rate of x_d"]
+        other: Any = Sampled(x_d.times, x_d.values.detach(), factor * x_d.rates)
+        (found,) = setpoint_findings(noted(one, x_d=other), SENSORS)
+        assert found.what == "rate of x_d"
         assert found.grave
         assert "x_d_dot is not the rate of x_d" in found.sentence
         assert words in found.sentence

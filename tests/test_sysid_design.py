@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE
-from test_sysid_readout import jaws  # noqa: F401
+from conftest import COARSE, grasp, turning
 
-from torchsoft import Parameters, Rig
+from torchsoft import Parameters, Profile, Reference
 from torchsoft.excitation import Excitation, Knots, Strokes, begin
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import RIG, Known, Problem, Recording, Sensor, Unknown, record
@@ -18,7 +17,7 @@ from torchsoft.sysid.criterion import Criterion, Outlook, chosen, deviations, ne
 from torchsoft.sysid.design import Design, design, draws
 from torchsoft.sysid.design_figure import design_figure
 from torchsoft.sysid.information import fisher
-from torchsoft.sysid.knots import Bounds, Moves
+from torchsoft.sysid.knots import Bounds, Moves, profile
 from torchsoft.sysid.planner import Planner
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.workers import Runner
@@ -115,9 +114,10 @@ def test_motions_keep_within_their_bounds_between_knots_too(plan: Recording) -> 
         reference = moves.reference(torch.from_numpy(z))
         for name, one in BOUNDS.items():
             value, rate = reference(t, [name])[:, 0].unbind(-1)
-            assert one.low - 1e-9 <= float(value.min()) and float(value.max()) <= one.high + 1e-9
+            assert one.low - 1e-9 <= float(value.min())
+            assert float(value.max()) <= one.high + 1e-9
             assert float(rate.abs().max()) <= one.speed * (1 + 1e-6)
-        times = reference["x_d"].times
+        times = profile(reference, "x_d").times
         assert float(times[1:].diff().min()) >= 0.02 * (1 - 1e-6)
         assert float(times[-1]) <= 0.25 * (1 + 1e-9)
     assert any("x_d at" in line for line in moves.active(moves.nearest(far)))
@@ -190,18 +190,24 @@ def test_a_design_has_a_picture(found: Design) -> None:
     assert len(design_figure(found).get_axes()) == 4
 
 
-def test_any_rig_with_profiles(jaws: Rig) -> None:
-    """Here knots are places of driven bodies, and what may be unknown has names of its own."""
-    y0 = torch.zeros(jaws.layout.size, dtype=torch.float64)
-    y0[jaws.layout.slices["pose", "disc"]] = torch.tensor([3e-4, 23.94e-3, 0.0], dtype=torch.float64)
-    t, sensors = np.linspace(0.0, 0.2, 41), {"x_disc": Sensor(noise=1e-5), "y_disc": Sensor(noise=1e-5)}
-    data = Recording("jaws", jaws, {name: (t, np.zeros(len(t))) for name in sensors}, Known(y0))
-    stated = Problem([data], sensors, {"rubber.E": Unknown(), "rubber.tau": Unknown()})
-    bounds = {"upper.x": Bounds(low=-10e-3, high=10e-3, speed=0.2, after=0.06, shortest=0.03)}
-    found = design(
-        stated, "jaws", bounds, names=["rubber.tau"], iterations=4, rate=0.2, limits={"x_disc": (-6e-3, 6e-3)}
+def test_any_rig_with_profiles() -> None:
+    """It has no excitation, and its start is given."""
+    rig = turning(control__senses="bracket")
+    y, still = grasp(rig.fixed())
+    x = float(profile(still, "x_d").values)
+    rig.reference = Reference(x_d=Profile([0.0, 0.04, 0.08], [x, x + 5e-4, x]), y_d=still["y_d"], F_ff=still["F_ff"])
+    t, sensors = np.linspace(0.0, 0.1, 21), {name: SENSORS[name] for name in ("x_C", "theta")}
+    data = Recording(
+        "turning", rig, {name: (t, np.zeros(len(t))) for name in sensors}, Known(rig.pack(rig.fixed().unpack(y)))
     )
-    assert found.after["rubber.tau"] < 0.9 * found.before["rubber.tau"]
+    stated, bounds = (
+        Problem([data], sensors, {"pad.E": Unknown(), "pad.tau": Unknown()}),
+        {"x_d": Bounds(low=x - 2e-3, high=x + 2e-3, speed=0.2, shortest=0.02)},
+    )
+    found = design(
+        stated, "turning", bounds, names=["pad.tau"], iterations=4, rate=0.3, limits={"x_C": (x - 1e-2, x + 1e-2)}
+    )
+    assert found.after["pad.tau"] < 0.9 * found.before["pad.tau"]
     assert found.made_by["gradients"] >= 4 * 4
 
 
@@ -243,7 +249,7 @@ def test_an_interruption_leaves_the_best_so_far(problem: Problem, monkeypatch: A
 
 
 def test_draws_come_from_priors(plan: Recording, problem: Problem) -> None:
-    with pytest.raises(ValueError, match="`pad.E` has no prior"):
+    with pytest.raises(ValueError, match=r"`pad\.E` has no prior"):
         draws(problem, 2)
     points = np.array(draws(problem, 400, spread=0.2))
     assert (points[0] == problem.coordinates.start).all()

@@ -2,12 +2,13 @@
 
 from torchsoft.channels import MEASURED
 from torchsoft.sysid.answer import Answer, load_answer
+from torchsoft.sysid.estimate import Estimate
 from torchsoft.sysid.first_samples import begin_underway
 from torchsoft.sysid.fit import Unreachable
 from torchsoft.sysid.plan import Stage
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Recording
-from torchsoft.sysid.result import Estimate, IdentificationResult
+from torchsoft.sysid.result import IdentificationResult
 from torchsoft.sysid.solve import identify
 from torchsoft.sysid.start import AtRest, Known
 from torchsoft.sysid.synthetic import RIG, record

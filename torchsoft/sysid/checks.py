@@ -181,7 +181,10 @@ def difference(
             if other is None:
                 return None, f"it has no meaning where recording `{recording.name}` begins"
             made.append(other)
-        varied = Problem(made, problem.sensors, problem.unknowns, problem.noise)
+        try:
+            varied = Problem(made, problem.sensors, problem.unknowns, problem.noise)
+        except ValueError as error:  # an unknown that the varied rig has not
+            return None, str(error)
         runner = Runner(varied.recordings, workers, journal)
     jobs = varied.jobs(x, which, steps, None)
     for k, job in enumerate(jobs):

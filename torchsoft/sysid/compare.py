@@ -12,7 +12,7 @@ from torchsoft.sysid.colour import ROUNDS, colours
 from torchsoft.sysid.comparison import Comparison, LawFit, Series, Versus, judged
 from torchsoft.sysid.evidence import Evidence, FittedLaw, ratio
 from torchsoft.sysid.fit import Fit, Unreachable, gauss_newton
-from torchsoft.sysid.misfit import parts
+from torchsoft.sysid.misfit import notices, parts
 from torchsoft.sysid.pattern import Motion, motion, where
 from torchsoft.sysid.plan import Stage, default_plan
 from torchsoft.sysid.problem import Problem
@@ -62,7 +62,7 @@ def compare(
             raise ValueError(f"the law `{name}` cannot follow the recordings: {lost}") from None
         evidence[name] = Evidence(law, runners[name], which, heldout)
     best = most_likely(evidence)
-    for name in laws.keys() - {best} if again else ():
+    for name in (name for name in laws if again and name != best):
         other = refitted(evidence[name].law, evidence[best].law, runners[name], which)
         if other is not None:
             better = Evidence(other, runners[name], which, heldout)
@@ -221,7 +221,8 @@ def law_fits(evidence: Mapping[str, Evidence]) -> list[LawFit]:
                 name, int(k[i]), {a.label: a.to_value(x) for a, x, free in zip(c.all, one.law.x, one.law.free) if free},
                 one.fitted.log, square / one.dof, float(stats.chi2.sf(square, one.dof)), float(aic[i]), float(aicc[i]),
                 float(bic[i]), float(weight[i] / weight.sum()), None if held is None else held.log / len(held.r),
-                None if held is None else held.p, one.numerical, one.law.converged,
+                None if held is None else held.p, one.numerical, one.law.converged, notices(one.verdicts),
+                any(verdict.alarming and verdict.test == "motion" for verdict in one.verdicts),
             )
         )  # fmt: skip
     return out

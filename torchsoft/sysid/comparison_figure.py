@@ -21,11 +21,15 @@ MOST = 4
 def plot(comparison: Comparison, other: str | None = None) -> Figure:
     """The evidence against `other` (by default the law next to the best) as it grows along each recording, in all and by the
     channels that tell most, and both laws' residuals of the channel that tells most. Raises `ValueError` for a law that was
-    not compared with the best."""
+    not compared with the best, and where the residuals have not been kept."""
     chosen = [v for v in comparison.against if other in (None, v.other)]
     if not chosen:
         raise ValueError(
             f"the best law was not compared with `{other}`, but with {', '.join(v.other for v in comparison.against)}"
+        )
+    if not comparison.series:
+        raise ValueError(
+            "the comparison was kept without its residuals, so there is nothing to draw: compare once more"
         )
     versus = min(chosen, key=lambda v: v.evidence)
     by_recording: dict[str, list[Series]] = {}

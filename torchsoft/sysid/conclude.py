@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from torchsoft.sysid import checks, misfit, robust
 from torchsoft.sysid.colour import Coloured, colour_notices, rewhitened
+from torchsoft.sysid.estimate import directions, estimates, nrmse, residual_channels
 from torchsoft.sysid.information import fisher
 from torchsoft.sysid.plan import Stage
 from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.recording import Array
-from torchsoft.sysid.result import IdentificationResult, described, directions, estimates, nrmse, residual_channels
+from torchsoft.sysid.result import IdentificationResult, described
 from torchsoft.sysid.robust import Loss
 from torchsoft.sysid.settle import FINER, STEP_BIAS, Settled, settle
 from torchsoft.sysid.stages import Method, progress_bar, stage_entry
@@ -129,15 +130,15 @@ def notices_on(found: list[Any], converged: bool, rtol: float, unchecked: bool) 
     for e in found:
         if not e.identifiable:
             change = f"a change by {e.relative_sd:.0%}" if e.relative_sd < 9 else "a change by a factor of ten"
-            out.append(f"{e.name} is not identifiable from these data: {change} would not show in them")
+            out.append(f"{e.label} is not identifiable from these data: {change} would not show in them")
         if e.at_bound:
-            out.append(f"{e.name} ended at a bound ({e.last:.4g}): widen the bound or question the model")
+            out.append(f"{e.label} ended at a bound ({e.last:.4g}): widen the bound or question the model")
     worst = max(found, key=lambda e: abs(e.step_bias_sd), default=None)
     if unchecked:
         out.append(f"the tolerance rtol = {rtol:g} could not be checked: a run failed that was made to check it")
     elif worst is not None and abs(worst.step_bias_sd) > STEP_BIAS:
         out.append(
-            f"the tolerance rtol = {rtol:g} is too coarse for these data: it shifts {worst.name} by "
+            f"the tolerance rtol = {rtol:g} is too coarse for these data: it shifts {worst.label} by "
             f"{abs(worst.step_bias_sd):.2g} standard deviations ({worst.step_bias_sd * worst.relative_sd:+.2%}); take "
             f"rtol = {FINER * rtol:g}"
         )

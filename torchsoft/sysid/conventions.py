@@ -6,7 +6,8 @@ tell a sign, a unit, a large delay, and the body whose place a set-point is. Set
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 import numpy as np
 import torch
@@ -62,24 +63,33 @@ def check(problem: Problem, runner: Runner, which: Sequence[str] | None = None) 
     which = problem.names if which is None else which
     unknown = [name for name in problem.coordinates.names if not name.startswith(PREFIX)]
     jobs = problem.jobs(x, which, LOOSE, None)
-    for job, got in zip(jobs, runner.run(jobs)):
-        recording = problem.recordings[job.recording]
-        mine = [*setpoint_findings(recording, problem.sensors), *loop_findings(recording, problem.sensors, unknown)]
-        expected = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of motions that a mistake makes violent
+        runs = runner.run(jobs)
+    for job, got in zip(jobs, runs):
+        recording, expected = problem.recordings[job.recording], {}
         if isinstance(got, Prediction):
             signals = Signals(got.t, recording.channels, got.signals, None)
-            readouts = problem.readouts(x, job.recording)
-            expected = {name: (one, signals) for name, one in readouts.items()}
-        mine += another_body(recording, problem.sensors, expected)
-        blamed = {f.what for f in mine}
-        if not any(f.grave for f in mine):
-            mine += [one for one in against_run(recording, problem.sensors, expected) if one.what not in blamed]
-        found += mine
+            expected = {name: (one, signals) for name, one in problem.readouts(x, job.recording).items()}
+        found += findings(recording, problem.sensors, expected, unknown)
     return together(found)
 
 
 Expected = Mapping[str, tuple[Readout, Signals]]
 """The sensors of a run, with its signals."""
+
+
+def findings(
+    recording: Recording, sensors: Mapping[str, Sensor], expected: Expected, unknown: Collection[str] = ()
+) -> list[Finding]:
+    """What looks wrong in one recording, which is expected to look as in a run from the start, if there is one; `unknown` are
+    the parameters whose values are not known. Nothing is held against the run where something grave is found without it."""
+    found = [*setpoint_findings(recording, sensors), *loop_findings(recording, sensors, unknown)]
+    found += another_body(recording, sensors, expected)
+    if any(one.grave for one in found):
+        return found
+    blamed = {one.what for one in found}
+    return found + [one for one in against_run(recording, sensors, expected) if one.what not in blamed]
 
 
 def samples(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> tuple[Array, Array]:

@@ -126,8 +126,8 @@ def design(
 
     Of the plan's samples only the times count; the other recordings and the priors count with what they tell. Sensors'
     biases and the like are nuisances: what the criterion sees is what is left when they are fitted too. `bounds` holds the
-    travel, speed and free knots of signals of the reference, `limits` the ranges (low, high) [unit] of channels of the run, such as
-    forces. `at` are points x of the coordinates (`draws`), by default the nominal one; the criterion's "mean" over them
+    travel, speed and free knots of signals of the reference, `limits` the ranges (low, high) [unit] of channels of the run,
+    such as forces. `at` are points x of the coordinates (`draws`), by default the nominal one; the criterion's "mean" over them
     is lowered, or the "worst".
 
     The search begins with the plan's own motion, or with the best of it and of `starts` - 1 random ones. Each of the

@@ -1,5 +1,7 @@
 """A designed motion in one picture: set-points before and after, standard deviations, and the criterion as it went."""
 
+from typing import Any
+
 import numpy as np
 import torch
 from matplotlib import rc_context
@@ -16,7 +18,8 @@ def design_figure(design: Design) -> Figure:
     """The signals whose knots moved, above; relative standard deviations and the criterion below."""
     names, bounds = tuple(design.made_by["bounds"]), design.made_by["bounds"]
     figure = Figure(figsize=(9.0, 1.8 * len(names) + 3.2), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(1.8 * len(names), 3.2))
+    panels: Any = figure.subfigures(2, 1, height_ratios=(1.8 * len(names), 3.2))
+    above, below = panels
     t = np.linspace(design.recording.times[0], design.recording.times[-1], 2000)
     for ax, name in zip(above.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0], names):
         shown, scale = SHOWN.get(unit(name), (unit(name), 1.0))

@@ -9,7 +9,7 @@ from scipy import stats
 from scipy.sparse.linalg import spsolve_triangular
 
 from torchsoft.sysid.fit import Unreachable
-from torchsoft.sysid.misfit import Part, parts
+from torchsoft.sysid.misfit import Part, judge, parts
 from torchsoft.sysid.noise import Autoregression, fit_noise, log_det
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
@@ -74,8 +74,9 @@ class Evidence:
         self.parameters = int(free.sum()) + sum(one.order + 1 for one in problem.noise.values())
         m = problem.samples(which)
         usual = self._at(which, law.rtol, False).r[:m]
-        r, J, _ = self._at(which, FINER * law.rtol, bool(heldout))
+        r, J, _ = self._at(which, FINER * law.rtol, True)
         self.fitted = density(problem, which, r[:m])
+        self.verdicts = judge(self.fitted.parts, r, J[:, free])
         self.numerical = abs(0.5 * float(usual @ usual - self.fitted.r @ self.fitted.r))
         self.dof, self.heldout = max(m - int(free.sum()), 1), None
         if heldout:

@@ -146,7 +146,7 @@ class Moves:
         for name, (times, values, first) in self.knots.items():
             one = self.bounds[name]
             low, high = np.sort(rng.uniform(one.low, one.high, 2))
-            steps = one.speed / PEAK * np.diff(times[first - 1 :]) * 10 ** rng.uniform(-1, 0)
+            steps = one.speed / PEAK * np.diff(times[first - 1 :]) * float(10 ** rng.uniform(-1, 0))
             at, path = values[first - 1], []
             for step in steps:
                 goal = rng.uniform(low, high)

@@ -140,9 +140,6 @@ def flipped(loop: Loop, F: Array, given: Array) -> Change:
 def sensed(rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop]) -> Iterator[Change]:
     """The coordinate of another body in the place of the one that the loop is taken to sense."""
     for other, its in rivals.items():
-        count = min(len(its.edges), len(loop.edges))
-        if count != len(its.edges) or not np.allclose(its.edges, loop.edges):
-            continue
         e = its.beyond(its.force() - its.given(its.asked(), its.found()))
         yield another_sense(rig, loop.actuator, body, other, e)
 

@@ -73,12 +73,23 @@ def visible(J: Array, candidates: NDArray[np.bool_], limit: float = FIRST_LOOK) 
     return out
 
 
+def told(problem: Problem, which: Sequence[str]) -> NDArray[np.bool_]:
+    """Coordinates (n,) that recordings may tell something of: not those of other recordings, nor of sensors that they lack."""
+    channels = {channel for recording in problem.recordings if recording.name in which for channel in recording.samples}
+    return np.array(
+        [
+            one.recording in (None, *which) and (one.of_the_rig or one.name in channels)
+            for one in problem.coordinates.all
+        ]
+    )
+
+
 def default_plan(problem: Problem, runner: Runner, rtol: float, which: Sequence[str], starts: int = 1) -> list[Stage]:
     """Stages for some recordings: the slowest first, for what its Fisher matrix at the start makes identifiable.
 
     Raises `Unreachable` where that recording cannot be simulated from the start.
     """
-    c, free = problem.coordinates, problem.coordinates.free
+    c, free = problem.coordinates, problem.coordinates.free & told(problem, which)
     ratios = np.array([bool(one.ratio_to) for one in c.all]) & free
     x, labels = tie_ratios(problem, c.start), np.array(c.labels, object)
     speed = {recording.name: recording.speed for recording in problem.recordings}

@@ -14,16 +14,11 @@ from torchsoft.physics.rig import Rig
 from torchsoft.sysid.answer import Answer, AssumptionCheck, ChannelNoise, FittedCoordinate, OrderTried
 from torchsoft.sysid.checks import Check
 from torchsoft.sysid.contribution import contributions
-from torchsoft.sysid.estimate import Estimate, directions, estimates, nrmse, residual_channels
 from torchsoft.sysid.information import Combination, combinations
 from torchsoft.sysid.noise import Score
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recorded import RecordedRig, recorded_rigs
 from torchsoft.sysid.recording import Array
-
-__all__ = [
-    "Estimate", "IdentificationResult", "described", "directions", "estimates", "nrmse", "residual_channels",
-]  # fmt: skip
 
 BLURRED = 0.1
 """Relative standard deviation of a combination of parameters from which it is looked for what the data see in its place."""

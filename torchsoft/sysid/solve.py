@@ -48,7 +48,8 @@ def identify(
     rig can do at all: signs, units, delays, zeros, set-points, the body that a loop senses (`conventions`); `meant` names
     findings that are no mistakes. With `assumptions` = "trusted" both are left out.
 
-    Raises `ValueError` for recordings that are not there or cannot be what they are taken for, `Unreachable` where the model cannot follow the data.
+    Raises `ValueError` for recordings that are not there or cannot be what they are taken for, `Unreachable` where the model
+    cannot follow the data.
     """
     unknown = set(heldout) - set(problem.names)
     if unknown or len(set(heldout)) == len(problem.recordings):
