@@ -43,4 +43,4 @@ CASES = {
     ),
     "series": Case("series", Roll(travel=4e-3), 0.25, 10.0, {"pad.E": 0.3, "contact.K_n": 0.7}),
 }  # fmt: skip
-"""Strokes that slip, seen well; and a roll that sees the stiffnesses of pads and contacts in series, and hardly each of them."""
+"""Strokes that slip, seen well; and a roll that sees the stiffnesses of pads and contacts in series, hardly each of them."""

@@ -1,7 +1,7 @@
 """Question: are posteriors right, over everything that the prior thinks possible?
 
-Simulation-based calibration: truths from the prior, data with noise from each, a fit, draws of its posterior, and the rank of the
-truth among them, which is uniform where all of this is right. Two problems: strokes that slip, four parameters, where
+Simulation-based calibration: truths from the prior, data with noise from each, a fit, draws of its posterior, and the rank of
+the truth among them, which is uniform where all of this is right. Two problems: strokes that slip, four parameters, where
 Laplace's approximation should do; and a roll that sees the stiffnesses of pads and contacts in series, where the posterior is
 bent, Laplace's Gaussian wrong, and NUTS is needed. "Gaussian" stands for Laplace's draws without their importance weights.
 Two tests by parameter, chi-squared on bins and the deviation of the distribution function; flat is what none of them rejects at
@@ -14,8 +14,9 @@ posteriors say that they are not to be trusted.
 """
 
 import time as clock
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +30,14 @@ from torchsoft.sysid.calibration import Calibration, calibrate, fitted, simulate
 from torchsoft.sysid.information import combinations
 from torchsoft.sysid.nuts import nuts
 from torchsoft.sysid.optimum import Optimum
-from torchsoft.sysid.posterior import Posterior, laplace
+from torchsoft.sysid.posterior import Posterior, inside, laplace
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.profile import Profile, profiles
 
 Posteriors = Callable[[Optimum, int], Posterior]
 
-TUNE = 60
-"""Draws for tuning before those of a chain: the whitened posterior needs few."""
+TUNE, FEW = 40, 19
+"""Draws for tuning before those of NUTS, which are whitened and need few; and how many ranks are among, three times thinned."""
 
 
 @dataclass(frozen=True)
@@ -44,19 +45,21 @@ class Config:
     out: Path = Path("out/calibration")
     runs: int = 100  # truths, Laplace
     nuts: int = 40  # truths, NUTS; none leaves it out
-    draws: int = 100  # of each posterior, ranks are among one less
+    draws: int = 100  # of Laplace, ranks are among one less
     rtol: float = 1e-4  # of the fits; data have a hundredth of it
     workers: int = 2
     seed: int = 0
-    smoke: bool = False  # ten truths of the second problem, a short chain
+    smoke: bool = False  # ten truths of the second problem, the Gaussian only
 
 
 @dataclass(frozen=True)
 class Way:
-    """One way to posteriors: its calibration, seconds by the wall, runs and gradients of all its posteriors."""
+    """One way to posteriors: its calibration, seconds by the wall and of the processor, of all ways of the same pass, runs and
+    gradients of its posteriors."""
 
     calibration: Calibration
     wall_s: float
+    cpu_s: float
     simulations: float
     gradients: float
 
@@ -85,55 +88,58 @@ class Result:
     looks: dict[str, Look]
 
 
-def calibrated(problem: Problem, config: Config, runs: int, posterior: Posteriors, draws: int) -> Way:
-    costs: list[dict[str, float]] = []
+def calibrated(
+    problem: Problem, config: Config, runs: int, draws: int, posteriors: Mapping[str, Posteriors]
+) -> dict[str, Way]:
+    """Posteriors of the same data, in one pass."""
+    costs: dict[str, list[dict[str, float]]] = {name: [] for name in posteriors}
 
-    def counted(o: Optimum, seed: int) -> Posterior:
-        found = posterior(o, seed)
-        costs.append(found.cost)
+    def counted(name: str, o: Optimum, seed: int) -> Posterior:
+        found = posteriors[name](o, seed)
+        costs[name].append(found.cost)
         return found
 
+    cpu = clock.process_time()
     found, wall = timed(
         lambda: calibrate(
-            problem, counted, rtol=config.rtol, runs=runs, draws=draws, workers=config.workers, seed=config.seed,
-            progress=True,
+            problem, {name: partial(counted, name) for name in posteriors}, rtol=config.rtol, runs=runs, draws=draws,
+            workers=config.workers, seed=config.seed, progress=True,
         )
     )  # fmt: skip
-    return Way(found, wall, *(sum(one[kind] for one in costs) for kind in ("simulations", "gradients")))
+    cpu = clock.process_time() - cpu
+    return {
+        name: Way(one, wall, cpu, *(sum(cost[kind] for cost in costs[name]) for kind in ("simulations", "gradients")))
+        for name, one in found.items()
+    }
 
 
 def ways(problem: Problem, config: Config) -> dict[str, Way]:
     """Laplace with and without its weights, and NUTS."""
-    known: dict[int, Posterior] = {}
 
     def weighted(o: Optimum, seed: int) -> Posterior:
-        known[seed] = laplace(o, draws=config.draws, seed=seed)
-        return known[seed]
+        return laplace(o, draws=config.draws, seed=seed)
 
     def unweighted(o: Optimum, seed: int) -> Posterior:
-        one = known[seed] if seed in known else weighted(o, seed)
-        return replace(one, weights=np.full_like(one.weights, 1 / one.weights.size))
-
-    fine = config.draws - 1 if not config.smoke else 19
-    out = {
-        "Laplace": calibrated(problem, config, config.runs, weighted, fine),
-        "Gaussian": calibrated(problem, config, config.runs, unweighted, fine),
-    }
-    if config.nuts:
-        few = 19 if config.nuts < 100 else fine
-        out["NUTS"] = calibrated(
-            problem,
-            config,
-            config.nuts,
-            lambda o, seed: nuts(o, chains=1, draws=config.draws, tune=TUNE, seed=seed),
-            few,
+        x, _ = inside(np.random.default_rng(seed), o.x[o.free], o.covariance, *o.bounds, config.draws)
+        equal = np.full((1, config.draws), 1 / config.draws)
+        return Posterior(
+            "laplace", list(o.labels), o.values(x)[None], equal, {}, [], {"simulations": 0, "gradients": 0}, {}
         )
-    return out
+
+    def sampled(o: Optimum, seed: int) -> Posterior:
+        return nuts(o, chains=1, draws=3 * FEW, tune=TUNE, seed=seed)
+
+    if config.smoke:
+        return calibrated(problem, config, config.runs, FEW, {"Gaussian": unweighted})
+    out = calibrated(problem, config, config.runs, config.draws - 1, {"Laplace": weighted, "Gaussian": unweighted})
+    return out | (calibrated(problem, config, config.nuts, FEW, {"NUTS": sampled}) if config.nuts else {})
 
 
 def look(problem: Problem, config: Config) -> Look:
     x, rng = problem.coordinates.start, np.random.default_rng(config.seed)
-    o = fitted(simulated(problem, x, 1e-2 * config.rtol, rng), config.rtol)
+    data = simulated(problem, x, 1e-2 * config.rtol, rng)
+    assert isinstance(data, Problem)
+    o = fitted(data, config.rtol)
     o.workers, before = config.workers, o.runner.jacobians
     curves, wall = timed(lambda: profiles(o, progress=True))
     spent = o.runner.jacobians - before
@@ -141,17 +147,17 @@ def look(problem: Problem, config: Config) -> Look:
     def seconds(of: Callable[[], Any]) -> float:
         return float(np.median([timed(of)[1] for _ in range(5)]))
 
-    chains, draws = (1, 30) if config.smoke else (4, 250)
+    chains, draws, tune = (1, 20, 20) if config.smoke else (2, 200, 60)
     return Look(
         laplace(o, draws=100 if config.smoke else 400, seed=config.seed),
-        nuts(o, chains=chains, draws=draws, tune=30 if config.smoke else 100, seed=config.seed),
+        nuts(o, chains=chains, draws=draws, tune=tune, seed=config.seed),
         curves, [one.sentence for one in combinations(o.labels, o.covariance, 0.1)], o.values(x).tolist(), wall, spent,
         seconds(lambda: o.residuals(o.x)), seconds(lambda: o.misfit(o.x)), seconds(lambda: o.residuals(o.x, True)),
     )  # fmt: skip
 
 
 def run(config: Config) -> Result:
-    config = replace(config, runs=10, nuts=0, workers=1) if config.smoke else config
+    config = replace(config, runs=10, workers=1) if config.smoke else config
     names = ["series"] if config.smoke else list(CASES)
     problems = {name: CASES[name].problem() for name in names}
     looks = {name: look(problem, config) for name, problem in problems.items()}
@@ -167,9 +173,9 @@ def summary(result: Result) -> dict[str, Any]:
         cases[name] = {
             "ways": {
                 way: asdict(it.calibration) | {
-                    "flat": it.calibration.flat, "wall_s": it.wall_s, "simulations": it.simulations,
-                    "gradients": it.gradients, "by_differences_s": it.gradients * (n + 1) * one.run_s,
-                    "gradients_s": it.gradients * one.gradient_s,
+                    "flat": it.calibration.flat, "wall_s": it.wall_s, "cpu_s": it.cpu_s,
+                    "simulations": it.simulations, "gradients": it.gradients, "gradients_s": it.gradients * one.gradient_s,
+                    "by_differences_s": it.gradients * (n + 1) * one.run_s,
                 }
                 for way, it in found.items()
             },
@@ -188,10 +194,9 @@ def table(result: Result) -> str:
         for way, it in found.items():
             c = it.calibration
             least = min([*c.p_chi2.values(), *c.p_ecdf.values()])
-            warned = next((text.split(" ")[0] for text in c.notices if "with a warning" in text), "0")
             rows.append(
                 (name, way, len(c.ranks), f"{least:.2g} of {2 * len(c.labels)}", "yes" if c.flat else "no",
-                 f"{warned} of {len(c.ranks)}", f"{it.wall_s:.0f}")
+                 f"{c.warned} of {len(c.ranks)}", f"{it.wall_s:.0f}")
             )  # fmt: skip
     head = ("problem", "posterior", "truths", "least p", "flat", "came with a warning", "wall time [s]")
     return markdown(head, rows)

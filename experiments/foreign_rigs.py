@@ -15,7 +15,7 @@ recordings included, which are kept in the folder --out.
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
@@ -64,6 +64,7 @@ class Outcome:
     found: IdentificationResult | None
     refused: str
     wall_s: float
+    cpu_s: float
 
     @property
     def warnings(self) -> list[str]:
@@ -103,9 +104,10 @@ class Outcome:
         case, found = self.case, self.found
         return {
             "name": case.name, "parameters": self.parameters(), "warnings": self.warnings, "verdict": self.verdict,
-            "naming_the_cause": self.naming, "wrong": self.wrong, "refused": found is None, "chi2": None if found is None else found.chi2,
-            "converged": None if found is None else found.converged, "recordings": list(case.excitations),
-            "fastest_slip": max(one.slip for one in self.made), "identify_wall_s": self.wall_s,
+            "naming_the_cause": self.naming, "wrong": self.wrong, "refused": found is None,
+            "chi2": None if found is None else found.chi2, "converged": None if found is None else found.converged,
+            "recordings": list(case.excitations), "fastest_slip": max(one.slip for one in self.made),
+            "identify_wall_s": self.wall_s, "identify_cpu_s": self.cpu_s,
             "recordings_wall_s": sum(one.wall_s for one in self.made),
         }  # fmt: skip
 
@@ -135,7 +137,7 @@ def chosen(config: Config) -> list[Case]:
 
 def study(case: Case, made: Mapping[Order, Made], config: Config) -> Outcome:
     """Identify one case."""
-    mine, began = [made[order] for order in case.orders()], perf_counter()
+    mine, began = [made[order] for order in case.orders()], (perf_counter(), process_time())
     found, refused = None, ""
     folder = config.out / f"runs-{case.name.replace(' ', '-').replace('/', '-')}"
     try:
@@ -150,7 +152,8 @@ def study(case: Case, made: Mapping[Order, Made], config: Config) -> Outcome:
         forget(folder)
     except (Unreachable, ValueError) as error:
         refused = str(error)
-    return Outcome(case, truths(config), mine, found, refused, perf_counter() - began)
+    wall, cpu = perf_counter() - began[0], process_time() - began[1]
+    return Outcome(case, truths(config), mine, found, refused, wall, cpu)
 
 
 def run(config: Config) -> list[Outcome]:

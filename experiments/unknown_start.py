@@ -259,23 +259,20 @@ def run(config: Config) -> Result:
 
 
 def figure(result: Result) -> Figure:
-    """By case, estimates over the truth with their intervals, and predicted deviations with the start known and
-    unknown."""
+    """By case, errors over their standard deviations, and predicted deviations with the start known and unknown."""
     fig = Figure(figsize=(4.0 * len(result.found), 6.0), layout="constrained")
-    axes = fig.subplots(2, len(result.found), squeeze=False, sharey="row", height_ratios=(1.6, 1))
+    axes = fig.subplots(2, len(result.found), squeeze=False, height_ratios=(1.6, 1))
     for (above, below), (case, found) in zip(axes.T, result.found.items()):
         names = result.shown(case)
         for i, name in enumerate(names):
-            for k, one in enumerate(found):
-                e, y = one[name], i + 0.7 * (k / max(len(found) - 1, 1) - 0.5)
-                low, high = e.ci95 or (e.last * np.exp(-1.96 * e.relative_sd), e.last * np.exp(1.96 * e.relative_sd))
-                colour = "C0" if holds(one, name) else "C3"
-                above.plot([low / TRUTH[name], high / TRUTH[name]], [y, y], color=colour, lw=1)
-                above.plot(e.last / TRUTH[name], y, ".", color=colour, ms=3)
-        above.axvline(1.0, color="k", lw=0.5)
-        above.set(xscale="log", xlim=(0.4, 2.5), xlabel="estimate over truth, 95 % interval", title=case)
-        above.set_xticks([0.5, 0.7, 1, 1.4, 2], ["0.5", "0.7", "1", "1.4", "2"])
-        above.minorticks_off()
+            errors = np.array([np.log(one[name].last / TRUTH[name]) / one[name].relative_sd for one in found])
+            places = i + np.linspace(-0.3, 0.3, len(found) + 2)[1:-1]
+            inside = np.array([holds(one, name) for one in found])
+            above.plot(errors[inside], places[inside], "o", color="C0", ms=3)
+            above.plot(errors[~inside], places[~inside], "x", color="C3", ms=5)
+        above.axvspan(-1.96, 1.96, color="0.93", zorder=0)
+        above.axvline(0.0, color="k", lw=0.5)
+        above.set(xlim=(-5, 5), xlabel="error of ln(estimate), in its standard deviations", title=case)
         above.set_yticks(range(len(names)), [name.split(".")[1] for name in names])
         above.set_ylim(len(names) - 0.4, -0.6)
         every = list(result.prices[case].unknown)

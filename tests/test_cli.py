@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_sysid_measured import CONFIG, EXAMPLE, X_C, X_D, Table, scale, write
+from test_sysid_measured import CONFIG, EXAMPLE, F_Y, X_C, X_D, Table, scale, write
 
 from torchsoft.cli import main
 from torchsoft.sysid import Unreachable
@@ -243,3 +243,26 @@ def test_an_interrupted_command_continues_and_ends_the_same(answered: tuple[Path
     first, second = (json.loads((folder / name / "answer.json").read_text()) for name in ("out", "again"))
     assert second["estimates"] == first["estimates"]
     assert second["cost"]["remembered"] >= first["cost"]["remembered"] + kept - 1
+
+
+def test_a_recording_that_looks_wrong_is_refused_with_the_way_on(folder: Path, capsys: Any) -> None:
+    flipped = rows(62)
+    scale(F_Y, -1.0)(flipped)
+    write(folder / "data.csv", flipped)
+    assert main(["identify", "data.csv", "rig.toml", "--out", "out", "--no-progress"]) == 2
+    message = capsys.readouterr().err
+    assert message.startswith("torchsoft: error: recording `data`: F_y looks as if its sign were opposite (")
+    assert message.endswith('; if it is meant so, say meant = ["sign of F_y"]\n')
+    assert not (folder / "out" / "answer.json").exists()
+
+
+@pytest.mark.slow
+def test_competing_laws_are_compared(folder: Path, capsys: Any) -> None:
+    laws = '[compare.coulomb]\nsettings.contact.friction = "coulomb"\n'
+    (folder / "rig.toml").write_text(f"{CONFIG}{laws}")
+    assert main(["identify", "data.csv", "rig.toml", "--out", "out", "--no-progress"]) == 0
+    text, _ = capsys.readouterr()
+    answer = json.loads((folder / "out" / "comparison.json").read_text())
+    assert sorted(one["name"] for one in answer["laws"]) == ["as stated", "coulomb"]
+    assert answer["verdict"] in text
+    assert sorted(path.name for path in (folder / "out").iterdir()) == ["answer.json", "comparison.json", "report.html"]

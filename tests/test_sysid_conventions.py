@@ -86,7 +86,7 @@ def changed(recording: Recording, **channels: Callable[[Any, Any], Any] | None) 
     return replace(recording, samples=samples)
 
 
-def noted(recording: Recording, settings: Mapping[str, Any] | None = None, **signals: torch.nn.Module) -> Recording:
+def noted(recording: Recording, settings: Mapping[str, Any] | None = None, **signals: Any) -> Recording:
     """With other settings, and other signals of the reference."""
     p, old = paper_settings(recording), recording.rig.reference
     reference = Reference(**{name: signals.get(name, old[name]) for name in ("x_d", "y_d", "F_ff")})
@@ -244,10 +244,8 @@ def at_rows(recording: Recording, rate: float, *, rates: bool = False) -> Record
     """With a reference that is known at `rate` [Hz]."""
     t = torch.arange(0.0, recording.duration + 0.5 / rate, 1 / rate, dtype=torch.float64)
     d = recording.rig.reference(t, ("x_d", "y_d", "F_ff")).detach()
-    given = {
-        name: Sampled(t, d[:, i, 0], d[:, i, 1] if rates else None) for i, name in enumerate(("x_d", "y_d", "F_ff"))
-    }
-    return noted(recording, **given)
+    x_d, y_d, F_ff = (Sampled(t, d[:, i, 0], d[:, i, 1] if rates else None) for i in range(3))
+    return noted(recording, x_d=x_d, y_d=y_d, F_ff=F_ff)
 
 
 @pytest.mark.parametrize("rates", [False, True])

@@ -182,8 +182,9 @@ def test_a_design_is_an_excitation_in_a_file(found: Design, tmp_path: Path) -> N
     path.write_text(excitation.to_toml(), encoding="utf-8")
     again = begin(Excitation.from_toml(path), P).model.reference
     t = torch.linspace(0, 0.3, 200, dtype=torch.float64)
-    wanted = found.recording.rig.reference(t, ["x_d", "y_d", "F_ff"])
-    assert float((again(t, ["x_d", "y_d", "F_ff"]) - wanted).abs().max()) < 1e-9
+    off = again(t, ["x_d", "y_d", "F_ff"]) - found.recording.rig.reference(t, ["x_d", "y_d", "F_ff"])
+    assert float(off[:, :2].abs().max()) < 1e-12
+    assert float(off[:, 2].abs().max()) < 1e-6  # a force that was solved for
 
 
 def test_a_design_has_a_picture(found: Design) -> None:
@@ -192,22 +193,20 @@ def test_a_design_has_a_picture(found: Design) -> None:
 
 def test_any_rig_with_profiles() -> None:
     """It has no excitation, and its start is given."""
-    rig = turning(control__senses="bracket")
+    rig: Any = turning(control__senses="bracket")
     y, still = grasp(rig.fixed())
     x = float(profile(still, "x_d").values)
     rig.reference = Reference(x_d=Profile([0.0, 0.04, 0.08], [x, x + 5e-4, x]), y_d=still["y_d"], F_ff=still["F_ff"])
-    t, sensors = np.linspace(0.0, 0.1, 21), {name: SENSORS[name] for name in ("x_C", "theta")}
+    t, sensors = np.linspace(0.0, 0.1, 21), {"x_disc": SENSORS["x_C"], "theta_disc": SENSORS["theta"]}
     data = Recording(
         "turning", rig, {name: (t, np.zeros(len(t))) for name in sensors}, Known(rig.pack(rig.fixed().unpack(y)))
     )
-    stated, bounds = (
-        Problem([data], sensors, {"pad.E": Unknown(), "pad.tau": Unknown()}),
-        {"x_d": Bounds(low=x - 2e-3, high=x + 2e-3, speed=0.2, shortest=0.02)},
-    )
+    stated = Problem([data], sensors, {"pads.L.material.E": Unknown(), "pads.L.material.tau": Unknown()})
+    bounds = {"x_d": Bounds(low=x - 2e-3, high=x + 2e-3, speed=0.2, shortest=0.02)}
     found = design(
-        stated, "turning", bounds, names=["pad.tau"], iterations=4, rate=0.3, limits={"x_C": (x - 1e-2, x + 1e-2)}
+        stated, "turning", bounds, names=["pads.L.material.tau"], iterations=4, rate=0.3, limits={"F_x": (-20.0, 20.0)}
     )
-    assert found.after["pad.tau"] < 0.9 * found.before["pad.tau"]
+    assert found.after["pads.L.material.tau"] < 0.9 * found.before["pads.L.material.tau"]
     assert found.made_by["gradients"] >= 4 * 4
 
 

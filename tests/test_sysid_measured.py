@@ -222,6 +222,10 @@ BAD_CONFIG = {
         CONFIG + '[[recordings]]\nfile = "b.csv"\nfiles = ["c.csv"]\n', r"recordings\.0: .*a `file` or `files`, not both",
     ),
     "held out": ('heldout = ["other"]\n' + CONFIG, r"heldout: there is no recording `other`; the recordings' names are data"),
+    "no such file": (
+        CONFIG + '[[recordings]]\nname = "b"\nfiles = ["b.csv"]\n',
+        r"rig\.toml, recordings: `files` of `b`: .*b\.csv: No such file or directory",
+    ),
     "nameless": (CONFIG + "[[recordings]]\n", r"recordings\.0: a recording needs a `file`"),
     "same name": (CONFIG + '[[recordings]]\nfile = "data.csv"\n', r"names of their own, but are called data, data"),
 }  # fmt: skip

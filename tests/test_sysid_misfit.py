@@ -193,6 +193,24 @@ def test_saturated_samples_and_ends_that_cannot_be_tested() -> None:
     assert not [f for f in short if f.alarming]
 
 
+def test_a_prior_that_the_data_contradict_is_named() -> None:
+    """The first unknown is known beforehand to 0.05, and to be zero, or to be 0.4."""
+    for far in (0.0, 0.4):
+        (parts, r, J), row = Case(6).fitted(), np.eye(4)[:1] / 0.05
+        both, at = np.concatenate((J, row)), np.append(r, -far / 0.05)
+        x = np.linalg.lstsq(both, -at, rcond=None)[0]
+        verdicts = judge(parts, at + both @ x, both, priors=["pad.E"])
+        z = abs(far - 0.0) / np.hypot(0.05, np.linalg.inv(J.T @ J)[0, 0] ** 0.5)  # the fit without it is at zero
+        (one,) = [v for v in verdicts if v.test == "priors"]
+        assert one.size == pytest.approx(z, rel=1e-6, abs=1e-9)
+        assert one.alarming == (far > 0)
+        assert any("contradict what was known before, pad.E by" in notice for notice in notices(verdicts)) == (far > 0)
+    unseen = judge(
+        parts, np.append(r, 0.0), np.concatenate((np.delete(J, 0, 1) @ np.eye(4)[1:], np.eye(4)[:1])), priors=["pad.E"]
+    )
+    assert not alarms(unseen, "priors")
+
+
 def test_holm_by_hand() -> None:
     p = (0.01, 0.04, 0.03, 0.005)
     adjusted = [f.adjusted for f in holm([Verdict("level", None, None, one, 1.0, "") for one in p])]

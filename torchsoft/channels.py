@@ -64,6 +64,7 @@ CHANNELS = {
 }  # fmt: skip
 """Every channel by its key."""
 
+
 def unit(channel: str) -> str:
     """SI unit of a channel: of the paper's from the table, of another rig's from how its key begins."""
     if channel in CHANNELS:

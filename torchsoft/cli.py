@@ -5,7 +5,6 @@ import io
 import sys
 import warnings
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -76,16 +75,11 @@ def identify(options: argparse.Namespace) -> int:
             priced = (fit.rtol, fit.starts, fit.workers, heldout, fit.method)
             expected = one_by_one(cost(problem, *priced) for problem in problems)
             agree(expected, options.yes, "take a larger rtol, fewer starts or less data")
-            seen = looked_at(case, fit.workers, not options.no_progress)
             options.out.mkdir(parents=True, exist_ok=True)
             result = identify(
-                case.problem,
-                heldout=heldout,
-                checkpoint=unfinished,
-                progress=not options.no_progress,
-                **fit.model_dump(),
-            )
-            result = replace(result, notices=list(dict.fromkeys((*seen, *result.notices))))
+                case.problem, heldout=heldout, meant=case.config.meant, checkpoint=unfinished,
+                progress=not options.no_progress, **fit.model_dump(),
+            )  # fmt: skip
             result.save(options.out / "answer.json")
             report(result, case.problem, options.out / "report.html", checkpoint=unfinished)
             forget(unfinished)
@@ -105,17 +99,6 @@ def identify(options: argparse.Namespace) -> int:
     print(verdict, end="")
     print(f"{result.cost['wall_s']:.0f} s; written to {options.out / 'answer.json'} and {options.out / 'report.html'}")
     return 0
-
-
-def looked_at(case: Any, workers: int, progress: bool) -> list[str]:
-    """Sentences on what looks strange in the recordings. Raises `ValueError` for what makes a fit worthless."""
-    from torchsoft.sysid.conventions import check
-    from torchsoft.sysid.finding import accepted
-    from torchsoft.sysid.workers import Runner
-
-    if progress:
-        print("looking at what the recordings mean", file=sys.stderr)
-    return accepted(check(case.problem, Runner(case.problem.recordings, workers)), case.config.meant)
 
 
 def compared(case: Any, fit: Any, options: argparse.Namespace) -> str:

@@ -42,7 +42,8 @@ def table() -> Table:
         return list(csv.reader(file))[:42]
 
 
-def config() -> dict[str, Any]:
+def config(whole: bool = True) -> dict[str, Any]:
+    """What a file may state; `whole` with what takes longer, a recording that begins in motion and competing laws."""
     tree = tomllib.loads((EXAMPLE / "rolling.toml").read_text())
     tree["settings"]["pad"] = {"elements_x": 20, "elements_y": 1, "height": 4.59e-3, "nu": 0.45}
     tree["settings"]["disc"] = {"radius": 19.37e-3}
@@ -51,15 +52,27 @@ def config() -> dict[str, Any]:
         "low": 100.0,
         "high": 1e3,
         "scale": "log",
-        "shared": True,
+        "per": "recording",
+        "prior": {"median": 400.0, "sd": 0.5, "kind": "log-normal"},
         "fixed": False,
     }
     tree["unknowns"]["contact.mu_s"] |= {"nominal": 0.9, "low": 0.5, "high": 2.0}
     tree["unknowns"]["pad.nu"] = {"scale": "linear", "low": 0.3, "high": 0.49}
-    tree["sensors"]["theta"] = {"noise": 0.5e-3, "bias": 1e-3, "delay": 2e-3}
+    tree["sensors"]["theta"] = {"noise": 0.5e-3, "bias": 1e-3, "delay": 2e-3, "per": "all"}
+    tree["sensors"]["F_y"] = {"noise": 0.1, "gain": 0.02, "drift": 0.1, "low": -500.0, "high": 500.0, "colour": "white"}
     tree["fit"] = {"rtol": RTOL, "starts": 1, "loss": "linear", "method": "gauss_newton", "workers": 1, "seed": 0}
-    tree["recordings"] = [{"file": "second.csv", "name": "second", "settings": {"contact.v_s": 0.06}}]
-    tree["heldout"] = ["second"]
+    second = {"files": ["second.csv", "force.csv"], "name": "second", "settings": {"contact.v_s": 0.06}}
+    tree["recordings"] = [second | {"missing": {"F_ff": 0.0}}]
+    tree |= {"heldout": ["second"], "ignore": ["Temp"], "meant": ["sign of F_x"], "missing": {"F_ff": -1.0}}
+    tree["start"] = {"kind": "rest", "x_sd": 1e-5}
+    if whole:
+        moving = {"kind": "underway", "lead": 40e-3, "given": {"disc.y": {"mean": 23.5e-3, "sd": 1e-4}}}
+        tree["recordings"].append({"file": "third.csv", "name": "third", "start": moving})
+        tree["pads"] = {"kind": "kelvin_voigt"}
+        tree["compare"] = {
+            "coulomb": {"settings": {"contact.friction": "coulomb"}, "without": ["contact.R_t"]},
+            "solid": {"pads": {"kind": "standard_linear_solid", "E_instant": 2e6, "tau_instant": 1e-4}},
+        }
     return tree
 
 
@@ -87,17 +100,24 @@ def one_run(case: measured.Case) -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    (tmp_path / "data.csv").write_bytes(written(table()))
-    (tmp_path / "second.csv").write_bytes(written(table()))
+    cells = table()
+    (tmp_path / "data.csv").write_bytes(written(cells))
+    force = [[row[i] for i in (0, 10, 11)] for row in cells]
+    (tmp_path / "second.csv").write_bytes(written([[*row[:5], *row[6:10]] for row in cells]))
+    (tmp_path / "force.csv").write_bytes(
+        written([[*row, "Temp [K]" if i == 0 else "warm"] for i, row in enumerate(force)])
+    )
+    (tmp_path / "third.csv").write_bytes(written(cells))
     (tmp_path / "rig.toml").write_text(toml(config()))
     return tmp_path
 
 
 @pytest.mark.parametrize("way", ["values", "text"])
 def test_a_mutated_identification(way: str, folder: Path, tally: Callable[[str], Tally]) -> None:
-    line, rng, tree, path = tally(f"identifications: {way}"), random(2, len(way)), config(), folder / "rig.toml"
+    line, rng, path = tally(f"identifications: {way}"), random(2, len(way)), folder / "rig.toml"
+    some, whole = config(False), config()
     for i in range(count(4000 if way == "values" else 1000)):
-        changed = mutation.written(path, tree, way, i, rng)
+        changed = mutation.written(path, whole if i % 10 == 5 else some, way, i, rng)
         follow = one_run if i % 10 == 0 else None
         ask(line, "identification", changed, lambda: measured.load([folder / "data.csv"], path), follow)
 

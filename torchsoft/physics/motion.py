@@ -21,7 +21,7 @@ class Piecewise(nn.Module):
 
     def __init__(self, times: Sequence[float] | Tensor, values: Sequence[float] | Tensor) -> None:
         super().__init__()
-        knots = torch.as_tensor(times, dtype=torch.float64)
+        knots = torch.as_tensor(times, dtype=torch.float64).contiguous()
         if knots.ndim != 1 or not bool(torch.all(knots.diff() > 0)) or not bool(torch.isfinite(knots).all()):
             raise ValueError(f"`times` must increase strictly, but are {times}")
         listed = values if isinstance(values, Tensor) else [torch.as_tensor(v, dtype=torch.float64) for v in values]

@@ -6,7 +6,7 @@ chi-squared on bins, and the largest deviation of the ranks' distribution functi
 (Saeilynoja, Buerkner and Vehtari 2022), which is found by simulation.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import NamedTuple
@@ -25,7 +25,7 @@ from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.readout import Signals
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.workers import Runner
-from torchsoft.threads import side_by_side
+from torchsoft.threads import side_by_side, single_threaded
 
 Counts = NDArray[np.int64]
 
@@ -56,6 +56,7 @@ class Calibration:
     truths: list[list[float]] = field(repr=False)
     p_chi2: dict[str, float]
     p_ecdf: dict[str, float]
+    warned: int  # posteriors that came with a notice
     notices: list[str]
 
     @property
@@ -66,55 +67,68 @@ class Calibration:
 
 
 class Replication(NamedTuple):
-    """The truth (n,) in physical units, its ranks (n,) among the draws, and what the posterior warned of."""
+    """The truth (n,) in physical units, and by posterior its ranks (n,) among the draws, and what it warned of."""
 
     truth: Array
-    ranks: Counts
-    warnings: list[str]
+    ranks: dict[str, Counts]
+    warnings: dict[str, list[str]]
 
 
 def calibrate(
-    problem: Problem, posterior: Callable[[Optimum, int], Posterior], *, rtol: float, runs: int = 100, draws: int = 99,
-    workers: int = 1, seed: int = 0, progress: bool = False,
-) -> Calibration:  # fmt: skip
+    problem: Problem, posteriors: Mapping[str, Callable[[Optimum, int], Posterior]], *, rtol: float, runs: int = 100,
+    draws: int = 99, workers: int = 1, seed: int = 0, progress: bool = False,
+) -> dict[str, Calibration]:  # fmt: skip
     """Ranks of truths that are drawn from the priors of `problem`, uniform between the bounds where there is none.
 
-    Its recordings give the motions and the times of the samples, whose values are made anew. `posterior` makes draws from an
-    optimum, of which `draws` are picked, and a seed. Replications run side by side in `workers` threads. Those that fail are
-    left out and counted in the notices: what is tested is then not the whole prior. Raises `ValueError` where the priors
-    depend on the data, and `RuntimeError` where hardly a replication succeeds.
+    Its recordings give the motions and the times of the samples, whose values are made anew. Each of the `posteriors` makes
+    draws from the same optima, of which `draws` are picked, and a seed. Replications run side by side in `workers` threads.
+    Those that fail are left out and counted in the notices: what is tested is then not the whole prior. Raises `ValueError`
+    where the priors depend on the data, and `RuntimeError` where hardly a replication succeeds.
     """
 
     def one(k: int) -> Replication | str:
         rng = np.random.default_rng([seed, k])
+        x = truth(problem, rng)
+        data = simulated(problem, x, EXACT * rtol, rng)
+        if isinstance(data, str):
+            return data
         try:
-            x = truth(problem, rng)
-            optimum = fitted(simulated(problem, x, EXACT * rtol, rng), rtol)
-            found = posterior(optimum, int(rng.integers(2**31)))
+            optimum, number = fitted(data, rtol), int(rng.integers(2**31))
+            found = {name: make(optimum, number) for name, make in posteriors.items()}
         except (Unreachable, ValueError) as failure:
             return str(failure)
         values = optimum.values(x[optimum.free])
-        return Replication(values, (found.pick(draws, rng) < values).sum(0), found.notices)
+        ranks = {name: (each.pick(draws, rng) < values).sum(0) for name, each in found.items()}
+        return Replication(values, ranks, {name: each.notices for name, each in found.items()})
 
-    work = side_by_side(one, runs, workers)
-    done = dict(tqdm(work, desc="replications", total=runs, disable=not progress))
+    with single_threaded():
+        work = side_by_side(one, runs, workers)
+        done = dict(tqdm(work, desc="replications", total=runs, disable=not progress))
     results = [done[k] for k in range(runs)]
     kept, lost = [r for r in results if not isinstance(r, str)], [r for r in results if isinstance(r, str)]
     if len(kept) < max(2 * EXPECTED, runs // 2):
         raise RuntimeError(f"only {len(kept)} of {runs} replications succeeded: {lost[0]}")
     notices = [f"{len(lost)} of {runs} replications failed and are left out: {lost[0]}"] if lost else []
-    warned = [one.warnings[0] for one in kept if one.warnings]
+    labels = [label for label, free in zip(problem.coordinates.labels, problem.coordinates.free) if free]
+    return {name: collected(labels, draws, name, kept, notices) for name in posteriors}
+
+
+def collected(labels: list[str], draws: int, name: str, kept: Sequence[Replication], notices: list[str]) -> Calibration:
+    """The calibration of one of the posteriors."""
+    ranks = np.array([one.ranks[name] for one in kept])
+    warned = [one.warnings[name][0] for one in kept if one.warnings[name]]
     if warned:
-        notices.append(f"{len(warned)} of {len(kept)} posteriors came with a warning, such as: {warned[0]}")
-    c, ranks = problem.coordinates, np.array([one.ranks for one in kept])
-    by_label = {label: ranks[:, i] for i, label in enumerate(np.array(c.labels)[c.free].tolist())}
+        told = f"{len(warned)} of {len(kept)} posteriors came with a warning, such as: {warned[0]}"
+        notices = [*notices, told]
+    by_label = {label: ranks[:, i] for i, label in enumerate(labels)}
     return Calibration(
-        labels=list(by_label),
+        labels=labels,
         draws=draws,
         ranks=ranks.tolist(),
         truths=[one.truth.tolist() for one in kept],
         p_chi2={label: chi2_test(some, draws) for label, some in by_label.items()},
         p_ecdf={label: ecdf_test(some, draws) for label, some in by_label.items()},
+        warned=len(warned),
         notices=notices,
     )
 
@@ -131,14 +145,14 @@ def truth(problem: Problem, rng: np.random.Generator) -> Array:
     return x
 
 
-def simulated(problem: Problem, x: Array, rtol: float, rng: np.random.Generator) -> Problem:
-    """The problem with the samples that its sensors would give at x (n,), with noise. Raises `Unreachable`."""
+def simulated(problem: Problem, x: Array, rtol: float, rng: np.random.Generator) -> Problem | str:
+    """The problem with the samples that its sensors would give at x (n,), with noise; or why there is no run at x."""
     jobs = problem.jobs(x, problem.names, rtol, None)
     recordings = []
     for job, run in zip(jobs, Runner(problem.recordings).run(jobs)):
         recording, samples = problem.recordings[job.recording], {}
         if isinstance(run, FailedRun):
-            raise Unreachable({recording.name: run})
+            return f"recording `{recording.name}` cannot be simulated from the prior: {run.reason}"
         signals = Signals(run.t, recording.channels, run.signals, None)
         for channel, sensor in problem.readouts(x, job.recording).items():
             t, _ = recording.samples[channel]

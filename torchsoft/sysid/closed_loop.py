@@ -16,14 +16,11 @@ from scipy.optimize import lsq_linear
 
 from torchsoft.physics.parts import Actuator
 from torchsoft.physics.rig import Rig
-from torchsoft.sysid.recording import REACH, Array, Recording
+from torchsoft.sysid.recording import BETWEEN, REACH, Array, Recording
 from torchsoft.sysid.unknowns import Sensor
 
 WINDOW = 20e-3
 """Length [s] of a window, or four samples where that is longer."""
-
-INSIDE = 16
-"""Points of a window at which the reference is evaluated."""
 
 FEWEST = 8
 """Windows without which nothing is said."""
@@ -45,7 +42,7 @@ class Signal(NamedTuple):
 @dataclass(frozen=True)
 class Loop:
     """An actuator with its force F and the coordinate x that it measures, over windows between `edges` (w + 1,) [s]; `keep`
-    (w,) are those n that both have samples in. `reference` gives set-point and force fed forward (..., 2) at times. Shifts
+    (w,) are those n that both have samples in. `reference` gives set-point and force fed forward (k, 2) at times (k,). Shifts
     in time go up to `reach` [s]; the force is taken to be `lag` [s] late."""
 
     actuator: Actuator
@@ -77,11 +74,16 @@ class Loop:
         """Mean of the force over each window (n,), if its samples are `late` [s]."""
         return self._over(self.curves[0](self.edges + self.lag + late))
 
+    @cached_property
+    def signals(self) -> tuple[PPoly, PPoly, PPoly]:
+        """Integral of the set-point, the set-point, integral of the force fed forward."""
+        t = np.arange(self.edges[0] - self.reach, self.edges[-1] + self.reach + BETWEEN, BETWEEN)
+        x, F = (CubicSpline(t, column) for column in self.reference(t).T)
+        return x.antiderivative(), x, F.antiderivative()
+
     def asked(self, late: float = 0.0) -> Array:
         """Set-point, its rate, and the force fed forward (n, 3)."""
-        inside = np.linspace(self.edges[:-1], self.edges[1:], 2 * INSIDE + 1)[1::2]
-        mean, ends = self.reference(inside + late).mean(0)[self.keep], self.reference(self.edges + late)[:, 0]
-        return np.stack((mean[:, 0], self._over(ends), mean[:, 1]), -1)
+        return np.stack([self._over(one(self.edges + late)) for one in self.signals], -1)
 
     def found(self, late: float = 0.0) -> Array:
         """The coordinate and its rate (n, 2)."""
@@ -151,7 +153,7 @@ def windows(recording: Recording, actuator: Actuator, F: Signal | None, x: Signa
     names = [actuator.setpoint, *([actuator.feed_forward] if actuator.feed_forward else [])]
 
     def reference(t: Array) -> Array:
-        at = recording.rig.reference(torch.from_numpy(np.ascontiguousarray(t)), names).detach().numpy()[..., 0]
-        return at if actuator.feed_forward else np.stack((at[..., 0], np.zeros(t.shape)), -1)
+        at = recording.rig.reference(torch.from_numpy(t), names).detach().numpy()[..., 0]
+        return at if actuator.feed_forward else np.stack((at[:, 0], np.zeros(len(t))), -1)
 
     return Loop(actuator, reference, F, x, edges, keep, reach) if keep.sum() >= FEWEST else None

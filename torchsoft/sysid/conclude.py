@@ -72,7 +72,13 @@ def conclude(
         else:
             predicted = nrmse(problem, held.r, list(how.heldout))
     sd = np.sqrt(np.diag(C_free))
-    verdicts = misfit.judge(misfit.parts(problem, at.r, stage.recordings), at.r, J, robust=how.loss != "linear")
+    verdicts = misfit.judge(
+        misfit.parts(problem, at.r, stage.recordings),
+        at.r,
+        J,
+        robust=how.loss != "linear",
+        priors=[c.labels[i] for i, _ in c.priors],
+    )
     notices += notices_on(found, fit.converged, rtol, end.bias is None)
     notices += checks.notices(checked) if checked is not None else []
     notices += misfit.notices(verdicts, max(1.0, chi2) ** 0.5 if how.loss == "linear" else 1.0)

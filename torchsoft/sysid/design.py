@@ -76,12 +76,12 @@ class Design:
 
     def excitation(self, given: Excitation) -> Excitation:
         """The motion as an excitation of the paper's rig, after the grasp of the one `given` that the search began with."""
-        since = (given.grasp_time + given.settle) * (1 + 1e-9)
+        since = given.grasp_time + given.settle
 
         def course(name: str) -> tuple[tuple[float, float], ...]:
             signal = profile(self.recording.rig.reference, name)
             t, v = signal.times.numpy(), signal.values.detach().numpy()
-            first = int(np.searchsorted(t, since, side="right"))
+            first = int(np.searchsorted(t, since * (1 + 1e-9), side="right"))
             return tuple((float(at - since), float(to - v[first - 1])) for at, to in zip(t[first:], v[first:]))
 
         return given.model_copy(update={"motion": Knots(x=course("x_d"), y=course("y_d"))})
@@ -167,7 +167,7 @@ def design(
             notices = []
         except KeyboardInterrupt:
             notices = [f"interrupted after {search.iteration} of {iterations} iterations"]
-    last = planner.look(search.z, points[0])
+    last = search.seen
     peaks = [f"{name} goes {part:.0%} of the way to its limits" for name, part in last.peaks.items() if part > 0.9]
     notices += [
         f"{name} goes beyond its limits, {part:.1%} of the way to them" for name, part in last.peaks.items() if part > 1
@@ -205,7 +205,7 @@ class Search:
             first = self.planner.look(moves.start, x)
         except SimulationFailed as failure:
             raise ValueError(f"the motion given cannot be run, so that nothing can begin with it: {failure}") from None
-        best, self.z = first, moves.start
+        self.seen, self.z = first, moves.start
         for _ in range(starts - 1):
             z = moves.random(self.rng)
             try:
@@ -213,30 +213,31 @@ class Search:
             except SimulationFailed:
                 self.lost += 1
                 continue
-            if there.value + there.cost < best.value + best.cost:
-                best, self.z = there, z
+            if there.value + there.cost < self.seen.value + self.seen.cost:
+                self.seen, self.z = there, z
         self.now = torch.from_numpy(self.z.copy()).requires_grad_(True)
         self.adam = torch.optim.Adam([self.now], lr=self.rate, betas=MEMORY)
-        self.best = self.visit(self.z)
+        self.best, _ = self.visit(self.z)
         return first
 
-    def visit(self, z: Array) -> Visit:
-        """What a motion is worth over all points; infinite where it is lost."""
+    def visit(self, z: Array) -> tuple[Visit, Look | None]:
+        """What a motion is worth over all points, infinite where it is lost, and the look at it at the first."""
         try:
             looks = [self.planner.look(z, x) for x in self.points]
         except SimulationFailed:
-            return Visit(self.iteration, np.inf, np.inf)
+            return Visit(self.iteration, np.inf, np.inf), None
         values = [one.value for one in looks]
         peak = max(max(one.peaks.values(), default=0.0) for one in looks)
-        return Visit(self.iteration, max(values) if self.robust == "worst" else float(np.mean(values)), peak)
+        value = max(values) if self.robust == "worst" else float(np.mean(values))
+        return Visit(self.iteration, value, peak), looks[0]
 
     def look(self) -> None:
         """Keeps the motion as it is now, if it is the best."""
         z = self.now.detach().numpy().copy()
-        visit = self.visit(z)
+        visit, seen = self.visit(z)
         self.history.append(visit)
-        if visit.score < self.best.score:
-            self.best, self.z = visit, z
+        if seen is not None and visit.score < self.best.score:
+            self.best, self.seen, self.z = visit, seen, z
 
     def move(self, iterations: int) -> None:
         """One step, or none where the motion is lost."""

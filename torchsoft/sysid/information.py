@@ -37,7 +37,7 @@ AS_GOOD = 1.3
 MINE = 0.7
 """Correlation of a parameter with a direction above which its uncertainty comes from there."""
 
-EXPONENTS = {1.0: 0.1, 0.5: 0.1, 0.1: 1 / CLOSER}
+EXPONENTS = {1.0: 0.1, 0.5: 0.1, 0.1: 0.2, 0.05: 0.2}
 """What exponents are rounded to multiples of, the roundest first, and the part of its parameters' least standard deviation that
 a combination may then have whatever it had."""
 
@@ -103,7 +103,7 @@ def rounded(direction: Array, C: Array) -> Array:
     exact = direction / direction[np.argmax(np.abs(direction))]
     own, least = float(exact @ C @ exact), float(np.diag(C).min())
     for part, small in EXPONENTS.items():
-        p = part * np.round(exact / part)
+        p = np.round(part * np.round(exact / part), 3)
         if float(p @ C @ p) <= max(AS_GOOD**2 * own, small**2 * least):
             return p
     return np.round(exact, 3)

@@ -21,6 +21,10 @@ PEAK = 35 / 16
 """Largest over mean speed of the 7th-order profile."""
 
 
+PHASES = 3
+"""Parts of a random motion that differ, at most."""
+
+
 class Bounds(Table):
     """What a signal of the reference may do: values from `low` to `high` [its unit], at `speed` [its unit/s] at most.
 
@@ -140,17 +144,20 @@ class Moves:
         return np.asarray(out.x[: self.n], np.float64)
 
     def random(self, rng: np.random.Generator) -> Array:
-        """A motion within the bounds that has nothing to do with the one given: every signal wanders within a part of its range
-        and at a part of its speed that are random themselves."""
+        """A motion within the bounds that has nothing to do with the one given: in up to `PHASES` phases every signal goes to and fro
+        between two random levels, not quite alike each time, at a random part of its speed."""
         z = []
         for name, (times, values, first) in self.knots.items():
-            one = self.bounds[name]
-            low, high = np.sort(rng.uniform(one.low, one.high, 2))
-            steps = one.speed / PEAK * np.diff(times[first - 1 :]) * float(10 ** rng.uniform(-1, 0))
+            one, spans = self.bounds[name], np.diff(times[first - 1 :])
+            phase = np.searchsorted(rng.uniform(0, len(spans), rng.integers(PHASES)), np.arange(len(spans)))
+            phase = np.unique(phase, return_inverse=True)[1]
+            levels = rng.uniform(one.low, one.high, (PHASES, 2))
+            part = 10 ** rng.uniform(-1, 0, PHASES)
             at, path = values[first - 1], []
-            for step in steps:
-                goal = rng.uniform(low, high)
-                at = at + np.clip(goal - at, -step, step)
+            for i, (k, span) in enumerate(zip(phase, spans)):
+                step = part[k] * one.speed / PEAK * span * rng.uniform(0.5, 1)
+                to, fro = levels[k] if i % 2 else levels[k][::-1]
+                at = at + np.clip(to + rng.uniform(0, 0.3) * (fro - to) - at, -step, step)
                 path.append(at)
             z.append(np.array(path))
             if one.shortest is not None:

@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from torchsoft.channels import unit
 from torchsoft.physics.paper import SoftGrasp
@@ -39,8 +40,8 @@ AS_GOOD = 1.15
 LATE = 1e-3
 """Shift in time [s] from which something is said."""
 
-SHIFTS = 161
-"""Shifts in time that are tried."""
+SHIFTS = 41
+"""Shifts in time that are tried, of which the best one is made better."""
 
 RESIZED = 5.0
 """Largest factor on a force that is not one of mistaken units."""
@@ -90,8 +91,7 @@ def with_its_lag(loop: Loop) -> Loop:
     """The loop with the force as late as fits best, of what its sensors declare."""
     reach = loop.F.sensor.delay + loop.x.sensor.delay
     given = loop.given(loop.asked(), loop.found())
-    tried = [replace(loop, lag=lag) for lag in np.linspace(-reach, reach, SHIFTS)] if reach > 0 else [loop]
-    return min(tried, key=lambda one: rms(one.beyond(one.force() - given)[one.inner]))
+    return replace(loop, lag=best_shift(loop, lambda late: loop.force(late) - given, reach)[0]) if reach > 0 else loop
 
 
 def disagreement(rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop], free: bool) -> Change | None:
@@ -182,6 +182,19 @@ def feed_flipped(loop: Loop, F: Array) -> Iterator[Change]:
         yield Change(f"sign of {name}", f"{name} looks as if its sign were opposite", loop.beyond(F - given), True)
 
 
+def best_shift(loop: Loop, rest: Callable[[float], Array], reach: float) -> tuple[float, Array]:
+    """The shift in time [s], up to `reach` to each side, that leaves least of a disagreement, and what it leaves."""
+
+    def still(late: float) -> Array:
+        return loop.beyond(rest(late))[loop.inner]
+
+    times = np.linspace(-reach, reach, SHIFTS)
+    near, step = float(min(times, key=lambda late: rms(still(late)))), float(times[1] - times[0])
+    found = minimize_scalar(lambda late: rms(still(late)), bounds=(near - step, near + step), options={"xatol": 1e-5})
+    late = float(np.clip(found.x, -reach, reach))
+    return late, still(late)
+
+
 def shifted(loop: Loop) -> Change:
     """Samples of the force, of the coordinate, or set-points, that are late or early: one of them, or what fits as well."""
     asked, found, force = loop.asked(), loop.found(), loop.force()
@@ -190,15 +203,10 @@ def shifted(loop: Loop) -> Change:
         loop.x.channel: lambda late: force - loop.given(asked, loop.found(late)),
         loop.actuator.setpoint: lambda late: force - loop.given(loop.asked(late), found),
     }
-    made, times = [], np.linspace(-loop.reach, loop.reach, SHIFTS)
+    made = []
     for name, rest in tried.items():
-        square = [rms(loop.beyond(rest(late))[loop.inner]) ** 2 for late in times]
-        i = int(np.clip(np.argmin(square), 1, SHIFTS - 2))
-        before, here, after = square[i - 1 : i + 2]
-        bend = before - 2 * here + after
-        late = float(times[i] + (0.5 * (before - after) / bend * (times[1] - times[0]) if bend > 0 else 0.0))
-        side = "late" if late > 0 else "early"
-        made.append(Change(name, f"{name} is {1e3 * abs(late):.3g} ms {side}", loop.beyond(rest(late))[loop.inner]))
+        late, e = best_shift(loop, rest, loop.reach)
+        made.append(Change(name, f"{name} is {1e3 * abs(late):.3g} ms {'late' if late > 0 else 'early'}", e))
     best = min(made, key=left)
     return best._replace(
         what=f"time of {best.what}", said=" or ".join(one.said for one in made if left(one) <= AS_GOOD * left(best))

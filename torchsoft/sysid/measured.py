@@ -247,7 +247,13 @@ def load(data: Sequence[str | Path], config: str | Path) -> Case:
     stated = read_config(config)
     entries, tables = sources(data, config, stated), dict[str, Tables]()
     for name, (entry, paths) in entries.items():
-        tables[name] = read_tables(paths, stated.ignore, entry.missing.over(stated.missing))
+        try:
+            tables[name] = read_tables(paths, stated.ignore, entry.missing.over(stated.missing))
+        except OSError as error:
+            if not entry.paths:
+                raise
+            own = "files" if entry.files else "file"
+            raise ValueError(f"{config}, recordings: `{own}` of `{name}`: {error.filename}: {error.strerror}") from None
     left_out = {name for one in tables.values() for table in one.tables for name in table.ignored}
     if strange := [name for name in stated.ignore if name not in left_out]:
         raise ValueError(f"{config}, ignore: no file has a column `{line(strange[0], 80)}`")

@@ -9,6 +9,7 @@ channel in one recording where it can:
     motion    F: they do not line up with the reading that the model predicts, nor with its rates, nor with other channels'
     channels  Bartlett: those of different channels, at one time, have nothing to do with each other
     outliers  Grubbs, and the kurtosis: tails are those of a normal distribution
+    priors    normal: estimates are where their priors expect them, as far as the data know better
 
 p-values are adjusted by Holm's method, so that with a right model one of them or more falls below `LEVEL` in as many of all
 identifications. What the noise was allowed to explain is not tested again: colour that a user has declared is no verdict, and
@@ -48,7 +49,7 @@ MOST = 3
 MEDIAN = 0.37
 """How many residuals tell the level as exactly, by their squares, as one residual does by the median of all."""
 
-Test = Literal["level", "white", "motion", "channels", "outliers"]
+Test = Literal["level", "white", "motion", "channels", "outliers", "priors"]
 
 
 class Part(NamedTuple):
@@ -107,8 +108,11 @@ class Verdict:
         return self.adjusted < LEVEL
 
 
-def judge(parts: Sequence[Part], r: Array, J: Array, *, robust: bool = False) -> list[Verdict]:
-    """All tests of a fit's whitened residuals r (m,), priors' included, with their Jacobian J (m, n) by what was free.
+def judge(
+    parts: Sequence[Part], r: Array, J: Array, *, robust: bool = False, priors: Sequence[str] = ()
+) -> list[Verdict]:
+    """All tests of a fit's whitened residuals r (m,), the last of them those of `priors`, which are named, with their Jacobian
+    J (m, n) by what was free.
 
     With a `robust` loss outliers are expected: the level is that of the median residual, and tails are not tested.
     """
@@ -131,6 +135,7 @@ def judge(parts: Sequence[Part], r: Array, J: Array, *, robust: bool = False) ->
             out.append(outliers(part, r))
     for recording in dict.fromkeys(part.recording for part in parts):
         out += together(recording, [part for part in parts if part.recording == recording], r, Q)
+    out += [contradicted(name, r[k], Q[k]) for name, k in zip(priors, range(len(r) - len(priors), len(r)))]
     return holm(out)
 
 
@@ -283,6 +288,15 @@ def together(recording: str, parts: Sequence[Part], r: Array, Q: Array) -> list[
     return [Verdict("channels", recording, None, p, float(C[i, j]), words)]
 
 
+def contradicted(name: str, r: float, q: Array) -> Verdict:
+    """Is the residual r of a prior, whose row of Q is q (n,), as small as it should be?"""
+    free = max(1.0 - float(q @ q), 0.0)
+    z = float(r) / free**0.5 if free > 1e-9 else 0.0  # without data it is where the prior is
+    return Verdict(
+        "priors", None, None, 2 * float(stats.norm.sf(abs(z))), abs(z), f"{name} by {abs(z):.2g} standard deviations"
+    )
+
+
 SENTENCES: dict[str, str] = {
     "larger": "residuals are larger than the noise that was stated, {}: the model may be wrong, or the noise larger",
     "smaller": "residuals are smaller than the noise that was stated, {}: state less of it, or intervals are too wide, and "
@@ -291,6 +305,7 @@ SENTENCES: dict[str, str] = {
     "motion": "residuals follow the motion in {}: a sensor is not as it was stated, or the model is wrong",
     "channels": "residuals of different channels belong together, {}: the model leaves out something that moves both",
     "outliers": "there are outliers in {}: look at these samples, or take a robust loss",
+    "priors": "the data contradict what was known before, {}: the prior is wrong, or the model",
 }  # fmt: skip
 
 

@@ -43,7 +43,8 @@ PRICE = 5.0
 
 class Look(NamedTuple):
     """One motion at one x: the criterion, what excess costs, how much of the way to their limits channels go, the covariance C
-    (n, n), the criterion's derivative G (n, n) by the Fisher matrix, the steps, the rows (m, n) of the Jacobian, and the signals of the run."""
+    (n, n), the criterion's derivative G (n, n) by the Fisher matrix, the rows J (m, n) of the samples, the steps, and the
+    signals of the run."""
 
     value: float
     cost: float

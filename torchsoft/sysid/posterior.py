@@ -6,6 +6,7 @@ is uniform between its bounds.
 
 import importlib
 import json
+import time as clock
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -18,7 +19,7 @@ from torchsoft.files import finite, replacing
 from torchsoft.sysid.answer import MarginalSummary, PosteriorSummary
 from torchsoft.sysid.optimum import CHOSEN_ANEW, Optimum
 from torchsoft.sysid.recording import Array
-from torchsoft.threads import side_by_side
+from torchsoft.threads import side_by_side, single_threaded
 
 WITHIN = 1e-3
 """Least share of Gaussian draws that must lie within the bounds."""
@@ -83,7 +84,7 @@ class Posterior:
             sd = float(weights @ (draws[:, i] - mean) ** 2) ** 0.5
             r_hat, effective = None, 1.0 / float(weights @ weights)
             if self.method == "nuts":
-                r_hat, effective = (float(of(self.draws[..., i])) for of in (known.rhat, known.ess))
+                r_hat, effective = (float(of(halves(self.draws[..., i]))) for of in (known.rhat, known.ess))
             out.append(MarginalSummary(label, mean, sd, q[1], (q[0], q[2]), effective, r_hat))
         return out
 
@@ -103,6 +104,11 @@ class Posterior:
         """Write the JSON file. It appears whole or not at all."""
         with replacing(path) as partial:
             partial.write_text(self.to_json(), encoding="utf-8")
+
+
+def halves(chains: Array) -> Array:
+    """Draws (chains, draws); those of a single chain as two."""
+    return chains if len(chains) > 1 else chains[:, : chains.size // 2 * 2].reshape(2, -1)
 
 
 def diagnostics() -> Any:
@@ -140,7 +146,7 @@ def laplace(o: Optimum, *, draws: int = 400, seed: int = 0, progress: bool = Fal
     if draws < FEWEST:
         raise ValueError(f"Laplace's approximation is checked by at least {FEWEST} draws, not by {draws}")
     rng, (low, high) = np.random.default_rng(seed), o.bounds
-    runs, wall = o.runner.simulations, tqdm(desc="Laplace", total=draws, disable=not progress)
+    runs, began = o.runner.simulations, clock.perf_counter()
     z, noise = inside(rng, o.x[o.free], o.covariance, low, high, draws)
     log_q = -0.5 * (noise**2).sum(-1)
     log_p, lost = np.full(draws, -np.inf), list[str]()
@@ -152,11 +158,10 @@ def laplace(o: Optimum, *, draws: int = 400, seed: int = 0, progress: bool = Fal
             return -np.inf, next(iter(at.lost.values())).reason
         return measure(o, x)[0] - 0.5 * float(at.r @ at.r), ""
 
-    with wall:
+    with single_threaded(), tqdm(desc="Laplace", total=draws, disable=not progress) as bar:
         for k, (value, reason) in side_by_side(density, draws, o.workers):
             log_p[k], lost = value, [*lost, reason] if reason else lost
-            wall.update()
-        seconds = wall.format_dict["elapsed"]
+            bar.update()
     w, k_hat = importance(log_p - log_q)
     share, limit = 1.0 / float(draws * (w @ w)), min(K_HAT, 1 - 1 / np.log10(draws))
     notices = notices_on_runs(o, lost, draws)
@@ -172,7 +177,7 @@ def laplace(o: Optimum, *, draws: int = 400, seed: int = 0, progress: bool = Fal
     off = steps_off(o, z[np.argsort(log_q)[: CHECKED // 2].tolist() + list(range(CHECKED // 2))])
     notices += notices_on_steps(o, off)
     checks = {"k_hat": k_hat, "efficiency": share, "failed": len(lost), "steps_off": off}
-    cost = {"simulations": o.runner.simulations - runs, "gradients": 0, "wall_s": seconds}
+    cost = {"simulations": o.runner.simulations - runs, "gradients": 0, "wall_s": clock.perf_counter() - began}
     return Posterior(
         "laplace", list(o.labels), o.values(z)[None], w[None], checks, notices, cost, {"seed": seed, "rtol": o.rtol}
     )

@@ -13,11 +13,11 @@ from scipy import stats
 from scipy.interpolate import PchipInterpolator
 from tqdm import tqdm
 
-from torchsoft.sysid.fit import gauss_newton, newton_step
+from torchsoft.sysid.fit import Unreachable, gauss_newton, newton_step
 from torchsoft.sysid.optimum import CHOSEN_ANEW, Optimum
 from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.recording import Array
-from torchsoft.threads import side_by_side
+from torchsoft.threads import side_by_side, single_threaded
 
 RISE = float(stats.chi2.ppf(0.95, 1))
 """2 Delta(-log posterior) where a 95 % interval ends."""
@@ -95,8 +95,9 @@ def profiles(optimum: Optimum, labels: Sequence[str] | None = None, *, progress:
     chosen = list(known if labels is None else labels)
     where = {label: i for i, label in enumerate(optimum.problem.coordinates.labels)}
     tasks = [(label, sign) for label in chosen for sign in (-1, 1)]
-    work = side_by_side(lambda k: walk(optimum, where[tasks[k][0]], tasks[k][1]), len(tasks), optimum.workers)
-    done = dict(tqdm(work, desc="profiles", total=len(tasks), disable=not progress))
+    with single_threaded():
+        work = side_by_side(lambda k: walk(optimum, where[tasks[k][0]], tasks[k][1]), len(tasks), optimum.workers)
+        done = dict(tqdm(work, desc="profiles", total=len(tasks), disable=not progress))
     return [assemble(optimum, where[label], done[2 * k], done[2 * k + 1]) for k, label in enumerate(chosen)]
 
 
@@ -158,10 +159,13 @@ def refit(o: Optimum, i: int, here: Point, aim: float) -> tuple[Point | None, st
         ahead[others] += step
         there = o.residuals(ahead, derivatives=True)
         if there.lost or there.r @ there.r > square - 0.1 * gain:  # the Jacobian does not hold as far as that
-            ahead = gauss_newton(
-                o.problem, o.runner, x, which=o.which, free=others, steps=o.steps, first=at, evaluations=10,
-                tolerance=0.1 * FITTED / square,
-            ).x  # fmt: skip
+            try:
+                ahead = gauss_newton(
+                    o.problem, o.runner, x, which=o.which, free=others, steps=o.steps, first=at, evaluations=10,
+                    tolerance=0.1 * FITTED / square,
+                ).x  # fmt: skip
+            except Unreachable as lost:
+                return None, str(lost)
             ahead[i] = aim
             there = o.residuals(ahead, derivatives=True)
         x, at = ahead, there

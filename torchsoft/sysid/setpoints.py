@@ -51,7 +51,7 @@ class Gap(NamedTuple):
 def cubic(signal: Sampled, every: int, derived: bool) -> Sampled:
     """The signal by one in so many rows; rates that were `derived` from all rows are derived from these."""
     rates = None if derived else signal.rates[::every]
-    return Sampled(signal.times[::every].contiguous(), signal.values.detach()[::every], rates)
+    return Sampled(signal.times[::every], signal.values.detach()[::every], rates)
 
 
 def is_derived(signal: Sampled) -> bool:
@@ -139,7 +139,7 @@ def other_rate(recording: Recording, setpoint: str) -> Finding | None:
     signal = recording.rig.reference[setpoint]
     assert isinstance(signal, Sampled)
     given, own = signal.rates.numpy(), spline_rates(signal)
-    fewer = spline_rates(Sampled(signal.times[::2].contiguous(), signal.values.detach()[::2]))
+    fewer = spline_rates(Sampled(signal.times[::2], signal.values.detach()[::2]))
     size, off, unsure = (float(np.sqrt(np.mean(e**2))) for e in (own, given - own, fewer - own[::2]))
     if off <= OTHER_RATE * max(size, float(np.sqrt(np.mean(given**2)))) or unsure > OTHER_RATE / 2 * size:
         return None
