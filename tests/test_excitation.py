@@ -1,10 +1,14 @@
 """Excitations: what cannot be carried out is refused by its field before anything is simulated."""
 
+from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 
-from torchsoft.excitation import CATALOGUE, Excitation
+from torchsoft import Parameters
+from torchsoft.excitation import CATALOGUE, Excitation, Knots, begin
+from torchsoft.physics.paper import apart
 from torchsoft.tables import InvalidTable
 
 ROLL = {"kind": "slow_roll"}
@@ -20,6 +24,8 @@ ROLL = {"kind": "slow_roll"}
         ({"motion": {"kind": "multi_sine", "frequency": [1.0, "2"]}}, "motion.frequency.1 should be a valid number, not '2'"),
         ({"motion": ROLL, "depth": True}, "depth should be a valid number, not True"),
         ({"motion": {"kind": "hop"}}, "motion.kind should be one of"),
+        ({"motion": {"kind": "knots", "x": [[0.1, 1e-3], [0.1, 0.0]]}}, "the times of motion.x must increase, but 0.1 s follows"),
+        ({"motion": {"kind": "knots", "y": [[2.0, 1e-3]]}}, "duration = 2 s ends before the last knot of the motion, at 2.5 s"),
     ],
 )  # fmt: skip
 def test_an_impossible_excitation_is_refused_by_its_field(tree: dict[str, Any], message: str) -> None:
@@ -31,3 +37,23 @@ def test_an_impossible_excitation_is_refused_by_its_field(tree: dict[str, Any], 
 def test_lists_stand_for_bands() -> None:
     shaking = CATALOGUE["shaking"].model_dump(mode="json")
     assert Excitation.model_validate(shaking) == CATALOGUE["shaking"]
+
+
+def test_knots_are_reached_from_the_grasp() -> None:
+    """At rest at each, on top of where the grasp ended."""
+    knots, p = Knots(x=((0.1, 4e-3), (0.3, -2e-3)), y=((0.2, -1e-4),)), Parameters()
+    excitation = Excitation(motion=knots, grasp_time=0.2, settle=0.1, duration=0.8, depth=1e-3)
+    reference, since = begin(excitation, p).model.reference, 0.3
+    t = torch.tensor([0.0, since, since + 0.1, since + 0.2, since + 0.3, 5.0], dtype=torch.float64)
+    value, rate = reference(t, ["x_d", "y_d"]).unbind(-1)
+    x, y = 60.3e-3, apart(p)
+    assert value[:, 0].tolist() == pytest.approx([x, x, x + 4e-3, x + 1e-3, x - 2e-3, x - 2e-3])
+    assert value[:, 1].tolist() == pytest.approx([y, y - 1e-3, y - 1.05e-3, y - 1.1e-3, y - 1.1e-3, y - 1.1e-3])
+    assert rate[[0, 1, 2, 4, 5], 0].abs().max() == 0
+
+
+@pytest.mark.parametrize("motion", [Knots(x=((0.1, 4e-3),)), *(one.motion for one in CATALOGUE.values())])
+def test_a_file_holds_an_excitation_to_the_bit(motion: Any, tmp_path: Path) -> None:
+    excitation, path = Excitation(motion=motion, depth=1 / 3e3, duration=3.0), tmp_path / "excitation.toml"
+    path.write_text(excitation.to_toml(), encoding="utf-8")
+    assert Excitation.from_toml(path) == excitation

@@ -194,6 +194,9 @@ BAD_CONFIG = {
     "no such column": ('ignore = ["Temp"]\n' + CONFIG, r"rig\.toml, ignore: no file has a column `Temp`"),
     "another constant": (CONFIG + "[missing]\nF_x = 0.0\n", r"rig\.toml: missing\.F_x is not known here"),
     "another start": (CONFIG + '[start]\nkind = "flying"\n', r"start\.kind should be one of 'rest', 'underway', not 'fl"),
+    "a start that is hardly uncertain": (
+        CONFIG + '[start]\nkind = "rest"\nx_sd = 1e-300\n', r"rig\.toml: start\.x_sd: should be 0, or at least 1e-12, but is 1e-300",
+    ),
     "a start without a kind": (CONFIG + "[start]\nx_sd = 1e-4\n", r"start\.kind is missing"),
     "a parameter by both names": (
         CONFIG.replace('"pad.E"]\nnominal = 0.7e6', '"contact.friction.mu_s"]\n[unknowns."contact.mu_s"]'),

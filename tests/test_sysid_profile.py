@@ -1,5 +1,8 @@
 """Profiles against closed forms, and combinations of parameters; both on a rig."""
 
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 from closed_forms import WALL, ClosedForm, optimum
@@ -8,8 +11,10 @@ from conftest import COARSE
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Roll
 from torchsoft.sysid import RIG, Problem, Stage, Unknown, identify, record
+from torchsoft.sysid.answer import load_answer
 from torchsoft.sysid.information import Combination, combinations
 from torchsoft.sysid.optimum import Optimum
+from torchsoft.sysid.posterior import laplace
 from torchsoft.sysid.profile import RISE, profiles
 
 RNG = np.random.default_rng(0)
@@ -86,7 +91,7 @@ def test_a_combination_names_what_is_seen_in_place_of_its_parameters() -> None:
     assert seen([1, 0, 0]) == []  # K and R are not seen at all
 
 
-def test_profile_and_combination_of_stiffnesses_in_series() -> None:
+def test_profile_and_combination_of_stiffnesses_in_series(tmp_path: Path) -> None:
     """Pads and contacts share the load: a motion that hardly slips sees their stiffness in series."""
     base = Parameters().override(COARSE)
     roll = Excitation(motion=Roll(travel=4e-3), duration=0.25, grasp_time=0.1, settle=0.0)
@@ -107,6 +112,13 @@ def test_profile_and_combination_of_stiffnesses_in_series() -> None:
     assert any("no parabola" in notice for notice in E.notices)
     K = np.array(E.others["contact.K_n"])
     assert (np.diff(K) < 0).all()
+    straight = laplace(optimum(ClosedForm(lambda x: STRAIGHT @ x, 3), 0, 0, 0), draws=100)  # its k-hat is infinite
+    answer = replace(result, profiles=[E], posterior=straight.summary)
+    answer.save(tmp_path / "answer.json")
+    back = load_answer(tmp_path / "answer.json")
+    assert back.profiles == [E]
+    assert back.posterior is not None
+    assert back.posterior.marginals == straight.marginals
     (both,) = combinations(o.labels, o.covariance, 0.1)
     assert both.formula == "pad.E * contact.K_n^0.1"
     assert both.sd < 0.2 * min(both.sds.values())

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from torchsoft.physics.paper import NAMES
 from torchsoft.sysid.conclude import Assumed
@@ -45,12 +45,23 @@ class Settings(Table):
         return given
 
 
+SURE = 1e-12
+"""Standard deviations [SI], over the value where that is larger than one, below which a number is known: say 0."""
+
+
+def told_apart(sd: float, value: float = 1.0) -> float:
+    """A standard deviation that is zero or can be computed with. Raises `ValueError` for another."""
+    if 0 < sd < (least := SURE * max(abs(value), 1.0)):
+        raise ValueError(f"should be 0, or at least {least:g}, but is {sd}")
+    return sd
+
+
 class Rest(Table):
     """A recording that begins at rest, the disc on the lower pad at `scenario.x_C0`, known to `x_sd` [m], and the bracket clear
     of it."""
 
     kind: Literal["rest"] = "rest"
-    x_sd: float = Field(default=0.0, ge=0, le=0.1)
+    x_sd: Annotated[float, AfterValidator(told_apart)] = Field(default=0.0, ge=0, le=0.1)
 
 
 class Known(Table):
@@ -58,6 +69,11 @@ class Known(Table):
 
     mean: float = Field(ge=-1e6, le=1e6)
     sd: float = Field(ge=0, le=1e6)
+
+    @model_validator(mode="after")
+    def _is_a_distribution(self) -> "Known":
+        told_apart(self.sd, self.mean)
+        return self
 
 
 class Moving(Table):

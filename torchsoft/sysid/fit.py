@@ -22,12 +22,14 @@ SETTLED = 0.2
 
 
 class Unreachable(RuntimeError):
-    """The model cannot follow a recording with the parameters that a fit starts from; `lost` has reason and time."""
+    """The model cannot follow a recording with the parameters that a fit starts from; `lost` has reason and time, `looks`
+    what looked wrong with the recordings themselves."""
 
-    def __init__(self, lost: dict[str, FailedRun]) -> None:
+    def __init__(self, lost: dict[str, FailedRun], looks: Sequence[str] = ()) -> None:
         reasons = "; ".join(f"recording `{name}`: {loss.reason}" for name, loss in lost.items())
-        super().__init__(f"the model cannot reach the data from this start: {reasons}")
-        self.lost = lost
+        behind = f"; what may be behind it: {'; '.join(looks)}" if looks else ""
+        super().__init__(f"the model cannot reach the data from this start: {reasons}{behind}")
+        self.lost, self.looks = lost, tuple(looks)
 
 
 class Fit(NamedTuple):

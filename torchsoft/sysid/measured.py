@@ -253,7 +253,9 @@ def load(data: Sequence[str | Path], config: str | Path) -> Case:
             if not entry.paths:
                 raise
             own = "files" if entry.files else "file"
-            raise ValueError(f"{config}, recordings: `{own}` of `{name}`: {error.filename}: {error.strerror}") from None
+            raise ValueError(
+                f"{config}, recordings: `{own}` of `{name}`: {line(error.filename)}: {error.strerror}"
+            ) from None
     left_out = {name for one in tables.values() for table in one.tables for name in table.ignored}
     if strange := [name for name in stated.ignore if name not in left_out]:
         raise ValueError(f"{config}, ignore: no file has a column `{line(strange[0], 80)}`")

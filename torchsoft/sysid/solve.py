@@ -1,7 +1,8 @@
 """`identify`: carry out a plan of stages, then state how certain the result is and what is not identifiable."""
 
 import time as clock
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from torchsoft.sysid.colour import Coloured, allow_for_colour
 from torchsoft.sysid.conclude import Assumed, How, conclude
 from torchsoft.sysid.conventions import check
 from torchsoft.sysid.finding import accepted
-from torchsoft.sysid.fit import Fit, Notify, chord, descend, gauss_newton
+from torchsoft.sysid.fit import Fit, Notify, Unreachable, chord, descend, gauss_newton
 from torchsoft.sysid.plan import Stage, default_plan
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
@@ -61,15 +62,16 @@ def identify(
     fitted, began = [name for name in problem.names if name not in heldout], clock.perf_counter()
     runner = Runner(problem.recordings, workers, Path(checkpoint) if checkpoint is not None else None)
     looks = accepted(check(problem, runner, fitted), meant) if assumptions == "checked" else []
-    if plan is None:
-        plan = default_plan(problem, runner, rtol, fitted, starts)
     x, fit, stages = problem.coordinates.start, None, []
-    for number, stage in enumerate(plan):
-        before = clock.perf_counter()
-        with progress_bar(f"{number + 1}/{len(plan)} {stage.name}", progress) as bar:
-            fit = run_stage(problem, runner, stage, x, loss, method, seed + number, bar)
-        x = fit.x
-        stages.append(stage_entry(stage.name, stage, stage.rtol, fit, before))
+    with explained(looks):
+        if plan is None:
+            plan = default_plan(problem, runner, rtol, fitted, starts)
+        for number, stage in enumerate(plan):
+            before = clock.perf_counter()
+            with progress_bar(f"{number + 1}/{len(plan)} {stage.name}", progress) as bar:
+                fit = run_stage(problem, runner, stage, x, loss, method, seed + number, bar)
+            x = fit.x
+            stages.append(stage_entry(stage.name, stage, stage.rtol, fit, before))
     if fit is None:
         raise ValueError("`plan` has no stages")
     before = clock.perf_counter()
@@ -80,6 +82,15 @@ def identify(
     ]
     how = How(fitted, tuple(heldout), method, loss, seed, assumptions, tightenings if loss == "linear" else 0)
     return conclude(coloured, runner, plan[-1], stages, how, looks, began, progress)
+
+
+@contextmanager
+def explained(looks: Sequence[str]) -> Iterator[None]:
+    """Tells whom the model cannot follow the data what looked wrong with the recordings themselves."""
+    try:
+        yield
+    except Unreachable as error:
+        raise Unreachable(error.lost, looks) from None
 
 
 def with_its_noise(

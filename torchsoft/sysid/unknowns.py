@@ -124,7 +124,7 @@ class Sensor(Table):
         out: dict[Nuisance, tuple[float, float, float]] = {}
         for kind in NUISANCES:
             nominal, reach = float(kind == "gain"), float(getattr(self, kind))
-            if reach > 0:
+            if nominal + reach > nominal:
                 out[kind] = nominal - reach, nominal, nominal + reach
         return out
 
