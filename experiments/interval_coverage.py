@@ -45,9 +45,9 @@ OFF = 1.002
 """Where a fit begins, over the truth."""
 
 SHORT = {
-    "strokes": Excitation(motion=Strokes(travel=12e-3, stroke_time=0.2), duration=0.7, senses="bracket"),
+    "strokes": Excitation(motion=Strokes(travel=12e-3, stroke_time=0.2), duration=0.9, senses="bracket"),
     "shaking": Excitation(
-        motion=MultiSine(amplitude_x=8e-3, amplitude_y=2e-4, frequency=(2.0, 12.0)), duration=0.7, senses="bracket"
+        motion=MultiSine(amplitude_x=8e-3, amplitude_y=2e-4, frequency=(2.0, 12.0)), duration=0.9, senses="bracket"
     ),
 }
 """Excitations of the smoke test."""

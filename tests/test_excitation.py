@@ -24,7 +24,7 @@ ROLL = {"kind": "slow_roll"}
         ({"motion": {"kind": "multi_sine", "frequency": [1.0, "2"]}}, "motion.frequency.1 should be a valid number, not '2'"),
         ({"motion": ROLL, "depth": True}, "depth should be a valid number, not True"),
         ({"motion": {"kind": "hop"}}, "motion.kind should be one of"),
-        ({"motion": {"kind": "knots", "x": [[0.1, 1e-3], [0.1, 0.0]]}}, "the times of motion.x must increase, but 0.1 s follows"),
+        ({"motion": {"kind": "knots", "x": [[0.1, 1e-3], [0.1, 0.0]]}}, "times of motion.x must increase, but 0.1 s"),
         ({"motion": {"kind": "knots", "y": [[2.0, 1e-3]]}}, "duration = 2 s ends before the last knot of the motion, at 2.5 s"),
     ],
 )  # fmt: skip

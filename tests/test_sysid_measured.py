@@ -195,7 +195,7 @@ BAD_CONFIG = {
     "another constant": (CONFIG + "[missing]\nF_x = 0.0\n", r"rig\.toml: missing\.F_x is not known here"),
     "another start": (CONFIG + '[start]\nkind = "flying"\n', r"start\.kind should be one of 'rest', 'underway', not 'fl"),
     "a start that is hardly uncertain": (
-        CONFIG + '[start]\nkind = "rest"\nx_sd = 1e-300\n', r"rig\.toml: start\.x_sd: should be 0, or at least 1e-12, but is 1e-300",
+        CONFIG + '[start]\nkind = "rest"\nx_sd = 1e-300\n', r"start\.x_sd: should be 0, or at least 1e-12, but is 1e-300",
     ),
     "a start without a kind": (CONFIG + "[start]\nx_sd = 1e-4\n", r"start\.kind is missing"),
     "a parameter by both names": (
@@ -524,6 +524,9 @@ def test_a_recording_may_begin_anywhere_if_that_is_said(case: Callable[..., list
     assert isinstance(one.start, Underway)
     assert one.start.lead == pytest.approx(0.04, abs=6e-3)
     assert one.start.bodies["disc.y"] == (23.5e-3, 1e-4)
+    priced = cost(load(*_split(case(cut, text))).problem, 1e-3, 1, 1)
+    plain = cost(load(*_split(case(config=sensors))).problem, 1e-3, 1, 1)
+    assert priced.seconds / priced.steps > 2 * plain.seconds / plain.steps  # of many more coordinates
     assert one.start.bodies["disc.x"][0] == pytest.approx(60.5e-3, abs=5e-4)
     with pytest.raises(ValueError, match=r"rig\.toml, recording `data`: .*disc\.z"):
         load(*_split(case(cut, text.replace("disc.y", "disc.z"))))

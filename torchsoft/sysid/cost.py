@@ -13,6 +13,9 @@ from torchsoft.sysid.settle import FINER
 CHECKED = 30
 """Runs that a recording is asked for to check what is taken for granted."""
 
+FEW, COLUMN = 8, 0.09
+"""So many unknowns are a few; what each one more adds to the time of a step that is differentiated."""
+
 
 def cost(
     problem: Problem,
@@ -38,11 +41,14 @@ def cost(
     descent, steps, seconds = method != "gauss_newton", 0.0, []
     for recording in fitted:
         seconds.append(0.0)
+        mine = [c for c in problem.coordinates.all if c.of_the_rig and c.recording in (None, recording.name)]
+        more = 1 + COLUMN * max(len(mine) - FEW, 0)
         for number, by, differentiated in runs(recording):
             length = (recording.duration + recording.start.lead) * steps_per_second(by) + rows[recording.name]
             number *= 4 if descent and differentiated else 1
             steps += number * length
-            seconds[-1] += number * (length * step_seconds(paper_settings(recording), differentiated) + RUN)
+            step = step_seconds(paper_settings(recording), differentiated) * (more if differentiated else 1.0)
+            seconds[-1] += number * (length * step + RUN)
     matrix = 3 * 8 / 2**30 if descent else 0.0
     memory = sorted(rows[r.name] * (row_memory(paper_settings(r)) + matrix * rows[r.name]) for r in problem.recordings)
     at_once = max(1, min(workers, len(fitted)))

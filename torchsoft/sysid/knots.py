@@ -144,15 +144,15 @@ class Moves:
         return np.asarray(out.x[: self.n], np.float64)
 
     def random(self, rng: np.random.Generator) -> Array:
-        """A motion within the bounds that has nothing to do with the one given: in up to `PHASES` phases every signal goes to and fro
-        between two random levels, not quite alike each time, at a random part of its speed."""
+        """A motion within the bounds that has nothing to do with the one given: in up to `PHASES` phases every signal
+        goes to and fro between two random levels, not quite alike each time, at a random part of its speed."""
         z = []
         for name, (times, values, first) in self.knots.items():
             one, spans = self.bounds[name], np.diff(times[first - 1 :])
             phase = np.searchsorted(rng.uniform(0, len(spans), rng.integers(PHASES)), np.arange(len(spans)))
             phase = np.unique(phase, return_inverse=True)[1]
             levels = rng.uniform(one.low, one.high, (PHASES, 2))
-            part = 10 ** rng.uniform(-1, 0, PHASES)
+            part = np.power(10.0, rng.uniform(-1, 0, PHASES))
             at, path = values[first - 1], []
             for i, (k, span) in enumerate(zip(phase, spans)):
                 step = part[k] * one.speed / PEAK * span * rng.uniform(0.5, 1)
@@ -170,7 +170,7 @@ class Moves:
         for name, (times, values) in self.split(z).items():
             one, (known_times, known_values, first) = self.bounds[name], self.knots[name]
             way = np.diff(np.append(known_values[first - 1], values))
-            span = np.diff(np.append(known_times[first - 1], times)) * one.speed / PEAK
+            span: Array = np.ediff1d(np.append(known_times[first - 1], times)).astype(np.float64) * (one.speed / PEAK)
             near = 1e-3 * (one.high - one.low)
             for what, count in (
                 (f"low = {one.low:g}", int(np.sum(values < one.low + near))),
