@@ -4,12 +4,12 @@ Both are measured on the data at hand. A run at the estimates, whose steps are c
 tolerance have other residuals; projected on the Jacobian, the difference is how far the estimates would move.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchsoft.sysid.fit import Fit, Notify, chord, settled
+from torchsoft.sysid.fit import Fit, Notify, chord, gauss_newton, settled
 from torchsoft.sysid.information import shift, standard_deviations
 from torchsoft.sysid.plan import Stage
 from torchsoft.sysid.problem import Problem, Residuals, StepsByName
@@ -21,6 +21,9 @@ STEP_BIAS = 0.5
 
 FINER = 0.1
 """The tolerance of the check over the one that is checked."""
+
+REFITS, EXACT = 15, 1e-6
+"""Evaluations with Jacobians of their own that such a fit may take, and its relative tolerance."""
 
 ROUNDS = 3
 """How often a fit goes on with steps chosen anew at its end."""
@@ -51,9 +54,13 @@ def settle(
     sd = standard_deviations(J)
 
     def along(start: Residuals, steps: StepsByName) -> bool:
-        """A fit on other steps from residuals on them; whether it came any further."""
+        """A fit on other steps from residuals on them, by new Jacobians where the last one leads astray; whether it came any
+        further."""
         nonlocal x, at
-        end = chord(problem, runner, x, start._replace(J=at.J), which=which, free=free, steps=steps, notify=notify)
+        common: dict[str, Any] = {"which": which, "free": free, "steps": steps, "notify": notify}
+        end = chord(problem, runner, x, start._replace(J=at.J), **common)
+        if not end.converged and (end.x == x).all():
+            end = gauss_newton(problem, runner, end.x, evaluations=REFITS, tolerance=EXACT, **common)
         assert end.at is not None
         if further := bool((end.x != x).any()):
             fits.append((rtol, end))
