@@ -135,11 +135,15 @@ def chosen(config: Config) -> list[Case]:
     ]
 
 
+def runs(case: Case, config: Config) -> Path:
+    """Where the runs of a fit are kept until all cases are done: begun again, it goes through them in seconds."""
+    return config.out / f"runs-{case.name.replace(' ', '-').replace('/', '-')}"
+
+
 def study(case: Case, made: Mapping[Order, Made], config: Config) -> Outcome:
     """Identify one case."""
     mine, began = [made[order] for order in case.orders()], (perf_counter(), process_time())
     found, refused = None, ""
-    folder = config.out / f"runs-{case.name.replace(' ', '-').replace('/', '-')}"
     try:
         recordings = [
             case.recording(name, one, config.seed + 10 * k, config.smoke)
@@ -147,9 +151,8 @@ def study(case: Case, made: Mapping[Order, Made], config: Config) -> Outcome:
         ]
         problem = Problem(recordings, RIG, unknowns(config))
         found = identify(
-            problem, rtol=config.rtol, workers=config.workers, checkpoint=folder, progress=not config.smoke
+            problem, rtol=config.rtol, workers=config.workers, checkpoint=runs(case, config), progress=not config.smoke
         )
-        forget(folder)
     except (Unreachable, ValueError) as error:
         refused = str(error)
     wall, cpu = perf_counter() - began[0], process_time() - began[1]
@@ -167,6 +170,8 @@ def run(config: Config) -> list[Outcome]:
         outcomes.append(study(case, made, config))
         print(f"\n{case.name}: {outcomes[-1].verdict}", *outcomes[-1].warnings, sep="\n  ")
         write(config.out, summary(config, outcomes), {"foreign_rigs": figure(outcomes)}, table(outcomes))
+    for case in cases:
+        forget(runs(case, config))
     return outcomes
 
 
@@ -205,7 +210,7 @@ REACH = 3.0
 def figure(outcomes: list[Outcome]) -> Figure:
     """Estimates and intervals over the truth, a panel a parameter, a row a case."""
     names = list(outcomes[0].truth)
-    fig = Figure(figsize=(2.2 + 1.55 * len(names), 1.6 + 0.36 * len(outcomes)), layout="constrained")
+    fig = Figure(figsize=(3.0 + 1.55 * len(names), 1.6 + 0.36 * len(outcomes)), layout="constrained")
     axes = fig.subplots(1, len(names), sharey=True, squeeze=False)[0]
     for ax, name in zip(axes, names):
         ax.axvline(0.0, color="0.6", lw=0.8)
@@ -224,16 +229,20 @@ def figure(outcomes: list[Outcome]) -> Figure:
             ax.plot(value, i, "o" if row["inside"] else "X", color=colour, ms=4 if row["inside"] else 7)
         ax.set(xlim=(-np.log(REACH), np.log(REACH)), title=name.split(".")[1])
         ax.set_xscale("symlog", linthresh=0.02)
-        ticks = [1 / REACH, 0.9, 1 / 1.01, 1.0, 1.01, 1.1, REACH]
-        ax.set_xticks(np.log(ticks), ["1/3", "−10 %", "", "0", "", "+10 %", "3"], fontsize=7)
+        percent = (-50, -10, -1, 0, 1, 10, 100)
+        ax.set_xticks(np.log([1 + p / 100 for p in percent]), [f"{p:g}" for p in percent], fontsize=7)
         ax.minorticks_off()
+        ax.tick_params(axis="y", length=0)
         ax.grid(axis="x", lw=0.3)
     axes[0].set_yticks(range(len(outcomes)), [one.case.name for one in outcomes], fontsize=8)
     axes[0].set_ylim(len(outcomes) - 0.5, -0.5)
+    for i, one in enumerate(outcomes):
+        said = "warned" if one.warnings else "no warning"
+        axes[-1].text(1.06, i, said, transform=axes[-1].get_yaxis_transform(), va="center", fontsize=8)
     marks = [Line2D([], [], color=colour, marker="o", lw=2.2, label=verdict) for verdict, colour in VERDICTS.items()]
     marks.append(Line2D([], [], color="0.4", marker="X", ls="", ms=7, label="interval without the truth"))
     fig.legend(handles=marks, loc="outside lower center", ncols=len(marks), fontsize=8, frameon=False)
-    fig.suptitle("Estimates and 95 % intervals over the truth", fontsize=10)
+    fig.suptitle("Estimates and 95 % intervals: off the truth by so many percent", fontsize=10)
     return fig
 
 

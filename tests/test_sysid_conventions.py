@@ -9,6 +9,7 @@ import pytest
 import torch
 from conftest import COARSE
 from scipy.interpolate import CubicSpline
+from scipy.signal import lfilter
 
 from torchsoft import Parameters, Reference, SoftGrasp
 from torchsoft.excitation import Excitation, MultiSine, Press, Strokes
@@ -223,10 +224,29 @@ def test_nothing_is_said_of_what_is_right(
 
 
 def test_gains_that_are_unknown_still_tell_a_sign(recordings: dict[str, Recording]) -> None:
-    one = noted(recordings["rolling"], {"control.K_98": 0.6e5, "control.R_99": 221.0})
-    assert list(loop_findings(one, SENSORS, ["control.K_98"])) == []
-    flipped = changed(one, F_y=scaled(-1))
-    assert [f.what for f in loop_findings(flipped, SENSORS, ["control.K_98"])] == ["sign of F_y"]
+    for factor in (0.3, 3.0):
+        gains = {"control.K_98": factor * NOMINAL.control.K_98, "control.R_99": factor * NOMINAL.control.R_99}
+        one = noted(recordings["rolling"], gains, F_ff=Profile([0.0], [0.0]))
+        pressed = changed(
+            one, F_y=lambda t, F: F - recordings["rolling"].rig.reference["F_ff"](torch.from_numpy(t))[0].numpy()
+        )
+        assert list(loop_findings(pressed, SENSORS, ["control.K_98"])) == []
+        flipped = changed(pressed, F_y=scaled(-1))
+        assert [f.what for f in loop_findings(flipped, SENSORS, ["control.K_98"])] == ["sign of F_y"]
+    about = noted(recordings["rolling"], {"control.senses": "disc"})
+    assert [f.what for f in loop_findings(about, SENSORS, ["control.K_81"])] == ["control.senses"]
+
+
+def test_coloured_noise_is_no_mistake(recordings: dict[str, Recording], runs: dict[str, Signals]) -> None:
+    """First-order autoregressions of 0.9, where the fit does not know it."""
+    rng = np.random.default_rng(0)
+    for motion, one in recordings.items():
+        for _ in range(3):
+            samples = {
+                name: (t, y + lfilter([0.43], [1, -0.9], SENSORS[name].noise * rng.standard_normal(len(t))))
+                for name, (t, y) in one.samples.items()
+            }
+            assert looked_at(replace(one, samples=samples), runs[motion]) == []
 
 
 def test_gaps_and_other_rates_of_samples_are_no_mistake(

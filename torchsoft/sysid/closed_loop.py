@@ -39,6 +39,15 @@ class Signal(NamedTuple):
         return float(np.median(np.diff(self.t)))
 
 
+class Noise(NamedTuple):
+    """Standard deviation [N] of the mean over a window of a disagreement that is noise: if that is `white`, and if it stays the
+    same for longer than a window (`coloured`); and the force per coordinate that the law gives (`gain`)."""
+
+    white: float
+    coloured: float
+    gain: float
+
+
 @dataclass(frozen=True)
 class Loop:
     """An actuator with its force F and the coordinate x that it measures, over windows between `edges` (w + 1,) [s]; `keep`
@@ -97,18 +106,25 @@ class Loop:
         return self.actuator(torch.from_numpy(np.concatenate((asked, found), -1))).detach().numpy()
 
     @cached_property
-    def noise(self) -> tuple[float, float]:
-        """How uncertain noise makes the difference of both sides, rms [N], and how much force the law gives per coordinate."""
+    def noise(self) -> "Noise":
+        """How uncertain the sensors' noise makes the difference of both sides."""
         inputs = torch.from_numpy(np.concatenate((self.asked(), self.found()), -1)).requires_grad_(True)
         (slope,) = torch.autograd.grad(self.actuator(inputs).sum(), inputs)
         by_x, by_v = slope[:, 3].numpy(), slope[:, 4].numpy()
-        F, x = ((one.sensor.noise**2, one.spacing / self.width) for one in (self.F, self.x))
-        variance = F[0] * F[1] + x[0] * (by_x**2 * x[1] + 2 * by_v**2 / self.width**2)
-        return float(np.sqrt(variance.mean())), float(np.abs(by_x).mean())
+        variance = []
+        for part in (lambda one: one.spacing / self.width, lambda one: 1.0):
+            x = self.x.sensor.noise**2 * (by_x**2 * part(self.x) + 2 * by_v**2 / self.width**2)
+            variance.append(np.mean(self.F.sensor.noise**2 * part(self.F) + x))
+        return Noise(float(np.sqrt(variance[0])), float(np.sqrt(variance[1])), float(np.abs(by_x).mean()))
+
+    @property
+    def unfed(self) -> bool:
+        """Whether a force might be fed forward, and none ever is."""
+        return self.actuator.feed_forward is not None and not self.asked()[:, 2].any()
 
     def beyond(self, e: Array) -> Array:
         """What is left of a disagreement e (n,) [N] if the faults that the sensors declare explain of it what they can."""
-        F, x, (_, gain) = self.F.sensor, self.x.sensor, self.noise
+        F, x, gain = self.F.sensor, self.x.sensor, self.noise.gain
         t = (0.5 * (self.edges[1:] + self.edges[:-1]))[self.keep]
         faults = [
             (np.ones(len(e)), F.bias + gain * x.bias), (t - t.mean(), F.drift + gain * x.drift), (self.force(), F.gain),

@@ -53,8 +53,9 @@ APART = 0.3
 EARLY = 10e-3
 """Time [s] from the first sample on in which nothing moves that begins at rest."""
 
-SURE = 5.0
-"""Standard deviations from which a mean is called different."""
+SURE, COLOURED = 5.0, 3.5
+"""Standard deviations from which a mean is called different: those of a mean, and those of one sample, which a mean of
+coloured noise may have."""
 
 
 def check(problem: Problem, runner: Runner, which: Sequence[str] | None = None) -> list[Finding]:
@@ -173,19 +174,24 @@ def zeros(recording: Recording, sensors: Mapping[str, Sensor], early: Mapping[st
         if name not in early or (actuator.measures != actuator.pushes):
             continue
         sensor, mean, count = sensors[name], float(early[name].mean()), len(early[name])
-        if abs(mean) > SURE * sensor.noise / math.sqrt(count) + sensor.bias:
+        if abs(mean) > surely(sensor, count) + sensor.bias:
             words = f"{name} begins {mean:+.3g} {unit(name)} from {actuator.setpoint}: do both have the same zero?"
             yield Finding(f"zero of {name}", recording.name, f"recording `{recording.name}`: {words}")
     if isinstance(rig, SoftGrasp) and {"x_C", "theta"} <= early.keys():
         R, (x, theta) = rig.settings.disc.radius, (sensors[name] for name in ("x_C", "theta"))
         off = float(early["theta"].mean() + early["x_C"].mean() / R)
-        sd = math.hypot(theta.noise / math.sqrt(len(early["theta"])), x.noise / R / math.sqrt(len(early["x_C"])))
-        if abs(off) > SURE * sd + theta.bias + x.bias / R:
+        sure = math.hypot(surely(theta, len(early["theta"])), surely(x, len(early["x_C"])) / R)
+        if abs(off) > sure + theta.bias + x.bias / R:
             words = (
                 f"theta begins {off:+.3g} rad from where the disc would have it that has rolled to its x_C: is zero its "
                 "angle as it is put down at scenario.x_C0, and is that its x?"
             )
             yield Finding("zero of theta", recording.name, f"recording `{recording.name}`: {words}")
+
+
+def surely(sensor: Sensor, count: int) -> float:
+    """What a mean of so many samples is by noise at most, be it coloured."""
+    return sensor.noise * max(SURE / math.sqrt(count), COLOURED)
 
 
 def another_body(recording: Recording, sensors: Mapping[str, Sensor], expected: Expected) -> Iterator[Finding]:

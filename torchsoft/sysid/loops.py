@@ -75,8 +75,9 @@ def loop_findings(
         body, _, axis = actuator.measures.partition(".")
         others = {one: f"{one}.{axis}" for one in rig.bodies if one != body}
         rivals = {o: windows(recording, actuator, F, sampled(recording, sensors, x)) for o, x in others.items()}
-        loop, free = with_its_lag(loop), any(id(p) in tensors for p in actuator.parameters())
-        found = disagreement(rig, loop, body, {k: v for k, v in rivals.items() if v is not None}, free)
+        loop, rivals = with_its_lag(loop), {o: with_its_lag(its) for o, its in rivals.items() if its is not None}
+        free = any(id(p) in tensors for p in actuator.parameters())
+        found = disagreement_of_signs(rig, loop, body, rivals) if free else disagreement(rig, loop, body, rivals)
         if found is not None:
             e = loop.force() - loop.given(loop.asked(), loop.found())
             text = (
@@ -94,54 +95,61 @@ def with_its_lag(loop: Loop) -> Loop:
     return replace(loop, lag=best_shift(loop, lambda late: loop.force(late) - given, reach)[0]) if reach > 0 else loop
 
 
-def disagreement(rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop], free: bool) -> Change | None:
-    """What is wrong with the loop about a body, if anything is; `free` gains tell only the sign, and what is sensed."""
+def disagreement_of_signs(rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop]) -> Change | None:
+    """What is wrong with a loop about a body whose gains are not known: its sign, or what it senses."""
     F, given = loop.force(), loop.given(loop.asked(), loop.found())
-    e, (noise, _) = loop.beyond(F - given), loop.noise
-    limit = 2 * noise + ROUGH * rms(F)
-    changes = [flipped(loop, F, given), *sensed(rig, loop, body, rivals)]
-    if free:
-        as_it_is, *changes = (scaled(change, F) for change in (Change("", "", F - given), *changes))
-        best = min(changes, key=left)
-        clear = left(as_it_is) > limit and left(best) < min(0.5 * left(as_it_is), 0.5 * rms(F))
-        return best if clear else None
+    as_it_is, changes = rms(scaled(F, given)), [flipped(loop, F, given)._replace(left=scaled(-F, given))]
+    for other, its in rivals.items():
+        e = scaled(its.force(), its.given(its.asked(), its.found()))
+        changes.append(another_sense(rig, loop.actuator, body, other, e))
+    best = min(changes, key=left)
+    clear = as_it_is > 2 * loop.noise.white + ROUGH * rms(F) and left(best) < 0.5 * min(as_it_is, rms(F))
+    return best if clear else None
+
+
+def scaled(F: Array, given: Array) -> Array:
+    """What is left of forces if the law's gains may all be larger, or smaller."""
+    return F - given * max(over(float(F @ given), float(given @ given)), 0.0)
+
+
+def over(a: float, b: float) -> float:
+    """a / b for b from zero on; large, where that is zero."""
+    return a / max(b, 1e-300)
+
+
+def disagreement(rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop]) -> Change | None:
+    """What is wrong with a loop about a body, if anything is."""
+    F, given = loop.force(), loop.given(loop.asked(), loop.found())
+    e, noise = loop.beyond(F - given), loop.noise
+    limit, coloured = (2 * sd + ROUGH * rms(F) for sd in (noise.white, noise.coloured))
     if rms(e) <= limit:
         return fine(loop, F, given)
-    missing = fed_forward(loop, e)
-    if missing is not None and not loop.asked()[:, 2].any():
+    changes = [flipped(loop, F, given)]
+    for other, its in rivals.items():
+        left_by_it = its.beyond(its.force() - its.given(its.asked(), its.found()))
+        changes.append(another_sense(rig, loop.actuator, body, other, left_by_it))
+    missing = fed_forward(loop, e) if loop.unfed or rms(e) > coloured else None
+    if missing is not None and loop.unfed:
         return min((missing, *changes), key=left)
-    changes += [offset(loop, e), *resized(loop, F, given), *feed_flipped(loop, F)]
+    changes += [*resized(loop, F, given), *feed_flipped(loop, F), *([offset(loop, e)] if is_off(loop, F, e) else [])]
     for more in (lambda: [], lambda: [shifted(loop)]):  # which takes longer
         changes += more()
         best = min(changes, key=left)
         if left(best) <= max(limit, EXPLAINED * min(rms(e), rms(F))) and left(best) < 0.5 * rms(e):
             return best
-    return missing or Change(
-        f"loop of {loop.F.channel}",
-        f"{loop.F.channel} is not what the controller gives: are its gains right, the units, and the set-points?", e,
-    )  # fmt: skip
+    if missing is not None or rms(e) <= coloured:
+        return missing
+    said = f"{loop.F.channel} is not what the controller gives: are its gains right, the units, and the set-points?"
+    return Change(f"loop of {loop.F.channel}", said, e)
 
 
 def left(change: Change) -> float:
     return rms(change.left)
 
 
-def scaled(change: Change, F: Array) -> Change:
-    """What is left if the law's gains may all have another size."""
-    given = F - change.left
-    return change._replace(left=F - given * max(float(F @ given) / max(float(given @ given), 1e-300), 0.0))
-
-
 def flipped(loop: Loop, F: Array, given: Array) -> Change:
     name = loop.F.channel
     return Change(f"sign of {name}", f"{name} looks as if its sign were opposite", loop.beyond(-F - given), True)
-
-
-def sensed(rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop]) -> Iterator[Change]:
-    """The coordinate of another body in the place of the one that the loop is taken to sense."""
-    for other, its in rivals.items():
-        e = its.beyond(its.force() - its.given(its.asked(), its.found()))
-        yield another_sense(rig, loop.actuator, body, other, e)
 
 
 def another_sense(rig: Rig, actuator: Actuator, body: str, other: str, left: Array) -> Change:
@@ -157,7 +165,7 @@ def another_sense(rig: Rig, actuator: Actuator, body: str, other: str, left: Arr
 
 def offset(loop: Loop, e: Array) -> Change:
     """A constant more of the force, or of the coordinate."""
-    F, x, mean, (_, gain) = loop.F.channel, loop.x.channel, float(e.mean()), loop.noise
+    F, x, mean, gain = loop.F.channel, loop.x.channel, float(e.mean()), loop.noise.gain
     zeros = (
         f", or {x} and {loop.actuator.setpoint} have zeros {abs(mean) / gain:.3g} {unit(x)} apart" if gain > 0 else ""
     )
@@ -166,7 +174,7 @@ def offset(loop: Loop, e: Array) -> Change:
 
 def resized(loop: Loop, F: Array, given: Array) -> Iterator[Change]:
     """A factor on the force: of a mistaken unit, or not much of one."""
-    g, name = float(F @ given) / float(given @ given), loop.F.channel
+    g, name = over(float(F @ given), float(given @ given)), loop.F.channel
     for factor, words in confusions(name):
         said = f"{name} looks as if it were in another unit: {words}"
         yield Change(f"unit of {name}", said, loop.beyond(F / factor - given), True)
@@ -217,7 +225,7 @@ def fed_forward(loop: Loop, e: Array) -> Change | None:
     """A force that was fed forward and is not in the recording: a disagreement that is slow, and not there from the start."""
     name, F = loop.actuator.feed_forward, loop.F.channel
     slow, began = np.diff(e) / np.sqrt(2), float(e[: max(2, len(e) // 20)].mean())
-    if name is None or rms(slow) > max(SLOW * rms(e), 2 * loop.noise[0]) or abs(began) > 0.5 * rms(e):
+    if name is None or rms(slow) > max(SLOW * rms(e), 2 * loop.noise.white) or abs(began) > 0.5 * rms(e):
         return None
     said = (
         f"{F} is {float(e.mean()):+.3g} {unit(F)} more, on the average, than the controller gives: was a force fed forward "
@@ -226,16 +234,31 @@ def fed_forward(loop: Loop, e: Array) -> Change | None:
     return Change(name, said, slow)
 
 
+def inflated(e: Array) -> float:
+    """How much larger the standard deviation of a mean of e (n,) is for their correlation: that of coloured noise, say."""
+    d = e - e.mean()
+    rho = np.correlate(d, d, "full")[len(d) - 1 :] / max(float(d @ d), 1e-300)
+    until = int(np.argmax(rho <= 0)) if (rho <= 0).any() else len(rho)
+    return float(np.sqrt(max(1.0, 1 + 2 * rho[1:until].sum())))
+
+
+def is_off(loop: Loop, F: Array, e: Array) -> bool:
+    """Whether the mean of a disagreement is not that of noise. Where nothing was fed forward, noise is taken to be white."""
+    sd = loop.noise.white if loop.unfed else max(loop.noise.white, rms(e - e.mean())) * inflated(e)
+    return bool(abs(e.mean()) > SURE * sd / np.sqrt(len(e)) + 0.02 * rms(F))
+
+
 def fine(loop: Loop, F: Array, given: Array) -> Change | None:
     """A zero, a factor or a time that is off by more than its own uncertainty, where both sides agree roughly."""
-    e, n, (noise, _) = loop.beyond(F - given), len(F), loop.noise
-    if abs(e.mean()) > SURE * noise / np.sqrt(n) + 0.02 * rms(F):
+    e = loop.beyond(F - given)
+    noise = loop.noise.white * inflated(e)
+    if is_off(loop, F, e):
         return fed_forward(loop, e) or offset(loop, e)
-    off, by_noise = float(e @ given) / float(given @ given), noise / max(rms(given), 1e-300)
-    if abs(off) > ROUGH + SURE * by_noise / np.sqrt(n) + 2 * by_noise**2:
+    off, by_noise = over(float(e @ given), float(given @ given)), over(noise, rms(given))
+    if abs(off) > ROUGH + SURE * by_noise / np.sqrt(len(F)) + 2 * by_noise**2:
         return next((one for one in resized(loop, F, given) if not one.grave), None)
     slope = ((loop.force(LATE) - loop.force(-LATE)) / (2 * LATE))[loop.inner]
-    late, sd = float(e[loop.inner] @ slope / (slope @ slope)), noise / max(float(np.sqrt(slope @ slope)), 1e-300)
+    late, sd = over(float(e[loop.inner] @ slope), float(slope @ slope)), over(noise, float(np.sqrt(slope @ slope)))
     if abs(late) > LATE + SURE * sd:
         return best if left(best := shifted(loop)) < 0.8 * rms(e) else None
     return None
