@@ -3,7 +3,7 @@
 A variation makes the recordings, or their parameters, as they would be if one thing were otherwise by a stated amount.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
@@ -15,6 +15,7 @@ from torchsoft.physics.contact import Coulomb, SmoothSlip
 from torchsoft.physics.motion import Piecewise, Reference, Sampled
 from torchsoft.physics.paper import SoftGrasp
 from torchsoft.physics.rig import Rig
+from torchsoft.sysid.prediction import set_parameters
 from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.start import AtRest
 from torchsoft.sysid.unknowns import Nuisance, Sensor
@@ -70,9 +71,9 @@ FAULTS: dict[Nuisance, Fault] = {
 class Assumption:
     """One thing that is taken for granted: `stated` says what, `otherwise` what the variation makes of it, as clauses.
 
-    `vary` gives another recording, None where that has no meaning for it; or `values` are factors on parameters. What is known,
-    and what a sensor is, may be otherwise by any part of the `amount` [unit], and to either side; a law or a constant of
-    the computation either is so, or is not.
+    `vary` gives another recording, None where that has no meaning for it; or `values` are factors on parameters, close to
+    one. What is known, and what a sensor is, may be otherwise by any part of the `amount` [unit], and to either side; a law
+    or a constant of the computation either is so, or is not.
     """
 
     name: str
@@ -106,7 +107,7 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Assu
         small = ", ".join(f"{SMALLER_RAMP * value:.3g}" for value in ramps.values())
         stated = ", ".join(f"{value:.3g}" for value in ramps.values())
         out.append(Assumption("ramp", "numerical", f"forces are ramped in at touch-down over epsilon = {stated} m",
-                              f"epsilon were {small} m", values=dict.fromkeys(ramps, SMALLER_RAMP)))  # fmt: skip
+                              f"epsilon were {small} m", vary=lambda r: ramped(r, tuple(ramps), SMALLER_RAMP)))  # fmt: skip
     if any(isinstance(one, Sampled) for one in rig.reference.signals.values()):
         out.append(Assumption("set-points", "numerical", "set-points are what a smooth curve through the recorded ones says",
                               "only every second one were known", vary=sparser))  # fmt: skip
@@ -167,6 +168,11 @@ def shifted(recording: Recording, part: float) -> Recording:
             pad.positions += step
 
     return with_rig(recording, change)
+
+
+def ramped(recording: Recording, names: Sequence[str], factor: float) -> Recording:
+    """The depths `names` of touch-down ramps by a factor."""
+    return with_rig(recording, lambda rig: set_parameters(rig, {n: factor * recording.parameters[n] for n in names}))
 
 
 def placed(recording: Recording) -> Recording | None:

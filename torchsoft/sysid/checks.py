@@ -6,23 +6,27 @@ residuals, how much of it the data ask for. A constant of the computation is not
 a coordinate more, with a standard normal prior on its amplitude, so that data that cannot tell it cost certainty.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import stats
 
 from torchsoft.sysid.assumptions import FAULTS, Assumption, Kind, assumptions
+from torchsoft.sysid.fit import Fit, Notify
 from torchsoft.sysid.information import fisher, shift, standard_deviations
-from torchsoft.sysid.misfit import parts
+from torchsoft.sysid.misfit import LEVEL, parts
 from torchsoft.sysid.plan import USUAL
-from torchsoft.sysid.prediction import FailedRun, Frozen
+from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.readout import Signals
 from torchsoft.sysid.recording import Array
+from torchsoft.sysid.robust import Loss
 from torchsoft.sysid.unknowns import Nuisance
+from torchsoft.sysid.variation import End, difference, ended, refit
 from torchsoft.sysid.workers import Runner
 
 ASKED = 20.0
@@ -50,7 +54,8 @@ class Check:
     `moves` is how far each coordinate would move, in its standard deviations, by label; `gain` by how much the sum of squares
     would fall if the data could choose the amplitude, `asked` that amplitude [unit] and `asked_sd` its standard deviation;
     `significance` is the gain over the misfit per sample that would be left, `pattern` the part of the residuals'
-    autocorrelation that would be left, 0 where there is none. `unchecked` says why there is no answer.
+    autocorrelation that would be left, 0 where there is none. `refitted`: that is of a fit with the whole variation, not to
+    first order. `unchecked` says why there is no answer.
     """
 
     name: str
@@ -65,6 +70,7 @@ class Check:
     asked_sd: float
     significance: float
     pattern: float = 0.0
+    refitted: bool = False
     unchecked: str = ""
 
     @property
@@ -72,6 +78,11 @@ class Check:
         """Whether the data ask for it."""
         either_side = self.kind in ("known", "sensor")
         return self.significance > ASKED and self.pattern < PATTERN and (either_side or self.asked > 0)
+
+    @property
+    def falls(self) -> str:
+        """What it does to the sum of squares, as a sentence has it."""
+        return f"falls by {self.gain:.0f} in a new fit" if self.refitted else f"would fall by {self.gain:.0f}"
 
     @property
     def most_moved(self) -> tuple[str, float]:
@@ -100,49 +111,93 @@ class Checked(NamedTuple):
 
 def check(
     problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_], which: Sequence[str], rtol: float, *,
-    workers: int = 1, journal: Path | None = None,
+    loss: Loss = "linear", workers: int = 1, journal: Path | None = None, notify: Notify = lambda chi2: None,
 ) -> Checked:  # fmt: skip
     """Vary what was taken for granted at the estimates x (n,), where `at` holds residuals and Jacobian of the recordings
-    `which`."""
-    rtol, J = max(rtol, USUAL), at.J[:, free]
-    Q, _ = np.linalg.qr(J)
-    sd = standard_deviations(J)
-    labels = [label for label, one in zip(problem.coordinates.labels, free) if one]
-    runner = Runner(problem.recordings, workers, journal)
-    base, steps = problem.freeze(runner, x, which, rtol)
-    r, places = at.r, [part.rows for part in parts(problem, at.r, which)]
-    left = max(1.0, float(r @ r) / max(len(r) - int(free.sum()), 1))
-    checks, columns = [], []
-
-    def judged(one: Assumption, d: Array) -> Check:
-        across = d - Q @ (Q.T @ d)
-        square, along = float(across @ across), float(across @ r)
-        moves = -shift(J, d) / sd
-        if square < 1e-12 * max(float(d @ d), 1e-300) or square == 0.0:
-            return Check(one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit,
-                         dict(zip(labels, moves.tolist())), 0.0, 0.0, float("inf"), 0.0)  # fmt: skip
-        gain, alpha = along**2 / square, -along / square
-        rest = max(1.0, (float(r @ r) - gain) / max(len(r) - int(free.sum()) - 1, 1))
-        pattern = pattern_of(places, r + alpha * across, r)
-        return Check(one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, dict(zip(labels, moves.tolist())),
-                     gain, alpha * one.amount, float((left / square) ** 0.5) * one.amount, gain / rest, pattern)  # fmt: skip
-
+    `which`. Where no variation explains why residuals are larger than the noise, the fit is repeated under each that is no
+    number of the rig."""
+    end = ended(problem, x, at, free, which, max(rtol, USUAL), workers, journal)
     recordings = [recording for recording in problem.recordings if recording.name in which]
     taken = assumptions(recordings, set(problem.coordinates.names))
+    judge, checks, columns = Judge(problem, end), dict[str, Check](), []
     for one in taken:
-        if one.kind == "known" and one.values is not None:
+        if one.vary is None:
             continue
-        d, reason = difference(problem, x, which, one, base, steps, workers, journal)
-        if d is None:
-            checks.append(Check(one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, {}, 0.0, 0.0, float("inf"),
-                                0.0, unchecked=reason))  # fmt: skip
-            continue
-        checks.append(judged(one, d))
-        if one.kind == "numerical":
+        d, reason = difference(problem, end, one)
+        checks[one.name] = judge.unchecked(one, reason) if d is None else judge.column(one, d)
+        if one.kind == "numerical" and d is not None:
             columns.append(d)
-    known = [one for one in taken if one.kind == "known" and one.values is not None]
-    checks += [judged(one, d) for one, d in columns_of(problem, runner, x, which, steps, known) if d.any()]
-    return Checked(checks, np.stack(columns, 1) if columns else np.zeros((len(r), 0)), J)
+    linear = columns_of(problem, Runner(problem.recordings, workers, journal), end, taken)
+    checks |= {one.name: judge.column(one, d) for one, d in linear if d.any()}
+    doubted = sorted((one for one in taken if one.vary is not None), key=lambda one: -checks[one.name].gain)
+    if not end.base.lost and judge.too_large(checks.values()):
+        as_stated = refit(problem, end, None, loss, notify)
+        for one in doubted:
+            fit = refit(problem, end, one, loss, notify)
+            if fit is not None and as_stated is not None:
+                checks[one.name] = judge.fit(one, fit, as_stated, checks[one.name])
+            if not judge.too_large(checks.values()):
+                break
+    return Checked(list(checks.values()), np.stack(columns, 1) if columns else np.zeros((len(at.r), 0)), judge.J)
+
+
+class Judge:
+    """What variations are worth at the end of a fit."""
+
+    def __init__(self, problem: Problem, end: End) -> None:
+        self.end, self.r, self.J = end, end.at.r, end.at.J[:, end.free]
+        self.Q, _ = np.linalg.qr(self.J)
+        self.sd = standard_deviations(self.J)
+        self.labels = [label for label, one in zip(problem.coordinates.labels, end.free) if one]
+        self.places = [part.rows for part in parts(problem, self.r, end.which)]
+        self.dof = max(len(self.r) - len(self.labels), 1)
+        self.square = float(self.r @ self.r)
+
+    def too_large(self, checks: Iterable[Check]) -> bool:
+        """Whether residuals are larger than the noise, and would be with whatever the data ask for."""
+        gain = max((one.gain for one in checks if one.wanted), default=0.0)
+        return float(stats.chi2.sf(self.square - gain, self.dof)) < LEVEL
+
+    def unchecked(self, one: Assumption, reason: str) -> Check:
+        return Check(one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, {}, 0.0, 0.0, float("inf"), 0.0,
+                     unchecked=reason)  # fmt: skip
+
+    def made(
+        self, one: Assumption, moves: Array, gain: float, asked: float, asked_sd: float, rest: float, pattern: float
+    ) -> Check:
+        """Of a variation that leaves a misfit `rest` per sample."""
+        by_label = dict(zip(self.labels, moves.tolist()))
+        return Check(one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, by_label, gain, asked, asked_sd,
+                     gain / rest, pattern)  # fmt: skip
+
+    def column(self, one: Assumption, d: Array) -> Check:
+        """Of what a variation adds to the residuals (m,), to first order in its amplitude."""
+        across = d - self.Q @ (self.Q.T @ d)
+        size, along = float(across @ across), float(across @ self.r)
+        moves = -shift(self.J, d) / self.sd
+        if size < 1e-12 * max(float(d @ d), 1e-300) or size == 0.0:
+            return self.made(one, moves, 0.0, 0.0, float("inf"), 1.0, 0.0)
+        gain, alpha = along**2 / size, -along / size
+        rest = max(1.0, (self.square - gain) / max(self.dof - 1, 1))
+        pattern, sd = (
+            pattern_of(self.places, self.r + alpha * across, self.r),
+            (max(1.0, self.square / self.dof) / size) ** 0.5,
+        )
+        return self.made(one, moves, gain, alpha * one.amount, sd * one.amount, rest, pattern)
+
+    def fit(self, one: Assumption, fit: Fit, as_stated: Fit, linear: Check) -> Check:
+        """Of a fit that was repeated with it, beside one that was repeated without; or what is known to first order, if that is
+        worth more."""
+        assert fit.at is not None
+        assert as_stated.at is not None
+        r, before = fit.at.r, as_stated.at.r
+        gain = float(before @ before - r @ r)
+        if gain <= linear.gain:
+            return linear
+        rest = max(1.0, float(r @ r) / self.dof)
+        moves, sd = (fit.x - self.end.x)[self.end.free] / self.sd, (rest / gain) ** 0.5
+        pattern = pattern_of(self.places, r, before)
+        return replace(self.made(one, moves, gain, one.amount, sd * one.amount, rest, pattern), refitted=True)
 
 
 def pattern_of(places: Sequence[slice], left: Array, r: Array) -> float:
@@ -163,47 +218,14 @@ def pattern_of(places: Sequence[slice], left: Array, r: Array) -> float:
     return (statistic(left)[0] / before) ** 0.5 if before > chance else 0.0
 
 
-def difference(
-    problem: Problem, x: Array, which: Sequence[str], one: Assumption, base: Residuals, steps: dict[str, Frozen], workers: int,
-    journal: Path | None,
-) -> tuple[Array | None, str]:  # fmt: skip
-    """What a variation adds to the residuals, or None and why that is not known."""
-    if base.lost:
-        return None, "the estimates cannot be simulated by the tolerance of the checks"
-    if one.values is not None:
-        varied, factors = problem, one.values
-        runner = Runner(problem.recordings, workers, journal)
-    else:
-        assert one.vary is not None
-        factors, made = {}, []
-        for recording in problem.recordings:
-            other = one.vary(recording) if recording.name in which else recording
-            if other is None:
-                return None, f"it has no meaning where recording `{recording.name}` begins"
-            made.append(other)
-        try:
-            varied = Problem(made, problem.sensors, problem.unknowns, problem.noise)
-        except ValueError as error:  # an unknown that the varied rig has not
-            return None, str(error)
-        runner = Runner(varied.recordings, workers, journal)
-    jobs = varied.jobs(x, which, steps, None)
-    for k, job in enumerate(jobs):
-        given = varied.recordings[job.recording].parameters
-        more = {name: factor * job.values.get(name, given[name]) for name, factor in factors.items()}
-        jobs[k] = job._replace(values=job.values | more)
-    got = varied.gather(x, jobs, runner.run(jobs))
-    if got.lost:
-        return None, f"a run failed: {next(iter(got.lost.values())).reason}"
-    return got.r - base.r, ""
-
-
 def columns_of(
-    problem: Problem, runner: Runner, x: Array, which: Sequence[str], steps: dict[str, Frozen], known: Sequence[Assumption]
-) -> list[tuple[Assumption, Array]]:  # fmt: skip
-    """What other values of `known` parameters, and faults of sensors that are not unknown, would add to the residuals, to first
+    problem: Problem, runner: Runner, end: End, taken: Sequence[Assumption]
+) -> list[tuple[Assumption, Array]]:
+    """What other values of known parameters, and faults of sensors that are not unknown, would add to the residuals, to first
     order: of one run a recording, with its derivatives. Nothing where a run fails."""
+    known = [one for one in taken if one.values is not None]
     names = tuple(name for one in known for name in one.values or ())
-    jobs = [job._replace(names=names) for job in problem.jobs(x, which, steps, None)]
+    jobs = [job._replace(names=names) for job in problem.jobs(end.x, end.which, end.steps, None)]
     runs = runner.run(jobs)
     if any(isinstance(run, FailedRun) for run in runs):
         return []
@@ -217,7 +239,7 @@ def columns_of(
         sizes = [
             (factor - 1) * recording.parameters[name] for one in known for name, factor in (one.values or {}).items()
         ]
-        for channel, one in problem.readouts(x, job.recording).items():
+        for channel, one in problem.readouts(end.x, job.recording).items():
             t, measured = recording.samples[channel]
             y, slopes, by = one.expected(signals, t)
             _, weight = one.residuals(y, measured)
@@ -242,14 +264,14 @@ def notices(checked: Checked) -> list[str]:
         best = asked[0]
         rivals = [c.name for c in asked[1:] if c.gain > 0.5 * best.gain]
         label, move = best.most_moved
-        text = f"the data contradict that {best.stated}: the sum of squares would fall by {best.gain:.0f} if {best.otherwise}"
+        text = f"the data contradict that {best.stated}: the sum of squares {best.falls} if {best.otherwise}"
         if best.kind in ("known", "sensor"):
             text += f" ({best.asked:+.3g} {best.unit} fit best, +- {best.asked_sd:.2g})"
             move *= best.asked / best.amount
         text += f"; {label} would move by {abs(move):.2g} standard deviations" if label else ""
         out.append(text + (f"; so would it with others: {', '.join(rivals)}" if rivals else ""))
         out += [
-            f"the data also ask for another value of what is stated: {c.stated} (the sum of squares would fall by {c.gain:.0f})"
+            f"the data also ask for another value of what is stated: {c.stated} (the sum of squares {c.falls})"
             for c in asked[1:4]
             if c.gain <= 0.5 * best.gain and c.gain > 0.1 * best.gain
         ]

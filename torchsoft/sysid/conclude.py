@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torchsoft.sysid import checks, misfit, robust
 from torchsoft.sysid.colour import Coloured, colour_notices, rewhitened
 from torchsoft.sysid.estimate import directions, estimates, nrmse, residual_channels
+from torchsoft.sysid.fit import Notify
 from torchsoft.sysid.information import fisher
 from torchsoft.sysid.plan import Stage
 from torchsoft.sysid.problem import Residuals
@@ -57,8 +58,7 @@ def conclude(
     checked = None
     if how.assumptions == "checked":
         with progress_bar("check of what is taken for granted", progress) as notify:
-            checked = taken_for_granted(coloured, runner, end, stage, free)
-            notify(chi2)
+            checked = taken_for_granted(coloured, runner, end, stage, free, how.loss, notify)
     C, shift = np.zeros((len(x), len(x))), np.zeros(len(x)) if end.bias is None else end.bias
     C_fit = C_free * max(1.0, chi2) if how.loss == "linear" else robust.covariance(J, at.r, how.loss, len(c.priors))
     C[np.ix_(free, free)] = C_fit + (checked.widening() if checked is not None else 0.0)
@@ -79,7 +79,7 @@ def conclude(
         robust=how.loss != "linear",
         priors=[c.labels[i] for i, _ in c.priors],
     )
-    notices += notices_on(found, fit.converged, rtol, end.bias is None)
+    notices += notices_on(found, fit.converged and end.at_rest, rtol, end.bias is None)
     notices += checks.notices(checked) if checked is not None else []
     notices += misfit.notices(verdicts, max(1.0, chi2) ** 0.5 if how.loss == "linear" else 1.0)
     notices += colour_notices(coloured.found, [name for name, s in problem.sensors.items() if s.colour == "ar"])
@@ -90,7 +90,7 @@ def conclude(
         correlation=(C_free / np.outer(sd, sd)).tolist(),
         directions=directions(labels, values, vectors),
         chi2=chi2,
-        converged=fit.converged,
+        converged=fit.converged and end.at_rest,
         residuals=residual_channels(problem, at, how.fitted),
         heldout=predicted,
         notices=notices,
@@ -116,7 +116,7 @@ def conclude(
 
 
 def taken_for_granted(
-    coloured: Coloured, runner: Runner, end: Settled, stage: Stage, free: NDArray[np.bool_]
+    coloured: Coloured, runner: Runner, end: Settled, stage: Stage, free: NDArray[np.bool_], loss: Loss, notify: Notify
 ) -> checks.Checked:
     """The checks at the end of a fit, on residuals with the colour that was declared and no other: what was found unasked may
     be the very trace of a wrong assumption. Their columns then get all the noise."""
@@ -124,7 +124,8 @@ def taken_for_granted(
     declared = {channel: noise for channel, noise in problem.noise.items() if problem.sensors[channel].colour == "ar"}
     plain = problem.with_noise(declared)
     finer = rewhitened(plain, end.finer, misfit.parts(problem, end.finer.r, which))
-    found = checks.check(plain, end.x, finer, free, which, end.rtol, workers=runner.workers, journal=runner.folder)
+    how: dict[str, Any] = {"loss": loss, "workers": runner.workers, "journal": runner.folder, "notify": notify}
+    found = checks.check(plain, end.x, finer, free, which, end.rtol, **how)
     rows = Residuals(found.columns[:, 0] if found.columns.size else finer.r, found.columns, {})
     columns: Array = rewhitened(problem, rows, misfit.parts(plain, rows.r, which)).J
     return found._replace(columns=columns, J=end.at.J[:, free])

@@ -31,8 +31,9 @@ ROUNDS = 3
 
 class Settled(NamedTuple):
     """A fit at its end: coordinates x (n,), residuals there by steps that `rtol` chooses at x, with the last Jacobian; how far
-    the steps have moved every coordinate (n,), None where that could not be checked; the fits on other steps since; and the
-    residuals by a tenth of the tolerance, those of `at` where these could not be had."""
+    the steps have moved every coordinate (n,), None where that could not be checked; the fits on other steps since; the
+    residuals by a tenth of the tolerance, those of `at` where these could not be had; and whether the fit is `at_rest`: with
+    steps chosen anew no coordinate would move by more than `SETTLED` standard deviations."""
 
     x: Array
     at: Residuals
@@ -40,6 +41,7 @@ class Settled(NamedTuple):
     bias: Array | None
     fits: list[tuple[float, Fit]]
     finer: Residuals
+    at_rest: bool
 
 
 def settle(
@@ -70,7 +72,7 @@ def settle(
     while True:
         fresh, steps = problem.freeze(runner, x, which, rtol)
         if fresh.lost:
-            return Settled(x, at, rtol, None, fits, at)
+            return Settled(x, at, rtol, None, fits, at, at_rest=False)
         if rounds and not settled(problem, x, fresh._replace(J=at.J), free):
             rounds -= 1
             if along(fresh, steps):
@@ -85,4 +87,5 @@ def settle(
                     continue
                 rtol /= FINER
         end = fresh._replace(J=at.J)
-        return Settled(x, end, rtol, bias, fits, end if finer.lost else finer._replace(J=at.J))
+        at_rest = not tightenings or settled(problem, x, end, free)
+        return Settled(x, end, rtol, bias, fits, end if finer.lost else finer._replace(J=at.J), at_rest)
