@@ -7,9 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy import stats
 
-from torchsoft.sysid.calibration import Calibration
-from torchsoft.sysid.posterior import Posterior
-from torchsoft.sysid.profile import RISE, Profile
+from torchsoft.sysid.certainty.calibration import Calibration
+from torchsoft.sysid.certainty.posterior import Posterior
+from torchsoft.sysid.certainty.profile import RISE, Profile
 
 
 def histogram(ax: Axes, one: Calibration, label: str, bins: int) -> None:

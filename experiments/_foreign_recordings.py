@@ -17,7 +17,7 @@ from torchsoft import Parameters, Reference
 from torchsoft.excitation import Chirp, Excitation, MultiSine, Press, Strokes, begin
 from torchsoft.files import replacing
 from torchsoft.sysid import RIG
-from torchsoft.sysid.recording import Array
+from torchsoft.sysid.problem.recording import Array
 from torchsoft.threads import side_by_side
 
 TESTS = Path(__file__).parents[1] / "tests"

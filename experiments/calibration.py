@@ -26,13 +26,13 @@ from _calibration_figures import one_posterior, rank_histograms
 from _experiment import markdown, options, raw_config, timed, write
 from matplotlib.figure import Figure
 
-from torchsoft.sysid.calibration import Calibration, calibrate, fitted, simulated
-from torchsoft.sysid.information import combinations
-from torchsoft.sysid.nuts import nuts
-from torchsoft.sysid.optimum import Optimum
-from torchsoft.sysid.posterior import Posterior, inside, laplace
-from torchsoft.sysid.problem import Problem
-from torchsoft.sysid.profile import Profile, profiles
+from torchsoft.sysid.certainty.calibration import Calibration, calibrate, fitted, simulated
+from torchsoft.sysid.certainty.nuts import nuts
+from torchsoft.sysid.certainty.optimum import Optimum
+from torchsoft.sysid.certainty.posterior import Posterior, inside, laplace
+from torchsoft.sysid.certainty.profile import Profile, profiles
+from torchsoft.sysid.fit.information import combinations
+from torchsoft.sysid.problem.problem import Problem
 
 Posteriors = Callable[[Optimum, int], Posterior]
 

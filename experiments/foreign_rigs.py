@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Unknown, Unreachable, identify
-from torchsoft.sysid.journal import forget
+from torchsoft.sysid.problem.journal import forget
 
 VERDICTS = {
     "holds": "C0",

@@ -28,11 +28,11 @@ from tqdm import tqdm
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Stage, Unknown, identify, record
-from torchsoft.sysid.estimate import Estimate, estimates
-from torchsoft.sysid.fit import chord
-from torchsoft.sysid.information import fisher
-from torchsoft.sysid.recording import Array
-from torchsoft.sysid.workers import Runner
+from torchsoft.sysid.answer.estimate import Estimate, estimates
+from torchsoft.sysid.fit.fit import chord
+from torchsoft.sysid.fit.information import fisher
+from torchsoft.sysid.problem.recording import Array
+from torchsoft.sysid.problem.workers import Runner
 from torchsoft.threads import side_by_side
 
 FEW = ("pad.E", "pad.tau", "contact.K_n", "contact.mu_s")

@@ -42,10 +42,10 @@ from torchsoft.sysid import (
     begin_underway,
     identify,
 )
-from torchsoft.sysid.information import fisher
-from torchsoft.sysid.measured import load
-from torchsoft.sysid.recording import Array
-from torchsoft.sysid.workers import Runner
+from torchsoft.sysid.files.measured import load
+from torchsoft.sysid.fit.information import fisher
+from torchsoft.sysid.problem.recording import Array
+from torchsoft.sysid.problem.workers import Runner
 from torchsoft.threads import side_by_side
 
 TRUTH = {

@@ -23,6 +23,19 @@ FLOWS = {
         grid kernel laws system progress tolerances rates stability stepper adjoint tangent unrolled continuous trajectory
         ledger simulate batch torchdiffeq .
     """,
+    "sysid": "problem fit conventions checks certainty answer conclude solve laws files report design .",
+    "sysid.problem": """
+        start underway recording unknowns readout noise prediction journal workers problem first_samples synthetic .
+    """,
+    "sysid.fit": "information robust fit plan stages settle .",
+    "sysid.conventions": "finding closed_loop loops setpoints conventions .",
+    "sysid.checks": "misfit colour assumptions variation checks .",
+    "sysid.laws": "evidence pattern compare .",
+    "sysid.certainty": "optimum profile summary posterior nuts calibration .",
+    "sysid.answer": "comparison estimate contribution recorded answer result .",
+    "sysid.files": "columns configuration measured cost .",
+    "sysid.report": "figures comparison_figure page sections report .",
+    "sysid.design": "criterion knots planner design design_figure .",
     "solve.kernel": """
         cache . arrays scratch linear inertia interface stage finish step taped run rates adjoint_pads adjoint tangent
     """,

@@ -17,12 +17,12 @@ from conftest import COARSE
 from torchsoft import Parameters, Profile, Sampled
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, Unreachable, identify, record
-from torchsoft.sysid.fit import descend, gauss_newton
-from torchsoft.sysid.information import fisher, shift, standard_deviations
-from torchsoft.sysid.misfit import whiteness
-from torchsoft.sysid.plan import default_plan, tie_ratios, visible
-from torchsoft.sysid.stages import sobol
-from torchsoft.sysid.workers import Runner
+from torchsoft.sysid.checks.misfit import whiteness
+from torchsoft.sysid.fit.fit import descend, gauss_newton
+from torchsoft.sysid.fit.information import fisher, shift, standard_deviations
+from torchsoft.sysid.fit.plan import default_plan, tie_ratios, visible
+from torchsoft.sysid.fit.stages import sobol
+from torchsoft.sysid.problem.workers import Runner
 
 BASE = Parameters().override(COARSE)
 RTOL = 1e-4

@@ -10,10 +10,10 @@ from conftest import COARSE
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
-from torchsoft.sysid.assumptions import PLACE, Assumption, assumptions, remeshed
-from torchsoft.sysid.checks import Checked, check, notices
-from torchsoft.sysid.prediction import predict
-from torchsoft.sysid.workers import Runner
+from torchsoft.sysid.checks.assumptions import PLACE, Assumption, assumptions, remeshed
+from torchsoft.sysid.checks.checks import Checked, check, notices
+from torchsoft.sysid.problem.prediction import predict
+from torchsoft.sysid.problem.workers import Runner
 
 BASE = Parameters().override(COARSE)
 TRUTH = {"pad.E": 0.85e6, "contact.K_n": 1.3e5}

@@ -16,13 +16,13 @@ from test_sysid_friction import Viscous
 from torchsoft import Parameters, Profile, Reference, SoftGrasp
 from torchsoft.excitation import Excitation, Roll, Strokes
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, record
-from torchsoft.sysid.compare import compare, versus
-from torchsoft.sysid.comparison import LawFit, Versus, judged
-from torchsoft.sysid.comparison_figure import plot
-from torchsoft.sysid.evidence import Density, density, ratio
-from torchsoft.sysid.misfit import Part
-from torchsoft.sysid.noise import Autoregression
-from torchsoft.sysid.pattern import Motion, shortest
+from torchsoft.sysid.answer.comparison import LawFit, Versus, judged
+from torchsoft.sysid.checks.misfit import Part
+from torchsoft.sysid.laws.compare import compare, versus
+from torchsoft.sysid.laws.evidence import Density, density, ratio
+from torchsoft.sysid.laws.pattern import Motion, shortest
+from torchsoft.sysid.problem.noise import Autoregression
+from torchsoft.sysid.report.comparison_figure import plot
 
 T: Any = np.arange(300) * 5e-3
 MOTION = Motion(T, np.zeros(300), np.zeros(300), ["slip"] * 150 + ["hold"] * 150)
@@ -80,7 +80,7 @@ def test_with_coloured_noise_that_was_taken_for_white_the_wrong_law_is_not_named
     L = np.linalg.cholesky(colour.autocovariance(len(T))[np.abs(np.subtract.outer(*2 * [np.arange(len(T))]))])
     draws = [L @ rng.standard_normal(len(T)) for _ in range(60)]
     assert shares(5.0, draws)["wrong"] <= 0.02
-    monkeypatch.setattr("torchsoft.sysid.evidence.fit_noise", lambda series, most: SimpleNamespace(noise=None))
+    monkeypatch.setattr("torchsoft.sysid.laws.evidence.fit_noise", lambda series, most: SimpleNamespace(noise=None))
     assert shares(5.0, draws)["wrong"] > 0.05
 
 

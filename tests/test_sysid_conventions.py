@@ -15,14 +15,14 @@ from torchsoft import Parameters, Reference, SoftGrasp
 from torchsoft.excitation import Excitation, MultiSine, Press, Strokes
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Unknown, record
-from torchsoft.sysid.conventions import check, findings
-from torchsoft.sysid.cost import paper_settings
-from torchsoft.sysid.finding import Finding, accepted, together
-from torchsoft.sysid.loops import loop_findings
-from torchsoft.sysid.plan import LOOSE
-from torchsoft.sysid.readout import Signals, readout
-from torchsoft.sysid.setpoints import gaps, setpoint_findings
-from torchsoft.sysid.workers import Runner
+from torchsoft.sysid.conventions.conventions import check, findings
+from torchsoft.sysid.conventions.finding import Finding, accepted, together
+from torchsoft.sysid.conventions.loops import loop_findings
+from torchsoft.sysid.conventions.setpoints import gaps, setpoint_findings
+from torchsoft.sysid.files.cost import paper_settings
+from torchsoft.sysid.fit.plan import LOOSE
+from torchsoft.sysid.problem.readout import Signals, readout
+from torchsoft.sysid.problem.workers import Runner
 
 NOMINAL = Parameters().override(COARSE)
 SENSORS = RIG | {"omega": Sensor(noise=0.02)}

@@ -13,14 +13,14 @@ from torchsoft import Parameters, Profile, Reference
 from torchsoft.excitation import Excitation, Knots, Strokes, begin
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import RIG, Known, Problem, Recording, Sensor, Unknown, record
-from torchsoft.sysid.criterion import Criterion, Outlook, chosen, deviations, next_recording
-from torchsoft.sysid.design import Design, design, draws
-from torchsoft.sysid.design_figure import design_figure
-from torchsoft.sysid.information import fisher
-from torchsoft.sysid.knots import Bounds, Moves, profile
-from torchsoft.sysid.planner import Planner
-from torchsoft.sysid.recording import Array
-from torchsoft.sysid.workers import Runner
+from torchsoft.sysid.design.criterion import Criterion, Outlook, chosen, deviations, next_recording
+from torchsoft.sysid.design.design import Design, design, draws
+from torchsoft.sysid.design.design_figure import design_figure
+from torchsoft.sysid.design.knots import Bounds, Moves, profile
+from torchsoft.sysid.design.planner import Planner
+from torchsoft.sysid.fit.information import fisher
+from torchsoft.sysid.problem.recording import Array
+from torchsoft.sysid.problem.workers import Runner
 
 P = Parameters().override(COARSE)
 PLAN = Excitation(
@@ -73,7 +73,7 @@ def test_slopes_are_those_of_differences(
     plan: Recording, sensors: dict[str, Sensor], rel: float, monkeypatch: Any
 ) -> None:
     """Of values and times of the knots, with what excess costs; a sensor's gain and bias are fitted beside the parameters."""
-    monkeypatch.setattr("torchsoft.sysid.planner.DIFFERENCE", 1e-4)
+    monkeypatch.setattr("torchsoft.sysid.design.planner.DIFFERENCE", 1e-4)
     stated = Problem([plan], SENSORS | sensors, {"pad.E": Unknown(), "contact.K_n": Unknown()})
     one = planner(stated, Criterion("A"), F_y=(-30.0, 30.0))
     z, x = one.moves.start, stated.coordinates.start

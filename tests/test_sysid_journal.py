@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from torchsoft.sysid import workers
-from torchsoft.sysid.journal import MARKER, Journal, decoded, encoded, forget
-from torchsoft.sysid.prediction import FailedRun, Frozen, Misfit, Prediction
-from torchsoft.sysid.workers import Job, Runner
+from torchsoft.sysid.problem.journal import MARKER, Journal, decoded, encoded, forget
+from torchsoft.sysid.problem.prediction import FailedRun, Frozen, Misfit, Prediction
+from torchsoft.sysid.problem.workers import Job, Runner
 
 ODD = np.array([0.0, -0.0, np.nan, np.inf, -np.inf, 5e-324, 0.1 + 0.2, 1e308])
 PREDICTION = Prediction(

@@ -20,11 +20,11 @@ from torchsoft.physics.contact import Coulomb
 from torchsoft.physics.material import StandardLinearSolid
 from torchsoft.solve.trajectory import save
 from torchsoft.sysid import MEASURED, Recording, Sensor, record
-from torchsoft.sysid.columns import COLUMNS, UNITS, read_table, read_tables
-from torchsoft.sysid.cost import cost, one_by_one, paper_settings
-from torchsoft.sysid.measured import STATED, known_parameters, load, read_recording, stem
-from torchsoft.sysid.start import AtRest
-from torchsoft.sysid.underway import Underway
+from torchsoft.sysid.files.columns import COLUMNS, UNITS, read_table, read_tables
+from torchsoft.sysid.files.cost import cost, one_by_one, paper_settings
+from torchsoft.sysid.files.measured import STATED, known_parameters, load, read_recording, stem
+from torchsoft.sysid.problem.start import AtRest
+from torchsoft.sysid.problem.underway import Underway
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "identify"
 

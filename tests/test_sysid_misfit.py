@@ -7,9 +7,9 @@ import pytest
 from scipy import signal, stats
 from test_sysid_noise import made
 
-from torchsoft.sysid.colour import colour_notices, colours, correlation
-from torchsoft.sysid.misfit import LEVEL, Part, Verdict, autocorrelation, holm, judge, notices, whiteness
-from torchsoft.sysid.noise import Autoregression
+from torchsoft.sysid.checks.colour import colour_notices, colours, correlation
+from torchsoft.sysid.checks.misfit import LEVEL, Part, Verdict, autocorrelation, holm, judge, notices, whiteness
+from torchsoft.sysid.problem.noise import Autoregression
 
 H = 5e-3
 CHANNELS = ("x_C", "theta", "F_x")

@@ -21,11 +21,11 @@ from test_experiments import experiment
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Roll
 from torchsoft.sysid import RIG, Prior, Problem, Sensor, Unknown, Unreachable, calibration, record
-from torchsoft.sysid.calibration import calibrate, chi2_test, ecdf_test, envelope
-from torchsoft.sysid.noise import Autoregression
-from torchsoft.sysid.nuts import Whitened, nuts
-from torchsoft.sysid.optimum import Optimum
-from torchsoft.sysid.posterior import Posterior, laplace
+from torchsoft.sysid.certainty.calibration import calibrate, chi2_test, ecdf_test, envelope
+from torchsoft.sysid.certainty.nuts import Whitened, nuts
+from torchsoft.sysid.certainty.optimum import Optimum
+from torchsoft.sysid.certainty.posterior import Posterior, laplace
+from torchsoft.sysid.problem.noise import Autoregression
 
 STRAIGHT = np.random.default_rng(0).standard_normal((20, 3))
 BENT = ClosedForm(lambda x: [np.sinh(x[0]) + 0.3 * x[0] ** 2], 1)

@@ -25,7 +25,7 @@ from torchsoft import (
 )
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import AtRest, Known, Prior, Problem, Recording, Sensor, Stage, Unknown, identify, record
-from torchsoft.sysid.workers import Runner
+from torchsoft.sysid.problem.workers import Runner
 
 BASE = Parameters().override(COARSE)
 STROKES = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.9)

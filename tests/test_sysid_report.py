@@ -32,11 +32,17 @@ from torchsoft.sysid import (
     record,
     sections,
 )
-from torchsoft.sysid.answer import AssumptionCheck, ChannelNoise, load_answer
-from torchsoft.sysid.comparison import Comparison
-from torchsoft.sysid.cost import paper_settings
-from torchsoft.sysid.estimate import Direction
-from torchsoft.sysid.figures import (
+from torchsoft.sysid.answer.answer import AssumptionCheck, ChannelNoise, load_answer
+from torchsoft.sysid.answer.comparison import Comparison
+from torchsoft.sysid.answer.estimate import Direction
+from torchsoft.sysid.certainty.profile import RISE, Profile
+from torchsoft.sysid.checks.misfit import autocorrelation
+from torchsoft.sysid.files.cost import paper_settings
+from torchsoft.sysid.fit.information import Combination
+from torchsoft.sysid.problem.noise import Autoregression
+from torchsoft.sysid.problem.prediction import FailedRun
+from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.report.figures import (
     contributions_figure,
     correlation_figure,
     direction_name,
@@ -45,14 +51,8 @@ from torchsoft.sysid.figures import (
     spectrum_figure,
     trace_figure,
 )
-from torchsoft.sysid.information import Combination
-from torchsoft.sysid.misfit import autocorrelation
-from torchsoft.sysid.noise import Autoregression
-from torchsoft.sysid.page import grouped, table
-from torchsoft.sysid.prediction import FailedRun
-from torchsoft.sysid.profile import RISE, Profile
-from torchsoft.sysid.report import report, traces
-from torchsoft.sysid.workers import Runner
+from torchsoft.sysid.report.page import grouped, table
+from torchsoft.sysid.report.report import report, traces
 
 Found = tuple[IdentificationResult, Problem]
 NOISE = Autoregression((0.8,), 0.7, 5e-3)

@@ -31,10 +31,10 @@ from torchsoft.physics.motion import Profile, Reference
 from torchsoft.physics.paper import SoftGrasp
 from torchsoft.solve.simulate import simulate
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, Unknown, identify
-from torchsoft.sysid.first_samples import WIDER, begin_underway, beginning, lasting_stretch
-from torchsoft.sysid.start import AtRest
-from torchsoft.sysid.underway import Stretch, Underway
-from torchsoft.sysid.workers import Runner
+from torchsoft.sysid.problem.first_samples import WIDER, begin_underway, beginning, lasting_stretch
+from torchsoft.sysid.problem.start import AtRest
+from torchsoft.sysid.problem.underway import Stretch, Underway
+from torchsoft.sysid.problem.workers import Runner
 
 MOTION = Excitation(motion=Strokes(travel=12e-3, stroke_time=0.3), duration=0.86, grasp_time=0.2, settle=0.05)
 COARSE = {"pad.elements_x": 60, "pad.elements_y": 2, "contact.v_s": 0.05}

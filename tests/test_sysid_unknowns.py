@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from torchsoft.parameters import bounds
-from torchsoft.sysid.unknowns import Coordinates, Unknown
+from torchsoft.sysid.problem.unknowns import Coordinates, Unknown
 from torchsoft.tables import InvalidTable
 
 GIVEN = {"pad.E": 0.75e6, "pad.nu": 0.45, "contact.mu_s": 0.8, "contact.mu_k": 0.7, "contact.friction.alpha": 2.0}

@@ -57,12 +57,12 @@ def identify(options: argparse.Namespace) -> int:
     try:
         # these take seconds to import, so that `--help` does without
         from torchsoft.cost import agree
-        from torchsoft.sysid import measured
-        from torchsoft.sysid.configuration import Settings
-        from torchsoft.sysid.cost import cost, one_by_one
-        from torchsoft.sysid.fit import Unreachable
-        from torchsoft.sysid.journal import forget
-        from torchsoft.sysid.report import report
+        from torchsoft.sysid.files import measured
+        from torchsoft.sysid.files.configuration import Settings
+        from torchsoft.sysid.files.cost import cost, one_by_one
+        from torchsoft.sysid.fit.fit import Unreachable
+        from torchsoft.sysid.problem.journal import forget
+        from torchsoft.sysid.report.report import report
         from torchsoft.sysid.solve import identify
 
         tables: dict[str, Any] = {}
@@ -103,8 +103,8 @@ def identify(options: argparse.Namespace) -> int:
 
 def compared(case: Any, fit: Any, options: argparse.Namespace) -> str:
     """Fits the competing laws, and says which one made the data."""
-    from torchsoft.sysid.compare import compare
-    from torchsoft.sysid.journal import forget
+    from torchsoft.sysid.laws.compare import compare
+    from torchsoft.sysid.problem.journal import forget
 
     unfinished: Path = options.checkpoint or options.out / "unfinished"
     folder = unfinished.with_name(f"{unfinished.name}-laws")

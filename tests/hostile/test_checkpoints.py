@@ -17,8 +17,8 @@ from hostile.trial import Tally
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import IdentificationResult, Problem, Sensor, Unknown, identify, record
-from torchsoft.sysid.journal import MARKER, Journal, forget
-from torchsoft.sysid.workers import Runner
+from torchsoft.sysid.problem.journal import MARKER, Journal, forget
+from torchsoft.sysid.problem.workers import Runner
 
 pytestmark = pytest.mark.slow
 
@@ -204,6 +204,6 @@ def test_folders_of_others_are_left_alone(
 
 
 def other(rng: np.random.Generator) -> Any:
-    from torchsoft.sysid.prediction import FailedRun
+    from torchsoft.sysid.problem.prediction import FailedRun
 
     return FailedRun("lost", float(rng.random()))

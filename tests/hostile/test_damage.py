@@ -18,7 +18,7 @@ from torchsoft.parameters import Parameters
 from torchsoft.physics.equilibrium import rest
 from torchsoft.physics.paper import SoftGrasp
 from torchsoft.solve.simulate import simulate
-from torchsoft.sysid.columns import read_table
+from torchsoft.sysid.files.columns import read_table
 
 pytestmark = pytest.mark.slow
 

@@ -24,9 +24,9 @@ from torchsoft import Parameters, simulate
 from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.files import sealed, unsealed
 from torchsoft.sysid import measured
-from torchsoft.sysid.columns import COLUMNS, read_table
-from torchsoft.sysid.cost import cost, paper_settings
-from torchsoft.sysid.workers import Runner
+from torchsoft.sysid.files.columns import COLUMNS, read_table
+from torchsoft.sysid.files.cost import cost, paper_settings
+from torchsoft.sysid.problem.workers import Runner
 
 pytestmark = pytest.mark.slow
 

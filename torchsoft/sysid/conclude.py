@@ -7,19 +7,20 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchsoft.sysid import checks, misfit, robust
-from torchsoft.sysid.colour import Coloured, colour_notices, rewhitened
-from torchsoft.sysid.estimate import directions, estimates, nrmse, residual_channels
-from torchsoft.sysid.fit import Notify
-from torchsoft.sysid.information import fisher
-from torchsoft.sysid.plan import Stage
-from torchsoft.sysid.problem import Residuals
-from torchsoft.sysid.recording import Array
-from torchsoft.sysid.result import IdentificationResult, described
-from torchsoft.sysid.robust import Loss
-from torchsoft.sysid.settle import FINER, STEP_BIAS, Settled, settle
-from torchsoft.sysid.stages import Method, progress_bar, stage_entry
-from torchsoft.sysid.workers import Runner
+from torchsoft.sysid.answer.estimate import directions, estimates, nrmse, residual_channels
+from torchsoft.sysid.answer.result import IdentificationResult, described
+from torchsoft.sysid.checks import checks, misfit
+from torchsoft.sysid.checks.colour import Coloured, colour_notices, rewhitened
+from torchsoft.sysid.fit import robust
+from torchsoft.sysid.fit.fit import Notify
+from torchsoft.sysid.fit.information import fisher
+from torchsoft.sysid.fit.plan import Stage
+from torchsoft.sysid.fit.robust import Loss
+from torchsoft.sysid.fit.settle import FINER, STEP_BIAS, Settled, settle
+from torchsoft.sysid.fit.stages import Method, progress_bar, stage_entry
+from torchsoft.sysid.problem.problem import Residuals
+from torchsoft.sysid.problem.recording import Array
+from torchsoft.sysid.problem.workers import Runner
 
 Assumed = Literal["checked", "trusted"]
 """Whether what is taken for granted is varied at the end, or believed."""

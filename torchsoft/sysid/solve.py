@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from torchsoft.sysid.colour import Coloured, allow_for_colour
+from torchsoft.sysid.answer.result import IdentificationResult
+from torchsoft.sysid.checks.colour import Coloured, allow_for_colour
 from torchsoft.sysid.conclude import Assumed, How, conclude
-from torchsoft.sysid.conventions import check
-from torchsoft.sysid.finding import accepted
-from torchsoft.sysid.fit import Fit, Notify, Unreachable, chord, descend, gauss_newton
-from torchsoft.sysid.plan import Stage, default_plan
-from torchsoft.sysid.problem import Problem, Residuals
-from torchsoft.sysid.recording import Array
-from torchsoft.sysid.result import IdentificationResult
-from torchsoft.sysid.robust import Loss
-from torchsoft.sysid.stages import Method, progress_bar, run_stage, stage_entry
-from torchsoft.sysid.workers import Runner
+from torchsoft.sysid.conventions.conventions import check
+from torchsoft.sysid.conventions.finding import accepted
+from torchsoft.sysid.fit.fit import Fit, Notify, Unreachable, chord, descend, gauss_newton
+from torchsoft.sysid.fit.plan import Stage, default_plan
+from torchsoft.sysid.fit.robust import Loss
+from torchsoft.sysid.fit.stages import Method, progress_bar, run_stage, stage_entry
+from torchsoft.sysid.problem.problem import Problem, Residuals
+from torchsoft.sysid.problem.recording import Array
+from torchsoft.sysid.problem.workers import Runner
 
 RTOL = 1e-5
 """Relative tolerance of the last stage: derivatives are then right to some percent, and estimates to a fraction of a standard

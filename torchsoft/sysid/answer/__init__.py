@@ -1,0 +1,1 @@
+"""What an identification found, in memory and as a file."""

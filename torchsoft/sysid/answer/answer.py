@@ -1,0 +1,285 @@
+"""The answer of an identification: what was found, how, and of what rig, as plain data; `answer.json` holds it.
+
+The file's schema, `schema()`, is published as `docs/answer.schema.json`. A checksum of the content, in which numbers count and
+not how they are written, tells a damaged file from a whole one.
+"""
+
+import json
+import warnings
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import ConfigDict, TypeAdapter
+
+from torchsoft.files import finite, replacing
+from torchsoft.physics.rig import Rig
+from torchsoft.sysid.answer.comparison import Comparison
+from torchsoft.sysid.answer.contribution import Contribution
+from torchsoft.sysid.answer.estimate import ChannelResiduals, Direction, Estimate
+from torchsoft.sysid.answer.recorded import RecordedRig, known
+from torchsoft.sysid.certainty.profile import Profile
+from torchsoft.sysid.certainty.summary import PosteriorSummary
+from torchsoft.sysid.fit.information import Combination
+from torchsoft.sysid.problem.noise import Autoregression
+from torchsoft.sysid.problem.prediction import set_parameters
+from torchsoft.sysid.problem.unknowns import Prior, Sensor, Unknown
+from torchsoft.tables import Number, line, refusing, shown
+
+SCHEMA = "torchsoft-answer-2"
+"""Name and version of the file's form."""
+
+
+@dataclass(frozen=True)
+class FittedCoordinate:
+    """One entry of the vector that the fit moved in: its bounds and nominal value in physical units, its value there, and the
+    standard deviation of the entry itself, which is the logarithm of the value or the value over the width of its bounds."""
+
+    label: str
+    name: str
+    kind: str
+    recording: str | None
+    nominal: float
+    low: float
+    high: float
+    scale: Literal["log", "linear"]
+    ratio_to: str | None
+    fixed: bool
+    prior: Prior | None
+    value: float
+    sd: Number
+
+
+@dataclass(frozen=True)
+class OrderTried:
+    """One order of autoregressive noise, with -2 log likelihood and the criteria of Akaike, corrected, and of Bayes."""
+
+    order: int
+    deviance: float
+    aicc: float
+    bic: float
+
+
+@dataclass(frozen=True)
+class ChannelNoise:
+    """Coloured noise of one channel: the model that residuals were whitened by, and the orders that were tried."""
+
+    channel: str
+    model: Autoregression
+    tried: list[OrderTried]
+
+
+@dataclass(frozen=True)
+class AssumptionCheck:
+    """One thing that was taken for granted: how far each coordinate would move, in its standard deviations, were it
+    otherwise by `amount` [unit]; by how much the sum of squares would fall if the data could choose the amount, which they
+    ask for, and its standard deviation. `suspected` says that they do ask, `unchecked` why there is no answer."""
+
+    name: str
+    kind: str
+    stated: str
+    otherwise: str
+    amount: float
+    unit: str
+    moves: dict[str, Number]
+    gain: Number
+    asked: Number
+    asked_sd: Number
+    suspected: bool
+    unchecked: str
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What an identification found: estimates, correlations, directions, residuals, predictions, and how it was made.
+
+    `x` and `covariance` are in `coordinates`, `correlation` and `directions` in those of them that were free (`labels`).
+    """
+
+    __pydantic_config__ = ConfigDict(strict=True, extra="forbid")
+
+    estimates: list[Estimate]
+    labels: list[str]
+    x: list[float]
+    correlation: list[list[Number]]
+    directions: list[Direction]
+    chi2: Number  # sum of squared residuals over degrees of freedom; 1 where model and noise are right
+    converged: bool
+    residuals: list[ChannelResiduals]
+    heldout: dict[str, dict[str, Number]]  # NRMSE of recordings that were not fitted, by recording and channel
+    notices: list[str]
+    stages: list[dict[str, Any]]
+    cost: dict[str, Number]
+    made_by: dict[str, Any]
+    covariance: list[list[Number]] = field(repr=False)
+    recordings: list[RecordedRig] = field(default_factory=list, repr=False)
+    unknowns: dict[str, Unknown] = field(default_factory=dict, repr=False)
+    sensors: dict[str, Sensor] = field(default_factory=dict, repr=False)
+    coordinates: list[FittedCoordinate] = field(default_factory=list, repr=False)
+    contributions: list[Contribution] = field(default_factory=list, repr=False)
+    combinations: list[Combination] = field(default_factory=list, repr=False)
+    noise: list[ChannelNoise] = field(default_factory=list, repr=False)
+    assumptions: list[AssumptionCheck] = field(default_factory=list, repr=False)
+    profiles: list[Profile] = field(default_factory=list, repr=False)
+    posterior: PosteriorSummary | None = field(default=None, repr=False)
+    comparison: Comparison | None = field(default=None, repr=False)
+    versions: dict[str, str] = field(default_factory=dict, repr=False)
+    command: str = ""
+
+    def __getitem__(self, name: str) -> Estimate:
+        """The first estimate of that name."""
+        for estimate in self.estimates:
+            if estimate.name == name:
+                return estimate
+        raise KeyError(f"no estimate of `{name}`; there are {', '.join(e.name for e in self.estimates)}")
+
+    def recorded(self, recording: str | None = None) -> RecordedRig:
+        """A recording and its rig, the first one by default. Raises `ValueError` for one that is not there, and, without a
+        name, where rigs differ from recording to recording."""
+        known = ", ".join(f"`{one.name}`" for one in self.recordings)
+        if recording is None and self.recordings:
+            first = self.recordings[0]
+            if any((one.identified, one.known) != (first.identified, first.known) for one in self.recordings):
+                raise ValueError(f"the rig is not the same in all recordings: say in which one, of {known}")
+            return first
+        for one in self.recordings:
+            if one.name == recording:
+                return one
+        raise ValueError(f"there is no recording {shown(recording)}; there are {known or 'none'}")
+
+    def model(self, recording: str | None = None) -> Rig:
+        """The identified rig, ready to run: that of a recording, which is needed where they differ.
+
+        The paper's rig from a file holds still until it is given a reference. Warns of parameters that are not identifiable.
+        Raises `ValueError` for a rig that a file cannot hold: `applied_to` says what to do then.
+        """
+        one = self.recorded(recording)
+        return self._identified(self._rig(one), one)
+
+    def applied_to(self, rig: Rig, recording: str | None = None) -> Rig:
+        """A copy of `rig` with the values that were identified: those of a recording, which is needed where they differ.
+
+        Warns of parameters that are not identifiable, and of numbers and laws that are not those of the fit. Raises
+        `ValueError` for a rig that has no such parameters.
+        """
+        one, mine = self.recorded(recording), known(rig.description(), {})
+        for name in one.identified:
+            rig.parameter(name)
+        other = [name for name, value in one.known.items() if mine.get(name) != value]
+        if other:
+            said = ", ".join(f"{name} is {shown(mine.get(name))} and was {shown(one.known[name])}" for name in other)
+            warnings.warn(
+                f"this rig is not the one of the fit, so its values may mislead: {line(said, 300)}", stacklevel=2
+            )
+        return self._identified(deepcopy(rig), one)
+
+    def _rig(self, one: RecordedRig) -> Rig:
+        """A rig of its own with the numbers of before the fit."""
+        return one.rebuilt()
+
+    def _identified(self, rig: Rig, one: RecordedRig) -> Rig:
+        set_parameters(rig, one.identified)
+        weak = [
+            e.name
+            for e in self.estimates
+            if not e.identifiable and e.kind == "parameter" and e.recording in (None, one.name)
+        ]
+        weak += [  # of a recording that was held out
+            c.name
+            for c in self.coordinates
+            if c.fixed and c.kind == "parameter" and c.recording == one.name and not self.unknowns[c.name].fixed
+        ]
+        if weak:
+            said = ", ".join(f"{name} = {one.identified[name]:.3g}" for name in weak)
+            warnings.warn(f"not identifiable from the data, and so only where the search ended: {said}", stacklevel=3)
+        return rig
+
+    def to_json(self) -> str:
+        """The content of the file. A comparison of laws goes without its residuals."""
+        plain = replace(self, comparison=replace(self.comparison, series=[])) if self.comparison is not None else self
+        content = finite(adapter().dump_python(plain, mode="json", by_alias=True))
+        return json.dumps({"schema": SCHEMA, "checksum": checksum(content)} | content, indent=1, allow_nan=False)
+
+    def save(self, path: str | Path) -> None:
+        """Write the JSON file. It appears whole or not at all."""
+        with replacing(path) as partial:
+            partial.write_text(self.to_json(), encoding="utf-8")
+
+    def table(self) -> str:
+        """One line an estimate."""
+        rows = [f"{'parameter':34s} {'estimate':>12s}   95 % interval"]
+        for e in self.estimates:
+            if e.value is None or e.ci95 is None:
+                rows.append(
+                    f"{e.label:34s} {'none':>12s}   not identifiable (the search ended at {e.last:.3g} {e.unit})"
+                )
+            else:
+                rows.append(f"{e.label:34s} {e.value:12.5g}   {e.ci95[0]:.5g} .. {e.ci95[1]:.5g} {e.unit}")
+        return "\n".join(rows)
+
+
+@cache
+def adapter() -> TypeAdapter[Answer]:
+    return TypeAdapter(Answer)
+
+
+def checksum(content: Any) -> str:
+    """Of JSON content, in which 1 is 1.0 and the order of names does not matter."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: plain(one) for key, one in value.items()}
+        if isinstance(value, list):
+            return [plain(one) for one in value]
+        return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+    return sha256(json.dumps(plain(content), sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+
+
+def schema() -> dict[str, Any]:
+    """The JSON Schema (2020-12) of the file."""
+    said = adapter().json_schema(by_alias=True, mode="serialization")
+    head = {
+        "schema": {"const": SCHEMA, "description": "Name and version of the file's form."},
+        "checksum": {
+            "type": "string",
+            "pattern": "^[0-9a-f]{64}$",
+            "description": "SHA-256 of the rest, names sorted.",
+        },
+    }
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$id": f"urn:{SCHEMA}",
+        **said,
+        "properties": head | said["properties"],
+        "required": [*head, *said["required"]],
+    }
+
+
+def load_answer(path: str | Path) -> Answer:
+    """The answer in a file. Raises `ValueError` naming the file for one that is damaged, or no answer, and `OSError`."""
+    try:
+        content = json.loads(Path(path).read_bytes().decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(
+            f"{path} is not an answer of torchsoft, or was cut: it is not JSON ({line(error, 200)})"
+        ) from None
+    form = content.pop("schema", None) if isinstance(content, dict) else None
+    if form != SCHEMA:
+        older = isinstance(content, dict) and {"estimates", "made_by"} <= content.keys()
+        why = (
+            "an older version wrote it, so identify again"
+            if form is None and older
+            else f"its `schema` is {shown(form)}"
+        )
+        raise ValueError(f"{path} is not an answer that this torchsoft reads, which are called {SCHEMA!r}: {why}")
+    if content.pop("checksum", None) != checksum(content):
+        raise ValueError(
+            f"{path} is damaged: its content is not what was saved; restore it from a copy, or identify again"
+        )
+    with refusing(content, str(path)), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a steep friction law, which was fitted nevertheless
+        return adapter().validate_json(json.dumps(content))

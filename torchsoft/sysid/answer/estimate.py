@@ -1,0 +1,201 @@
+"""Estimates with intervals, what is identifiable, and what the fit left in the residuals."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy import stats
+
+from torchsoft import channels
+from torchsoft.parameters import Parameters
+from torchsoft.sysid.checks.misfit import whiteness
+from torchsoft.sysid.problem.problem import Problem, Residuals
+from torchsoft.sysid.problem.recording import Array
+from torchsoft.sysid.problem.start import PREFIX
+from torchsoft.sysid.problem.unknowns import Coordinate, Prior
+from torchsoft.tables import Number
+
+CONFIDENCE = 0.95
+
+IDENTIFIABLE = 0.5
+"""Standard deviation of a coordinate [1] above which it counts as not identifiable: its interval spans a factor of seven."""
+
+Seen = Annotated[bool, Field(alias="seen")]
+"""Called `seen` in files, since the first version of them."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """One parameter (or a coordinate of a start, or something wrong with a sensor) in one recording or in all: value, 95 %
+    interval, standard deviation over the value. One that is not identifiable has neither value nor interval, but `last`,
+    where the search happened to end. `kind` is "parameter", "start", or what is wrong with the sensor, `start` where the
+    search began, and `step_bias_sd` what the steps of the simulation shift the estimate by, in standard deviations."""
+
+    name: str
+    unit: str
+    recording: str | None
+    value: float | None
+    ci95: tuple[float, float] | None
+    relative_sd: Number
+    last: float
+    identifiable: Seen
+    at_bound: bool
+    step_bias_sd: Number
+    kind: str = "parameter"
+    start: float | None = None
+    prior: Prior | None = None
+
+    @property
+    def label(self) -> str:
+        """Its name, with the recording it belongs to."""
+        return self.name + (f" in {self.recording}" if self.recording else "")
+
+
+@dataclass(frozen=True)
+class Direction:
+    """An eigenvector of the Fisher matrix in the coordinates: its standard deviation and its largest components by label."""
+
+    sd: float
+    identifiable: Seen
+    components: dict[str, float]
+
+
+@dataclass(frozen=True)
+class ChannelResiduals:
+    """Residuals of one channel in one recording, over the noise and whitened: their rms, the first autocorrelation, and the
+    Ljung-Box p-value of their whiteness."""
+
+    recording: str
+    channel: str
+    rms: Number
+    lag1: Number
+    p_white: Number
+
+
+class Quantity(NamedTuple):
+    """Something that is estimated: its value, that at the start, and how it moves with the coordinates (n,): its logarithm, or
+    the value over `size`. `places` are the coordinates that move it."""
+
+    name: str
+    kind: str
+    recording: str | None
+    unit: str
+    value: float
+    start: float
+    size: float | None
+    slope: Array
+    places: list[int]
+    prior: Prior | None
+
+    @property
+    def label(self) -> str:
+        return self.name + (f" in {self.recording}" if self.recording else "")
+
+    def interval(self, sd: float) -> tuple[float, float]:
+        """95 % of it, for a standard deviation of what moves."""
+        reach = float(stats.norm.ppf(0.5 + CONFIDENCE / 2)) * sd
+        if self.size is not None:
+            return self.value - reach * self.size, self.value + reach * self.size
+        reach = min(reach, 700.0)  # a parameter without any trace in the data would overflow
+        return self.value * float(np.exp(-reach)), self.value * float(np.exp(reach))
+
+
+def quantities(problem: Problem, x: Array, free: NDArray[np.bool_]) -> Iterator[Quantity]:
+    """Parameters in physical units, then coordinates of starts, and what is wrong with sensors, at x (n,)."""
+    c = problem.coordinates
+    units = {name: row["unit"] for name, row in Parameters().table().items()}
+    for k, recording in enumerate(problem.recordings):
+        values, before = problem.values(x, k), problem.values(c.start, k)
+        chain = c.jacobian(x, recording.name, values)
+        for row, name in enumerate(c.names):
+            places = [int(i) for i in np.flatnonzero(chain[row]) if free[i]]
+            own = any(c.all[i].recording is not None for i in places)
+            if name.startswith(PREFIX) or not places or (k > 0 and not own):
+                continue
+            first, value = c.all[places[0]], values[name]
+            alone, size = len(places) == 1 and first.name == name and not first.ratio_to, None
+            if first.scale == "linear":
+                size = first.high - first.low if alone else abs(value)
+            yield Quantity(
+                name, "parameter", recording.name if own else None, units.get(name, ""), value,
+                first.nominal if alone else before[name], size, chain[row] / (value if size is None else size), places,
+                first.prior if alone else None,
+            )  # fmt: skip
+    for i, one in enumerate(c.all):
+        if one.kind != "parameter" and free[i]:
+            name, where, unit = one._replace(recording=None).label, one.recording, nuisance_unit(one)
+            slope, size, value = np.eye(len(c))[i], float(one.slope(x[i])), one.to_value(x[i])
+            yield Quantity(name, one.kind, where, unit, value, one.nominal, size, slope, [i], one.prior)
+
+
+def estimates(problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shift: Array) -> list[Estimate]:
+    """Everything that was estimated, in physical units; C (n, n) and shift (n,) are of all coordinates."""
+    low, high = problem.coordinates.bounds
+    edge = free & ((x - low < 1e-4 * (high - low)) | (high - x < 1e-4 * (high - low)))
+    out = []
+    for one in quantities(problem, x, free):
+        sd = float(np.sqrt(max(one.slope @ C @ one.slope, 0.0)))
+        known = (one.value, one.interval(sd)) if (identifiable := sd < IDENTIFIABLE) else (None, None)
+        relative = sd if one.size is None else sd * one.size / max(abs(one.value), 1e-300)
+        bias = float(one.slope @ shift) / sd if sd > 0 else 0.0
+        found = Estimate(
+            one.name, one.unit, one.recording, *known, relative, one.value, identifiable, bool(edge[one.places].any()), bias,
+            one.kind, one.start, one.prior,
+        )  # fmt: skip
+        out.append(found)
+    return out
+
+
+def nuisance_unit(one: Coordinate) -> str:
+    """Unit of a start's coordinate, or of what is wrong with a sensor."""
+    if one.kind == "start":
+        axis = one.name.split(".")[2]
+        return "rad/s" if axis == "v_theta" else "m/s" if axis.startswith("v_") else "rad" if axis == "theta" else "m"
+    own = channels.unit(one.name)
+    units = {"bias": own, "drift": f"{own}/s", "delay": "s", "gain": "1", "misalignment": "rad", "inertia": "kg"}
+    return units[one.kind]
+
+
+def directions(labels: list[str], values: Array, vectors: Array) -> list[Direction]:
+    """Eigenvectors of the Fisher matrix, the best determined first."""
+    out = []
+    for k in np.argsort(values)[::-1]:
+        sd = float(1.0 / np.sqrt(max(values[k], 1e-12)))
+        order = np.argsort(-np.abs(vectors[:, k]))
+        parts = {labels[i]: float(vectors[i, k]) for i in order if abs(vectors[i, k]) > 0.2}
+        out.append(Direction(sd, sd < IDENTIFIABLE, parts))
+    return out
+
+
+def split(problem: Problem, r: Array, which: list[str]) -> dict[tuple[str, str], Array]:
+    """Rows (m, ...) of residuals, or of their Jacobian, by recording and channel, in the order of `Problem.residuals`."""
+    out, at = {}, 0
+    for recording in problem.recordings:
+        for channel in problem.sensors if recording.name in which else ():
+            if channel in recording.samples:
+                n = len(recording.samples[channel][0])
+                out[recording.name, channel] = r[at : at + n]
+                at += n
+    return out
+
+
+def nrmse(problem: Problem, r: Array, which: list[str]) -> dict[str, dict[str, float]]:
+    """RMS residual over the range of what was measured, by recording and channel."""
+    out: dict[str, dict[str, float]] = {name: {} for name in which}
+    measured = {recording.name: recording.samples for recording in problem.recordings}
+    for (name, channel), part in split(problem, r, which).items():
+        y = measured[name][channel][1]
+        rms = float(np.sqrt(np.mean(part**2))) * problem.sensors[channel].noise
+        out[name][channel] = rms / max(float(np.ptp(y)), 1e-300)
+    return out
+
+
+def residual_channels(problem: Problem, residuals: Residuals, which: list[str]) -> list[ChannelResiduals]:
+    orders = {channel: noise.order for channel, noise in problem.noise.items()}
+    return [
+        ChannelResiduals(name, channel, float(np.sqrt(np.mean(r**2))), *whiteness(r, orders.get(channel, 0)))
+        for (name, channel), r in split(problem, residuals.r, which).items()
+    ]

@@ -1,0 +1,1 @@
+"""How well parameters are known: profiles, posteriors, and whether these are calibrated."""

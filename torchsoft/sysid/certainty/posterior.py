@@ -1,0 +1,240 @@
+"""Posterior draws: by Laplace's approximation, checked and corrected by importance, and by NUTS on the exact gradients.
+
+The density is that of the coordinates: exp(-|r|^2 / 2), priors being rows of r, within the bounds. A coordinate without a prior
+is uniform between its bounds.
+"""
+
+import importlib
+import json
+import time as clock
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from tqdm import tqdm
+
+from torchsoft.files import finite, replacing
+from torchsoft.sysid.certainty.optimum import CHOSEN_ANEW, Optimum
+from torchsoft.sysid.certainty.summary import MarginalSummary, PosteriorSummary
+from torchsoft.sysid.problem.recording import Array
+from torchsoft.threads import side_by_side, single_threaded
+
+WITHIN = 1e-3
+"""Least share of Gaussian draws that must lie within the bounds."""
+
+K_HAT = 0.7
+"""Shape of the tail of the importance weights above which they cannot be trusted (Vehtari et al. 2024)."""
+
+EFFICIENT = 0.5
+"""Effective over all draws, by their weights, below which Laplace's approximation is said to be rough."""
+
+SAME = 1e-6
+"""Difference of logarithms of weights below which they are all the same."""
+
+ALIKE = 0.9
+"""The same, above which weights are so much alike that the shape of their tail tells nothing."""
+
+LEAST = -700.0
+"""Logarithm of a weight over the largest that is as good as zero."""
+
+FEWEST = 100
+"""Draws that can tell the tail of their weights."""
+
+CHECKED = 8
+"""Draws that are simulated once more, with steps chosen anew."""
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Draws (chains, draws, n) of the free coordinates `labels` in physical units, and their normalised `weights` (chains,
+    draws); what was checked, what a reader must know, what it cost, how it was made.
+
+    A run that was interrupted has fewer draws than were asked for.
+    """
+
+    method: Literal["laplace", "nuts"]
+    labels: list[str]
+    draws: Array = field(repr=False)
+    weights: Array = field(repr=False)
+    checks: dict[str, float]
+    notices: list[str]
+    cost: dict[str, float]
+    made_by: dict[str, Any]
+
+    @property
+    def flat(self) -> tuple[Array, Array]:
+        """All draws (draws, n) and their weights (draws,)."""
+        return self.draws.reshape(-1, len(self.labels)), self.weights.ravel()
+
+    def pick(self, count: int, rng: np.random.Generator) -> Array:
+        """So many draws (count, n) by their weights: equally far apart in the chains where these are equal."""
+        draws, weights = self.flat
+        if np.ptp(weights) == 0:
+            return draws[np.linspace(0, len(draws) - 1, count).round().astype(int)]
+        return draws[rng.choice(len(draws), count, p=weights)]
+
+    @property
+    def marginals(self) -> list[MarginalSummary]:
+        (draws, weights), known, out = self.flat, diagnostics(), []
+        for i, label in enumerate(self.labels):
+            q = [quantile(draws[:, i], weights, part) for part in (0.025, 0.5, 0.975)]
+            mean = float(weights @ draws[:, i])
+            sd = float(weights @ (draws[:, i] - mean) ** 2) ** 0.5
+            r_hat, effective = None, 1.0 / float(weights @ weights)
+            if self.method == "nuts":
+                r_hat, effective = (float(of(halves(self.draws[..., i]))) for of in (known.rhat, known.ess))
+            out.append(MarginalSummary(label, mean, sd, q[1], (q[0], q[2]), effective, r_hat))
+        return out
+
+    @property
+    def summary(self) -> PosteriorSummary:
+        """What an `Answer` holds of it."""
+        return PosteriorSummary(self.method, self.weights.size, self.marginals, self.checks, self.notices)
+
+    def to_json(self) -> str:
+        content = asdict(self) | {
+            "draws": self.draws.tolist(), "weights": self.weights.tolist(),
+            "marginals": [asdict(one) for one in self.marginals],
+        }  # fmt: skip
+        return json.dumps(finite(content), allow_nan=False)
+
+    def save(self, path: str | Path) -> None:
+        """Write the JSON file. It appears whole or not at all."""
+        with replacing(path) as partial:
+            partial.write_text(self.to_json(), encoding="utf-8")
+
+
+def halves(chains: Array) -> Array:
+    """Draws (chains, draws); those of a single chain as two."""
+    return chains if len(chains) > 1 else chains[:, : chains.size // 2 * 2].reshape(2, -1)
+
+
+def diagnostics() -> Any:
+    """ArviZ's functions of arrays; their import takes a second."""
+    return importlib.import_module("arviz_stats.base").array_stats
+
+
+def quantile(values: Array, weights: Array, part: float) -> float:
+    """Of weighted draws (draws,)."""
+    order = np.argsort(values)
+    return float(np.interp(part, np.cumsum(weights[order]) - weights[order] / 2, values[order]))
+
+
+def measure(o: Optimum, x: Array) -> tuple[float, Array]:
+    """What a density of values has more, as one of coordinates x (n,), and its gradient by the free ones: the logarithm of
+    d value / d x where a prior is normal on a logarithmic scale, or log-normal on a linear one."""
+    total, gradient = 0.0, np.zeros(len(x))
+    for i, prior in o.problem.coordinates.priors:
+        c = o.problem.coordinates.all[i]
+        if c.scale == "log" and prior.kind == "normal":
+            total, gradient[i] = total + float(x[i]), 1.0
+        elif c.scale == "linear" and prior.kind == "log-normal":
+            value = c.to_value(x[i])
+            total, gradient[i] = total - float(np.log(value)), -c.slope(x[i]) / value
+    return total, gradient[o.free]
+
+
+def laplace(o: Optimum, *, draws: int = 400, seed: int = 0, progress: bool = False) -> Posterior:
+    """Draws of the Gaussian at the optimum, with the covariance of the Fisher matrix, within the bounds.
+
+    The exact density at every draw, a run each, gives them importance weights, Pareto-smoothed: they correct the Gaussian where
+    it is roughly right, and their k-hat says where it is not. Raises `ValueError` where hardly a draw is within the bounds: the
+    data do not determine all coordinates; and for fewer draws than `FEWEST`.
+    """
+    if draws < FEWEST:
+        raise ValueError(f"Laplace's approximation is checked by at least {FEWEST} draws, not by {draws}")
+    rng, (low, high) = np.random.default_rng(seed), o.bounds
+    runs, began = o.runner.simulations, clock.perf_counter()
+    z, noise = inside(rng, o.x[o.free], o.covariance, low, high, draws)
+    log_q = -0.5 * (noise**2).sum(-1)
+    log_p, lost = np.full(draws, -np.inf), list[str]()
+
+    def density(k: int) -> tuple[float, str]:
+        x = o.place(z[k])
+        at = o.residuals(x)
+        if at.lost:
+            return -np.inf, next(iter(at.lost.values())).reason
+        return measure(o, x)[0] - 0.5 * float(at.r @ at.r), ""
+
+    with single_threaded(), tqdm(desc="Laplace", total=draws, disable=not progress) as bar:
+        for k, (value, reason) in side_by_side(density, draws, o.workers):
+            log_p[k], lost = value, [*lost, reason] if reason else lost
+            bar.update()
+    w, k_hat = importance(log_p - log_q)
+    share, limit = 1.0 / float(draws * (w @ w)), min(K_HAT, 1 - 1 / np.log10(draws))
+    notices = notices_on_runs(o, lost, draws)
+    if k_hat > limit and share < ALIKE:
+        notices.append(
+            f"Laplace's approximation is not to be trusted here: the tail of its importance weights has k = {k_hat:.2g} "
+            f"(at most {limit:.2g}); use NUTS"
+        )
+    elif share < EFFICIENT:
+        notices.append(
+            f"Laplace's approximation is rough here: its draws are worth {share:.0%} of as many; use them by their weights"
+        )
+    off = steps_off(o, z[np.argsort(log_q)[: CHECKED // 2].tolist() + list(range(CHECKED // 2))])
+    notices += notices_on_steps(o, off)
+    checks = {"k_hat": k_hat, "efficiency": share, "failed": len(lost), "steps_off": off}
+    cost = {"simulations": o.runner.simulations - runs, "gradients": 0, "wall_s": clock.perf_counter() - began}
+    return Posterior(
+        "laplace", list(o.labels), o.values(z)[None], w[None], checks, notices, cost, {"seed": seed, "rtol": o.rtol}
+    )
+
+
+def importance(log_weights: Array) -> tuple[Array, float]:
+    """Normalised weights (draws,), Pareto-smoothed, and the shape k of their tail, infinite where a few draws have all the
+    weight. Draws without density have none."""
+    known = np.isfinite(log_weights)
+    log_w, k_hat = log_weights[known] - log_weights[known].max(), -np.inf
+    if np.ptp(log_w) > SAME:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            smoothed, k_hat = diagnostics().psislw(-np.maximum(log_w, LEAST))  # it takes weights' inverses
+        log_w, k_hat = (smoothed, k_hat) if np.isfinite(smoothed).all() else (log_w, np.inf)
+    w = np.zeros(len(log_weights))
+    w[known] = np.exp(log_w - np.max(log_w))
+    return w / w.sum(), float(k_hat)
+
+
+def inside(rng: np.random.Generator, mean: Array, C: Array, low: Array, high: Array, count: int) -> tuple[Array, Array]:
+    """Normal draws (count, n) with covariance C (n, n) that lie between bounds, and the standard normal ones behind them."""
+    L, kept, tried = np.linalg.cholesky(C).T, np.zeros((0, len(mean))), 0
+    while len(kept) < count and tried < count / WITHIN:
+        noise = rng.standard_normal((4 * count, len(mean)))
+        z = mean + noise @ L
+        kept, tried = np.concatenate((kept, noise[((z >= low) & (z <= high)).all(-1)])), tried + len(noise)
+    if len(kept) < count:
+        raise ValueError(
+            f"fewer than one in {1 / WITHIN:.0f} draws of the Gaussian at the optimum lie within the bounds: the data do not "
+            "determine all coordinates, and Laplace's approximation says nothing; use NUTS, or priors"
+        )
+    return mean + kept[:count] @ L, kept[:count]
+
+
+def steps_off(o: Optimum, z: Array) -> float:
+    """Largest change of |r|^2 at free coordinates z (k, free coordinates) by steps chosen anew; infinite where a run fails."""
+    off = [o.off(o.place(one)) for one in z]
+    return float(np.max(np.where(np.isnan(off), np.inf, np.abs(off))))
+
+
+def notices_on_steps(o: Optimum, off: float) -> list[str]:
+    if off <= CHOSEN_ANEW:
+        return []
+    return [
+        f"steps chosen anew at some draws change |r|^2 by {off:.2g}: take a tighter tolerance than rtol = {o.rtol:g}"
+    ]
+
+
+def notices_on_runs(o: Optimum, lost: Sequence[str], runs: int) -> list[str]:
+    """Sentences on runs that failed, and on residuals that are too large for the noise."""
+    m = o.problem.samples(o.which)
+    chi2, out = o.square / m, []
+    if lost:
+        out.append(f"{len(lost)} of {runs} runs failed, so the posterior ends there: {lost[0]}")
+    if chi2 > 1 + 4 * np.sqrt(2 / m):
+        out.append(
+            f"the residuals are larger than the noise that was given (chi2 = {chi2:.3g}): the model or the noise is wrong, "
+            "and the posterior with them"
+        )
+    return out

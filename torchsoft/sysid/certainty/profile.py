@@ -1,0 +1,214 @@
+"""Profile likelihood: how the misfit rises when one coordinate is held away from its optimum and all others are fitted again.
+
+Twice the rise of the negative log posterior is chi-squared with one degree of freedom where the interval ends, also where the
+misfit is no parabola and the interval of Cramer and Rao (Wald's) is wrong.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from scipy import stats
+from scipy.interpolate import PchipInterpolator
+from tqdm import tqdm
+
+from torchsoft.sysid.certainty.optimum import CHOSEN_ANEW, Optimum
+from torchsoft.sysid.fit.fit import Unreachable, gauss_newton, newton_step
+from torchsoft.sysid.problem.problem import Residuals
+from torchsoft.sysid.problem.recording import Array
+from torchsoft.threads import side_by_side, single_threaded
+
+RISE = float(stats.chi2.ppf(0.95, 1))
+"""2 Delta(-log posterior) where a 95 % interval ends."""
+
+STRIDE = 0.5
+"""Change of the square root of the rise from one point of a profile to the next; its end is at 1.96."""
+
+POINTS = 12
+"""Most points to either side."""
+
+ROUNDS = 5
+"""Most steps of Gauss-Newton to a point."""
+
+BEYOND = (RISE**0.5 + STRIDE) ** 2
+"""Rise above which a point lies too far beyond the end of the interval to tell where that is."""
+
+SHORTER = 6
+"""How often, to either side, a stride is made shorter because a run fails or the rise goes too far."""
+
+FITTED = 0.02
+"""What the others may still gain in |r|^2 by another step of Gauss-Newton, which is then taken for true."""
+
+LOWER = 0.1
+"""Fall of |r|^2 below the optimum's from which the fit was not at its optimum."""
+
+DIFFERENT = 0.2
+"""Difference of an end of the two intervals, over the half width of Wald's, above which they are called different."""
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The profile of one coordinate: its values in physical units, ascending, and the `rises` of 2 (-log posterior) there.
+
+    `others` holds, by label, where the other coordinates went, in physical units. `ci95` has None for an end that was not
+    found, and `notices` says why; `wald95` is what the covariance says. `variance` is what the rises were divided by: above one
+    where residuals are larger than the noise that was given.
+    """
+
+    label: str
+    best: float
+    values: list[float]
+    rises: list[float]
+    others: dict[str, list[float]] = field(repr=False)
+    ci95: tuple[float | None, float | None]
+    wald95: tuple[float, float]
+    variance: float
+    notices: list[str]
+
+
+class Point(NamedTuple):
+    """Coordinates (n,) of a profile, the rise there, and the residuals with their Jacobian."""
+
+    x: Array
+    rise: float
+    at: Residuals
+
+
+class Side(NamedTuple):
+    """The points to one side of the optimum, outwards, why it ended before the interval did, and what else there is to say."""
+
+    points: list[Point]
+    ended: str
+    notices: list[str]
+
+
+def profiles(optimum: Optimum, labels: Sequence[str] | None = None, *, progress: bool = False) -> list[Profile]:
+    """Profiles of some coordinates, or of all free ones, both sides of each side by side in the optimum's threads.
+
+    Raises `ValueError` for a label that is not a free coordinate's.
+    """
+    known = optimum.labels
+    for label in labels or ():
+        if label not in known:
+            raise ValueError(f"there is no free coordinate {label!r} to profile; there are {', '.join(known)}")
+    chosen = list(known if labels is None else labels)
+    where = {label: i for i, label in enumerate(optimum.problem.coordinates.labels)}
+    tasks = [(label, sign) for label in chosen for sign in (-1, 1)]
+    with single_threaded():
+        work = side_by_side(lambda k: walk(optimum, where[tasks[k][0]], tasks[k][1]), len(tasks), optimum.workers)
+        done = dict(tqdm(work, desc="profiles", total=len(tasks), disable=not progress))
+    return [assemble(optimum, where[label], done[2 * k], done[2 * k + 1]) for k, label in enumerate(chosen)]
+
+
+def walk(o: Optimum, i: int, sign: int) -> Side:
+    """From the optimum outwards in coordinate number i, until the interval has ended."""
+    label, (low, high) = o.problem.coordinates.labels[i], (float(b[i]) for b in o.problem.coordinates.bounds)
+    edge, inner = (high if sign > 0 else low), int(np.flatnonzero(np.flatnonzero(o.free) == i)[0])
+    sd = float(np.sqrt(o.covariance[inner, inner] * o.variance))
+    here, stride = Point(o.x, 0.0, o.at), min(STRIDE * sd, (high - low) / 8)
+    points, notices, shorter = list[Point](), list[str](), 0
+    while here.rise < RISE and len(points) < POINTS:
+        if sign * (edge - here.x[i]) <= 1e-9 * (high - low):
+            return Side(points, f"{label} may not be {'larger' if sign > 0 else 'smaller'}", notices)
+        length = min(stride, sign * (edge - here.x[i]))
+        there, reason = refit(o, i, here, here.x[i] + sign * length)
+        if there is None and shorter == SHORTER:
+            return Side(points, reason, notices)
+        gained = 0.0 if there is None else max(there.rise, 0.0) ** 0.5 - max(here.rise, 0.0) ** 0.5
+        if there is None or (there.rise > BEYOND and shorter < SHORTER):
+            stride, shorter = length * float(np.clip(STRIDE / max(gained, 1e-9), 0.1, 0.5)), shorter + 1
+            continue
+        points.append(there)
+        if there.rise * o.variance < -LOWER:
+            value = o.problem.coordinates.all[i].to_value(there.x[i])
+            notices.append(
+                f"the fit did not end at the optimum: with {label} = {value:.4g} the misfit |r|^2 is less by "
+                f"{-there.rise * o.variance:.2g}; fit again from there"
+            )
+            return Side(points, "the fit did not end at the optimum", notices)
+        if there.rise < here.rise - LOWER:
+            notices.append(f"the profile of {label} is not monotone: there may be another optimum")
+        stride, here = length * float(np.clip(STRIDE / max(gained, 1e-9), 0.3, 3.0)), there
+    return Side(
+        points, "" if here.rise >= RISE else f"after {POINTS} points the rise is still {here.rise:.2g}", notices
+    )
+
+
+def refit(o: Optimum, i: int, here: Point, aim: float) -> tuple[Point | None, str]:
+    """The others' optimum with coordinate number i at `aim`, begun along the tangent of the profile; or why there is none."""
+    others, (low, high) = o.free.copy(), o.problem.coordinates.bounds
+    others[i] = False
+    x = here.x.copy()
+    if others.any():
+        tangent = -np.linalg.lstsq(here.at.J[:, others], here.at.J[:, i], rcond=None)[0]
+        x[others] = np.clip(x[others] + tangent * (aim - x[i]), low[others], high[others])
+    x[i] = aim
+    at = o.residuals(x, derivatives=True)
+    for _ in range(ROUNDS):
+        if at.lost:
+            return None, next(iter(at.lost.values())).reason
+        step, square = newton_step(o.problem, x, at, others), float(at.r @ at.r)
+        predicted = at.r + at.J[:, others] @ step
+        gain = square - float(predicted @ predicted)
+        x = x.copy()
+        if gain < FITTED:
+            x[others] += step
+            return Point(x, (square - gain - o.square) / o.variance, at), ""
+        ahead = x.copy()
+        ahead[others] += step
+        there = o.residuals(ahead, derivatives=True)
+        if there.lost or there.r @ there.r > square - 0.1 * gain:  # the Jacobian does not hold as far as that
+            try:
+                ahead = gauss_newton(
+                    o.problem, o.runner, x, which=o.which, free=others, steps=o.steps, first=at, evaluations=10,
+                    tolerance=0.1 * FITTED / square,
+                ).x  # fmt: skip
+            except Unreachable as lost:
+                return None, str(lost)
+            ahead[i] = aim
+            there = o.residuals(ahead, derivatives=True)
+        x, at = ahead, there
+    return None, "the other coordinates could not be fitted there"
+
+
+def assemble(o: Optimum, i: int, below: Side, above: Side) -> Profile:
+    """The curve of both sides, its interval, and what is to be said of it."""
+    c = o.problem.coordinates
+    one, points = c.all[i], [*below.points[::-1], Point(o.x, 0.0, o.at), *above.points]
+    x = np.array([point.x[i] for point in points])
+    zeta = np.sign(x - o.x[i]) * np.sqrt(np.maximum([point.rise for point in points], 0.0))
+    ends, notices = list[float | None](), [*below.notices, *above.notices]
+    for side, sign, name in ((below, -1, "lower"), (above, 1, "upper")):
+        if side.ended or not side.points:
+            last = one.to_value(side.points[-1].x[i] if side.points else o.x[i])
+            notices.append(f"{one.label} has no {name} bound of its 95 % interval within {last:.4g}: {side.ended}")
+            ends.append(None)
+            continue
+        a, b = sorted((side.points[-1].x[i], side.points[-2].x[i] if len(side.points) > 1 else o.x[i]))
+        roots = PchipInterpolator(x, zeta).solve(sign * RISE**0.5)
+        ends.append(float(roots[(roots >= a) & (roots <= b)][0]))
+        off = o.off(side.points[-1].x)
+        if not abs(off) < CHOSEN_ANEW * o.variance:
+            notices.append(
+                f"the {name} end of the profile of {one.label} is uncertain: steps chosen anew there change |r|^2 by "
+                f"{off:.2g}; take a tighter tolerance than rtol = {o.rtol:g}"
+            )
+    inner = int(np.flatnonzero(np.flatnonzero(o.free) == i)[0])
+    half = float(np.sqrt(o.covariance[inner, inner] * o.variance * RISE))
+    wald = o.x[i] - half, o.x[i] + half
+    worst = max((abs(e - w) / half for e, w in zip(ends, wald) if e is not None), default=0.0)
+    physical = [None if e is None else one.to_value(e) for e in ends]
+    straight = one.to_value(max(wald[0], -700.0)), one.to_value(min(wald[1], 700.0))
+    if worst > DIFFERENT:
+        told = [f"{e:.4g}" if e is not None else "open" for e in physical]
+        notices.append(
+            f"the misfit is no parabola in {one.label}: its profile's interval is {told[0]} .. {told[1]}, the covariance's "
+            f"{straight[0]:.4g} .. {straight[1]:.4g}; take the profile's"
+        )
+    every = [k for k in np.flatnonzero(o.free) if k != i]
+    return Profile(
+        one.label, one.to_value(o.x[i]), [one.to_value(v) for v in x], [max(float(point.rise), 0.0) for point in points],
+        {c.labels[k]: [c.all[k].to_value(point.x[k]) for point in points] for k in every},
+        (physical[0], physical[1]), straight, o.variance, list(dict.fromkeys(notices)),
+    )  # fmt: skip

@@ -1,0 +1,228 @@
+"""What an identification takes for granted: numerical constants, numbers called known, laws; and how to vary each.
+
+A variation makes the recordings, or their parameters, as they would be if one thing were otherwise by a stated amount.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+from torch import Tensor, nn
+
+from torchsoft.channels import unit
+from torchsoft.physics.contact import Coulomb, SmoothSlip
+from torchsoft.physics.motion import Piecewise, Reference, Sampled
+from torchsoft.physics.paper import SoftGrasp
+from torchsoft.physics.rig import Rig
+from torchsoft.sysid.problem.prediction import set_parameters
+from torchsoft.sysid.problem.recording import Recording
+from torchsoft.sysid.problem.start import AtRest
+from torchsoft.sysid.problem.unknowns import Nuisance, Sensor
+
+Kind = Literal["numerical", "known", "sensor", "law"]
+"""A constant of the computation; a number of the rig that is called known; what a sensor is taken to be; a law."""
+
+PLACE = 20e-6
+"""How far x_C0 is varied [m]: what a careful hand places a disc to."""
+
+RADIUS = 1e-3
+"""Relative variation of lengths of the rig that are called known."""
+
+KNOWN = 1e-2
+"""Relative variation of the other numbers that are called known."""
+
+FORCE = 0.5
+"""Variation of forces that are fed forward [N]."""
+
+SMALLER_RAMP = 0.1
+"""Factor by which the depth epsilon of the touch-down ramp is made smaller."""
+
+
+class Fault(NamedTuple):
+    """What a sensor may have and is not known to have: how large it is taken in a variation, in words."""
+
+    amount: float
+    per: str
+    verb: str
+
+    def size(self, sensor: Sensor, recording: Recording) -> float:
+        """In SI units."""
+        noise = {"noise": sensor.noise, "noise/s": sensor.noise / max(recording.duration, 1e-9)}
+        return self.amount * noise.get(self.per, 1.0)
+
+    def assumption(self, channel: str, sensor: Sensor) -> "Assumption":
+        scale = {"s": (1e3, "ms"), "1": (1e2, "%"), "noise": (sensor.noise, unit(channel))}
+        factor, shown = scale.get(self.per, (sensor.noise, f"{unit(channel)} over a recording"))
+        return Assumption(f"{self.verb.split()[0]} {channel}", "sensor", f"{channel} has no unknown {self.verb.split()[0]}",
+                          f"{channel} {self.verb.partition(' ')[2]}", factor * self.amount, shown)  # fmt: skip
+
+
+FAULTS: dict[Nuisance, Fault] = {
+    "bias": Fault(0.1, "noise", "bias read too much"),
+    "delay": Fault(1e-4, "s", "delay came late"),
+    "gain": Fault(1e-3, "1", "gain were too sensitive"),
+    "drift": Fault(0.1, "noise/s", "drift drifted upwards"),
+}
+"""Faults of sensors that are looked for where they are not unknown."""
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """One thing that is taken for granted: `stated` says what, `otherwise` what the variation makes of it, as clauses.
+
+    `vary` gives another recording, None where that has no meaning for it; or `values` are factors on parameters, close to
+    one. What is known, and what a sensor is, may be otherwise by any part of the `amount` [unit], and to either side; a law
+    or a constant of the computation either is so, or is not.
+    """
+
+    name: str
+    kind: Kind
+    stated: str
+    otherwise: str
+    amount: float = 1.0
+    unit: str = ""
+    vary: Callable[[Recording], Recording | None] | None = None
+    values: Mapping[str, float] | None = None
+
+
+def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Assumption]:
+    """Everything that the runs of some recordings take for granted and that can be varied; `unknown` are the parameters, and
+    coordinates of starts, that are identified."""
+    first, *_ = recordings
+    rig = first.rig
+    pad = next(iter(rig.pads.values()))
+    nx, ny, points = pad.mesh.elements_x, pad.mesh.elements_y, pad.points
+    at = f"{points} points an element" if points else "on the nodes"
+    out = [
+        Assumption("mesh", "numerical", f"the pads have {nx} x {ny} elements", f"they had {2 * nx} x {2 * ny}",
+                   vary=lambda r: remeshed(r, 2, points)),
+        Assumption("contact points", "numerical", f"contact is computed {at}", f"it were at {points + 2} points an element",
+                   vary=lambda r: remeshed(r, 1, points + 2)),
+        Assumption("mesh phase", "numerical", "a node lies where the mesh puts it", "nodes lay a quarter of an element on",
+                   vary=lambda r: shifted(r, 0.25)),
+    ]  # fmt: skip
+    ramps = {name: float(value) for name, value in first.parameters.items() if name.split(".")[-1] == "epsilon"}
+    if not ramps.keys() & unknown:
+        small = ", ".join(f"{SMALLER_RAMP * value:.3g}" for value in ramps.values())
+        stated = ", ".join(f"{value:.3g}" for value in ramps.values())
+        out.append(Assumption("ramp", "numerical", f"forces are ramped in at touch-down over epsilon = {stated} m",
+                              f"epsilon were {small} m", vary=lambda r: ramped(r, tuple(ramps), SMALLER_RAMP)))  # fmt: skip
+    if any(isinstance(one, Sampled) for one in rig.reference.signals.values()):
+        out.append(Assumption("set-points", "numerical", "set-points are what a smooth curve through the recorded ones says",
+                              "only every second one were known", vary=sparser))  # fmt: skip
+    if any(actuator.feed_forward is not None for actuator in rig.actuators.values()):
+        out.append(Assumption("feed-forward", "known", "what was fed forward is known", f"it were {FORCE} N more", FORCE, "N",
+                              vary=lambda r: raised(r, FORCE)))  # fmt: skip
+    if isinstance(rig, SoftGrasp):
+        out += of_the_paper(first, rig, unknown)
+    for name, value in first.parameters.items():
+        if name in unknown or value == 0.0 or name in ramps or name.startswith("start.") or "fixed" in name:
+            continue
+        part = RADIUS if name.endswith("radius") else KNOWN
+        out.append(Assumption(name, "known", f"{name} is {value:.6g}", f"{name} were {(1 + part) * value:.6g}",
+                              100 * part, "%", values={name: 1 + part}))  # fmt: skip
+    return out
+
+
+def of_the_paper(recording: Recording, rig: SoftGrasp, unknown: set[str]) -> list[Assumption]:
+    """What the paper's rig takes for granted besides."""
+    out, start = [], recording.start
+    if isinstance(start, AtRest) and "start.disc.x" not in unknown:
+        out.append(Assumption("x_C0", "known", "the disc begins at scenario.x_C0", f"it began {1e6 * PLACE:g} um further right",
+                              1e6 * PLACE, "um", vary=placed))  # fmt: skip
+    law = rig.contacts["L"].law.friction
+    if isinstance(law, SmoothSlip):
+        out.append(Assumption("Coulomb friction", "law", "slip is smooth (contact.friction = \"smooth\")",
+                              "it were Coulomb's", vary=coulomb))  # fmt: skip
+    return out
+
+
+def with_rig(recording: Recording, change: Callable[[Rig], None]) -> Recording:
+    """The recording with a changed copy of its rig."""
+    rig = deepcopy(recording.rig)
+    change(rig)
+    return replace(recording, rig=rig)
+
+
+def remeshed(recording: Recording, finer: int, points: int) -> Recording | None:
+    """Every pad of more elements, or with more contact points; None where the start is a state of this mesh."""
+    if not isinstance(recording.start, AtRest):
+        return None
+
+    def change(rig: Rig) -> None:
+        modules: nn.ModuleDict = rig.pads  # pyright: ignore[reportAssignmentType]
+        for name, pad in rig.pads.items():
+            modules[name] = pad.remeshed(finer, points)
+
+    return with_rig(recording, change)
+
+
+def shifted(recording: Recording, part: float) -> Recording:
+    """Every pad moved along its face by a part of an element."""
+
+    def change(rig: Rig) -> None:
+        for pad in rig.pads.values():
+            step = part * pad.mesh.length / pad.mesh.elements_x * pad.axes[:, 0]
+            pad.origin += step
+            pad.positions += step
+
+    return with_rig(recording, change)
+
+
+def ramped(recording: Recording, names: Sequence[str], factor: float) -> Recording:
+    """The depths `names` of touch-down ramps by a factor."""
+    return with_rig(recording, lambda rig: set_parameters(rig, {n: factor * recording.parameters[n] for n in names}))
+
+
+def placed(recording: Recording) -> Recording | None:
+    """The disc a little further right."""
+    start, rig = recording.start, recording.rig
+    if not isinstance(start, AtRest) or not isinstance(rig, SoftGrasp):
+        return None
+    return replace(recording, start=start._replace(x=start.place(rig) + PLACE))
+
+
+def coulomb(recording: Recording) -> Recording:
+    """Coulomb's friction with the same coefficients."""
+
+    def change(rig: Rig) -> None:
+        laws = {id(contact.law): contact.law for contact in rig.contacts.values()}
+        for law in laws.values():
+            smooth = law.friction
+            if isinstance(smooth, SmoothSlip):
+                law.friction = Coulomb(smooth.mu_s.item(), smooth.mu_k.item())
+
+    return with_rig(recording, change)
+
+
+def with_reference(recording: Recording, **signals: nn.Module) -> Recording:
+    """The recording with other signals."""
+    known = {name.replace(":", "."): one for name, one in recording.rig.reference.signals.items()}
+
+    def change(rig: Rig) -> None:
+        rig.reference = Reference(**(known | signals))
+
+    return with_rig(recording, change)
+
+
+def sparser(recording: Recording) -> Recording:
+    """Every second set-point left out, and a spline through the others."""
+    signals = {}
+    for name, one in recording.rig.reference.signals.items():
+        if isinstance(one, Sampled) and len(one.times) > 3:
+            signals[name.replace(":", ".")] = Sampled(one.times[::2], one.values[::2])
+    return with_reference(recording, **signals)
+
+
+def raised(recording: Recording, by: float) -> Recording | None:
+    """More force [N] fed forward to every actuator; None where a signal is not made of polynomials."""
+    names = {a.feed_forward for a in recording.rig.actuators.values() if a.feed_forward is not None}
+    known = {name: recording.rig.reference[name] for name in names}
+    if not all(isinstance(one, Piecewise) for one in known.values()):
+        return None
+    signals = deepcopy(known)
+    for one in signals.values():
+        values: Tensor = one.values  # pyright: ignore[reportAssignmentType]
+        values.data.add_(by)
+    return with_reference(recording, **signals)

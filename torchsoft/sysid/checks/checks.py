@@ -1,0 +1,288 @@
+"""Do the data agree with what was taken for granted, and how far would estimates move if it were otherwise?
+
+One run a recording and variation, at the estimates, on the same steps: the difference d (m,) that it makes to the residuals is
+one more column beside the Jacobian J. Its projection on J says how far estimates would move; the rest of it, along the
+residuals, how much of it the data ask for. A constant of the computation is not known to be right: it enters the intervals as
+a coordinate more, with a standard normal prior on its amplitude, so that data that cannot tell it cost certainty.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from torchsoft.sysid.checks.assumptions import FAULTS, Assumption, Kind, assumptions
+from torchsoft.sysid.checks.misfit import LEVEL, parts
+from torchsoft.sysid.checks.variation import End, difference, ended, refit
+from torchsoft.sysid.fit.fit import Fit, Notify
+from torchsoft.sysid.fit.information import fisher, shift, standard_deviations
+from torchsoft.sysid.fit.plan import USUAL
+from torchsoft.sysid.fit.robust import Loss
+from torchsoft.sysid.problem.prediction import FailedRun
+from torchsoft.sysid.problem.problem import Problem, Residuals
+from torchsoft.sysid.problem.readout import Signals
+from torchsoft.sysid.problem.recording import Array
+from torchsoft.sysid.problem.unknowns import Nuisance
+from torchsoft.sysid.problem.workers import Runner
+
+ASKED = 20.0
+"""Fall of chi2, over the misfit that is left per sample, from which the data ask for a variation: four and a half standard
+deviations, for some twenty variations are looked at."""
+
+PATTERN = 0.5
+"""Part of the residuals' autocorrelation that a variation may leave and yet count as what the data ask for: a cause takes the
+pattern away with it, while coloured noise lines up with anything slow."""
+
+LAGS = 10
+"""Autocorrelations that are looked at."""
+
+BY_CHANCE = 2.0
+"""What the statistic of Box and Pierce may be by chance, over its expectation."""
+
+MOVED = 0.5
+"""Standard deviations by which a constant of the computation may move an estimate without a word."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that was taken for granted, and what a variation of it by `amount` [unit] does.
+
+    `moves` is how far each coordinate would move, in its standard deviations, by label; `gain` by how much the sum of squares
+    would fall if the data could choose the amplitude, `asked` that amplitude [unit] and `asked_sd` its standard deviation;
+    `significance` is the gain over the misfit per sample that would be left, `pattern` the part of the residuals'
+    autocorrelation that would be left, 0 where there is none. `refitted`: that is of a fit with the whole variation, not to
+    first order. `unchecked` says why there is no answer.
+    """
+
+    name: str
+    kind: Kind
+    stated: str
+    otherwise: str
+    amount: float
+    unit: str
+    moves: dict[str, float]
+    gain: float
+    asked: float
+    asked_sd: float
+    significance: float
+    pattern: float = 0.0
+    refitted: bool = False
+    unchecked: str = ""
+
+    @property
+    def wanted(self) -> bool:
+        """Whether the data ask for it."""
+        either_side = self.kind in ("known", "sensor")
+        return self.significance > ASKED and self.pattern < PATTERN and (either_side or self.asked > 0)
+
+    @property
+    def falls(self) -> str:
+        """What it does to the sum of squares, as a sentence has it."""
+        return f"falls by {self.gain:.0f} in a new fit" if self.refitted else f"would fall by {self.gain:.0f}"
+
+    @property
+    def most_moved(self) -> tuple[str, float]:
+        """The label of the coordinate that would move most, and by how many standard deviations."""
+        return max(self.moves.items(), key=lambda item: abs(item[1]), default=("", 0.0))
+
+
+class Checked(NamedTuple):
+    """All checks; columns (m, k) of the constants of the computation, and those of the free coordinates' Jacobian (m, n)."""
+
+    checks: list[Check]
+    columns: Array
+    J: Array
+
+    def covariance(self) -> Array:
+        """Covariance (n, n) of the free coordinates, which the constants of the computation enlarge."""
+        k, n = self.columns.shape[1], self.J.shape[1]
+        rows = np.block([[self.J, self.columns], [np.zeros((k, n)), np.eye(k)]])
+        _, R = np.linalg.qr(rows[:, [*range(n, n + k), *range(n)]])
+        return fisher(R[k:, k:])[0]
+
+    def widening(self) -> Array:
+        """What that is more than without them (n, n)."""
+        return self.covariance() - fisher(self.J)[0]
+
+
+def check(
+    problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_], which: Sequence[str], rtol: float, *,
+    loss: Loss = "linear", workers: int = 1, journal: Path | None = None, notify: Notify = lambda chi2: None,
+) -> Checked:  # fmt: skip
+    """Vary what was taken for granted at the estimates x (n,), where `at` holds residuals and Jacobian of the recordings
+    `which`. Where no variation explains why residuals are larger than the noise, the fit is repeated under each that is no
+    number of the rig."""
+    end = ended(problem, x, at, free, which, max(rtol, USUAL), workers, journal)
+    recordings = [recording for recording in problem.recordings if recording.name in which]
+    taken = assumptions(recordings, set(problem.coordinates.names))
+    judge, checks, columns = Judge(problem, end), dict[str, Check](), []
+    for one in taken:
+        if one.vary is None:
+            continue
+        d, reason = difference(problem, end, one)
+        checks[one.name] = judge.unchecked(one, reason) if d is None else judge.column(one, d)
+        if one.kind == "numerical" and d is not None:
+            columns.append(d)
+    linear = columns_of(problem, Runner(problem.recordings, workers, journal), end, taken)
+    checks |= {one.name: judge.column(one, d) for one, d in linear if d.any()}
+    doubted = sorted((one for one in taken if one.vary is not None), key=lambda one: -checks[one.name].gain)
+    if not end.base.lost and judge.too_large(checks.values()):
+        as_stated = refit(problem, end, None, loss, notify)
+        for one in doubted:
+            fit = refit(problem, end, one, loss, notify)
+            if fit is not None and as_stated is not None:
+                checks[one.name] = judge.fit(one, fit, as_stated, checks[one.name])
+            if not judge.too_large(checks.values()):
+                break
+    return Checked(list(checks.values()), np.stack(columns, 1) if columns else np.zeros((len(at.r), 0)), judge.J)
+
+
+class Judge:
+    """What variations are worth at the end of a fit."""
+
+    def __init__(self, problem: Problem, end: End) -> None:
+        self.end, self.r, self.J = end, end.at.r, end.at.J[:, end.free]
+        self.Q, _ = np.linalg.qr(self.J)
+        self.sd = standard_deviations(self.J)
+        self.labels = [label for label, one in zip(problem.coordinates.labels, end.free) if one]
+        self.places = [part.rows for part in parts(problem, self.r, end.which)]
+        self.dof = max(len(self.r) - len(self.labels), 1)
+        self.square = float(self.r @ self.r)
+
+    def too_large(self, checks: Iterable[Check]) -> bool:
+        """Whether residuals are larger than the noise, and would be with whatever the data ask for."""
+        gain = max((one.gain for one in checks if one.wanted), default=0.0)
+        return float(stats.chi2.sf(self.square - gain, self.dof)) < LEVEL
+
+    def unchecked(self, one: Assumption, reason: str) -> Check:
+        return Check(one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, {}, 0.0, 0.0, float("inf"), 0.0,
+                     unchecked=reason)  # fmt: skip
+
+    def made(
+        self, one: Assumption, moves: Array, gain: float, asked: float, asked_sd: float, rest: float, pattern: float
+    ) -> Check:
+        """Of a variation that leaves a misfit `rest` per sample."""
+        by_label = dict(zip(self.labels, moves.tolist()))
+        return Check(one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, by_label, gain, asked, asked_sd,
+                     gain / rest, pattern)  # fmt: skip
+
+    def column(self, one: Assumption, d: Array) -> Check:
+        """Of what a variation adds to the residuals (m,), to first order in its amplitude."""
+        across = d - self.Q @ (self.Q.T @ d)
+        size, along = float(across @ across), float(across @ self.r)
+        moves = -shift(self.J, d) / self.sd
+        if size < 1e-12 * max(float(d @ d), 1e-300) or size == 0.0:
+            return self.made(one, moves, 0.0, 0.0, float("inf"), 1.0, 0.0)
+        gain, alpha = along**2 / size, -along / size
+        rest = max(1.0, (self.square - gain) / max(self.dof - 1, 1))
+        pattern, sd = (
+            pattern_of(self.places, self.r + alpha * across, self.r),
+            (max(1.0, self.square / self.dof) / size) ** 0.5,
+        )
+        return self.made(one, moves, gain, alpha * one.amount, sd * one.amount, rest, pattern)
+
+    def fit(self, one: Assumption, fit: Fit, as_stated: Fit, linear: Check) -> Check:
+        """Of a fit that was repeated with it, beside one that was repeated without; or what is known to first order, if that is
+        worth more."""
+        assert fit.at is not None
+        assert as_stated.at is not None
+        r, before = fit.at.r, as_stated.at.r
+        gain = float(before @ before - r @ r)
+        if gain <= linear.gain:
+            return linear
+        rest = max(1.0, float(r @ r) / self.dof)
+        moves, sd = (fit.x - self.end.x)[self.end.free] / self.sd, (rest / gain) ** 0.5
+        pattern = pattern_of(self.places, r, before)
+        return replace(self.made(one, moves, gain, one.amount, sd * one.amount, rest, pattern), refitted=True)
+
+
+def pattern_of(places: Sequence[slice], left: Array, r: Array) -> float:
+    """What is left of the autocovariances of residuals r, by the root of the sum of their squares; 0 where r has none beyond
+    chance."""
+
+    def statistic(r: Array) -> tuple[float, float]:
+        """That of Box and Pierce, over the stated noise in place of the residuals' own, and what chance may make of it."""
+        total = chance = 0.0
+        for rows in places:
+            own, n = r[rows], len(r[rows])
+            gamma = np.array([own[k:] @ own[:-k] / n for k in range(1, min(LAGS, n // 4) + 1)])
+            total += n * float(gamma @ gamma)
+            chance += BY_CHANCE * len(gamma) * max(1.0, float(own @ own) / n) ** 2
+        return total, chance
+
+    before, chance = statistic(r)
+    return (statistic(left)[0] / before) ** 0.5 if before > chance else 0.0
+
+
+def columns_of(
+    problem: Problem, runner: Runner, end: End, taken: Sequence[Assumption]
+) -> list[tuple[Assumption, Array]]:
+    """What other values of known parameters, and faults of sensors that are not unknown, would add to the residuals, to first
+    order: of one run a recording, with its derivatives. Nothing where a run fails."""
+    known = [one for one in taken if one.values is not None]
+    names = tuple(name for one in known for name in one.values or ())
+    jobs = [job._replace(names=names) for job in problem.jobs(end.x, end.which, end.steps, None)]
+    runs = runner.run(jobs)
+    if any(isinstance(run, FailedRun) for run in runs):
+        return []
+    faults: list[tuple[str, Nuisance]] = [(channel, kind) for channel in problem.sensors for kind in FAULTS]
+    have = {(one.name, one.kind) for one in problem.coordinates.all}
+    rows = np.zeros((len(problem.coordinates.priors), len(names) + len(faults)))
+    blocks = []
+    for job, run in zip(jobs, runs):
+        recording = problem.recordings[job.recording]
+        signals = Signals(run.t, recording.channels, run.signals, run.derivatives)
+        sizes = [
+            (factor - 1) * recording.parameters[name] for one in known for name, factor in (one.values or {}).items()
+        ]
+        for channel, one in problem.readouts(end.x, job.recording).items():
+            t, measured = recording.samples[channel]
+            y, slopes, by = one.expected(signals, t)
+            _, weight = one.residuals(y, measured)
+            block = np.zeros((len(t), len(names) + len(faults)))
+            if slopes is not None:
+                block[:, : len(names)] = slopes * sizes
+            for k, (other, kind) in enumerate(faults):
+                if other == channel:
+                    block[:, len(names) + k] = by[kind] * FAULTS[kind].size(problem.sensors[channel], recording)
+            blocks.append(problem.whitened(recording, channel, weight[:, None] * block))
+    D = np.concatenate([*blocks, rows])
+    sensors = [FAULTS[kind].assumption(channel, problem.sensors[channel]) for channel, kind in faults]
+    out = [(one, d) for one, d in zip((*known, *sensors), D.T)]
+    return [pair for k, pair in enumerate(out) if k < len(known) or faults[k - len(known)] not in have]
+
+
+def notices(checked: Checked) -> list[str]:
+    """Sentences on what the data ask for, the strongest first, and on constants of the computation that estimates hang on."""
+    out, checks = [], checked.checks
+    asked = sorted((c for c in checks if c.wanted), key=lambda c: -c.gain)
+    if asked:
+        best = asked[0]
+        rivals = [c.name for c in asked[1:] if c.gain > 0.5 * best.gain]
+        label, move = best.most_moved
+        text = f"the data contradict that {best.stated}: the sum of squares {best.falls} if {best.otherwise}"
+        if best.kind in ("known", "sensor"):
+            text += f" ({best.asked:+.3g} {best.unit} fit best, +- {best.asked_sd:.2g})"
+            move *= best.asked / best.amount
+        text += f"; {label} would move by {abs(move):.2g} standard deviations" if label else ""
+        out.append(text + (f"; so would it with others: {', '.join(rivals)}" if rivals else ""))
+        out += [
+            f"the data also ask for another value of what is stated: {c.stated} (the sum of squares {c.falls})"
+            for c in asked[1:4]
+            if c.gain <= 0.5 * best.gain and c.gain > 0.1 * best.gain
+        ]
+    for c in checks:
+        if c.kind == "numerical" and c.unchecked:
+            out.append(f"it could not be checked what it does that {c.stated}: {c.unchecked}")
+        elif c.kind == "numerical" and not c.wanted and c.asked_sd > MOVED:
+            label, move = c.most_moved
+            if abs(move) > MOVED:
+                out.append(
+                    f"{label} hangs on a constant of the computation: {c.stated}; if {c.otherwise} it would move by "
+                    f"{abs(move):.2g} standard deviations, and the data cannot tell: the interval allows for that"
+                )
+    return out

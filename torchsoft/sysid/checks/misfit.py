@@ -1,0 +1,327 @@
+"""Is what a fit left over noise? Tests of its residuals, each with a p-value for as many samples as there are.
+
+The residuals r (m,) are whitened with the noise that is assumed, J (m, n) is their Jacobian. Where model and noise are
+right they are independent, normal, of variance one, but for the n directions that the fit took out. Every test speaks of one
+channel in one recording where it can:
+
+    level     the sum of squares is chi-squared: residuals are as large as the noise that was stated
+    white     Ljung and Box: nothing is left that lasts longer than a sample
+    motion    F: they do not line up with the reading that the model predicts, nor with its rates, nor with other channels'
+    channels  Bartlett: those of different channels, at one time, have nothing to do with each other
+    outliers  Grubbs, and the kurtosis: tails are those of a normal distribution
+    priors    normal: estimates are where their priors expect them, as far as the data know better
+
+p-values are adjusted by Holm's method, so that with a right model one of them or more falls below `LEVEL` in as many of all
+identifications. What the noise was allowed to explain is not tested again: colour that a user has declared is no verdict, and
+colour that was found unasked is one, although intervals allow for it, because a sensor may have made it, or a wrong model.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Literal, NamedTuple
+
+import numpy as np
+from scipy import stats
+from scipy.interpolate import CubicSpline
+from scipy.sparse.linalg import spsolve_triangular
+
+from torchsoft.sysid.problem.noise import Autoregression
+from torchsoft.sysid.problem.problem import Problem
+from torchsoft.sysid.problem.recording import Array
+
+LEVEL = 0.01
+"""Part of all identifications with a right model and right noise in which a test gives a false alarm."""
+
+LAGS = 20
+"""Autocorrelations that are shown, at most, and at most a quarter of the samples."""
+
+TESTED = 10
+"""Autocorrelations that are tested, at most, and at most one in twenty samples: the sum of more is not yet chi-squared in its
+tail, where alarms are."""
+
+FAINT = 0.5
+"""Residuals over the noise below which their pattern is not judged: the noise is overstated, and that is said."""
+
+MOST = 3
+"""Channels that a sentence names; it counts the others."""
+
+MEDIAN = 0.37
+"""How many residuals tell the level as exactly, by their squares, as one residual does by the median of all."""
+
+Test = Literal["level", "white", "motion", "channels", "outliers", "priors"]
+
+
+class Part(NamedTuple):
+    """One channel of one recording at the fit: sample times t (m,) [s], the rows of r and J that are its own, the residuals
+    `raw` (m,) over the noise that the sensor states, the `reading` (m,) that the model predicts [unit], the noise that is
+    assumed (white as stated, if None), whether its level was `found` from such residuals, and what whitens (m,) or (m, k)."""
+
+    recording: str
+    channel: str
+    t: Array
+    rows: slice
+    raw: Array
+    reading: Array
+    noise: Autoregression | None = None
+    found: bool = False
+    whitened: Callable[[Array], Array] = lambda rows: rows
+
+    @property
+    def name(self) -> str:
+        """As sentences name it."""
+        return f"{self.channel} of `{self.recording}`"
+
+
+def parts(problem: Problem, r: Array, which: Sequence[str]) -> list[Part]:
+    """The parts of residuals r of `Problem.residuals`, whitened by the problem's noise."""
+    out, at = [], 0
+    for recording in problem.recordings:
+        for channel, sensor in problem.sensors.items() if recording.name in which else ():
+            if channel not in recording.samples:
+                continue
+            t, measured = recording.samples[channel]
+            rows, noise = slice(at, at + len(t)), problem.noise.get(channel)
+            raw = r[rows] if noise is None else spsolve_triangular(noise.whitener(t), r[rows])
+            reading, found = measured + sensor.noise * raw, noise is not None
+            whitened = partial(problem.whitened, recording, channel)
+            out.append(Part(recording.name, channel, t, rows, raw, reading, noise, found, whitened))
+            at += len(t)
+    return out
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """One test of one channel in one recording (of all, where they are None): its p-value, the one that is adjusted for all
+    tests together, the size of what it looks at, and that in words."""
+
+    test: Test
+    recording: str | None
+    channel: str | None
+    p: float
+    size: float
+    words: str
+    adjusted: float = 1.0
+
+    @property
+    def alarming(self) -> bool:
+        return self.adjusted < LEVEL
+
+
+def judge(
+    parts: Sequence[Part], r: Array, J: Array, *, robust: bool = False, priors: Sequence[str] = ()
+) -> list[Verdict]:
+    """All tests of a fit's whitened residuals r (m,), the last of them those of `priors`, which are named, with their Jacobian
+    J (m, n) by what was free.
+
+    With a `robust` loss outliers are expected: the level is that of the median residual, and tails are not tested.
+    """
+    Q, R = np.linalg.qr(J)
+    seen = np.abs(np.diag(R)) > 1e-9 * max(np.abs(np.diag(R)).max(initial=0.0), 1e-300)
+    Q, out = Q[:, seen], list[Verdict]()
+    sums = [level(part, r, Q, robust) for part in parts]
+    out += [verdict for verdict, _, _ in sums]
+    exact = [(square, dof) for part, (_, square, dof) in zip(parts, sums) if not part.found]
+    if len(exact) > 1:
+        square, dof = (float(sum(some)) for some in zip(*exact))
+        words = f"all of them together {(square / dof) ** 0.5:.3g} times, in {dof:.0f} samples"
+        out.append(Verdict("level", None, None, two_sided(square, dof), (square / dof) ** 0.5, words))
+    for part in parts:
+        if float(np.mean(part.raw**2)) < FAINT**2:
+            continue
+        out.append(white(part, r))
+        out += lines_up(part, [p for p in parts if p.recording == part.recording], r, Q)
+        if not robust:
+            out.append(outliers(part, r))
+    for recording in dict.fromkeys(part.recording for part in parts):
+        out += together(recording, [part for part in parts if part.recording == recording], r, Q)
+    out += [contradicted(name, r[k], Q[k]) for name, k in zip(priors, range(len(r) - len(priors), len(r)))]
+    return holm(out)
+
+
+def holm(verdicts: Sequence[Verdict]) -> list[Verdict]:
+    """With p-values adjusted for as many tests as there are, in the order given."""
+    p, n = np.array([f.p for f in verdicts]), len(verdicts)
+    order = np.argsort(p)
+    adjusted = np.empty(n)
+    adjusted[order] = np.minimum(np.maximum.accumulate(p[order] * (n - np.arange(n))), 1.0)
+    return [replace(f, adjusted=float(a)) for f, a in zip(verdicts, adjusted)]
+
+
+def two_sided(square: float, dof: float) -> float:
+    """p-value of a chi-squared sum that should be neither too large nor too small."""
+    return float(min(1.0, 2 * min(stats.chi2.sf(square, dof), stats.chi2.cdf(square, dof))))
+
+
+def level(part: Part, r: Array, Q: Array, robust: bool) -> tuple[Verdict, float, float]:
+    """Is the sum of squares that of the noise as stated? With it that sum, and how many independent samples it is worth.
+
+    Where the noise's level was found from these residuals, so that whitened ones tell nothing, the raw ones have it, which are
+    worth `Autoregression.effective` samples (Satterthwaite).
+    """
+    raw = part.found and part.noise is not None
+    rows = part.raw if raw else r[part.rows]
+    n = int(np.count_nonzero(part.raw))  # a saturated sample that is explained says nothing
+    free = max(1.0 - float(np.sum(Q[part.rows] ** 2)) / max(n, 1), 1 / max(n, 1))  # what the fit left of them
+    mean, worth = float(rows @ rows) / max(n, 1), float(n)
+    if robust:
+        mean, worth = (float(np.median(np.abs(rows))) / float(stats.norm.ppf(0.75))) ** 2, MEDIAN * n
+    if raw and part.noise is not None:
+        worth *= part.noise.effective(n) / n
+    dof = worth * free
+    square, size = mean * worth, float((mean / free) ** 0.5)
+    words = f"{part.name} {size:.3g} times"
+    return Verdict("level", part.recording, part.channel, two_sided(square, dof), size, words), square, dof
+
+
+def autocorrelation(r: Array) -> Array:
+    """Of residuals r (m,) at lags 1, 2, ..., at most `LAGS` and a quarter of the samples."""
+    c = r - r.mean()
+    lags, power = min(LAGS, len(r) // 4), float(c @ c)
+    return np.array([c[k:] @ c[:-k] / power for k in range(1, lags + 1)]) if power > 0 else np.zeros(lags)
+
+
+def whiteness(r: Array, coefficients: int = 0) -> tuple[float, float]:
+    """First autocorrelation and Ljung-Box p-value of one channel's residuals (m,), after so many coefficients were fitted."""
+    rho, m = autocorrelation(r), len(r)
+    lags = min(max(TESTED, coefficients + 3), m // 20)
+    if not rho.any() or lags <= coefficients:
+        return float(rho[0]) if len(rho) else 0.0, 1.0
+    Q = m * (m + 2) * float((rho[:lags] ** 2 / (m - np.arange(1, lags + 1))).sum())
+    return float(rho[0]), float(stats.chi2.sf(Q, lags - coefficients))
+
+
+def white(part: Part, r: Array) -> Verdict:
+    """Is what was whitened white?"""
+    rho, p = whiteness(r[part.rows], part.noise.order if part.noise is not None else 0)
+    words = f"{part.name} (neighbouring samples correlate by {rho:.2f})"
+    return Verdict("white", part.recording, part.channel, p, rho, words)
+
+
+def explained(part: Part, Z: Array, r: Array, Q: Array) -> tuple[float, float, Array]:
+    """What residuals have in common with Z (m, k), signals at the samples of a part: the F test's p-value of fitting them
+    besides the unknowns, against the variance of the part itself, the share of that which they take, and what each alone
+    would take, signed (k,)."""
+    size = np.linalg.norm(Z, axis=0)
+    columns = np.zeros((len(r), Z.shape[1]))
+    columns[part.rows] = part.whitened(Z / np.where(size > 0, size, 1.0))
+    before = np.linalg.norm(columns, axis=0)
+    columns -= Q @ (Q.T @ columns)  # what the unknowns could not have explained themselves
+    after = np.linalg.norm(columns, axis=0)
+    new = after > 1e-3 * np.where(before > 0, before, np.inf)
+    unit = columns[:, new] / after[new]
+    U, s, _ = np.linalg.svd(unit, full_matrices=False)
+    U, own = U[:, s > 1e-3], float(np.sum(r[part.rows] ** 2))
+    k, taken = U.shape[1], float(np.sum((U.T @ r) ** 2))
+    left = len(part.t) - float(np.sum(Q[part.rows] ** 2)) - k
+    if k == 0 or left < 1:
+        return 1.0, 0.0, np.zeros(Z.shape[1])
+    alone = np.zeros(Z.shape[1])
+    alone[new] = unit.T @ r
+    p = float(stats.f.sf((taken / k) / max((own - taken) / left, 1e-300), k, left))
+    return p, min(taken / max(own, 1e-300), 1.0), alone
+
+
+def lines_up(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[Verdict]:
+    """Do residuals line up with the reading that the model predicts, as a wrong sensor would make them, or with those of the
+    other channels and their rates, as a wrong law would?"""
+    out, t = [], part.t
+    y = spline(part)
+    own = {
+        "an offset": np.ones(len(t)), "a drift": t - t.mean(), "the reading itself, as an error of its gain would be": y(t),
+        "its rate, as a delay would be": y(t, 1), "its acceleration": y(t, 2),
+    }  # fmt: skip
+    others = {}
+    for other in beside:
+        if other.channel != part.channel and other.t[0] <= t[0] + 0.05 and other.t[-1] >= t[-1] - 0.05:
+            s = spline(other)
+            others |= {other.channel: s(t), f"the rate of {other.channel}": s(t, 1)}
+            others |= {f"the acceleration of {other.channel}": s(t, 2)}
+    for what in (own, others):
+        if len(t) < 4 * len(what) or not what:
+            continue
+        p, share, alone = explained(part, np.stack(list(what.values()), 1), r, Q)
+        likest = list(what)[int(np.argmax(np.abs(alone)))]
+        words = f"{part.name} ({share:.0%} of it, most like {likest})"
+        out.append(Verdict("motion", part.recording, part.channel, p, share, words))
+    return out
+
+
+def spline(part: Part) -> CubicSpline:
+    """The reading between samples."""
+    return CubicSpline(part.t, part.reading)
+
+
+def outliers(part: Part, r: Array) -> Verdict:
+    """Is the largest residual larger than it may be (Grubbs), or are the tails too heavy (Anscombe and Glynn)?"""
+    rows = r[part.rows]
+    m, at = len(rows), int(np.argmax(np.abs(rows)))
+    sd = float(rows.std(ddof=1)) if m > 2 else 0.0
+    if m < LAGS or sd == 0:
+        return Verdict("outliers", part.recording, part.channel, 1.0, 0.0, f"{part.name} (too short to tell)")
+    G = float(np.abs(rows - rows.mean())[at]) / sd
+    beyond = (m - 1) ** 2 - m * G**2
+    t = G * (m * (m - 2) / beyond) ** 0.5 if beyond > 0 else np.inf
+    grubbs = min(1.0, 2 * m * float(stats.t.sf(t, m - 2)))
+    tails = float(stats.kurtosistest(rows, alternative="greater").pvalue)
+    words = f"{part.name} (the largest {abs(rows[at]):.1f} times the noise, at t = {part.t[at]:.4g} s)"
+    return Verdict(
+        "outliers", part.recording, part.channel, min(1.0, 2 * min(grubbs, tails)), abs(float(rows[at])), words
+    )
+
+
+def together(recording: str, parts: Sequence[Part], r: Array, Q: Array) -> list[Verdict]:
+    """Do residuals of different channels, where they are sampled at the same times, have something in common (Bartlett)?"""
+    alike = [p for p in parts if np.array_equal(p.t, parts[0].t) and float(np.mean(p.raw**2)) >= FAINT**2]
+    k = len(alike)
+    if k < 2:
+        return []
+    rows = np.stack([r[p.rows] for p in alike])
+    n = rows.shape[1] - sum(float(np.sum(Q[p.rows] ** 2)) for p in alike) / k
+    if n < 4 * k or (rows.std(1) == 0).any():
+        return []
+    C = np.atleast_2d(np.corrcoef(rows))
+    square = -(n - 1 - (2 * k + 5) / 6) * float(np.linalg.slogdet(C)[1])
+    i, j = np.unravel_index(int(np.argmax(np.abs(np.triu(C, 1)))), C.shape)
+    words = f"{alike[i].channel} and {alike[j].channel} of `{recording}` (correlation {C[i, j]:.2f})"
+    p = float(stats.chi2.sf(square, k * (k - 1) / 2))
+    return [Verdict("channels", recording, None, p, float(C[i, j]), words)]
+
+
+def contradicted(name: str, r: float, q: Array) -> Verdict:
+    """Is the residual r of a prior, whose row of Q is q (n,), as small as it should be?"""
+    free = max(1.0 - float(q @ q), 0.0)
+    z = float(r) / free**0.5 if free > 1e-9 else 0.0  # without data it is where the prior is
+    return Verdict(
+        "priors", None, None, 2 * float(stats.norm.sf(abs(z))), abs(z), f"{name} by {abs(z):.2g} standard deviations"
+    )
+
+
+SENTENCES: dict[str, str] = {
+    "larger": "residuals are larger than the noise that was stated, {}: the model may be wrong, or the noise larger",
+    "smaller": "residuals are smaller than the noise that was stated, {}: state less of it, or intervals are too wide, and "
+    "faults of the model stay hidden",
+    "white": "residuals are not white in {}: something systematic is left, and intervals may be too narrow",
+    "motion": "residuals follow the motion in {}: a sensor is not as it was stated, or the model is wrong",
+    "channels": "residuals of different channels belong together, {}: the model leaves out something that moves both",
+    "outliers": "there are outliers in {}: look at these samples, or take a robust loss",
+    "priors": "the data contradict what was known before, {}: the prior is wrong, or the model",
+}  # fmt: skip
+
+
+def notices(verdicts: Sequence[Verdict], widened: float = 1.0) -> list[str]:
+    """A sentence for each kind of alarm, naming recordings and channels, the clearest first; intervals are `widened` [1] for
+    residuals that are too large."""
+    kinds: dict[str, list[Verdict]] = {kind: [] for kind in SENTENCES}
+    for verdict in sorted((f for f in verdicts if f.alarming), key=lambda f: (f.recording is None, f.p)):
+        kinds[verdict.test if verdict.test != "level" else "larger" if verdict.size > 1 else "smaller"].append(verdict)
+    out = {kind: SENTENCES[kind].format(named([f.words for f in some])) for kind, some in kinds.items() if some}
+    if "larger" in out and widened > 1.0:
+        out["larger"] += f"; intervals are widened by {widened:.3g}"
+    return list(out.values())
+
+
+def named(words: Sequence[str]) -> str:
+    """The first of them, and how many more there are."""
+    more = len(words) - MOST
+    return ", ".join(words[:MOST]) + (f" and {more} more" if more > 0 else "")

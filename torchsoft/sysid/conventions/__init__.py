@@ -1,0 +1,1 @@
+"""Before a fit: can recordings be what they are taken for?"""

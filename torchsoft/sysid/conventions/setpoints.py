@@ -1,0 +1,152 @@
+"""Are recorded set-points close enough together for their motion, and are their rates theirs?
+
+A recorded signal is known at its rows only; a cubic stands between them. What that gets wrong is estimated from the rows:
+without every second one, and without three in four, the cubic gets more wrong, by an order that is observed. It is told in
+units of what it does: how far off the set-point is, against the noise of the sensor of that coordinate, and what the
+controller makes of it and of its rate, against the noise of the force.
+"""
+
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.interpolate import CubicSpline
+from torch import Tensor, nn
+
+from torchsoft.channels import unit
+from torchsoft.physics.motion import Sampled
+from torchsoft.physics.parts import Actuator
+from torchsoft.sysid.conventions.closed_loop import channel
+from torchsoft.sysid.conventions.finding import Finding
+from torchsoft.sysid.problem.recording import Array, Recording
+from torchsoft.sysid.problem.unknowns import Sensor
+
+NOTICED = 0.2
+"""Part of a sensor's noise from which what happens between rows is said: residuals would be off by it everywhere."""
+
+HOPELESS, ORDERLESS = 100.0, 1.0
+"""Times a sensor's noise by which the unknown between rows makes a fit worthless, if it does not even fall by this order where
+rows are closer."""
+
+ORDERS = (0.5, 4.0)
+"""Least and largest order that is believed; a cubic through exact values has the largest."""
+
+BETWEEN = (0.0, 0.25, 0.5, 0.75)
+"""Where between rows signals are compared."""
+
+OTHER_RATE = 0.25
+"""Part of a rate by which it may differ from that of the spline through the values, which must be sure to half of it."""
+
+
+class Gap(NamedTuple):
+    """What happens between rows: an error [SI], rms, in units of the noise of a channel, and the order with which it falls."""
+
+    channel: str
+    error: float
+    noises: float
+    order: float
+
+
+def cubic(signal: Sampled, every: int, derived: bool) -> Sampled:
+    """The signal by one in so many rows; rates that were `derived` from all rows are derived from these."""
+    rates = None if derived else signal.rates[::every]
+    return Sampled(signal.times[::every], signal.values.detach()[::every], rates)
+
+
+def is_derived(signal: Sampled) -> bool:
+    """Whether its rates are those of the spline through its values."""
+    return bool(np.allclose(spline_rates(signal), signal.rates.numpy(), rtol=1e-9, atol=1e-12))
+
+
+def spline_rates(signal: Sampled) -> Array:
+    t = signal.times.numpy()
+    return CubicSpline(t, signal.values.detach().numpy())(t, 1)
+
+
+def extrapolated(by: Mapping[int, Tensor]) -> tuple[float, float]:
+    """RMS error of a quantity at every row, from those by every row, every second and every fourth; and the observed order."""
+    half, quarter = (float((by[2 * k] - by[k]).square().mean().sqrt()) for k in (1, 2))
+    order = float(np.clip(np.log2(max(quarter, 1e-300) / max(half, 1e-300)), *ORDERS))
+    return half / (2**order - 1), order
+
+
+def gaps(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> list[Gap]:
+    """What the rows of an actuator's set-point leave open, in the channels that have sensors."""
+    rig, out = recording.rig, []
+    actuator = rig.actuators[name]
+    signal = rig.reference[actuator.setpoint]
+    if not isinstance(signal, Sampled) or len(signal.times) < 9:
+        return []
+    feed = rig.reference[actuator.feed_forward] if actuator.feed_forward else None
+    t, derived = signal.times, is_derived(signal)
+    inside = torch.cat([t[:-1] + part * t.diff() for part in BETWEEN]).sort().values
+    inside = inside[inside <= t[4 * ((len(t) - 1) // 4)]]
+    x, v = signal(inside)
+    places, efforts = {}, {}
+    for every in (1, 2, 4):
+        places[every], rate = cubic(signal, every, derived)(inside)
+        efforts[every] = demanded(actuator, feed, every, inside, places[every], rate, x, v)
+    for own, by in ((channel(rig, actuator.measures), places), (channel(rig, name), efforts)):
+        if own in sensors and own in recording.samples:
+            error, order = extrapolated(by)
+            out.append(Gap(own, error, error / sensors[own].noise, order))
+    return out
+
+
+@torch.no_grad()
+def demanded(
+    actuator: Actuator, feed: nn.Module | None, every: int, t: Tensor, place: Tensor, rate: Tensor, x: Tensor, v: Tensor
+) -> Tensor:
+    """What the controller makes (n,) of a set-point while its coordinate is at x and moves at v."""
+    known = cubic(feed, every, is_derived(feed)) if isinstance(feed, Sampled) else feed
+    more = torch.zeros_like(x) if known is None else known(t)[0]
+    return actuator(torch.stack((place, rate, more, x, v), -1))
+
+
+def setpoint_findings(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Finding]:
+    """What looks wrong with the set-points of a recording."""
+    for name, actuator in recording.rig.actuators.items():
+        signal = recording.rig.reference[actuator.setpoint]
+        if not isinstance(signal, Sampled):
+            continue
+        found = other_rate(recording, actuator.setpoint) or sparse_finding(recording, sensors, name)
+        if found is not None:
+            yield found
+
+
+def sparse_finding(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> Finding | None:
+    """The words on set-points that are too far apart."""
+    found = gaps(recording, sensors, name)
+    if not found or (worst := max(found, key=lambda gap: gap.noises)).noises <= NOTICED:
+        return None
+    setpoint = recording.rig.actuators[name].setpoint
+    signal = recording.rig.reference[setpoint]
+    assert isinstance(signal, Sampled)
+    apart = float(signal.times.diff().max())
+    enough = apart * (NOTICED / worst.noises) ** (1 / worst.order)
+    rates = f", and its rate is not known (no column {setpoint}_dot)" if is_derived(signal) else ""
+    size = f"{worst.error:.2g} {unit(worst.channel)}, {worst.noises:.2g} times the noise of {worst.channel}"
+    text = (
+        f"recording `{recording.name}`: set-points {setpoint} every {1e3 * apart:.3g} ms are too sparse for this motion"
+        f"{rates}: what they leave open between them makes {size}; give them every {1e3 * enough:.2g} ms"
+    )
+    return Finding(f"set-points {setpoint}", recording.name, text, worst.noises > HOPELESS and worst.order <= ORDERLESS)
+
+
+def other_rate(recording: Recording, setpoint: str) -> Finding | None:
+    """The words on rates that are not those of the values."""
+    signal = recording.rig.reference[setpoint]
+    assert isinstance(signal, Sampled)
+    given, own = signal.rates.numpy(), spline_rates(signal)
+    fewer = spline_rates(Sampled(signal.times[::2], signal.values.detach()[::2]))
+    size, off, unsure = (float(np.sqrt(np.mean(e**2))) for e in (own, given - own, fewer - own[::2]))
+    if off <= OTHER_RATE * max(size, float(np.sqrt(np.mean(given**2)))) or unsure > OTHER_RATE / 2 * size:
+        return None
+    factor = float(given @ own) / max(float(own @ own), 1e-300)
+    looks = "its sign looks opposite" if factor < 0 else f"it is {factor:.3g} times that"
+    text = (
+        f"recording `{recording.name}`: {setpoint}_dot is not the rate of {setpoint}: it differs by {off:.3g} rms from that "
+        f"of a spline through it, {size:.3g}; {looks}"
+    )
+    return Finding(f"rate of {setpoint}", recording.name, text, grave=True)

@@ -1,0 +1,195 @@
+"""The criterion of a motion that could be made, and its slopes by the knots: exact, by 2 n runs of the adjoint.
+
+With the whitened Jacobian J (m, n) of the samples by the coordinates x, the covariance is C = (J'J)^-1; for a criterion phi
+and G = d phi / d(J'J), its derivative by a knot k is
+
+    d phi / dk = sum_j W_j . d/dx_j (dr/dk),        W = 2 J G held fixed,
+
+the difference along each x_j of what the discrete adjoint gives by the knots for the weights W_j: 2 n runs, however many
+knots there are.
+"""
+
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from torchsoft.solve.simulate import simulate
+from torchsoft.sysid.design.criterion import Criterion, chosen, deviations
+from torchsoft.sysid.design.knots import Moves
+from torchsoft.sysid.fit.information import fisher
+from torchsoft.sysid.problem.prediction import Frozen, Steps, choice, predict, prepared
+from torchsoft.sysid.problem.problem import Problem
+from torchsoft.sysid.problem.readout import Signals
+from torchsoft.sysid.problem.recording import Array, Begun, Recording
+from torchsoft.sysid.problem.workers import Runner
+from torchsoft.threads import side_by_side, single_threaded
+
+Range = tuple[float, float]
+"""Least and largest value of a channel [its unit]."""
+
+DIFFERENCE = 1e-2
+"""Step of the difference along a coordinate [1]: wide, since slopes are rough where points touch, leave and slip."""
+
+MARGIN = 0.97
+"""Part of the way to a limit from which on it costs, since peaks lie between samples."""
+
+PRICE = 5.0
+"""What a sample at twice the way to a limit costs, in units of the criterion."""
+
+
+class Look(NamedTuple):
+    """One motion at one x: the criterion, what excess costs, how much of the way to their limits channels go, the covariance C
+    (n, n), the criterion's derivative G (n, n) by the Fisher matrix, the rows J (m, n) of the samples, the steps, and the
+    signals of the run."""
+
+    value: float
+    cost: float
+    peaks: dict[str, float]
+    C: Array
+    G: Array
+    J: Array
+    steps: Frozen
+    signals: Signals
+
+
+class Planner:
+    """The criterion of motions of one recording of a problem, and its slopes by their knots."""
+
+    def __init__(
+        self, problem: Problem, plan: str, moves: Moves, limits: Mapping[str, Range], criterion: Criterion,
+        names: Sequence[str] | None, rtol: float, workers: int,
+    ) -> None:  # fmt: skip
+        self.problem, self.k, self.moves, self.limits = problem, problem.names.index(plan), moves, dict(limits)
+        self.recording, self.criterion, self.rtol, self.workers = problem.recordings[self.k], criterion, rtol, workers
+        self.names, _ = chosen(problem, problem.coordinates.start, names)
+        criterion.check(self.names)
+        self.grid = self.recording.grid(problem.interpolated)
+        self._others = Runner(problem.recordings, workers)
+        self._known: dict[bytes, Array] = {}
+        self._idle: list[Begun] = []
+        self._pulls = [problem.noise[ch].whitener(self.recording.samples[ch][0]) if ch in problem.noise else None
+                       for ch in problem.sensors if ch in self.recording.samples]  # fmt: skip
+        self.runs = self.gradients = 0
+
+    def recorded(self, x: Array) -> Array:
+        """A root (.., n) of the Fisher matrix of the other recordings. Raises `ValueError` where they are lost."""
+        if x.tobytes() not in self._known:
+            p, which = self.problem, [name for name in self.problem.names if name != self.recording.name]
+            J = np.zeros((0, len(x)))
+            if which:
+                at = p.residuals(self._others, x, which, self.rtol, p.coordinates.free)
+                if at.lost:
+                    reasons = "; ".join(f"`{name}`: {lost.reason}" for name, lost in at.lost.items())
+                    raise ValueError(f"a draw of the parameters does not reproduce what was recorded: {reasons}")
+                J = at.J[: len(at.J) - len(p.coordinates.priors)]
+            self._known[x.tobytes()] = np.linalg.qr(J)[1]
+        return self._known[x.tobytes()]
+
+    def _begun(self) -> Begun:
+        return self._idle.pop() if self._idle else self.recording.begin()
+
+    def look(self, z: Array, x: Array, steps: Steps | None = None) -> Look:
+        """The motion z at x. Raises `SimulationFailed`."""
+        p, c, given = self.problem, self.problem.coordinates, self.rtol if steps is None else steps
+        by_name = {self.recording.name: given} if isinstance(given, Frozen) else given
+        (job,) = p.jobs(x, [self.recording.name], by_name, c.free)
+        begun = self._begun()
+        begun.rig.reference = self.moves.reference(torch.from_numpy(z))
+        run = predict(begun, job.values, self.grid, job.names, given)
+        self._idle.append(begun)
+        self.runs += 1
+        J = p.gather(x, [job], [run]).J
+        prior = J[len(J) - len(c.priors) :]
+        J = J[: len(J) - len(c.priors)]
+        C = np.zeros((len(x), len(x)))
+        C[np.ix_(c.free, c.free)] = fisher(np.concatenate((self.recorded(x), prior, J))[:, c.free])[0]
+        _, T = chosen(p, x, self.names)
+        value, S = self.criterion(T @ C @ T.T)
+        signals = Signals(run.t, self.recording.channels, run.signals, None)
+        reached = {name: np.abs(part) for name, part in self.reached(signals).items()}
+        peaks = {name: float(part.max()) for name, part in reached.items()}
+        cost = PRICE * sum(float(np.sum(np.maximum(part - MARGIN, 0.0) ** 2)) for part in reached.values())
+        frozen = Frozen(run.knots) if run.knots is not None else given
+        assert isinstance(frozen, Frozen)
+        return Look(value, cost, peaks, C, -C @ T.T @ S @ T @ C, J, frozen, signals)
+
+    def reached(self, signals: Signals) -> dict[str, Array]:
+        """Where limited channels are (G,) between the middle of their range, 0, and its ends, -1 and 1."""
+        return {
+            name: (2 * signals.values[:, signals.names.index(name)] - low - high) / (high - low)
+            for name, (low, high) in self.limits.items()
+        }
+
+    def slopes(self, z: Array, x: Array, at: Look) -> Array:
+        """Derivative by z of the criterion and of what excess costs, on the steps of the look. Raises `SimulationFailed`."""
+        c, W = self.problem.coordinates, 2 * at.J @ at.G
+        low, high = c.bounds
+        tasks, beside = list[tuple[Array, Array]](), self.overload(at.signals)  # points x, weights on the signals there
+        for j in np.flatnonzero(c.free & (np.abs(at.J).max(0) > 0)):
+            ahead, behind = x.copy(), x.copy()
+            ahead[j], behind[j] = min(x[j] + DIFFERENCE, high[j]), max(x[j] - DIFFERENCE, low[j])
+            w = W[:, j] / (ahead[j] - behind[j])
+            if c.all[j].of_the_rig:
+                weights = self.pulled(x, at.signals, w)
+                tasks += [(ahead, weights), (behind, -weights)]
+            else:  # the run is the same, only what a sensor makes of it is not
+                beside += self.pulled(ahead, at.signals, w) - self.pulled(behind, at.signals, w)
+        if beside.any():
+            tasks.append((x, beside))
+
+        def swept(i: int) -> Array:
+            return self.adjoint(z, tasks[i][0], at.steps, tasks[i][1])
+
+        with single_threaded():
+            return np.asarray(sum(part for _, part in side_by_side(swept, len(tasks), self.workers)))
+
+    def adjoint(self, z: Array, x: Array, steps: Steps, weights: Array) -> Array:
+        """Slopes by z of weights (G, channels) on the signals of the run at x. Raises `SimulationFailed`."""
+        begun, variables = self._begun(), torch.tensor(z, requires_grad=True)
+        reference = self.moves.reference(variables)
+        y0 = prepared(begun, self.problem.values(x, self.k), ()).y0.detach()
+        run = simulate(begun.rig, self.grid.t, y0=y0, reference=reference, gradient="discrete", **choice(steps))
+        signals = run.together(*self.recording.channels)[self.grid.early :]
+        (slopes,) = torch.autograd.grad(signals, variables, torch.from_numpy(weights))
+        self._idle.append(begun)
+        self.gradients += 1
+        return slopes.numpy()
+
+    def pulled(self, x: Array, signals: Signals, w: Array) -> Array:
+        """What weights w (m,) on the residuals are on the signals (G, channels)."""
+        out, at = np.zeros(signals.values.shape), 0
+        for one, W in zip(self.problem.readouts(x, self.k).values(), self._pulls):
+            t, measured = self.recording.samples[one.channel]
+            own = w[at : at + len(t)] if W is None else W.T @ w[at : at + len(t)]
+            y, _, _ = one.expected(signals, t)
+            out, at = out + one.pulled_back(signals, t, one.residuals(y, measured)[1] * own), at + len(t)
+        return out
+
+    def overload(self, signals: Signals) -> Array:
+        """Derivative of what excess costs by the signals (G, channels)."""
+        out = np.zeros(signals.values.shape)
+        for name, part in self.reached(signals).items():
+            low, high = self.limits[name]
+            excess = np.maximum(np.abs(part) - MARGIN, 0.0) * np.sign(part)
+            out[:, signals.names.index(name)] = 4 * PRICE * excess / (high - low)
+        return out
+
+    def deviations(self, x: Array, at: Look) -> dict[str, float]:
+        """Relative standard deviations of the parameters."""
+        names, T = chosen(self.problem, x, self.names)
+        return deviations(names, T, at.C)
+
+    def made(self, z: Array, x: Array, at: Look) -> Recording:
+        """The recording that follows a motion, with the samples that its sensors would give without noise."""
+        rig = deepcopy(self.recording.rig)
+        with torch.no_grad():
+            rig.reference = self.moves.reference(torch.from_numpy(z))
+        samples = {}
+        for channel, one in self.problem.readouts(x, self.k).items():
+            t, _ = self.recording.samples[channel]
+            samples[channel] = t, one.expected(at.signals, t)[0]
+        return replace(self.recording, rig=rig, samples=samples)

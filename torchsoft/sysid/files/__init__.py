@@ -1,0 +1,1 @@
+"""Identification from files: a configuration, and measured recordings."""

@@ -1,0 +1,229 @@
+"""What a TOML file states of an identification: what is known, what is unknown, and how good the sensors are."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, model_validator
+
+from torchsoft.physics.paper import NAMES
+from torchsoft.sysid.conclude import Assumed
+from torchsoft.sysid.fit.robust import Loss
+from torchsoft.sysid.fit.stages import Method
+from torchsoft.sysid.problem.underway import LEAD
+from torchsoft.sysid.problem.unknowns import Sensor, Unknown
+from torchsoft.sysid.solve import RTOL
+from torchsoft.tables import LISTED, SEED, Table, from_toml
+
+VOCABULARY = {own: name for name, own in NAMES.items()}
+"""The rig's own names of parameters, by which they are understood too, with those of `Parameters`."""
+
+Name = Annotated[str, Field(min_length=1, max_length=100)]
+File = Annotated[str, Field(min_length=1, max_length=1000)]
+
+
+class Settings(Table):
+    """How to fit: the arguments of `identify` by the same names."""
+
+    rtol: float = Field(RTOL, ge=1e-8, le=1e-2)
+    starts: int = Field(1, ge=1, le=2**20)
+    loss: Loss = "linear"
+    method: Method = "gauss_newton"
+    workers: int = Field(1, ge=1, le=1000)
+    seed: int = Field(0, ge=0, le=SEED)
+    tightenings: int = Field(2, ge=0, le=10)
+    assumptions: Assumed = "checked"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _has_no_step(cls, given: Any) -> Any:
+        if isinstance(given, dict) and "step" in given:
+            raise ValueError(
+                "there is no `step` any more: tolerances choose the steps; leave it out, or give the relative tolerance `rtol` "
+                f"({RTOL:g})"
+            )
+        return given
+
+
+SURE = 1e-12
+"""Standard deviations [SI], over the value where that is larger than one, below which a number is known: say 0."""
+
+
+def told_apart(sd: float, value: float = 1.0) -> float:
+    """A standard deviation that is zero or can be computed with. Raises `ValueError` for another."""
+    if 0 < sd < (least := SURE * max(abs(value), 1.0)):
+        raise ValueError(f"should be 0, or at least {least:g}, but is {sd}")
+    return sd
+
+
+class Rest(Table):
+    """A recording that begins at rest, the disc on the lower pad at `scenario.x_C0`, known to `x_sd` [m], and the bracket clear
+    of it."""
+
+    kind: Literal["rest"] = "rest"
+    x_sd: Annotated[float, AfterValidator(told_apart)] = Field(default=0.0, ge=0, le=0.1)
+
+
+class Known(Table):
+    """What is known of a coordinate: mean and standard deviation [m, rad, m/s or rad/s]."""
+
+    mean: float = Field(ge=-1e6, le=1e6)
+    sd: float = Field(ge=0, le=1e6)
+
+    @model_validator(mode="after")
+    def _is_a_distribution(self) -> "Known":
+        told_apart(self.sd, self.mean)
+        return self
+
+
+class Moving(Table):
+    """A recording that begins anywhere, in motion or in mid-grasp: its samples of the first `lead` [s] tell where, with what is
+    `given` of coordinates such as "disc.x" and "disc.v_x"."""
+
+    kind: Literal["underway"] = "underway"
+    lead: float = Field(default=LEAD, gt=0, le=10)
+    given: dict[Name, Known] = Field(default_factory=dict)
+
+
+Beginning = Annotated[Rest | Moving, Field(discriminator="kind")]
+
+
+class Missing(Table):
+    """Constants [m, N] in the place of columns that a recording does not have."""
+
+    x_d: float | None = Field(default=None, ge=-100, le=100)
+    y_d: float | None = Field(default=None, ge=-100, le=100)
+    F_ff: float | None = Field(default=None, ge=-1e9, le=1e9)
+
+    def over(self, other: "Missing") -> dict[str, float]:
+        """Those of this table, and of the other where this has none."""
+        both = other.model_dump() | {name: value for name, value in self.model_dump().items() if value is not None}
+        return {name: value for name, value in both.items() if value is not None}
+
+
+class KelvinVoigtPads(Table):
+    """Pads of one retardation time, `pad.tau`."""
+
+    kind: Literal["kelvin_voigt"] = "kelvin_voigt"
+
+
+class StandardLinearPads(Table):
+    """Pads that are stiffer at first: `E_instant` [Pa] above `pad.E`, which is the relaxed modulus."""
+
+    kind: Literal["standard_linear_solid"] = "standard_linear_solid"
+    E_instant: float = Field(ge=1.0, le=1e13)
+    tau_instant: float = Field(default=1e-4, ge=1e-9, le=1e6)
+
+
+Pads = Annotated[KelvinVoigtPads | StandardLinearPads, Field(discriminator="kind")]
+
+
+class Entry(Table):
+    """One more recording, called `name` or like its file: its columns stand in `file`, or in several `files` next to the
+    configuration, each with times of its own. Without a file it has what is particular about the recording of that name."""
+
+    name: Name | None = None
+    file: File | None = None
+    files: Annotated[tuple[File, ...], LISTED] = ()
+    settings: dict[str, Any] = Field(default_factory=dict)
+    start: Beginning | None = None
+    missing: Missing = Missing()
+
+    @model_validator(mode="after")
+    def _is_named(self) -> "Entry":
+        if self.file is not None and self.files:
+            raise ValueError("a recording has a `file` or `files`, not both")
+        if self.name is None and self.file is None:
+            raise ValueError("a recording needs a `file`, or the `name` of one that is given elsewhere")
+        return self
+
+    @property
+    def paths(self) -> tuple[str, ...]:
+        return self.files or ((self.file,) if self.file is not None else ())
+
+
+class Law(Table):
+    """A competing law: `settings` that differ, such as `contact.friction`, another material of the `pads`, `unknowns` that
+    it has besides or with other bounds, and those that it is `without`."""
+
+    settings: dict[str, Any] = Field(default_factory=dict)
+    pads: Pads | None = None
+    unknowns: dict[str, Unknown] = Field(default_factory=dict)
+    without: Annotated[tuple[str, ...], LISTED] = ()
+
+
+class Config(Table):
+    """An identification as a TOML file states it.
+
+    `settings` are known numbers, by the groups and names of `Parameters`; `unknowns` and `sensors` are tables by the dotted
+    names of parameters and by channels; `heldout` names recordings that are predicted and not fitted, `ignore` columns that
+    are left out, and `meant` findings that are no mistakes. `missing` and `start` hold for all recordings that say nothing
+    else. `compare` has competing laws by name.
+    """
+
+    unknowns: dict[str, Unknown]
+    sensors: dict[str, Sensor]
+    settings: dict[str, Any] = Field(default_factory=dict)
+    pads: Pads = KelvinVoigtPads()
+    start: Beginning = Rest()
+    missing: Missing = Missing()
+    fit: Settings = Field(default_factory=lambda: Settings.model_validate({}))
+    recordings: Annotated[tuple[Entry, ...], LISTED] = ()
+    compare: dict[Name, Law] = Field(default_factory=dict)
+    heldout: Annotated[tuple[str, ...], LISTED] = ()
+    ignore: Annotated[tuple[str, ...], LISTED] = ()
+    meant: Annotated[tuple[str, ...], LISTED] = ()
+
+    @model_validator(mode="after")
+    def _laws_have_likelihoods(self) -> "Config":
+        if self.compare and self.fit.loss != "linear":
+            raise ValueError(f"compare needs likelihoods: fit.loss must be 'linear', not '{self.fit.loss}'")
+        known = {understood(name) for name in self.unknowns}
+        for law, one in self.compare.items():
+            if strange := [name for name in one.without if understood(name) not in known]:
+                raise ValueError(f"compare.{law}.without: `{strange[0]}` is not an unknown")
+        return self
+
+
+def read_config(path: str | Path) -> Config:
+    """Raises `ValueError` naming the file and the field, `OSError` for a file that cannot be read."""
+    return from_toml(path, Config.model_validate)
+
+
+def understood(name: str) -> str:
+    """A parameter's name among `Parameters`, where it is called by the rig's own."""
+    return VOCABULARY.get(name, name)
+
+
+def in_one_vocabulary(unknowns: Mapping[str, Unknown]) -> dict[str, Unknown]:
+    """Unknowns by their names among `Parameters`, where they have one. Raises `ValueError` for one that is there by both."""
+    out: dict[str, Unknown] = {}
+    for name, one in unknowns.items():
+        if understood(name) in out:
+            raise ValueError(f"unknowns.{name} is there twice: it is {understood(name)} too")
+        ratio = one.ratio_to
+        out[understood(name)] = one.model_copy(update={"ratio_to": understood(ratio)}) if ratio is not None else one
+    return out
+
+
+def flattened(settings: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
+    """Values by their dotted names among `Parameters`."""
+    for key, value in settings.items():
+        if isinstance(value, dict) and value:
+            yield from flattened(value, f"{within}{key}.")
+        else:
+            yield understood(within + key), value
+
+
+def groups(*settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings by group and name, the later ones first."""
+    tree: dict[str, Any] = {}
+    for given in settings:
+        for name, value in flattened(given):
+            group, _, field = name.partition(".")
+            if not field:
+                tree[group] = value
+            else:
+                old = tree.get(group)
+                tree[group] = (old if isinstance(old, dict) else {}) | {field: value}
+    return tree

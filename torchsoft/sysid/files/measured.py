@@ -1,0 +1,302 @@
+"""Recordings and problems as files state them: tables of measurements, and a TOML file (`configuration`).
+
+Every error is a `ValueError` in a sentence that names the file, and the row and column or the field.
+"""
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import TypeAdapter
+
+from torchsoft.channels import CHANNELS, MEASURED, SETPOINTS
+from torchsoft.parameters import Parameters
+from torchsoft.physics.material import Material, StandardLinearSolid
+from torchsoft.physics.motion import Reference, Sampled
+from torchsoft.physics.paper import SoftGrasp, apart
+from torchsoft.sysid.files.columns import Tables, read_tables
+from torchsoft.sysid.files.configuration import (
+    Beginning,
+    Config,
+    Entry,
+    KelvinVoigtPads,
+    Law,
+    Moving,
+    Pads,
+    Rest,
+    StandardLinearPads,
+    groups,
+    in_one_vocabulary,
+    read_config,
+    understood,
+)
+from torchsoft.sysid.fit.fit import Unreachable
+from torchsoft.sysid.problem.first_samples import begin_underway
+from torchsoft.sysid.problem.problem import Problem
+from torchsoft.sysid.problem.recording import Recording
+from torchsoft.sysid.problem.start import BOUNDS, AtRest
+from torchsoft.sysid.problem.unknowns import Sensor, Unknown
+from torchsoft.tables import InvalidTable, line, refusing
+
+BEGINNING, CREEP = 10e-3, 20e-3
+"""For so long [s] nothing may move faster than this [m/s]: a disc put down on a pad still settles."""
+
+APART = 1e-3
+"""How far [m] the first samples may be from where the run begins; the disc may roll into a dent while it settles."""
+
+SUNK = 3e-4
+"""How far [m] below undeformed touch the bracket may begin: a disc sinks into its pad under its weight."""
+
+WAY_OUT = 'or say start = {kind = "underway"} for a recording that begins in motion or in mid-grasp'
+
+STATED = "as stated"
+"""The name of the law of the file itself among competing ones."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A problem as its files state it; `tables` are the recordings' by name; `laws`, if there are competing ones, are that
+    problem and those with the others."""
+
+    problem: Problem
+    config: Config
+    tables: dict[str, Tables]
+    laws: dict[str, Problem] = field(default_factory=dict)
+
+
+def known_parameters(config: Path, name: str, tables: Tables, *settings: dict[str, Any]) -> Parameters:
+    """Parameters of the recording `name`: the settings, the later ones first, with the reach of its set-points as scenario.
+
+    Raises `ValueError` naming the configuration and the field, or the row where nothing is grasped.
+    """
+    tree, whose = groups(*settings), f"{config}, settings of `{name}`"
+    made: dict[str, Any] = {}
+    for group, declared in Parameters.model_fields.items():
+        kind: Any = declared.annotation
+        with refusing(tree.get(group), f"{whose}: {group}"):
+            made[group] = TypeAdapter(kind).validate_python(tree.get(group, {}))
+    across, down = (tables.of(one) for one in SETPOINTS)
+    x, y = across.values["x_d"], down.values["y_d"]
+    if y.min() >= (touch := apart(Parameters.model_construct(**made))):
+        raise ValueError(
+            f"{down.at(int(y.argmin()))}, column `y_d`: the bracket never comes lower than {1e3 * y.min():.4g} mm, but "
+            f"the pads of {config} touch the disc at {1e3 * touch:.4g} mm ({STACK}): nothing is grasped"
+        )
+    scenario = tree.get("scenario")
+    given = scenario if isinstance(scenario, dict) else {}
+    signed = x - (made["scenario"].x_C0 if "x_C0" in given else x[0])
+    part = 0.5 if made["control"].senses == "bracket" else 1.0  # a disc rolls half as far as the bracket
+    lowest, farthest = int(y.argmin()), int(np.abs(signed).argmax())
+    mine = {"y_Br_grasp": float(y[lowest]), "travel": part * float(signed[farthest])}
+    try:
+        return Parameters.model_validate(tree | {"scenario": mine | given})
+    except InvalidTable as error:
+        raise ValueError(
+            f"{whose}: {error} (scenario.y_Br_grasp and scenario.travel, unless given, are those of {down.at(lowest)}, column "
+            f"`y_d`, and of {across.row} {across.rows[farthest]}, column `x_d`)"
+        ) from None
+
+
+STACK = "twice pad.height and disc.radius, and bracket.cm_height"
+"""What decides where the pads touch."""
+
+
+def check_plausible(tables: Tables, p: Parameters, sensors: Mapping[str, Sensor]) -> None:
+    """Raises `ValueError` for values that no such rig can have; it names row and column."""
+    L, H = p.pad.length, apart(p)
+    ranges = {"rad": (-100.0, 100.0), "m/s": (-10.0, 10.0), "rad/s": (-1e3, 1e3), "N": (-1e4, 1e4)}
+    for name, (_, column) in tables.columns.items():
+        unit, table = CHANNELS[name].unit, tables.of(name)
+        low, high = ranges.get(unit, (-L, 2 * L) if name.startswith("x") else (0.25 * H, 2 * H))
+        by = "" if unit in ranges else " (pad.length)" if name.startswith("x") else f" ({STACK})"
+        for i in np.flatnonzero((column < low) | (column > high))[:1].tolist():
+            raise ValueError(
+                f"{table.at(i)}, column `{name}`: {column[i]:.4g} {unit} is not plausible, it should be between {low:.3g} "
+                f"and {high:.3g} {unit}{by}; is the unit in the heading right?"
+            )
+
+
+def check_rest(tables: Tables, p: Parameters, sensors: Mapping[str, Sensor], x_sd: float) -> None:
+    """Raises `ValueError` for a recording that does not begin at rest, with the disc where `scenario.x_C0` says and the bracket
+    clear of it; it names row and column."""
+    H, x_C0, first = apart(p), p.scenario.x_C0, tables.begin
+    down = tables.of("y_d")
+    begin = {"x_d": x_C0, "x_C": x_C0, "x_Br": x_C0, "theta": 0.0, "y_Br": down.values["y_d"][0]}
+    for name, (t, column) in tables.columns.items():
+        unit, table, here = CHANNELS[name].unit, tables.of(name), np.flatnonzero(np.isfinite(column))
+        asked = name not in MEASURED
+        if not here.size or unit == "N" or (not asked and t[here[0]] > first + BEGINNING):
+            continue
+        sensor, size = sensors.get(name), 1 / p.disc.radius if unit.startswith("rad") else 1.0
+        slack, bias = (8 * sensor.noise, sensor.bias) if sensor else (0.0, 0.0)
+        reach = (APART + BOUNDS * x_sd) * size + slack + bias
+        if name in begin and abs(column[here[0]] - begin[name]) > reach:
+            what = "scenario.x_C0" if name.startswith("x") else "the set-point y_d" if name == "y_Br" else "the start"
+            opposite = abs(column[here[0]] + begin[name]) <= reach
+            raise ValueError(
+                f"{table.at(int(here[0]))}, column `{name}`: it begins at {column[here[0]]:.5g} {unit}, but {what} is "
+                f"{begin[name]:.5g} {unit}" + ("; is its sign opposite?" if opposite else f"; mend that, {WAY_OUT}")
+            )
+        t = t[here]
+        early = (t <= first + BEGINNING) | (np.arange(len(t)) < 2)
+        y, t = column[here][early], t[early]
+        moving = np.abs(y) > CREEP * size + slack + bias
+        if not unit.endswith("/s"):
+            moving = np.abs(y - y[0]) > CREEP * size * (t - t[0]) + slack
+        for i in np.flatnonzero(moving)[:1].tolist():
+            raise ValueError(
+                f"{table.at(int(here[i]))}, column `{name}` moves already: a recording must begin at rest, the disc on the "
+                f"lower pad and the bracket clear of it, {WAY_OUT}"
+            )
+    if (y := down.values["y_d"][0]) < H - SUNK:
+        raise ValueError(
+            f"{down.at(0)}, column `y_d`: the bracket must begin clear of the disc, but begins at {1e3 * y:.4g} mm, and the "
+            f"pads touch the disc at {1e3 * H:.4g} mm ({STACK}); mend that, {WAY_OUT}"
+        )
+
+
+def read_recording(path: str | Path, name: str, p: Parameters, sensors: dict[str, Sensor]) -> Recording:
+    """A recording of one CSV or NetCDF file with the given settings. Raises `ValueError` naming row and column."""
+    return recording(read_tables([Path(path)], (), {}), name, p, sensors)
+
+
+AT_REST, PLAIN = Rest(), KelvinVoigtPads()
+"""How a recording begins, and what the pads are made of, where nothing is said."""
+
+
+def recording(
+    tables: Tables, name: str, p: Parameters, sensors: dict[str, Sensor], start: Beginning = AT_REST, pads: Pads = PLAIN
+) -> Recording:
+    """The recording that tables hold, of a rig with the parameters p. Raises `ValueError` naming row and column."""
+    check_plausible(tables, p, sensors)
+    if isinstance(start, Rest):
+        check_rest(tables, p, sensors, start.x_sd)
+    columns, samples, files = tables.columns, {}, ", ".join(str(table.path) for table in tables.tables)
+    for channel in (c for c in MEASURED if c in columns):
+        t, y = columns[channel]
+        here = np.isfinite(y)
+        if here.sum() >= 2:
+            samples[channel] = (t[here], y[here])
+        elif channel in sensors:
+            raise ValueError(
+                f"{tables.of(channel).path}, column `{channel}` has {here.sum()} samples, but needs at least two"
+            )
+    if not set(samples) & set(sensors):
+        raise ValueError(f"{files} has no column for any of the sensors {', '.join(sensors)}")
+    rates = {f"{name}_dot": columns.get(f"{name}_dot") for name in SETPOINTS}
+    signals = {name: sampled(*columns[name], rates.get(f"{name}_dot")) for name in (*SETPOINTS, "F_ff")}
+    made = Recording(name, rig(p, Reference(**signals), pads), samples)
+    if isinstance(start, Moving):
+        given = {coordinate: (one.mean, one.sd) for coordinate, one in start.given.items()}
+        used = {channel: sensors[channel] for channel in sensors if channel in samples}
+        return begin_underway(made, used, lead=start.lead, given=given)
+    return replace(made, start=AtRest(x_sd=start.x_sd))
+
+
+def sampled(t: np.ndarray, y: np.ndarray, rate: tuple[np.ndarray, np.ndarray] | None) -> Sampled:
+    """A set-point, with the rate of its column, if there is one."""
+    times, values = torch.tensor(t), torch.tensor(y)
+    return Sampled(times, values, None if rate is None else torch.tensor(rate[1]))
+
+
+def rig(p: Parameters, reference: Reference, pads: Pads) -> SoftGrasp:
+    """The paper's rig, on pads of the material that is stated. Raises `ValueError` for moduli that do not fit together."""
+    material: Material | None = None
+    if isinstance(pads, StandardLinearPads):
+        if pads.E_instant <= p.pad.E:
+            raise ValueError(
+                f"pads.E_instant = {pads.E_instant:g} must be above pad.E = {p.pad.E:g}, the relaxed modulus"
+            )
+        q = p.pad
+        material = StandardLinearSolid(q.E, pads.E_instant, q.nu, q.rho, q.tau, q.depth, pads.tau_instant)
+    return SoftGrasp(p, reference, material=material)
+
+
+def stem(path: Path) -> str:
+    """The name of a file without its ending, in UTF-8 even where the system knows ASCII only."""
+    return os.fsencode(path.stem).decode("utf-8", "replace")
+
+
+def sources(data: Sequence[str | Path], config: Path, stated: Config) -> dict[str, tuple[Entry, list[Path]]]:
+    """What is particular about every recording, and its files, by name. Raises `ValueError` for names that do not fit."""
+    own = {entry.name or stem(Path(entry.paths[0])): entry for entry in stated.recordings}
+    files = [(stem(Path(file)), [Path(file)]) for file in data]
+    files += [(name, [config.parent / path for path in entry.paths]) for name, entry in own.items() if entry.paths]
+    names = [name for name, _ in files]
+    if not files:
+        raise ValueError(f"there is nothing to identify from: no data file, and no recording with a file in {config}")
+    if len(own) < len(stated.recordings) or len(set(names)) < len(names):
+        raise ValueError(f"{config}: recordings need names of their own, but are called {line(', '.join(names))}")
+    if strange := [name for name in (*own, *stated.heldout) if name not in names]:
+        where = "heldout" if strange[0] in stated.heldout else "recordings"
+        raise ValueError(
+            f"{config}, {where}: there is no recording `{line(strange[0], 80)}`; the recordings' names are {', '.join(names)}"
+        )
+    if stated.heldout and set(stated.heldout) == set(names):
+        raise ValueError(f"{config}, heldout: it names every recording, so that nothing is left to fit")
+    return {name: (own.get(name, Entry(name=name)), paths) for name, paths in files}
+
+
+def load(data: Sequence[str | Path], config: str | Path) -> Case:
+    """The problem that data files and a configuration state. Raises `ValueError`, and `OSError` for what cannot be read."""
+    config = Path(config)
+    stated = read_config(config)
+    entries, tables = sources(data, config, stated), dict[str, Tables]()
+    for name, (entry, paths) in entries.items():
+        try:
+            tables[name] = read_tables(paths, stated.ignore, entry.missing.over(stated.missing))
+        except OSError as error:
+            if not entry.paths:
+                raise
+            own = "files" if entry.files else "file"
+            raise ValueError(
+                f"{config}, recordings: `{own}` of `{name}`: {line(error.filename)}: {error.strerror}"
+            ) from None
+    left_out = {name for one in tables.values() for table in one.tables for name in table.ignored}
+    if strange := [name for name in stated.ignore if name not in left_out]:
+        raise ValueError(f"{config}, ignore: no file has a column `{line(strange[0], 80)}`")
+
+    def problem(law: Law, what: str) -> Problem:
+        made = []
+        for name, (entry, _) in entries.items():
+            p = known_parameters(config, name, tables[name], stated.settings, entry.settings, law.settings)
+            try:
+                made.append(
+                    recording(
+                        tables[name], name, p, stated.sensors, entry.start or stated.start, law.pads or stated.pads
+                    )
+                )
+            except ValueError as error:
+                known = any(str(table.path) in str(error) for table in tables[name].tables)
+                raise error if known else ValueError(f"{config}{what}, recording `{name}`: {error}") from None
+        try:
+            return Problem(made, stated.sensors, unknowns_of(stated, law))
+        except ValueError as error:
+            raise ValueError(f"{config}{what}: {error}") from None
+
+    main = problem(Law(), "")
+    laws = {name: problem(law, f", compare.{name}") for name, law in stated.compare.items()}
+    if STATED in laws:
+        raise ValueError(
+            f"{config}, compare: the law of the file itself is called `{STATED}`; call the other one otherwise"
+        )
+    return Case(main, stated, tables, {STATED: main, **laws} if laws else {})
+
+
+def unknowns_of(stated: Config, law: Law) -> dict[str, Unknown]:
+    """What a law has to be found."""
+    without = {understood(name) for name in law.without}
+    mine = in_one_vocabulary(stated.unknowns) | in_one_vocabulary(law.unknowns)
+    return {name: one for name, one in mine.items() if name not in without}
+
+
+def unreachable(error: Unreachable, tables: Mapping[str, Tables]) -> str:
+    """Which recording the model could not follow, and the row of its file where the run ended."""
+    return "; ".join(
+        f"{tables[name].near(lost.time)}: the model cannot follow recording `{name}` here: {lost.reason}"
+        for name, lost in error.lost.items()
+    )

@@ -1,0 +1,1 @@
+"""Ways down the misfit, in stages, and what a Jacobian tells."""

@@ -1,0 +1,240 @@
+"""Which law made the data? Competing laws, each with its own unknowns, fitted to the same recordings and compared."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy import stats
+
+from torchsoft.solve.progress import SimulationFailed
+from torchsoft.sysid.answer.comparison import Comparison, LawFit, Series, Versus, judged
+from torchsoft.sysid.checks.colour import ROUNDS, colours
+from torchsoft.sysid.checks.misfit import notices, parts
+from torchsoft.sysid.fit.fit import Fit, Unreachable, gauss_newton
+from torchsoft.sysid.fit.plan import Stage, default_plan
+from torchsoft.sysid.fit.settle import FINER
+from torchsoft.sysid.fit.stages import progress_bar, run_stage
+from torchsoft.sysid.laws.evidence import Evidence, FittedLaw, ratio
+from torchsoft.sysid.laws.pattern import Motion, motion, where
+from torchsoft.sysid.problem.problem import Problem
+from torchsoft.sysid.problem.recording import Recording
+from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.solve import RTOL
+
+SAME = 1e-6
+"""Part of its range by which a signal of two references may differ."""
+
+CLOSE = 1e-3
+"""Relative tolerance of the last fits, on the misfit and on the coordinates."""
+
+
+def compare(
+    laws: Mapping[str, Problem], *, heldout: Sequence[str] = (), plans: Mapping[str, Sequence[Stage]] | None = None,
+    rtol: float = RTOL, starts: int = 1, again: bool = True, workers: int = 1, checkpoint: str | Path | None = None,
+    progress: bool = False,
+) -> Comparison:  # fmt: skip
+    """Fit every law to the same recordings, and say which one made them, or that the data cannot tell: `Comparison.verdict`, by
+    the rule of `torchsoft.sysid.answer.comparison`.
+
+    `laws` are problems by name with the same recordings and sensors, on rigs with other laws, and with unknowns of their
+    own: `dataclasses.replace(recording, rig=...)` makes such a recording. Bounds belong to the law: one that contains
+    another (a standard linear solid with any instantaneous modulus contains Kelvin and Voigt's) is never behind it by
+    more than its penalty, unless its bounds keep it away from the other. Noise is what the sensors state: where one
+    declares its `colour` it is found for every law, but no law may explain what it misses as noise that nobody
+    declared.
+
+    Recordings named in `heldout` are predicted, not fitted. `plans`, `rtol`, `starts`, `workers` and the folder
+    `checkpoint` are those of `identify`. With `again` every law but the best is fitted once more from where the best
+    one ended, as far as they share coordinates, and the better end is kept: no law is to lose by its start.
+
+    Raises `ValueError` for laws that were not given the same data, and for a law that cannot follow the data.
+    """
+    check_alike(laws, heldout)
+    which = [name for name in next(iter(laws.values())).names if name not in heldout]
+    folder = Path(checkpoint) if checkpoint is not None else None
+    evidence, runners = dict[str, Evidence](), dict[str, Runner]()
+    for name, problem in laws.items():
+        runners[name] = Runner(problem.recordings, workers, folder / name if folder is not None else None)
+        try:
+            law = fitted(name, problem, runners[name], which, (plans or {}).get(name), rtol, starts, progress)
+        except Unreachable as lost:
+            raise ValueError(f"the law `{name}` cannot follow the recordings: {lost}") from None
+        evidence[name] = Evidence(law, runners[name], which, heldout)
+    best = most_likely(evidence)
+    for name in (name for name in laws if again and name != best):
+        other = refitted(evidence[name].law, evidence[best].law, runners[name], which)
+        if other is not None:
+            better = Evidence(other, runners[name], which, heldout)
+            if better.fitted.log > evidence[name].fitted.log:
+                evidence[name] = better
+    return gathered(evidence, list(heldout))
+
+
+def check_alike(laws: Mapping[str, Problem], heldout: Sequence[str]) -> None:
+    """Raises `ValueError` where the laws were not given the same data."""
+    if len(laws) < 2:
+        raise ValueError(f"a comparison needs two laws or more, not {len(laws)}")
+    (first, one), *others = laws.items()
+    if set(heldout) - set(one.names) or not set(one.names) - set(heldout):
+        raise ValueError(f"`heldout` must name some of {list(one.names)}, but not all; it is {list(heldout)}")
+    for name, other in others:
+        both = f"the laws `{first}` and `{name}`"
+        if one.names != other.names:
+            raise ValueError(f"{both} have other recordings: {', '.join(one.names)} and {', '.join(other.names)}")
+        if one.sensors != other.sensors:
+            raise ValueError(f"{both} have other sensors, so that their likelihoods are of other data")
+        for mine, its in zip(one.recordings, other.recordings):
+            a, b = mine.samples, its.samples
+            if a.keys() != b.keys() or not all(np.array_equal(a[c][i], b[c][i]) for c in a for i in (0, 1)):
+                raise ValueError(f"recording `{mine.name}` of {both} has other samples")
+            if not same_reference(mine, its):
+                raise ValueError(f"the rigs of {both} follow another reference in recording `{mine.name}`")
+
+
+def same_reference(one: Recording, other: Recording) -> bool:
+    """Whether what both rigs follow is the same, as far as both have the same signals."""
+    t = torch.from_numpy(one.times)
+    a, b = (dict(zip(r.rig.signals, r.rig.follow(t).detach()[..., 0].unbind(-1))) for r in (one, other))
+    return all(float((a[k] - b[k]).abs().max()) <= SAME * float(a[k].abs().max()) for k in a.keys() & b.keys())
+
+
+def fitted(
+    name: str, problem: Problem, runner: Runner, which: Sequence[str], plan: Sequence[Stage] | None, rtol: float,
+    starts: int, progress: bool,
+) -> FittedLaw:  # fmt: skip
+    """A law where the plan ends, and with the noise of its sensors, where they declare a colour. Raises `Unreachable`."""
+    if plan is None:
+        plan = default_plan(problem, runner, rtol, which, starts)
+    if not plan or list(plan[-1].recordings) != list(which):
+        raise ValueError(f"the last stage of the plan of `{name}` must fit {', '.join(which)}")
+    x, fit = problem.coordinates.start, None
+    for number, stage in enumerate(plan):
+        with progress_bar(f"{name} {number + 1}/{len(plan)} {stage.name}", progress) as bar:
+            fit = run_stage(problem, runner, stage, x, "linear", "gauss_newton", number, bar)
+        x = fit.x
+    assert fit is not None
+    assert fit.at is not None
+    free = np.isin(problem.coordinates.labels, plan[-1].free)
+    declared, given = [c for c, s in problem.sensors.items() if s.colour == "ar"], problem.noise
+    for _ in range(ROUNDS if declared else 0):
+        found = colours(parts(problem, fit.at.r, which), fit.at.J[:, free], declared)
+        noise = given | {channel: found[channel].noise for channel in declared if channel in found}
+        if not noise:
+            break
+        problem = problem.with_noise(noise)
+        fit = gauss_newton(problem, runner, fit.x, which=which, free=free, steps=fit.steps, tolerance=CLOSE)
+        assert fit.at is not None
+    return ended(name, problem, fit, free, plan[-1].rtol)
+
+
+def ended(name: str, problem: Problem, fit: Fit, free: np.ndarray, rtol: float) -> FittedLaw:
+    return FittedLaw(name, problem, fit.x, free, rtol, fit.converged)
+
+
+def refitted(law: FittedLaw, best: FittedLaw, runner: Runner, which: Sequence[str]) -> FittedLaw | None:
+    """The law fitted once more, from the values that another one ended with; None where they share none, or it cannot be run
+    there."""
+    c, x = law.problem.coordinates, law.x.copy()
+    known = {
+        label: one.to_value(v)
+        for label, one, v in zip(best.problem.coordinates.labels, best.problem.coordinates.all, best.x)
+    }
+    for i, one in enumerate(c.all):
+        if law.free[i] and one.label in known:
+            x[i] = one.to_x(float(np.clip(known[one.label], one.low, one.high)))
+    if (x == law.x).all():
+        return None
+    try:
+        first, steps = law.problem.freeze(runner, x, which, law.rtol, law.free)
+        if first.lost:
+            return None
+        fit = gauss_newton(
+            law.problem, runner, x, which=which, free=law.free, steps=steps, tolerance=CLOSE, first=first
+        )
+    except Unreachable:
+        return None
+    return ended(law.name, law.problem, fit, law.free, law.rtol)
+
+
+def most_likely(evidence: Mapping[str, Evidence]) -> str:
+    """The law with the largest penalised likelihood of all the data."""
+    return max(evidence, key=lambda name: evidence[name].total)
+
+
+def gathered(evidence: Mapping[str, Evidence], heldout: list[str]) -> Comparison:
+    """The answer."""
+    best = evidence[most_likely(evidence)]
+    motions = moved(best, heldout)
+    against = [versus(best, one, motions) for name, one in evidence.items() if name != best.name]
+    laws = sorted(law_fits(evidence), key=lambda one: -evidence[one.name].total)
+    outcome, law, verdict = judged(laws, against)
+    return Comparison(
+        outcome, law, verdict, laws, against, len(best.fitted.r), heldout,
+        {name: one.pieces for name, one in motions.items()}, series(evidence),
+    )  # fmt: skip
+
+
+def moved(best: Evidence, heldout: Sequence[str]) -> dict[str, Motion]:
+    """How every recording moves, by the best law."""
+    law, out = best.law, {}
+    for k, name in enumerate(law.problem.names):
+        if name in (*best.which, *heldout):
+            try:
+                out[name] = motion(law.problem, law.x, k, FINER * law.rtol)
+            except SimulationFailed as failure:
+                raise ValueError(f"the law `{law.name}` cannot be run at its estimates: {failure}") from None
+    return out
+
+
+def versus(best: Evidence, other: Evidence, motions: Mapping[str, Motion]) -> Versus:
+    """The best law against another, by the rule of `torchsoft.sysid.answer.comparison`."""
+    fitted, n = ratio(best.fitted, other.fitted), len(best.fitted.r)
+    pairs, evidence = [(best.fitted, other.fitted)], fitted.log / fitted.inflation
+    log, stated, variance, told, z = fitted.log, fitted.stated, fitted.variance, None, None
+    if best.heldout is not None and other.heldout is not None:
+        ahead, m = ratio(best.heldout, other.heldout), len(best.heldout.r)
+        pairs.append((best.heldout, other.heldout))
+        evidence, log = evidence + ahead.log / ahead.inflation, log + ahead.log
+        stated, variance = stated + ahead.stated, variance + ahead.variance
+        told, z = (ahead.log / m, ahead.variance**0.5 / m), ahead.z
+    evidence -= 0.5 * max(best.parameters - other.parameters, 0) * float(np.log(n))
+    return Versus(
+        best.name, other.name, fitted.log, None if told is None else log - fitted.log, told, stated**0.5,
+        variance / stated if stated > 0 else 1.0, evidence, log / variance**0.5 if variance > 0 else 0.0, z,
+        (best.numerical + other.numerical) / fitted.inflation, where(other.name, pairs, motions),
+    )  # fmt: skip
+
+
+def law_fits(evidence: Mapping[str, Evidence]) -> list[LawFit]:
+    """Every law with its criteria."""
+    k = np.array([one.parameters for one in evidence.values()])
+    n, deviance = len(next(iter(evidence.values())).fitted.r), np.array([-2 * e.fitted.log for e in evidence.values()])
+    aic, bic = deviance + 2 * k, deviance + k * np.log(n)
+    aicc = aic + 2 * k * (k + 1) / np.maximum(n - k - 1, 1)
+    weight = np.exp(-0.5 * (aicc - aicc.min()))
+    out = []
+    for i, (name, one) in enumerate(evidence.items()):
+        square, held, c = float(one.fitted.r @ one.fitted.r), one.heldout, one.law.problem.coordinates
+        out.append(
+            LawFit(
+                name, int(k[i]), {a.label: a.to_value(x) for a, x, free in zip(c.all, one.law.x, one.law.free) if free},
+                one.fitted.log, square / one.dof, float(stats.chi2.sf(square, one.dof)), float(aic[i]), float(aicc[i]),
+                float(bic[i]), float(weight[i] / weight.sum()), None if held is None else held.log / len(held.r),
+                None if held is None else held.p, one.numerical, one.law.converged, notices(one.verdicts),
+                any(verdict.alarming and verdict.test == "motion" for verdict in one.verdicts),
+            )
+        )  # fmt: skip
+    return out
+
+
+def series(evidence: Mapping[str, Evidence]) -> list[Series]:
+    """Residuals of all laws, side by side."""
+    out = []
+    for part in ("fitted", "heldout"):
+        densities = {name: getattr(one, part) for name, one in evidence.items()}
+        first = next(iter(densities.values()))
+        for one in first.parts if first is not None else ():
+            rows = {name: density.r[one.rows].tolist() for name, density in densities.items()}
+            out.append(Series(one.recording, one.channel, part == "fitted", one.t.tolist(), rows))
+    return out

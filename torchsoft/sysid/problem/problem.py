@@ -1,0 +1,238 @@
+"""The least-squares problem: recordings, sensors and unknowns; residuals in units of the sensors' noise."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from copy import deepcopy
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchsoft.parameters import ORDERED
+from torchsoft.physics.paper import NAMES, SoftGrasp
+from torchsoft.physics.validity import check_values
+from torchsoft.sysid.problem.noise import Autoregression
+from torchsoft.sysid.problem.prediction import FailedRun, Frozen, Prediction, set_parameters
+from torchsoft.sysid.problem.readout import Readout, Signals, readout
+from torchsoft.sysid.problem.recording import Array, Recording
+from torchsoft.sysid.problem.unknowns import NUISANCES, Coordinates, Nuisance, Sensor, Unknown
+from torchsoft.sysid.problem.workers import Job, Runner
+from torchsoft.tables import line
+
+StepsByName = float | Mapping[str, Frozen]
+"""The steps of runs: a relative tolerance that chooses them, or frozen ones by recording."""
+
+
+class Residuals(NamedTuple):
+    """Residuals r (m,) over the sensors' noise, whitened where its colour is known, then those of the priors; their Jacobian
+    J (m, n) by the coordinates (zero where not free), and what was lost: recordings that could not be simulated, with the
+    reason. With a loss r and J are infinite. |r|^2 / 2 is the negative logarithm of the posterior density, but for a constant.
+    """
+
+    r: Array
+    J: Array
+    lost: dict[str, FailedRun]
+
+
+def check_ends(coordinates: Coordinates, recordings: Sequence[Recording]) -> None:
+    """Raises `ValueError` where the bounds of an unknown leave no rig: a disc that does not fit between the pads, say."""
+    for c in coordinates.all:
+        if c.kind != "parameter" or c.ratio_to or c.name in ORDERED:
+            continue
+        for recording in recordings:
+            for field, value in (("low", c.low), ("high", c.high)):
+                try:
+                    with warnings.catch_warnings():
+                        warnings.simplefilter("ignore")  # of a steep friction law, which a search may pass through
+                        check_value(recording, c.name, value)
+                except ValueError as error:
+                    raise ValueError(f"unknowns.{c.name}.{field} = {value:g} is impossible: {error}") from None
+
+
+def check_value(recording: Recording, name: str, value: float) -> None:
+    """Raises `ValueError` for a rig that cannot be."""
+    if isinstance(recording.rig, SoftGrasp) and name in NAMES:
+        recording.rig.settings.override({name: value})
+    else:
+        rig = deepcopy(recording.rig)
+        set_parameters(rig, {name: value})
+        check_values(rig)
+
+
+class Problem:
+    """Which parameters explain these recordings?
+
+    `recordings` have names of their own; `sensors` are the channels that count, with their noise; `unknowns` the parameters;
+    `noise` the colour of a channel's noise, white where there is none. Raises `ValueError` where these do not fit together.
+    """
+
+    def __init__(
+        self, recordings: Sequence[Recording], sensors: dict[str, Sensor], unknowns: dict[str, Unknown],
+        noise: Mapping[str, Autoregression] | None = None,
+    ) -> None:  # fmt: skip
+        names = [recording.name for recording in recordings]
+        if not recordings or len(set(names)) < len(names):
+            raise ValueError(f"recordings need names of their own, but are called {names}")
+        for channel in sensors:
+            if not any(channel in recording.channels for recording in recordings):
+                known = ", ".join(dict.fromkeys(c for recording in recordings for c in recording.channels))
+                raise ValueError(f"sensors: `{line(channel, 80)}` is not a channel; known: {known}")
+            if not any(channel in recording.samples for recording in recordings):
+                raise ValueError(f"sensors: no recording has samples of `{channel}`")
+        for recording in recordings:
+            if not set(sensors) & set(recording.samples):
+                raise ValueError(f"recording `{recording.name}` has samples of none of the sensors {list(sensors)}")
+        self.recordings, self.sensors, self.unknowns = tuple(recordings), sensors, unknowns
+        self.coordinates = Coordinates(unknowns, sensors, recordings)
+        if not self.coordinates.free.any():
+            raise ValueError("there is nothing to identify: no unknown is free")
+        check_ends(self.coordinates, recordings)
+        self.interpolated = any(sensor.delay > 0 or sensor.inertia > 0 for sensor in sensors.values())
+        self.noise = dict(noise or {})
+        self._whiteners: dict[tuple[str, str], Any] = {}
+        for k in range(len(recordings)):
+            self.readouts(self.coordinates.start, k)
+
+    def with_noise(self, noise: Mapping[str, Autoregression]) -> "Problem":
+        """The same problem with noise of these colours, by channel."""
+        return Problem(self.recordings, self.sensors, self.unknowns, noise)
+
+    def whitened(self, recording: Recording, channel: str, rows: Array) -> Array:
+        """Rows (k,) or (k, n) of a channel's samples, made independent of each other."""
+        if channel not in self.noise:
+            return rows
+        key = recording.name, channel
+        if key not in self._whiteners:
+            self._whiteners[key] = self.noise[channel].whitener(recording.samples[channel][0])
+        return self._whiteners[key] @ rows
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(recording.name for recording in self.recordings)
+
+    def samples(self, which: Sequence[str] | None = None) -> int:
+        """Number of samples that count, in some recordings or in all."""
+        return sum(
+            len(t)
+            for recording in self.recordings
+            if which is None or recording.name in which
+            for channel, (t, _) in recording.samples.items()
+            if channel in self.sensors
+        )
+
+    @property
+    def data_seconds(self) -> float:
+        return sum(recording.duration for recording in self.recordings)
+
+    def values(self, x: Array, k: int) -> dict[str, float]:
+        """Values of what is unknown of the rig and of the start in recording number k."""
+        recording = self.recordings[k]
+        return self.coordinates.values(x, recording.name, recording.parameters)
+
+    def readouts(self, x: Array, k: int) -> dict[str, Readout]:
+        """The sensors that recording number k has samples of, at x (n,)."""
+        recording, out = self.recordings[k], {}
+        for channel, sensor in self.sensors.items():
+            if channel in recording.samples:
+                at = self.coordinates.nuisances(x, channel, recording.name)
+                span = float(recording.times[0]), float(recording.times[-1])
+                values: dict[Nuisance, float] = {kind: value for kind, (value, _) in at.items()}
+                out[channel] = readout(recording.rig, channel, sensor, values, span)
+        return out
+
+    def jobs(
+        self, x: Array, which: Sequence[str], steps: StepsByName, free: NDArray[np.bool_] | None, adjoint: bool = False
+    ) -> list[Job]:
+        """One run a recording; with `free` they are differentiated by the parameters that free coordinates (n,) move."""
+        c, out = self.coordinates, []
+        for k, recording in enumerate(self.recordings):
+            if recording.name not in which:
+                continue
+            values, names = self.values(x, k), ()
+            if free is not None:
+                moved = (c.jacobian(x, recording.name, values)[:, free] != 0).any(1)
+                names = tuple(name for name, moves in zip(c.names, moved) if moves)
+            judged = None
+            if adjoint:
+                judged = tuple((one, self.noise.get(one.channel)) for one in self.readouts(x, k).values())
+            mine = steps[recording.name] if isinstance(steps, Mapping) else steps
+            out.append(Job(k, values, names, mine, self.interpolated, judged))
+        return out
+
+    def residuals(
+        self, runner: Runner, x: Array, which: Sequence[str], steps: StepsByName, free: NDArray[np.bool_] | None = None
+    ) -> Residuals:
+        """Residuals of some recordings at x (n,); the Jacobian's columns of `free` coordinates. On frozen steps they are smooth
+        in x."""
+        jobs = self.jobs(x, which, steps, free)
+        return self.gather(x, jobs, runner.run(jobs))
+
+    def freeze(
+        self, runner: Runner, x: Array, which: Sequence[str], rtol: float, free: NDArray[np.bool_] | None = None
+    ) -> tuple[Residuals, dict[str, Frozen]]:
+        """`residuals` by runs whose steps `rtol` chooses, and those steps by recording; none where one is lost."""
+        jobs = self.jobs(x, which, rtol, free)
+        runs = runner.run(jobs)
+        at = self.gather(x, jobs, runs)
+        names = [self.recordings[job.recording].name for job in jobs]
+        return at, {} if at.lost else {name: Frozen(run.knots) for name, run in zip(names, runs)}
+
+    def gather(self, x: Array, jobs: Sequence[Job], results: Sequence[Any]) -> Residuals:
+        """Residuals at x (n,) from the results of its jobs."""
+        lost = {
+            self.recordings[job.recording].name: got for job, got in zip(jobs, results) if isinstance(got, FailedRun)
+        }
+        if lost:
+            m = self.samples([self.recordings[job.recording].name for job in jobs]) + len(self.coordinates.priors)
+            return Residuals(np.full(m, np.inf), np.full((m, len(x)), np.inf), lost)
+        parts = [self._compare(x, job, got) for job, got in zip(jobs, results)]
+        parts.append(self._priors(x))
+        return Residuals(np.concatenate([r for r, _ in parts]), np.concatenate([J for _, J in parts]), {})
+
+    def _priors(self, x: Array) -> tuple[Array, Array]:
+        """Residuals of the priors, and their Jacobian."""
+        c = self.coordinates
+        r, J = np.zeros(len(c.priors)), np.zeros((len(c.priors), len(x)))
+        for row, (i, prior) in enumerate(c.priors):
+            r[row], slope = prior.row(c.all[i].to_value(x[i]))
+            J[row, i] = slope * c.all[i].slope(x[i])
+        return r, J
+
+    def _compare(self, x: Array, job: Job, prediction: Prediction) -> tuple[Array, Array]:
+        """Residuals and Jacobian of one recording."""
+        c, recording = self.coordinates, self.recordings[job.recording]
+        chain = c.jacobian(x, recording.name, job.values)[[c.names.index(name) for name in job.names]]
+        signals, rs, Js = Signals(prediction.t, recording.channels, prediction.signals, prediction.derivatives), [], []
+        for channel, one in self.readouts(x, job.recording).items():
+            t, measured = recording.samples[channel]
+            y, slopes, by = one.expected(signals, t)
+            r, weight = one.residuals(y, measured)
+            J = np.zeros((len(t), len(x)))
+            if slopes is not None:
+                J += slopes @ chain
+            for kind, (_, at) in c.nuisances(x, channel, recording.name).items():
+                J[:, at] = by[kind] * c.all[at].slope(x[at])
+            rs.append(self.whitened(recording, channel, r))
+            Js.append(self.whitened(recording, channel, weight[:, None] * J))
+        return np.concatenate(rs), np.concatenate(Js)
+
+    def misfit(
+        self, runner: Runner, x: Array, which: Sequence[str], steps: StepsByName, free: NDArray[np.bool_]
+    ) -> tuple[float, Array, dict[str, FailedRun]]:
+        """Half the sum of squares and its gradient (n,), by the discrete adjoint; infinite where a run is lost."""
+        c, jobs = self.coordinates, self.jobs(x, which, steps, free, adjoint=True)
+        total, gradient, lost = 0.0, np.zeros(len(x)), {}
+        for job, got in zip(jobs, runner.run(jobs)):
+            name = self.recordings[job.recording].name
+            if isinstance(got, FailedRun):
+                lost[name] = got
+                continue
+            rows = [c.names.index(n) for n in job.names]
+            total, gradient = total + got.loss, gradient + got.parameters @ c.jacobian(x, name, job.values)[rows]
+            for one, row in zip(self.readouts(x, job.recording), got.nuisances):
+                for kind, (_, at) in c.nuisances(x, one, name).items():
+                    gradient[at] += row[NUISANCES.index(kind)] * c.all[at].slope(x[at])
+        if lost:
+            return np.inf, np.full(len(x), np.nan), lost
+        r, J = self._priors(x)
+        return total + 0.5 * float(r @ r), np.where(free, gradient + r @ J, 0.0), {}

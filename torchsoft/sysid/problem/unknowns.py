@@ -1,0 +1,314 @@
+"""What is unknown: parameters with bounds and scales, and the vector of coordinates that the fits move in.
+
+A coordinate is the logarithm of a value, or the value over the width of its bounds; so a coordinate's standard deviation is
+a relative one either way.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple, Self, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from torchsoft.parameters import ORDERED, bounds
+from torchsoft.sysid.problem.recording import REACH, Array, Recording
+from torchsoft.sysid.problem.start import BOUNDS, PREFIX
+from torchsoft.tables import Table, line, shown
+
+SPREAD = 10.0
+"""Bounds of a logarithmic parameter that gives none: its nominal value divided and multiplied by this."""
+
+
+Per = Literal["all", "recording"]
+"""Whether one value belongs to all recordings, or each has its own."""
+
+
+class Prior(Table):
+    """What is known of a value beforehand: a normal distribution with standard deviation `sd` about the `median`, or
+    ("log-normal") one of the logarithm, `sd` being that of ln."""
+
+    median: float
+    sd: float = Field(gt=0, le=1e12)
+    kind: Literal["normal", "log-normal"] = "normal"
+
+    @model_validator(mode="after")
+    def _has_a_logarithm(self) -> Self:
+        if self.kind == "log-normal" and self.median <= 0:
+            raise ValueError(f"a log-normal prior needs median > 0, but it is {self.median}")
+        return self
+
+    def row(self, value: float) -> tuple[float, float]:
+        """The residual (value - median) / sd, or that of logarithms, and its derivative by the value."""
+        if self.kind == "log-normal":
+            return math.log(value / self.median) / self.sd, 1 / (value * self.sd)
+        return (value - self.median) / self.sd, 1 / self.sd
+
+    def draw(self, rng: np.random.Generator) -> float:
+        """A value from the distribution."""
+        z = self.sd * float(rng.standard_normal())
+        return self.median * math.exp(z) if self.kind == "log-normal" else self.median + z
+
+
+class Unknown(Table):
+    """One parameter to be identified: of the rig, a user's law included, by its name there, or by its alias in `Parameters`.
+
+    `nominal` is where the search starts, by default the value of the recordings' own rigs; with `ratio_to` the value,
+    nominal, bounds and prior are those of the ratio to that other parameter, and `fixed` besides ties the two. Bounds end where
+    the parameter's own do (`torchsoft.parameters.bounds`): wider ones are errors. With `per` = "recording" every recording has
+    a value of its own. A `prior` counts as one more measurement.
+    """
+
+    nominal: float | None = None
+    low: float | None = None
+    high: float | None = None
+    scale: Literal["log", "linear"] = "log"
+    ratio_to: str | None = None
+    fixed: bool = False
+    per: Per = "all"
+    prior: Prior | None = None
+
+    @model_validator(mode="after")
+    def _bounds_are_ordered(self) -> Self:
+        if self.low is not None and self.high is not None and self.low >= self.high:
+            raise ValueError(f"low = {self.low} must be below high = {self.high}")
+        if self.scale == "linear" and (self.low is None or self.high is None):
+            raise ValueError("a linear scale needs `low` and `high`")
+        for name in ("nominal", "low", "high"):
+            value = getattr(self, name)
+            if self.scale == "log" and value is not None and value <= 0:
+                raise ValueError(f"a logarithmic scale needs {name} > 0, but it is {value}")
+        if self.fixed and self.prior is not None:
+            raise ValueError("a fixed unknown needs no prior")
+        return self
+
+
+Nuisance = Literal["bias", "delay", "gain", "drift", "misalignment", "inertia"]
+NUISANCES: tuple[Nuisance, ...] = get_args(Nuisance)
+"""What may be wrong with a sensor, in the order of a problem's coordinates."""
+
+
+class Sensor(Table):
+    """A measured channel: standard deviation of its noise [the channel's unit], what may be wrong with it, and where it ends.
+
+    How large may be a constant `bias` [unit], a `delay` [s], the error of its `gain` [1], a `drift` [unit/s] from the middle of
+    the recording on, its `misalignment` [rad] about the axis out of the plane; the `inertia` [kg] between a force sensor and
+    what it pushes, whose acceleration it does not feel. Zero leaves them out, otherwise they are identified too, one for all
+    recordings or one for each (`per`). Samples at `low` or `high` [unit] or beyond are saturated: they only say that the value
+    is there or beyond. `colour` says whether the noise is known to be independent ("white"), or may be an autoregression
+    ("ar"), whose order and coefficients are then found.
+    """
+
+    noise: float = Field(ge=1e-15, le=1e6)
+    bias: float = Field(default=0.0, ge=0, le=1e6)
+    delay: float = Field(default=0.0, ge=0, le=REACH)
+    gain: float = Field(default=0.0, ge=0, le=0.5)
+    drift: float = Field(default=0.0, ge=0, le=1e6)
+    misalignment: float = Field(default=0.0, ge=0, le=0.5)
+    inertia: float = Field(default=0.0, ge=0, le=1e5)
+    per: Per = "all"
+    low: float | None = None
+    high: float | None = None
+    colour: Literal["white", "ar"] = "white"
+
+    @model_validator(mode="after")
+    def _has_a_range(self) -> Self:
+        if self.low is not None and self.high is not None and self.low >= self.high:
+            raise ValueError(f"low = {self.low} must be below high = {self.high}")
+        return self
+
+    @property
+    def nuisances(self) -> dict[Nuisance, tuple[float, float, float]]:
+        """Least, nominal and largest value of what is to be identified of it."""
+        out: dict[Nuisance, tuple[float, float, float]] = {}
+        for kind in NUISANCES:
+            nominal, reach = float(kind == "gain"), float(getattr(self, kind))
+            if nominal + reach > nominal:
+                out[kind] = nominal - reach, nominal, nominal + reach
+        return out
+
+
+class Coordinate(NamedTuple):
+    """One entry of the vector: what it belongs to, its bounds and start in physical units, its scale, and its prior."""
+
+    name: str
+    kind: Literal["parameter", "start"] | Nuisance
+    recording: str | None
+    nominal: float
+    low: float
+    high: float
+    scale: Literal["log", "linear"] = "linear"
+    ratio_to: str | None = None
+    fixed: bool = False
+    prior: Prior | None = None
+
+    @property
+    def of_the_rig(self) -> bool:
+        """Whether a run depends on it, not only what sensors make of the run."""
+        return self.kind in ("parameter", "start")
+
+    @property
+    def label(self) -> str:
+        """Readable name, such as `contact.K_n`, `contact.mu_k / contact.mu_s`, `delay of theta`."""
+        what = self.name if self.of_the_rig else f"{self.kind} of {self.name}"
+        ratio = f" / {self.ratio_to}" if self.ratio_to else ""
+        return f"{what}{ratio}" + (f" in {self.recording}" if self.recording else "")
+
+    def to_x(self, value: float) -> float:
+        return math.log(value) if self.scale == "log" else value / (self.high - self.low)
+
+    def to_value(self, x: float) -> float:
+        return math.exp(x) if self.scale == "log" else x * (self.high - self.low)
+
+    def slope(self, x: float) -> float:
+        """d value / d x."""
+        return math.exp(x) if self.scale == "log" else self.high - self.low
+
+
+def limits(name: str, unknowns: Mapping[str, Unknown], given: Mapping[str, float]) -> tuple[float, float]:
+    """The least and the largest value that an unknown may have whatever the others are, or that its ratio may.
+
+    The parameters declare them; those of a user's own law have the limits that its modules check when they run.
+    """
+    ratio_to = unknowns[name].ratio_to
+    if ratio_to is not None:
+        return (0.0, 1.0) if (name, ratio_to) == ORDERED else (-math.inf, math.inf)
+    try:
+        least, most = bounds(name)
+    except KeyError:
+        return -math.inf, math.inf
+    lower, upper = ORDERED
+    known = {**given, **{other: u.nominal for other, u in unknowns.items() if u.fixed and u.nominal is not None}}
+    free = {other for other, u in unknowns.items() if not u.fixed}
+    if name == lower and upper in known and upper not in free:
+        most = min(most, known[upper])
+    if name == upper and lower in known and lower not in free:
+        least = max(least, known[lower])
+    return least, most
+
+
+class Coordinates:
+    """All coordinates of a problem, in a fixed order, and the way from their vector x (n,) to parameters of the rig, of where
+    runs begin, and of the sensors.
+
+    Raises `ValueError` for unknowns that some recording's rig has not, a ratio to something that is not there, or a nominal
+    value out of bounds.
+    """
+
+    def __init__(
+        self, unknowns: dict[str, Unknown], sensors: dict[str, Sensor], recordings: Sequence[Recording]
+    ) -> None:
+        self.recordings, self.all = tuple(r.name for r in recordings), list[Coordinate]()
+        given = {name: value for name, value in recordings[0].parameters.items() if not name.startswith(PREFIX)}
+        for name, u in unknowns.items():
+            if without := next((r.name for r in recordings[1:] if name in given and name not in r.parameters), None):
+                raise ValueError(f"unknowns: the rig of recording `{without}` has no `{line(name, 80)}`")
+            if name not in given:
+                raise ValueError(f"unknowns: `{line(name, 80)}` cannot be identified; what can: {', '.join(given)}")
+            if u.ratio_to is not None and (u.ratio_to not in given or u.ratio_to == name):
+                raise ValueError(
+                    f"unknowns.{name}.ratio_to = {shown(u.ratio_to)} is not another parameter of the model"
+                )
+            if u.ratio_to in unknowns and unknowns[u.ratio_to].ratio_to:
+                raise ValueError(f"unknowns.{name}.ratio_to = {shown(u.ratio_to)} is a ratio itself")
+            own = given[name] / (given[u.ratio_to] if u.ratio_to else 1.0)
+            nominal = own if u.nominal is None else u.nominal
+            if u.scale == "log" and nominal <= 0:
+                raise ValueError(
+                    f"unknowns.{name} = {nominal:g} is not on a logarithmic scale: give a positive `nominal`, or "
+                    "scale = 'linear'"
+                )
+            least, most = limits(name, unknowns, given)
+            for field in ("low", "high", "nominal"):
+                value = getattr(u, field)
+                if value is not None and not least <= value <= most:
+                    what = f"{name} / {u.ratio_to}" if u.ratio_to else name
+                    raise ValueError(
+                        f"unknowns.{name}.{field} = {value:g} is beyond what {what} may be, from {least:g} to {most:g}"
+                    )
+            low = max(nominal / SPREAD, least) if u.low is None else u.low
+            high = min(nominal * SPREAD, most) if u.high is None else u.high
+            if not low <= nominal <= high or low == high:
+                raise ValueError(
+                    f"unknowns.{name}.nominal = {nominal:g} is not between low = {low:g} and high = {high:g}"
+                )
+            for where in (None,) if u.per == "all" else self.recordings:
+                self.all.append(
+                    Coordinate(name, "parameter", where, nominal, low, high, u.scale, u.ratio_to, u.fixed, u.prior)
+                )
+        self._check_order()
+        for r in recordings:
+            for name, mean, sd in r.start_coordinates:
+                low, high = mean - BOUNDS * sd, mean + BOUNDS * sd
+                prior = Prior(median=mean, sd=sd)
+                self.all.append(Coordinate(name, "start", r.name, mean, low, high, prior=prior))
+        for channel, sensor in sensors.items():
+            for kind, (low, nominal, high) in sensor.nuisances.items():
+                seen = [r.name for r in recordings if channel in r.samples] if sensor.per == "recording" else [None]
+                self.all += [Coordinate(channel, kind, where, nominal, low, high) for where in seen]
+        self.names = tuple(dict.fromkeys(c.name for c in self.all if c.of_the_rig))
+
+    def _check_order(self) -> None:
+        """Raises `ValueError` where a search could take the first of `ORDERED` above the second."""
+        lower, upper = ({c.name: c for c in self.all if not c.fixed}.get(name) for name in ORDERED)
+        if lower and upper and not lower.ratio_to and lower.high > upper.low:
+            raise ValueError(
+                f"unknowns.{lower.name} must not exceed {upper.name}, but may be up to {lower.high:g} and the other down to "
+                f"{upper.low:g}: give unknowns.{lower.name}.ratio_to = '{upper.name}'"
+            )
+
+    def __len__(self) -> int:
+        return len(self.all)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(c.label for c in self.all)
+
+    @property
+    def start(self) -> Array:
+        """x of the nominal values (n,)."""
+        return np.array([c.to_x(c.nominal) for c in self.all])
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        return np.array([c.to_x(c.low) for c in self.all]), np.array([c.to_x(c.high) for c in self.all])
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        return np.array([not c.fixed for c in self.all], bool)
+
+    def values(self, x: Array, recording: str, given: Mapping[str, float]) -> dict[str, float]:
+        """Values of the unknown parameters in one recording; `given` holds those that a ratio may refer to."""
+        mine = [(i, c) for i, c in enumerate(self.all) if c.of_the_rig and c.recording in (None, recording)]
+        out = {c.name: c.to_value(x[i]) for i, c in mine}
+        for _, c in mine:
+            if c.ratio_to:
+                out[c.name] *= out.get(c.ratio_to, given[c.ratio_to])
+        return out
+
+    def jacobian(self, x: Array, recording: str, values: dict[str, float]) -> Array:
+        """d (parameters `names`) / d x (names, n) in one recording; `values` are those of `values(x, recording)`."""
+        out = np.zeros((len(self.names), len(self.all)))
+        for i, c in enumerate(self.all):
+            if c.of_the_rig and c.recording in (None, recording):
+                row = self.names.index(c.name)
+                out[row, i] = c.slope(x[i]) * (values[c.name] / c.to_value(x[i]) if c.ratio_to else 1.0)
+                for other in self.all:  # a ratio moves with what it is a ratio to
+                    if other.ratio_to == c.name and other.recording in (None, recording):
+                        part = values[other.name] / values[c.name]
+                        out[self.names.index(other.name), i] += part * c.slope(x[i])
+        return out
+
+    def nuisances(self, x: Array, channel: str, recording: str) -> dict[Nuisance, tuple[float, int]]:
+        """Values of what is wrong with a sensor [SI] in one recording, and their places in x."""
+        return {
+            c.kind: (c.to_value(x[i]), i)
+            for i, c in enumerate(self.all)
+            if c.name == channel and not c.of_the_rig and c.recording in (None, recording)
+        }  # pyright: ignore[reportReturnType]
+
+    @property
+    def priors(self) -> list[tuple[int, Prior]]:
+        """Places of coordinates that have a prior and are free, and the priors."""
+        return [(i, c.prior) for i, c in enumerate(self.all) if c.prior is not None and not c.fixed]

@@ -1,0 +1,258 @@
+"""Pictures of an identification: estimates, what recordings told, the Fisher spectrum, correlations, profiles, residuals."""
+
+from collections.abc import Sequence
+from textwrap import fill, shorten
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator, PercentFormatter
+
+from torchsoft.channels import unit
+from torchsoft.plot.figures import ACTUAL, DESIRED, OTHER, STYLE
+from torchsoft.sysid.answer.answer import Answer
+from torchsoft.sysid.answer.estimate import IDENTIFIABLE, ChannelResiduals, Direction, Estimate
+from torchsoft.sysid.certainty.profile import RISE, Profile
+from torchsoft.sysid.checks.misfit import LAGS, autocorrelation
+from torchsoft.sysid.problem.noise import Autoregression
+from torchsoft.sysid.problem.recording import Array
+
+SHOWN = {"m": ("mm", 1e3), "m/s": ("mm/s", 1e3)}
+"""Units of pictures, and what one SI unit is in them; others stay as they are."""
+
+WIDTH = 5.4
+"""Width of a picture [in]: its text stays legible on a phone."""
+
+NAME = 24
+"""Characters in a line of a name beside an axis."""
+
+MOST_NAMES = 3
+"""Parts of a direction that its name has room for."""
+
+SOURCES = ("#0077bb", "#ee7733", "#009988", "#cc3311", "#33bbee", "#ee3377", "#8a6d00")
+"""Colours of recordings, in turn."""
+
+REST = "#bbbbbb"
+"""Colour of the priors, and of recordings that there are no colours left for."""
+
+
+class Trace(NamedTuple):
+    """One channel of one recording: times (k,) [s], what was measured and predicted (k,), and residuals over the noise (k,), as
+    they are and whitened."""
+
+    recording: str
+    channel: str
+    t: Array
+    measured: Array
+    predicted: Array
+    residual: Array
+    white: Array
+
+
+def direction_name(d: Direction) -> str:
+    """Its largest components, such as `pad.E − 0.24 contact.K_n`."""
+    parts = list(d.components.items())
+    sign = -1 if parts and parts[0][1] < 0 else 1
+    parts = [(name, sign * value) for name, value in parts]
+    text = " ".join(
+        f"{'−' if v < 0 else '+' if i else ''} {f'{abs(v):.2f} ' if abs(v) < 0.995 else ''}{name}".strip()
+        for i, (name, v) in enumerate(parts[:MOST_NAMES])
+    )
+    return text + (" …" if len(parts) > MOST_NAMES else "")
+
+
+def literal(text: str, width: int = 200) -> str:
+    """Text as matplotlib must be given it, lest dollars begin a formula, in lines of `width` characters at most."""
+    return fill(text, width).replace("$", r"\$")
+
+
+@rc_context(STYLE)
+def estimates_figure(estimates: Sequence[Estimate]) -> Figure | None:
+    """Estimates over their starts, with intervals; None where there is nothing on a log scale."""
+    rows = [(e, e.start) for e in estimates if e.start is not None and e.start > 0]
+    if not rows:
+        return None
+    figure = Figure(figsize=(WIDTH, 0.9 + 0.42 * len(rows)), layout="constrained")
+    axes = figure.subplots()
+    axes.axvline(1, color="#999999", lw=1, zorder=0.5)
+    reach = [1 / 1.5, 1.5]
+    for row, (e, s) in enumerate(rows):
+        if e.value is None or e.ci95 is None:
+            axes.axhspan(row - 0.32, row + 0.32, color="#f6e3d6", lw=0)
+            axes.text(0.5, row, "not identifiable", transform=axes.get_yaxis_transform(), ha="center", va="center",
+                      fontsize=9, color="#a34400")  # fmt: skip
+            continue
+        low, value, high = (max(v / s, 1e-6) for v in (e.ci95[0], e.value, e.ci95[1]))
+        axes.plot([low, high], [row, row], color=ACTUAL, lw=2.4, solid_capstyle="butt")
+        axes.plot([low, low, high, high], [row - 0.13, row + 0.13, row + 0.13, row - 0.13], " ")
+        axes.vlines([low, high], row - 0.16, row + 0.16, color=ACTUAL, lw=1.2)
+        axes.plot(value, row, "o", color=ACTUAL, ms=6)
+        reach += [low, high]
+    axes.set_xscale("log")
+    low, high = min(reach) / 1.15, max(reach) * 1.15
+    axes.set(xlim=(low, high), ylim=(len(rows) - 0.5, -0.5))
+    figure.supxlabel("estimate over start value, 95 % interval", fontsize=10)
+    axes.set_yticks(range(len(rows)), [literal(e.label, NAME) for e, _ in rows])
+    ticks = [v for v in (0.01, 0.03, 0.1, 0.2, 0.33, 0.5, 0.7, 1, 1.5, 2, 3, 5, 10, 30, 100) if low <= v <= high]
+    while len(ticks) > 7:
+        ticks = [v for i, v in enumerate(ticks) if v == 1 or (i - ticks.index(1)) % 2 == 0]
+    axes.xaxis.set_major_locator(FixedLocator(ticks))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda v, _: f"× {v:g}"))
+    axes.grid(False, axis="y")
+    return figure
+
+
+@rc_context(STYLE)
+def correlation_figure(result: Answer) -> Figure:
+    """The correlation matrix of the coordinates."""
+    n, C = len(result.labels), np.array(result.correlation, float)
+    figure = Figure(figsize=(WIDTH, max(2.2, 0.7 + 0.42 * n)), layout="constrained")
+    axes = figure.subplots()
+    image = axes.imshow(C, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
+    names = [literal(label, NAME) for label in result.labels]
+    axes.set_xticks(range(n), [str(i + 1) for i in range(n)])
+    axes.set_yticks(range(n), [f"{name}   {i + 1}" for i, name in enumerate(names)])
+    axes.tick_params(length=0, labelsize=9 if n <= 8 else 8)
+    axes.grid(False)
+    axes.spines[:].set_visible(False)
+    for i in range(n if n <= 8 else 0):
+        for j in range(n):
+            dark = abs(C[i, j]) > 0.6
+            axes.text(j, i, f"{C[i, j]:.2f}".replace("-", "−"), ha="center", va="center", fontsize=8 if n <= 6 else 6.5,
+                      color="white" if dark else "#1d2329")  # fmt: skip
+    figure.colorbar(image, ax=axes, shrink=0.75, ticks=[-1, 0, 1])
+    return figure
+
+
+@rc_context(STYLE)
+def spectrum_figure(result: Answer) -> Figure:
+    """Standard deviation along each eigenvector of the Fisher matrix, its name above its bar; orange: not identifiable."""
+    n = len(result.directions)
+    figure = Figure(figsize=(WIDTH, 1.0 + 0.5 * n), layout="constrained")
+    axes = figure.subplots()
+    sds = [d.sd for d in result.directions]
+    low, high = 10 ** np.floor(np.log10(min(*sds, 0.1))), 10 ** np.ceil(np.log10(max(*sds, 2 * IDENTIFIABLE)))
+    for row, d in enumerate(result.directions):
+        axes.barh(row + 0.18, d.sd, height=0.3, left=0, color=ACTUAL if d.identifiable else OTHER)
+        text = literal(shorten(direction_name(d), 60, placeholder=" …")) + (
+            "" if d.identifiable else ": not identifiable"
+        )
+        axes.text(0.01, row - 0.17, text, transform=axes.get_yaxis_transform(), va="center", fontsize=9,
+                  color="#1d2329" if d.identifiable else "#a34400", bbox={"fc": "white", "ec": "none", "pad": 0.8})  # fmt: skip
+    axes.axvline(IDENTIFIABLE, color="#1d2329", lw=1, ls=(0, (4, 2)))
+    axes.set_xscale("log")
+    axes.set(
+        xlim=(low, high),
+        ylim=(n - 0.4, -0.6),
+        xlabel="standard deviation (1 is a factor of e); dashed: identifiable below it",
+    )
+    axes.set_yticks([])
+    axes.spines["left"].set_visible(False)
+    axes.grid(False)
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    return figure
+
+
+@rc_context(STYLE)
+def contributions_figure(result: Answer) -> Figure | None:
+    """Weight of every recording, and of the priors, in what is identifiable; None where there is only one source."""
+    labels = [e.label for e in result.estimates if e.identifiable and e.kind == "parameter"]
+    sources = result.contributions
+    if len(sources) < 2 or not labels:
+        return None
+    named = [one for one in sources if one.source is not None][: len(SOURCES)]
+    shares = [(one.source or "", SOURCES[i], [one.shares[label] for label in labels]) for i, one in enumerate(named)]
+    rest = [one for one in sources if one not in named]
+    if rest:
+        name = "priors" if rest[0].source is None else "the others"
+        shares.append((name, REST, [sum(one.shares[label] for one in rest) for label in labels]))
+    figure = Figure(figsize=(WIDTH, 0.8 + 0.42 * len(labels) + 0.2 * len(shares)), layout="constrained")
+    axes, left = figure.subplots(), np.zeros(len(labels))
+    for name, colour, part in shares:
+        label = f" {literal(name, 60)}"  # matplotlib does not show those that begin with _
+        axes.barh(range(len(labels)), part, left=left, height=0.6, color=colour, label=label)
+        left += part
+    axes.set(xlim=(0, 1), ylim=(len(labels) - 0.4, -0.6))
+    axes.set_yticks(range(len(labels)), [literal(label, NAME) for label in labels])
+    axes.xaxis.set_major_formatter(PercentFormatter(1.0))
+    axes.spines["left"].set_visible(False)
+    axes.tick_params(axis="y", length=0)
+    axes.grid(False, axis="y")
+    figure.legend(loc="outside lower left", ncols=1, handlelength=1.0)
+    return figure
+
+
+@rc_context(STYLE)
+def profile_figure(profile: Profile, unit: str) -> Figure:
+    """Rise of the misfit away from the optimum, the others fitted again, beside the parabola of the covariance."""
+    figure = Figure(figsize=(WIDTH, 2.5), layout="constrained")
+    axes, values, best = figure.subplots(), np.array(profile.values), profile.best
+    low, high = profile.ci95
+    shown, scale = SHOWN.get(unit, (unit, 1.0))
+    axes.axvspan(
+        scale * (values[0] if low is None else low),
+        scale * (values[-1] if high is None else high),
+        color="#e8f1f7",
+        lw=0,
+    )
+    axes.axhline(RISE, color="#1d2329", lw=1, ls=(0, (4, 2)))
+    v, (a, b) = np.linspace(values[0], values[-1], 200), profile.wald95
+    log = min(a, values[0]) > 0 and abs(np.log(a * b / best**2)) < 0.01 * np.log(b / a)
+    z = np.log(v / best) / np.log(b / a) if log else (v - best) / (b - a)
+    axes.plot(scale * v, RISE * (2 * z) ** 2, color=DESIRED, lw=1.2, label="covariance")
+    axes.plot(scale * values, profile.rises, "o-", color=ACTUAL, ms=4, label="profile")
+    axes.set(
+        ylim=(0, 1.7 * RISE),
+        xlim=(scale * values[0], scale * values[-1]),
+        xlabel=f"[{shown}]" if shown not in ("", "1") else "",
+    )
+    axes.set_title(literal(f"{profile.label}: rise of the misfit (dashed: 95 %)", 60))
+    axes.xaxis.set_major_locator(MaxNLocator(4))
+    axes.yaxis.set_major_locator(MaxNLocator(4))
+    axes.legend(loc="upper center", ncols=2, handlelength=1.2)
+    return figure
+
+
+@rc_context(STYLE)
+def trace_figure(trace: Trace, channel: ChannelResiduals | None, noise: Autoregression | None = None) -> Figure:
+    """Measured and predicted, residuals over the noise, and the autocorrelation of those that are to be white, with its band;
+    where the noise is coloured, that before and that of its model too."""
+    own = unit(trace.channel)
+    shown, scale = SHOWN.get(own, (own, 1.0))
+    figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
+    data, residual, correlation = figure.subplots(3, 1, height_ratios=(2.1, 1, 1))
+    data.plot(trace.t, scale * trace.measured, ".", color="#999999", ms=3.5, label="measured")
+    data.plot(trace.t, scale * trace.predicted, color=ACTUAL, lw=1.1, label="predicted")
+    data.set_title(literal(f"{trace.channel} [{shown}]" if shown else trace.channel))
+    data.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=2, handlelength=1.2, borderpad=0.2)
+    data.tick_params(labelbottom=False)
+    rms, r = float(np.sqrt(np.mean(trace.residual**2))), trace.residual
+    residual.axhspan(-1.96, 1.96, color="#e8f1f7", lw=0)
+    residual.plot(trace.t, r, ".", color=ACTUAL, ms=2.5)
+    residual.set_title(f"residual over noise (rms {rms:.2f}; band: 95 %)")
+    residual.set(xlabel="time [s]", xlim=data.get_xlim())
+    most = 1.1 * max(3.0, float(np.abs(r).max()))
+    residual.set_ylim(-most, most)
+    rho, band = autocorrelation(trace.white), 1.96 / np.sqrt(len(r))
+    correlation.axhspan(-band, band, color="#e8f1f7", lw=0)
+    correlation.axhline(0, color="#1d2329", lw=0.6)
+    if len(rho):
+        correlation.vlines(np.arange(1, len(rho) + 1), 0, rho, color=ACTUAL, lw=2)
+    most = max(0.2, float(np.abs(rho).max(initial=0.0)))
+    white = f" (white: p = {channel.p_white:.2g})" if channel is not None else ""
+    if noise is not None:
+        before, gamma = autocorrelation(r), noise.autocovariance(len(rho) + 1)
+        lags = np.arange(1, len(rho) + 1)
+        correlation.plot(lags, gamma[1:] / gamma[0], color=OTHER, lw=1.2)
+        correlation.plot(lags, before, "o", color=OTHER, ms=3)
+        most = max(most, float(np.abs(before).max(initial=0.0)))
+        white = f"; orange: before order {noise.order} was taken out"
+    correlation.set_title(f"autocorrelation{'' if noise is not None else ' of the residual'}{white}")
+    correlation.set(xlabel="lag [samples]", xlim=(0.3, LAGS + 0.7))
+    correlation.set_ylim(-1.25 * most, 1.25 * most)
+    correlation.xaxis.set_major_locator(MaxNLocator(integer=True))
+    for axes in (data, residual, correlation):
+        axes.yaxis.set_major_locator(MaxNLocator(5 if axes is data else 3))
+    return figure
