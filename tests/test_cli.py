@@ -4,6 +4,7 @@ import csv
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -194,7 +195,10 @@ def test_it_writes_answer_and_page(answered: tuple[Path, list[str]]) -> None:
     found = {e["name"]: e for e in answer["estimates"]}
     assert set(found) == {"contact.K_n", "pad.E"}
     assert answer["converged"]
+    command = shlex.join(["torchsoft", "identify", *answered[1], "--out", str(out), "--no-progress"])
+    assert answer["command"] == command
     page = (out / "report.html").read_text()
+    assert command in page
     assert page.startswith("<!doctype html>")
     assert all(notice in page or "&" in notice for notice in answer["notices"])
 

@@ -2,9 +2,12 @@
 
 import argparse
 import io
+import os
+import shlex
 import sys
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for stream in (sys.stdout, sys.stderr):  # a terminal that cannot show a sign gets its number
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-    options = parser.parse_args(arguments)
+    given = sys.argv[1:] if arguments is None else arguments
+    options = parser.parse_args(given)
+    options.command = shlex.join(["torchsoft", *(os.fsencode(one).decode("utf-8", "replace") for one in given)])
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: print(f"torchsoft: note: {message}", file=sys.stderr)
         return identify(options)
@@ -80,6 +85,7 @@ def identify(options: argparse.Namespace) -> int:
                 case.problem, heldout=heldout, meant=case.config.meant, checkpoint=unfinished,
                 progress=not options.no_progress, **fit.model_dump(),
             )  # fmt: skip
+            result = replace(result, command=options.command)
             result.save(options.out / "answer.json")
             report(result, case.problem, options.out / "report.html", checkpoint=unfinished)
             forget(unfinished)

@@ -117,9 +117,25 @@ class Coulomb(nn.Module):
         return torch.where(self.mu_s * F_N <= E, (E - self.mu_k * F_N) / R, 0.0)
 
 
+Sliding = Callable[[Tensor, Tensor], Tensor]
+"""Rate [m/s] at which sliding at v_T [m/s] stretches the tangential elements, with the ramp rho [1]."""
+
+
+def ramped(rho: Tensor, v_T: Tensor) -> Tensor:
+    """rho v_T: as much of the sliding as of the force is taken in, which is the power that the element gets."""
+    return rho * v_T
+
+
+def at_once(rho: Tensor, v_T: Tensor) -> Tensor:
+    """All of the sliding from touch-down on, while the force is ramped in: power (1 - rho) e v_T comes from nowhere. Not
+    continuous at touch-down."""
+    return torch.where(rho > 0, v_T, torch.zeros_like(v_T))
+
+
 class SoftContact(nn.Module):
     """The contact elements of one point, per reference spacing: springs K_n, K_t [N/m], dashpots R_n, R_t [N.s/m], the ramp's
-    depth epsilon [m], and a friction law. `weight` scales them to the length of surface that a point stands for."""
+    depth epsilon [m], and a friction law. `weight` scales them to the length of surface that a point stands for. `sliding`
+    other than `ramped` breaks the power balance."""
 
     limits: ClassVar = {
         "K_n": "positive",
@@ -138,6 +154,7 @@ class SoftContact(nn.Module):
         self.K_n, self.R_n, self.K_t, self.R_t = (parameter(value) for value in (K_n, R_n, K_t, R_t))
         self.epsilon = parameter(epsilon, trained=False)
         self.node_spacing, self.friction = positive("node_spacing", node_spacing), friction
+        self.sliding: Sliding = ramped
 
     def well_posed(self) -> str:
         """What is wrong with the parameters together; empty if nothing is."""
@@ -163,12 +180,13 @@ class SoftContact(nn.Module):
         """
         R = self.R_t + stage * self.K_t
         rho = ramp(g, self.epsilon)
+        slide = self.sliding(rho, v_T)
         F_N = normal_force(g, g_dot, rho, self.K_n, self.R_n)  # (8), (9)
-        trial = self.K_t * s + R * rho * v_T  # (10), (11): the effort if nothing slipped
+        trial = self.K_t * s + R * slide  # (10), (11): the effort if nothing slipped
         one = torch.ones_like(trial)
         sign = torch.where(trial >= 0, one, -one)
         gamma_dot = sign * self.friction(sign * trial, F_N, R)  # (12), (13)
-        s_dot = rho * v_T - gamma_dot
+        s_dot = slide - gamma_dot
         e = self.K_t * s + R * s_dot
         return ContactState(weight * F_N, weight * rho * e, s_dot, gamma_dot, weight * e, rho)
 

@@ -56,10 +56,18 @@ def conclude(
     J = at.J[:, free]
     C_free, values, vectors = fisher(J)
     chi2 = float(at.r @ at.r) / max(len(at.r) - int(free.sum()), 1)
+    verdicts = misfit.judge(
+        misfit.parts(problem, at.r, stage.recordings), at.r, J, robust=how.loss != "linear",
+        priors=[c.labels[i] for i, _ in c.priors],
+    )  # fmt: skip
+    declared = [name for name, one in problem.sensors.items() if one.colour == "ar"]
+    converged = fit.converged and end.at_rest
+    colour, bound = bool(coloured.found.keys() - set(declared)), bool((free & c.at_bound(x)).any())
+    doubtful = not converged or colour or bound or any(one.alarming for one in verdicts)
     checked = None
     if how.assumptions == "checked":
         with progress_bar("check of what is taken for granted", progress) as notify:
-            checked = taken_for_granted(coloured, runner, end, stage, free, how.loss, notify)
+            checked = taken_for_granted(coloured, runner, end, stage, free, doubtful, how.loss, notify)
     C, shift = np.zeros((len(x), len(x))), np.zeros(len(x)) if end.bias is None else end.bias
     C_fit = C_free * max(1.0, chi2) if how.loss == "linear" else robust.covariance(J, at.r, how.loss, len(c.priors))
     C[np.ix_(free, free)] = C_fit + (checked.widening() if checked is not None else 0.0)
@@ -73,17 +81,10 @@ def conclude(
         else:
             predicted = nrmse(problem, held.r, list(how.heldout))
     sd = np.sqrt(np.diag(C_free))
-    verdicts = misfit.judge(
-        misfit.parts(problem, at.r, stage.recordings),
-        at.r,
-        J,
-        robust=how.loss != "linear",
-        priors=[c.labels[i] for i, _ in c.priors],
-    )
-    notices += notices_on(found, fit.converged and end.at_rest, rtol, end.bias is None)
+    notices += notices_on(found, converged, rtol, end.bias is None)
     notices += checks.notices(checked) if checked is not None else []
     notices += misfit.notices(verdicts, max(1.0, chi2) ** 0.5 if how.loss == "linear" else 1.0)
-    notices += colour_notices(coloured.found, [name for name, s in problem.sensors.items() if s.colour == "ar"])
+    notices += colour_notices(coloured.found, declared)
     return IdentificationResult(
         estimates=found,
         labels=labels,
@@ -91,7 +92,7 @@ def conclude(
         correlation=(C_free / np.outer(sd, sd)).tolist(),
         directions=directions(labels, values, vectors),
         chi2=chi2,
-        converged=fit.converged and end.at_rest,
+        converged=converged,
         residuals=residual_channels(problem, at, how.fitted),
         heldout=predicted,
         notices=notices,
@@ -117,16 +118,17 @@ def conclude(
 
 
 def taken_for_granted(
-    coloured: Coloured, runner: Runner, end: Settled, stage: Stage, free: NDArray[np.bool_], loss: Loss, notify: Notify
-) -> checks.Checked:
+    coloured: Coloured, runner: Runner, end: Settled, stage: Stage, free: NDArray[np.bool_], doubtful: bool, loss: Loss,
+    notify: Notify,
+) -> checks.Checked:  # fmt: skip
     """The checks at the end of a fit, on residuals with the colour that was declared and no other: what was found unasked may
     be the very trace of a wrong assumption. Their columns then get all the noise."""
     problem, which = coloured.problem, stage.recordings
     declared = {channel: noise for channel, noise in problem.noise.items() if problem.sensors[channel].colour == "ar"}
     plain = problem.with_noise(declared)
     finer = rewhitened(plain, end.finer, misfit.parts(problem, end.finer.r, which))
-    how: dict[str, Any] = {"loss": loss, "workers": runner.workers, "journal": runner.folder, "notify": notify}
-    found = checks.check(plain, end.x, finer, free, which, end.rtol, **how)
+    how: dict[str, Any] = {"workers": runner.workers, "journal": runner.folder, "notify": notify}
+    found = checks.check(plain, end.x, finer, free, which, end.rtol, doubtful=doubtful, loss=loss, **how)
     rows = Residuals(found.columns[:, 0] if found.columns.size else finer.r, found.columns, {})
     columns: Array = rewhitened(problem, rows, misfit.parts(plain, rows.r, which)).J
     return found._replace(columns=columns, J=end.at.J[:, free])

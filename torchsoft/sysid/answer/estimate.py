@@ -133,9 +133,7 @@ def quantities(problem: Problem, x: Array, free: NDArray[np.bool_]) -> Iterator[
 
 def estimates(problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shift: Array) -> list[Estimate]:
     """Everything that was estimated, in physical units; C (n, n) and shift (n,) are of all coordinates."""
-    low, high = problem.coordinates.bounds
-    edge = free & ((x - low < 1e-4 * (high - low)) | (high - x < 1e-4 * (high - low)))
-    out = []
+    edge, out = free & problem.coordinates.at_bound(x), []
     for one in quantities(problem, x, free):
         sd = float(np.sqrt(max(one.slope @ C @ one.slope, 0.0)))
         known = (one.value, one.interval(sd)) if (identifiable := sd < IDENTIFIABLE) else (None, None)

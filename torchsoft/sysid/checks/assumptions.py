@@ -3,7 +3,7 @@
 A variation makes the recordings, or their parameters, as they would be if one thing were otherwise by a stated amount.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
@@ -11,7 +11,7 @@ from typing import Literal, NamedTuple
 from torch import Tensor, nn
 
 from torchsoft.channels import unit
-from torchsoft.physics.contact import Coulomb, SmoothSlip
+from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact, at_once
 from torchsoft.physics.motion import Piecewise, Reference, Sampled
 from torchsoft.physics.paper import SoftGrasp
 from torchsoft.physics.rig import Rig
@@ -71,8 +71,8 @@ FAULTS: dict[Nuisance, Fault] = {
 class Assumption:
     """One thing that is taken for granted: `stated` says what, `otherwise` what the variation makes of it, as clauses.
 
-    `vary` gives another recording, None where that has no meaning for it; or `values` are factors on parameters, close to
-    one. What is known, and what a sensor is, may be otherwise by any part of the `amount` [unit], and to either side; a law
+    `vary` gives another recording, None where that has no meaning for it; or `parameter` is varied by the amount
+    [%]. What is known, and what a sensor is, may be otherwise by any part of the `amount` [unit], and to either side; a law
     or a constant of the computation either is so, or is not.
     """
 
@@ -83,7 +83,7 @@ class Assumption:
     amount: float = 1.0
     unit: str = ""
     vary: Callable[[Recording], Recording | None] | None = None
-    values: Mapping[str, float] | None = None
+    parameter: str = ""
 
 
 def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Assumption]:
@@ -107,7 +107,9 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Assu
         small = ", ".join(f"{SMALLER_RAMP * value:.3g}" for value in ramps.values())
         stated = ", ".join(f"{value:.3g}" for value in ramps.values())
         out.append(Assumption("ramp", "numerical", f"forces are ramped in at touch-down over epsilon = {stated} m",
-                              f"epsilon were {small} m", vary=lambda r: ramped(r, tuple(ramps), SMALLER_RAMP)))  # fmt: skip
+                              f"epsilon were {small} m", vary=lambda r: scaled(r, tuple(ramps), SMALLER_RAMP)))  # fmt: skip
+    out.append(Assumption("ramp of the sliding", "law", "sliding stretches the tangential springs by the ramp of touch-down",
+                          "it did in full from touch-down on, without a ramp", vary=unramped))  # fmt: skip
     if any(isinstance(one, Sampled) for one in rig.reference.signals.values()):
         out.append(Assumption("set-points", "numerical", "set-points are what a smooth curve through the recorded ones says",
                               "only every second one were known", vary=sparser))  # fmt: skip
@@ -121,7 +123,7 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Assu
             continue
         part = RADIUS if name.endswith("radius") else KNOWN
         out.append(Assumption(name, "known", f"{name} is {value:.6g}", f"{name} were {(1 + part) * value:.6g}",
-                              100 * part, "%", values={name: 1 + part}))  # fmt: skip
+                              100 * part, "%", parameter=name))  # fmt: skip
     return out
 
 
@@ -170,8 +172,8 @@ def shifted(recording: Recording, part: float) -> Recording:
     return with_rig(recording, change)
 
 
-def ramped(recording: Recording, names: Sequence[str], factor: float) -> Recording:
-    """The depths `names` of touch-down ramps by a factor."""
+def scaled(recording: Recording, names: Collection[str], factor: float) -> Recording:
+    """Parameters by a factor."""
     return with_rig(recording, lambda rig: set_parameters(rig, {n: factor * recording.parameters[n] for n in names}))
 
 
@@ -183,12 +185,26 @@ def placed(recording: Recording) -> Recording | None:
     return replace(recording, start=start._replace(x=start.place(rig) + PLACE))
 
 
+def laws(rig: Rig) -> list[SoftContact]:
+    """The contact laws of a rig, each once."""
+    return list({id(contact.law): contact.law for contact in rig.contacts.values()}.values())
+
+
+def unramped(recording: Recording) -> Recording:
+    """Sliding taken in at once where a point touches."""
+
+    def change(rig: Rig) -> None:
+        for law in laws(rig):
+            law.sliding = at_once
+
+    return with_rig(recording, change)
+
+
 def coulomb(recording: Recording) -> Recording:
     """Coulomb's friction with the same coefficients."""
 
     def change(rig: Rig) -> None:
-        laws = {id(contact.law): contact.law for contact in rig.contacts.values()}
-        for law in laws.values():
+        for law in laws(rig):
             smooth = law.friction
             if isinstance(smooth, SmoothSlip):
                 law.friction = Coulomb(smooth.mu_s.item(), smooth.mu_k.item())

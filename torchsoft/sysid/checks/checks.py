@@ -6,7 +6,7 @@ residuals, how much of it the data ask for. A constant of the computation is not
 a coordinate more, with a standard normal prior on its amplitude, so that data that cannot tell it cost certainty.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -17,8 +17,8 @@ from scipy import stats
 
 from torchsoft.sysid.checks.assumptions import FAULTS, Assumption, Kind, assumptions
 from torchsoft.sysid.checks.misfit import LEVEL, parts
-from torchsoft.sysid.checks.variation import End, difference, ended, refit
-from torchsoft.sysid.fit.fit import Fit, Notify
+from torchsoft.sysid.checks.variation import End, Refit, difference, ended, refit
+from torchsoft.sysid.fit.fit import Notify
 from torchsoft.sysid.fit.information import fisher, shift, standard_deviations
 from torchsoft.sysid.fit.plan import USUAL
 from torchsoft.sysid.fit.robust import Loss
@@ -42,6 +42,9 @@ LAGS = 10
 
 BY_CHANCE = 2.0
 """What the statistic of Box and Pierce may be by chance, over its expectation."""
+
+RIVALS = 3
+"""Numbers of the rig that are taken to be unknown where a doubtful fit is repeated, one at a time."""
 
 MOVED = 0.5
 """Standard deviations by which a constant of the computation may move an estimate without a word."""
@@ -111,11 +114,12 @@ class Checked(NamedTuple):
 
 def check(
     problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_], which: Sequence[str], rtol: float, *,
-    loss: Loss = "linear", workers: int = 1, journal: Path | None = None, notify: Notify = lambda chi2: None,
+    doubtful: bool = False, loss: Loss = "linear", workers: int = 1, journal: Path | None = None,
+    notify: Notify = lambda chi2: None,
 ) -> Checked:  # fmt: skip
     """Vary what was taken for granted at the estimates x (n,), where `at` holds residuals and Jacobian of the recordings
-    `which`. Where no variation explains why residuals are larger than the noise, the fit is repeated under each that is no
-    number of the rig."""
+    `which`. A fit that is `doubtful` is repeated under each variation that is no number of the rig, by `loss`, until one
+    explains what the fit left: what is true to first order is not where a fit has run far off."""
     end = ended(problem, x, at, free, which, max(rtol, USUAL), workers, journal)
     recordings = [recording for recording in problem.recordings if recording.name in which]
     taken = assumptions(recordings, set(problem.coordinates.names))
@@ -129,16 +133,23 @@ def check(
             columns.append(d)
     linear = columns_of(problem, Runner(problem.recordings, workers, journal), end, taken)
     checks |= {one.name: judge.column(one, d) for one, d in linear if d.any()}
-    doubted = sorted((one for one in taken if one.vary is not None), key=lambda one: -checks[one.name].gain)
-    if not end.base.lost and judge.too_large(checks.values()):
+    if doubtful and not end.base.lost and not judge.explained(checks.values()):
         as_stated = refit(problem, end, None, loss, notify)
-        for one in doubted:
-            fit = refit(problem, end, one, loss, notify)
-            if fit is not None and as_stated is not None:
-                checks[one.name] = judge.fit(one, fit, as_stated, checks[one.name])
-            if not judge.too_large(checks.values()):
+        for one in doubted(taken, checks) if as_stated is not None else ():
+            again = refit(problem, end, one, loss, notify)
+            if again is not None and as_stated is not None:
+                checks[one.name] = judge.fit(one, again, as_stated, checks[one.name])
+            if judge.explained(checks.values()):
                 break
     return Checked(list(checks.values()), np.stack(columns, 1) if columns else np.zeros((len(at.r), 0)), judge.J)
+
+
+def doubted(taken: Sequence[Assumption], checks: Mapping[str, Check]) -> list[Assumption]:
+    """What a fit is repeated without, the likeliest first: all that either is so or is not, and the `RIVALS` of the rig's
+    numbers that would explain most."""
+    by_gain = sorted((one for one in taken if one.name in checks), key=lambda one: -checks[one.name].gain)
+    numbers = [one for one in by_gain if one.parameter and checks[one.name].significance > ASKED][:RIVALS]
+    return [one for one in by_gain if one.vary is not None or one in numbers]
 
 
 class Judge:
@@ -153,10 +164,10 @@ class Judge:
         self.dof = max(len(self.r) - len(self.labels), 1)
         self.square = float(self.r @ self.r)
 
-    def too_large(self, checks: Iterable[Check]) -> bool:
-        """Whether residuals are larger than the noise, and would be with whatever the data ask for."""
+    def explained(self, checks: Iterable[Check]) -> bool:
+        """Whether the data ask for something with which residuals are no larger than the noise."""
         gain = max((one.gain for one in checks if one.wanted), default=0.0)
-        return float(stats.chi2.sf(self.square - gain, self.dof)) < LEVEL
+        return gain > 0 and float(stats.chi2.sf(self.square - gain, self.dof)) > LEVEL
 
     def unchecked(self, one: Assumption, reason: str) -> Check:
         return Check(one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, {}, 0.0, 0.0, float("inf"), 0.0,
@@ -185,19 +196,25 @@ class Judge:
         )
         return self.made(one, moves, gain, alpha * one.amount, sd * one.amount, rest, pattern)
 
-    def fit(self, one: Assumption, fit: Fit, as_stated: Fit, linear: Check) -> Check:
+    def fit(self, one: Assumption, again: Refit, as_stated: Refit, linear: Check) -> Check:
         """Of a fit that was repeated with it, beside one that was repeated without; or what is known to first order, if that is
         worth more."""
-        assert fit.at is not None
-        assert as_stated.at is not None
-        r, before = fit.at.r, as_stated.at.r
-        gain = float(before @ before - r @ r)
+        at, before = again.fit.at, as_stated.fit.at
+        assert at is not None
+        assert before is not None
+        gain = float(before.r @ before.r - at.r @ at.r)
         if gain <= linear.gain:
             return linear
-        rest = max(1.0, float(r @ r) / self.dof)
-        moves, sd = (fit.x - self.end.x)[self.end.free] / self.sd, (rest / gain) ** 0.5
-        pattern = pattern_of(self.places, r, before)
-        return replace(self.made(one, moves, gain, one.amount, sd * one.amount, rest, pattern), refitted=True)
+        rest = max(1.0, float(at.r @ at.r) / self.dof)
+        moves = np.array([again.of(label) for label in self.labels]) - self.end.x[self.end.free]
+        asked, sd = one.amount, (rest / gain) ** 0.5 * one.amount
+        if one.parameter:
+            labels = [label for label, is_free in zip(again.problem.coordinates.labels, again.free) if is_free]
+            k = again.problem.coordinates.labels.index(one.parameter)
+            asked = 100 * (np.exp(again.fit.x[k] - again.problem.coordinates.start[k]) - 1)
+            sd = 100 * rest**0.5 * float(standard_deviations(at.J[:, again.free])[labels.index(one.parameter)])
+        pattern = pattern_of(self.places, at.r, before.r)
+        return replace(self.made(one, moves / self.sd, gain, asked, sd, rest, pattern), refitted=True)
 
 
 def pattern_of(places: Sequence[slice], left: Array, r: Array) -> float:
@@ -223,8 +240,8 @@ def columns_of(
 ) -> list[tuple[Assumption, Array]]:
     """What other values of known parameters, and faults of sensors that are not unknown, would add to the residuals, to first
     order: of one run a recording, with its derivatives. Nothing where a run fails."""
-    known = [one for one in taken if one.values is not None]
-    names = tuple(name for one in known for name in one.values or ())
+    known = [one for one in taken if one.parameter]
+    names = tuple(one.parameter for one in known)
     jobs = [job._replace(names=names) for job in problem.jobs(end.x, end.which, end.steps, None)]
     runs = runner.run(jobs)
     if any(isinstance(run, FailedRun) for run in runs):
@@ -236,9 +253,7 @@ def columns_of(
     for job, run in zip(jobs, runs):
         recording = problem.recordings[job.recording]
         signals = Signals(run.t, recording.channels, run.signals, run.derivatives)
-        sizes = [
-            (factor - 1) * recording.parameters[name] for one in known for name, factor in (one.values or {}).items()
-        ]
+        sizes = [one.amount / 100 * recording.parameters[one.parameter] for one in known]
         for channel, one in problem.readouts(end.x, job.recording).items():
             t, measured = recording.samples[channel]
             y, slopes, by = one.expected(signals, t)
@@ -267,7 +282,7 @@ def notices(checked: Checked) -> list[str]:
         text = f"the data contradict that {best.stated}: the sum of squares {best.falls} if {best.otherwise}"
         if best.kind in ("known", "sensor"):
             text += f" ({best.asked:+.3g} {best.unit} fit best, +- {best.asked_sd:.2g})"
-            move *= best.asked / best.amount
+            move *= 1.0 if best.refitted else best.asked / best.amount
         text += f"; {label} would move by {abs(move):.2g} standard deviations" if label else ""
         out.append(text + (f"; so would it with others: {', '.join(rivals)}" if rivals else ""))
         out += [

@@ -8,16 +8,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchsoft.sysid.checks.assumptions import Assumption
-from torchsoft.sysid.fit.fit import Fit, Notify, gauss_newton
+from torchsoft.sysid.fit.fit import Fit, Notify, Unreachable
+from torchsoft.sysid.fit.plan import SCANNED, Stage
 from torchsoft.sysid.fit.robust import Loss
+from torchsoft.sysid.fit.stages import run_stage
 from torchsoft.sysid.problem.prediction import Frozen
 from torchsoft.sysid.problem.problem import Problem, Residuals
 from torchsoft.sysid.problem.recording import Array
+from torchsoft.sysid.problem.unknowns import Unknown
 from torchsoft.sysid.problem.workers import Runner
 
 REFITS, ROUGH = 12, 1e-2
 """Evaluations that a fit under another assumption may take, and its relative tolerance: it has to find out whether the misfit
 goes away, not where exactly."""
+
+
+AMOUNTS = 10.0
+"""How many amounts of a variation a number of the rig may be off where a fit is repeated."""
 
 
 class End(NamedTuple):
@@ -45,17 +52,21 @@ def ended(
 
 
 def varied(problem: Problem, which: Sequence[str], one: Assumption) -> Problem | str:
-    """The problem with one assumption otherwise in the recordings `which`, or why there is none."""
-    assert one.vary is not None
-    made = []
+    """The problem with one assumption otherwise in the recordings `which`, or why there is none. A parameter that is called
+    known becomes one more unknown."""
+    made, unknowns = [], dict(problem.unknowns)
+    if one.parameter:
+        value, reach = problem.recordings[0].parameters[one.parameter], AMOUNTS * one.amount / 100
+        low, high = sorted((value * (1 - reach), value * (1 + reach)))
+        unknowns[one.parameter] = Unknown(nominal=value, low=low, high=high)
     for recording in problem.recordings:
-        other = one.vary(recording) if recording.name in which else recording
+        other = one.vary(recording) if one.vary is not None and recording.name in which else recording
         if other is None:
             return f"it has no meaning where recording `{recording.name}` begins"
         made.append(other)
     try:
-        return Problem(made, problem.sensors, problem.unknowns, problem.noise)
-    except ValueError as error:  # an unknown that the varied rig has not
+        return Problem(made, problem.sensors, unknowns, problem.noise)
+    except ValueError as error:  # an unknown that the varied rig has not, or that cannot be one
         return str(error)
 
 
@@ -72,17 +83,36 @@ def difference(problem: Problem, end: End, one: Assumption) -> tuple[Array | Non
     return got.r - end.base.r, ""
 
 
-def refit(problem: Problem, end: End, one: Assumption | None, loss: Loss, notify: Notify) -> Fit | None:
-    """Where the fit would end with one assumption otherwise, or with all as stated, on steps of its own; None where it cannot
-    begin."""
+class Refit(NamedTuple):
+    """A fit that was repeated: the problem, its end, and which of its coordinates were free."""
+
+    problem: Problem
+    fit: Fit
+    free: NDArray[np.bool_]
+
+    def of(self, label: str) -> float:
+        """A coordinate at the end."""
+        return float(self.fit.x[self.problem.coordinates.labels.index(label)])
+
+
+def refit(problem: Problem, end: End, one: Assumption | None, loss: Loss, notify: Notify) -> Refit | None:
+    """The fit with one assumption otherwise, or with all as stated, on steps of its own; None where it cannot begin.
+
+    Ratios that ended at a bound are looked for again over all of their range.
+    """
     other = varied(problem, end.which, one) if one is not None else problem
     if isinstance(other, str):
         return None
+    c, at = other.coordinates, dict(zip(problem.coordinates.labels, end.x))
+    fitted = {label for label, is_free in zip(problem.coordinates.labels, end.free) if is_free}
+    x = np.array([at.get(label, own) for label, own in zip(c.labels, c.start)])
+    free = np.array([label in fitted or label not in at for label in c.labels])
+    stuck = [one for one, is_stuck in zip(c.all, free & c.at_bound(x)) if is_stuck and one.ratio_to]
+    scans = tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in stuck)
+    labels = tuple(label for label, is_free in zip(c.labels, free) if is_free)
+    stage = Stage("once more", end.which, labels, end.rtol, REFITS, ROUGH, scanned=scans)
     runner = Runner(other.recordings, end.workers, end.journal)
-    first, steps = other.freeze(runner, end.x, end.which, end.rtol, end.free)
-    if first.lost:
+    try:
+        return Refit(other, run_stage(other, runner, stage, x, loss, "gauss_newton", 0, notify), free)
+    except Unreachable:
         return None
-    return gauss_newton(
-        other, runner, end.x, which=end.which, free=end.free, steps=steps, evaluations=REFITS, tolerance=ROUGH, loss=loss,
-        first=first, notify=notify,
-    )  # fmt: skip

@@ -188,6 +188,10 @@ def limits(name: str, unknowns: Mapping[str, Unknown], given: Mapping[str, float
     return least, most
 
 
+AT_BOUND = 1e-4
+"""Part of the way between its bounds within which a coordinate counts as being at one."""
+
+
 class Coordinates:
     """All coordinates of a problem, in a fixed order, and the way from their vector x (n,) to parameters of the rig, of where
     runs begin, and of the sensors.
@@ -273,6 +277,11 @@ class Coordinates:
     @property
     def bounds(self) -> tuple[Array, Array]:
         return np.array([c.to_x(c.low) for c in self.all]), np.array([c.to_x(c.high) for c in self.all])
+
+    def at_bound(self, x: Array) -> NDArray[np.bool_]:
+        """Which coordinates (n,) are as close to a bound as `AT_BOUND` of the way to the other one."""
+        low, high = self.bounds
+        return np.minimum(x - low, high - x) < AT_BOUND * (high - low)
 
     @property
     def free(self) -> NDArray[np.bool_]:
