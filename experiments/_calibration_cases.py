@@ -12,13 +12,14 @@ from torchsoft.sysid import RIG, Prior, Problem, Sensor, Unknown, record
 @dataclass(frozen=True)
 class Case:
     """A motion of less than half a second, sensors `noise` times as bad as the good rig's, and by parameter the standard
-    deviation of its logarithm beforehand."""
+    deviation of its logarithm beforehand. `bent`: its posteriors are not nearly normal, and NUTS is tried."""
 
     title: str
     motion: Strokes | Roll
     duration: float
     noise: float
     priors: dict[str, float]
+    bent: bool = False
 
     def problem(self) -> Problem:
         """With the samples of the middle of the prior; a calibration keeps their times only."""
@@ -41,6 +42,6 @@ CASES = {
         "strokes", Strokes(travel=6e-3, stroke_time=0.1), 0.35, 5.0,
         {"pad.E": 0.1, "pad.tau": 0.2, "contact.K_t": 0.2, "contact.mu_s": 0.1},
     ),
-    "series": Case("series", Roll(travel=4e-3), 0.25, 10.0, {"pad.E": 0.3, "contact.K_n": 0.7}),
+    "series": Case("series", Roll(travel=4e-3), 0.25, 10.0, {"pad.E": 0.3, "contact.K_n": 0.7}, bent=True),
 }  # fmt: skip
 """Strokes that slip, seen well; and a roll that sees the stiffnesses of pads and contacts in series, hardly each of them."""

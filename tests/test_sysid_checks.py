@@ -149,7 +149,7 @@ def test_a_variation_that_cannot_be_run_is_said(monkeypatch: pytest.MonkeyPatch)
     def bare(*_: object) -> list[Assumption]:
         return [Assumption("mesh", "numerical", "the pads have few elements", "they had more", vary=lambda r: None)]
 
-    monkeypatch.setattr("torchsoft.sysid.checks.assumptions", bare)
+    monkeypatch.setattr("torchsoft.sysid.checks.checks.assumptions", bare)
     found = checked(recorded())
     assert any(
         sentence.startswith("it could not be checked what it does that the pads have few elements")

@@ -218,21 +218,23 @@ class Judge:
 
 
 def pattern_of(places: Sequence[slice], left: Array, r: Array) -> float:
-    """What is left of the autocovariances of residuals r, by the root of the sum of their squares; 0 where r has none beyond
-    chance."""
+    """What is left of the autocovariances of residuals r beyond those of white noise, by the root of the sum of their squares;
+    0 where r has none beyond chance."""
 
     def statistic(r: Array) -> tuple[float, float]:
-        """That of Box and Pierce, over the stated noise in place of the residuals' own, and what chance may make of it."""
-        total = chance = 0.0
+        """That of Box and Pierce, over the stated noise in place of the residuals' own, and its mean for white residuals."""
+        total = white = 0.0
         for rows in places:
             own, n = r[rows], len(r[rows])
             gamma = np.array([own[k:] @ own[:-k] / n for k in range(1, min(LAGS, n // 4) + 1)])
             total += n * float(gamma @ gamma)
-            chance += BY_CHANCE * len(gamma) * max(1.0, float(own @ own) / n) ** 2
-        return total, chance
+            white += len(gamma) * max(1.0, float(own @ own) / n) ** 2
+        return total, white
 
-    before, chance = statistic(r)
-    return (statistic(left)[0] / before) ** 0.5 if before > chance else 0.0
+    (before, by_chance), (after, rest) = statistic(r), statistic(left)
+    if before <= BY_CHANCE * by_chance:
+        return 0.0
+    return (max(after - rest, 0.0) / (before - by_chance)) ** 0.5
 
 
 def columns_of(

@@ -18,7 +18,7 @@ from torchsoft.sysid.problem.recording import Array
 from torchsoft.sysid.problem.unknowns import Unknown
 from torchsoft.sysid.problem.workers import Runner
 
-REFITS, ROUGH = 12, 1e-2
+REFITS, ROUGH = 20, 1e-3
 """Evaluations that a fit under another assumption may take, and its relative tolerance: it has to find out whether the misfit
 goes away, not where exactly."""
 
