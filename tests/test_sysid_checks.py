@@ -10,7 +10,7 @@ from conftest import COARSE
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
-from torchsoft.sysid.checks.assumptions import PLACE, Assumption, assumptions, remeshed
+from torchsoft.sysid.checks.assumptions import PLACE, Assumption, assumptions, remeshed, scaled, unramped
 from torchsoft.sysid.checks.checks import Checked, check, notices
 from torchsoft.sysid.problem.prediction import predict
 from torchsoft.sysid.problem.workers import Runner
@@ -29,8 +29,8 @@ def recorded(truth: Parameters = BASE, excitation: Excitation = STROKES) -> Reco
     return record("strokes", excitation, truth.override(TRUTH), BASE, SENSORS, rtol=1e-6, seed=4)
 
 
-def checked(data: Recording, doubtful: bool = False) -> Checked:
-    problem = Problem([data], SENSORS, {name: Unknown() for name in TRUTH})
+def checked(data: Recording, doubtful: bool = False, sensors: dict[str, Sensor] = SENSORS) -> Checked:
+    problem = Problem([data], sensors, {name: Unknown() for name in TRUTH})
     free, runner = problem.coordinates.free, Runner(problem.recordings)
     answer = identify(problem, plan=[Stage("all", problem.names, problem.coordinates.labels, RTOL)])
     x = np.array(answer.x)
@@ -108,20 +108,41 @@ def test_the_cause_is_named_with_its_amount(
     assert notices(found)[0].startswith(says)
 
 
+def made_by(other: Recording | None, data: Recording, sensors: dict[str, Sensor] = SENSORS) -> Recording:
+    """The samples that another rig would have given, with noise."""
+    assert other is not None
+    run, rng = predict(other.begin(), TRUTH, other.grid(False), (), 1e-6), np.random.default_rng(0)
+    samples = {}
+    for channel, sensor in sensors.items():
+        exact = run.signals[:, other.channels.index(channel)]
+        samples[channel] = (run.t, exact + sensor.noise * rng.standard_normal(len(exact)))
+    return replace(data, samples=samples)
+
+
 def test_a_finer_mesh_is_asked_for_by_data_that_one_made() -> None:
     data = recorded()
-    finer = remeshed(data, 2, 0)
-    assert finer is not None
-    run, rng = predict(finer.begin(), TRUTH, finer.grid(False), (), 1e-6), np.random.default_rng(0)
-    samples = {}
-    for channel, sensor in SENSORS.items():
-        exact = run.signals[:, finer.channels.index(channel)]
-        samples[channel] = (run.t, exact + sensor.noise * rng.standard_normal(len(exact)))
-    found = checked(replace(data, samples=samples))
+    found = checked(made_by(remeshed(data, 2, 0), data))
     (mesh,) = (one for one in found.checks if one.name == "mesh")
     assert mesh.wanted
     assert mesh.asked == pytest.approx(1.0, abs=0.2)
     assert any("elements" in sentence for sentence in notices(found))
+
+
+LIGHT = Excitation(motion=Strokes(travel=30e-3, stroke_time=0.15), duration=0.9, depth=3e-4)
+QUIET = {name: Sensor(noise=0.2 * one.noise) for name, one in SENSORS.items()}
+
+
+@pytest.mark.parametrize(
+    ("vary", "name"), [(unramped, "ramp of the sliding"), (lambda data: scaled(data, ["contact.epsilon"], 0.1), "ramp")]
+)
+def test_another_ramp_is_asked_for_by_data_that_it_made(vary: Callable[[Recording], Recording], name: str) -> None:
+    """A light grasp that slips: many points are hardly in contact. The fit runs off, and is repeated."""
+    data = recorded(excitation=LIGHT)
+    found = checked(made_by(vary(data), data, QUIET), doubtful=True, sensors=QUIET)
+    (one,) = (one for one in found.checks if one.name == name)
+    assert one.wanted
+    assert 0.5 < one.asked < 1.5
+    assert any("ramp" in sentence for sentence in notices(found))
 
 
 def test_every_pad_is_meshed_anew_where_it_was() -> None:
