@@ -16,7 +16,7 @@ FLOWS = {
     """,
     "codegen": "graph derivatives operations trace emit . invoke",
     "physics": """
-        arguments mesh shapes contact material pads motion multibond state parts condensed validity rig energy paper
+        arguments mesh shapes contact retardation material pads motion multibond state parts condensed validity rig energy paper
         equilibrium settled .
     """,
     "solve": """
