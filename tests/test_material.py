@@ -44,6 +44,7 @@ from torchsoft.physics.material import KINDS, Material
 from torchsoft.physics.retardation import retarded
 from torchsoft.plot.diagram import graph_of
 from torchsoft.solve.trajectory import load
+from torchsoft.sysid import AtRest, Known, Problem, Recording, Sensor, Unknown, identify
 
 COMMON = {"E": 7.5e5, "nu": 0.45, "rho": 1100.0, "depth": 0.044}
 MATERIALS: dict[str, Callable[[], Material]] = {
@@ -239,6 +240,25 @@ def test_gradients_of_creep_by_every_coefficient_equal_differences(material: Mat
         assert float(sensitivities[WEIGHED, 0, k].sum()) == pytest.approx(float(grad), rel=1e-9, abs=1e-12 * size), name
 
 
+def test_every_coefficient_of_a_series_is_identified() -> None:
+    """From the punch's height under a held force, without noise, from starts a third away."""
+    t = torch.cat((torch.zeros(1).double(), torch.logspace(-3, 0.5, 120, dtype=torch.float64)))
+    values = {"E": 7.5e5, "E_1": 5e5, "tau_1": 5e-3, "E_2": 3e5, "tau_2": 0.1}
+
+    def solid(E: float, E_1: float, tau_1: float, E_2: float, tau_2: float) -> Prony:
+        return Prony(**(COMMON | {"E": E}), moduli=[E_1, E_2], tau=[tau_1, tau_2])
+
+    rig, y0 = punch(solid(**values), force=1.0)
+    y = simulate(rig, t, y0=y0, rtol=1e-7)["y_punch"].detach().numpy()
+    start = {name: value * factor for (name, value), factor in zip(values.items(), (1.3, 0.7, 1.4, 0.8, 0.75))}
+    nominal, _ = punch(solid(**start), force=1.0)
+    recording = Recording("creep", nominal, {"y_punch": (t.numpy(), y)}, Known(y0))
+    unknowns = {f"rubber.{name}": Unknown() for name in values}
+    result = identify(Problem([recording], {"y_punch": Sensor(noise=1e-9)}, unknowns), rtol=1e-5)
+    found = {one.name.removeprefix("rubber."): one.value for one in result.estimates}
+    assert found == pytest.approx(values, rel=1e-4)
+
+
 # --- the grasp --------------------------------------------------------------------------------------------------------------
 
 STABLE = Parameters().override(COARSE | {"control.senses": "bracket"})
@@ -381,6 +401,15 @@ def test_an_inertial_pad_of_several_times_is_refused(name: str) -> None:
         model(0.0, y)
     with pytest.raises(NotImplementedError, match=message):
         simulate(model, times(0.1, 2), y0=y)
+
+
+def test_a_recording_that_begins_before_the_pads_forget_is_named() -> None:
+    model = SoftGrasp(STABLE, material=MATERIALS["prony"]())
+    samples = {"y_C": (np.linspace(0, 1, 5), np.zeros(5))}
+    with pytest.warns(UserWarning, match=r"begins 0.2 s before the first sample, but the pad `.` creeps for 4.27 s") as said:
+        _ = Recording("slow", model, samples, AtRest()).start_coordinates
+    assert len(said) == 2
+    _ = Recording("slow", model, samples, AtRest(lead=20.0)).start_coordinates
 
 
 def test_every_material_has_a_name_in_files() -> None:

@@ -42,6 +42,7 @@ def fitted(fit: Fit) -> Figure:
         spectrum.errorbar(x, size * y, size * np.array(along), across, fmt="o", color=ACTUAL, capsize=3)
     E = fit.values["E"]
     kept = f"E = {MPA * E:.4g} MPa ± {1.96 * fit.sd['E'] / E:.1%}"
+    spectrum.margins(y=0.2)
     spectrum.set(
         xscale="log", yscale="log", xlabel="time [s]", ylabel=f"${symbol}_i${unit}", title=f"c) terms; {kept}, relaxed"
     )

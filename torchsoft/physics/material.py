@@ -57,6 +57,10 @@ class Material(nn.Module):
         J, tau = self.chain()
         return self.E / (J / (1 + 1j * omega[..., None] * tau)).sum(-1)
 
+    def well_posed(self) -> str:
+        """What is wrong with the parameters together; empty if nothing is."""
+        return ""
+
     def lame(self) -> tuple[Tensor, Tensor]:
         """Lame moduli (lambda, mu) [Pa]."""
         return lame_moduli(self.E, self.nu)
@@ -94,7 +98,6 @@ class StandardLinearSolid(Material):
         self.E_instant, self.tau, self.tau_instant = (parameter(x) for x in (E_instant, tau, tau_instant))
 
     def well_posed(self) -> str:
-        """What is wrong with the parameters together; empty if nothing is."""
         return "E_instant is below E" if self.E_instant.item() < self.E.item() else ""
 
     def chain(self) -> tuple[Tensor, Tensor]:
@@ -143,7 +146,6 @@ class Series(Material):
         return torch.stack(one), torch.stack(other)
 
     def well_posed(self) -> str:
-        """What is wrong with the parameters together; empty if nothing is."""
         shortest, instant = float(self.series()[1].detach().min()), self.tau_instant.item()
         if instant >= shortest:
             return f"tau_instant = {instant:g} s must be below the shortest tau, {shortest:g} s"
