@@ -333,6 +333,20 @@ def test_gradients_of_a_grasp_by_every_coefficient_equal_differences(name: str) 
         assert float(value.grad * value.detach()) == pytest.approx((up - down) / 2e-6, rel=1e-6, abs=1e-8), own
 
 
+def test_the_adjoint_of_a_chain_equals_backpropagation() -> None:
+    """Through the same steps in plain torch."""
+    grads = []
+    for gradient in ("discrete", "unrolled"):
+        model = SoftGrasp(STABLE, material=MATERIALS["prony"]())
+        y0, reference = rolling(model)
+        run = simulate(model, times(0.02, 2), y0=y0, reference=reference, step=2e-3, tolerance=1e-10, gradient=gradient)
+        run.state.pose["disc"][-1, 1].backward()
+        values = [value for name, value in model.pad.named_parameters() if name != "rho"]
+        grads.append(torch.stack([value.grad * value.detach() for value in values if value.grad is not None]))
+    assert len(grads[0]) == len(grads[1]) == 14
+    assert float((grads[0] - grads[1]).abs().max()) < 1e-9 * float(grads[0].abs().max())
+
+
 @torch.no_grad()
 def test_a_chain_of_one_element_is_kelvin_and_voigts() -> None:
     """To rounding: nothing is left for the instantaneous spring."""
@@ -406,7 +420,9 @@ def test_an_inertial_pad_of_several_times_is_refused(name: str) -> None:
 def test_a_recording_that_begins_before_the_pads_forget_is_named() -> None:
     model = SoftGrasp(STABLE, material=MATERIALS["prony"]())
     samples = {"y_C": (np.linspace(0, 1, 5), np.zeros(5))}
-    with pytest.warns(UserWarning, match=r"begins 0.2 s before the first sample, but the pad `.` creeps for 4.27 s") as said:
+    with pytest.warns(
+        UserWarning, match=r"begins 0.2 s before the first sample, but the pad `.` creeps for 4.27 s"
+    ) as said:
         _ = Recording("slow", model, samples, AtRest()).start_coordinates
     assert len(said) == 2
     _ = Recording("slow", model, samples, AtRest(lead=20.0)).start_coordinates
