@@ -41,7 +41,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_help_names_every_command_argument_and_option(capsys: Any) -> None:
     for arguments, words in (
-        (["--help"], ("identify",)),
+        (["--help"], ("identify", "material")),
+        (["material", "--help"], ("fit", "presets")),
+        (
+            ["material", "fit", "--help"],
+            ("FILE.csv", "--out", "--test", "--terms", "--length", "--area", "--nu", "compliance"),
+        ),
+        (["material", "presets", "--help"], ("published",)),
         (["identify", "--help"], ("DATA.csv", "CONFIG.toml", *OPTIONS)),
     ):
         with pytest.raises(SystemExit) as end:
@@ -58,6 +64,9 @@ def test_help_names_every_command_argument_and_option(capsys: Any) -> None:
         ([], "COMMAND"),
         (["simulate"], "invalid choice: 'simulate'"),
         (["identify"], "DATA.csv"),
+        (["material"], "COMMAND"),
+        (["material", "fit"], "FILE.csv"),
+        (["material", "fit", "test.csv", "--test", "pull"], "invalid choice: 'pull'"),
         (["identify", "rig.toml", "--step", "1"], "unrecognized arguments: --step"),
         (["identify", "rig.toml", "--rtol", "fast"], "invalid float value: 'fast'"),
     ],

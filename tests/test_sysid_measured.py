@@ -21,7 +21,7 @@ from torchsoft.physics.material import StandardLinearSolid
 from torchsoft.solve.trajectory import save
 from torchsoft.sysid import MEASURED, Recording, Sensor, record
 from torchsoft.sysid.files.columns import COLUMNS, UNITS, read_table, read_tables
-from torchsoft.sysid.files.cost import cost, one_by_one, paper_settings
+from torchsoft.sysid.files.cost import cost, paper_settings
 from torchsoft.sysid.files.measured import STATED, known_parameters, load, read_recording, stem
 from torchsoft.sysid.problem.start import AtRest
 from torchsoft.sysid.problem.underway import Underway
@@ -549,6 +549,30 @@ def test_competing_laws_have_the_same_data(case: Callable[..., list[str]]) -> No
     rigs = {name: law.recordings[0].rig for name, law in made.laws.items()}
     assert isinstance(rigs["coulomb"].contacts["L"].law.friction, Coulomb)
     assert isinstance(rigs["solid"].pads["U"].material, StandardLinearSolid)
-    one, both = (cost(made.laws[name], 1e-3, 1, 1) for name in (STATED, "coulomb"))
-    assert one_by_one([one, both]).seconds == pytest.approx(one.seconds + both.seconds)
-    assert load(*_split(case())).laws == {}
+
+
+@pytest.mark.parametrize(
+    ("pads", "message"),
+    [
+        ('kind = "prony"\nmoduli = [2e5, 1e5]\ntau = [2e-3, 0.01]', ""),
+        ('kind = "generalised_kelvin"\nJ = [0.3, 0.2]\ntau = [2e-3, 0.01]', ""),
+        ('kind = "prony"\nmoduli = [2e5, 1e5]\ntau = [2e-3]', "a series needs as many `E` as `tau`, and at least one"),
+        ('kind = "prony"\nmoduli = [2e5]\ntau = [1e-5]', "pads: tau_instant = 0.0001 s must be below the shortest tau"),
+        ('kind = "generalised_kelvin"\nJ = [0.8, 0.5]\ntau = [1, 2]', "pads: the fractions J sum to 1.3, above one"),
+        ('kind = "prony"\nmoduli = [-2e5]\ntau = [1.0]', "pads.moduli.0 should be greater than or equal to"),
+    ],
+)
+def test_pads_may_be_of_any_series(case: Callable[..., list[str]], pads: str, message: str) -> None:
+    """Of the relaxed modulus `pad.E`; their coefficients may be unknown."""
+    symbol, bound = ("E", "") if "prony" in pads else ("J", "\nhigh = 0.7")
+    config = CONFIG.replace('[unknowns."contact.K_n"]\nnominal = 1e5', f'[unknowns."pad.{symbol}_1"]{bound}')
+    files = _split(case(config=f"{config}[pads]\n{pads}\n"))
+    if message:
+        with pytest.raises(ValueError, match=re.escape(message)):
+            load(*files)
+        return
+    problem = load(*files).problem
+    assert set(problem.unknowns) == {f"pad.{symbol}_1", "pad.E"}
+    one = problem.recordings[0]
+    assert one.rig.pads["L"].material.branches == 3
+    assert one.rig.pads["L"].material.E.item() == one.parameters["pad.E"]

@@ -3,7 +3,7 @@
 from torchsoft.parameters import Parameters
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact
 from torchsoft.physics.equilibrium import NoEquilibrium, press, rest
-from torchsoft.physics.material import KelvinVoigt, StandardLinearSolid
+from torchsoft.physics.material import GeneralisedKelvin, KelvinVoigt, Prony, StandardLinearSolid
 from torchsoft.physics.mesh import PadMesh
 from torchsoft.physics.motion import Profile, Reference, Sampled, hold
 from torchsoft.physics.pads import Pad
@@ -21,8 +21,8 @@ from torchsoft.solve.trajectory import Trajectory
 register()
 
 __all__ = [
-    "METHOD", "PD", "Actuator", "Batch", "Body", "Circle", "Contact", "Coulomb", "Ellipse", "Interrupted", "KelvinVoigt",
-    "NoEquilibrium", "Pad", "PadMesh", "Parameters", "Profile", "Reference", "Rig", "Sampled", "SamplesFailed", "Shape",
-    "SimulationFailed", "SmoothSlip", "SoftContact", "SoftGrasp", "StandardLinearSolid", "Trajectory", "hold", "press",
-    "rest", "simulate", "simulate_batch",
+    "METHOD", "PD", "Actuator", "Batch", "Body", "Circle", "Contact", "Coulomb", "Ellipse", "GeneralisedKelvin",
+    "Interrupted", "KelvinVoigt", "NoEquilibrium", "Pad", "PadMesh", "Parameters", "Profile", "Prony", "Reference", "Rig",
+    "Sampled", "SamplesFailed", "Shape", "SimulationFailed", "SmoothSlip", "SoftContact", "SoftGrasp",
+    "StandardLinearSolid", "Trajectory", "hold", "press", "rest", "simulate", "simulate_batch",
 ]  # fmt: skip

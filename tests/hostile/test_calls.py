@@ -22,12 +22,14 @@ from torchsoft import (
     Contact,
     Coulomb,
     Ellipse,
+    GeneralisedKelvin,
     KelvinVoigt,
     NoEquilibrium,
     Pad,
     PadMesh,
     Parameters,
     Profile,
+    Prony,
     Reference,
     Rig,
     Sampled,
@@ -217,6 +219,20 @@ def of_parts() -> Iterator[Call]:
             values: list[Any] = [p.E, p.nu, p.rho, p.tau, p.depth]
             values[i] = 0.5 if i == 1 and isinstance(odd, float) else odd
             yield f"KelvinVoigt #{i} = {odd!r:.20}", lambda v=values: grasping(material=KelvinVoigt(*v))
+        for i in range(2):
+            series = [1e5, 1.0]
+            series[i] = odd
+            common = {"E": p.E, "nu": p.nu, "rho": p.rho, "depth": p.depth, "tau": [series[1], 2.0]}
+            yield (
+                f"Prony #{i} = {odd!r:.20}",
+                lambda q=common, x=series[0]: grasping(material=Prony(**q, moduli=[x, 1e5])),
+            )
+            yield (
+                f"GeneralisedKelvin #{i} = {odd!r:.20}",
+                lambda q=common, x=1e-6 * series[0] if i else series[0]: grasping(
+                    material=GeneralisedKelvin(**q, J=[x, 0.1])
+                ),
+            )
         for i in (0, 2):
             values = [c.K_n, c.R_n, c.K_t, c.R_t]
             values[i] = odd

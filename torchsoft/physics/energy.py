@@ -58,11 +58,11 @@ def dissipated(rig: Rig, state: State, graph: Evaluation) -> dict[str, Tensor]:
     powers, dashpots, slip = {}, 0.0, 0.0
     for name, pad in rig.pads.items():
         port = graph.ports[f"pad_{name}"]
-        u_dot, fractions_times = port.transformer.flow(graph.flows), pad.material.chain()
         if pad.inertial:
-            powers[f"pad_{name}"] = (fractions_times[1] * u_dot * pad.elastic_force(u_dot)).sum((-2, -1))
+            u_dot = port.transformer.flow(graph.flows)
+            powers[f"pad_{name}"] = (pad.retardation_time(name) * u_dot * pad.elastic_force(u_dot)).sum((-2, -1))
         else:
-            fractions, times = fractions_times
+            fractions, times = pad.material.chain()
             rate = ((port.effort[..., None, :, :] - state.pads[name]) / times[:, None, None]).flatten(-2)
             powers[f"pad_{name}"] = (fractions * times * ((rate @ pad.compliance()) * rate).sum(-1)).sum(-1)
     for interface in graph.interfaces.values():

@@ -190,5 +190,5 @@ class _Side:
         count = len(self.pad.mesh.surface)
         full = torch.zeros(count, 2, dtype=F.dtype).index_copy(0, self.near, F)
         if not self.pad.inertial:
-            return full.expand(len(self.pad.material.chain()[0]), -1, -1)
+            return full.expand(self.pad.material.branches, -1, -1)
         return self.pad.static_displacement(full)

@@ -5,19 +5,34 @@ compliance of the relaxed material, J_b the fractions of it, and z_b the part of
 tau_b z_b' + z_b = f.
 """
 
+from collections.abc import Iterable, Mapping
 from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from torchsoft.physics.arguments import number
 from torchsoft.physics.mesh import lame_moduli
+from torchsoft.physics.retardation import retarded
 from torchsoft.physics.shapes import parameter
+
+INSTANT = 1e-4
+"""Retardation time [s] of an instantaneous spring, where none is given: small, not zero, so that the rates are functions of
+the state."""
+
+TOO_MUCH = 1e-12
+"""By how much fractions that sum to one may exceed it: rounding."""
 
 
 class Material(nn.Module):
     """What a pad asks of its material: E [Pa] (relaxed), nu [1], rho [kg/m3], the out-of-plane depth [m], and a chain."""
 
-    limits: ClassVar = {"E": "positive", "nu": "between -1 and 0.5", "rho": "positive", "depth": "positive"}
+    limits: ClassVar[Mapping[str, str]] = {
+        "E": "positive",
+        "nu": "between -1 and 0.5",
+        "rho": "positive",
+        "depth": "positive",
+    }
 
     def __init__(self, E: float, nu: float, rho: float, depth: float) -> None:
         super().__init__()
@@ -27,6 +42,25 @@ class Material(nn.Module):
         """Fractions J [1], which sum to one, and retardation times tau [s] > 0, shape (branches,) each."""
         raise NotImplementedError
 
+    @property
+    def branches(self) -> int:
+        """Elements of the chain."""
+        return len(self.chain()[0].detach())
+
+    def creep(self, t: Tensor) -> Tensor:
+        """Strain per held stress [1/Pa] at times t (...) [s] after it was put on."""
+        J, tau = self.chain()
+        return (J * -torch.expm1(-t[..., None] / tau)).sum(-1) / self.E
+
+    def complex_modulus(self, omega: Tensor) -> Tensor:
+        """Storage modulus + i loss modulus [Pa] at angular frequencies omega (...) [rad/s]."""
+        J, tau = self.chain()
+        return self.E / (J / (1 + 1j * omega[..., None] * tau)).sum(-1)
+
+    def well_posed(self) -> str:
+        """What is wrong with the parameters together; empty if nothing is."""
+        return ""
+
     def lame(self) -> tuple[Tensor, Tensor]:
         """Lame moduli (lambda, mu) [Pa]."""
         return lame_moduli(self.E, self.nu)
@@ -35,7 +69,7 @@ class Material(nn.Module):
 class KelvinVoigt(Material):
     """One retardation time tau [s]: R = tau K, the paper's constant R field."""
 
-    limits: ClassVar = Material.limits | {"tau": "positive"}
+    limits: ClassVar = {**Material.limits, "tau": "positive"}
 
     def __init__(self, E: float, nu: float, rho: float, tau: float, depth: float) -> None:
         super().__init__(E, nu, rho, depth)
@@ -44,6 +78,10 @@ class KelvinVoigt(Material):
     def chain(self) -> tuple[Tensor, Tensor]:
         return torch.ones_like(self.tau)[None], self.tau[None]
 
+    @property
+    def branches(self) -> int:
+        return 1
+
 
 class StandardLinearSolid(Material):
     """A spring in series with a Kelvin element: E [Pa] relaxed, E_instant [Pa] > E at first, retardation time tau [s].
@@ -51,18 +89,139 @@ class StandardLinearSolid(Material):
     The spring's own retardation time tau_instant [s] is small, not zero, so that the rates are functions of the state.
     """
 
-    limits: ClassVar = Material.limits | {"E_instant": "positive", "tau": "positive", "tau_instant": "positive"}
+    limits: ClassVar = {**Material.limits, "E_instant": "positive", "tau": "positive", "tau_instant": "positive"}
 
     def __init__(
-        self, E: float, E_instant: float, nu: float, rho: float, tau: float, depth: float, tau_instant: float = 1e-4
+        self, E: float, E_instant: float, nu: float, rho: float, tau: float, depth: float, tau_instant: float = INSTANT
     ) -> None:
         super().__init__(E, nu, rho, depth)
         self.E_instant, self.tau, self.tau_instant = (parameter(x) for x in (E_instant, tau, tau_instant))
 
     def well_posed(self) -> str:
-        """What is wrong with the parameters together; empty if nothing is."""
         return "E_instant is below E" if self.E_instant.item() < self.E.item() else ""
 
     def chain(self) -> tuple[Tensor, Tensor]:
         first = self.E / self.E_instant
         return torch.stack((first, 1 - first)), torch.stack((self.tau_instant, self.tau))
+
+    @property
+    def branches(self) -> int:
+        return 2
+
+
+class Series(Material):
+    """A material of any number of terms, each a strength and a time: scalar parameters <symbol>_1, tau_1, <symbol>_2, ...
+
+    An instantaneous spring stands before them in the chain, with the retardation time tau_instant [s], below every tau. Raises
+    `ValueError` unless there are as many strengths as times, and at least one.
+    """
+
+    symbol = ""
+
+    def __init__(
+        self, E: float, nu: float, rho: float, depth: float, strengths: Iterable[float], tau: Iterable[float],
+        tau_instant: float,
+    ) -> None:  # fmt: skip
+        super().__init__(E, nu, rho, depth)
+        one, other = terms(self.symbol, strengths), terms("tau", tau)
+        if len(one) != len(other) or not one:
+            raise ValueError(
+                f"a series needs as many `{self.symbol}` as `tau`, and at least one, but has {len(one)} and {len(other)}"
+            )
+        self.terms = len(one)
+        for k, (strength, time) in enumerate(zip(one, other), 1):
+            self.register_parameter(f"{self.symbol}_{k}", parameter(strength))
+            self.register_parameter(f"tau_{k}", parameter(time))
+        self.tau_instant = parameter(tau_instant)
+
+    @property
+    def limits(self) -> Mapping[str, str]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        own = [f"{symbol}_{k + 1}" for k in range(self.terms) for symbol in (self.symbol, "tau")]
+        return {**Material.limits, **dict.fromkeys((*own, "tau_instant"), "positive")}
+
+    def series(self) -> tuple[Tensor, Tensor]:
+        """Strengths and times [s] of the terms, (terms,) each."""
+        numbers = range(1, self.terms + 1)
+        one, other = (tuple(getattr(self, f"{symbol}_{k}") for k in numbers) for symbol in (self.symbol, "tau"))
+        return torch.stack(one), torch.stack(other)
+
+    def well_posed(self) -> str:
+        shortest, instant = float(self.series()[1].detach().min()), self.tau_instant.item()
+        if instant >= shortest:
+            return f"tau_instant = {instant:g} s must be below the shortest tau, {shortest:g} s"
+        return ""
+
+    @property
+    def branches(self) -> int:
+        return self.terms + 1
+
+
+class GeneralisedKelvin(Series):
+    """A spring in series with Kelvin elements: under a held stress, the fractions J (terms,) [1] of the relaxed compliance
+    1/E set in with the retardation times tau (terms,) [s], and what they leave of one at once.
+
+    Parameters are called J_1, tau_1 and so on.
+    """
+
+    symbol = "J"
+
+    def __init__(
+        self, E: float, nu: float, rho: float, depth: float, J: Iterable[float], tau: Iterable[float],
+        tau_instant: float = INSTANT,
+    ) -> None:  # fmt: skip
+        super().__init__(E, nu, rho, depth, J, tau, tau_instant)
+
+    def well_posed(self) -> str:
+        total = float(self.series()[0].detach().sum())
+        return f"the fractions J sum to {total:.6g}, above one" if total > 1 + TOO_MUCH else super().well_posed()
+
+    def chain(self) -> tuple[Tensor, Tensor]:
+        J, tau = self.series()
+        return torch.cat((1 - J.sum()[None], J)), torch.cat((self.tau_instant[None], tau))
+
+
+class Prony(Series):
+    """A relaxation series: after a step of strain the modulus is E + sum of E_i exp(-t / tau_i), with E [Pa] what remains,
+    `moduli` E_i (terms,) [Pa] what fades, and relaxation times tau (terms,) [s], no two of them equal.
+
+    Parameters are called E_1, tau_1 and so on. The chain is this same solid, exactly (`retardation`), but for the instantaneous
+    spring, which takes tau_instant [s] to give way.
+    """
+
+    symbol = "E"
+
+    def __init__(
+        self, E: float, nu: float, rho: float, depth: float, moduli: Iterable[float], tau: Iterable[float],
+        tau_instant: float = INSTANT,
+    ) -> None:  # fmt: skip
+        super().__init__(E, nu, rho, depth, moduli, tau, tau_instant)
+
+    def well_posed(self) -> str:
+        times = self.series()[1].detach().tolist()
+        return "two relaxation times are equal" if len(set(times)) < len(times) else super().well_posed()
+
+    def relaxation(self, t: Tensor) -> Tensor:
+        """Stress per held strain [Pa] at times t (...) [s] after it was put on."""
+        moduli, tau = self.series()
+        return self.E + (moduli * torch.exp(-t[..., None] / tau)).sum(-1)
+
+    def chain(self) -> tuple[Tensor, Tensor]:
+        moduli, times = self.series()
+        J, tau = retarded(moduli / self.E, times)
+        return J, torch.cat((self.tau_instant[None], tau))
+
+
+def terms(name: str, values: Iterable[float]) -> list[float]:
+    """Raises `ValueError` for what is not a list of numbers."""
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise ValueError(f"`{name}` must be a list of numbers, but is {values!r}")
+    return [number(f"{name}_{k}", value) for k, value in enumerate(values, 1)]
+
+
+KINDS: Mapping[str, type[Material]] = {
+    "kelvin_voigt": KelvinVoigt,
+    "standard_linear_solid": StandardLinearSolid,
+    "generalised_kelvin": GeneralisedKelvin,
+    "prony": Prony,
+}
+"""The materials by what files call them; their tables have the names of the constructors' arguments."""

@@ -72,6 +72,11 @@ class Pad(nn.Module):
     def nodes(self) -> int:
         return len(self.positions)
 
+    @property
+    def state_shape(self) -> tuple[int, ...]:
+        """Of its part of the state: displacements (nodes, 2), or forces that have set in (branches, nodes, 2)."""
+        return (self.nodes, 2) if self.inertial else (self.material.branches, self.nodes, 2)
+
     def placed(self, own: Array) -> Array:
         """Places (..., 2) in the pad's own frame, in the base's."""
         return own @ self.axes.numpy().T + self.origin.numpy()
@@ -103,6 +108,21 @@ class Pad(nn.Module):
         if material.nu.requires_grad:
             C = C + dC * (material.nu - material.nu.detach())
         return C / (material.E * material.depth)
+
+    def retardation_time(self, name: str) -> Tensor:
+        """tau [s] of an inertial pad, R = tau K. Raises `NotImplementedError` naming the pad for a material with several."""
+        _, tau = self.material.chain()
+        if len(tau) != 1:
+            raise NotImplementedError(
+                f"the inertial pad `{name}` needs a Kelvin-Voigt material (one retardation time), but has {len(tau)}; take a "
+                "massless pad"
+            )
+        return tau[0]
+
+    def elements(self, name: str) -> tuple[str, ...]:
+        """The pad of this name in the multibond graph: a C and an R field, those of all Kelvin elements of its chain."""
+        own = name if self.material.branches == 1 else f"{name},1..{self.material.branches}"
+        return f"C: [K_{own}]^-1", f"R: [R_{own}]"
 
     def masses(self) -> Tensor:
         """Lumped mass of each node that moves [kg], (nodes,); the bonded nodes' masses are left out, as in the paper."""

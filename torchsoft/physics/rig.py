@@ -60,7 +60,8 @@ class Rig(nn.Module):
 
     `forward(t, y)` follows torchdiffeq: y has shape (..., `layout.size`), float64, any batch dimensions. Not smooth where a
     point touches, where the normal force is cut at zero and where a point begins to slip; continuous there with smooth laws.
-    Raises `ValueError` for names that do not fit together, and `NotImplementedError` for an inertial pad whose base turns.
+    Raises `ValueError` for names that do not fit together, and `NotImplementedError` for an inertial pad whose base turns or
+    whose material has several retardation times.
     """
 
     def __init__(
@@ -94,7 +95,10 @@ class Rig(nn.Module):
         for name, pad in self.pads.items():
             if pad.base is not None and pad.base not in self.bodies:
                 raise ValueError(f"pad `{name}` is bonded to `{pad.base}`, but the bodies are {', '.join(self.bodies)}")
-            if pad.inertial and pad.base is not None and self.bodies[pad.base].freedom["theta"] != "fixed":
+            if not pad.inertial:
+                continue
+            pad.retardation_time(name)
+            if pad.base is not None and self.bodies[pad.base].freedom["theta"] != "fixed":
                 raise NotImplementedError(
                     f"pad `{name}` is inertial and its base `{pad.base}` may turn: nodal accelerations in a turning frame are "
                     "not modelled; fix the base's theta or take a massless pad"
@@ -161,9 +165,8 @@ class Rig(nn.Module):
     @property
     def layout(self) -> Layout:
         """Where everything stands in the state vector."""
-        branches = {name: len(pad.material.chain()[0].detach()) for name, pad in self.pads.items()}
         return Layout(
-            pads={name: (p.nodes, 2) if p.inertial else (branches[name], p.nodes, 2) for name, p in self.pads.items()},
+            pads={name: pad.state_shape for name, pad in self.pads.items()},
             stretch={name: len(self.pads[c.pad].point_nodes) for name, c in self.contacts.items()},
             free={
                 name: [i for i, axis in enumerate(COORDINATES) if body.freedom[axis] == "free"]
@@ -328,15 +331,8 @@ class Rig(nn.Module):
         return Interface(frame, interface_law(contact.law, body.shape, x), transformer, transformer.flow(flows))
 
     def _pad_port(
-        self,
-        name: str,
-        own: list[str],
-        ports: Mapping[str, Port],
-        u: Tensor,
-        u_dot: Tensor,
-        moment_arm: Tensor,
-        angle: Tensor,
-    ) -> Port:
+        self, name: str, own: list[str], ports: Mapping[str, Port], u: Tensor, u_dot: Tensor, moment_arm: Tensor, angle: Tensor
+    ) -> Port:  # fmt: skip
         """The pad's viscoelastic field on its strain rate: node velocities less those of what it is bonded to (Fig. 7)."""
         pad, key = self.pads[name], f"pad_{name}"
         eye = torch.eye(2, dtype=u.dtype).expand(*angle.shape, 2, 2)
@@ -348,11 +344,11 @@ class Rig(nn.Module):
             blocks[pad.base] = Block(-Q_T)
             blocks[f"{pad.base}_spin"] = Block(-turned(cross(moment_arm), -angle)[..., None])  # (35)
         if pad.inertial:
-            effort = pad.elastic_force(u + pad.material.chain()[1] * u_dot)
+            effort = pad.elastic_force(u + pad.retardation_time(name) * u_dot)
         else:  # no I field: the field's effort is whatever the contacts leave at the junction
             contacts = net_efforts({k: ports[f"contact_{k}"] for k in own}, self.junctions)
             effort = turned(contacts[key], -angle) if own else torch.zeros_like(u)
-        return Port(Transformer(blocks), effort, (f"C: [K_{name}]^-1", f"R: [R_{name}]"))
+        return Port(Transformer(blocks), effort, pad.elements(name))
 
     def _sources(self, state: State, signals: Tensor) -> dict[str, Port]:
         """Weights and actuators."""

@@ -69,7 +69,7 @@ def _forces(rig: Rig, name: str, state: State) -> Tensor:
     """
     pad = rig.pads[name]
     own = [key for key, contact in rig.contacts.items() if contact.pad == name]
-    C, branches = pad.compliance(), len(pad.material.chain()[0])
+    C, branches = pad.compliance(), pad.material.branches
     points = torch.zeros(len(pad.point_nodes), 2, dtype=torch.float64)
 
     def force(u: Tensor) -> Tensor:

@@ -60,7 +60,9 @@ def describe_instability(model: SoftGrasp) -> str:
     leading = complex(loop_modes(model)[0])
     if leading.real <= NEUTRAL:
         return ""
+    names = [name for name, _ in model.pads["L"].material.named_parameters() if name.startswith("tau")]
+    slower = ", ".join(f"pad.{name}" for name in names if name != "tau_instant")
     return (
-        f"the closed loop is unstable: its leading mode is {leading.real:+.3g} {leading.imag:+.3g}j 1/s; raise pad.tau or "
+        f"the closed loop is unstable: its leading mode is {leading.real:+.3g} {leading.imag:+.3g}j 1/s; raise {slower} or "
         "pad.E, or lower control.K_81"
     )

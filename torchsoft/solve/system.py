@@ -145,10 +145,6 @@ class Compiled:
             rows["chain_at"].append(self._add(fractions))
             self._add(times)
             if pad.inertial:
-                if len(fractions) != 1:
-                    raise NotImplementedError(
-                        f"the inertial pad `{name}` needs a Kelvin-Voigt material (one retardation time)"
-                    )
                 lame_lambda, lame_mu = material.lame()
                 density = material.rho * material.depth
                 material_at.append(

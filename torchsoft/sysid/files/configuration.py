@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from torchsoft.physics.material import INSTANT
 from torchsoft.physics.paper import NAMES
 from torchsoft.sysid.conclude import Assumed
 from torchsoft.sysid.fit.robust import Loss
@@ -112,10 +113,31 @@ class StandardLinearPads(Table):
 
     kind: Literal["standard_linear_solid"] = "standard_linear_solid"
     E_instant: float = Field(ge=1.0, le=1e13)
-    tau_instant: float = Field(default=1e-4, ge=1e-9, le=1e6)
+    tau_instant: float = Field(default=INSTANT, ge=1e-9, le=1e6)
 
 
-Pads = Annotated[KelvinVoigtPads | StandardLinearPads, Field(discriminator="kind")]
+Times = Annotated[tuple[Annotated[float, Field(ge=1e-9, le=1e6)], ...], LISTED]
+
+
+class GeneralisedKelvinPads(Table):
+    """Pads that creep in several times `tau` [s], each by a fraction `J` of the relaxed compliance 1 / `pad.E`."""
+
+    kind: Literal["generalised_kelvin"] = "generalised_kelvin"
+    J: Annotated[tuple[Annotated[float, Field(gt=0, le=1)], ...], LISTED]
+    tau: Times
+    tau_instant: float = Field(default=INSTANT, ge=1e-9, le=1e6)
+
+
+class PronyPads(Table):
+    """Pads with a relaxation series: `moduli` [Pa] on top of `pad.E`, the relaxed one, that fade in the times `tau` [s]."""
+
+    kind: Literal["prony"] = "prony"
+    moduli: Annotated[tuple[Annotated[float, Field(ge=1e-6, le=1e13)], ...], LISTED]
+    tau: Times
+    tau_instant: float = Field(default=INSTANT, ge=1e-9, le=1e6)
+
+
+Pads = Annotated[KelvinVoigtPads | StandardLinearPads | GeneralisedKelvinPads | PronyPads, Field(discriminator="kind")]
 
 
 class Entry(Table):

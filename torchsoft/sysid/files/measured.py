@@ -15,7 +15,7 @@ from pydantic import TypeAdapter
 
 from torchsoft.channels import CHANNELS, MEASURED, SETPOINTS
 from torchsoft.parameters import Parameters
-from torchsoft.physics.material import Material, StandardLinearSolid
+from torchsoft.physics.material import KINDS, StandardLinearSolid
 from torchsoft.physics.motion import Reference, Sampled
 from torchsoft.physics.paper import SoftGrasp, apart
 from torchsoft.sysid.files.columns import Tables, read_tables
@@ -205,14 +205,18 @@ def sampled(t: np.ndarray, y: np.ndarray, rate: tuple[np.ndarray, np.ndarray] | 
 
 def rig(p: Parameters, reference: Reference, pads: Pads) -> SoftGrasp:
     """The paper's rig, on pads of the material that is stated. Raises `ValueError` for moduli that do not fit together."""
-    material: Material | None = None
+    q, material = p.pad, None
     if isinstance(pads, StandardLinearPads):
         if pads.E_instant <= p.pad.E:
             raise ValueError(
                 f"pads.E_instant = {pads.E_instant:g} must be above pad.E = {p.pad.E:g}, the relaxed modulus"
             )
-        q = p.pad
         material = StandardLinearSolid(q.E, pads.E_instant, q.nu, q.rho, q.tau, q.depth, pads.tau_instant)
+    elif not isinstance(pads, KelvinVoigtPads):
+        series = pads.model_dump(exclude={"kind"})
+        material = KINDS[pads.kind](E=q.E, nu=q.nu, rho=q.rho, depth=q.depth, **series)
+        if wrong := material.well_posed():
+            raise ValueError(f"pads: {wrong}")
     return SoftGrasp(p, reference, material=material)
 
 

@@ -4,6 +4,7 @@ A start adds coordinates of its own to a problem, called `start.<body>.<axis>` a
 travel with those of the parameters, and the state at the beginning is differentiable in both.
 """
 
+import warnings
 from collections.abc import Callable, Mapping
 from copy import deepcopy
 from typing import NamedTuple, Protocol
@@ -29,6 +30,9 @@ PREFIX = "start."
 
 SETTLE = 0.2
 """Time [s] that a disc at rest is given, before the first sample, to sink into the pad: twenty of the pads' own times tau."""
+
+FORGOTTEN = 3.0
+"""Longest retardation times of the pads after which what a start gets wrong of their displacements counts as gone."""
 
 BOUNDS = 8.0
 """Bounds of a start's coordinate: so many standard deviations of its prior to each side."""
@@ -79,6 +83,7 @@ class AtRest(NamedTuple):
     def coordinates(self, rig: Rig, samples: Samples) -> tuple[StartCoordinate, ...]:
         if not isinstance(rig, SoftGrasp):
             raise ValueError("only the paper's rig has a rest of its own: give the recording another `start`")
+        warn_of_memory(rig, self.lead)
         if not 0 <= self.x_sd <= 0.1:
             raise ValueError(f"`x_sd` must be from 0 to 0.1 m, but is {self.x_sd}")
         return (StartCoordinate("start.disc.x", self.place(rig), self.x_sd),) if self.x_sd > 0 else ()
@@ -135,6 +140,18 @@ class Lying:
 def held_start(nominal: SoftGrasp, rig: SoftGrasp) -> Tensor:
     """The state (size,) of `AtRest` for a rig that may have other parameters than the nominal one."""
     return Lying(nominal, rig, AtRest().place(nominal))({})
+
+
+def warn_of_memory(rig: Rig, lead: float) -> None:
+    """Warns of massless pads that do not forget their beginning before the first sample, `lead` [s] later."""
+    for name, pad in rig.pads.items():
+        longest = float(pad.material.chain()[1].detach().max())
+        if not pad.inertial and lead < FORGOTTEN * longest:
+            warnings.warn(
+                f"the run begins {lead:g} s before the first sample, but the pad `{name}` creeps for {longest:.3g} s: what "
+                f"is not known of its beginning reaches the samples; a `lead` of {FORGOTTEN * longest:.3g} s would do",
+                stacklevel=2,
+            )
 
 
 def held_forces(pad: Pad, z: Tensor, nominal: Pad) -> Tensor:

@@ -17,7 +17,7 @@ from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.settled import settled
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.sysid.problem.start import PREFIX, Array, Begin, Samples, StartCoordinate
+from torchsoft.sysid.problem.start import PREFIX, Array, Begin, Samples, StartCoordinate, warn_of_memory
 
 LEAD = 50e-3
 """Time [s] for which samples do not count: five of the pads' own times tau."""
@@ -76,6 +76,7 @@ class Underway(NamedTuple):
                 raise ValueError(f"`{name}` needs a finite mean, and a deviation from 0 on, but has {mean} and {sd}")
         if not (np.isfinite(self.lead) and self.lead >= 0):
             raise ValueError(f"`lead` of the start must not be negative, but is {self.lead}")
+        warn_of_memory(rig, self.lead)
         return tuple(StartCoordinate(*one) for one in out if one[2] > 0)
 
     def begin(self, rig: Rig, samples: Samples) -> Begin:

@@ -1,0 +1,432 @@
+"""Materials of the pads: closed forms of creep and relaxation, the exact conversion, energy, gradients, what is refused."""
+
+import json
+import math
+import re
+from collections.abc import Callable, Sequence
+from copy import deepcopy
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import COARSE, coarse, random_state, times
+from scipy.optimize import brentq
+from torch import Tensor
+from torch.autograd import gradcheck
+
+from torchsoft import (
+    Actuator,
+    Body,
+    Circle,
+    Contact,
+    GeneralisedKelvin,
+    KelvinVoigt,
+    Pad,
+    PadMesh,
+    Parameters,
+    Profile,
+    Prony,
+    Reference,
+    Rig,
+    SmoothSlip,
+    SoftContact,
+    SoftGrasp,
+    StandardLinearSolid,
+    Trajectory,
+    rest,
+    simulate,
+)
+from torchsoft.physics.energy import dissipated, stored, supplied
+from torchsoft.physics.material import KINDS, Material
+from torchsoft.physics.retardation import retarded
+from torchsoft.plot.diagram import graph_of
+from torchsoft.solve.trajectory import load
+from torchsoft.sysid import AtRest, Known, Problem, Recording, Sensor, Unknown, identify
+
+COMMON = {"E": 7.5e5, "nu": 0.45, "rho": 1100.0, "depth": 0.044}
+MATERIALS: dict[str, Callable[[], Material]] = {
+    "kelvin_voigt": lambda: KelvinVoigt(**COMMON, tau=0.01),
+    "standard_linear_solid": lambda: StandardLinearSolid(**COMMON, E_instant=1.5e6, tau=0.02, tau_instant=1e-3),
+    "generalised_kelvin": lambda: GeneralisedKelvin(**COMMON, J=[0.3, 0.2, 0.1], tau=[4e-3, 0.02, 0.3], tau_instant=1e-3),
+    "prony": lambda: Prony(
+        **COMMON, moduli=[3e5, 2e5, 1e5, 5e4, 5e4], tau=[3e-3, 0.01, 0.1, 0.5, 4.0], tau_instant=1e-3
+    ),
+}  # fmt: skip
+CLOSED = 1e-6
+"""Runs against closed forms, relative."""
+TIGHT = 2e-9
+"""Relative tolerance of the steps of these runs."""
+
+
+@pytest.fixture(params=list(MATERIALS))
+def material(request: pytest.FixtureRequest) -> Material:
+    return MATERIALS[request.param]()
+
+
+# --- the chain ------------------------------------------------------------------------------------------------------------
+
+
+def impedance(solid: Prony, s: Tensor) -> Tensor:
+    """Stress over strain [Pa] of a relaxation series at complex frequencies s (...) [1/s]."""
+    moduli, tau = solid.series()
+    return solid.E + (moduli * s[..., None] * tau / (1 + s[..., None] * tau)).sum(-1)
+
+
+SERIES: dict[str, tuple[Sequence[float], Sequence[float]]] = {
+    "one": ([5e5], [0.1]),
+    "unsorted": ([1e5, 5e5, 2e5], [3.0, 1e-2, 0.2]),
+    "ten decades": (np.geomspace(1e6, 1e3, 11).tolist(), np.geomspace(1e-5, 1e5, 11).tolist()),
+    "faint and strong": ([1e-6, 1e9, 1e-3, 1e7], [1e-3, 2e-3, 1.0, 50.0]),
+    "close": ([1e5, 2e5, 1e5], [0.1, 0.1 * (1 + 1e-7), 5.0]),
+}
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", SERIES)
+def test_a_relaxation_series_is_its_chain_exactly(name: str) -> None:
+    """Compliance times modulus is one at every frequency, and retardation times interlace with relaxation times."""
+    moduli, tau = SERIES[name]
+    solid = Prony(**COMMON, moduli=moduli, tau=tau, tau_instant=1e-9)
+    J, late = retarded(solid.series()[0] / solid.E, solid.series()[1])
+    omega = torch.logspace(-8, 8, 65, dtype=torch.float64)
+    compliance = (J[0] + (J[1:] / (1 + 1j * omega[:, None] * late)).sum(-1)) / solid.E
+    assert float((compliance * impedance(solid, 1j * omega) - 1).abs().max()) < 1e-10
+    assert float(J.sum()) == pytest.approx(1.0, abs=1e-12)
+    assert bool((J > 0).all())
+    early = torch.tensor(sorted(tau), dtype=torch.float64)
+    assert bool((late > early).all() and (late[:-1] < early[1:]).all())
+
+
+@pytest.mark.parametrize("name", ["one", "unsorted", "ten decades"])
+def test_the_conversion_is_differentiable(name: str) -> None:
+    """In logarithms of moduli and times, against differences."""
+    moduli, tau = (torch.tensor(x, dtype=torch.float64) for x in SERIES[name])
+
+    def logarithms(m: Tensor, t: Tensor) -> Tensor:
+        return torch.cat([x.log() for x in retarded(m.exp(), t.exp())])
+
+    m, t = (moduli / 7.5e5).log().requires_grad_(), tau.log().requires_grad_()
+    assert gradcheck(logarithms, (m, t), eps=1e-6, atol=1e-8, rtol=1e-6)
+
+
+@torch.no_grad()
+def test_one_relaxation_time_is_the_standard_linear_solid() -> None:
+    solid = Prony(**COMMON, moduli=[7.5e5], tau=[0.01])
+    like = StandardLinearSolid(**COMMON, E_instant=1.5e6, tau=0.02)
+    other = GeneralisedKelvin(**COMMON, J=[0.5], tau=[0.02])
+    for one in (solid, other):
+        for mine, its in zip(one.chain(), like.chain()):
+            assert torch.allclose(mine, its, rtol=1e-14, atol=0)
+
+
+@torch.no_grad()
+def test_creep_and_complex_modulus_have_their_limits(material: Material) -> None:
+    """From nothing to 1/E; the storage modulus from E on grows, and losses are positive."""
+    E, ends = material.E.item(), torch.tensor([0.0, 1e6], dtype=torch.float64)
+    assert (material.creep(ends) * E).tolist() == pytest.approx([0.0, 1.0], abs=1e-12)
+    modulus = material.complex_modulus(torch.logspace(-4, 2, 25, dtype=torch.float64))
+    assert modulus.real[0].item() == pytest.approx(E, rel=1e-3)
+    assert bool((modulus.real.diff() > -1e-12 * E).all() and (modulus.imag > 0).all())
+    if isinstance(material, Prony):  # but for the instantaneous spring, which gives way in tau_instant
+        omega = torch.logspace(-4, 1, 9, dtype=torch.float64)
+        expected = impedance(material, 1j * omega)
+        assert float((material.complex_modulus(omega) / expected - 1).abs().max()) < 2e-2
+        assert float(material.relaxation(ends[:1])) == pytest.approx(E + 7e5, rel=1e-14)
+
+
+# --- a pad under a held force and a held indentation --------------------------------------------------------------------------
+
+RADIUS, HEIGHT, STIFFNESS = 5e-3, 4.59e-3, 1.2e5
+"""Of the punch, so round that it touches one node of the 1 mm mesh, the pad, and the contact spring: m, m, N/m."""
+
+
+def punch(material: Material, *, force: float | None = None, depth: float = 0.0) -> tuple[Rig, Tensor]:
+    """A punch without friction on the middle node of a pad, pushed by a force [N] or held at a depth [m]; and the state at
+    which it begins, with the contact spring pressed and the pad not yet. A dashpot stops the pushed one's hardly any mass
+    from ringing, and carries no force once punch and pad move together."""
+    mesh, R_n = PadMesh(6e-3, HEIGHT, 6, 2), 0.0 if force is None else 0.2
+    law = SoftContact(STIFFNESS, R_n, STIFFNESS, 1.0, friction=SmoothSlip(0, 0, 1, 1))
+    body = Body(1e-7, Circle(RADIUS), x=3e-3, y="driven" if force is None else "free", theta=0.0, weighted=False)
+    push = Actuator("punch.y", "punch.y", lambda w, w_dot, f, q, q_dot: f, setpoint="y_d", feed_forward="F")
+    y = HEIGHT + RADIUS - (depth if force is None else force / STIFFNESS)
+    signals = {"punch.y": y} if force is None else {"y_d": y, "F": -force}
+    rig = Rig(
+        bodies={"punch": body}, pads={"pad": Pad(mesh, material)},
+        contacts={"pad": Contact("pad", "punch", law, may_leave=True)},
+        actuators={} if force is None else {"push": push}, groups={"rubber": material},
+        reference=Reference(**{name: Profile([0.0], [value]) for name, value in signals.items()}),
+    )  # fmt: skip
+    y0 = torch.zeros(rig.layout.size, dtype=torch.float64)
+    if force is not None:
+        y0[rig.layout.slices["pose", "punch"]] = y
+    return rig, y0
+
+
+def softness(rig: Rig) -> float:
+    """Displacement of the middle node per force on it [m/N]."""
+    return float(rig.pads["pad"].compliance().detach()[7, 7])
+
+
+def relaxed(first: float, J: Tensor, tau: Tensor, t: Tensor) -> Tensor:
+    """Stress per held strain (...) of a spring of the compliance `first` in series with Kelvin elements J, tau (n,): a
+    residue at every zero of the compliance."""
+    compliance = lambda r: first + float((J / (1 - r * tau)).sum())
+    rates, out = sorted((1 / tau).tolist()), torch.full_like(t, 1 / (first + float(J.sum())))
+    for low, high in pairwise([*rates, rates[-1] * (1 + 2 * float(J.sum()) / first)]):
+        r = brentq(compliance, low * (1 + 1e-12), high * (1 - 1e-12), xtol=1e-300, rtol=1e-15)
+        slope = -float((J * tau / (1 - r * tau) ** 2).sum())
+        out = out + torch.exp(-r * t) / (-r * slope)
+    return out
+
+
+SAMPLED = torch.cat((torch.zeros(1).double(), torch.logspace(-3, 1, 17, dtype=torch.float64)))
+
+
+def closed(run: Trajectory, found: Tensor, expected: Tensor) -> None:
+    """Equal at every output but the first, relative to the value there."""
+    assert len(run.knots) > 500
+    assert float(((found - expected)[1:] / expected[1:]).abs().max()) < CLOSED
+
+
+@torch.no_grad()
+def test_creep_under_a_held_force_is_the_closed_form(material: Material) -> None:
+    rig, y0 = punch(material, force=1.0)
+    run = simulate(rig, SAMPLED, y0=y0, rtol=TIGHT, atol=1e-14)
+    closed(run, run["y_punch"][0] - run["y_punch"], softness(rig) * material.creep(SAMPLED) * material.E)
+
+
+@torch.no_grad()
+def test_relaxation_under_a_held_indentation_is_the_closed_form(material: Material) -> None:
+    rig, y0 = punch(material, depth=5e-5)
+    run = simulate(rig, SAMPLED, y0=y0, rtol=TIGHT, atol=1e-14)
+    J, tau = material.chain()
+    closed(run, run.load["punch"][:, 1], 5e-5 * relaxed(1 / STIFFNESS, softness(rig) * J, tau, SAMPLED))
+
+
+WEIGHED = [1, 2, -1]
+"""Outputs of which the sum is differentiated: 1, 6 and 1000 ms after the force."""
+
+
+def test_gradients_of_creep_by_every_coefficient_equal_differences(material: Material) -> None:
+    """The adjoint along frozen steps, in logarithms; sensitivities the same."""
+    names = [f"rubber.{name}" for name, _ in material.named_parameters() if name != "rho"]
+    t = torch.cat((torch.zeros(1).double(), torch.logspace(-3, 0, 5, dtype=torch.float64)))
+
+    def run(changes: dict[str, float], gradient: str, knots: Tensor | None = None) -> tuple[Rig, Trajectory]:
+        rig, y0 = punch(deepcopy(material), force=1.0)
+        with torch.no_grad():
+            for name, value in changes.items():
+                rig.parameter(name).mul_(math.exp(value))
+        how = {"knots": knots} if knots is not None else {"rtol": 1e-6}
+        wrt = {"wrt": names, "rigid": True} if gradient == "forward" else {}
+        return rig, simulate(rig, t, y0=y0, gradient=gradient, tolerance=1e-10, **how, **wrt)
+
+    rig, made = run({}, "discrete")
+    made["y_punch"][WEIGHED].sum().backward()
+    sensitivities = run({}, "forward", made.knots)[1].sensitivities
+    assert sensitivities is not None
+    size, eps = float((made["y_punch"][0] - made["y_punch"][-1]).detach()), 1e-4
+    for k, name in enumerate(names):
+        value, grad = rig.parameter(name), rig.parameter(name).grad
+        assert grad is not None
+        ends = [run({name: s * eps}, "none", made.knots)[1]["y_punch"][WEIGHED].sum() for s in (1, -1)]
+        expected = float((ends[0] - ends[1]).detach()) / (2 * eps)
+        slope = float(grad * value.detach())
+        assert abs(slope) > 1e-4 * size, name
+        assert abs(slope - expected) < 1e-6 * abs(slope), name
+        assert float(sensitivities[WEIGHED, 0, k].sum()) == pytest.approx(float(grad), rel=1e-9, abs=1e-12 * size), name
+
+
+def test_every_coefficient_of_a_series_is_identified() -> None:
+    """From the punch's height under a held force, without noise, from starts a third away."""
+    t = torch.cat((torch.zeros(1).double(), torch.logspace(-3, 0.5, 120, dtype=torch.float64)))
+    values = {"E": 7.5e5, "E_1": 5e5, "tau_1": 5e-3, "E_2": 3e5, "tau_2": 0.1}
+
+    def solid(E: float, E_1: float, tau_1: float, E_2: float, tau_2: float) -> Prony:
+        return Prony(**(COMMON | {"E": E}), moduli=[E_1, E_2], tau=[tau_1, tau_2])
+
+    rig, y0 = punch(solid(**values), force=1.0)
+    y = simulate(rig, t, y0=y0, rtol=1e-7)["y_punch"].detach().numpy()
+    start = {name: value * factor for (name, value), factor in zip(values.items(), (1.3, 0.7, 1.4, 0.8, 0.75))}
+    nominal, _ = punch(solid(**start), force=1.0)
+    recording = Recording("creep", nominal, {"y_punch": (t.numpy(), y)}, Known(y0))
+    unknowns = {f"rubber.{name}": Unknown() for name in values}
+    result = identify(Problem([recording], {"y_punch": Sensor(noise=1e-9)}, unknowns), rtol=1e-5)
+    found = {one.name.removeprefix("rubber."): one.value for one in result.estimates}
+    assert found == pytest.approx(values, rel=1e-4)
+
+
+# --- the grasp --------------------------------------------------------------------------------------------------------------
+
+STABLE = Parameters().override(COARSE | {"control.senses": "bracket"})
+
+
+def rolling(model: SoftGrasp) -> tuple[Tensor, Reference]:
+    """The disc at rest (size,), and 0.2 s that press and roll it."""
+    y0 = rest(model).detach()
+    pose = model.unpack(y0).pose
+    x, y = float(pose["bracket"][0]), float(pose["bracket"][1])
+    signals = {"x_d": Profile([0.0, 0.2], [x, x - 2e-3]), "y_d": Profile([0.0, 0.1], [y, y - 1e-3])}
+    return y0, Reference(**signals, F_ff=Profile([0.0], [0.0]))
+
+
+def grasping(material: Material, **how: Any) -> Trajectory:
+    """The paper's coarse rig on pads of a material."""
+    model = SoftGrasp(STABLE, material=material)
+    y0, reference = rolling(model)
+    return simulate(model, times(0.2, 41), y0=y0, reference=reference, **how)
+
+
+@torch.no_grad()
+def test_energy_is_balanced_with_every_material(material: Material, tmp_path: Path) -> None:
+    """And the run is saved, with the numbers and the name of its material."""
+    run = grasping(material)
+    assert run.energy_residual_rel < 1e-3
+    lost = [work.diff().min() for name, work in run.dissipated.items() if name.startswith("pad")]
+    assert float(min(lost)) > -1e-12
+    run.save(tmp_path / "run.nc")
+    said = {key: json.loads(text) for key, text in load(tmp_path / "run.nc").attrs.items()}
+    assert said["material"] == {name: type(material).__name__ for name in ("L", "U")}
+    own = {f"pad.{name}": value.item() for name, value in material.named_parameters()}
+    assert {name: said["parameters"][name] for name in own} == own
+    assert ("pad.tau" in said["parameters"]) == hasattr(material, "tau")
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_power_is_balanced_at_random_states(material: Material, seed: int) -> None:
+    """dH/dt = supplied - dissipated to rounding, with all branches of the chain shaken, and no R field supplies power."""
+    rig = SoftGrasp(STABLE, material=material)
+    y = random_state(rig, seed, slip=0.05).requires_grad_(True)
+    (slope,) = torch.autograd.grad(torch.stack(list(stored(rig, rig.unpack(y)).values())).sum(), y)
+    with torch.no_grad():
+        H_dot, state = (slope * rig(0.0, y)).sum(), rig.unpack(y)
+        graph = rig.evaluate(0.0, state)
+        supply, loss = (torch.stack(list(p.values())) for p in (supplied(graph), dissipated(rig, state, graph)))
+    assert abs(float(H_dot - supply.sum() + loss.sum())) < 1e-9 * float(supply.abs().sum() + loss.abs().sum())
+    assert float(loss.min()) > -1e-12 * float(loss.sum())
+
+
+@pytest.mark.parametrize("name", ["generalised_kelvin", "prony"])
+def test_gradients_of_a_grasp_by_every_coefficient_equal_differences(name: str) -> None:
+    """Height of the pressed and rolled disc [mm], along frozen steps, in logarithms. The differences are small, so that no
+    point begins to touch between them; their rounding is 1e-8."""
+    y0, reference = rolling(SoftGrasp(STABLE, material=MATERIALS[name]()))
+
+    def height(changes: dict[str, float], **how: Any) -> tuple[Material, Trajectory]:
+        solid = MATERIALS[name]()
+        with torch.no_grad():
+            for own, change in changes.items():
+                solid.get_parameter(own).mul_(math.exp(change))
+        model = SoftGrasp(STABLE, material=solid)
+        return solid, simulate(model, times(0.2, 3), y0=y0, reference=reference, tolerance=1e-10, **how)
+
+    solid, made = height({}, gradient="discrete", rtol=1e-5)
+    (1e3 * made["y_C"][-1]).backward()
+    for own, value in solid.named_parameters():
+        if own == "rho":
+            continue
+        assert value.grad is not None
+        up, down = (1e3 * float(height({own: s * 1e-6}, knots=made.knots)[1]["y_C"][-1]) for s in (1, -1))
+        assert float(value.grad * value.detach()) == pytest.approx((up - down) / 2e-6, rel=1e-6, abs=1e-8), own
+
+
+def test_the_adjoint_of_a_chain_equals_backpropagation() -> None:
+    """Through the same steps in plain torch."""
+    grads = []
+    for gradient in ("discrete", "unrolled"):
+        model = SoftGrasp(STABLE, material=MATERIALS["prony"]())
+        y0, reference = rolling(model)
+        run = simulate(model, times(0.02, 2), y0=y0, reference=reference, step=2e-3, tolerance=1e-10, gradient=gradient)
+        run.state.pose["disc"][-1, 1].backward()
+        values = [value for name, value in model.pad.named_parameters() if name != "rho"]
+        grads.append(torch.stack([value.grad * value.detach() for value in values if value.grad is not None]))
+    assert len(grads[0]) == len(grads[1]) == 14
+    assert float((grads[0] - grads[1]).abs().max()) < 1e-9 * float(grads[0].abs().max())
+
+
+@torch.no_grad()
+def test_a_chain_of_one_element_is_kelvin_and_voigts() -> None:
+    """To rounding: nothing is left for the instantaneous spring."""
+    chain = GeneralisedKelvin(**COMMON, J=[1.0], tau=[0.01])
+    mine, its = grasping(chain, step=1e-3), grasping(MATERIALS["kelvin_voigt"](), step=1e-3)
+    assert mine.state.pads["L"].shape[-3] == 2
+    for name in ("x_C", "y_C", "theta", "F_x", "F_y"):
+        assert float((mine[name] - its[name]).abs().max()) <= 1e-13 * float(its[name].abs().max()), name
+
+
+@torch.no_grad()
+def test_the_graph_has_the_fields_of_the_chain(material: Material) -> None:
+    labels = {data["label"] for _, data in graph_of(SoftGrasp(STABLE, material=material)).nodes(data=True)}
+    own = "L" if material.branches == 1 else f"L,1..{material.branches}"
+    assert {f"C: [K_{own}]^-1", f"R: [R_{own}]"} <= labels
+    assert material.branches == len(material.chain()[0])
+
+
+# --- what is refused ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Prony(**COMMON, moduli=[1e5], tau=[0.1, 1.0]), "as many `E` as `tau`, and at least one, but has 1 and 2"),
+        (lambda: GeneralisedKelvin(**COMMON, J=[], tau=[]), "as many `J` as `tau`, and at least one, but has 0 and 0"),
+        (lambda: Prony(**COMMON, moduli="12", tau=[0.1, 1.0]), "`E` must be a list of numbers, but is '12'"),
+        (lambda: Prony(**COMMON, moduli=[1e5], tau=0.1), "`tau` must be a list of numbers, but is 0.1"),  # pyright: ignore
+        (lambda: GeneralisedKelvin(**COMMON, J=[0.1, True], tau=[1, 2]), "`J_2` must be a number, but is True"),
+    ],
+)  # fmt: skip
+def test_a_series_that_is_none_is_refused(make: Callable[[], Material], message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(message)):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("solid", "message"),
+    [
+        (Prony(**COMMON, moduli=[1e5, 2e5], tau=[0.1, 0.1]), "two relaxation times are equal"),
+        (Prony(**COMMON, moduli=[1e5, -2e5], tau=[0.1, 0.2]), "parameter `pad.E_2` must be positive, but is -200000"),
+        (Prony(**COMMON, moduli=[1e5], tau=[5e-5]), "tau_instant = 0.0001 s must be below the shortest tau, 5e-05 s"),
+        (GeneralisedKelvin(**COMMON, J=[0.6, 0.5], tau=[0.1, 1]), "the fractions J sum to 1.1, above one"),
+        (GeneralisedKelvin(**COMMON, J=[0.6], tau=[0.0]), "parameter `pad.tau_1` must be positive, but is 0"),
+        (GeneralisedKelvin(**COMMON, J=[math.nan], tau=[0.1]), "parameter `pad.J_1` must be finite, but is nan"),
+    ],
+)
+def test_unphysical_coefficients_are_refused_before_a_run(solid: Material, message: str) -> None:
+    model = SoftGrasp(STABLE, material=solid)
+    y0 = torch.zeros(model.layout.size, dtype=torch.float64)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        simulate(model, times(0.1, 2), y0=y0)
+
+
+@pytest.mark.parametrize("name", [name for name in MATERIALS if name != "kelvin_voigt"])
+def test_an_inertial_pad_of_several_times_is_refused(name: str) -> None:
+    """When the rig is made, before a run with a part replaced, and wherever its law is asked for."""
+    message = "the inertial pad `L` needs a Kelvin-Voigt material \\(one retardation time\\), but has"
+    with pytest.raises(NotImplementedError, match=message):
+        SoftGrasp(STABLE.override({"pad.fidelity": "inertial"}), material=MATERIALS[name]())
+    model = coarse(pad__fidelity="inertial")
+    y = random_state(model, 0)
+    for pad in model.pads.values():
+        pad.material = model.pad = MATERIALS[name]()
+    with pytest.raises(NotImplementedError, match=message):
+        model(0.0, y)
+    with pytest.raises(NotImplementedError, match=message):
+        simulate(model, times(0.1, 2), y0=y)
+
+
+def test_a_recording_that_begins_before_the_pads_forget_is_named() -> None:
+    model = SoftGrasp(STABLE, material=MATERIALS["prony"]())
+    samples = {"y_C": (np.linspace(0, 1, 5), np.zeros(5))}
+    with pytest.warns(
+        UserWarning, match=r"begins 0.2 s before the first sample, but the pad `.` creeps for 4.27 s"
+    ) as said:
+        _ = Recording("slow", model, samples, AtRest()).start_coordinates
+    assert len(said) == 2
+    _ = Recording("slow", model, samples, AtRest(lead=20.0)).start_coordinates
+
+
+def test_every_material_has_a_name_in_files() -> None:
+    assert {name: type(make()) for name, make in MATERIALS.items()} == dict(KINDS)

@@ -1,0 +1,1 @@
+"""Materials from measurements and from the literature."""

@@ -1,0 +1,261 @@
+"""A material fitted to a relaxation or creep test: nonnegative least squares on a grid of times, then the times themselves.
+
+A relaxation test gives a relaxation series (`Prony`), a creep test a chain of Kelvin elements (`GeneralisedKelvin`), in how
+many terms Schwarz's criterion (BIC) says. The residuals count alike at all rows.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares, nnls
+
+from torchsoft.materials.measured import SMALL_STRAIN, Array, Measured
+from torchsoft.materials.series import responses
+from torchsoft.physics.material import INSTANT, KINDS, Material
+
+GRID = 10
+"""Times a decade of the grid that fits begin on."""
+
+STEP = 1e-5
+"""Change of a time's logarithm by which its slopes are taken."""
+
+MOST = 12
+"""Terms that are tried at the most; at the most one for every decade that the rows resolve, and one more."""
+
+PATIENCE = 2
+"""Numbers of terms, one after the other, that may fit worse than the best one before no more are tried."""
+
+UNSURE = 0.5
+"""Relative standard deviation from which a coefficient is called hardly determined."""
+
+COLOURED = 0.3
+"""Correlation of neighbouring residuals from which they are called a pattern."""
+
+EDGE = 1.05
+"""A time within this factor of the shortest or longest one that the rows resolve stands at the edge."""
+
+VANISHED = 1e-6
+"""Strength over the sum of all below which a term is none."""
+
+ROUNDING = 1e-12
+"""Residual over the largest answer below which a fit is exact."""
+
+INSTANT_PART = 0.1
+"""Largest retardation time of the instantaneous spring, over the shortest time of the series."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A series fitted to a test: `values` of E [Pa] and of every E_i [Pa] or J_i [1], and tau_i [s], with their standard
+    deviations `sd`; the `fitted` answer (n,); and the criterion by the number of terms, the least being the best.
+
+    Where residuals follow a pattern the deviations count as many independent rows as their correlation leaves.
+    """
+
+    measured: Measured
+    values: Mapping[str, float]
+    sd: Mapping[str, float]
+    fitted: Array
+    scores: Mapping[int, float]
+    correlation: float
+    notices: tuple[str, ...]
+
+    @property
+    def kind(self) -> str:
+        """Of the material, as files call it."""
+        return "prony" if self.measured.test == "relaxation" else "generalised_kelvin"
+
+    @property
+    def terms(self) -> int:
+        return (len(self.values) - 1) // 2
+
+    @property
+    def residual(self) -> Array:
+        """Measured less fitted (n,)."""
+        return self.measured.answer - self.fitted
+
+    @property
+    def rms(self) -> float:
+        """Of the residual, over the largest answer."""
+        return float(np.sqrt(np.mean(self.residual**2)) / np.abs(self.measured.answer).max())
+
+    def table(self) -> dict[str, Any]:
+        """The arguments of the material's constructor that the test tells, and tau_instant."""
+        symbol, argument = ("E", "moduli") if self.kind == "prony" else ("J", "J")
+        numbers = range(1, self.terms + 1)
+        tau = [self.values[f"tau_{k}"] for k in numbers]
+        strengths = [self.values[f"{symbol}_{k}"] for k in numbers]
+        instant = min(INSTANT, INSTANT_PART * min(tau))
+        return {"E": self.values["E"], argument: strengths, "tau": tau, "tau_instant": instant}
+
+    def material(self, *, nu: float, rho: float, depth: float) -> Material:
+        """The material, with what a test in one dimension does not tell."""
+        return KINDS[self.kind](**self.table(), nu=nu, rho=rho, depth=depth)
+
+
+class Trial(NamedTuple):
+    """A fit with some number of times: coefficients c (1 + terms,) and the unit of each, times tau (terms,) [s], residuals (n,)
+    over the largest answer, and their slopes (n, 1 + 2 terms) by c in its units and by ln tau."""
+
+    c: Array
+    unit: Array
+    tau: Array
+    r: Array
+    J: Array
+
+    @property
+    def score(self) -> float:
+        n, parameters = self.J.shape
+        return n * math.log(max(float(self.r @ self.r) / n, ROUNDING**2)) + parameters * math.log(n)
+
+
+def fit(measured: Measured, *, terms: int | None = None) -> Fit:
+    """The series with the least criterion, or with as many `terms` as asked for. Raises `ValueError` where the rows are too few
+    for these, or tell no modulus that remains."""
+    shortest, longest = measured.window
+    most = min(MOST, 2 + int(math.log10(longest / shortest)), (len(measured.t) - 2) // 2)
+    if terms is not None and not 1 <= terms <= most:
+        raise ValueError(f"`terms` must be from 1 to {most} for what {measured.path} resolves, but is {terms}")
+    tried: dict[int, Trial] = {}
+    for count in range(1, most + 1) if terms is None else (terms,):
+        found = [trial for begin in beginnings(measured, count) if (trial := refined(measured, begin)) is not None]
+        if found:
+            tried[count] = min(found, key=lambda trial: trial.score)
+        best = min(tried, key=lambda k: tried[k].score, default=count)
+        if count - best >= PATIENCE:
+            break
+    if not tried:
+        raise ValueError(
+            f"{measured.path}: no relaxed modulus remains, or nothing changes in time: a series needs an E above zero, and "
+            "terms; measure for longer, or look at the columns"
+        )
+    return concluded(measured, tried[best], {count: trial.score for count, trial in tried.items()})
+
+
+def beginnings(measured: Measured, count: int) -> list[Array]:
+    """Times [s] that a fit may begin with: spread evenly over the decades, and where nonnegative least squares on the grid
+    finds them, neighbours put together until so many are left."""
+    low, high = (math.log(x) for x in measured.window)
+    even = np.linspace(low, high, 2 * count + 1)[1::2]
+    grid = np.linspace(low, high, max(2, round(GRID * (high - low) / math.log(10))))
+    c = coefficients(measured, np.exp(grid))[1:]
+    groups = [(c[i], grid[i]) for i in np.flatnonzero(c)]
+    while len(groups) > count:
+        i = int(np.argmin([groups[i + 1][1] - groups[i][1] for i in range(len(groups) - 1)]))
+        (a, x), (b, y) = groups[i : i + 2]
+        groups[i : i + 2] = [(a + b, (a * x + b * y) / (a + b))]
+    own = [np.array([x for _, x in groups])] if len(groups) == count else []
+    return [np.exp(x) for x in (even, *own)]
+
+
+def coefficients(measured: Measured, tau: Array) -> Array:
+    """Nonnegative coefficients (1 + terms,) of the series with given times."""
+    A, size = responses(measured.test, measured.t, measured.driven, tau), np.abs(measured.answer).max()
+    scale = np.abs(A).max(0)
+    return nnls(A / scale, measured.answer / size)[0] * size / scale
+
+
+def refined(measured: Measured, tau: Array) -> Trial | None:
+    """The least-squares fit from these times on, within what the rows resolve; None where a term, or the modulus that remains,
+    vanishes."""
+    size, (low, high) = float(np.abs(measured.answer).max()), measured.window
+    c = coefficients(measured, tau)
+    scale = size / np.abs(responses(measured.test, measured.t, measured.driven, tau)).max(0)
+    count = len(tau)
+
+    def residuals(z: Array) -> Array:
+        A = responses(measured.test, measured.t, measured.driven, np.exp(z[count + 1 :]))
+        return (A @ (z[: count + 1] * scale) - measured.answer) / size
+
+    def slopes(z: Array) -> Array:
+        A, later, sooner = (
+            responses(measured.test, measured.t, measured.driven, np.exp(z[count + 1 :] + by))
+            for by in (0.0, STEP, -STEP)
+        )
+        by_tau = (later - sooner)[:, 1:] / (2 * STEP) * (z[1 : count + 1] * scale[1:])
+        return np.column_stack((A * scale, by_tau)) / size
+
+    z = np.concatenate((np.maximum(c / scale, 1e-6), np.log(tau)))
+    bounds = (
+        np.repeat([0.0, math.log(low)], [count + 1, count]),
+        np.repeat([np.inf, math.log(high)], [count + 1, count]),
+    )
+    z = np.clip(z, bounds[0] + 1e-9, bounds[1] - 1e-9)
+    close: Any = {"xtol": 1e-10, "ftol": 1e-10, "gtol": 1e-12, "max_nfev": 300, "x_scale": "jac"}
+    done = least_squares(residuals, z, slopes, bounds, **close)  # pyright: ignore[reportArgumentType]
+    c, tau = done.x[: count + 1] * scale, np.exp(done.x[count + 1 :])
+    needed = c if measured.test == "relaxation" else c[1:]  # what creeps may have no spring
+    if not (needed > VANISHED * c.sum()).all() or not done.success:
+        return None
+    order = np.argsort(tau)
+    own, every = [0, *(1 + order)], [0, *(1 + order), *(1 + count + order)]
+    return Trial(c[own], scale[own], tau[order], done.fun, done.jac[:, every])
+
+
+def concluded(measured: Measured, best: Trial, scores: Mapping[int, float]) -> Fit:
+    """Values and standard deviations, and what the data cannot tell."""
+    names, values, G = named(measured, best)
+    correlation = float(np.corrcoef(best.r[1:], best.r[:-1])[0, 1]) if np.ptp(best.r) > ROUNDING else 0.0
+    n, parameters = best.J.shape
+    independent = (1 - min(max(correlation, 0.0), 0.99)) / (1 + min(max(correlation, 0.0), 0.99))
+    _, s, V = np.linalg.svd(best.J, full_matrices=False)
+    root = G @ (V.T / np.maximum(s, 1e-300))
+    sd = np.sqrt((root**2).sum(1) * float(best.r @ best.r) / ((n - parameters) * independent))
+    fitted = measured.answer + best.r * np.abs(measured.answer).max()
+    made = dict(zip(names, values.tolist())), dict(zip(names, sd.tolist()))
+    return Fit(measured, *made, fitted, scores, correlation, tuple(notices(measured, *made, scores, correlation)))
+
+
+def named(measured: Measured, best: Trial) -> tuple[list[str], Array, Array]:
+    """Names and values of the material's coefficients, and their slopes by those of the trial."""
+    count = len(best.tau)
+    G = np.zeros((1 + 2 * count, 1 + 2 * count))
+    G[1 + count :, 1 + count :] = np.diag(best.tau)
+    if measured.test == "relaxation":
+        symbol, strengths = "E", best.c
+        G[: 1 + count, : 1 + count] = np.diag(best.unit)
+    else:  # E = 1 / sum of c, and J_k = c_k E
+        symbol, total = "J", float(best.c.sum())
+        strengths = np.append(1.0, best.c[1:]) / total
+        G[: 1 + count, : 1 + count] = -np.outer(strengths, best.unit) / total
+        G[range(1, 1 + count), range(1, 1 + count)] += best.unit[1:] / total
+    numbers = range(1, 1 + count)
+    names = ["E", *(f"{symbol}_{k}" for k in numbers), *(f"tau_{k}" for k in numbers)]
+    return names, np.concatenate((strengths, best.tau)), G
+
+
+def notices(
+    measured: Measured, values: Mapping[str, float], sd: Mapping[str, float], scores: Mapping[int, float], correlation: float
+) -> list[str]:  # fmt: skip
+    """Sentences on what the data do not tell, and on what is taken for granted."""
+    (shortest, longest), terms = measured.window, (len(values) - 1) // 2
+    what = "relaxes" if measured.test == "relaxation" else "creeps"
+    said = [
+        f"the rows resolve times from {shortest:.3g} to {longest:.3g} s: they do not tell what {what} faster, and what {what} "
+        "slower counts to the relaxed modulus E, which may be lower still"
+    ]
+    edge = [f"tau_{k}" for k in range(1, terms + 1) if not EDGE * shortest < values[f"tau_{k}"] < longest / EDGE]
+    if edge:
+        said.append(f"at the edge of what the rows resolve, or beyond: {', '.join(edge)}")
+    unsure = [name for name in values if not sd[name] <= UNSURE * values[name]]
+    if unsure:
+        said.append(f"hardly determined, with a standard deviation above {UNSURE:.0%}: {', '.join(unsure)}")
+    if len(scores) > 1 and terms == max(scores):
+        said.append(f"more terms than {terms} might fit better still: the criterion was falling up to there")
+    if correlation > COLOURED:
+        said.append(
+            f"the residuals follow a pattern (neighbours correlate by {correlation:.2f}): the series, or the theory, misses "
+            "something; the standard deviations count as many rows as that leaves independent, and are too small still"
+        )
+    largest = float(np.abs(measured.strain).max())
+    if measured.per_load:
+        said.append("the file does not say how large the strain was: the material is linear, and holds for small ones")
+    elif largest > SMALL_STRAIN:
+        said.append(
+            f"strains go up to {largest:.0%}, and the material is linear: these moduli are secants at that strain, and rubber "
+            "that is stretched less is another one"
+        )
+    return said
