@@ -212,6 +212,7 @@ LOOKUPS = {  # x (3,), table (4, 3)
     "expressions": lambda x, t: F.embedding((t @ x).argmin(), torch.sin(t) * x) + x,
     "inputs": lambda x, t: F.embedding(t[:, 1].argmin() * 0 + x.argmax(), x[:, None]) * t[0],
     "constants": lambda x, t: F.embedding(x.argmin(), torch.eye(3).double()) * x + t[0],
+    "stopped": lambda x, t: F.embedding((t @ x).argmin(), t.detach()) * x + t[0],
     "counts": lambda x, t: x * (x > 0).sum() + t[0] * (-x[0]).long() + t[1] * (3 * x[1]).long(),
 }
 

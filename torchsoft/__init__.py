@@ -10,7 +10,7 @@ from torchsoft.physics.pads import Pad
 from torchsoft.physics.paper import SoftGrasp
 from torchsoft.physics.parts import PD, Actuator, Body, Contact
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.shapes import Circle, Ellipse, Shape
+from torchsoft.physics.shapes import Circle, Contour, Ellipse, RoundedBox, RoundedPolygon, Shape, Superellipse
 from torchsoft.solve.batch import Batch, SamplesFailed, simulate_batch
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import Interrupted, simulate
@@ -21,8 +21,8 @@ from torchsoft.solve.trajectory import Trajectory
 register()
 
 __all__ = [
-    "METHOD", "PD", "Actuator", "Batch", "Body", "Circle", "Contact", "Coulomb", "Ellipse", "Interrupted", "KelvinVoigt",
-    "NoEquilibrium", "Pad", "PadMesh", "Parameters", "Profile", "Reference", "Rig", "Sampled", "SamplesFailed", "Shape",
-    "SimulationFailed", "SmoothSlip", "SoftContact", "SoftGrasp", "StandardLinearSolid", "Trajectory", "hold", "press",
-    "rest", "simulate", "simulate_batch",
+    "METHOD", "PD", "Actuator", "Batch", "Body", "Circle", "Contact", "Contour", "Coulomb", "Ellipse", "Interrupted",
+    "KelvinVoigt", "NoEquilibrium", "Pad", "PadMesh", "Parameters", "Profile", "Reference", "Rig", "RoundedBox",
+    "RoundedPolygon", "Sampled", "SamplesFailed", "Shape", "SimulationFailed", "SmoothSlip", "SoftContact", "SoftGrasp",
+    "StandardLinearSolid", "Superellipse", "Trajectory", "hold", "press", "rest", "simulate", "simulate_batch",
 ]  # fmt: skip

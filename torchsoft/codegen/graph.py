@@ -86,6 +86,8 @@ class Graph:
         place = self.value(index)
         if place is not None:
             return entries[int(place)]
+        if all(self.ops[entry] == "stop" for entry in entries):
+            return self("stop", self.lookup(index, [self.args[entry][0] for entry in entries]))
         first, *rest = (self.args[entry][0] if self.ops[entry] == "p" else -1 for entry in entries)
         stride = rest[0] - first if rest else 1
         if first >= 0 and rest == [first + stride * (i + 1) for i in range(len(rest))]:

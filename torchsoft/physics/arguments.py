@@ -4,6 +4,9 @@ import math
 from numbers import Integral, Real
 from typing import Any
 
+import torch
+from torch import Tensor
+
 
 def number(name: str, value: Any) -> float:
     """Raises `ValueError` for what is not a real number; text and truth values are not."""
@@ -24,3 +27,25 @@ def whole(name: str, value: Any, least: int) -> int:
     if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
         raise ValueError(f"`{name}` must be a whole number from {least} on, but is {value!r}")
     return int(value)
+
+
+def places(name: str, value: Any) -> Tensor:
+    """Places in the plane (n, 2) in float64, a copy. Raises `ValueError` for what is not such numbers."""
+    try:
+        given = torch.as_tensor(value)
+        fine = (
+            given.ndim == 2
+            and given.shape[1] == 2
+            and given.dtype not in (torch.bool, torch.complex64, torch.complex128)
+        )
+    except (TypeError, ValueError, RuntimeError):
+        given, fine = torch.zeros(0), False
+    if not fine or not bool(given.isfinite().all()):
+        raise ValueError(f"`{name}` must be finite numbers of the shape (n, 2), but is {line(value)}")
+    return given.detach().double().clone()
+
+
+def line(value: Any) -> str:
+    """A value in one short line."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -230,7 +230,7 @@ class Scene:
         for k, outline in self.shapes.items():
             pose = instant.pose[k]
             self.bodies[k].set_xy(in_world(outline, pose))
-            top = outline[len(outline) // 4]  # the boundary's point furthest along the body's own y
+            top = outline[outline[:, 1].argmax()]
             self.spokes[k].set_data(*np.stack((pose[:2], in_world(top, pose)), -1))
             self.hubs[k].set_data(*pose[:2, None])
         for k in self.normal:

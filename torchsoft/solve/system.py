@@ -237,7 +237,7 @@ class Compiled:
             key = id(contact.law), id(shape)
             if key not in self._known:
                 check_shape(contact.body, shape)
-                self._known[key] = contact_laws(contact.law, shape)
+                self._known[key] = contact_laws(contact.law, shape.prepared())
                 stiffness = contact.law.R_t.item() + NOMINAL * contact.law.K_t.item()
                 if structure(contact.law) is None and (wrong := check_slip(name, contact.law.friction, stiffness)):
                     warnings.warn(wrong, stacklevel=2)
