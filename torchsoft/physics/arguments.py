@@ -4,6 +4,7 @@ import math
 from numbers import Integral, Real
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,17 +33,12 @@ def whole(name: str, value: Any, least: int) -> int:
 def places(name: str, value: Any) -> Tensor:
     """Places in the plane (n, 2) in float64, a copy. Raises `ValueError` for what is not such numbers."""
     try:
-        given = torch.as_tensor(value)
-        fine = (
-            given.ndim == 2
-            and given.shape[1] == 2
-            and given.dtype not in (torch.bool, torch.complex64, torch.complex128)
-        )
-    except (TypeError, ValueError, RuntimeError):
-        given, fine = torch.zeros(0), False
-    if not fine or not bool(given.isfinite().all()):
+        given = np.array(value.detach() if isinstance(value, Tensor) else value)
+    except (TypeError, ValueError):  # rows of different lengths
+        given = np.zeros(0)
+    if given.ndim != 2 or given.shape[1] != 2 or given.dtype.kind not in "iuf" or not np.isfinite(given).all():
         raise ValueError(f"`{name}` must be finite numbers of the shape (n, 2), but is {line(value)}")
-    return given.detach().double().clone()
+    return torch.from_numpy(given.astype(np.float64))
 
 
 def line(value: Any) -> str:

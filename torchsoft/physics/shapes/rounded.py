@@ -9,7 +9,7 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torchsoft.physics.arguments import places
+from torchsoft.physics.arguments import places, positive
 from torchsoft.physics.shapes.area import Moments, gauss, moments
 from torchsoft.physics.shapes.shape import Prepared, Shape, note_centre, parameter
 from torchsoft.physics.shapes.simple import crossing
@@ -84,7 +84,8 @@ class RoundedPolygon(Shape):
     The arcs touch the sides that meet at a vertex, so that the sides stay where they are. The vertices may be given about any
     point: the body's own frame has its origin at the centre of mass, wherever the vertices move it, and the note that says so
     tells where that is. They are one parameter with the shape (n, 2), which gradients reach; only `radius` is a scalar that can
-    be asked for by name in a Jacobian or an identification. Raises `ValueError` for anything but from 3 to `MOST` places.
+    be asked for by name in a Jacobian or an identification. Raises `ValueError` for anything but from 3 to `MOST` places, for
+    corners that do not fit on their sides, and for sides that cross.
     """
 
     limits: ClassVar = {"radius": "positive"}
@@ -96,9 +97,10 @@ class RoundedPolygon(Shape):
         given = places("vertices", vertices)
         if not 3 <= len(given) <= self.MOST:
             raise ValueError(f"`vertices` must be 3 to {self.MOST} places, but are {len(given)}")
-        self.vertices, self.radius = nn.Parameter(given), parameter(radius)
-        if not self.well_posed():
-            note_centre("vertices", self.moments().centre)
+        self.vertices, self.radius = nn.Parameter(given), parameter(positive("radius", radius))
+        if wrong := self.well_posed():
+            raise ValueError(f"`vertices` cannot be used as a polygon: {wrong}")
+        note_centre("vertices", self.moments().centre)
 
     def well_posed(self) -> str:
         """What is wrong with the parameters together; empty if nothing is."""
