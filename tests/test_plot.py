@@ -32,7 +32,7 @@ from torchsoft.physics.mesh import lame_moduli
 from torchsoft.plot import figures
 from torchsoft.plot.animation import animate
 from torchsoft.plot.diagram import dot, graph_of, multibond_graph, positions
-from torchsoft.plot.scene import deformed_mesh, instants
+from torchsoft.plot.scene import deformed_mesh, instants, straight_up
 from torchsoft.scenario import grasp_and_roll
 
 Done = tuple[SoftGrasp, Trajectory]
@@ -48,6 +48,13 @@ def manipulated(**changes: object) -> Done:
 @pytest.fixture(scope="module")
 def done() -> Done:
     return manipulated()
+
+
+def test_a_spoke_ends_on_the_outline() -> None:
+    square = np.array([[-1.0, -2.0], [3.0, -2.0], [3.0, 1.0], [-1.0, 2.0], [-1.0, -2.0]])
+    np.testing.assert_allclose(straight_up(square), [0.0, 1.75], rtol=1e-15)
+    np.testing.assert_allclose(straight_up(Circle(2.0).outline().numpy()), [0.0, 2.0], atol=1e-3)
+    np.testing.assert_allclose(straight_up(square + [2.0, 0.0]), [0.0, 0.0], rtol=1e-15)
 
 
 @pytest.mark.parametrize("enclosed", [False, True])

@@ -71,6 +71,14 @@ def in_world(places: Array, pose: Array) -> Array:
     return places @ np.array([[c, s], [-s, c]]) + pose[:2]
 
 
+def straight_up(outline: Array) -> Array:
+    """The highest place (2,) where a closed outline (points, 2) crosses the y axis; the origin if it does nowhere."""
+    (x, y), (x_next, y_next) = outline[:-1].T, outline[1:].T
+    k = np.flatnonzero((x > 0) != (x_next > 0))
+    crossed = y[k] + (y_next - y)[k] * x[k] / (x - x_next)[k]
+    return np.array([0.0, crossed.max(initial=0.0)])
+
+
 class Instant(NamedTuple):
     """One sample as drawn: time [s], poses of the bodies and of the pads' bases (3,) [mm, mm, rad], places [mm], forces [N].
 
@@ -230,8 +238,7 @@ class Scene:
         for k, outline in self.shapes.items():
             pose = instant.pose[k]
             self.bodies[k].set_xy(in_world(outline, pose))
-            top = outline[outline[:, 1].argmax()]
-            self.spokes[k].set_data(*np.stack((pose[:2], in_world(top, pose)), -1))
+            self.spokes[k].set_data(*np.stack((pose[:2], in_world(straight_up(outline), pose)), -1))
             self.hubs[k].set_data(*pose[:2, None])
         for k in self.normal:
             name, rows = self.rig.contacts[k].pad, instant.near(k)
