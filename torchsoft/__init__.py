@@ -4,7 +4,7 @@ from torchsoft.parameters import Parameters
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact
 from torchsoft.physics.equilibrium import NoEquilibrium, press, rest
 from torchsoft.physics.material import KelvinVoigt, StandardLinearSolid
-from torchsoft.physics.mesh import PadMesh
+from torchsoft.physics.mesh import CurvedPadMesh, FingertipMesh, PadMesh, QuadMesh
 from torchsoft.physics.motion import Profile, Reference, Sampled, hold
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.paper import SoftGrasp
@@ -21,8 +21,9 @@ from torchsoft.solve.trajectory import Trajectory
 register()
 
 __all__ = [
-    "METHOD", "PD", "Actuator", "Batch", "Body", "Circle", "Contact", "Contour", "Coulomb", "Ellipse", "Interrupted",
-    "KelvinVoigt", "NoEquilibrium", "Pad", "PadMesh", "Parameters", "Profile", "Reference", "Rig", "RoundedBox",
-    "RoundedPolygon", "Sampled", "SamplesFailed", "Shape", "SimulationFailed", "SmoothSlip", "SoftContact", "SoftGrasp",
-    "StandardLinearSolid", "Superellipse", "Trajectory", "hold", "press", "rest", "simulate", "simulate_batch",
+    "METHOD", "PD", "Actuator", "Batch", "Body", "Circle", "Contact", "Contour", "Coulomb", "CurvedPadMesh", "Ellipse",
+    "FingertipMesh", "Interrupted", "KelvinVoigt", "NoEquilibrium", "Pad", "PadMesh", "Parameters", "Profile", "QuadMesh",
+    "Reference", "Rig", "RoundedBox", "RoundedPolygon", "Sampled", "SamplesFailed", "Shape", "SimulationFailed", "SmoothSlip",
+    "SoftContact", "SoftGrasp", "StandardLinearSolid", "Superellipse", "Trajectory", "hold", "press", "rest", "simulate",
+    "simulate_batch",
 ]  # fmt: skip

@@ -36,9 +36,16 @@ def places(name: str, value: Any) -> Tensor:
         given = np.array(value.detach() if isinstance(value, Tensor) else value)
     except (TypeError, ValueError):  # rows of different lengths
         given = np.zeros(0)
-    if given.ndim != 2 or given.shape[1] != 2 or given.dtype.kind not in "iuf" or not np.isfinite(given).all():
+    if given.ndim != 2 or given.shape[-1] != 2 or given.dtype.kind not in "iuf" or not np.isfinite(given).all():
         raise ValueError(f"`{name}` must be finite numbers of the shape (n, 2), but is {line(value)}")
     return torch.from_numpy(given.astype(np.float64))
+
+
+def names(name: str, value: Any, known: tuple[str, ...]) -> None:
+    """Raises `ValueError` for what is not some of the known names, each of them once."""
+    fine = isinstance(value, tuple) and all(isinstance(one, str) and one in known for one in value)
+    if not fine or not value or len({*value}) != len(value):
+        raise ValueError(f"`{name}` must be some of {', '.join(known)}, but is {line(value)}")
 
 
 def line(value: Any) -> str:
