@@ -19,6 +19,8 @@ FLOWS = {
         arguments mesh shapes contact retardation material pads motion multibond state parts condensed validity rig energy paper
         equilibrium settled .
     """,
+    "physics.mesh": "element mesh compliance block fingertip file quads .",
+    "physics.shapes": "shape area simple oval rounded closed contour .",
     "solve": """
         grid kernel laws system progress tolerances rates stability stepper adjoint tangent unrolled continuous trajectory
         ledger simulate batch torchdiffeq .

@@ -204,6 +204,33 @@ def test_sums_products_and_quotients_are_bitwise_those_of_torch_and_roots_are_ro
         np.testing.assert_array_equal(found[4:], np.sqrt(np.abs(x.numpy())))
 
 
+LOOKUPS = {  # x (3,), table (4, 3)
+    "nearest row": lambda x, t: F.embedding(((t - x) ** 2).sum(-1).argmin(), t) * x,
+    "rows around": lambda x, t: F.embedding(torch.stack([x.argmin(), x.argmax() + 1]), t).prod(0),
+    "by a cut number": lambda x, t: F.embedding((1.5 + x[:1].tanh()).floor().long(), t)[0] * x,
+    "column": lambda x, t: F.embedding(x.argmin(), t.T[:, 1:]) * x,
+    "expressions": lambda x, t: F.embedding((t @ x).argmin(), torch.sin(t) * x) + x,
+    "inputs": lambda x, t: F.embedding(t[:, 1].argmin() * 0 + x.argmax(), x[:, None]) * t[0],
+    "constants": lambda x, t: F.embedding(x.argmin(), torch.eye(3).double()) * x + t[0],
+    "stopped": lambda x, t: F.embedding((t @ x).argmin(), t.detach()) * x + t[0],
+    "counts": lambda x, t: x * (x > 0).sum() + t[0] * (-x[0]).long() + t[1] * (3 * x[1]).long(),
+}
+
+
+@pytest.mark.parametrize("name", LOOKUPS)
+def test_rows_at_computed_places_equal_torch(name):
+    table = {"table": torch.stack(_points(3, 4, seed=7))}
+    _assert_equal_to_torch(lambda x, p: LOOKUPS[name](x, p["table"]), _points(3, 12), table, value_tolerance=4e-15)
+
+
+@pytest.mark.parametrize("place", [-1.0, 4.0, 1e300, np.nan])
+def test_a_place_outside_a_table_is_its_first(place):
+    law = lambda x, p: F.embedding((x[0] - 1.0).long().clamp(-9, 9), p["table"]) * x[1]
+    compiled = compile_law(law, torch.tensor([2.0, 1.0]).double(), {"table": torch.zeros(4, 1).double()})
+    out, _, p_bar = _compiled_results(compiled, np.array([place + 1.0, 3.0]), np.arange(5.0, 9.0), np.ones(1))
+    assert (out[0], *p_bar) == (15.0, 3.0, 0.0, 0.0, 0.0)
+
+
 KINKS = {
     "abs": lambda x: x.abs(),
     "sign": lambda x: x.sign(),
@@ -305,7 +332,11 @@ REFUSED = {
     "write": (_in_place, "in-place operation aten.copy_"),
     "float32": (lambda x, p: x.to(torch.float32).double(), "float32"),
     "float32 constant": (lambda x, p: x * torch.ones(2), "float32"),
-    "int": (lambda x, p: x * (x > 0).sum(), "int64"),
+    "int32": (lambda x, p: x * (x > 0).sum().to(torch.int32), "int32"),
+    "bits": (lambda x, p: x * (x.argmin() & 1), "bitwise_and"),
+    "whole quotient": (lambda x, p: x * (x.argmin() // 2), "floor_divide"),
+    "place": (lambda x, p: torch.index_select(x, 0, x.argmin().reshape(1)), "look up rows of a parameter"),
+    "look-up without gradient": (lambda x, p: F.embedding(x.argmin(), x[:, None], padding_idx=1), "look-up with grad"),
     "random": (lambda x, p: x + torch.rand(2, dtype=torch.float64), "random operation aten.rand"),
     "norm of order 1": (lambda x, p: torch.linalg.vector_norm(x, 1).reshape(1), "linalg_vector_norm"),
     "rounding": (lambda x, p: torch.div(x, 2, rounding_mode="floor"), "a division that rounds"),

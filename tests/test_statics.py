@@ -1,12 +1,20 @@
-"""The statics experiment at smoke size: force, height and contact of the full grasp, and how they converge."""
+"""Statics: the experiment at smoke size, and a long box lying flat as a flat punch of another finite-element program."""
 
 import json
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from fem_oracle import dilatation, shear, world_stiffness
+from skfem import Basis, ElementQuad2, ElementVector, MeshQuad, condense, solve
 from test_experiments import experiment
+
+from torchsoft import Parameters, RoundedBox, SoftGrasp, press
+from torchsoft.physics.equilibrium import holding_force
+from torchsoft.physics.mesh import lame_moduli
+from torchsoft.physics.state import State
 
 
 @pytest.fixture(scope="module")
@@ -58,3 +66,58 @@ def test_files(statics: ModuleType, result: Any) -> None:
     assert numbers["made_by"]["config"]["smoke"] == "True"
     assert (result.config.out / "statics.png").read_bytes().startswith(b"\x89PNG")
     assert statics.table("mesh", result.meshes).splitlines()[2].startswith("| 60 x 2 | 69.175 |")
+
+
+# --- a flat punch ----------------------------------------------------------------------------------------------------------
+
+PUNCH = RoundedBox(half_width=15.5e-3, half_height=10e-3, radius=1e-3)
+FLAT = 14.5e-3
+"""Half of its flat side [m]."""
+DEPTH = 1e-4
+"""By how much [m] it is pressed into each of two pads."""
+
+
+def punched(K_n: float, elements_x: int) -> tuple[SoftGrasp, State, float]:
+    """The box pressed between the pads without weight; the force [N] on the bracket."""
+    changes = {"scenario.gravity": 0.0, "contact.K_n": K_n}
+    mesh = {"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30}
+    model = SoftGrasp(Parameters().override(changes | mesh), shape=PUNCH)
+    p = model.settings
+    y = press(model, 2 * (p.pad.height + 10e-3 - DEPTH) + p.bracket.cm_height).detach()
+    return model, model.unpack(y), holding_force(model, y)
+
+
+def test_a_long_box_is_a_flat_punch_on_springs() -> None:
+    """On the same mesh, assembled by scikit-fem, with a spring K_n between each node under the flat side and the box."""
+    model, state, force = punched(1.2e5, 120)
+    pad = model.settings.pad
+    nodes, K = world_stiffness(pad, "L")
+    under = np.flatnonzero((nodes[:, 1] == pad.height) & (np.abs(nodes[:, 0] - 60e-3) < FLAT))
+    springs = 1.2e5 * np.bincount(2 * under + 1, minlength=len(K))
+    depth = pad.height - (float(state.pose["disc"][1]) - 10e-3)
+    u = np.linalg.solve(K + np.diag(springs), -depth * springs)
+    carried = springs * (depth + u)
+    assert depth == pytest.approx(DEPTH, rel=1e-9)  # both pads give way alike
+    assert len(under) == 29
+    assert force == pytest.approx(carried.sum(), rel=1e-9)
+    surface = nodes[:, 1] == pad.height
+    assert state.pads["L"][0, :, 1].numpy() == pytest.approx(-carried[1::2][surface], rel=1e-7, abs=1e-9)
+
+
+def test_a_long_box_on_stiff_springs_is_a_rigid_flat_punch() -> None:
+    """Quadratic elements of a quarter of a millimetre under a rigid, smooth punch; ours are bilinear of half a millimetre."""
+    pad = Parameters().pad
+    mesh = MeshQuad.init_tensor(np.linspace(0, pad.length, 481), np.linspace(0, pad.height, 17))
+    basis = Basis(mesh, ElementVector(ElementQuad2()), intorder=4)
+    lame_lambda, lame_mu = lame_moduli(pad.E, pad.nu)
+    K = pad.depth * (lame_lambda * dilatation.assemble(basis) + lame_mu * shear.assemble(basis))
+    x, y = basis.doflocs
+    vertical = np.isin(np.arange(basis.N), np.concatenate([dofs[1] for dofs in (basis.nodal_dofs, basis.facet_dofs)]))
+    under = np.flatnonzero(vertical & (y == pad.height) & (np.abs(x - 60e-3) < FLAT + 1e-9))
+    u = np.zeros(basis.N)
+    u[under] = -DEPTH
+    u = solve(*condense(K, x=u, D=np.union1d(np.flatnonzero(y == 0), under)))
+    rigid = -(K @ u)[under].sum()
+    assert rigid == pytest.approx(66.17, abs=0.01)
+    assert punched(1.2e8, 240)[2] == pytest.approx(rigid, rel=2e-3)
+    assert punched(1.2e8, 120)[2] == pytest.approx(rigid, rel=3e-2)  # the flat side ends between its nodes

@@ -4,13 +4,13 @@ from torchsoft.parameters import Parameters
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact
 from torchsoft.physics.equilibrium import NoEquilibrium, press, rest
 from torchsoft.physics.material import GeneralisedKelvin, KelvinVoigt, Prony, StandardLinearSolid
-from torchsoft.physics.mesh import PadMesh
+from torchsoft.physics.mesh import CurvedPadMesh, FingertipMesh, PadMesh, QuadMesh
 from torchsoft.physics.motion import Profile, Reference, Sampled, hold
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.paper import SoftGrasp
 from torchsoft.physics.parts import PD, Actuator, Body, Contact
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.shapes import Circle, Ellipse, Shape
+from torchsoft.physics.shapes import Circle, Contour, Ellipse, RoundedBox, RoundedPolygon, Shape, Superellipse
 from torchsoft.solve.batch import Batch, SamplesFailed, simulate_batch
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import Interrupted, simulate
@@ -21,8 +21,9 @@ from torchsoft.solve.trajectory import Trajectory
 register()
 
 __all__ = [
-    "METHOD", "PD", "Actuator", "Batch", "Body", "Circle", "Contact", "Coulomb", "Ellipse", "GeneralisedKelvin",
-    "Interrupted", "KelvinVoigt", "NoEquilibrium", "Pad", "PadMesh", "Parameters", "Profile", "Prony", "Reference", "Rig",
-    "Sampled", "SamplesFailed", "Shape", "SimulationFailed", "SmoothSlip", "SoftContact", "SoftGrasp",
-    "StandardLinearSolid", "Trajectory", "hold", "press", "rest", "simulate", "simulate_batch",
+    "METHOD", "PD", "Actuator", "Batch", "Body", "Circle", "Contact", "Contour", "Coulomb", "CurvedPadMesh", "Ellipse",
+    "FingertipMesh", "GeneralisedKelvin", "Interrupted", "KelvinVoigt", "NoEquilibrium", "Pad", "PadMesh", "Parameters",
+    "Profile", "Prony", "QuadMesh", "Reference", "Rig", "RoundedBox", "RoundedPolygon", "Sampled", "SamplesFailed",
+    "Shape", "SimulationFailed", "SmoothSlip", "SoftContact", "SoftGrasp", "StandardLinearSolid", "Superellipse",
+    "Trajectory", "hold", "press", "rest", "simulate", "simulate_batch",
 ]  # fmt: skip

@@ -83,11 +83,12 @@ def _functions(g: Graph, outputs: list[int], linear: int, differentiated: int, p
         weight = g.leaf("w", o)
         seeds[node] = g("add", seeds[node], weight) if node in seeds else weight
     J = itertools.chain.from_iterable(jacobian(g, outputs[:linear], x))
-    p_bar = adjoints(g, seeds, {}, dependent(g, p), p)
+    lookups = [node for node, op in enumerate(g.ops) if op == "lookup"]  # of parameters: known when it runs of which
+    p_bar = adjoints(g, seeds, {}, dependent(g, p + lookups), p + lookups)
     return [
         emit.function(g, "value", ("x", "p", "out"), {"out": outputs}),
         emit.function(g, "linearise", ("x", "p", "out", "J"), {"out": outputs, "J": J}),
-        emit.function(g, "pullback", ("x", "p", "w", "p_bar"), {"p_bar": p_bar}, add=True),
+        emit.function(g, "pullback", ("x", "p", "w", "p_bar"), {}, {"p_bar": zip(p + lookups, p_bar)}),
     ]
 
 

@@ -42,27 +42,39 @@ _engines: dict[str, llvm.ExecutionEngine] = {}
 
 
 def function(
-    g: Graph, name: str, pointers: Iterable[str], results: Mapping[str, Iterable[int]], add: bool = False
-) -> str:
+    g: Graph, name: str, pointers: Iterable[str], results: Mapping[str, Iterable[int]],
+    added: Mapping[str, Iterable[tuple[int, int]]] | None = None,
+) -> str:  # fmt: skip
     """IR of void `name`(pointers...), which stores the nodes of `results` where the pointer of that name points.
 
-    With `add` the nodes are added to what is stored there.
+    `added` has pairs of nodes, a parameter or a look-up of one and what is added where it stands from that pointer on.
     """
     text: dict[int, str] = {}
     lines = [f"define void @{name}({', '.join(f'{POINTER} %{p}' for p in pointers)}) nounwind {{"]
     for letter, nodes in results.items():
         for index, node in enumerate(nodes):
-            if add and g.value(node) == 0.0:
+            lines += _evaluation(g, node, text)
+            lines.append(f"%{letter}{index} = getelementptr double, {POINTER} %{letter}, i64 {index}")
+            lines.append(f"store double {text[node]}, {POINTER} %{letter}{index}")
+    for letter, pairs in (added or {}).items():
+        for index, (target, node) in enumerate(pairs):
+            if g.value(node) == 0.0:
                 continue
             lines += _evaluation(g, node, text)
-            place, value = f"%{letter}{index}", text[node]
-            lines.append(f"{place} = getelementptr double, {POINTER} %{letter}, i64 {index}")
-            if add:
-                lines.append(f"{place}.old = load double, {POINTER} {place}")
-                lines.append(f"{place}.new = fadd double {place}.old, {value}")
-                value = f"{place}.new"
-            lines.append(f"store double {value}, {POINTER} {place}")
+            for needed in _operands(g, target):
+                lines += _evaluation(g, needed, text)
+            place = f"%{letter}{index}"
+            lines += _address(g, target, letter, place, [text[a] for a in _operands(g, target)])
+            lines.append(f"{place}.old = load double, {POINTER} {place}")
+            lines.append(f"{place}.new = fadd double {place}.old, {text[node]}")
+            lines.append(f"store double {place}.new, {POINTER} {place}")
     return "\n".join([*lines, "ret void", "}"])
+
+
+def _operands(g: Graph, node: int) -> tuple[int, ...]:
+    """The nodes whose values the instruction of `node` takes."""
+    op = g.ops[node]
+    return () if op in (*LEAVES, "constant") else g.args[node][:1] if op in (*NAMED, "lookup") else g.args[node]
 
 
 def _evaluation(g: Graph, root: int, text: dict[int, str]) -> Iterator[str]:
@@ -73,7 +85,7 @@ def _evaluation(g: Graph, root: int, text: dict[int, str]) -> Iterator[str]:
         if node in text:
             continue
         op = g.ops[node]
-        needed = () if op in LEAVES or op == "constant" else g.args[node][:1] if op in NAMED else g.args[node]
+        needed = _operands(g, node)
         missing = [a for a in needed if a not in text]
         if missing:
             pending += [node, *reversed(missing)]
@@ -89,13 +101,29 @@ def _evaluation(g: Graph, root: int, text: dict[int, str]) -> Iterator[str]:
 
 def _instruction(g: Graph, node: int, operands: list[str]) -> Iterator[str]:
     op = g.ops[node]
-    if op in LEAVES:
-        yield f"%a{node} = getelementptr double, {POINTER} %{op}, i64 {g.args[node][0]}"
+    if op in LEAVES or op == "lookup":
+        yield from _address(g, node, op if op in LEAVES else "p", f"%a{node}", operands)
         yield f"%v{node} = load double, {POINTER} %a{node}"
     elif op in INSTRUCTIONS:
         yield f"%v{node} = {INSTRUCTIONS[op].format(*operands)}"
     else:
         yield f"%v{node} = call double @{FUNCTIONS[op]}({', '.join('double ' + a for a in operands)})"
+
+
+def _address(g: Graph, node: int, pointer: str, name: str, operands: list[str]) -> Iterator[str]:
+    """The place of a leaf or a look-up from `pointer` on; a number outside the table, or none, is the first entry's."""
+    if g.ops[node] in LEAVES:
+        yield f"{name} = getelementptr double, {POINTER} %{pointer}, i64 {g.args[node][0]}"
+        return
+    (index,), (_, first, stride, count) = operands, g.args[node]
+    yield f"{name}.least = fcmp oge double {index}, {_literal(0.0)}"
+    yield f"{name}.most = fcmp olt double {index}, {_literal(float(count))}"
+    yield f"{name}.inside = and i1 {name}.least, {name}.most"
+    yield f"{name}.safe = select i1 {name}.inside, double {index}, double {_literal(0.0)}"
+    yield f"{name}.whole = fptosi double {name}.safe to i64"
+    yield f"{name}.steps = mul i64 {name}.whole, {stride}"
+    yield f"{name}.place = add i64 {name}.steps, {first}"
+    yield f"{name} = getelementptr double, {POINTER} %{pointer}, i64 {name}.place"
 
 
 def _literal(value: float | bool) -> str:

@@ -6,7 +6,7 @@ and an argument always has a smaller number than the node that uses it.
 
 import math
 import operator
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 
 LEAVES = ("x", "p", "w")  # the inputs, the parameters, and the output weights of a pullback
 COMPARISONS = {
@@ -79,6 +79,24 @@ class Graph:
         for node in nodes:
             total = self("add", total, node)
         return total
+
+    def lookup(self, index: int, entries: Sequence[int]) -> int:
+        """entries[index] of a whole number, entry 0 where there is none of that number. Parameters that stand equally far apart
+        are read from their place; other entries are chosen among."""
+        place = self.value(index)
+        if place is not None:
+            return entries[int(place)]
+        if all(self.ops[entry] == "stop" for entry in entries):
+            return self("stop", self.lookup(index, [self.args[entry][0] for entry in entries]))
+        first, *rest = (self.args[entry][0] if self.ops[entry] == "p" else -1 for entry in entries)
+        stride = rest[0] - first if rest else 1
+        if first >= 0 and rest == [first + stride * (i + 1) for i in range(len(rest))]:
+            args = index, first, stride, len(entries)
+            return self._node("lookup", args, ("lookup", *args), False, True)
+        chosen = entries[0]
+        for i, entry in enumerate(entries[1:], 1):
+            chosen = self("select", self("eq", index, self.constant(i)), entry, chosen)
+        return chosen
 
     def product(self, adjoint: int, local: int) -> int:
         """adjoint·local, and 0 where the adjoint is exactly 0, however singular the local derivative is there."""

@@ -106,6 +106,13 @@ def _div(g: Graph, a: int, b: int, rounding_mode: str | None = None) -> int:
     return g("div", a, b)
 
 
+def _converted(g: Graph, a: int, dtype: Any = None, **_: Any) -> int:
+    """The same number; to a whole one the part after the point is cut off."""
+    if dtype != torch.int64:
+        return a
+    return g("select", g("lt", a, g.zero), g("neg", g("floor", g("neg", a))), g("floor", a))
+
+
 def _primitive(op: str) -> Callable[..., int]:
     return lambda g, *args: g(op, *args)
 
@@ -154,7 +161,7 @@ ELEMENTWISE: dict[str, Callable[..., int]] = {
     "deg2rad": lambda g, a: g("mul", a, g.constant(math.pi / 180)),
     "rad2deg": lambda g, a: g("mul", a, g.constant(180 / math.pi)),
     "detach": _primitive("stop"),
-    "_to_copy": lambda g, a, **options: a,
+    "_to_copy": _converted,
     "copy": lambda g, a, b, *options: b,
     "fill": lambda g, a, value: value,
     # the derivatives that torch.func.grad takes inside a law
@@ -175,6 +182,33 @@ def _reduced(fold: Callable[..., int], g: Graph, x: Nodes, dim: Any = None, keep
     for index in np.ndindex(out.shape):
         out[index] = fold(g, rows[index].tolist())
     return np.expand_dims(out, tuple(axes)) if keepdim else out
+
+
+def _place(better: str) -> Callable[..., int]:
+    """Where the first of the best entries stands, as a number that has no derivative."""
+
+    def fold(g: Graph, entries: Sequence[int]) -> int:
+        best, place = entries[0], g.zero
+        for i, entry in enumerate(entries[1:], 1):
+            found = g(better, entry, best)
+            best, place = g("select", found, entry, best), g("select", found, g.constant(i), place)
+        return place
+
+    return fold
+
+
+def _entry(g: Graph, entries: Sequence[int], place: int) -> int:
+    return g.lookup(place, entries)
+
+
+def _looked_up(
+    g: Graph, table: Nodes, places: Nodes, padding: int = -1, scaled: bool = False, sparse: bool = False
+) -> Nodes:
+    """Rows table[places], (..., columns)."""
+    if padding >= 0 or scaled:
+        raise TypeError("a look-up with gradients of its own")
+    columns = table.T.tolist()
+    return np.stack([mapped(partial(_entry, g, column), places) for column in columns], -1)
 
 
 def _mean(g: Graph, entries: Sequence[int]) -> int:
@@ -246,6 +280,9 @@ WHOLE: dict[str, Callable[..., Nodes]] = {
     "all": partial(_reduced, lambda g, entries: reduce(partial(g, "and"), entries, g.constant(True))),
     "amax": _folded(_maximum),
     "amin": _folded(_minimum),
+    "argmax": partial(_reduced, _place("gt")),
+    "argmin": partial(_reduced, _place("lt")),
+    "embedding": _looked_up,
     "linalg_vector_norm": _vector_norm,
     "cumsum": _cumsum,
     "linalg_cross": _cross,

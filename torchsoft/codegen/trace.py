@@ -27,6 +27,7 @@ except ImportError as error:
 _SKIPPED = tuple(os.path.dirname(str(file)) + os.sep for file in (torch.__file__, __file__))
 _BRANCH = "use torch.where in place of a Python branch, and torch.stack in place of torch.tensor"
 _PYTHON_READS = {torch.tensor, torch.as_tensor, Tensor.tolist, Tensor.numpy, Tensor.__array__}
+_BITWISE = {"bitwise_and", "bitwise_or", "bitwise_xor", "bitwise_not"}  # no rule for whole numbers
 
 
 class UnknownOperation(TypeError):
@@ -107,7 +108,8 @@ class Trace(TorchDispatchMode):
             raise self.refused(f"reading a value into Python ({func})", _BRANCH)
         if func._schema.is_mutable and name not in MOVES:
             raise self.refused(f"the in-place operation {func}", "make a new tensor, for example by torch.stack")
-        if name not in MOVES and name not in WHOLE and name not in ELEMENTWISE:
+        whole = any(isinstance(x, Tensor) and x.dtype == torch.int64 for x in tree_leaves((args, kwargs)))
+        if (name not in MOVES and name not in WHOLE and name not in ELEMENTWISE) or (whole and name in _BITWISE):
             raise self.refused(f"the operation {func}", "it has no rule, so write it with other operations")
         try:
             nodes = self._recorded(name, func, args, kwargs)
@@ -123,7 +125,7 @@ class Trace(TorchDispatchMode):
         return result
 
     def _keep(self, func: Any, tensor: Tensor, nodes: Any) -> None:
-        if tensor.dtype not in (torch.float64, torch.bool):
+        if tensor.dtype not in (torch.float64, torch.bool, torch.int64):
             raise self.refused(f"the operation {func} with a result of {tensor.dtype}", "keep all numbers in float64")
         typed = self.graph.truth if tensor.dtype == torch.bool else self.graph.number
         nodes = mapped(typed, np.asarray(nodes))
@@ -134,7 +136,8 @@ class Trace(TorchDispatchMode):
     def _recorded(self, name: str, func: Any, args: tuple, kwargs: Mapping[str, Any]) -> Any:
         if name in MOVES:
             if self.holds((args[1:], kwargs)):
-                raise self.refused(f"{func} at places that depend on values", "use torch.where")
+                remedy = "use torch.where, or torch.nn.functional.embedding to look up rows of a parameter"
+                raise self.refused(f"{func} at places that depend on values", remedy)
             place = lambda t: torch.from_numpy(np.array(self.nodes(t))) if isinstance(t, Tensor) else t
             return func(tree_map(place, args[0]), *args[1:], **kwargs)
         if name in WHOLE:

@@ -4,6 +4,10 @@ import math
 from numbers import Integral, Real
 from typing import Any
 
+import numpy as np
+import torch
+from torch import Tensor
+
 
 def number(name: str, value: Any) -> float:
     """Raises `ValueError` for what is not a real number; text and truth values are not."""
@@ -24,3 +28,27 @@ def whole(name: str, value: Any, least: int) -> int:
     if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
         raise ValueError(f"`{name}` must be a whole number from {least} on, but is {value!r}")
     return int(value)
+
+
+def places(name: str, value: Any) -> Tensor:
+    """Places in the plane (n, 2) in float64, a copy. Raises `ValueError` for what is not such numbers."""
+    try:
+        given = np.array(value.detach() if isinstance(value, Tensor) else value)
+    except (TypeError, ValueError):  # rows of different lengths
+        given = np.zeros(0)
+    if given.ndim != 2 or given.shape[-1] != 2 or given.dtype.kind not in "iuf" or not np.isfinite(given).all():
+        raise ValueError(f"`{name}` must be finite numbers of the shape (n, 2), but is {line(value)}")
+    return torch.from_numpy(given.astype(np.float64))
+
+
+def names(name: str, value: Any, known: tuple[str, ...]) -> None:
+    """Raises `ValueError` for what is not some of the known names, each of them once."""
+    fine = isinstance(value, tuple) and all(isinstance(one, str) and one in known for one in value)
+    if not fine or not value or len({*value}) != len(value):
+        raise ValueError(f"`{name}` must be some of {', '.join(known)}, but is {line(value)}")
+
+
+def line(value: Any) -> str:
+    """A value in one short line."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 60 else text[:57] + "..."

@@ -1,5 +1,6 @@
 """Static, frictionless equilibria of the paper's rig: the object at rest under its weight, and pressed between the pads."""
 
+import warnings
 from typing import Any
 
 import torch
@@ -7,13 +8,16 @@ from scipy.optimize import brentq
 from torch import Tensor
 
 from torchsoft.physics.arguments import number
-from torchsoft.physics.contact import Frame, moving_frame, normal_force
+from torchsoft.physics.contact import Frame, cross, moving_frame, normal_force
 from torchsoft.physics.paper import SoftGrasp
 from torchsoft.physics.state import State
 from torchsoft.physics.validity import check_values
 
 RESIDUAL = 1e-13
 """Equilibrium residual [m], forces counted by the compliance they meet."""
+
+LEVER = 1e-2
+"""How far off its centre, over its size, the object may be carried without a word."""
 
 
 class NoEquilibrium(RuntimeError):
@@ -74,7 +78,7 @@ def _touching(model: SoftGrasp, x: Tensor) -> State:
     top = model.settings.pad.height
     zero = torch.zeros((), dtype=torch.float64)
     below = float(model.shape.support(torch.tensor([0.0, -1.0]).double()).detach())
-    side = _Side(model, "L", torch.zeros(2, dtype=torch.float64), x, min(below, 3 * (below * top) ** 0.5))
+    side = _Side(model, "L", torch.zeros(2, dtype=torch.float64), x)
 
     def deepest(height: Tensor) -> tuple[Tensor, Tensor]:
         """Penetration of the deepest point [m], and its derivative by the height."""
@@ -104,8 +108,8 @@ def _solve(model: SoftGrasp, bracket_height: float | None, x: Tensor) -> State:
     bases = {"L": torch.zeros(2, dtype=torch.float64)} | (
         {} if bracket_height is None else {"U": torch.stack((x, y_Br))}
     )
-    weight, reach = model.disc.mass * model.gravity, min(below, 3 * (below * height) ** 0.5)
-    sides = [_Side(model, k, base, x, reach) for k, base in bases.items()]
+    weight = model.disc.mass * model.gravity
+    sides = [_Side(model, k, base, x) for k, base in bases.items()]
     soft = sides[0].C.detach().diagonal().max()
     sizes = [2 * len(side.near) for side in sides]
 
@@ -147,6 +151,14 @@ def _solve(model: SoftGrasp, bracket_height: float | None, x: Tensor) -> State:
             )
         J = linearise(z)
     z = z - _newton_step(J, residual(z))
+    with torch.no_grad():
+        turning = [side.turning(u.unflatten(0, (-1, 2)), z[0]) for side, u in zip(sides, z[1:].split(sizes))]
+        moment, load = (float(sum(x)) for x in zip(*turning))
+    if abs(moment) > LEVER * model.shape.size() * load:
+        warnings.warn(
+            f"the object is held at theta = 0, where the pads turn it with {moment:.3g} N.m: a run from here begins with that",
+            stacklevel=3,
+        )
     state = model.unpack(torch.zeros(model.layout.size, dtype=torch.float64))
     pads = dict(state.pads)
     for side, F in zip(sides, forces(z)):
@@ -162,10 +174,12 @@ def _newton_step(J: Tensor, r: Tensor) -> Tensor:
 
 
 class _Side:
-    """One pad's surface within `reach` of the object's x: its frictionless nodal forces, and what they do to the pad."""
+    """One pad's surface as far as the object reaches sideways: its frictionless nodal forces, and what they do to the pad."""
 
-    def __init__(self, model: SoftGrasp, name: str, base: Tensor, x: Tensor, reach: float) -> None:
+    def __init__(self, model: SoftGrasp, name: str, base: Tensor, x: Tensor) -> None:
         self.model, self.name, self.x, self.pad = model, name, x, model.pads[name]
+        sideways = torch.tensor([[1.0, 0.0], [-1.0, 0.0]]).double()
+        reach = float(model.shape.support(sideways).detach().max())
         places = self.pad.point_positions + base
         points = torch.nonzero((places[:, 0] - x.detach()).abs() < reach)[:, 0]
         spread = self.pad.spread[points][:, self.pad.surface]
@@ -180,10 +194,20 @@ class _Side:
         d = self.places + self.spread @ u - torch.stack((self.x, y_C))
         return moving_frame(self.model.shape, d, torch.zeros_like(y_C).expand(len(d)))
 
+    def point_forces(self, frame: Frame) -> Tensor:
+        """On each near point (points, 2) [N]."""
+        zero = torch.zeros((), dtype=torch.float64)
+        return normal_force(frame.g, zero, zero, self.K_n, zero)[:, None] * frame.n
+
     def force(self, u: Tensor, y_C: Tensor) -> Tensor:
         """On each near node, (near, 2) [N], for their displacements u (near, 2) [m] and the object's height [m]."""
-        frame, zero = self.frame(u, y_C), torch.zeros_like(y_C)
-        return self.spread.mT @ (normal_force(frame.g, zero, zero, self.K_n, zero)[:, None] * frame.n)
+        return self.spread.mT @ self.point_forces(self.frame(u, y_C))
+
+    def turning(self, u: Tensor, y_C: Tensor) -> tuple[Tensor, Tensor]:
+        """Moment on the object [N.m], and the sum of the points' forces [N]."""
+        frame = self.frame(u, y_C)
+        f = self.point_forces(frame)
+        return -(cross(frame.d) * f).sum(), torch.linalg.vector_norm(f, dim=-1).sum()
 
     def everywhere(self, F: Tensor) -> Tensor:
         """The pad's state under nodal forces F (near, 2): forces that have set in, or the displacements of all nodes."""

@@ -4,7 +4,6 @@ Displacements are in the frame of the base, which turns with it. A massless pad'
 nodal forces that have set in, branch by branch of its material's chain; an inertial pad's its displacements and velocities.
 """
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from torch import Tensor, nn
 
 from torchsoft.physics.arguments import whole
 from torchsoft.physics.material import Material
-from torchsoft.physics.mesh import Array, PadMesh, lame_moduli, unit_compliance
+from torchsoft.physics.mesh import Array, Mesh, lame_moduli, unit_compliance
 
 
 class Pad(nn.Module):
@@ -33,7 +32,7 @@ class Pad(nn.Module):
     axes: Tensor
 
     def __init__(
-        self, mesh: PadMesh, material: Material, *, base: str | None = None, origin: tuple[float, float] = (0.0, 0.0),
+        self, mesh: Mesh, material: Material, *, base: str | None = None, origin: tuple[float, float] = (0.0, 0.0),
         angle: float = 0.0, mirrored: bool = False, inertial: bool = False, points: int = 0,
     ) -> None:  # fmt: skip
         super().__init__()
@@ -45,7 +44,8 @@ class Pad(nn.Module):
         self.register_buffer("axes", torch.from_numpy(axes), persistent=False)
         self.register_buffer("origin", torch.tensor(origin, dtype=torch.float64), persistent=False)
         self.register_buffer("positions", torch.from_numpy(self.placed(mesh.nodes[mesh.free][kept])), persistent=False)
-        self.register_buffer("surface", torch.from_numpy(np.searchsorted(kept, mesh.surface)), persistent=False)
+        own = mesh.surface if inertial else np.arange(len(kept))
+        self.register_buffer("surface", torch.from_numpy(own.copy()), persistent=False)
         self.point_nodes, self.point_shares, self.point_lengths = contact_points(mesh, points)
         spread = np.zeros((len(self.point_nodes), len(kept)))
         for j in (0, 1):
@@ -54,10 +54,9 @@ class Pad(nn.Module):
 
     def remeshed(self, finer: int, points: int) -> "Pad":
         """The same pad of `finer` times as many elements each way, with so many contact points an element."""
-        m, (c, s) = self.mesh, self.axes[:, 0].tolist()
-        mesh = replace(m, elements_x=finer * m.elements_x, elements_y=finer * m.elements_y)
+        c, s = self.axes[:, 0].tolist()
         return Pad(
-            mesh, self.material, base=self.base, origin=(float(self.origin[0]), float(self.origin[1])),
+            self.mesh.refined(finer), self.material, base=self.base, origin=(float(self.origin[0]), float(self.origin[1])),
             angle=float(np.arctan2(s, c)), mirrored=float(self.axes.det()) < 0, inertial=self.inertial, points=points,
         )  # fmt: skip
 
@@ -156,12 +155,12 @@ class Pad(nn.Module):
         slot[mesh.free] = np.arange(len(mesh.free))
         connectivity = torch.from_numpy(slot[mesh.elements])
         padded = nn.functional.pad(u @ self.axes, (0, 0, 0, 1))
-        f_e = (padded[..., connectivity, :].flatten(-2) @ K_e).unflatten(-1, (4, 2))
+        f_e = (padded[..., connectivity, :].flatten(-2)[..., None, :] @ K_e)[..., 0, :].unflatten(-1, (4, 2))
         f = torch.zeros_like(padded).index_add(-2, connectivity.flatten(), f_e.flatten(-3, -2))
         return f[..., :-1, :] @ self.axes.mT
 
 
-def contact_points(mesh: PadMesh, points: int) -> tuple[Any, Array, Array]:
+def contact_points(mesh: Mesh, points: int) -> tuple[Any, Array, Array]:
     """Two surface nodes of every contact point (points, 2), their shape functions there, and the length of surface that the
     point stands for [m]."""
     count = len(mesh.surface)
@@ -169,7 +168,7 @@ def contact_points(mesh: PadMesh, points: int) -> tuple[Any, Array, Array]:
         nodes = np.stack((np.arange(count), np.arange(count)), -1)
         return nodes, np.tile([1.0, 0.0], (count, 1)), mesh.tributary
     xi, weight = np.polynomial.legendre.leggauss(points)
-    spacing = np.diff(mesh.nodes[mesh.free[mesh.surface], 0])
+    spacing = np.linalg.norm(np.diff(mesh.nodes[mesh.free[mesh.surface]], axis=0), axis=1)
     left = np.repeat(np.arange(count - 1), points)
     right = np.tile(0.5 * (1 + xi), count - 1)
     lengths = np.repeat(spacing, points) * np.tile(0.5 * weight, count - 1)

@@ -98,10 +98,10 @@ class SoftGrasp(Rig):
                 out[name] = getattr(self.get_submodule(owner), last).item()
             except AttributeError:  # a part of another kind, which has no such number
                 continue
-        pad, law = self.pads["L"], self.contacts["L"].law
+        pad, upper, law = self.pads["L"], self.pads["U"].mesh, self.contacts["L"].law
         out |= {f"pad.{name}": getattr(pad.mesh, name) for name in ("length", "height", "elements_x", "elements_y")}
         out |= {
-            "pad.enclosed": self.pads["U"].mesh.bonded_sides,
+            "pad.enclosed": isinstance(upper, PadMesh) and upper.bonded_sides,
             "pad.fidelity": "inertial" if pad.inertial else "massless",
         }
         out |= {"contact.points": pad.points, "contact.node_spacing": law.node_spacing}

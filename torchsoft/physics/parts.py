@@ -1,11 +1,12 @@
 """The parts of a rig beside its pads: rigid bodies, contacts, and actuators with their control laws."""
 
 from collections.abc import Callable
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal, Self
 
 import torch
 from torch import Tensor, nn
 
+from torchsoft.physics.arguments import positive
 from torchsoft.physics.contact import SoftContact
 from torchsoft.physics.shapes import Shape, parameter
 
@@ -43,6 +44,13 @@ class Body(nn.Module):
         self.own_inertia = None if inertia is None else parameter(inertia)
         if self.freedom["theta"] == "free" and shape is None and inertia is None:
             raise ValueError("a body that may turn needs an `inertia`, or a `shape` to compute it from")
+
+    @classmethod
+    def uniform(cls, shape: Shape, density: float, depth: float, **given: Any) -> Self:
+        """A body of uniform `density` [kg/m3] over its `depth` [m]. Its mass is that of the shape as it is now, and a number of
+        its own from then on; its inertia follows the shape. Raises `ValueError` for numbers that are not positive."""
+        mass = positive("density", density) * positive("depth", depth) * float(shape.area().detach())
+        return cls(mass, shape, **given)
 
     def well_posed(self) -> str:
         """What is wrong with the parameters together; empty if nothing is."""

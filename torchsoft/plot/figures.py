@@ -174,7 +174,7 @@ def close_up(axes: Axes, rig: Rig, instant: Instant, contact: str, shared: bool)
     assert shape is not None
     inwards = -own_axes(pad, instant.base[name])[1]
     own = torch.from_numpy(in_world(inwards, np.array([0.0, 0.0, -pose[2]])))
-    reach = MM * (float(shape.support(own).detach()) + 0.5 * pad.mesh.height) - 0.5 * unit(rig)
+    reach = MM * (float(shape.support(own).detach()) + min(0.5 * pad.mesh.height, 2.5e-3 * unit(rig))) - 0.5 * unit(rig)
     x, y = pose[:2] + reach * inwards
     axes.set_xlim(x - CLOSE * unit(rig), x + CLOSE * unit(rig))
     axes.set_ylim(y - 3.3 * unit(rig), y + 3.3 * unit(rig), auto=True)

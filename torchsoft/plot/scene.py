@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.sparse.linalg import SuperLU, splu
 from torch import Tensor
 
-from torchsoft.physics.mesh import Array, PadMesh, lame_moduli
+from torchsoft.physics.mesh import Array, Mesh, lame_moduli
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.trajectory import Trajectory
@@ -30,7 +30,7 @@ MM = 1e3
 
 
 @lru_cache(maxsize=4)
-def interior_solver(mesh: PadMesh, nu: float) -> tuple[SuperLU, NDArray[np.int64], Array]:
+def interior_solver(mesh: Mesh, nu: float) -> tuple[SuperLU, NDArray[np.int64], Array]:
     """Factorised K_ii, the free dofs that are interior, and K_is (dense), for the surface dofs in `mesh.surface` order.
 
     The interior follows the surface whatever E and depth, so both are taken as 1.
@@ -46,10 +46,10 @@ def interior_solver(mesh: PadMesh, nu: float) -> tuple[SuperLU, NDArray[np.int64
 
 
 def deformed_mesh(pad: Pad, u: Tensor) -> Array:
-    """Places (..., elements_x + 1, elements_y + 1, 2) [m] of all mesh nodes, bonded ones too, in the frame of the pad's base.
+    """Places (..., mesh nodes, 2) [m] of all nodes of the mesh, bonded ones too, in the frame of the pad's base.
 
     u (..., nodes, 2) [m]: displacements as a run records them. A massless pad has only its surface there; the interior is
-    in equilibrium with it, u_i = -K_ii^-1 K_is u_s. The second mesh axis runs from the bonded face to the free surface.
+    in equilibrium with it, u_i = -K_ii^-1 K_is u_s.
     """
     mesh, batch = pad.mesh, tuple(u.shape[:-2])
     own = (u.detach().reshape(-1, pad.nodes, 2) @ pad.axes).flatten(1).numpy()
@@ -62,7 +62,7 @@ def deformed_mesh(pad: Pad, u: Tensor) -> Array:
         free[:, interior] = -factor.solve(K_is @ own.T).T
     displacement = np.zeros((len(own), len(mesh.nodes), 2))
     displacement[:, mesh.free] = free.reshape(len(own), -1, 2)
-    return pad.placed(mesh.nodes + displacement).reshape(*batch, mesh.elements_x + 1, mesh.elements_y + 1, 2)
+    return pad.placed(mesh.nodes + displacement).reshape(*batch, -1, 2)
 
 
 def in_world(places: Array, pose: Array) -> Array:
@@ -71,10 +71,18 @@ def in_world(places: Array, pose: Array) -> Array:
     return places @ np.array([[c, s], [-s, c]]) + pose[:2]
 
 
+def straight_up(outline: Array) -> Array:
+    """The highest place (2,) where a closed outline (points, 2) crosses the y axis; the origin if it does nowhere."""
+    (x, y), (x_next, y_next) = outline[:-1].T, outline[1:].T
+    k = np.flatnonzero((x > 0) != (x_next > 0))
+    crossed = y[k] + (y_next - y)[k] * x[k] / (x - x_next)[k]
+    return np.array([0.0, crossed.max(initial=0.0)])
+
+
 class Instant(NamedTuple):
     """One sample as drawn: time [s], poses of the bodies and of the pads' bases (3,) [mm, mm, rad], places [mm], forces [N].
 
-    mesh: pad -> (elements_x + 1, elements_y + 1, 2); points: contact -> (points, 2); force: contact -> (points, 2), normal
+    mesh: pad -> (mesh nodes, 2); points: contact -> (points, 2); force: contact -> (points, 2), normal
     force and friction on the pad, the latter positive along `along_surface`; along: contact -> (points,), how far the points
     are in that direction.
     """
@@ -222,16 +230,16 @@ class Scene:
 
     def show(self, instant: Instant) -> None:
         """Put everything where it is at `instant`."""
-        for k, mesh in instant.mesh.items():
-            self.outlines[k].set_xy(np.concatenate((mesh[:, 0], mesh[-1], mesh[::-1, -1], mesh[0, ::-1])))
-            self.layers[k].set_segments([*mesh.swapaxes(0, 1), *mesh[:: self.columns], mesh[-1]])
+        for k, nodes in instant.mesh.items():
+            mesh = self.rig.pads[k].mesh
+            self.outlines[k].set_xy(nodes[mesh.outline])
+            self.layers[k].set_segments([nodes[line] for line in mesh.lines(self.columns)])
         for k, plate in self.plates.items():
             plate.set_xy(self.behind(instant, k, 0.0, self.thickness[k]))
         for k, outline in self.shapes.items():
             pose = instant.pose[k]
             self.bodies[k].set_xy(in_world(outline, pose))
-            top = outline[len(outline) // 4]  # the boundary's point furthest along the body's own y
-            self.spokes[k].set_data(*np.stack((pose[:2], in_world(top, pose)), -1))
+            self.spokes[k].set_data(*np.stack((pose[:2], in_world(straight_up(outline), pose)), -1))
             self.hubs[k].set_data(*pose[:2, None])
         for k in self.normal:
             name, rows = self.rig.contacts[k].pad, instant.near(k)
@@ -245,8 +253,8 @@ class Scene:
     def behind(self, instant: Instant, name: str, side: float, depth: float) -> Array:
         """Corners (4, 2) [mm] of the rectangle behind a pad's bonded face, wider than it by `side` [mm] on each side."""
         pad = self.rig.pads[name]
-        left, right = -side, MM * pad.mesh.length + side
-        corners = np.array([[left, -depth], [right, -depth], [right, 0.0], [left, 0.0]])
+        (left, face), (right, _) = MM * pad.mesh.base + [[-side, 0.0], [side, 0.0]]
+        corners = np.array([[left, face - depth], [right, face - depth], [right, face], [left, face]])
         return own_places(pad, instant.base[name], corners)
 
     def limits(self, shown: Sequence[Instant]) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy import linalg
+from scipy import linalg, sparse
 from torch import Tensor
 
 from torchsoft.physics.mesh import banded
@@ -25,9 +25,6 @@ from torchsoft.solve.laws import LawSet, actuator_law, contact_laws, structure
 
 NOMINAL = 1e-3
 """Stage length a h [s] with which slip laws of one's own are tried."""
-
-WIDEST_ROW = 18
-"""Entries of a stiffness row: nine nodes around one, two components each."""
 
 
 @contextmanager
@@ -184,18 +181,21 @@ class Compiled:
     def _make_inertia(self, dofs: list[int], node_start: list[int], material_at: list[int]) -> Inertia:
         total = dofs[-1]
         X, area, D = np.zeros(total), np.zeros(total), np.zeros((total, 2))
-        surface, column = np.zeros(2 * node_start[-1], np.int64), np.zeros((total, WIDEST_ROW), np.int64)
-        K = [np.zeros((total, WIDEST_ROW)) for _ in range(2)]
-        for i, pad in enumerate(self.rig.pads.values()):
-            if not pad.inertial:
-                continue
+        moving = {i: pad for i, pad in enumerate(self.rig.pads.values()) if pad.inertial}
+        both = {i: [pad.stiffness(modulus) for modulus in range(2)] for i, pad in moving.items()}
+        patterns = {i: sparse.csr_array(abs(K_lambda) + abs(K_mu)) for i, (K_lambda, K_mu) in both.items()}
+        for pattern in patterns.values():
+            pattern.eliminate_zeros()
+        widest = max((pattern.count_nonzero(axis=1).max() for pattern in patterns.values()), default=0)
+        surface, column = np.zeros(2 * node_start[-1], np.int64), np.zeros((total, widest), np.int64)
+        K = [np.zeros((total, widest)) for _ in range(2)]
+        for i, pad in moving.items():
             here = slice(dofs[i], dofs[i + 1])
             X[here], area[here] = pad.positions.numpy().ravel(), np.repeat(pad.mesh.nodal_areas, 2)
             own = 2 * pad.surface.numpy()[:, None] + np.arange(2)
             surface[2 * node_start[i] : 2 * node_start[i + 1]] = own.ravel()
-            stiffness = [pad.stiffness(modulus) for modulus in range(2)]
-            pattern = (abs(stiffness[0]) + abs(stiffness[1])).tocsr()
-            for row in range(pattern.shape[0]):
+            stiffness, pattern = both[i], patterns[i]
+            for row in range(here.stop - here.start):
                 columns = pattern.indices[pattern.indptr[row] : pattern.indptr[row + 1]]
                 column[dofs[i] + row, : len(columns)] = columns
                 for k in range(2):
@@ -233,7 +233,7 @@ class Compiled:
             key = id(contact.law), id(shape)
             if key not in self._known:
                 check_shape(contact.body, shape)
-                self._known[key] = contact_laws(contact.law, shape)
+                self._known[key] = contact_laws(contact.law, shape.prepared())
                 stiffness = contact.law.R_t.item() + NOMINAL * contact.law.K_t.item()
                 if structure(contact.law) is None and (wrong := check_slip(name, contact.law.friction, stiffness)):
                     warnings.warn(wrong, stacklevel=2)
@@ -250,8 +250,7 @@ class Compiled:
             N.append(pad.point_shares)
             point_start.append(point_start[-1] + len(pad.point_nodes))
             sizes.append(shape.size())
-            length = pad.mesh.length
-            corners = pad.placed(np.array([[0.0, -length], [0.0, length], [length, -length], [length, length]]))
+            corners = pad.placed(np.stack(np.meshgrid(*pad.mesh.space.T), -1).reshape(-1, 2))
             box = (*corners[:, 0][[corners[:, 0].argmin(), corners[:, 0].argmax()]], *np.sort(corners[:, 1])[[0, -1]])
             limits.append((-np.inf, np.inf, -np.inf, np.inf) if contact.may_leave else box)
         columns = [np.ascontiguousarray(x) for x in _ints(rows).reshape(-1, 8).T]

@@ -168,7 +168,7 @@ def plain(part: nn.Module) -> str:
         elif not name.startswith("_") and isinstance(value, int | float | str | tuple | dict | None):
             known[name] = value
     if isinstance(part, Pad):
-        known["mesh"] = part.mesh.nodes.tolist(), part.mesh.bonded_sides
+        known["mesh"] = part.mesh.nodes.tolist(), part.mesh.bonded.tolist()
     return repr(sorted(known.items()))
 
 

@@ -1,0 +1,494 @@
+"""Pads that are no rectangles: curved blocks, fingertips, meshes from files; against scikit-fem, each other, and in runs."""
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+import torch
+from conftest import f64, times
+from fem_oracle import dilatation, mass, shear
+from skfem import Basis, ElementQuad1, ElementQuad2, ElementVector, FacetBasis, LinearForm, MeshQuad, condense, solve
+from torch import Tensor
+
+from torchsoft import (
+    Body,
+    Circle,
+    Contact,
+    CurvedPadMesh,
+    FingertipMesh,
+    KelvinVoigt,
+    Pad,
+    PadMesh,
+    Profile,
+    QuadMesh,
+    Reference,
+    Rig,
+    SmoothSlip,
+    SoftContact,
+    simulate,
+)
+from torchsoft.physics.mesh import Array, Mesh, lame_moduli
+
+ROUNDING = 1e-12
+"""Relative to the largest entry: two assemblies of the same integrals, in another order of summation."""
+
+RADIUS = 8e-3
+
+
+def trapezium() -> QuadMesh:
+    """A skew, ragged mesh whose points are numbered at random, and some of whose quadrilaterals are clockwise."""
+    rng = np.random.default_rng(4)
+    s, t = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 4), indexing="ij")
+    inner = (s * (1 - s) > 0) & (t * (1 - t) > 0)
+    s, t = s + 0.02 * inner * rng.standard_normal(s.shape), t + 0.05 * inner * rng.standard_normal(s.shape)
+    points = np.stack((30e-3 * s + 4e-3 * t * (1 - 2 * s), 6e-3 * t + 1e-3 * s), -1).reshape(-1, 2)
+    number = np.arange(len(points)).reshape(s.shape)
+    quads = np.stack((number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]), -1).reshape(-1, 4)
+    quads[::3] = quads[::3, ::-1]
+    face, base = (np.stack((row[:-1], row[1:]), -1) for row in (number[:, -1], number[:, 0]))
+    mixed = rng.permutation(len(points) + 1)  # the last belongs to no quadrilateral
+    shuffled = np.empty((len(points) + 1, 2))
+    shuffled[mixed] = np.concatenate((points, [[9.0, 9.0]]))
+    return QuadMesh.of(shuffled, mixed[quads], mixed[face[::-1]], mixed[base])
+
+
+MESHES: dict[str, Callable[[], Mesh]] = {
+    "crowned": lambda: CurvedPadMesh(30e-3, 6e-3, 15, 3, radius=40e-3),
+    "hollow": lambda: CurvedPadMesh(30e-3, 4e-3, 15, 3, radius=-50e-3, bonded_edges=("base", "right")),
+    "fingertip": lambda: FingertipMesh(RADIUS, 12),
+    "trapezium": trapezium,
+}
+
+
+@pytest.fixture(params=MESHES)
+def mesh(request: pytest.FixtureRequest) -> Mesh:
+    return MESHES[request.param]()
+
+
+def rubber(nu: float = 0.45) -> KelvinVoigt:
+    return KelvinVoigt(0.75e6, nu, 1100.0, 10e-3, 44e-3)
+
+
+# --- elements -----------------------------------------------------------------------------------------------------------
+
+
+def in_scikit_fem(mesh: Mesh) -> MeshQuad:
+    return MeshQuad(mesh.nodes.T, mesh.elements.T)
+
+
+def test_assembly_equals_scikit_fem(mesh: Mesh) -> None:
+    theirs, element = in_scikit_fem(mesh), ElementVector(ElementQuad1())
+    basis = Basis(theirs, element, intorder=2)
+    centre = Basis(theirs, element, quadrature=(np.full((2, 1), 0.5), np.ones(1)))
+    exact = Basis(theirs, element, intorder=5)
+    order = basis.nodal_dofs.T.ravel()
+    for mine, form, at in zip(mesh.matrices, (dilatation, shear, mass), (centre, basis, exact)):
+        want = form.assemble(at).toarray()[order][:, order]
+        assert np.abs(mesh.assemble(mine, all_nodes=True).toarray() - want).max() < ROUNDING * np.abs(want).max()
+
+
+@pytest.mark.parametrize("nu", [0.3, 0.4999])
+def test_patch_test(mesh: Mesh, nu: float) -> None:
+    """A linear displacement has a uniform stress: forces only at the boundary, each the stress on half of both its sides."""
+    gradient = np.array([[0.3, -0.7], [1.1, 0.4]])
+    strain = (gradient + gradient.T) / 2
+    lame_lambda, lame_mu = lame_moduli(1.0, nu)
+    stress = lame_lambda * np.trace(strain) * np.eye(2) + 2 * lame_mu * strain
+    K = mesh.assemble(lame_lambda * mesh.matrices[0] + lame_mu * mesh.matrices[1], all_nodes=True)
+    force = (K @ (mesh.nodes @ gradient.T).ravel()).reshape(-1, 2)
+    expected, around = np.zeros_like(force), mesh.outline
+    sides = mesh.nodes[np.roll(around, -1)] - mesh.nodes[around]
+    traction = np.stack((sides[:, 1], -sides[:, 0]), -1) @ stress
+    np.add.at(expected, around, 0.5 * (traction + np.roll(traction, 1, 0)))
+    assert np.abs(force - expected).max() < ROUNDING * np.abs(K.toarray()).max() * np.abs(mesh.nodes).max()
+
+
+def test_only_rigid_motions_cost_no_energy(mesh: Mesh) -> None:
+    lame_lambda, lame_mu = lame_moduli(1.0, 0.49)
+    K = mesh.assemble(lame_lambda * mesh.matrices[0] + lame_mu * mesh.matrices[1], all_nodes=True).toarray()
+    values = np.linalg.eigvalsh(K)
+    assert int((np.abs(values) < 1e-12 * values[-1]).sum()) == 3
+    assert values[3] > 1e-5 * values[-1]
+
+
+# --- geometry -------------------------------------------------------------------------------------------------------------
+
+
+def test_face_and_base_are_where_they_should_be(mesh: Mesh) -> None:
+    face = mesh.nodes[mesh.face]
+    assert np.all(np.diff(face[:, 0]) > 0)  # from left to right
+    assert not mesh.bonded[mesh.free].any()
+    assert set(mesh.free[mesh.surface]) == set(mesh.face[~mesh.bonded[mesh.face]])
+    assert np.all(np.isin(mesh.face, mesh.outline))
+    lengths = np.linalg.norm(np.diff(face, axis=0), axis=1)
+    held = [lengths[k] / 2 for k in (0, -1) if mesh.bonded[mesh.face[k]]]
+    assert mesh.tributary.sum() == pytest.approx(lengths.sum() - sum(held), rel=1e-13)
+    x, y = mesh.nodes[mesh.outline].T
+    area = 0.5 * (x * np.roll(y, -1) - y * np.roll(x, -1)).sum()
+    assert mesh.assemble(mesh.matrices[2], all_nodes=True).sum() / 2 == pytest.approx(area, rel=1e-13)
+    low, high = mesh.space
+    assert np.all(low <= mesh.nodes.min(0)) and np.all(mesh.nodes.max(0) <= high)  # noqa: PT018
+
+
+def test_a_curved_block_has_an_arc() -> None:
+    for radius, middle, ends in ((40e-3, 6e-3, None), (-40e-3, 6e-3, None), (np.inf, 6e-3, 6e-3)):
+        mesh = CurvedPadMesh(30e-3, 6e-3, 10, 2, radius=radius)
+        face = mesh.nodes[mesh.face]
+        assert face[5] == pytest.approx([15e-3, middle], abs=1e-15)
+        if ends is None:
+            centre = np.array([15e-3, 6e-3 - radius])
+            assert np.linalg.norm(face - centre, axis=1) == pytest.approx(np.full(11, 40e-3), rel=1e-13)
+        else:
+            assert face[:, 1] == pytest.approx(np.full(11, ends), abs=1e-15)
+
+
+def test_bonded_edges_have_names() -> None:
+    for edges in (("base",), ("left", "right"), ("base", "left", "right"), ("right",)):
+        mesh = CurvedPadMesh(30e-3, 6e-3, 10, 2, bonded_edges=edges)
+        x, y = mesh.nodes.T
+        where = {"base": y == 0, "left": x == 0, "right": x == 30e-3}
+        assert np.array_equal(mesh.bonded, np.any([where[name] for name in edges], axis=0))
+
+
+def test_a_flat_curved_block_is_the_block() -> None:
+    plain, curved = PadMesh(30e-3, 6e-3, 10, 2), CurvedPadMesh(30e-3, 6e-3, 10, 2)
+    assert np.allclose(plain.nodes, curved.nodes, rtol=0, atol=1e-18)
+    pads = [Pad(mesh, rubber()).compliance().detach() for mesh in (plain, curved)]
+    assert torch.allclose(*pads, rtol=1e-10)
+    enclosed = CurvedPadMesh(30e-3, 6e-3, 10, 2, bonded_edges=("base", "left", "right"))
+    assert np.array_equal(enclosed.bonded, PadMesh(30e-3, 6e-3, 10, 2, bonded_sides=True).bonded)
+
+
+def test_a_fingertip_is_half_a_disc() -> None:
+    areas = []
+    for around in (8, 16, 32, 64):
+        mesh = FingertipMesh(RADIUS, around)
+        face = mesh.nodes[mesh.face]
+        assert len(face) == around + 1
+        assert np.linalg.norm(face - [RADIUS, 0.0], axis=1) == pytest.approx(np.full(around + 1, RADIUS), rel=1e-14)
+        assert np.linalg.norm(np.diff(face, axis=0), axis=1) == pytest.approx(mesh.tributary.max(), rel=1e-12)
+        assert np.array_equal(mesh.bonded, mesh.nodes[:, 1] == 0)
+        assert mesh.refined(2) == FingertipMesh(RADIUS, 2 * around)
+        sides = np.linalg.norm(np.diff(mesh.nodes[mesh.elements[:, [0, 1, 2, 3, 0]]], axis=1), axis=-1)
+        assert (sides.max(1) / sides.min(1)).max() < 2.5
+        areas.append(mesh.assemble(mesh.matrices[2], all_nodes=True).sum() / 2)
+    errors = 1 - np.array(areas) / (0.5 * np.pi * RADIUS**2)
+    assert np.log2(errors[:-1] / errors[1:]) == pytest.approx(np.full(3, 2.0), abs=0.02)
+
+
+def test_a_mesh_of_quadrilaterals_may_be_any_of_the_others() -> None:
+    for other in (PadMesh(20e-3, 5e-3, 8, 3), CurvedPadMesh(20e-3, 5e-3, 8, 3, radius=30e-3), FingertipMesh(RADIUS, 8)):
+        line = np.stack((other.face[:-1], other.face[1:]), -1)
+        around = np.stack((other.outline, np.roll(other.outline, -1)), -1)
+        held = around[other.bonded[around].all(1)]
+        mesh = QuadMesh.of(other.nodes, other.elements[:, [2, 3, 0, 1]], line[::-1], held)
+        assert np.array_equal(mesh.nodes[mesh.face], other.nodes[other.face])
+        C, expected = (Pad(m, rubber()).compliance().detach() for m in (mesh, other))
+        assert float((C - expected).abs().max()) < 1e-10 * float(expected.abs().max())
+
+
+def test_refining_divides_every_quadrilateral() -> None:
+    coarse = trapezium()
+    for finer in (2, 3):
+        fine = coarse.refined(finer)
+        assert len(fine.elements) == finer**2 * len(coarse.elements)
+        assert len(fine.face) - 1 == finer * (len(coarse.face) - 1)
+        assert np.allclose(fine.nodes[fine.face][::finer], coarse.nodes[coarse.face], rtol=0, atol=1e-17)
+        mine, its = (m.assemble(m.matrices[2], all_nodes=True).sum() for m in (fine, coarse))
+        assert mine == pytest.approx(its, rel=1e-13)
+    assert coarse.refined(1).nodes[coarse.refined(1).face] == pytest.approx(coarse.nodes[coarse.face])
+
+
+def test_equal_descriptions_are_one_mesh() -> None:
+    for make in MESHES.values():
+        assert make() == make()
+        assert hash(make()) == hash(make())
+
+
+# --- how they give way ----------------------------------------------------------------------------------------------------
+
+
+@cache
+def fine_work(nu: float) -> float:
+    """Work of a smooth pressure downwards on a fingertip with E = 1 and unit depth: scikit-fem, quadratic elements."""
+    mesh = FingertipMesh(RADIUS, 96)
+    theirs = in_scikit_fem(mesh).with_boundaries(
+        {"face": lambda x: (x[0] - RADIUS) ** 2 + x[1] ** 2 > (0.999 * RADIUS) ** 2}
+    )
+    basis = Basis(theirs, ElementVector(ElementQuad2()))
+    facets = FacetBasis(theirs, ElementVector(ElementQuad2()), facets="face", intorder=8)
+    lame_lambda, lame_mu = lame_moduli(1.0, nu)
+    K = lame_lambda * dilatation.assemble(basis) + lame_mu * shear.assemble(basis)
+    f = LinearForm(lambda v, w: -pressure(w.x[0]) * v[1]).assemble(facets)
+    held = basis.get_dofs(lambda x: x[1] < 1e-12)
+    return float(f @ solve(*condense(K, f, D=held)))
+
+
+def pressure(x: Array) -> Array:
+    return np.exp(-(((x - 1.1 * RADIUS) / (0.3 * RADIUS)) ** 2))
+
+
+@pytest.mark.parametrize(("nu", "bound"), [(0.3, 2e-3), (0.49, 6e-3)])
+def test_a_fingertip_gives_way_as_in_scikit_fem(nu: float, bound: float) -> None:
+    errors = []
+    for around in (16, 32, 64):
+        pad = Pad(FingertipMesh(RADIUS, around), KelvinVoigt(1.0, nu, 1.0, 1.0, depth=1.0))
+        f = np.zeros((pad.nodes, 2))
+        f[:, 1] = -pressure(pad.positions[:, 0].numpy()) * pad.mesh.tributary
+        work = f.ravel() @ pad.compliance().detach().numpy() @ f.ravel()
+        errors.append(abs(work / fine_work(nu) - 1))
+    assert errors[-1] < bound
+    assert np.all(np.log2(np.array(errors[:-1]) / errors[1:]) > 1.7)
+
+
+# --- runs --------------------------------------------------------------------------------------------------------------------
+
+DISC = 12e-3
+
+
+def finger(tip: Mesh, inertial: bool = False, points: int = 0, **parameters: float) -> tuple[Rig, Tensor]:
+    """A disc on a flat pad under a pad that hangs from a driven body: pressed by 0.6 mm, then rolled by 3 mm."""
+    floor, soft = PadMesh(40e-3, 5e-3, 40, 3), rubber()
+    law = SoftContact(1.2e5, 441.7, 1.2e5, 441.7, friction=SmoothSlip(0.8, 0.7, 5e-2, 10.0))
+    top = 5e-3 + 2 * DISC + tip.height
+    rig = Rig(
+        bodies={
+            "disc": Body(0.2, Circle(DISC)),
+            "hand": Body(x="driven", y="driven", theta=0.0, weighted=False),
+        },
+        pads={
+            "floor": Pad(floor, soft, origin=(-20e-3, 0.0), points=points),
+            "tip": Pad(
+                tip, soft, base="hand", origin=(-0.5 * tip.length, 0.0), mirrored=True, inertial=inertial, points=points
+            ),
+        },
+        contacts={name: Contact(name, "disc", law) for name in ("floor", "tip")},
+        reference=Reference(
+            **{
+                "hand.x": Profile([0.05, 0.15], [0.0, 3e-3]),
+                "hand.y": Profile([0.0, 0.05], [top + 1e-5, top - 6e-4]),
+            }
+        ),
+        groups={"rubber": soft, "contact": law},
+    )
+    with torch.no_grad():
+        for name, value in parameters.items():
+            rig.parameter(name.replace("__", ".")).fill_(value)
+    state = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64))
+    return rig, rig.pack(state._replace(pose=state.pose | {"disc": f64(3e-4, 5e-3 + DISC - 2e-5, 0.0)}))
+
+
+TIPS: dict[str, Callable[[], Mesh]] = {
+    "fingertip": lambda: FingertipMesh(RADIUS, 24),
+    "crowned": lambda: CurvedPadMesh(30e-3, 6e-3, 30, 3, radius=40e-3),
+    "trapezium": lambda: trapezium().refined(2),
+}
+
+
+@pytest.mark.parametrize("name", TIPS)
+@pytest.mark.parametrize("points", [0, 2])
+def test_runs_keep_their_energy_and_roll_the_disc(name: str, points: int) -> None:
+    rig, y0 = finger(TIPS[name](), points=points)
+    run = simulate(rig, times(0.15, 31), y0=y0, step=5e-4)
+    assert run.energy_residual_rel < 2e-3
+    assert float(run["x_disc"][-1] - run["x_disc"][0]) > 1e-3
+    touching = run.force["tip"][-1, :, 0] > 0
+    assert int(touching.sum()) >= (1 if name == "trapezium" else 2)
+    state = rig.unpack(run.y[-1], t=run.t[-1])
+    assert torch.equal(rig.penetration("tip", state) > 0, touching)
+    load = run.load["disc"][-1]
+    rate = rig(run.t[-1], run.y[-1].detach())[rig.layout.slices["velocity", "disc"]].detach()
+    expected = rate * f64(0.2, 0.2, 0.2 * DISC**2 / 2) + f64(0.0, 0.2 * 9.81, 0.0)
+    assert torch.allclose(load, expected, rtol=1e-6, atol=1e-6)  # what runs is what torch says
+
+
+@pytest.mark.parametrize("name", ["fingertip", "crowned"])
+def test_gradients_are_those_of_differences(name: str) -> None:
+    def end(gradient: str = "none", **parameters: float) -> tuple[Rig, Tensor]:
+        rig, y0 = finger(TIPS[name](), points=2, **parameters)
+        run = simulate(rig, times(0.15, 4), y0=y0, step=1e-3, tolerance=1e-10, gradient=gradient)
+        return rig, 1e3 * run["x_disc"][-1] + run["theta_disc"][-1]
+
+    rig, value = end("discrete")
+    value.backward()
+    for parameter in ("rubber.E", "rubber.nu", "contact.K_n"):
+        p = rig.parameter(parameter)
+        here, h = float(p.detach()), 1e-6
+        key = parameter.replace(".", "__")
+        up, down = (float(end(**{key: here * (1 + s * h)})[1].detach()) for s in (1, -1))
+        assert float(p.grad * here) == pytest.approx((up - down) / (2 * h), rel=2e-5, abs=1e-7), parameter
+
+
+def test_an_inertial_fingertip_moves_like_a_massless_one() -> None:
+    runs = []
+    for inertial in (False, True):
+        rig, y0 = finger(FingertipMesh(RADIUS, 16), inertial=inertial)
+        runs.append(simulate(rig, times(0.15, 16), y0=y0, step=1e-3))
+    for key, bound in (("x_disc", 1e-6), ("y_disc", 1e-6), ("theta_disc", 1e-4)):
+        assert float((runs[0][key] - runs[1][key]).abs().max()) < bound, key
+    assert runs[1].energy_residual_rel < 1e-2
+
+
+# --- files -------------------------------------------------------------------------------------------------------------------
+
+
+def written(path: Path, mesh: Mesh, z: float | Array = 0.25) -> Path:
+    """The mesh in a file of gmsh 2.2 [mm], with groups of lines."""
+    line = np.stack((mesh.face[:-1], mesh.face[1:]), -1)
+    around = np.stack((mesh.outline, np.roll(mesh.outline, -1)), -1)
+    held = around[mesh.bonded[around].all(1)]
+    points = np.concatenate((1e3 * mesh.nodes, np.broadcast_to(z, len(mesh.nodes))[:, None]), 1)
+    cells = [("line", line), ("line", held), ("quad", mesh.elements)]
+    tags = [np.full(len(block), k + 1) for k, (_, block) in enumerate(cells)]
+    names = {"skin": np.array([1, 1]), "bone": np.array([2, 1]), "rubber": np.array([3, 2])}
+    file = meshio.Mesh(points, cells, cell_data={"gmsh:physical": tags, "gmsh:geometrical": tags}, field_data=names)
+    meshio.write(path, file, file_format="gmsh22")
+    return path
+
+
+GMSH = """$MeshFormat
+4.1 0 8
+$EndMeshFormat
+$PhysicalNames
+3
+1 5 "base"
+1 7 "face"
+2 1 "rubber"
+$EndPhysicalNames
+$Entities
+0 2 1 0
+1 0 0 0 20 0 0 1 5 0
+2 0 5 0 20 5 0 1 7 0
+1 0 0 0 20 5 0 1 1 0
+$EndEntities
+$Nodes
+1 6 1 6
+2 1 0 6
+1
+2
+3
+4
+5
+6
+0 0 0
+10 0 0
+20 0 0
+0 5 0
+10 5 0
+20 5 0
+$EndNodes
+$Elements
+3 6 1 6
+1 1 1 2
+1 1 2
+2 2 3
+1 2 1 2
+3 5 6
+4 4 5
+2 1 3 2
+5 1 2 5 4
+6 2 3 6 5
+$EndElements
+"""
+
+
+def test_a_mesh_from_a_file(tmp_path: Path) -> None:
+    tip = FingertipMesh(RADIUS, 8)
+    mesh = QuadMesh.read(written(tmp_path / "tip.msh", tip), unit="mm", face="skin", bonded=["bone"])
+    C, expected = (Pad(m, rubber()).compliance().detach() for m in (mesh, tip))
+    assert torch.allclose(C, expected, rtol=1e-8, atol=1e-10 * float(expected.abs().max()))
+    file = tmp_path / "block.msh"
+    file.write_text(GMSH, encoding="ascii")
+    mesh = QuadMesh.read(file, unit="cm")
+    assert mesh.nodes[mesh.face] == pytest.approx(np.array([[0.0, 0.05], [0.1, 0.05], [0.2, 0.05]]))
+    assert mesh.nodes[mesh.bonded][:, 1] == pytest.approx(np.zeros(3))
+    C, expected = (Pad(m, rubber()).compliance().detach() for m in (mesh, PadMesh(0.2, 0.05, 2, 1)))
+    assert torch.allclose(C, expected, rtol=1e-8, atol=1e-10 * float(expected.abs().max()))
+
+
+def test_files_that_are_no_meshes_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "tip.msh"
+    tip = FingertipMesh(RADIUS, 8)
+    with pytest.raises(FileNotFoundError):
+        QuadMesh.read(file, unit="mm")
+    written(file, tip)
+    for options, match in (
+        ({"unit": "inch"}, "`unit` must be one of m, cm, mm, but is 'inch'"),
+        ({"unit": "mm"}, "tip.msh: there is no group of lines `face`; there are skin, bone"),
+        ({"unit": "mm", "face": "skin", "bonded": ["rubber"]}, "there is no group of lines `rubber`"),
+        (
+            {"unit": "mm", "face": "skin", "bonded": []},
+            "`bonded_sides` must be sides of quadrilaterals, but there are none",
+        ),
+        ({"unit": "mm", "face": "skin", "bonded": ["skin"]}, "fewer than two points of the face are free"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            QuadMesh.read(file, **options)
+    written(file, tip, z=np.linspace(0, 1, len(tip.nodes)))
+    with pytest.raises(ValueError, match="points in a plane of constant z"):
+        QuadMesh.read(file, unit="mm", face="skin", bonded=["bone"])
+    meshio.write(file, meshio.Mesh(np.eye(3), [("triangle", [[0, 1, 2]])]), file_format="gmsh22")
+    with pytest.raises(ValueError, match="must be a mesh of quadrilaterals with four points, but has triangle"):
+        QuadMesh.read(file, unit="mm")
+    for name, text in (("tip.msh", "no mesh"), ("tip.mesh2", "no mesh"), ("tip.msh", GMSH[:300])):
+        (tmp_path / name).write_text(text, encoding="ascii")
+        with pytest.raises(ValueError, match=f"{name} is not a mesh that can be read"):
+            QuadMesh.read(tmp_path / name, unit="mm")
+
+
+SQUARES = [[x, y] for x in (0.0, 1.0, 2.0) for y in (0.0, 1.0, 2.0)]
+QUADS = [[0, 3, 4, 1], [3, 6, 7, 4], [1, 4, 5, 2], [4, 7, 8, 5]]
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"quads": []}, "`quads` must be quadrilaterals of four numbers"),
+        ({"quads": [[0, 3, 4]]}, "`quads` must be quadrilaterals of four numbers"),
+        ({"quads": [[0, 3, 4, 9]]}, "numbers of the 9 points, from 0 on"),
+        ({"quads": [[0, 4, 3, 1], *QUADS[1:]]}, "quadrilateral 0 is folded"),
+        ({"quads": [QUADS[0], QUADS[3]], "points": SQUARES + [[5.0, 5.0]]}, None),
+        (
+            {"quads": [[0, 3, 4, 1], [9, 10, 11, 12]], "points": [*SQUARES, [5, 5], [6, 5], [6, 6], [5, 6]]},
+            "not connected",
+        ),
+        ({"face": [[2, 4]]}, "`face_sides` has (2, 4), which is no side on the boundary"),
+        ({"face": [[1, 4]]}, "`face_sides` has (1, 4), which is no side on the boundary"),
+        ({"face": [[2, 5], [6, 7]]}, "`face_sides` must be one line with two ends"),
+        ({"face": [[2, 5], [5, 8], [0, 1], [1, 2], [8, 7], [7, 6], [6, 3], [3, 0]]}, "must be one line with two ends"),
+        ({"bonded": [[0, 3, 6]]}, "`bonded_sides` has (0, 3, 6), which is no side"),
+        ({"points": [[0, 0, 0]]}, "`points` must be finite numbers of the shape (n, 2)"),
+    ],
+)
+def test_quadrilaterals_that_are_no_pad_are_refused(changes: dict[str, object], match: str | None) -> None:
+    given = {"points": SQUARES, "quads": QUADS, "face": [[2, 5], [5, 8]], "bonded": [[0, 3], [3, 6]]} | changes
+    if match is None:  # two squares that share a corner hang together
+        given["face"], given["bonded"] = [[5, 8]], [[0, 3]]
+        assert len(QuadMesh.of(**given).nodes) == 7
+        return
+    with pytest.raises(ValueError, match=match.replace("(", r"\(").replace(")", r"\)")):
+        QuadMesh.of(**given)
+
+
+@pytest.mark.parametrize(
+    ("made", "match"),
+    [
+        (
+            lambda: CurvedPadMesh(30e-3, 6e-3, 3, 2, radius=14e-3),
+            "`radius` must be at least half of the length, 0.015 m",
+        ),
+        (lambda: CurvedPadMesh(30e-3, 6e-3, 3, 2, radius=16e-3), "makes the arc deeper than the `height` of 0.006 m"),
+        (lambda: CurvedPadMesh(30e-3, 6e-3, 3, 2, radius=float("nan")), "`radius` must be at least half of the length"),
+        (lambda: CurvedPadMesh(30e-3, 6e-3, 3, 2, bonded_edges=("top",)), "must be some of base, left, right, but is"),
+        (lambda: CurvedPadMesh(30e-3, 6e-3, 3, 2, bonded_edges=()), "must be some of base, left, right, but is"),
+        (lambda: CurvedPadMesh(30e-3, 6e-3, 3, 2, bonded_sides=True), "`bonded_sides` must be left out"),
+        (lambda: FingertipMesh(8e-3, 10), "`elements_around` must be a multiple of 4, but is 10"),
+        (lambda: FingertipMesh(0.0, 8), "`radius` must be positive and finite, but is 0"),
+    ],
+)
+def test_pads_that_are_none_are_refused(made: Callable[[], Mesh], match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        made()

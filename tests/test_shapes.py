@@ -1,0 +1,583 @@
+"""Shapes of rigid bodies against boundaries that are written down here, closed forms, differences and each other."""
+
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import f64, times
+from matplotlib.path import Path as Polygon
+from numpy.typing import NDArray
+from scipy.integrate import quad
+from scipy.interpolate import BSpline
+from scipy.optimize import minimize_scalar
+from torch import Tensor, nn
+
+from torchsoft import (
+    Body,
+    Circle,
+    Contour,
+    Ellipse,
+    Parameters,
+    Profile,
+    Reference,
+    RoundedBox,
+    RoundedPolygon,
+    Shape,
+    SmoothSlip,
+    SoftContact,
+    SoftGrasp,
+    Superellipse,
+    press,
+    rest,
+    simulate,
+)
+from torchsoft.physics.contact import interface_law
+from torchsoft.physics.shapes.area import moments
+from torchsoft.physics.validity import check_shape
+from torchsoft.solve.laws import contact_laws
+
+Array = NDArray[np.float64]
+Boundary = Callable[[Array], Array]
+"""Points (n, 2) [m] of a boundary, anticlockwise, of parameters (n,) from 0 to 1."""
+
+BAND = 5e-4
+"""How deep [m] contacts go, and from how far their shapes are asked."""
+
+ANGLED = [[0.0, 0.0], [40e-3, 0.0], [40e-3, 14e-3], [16e-3, 14e-3], [16e-3, 34e-3], [0.0, 34e-3]]
+TRIANGLE = [[-12e-3, -9e-3], [19e-3, -9e-3], [-12e-3, 18e-3]]
+
+
+def pear(count: int = 60) -> Array:
+    """Points around a smooth contour that is hollow on three sides."""
+    t = np.arange(count) * 2 * np.pi / count
+    r = 18e-3 * (1 + 0.12 * np.cos(3 * t) + 0.05 * np.sin(2 * t))
+    return np.stack((r * np.cos(t), r * np.sin(t)), -1)
+
+
+def superellipse(a: float, b: float, n: float) -> Boundary:
+    def at(s: Array) -> Array:
+        way = np.stack((np.cos(2 * np.pi * s), np.sin(2 * np.pi * s)), -1)
+        return way / ((np.abs(way / [a, b]) ** n).sum(-1, keepdims=True)) ** (1 / n)
+
+    return at
+
+
+def rounded(vertices: list[list[float]], radius: float) -> Boundary:
+    """Arcs and sides in turn, by their lengths; an arc's centre is where the lines meet that are its radius away from both
+    sides."""
+    v = np.array(vertices)
+    ways = (np.roll(v, -1, 0) - v) / np.linalg.norm(np.roll(v, -1, 0) - v, axis=1)[:, None]
+    centre, first, turn = np.empty_like(v), np.empty(len(v)), np.empty(len(v))
+    for i, (corner, before, after) in enumerate(zip(v, np.roll(ways, 1, 0), ways)):
+        bulge = np.sign(before[0] * after[1] - before[1] * after[0])
+        inwards = [bulge * radius * np.array([-w[1], w[0]]) for w in (before, after)]
+        along = np.linalg.solve(np.stack((before, -after), -1), inwards[1] - inwards[0])
+        centre[i] = corner + inwards[0] + along[0] * before
+        angles = [np.arctan2(-y, -x) for x, y in inwards]
+        first[i], turn[i] = angles[0], bulge * ((bulge * (angles[1] - angles[0])) % (2 * np.pi))
+
+    def arc(i: Array, part: Array) -> Array:
+        angle = first[i] + part * turn[i]
+        return centre[i] + radius * np.stack((np.cos(angle), np.sin(angle)), -1)
+
+    every = np.arange(len(v))
+    begin, end = arc(every, np.ones(len(v))), arc((every + 1) % len(v), np.zeros(len(v)))
+    lengths = np.stack((radius * np.abs(turn), np.linalg.norm(end - begin, axis=1)), -1)
+    before = np.concatenate(([0.0], np.cumsum(lengths)))
+
+    def at(s: Array) -> Array:
+        way = (s % 1.0) * before[-1]
+        k = np.searchsorted(before, way, side="right") - 1
+        i, part = k // 2, (way - before[k]) / lengths.ravel()[k]
+        return np.where((k % 2 == 0)[:, None], arc(i, part), begin[i] + part[:, None] * (end - begin)[i])
+
+    return at
+
+
+def spline(control: Array) -> Boundary:
+    count = len(control)
+    curve = BSpline(np.arange(-3.0, count + 4), np.concatenate((control[-1:], control, control[:2])), 3)
+    return lambda s: curve((s % 1.0) * count)
+
+
+def box(a: float, b: float) -> list[list[float]]:
+    return [[-a, -b], [a, -b], [a, b], [-a, b]]
+
+
+@cache
+def contour() -> Contour:
+    return Contour(pear())
+
+
+def centred(boundary: Boundary) -> tuple[Boundary, Array]:
+    """The boundary about the centre of mass of a polygon of very many of its points, and that centre."""
+    x = boundary(np.arange(200_000) / 200_000)
+    cross = x[:, 0] * np.roll(x[:, 1], -1) - x[:, 1] * np.roll(x[:, 0], -1)
+    centre = ((x + np.roll(x, -1, 0)) * cross[:, None]).sum(0) / (3 * cross.sum())
+    return lambda s: boundary(s) - centre, centre
+
+
+CASES: dict[str, tuple[Callable[[], Shape], Callable[[], Boundary]]] = {
+    "ellipse": (lambda: Ellipse(20e-3, 12e-3), lambda: superellipse(20e-3, 12e-3, 2.0)),
+    "squircle": (lambda: Superellipse(20e-3, 14e-3, 4.0), lambda: superellipse(20e-3, 14e-3, 4.0)),
+    "nearly an ellipse": (lambda: Superellipse(12e-3, 20e-3, 2.3), lambda: superellipse(12e-3, 20e-3, 2.3)),
+    "nearly a box": (lambda: Superellipse(20e-3, 20e-3, 20.0), lambda: superellipse(20e-3, 20e-3, 20.0)),
+    "box": (lambda: RoundedBox(20e-3, 9e-3, 2e-3), lambda: rounded(box(20e-3, 9e-3), 2e-3)),
+    "stadium": (lambda: RoundedBox(20e-3, 9e-3, 9e-3), lambda: rounded(box(20e-3, 9e-3), 8.999999999e-3)),
+    "triangle": (lambda: RoundedPolygon(TRIANGLE, 3e-3), lambda: rounded(TRIANGLE, 3e-3)),
+    "angle": (lambda: RoundedPolygon(ANGLED[::-1], 2e-3), lambda: rounded(ANGLED, 2e-3)),
+    "pear": (contour, lambda: spline(contour().control.detach().numpy())),
+}
+
+
+@cache
+def known(name: str) -> tuple[Shape, Boundary]:
+    """A shape, and its boundary about the same centre."""
+    shape, boundary = (made() for made in CASES[name])
+    return shape, centred(boundary)[0]
+
+
+@pytest.fixture(params=CASES)
+def case(request: pytest.FixtureRequest) -> tuple[Shape, Boundary]:
+    return known(request.param)
+
+
+def near(boundary: Boundary, count: int, band: float, seed: int = 0) -> Array:
+    """Places up to `band` from the boundary, on both sides."""
+    rng = np.random.default_rng(seed)
+    return boundary(rng.random(count)) + band * rng.uniform(-0.7, 0.7, (count, 2))
+
+
+def distance(boundary: Boundary, x: Array) -> float:
+    """Signed distance: the nearest of many points, looked at again in between; inside by the polygon of these points."""
+    s = np.arange(2000) / 2000
+    dense = boundary(s)
+    away = np.linalg.norm(dense - x, axis=1)
+    found = []
+    for k in np.argsort(away)[:4]:
+        f = lambda t: float(np.linalg.norm(boundary(np.array([t]))[0] - x))
+        found.append(
+            minimize_scalar(f, bounds=(s[k] - 1e-3, s[k] + 1e-3), method="bounded", options={"xatol": 1e-12}).fun
+        )
+    return min(found) * (-1 if Polygon(dense).contains_point(x) else 1)
+
+
+@torch.no_grad()
+def test_distance_is_that_of_the_nearest_point(case: tuple[Shape, Boundary]) -> None:
+    """In the band of contacts, and far outside, where a run looks for what may touch."""
+    shape, boundary = case
+    for band, count in ((BAND, 40), (20e-3, 20)):
+        x = near(boundary, count, band)
+        expected = f64(*(distance(boundary, one) for one in x))
+        which = expected > (-torch.inf if band == BAND else 0.0)
+        phi = shape(torch.from_numpy(x))[0]
+        assert int(which.sum()) > 5
+        assert float((phi - expected)[which].abs().max()) < 1e-9
+
+
+def test_normals_are_the_slopes_of_distances(case: tuple[Shape, Boundary]) -> None:
+    shape, boundary = case
+    x, h = torch.from_numpy(near(boundary, 200, BAND)), 1e-6
+    with torch.no_grad():
+        n = shape(x)[1]
+        ways = torch.eye(2, dtype=torch.float64)
+        slope = torch.stack([(shape(x + h * way)[0] - shape(x - h * way)[0]) / (2 * h) for way in ways], -1)
+    assert torch.allclose(n.norm(dim=-1), torch.ones(200).double(), rtol=0, atol=1e-14)
+    assert float((n - slope).abs().max()) < 1e-6  # where an arc begins differences are of first order
+    assert float((n - slope).abs().median()) < 1e-9
+
+
+def turning(boundary: Boundary, s: Array, h: float = 1e-5) -> tuple[Array, Array]:
+    """Outward normals (n, 2) and curvature (n,) [1/m] from differences along the boundary."""
+    before, here, after = boundary(s - h), boundary(s), boundary(s + h)
+    (x, y), (bend_x, bend_y) = ((after - before) / (2 * h)).T, ((after - 2 * here + before) / h**2).T
+    speed = np.hypot(x, y)
+    return np.stack((y, -x), -1) / speed[:, None], (x * bend_y - y * bend_x) / speed**3
+
+
+def test_curvature_is_that_of_the_boundary(case: tuple[Shape, Boundary]) -> None:
+    shape, boundary = case
+    s = 0.013 + np.arange(50) / 50
+    normal, expected = turning(boundary, s)
+    size = shape.size()
+    for depth in (0.0, -2e-4, 2e-4):
+        kappa = shape.curvature(torch.from_numpy(boundary(s) + depth * normal))
+        assert np.abs(kappa.numpy() - expected).max() * size < 2e-3
+        assert np.median(np.abs(kappa.numpy() - expected)) * size < 2e-5
+
+
+# --- limits ----------------------------------------------------------------------------------------------------------------
+
+R = 19.37e-3
+HEXAGON = [
+    [R / np.cos(np.pi / 6) * np.cos(k * np.pi / 3), R / np.cos(np.pi / 6) * np.sin(k * np.pi / 3)] for k in range(6)
+]
+ROUND = {
+    "superellipse": lambda: Superellipse(R, R, 2.0),
+    "box": lambda: RoundedBox(R, R, R),
+    "square": lambda: RoundedPolygon(box(R, R), R),
+    "hexagon": lambda: RoundedPolygon(HEXAGON, R),
+    "contour": lambda: Contour(
+        R * np.stack([f(np.arange(480) * np.pi / 240) for f in (np.cos, np.sin)], -1), tolerance=1e-10
+    ),
+}
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("name", ROUND)
+def test_full_rounding_is_the_circle(name: str) -> None:
+    shape, circle = ROUND[name](), Circle(R)
+    assert shape.well_posed() == ""
+    x = torch.from_numpy(near(superellipse(R, R, 2.0), 300, 2e-3))
+    for mine, its in zip(shape(x), circle(x)):
+        assert float((mine - its).abs().max()) < (1e-9 if its.ndim == 1 else 1e-6)
+    assert float(shape.area()) == pytest.approx(float(circle.area()), rel=1e-8)
+    assert float(shape.gyration()) == pytest.approx(float(circle.gyration()), rel=1e-8)
+    way = nn.functional.normalize(torch.from_numpy(near(superellipse(R, R, 2.0), 50, 0.0)), dim=-1)
+    assert torch.allclose(shape.support(way), circle.support(way), rtol=0, atol=1e-9)
+    assert float((shape.curvature(x) * R - 1).abs().max()) < 1e-3
+
+
+@torch.no_grad()
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        (lambda: Superellipse(20e-3, 12e-3, 2.0), lambda: Ellipse(20e-3, 12e-3)),
+        (lambda: RoundedPolygon(box(20e-3, 9e-3), 2e-3), lambda: RoundedBox(20e-3, 9e-3, 2e-3)),
+        (lambda: RoundedPolygon(np.array(ANGLED) + [3.0, -2.0], 2e-3), lambda: RoundedPolygon(ANGLED[::-1], 2e-3)),
+        (lambda: Contour(pear(200)[::-1] - [0.5, 0.2], tolerance=1e-8), lambda: Contour(pear(200), tolerance=1e-8)),
+    ],
+)
+def test_two_ways_to_one_body(one: Callable[[], Shape], other: Callable[[], Shape]) -> None:
+    """Whatever the class, the order of the points, and the point that they are given about."""
+    one, other = one(), other()
+    x = torch.rand(300, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 30e-3
+    outside = other(x)[0] > -1e-3
+    for mine, its in zip(one(x), other(x)):
+        assert float((mine - its)[outside].abs().max()) < 1e-9
+    for quantity in ("area", "gyration"):
+        assert float(getattr(one, quantity)()) == pytest.approx(float(getattr(other, quantity)()), rel=1e-9)
+    assert one.size() == pytest.approx(other.size(), rel=1e-9)
+
+
+def test_full_rounding_runs_like_the_circle() -> None:
+    plain = SoftGrasp(COARSE)
+    y0 = rest(plain).detach()
+    reference, step = grasp(plain, y0), {"step": 1e-3}
+    expected = simulate(plain, times(0.1, 11), y0=y0, reference=reference, **step)
+    for shape in (RoundedBox(R, R, R), Superellipse(R, R, 2.0), RoundedPolygon(HEXAGON, R)):
+        model = SoftGrasp(COARSE, shape=shape)
+        assert torch.allclose(rest(model).detach(), y0, rtol=0, atol=1e-12)
+        run = simulate(model, expected.t, y0=y0, reference=reference, **step)
+        for key in ("x_C", "y_C", "theta", "x_Br", "y_Br"):
+            scale = float(expected[key].max() - expected[key].min())
+            assert float((run[key] - expected[key]).abs().max()) <= 1e-9 * max(scale, 1e-3), key
+
+
+# --- area, centre of mass, inertia -------------------------------------------------------------------------------------------
+
+
+@torch.no_grad()
+def test_moments_are_those_of_the_boundary(case: tuple[Shape, Boundary]) -> None:
+    shape, boundary = case
+    x = boundary((np.arange(400_000) + 0.5) / 400_000)
+    y = np.roll(x, -1, 0)
+    of = moments(torch.from_numpy(0.5 * (x + y)), torch.from_numpy(y - x))
+    assert float(shape.area()) == pytest.approx(float(of.area), rel=1e-8)
+    assert float(shape.gyration()) == pytest.approx(float(of.gyration), rel=1e-8)
+    assert float(of.centre.abs().max()) < 1e-9
+
+
+def test_moments_by_green_are_those_of_a_disc() -> None:
+    t = torch.arange(40, dtype=torch.float64) * torch.pi / 20
+    circle = torch.stack((t.cos(), t.sin()), -1)
+    of = moments(0.3 * circle + f64(5.0, -7.0), 0.3 * torch.pi / 20 * torch.stack((-t.sin(), t.cos()), -1))
+    assert float(of.area) == pytest.approx(0.09 * np.pi, rel=1e-13)
+    assert torch.allclose(of.centre, f64(5.0, -7.0), rtol=1e-14)
+    assert float(of.gyration) == pytest.approx(0.045, rel=1e-11)
+
+
+@torch.no_grad()
+def test_a_superellipse_has_the_moments_of_its_integrals() -> None:
+    a, b, n = 0.3, 0.2, 3.7
+    shape = Superellipse(a, b, n)
+    height = lambda x: b * (1 - (x / a) ** n) ** (1 / n)
+    area = 4 * quad(height, 0, a, epsabs=1e-13)[0]
+    square = 4 * quad(lambda x: x**2 * height(x) + height(x) ** 3 / 3, 0, a, epsabs=1e-13)[0]
+    assert float(shape.area()) == pytest.approx(area, rel=1e-9)
+    assert float(shape.gyration()) == pytest.approx(square / area, rel=1e-9)
+
+
+def test_a_uniform_body_has_mass_and_inertia_of_its_shape() -> None:
+    body = Body.uniform(RoundedBox(20e-3, 10e-3, 1e-12), density=7800.0, depth=44e-3, theta=0.0)
+    mass = body.mass.item()
+    assert mass == pytest.approx(7800 * 44e-3 * 40e-3 * 20e-3, rel=1e-12)
+    assert body.inertia.item() == pytest.approx(mass * (40e-3**2 + 20e-3**2) / 12, rel=1e-12)
+    assert body.freedom["theta"] == "fixed"
+    (slope,) = torch.autograd.grad(body.inertia, body.shape.half_width)
+    assert float(slope) == pytest.approx(mass * 2 * 20e-3 / 3, rel=1e-9)
+    with pytest.raises(ValueError, match="`density` must be positive and finite, but is 0"):
+        Body.uniform(Circle(0.02), density=0, depth=0.044)
+
+
+@torch.no_grad()
+def test_support_outline_and_size_are_the_bodys(case: tuple[Shape, Boundary]) -> None:
+    shape, boundary = case
+    x = torch.from_numpy(boundary(np.arange(100_000) / 100_000))
+    angle = torch.linspace(0, 6.2, 40, dtype=torch.float64)
+    way = torch.stack((angle.cos(), angle.sin()), -1)
+    assert float((shape.support(way) - (way @ x.mT).amax(-1)).abs().max()) < 1e-8
+    assert shape.size() == pytest.approx(float(x.norm(dim=-1).max()), rel=1e-4)
+    outline = shape.outline()
+    assert float(shape(outline)[0].abs().max()) < 1e-9
+    assert float((outline @ way.mT).amax(0).sub(shape.support(way)).abs().max()) < 1e-3
+    if not isinstance(shape, RoundedPolygon):  # whose inner corner is grazed by the rays that look for the boundary
+        check_shape("body", shape_of_another(shape))
+
+
+def shape_of_another(shape: Shape) -> Shape:
+    """The same shape as somebody's own, which a run tries before it uses it."""
+
+    class Own(Shape):
+        def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+            return shape(x)
+
+        def support(self, direction: Tensor) -> Tensor:
+            return shape.support(direction)
+
+    return Own()
+
+
+# --- derivatives --------------------------------------------------------------------------------------------------------------
+
+
+def test_derivatives_are_those_of_differences(case: tuple[Shape, Boundary]) -> None:
+    """Of distance and normal by the place and by each of the parameters, along a direction."""
+    shape, boundary = case
+    generator = torch.Generator().manual_seed(2)
+    own = {name: p.detach() for name, p in shape.named_parameters()} | {
+        "x": torch.from_numpy(near(boundary, 30, BAND, 3))
+    }
+    for name, p in own.items():
+        way = torch.randn(p.shape, generator=generator, dtype=torch.float64) * (1.0 if name == "n" else 1e-3)
+
+        def value(by: Tensor, name: str = name, p: Tensor = p, way: Tensor = way) -> Tensor:
+            moved = own | {name: p + by * way}
+            phi, n = torch.func.functional_call(shape, {k: v for k, v in moved.items() if k != "x"}, (moved["x"],))
+            return torch.cat((1e2 * phi[:, None], n), -1)
+
+        slope = torch.autograd.functional.jvp(value, f64(0.0)[0], f64(1.0)[0])[1]
+        fine, coarse = ((value(f64(h)[0]) - value(f64(-h)[0])) / (2 * h) for h in (5e-4, 1e-3))
+        expected = (4 * fine - coarse) / 3
+        error = (slope - expected).abs().amax(-1) / expected.abs().max()
+        assert float(error.median()) < 1e-8, name
+        assert int((error > 1e-6).sum()) <= 2, name  # of thirty points, some come from a side onto an arc
+
+
+LAW = SoftContact(1.2e5, 440.0, 1.1e5, 430.0, friction=SmoothSlip(0.8, 0.7, 5e-2, 10.0))
+
+
+def test_compiled_laws_are_those_of_torch(case: tuple[Shape, Boundary]) -> None:
+    """Value, derivatives by what moves, and by the parameters that the shape was made of."""
+    from test_codegen import _compiled_results
+
+    shape, boundary = case
+    prepared = shape.prepared()
+    laws = contact_laws(LAW, prepared)
+    p = torch.cat([value.reshape(-1) for value in laws.parameters.values()])
+    own = list(shape.parameters())
+    for k, d in enumerate(near(boundary, 20, 2e-4, seed=5)):
+        x = f64(0.02, -0.03, 1.5, *d, 0.3, 1e-5, 1.0, 2e-4)
+        x[3:5] = f64(np.cos(0.3) * d[0] - np.sin(0.3) * d[1], np.sin(0.3) * d[0] + np.cos(0.3) * d[1])
+        at = x.clone().requires_grad_()
+        expected = interface_law(LAW, shape, at)
+        weight = f64(0.5, 1.1, -0.7)
+        rows = [torch.autograd.grad(expected[i], at, retain_graph=True)[0][:7].numpy() for i in range(3)]
+        slopes = torch.autograd.grad((expected[:3] * weight).sum(), own, retain_graph=True)
+        out, J, p_bar = _compiled_results(laws.interface, x.numpy(), p.detach().numpy(), weight.numpy())
+        pulled = torch.autograd.grad(p, own, torch.from_numpy(p_bar), retain_graph=True)
+        for mine, its in ((out, expected.detach().numpy()), (J, np.stack(rows)), *zip(pulled, slopes)):
+            mine, its = np.asarray(mine), np.asarray(its)
+            assert np.abs(mine - its).max() <= 1e-10 * max(1e-2, np.abs(its).max()), k
+
+
+COARSE = Parameters().override({"pad.elements_x": 60, "pad.elements_y": 3})
+
+
+def grasp(model: SoftGrasp, y0: Tensor) -> Reference:
+    """A grasp by 1 mm in 50 ms, then a stroke of the disc by 2 mm."""
+    pose = model.unpack(y0).pose
+    x, top = float(pose["disc"][0]), float(pose["bracket"][1])
+    return Reference(
+        x_d=Profile([0.06, 0.16], [x, x + 2e-3]),
+        y_d=Profile([0.0, 0.05], [top, top - 1e-3]),
+        F_ff=Profile([0.0], [0.0]),
+    )
+
+
+def directed(shape: nn.Module, name: str) -> Tensor:
+    """A direction in which a parameter is varied: its own size, or a change of a form that is no motion and no scaling."""
+    p = dict(shape.named_parameters())[name].detach()
+    return p.clone() if p.ndim == 0 else 1e-2 * torch.sin(torch.arange(p.numel()).double()).reshape(p.shape)
+
+
+RUNS: dict[str, Callable[[], Shape]] = {
+    "superellipse": lambda: Superellipse(20e-3, 18.5e-3, 2.6),
+    "box": lambda: RoundedBox(18e-3, 17e-3, 12e-3),
+    "polygon": lambda: RoundedPolygon(
+        [[20e-3 * np.sin(t), 20e-3 * np.cos(t)] for t in np.arange(0.5, 8) * np.pi / 4], 9e-3
+    ),
+    "contour": lambda: Contour(
+        [[20e-3 * np.cos(t), 18e-3 * np.sin(t)] for t in np.arange(24) * np.pi / 12], tolerance=1e-5
+    ),
+}
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_gradients_of_a_run_are_those_of_differences(name: str) -> None:
+    settings = COARSE.override({"control.senses": "bracket"})
+    model = SoftGrasp(settings, shape=RUNS[name]())
+    touching = model.unpack(rest(model).detach()).pose["bracket"][1].item()
+    y0 = press(model, touching - 5e-4).detach()  # just touching, it would start at a kink
+    reference = grasp(model, y0)
+
+    def run(parameter: str = "", by: float = 0.0, gradient: str = "none") -> tuple[Shape, Tensor]:
+        shape = RUNS[name]()
+        if parameter:
+            with torch.no_grad():
+                shape.get_parameter(parameter).add_(by * directed(shape, parameter))
+        model = SoftGrasp(settings, shape=shape)
+        run = simulate(model, times(0.12, 7), y0=y0, reference=reference, step=1e-3, tolerance=1e-10, gradient=gradient)
+        assert float(run.force["U"][-1, :, 0].sum()) > 10  # it is grasped
+        return shape, 1e3 * run["y_C"][-1] + 10 * run["theta"][-1]
+
+    shape, value = run(gradient="discrete")
+    value.backward()
+    for parameter, p in shape.named_parameters():
+        h = 1e-7
+        up, down = (float(run(parameter, sign * h)[1].detach()) for sign in (1, -1))
+        assert p.grad is not None
+        slope = float((p.grad * directed(shape, parameter)).sum())
+        assert slope == pytest.approx((up - down) / (2 * h), rel=1e-6, abs=1e-6), parameter
+
+
+# --- what is refused, and what is said ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("shape", "match"),
+    [
+        (lambda: Superellipse(20e-3, 20e-3, 1.9), "n must be from 2 to 20, but is 1.9"),
+        (lambda: Superellipse(20e-3, 20e-3, 21.0), "n must be from 2 to 20, but is 21"),
+        (lambda: Superellipse(20e-3, 6e-3, 4.0), "differ by more than a factor of 3"),
+        (lambda: Superellipse(20e-3, 20e-3, float("nan")), "`disc.shape.n` must be finite"),
+        (lambda: RoundedBox(20e-3, 9e-3, 9.1e-3), "the corners' radius 0.0091 is larger than half of the box, 0.009"),
+        (lambda: RoundedBox(20e-3, 9e-3, 0.0), "`disc.shape.radius` must be positive, but is 0"),
+    ],
+)
+def test_shapes_that_are_none_are_refused(shape: Callable[[], Shape], match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        rest(SoftGrasp(COARSE, shape=shape()))
+
+
+CIRCLE = [[20e-3 * np.cos(t), 20e-3 * np.sin(t)] for t in np.arange(24) * np.pi / 12]
+EIGHT = [[np.sin(2 * t), np.sin(t)] for t in (np.arange(200) + 0.3) * np.pi / 100]
+NECK = [[np.cos(t), np.sin(t) * (0.005 + np.cos(t) ** 2)] for t in np.arange(400) * np.pi / 200]
+
+
+@pytest.mark.parametrize(
+    ("made", "match"),
+    [
+        (lambda: Contour(CIRCLE[:7]), "must be at least 8 places around a contour, but are 7"),
+        (lambda: Contour([*CIRCLE, CIRCLE[-1]]), "has the same place twice: point 23"),
+        (
+            lambda: Contour([*CIRCLE[:-1], [0.1, float("inf")]]),
+            r"`points` must be finite numbers of the shape \(n, 2\)",
+        ),
+        (lambda: Contour([[1.0, 2.0, 3.0]]), r"of the shape \(n, 2\), but is \[\[1.0, 2.0, 3.0\]\]"),
+        (lambda: Contour("pear.csv"), r"of the shape \(n, 2\), but is 'pear.csv'"),
+        (
+            lambda: Contour(np.concatenate((CIRCLE[:12], np.linspace([-0.02, 0], [0.02, 0], 9)[1:]))),
+            "turns by .* degrees",
+        ),
+        (lambda: Contour(EIGHT), "a contour that crosses itself"),
+        (lambda: Contour(NECK, tolerance=1e-3), "so sharp, or so narrow, that the nearest point is the only one up to"),
+        (lambda: Contour(pear(500), tolerance=1e-12), "a contour of 512 pieces still passes the points at .*e-.* m"),
+        (lambda: Contour(CIRCLE, tolerance=0), "`tolerance` must be positive and finite, but is 0"),
+        (lambda: RoundedPolygon(TRIANGLE, 9e-3), "corners of radius 0.009 do not fit on side . of the polygon"),
+        (lambda: RoundedPolygon([[0, 0], [1, 0], [0, 0], [0, 1]], 0.01), "do not fit on side . of the polygon"),
+        (lambda: RoundedPolygon([[0, 0], [2, 2], [2, 0], [0, 1]], 0.01), "the polygon crosses itself"),
+        (lambda: RoundedPolygon(TRIANGLE, 0.0), "`radius` must be positive and finite, but is 0"),
+        (lambda: RoundedPolygon([[0, 0], [1, 0]], 0.1), "`vertices` must be 3 to 64 places, but are 2"),
+        (lambda: RoundedPolygon([[0, 0], [1, 0], [True, "a"]], 0.1), "`vertices` must be finite numbers"),
+    ],
+)
+def test_points_that_are_no_contour_are_refused(made: Callable[[], Shape], match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        made()
+
+
+def test_control_points_that_were_spoilt_are_refused() -> None:
+    shape = Contour(pear())
+    with torch.no_grad():
+        shape.control[3] *= 3.0
+    with pytest.raises(ValueError, match="so sharp, or so narrow"):
+        rest(SoftGrasp(COARSE, shape=shape))
+
+
+def test_a_contour_from_a_file(tmp_path: Path) -> None:
+    file, points = tmp_path / "pear.csv", pear()
+    file.write_text("y [cm], x [mm]\n" + "".join(f"{1e2 * y},{1e3 * x}\n\n" for x, y in points), encoding="utf-8")
+    shape = Contour.from_csv(file)
+    assert torch.allclose(shape.control, Contour(points).control, rtol=0, atol=1e-12)
+    assert shape.residual < 1e-6
+    for text, match in (
+        ("", "the heading must be `x .mm.,y .mm.`, with m, cm or mm, but is `nothing`"),
+        ("x,y\n1,2\n", "the heading must be .*, but is `x,y`"),
+        ("x [mm],y [in]\n1,2\n", "but is `x .mm.,y .in.`"),
+        ("x [mm],y [mm]\n1,2\n3\n", "row 3: must be two finite numbers, but is `3`"),
+        ("x [mm],y [mm]\n1,nan\n", "row 2: must be two finite numbers, but is `1,nan`"),
+        ("x [mm],y [mm]\n1,2\n", r"pear.csv: `points` must be at least 8 places"),
+    ):
+        file.write_text(text, encoding="utf-8")
+        with pytest.raises(ValueError, match=match):
+            Contour.from_csv(file)
+    file.write_bytes(b"x [mm],y [mm]\n\xff\xfe")
+    with pytest.raises(ValueError, match="is not a CSV file in UTF-8"):
+        Contour.from_csv(file)
+
+
+def test_a_centre_of_mass_off_the_origin_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    RoundedPolygon(box(20e-3, 9e-3), 2e-3)
+    Contour(CIRCLE)
+    assert caplog.text == ""
+    RoundedPolygon(np.array(box(20e-3, 9e-3)) + [0.5, 0.25], 2e-3)
+    assert "the centre of mass is at (0.5, 0.25) m of `vertices`: the body's pose is that of this point" in caplog.text
+
+
+def test_the_centre_of_mass_follows_the_vertices() -> None:
+    """Moving them all is no change of the body; moving one moves the others away from the centre."""
+    shape = RoundedPolygon(ANGLED, 2e-3)
+    x = torch.from_numpy(near(known("angle")[1], 40, BAND))
+    phi = shape(x)[0]
+    (slope,) = torch.autograd.grad(phi.sum(), shape.vertices)
+    assert float(slope.sum(0).abs().max()) < 1e-12
+    assert float(slope.abs().max()) > 1e-2
+
+
+def test_an_object_that_its_pads_would_turn_is_told_of() -> None:
+    wedge = RoundedPolygon([[-20e-3, -10e-3], [20e-3, -10e-3], [20e-3, 10e-3], [-20e-3, 0.0]], 2e-3)
+    with pytest.warns(UserWarning, match=r"held at theta = 0, where the pads turn it with -?[\d.e-]+ N.m"):
+        rest(SoftGrasp(COARSE, shape=wedge))
+
+
+def test_a_long_box_rests_on_its_whole_side() -> None:
+    model = SoftGrasp(COARSE, shape=RoundedBox(30e-3, 5e-3, 1e-3))
+    state = model.unpack(rest(model).detach())
+    g = model.penetration("L", state)
+    x = model.pads["L"].positions[:, 0] - state.pose["disc"][0]
+    assert torch.equal(g > 0, x.abs() < 29.5e-3)
+    assert float(state.pads["L"][0, :, 1].sum()) == pytest.approx(-float(model.disc.mass.detach()) * 9.81, rel=1e-9)

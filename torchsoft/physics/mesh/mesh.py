@@ -1,0 +1,148 @@
+"""What a pad asks of its mesh."""
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+
+from torchsoft.physics.mesh.element import Array, element_matrices
+
+Index = NDArray[np.int64]
+
+
+class Mesh:
+    """A pad's mesh in its own frame: it gives `nodes` (N, 2) [m], `elements` (n, 4) anticlockwise, which nodes are `bonded`,
+    and `face`, the nodes along the free surface from left to right; its extents `length` and `height` [m] along x and y, and
+    how many elements are along the face and, about, through it.
+
+    Meshes of the same description are equal and have one hash, so that what is computed of one serves all.
+    """
+
+    nodes: Any
+    elements: Any
+    bonded: Any
+    face: Any
+    length: Any
+    height: Any
+    elements_x: Any
+    elements_y: Any
+
+    def refined(self, finer: int) -> "Mesh":
+        """The mesh of the same pad with `finer` times as many elements each way."""
+        raise NotImplementedError
+
+    @cached_property
+    def free(self) -> Index:
+        """Numbers of the nodes that move."""
+        return np.flatnonzero(~self.bonded)
+
+    @cached_property
+    def surface(self) -> Index:
+        """Numbers, among the free nodes, of those on the free surface, from left to right."""
+        return np.searchsorted(self.free, self.face[~self.bonded[self.face]])
+
+    @cached_property
+    def tributary(self) -> Array:
+        """Length of surface that each surface node stands for [m], shape (surface,)."""
+        lengths = np.linalg.norm(np.diff(self.nodes[self.face], axis=0), axis=1)
+        shares = 0.5 * (np.concatenate(([0.0], lengths)) + np.concatenate((lengths, [0.0])))
+        return shares[~self.bonded[self.face]]
+
+    @cached_property
+    def matrices(self) -> tuple[Array, Array, Array]:
+        """Element matrices K_lambda, K_mu, M, each (8, 8) or (elements, 8, 8)."""
+        return element_matrices(self.nodes[self.elements])
+
+    def assemble(self, element: Array, all_nodes: bool = False) -> sparse.csr_array:
+        """Global matrix of element matrices (8, 8) or (elements, 8, 8), on the dofs of the free nodes or of all of them."""
+        dofs = (2 * self.elements[:, :, None] + np.arange(2)).reshape(-1, 8)
+        rows, cols = np.repeat(dofs, 8, 1).ravel(), np.tile(dofs, (1, 8)).ravel()
+        entries = np.broadcast_to(element, (len(dofs), 8, 8)).ravel()
+        size = 2 * len(self.nodes)
+        full = sparse.csr_array((entries, (rows, cols)), shape=(size, size))
+        keep = (2 * self.free[:, None] + np.arange(2)).ravel()
+        return full if all_nodes else full[keep][:, keep]
+
+    @cached_property
+    def nodal_areas(self) -> Array:
+        """Lumped mass per density and depth of the free nodes [m2], shape (free,): row sums of the consistent M."""
+        return self.assemble(self.matrices[2], all_nodes=True).sum(1)[::2][self.free]
+
+    @property
+    def space(self) -> Array:
+        """Two corners (2, 2) [m] of the rectangle in which the centre of a body must be to touch the pad."""
+        low, high = self.nodes.min(0), self.nodes.max(0)
+        return np.stack((low - self.length, high + self.length))
+
+    @property
+    def base(self) -> Array:
+        """Two corners (2, 2) [m] of the rectangle around the bonded nodes."""
+        held = self.nodes[self.bonded]
+        return np.stack((held.min(0), held.max(0)))
+
+    @cached_property
+    def outline(self) -> Index:
+        """Numbers of the nodes around the pad, anticlockwise."""
+        return around(self.elements)
+
+    def lines(self, columns: int) -> list[Index]:
+        """Chains of nodes to draw: the elements' sides, or less of them where `columns` elements along the face are one."""
+        sides = np.sort(edges(self.elements), 1)
+        return list(np.unique(sides, axis=0))
+
+
+class FreeMesh(Mesh):
+    """A mesh whose nodes are in no rows and columns."""
+
+    @property
+    def length(self) -> float:
+        return float(np.ptp(self.nodes[:, 0]))
+
+    @property
+    def height(self) -> float:
+        return float(np.ptp(self.nodes[:, 1]))
+
+    @property
+    def elements_x(self) -> int:
+        return len(self.face) - 1
+
+    @property
+    def elements_y(self) -> int:
+        return max(1, round(len(self.elements) / self.elements_x))
+
+
+def edges(elements: Index) -> Index:
+    """Sides of all elements (4 elements, 2), from node to node."""
+    return np.stack((elements, np.roll(elements, -1, 1)), -1).reshape(-1, 2)
+
+
+def boundary(elements: Index) -> Index:
+    """Sides (sides, 2) that belong to one element only, with the elements to their left."""
+    sides = edges(elements)
+    _, first, count = np.unique(np.sort(sides, 1), axis=0, return_index=True, return_counts=True)
+    return sides[first[count == 1]]
+
+
+def around(elements: Index) -> Index:
+    """Numbers of the nodes around the elements, anticlockwise; the longest way round where there are several."""
+    after = {int(a): int(b) for a, b in boundary(elements)}
+    loops: list[list[int]] = []
+    while after:
+        start, node = after.popitem()
+        loop = [start]
+        while node != start:
+            loop.append(node)
+            node = after.pop(node)
+        loops.append(loop)
+    return np.array(max(loops, key=len))
+
+
+def in_band(nodes: Array, elements: Index) -> Index:
+    """The order of the nodes in which those of one element are close to each other (reverse Cuthill-McKee)."""
+    pairs = np.array([(a, b) for a in range(4) for b in range(4) if a != b])
+    rows, cols = elements[:, pairs[:, 0]].ravel(), elements[:, pairs[:, 1]].ravel()
+    graph = sparse.csr_array((np.ones(len(rows)), (rows, cols)), shape=(len(nodes), len(nodes)))
+    return reverse_cuthill_mckee(sparse.csr_matrix(graph), symmetric_mode=True).astype(np.int64)

@@ -1,0 +1,93 @@
+"""Closed contours through given points: from a file, and as the control points of a periodic cubic B-spline."""
+
+import csv
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from torchsoft.physics.arguments import places
+from torchsoft.physics.shapes.simple import crossing
+
+Array = NDArray[np.float64]
+
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+
+FINE = 64
+"""Intervals a piece in which lengths along a spline are summed up."""
+
+
+LEAST, SHARPEST = 8, np.radians(60)
+"""Points that are a contour, and by how much it may turn at one of them [rad]: a spline would swing around a corner."""
+
+
+def contour_points(points: object) -> Array:
+    """Points (n, 2) [m] around a contour, the first of which is not there again at the end. Raises `ValueError` for what is not
+    enough points, or points of which some are the same, turn by more than `SHARPEST`, or go along lines that cross."""
+    given = places("points", points).numpy()
+    if len(given) > 1 and np.array_equal(given[0], given[-1]):
+        given = given[:-1]
+    if len(given) < LEAST:
+        raise ValueError(f"`points` must be at least {LEAST} places around a contour, but are {len(given)}")
+    x, y = (np.roll(given, -1, 0) - given).T
+    if not (np.hypot(x, y) > 0).all():
+        raise ValueError(
+            f"`points` has the same place twice: point {int(np.hypot(x, y).argmin())} and the one after it"
+        )
+    turn = np.arctan2(np.roll(x, 1) * y - np.roll(y, 1) * x, np.roll(x, 1) * x + np.roll(y, 1) * y)
+    sharpest = int(np.abs(turn).argmax())
+    if abs(turn[sharpest]) > SHARPEST:
+        raise ValueError(
+            f"`points` turns by {abs(np.degrees(turn[sharpest])):.3g} degrees at point {sharpest}, a smooth contour by "
+            f"{np.degrees(SHARPEST):.3g} at most; give more points there, or a RoundedPolygon"
+        )
+    if crossing(given):
+        raise ValueError("`points` go along a contour that crosses itself")
+    return given
+
+
+def read_points(path: str | Path) -> Array:
+    """Points (n, 2) [m] of a CSV file with columns x and y whose headings have units in brackets. Raises `ValueError` naming
+    file and row for anything else, and `OSError`."""
+    try:
+        with Path(path).open(encoding="utf-8-sig", newline="") as file:
+            rows = [row for row in csv.reader(file) if any(cell.strip() for cell in row)]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path} is not a CSV file in UTF-8: {error}") from None
+    heads = [re.fullmatch(r"\s*([xy])\s*\[(m|cm|mm)\]\s*", head) for head in (rows[0] if rows else [])]
+    if [head and head[1] for head in heads] not in (["x", "y"], ["y", "x"]):
+        found = ",".join(rows[0]) if rows else "nothing"
+        raise ValueError(f"{path}: the heading must be `x [mm],y [mm]`, with m, cm or mm, but is `{found}`")
+    columns = {head[1]: (i, UNITS[head[2]]) for i, head in enumerate(heads) if head}
+    points = np.empty((len(rows) - 1, 2))
+    for number, row in enumerate(rows[1:], 2):
+        try:
+            if len(row) != 2:
+                raise ValueError
+            values = [float(row[i]) * unit for i, unit in (columns["x"], columns["y"])]
+            if not all(map(math.isfinite, values)):
+                raise ValueError
+        except ValueError:
+            raise ValueError(f"{path}, row {number}: must be two finite numbers, but is `{','.join(row)}`") from None
+        points[number - 2] = values
+    return points
+
+
+def control_points(points: Array, pieces: int) -> Array:
+    """Control points (pieces, 2) [m], anticlockwise, of a uniform periodic cubic B-spline: where its pieces meet, equally far
+    apart, it agrees with the periodic cubic spline through the points (n, 2) over the chords' lengths."""
+    x, y = points.T
+    if (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() < 0:
+        points = points[::-1]
+    closed = np.concatenate((points, points[:1]))
+    chords = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))))
+    spline = CubicSpline(chords, closed, bc_type="periodic")
+    t = np.linspace(0, chords[-1], FINE * max(pieces, len(points)) + 1)
+    speed = np.linalg.norm(spline(t, 1), axis=1)
+    length = np.concatenate(([0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(t))))
+    at = CubicSpline(length, t)(np.linspace(0, length[-1], pieces, endpoint=False))
+    turn = 2 * np.pi * np.arange(pieces) / pieces
+    return np.fft.ifft(np.fft.fft(spline(at), axis=0) / ((4 + 2 * np.cos(turn)) / 6)[:, None], axis=0).real.copy()

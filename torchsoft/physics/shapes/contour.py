@@ -1,0 +1,219 @@
+"""A body inside any smooth closed contour: a periodic cubic spline."""
+
+from pathlib import Path
+from typing import Self
+
+import torch
+from torch import Tensor, nn
+
+from torchsoft.physics.arguments import positive
+from torchsoft.physics.shapes.area import Moments, gauss, moments
+from torchsoft.physics.shapes.closed import contour_points, control_points, read_points
+from torchsoft.physics.shapes.shape import Prepared, Shape, note_centre
+from torchsoft.physics.shapes.simple import crossing, reach
+
+PIECES = (32, 64, 128, 256, 512)
+"""How many pieces a contour may have; as many are taken as its tolerance asks for."""
+
+SHARPEST = 1e-2
+"""How far from a contour, over its size, the nearest point must at least be the only one."""
+
+JUDGED = 1024
+"""About how many points of a contour are looked at to judge it."""
+
+EXACT = 1e-9
+"""How exact distances [m] and normals [1] must be found up to half as far as the nearest point is the only one."""
+
+
+class Contour(Shape):
+    """A body inside a periodic cubic B-spline through points (n, 2) [m] of its contour in their order, which may be given about
+    any point: the body's own frame has its origin at the centre of mass, and a note says where that is.
+
+    The contour is smooth: curvature is continuous. It passes the points at `residual` [m], which is at most the `tolerance`
+    [m]; between them it follows the periodic cubic spline over the chords' lengths. Its `control` points, (pieces, 2) [m], are
+    one parameter, which gradients reach. Distance and normal are exact wherever the nearest point is the only one, as deep
+    as the sharpest curvature and half of the narrowest neck.
+
+    Raises `ValueError` for points that are too few or turn too sharply, and for a contour that passes them farther than the
+    tolerance, crosses itself, or is so sharp, narrow or intricate that the nearest points cannot be told apart.
+    """
+
+    POINTS = 6
+    """Of the quadrature along a piece: its moments are polynomials of degree 11."""
+
+    def __init__(self, points: object, *, tolerance: float = 1e-6) -> None:
+        super().__init__()
+        given, tolerance = contour_points(points), positive("tolerance", tolerance)
+        self._judged = (b"", "")
+        for pieces in PIECES:
+            self.control = nn.Parameter(torch.from_numpy(control_points(given, pieces)))
+            with torch.no_grad():
+                self.residual = float(self(torch.from_numpy(given) - self.moments().centre)[0].abs().max())
+            if self.residual <= tolerance:
+                break
+        else:
+            raise ValueError(
+                f"a contour of {PIECES[-1]} pieces still passes the points at {self.residual:.2g} m; give a `tolerance` above "
+                "that, or points with rounded corners"
+            )
+        if wrong := self.well_posed():
+            raise ValueError(f"`points` cannot be used as a contour: {wrong}")
+        note_centre("points", self.moments().centre)
+
+    @classmethod
+    def from_csv(cls, path: str | Path, *, tolerance: float = 1e-6) -> Self:
+        """The contour through the points of a file: two columns with a unit in their heading, such as `x [mm],y [mm]`. Raises
+        `ValueError` naming file and row for anything else, and `OSError`."""
+        points = read_points(path)
+        try:
+            return cls(points, tolerance=tolerance)
+        except ValueError as error:
+            raise ValueError(f"{path}: {error}") from None
+
+    def well_posed(self) -> str:
+        """What is wrong with the control points; empty if nothing is."""
+        control = self.control.detach().numpy().tobytes()
+        if self._judged[0] != control:
+            self._judged = control, self.judged()
+        return self._judged[1]
+
+    @torch.no_grad()
+    def judged(self) -> str:
+        """What is wrong with the control points, which is looked for along the whole contour."""
+        each = min(8, max(2, JUDGED // len(self.control)))
+        points, way, bend = (x.flatten(0, 1) for x in self.along(torch.arange(each, dtype=torch.float64) / each))
+        moments = self.moments()
+        points = points - moments.centre
+        size, speed = float(points.norm(dim=-1).max()), way.norm(dim=-1, keepdim=True)
+        if not float(moments.area) > 0 or float(speed.min()) == 0 or crossing(points.numpy()):
+            return "it crosses itself, or goes round clockwise"
+        normals = torch.stack((way[:, 1], -way[:, 0]), -1) / speed
+        curvature = (way[:, 0] * bend[:, 1] - way[:, 1] * bend[:, 0]) / speed[:, 0] ** 3
+        unique = reach(points.numpy(), normals.numpy(), curvature.numpy())
+        if unique < SHARPEST * size:
+            return (
+                f"it is so sharp, or so narrow, that the nearest point is the only one up to {unique:.2g} m from it, which "
+                f"must be {SHARPEST:g} of its size, {SHARPEST * size:.2g} m"
+            )
+        shape = self.prepared()
+        for depth in (-0.5 * unique, 0.5 * unique):
+            phi, n = shape(points + depth * normals)
+            off = max(float((phi - depth).abs().max()), float((n - normals).abs().max()))
+            if not off <= EXACT:
+                return f"it is so intricate that nearest points are not found: they are off by {off:.2g}"
+        return ""
+
+    def cubics(self) -> Tensor:
+        """Coefficients (pieces, 4, 2) [m] of the pieces' polynomials in the part of each from 0 to 1."""
+        before, here, after, last = (self.control.roll(by, 0) for by in (1, 0, -1, -2))
+        parts = (
+            (before + 4 * here + after) / 6,
+            (after - before) / 2,
+            (before - 2 * here + after) / 2,
+            (last - before + 3 * (here - after)) / 6,
+        )
+        return torch.stack(parts, 1)
+
+    def along(self, part: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Places (pieces, parts, 2) [m] at these parts of every piece, and their first two derivatives by the part."""
+        t = part[:, None]
+        k = self.cubics()[:, :, None].unbind(1)
+        return ((k[3] * t + k[2]) * t + k[1]) * t + k[0], (3 * k[3] * t + 2 * k[2]) * t + k[1], 6 * k[3] * t + 2 * k[2]
+
+    def moments(self) -> Moments:
+        part, weight = gauss(self.POINTS)
+        x, way, _ = self.along(part)
+        return moments(x.flatten(0, 1), (weight[:, None] * way).flatten(0, 1))
+
+    def prepared(self) -> Shape:
+        k = self.cubics()
+        return Pieces.of(cubics=torch.cat((k[:, :1] - self.moments().centre, k[:, 1:]), 1).flatten(1))
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        return self.prepared()(x)
+
+    def area(self) -> Tensor:
+        return self.moments().area
+
+    def gyration(self) -> Tensor:
+        return self.moments().gyration
+
+    def support(self, direction: Tensor) -> Tensor:
+        k = torch.einsum("pjx,...x->...pj", self.cubics(), direction)
+        with torch.no_grad():  # where the contour's component has no slope: the roots of a quadratic a piece
+            _, b, c, d = k.unbind(-1)
+            root = torch.sqrt((c * c - 3 * b * d).clamp(min=0.0))
+            q = -(c + torch.where(c < 0, -root, root))
+            flat = torch.stack((torch.zeros_like(b), q / (3 * d), b / q), -1)
+            flat = torch.where((flat >= 0) & (flat <= 1), flat, 0.0)
+        heights = sum(k[..., j, None] * flat**j for j in range(4))
+        return torch.as_tensor(heights).flatten(-2).amax(-1) - direction @ self.moments().centre
+
+    @torch.no_grad()
+    def outline(self, points: int = 181) -> Tensor:
+        part = torch.arange(max(1, points // len(self.control)), dtype=torch.float64)
+        around = self.along(part / len(part))[0].flatten(0, 1) - self.moments().centre
+        return torch.cat((around, around[:1]))
+
+
+class Pieces(Prepared):
+    """What the law of a contour is compiled from: `cubics` (pieces, 8) [m], the coefficients of every piece's x and y."""
+
+    STARTS, ITERATIONS = 64, 8
+    """Points of the contour at the most among which the nearest is looked for, and steps of Newton's method from there."""
+    ROUNDING = 1e-9
+    """How far a step of Newton's method may lead beyond known bounds [pieces]; farther, it goes to their middle."""
+
+    cubics: Tensor
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        s = self.nearest(x.detach())
+        piece, part = self.place(s)
+        row = nn.functional.embedding(piece, self.cubics)
+        f, slope = self.stationarity(row, part, x)
+        turn = -f / slope.detach()
+        (cx, cy), (tx, ty), _ = self.curve(row, part + (turn - turn.detach()))
+        size = torch.sqrt(tx * tx + ty * ty)
+        nx, ny = ty / size, -tx / size
+        return (x[..., 0] - cx) * nx + (x[..., 1] - cy) * ny, torch.stack((nx, ny), -1)
+
+    def place(self, s: Tensor) -> tuple[Tensor, Tensor]:
+        """Number of the piece, and the part of it, at s pieces from the start, around any number of times."""
+        count = len(self.cubics)
+        around = s - count * torch.floor(s / count)
+        piece = torch.floor(around).clamp(max=count - 1.0)
+        return piece.long(), around - piece
+
+    @staticmethod
+    def curve(row: Tensor, t: Tensor) -> tuple[tuple[Tensor, Tensor], ...]:
+        """x and y on a piece (..., 8) at its part t, and their first two derivatives by it."""
+        ax, ay, bx, by, cx, cy, dx, dy = row.unbind(-1)
+        return (
+            (((dx * t + cx) * t + bx) * t + ax, ((dy * t + cy) * t + by) * t + ay),
+            ((3 * dx * t + 2 * cx) * t + bx, (3 * dy * t + 2 * cy) * t + by),
+            (6 * dx * t + 2 * cx, 6 * dy * t + 2 * cy),
+        )
+
+    def stationarity(self, row: Tensor, t: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Half of what the squared distance of x from the place t rises by with t [m2], and the slope of that."""
+        (cx, cy), (tx, ty), (bx, by) = self.curve(row, t)
+        ex, ey = cx - x[..., 0], cy - x[..., 1]
+        return ex * tx + ey * ty, tx * tx + ty * ty + ex * bx + ey * by
+
+    @torch.no_grad()
+    def nearest(self, x: Tensor) -> Tensor:
+        """Pieces from the start to the point nearest to x."""
+        cubics, step = self.cubics.detach(), -(-len(self.cubics) // self.STARTS)
+        start = cubics[::step, :2]
+        away = (start[:, 0] - x[..., 0, None]) ** 2 + (start[:, 1] - x[..., 1, None]) ** 2
+        s = step * away.argmin(-1).to(torch.float64)
+        first, last = low, high = s - step, s + step
+        for _ in range(self.ITERATIONS):
+            piece, part = self.place(s)
+            f, slope = self.stationarity(nn.functional.embedding(piece, cubics), part, x)
+            falling = f < 0
+            low, high = torch.where(falling, s, low), torch.where(falling, high, s)
+            s = torch.minimum(torch.maximum(s - f / slope, first), last)
+            inside = (slope > 0) & (s >= low - self.ROUNDING) & (s <= high + self.ROUNDING)
+            s = torch.where(inside, s, 0.5 * (low + high))
+        return s

@@ -1,0 +1,216 @@
+"""Bodies with flat sides and rounded corners: boxes and polygons.
+
+Their boundaries are segments and arcs that continue each other's tangents. Distance and normal are exact wherever the nearest
+point is the only one, in particular down to the corners' radius; the curvature jumps where an arc begins.
+"""
+
+from typing import ClassVar, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from torchsoft.physics.arguments import places, positive
+from torchsoft.physics.shapes.area import Moments, gauss, moments
+from torchsoft.physics.shapes.shape import Prepared, Shape, note_centre, parameter
+from torchsoft.physics.shapes.simple import crossing
+
+
+class RoundedBox(Shape):
+    """A box with half of its width and of its height [m] along the body's x and y, and corners rounded to `radius` [m]: a
+    circle where all three are equal."""
+
+    limits: ClassVar = {"half_width": "positive", "half_height": "positive", "radius": "positive"}
+
+    def __init__(self, half_width: float, half_height: float, radius: float) -> None:
+        super().__init__()
+        self.half_width, self.half_height, self.radius = (
+            parameter(value) for value in (half_width, half_height, radius)
+        )
+
+    def well_posed(self) -> str:
+        """What is wrong with the parameters together; empty if nothing is."""
+        most = min(self.half_width.item(), self.half_height.item())
+        radius = self.radius.item()
+        return f"the corners' radius {radius:g} is larger than half of the box, {most:g}" if radius > most else ""
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        left, below = x[..., 0].detach() < 0, x[..., 1].detach() < 0
+        qx = torch.where(left, -x[..., 0], x[..., 0]) - (self.half_width - self.radius)
+        qy = torch.where(below, -x[..., 1], x[..., 1]) - (self.half_height - self.radius)
+        corner, side = (qx >= 0) & (qy >= 0) & (qx + qy > 0), qx > qy
+        far = torch.sqrt(torch.where(corner, qx * qx + qy * qy, 1.0))
+        one, zero = torch.ones_like(far), torch.zeros_like(far)
+        nx = torch.where(corner, qx / far, torch.where(side, one, zero))
+        ny = torch.where(corner, qy / far, torch.where(side, zero, one))
+        phi = torch.where(corner, far, torch.where(side, qx, qy)) - self.radius
+        return phi, torch.stack((torch.where(left, -nx, nx), torch.where(below, -ny, ny)), -1)
+
+    def area(self) -> Tensor:
+        return 4 * self.half_width * self.half_height - (4 - torch.pi) * self.radius**2
+
+    def gyration(self) -> Tensor:
+        a, b, r = self.half_width, self.half_height, self.radius
+        square = 4 / 3 * a * b * (a**2 + b**2)  # of the box, whose corners are then exchanged for quarters of a disc
+        for side in (a, b):
+            c = side - r
+            square = square + torch.pi * r**2 * (c**2 + r**2 / 4) + 8 / 3 * c * r**3 - 4 / 3 * r * (side**3 - c**3)
+        return square / self.area()
+
+    def support(self, direction: Tensor) -> Tensor:
+        dx, dy = direction.abs().unbind(-1)
+        r = self.radius
+        return (
+            (self.half_width - r) * dx + (self.half_height - r) * dy + r * torch.linalg.vector_norm(direction, dim=-1)
+        )
+
+
+class Sides(NamedTuple):
+    """A polygon's sides and the arcs before them, anticlockwise: unit tangents and outward normals (n, 2), where the sides
+    begin (n, 2) [m] and how long they are (n,) [m]; the arcs' centres (n, 2) [m], by how much they turn (n,) [rad], and 1
+    where they bulge outwards, else -1."""
+
+    tangent: Tensor
+    normal: Tensor
+    start: Tensor
+    length: Tensor
+    centre: Tensor
+    turn: Tensor
+    bulge: Tensor
+
+
+class RoundedPolygon(Shape):
+    """A polygon with `vertices` (n, 2) [m] in their order, whose corners, inner ones too, are rounded to `radius` [m].
+
+    The arcs touch the sides that meet at a vertex, so that the sides stay where they are. The vertices may be given about any
+    point: the body's own frame has its origin at the centre of mass, wherever the vertices move it, and the note that says so
+    tells where that is. They are one parameter with the shape (n, 2), which gradients reach; only `radius` is a scalar that can
+    be asked for by name in a Jacobian or an identification. Raises `ValueError` for anything but from 3 to `MOST` places, for
+    corners that do not fit on their sides, and for sides that cross.
+    """
+
+    limits: ClassVar = {"radius": "positive"}
+    MOST, ARC = 64, 16
+    """Vertices, and points of the quadrature along an arc: exact to rounding up to half a turn."""
+
+    def __init__(self, vertices: object, radius: float) -> None:
+        super().__init__()
+        given = places("vertices", vertices)
+        if not 3 <= len(given) <= self.MOST:
+            raise ValueError(f"`vertices` must be 3 to {self.MOST} places, but are {len(given)}")
+        self.vertices, self.radius = nn.Parameter(given), parameter(positive("radius", radius))
+        if wrong := self.well_posed():
+            raise ValueError(f"`vertices` cannot be used as a polygon: {wrong}")
+        note_centre("vertices", self.moments().centre)
+
+    def well_posed(self) -> str:
+        """What is wrong with the parameters together; empty if nothing is."""
+        sides, r = self.sides(), self.radius.item()
+        short = sides.length.detach() / self.vertices.detach().abs().max()
+        if not bool((short > -1e-12).all()):
+            worst = int(torch.nan_to_num(short, nan=-torch.inf).argmin())
+            return (
+                f"corners of radius {r:g} do not fit on side {worst} of the polygon (from 0 on, anticlockwise): there it is "
+                "too short, or folds back"
+            )
+        return "the polygon crosses itself" if crossing(self.outline().numpy()) else ""
+
+    def sides(self) -> Sides:
+        v = self.vertices
+        x, y = v.detach().unbind(-1)
+        if float((x * y.roll(-1) - y * x.roll(-1)).sum()) < 0:
+            v = v.flip(0)
+        edge = v.roll(-1, 0) - v
+        length = torch.linalg.vector_norm(edge, dim=-1)
+        t = edge / length[:, None]
+        before = t.roll(1, 0)
+        cross = before[:, 0] * t[:, 1] - before[:, 1] * t[:, 0]
+        dot = (before * t).sum(-1)
+        bulge = torch.where(cross >= 0, 1.0, -1.0).double()
+        trim = self.radius * bulge * cross / (1 + dot)  # r tan(|turn| / 2): what an arc takes of both of its sides
+        normal, start = torch.stack((t[:, 1], -t[:, 0]), -1), v + trim[:, None] * t
+        centre = start - (bulge * self.radius)[:, None] * normal
+        return Sides(t, normal, start, length - trim - trim.roll(-1), centre, torch.atan2(cross, dot), bulge)
+
+    def along_arcs(self, sides: Sides, part: Tensor) -> tuple[Tensor, Tensor]:
+        """Places (n, parts, 2) [m] on the arcs at these parts of their turn, and the directions in which they go on there."""
+        angle = (sides.turn[:, None] * (part - 1))[..., None]  # from the arc's end, where the side begins
+        normal, tangent = (x[:, None] for x in (sides.normal, sides.tangent))
+        out = angle.cos() * normal + angle.sin() * tangent
+        on = angle.cos() * tangent - angle.sin() * normal
+        return sides.centre[:, None] + (sides.bulge * self.radius)[:, None, None] * out, on
+
+    def moments(self) -> Moments:
+        sides = self.sides()
+        (half, halves), (part, weight) = gauss(2), gauss(self.ARC)
+        way = sides.length[:, None] * sides.tangent
+        on_sides = sides.start[:, None] + half[:, None] * way[:, None]
+        on_arcs, on = self.along_arcs(sides, part)
+        length = self.radius * sides.turn.abs()
+        steps = (halves[:, None] * way[:, None], (weight * length[:, None])[..., None] * on)
+        return moments(*(torch.cat([x.flatten(0, 1) for x in parts]) for parts in ((on_sides, on_arcs), steps)))
+
+    def prepared(self) -> Shape:
+        sides, origin = self.sides(), self.moments().centre
+        start = sides.start - origin
+        offset = [(axis * start).sum(-1, keepdim=True) for axis in (sides.tangent, sides.normal)]
+        edges = torch.cat((sides.tangent, *offset, sides.length[:, None]), -1)
+        arcs = torch.cat((sides.centre - origin, sides.bulge[:, None]), -1)
+        return SidesAndArcs.of(edges=edges, arcs=arcs, radius=self.radius)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        return self.prepared()(x)
+
+    def area(self) -> Tensor:
+        return self.moments().area
+
+    def gyration(self) -> Tensor:
+        return self.moments().gyration
+
+    def support(self, direction: Tensor) -> Tensor:
+        sides = self.sides()
+        centre = (sides.centre - self.moments().centre)[sides.bulge > 0]
+        return (direction @ centre.mT).amax(-1) + self.radius * torch.linalg.vector_norm(direction, dim=-1)
+
+    @torch.no_grad()
+    def outline(self, points: int = 181) -> Tensor:
+        part = torch.linspace(0, 1, max(2, points // len(self.vertices)), dtype=torch.float64)
+        around = self.along_arcs(self.sides(), part)[0].flatten(0, 1) - self.moments().centre
+        return torch.cat((around, around[:1]))
+
+
+class SidesAndArcs(Prepared):
+    """What the law of a rounded polygon is compiled from.
+
+    `edges` (n, 5): the sides' unit tangents, the tangents' and the normals' components of where they begin [m], their lengths
+    [m]; `arcs` (n, 3): the centres [m] of the arcs before them, and 1 where they bulge outwards, else -1; `radius` [m].
+    """
+
+    edges: Tensor
+    arcs: Tensor
+    radius: Tensor
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        nearest, count = self.nearest(x.detach()), len(self.edges)
+        round_ = nearest >= count
+        side = torch.where(round_, nearest - count, nearest)
+        tx, ty, _, offset, _ = nn.functional.embedding(side, self.edges).unbind(-1)
+        cx, cy, bulge = nn.functional.embedding(side, self.arcs).unbind(-1)
+        dx, dy = x[..., 0] - cx, x[..., 1] - cy
+        far = torch.sqrt(torch.where(round_, dx * dx + dy * dy, 1.0))
+        phi = torch.where(round_, bulge * (far - self.radius), ty * x[..., 0] - tx * x[..., 1] - offset)
+        nx, ny = torch.where(round_, bulge * dx / far, ty), torch.where(round_, bulge * dy / far, -tx)
+        return phi, torch.stack((nx, ny), -1)
+
+    @torch.no_grad()
+    def nearest(self, x: Tensor) -> Tensor:
+        """Number of the side nearest to x, or, behind the last, of the arc. An arc counts where its centre's directions to its
+        ends enclose x, a side's ends belong to arcs."""
+        tx, ty, start, offset, length = self.edges.detach().unbind(-1)
+        cx, cy, _ = self.arcs.detach().unbind(-1)
+        x, y = x[..., 0, None], x[..., 1, None]
+        along, across = tx * x + ty * y - start, ty * x - tx * y - offset
+        beyond = along - torch.minimum(along.clamp(min=0.0), length)
+        far = torch.sqrt((x - cx) ** 2 + (y - cy) ** 2)
+        enclosed = ((along - length).roll(1, -1) >= 0) & (along <= 0)
+        to_arc = torch.where(enclosed, (far - self.radius.detach()).abs(), torch.inf)
+        return torch.cat((across.abs() + beyond.abs(), to_arc), -1).argmin(-1)
