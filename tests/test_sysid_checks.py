@@ -10,8 +10,9 @@ from conftest import COARSE
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
-from torchsoft.sysid.checks.assumptions import PLACE, Assumption, assumptions, remeshed, scaled, unramped
+from torchsoft.sysid.checks.assumptions import PLACE, Assumption, assumptions, coulomb, remeshed, scaled, unramped
 from torchsoft.sysid.checks.checks import Checked, check, notices
+from torchsoft.sysid.checks.variation import ended, refit
 from torchsoft.sysid.problem.prediction import predict
 from torchsoft.sysid.problem.workers import Runner
 
@@ -143,6 +144,24 @@ def test_another_ramp_is_asked_for_by_data_that_it_made(vary: Callable[[Recordin
     assert one.wanted
     assert 0.5 < one.asked < 1.5
     assert any("ramp" in sentence for sentence in notices(found))
+
+
+def test_under_another_law_a_fit_that_is_far_off_begins_anew() -> None:
+    """Data of Coulomb's friction, and a fit with smooth friction that has ended where nothing can be learnt."""
+    known = BASE.override({"contact.mu_s": 0.1, "contact.mu_k": 0.07, "contact.v_s": 0.1, "contact.eta": 100.0})
+    data = record("light", LIGHT, known.override(TRUTH), known, SENSORS, rtol=1e-5, noise=0.0)
+    problem = Problem([made_by(coulomb(data), data)], SENSORS, {name: Unknown() for name in TRUTH})
+    free, runner, x = problem.coordinates.free, Runner(problem.recordings), problem.coordinates.start + [0.5, -0.7]
+    at, _ = problem.freeze(runner, x, problem.names, RTOL, free)
+    end = ended(problem, x, at, free, problem.names, RTOL, 1, None)
+    law = next(one for one in assumptions(problem.recordings, set(TRUTH)) if one.name == "Coulomb friction")
+    as_stated, again = (refit(problem, end, one, "linear", lambda chi2: None) for one in (None, law))
+    assert as_stated is not None
+    assert again is not None
+    assert as_stated.fit.chi2 > 1.5
+    assert again.fit.chi2 < 1.1
+    for name, value in TRUTH.items():
+        assert again.of(name) == pytest.approx(np.log(value), abs=0.05)
 
 
 def test_every_pad_is_meshed_anew_where_it_was() -> None:

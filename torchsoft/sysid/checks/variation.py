@@ -1,6 +1,7 @@
 """A problem in which one assumption is otherwise: what that adds to the residuals of a fit, and where the fit would end."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from torchsoft.sysid.checks.assumptions import Assumption
 from torchsoft.sysid.fit.fit import Fit, Notify, Unreachable
-from torchsoft.sysid.fit.plan import SCANNED, Stage
+from torchsoft.sysid.fit.plan import SCANNED, Stage, default_plan
 from torchsoft.sysid.fit.robust import Loss
 from torchsoft.sysid.fit.stages import run_stage
 from torchsoft.sysid.problem.prediction import Frozen
@@ -22,6 +23,9 @@ REFITS, ROUGH = 20, 1e-3
 """Evaluations that a fit under another assumption may take, and its relative tolerance: it has to find out whether the misfit
 goes away, not where exactly."""
 
+
+FAR = 2.0
+"""Misfit per sample from which a fit under another law begins where the first one began, too: where it ended tells nothing."""
 
 AMOUNTS = 10.0
 """How many amounts of a variation a number of the rig may be off where a fit is repeated."""
@@ -98,7 +102,8 @@ class Refit(NamedTuple):
 def refit(problem: Problem, end: End, one: Assumption | None, loss: Loss, notify: Notify) -> Refit | None:
     """The fit with one assumption otherwise, or with all as stated, on steps of its own; None where it cannot begin.
 
-    Ratios that ended at a bound are looked for again over all of their range.
+    It begins where the fit ended; ratios that ended at a bound are looked for again over all of their range. With another
+    law, and a misfit above `FAR`, it begins where the first fit began as well, and the better end counts.
     """
     other = varied(problem, end.which, one) if one is not None else problem
     if isinstance(other, str):
@@ -110,9 +115,24 @@ def refit(problem: Problem, end: End, one: Assumption | None, loss: Loss, notify
     stuck = [one for one, is_stuck in zip(c.all, free & c.at_bound(x)) if is_stuck and one.ratio_to]
     scans = tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in stuck)
     labels = tuple(label for label, is_free in zip(c.labels, free) if is_free)
-    stage = Stage("once more", end.which, labels, end.rtol, REFITS, ROUGH, scanned=scans)
     runner = Runner(other.recordings, end.workers, end.journal)
-    try:
-        return Refit(other, run_stage(other, runner, stage, x, loss, "gauss_newton", 0, notify), free)
-    except Unreachable:
-        return None
+
+    def carried_out(plan: Sequence[Stage], x: Array) -> Iterator[Fit]:
+        """The fit of the last stage, if none is lost."""
+        fit = None
+        try:
+            for stage in plan:
+                fit = run_stage(other, runner, stage, x, loss, "gauss_newton", 0, notify)
+                x = fit.x
+        except Unreachable:
+            return
+        if fit is not None:
+            yield fit
+
+    fits = [*carried_out([Stage("once more", end.which, labels, end.rtol, REFITS, ROUGH, scanned=scans)], x)]
+    if one is not None and one.kind == "law" and float(np.mean(end.base.r**2)) > FAR:
+        with suppress(Unreachable):
+            plan = default_plan(other, runner, end.rtol, end.which)
+            if set(plan[-1].free) == set(labels):
+                fits += carried_out(plan, c.start)
+    return Refit(other, min(fits, key=lambda fit: fit.chi2), free) if fits else None
