@@ -20,7 +20,6 @@ from torchsoft.sysid.checks.misfit import LEVEL, parts
 from torchsoft.sysid.checks.variation import End, Refit, difference, ended, refit
 from torchsoft.sysid.fit.fit import Notify
 from torchsoft.sysid.fit.information import fisher, shift, standard_deviations
-from torchsoft.sysid.fit.plan import USUAL
 from torchsoft.sysid.fit.robust import Loss
 from torchsoft.sysid.problem.prediction import FailedRun
 from torchsoft.sysid.problem.problem import Problem, Residuals
@@ -120,7 +119,7 @@ def check(
     """Vary what was taken for granted at the estimates x (n,), where `at` holds residuals and Jacobian of the recordings
     `which`. A fit that is `doubtful` is repeated under each variation that is no number of the rig, by `loss`, until one
     explains what the fit left: what is true to first order is not where a fit has run far off."""
-    end = ended(problem, x, at, free, which, max(rtol, USUAL), workers, journal)
+    end = ended(problem, x, at, free, which, rtol, workers, journal)
     recordings = [recording for recording in problem.recordings if recording.name in which]
     taken = assumptions(recordings, set(problem.coordinates.names))
     judge, checks, columns = Judge(problem, end), dict[str, Check](), []
@@ -242,6 +241,8 @@ def columns_of(
 ) -> list[tuple[Assumption, Array]]:
     """What other values of known parameters, and faults of sensors that are not unknown, would add to the residuals, to first
     order: of one run a recording, with its derivatives. Nothing where a run fails."""
+    if end.base.lost:
+        return []
     known = [one for one in taken if one.parameter]
     names = tuple(one.parameter for one in known)
     jobs = [job._replace(names=names) for job in problem.jobs(end.x, end.which, end.steps, None)]

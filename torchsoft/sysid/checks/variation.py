@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from torchsoft.sysid.checks.assumptions import Assumption
 from torchsoft.sysid.fit.fit import Fit, Notify, Unreachable
-from torchsoft.sysid.fit.plan import SCANNED, Stage, default_plan
+from torchsoft.sysid.fit.plan import SCANNED, USUAL, Stage, default_plan
 from torchsoft.sysid.fit.robust import Loss
 from torchsoft.sysid.fit.stages import run_stage
 from torchsoft.sysid.problem.prediction import Frozen
@@ -50,8 +50,15 @@ def ended(
     problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_], which: Sequence[str], rtol: float, workers: int,
     journal: Path | None,
 ) -> End:  # fmt: skip
-    """The end of a fit, with a run a recording by the tolerance of the variations."""
-    base, steps = problem.freeze(Runner(problem.recordings, workers, journal), x, which, rtol)
+    """The end of a fit, which took steps by `rtol`, with a run a recording by the tolerance of the variations: `USUAL`, or that of
+    the fit, if runs are lost with it."""
+    runner = Runner(problem.recordings, workers, journal)
+    usual = max(rtol, USUAL)
+    base, steps = problem.freeze(runner, x, which, usual)
+    if base.lost and usual > rtol:
+        base, steps = problem.freeze(runner, x, which, rtol)
+    else:
+        rtol = usual
     return End(x, at, free, tuple(which), base, steps, rtol, workers, journal)
 
 
