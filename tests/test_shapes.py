@@ -209,6 +209,33 @@ def test_curvature_is_that_of_the_boundary(case: tuple[Shape, Boundary]) -> None
         assert np.median(np.abs(kappa.numpy() - expected)) * size < 2e-5
 
 
+@pytest.mark.parametrize("depth", [0.0, -2e-4, 3e-4])
+def test_curvature_is_exact(depth: float) -> None:
+    """Of a superellipse by the formula of its equation, of a contour by its spline's derivatives, of a box by its corners."""
+    s = 0.013 + np.arange(40) / 40
+    a, b, n = 20e-3, 14e-3, 4.0
+    x, y = superellipse(a, b, n)(s).T
+    fx, fy = np.sign(x) * np.abs(x / a) ** (n - 1) / a, np.sign(y) * np.abs(y / b) ** (n - 1) / b
+    fxx, fyy = (n - 1) * np.abs(x / a) ** (n - 2) / a**2, (n - 1) * np.abs(y / b) ** (n - 2) / b**2
+    speed = np.hypot(fx, fy)
+    of_superellipse = np.stack((x, y, fx / speed, fy / speed, (fxx * fy**2 + fyy * fx**2) / speed**3), -1)
+    control = contour().control.detach().numpy() - contour().moments().centre.detach().numpy()
+    count = len(control)
+    curve = BSpline(np.arange(-3.0, count + 4), np.concatenate((control[-1:], control, control[:2])), 3)
+    (x, y), (tx, ty), (bx, by) = (curve(s * count, k).T for k in range(3))
+    speed = np.hypot(tx, ty)
+    of_contour = np.stack((x, y, ty / speed, -tx / speed, (tx * by - ty * bx) / speed**3), -1)
+    corner = np.sqrt(0.5)
+    of_box = np.array(
+        [[18e-3 + 2e-3 * corner, 7e-3 + 2e-3 * corner, corner, corner, 500.0], [3e-3, -9e-3, 0.0, -1.0, 0.0]]
+    )
+    for shape, expected in (
+        (Superellipse(a, b, n), of_superellipse), (contour(), of_contour), (RoundedBox(20e-3, 9e-3, 2e-3), of_box),
+    ):  # fmt: skip
+        kappa = shape.curvature(torch.from_numpy(expected[:, :2] + depth * expected[:, 2:4]))
+        assert kappa.numpy() == pytest.approx(expected[:, 4], rel=1e-9, abs=1e-9)
+
+
 # --- limits ----------------------------------------------------------------------------------------------------------------
 
 R = 19.37e-3

@@ -8,6 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+"""Units [m] in which files may give lengths."""
+
 
 def number(name: str, value: Any) -> float:
     """Raises `ValueError` for what is not a real number; text and truth values are not."""

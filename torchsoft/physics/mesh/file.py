@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from torchsoft.physics.arguments import LENGTHS
 from torchsoft.physics.mesh.element import Array
 from torchsoft.physics.mesh.mesh import Index
-
-UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
 IGNORED = {"line", "vertex"}
 """Kinds of cells beside the quadrilaterals."""
@@ -27,8 +26,8 @@ def read_quads(path: str | Path, unit: str) -> tuple[Array, Index, dict[str, Ind
     """
     import meshio  # takes half a second, and few need it
 
-    if unit not in UNITS:
-        raise ValueError(f"`unit` must be one of {', '.join(UNITS)}, but is {unit!r}")
+    if unit not in LENGTHS:
+        raise ValueError(f"`unit` must be one of {', '.join(LENGTHS)}, but is {unit!r}")
     with Path(path).open("rb"):  # what is not there, or not to be read, is an OSError
         pass
     try:
@@ -49,7 +48,7 @@ def read_quads(path: str | Path, unit: str) -> tuple[Array, Index, dict[str, Ind
     if not np.isfinite(x).all() or (x.shape[1] > 2 and np.ptp(x[:, 2]) > FLAT * np.ptp(x[:, :2])):
         raise ValueError(f"{path} must have finite points in a plane of constant z")
     quads = np.concatenate([block.data for block in mesh.cells if block.type == "quad"])
-    return UNITS[unit] * x[:, :2], quads, groups_of_lines(mesh)
+    return LENGTHS[unit] * x[:, :2], quads, groups_of_lines(mesh)
 
 
 def groups_of_lines(mesh: Any) -> dict[str, Index]:

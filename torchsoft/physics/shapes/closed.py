@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from torchsoft.physics.arguments import places
+from torchsoft.physics.arguments import LENGTHS, places
 from torchsoft.physics.shapes.simple import crossing
 
 Array = NDArray[np.float64]
-
-UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
 FINE = 64
 """Intervals a piece in which lengths along a spline are summed up."""
@@ -61,7 +59,7 @@ def read_points(path: str | Path) -> Array:
     if [head and head[1] for head in heads] not in (["x", "y"], ["y", "x"]):
         found = ",".join(rows[0]) if rows else "nothing"
         raise ValueError(f"{path}: the heading must be `x [mm],y [mm]`, with m, cm or mm, but is `{found}`")
-    columns = {head[1]: (i, UNITS[head[2]]) for i, head in enumerate(heads) if head}
+    columns = {head[1]: (i, LENGTHS[head[2]]) for i, head in enumerate(heads) if head}
     points = np.empty((len(rows) - 1, 2))
     for number, row in enumerate(rows[1:], 2):
         try:

@@ -1,6 +1,7 @@
 """What a rig asks of the shape of a rigid body."""
 
 import logging
+import math
 from typing import Any, ClassVar, Self
 
 import torch
@@ -58,9 +59,10 @@ class Shape(nn.Module):
         raise NotImplementedError
 
     def size(self) -> float:
-        """Radius [m] of the circle about the centre that holds the body."""
+        """Radius [m] of a circle about the centre that holds the body, the smallest to 4e-5."""
         angle = torch.linspace(0, 2 * torch.pi, 361, dtype=torch.float64)
-        return float(self.support(torch.stack((angle.cos(), angle.sin()), -1)).detach().max())
+        reach = self.support(torch.stack((angle.cos(), angle.sin()), -1)).detach().max()
+        return float(reach) / math.cos(torch.pi / 360)  # a boundary point is half a degree from one of the directions
 
     def curvature(self, x: Tensor) -> Tensor:
         """Curvature [1/m] (...) of the boundary at its points nearest to x (..., 2) [m], positive where it bulges outwards.

@@ -50,8 +50,8 @@ def ended(
     problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_], which: Sequence[str], rtol: float, workers: int,
     journal: Path | None,
 ) -> End:  # fmt: skip
-    """The end of a fit, which took steps by `rtol`, with a run a recording by the tolerance of the variations: `USUAL`, or that of
-    the fit, if runs are lost with it."""
+    """The end of a fit, which took steps by `rtol`, with a run a recording by the tolerance of the variations: `USUAL`, or that
+    of the fit, if runs are lost with it."""
     runner = Runner(problem.recordings, workers, journal)
     usual = max(rtol, USUAL)
     base, steps = problem.freeze(runner, x, which, usual)
