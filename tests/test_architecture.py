@@ -11,13 +11,13 @@ import torchsoft
 ROOT = Path(torchsoft.__file__).parent
 FLOWS = {
     "": """
-        channels files threads tables parameters cost codegen physics solve scenario excitation processes plot sysid
-        reduced datasets cli __main__
+        channels files threads tables parameters cost codegen physics solve scenario excitation processes plot rigs
+        sysid reduced datasets cli __main__
     """,
     "codegen": "graph derivatives operations trace emit . invoke",
     "physics": """
         arguments mesh shapes contact material pads motion multibond state parts condensed validity rig energy paper
-        equilibrium settled .
+        equilibrium settled resting .
     """,
     "solve": """
         grid kernel laws system progress tolerances rates stability stepper adjoint tangent unrolled continuous trajectory
@@ -28,7 +28,7 @@ FLOWS = {
     """,
 }
 """For every folder with layers its modules and folders from the top down; "." is what the folder's own file imports."""
-APART = ("plot", "sysid", "reduced", "datasets")
+APART = ("plot", "rigs", "sysid", "reduced", "datasets")
 """Folders over the engine; of these, only `plot` may be imported by another."""
 LONGEST = 350
 """Lines; a file that grows past them holds more than one idea."""

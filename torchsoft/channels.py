@@ -1,5 +1,6 @@
 """Every channel of the rig: its key, the variable and component that hold it in files and datasets, unit, symbol."""
 
+import math
 from typing import Any, NamedTuple
 
 
@@ -63,6 +64,18 @@ CHANNELS = {
     for variable, v in VARIABLES.items() for axis, (key, symbol) in enumerate(v.symbols.items())
 }  # fmt: skip
 """Every channel by its key."""
+
+
+UNITS = {
+    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6},
+    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6},
+    "rad": {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180, "°": math.pi / 180},
+    "m/s": {"m/s": 1.0, "mm/s": 1e-3, "um/s": 1e-6},
+    "rad/s": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": math.pi / 180},
+    "N": {"N": 1.0, "mN": 1e-3, "kN": 1e3},
+    "N.m": {"N.m": 1.0, "mN.m": 1e-3, "N.mm": 1e-3},
+}
+"""Units by dimension, and what they are in SI."""
 
 
 def unit(channel: str) -> str:

@@ -54,11 +54,19 @@ class Pad(nn.Module):
 
     def remeshed(self, finer: int, points: int) -> "Pad":
         """The same pad of `finer` times as many elements each way, with so many contact points an element."""
-        m, (c, s) = self.mesh, self.axes[:, 0].tolist()
+        m = self.mesh
         mesh = replace(m, elements_x=finer * m.elements_x, elements_y=finer * m.elements_y)
+        return self._again(mesh, self.inertial, points)
+
+    def condensed(self) -> "Pad":
+        """The same pad without inertia."""
+        return self._again(self.mesh, False, self.points)
+
+    def _again(self, mesh: PadMesh, inertial: bool, points: int) -> "Pad":
+        c, s = self.axes[:, 0].tolist()
         return Pad(
             mesh, self.material, base=self.base, origin=(float(self.origin[0]), float(self.origin[1])),
-            angle=float(np.arctan2(s, c)), mirrored=float(self.axes.det()) < 0, inertial=self.inertial, points=points,
+            angle=float(np.arctan2(s, c)), mirrored=float(self.axes.det()) < 0, inertial=inertial, points=points,
         )  # fmt: skip
 
     spread: Tensor

@@ -14,23 +14,13 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from torchsoft.channels import CHANNELS, FEED_FORWARD, MEASURED, SETPOINTS, VARIABLES
+from torchsoft.channels import CHANNELS, FEED_FORWARD, MEASURED, SETPOINTS, UNITS, VARIABLES
 from torchsoft.solve.trajectory import load
 from torchsoft.sysid.recording import Array
 from torchsoft.tables import line, shown
 
 COLUMNS = ("t", *SETPOINTS, *FEED_FORWARD, *MEASURED)
 """Names that a column may have."""
-
-UNITS = {
-    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6},
-    "m": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6},
-    "rad": {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180, "°": math.pi / 180},
-    "m/s": {"m/s": 1.0, "mm/s": 1e-3, "um/s": 1e-6},
-    "rad/s": {"rad/s": 1.0, "mrad/s": 1e-3, "deg/s": math.pi / 180},
-    "N": {"N": 1.0, "mN": 1e-3, "kN": 1e3},
-}
-"""Units by dimension, and what they are in SI."""
 
 ROWS = 10
 """A table with set-points has at least as many rows."""
