@@ -51,12 +51,13 @@ def standing(rig: Rig, pose: Mapping[str, Tensor]) -> Tensor:
     return rig.pack(own._replace(pads=pads, pose=state.pose))
 
 
-def resting(rig: Rig, pose: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def resting(rig: Rig, pose: Mapping[str, Tensor], residual: float = RESIDUAL) -> dict[str, Tensor]:
     """Poses (3,) [m, m, rad] by body of a rig at rest, looked for from `pose`; fixed and driven coordinates are what they are
     at t = 0, whatever `pose` says.
 
     Newton's method on the net loads of the free coordinates, each step no longer than `STRIDE`: a body above its pad comes down
-    to it. Raises `NoEquilibrium` where there is no balance, and what `settled` does.
+    to it. Done when net loads, counted by the compliance of the softest pad, are below `residual` [m]. Raises `NoEquilibrium`
+    where there is no balance, and what `settled` does.
     """
     soft = massless(rig)
     held, _ = soft.held(soft.follow(0.0))
@@ -94,7 +95,7 @@ def resting(rig: Rig, pose: Mapping[str, Tensor]) -> dict[str, Tensor]:
             rows = [torch.autograd.grad(one, x, retain_graph=True, allow_unused=True)[0] for one in F]
         F, K = F.detach(), -torch.stack([torch.zeros_like(q) if row is None else row for row in rows])
         size = float(F.norm())
-        if size * softest <= RESIDUAL:
+        if size * softest <= residual:
             return {name: value.detach() for name, value in poses(q).items()}
         # as stiff as keeps the step short, which vanishes with the load: quadratic at the end
         q = q + torch.linalg.solve(K + size / (STRIDE * mesh) * torch.eye(len(q), dtype=q.dtype), F)

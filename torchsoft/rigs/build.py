@@ -1,7 +1,7 @@
 """A rig file: tables, from TOML or from Python, and what is built from them: the rig with its reference, its state at the
 start, and the times of its outputs."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -33,15 +33,19 @@ class Ready(NamedTuple):
     t: Tensor
 
 
-def assemble(file: RigTables, held: Mapping[str, Mapping[str, float]] | None = None, loops: bool = True) -> Rig:
-    """The rig without a reference; `held` are coordinates that are fixed, by body and axis, and `loops` its actuators."""
+def assemble(
+    file: RigTables, held: Mapping[str, Mapping[str, float]] | None = None, loops: Collection[str] | None = None
+) -> Rig:
+    """The rig without a reference; `held` are coordinates that are fixed, by body and axis, and `loops` names its actuators,
+    all by default."""
+    actuators = {name: one for name, one in file.actuators.items() if loops is None or name in loops}
     materials = {name: table.build() for name, table in file.materials.items()}
     laws = {name: table.build() for name, table in file.laws.items()}
     return Rig(
         bodies={name: body.build(file.folder, dict((held or {}).get(name, {}))) for name, body in file.bodies.items()},
         pads={name: pad.build(materials[pad.material]) for name, pad in file.pads.items()},
         contacts={name: contact.build(laws) for name, contact in file.contacts.items()},
-        actuators={name: actuator.build() for name, actuator in file.actuators.items()} if loops else {},
+        actuators={name: actuator.build() for name, actuator in actuators.items()},
         gravity=file.gravity,
         symbols={name: body.symbol or name for name, body in file.bodies.items()},
     )
@@ -82,7 +86,7 @@ def starts(file: RigTables, driven: Mapping[str, float]) -> dict[str, Array]:
         name: {axis: float(at) for axis, at in zip(COORDINATES, row) if (name, axis) not in wanted}
         for name, row in pose.items()
     }
-    rig = assemble(file, held, loops=False)
+    rig = assemble(file, held, loops=())
     for name, axis in wanted:
         if axis == "y":
             pose[name][1] = above(rig, name, pose)

@@ -1,19 +1,21 @@
 """What is wrong or dangerous in a rig file, said before any run: findings, each with its severity, its field and a sentence."""
 
 import itertools
-from collections.abc import Iterator
-from typing import Literal, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Literal, NamedTuple, get_args
 
 import networkx as nx
 import numpy as np
 import torch
+from torch import Tensor
 
 from torchsoft.physics.contact import SmoothSlip
 from torchsoft.physics.equilibrium import NoEquilibrium
-from torchsoft.physics.motion import Sampled, hold
+from torchsoft.physics.motion import Reference, Sampled, hold
 from torchsoft.physics.resting import massless, standing
+from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import Ready, RigFile
-from torchsoft.rigs.course import Course, Estimate, at, sampled, signals
+from torchsoft.rigs.course import Course, Estimate, at, signals
 from torchsoft.rigs.geometry import crossing, facing, outline, overlap, pressed, surface
 from torchsoft.rigs.motion import CsvTable
 from torchsoft.solve.ledger import COMPRESSED
@@ -32,8 +34,8 @@ JUMP = {"m": 1e-4, "rad": 1e-2}
 SAMPLES = 61
 """Times at which the course of the bodies is looked at, besides the motions' knots."""
 
-MOMENTS = 8
-"""Times at which the modes are computed, at the most."""
+MOMENTS = 5
+"""Times at which the rig is brought into balance, at the most."""
 
 STEPS_PER_PERIOD = 5
 """Steps that a period of an oscillation needs at the least: 2 ms for the paper's, 4e-3 of its forces off."""
@@ -42,6 +44,7 @@ OUTPUTS_PER_PERIOD = 4
 """Outputs that a period of a motion needs at the least."""
 
 Severity = Literal["error", "warning", "note"]
+SEVERITIES: tuple[Severity, ...] = get_args(Severity)
 
 
 class Finding(NamedTuple):
@@ -56,21 +59,20 @@ class Finding(NamedTuple):
 
 
 def check(file: RigFile) -> list[Finding]:
-    """Findings on a rig file, errors first. Takes a second or so."""
+    """Findings on a rig file, errors first. Takes some seconds."""
     try:
         ready = file.build()
     except ValueError as error:
         field, _, sentence = str(error).partition(": ")
         return [Finding("error", field, sentence)]
-    estimate = Estimate(ready)
-    course = sampled(estimate, SAMPLES)
+    estimate = Estimate(file, ready)
     found = [
         *ties(file), *recordings(file, ready), *jumps(file, ready, estimate), *carried(file, ready, estimate),
-        *overlaps(file, ready, estimate, course), *fits(ready, course),
+        *overlaps(ready.rig, estimate),
     ]  # fmt: skip
     if not any(one.severity == "error" for one in found):
-        found += [*dynamics(file, ready, estimate)]
-    return sorted(found, key=lambda one: ("error", "warning", "note").index(one.severity))
+        found += at_moments(file, ready, estimate)
+    return sorted(found, key=lambda one: SEVERITIES.index(one.severity))
 
 
 def ties(file: RigFile) -> Iterator[Finding]:
@@ -156,12 +158,12 @@ def carried(file: RigFile, ready: Ready, estimate: Estimate) -> Iterator[Finding
         )  # fmt: skip
 
 
-def overlaps(file: RigFile, ready: Ready, estimate: Estimate, course: list[tuple[float, Course]]) -> Iterator[Finding]:
+def overlaps(rig: Rig, estimate: Estimate) -> Iterator[Finding]:
     """Things that lie in each other without a contact between them: at the start, and those whose course is known later."""
-    rig, said = ready.rig, set()
+    said: set[tuple[str, str]] = set()
     contacts = {(contact.pad, contact.body) for contact in rig.contacts.values()}
     shaped = [name for name, body in rig.bodies.items() if body.shape is not None]
-    for time, pose in course:
+    for time, pose in estimate.sampled(SAMPLES):
         sure = [name for name in shaped if time == 0 or estimate.known(name)]
         moved = {name: surface(pad, pose).corners for name, pad in rig.pads.items()}
         lying = [
@@ -186,85 +188,134 @@ def overlaps(file: RigFile, ready: Ready, estimate: Estimate, course: list[tuple
                 )  # fmt: skip
 
 
-def fits(ready: Ready, course: list[tuple[float, Course]]) -> Iterator[Finding]:
-    """How much pads would have to give way, over their heights."""
-    rig, worst = ready.rig, dict[tuple[str, ...], tuple[float, float, float]]()
-    for time, pose in course:
-        pairs = [pair for body in rig.bodies for pair in facing(rig, body, pose)]
-        alone = [(key,) for key in rig.contacts if time == 0 and not any(key in pair for pair in pairs)]
-        for group in [*pairs, *alone]:
-            off = [surface(rig.pads[rig.contacts[k].pad], pose).off(pose[rig.contacts[k].body][:2]) for k in group]
-            give = sum(pressed(rig, key, pose) for key in group) if max(off) < 0 else -np.inf
-            height = sum(rig.pads[rig.contacts[key].pad].mesh.height for key in group)
-            worst[group] = max(worst.get(group, (-np.inf, 0.0, 0.0)), (give / height, give, time))
-    for group, (part, give, time) in worst.items():
-        body, pads = rig.contacts[group[0]].body, " and ".join(f"`{rig.contacts[key].pad}`" for key in group)
-        field = f"contacts.{group[-1]}"
-        asked = (
-            f"at t = {time:.3g} s `{body}` asks {pads} to give way by {1e3 * give:.3g} mm, {part:.0%} of their height"
-        )
-        if part >= COMPRESSED:
-            yield Finding(
-                "error", field, f"`{body}` does not fit: {asked}, far beyond linear elasticity; leave it more room"
-            )
-        elif part > LINEAR:
-            yield Finding(
-                "warning", field, f"the strain leaves linear elasticity: {asked}; above {LINEAR:.0%} forces are off"
-            )
-        elif len(group) == 2 and -np.inf < part <= 0:
-            yield Finding(
-                "warning", field, f"{pads} never press `{body}`: they come no nearer than {-1e3 * give:.3g} mm to it"
-            )
+class Moment(NamedTuple):
+    """The rig in balance at a time [s]: poses by body, state (size,) of settled pads, and the signals, held."""
+
+    time: float
+    pose: Course
+    y: Tensor
+    reference: Reference
 
 
 @torch.no_grad()
-def dynamics(file: RigFile, ready: Ready, estimate: Estimate) -> Iterator[Finding]:
-    """Loops that are unstable, steps too long for the modes, and friction that is not single-valued, at the motions' knots."""
-    rig = massless(ready.rig)
-    slowest, fastest, least, largest = np.inf, 0.0, None, dict.fromkeys(rig.contacts, 0.0)
-    for time, pose in moments(estimate):
+def at_moments(file: RigFile, ready: Ready, estimate: Estimate) -> list[Finding]:
+    """What comes of the rig in balance at some of its motions' knots: strains, modes, steps, friction."""
+    rig, found, there = massless(ready.rig), list[Finding](), list[Moment]()
+    for time in estimate.moments(MOMENTS):
+        pose = estimate.balanced(time)
+        found += [one for one in fits(rig, time, pose) if (one.field, one.severity) not in {x[1::-1] for x in found}]
+        if found and found[-1].severity == "error":
+            return found
         try:
             y = standing(rig, {name: torch.from_numpy(x) for name, x in pose.items()})
         except NoEquilibrium as error:
-            yield Finding("warning", "motion", f"pads do not settle as they would at t = {time:.3g} s: {error}")
+            found.append(
+                Finding("error", "motion", f"pads cannot settle where bodies are at t = {time:.3g} s: {error}")
+            )
+            return found
+        there.append(Moment(time, pose, y, hold(**signals(rig, time))))
+    return [*found, *presses(rig, there), *strains(rig, there), *swings(file, rig, there), *slips(file, rig, there)]
+
+
+def fits(rig: Rig, time: float, pose: Course) -> Iterator[Finding]:
+    """Bodies that pads have no room for."""
+    pairs = [pair for body in rig.bodies for pair in facing(rig, body, pose)]
+    alone = [(key,) for key in rig.contacts if not any(key in pair for pair in pairs)]
+    for group in [*pairs, *alone]:
+        give, height = room(rig, group, pose)
+        if give / height >= COMPRESSED:
+            body, pads = rig.contacts[group[0]].body, " and ".join(f"`{rig.contacts[key].pad}`" for key in group)
+            yield Finding(
+                "error", f"contacts.{group[-1]}",
+                f"`{body}` does not fit: at t = {time:.3g} s it asks {pads} to give way by {1e3 * give:.3g} mm, "
+                f"{give / height:.0%} of their height, far beyond linear elasticity; leave it more room",
+            )  # fmt: skip
+
+
+def room(rig: Rig, group: Sequence[str], pose: Course) -> tuple[float, float]:
+    """By how much the pads of some contacts of one body have to give way [m], together, and their heights [m]; negative where
+    they are apart, or the body is beyond the end of one."""
+    at_pads = [surface(rig.pads[rig.contacts[key].pad], pose) for key in group]
+    beside = max(float(s.off(pose[rig.contacts[key].body][:2])) for s, key in zip(at_pads, group))
+    give = sum(pressed(rig, key, pose) for key in group)
+    return -beside if beside > 0 else give, sum(s.height for s in at_pads)
+
+
+def presses(rig: Rig, there: list[Moment]) -> Iterator[Finding]:
+    """Pads that face each other and never press what is between them."""
+    pairs = {pair for moment in there for body in rig.bodies for pair in facing(rig, body, moment.pose)}
+    for pair in sorted(pairs):
+        nearest = max(room(rig, pair, moment.pose)[0] for moment in there)
+        if nearest <= 0:
+            pads = " and ".join(f"`{rig.contacts[key].pad}`" for key in pair)
+            yield Finding(
+                "warning", f"contacts.{pair[-1]}",
+                f"{pads} never press `{rig.contacts[pair[0]].body}`: at the motions' knots they come no nearer than "
+                f"{-1e3 * nearest:.3g} mm",
+            )  # fmt: skip
+
+
+def strains(rig: Rig, there: list[Moment]) -> Iterator[Finding]:
+    """Pads that are pressed in beyond linear elasticity."""
+    for name, pad in rig.pads.items():
+        parts = [
+            float(rig.displacement(name, rig.unpack(m.y, rig.follow(0.0, m.reference))).norm(dim=-1).max())
+            / pad.mesh.height
+            for m in there
+        ]
+        worst = int(np.argmax(parts))
+        if parts[worst] > LINEAR:
+            yield Finding(
+                "warning", f"pads.{name}",
+                f"the strain leaves linear elasticity: at t = {there[worst].time:.3g} s it gives way by {parts[worst]:.0%} of "
+                f"its height, and above {LINEAR:.0%} forces are off; press less, or take a thicker or stiffer pad",
+            )  # fmt: skip
+
+
+def swings(file: RigFile, rig: Rig, there: list[Moment]) -> Iterator[Finding]:
+    """Loops that are unstable, and steps that are too long."""
+    fastest, least = 0.0, (complex("-inf"), 0.0)
+    for moment in there:
+        if grazing(rig, moment):
             continue
-        reference = hold(**signals(rig, time))
-        for key, contact in rig.contacts.items():
-            pad, most = rig.pads[contact.pad], rig.weight(key).max()
-            forces = rig.unpack(y, rig.follow(0.0, reference)).pads[contact.pad][0]
-            largest[key] = max(largest[key], float(forces.norm(dim=-1).max() / most) if pad.points == 0 else 0.0)
-        found = modes(rig, y, reference)
+        found = modes(rig, moment.y, moment.reference)
         swinging = found.values[found.values.imag.abs() > found.values.real.abs()].imag.abs()
         fastest = max(fastest, float(swinging.max()) if len(swinging) else 0.0)
         if float(found.values[0].real) > NEUTRAL and file.actuators:
-            yield unstable(file, found, time)
-            break
+            yield unstable(file, found, moment.time)
+            return
         decaying = found.values[found.values.real < -NEUTRAL]
-        if len(decaying) and float(-decaying.real.max()) < slowest:
-            slowest, least = float(-decaying.real.max()), (complex(decaying[0]), time)
-    if least is not None and file.actuators:
-        yield Finding("note", "actuators", f"stable; the slowest mode is {shown(least[0])} at t = {least[1]:.3g} s")
+        if len(decaying) and float(decaying[0].real) > least[0].real:
+            least = complex(decaying[0]), moment.time
+    if file.actuators:
+        yield Finding(
+            "note", "actuators", f"stable; the mode that lasts longest is {shown(least[0])}, at t = {least[1]:.3g} s"
+        )
     yield from steps(file, fastest)
+
+
+def grazing(rig: Rig, moment: Moment) -> bool:
+    """Whether a contact only just touches: what it ties, it does not tie for long."""
+    state = rig.unpack(moment.y, rig.follow(0.0, moment.reference))
+    deepest = {key: float(rig.penetration(key, state).max()) for key in rig.contacts}
+    return any(0 < deep < float(rig.contacts[key].law.epsilon) for key, deep in deepest.items())
+
+
+def slips(file: RigFile, rig: Rig, there: list[Moment]) -> Iterator[Finding]:
+    """Friction that falls with slip faster than is single-valued."""
     for key, contact in rig.contacts.items():
-        law, slip = contact.law, contact.law.friction
-        if isinstance(slip, SmoothSlip):
-            falls = float((slip.mu_s - slip.mu_k) * largest[key] / slip.v_s)
-            if float(slip.eta + law.R_t) < falls:
-                yield Finding(
-                    "warning", f"laws.{file.contacts[key].law}.friction",
-                    f"slip is not single-valued at a normal force of {largest[key]:.3g} N: eta + R_t = "
-                    f"{float(slip.eta + law.R_t):.3g} N.s/m is below (mu_s - mu_k) F_N / v_s = {falls:.3g}; raise v_s or eta",
-                )  # fmt: skip
-
-
-def moments(estimate: Estimate) -> list[tuple[float, Course]]:
-    """Times [s] of the motions' knots and the poses there, those left out that are like an earlier one."""
-    out: list[tuple[float, Course]] = []
-    for time in estimate.knots():
-        pose = estimate(time)
-        if not any(all(np.allclose(pose[k], old[k], rtol=0, atol=1e-6) for k in pose) for _, old in out):
-            out.append((time, pose))
-    return [out[i] for i in np.unique(np.linspace(0, len(out) - 1, min(MOMENTS, len(out))).astype(int))]
+        law, slip, pad = contact.law, contact.law.friction, rig.pads[contact.pad]
+        if not isinstance(slip, SmoothSlip) or pad.points:
+            continue
+        forces = [rig.unpack(m.y, rig.follow(0.0, m.reference)).pads[contact.pad][0].norm(dim=-1).max() for m in there]
+        largest = float(max(forces) / rig.weight(key).max())
+        falls, damps = float((slip.mu_s - slip.mu_k) * largest / slip.v_s), float(slip.eta + law.R_t)
+        if damps < falls:
+            yield Finding(
+                "warning", f"laws.{file.contacts[key].law}.friction",
+                f"slip is not single-valued at a normal force of {largest:.3g} N: eta + R_t = {damps:.3g} N.s/m is below "
+                f"(mu_s - mu_k) F_N / v_s = {falls:.3g}; raise v_s or eta",
+            )  # fmt: skip
 
 
 def unstable(file: RigFile, found: Modes, time: float) -> Finding:
