@@ -11,7 +11,7 @@ import torchsoft
 ROOT = Path(torchsoft.__file__).parent
 FLOWS = {
     "": """
-        channels files threads tables parameters cost codegen physics solve scenario excitation processes plot rigs
+        channels files threads tables csvfile parameters cost codegen physics solve scenario excitation processes plot rigs
         sysid reduced datasets cli __main__
     """,
     "codegen": "graph derivatives operations trace emit . invoke",
@@ -22,6 +22,10 @@ FLOWS = {
     "solve": """
         grid kernel laws system progress tolerances rates stability stepper adjoint tangent unrolled continuous trajectory
         ledger simulate batch torchdiffeq .
+    """,
+    "rigs": """
+        fields recorded shapes materials bodies pads contacts actuators motion outputs schema geometry build course finding
+        balance check written template pictures run .
     """,
     "solve.kernel": """
         cache . arrays scratch linear inertia interface stage finish step taped run rates adjoint_pads adjoint tangent
@@ -115,6 +119,13 @@ def test_the_kernels_know_no_law() -> None:
     own = {name for name in MODULES if layer(name, "solve") == "kernel"}
     for name in own:
         assert imports(MODULES[name]) <= own | {"files" if name == "solve.kernel.cache" else "codegen.invoke"}, name
+
+
+def test_rigs_are_drawn_in_one_room() -> None:
+    """Whatever else they do needs no matplotlib."""
+    drawing = {name for name, path in MODULES.items() if layer(name, "") == "rigs" and "plot" in
+               {layer(other, "") for other in imports(path)}}  # fmt: skip
+    assert drawing == {"rigs.pictures"}
 
 
 @pytest.mark.parametrize("folder", APART)

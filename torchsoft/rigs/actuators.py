@@ -14,14 +14,16 @@ class ActuatorTable(Group):
 
     pushes: str = Field(description='the coordinate that it pushes, such as "bracket.x"')
     measures: str | None = Field(
-        None, description="the coordinate q that it measures; the one that it pushes if not given"
+        default=None, description="the coordinate q that it measures; the one that it pushes if not given"
     )
     setpoint: str | None = Field(
-        None, description="name of the motion w that q is to follow; none: no loop, only feed_forward"
+        default=None, description="name of the motion w that q is to follow; none: no loop, only feed_forward"
     )
-    feed_forward: str | None = Field(None, description="name of the motion that is added as an effort [N or N.m]")
-    Kp: Annotated[float, Within(0.0, 1e12, "N/m, N, N.m/rad")] = Field(0.0, description="proportional gain")
-    Kd: Annotated[float, Within(0.0, 1e12, "N.s/m, N.s, N.m.s/rad")] = Field(0.0, description="derivative gain")
+    feed_forward: str | None = Field(
+        default=None, description="name of the motion that is added as an effort [N or N.m]"
+    )
+    Kp: Annotated[float, Within(0.0, 1e12, "N/m, N, N.m/rad")] = Field(default=0.0, description="proportional gain")
+    Kd: Annotated[float, Within(0.0, 1e12, "N.s/m, N.s, N.m.s/rad")] = Field(default=0.0, description="derivative gain")
 
     @model_validator(mode="after")
     def _does_something(self) -> Self:

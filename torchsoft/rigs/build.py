@@ -126,7 +126,8 @@ def output_times(file: RigTables) -> Tensor:
 
 
 class RigFile(RigTables):
-    """A rig and its run, from a TOML file or made in Python."""
+    """A rig and its run. SI units throughout: m, kg, s, N, rad, Pa; 4.59e-3 is 4.59 mm. The model is planar: x to the right, y
+    upwards, theta anticlockwise."""
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:

@@ -28,8 +28,8 @@ class SmoothTable(Coefficients):
     """Stick and slip with a coefficient that falls smoothly from mu_s to mu_k."""
 
     kind: Literal["smooth"] = "smooth"
-    v_s: Annotated[float, Within(1e-9, 1e3, "m/s")] = Field(5e-3, description="slip speed over which it falls")
-    eta: Dashpot = Field(10.0, description="viscosity of the slip element")
+    v_s: Annotated[float, Within(1e-9, 1e3, "m/s")] = Field(default=5e-3, description="slip speed over which it falls")
+    eta: Dashpot = Field(default=10.0, description="viscosity of the slip element")
 
     def build(self) -> SlipLaw:
         return SmoothSlip(self.mu_s, self.mu_k, self.v_s, self.eta)
@@ -55,9 +55,9 @@ class LawTable(Group):
     K_t: Stiffness = Field(description="tangential spring, momentary: until the point slips")
     R_t: Dashpot = Field(description="tangential dashpot")
     epsilon: Annotated[float, Within(1e-12, 1e-2, "m")] = Field(
-        1e-6, description="depth over which dashpots and friction come in at touch-down"
+        default=1e-6, description="depth over which dashpots and friction come in at touch-down"
     )
-    node_spacing: Length = Field(1e-3, description="length of surface that the four numbers belong to")
+    node_spacing: Length = Field(default=1e-3, description="length of surface that the four numbers belong to")
     friction: FrictionTable
 
     @model_validator(mode="after")
@@ -83,7 +83,9 @@ class ContactTable(Group):
     pad: str = Field(description="name of one of the pads")
     body: str = Field(description="name of one of the bodies, with a shape")
     law: str = Field(description="name of one of the laws")
-    may_leave: bool = Field(False, description="true: the run goes on where the body leaves the space over the pad")
+    may_leave: bool = Field(
+        default=False, description="true: the run goes on where the body leaves the space over the pad"
+    )
 
     def build(self, laws: dict[str, SoftContact]) -> Contact:
         return Contact(self.pad, self.body, laws[self.law], may_leave=self.may_leave)

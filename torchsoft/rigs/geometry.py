@@ -88,6 +88,17 @@ def overlap(rig: Rig, one: str, other: str, pose: Poses) -> float:
         return -float(shape(torch.from_numpy(own))[0].min())
 
 
+def into(rig: Rig, body: str, pose: Poses, pad: Surface) -> float:
+    """How deep a body and an undeformed pad lie in each other [m]; negative where they are apart."""
+    shape, places = rig.bodies[body].shape, outline(rig, body, pose)
+    assert shape is not None
+    deep = pad.depth(places)
+    inside = np.minimum(np.minimum(deep, pad.height - deep), -pad.off(places)).max()
+    own = turned(pad.corners - pose[body][:2], -pose[body][2])
+    with torch.no_grad():
+        return max(float(inside), -float(shape(torch.from_numpy(own))[0].min()))
+
+
 def crossing(one: Array, other: Array) -> float:
     """How far two convex polygons (corners, 2), around, overlap along the direction in which they overlap least [m]."""
     least = np.inf

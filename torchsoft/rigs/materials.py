@@ -16,9 +16,11 @@ class Elastic(Group):
     """What every material has."""
 
     E: Modulus = Field(description="Young's modulus, relaxed; rubber has 0.1e6 to 10e6")
-    nu: Annotated[float, Within(-0.999, 0.4999)] = Field(0.45, description="Poisson's ratio")
+    nu: Annotated[float, Within(-0.999, 0.4999)] = Field(default=0.45, description="Poisson's ratio")
     depth: Length = Field(description="how deep the pads are, out of the plane")
-    rho: Annotated[float, Within(1e-3, 1e6, "kg/m3")] = Field(1100.0, description="density, of inertial pads only")
+    rho: Annotated[float, Within(1e-3, 1e6, "kg/m3")] = Field(
+        default=1100.0, description="density, of inertial pads only"
+    )
 
 
 class KelvinVoigtTable(Elastic):
@@ -37,7 +39,7 @@ class StandardLinearSolidTable(Elastic):
     kind: Literal["standard_linear_solid"] = "standard_linear_solid"
     E_instant: Modulus = Field(description="Young's modulus at first, above E")
     tau: Retardation = Field(description="retardation time")
-    tau_instant: Retardation = Field(1e-4, description="retardation time of the first spring, small")
+    tau_instant: Retardation = Field(default=1e-4, description="retardation time of the first spring, small")
 
     def build(self) -> Material:
         return StandardLinearSolid(

@@ -66,7 +66,7 @@ class HoldTable(Motion):
     """Stays where it is."""
 
     kind: Literal["hold"] = "hold"
-    value: Value = Field(START, description=f'"{START}": where the coordinate that follows starts')
+    value: Value = Field(default=START, description=f'"{START}": where the coordinate that follows starts')
 
     def build(self, asked: Asked) -> Piecewise:
         return Profile([0.0], [asked.value("value", self.value)])
@@ -119,11 +119,13 @@ class SplineTable(Knots):
 class Wavy(Knots):
     """Waves on top of a profile, from `since` to `until`, where they come and go."""
 
-    times: Times = Field((0.0,), description="of the profile that the waves are added to [s]")
-    values: Values = Field((START,), description=f'of the profile; "{START}": where the coordinate that follows starts')
-    since: Time = Field(0.0, description="when the waves begin; they come within 0.15 s")
+    times: Times = Field(default=(0.0,), description="of the profile that the waves are added to [s]")
+    values: Values = Field(
+        default=(START,), description=f'of the profile; "{START}": where the coordinate that follows starts'
+    )
+    since: Time = Field(default=0.0, description="when the waves begin; they come within 0.15 s")
     until: Time | None = Field(
-        None, description="when they have gone, again within 0.15 s; the end of the run if not given"
+        default=None, description="when they have gone, again within 0.15 s; the end of the run if not given"
     )
 
     def window(self, asked: Asked) -> tuple[float, float]:
@@ -146,7 +148,7 @@ class ComponentTable(Group):
 
     amplitude: Annotated[float, Within(-1e6, 1e6, "m, rad, N or N.m")] = Field(description="amplitude")
     frequency: Frequency = Field(description="frequency")
-    phase: Annotated[float, Within(-1e3, 1e3, "rad")] = Field(0.0, description="phase")
+    phase: Annotated[float, Within(-1e3, 1e3, "rad")] = Field(default=0.0, description="phase")
 
 
 class SinesTable(Wavy):
@@ -188,7 +190,9 @@ class CsvTable(Motion):
     kind: Literal["csv"] = "csv"
     file: str = Field(description="the file, from the folder of this one")
     column: str = Field(description="the column's name, without its unit")
-    offset: Value = Field(0.0, description=f'what is added; "{START}": where the coordinate that follows starts')
+    offset: Value = Field(
+        default=0.0, description=f'what is added; "{START}": where the coordinate that follows starts'
+    )
 
     def build(self, asked: Asked) -> Piecewise:
         try:

@@ -15,15 +15,19 @@ class OutputsTable(Group):
     """How long the run lasts, and what is written."""
 
     duration: Annotated[float, Within(1e-3, 1e5, "s")] = Field(description="of the run")
-    interval: Annotated[float, Within(1e-6, 1e3, "s")] = Field(0.01, description="between outputs")
-    figures: bool = Field(True, description="write the figures")
+    interval: Annotated[float, Within(1e-6, 1e3, "s")] = Field(default=0.01, description="between outputs")
+    figures: bool = Field(default=True, description="write the figures")
     snapshots: Annotated[tuple[Time, ...], LISTED, Field(max_length=12)] = Field(
-        (), description="times of the pictures in snapshots.png; six over the whole run if none is given [s]"
+        default=(), description="times of the pictures in snapshots.png; six over the whole run if none is given [s]"
     )
-    video: Literal["gif", "mp4", "none"] = Field("gif", description="kind of the video; mp4 needs imageio-ffmpeg")
-    frames: Annotated[int, Field(ge=2, le=10_000)] = Field(150, description="pictures of the video, 12 a second")
+    video: Literal["gif", "mp4", "none"] = Field(
+        default="gif", description="kind of the video; mp4 needs imageio-ffmpeg"
+    )
+    frames: Annotated[int, Field(ge=2, le=10_000)] = Field(
+        default=150, description="pictures of the video, 12 a second"
+    )
     follow: str = Field(
-        "", description='coordinate under the video, such as "disc.x"; the one that moves most if not given'
+        default="", description='coordinate under the video, such as "disc.x"; the one that moves most if not given'
     )
 
     @model_validator(mode="after")
@@ -40,14 +44,18 @@ class OutputsTable(Group):
 class SolverTable(Group):
     """How steps are chosen: by tolerance, or equal ones."""
 
-    rtol: Annotated[float, Within(1e-9, 1e-1)] | None = Field(None, description="relative tolerance; 1e-5 if not given")
+    rtol: Annotated[float, Within(1e-9, 1e-1)] | None = Field(
+        default=None, description="relative tolerance; 1e-5 if not given"
+    )
     atol: Annotated[float, Within(1e-12, 1.0)] | None = Field(
-        None, description="absolute tolerance, in N, mm and rad; a tenth of rtol if not given"
+        default=None, description="absolute tolerance, in N, mm and rad; a tenth of rtol if not given"
     )
     step: Annotated[float, Within(1e-7, 1.0, "s")] | None = Field(
-        None, description="equal steps no longer than this instead"
+        default=None, description="equal steps no longer than this instead"
     )
-    tolerance: Annotated[float, Within(1e-10, 1e-3, "N")] = Field(1e-9, description="Newton's, on every nodal force")
+    tolerance: Annotated[float, Within(1e-10, 1e-3, "N")] = Field(
+        default=1e-9, description="Newton's, on every nodal force"
+    )
 
     @model_validator(mode="after")
     def _choose_once(self) -> Self:

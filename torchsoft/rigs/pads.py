@@ -23,22 +23,26 @@ class PadTable(Group):
         description="finite elements along it; 1 mm each is usual"
     )
     elements_y: Annotated[int, Field(ge=1, le=1000)] = Field(description="finite elements through it")
-    base: str | None = Field(None, description="name of the body that it is bonded to; the ground if not given")
+    base: str | None = Field(default=None, description="name of the body that it is bonded to; the ground if not given")
     origin: Annotated[tuple[Place, Place], LISTED] = Field(
-        (0.0, 0.0), description="its corner, in the base's own frame [m]"
+        default=(0.0, 0.0), description="its corner, in the base's own frame [m]"
     )
-    angle: Angle = Field(0.0, description="by which it is turned about the corner, anticlockwise")
-    mirrored: bool = Field(False, description="upside down: its free surface faces down (before it is turned)")
-    bonded_sides: bool = Field(False, description="bonded at both ends as well")
-    inertial: bool = Field(False, description="with mass at every node; true costs time and changes next to nothing")
+    angle: Angle = Field(default=0.0, description="by which it is turned about the corner, anticlockwise")
+    mirrored: bool = Field(default=False, description="upside down: its free surface faces down (before it is turned)")
+    bonded_sides: bool = Field(default=False, description="bonded at both ends as well")
+    inertial: bool = Field(
+        default=False, description="with mass at every node; true costs time and changes next to nothing"
+    )
     points: Annotated[int, Field(ge=0, le=8)] = Field(
-        0, description="contact points an element; 0 puts one on every node"
+        default=0, description="contact points an element; 0 puts one on every node"
     )
 
     @model_validator(mode="after")
     def _fits_in_memory(self) -> Self:
-        counts = {"elements_x": max(4, self.elements_x), "elements_y": self.elements_y}
-        need = PadParameters(**counts, fidelity="inertial" if self.inertial else "massless").memory
+        need = PadParameters(
+            elements_x=max(4, self.elements_x), elements_y=self.elements_y,
+            fidelity="inertial" if self.inertial else "massless",
+        ).memory  # fmt: skip
         if need > MEMORY:
             raise ValueError(
                 f"elements_x = {self.elements_x} by elements_y = {self.elements_y} take about {need:.3g} GiB of memory, but "

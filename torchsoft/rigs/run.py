@@ -11,6 +11,7 @@ from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import Ready, RigFile
 from torchsoft.rigs.check import Finding
 from torchsoft.rigs.pictures import draw
+from torchsoft.solve.ledger import doubts
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import Interrupted, simulate
 from torchsoft.solve.trajectory import Trajectory
@@ -92,6 +93,7 @@ def summary(file: RigFile, done: Done, found: list[Finding]) -> dict[str, Any]:
             "worst_imbalance_J": float(run.energy_residual.abs().max()),
             "worst_imbalance_over_injected": run.energy_residual_rel,
         },
+        "doubts": list(doubts(run, rig)),
         "stepping": vars(run.stats) | {"newton_per_step": run.stats.newton_per_step},
         "findings": [one._asdict() for one in found],
         "torchsoft": version("torchsoft"),

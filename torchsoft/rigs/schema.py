@@ -25,11 +25,10 @@ TAKEN = frozenset(dir(nn.ModuleDict()))
 
 
 class RigTables(Group):
-    """A rig and its run. SI units throughout: m, kg, s, N, rad, Pa. The model is planar: x to the right, y upwards, theta
-    anticlockwise."""
+    """What a rig and its run consist of, and whether it fits together by its names."""
 
-    title: str = Field("", description="what it is")
-    gravity: Annotated[float, Within(0.0, 1e3, "m/s2")] = Field(9.81, description="acts downwards")
+    title: str = Field(default="", description="what it is")
+    gravity: Annotated[float, Within(0.0, 1e3, "m/s2")] = Field(default=9.81, description="acts downwards")
     bodies: dict[str, BodyTable] = Field(min_length=1)
     materials: dict[str, MaterialTable] = Field(min_length=1)
     pads: dict[str, PadTable] = Field(min_length=1)

@@ -3,8 +3,6 @@
 Every error is a `ValueError` in a sentence that names the file, the row and the column.
 """
 
-import csv
-import math
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,10 +12,11 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from torchsoft import csvfile
 from torchsoft.channels import CHANNELS, FEED_FORWARD, MEASURED, SETPOINTS, UNITS, VARIABLES
 from torchsoft.solve.trajectory import load
 from torchsoft.sysid.recording import Array
-from torchsoft.tables import line, shown
+from torchsoft.tables import shown
 
 COLUMNS = ("t", *SETPOINTS, *FEED_FORWARD, *MEASURED)
 """Names that a column may have."""
@@ -148,29 +147,6 @@ def read_table(path: Path, ignore: Collection[str] = ()) -> Columns:
     return read_trajectory(path, ignore) if path.suffix in (".nc", ".h5") else read_csv(path, ignore)
 
 
-def heading(path: Path, cells: Sequence[str], ignore: Collection[str] = ()) -> list[tuple[str, float] | None]:
-    """Name of each column, and what its unit is in SI; None for those left out. Raises `ValueError` naming the column."""
-    out: list[tuple[str, float] | None] = []
-    for cell in cells:
-        match = re.fullmatch(r"\s*([^\[\]]*?)\s*(?:\[\s*([^\[\]]*?)\s*\])?\s*", cell)
-        name, unit = (match[1], match[2]) if match else (cell.strip(), None)
-        where = f"{path}, row 1, column `{line(name, 80)}`"
-        if name in ignore:
-            out.append(None)
-            continue
-        if name not in COLUMNS:
-            raise ValueError(f"{where} is not known{hint(name, len(cells))}")
-        known = UNITS[CHANNELS[name].unit]
-        if unit is None:
-            raise ValueError(f"{where} has no unit: write `{name} [{next(iter(known))}]`")
-        if unit not in known:
-            raise ValueError(f"{where} cannot be in {shown(unit)}; it can be in {', '.join(known)}")
-        if name in (one[0] for one in out if one):
-            raise ValueError(f"{where} is there twice")
-        out.append((name, known[unit]))
-    return out
-
-
 def hint(name: str, columns: int) -> str:
     """What helps with a column that is not known: the nearest name, and how to leave it out."""
     known = f"columns are {', '.join(COLUMNS)}, each with its unit in brackets"
@@ -184,44 +160,8 @@ def hint(name: str, columns: int) -> str:
 
 def read_csv(path: Path, ignore: Collection[str] = ()) -> Columns:
     """A table of numbers under `name [unit]`. Raises `ValueError` naming the row (the heading is row 1) and the column."""
-    values: list[list[float]] = []
-    rows: list[int] = []
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            first = next(reader, [])
-            head = heading(path, first, ignore)
-            for cells in reader:
-                if not any(cell.strip() for cell in cells):
-                    continue
-                row = reader.line_num
-                if len(cells) != len(head):
-                    raise ValueError(f"{path}, row {row} has {len(cells)} cells, but there are {len(head)} columns")
-                rows.append(row)
-                used = [(*one, cell) for one, cell in zip(head, cells) if one]
-                values.append([number(path, row, name, cell) * unit for name, unit, cell in used])
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path} is not a CSV file in UTF-8: {line(error)}") from None
-    names = [one[0] for one in head if one]
-    columns = np.array(values).reshape(len(rows), len(names)).T
-    left_out = tuple(cell.partition("[")[0].strip() for cell, one in zip(first, head) if one is None)
-    return check_table(Columns(path, dict(zip(names, columns)), rows, ignored=left_out))
-
-
-def number(path: Path, row: int, column: str, cell: str) -> float:
-    """A finite number, or NaN for an empty cell."""
-    if not (text := cell.strip()):
-        return math.nan
-    try:
-        value = float(text) if text.isascii() and "_" not in text else math.nan
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise ValueError(
-            f"{path}, row {row}, column `{column}`: {shown(text)} is not a finite number; leave the cell empty "
-            "where a sample is missing"
-        )
-    return value
+    table = csvfile.read(path, {name: UNITS[CHANNELS[name].unit] for name in COLUMNS}, hint, ignore)
+    return check_table(Columns(path, table.values, table.rows, ignored=table.ignored))
 
 
 def read_trajectory(path: Path, ignore: Collection[str] = ()) -> Columns:
