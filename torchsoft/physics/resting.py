@@ -92,7 +92,7 @@ def resting(rig: Rig, pose: Mapping[str, Tensor], residual: float = RESIDUAL) ->
         with torch.enable_grad():
             x = q.detach().requires_grad_(True)
             F = loads(x)
-            rows = [torch.autograd.grad(one, x, retain_graph=True, allow_unused=True)[0] for one in F]
+            rows = [torch.autograd.grad(one, x, retain_graph=True)[0] if one.requires_grad else None for one in F]
         F, K = F.detach(), -torch.stack([torch.zeros_like(q) if row is None else row for row in rows])
         size = float(F.norm())
         if size * softest <= residual:

@@ -4,7 +4,7 @@ from typing import Annotated, Self
 
 from pydantic import Field, model_validator
 
-from torchsoft.physics.parts import PD, Actuator
+from torchsoft.physics.parts import PD, Actuator, ReversedPD
 from torchsoft.rigs.fields import Group, Within
 
 
@@ -25,6 +25,10 @@ class ActuatorTable(Group):
     Kp: Annotated[float, Within(0.0, 1e12, "N/m, N, N.m/rad")] = Field(default=0.0, description="proportional gain")
     Kd: Annotated[float, Within(0.0, 1e12, "N.s/m, N.s, N.m.s/rad")] = Field(default=0.0, description="derivative gain")
 
+    reversed: bool = Field(
+        default=False, description="the loop pushes the other way, for a q that falls where the pushed coordinate rises"
+    )
+
     @model_validator(mode="after")
     def _does_something(self) -> Self:
         if self.setpoint is None and (self.Kp or self.Kd):
@@ -42,6 +46,7 @@ class ActuatorTable(Group):
     def build(self) -> Actuator:
         followed = self.setpoint or self.feed_forward  # without gains it does not matter which signal is the set-point
         assert followed is not None
+        law = ReversedPD(self.Kp, self.Kd) if self.reversed else PD(self.Kp, self.Kd)
         return Actuator(
-            self.measured, self.pushes, PD(self.Kp, self.Kd), setpoint=followed, feed_forward=self.feed_forward
+            self.measured, self.pushes, law, setpoint=followed, feed_forward=self.feed_forward
         )  # fmt: skip

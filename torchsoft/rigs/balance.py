@@ -1,8 +1,10 @@
 """What comes of a rig in balance at some moments of its motions: room, strains, modes and steps, friction."""
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
+import networkx as nx
 import numpy as np
 import torch
 from torch import Tensor
@@ -12,10 +14,11 @@ from torchsoft.physics.equilibrium import NoEquilibrium
 from torchsoft.physics.motion import Reference, hold
 from torchsoft.physics.resting import massless, standing
 from torchsoft.physics.rig import Rig
-from torchsoft.rigs.build import Ready, RigFile, assemble
-from torchsoft.rigs.course import Course, Estimate, signals
+from torchsoft.rigs.build import Ready, RigFile
+from torchsoft.rigs.course import Course, Estimate, at, signals
 from torchsoft.rigs.finding import Finding
-from torchsoft.rigs.geometry import facing, pressed, surface
+from torchsoft.rigs.geometry import facing, pressed, surface, tied
+from torchsoft.rigs.motion import ProfileTable
 from torchsoft.solve.kernel.run import PASSED
 from torchsoft.solve.ledger import COMPRESSED
 from torchsoft.solve.stability import NEUTRAL, Modes, modes
@@ -27,8 +30,14 @@ and the stress of rubber leaves the straight line of small strains by some ten p
 MOMENTS = 5
 """Times at which the rig is brought into balance, at the most."""
 
+NEAR = 1e-4
+"""A gap [m] that loops close before what they measure has gone anywhere."""
+
 STEPS_PER_PERIOD = 5
-"""Steps that a period of an oscillation needs at the least: 2 ms for the paper's, 4e-3 of its forces off."""
+"""Steps that a period of an oscillation needs at the least."""
+
+STEPS_PER_PROFILE = 20
+"""Steps from one value of a profile to the next at the least."""
 
 
 class Moment(NamedTuple):
@@ -116,34 +125,46 @@ def strains(rig: Rig, there: list[Moment]) -> Iterator[Finding]:
 
 
 def swings(file: RigFile, rig: Rig, there: list[Moment]) -> Iterator[Finding]:
-    """Loops that are unstable, and steps that are too long. What goes off as fast without any loop is no loop's fault: a disc
-    on the top of a node rolls off it."""
-    fastest, least, passive = 0.0, (complex("-inf"), 0.0), massless(assemble(file, loops=()))
+    """Loops that are unstable or not tied to what they measure, and steps that are too long. What goes off where no loop
+    reaches is no loop's fault: a disc on the top of a node rolls off it."""
+    loops = {name: one for name, one in file.actuators.items() if one.setpoint is not None}
+    fastest, least = 0.0, (complex("-inf"), 0.0)
     for moment in there:
-        if grazing(rig, moment):
-            continue
+        depth = depths(rig, moment)
+        if any(0 < deep < float(rig.contacts[key].law.epsilon) for key, deep in depth.items()):
+            continue  # it only just touches, which it does not for long
+        ties = tied(rig, [key for key, deep in depth.items() if deep > -NEAR])
+        for name, one in loops.items():
+            (measured, _), (pushed, _) = at(one.measured), at(one.pushes)
+            if not nx.has_path(ties, measured, pushed):
+                yield Finding(
+                    "warning", f"actuators.{name}",
+                    f"at t = {moment.time:.3g} s nothing that touches ties {one.measured}, which it measures, to {one.pushes}: "
+                    f"what `{measured}` does by itself drives `{pushed}` away; start where they touch, or measure {one.pushes}",
+                )  # fmt: skip
         found = modes(rig, moment.y, moment.reference)
         swinging = found.values[found.values.imag.abs() > found.values.real.abs()].imag.abs()
         fastest = max(fastest, float(swinging.max()) if len(swinging) else 0.0)
-        leads = float(found.values[0].real)
-        if leads > NEUTRAL and leads > 2 * float(modes(passive, moment.y, moment.reference).values[0].real):
+        reached = nx.node_connected_component(ties, found.moves.partition(".")[0])
+        if float(found.values[0].real) > NEUTRAL and any(
+            at(coordinate)[0] in reached for one in loops.values() for coordinate in (one.measured, one.pushes)
+        ):
             yield unstable(file, found, moment.time)
             return
         decaying = found.values[found.values.real < -NEUTRAL]
         if len(decaying) and float(decaying[0].real) > least[0].real:
             least = complex(decaying[0]), moment.time
-    if file.actuators and np.isfinite(least[0].real):
+    if loops and np.isfinite(least[0].real):
         yield Finding(
             "note", "actuators", f"stable; the mode that lasts longest is {shown(least[0])}, at t = {least[1]:.3g} s"
         )
     yield from steps(file, fastest, flight(file, rig, there[0].pose))
 
 
-def grazing(rig: Rig, moment: Moment) -> bool:
-    """Whether a contact only just touches: what it ties, it does not tie for long."""
+def depths(rig: Rig, moment: Moment) -> dict[str, float]:
+    """How deep the deepest point of each contact is in the body [m]; negative where they are apart."""
     state = rig.unpack(moment.y, rig.follow(0.0, moment.reference))
-    deepest = {key: float(rig.penetration(key, state).max()) for key in rig.contacts}
-    return any(0 < deep < float(rig.contacts[key].law.epsilon) for key, deep in deepest.items())
+    return {key: float(rig.penetration(key, state).max()) for key in rig.contacts}
 
 
 def slips(file: RigFile, rig: Rig, there: list[Moment]) -> Iterator[Finding]:
@@ -189,6 +210,15 @@ def flight(file: RigFile, rig: Rig, pose: Course) -> float:
 def steps(file: RigFile, fastest: float, flies: float) -> Iterator[Finding]:
     """Equal steps that are too long for the rig's modes, its motions, or a body that comes flying."""
     step = file.solver.step
+    for name, motion in file.motion.items():
+        if step is not None and isinstance(motion, ProfileTable) and len(motion.times) > 1:
+            span = min(b - a for a, b in pairwise(motion.times))
+            if step * STEPS_PER_PROFILE > span:
+                yield Finding(
+                    "warning", "solver.step",
+                    f"steps of {step:g} s are too coarse: motion.{name} goes from value to value within {span:g} s; take "
+                    f"{span / STEPS_PER_PROFILE:.2g} s or less, or leave step out and let rtol choose",
+                )  # fmt: skip
     causes = {f"a mode of the rig swings with {fastest:.3g} rad/s": fastest}
     causes |= {f"motion.{k} goes up to {m.fastest():g} Hz": 2 * np.pi * m.fastest() for k, m in file.motion.items()}
     if step is not None and flies * step > PASSED:

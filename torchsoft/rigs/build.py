@@ -145,10 +145,12 @@ class RigFile(RigTables):
 
     def override(self, **groups: dict[str, Any]) -> Self:
         """Another file with some fields replaced: `override(outputs={"duration": 0.1}, pads={"lower": {"elements_x": 30}})`.
-        Raises `ValueError`."""
+        A table of another kind replaces the whole of the old one. Raises `ValueError`."""
 
         def merged(old: Any, new: Any) -> Any:
-            if not (isinstance(old, dict) and isinstance(new, dict)):
+            if not (isinstance(old, dict) and isinstance(new, dict)) or new.get("kind", old.get("kind")) != old.get(
+                "kind"
+            ):
                 return new
             return old | {key: merged(old.get(key), value) for key, value in new.items()}
 

@@ -11,11 +11,8 @@ from torchsoft.rigs.balance import at_moments
 from torchsoft.rigs.build import Ready, RigFile
 from torchsoft.rigs.course import Estimate, at, signals
 from torchsoft.rigs.finding import SEVERITIES, Finding
-from torchsoft.rigs.geometry import crossing, into, overlap, pressed, surface
+from torchsoft.rigs.geometry import TOUCH, crossing, into, overlap, pressed, surface, tied
 from torchsoft.rigs.motion import CsvTable
-
-TOUCH = 1e-6
-"""Depth [m] up to which things that touch do not overlap."""
 
 JUMP = {"m": 1e-4, "rad": 1e-2}
 """How far a set-point may be from its coordinate at the start without a warning."""
@@ -36,7 +33,7 @@ def check(file: RigFile) -> list[Finding]:
         return [Finding("error", field, sentence)]
     estimate = Estimate(file, ready)
     found = [
-        *ties(file), *recordings(file, ready), *jumps(file, ready, estimate), *carried(file, ready, estimate),
+        *ties(file, ready.rig), *recordings(file, ready), *jumps(file, ready, estimate), *carried(file, ready, estimate),
         *overlaps(ready.rig, estimate),
     ]  # fmt: skip
     if not any(one.severity == "error" for one in found):
@@ -44,13 +41,9 @@ def check(file: RigFile) -> list[Finding]:
     return sorted(found, key=lambda one: SEVERITIES.index(one.severity))
 
 
-def ties(file: RigFile) -> Iterator[Finding]:
+def ties(file: RigFile, rig: Rig) -> Iterator[Finding]:
     """Loops that measure a body which they cannot move."""
-    graph = nx.Graph()
-    graph.add_nodes_from(file.bodies)
-    graph.add_edges_from(
-        (file.pads[one.pad].base, one.body) for one in file.contacts.values() if file.pads[one.pad].base is not None
-    )
+    graph = tied(rig, rig.contacts)
     for name, actuator in file.actuators.items():
         (measured, _), (pushed, _) = at(actuator.measured), at(actuator.pushes)
         if actuator.setpoint is not None and not nx.has_path(graph, measured, pushed):

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, model_validator
 from pydantic_core import CoreSchema, core_schema
@@ -67,6 +67,13 @@ class Group(Table):
                     meant = f"is it `{near[0]}`?" if near else f"known are {', '.join(cls.model_fields)}"
                     raise ValueError(f"`{key}` is not known here; {meant}")
         return data
+
+    @model_validator(mode="after")
+    def _has_its_kind(self) -> Self:
+        """A kind counts as given, also where a class says it: files need it."""
+        if "kind" in type(self).model_fields:
+            self.__pydantic_fields_set__.add("kind")
+        return self
 
 
 Length = Annotated[float, Within(1e-6, 10.0, "m")]

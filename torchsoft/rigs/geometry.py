@@ -1,8 +1,9 @@
 """Where things are: surfaces of pads and outlines of bodies in the world, gaps and overlaps, without any elasticity."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
+import networkx as nx
 import numpy as np
 import torch
 
@@ -12,6 +13,9 @@ from torchsoft.physics.rig import Rig
 
 FACING = -0.9
 """Product of two surfaces' normals below which they face each other."""
+
+TOUCH = 1e-6
+"""Depth [m] up to which things that touch do not overlap."""
 
 Poses = Mapping[str, Array]
 """Poses (3,) [m, m, rad] by body."""
@@ -108,6 +112,17 @@ def crossing(one: Array, other: Array) -> float:
             a, b = one @ n, other @ n
             least = min(least, a.max() - b.min(), b.max() - a.min())
     return float(least)
+
+
+def tied(rig: Rig, contacts: Iterable[str]) -> nx.Graph:
+    """Bodies, with an edge where one of the contacts is between a body and a pad of the other; the ground ties nothing."""
+    graph = nx.Graph()
+    graph.add_nodes_from(rig.bodies)
+    for key in contacts:
+        base = rig.pads[rig.contacts[key].pad].base
+        if base is not None:
+            graph.add_edge(base, rig.contacts[key].body)
+    return graph
 
 
 def facing(rig: Rig, body: str, pose: Poses) -> list[tuple[str, str]]:

@@ -10,7 +10,7 @@ import torch
 import xarray as xr
 from torch import Tensor
 
-from torchsoft.channels import PADS, VARIABLES
+from torchsoft.channels import MEASURED, PADS, VARIABLES
 from torchsoft.files import replacing, sealed, unsealed
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
@@ -99,7 +99,8 @@ class Trajectory:
         """The run as an xarray Dataset with named dimensions, units, and how it was made."""
         columns: dict[str, tuple[tuple[str, ...], Tensor, str, str]] = {}
         left = dict(self.channels)
-        for name, variable in VARIABLES.items():
+        papers = all(name in left for name in MEASURED)  # another rig may call by these names what is something else
+        for name, variable in VARIABLES.items() if papers else ():
             keys = list(variable.symbols)
             if all(key in left for key in keys):
                 parts = [left.pop(key) for key in keys]
