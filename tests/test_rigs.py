@@ -458,16 +458,15 @@ def test_run_writes_everything(small: Path, tmp_path: Path, capsys: Any) -> None
 
 def test_what_is_wrong_is_not_run_unless_it_is_meant(small: Path, tmp_path: Path, capsys: Any) -> None:
     path = tmp_path / "wrong.toml"
-    deep = {"times": (0.0, 0.05), "values": ("start", 43e-3)}
-    wrong = changed(RigFile.from_toml(small), motion__y_d=deep, outputs__video="none")
+    wrong = changed(RigFile.from_toml(small), bodies__stone=STONE, outputs__video="none")
     path.write_text(to_toml(changed(wrong, outputs__figures=False)), encoding="utf-8")
     assert main(["check", str(path)]) == 2
-    assert "`disc` does not fit" in capsys.readouterr().out
+    assert "error: bodies.disc: it and bodies.stone overlap" in capsys.readouterr().out
     assert main(["run", str(path), "--out", str(tmp_path / "out"), "--no-progress"]) == 2
     assert "wrong.toml is not run; mend what is wrong, or say --anyway" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     assert main(["run", str(path), "--out", str(tmp_path / "out"), "--no-progress", "--anyway"]) == 0
-    assert "beyond linear elasticity" in capsys.readouterr().err
+    assert "bodies.stone overlap" in capsys.readouterr().err
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"trajectory.nc", "summary.json"}
 
 

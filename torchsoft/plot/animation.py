@@ -21,7 +21,20 @@ from torchsoft.physics.mesh import Array
 from torchsoft.physics.rig import Rig
 from torchsoft.plot.figures import ACTUAL, DESIRED, STYLE, timeline
 from torchsoft.plot.general import Curve, curves
-from torchsoft.plot.scene import FRICTION, INK, NORMAL, Instant, Scene, force_scale, instants
+from torchsoft.plot.scene import (
+    DISC,
+    FRICTION,
+    INK,
+    LAYER,
+    NORMAL,
+    PAD,
+    STEEL,
+    Instant,
+    Scene,
+    force_scale,
+    instants,
+    outwards,
+)
 from torchsoft.solve.trajectory import Trajectory
 
 FRAMES_PER_SECOND = 12
@@ -66,7 +79,7 @@ def set_stage(trajectory: Trajectory, rig: Rig, shown: Sequence[Instant], dpi: i
     whole.set_title(title)
     whole.grid(False)
     whole.plot([], [], "o-", color=NORMAL, ms=3, label="normal force")
-    whole.plot([], [], color=FRICTION, label="friction (outwards: to the right)")
+    whole.plot([], [], color=FRICTION, label=f"friction ({outwards(rig, shown[0])})")
     whole.legend(loc="lower left")
     t = timeline(strip, follow.label, trajectory)
     if follow.setpoint is not None:
@@ -132,7 +145,10 @@ def animate(
 def write_gif(pictures: Iterable[Picture], path: Path) -> None:
     """All pictures on the first one's palette, which keeps still areas identical and so the file small."""
     images = [Image.fromarray(picture) for picture in pictures]
-    palette = images[len(images) // 2].quantize(64)
+    middle = images[len(images) // 2].copy()
+    for i, colour in enumerate((NORMAL, FRICTION, PAD, LAYER, DISC, STEEL, ACTUAL)):  # few pixels have some of them
+        middle.paste(colour, (0, 12 * i, middle.width, 12 * (i + 1)))
+    palette = middle.quantize(96)
     reduced = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     pause = round(1000 / FRAMES_PER_SECOND)
     reduced[0].save(path, "GIF", save_all=True, append_images=reduced[1:], duration=pause, loop=0)

@@ -32,6 +32,7 @@ from torchsoft.plot.scene import (
     force_scale,
     in_world,
     instants,
+    outwards,
     own_axes,
     unit,
 )
@@ -261,7 +262,7 @@ def snapshots(
         axes.set_ylabel("y [mm]")
     first = grid.flat[0]
     handles = [first.plot([], [], "o-", color=NORMAL, ms=3)[0], first.plot([], [], color=FRICTION)[0]]
-    labels = ["normal force on the nodes", "friction on the pad (outwards: to the right)"]
+    labels = ["normal force on the nodes", f"friction on the pad ({outwards(rig, shown[0])})"]
     figure.legend(handles, labels, loc="outside lower center", ncols=min(2, columns))
     return figure
 

@@ -125,6 +125,12 @@ def along_surface(pad: Pad, base: Array) -> Array:
     return x if x[0] + 1e-6 * x[1] > 0 else -x
 
 
+def outwards(rig: Rig, instant: Instant) -> str:
+    """Where friction points that is drawn outwards."""
+    steep = any(abs(along_surface(pad, instant.base[name])[0]) < 0.7 for name, pad in rig.pads.items())
+    return "outwards: to the right or up" if steep else "outwards: to the right"
+
+
 def own_places(pad: Pad, base: Array, own: Array) -> Array:
     """Places (..., 2) [mm] in the pad's own frame, in the world [mm]."""
     return in_world(MM * pad.placed(own / MM), base)
@@ -166,7 +172,7 @@ def plates(rig: Rig) -> dict[str, float]:
             )  # the face's height over the base's centre
             if rig.bodies[pad.base].shape is not None:
                 out[name] = 0.0
-            elif behind > 0:
+            elif behind > 1e-6:
                 out[name] = behind
     thickest = max(out.values(), default=0.0) or 4 * unit(rig)
     return {name: out.get(name, thickest) for name in rig.pads}
