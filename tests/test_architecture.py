@@ -12,12 +12,12 @@ ROOT = Path(torchsoft.__file__).parent
 FLOWS = {
     "": """
         channels files threads tables csvfile parameters cost codegen physics solve scenario excitation processes plot
-        materials sysid reduced datasets cli __main__
+        materials rigs sysid reduced datasets cli __main__
     """,
     "codegen": "graph derivatives operations trace emit . invoke",
     "physics": """
         arguments mesh shapes contact retardation material pads motion multibond state parts condensed validity rig energy paper
-        equilibrium settled .
+        equilibrium settled resting .
     """,
     "physics.mesh": "element mesh compliance block fingertip file quads .",
     "physics.shapes": "shape area simple oval rounded closed contour .",
@@ -38,12 +38,16 @@ FLOWS = {
     "sysid.files": "columns configuration measured cost .",
     "sysid.report": "figures comparison_figure page sections report .",
     "sysid.design": "criterion knots planner design design_figure .",
+    "rigs": """
+        fields recorded shapes materials bodies pads contacts actuators motion outputs schema geometry build course finding
+        balance check written template pictures run .
+    """,
     "solve.kernel": """
         cache . arrays scratch linear inertia interface stage finish step taped run rates adjoint_pads adjoint tangent
     """,
 }
 """For every folder with layers its modules and folders from the top down; "." is what the folder's own file imports."""
-APART = ("plot", "materials", "sysid", "reduced", "datasets")
+APART = ("plot", "materials", "rigs", "sysid", "reduced", "datasets")
 """Folders over the engine; of these, only `plot` may be imported by another."""
 LONGEST = 350
 """Lines; a file that grows past them holds more than one idea."""
@@ -130,6 +134,13 @@ def test_the_kernels_know_no_law() -> None:
     own = {name for name in MODULES if layer(name, "solve") == "kernel"}
     for name in own:
         assert imports(MODULES[name]) <= own | {"files" if name == "solve.kernel.cache" else "codegen.invoke"}, name
+
+
+def test_rigs_are_drawn_in_one_room() -> None:
+    """Whatever else they do needs no matplotlib."""
+    drawing = {name for name, path in MODULES.items() if layer(name, "") == "rigs" and "plot" in
+               {layer(other, "") for other in imports(path)}}  # fmt: skip
+    assert drawing == {"rigs.pictures"}
 
 
 @pytest.mark.parametrize("folder", APART)

@@ -156,7 +156,7 @@ def test_any_rig_is_drawn_where_its_bodies_are(held: tuple[Rig, Trajectory]) -> 
     for mesh in instant.mesh.values():
         assert left <= mesh[..., 0].min() < mesh[..., 0].max() <= right
         assert low <= mesh[..., 1].min() < mesh[..., 1].max() <= high
-    assert len(axes.patches) == 3 + 2 + 2  # pads, bodies with a shape, plates behind floor and wall
+    assert len(axes.patches) == 3 + 2 + 3  # pads, bodies with a shape, plates behind the pads
 
 
 @pytest.mark.parametrize("name", ["snapshots", "force_distribution", "energy_balance", "multibond_graph"])

@@ -14,6 +14,7 @@ def test_the_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     for long, short in SHORTER.items():
         assert long in code
         code = code.replace(long, short)
+    (tmp_path / "rigs").symlink_to(README.parent / "rigs")
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     exec(code, names)

@@ -54,10 +54,17 @@ class Pad(nn.Module):
 
     def remeshed(self, finer: int, points: int) -> "Pad":
         """The same pad of `finer` times as many elements each way, with so many contact points an element."""
+        return self._again(self.mesh.refined(finer), self.inertial, points)
+
+    def condensed(self) -> "Pad":
+        """The same pad without inertia."""
+        return self._again(self.mesh, False, self.points)
+
+    def _again(self, mesh: Mesh, inertial: bool, points: int) -> "Pad":
         c, s = self.axes[:, 0].tolist()
         return Pad(
-            self.mesh.refined(finer), self.material, base=self.base, origin=(float(self.origin[0]), float(self.origin[1])),
-            angle=float(np.arctan2(s, c)), mirrored=float(self.axes.det()) < 0, inertial=self.inertial, points=points,
+            mesh, self.material, base=self.base, origin=(float(self.origin[0]), float(self.origin[1])),
+            angle=float(np.arctan2(s, c)), mirrored=float(self.axes.det()) < 0, inertial=inertial, points=points,
         )  # fmt: skip
 
     spread: Tensor

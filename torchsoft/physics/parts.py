@@ -94,6 +94,14 @@ class PD(nn.Module):
         return self.Kp * (w - q) + self.Kd * (w_dot - q_dot) + feed_forward
 
 
+class ReversedPD(PD):
+    """The same with the other sign, for a coordinate that falls where the one that is pushed rises: a bracket that goes to the
+    right turns a disc under it clockwise. Its feed-forward keeps the sign."""
+
+    def forward(self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor) -> Tensor:
+        return feed_forward - self.Kp * (w - q) - self.Kd * (w_dot - q_dot)
+
+
 class Actuator(nn.Module):
     """Measures one coordinate, such as "disc.x", and pushes one, such as "bracket.x", by a law.
 

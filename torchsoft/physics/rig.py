@@ -253,15 +253,14 @@ class Rig(nn.Module):
             u_dot = graph.ports[f"pad_{name}"].transformer.flow(graph.flows)
             if pad.inertial:
                 angle = self.base_motion(name, state)[0][..., 2]
-                pads[name], rates[name] = (
-                    u_dot,
-                    turned(effort[f"pad_{name}"], -angle[..., None]) / pad.masses()[:, None],
-                )
+                pads[name] = u_dot
+                rates[name] = turned(effort[f"pad_{name}"], -angle[..., None]) / pad.masses()[:, None]
             else:
                 f, (_, times) = graph.ports[f"pad_{name}"].effort, pad.material.chain()
                 pads[name] = (f[..., None, :, :] - state.pads[name]) / times[:, None, None]
         for name, body in self.bodies.items():
-            load = torch.cat((effort[name][..., 0, :], effort[f"{name}_spin"][..., 0, :]), -1)
+            force, moment = (effort.get(k, torch.zeros_like(graph.flows[k])) for k in (name, f"{name}_spin"))
+            load = torch.cat((force[..., 0, :], moment[..., 0, :]), -1)
             velocity[name] = load / torch.stack(body.masses)  # (17), (18)
         stretch = {name: interface.out[..., 2] for name, interface in graph.interfaces.items()}
         return self.pack(State(pads, stretch, state.velocity, rates, velocity))

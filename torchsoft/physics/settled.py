@@ -70,6 +70,8 @@ def _forces(rig: Rig, name: str, state: State) -> Tensor:
     pad = rig.pads[name]
     own = [key for key, contact in rig.contacts.items() if contact.pad == name]
     C, branches = pad.compliance(), pad.material.branches
+    if not own:
+        return torch.zeros(branches, pad.nodes, 2, dtype=torch.float64)
     points = torch.zeros(len(pad.point_nodes), 2, dtype=torch.float64)
 
     def force(u: Tensor) -> Tensor:

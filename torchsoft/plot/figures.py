@@ -32,6 +32,7 @@ from torchsoft.plot.scene import (
     force_scale,
     in_world,
     instants,
+    outwards,
     own_axes,
     unit,
 )
@@ -231,17 +232,21 @@ def force_distribution(trajectory: Trajectory, rig: Rig, time: float) -> Figure:
 
 
 @rc_context(STYLE)
-def snapshots(trajectory: Trajectory, rig: Rig, times: Sequence[float] = SNAPSHOTS) -> Figure:
+def snapshots(
+    trajectory: Trajectory, rig: Rig, times: Sequence[float] = SNAPSHOTS,
+    title: str = "Bodies, pads and contact forces over time (paper: Fig. 16)",
+) -> Figure:  # fmt: skip
     """Bodies, deformed pads and contact forces at `times` [s]; those after the end of the run are left out."""
     end = float(trajectory.t[-1]) + 1e-9
     shown = instants(rig, trajectory, [t for t in times if t <= end] or [end])
     columns = min(3, len(shown))
     rows = -(-len(shown) // columns)
-    figure = new_figure(
-        "Bodies, pads and contact forces over time (paper: Fig. 16)", 4.6 * columns + 0.4, 2.75 * rows + 0.9
-    )
-    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     curves = force_scale(rig, shown)
+    (left, right), (low, high) = Scene(Figure().subplots(), rig, curves=curves).limits(shown)
+    tall = min(max((high - low) / (right - left), 0.3), 1.5)
+    width = 4.6 if tall < 0.75 else 3.4
+    figure = new_figure(title, width * columns + 0.4, (0.9 * width * tall + 0.3) * rows + 0.9)
+    grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for axes, instant, letter in zip(grid.flat, shown, "abcdefghijklmnopqrstuvwxyz"):
         scene = Scene(axes, rig, columns=5, curves=curves)
         scene.show(instant)
@@ -257,7 +262,7 @@ def snapshots(trajectory: Trajectory, rig: Rig, times: Sequence[float] = SNAPSHO
         axes.set_ylabel("y [mm]")
     first = grid.flat[0]
     handles = [first.plot([], [], "o-", color=NORMAL, ms=3)[0], first.plot([], [], color=FRICTION)[0]]
-    labels = ["normal force on the nodes", "friction on the pad (outwards: to the right)"]
+    labels = ["normal force on the nodes", f"friction on the pad ({outwards(rig, shown[0])})"]
     figure.legend(handles, labels, loc="outside lower center", ncols=min(2, columns))
     return figure
 

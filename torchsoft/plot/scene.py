@@ -133,6 +133,12 @@ def along_surface(pad: Pad, base: Array) -> Array:
     return x if x[0] + 1e-6 * x[1] > 0 else -x
 
 
+def outwards(rig: Rig, instant: Instant) -> str:
+    """Where friction points that is drawn outwards."""
+    steep = any(abs(along_surface(pad, instant.base[name])[0]) < 0.7 for name, pad in rig.pads.items())
+    return "outwards: to the right or up" if steep else "outwards: to the right"
+
+
 def own_places(pad: Pad, base: Array, own: Array) -> Array:
     """Places (..., 2) [mm] in the pad's own frame, in the world [mm]."""
     return in_world(MM * pad.placed(own / MM), base)
@@ -164,14 +170,18 @@ def force_scale(rig: Rig, shown: Sequence[Instant]) -> tuple[float, float]:
 
 
 def plates(rig: Rig) -> dict[str, float]:
-    """Thickness [mm] of the plate behind each pad: symmetric about its base's centre, none on a base that has a shape."""
+    """Thickness [mm] of the plate behind each pad: symmetric about its base's centre, none on a base that has a shape, that of
+    the others where the centre is not behind the pad."""
     out = {}
     for name, pad in rig.pads.items():
         if pad.base is not None:
             behind = (
                 2 * MM * float((pad.placed(np.zeros(2)) @ pad.axes.numpy())[1])
             )  # the face's height over the base's centre
-            out[name] = max(behind, 0.0) if rig.bodies[pad.base].shape is None else 0.0
+            if rig.bodies[pad.base].shape is not None:
+                out[name] = 0.0
+            elif behind > 1e-6:
+                out[name] = behind
     thickest = max(out.values(), default=0.0) or 4 * unit(rig)
     return {name: out.get(name, thickest) for name in rig.pads}
 
@@ -261,7 +271,9 @@ class Scene:
         """Limits of x and y [mm] that hold every instant shown, with the force curves behind the pads."""
         step, rows = unit(self.rig), []
         for instant in shown:
-            rows += [in_world(outline, instant.pose[k]) for k, outline in self.shapes.items()]
+            for k, outline in self.shapes.items():
+                around = in_world(outline, instant.pose[k])
+                rows += [around - 2.0 * step, around + 2.0 * step]
             for k, mesh in instant.mesh.items():
                 depth = self.thickness[k] + (curve_height(self.rig) + 7.0 * step if self.curves else 4.0 * step)
                 rows += [mesh.reshape(-1, 2), self.behind(instant, k, 4.0 * step, depth)]

@@ -25,7 +25,7 @@ from torchsoft.solve.progress import Progress, SimulationFailed
 from torchsoft.solve.stability import describe_instability
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
 from torchsoft.solve.system import independent
-from torchsoft.solve.trajectory import Stats, Trajectory, channels
+from torchsoft.solve.trajectory import Stats, Trajectory, channels, units
 from torchsoft.solve.unrolled import unrolled_solution
 
 Route = Literal["none", "discrete", "forward", "unrolled", "continuous"]
@@ -242,6 +242,7 @@ def _recorded(stepper: ImplicitStepper, t: Tensor, y0: Tensor, gradient: Route) 
     return Trajectory(
         t, y, state, channels(rig, state, signals), {}, {}, {}, {}, {}, {}, nothing,
         Stats(0, 0, 0, 0, clock.perf_counter() - began), nothing, rig.layout, made_by(rig, gradient),
+        units=units(rig),
     )  # fmt: skip
 
 
@@ -296,5 +297,5 @@ def gather(task: Task, y: Tensor, out: Progress, wall: float, dy: Tensor | None 
         injected=columns["injected"],
         stats=Stats(out.steps, out.solves, out.failed, out.refused, wall), knots=torch.from_numpy(out.knots), layout=rig.layout,
         made_by=made_by(rig, METHOD) | {"steps": steps}, wrt=task.wrt,
-        sensitivities=None if dy is None else dy[:rows],
+        sensitivities=None if dy is None else dy[:rows], units=units(rig),
     )  # fmt: skip

@@ -1,8 +1,11 @@
-"""Stability of the closed loop: the linearised modes of the grasped system about its static equilibrium.
+"""Stability of the closed loop: the linearised modes of any rig about a state of rest, of the grasped system about its own.
 
 The horizontal loop senses the disc and pushes the bracket, through two soft pads: non-collocated, and unstable for many
 combinations of gains, pad stiffness and pad damping.
 """
+
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -11,6 +14,8 @@ from torch import Tensor
 from torchsoft.physics.equilibrium import holding_force, press
 from torchsoft.physics.motion import Reference, hold
 from torchsoft.physics.paper import SoftGrasp
+from torchsoft.physics.parts import COORDINATES
+from torchsoft.physics.rig import Rig
 from torchsoft.solve.rates import Rates
 
 DISPLACEMENT, VELOCITY = 1e-9, 1e-8
@@ -21,8 +26,9 @@ NEUTRAL = 0.1
 
 
 @torch.no_grad()
-def linearised(model: SoftGrasp, y: Tensor, reference: Reference) -> Tensor:
-    """dy'/dy (size, size) at a state y (size,) of rest, with touching and sticking as they are there."""
+def linearised(model: Rig, y: Tensor, reference: Reference, only: Sequence[int] | None = None) -> Tensor:
+    """dy'/dy (size, size) at a state y (size,) of rest, with touching and sticking as they are there; `only` takes some of the
+    components, of a rig whose pads are massless."""
     size = torch.full((model.layout.size,), DISPLACEMENT, dtype=torch.float64)
     for (part, name), where in model.layout.slices.items():
         if part == "pads" and not model.pads[name].inertial:  # forces, counted by the displacement they make
@@ -32,13 +38,49 @@ def linearised(model: SoftGrasp, y: Tensor, reference: Reference) -> Tensor:
     if any(pad.inertial for pad in model.pads.values()):
         ahead, behind = (model(0.0, y + sign * torch.diag(size), reference) for sign in (1, -1))
         return ((ahead - behind) / (2 * size[:, None])).mT
-    rates, at, out = Rates(model, reference), y.numpy(), np.empty((len(size), len(size)))
-    for i, one in enumerate(size.tolist()):
-        there = [at.copy(), at.copy()]
+    which = np.arange(len(size)) if only is None else np.array(only)
+    rates, at, out = Rates(model, reference), y.numpy(), np.empty((len(which), len(which)))
+    for column, i in enumerate(which):
+        there, one = [at.copy(), at.copy()], float(size[i])
         there[0][i] += one
         there[1][i] -= one
-        out[:, i] = (rates(0.0, there[0]) - rates(0.0, there[1])) / (2 * one)
+        out[:, column] = ((rates(0.0, there[0]) - rates(0.0, there[1])) / (2 * one))[which]
     return torch.from_numpy(out)
+
+
+class Modes(NamedTuple):
+    """Eigenvalues [1/s], complex, the least stable first, and the coordinate that moves most in the first of them."""
+
+    values: Tensor
+    moves: str
+
+
+@torch.no_grad()
+def modes(rig: Rig, y: Tensor, reference: Reference) -> Modes:
+    """Of a rig with massless pads about a state y (size,) at rest, pads settled, with the constant `reference`; constant loads
+    out of balance there do not matter, touching and sticking points do.
+
+    Away from contact nodal forces and stretches fade by themselves, whatever the rest does: those modes are left out. An
+    angle counts by the radius of gyration.
+    """
+    state, layout = rig.unpack(y, rig.follow(0.0, reference)), rig.layout
+    acting = torch.ones(layout.size, dtype=torch.bool)
+    for name, forces in state.pads.items():
+        acting[layout.slices["pads", name]] = (forces != 0).any(-1, keepdim=True).expand(forces.shape).flatten()
+    for name in rig.contacts:
+        acting[layout.slices["stretch", name]] = rig.penetration(name, state) > 0
+    only = acting.nonzero()[:, 0].tolist()
+    values, vectors = torch.linalg.eig(linearised(rig, y, reference, only))
+    order = values.real.argsort(descending=True)
+    most, moves = -1.0, ""
+    for name, axes in rig.layout.free.items():
+        mass, _, inertia = (float(m.detach()) for m in rig.bodies[name].masses)
+        for i, axis in enumerate(axes):
+            at = only.index(layout.slices["pose", name].start + i)
+            size = float(vectors[at, order[0]].abs()) * ((inertia / mass) ** 0.5 if axis == 2 else 1.0)
+            if size > most:
+                most, moves = size, f"{name}.{COORDINATES[axis]}"
+    return Modes(values[order], moves)
 
 
 @torch.no_grad()

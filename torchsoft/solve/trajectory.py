@@ -10,7 +10,7 @@ import torch
 import xarray as xr
 from torch import Tensor
 
-from torchsoft.channels import PADS, VARIABLES
+from torchsoft.channels import MEASURED, PADS, VARIABLES
 from torchsoft.files import replacing, sealed, unsealed
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
@@ -42,6 +42,8 @@ class Trajectory:
     pads do to each body (T, 3), a force [N] and a moment about its centre [N.m], world axes. displacement: of the nodes of
     each pad (T, nodes, 2) [m], in its base's frame. energy: stored [J]; dissipated, supplied and `injected` [J] since t[0].
 
+    units: of the channels, by key, as far as the rig knows them.
+
     knots (steps + 1,): where the steps began and ended [s]; given to another run, that takes the same ones.
 
     sensitivities (T, components, n): derivatives of the state's last `components` by the n parameters `wrt`, and along the
@@ -65,6 +67,7 @@ class Trajectory:
     made_by: dict[str, Any] = field(repr=False)
     wrt: tuple[str, ...] = ()
     sensitivities: Tensor | None = field(default=None, repr=False)
+    units: dict[str, str] = field(default_factory=dict, repr=False)
 
     def __getitem__(self, channel: str) -> Tensor:
         """A channel (T,). Raises `KeyError` naming those that are there."""
@@ -96,14 +99,17 @@ class Trajectory:
         """The run as an xarray Dataset with named dimensions, units, and how it was made."""
         columns: dict[str, tuple[tuple[str, ...], Tensor, str, str]] = {}
         left = dict(self.channels)
-        for name, variable in VARIABLES.items():
+        papers = all(name in left for name in MEASURED)  # another rig may call by these names what is something else
+        for name, variable in VARIABLES.items() if papers else ():
             keys = list(variable.symbols)
             if all(key in left for key in keys):
                 parts = [left.pop(key) for key in keys]
                 dims = ("time", "axis") if len(parts) == 2 else ("time",)
                 value = torch.stack(parts, -1) if len(parts) == 2 else parts[0]
                 columns[name] = (dims, value, variable.unit, variable.meaning)
-        columns |= {name: (("time",), value, "", "channel of the rig") for name, value in left.items()}
+        columns |= {
+            name: (("time",), value, self.units.get(name, ""), "channel of the rig") for name, value in left.items()
+        }
         columns["energy_injected"] = (("time",), self.injected, "J", "positive part of the sources' work")
         columns["energy_residual"] = (("time",), self.energy_residual, "J", "stored - supplied + dissipated")
         for key, force in self.force.items():
@@ -176,6 +182,31 @@ def channels(rig: Rig, state: State, signals: Tensor, moments: dict[str, Tensor]
         out[f"F_{name}"] = rig.actuator_effort(name, state, signals)
     out |= {f"M_{name}": moment for name, moment in (moments or {}).items()}
     return {rig.renamed.get(key, key): value for key, value in out.items()}
+
+
+def units(rig: Rig) -> dict[str, str]:
+    """SI unit of every channel, by its key; a signal's follows from what uses it."""
+    out: dict[str, str] = {}
+
+    def signal(name: str, unit: str) -> None:
+        out[name], out[f"{name}_dot"] = unit, f"{unit}/s"
+
+    for name, symbol in rig.symbols.items():
+        for i, axis in enumerate(COORDINATES):
+            unit = "rad" if axis == "theta" else "m"
+            key = f"{axis}_{symbol}"
+            out[key], out[rate_channel(key)] = unit, f"{unit}/s"
+            if rig.bodies[name].freedom[axis] == "driven":
+                signal(f"{name}.{axis}", unit)
+        out[f"L_{symbol}"] = "kg.m2/s"
+    for name, actuator in rig.actuators.items():
+        signal(actuator.setpoint, "rad" if actuator.measures.endswith(".theta") else "m")
+        effort = "N.m" if actuator.pushes.endswith(".theta") else "N"
+        if actuator.feed_forward is not None:
+            signal(actuator.feed_forward, effort)
+        out[f"F_{name}"] = effort
+    out |= {f"M_{name}": "N.m" for name in rig.pads}
+    return {rig.renamed.get(key, key): unit for key, unit in out.items()}
 
 
 def measurable(rig: Rig) -> tuple[str, ...]:

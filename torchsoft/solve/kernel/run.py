@@ -35,6 +35,10 @@ SAFETY, LARGEST, SMALLEST = 0.9, 4.0, 0.2
 INTEGRAL, PROPORTIONAL = 0.7 / 3.0, 0.4 / 3.0
 """Exponents of the PI controller (Gustafsson, ACM TOMS 17, 1991)."""
 
+PASSED = 0.25
+"""A step that tolerances choose moves no body by more than this part of its size over a pad that it may touch: one that flies
+would else be through the pad between two steps."""
+
 LEAST_ERROR = 1e-6
 """Errors below this part of the tolerance count as this."""
 
@@ -82,6 +86,17 @@ def estimate(e: Any, d: Any, y: Array, k: Array, h: float, rtol: float) -> tuple
         if not ratio <= worst:
             worst, which = ratio, part
     return worst, which
+
+
+@compiled
+def passing(s: Any, w: Any) -> float:
+    """The largest speed of a body over a pad that it may touch, over its size [1/s]."""
+    most = 0.0
+    for c in range(s.contact_pad.size):
+        f = w.frame[c]
+        speed = np.hypot(f[4] + f[6] * f[3], f[5] - f[6] * f[2])
+        most = max(most, speed / s.contact_size[c])
+    return most
 
 
 @compiled
@@ -143,6 +158,7 @@ def run(
             solves += count
             if status == CONVERGED and not given:
                 error, which = estimate(e, d, y, k, now, rtol)
+                error = max(error, (now * passing(s, w) / PASSED) ** 3)
                 if not error <= 1.0:
                     status = REFUSED
             if status == CONVERGED:

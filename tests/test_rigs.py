@@ -1,0 +1,500 @@
+"""Rigs in files: what is read, refused, checked, built, run and drawn, from Python and from the command line."""
+
+import json
+import math
+import re
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from torchsoft import Parameters, SoftGrasp, press, simulate
+from torchsoft.cli import main
+from torchsoft.physics.resting import resting, standing
+from torchsoft.rigs import RigFile
+from torchsoft.rigs import run as running
+from torchsoft.rigs.check import check
+from torchsoft.rigs.course import Estimate
+from torchsoft.rigs.motion import flattened
+from torchsoft.rigs.template import template
+from torchsoft.rigs.written import to_toml
+from torchsoft.scenario import grasp_and_roll
+from torchsoft.solve.simulate import Interrupted
+from torchsoft.solve.stability import linearised, loop_modes, modes
+from torchsoft.solve.trajectory import load
+
+READY = sorted((Path(__file__).parents[1] / "rigs").glob("*.toml"))
+
+
+def coarse(file: RigFile, **groups: dict[str, Any]) -> RigFile:
+    """The rig on a mesh half as fine."""
+    pads = {
+        name: {"elements_x": max(16, pad.elements_x // 2), "elements_y": 2} for name, pad in file.pads.items()
+    }  # fmt: skip
+    return file.override(pads=pads).override(**groups)
+
+
+def shorter(file: RigFile, duration: float) -> RigFile:
+    return file.override(outputs={"duration": duration, "snapshots": (), "frames": 3})
+
+
+def changed(file: RigFile, **values: Any) -> RigFile:
+    """The rig with fields replaced by their dotted names, `__` for a dot."""
+    for name, value in values.items():
+        for part in reversed(name.split("__")):
+            value = {part: value}
+        file = file.override(**value)
+    return file
+
+
+# ready rigs ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", READY, ids=lambda path: path.stem)
+def test_a_ready_rig_checks_clean_and_runs(path: Path) -> None:
+    file = coarse(RigFile.from_toml(path))
+    assert [str(one) for one in check(file) if one.severity != "note"] == []
+    done = running.carry_out(shorter(file, 0.1))
+    assert done.stopped is None
+    assert float(done.trajectory.t[-1]) == pytest.approx(0.1)
+    assert done.trajectory.energy_residual_rel < 1e-3
+
+
+def test_there_are_ready_rigs() -> None:
+    assert {"paper", "ellipse", "two_fingers", "light_grasp", "drop"} <= {path.stem for path in READY}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", READY, ids=lambda path: path.stem)
+def test_a_ready_rig_runs_to_its_end(path: Path) -> None:
+    file = RigFile.from_toml(path)
+    assert [str(one) for one in check(file) if one.severity != "note"] == []
+    done = running.carry_out(file)
+    assert done.stopped is None
+    assert done.trajectory.energy_residual_rel < 1e-3
+
+
+def test_the_papers_rig_is_soft_grasp() -> None:
+    """The same start to rounding, and from the same start the same bits."""
+    model = SoftGrasp(Parameters().override({"pad.elements_x": 60, "pad.elements_y": 2}))
+    manipulation = grasp_and_roll(model, grasp_force=80.0)
+    top = float(model.unpack(manipulation.y0).pose["bracket"][1])
+    file = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "paper")))
+    file = changed(file, bodies__bracket__start__y=top, motion__F_ff__values=(0.0, -80.0))
+    ready = file.build()
+    assert torch.allclose(ready.y0, manipulation.y0, rtol=0, atol=1e-11)
+    t = torch.linspace(0, 0.6, 61, dtype=torch.float64)
+    with torch.no_grad():
+        assert torch.equal(ready.rig(0.1, manipulation.y0), model(0.1, manipulation.y0))
+    runs = [simulate(rig, t, y0=manipulation.y0) for rig in (model, ready.rig)]
+    assert torch.equal(runs[0].y, runs[1].y)
+    for own, other in (("x_C", "x_C"), ("theta", "theta_C"), ("F_x", "F_x"), ("F_y", "F_y"), ("bracket_moment", "M_U")):
+        assert torch.equal(runs[0][own], runs[1][other])
+
+
+def test_a_drop_is_not_missed() -> None:
+    """Steps chosen by tolerance would be through the pad; the first touch is where free fall says."""
+    file = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "drop")))
+    file = changed(shorter(file, 0.3), outputs__interval=1e-3)
+    run = running.carry_out(file).trajectory
+    y, force = run["y_ellipse"], run.force["ground"][..., 0].sum(-1)
+    touch = int((force > 0).nonzero()[0])
+    s = file.bodies["ellipse"].start
+    assert isinstance(s.y, float)
+    fallen = s.y - 0.5 * 9.81 * run.t[:touch] ** 2
+    assert torch.allclose(y[:touch], fallen, rtol=0, atol=1e-7)
+    reach = math.hypot(18e-3 * math.sin(0.5), 11e-3 * math.cos(0.5))
+    assert float(y[touch]) == pytest.approx(12e-3 + reach, abs=1.2e-3)
+    assert float(y.min()) > 12e-3 + 9e-3  # it lies on the pad
+
+
+# what makes no sense -------------------------------------------------------------------------------------------------
+
+
+REFUSED: dict[str, tuple[dict[str, Any], str]] = {
+    "misspelt": ({"pads__lower__lenght": 0.1}, r"pads\.lower: `lenght` is not known here; is it `length`\?"),
+    "unknown": ({"gadgets": {}}, r"`gadgets` is not known here; known are title, gravity, bodies"),
+    "millimetres": ({"pads__lower__length": 80.0}, r"pads\.lower\.length: should be from 1e-06 to 10 m, not 80"),
+    "incompressible": ({"materials__rubber__nu": 0.5}, r"materials\.rubber\.nu: should be from -0\.999 to 0\.4999, not 0\.5"),
+    "text": ({"bodies__disc__mass": "heavy"}, r"bodies\.disc\.mass should be a valid number, not 'heavy'"),
+    "freedom": ({"bodies__bracket__theta": "locked"}, r'bodies\.bracket\.theta: should be "free", "driven" or a number'),
+    "friction": ({"laws__dry__friction__mu_k": 0.9}, r"laws\.dry\.friction.*: mu_k = 0\.9 is above mu_s = 0\.8"),
+    "sort": ({"bodies__disc__shape__kind": "heart"}, r"bodies\.disc\.shape\.kind should be one of .*'circle'.*, not 'heart'"),
+    "no mass": ({"bodies__bracket__mass": None}, r"bodies\.bracket: mass is missing, but x and y can move freely"),
+    "no start": ({"bodies__bracket__start": {"y": None}}, r"bodies\.bracket: start\.y is missing: y is free"),
+    "start of what is fixed": ({"bodies__bracket__start__theta": 0.1}, r"bodies\.bracket: start\.theta has no meaning"),
+    "no such base": ({"pads__upper__base": "braket"}, r"pads\.upper\.base: there is no `braket` among bodies; there is disc"),
+    "pad on its own body": ({"pads__lower__base": "disc"}, r"contacts\.lower: the pad `lower` is bonded to the body `disc`"),
+    "nothing to touch with": ({"contacts__lower__body": "bracket"}, r"contacts\.lower\.body: `bracket` has no shape"),
+    "pushes what is fixed": ({"actuators__x__pushes": "bracket.theta"}, r"actuators\.x\.pushes: bracket\.theta is fixed at 0"),
+    "no such coordinate": ({"actuators__x__pushes": "bracket.z"}, r"`bracket\.z` is not a coordinate; free ones are disc\.x"),
+    "loop without a motion": ({"actuators__x__setpoint": None}, r"actuators\.x: setpoint is missing: the gains Kp and Kd need"),
+    "motion that nothing follows": ({"motion__wave": {"kind": "hold"}}, r"motion\.wave: nothing follows it"),
+    "motion that is missing": ({"actuators__x__setpoint": "w"}, r"motion\.w is missing: bracket\.x is to follow it"),
+    "time goes back": ({"motion__x_d__times": (1.5, 0.5)}, r"motion\.x_d.*: times must increase, but 0\.5 s follows 1\.5 s"),
+    "two ways to step": ({"solver": {"step": 1e-3, "rtol": 1e-4}}, r"solver: step and rtol .*each say which steps to take"),
+    "one motion, two units": ({"actuators__y__feed_forward": "x_d"}, r"motion\.(x_d would be in two units|press: nothing)"),
+    "name": ({"bodies": {"my disc": {"x": 0.0, "y": 0.0, "theta": 0.0}}}, r"bodies\.my disc: the name should be letters"),
+    "taken": ({"bodies": {"keys": {"x": 0.0, "y": 0.0, "theta": 0.0}}}, r"bodies\.keys: the name is taken by torch"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_is_no_rig_is_refused_with_its_field(name: str) -> None:
+    changes, sentence = REFUSED[name]
+    with pytest.raises(ValueError, match=sentence) as refusal:
+        changed(template("t"), **changes)
+    assert "\n" not in str(refusal.value)
+
+
+STONE = {"x": 0.3e-3, "y": 30e-3, "theta": 0.0, "shape": {"kind": "circle", "radius": 5e-3}}
+
+DANGEROUS: dict[str, tuple[dict[str, Any], str]] = {
+    "overlap": ({"bodies": {"stone": STONE}}, r"error: bodies\.disc: it and bodies\.stone overlap by .* mm at t = 0 s"),
+    "no room": ({"motion__y_d__values": ("start", 40e-3)}, r"error: contacts\.upper: `disc` does not fit: at t = 0\.4 s"),
+    "strain": ({"motion__y_d__values": ("start", 45.8e-3)}, r"warning: pads\.\w+: the strain leaves linear elasticity: at"),
+    "steps": ({"solver": {"step": 0.05}}, r"warning: solver\.step: steps of 0\.05 s are too coarse: motion\.y_d goes"),
+    "nothing carries it": (
+        {"bodies": {"ball": {"mass": 0.1, "shape": {"kind": "circle", "radius": 5e-3}, "start": {"x": 0.0, "y": 0.1}}}},
+        r"error: bodies\.ball: nothing carries it: it has no contact with any pad",
+    ),
+    "beside the pad": (
+        {"bodies__disc__start": {"x": 0.1, "y": 0.03}},
+        r"error: bodies\.disc: nothing carries it: no pad that it has a contact with lies under it",
+    ),
+    "no rest beside the pad": ({"bodies__disc__start__x": 0.1}, r'error: bodies\.disc\.start\.y: "rest", but no pad'),
+    "set-point elsewhere": (
+        {"motion__x_d__values": (10e-3, 20e-3)},
+        r"warning: motion\.x_d: it begins at 0\.01 m, but bracket\.x at 0 m: the loop `x` pushes with 1e\+03 at once",
+    ),
+    "never touches": ({"motion__y_d__values": ("start", 50.05e-3), "motion__press__values": (0.0, 0.0)},
+                      r"warning: contacts\.upper: `lower` and `upper` never press `disc`"),
+    "slip": ({"laws__dry__friction__v_s": 1e-4}, r"warning: laws\.dry\.friction: slip is not single-valued"),
+    "outputs": (
+        {"motion__x_d": {"kind": "chirp", "amplitude": 1e-3, "first": 1.0, "last": 50.0}},
+        r"warning: outputs\.interval: outputs every 0\.01 s do not show motion\.x_d, which goes up to 50 Hz; take 0\.005 s",
+    ),
+    "start of an effort": (
+        {"motion__press__values": ("start", -30.0)}, r'error: motion\.press\.values: "start" stands for where the one free'
+    ),
+    "no time for waves": (
+        {"motion__x_d": {"kind": "sines", "components": [{"amplitude": 1e-3, "frequency": 5.0}], "since": 1.9}},
+        r"error: motion\.x_d\.since = 1\.9 s leaves 0\.1 s until 2 s, but waves take 0\.3 s",
+    ),
+    "no file": (
+        {"motion__x_d": {"kind": "csv", "file": "none.csv", "column": "x_d"}}, r"error: motion\.x_d\.file: none\.csv: No such"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DANGEROUS)
+def test_what_is_dangerous_is_said_before_any_run(name: str) -> None:
+    changes, sentence = DANGEROUS[name]
+    found = [str(one) for one in check(changed(coarse(template("t")), **changes))]
+    assert any(re.match(sentence, one) for one in found), found
+    if sentence.startswith("error"):
+        assert found[0].startswith("error")
+
+
+def test_a_loop_is_unstable_as_the_papers_modes_say() -> None:
+    """The leading mode is that of the paper's own equilibrium: the friction-free grasp."""
+    changes = {"pad.elements_x": 60, "pad.elements_y": 2, "pad.tau": 1e-3}
+    leading = complex(loop_modes(SoftGrasp(Parameters().override(changes)))[0])
+    paper = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "paper")))
+    (found,) = check(changed(paper, materials__rubber__tau=1e-3))
+    assert found.severity == "error"
+    assert found.field == "actuators.x"
+    assert "the rig is unstable at t = 0.375 s: its leading mode is +" in found.sentence
+    words = found.sentence.partition("mode is ")[2].split()
+    assert float(words[0]) == pytest.approx(leading.real, rel=0.2)
+    assert float(words[2].rstrip("j")) == pytest.approx(abs(leading.imag), rel=0.05)
+
+
+def test_modes_are_those_of_the_whole_state() -> None:
+    """What is left out where nothing touches decides nothing."""
+    model = SoftGrasp(Parameters().override({"pad.elements_x": 60, "pad.elements_y": 2}))
+    y = press(model, model.settings.scenario.y_Br_grasp)
+    whole = torch.linalg.eigvals(linearised(model, y, model.reference))
+    some = modes(model, y, model.reference).values
+    found = (some[:, None] - whole).abs().amin(1) / some.abs().clamp(min=1.0)
+    assert float(found.max()) < 1e-3
+    assert float(whole.real.max()) == pytest.approx(float(some.real.max()), abs=0.05)
+
+
+def test_steps_are_held_against_the_modes() -> None:
+    """With less damping the paper's loops swing with 600 rad/s: five steps a period are 2 ms."""
+    paper = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "paper")))
+    paper = changed(paper, materials__rubber__tau=2e-3)
+    sentences = [[one.sentence for one in check(paper.override(solver={"step": h}))] for h in (1e-3, 4e-3)]
+    assert [any("a mode of the rig swings with" in one for one in found) for found in sentences] == [False, True]
+
+
+def test_a_loop_that_cannot_move_what_it_measures_is_found() -> None:
+    file = coarse(template("t"))
+    tree = file.model_dump(exclude_unset=True)
+    del tree["contacts"]["upper"]
+    tree["actuators"]["x"]["measures"] = "disc.x"
+    found = [str(one) for one in check(RigFile.model_validate(tree))]
+    assert any(
+        "actuators.x: it measures disc.x and pushes bracket.x, but no pad and contact tie" in one for one in found
+    )
+
+
+def test_a_body_that_flies_is_told_of_coarse_steps() -> None:
+    file = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "drop")), solver={"step": 0.05})
+    assert any("a body comes flying and may be through a pad" in one.sentence for one in check(file))
+
+
+# motions -------------------------------------------------------------------------------------------------------------
+
+
+def motion(table: dict[str, Any], folder: Path | None = None, duration: float = 2.0) -> Callable[[float], float]:
+    """A motion of the template's bracket in x, as a function of time."""
+    file = changed(coarse(template("t")), motion__x_d=table, outputs__duration=duration)
+    file._folder = folder or Path()
+    signal = file.build().rig.reference["x_d"]
+    return lambda t: float(signal(torch.tensor(t, dtype=torch.float64))[0].detach())
+
+
+def test_motions_go_through_what_they_are_given(tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_text("\ufefft [ms], note [mm], x_d [mm]\n0,7,1\n500,,2\n1000,7,4\n", encoding="utf-8")
+    knots = {"times": (0.2, 1.0), "values": ("start", 5e-3)}
+    for table, expected in (
+        ({"kind": "hold"}, {0.0: 0.0, 1.0: 0.0}),
+        ({"kind": "hold", "value": 2e-3}, {1.0: 2e-3}),
+        ({"kind": "profile", **knots}, {0.0: 0.0, 0.2: 0.0, 0.6: 2.5e-3, 1.0: 5e-3, 2.0: 5e-3}),
+        ({"kind": "spline", **knots}, {0.0: 0.0, 0.2: 0.0, 0.6: 2.5e-3, 1.0: 5e-3, 2.0: 5e-3}),
+        ({"kind": "sines", "components": [{"amplitude": 1e-3, "frequency": 2.0}]}, {0.0: 0.0, 1.125: 1e-3, 2.0: 0.0}),
+        ({"kind": "chirp", "amplitude": 1e-3, "first": 1.0, "last": 1.0, "since": 0.5}, {0.5: 0.0, 1.25: -1e-3 * -1, 1.0: 0.0}),
+        ({"kind": "csv", "file": "x.csv", "column": "x_d", "offset": 1e-3}, {0.0: 2e-3, 0.5: 3e-3, 1.0: 5e-3, 2.0: 5e-3}),
+    ):  # fmt: skip
+        x = motion(table, tmp_path)
+        for time, value in expected.items():
+            if table["kind"] == "chirp" and time == 1.25:
+                value = 1e-3 * math.sin(2 * math.pi * 0.75)
+            assert x(time) == pytest.approx(value, abs=1e-9), (table["kind"], time)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("t [s],x_d [mm]\n0,0\n1,1\n", r"x\.csv ends at 1 s, but the run lasts until 2 s"),
+        ("t [s],x [mm]\n0,0\n1,1\n", r"x\.csv has no column `x_d \[m\]`; it has `t`, `x`"),
+        ("t [s],x_d\n0,0\n1,1\n", r"row 1, column `x_d` has no unit: write `x_d \[m\]`"),
+        ("t [s],x_d [N]\n0,0\n1,1\n", r"row 1, column `x_d` cannot be in 'N'; it can be in m, cm, mm"),
+        ("t [s],x_d [mm]\n0,0\n1,one\n", r"row 3, column `x_d`: 'one' is not a finite number"),
+        ("t [s],x_d [mm]\n0,0\n1,\n", r"row 3, column `x_d` is empty"),
+        ("t [s],x_d [mm]\n1,0\n0,1\n", r"row 3, column `t`: 0 s follows 1 s; times must increase"),
+        ("t [s],x_d [mm]\n0,0\n", r"has 1 rows of numbers"),
+    ],
+)
+def test_a_recorded_motion_that_cannot_be_is_named(tmp_path: Path, text: str, sentence: str) -> None:
+    (tmp_path / "x.csv").write_text(text, encoding="utf-8")
+    file = changed(coarse(template("t")), motion__x_d={"kind": "csv", "file": "x.csv", "column": "x_d"})
+    file._folder = tmp_path
+    (first, *_) = check(file)
+    assert first.severity == "error"
+    assert first.field == "motion.x_d.file"
+    assert re.search(sentence, first.sentence), first.sentence
+
+
+def test_motions_of_driven_coordinates_may_nest() -> None:
+    hold = {"kind": "hold", "value": 0.0}
+    assert flattened({"w": hold, "upper": {"y": hold}}) == {"w": hold, "upper.y": hold}
+    assert flattened({"upper.y": hold}) == {"upper.y": hold}
+
+
+def test_driven_jaws_carry_a_disc() -> None:
+    """Coordinates driven in x, y and theta, without a loop; the pads settle around a start that is a grasp."""
+    jaw = {"x": "driven", "y": "driven", "theta": "driven"}
+    tree = coarse(template("t")).model_dump(exclude_unset=True)
+    tree["bodies"]["bracket"] = jaw
+    tree["bodies"]["disc"]["start"] = {"x": 0.3e-3, "y": 24.5e-3}
+    tree["actuators"] = {}
+    tree["motion"] = {
+        "bracket": {
+            "x": {"kind": "profile", "times": [0.0, 0.2], "values": [0.0, 4e-3]},
+            "y": {"kind": "hold", "value": 49e-3}, "theta": {"kind": "hold", "value": 0.0},
+        }
+    }  # fmt: skip
+    tree["outputs"] = {"duration": 0.25}
+    file = RigFile.from_tree(tree)
+    run = running.carry_out(file).trajectory
+    assert float(run.force["upper"][0, :, 0].sum()) > 10.0  # it starts pressed
+    assert float(run["x_disc"][-1]) == pytest.approx(2.3e-3, abs=2e-4)
+    assert run.units["bracket.x"] == "m"
+    assert "drive_bracket" in run.supplied
+
+
+def test_orientation_is_controlled_through_another_body() -> None:
+    """A loop that measures the disc's angle and pushes the bracket sideways; the other way round it is unstable."""
+    loop = {"pushes": "bracket.x", "measures": "disc.theta", "setpoint": "w", "Kp": 1000.0, "Kd": 4.0, "reversed": True}
+    tree = coarse(template("t")).model_dump(exclude_unset=True)
+    tree["actuators"]["x"] = loop
+    tree["motion"] |= {"w": {"kind": "profile", "times": (0.5, 1.0), "values": ("start", 0.3)}}
+    del tree["motion"]["x_d"]
+    tree["outputs"] = {"duration": 1.3, "interval": 0.05}
+    early = RigFile.model_validate(tree)  # before they touch
+    assert any("nothing that touches ties disc.theta" in one.sentence for one in check(early))
+    tree["bodies"]["bracket"]["start"]["y"] = 49.5e-3
+    tree["motion"]["y_d"] = {"kind": "hold"}
+    file = RigFile.model_validate(tree)
+    assert [one.severity for one in check(file)] == ["note"]
+    run = running.carry_out(file).trajectory
+    assert float(run["theta_disc"][-1]) == pytest.approx(0.3, abs=5e-3)
+    assert float(run["x_bracket"][-1]) < -8e-3
+    wrong = file.override(actuators={"x": {"reversed": False}})
+    assert "the rig is unstable" in check(wrong)[0].sentence
+
+
+def test_efforts_may_be_fed_forward_without_a_loop() -> None:
+    """A constant force on the disc accelerates it as Newton says, where nothing touches it."""
+    tree = coarse(template("t")).model_dump(exclude_unset=True)
+    tree["gravity"] = 0.0
+    tree["bodies"]["disc"]["start"] = {"x": 0.0, "y": 24.95e-3 + 5e-5}
+    tree["actuators"] = {"wind": {"pushes": "disc.x", "feed_forward": "F"}}
+    tree["motion"] = {"F": {"kind": "hold", "value": 0.2}}
+    tree["bodies"]["bracket"] = {"x": 0.0, "y": 60e-3, "theta": 0.0}
+    tree["outputs"] = {"duration": 0.1}
+    run = running.carry_out(RigFile.model_validate(tree)).trajectory
+    assert torch.allclose(run["x_disc"], 0.5 * 0.2 / 0.4 * run.t**2, rtol=1e-6, atol=1e-9)
+    assert run.units["F"] == "N"
+
+
+# starts and estimates ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("inertial", [False, True])
+def test_a_body_rests_where_nothing_accelerates_it(inertial: bool) -> None:
+    file = coarse(template("t"), pads={"lower": {"inertial": inertial}})
+    ready = file.build()
+    rate = ready.rig.unpack(ready.rig(0.0, ready.y0)).velocity["disc"]
+    assert float(rate[1].detach().abs()) < 1e-5
+    hovering = changed(file, bodies__disc__start__y=60e-3).build()
+    assert float(hovering.y0[hovering.rig.layout.slices["pads", "lower"]].abs().max()) == 0.0
+
+
+def test_a_body_comes_down_to_its_rest_from_far_above_and_in_every_coordinate() -> None:
+    file = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "drop")))
+    rig = file.build().rig
+    pose = {"ellipse": torch.tensor([60.2e-3, 30e-3, 0.1], dtype=torch.float64)}
+    found = resting(rig, pose)["ellipse"]
+    rate = rig(0.0, standing(rig, {"ellipse": found}))[rig.layout.rigid[3:]]
+    assert float(rate.detach().abs().max()) < 1e-4
+    assert float(found[2]) == pytest.approx(0.0, abs=1e-6)  # on its broad side
+
+
+def test_the_estimate_by_statics_is_where_the_run_ends() -> None:
+    file = coarse(template("t"))
+    ready = file.build()
+    expected = Estimate(file, ready).balanced(0.45)
+    run = running.carry_out(shorter(file, 0.45)).trajectory
+    for name in ("disc", "bracket"):
+        assert float(run[f"y_{name}"][-1]) == pytest.approx(expected[name][1], abs=3e-5)
+
+
+# writing and running -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", READY, ids=lambda path: path.stem)
+def test_what_is_written_is_what_was_read(path: Path) -> None:
+    file = RigFile.from_toml(path)
+    again = RigFile.from_tree(tomllib.loads(to_toml(file)))
+    assert again.model_dump() == file.model_dump()
+
+
+def test_the_file_to_start_from_is_a_rig_with_a_comment_on_every_number(tmp_path: Path, capsys: Any) -> None:
+    path = tmp_path / "mine.toml"
+    assert main(["init", str(path.with_suffix(""))]) == 0
+    text = path.read_text(encoding="utf-8")
+    assert RigFile.from_toml(path).model_dump() == template("mine").model_dump()
+    rows = [row for row in text.splitlines() if " = " in row and not row.startswith("# An ")]
+    assert [row for row in rows if "  # " not in row and " # " not in row[2:]] == []
+    for word in ("[kg]", "[m]", "[Pa]", "[N.s/m]", "[s]", "# points = 0", "# step ="):
+        assert word in text
+    assert main(["init", str(path)]) == 2
+    assert f"{path} is there already" in capsys.readouterr().err
+    assert [one for one in check(coarse(RigFile.from_toml(path))) if one.severity != "note"] == []
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A rig file that runs in no time."""
+    path = tmp_path_factory.mktemp("rig") / "small.toml"
+    path.write_text(to_toml(shorter(coarse(template("small")), 0.1)), encoding="utf-8")
+    return path
+
+
+def test_run_writes_everything(small: Path, tmp_path: Path, capsys: Any) -> None:
+    assert main(["run", str(small), "--out", str(tmp_path / "out"), "--no-progress"]) == 0
+    out, err = capsys.readouterr()
+    assert "0.1 s simulated" in out
+    assert "note: actuators: stable" in err
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    figures = {f"{name}.png" for name in ("snapshots", "motion", "forces", "power", "energy")}
+    assert names == {"trajectory.nc", "summary.json", "video.gif"} | figures
+    for name in figures:
+        with Image.open(tmp_path / "out" / name) as picture:
+            assert np.ptp(np.asarray(picture.convert("L"))) > 100
+    with Image.open(tmp_path / "out" / "video.gif") as video:
+        assert video.n_frames == 3  # pyright: ignore[reportAttributeAccessIssue]
+    data = load(tmp_path / "out" / "trajectory.nc")
+    assert data["y_disc"].attrs["units"] == data["y_d"].attrs["units"] == "m"
+    assert data["F_y"].attrs["units"] == data["press"].attrs["units"] == "N"
+    assert data["x_d_dot"].attrs["units"] == "m/s"
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
+    assert summary["stopped"] is None
+    assert summary["doubts"] == []
+    assert summary["energy"]["worst_imbalance_over_injected"] < 1e-3
+    assert (
+        RigFile.model_validate_json(json.dumps(summary["file"])).model_dump() == RigFile.from_toml(small).model_dump()
+    )
+
+
+def test_what_is_wrong_is_not_run_unless_it_is_meant(small: Path, tmp_path: Path, capsys: Any) -> None:
+    path = tmp_path / "wrong.toml"
+    wrong = changed(RigFile.from_toml(small), bodies__stone=STONE, outputs__video="none")
+    path.write_text(to_toml(changed(wrong, outputs__figures=False)), encoding="utf-8")
+    assert main(["check", str(path)]) == 2
+    assert "error: bodies.disc: it and bodies.stone overlap" in capsys.readouterr().out
+    assert main(["run", str(path), "--out", str(tmp_path / "out"), "--no-progress"]) == 2
+    assert "wrong.toml is not run; mend what is wrong, or say --anyway" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    assert main(["run", str(path), "--out", str(tmp_path / "out"), "--no-progress", "--anyway"]) == 0
+    assert "bodies.stone overlap" in capsys.readouterr().err
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"trajectory.nc", "summary.json"}
+
+
+def test_an_interruption_keeps_what_was_simulated(small: Path, tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
+    def interrupted(*args: Any, **options: Any) -> None:
+        raise Interrupted(simulate(*args, **options))
+
+    monkeypatch.setattr(running, "simulate", interrupted)
+    assert main(["run", str(small), "--out", str(tmp_path), "--no-progress"]) == 130
+    assert "interrupted; what was simulated until then is in" in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {"trajectory.nc", "summary.json"}
+    assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["stopped"] == "interrupted"
+
+
+def test_a_failure_keeps_what_was_simulated(small: Path, tmp_path: Path, capsys: Any) -> None:
+    """A disc thrown off its pad."""
+    path = tmp_path / "thrown.toml"
+    file = changed(RigFile.from_toml(small), bodies__disc__start__v_x=3.0, bodies__bracket__start__y=90e-3)
+    path.write_text(to_toml(changed(file, motion__y_d__values=("start", "start"))), encoding="utf-8")
+    assert main(["run", str(path), "--out", str(tmp_path / "out"), "--no-progress", "--anyway"]) == 2
+    assert "the body was lost" in capsys.readouterr().err
+    assert "the body was lost" in json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))["stopped"]
+
+
+def test_check_and_run_name_what_cannot_be_read(tmp_path: Path, capsys: Any) -> None:
+    (tmp_path / "no.toml").write_text("[[", encoding="utf-8")
+    for command in ("check", "run"):
+        assert main([command, str(tmp_path / "none.toml")]) == 2
+        assert "none.toml: No such file or directory" in capsys.readouterr().err
+        assert main([command, str(tmp_path / "no.toml")]) == 2
+        assert "no.toml is not a TOML file" in capsys.readouterr().err

@@ -1,0 +1,181 @@
+"""A rig file: tables, from TOML or from Python, and what is built from them: the rig with its reference, its state at the
+start, and the times of its outputs."""
+
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchsoft.physics.equilibrium import NoEquilibrium
+from torchsoft.physics.mesh import Array
+from torchsoft.physics.motion import Piecewise, Reference
+from torchsoft.physics.parts import COORDINATES
+from torchsoft.physics.resting import resting, standing
+from torchsoft.physics.rig import Rig
+from torchsoft.rigs.bodies import REST
+from torchsoft.rigs.geometry import reach, surface
+from torchsoft.rigs.motion import Asked, flattened
+from torchsoft.rigs.schema import RigTables
+from torchsoft.tables import from_toml
+
+UPWARDS = 0.1
+"""Least upward part of the normal of a pad that something may rest on."""
+
+
+class Ready(NamedTuple):
+    """A rig with what it follows, its state y0 (size,) at the start, and the times t (T,) [s] of the outputs."""
+
+    rig: Rig
+    y0: Tensor
+    t: Tensor
+
+
+def assemble(
+    file: RigTables, held: Mapping[str, Mapping[str, float]] | None = None, loops: Collection[str] | None = None
+) -> Rig:
+    """The rig without a reference; `held` are coordinates that are fixed, by body and axis, and `loops` names its actuators,
+    all by default."""
+    actuators = {name: one for name, one in file.actuators.items() if loops is None or name in loops}
+    materials = {name: table.build() for name, table in file.materials.items()}
+    laws = {name: table.build() for name, table in file.laws.items()}
+    return Rig(
+        bodies={name: body.build(file.folder, dict((held or {}).get(name, {}))) for name, body in file.bodies.items()},
+        pads={name: pad.build(materials[pad.material]) for name, pad in file.pads.items()},
+        contacts={name: contact.build(laws) for name, contact in file.contacts.items()},
+        actuators={name: actuator.build() for name, actuator in actuators.items()},
+        gravity=file.gravity,
+        symbols={name: body.symbol or name for name, body in file.bodies.items()},
+    )
+
+
+def signal(file: RigTables, name: str, pose: Mapping[str, Array] | None) -> Piecewise:
+    """One motion, with bodies that start at `pose` (3,)."""
+    setpoints = {coordinate for role, coordinate in file.followers()[name] if role == "setpoint"}
+    start = None
+    if pose is not None and len(setpoints) == 1:
+        body, _, axis = setpoints.pop().partition(".")
+        start = float(pose[body][COORDINATES.index(axis)])
+    asked = Asked(name, file.unit(name), start, file.outputs.duration, file.folder)
+    try:
+        return file.motion[name].build(asked)
+    except ValueError as error:
+        prefix = "" if str(error).startswith("motion.") else f"motion.{name}: "
+        raise ValueError(f"{prefix}{error}") from None
+
+
+def starts(file: RigTables, driven: Mapping[str, float]) -> dict[str, Array]:
+    """Poses (3,) [m, m, rad] by body at the start, those that rest solved for; `driven` are where driven coordinates begin."""
+    pose: dict[str, Array] = {}
+    wanted: list[tuple[str, str]] = []
+    for name, body in file.bodies.items():
+        row = []
+        for axis, kind in body.freedom.items():
+            place = (
+                getattr(body.start, axis) if kind == "free" else driven[f"{name}.{axis}"] if kind == "driven" else kind
+            )
+            if place == REST:
+                wanted.append((name, axis))
+            row.append(0.0 if place is None or place == REST else float(place))
+        pose[name] = np.array(row)
+    if not wanted:
+        return pose
+    held = {
+        name: {axis: float(at) for axis, at in zip(COORDINATES, row) if (name, axis) not in wanted}
+        for name, row in pose.items()
+    }
+    rig = assemble(file, held, loops=())
+    for name, axis in wanted:
+        if axis == "y":
+            pose[name][1] = above(rig, name, pose)
+    try:
+        found = resting(rig, {name: torch.from_numpy(at) for name, at in pose.items()})
+    except NoEquilibrium as error:
+        name, axis = wanted[0]
+        raise ValueError(f"bodies.{name}.start.{axis}: {error}") from None
+    return {name: at.numpy() for name, at in found.items()}
+
+
+def above(rig: Rig, body: str, pose: Mapping[str, Array]) -> float:
+    """The height [m] at which a body just touches the highest pad under it. Raises `ValueError` where there is none."""
+    heights = []
+    for contact in rig.contacts.values():
+        at = surface(rig.pads[contact.pad], pose)
+        if contact.body != body or at.normal[1] < UPWARDS:
+            continue
+        x = float(pose[body][0])
+        level = at.middle[1] + (reach(rig, body, pose, -at.normal) - (x - at.middle[0]) * at.normal[0]) / at.normal[1]
+        if at.off(np.array([x, level])) < 0:
+            heights.append(float(level))
+    if not heights:
+        raise ValueError(
+            f'bodies.{body}.start.y: "{REST}", but no pad that it has a contact with lies under x = {pose[body][0]:g} m; '
+            "place it over one, or say at which height it starts"
+        )
+    return max(heights)
+
+
+def output_times(file: RigTables) -> Tensor:
+    """Equal intervals, and the times of snapshots [s]."""
+    o = file.outputs
+    grid = torch.linspace(0, o.duration, max(1, round(o.duration / o.interval)) + 1, dtype=torch.float64)
+    more = [t for t in o.snapshots if float((grid - t).abs().min()) > 1e-6]
+    return torch.cat((grid, torch.tensor(more, dtype=torch.float64))).sort().values
+
+
+class RigFile(RigTables):
+    """A rig and its run. SI units throughout: m, kg, s, N, rad, Pa; 4.59e-3 is 4.59 mm. The model is planar: x to the right, y
+    upwards, theta anticlockwise."""
+
+    @classmethod
+    def from_toml(cls, path: str | Path) -> Self:
+        """Read from a TOML file. Raises `ValueError` in one sentence with the file and the field, and `OSError`."""
+        file = from_toml(path, cls.from_tree)
+        file._folder = Path(path).parent
+        return file
+
+    @classmethod
+    def from_tree(cls, tree: Any) -> Self:
+        """From what TOML makes of a file. Raises `ValueError`."""
+        if isinstance(tree, dict) and "motion" in tree:
+            tree = tree | {"motion": flattened(tree["motion"])}
+        return cls.model_validate(tree)
+
+    def override(self, **groups: dict[str, Any]) -> Self:
+        """Another file with some fields replaced: `override(outputs={"duration": 0.1}, pads={"lower": {"elements_x": 30}})`.
+        A table of another kind replaces the whole of the old one. Raises `ValueError`."""
+
+        def merged(old: Any, new: Any) -> Any:
+            if not (isinstance(old, dict) and isinstance(new, dict)) or new.get("kind", old.get("kind")) != old.get(
+                "kind"
+            ):
+                return new
+            return old | {key: merged(old.get(key), value) for key, value in new.items()}
+
+        file = type(self).model_validate(merged(self.model_dump(exclude_unset=True), groups))
+        file._folder = self._folder
+        return file
+
+    def build(self) -> Ready:
+        """What the file describes, ready for `simulate(rig, t, y0=y0)`.
+
+        Pads are settled around the bodies where these start. Raises `ValueError` with the field's name: for motions that cannot
+        be, recorded ones that cannot be read, bodies that find no rest, and bodies too deep in a pad for it to settle.
+        """
+        known = {name: signal(self, name, None) for name, who in self.followers().items() if who[0][0] == "driven"}
+        pose = starts(
+            self, {name: float(one(torch.zeros((), dtype=torch.float64))[0].detach()) for name, one in known.items()}
+        )
+        signals = {name: known.get(name) or signal(self, name, pose) for name in self.motion}
+        rig = assemble(self)
+        rig.reference = Reference(**signals)
+        try:
+            y0 = standing(rig, {name: torch.from_numpy(at) for name, at in pose.items()})
+        except NoEquilibrium as error:
+            raise ValueError(f"bodies: the pads cannot settle where bodies start: {error}") from None
+        for name, body in self.bodies.items():
+            rates = [v for v, axis in zip(body.start.velocity, COORDINATES) if axis in body.free]
+            y0[rig.layout.slices["velocity", name]] = torch.tensor(rates, dtype=torch.float64)
+        return Ready(rig, y0, output_times(self))

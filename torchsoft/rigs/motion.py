@@ -1,0 +1,234 @@
+"""Motions of a rig file: what loops follow, what is fed forward, and where driven coordinates go, as functions of time."""
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple, Self
+
+import numpy as np
+from pydantic import Field, model_validator
+from scipy.interpolate import CubicSpline
+
+from torchsoft.excitation import FADE, Waves, wave
+from torchsoft.physics.motion import Piecewise, Profile, Sampled
+from torchsoft.rigs.fields import Group, NumberOr, Time, Within
+from torchsoft.rigs.recorded import read_column
+from torchsoft.tables import LISTED, shown
+
+START = "start"
+"""The word for where the coordinate that follows a motion is when the run begins."""
+
+PERIODS = 1e5
+"""Periods of a wave in one run at the most."""
+
+Value = Annotated[float | str, NumberOr("m, rad, N or N.m", START)]
+
+Times = Annotated[tuple[Time, ...], LISTED, Field(min_length=1, max_length=100_000)]
+Values = Annotated[tuple[Value, ...], LISTED, Field(min_length=1, max_length=100_000)]
+
+Frequency = Annotated[float, Within(1e-6, 1e5, "Hz")]
+
+
+class Asked(NamedTuple):
+    """What a motion is made for: its name, its unit, where the coordinate that follows it starts (None: no coordinate that is
+    free does), the end of the run [s], and the folder of the rig's file."""
+
+    name: str
+    unit: str
+    start: float | None
+    end: float
+    folder: Path
+
+    def value(self, field: str, value: float | str) -> float:
+        """A number, or the start. Raises `ValueError`."""
+        if not isinstance(value, str):
+            return value
+        if self.start is None:
+            raise ValueError(
+                f'motion.{self.name}.{field}: "{START}" stands for where the one free coordinate that follows a motion as its '
+                "set-point starts, and there is none such here; give a number"
+            )
+        return self.start
+
+
+class Motion(Group):
+    """A function of time, in m or rad where a coordinate follows it, in N or N.m where it is fed forward."""
+
+    def build(self, asked: Asked) -> Piecewise:
+        """The signal. Raises `ValueError` naming the field."""
+        raise NotImplementedError
+
+    def fastest(self) -> float:
+        """Its highest frequency [Hz]; 0 where it has none."""
+        return 0.0
+
+
+class HoldTable(Motion):
+    """Stays where it is."""
+
+    kind: Literal["hold"] = "hold"
+    value: Value = Field(default=START, description=f'"{START}": where the coordinate that follows starts')
+
+    def build(self, asked: Asked) -> Piecewise:
+        return Profile([0.0], [asked.value("value", self.value)])
+
+
+class Knots(Motion):
+    """Values at given times."""
+
+    times: Times = Field(description="increasing; constant before the first and after the last [s]")
+    values: Values = Field(description=f'one per time; "{START}": where the coordinate that follows starts')
+
+    @model_validator(mode="after")
+    def _are_pairs(self) -> Self:
+        if len(self.times) != len(self.values):
+            raise ValueError(
+                f"times has {len(self.times)} numbers, but values {len(self.values)}; give one value per time"
+            )
+        for before, after in pairwise(self.times):
+            if after <= before:
+                raise ValueError(f"times must increase, but {after:g} s follows {before:g} s")
+        return self
+
+    def knots(self, asked: Asked) -> tuple[list[float], list[float]]:
+        """Times and values."""
+        return list(self.times), [asked.value("values", value) for value in self.values]
+
+
+class ProfileTable(Knots):
+    """From value to value along polynomials of 7th order, at rest at each."""
+
+    kind: Literal["profile"] = "profile"
+
+    def build(self, asked: Asked) -> Piecewise:
+        return Profile(*self.knots(asked))
+
+
+class SplineTable(Knots):
+    """A cubic spline through the values, at rest at the first and the last."""
+
+    kind: Literal["spline"] = "spline"
+
+    def build(self, asked: Asked) -> Piecewise:
+        times, values = self.knots(asked)
+        if len(times) == 1:
+            return Profile(times, values)
+        slopes = CubicSpline(times, values, bc_type="clamped").derivative()(times)
+        return Sampled(times, values, slopes.tolist())
+
+
+class Wavy(Knots):
+    """Waves on top of a profile, from `since` to `until`, where they come and go."""
+
+    times: Times = Field(default=(0.0,), description="of the profile that the waves are added to [s]")
+    values: Values = Field(
+        default=(START,), description=f'of the profile; "{START}": where the coordinate that follows starts'
+    )
+    since: Time = Field(default=0.0, description="when the waves begin; they come within 0.15 s")
+    until: Time | None = Field(
+        default=None, description="when they have gone, again within 0.15 s; the end of the run if not given"
+    )
+
+    def window(self, asked: Asked) -> tuple[float, float]:
+        """Begin and end [s] of the waves. Raises `ValueError`."""
+        until = asked.end if self.until is None else self.until
+        if not until - self.since > 2 * FADE:
+            raise ValueError(
+                f"motion.{asked.name}.since = {self.since:g} s leaves {until - self.since:g} s until {until:g} s, but waves "
+                f"take {2 * FADE:g} s to come and go"
+            )
+        if self.fastest() * (until - self.since) > PERIODS:
+            raise ValueError(
+                f"motion.{asked.name} has more than {PERIODS:g} periods; take a lower frequency or a shorter time"
+            )
+        return self.since, until
+
+
+class ComponentTable(Group):
+    """One sine."""
+
+    amplitude: Annotated[float, Within(-1e6, 1e6, "m, rad, N or N.m")] = Field(description="amplitude")
+    frequency: Frequency = Field(description="frequency")
+    phase: Annotated[float, Within(-1e3, 1e3, "rad")] = Field(default=0.0, description="phase")
+
+
+class SinesTable(Wavy):
+    """Sines on top of a profile."""
+
+    kind: Literal["sines"] = "sines"
+    components: Annotated[tuple[ComponentTable, ...], LISTED, Field(min_length=1, max_length=100)] = Field(
+        description="amplitude, frequency [Hz] and phase [rad] of each sine"
+    )
+
+    def fastest(self) -> float:
+        return max(one.frequency for one in self.components)
+
+    def build(self, asked: Asked) -> Piecewise:
+        columns = np.array([(one.amplitude, one.frequency, 0.0, one.phase) for one in self.components]).T
+        return Waves(self.knots(asked), *self.window(asked), wave(*columns))
+
+
+class ChirpTable(Wavy):
+    """A sine on top of a profile, its frequency going from `first` to `last`."""
+
+    kind: Literal["chirp"] = "chirp"
+    amplitude: Annotated[float, Within(-1e6, 1e6, "m, rad, N or N.m")] = Field(description="amplitude")
+    first: Frequency = Field(description="frequency at its begin")
+    last: Frequency = Field(description="frequency at its end")
+
+    def fastest(self) -> float:
+        return max(self.first, self.last)
+
+    def build(self, asked: Asked) -> Piecewise:
+        since, until = self.window(asked)
+        sweep = (self.last - self.first) / (until - since)
+        return Waves(self.knots(asked), since, until, wave(self.amplitude, self.first, sweep, 0.0))
+
+
+class CsvTable(Motion):
+    """A recorded motion: a cubic spline through a column of a CSV file, with units in its heading: `t [s], x_d [mm]`."""
+
+    kind: Literal["csv"] = "csv"
+    file: str = Field(description="the file, from the folder of this one")
+    column: str = Field(description="the column's name, without its unit")
+    offset: Value = Field(
+        default=0.0, description=f'what is added; "{START}": where the coordinate that follows starts'
+    )
+
+    def build(self, asked: Asked) -> Piecewise:
+        try:
+            times, values = read_column(asked.folder / self.file, self.column, asked.unit)
+        except ValueError as error:
+            raise ValueError(f"motion.{asked.name}.file: {error}") from None
+        offset = asked.value("offset", self.offset)
+        return Sampled(times, [offset + value for value in values])
+
+
+MotionTable = Annotated[
+    HoldTable | ProfileTable | SplineTable | SinesTable | ChirpTable | CsvTable, Field(discriminator="kind")
+]
+
+
+def flattened(motion: object, within: str = "") -> object:
+    """Motions by name, where TOML nests them: [motion.upper.y] is the motion of the coordinate "upper.y"."""
+    if not isinstance(motion, dict):
+        return motion
+    out: dict[str, object] = {}
+    for key, value in motion.items():
+        name = f"{within}.{key}" if within else str(key)
+        inner = flattened(value, name) if is_nest(value) else {name: value}
+        assert isinstance(inner, dict)
+        for one, table in inner.items():
+            if one in out:
+                raise ValueError(f"motion.{shown(one)} is there twice")
+            out[one] = table
+    return out
+
+
+def is_nest(value: object) -> bool:
+    """Whether a table holds motions, and is none itself."""
+    return (
+        isinstance(value, dict)
+        and "kind" not in value
+        and bool(value)
+        and all(isinstance(x, dict) for x in value.values())
+    )

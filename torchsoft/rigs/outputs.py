@@ -1,0 +1,64 @@
+"""What a run of a rig file writes, and how it is computed."""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from torchsoft.rigs.fields import Group, Time, Within
+from torchsoft.tables import LISTED
+
+ROWS = 1_000_000
+"""Outputs of one run at the most."""
+
+
+class OutputsTable(Group):
+    """How long the run lasts, and what is written."""
+
+    duration: Annotated[float, Within(1e-3, 1e5, "s")] = Field(description="of the run")
+    interval: Annotated[float, Within(1e-6, 1e3, "s")] = Field(default=0.01, description="between outputs")
+    figures: bool = Field(default=True, description="write the figures")
+    snapshots: Annotated[tuple[Time, ...], LISTED, Field(max_length=12)] = Field(
+        default=(), description="times of the pictures in snapshots.png; six over the whole run if none is given [s]"
+    )
+    video: Literal["gif", "mp4", "none"] = Field(
+        default="gif", description="kind of the video; mp4 needs imageio-ffmpeg"
+    )
+    frames: Annotated[int, Field(ge=2, le=10_000)] = Field(
+        default=150, description="pictures of the video, 12 a second"
+    )
+    follow: str = Field(
+        default="", description='coordinate under the video, such as "disc.x"; the one that moves most if not given'
+    )
+
+    @model_validator(mode="after")
+    def _are_possible(self) -> Self:
+        if self.interval > self.duration:
+            raise ValueError(f"interval = {self.interval:g} s is longer than duration = {self.duration:g} s")
+        if self.duration / self.interval > ROWS:
+            raise ValueError(f"interval = {self.interval:g} s makes more than {ROWS} outputs in {self.duration:g} s")
+        if late := [time for time in self.snapshots if time > self.duration]:
+            raise ValueError(f"snapshots: {late[0]:g} s is after the end of the run, duration = {self.duration:g} s")
+        return self
+
+
+class SolverTable(Group):
+    """How steps are chosen: by tolerance, or equal ones."""
+
+    rtol: Annotated[float, Within(1e-9, 1e-1)] | None = Field(
+        default=None, description="relative tolerance; 1e-5 if not given"
+    )
+    atol: Annotated[float, Within(1e-12, 1.0)] | None = Field(
+        default=None, description="absolute tolerance, in N, mm and rad; a tenth of rtol if not given"
+    )
+    step: Annotated[float, Within(1e-7, 1.0, "s")] | None = Field(
+        default=None, description="equal steps no longer than this instead"
+    )
+    tolerance: Annotated[float, Within(1e-10, 1e-3, "N")] = Field(
+        default=1e-9, description="Newton's, on every nodal force"
+    )
+
+    @model_validator(mode="after")
+    def _choose_once(self) -> Self:
+        if self.step is not None and (self.rtol or self.atol) is not None:
+            raise ValueError("step and rtol (or atol) each say which steps to take; give one of them")
+        return self

@@ -1,0 +1,116 @@
+"""From a rig file to a folder of results: the trajectory, a summary in numbers with how it was made, figures and a video."""
+
+import time
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from torchsoft.files import make_folder, write_json
+from torchsoft.physics.parts import COORDINATES
+from torchsoft.physics.rig import Rig
+from torchsoft.rigs.build import Ready, RigFile
+from torchsoft.rigs.check import Finding
+from torchsoft.rigs.pictures import draw
+from torchsoft.solve.ledger import doubts
+from torchsoft.solve.progress import SimulationFailed
+from torchsoft.solve.simulate import Interrupted, simulate
+from torchsoft.solve.trajectory import Trajectory
+
+
+class Done(NamedTuple):
+    """A run, as far as it went, and what ended it early, if anything did."""
+
+    ready: Ready
+    trajectory: Trajectory
+    stopped: SimulationFailed | Interrupted | None
+
+
+def carry_out(file: RigFile, *, progress: bool = False) -> Done:
+    """Simulate what a file describes. A failure and Ctrl-C end it early, with what was simulated until then.
+
+    Raises `ValueError` for what cannot be built, and `KeyboardInterrupt` before anything was simulated.
+    """
+    ready, s = file.build(), file.solver
+    try:
+        run = simulate(
+            ready.rig,
+            ready.t,
+            y0=ready.y0,
+            rtol=s.rtol,
+            atol=s.atol,
+            step=s.step,
+            tolerance=s.tolerance,
+            progress=progress,
+        )
+    except (SimulationFailed, Interrupted) as stop:
+        if stop.trajectory is None:
+            raise
+        return Done(ready, stop.trajectory, stop)
+    return Done(ready, run, None)
+
+
+def run(file: RigFile, out: Path, *, found: list[Finding] | None = None, progress: bool = False) -> Done:
+    """Simulate and write everything to the folder `out`: data first, pictures only of a run that was not stopped. `found` are
+    the check's findings, for the summary."""
+    began = time.perf_counter()
+    done = carry_out(file, progress=progress)
+    make_folder(out)
+    done.trajectory.save(out / "trajectory.nc")
+    numbers = summary(file, done, found or []) | {"wall_s": time.perf_counter() - began}
+    write_json(out / "summary.json", numbers)
+    if done.stopped is None:
+        draw(file, done.ready.rig, done.trajectory, out, progress)
+    return done
+
+
+def summary(file: RigFile, done: Done, found: list[Finding]) -> dict[str, Any]:
+    """The run in numbers, in SI units, and how it was made."""
+    run, rig = done.trajectory, done.ready.rig
+    stopped = done.stopped
+    why = None if stopped is None else stopped.reason if isinstance(stopped, SimulationFailed) else "interrupted"
+    return {
+        "title": file.title,
+        "stopped": why,
+        "simulated_s": float(run.t[-1]),
+        "bodies": {name: coordinates(rig, run, name) for name in rig.bodies},
+        "contacts": {
+            name: {
+                "largest_normal_force_N": float(force[..., 0].sum(-1).max()),
+                "normal_force_at_end_N": float(force[-1, :, 0].sum()),
+                "largest_friction_N": float(force[..., 1].sum(-1).abs().max()),
+                "most_points_touching": int((force[..., 0] > 0).sum(-1).max()),
+            }
+            for name, force in run.force.items()
+        },
+        "pads": {
+            name: {"largest_displacement_over_height": float(u.norm(dim=-1).max()) / rig.pads[name].mesh.height}
+            for name, u in run.displacement.items()
+        },
+        "actuators": {name: {"largest_effort": float(run[effort(rig, name)].abs().max())} for name in rig.actuators},
+        "energy": {
+            "injected_J": float(run.injected[-1]),
+            "dissipated_J": {name: float(work[-1]) for name, work in run.dissipated.items()},
+            "worst_imbalance_J": float(run.energy_residual.abs().max()),
+            "worst_imbalance_over_injected": run.energy_residual_rel,
+        },
+        "doubts": list(doubts(run, rig)),
+        "stepping": vars(run.stats) | {"newton_per_step": run.stats.newton_per_step},
+        "findings": [one._asdict() for one in found],
+        "torchsoft": version("torchsoft"),
+        "file": file.model_dump(mode="json", exclude_none=True),
+    }
+
+
+def coordinates(rig: Rig, run: Trajectory, body: str) -> dict[str, dict[str, float]]:
+    """Start, end, least and largest value of a body's coordinates that are not fixed [m, rad]."""
+    rows = {}
+    for i, axis in enumerate(COORDINATES):
+        if rig.bodies[body].freedom[axis] != "fixed":
+            place = run.state.pose[body][:, i].detach()
+            rows[axis] = {"start": place[0], "end": place[-1], "least": place.min(), "largest": place.max()}
+    return {axis: {name: float(value) for name, value in row.items()} for axis, row in rows.items()}
+
+
+def effort(rig: Rig, actuator: str) -> str:
+    """The channel of an actuator's effort."""
+    return rig.renamed.get(f"F_{actuator}", f"F_{actuator}")

@@ -1,0 +1,109 @@
+"""A rig file as TOML text: every field with its unit and meaning as a comment, from the schema; what is left at its default is
+commented out."""
+
+import json
+from collections.abc import Iterator, Mapping
+from typing import Annotated, Any, get_args, get_origin
+
+from pydantic.fields import FieldInfo
+
+from torchsoft.rigs.fields import Group, NumberOr, Within
+from torchsoft.rigs.schema import RigTables
+
+COLUMN = 44
+"""Where comments begin."""
+
+
+def to_toml(file: RigTables) -> str:
+    """The text of a TOML file that `RigFile.from_toml` reads."""
+    seen: set[type[Group]] = set()
+    lines = [*heading(type(file)), "", *scalars(file, [], seen)]
+    for name, field in type(file).model_fields.items():
+        value = getattr(file, name)
+        if isinstance(value, Mapping):
+            for key, table in value.items():
+                lines += ["", *(heading(type(table)) if type(table) not in seen else ())]
+                lines += section(table, f"{name}.{key}", kinds(field), seen)
+        elif isinstance(value, Group):
+            lines += ["", *heading(type(value)), *section(value, name, kinds(field), seen)]
+    return "\n".join(lines) + "\n"
+
+
+def heading(table: type[Group]) -> list[str]:
+    """What a table is, as comments."""
+    return [f"# {line.strip()}" for line in (table.__doc__ or "").strip().splitlines()]
+
+
+def section(table: Group, path: str, known: list[str], seen: set[type[Group]]) -> Iterator[str]:
+    """A table under its heading, and the tables in it."""
+    yield f"[{path}]"
+    yield from scalars(table, known, seen)
+    for name, field in type(table).model_fields.items():
+        value = getattr(table, name)
+        if isinstance(value, Group) and (name in table.model_fields_set or field.is_required()):
+            yield from section(value, f"{path}.{name}", kinds(field), seen)
+
+
+def scalars(table: Group, known: list[str], seen: set[type[Group]]) -> Iterator[str]:
+    """A line for every field that is no table, with a comment; those at their default only in the first table of its sort."""
+    again = type(table) in seen
+    seen.add(type(table))
+    fields = type(table).model_fields
+    if "kind" in fields:
+        yield commented(f"kind = {text(table.model_dump()['kind'])}", f"one of {', '.join(known)}")
+    for name, field in fields.items():
+        value = getattr(table, name)
+        if name == "kind" or isinstance(value, Group | Mapping) or (value is None and any(tables(field.annotation))):
+            continue
+        if value is not None and (name in table.model_fields_set or field.is_required()):
+            yield commented(f"{name} = {text(value)}", remark(field))
+        elif not again:
+            yield commented(f"# {name} = {text(value)}" if value is not None else f"# {name} =", remark(field))
+
+
+def commented(row: str, remark: str) -> str:
+    """A line with its comment."""
+    return f"{row.ljust(COLUMN - 1)} # {remark}" if remark else row
+
+
+def remark(field: FieldInfo) -> str:
+    """Meaning and unit of a field."""
+    unit = next(
+        (one.unit for one in metadata(field) if isinstance(one, Within | NumberOr) and one.unit not in ("", "1")), ""
+    )
+    meaning = field.description or ""
+    return meaning if not unit or f"[{unit}]" in meaning else f"{meaning} [{unit}]"
+
+
+def metadata(field: FieldInfo) -> Iterator[Any]:
+    """What the annotation of a field says besides its type."""
+    yield from field.metadata
+    for one in get_args(field.annotation):
+        if get_origin(one) is Annotated:
+            yield from one.__metadata__
+
+
+def tables(annotation: Any) -> Iterator[type[Group]]:
+    """The tables that an annotation speaks of."""
+    if isinstance(annotation, type) and issubclass(annotation, Group):
+        yield annotation
+    for one in get_args(annotation):
+        yield from tables(one)
+
+
+def kinds(field: FieldInfo) -> list[str]:
+    """The kinds of table that a field may be."""
+    found = (one.model_fields["kind"].default for one in tables(field.annotation) if "kind" in one.model_fields)
+    return list(dict.fromkeys(found))
+
+
+def text(value: Any) -> str:
+    """A value in TOML."""
+    if isinstance(value, Group):
+        inner = ", ".join(f"{name} = {text(getattr(value, name))}" for name in type(value).model_fields)
+        return f"{{{inner}}}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(text(one) for one in value)}]"
+    if isinstance(value, float):
+        return repr(value)
+    return json.dumps(value, ensure_ascii=False)
