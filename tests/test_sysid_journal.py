@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from torchsoft.sysid import workers
+from torchsoft.sysid.problem import workers
 from torchsoft.sysid.problem.journal import MARKER, Journal, decoded, encoded, forget
 from torchsoft.sysid.problem.prediction import FailedRun, Frozen, Misfit, Prediction
 from torchsoft.sysid.problem.workers import Job, Runner

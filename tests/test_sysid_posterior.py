@@ -20,7 +20,8 @@ from test_experiments import experiment
 
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Roll
-from torchsoft.sysid import RIG, Prior, Problem, Sensor, Unknown, Unreachable, calibration, record
+from torchsoft.sysid import RIG, Prior, Problem, Sensor, Unknown, Unreachable, record
+from torchsoft.sysid.certainty import calibration
 from torchsoft.sysid.certainty.calibration import calibrate, chi2_test, ecdf_test, envelope
 from torchsoft.sysid.certainty.nuts import Whitened, nuts
 from torchsoft.sysid.certainty.optimum import Optimum

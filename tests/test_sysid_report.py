@@ -30,7 +30,6 @@ from torchsoft.sysid import (
     Unknown,
     identify,
     record,
-    sections,
 )
 from torchsoft.sysid.answer.answer import AssumptionCheck, ChannelNoise, load_answer
 from torchsoft.sysid.answer.comparison import Comparison
@@ -42,6 +41,7 @@ from torchsoft.sysid.fit.information import Combination
 from torchsoft.sysid.problem.noise import Autoregression
 from torchsoft.sysid.problem.prediction import FailedRun
 from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.report import sections
 from torchsoft.sysid.report.figures import (
     contributions_figure,
     correlation_figure,

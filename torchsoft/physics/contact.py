@@ -117,19 +117,19 @@ class Coulomb(nn.Module):
         return torch.where(self.mu_s * F_N <= E, (E - self.mu_k * F_N) / R, 0.0)
 
 
-Sliding = Callable[[Tensor, Tensor], Tensor]
-"""Rate [m/s] at which sliding at v_T [m/s] stretches the tangential elements, with the ramp rho [1]."""
+Sliding = Callable[[Tensor], Tensor]
+"""The part [1] of the sliding that stretches the tangential elements, where the ramp is rho [1]."""
 
 
-def ramped(rho: Tensor, v_T: Tensor) -> Tensor:
-    """rho v_T: as much of the sliding as of the force is taken in, which is the power that the element gets."""
-    return rho * v_T
+def ramped(rho: Tensor) -> Tensor:
+    """rho: as much of the sliding as of the force is taken in, which is the power that the element gets."""
+    return rho
 
 
-def at_once(rho: Tensor, v_T: Tensor) -> Tensor:
+def at_once(rho: Tensor) -> Tensor:
     """All of the sliding from touch-down on, while the force is ramped in: power (1 - rho) e v_T comes from nowhere. Not
     continuous at touch-down."""
-    return torch.where(rho > 0, v_T, torch.zeros_like(v_T))
+    return torch.where(rho > 0, torch.ones_like(rho), torch.zeros_like(rho))
 
 
 class SoftContact(nn.Module):
@@ -180,13 +180,13 @@ class SoftContact(nn.Module):
         """
         R = self.R_t + stage * self.K_t
         rho = ramp(g, self.epsilon)
-        slide = self.sliding(rho, v_T)
+        part = self.sliding(rho)
         F_N = normal_force(g, g_dot, rho, self.K_n, self.R_n)  # (8), (9)
-        trial = self.K_t * s + R * slide  # (10), (11): the effort if nothing slipped
+        trial = self.K_t * s + R * part * v_T  # (10), (11): the effort if nothing slipped
         one = torch.ones_like(trial)
         sign = torch.where(trial >= 0, one, -one)
         gamma_dot = sign * self.friction(sign * trial, F_N, R)  # (12), (13)
-        s_dot = slide - gamma_dot
+        s_dot = part * v_T - gamma_dot
         e = self.K_t * s + R * s_dot
         return ContactState(weight * F_N, weight * rho * e, s_dot, gamma_dot, weight * e, rho)
 
