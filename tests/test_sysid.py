@@ -205,16 +205,16 @@ def shaking() -> Recording:
 
 def test_a_tolerance_too_coarse_for_the_data_is_found_and_tightened(shaking: Recording) -> None:
     problem = Problem([shaking], SENSORS, {"pad.E": Unknown(), "pad.tau": Unknown()})
-    plan = [Stage("all", ("shaking",), ("pad.E", "pad.tau"), 6e-3)]
+    plan = [Stage("all", ("shaking",), ("pad.E", "pad.tau"), 8e-3)]
     coarse = identify(problem, plan=plan, tightenings=0, assumptions="trusted")
-    assert any("rtol = 0.006 is too coarse" in notice and "take rtol = 0.0006" in notice for notice in coarse.notices)
+    assert any("rtol = 0.008 is too coarse" in notice and "take rtol = 0.0008" in notice for notice in coarse.notices)
     worst = max(coarse.estimates, key=lambda e: abs(e.step_bias_sd))
     error = float(np.log(worst.last / BASE.table()[worst.name]["value"]))
     assert abs(error) > worst.relative_sd  # so the notice is needed
     assert worst.step_bias_sd * worst.relative_sd == pytest.approx(error, rel=0.5)  # and its size is about right
     better = identify(problem, plan=plan)
     assert not any("too coarse" in notice for notice in better.notices)
-    assert better.made_by["rtol"] < 6e-3
+    assert better.made_by["rtol"] < 8e-3
     assert abs(np.log(better[worst.name].last / BASE.table()[worst.name]["value"])) < 0.2 * abs(error)
 
 

@@ -158,10 +158,10 @@ def test_under_another_law_a_fit_that_is_far_off_begins_anew() -> None:
     as_stated, again = (refit(problem, end, one, "linear", lambda chi2: None) for one in (None, law))
     assert as_stated is not None
     assert again is not None
-    assert as_stated.fit.chi2 > 1.5
-    assert again.fit.chi2 < 1.1
+    assert as_stated.fit.chi2 > 1e3  # nothing can be done with smooth friction
+    assert again.fit.chi2 < 2  # on steps as coarse as those of the checks
     for name, value in TRUTH.items():
-        assert again.of(name) == pytest.approx(np.log(value), abs=0.05)
+        assert again.of(name) == pytest.approx(np.log(value), abs=0.1)
 
 
 def test_every_pad_is_meshed_anew_where_it_was() -> None:

@@ -100,5 +100,6 @@ def test_a_robust_loss_sees_through_outliers(exact: Recording) -> None:
     assert not robust.notices
     for name, truth in TRUTH.items():
         assert abs(np.log(robust[name].last / truth)) < 3 * robust[name].relative_sd, name
-        assert 1.0 < robust[name].relative_sd / clean[name].relative_sd < 1.25
+        # nine tenths as efficient, by an estimate from the residuals themselves, which scatters by some percent
+        assert 0.9 < robust[name].relative_sd / clean[name].relative_sd < 1.25
         assert plain[name].relative_sd > 2 * robust[name].relative_sd

@@ -159,7 +159,7 @@ def test_bounds_and_criteria_are_checked() -> None:
 @pytest.fixture(scope="module")
 def found(problem: Problem) -> Design:
     return design(
-        problem, "plan", BOUNDS, limits={"F_y": (-60.0, 60.0)}, at=draws(problem, 2, spread=0.1), iterations=8, rate=0.3,
+        problem, "plan", BOUNDS, limits={"F_y": (-60.0, 60.0)}, at=draws(problem, 2, spread=0.1), iterations=16, rate=0.3,
     )  # fmt: skip
 
 
@@ -167,7 +167,7 @@ def test_a_designed_motion_tells_more(found: Design, problem: Problem) -> None:
     """What is predicted for it is what its recording's own Jacobian says."""
     assert all(found.after[name] < 0.9 * was for name, was in found.before.items())
     assert found.history[-1].peak < 1.05
-    assert found.made_by["gradients"] >= 8 * 4
+    assert found.made_by["gradients"] >= 16 * 4
     again = Problem([found.recording], SENSORS, problem.unknowns)
     x = again.coordinates.start
     at = again.residuals(Runner([found.recording]), x, ["plan"], 1e-3, again.coordinates.free)
