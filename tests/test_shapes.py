@@ -11,7 +11,7 @@ from conftest import f64, times
 from matplotlib.path import Path as Polygon
 from numpy.typing import NDArray
 from scipy.integrate import quad
-from scipy.interpolate import BSpline
+from scipy.interpolate import BSpline, CubicSpline
 from scipy.optimize import minimize_scalar
 from torch import Tensor, nn
 
@@ -532,7 +532,10 @@ NECK = [[np.cos(t), np.sin(t) * (0.005 + np.cos(t) ** 2)] for t in np.arange(400
         ),
         (lambda: Contour(EIGHT), "a contour that crosses itself"),
         (lambda: Contour(NECK, tolerance=1e-3), "so sharp, or so narrow, that the nearest point is the only one up to"),
-        (lambda: Contour(pear(500), tolerance=1e-12), "a contour of 512 pieces still passes the points at .*e-.* m"),
+        (
+            lambda: Contour(pear(500), tolerance=1e-12),
+            "a contour of 512 pieces still passes the points, or the spline .*, at .*e-.* m",
+        ),
         (lambda: Contour(CIRCLE, tolerance=0), "`tolerance` must be positive and finite, but is 0"),
         (lambda: RoundedPolygon(TRIANGLE, 9e-3), "corners of radius 0.009 do not fit on side . of the polygon"),
         (lambda: RoundedPolygon([[0, 0], [1, 0], [0, 0], [0, 1]], 0.01), "do not fit on side . of the polygon"),
@@ -553,6 +556,18 @@ def test_control_points_that_were_spoilt_are_refused() -> None:
         shape.control[3] *= 3.0
     with pytest.raises(ValueError, match="so sharp, or so narrow"):
         rest(SoftGrasp(COARSE, shape=shape))
+
+
+@pytest.mark.parametrize(("tolerance", "pieces"), [(1e-4, 32), (1e-6, 128), (1e-8, 512)])
+def test_a_contour_follows_the_spline_through_its_points(tolerance: float, pieces: int) -> None:
+    shape, closed = Contour(pear(), tolerance=tolerance), np.concatenate((pear(), pear()[:1]))
+    way = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))))
+    dense = CubicSpline(way, closed, bc_type="periodic")(np.linspace(0, way[-1], 3000))
+    with torch.no_grad():
+        off = shape(torch.from_numpy(dense) - shape.moments().centre)[0].abs().max().item()
+    assert len(shape.control) == pieces
+    assert off <= 1.1 * shape.residual <= 1.1 * tolerance
+    assert off > 0.5 * shape.residual
 
 
 def test_a_contour_from_a_file(tmp_path: Path) -> None:

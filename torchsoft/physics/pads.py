@@ -19,7 +19,7 @@ from torchsoft.physics.mesh import Array, Mesh, lame_moduli, unit_compliance
 
 class Pad(nn.Module):
     """`base` names the body that it is bonded to, None the ground; the mesh is mirrored if wanted (y upside down), turned by
-    `angle` [rad] and put with its corner at `origin` [m] in the base's frame.
+    `angle` [rad] and put with its own origin, a corner or the left end of its base, at `origin` [m] in the base's frame.
 
     `points` contact points an element of the surface lie at Gauss places; 0 puts one on every node, as in the paper.
     `positions` are the undeformed places of the nodes in the state (nodes, 2) [m], `surface` numbers those on the surface.

@@ -74,16 +74,21 @@ def read_points(path: str | Path) -> Array:
     return points
 
 
-def control_points(points: Array, pieces: int) -> Array:
-    """Control points (pieces, 2) [m], anticlockwise, of a uniform periodic cubic B-spline: where its pieces meet, equally far
-    apart, it agrees with the periodic cubic spline through the points (n, 2) over the chords' lengths."""
+def closed_spline(points: Array) -> tuple[CubicSpline, Array]:
+    """The periodic cubic spline through points (n, 2) [m] over the lengths of their chords, anticlockwise, and these lengths
+    from the first point on to the first point again (n + 1,) [m]."""
     x, y = points.T
     if (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() < 0:
         points = points[::-1]
     closed = np.concatenate((points, points[:1]))
     chords = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))))
-    spline = CubicSpline(chords, closed, bc_type="periodic")
-    t = np.linspace(0, chords[-1], FINE * max(pieces, len(points)) + 1)
+    return CubicSpline(chords, closed, bc_type="periodic"), chords
+
+
+def control_points(spline: CubicSpline, chords: Array, pieces: int) -> Array:
+    """Control points (pieces, 2) [m] of the uniform periodic cubic B-spline that meets a closed spline where its pieces do, at
+    places equally far apart along it."""
+    t = np.linspace(0, chords[-1], FINE * max(pieces, len(chords)) + 1)
     speed = np.linalg.norm(spline(t, 1), axis=1)
     length = np.concatenate(([0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(t))))
     at = CubicSpline(length, t)(np.linspace(0, length[-1], pieces, endpoint=False))

@@ -3,17 +3,21 @@
 from pathlib import Path
 from typing import Self
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from torchsoft.physics.arguments import positive
 from torchsoft.physics.shapes.area import Moments, gauss, moments
-from torchsoft.physics.shapes.closed import contour_points, control_points, read_points
+from torchsoft.physics.shapes.closed import closed_spline, contour_points, control_points, read_points
 from torchsoft.physics.shapes.shape import Prepared, Shape, note_centre
 from torchsoft.physics.shapes.simple import crossing, reach
 
 PIECES = (32, 64, 128, 256, 512)
 """How many pieces a contour may have; as many are taken as its tolerance asks for."""
+
+BETWEEN = 8
+"""Places from point to point at which a contour is held against the spline through the points."""
 
 SHARPEST = 1e-2
 """How far from a contour, over its size, the nearest point must at least be the only one."""
@@ -29,10 +33,10 @@ class Contour(Shape):
     """A body inside a periodic cubic B-spline through points (n, 2) [m] of its contour in their order, which may be given about
     any point: the body's own frame has its origin at the centre of mass, and a note says where that is.
 
-    The contour is smooth: curvature is continuous. It passes the points at `residual` [m], which is at most the `tolerance`
-    [m]; between them it follows the periodic cubic spline over the chords' lengths. Its `control` points, (pieces, 2) [m], are
-    one parameter, which gradients reach. Distance and normal are exact wherever the nearest point is the only one, as deep
-    as the sharpest curvature and half of the narrowest neck.
+    The contour is smooth: curvature is continuous. It passes the points, and between them their periodic cubic spline over
+    the chords' lengths, at `residual` [m], which is at most the `tolerance` [m]. Its `control` points, (pieces, 2) [m], are
+    one parameter, which gradients reach. Distance and normal are exact up to half as far from the contour as the nearest point
+    is the only one, which the sharpest curvature and the narrowest neck decide.
 
     Raises `ValueError` for points that are too few or turn too sharply, and for a contour that passes them farther than the
     tolerance, crosses itself, or is so sharp, narrow or intricate that the nearest points cannot be told apart.
@@ -43,18 +47,20 @@ class Contour(Shape):
 
     def __init__(self, points: object, *, tolerance: float = 1e-6) -> None:
         super().__init__()
-        given, tolerance = contour_points(points), positive("tolerance", tolerance)
+        (spline, chords), tolerance = closed_spline(contour_points(points)), positive("tolerance", tolerance)
+        between = np.linspace(chords[:-1], chords[1:], BETWEEN, endpoint=False).ravel()
+        given = torch.from_numpy(spline(between))
         self._judged = (b"", "")
         for pieces in PIECES:
-            self.control = nn.Parameter(torch.from_numpy(control_points(given, pieces)))
+            self.control = nn.Parameter(torch.from_numpy(control_points(spline, chords, pieces)))
             with torch.no_grad():
-                self.residual = float(self(torch.from_numpy(given) - self.moments().centre)[0].abs().max())
+                self.residual = float(self(given - self.moments().centre)[0].abs().max())
             if self.residual <= tolerance:
                 break
         else:
             raise ValueError(
-                f"a contour of {PIECES[-1]} pieces still passes the points at {self.residual:.2g} m; give a `tolerance` above "
-                "that, or points with rounded corners"
+                f"a contour of {PIECES[-1]} pieces still passes the points, or the spline between them, at "
+                f"{self.residual:.2g} m; give a `tolerance` above that, or points with rounded corners"
             )
         if wrong := self.well_posed():
             raise ValueError(f"`points` cannot be used as a contour: {wrong}")
