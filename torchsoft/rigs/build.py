@@ -1,9 +1,10 @@
 """A rig file: tables, from TOML or from Python, and what is built from them: the rig with its reference, its state at the
 start, and the times of its outputs."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 import torch
@@ -16,13 +17,16 @@ from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.resting import resting, standing
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.bodies import REST
-from torchsoft.rigs.geometry import reach, surface
+from torchsoft.rigs.geometry import points, reach, surface
 from torchsoft.rigs.motion import Asked, flattened
 from torchsoft.rigs.schema import RigTables
 from torchsoft.tables import from_toml
 
 UPWARDS = 0.1
 """Least upward part of the normal of a pad that something may rest on."""
+
+
+T = TypeVar("T")
 
 
 class Ready(NamedTuple):
@@ -38,17 +42,31 @@ def assemble(
 ) -> Rig:
     """The rig without a reference; `held` are coordinates that are fixed, by body and axis, and `loops` names its actuators,
     all by default."""
-    actuators = {name: one for name, one in file.actuators.items() if loops is None or name in loops}
-    materials = {name: table.build() for name, table in file.materials.items()}
+    loops = file.actuators if loops is None else loops
+    materials = {name: made(f"materials.{name}", one.build) for name, one in file.materials.items()}
     laws = {name: table.build() for name, table in file.laws.items()}
+    held = held or {}
     return Rig(
-        bodies={name: body.build(file.folder, dict((held or {}).get(name, {}))) for name, body in file.bodies.items()},
-        pads={name: pad.build(materials[pad.material]) for name, pad in file.pads.items()},
-        contacts={name: contact.build(laws) for name, contact in file.contacts.items()},
-        actuators={name: actuator.build() for name, actuator in actuators.items()},
+        bodies={
+            name: made(f"bodies.{name}", partial(one.build, file.folder, dict(held.get(name, {}))))
+            for name, one in file.bodies.items()
+        },
+        pads={
+            name: made(f"pads.{name}", partial(one.build, materials[one.material])) for name, one in file.pads.items()
+        },
+        contacts={name: one.build(laws) for name, one in file.contacts.items()},
+        actuators={name: one.build() for name, one in file.actuators.items() if name in loops},
         gravity=file.gravity,
-        symbols={name: body.symbol or name for name, body in file.bodies.items()},
+        symbols={name: one.symbol or name for name, one in file.bodies.items()},
     )
+
+
+def made(field: str, build: Callable[[], T]) -> T:
+    """What `build` makes. Raises its `ValueError` with the field's name."""
+    try:
+        return build()
+    except ValueError as error:
+        raise ValueError(f"{field}: {error}") from None
 
 
 def signal(file: RigTables, name: str, pose: Mapping[str, Array] | None) -> Piecewise:
@@ -99,16 +117,16 @@ def starts(file: RigTables, driven: Mapping[str, float]) -> dict[str, Array]:
 
 
 def above(rig: Rig, body: str, pose: Mapping[str, Array]) -> float:
-    """The height [m] at which a body just touches the highest pad under it. Raises `ValueError` where there is none."""
+    """A height [m] at which a body is clear of the pads under it. Raises `ValueError` where there is none."""
+    below = reach(rig, body, pose, np.array([0.0, -1.0]))
+    beside = [reach(rig, body, pose, np.array([side, 0.0])) for side in (-1.0, 1.0)]
     heights = []
     for contact in rig.contacts.values():
         at = surface(rig.pads[contact.pad], pose)
-        if contact.body != body or at.normal[1] < UPWARDS:
-            continue
-        x = float(pose[body][0])
-        level = at.middle[1] + (reach(rig, body, pose, -at.normal) - (x - at.middle[0]) * at.normal[0]) / at.normal[1]
-        if at.off(np.array([x, level])) < 0:
-            heights.append(float(level))
+        x, places = float(pose[body][0]), points(rig.pads[contact.pad], pose)
+        under = (places[:, 0] > x - beside[0]) & (places[:, 0] < x + beside[1])
+        if contact.body == body and at.normal[1] > UPWARDS and places[:, 0].min() < x < places[:, 0].max():
+            heights.append(float(places[under, 1].max()) + below)
     if not heights:
         raise ValueError(
             f'bodies.{body}.start.y: "{REST}", but no pad that it has a contact with lies under x = {pose[body][0]:g} m; '

@@ -11,7 +11,7 @@ from torchsoft.rigs.balance import at_moments
 from torchsoft.rigs.build import Ready, RigFile
 from torchsoft.rigs.course import Estimate, at, signals
 from torchsoft.rigs.finding import SEVERITIES, Finding
-from torchsoft.rigs.geometry import TOUCH, crossing, into, overlap, pressed, surface, tied
+from torchsoft.rigs.geometry import TOUCH, crossing, hull, inside, nodes, overlap, pressed, surface, tied
 from torchsoft.rigs.motion import CsvTable
 
 JUMP = {"m": 1e-4, "rad": 1e-2}
@@ -127,20 +127,17 @@ def overlaps(rig: Rig, estimate: Estimate) -> Iterator[Finding]:
     shaped = [name for name, body in rig.bodies.items() if body.shape is not None]
     for time, pose in estimate.sampled(SAMPLES):
         sure = [name for name in shaped if time == 0 or estimate.known(name)]
-        moved = {name: surface(pad, pose) for name, pad in rig.pads.items()}
         lying = [
             (f"bodies.{a}", f"bodies.{b}", max(overlap(rig, a, b, pose), overlap(rig, b, a, pose)))
             for a, b in itertools.combinations(sure, 2)
         ]
         lying += [
-            (f"bodies.{body}", f"pads.{pad}", into(rig, body, pose, at_pad))
-            for body in sure for pad, at_pad in moved.items()
-            if (pad, body) not in contacts and rig.pads[pad].base != body
+            (f"bodies.{body}", f"pads.{name}", inside(rig, body, pose, nodes(pad, pose)))
+            for body in sure for name, pad in rig.pads.items()
+            if (name, body) not in contacts and pad.base != body
         ]  # fmt: skip
-        lying += [
-            (f"pads.{a}", f"pads.{b}", crossing(x.corners, y.corners))
-            for (a, x), (b, y) in itertools.combinations(moved.items(), 2)
-        ]
+        hulls = {name: hull(pad, pose) for name, pad in rig.pads.items()}
+        lying += [(f"pads.{a}", f"pads.{b}", crossing(hulls[a], hulls[b])) for a, b in itertools.combinations(hulls, 2)]
         for one, other, depth in lying:
             if depth > TOUCH and (one, other) not in said:
                 said.add((one, other))

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import networkx as nx
 import numpy as np
 import torch
+from scipy.spatial import ConvexHull
 
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.pads import Pad
@@ -22,8 +23,8 @@ Poses = Mapping[str, Array]
 
 
 class Surface(NamedTuple):
-    """An undeformed pad in the world: middle of its free surface [m], outward normal, direction along it (2,); half its length
-    and its height [m]."""
+    """An undeformed pad in the world: the middle of its free surface, at its highest [m], outward normal, direction along it
+    (2,); half its length and its height [m]."""
 
     middle: Array
     normal: Array
@@ -32,18 +33,12 @@ class Surface(NamedTuple):
     height: float
 
     def depth(self, place: Array) -> Array:
-        """How deep places (..., 2) lie under the surface's line [m]; negative above it."""
+        """How deep places (..., 2) lie under the line through the middle [m]; negative above it."""
         return -(place - self.middle) @ self.normal
 
     def off(self, place: Array) -> Array:
         """How far places (..., 2) lie beyond the pad's ends [m]; negative between them."""
         return np.abs((place - self.middle) @ self.along) - self.half
-
-    @property
-    def corners(self) -> Array:
-        """Of the whole pad (4, 2), around."""
-        x, y = self.half * self.along, self.height * self.normal
-        return self.middle + np.array([-x - y, x - y, x, -x])
 
 
 def turned(v: Array, angle: float) -> Array:
@@ -52,13 +47,20 @@ def turned(v: Array, angle: float) -> Array:
     return v @ np.array([[c, s], [-s, c]])
 
 
+def in_world(pad: Pad, pose: Poses, own: Array) -> Array:
+    """Places (..., 2) in a pad's own frame [m], in the world."""
+    base = np.zeros(3) if pad.base is None else np.asarray(pose[pad.base])
+    return base[:2] + turned(pad.placed(own), base[2])
+
+
 def surface(pad: Pad, pose: Poses) -> Surface:
     """A pad with its base at its pose."""
-    base = np.zeros(3) if pad.base is None else np.asarray(pose[pad.base])
-    mesh, axes = pad.mesh, pad.axes.numpy()
-    middle = pad.placed(np.array([0.5 * mesh.length, mesh.height]))
-    normal, along = turned(axes[:, 1], base[2]), turned(axes[:, 0], base[2])
-    return Surface(base[:2] + turned(middle, base[2]), normal, along, 0.5 * mesh.length, mesh.height)
+    mesh = pad.mesh
+    own = mesh.nodes[mesh.free[mesh.surface]]
+    left, right, top = own[:, 0].min(), own[:, 0].max(), own[:, 1].max()
+    middle = np.array([0.5 * (left + right), top])
+    origin, along, normal = (in_world(pad, pose, middle + step) for step in ([0.0, 0.0], [1.0, 0.0], [0.0, 1.0]))
+    return Surface(origin, normal - origin, along - origin, 0.5 * (right - left), top)
 
 
 def reach(rig: Rig, body: str, pose: Poses, direction: Array) -> float:
@@ -69,11 +71,25 @@ def reach(rig: Rig, body: str, pose: Poses, direction: Array) -> float:
         return float(shape.support(torch.from_numpy(turned(direction, -pose[body][2]))))
 
 
+def inside(rig: Rig, body: str, pose: Poses, places: Array) -> float:
+    """How deep the deepest of some places (n, 2) of the world is in a body [m]; negative where all are outside."""
+    shape = rig.bodies[body].shape
+    assert shape is not None
+    own = turned(places - pose[body][:2], -pose[body][2])
+    with torch.no_grad():
+        return -float(shape(torch.from_numpy(own))[0].min())
+
+
+def points(pad: Pad, pose: Poses) -> Array:
+    """The contact points (points, 2) of an undeformed pad in the world [m]."""
+    base = np.zeros(3) if pad.base is None else np.asarray(pose[pad.base])
+    return base[:2] + turned(pad.point_positions.numpy(), base[2])
+
+
 def pressed(rig: Rig, contact: str, pose: Poses) -> float:
-    """How deep a contact's body reaches under the undeformed surface of its pad [m]; negative where they are apart."""
-    body = rig.contacts[contact].body
-    at = surface(rig.pads[rig.contacts[contact].pad], pose)
-    return float(at.depth(pose[body][:2])) + reach(rig, body, pose, -at.normal)
+    """How deep the undeformed pad of a contact is in the body [m]; negative where they are apart."""
+    one = rig.contacts[contact]
+    return inside(rig, one.body, pose, points(rig.pads[one.pad], pose))
 
 
 def outline(rig: Rig, body: str, pose: Poses) -> Array:
@@ -85,22 +101,18 @@ def outline(rig: Rig, body: str, pose: Poses) -> Array:
 
 def overlap(rig: Rig, one: str, other: str, pose: Poses) -> float:
     """How deep the outline of a body reaches into another body [m]; negative where they are apart."""
-    shape = rig.bodies[other].shape
-    assert shape is not None
-    own = turned(outline(rig, one, pose) - pose[other][:2], -pose[other][2])
-    with torch.no_grad():
-        return -float(shape(torch.from_numpy(own))[0].min())
+    return inside(rig, other, pose, outline(rig, one, pose))
 
 
-def into(rig: Rig, body: str, pose: Poses, pad: Surface) -> float:
-    """How deep a body and an undeformed pad lie in each other [m]; negative where they are apart."""
-    shape, places = rig.bodies[body].shape, outline(rig, body, pose)
-    assert shape is not None
-    deep = pad.depth(places)
-    inside = np.minimum(np.minimum(deep, pad.height - deep), -pad.off(places)).max()
-    own = turned(pad.corners - pose[body][:2], -pose[body][2])
-    with torch.no_grad():
-        return max(float(inside), -float(shape(torch.from_numpy(own))[0].min()))
+def nodes(pad: Pad, pose: Poses) -> Array:
+    """All nodes (nodes, 2) of an undeformed pad in the world [m]."""
+    return in_world(pad, pose, pad.mesh.nodes)
+
+
+def hull(pad: Pad, pose: Poses) -> Array:
+    """The corners (corners, 2), around, of the convex hull of an undeformed pad [m]."""
+    places = nodes(pad, pose)
+    return places[ConvexHull(places).vertices]
 
 
 def crossing(one: Array, other: Array) -> float:
