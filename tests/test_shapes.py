@@ -558,14 +558,13 @@ def test_control_points_that_were_spoilt_are_refused() -> None:
         rest(SoftGrasp(COARSE, shape=shape))
 
 
-@pytest.mark.parametrize(("tolerance", "pieces"), [(1e-4, 32), (1e-6, 128), (1e-8, 512)])
-def test_a_contour_follows_the_spline_through_its_points(tolerance: float, pieces: int) -> None:
+@pytest.mark.parametrize("tolerance", [1e-4, 1e-6, 1e-8])
+def test_a_contour_follows_the_spline_through_its_points(tolerance: float) -> None:
     shape, closed = Contour(pear(), tolerance=tolerance), np.concatenate((pear(), pear()[:1]))
     way = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))))
     dense = CubicSpline(way, closed, bc_type="periodic")(np.linspace(0, way[-1], 3000))
     with torch.no_grad():
         off = shape(torch.from_numpy(dense) - shape.moments().centre)[0].abs().max().item()
-    assert len(shape.control) == pieces
     assert off <= 1.1 * shape.residual <= 1.1 * tolerance
     assert off > 0.5 * shape.residual
 
