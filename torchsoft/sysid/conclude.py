@@ -61,9 +61,8 @@ def conclude(
         priors=[c.labels[i] for i, _ in c.priors],
     )  # fmt: skip
     declared = [name for name, one in problem.sensors.items() if one.colour == "ar"]
-    converged = fit.converged and end.at_rest
     colour, bound = bool(coloured.found.keys() - set(declared)), bool((free & c.at_bound(x)).any())
-    doubtful = not converged or colour or bound or any(one.alarming for one in verdicts)
+    doubtful = not end.at_rest or colour or bound or any(one.alarming for one in verdicts)
     checked = None
     if how.assumptions == "checked":
         with progress_bar("check of what is taken for granted", progress) as notify:
@@ -81,7 +80,7 @@ def conclude(
         else:
             predicted = nrmse(problem, held.r, list(how.heldout))
     sd = np.sqrt(np.diag(C_free))
-    notices += notices_on(found, converged, rtol, end.bias is None)
+    notices += notices_on(found, end.at_rest, rtol, end.bias is None)
     notices += checks.notices(checked) if checked is not None else []
     notices += misfit.notices(verdicts, max(1.0, chi2) ** 0.5 if how.loss == "linear" else 1.0)
     notices += colour_notices(coloured.found, declared)
@@ -92,7 +91,7 @@ def conclude(
         correlation=(C_free / np.outer(sd, sd)).tolist(),
         directions=directions(labels, values, vectors),
         chi2=chi2,
-        converged=converged,
+        converged=end.at_rest,
         residuals=residual_channels(problem, at, how.fitted),
         heldout=predicted,
         notices=notices,

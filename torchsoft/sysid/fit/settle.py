@@ -33,7 +33,8 @@ class Settled(NamedTuple):
     """A fit at its end: coordinates x (n,), residuals there by steps that `rtol` chooses at x, with the last Jacobian; how far
     the steps have moved every coordinate (n,), None where that could not be checked; the fits on other steps since; the
     residuals by a tenth of the tolerance, those of `at` where these could not be had; and whether the fit is `at_rest`: with
-    steps chosen anew no coordinate would move by more than `SETTLED` standard deviations."""
+    steps chosen anew no coordinate would move by more than `SETTLED` standard deviations (where steps are only checked:
+    whether the fit has converged)."""
 
     x: Array
     at: Residuals
@@ -52,16 +53,15 @@ def settle(
     are kept, and only checked."""
     x, which, rtol, left, fits = fit.x, stage.recordings, stage.rtol, tightenings, []
     at = fit.at or problem.residuals(runner, x, which, fit.steps, free)
-    J, rounds = at.J[:, free], ROUNDS if tightenings else 0
-    sd = standard_deviations(J)
+    rounds = ROUNDS if tightenings else 0
 
     def along(start: Residuals, steps: StepsByName) -> bool:
-        """A fit on other steps from residuals on them, by new Jacobians where the last one leads astray; whether it came any
-        further."""
+        """A fit on other steps from residuals on them, by new Jacobians where the last one does not lead to its end; whether
+        it came any further."""
         nonlocal x, at
         common: dict[str, Any] = {"which": which, "free": free, "steps": steps, "notify": notify}
         end = chord(problem, runner, x, start._replace(J=at.J), **common)
-        if not end.converged and (end.x == x).all():
+        if not end.converged:
             end = gauss_newton(problem, runner, end.x, evaluations=REFITS, tolerance=EXACT, **common)
         assert end.at is not None
         if further := bool((end.x != x).any()):
@@ -73,19 +73,20 @@ def settle(
         fresh, steps = problem.freeze(runner, x, which, rtol)
         if fresh.lost:
             return Settled(x, at, rtol, None, fits, at, at_rest=False)
-        if rounds and not settled(problem, x, fresh._replace(J=at.J), free):
+        end = fresh._replace(J=at.J)
+        at_rest = settled(problem, x, end, free) if tightenings else fit.converged
+        if rounds and not at_rest:
             rounds -= 1
             if along(fresh, steps):
                 continue
         finer, steps = problem.freeze(runner, x, which, FINER * rtol)
-        bias = None if finer.lost else np.zeros(len(x))
-        if bias is not None:
-            bias[free] = shift(J, finer.r - at.r)
-            if left and (np.abs(bias[free]) > STEP_BIAS * sd).any():
-                left, rtol = left - 1, FINER * rtol
-                if along(finer, steps):
-                    continue
-                rtol /= FINER
-        end = fresh._replace(J=at.J)
-        at_rest = not tightenings or settled(problem, x, end, free)
-        return Settled(x, end, rtol, bias, fits, end if finer.lost else finer._replace(J=at.J), at_rest)
+        if finer.lost:
+            return Settled(x, end, rtol, None, fits, end, at_rest)
+        J, bias = at.J[:, free], np.zeros(len(x))
+        bias[free] = shift(J, finer.r - at.r)
+        if left and not (at_rest and (np.abs(bias[free]) <= STEP_BIAS * standard_deviations(J)).all()):
+            left, rounds, rtol = left - 1, ROUNDS, FINER * rtol
+            if along(finer, steps):
+                continue
+            rtol /= FINER
+        return Settled(x, end, rtol, bias, fits, finer._replace(J=at.J), at_rest)
