@@ -7,6 +7,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,10 +19,11 @@ from torchsoft import Parameters, Profile, Sampled
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, Unreachable, identify, record
 from torchsoft.sysid.checks.misfit import whiteness
-from torchsoft.sysid.fit.fit import descend, gauss_newton
+from torchsoft.sysid.fit.fit import descend, gauss_newton, newton_step
 from torchsoft.sysid.fit.information import fisher, shift, standard_deviations
 from torchsoft.sysid.fit.plan import default_plan, tie_ratios, visible
 from torchsoft.sysid.fit.stages import sobol
+from torchsoft.sysid.problem.problem import Residuals
 from torchsoft.sysid.problem.workers import Runner
 
 BASE = Parameters().override(COARSE)
@@ -216,6 +218,17 @@ def test_a_tolerance_too_coarse_for_the_data_is_found_and_tightened(shaking: Rec
     assert not any("too coarse" in notice for notice in better.notices)
     assert better.made_by["rtol"] < 8e-3
     assert abs(np.log(better[worst.name].last / BASE.table()[worst.name]["value"])) < 0.2 * abs(error)
+
+
+def test_a_coordinate_held_at_its_bound_leaves_the_others_at_rest() -> None:
+    """Two that correlate, the second held where the misfit still falls: the first is where it is least, beside it."""
+    J, x = np.array([[1.0, 0.9], [0.0, 0.3], [0.2, 0.1]]), np.array([0.0, 1.0])
+    r = np.array([-0.9, -2.0, 0.0])
+    r -= J[:, 0] * (J[:, 0] @ r) / (J[:, 0] @ J[:, 0])
+    problem: Any = SimpleNamespace(coordinates=SimpleNamespace(bounds=(np.array([-5.0, 0.0]), np.array([5.0, 1.0]))))
+    assert newton_step(problem, x, Residuals(r, J, {}), np.array([True, True])) == pytest.approx([0.0, 0.0], abs=1e-9)
+    wider: Any = SimpleNamespace(coordinates=SimpleNamespace(bounds=(np.array([-5.0, 0.0]), np.array([5.0, 9.0]))))
+    assert abs(newton_step(wider, x, Residuals(r, J, {}), np.array([True, True]))).min() > 0.5
 
 
 def test_a_fit_that_went_far_goes_on_with_steps_of_its_own(strokes: Recording) -> None:

@@ -6,7 +6,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, lsq_linear
 
 from torchsoft.sysid.fit.information import shift, standard_deviations
 from torchsoft.sysid.fit.robust import REACH, Loss, spared
@@ -109,9 +109,14 @@ def chord(
 
 
 def newton_step(problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_]) -> Array:
-    """What Gauss-Newton adds to the free coordinates at x, within their bounds."""
-    low, high = (bound[free] for bound in problem.coordinates.bounds)
-    return np.clip(x[free] - shift(at.J[:, free], at.r), low, high) - x[free]
+    """What Gauss-Newton adds to the free coordinates at x: the least squares within their bounds. To clip the free step would
+    not do: what is held at a bound leaves the others where they are."""
+    low, high = (bound[free] - x[free] for bound in problem.coordinates.bounds)
+    step = -shift(at.J[:, free], at.r)
+    if ((low <= step) & (step <= high)).all():
+        return step
+    Q, R = np.linalg.qr(at.J[:, free])
+    return np.asarray(lsq_linear(R, -Q.T @ at.r, (np.minimum(low, 0.0), np.maximum(high, 0.0))).x)
 
 
 def settled(problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_]) -> bool:
