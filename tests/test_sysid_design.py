@@ -18,6 +18,7 @@ from torchsoft.sysid.design.design import Design, design, draws
 from torchsoft.sysid.design.design_figure import design_figure
 from torchsoft.sysid.design.knots import Bounds, Moves, profile
 from torchsoft.sysid.design.planner import Planner
+from torchsoft.sysid.design.zigzags import Zigzags
 from torchsoft.sysid.fit.information import fisher
 from torchsoft.sysid.problem.recording import Array
 from torchsoft.sysid.problem.workers import Runner
@@ -110,8 +111,9 @@ def test_motions_keep_within_their_bounds_between_knots_too(plan: Recording) -> 
     moves, t = Moves(plan.rig.reference, BOUNDS, 0.25), torch.linspace(0.13, 0.3, 2000, dtype=torch.float64)
     rng = np.random.default_rng(0)
     far = moves.start + 5 * rng.standard_normal(moves.n)
-    for z in (moves.nearest(far), moves.random(rng)):
-        reference = moves.reference(torch.from_numpy(z))
+    family = Zigzags(moves)
+    bred = [family.reference(rng.random(family.n)) for _ in range(5)]
+    for reference in (moves.reference(torch.from_numpy(moves.nearest(far))), *bred):
         for name, one in BOUNDS.items():
             value, rate = reference(t, [name])[:, 0].unbind(-1)
             assert one.low - 1e-9 <= float(value.min())
@@ -159,15 +161,16 @@ def test_bounds_and_criteria_are_checked() -> None:
 @pytest.fixture(scope="module")
 def found(problem: Problem) -> Design:
     return design(
-        problem, "plan", BOUNDS, limits={"F_y": (-60.0, 60.0)}, at=draws(problem, 2, spread=0.1), iterations=16, rate=0.3,
+        problem, "plan", BOUNDS, limits={"F_y": (-60.0, 60.0)}, at=draws(problem, 2, spread=0.1), iterations=10, rate=0.3,
+        starts=25,
     )  # fmt: skip
 
 
 def test_a_designed_motion_tells_more(found: Design, problem: Problem) -> None:
     """What is predicted for it is what its recording's own Jacobian says."""
     assert all(found.after[name] < 0.9 * was for name, was in found.before.items())
-    assert found.history[-1].peak < 1.05
-    assert found.made_by["gradients"] >= 16 * 4
+    assert not any("beyond its limits" in notice for notice in found.notices)
+    assert found.made_by["gradients"] >= 10 * 4
     again = Problem([found.recording], SENSORS, problem.unknowns)
     x = again.coordinates.start
     at = again.residuals(Runner([found.recording]), x, ["plan"], 1e-3, again.coordinates.free)

@@ -7,13 +7,15 @@ iteration takes one draw and one random shift, which makes the motion robust at 
 """
 
 import time as clock
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any, Literal
 
 import numpy as np
 import torch
+from scipy.optimize import differential_evolution
+from scipy.stats import qmc
 from tqdm import tqdm
 
 from torchsoft.excitation import Excitation, Knots
@@ -22,6 +24,7 @@ from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.design.criterion import VOLUME, Criterion
 from torchsoft.sysid.design.knots import Bounds, Moves, profile
 from torchsoft.sysid.design.planner import PRICE, Look, Planner, Range
+from torchsoft.sysid.design.zigzags import Zigzags
 from torchsoft.sysid.problem.problem import Problem
 from torchsoft.sysid.problem.recording import Array, Recording
 
@@ -36,6 +39,12 @@ MEMORY = 0.85, 0.97
 
 LOOK = 10
 """Iterations between two looks at the motion itself, with all draws and no random shift."""
+
+POPULATION = 24
+"""Motions of one generation."""
+
+HOPELESS = 1e3
+"""What a motion that cannot be run counts in the evolution."""
 
 FAILURES = 5
 """Runs lost one after the other until the search goes back to the best motion so far."""
@@ -130,7 +139,8 @@ def design(
     such as forces. `at` are points x of the coordinates (`draws`), by default the nominal one; the criterion's "mean" over them
     is lowered, or the "worst".
 
-    The search begins with the plan's own motion, or with the best of it and of `starts` - 1 random ones. Each of the
+    The search begins with the plan's own motion, or with the best of it and of `starts` - 1 others: `Zigzags`, random ones at
+    first, then what differential evolution breeds from them, judged at the first point. Each of the
     `iterations` moves knots by at most about `rate` times what speed allows from one to the next, shifted at random by
     `smoothing` times that, and takes a run with sensitivities and 2 n with the adjoint, of relative tolerance `rtol`. A
     motion that cannot be run is left; with Ctrl-C the best so far is returned, with a notice. Raises `ValueError` for
@@ -156,13 +166,20 @@ def design(
     moves = Moves(recording.rig.reference, bounds, float(recording.times[-1]))
     planner = Planner(problem, plan, moves, limits or {}, criterion, names, rtol, workers)
     search = Search(planner, points, robust, rate, smoothing, seed)
-    first = search.begin(starts)
-    with tqdm(total=iterations, desc="design", disable=not progress) as bar:
+    first = search.begin()
+    before, given = planner.deviations(points[0], first), planner.made(moves.start, points[0], first)
+    with tqdm(total=starts - 1 + iterations, desc="design", disable=not progress) as bar:
+
+        def tried(best: float) -> None:
+            bar.set_postfix_str(f"criterion {best:.3f}", refresh=False)
+            bar.update()
+
         try:
+            search.breed(starts - 1, tried)
             while search.iteration < iterations:
                 search.move(iterations)
                 bar.set_postfix_str(f"criterion {search.best.value:.3f}", refresh=False)
-                bar.update(search.iteration - bar.n)
+                bar.update(starts - 1 + search.iteration - bar.n)
             search.look()
             notices = []
         except KeyboardInterrupt:
@@ -175,9 +192,9 @@ def design(
     if search.lost:
         notices.append(f"{search.lost} motions that the search tried could not be run")
     return Design(
-        given=planner.made(moves.start, points[0], first), recording=planner.made(search.z, points[0], last),
-        before=planner.deviations(points[0], first), after=planner.deviations(points[0], last),
-        history=tuple(search.history), limits=(*moves.active(search.z), *peaks), notices=tuple(notices),
+        given=given, recording=planner.made(search.z, points[0], last), before=before,
+        after=planner.deviations(points[0], last), history=tuple(search.history),
+        limits=(*planner.moves.active(search.z), *peaks), notices=tuple(notices),
         made_by={
             "torchsoft": version("torchsoft"), "criterion": criterion.optimality, "targets": criterion.targets,
             "bounds": {name: one.model_dump() for name, one in bounds.items()}, "limits": dict(limits or {}),
@@ -198,27 +215,58 @@ class Search:
         self.rng, self.iteration, self.lost, self.in_a_row = np.random.default_rng(seed), 0, 0, 0
         self.history: list[Visit] = []
 
-    def begin(self, starts: int) -> Look:
-        """Chooses where to begin, and returns the look at the motion given. Raises `ValueError` where that cannot be run."""
-        moves, x = self.planner.moves, self.points[0]
+    def begin(self) -> Look:
+        """The look at the motion given, which is the best so far. Raises `ValueError` where it cannot be run."""
         try:
-            first = self.planner.look(moves.start, x)
+            first = self.planner.look(self.planner.moves.start, self.points[0])
         except SimulationFailed as failure:
             raise ValueError(f"the motion given cannot be run, so that nothing can begin with it: {failure}") from None
-        self.seen, self.z = first, moves.start
-        for _ in range(starts - 1):
-            z = moves.random(self.rng)
-            try:
-                there = self.planner.look(z, x)
-            except SimulationFailed:
-                self.lost += 1
-                continue
-            if there.value + there.cost < self.seen.value + self.seen.cost:
-                self.seen, self.z = there, z
+        self.set_out(self.planner.moves, first)
+        return first
+
+    def set_out(self, moves: Moves, seen: Look) -> None:
+        """From the motion of some knots on, by gradient."""
+        self.planner.moves, self.seen, self.z = moves, seen, moves.start
         self.now = torch.from_numpy(self.z.copy()).requires_grad_(True)
         self.adam = torch.optim.Adam([self.now], lr=self.rate, betas=MEMORY)
         self.best, _ = self.visit(self.z)
-        return first
+
+    def breed(self, count: int, tried: Callable[[float], None]) -> None:
+        """Tries so many zigzags, about, and sets out from the best if it is better than the motion given."""
+        given, seen, size = self.planner.moves, self.seen, min(count, POPULATION)
+        family, best = Zigzags(given), given
+
+        def worth(u: Array) -> float:
+            nonlocal best, seen
+            moves = Moves(family.reference(u), given.bounds, given.end)
+            self.planner.moves = moves
+            try:
+                there = self.planner.look(moves.start, self.points[0])
+            except SimulationFailed:
+                self.lost += 1
+                return HOPELESS
+            finally:
+                self.planner.moves = best
+                tried(seen.value)
+            if there.value + there.cost < seen.value + seen.cost:
+                self.planner.moves, best, seen = moves, moves, there
+            return there.value + there.cost
+
+        if count == 0:
+            return
+        some = qmc.LatinHypercube(family.n, rng=self.rng).random(size)
+        try:
+            if count < 2 * size:
+                for u in some:
+                    worth(u)
+            else:
+                differential_evolution(
+                    worth, [(0.0, 1.0)] * family.n, init=some, maxiter=count // size - 1, mutation=(0.3, 0.8),
+                    recombination=0.5, tol=0.0, polish=False, rng=self.rng,
+                )  # fmt: skip
+        finally:
+            if best is not given:
+                self.set_out(best, seen)
 
     def visit(self, z: Array) -> tuple[Visit, Look | None]:
         """What a motion is worth over all points, infinite where it is lost, and the look at it at the first."""

@@ -21,10 +21,6 @@ PEAK = 35 / 16
 """Largest over mean speed of the 7th-order profile."""
 
 
-PHASES = 3
-"""Parts of a random motion that differ, at most."""
-
-
 class Bounds(Table):
     """What a signal of the reference may do: values from `low` to `high` [its unit], at `speed` [its unit/s] at most.
 
@@ -142,27 +138,6 @@ class Moves:
         if out.status != 0:
             raise ValueError("no motion of these knots keeps within the bounds: allow more travel, speed or time")
         return np.asarray(out.x[: self.n], np.float64)
-
-    def random(self, rng: np.random.Generator) -> Array:
-        """A motion within the bounds that has nothing to do with the one given: in up to `PHASES` phases every signal
-        goes to and fro between two random levels, not quite alike each time, at a random part of its speed."""
-        z = []
-        for name, (times, values, first) in self.knots.items():
-            one, spans = self.bounds[name], np.diff(times[first - 1 :])
-            phase = np.searchsorted(rng.uniform(0, len(spans), rng.integers(PHASES)), np.arange(len(spans)))
-            phase = np.unique(phase, return_inverse=True)[1]
-            levels = rng.uniform(one.low, one.high, (PHASES, 2))
-            part = np.power(10.0, rng.uniform(-1, 0, PHASES))
-            at, path = values[first - 1], []
-            for i, (k, span) in enumerate(zip(phase, spans)):
-                step = part[k] * one.speed / PEAK * span * rng.uniform(0.5, 1)
-                to, fro = levels[k] if i % 2 else levels[k][::-1]
-                at = at + np.clip(to + rng.uniform(0, 0.3) * (fro - to) - at, -step, step)
-                path.append(at)
-            z.append(np.array(path))
-            if one.shortest is not None:
-                z.append(times[first:])
-        return self.nearest(np.concatenate(z) / self.unit)
 
     def active(self, z: Array) -> list[str]:
         """Which bounds a motion touches, and at how many knots, in words."""

@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import simulate
 from torchsoft.sysid.design.criterion import Criterion, chosen, deviations
 from torchsoft.sysid.design.knots import Moves
@@ -36,6 +37,9 @@ DIFFERENCE = 1e-2
 
 MARGIN = 0.97
 """Part of the way to a limit from which on it costs, since peaks lie between samples."""
+
+PREDICTABLE = 10.0
+"""Change of a sample with the logarithm of a parameter, over the largest of its channel, above which a motion is no use."""
 
 PRICE = 5.0
 """What a sample at twice the way to a limit costs, in units of the criterion."""
@@ -93,7 +97,7 @@ class Planner:
         return self._idle.pop() if self._idle else self.recording.begin()
 
     def look(self, z: Array, x: Array, steps: Steps | None = None) -> Look:
-        """The motion z at x. Raises `SimulationFailed`."""
+        """The motion z at x. Raises `SimulationFailed`, also where what the run does cannot be predicted from parameters."""
         p, c, given = self.problem, self.problem.coordinates, self.rtol if steps is None else steps
         by_name = {self.recording.name: given} if isinstance(given, Frozen) else given
         (job,) = p.jobs(x, [self.recording.name], by_name, c.free)
@@ -110,12 +114,29 @@ class Planner:
         _, T = chosen(p, x, self.names)
         value, S = self.criterion(T @ C @ T.T)
         signals = Signals(run.t, self.recording.channels, run.signals, None)
+        self.check_predictable(x, J, signals)
         reached = {name: np.abs(part) for name, part in self.reached(signals).items()}
         peaks = {name: float(part.max()) for name, part in reached.items()}
         cost = PRICE * sum(float(np.sum(np.maximum(part - MARGIN, 0.0) ** 2)) for part in reached.values())
         frozen = Frozen(run.knots) if run.knots is not None else given
         assert isinstance(frozen, Frozen)
         return Look(value, cost, peaks, C, -C @ T.T @ S @ T @ C, J, frozen, signals)
+
+    def check_predictable(self, x: Array, J: Array, signals: Signals) -> None:
+        """Raises `SimulationFailed` where a parameter that hardly changes would change the samples altogether: then their
+        information is that of chaos, which no fit can use."""
+        c, at = self.problem.coordinates, 0
+        rig = [one.of_the_rig and one.scale == "log" for one in c.all]
+        for channel, one in self.problem.readouts(x, self.k).items():
+            t, _ = self.recording.samples[channel]
+            most = np.abs(one.expected(signals, t)[0]).max() / self.problem.sensors[channel].noise
+            of = np.abs(J[at : at + len(t)]).max(0) * rig / max(most, 1.0)
+            if of.max() > PREDICTABLE:
+                raise SimulationFailed(
+                    f"a change of `{c.labels[int(of.argmax())]}` by 1 % would change `{channel}` by {of.max():.0f} % of its "
+                    "largest value: nothing that follows from it can be predicted", float(signals.t[-1]),
+                )  # fmt: skip
+            at += len(t)
 
     def reached(self, signals: Signals) -> dict[str, Array]:
         """Where limited channels are (G,) between the middle of their range, 0, and its ends, -1 and 1."""
