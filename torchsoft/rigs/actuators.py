@@ -11,8 +11,8 @@ from torchsoft.rigs.network import NetworkPD, read_network
 
 
 class ActuatorTable(Group):
-    """An effort on one free coordinate, Kp (w - q) + Kd (w' - q') + network(w, w', q, q') + what is fed forward. The coordinate q that it measures may
-    be another one, of another body, and of another kind: "disc.theta" through "bracket.x"."""
+    """An effort on one free coordinate, Kp (w - q) + Kd (w' - q') + network(w, w', q, q') + what is fed forward. The coordinate
+    q that it measures may be another one, of another body, and of another kind: "disc.theta" through "bracket.x"."""
 
     pushes: str = Field(description='the coordinate that it pushes, such as "bracket.x"')
     measures: str | None = Field(
@@ -42,7 +42,9 @@ class ActuatorTable(Group):
         if self.setpoint is None and self.network is not None:
             raise ValueError("setpoint is missing: the network is one of a motion w and the coordinate that follows it")
         if self.setpoint is not None and not (self.Kp or self.Kd or self.network):
-            raise ValueError("Kp and Kd are both 0, so that the setpoint would have no effect; give a gain, or a network")
+            raise ValueError(
+                "Kp and Kd are both 0, so that the setpoint would have no effect; give a gain, or a network"
+            )
         if self.setpoint is None and self.feed_forward is None:
             raise ValueError("it does nothing: give a setpoint with gains, or feed_forward")
         return self

@@ -44,7 +44,9 @@ def assemble(
     """The rig without a reference; `held` are coordinates that are fixed, by body and axis, and `loops` names its actuators,
     all by default."""
     loops = file.actuators if loops is None else loops
-    materials = {name: made(f"materials.{name}", partial(one.build, file.folder)) for name, one in file.materials.items()}
+    materials = {
+        name: made(f"materials.{name}", partial(one.build, file.folder)) for name, one in file.materials.items()
+    }
     laws = {name: table.build() for name, table in file.laws.items()}
     held = held or {}
     return Rig(

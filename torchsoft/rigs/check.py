@@ -132,8 +132,8 @@ def corners(file: RigFile, rig: Rig) -> Iterator[Finding]:
         if sharpest < spacing:
             yield Finding(
                 "warning", f"bodies.{contact.body}.shape",
-                f"its sharpest corner has a radius of {1e3 * sharpest:.3g} mm, but the contact points of `{contact.pad}` are up "
-                f"to {1e3 * spacing:.3g} mm apart: forces jump as it goes from one to the next; round it more, or give "
+                f"its sharpest corner has a radius of {1e3 * sharpest:.3g} mm, but the contact points of `{contact.pad}` "
+                f"are up to {1e3 * spacing:.3g} mm apart: forces jump as it goes from one to the next; round it more, or give "
                 f"pads.{contact.pad} more elements or points",
             )  # fmt: skip
 

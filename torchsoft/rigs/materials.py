@@ -80,8 +80,8 @@ class GeneralisedKelvinTable(SeriesTable):
     and what they leave of one at once."""
 
     kind: Literal["generalised_kelvin"] = "generalised_kelvin"
-    J: Annotated[tuple[Annotated[float, Within(1e-9, 1.0)], ...], LISTED, Field(min_length=1, max_length=TERMS)] = Field(
-        description="fractions of the relaxed compliance, one per tau; their sum is at most 1"
+    J: Annotated[tuple[Annotated[float, Within(1e-9, 1.0)], ...], LISTED, Field(min_length=1, max_length=TERMS)] = (
+        Field(description="fractions of the relaxed compliance, one per tau; their sum is at most 1")
     )
 
     @model_validator(mode="after")
@@ -139,7 +139,9 @@ class FileTable(Group):
             tree = read_toml(path).get("materials")
             found = tree if isinstance(tree, dict) else {}
             if self.name is None and len(found) != 1:
-                raise ValueError(f"{path} has {len(found)} tables [materials.*]; say by name which one is meant, or one")
+                raise ValueError(
+                    f"{path} has {len(found)} tables [materials.*]; say by name which one is meant, or one"
+                )
             name = next(iter(found)) if self.name is None else self.name
             if name not in found:
                 raise ValueError(f"{path} has no [materials.{name}]; it has {', '.join(found) or 'none'}")

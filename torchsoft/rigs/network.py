@@ -59,8 +59,8 @@ def layers(arrays: dict[str, np.ndarray]) -> nn.Sequential:
     found = sorted(int(name[1]) for name in (re.fullmatch(r"(\d{1,3})\.weight", name) for name in arrays) if name)
     if not found or {*arrays} != {f"{i}.{part}" for i in found for part in ("weight", "bias")}:
         raise ValueError(
-            f"it has {', '.join(line(name, 40) for name in arrays) or 'nothing'}, but a network has 0.weight, 0.bias, 2.weight, "
-            "2.bias and so on: linear layers with tanh between them"
+            f"it has {', '.join(line(name, 40) for name in arrays) or 'nothing'}, but a network has 0.weight, 0.bias, "
+            "2.weight, 2.bias and so on: linear layers with tanh between them"
         )
     if sum(array.size for array in arrays.values()) > WEIGHTS:
         raise ValueError(f"it has more than {WEIGHTS} numbers, which are too many to be compiled")

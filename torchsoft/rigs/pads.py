@@ -103,7 +103,7 @@ class BlockTable(Rectangular):
 
 
 class CurvedTable(Rectangular):
-    """A pad like a block whose face is an arc: `height` thick in the middle, thinner at the ends, or thicker if it is hollow."""
+    """A pad like a block whose face is an arc: `height` thick in the middle, thinner at the ends; thicker, if it is hollow."""
 
     kind: Literal["curved"] = "curved"
     radius: Annotated[float, Within(-1e3, 1e3, "m")] = Field(
@@ -113,7 +113,12 @@ class CurvedTable(Rectangular):
 
     def mesh(self, folder: Path) -> Mesh:
         return CurvedPadMesh(
-            self.length, self.height, self.elements_x, self.elements_y, radius=self.radius, bonded_edges=self.bonded_edges
+            self.length,
+            self.height,
+            self.elements_x,
+            self.elements_y,
+            radius=self.radius,
+            bonded_edges=self.bonded_edges,
         )
 
 
