@@ -540,6 +540,10 @@ NECK = [[np.cos(t), np.sin(t) * (0.005 + np.cos(t) ** 2)] for t in np.arange(400
         (lambda: RoundedPolygon(TRIANGLE, 9e-3), "corners of radius 0.009 do not fit on side . of the polygon"),
         (lambda: RoundedPolygon([[0, 0], [1, 0], [0, 0], [0, 1]], 0.01), "do not fit on side . of the polygon"),
         (lambda: RoundedPolygon([[0, 0], [2, 2], [2, 0], [0, 1]], 0.01), "the polygon crosses itself"),
+        (
+            lambda: RoundedPolygon([[-2, -2], [1.6, 2], [2, -2], [-1.6, 2]], 0.1),
+            "the polygon crosses itself",
+        ),  # no area
         (lambda: RoundedPolygon(TRIANGLE, 0.0), "`radius` must be positive and finite, but is 0"),
         (lambda: RoundedPolygon([[0, 0], [1, 0]], 0.1), "`vertices` must be 3 to 64 places, but are 2"),
         (lambda: RoundedPolygon([[0, 0], [1, 0], [True, "a"]], 0.1), "`vertices` must be finite numbers"),
@@ -576,11 +580,14 @@ def test_a_contour_from_a_file(tmp_path: Path) -> None:
     assert torch.allclose(shape.control, Contour(points).control, rtol=0, atol=1e-12)
     assert shape.residual < 1e-6
     for text, match in (
-        ("", "the heading must be `x .mm.,y .mm.`, with m, cm or mm, but is `nothing`"),
-        ("x,y\n1,2\n", "the heading must be .*, but is `x,y`"),
-        ("x [mm],y [in]\n1,2\n", "but is `x .mm.,y .in.`"),
-        ("x [mm],y [mm]\n1,2\n3\n", "row 3: must be two finite numbers, but is `3`"),
-        ("x [mm],y [mm]\n1,nan\n", "row 2: must be two finite numbers, but is `1,nan`"),
+        ("", "row 1: the columns must be `x .mm.` and `y .mm.`, in m, cm or mm, but are none"),
+        ("x [mm]\n1\n", "row 1: the columns must be .*, but are x"),
+        ("x,y\n1,2\n", "row 1, column `x` has no unit"),
+        ("x [mm],y [in]\n1,2\n", "column `y` cannot be in 'in'; it can be in m, cm, mm"),
+        ("x [mm],y [mm],z [mm]\n1,2,3\n", "column `z` is not known: the columns must be"),
+        ("x [mm],y [mm]\n1,2\n3\n", "row 3 has 1 cells, but there are 2 columns"),
+        ("x [mm],y [mm]\n1,nan\n", "row 2, column `y`: 'nan' is not a finite number"),
+        ("x [mm],y [mm]\n1,\n", "row 2 has an empty cell"),
         ("x [mm],y [mm]\n1,2\n", r"pear.csv: `points` must be at least 8 places"),
     ):
         file.write_text(text, encoding="utf-8")

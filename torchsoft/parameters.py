@@ -33,6 +33,12 @@ def quantity(default: Any, unit: str, source: Source, meaning: str, **bounds: An
     return Field(default, description=meaning, json_schema_extra={"unit": unit, "source": source}, **bounds)
 
 
+def condensation_memory(surface: int, free: int, band: int) -> float:
+    """What it takes to condense a mesh onto its surface [GiB], about: the nodes that move, `free`, under loads on so many nodes
+    of the `surface`, and their products; the stiffness, in which nodes up to `band` apart meet, and its factor."""
+    return 8 * 4 * free * (6 * surface + 2 * band) / 2**30
+
+
 class PadParameters(Table):
     """One soft pad; the upper one is the lower one mirrored."""
 
@@ -55,11 +61,9 @@ class PadParameters(Table):
     @property
     def memory(self) -> float:
         """What the stiffness of the mesh and its loads take [GiB]."""
-        surface = 2 * (self.elements_x + 1)
-        dense = (
-            6 * surface**2 * self.elements_y
-        )  # displacements of all nodes under loads on the surface, and their products
-        return 8 * dense / 2**30 if self.fidelity == "massless" else 8 * surface**2 * self.elements_y / 2**30
+        surface = self.elements_x + 1
+        whole = condensation_memory(surface, surface * self.elements_y, self.elements_y + 2)
+        return whole if self.fidelity == "massless" else whole / 6
 
 
 class ContactParameters(Table):

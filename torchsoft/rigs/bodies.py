@@ -1,12 +1,12 @@
 """Rigid bodies of a rig file, and where they start."""
 
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
 from torchsoft.physics.parts import COORDINATES, Body
-from torchsoft.rigs.fields import Group, Mass, NumberOr, Place, Within
+from torchsoft.rigs.fields import Group, Length, Mass, NumberOr, Place, Within, at_field, sound
 from torchsoft.rigs.shapes import ShapeTable
 
 REST = "rest"
@@ -39,7 +39,13 @@ class BodyTable(Group):
     """A rigid body: what is manipulated, or what carries a pad. Each coordinate is "free", "driven" by the motion of that name,
     or a number at which it is fixed."""
 
-    mass: Mass | None = Field(default=None, description="mass; not needed where no coordinate is free")
+    mass: Mass | None = Field(
+        default=None, description="mass, or density and depth; not needed where no coordinate is free"
+    )
+    density: Annotated[float, Within(1e-3, 1e6, "kg/m3")] | None = Field(
+        default=None, description="density, which gives the mass of its shape; steel has 7800, aluminium 2700"
+    )
+    depth: Length | None = Field(default=None, description="how deep it is, out of the plane; goes with density")
     x: Annotated[float | str, NumberOr("m", "free", "driven")] = Field(default="free", description="to the right")
     y: Annotated[float | str, NumberOr("m", "free", "driven")] = Field(default="free", description="upwards")
     theta: Annotated[float | str, NumberOr("rad", "free", "driven")] = Field(
@@ -67,8 +73,17 @@ class BodyTable(Group):
 
     @model_validator(mode="after")
     def _fits_together(self) -> Self:
-        if self.free and self.mass is None:
-            raise ValueError(f"mass is missing, but {' and '.join(self.free)} can move freely")
+        if self.mass is not None and self.density is not None:
+            raise ValueError("mass and density each say how heavy it is; give one of them")
+        if (self.density is None) != (self.depth is None):
+            given, missing = ("density", "depth") if self.depth is None else ("depth", "density")
+            raise ValueError(f"{missing} is missing: {given} is given, and the mass is density times area times depth")
+        if self.density is not None and self.shape is None:
+            raise ValueError("shape is missing: density is given, and the mass is density times its area times depth")
+        if self.free and self.mass is None and self.density is None:
+            raise ValueError(
+                f"mass is missing, but {' and '.join(self.free)} can move freely; give it, or density and depth"
+            )
         if "theta" in self.free and self.shape is None and self.inertia is None:
             raise ValueError("inertia is missing: theta is free, and there is no shape to compute it from")
         for (axis, kind), rate in zip(self.freedom.items(), ("v_x", "v_y", "omega")):
@@ -81,7 +96,13 @@ class BodyTable(Group):
         return self
 
     def build(self, folder: Path, held: dict[str, float] | None = None) -> Body:
-        """The body; `held` are numbers at which coordinates are fixed in the place of their freedom."""
-        freedom: dict[str, float | str] = self.freedom | (held or {})
-        shape = None if self.shape is None else self.shape.build(folder)
-        return Body(self.mass or 1.0, shape, inertia=self.inertia, weighted=self.weighted, **freedom)  # pyright: ignore
+        """The body; `held` are numbers at which coordinates are fixed in the place of their freedom. Raises `ValueError`."""
+        freedom: dict[str, Any] = self.freedom | (held or {})
+        given: dict[str, Any] = {"inertia": self.inertia, "weighted": self.weighted, **freedom}
+        if self.shape is None:
+            return Body(self.mass or 1.0, **given)
+        with at_field("shape"):
+            shape = sound(self.shape.build(folder))
+        if self.density is not None and self.depth is not None:
+            return Body.uniform(shape, self.density, self.depth, **given)
+        return Body(self.mass or 1.0, shape, **given)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Self, TypeVar
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchsoft.physics.equilibrium import NoEquilibrium
 from torchsoft.physics.mesh import Array
@@ -17,6 +17,7 @@ from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.resting import resting, standing
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.bodies import REST
+from torchsoft.rigs.fields import at_field, sound
 from torchsoft.rigs.geometry import points, reach, surface
 from torchsoft.rigs.motion import Asked, flattened
 from torchsoft.rigs.schema import RigTables
@@ -26,7 +27,7 @@ UPWARDS = 0.1
 """Least upward part of the normal of a pad that something may rest on."""
 
 
-T = TypeVar("T")
+M = TypeVar("M", bound=nn.Module)
 
 
 class Ready(NamedTuple):
@@ -43,7 +44,9 @@ def assemble(
     """The rig without a reference; `held` are coordinates that are fixed, by body and axis, and `loops` names its actuators,
     all by default."""
     loops = file.actuators if loops is None else loops
-    materials = {name: made(f"materials.{name}", one.build) for name, one in file.materials.items()}
+    materials = {
+        name: made(f"materials.{name}", partial(one.build, file.folder)) for name, one in file.materials.items()
+    }
     laws = {name: table.build() for name, table in file.laws.items()}
     held = held or {}
     return Rig(
@@ -52,21 +55,23 @@ def assemble(
             for name, one in file.bodies.items()
         },
         pads={
-            name: made(f"pads.{name}", partial(one.build, materials[one.material])) for name, one in file.pads.items()
+            name: made(f"pads.{name}", partial(one.build, materials[one.material], file.folder))
+            for name, one in file.pads.items()
         },
         contacts={name: one.build(laws) for name, one in file.contacts.items()},
-        actuators={name: one.build() for name, one in file.actuators.items() if name in loops},
+        actuators={
+            name: made(f"actuators.{name}", partial(one.build, file.folder))
+            for name, one in file.actuators.items() if name in loops
+        },
         gravity=file.gravity,
         symbols={name: one.symbol or name for name, one in file.bodies.items()},
-    )
+    )  # fmt: skip
 
 
-def made(field: str, build: Callable[[], T]) -> T:
-    """What `build` makes. Raises its `ValueError` with the field's name."""
-    try:
-        return build()
-    except ValueError as error:
-        raise ValueError(f"{field}: {error}") from None
+def made(field: str, build: Callable[[], M]) -> M:
+    """What `build` makes, with parameters that are physical together. Raises `ValueError` with the field's name."""
+    with at_field(field):
+        return sound(build())
 
 
 def signal(file: RigTables, name: str, pose: Mapping[str, Array] | None) -> Piecewise:

@@ -4,14 +4,16 @@ import itertools
 from collections.abc import Iterator
 
 import networkx as nx
+import torch
 
 from torchsoft.physics.motion import Sampled
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.balance import at_moments
 from torchsoft.rigs.build import Ready, RigFile
 from torchsoft.rigs.course import Estimate, at, signals
+from torchsoft.rigs.fields import Refused
 from torchsoft.rigs.finding import SEVERITIES, Finding
-from torchsoft.rigs.geometry import TOUCH, crossing, hull, inside, nodes, overlap, pressed, surface, tied
+from torchsoft.rigs.geometry import TOUCH, collision, corner, inside, nodes, overlap, pressed, surface, tied
 from torchsoft.rigs.motion import CsvTable
 
 JUMP = {"m": 1e-4, "rad": 1e-2}
@@ -28,13 +30,15 @@ def check(file: RigFile) -> list[Finding]:
     """Findings on a rig file, errors first. Takes some seconds."""
     try:
         ready = file.build()
+    except Refused as error:
+        return [Finding("error", error.field, error.sentence)]
     except ValueError as error:
         field, _, sentence = str(error).partition(": ")
         return [Finding("error", field, sentence)]
     estimate = Estimate(file, ready)
     found = [
         *ties(file, ready.rig), *recordings(file, ready), *jumps(file, ready, estimate), *carried(file, ready, estimate),
-        *overlaps(ready.rig, estimate),
+        *overlaps(ready.rig, estimate), *corners(file, ready.rig),
     ]  # fmt: skip
     if not any(one.severity == "error" for one in found):
         found += at_moments(file, ready, estimate)
@@ -91,10 +95,11 @@ def jumps(file: RigFile, ready: Ready, estimate: Estimate) -> Iterator[Finding]:
         unit = file.unit(actuator.setpoint)
         here, wanted = estimate.start[body][axis], values[actuator.setpoint]
         if abs(wanted - here) > JUMP[unit]:
+            pushes = float(ready.rig.actuators[name](torch.tensor([wanted, 0.0, 0.0, here, 0.0], dtype=torch.float64)))
             yield Finding(
                 "warning", f"motion.{actuator.setpoint}",
                 f"it begins at {wanted:.6g} {unit}, but {actuator.measured} at {here:.6g} {unit}: the loop `{name}` pushes "
-                f'with {abs(actuator.Kp * (wanted - here)):.3g} at once; begin at "start"',
+                f'with {abs(pushes):.3g} at once; begin at "start"',
             )  # fmt: skip
 
 
@@ -120,6 +125,19 @@ def carried(file: RigFile, ready: Ready, estimate: Estimate) -> Iterator[Finding
         )  # fmt: skip
 
 
+def corners(file: RigFile, rig: Rig) -> Iterator[Finding]:
+    """Corners that fall between contact points."""
+    for contact in rig.contacts.values():
+        spacing, sharpest = float(rig.pads[contact.pad].point_lengths.max()), corner(rig, contact.body)
+        if sharpest < spacing:
+            yield Finding(
+                "warning", f"bodies.{contact.body}.shape",
+                f"its sharpest corner has a radius of {1e3 * sharpest:.3g} mm, but the contact points of `{contact.pad}` "
+                f"are up to {1e3 * spacing:.3g} mm apart: forces jump as it goes from one to the next; round it more, or give "
+                f"pads.{contact.pad} more elements or points",
+            )  # fmt: skip
+
+
 def overlaps(rig: Rig, estimate: Estimate) -> Iterator[Finding]:
     """Things that lie in each other without a contact between them: at the start, and those whose course is known later."""
     said: set[tuple[str, str]] = set()
@@ -136,8 +154,10 @@ def overlaps(rig: Rig, estimate: Estimate) -> Iterator[Finding]:
             for body in sure for name, pad in rig.pads.items()
             if (name, body) not in contacts and pad.base != body
         ]  # fmt: skip
-        hulls = {name: hull(pad, pose) for name, pad in rig.pads.items()}
-        lying += [(f"pads.{a}", f"pads.{b}", crossing(hulls[a], hulls[b])) for a, b in itertools.combinations(hulls, 2)]
+        lying += [
+            (f"pads.{a}", f"pads.{b}", collision(rig.pads[a], rig.pads[b], pose))
+            for a, b in itertools.combinations(rig.pads, 2)
+        ]
         for one, other, depth in lying:
             if depth > TOUCH and (one, other) not in said:
                 said.add((one, other))

@@ -1,15 +1,48 @@
 """What the fields of a rig file are made of: numbers with unit and bounds, words, and tables that know their own keys."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from difflib import get_close_matches
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Self, TypeVar
 
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, model_validator
 from pydantic_core import CoreSchema, core_schema
+from torch import nn
 
 from torchsoft.tables import Table, shown
+
+M = TypeVar("M", bound=nn.Module)
+
+
+class Refused(ValueError):
+    """What cannot be, with the field that says so."""
+
+    def __init__(self, field: str, sentence: str) -> None:
+        super().__init__(f"{field}: {sentence}")
+        self.field, self.sentence = field, sentence
+
+
+@contextmanager
+def at_field(field: str) -> Iterator[None]:
+    """Turns errors in what a field says into `Refused`, those of a field within it too."""
+    try:
+        yield
+    except Refused as error:
+        raise Refused(f"{field}.{error.field}", error.sentence) from None
+    except OSError as error:
+        raise Refused(field, f"{error.filename}: {error.strerror}" if error.filename else str(error)) from None
+    except (ValueError, NotImplementedError) as error:
+        raise Refused(field, str(error)) from None
+
+
+def sound(part: M) -> M:
+    """A part whose parameters are physical together. Raises `ValueError` where they are not."""
+    well_posed = getattr(part, "well_posed", None)
+    if well_posed is not None and (wrong := well_posed()):
+        raise ValueError(wrong)
+    return part
 
 
 @dataclass(frozen=True)

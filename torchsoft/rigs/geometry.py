@@ -18,23 +18,29 @@ FACING = -0.9
 TOUCH = 1e-6
 """Depth [m] up to which things that touch do not overlap."""
 
+CORNERS = 1440
+"""Points of an outline at which its curvature is looked at."""
+
 Poses = Mapping[str, Array]
 """Poses (3,) [m, m, rad] by body."""
 
 
 class Surface(NamedTuple):
     """An undeformed pad in the world: the middle of its free surface, at its highest [m], outward normal, direction along it
-    (2,); half its length and its height [m]."""
+    (2,); half its length and its height [m]; the surface itself from left to right (nodes, 2) [m], along it from the middle
+    and outwards from there."""
 
     middle: Array
     normal: Array
     along: Array
     half: float
     height: float
+    profile: Array
 
     def depth(self, place: Array) -> Array:
-        """How deep places (..., 2) lie under the line through the middle [m]; negative above it."""
-        return -(place - self.middle) @ self.normal
+        """How deep places (..., 2) lie under the surface [m], along its middle's normal; negative above it."""
+        outwards = np.interp((place - self.middle) @ self.along, *self.profile.T)
+        return outwards - (place - self.middle) @ self.normal
 
     def off(self, place: Array) -> Array:
         """How far places (..., 2) lie beyond the pad's ends [m]; negative between them."""
@@ -60,7 +66,8 @@ def surface(pad: Pad, pose: Poses) -> Surface:
     left, right, top = own[:, 0].min(), own[:, 0].max(), own[:, 1].max()
     middle = np.array([0.5 * (left + right), top])
     origin, along, normal = (in_world(pad, pose, middle + step) for step in ([0.0, 0.0], [1.0, 0.0], [0.0, 1.0]))
-    return Surface(origin, normal - origin, along - origin, 0.5 * (right - left), top)
+    profile = (own - middle)[np.argsort(own[:, 0], kind="stable")]
+    return Surface(origin, normal - origin, along - origin, 0.5 * (right - left), mesh.height, profile)
 
 
 def reach(rig: Rig, body: str, pose: Poses, direction: Array) -> float:
@@ -124,6 +131,45 @@ def crossing(one: Array, other: Array) -> float:
             a, b = one @ n, other @ n
             least = min(least, a.max() - b.min(), b.max() - a.min())
     return float(least)
+
+
+def around(pad: Pad, pose: Poses) -> Array:
+    """The corners (corners, 2), around, of an undeformed pad [m], which may be hollow."""
+    return in_world(pad, pose, pad.mesh.nodes[pad.mesh.outline])
+
+
+def within(places: Array, corners: Array) -> bool:
+    """Whether any of some places (n, 2) is inside a polygon (corners, 2): a line to the right crosses it an odd number of
+    times."""
+    (x, y), (ax, ay) = places.T[:, :, None], corners.T
+    bx, by = np.roll(corners, -1, 0).T
+    level = (ay > y) != (by > y)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        right = ax + (y - ay) / (by - ay) * (bx - ax) > x
+    return bool(((level & right).sum(1) % 2 == 1).any())
+
+
+def collision(one: Pad, other: Pad, pose: Poses) -> float:
+    """How far two undeformed pads overlap, as their convex hulls do [m]; zero where something lies in the hollow of another."""
+    deep = crossing(hull(one, pose), hull(other, pose))
+    if deep <= TOUCH or (is_convex(one) and is_convex(other)):
+        return deep
+    lie = within(nodes(one, pose), around(other, pose)) or within(nodes(other, pose), around(one, pose))
+    return deep if lie else 0.0
+
+
+def is_convex(pad: Pad) -> bool:
+    """Whether a pad is its convex hull, but for rounding."""
+    x, y = pad.mesh.nodes[pad.mesh.outline].T
+    area = 0.5 * abs(float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()))
+    return area > (1 - 1e-6) * ConvexHull(pad.mesh.nodes).volume  # of a plane body the area
+
+
+def corner(rig: Rig, body: str) -> float:
+    """The smallest radius of curvature of a body where it bulges outwards [m]."""
+    shape = rig.bodies[body].shape
+    assert shape is not None
+    return 1 / float(shape.curvature(shape.outline(CORNERS)).max())
 
 
 def tied(rig: Rig, contacts: Iterable[str]) -> nx.Graph:

@@ -7,7 +7,7 @@ from torchsoft.rigs.contacts import ContactTable, LawTable, SmoothTable
 from torchsoft.rigs.materials import KelvinVoigtTable
 from torchsoft.rigs.motion import ProfileTable
 from torchsoft.rigs.outputs import OutputsTable
-from torchsoft.rigs.pads import PadTable
+from torchsoft.rigs.pads import BlockTable
 from torchsoft.rigs.shapes import CircleTable
 
 
@@ -22,8 +22,8 @@ def template(title: str) -> RigFile:
         },
         materials={"rubber": KelvinVoigtTable(E=0.75e6, nu=0.45, tau=10e-3, depth=44e-3)},
         pads={
-            "lower": PadTable(**pad, origin=(-40e-3, 0.0)),
-            "upper": PadTable(**pad, base="bracket", origin=(-40e-3, 0.0), mirrored=True),
+            "lower": BlockTable(**pad, origin=(-40e-3, 0.0)),
+            "upper": BlockTable(**pad, base="bracket", origin=(-40e-3, 0.0), mirrored=True),
         },
         laws={
             "dry": LawTable(

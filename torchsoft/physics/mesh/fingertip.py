@@ -33,11 +33,16 @@ class FingertipMesh(FreeMesh):
     def refined(self, finer: int) -> Mesh:
         return replace(self, elements_around=finer * self.elements_around)
 
+    @property
+    def layers(self) -> int:
+        """Of elements around the core."""
+        return max(1, round((1 - CORE) * self.elements_around / np.pi))
+
     @cached_property
     def whole_mesh(self) -> tuple[Array, Index, Index]:
         """Nodes, elements, and nodes along the face."""
         R, k = self.radius, self.elements_around // 4
-        layers = max(1, round((1 - CORE) * self.elements_around / np.pi))
+        layers = self.layers
         x, y = np.linspace(-CORE, CORE, 2 * k + 1) * R, np.linspace(0, CORE, k + 1) * R
         core = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
         number = np.arange(len(core)).reshape(2 * k + 1, k + 1)

@@ -72,6 +72,11 @@ class Mesh:
         return self.assemble(self.matrices[2], all_nodes=True).sum(1)[::2][self.free]
 
     @property
+    def band(self) -> int:
+        """How far apart the numbers of one element's nodes are at the most."""
+        return int(np.ptp(self.elements, axis=1).max())
+
+    @property
     def space(self) -> Array:
         """Two corners (2, 2) [m] of the rectangle in which the centre of a body must be to touch the pad."""
         low, high = self.nodes.min(0), self.nodes.max(0)

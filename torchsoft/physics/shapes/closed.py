@@ -1,14 +1,12 @@
 """Closed contours through given points: from a file, and as the control points of a periodic cubic B-spline."""
 
-import csv
-import math
-import re
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from torchsoft import csvfile
 from torchsoft.physics.arguments import LENGTHS, places
 from torchsoft.physics.shapes.simple import crossing
 
@@ -50,27 +48,13 @@ def contour_points(points: object) -> Array:
 def read_points(path: str | Path) -> Array:
     """Points (n, 2) [m] of a CSV file with columns x and y whose headings have units in brackets. Raises `ValueError` naming
     file and row for anything else, and `OSError`."""
-    try:
-        with Path(path).open(encoding="utf-8-sig", newline="") as file:
-            rows = [row for row in csv.reader(file) if any(cell.strip() for cell in row)]
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(f"{path} is not a CSV file in UTF-8: {error}") from None
-    heads = [re.fullmatch(r"\s*([xy])\s*\[(m|cm|mm)\]\s*", head) for head in (rows[0] if rows else [])]
-    if [head and head[1] for head in heads] not in (["x", "y"], ["y", "x"]):
-        found = ",".join(rows[0]) if rows else "nothing"
-        raise ValueError(f"{path}: the heading must be `x [mm],y [mm]`, with m, cm or mm, but is `{found}`")
-    columns = {head[1]: (i, LENGTHS[head[2]]) for i, head in enumerate(heads) if head}
-    points = np.empty((len(rows) - 1, 2))
-    for number, row in enumerate(rows[1:], 2):
-        try:
-            if len(row) != 2:
-                raise ValueError
-            values = [float(row[i]) * unit for i, unit in (columns["x"], columns["y"])]
-            if not all(map(math.isfinite, values)):
-                raise ValueError
-        except ValueError:
-            raise ValueError(f"{path}, row {number}: must be two finite numbers, but is `{','.join(row)}`") from None
-        points[number - 2] = values
+    needed = "the columns must be `x [mm]` and `y [mm]`, in m, cm or mm"
+    table = csvfile.read(Path(path), dict.fromkeys("xy", LENGTHS), lambda *_: f": {needed}")
+    if table.values.keys() != {"x", "y"}:
+        raise ValueError(f"{path}, row 1: {needed}, but are {', '.join(table.values) or 'none'}")
+    points = np.stack((table.values["x"], table.values["y"]), -1)
+    if (empty := np.flatnonzero(np.isnan(points).any(1))).size:
+        raise ValueError(f"{path}, row {table.rows[empty[0]]} has an empty cell; a point needs x and y")
     return points
 
 

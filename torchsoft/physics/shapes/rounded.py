@@ -112,7 +112,7 @@ class RoundedPolygon(Shape):
                 f"corners of radius {r:g} do not fit on side {worst} of the polygon (from 0 on, anticlockwise): there it is "
                 "too short, or folds back"
             )
-        return "the polygon crosses itself" if crossing(self.outline().numpy()) else ""
+        return "the polygon crosses itself" if crossing(self.boundary(181).numpy()) else ""
 
     def sides(self) -> Sides:
         v = self.vertices
@@ -172,9 +172,14 @@ class RoundedPolygon(Shape):
         return (direction @ centre.mT).amax(-1) + self.radius * torch.linalg.vector_norm(direction, dim=-1)
 
     @torch.no_grad()
-    def outline(self, points: int = 181) -> Tensor:
+    def boundary(self, points: int) -> Tensor:
+        """About so many points around (points, 2) [m], among the vertices."""
         part = torch.linspace(0, 1, max(2, points // len(self.vertices)), dtype=torch.float64)
-        around = self.along_arcs(self.sides(), part)[0].flatten(0, 1) - self.moments().centre
+        return self.along_arcs(self.sides(), part)[0].flatten(0, 1)
+
+    @torch.no_grad()
+    def outline(self, points: int = 181) -> Tensor:
+        around = self.boundary(points) - self.moments().centre
         return torch.cat((around, around[:1]))
 
 

@@ -1,0 +1,449 @@
+"""Every shape, material, pad and control law that a rig file may have, and rigs that make no sense."""
+
+import json
+import re
+import tomllib
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import meshio
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+
+from torchsoft import Body, Circle, PadMesh, Profile, Reference, Rig, Trajectory, simulate
+from torchsoft.cli import main
+from torchsoft.materials.presets import PRESETS
+from torchsoft.parameters import condensation_memory
+from torchsoft.physics.material import GeneralisedKelvin, KelvinVoigt, Prony
+from torchsoft.physics.mesh import CurvedPadMesh, FingertipMesh, Mesh, QuadMesh, unit_compliance
+from torchsoft.physics.shapes import Contour, RoundedBox, RoundedPolygon, Superellipse
+from torchsoft.rigs import RigFile
+from torchsoft.rigs import run as running
+from torchsoft.rigs.check import check
+from torchsoft.rigs.geometry import collision, surface
+from torchsoft.rigs.pads import BlockTable, CurvedTable, FingertipTable
+from torchsoft.rigs.template import template
+from torchsoft.rigs.written import to_toml
+
+SQUARE = [[-20e-3, -20e-3], [20e-3, -20e-3], [16e-3, 20e-3], [-16e-3, 20e-3]]
+RUBBER = {"E": 0.75e6, "depth": 44e-3}
+COARSE = {
+    "length": 80e-3, "height": 5e-3, "elements_x": 40, "elements_y": 2, "origin": [-40e-3, 0.0], "material": "rubber"
+}  # fmt: skip
+TIP = {"kind": "fingertip", "radius": 20e-3, "elements_around": 28, "origin": [-20e-3, 0.0], "material": "rubber"}
+
+SHAPES: dict[str, tuple[dict[str, Any], type]] = {
+    "superellipse": ({"a": 20e-3, "b": 20e-3, "n": 3.0}, Superellipse),
+    "rounded_box": ({"half_width": 20e-3, "half_height": 20e-3, "radius": 6e-3}, RoundedBox),
+    "rounded_polygon": ({"vertices": SQUARE, "radius": 5e-3}, RoundedPolygon),
+    "contour": ({"file": "pear.csv"}, Contour),
+}
+MATERIALS: dict[str, tuple[dict[str, Any], type]] = {
+    "generalised_kelvin": (RUBBER | {"J": [0.3, 0.5], "tau": [1e-2, 1e-1]}, GeneralisedKelvin),
+    "prony": (RUBBER | {"moduli": [2e5, 3e5], "tau": [2e-2, 2e-1]}, Prony),
+    "preset": ({"name": "Dragon Skin 20", "depth": 44e-3}, KelvinVoigt),
+    "file": ({"file": "material.toml", "depth": 30e-3}, Prony),
+}
+PADS: dict[str, tuple[dict[str, Any], type[Mesh]]] = {
+    "curved": (COARSE | {"radius": 0.2}, CurvedPadMesh),
+    "fingertip": (TIP, FingertipMesh),
+    "mesh": ({"file": "pad.msh", "unit": "mm", "material": "rubber", "origin": [-40e-3, 0.0]}, QuadMesh),
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """With a contour, a material, a mesh and networks."""
+    path = tmp_path_factory.mktemp("parts")
+    turn = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    r = 20 * (1 + 0.1 * np.cos(3 * turn))
+    rows = [f"{x},{y}" for x, y in zip(r * np.cos(turn) + 3, r * np.sin(turn))]
+    (path / "pear.csv").write_text("\n".join(["x [mm],y [mm]", *rows]), encoding="utf-8")
+    (path / "material.toml").write_text(
+        '[materials.test]\nkind = "prony"\nE = 5e5\nmoduli = [1e5]\ntau = [0.1]\ndepth = 1e-2\n', encoding="utf-8"
+    )
+    mesh = PadMesh(80e-3, 5e-3, 40, 2)
+    sides = [np.stack((mesh.edge(name)[:-1], mesh.edge(name)[1:]), -1) for name in ("face", "base")]
+    tags = [np.full(len(mesh.elements), 3), np.full(len(sides[0]), 1), np.full(len(sides[1]), 2)]
+    meshio.write(
+        path / "pad.msh",
+        meshio.Mesh(
+            np.pad(1e3 * mesh.nodes, ((0, 0), (0, 1))),
+            [("quad", mesh.elements), ("line", sides[0]), ("line", sides[1])],
+            cell_data={"gmsh:physical": tags, "gmsh:geometrical": tags},
+            field_data={"face": np.array([1, 1]), "base": np.array([2, 1])},
+        ),
+        file_format="gmsh22",
+    )
+    save_network(path / "law.npz", network())
+    return path
+
+
+def save_network(path: Path, net: nn.Module) -> None:
+    np.savez(path, **{name: value.numpy() for name, value in net.state_dict().items()})
+
+
+def network() -> nn.Sequential:
+    """A network whose first layer brings metres and metres a second to one."""
+    net = nn.Sequential(nn.Linear(4, 5), nn.Tanh(), nn.Linear(5, 1)).double()
+    generator = torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        for p in net.parameters():
+            p.copy_(torch.randn(p.shape, generator=generator, dtype=torch.float64))
+        net[0].weight.mul_(torch.tensor([50.0, 1.0, 50.0, 1.0], dtype=torch.float64))
+    return net
+
+
+def changed(tree: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
+    """A tree with others put into it; a table of another kind replaces the whole."""
+    for name, value in changes.items():
+        old = tree.get(name)
+        inner = (
+            isinstance(old, dict) and isinstance(value, dict) and value.get("kind", old.get("kind")) == old.get("kind")
+        )
+        tree[name] = changed(dict(old), value) if inner and isinstance(old, dict) else value
+    return tree
+
+
+def rig(folder: Path, **changes: Any) -> RigFile:
+    """The template on a coarse mesh, changed."""
+    tree = template("t").model_dump(exclude_unset=True)
+    tree["pads"] = {name: pad | {"elements_x": 40, "elements_y": 2} for name, pad in tree["pads"].items()}
+    file = RigFile.from_tree(changed(tree, changes))
+    file._folder = folder
+    return file
+
+
+def runs(file: RigFile) -> Trajectory:
+    """The first tenth of a second of a rig that checks clean."""
+    assert [str(one) for one in check(file) if one.severity != "note"] == []
+    done = running.carry_out(file.override(outputs={"duration": 0.12}))
+    assert done.stopped is None
+    assert done.trajectory.energy_residual_rel < 1e-3
+    return done.trajectory
+
+
+# shapes, materials, pads ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_every_shape_is_checked_and_runs(kind: str, folder: Path) -> None:
+    table, made = SHAPES[kind]
+    body = {"shape": {"kind": kind, **table}, "mass": None, "density": 7800.0, "depth": 20e-3}
+    file = rig(folder, bodies={"disc": body})
+    disc = file.build().rig.bodies["disc"]
+    assert type(disc.shape) is made
+    assert disc.mass.item() == pytest.approx(7800 * 20e-3 * disc.shape.area().item(), rel=1e-12)
+    assert disc.inertia.item() == pytest.approx(disc.mass.item() * disc.shape.gyration().item(), rel=1e-12)
+    run = runs(file)
+    weight = disc.mass.item() * 9.81
+    assert float(run.load["disc"][0, 1]) == pytest.approx(weight, rel=1e-3)  # it rests
+    again = RigFile.from_tree(tomllib.loads(to_toml(file)))
+    assert again.model_dump() == file.model_dump()
+
+
+def test_parts_of_two_builds_are_not_the_same(folder: Path) -> None:
+    """A contour is fitted once, but parameters that one user trains are not another's."""
+    file = rig(folder, bodies={"disc": {"shape": {"kind": "contour", "file": "pear.csv"}}})
+    one, other = (file.build().rig.bodies["disc"].shape for _ in range(2))
+    assert isinstance(one, Contour)
+    assert isinstance(other, Contour)
+    assert one.control is not other.control
+    assert torch.equal(one.control, other.control)
+
+
+@pytest.mark.parametrize("kind", MATERIALS)
+def test_every_material_is_built(kind: str, folder: Path) -> None:
+    table, made = MATERIALS[kind]
+    file = rig(folder, materials={"rubber": {"kind": kind, **table}})
+    found = file.build().rig.pads["lower"].material
+    assert type(found) is made
+    assert found.depth.item() == table["depth"]
+    if kind == "preset":
+        assert found.E.item() == PRESETS["Dragon Skin 20"].coefficients["E"].value
+    if kind == "file":
+        assert found.get_parameter("E_1").item() == 1e5
+    again = RigFile.from_tree(tomllib.loads(to_toml(file)))
+    assert again.model_dump() == file.model_dump()
+
+
+@pytest.mark.parametrize("kind", PADS)
+def test_every_pad_is_checked_and_runs(kind: str, folder: Path) -> None:
+    table, made = PADS[kind]
+    pad = {"kind": kind, **table}
+    start, motion = {}, {}
+    if kind == "fingertip":  # higher than a block
+        start = {"bracket": {"start": {"y": 80.1e-3}}}
+        motion = {"y_d": {"values": ["start", 79e-3]}}
+    file = rig(
+        folder, pads={"lower": pad, "upper": pad | {"base": "bracket", "mirrored": True}}, bodies=start, motion=motion
+    )
+    assert type(file.build().rig.pads["lower"].mesh) is made
+    run = runs(file)
+    assert float(run.load["disc"][0, 1]) == pytest.approx(0.4 * 9.81, rel=1e-3)
+    again = RigFile.from_tree(tomllib.loads(to_toml(file)))
+    assert again.model_dump() == file.model_dump()
+
+
+def test_a_mesh_from_a_file_is_the_block_that_it_was_made_of(folder: Path) -> None:
+    table = {"kind": "mesh", **PADS["mesh"][0]}
+    found = [float(rig(folder, **change).build().y0[:-12].abs().sum()) for change in ({}, {"pads": {"lower": table}})]
+    assert found[0] == pytest.approx(found[1], rel=1e-9)
+
+
+def test_a_pad_without_a_kind_is_a_block() -> None:
+    tree = template("t").model_dump(exclude_unset=True)
+    del tree["pads"]["lower"]["kind"]
+    assert isinstance(RigFile.from_tree(tree).pads["lower"], BlockTable)
+
+
+def test_the_middle_of_a_hollow_pad_is_below_its_ends(folder: Path) -> None:
+    """And what lies in the hollow does not overlap it."""
+    hollow = COARSE | {"kind": "curved", "radius": -0.05, "height": 3e-3}
+    file = rig(folder, pads={"lower": hollow}, bodies={"disc": {"start": {"x": 0.0}}})
+    ready = file.build()
+    pose = {name: x.numpy() for name, x in ready.rig.unpack(ready.y0).pose.items()}
+    at = surface(ready.rig.pads["lower"], pose)
+    sag = 0.05 - (0.05**2 - 0.04**2) ** 0.5
+    assert at.depth(np.array([0.0, 3e-3])) == pytest.approx(0.0, abs=1e-12)
+    assert at.depth(np.array([39.999e-3, 3e-3])) == pytest.approx(sag, rel=1e-2)
+    pads = dict(ready.rig.pads)
+    for bottom, overlap in ((6e-3, False), (2e-3, True)):
+        inner = file.override(pads={"upper": {"length": 10e-3, "elements_x": 8, "base": None, "mirrored": False}})
+        inner = inner.override(pads={"upper": {"origin": [-5e-3, bottom]}}, contacts={"upper": {"may_leave": True}})
+        small = inner.pads["upper"].build(ready.rig.pads["lower"].material, folder)
+        assert (collision(pads["lower"], small, pose) > 1e-6) == overlap
+
+
+@pytest.mark.parametrize(
+    "table",
+    [
+        BlockTable(material="r", length=0.1, height=5e-3, elements_x=120, elements_y=4),
+        BlockTable(material="r", length=0.05, height=0.05, elements_x=40, elements_y=40),
+        CurvedTable(material="r", length=0.1, height=2e-2, elements_x=100, elements_y=10, radius=0.1),
+        FingertipTable(material="r", radius=1e-2, elements_around=64),
+    ],
+    ids=["block", "square", "curved", "fingertip"],
+)
+def test_the_memory_of_a_pad_is_estimated_before_it_is_built(table: BlockTable, tmp_path: Path) -> None:
+    """From above, and not by far; the same from the mesh itself, as of those in files."""
+    mesh = table.mesh(tmp_path)
+    assert table.size()[:2] == (len(mesh.face), len(mesh.free))
+    need = condensation_memory(*table.size())
+    assert condensation_memory(len(mesh.face), len(mesh.free), mesh.band) == pytest.approx(need, rel=0.2)
+    _ = mesh.matrices, mesh.surface
+    unit_compliance.cache_clear()
+    tracemalloc.start()
+    unit_compliance(mesh, 0.45)
+    taken = tracemalloc.get_traced_memory()[1] / 2**30
+    tracemalloc.stop()
+    assert 0.6 * need < taken < need
+
+
+# control laws --------------------------------------------------------------------------------------------------------
+
+
+def test_a_network_from_a_file_is_the_module_in_python(folder: Path) -> None:
+    file = rig(folder, actuators={"x": {"network": "law.npz"}}, outputs={"duration": 0.12})
+    ready = file.build()
+    run = running.carry_out(file).trajectory
+    law = ready.rig.actuators["x"]
+    x = torch.tensor([1e-2, 0.1, 7.0, 5e-3, -0.2], dtype=torch.float64)
+    net = network()
+    with torch.no_grad():
+        expected = 1e5 * 5e-3 + 400 * 0.3 + 7.0 + net(x[[0, 1, 3, 4]])[0]
+        assert float(law(x)) == pytest.approx(float(expected), rel=1e-12)
+    with torch.no_grad():
+        at = torch.stack((run["x_d"], run["x_d_dot"], run["x_bracket"], run["v_x_bracket"]), -1)
+        loop = 1e5 * (at[:, 0] - at[:, 2]) + 400 * (at[:, 1] - at[:, 3])
+        assert torch.allclose(run["F_x"], loop + net(at)[:, 0], rtol=1e-9, atol=1e-9)
+    assert run.energy_residual_rel < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("arrays", "sentence"),
+    [
+        ({"0.weight": np.zeros((1, 3)), "0.bias": np.zeros(1)}, r"0\.weight has the shape \(1, 3\)"),
+        ({"0.weight": np.zeros((2, 4)), "0.bias": np.zeros(2)}, r"must have \(1, 4\) and \(1,\)"),
+        ({"a": np.zeros(3)}, r"it has a, but a network has 0\.weight, 0\.bias"),
+        ({"0.weight": np.full((1, 4), np.nan), "0.bias": np.zeros(1)}, r"0\.weight must be finite numbers"),
+        ({"0.weight": np.zeros((600, 4)), "0.bias": np.zeros(600)}, r"more than 2000 numbers"),
+        ({"0.weight": np.array([object()]), "0.bias": np.zeros(1)}, r"is not an \.npz file of numbers: Object arrays"),
+    ],
+)
+def test_weights_that_are_no_network_are_refused(tmp_path: Path, arrays: dict[str, Any], sentence: str) -> None:
+    np.savez(tmp_path / "law.npz", allow_pickle=True, **arrays)
+    (found,) = check(rig(tmp_path, actuators={"x": {"network": "law.npz"}}))
+    assert (found.severity, found.field) == ("error", "actuators.x.network")
+    assert re.search(sentence, found.sentence), found.sentence
+
+
+class Learned(nn.Module):
+    """A user's law: a PD loop whose stiffness and bias a network corrects, by state and set-point."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.Kp, self.Kd = (nn.Parameter(torch.tensor(x, dtype=torch.float64)) for x in (1e5, 400.0))
+        self.net = network()
+
+    def forward(self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor) -> Tensor:
+        correction = self.net(torch.stack((w, w_dot, q, q_dot), -1))[..., 0]
+        return (self.Kp + 1e3 * correction) * (w - q) + self.Kd * (w_dot - q_dot) + 5 * correction + feed_forward
+
+
+def test_gradients_into_a_network_gains_and_knots_equal_differences(folder: Path) -> None:
+    """A controller that is a module: every gain, every layer and every knot, along the same steps."""
+    ready = rig(folder, bodies={"disc": {"start": {"y": 24.9e-3}}, "bracket": {"start": {"y": 49.5e-3}}}).build()
+    made: Rig = ready.rig
+    law = made.actuators["x"].law = Learned()
+    knots = Profile([0.0, 0.03, 0.1], [0.0, 1e-3, 3e-3])
+    made.reference = Reference(x_d=knots, y_d=Profile([0.0], [49.4e-3]), press=Profile([0.0], [-5.0]))
+    knots.values.requires_grad_(True)
+    t = torch.linspace(0, 0.06, 4, dtype=torch.float64)
+
+    def loss(**how: Any) -> tuple[Tensor, Trajectory]:
+        run = simulate(made, t, y0=ready.y0, tolerance=1e-10, **how)
+        return 1e3 * run["x_disc"][-1] + 10 * run["theta_disc"][-1] + 0.1 * run["x_bracket"][1], run
+
+    value, first = loss(gradient="discrete", rtol=1e-5)
+    assert float(first.force["upper"][:, :, 0].sum(-1).min()) > 1.0  # it is gripped all the time
+    value.backward()
+    generator = torch.Generator().manual_seed(5)
+    for name, p in [*law.named_parameters(), ("knots", knots.values)]:
+        assert p.grad is not None
+        way = p.detach().abs().mean() * torch.randn(p.shape, generator=generator, dtype=torch.float64)
+        keep, found = p.detach().clone(), []
+        for by in (1e-4, -1e-4):
+            with torch.no_grad():
+                p.add_(by * way)
+                found.append(float(loss(knots=first.knots)[0]))
+                p.copy_(keep)
+        slope = (found[0] - found[1]) / 2e-4
+        assert float((p.grad * way).sum()) == pytest.approx(slope, rel=1e-6, abs=1e-9), name
+
+
+# rigs that make no sense ---------------------------------------------------------------------------------------------
+
+STONE = {"x": 0.3e-3, "y": 30e-3, "theta": 0.0, "shape": {"kind": "circle", "radius": 5e-3}}
+
+NONSENSE: dict[str, tuple[dict[str, Any], str]] = {
+    "bodies in each other": ({"bodies": {"stone": STONE}}, "it and bodies.stone overlap by"),
+    "no room": ({"motion": {"y_d": {"values": ["start", 40e-3]}}}, "`disc` does not fit: at t = 0.4 s it asks"),
+    "an unstable loop": (
+        {"materials": {"rubber": {"tau": 1e-4}}, "actuators": {"x": {"measures": "disc.x", "Kp": 1e6, "Kd": 10.0}},
+         "bodies": {"bracket": {"start": {"y": 49.5e-3}}}, "motion": {"y_d": {"kind": "hold"}}},
+        "the rig is unstable at t = ",
+    ),
+    "nothing carries it": (
+        {"bodies": {"ball": {"mass": 0.1, "start": {"x": 0.0, "y": 0.2}, "shape": {"kind": "circle", "radius": 5e-3}}}},
+        "error: bodies.ball: nothing carries it: it has no contact with any pad",
+    ),
+    "a loop that cannot reach": (
+        {"actuators": {"x": {"measures": "disc.x"}}, "contacts": {"upper": {"pad": "lower"}}},
+        "actuators.x: it measures disc.x and pushes bracket.x, but no pad and contact tie `bracket` to `disc`",
+    ),
+    "a file that is not there": (
+        {"bodies": {"disc": {"shape": {"kind": "contour", "file": "none.csv"}}}},
+        "error: bodies.disc.shape.file: none.csv: No such file or directory",
+    ),
+    "millimetres": ({"pads": {"lower": {"length": 80.0}}}, "pads.lower.length: should be from 1e-06 to 10 m, not 80"),
+    "too slim": (
+        {"bodies": {"disc": {"shape": {"kind": "ellipse", "a": 40e-3, "b": 10e-3}}}},
+        "error: bodies.disc.shape: the axes a and b differ by more than a factor of 3",
+    ),
+    "too round": (
+        {"bodies": {"disc": {"shape": {"kind": "rounded_box", "half_width": 2e-2, "half_height": 1e-2, "radius": 15e-3}}}},
+        "error: bodies.disc.shape: the corners' radius 0.015 is larger than half of the box, 0.01",
+    ),
+    "sides that cross": (
+        {"bodies": {"disc": {"shape": {"kind": "rounded_polygon", "vertices": [SQUARE[i] for i in (0, 2, 1, 3)],
+                                       "radius": 1e-3}}}},
+        "error: bodies.disc.shape: `vertices` cannot be used as a polygon",
+    ),
+    "two masses": (
+        {"bodies": {"disc": {"density": 7800.0, "depth": 1e-2}}}, "mass and density each say how heavy it is; give one"
+    ),
+    "density of nothing": (
+        {"bodies": {"bracket": {"mass": None, "density": 7800.0, "depth": 1e-2}}}, "bodies.bracket: shape is missing"
+    ),
+    "depth without density": ({"bodies": {"disc": {"depth": 1e-2}}}, "bodies.disc: density is missing: depth is given"),
+    "more than all": (
+        {"materials": {"rubber": {"kind": "generalised_kelvin", **RUBBER, "J": [0.8, 0.7], "tau": [0.1, 1.0]}}},
+        "error: materials.rubber: the fractions J sum to 1.5, above one",
+    ),
+    "a time too few": (
+        {"materials": {"rubber": {"kind": "prony", **RUBBER, "moduli": [1e5, 1e5], "tau": [0.1]}}},
+        "moduli has 2 numbers, but tau 1; give one of each per term",
+    ),
+    "no such rubber": (
+        {"materials": {"rubber": {"kind": "preset", "name": "Dragon", "depth": 1e-2}}},
+        "there is no preset `Dragon`; there are Dragon Skin 20, Dragon Skin 30",
+    ),
+    "an inertial series": (
+        {"materials": {"rubber": {"kind": "prony", **RUBBER, "moduli": [1e5], "tau": [0.1]}},
+         "pads": {"lower": {"inertial": True}}},
+        "error: pads.lower.inertial: an inertial pad has one retardation time",
+    ),
+    "more than memory": (
+        {"pads": {"lower": {"kind": "fingertip", "material": "rubber", "radius": 1e-2, "elements_around": 4000}}},
+        "elements_around = 4000 take about",
+    ),
+    "an arc that is too short": (
+        {"pads": {"lower": COARSE | {"kind": "curved", "radius": 30e-3}}},
+        "error: pads.lower: `radius` must be at least half of the length",
+    ),
+    "an edge that is not there": (
+        {"pads": {"lower": COARSE | {"kind": "curved", "radius": 0.2, "bonded_edges": ["top"]}}},
+        "error: pads.lower: `bonded_edges` must be some of base, left, right",
+    ),
+    "a mesh that is none": (
+        {"pads": {"lower": {"kind": "mesh", "material": "rubber", "file": "pear.csv", "unit": "mm"}}},
+        "error: pads.lower.file:",
+    ),
+    "a program for weights": (
+        {"actuators": {"x": {"network": "law.pt"}}},
+        "error: actuators.x.network: law.pt is not an .npz file: weights are data, and other files may be programs",
+    ),
+    "corners between the points": (
+        {"bodies": {"disc": {"shape": {"kind": "rounded_box", "half_width": 2e-2, "half_height": 2e-2, "radius": 5e-4}}}},
+        "warning: bodies.disc.shape: its sharpest corner has a radius of 0.5 mm",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NONSENSE)
+def test_a_rig_that_makes_no_sense_is_refused(
+    name: str, folder: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Through a file, by the sentence that helps. A file that TOML cannot write is one that JSON can."""
+    changes, sentence = NONSENSE[name]
+    tree = template("t").model_dump(exclude_unset=True)
+    tree["pads"] = {key: pad | {"elements_x": 40, "elements_y": 2} for key, pad in tree["pads"].items()}
+    monkeypatch.chdir(folder)
+    path = Path(f"{name.replace(' ', '_')}.toml")
+    path.write_text(toml(changed(tree, changes)), encoding="utf-8")
+    status = main(["check", str(path)])
+    out, err = capsys.readouterr()
+    assert sentence in out + err
+    assert status == (0 if sentence.startswith("warning") else 2)
+
+
+def toml(tree: dict[str, Any]) -> str:
+    """Any tables as TOML, right or wrong."""
+
+    def value(x: Any) -> str:
+        if isinstance(x, dict):
+            return "{" + ", ".join(f"{json.dumps(k)} = {value(v)}" for k, v in x.items() if v is not None) + "}"
+        return f"[{', '.join(map(value, x))}]" if isinstance(x, list | tuple) else json.dumps(x)
+
+    return "".join(f"{key} = {value(x)}\n" for key, x in tree.items())
+
+
+def test_a_mass_by_density_is_pythons(folder: Path) -> None:
+    disc = rig(folder, bodies={"disc": {"mass": None, "density": 2700.0, "depth": 44e-3}}).build().rig.bodies["disc"]
+    expected = Body.uniform(Circle(20e-3), 2700.0, 44e-3)
+    assert disc.mass.item() == expected.mass.item()
+    assert disc.inertia.item() == expected.inertia.item()

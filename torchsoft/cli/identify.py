@@ -1,0 +1,109 @@
+"""Identification from files."""
+
+import argparse
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from torchsoft.cli.failure import failed
+
+IDENTIFY = """\
+Which parameters explain these recordings, and how sure is that?
+
+DATA are CSV files with a heading such as `t [s], x_d [mm], y_d [mm], F_ff [N], x_C [mm], theta [deg]`, or trajectory files of
+this project (.nc). CONFIG.toml states what is known, what is unknown and how good the sensors are; examples/identify has both.
+Recordings that look wrong (a sign, a unit, set-points too far apart) are refused, or named, before anything is fitted.
+Writes answer.json and report.html, and comparison.json where there are competing laws. Interrupted, the same command continues
+where it was."""
+
+
+def add_commands(commands: Any) -> None:
+    """The command that identifies."""
+    one = commands.add_parser(
+        "identify", help="find parameters in recordings", description=IDENTIFY,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    one.add_argument(
+        "files", nargs="+", type=Path, metavar="DATA.csv ... CONFIG.toml", help="data files and one configuration"
+    )
+    one.add_argument("--out", type=Path, default=Path("out/identify"), help="folder for the results (%(default)s)")
+    one.add_argument("--workers", type=int, help="threads, one recording each (fit.workers)")
+    one.add_argument("--rtol", type=float, help="relative tolerance that chooses the simulation's steps (fit.rtol)")
+    one.add_argument("--checkpoint", type=Path, help="folder for what is unfinished (OUT/unfinished)")
+    one.add_argument("--yes", action="store_true", help="begin even what takes hours, or much memory")
+    one.add_argument("--no-progress", action="store_true", help="show no progress")
+    one.set_defaults(run=identify)
+
+
+def identify(options: argparse.Namespace) -> int:
+    configs = [file for file in options.files if file.suffix == ".toml"]
+    data = [file for file in options.files if file.suffix != ".toml"]
+    unfinished: Path = options.checkpoint or options.out / "unfinished"
+    if len(configs) != 1:
+        return failed(f"one CONFIG.toml is needed, but {len(configs)} were given")
+    try:
+        # these take seconds to import, so that `--help` does without
+        from torchsoft.cost import agree
+        from torchsoft.sysid.files import measured
+        from torchsoft.sysid.files.configuration import Settings
+        from torchsoft.sysid.files.cost import cost, one_by_one
+        from torchsoft.sysid.fit.fit import Unreachable
+        from torchsoft.sysid.problem.journal import forget
+        from torchsoft.sysid.report.report import report
+        from torchsoft.sysid.solve import identify
+
+        tables: dict[str, Any] = {}
+        try:
+            case = measured.load(data, configs[0])
+            fit, tables = case.config.fit, case.tables
+            changed = {"rtol": options.rtol, "workers": options.workers}
+            fit = Settings.model_validate(fit.model_dump() | {k: v for k, v in changed.items() if v is not None})
+            problems, heldout = list(case.laws.values()) or [case.problem], case.config.heldout
+            priced = (fit.rtol, fit.starts, fit.workers, heldout, fit.method)
+            expected = one_by_one(cost(problem, *priced) for problem in problems)
+            agree(expected, options.yes, "take a larger rtol, fewer starts or less data")
+            options.out.mkdir(parents=True, exist_ok=True)
+            result = identify(
+                case.problem, heldout=heldout, meant=case.config.meant, checkpoint=unfinished,
+                progress=not options.no_progress, **fit.model_dump(),
+            )  # fmt: skip
+            result = replace(result, command=options.command)
+            result.save(options.out / "answer.json")
+            report(result, case.problem, options.out / "report.html", checkpoint=unfinished)
+            forget(unfinished)
+            verdict = compared(case, fit, options) if case.laws else ""
+        except Unreachable as error:
+            return failed(measured.unreachable(error, tables))
+        except (ValueError, RuntimeError) as error:  # a model without equilibrium, a worker that was killed
+            return failed(str(error))
+        except OSError as error:
+            return failed(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    except KeyboardInterrupt:
+        print(f"\ninterrupted; what is done so far is in {unfinished}, and the same command continues", file=sys.stderr)
+        return 130
+    print(result.table())
+    for notice in result.notices:
+        print(f"note: {notice}")
+    print(verdict, end="")
+    print(f"{result.cost['wall_s']:.0f} s; written to {options.out / 'answer.json'} and {options.out / 'report.html'}")
+    return 0
+
+
+def compared(case: Any, fit: Any, options: argparse.Namespace) -> str:
+    """Fits the competing laws, and says which one made the data."""
+    from torchsoft.sysid.laws.compare import compare
+    from torchsoft.sysid.problem.journal import forget
+
+    unfinished: Path = options.checkpoint or options.out / "unfinished"
+    folder = unfinished.with_name(f"{unfinished.name}-laws")
+    answer = compare(
+        case.laws, heldout=case.config.heldout, rtol=fit.rtol, starts=fit.starts, workers=fit.workers,
+        checkpoint=folder, progress=not options.no_progress,
+    )  # fmt: skip
+    answer.save(options.out / "comparison.json")
+    for name in case.laws:
+        forget(folder / name)
+    if folder.is_dir() and not any(folder.iterdir()):
+        folder.rmdir()
+    return f"{answer.table()}\n{answer.verdict}\nwritten to {options.out / 'comparison.json'}\n"

@@ -1,0 +1,102 @@
+"""Commands on rig files: run, check, init."""
+
+import argparse
+import sys
+from pathlib import Path
+from typing import Any
+
+from torchsoft.cli.failure import failed
+
+RUN = """\
+Simulates the rig that a TOML file describes, and writes trajectory.nc, summary.json, figures and a video to a folder.
+
+The file is checked first, and a rig that makes no sense is not run. Interrupted, what was simulated until then is written."""
+
+CHECK = """\
+Says what is wrong or dangerous in a rig file before any run: bodies that overlap or do not fit, a loop that is unstable,
+strains beyond linear elasticity, steps that are too coarse, bodies that nothing carries, recordings that end early.
+The exit status is 2 where there is an error; warnings and notes are said only."""
+
+INIT = """\
+Writes NAME.toml, a rig to start from: a disc between two pads, with the unit and the meaning of every number in a comment."""
+
+
+def add_commands(commands: Any) -> None:
+    """The commands on rig files."""
+    one = commands.add_parser(
+        "run", help="simulate a rig file", description=RUN, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    one.add_argument("file", type=Path, metavar="RIG.toml", help="the rig")
+    one.add_argument("--out", type=Path, help="folder for the results (out/RIG)")
+    one.add_argument("--anyway", action="store_true", help="run even what the check finds wrong")
+    one.add_argument("--no-progress", action="store_true", help="show no progress")
+    one.set_defaults(run=run_rig)
+    one = commands.add_parser(
+        "check", help="say what is wrong in a rig file", description=CHECK,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    one.add_argument("file", type=Path, metavar="RIG.toml", help="the rig")
+    one.set_defaults(run=check_rig)
+    one = commands.add_parser(
+        "init", help="write a rig file to start from", description=INIT,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    one.add_argument("name", type=Path, metavar="NAME", help="the file's name, with or without .toml")
+    one.set_defaults(run=init_rig)
+
+
+def run_rig(options: argparse.Namespace) -> int:
+    """Check a rig file, simulate it, and write what came of it."""
+    from torchsoft.rigs import RigFile
+    from torchsoft.rigs.check import check
+    from torchsoft.rigs.run import run
+    from torchsoft.solve.progress import SimulationFailed
+
+    out: Path = options.out or Path("out") / options.file.stem
+    file = RigFile.from_toml(options.file)
+    found = check(file)
+    for one in found:
+        print(one, file=sys.stderr)
+    if any(one.severity == "error" for one in found) and not options.anyway:
+        return failed(f"{options.file} is not run; mend what is wrong, or say --anyway")
+    done = run(file, out, found=found, progress=not options.no_progress)
+    if isinstance(done.stopped, SimulationFailed):
+        return failed(f"{done.stopped.reason}; what was simulated until then is in {out}")
+    if done.stopped is not None:
+        print(f"\ninterrupted; what was simulated until then is in {out}", file=sys.stderr)
+        return 130
+    stats = done.trajectory.stats
+    print(
+        f"{float(done.trajectory.t[-1]):g} s simulated in {stats.wall_s:.2g} s ({stats.steps} steps), energies balanced to "
+        f"{done.trajectory.energy_residual_rel:.1e} of what was injected; written to {out}"
+    )
+    return 0
+
+
+def check_rig(options: argparse.Namespace) -> int:
+    """Say what is wrong in a rig file."""
+    from torchsoft.rigs import RigFile
+    from torchsoft.rigs.check import check
+
+    found = check(RigFile.from_toml(options.file))
+    for one in found:
+        print(one)
+    count = {kind: sum(one.severity == kind for one in found) for kind in ("error", "warning")}
+    print(f"{options.file}: {count['error']} errors, {count['warning']} warnings")
+    return 2 if count["error"] else 0
+
+
+def init_rig(options: argparse.Namespace) -> int:
+    """Write a rig file to start from."""
+    from torchsoft.rigs.template import template
+    from torchsoft.rigs.written import to_toml
+
+    path: Path = options.name.with_suffix(".toml")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(to_toml(template(path.stem)))
+    except FileExistsError:
+        return failed(f"{path} is there already; take another name")
+    print(f"written to {path}; torchsoft check {path} looks it over, torchsoft run {path} simulates it")
+    return 0
