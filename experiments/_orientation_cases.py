@@ -1,7 +1,6 @@
-"""The rig of `orientation.py` in its variants: gains by design, other shapes and speeds, friction, efforts fed forward; and what
-rigid bodies predict of them."""
+"""The rig of `orientation.py` in its variants: gains by design, other shapes and speeds, friction, efforts fed forward; and
+what rigid bodies predict of them."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,12 +9,25 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchsoft import PD, Actuator, Circle, Profile, Reference, Rig, Sampled, Shape, SimulationFailed, SmoothSlip, Trajectory
+from torchsoft import (
+    PD,
+    Actuator,
+    Circle,
+    Profile,
+    Reference,
+    Rig,
+    Sampled,
+    Shape,
+    SimulationFailed,
+    SmoothSlip,
+    Trajectory,
+)
 from torchsoft import simulate as simulated
-from torchsoft.physics.motion import Piecewise
+from torchsoft.physics.motion import Piecewise, hold
 from torchsoft.physics.resting import resting, standing
 from torchsoft.rigs import RigFile
 from torchsoft.rigs.build import assemble
+from torchsoft.solve.stability import NEUTRAL, modes
 
 FILE = Path(__file__).parents[1] / "rigs" / "orientation.toml"
 
@@ -97,7 +109,7 @@ def file_of(gains: Gains | None, **groups: dict[str, Any]) -> RigFile:
 
 
 def case_of(file: RigFile, shape: Shape | None = None) -> Case:
-    """The rig with another shape in place of the disc, which lies between the same pads, equally far pressed by the upper one."""
+    """The rig with another shape in place of the disc, between jaws that are as far from its surface."""
     ready = file.build()
     signals = {name: ready.rig.reference[name] for name in ready.rig.signals}
     case = Case(ready.rig, ready.y0, signals, file.outputs.duration)
@@ -133,12 +145,18 @@ def faster(case: Case, speed: float) -> Case:
     return Case(case.rig, case.y0, signals, GRIPPED + (case.end - GRIPPED) / speed)
 
 
-def rubbed(case: Case, mu: float) -> None:
-    """Give the law of both contacts a static coefficient of friction, the kinetic one in the same ratio as before."""
+def friction_of(case: Case) -> SmoothSlip:
+    """The friction law that both contacts share."""
     slip = case.rig.contacts["lower"].law.friction
     assert isinstance(slip, SmoothSlip)
+    return slip
+
+
+def rubbed(case: Case, mu: float) -> None:
+    """Give the law of both contacts a static coefficient of friction, the kinetic one in the same ratio as before."""
+    slip = friction_of(case)
     with torch.no_grad():
-        slip.mu_k *= mu / slip.mu_s
+        slip.mu_k.mul_(mu / slip.mu_s)
         slip.mu_s.fill_(mu)
 
 
@@ -161,7 +179,11 @@ def by_kinematics(case: Case, gains: Gains, R: float) -> Case:
         jaws[f"carry_{jaw}"] = Actuator(f"{jaw}.x", f"{jaw}.x", PD(**gains.of(gains.carry)), setpoint=f"{jaw}_d")
     own = {name: rig.actuators[name] for name in ("lift", "grip")}
     alone = Rig(
-        bodies=rig.bodies, pads=rig.pads, contacts=rig.contacts, actuators=jaws | own, gravity=float(rig.gravity.detach())
+        bodies=rig.bodies,
+        pads=rig.pads,
+        contacts=rig.contacts,
+        actuators=jaws | own,
+        gravity=float(rig.gravity.detach()),
     )
     return Case(alone, case.y0, signals, case.end)
 
@@ -172,7 +194,8 @@ def simulate(case: Case, rtol: float) -> tuple[Trajectory, str]:
     try:
         return simulated(case.rig, t, y0=case.y0, reference=Reference(**case.signals), rtol=rtol), ""
     except SimulationFailed as failure:
-        assert failure.trajectory is not None
+        if failure.trajectory is None:
+            raise
         return failure.trajectory, failure.reason
 
 
@@ -199,6 +222,18 @@ def outcome(case: Case, run: Trajectory, stopped: str = "") -> Outcome:
     )  # fmt: skip
 
 
+def gripped_modes(case: Case, run: Trajectory) -> complex:
+    """The mode of the closed loops in the closed grip that lasts longest [1/s]. Raises `ValueError` for one that grows."""
+    row = run.at(GRIPPED)
+    now = {name: float(one(run.t[row])[0].detach()) for name, one in case.signals.items()}
+    values = modes(case.rig, run.y[row].detach(), hold(**now)).values
+    if float(values[0].real) > NEUTRAL:
+        raise ValueError(
+            f"these gains are unstable: the leading mode is {complex(values[0]):.3g} 1/s; lower `bandwidth`"
+        )
+    return complex(values[values.real < -NEUTRAL][0])
+
+
 class Rigid(NamedTuple):
     """What rolling of a rigid shape between rigid plates asks for in a quarter turn, at rest."""
 
@@ -208,8 +243,8 @@ class Rigid(NamedTuple):
 
 
 def rigid(shape: Shape, grip: float, weight: float) -> Rigid:
-    """With the support function h of the angle: the plates' normal forces N and N + W act h' beside the centre, and the friction
-    F on either plate balances their couple: 2 F h = (2 N + W) h'."""
+    """With the support function h of the angle: the plates' normal forces N and N + W act h' beside the centre, and the
+    friction F on either plate balances their couple: 2 F h = (2 N + W) h'."""
     points = shape.outline(1441).numpy()
     angle = np.linspace(0, 2 * np.pi, len(points))
     n, t = (np.stack(axes, -1) for axes in ((np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))))
@@ -217,9 +252,3 @@ def rigid(shape: Shape, grip: float, weight: float) -> Rigid:
     h, slope = ((points * axes).sum(-1)[quarter] for axes in (n, t))
     F = (grip + weight / 2) * float(np.abs(slope / h).max())
     return Rigid(F / grip, F, 2 * MM * float(np.abs(h - h[-1]).max()))
-
-
-def markers(outcomes: Mapping[Any, Outcome], position_mm: float, angle_deg: float) -> tuple[list[Any], list[Any]]:
-    """Keys of the outcomes within and beyond the tolerance."""
-    good = [key for key, one in outcomes.items() if one.within(position_mm, angle_deg)]
-    return good, [key for key in outcomes if key not in good]
