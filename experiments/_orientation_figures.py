@@ -1,15 +1,19 @@
 """The figure of `orientation.py`."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from _orientation_cases import DEGREES, MM, Outcome, errors
+from _orientation_cases import DEGREES, GRIPPED, MM, Outcome, errors
 from _orientation_result import DISC, KINEMATICS, Result, angle_of
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from torchsoft.plot.figures import ACTUAL, DESIRED, OTHER, STYLE, timeline
+
+BOXED: dict[str, Any] = {"frameon": True, "facecolor": "white", "edgecolor": "none", "framealpha": 1.0}
+"""Of legends that lie on lines."""
 
 
 def limits(axes: Axes, value: float, label: str) -> None:
@@ -52,7 +56,7 @@ def figure(result: Result) -> Figure:
             bars.text(i + 0.02, 1.15 * result.alone[name].angle_deg, "lost", ha="center", color="#cc3311", size=9)
     limits(bars, c.angle_deg, "tolerance")
     bars.set_xticks(place, [name.replace(" ", "\n", 1) for name in names])
-    bars.set(yscale="log", ylabel="largest error of theta [deg]", title="c) other shapes", ylim=(0.003, 60.0))
+    bars.set(yscale="log", ylabel="largest error of theta [deg]", title="c) other shapes", ylim=(0.001, 100.0))
     bars.legend(loc="upper left", ncols=2)
 
     fast = list(result.speeds)
@@ -65,7 +69,7 @@ def figure(result: Result) -> Figure:
     speed.set_xticks(fast, [f"{s:g}" for s in fast])
     speed.minorticks_off()
     speed.set(xlabel="times as fast", ylabel="largest error", title="d) disc: speed (dotted: tolerances)")
-    speed.legend(loc="upper left", ncols=2)
+    speed.legend(loc="lower right", **BOXED)
 
     aspect = f"ellipse {c.slipping_aspect:g}"
     swept = [(f"disc, {c.disc_speed:g} times as fast", result.disc_frictions, result.disc_cone, ACTUAL)]
@@ -82,12 +86,13 @@ def figure(result: Result) -> Figure:
     friction.plot([], [], color=DESIRED, ls="--", lw=1.0, label="friction cone, rigid")
     limits(friction, 1.0, "tolerance")
     friction.set(xlabel="coefficient of friction", ylabel="largest error over its tolerance", title="e) friction")
-    friction.legend()
+    friction.legend(loc="lower left", **BOXED)
 
     for name, colour in zip([name for name in names if name != DISC], (ACTUAL, OTHER, "#009988", "#ee3377")):
         _, done = result.runs[name]
-        apart = MM * (done["y_upper"] - done["y_lower"]).detach().numpy()
-        turned = DEGREES * done["theta_disc"].detach().numpy()
+        later = done.t >= GRIPPED
+        apart = MM * (done["y_upper"] - done["y_lower"]).detach()[later].numpy()
+        turned = DEGREES * done["theta_disc"].detach()[later].numpy()
         opening.plot(turned, apart, color=colour, label=name + (" (lost)" if result.alone[name].stopped else ""))
     opening.set(xlabel="theta [deg]", ylabel="distance of the jaws [mm]", title="f) the jaws give way")
     opening.legend()

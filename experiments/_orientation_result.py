@@ -104,16 +104,18 @@ def of_the_disc(result: Result) -> Iterator[str]:
         f"Disc, by the kinematics of rigid rolling without a loop on it: {blind.angle_deg:.2f} deg, {blind.rest_deg:.2f} deg "
         f"at rest: {result.verdict(blind)} the tolerance; soft pads do not roll with the disc's radius."
     )
-    fastest = max(result.speeds)
-    millimetres, degrees = result.lags[fastest]
-    yield (
-        f"Disc, times as fast: {fails(result, result.speeds, rising=True)}. At {fastest:g} times the inertia of rigid parts "
-        f"alone makes {millimetres:.3f} mm and {degrees:.3f} deg (a / w^2), which a higher bandwidth would mend."
-    )
-    yield (
-        f"Disc, {c.disc_speed:g} times as fast, mu: {fails(result, result.disc_frictions, rising=False)}. Its friction cone "
-        f"asks for {result.disc_cone:.4f}: a disc needs next to no friction."
-    )
+    if result.speeds:
+        fastest = max(result.speeds)
+        millimetres, degrees = result.lags[fastest]
+        yield (
+            f"Disc, times as fast: {fails(result, result.speeds, rising=True)}. At {fastest:g} times the inertia of rigid "
+            f"parts alone makes {millimetres:.3f} mm and {degrees:.3f} deg (a / w^2), which a higher bandwidth would mend."
+        )
+    if result.disc_frictions:
+        yield (
+            f"Disc, {c.disc_speed:g} times as fast, mu: {fails(result, result.disc_frictions, rising=False)}. Its friction "
+            f"cone asks for {result.disc_cone:.4f}; what friction cannot carry the dents in the pads do."
+        )
 
 
 def of_a_shape(result: Result, name: str) -> str:
