@@ -72,18 +72,21 @@ def figure(result: Result) -> Figure:
     speed.legend(loc="lower right", **BOXED)
 
     aspect = f"ellipse {c.slipping_aspect:g}"
-    swept = [(f"disc, {c.disc_speed:g} times as fast", result.disc_frictions, result.disc_cone, ACTUAL)]
+    swept = [
+        (f"disc, {c.disc_speed:g} times as fast", result.disc_frictions, [result.turning, result.carrying], ACTUAL)
+    ]
     if result.frictions:
-        swept.append((f"{aspect}, fed forward", result.frictions, result.rigid[aspect].friction, OTHER))
-    for label, outcomes, cone, colour in swept:
+        swept.append((f"{aspect}, fed forward", result.frictions, [result.rigid[aspect].friction], OTHER))
+    for label, outcomes, cones, colour in swept:
         mus = sorted(outcomes)
         friction.loglog(mus, [part(outcomes[mu]) for mu in mus], color=colour, label=label)
         for mu in mus:
             lost = bool(outcomes[mu].stopped)
             friction.plot(mu, part(outcomes[mu]), "X" if lost else "o", color=colour, ms=8 if lost else 5)
-        friction.axvline(cone, color=colour, ls="--", lw=1.0)
+        for cone in cones:
+            friction.axvline(cone, color=colour, ls="--", lw=1.0)
     friction.plot([], [], "X", color=DESIRED, ms=8, label="lost")
-    friction.plot([], [], color=DESIRED, ls="--", lw=1.0, label="friction cone, rigid")
+    friction.plot([], [], color=DESIRED, ls="--", lw=1.0, label="friction cones, rigid")
     limits(friction, 1.0, "tolerance")
     friction.set(xlabel="coefficient of friction", ylabel="largest error over its tolerance", title="e) friction")
     friction.legend(loc="lower left", **BOXED)

@@ -8,6 +8,7 @@ from _experiment import markdown
 from _orientation_cases import DEGREES, Case, Gains, Outcome, Rigid
 
 from torchsoft import Trajectory
+from torchsoft.rigs.balance import shown
 
 DISC, KINEMATICS = "disc", "disc, by kinematics"
 
@@ -38,7 +39,8 @@ class Result:
     gains: Gains
     grip: float  # [N]
     mu: float  # coefficient of friction of the rig
-    disc_cone: float  # the coefficient of friction m a / 2 N that the disc asks for at `disc_speed`
+    carrying: float  # the coefficient of friction m a / 2 N that carrying the disc asks for at `disc_speed`
+    turning: float  # and I alpha / 2 R N, turning it
     slowest: complex = 0j  # the mode of the closed grip that lasts longest [1/s]
     rigid: dict[str, Rigid] = field(default_factory=dict)  # predictions by shape
     alone: dict[str, Outcome] = field(default_factory=dict)  # by shape, by loops alone
@@ -88,9 +90,13 @@ def fails(result: Result, outcomes: dict[float, Outcome], rising: bool) -> str:
     if bad is None:
         return f"within the tolerance in every run, to {order[-1]:g}"
     one, good = outcomes[bad], order[: order.index(bad)]
-    until = f"within the tolerance to {good[-1]:g}, " if good else ""
-    size = f"{one.position_mm:.3f} mm and {one.angle_deg:.3f} deg"
-    return f"{until}beyond it at {bad:g} ({f'the run ends: {one.stopped}' if one.stopped else size})"
+    lost = next((key for key in order if outcomes[key].stopped), None)
+    parts = [f"within the tolerance to {good[-1]:g}"] if good else []
+    if not one.stopped:
+        parts.append(f"beyond it at {bad:g} ({one.position_mm:.3f} mm and {one.angle_deg:.3f} deg)")
+    if lost is not None:
+        parts.append(f"lost at {lost:g} ({outcomes[lost].stopped})")
+    return ", ".join(parts)
 
 
 def of_the_disc(result: Result) -> Iterator[str]:
@@ -98,7 +104,7 @@ def of_the_disc(result: Result) -> Iterator[str]:
     yield (
         f"Disc, by PD loops of {c.bandwidth:g} rad/s: centre within {disc.position_mm:.4f} mm, orientation within "
         f"{disc.angle_deg:.3f} deg, at rest {disc.rest_mm:.4f} mm and {disc.rest_deg:.4f} deg: {result.verdict(disc)} the "
-        f"tolerance of {c.position_mm:g} mm and {c.angle_deg:g} deg. Slowest mode in the grip: {result.slowest:.3g} 1/s."
+        f"tolerance of {c.position_mm:g} mm and {c.angle_deg:g} deg. Slowest mode in the grip: {shown(result.slowest)}."
     )
     yield (
         f"Disc, by the kinematics of rigid rolling without a loop on it: {blind.angle_deg:.2f} deg, {blind.rest_deg:.2f} deg "
@@ -114,7 +120,8 @@ def of_the_disc(result: Result) -> Iterator[str]:
     if result.disc_frictions:
         yield (
             f"Disc, {c.disc_speed:g} times as fast, mu: {fails(result, result.disc_frictions, rising=False)}. Its friction "
-            f"cone asks for {result.disc_cone:.4f}; what friction cannot carry the dents in the pads do."
+            f"cone asks for {result.turning:.4f} to be turned and for {result.carrying:.4f} to be carried, but what friction "
+            "cannot carry the dents in the pads do."
         )
 
 

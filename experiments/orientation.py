@@ -6,8 +6,8 @@ on disc.theta pushes them against each other, the loop on disc.y lifts the lower
 design: one bandwidth w, damping 1, for the masses of rigid parts that roll. Errors count from the closed grip on.
   kinematics  jaws under loops of their own, driven as a rigid disc would roll: what it costs not to see the disc
   speed       everything after the grip faster; rigid parts lag behind by a / w^2
-  friction    less of it; a disc asks for mu = m a / 2 N, a shape between rigid plates for max h'/h (1 + W / 2 N), with its
-              support function h, grip N and weight W (the friction cone)
+  friction    less of it: a disc asks for mu = I alpha / 2 R N and m a / 2 N, a shape between rigid plates for
+              max h'/h (1 + W / 2 N), with its support function h, grip N and weight W (the friction cone)
   shape       ellipses of the disc's area and a rounded box: the grip turns them with F = max h'/h (N + W / 2) on either
               jaw, for which the loop needs an error F / Kp; then with the efforts of the run before fed forward
 
@@ -15,7 +15,7 @@ Command: .venv/bin/python experiments/orientation.py [--smoke]
 Expected: the disc within 0.009 mm and 0.09 degrees, 0.0005 mm and 0.003 degrees at rest; by kinematics 2.1 degrees off.
 Beyond the tolerance: the disc four times as fast (inertia); by loops alone the ellipse of 1.1 and all that is farther from
 a disc, which efforts fed forward mend for 1.1, 1.3 and the box; the ellipse of 1.3 with mu near its friction cone of 0.29 or
-below; the ellipse of 2, which asks for 0.82 and has 0.8, and is lost. About a minute on one core.
+below; the ellipse of 2, which asks for 0.82 and has 0.8, and is lost. Little more than a minute on one core.
 """
 
 from collections.abc import Mapping
@@ -89,8 +89,10 @@ def run(config: Config) -> Result:
     R, mass = float(disc.shape.radius.detach()), float(disc.mass.detach())
     weight = float(base.rig.gravity.detach()) * mass
     grip = -float(base.signals["grip"](torch.tensor(base.end, dtype=torch.float64))[0].detach())
-    cone = mass * peak(hurried.signals["x_d"]) / (2 * grip)
-    result = Result(config, gains, grip, float(slip.mu_s.detach()), cone)
+    inertia = float(disc.inertia.detach())
+    carrying = mass * peak(hurried.signals["x_d"]) / (2 * grip)
+    turning = inertia * peak(hurried.signals["theta_d"]) / (2 * R * grip)
+    result = Result(config, gains, grip, float(slip.mu_s.detach()), carrying, turning)
     bar = tqdm(unit="run")
 
     def attempt(case: Case, name: str = "") -> tuple[Trajectory, Outcome]:
@@ -147,7 +149,7 @@ def summary(result: Result) -> dict[str, Any]:
         "efforts_fed_forward": rows(result.known),
         "speeds": rows(result.speeds),
         "inertia_alone_mm_deg": {str(key): value for key, value in result.lags.items()},
-        "disc_cone": result.disc_cone,
+        "disc_cones": {"turning": result.turning, "carrying": result.carrying},
         "disc_frictions": rows(result.disc_frictions),
         "frictions": rows(result.frictions),
     }
