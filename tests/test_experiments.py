@@ -2,11 +2,14 @@
 
 import importlib.util
 import json
+import math
 import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+
+from torchsoft import Ellipse
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 sys.path.insert(0, str(EXPERIMENTS))  # as for a script; what experiments share lies beside them
@@ -187,3 +190,40 @@ def test_contact_points_smoke(tmp_path: Path) -> None:
     assert between[name] < 0.3 * nodes[name]
     assert max(case["gradient from differences over 1e-06"] for case in (nodes, between)) < 5e-5
     assert (tmp_path / "contact_points.png").stat().st_size > 10_000
+
+
+def test_orientation_smoke(tmp_path: Path) -> None:
+    """Loops turn and carry the disc within the tolerance; what they do not do is as rigid statics say, and is said."""
+    module = experiment("orientation")
+    module.main(module.Config(out=tmp_path, smoke=True))
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    alone, fed = summary["loops_alone"], summary["efforts_fed_forward"]["ellipse 1.3"]
+    assert alone["disc"]["verdict"] == fed["verdict"] == "within"
+    assert alone["disc, by kinematics"]["rest_deg"] > 1.0  # soft pads do not roll with the disc's radius
+    ellipse, asks = alone["ellipse 1.3"], summary["rigid"]["ellipse 1.3"]
+    stiffness = summary["gains"]["turn_lower"]["Kp"] * math.pi / 180  # [N/deg]
+    assert ellipse["verdict"] == "beyond"
+    assert ellipse["angle_deg"] == pytest.approx(asks["effort"] / stiffness, rel=0.25)
+    assert ellipse["friction"] == pytest.approx(asks["friction"], rel=0.1)
+    assert ellipse["opening_mm"] == pytest.approx(asks["opening_mm"], rel=0.05)
+    assert summary["frictions"]["0.2"]["verdict"] == "lost"  # its friction cone asks for 0.29
+    assert summary["speeds"]["6.0"]["verdict"] == "beyond"
+    assert summary["speeds"]["6.0"]["position_mm"] == pytest.approx(summary["inertia_alone_mm_deg"]["6.0"][0], rel=0.2)
+    sentences = " ".join(summary["sentences"])
+    assert "within the tolerance of 0.1 mm and 0.5 deg" in sentences
+    assert "mu: lost at 0.2 (at t = " in sentences
+    assert {"orientation.png", "snapshots.png", "orientation.gif", "ellipse.gif"} <= {
+        x.name for x in tmp_path.iterdir()
+    }
+
+
+def test_orientation_rig_has_the_gains_of_its_design() -> None:
+    """The gains in the file are those of the experiment's bandwidth; rigid statics are the closed form of an ellipse."""
+    module = experiment("_orientation_cases")
+    file = module.RigFile.from_toml(module.FILE)
+    for name, gains in module.design(file, 150.0).table.items():
+        assert file.actuators[name].Kp == pytest.approx(gains["Kp"], rel=1e-2)
+        assert file.actuators[name].Kd == pytest.approx(gains["Kd"], rel=1e-2)
+    asks = module.rigid(Ellipse(20e-3, 10e-3), 10.0, 0.0)
+    assert asks.friction == pytest.approx(0.75, rel=1e-3)  # (k^2 - 1) / 2 k at aspect k = 2
+    assert asks.opening_mm == pytest.approx(20.0)
