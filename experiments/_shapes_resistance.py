@@ -9,15 +9,30 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from _shapes_theory import Rolling, moving_contact, peak, winkler
+from tqdm import tqdm
 
 from torchsoft import (
-    PD, Actuator, Body, Circle, Contact, KelvinVoigt, Pad, PadMesh, Profile, Prony, Reference, Rig, Sampled, SmoothSlip,
-    SoftContact, StandardLinearSolid, simulate,
-)  # fmt: skip
+    PD,
+    Actuator,
+    Body,
+    Circle,
+    Contact,
+    KelvinVoigt,
+    Pad,
+    PadMesh,
+    Profile,
+    Prony,
+    Reference,
+    Rig,
+    Sampled,
+    SmoothSlip,
+    SoftContact,
+    StandardLinearSolid,
+    simulate,
+)
 from torchsoft.physics.material import Material
 from torchsoft.physics.resting import resting, standing
-
-from _shapes_theory import Rolling, moving_contact, peak, winkler  # isort: skip
 
 RADIUS, HEIGHT, DEPTH = 19.37e-3, 4.59e-3, 44e-3
 """The paper's disc and pads [m]."""
@@ -35,7 +50,7 @@ SPRING_TIME = 1e-6
 MASS = 0.02
 """Of the disc [kg], so light that its bounces die out at once."""
 
-MARGIN, RAMP, SETTLING, WAKES = 15e-3, 4e-3, 12e-3, 3.0
+MARGIN, RAMP, SETTLING, WAKES = 15e-3, 4e-3, 12e-3, 4.0
 """Pad kept free at its ends, way in which the speed is reached, and way before the reading [m]: `SETTLING`, or so many times
 v TAU, after which the wake behind the disc is as long as it gets."""
 
@@ -94,7 +109,9 @@ def cases(load: float, element: float) -> dict[str, Case]:
         "relaxation series": series({5e-3: 0.25e6, 15e-3: 0.25e6, 50e-3: 0.25e6}),
     }
     out = {name: layer(HEIGHT, load, rubber, element, 6) for name, rubber in rubbers.items()}
-    return out | {"thin layer, one relaxation time": layer(1e-3, 0.25 * load, series({50e-3: 0.75e6}, 0.2), 0.5 * element, 4)}
+    return out | {
+        "thin layer, one relaxation time": layer(1e-3, 0.25 * load, series({50e-3: 0.75e6}, 0.2), 0.5 * element, 4)
+    }
 
 
 def half_width(case: Case) -> float:
@@ -146,6 +163,31 @@ def roll(case: Case, v: float, pad_length: float, rtol: float) -> Roll:
     )  # fmt: skip
 
 
-def highest(rolls: list[Roll], kind: str) -> tuple[float, float] | None:
-    """Speed [m/s] and height of a curve's peak."""
-    return peak([one.speed for one in rolls], [getattr(one, kind) for one in rolls])
+@dataclass(frozen=True)
+class Resistance:
+    """One rubber's curve: half-width of the contact at rest [m], its rolls, and both theories at speeds between [m/s]."""
+
+    half_width: float
+    rolls: list[Roll]
+    speeds: list[float]
+    theory: list[float]
+    winkler: list[float]
+
+    def deborah(self, v: float) -> float:
+        """De = v TAU / a."""
+        return v * TAU / self.half_width
+
+    def peak(self, kind: str) -> tuple[float, float] | None:
+        """Speed [m/s] and height of the rolls' largest "force", or of a theory at their speeds."""
+        return peak([one.speed for one in self.rolls], [getattr(one, kind) for one in self.rolls])
+
+
+def resistance(case: Case, slowest: float, fastest: float, speeds: int, rtol: float) -> Resistance:
+    """Rolls at `speeds` speeds from `slowest` to `fastest`, as De."""
+    a = half_width(case)
+    measured, between = ((np.geomspace(slowest, fastest, n) * a / TAU).tolist() for n in (speeds, 3 * speeds - 2))
+    pad_length = length(case, measured)
+    rolls = [roll(case, v, pad_length, rtol) for v in tqdm(measured, "speeds", leave=False)]
+    theory = [moving_contact(case.at, case.material, case.load, v).coefficient for v in between]
+    thin = [winkler(case.at, case.material, case.load, v)[0] for v in between]
+    return Resistance(a, rolls, between, theory, thin)

@@ -13,17 +13,32 @@ from typing import Any
 
 import numpy as np
 import torch
+from _shapes_theory import Rolling, moving_contact
 
 from torchsoft import (
-    Circle, Contour, Ellipse, GeneralisedKelvin, KelvinVoigt, Parameters, Profile, Prony, Reference, RoundedBox,
-    RoundedPolygon, Shape, SoftGrasp, StandardLinearSolid, Superellipse, Trajectory, rest, simulate,
-)  # fmt: skip
+    Circle,
+    Contour,
+    Ellipse,
+    GeneralisedKelvin,
+    KelvinVoigt,
+    Parameters,
+    Profile,
+    Prony,
+    Reference,
+    RoundedBox,
+    RoundedPolygon,
+    Shape,
+    SoftGrasp,
+    StandardLinearSolid,
+    Superellipse,
+    Trajectory,
+    rest,
+    simulate,
+)
 from torchsoft.materials.presets import PRESETS
 from torchsoft.physics.material import Material
 from torchsoft.rigs.balance import LINEAR
 from torchsoft.solve.stability import loop_modes
-
-from _shapes_theory import Rolling, moving_contact  # isort: skip
 
 FORCE = 80.0
 """Grasping force [N], about the paper's."""
@@ -49,7 +64,7 @@ def objects() -> dict[str, Shape]:
     """Bodies about as large as the paper's disc, that lie on a side or an end at the start. The contour has three lobes and
     the same width all around, nearly."""
     R = Parameters().disc.radius
-    sixths = math.pi / 6 + math.pi / 3 * np.arange(6)
+    sixths = math.pi / 3 * np.arange(6)
     corners = R / math.cos(math.pi / 6) * np.stack((np.cos(sixths), np.sin(sixths)), -1)
     around = np.linspace(0, 2 * np.pi, 48, endpoint=False)
     lobes = R * (1 + 0.05 * np.sin(3 * around))
@@ -65,8 +80,8 @@ def objects() -> dict[str, Shape]:
 
 
 def rubbers() -> dict[str, Material]:
-    """The paper's rubber, one of the presets, and slow ones: relaxed they are as stiff as the paper's, at first twice that. Their
-    times and moduli are assumed."""
+    """The paper's rubber, one of the presets, and slow ones: relaxed as stiff as the paper's, at first twice that. Their times
+    and moduli are assumed."""
     paper = Parameters().pad
     E, nu, rho, depth = paper.E, paper.nu, paper.rho, paper.depth
     preset = "natural rubber 40 IRHD"

@@ -92,12 +92,12 @@ def moving_contact(at: Rolling, material: Material, load: float, v: float, cell:
     q / K_t + (C_xx q - C_xy p) = c_0 - c xi, with d, c_0 and the creep c from the load, no stretch in front, and no moment on
     the disc. Raises `RuntimeError` where the contact is not found.
     """
-    k = 2 * np.pi * np.fft.fftfreq(CELLS, cell)
+    k: Array = 2 * np.pi * np.fft.fftfreq(CELLS, cell).astype(np.float64)
     modulus = complex_modulus(material, -k * v)[:, None, None]
     waves = layer_compliance(k, at.height, material.nu.item()) / modulus
     kernel = np.fft.ifft(waves * np.sinc(0.5 * k * cell / np.pi)[:, None, None], axis=0).real / at.depth
     half = round(0.62 * at.radius / cell)
-    xi = cell * np.arange(-half, half + 1)
+    xi: Array = cell * np.arange(-half, half + 1, dtype=np.float64)
     G = kernel[np.subtract.outer(np.arange(len(xi)), np.arange(len(xi))) % CELLS]
     gap = at.radius - np.sqrt(at.radius**2 - xi**2)
     touching = gap < 0.02 * at.radius
@@ -113,12 +113,20 @@ def moving_contact(at: Rolling, material: Material, load: float, v: float, cell:
         A[2 * n + 1, Q] = cell
         A[2 * n + 2, 2 * n - 1] = 1.0
         solved = np.linalg.solve(A, b)
-        p, q = np.zeros_like(xi), np.zeros_like(xi)
+        p, q = np.zeros(len(xi)), np.zeros(len(xi))
         p[a], q[a] = solved[P], solved[Q]
         inside = solved[d] - gap + G[..., 1, 0] @ q - G[..., 1, 1] @ p
         now = np.where(touching, p > 0, inside > 0)
         if (now == touching).all():
-            return Steady(float((p * xi).sum() * cell / (at.radius * load)), float(solved[d]), xi[a[-1]], -xi[a[0]], xi, p, q)
+            return Steady(
+                float((p * xi).sum() * cell / (at.radius * load)),
+                float(solved[d]),
+                float(xi[a[-1]]),
+                -float(xi[a[0]]),
+                xi,
+                p,
+                q,
+            )
         touching = now
     raise RuntimeError(f"the moving contact at {v:g} m/s and {load:g} N was not found in {WAYS} changes")
 
@@ -134,10 +142,10 @@ def foundation(at: Rolling, material: Material) -> tuple[float, Array, Array]:
     M = material.E.item() * (1 - nu) / ((1 + nu) * (1 - 2 * nu))  # the constrained modulus
     c_0, c = 1 / at.K_n, J * at.height / (M * at.depth)
     A = -np.diag(1 / tau) - np.outer(c / tau, np.ones(len(c))) / c_0
-    rates, V = np.linalg.eig(A)
+    rates, V = (np.real(part) for part in np.linalg.eig(A))  # all decay
     settled = -np.linalg.solve(A, c / tau) / c_0
     strengths = V.sum(0) * np.linalg.solve(V, settled) / c_0
-    return 1 / (c_0 + c.sum()), strengths.real, -1 / rates.real
+    return float(1 / (c_0 + c.sum())), strengths, -1 / rates
 
 
 def winkler(at: Rolling, material: Material, load: float, v: float) -> tuple[float, float]:
