@@ -118,15 +118,8 @@ def moving_contact(at: Rolling, material: Material, load: float, v: float, cell:
         inside = solved[d] - gap + G[..., 1, 0] @ q - G[..., 1, 1] @ p
         now = np.where(touching, p > 0, inside > 0)
         if (now == touching).all():
-            return Steady(
-                float((p * xi).sum() * cell / (at.radius * load)),
-                float(solved[d]),
-                float(xi[a[-1]]),
-                -float(xi[a[0]]),
-                xi,
-                p,
-                q,
-            )
+            resistance = float((p * xi).sum()) * cell / (at.radius * load)
+            return Steady(resistance, float(solved[d]), float(xi[a[-1]]), -float(xi[a[0]]), xi, p, q)
         touching = now
     raise RuntimeError(f"the moving contact at {v:g} m/s and {load:g} N was not found in {WAYS} changes")
 

@@ -63,7 +63,7 @@ class Result:
 
 def smoke(config: Config) -> Config:
     return replace(
-        config, speeds=3, slowest=0.2, fastest=2.0, loads_N=(2.5, 20.0), element_mm=1.0, duration=0.6,
+        config, speeds=3, slowest=0.2, fastest=2.0, loads_N=(5.0,), element_mm=1.0, duration=0.6,
         moments=(0.3, 0.6), rtol=1e-3, video=False,
     )  # fmt: skip
 
