@@ -24,8 +24,8 @@ DEEP = 12.0
 CELLS = 8192
 """Cells of the periodic surface; many more than the contact and its wake need."""
 
-WAYS = 60
-"""Changes of the set of touching cells at the most."""
+WAYS, SETTLED = 60, 20
+"""Changes of the set of touching cells at the most; and after how many a cell at either edge may still come and go."""
 
 
 @dataclass(frozen=True)
@@ -85,23 +85,24 @@ def complex_modulus(material: Material, omega: Array) -> Array:
     return material.complex_modulus(torch.from_numpy(omega)).detach().numpy()
 
 
-def moving_contact(at: Rolling, material: Material, load: float, v: float, cell: float = 1e-4) -> Steady:
-    """Steady rolling at v [m/s] under a load [N], on cells [m] of constant traction.
+def moving_contact(at: Rolling, material: Material, load: float, v: float) -> Steady:
+    """Steady rolling at v [m/s] under a load [N], on cells of constant traction.
 
     Touching cells: p / K_n + (C_yy p - C_yx q) = d - (R - sqrt(R^2 - xi^2)), and, for points that stick from the front on,
     q / K_t + (C_xx q - C_xy p) = c_0 - c xi, with d, c_0 and the creep c from the load, no stretch in front, and no moment on
     the disc. Raises `RuntimeError` where the contact is not found.
     """
+    cell = min(5e-3 * at.radius, at.height / 20)
     k: Array = 2 * np.pi * np.fft.fftfreq(CELLS, cell).astype(np.float64)
     modulus = complex_modulus(material, -k * v)[:, None, None]
     waves = layer_compliance(k, at.height, material.nu.item()) / modulus
     kernel = np.fft.ifft(waves * np.sinc(0.5 * k * cell / np.pi)[:, None, None], axis=0).real / at.depth
-    half = round(0.62 * at.radius / cell)
+    half = round(0.45 * at.radius / cell)
     xi: Array = cell * np.arange(-half, half + 1, dtype=np.float64)
     G = kernel[np.subtract.outer(np.arange(len(xi)), np.arange(len(xi))) % CELLS]
     gap = at.radius - np.sqrt(at.radius**2 - xi**2)
     touching = gap < 0.02 * at.radius
-    for _ in range(WAYS):
+    for change in range(WAYS):
         a = np.flatnonzero(touching)
         n, block = len(a), np.ix_(a, a)
         A, b = np.zeros((2 * n + 3, 2 * n + 3)), np.zeros(2 * n + 3)
@@ -117,7 +118,7 @@ def moving_contact(at: Rolling, material: Material, load: float, v: float, cell:
         p[a], q[a] = solved[P], solved[Q]
         inside = solved[d] - gap + G[..., 1, 0] @ q - G[..., 1, 1] @ p
         now = np.where(touching, p > 0, inside > 0)
-        if (now == touching).all():
+        if (now != touching).sum() <= (2 if change >= SETTLED else 0):
             resistance = float((p * xi).sum()) * cell / (at.radius * load)
             return Steady(resistance, float(solved[d]), float(xi[a[-1]]), -float(xi[a[0]]), xi, p, q)
         touching = now

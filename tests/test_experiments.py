@@ -221,7 +221,7 @@ def test_the_theories_of_rolling_meet() -> None:
     rubber = Prony(0.75e6, 0.2, 1100.0, 44e-3, [0.75e6], [0.05], tau_instant=1e-6)
     at = theory.Rolling(19.37e-3, 0.25e-3, 44e-3, 1.2e8, 1.2e8)
     speeds = [5e-3, 1e-2, 2e-2]
-    moving = [theory.moving_contact(at, rubber, 5.0, v, cell=5e-5).coefficient for v in speeds]
+    moving = [theory.moving_contact(at, rubber, 5.0, v).coefficient for v in speeds]
     thin = [theory.winkler(at, rubber, 5.0, v)[0] for v in speeds]
     assert moving == pytest.approx(thin, rel=0.03)
     assert theory.peak(speeds, moving)[0] == pytest.approx(theory.peak(speeds, thin)[0], rel=0.03)
