@@ -129,10 +129,9 @@ def resistance_figure(curves: Mapping[str, Resistance], loads: Mapping[float, Ro
         axes.set_visible(False)
     for axes, colour, (name, one) in zip(panels, COLOURS, curves.items()):
         De = [one.deborah(r.speed) for r in one.rolls]
-        axes.loglog(
-            De, [r.theory for r in one.rolls], color=colour, lw=1.6, label="theory: moving contact on the layer"
-        )
-        axes.loglog(De, [r.winkler for r in one.rolls], ":", color=INK, lw=1.2, label="closed form: thin layer")
+        between = [one.deborah(v) for v in one.speeds]
+        axes.loglog(between, one.theory, color=colour, lw=1.6, label="theory: moving contact on the layer")
+        axes.loglog(between, one.winkler, ":", color=INK, lw=1.2, label="closed form: thin layer")
         axes.loglog(
             De, [r.force for r in one.rolls], "o", color=colour, mfc="none", ms=7, label="measured: driving force"
         )
@@ -166,7 +165,7 @@ def pictures(rolled: Mapping[str, Rolled], times: Sequence[float]) -> Iterator[P
     scale = min((force_scale(one.model, shown[name]) for name, one in rolled.items()), key=lambda pair: pair[0])
     with rc_context(STYLE):
         columns = -(-len(rolled) // 2)
-        figure = Figure(figsize=(3.9 * columns, 7.2), dpi=80, layout="constrained")
+        figure = Figure(figsize=(2.9 * columns, 7.6), dpi=90, layout="constrained")
         canvas = FigureCanvasAgg(figure)
         panels = figure.subplots(2, columns, squeeze=False).ravel()
         scenes = {}
@@ -174,6 +173,7 @@ def pictures(rolled: Mapping[str, Rolled], times: Sequence[float]) -> Iterator[P
             scenes[name] = Scene(axes, one.model, columns=5, curves=scale)
             axes.set(xlim=(15, 85), ylim=(-26, 80), xticks=[], yticks=[], title=name)
             axes.grid(False)
+            axes.spines[:].set_visible(False)
         for axes in panels[len(rolled) :]:
             axes.set_visible(False)
         first = panels[0]
