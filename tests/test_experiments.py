@@ -7,9 +7,10 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 
-from torchsoft import Ellipse
+from torchsoft import Ellipse, Prony
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
 sys.path.insert(0, str(EXPERIMENTS))  # as for a script; what experiments share lies beside them
@@ -227,3 +228,38 @@ def test_orientation_rig_has_the_gains_of_its_design() -> None:
     asks = module.rigid(Ellipse(20e-3, 10e-3), 10.0, 0.0)
     assert asks.friction == pytest.approx(0.75, rel=1e-3)  # (k^2 - 1) / 2 k at aspect k = 2
     assert asks.opening_mm == pytest.approx(20.0)
+
+
+def test_shapes_and_materials_smoke(tmp_path: Path) -> None:
+    """Force and power give one resistance, near theory's; a shape that would slide is refused, a hexagon rolls."""
+    module = experiment("shapes_and_materials")
+    module.main(module.Config(out=tmp_path, smoke=True))
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert "it would slide" in summary["refused"]["long box"]
+    assert set(summary["objects"]) == {"circle", "rounded hexagon"}
+    (one,) = summary["resistance"].values()
+    assert one["power over force less one, largest"] < 0.02
+    assert 0.97 < min(one["force over theory"]) < max(one["force over theory"]) < 1.06
+    low, top, high = (roll["force"] for roll in one["rolls"])
+    assert top > 1.2 * max(low, high)  # the peak
+    assert summary["by load"]["10 N"]["force over theory"] == pytest.approx(1.01, abs=0.02)
+    assert summary["rubbers"]["standard linear solid"]["the paper's loop on it, leading mode [1/s]"][0] > 50
+    names = {path.name for path in tmp_path.iterdir()}
+    assert {"objects.png", "rubbers.png", "paths.png", "resistance.png", "table.md"} <= names
+
+
+def test_the_theories_of_rolling_meet() -> None:
+    """Long waves compress a layer uniaxially, short ones see a half-plane; on a thin layer the moving contact is the closed
+    form's, with the same peak."""
+    theory = experiment("_shapes_theory")
+    h, nu = 4e-3, 0.3
+    long, deep, deeper = theory.layer_compliance(np.array([1e-3, 11.9, 12.1]) / h, h, nu)
+    assert long[1, 1].real == pytest.approx(h * (1 + nu) * (1 - 2 * nu) / (1 - nu), rel=1e-5)
+    assert np.abs(deeper / deep * 12.1 / 11.9 - 1).max() < 1e-6
+    rubber = Prony(0.75e6, 0.2, 1100.0, 44e-3, [0.75e6], [0.05], tau_instant=1e-6)
+    at = theory.Rolling(19.37e-3, 0.25e-3, 44e-3, 1.2e8, 1.2e8)
+    speeds = [5e-3, 1e-2, 2e-2]
+    moving = [theory.moving_contact(at, rubber, 5.0, v).coefficient for v in speeds]
+    thin = [theory.winkler(at, rubber, 5.0, v)[0] for v in speeds]
+    assert moving == pytest.approx(thin, rel=0.03)
+    assert theory.peak(speeds, moving)[0] == pytest.approx(theory.peak(speeds, thin)[0], rel=0.03)

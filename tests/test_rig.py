@@ -16,6 +16,7 @@ from torchsoft import (
     Pad,
     PadMesh,
     Rig,
+    RoundedBox,
     SmoothSlip,
     SoftContact,
     SoftGrasp,
@@ -122,6 +123,17 @@ def test_a_rig_of_lists_is_the_papers() -> None:
 
 
 # names --------------------------------------------------------------------------------------------------------------
+
+
+def test_the_radius_of_a_box_is_not_the_discs() -> None:
+    """A box has a radius, too, that of its corners: it must not be read as the object's."""
+    model = SoftGrasp(shape=RoundedBox(20e-3, 19e-3, radius=5e-3))
+    assert model.settings.compression == Parameters().compression
+    with pytest.raises(ValueError, match=r"`disc\.radius` is not a parameter"):
+        model.parameter("disc.radius")
+    said = model.description()["parameters"]
+    assert "disc.radius" not in said
+    assert said["disc.shape.radius"] == 5e-3
 
 
 def test_parameters_have_the_names_of_the_settings() -> None:

@@ -40,7 +40,6 @@ class SoftGrasp(Rig):
     those of the settings. Parts that both pads share are `pad` (the material), `contact`, `disc`, `bracket` and `control`.
     """
 
-    aliases = NAMES
     renamed: Mapping[str, str] = {
         "disc_spin": "spin", "theta_C": "theta", "v_x_C": "v_x", "v_y_C": "v_y", "omega_C": "omega", "M_U": "bracket_moment",
         "L_C": "angular_momentum",
@@ -89,10 +88,15 @@ class SoftGrasp(Rig):
         )  # fmt: skip
         self._settings = p
 
+    @property
+    def aliases(self) -> Mapping[str, str]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """`NAMES`, but for "disc.radius" where the object is not round: the radius of a box is that of its corners."""
+        return {name: own for name, own in NAMES.items() if name != "disc.radius" or self.shape.round}
+
     def _values(self) -> dict[str, float | int | str | bool]:
         """The numbers of `Parameters` that stand in the modules, parametrised or not, as they are now."""
         out: dict[str, float | int | str | bool] = {}
-        for name, own in NAMES.items():
+        for name, own in self.aliases.items():
             owner, _, last = own.rpartition(".")
             try:
                 out[name] = getattr(self.get_submodule(owner), last).item()
@@ -125,7 +129,7 @@ class SoftGrasp(Rig):
         own, said = self._values(), super().description()
         absent = {name for name in (*NAMES, "contact.friction") if name not in own}
         values = {name: row["value"] for name, row in self.settings.table().items() if name not in absent}
-        others = {name: x for name, x in said["parameters"].items() if name not in NAMES.values()}
+        others = {name: x for name, x in said["parameters"].items() if name not in self.aliases.values()}
         return said | {"parameters": values | others}
 
     @property

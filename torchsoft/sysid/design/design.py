@@ -260,7 +260,8 @@ class Search:
                 for u in some:
                     worth(u)
             else:
-                differential_evolution(
+                evolve: Any = differential_evolution  # its `init` may be an array
+                evolve(
                     worth, [(0.0, 1.0)] * family.n, init=some, maxiter=count // size - 1, mutation=(0.3, 0.8),
                     recombination=0.5, tol=0.0, polish=False, rng=self.rng,
                 )  # fmt: skip

@@ -63,4 +63,5 @@ class Zigzags:
 def evenly(start: float, shortest: float, spacing: float, end: float) -> Array:
     """Times after `start` until `end`: one at least, unless that is too near."""
     spacing = max(min(spacing, end - start), shortest)
-    return start + spacing * np.arange(1, int((end - start) / spacing * (1 + 1e-12)) + 1)
+    count = int((end - start) / spacing * (1 + 1e-12))
+    return np.linspace(start + spacing, start + count * spacing, count)
