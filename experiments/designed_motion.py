@@ -125,7 +125,8 @@ def search(truth: dict[str, float], real: Parameters, half: dict[str, float], co
     bounds = {
         "x_d": Bounds(low=x_0 - TRAVEL, high=x_0 + TRAVEL, speed=SPEED["x_d"], after=since, shortest=config.shortest),
         "y_d": Bounds(
-            low=open_at - COMPRESSION[1], high=open_at - COMPRESSION[0], speed=SPEED["y_d"], after=since, shortest=config.shortest
+            low=open_at - COMPRESSION[1], high=open_at - COMPRESSION[0], speed=SPEED["y_d"], after=since,
+            shortest=config.shortest,
         ),
     }  # fmt: skip
     names, _ = chosen(plan, plan.coordinates.start, None)
@@ -224,7 +225,7 @@ def main(config: Config) -> None:
         slope = 2 * knots * (many + 1) * result.seconds["run"]
         sentences += [
             f"the search took {made['wall_s']:.0f} s: {made['runs']} runs with sensitivities, {made['gradients']} with the "
-            f"adjoint; one slope of the criterion by its {2 * knots} values and times would take {slope:.0f} s by finite differences",
+            f"adjoint; one slope of the criterion by its {2 * knots} values and times would take {slope:.0f} s by differences",
             *(f"limit: {one}" for one in found.limits), *found.notices,
         ]  # fmt: skip
         summary |= {

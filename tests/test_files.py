@@ -1,13 +1,15 @@
 """Files appear whole or not at all, last, and leave nothing behind."""
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from torchsoft.files import PARTIAL, remove_partials, replacing, sealed, unsealed
+from torchsoft.files import PARTIAL, remove_partials, replacing, sealed, unsealed, write_json
 
 DIE = """
 import os, sys
@@ -92,3 +94,9 @@ def test_a_sealed_file_is_read_as_it_was_written_or_not_at_all(tmp_path: Path) -
         path.write_bytes(whole[:i])
         with pytest.raises(ValueError, match=r"is damaged|no checksum"):
             unsealed(path)
+
+
+def test_json_takes_numpys_numbers_and_leaves_out_what_is_not_finite(tmp_path: Path) -> None:
+    content = {"a": np.int64(3), "b": [np.float64(0.5), np.float32(np.nan), np.bool_(True)], "c": (float("inf"), "x")}
+    write_json(tmp_path / "file.json", content)
+    assert json.loads((tmp_path / "file.json").read_text()) == {"a": 3, "b": [0.5, None, True], "c": [None, "x"]}

@@ -122,11 +122,12 @@ def unsealed(path: str | Path) -> bytes:
 
 
 def finite(value: Any) -> Any:
-    """The value with None for every number that is not finite, which JSON cannot express."""
+    """The value with None for every number that is not finite, which JSON cannot express, and numpy's numbers as Python's."""
     if isinstance(value, dict):
         return {k: finite(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
         return [finite(v) for v in value]
+    value = value.item() if isinstance(value, np.generic) else value
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
