@@ -8,7 +8,7 @@ could predict are left: chaos has information that no fit can use. The motion fo
 identified, and the intervals that hold the truth are counted. By finite differences the same search would take a run for each
 parameter and each knot: the time of a slope is that many times the measured time of a run.
 
-Command: .venv/bin/python experiments/designed_motion.py [--starts 480] [--iterations 40] [--seeds 50] [--motion FILE] [--smoke]
+Command: .venv/bin/python experiments/designed_motion.py [--starts 600] [--iterations 30] [--seeds 50] [--motion FILE] [--smoke]
 Expected: TODO
 """
 
@@ -53,6 +53,9 @@ COMPRESSION = (-0.3e-3, 3.3e-3)
 FORCE = {"F_x": (-150.0, 150.0), "F_y": (-300.0, 300.0)}
 """Of the bracket's drives [N]; the catalogue's largest are 60 and 275."""
 
+OFF = 1.0005
+"""Where a fit begins, over the truth; so near that only the noise decides."""
+
 SMOKE = {
     "strokes": Excitation(motion=Strokes(travel=8e-3, stroke_time=0.3), duration=0.9, senses="bracket"),
 }
@@ -61,10 +64,11 @@ SMOKE = {
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/designed_motion")
-    starts: int = 480  # motions that are tried before the gradient's
-    iterations: int = 40  # of the gradient
+    starts: int = 600  # motions that are tried before the gradient's
+    iterations: int = 30  # of the gradient
     seeds: int = 50  # of the noise
-    rtol: float = 3e-5  # of the fits; data have a hundredth of it
+    design_rtol: float = 1e-3  # of the search
+    rtol: float = 1e-5  # of the fits; data have a tenth of it
     workers: int = 2
     seed: int = 0
     motion: Path | None = None  # a motion found before, which is only assessed
@@ -132,7 +136,8 @@ def search(truth: dict[str, float], real: Parameters, half: dict[str, float], co
     names, _ = chosen(plan, plan.coordinates.start, None)
     return design(
         plan, "designed", bounds, limits=FORCE, criterion=Criterion("worst", tuple(half[name] for name in names)),
-        starts=config.starts, iterations=config.iterations, workers=config.workers, seed=config.seed, progress=True,
+        starts=config.starts, iterations=config.iterations, rtol=config.design_rtol, workers=config.workers, seed=config.seed,
+        progress=True,
     )  # fmt: skip
 
 
@@ -154,7 +159,7 @@ def run(config: Config) -> Result:
         excitation = found.excitation(GIVEN)
     else:
         excitation = Excitation.from_toml(config.motion)
-    fine = record("designed", excitation, real, nominal, RIG, rtol=1e-2 * config.rtol, noise=0.0)
+    fine = record("designed", excitation, real, nominal, RIG, rtol=0.1 * config.rtol, noise=0.0)
     alone = stated([fine], truth)
     designed, seconds["jacobian"] = timed(lambda: predicted(alone, config.rtol))
     x, runner = alone.coordinates.start, Runner(alone.recordings)
@@ -163,9 +168,9 @@ def run(config: Config) -> Result:
     def fit(seed: int) -> IdentificationResult:
         rng = np.random.default_rng(seed)
         samples = {c: (t, y + RIG[c].noise * rng.standard_normal(len(t))) for c, (t, y) in fine.samples.items()}
-        problem = stated([replace(fine, samples=samples)], truth, 1.002)
+        problem = stated([replace(fine, samples=samples)], truth, OFF)
         plan = [Stage("all", problem.names, problem.coordinates.labels, config.rtol, tolerance=1e-3)]
-        return identify(problem, plan=plan, assumptions="trusted", tightenings=0 if config.smoke else 2)
+        return identify(problem, plan=plan, assumptions="trusted", tightenings=0)
 
     work = side_by_side(fit, config.seeds, config.workers)
     pairs, seconds["fits"] = timed(
