@@ -70,7 +70,7 @@ def test_its_derivatives_by_both_routes_are_those_of_differences(jerks: Recordin
     problem = Problem([jerks], SENSORS, {"contact.friction.alpha": Unknown()} | slack | ratio)
     x, free, h = problem.coordinates.start, problem.coordinates.free, 1e-5
     runner = Runner(problem.recordings)
-    _, steps = problem.freeze(runner, x, ["jerks"], 1e-4)
+    _, steps = problem.freeze(runner, x, ["jerks"], 3e-5)
     at = problem.residuals(runner, x, ["jerks"], steps, free)
     for i, label in enumerate(problem.coordinates.labels):
         ahead, behind = (problem.residuals(runner, x + s * h * np.eye(3)[i], ["jerks"], steps).r for s in (1, -1))

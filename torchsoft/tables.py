@@ -82,7 +82,9 @@ def findings(error: ValidationError, data: Any = None, within: str = "") -> str:
 
 def finding(one: Mapping[str, Any], data: Any, within: str) -> str:
     """One finding: `pad.E should be greater than or equal to 1, not -1.0`."""
-    kind, place = one["type"], ".".join(part for part in (within, path(one["loc"], data)) if part)
+    kind = one["type"]
+    judged = kind in ("value_error", "assertion_error")  # a value that is there, not one that is missing or too many
+    place = ".".join(part for part in (within, path(one["loc"], data, judged)) if part)
     field, given, text = place or "what is given", shown(one["input"]), one["msg"]
     if kind == "extra_forbidden":
         return f"{field} is not known here"
@@ -95,7 +97,7 @@ def finding(one: Mapping[str, Any], data: Any, within: str) -> str:
         if "expected_tags" not in one["ctx"]:
             return f"{field}.{tag} is missing"
         return f"{field}.{tag} should be one of {one['ctx']['expected_tags']}, not {shown(one['input'][tag])}"
-    if kind in ("value_error", "assertion_error"):
+    if judged:
         text = line(text.removeprefix("Value error, "))
         return f"{place}: {text}" if place else text
     if kind in ("dict_type", "model_type", "model_attributes_type"):
@@ -104,11 +106,12 @@ def finding(one: Mapping[str, Any], data: Any, within: str) -> str:
     return f"{field} {text.removeprefix('Input ')}, not {given}" if text.startswith("Input ") else f"{field}: {text}"
 
 
-def path(loc: tuple[int | str, ...], data: Any) -> str:
-    """A place in `data` as messages name it, without the names that pydantic gives to members of a union."""
+def path(loc: tuple[int | str, ...], data: Any, there: bool) -> str:
+    """A place in `data`, which is `there` or not, as messages name it, without the names that pydantic gives to members of a
+    union."""
     parts = []
     for i, part in enumerate(loc):
-        if isinstance(data, Mapping) and part not in data and i + 1 < len(loc):
+        if isinstance(data, Mapping) and part not in data and (there or i + 1 < len(loc)):
             continue
         parts.append(str(part))
         if isinstance(data, Mapping):

@@ -95,7 +95,9 @@ def jumps(file: RigFile, ready: Ready, estimate: Estimate) -> Iterator[Finding]:
         unit = file.unit(actuator.setpoint)
         here, wanted = estimate.start[body][axis], values[actuator.setpoint]
         if abs(wanted - here) > JUMP[unit]:
-            pushes = float(ready.rig.actuators[name](torch.tensor([wanted, 0.0, 0.0, here, 0.0], dtype=torch.float64)))
+            pushes = float(
+                ready.rig.actuators[name](torch.tensor([wanted, 0.0, 0.0, here, 0.0], dtype=torch.float64)).detach()
+            )
             yield Finding(
                 "warning", f"motion.{actuator.setpoint}",
                 f"it begins at {wanted:.6g} {unit}, but {actuator.measured} at {here:.6g} {unit}: the loop `{name}` pushes "

@@ -213,7 +213,6 @@ class Search:
     ) -> None:
         self.planner, self.points, self.robust, self.rate, self.smoothing = planner, points, robust, rate, smoothing
         self.rng, self.iteration, self.lost, self.in_a_row = np.random.default_rng(seed), 0, 0, 0
-        self.history: list[Visit] = []
 
     def begin(self) -> Look:
         """The look at the motion given, which is the best so far. Raises `ValueError` where it cannot be run."""
@@ -230,6 +229,7 @@ class Search:
         self.now = torch.from_numpy(self.z.copy()).requires_grad_(True)
         self.adam = torch.optim.Adam([self.now], lr=self.rate, betas=MEMORY)
         self.best, _ = self.visit(self.z)
+        self.history = [self.best]
 
     def breed(self, count: int, tried: Callable[[float], None]) -> None:
         """Tries so many zigzags, about, and sets out from the best if it is better than the motion given."""
