@@ -66,7 +66,8 @@ def made_by(config: Any, **more: Any) -> dict[str, Any]:
 
 def raw_config(config: Any) -> dict[str, Any]:
     """Version and configuration as JSON values, at the top of a summary."""
-    return {"torchsoft": version("torchsoft"), "config": asdict(config) | {"out": str(config.out)}}
+    values = {name: str(one) if isinstance(one, Path) else one for name, one in asdict(config).items()}
+    return {"torchsoft": version("torchsoft"), "config": values}
 
 
 @torch.no_grad()
