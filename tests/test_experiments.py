@@ -148,6 +148,7 @@ def test_experiment_design_smoke(tmp_path: Path) -> None:
     assert (tmp_path / "experiment_design.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_identify_contact_smoke(tmp_path: Path) -> None:
     """Without noise the truth, with noise the truth within what was predicted, by differences the same at more runs."""
     module = experiment("identify_contact")
@@ -193,6 +194,7 @@ def test_contact_points_smoke(tmp_path: Path) -> None:
     assert (tmp_path / "contact_points.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_orientation_smoke(tmp_path: Path) -> None:
     """Loops turn and carry the disc within the tolerance; what they do not do is as rigid statics say, and is said."""
     module = experiment("orientation")
@@ -230,6 +232,7 @@ def test_orientation_rig_has_the_gains_of_its_design() -> None:
     assert asks.opening_mm == pytest.approx(20.0)
 
 
+@pytest.mark.slow
 def test_shapes_and_materials_smoke(tmp_path: Path) -> None:
     """Force and power give one resistance, near theory's; a shape that would slide is refused, a hexagon rolls."""
     module = experiment("shapes_and_materials")
@@ -265,6 +268,7 @@ def test_the_theories_of_rolling_meet() -> None:
     assert theory.peak(speeds, moving)[0] == pytest.approx(theory.peak(speeds, thin)[0], rel=0.03)
 
 
+@pytest.mark.slow
 def test_designed_motion_smoke(tmp_path: Path) -> None:
     """Bred from a few motions it tells more than gentle strokes, and an interval is given for every parameter."""
     module = experiment("designed_motion")

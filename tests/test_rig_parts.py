@@ -54,6 +54,10 @@ PADS: dict[str, tuple[dict[str, Any], type[Mesh]]] = {
 }
 
 
+def slow(*kinds: str) -> list[Any]:
+    return [pytest.param(kind, marks=pytest.mark.slow) for kind in kinds]
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """With a contour, a material, a mesh and networks."""
@@ -129,7 +133,7 @@ def runs(file: RigFile) -> Trajectory:
 # shapes, materials, pads ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", SHAPES)
+@pytest.mark.parametrize("kind", ["rounded_box", *slow("superellipse", "rounded_polygon", "contour")])
 def test_every_shape_is_checked_and_runs(kind: str, folder: Path) -> None:
     table, made = SHAPES[kind]
     body = {"shape": {"kind": kind, **table}, "mass": None, "density": 7800.0, "depth": 20e-3}
@@ -170,7 +174,7 @@ def test_every_material_is_built(kind: str, folder: Path) -> None:
     assert again.model_dump() == file.model_dump()
 
 
-@pytest.mark.parametrize("kind", PADS)
+@pytest.mark.parametrize("kind", ["curved", *slow("fingertip", "mesh")])
 def test_every_pad_is_checked_and_runs(kind: str, folder: Path) -> None:
     table, made = PADS[kind]
     pad = {"kind": kind, **table}

@@ -272,6 +272,7 @@ def test_refusals(cut: Cut) -> None:
     assert Underway(deep, {}).coordinates(rig, samples)
 
 
+@pytest.mark.slow
 def test_unknown_start_smoke(tmp_path: Path) -> None:
     """The experiment: errors of a few standard deviations, a price for not knowing the start, and rest not assumed in
     silence."""
