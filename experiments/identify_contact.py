@@ -141,7 +141,8 @@ def start(config: Config, seed: int) -> dict[str, float]:
     return out
 
 
-def problem(config: Config, recordings: list[Recording], begin: dict[str, float], kind: type[Problem]) -> Problem:
+def problem(recordings: list[Recording], begin: dict[str, float], kind: type[Problem] = Problem) -> Problem:
+    """Unknowns that begin there, mu_k as a part of mu_s."""
     unknowns = {name: Unknown(nominal=value) for name, value in begin.items()}
     if "contact.mu_k" in begin:
         ratio = begin["contact.mu_k"] / begin["contact.mu_s"]
@@ -157,7 +158,7 @@ def run(config: Config) -> Result:
 
     def case(name: str, noise: float, seed: int, kind: type[Problem] = Problem) -> Problem:
         begin = start(config, seed)
-        stated = problem(config, noisy if noise else exact, begin, kind)
+        stated = problem(noisy if noise else exact, begin, kind)
         print(f"\n{name}, start {seed}: off by factors of", *(f"{v / truths(config)[k]:.2f}" for k, v in begin.items()))
         folder = config.out / f"runs-{name.replace(' ', '-')}-{seed}"
         found = identify(

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+import identify_contact
 import numpy as np
 from _experiment import COARSE, markdown, options, raw_config, write
 from identify_contact import FITTED, TRUTH
@@ -27,7 +28,7 @@ from tqdm import tqdm
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes
-from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Stage, Unknown, identify, record
+from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Stage, identify, record
 from torchsoft.sysid.answer.estimate import Estimate, estimates
 from torchsoft.sysid.fit.fit import chord
 from torchsoft.sysid.fit.information import fisher
@@ -113,11 +114,7 @@ def problem(recordings: list[Recording], truth: dict[str, float], rho: float, se
     for r in recordings:
         samples = {c: (t, y + RIG[c].noise * noise(rho, len(t), rng)) for c, (t, y) in r.samples.items()}
         noisy.append(replace(r, samples=samples))
-    unknowns = {name: Unknown(nominal=OFF * value) for name, value in truth.items()}
-    if "contact.mu_k" in truth:
-        ratio = truth["contact.mu_k"] / truth["contact.mu_s"]
-        unknowns["contact.mu_k"] = Unknown(nominal=ratio, ratio_to="contact.mu_s", low=0.1, high=1.0)
-    return Problem(noisy, RIG, unknowns)
+    return identify_contact.problem(noisy, {name: OFF * value for name, value in truth.items()})
 
 
 def errors(found: dict[str, Estimate], truth: dict[str, float]) -> dict[str, tuple[float, bool]]:

@@ -18,9 +18,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import identify_contact
 import numpy as np
 import torch
 from _experiment import COARSE, markdown, options, raw_config, timed, write
+from identify_contact import TRUTH
 from matplotlib.figure import Figure
 from scipy import stats
 from tqdm import tqdm
@@ -37,7 +39,6 @@ from torchsoft.sysid import (
     Recording,
     Stage,
     Underway,
-    Unknown,
     Unreachable,
     begin_underway,
     identify,
@@ -48,10 +49,6 @@ from torchsoft.sysid.problem.recording import Array
 from torchsoft.sysid.problem.workers import Runner
 from torchsoft.threads import side_by_side
 
-TRUTH = {
-    "contact.K_n": 1.6e5, "contact.R_n": 300.0, "contact.K_t": 0.8e5, "contact.R_t": 600.0, "contact.mu_s": 0.65,
-    "contact.mu_k": 0.5, "pad.E": 0.9e6, "pad.tau": 0.012,
-}  # fmt: skip
 CUTS = {"mid-roll": ("strokes", 0.85), "mid-grasp": ("strokes", 0.2), "hidden history": ("fast strokes", 1.0)}
 """Motion, and when the recording of it begins [s]."""
 
@@ -138,11 +135,7 @@ def noisy(recording: Recording, seed: int) -> Recording:
 
 def problem(recording: Recording, config: Config, off: float) -> Problem:
     """All parameters from one recording, begun `off` times the truth."""
-    unknowns = {name: Unknown(nominal=off * value) for name, value in sought(config).items()}
-    if "contact.mu_k" in unknowns:
-        ratio = TRUTH["contact.mu_k"] / TRUTH["contact.mu_s"]
-        unknowns["contact.mu_k"] = Unknown(nominal=ratio, ratio_to="contact.mu_s", low=0.1, high=1.0)
-    return Problem([recording], RIG, unknowns)
+    return identify_contact.problem([recording], {name: off * value for name, value in sought(config).items()})
 
 
 def fit(recording: Recording, config: Config) -> IdentificationResult:
