@@ -16,8 +16,8 @@ FLOWS = {
     """,
     "codegen": "graph derivatives operations trace emit . invoke",
     "physics": """
-        arguments mesh shapes contact retardation material pads motion multibond state parts condensed validity rig energy paper
-        equilibrium settled resting .
+        arguments mesh shapes contact retardation material pads motion multibond state parts controllers condensed validity rig
+        energy paper equilibrium settled resting .
     """,
     "physics.mesh": "element mesh compliance block fingertip file quads .",
     "physics.shapes": "shape area simple oval rounded closed contour .",

@@ -15,7 +15,7 @@ from PIL import Image
 
 from torchsoft import Parameters, SoftGrasp, press, simulate
 from torchsoft.cli import main
-from torchsoft.physics.resting import resting, standing
+from torchsoft.physics.resting import STALLED, resting, stalled, standing
 from torchsoft.rigs import RigFile
 from torchsoft.rigs import run as running
 from torchsoft.rigs.check import check
@@ -66,7 +66,8 @@ def test_a_ready_rig_checks_clean_and_runs(path: Path) -> None:
 
 
 def test_there_are_ready_rigs() -> None:
-    assert {"paper", "ellipse", "two_fingers", "light_grasp", "drop"} <= {path.stem for path in READY}
+    ready = {"paper", "ellipse", "rounded_box", "two_fingers", "fingertips", "light_grasp", "orientation", "drop"}
+    assert ready <= {path.stem for path in READY}
 
 
 @pytest.mark.slow
@@ -170,7 +171,7 @@ DANGEROUS: dict[str, tuple[dict[str, Any], str]] = {
     "no rest beside the pad": ({"bodies__disc__start__x": 0.1}, r'error: bodies\.disc\.start\.y: "rest", but no pad'),
     "set-point elsewhere": (
         {"motion__x_d__values": (10e-3, 20e-3)},
-        r"warning: motion\.x_d: it begins at 0\.01 m, but bracket\.x at 0 m: the loop `x` pushes with 1e\+03 at once",
+        r"warning: motion\.x_d: it begins at 0\.01 m, but bracket\.x at 0 m: `actuators\.x` pushes with 1e\+03 at once",
     ),
     "never touches": ({"motion__y_d__values": ("start", 50.05e-3), "motion__press__values": (0.0, 0.0)},
                       r"warning: contacts\.upper: `lower` and `upper` never press `disc`"),
@@ -301,6 +302,27 @@ def test_a_recorded_motion_that_cannot_be_is_named(tmp_path: Path, text: str, se
     assert first.severity == "error"
     assert first.field == "motion.x_d.file"
     assert re.search(sentence, first.sentence), first.sentence
+
+
+def test_what_two_pads_grip_is_taken_along() -> None:
+    """The estimate before a run: fingertips go around a box that they hold, and the box with them; the run agrees."""
+    file = RigFile.from_toml(next(path for path in READY if path.stem == "fingertips"))
+    estimate = Estimate(file, file.build())
+    for time, angle in ((2.0, -0.6), (3.4, 0.6), (4.4, 0.0)):
+        box = estimate(time)["box"]
+        assert box == pytest.approx([0.0, 45e-3, angle], abs=2e-4)
+    assert estimate(0.5)["box"][1] < 22e-3  # not lifted yet
+
+
+def test_a_search_for_balance_that_goes_to_and_fro_is_given_up() -> None:
+    there = [torch.zeros(1), torch.ones(1)]
+    to_and_fro = [(1.0, there[i % 2]) for i in range(60)]
+    falling = [(1.0, torch.full((1,), float(i))) for i in range(60)]
+    better = [(1.0 / (1 + i), there[i % 2]) for i in range(60)]
+    assert stalled(to_and_fro, 2.0)
+    assert not stalled(to_and_fro[:STALLED], 2.0)
+    assert not stalled(falling, 2.0)
+    assert not stalled(better, 2.0)
 
 
 def test_motions_of_driven_coordinates_may_nest() -> None:

@@ -2,6 +2,7 @@
 
 from torchsoft.parameters import Parameters
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact
+from torchsoft.physics.controllers import StateFeedback, controller
 from torchsoft.physics.equilibrium import NoEquilibrium, press, rest
 from torchsoft.physics.material import GeneralisedKelvin, KelvinVoigt, Prony, StandardLinearSolid
 from torchsoft.physics.mesh import CurvedPadMesh, FingertipMesh, PadMesh, QuadMesh
@@ -24,6 +25,6 @@ __all__ = [
     "METHOD", "PD", "Actuator", "Batch", "Body", "Circle", "Contact", "Contour", "Coulomb", "CurvedPadMesh", "Ellipse",
     "FingertipMesh", "GeneralisedKelvin", "Interrupted", "KelvinVoigt", "NoEquilibrium", "Pad", "PadMesh", "Parameters",
     "Profile", "Prony", "QuadMesh", "Reference", "Rig", "RoundedBox", "RoundedPolygon", "Sampled", "SamplesFailed",
-    "Shape", "SimulationFailed", "SmoothSlip", "SoftContact", "SoftGrasp", "StandardLinearSolid", "Superellipse",
-    "Trajectory", "hold", "press", "rest", "simulate", "simulate_batch",
+    "Shape", "SimulationFailed", "SmoothSlip", "SoftContact", "SoftGrasp", "StandardLinearSolid", "StateFeedback",
+    "Superellipse", "Trajectory", "controller", "hold", "press", "rest", "simulate", "simulate_batch",
 ]  # fmt: skip

@@ -1,6 +1,6 @@
 """The parts of a rig beside its pads: rigid bodies, contacts, and actuators with their control laws."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Literal, Self
 
 import torch
@@ -103,31 +103,70 @@ class ReversedPD(PD):
 
 
 class Actuator(nn.Module):
-    """Measures one coordinate, such as "disc.x", and pushes one, such as "bracket.x", by a law.
+    """Measures coordinates, such as "disc.x", and pushes one, such as "bracket.x", by a law.
 
-    `law` (setpoint, its rate, feed-forward, coordinate, its rate) -> effort [N or N.m] is torch code: a `PD`, a
-    function, or any
-    module. `setpoint` and `feed_forward` name signals of the reference. `elements` are the graph's names of what is behind it.
+    `law` (set-point, its rate, feed-forward, coordinate, its rate) -> effort (...) [N or N.m] is torch code: a `PD`, a
+    function, or any module. `setpoint` and `feed_forward` name signals of the reference. A law of several coordinates is given
+    `measures` and `setpoint` as sequences of names, and sees them along a last dimension; set-points are those of the first
+    coordinates, in their order, and there may be none. Laws with several efforts: `controller`. `elements` are the graph's
+    names of what is behind it. Raises `ValueError` for what are no names, and for more set-points than coordinates.
     """
 
     def __init__(
-        self, measures: str, pushes: str, law: Callable[..., Tensor], *, setpoint: str, feed_forward: str | None = None,
-        elements: tuple[str, ...] = ("C: Kp", "R: Kd"),
+        self, measures: str | Sequence[str], pushes: str, law: Callable[..., Tensor], *, setpoint: str | Sequence[str],
+        feed_forward: str | None = None, elements: tuple[str, ...] = ("C: Kp", "R: Kd"),
     ) -> None:  # fmt: skip
         super().__init__()
-        for name, value in (
-            ("measures", measures),
-            ("pushes", pushes),
-            ("setpoint", setpoint),
-            ("feed_forward", feed_forward or ""),
-        ):
+        self.measures, self.setpoints = names_of("measures", measures), names_of("setpoint", setpoint)
+        for name, value in (("pushes", pushes), ("feed_forward", feed_forward or "")):
             if not isinstance(value, str):
                 raise ValueError(f"`{name}` of an actuator must be a name, but is {value!r}")
         if not callable(law):
             raise ValueError(f"`law` of an actuator must be a function or a module, but is {law!r}")
-        self.measures, self.pushes, self.law = measures, pushes, law
-        self.setpoint, self.feed_forward, self.elements = setpoint, feed_forward, elements
+        if not self.measures or len(self.setpoints) > len(self.measures):
+            raise ValueError(
+                f"an actuator measures {len(self.measures)} coordinates and follows {len(self.setpoints)} set-points, but must "
+                "measure one at least, and what is to follow each set-point"
+            )
+        self.several = not isinstance(measures, str), not isinstance(setpoint, str)
+        self.pushes, self.law, self.feed_forward, self.elements = pushes, law, feed_forward, elements
+
+    @property
+    def is_loop(self) -> bool:
+        """Whether it is the loop of one coordinate, which follows one set-point."""
+        return len(self.measures) == len(self.setpoints) == 1
+
+    @property
+    def measured(self) -> str:
+        """The coordinate that follows the first set-point."""
+        return self.measures[0]
+
+    @property
+    def setpoint(self) -> str:
+        """The set-point of a loop. Raises `ValueError` where there are none or several."""
+        (name,) = self.setpoints
+        return name
+
+    @property
+    def inputs(self) -> int:
+        """How many numbers the law sees."""
+        return 2 * len(self.setpoints) + 1 + 2 * len(self.measures)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Effort (...) of x = (setpoint, its rate, feed-forward, coordinate, its rate) (..., 5)."""
-        return self.law(*x.unbind(-1))
+        """Effort (...) of x (..., inputs): every set-point and its rate, feed-forward, every coordinate and its rate."""
+        feed = 2 * len(self.setpoints)
+        w, w_dot, q, q_dot = x[..., 0:feed:2], x[..., 1:feed:2], x[..., feed + 1 :: 2], x[..., feed + 2 :: 2]
+        if not self.several[0]:
+            q, q_dot = q[..., 0], q_dot[..., 0]
+        if not self.several[1]:
+            w, w_dot = w[..., 0], w_dot[..., 0]
+        return self.law(w, w_dot, x[..., feed], q, q_dot)
+
+
+def names_of(field: str, given: str | Sequence[str]) -> tuple[str, ...]:
+    """One name, or several. Raises `ValueError`."""
+    names = (given,) if isinstance(given, str) else tuple(given) if isinstance(given, Sequence) else (given,)
+    for name in names:
+        if not isinstance(name, str):
+            raise ValueError(f"`{field}` of an actuator must be a name, or a sequence of them, but is {given!r}")
+    return names

@@ -3,7 +3,7 @@
 Friction locked in is left out: no point is stretched. A coordinate that nothing pushes stays where it was put.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -15,6 +15,10 @@ from torchsoft.physics.settled import settled
 
 STRIDE = 0.2
 """Longest step of the search over the height of the thinnest pad."""
+
+STALLED = 20
+"""Steps without smaller loads, and without having gone further than one of the longest steps, after which it is given up: loads
+to and fro over the edge of a contact."""
 
 ITERATIONS = 200
 """Steps of the search at the most: a body may start that many strides above its pad."""
@@ -88,7 +92,8 @@ def resting(rig: Rig, pose: Mapping[str, Tensor], residual: float = RESIDUAL) ->
         """Net loads on the free coordinates (n,) [N]."""
         return soft(0.0, settled(soft, poses(q), still, stretch))[rates] * inertia / scale
 
-    for _ in range(ITERATIONS):
+    path: list[tuple[float, Tensor]] = []
+    while len(path) < ITERATIONS and not stalled(path, STRIDE * mesh):
         with torch.enable_grad():
             x = q.detach().requires_grad_(True)
             F = loads(x)
@@ -97,11 +102,21 @@ def resting(rig: Rig, pose: Mapping[str, Tensor], residual: float = RESIDUAL) ->
         size = float(F.norm())
         if size * softest <= residual:
             return {name: value.detach() for name, value in poses(q).items()}
+        path.append((size, q))
         # as stiff as keeps the step short, which vanishes with the load: quadratic at the end
         q = q + torch.linalg.solve(K + size / (STRIDE * mesh) * torch.eye(len(q), dtype=q.dtype), F)
     worst = int(F.abs().argmax())
     names = [f"{name}.{COORDINATES[int(axis)]}" for name, axes in free.items() for axis in axes]
     raise NoEquilibrium(
-        f"nothing is at rest: after {ITERATIONS} steps {float(F.abs().max()):.2g} N still push {names[worst]}; is there a pad "
+        f"nothing is at rest: after {len(path)} steps {float(F.abs().max()):.2g} N still push {names[worst]}; is there a pad "
         "to carry it?"
     )
+
+
+def stalled(path: Sequence[tuple[float, Tensor]], stride: float) -> bool:
+    """Whether the last steps of loads [N] and coordinates (n,) [m] led nowhere."""
+    if len(path) <= STALLED:
+        return False
+    before, last = path[:-STALLED], path[-STALLED:]
+    near = float((last[-1][1] - last[0][1]).norm()) <= stride
+    return near and min(size for size, _ in last) >= min(size for size, _ in before)

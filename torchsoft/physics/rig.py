@@ -115,7 +115,7 @@ class Rig(nn.Module):
                     f"contact `{name}`: the pad `{contact.pad}` is bonded to the body `{contact.body}` itself"
                 )
         for name, actuator in self.actuators.items():
-            for coordinate in (actuator.measures, actuator.pushes):
+            for coordinate in (*actuator.measures, actuator.pushes):
                 self.coordinate(coordinate, f"actuator `{name}`")
 
     def coordinate(self, name: str, owner: str = "`name`") -> int:
@@ -130,6 +130,11 @@ class Rig(nn.Module):
         """Each module once, whatever is asked for: `torch.func.functional_call` would put back the wrong tensors of a part that
         several of the lists share."""
         return super().named_modules(memo, prefix, True)
+
+    @property
+    def loops(self) -> dict[str, Actuator]:
+        """The actuators that are loops of one coordinate; the others are laws of several."""
+        return {name: one for name, one in self.actuators.items() if one.is_loop}
 
     aliases: Mapping[str, str] = {}
     """Other names of parameters."""
@@ -180,7 +185,7 @@ class Rig(nn.Module):
         """The reference's signals that the rig follows: setpoints, feed-forward efforts, driven coordinates."""
         names: list[str | None] = []
         for actuator in self.actuators.values():
-            names += [actuator.setpoint, actuator.feed_forward]
+            names += [*actuator.setpoints, actuator.feed_forward]
         for body_name, body in self.bodies.items():
             names += [f"{body_name}.{axis}" for axis in COORDINATES if body.freedom[axis] == "driven"]
         return tuple(dict.fromkeys(name for name in names if name is not None))
@@ -359,27 +364,33 @@ class Rig(nn.Module):
                 out[f"weight_{name}"] = Port(down, force[..., None, None], (f"Se: m_{self.symbols[name]} g",), True)
         for name, actuator in self.actuators.items():
             body, _, axis = actuator.pushes.partition(".")
-            measured, _, _ = actuator.measures.partition(".")
+            measured = (coordinate.partition(".") for coordinate in actuator.measures)
+            sensed = dict.fromkeys(f"{one}_spin" if of == "theta" else one for one, _, of in measured)
             force = self.actuator_effort(name, state, signals)
             spin = axis == "theta"
+            own = f"{body}_spin" if spin else body
             row = (
                 torch.ones(1, 1, 1, dtype=torch.float64)
                 if spin
                 else identity(2, force)[:, COORDINATES.index(axis), None]
             )
             out[f"control_{name}"] = Port(
-                Transformer({f"{body}_spin" if spin else body: Block(row)}), force[..., None, None], actuator.elements, True,
-                senses=(measured,) if measured != body else (),
+                Transformer({own: Block(row)}), force[..., None, None], actuator.elements, True,
+                senses=tuple(one for one in sensed if one != own),
             )  # fmt: skip
         return out
 
     def actuator_effort(self, name: str, state: State, signals: Tensor) -> Tensor:
         """Effort (...) [N or N.m] of an actuator on the coordinate that it pushes."""
-        actuator = self.actuators[name]
-        body, _, axis = actuator.measures.partition(".")
-        i, setpoint = COORDINATES.index(axis), signals[..., self.signals.index(actuator.setpoint), :]
-        feed = torch.zeros_like(setpoint[..., 0])
+        actuator, inputs = self.actuators[name], []
+        for setpoint in actuator.setpoints:
+            inputs += signals[..., self.signals.index(setpoint), :].unbind(-1)
         if actuator.feed_forward is not None:
-            feed = signals[..., self.signals.index(actuator.feed_forward), 0]
-        measured = state.pose[body][..., i], state.velocity[body][..., i]
-        return actuator(torch.stack((setpoint[..., 0], setpoint[..., 1], feed, *measured), -1))
+            inputs.append(signals[..., self.signals.index(actuator.feed_forward), 0])
+        else:
+            inputs.append(torch.zeros(signals.shape[:-2], dtype=signals.dtype))
+        for coordinate in actuator.measures:
+            body, _, axis = coordinate.partition(".")
+            i = COORDINATES.index(axis)
+            inputs += state.pose[body][..., i], state.velocity[body][..., i]
+        return actuator(torch.stack(inputs, -1))

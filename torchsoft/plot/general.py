@@ -35,7 +35,11 @@ class Curve(NamedTuple):
 
 def curves(trajectory: Trajectory, rig: Rig) -> Iterator[Curve]:
     """Every coordinate that is not fixed."""
-    wanted = {a.measures: a.setpoint for a in rig.actuators.values() if a.setpoint != a.feed_forward}
+    wanted = {
+        coordinate: setpoint
+        for a in rig.actuators.values()
+        for coordinate, setpoint in zip(a.measures, a.setpoints) if setpoint != a.feed_forward
+    }  # fmt: skip
     for name, body in rig.bodies.items():
         for axis, place in zip(COORDINATES, trajectory.state.pose[name].detach().numpy().T):
             if body.freedom[axis] == "fixed":

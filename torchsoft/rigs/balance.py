@@ -127,18 +127,18 @@ def strains(rig: Rig, there: list[Moment]) -> Iterator[Finding]:
 def swings(file: RigFile, rig: Rig, there: list[Moment]) -> Iterator[Finding]:
     """Loops that are unstable or not tied to what they measure, and steps that are too long. What goes off where no loop
     reaches is no loop's fault: a disc on the top of a node rolls off it."""
-    loops = {name: one for name, one in file.actuators.items() if one.setpoint is not None}
+    loops = file.loops()
     fastest, least = 0.0, (complex("-inf"), 0.0)
     for moment in there:
         depth = depths(rig, moment)
         if any(0 < deep < float(rig.contacts[key].law.epsilon) for key, deep in depth.items()):
             continue  # it only just touches, which it does not for long
         ties = tied(rig, [key for key, deep in depth.items() if deep > -NEAR])
-        for name, one in loops.items():
+        for one in loops:
             (measured, _), (pushed, _) = at(one.measured), at(one.pushes)
             if not nx.has_path(ties, measured, pushed):
                 yield Finding(
-                    "warning", f"actuators.{name}",
+                    "warning", one.field,
                     f"at t = {moment.time:.3g} s nothing that touches ties {one.measured}, which it measures, to {one.pushes}: "
                     f"what `{measured}` does by itself drives `{pushed}` away; start where they touch, or measure {one.pushes}",
                 )  # fmt: skip
@@ -147,7 +147,7 @@ def swings(file: RigFile, rig: Rig, there: list[Moment]) -> Iterator[Finding]:
         fastest = max(fastest, float(swinging.max()) if len(swinging) else 0.0)
         reached = nx.node_connected_component(ties, found.moves.partition(".")[0])
         if float(found.values[0].real) > NEUTRAL and any(
-            at(coordinate)[0] in reached for one in loops.values() for coordinate in (one.measured, one.pushes)
+            at(coordinate)[0] in reached for one in loops for coordinate in (one.measured, one.pushes)
         ):
             yield unstable(file, found, moment.time)
             return
@@ -187,8 +187,8 @@ def slips(file: RigFile, rig: Rig, there: list[Moment]) -> Iterator[Finding]:
 def unstable(file: RigFile, found: Modes, time: float) -> Finding:
     """A loop that goes off by itself."""
     mode = complex(found.values[0])
-    across = [name for name, one in file.actuators.items() if one.setpoint and one.measured != one.pushes]
-    field = f"actuators.{across[0]}" if across else "actuators"
+    across = [one.field for one in file.loops() if one.measured != one.pushes]
+    field = across[0] if across else "actuators"
     return Finding(
         "error", field,
         f"the rig is unstable at t = {time:.3g} s: its leading mode is {shown(mode)}, mostly of {found.moves}, and grows by "

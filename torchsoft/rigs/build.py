@@ -41,9 +41,15 @@ class Ready(NamedTuple):
 def assemble(
     file: RigTables, held: Mapping[str, Mapping[str, float]] | None = None, loops: Collection[str] | None = None
 ) -> Rig:
-    """The rig without a reference; `held` are coordinates that are fixed, by body and axis, and `loops` names its actuators,
-    all by default."""
-    loops = file.actuators if loops is None else loops
+    """The rig without a reference; `held` are coordinates that are fixed, by body and axis, and `loops` names its actuators
+    (none of a controller), all by default."""
+    actuators = {
+        name: made(f"actuators.{name}", partial(one.build, file.folder))
+        for name, one in file.actuators.items() if loops is None or name in loops
+    }  # fmt: skip
+    for name, one in file.controllers.items() if loops is None else ():
+        with at_field(f"controllers.{name}"):
+            actuators |= one.build(name, file.folder)
     materials = {
         name: made(f"materials.{name}", partial(one.build, file.folder)) for name, one in file.materials.items()
     }
@@ -59,10 +65,7 @@ def assemble(
             for name, one in file.pads.items()
         },
         contacts={name: one.build(laws) for name, one in file.contacts.items()},
-        actuators={
-            name: made(f"actuators.{name}", partial(one.build, file.folder))
-            for name, one in file.actuators.items() if name in loops
-        },
+        actuators=actuators,
         gravity=file.gravity,
         symbols={name: one.symbol or name for name, one in file.bodies.items()},
     )  # fmt: skip

@@ -4,7 +4,6 @@ import itertools
 from collections.abc import Iterator
 
 import networkx as nx
-import torch
 
 from torchsoft.physics.motion import Sampled
 from torchsoft.physics.rig import Rig
@@ -37,8 +36,8 @@ def check(file: RigFile) -> list[Finding]:
         return [Finding("error", field, sentence)]
     estimate = Estimate(file, ready)
     found = [
-        *ties(file, ready.rig), *recordings(file, ready), *jumps(file, ready, estimate), *carried(file, ready, estimate),
-        *overlaps(ready.rig, estimate), *corners(file, ready.rig),
+        *ties(file, ready.rig), *unseen(file, ready.rig), *recordings(file, ready), *jumps(file, ready, estimate),
+        *carried(file, ready, estimate), *overlaps(ready.rig, estimate), *corners(file, ready.rig),
     ]  # fmt: skip
     if not any(one.severity == "error" for one in found):
         found += at_moments(file, ready, estimate)
@@ -48,14 +47,27 @@ def check(file: RigFile) -> list[Finding]:
 def ties(file: RigFile, rig: Rig) -> Iterator[Finding]:
     """Loops that measure a body which they cannot move."""
     graph = tied(rig, rig.contacts)
-    for name, actuator in file.actuators.items():
-        (measured, _), (pushed, _) = at(actuator.measured), at(actuator.pushes)
-        if actuator.setpoint is not None and not nx.has_path(graph, measured, pushed):
+    for loop in file.loops():
+        (measured, _), (pushed, _) = at(loop.measured), at(loop.pushes)
+        if not nx.has_path(graph, measured, pushed):
             yield Finding(
-                "error", f"actuators.{name}",
-                f"it measures {actuator.measured} and pushes {actuator.pushes}, but no pad and contact tie `{pushed}` to "
-                f"`{measured}`: whatever it does, it moves nothing that it sees; add a contact, or measure {actuator.pushes}",
+                "error", loop.field,
+                f"it measures {loop.measured} and pushes {loop.pushes}, but no pad and contact tie `{pushed}` to "
+                f"`{measured}`: whatever it does, it moves nothing that it sees; add a contact, or measure {loop.pushes}",
             )  # fmt: skip
+
+
+def unseen(file: RigFile, rig: Rig) -> Iterator[Finding]:
+    """Efforts of controllers that move nothing of what these see."""
+    graph = tied(rig, rig.contacts)
+    for name, one in file.controllers.items():
+        for pushed in one.pushes:
+            if not any(nx.has_path(graph, at(measured)[0], at(pushed)[0]) for measured in one.measures):
+                yield Finding(
+                    "error", f"controllers.{name}.pushes",
+                    f"no pad and contact tie `{at(pushed)[0]}` to anything that it measures: pushing {pushed} moves nothing "
+                    "that it sees; add a contact, or measure it",
+                )  # fmt: skip
 
 
 def recordings(file: RigFile, ready: Ready) -> Iterator[Finding]:
@@ -88,27 +100,24 @@ def recordings(file: RigFile, ready: Ready) -> Iterator[Finding]:
 def jumps(file: RigFile, ready: Ready, estimate: Estimate) -> Iterator[Finding]:
     """Set-points that begin elsewhere than their coordinate."""
     values = signals(ready.rig, 0.0)
-    for name, actuator in file.actuators.items():
-        if actuator.setpoint is None:
-            continue
-        body, axis = at(actuator.measured)
-        unit = file.unit(actuator.setpoint)
-        here, wanted = estimate.start[body][axis], values[actuator.setpoint]
+    state, followed = ready.rig.unpack(ready.y0), ready.rig.follow(0.0)
+    for loop in file.loops():
+        body, axis = at(loop.measured)
+        unit = file.unit(loop.setpoint)
+        here, wanted = estimate.start[body][axis], values[loop.setpoint]
         if abs(wanted - here) > JUMP[unit]:
-            pushes = float(
-                ready.rig.actuators[name](torch.tensor([wanted, 0.0, 0.0, here, 0.0], dtype=torch.float64)).detach()
-            )
+            efforts = [float(ready.rig.actuator_effort(name, state, followed).detach()) for name in loop.actuators]
             yield Finding(
-                "warning", f"motion.{actuator.setpoint}",
-                f"it begins at {wanted:.6g} {unit}, but {actuator.measured} at {here:.6g} {unit}: the loop `{name}` pushes "
-                f'with {abs(pushes):.3g} at once; begin at "start"',
+                "warning", f"motion.{loop.setpoint}",
+                f"it begins at {wanted:.6g} {unit}, but {loop.measured} at {here:.6g} {unit}: `{loop.field}` pushes "
+                f'with {max(map(abs, efforts)):.3g} at once; begin at "start"',
             )  # fmt: skip
 
 
 def carried(file: RigFile, ready: Ready, estimate: Estimate) -> Iterator[Finding]:
     """Bodies that nothing carries against gravity."""
     rig, pose = ready.rig, estimate.start
-    pushed = {actuator.pushes for actuator in file.actuators.values()}
+    pushed = {*file.pushed().values()}
     for name, body in file.bodies.items():
         if file.gravity == 0 or not body.weighted or "y" not in body.free or f"{name}.y" in pushed:
             continue

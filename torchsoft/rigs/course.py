@@ -1,8 +1,9 @@
 """Where bodies will be, before any run: what is driven, what loops follow, and what is gripped between two pads.
 
-Two estimates. By geometry alone, at any time: loops are taken to reach their set-points, and a body between two pads that press
-it to be in their middle. By statics, at a few moments: loops and efforts that are fed forward press pads against bodies until
-both are in balance, without friction. Everything else is taken to stay where it starts.
+Two estimates. By geometry alone, at any time: loops are taken to reach their set-points, a body between two pads that press
+it to be in their middle, and to go along with them if both are on bodies. By statics, at a few moments: loops and efforts
+that are fed forward press pads against bodies until both are in balance, without friction. Everything else is taken to stay
+where it is.
 """
 
 import numpy as np
@@ -16,7 +17,7 @@ from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.resting import resting
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import Ready, RigFile, assemble
-from torchsoft.rigs.geometry import facing, pressed, surface
+from torchsoft.rigs.geometry import facing, pressed, surface, turned
 
 Course = dict[str, Array]
 """Poses (3,) by body at one time."""
@@ -38,10 +39,10 @@ class Estimate:
         self.file, self.rig, self.end = file, ready.rig, float(ready.t[-1])
         with torch.no_grad():
             self.start = {name: x.numpy().copy() for name, x in self.rig.unpack(ready.y0).pose.items()}
-        loops = {name: one for name, one in file.actuators.items() if one.setpoint is not None}
-        self.loops = loops
-        self.measured = {one.measured for one in loops.values()}
+        self.loops = file.loops()
+        self.measured = {one.measured for one in self.loops}
         self.own = [name for name, one in file.actuators.items() if one.measured == one.pushes]
+        self._past: list[tuple[float, Course]] = []
 
     def known(self, body: str) -> bool:
         """Whether no coordinate of a body is left to the run."""
@@ -49,26 +50,45 @@ class Estimate:
 
     def __call__(self, time: float) -> Course:
         """By geometry."""
-        pose = {name: x.copy() for name, x in self.start.items()}
+        for knot in self.knots() if not self._past else ():
+            self._past.append((knot, self._next(self._past[-1][1] if self._past else self.start, knot)))
+        before = [pose for knot, pose in self._past if knot < time]
+        return self._next(before[-1] if before else self.start, time)
+
+    def _next(self, before: Course, time: float) -> Course:
+        """At a time [s], after the poses of the knot before."""
+        pose = {name: x.copy() for name, x in before.items()}
         values = signals(self.rig, time)
         held, _ = self.rig.held(self.rig.follow(time))
         for body, axis, kind in self.file.coordinates():
             if kind != "free":
                 i = COORDINATES.index(axis)
                 pose[body][i] = float(held[body][i].detach())
-        for one in self.loops.values():
+        for one in self.loops:
             (body, axis), (pushed, other) = at(one.measured), at(one.pushes)
-            assert one.setpoint is not None
             pose[body][axis] = values[one.setpoint]
             if one.pushes not in self.measured and axis == other:  # it goes along
                 pose[pushed][axis] = self.start[pushed][axis] + values[one.setpoint] - self.start[body][axis]
         for name in self.rig.bodies:
+            self._carry(name, before, pose)
             for pair in facing(self.rig, name, pose):
                 n = surface(self.rig.pads[self.rig.contacts[pair[0]].pad], pose).normal
                 deep = [pressed(self.rig, key, pose) for key in pair]
                 if sum(deep) > 0 and all(abs(n[i]) < 0.1 or self._is_own(name, i) for i in (0, 1)):
                     pose[name][:2] += 0.5 * (deep[0] - deep[1]) * n
         return pose
+
+    def _carry(self, name: str, before: Course, pose: Course) -> None:
+        """Takes a body along with the two others between whose pads it was gripped: as they move in the mean."""
+        for pair in facing(self.rig, name, before):
+            bases = [base for key in pair if (base := self.rig.pads[self.rig.contacts[key].pad].base) is not None]
+            if len(bases) < 2 or min(pressed(self.rig, key, before) for key in pair) <= 0:
+                continue
+            was, now = (np.mean([at[base] for base in bases], 0) for at in (before, pose))
+            turn = now[2] - was[2]
+            moved = np.append(now[:2] + turned(before[name][:2] - was[:2], turn), before[name][2] + turn)
+            own = [self._is_own(name, axis) for axis in range(3)]
+            pose[name] = np.where(own, moved, pose[name])
 
     def _is_own(self, body: str, axis: int) -> bool:
         """Whether a coordinate is free, and no loop measures it."""

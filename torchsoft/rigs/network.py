@@ -2,22 +2,27 @@
 
 import re
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from torchsoft.physics.controllers import StateFeedback
 from torchsoft.physics.parts import PD
 from torchsoft.tables import line
-
-INPUTS = 4
-"""Set-point, its rate, the measured coordinate, its rate, in SI units."""
 
 WEIGHTS = 2000
 """Numbers of a network at the most: every one of them becomes machine code."""
 
-PYTHON = "a module of another kind is given in Python: torchsoft.Actuator(measures, pushes, module, setpoint=...)"
+PYTHON = (
+    "a module of another kind is given in Python: torchsoft.Actuator(measures, pushes, module, setpoint=...) or "
+    "torchsoft.controller(module, ...)"
+)
+
+LOOP = "set-point", "its rate", "coordinate", "its rate"
+"""What the network of one loop sees, in SI units."""
 
 
 class NetworkPD(PD):
@@ -32,9 +37,25 @@ class NetworkPD(PD):
         return self.sign * loop + self.network(torch.stack((w, w_dot, q, q_dot), -1))[..., 0] + feed_forward
 
 
-def read_network(path: Path) -> nn.Sequential:
+class FedNetwork(nn.Module):
+    """State feedback and a network of (set-points, their rates, coordinates, their rates), whose efforts [N or N.m] are added;
+    either may be missing."""
+
+    def __init__(self, feedback: StateFeedback | None, network: nn.Module | None) -> None:
+        super().__init__()
+        self.feedback, self.network = feedback, network
+
+    def forward(self, setpoints: Tensor, state: Tensor) -> Tensor:
+        if self.network is None:
+            assert self.feedback is not None
+            return self.feedback(setpoints, state)
+        efforts = self.network(torch.cat((setpoints, state), -1))
+        return efforts if self.feedback is None else self.feedback(setpoints, state) + efforts
+
+
+def read_network(path: Path, inputs: Sequence[str], efforts: int = 1) -> nn.Sequential:
     """Linear layers with tanh between them from an .npz file of their weights and biases, with the names of torch's
-    `Sequential(Linear, Tanh, Linear, ...)`: 0.weight, 0.bias, 2.weight, ...
+    `Sequential(Linear, Tanh, Linear, ...)`: 0.weight, 0.bias, 2.weight, ... `inputs` are the words for what it sees.
 
     Raises `ValueError` naming the file for another kind of file, names or shapes, and `OSError`.
     """
@@ -49,12 +70,12 @@ def read_network(path: Path) -> nn.Sequential:
     except (ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} is not an .npz file of numbers: {line(error, 120)}") from None
     try:
-        return layers(arrays)
+        return layers(arrays, inputs, efforts)
     except ValueError as error:
         raise ValueError(f"{path}: {error}. {PYTHON}") from None
 
 
-def layers(arrays: dict[str, np.ndarray]) -> nn.Sequential:
+def layers(arrays: dict[str, np.ndarray], inputs: Sequence[str], efforts: int) -> nn.Sequential:
     """Raises `ValueError` for what is no network of such layers."""
     found = sorted(int(name[1]) for name in (re.fullmatch(r"(\d{1,3})\.weight", name) for name in arrays) if name)
     if not found or {*arrays} != {f"{i}.{part}" for i in found for part in ("weight", "bias")}:
@@ -64,15 +85,20 @@ def layers(arrays: dict[str, np.ndarray]) -> nn.Sequential:
         )
     if sum(array.size for array in arrays.values()) > WEIGHTS:
         raise ValueError(f"it has more than {WEIGHTS} numbers, which are too many to be compiled")
-    width, parts = INPUTS, list[nn.Module]()
+    width, parts = len(inputs), list[nn.Module]()
     for i in found:
         weight, bias = arrays[f"{i}.weight"], arrays[f"{i}.bias"]
         last = i == found[-1]
-        if weight.ndim != 2 or weight.shape[1] != width or bias.shape != weight.shape[:1] or (last and len(bias) != 1):
+        if (
+            weight.ndim != 2
+            or weight.shape[1] != width
+            or bias.shape != weight.shape[:1]
+            or (last and len(bias) != efforts)
+        ):
             raise ValueError(
                 f"{i}.weight has the shape {weight.shape} and {i}.bias {bias.shape}, but must have "
-                f"({1 if last else 'n'}, {width}) and ({1 if last else 'n'},): from {INPUTS} inputs (set-point, its rate, "
-                "coordinate, its rate) to one effort"
+                f"({efforts if last else 'n'}, {width}) and ({efforts if last else 'n'},): from {len(inputs)} inputs "
+                f"({', '.join(inputs)}) to {'one effort' if efforts == 1 else f'{efforts} efforts'}"
             )
         for name, array in (("weight", weight), ("bias", bias)):
             if array.dtype.kind not in "iuf" or not np.isfinite(array).all():

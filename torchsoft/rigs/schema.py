@@ -9,7 +9,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from torch import nn
 
 from torchsoft.physics.parts import COORDINATES
-from torchsoft.rigs.actuators import ActuatorTable
+from torchsoft.rigs.actuators import ActuatorTable, ControllerTable, Loop
 from torchsoft.rigs.bodies import UNITS, BodyTable
 from torchsoft.rigs.contacts import ContactTable, LawTable
 from torchsoft.rigs.fields import Group, Within
@@ -35,6 +35,7 @@ class RigTables(Group):
     laws: dict[str, LawTable] = Field(min_length=1)
     contacts: dict[str, ContactTable] = Field(min_length=1)
     actuators: dict[str, ActuatorTable] = Field(default_factory=dict)
+    controllers: dict[str, ControllerTable] = Field(default_factory=dict)
     motion: dict[str, MotionTable] = Field(default_factory=dict)
     outputs: OutputsTable
     solver: SolverTable = SolverTable()
@@ -54,15 +55,25 @@ class RigTables(Group):
     def followers(self) -> dict[str, list[tuple[str, str]]]:
         """What follows each motion: roles ("setpoint", "feed_forward" or "driven") and coordinates by the motion's name."""
         out: dict[str, list[tuple[str, str]]] = {}
+        for loop in self.loops():
+            out.setdefault(loop.setpoint, []).append(("setpoint", loop.measured))
         for actuator in self.actuators.values():
-            if actuator.setpoint is not None:
-                out.setdefault(actuator.setpoint, []).append(("setpoint", actuator.measured))
             if actuator.feed_forward is not None:
                 out.setdefault(actuator.feed_forward, []).append(("feed_forward", actuator.pushes))
         for body, axis, kind in self.coordinates():
             if kind == "driven":
                 out.setdefault(f"{body}.{axis}", []).append(("driven", f"{body}.{axis}"))
         return out
+
+    def loops(self) -> list[Loop]:
+        """What follows motions, by actuators and by controllers."""
+        groups = *self.actuators.items(), *self.controllers.items()
+        return [loop for name, one in groups for loop in one.loops(name)]
+
+    def pushed(self) -> dict[str, str]:
+        """The coordinates that are pushed, by the actuators of the rig that do so."""
+        own = {name: one.pushes for name, one in self.actuators.items()}
+        return own | {key: at for name, one in self.controllers.items() for key, at in one.actuators(name).items()}
 
     def unit(self, motion: str) -> str:
         """Unit of a motion, from what follows it."""
@@ -72,7 +83,7 @@ class RigTables(Group):
 
     @model_validator(mode="after")
     def _names_are_names(self) -> Self:
-        for group in ("bodies", "materials", "pads", "laws", "contacts", "actuators"):
+        for group in ("bodies", "materials", "pads", "laws", "contacts", "actuators", "controllers"):
             for name in getattr(self, group):
                 if not NAME.fullmatch(name) or name in TAKEN:
                     why = (
@@ -113,6 +124,12 @@ class RigTables(Group):
         for name, actuator in self.actuators.items():
             for field in ("pushes", "measures"):
                 self._check_coordinate(f"actuators.{name}.{field}", getattr(actuator, field))
+        for name, one in self.controllers.items():
+            for field in ("pushes", "measures"):
+                for coordinate in getattr(one, field):
+                    self._check_coordinate(f"controllers.{name}.{field}", coordinate)
+            for taken in sorted(one.actuators(name).keys() & self.actuators.keys()):
+                raise ValueError(f"controllers.{name}: one of its efforts would be called `{taken}`, as an actuator is")
         return self
 
     def _check_coordinate(self, field: str, coordinate: str | None) -> None:

@@ -15,6 +15,7 @@ from torchsoft.codegen import Law, compile_law
 from torchsoft.codegen.graph import Graph
 from torchsoft.codegen.trace import traced
 from torchsoft.physics.contact import distance_law, free_law, interface_law
+from torchsoft.physics.parts import Actuator
 from torchsoft.solve.kernel.arrays import INPUTS
 
 
@@ -117,9 +118,9 @@ def _effort(actuator: nn.Module, x: Tensor) -> Tensor:
     return actuator(x)[None]
 
 
-def actuator_law(actuator: nn.Module, parameters: Mapping[str, Tensor]) -> Law:
-    """The law of an actuator: its effort by setpoint, its rate, feed-forward, coordinate, its rate."""
-    return compiled_law(parameters, _effort, 5, 1, 5, law=actuator)
+def actuator_law(actuator: Actuator, parameters: Mapping[str, Tensor]) -> Law:
+    """The law of an actuator: its effort by set-points and their rates, feed-forward, coordinates and their rates."""
+    return compiled_law(parameters, _effort, actuator.inputs, 1, actuator.inputs, law=actuator)
 
 
 def contact_laws(law: Any, shape: Any) -> LawSet:

@@ -207,22 +207,26 @@ class Compiled:
         )  # fmt: skip
 
     def _make_actuators(self) -> Actuators:
-        rig, rows, starts = self.rig, [], []
+        rig, rows, starts, setpoints, measured = self.rig, [], [], [], []
         for actuator in rig.actuators.values():
             parameters = {f"law.{k}": v for k, v in actuator.named_parameters()}
             law = actuator_law(actuator, parameters)
             starts.append(self._add_all(parameters))
             feed = rig.signals.index(actuator.feed_forward) if actuator.feed_forward is not None else -1
-            rows.append(
-                (law.linearise, law.pullback, rig.coordinate(actuator.measures), rig.coordinate(actuator.pushes),
-                 rig.signals.index(actuator.setpoint), feed)
-            )  # fmt: skip
-        linearise, pullback, measured, pushed, setpoint, feed_forward = _ints(rows).reshape(-1, 6).T
+            rows.append((law.linearise, law.pullback, rig.coordinate(actuator.pushes), feed))
+            setpoints.append([rig.signals.index(name) for name in actuator.setpoints])
+            measured.append([rig.coordinate(name) for name in actuator.measures])
+        linearise, pullback, pushed, feed_forward = (np.ascontiguousarray(x) for x in _ints(rows).reshape(-1, 4).T)
         make: Any = Actuators
         return make(
-            *(np.ascontiguousarray(x) for x in (linearise, pullback)), _ints([*starts, self._count]),
-            *(np.ascontiguousarray(x) for x in (measured, pushed, setpoint, feed_forward)),
-        )  # fmt: skip
+            linearise,
+            pullback,
+            _ints([*starts, self._count]),
+            pushed,
+            feed_forward,
+            *_ragged(setpoints),
+            *_ragged(measured),
+        )
 
     def _make_contacts(self) -> tuple[Contacts, Points]:
         rig, rows, starts, point_start, sizes, limits = self.rig, [], [], [0], [], []
@@ -312,6 +316,11 @@ class Compiled:
             band[i] = len(factor)
             factors[: len(factor), here] = factor
         return pads, inertia._replace(factor=factors, band=band, D=D, B=B)
+
+
+def _ragged(lists: list[list[int]]) -> tuple[Index, Index]:
+    """The ends of lists that are put one after the other, and all their numbers."""
+    return _ints([0, *np.cumsum([len(one) for one in lists])]), _ints([number for one in lists for number in one])
 
 
 def _ints(values: Any) -> Index:

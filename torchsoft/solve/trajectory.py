@@ -200,7 +200,8 @@ def units(rig: Rig) -> dict[str, str]:
                 signal(f"{name}.{axis}", unit)
         out[f"L_{symbol}"] = "kg.m2/s"
     for name, actuator in rig.actuators.items():
-        signal(actuator.setpoint, "rad" if actuator.measures.endswith(".theta") else "m")
+        for setpoint, coordinate in zip(actuator.setpoints, actuator.measures):
+            signal(setpoint, "rad" if coordinate.endswith(".theta") else "m")
         effort = "N.m" if actuator.pushes.endswith(".theta") else "N"
         if actuator.feed_forward is not None:
             signal(actuator.feed_forward, effort)

@@ -15,7 +15,7 @@ from torchsoft.solve.kernel.adjoint_pads import inertial_state, nodal_cotangent,
 from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.interface import assemble
 from torchsoft.solve.kernel.linear import solve_dense
-from torchsoft.solve.kernel.stage import actuate
+from torchsoft.solve.kernel.stage import actuate, by_velocities
 from torchsoft.solve.kernel.step import GAMMA, MIX, TINY, dense_states
 from torchsoft.solve.kernel.taped import restore
 
@@ -26,12 +26,11 @@ def rigid_part(s: Any, w: Any, y: Array, signals: Array, a: float, Rv: Array) ->
     Rv[:] = 0.0
     for i in range(s.body_coordinate.size):
         Rv[i, i] = -s.p[s.body_mass_at[i]] / a
-    x, out, J = w.effort_x, w.effort, w.effort_J
-    for i in range(s.act_measured.size):
-        number, towards = s.body_free[s.act_pushed[i]], s.body_free[s.act_measured[i]]
-        if number >= 0 and towards >= 0:
-            actuate(s, i, w.q, w.V, signals, x, out, J)
-            Rv[number, towards] += a * J[0, 3] + J[0, 4]
+    for i in range(s.act_pushed.size):
+        number = s.body_free[s.act_pushed[i]]
+        if number >= 0:
+            actuate(s, i, w.q, w.V, signals, w.effort_x, w.effort, w.effort_J)
+            by_velocities(s, i, w.effort_J, a, Rv[number])
 
 
 @compiled
@@ -129,19 +128,24 @@ def stage_adjoint(
             pad_state(s, w, z, pad, y, y_bar, a, rate_bar, u_bar, p_bar)
 
     x, out, J = w.effort_x, w.effort, w.effort_J
-    for i in range(s.act_measured.size):
+    for i in range(s.act_pushed.size):
         number = s.body_free[s.act_pushed[i]]
         if number < 0:
             continue
         actuate(s, i, w.q, w.V, signals, x, out, J)
         own, push = slice(s.act_p_start[i], s.act_p_start[i + 1]), nu[number]
         call_pullback(s.act_pullback[i], x, p[own], push, p_bar[own])
-        signals_bar[s.act_setpoint[i], 0] += push[0] * J[0, 0]
-        signals_bar[s.act_setpoint[i], 1] += push[0] * J[0, 1]
+        n = 0
+        for k in range(s.act_setpoint_start[i], s.act_setpoint_start[i + 1]):
+            signals_bar[s.act_setpoint[k], 0] += push[0] * J[0, n]
+            signals_bar[s.act_setpoint[k], 1] += push[0] * J[0, n + 1]
+            n += 2
         if s.act_feed_forward[i] >= 0:
-            signals_bar[s.act_feed_forward[i], 0] += push[0] * J[0, 2]
-        q_hat[s.act_measured[i]] += push[0] * J[0, 3]
-        V_hat[s.act_measured[i]] += push[0] * J[0, 4]
+            signals_bar[s.act_feed_forward[i], 0] += push[0] * J[0, n]
+        for k in range(s.act_measured_start[i], s.act_measured_start[i + 1]):
+            q_hat[s.act_measured[k]] += push[0] * J[0, n + 1]
+            V_hat[s.act_measured[k]] += push[0] * J[0, n + 2]
+            n += 2
     for i in range(free):
         c, mass = s.body_coordinate[i], p[s.body_mass_at[i]]
         rate = (w.V[c] - y[s.body_V_start + i]) / a

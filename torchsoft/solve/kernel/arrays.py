@@ -33,15 +33,18 @@ class Bodies(NamedTuple):
 
 
 class Actuators(NamedTuple):
-    """Per actuator: law addresses, its parameters' ends in p, coordinates measured and pushed, signals (-1: none)."""
+    """Per actuator: law addresses, its parameters' ends in p, coordinate pushed, signal fed forward (-1: none), the ends of its
+    signals in setpoint and of its coordinates in measured."""
 
     linearise: Index
     pullback: Index
     p_start: Index
-    measured: Index
     pushed: Index
-    setpoint: Index
     feed_forward: Index
+    setpoint_start: Index
+    setpoint: Index
+    measured_start: Index
+    measured: Index
 
 
 class Pads(NamedTuple):

@@ -34,7 +34,7 @@ def rates(
     for i in range(s.body_coordinate.size):
         c, mass = s.body_coordinate[i], s.p[s.body_mass_at[i]]
         load = w.load[c] - s.body_weight[i] * mass * s.p[s.body_gravity_at]
-        for a in range(s.act_measured.size):
+        for a in range(s.act_pushed.size):
             if s.act_pushed[a] == c:
                 load += actuate(s, a, w.q, w.V, signals[0], w.effort_x, w.effort, w.effort_J)
         out[s.body_V_start + i] = load / mass  # (17), (18)

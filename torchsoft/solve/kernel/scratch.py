@@ -82,6 +82,7 @@ def scratch(s: Any, size: int, columns: int = 1) -> Work:
     points, pads, contacts = len(s.point_X), len(s.pad_base), len(s.contact_pad)
     z = lambda *shape: np.zeros(shape)
     i = lambda *shape: np.zeros(shape, np.int64)
+    inputs = 1 + 2 * int((np.diff(s.act_setpoint_start) + np.diff(s.act_measured_start)).max(initial=0))
     per_node = ("u", "free", "u_dot", "u_dot_old", "u_dot_new", "F", "F_linear", "F_old", "F_new")
     return Work(
         q=z(coordinates), V=z(coordinates), frame=z(contacts, 7), zeta=z(2 * nodes), zeta_rate=z(2 * nodes),
@@ -89,8 +90,8 @@ def scratch(s: Any, size: int, columns: int = 1) -> Work:
         H=z(points, 3, 8), S=z(points, 3, 8), G=z(points, 6, 2), L=z(points, 6, 8), window=i(points), windows=i(pads),
         active=i(points), actives=i(pads), low=i(pads), high=i(pads), slot=i(nodes), touched=i(nodes), counts=i(pads),
         A=z(widest, widest), P=z(widest, widest), PB=z(2, widest), K=z(6, 8), number=i(6), r=z(free, 1),
-        Rv=z(free, free), b=z(free, 1), dV=z(free), V_old=z(coordinates), phi=z(1), effort_x=z(5), effort=z(1),
-        effort_J=z(1, 5), probe=z(INPUTS), decay=z(3), inertial=z(4, dofs), Hc=z(widest, free), Rf=z(free, widest),
+        Rv=z(free, free), b=z(free, 1), dV=z(free), V_old=z(coordinates), phi=z(1), effort_x=z(inputs), effort=z(1),
+        effort_J=z(1, inputs), probe=z(INPUTS), decay=z(3), inertial=z(4, dofs), Hc=z(widest, free), Rf=z(free, widest),
         X=z(2 * nodes, columns + free), k=z(size), load=z(coordinates), full=z(dofs), travelled=np.array([np.inf, 0.0, 0.0]),
     )  # fmt: skip
 

@@ -41,12 +41,34 @@ def drive(s: Any, w: Any, y: Array, signals: Array, a: float) -> None:
 
 @compiled
 def actuate(s: Any, i: int, q: Array, V: Array, signals: Array, x: Array, out: Array, J: Array) -> float:
-    """Effort [N or N.m] of actuator i; x receives (setpoint, its rate, feed-forward, measured coordinate, its rate)."""
-    m, at, ff = s.act_measured[i], s.act_setpoint[i], s.act_feed_forward[i]
-    x[0], x[1], x[2] = signals[at, 0], signals[at, 1], signals[ff, 0] if ff >= 0 else 0.0
-    x[3], x[4] = q[m], V[m]
+    """Effort [N or N.m] of actuator i; x receives (set-points and their rates, feed-forward, coordinates and their rates)."""
+    ff, n = s.act_feed_forward[i], 0
+    for k in range(s.act_setpoint_start[i], s.act_setpoint_start[i + 1]):
+        x[n], x[n + 1] = signals[s.act_setpoint[k], 0], signals[s.act_setpoint[k], 1]
+        n += 2
+    x[n] = signals[ff, 0] if ff >= 0 else 0.0
+    for k in range(s.act_measured_start[i], s.act_measured_start[i + 1]):
+        x[n + 1], x[n + 2] = q[s.act_measured[k]], V[s.act_measured[k]]
+        n += 2
     call_linearise(s.act_linearise[i], x, s.p[s.act_p_start[i] : s.act_p_start[i + 1]], out, J)
     return out[0]
+
+
+@compiled
+def coordinates_at(s: Any, i: int) -> int:
+    """Where the coordinates begin among the inputs of actuator i."""
+    return 2 * (s.act_setpoint_start[i + 1] - s.act_setpoint_start[i]) + 1
+
+
+@compiled
+def by_velocities(s: Any, i: int, J: Array, a: float, row: Array) -> None:
+    """Add the derivative of actuator i's effort by the free velocities (free,), which move coordinates by a."""
+    n = coordinates_at(s, i)
+    for k in range(s.act_measured_start[i], s.act_measured_start[i + 1]):
+        towards = s.body_free[s.act_measured[k]]
+        if towards >= 0:
+            row[towards] += a * J[0, n] + J[0, n + 1]
+        n += 2
 
 
 @compiled
@@ -60,13 +82,11 @@ def balance(s: Any, w: Any, y: Array, signals: Array, a: float, r: Array, Rv: Ar
             (w.V[s.body_coordinate[i]] - y[s.body_V_start + i]) / a + s.body_weight[i] * p[s.body_gravity_at]
         )
         Rv[i, i] = -mass / a  # (17)
-    x, out, J = w.effort_x, w.effort, w.effort_J
-    for i in range(s.act_measured.size):
-        number, towards = s.body_free[s.act_pushed[i]], s.body_free[s.act_measured[i]]
+    for i in range(s.act_pushed.size):
+        number = s.body_free[s.act_pushed[i]]
         if number >= 0:
-            r[number, 0] += actuate(s, i, w.q, w.V, signals, x, out, J)  # (32), (34)
-            if towards >= 0:
-                Rv[number, towards] += a * J[0, 3] + J[0, 4]
+            r[number, 0] += actuate(s, i, w.q, w.V, signals, w.effort_x, w.effort, w.effort_J)  # (32), (34)
+            by_velocities(s, i, w.effort_J, a, Rv[number])
 
 
 @compiled

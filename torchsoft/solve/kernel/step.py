@@ -73,9 +73,9 @@ def supply(s: Any, w: Any, signals: Array, powers: Array) -> None:
     """Powers [W] of the actuators, of gravity, of what drives the bodies, and the sum of the positive ones."""
     at = s.pad_base.size + 2
     x, out, J = w.effort_x, w.effort, w.effort_J
-    for i in range(s.act_measured.size):
+    for i in range(s.act_pushed.size):
         powers[at + i] = actuate(s, i, w.q, w.V, signals, x, out, J) * w.V[s.act_pushed[i]]
-    at += s.act_measured.size
+    at += s.act_pushed.size
     gravity = 0.0
     for i in range(s.body_coordinate.size):
         gravity -= s.body_weight[i] * s.p[s.body_mass_at[i]] * s.p[s.body_gravity_at] * w.V[s.body_coordinate[i]]
@@ -85,7 +85,7 @@ def supply(s: Any, w: Any, signals: Array, powers: Array) -> None:
         for c in range(3 * b, 3 * b + 3):
             if s.body_free[c] < 0:
                 drive -= w.load[c] * w.V[c]
-        for i in range(s.act_measured.size):  # what pushes a driven coordinate is held by what drives it
+        for i in range(s.act_pushed.size):  # what pushes a driven coordinate is held by what drives it
             if s.act_pushed[i] // 3 == b and s.body_free[s.act_pushed[i]] < 0:
                 drive -= powers[s.pad_base.size + 2 + i]
         powers[at + 1 + b] = drive

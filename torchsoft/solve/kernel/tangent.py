@@ -15,7 +15,7 @@ from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
 from torchsoft.solve.kernel.interface import NEGLIGIBLE, assemble
 from torchsoft.solve.kernel.linear import put, row_of, solve_dense
-from torchsoft.solve.kernel.stage import actuate, eliminate
+from torchsoft.solve.kernel.stage import actuate, coordinates_at, eliminate
 from torchsoft.solve.kernel.step import GAMMA, MIX, dense_states
 from torchsoft.solve.kernel.taped import restore
 
@@ -185,8 +185,8 @@ def stage_tangent(s: Any, w: Any, z: Any, tape: Any, row: int, a: float, signals
                 dp[s.body_mass_at[i], k] * p[s.body_gravity_at] + mass * dp[s.body_gravity_at, k]
             )
     x, out, J, change = w.effort_x, w.effort, w.effort_J, z.change
-    for i in range(s.act_measured.size):
-        number, measured = s.body_free[s.act_pushed[i]], s.body_free[s.act_measured[i]]
+    for i in range(s.act_pushed.size):
+        number = s.body_free[s.act_pushed[i]]
         if number < 0:
             continue
         actuate(s, i, w.q, w.V, signals, x, out, J)
@@ -194,8 +194,13 @@ def stage_tangent(s: Any, w: Any, z: Any, tape: Any, row: int, a: float, signals
         law_derivatives(z, s.act_pullback[i], x, p[own], dp[own], 1, change)
         for k in range(m):
             r[number, k] += change[0, k]
+        n = coordinates_at(s, i)
+        for j in range(s.act_measured_start[i], s.act_measured_start[i + 1]):
+            measured = s.body_free[s.act_measured[j]]
             if measured >= 0:
-                r[number, k] += J[0, 3] * dy[s.body_q_start + measured, k]
+                for k in range(m):
+                    r[number, k] += J[0, n] * dy[s.body_q_start + measured, k]
+            n += 2
 
     e, known, dq = z.e, z.known, z.q
     for pad in range(count):

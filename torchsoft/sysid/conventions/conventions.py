@@ -169,9 +169,9 @@ def zeros(recording: Recording, sensors: Mapping[str, Sensor], early: Mapping[st
     """Of the coordinates that controllers hold at their set-points in the beginning, and of the disc's angle: it rolls into the
     dent that it makes, so that its angle and its place belong together."""
     rig = recording.rig
-    for actuator in rig.actuators.values():
-        name = channel(rig, actuator.measures)
-        if name not in early or (actuator.measures != actuator.pushes):
+    for actuator in rig.loops.values():
+        name = channel(rig, actuator.measured)
+        if name not in early or actuator.measured != actuator.pushes:
             continue
         sensor, mean, count = sensors[name], float(early[name].mean()), len(early[name])
         if abs(mean) > surely(sensor, count) + sensor.bias:
@@ -198,9 +198,9 @@ def another_body(recording: Recording, sensors: Mapping[str, Sensor], expected: 
     """A set-point that another body follows than the one whose coordinate the loop is taken to measure; or that this one
     does not follow, as it does in the run."""
     rig = recording.rig
-    for actuator in rig.actuators.values():
-        body, _, axis = actuator.measures.partition(".")
-        own, asked = channel(rig, actuator.measures), actuator.setpoint
+    for actuator in rig.loops.values():
+        body, _, axis = actuator.measured.partition(".")
+        own, asked = channel(rig, actuator.measured), actuator.setpoint
         mine, run = off(recording, sensors, asked, own), off_in_run(recording, sensors, asked, own, expected)
         others = [name for name in rig.bodies if name != body and f"{name}.{axis}" in movable(rig)]
         for other in others:

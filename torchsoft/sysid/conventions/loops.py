@@ -67,12 +67,12 @@ def loop_findings(
     parameters whose values are not known."""
     rig = recording.rig
     tensors = {id(rig.parameter(name)) for name in unknown}
-    for name, actuator in rig.actuators.items():
+    for name, actuator in rig.loops.items():
         F = sampled(recording, sensors, name)
-        loop = windows(recording, actuator, F, sampled(recording, sensors, actuator.measures))
+        loop = windows(recording, actuator, F, sampled(recording, sensors, actuator.measured))
         if loop is None:
             continue
-        body, _, axis = actuator.measures.partition(".")
+        body, _, axis = actuator.measured.partition(".")
         others = {one: f"{one}.{axis}" for one in rig.bodies if one != body}
         rivals = {o: windows(recording, actuator, F, sampled(recording, sensors, x)) for o, x in others.items()}
         loop, rivals = with_its_lag(loop), {o: with_its_lag(its) for o, its in rivals.items() if its is not None}
@@ -153,8 +153,8 @@ def flipped(loop: Loop, F: Array, given: Array) -> Change:
 
 
 def another_sense(rig: Rig, actuator: Actuator, body: str, other: str, left: Array) -> Change:
-    paper = isinstance(rig, SoftGrasp) and actuator.measures.endswith(".x")
-    axis = actuator.measures.partition(".")[2]
+    paper = isinstance(rig, SoftGrasp) and actuator.measured.endswith(".x")
+    axis = actuator.measured.partition(".")[2]
     remedy = f' (say control.senses = "{other}")' if paper else ""
     said = (
         f"{actuator.setpoint} looks like the set-point of the {other}, not of the {body}{remedy}; or are "

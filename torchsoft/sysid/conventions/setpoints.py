@@ -87,7 +87,7 @@ def gaps(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> list
     for every in (1, 2, 4):
         places[every], rate = cubic(signal, every, derived)(inside)
         efforts[every] = demanded(actuator, feed, every, inside, places[every], rate, x, v)
-    for own, by in ((channel(rig, actuator.measures), places), (channel(rig, name), efforts)):
+    for own, by in ((channel(rig, actuator.measured), places), (channel(rig, name), efforts)):
         if own in sensors and own in recording.samples:
             error, order = extrapolated(by)
             out.append(Gap(own, error, error / sensors[own].noise, order))
@@ -105,14 +105,17 @@ def demanded(
 
 
 def setpoint_findings(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Finding]:
-    """What looks wrong with the set-points of a recording."""
-    for name, actuator in recording.rig.actuators.items():
-        signal = recording.rig.reference[actuator.setpoint]
-        if not isinstance(signal, Sampled):
-            continue
-        found = other_rate(recording, actuator.setpoint) or sparse_finding(recording, sensors, name)
-        if found is not None:
-            yield found
+    """What looks wrong with the set-points of a recording. Of laws of several coordinates only rates are judged here: that
+    they are too sparse shows when every second one is left out (`checks`)."""
+    rig = recording.rig
+    recorded = {n for one in rig.actuators.values() for n in one.setpoints if isinstance(rig.reference[n], Sampled)}
+    findings = {name: other_rate(recording, name) for name in sorted(recorded)}
+    yield from (one for one in findings.values() if one is not None)
+    for name, actuator in rig.loops.items():
+        if actuator.setpoint in recorded and findings[actuator.setpoint] is None:
+            sparse = sparse_finding(recording, sensors, name)
+            if sparse is not None:
+                yield sparse
 
 
 def sparse_finding(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> Finding | None:

@@ -94,7 +94,8 @@ class Recording:
     @cached_property
     def speed(self) -> float:
         """Root mean square of the speed of the horizontal setpoints and drives [m/s]: slow recordings are the easy ones."""
-        names = [a.setpoint for a in self.rig.actuators.values() if a.measures.endswith(".x") and a.setpoint]
+        pairs = [pair for a in self.rig.actuators.values() for pair in zip(a.measures, a.setpoints)]
+        names = [setpoint for coordinate, setpoint in pairs if coordinate.endswith(".x")]
         names += [name for name in self.rig.signals if name.endswith(".x")]
         if not names:
             return 0.0
