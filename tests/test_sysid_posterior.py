@@ -5,7 +5,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -154,6 +154,15 @@ def test_nuts_takes_failing_runs_for_walls_and_says_so() -> None:
     assert any("runs failed" in notice and WALL in notice for notice in found.notices)
 
 
+@pytest.fixture
+def heard() -> Iterator[None]:
+    """Ctrl-C is heard, which test runners in the background ignore."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("heard")
 def test_an_interruption_keeps_the_draws_so_far() -> None:
     pytest.importorskip("nutpie")
     count, lock = 0, threading.Lock()

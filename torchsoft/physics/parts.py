@@ -1,6 +1,6 @@
 """The parts of a rig beside its pads: rigid bodies, contacts, and actuators with their control laws."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, Literal, Self
 
 import torch
@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torchsoft.physics.arguments import positive
 from torchsoft.physics.contact import SoftContact
 from torchsoft.physics.shapes import Shape, parameter
+from torchsoft.physics.state import State
 
 COORDINATES = ("x", "y", "theta")
 """The coordinates of a body [m, m, rad]."""
@@ -151,6 +152,17 @@ class Actuator(nn.Module):
     def inputs(self) -> int:
         """How many numbers the law sees."""
         return 2 * len(self.setpoints) + 1 + 2 * len(self.measures)
+
+    def seen(self, signals: Mapping[str, Tensor], state: State, batch: Sequence[int]) -> Tensor:
+        """The law's inputs x (*batch, inputs), of signals by name (*batch, 2) and a state."""
+        x = [part for name in self.setpoints for part in signals[name].unbind(-1)]
+        fed = self.feed_forward
+        x.append(torch.zeros(tuple(batch), dtype=torch.float64) if fed is None else signals[fed][..., 0])
+        for coordinate in self.measures:
+            body, _, axis = coordinate.partition(".")
+            i = COORDINATES.index(axis)
+            x += state.pose[body][..., i], state.velocity[body][..., i]
+        return torch.stack(x, -1)
 
     def forward(self, x: Tensor) -> Tensor:
         """Effort (...) of x (..., inputs): every set-point and its rate, feed-forward, every coordinate and its rate."""

@@ -382,15 +382,5 @@ class Rig(nn.Module):
 
     def actuator_effort(self, name: str, state: State, signals: Tensor) -> Tensor:
         """Effort (...) [N or N.m] of an actuator on the coordinate that it pushes."""
-        actuator, inputs = self.actuators[name], []
-        for setpoint in actuator.setpoints:
-            inputs += signals[..., self.signals.index(setpoint), :].unbind(-1)
-        if actuator.feed_forward is not None:
-            inputs.append(signals[..., self.signals.index(actuator.feed_forward), 0])
-        else:
-            inputs.append(torch.zeros(signals.shape[:-2], dtype=signals.dtype))
-        for coordinate in actuator.measures:
-            body, _, axis = coordinate.partition(".")
-            i = COORDINATES.index(axis)
-            inputs += state.pose[body][..., i], state.velocity[body][..., i]
-        return actuator(torch.stack(inputs, -1))
+        rows = dict(zip(self.signals, signals.unbind(-2)))
+        return self.actuators[name](self.actuators[name].seen(rows, state, signals.shape[:-2]))
