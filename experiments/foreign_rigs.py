@@ -27,6 +27,7 @@ from matplotlib.lines import Line2D
 
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Unknown, Unreachable, identify
 from torchsoft.sysid.problem.journal import forget
+from torchsoft.sysid.problem.workers import Runner
 
 VERDICTS = {
     "holds": "C0",
@@ -65,6 +66,8 @@ class Outcome:
     refused: str
     wall_s: float
     cpu_s: float
+    differences_s: float
+    """Processor time that the fit's Jacobians alone would take by forward differences: a measured run for each unknown."""
 
     @property
     def warnings(self) -> list[str]:
@@ -107,7 +110,7 @@ class Outcome:
             "naming_the_cause": self.naming, "wrong": self.wrong, "refused": found is None,
             "chi2": None if found is None else found.chi2, "converged": None if found is None else found.converged,
             "recordings": list(case.excitations), "fastest_slip": max(one.slip for one in self.made),
-            "identify_wall_s": self.wall_s, "identify_cpu_s": self.cpu_s,
+            "identify_wall_s": self.wall_s, "identify_cpu_s": self.cpu_s, "jacobians_by_differences_cpu_s": self.differences_s,
             "recordings_wall_s": sum(one.wall_s for one in self.made),
         }  # fmt: skip
 
@@ -143,7 +146,7 @@ def runs(case: Case, config: Config) -> Path:
 def study(case: Case, made: Mapping[Order, Made], config: Config) -> Outcome:
     """Identify one case."""
     mine, began = [made[order] for order in case.orders()], (perf_counter(), process_time())
-    found, refused = None, ""
+    found, refused, differences = None, "", 0.0
     try:
         recordings = [
             case.recording(name, one, config.seed + 10 * k, config.smoke)
@@ -153,10 +156,19 @@ def study(case: Case, made: Mapping[Order, Made], config: Config) -> Outcome:
         found = identify(
             problem, rtol=config.rtol, workers=config.workers, checkpoint=runs(case, config), progress=not config.smoke
         )
+        wall, cpu = perf_counter() - began[0], process_time() - began[1]
+        differences = found.cost["jacobians"] * (len(problem.coordinates) + 1) * a_run(problem, config)
     except (Unreachable, ValueError) as error:
         refused = str(error)
-    wall, cpu = perf_counter() - began[0], process_time() - began[1]
-    return Outcome(case, truths(config), mine, found, refused, wall, cpu)
+        wall, cpu = perf_counter() - began[0], process_time() - began[1]
+    return Outcome(case, truths(config), mine, found, refused, wall, cpu, differences)
+
+
+def a_run(problem: Problem, config: Config) -> float:
+    """Processor time of the mean recording's run [s], where the fit begins."""
+    began = process_time()
+    problem.residuals(Runner(problem.recordings), problem.coordinates.start, problem.names, config.rtol)
+    return (process_time() - began) / len(problem.recordings)
 
 
 def run(config: Config) -> list[Outcome]:
