@@ -37,9 +37,9 @@ def rank_histograms(calibrations: Mapping[str, Calibration]) -> Figure:
         for ax, label in zip(row, one.labels):
             histogram(ax, one, label, 10)
         row[0].set_ylabel(f"{name}\n{len(one.ranks)} truths", fontsize=8)
-    figure.supxlabel(
-        "rank of the truth among the draws, from lowest to highest; grey: 95 % of uniform ranks", fontsize=8
-    )
+    between = "\n" if columns < 3 else "; "
+    caption = "rank of the truth among the draws, from lowest to highest", "grey: 95 % of uniform ranks"
+    figure.supxlabel(between.join(caption), fontsize=8)
     return figure
 
 
