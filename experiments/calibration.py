@@ -9,9 +9,10 @@ Two tests by parameter, chi-squared on bins and the deviation of the distributio
 time of a run.
 
 Command: .venv/bin/python experiments/calibration.py [--runs 100] [--nuts 20] [--workers 2] [--smoke]
-Expected: Laplace flat for the strokes by 100 truths, NUTS flat in series by 20; 100 truths do not tell the Gaussian there from a
-flat one either (least p 0.018 of four tests), though its posteriors are visibly bent. Laplace says of 19 of 20 of these that its
-weights are not to be trusted, NUTS of all that so few draws make rough intervals. About 90 min of one core, most of it NUTS.
+Expected: Laplace flat for the strokes by 100 truths, NUTS flat in series by 20; 100 truths do not tell the Gaussian there
+from a flat one either (least p 0.018 of four tests), though its posteriors are visibly bent. Laplace says of 19 of 20 of these
+that its weights are not to be trusted, NUTS of all that so few draws make rough intervals. About 90 min of one core, most of
+it NUTS.
 """
 
 import time as clock
