@@ -165,6 +165,7 @@ def test_identify_contact_smoke(tmp_path: Path) -> None:
     assert {"report.html", "identify_contact.png"} <= {path.name for path in tmp_path.iterdir()}
 
 
+@pytest.mark.slow
 def test_interval_coverage_smoke(tmp_path: Path) -> None:
     """Errors of a few standard deviations, not of many: two seeds are too few for a share. Colour is found where it is."""
     module = experiment("interval_coverage")

@@ -122,6 +122,7 @@ def made_by(other: Recording | None, data: Recording, sensors: dict[str, Sensor]
     return replace(data, samples=samples)
 
 
+@pytest.mark.slow
 def test_a_finer_mesh_is_asked_for_by_data_that_one_made() -> None:
     data = recorded()
     found = checked(made_by(remeshed(data, 2, 0), data))
