@@ -8,10 +8,11 @@ than anybody could predict are left: chaos has information that no fit can use. 
 noise seeds and identified, and the intervals that hold the truth are counted. By finite differences the same search would take
 a run for each parameter and each knot: the time of a slope is that many times the measured time of a run.
 
-Command: .venv/bin/python experiments/designed_motion.py [--starts 1500] [--seeds 50] [--motion FILE] [--smoke]
+Command: .venv/bin/python experiments/designed_motion.py [--starts 600] [--seeds 50] [--motion FILE] [--smoke]
 Expected: seven of eight deviations 0.15 to 0.58 times those of the three, mu_s 0.91: the search, by runs of tolerance 1e-3,
 took it for twice as well known as it is. 43 to 48 of 50 intervals hold the truth. Twenty minutes of search and a quarter of an
-hour of fits on one core.
+hour of fits on one core. The motion is kept beside this file as designed_motion.toml. A longer and finer search (--starts 1500
+--design-rtol 1e-4) halves six of eight on paper, but ends where intervals do not hold: at the edge of chaos.
 """
 
 from dataclasses import dataclass, replace
@@ -68,10 +69,10 @@ SMOKE = {
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/designed_motion")
-    starts: int = 1500  # motions that are tried before the gradient's
-    iterations: int = 10  # of the gradient
+    starts: int = 600  # motions that are tried before the gradient's
+    iterations: int = 30  # of the gradient
     seeds: int = 50  # of the noise
-    design_rtol: float = 1e-4  # of the search
+    design_rtol: float = 1e-3  # of the search
     rtol: float = 1e-5  # of the fits; data have a tenth of it
     workers: int = 2
     seed: int = 0
