@@ -146,7 +146,7 @@ def runs(case: Case, config: Config) -> Path:
 def study(case: Case, made: Mapping[Order, Made], config: Config) -> Outcome:
     """Identify one case."""
     mine, began = [made[order] for order in case.orders()], (perf_counter(), process_time())
-    found, refused, differences = None, "", 0.0
+    found, refused, problem = None, "", None
     try:
         recordings = [
             case.recording(name, one, config.seed + 10 * k, config.smoke)
@@ -156,11 +156,11 @@ def study(case: Case, made: Mapping[Order, Made], config: Config) -> Outcome:
         found = identify(
             problem, rtol=config.rtol, workers=config.workers, checkpoint=runs(case, config), progress=not config.smoke
         )
-        wall, cpu = perf_counter() - began[0], process_time() - began[1]
-        differences = found.cost["jacobians"] * (len(problem.coordinates) + 1) * a_run(problem, config)
     except (Unreachable, ValueError) as error:
         refused = str(error)
-        wall, cpu = perf_counter() - began[0], process_time() - began[1]
+    wall, cpu, differences = perf_counter() - began[0], process_time() - began[1], 0.0
+    if found is not None and problem is not None:
+        differences = found.cost["jacobians"] * (len(problem.coordinates) + 1) * a_run(problem, config)
     return Outcome(case, truths(config), mine, found, refused, wall, cpu, differences)
 
 

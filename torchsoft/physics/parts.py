@@ -133,6 +133,11 @@ class Actuator(nn.Module):
         self.pushes, self.law, self.feed_forward, self.elements = pushes, law, feed_forward, elements
 
     @property
+    def follows(self) -> tuple[tuple[str, str], ...]:
+        """Coordinates with the set-points that they are to follow."""
+        return tuple(zip(self.measures, self.setpoints))
+
+    @property
     def is_loop(self) -> bool:
         """Whether it is the loop of one coordinate, which follows one set-point."""
         return len(self.measures) == len(self.setpoints) == 1

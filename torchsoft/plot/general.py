@@ -38,7 +38,7 @@ def curves(trajectory: Trajectory, rig: Rig) -> Iterator[Curve]:
     wanted = {
         coordinate: setpoint
         for a in rig.actuators.values()
-        for coordinate, setpoint in zip(a.measures, a.setpoints) if setpoint != a.feed_forward
+        for coordinate, setpoint in a.follows if setpoint != a.feed_forward
     }  # fmt: skip
     for name, body in rig.bodies.items():
         for axis, place in zip(COORDINATES, trajectory.state.pose[name].detach().numpy().T):

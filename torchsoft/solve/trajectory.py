@@ -200,7 +200,7 @@ def units(rig: Rig) -> dict[str, str]:
                 signal(f"{name}.{axis}", unit)
         out[f"L_{symbol}"] = "kg.m2/s"
     for name, actuator in rig.actuators.items():
-        for setpoint, coordinate in zip(actuator.setpoints, actuator.measures):
+        for coordinate, setpoint in actuator.follows:
             signal(setpoint, "rad" if coordinate.endswith(".theta") else "m")
         effort = "N.m" if actuator.pushes.endswith(".theta") else "N"
         if actuator.feed_forward is not None:

@@ -125,7 +125,7 @@ def completed(rig: Rig, known: Mapping[str, Normal], at: float) -> dict[str, Nor
     """All coordinates of the bodies at a time [s], where some are known. Raises `ValueError` for one that nothing
     tells."""
     out, names, signals = dict(known), free_coordinates(rig), rig.follow(at).detach()
-    pairs = [pair for a in rig.actuators.values() for pair in zip(a.measures, a.setpoints)]
+    pairs = [pair for a in rig.actuators.values() for pair in a.follows]
     followed = {coordinate: rig.signals.index(setpoint) for coordinate, setpoint in pairs}
     for name in sorted(names[: len(names) // 2], key=lambda name: name not in followed):
         body, axis = name.split(".")

@@ -94,7 +94,7 @@ class Recording:
     @cached_property
     def speed(self) -> float:
         """Root mean square of the speed of the horizontal setpoints and drives [m/s]: slow recordings are the easy ones."""
-        pairs = [pair for a in self.rig.actuators.values() for pair in zip(a.measures, a.setpoints)]
+        pairs = [pair for a in self.rig.actuators.values() for pair in a.follows]
         names = [setpoint for coordinate, setpoint in pairs if coordinate.endswith(".x")]
         names += [name for name in self.rig.signals if name.endswith(".x")]
         if not names:
