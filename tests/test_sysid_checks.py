@@ -11,7 +11,7 @@ from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
 from torchsoft.sysid.checks.assumptions import PLACE, Assumption, assumptions, coulomb, remeshed, scaled, unramped
-from torchsoft.sysid.checks.checks import Checked, check, notices
+from torchsoft.sysid.checks.checks import Check, Checked, check, notices
 from torchsoft.sysid.checks.variation import ended, refit
 from torchsoft.sysid.problem.prediction import predict
 from torchsoft.sysid.problem.workers import Runner
@@ -198,3 +198,13 @@ def test_a_variation_that_cannot_be_run_is_said(monkeypatch: pytest.MonkeyPatch)
         sentence.startswith("it could not be checked what it does that the pads have few elements")
         for sentence in notices(found)
     )
+
+
+@pytest.mark.parametrize(
+    ("asked", "refitted", "unit", "wanted"),
+    [(24.0, False, "%", True), (-208.0, False, "%", False), (-208.0, True, "%", True), (124.0, False, "N", True)],
+)
+def test_a_negative_mass_explains_nothing(asked: float, refitted: bool, unit: str, wanted: bool) -> None:
+    """A number of the rig that would have to vanish is no cause, and ends no search for one."""
+    one = Check("disc.mass", "known", "", "", 1.0, unit, {}, 1e6, asked, 5.0, 1e6, refitted=refitted)
+    assert one.wanted is wanted

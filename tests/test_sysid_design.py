@@ -86,6 +86,24 @@ def test_slopes_are_those_of_differences(
     assert slopes @ direction == pytest.approx(wanted, rel=rel)
 
 
+def test_what_finite_steps_and_bent_samples_do_to_a_fit_counts(plan: Recording) -> None:
+    """Sensors a thousand times as good see the steps, and what a covariance promises is not there."""
+    parts, sds = [], []
+    for better in (1.0, 1e3):
+        sensors = {name: Sensor(noise=one.noise / better) for name, one in SENSORS.items()}
+        stated = Problem([plan], sensors, {"pad.E": Unknown(), "contact.K_n": Unknown()})
+        one = planner(stated, Criterion("A"))
+        at = one.look(one.moves.start, stated.coordinates.start)
+        sd = np.array(list(one.deviations(stated.coordinates.start, at).values()))
+        assert at.errors.shape == (2, 2)
+        assert at.value == pytest.approx(0.5 * np.log(np.mean(sd**2 + (at.errors**2).mean(0))))
+        parts.append(np.abs(at.errors) / sd)
+        sds.append(sd)
+    assert parts[0].max() < 0.5
+    assert parts[1].max() > 5
+    np.testing.assert_allclose(sds[0], 1e3 * sds[1], rtol=1e-9)
+
+
 def test_nuisances_are_left_out_as_the_schur_complement(plan: Recording) -> None:
     stated = Problem(
         [plan], {**SENSORS, "F_y": Sensor(noise=0.1, bias=1.0)}, {"pad.E": Unknown(), "contact.K_n": Unknown()}

@@ -76,10 +76,16 @@ class Check:
     unchecked: str = ""
 
     @property
+    def absurd(self) -> bool:
+        """Whether a number of the rig would have to vanish, or be twice itself: what is so to first order says nothing then."""
+        return self.kind == "known" and self.unit == "%" and not self.refitted and abs(self.asked) >= 100
+
+    @property
     def wanted(self) -> bool:
         """Whether the data ask for it."""
         either_side = self.kind in ("known", "sensor")
-        return self.significance > ASKED and self.pattern < PATTERN and (either_side or self.asked > 0)
+        enough = self.significance > ASKED and self.pattern < PATTERN
+        return enough and (either_side or self.asked > 0) and not self.absurd
 
     @property
     def falls(self) -> str:

@@ -46,6 +46,9 @@ POPULATION = 24
 HOPELESS = 1e3
 """What a motion that cannot be run counts in the evolution."""
 
+BENT = 1.0
+"""Standard deviations that a step of a fit may end from the truth without a word."""
+
 FAILURES = 5
 """Runs lost one after the other until the search goes back to the best motion so far."""
 
@@ -134,7 +137,8 @@ def design(
     """Move the knots of the recording `plan` of a problem until the parameters `names` (all, by default) are known best.
 
     Of the plan's samples only the times count; the other recordings and the priors count with what they tell. Sensors'
-    biases and the like are nuisances: what the criterion sees is what is left when they are fitted too. `bounds` holds the
+    biases and the like are nuisances: what the criterion sees is what is left when they are fitted too; and, beside the
+    covariance, how far finite steps and bent samples would lead a fit astray (`Planner.errors`). `bounds` holds the
     travel, speed and free knots of signals of the reference, `limits` the ranges (low, high) [unit] of channels of the run,
     such as forces. `at` are points x of the coordinates (`draws`), by default the nominal one; the criterion's "mean" over them
     is lowered, or the "worst".
@@ -189,6 +193,12 @@ def design(
     notices += [
         f"{name} goes beyond its limits, {part:.1%} of the way to them" for name, part in last.peaks.items() if part > 1
     ]
+    bent = {name: float(np.abs(part).max()) for name, part in planner.bent(points[0], last).items()}
+    if (most := max(bent, key=lambda name: bent[name])) and bent[most] > BENT:
+        notices.append(
+            f"a fit on steps by rtol = {rtol:g} that begins a standard deviation from the truth ends {bent[most]:.2g} of "
+            f"them from it in `{most}`: take finer steps, and count intervals that hold before this motion is used"
+        )
     if search.lost:
         notices.append(f"{search.lost} motions that the search tried could not be run")
     return Design(

@@ -7,6 +7,11 @@ and G = d phi / d(J'J), its derivative by a knot k is
 
 the difference along each x_j of what the discrete adjoint gives by the knots for the weights W_j: 2 n runs, however many
 knots there are.
+
+A covariance is what a fit ends with if samples are linear in the parameters, as far as the intervals reach, and runs exact.
+Both fail where a motion is chaotic, whose sensitivities are large and no use. So phi is that of C + mean(e e'), e being the
+errors of one Gauss-Newton step that begins a standard deviation away; its derivative leaves e as it is. Where chaos is
+such that a small change of a parameter changes samples altogether, a motion is refused (`check_predictable`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,14 +21,15 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import simulate
 from torchsoft.sysid.design.criterion import Criterion, chosen, deviations
 from torchsoft.sysid.design.knots import Moves
 from torchsoft.sysid.fit.information import fisher
-from torchsoft.sysid.problem.prediction import Frozen, Steps, choice, predict, prepared
-from torchsoft.sysid.problem.problem import Problem
+from torchsoft.sysid.problem.prediction import Frozen, Prediction, Steps, choice, predict, prepared
+from torchsoft.sysid.problem.problem import Problem, Residuals
 from torchsoft.sysid.problem.readout import Signals
 from torchsoft.sysid.problem.recording import Array, Begun, Recording
 from torchsoft.sysid.problem.workers import Runner
@@ -41,19 +47,29 @@ MARGIN = 0.97
 PREDICTABLE = 10.0
 """Change of a sample with the logarithm of a parameter, over the largest of its channel, above which a motion is no use."""
 
+FARTHEST = 0.1
+"""Relative error of a parameter, at most, with which a fit is tried."""
+
+TRIED = 2
+"""Points that are tried, each with signs of its own."""
+
+LEFT = 0.3
+"""Part of the errors there that counts: fits take finer steps than a search for motions."""
+
 PRICE = 5.0
 """What a sample at twice the way to a limit costs, in units of the criterion."""
 
 
 class Look(NamedTuple):
     """One motion at one x: the criterion, what excess costs, how much of the way to their limits channels go, the covariance C
-    (n, n), the criterion's derivative G (n, n) by the Fisher matrix, the rows J (m, n) of the samples, the steps, and the
-    signals of the run."""
+    (n, n), the `errors` (k, s) of the parameters that the samples' not being linear makes, the criterion's derivative
+    G (n, n) by the Fisher matrix, the rows J (m, n) of the samples, the steps, and the signals of the run."""
 
     value: float
     cost: float
     peaks: dict[str, float]
     C: Array
+    errors: Array
     G: Array
     J: Array
     steps: Frozen
@@ -93,34 +109,40 @@ class Planner:
             self._known[x.tobytes()] = np.linalg.qr(J)[1]
         return self._known[x.tobytes()]
 
-    def _begun(self) -> Begun:
+    def begun(self) -> Begun:
+        """The recording's rig, ready to run."""
         return self._idle.pop() if self._idle else self.recording.begin()
 
-    def look(self, z: Array, x: Array, steps: Steps | None = None) -> Look:
-        """The motion z at x. Raises `SimulationFailed`, also where what the run does cannot be predicted from parameters."""
-        p, c, given = self.problem, self.problem.coordinates, self.rtol if steps is None else steps
-        by_name = {self.recording.name: given} if isinstance(given, Frozen) else given
-        (job,) = p.jobs(x, [self.recording.name], by_name, c.free)
-        begun = self._begun()
+    def run(self, z: Array, x: Array, steps: Steps, free: NDArray[np.bool_] | None) -> tuple[Residuals, Prediction]:
+        """Residuals of the motion z at x, without those of the priors, and the run. Raises `SimulationFailed`."""
+        p = self.problem
+        by_name = {self.recording.name: steps} if isinstance(steps, Frozen) else steps
+        (job,) = p.jobs(x, [self.recording.name], by_name, free)
+        begun = self.begun()
         begun.rig.reference = self.moves.reference(torch.from_numpy(z))
-        run = predict(begun, job.values, self.grid, job.names, given)
+        run = predict(begun, job.values, self.grid, job.names, steps)
         self._idle.append(begun)
         self.runs += 1
-        J = p.gather(x, [job], [run]).J
-        prior = J[len(J) - len(c.priors) :]
-        J = J[: len(J) - len(c.priors)]
+        return p.gather(x, [job], [run]), run
+
+    def look(self, z: Array, x: Array, steps: Steps | None = None) -> Look:
+        """The motion z at x; on `steps` that are given without the errors. Raises `SimulationFailed`."""
+        c, given = self.problem.coordinates, self.rtol if steps is None else steps
+        at, run = self.run(z, x, given, c.free)
         C = np.zeros((len(x), len(x)))
-        C[np.ix_(c.free, c.free)] = fisher(np.concatenate((self.recorded(x), prior, J))[:, c.free])[0]
-        _, T = chosen(p, x, self.names)
-        value, S = self.criterion(T @ C @ T.T)
+        C[np.ix_(c.free, c.free)] = fisher(np.concatenate((self.recorded(x), at.J))[:, c.free])[0]
+        _, T = chosen(self.problem, x, self.names)
         signals = Signals(run.t, self.recording.channels, run.signals, None)
-        self.check_predictable(x, J, signals)
+        self.check_predictable(x, at.J, signals)
+        errors = self.errors(z, x, at, C, T) if steps is None else np.zeros((1, len(T)))
+        value, S = self.criterion(T @ C @ T.T + errors.T @ errors / len(errors))
         reached = {name: np.abs(part) for name, part in self.reached(signals).items()}
         peaks = {name: float(part.max()) for name, part in reached.items()}
         cost = PRICE * sum(float(np.sum(np.maximum(part - MARGIN, 0.0) ** 2)) for part in reached.values())
         frozen = Frozen(run.knots) if run.knots is not None else given
         assert isinstance(frozen, Frozen)
-        return Look(value, cost, peaks, C, -C @ T.T @ S @ T @ C, J, frozen, signals)
+        J = at.J[: len(at.J) - len(c.priors)]
+        return Look(value, cost, peaks, C, errors, -C @ T.T @ S @ T @ C, J, frozen, signals)
 
     def check_predictable(self, x: Array, J: Array, signals: Signals) -> None:
         """Raises `SimulationFailed` where a parameter that hardly changes would change the samples altogether: then their
@@ -137,6 +159,19 @@ class Planner:
                     "largest value: nothing that follows from it can be predicted", float(signals.t[-1]),
                 )  # fmt: skip
             at += len(t)
+
+    def errors(self, z: Array, x: Array, at: Residuals, C: Array, T: Array) -> Array:
+        """How far (k, s) relative to the parameters a Gauss-Newton step without noise ends from the truth, that begins a
+        standard deviation from it at points of different signs, on steps of their own: nothing where samples are linear over
+        an interval, and steps fine enough; much where the motion is chaotic. Raises `SimulationFailed`."""
+        out, (low, high) = [], self.problem.coordinates.bounds
+        sd = np.minimum(np.sqrt(np.diag(T @ C @ T.T)), FARTHEST)
+        for k in range(TRIED):
+            signs = (-1.0) ** (np.arange(len(T)) // 2**k)
+            off = np.clip(x + np.linalg.pinv(T) @ (signs * sd), low, high) - x
+            there, _ = self.run(z, x + off, self.rtol, None)
+            out.append(LEFT * (T @ C @ at.J.T @ (there.r - at.r - at.J @ off)))
+        return np.array(out)
 
     def reached(self, signals: Signals) -> dict[str, Array]:
         """Where limited channels are (G,) between the middle of their range, 0, and its ends, -1 and 1."""
@@ -170,7 +205,7 @@ class Planner:
 
     def adjoint(self, z: Array, x: Array, steps: Steps, weights: Array) -> Array:
         """Slopes by z of weights (G, channels) on the signals of the run at x. Raises `SimulationFailed`."""
-        begun, variables = self._begun(), torch.tensor(z, requires_grad=True)
+        begun, variables = self.begun(), torch.tensor(z, requires_grad=True)
         reference = self.moves.reference(variables)
         y0 = prepared(begun, self.problem.values(x, self.k), ()).y0.detach()
         run = simulate(begun.rig, self.grid.t, y0=y0, reference=reference, gradient="discrete", **choice(steps))
@@ -203,6 +238,10 @@ class Planner:
         """Relative standard deviations of the parameters."""
         names, T = chosen(self.problem, x, self.names)
         return deviations(names, T, at.C)
+
+    def bent(self, x: Array, at: Look) -> dict[str, Array]:
+        """The errors (k,) by parameter, over its standard deviation, in full."""
+        return {name: error / LEFT / sd for (name, sd), error in zip(self.deviations(x, at).items(), at.errors.T)}
 
     def made(self, z: Array, x: Array, at: Look) -> Recording:
         """The recording that follows a motion, with the samples that its sensors would give without noise."""
