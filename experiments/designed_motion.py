@@ -10,10 +10,8 @@ many noise seeds and identified, and the intervals that hold the truth are count
 take a run for each parameter and each knot: the time of a slope is that many times the measured time of a run.
 
 Command: .venv/bin/python experiments/designed_motion.py [--starts 600] [--seeds 50] [--motion FILE] [--smoke]
-Expected: with --starts 300 --iterations 5 --seeds 4 deviations of 0.14 to 0.81 times those of the three, and 31 of 32 intervals
-hold the truth: 16 min of search, half a minute a fit on one core. The motion kept beside this file as designed_motion.toml was
-found by 600 motions and the covariance alone: 0.15 to 0.58, mu_s 0.91; of its intervals 43 to 48 of 50 held, by fits that kept
-the steps of their first stage.
+Expected: with --starts 300 --iterations 5 deviations of 0.14 to 0.81 times those of the three, and 26 to 30 of 30 intervals
+hold the truth: 16 min of search, half a minute a fit on one core. That motion is kept beside this file as designed_motion.toml.
 """
 
 from dataclasses import dataclass, replace
