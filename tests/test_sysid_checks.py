@@ -11,8 +11,8 @@ from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
 from torchsoft.sysid.checks.assumptions import PLACE, Assumption, assumptions, coulomb, remeshed, scaled, unramped
-from torchsoft.sysid.checks.checks import Check, Checked, check, notices
-from torchsoft.sysid.checks.variation import ended, refit
+from torchsoft.sysid.checks.checks import Check, Checked, check, doubted, notices
+from torchsoft.sysid.checks.variation import AMOUNTS, ended, refit, varied
 from torchsoft.sysid.problem.prediction import predict
 from torchsoft.sysid.problem.workers import Runner
 
@@ -167,6 +167,30 @@ def test_under_another_law_a_fit_that_is_far_off_begins_anew() -> None:
         assert again.of(name) == pytest.approx(np.log(value), abs=0.1)
 
 
+def test_a_number_is_varied_as_far_as_there_is_a_rig() -> None:
+    """A disc that is smaller by a hundredth leaves these pads apart."""
+    problem = Problem([recorded(excitation=LIGHT)], SENSORS, {name: Unknown() for name in TRUTH})
+    (one,) = (one for one in assumptions(problem.recordings, set(TRUTH)) if one.name == "disc.radius")
+    other = varied(problem, problem.names, one)
+    assert isinstance(other, Problem)
+    radius = next(a for a in other.coordinates.all if a.name == "disc.radius")
+    reach = AMOUNTS * one.amount / 100
+    assert radius.high == pytest.approx((1 + reach) * radius.nominal)
+    assert (1 - reach) * radius.nominal < radius.low < radius.nominal
+
+
+@pytest.mark.parametrize(("far", "numbers"), [(False, "abc"), (True, "fed")])
+def test_which_numbers_a_doubtful_fit_is_repeated_without(far: bool, numbers: str) -> None:
+    """What would explain most; far off, where that says nothing, what the data would see first."""
+    taken = [Assumption(name, "known", "", "", parameter=name) for name in "abcdef"]
+    taken.append(Assumption("law", "law", "", "", vary=lambda r: r))
+    checks = {
+        one.name: Check(one.name, "known", "", "", 1.0, "%", {}, 100.0 - k, 900.0, 1.0, 10.0 - k, 100.0 - k)
+        for k, one in enumerate(taken)
+    }
+    assert {one.name for one in doubted(taken, checks, far)} == {*numbers, "law"}
+
+
 def test_every_pad_is_meshed_anew_where_it_was() -> None:
     data = recorded()
     other = remeshed(data, 2, 3)
@@ -206,5 +230,5 @@ def test_a_variation_that_cannot_be_run_is_said(monkeypatch: pytest.MonkeyPatch)
 )
 def test_a_negative_mass_explains_nothing(asked: float, refitted: bool, unit: str, wanted: bool) -> None:
     """A number of the rig that would have to vanish is no cause, and ends no search for one."""
-    one = Check("disc.mass", "known", "", "", 1.0, unit, {}, 1e6, asked, 5.0, 1e6, refitted=refitted)
+    one = Check("disc.mass", "known", "", "", 1.0, unit, {}, 1e6, 1e3, asked, 5.0, 1e6, refitted=refitted)
     assert one.wanted is wanted

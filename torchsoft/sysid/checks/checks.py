@@ -54,8 +54,8 @@ class Check:
     """One thing that was taken for granted, and what a variation of it by `amount` [unit] does.
 
     `moves` is how far each coordinate would move, in its standard deviations, by label; `gain` by how much the sum of squares
-    would fall if the data could choose the amplitude, `asked` that amplitude [unit] and `asked_sd` its standard deviation;
-    `significance` is the gain over the misfit per sample that would be left, `pattern` the part of the residuals'
+    would fall if the data could choose the amplitude, to `left`, `asked` that amplitude [unit] and `asked_sd` its standard
+    deviation; `significance` is the gain over the misfit per sample that would be left, `pattern` the part of the residuals'
     autocorrelation that would be left, 0 where there is none. `refitted`: that is of a fit with the whole variation, not to
     first order. `unchecked` says why there is no answer.
     """
@@ -68,6 +68,7 @@ class Check:
     unit: str
     moves: dict[str, float]
     gain: float
+    left: float
     asked: float
     asked_sd: float
     significance: float
@@ -140,7 +141,7 @@ def check(
     checks |= {one.name: judge.column(one, d) for one, d in linear if d.any()}
     if doubtful and not end.base.lost and not judge.explained(checks.values()):
         as_stated = refit(problem, end, None, loss, notify)
-        for one in doubted(taken, checks) if as_stated is not None else ():
+        for one in doubted(taken, checks, end.far) if as_stated is not None else ():
             again = refit(problem, end, one, loss, notify)
             if again is not None and as_stated is not None:
                 checks[one.name] = judge.fit(one, again, as_stated, checks[one.name])
@@ -149,12 +150,14 @@ def check(
     return Checked(list(checks.values()), np.stack(columns, 1) if columns else np.zeros((len(at.r), 0)), judge.J)
 
 
-def doubted(taken: Sequence[Assumption], checks: Mapping[str, Check]) -> list[Assumption]:
-    """What a fit is repeated without, the likeliest first: all that either is so or is not, and the `RIVALS` of the rig's
-    numbers that would explain most."""
+def doubted(taken: Sequence[Assumption], checks: Mapping[str, Check], far: bool) -> list[Assumption]:
+    """What a fit is repeated without, the likeliest first: all that either is so or is not, and `RIVALS` of the rig's numbers,
+    those that would explain most or, where a fit ended `far` off, those whose variation would make the greatest misfit."""
     by_gain = sorted((one for one in taken if one.name in checks), key=lambda one: -checks[one.name].gain)
-    numbers = [one for one in by_gain if one.parameter and checks[one.name].significance > ASKED][:RIVALS]
-    return [one for one in by_gain if one.vary is not None or one in numbers]
+    numbers = [one for one in by_gain if one.parameter and (far or checks[one.name].significance > ASKED)]
+    if far:
+        numbers.sort(key=lambda one: checks[one.name].asked_sd / one.amount)
+    return [one for one in by_gain if one.vary is not None or one in numbers[:RIVALS]]
 
 
 class Judge:
@@ -171,19 +174,27 @@ class Judge:
 
     def explained(self, checks: Iterable[Check]) -> bool:
         """Whether the data ask for something with which residuals are no larger than the noise."""
-        gain = max((one.gain for one in checks if one.wanted), default=0.0)
-        return gain > 0 and float(stats.chi2.sf(self.square - gain, self.dof)) > LEVEL
+        left = min((one.left for one in checks if one.wanted), default=np.inf)
+        return float(stats.chi2.sf(left, self.dof)) > LEVEL
 
     def unchecked(self, one: Assumption, reason: str) -> Check:
-        return Check(one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, {}, 0.0, 0.0, float("inf"), 0.0,
-                     unchecked=reason)  # fmt: skip
+        return Check(one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, {}, 0.0, self.square, 0.0,
+                     float("inf"), 0.0, unchecked=reason)  # fmt: skip
 
     def made(
-        self, one: Assumption, moves: Array, gain: float, asked: float, asked_sd: float, rest: float, pattern: float
+        self,
+        one: Assumption,
+        moves: Array,
+        gain: float,
+        left: float,
+        asked: float,
+        asked_sd: float,
+        rest: float,
+        pattern: float,
     ) -> Check:
-        """Of a variation that leaves a misfit `rest` per sample."""
+        """Of a variation that leaves a sum of squares `left`, a misfit `rest` per sample."""
         by_label = dict(zip(self.labels, moves.tolist()))
-        return Check(one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, by_label, gain, asked, asked_sd,
+        return Check(one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, by_label, gain, left, asked, asked_sd,
                      gain / rest, pattern)  # fmt: skip
 
     def column(self, one: Assumption, d: Array) -> Check:
@@ -192,14 +203,14 @@ class Judge:
         size, along = float(across @ across), float(across @ self.r)
         moves = -shift(self.J, d) / self.sd
         if size < 1e-12 * max(float(d @ d), 1e-300) or size == 0.0:
-            return self.made(one, moves, 0.0, 0.0, float("inf"), 1.0, 0.0)
+            return self.made(one, moves, 0.0, self.square, 0.0, float("inf"), 1.0, 0.0)
         gain, alpha = along**2 / size, -along / size
         rest = max(1.0, (self.square - gain) / max(self.dof - 1, 1))
         pattern, sd = (
             pattern_of(self.places, self.r + alpha * across, self.r),
             (max(1.0, self.square / self.dof) / size) ** 0.5,
         )
-        return self.made(one, moves, gain, alpha * one.amount, sd * one.amount, rest, pattern)
+        return self.made(one, moves, gain, self.square - gain, alpha * one.amount, sd * one.amount, rest, pattern)
 
     def fit(self, one: Assumption, again: Refit, as_stated: Refit, linear: Check) -> Check:
         """Of a fit that was repeated with it, beside one that was repeated without; or what is known to first order, if that is
@@ -210,7 +221,8 @@ class Judge:
         gain = float(before.r @ before.r - at.r @ at.r)
         if gain <= linear.gain:
             return linear
-        rest = max(1.0, float(at.r @ at.r) / self.dof)
+        left = float(at.r @ at.r)
+        rest = max(1.0, left / self.dof)
         moves = np.array([again.of(label) for label in self.labels]) - self.end.x[self.end.free]
         asked, sd = one.amount, (rest / gain) ** 0.5 * one.amount
         if one.parameter:
@@ -219,7 +231,7 @@ class Judge:
             asked = 100 * (np.exp(again.fit.x[k] - again.problem.coordinates.start[k]) - 1)
             sd = 100 * rest**0.5 * float(standard_deviations(at.J[:, again.free])[labels.index(one.parameter)])
         pattern = pattern_of(self.places, at.r, before.r)
-        return replace(self.made(one, moves / self.sd, gain, asked, sd, rest, pattern), refitted=True)
+        return replace(self.made(one, moves / self.sd, gain, left, asked, sd, rest, pattern), refitted=True)
 
 
 def pattern_of(places: Sequence[slice], left: Array, r: Array) -> float:

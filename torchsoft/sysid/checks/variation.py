@@ -14,8 +14,8 @@ from torchsoft.sysid.fit.plan import SCANNED, USUAL, Stage, default_plan
 from torchsoft.sysid.fit.robust import Loss
 from torchsoft.sysid.fit.stages import run_stage
 from torchsoft.sysid.problem.prediction import Frozen
-from torchsoft.sysid.problem.problem import Problem, Residuals
-from torchsoft.sysid.problem.recording import Array
+from torchsoft.sysid.problem.problem import Problem, Residuals, check_value
+from torchsoft.sysid.problem.recording import Array, Recording
 from torchsoft.sysid.problem.unknowns import Unknown
 from torchsoft.sysid.problem.workers import Runner
 
@@ -25,10 +25,14 @@ goes away, not where exactly."""
 
 
 FAR = 2.0
-"""Misfit per sample from which a fit under another law begins where the first one began, too: where it ended tells nothing."""
+"""Misfit per sample from which where a fit ended tells nothing: under another assumption it begins where the first one began,
+too."""
 
 AMOUNTS = 10.0
 """How many amounts of a variation a number of the rig may be off where a fit is repeated."""
+
+HALVINGS = 10
+"""How often that is halved where there is no such rig."""
 
 
 class End(NamedTuple):
@@ -44,6 +48,11 @@ class End(NamedTuple):
     rtol: float
     workers: int
     journal: Path | None
+
+    @property
+    def far(self) -> bool:
+        """Whether the fit left so much that what is so to first order where it ended says nothing."""
+        return float(np.mean(self.base.r**2)) > FAR
 
 
 def ended(
@@ -66,19 +75,31 @@ def varied(problem: Problem, which: Sequence[str], one: Assumption) -> Problem |
     """The problem with one assumption otherwise in the recordings `which`, or why there is none. A parameter that is called
     known becomes one more unknown."""
     made, unknowns = [], dict(problem.unknowns)
-    if one.parameter:
-        value, reach = problem.recordings[0].parameters[one.parameter], AMOUNTS * one.amount / 100
-        low, high = sorted((value * (1 - reach), value * (1 + reach)))
-        unknowns[one.parameter] = Unknown(nominal=value, low=low, high=high)
     for recording in problem.recordings:
         other = one.vary(recording) if one.vary is not None and recording.name in which else recording
         if other is None:
             return f"it has no meaning where recording `{recording.name}` begins"
         made.append(other)
     try:
+        if one.parameter:
+            value, reach = problem.recordings[0].parameters[one.parameter], AMOUNTS * one.amount / 100
+            low, high = sorted(farthest(problem.recordings, one.parameter, value, part) for part in (-reach, reach))
+            unknowns[one.parameter] = Unknown(nominal=value, low=low, high=high)
         return Problem(made, problem.sensors, unknowns, problem.noise)
     except ValueError as error:  # an unknown that the varied rig has not, or that cannot be one
         return str(error)
+
+
+def farthest(recordings: Sequence[Recording], name: str, value: float, part: float) -> float:
+    """A number of the rig that is off by a relative `part`, or by half of that, a quarter and so on until there is such a rig:
+    a smaller disc may leave the pads apart. Raises `ValueError` where there is none."""
+    for _ in range(HALVINGS):
+        with suppress(ValueError):
+            for recording in recordings:
+                check_value(recording, name, value * (1 + part))
+            return value * (1 + part)
+        part /= 2
+    raise ValueError(f"{name} = {value:g} can hardly be varied")
 
 
 def difference(problem: Problem, end: End, one: Assumption) -> tuple[Array | None, str]:
@@ -109,8 +130,8 @@ class Refit(NamedTuple):
 def refit(problem: Problem, end: End, one: Assumption | None, loss: Loss, notify: Notify) -> Refit | None:
     """The fit with one assumption otherwise, or with all as stated, on steps of its own; None where it cannot begin.
 
-    It begins where the fit ended; ratios that ended at a bound are looked for again over all of their range. With another
-    law, and a misfit above `FAR`, it begins where the first fit began as well, and the better end counts.
+    It begins where the fit ended; ratios that ended at a bound are looked for again over all of their range. With another law
+    or number, and a misfit above `FAR`, it begins where the first fit began as well, and the better end counts.
     """
     other = varied(problem, end.which, one) if one is not None else problem
     if isinstance(other, str):
@@ -137,7 +158,7 @@ def refit(problem: Problem, end: End, one: Assumption | None, loss: Loss, notify
             yield fit
 
     fits = [*carried_out([Stage("once more", end.which, labels, end.rtol, REFITS, ROUGH, scanned=scans)], x)]
-    if one is not None and one.kind == "law" and float(np.mean(end.base.r**2)) > FAR:
+    if one is not None and one.kind in ("law", "known") and end.far:
         with suppress(Unreachable):
             plan = default_plan(other, runner, end.rtol, end.which)
             if set(plan[-1].free) == set(labels):

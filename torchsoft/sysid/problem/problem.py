@@ -42,21 +42,21 @@ def check_ends(coordinates: Coordinates, recordings: Sequence[Recording]) -> Non
         for recording in recordings:
             for field, value in (("low", c.low), ("high", c.high)):
                 try:
-                    with warnings.catch_warnings():
-                        warnings.simplefilter("ignore")  # of a steep friction law, which a search may pass through
-                        check_value(recording, c.name, value)
+                    check_value(recording, c.name, value)
                 except ValueError as error:
                     raise ValueError(f"unknowns.{c.name}.{field} = {value:g} is impossible: {error}") from None
 
 
 def check_value(recording: Recording, name: str, value: float) -> None:
     """Raises `ValueError` for a rig that cannot be."""
-    if isinstance(recording.rig, SoftGrasp) and name in NAMES:
-        recording.rig.settings.override({name: value})
-    else:
-        rig = deepcopy(recording.rig)
-        set_parameters(rig, {name: value})
-        check_values(rig)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of a steep friction law, which a search may pass through
+        if isinstance(recording.rig, SoftGrasp) and name in NAMES:
+            recording.rig.settings.override({name: value})
+        else:
+            rig = deepcopy(recording.rig)
+            set_parameters(rig, {name: value})
+            check_values(rig)
 
 
 class Problem:
