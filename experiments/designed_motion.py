@@ -34,6 +34,7 @@ from torchsoft.sysid.design.criterion import Criterion, chosen, deviations
 from torchsoft.sysid.design.design import Design, design
 from torchsoft.sysid.design.design_figure import design_figure
 from torchsoft.sysid.design.knots import Bounds
+from torchsoft.sysid.design.zigzags import Phase, ToAndFro
 from torchsoft.sysid.fit.information import fisher
 from torchsoft.sysid.problem.workers import Runner
 from torchsoft.threads import side_by_side
@@ -53,6 +54,9 @@ TRAVEL = 40e-3
 
 COMPRESSION = (-0.3e-3, 3.3e-3)
 """Of both pads together [m]; below zero the bracket is clear of the disc. The catalogue's deepest is 3.3 mm."""
+
+LIGHT, DEEP = 4e-4, 3.1e-3
+"""Compression of both pads together in the two phases of the guess [m]."""
 
 FORCE = {"F_x": (-150.0, 150.0), "F_y": (-300.0, 300.0)}
 """Of the bracket's drives [N]; the catalogue's largest are 60 and 275."""
@@ -77,6 +81,7 @@ class Config:
     seed: int = 0
     motion: Path | None = None  # a motion found before, which is only assessed
     shortest: float = 10e-3  # between two knots of a set-point [s]
+    drives: float = 1.0  # what they may do, speed and force, over the bounds above
     smoke: bool = False  # a few motions of few knots, one seed, four parameters
 
 
@@ -127,16 +132,26 @@ def search(truth: dict[str, float], real: Parameters, half: dict[str, float], co
     x_0, open_at = GIVEN.x_C0, begin(GIVEN, real).model.settings.scenario.y_Br_grasp + GIVEN.depth
     since = GIVEN.grasp_time * (1 + 1e-9)
     bounds = {
-        "x_d": Bounds(low=x_0 - TRAVEL, high=x_0 + TRAVEL, speed=SPEED["x_d"], after=since, shortest=config.shortest),
+        "x_d": Bounds(
+            low=x_0 - TRAVEL, high=x_0 + TRAVEL, speed=config.drives * SPEED["x_d"], after=since,
+            shortest=config.shortest,
+        ),
         "y_d": Bounds(
-            low=open_at - COMPRESSION[1], high=open_at - COMPRESSION[0], speed=SPEED["y_d"], after=since,
+            low=open_at - COMPRESSION[1], high=open_at - COMPRESSION[0], speed=config.drives * SPEED["y_d"], after=since,
             shortest=config.shortest,
         ),
     }  # fmt: skip
+    middle = 0.5 * (bounds["x_d"].low + bounds["x_d"].high)
+    guess = (  # a light grasp that slips, for friction, normal contact and rubber; long rolls of a deep one for K_t
+        Phase(1.0, {"x_d": ToAndFro(0.022, middle, 8e-3), "y_d": ToAndFro(0.02, open_at - LIGHT, 6e-4)}),
+        Phase(3.0, {"x_d": ToAndFro(0.073, middle, 20e-3), "y_d": ToAndFro(0.03, open_at - DEEP, 3e-4)}),
+    )  # fmt: skip
+    limits = {name: (config.drives * low, config.drives * high) for name, (low, high) in FORCE.items()}
     names, _ = chosen(plan, plan.coordinates.start, None)
     return design(
-        plan, "designed", bounds, limits=FORCE, criterion=Criterion("worst", tuple(half[name] for name in names)),
-        starts=config.starts, iterations=config.iterations, rtol=config.design_rtol, workers=config.workers, seed=config.seed,
+        plan, "designed", bounds, limits=limits, criterion=Criterion("worst", tuple(half[name] for name in names)),
+        phases=guess, starts=config.starts, iterations=config.iterations,
+        rtol=config.design_rtol, workers=config.workers, seed=config.seed,
         progress=True,
     )  # fmt: skip
 

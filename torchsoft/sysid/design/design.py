@@ -8,13 +8,13 @@ iteration takes one draw and one random shift, which makes the motion robust at 
 
 import time as clock
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
+import cma
 import numpy as np
 import torch
-from scipy.optimize import differential_evolution
 from scipy.stats import qmc
 from tqdm import tqdm
 
@@ -24,9 +24,10 @@ from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.design.criterion import VOLUME, Criterion
 from torchsoft.sysid.design.knots import Bounds, Moves, profile
 from torchsoft.sysid.design.planner import PRICE, Look, Planner, Range
-from torchsoft.sysid.design.zigzags import Zigzags
+from torchsoft.sysid.design.zigzags import PHASES, Phase, Zigzags
 from torchsoft.sysid.problem.problem import Problem
 from torchsoft.sysid.problem.recording import Array, Recording
+from torchsoft.threads import side_by_side, single_threaded
 
 RTOL = 1e-3
 """Relative tolerance of the runs: standard deviations are right to some percent."""
@@ -41,7 +42,23 @@ LOOK = 10
 """Iterations between two looks at the motion itself, with all draws and no random shift."""
 
 POPULATION = 24
+"""Motions that are tried at random, before others are bred from the best of them."""
+
+GENERATION = 12
 """Motions of one generation."""
+
+SPREAD = 0.2
+"""Standard deviation, of the first generation, of the numbers from 0 to 1 that motions are bred by."""
+
+GUESSED = 0.12
+"""The same where they begin with a guess."""
+
+FINALISTS = 6
+"""Best motions bred, of which that is taken which is best by finer runs: what one is worth varies with the steps, most where
+points slip, and the best of many by coarse runs is often a lucky one."""
+
+FINER = 0.1
+"""Tolerance of those runs, over that of the search."""
 
 HOPELESS = 1e3
 """What a motion that cannot be run counts in the evolution."""
@@ -65,6 +82,18 @@ class Visit:
     def score(self) -> float:
         """The criterion, and a price of excess."""
         return self.value + PRICE * max(0.0, self.peak - 1.0)
+
+
+class Tried(NamedTuple):
+    """Knots of a motion, with the look at it at the first point."""
+
+    moves: Moves
+    look: Look
+
+    @property
+    def worth(self) -> float:
+        """The criterion, and what excess costs."""
+        return self.look.value + self.look.cost
 
 
 @dataclass(frozen=True)
@@ -131,8 +160,8 @@ def draws(problem: Problem, count: int, *, spread: float | None = None, seed: in
 def design(
     problem: Problem, plan: str, bounds: Mapping[str, Bounds], *, limits: Mapping[str, Range] | None = None,
     criterion: Criterion = VOLUME, names: Sequence[str] | None = None, at: Sequence[Array] | None = None,
-    robust: Literal["mean", "worst"] = "mean", iterations: int = 100, starts: int = 1, rate: float = 0.03,
-    smoothing: float = 0.02, rtol: float = RTOL, seed: int = 0, workers: int = 1, progress: bool = False,
+    robust: Literal["mean", "worst"] = "mean", phases: Sequence[Phase] | int = PHASES, starts: int = 1, iterations: int = 100,
+    rate: float = 0.03, smoothing: float = 0.02, rtol: float = RTOL, seed: int = 0, workers: int = 1, progress: bool = False,
 ) -> Design:  # fmt: skip
     """Move the knots of the recording `plan` of a problem until the parameters `names` (all, by default) are known best.
 
@@ -143,8 +172,9 @@ def design(
     such as forces. `at` are points x of the coordinates (`draws`), by default the nominal one; the criterion's "mean" over them
     is lowered, or the "worst".
 
-    The search begins with the plan's own motion, or with the best of it and of `starts` - 1 others: `Zigzags`, random ones at
-    first, then what differential evolution breeds from them, judged at the first point. Each of the
+    The search begins with the plan's own motion, or with the best of it and of `starts` - 1 others, `Zigzags` of some
+    `phases`: what evolution (CMA-ES) breeds from the phases given, or from the best of random ones, judged at the first point,
+    the best few by finer runs. A guess that has every parameter in it spares hundreds of motions. Each of the
     `iterations` moves knots by at most about `rate` times what speed allows from one to the next, shifted at random by
     `smoothing` times that, and takes a run with sensitivities and 2 n with the adjoint, of relative tolerance `rtol`. A
     motion that cannot be run is left; with Ctrl-C the best so far is returned, with a notice. Raises `ValueError` for
@@ -152,8 +182,11 @@ def design(
     """
     if plan not in problem.names:
         raise ValueError(f"`plan` must be one of the recordings {list(problem.names)}, but is {plan!r}")
-    if iterations < 1 or starts < 1 or not 0 < rate <= 1 or not 0 <= smoothing <= 1:
-        raise ValueError("`iterations` and `starts` must be positive, `rate` and `smoothing` parts of 1")
+    parts = phases if isinstance(phases, int) else len(phases)
+    if min(iterations, starts - 1, parts - 1) < 0 or not 0 < rate <= 1 or not 0 <= smoothing <= 1:
+        raise ValueError(
+            "`starts` and `phases` must be positive, `iterations` not negative, `rate` and `smoothing` parts of 1"
+        )
     points, recording = (
         [problem.coordinates.start] if at is None else list(at),
         problem.recordings[problem.names.index(plan)],
@@ -168,6 +201,8 @@ def design(
             )
     began = clock.perf_counter()
     moves = Moves(recording.rig.reference, bounds, float(recording.times[-1]))
+    family = Zigzags(moves, parts)
+    guess = None if isinstance(phases, int) else family.numbers(phases)
     planner = Planner(problem, plan, moves, limits or {}, criterion, names, rtol, workers)
     search = Search(planner, points, robust, rate, smoothing, seed)
     first = search.begin()
@@ -179,7 +214,7 @@ def design(
             bar.update()
 
         try:
-            search.breed(starts - 1, tried)
+            search.breed(family, guess, starts - 1, tried)
             while search.iteration < iterations:
                 search.move(iterations)
                 bar.set_postfix_str(f"criterion {search.best.value:.3f}", refresh=False)
@@ -188,13 +223,14 @@ def design(
             notices = []
         except KeyboardInterrupt:
             notices = [f"interrupted after {search.iteration} of {iterations} iterations"]
-    last = search.seen
+    last, planner = search.seen, search.planner
     peaks = [f"{name} goes {part:.0%} of the way to its limits" for name, part in last.peaks.items() if part > 0.9]
     notices += [
         f"{name} goes beyond its limits, {part:.1%} of the way to them" for name, part in last.peaks.items() if part > 1
     ]
     bent = {name: float(np.abs(part).max()) for name, part in planner.bent(points[0], last).items()}
-    if (most := max(bent, key=lambda name: bent[name])) and bent[most] > BENT:
+    most = max(bent, key=lambda name: bent[name])
+    if bent[most] > BENT:
         notices.append(
             f"a fit on steps by rtol = {rtol:g} that begins a standard deviation from the truth ends {bent[most]:.2g} of "
             f"them from it in `{most}`: take finer steps, and count intervals that hold before this motion is used"
@@ -209,7 +245,8 @@ def design(
             "torchsoft": version("torchsoft"), "criterion": criterion.optimality, "targets": criterion.targets,
             "bounds": {name: one.model_dump() for name, one in bounds.items()}, "limits": dict(limits or {}),
             "draws": len(points), "robust": robust, "iterations": search.iteration, "starts": starts, "rate": rate,
-            "smoothing": smoothing, "rtol": rtol, "seed": seed, "runs": planner.runs, "gradients": planner.gradients,
+            "phases": phases if isinstance(phases, int) else [asdict(phase) for phase in phases],
+            "smoothing": smoothing, "rtol": rtol, "seed": seed, **planner.cost,
             "wall_s": clock.perf_counter() - began,
         },
     )  # fmt: skip
@@ -235,49 +272,61 @@ class Search:
 
     def set_out(self, moves: Moves, seen: Look) -> None:
         """From the motion of some knots on, by gradient."""
-        self.planner.moves, self.seen, self.z = moves, seen, moves.start
+        self.planner, self.seen, self.z = self.planner.of(moves), seen, moves.start
         self.now = torch.from_numpy(self.z.copy()).requires_grad_(True)
         self.adam = torch.optim.Adam([self.now], lr=self.rate, betas=MEMORY)
         self.best, _ = self.visit(self.z)
         self.history = [self.best]
 
-    def breed(self, count: int, tried: Callable[[float], None]) -> None:
-        """Tries so many zigzags, about, and sets out from the best if it is better than the motion given."""
-        given, seen, size = self.planner.moves, self.seen, min(count, POPULATION)
-        family, best = Zigzags(given), given
+    def breed(self, family: Zigzags, guess: Array | None, count: int, tried: Callable[[float], None]) -> None:
+        """Tries so many zigzags, about, near a guess (n,) if there is one, and sets out from the best if it is better than the
+        motion given."""
+        given, best = family.moves, [Tried(family.moves, self.seen)]
 
-        def worth(u: Array) -> float:
-            nonlocal best, seen
-            moves = Moves(family.reference(u), given.bounds, given.end)
-            self.planner.moves = moves
-            try:
-                there = self.planner.look(moves.start, self.points[0])
-            except SimulationFailed:
-                self.lost += 1
-                return HOPELESS
-            finally:
-                self.planner.moves = best
-                tried(seen.value)
-            if there.value + there.cost < seen.value + seen.cost:
-                self.planner.moves, best, seen = moves, moves, there
-            return there.value + there.cost
+        def judged(u: Array) -> list[float]:
+            """What the motions of numbers (k, n) are worth."""
+            moves = [Moves(family.reference(one), given.bounds, given.end) for one in u]
+            worth = np.full(len(u), HOPELESS)
+            for i, look in side_by_side(lambda i: self.tried(moves[i], None), len(moves), self.planner.workers):
+                if look is None:
+                    self.lost += 1
+                else:
+                    best.append(Tried(moves[i], look))
+                    worth[i] = best[-1].worth
+                    best[:] = sorted(best, key=lambda one: one.worth)[:FINALISTS]
+                tried(best[0].look.value)
+            return worth.tolist()
+
+        def evolved(some: Array) -> None:
+            """Breeds from the best of them."""
+            evolution: Any = cma.CMAEvolutionStrategy(
+                some[int(np.argmin(judged(some)))], SPREAD if guess is None else GUESSED,
+                {"bounds": [0, 1], "popsize": GENERATION, "seed": np.nan, "verbose": -9,
+                 "randn": lambda *shape: self.rng.standard_normal(shape)},
+            )  # fmt: skip
+            while count - len(some) - evolution.countevals >= GENERATION:
+                bred = evolution.ask()
+                evolution.tell(bred, judged(np.array(bred)))
 
         if count == 0:
             return
-        some = qmc.LatinHypercube(family.n, rng=self.rng).random(size)
+        with single_threaded():
+            try:
+                some = qmc.LatinHypercube(family.n, rng=self.rng).random(min(count, POPULATION))
+                evolved(some if guess is None else guess[None])
+                finals = [self.tried(one.moves, FINER * self.planner.rtol) for one in best]
+                worth = [np.inf if look is None else Tried(given, look).worth for look in finals]
+                best.insert(0, best[int(np.argmin(worth))])
+            finally:
+                if best[0].moves is not given:
+                    self.set_out(*best[0])
+
+    def tried(self, moves: Moves, rtol: float | None) -> Look | None:
+        """The look at a motion at the first point; None where it is lost."""
         try:
-            if count < 2 * size:
-                for u in some:
-                    worth(u)
-            else:
-                evolve: Any = differential_evolution  # its `init` may be an array
-                evolve(
-                    worth, [(0.0, 1.0)] * family.n, init=some, maxiter=count // size - 1, mutation=(0.3, 0.8),
-                    recombination=0.5, tol=0.0, polish=False, rng=self.rng,
-                )  # fmt: skip
-        finally:
-            if best is not given:
-                self.set_out(best, seen)
+            return self.planner.of(moves).look(moves.start, self.points[0], rtol)
+        except SimulationFailed:
+            return None
 
     def visit(self, z: Array) -> tuple[Visit, Look | None]:
         """What a motion is worth over all points, infinite where it is lost, and the look at it at the first."""

@@ -9,15 +9,17 @@ the difference along each x_j of what the discrete adjoint gives by the knots fo
 knots there are.
 
 A covariance is what a fit ends with if samples are linear in the parameters, as far as the intervals reach, and runs exact.
-Both fail where a motion is chaotic, whose sensitivities are large and no use. So phi is that of C + mean(e e'), e being the
-errors of one Gauss-Newton step that begins a standard deviation away; its derivative leaves e as it is. Where chaos is
+Both fail where a motion is chaotic, whose sensitivities are large and no use. So phi is that of C + mean(e e'), e being a part
+of the errors of one Gauss-Newton step that begins a standard deviation away; its derivative leaves e as it is. Where chaos is
 such that a small change of a parameter changes samples altogether, a motion is refused (`check_predictable`).
 """
 
-from collections.abc import Mapping, Sequence
-from copy import deepcopy
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from copy import copy, deepcopy
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
@@ -54,7 +56,7 @@ TRIED = 2
 """Points that are tried, each with signs of its own."""
 
 LEFT = 0.3
-"""Part of the errors there that counts: fits take finer steps than a search for motions."""
+"""Part of the errors there that the criterion counts: fits take finer steps than a search for motions."""
 
 PRICE = 5.0
 """What a sample at twice the way to a limit costs, in units of the criterion."""
@@ -93,7 +95,13 @@ class Planner:
         self._idle: list[Begun] = []
         self._pulls = [problem.noise[ch].whitener(self.recording.samples[ch][0]) if ch in problem.noise else None
                        for ch in problem.sensors if ch in self.recording.samples]  # fmt: skip
-        self.runs = self.gradients = 0
+        self.cost = Counter({"runs": 0, "gradients": 0})
+
+    def of(self, moves: Moves) -> Self:
+        """The same for motions of other knots; what it costs is counted together."""
+        other = copy(self)
+        other.moves = moves
+        return other
 
     def recorded(self, x: Array) -> Array:
         """A root (.., n) of the Fisher matrix of the other recordings. Raises `ValueError` where they are lost."""
@@ -109,24 +117,27 @@ class Planner:
             self._known[x.tobytes()] = np.linalg.qr(J)[1]
         return self._known[x.tobytes()]
 
-    def begun(self) -> Begun:
-        """The recording's rig, ready to run."""
-        return self._idle.pop() if self._idle else self.recording.begin()
+    @contextmanager
+    def _begun(self) -> Iterator[Begun]:
+        """The recording's rig, ready to run; not used again where a run fails."""
+        begun = self._idle.pop() if self._idle else self.recording.begin()
+        yield begun
+        self._idle.append(begun)
 
     def run(self, z: Array, x: Array, steps: Steps, free: NDArray[np.bool_] | None) -> tuple[Residuals, Prediction]:
-        """Residuals of the motion z at x, without those of the priors, and the run. Raises `SimulationFailed`."""
+        """Residuals of the motion z at x, the last of them those of the priors, and the run. Raises `SimulationFailed`."""
         p = self.problem
         by_name = {self.recording.name: steps} if isinstance(steps, Frozen) else steps
         (job,) = p.jobs(x, [self.recording.name], by_name, free)
-        begun = self.begun()
-        begun.rig.reference = self.moves.reference(torch.from_numpy(z))
-        run = predict(begun, job.values, self.grid, job.names, steps)
-        self._idle.append(begun)
-        self.runs += 1
+        with self._begun() as begun:
+            begun.rig.reference = self.moves.reference(torch.from_numpy(z))
+            run = predict(begun, job.values, self.grid, job.names, steps)
+        self.cost["runs"] += 1
         return p.gather(x, [job], [run]), run
 
     def look(self, z: Array, x: Array, steps: Steps | None = None) -> Look:
-        """The motion z at x; on `steps` that are given without the errors. Raises `SimulationFailed`."""
+        """The motion z at x, by the planner's tolerance or that of `steps`; on steps that are given without the errors. Raises
+        `SimulationFailed`."""
         c, given = self.problem.coordinates, self.rtol if steps is None else steps
         at, run = self.run(z, x, given, c.free)
         C = np.zeros((len(x), len(x)))
@@ -134,8 +145,8 @@ class Planner:
         _, T = chosen(self.problem, x, self.names)
         signals = Signals(run.t, self.recording.channels, run.signals, None)
         self.check_predictable(x, at.J, signals)
-        errors = self.errors(z, x, at, C, T) if steps is None else np.zeros((1, len(T)))
-        value, S = self.criterion(T @ C @ T.T + errors.T @ errors / len(errors))
+        errors = np.zeros((1, len(T))) if isinstance(given, Frozen) else self.errors(z, x, given, at, C, T)
+        value, S = self.criterion(T @ C @ T.T + LEFT**2 * errors.T @ errors / len(errors))
         reached = {name: np.abs(part) for name, part in self.reached(signals).items()}
         peaks = {name: float(part.max()) for name, part in reached.items()}
         cost = PRICE * sum(float(np.sum(np.maximum(part - MARGIN, 0.0) ** 2)) for part in reached.values())
@@ -160,7 +171,7 @@ class Planner:
                 )  # fmt: skip
             at += len(t)
 
-    def errors(self, z: Array, x: Array, at: Residuals, C: Array, T: Array) -> Array:
+    def errors(self, z: Array, x: Array, rtol: float, at: Residuals, C: Array, T: Array) -> Array:
         """How far (k, s) relative to the parameters a Gauss-Newton step without noise ends from the truth, that begins a
         standard deviation from it at points of different signs, on steps of their own: nothing where samples are linear over
         an interval, and steps fine enough; much where the motion is chaotic. Raises `SimulationFailed`."""
@@ -169,8 +180,8 @@ class Planner:
         for k in range(TRIED):
             signs = (-1.0) ** (np.arange(len(T)) // 2**k)
             off = np.clip(x + np.linalg.pinv(T) @ (signs * sd), low, high) - x
-            there, _ = self.run(z, x + off, self.rtol, None)
-            out.append(LEFT * (T @ C @ at.J.T @ (there.r - at.r - at.J @ off)))
+            there, _ = self.run(z, x + off, rtol, None)
+            out.append(T @ C @ at.J.T @ (there.r - at.r - at.J @ off))
         return np.array(out)
 
     def reached(self, signals: Signals) -> dict[str, Array]:
@@ -205,14 +216,14 @@ class Planner:
 
     def adjoint(self, z: Array, x: Array, steps: Steps, weights: Array) -> Array:
         """Slopes by z of weights (G, channels) on the signals of the run at x. Raises `SimulationFailed`."""
-        begun, variables = self.begun(), torch.tensor(z, requires_grad=True)
+        variables = torch.tensor(z, requires_grad=True)
         reference = self.moves.reference(variables)
-        y0 = prepared(begun, self.problem.values(x, self.k), ()).y0.detach()
-        run = simulate(begun.rig, self.grid.t, y0=y0, reference=reference, gradient="discrete", **choice(steps))
-        signals = run.together(*self.recording.channels)[self.grid.early :]
-        (slopes,) = torch.autograd.grad(signals, variables, torch.from_numpy(weights))
-        self._idle.append(begun)
-        self.gradients += 1
+        with self._begun() as begun:
+            y0 = prepared(begun, self.problem.values(x, self.k), ()).y0.detach()
+            run = simulate(begun.rig, self.grid.t, y0=y0, reference=reference, gradient="discrete", **choice(steps))
+            signals = run.together(*self.recording.channels)[self.grid.early :]
+            (slopes,) = torch.autograd.grad(signals, variables, torch.from_numpy(weights))
+        self.cost["gradients"] += 1
         return slopes.numpy()
 
     def pulled(self, x: Array, signals: Signals, w: Array) -> Array:
@@ -240,8 +251,8 @@ class Planner:
         return deviations(names, T, at.C)
 
     def bent(self, x: Array, at: Look) -> dict[str, Array]:
-        """The errors (k,) by parameter, over its standard deviation, in full."""
-        return {name: error / LEFT / sd for (name, sd), error in zip(self.deviations(x, at).items(), at.errors.T)}
+        """The errors (k,) by parameter, over its standard deviation."""
+        return {name: error / sd for (name, sd), error in zip(self.deviations(x, at).items(), at.errors.T)}
 
     def made(self, z: Array, x: Array, at: Look) -> Recording:
         """The recording that follows a motion, with the samples that its sensors would give without noise."""
