@@ -68,6 +68,7 @@ def test_pads_are_as_soft() -> None:
     np.testing.assert_allclose(compliance(OWN), C, rtol=0, atol=1e-10 * C.max())
 
 
+@pytest.mark.slow
 def test_motions_agree_with_equal_assumptions() -> None:
     """Halving the step halves the difference from torchsoft; of two runs extrapolated to no step at all, poses are within 1e-4
     of their ranges and rates and forces within 1e-3, slip of 0.1 m/s and touching and parting nodes included."""

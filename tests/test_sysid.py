@@ -118,6 +118,7 @@ def test_jacobian_of_either_kind_of_pads_at_the_start_of_a_grasp(fidelity: str) 
     np.testing.assert_allclose(gradient, at.J.T @ at.r, rtol=1e-8, atol=1e-8 * np.abs(gradient).max())
 
 
+@pytest.mark.slow
 def test_noise_free_data_give_the_truth_back_and_intervals_hold_it(strokes: Recording, shake: Recording) -> None:
     answer = identify(Problem([strokes, shake], SENSORS, four()), heldout=["shake"])
     for name in FOUR:

@@ -208,6 +208,7 @@ def found(problem: Problem) -> Design:
     )  # fmt: skip
 
 
+@pytest.mark.xdist_group("design")
 def test_a_designed_motion_tells_more(found: Design, problem: Problem) -> None:
     """What is predicted for it is what its recording's own Jacobian says."""
     assert all(found.after[name] < 0.9 * was for name, was in found.before.items())
@@ -222,6 +223,7 @@ def test_a_designed_motion_tells_more(found: Design, problem: Problem) -> None:
     assert found.table().count("\n") == 2
 
 
+@pytest.mark.xdist_group("design")
 def test_a_design_is_an_excitation_in_a_file(found: Design, tmp_path: Path) -> None:
     excitation, path = found.excitation(PLAN), tmp_path / "motion.toml"
     path.write_text(excitation.to_toml(), encoding="utf-8")
@@ -232,6 +234,7 @@ def test_a_design_is_an_excitation_in_a_file(found: Design, tmp_path: Path) -> N
     assert float(off[:, 2].abs().max()) < 1e-6  # a force that was solved for
 
 
+@pytest.mark.xdist_group("design")
 def test_a_design_has_a_picture(found: Design) -> None:
     assert len(design_figure(found).get_axes()) == 4
 
