@@ -279,5 +279,5 @@ def test_designed_motion_smoke(tmp_path: Path) -> None:
     assert max(one["ratio"] for one in summary["parameters"].values()) < 0.5
     assert summary["made_by"]["runs"] >= 5
     again = module.Excitation.from_toml(tmp_path / "motion.toml")
-    assert again.duration == module.DURATION
+    assert again.duration == module.Config().duration
     assert {"designed_motion.png", "motion.png", "table.md"} <= {path.name for path in tmp_path.iterdir()}
