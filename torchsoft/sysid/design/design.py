@@ -50,7 +50,7 @@ GENERATION = 12
 SPREAD = 0.2
 """Standard deviation, of the first generation, of the numbers from 0 to 1 that motions are bred by."""
 
-GUESSED = 0.06
+GUESSED = 0.03
 """The same where they begin with a guess."""
 
 FINALISTS = 6
