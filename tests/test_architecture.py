@@ -37,7 +37,7 @@ FLOWS = {
     "sysid.answer": "comparison estimate contribution recorded answer result .",
     "sysid.files": "columns configuration measured cost .",
     "sysid.report": "figures comparison_figure page sections report .",
-    "sysid.design": "criterion knots zigzags planner design design_figure .",
+    "sysid.design": "criterion knots zigzags planner search design design_figure .",
     "rigs": """
         fields recorded shapes materials bodies pads contacts network actuators motion outputs schema geometry build course
         finding balance check written template pictures run .
