@@ -39,7 +39,7 @@ from torchsoft.sysid.design.criterion import Criterion, chosen, deviations
 from torchsoft.sysid.design.design import Design, design
 from torchsoft.sysid.design.design_figure import design_figure
 from torchsoft.sysid.design.knots import Bounds
-from torchsoft.sysid.design.zigzags import Phase, ToAndFro
+from torchsoft.sysid.design.zigzags import PHASES, Phase, ToAndFro
 from torchsoft.sysid.fit.information import fisher
 from torchsoft.sysid.problem.workers import Runner
 from torchsoft.threads import side_by_side
@@ -160,7 +160,7 @@ def search(truth: dict[str, float], real: Parameters, half: dict[str, float], co
     names, _ = chosen(plan, plan.coordinates.start, None)
     return design(
         plan, "designed", bounds, limits=FORCE, criterion=Criterion("worst", tuple(half[name] for name in names)),
-        phases=guess, starts=config.starts, iterations=config.iterations,
+        phases=PHASES if config.smoke else guess, starts=config.starts, iterations=config.iterations,
         rtol=config.design_rtol, workers=config.workers, seed=config.seed,
         progress=True,
     )  # fmt: skip

@@ -35,12 +35,12 @@ BOUNDS = {
 SENSORS = {name: RIG[name] for name in ("x_C", "theta", "y_Br", "F_x", "F_y")}
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def plan() -> Recording:
     return record("plan", PLAN, P, P, SENSORS, rtol=1e-3, noise=0.0)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def problem(plan: Recording) -> Problem:
     return Problem([plan], SENSORS, {"pad.E": Unknown(), "contact.K_n": Unknown()})
 
@@ -200,7 +200,7 @@ def test_bounds_and_criteria_are_checked() -> None:
         Criterion("A", (1.0, 0.0))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def found(problem: Problem) -> Design:
     return design(
         problem, "plan", BOUNDS, limits={"F_y": (-60.0, 60.0)}, at=draws(problem, 2, spread=0.1), iterations=10, rate=0.3,
