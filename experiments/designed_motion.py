@@ -120,6 +120,7 @@ def smoke(config: Config) -> Config:
 
 
 def given(config: Config) -> Excitation:
+    """What the search begins with."""
     return GIVEN.model_copy(update={"duration": config.duration})
 
 
@@ -144,10 +145,7 @@ def search(truth: dict[str, float], real: Parameters, half: dict[str, float], co
     x_0, open_at = GIVEN.x_C0, begin(given(config), real).model.settings.scenario.y_Br_grasp + GIVEN.depth
     since = GIVEN.grasp_time * (1 + 1e-9)
     bounds = {
-        "x_d": Bounds(
-            low=x_0 - TRAVEL, high=x_0 + TRAVEL, speed=SPEED["x_d"], after=since,
-            shortest=config.shortest,
-        ),
+        "x_d": Bounds(low=x_0 - TRAVEL, high=x_0 + TRAVEL, speed=SPEED["x_d"], after=since, shortest=config.shortest),
         "y_d": Bounds(
             low=open_at - COMPRESSION[1], high=open_at - COMPRESSION[0], speed=SPEED["y_d"], after=since,
             shortest=config.shortest,

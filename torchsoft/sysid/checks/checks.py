@@ -182,16 +182,9 @@ class Judge:
                      float("inf"), 0.0, unchecked=reason)  # fmt: skip
 
     def made(
-        self,
-        one: Assumption,
-        moves: Array,
-        gain: float,
-        left: float,
-        asked: float,
-        asked_sd: float,
-        rest: float,
+        self, one: Assumption, moves: Array, gain: float, left: float, asked: float, asked_sd: float, rest: float,
         pattern: float,
-    ) -> Check:
+    ) -> Check:  # fmt: skip
         """Of a variation that leaves a sum of squares `left`, a misfit `rest` per sample."""
         by_label = dict(zip(self.labels, moves.tolist()))
         return Check(one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, by_label, gain, left, asked, asked_sd,

@@ -6,7 +6,7 @@ criterion smoothed over small random motions and over draws of the parameters, b
 iteration takes one draw and one random shift, which makes the motion robust at no further cost.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -119,7 +119,7 @@ class Search:
             """What the motions of numbers (k, n) are worth."""
             moves = [Moves(family.reference(one), given.bounds, given.end) for one in u]
             worth = np.full(len(u), HOPELESS)
-            for i, look in side_by_side(lambda i: self.tried(moves[i], None), len(moves), self.planner.workers):
+            for i, look in self.looks(moves, None):
                 if look is None:
                     self.lost += 1
                 else:
@@ -146,12 +146,17 @@ class Search:
             try:
                 some = qmc.LatinHypercube(family.n, rng=self.rng).random(min(count, POPULATION))
                 evolved(some if guess is None else guess[None])
-                finals = [self.tried(one.moves, FINER * self.planner.rtol) for one in best]
-                worth = [np.inf if look is None else Tried(given, look).worth for look in finals]
+                worth = np.full(len(best), np.inf)
+                for i, look in self.looks([one.moves for one in best], FINER * self.planner.rtol):
+                    worth[i] = np.inf if look is None else Tried(given, look).worth
                 best.insert(0, best[int(np.argmin(worth))])
             finally:
                 if best[0].moves is not given:
                     self.set_out(*best[0])
+
+    def looks(self, moves: Sequence[Moves], rtol: float | None) -> Iterator[tuple[int, Look | None]]:
+        """`tried` of some motions, by number, in the order of their ends."""
+        return side_by_side(lambda i: self.tried(moves[i], rtol), len(moves), self.planner.workers)
 
     def tried(self, moves: Moves, rtol: float | None) -> Look | None:
         """The look at a motion at the first point; None where it is lost."""
