@@ -31,7 +31,7 @@ FLOWS = {
     """,
     "sysid.fit": "information robust fit plan stages settle .",
     "sysid.conventions": "finding closed_loop loops setpoints conventions .",
-    "sysid.checks": "misfit colour assumptions variation checks .",
+    "sysid.checks": "parts misfit colour assumptions variation checks .",
     "sysid.laws": "evidence pattern compare .",
     "sysid.certainty": "optimum profile summary posterior nuts calibration .",
     "sysid.answer": "comparison estimate contribution recorded answer result .",

@@ -11,7 +11,7 @@ from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
 from torchsoft.sysid.checks.colour import rewhitened
-from torchsoft.sysid.checks.misfit import parts
+from torchsoft.sysid.checks.parts import parts
 from torchsoft.sysid.problem.noise import Autoregression
 from torchsoft.sysid.problem.workers import Runner
 

@@ -17,7 +17,7 @@ from torchsoft import Parameters, Profile, Reference, SoftGrasp
 from torchsoft.excitation import Excitation, Roll, Strokes
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, record
 from torchsoft.sysid.answer.comparison import LawFit, Versus, judged
-from torchsoft.sysid.checks.misfit import Part
+from torchsoft.sysid.checks.parts import Part
 from torchsoft.sysid.laws.compare import compare, versus
 from torchsoft.sysid.laws.evidence import Density, density, ratio
 from torchsoft.sysid.laws.pattern import Motion, shortest

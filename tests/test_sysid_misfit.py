@@ -8,7 +8,8 @@ from scipy import signal, stats
 from test_sysid_noise import made
 
 from torchsoft.sysid.checks.colour import colour_notices, colours, correlation
-from torchsoft.sysid.checks.misfit import LEVEL, Part, Verdict, autocorrelation, holm, judge, notices, whiteness
+from torchsoft.sysid.checks.misfit import LEVEL, Verdict, autocorrelation, holm, judge, notices, whiteness
+from torchsoft.sysid.checks.parts import Part
 from torchsoft.sysid.problem.noise import Autoregression
 
 H = 5e-3
@@ -40,7 +41,7 @@ class Case:
                 e = rng.standard_normal(m) if self.noise is None else made(self.noise, m, rng)
                 columns.append(signal.lfilter(*filtered, rng.standard_normal((m + 200, 4)), axis=0)[200:])
                 rows.append(self.scale * e + self.fault.get((f"run {k}", channel), 0.0))
-                known.append((f"run {k}", channel, np.arange(m) * H, slice(at, at + m), reading))
+                known.append((f"run {k}", channel, np.arange(m) * H, np.arange(at, at + m), reading))
                 at += m
         W = [None if self.assumed is None else self.assumed.whitener(t) for _, _, t, _, _ in known]
         J = np.concatenate([j if w is None else w @ j for w, j in zip(W, columns)])
@@ -185,10 +186,16 @@ def test_an_outlier_is_named_with_its_time_and_expected_of_a_robust_loss() -> No
 
 def test_saturated_samples_and_ends_that_cannot_be_tested() -> None:
     parts, r, J = Case(0).fitted()
-    quiet = np.where(np.arange(len(r)) % 3 == 0, 0.0, r)  # a third is saturated, as the model says
-    some = [p._replace(raw=quiet[p.rows]) for p in parts]
-    assert not alarms(judge(some, quiet, np.where((quiet == 0)[:, None], 0.0, J)), "level")
-    short = judge([p._replace(t=p.t[:3], rows=slice(3 * i, 3 * i + 3), raw=p.raw[:3], reading=p.reading[:3])
+    quiet = np.where(np.arange(len(r)) % 3 == 0, 0.0, r)  # a third is saturated, far beyond the range
+    some = []
+    for p in parts:
+        inside = p.rows % 3 != 0
+        some.append(
+            p._replace(t=p.t[inside], rows=p.rows[inside], raw=p.raw[inside], reading=p.reading[inside], saturated=100)
+        )
+    assert not [f for f in judge(some, quiet, np.where((quiet == 0)[:, None], 0.0, J)) if f.alarming]
+    assert not colours(some, J)
+    short = judge([p._replace(t=p.t[:3], rows=np.arange(3 * i, 3 * i + 3), raw=p.raw[:3], reading=p.reading[:3])
                    for i, p in enumerate(parts)], r[:18], np.zeros((18, 4)))  # fmt: skip
     assert not [f for f in short if f.alarming]
 

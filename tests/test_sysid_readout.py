@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 from conftest import COARSE
+from scipy import stats
+from scipy.optimize import least_squares
 
 from torchsoft import (
     Body,
@@ -25,6 +27,8 @@ from torchsoft import (
 )
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import AtRest, Known, Prior, Problem, Recording, Sensor, Stage, Unknown, identify, record
+from torchsoft.sysid.checks.parts import CLEAR, parts, predicted
+from torchsoft.sysid.problem.readout import Readout
 from torchsoft.sysid.problem.workers import Runner
 
 BASE = Parameters().override(COARSE)
@@ -63,7 +67,7 @@ def test_every_kind_of_coordinate_has_its_derivative(strokes: Recording) -> None
     _, steps = problem.freeze(runner, x, problem.names, 1e-4, c.free)
     at = problem.residuals(runner, x, problem.names, steps, c.free)
     assert len(at.r) == problem.samples() + 3  # of the priors, the place's own among them
-    assert (at.r[: problem.samples()] == 0).any()  # of saturated samples
+    assert any(one.saturated(strokes.samples[channel][1]).any() for channel, one in FAULTY.items())
     for i, label in enumerate(c.labels):
         h = 1e-5 * np.eye(len(c))[i]
         ahead, behind = (problem.residuals(runner, x + s * h, problem.names, steps).r for s in (1, -1))
@@ -141,3 +145,57 @@ def test_another_rig_is_identified_by_its_own_names(jaws: Rig) -> None:
         replace(data, samples={"x_C": samples["x_disc"]})
     with pytest.raises(ValueError, match="only the paper's rig has a rest of its own"):
         Problem([replace(data, start=AtRest())], sensors, unknowns)
+
+
+def test_saturated_samples_have_tobins_likelihood() -> None:
+    """An amplitude, of which a sensor cuts a third off: its likelihood is that of the normal distribution function, and with
+    many seeds errors are standard normal."""
+    t, limit, noise = np.arange(200) * 5e-3, 0.9, 0.1
+    shape, z = np.sin(4 * np.pi * t), []
+    one = Readout("F_x", noise, -limit, limit, 1.0, 0.0, 0.0, 0.0, 0.0, ())
+    for seed in range(200):
+        y = np.clip(shape + noise * np.random.default_rng(seed).standard_normal(len(t)), -limit, limit)
+        fit = least_squares(
+            lambda a, y=y: one.residuals(a * shape, y)[0], [1.0],
+            jac=lambda a, y=y: (one.residuals(a * shape, y)[1] * shape)[:, None],
+        )  # fmt: skip
+        z.append((fit.x[0] - 1.0) * float(np.linalg.norm(fit.jac)))
+        if seed < 3:
+            expected = 1.02 * shape
+            mine = np.where(
+                np.abs(y) < limit, stats.norm.logpdf((y - expected) / noise) + 0.5 * np.log(2 * np.pi),
+                stats.norm.logsf((limit - np.sign(y) * expected) / noise),
+            )  # fmt: skip
+            np.testing.assert_allclose(-0.5 * one.residuals(expected, y)[0] ** 2, mine, rtol=1e-9, atol=1e-12)
+    assert abs(np.mean(z)) < 3 / len(z) ** 0.5
+    assert stats.kstest(z, "norm").pvalue > 0.01
+    far, slope = one.residuals(np.array([50.0, -50.0]), np.array([limit, -limit]))
+    assert not far.any()
+    assert not slope.any()
+
+
+def test_saturated_samples_cannot_have_coloured_noise(strokes: Recording) -> None:
+    sensors = {"F_x": Sensor(noise=0.1, high=float(strokes.samples["F_x"][1].max()), colour="ar")}
+    with pytest.raises(ValueError, match=r"sensors\.F_x: in `strokes` samples are at its `low` or `high`"):
+        Problem([strokes], sensors, {"pad.E": Unknown()})
+
+
+def test_what_saturation_has_changed_is_not_judged(strokes: Recording) -> None:
+    """Noise as stated and a sensor that is saturated most of the time: residuals near its range's end are not normal, those
+    well inside are; and one far from the prediction counts wherever it is."""
+    t, y = strokes.samples["F_x"]
+    limit = float(np.quantile(np.abs(y), 0.4))
+    noise = limit / 20
+    sensor, rng = Sensor(noise=noise, low=-limit, high=limit), np.random.default_rng(0)
+    measured = np.clip(y + noise * rng.standard_normal(len(t)), -limit, limit)
+    measured[np.argmax(y)] = 0.0  # a sample that is lost
+    cut = replace(strokes, samples={"F_x": (t, measured)})
+    problem = Problem([cut], {"F_x": sensor}, {"pad.E": Unknown()})
+    r, _ = Readout("F_x", noise, -limit, limit, 1.0, 0.0, 0.0, 0.0, 0.0, ()).residuals(y, measured)
+    (part,) = parts(problem, r, ["strokes"])
+    assert part.saturated > 0.5 * len(t)
+    inside = np.flatnonzero(np.abs(y) < limit - CLEAR * noise)
+    assert set(part.rows) == {*inside, int(np.argmax(y))}
+    np.testing.assert_allclose(part.reading, y[part.rows], rtol=1e-6)
+    near = np.abs(y) < limit + CLEAR * noise
+    np.testing.assert_allclose(predicted(sensor, measured, r)[near], y[near], rtol=1e-5, atol=1e-6)

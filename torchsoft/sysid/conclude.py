@@ -11,6 +11,7 @@ from torchsoft.sysid.answer.estimate import directions, estimates, nrmse, residu
 from torchsoft.sysid.answer.result import IdentificationResult, described
 from torchsoft.sysid.checks import checks, misfit
 from torchsoft.sysid.checks.colour import Coloured, colour_notices, rewhitened
+from torchsoft.sysid.checks.parts import parts
 from torchsoft.sysid.fit import robust
 from torchsoft.sysid.fit.fit import Notify
 from torchsoft.sysid.fit.information import fisher
@@ -55,9 +56,12 @@ def conclude(
         stages = [*stages, stage_entry(name, stage, by, one, start)]
     J = at.J[:, free]
     C_free, values, vectors = fisher(J)
-    chi2 = float(at.r @ at.r) / max(len(at.r) - int(free.sum()), 1)
+    left = parts(problem, at.r, stage.recordings)
+    exact = np.concatenate([np.arange(0), *(part.rows for part in left)])  # not saturated
+    rows = np.append(exact, np.arange(len(at.r) - len(c.priors), len(at.r)))
+    chi2 = float(at.r[rows] @ at.r[rows]) / max(len(rows) - int(free.sum()), 1)
     verdicts = misfit.judge(
-        misfit.parts(problem, at.r, stage.recordings), at.r, J, robust=how.loss != "linear",
+        left, at.r, J, robust=how.loss != "linear",
         priors=[c.labels[i] for i, _ in c.priors],
     )  # fmt: skip
     declared = [name for name, one in problem.sensors.items() if one.colour == "ar"]
@@ -68,7 +72,9 @@ def conclude(
         with progress_bar("check of what is taken for granted", progress) as notify:
             checked = taken_for_granted(coloured, runner, end, stage, free, doubtful, how.loss, notify)
     C, shift = np.zeros((len(x), len(x))), np.zeros(len(x)) if end.bias is None else end.bias
-    C_fit = C_free * max(1.0, chi2) if how.loss == "linear" else robust.covariance(J, at.r, how.loss, len(c.priors))
+    C_fit = (
+        C_free * max(1.0, chi2) if how.loss == "linear" else robust.covariance(J, at.r, how.loss, len(c.priors), exact)
+    )
     C[np.ix_(free, free)] = C_fit + (checked.widening() if checked is not None else 0.0)
     labels = [label for label, one in zip(c.labels, free) if one]
     found = estimates(problem, x, free, C, shift)
@@ -125,11 +131,11 @@ def taken_for_granted(
     problem, which = coloured.problem, stage.recordings
     declared = {channel: noise for channel, noise in problem.noise.items() if problem.sensors[channel].colour == "ar"}
     plain = problem.with_noise(declared)
-    finer = rewhitened(plain, end.finer, misfit.parts(problem, end.finer.r, which))
+    finer = rewhitened(plain, end.finer, parts(problem, end.finer.r, which))
     how: dict[str, Any] = {"workers": runner.workers, "journal": runner.folder, "notify": notify}
     found = checks.check(plain, end.x, finer, free, which, end.rtol, doubtful=doubtful, loss=loss, **how)
     rows = Residuals(found.columns[:, 0] if found.columns.size else finer.r, found.columns, {})
-    columns: Array = rewhitened(problem, rows, misfit.parts(plain, rows.r, which)).J
+    columns: Array = rewhitened(problem, rows, parts(plain, rows.r, which)).J
     return found._replace(columns=columns, J=end.at.J[:, free])
 
 

@@ -12,6 +12,7 @@ from scipy import stats
 from torchsoft import channels
 from torchsoft.parameters import Parameters
 from torchsoft.sysid.checks.misfit import whiteness
+from torchsoft.sysid.checks.parts import parts
 from torchsoft.sysid.problem.problem import Problem, Residuals
 from torchsoft.sysid.problem.recording import Array
 from torchsoft.sysid.problem.start import PREFIX
@@ -65,8 +66,8 @@ class Direction:
 
 @dataclass(frozen=True)
 class ChannelResiduals:
-    """Residuals of one channel in one recording, over the noise and whitened: their rms, the first autocorrelation, and the
-    Ljung-Box p-value of their whiteness."""
+    """Residuals of one channel in one recording, over the noise and whitened, without what saturation has changed: their rms,
+    the first autocorrelation, and the Ljung-Box p-value of their whiteness."""
 
     recording: str
     channel: str
@@ -181,19 +182,24 @@ def split(problem: Problem, r: Array, which: list[str]) -> dict[tuple[str, str],
 
 
 def nrmse(problem: Problem, r: Array, which: list[str]) -> dict[str, dict[str, float]]:
-    """RMS residual over the range of what was measured, by recording and channel."""
+    """RMS residual over the range of what was measured, by recording and channel, without what saturation has changed."""
     out: dict[str, dict[str, float]] = {name: {} for name in which}
     measured = {recording.name: recording.samples for recording in problem.recordings}
-    for (name, channel), part in split(problem, r, which).items():
-        y = measured[name][channel][1]
-        rms = float(np.sqrt(np.mean(part**2))) * problem.sensors[channel].noise
-        out[name][channel] = rms / max(float(np.ptp(y)), 1e-300)
+    for part in parts(problem.with_noise({}), r, which):
+        y = measured[part.recording][part.channel][1]
+        rms = float(np.sqrt(np.mean(part.raw**2))) * problem.sensors[part.channel].noise
+        out[part.recording][part.channel] = rms / max(float(np.ptp(y)), 1e-300)
     return out
 
 
 def residual_channels(problem: Problem, residuals: Residuals, which: list[str]) -> list[ChannelResiduals]:
     orders = {channel: noise.order for channel, noise in problem.noise.items()}
     return [
-        ChannelResiduals(name, channel, float(np.sqrt(np.mean(r**2))), *whiteness(r, orders.get(channel, 0)))
-        for (name, channel), r in split(problem, residuals.r, which).items()
+        ChannelResiduals(
+            part.recording,
+            part.channel,
+            float(np.sqrt(np.mean((r := residuals.r[part.rows]) ** 2))),
+            *whiteness(r, orders.get(part.channel, 0)),
+        )
+        for part in parts(problem, residuals.r, which)
     ]

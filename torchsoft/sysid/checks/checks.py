@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from torchsoft.sysid.checks.assumptions import FAULTS, Assumption, Kind, assumptions
-from torchsoft.sysid.checks.misfit import LEVEL, parts
+from torchsoft.sysid.checks.misfit import LEVEL
+from torchsoft.sysid.checks.parts import parts
 from torchsoft.sysid.checks.variation import End, Refit, difference, ended, refit
 from torchsoft.sysid.fit.fit import Notify
 from torchsoft.sysid.fit.information import fisher, shift, standard_deviations
@@ -169,7 +170,7 @@ class Judge:
         self.sd = standard_deviations(self.J)
         self.labels = [label for label, one in zip(problem.coordinates.labels, end.free) if one]
         self.places = [part.rows for part in parts(problem, self.r, end.which)]
-        self.dof = max(len(self.r) - len(self.labels), 1)
+        self.dof = max(sum(map(len, self.places)) - len(self.labels), 1)
         self.square = float(self.r @ self.r)
 
     def explained(self, checks: Iterable[Check]) -> bool:
@@ -227,7 +228,7 @@ class Judge:
         return replace(self.made(one, moves / self.sd, gain, left, asked, sd, rest, pattern), refitted=True)
 
 
-def pattern_of(places: Sequence[slice], left: Array, r: Array) -> float:
+def pattern_of(places: Sequence[NDArray[np.int_]], left: Array, r: Array) -> float:
     """What is left of the autocovariances of residuals r beyond those of white noise, by the root of the sum of their squares;
     0 where r has none beyond chance."""
 

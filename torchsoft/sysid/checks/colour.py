@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.sparse.linalg import spsolve_triangular
 
-from torchsoft.sysid.checks.misfit import FAINT, LEVEL, Part, named, parts
+from torchsoft.sysid.checks.misfit import FAINT, LEVEL, named
+from torchsoft.sysid.checks.parts import Part, parts
 from torchsoft.sysid.fit.fit import Fit, settled
 from torchsoft.sysid.problem.noise import Autoregression, NoiseFit, fit_noise
 from torchsoft.sysid.problem.problem import Problem, Residuals
@@ -73,12 +74,15 @@ def colours(parts: Sequence[Part], J: Array, declared: Sequence[str] = ()) -> di
     """The noise of channels whose residuals, all recordings together, are not white, by channel; J (m, n) is the Jacobian.
 
     White noise is refused by the ratio of likelihoods, at `LEVEL` for all channels and orders together; that of `declared`
-    channels by the Bayesian criterion alone. Noise is never taken to be less than the sensor states.
+    channels by the Bayesian criterion alone. Noise is never taken to be less than the sensor states. That of channels with
+    saturated samples stays white: what their residuals have of colour is a verdict, with its sentence.
     """
     Q, out = np.linalg.qr(J)[0], {}
     channels = list(dict.fromkeys(part.channel for part in parts))
     for channel in channels:
         mine = [part for part in parts if part.channel == channel]
+        if any(part.saturated for part in mine):
+            continue
         if float(np.mean(np.concatenate([part.raw for part in mine]) ** 2)) < FAINT**2:
             continue
         fitted = sum(float(np.sum(Q[part.rows] ** 2)) for part in mine)

@@ -16,18 +16,15 @@ identifications. What the noise was allowed to explain is not tested again: colo
 colour that was found unasked is one, although intervals allow for it, because a sensor may have made it, or a wrong model.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 from scipy import stats
 from scipy.interpolate import CubicSpline
-from scipy.sparse.linalg import spsolve_triangular
 
-from torchsoft.sysid.problem.noise import Autoregression
-from torchsoft.sysid.problem.problem import Problem
+from torchsoft.sysid.checks.parts import Part
 from torchsoft.sysid.problem.recording import Array
 
 LEVEL = 0.01
@@ -50,44 +47,6 @@ MEDIAN = 0.37
 """How many residuals tell the level as exactly, by their squares, as one residual does by the median of all."""
 
 Test = Literal["level", "white", "motion", "channels", "outliers", "priors"]
-
-
-class Part(NamedTuple):
-    """One channel of one recording at the fit: sample times t (m,) [s], the rows of r and J that are its own, the residuals
-    `raw` (m,) over the noise that the sensor states, the `reading` (m,) that the model predicts [unit], the noise that is
-    assumed (white as stated, if None), whether its level was `found` from such residuals, and what whitens (m,) or (m, k)."""
-
-    recording: str
-    channel: str
-    t: Array
-    rows: slice
-    raw: Array
-    reading: Array
-    noise: Autoregression | None = None
-    found: bool = False
-    whitened: Callable[[Array], Array] = lambda rows: rows
-
-    @property
-    def name(self) -> str:
-        """As sentences name it."""
-        return f"{self.channel} of `{self.recording}`"
-
-
-def parts(problem: Problem, r: Array, which: Sequence[str]) -> list[Part]:
-    """The parts of residuals r of `Problem.residuals`, whitened by the problem's noise."""
-    out, at = [], 0
-    for recording in problem.recordings:
-        for channel, sensor in problem.sensors.items() if recording.name in which else ():
-            if channel not in recording.samples:
-                continue
-            t, measured = recording.samples[channel]
-            rows, noise = slice(at, at + len(t)), problem.noise.get(channel)
-            raw = r[rows] if noise is None else spsolve_triangular(noise.whitener(t), r[rows])
-            reading, found = measured + sensor.noise * raw, noise is not None
-            whitened = partial(problem.whitened, recording, channel)
-            out.append(Part(recording.name, channel, t, rows, raw, reading, noise, found, whitened))
-            at += len(t)
-    return out
 
 
 @dataclass(frozen=True)
@@ -161,9 +120,9 @@ def level(part: Part, r: Array, Q: Array, robust: bool) -> tuple[Verdict, float,
     """
     raw = part.found and part.noise is not None
     rows = part.raw if raw else r[part.rows]
-    n = int(np.count_nonzero(part.raw))  # a saturated sample that is explained says nothing
-    free = max(1.0 - float(np.sum(Q[part.rows] ** 2)) / max(n, 1), 1 / max(n, 1))  # what the fit left of them
-    mean, worth = float(rows @ rows) / max(n, 1), float(n)
+    n = len(rows)
+    free = max(1.0 - float(np.sum(Q[part.rows] ** 2)) / n, 1 / n)  # what the fit left of them
+    mean, worth = float(rows @ rows) / n, float(n)
     if robust:
         mean, worth = (float(np.median(np.abs(rows))) / float(stats.norm.ppf(0.75))) ** 2, MEDIAN * n
     if raw and part.noise is not None:
@@ -272,7 +231,8 @@ def outliers(part: Part, r: Array) -> Verdict:
 
 def together(recording: str, parts: Sequence[Part], r: Array, Q: Array) -> list[Verdict]:
     """Do residuals of different channels, where they are sampled at the same times, have something in common (Bartlett)?"""
-    alike = [p for p in parts if np.array_equal(p.t, parts[0].t) and float(np.mean(p.raw**2)) >= FAINT**2]
+    longest = max((p.t for p in parts), key=len)
+    alike = [p for p in parts if np.array_equal(p.t, longest) and float(np.mean(p.raw**2)) >= FAINT**2]
     k = len(alike)
     if k < 2:
         return []

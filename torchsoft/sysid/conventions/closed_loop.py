@@ -149,8 +149,7 @@ def sampled(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> S
     if own not in recording.samples or own not in sensors:
         return None
     one, (t, y) = sensors[own], recording.samples[own]
-    low, high = -np.inf if one.low is None else one.low, np.inf if one.high is None else one.high
-    clean = one.inertia == 0 and one.misalignment == 0 and low < y.min() and y.max() < high and len(t) > 3
+    clean = one.inertia == 0 and one.misalignment == 0 and not one.saturated(y).any() and len(t) > 3
     return Signal(own, t, y, one) if clean else None
 
 

@@ -97,12 +97,7 @@ def findings(
 def samples(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> tuple[Array, Array]:
     """Times and values of a channel, without those that are saturated."""
     t, y = recording.samples[name]
-    sensor = sensors[name]
-    inside = np.full(len(t), True)
-    if sensor.low is not None:
-        inside &= y > sensor.low
-    if sensor.high is not None:
-        inside &= y < sensor.high
+    inside = ~sensors[name].saturated(y)
     return t[inside], y[inside]
 
 

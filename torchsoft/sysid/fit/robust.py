@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from torchsoft.sysid.fit.information import fisher
 from torchsoft.sysid.problem.recording import Array
@@ -52,18 +53,20 @@ def spared(loss: Loss, priors: int) -> Callable[[Array], Array]:
     return rows
 
 
-def covariance(J: Array, r: Array, loss: Loss, priors: int = 0) -> Array:
+def covariance(J: Array, r: Array, loss: Loss, priors: int = 0, exact: NDArray[np.int_] | None = None) -> Array:
     """Of the coordinates (n, n) where a robust fit has ended: J (m, n) and residuals r (m,) there, the last rows `priors`.
 
     With psi = rho' r, A = E[psi'] J'J and B = E[psi^2] J'J, both with the priors' own J'J, it is A^-1 B A^-1; expectations are
-    means over the residuals, that of psi^2 over the degrees of freedom. They are not taken below what Gaussian noise as stated
+    means over the residuals, that of psi^2 over the degrees of freedom; over those `exact` (k,) only, where some samples are
+    saturated. They are not taken below what Gaussian noise as stated
     gives, 1 over the loss's efficiency. Raises `ValueError` where so many residuals are outliers that nothing holds the
     estimates.
     """
     m, n = len(r) - priors, J.shape[1]
-    z = (r[:m] / REACH[loss]) ** 2
+    own = r[:m] if exact is None else r[exact]
+    z = (own / REACH[loss]) ** 2
     _, first, second = rho(loss, z)
-    slope, power = float(np.mean(first + 2 * z * second)), float(np.sum((first * r[:m]) ** 2)) / max(m - n, 1)
+    slope, power = float(np.mean(first + 2 * z * second)), float(np.sum((first * own) ** 2)) / max(len(own) - n, 1)
     if slope <= 0:
         raise ValueError(
             f"the loss `{loss}` holds on to nothing: most residuals count as outliers; state more noise, or take another loss"

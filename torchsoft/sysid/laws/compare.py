@@ -10,7 +10,8 @@ from scipy import stats
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.answer.comparison import Comparison, LawFit, Series, Versus, judged
 from torchsoft.sysid.checks.colour import ROUNDS, colours
-from torchsoft.sysid.checks.misfit import notices, parts
+from torchsoft.sysid.checks.misfit import notices
+from torchsoft.sysid.checks.parts import parts
 from torchsoft.sysid.fit.fit import Fit, Unreachable, gauss_newton
 from torchsoft.sysid.fit.plan import Stage, default_plan
 from torchsoft.sysid.fit.settle import FINER

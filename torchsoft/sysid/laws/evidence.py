@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.sparse.linalg import spsolve_triangular
 
-from torchsoft.sysid.checks.misfit import Part, judge, parts
+from torchsoft.sysid.checks.misfit import judge
+from torchsoft.sysid.checks.parts import Part, parts
 from torchsoft.sysid.fit.fit import Unreachable
 from torchsoft.sysid.fit.settle import FINER
 from torchsoft.sysid.problem.noise import Autoregression, fit_noise, log_det
@@ -32,7 +33,12 @@ class Density(NamedTuple):
     @property
     def p(self) -> float:
         """Of as large a sum of squares."""
-        return float(stats.chi2.sf(self.r @ self.s, len(self.r)))
+        return float(stats.chi2.sf(self.r @ self.s, self.samples))
+
+    @property
+    def samples(self) -> int:
+        """Those that saturation has not changed."""
+        return sum(len(part.t) for part in self.parts)
 
 
 def density(problem: Problem, which: Sequence[str], r: Array, spread: Array | None = None) -> Density:
@@ -41,9 +47,9 @@ def density(problem: Problem, which: Sequence[str], r: Array, spread: Array | No
     if spread is not None:
         inner = np.eye(spread.shape[1]) + spread.T @ spread
         s, wider = r - spread @ np.linalg.solve(inner, spread.T @ r), float(np.linalg.slogdet(inner)[1])
-    log = -0.5 * (float(r @ s) + wider + len(r) * np.log(2 * np.pi))
+    log = -0.5 * (float(r @ s) + wider)
     for one in mine:
-        log -= len(one.t) * np.log(problem.sensors[one.channel].noise)
+        log -= len(one.t) * np.log(problem.sensors[one.channel].noise * (2 * np.pi) ** 0.5)
         if one.noise is not None:
             log -= 0.5 * log_det(one.noise.whitener(one.t))
     return Density(mine, r, s, float(log))
@@ -78,7 +84,7 @@ class Evidence:
         self.fitted = density(problem, which, r[:m])
         self.verdicts = judge(self.fitted.parts, r, J[:, free])
         self.numerical = abs(0.5 * float(usual @ usual - self.fitted.r @ self.fitted.r))
-        self.dof, self.heldout = max(m - int(free.sum()), 1), None
+        self.dof, self.heldout = max(self.fitted.samples - int(free.sum()), 1), None
         if heldout:
             low, high = (bound[free] for bound in problem.coordinates.bounds)
             F = J[:, free].T @ J[:, free] + np.diag(12 / (high - low) ** 2)  # what is unknown is between its bounds

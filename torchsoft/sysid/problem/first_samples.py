@@ -98,10 +98,7 @@ def beginning(what: str, t: Array, y: Array, sensor: Sensor, other: float) -> tu
     """Value and rate at t = 0 of a channel with samples y (k,) at t (k,) [s], by the polynomial through them; `other`
     is the size of the channel at right angles that a misaligned sensor sees. Raises `ValueError` for too few
     samples."""
-    inside = np.full(len(t), True)
-    for limit, sign in ((sensor.high, 1.0), (sensor.low, -1.0)):
-        if limit is not None:
-            inside &= sign * y < sign * limit
+    inside = ~sensor.saturated(y)
     t, y = t[inside], y[inside]
     if len(t) < DEGREE + 1:
         raise ValueError(

@@ -92,6 +92,19 @@ class Problem:
         self._whiteners: dict[tuple[str, str], Any] = {}
         for k in range(len(recordings)):
             self.readouts(self.coordinates.start, k)
+        self.check_saturated()
+
+    def check_saturated(self) -> None:
+        """Raises `ValueError` where noise is coloured and samples are saturated: of such neighbours no likelihood is known that
+        can be computed."""
+        for recording in self.recordings:
+            for channel, sensor in self.sensors.items():
+                coloured = sensor.colour == "ar" or channel in self.noise
+                if coloured and channel in recording.samples and sensor.saturated(recording.samples[channel][1]).any():
+                    raise ValueError(
+                        f"sensors.{channel}: in `{recording.name}` samples are at its `low` or `high`, which cannot go "
+                        'together with noise of `colour = "ar"`; declare it "white", or record within the range'
+                    )
 
     def with_noise(self, noise: Mapping[str, Autoregression]) -> "Problem":
         """The same problem with noise of these colours, by channel."""

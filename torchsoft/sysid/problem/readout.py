@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
+from scipy.special import log_ndtr
 
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.trajectory import rate_channel
@@ -77,13 +78,16 @@ class Readout:
         return y, None if slopes is None else self.gain * slopes, by
 
     def residuals(self, y: Array, measured: Array) -> tuple[Array, Array]:
-        """Expected less measured over the noise (k,), and its derivative by the expected; of saturated samples only what is
-        short of the sensor's range counts."""
+        """Expected less measured over the noise (k,), and its derivative by the expected.
+
+        Of a saturated sample half the square is the negative logarithm of the probability that value and noise are together
+        beyond the limit (Tobin, 1958)."""
         r, weight = (y - measured) / self.noise, np.full(len(y), 1 / self.noise)
         for limit, sign in ((self.high, 1.0), (self.low, -1.0)):
             if limit is not None:
-                beyond = (sign * measured >= sign * limit) & (sign * y >= sign * limit)
-                r, weight = np.where(beyond, 0.0, r), np.where(beyond, 0.0, weight)
+                at = sign * measured >= sign * limit
+                beyond, slope = censored(sign * (y[at] - limit) / self.noise)
+                r[at], weight[at] = sign * beyond, slope / self.noise
         return r, weight
 
     def pulled_back(self, signals: Signals, times: Array, v: Array) -> Array:
@@ -94,6 +98,15 @@ class Readout:
                 j = signals.names.index(term.channel)
                 out[:, j] += self.gain * term.factor * (v @ spline(times - self.delay, term.order))
         return out
+
+
+def censored(z: Array) -> tuple[Array, Array]:
+    """-sqrt(-2 ln Phi(z)) (k,), where values are expected z standard deviations beyond a limit, and its derivative; Phi is the
+    normal distribution function. It is z far short of the limit, and nothing far beyond."""
+    log = log_ndtr(z)
+    r = -np.sqrt(-2 * log)
+    density = np.exp(-0.5 * z**2 - log) / np.sqrt(2 * np.pi)
+    return r, np.divide(density, -r, out=np.zeros_like(r), where=r < 0)
 
 
 def partner(rig: Rig, channel: str) -> tuple[str, float]:

@@ -95,9 +95,9 @@ class Sensor(Table):
     How large may be a constant `bias` [unit], a `delay` [s], the error of its `gain` [1], a `drift` [unit/s] from the middle of
     the recording on, its `misalignment` [rad] about the axis out of the plane; the `inertia` [kg] between a force sensor and
     what it pushes, whose acceleration it does not feel. Zero leaves them out, otherwise they are identified too, one for all
-    recordings or one for each (`per`). Samples at `low` or `high` [unit] or beyond are saturated: they only say that the value
-    is there or beyond. `colour` says whether the noise is known to be independent ("white"), or may be an autoregression
-    ("ar"), whose order and coefficients are then found.
+    recordings or one for each (`per`). Samples at `low` or `high` [unit] or beyond are saturated: they only say that value and
+    noise together are there or beyond (Tobin's likelihood), and that noise must be white. `colour` says whether the noise is
+    known to be independent ("white"), or may be an autoregression ("ar"), whose order and coefficients are then found.
     """
 
     noise: float = Field(ge=1e-15, le=1e6)
@@ -117,6 +117,11 @@ class Sensor(Table):
         if self.low is not None and self.high is not None and self.low >= self.high:
             raise ValueError(f"low = {self.low} must be below high = {self.high}")
         return self
+
+    def saturated(self, y: Array) -> NDArray[np.bool_]:
+        """Which samples y (k,) [unit] are at the end of its range, or beyond."""
+        low, high = -math.inf if self.low is None else self.low, math.inf if self.high is None else self.high
+        return (y <= low) | (y >= high)
 
     @property
     def nuisances(self) -> dict[Nuisance, tuple[float, float, float]]:
