@@ -42,7 +42,7 @@ FLOWS = {
         fields recorded shapes materials bodies pads contacts network actuators motion outputs schema geometry build course
         finding balance check written template pictures run .
     """,
-    "cli": "failure rigs identify material .",
+    "cli": "failure results rigs identify material .",
     "solve.kernel": """
         cache . arrays scratch linear inertia interface stage finish step taped run rates adjoint_pads adjoint tangent
     """,

@@ -110,7 +110,7 @@ ERRORS: dict[str, tuple[list[str], str]] = {
     ),
     "another encoding": (["data.csv", "latin.toml"], "latin.toml is not a TOML file: 'utf-8' codec"),
     "workers": (["data.csv", "rig.toml", "--workers", "0"], "workers should be greater than or equal to 1, not 0"),
-    "out is a file": (["data.csv", "rig.toml", "--out", "data.csv"], "data.csv: File exists"),
+    "out is a file": (["data.csv", "rig.toml", "--out", "data.csv"], "--out: results cannot be written to data.csv ("),
 }
 
 

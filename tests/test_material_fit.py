@@ -262,7 +262,7 @@ ERRORS: dict[str, tuple[list[str], str]] = {
     "an area": (["test.csv", "--area", "1e-5"], "`stress` needs no `area`"),
     "many terms": (["test.csv", "--terms", "50"], "`terms` must be from 1 to"),
     "no such ratio": (["test.csv", "--nu", "0.6"], "pad.nu should be less than or equal to 0.4999, not 0.6"),
-    "out is a file": (["test.csv", "--out", "test.csv"], "test.csv"),
+    "out is a file": (["test.csv", "--out", "test.csv"], "--out: results cannot be written to test.csv ("),
 }
 
 

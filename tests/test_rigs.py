@@ -499,6 +499,19 @@ def test_what_is_wrong_is_not_run_unless_it_is_meant(small: Path, tmp_path: Path
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"trajectory.nc", "summary.json"}
 
 
+def test_where_results_cannot_be_written_nothing_is_run(
+    small: Path, tmp_path: Path, monkeypatch: Any, capsys: Any
+) -> None:
+    monkeypatch.delattr(running, "simulate")
+    (tmp_path / "taken").write_text("mine", encoding="utf-8")
+    for out in (tmp_path / "taken", tmp_path / "taken" / "out"):
+        assert main(["run", str(small), "--out", str(out), "--no-progress"]) == 2
+        assert f"error: --out: results cannot be written to {out} (" in capsys.readouterr().err
+        with pytest.raises(OSError, match="taken"):
+            running.run(RigFile.from_toml(small), out)
+    assert (tmp_path / "taken").read_text(encoding="utf-8") == "mine"
+
+
 def test_an_interruption_keeps_what_was_simulated(small: Path, tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
     def interrupted(*args: Any, **options: Any) -> None:
         raise Interrupted(simulate(*args, **options))

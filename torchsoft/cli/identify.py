@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from torchsoft.cli.failure import failed
+from torchsoft.cli.results import try_folder
 
 IDENTIFY = """\
 Which parameters explain these recordings, and how sure is that?
@@ -63,7 +64,7 @@ def identify(options: argparse.Namespace) -> int:
             priced = (fit.rtol, fit.starts, fit.workers, heldout, fit.method)
             expected = one_by_one(cost(problem, *priced) for problem in problems)
             agree(expected, options.yes, "take a larger rtol, fewer starts or less data")
-            options.out.mkdir(parents=True, exist_ok=True)
+            try_folder(options.out)
             result = identify(
                 case.problem, heldout=heldout, meant=case.config.meant, checkpoint=unfinished,
                 progress=not options.no_progress, **fit.model_dump(),

@@ -4,6 +4,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from torchsoft.cli.results import try_folder
+
 MATERIAL_FIT = """\
 Which material relaxes, or creeps, as this one did?
 
@@ -61,6 +63,7 @@ def fit_material(options: argparse.Namespace) -> int:
     given = {name: getattr(options, name) for name in ("nu", "rho", "depth")}
     pad = Parameters().override({f"pad.{name}": x for name, x in given.items() if x is not None}).pad
     found = fit(read(options.file, **asked), terms=options.terms)
+    try_folder(options.out)
     write(found, options.out, {name: getattr(pad, name) for name in given}, {**asked, "terms": options.terms, **given})
     print(printed(found))
     print(f"written to {', '.join(str(options.out / name) for name in FILES)}")

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from torchsoft.cli.failure import failed
+from torchsoft.cli.results import try_folder
 
 RUN = """\
 Simulates the rig that a TOML file describes, and writes trajectory.nc, summary.json, figures and a video to a folder.
@@ -59,6 +60,7 @@ def run_rig(options: argparse.Namespace) -> int:
         print(one, file=sys.stderr)
     if any(one.severity == "error" for one in found) and not options.anyway:
         return failed(f"{options.file} is not run; mend what is wrong, or say --anyway")
+    try_folder(out)
     done = run(file, out, found=found, progress=not options.no_progress)
     if isinstance(done.stopped, SimulationFailed):
         return failed(f"{done.stopped.reason}; what was simulated until then is in {out}")

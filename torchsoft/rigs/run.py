@@ -51,10 +51,10 @@ def carry_out(file: RigFile, *, progress: bool = False) -> Done:
 
 def run(file: RigFile, out: Path, *, found: list[Finding] | None = None, progress: bool = False) -> Done:
     """Simulate and write everything to the folder `out`: data first, pictures only of a run that was not stopped. `found` are
-    the check's findings, for the summary."""
+    the check's findings, for the summary. Raises `OSError` for a folder that cannot be made, and what `carry_out` does."""
     began = time.perf_counter()
-    done = carry_out(file, progress=progress)
     make_folder(out)
+    done = carry_out(file, progress=progress)
     done.trajectory.save(out / "trajectory.nc")
     numbers = summary(file, done, found or []) | {"wall_s": time.perf_counter() - began}
     write_json(out / "summary.json", numbers)
