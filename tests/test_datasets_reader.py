@@ -38,12 +38,13 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> str:
     values = np.arange(COUNT * SAMPLES * 2, dtype=float).reshape(COUNT, SAMPLES, 2)
     put("disc_position", values, ("trajectory", "time", "axis"), 4)
     put("pad.E", np.arange(COUNT) + 0.5, ("trajectory",), 4)
+    put("large", np.array([6e4, np.inf, 0.0, 7e5, *[1.0] * (COUNT - 4)]), ("trajectory",), 4)
     put("failed", (np.arange(COUNT) == 2).astype(np.uint8), ("trajectory",), 4)
     put("split", np.array((["train", "test"] * COUNT)[:COUNT], object), ("trajectory",), 4)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # consolidated metadata is zarr-python's and xarray's own addition
         zarr.consolidate_metadata(url)
-    files = ("disc_position/c/{shard}/0/0", "pad.E/c/{shard}", "failed/c/{shard}", "split/c/{shard}")
+    files = ("disc_position/c/{shard}/0/0", "pad.E/c/{shard}", "large/c/{shard}", "failed/c/{shard}", "split/c/{shard}")
     layout = Layout(shards=3, trajectories_per_shard=4, files=files)
     there = {key: digest((Path(url) / key).read_bytes()) for key in keys(url)}
     of_shards = {key: there.pop(key) for shard in range(3) for key in layout.of(shard)}
@@ -108,16 +109,31 @@ def test_object_stores_are_read_like_folders_and_by_forked_workers(store: str) -
 
 
 def test_wrong_arguments_are_refused(store: str) -> None:
-    with pytest.raises(ValueError, match=r"no numbers named 'disc_pose'; known: disc_position, failed, pad\.E"):
+    with pytest.raises(ValueError, match=r"no numbers named 'disc_pose'; known: disc_position, failed, large, pad\.E"):
         reading(store, ["disc_pose"])
     with pytest.raises(ValueError, match="`window` must be 1 to 21"):
         reading(store, ["disc_position"], window=22)
-    with pytest.raises(ValueError, match="`stride`"):
-        reading(store, ["disc_position"], stride=0)
+    for name, value in (("window", 10.5), ("window", 0), ("stride", 0), ("stride", 2.5)):
+        with pytest.raises(ValueError, match=f"`{name}` must be a whole number from 1 on, but is {value}"):
+            reading(store, ["disc_position"], **{name: value})
+    for dtype in (torch.int32, torch.bool, torch.complex64, "float32"):
+        with pytest.raises(ValueError, match=r"`dtype` must be one of torch\.float64, .*, but is "):
+            reading(store, ["disc_position"], dtype=dtype)
     with pytest.raises(ValueError, match="`split` must be"):
         reading(store, ["disc_position"], split="dev")
     with pytest.raises(IndexError):
         reading(store, ["disc_position"])[100]
+
+
+def test_numbers_that_the_dtype_cannot_hold_are_refused(store: str) -> None:
+    """And those that are not finite in the store are given as they are."""
+    data = reading(store, ["disc_position", "large"], dtype=torch.float16)
+    assert data[0]["large"] == 6e4
+    assert torch.isinf(data[1]["large"])
+    with pytest.raises(
+        ValueError, match=r"`large` of trajectory 3 holds 7e\+05, which torch\.float16 cannot; take a wider `dtype`"
+    ):
+        data[2]
 
 
 def test_xarray_reads_the_same(store: str) -> None:

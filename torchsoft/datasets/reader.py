@@ -14,6 +14,10 @@ from torch.utils.data import Dataset
 from torchsoft.datasets.manifest import Manifest, finished
 from torchsoft.datasets.storage import StoreError
 from torchsoft.datasets.vouched import Vouched
+from torchsoft.physics.arguments import whole
+
+DTYPES = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
+"""What numbers may be given as."""
 
 
 def vouched(url: str, *, unfinished: bool = False) -> Vouched:
@@ -31,15 +35,16 @@ def vouched(url: str, *, unfinished: bool = False) -> Vouched:
 class Trajectories(Dataset[dict[str, Tensor]]):
     """Windows of the trajectories of one split, read on access.
 
-    Item i holds every variable of `variables` in SI units, a series as (window, ...) and a number of the trajectory as (),
-    besides `trajectory` and `start`, its origin. `window` is a number of samples, the whole run by
+    Item i holds every variable of `variables` in SI units, a series as (window, ...) and a number of the trajectory as (), in
+    one of `DTYPES`, besides `trajectory` and `start`, its origin. `window` is a number of samples, the whole run by
     default; windows of a trajectory begin every `stride` samples, `window` by default. Failed simulations are left out, and
     trajectories of unfinished shards too where `unfinished` says so. The object is small, can be pickled, and opens the store
     in each process for itself, forked ones included. Each of these reads a file whole when it first touches it, to hold it
     against its digest.
 
-    Raises `ValueError` for an unknown variable or split, or a window that does not fit, and `StoreError` for a dataset that is
-    damaged or unfinished; the same when a damaged file is first touched.
+    Raises `ValueError` for an unknown variable or split, another dtype, or a window or stride that does not fit, and
+    `StoreError` for a dataset that is damaged or unfinished; the same when a damaged file is first touched, and `ValueError`
+    for an item with a number that is too large for the dtype.
     """
 
     def __init__(
@@ -47,6 +52,8 @@ class Trajectories(Dataset[dict[str, Tensor]]):
         stride: int | None = None, dtype: torch.dtype = torch.float64, unfinished: bool = False,
     ) -> None:  # fmt: skip
         self.url, self.variables, self.dtype, self.unfinished = str(url), tuple(variables), dtype, unfinished
+        if dtype not in DTYPES:
+            raise ValueError(f"`dtype` must be one of {', '.join(map(str, DTYPES))}, but is {dtype!r}")
         self._group: zarr.Group | None = None
         self._opened_by = 0
         for name in self.variables:
@@ -54,12 +61,10 @@ class Trajectories(Dataset[dict[str, Tensor]]):
                 known = [k for k, a in self.group.arrays() if self.dims(k)[0] == "trajectory" and a.dtype.kind in "fiu"]
                 raise ValueError(f"`variables` has no numbers named {name!r}; known: {', '.join(sorted(known))}")
         samples = self.array("time").shape[0]
-        self.window = samples if window is None else window
-        if not 1 <= self.window <= samples:
+        self.window = samples if window is None else whole("window", window, 1)
+        if self.window > samples:
             raise ValueError(f"`window` must be 1 to {samples} samples, but is {window}")
-        step = self.window if stride is None else stride
-        if step < 1:
-            raise ValueError(f"`stride` must be positive, but is {stride}")
+        step = self.window if stride is None else whole("stride", stride, 1)
         self.starts = range(0, samples - self.window + 1, step)
         self.trajectories = self._usable(split)
 
@@ -104,7 +109,14 @@ class Trajectories(Dataset[dict[str, Tensor]]):
         for name in self.variables:
             array = self.array(name)
             at = (trajectory, slice(start, start + self.window)) if array.ndim > 1 else trajectory
-            item[name] = torch.from_numpy(np.array(array[at])).to(self.dtype)
+            given = torch.from_numpy(np.array(array[at], dtype=float))
+            item[name] = given.to(self.dtype)
+            lost = given[item[name].isinf() & given.isfinite()]
+            if len(lost):
+                raise ValueError(
+                    f"`{name}` of trajectory {trajectory} holds {float(lost[0]):.3g}, which {self.dtype} cannot; take a wider "
+                    "`dtype`"
+                )
         return item
 
 
