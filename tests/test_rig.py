@@ -182,6 +182,10 @@ def small(**changes: object) -> Rig:
             "contact `d` is between `P` and `dish`, which are not",
         ),
         (
+            {"contacts": lambda m, r, c: {"d": Contact("P", "disc", c)}},
+            r"contacts\.d: it is between the same pad and body as `c`; leave one out",
+        ),
+        (
             {"bodies": lambda m, r, c: {"disc": Body(0.4, theta=0.0)}},
             "contact `c` needs a shape, but the body `disc` has none",
         ),

@@ -346,7 +346,7 @@ NONSENSE: dict[str, tuple[dict[str, Any], str]] = {
         "error: bodies.ball: nothing carries it: it has no contact with any pad",
     ),
     "a loop that cannot reach": (
-        {"actuators": {"x": {"measures": "disc.x"}}, "contacts": {"upper": {"pad": "lower"}}},
+        {"actuators": {"x": {"measures": "disc.x"}}, "contacts": {"upper": None}},
         "actuators.x: it measures disc.x and pushes bracket.x, but no pad and contact tie `bracket` to `disc`",
     ),
     "a file that is not there": (

@@ -124,6 +124,9 @@ def test_a_drop_is_not_missed() -> None:
 # what makes no sense -------------------------------------------------------------------------------------------------
 
 
+SOFT = {"kind": "kelvin_voigt", "E": 1e5, "nu": 0.45, "tau": 10e-3, "depth": 44e-3}
+WET = {"K_n": 1e5, "R_n": 400.0, "K_t": 1e5, "R_t": 400.0, "friction": {"kind": "smooth", "mu_s": 0.2, "mu_k": 0.1}}
+
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "misspelt": ({"pads__lower__lenght": 0.1}, r"pads\.lower: `lenght` is not known here; is it `length`\?"),
     "unknown": ({"gadgets": {}}, r"`gadgets` is not known here; known are title, gravity, bodies"),
@@ -143,6 +146,8 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "no such coordinate": ({"actuators__x__pushes": "bracket.z"}, r"`bracket\.z` is not a coordinate; free ones are disc\.x"),
     "loop without a motion": ({"actuators__x__setpoint": None}, r"actuators\.x: setpoint is missing: the gains Kp and Kd need"),
     "motion that nothing follows": ({"motion__wave": {"kind": "hold"}}, r"motion\.wave: nothing follows it"),
+    "material of nothing": ({"materials__gel": SOFT}, r"materials\.gel: no pad is made of it; name it as the material of one"),
+    "law of nothing": ({"laws__wet": WET}, r"laws\.wet: no contact follows it; name it as the law of one"),
     "motion that is missing": ({"actuators__x__setpoint": "w"}, r"motion\.w is missing: bracket\.x is to follow it"),
     "time goes back": ({"motion__x_d__times": (1.5, 0.5)}, r"motion\.x_d.*: times must increase, but 0\.5 s follows 1\.5 s"),
     "two ways to step": ({"solver": {"step": 1e-3, "rtol": 1e-4}}, r"solver: step and rtol .*each say which steps to take"),
@@ -174,6 +179,10 @@ DANGEROUS: dict[str, tuple[dict[str, Any], str]] = {
     "beside the pad": (
         {"bodies__disc__start": {"x": 0.1, "y": 0.03}},
         r"error: bodies\.disc: nothing carries it: no pad that it has a contact with lies under it",
+    ),
+    "the same contact twice": (
+        {"contacts__again": {"pad": "lower", "body": "disc", "law": "dry"}},
+        r"error: contacts\.again: it is between the same pad and body as `lower`; leave one out",
     ),
     "no rest beside the pad": ({"bodies__disc__start__x": 0.1}, r'error: bodies\.disc\.start\.y: "rest", but no pad'),
     "set-point elsewhere": (

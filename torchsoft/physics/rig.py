@@ -103,7 +103,10 @@ class Rig(nn.Module):
                     f"pad `{name}` is inertial and its base `{pad.base}` may turn: nodal accelerations in a turning frame are "
                     "not modelled; fix the base's theta or take a massless pad"
                 )
+        between = {(contact.pad, contact.body): name for name, contact in self.contacts.items()}
         for name, contact in self.contacts.items():
+            if (twin := between[contact.pad, contact.body]) != name:
+                raise ValueError(f"contacts.{twin}: it is between the same pad and body as `{name}`; leave one out")
             if contact.pad not in self.pads or contact.body not in self.bodies:
                 raise ValueError(
                     f"contact `{name}` is between `{contact.pad}` and `{contact.body}`, which are not both there"

@@ -121,6 +121,10 @@ class RigTables(Group):
                 raise ValueError(
                     f"contacts.{name}: the pad `{contact.pad}` is bonded to the body `{contact.body}` itself"
                 )
+        for name in sorted(self.materials.keys() - {pad.material for pad in self.pads.values()}):
+            raise ValueError(f"materials.{name}: no pad is made of it; name it as the material of one, or leave it out")
+        for name in sorted(self.laws.keys() - {contact.law for contact in self.contacts.values()}):
+            raise ValueError(f"laws.{name}: no contact follows it; name it as the law of one, or leave it out")
         for name, actuator in self.actuators.items():
             for field in ("pushes", "measures"):
                 self._check_coordinate(f"actuators.{name}.{field}", getattr(actuator, field))
