@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import shlex
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
@@ -458,6 +459,36 @@ def test_the_file_to_start_from_is_a_rig_with_a_comment_on_every_number(tmp_path
     assert main(["init", str(path)]) == 2
     assert f"{path} is there already" in capsys.readouterr().err
     assert [one for one in check(coarse(RigFile.from_toml(path))) if one.severity != "note"] == []
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("v1.2", "v1.2.toml"),
+        ("v1.2.toml", "v1.2.toml"),
+        ("my rig", "my rig.toml"),
+        ("new/folder/.x", "new/folder/.x.toml"),
+    ],
+)
+def test_the_file_to_start_from_has_the_name_that_was_asked_for(
+    name: str, file: str, tmp_path: Path, monkeypatch: Any, capsys: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["init", name]) == 0
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [tmp_path / file]
+    assert RigFile.from_toml(file).title == Path(file).stem
+    said = capsys.readouterr().out.removeprefix(f"written to {file}; ").partition(" looks it over, ")
+    commands = [shlex.split(text) for text in (said[0], said[2].removesuffix(" simulates it\n"))]
+    assert commands == [["torchsoft", "check", file], ["torchsoft", "run", file]]
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "a/", "a/..", ".toml", "/"])
+def test_a_name_that_is_no_files_is_refused(name: str, tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["init", name]) == 2
+    expected = f"torchsoft: error: NAME should be the name of a file, such as mine or mine.toml, not {name!r}\n"
+    assert capsys.readouterr().err == expected
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """Commands on rig files: run, check, init."""
 
 import argparse
+import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,8 @@ strains beyond linear elasticity, steps that are too coarse, bodies that nothing
 The exit status is 2 where there is an error; warnings and notes are said only."""
 
 INIT = """\
-Writes NAME.toml, a rig to start from: a disc between two pads, with the unit and the meaning of every number in a comment."""
+Writes NAME.toml, a rig to start from: a disc between two pads, with the unit and the meaning of every number in a comment.
+A folder that is not there is made."""
 
 
 def add_commands(commands: Any) -> None:
@@ -42,7 +44,7 @@ def add_commands(commands: Any) -> None:
         "init", help="write a rig file to start from", description=INIT,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
-    one.add_argument("name", type=Path, metavar="NAME", help="the file's name, with or without .toml")
+    one.add_argument("name", metavar="NAME", help="the file's name, with or without .toml")
     one.set_defaults(run=init_rig)
 
 
@@ -93,12 +95,15 @@ def init_rig(options: argparse.Namespace) -> int:
     from torchsoft.rigs.template import template
     from torchsoft.rigs.written import to_toml
 
-    path: Path = options.name.with_suffix(".toml")
+    path = Path(options.name.removesuffix(".toml") + ".toml")
+    if not path.name.removesuffix(".toml").strip("."):
+        return failed(f"NAME should be the name of a file, such as mine or mine.toml, not {options.name!r}")
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with path.open("x", encoding="utf-8") as file:
             file.write(to_toml(template(path.stem)))
     except FileExistsError:
         return failed(f"{path} is there already; take another name")
-    print(f"written to {path}; torchsoft check {path} looks it over, torchsoft run {path} simulates it")
+    check, run = (shlex.join(["torchsoft", command, str(path)]) for command in ("check", "run"))
+    print(f"written to {path}; {check} looks it over, {run} simulates it")
     return 0
