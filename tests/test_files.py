@@ -43,6 +43,14 @@ def test_a_file_is_replaced_at_the_end(tmp_path: Path) -> None:
     assert os.listdir(path.parent) == ["file"]
 
 
+def test_a_folder_is_not_replaced_by_a_file(tmp_path: Path) -> None:
+    with pytest.raises(IsADirectoryError) as refusal:
+        write(tmp_path, b"new")
+    assert str(refusal.value) == f"{tmp_path} is a folder; name a file, perhaps one in it"
+    assert os.listdir(tmp_path) == []
+    assert not [path for path in tmp_path.parent.iterdir() if PARTIAL.search(path.name)]
+
+
 @pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
 def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path: Path, error: BaseException) -> None:
     path = tmp_path / "file"

@@ -31,8 +31,11 @@ def replacing(path: str | Path) -> Iterator[Path]:
 
     Missing folders are made. The partial file is removed when writing it fails; one that a killed process left is
     removed by the next that writes the same file. Its writer holds a lock on it, so that nobody removes it before.
+    Raises `IsADirectoryError` before anything is written where `path` is a folder.
     """
     path = Path(path)
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder; name a file, perhaps one in it")
     make_folder(path.parent)
     remove_partials(path.parent.glob(f"{escape(path.name)}.*.partial"))
     partial, handle = new_partial(path)
