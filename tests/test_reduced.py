@@ -17,6 +17,7 @@ from torchsoft.reduced.ode import BEYOND, Factor, Held, ReducedModel, Term
 from torchsoft.reduced.records import KINEMATICS, STATES, Record, noisy, record, rolling_radius
 from torchsoft.reduced.rollout import recursion
 from torchsoft.reduced.terms import friction, joined, mechanics, polynomials, variable
+from torchsoft.rigs.template import template
 
 R = 0.0183
 TRUTH = {
@@ -265,6 +266,15 @@ def test_records_of_a_run_and_of_a_dataset_are_the_same() -> None:
     values[50] = np.nan
     with pytest.raises(ValueError, match=r"'omega' \(disc_spin\) .* first at t = 0.1 s"):
         record({name: series[name].values for name in series} | {"disc_spin": values}, run.t)
+
+
+def test_a_run_without_any_series_of_a_record_is_refused() -> None:
+    ready = template("t").override(outputs={"duration": 0.02, "interval": 5e-3, "snapshots": ()}).build()
+    run = simulate(ready.rig, ready.t, y0=ready.y0)
+    with pytest.raises(
+        ValueError, match=r"`source` has none of disc_position, .*, desired_x.*; take a run of `SoftGrasp`"
+    ):
+        record(run)
 
 
 def test_pysindy_is_imported_only_when_it_is_used() -> None:

@@ -44,7 +44,8 @@ def record(source: Trajectory | Mapping[Any, Any], t: Any = None, *, begin: floa
     item of `torchsoft.datasets.Trajectories`) at times t [s].
 
     Samples before `begin` [s] are left out, and positions and angle counted from the first one kept; x_d from the disc's.
-    Raises `ValueError` for times that are not equally spaced and for a value that is not finite, naming the series.
+    What the source lacks the record lacks. Raises `ValueError` for times that are not equally spaced, for a value that is not
+    finite, naming the series, and for a source without any of them, such as the run of a rig that is not the paper's.
     """
     data: Mapping[Any, Any] = source.to_dataset() if isinstance(source, Trajectory) else source
     times = np.asarray(data["time"] if t is None else t, dtype=float)
@@ -52,8 +53,8 @@ def record(source: Trajectory | Mapping[Any, Any], t: Any = None, *, begin: floa
     if keep.sum() < 3 or not np.allclose(np.diff(times), times[1] - times[0], rtol=1e-6, atol=0):
         raise ValueError("`t` must hold at least three equally spaced times")
     series = {}
-    for name in VARIABLES:
-        channel = CHANNELS[ALIASES.get(name, name)]
+    channels = {name: CHANNELS[ALIASES.get(name, name)] for name in VARIABLES}
+    for name, channel in channels.items():
         if channel.variable not in data:
             continue
         x = channel.of(np.asarray(data[channel.variable], dtype=float)[keep])
@@ -63,6 +64,9 @@ def record(source: Trajectory | Mapping[Any, Any], t: Any = None, *, begin: floa
                 f"series {name!r} ({channel.variable}) has values that are not finite, first at t = {first:g} s"
             )
         series[name] = x
+    if not series:
+        known = ", ".join(dict.fromkeys(channel.variable for channel in channels.values()))
+        raise ValueError(f"`source` has none of {known}; take a run of `SoftGrasp`, or give series by these names")
     origin = {name: float(series[name][0]) for name in ("x_C", "theta", "x_Br") if name in series}
     if "x_d" in series and "x_C" in origin:
         origin["x_d"] = origin["x_C"]
