@@ -58,7 +58,9 @@ TRAVEL = 40e-3
 COMPRESSION = (-0.3e-3, 3.3e-3)
 """Of both pads together [m]; below zero the bracket is clear of the disc. The catalogue's deepest is 3.3 mm."""
 
-GUESS = {
+Guess = tuple[float, tuple[float, float], tuple[float, float], float]
+
+GUESS: dict[str, Guess] = {
     "light": (0.36, (49.42e-3, 12.21e-3), (10e-3, 0.18e-3), 0.04e-3),
     "rolled": (0.64, (66.54e-3, 15.62e-3), (46.07e-3, 0.10e-3), 3.19e-3),
 }
@@ -139,8 +141,10 @@ def predicted(problem: Problem, rtol: float) -> dict[str, float]:
     return deviations(names, T, fisher(at.J)[0])
 
 
-def search(truth: dict[str, float], real: Parameters, half: dict[str, float], config: Config) -> Design:
-    """The motion whose largest deviation over its target is least."""
+def search(
+    truth: dict[str, float], real: Parameters, half: dict[str, float], config: Config, guess: dict[str, Guess] = GUESS
+) -> Design:
+    """The motion whose largest deviation over its target is least, from a guess of some phases."""
     plan = stated([record("designed", given(config), real, real, RIG, rtol=1e-3, noise=0.0)], truth)
     x_0, open_at = GIVEN.x_C0, begin(given(config), real).model.settings.scenario.y_Br_grasp + GIVEN.depth
     since = GIVEN.grasp_time * (1 + 1e-9)
@@ -151,14 +155,14 @@ def search(truth: dict[str, float], real: Parameters, half: dict[str, float], co
             shortest=config.shortest,
         ),
     }  # fmt: skip
-    guess = [
+    phases = [
         Phase(share, {"x_d": ToAndFro(x[0], x_0, x[1]), "y_d": ToAndFro(y[0], open_at - depth, y[1])})
-        for share, x, y, depth in GUESS.values()
+        for share, x, y, depth in guess.values()
     ]
     names, _ = chosen(plan, plan.coordinates.start, None)
     return design(
         plan, "designed", bounds, limits=FORCE, criterion=Criterion("worst", tuple(half[name] for name in names)),
-        phases=PHASES if config.smoke else guess, starts=config.starts, iterations=config.iterations,
+        phases=PHASES if config.smoke else phases, starts=config.starts, iterations=config.iterations,
         rtol=config.design_rtol, workers=config.workers, seed=config.seed,
         progress=True,
     )  # fmt: skip
