@@ -401,6 +401,44 @@ def test_unphysical_coefficients_are_refused_before_a_run(solid: Material, messa
         simulate(model, times(0.1, 2), y0=y0)
 
 
+class Chain(Material):
+    """A material with the chain that it is given."""
+
+    def __init__(self, *given: object) -> None:
+        super().__init__(**COMMON)
+        self.given = given
+
+    def chain(self) -> Any:
+        return tuple(torch.tensor(x, dtype=torch.float64) if isinstance(x, list) else x for x in self.given)
+
+    @property
+    def branches(self) -> int:
+        return 2
+
+
+@pytest.mark.parametrize(
+    ("chain", "message"),
+    [
+        (([0.7, 0.5], [0.01, 0.1]), "must sum to one, but [0.7, 0.5] sum to 1.2; divide both J and E by that sum"),
+        (([1.2, -0.2], [0.01, 0.1]), "the fractions J of the material of `L` must not be negative"),
+        (([0.5, math.nan], [0.01, 0.1]), "the fractions J of the material of `L` must not be negative"),
+        (([0.5, 0.5], [0.01, 0.0]), "the retardation times tau of the material of `L` must be positive and finite"),
+        (([0.5, 0.5], [0.01, math.inf]), "the retardation times tau of the material of `L` must be positive and finite"),
+        (([0.5, 0.5], [0.01]), "`tau` of the material of `L` must have shape (branches,) = (2,), one at least, but has (1,)"),
+        (([0.2, 0.3, 0.5], [0.01, 0.1, 1.0]), "`J` of the material of `L` must have shape (branches,) = (2,)"),
+        (([[0.5, 0.5]], [0.01, 0.1]), "`J` of the material of `L` must have shape"),
+        (([0.5, 0.5], 0.01), "`tau of the material of L` must be a float64 tensor, but is float"),
+        (([0.5, 0.5], torch.ones(2)), "`tau of the material of L` must be float64"),
+        (([1.0, 0.0],), "`chain` of the material of `L` must give two tensors, J and tau"),
+    ],
+)  # fmt: skip
+def test_a_chain_that_is_none_is_refused_before_a_run(chain: tuple[Any, ...], message: str) -> None:
+    model = SoftGrasp(STABLE, material=Chain(*chain))
+    y0 = torch.zeros(model.layout.size, dtype=torch.float64)
+    with pytest.raises(ValueError, match=re.escape(message)):
+        simulate(model, times(0.1, 2), y0=y0)
+
+
 @pytest.mark.parametrize("name", [name for name in MATERIALS if name != "kelvin_voigt"])
 def test_an_inertial_pad_of_several_times_is_refused(name: str) -> None:
     """When the rig is made, before a run with a part replaced, and wherever its law is asked for."""

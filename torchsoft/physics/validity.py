@@ -1,5 +1,6 @@
-"""What a rig has to be before anything is computed with it: numbers in float64 on the CPU, finite and physical, shapes that
-measure distances, slip laws that take no more than the effort. Every refusal is one sentence that names what is wrong.
+"""What a rig has to be before anything is computed with it: numbers in float64 on the CPU, finite and physical, materials whose
+fractions sum to one, shapes that measure distances, slip laws that take no more than the effort. Every refusal is one sentence
+that names what is wrong.
 """
 
 import math
@@ -7,13 +8,17 @@ from collections.abc import Mapping
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor  # private, and the only way to tell
 
+from torchsoft.physics.material import Material
 from torchsoft.physics.shapes import Shape
 
 LARGEST = 1e100
 """Largest magnitude of a parameter, in SI units: squares and products of a few stay finite numbers."""
+
+MISSING = 1e-9
+"""By how much a material's fractions may miss one, or fall below zero: rounding."""
 
 DEPTHS = (1e-3, -1e-3)
 """Distances from the boundary, over the body's size, at which a shape is tried: outside and inside."""
@@ -48,9 +53,9 @@ def check_place() -> None:
         )
 
 
-def check_values(rig: nn.Module) -> None:
+def check_values(rig: Any) -> None:
     """Raises `ValueError` naming a parameter of the rig or a tensor of its parts that is not a float64 number on the CPU, not
-    finite, or not physical by its module's `limits` and `well_posed`."""
+    finite, or not physical by its module's `limits` and `well_posed`, or a material whose `chain` is not one."""
     check_place()
     for owner, module in rig.named_modules():
         path = f"{owner}." if owner else ""
@@ -80,6 +85,38 @@ def check_values(rig: nn.Module) -> None:
         well_posed = getattr(module, "well_posed", None)
         if well_posed is not None and (wrong := well_posed()):
             raise ValueError(f"the parameters of `{owner}` are not physical together: {wrong}")
+    for name, pad in rig.pads.items():
+        check_chain(name, pad.material)
+
+
+@torch.no_grad()
+def check_chain(where: str, material: Material) -> None:
+    """Raises `ValueError` naming the pad `where` unless its material's chain is one: fractions J that sum to one, and as many
+    positive retardation times tau."""
+    given = material.chain()
+    if not isinstance(given, tuple) or len(given) != 2:
+        raise ValueError(
+            f"`chain` of the material of `{where}` must give two tensors, J and tau, but gives {type(given).__name__}"
+        )
+    J, tau = given
+    for name, x in (("J", J), ("tau", tau)):
+        check_array(f"{name} of the material of {where}", x)
+        if x.shape != (material.branches,) or len(x) == 0:
+            raise ValueError(
+                f"`{name}` of the material of `{where}` must have shape (branches,) = ({material.branches},), one at least, "
+                f"but has {tuple(x.shape)}"
+            )
+    if not bool((J >= -MISSING).all()):
+        raise ValueError(f"the fractions J of the material of `{where}` must not be negative, but are {J.tolist()}")
+    if not abs(float(J.sum()) - 1) <= MISSING:
+        raise ValueError(
+            f"the fractions J of the material of `{where}` must sum to one, but {J.tolist()} sum to {float(J.sum()):.10g}; "
+            "divide both J and E by that sum"
+        )
+    if not bool((tau > 0).all()) or not bool(tau.isfinite().all()):
+        raise ValueError(
+            f"the retardation times tau of the material of `{where}` must be positive and finite, but are {tau.tolist()} s"
+        )
 
 
 def check_groups(rig: Any) -> None:
