@@ -5,11 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import torch
-from conftest import f64
+from conftest import coarse, f64, grasped, times
 from scipy.interpolate import CubicSpline
 from torch.autograd import gradcheck
 
-from torchsoft import Profile, Reference, Sampled, hold
+from torchsoft import Profile, Reference, Sampled, hold, simulate
 
 TIMES = [0.0, 0.4, 1.0, 1.5]
 VALUES = [0.06, 0.04, 0.05, 0.01]
@@ -50,6 +50,7 @@ def test_profile_goes_through_its_knots_and_stays_outside_them() -> None:
         ([0.0, float("nan")], [1.0, 2.0], "increase strictly"),
         ([0.0, 1.0], [1.0], "per time"),
         ([0.0], [float("nan")], "finite"),
+        ([], [], "from one time on"),
     ],
 )
 def test_bad_knots_are_refused(kind: type[Profile], times: list[float], values: list[float], match: str) -> None:
@@ -63,15 +64,47 @@ def test_bad_rates_are_refused() -> None:
             Sampled([0.0, 1.0], [1.0, 2.0], rates)
 
 
-def test_sampled_is_the_cubic_spline_and_stays_outside_it() -> None:
-    signal, spline = Sampled(TIMES, VALUES), CubicSpline(TIMES, VALUES)
-    t = torch.linspace(0, 1.5, 301, dtype=torch.float64)
+@pytest.mark.parametrize("knots", [2, 3, 4])
+def test_sampled_is_the_cubic_spline_and_stays_outside_it(knots: int) -> None:
+    signal, spline = Sampled(TIMES[:knots], VALUES[:knots]), CubicSpline(TIMES[:knots], VALUES[:knots])
+    t = torch.linspace(0, TIMES[knots - 1], 301, dtype=torch.float64)
     value, rate = signal(t)
     np.testing.assert_allclose(value, spline(t), rtol=0, atol=1e-15)
     np.testing.assert_allclose(rate, spline(t, 1), rtol=0, atol=1e-13)
     value, rate = signal(f64(-0.5, 2.0))
-    assert value.tolist() == pytest.approx([VALUES[0], VALUES[-1]], abs=1e-16)
+    assert value.tolist() == pytest.approx([VALUES[0], VALUES[knots - 1]], abs=1e-16)
     assert torch.equal(rate, torch.zeros_like(rate))
+
+
+def test_sampled_stays_the_spline_when_its_knots_are_changed() -> None:
+    """In place, and by a gradient: that of what is computed by finite differences of the values and of the times."""
+    signal = Sampled([0.0, 0.1, 0.2, 0.3, 0.4], [1.0, 1.0, 1.0, 1.0, 1.0])
+    at, values = f64(0.0, 0.4, 1.0, 1.5, 2.5), f64(0.06, 0.04, 0.05, 0.01, 0.02)
+    with torch.no_grad():
+        signal.times.copy_(at)
+        signal.values.copy_(values)
+    t = torch.linspace(0, 2.5, 101, dtype=torch.float64)
+    np.testing.assert_allclose(signal(t)[1].detach(), CubicSpline(at, values)(t, 1), rtol=0, atol=1e-13)
+    for k in (2, 3, 4, 5):
+        knots = at[:k].clone().requires_grad_(), values[:k].clone().requires_grad_()
+        assert gradcheck(lambda *knots: torch.stack(Sampled(*knots)(f64(0.1, 0.3))), knots)
+
+
+@pytest.mark.parametrize("kind", [Profile, Sampled])
+def test_knots_that_are_none_any_more_are_refused(kind: type[Profile]) -> None:
+    """Wherever the signal is asked for by its reference, by a run too."""
+    reference = Reference(**{"jaw.x": kind([0.0, 0.1, 0.2], [0.0, 1.0, 2.0])})
+    reference["jaw.x"].times[2] = 0.05
+    message = "the signal `jaw.x` of the reference is none any more: `times` must increase strictly"
+    with pytest.raises(ValueError, match=message):
+        reference(f64(0.1), ("jaw.x",))
+    with pytest.raises(ValueError, match=message):
+        reference.plain(("jaw.x",))
+    model = coarse()
+    y0 = grasped(model)
+    model.reference["x_d"].times.fill_(float("nan"))
+    with pytest.raises(ValueError, match="the signal `x_d` of the reference is none any more"):
+        simulate(model, times(0.01, 2), y0=y0)
 
 
 def test_sampled_with_rates_is_hermites_cubic() -> None:

@@ -3,11 +3,14 @@
 from collections.abc import Sequence
 from itertools import pairwise
 from math import perm
-from typing import ClassVar
+from typing import Any, ClassVar
 
+import numpy as np
 import torch
-from scipy.interpolate import CubicSpline
+from scipy.linalg import solve_banded
 from torch import Tensor, nn
+
+from torchsoft.physics.arguments import line
 
 
 class Piecewise(nn.Module):
@@ -22,15 +25,24 @@ class Piecewise(nn.Module):
     def __init__(self, times: Sequence[float] | Tensor, values: Sequence[float] | Tensor) -> None:
         super().__init__()
         knots = torch.as_tensor(times, dtype=torch.float64).contiguous()
-        if knots.ndim != 1 or not bool(torch.all(knots.diff() > 0)) or not bool(torch.isfinite(knots).all()):
-            raise ValueError(f"`times` must increase strictly, but are {times}")
         listed = values if isinstance(values, Tensor) else [torch.as_tensor(v, dtype=torch.float64) for v in values]
         many = listed if isinstance(listed, Tensor) else torch.stack(listed) if listed else torch.zeros(0)
-        if many.shape != knots.shape or not bool(torch.isfinite(many).all()):
-            raise ValueError(f"`values` must hold one finite number per time ({len(knots)}), but are {values}")
         self.register_buffer("times", knots)
         # a tensor with a graph keeps it; anything else becomes a parameter that is not trained unless asked for
         self.values = many.double() if many.requires_grad else nn.Parameter(many.double(), requires_grad=False)
+        if wrong := self.ill_posed():
+            raise ValueError(wrong)
+        if not bool(torch.isfinite(many).all()):
+            raise ValueError(f"`values` must be finite, but are {line(many.tolist())}")
+
+    def ill_posed(self) -> str:
+        """What is wrong with the knots as they are now, but for values that are not finite; empty if nothing is."""
+        t = self.times.detach()
+        if t.ndim != 1 or len(t) == 0 or not bool((t.diff() > 0).all()) or not bool(t.isfinite().all()):
+            return f"`times` must increase strictly, from one time on, but are {line(t.tolist())}"
+        if self.values.shape != t.shape:
+            return f"`values` must hold one number per time ({len(t)}), but have shape {tuple(self.values.shape)}"
+        return ""
 
     def control(self) -> Tensor:
         """Control points of every piece's polynomial, in Bernstein's form (k - 1, degree + 1)."""
@@ -106,7 +118,7 @@ class Sampled(Piecewise):
     `KNOTS_PER_STEP` knots at most."""
 
     KNOTS_PER_STEP: ClassVar = 4
-    rates: Tensor
+    given: Tensor | None
 
     def __init__(
         self,
@@ -115,12 +127,15 @@ class Sampled(Piecewise):
         rates: Sequence[float] | Tensor | None = None,
     ) -> None:
         super().__init__(times, values)
-        if rates is None:
-            rates = CubicSpline(times, values).derivative()(times).tolist() if len(times) > 1 else [0.0]
-        slope = torch.as_tensor(rates, dtype=torch.float64)
-        if slope.shape != self.times.shape or not bool(torch.isfinite(slope).all()):
+        slope = None if rates is None else torch.as_tensor(rates, dtype=torch.float64)
+        if slope is not None and (slope.shape != self.times.shape or not bool(torch.isfinite(slope).all())):
             raise ValueError(f"`rates` must hold one finite number per time ({len(self.times)}), but are {rates}")
-        self.register_buffer("rates", slope)
+        self.register_buffer("given", slope)
+
+    @property
+    def rates(self) -> Tensor:
+        """Rates (k,) at the knots: the given ones, or the spline's through the values as they are now."""
+        return spline_rates(self.times, self.values) if self.given is None else self.given
 
     @property
     def stops(self) -> Tensor:
@@ -129,9 +144,46 @@ class Sampled(Piecewise):
 
     def control(self) -> Tensor:
         """Control points of every piece (k - 1, 4)."""
-        third = self.times.diff() / 3
+        third, rates = self.times.diff() / 3, self.rates
         a, b = self.values[:-1], self.values[1:]
-        return torch.stack((a, a + third * self.rates[:-1], b - third * self.rates[1:], b), -1)
+        return torch.stack((a, a + third * rates[:-1], b - third * rates[1:], b), -1)
+
+
+def spline_rates(t: Tensor, y: Tensor) -> Tensor:
+    """Rates (k,) at the knots of the cubic spline through y (k,) at times t (k,) [s] without a knot at the second time and at
+    the last but one: a parabola through three, a line through two. Differentiable in both."""
+    h = t.diff()
+    slope = y.diff() / h
+    if len(t) < 3:
+        return torch.zeros_like(y) if len(t) == 1 else slope.expand(2)
+    inner = h[1:] * slope[:-1] + h[:-1] * slope[1:]
+    if len(t) == 3:
+        middle = inner / h.sum()
+        return torch.cat((2 * slope[:1] - middle, middle, 2 * slope[1:] - middle))
+    first, last = h[:1] + h[1:2], h[-2:-1] + h[-1:]
+    diagonal = torch.cat((h[1:2], 2 * (h[:-1] + h[1:]), h[-2:-1]))
+    lower, upper = torch.cat((h[1:], last)), torch.cat((first, h[:-1]))
+    begin = ((h[:1] + 2 * first) * h[1:2] * slope[:1] + h[:1] ** 2 * slope[1:2]) / first
+    end = (h[-1:] ** 2 * slope[-2:-1] + (2 * last + h[-1:]) * h[-2:-1] * slope[-1:]) / last
+    return Tridiagonal.apply(lower, diagonal, upper, torch.cat((begin, 3 * inner, end)))  # pyright: ignore[reportReturnType]
+
+
+class Tridiagonal(torch.autograd.Function):
+    """The solution x (k,) of a tridiagonal system with right-hand side b (k,): O(k), differentiable in everything."""
+
+    @staticmethod
+    def forward(ctx: Any, lower: Tensor, diagonal: Tensor, upper: Tensor, b: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        bands = np.zeros((3, len(b)))
+        bands[0, 1:], bands[1], bands[2, :-1] = upper.numpy(), diagonal.numpy(), lower.numpy()
+        x = torch.from_numpy(solve_banded((1, 1), bands, b.numpy()))
+        ctx.save_for_backward(lower, diagonal, upper, x)
+        return x
+
+    @staticmethod
+    def backward(ctx: Any, x_bar: Tensor) -> tuple[Tensor, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        lower, diagonal, upper, x = ctx.saved_tensors
+        b_bar: Any = Tridiagonal.apply(upper, diagonal, lower, x_bar)
+        return -b_bar[1:] * x[:-1], -b_bar * x, -b_bar[:-1] * x[1:], b_bar
 
 
 class Reference(nn.Module):
@@ -150,7 +202,7 @@ class Reference(nn.Module):
         self.signals = nn.ModuleDict({name.replace(".", ":"): signal for name, signal in signals.items()})
 
     def forward(self, t: Tensor, names: Sequence[str]) -> Tensor:
-        """Values and rates (..., names, 2) at t (...) [s]. Raises `ValueError` for a signal that is not there."""
+        """Values and rates (..., names, 2) at t (...) [s]. Raises `ValueError` for a signal that is not there, or is none."""
         rows = []
         for name in names:
             if name.replace(".", ":") not in self.signals:
@@ -161,7 +213,7 @@ class Reference(nn.Module):
 
     def _asked(self, name: str, t: Tensor) -> Tensor:
         """Value and rate (..., 2) of one signal."""
-        given = self[name](t)
+        given = self._now(name)(t)
         if not isinstance(given, tuple) or len(given) != 2 or not all(isinstance(x, Tensor) for x in given):
             raise ValueError(
                 f"the signal `{name}` must give two tensors, value and rate, but gives {type(given).__name__}"
@@ -173,9 +225,17 @@ class Reference(nn.Module):
                 )
         return torch.stack(given, -1)
 
+    def _now(self, name: str) -> nn.Module:
+        """A signal, whose knots may have been changed since it was made. Raises `ValueError` for those that are none."""
+        signal = self[name]
+        if isinstance(signal, Piecewise) and (wrong := signal.ill_posed()):
+            raise ValueError(f"the signal `{name}` of the reference is none any more: {wrong}")
+        return signal
+
     def plain(self, names: Sequence[str]) -> list[Piecewise] | None:
-        """These signals, if all of them are polynomials of this package's and nothing else decides their values; else None."""
-        chosen = [self[name] for name in names]
+        """These signals, if all of them are polynomials of this package's and nothing else decides their values; else None.
+        Raises `ValueError` for knots that are none."""
+        chosen = [self._now(name) for name in names]
         if type(self).forward is not Reference.forward or self._forward_hooks or self._forward_pre_hooks:
             return None
         for one in chosen:

@@ -11,15 +11,14 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.interpolate import CubicSpline
 from torch import Tensor, nn
 
 from torchsoft.channels import unit
-from torchsoft.physics.motion import Sampled
+from torchsoft.physics.motion import Sampled, spline_rates
 from torchsoft.physics.parts import Actuator
 from torchsoft.sysid.conventions.closed_loop import channel
 from torchsoft.sysid.conventions.finding import Finding
-from torchsoft.sysid.problem.recording import Array, Recording
+from torchsoft.sysid.problem.recording import Recording
 from torchsoft.sysid.problem.unknowns import Sensor
 
 NOTICED = 0.2
@@ -50,18 +49,14 @@ class Gap(NamedTuple):
 
 def cubic(signal: Sampled, every: int, derived: bool) -> Sampled:
     """The signal by one in so many rows; rates that were `derived` from all rows are derived from these."""
-    rates = None if derived else signal.rates[::every]
+    rates = None if derived else signal.rates.detach()[::every]
     return Sampled(signal.times[::every], signal.values.detach()[::every], rates)
 
 
 def is_derived(signal: Sampled) -> bool:
     """Whether its rates are those of the spline through its values."""
-    return bool(np.allclose(spline_rates(signal), signal.rates.numpy(), rtol=1e-9, atol=1e-12))
-
-
-def spline_rates(signal: Sampled) -> Array:
-    t = signal.times.numpy()
-    return CubicSpline(t, signal.values.detach().numpy())(t, 1)
+    own = spline_rates(signal.times, signal.values)
+    return bool(torch.allclose(own, signal.rates, rtol=1e-9, atol=1e-12))
 
 
 def extrapolated(by: Mapping[int, Tensor]) -> tuple[float, float]:
@@ -141,8 +136,9 @@ def other_rate(recording: Recording, setpoint: str) -> Finding | None:
     """The words on rates that are not those of the values."""
     signal = recording.rig.reference[setpoint]
     assert isinstance(signal, Sampled)
-    given, own = signal.rates.numpy(), spline_rates(signal)
-    fewer = spline_rates(Sampled(signal.times[::2], signal.values.detach()[::2]))
+    times, values = signal.times, signal.values.detach()
+    given, own = signal.rates.detach().numpy(), spline_rates(times, values).numpy()
+    fewer = spline_rates(times[::2], values[::2]).numpy()
     size, off, unsure = (float(np.sqrt(np.mean(e**2))) for e in (own, given - own, fewer - own[::2]))
     if off <= OTHER_RATE * max(size, float(np.sqrt(np.mean(given**2)))) or unsure > OTHER_RATE / 2 * size:
         return None
