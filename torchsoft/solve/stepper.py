@@ -59,7 +59,7 @@ class ImplicitStepper:
     does not solve is taken as two of half the length, and so on up to `HALVINGS` times. `window` [m] is how near a point has to
     be to count as one that may touch (checked after every stage; only speed depends on it).
 
-    Raises `ValueError` for a tolerance below `SMALLEST_TOLERANCE`.
+    Raises `ValueError` for a tolerance below `SMALLEST_TOLERANCE` and an rtol that is not below 1.
     """
 
     def __init__(
@@ -74,6 +74,10 @@ class ImplicitStepper:
             raise ValueError(f"`reference` must be a Reference, but is {type(followed).__name__}")
         self.step = None if step is None else positive("step", step)
         self.rtol, self.atol = positive("rtol", rtol), positive("atol", atol)
+        if self.rtol >= 1:
+            raise ValueError(
+                f"`rtol` must be below 1, but is {self.rtol:g}; where only `atol` is given, it is ten times that"
+            )
         self.longest = positive("longest", longest)
         self.tolerance, self.window = positive("tolerance", tolerance), positive("window", window)
         self.max_iterations, self.landing = whole("max_iterations", max_iterations, 1), landing
