@@ -148,6 +148,13 @@ def test_a_run_that_fails_leaves_the_others_alone(start: tuple[SoftGrasp, Tensor
         ({"parameters": {"contact.K_n": K_n.float()}}, "float64"),
         ({"parameters": {"contact.K_n": K_n}, "gradient": "unrolled"}, "a batch takes gradient='none'"),
         ({"parameters": {"contact.K_n": K_n}, "rtol": -1.0}, "`rtol` must be positive"),
+        *(
+            (
+                {"parameters": {"contact.K_n": K_n}, "threads": threads},
+                "`threads` must be a whole number from 1 on, but is",
+            )
+            for threads in (0, -1, 1.5, True, "2")
+        ),
     ],
 )
 def test_what_no_batch_can_be_is_refused(start: tuple[SoftGrasp, Tensor], options: dict[str, Any], match: str) -> None:

@@ -2,22 +2,23 @@
 
 import re
 import warnings
+from collections.abc import Callable
 
 import pytest
 import torch
 from conftest import coarse, grasped, times
 from torch import Tensor, nn
 
-from torchsoft import Body, Circle, Profile, Reference, Rig, SoftGrasp, hold, simulate
+from torchsoft import Body, Circle, Profile, Reference, Rig, SoftGrasp, hold, simulate, simulate_batch
 from torchsoft.excitation import CATALOGUE, begin
 from torchsoft.solve.ledger import RESIDUAL, doubts
 
 
-def told(model: Rig, **options: object) -> list[str]:
-    """The warnings of a run."""
+def told(model: Rig, run: Callable[..., object] = simulate, **options: object) -> list[str]:
+    """The warnings of a run, or of many."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        simulate(model, **options)  # pyright: ignore[reportArgumentType]
+        run(model, **options)
     return [str(w.message) for w in caught]
 
 
@@ -59,9 +60,22 @@ def test_a_pad_pressed_flat_is_told_of() -> None:
     assert any("gave way by" in text and "beyond linear elasticity" in text for text in said), said
 
 
+def test_a_batch_tells_every_doubt_once_with_all_its_runs() -> None:
+    model = coarse()
+    y0 = grasped(model)
+    pressed = hold(x_d=0.06, y_d=0.044, F_ff=-1000.0)
+    references = [model.reference, pressed, model.reference, pressed]
+    said = told(model, simulate_batch, t=times(0.02, 3), y0=y0, step=5e-4, reference=references)
+    for pad, text in zip("LU", said, strict=True):
+        assert re.match(rf"runs 1, 3 \(numbers of run 1\): the pad `{pad}` of height .* gave way by", text), text
+    assert told(model, simulate_batch, t=times(0.02, 3), y0=y0, step=5e-4, reference=references[:2])[0].startswith(
+        "run 1: the pad"
+    )
+
+
 def test_a_body_without_contact_or_energy_passes() -> None:
     """Nothing moves, nothing is stored: no division by nothing."""
     rig = Rig(bodies={"disc": Body(1.0, Circle(0.02), weighted=False)}, pads={}, contacts={})
     run = simulate(rig, times(0.1, 3), y0=torch.zeros(6, dtype=torch.float64))
-    assert list(doubts(run, rig)) == []
+    assert doubts(run, rig) == {}
     assert 0 < RESIDUAL < 0.1

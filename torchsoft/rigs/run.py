@@ -93,7 +93,7 @@ def summary(file: RigFile, done: Done, found: list[Finding]) -> dict[str, Any]:
             "worst_imbalance_J": float(run.energy_residual.abs().max()),
             "worst_imbalance_over_injected": run.energy_residual_rel,
         },
-        "doubts": list(doubts(run, rig)),
+        "doubts": list(doubts(run, rig).values()),
         "stepping": vars(run.stats) | {"newton_per_step": run.stats.newton_per_step},
         "findings": [one._asdict() for one in found],
         "torchsoft": version("torchsoft"),

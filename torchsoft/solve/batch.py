@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from torchsoft.physics.arguments import whole
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
@@ -107,7 +108,7 @@ def simulate_batch(
     gradient: Route = options.get("gradient", "none")
     if gradient not in ("none", "discrete", "forward"):
         raise ValueError(f"a batch takes gradient='none', 'discrete' or 'forward', not {gradient!r}")
-    began, threads = clock.perf_counter(), min(count, cores() if threads is None else threads)
+    began, threads = clock.perf_counter(), min(count, cores() if threads is None else whole("threads", threads, 1))
     budget = TAPE_BYTES / count
 
     def work(i: int) -> Done | Exception:
@@ -145,11 +146,15 @@ def simulate_batch(
 
 
 def _doubt(rigs: Sequence[Rig], trajectories: Sequence[Trajectory | None]) -> None:
-    """Warn of what is doubtful in any run, once."""
+    """Warn once of everything that is doubtful, naming its runs, in the words of the first of them."""
+    found: dict[str, dict[int, str]] = {}
     for i, trajectory in enumerate(trajectories):
-        for doubt in doubts(trajectory, rigs[i]) if trajectory is not None else ():
-            warnings.warn(f"run {i}: {doubt}", stacklevel=3)
-            return
+        for subject, doubt in doubts(trajectory, rigs[i]).items() if trajectory is not None else ():
+            found.setdefault(subject, {})[i] = doubt
+    for runs in found.values():
+        first, *others = runs
+        who = f"runs {', '.join(map(str, runs))} (numbers of run {first})" if others else f"run {first}"
+        warnings.warn(f"{who}: {runs[first]}", stacklevel=3)
 
 
 def _spread(

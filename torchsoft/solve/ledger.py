@@ -1,7 +1,5 @@
 """What a finished run says of itself: whether its energies balance, and whether its pads are pressed beyond the theory."""
 
-from collections.abc import Iterator
-
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.trajectory import Trajectory
 
@@ -19,24 +17,29 @@ COMPRESSED = 0.5
 """Part of its height by which a pad may be pressed in: linear elasticity ends well below."""
 
 
-def doubts(trajectory: Trajectory, rig: Rig) -> Iterator[str]:
-    """Sentences on what is wrong with a finished run that has a ledger; none if nothing is."""
-    run = trajectory
+def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
+    """Sentences on what is wrong with a finished run that has a ledger, by what they are about; none if nothing is."""
+    run, found = trajectory, {}
     stored = sum(float(part[0].detach()) for part in run.energy.values())
     scale = max(stored + float(run.injected[-1]), NEGLIGIBLE)
     part = float(run.energy_residual.detach().abs().max()) / scale
     if not part <= RESIDUAL:
         longest = float(run.knots.diff().max())
         better = 0.4 * longest * min(1.0, RESIDUAL / part)
-        yield (
+        found["energies"] = (
             f"the energies of the run do not balance: {part:.2%} of what was stored at the start and injected since is missing "
             f"or too much, with steps of {longest:.3g} s; try steps of {better:.2g} s"
         )
     for name, work in run.dissipated.items():
         back = -float(work.diff().min())
         if back > SUPPLIED * scale:
-            yield f"`{name}` is to dissipate energy, but gave {back:.3g} J back between two outputs; check its law"
+            found[f"dissipated {name}"] = (
+                f"`{name}` is to dissipate energy, but gave {back:.3g} J back between two outputs; check its law"
+            )
     for name, u in run.displacement.items():
         deepest, height = float(u.detach().norm(dim=-1).max()), rig.pads[name].mesh.height
         if not deepest <= COMPRESSED * height:
-            yield f"the pad `{name}` of height {height:.3g} m gave way by {deepest:.3g} m, beyond linear elasticity"
+            found[f"pad {name}"] = (
+                f"the pad `{name}` of height {height:.3g} m gave way by {deepest:.3g} m, beyond linear elasticity"
+            )
+    return found

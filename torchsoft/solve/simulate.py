@@ -84,7 +84,7 @@ def simulate(
     if gradient in ("unrolled", "continuous"):
         return _recorded(task.stepper, t, task.y0, gradient)
     trajectory = run(task, TAPE_BYTES, progress).trajectory()
-    for doubt in doubts(trajectory, rig):
+    for doubt in doubts(trajectory, rig).values():
         warnings.warn(doubt, stacklevel=2)
     return trajectory
 
