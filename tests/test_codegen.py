@@ -291,6 +291,27 @@ def test_detach_passes_the_value_and_stops_the_derivative():
     _assert_equal_to_torch(law, _points(3), _numbers(a=0.4))
 
 
+def _under_no_grad(x, p):
+    with torch.no_grad():
+        y = torch.where(x > 0, p["a"] * x, x[0])
+        with torch.enable_grad():
+            y = y * x.exp()
+    return y * x
+
+
+def _by_a_slope(x, p):
+    """A derivative that is taken without its own graph is a number to torch."""
+    with torch.enable_grad():
+        y = x.detach().requires_grad_()
+        (slope,) = torch.autograd.grad((y**3 * p["a"]).sum(), y)
+    return slope * x
+
+
+@pytest.mark.parametrize("law", [_under_no_grad, _by_a_slope])
+def test_where_torch_records_no_derivative_a_law_has_none(law):
+    _assert_equal_to_torch(law, _points(3), _numbers(a=0.4))
+
+
 def test_leading_outputs_and_inputs_are_chosen_and_the_pullback_accumulates():
     law = lambda x, p: torch.cat([x * p["a"], x**2])
     compiled = compile_law(law, _points(3)[0], _numbers(a=2.0), linear=2, differentiated=1)
@@ -319,6 +340,26 @@ def _in_place(x, p):
     return y
 
 
+class _Straight(torch.autograd.Function):
+    """A limit through which the gradient passes as if there were none."""
+
+    @staticmethod
+    def forward(ctx, x):
+        return x.clamp(max=0.5)
+
+    @staticmethod
+    def backward(ctx, g):
+        return g
+
+
+class _Reversed(_Straight):
+    """The same number with another gradient, by no operation at all."""
+
+    @staticmethod
+    def forward(ctx, x):
+        return x
+
+
 REFUSED = {
     "operation without a rule": (lambda x, p: torch.special.bessel_j0(x), "bessel_j0"),
     "Python branch": (lambda x, p: x if x[0] > 0 else -x, r"use torch\.where"),
@@ -337,6 +378,11 @@ REFUSED = {
     "whole quotient": (lambda x, p: x * (x.argmin() // 2), "floor_divide"),
     "place": (lambda x, p: torch.index_select(x, 0, x.argmin().reshape(1)), "look up rows of a parameter"),
     "look-up without gradient": (lambda x, p: F.embedding(x.argmin(), x[:, None], padding_idx=1), "look-up with grad"),
+    "backward of one's own": (
+        lambda x, p: _Straight.apply(x),
+        "the torch.autograd.Function _Straight at .* cannot be compiled",
+    ),
+    "backward of one's own on nothing": (lambda x, p: _Reversed.apply(x), "the torch.autograd.Function _Reversed"),
     "random": (lambda x, p: x + torch.rand(2, dtype=torch.float64), "random operation aten.rand"),
     "norm of order 1": (lambda x, p: torch.linalg.vector_norm(x, 1).reshape(1), "linalg_vector_norm"),
     "rounding": (lambda x, p: torch.div(x, 2, rounding_mode="floor"), "a division that rounds"),

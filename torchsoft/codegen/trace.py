@@ -27,6 +27,7 @@ except ImportError as error:
 _SKIPPED = tuple(os.path.dirname(str(file)) + os.sep for file in (torch.__file__, __file__))
 _BRANCH = "use torch.where in place of a Python branch, and torch.stack in place of torch.tensor"
 _PYTHON_READS = {torch.tensor, torch.as_tensor, Tensor.tolist, Tensor.numpy, Tensor.__array__}
+_APPLY = torch.autograd.Function.apply.__func__.__code__
 _BITWISE = {"bitwise_and", "bitwise_or", "bitwise_xor", "bitwise_not"}  # no rule for whole numbers
 
 
@@ -43,6 +44,16 @@ def _place() -> str:
     return f"{file}:{line}, `{linecache.getline(file, line, frame.f_globals).strip()}`"
 
 
+def _applied() -> str:
+    """The name of the torch.autograd.Function that is being applied; empty if none is."""
+    frame = sys._getframe(1)
+    while frame is not None:
+        if frame.f_code is _APPLY:
+            return frame.f_locals["cls"].__name__
+        frame = frame.f_back
+    return ""
+
+
 class _Reads(TorchFunctionMode):
     """Refuses the functions that copy a symbolic tensor's memory without asking the dispatcher."""
 
@@ -57,7 +68,8 @@ class _Reads(TorchFunctionMode):
 
 
 class Trace(TorchDispatchMode):
-    """Runs every operation and, where it depends on a symbolic tensor, records what each entry of the result is."""
+    """Runs every operation and, where it depends on a symbolic tensor, records what each entry of the result is: without
+    derivatives where torch records none, as under torch.no_grad()."""
 
     def __init__(self, graph: Graph) -> None:
         super().__init__()
@@ -104,6 +116,11 @@ class Trace(TorchDispatchMode):
                 )
         if not self.holds((args, kwargs)) or name in CONSTANT:
             return func(*args, **kwargs)
+        if own := _applied():
+            raise self.refused(
+                f"the torch.autograd.Function {own}",
+                "its own backward cannot be compiled, so write it with torch's operations",
+            )
         if name in READS:
             raise self.refused(f"reading a value into Python ({func})", _BRANCH)
         if func._schema.is_mutable and name not in MOVES:
@@ -131,6 +148,8 @@ class Trace(TorchDispatchMode):
         nodes = mapped(typed, np.asarray(nodes))
         if nodes.shape != tuple(tensor.shape):
             raise RuntimeError(f"the rule of {func} gives shape {nodes.shape}, torch {tuple(tensor.shape)}")
+        if tensor.dtype == torch.float64 and not torch.is_grad_enabled():
+            nodes = mapped(lambda node: node if self.graph.ops[node] == "stop" else self.graph("stop", node), nodes)
         self.register(tensor, nodes)
 
     def _recorded(self, name: str, func: Any, args: tuple, kwargs: Mapping[str, Any]) -> Any:
@@ -184,7 +203,7 @@ def traced(
         start += tensor.numel()
     out = None
     try:
-        with torch.no_grad(), _Reads(trace), trace:
+        with torch.enable_grad(), _Reads(trace), trace:
             out = function(x, copies)
     except Exception:
         if trace.refusal is None:
