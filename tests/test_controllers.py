@@ -12,6 +12,8 @@ from torch import Tensor, nn
 from torchsoft import (
     PD,
     Actuator,
+    Body,
+    Circle,
     Parameters,
     Profile,
     Reference,
@@ -19,6 +21,7 @@ from torchsoft import (
     SoftGrasp,
     StateFeedback,
     controller,
+    hold,
     press,
     simulate,
 )
@@ -214,6 +217,31 @@ def file(**changes: Any) -> RigFile:
     }  # fmt: skip
     tree["outputs"] = {"duration": 0.6, "interval": 0.02}
     return RigFile.from_tree(tree)
+
+
+def test_a_law_of_ones_own_that_is_none_is_refused_with_its_actuator() -> None:
+    """Before the run, with what it must take and return."""
+    kept: list[torch.Tensor] = []
+
+    def keeping(w: Any, w_dot: Any, feed_forward: Any, q: Any, q_dot: Any) -> torch.Tensor:
+        kept.append(q)
+        return 100.0 * (w - kept[0])
+
+    must = r"the law of `actuators.x` must take five tensors .* and return the effort, .* but "
+    for law, message in (
+        (lambda w, w_dot, feed_forward, q, q_dot: None, must + "TypeError: for one state it gives None"),
+        (lambda w, w_dot, feed_forward, q, q_dot: 3.0, must + r"TypeError: for one state it gives 3\.0"),
+        (lambda w, w_dot, feed_forward, q, q_dot: torch.stack((w, q)), must + r".* a tensor of shape \(2,\)"),
+        (lambda w, q: w - q, must + "TypeError: .* takes 2 positional arguments but 5 were given"),
+        (lambda w, w_dot, feed_forward, q, q_dot: (w - q)[3], must + "IndexError"),
+        (keeping, "`actuators.x`: The law is another one when it is called again"),
+    ):
+        rig = Rig(
+            bodies={"disc": Body(1.0, Circle(0.02), weighted=False)}, pads={}, contacts={}, reference=hold(x_d=0.0),
+            actuators={"x": Actuator("disc.x", "disc.x", law, setpoint="x_d")},
+        )  # fmt: skip
+        with pytest.raises(TypeError, match=message):
+            simulate(rig, times(0.01, 2), y0=torch.zeros(6, dtype=torch.float64))
 
 
 def test_a_controller_in_a_file_is_the_loops_that_it_stands_for(tmp_path: Path) -> None:

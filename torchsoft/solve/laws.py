@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from torchsoft.codegen import Law, compile_law
+from torchsoft.codegen import Law, UnknownOperation, compile_law
 from torchsoft.codegen.graph import Graph
 from torchsoft.codegen.trace import traced
 from torchsoft.physics.contact import distance_law, free_law, interface_law
@@ -105,22 +105,45 @@ def compiled_law(
             return torch.func.functional_call(called, own, (x,))
 
         example = torch.linspace(0.01, 0.02, size, dtype=torch.float64)
-        if not known:  # what somebody's own code does is known from running it only, and may change any time
+
+        def expressions() -> tuple[Any, ...]:
             graph = Graph()
             outputs = traced(graph, law, example, names)
-            key = tuple(graph.ops), repr(graph.args), tuple(outputs), shapes, linear, differentiated
+            return tuple(graph.ops), repr(graph.args), tuple(outputs), shapes, linear, differentiated
+
+        if not known:  # what somebody's own code does is known from running it only, and may change any time
+            key = expressions()
         if key not in _laws:
+            if not known and expressions() != key:
+                raise UnknownOperation(
+                    "The law is another one when it is called again, so it keeps something of a call."
+                )
             _laws[key] = compile_law(law, example, names, linear=linear, differentiated=differentiated)
         return _laws[key]
 
 
 def _effort(actuator: nn.Module, x: Tensor) -> Tensor:
-    return actuator(x)[None]
+    effort = actuator(x)
+    if not isinstance(effort, Tensor) or effort.ndim:
+        shown = f"a tensor of shape {tuple(effort.shape)}" if isinstance(effort, Tensor) else repr(effort)
+        raise TypeError(f"for one state it gives {shown}")
+    return effort[None]
 
 
-def actuator_law(actuator: Actuator, parameters: Mapping[str, Tensor]) -> Law:
-    """The law of an actuator: its effort by set-points and their rates, feed-forward, coordinates and their rates."""
-    return compiled_law(parameters, _effort, actuator.inputs, 1, actuator.inputs, law=actuator)
+def actuator_law(name: str, actuator: Actuator, parameters: Mapping[str, Tensor]) -> Law:
+    """The law of an actuator: its effort by set-points and their rates, feed-forward, coordinates and their rates.
+
+    Raises `UnknownOperation` for one that cannot be compiled, `TypeError` for one that fails or gives no effort; with its name.
+    """
+    try:
+        return compiled_law(parameters, _effort, actuator.inputs, 1, actuator.inputs, law=actuator)
+    except UnknownOperation as error:
+        raise UnknownOperation(f"`actuators.{name}`: {error}") from error
+    except Exception as error:  # whatever somebody's own code raises
+        raise TypeError(
+            f"the law of `actuators.{name}` must take five tensors (set-point, its rate, feed-forward, coordinate, its rate) "
+            f"and return the effort, a tensor of a coordinate's shape, but {type(error).__name__}: {error}"
+        ) from error
 
 
 def contact_laws(law: Any, shape: Any) -> LawSet:

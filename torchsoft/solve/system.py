@@ -208,14 +208,14 @@ class Compiled:
 
     def _make_actuators(self) -> Actuators:
         rig, rows, starts, setpoints, measured = self.rig, [], [], [], []
-        for actuator in rig.actuators.values():
+        for name, actuator in rig.actuators.items():
             parameters = {f"law.{k}": v for k, v in actuator.named_parameters()}
-            law = actuator_law(actuator, parameters)
+            law = actuator_law(name, actuator, parameters)
             starts.append(self._add_all(parameters))
             feed = rig.signals.index(actuator.feed_forward) if actuator.feed_forward is not None else -1
             rows.append((law.linearise, law.pullback, rig.coordinate(actuator.pushes), feed))
-            setpoints.append([rig.signals.index(name) for name in actuator.setpoints])
-            measured.append([rig.coordinate(name) for name in actuator.measures])
+            setpoints.append([rig.signals.index(one) for one in actuator.setpoints])
+            measured.append([rig.coordinate(one) for one in actuator.measures])
         linearise, pullback, pushed, feed_forward = (np.ascontiguousarray(x) for x in _ints(rows).reshape(-1, 4).T)
         make: Any = Actuators
         return make(
