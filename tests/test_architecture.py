@@ -25,7 +25,7 @@ FLOWS = {
         grid kernel laws system progress tolerances rates stability stepper adjoint tangent unrolled continuous trajectory
         ledger simulate batch torchdiffeq .
     """,
-    "sysid": "problem fit conventions checks certainty answer conclude solve laws files report design .",
+    "sysid": "problem fit conventions checks certainty answer settings conclude solve laws files report design .",
     "sysid.problem": """
         start underway recording unknowns readout noise prediction journal workers problem first_samples synthetic .
     """,

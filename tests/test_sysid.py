@@ -289,6 +289,29 @@ def test_data_out_of_reach_name_the_recording() -> None:
         identify(problem, rtol=RTOL)
 
 
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ({"loss": "huber", "method": "lbfgs"}, "^the method 'lbfgs' has no robust loss: for loss = 'huber' take"),
+        ({"loss": "cauchy", "method": "adam"}, "^the method 'adam' has no robust loss"),
+        ({"loss": "Huber"}, "^loss should be 'linear', .* or 'arctan', not 'Huber'"),
+        ({"method": "LBFGS"}, "^method should be 'gauss_newton', 'lbfgs' or 'adam', not 'LBFGS'"),
+        ({"assumptions": "check"}, "^assumptions should be 'checked' or 'trusted', not 'check'"),
+        ({"seed": -1}, "^seed should be greater than or equal to 0, not -1"),
+        ({"rtol": "1e-5"}, "^rtol should be a valid number, not '1e-5'"),
+        ({"rtol": float("nan")}, "^rtol should be a finite number, not nan"),
+        ({"workers": 1.5}, "^workers should be a valid integer, not 1.5"),
+        ({"tightenings": -1}, "^tightenings should be greater than or equal to 0, not -1"),
+        ({"starts": 0}, "^starts should be greater than or equal to 1, not 0"),
+        ({"starts": 3, "plan": []}, "^`starts` and `rtol` are those of the default plan"),
+        ({"rtol": 1e-7, "plan": []}, "^`starts` and `rtol` are those of the default plan"),
+    ],
+)  # fmt: skip
+def test_what_a_fit_cannot_honour_is_refused_before_it(strokes: Recording, how: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        identify(Problem([strokes], SENSORS, four()), **how)
+
+
 def test_sobol_starts_stay_within_bounds_and_the_best_end_is_kept(strokes: Recording) -> None:
     problem = Problem([strokes], SENSORS, {"pad.E": Unknown(nominal=1.0e6, low=0.5e6, high=2e6)} | rest_known())
     stage = Stage("all", ("strokes",), ("pad.E",), RTOL, starts=4)

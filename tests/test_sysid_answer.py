@@ -25,6 +25,7 @@ from torchsoft.sysid.answer.contribution import contributions
 from torchsoft.sysid.answer.estimate import Number, estimates
 from torchsoft.sysid.answer.recorded import recorded_rigs
 from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.settings import Settings
 
 ROOT = Path(__file__).parents[1]
 PUBLISH = "from torchsoft.files import write_json; write_json('docs/answer.schema.json', schema())"
@@ -112,6 +113,12 @@ def test_what_was_saved_comes_back(result: IdentificationResult, path: Path) -> 
     assert answer.to_json() == path.read_text(encoding="utf-8")
     assert answer.table() == result.table()
     assert answer.recordings[1].began == {"start.disc.x": result["start.disc.x"].last}
+
+
+def test_an_answer_says_what_was_asked_for(result: IdentificationResult) -> None:
+    """The tolerance too, beside the one at which the fit ended."""
+    asked = Settings(tightenings=0, assumptions="trusted").model_dump() | {"rtol_asked": 1e-3, "meant": []}
+    assert {name: result.made_by[name] for name in asked} == asked | {"rtol": 1e-3}
 
 
 def test_everything_that_an_answer_can_hold_comes_back(tmp_path: Path) -> None:

@@ -183,6 +183,9 @@ BAD_CONFIG = {
     "rtol": (CONFIG.replace("rtol = 1e-3", "rtol = -1"), r"fit\.rtol should be greater than or equal to 1e-08, not -1"),
     "step": (CONFIG.replace("rtol = 1e-3", "step = 5e-3"), r"fit: .*tolerances choose the steps; leave it out, or give"),
     "method": (CONFIG + 'method = "magic"\n', r"fit\.method should be 'gauss_newton'"),
+    "a loss that the method has not": (
+        CONFIG + 'loss = "huber"\nmethod = "lbfgs"\n', r"fit: the method 'lbfgs' has no robust loss: for loss = 'huber' take",
+    ),
     "text for a number": (CONFIG.replace("rtol = 1e-3", 'rtol = "1e-3"'), r"fit\.rtol should be a valid number, not '1e-3'"),
     "truth for a number": (CONFIG.replace("nominal = 1e5", "nominal = true"), r"nominal should be a valid number, not True"),
     "a disc that fits nowhere": (

@@ -47,11 +47,11 @@ def identify(options: argparse.Namespace) -> int:
         # these take seconds to import, so that `--help` does without
         from torchsoft.cost import agree
         from torchsoft.sysid.files import measured
-        from torchsoft.sysid.files.configuration import Settings
         from torchsoft.sysid.files.cost import cost, one_by_one
         from torchsoft.sysid.fit.fit import Unreachable
         from torchsoft.sysid.problem.journal import forget
         from torchsoft.sysid.report.report import report
+        from torchsoft.sysid.settings import Settings
         from torchsoft.sysid.solve import identify
 
         tables: dict[str, Any] = {}

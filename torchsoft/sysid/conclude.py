@@ -2,7 +2,7 @@
 
 import time as clock
 from importlib.metadata import version
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +18,11 @@ from torchsoft.sysid.fit.information import fisher
 from torchsoft.sysid.fit.plan import Stage
 from torchsoft.sysid.fit.robust import Loss
 from torchsoft.sysid.fit.settle import FINER, STEP_BIAS, Settled, settle
-from torchsoft.sysid.fit.stages import Method, progress_bar, stage_entry
+from torchsoft.sysid.fit.stages import progress_bar, stage_entry
 from torchsoft.sysid.problem.problem import Residuals
 from torchsoft.sysid.problem.recording import Array
 from torchsoft.sysid.problem.workers import Runner
-
-Assumed = Literal["checked", "trusted"]
-"""Whether what is taken for granted is varied at the end, or believed."""
+from torchsoft.sysid.settings import Settings
 
 
 class How(NamedTuple):
@@ -32,11 +30,17 @@ class How(NamedTuple):
 
     fitted: list[str]
     heldout: tuple[str, ...]
-    method: Method
-    loss: Loss
-    seed: int
-    assumptions: Assumed
-    tightenings: int
+    meant: tuple[str, ...]
+    settings: Settings
+
+    @property
+    def loss(self) -> Loss:
+        return self.settings.loss
+
+    @property
+    def tightenings(self) -> int:
+        """How often the tolerance may become tighter; a robust fit ends on the steps that it has."""
+        return self.settings.tightenings if self.loss == "linear" else 0
 
 
 def conclude(
@@ -68,7 +72,7 @@ def conclude(
     colour, bound = bool(coloured.found.keys() - set(declared)), bool((free & c.at_bound(x)).any())
     doubtful = not end.at_rest or colour or bound or any(one.alarming for one in verdicts)
     checked = None
-    if how.assumptions == "checked":
+    if how.settings.assumptions == "checked":
         with progress_bar("check of what is taken for granted", progress) as notify:
             checked = taken_for_granted(coloured, runner, end, stage, free, doubtful, how.loss, notify)
     C, shift = np.zeros((len(x), len(x))), np.zeros(len(x)) if end.bias is None else end.bias
@@ -108,8 +112,8 @@ def conclude(
             "data_seconds": sum(r.duration for r in problem.recordings if r.name in how.fitted),
         },
         made_by={
-            "torchsoft": version("torchsoft"), "method": how.method, "loss": how.loss, "seed": how.seed, "rtol": rtol,
-            "assumptions": how.assumptions, "workers": runner.workers,
+            "torchsoft": version("torchsoft"), **how.settings.model_dump(), "rtol": rtol, "rtol_asked": stage.rtol,
+            "meant": list(how.meant),
             "unknowns": {name: u.model_dump() for name, u in problem.unknowns.items()},
             "sensors": {name: s.model_dump() for name, s in problem.sensors.items()},
             "recordings": {r.name: r.fingerprint for r in problem.recordings},

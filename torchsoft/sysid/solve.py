@@ -10,7 +10,7 @@ import numpy as np
 
 from torchsoft.sysid.answer.result import IdentificationResult
 from torchsoft.sysid.checks.colour import Coloured, allow_for_colour
-from torchsoft.sysid.conclude import Assumed, How, conclude
+from torchsoft.sysid.conclude import How, conclude
 from torchsoft.sysid.conventions.conventions import check
 from torchsoft.sysid.conventions.finding import accepted
 from torchsoft.sysid.fit.fit import Fit, Notify, Unreachable, chord, descend, gauss_newton
@@ -20,10 +20,7 @@ from torchsoft.sysid.fit.stages import Method, progress_bar, run_stage, stage_en
 from torchsoft.sysid.problem.problem import Problem, Residuals
 from torchsoft.sysid.problem.recording import Array
 from torchsoft.sysid.problem.workers import Runner
-
-RTOL = 1e-5
-"""Relative tolerance of the last stage: derivatives are then right to some percent, and estimates to a fraction of a standard
-deviation where sensors are as good as `RIG`."""
+from torchsoft.sysid.settings import RTOL, Assumed, Settings
 
 
 def identify(
@@ -38,7 +35,8 @@ def identify(
     freezes the steps that its tolerance chooses at its start, one sequence a recording, so that residuals are smooth in the
     unknowns. `rtol` is the last stage's. At the end a run with a tenth of it tells how far the steps shift the estimates:
     where that is more than `STEP_BIAS` standard deviations, the fit goes on with a tenth of the tolerance, up to
-    `tightenings` times (with the linear loss). `loss` is scipy's robust loss; `method` may descend on the adjoint instead.
+    `tightenings` times (with the linear loss). `loss` is scipy's robust loss; `method` may descend on the adjoint instead,
+    with the linear loss only.
     Recordings named in `heldout` are predicted, not fitted; `workers` threads run side by side. With a `checkpoint`
     folder every run is kept there: an identification that was interrupted, called again with the same arguments, continues
     where it was.
@@ -49,16 +47,18 @@ def identify(
     rig can do at all: signs, units, delays, zeros, set-points, the body that a loop senses (`conventions`); `meant` names
     findings that are no mistakes. With `assumptions` = "trusted" both are left out.
 
-    Raises `ValueError` for recordings that are not there or cannot be what they are taken for, `Unreachable` where the model
-    cannot follow the data.
+    Raises `ValueError` for what `Settings` does not take, and for recordings that are not there or cannot be what they are
+    taken for, `Unreachable` where the model cannot follow the data.
     """
     unknown = set(heldout) - set(problem.names)
     if unknown or len(set(heldout)) == len(problem.recordings):
         raise ValueError(f"`heldout` must name some of {list(problem.names)}, but not all; it is {list(heldout)}")
-    if rtol <= 0 or starts < 1 or tightenings < 0:
-        raise ValueError(
-            f"`rtol` and `starts` must be positive and `tightenings` not negative, but are {rtol}, {starts} and {tightenings}"
-        )
+    settings = Settings(
+        rtol=rtol, starts=starts, loss=loss, method=method, workers=workers, seed=seed, tightenings=tightenings,
+        assumptions=assumptions,
+    )  # fmt: skip
+    if plan is not None and (starts > 1 or rtol not in (RTOL, *(stage.rtol for stage in plan))):
+        raise ValueError("`starts` and `rtol` are those of the default plan: say them of the stages of `plan` instead")
     fitted, began = [name for name in problem.names if name not in heldout], clock.perf_counter()
     runner = Runner(problem.recordings, workers, Path(checkpoint) if checkpoint is not None else None)
     looks = accepted(check(problem, runner, fitted), meant) if assumptions == "checked" else []
@@ -80,7 +80,7 @@ def identify(
     stages += [
         stage_entry("with the noise that was found", plan[-1], plan[-1].rtol, one, before) for one in coloured.fits
     ]
-    how = How(fitted, tuple(heldout), method, loss, seed, assumptions, tightenings if loss == "linear" else 0)
+    how = How(fitted, tuple(heldout), tuple(meant), settings)
     return conclude(coloured, runner, plan[-1], stages, how, looks, began, progress)
 
 

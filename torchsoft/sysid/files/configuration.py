@@ -8,42 +8,16 @@ from pydantic import AfterValidator, Field, model_validator
 
 from torchsoft.physics.material import INSTANT
 from torchsoft.physics.paper import NAMES
-from torchsoft.sysid.conclude import Assumed
-from torchsoft.sysid.fit.robust import Loss
-from torchsoft.sysid.fit.stages import Method
 from torchsoft.sysid.problem.underway import LEAD
 from torchsoft.sysid.problem.unknowns import Sensor, Unknown
-from torchsoft.sysid.solve import RTOL
-from torchsoft.tables import LISTED, SEED, Table, from_toml
+from torchsoft.sysid.settings import Settings
+from torchsoft.tables import LISTED, Table, from_toml
 
 VOCABULARY = {own: name for name, own in NAMES.items()}
 """The rig's own names of parameters, by which they are understood too, with those of `Parameters`."""
 
 Name = Annotated[str, Field(min_length=1, max_length=100)]
 File = Annotated[str, Field(min_length=1, max_length=1000)]
-
-
-class Settings(Table):
-    """How to fit: the arguments of `identify` by the same names."""
-
-    rtol: float = Field(RTOL, ge=1e-8, le=1e-2)
-    starts: int = Field(1, ge=1, le=2**20)
-    loss: Loss = "linear"
-    method: Method = "gauss_newton"
-    workers: int = Field(1, ge=1, le=1000)
-    seed: int = Field(0, ge=0, le=SEED)
-    tightenings: int = Field(2, ge=0, le=10)
-    assumptions: Assumed = "checked"
-
-    @model_validator(mode="before")
-    @classmethod
-    def _has_no_step(cls, given: Any) -> Any:
-        if isinstance(given, dict) and "step" in given:
-            raise ValueError(
-                "there is no `step` any more: tolerances choose the steps; leave it out, or give the relative tolerance `rtol` "
-                f"({RTOL:g})"
-            )
-        return given
 
 
 SURE = 1e-12

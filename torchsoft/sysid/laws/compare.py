@@ -21,7 +21,7 @@ from torchsoft.sysid.laws.pattern import Motion, motion, where
 from torchsoft.sysid.problem.problem import Problem
 from torchsoft.sysid.problem.recording import Recording
 from torchsoft.sysid.problem.workers import Runner
-from torchsoft.sysid.solve import RTOL
+from torchsoft.sysid.settings import RTOL
 
 SAME = 1e-6
 """Part of its range by which a signal of two references may differ."""
