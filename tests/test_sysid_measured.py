@@ -180,6 +180,10 @@ BAD_CONFIG = {
     "not a number": (CONFIG.replace("60.3e-3", '"here"'), r"scenario\.x_C0 should be a valid number, not 'here'"),
     "other pads": (CONFIG.replace("contact.v_s", "pad.height = 3e-3\ncontact.v_s"), r"touch .* at 46.92 mm \(twice pad.height"),
     "bounds": (CONFIG.replace("nominal = 1e5", "low = 2\nhigh = 1"), r"unknowns\.contact\.K_n: low = 2.0 must be below"),
+    "a prior beyond the bounds": (
+        CONFIG.replace("nominal = 1e5", "low = 8e4\nhigh = 1.4e5\nprior = {median = 1e6, sd = 1e3}"),
+        r"rig\.toml: unknowns\.contact\.K_n\.prior\.median = 1e\+06 is not between low = 80000 and high = 140000",
+    ),
     "rtol": (CONFIG.replace("rtol = 1e-3", "rtol = -1"), r"fit\.rtol should be greater than or equal to 1e-08, not -1"),
     "step": (CONFIG.replace("rtol = 1e-3", "step = 5e-3"), r"fit: .*tolerances choose the steps; leave it out, or give"),
     "method": (CONFIG + 'method = "magic"\n', r"fit\.method should be 'gauss_newton'"),

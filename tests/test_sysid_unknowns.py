@@ -6,16 +6,20 @@ from typing import Any
 import pytest
 
 from torchsoft.parameters import bounds
-from torchsoft.sysid.problem.unknowns import Coordinates, Unknown
+from torchsoft.sysid.problem.unknowns import Coordinates, Prior, Unknown
 from torchsoft.tables import InvalidTable
 
 GIVEN = {"pad.E": 0.75e6, "pad.nu": 0.45, "contact.mu_s": 0.8, "contact.mu_k": 0.7, "contact.friction.alpha": 2.0}
 
 
-def coordinates(**unknowns: dict[str, Any]) -> Coordinates:
+def coordinates(*others: dict[str, float], **unknowns: dict[str, Any]) -> Coordinates:
+    """Of a recording `one` and more of them, `two` and so on, with other values."""
     tables = {name.replace("__", "."): Unknown(**table) for name, table in unknowns.items()}
-    one: Any = SimpleNamespace(name="one", parameters=GIVEN, start_coordinates=())
-    return Coordinates(tables, {}, [one])
+    recordings: list[Any] = [
+        SimpleNamespace(name=name, parameters=GIVEN | own, start_coordinates=())
+        for name, own in zip(("one", "two", "three"), ({}, *others))
+    ]
+    return Coordinates(tables, {}, recordings)
 
 
 def ends(found: Coordinates, name: str) -> tuple[float, float]:
@@ -49,12 +53,37 @@ def test_bounds_that_are_not_given_end_where_the_parameters_do() -> None:
             r"high = 1\.2 is beyond what contact\.mu_k / contact\.mu_s",
         ),
         ({"contact__mu_k": {}, "contact__mu_s": {}}, r"give unknowns\.contact\.mu_k\.ratio_to = 'contact\.mu_s'"),
+        ({"pad__E": {"prior": Prior(median=1e8, sd=1e3)}}, r"^unknowns\.pad\.E\.prior\.median = 1e\+08 is not between"),
+        (
+            {"pad__E": {"low": 8e4, "high": 1.4e6, "prior": Prior(median=1.5e6, sd=0.1, kind="log-normal")}},
+            r"prior\.median = 1\.5e\+06 is not between low = 80000 and high = 1\.4e\+06$",
+        ),
         ({"pad__Young": {}}, r"^unknowns: `pad\.Young` cannot be identified; what can: pad\.E, "),
     ],
 )
 def test_bounds_beyond_are_refused_by_their_field(unknowns: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         coordinates(**unknowns)
+
+
+@pytest.mark.parametrize("others", [({"contact.mu_s": 0.3},), ({}, {"contact.mu_s": 0.3}), ({"contact.mu_s": 0.3}, {})])
+def test_bounds_hold_in_every_recording(others: tuple[dict[str, float], ...]) -> None:
+    assert ends(coordinates(*others, contact__mu_k={"nominal": 0.2}), "contact.mu_k") == (0.02, 0.3)
+    for field, value in (("high", 0.5), ("nominal", 0.5)):
+        with pytest.raises(
+            ValueError, match=f"mu_k.{field} = 0.5 is beyond what .* may be in all recordings, from 0 to 0.3"
+        ):
+            coordinates(*others, contact__mu_k={"nominal": 0.2, field: value})
+
+
+def test_a_search_starts_where_all_rigs_are() -> None:
+    assert ends(coordinates({}, pad__E={}), "pad.E") == (0.75e5, 0.75e7)
+    for others, second in ((({"pad.E": 1e6},), "two"), (({}, {"pad.E": 1e6}), "three")):
+        with pytest.raises(
+            ValueError, match=f"`one` and 1e\\+06 in that of `{second}`: say by `nominal` where the search"
+        ):
+            coordinates(*others, pad__E={})
+        assert len(coordinates(*others, pad__E={"nominal": 1e6})) == 1
 
 
 def test_friction_coefficients_may_both_be_free_where_they_cannot_cross() -> None:

@@ -193,6 +193,18 @@ def limits(name: str, unknowns: Mapping[str, Unknown], given: Mapping[str, float
     return least, most
 
 
+def own_value(name: str, u: Unknown, recordings: Sequence[Recording]) -> float:
+    """Of an unknown, or its ratio, in the rigs of all recordings. Raises `ValueError` where they do not have the same."""
+    own = [r.parameters[name] / (r.parameters[u.ratio_to] if u.ratio_to else 1.0) for r in recordings]
+    for r, value in zip(recordings, own):
+        if not math.isclose(value, own[0], rel_tol=1e-9):
+            raise ValueError(
+                f"unknowns.{name}: it is {own[0]:g} in the rig of recording `{recordings[0].name}` and {value:g} in that of "
+                f"`{r.name}`: say by `nominal` where the search starts"
+            )
+    return own[0]
+
+
 AT_BOUND = 1e-4
 """Part of the way between its bounds within which a coordinate counts as being at one."""
 
@@ -202,7 +214,7 @@ class Coordinates:
     runs begin, and of the sensors.
 
     Raises `ValueError` for unknowns that some recording's rig has not, a ratio to something that is not there, or a nominal
-    value out of bounds.
+    value or the median of a prior out of bounds.
     """
 
     def __init__(
@@ -211,8 +223,9 @@ class Coordinates:
         self.recordings, self.all = tuple(r.name for r in recordings), list[Coordinate]()
         given = {name: value for name, value in recordings[0].parameters.items() if not name.startswith(PREFIX)}
         for name, u in unknowns.items():
-            if without := next((r.name for r in recordings[1:] if name in given and name not in r.parameters), None):
-                raise ValueError(f"unknowns: the rig of recording `{without}` has no `{line(name, 80)}`")
+            for one in given.keys() & {name, u.ratio_to}:
+                if without := next((r.name for r in recordings[1:] if one not in r.parameters), None):
+                    raise ValueError(f"unknowns: the rig of recording `{without}` has no `{line(one, 80)}`")
             if name not in given:
                 raise ValueError(f"unknowns: `{line(name, 80)}` cannot be identified; what can: {', '.join(given)}")
             if u.ratio_to is not None and (u.ratio_to not in given or u.ratio_to == name):
@@ -221,27 +234,29 @@ class Coordinates:
                 )
             if u.ratio_to in unknowns and unknowns[u.ratio_to].ratio_to:
                 raise ValueError(f"unknowns.{name}.ratio_to = {shown(u.ratio_to)} is a ratio itself")
-            own = given[name] / (given[u.ratio_to] if u.ratio_to else 1.0)
-            nominal = own if u.nominal is None else u.nominal
+            nominal = own_value(name, u, recordings) if u.nominal is None else u.nominal
             if u.scale == "log" and nominal <= 0:
                 raise ValueError(
                     f"unknowns.{name} = {nominal:g} is not on a logarithmic scale: give a positive `nominal`, or "
                     "scale = 'linear'"
                 )
-            least, most = limits(name, unknowns, given)
+            ends = [limits(name, unknowns, r.parameters) for r in recordings]
+            least, most = max(least for least, _ in ends), min(most for _, most in ends)
             for field in ("low", "high", "nominal"):
                 value = getattr(u, field)
                 if value is not None and not least <= value <= most:
                     what = f"{name} / {u.ratio_to}" if u.ratio_to else name
+                    where = " in all recordings" if len(set(ends)) > 1 else ""
                     raise ValueError(
-                        f"unknowns.{name}.{field} = {value:g} is beyond what {what} may be, from {least:g} to {most:g}"
+                        f"unknowns.{name}.{field} = {value:g} is beyond what {what} may be{where}, from {least:g} to {most:g}"
                     )
             low = max(nominal / SPREAD, least) if u.low is None else u.low
             high = min(nominal * SPREAD, most) if u.high is None else u.high
-            if not low <= nominal <= high or low == high:
-                raise ValueError(
-                    f"unknowns.{name}.nominal = {nominal:g} is not between low = {low:g} and high = {high:g}"
-                )
+            for field, value in (("nominal", nominal), ("prior.median", u.prior.median if u.prior else nominal)):
+                if not low <= value <= high or low == high:
+                    raise ValueError(
+                        f"unknowns.{name}.{field} = {value:g} is not between low = {low:g} and high = {high:g}"
+                    )
             for where in (None,) if u.per == "all" else self.recordings:
                 self.all.append(
                     Coordinate(name, "parameter", where, nominal, low, high, u.scale, u.ratio_to, u.fixed, u.prior)
