@@ -34,6 +34,7 @@ from torchsoft.sysid import (
 from torchsoft.sysid.answer.answer import AssumptionCheck, ChannelNoise, load_answer
 from torchsoft.sysid.answer.comparison import Comparison
 from torchsoft.sysid.answer.estimate import Direction
+from torchsoft.sysid.answer.recorded import untold
 from torchsoft.sysid.certainty.profile import RISE, Profile
 from torchsoft.sysid.checks.misfit import autocorrelation
 from torchsoft.sysid.files.cost import paper_settings
@@ -78,6 +79,13 @@ def found() -> Found:
     problem = Problem(recordings, sensors, unknowns)
     plan = [Stage("all", (HOSTILE, "shallow"), problem.coordinates.labels, 1e-3, evaluations=4)]
     return identify(problem, plan=plan, tightenings=0, heldout=["held"], assumptions="trusted"), problem
+
+
+def test_a_prediction_with_values_that_nothing_tells_says_so(found: Found) -> None:
+    """Of the unknown that is the held-out recording's own."""
+    answer, _ = found
+    said = untold({"contact.R_n": answer.recorded("held").identified["contact.R_n"]})
+    assert f"held-out recording `held` is predicted with what is {said}" in answer.notices
 
 
 @pytest.fixture(scope="module")

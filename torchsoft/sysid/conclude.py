@@ -1,6 +1,7 @@
 """What is known at the end of a fit: intervals, verdicts on the misfit and on what was taken for granted, and the result."""
 
 import time as clock
+from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchsoft.sysid.answer.estimate import directions, estimates, nrmse, residual_channels
+from torchsoft.sysid.answer.recorded import untold
 from torchsoft.sysid.answer.result import IdentificationResult, described
 from torchsoft.sysid.checks import checks, misfit
 from torchsoft.sysid.checks.colour import Coloured, colour_notices, rewhitened
@@ -19,7 +21,7 @@ from torchsoft.sysid.fit.plan import Stage
 from torchsoft.sysid.fit.robust import Loss
 from torchsoft.sysid.fit.settle import FINER, STEP_BIAS, Settled, settle
 from torchsoft.sysid.fit.stages import progress_bar, stage_entry
-from torchsoft.sysid.problem.problem import Residuals
+from torchsoft.sysid.problem.problem import Problem, Residuals
 from torchsoft.sysid.problem.recording import Array
 from torchsoft.sysid.problem.workers import Runner
 from torchsoft.sysid.settings import Settings
@@ -89,6 +91,7 @@ def conclude(
             notices += [f"held-out recording `{k}` could not be simulated: {v.reason}" for k, v in held.lost.items()]
         else:
             predicted = nrmse(problem, held.r, list(how.heldout))
+            notices += guesses(problem, x, how.heldout)
     sd = np.sqrt(np.diag(C_free))
     notices += notices_on(found, end.at_rest, rtol, end.bias is None)
     notices += checks.notices(checked) if checked is not None else []
@@ -141,6 +144,17 @@ def taken_for_granted(
     rows = Residuals(found.columns[:, 0] if found.columns.size else finer.r, found.columns, {})
     columns: Array = rewhitened(problem, rows, parts(plain, rows.r, which)).J
     return found._replace(columns=columns, J=end.at.J[:, free])
+
+
+def guesses(problem: Problem, x: Array, heldout: Sequence[str]) -> list[str]:
+    """Sentences on recordings that were predicted with values of their own, which no recording that was fitted tells."""
+    out = []
+    for k in (k for k, name in enumerate(problem.names) if name in heldout):
+        mine = [c for c in problem.coordinates.all if c.recording == problem.names[k] and not c.fixed]
+        values = problem.values(x, k)
+        if own := {c.name: values[c.name] for c in mine if c.kind == "parameter"}:
+            out.append(f"held-out recording `{problem.names[k]}` is predicted with what is {untold(own)}")
+    return out
 
 
 def notices_on(found: list[Any], converged: bool, rtol: float, unchecked: bool) -> list[str]:

@@ -20,7 +20,7 @@ from torchsoft.physics.rig import Rig
 from torchsoft.sysid.answer.comparison import Comparison
 from torchsoft.sysid.answer.contribution import Contribution
 from torchsoft.sysid.answer.estimate import ChannelResiduals, Direction, Estimate
-from torchsoft.sysid.answer.recorded import RecordedRig, known
+from torchsoft.sysid.answer.recorded import RecordedRig, known, untold
 from torchsoft.sysid.certainty.profile import Profile
 from torchsoft.sysid.certainty.summary import PosteriorSummary
 from torchsoft.sysid.fit.information import Combination
@@ -193,8 +193,7 @@ class Answer:
             if c.fixed and c.kind == "parameter" and c.recording == one.name and not self.unknowns[c.name].fixed
         ]
         if weak:
-            said = ", ".join(f"{name} = {one.identified[name]:.3g}" for name in weak)
-            warnings.warn(f"not identifiable from the data, and so only where the search ended: {said}", stacklevel=3)
+            warnings.warn(untold({name: one.identified[name] for name in weak}), stacklevel=3)
         return rig
 
     def to_json(self) -> str:

@@ -1,7 +1,7 @@
 """The rigs of recordings as plain data, from which those of this package are built again."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -57,6 +57,12 @@ def known(description: dict[str, Any], identified: dict[str, float]) -> dict[str
     laws = {f"{part} of {name}": law for part, laws in parts.items() for name, law in laws.items()}
     scenario = {name for name in parameters if name.startswith("scenario.") and name != "scenario.gravity"}
     return {name: value for name, value in (parameters | laws).items() if name not in scenario}
+
+
+def untold(values: Mapping[str, float]) -> str:
+    """What is said of values that the data do not tell."""
+    said = ", ".join(f"{name} = {value:.3g}" for name, value in values.items())
+    return f"not identifiable from the data, and so only where the search ended: {said}"
 
 
 def rebuildable(rig: Rig) -> bool:
