@@ -317,6 +317,14 @@ def test_findings_of_a_kind_are_said_once_and_refused_unless_they_are_meant() ->
     assert found[0].sentence == "F_x looks wrong; so it is in `b`"
     with pytest.raises(ValueError, match=r'if it is meant so, say meant = \["sign of F_x"\]'):
         accepted(found, [])
+    with pytest.raises(
+        ValueError, match=r"called 'nonsense', so leave it out; what was found is sign of F_x, zero of F_y$"
+    ):
+        accepted(found, ["sign of F_x", "nonsense"])
+    with pytest.raises(
+        ValueError, match=r"^meant: nothing was found that is called 'nonsense', .* nothing looks wrong$"
+    ):
+        accepted([], ["nonsense"])
     first, second = accepted(found, ["sign of F_x"])
     assert first == "F_x looks wrong; so it is in `b` (you say that it is meant so)"
     assert second == "F_y is off"

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from torchsoft.channels import unit
+from torchsoft.tables import shown
 
 
 class Finding(NamedTuple):
@@ -31,7 +32,12 @@ def together(found: Sequence[Finding]) -> list[Finding]:
 
 
 def accepted(found: Sequence[Finding], meant: Sequence[str]) -> list[str]:
-    """The sentences of what is not grave, or was said to be meant so. Raises `ValueError` for the others."""
+    """The sentences of what is not grave, or was said to be meant so. Raises `ValueError` for the others, and for what is meant
+    and was not found."""
+    names = dict.fromkeys(one.what for one in found)
+    if strange := [name for name in meant if name not in names]:
+        there = f"what was found is {', '.join(names)}" if names else "nothing looks wrong"
+        raise ValueError(f"meant: nothing was found that is called {shown(strange[0])}, so leave it out; {there}")
     for one in found:
         if one.grave and one.what not in meant:
             raise ValueError(f'{one.sentence}; if it is meant so, say meant = ["{one.what}"]')
