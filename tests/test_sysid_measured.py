@@ -237,6 +237,10 @@ BAD_CONFIG = {
         r"rig\.toml, recordings: `files` of `b`: .*b\.csv: No such file or directory",
     ),
     "nameless": (CONFIG + "[[recordings]]\n", r"recordings\.0: a recording needs a `file`"),
+    "a setting that is unknown": (
+        CONFIG + '[[recordings]]\nname = "data"\nsettings.pad.E = 2e6\n',
+        r"recordings\.0\.settings: pad\.E is unknown, .* leave it out there, and say by unknowns\.\"pad\.E\"\.nominal where",
+    ),
     "same name": (CONFIG + '[[recordings]]\nfile = "data.csv"\n', r"names of their own, but are called data, data"),
 }  # fmt: skip
 
@@ -450,8 +454,20 @@ def test_a_constant_stands_for_a_column_that_is_missing(case: Callable[..., list
         at = one.rig.reference(torch.tensor([0.0, 0.1], dtype=torch.float64), ("F_ff",))
         np.testing.assert_array_equal(at[:, 0].detach(), [[force, 0.0]] * 2)
         assert made.tables["data"].constants == ("F_ff",)
-    stated = load(*_split(case(config=CONFIG + "[missing]\nF_ff = 7.0\n")))
-    assert stated.tables["data"].constants == ()  # where there is a column, it counts
+    for text, where in (("[missing]\nF_ff = 7.0\n", "missing"), (own, "recordings: missing of `data`")):
+        files = _split(case(config=CONFIG + text))
+        with pytest.raises(ValueError, match=rf"rig\.toml, {where}: F_ff is not missing, .* say ignore = \['F_ff'\]$"):
+            load(*files)
+    files = _split(case(config=f"ignore = ['F_ff']\n{CONFIG}[missing]\nF_ff = 7.0\n"))
+    assert load(*files).tables["data"].constants == ("F_ff",)
+
+
+def test_a_constant_may_stand_for_the_column_of_one_of_the_recordings(case: Callable[..., list[str]]) -> None:
+    more = '[missing]\nF_ff = 7.0\n[[recordings]]\nfile = "second.csv"\n'
+    data, config = case(config=CONFIG + more)
+    Path(data).with_name("second.csv").write_text(Path(data).read_text())
+    made = load([case(drop(F_FF), CONFIG + more)[0]], config)
+    assert {name: one.constants for name, one in made.tables.items()} == {"data": ("F_ff",), "second": ()}
 
 
 def parts(table: Table, *columns: list[int]) -> list[Table]:

@@ -180,6 +180,17 @@ class Config(Table):
                 raise ValueError(f"compare.{law}.without: `{strange[0]}` is not an unknown")
         return self
 
+    @model_validator(mode="after")
+    def _recordings_state_what_is_known(self) -> "Config":
+        unknown = {understood(name): name for name in self.unknowns}
+        for i, entry in enumerate(self.recordings):
+            if strange := [name for name, _ in flattened(entry.settings) if name in unknown]:
+                raise ValueError(
+                    f"recordings.{i}.settings: {strange[0]} is unknown, so that no recording can state it: leave it out there, "
+                    f'and say by unknowns."{unknown[strange[0]]}".nominal where the search starts'
+                )
+        return self
+
 
 def read_config(path: str | Path) -> Config:
     """Raises `ValueError` naming the file and the field, `OSError` for a file that cannot be read."""

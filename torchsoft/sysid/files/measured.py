@@ -25,6 +25,7 @@ from torchsoft.sysid.files.configuration import (
     Entry,
     KelvinVoigtPads,
     Law,
+    Missing,
     Moving,
     Pads,
     Rest,
@@ -40,7 +41,7 @@ from torchsoft.sysid.problem.problem import Problem
 from torchsoft.sysid.problem.recording import Recording
 from torchsoft.sysid.problem.start import BOUNDS, AtRest
 from torchsoft.sysid.problem.unknowns import Sensor, Unknown
-from torchsoft.tables import InvalidTable, line, refusing
+from torchsoft.tables import InvalidTable, line, refusing, shown
 
 BEGINNING, CREEP = 10e-3, 20e-3
 """For so long [s] nothing may move faster than this [m/s]: a disc put down on a pad still settles."""
@@ -263,6 +264,16 @@ def load(data: Sequence[str | Path], config: str | Path) -> Case:
     left_out = {name for one in tables.values() for table in one.tables for name in table.ignored}
     if strange := [name for name in stated.ignore if name not in left_out]:
         raise ValueError(f"{config}, ignore: no file has a column `{line(strange[0], 80)}`")
+    for where, missing, of in (
+        (f"{config}, missing", stated.missing, list(tables.values())),
+        *((f"{config}, recordings: missing of `{k}`", entry.missing, [tables[k]]) for k, (entry, _) in entries.items()),
+    ):
+        filled = {name for one in of for name in one.constants}
+        if strange := [name for name in missing.over(Missing()) if name not in filled]:
+            raise ValueError(
+                f"{where}: {strange[0]} is not missing, there is a column; leave the constant out, or the column: say "
+                f"ignore = [{shown(strange[0])}]"
+            )
 
     def problem(law: Law, what: str) -> Problem:
         made = []
