@@ -14,8 +14,8 @@ look better and are lucky: where points slip and bounce, the same motion by othe
 half.
 
 Command: .venv/bin/python experiments/designed_motion.py [--seeds 50] [--duration 3.4] [--starts 120] [--motion FILE] [--smoke]
-Expected: deviations of 0.16 to 0.77 times those of the three, and of 27 seeds 25 or 26 intervals hold the truth; half a minute,
-and 30 to 140 s a fit on one core.
+Expected: deviations of 0.16 to 0.77 times those of the three, and of 50 seeds 44 to 49 intervals hold the truth; half a minute,
+and 21 min for the fits on two cores.
 That motion is kept beside this file as designed_motion.toml.
 """
 
