@@ -45,9 +45,9 @@ def _place() -> str:
 
 
 def _applied() -> str:
-    """The name of the torch.autograd.Function that is being applied; empty if none is."""
+    """The name of the torch.autograd.Function that the law applies; empty if it applies none."""
     frame = sys._getframe(1)
-    while frame is not None:
+    while frame is not None and frame.f_code is not traced.__code__:
         if frame.f_code is _APPLY:
             return frame.f_locals["cls"].__name__
         frame = frame.f_back
