@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from torchsoft import (
+    Actuator,
     Coulomb,
     Ellipse,
     KelvinVoigt,
@@ -324,10 +325,14 @@ def test_what_is_saved_is_what_ran() -> None:
     assert made_by["parameters"]["contact.friction"] == "coulomb"
     assert made_by["friction"]["L"] == "Coulomb"
     assert "contact.v_s" not in made_by["parameters"]
+    assert made_by["control"] == {"x": "PD", "y": "PD"}
+    assert made_by["mesh"]["L"] == f"PadMesh, {len(model.pads['L'].mesh.nodes)} nodes"
     oval = SoftGrasp(coarse().settings, shape=Ellipse(19.8e-3, 19.1e-3))
     described = oval.description()
     assert "disc.radius" not in described["parameters"]
     assert described["shape"] == {"disc": "Ellipse"}
+    oval.actuators["x"] = Actuator("disc.x", "bracket.x", lambda w, w_dot, f, q, q_dot: f - 1e3 * q, setpoint="x_d")
+    assert oval.description()["control"]["x"].endswith("<lambda>")
 
 
 # surroundings -------------------------------------------------------------------------------------------------------

@@ -82,6 +82,11 @@ class Contact(nn.Module):
         self.pad, self.body, self.law, self.may_leave = pad, body, law, may_leave
 
 
+def law_name(law: Callable[..., Tensor]) -> str:
+    """What a law is called: a function by its own name, a module by that of its class."""
+    return getattr(law, "__qualname__", type(law).__name__)
+
+
 class PD(nn.Module):
     """A proportional-derivative law: F = Kp (w - q) + Kd (w' - q') + feed-forward (Eq. 31-34)."""
 

@@ -15,7 +15,7 @@ from torchsoft.physics.contact import Frame, cross, interface_law, moving_frame,
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import Block, Junction, Port, Transformer, identity, net_efforts
 from torchsoft.physics.pads import Pad
-from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact
+from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, law_name
 from torchsoft.physics.shapes import parameter
 from torchsoft.physics.state import Layout, State
 
@@ -148,12 +148,13 @@ class Rig(nn.Module):
     def description(self) -> dict[str, Any]:
         """The numbers and laws of the rig as they are now, for what is saved with a run."""
         mine = {name: value for name, value in self.named_parameters() if not name.startswith("reference.")}
-        laws = {name: contact.law.friction for name, contact in self.contacts.items()}
         return {
             "parameters": {name: value.detach().tolist() for name, value in mine.items()},
-            "friction": {name: getattr(law, "__qualname__", type(law).__name__) for name, law in laws.items()},
+            "friction": {name: law_name(contact.law.friction) for name, contact in self.contacts.items()},
+            "control": {name: law_name(actuator.law) for name, actuator in self.actuators.items()},
             "shape": {name: type(body.shape).__name__ for name, body in self.bodies.items() if body.shape is not None},
             "material": {name: type(pad.material).__name__ for name, pad in self.pads.items()},
+            "mesh": {k: f"{type(pad.mesh).__name__}, {len(pad.mesh.nodes)} nodes" for k, pad in self.pads.items()},
         }
 
     def parameter(self, name: str) -> Tensor:
