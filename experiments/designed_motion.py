@@ -141,6 +141,19 @@ def predicted(problem: Problem, rtol: float) -> dict[str, float]:
     return deviations(names, T, fisher(at.J)[0])
 
 
+def guessed(truth: dict[str, float]) -> Parameters:
+    """Nominal parameters, but for those that are known because `truth` does not ask for them."""
+    known = {name: value for name, value in TRUTH.items() if name not in truth}
+    return Parameters().override({"contact.v_s": 0.05} | COARSE | known)
+
+
+def by_hand(truth: dict[str, float], real: Parameters, rtol: float, smoke: bool) -> dict[str, float]:
+    """What the hand-made three predict, or the strokes in their place."""
+    three = SMOKE if smoke else {name: CATALOGUE[name] for name in FITTED}
+    made = [record(name, one, real, real, RIG, rtol=rtol, noise=0.0) for name, one in three.items()]
+    return predicted(stated(made, truth), rtol)
+
+
 def search(
     truth: dict[str, float], real: Parameters, half: dict[str, float], config: Config, guess: dict[str, Guess] = GUESS
 ) -> Design:
@@ -173,13 +186,9 @@ def run(config: Config) -> Result:
     truth = (
         {name: TRUTH[name] for name in ("pad.E", "pad.tau", "contact.K_n", "contact.mu_s")} if config.smoke else TRUTH
     )
-    known = {name: value for name, value in TRUTH.items() if name not in truth}
-    nominal = Parameters().override({"contact.v_s": 0.05} | COARSE | known)
+    nominal = guessed(truth)
     real, seconds = nominal.override(truth), {}
-    three = SMOKE if config.smoke else {name: CATALOGUE[name] for name in FITTED}
-    coarse = 1e-3 if config.smoke else 1e-4
-    by_hand = stated([record(name, e, real, real, RIG, rtol=coarse, noise=0.0) for name, e in three.items()], truth)
-    hand_made, found = predicted(by_hand, coarse), None
+    hand_made, found = by_hand(truth, real, 1e-3 if config.smoke else 1e-4, config.smoke), None
     if config.motion is None:
         half = {name: 0.5 * sd for name, sd in hand_made.items()}
         found, seconds["design"] = timed(lambda: search(truth, real, half, config))

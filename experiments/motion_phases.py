@@ -18,10 +18,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import designed_motion
-import identify_contact
 import numpy as np
-from _experiment import COARSE, markdown, options, raw_config, timed, write
-from designed_motion import COMPRESSION, FORCE, GIVEN, SMOKE, SPEED, TRAVEL, predicted, stated
+from _experiment import markdown, options, raw_config, timed, write
+from designed_motion import COMPRESSION, FORCE, GIVEN, SPEED, TRAVEL, by_hand, guessed, stated
 from identify_contact import TRUTH
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
@@ -29,8 +28,7 @@ from scipy.optimize import minimize
 from scipy.stats import qmc
 from tqdm import tqdm
 
-from torchsoft import Parameters
-from torchsoft.excitation import CATALOGUE, Excitation, Knots
+from torchsoft.excitation import Excitation, Knots
 from torchsoft.physics.equilibrium import NoEquilibrium
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import RIG, record
@@ -135,13 +133,8 @@ class Study:
     def __init__(self, config: Config) -> None:
         self.config = config
         self.truth = {name: TRUTH[name] for name in (list(TRUTH)[:4] if config.smoke else TRUTH)}
-        known = {name: value for name, value in TRUTH.items() if name not in self.truth}
-        self.real = Parameters().override({"contact.v_s": 0.05} | COARSE | known).override(self.truth)
-        three = SMOKE if config.smoke else {name: CATALOGUE[name] for name in identify_contact.FITTED}
-        by_hand = [
-            record(name, one, self.real, self.real, RIG, rtol=config.rtol, noise=0.0) for name, one in three.items()
-        ]
-        self.hand_made = predicted(stated(by_hand, self.truth), config.rtol)
+        self.real = guessed(self.truth).override(self.truth)
+        self.hand_made = by_hand(self.truth, self.real, config.rtol, config.smoke)
 
     @property
     def time(self) -> float:
