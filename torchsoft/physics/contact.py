@@ -7,13 +7,14 @@ adhesion, and the moving frame, which follows the point on the body nearest to t
 """
 
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from torchsoft.physics.arguments import positive
 from torchsoft.physics.shapes import Shape, parameter
+from torchsoft.quantity import Dashpot, FrictionCoefficient, Quantity, Stiffness
 
 SlipLaw = Callable[[Tensor, Tensor, Tensor], Tensor]
 """Slip rate |gamma'| >= 0 [m/s] under a trial effort E >= 0 [N], a normal force F_N [N] and the dashpot R [N.s/m] that the slip
@@ -73,18 +74,39 @@ def normal_force(g: Tensor, g_dot: Tensor, rho: Tensor, K_n: Tensor, R_n: Tensor
     return (K_n * g.clamp(min=0.0) + R_n * rho * g_dot).clamp(min=0.0)
 
 
-class SmoothSlip(nn.Module):
+StaticFriction = Annotated[FrictionCoefficient, "static coefficient of friction"]
+KineticFriction = Annotated[FrictionCoefficient, "kinetic coefficient of friction, at most mu_s"]
+
+
+class Friction(nn.Module):
+    """A static and a kinetic coefficient of friction [1]."""
+
+    def __init__(self, mu_s: StaticFriction, mu_k: KineticFriction) -> None:
+        super().__init__()
+        self.mu_s, self.mu_k = parameter(mu_s), parameter(mu_k)
+
+    def well_posed(self) -> str:
+        """The conflict between the parameters; empty where there is none."""
+        mu_s, mu_k = self.mu_s.item(), self.mu_k.item()
+        return f"mu_k must not exceed mu_s, but mu_k = {mu_k:g} > mu_s = {mu_s:g}" if mu_k > mu_s else ""
+
+
+class SmoothSlip(Friction):
     """The slip element: (eta + R) |gamma'| = <E - mu(gamma') F_N>+, mu = mu_k + (mu_s - mu_k) / (1 + |gamma'| / v_s).
 
     A quadratic in |gamma'|, with one positive root when E > mu_s F_N. Continuous, not smooth at slip onset; continuous
     only if eta + R >= (mu_s - mu_k) F_N / v_s.
     """
 
-    limits: ClassVar = {"mu_s": "not negative", "mu_k": "not negative", "v_s": "positive", "eta": "not negative"}
-
-    def __init__(self, mu_s: float, mu_k: float, v_s: float, eta: float) -> None:
-        super().__init__()
-        self.mu_s, self.mu_k, self.v_s, self.eta = (parameter(value) for value in (mu_s, mu_k, v_s, eta))
+    def __init__(
+        self,
+        mu_s: StaticFriction,
+        mu_k: KineticFriction,
+        v_s: Annotated[float, Quantity("m/s", 1e-9, 1e3, "slip speed over which mu falls from mu_s to mu_k")] = 5e-3,
+        eta: Annotated[Dashpot, "viscosity of the slip element; 0 is Coulomb's limit"] = 10.0,
+    ) -> None:
+        super().__init__(mu_s, mu_k)
+        self.v_s, self.eta = parameter(v_s), parameter(eta)
 
     def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
         a = self.eta + R
@@ -96,22 +118,12 @@ class SmoothSlip(nn.Module):
         return torch.where(self.mu_s * F_N <= E, rate, 0.0)
 
 
-class Coulomb(nn.Module):
+class Coulomb(Friction):
     """Stick up to mu_s F_N, then mu_k F_N (Eq. 12-13 with the force's modulus).
 
     The spring re-anchors so that the Voigt pair carries just mu_k F_N, |gamma'| = (E - mu_k F_N) / R. Discontinuous at slip
     onset unless mu_s = mu_k: gradients across it are biased.
     """
-
-    limits: ClassVar = {"mu_s": "not negative", "mu_k": "not negative"}
-
-    def __init__(self, mu_s: float, mu_k: float) -> None:
-        super().__init__()
-        self.mu_s, self.mu_k = parameter(mu_s), parameter(mu_k)
-
-    def well_posed(self) -> str:
-        """What is wrong with the parameters together; empty if nothing is."""
-        return "mu_k is above mu_s, so that slip would supply power" if self.mu_k.item() > self.mu_s.item() else ""
 
     def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
         return torch.where(self.mu_s * F_N <= E, (E - self.mu_k * F_N) / R, 0.0)
@@ -137,19 +149,19 @@ class SoftContact(nn.Module):
     depth epsilon [m], and a friction law. `weight` scales them to the length of surface that a point stands for. `sliding`
     other than `ramped` breaks the power balance."""
 
-    limits: ClassVar = {
-        "K_n": "positive",
-        "R_n": "not negative",
-        "K_t": "positive",
-        "R_t": "not negative",
-        "epsilon": "positive",
-        "node_spacing": "positive",
-    }
-
     def __init__(
-        self, K_n: float, R_n: float, K_t: float, R_t: float, *, friction: SlipLaw, epsilon: float = 1e-6,
-        node_spacing: float = 1e-3,
-    ) -> None:  # fmt: skip
+        self,
+        K_n: Annotated[Stiffness, "normal spring"],
+        R_n: Annotated[Dashpot, "normal dashpot"],
+        K_t: Annotated[Stiffness, "momentary tangential spring: until the point slips"],
+        R_t: Annotated[Dashpot, "tangential dashpot"],
+        *,
+        friction: SlipLaw,
+        epsilon: Annotated[float, Quantity("m", 1e-12, 1.0, "touch-down depth of the ramp g / (g + epsilon)")] = 1e-6,
+        node_spacing: Annotated[
+            float, Quantity("m", 1e-7, 1.0, "length of surface that the four numbers belong to")
+        ] = 1e-3,
+    ) -> None:
         super().__init__()
         self.K_n, self.R_n, self.K_t, self.R_t = (parameter(value) for value in (K_n, R_n, K_t, R_t))
         self.epsilon = parameter(epsilon, trained=False)

@@ -6,7 +6,7 @@ tau_b z_b' + z_b = f.
 """
 
 from collections.abc import Iterable, Mapping
-from typing import ClassVar
+from typing import Annotated
 
 import torch
 from torch import Tensor, nn
@@ -15,10 +15,21 @@ from torchsoft.physics.arguments import number
 from torchsoft.physics.mesh import lame_moduli
 from torchsoft.physics.retardation import retarded
 from torchsoft.physics.shapes import parameter
+from torchsoft.quantity import Density, Depth, Modulus, PoissonRatio, Quantity, Retardation
 
 INSTANT = 1e-4
 """Retardation time [s] of an instantaneous spring, where none is given: small, not zero, so that the rates are functions of
 the state."""
+
+TERMS = 20
+"""Terms of a series at the most."""
+
+InstantRetardation = Annotated[Retardation, "retardation time of the instantaneous spring: below every tau"]
+Retardations = Annotated[Iterable[float], Quantity("s", 1e-9, 1e6, "times, one per term")]
+Fractions = Annotated[
+    Iterable[float], Quantity("1", 1e-9, 1.0, "fractions of the relaxed compliance, one per tau, in sum at most 1")
+]
+Moduli = Annotated[Iterable[float], Quantity("Pa", 1.0, 1e13, "moduli that fade, one per tau")]
 
 TOO_MUCH = 1e-12
 """By how much fractions that sum to one may exceed it: rounding."""
@@ -27,14 +38,7 @@ TOO_MUCH = 1e-12
 class Material(nn.Module):
     """What a pad asks of its material: E [Pa] (relaxed), nu [1], rho [kg/m3], the out-of-plane depth [m], and a chain."""
 
-    limits: ClassVar[Mapping[str, str]] = {
-        "E": "positive",
-        "nu": "between -1 and 0.5",
-        "rho": "positive",
-        "depth": "positive",
-    }
-
-    def __init__(self, E: float, nu: float, rho: float, depth: float) -> None:
+    def __init__(self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth) -> None:
         super().__init__()
         self.E, self.nu, self.rho, self.depth = (parameter(value) for value in (E, nu, rho, depth))
 
@@ -69,9 +73,7 @@ class Material(nn.Module):
 class KelvinVoigt(Material):
     """One retardation time tau [s]: R = tau K, the paper's constant R field."""
 
-    limits: ClassVar = {**Material.limits, "tau": "positive"}
-
-    def __init__(self, E: float, nu: float, rho: float, tau: float, depth: float) -> None:
+    def __init__(self, E: Modulus, nu: PoissonRatio, rho: Density, tau: Retardation, depth: Depth) -> None:
         super().__init__(E, nu, rho, depth)
         self.tau = parameter(tau)
 
@@ -89,11 +91,10 @@ class StandardLinearSolid(Material):
     The spring's own retardation time tau_instant [s] is small, not zero, so that the rates are functions of the state.
     """
 
-    limits: ClassVar = {**Material.limits, "E_instant": "positive", "tau": "positive", "tau_instant": "positive"}
-
     def __init__(
-        self, E: float, E_instant: float, nu: float, rho: float, tau: float, depth: float, tau_instant: float = INSTANT
-    ) -> None:
+        self, E: Modulus, E_instant: Annotated[Modulus, "Young's modulus at first, above E"], nu: PoissonRatio, rho: Density,
+        tau: Retardation, depth: Depth, tau_instant: InstantRetardation = INSTANT,
+    ) -> None:  # fmt: skip
         super().__init__(E, nu, rho, depth)
         self.E_instant, self.tau, self.tau_instant = (parameter(x) for x in (E_instant, tau, tau_instant))
 
@@ -119,25 +120,20 @@ class Series(Material):
     symbol = ""
 
     def __init__(
-        self, E: float, nu: float, rho: float, depth: float, strengths: Iterable[float], tau: Iterable[float],
-        tau_instant: float,
+        self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, strengths: Iterable[float], tau: Retardations,
+        tau_instant: InstantRetardation,
     ) -> None:  # fmt: skip
         super().__init__(E, nu, rho, depth)
         one, other = terms(self.symbol, strengths), terms("tau", tau)
-        if len(one) != len(other) or not one:
+        if len(one) != len(other) or not 1 <= len(one) <= TERMS:
             raise ValueError(
-                f"a series needs as many `{self.symbol}` as `tau`, and at least one, but has {len(one)} and {len(other)}"
+                f"a series needs as many `{self.symbol}` as `tau`, from 1 to {TERMS}, but has {len(one)} and {len(other)}"
             )
         self.terms = len(one)
         for k, (strength, time) in enumerate(zip(one, other), 1):
             self.register_parameter(f"{self.symbol}_{k}", parameter(strength))
             self.register_parameter(f"tau_{k}", parameter(time))
         self.tau_instant = parameter(tau_instant)
-
-    @property
-    def limits(self) -> Mapping[str, str]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        own = [f"{symbol}_{k + 1}" for k in range(self.terms) for symbol in (self.symbol, "tau")]
-        return {**Material.limits, **dict.fromkeys((*own, "tau_instant"), "positive")}
 
     def series(self) -> tuple[Tensor, Tensor]:
         """Strengths and times [s] of the terms, (terms,) each."""
@@ -166,8 +162,8 @@ class GeneralisedKelvin(Series):
     symbol = "J"
 
     def __init__(
-        self, E: float, nu: float, rho: float, depth: float, J: Iterable[float], tau: Iterable[float],
-        tau_instant: float = INSTANT,
+        self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, J: Fractions, tau: Retardations,
+        tau_instant: InstantRetardation = INSTANT,
     ) -> None:  # fmt: skip
         super().__init__(E, nu, rho, depth, J, tau, tau_instant)
 
@@ -191,8 +187,8 @@ class Prony(Series):
     symbol = "E"
 
     def __init__(
-        self, E: float, nu: float, rho: float, depth: float, moduli: Iterable[float], tau: Iterable[float],
-        tau_instant: float = INSTANT,
+        self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, moduli: Moduli, tau: Retardations,
+        tau_instant: InstantRetardation = INSTANT,
     ) -> None:  # fmt: skip
         super().__init__(E, nu, rho, depth, moduli, tau, tau_instant)
 

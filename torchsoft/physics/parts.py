@@ -1,7 +1,7 @@
 """The parts of a rig beside its pads: rigid bodies, contacts, and actuators with their control laws."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import torch
 from torch import Tensor, nn
@@ -10,6 +10,7 @@ from torchsoft.physics.arguments import positive
 from torchsoft.physics.contact import SoftContact
 from torchsoft.physics.shapes import Shape, parameter
 from torchsoft.physics.state import State
+from torchsoft.quantity import Gain, Inertia, Mass
 
 COORDINATES = ("x", "y", "theta")
 """The coordinates of a body [m, m, rad]."""
@@ -25,11 +26,9 @@ class Body(nn.Module):
     `ValueError` for another coordinate, or a body without shape and inertia that may turn.
     """
 
-    limits: ClassVar = {"mass": "positive", "own_inertia": "positive"}
-
     def __init__(
-        self, mass: float = 1.0, shape: Shape | None = None, *, x: Freedom = "free", y: Freedom = "free",
-        theta: Freedom = "free", inertia: float | None = None, weighted: bool = True,
+        self, mass: Mass = 1.0, shape: Shape | None = None, *, x: Freedom = "free", y: Freedom = "free",
+        theta: Freedom = "free", inertia: Inertia | None = None, weighted: bool = True,
     ) -> None:  # fmt: skip
         super().__init__()
         if shape is not None and not isinstance(shape, Shape):
@@ -52,11 +51,6 @@ class Body(nn.Module):
         its own from then on; its inertia follows the shape. Raises `ValueError` for numbers that are not positive."""
         mass = positive("density", density) * positive("depth", depth) * float(shape.area().detach())
         return cls(mass, shape, **given)
-
-    def well_posed(self) -> str:
-        """What is wrong with the parameters together; empty if nothing is."""
-        inertia = self.inertia.item()
-        return "" if inertia > 0 else f"the moment of inertia is {inertia:g} kg.m2, but must be positive"
 
     @property
     def inertia(self) -> Tensor:
@@ -90,9 +84,7 @@ def law_name(law: Callable[..., Tensor]) -> str:
 class PD(nn.Module):
     """A proportional-derivative law: F = Kp (w - q) + Kd (w' - q') + feed-forward (Eq. 31-34)."""
 
-    limits: ClassVar = {"Kp": "not negative", "Kd": "not negative"}
-
-    def __init__(self, Kp: float, Kd: float) -> None:
+    def __init__(self, Kp: Annotated[Gain, "proportional gain"], Kd: Annotated[Gain, "derivative gain"]) -> None:
         super().__init__()
         self.Kp, self.Kd = parameter(Kp), parameter(Kd)
 

@@ -5,7 +5,7 @@ and integrates what is left over at its 1-junctions.
 """
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +18,7 @@ from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, law_name
 from torchsoft.physics.shapes import parameter
 from torchsoft.physics.state import Layout, State
+from torchsoft.quantity import Gravity
 
 GROUND = "ground"
 
@@ -66,7 +67,7 @@ class Rig(nn.Module):
 
     def __init__(
         self, *, bodies: Mapping[str, Body], pads: Mapping[str, Pad], contacts: Mapping[str, Contact],
-        actuators: Mapping[str, Actuator] | None = None, reference: Reference | None = None, gravity: float = 9.81,
+        actuators: Mapping[str, Actuator] | None = None, reference: Reference | None = None, gravity: Gravity = 9.81,
         symbols: Mapping[str, str] | None = None, groups: Mapping[str, nn.Module] | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
@@ -84,7 +85,6 @@ class Rig(nn.Module):
         self.symbols = {name: (symbols or {}).get(name, name) for name in bodies}
         self.check_names()
 
-    limits: ClassVar = {"gravity": "not negative"}
     bodies: Mapping[str, Body]
     pads: Mapping[str, Pad]
     contacts: Mapping[str, Contact]

@@ -4,7 +4,6 @@ that names what is wrong.
 """
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -13,6 +12,7 @@ from torch._C._functorch import is_functorch_wrapped_tensor  # private, and the 
 
 from torchsoft.physics.material import Material
 from torchsoft.physics.shapes import Shape
+from torchsoft.quantity import quantities, quantity_of
 
 LARGEST = 1e100
 """Largest magnitude of a parameter, in SI units: squares and products of a few stay finite numbers."""
@@ -55,7 +55,7 @@ def check_place() -> None:
 
 def check_values(rig: Any) -> None:
     """Raises `ValueError` naming a parameter of the rig or a tensor of its parts that is not a float64 number on the CPU, not
-    finite, or not physical by its module's `limits` and `well_posed`, or a material whose `chain` is not one."""
+    finite, out of the bounds of its quantity or not physical by its module's `well_posed`, or a material without a `chain`."""
     check_place()
     for owner, module in rig.named_modules():
         path = f"{owner}." if owner else ""
@@ -69,18 +69,18 @@ def check_values(rig: Any) -> None:
         for name, value in module.named_buffers(recurse=False):
             if value.is_floating_point():
                 check_array(f"{path}{name}", value)
-        limits: Mapping[str, str] = getattr(module, "limits", {})
-        for name, limit in limits.items():
-            value = getattr(module, name, None)
-            if value is None:
+        for name in dict.fromkeys((*quantities(type(module)), *module._parameters)):
+            declared, value = quantity_of(module, name), getattr(module, name, None)
+            if declared is None or not isinstance(value, Tensor | float):
                 continue
-            number = torch.as_tensor(value, dtype=torch.float64).detach()
-            if number.ndim:
-                raise ValueError(f"parameter `{path}{name}` must be one number, but has shape {tuple(number.shape)}")
-            x = float(number)
-            fine = {"positive": x > 0, "not negative": x >= 0, "between -1 and 0.5": -1 < x < 0.5}[limit]
-            if not fine or not math.isfinite(x):
-                raise ValueError(f"parameter `{path}{name}` must be {limit}, but is {x:g}")
+            numbers = torch.as_tensor(value, dtype=torch.float64).detach()
+            if numbers.ndim and not isinstance(module, Shape):
+                raise ValueError(f"parameter `{path}{name}` must be one number, but has shape {tuple(numbers.shape)}")
+            wrong = numbers[~((declared.low <= numbers) & (numbers <= declared.high))]
+            if wrong.numel():
+                raise ValueError(
+                    f"parameter `{path}{name}` must be {declared.range}, but is {wrong.flatten()[0].item():g}"
+                )
     for owner, module in rig.named_modules():
         well_posed = getattr(module, "well_posed", None)
         if well_posed is not None and (wrong := well_posed()):

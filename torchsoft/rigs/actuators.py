@@ -7,12 +7,13 @@ from pydantic import Field, model_validator
 
 from torchsoft.physics.controllers import StateFeedback, controller
 from torchsoft.physics.parts import PD, Actuator, ReversedPD
-from torchsoft.rigs.fields import Group, Within, at_field
+from torchsoft.quantity import Gain, Quantity
+from torchsoft.rigs.fields import Group, at_field
 from torchsoft.rigs.network import LOOP, FedNetwork, NetworkPD, read_network
 from torchsoft.tables import LISTED
 
 Names = Annotated[tuple[str, ...], LISTED]
-Gains = Annotated[float, Within(-1e12, 1e12, "N/m, N.m/rad, N.s/m, N.m.s/rad")]
+Gains = Annotated[float, Quantity("N/m, N.m/rad, N.s/m, N.m.s/rad", -1e12, 1e12)]
 Rows = Annotated[tuple[Annotated[tuple[Gains, ...], LISTED], ...], LISTED]
 
 
@@ -40,8 +41,10 @@ class ActuatorTable(Group):
     feed_forward: str | None = Field(
         default=None, description="name of the motion that is added as an effort [N or N.m]"
     )
-    Kp: Annotated[float, Within(0.0, 1e12, "N/m, N, N.m/rad")] = Field(default=0.0, description="proportional gain")
-    Kd: Annotated[float, Within(0.0, 1e12, "N.s/m, N.s, N.m.s/rad")] = Field(default=0.0, description="derivative gain")
+    Kp: Gain = Field(default=0.0, description="proportional gain")
+    Kd: Annotated[float, Quantity("N.s/m, N.s, N.m.s/rad", 0.0, 1e12)] = Field(
+        default=0.0, description="derivative gain"
+    )
     reversed: bool = Field(
         default=False, description="the gains push the other way, for a q that falls where the pushed coordinate rises"
     )

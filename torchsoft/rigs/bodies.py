@@ -6,7 +6,8 @@ from typing import Annotated, Any, Self
 from pydantic import Field, model_validator
 
 from torchsoft.physics.parts import COORDINATES, Body
-from torchsoft.rigs.fields import Group, Length, Mass, NumberOr, Place, Within, at_field, sound
+from torchsoft.quantity import Density, Depth, Inertia, Mass, Place, Quantity
+from torchsoft.rigs.fields import Group, NumberOr, at_field
 from torchsoft.rigs.shapes import ShapeTable
 
 REST = "rest"
@@ -26,9 +27,9 @@ class StartTable(Group):
     theta: Annotated[float | str | None, NumberOr("rad", REST, optional=True)] = Field(
         default=None, description='anticlockwise, 0 if not given; "rest" as for y'
     )
-    v_x: Annotated[float, Within(-1e3, 1e3, "m/s")] = Field(default=0.0, description="velocity")
-    v_y: Annotated[float, Within(-1e3, 1e3, "m/s")] = Field(default=0.0, description="velocity")
-    omega: Annotated[float, Within(-1e5, 1e5, "rad/s")] = Field(default=0.0, description="angular velocity")
+    v_x: Annotated[float, Quantity("m/s", -1e3, 1e3)] = Field(default=0.0, description="velocity")
+    v_y: Annotated[float, Quantity("m/s", -1e3, 1e3)] = Field(default=0.0, description="velocity")
+    omega: Annotated[float, Quantity("rad/s", -1e5, 1e5)] = Field(default=0.0, description="angular velocity")
 
     @property
     def velocity(self) -> tuple[float, float, float]:
@@ -42,18 +43,16 @@ class BodyTable(Group):
     mass: Mass | None = Field(
         default=None, description="mass, or density and depth; not needed where no coordinate is free"
     )
-    density: Annotated[float, Within(1e-3, 1e6, "kg/m3")] | None = Field(
+    density: Density | None = Field(
         default=None, description="density, which gives the mass of its shape; steel has 7800, aluminium 2700"
     )
-    depth: Length | None = Field(default=None, description="how deep it is, out of the plane; goes with density")
+    depth: Depth | None = Field(default=None, description="how deep it is, out of the plane; goes with density")
     x: Annotated[float | str, NumberOr("m", "free", "driven")] = Field(default="free", description="to the right")
     y: Annotated[float | str, NumberOr("m", "free", "driven")] = Field(default="free", description="upwards")
     theta: Annotated[float | str, NumberOr("rad", "free", "driven")] = Field(
         default="free", description="anticlockwise"
     )
-    inertia: Annotated[float, Within(1e-12, 1e6, "kg.m2")] | None = Field(
-        default=None, description="moment of inertia; that of its shape if not given"
-    )
+    inertia: Inertia | None = Field(default=None, description="moment of inertia; that of its shape if not given")
     weighted: bool = Field(default=True, description="whether gravity acts on it")
     symbol: str = Field(
         default="", description="what its channels are called: x_SYMBOL and so on; its name if not given"
@@ -102,7 +101,7 @@ class BodyTable(Group):
         if self.shape is None:
             return Body(self.mass or 1.0, **given)
         with at_field("shape"):
-            shape = sound(self.shape.build(folder))
+            shape = self.shape.build(folder)
         if self.density is not None and self.depth is not None:
             return Body.uniform(shape, self.density, self.depth, **given)
         return Body(self.mass or 1.0, shape, **given)

@@ -53,7 +53,7 @@ def assemble(
     materials = {
         name: made(f"materials.{name}", partial(one.build, file.folder)) for name, one in file.materials.items()
     }
-    laws = {name: table.build() for name, table in file.laws.items()}
+    laws = {name: table.build(file.folder) for name, table in file.laws.items()}
     held = held or {}
     return Rig(
         bodies={

@@ -1,17 +1,22 @@
-"""What the fields of a rig file are made of: numbers with unit and bounds, words, and tables that know their own keys."""
+"""Fields of rig files: tables made from constructors, numbers or words, and tables that know their own keys."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from copy import deepcopy
 from difflib import get_close_matches
-from typing import Annotated, Any, Self, TypeVar
+from functools import lru_cache, reduce
+from inspect import signature
+from operator import or_
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args, get_origin
 
-from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, model_validator
+from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler, create_model, model_validator
 from pydantic_core import CoreSchema, core_schema
 from torch import nn
 
-from torchsoft.tables import Table, shown
+from torchsoft.quantity import metadata, quantity
+from torchsoft.tables import LISTED, Table, shown
 
 M = TypeVar("M", bound=nn.Module)
 
@@ -43,27 +48,6 @@ def sound(part: M) -> M:
     if well_posed is not None and (wrong := well_posed()):
         raise ValueError(wrong)
     return part
-
-
-@dataclass(frozen=True)
-class Within:
-    """A number from `low` to `high`, in `unit`: all three are said where another one is refused, and in the schema."""
-
-    low: float
-    high: float
-    unit: str = "1"
-
-    def check(self, x: float) -> float:
-        if not self.low <= x <= self.high:
-            unit = "" if self.unit == "1" else f" {self.unit}"
-            raise ValueError(f"should be from {self.low:g} to {self.high:g}{unit}, not {x:g}")
-        return x
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.no_info_after_validator_function(self.check, handler(source))
-
-    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        return handler(schema) | {"minimum": self.low, "maximum": self.high, "unit": self.unit}
 
 
 class NumberOr:
@@ -109,19 +93,64 @@ class Group(Table):
         return self
 
 
-Length = Annotated[float, Within(1e-6, 10.0, "m")]
-"""A size."""
+class PartTable(Group):
+    """Table of a part: one field for each argument of its constructor, with the argument's quantity."""
 
-Place = Annotated[float, Within(-100.0, 100.0, "m")]
-"""A coordinate."""
+    part: ClassVar[Callable[..., Any]]
 
-Angle = Annotated[float, Within(-1e3, 1e3, "rad")]
+    def arguments(self, folder: Path) -> tuple[tuple[str, Any], ...]:
+        """Arguments of the constructor by name; `folder` is where a file that a table names lies."""
+        given = ((name, getattr(self, name)) for name in signature(self.part).parameters)
+        return tuple((name, one.build(folder) if isinstance(one, PartTable) else one) for name, one in given)
 
-Mass = Annotated[float, Within(1e-6, 1e5, "kg")]
+    def build(self, folder: Path) -> Any:
+        """The part, physical by itself. Raises `ValueError`."""
+        return deepcopy(made(type(self).part, self.arguments(folder)))
 
-Time = Annotated[float, Within(0.0, 1e5, "s")]
+    @model_validator(mode="after")
+    def _is_sound(self) -> Self:
+        if "file" not in type(self).model_fields:
+            self.build(Path())
+        return self
 
-Coefficient = Annotated[float, Within(0.0, 100.0)]
-"""A coefficient of friction."""
 
-Dashpot = Annotated[float, Within(0.0, 1e9, "N.s/m")]
+@lru_cache(maxsize=32)
+def made(part: Callable[..., Any], arguments: tuple[tuple[str, Any], ...]) -> Any:
+    """A part, made once: what it logs is said once, and a contour takes a while. Raises `ValueError`."""
+    return sound(part(**dict(arguments)))
+
+
+def table_of(
+    part: Callable[..., Any], kind: str = "", base: type[PartTable] = PartTable, **fields: Any
+) -> type[PartTable]:
+    """The table of a part, called `kind` in files; `fields` are annotations, or defaults, in the place of the constructor's."""
+    found: dict[str, Any] = {"kind": (Literal[kind], kind)} if kind else {}
+    for name, argument in signature(part).parameters.items():
+        given = fields.get(name, argument.default)
+        hint, default = (given, ...) if get_origin(given) is not None else (argument.annotation, given)
+        declared = quantity(hint)
+        texts = [one for one in metadata(hint) if isinstance(one, str)]
+        meaning = texts[-1] if texts else declared.meaning if declared else None
+        found[name] = listed(hint), Field(... if default is argument.empty else default, description=meaning)
+    made = create_model(f"{getattr(part, '__name__', kind)}Table", __base__=base, __doc__=part.__doc__, **found)
+    made.part = part
+    return made
+
+
+def listed(hint: Any) -> Any:
+    """The annotation of a field that lists what the constructor iterates over: a tuple, which TOML gives as a list."""
+    bare = get_args(hint)[0] if get_origin(hint) is Annotated else hint
+    if get_origin(bare) is Iterable:
+        (inner,), entry = get_args(bare), quantity(hint)
+        one = (
+            Annotated[inner, entry]
+            if inner is float
+            else listed(tuple[(Annotated[float, entry],) * len(get_args(inner))])
+        )
+        return Annotated[tuple[one, ...], LISTED, Field(min_length=1, max_length=100_000), entry.unit]
+    return Annotated[hint, LISTED] if get_origin(bare) is tuple else hint
+
+
+def one_of(*tables: type[PartTable] | type[Group]) -> Any:
+    """A table whose `kind` says which of these it is."""
+    return Annotated[reduce(or_, tables), Field(discriminator="kind")]

@@ -10,7 +10,8 @@ from scipy.interpolate import CubicSpline
 
 from torchsoft.excitation import FADE, Waves, wave
 from torchsoft.physics.motion import Piecewise, Profile, Sampled
-from torchsoft.rigs.fields import Group, NumberOr, Time, Within
+from torchsoft.quantity import Quantity, Time
+from torchsoft.rigs.fields import Group, NumberOr
 from torchsoft.rigs.recorded import read_column
 from torchsoft.tables import LISTED, shown
 
@@ -25,7 +26,7 @@ Value = Annotated[float | str, NumberOr("m, rad, N or N.m", START)]
 Times = Annotated[tuple[Time, ...], LISTED, Field(min_length=1, max_length=100_000)]
 Values = Annotated[tuple[Value, ...], LISTED, Field(min_length=1, max_length=100_000)]
 
-Frequency = Annotated[float, Within(1e-6, 1e5, "Hz")]
+Frequency = Annotated[float, Quantity("Hz", 1e-6, 1e5)]
 
 
 class Asked(NamedTuple):
@@ -146,9 +147,9 @@ class Wavy(Knots):
 class ComponentTable(Group):
     """One sine."""
 
-    amplitude: Annotated[float, Within(-1e6, 1e6, "m, rad, N or N.m")] = Field(description="amplitude")
+    amplitude: Annotated[float, Quantity("m, rad, N or N.m", -1e6, 1e6)] = Field(description="amplitude")
     frequency: Frequency = Field(description="frequency")
-    phase: Annotated[float, Within(-1e3, 1e3, "rad")] = Field(default=0.0, description="phase")
+    phase: Annotated[float, Quantity("rad", -1e3, 1e3)] = Field(default=0.0, description="phase")
 
 
 class SinesTable(Wavy):
@@ -171,7 +172,7 @@ class ChirpTable(Wavy):
     """A sine on top of a profile, its frequency going from `first` to `last`."""
 
     kind: Literal["chirp"] = "chirp"
-    amplitude: Annotated[float, Within(-1e6, 1e6, "m, rad, N or N.m")] = Field(description="amplitude")
+    amplitude: Annotated[float, Quantity("m, rad, N or N.m", -1e6, 1e6)] = Field(description="amplitude")
     first: Frequency = Field(description="frequency at its begin")
     last: Frequency = Field(description="frequency at its end")
 

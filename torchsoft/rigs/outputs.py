@@ -4,7 +4,8 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from torchsoft.rigs.fields import Group, Time, Within
+from torchsoft.quantity import Quantity, Time
+from torchsoft.rigs.fields import Group
 from torchsoft.tables import LISTED
 
 ROWS = 1_000_000
@@ -14,8 +15,8 @@ ROWS = 1_000_000
 class OutputsTable(Group):
     """How long the run lasts, and what is written."""
 
-    duration: Annotated[float, Within(1e-3, 1e5, "s")] = Field(description="of the run")
-    interval: Annotated[float, Within(1e-6, 1e3, "s")] = Field(default=0.01, description="between outputs")
+    duration: Annotated[float, Quantity("s", 1e-3, 1e5)] = Field(description="of the run")
+    interval: Annotated[float, Quantity("s", 1e-6, 1e3)] = Field(default=0.01, description="between outputs")
     figures: bool = Field(default=True, description="write the figures")
     snapshots: Annotated[tuple[Time, ...], LISTED, Field(max_length=12)] = Field(
         default=(), description="times of the pictures in snapshots.png; six over the whole run if none is given [s]"
@@ -44,16 +45,16 @@ class OutputsTable(Group):
 class SolverTable(Group):
     """How steps are chosen: by tolerance, or equal ones."""
 
-    rtol: Annotated[float, Within(1e-9, 1e-1)] | None = Field(
+    rtol: Annotated[float, Quantity("1", 1e-9, 1e-1)] | None = Field(
         default=None, description="relative tolerance; 1e-5 if not given"
     )
-    atol: Annotated[float, Within(1e-12, 1.0)] | None = Field(
+    atol: Annotated[float, Quantity("1", 1e-12, 1.0)] | None = Field(
         default=None, description="absolute tolerance, in N, mm and rad; a tenth of rtol if not given"
     )
-    step: Annotated[float, Within(1e-7, 1.0, "s")] | None = Field(
+    step: Annotated[float, Quantity("s", 1e-7, 1.0)] | None = Field(
         default=None, description="equal steps no longer than this instead"
     )
-    tolerance: Annotated[float, Within(1e-10, 1e-3, "N")] = Field(
+    tolerance: Annotated[float, Quantity("N", 1e-10, 1e-3)] = Field(
         default=1e-9, description="Newton's, on every nodal force"
     )
 

@@ -3,20 +3,21 @@
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Self
 
 from pydantic import Field, PrivateAttr, model_validator
 from torch import nn
 
 from torchsoft.physics.parts import COORDINATES
+from torchsoft.quantity import Gravity
 from torchsoft.rigs.actuators import ActuatorTable, ControllerTable, Loop
 from torchsoft.rigs.bodies import UNITS, BodyTable
 from torchsoft.rigs.contacts import ContactTable, LawTable
-from torchsoft.rigs.fields import Group, Within
+from torchsoft.rigs.fields import Group
 from torchsoft.rigs.materials import MaterialTable
 from torchsoft.rigs.motion import MotionTable
 from torchsoft.rigs.outputs import OutputsTable, SolverTable
-from torchsoft.rigs.pads import PadTable
+from torchsoft.rigs.pads import AnyPad
 from torchsoft.tables import line
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
@@ -28,10 +29,10 @@ class RigTables(Group):
     """What a rig and its run consist of, and whether it fits together by its names."""
 
     title: str = Field(default="", description="what it is")
-    gravity: Annotated[float, Within(0.0, 1e3, "m/s2")] = Field(default=9.81, description="acts downwards")
+    gravity: Gravity = Field(default=9.81, description="acts downwards")
     bodies: dict[str, BodyTable] = Field(min_length=1)
     materials: dict[str, MaterialTable] = Field(min_length=1)
-    pads: dict[str, PadTable] = Field(min_length=1)
+    pads: dict[str, AnyPad] = Field(min_length=1)
     laws: dict[str, LawTable] = Field(min_length=1)
     contacts: dict[str, ContactTable] = Field(min_length=1)
     actuators: dict[str, ActuatorTable] = Field(default_factory=dict)

@@ -7,7 +7,8 @@ from typing import Annotated, Any, get_args, get_origin
 
 from pydantic.fields import FieldInfo
 
-from torchsoft.rigs.fields import Group, NumberOr, Within
+from torchsoft.quantity import Quantity
+from torchsoft.rigs.fields import Group, NumberOr
 from torchsoft.rigs.schema import RigTables
 
 COLUMN = 44
@@ -30,8 +31,9 @@ def to_toml(file: RigTables) -> str:
 
 
 def heading(table: type[Group]) -> list[str]:
-    """What a table is, as comments."""
-    return [f"# {line.strip()}" for line in (table.__doc__ or "").strip().splitlines()]
+    """First paragraph of the table's description, as comments."""
+    first = (table.__doc__ or "").strip().replace("`", "").split("\n\n")[0]
+    return [f"# {line.strip()}" for line in first.splitlines()]
 
 
 def section(table: Group, path: str, known: list[str], seen: set[type[Group]]) -> Iterator[str]:
@@ -69,7 +71,7 @@ def commented(row: str, remark: str) -> str:
 def remark(field: FieldInfo) -> str:
     """Meaning and unit of a field."""
     unit = next(
-        (one.unit for one in metadata(field) if isinstance(one, Within | NumberOr) and one.unit not in ("", "1")), ""
+        (one.unit for one in metadata(field) if isinstance(one, Quantity | NumberOr) and one.unit not in ("", "1")), ""
     )
     meaning = field.description or ""
     return meaning if not unit or f"[{unit}]" in meaning else f"{meaning} [{unit}]"

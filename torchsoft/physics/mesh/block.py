@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf, isnan
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from torchsoft.physics.arguments import names, number, positive, whole
 from torchsoft.physics.mesh.element import Array, element_matrices
 from torchsoft.physics.mesh.mesh import Index, Mesh
+from torchsoft.quantity import Length, Quantity
 
 SIDES = ("base", "left", "right")
 """Edges of a block that may be bonded; the fourth is its face."""
@@ -20,17 +22,24 @@ class PadMesh(Mesh):
     """A rectangular block with a corner at the origin: bonded at y = 0, free at y = `height` [m]. The sides at x = 0 and at
     x = `length` [m] may be bonded as well."""
 
-    length: float
-    height: float
-    elements_x: int
-    elements_y: int
-    bonded_sides: bool = False
+    length: Annotated[Length, "length along the surface"]
+    height: Annotated[Length, "thickness"]
+    elements_x: Annotated[int, Quantity("1", 1, 100_000, "finite elements along it; 1 mm each is usual")]
+    elements_y: Annotated[int, Quantity("1", 1, 1000, "finite elements through it")]
+    bonded_sides: Annotated[bool, "bonded at both ends as well"] = False
 
     def __post_init__(self) -> None:
         for name in ("length", "height"):
             positive(name, getattr(self, name))
         for name in ("elements_x", "elements_y"):
             whole(name, getattr(self, name), 1)
+
+    @property
+    def numbers(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return f"elements_x = {self.elements_x} by elements_y = {self.elements_y}"
+
+    def counts(self) -> tuple[int, int, int]:
+        return self.elements_x + 1, (self.elements_x + 1) * self.elements_y, self.elements_y + 2
 
     def refined(self, finer: int) -> Mesh:
         return replace(self, elements_x=finer * self.elements_x, elements_y=finer * self.elements_y)
@@ -43,8 +52,8 @@ class PadMesh(Mesh):
         return np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
 
     @property
-    def numbers(self) -> Index:
-        """Of the nodes, (elements_x + 1, elements_y + 1)."""
+    def grid(self) -> Index:
+        """Numbers of the nodes, (elements_x + 1, elements_y + 1)."""
         return np.arange((self.elements_x + 1) * (self.elements_y + 1)).reshape(
             self.elements_x + 1, self.elements_y + 1
         )
@@ -52,13 +61,13 @@ class PadMesh(Mesh):
     @cached_property
     def elements(self) -> Index:
         """Node numbers of each element, anticlockwise, shape (elements, 4)."""
-        number = self.numbers
+        number = self.grid
         corners = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
         return np.stack(corners, -1).reshape(-1, 4)
 
     def edge(self, name: str) -> Index:
         """Numbers of the nodes on an edge of the block."""
-        number = self.numbers
+        number = self.grid
         return {"base": number[:, 0], "left": number[0], "right": number[-1], "face": number[:, -1]}[name]
 
     def held(self) -> tuple[str, ...]:
@@ -89,8 +98,13 @@ class PadMesh(Mesh):
         return np.array([[0.0, -self.length], [self.length, self.length]])
 
     def lines(self, columns: int) -> list[Index]:
-        number = self.numbers
+        number = self.grid
         return [*number.T, *number[::columns], number[-1]]
+
+
+FaceRadius = Annotated[
+    float, Quantity("m", -1e3, 1e3, "radius of the face, at least half of the length; negative: hollow")
+]
 
 
 @dataclass(frozen=True)
@@ -101,8 +115,8 @@ class CurvedPadMesh(PadMesh):
     Raises `ValueError` for an arc that does not span the length, or leaves nothing of the sides or of the middle.
     """
 
-    radius: float = inf
-    bonded_edges: tuple[str, ...] = SIDES[:1]
+    radius: FaceRadius = inf
+    bonded_edges: Annotated[tuple[str, ...], 'edges that are bonded: of "base", "left", "right"'] = SIDES[:1]
 
     def __post_init__(self) -> None:
         super().__post_init__()

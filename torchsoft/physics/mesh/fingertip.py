@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from torchsoft.physics.arguments import positive, whole
 from torchsoft.physics.mesh.element import Array
 from torchsoft.physics.mesh.mesh import FreeMesh, Index, Mesh, in_band
+from torchsoft.quantity import Length, Quantity
 
 CORE = 0.5
 """Half of the width of the core, and its height, over the radius."""
@@ -22,13 +24,23 @@ class FingertipMesh(FreeMesh):
     Layers of elements, about as high as long, lead inwards to a core of rectangles. Raises `ValueError` for other numbers.
     """
 
-    radius: float
-    elements_around: int
+    radius: Annotated[Length, "radius"]
+    elements_around: Annotated[
+        int, Quantity("1", 4, 100_000, "finite elements along the half circle, a multiple of 4; 1 mm each is usual")
+    ]
 
     def __post_init__(self) -> None:
         positive("radius", self.radius)
         if whole("elements_around", self.elements_around, 4) % 4:
             raise ValueError(f"`elements_around` must be a multiple of 4, but is {self.elements_around}")
+
+    @property
+    def numbers(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return f"elements_around = {self.elements_around}"
+
+    def counts(self) -> tuple[int, int, int]:
+        k = self.elements_around // 4
+        return 4 * k + 1, (2 * k + 1) * k + self.layers * (4 * k - 1), 4 * k + 2
 
     def refined(self, finer: int) -> Mesh:
         return replace(self, elements_around=finer * self.elements_around)

@@ -12,6 +12,9 @@ from torchsoft.physics.mesh.element import Array, element_matrices
 
 Index = NDArray[np.int64]
 
+MEMORY = 8.0
+"""Largest memory [GiB] that condensing a mesh may need."""
+
 
 class Mesh:
     """A pad's mesh in its own frame: it gives `nodes` (N, 2) [m], `elements` (n, 4) anticlockwise, which nodes are `bonded`,
@@ -29,6 +32,27 @@ class Mesh:
     height: Any
     elements_x: Any
     elements_y: Any
+
+    numbers = "the elements of its file"
+    """Arguments that say how many elements it has, for messages."""
+
+    def counts(self) -> tuple[int, int, int]:
+        """Nodes on the face, nodes that move, and the largest difference between node numbers of one element, about."""
+        return len(self.face), len(self.free), self.band
+
+    @property
+    def memory(self) -> float:
+        """Memory [GiB] for condensing the mesh onto its surface, about: displacements under loads on the surface and their
+        products, the banded stiffness and its factor."""
+        surface, free, band = self.counts()
+        return 8 * 4 * free * (6 * surface + 2 * band) / 2**30
+
+    def check_memory(self) -> None:
+        """Raises `ValueError` for a mesh too fine to be condensed; inertial pads are condensed too, to find the start."""
+        if (need := self.memory) > MEMORY:
+            raise ValueError(
+                f"{self.numbers} take about {need:.3g} GiB of memory, but {MEMORY:g} GiB are the most; take fewer"
+            )
 
     def refined(self, finer: int) -> "Mesh":
         """The mesh of the same pad with `finer` times as many elements each way."""

@@ -4,7 +4,7 @@ Their boundaries are segments and arcs that continue each other's tangents. Dist
 point is the only one, in particular down to the corners' radius; the curvature jumps where an arc begins.
 """
 
-from typing import ClassVar, NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -13,15 +13,19 @@ from torchsoft.physics.arguments import places, positive
 from torchsoft.physics.shapes.area import Moments, gauss, moments
 from torchsoft.physics.shapes.shape import Prepared, Shape, note_centre, parameter
 from torchsoft.physics.shapes.simple import crossing
+from torchsoft.quantity import Length, Points
 
 
 class RoundedBox(Shape):
     """A box with half of its width and of its height [m] along the body's x and y, and corners rounded to `radius` [m]: a
     circle where all three are equal."""
 
-    limits: ClassVar = {"half_width": "positive", "half_height": "positive", "radius": "positive"}
-
-    def __init__(self, half_width: float, half_height: float, radius: float) -> None:
+    def __init__(
+        self,
+        half_width: Annotated[Length, "half of the size along the body's own x"],
+        half_height: Annotated[Length, "half of the size along the body's own y"],
+        radius: Annotated[Length, "radius of the corners, at most the smaller half size"],
+    ) -> None:
         super().__init__()
         self.half_width, self.half_height, self.radius = (
             parameter(value) for value in (half_width, half_height, radius)
@@ -88,11 +92,14 @@ class RoundedPolygon(Shape):
     corners that do not fit on their sides, and for sides that cross.
     """
 
-    limits: ClassVar = {"radius": "positive"}
     MOST, ARC = 64, 16
     """Vertices, and points of the quadrature along an arc: exact to rounding up to half a turn."""
 
-    def __init__(self, vertices: object, radius: float) -> None:
+    def __init__(
+        self,
+        vertices: Annotated[Points, "corners before rounding, in their order, [x, y] each"],
+        radius: Annotated[Length, "radius of the corners, inner ones too"],
+    ) -> None:
         super().__init__()
         given = places("vertices", vertices)
         if not 3 <= len(given) <= self.MOST:

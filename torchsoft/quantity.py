@@ -1,0 +1,113 @@
+"""Quantities: unit, bounds and meaning of a number, declared once, in the signature of the constructor that takes it.
+
+Everything else that speaks of the number reads it there: the check of a module's parameters, the tables of rig files, the
+settings of the paper's rig, the bounds of an identification.
+"""
+
+import inspect
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import cache
+from types import MappingProxyType
+from typing import Annotated, Any, get_args, get_origin
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Closed interval [`low`, `high`] in `unit`, and the meaning of the number; an annotation of a constructor's argument, and
+    of a pydantic field. Bounds are wide: they end where sums and products of such numbers would not be finite."""
+
+    unit: str
+    low: float
+    high: float
+    meaning: str = ""
+
+    @property
+    def range(self) -> str:
+        """The interval with its unit, for messages."""
+        return f"from {self.low:g} to {self.high:g}{'' if self.unit == '1' else f' {self.unit}'}"
+
+    def check(self, x: float) -> float:
+        """Raises `ValueError` for a number outside the interval."""
+        if not self.low <= x <= self.high:
+            raise ValueError(f"should be {self.range}, not {x:g}")
+        return x
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_after_validator_function(self.check, handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
+        return handler(schema) | {"minimum": self.low, "maximum": self.high, "unit": self.unit}
+
+
+def metadata(hint: Any) -> Iterator[Any]:
+    """Metadata of an annotation, from the inside out."""
+    for inner in get_args(hint):
+        yield from metadata(inner)
+    if get_origin(hint) is Annotated:
+        yield from hint.__metadata__
+
+
+def quantity(hint: Any) -> Quantity | None:
+    """Quantity of an annotation, if it has one; text in the annotation is its meaning."""
+    found = None
+    for one in metadata(hint):
+        if isinstance(one, Quantity):
+            found = one
+        elif isinstance(one, str) and found is not None:
+            found = replace(found, meaning=one)
+    return found
+
+
+@cache
+def quantities(part: type) -> Mapping[str, Quantity]:
+    """Quantities of the arguments of a part's constructor, by name."""
+    arguments = inspect.signature(part.__init__).parameters
+    found = {name: quantity(argument.annotation) for name, argument in arguments.items()}
+    return MappingProxyType({name: one for name, one in found.items() if one is not None})
+
+
+def quantity_of(part: object, name: str) -> Quantity | None:
+    """Quantity of the parameter `name` of a part, if its constructor declares it: "tau_2" is an entry of "tau"."""
+    known, (stem, _, number) = quantities(type(part)), name.rpartition("_")
+    return known.get(name, known.get(stem) if number.isdigit() else None)
+
+
+Length = Annotated[float, Quantity("m", 1e-6, 100.0)]
+"""A size."""
+
+Place = Annotated[float, Quantity("m", -100.0, 100.0)]
+"""A coordinate."""
+
+Angle = Annotated[float, Quantity("rad", -1e3, 1e3)]
+
+Points = Annotated[Iterable[tuple[float, float]], Quantity("m", -100.0, 100.0)]
+"""Places in the plane."""
+
+Mass = Annotated[float, Quantity("kg", 1e-6, 1e5, "mass")]
+
+Inertia = Annotated[float, Quantity("kg.m2", 1e-12, 1e6, "moment of inertia about the centre of mass")]
+
+Depth = Annotated[float, Quantity("m", 1e-6, 100.0, "depth out of the plane")]
+
+Modulus = Annotated[float, Quantity("Pa", 1.0, 1e13, "Young's modulus, relaxed; rubber has 0.1e6 to 10e6")]
+
+PoissonRatio = Annotated[float, Quantity("1", -0.999, 0.4999, "Poisson's ratio")]
+
+Density = Annotated[float, Quantity("kg/m3", 1e-3, 1e6, "density")]
+
+Retardation = Annotated[float, Quantity("s", 1e-9, 1e6, "retardation time: the dashpot's viscosity over the modulus")]
+
+Stiffness = Annotated[float, Quantity("N/m", 1e-3, 1e12)]
+
+Dashpot = Annotated[float, Quantity("N.s/m", 0.0, 1e9)]
+
+FrictionCoefficient = Annotated[float, Quantity("1", 0.0, 100.0)]
+
+Gain = Annotated[float, Quantity("N/m, N, N.m/rad", 0.0, 1e12)]
+
+Gravity = Annotated[float, Quantity("m/s2", 0.0, 1e3, "gravitational acceleration, downwards")]
+
+Time = Annotated[float, Quantity("s", 0.0, 1e5)]
