@@ -22,7 +22,6 @@ from torchsoft.rigs import run as running
 from torchsoft.rigs.check import check
 from torchsoft.rigs.course import Estimate
 from torchsoft.rigs.motion import flattened
-from torchsoft.rigs.pads import FingertipTable
 from torchsoft.rigs.template import template
 from torchsoft.rigs.written import to_toml
 from torchsoft.scenario import grasp_and_roll
@@ -37,7 +36,7 @@ def coarse(file: RigFile, **groups: dict[str, Any]) -> RigFile:
     """The rig on a mesh half as fine."""
     pads = {
         name: {"elements_around": pad.elements_around // 2}
-        if isinstance(pad, FingertipTable)
+        if pad.kind == "fingertip"
         else {"elements_x": max(16, pad.elements_x // 2), "elements_y": 2}
         for name, pad in file.pads.items()
     }
@@ -135,7 +134,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "incompressible": ({"materials__rubber__nu": 0.5}, r"materials\.rubber\.nu: should be from -0\.999 to 0\.4999, not 0\.5"),
     "text": ({"bodies__disc__mass": "heavy"}, r"bodies\.disc\.mass should be a valid number, not 'heavy'"),
     "freedom": ({"bodies__bracket__theta": "locked"}, r'bodies\.bracket\.theta: should be "free", "driven" or a number'),
-    "friction": ({"laws__dry__friction__mu_k": 0.9}, r"laws\.dry\.friction.*: mu_k = 0\.9 is above mu_s = 0\.8"),
+    "friction": ({"laws__dry__friction__mu_k": 0.9}, r"laws\.dry\.friction.*: mu_k must not exceed mu_s, but mu_k = 0\.9 > mu_s = 0\.8"),
     "sort": ({"bodies__disc__shape__kind": "heart"}, r"bodies\.disc\.shape\.kind should be one of .*'circle'.*, not 'heart'"),
     "no mass": ({"bodies__bracket__mass": None}, r"bodies\.bracket: mass is missing, but x and y can move freely"),
     "no start": ({"bodies__bracket__start": {"y": None}}, r"bodies\.bracket: start\.y is missing: y is free"),
@@ -452,7 +451,7 @@ def test_the_file_to_start_from_is_a_rig_with_a_comment_on_every_number(tmp_path
     assert main(["init", str(path.with_suffix(""))]) == 0
     text = path.read_text(encoding="utf-8")
     assert RigFile.from_toml(path).model_dump() == template("mine").model_dump()
-    rows = [row for row in text.splitlines() if " = " in row and not row.startswith("# An ")]
+    rows = [row for row in text.splitlines() if re.match(r"(# )?\w+ = ?\S*$|.*  # ", row)]
     assert [row for row in rows if "  # " not in row and " # " not in row[2:]] == []
     for word in ("[kg]", "[m]", "[Pa]", "[N.s/m]", "[s]", "# points = 0", "# step ="):
         assert word in text

@@ -497,12 +497,12 @@ def test_gradients_of_a_run_are_those_of_differences(name: str) -> None:
 @pytest.mark.parametrize(
     ("shape", "match"),
     [
-        (lambda: Superellipse(20e-3, 20e-3, 1.9), "n must be from 2 to 20, but is 1.9"),
-        (lambda: Superellipse(20e-3, 20e-3, 21.0), "n must be from 2 to 20, but is 21"),
+        (lambda: Superellipse(20e-3, 20e-3, 1.9), "`disc.shape.n` must be from 2 to 20, but is 1.9"),
+        (lambda: Superellipse(20e-3, 20e-3, 21.0), "`disc.shape.n` must be from 2 to 20, but is 21"),
         (lambda: Superellipse(20e-3, 6e-3, 4.0), "differ by more than a factor of 3"),
         (lambda: Superellipse(20e-3, 20e-3, float("nan")), "`disc.shape.n` must be finite"),
         (lambda: RoundedBox(20e-3, 9e-3, 9.1e-3), "the corners' radius 0.0091 is larger than half of the box, 0.009"),
-        (lambda: RoundedBox(20e-3, 9e-3, 0.0), "`disc.shape.radius` must be positive, but is 0"),
+        (lambda: RoundedBox(20e-3, 9e-3, 0.0), "`disc.shape.radius` must be from 1e-06 to 10 m, but is 0"),
     ],
 )
 def test_shapes_that_are_none_are_refused(shape: Callable[[], Shape], match: str) -> None:

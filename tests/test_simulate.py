@@ -443,14 +443,14 @@ def test_a_reference_that_turns_nan_is_refused() -> None:
 @pytest.mark.parametrize(
     ("name", "value", "match"),
     [
-        ("pad.E", 0.0, r"parameter `.*\.E` must be positive, but is 0"),
-        ("contact.K_n", -1.2e5, r"parameter `.*K_n` must be positive, but is -120000"),
+        ("pad.E", 0.0, r"parameter `.*\.E` must be from 1 to 1e\+13 Pa, but is 0"),
+        ("contact.K_n", -1.2e5, r"parameter `.*K_n` must be from 0.001 to 1e\+12 N/m, but is -120000"),
         ("contact.K_n", float("nan"), r"parameter `.*K_n` must be finite, but is nan"),
-        ("contact.mu_s", -0.1, r"parameter `.*mu_s` must be not negative"),
-        ("pad.nu", 0.5, r"parameter `.*nu` must be between -1 and 0\.5"),
-        ("disc.radius", -1e-3, r"parameter `.*radius` must be positive"),
+        ("contact.mu_s", -0.1, r"parameter `.*mu_s` must be from 0 to 100"),
+        ("pad.nu", 0.5, r"parameter `.*nu` must be from -0\.999 to 0\.4999"),
+        ("disc.radius", -1e-3, r"parameter `.*radius` must be from 1e-06 to 10 m"),
         ("disc.mass", float("inf"), r"parameter `.*mass` must be finite"),
-        ("control.K_81", -1.0, r"parameter `.*Kp` must be not negative"),
+        ("control.K_81", -1.0, r"parameter `.*Kp` must be from 0 to 1e\+12"),
         ("scenario.gravity", float("nan"), r"parameter `gravity` must be finite"),
     ],
 )

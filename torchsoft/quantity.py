@@ -75,7 +75,7 @@ def quantity_of(part: object, name: str) -> Quantity | None:
     return known.get(name, known.get(stem) if number.isdigit() else None)
 
 
-Length = Annotated[float, Quantity("m", 1e-6, 100.0)]
+Length = Annotated[float, Quantity("m", 1e-6, 10.0)]
 """A size."""
 
 Place = Annotated[float, Quantity("m", -100.0, 100.0)]
@@ -86,11 +86,11 @@ Angle = Annotated[float, Quantity("rad", -1e3, 1e3)]
 Points = Annotated[Iterable[tuple[float, float]], Quantity("m", -100.0, 100.0)]
 """Places in the plane."""
 
-Mass = Annotated[float, Quantity("kg", 1e-6, 1e5, "mass")]
+Mass = Annotated[float, Quantity("kg", 1e-12, 1e5, "mass")]
 
-Inertia = Annotated[float, Quantity("kg.m2", 1e-12, 1e6, "moment of inertia about the centre of mass")]
+Inertia = Annotated[float, Quantity("kg.m2", 1e-24, 1e6, "moment of inertia about the centre of mass")]
 
-Depth = Annotated[float, Quantity("m", 1e-6, 100.0, "depth out of the plane")]
+Depth = Annotated[float, Quantity("m", 1e-6, 10.0, "depth out of the plane")]
 
 Modulus = Annotated[float, Quantity("Pa", 1.0, 1e13, "Young's modulus, relaxed; rubber has 0.1e6 to 10e6")]
 

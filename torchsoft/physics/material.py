@@ -117,7 +117,8 @@ class Series(Material):
     `ValueError` unless there are as many strengths as times, and at least one.
     """
 
-    symbol = ""
+    symbol = strength = ""
+    """Names of a strength's parameters, and of the constructor's argument."""
 
     def __init__(
         self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, strengths: Iterable[float], tau: Retardations,
@@ -127,7 +128,7 @@ class Series(Material):
         one, other = terms(self.symbol, strengths), terms("tau", tau)
         if len(one) != len(other) or not 1 <= len(one) <= TERMS:
             raise ValueError(
-                f"a series needs as many `{self.symbol}` as `tau`, from 1 to {TERMS}, but has {len(one)} and {len(other)}"
+                f"a series needs as many `{self.strength}` as `tau`, from 1 to {TERMS}, but has {len(one)} and {len(other)}"
             )
         self.terms = len(one)
         for k, (strength, time) in enumerate(zip(one, other), 1):
@@ -159,7 +160,7 @@ class GeneralisedKelvin(Series):
     Parameters are called J_1, tau_1 and so on.
     """
 
-    symbol = "J"
+    symbol = strength = "J"
 
     def __init__(
         self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, J: Fractions, tau: Retardations,
@@ -184,7 +185,7 @@ class Prony(Series):
     spring, which takes tau_instant [s] to give way.
     """
 
-    symbol = "E"
+    symbol, strength = "E", "moduli"
 
     def __init__(
         self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, moduli: Moduli, tau: Retardations,

@@ -69,7 +69,9 @@ def check_values(rig: Any) -> None:
         for name, value in module.named_buffers(recurse=False):
             if value.is_floating_point():
                 check_array(f"{path}{name}", value)
-        for name in dict.fromkeys((*quantities(type(module)), *module._parameters)):
+    for owner, module in rig.named_modules():
+        path = f"{owner}." if owner else ""
+        for name in dict.fromkeys((*module._parameters, *quantities(type(module)))):
             declared, value = quantity_of(module, name), getattr(module, name, None)
             if declared is None or not isinstance(value, Tensor | float):
                 continue

@@ -24,8 +24,7 @@ class ContourTable(PartTable):
     )
 
     def arguments(self, folder: Path) -> tuple[tuple[str, Any], ...]:
-        with at_field("file"):
-            points = read_points(folder / self.file)
+        points = read_points(folder / self.file)
         return ("points", tuple((x, y) for x, y in points.tolist())), ("tolerance", self.tolerance)
 
     def build(self, folder: Path) -> Any:
