@@ -12,7 +12,7 @@ from _experiment import COARSE, at_the_points, timed
 from torch import Tensor
 
 from torchsoft import Parameters, Profile, Reference, SoftGrasp, press, simulate
-from torchsoft.physics.equilibrium import holding_force
+from torchsoft.paper.equilibrium import holding_force
 from torchsoft.scenario import grasp_and_roll, reference
 from torchsoft.solve.simulate import Route
 from torchsoft.solve.trajectory import channels

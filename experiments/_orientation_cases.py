@@ -24,7 +24,7 @@ from torchsoft import (
 )
 from torchsoft import simulate as simulated
 from torchsoft.physics.motion import Piecewise, hold
-from torchsoft.physics.resting import resting, standing
+from torchsoft.physics.statics import resting, standing
 from torchsoft.rigs import RigFile
 from torchsoft.rigs.build import assemble
 from torchsoft.solve.stability import NEUTRAL, modes

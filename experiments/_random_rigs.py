@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchsoft import Parameters, SoftGrasp
 from torchsoft.excitation import FADE, Begun, Chirp, Excitation, MultiSine, Press, Roll, Strokes, begin
-from torchsoft.physics.equilibrium import holding_force, press, rest
+from torchsoft.paper.equilibrium import holding_force, press, rest
 from torchsoft.scenario import reference
 
 SCALED = (

@@ -32,7 +32,7 @@ from torchsoft import (
     simulate,
 )
 from torchsoft.physics.material import Material
-from torchsoft.physics.resting import resting, standing
+from torchsoft.physics.statics import resting, standing
 
 RADIUS, HEIGHT, DEPTH = 19.37e-3, 4.59e-3, 44e-3
 """The paper's disc and pads [m]."""

@@ -30,7 +30,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Parameters, Profile, Reference, SoftGrasp, press, rest, simulate
-from torchsoft.physics.equilibrium import holding_force
+from torchsoft.paper.equilibrium import holding_force
 from torchsoft.physics.motion import hold
 from torchsoft.scenario import Manipulation, grasp_and_roll
 

@@ -29,7 +29,7 @@ from scipy.stats import qmc
 from tqdm import tqdm
 
 from torchsoft.excitation import Excitation, Knots
-from torchsoft.physics.equilibrium import NoEquilibrium
+from torchsoft.physics.statics import NoEquilibrium
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import RIG, record
 from torchsoft.sysid.design.criterion import chosen

@@ -1,7 +1,7 @@
 """Question: does every run end, and say why, wherever the parameters lie?
 
 Random rigs and short motions (about 0.3 s), each run by tolerances and by equal steps. Parameters are drawn where a rig exists,
-far inside the bounds that `torchsoft.parameters` declares: stiffnesses, dashpots, times, masses and gains by a factor of 10 up
+far inside the bounds that `torchsoft.paper.parameters` declares: stiffnesses, dashpots, times, masses and gains by a factor of 10 up
 and down from their defaults (log-uniform, as is the touch-down depth, and a factor of 3 for the pad's depth), mu_s from 0.05 to
 2 with mu_k at 30 to 100 % of it, nu from 0 to 0.495, heights at 70 to 150 %, three meshes, both friction laws, contact points
 on nodes or two an element, whose x the loop senses. Motions are rolls, strokes, sines, chirps and presses after a grasp of 0.2

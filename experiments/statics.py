@@ -27,7 +27,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Parameters, SoftGrasp, press
-from torchsoft.physics.equilibrium import holding_force
+from torchsoft.paper.equilibrium import holding_force
 
 MILLI, MICRO = 1e3, 1e6
 

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchsoft import Body, Parameters, Reference, Rig, SoftGrasp, hold, press
-from torchsoft.physics.equilibrium import holding_force
+from torchsoft.paper.equilibrium import holding_force
 from torchsoft.physics.state import State
 
 torch.set_num_threads(1)

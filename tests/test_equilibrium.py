@@ -8,7 +8,7 @@ from conftest import coarse as build
 from torch import Tensor
 
 from torchsoft import NoEquilibrium, Parameters, SoftGrasp, press, rest
-from torchsoft.physics.equilibrium import holding_force
+from torchsoft.paper.equilibrium import holding_force
 from torchsoft.physics.multibond import net_efforts
 
 GRASP = 48.6e-3
@@ -202,7 +202,7 @@ def test_a_bracket_above_the_sunken_disc_is_refused() -> None:
 
 
 def test_no_equilibrium_is_reported_when_newton_does_not_converge(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchsoft.physics.equilibrium.RESIDUAL", -1.0)
+    monkeypatch.setattr("torchsoft.paper.equilibrium.RESIDUAL", -1.0)
     with pytest.raises(NoEquilibrium, match="no static equilibrium found"):
         press(build(), GRASP)
 

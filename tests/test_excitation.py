@@ -8,7 +8,7 @@ import torch
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, Knots, begin
-from torchsoft.physics.paper import apart
+from torchsoft.paper.rig import apart
 from torchsoft.tables import InvalidTable
 
 ROLL = {"kind": "slow_roll"}

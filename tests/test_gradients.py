@@ -14,7 +14,7 @@ from torchdiffeq import odeint
 import torchsoft.solve.adjoint
 from torchsoft import METHOD, Parameters, Profile, Reference, Rig, SoftGrasp, simulate
 from torchsoft.channels import MEASURED
-from torchsoft.physics.paper import NAMES
+from torchsoft.paper.rig import NAMES
 from torchsoft.solve.adjoint import GradientFailed
 from torchsoft.solve.trajectory import channels
 from torchsoft.solve.unrolled import unrolled_solution

@@ -387,10 +387,16 @@ def test_a_series_that_is_none_is_refused(make: Callable[[], Material], message:
     ("solid", "message"),
     [
         (Prony(**COMMON, moduli=[1e5, 2e5], tau=[0.1, 0.1]), "two relaxation times are equal"),
-        (Prony(**COMMON, moduli=[1e5, -2e5], tau=[0.1, 0.2]), "parameter `pad.E_2` must be from 1 to 1e+13 Pa, but is -200000"),
+        (
+            Prony(**COMMON, moduli=[1e5, -2e5], tau=[0.1, 0.2]),
+            "parameter `pad.E_2` must be from 1 to 1e+13 Pa, but is -200000",
+        ),
         (Prony(**COMMON, moduli=[1e5], tau=[5e-5]), "tau_instant = 0.0001 s must be below the shortest tau, 5e-05 s"),
         (GeneralisedKelvin(**COMMON, J=[0.6, 0.5], tau=[0.1, 1]), "the fractions J sum to 1.1, above one"),
-        (GeneralisedKelvin(**COMMON, J=[0.6], tau=[0.0]), "parameter `pad.tau_1` must be from 1e-09 to 1e+06 s, but is 0"),
+        (
+            GeneralisedKelvin(**COMMON, J=[0.6], tau=[0.0]),
+            "parameter `pad.tau_1` must be from 1e-09 to 1e+06 s, but is 0",
+        ),
         (GeneralisedKelvin(**COMMON, J=[math.nan], tau=[0.1]), "parameter `pad.J_1` must be finite, but is nan"),
     ],
 )

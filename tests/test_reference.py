@@ -11,7 +11,7 @@ from torch import Tensor
 from torchsoft import Parameters, SoftGrasp, Trajectory, press, rest, simulate
 from torchsoft.excitation import CATALOGUE, begin
 from torchsoft.excitation import reference as excited
-from torchsoft.physics.equilibrium import holding_force
+from torchsoft.paper.equilibrium import holding_force
 from torchsoft.scenario import grasp_and_roll
 from torchsoft.solve.stability import NEUTRAL, loop_modes
 

@@ -23,8 +23,8 @@ from torchsoft import (
     hold,
     rest,
 )  # fmt: skip
-from torchsoft.parameters import Parameters
-from torchsoft.physics.paper import NAMES
+from torchsoft.paper.parameters import Parameters
+from torchsoft.paper.rig import NAMES
 
 STEP = 1e-5
 """Relative step of the central differences."""

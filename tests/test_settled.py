@@ -12,8 +12,8 @@ from torch import Tensor
 from torchsoft import Body, Circle, Contact, NoEquilibrium, Pad, PadMesh, Rig, SoftContact, SoftGrasp, press
 from torchsoft.physics.contact import SmoothSlip
 from torchsoft.physics.material import StandardLinearSolid
-from torchsoft.physics.settled import settled
 from torchsoft.physics.state import State
+from torchsoft.physics.statics import settled
 
 HEIGHT = 48.6e-3
 """Of the bracket in the grasp [m]."""

@@ -12,7 +12,7 @@ from skfem import Basis, ElementQuad2, ElementVector, MeshQuad, condense, solve
 from test_experiments import experiment
 
 from torchsoft import Parameters, RoundedBox, SoftGrasp, press
-from torchsoft.physics.equilibrium import holding_force
+from torchsoft.paper.equilibrium import holding_force
 from torchsoft.physics.mesh import lame_moduli
 from torchsoft.physics.state import State
 

@@ -26,9 +26,9 @@ from torchsoft import (
     hold,
 )
 from torchsoft.excitation import Excitation, Strokes, begin
+from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.material import KelvinVoigt
 from torchsoft.physics.motion import Profile, Reference
-from torchsoft.physics.paper import SoftGrasp
 from torchsoft.solve.simulate import simulate
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, Unknown, identify
 from torchsoft.sysid.problem.first_samples import WIDER, begin_underway, beginning, lasting_stretch

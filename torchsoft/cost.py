@@ -7,7 +7,7 @@ import os
 import sys
 from typing import NamedTuple
 
-from torchsoft.parameters import Parameters
+from torchsoft.paper.parameters import Parameters
 
 LONG = 3600.0
 """Work that takes longer than this [s] needs the user's word."""

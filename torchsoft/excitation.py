@@ -15,10 +15,10 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from torchsoft.parameters import Parameters
-from torchsoft.physics.equilibrium import holding_force, press, rest
+from torchsoft.paper.equilibrium import holding_force, press, rest
+from torchsoft.paper.parameters import Parameters
+from torchsoft.paper.rig import SoftGrasp, apart
 from torchsoft.physics.motion import Pieces, Profile, Reference, evaluate, hermite
-from torchsoft.physics.paper import SoftGrasp, apart
 from torchsoft.tables import LISTED, SEED, Table, from_toml
 
 FADE = 0.15

@@ -6,9 +6,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchsoft.physics.equilibrium import NoEquilibrium, rest
+from torchsoft.paper.equilibrium import rest
+from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.motion import Profile, Reference
-from torchsoft.physics.paper import SoftGrasp
+from torchsoft.physics.statics import NoEquilibrium
 from torchsoft.solve.simulate import simulate
 
 SETTLE = 0.5

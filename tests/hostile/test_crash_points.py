@@ -18,8 +18,8 @@ from hostile.trial import Tally
 from torchsoft import Parameters, simulate
 from torchsoft.datasets import check
 from torchsoft.excitation import Excitation, Strokes
-from torchsoft.physics.equilibrium import rest
-from torchsoft.physics.paper import SoftGrasp
+from torchsoft.paper.equilibrium import rest
+from torchsoft.paper.rig import SoftGrasp
 from torchsoft.sysid import Problem, Sensor, Unknown, identify, record
 from torchsoft.sysid.report import report as page
 

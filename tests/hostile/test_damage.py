@@ -14,9 +14,9 @@ from hostile.trial import Tally
 from torchsoft.datasets import Trajectories, open_dataset
 from torchsoft.datasets.check import check
 from torchsoft.datasets.storage import StoreError
-from torchsoft.parameters import Parameters
-from torchsoft.physics.equilibrium import rest
-from torchsoft.physics.paper import SoftGrasp
+from torchsoft.paper.equilibrium import rest
+from torchsoft.paper.parameters import Parameters
+from torchsoft.paper.rig import SoftGrasp
 from torchsoft.solve.simulate import simulate
 from torchsoft.sysid.files.columns import read_table
 

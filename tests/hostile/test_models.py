@@ -23,7 +23,7 @@ from torchsoft import (
     simulate,
 )
 from torchsoft.excitation import Chirp, Excitation, MultiSine, Press, Roll, Strokes, reference, start
-from torchsoft.physics.equilibrium import NoEquilibrium
+from torchsoft.physics.statics import NoEquilibrium
 from torchsoft.solve.adjoint import GradientFailed
 from torchsoft.solve.ledger import NEGLIGIBLE, RESIDUAL
 

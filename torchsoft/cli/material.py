@@ -57,7 +57,7 @@ def fit_material(options: argparse.Namespace) -> int:
     from torchsoft.materials.fit import fit
     from torchsoft.materials.measured import read
     from torchsoft.materials.written import FILES, printed, write
-    from torchsoft.parameters import Parameters
+    from torchsoft.paper.parameters import Parameters
 
     asked = {name: getattr(options, name) for name in ("test", "length", "area")}
     given = {name: getattr(options, name) for name in ("nu", "rho", "depth")}

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from torchsoft.excitation import MOST
-from torchsoft.parameters import Parameters, check
+from torchsoft.paper.parameters import Parameters, check
 from torchsoft.tables import LISTED, SEED, Table, from_toml, line
 
 RATIO = "contact.mu_k/contact.mu_s"

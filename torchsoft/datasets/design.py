@@ -9,7 +9,7 @@ from scipy.stats import qmc
 
 from torchsoft.datasets.config import Config, Kind, MultiSine, ranges
 from torchsoft.excitation import Excitation
-from torchsoft.parameters import Parameters
+from torchsoft.paper.parameters import Parameters
 
 SPLITS = ("train", "validation", "test")
 

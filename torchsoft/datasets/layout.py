@@ -14,8 +14,8 @@ from torchsoft.channels import PADS
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.manifest import Layout
 from torchsoft.datasets.schema import Variable, sizes, variables
-from torchsoft.parameters import Parameters
-from torchsoft.physics.paper import SoftGrasp
+from torchsoft.paper.parameters import Parameters
+from torchsoft.paper.rig import SoftGrasp
 
 SMALL = (ZstdCodec(level=3), Crc32cCodec())
 LARGE = (BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"), Crc32cCodec())

@@ -7,7 +7,7 @@ import numpy as np
 
 from torchsoft.channels import PADS, VARIABLES
 from torchsoft.datasets.config import RATIO, Config
-from torchsoft.parameters import Parameters
+from torchsoft.paper.parameters import Parameters
 
 KEPT = tuple(name for name in VARIABLES if name not in ("time", "angular_momentum"))
 """Variables of the rig's channels that a dataset keeps of every trajectory."""

@@ -10,8 +10,8 @@ from torchsoft.datasets.config import RATIO, Config
 from torchsoft.datasets.design import Task, excitation
 from torchsoft.datasets.schema import KEPT, energies, not_finite, sizes, variables
 from torchsoft.excitation import reference
-from torchsoft.physics.equilibrium import holding_force, press, rest
-from torchsoft.physics.paper import SoftGrasp
+from torchsoft.paper.equilibrium import holding_force, press, rest
+from torchsoft.paper.rig import SoftGrasp
 from torchsoft.scenario import find_grasp_force
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import simulate

@@ -23,7 +23,7 @@ from torchsoft.datasets.storage import (
 )  # fmt: skip
 from torchsoft.datasets.vouched import Vouched
 from torchsoft.files import PARTIAL, finite
-from torchsoft.parameters import Parameters
+from torchsoft.paper.parameters import Parameters
 
 
 class Store:

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from torchsoft.parameters import Parameters, Source
+from torchsoft.paper.parameters import Parameters, Source
 from torchsoft.physics.material import KelvinVoigt
 
 GENT = "A. N. Gent, On the relation between indentation hardness and Young's modulus, Rubber Chem. Technol. 31 (1958) 896-906"

@@ -7,7 +7,7 @@ adhesion, and the moving frame, which follows the point on the body nearest to t
 """
 
 from collections.abc import Callable
-from typing import Annotated, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -80,6 +80,9 @@ KineticFriction = Annotated[FrictionCoefficient, "kinetic coefficient of frictio
 
 class Friction(nn.Module):
     """A static and a kinetic coefficient of friction [1]."""
+
+    ordered: ClassVar = ("mu_k", "mu_s")
+    """The first must not exceed the second."""
 
     def __init__(self, mu_s: StaticFriction, mu_k: KineticFriction) -> None:
         super().__init__()

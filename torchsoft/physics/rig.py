@@ -18,7 +18,7 @@ from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, law_name
 from torchsoft.physics.shapes import parameter
 from torchsoft.physics.state import Layout, State
-from torchsoft.quantity import Gravity
+from torchsoft.quantity import Gravity, Quantity, quantity_of
 
 GROUND = "ground"
 
@@ -165,6 +165,18 @@ class Rig(nn.Module):
             shown = dict.fromkeys((*self.aliases, *dict(self.named_parameters())))
             raise ValueError(f"`{name}` is not a parameter of this rig; known: {', '.join(shown)}")
         return found
+
+    def quantity(self, name: str) -> Quantity | None:
+        """Unit, bounds and meaning of a parameter by its name, where its part declares them."""
+        owner, _, last = self.aliases.get(name, name).rpartition(".")
+        return quantity_of(self.get_submodule(owner), last)
+
+    @property
+    def ordered(self) -> dict[str, str]:
+        """Parameters that must not exceed another one, with the name of that one."""
+        names = {own: name for name, own in self.aliases.items()}
+        pairs = [[f"{k}.{one}" for one in m.ordered] for k, m in self.named_modules() if hasattr(m, "ordered") and k]
+        return {names.get(lower, lower): names.get(upper, upper) for lower, upper in pairs}
 
     def weight(self, name: str) -> Tensor:
         """What scales a contact's law at its points: the length of surface that each stands for over the law's spacing."""

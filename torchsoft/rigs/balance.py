@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from torchsoft.physics.contact import SmoothSlip
-from torchsoft.physics.equilibrium import NoEquilibrium
 from torchsoft.physics.motion import Reference, hold
-from torchsoft.physics.resting import massless, standing
 from torchsoft.physics.rig import Rig
+from torchsoft.physics.statics import NoEquilibrium, massless, standing
 from torchsoft.rigs.build import Ready, RigFile
 from torchsoft.rigs.course import Course, Estimate, at, signals
 from torchsoft.rigs.finding import Finding

@@ -10,12 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchsoft.physics.equilibrium import NoEquilibrium
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Piecewise, Reference
 from torchsoft.physics.parts import COORDINATES
-from torchsoft.physics.resting import resting, standing
 from torchsoft.physics.rig import Rig
+from torchsoft.physics.statics import NoEquilibrium, resting, standing
 from torchsoft.rigs.bodies import REST
 from torchsoft.rigs.fields import at_field, sound
 from torchsoft.rigs.geometry import points, reach, surface

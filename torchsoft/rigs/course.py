@@ -10,12 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.physics.equilibrium import NoEquilibrium
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Piecewise, hold
 from torchsoft.physics.parts import COORDINATES
-from torchsoft.physics.resting import resting
 from torchsoft.physics.rig import Rig
+from torchsoft.physics.statics import NoEquilibrium, resting
 from torchsoft.rigs.build import Ready, RigFile, assemble
 from torchsoft.rigs.geometry import facing, pressed, surface, turned
 

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from torchsoft.paper.equilibrium import rest
+from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.energy import stored
-from torchsoft.physics.equilibrium import rest
 from torchsoft.physics.motion import Reference
-from torchsoft.physics.paper import SoftGrasp
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
 from torchsoft.solve import tangent

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.physics.equilibrium import holding_force, press
+from torchsoft.paper.equilibrium import holding_force, press
+from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.motion import Reference, hold
-from torchsoft.physics.paper import SoftGrasp
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.rates import Rates

@@ -10,7 +10,6 @@ from pydantic import Field
 from scipy import stats
 
 from torchsoft import channels
-from torchsoft.parameters import Parameters
 from torchsoft.sysid.checks.misfit import whiteness
 from torchsoft.sysid.checks.parts import parts
 from torchsoft.sysid.problem.problem import Problem, Residuals
@@ -107,7 +106,6 @@ class Quantity(NamedTuple):
 def quantities(problem: Problem, x: Array, free: NDArray[np.bool_]) -> Iterator[Quantity]:
     """Parameters in physical units, then coordinates of starts, and what is wrong with sensors, at x (n,)."""
     c = problem.coordinates
-    units = {name: row["unit"] for name, row in Parameters().table().items()}
     for k, recording in enumerate(problem.recordings):
         values, before = problem.values(x, k), problem.values(c.start, k)
         chain = c.jacobian(x, recording.name, values)
@@ -120,8 +118,9 @@ def quantities(problem: Problem, x: Array, free: NDArray[np.bool_]) -> Iterator[
             alone, size = len(places) == 1 and first.name == name and not first.ratio_to, None
             if first.scale == "linear":
                 size = first.high - first.low if alone else abs(value)
+            declared = recording.rig.quantity(name)
             yield Quantity(
-                name, "parameter", recording.name if own else None, units.get(name, ""), value,
+                name, "parameter", recording.name if own else None, declared.unit if declared else "", value,
                 first.nominal if alone else before[name], size, chain[row] / (value if size is None else size), places,
                 first.prior if alone else None,
             )  # fmt: skip

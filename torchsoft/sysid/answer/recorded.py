@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from torchsoft.parameters import Parameters
-from torchsoft.physics.paper import SoftGrasp
+from torchsoft.paper.parameters import Parameters
+from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.rig import Rig
 from torchsoft.sysid.problem.problem import Problem
 from torchsoft.sysid.problem.recording import Array, identity

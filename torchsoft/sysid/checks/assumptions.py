@@ -11,9 +11,9 @@ from typing import Literal, NamedTuple
 from torch import Tensor, nn
 
 from torchsoft.channels import unit
+from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact, at_once
 from torchsoft.physics.motion import Piecewise, Reference, Sampled
-from torchsoft.physics.paper import SoftGrasp
 from torchsoft.physics.rig import Rig
 from torchsoft.sysid.problem.prediction import set_parameters
 from torchsoft.sysid.problem.recording import Recording

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from torchsoft.channels import unit
-from torchsoft.physics.paper import SoftGrasp
+from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.sysid.conventions.closed_loop import channel

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from torchsoft.channels import unit
-from torchsoft.physics.paper import SoftGrasp
+from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.parts import Actuator
 from torchsoft.physics.rig import Rig
 from torchsoft.sysid.conventions.closed_loop import Loop, channel, sampled, windows

@@ -6,8 +6,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, model_validator
 
+from torchsoft.paper.rig import NAMES
 from torchsoft.physics.material import INSTANT
-from torchsoft.physics.paper import NAMES
 from torchsoft.sysid.problem.underway import LEAD
 from torchsoft.sysid.problem.unknowns import Sensor, Unknown
 from torchsoft.sysid.settings import Settings

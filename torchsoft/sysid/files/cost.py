@@ -3,8 +3,8 @@
 from collections.abc import Iterable
 
 from torchsoft.cost import RUN, Cost, row_memory, step_seconds, steps_per_second
-from torchsoft.parameters import Parameters
-from torchsoft.physics.paper import SoftGrasp
+from torchsoft.paper.parameters import Parameters
+from torchsoft.paper.rig import SoftGrasp
 from torchsoft.sysid.fit.plan import ALL, FIRST, FREE, LAST, LOOSE, USUAL
 from torchsoft.sysid.fit.settle import FINER
 from torchsoft.sysid.problem.problem import Problem

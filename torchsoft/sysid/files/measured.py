@@ -14,10 +14,10 @@ import torch
 from pydantic import TypeAdapter
 
 from torchsoft.channels import CHANNELS, MEASURED, SETPOINTS
-from torchsoft.parameters import Parameters
+from torchsoft.paper.parameters import Parameters
+from torchsoft.paper.rig import SoftGrasp, apart
 from torchsoft.physics.material import KINDS, StandardLinearSolid
 from torchsoft.physics.motion import Reference, Sampled
-from torchsoft.physics.paper import SoftGrasp, apart
 from torchsoft.sysid.files.columns import Tables, read_tables
 from torchsoft.sysid.files.configuration import (
     Beginning,

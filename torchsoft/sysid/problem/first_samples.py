@@ -12,14 +12,13 @@ import torch
 from scipy.optimize import brentq
 from torch import Tensor
 
+from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.condensed import point_inputs
 from torchsoft.physics.contact import cross
-from torchsoft.physics.equilibrium import NoEquilibrium
-from torchsoft.physics.paper import SoftGrasp
 from torchsoft.physics.parts import Contact
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.settled import settled
 from torchsoft.physics.state import State
+from torchsoft.physics.statics import NoEquilibrium, settled
 from torchsoft.solve.trajectory import measurable
 from torchsoft.sysid.problem.readout import partner
 from torchsoft.sysid.problem.recording import SAME, Array, Recording

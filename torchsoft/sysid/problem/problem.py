@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchsoft.parameters import ORDERED
-from torchsoft.physics.paper import NAMES, SoftGrasp
+from torchsoft.paper.rig import NAMES, SoftGrasp
 from torchsoft.physics.validity import check_values
 from torchsoft.sysid.problem.noise import Autoregression
 from torchsoft.sysid.problem.prediction import FailedRun, Frozen, Prediction, set_parameters
@@ -37,9 +36,11 @@ class Residuals(NamedTuple):
 def check_ends(coordinates: Coordinates, recordings: Sequence[Recording]) -> None:
     """Raises `ValueError` where the bounds of an unknown leave no rig: a disc that does not fit between the pads, say."""
     for c in coordinates.all:
-        if c.kind != "parameter" or c.ratio_to or c.name in ORDERED:
+        if c.kind != "parameter" or c.ratio_to:
             continue
         for recording in recordings:
+            if c.name in {*recording.rig.ordered, *recording.rig.ordered.values()}:
+                continue
             for field, value in (("low", c.low), ("high", c.high)):
                 try:
                     check_value(recording, c.name, value)

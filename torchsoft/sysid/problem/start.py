@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchsoft.excitation import start
+from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.pads import Pad
-from torchsoft.physics.paper import SoftGrasp
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.tangent import directions
 

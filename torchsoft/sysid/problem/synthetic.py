@@ -6,9 +6,9 @@ import numpy as np
 import torch
 
 from torchsoft.excitation import Excitation, begin
-from torchsoft.parameters import Parameters
+from torchsoft.paper.parameters import Parameters
+from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.motion import Reference
-from torchsoft.physics.paper import SoftGrasp
 from torchsoft.solve.simulate import simulate
 from torchsoft.sysid.problem.prediction import choice, set_parameters
 from torchsoft.sysid.problem.recording import Recording

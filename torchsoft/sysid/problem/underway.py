@@ -11,11 +11,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.physics.equilibrium import NoEquilibrium
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.settled import settled
+from torchsoft.physics.statics import NoEquilibrium, settled
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.problem.start import PREFIX, Array, Begin, Samples, StartCoordinate, warn_of_memory
 

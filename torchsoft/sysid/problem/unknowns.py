@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from torchsoft.parameters import ORDERED, bounds
 from torchsoft.sysid.problem.recording import REACH, Array, Recording
 from torchsoft.sysid.problem.start import BOUNDS, PREFIX
 from torchsoft.tables import Table, line, shown
@@ -56,7 +55,7 @@ class Unknown(Table):
 
     `nominal` is where the search starts, by default the value of the recordings' own rigs; with `ratio_to` the value,
     nominal, bounds and prior are those of the ratio to that other parameter, and `fixed` besides ties the two. Bounds end where
-    the parameter's own do (`torchsoft.parameters.bounds`): wider ones are errors. With `per` = "recording" every recording has
+    the parameter's own do (`Rig.quantity`): wider ones are errors. With `per` = "recording" every recording has
     a value of its own. A `prior` counts as one more measurement.
     """
 
@@ -171,25 +170,22 @@ class Coordinate(NamedTuple):
         return math.exp(x) if self.scale == "log" else self.high - self.low
 
 
-def limits(name: str, unknowns: Mapping[str, Unknown], given: Mapping[str, float]) -> tuple[float, float]:
-    """The least and the largest value that an unknown may have whatever the others are, or that its ratio may.
-
-    The parameters declare them; those of a user's own law have the limits that its modules check when they run.
-    """
-    ratio_to = unknowns[name].ratio_to
+def limits(name: str, unknowns: Mapping[str, Unknown], recording: Recording) -> tuple[float, float]:
+    """Bounds of an unknown, or of its ratio, whatever the others are: those that its part's constructor declares."""
+    given, ordered, ratio_to = recording.parameters, recording.rig.ordered, unknowns[name].ratio_to
     if ratio_to is not None:
-        return (0.0, 1.0) if (name, ratio_to) == ORDERED else (-math.inf, math.inf)
-    try:
-        least, most = bounds(name)
-    except KeyError:
+        return (0.0, 1.0) if ordered.get(name) == ratio_to else (-math.inf, math.inf)
+    declared = None if name.startswith(PREFIX) else recording.rig.quantity(name)
+    if declared is None:
         return -math.inf, math.inf
-    lower, upper = ORDERED
+    least, most = declared.low, declared.high
     known = {**given, **{other: u.nominal for other, u in unknowns.items() if u.fixed and u.nominal is not None}}
     free = {other for other, u in unknowns.items() if not u.fixed}
-    if name == lower and upper in known and upper not in free:
-        most = min(most, known[upper])
-    if name == upper and lower in known and lower not in free:
-        least = max(least, known[lower])
+    for lower, upper in ordered.items():
+        if name == lower and upper in known and upper not in free:
+            most = min(most, known[upper])
+        if name == upper and lower in known and lower not in free:
+            least = max(least, known[lower])
     return least, most
 
 
@@ -240,7 +236,7 @@ class Coordinates:
                     f"unknowns.{name} = {nominal:g} is not on a logarithmic scale: give a positive `nominal`, or "
                     "scale = 'linear'"
                 )
-            ends = [limits(name, unknowns, r.parameters) for r in recordings]
+            ends = [limits(name, unknowns, r) for r in recordings]
             least, most = max(least for least, _ in ends), min(most for _, most in ends)
             for field in ("low", "high", "nominal"):
                 value = getattr(u, field)
@@ -261,7 +257,8 @@ class Coordinates:
                 self.all.append(
                     Coordinate(name, "parameter", where, nominal, low, high, u.scale, u.ratio_to, u.fixed, u.prior)
                 )
-        self._check_order()
+        for pair in dict.fromkeys(pair for r in recordings for pair in r.rig.ordered.items()):
+            self._check_order(*pair)
         for r in recordings:
             for name, mean, sd in r.start_coordinates:
                 low, high = mean - BOUNDS * sd, mean + BOUNDS * sd
@@ -273,9 +270,9 @@ class Coordinates:
                 self.all += [Coordinate(channel, kind, where, nominal, low, high) for where in seen]
         self.names = tuple(dict.fromkeys(c.name for c in self.all if c.of_the_rig))
 
-    def _check_order(self) -> None:
-        """Raises `ValueError` where a search could take the first of `ORDERED` above the second."""
-        lower, upper = ({c.name: c for c in self.all if not c.fixed}.get(name) for name in ORDERED)
+    def _check_order(self, *names: str) -> None:
+        """Raises `ValueError` where a search could take the first of two parameters above the second."""
+        lower, upper = ({c.name: c for c in self.all if not c.fixed}.get(name) for name in names)
         if lower and upper and not lower.ratio_to and lower.high > upper.low:
             raise ValueError(
                 f"unknowns.{lower.name} must not exceed {upper.name}, but may be up to {lower.high:g} and the other down to "

@@ -7,24 +7,18 @@ import torch
 from scipy.optimize import brentq
 from torch import Tensor
 
+from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.arguments import number
 from torchsoft.physics.contact import Frame, cross, moving_frame, normal_force
-from torchsoft.physics.paper import SoftGrasp
 from torchsoft.physics.state import State
+from torchsoft.physics.statics import RESIDUAL, NoEquilibrium
 from torchsoft.physics.validity import check_values
 
-RESIDUAL = 1e-13
-"""Equilibrium residual [m], forces counted by the compliance they meet."""
-
-LEVER = 1e-2
-"""How far off its centre, over its size, the object may be carried without a word."""
+MOMENT_ARM = 1e-2
+"""Largest moment on the object, over its size and the load, that is not worth a warning."""
 
 
-class NoEquilibrium(RuntimeError):
-    """Newton's iteration found no static equilibrium."""
-
-
-def _check(model: SoftGrasp) -> None:
+def check_statics(model: SoftGrasp) -> None:
     """Raises `ValueError` for a model whose statics would be nonsense, or have no graph."""
     if torch.is_inference_mode_enabled():
         raise ValueError("statics need torch's graphs, which torch.inference_mode() has not; use torch.no_grad()")
@@ -36,12 +30,12 @@ def rest(model: SoftGrasp, x: Tensor | None = None) -> Tensor:
 
     `x` () [m] is where, by default the scenario's x_C0; the state is differentiable in it.
     """
-    _check(model)
+    check_statics(model)
     weightless = float((model.disc.mass * model.gravity).detach()) == 0.0
     at = torch.tensor(model.settings.scenario.x_C0, dtype=torch.float64) if x is None else x
-    state = _touching(model, at) if weightless else _solve(model, None, at)
+    state = touching(model, at) if weightless else solve(model, None, at)
     x, y, _ = state.pose["disc"]
-    return model.pack(_with_bracket(state, x, model.touch_height(y)))
+    return model.pack(with_bracket(state, x, model.touch_height(y)))
 
 
 def press(model: SoftGrasp, bracket_height: float) -> Tensor:
@@ -49,13 +43,13 @@ def press(model: SoftGrasp, bracket_height: float) -> Tensor:
 
     Raises `NoEquilibrium` when the bracket is too high for its pad to touch the object, sunk in under its weight.
     """
-    _check(model)
+    check_statics(model)
     number("bracket_height", bracket_height)
     p = model.settings
     with torch.no_grad():
         up = float(model.touch_height(p.pad.height + model.shape.support(torch.tensor([0.0, -1.0]).double())))
     x = torch.tensor(p.scenario.x_C0, dtype=torch.float64)
-    state = None if bracket_height >= up else _solve(model, bracket_height, x)
+    state = None if bracket_height >= up else solve(model, bracket_height, x)
     if state is None or not bool(state.pads["U"].any()):
         raise NoEquilibrium(f"the bracket at {bracket_height} m is too high for its pad to touch the disc; lower it")
     return model.pack(state)
@@ -69,16 +63,16 @@ def holding_force(model: SoftGrasp, y: Tensor) -> float:
     return float(force[:, 1].sum())
 
 
-def _with_bracket(state: State, x: Tensor, y: Tensor) -> State:
+def with_bracket(state: State, x: Tensor, y: Tensor) -> State:
     return state._replace(pose=state.pose | {"bracket": torch.stack((x, y, torch.zeros_like(y)))})
 
 
-def _touching(model: SoftGrasp, x: Tensor) -> State:
+def touching(model: SoftGrasp, x: Tensor) -> State:
     """The object where it just touches the undeformed lower pad: what a body without weight rests like."""
     top = model.settings.pad.height
     zero = torch.zeros((), dtype=torch.float64)
     below = float(model.shape.support(torch.tensor([0.0, -1.0]).double()).detach())
-    side = _Side(model, "L", torch.zeros(2, dtype=torch.float64), x)
+    side = Side(model, "L", torch.zeros(2, dtype=torch.float64), x)
 
     def deepest(height: Tensor) -> tuple[Tensor, Tensor]:
         """Penetration of the deepest point [m], and its derivative by the height."""
@@ -91,10 +85,10 @@ def _touching(model: SoftGrasp, x: Tensor) -> State:
     penetration, slope = deepest(zero + y)
     height = y - penetration / slope.detach()  # its gradient is the implicit function theorem's
     state = model.unpack(torch.zeros(model.layout.size, dtype=torch.float64))
-    return _with_bracket(state._replace(pose=state.pose | {"disc": torch.stack((x, height, zero))}), x, zero)
+    return with_bracket(state._replace(pose=state.pose | {"disc": torch.stack((x, height, zero))}), x, zero)
 
 
-def _solve(model: SoftGrasp, bracket_height: float | None, x: Tensor) -> State:
+def solve(model: SoftGrasp, bracket_height: float | None, x: Tensor) -> State:
     """Unknowns: the object's height and the displacements of the nodes under (and above) it; the object stays at x [m].
 
     Newton with the module's own normal law; the last iteration is taken with the gradient on, so that the equilibrium's
@@ -109,7 +103,7 @@ def _solve(model: SoftGrasp, bracket_height: float | None, x: Tensor) -> State:
         {} if bracket_height is None else {"U": torch.stack((x, y_Br))}
     )
     weight = model.disc.mass * model.gravity
-    sides = [_Side(model, k, base, x) for k, base in bases.items()]
+    sides = [Side(model, k, base, x) for k, base in bases.items()]
     soft = sides[0].C.detach().diagonal().max()
     sizes = [2 * len(side.near) for side in sides]
 
@@ -135,7 +129,7 @@ def _solve(model: SoftGrasp, bracket_height: float | None, x: Tensor) -> State:
         for _ in range(100):
             if float(r.abs().max()) <= RESIDUAL:
                 break
-            step = _newton_step(linearise(z), r)
+            step = newton_step(linearise(z), r)
             scale = min(1.0, 0.2 * height / float(step[0].abs().clamp(min=1e-12)))
             for _ in range(12):
                 trial = z - scale * step
@@ -150,11 +144,11 @@ def _solve(model: SoftGrasp, bracket_height: float | None, x: Tensor) -> State:
                 "contact springs far stiffer than the pads?"
             )
         J = linearise(z)
-    z = z - _newton_step(J, residual(z))
+    z = z - newton_step(J, residual(z))
     with torch.no_grad():
         turning = [side.turning(u.unflatten(0, (-1, 2)), z[0]) for side, u in zip(sides, z[1:].split(sizes))]
         moment, load = (float(sum(x)) for x in zip(*turning))
-    if abs(moment) > LEVER * model.shape.size() * load:
+    if abs(moment) > MOMENT_ARM * model.shape.size() * load:
         warnings.warn(
             f"the object is held at theta = 0, where the pads turn it with {moment:.3g} N.m: a run from here begins with that",
             stacklevel=3,
@@ -164,16 +158,16 @@ def _solve(model: SoftGrasp, bracket_height: float | None, x: Tensor) -> State:
     for side, F in zip(sides, forces(z)):
         pads[side.name] = side.everywhere(F)
     state = state._replace(pads=pads, pose=state.pose | {"disc": torch.stack((x, z[0], zero))})
-    return _with_bracket(state, x, y_Br)
+    return with_bracket(state, x, y_Br)
 
 
-def _newton_step(J: Tensor, r: Tensor) -> Tensor:
+def newton_step(J: Tensor, r: Tensor) -> Tensor:
     """J^-1 r; the shortest step where no node touches and leaves the object's height undetermined."""
     step, singular = torch.linalg.solve_ex(J, r[:, None])
     return (torch.linalg.lstsq(J, r[:, None]).solution if bool(singular) else step)[:, 0]
 
 
-class _Side:
+class Side:
     """One pad's surface as far as the object reaches sideways: its frictionless nodal forces, and what they do to the pad."""
 
     def __init__(self, model: SoftGrasp, name: str, base: Tensor, x: Tensor) -> None:

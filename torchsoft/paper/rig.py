@@ -1,13 +1,14 @@
 """The paper's rig from the lists: a disc between two soft pads, the upper one in a bracket under two PD controllers."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from torchsoft.parameters import Parameters
-from torchsoft.physics.contact import Coulomb, SlipLaw, SmoothSlip, SoftContact
+from torchsoft.paper.parameters import Parameters
+from torchsoft.physics.contact import Coulomb, SlipLaw, SmoothSlip
 from torchsoft.physics.material import KelvinVoigt, Material
 from torchsoft.physics.mesh import PadMesh
 from torchsoft.physics.motion import Reference, hold
@@ -52,24 +53,21 @@ class SoftGrasp(Rig):
         shape: Shape | None = None, material: Material | None = None,
     ) -> None:  # fmt: skip
         p = settings or Parameters()
-        c, k, length, height = p.contact, p.control, p.pad.length, p.pad.height
-        if friction is None:
-            smooth = c.friction == "smooth"
-            friction = SmoothSlip(c.mu_s, c.mu_k, c.v_s, c.eta) if smooth else Coulomb(c.mu_s, c.mu_k)
+        c, k = p.contact, p.control
         rubber = material or KelvinVoigt(p.pad.E, p.pad.nu, p.pad.rho, p.pad.tau, p.pad.depth)
-        law = SoftContact(c.K_n, c.R_n, c.K_t, c.R_t, friction=friction, epsilon=c.epsilon, node_spacing=c.node_spacing)
+        law = c.law
+        law.friction = friction or law.friction
         disc = Body(p.disc.mass, shape or Circle(p.disc.radius))
         bracket = Body(p.bracket.mass, theta=0.0, weighted=False)
         control = nn.ModuleDict({"x": PD(k.K_81, k.R_80), "y": PD(k.K_98, k.R_99)})
-        mesh = PadMesh(length, height, p.pad.elements_x, p.pad.elements_y)
-        upper = PadMesh(length, height, p.pad.elements_x, p.pad.elements_y, bonded_sides=p.pad.enclosed)
+        upper = replace(p.pad.mesh, bonded_sides=p.pad.enclosed)
         common: dict[str, Any] = {"inertial": p.pad.fidelity == "inertial", "points": p.contact.points}
-        at_bracket = (-length / 2, -p.bracket.cm_height)
+        at_bracket = (-p.pad.length / 2, -p.bracket.cm_height)
         super().__init__(
             groups={"pad": rubber, "contact": law, "disc": disc, "bracket": bracket, "control": control},
             bodies={"disc": disc, "bracket": bracket},
             pads={
-                "L": Pad(mesh, rubber, **common),
+                "L": Pad(p.pad.mesh, rubber, **common),
                 "U": Pad(upper, rubber, base="bracket", origin=at_bracket, mirrored=True, **common),
             },
             contacts={name: Contact(name, "disc", law) for name in ("L", "U")},

@@ -1,0 +1,1 @@
+"""The paper's rig: a preset made of the same parts as any other."""
