@@ -5,9 +5,11 @@ from typing import Any
 
 import pytest
 
+from torchsoft.paper.rig import SoftGrasp
 from torchsoft.sysid.problem.unknowns import Coordinates, Prior, Unknown
 from torchsoft.tables import InvalidTable
 
+RIG = SoftGrasp()
 GIVEN = {"pad.E": 0.75e6, "pad.nu": 0.45, "contact.mu_s": 0.8, "contact.mu_k": 0.7, "contact.friction.alpha": 2.0}
 
 
@@ -15,7 +17,7 @@ def coordinates(*others: dict[str, float], **unknowns: dict[str, Any]) -> Coordi
     """Of a recording `one` and more of them, `two` and so on, with other values."""
     tables = {name.replace("__", "."): Unknown(**table) for name, table in unknowns.items()}
     recordings: list[Any] = [
-        SimpleNamespace(name=name, parameters=GIVEN | own, start_coordinates=())
+        SimpleNamespace(name=name, rig=RIG, parameters=GIVEN | own, start_coordinates=())
         for name, own in zip(("one", "two", "three"), ({}, *others))
     ]
     return Coordinates(tables, {}, recordings)

@@ -63,10 +63,13 @@ def quantity(hint: Any) -> Quantity | None:
 
 @cache
 def quantities(part: type) -> Mapping[str, Quantity]:
-    """Quantities of the arguments of a part's constructor, by name."""
-    arguments = inspect.signature(part.__init__).parameters
-    found = {name: quantity(argument.annotation) for name, argument in arguments.items()}
-    return MappingProxyType({name: one for name, one in found.items() if one is not None})
+    """Quantities of the arguments of a part's constructor, and of those of its base classes, by name."""
+    found: dict[str, Quantity] = {}
+    for owner in reversed(part.__mro__):
+        arguments = inspect.signature(owner.__init__).parameters if "__init__" in vars(owner) else {}
+        declared = {name: quantity(argument.annotation) for name, argument in arguments.items()}
+        found |= {name: one for name, one in declared.items() if one is not None}
+    return MappingProxyType(found)
 
 
 def quantity_of(part: object, name: str) -> Quantity | None:
@@ -106,7 +109,9 @@ Dashpot = Annotated[float, Quantity("N.s/m", 0.0, 1e9)]
 
 FrictionCoefficient = Annotated[float, Quantity("1", 0.0, 100.0)]
 
-Gain = Annotated[float, Quantity("N/m, N, N.m/rad", 0.0, 1e12)]
+ProportionalGain = Annotated[float, Quantity("N/m, N, N.m/rad", 0.0, 1e12, "proportional gain")]
+
+DerivativeGain = Annotated[float, Quantity("N.s/m, N.s, N.m.s/rad", 0.0, 1e12, "derivative gain")]
 
 Gravity = Annotated[float, Quantity("m/s2", 0.0, 1e3, "gravitational acceleration, downwards")]
 

@@ -12,23 +12,24 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import ConfigDict, Field, TypeAdapter, model_validator
 
-from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact
+from torchsoft.physics.contact import Coulomb, SlipLaw, SmoothSlip, SoftContact
 from torchsoft.physics.material import KelvinVoigt
 from torchsoft.physics.mesh import PadMesh
 from torchsoft.physics.mesh.mesh import MEMORY
 from torchsoft.physics.parts import PD, Body
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.shapes import Circle
+from torchsoft.physics.validity import sound
 from torchsoft.quantity import quantities
 from torchsoft.tables import Table, from_toml, line, refusing
 
 Source = Literal["published", "assumed"]
 
 
-def of(part: type, name: str, default: float, source: Source, note: str = "") -> Any:
+def of(part: type, name: str, default: float, source: Source, note: str = "", unit: str = "") -> Any:
     """A number of the paper's rig: an argument of a part's constructor, with its default and source; `note` says more."""
     declared = quantities(part)[name]
-    return number(default, declared.unit, source, note or declared.meaning, declared.low, declared.high)
+    return number(default, unit or declared.unit, source, note or declared.meaning, declared.low, declared.high)
 
 
 def number(default: float, unit: str, source: Source, meaning: str, low: float, high: float) -> Any:
@@ -92,20 +93,25 @@ class ContactParameters(Table):
         0, "1", "assumed", "contact points an element; 0 puts one on every node, as the paper does", 0, 8
     )
 
-    @property
-    def law(self) -> SoftContact:
-        """The law of a contact point."""
+    def law(self, friction: SlipLaw | None = None) -> SoftContact:
+        """Law of a contact point; `friction` replaces the one of the settings."""
         smooth = self.friction == "smooth"
         slip = SmoothSlip(self.mu_s, self.mu_k, self.v_s, self.eta) if smooth else Coulomb(self.mu_s, self.mu_k)
         return SoftContact(
-            self.K_n, self.R_n, self.K_t, self.R_t, friction=slip, epsilon=self.epsilon, node_spacing=self.node_spacing
+            self.K_n,
+            self.R_n,
+            self.K_t,
+            self.R_t,
+            friction=friction or slip,
+            epsilon=self.epsilon,
+            node_spacing=self.node_spacing,
         )
 
     @model_validator(mode="after")
     def _laws_are_well_posed(self) -> Self:
-        law = self.law
-        if wrong := law.friction.well_posed() or law.well_posed():
-            raise ValueError(wrong)
+        law = self.law()
+        for part in (law.friction, law):
+            sound(part)
         return self
 
 
@@ -120,10 +126,10 @@ class BracketParameters(Table):
 
 
 class ControlParameters(Table):
-    K_81: float = of(PD, "Kp", 1.2e5, "published", "horizontal loop, proportional gain, Eq. 34")
-    R_80: float = of(PD, "Kd", 441.7149, "published", "horizontal loop, derivative gain, Eq. 34")
-    K_98: float = of(PD, "Kp", 1.2e5, "published", "vertical loop, proportional gain, Eq. 32")
-    R_99: float = of(PD, "Kd", 441.7149, "published", "vertical loop, derivative gain, Eq. 32")
+    K_81: float = of(PD, "Kp", 1.2e5, "published", "horizontal loop, proportional gain, Eq. 34", "N/m")
+    R_80: float = of(PD, "Kd", 441.7149, "published", "horizontal loop, derivative gain, Eq. 34", "N.s/m")
+    K_98: float = of(PD, "Kp", 1.2e5, "published", "vertical loop, proportional gain, Eq. 32", "N/m")
+    R_99: float = of(PD, "Kd", 441.7149, "published", "vertical loop, derivative gain, Eq. 32", "N.s/m")
     senses: Literal["disc", "bracket"] = choice(
         "disc", "published", "whose x the horizontal loop measures; the bracket's makes the loop collocated"
     )

@@ -55,8 +55,7 @@ class SoftGrasp(Rig):
         p = settings or Parameters()
         c, k = p.contact, p.control
         rubber = material or KelvinVoigt(p.pad.E, p.pad.nu, p.pad.rho, p.pad.tau, p.pad.depth)
-        law = c.law
-        law.friction = friction or law.friction
+        law = c.law(friction)
         disc = Body(p.disc.mass, shape or Circle(p.disc.radius))
         bracket = Body(p.bracket.mass, theta=0.0, weighted=False)
         control = nn.ModuleDict({"x": PD(k.K_81, k.R_80), "y": PD(k.K_98, k.R_99)})

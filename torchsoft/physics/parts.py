@@ -1,7 +1,7 @@
 """The parts of a rig beside its pads: rigid bodies, contacts, and actuators with their control laws."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, Literal, Self
+from typing import Any, Literal, Self
 
 import torch
 from torch import Tensor, nn
@@ -10,7 +10,7 @@ from torchsoft.physics.arguments import positive
 from torchsoft.physics.contact import SoftContact
 from torchsoft.physics.shapes import Shape, parameter
 from torchsoft.physics.state import State
-from torchsoft.quantity import Gain, Inertia, Mass
+from torchsoft.quantity import DerivativeGain, Inertia, Mass, ProportionalGain
 
 COORDINATES = ("x", "y", "theta")
 """The coordinates of a body [m, m, rad]."""
@@ -84,7 +84,7 @@ def law_name(law: Callable[..., Tensor]) -> str:
 class PD(nn.Module):
     """A proportional-derivative law: F = Kp (w - q) + Kd (w' - q') + feed-forward (Eq. 31-34)."""
 
-    def __init__(self, Kp: Annotated[Gain, "proportional gain"], Kd: Annotated[Gain, "derivative gain"]) -> None:
+    def __init__(self, Kp: ProportionalGain, Kd: DerivativeGain) -> None:
         super().__init__()
         self.Kp, self.Kd = parameter(Kp), parameter(Kd)
 
@@ -149,6 +149,12 @@ class Actuator(nn.Module):
         """The set-point of a loop. Raises `ValueError` where there are none or several."""
         (name,) = self.setpoints
         return name
+
+    def gain_unit(self, rate: bool) -> str:
+        """Unit of the effort per measured coordinate, or per its rate."""
+        effort, coordinate = ("N.m" if self.pushes.endswith(".theta") else "N"), self.measured.endswith(".theta")
+        per = "/rad" if coordinate else "/m"
+        return f"{effort}{'.s' if rate else ''}{per}"
 
     @property
     def inputs(self) -> int:

@@ -5,6 +5,7 @@ and integrates what is left over at its 1-junctions.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
@@ -15,7 +16,7 @@ from torchsoft.physics.contact import Frame, cross, interface_law, moving_frame,
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import Block, Junction, Port, Transformer, identity, net_efforts
 from torchsoft.physics.pads import Pad
-from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, law_name
+from torchsoft.physics.parts import COORDINATES, PD, Actuator, Body, Contact, law_name
 from torchsoft.physics.shapes import parameter
 from torchsoft.physics.state import Layout, State
 from torchsoft.quantity import Gravity, Quantity, quantity_of
@@ -169,13 +170,16 @@ class Rig(nn.Module):
     def quantity(self, name: str) -> Quantity | None:
         """Unit, bounds and meaning of a parameter by its name, where its part declares them."""
         owner, _, last = self.aliases.get(name, name).rpartition(".")
-        return quantity_of(self.get_submodule(owner), last)
+        part = self.get_submodule(owner)
+        found = quantity_of(part, last)
+        loop = next((one for one in self.actuators.values() if one.law is part), None)
+        return found and (replace(found, unit=loop.gain_unit(last == "Kd")) if isinstance(part, PD) and loop else found)
 
     @property
     def ordered(self) -> dict[str, str]:
         """Parameters that must not exceed another one, with the name of that one."""
         names = {own: name for name, own in self.aliases.items()}
-        pairs = [[f"{k}.{one}" for one in m.ordered] for k, m in self.named_modules() if hasattr(m, "ordered") and k]
+        pairs = [[f"{k}.{one}" for one in m.ordered] for k, m in self.named_modules() if k and hasattr(m, "ordered")]
         return {names.get(lower, lower): names.get(upper, upper) for lower, upper in pairs}
 
     def weight(self, name: str) -> Tensor:

@@ -4,7 +4,7 @@ that names what is wrong.
 """
 
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -13,6 +13,8 @@ from torch._C._functorch import is_functorch_wrapped_tensor  # private, and the 
 from torchsoft.physics.material import Material
 from torchsoft.physics.shapes import Shape
 from torchsoft.quantity import quantities, quantity_of
+
+P = TypeVar("P")
 
 LARGEST = 1e100
 """Largest magnitude of a parameter, in SI units: squares and products of a few stay finite numbers."""
@@ -28,6 +30,14 @@ ALIKE = 1e-3
 
 EFFORTS, NORMALS = (1e-3, 0.1, 1.0, 10.0, 100.0), (0.0, 0.1, 1.0, 10.0)
 """Trial efforts and normal forces [N] at which a slip law is tried."""
+
+
+def sound(part: P) -> P:
+    """A part whose parameters are physical together. Raises `ValueError` where they are not."""
+    well_posed = getattr(part, "well_posed", None)
+    if well_posed is not None and (wrong := well_posed()):
+        raise ValueError(wrong)
+    return part
 
 
 def check_array(name: str, x: Any) -> None:

@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 
 from torchsoft.physics.controllers import StateFeedback, controller
 from torchsoft.physics.parts import PD, Actuator, ReversedPD
-from torchsoft.quantity import Gain, Quantity
+from torchsoft.quantity import DerivativeGain, ProportionalGain, Quantity
 from torchsoft.rigs.fields import Group, at_field
 from torchsoft.rigs.network import LOOP, FedNetwork, NetworkPD, read_network
 from torchsoft.tables import LISTED
@@ -41,10 +41,8 @@ class ActuatorTable(Group):
     feed_forward: str | None = Field(
         default=None, description="name of the motion that is added as an effort [N or N.m]"
     )
-    Kp: Gain = Field(default=0.0, description="proportional gain")
-    Kd: Annotated[float, Quantity("N.s/m, N.s, N.m.s/rad", 0.0, 1e12)] = Field(
-        default=0.0, description="derivative gain"
-    )
+    Kp: ProportionalGain = Field(default=0.0, description="proportional gain")
+    Kd: DerivativeGain = Field(default=0.0, description="derivative gain")
     reversed: bool = Field(
         default=False, description="the gains push the other way, for a q that falls where the pushed coordinate rises"
     )

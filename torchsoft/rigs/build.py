@@ -15,8 +15,9 @@ from torchsoft.physics.motion import Piecewise, Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import NoEquilibrium, resting, standing
+from torchsoft.physics.validity import sound
 from torchsoft.rigs.bodies import REST
-from torchsoft.rigs.fields import at_field, sound
+from torchsoft.rigs.fields import at_field
 from torchsoft.rigs.geometry import points, reach, surface
 from torchsoft.rigs.motion import Asked, flattened
 from torchsoft.rigs.schema import RigTables

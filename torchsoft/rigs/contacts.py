@@ -1,14 +1,17 @@
 """Contacts of a rig file: laws by name, and which pad touches which body by which law."""
 
+from typing import TYPE_CHECKING
+
 from pydantic import Field
 
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact
 from torchsoft.physics.parts import Contact
 from torchsoft.rigs.fields import Group, PartTable, one_of, table_of
 
-FrictionTable = one_of(table_of(SmoothSlip, "smooth"), table_of(Coulomb, "coulomb"))
-
-LawTable: type[PartTable] = table_of(SoftContact, friction=FrictionTable)
+if TYPE_CHECKING:
+    LawTable = PartTable
+else:
+    LawTable = table_of(SoftContact, friction=one_of(table_of(SmoothSlip, "smooth"), table_of(Coulomb, "coulomb")))
 
 
 class ContactTable(Group):

@@ -9,16 +9,14 @@ from functools import lru_cache, reduce
 from inspect import signature
 from operator import or_
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args, get_origin
 
 from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler, create_model, model_validator
 from pydantic_core import CoreSchema, core_schema
-from torch import nn
 
+from torchsoft.physics.validity import sound
 from torchsoft.quantity import metadata, quantity
 from torchsoft.tables import LISTED, Table, shown
-
-M = TypeVar("M", bound=nn.Module)
 
 
 class Refused(ValueError):
@@ -40,14 +38,6 @@ def at_field(field: str) -> Iterator[None]:
         raise Refused(field, f"{error.filename}: {error.strerror}" if error.filename else str(error)) from None
     except (ValueError, NotImplementedError) as error:
         raise Refused(field, str(error)) from None
-
-
-def sound(part: M) -> M:
-    """A part whose parameters are physical together. Raises `ValueError` where they are not."""
-    well_posed = getattr(part, "well_posed", None)
-    if well_posed is not None and (wrong := well_posed()):
-        raise ValueError(wrong)
-    return part
 
 
 class NumberOr:
@@ -147,7 +137,7 @@ def listed(hint: Any) -> Any:
             if inner is float
             else listed(tuple[(Annotated[float, entry],) * len(get_args(inner))])
         )
-        return Annotated[tuple[one, ...], LISTED, Field(min_length=1, max_length=100_000), entry.unit]
+        return Annotated[tuple[one, ...], LISTED, Field(min_length=1, max_length=100_000), entry and entry.unit]
     return Annotated[hint, LISTED] if get_origin(bare) is tuple else hint
 
 
