@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 OUT    ?= out/grasp_and_roll
 
-.PHONY: run test test-slow test-hostile lint clean
+.PHONY: run test test-slow test-hostile test-newest lint clean
 
 run: $(STAMP)
 	$(BIN)/python experiments/grasp_and_roll.py --out $(OUT)
@@ -15,6 +15,11 @@ test: $(STAMP)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow --ignore tests/hostile
+
+# the newest Python that has wheels of everything; a plain install of torch brings some GB of CUDA
+NEWEST ?= python3.13
+test-newest:
+	$(NEWEST) tests/newest.py $(NEWEST)
 
 test-hostile: $(STAMP)
 	rm -rf out/hostile

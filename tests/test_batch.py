@@ -24,7 +24,7 @@ from torchsoft.threads import side_by_side
 
 T = times(0.2, 9)
 K_n = f64(2e4, 3e4, 4.5e4)
-mu_s = f64(0.5, 0.7, 0.6)
+mu_s = f64(0.75, 0.95, 0.85)
 
 
 @pytest.fixture

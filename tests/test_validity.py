@@ -1,6 +1,7 @@
 """What a rig must be before it runs: numbers, tensors, shapes and slip laws, each refused by its name."""
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from torchsoft import (
     KelvinVoigt,
     Shape,
     SmoothSlip,
+    SoftContact,
     SoftGrasp,
     StandardLinearSolid,
     rest,
@@ -83,6 +85,41 @@ def test_a_slip_law_that_supplies_power_is_told_of() -> None:
     model = SoftGrasp(coarse().settings, friction=lambda E, F_N, R: 1.5 * E / R)
     with pytest.warns(UserWarning, match="the slip law of `L` gives"):
         simulate(model, T, y0=grasped(model))
+
+
+def rated(change: Callable[..., Tensor]) -> Callable[..., Tensor]:
+    """A slip law like Coulomb's, with another normal force."""
+    return lambda E, F_N, R: (E - 0.5 * change(F_N)).clamp(min=0.0) / (R + 10.0)
+
+
+@pytest.mark.parametrize(
+    ("law", "match"),
+    [
+        (
+            rated(lambda N: N.mean().expand_as(N)),
+            r"aten\.mean\.default, which couples contact points at .*test_validity",
+        ),
+        (rated(lambda N: N.sum() + 0 * N), r"aten\.sum\.default, which couples contact points at .*test_validity"),
+        (rated(lambda N: N.reshape(-1).cumsum(0).reshape(N.shape)), r"cumsum"),
+        (rated(lambda N: N.reshape(-1).flip(0).reshape(N.shape)), r"aten\.flip\.default, which couples contact points"),
+        (rated(lambda N: N.reshape(-1)[0] + 0 * N), "couples contact points at .*test_validity"),
+        (rated(lambda N: N / N.numel()), "several points at once other rates .*numel"),
+        (rated(lambda N: (-1 - N).sqrt()), "the slip law of `L` gives nan at an effort of 0.001 N"),
+        (torch.nn.Dropout(), r"the slip law of `L` must take three tensors .*TypeError"),
+        (lambda E, F_N, R: None, "the slip law of `L` must give a tensor of shape .*, but gives NoneType"),
+    ],
+    ids=["mean", "sum", "cumsum", "flip", "first", "numel", "nan", "dropout", "none"],
+)
+def test_slip_laws_that_are_none_of_one_point_are_refused(law: Any, match: str) -> None:
+    model = SoftGrasp(coarse().settings, friction=law)
+    y0 = torch.zeros(model.layout.size, dtype=torch.float64)
+    with pytest.raises((ValueError, TypeError), match=match):
+        simulate(model, T, y0=y0)
+
+
+def test_no_law_is_refused() -> None:
+    with pytest.raises(ValueError, match="`friction` must be a function or a module"):
+        SoftContact(1e5, 1.0, 1e5, 1.0, friction=None)  # pyright: ignore[reportArgumentType]
 
 
 @pytest.mark.parametrize(

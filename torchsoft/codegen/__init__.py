@@ -14,7 +14,7 @@ from torch import Tensor
 from torchsoft.codegen import emit
 from torchsoft.codegen.derivatives import adjoints, dependent, jacobian
 from torchsoft.codegen.graph import Graph
-from torchsoft.codegen.trace import UnknownOperation, traced
+from torchsoft.codegen.trace import UnknownOperation, check_backward, traced
 
 __all__ = ["Law", "UnknownOperation", "compile_law"]
 
@@ -59,6 +59,7 @@ def compile_law(
     ValueError for arguments or results of another kind.
     """
     _check(x, parameters)
+    check_backward(function, x, parameters)
     graph = Graph()
     outputs = traced(graph, function, x, parameters)
     elsewhere = {name: 0.9 * tensor.detach() + 0.01 for name, tensor in parameters.items()}

@@ -1,9 +1,11 @@
 """One run of a torch function, recorded as scalar expressions."""
 
+import inspect
 import linecache
 import os
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -27,7 +29,6 @@ except ImportError as error:
 _SKIPPED = tuple(os.path.dirname(str(file)) + os.sep for file in (torch.__file__, __file__))
 _BRANCH = "use torch.where in place of a Python branch, and torch.stack in place of torch.tensor"
 _PYTHON_READS = {torch.tensor, torch.as_tensor, Tensor.tolist, Tensor.numpy, Tensor.__array__}
-_APPLY = torch.autograd.Function.apply.__func__.__code__
 _BITWISE = {"bitwise_and", "bitwise_or", "bitwise_xor", "bitwise_not"}  # no rule for whole numbers
 
 
@@ -42,16 +43,6 @@ def _place() -> str:
         frame = frame.f_back
     file, line = frame.f_code.co_filename, frame.f_lineno
     return f"{file}:{line}, `{linecache.getline(file, line, frame.f_globals).strip()}`"
-
-
-def _applied() -> str:
-    """The name of the torch.autograd.Function that the law applies; empty if it applies none."""
-    frame = sys._getframe(1)
-    while frame is not None and frame.f_code is not traced.__code__:
-        if frame.f_code is _APPLY:
-            return frame.f_locals["cls"].__name__
-        frame = frame.f_back
-    return ""
 
 
 class _Reads(TorchFunctionMode):
@@ -116,11 +107,6 @@ class Trace(TorchDispatchMode):
                 )
         if not self.holds((args, kwargs)) or name in CONSTANT:
             return func(*args, **kwargs)
-        if own := _applied():
-            raise self.refused(
-                f"the torch.autograd.Function {own}",
-                "its own backward cannot be compiled, so write it with torch's operations",
-            )
         if name in READS:
             raise self.refused(f"reading a value into Python ({func})", _BRANCH)
         if func._schema.is_mutable and name not in MOVES:
@@ -187,15 +173,18 @@ def traced(
     function: Callable[[Tensor, dict[str, Tensor]], Tensor],
     x: Tensor,
     parameters: Mapping[str, Tensor],
+    first: int = 0,
+    kind: type[Trace] = Trace,
 ) -> list[int]:
     """The nodes of function(x, parameters), an (outputs,) float64 tensor, from one run at these values.
 
-    Raises UnknownOperation for what cannot be recorded, and TypeError for a result of another kind.
+    Entry i of x is the leaf `first` + i. Raises UnknownOperation for what cannot be recorded, and TypeError for a result of
+    another kind.
     """
-    trace = Trace(graph)
+    trace = kind(graph)
     x = x.detach().clone()
     copies = {name: tensor.detach().clone() for name, tensor in parameters.items()}
-    trace.register(x, mapped(partial(graph.leaf, "x"), np.arange(x.numel())))
+    trace.register(x, mapped(partial(graph.leaf, "x"), first + np.arange(x.numel())))
     start = 0
     for tensor in copies.values():
         index = np.arange(start, start + tensor.numel()).reshape(tuple(tensor.shape))
@@ -211,6 +200,45 @@ def traced(
     if trace.refusal is not None:
         raise trace.refusal
     if not isinstance(out, Tensor) or out.ndim != 1 or out.dtype != torch.float64:
-        kind = f"{out.dtype} of shape {tuple(out.shape)}" if isinstance(out, Tensor) else type(out).__name__
-        raise TypeError(f"a law must return a 1-D float64 tensor, not {kind}")
+        given = f"{out.dtype} of shape {tuple(out.shape)}" if isinstance(out, Tensor) else type(out).__name__
+        raise TypeError(f"a law must return a 1-D float64 tensor, not {given}")
     return trace.nodes(out).tolist()
+
+
+def check_backward(
+    function: Callable[[Tensor, dict[str, Tensor]], Tensor], x: Tensor, parameters: Mapping[str, Tensor]
+) -> None:
+    """Raises UnknownOperation for a law that applies a torch.autograd.Function of its own: a node of the graph of its result
+    that Python made. A law that fails otherwise is left to `traced`."""
+    given = {name: tensor.detach().clone().requires_grad_() for name, tensor in parameters.items()}
+    try:
+        with torch.enable_grad():
+            out = function(x.detach().clone().requires_grad_(), given)
+    except Exception:
+        return
+    found, seen = [one.grad_fn for one in tree_leaves(out) if isinstance(one, Tensor)], set()
+    while found:
+        node = found.pop()
+        if node is None or node in seen:
+            continue
+        seen.add(node)
+        if isinstance(node, torch.autograd.function.FunctionCtx):
+            name = node.name().removesuffix("Backward")
+            raise UnknownOperation(
+                f"The law cannot be compiled because of the torch.autograd.Function {name} at {_defined(name)}; its own "
+                "backward cannot be compiled, so write it with torch's operations."
+            )
+        found += [following for following, _ in node.next_functions]
+
+
+def _defined(name: str) -> str:
+    """Line of the definition of a torch.autograd.Function, as far as it can be found."""
+    kinds: list[type] = [torch.autograd.Function]
+    for kind in kinds:
+        kinds += kind.__subclasses__()
+    for kind in reversed(kinds):
+        with suppress(OSError, TypeError):
+            if kind.__name__ == name:
+                lines, line = inspect.getsourcelines(kind)
+                return f"{inspect.getsourcefile(kind)}:{line}, `{lines[0].strip()}`"
+    return "a place that cannot be found"

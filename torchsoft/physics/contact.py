@@ -168,6 +168,10 @@ class SoftContact(nn.Module):
         super().__init__()
         self.K_n, self.R_n, self.K_t, self.R_t = (parameter(value) for value in (K_n, R_n, K_t, R_t))
         self.epsilon = parameter(epsilon, trained=False)
+        if not callable(friction):
+            raise ValueError(
+                f"`friction` must be a function or a module of (effort, normal force, dashpot), but is {friction!r}"
+            )
         self.node_spacing, self.friction = positive("node_spacing", node_spacing), friction
         self.sliding: Sliding = ramped
 

@@ -28,6 +28,9 @@ DEPTHS = (1e-3, -1e-3)
 ALIKE = 1e-3
 """By how much a shape's normal, the slope of its distance, and its reach (over its size) may differ from what they must be."""
 
+ALIKE_POINTS = 1e-9
+"""By how much slip rates of several points at once may differ from those of each alone, relatively: rounding."""
+
 EFFORTS, NORMALS = (1e-3, 0.1, 1.0, 10.0, 100.0), (0.0, 0.1, 1.0, 10.0)
 """Trial efforts and normal forces [N] at which a slip law is tried."""
 
@@ -193,16 +196,48 @@ def check_shape(where: str, shape: Shape) -> None:
 def check_slip(where: str, law: Any, R: float) -> str:
     """What is wrong with a slip law at some efforts and normal forces, with the dashpot R [N.s/m]; empty if nothing is.
 
-    A slip that takes more than the effort, R gamma' > E, supplies power.
+    A slip that takes more than the effort, R gamma' > E, supplies power. Raises `ValueError` for what is no law of three
+    tensors, gives no number, or gives several points at once other rates than each alone.
     """
-    for E in EFFORTS:
-        for F_N in NORMALS:
-            numbers = (torch.tensor(x, dtype=torch.float64) for x in (E, F_N, R))
-            with torch.no_grad():
-                rate = float(law(*numbers))
-            if R * rate < 0 or R * rate > E * (1 + 1e-9):  # a run that meets what is not a number ends by itself
-                return (
-                    f"the slip law of `{where}` gives {rate:.3g} m/s at an effort of {E:g} N and a normal force of {F_N:g} N: "
-                    f"times the dashpot, {R:.3g} N.s/m, that must be from 0 to the effort, or slip supplies power"
-                )
-    return ""
+    E, F_N = (
+        x.flatten() for x in torch.meshgrid(*(torch.tensor(x).double() for x in (EFFORTS, NORMALS)), indexing="ij")
+    )
+    together, alone = (
+        slip_rates(where, law, E, F_N, R),
+        torch.stack([slip_rates(where, law, e, f, R) for e, f in zip(E, F_N)]),
+    )
+    if bool(alone.isnan().any()):
+        k = int(alone.isnan().int().argmax())
+        raise ValueError(
+            f"the slip law of `{where}` gives nan at an effort of {E[k]:g} N, a normal force of {F_N[k]:g} N and a dashpot of "
+            f"{R:.3g} N.s/m; make it finite there"
+        )
+    if not torch.allclose(together, alone, rtol=ALIKE_POINTS, atol=0.0):
+        raise ValueError(
+            f"the slip law of `{where}` gives several points at once other rates than each of them alone; a law is of one "
+            "point, so it must not use the number of points (numel, shape, len) or mix them"
+        )
+    wrong = torch.nonzero((R * alone < 0) | (R * alone > E * (1 + 1e-9)))[:, 0]
+    if not len(wrong):
+        return ""
+    k = int(wrong[0])
+    return (
+        f"the slip law of `{where}` gives {alone[k]:.3g} m/s at an effort of {E[k]:g} N and a normal force of {F_N[k]:g} N: "
+        f"times the dashpot, {R:.3g} N.s/m, that must be from 0 to the effort, or slip supplies power"
+    )
+
+
+@torch.no_grad()
+def slip_rates(where: str, law: Any, E: Tensor, F_N: Tensor, R: float) -> Tensor:
+    """Slip rates [m/s] of efforts and normal forces (...). Raises `ValueError` for a law that gives no such tensor."""
+    try:
+        rate = law(E, F_N, torch.tensor(R, dtype=torch.float64))
+    except Exception as error:  # whatever somebody's own code raises
+        raise ValueError(
+            f"the slip law of `{where}` must take three tensors (effort, normal force, dashpot) and give the slip rate, but "
+            f"{type(error).__name__}: {error}"
+        ) from error
+    if not isinstance(rate, Tensor) or rate.shape != E.shape:
+        given = f"shape {tuple(rate.shape)}" if isinstance(rate, Tensor) else type(rate).__name__
+        raise ValueError(f"the slip law of `{where}` must give a tensor of shape {tuple(E.shape)}, but gives {given}")
+    return rate

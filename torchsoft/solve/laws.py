@@ -13,7 +13,8 @@ from torch import Tensor, nn
 
 from torchsoft.codegen import Law, UnknownOperation, compile_law
 from torchsoft.codegen.graph import Graph
-from torchsoft.codegen.trace import traced
+from torchsoft.codegen.pointwise import check_pointwise
+from torchsoft.codegen.trace import check_backward, traced
 from torchsoft.physics.contact import distance_law, free_law, interface_law
 from torchsoft.physics.parts import Actuator
 from torchsoft.solve.kernel.arrays import INPUTS
@@ -87,10 +88,12 @@ def compiled_law(
     size: int,
     linear: int,
     differentiated: int,
+    points: bool = False,
     **modules: Any,
 ) -> Law:
     """The law of a function of modules and x (size,), differentiable in the first inputs and in the parameters `names`,
-    of which it may not use all. Raises `UnknownOperation` naming the line of a law that cannot be compiled."""
+    of which it may not use all; `points` says that it is the law of a contact point, whatever the others do. Raises
+    `UnknownOperation` naming the line of a law that cannot be compiled."""
     decided = tuple((name, structure(module)) for name, module in modules.items())
     shapes = tuple((name, tuple(value.shape)) for name, value in names.items())
     with _compiling:
@@ -112,12 +115,15 @@ def compiled_law(
             return tuple(graph.ops), repr(graph.args), tuple(outputs), shapes, linear, differentiated
 
         if not known:  # what somebody's own code does is known from running it only, and may change any time
+            check_backward(law, example, names)
             key = expressions()
         if key not in _laws:
             if not known and expressions() != key:
                 raise UnknownOperation(
                     "The law is another one when it is called again, so it keeps something of a call."
                 )
+            if points:
+                check_pointwise(law, example, names)
             _laws[key] = compile_law(law, example, names, linear=linear, differentiated=differentiated)
         return _laws[key]
 
@@ -151,7 +157,7 @@ def contact_laws(law: Any, shape: Any) -> LawSet:
     parameters: dict[str, Tensor] = dict(_Called(interface_law, law=law, shape=shape).named_parameters())
     return LawSet(
         compiled_law(parameters, distance_law, INPUTS, 0, 0, shape=shape),
-        compiled_law(parameters, interface_law, INPUTS, 3, 7, law=law, shape=shape),
+        compiled_law(parameters, interface_law, INPUTS, 3, 7, points=True, law=law, shape=shape),
         compiled_law(parameters, free_law, 3, 1, 1, law=law),
         parameters,
     )

@@ -18,7 +18,7 @@ from torchsoft.physics.mesh import banded
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.validity import check_array, check_groups, check_shape, check_slip, check_values
+from torchsoft.physics.validity import check_array, check_groups, check_shape, check_slip, check_values, slip_rates
 from torchsoft.solve.kernel.arrays import Actuators, Bodies, Contacts, Index, Inertia, Pads, Points, system
 from torchsoft.solve.kernel.step import GAMMA
 from torchsoft.solve.laws import LawSet, actuator_law, contact_laws, structure
@@ -237,9 +237,12 @@ class Compiled:
             key = id(contact.law), id(shape)
             if key not in self._known:
                 check_shape(contact.body, shape)
-                self._known[key] = contact_laws(contact.law, shape.prepared())
+                own, slip = structure(contact.law) is None, contact.law.friction
                 stiffness = contact.law.R_t.item() + NOMINAL * contact.law.K_t.item()
-                if structure(contact.law) is None and (wrong := check_slip(name, contact.law.friction, stiffness)):
+                if own:
+                    slip_rates(name, slip, torch.ones(()).double(), torch.ones(()).double(), stiffness)
+                self._known[key] = contact_laws(contact.law, shape.prepared())
+                if own and (wrong := check_slip(name, slip, stiffness)):
                     warnings.warn(wrong, stacklevel=2)
             laws = self._known[key]
             starts.append(self._add_all(laws.parameters))

@@ -1,0 +1,75 @@
+"""The wheel with the newest versions of everything: built, installed without constraints into a fresh environment outside the
+checkout, and used from an empty folder. `python tests/newest.py PYTHON`; prints versions and times."""
+
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = (
+    "torch",
+    "torchdiffeq",
+    "numpy",
+    "scipy",
+    "numba",
+    "xarray",
+    "h5py",
+    "pydantic",
+    "zarr",
+    "pysindy",
+    "matplotlib",
+)
+GRADIENT = """
+import torch
+from torchsoft import Circle, SoftGrasp, rest, simulate
+model = SoftGrasp()
+t = torch.linspace(0, 0.05, 6, dtype=torch.float64)
+run = simulate(model, t, y0=rest(model).detach(), gradient="discrete")
+run["y_C"][-1].backward()
+assert torch.isfinite(model.pad.E.grad) and model.pad.E.grad != 0
+class Straight(torch.autograd.Function):
+    forward = staticmethod(lambda ctx, x: x.clamp(max=0.5))
+    backward = staticmethod(lambda ctx, g: g)
+try:
+    simulate(SoftGrasp(friction=lambda E, F_N, R: Straight.apply(E) / (R + 10.0)), t, y0=rest(model).detach())
+except TypeError as error:
+    assert "the torch.autograd.Function" in str(error), error
+else:
+    raise SystemExit("a law with a backward of its own was not refused")
+"""
+
+
+def main(python: str) -> None:
+    """Raises `CalledProcessError` for the first step that fails."""
+    begin = time.monotonic()
+
+    def run(*command: object, where: Path) -> None:
+        start = time.monotonic()
+        subprocess.run([str(one) for one in command], cwd=where, check=True)
+        print(f"[{time.monotonic() - start:6.1f} s] {' '.join(map(str, command))[:100]}", flush=True)
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        source, work = folder / "source", folder / "empty"
+        work.mkdir()
+        shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(".venv", ".git", "out", "__pycache__", "build"))
+        run(python, "-m", "venv", folder / "venv", where=folder)
+        bin = folder / "venv" / "bin"
+        run(bin / "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", folder, source, where=folder)
+        run(bin / "pip", "install", "--quiet", next(folder.glob("*.whl")), where=folder)
+        run(bin / "python", "-c", f"from importlib.metadata import version as v; print({{p: v(p) for p in {PACKAGES}}})",
+            where=work)  # fmt: skip
+        shutil.copytree(ROOT / "examples" / "identify", work / "identify")
+        run(bin / "torchsoft", "init", "mine", where=work)
+        run(bin / "torchsoft", "check", "mine.toml", where=work)
+        run(bin / "torchsoft", "run", "mine.toml", "--out", "out", where=work)
+        run(bin / "torchsoft", "identify", "identify/rolling.csv", "identify/rolling.toml", "--out", "fit", where=work)
+        run(bin / "python", "-c", GRADIENT, where=work)
+    print(f"all of it in {time.monotonic() - begin:.0f} s")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
