@@ -9,6 +9,7 @@ from conftest import coarse, f64, random_state, turning
 from torchsoft import Rig, simulate
 from torchsoft.physics.energy import dissipated, stored, supplied
 from torchsoft.physics.multibond import net_efforts
+from torchsoft.rigs import RigFile
 from torchsoft.scenario import grasp_and_roll
 
 SEEDS = range(4)
@@ -117,3 +118,13 @@ def test_a_run_balances_its_energies_better_with_smaller_steps() -> None:
     assert residual[0] < 1e-3
     assert residual[2] < residual[1] < residual[0]
     assert residual[2] < 0.5 * residual[0]  # nodes touch and leave all along, so not second order
+
+
+def test_the_energy_residual_of_a_fall_falls_with_the_tolerance() -> None:
+    """An ellipse in free flight and on a pad, with long steps between outputs."""
+    ready = RigFile.from_toml("rigs/drop.toml").override(outputs={"duration": 0.2, "snapshots": []}).build()
+    runs = [simulate(ready.rig, ready.t, y0=ready.y0, rtol=rtol) for rtol in (1e-4, 1e-6)]
+    assert runs[0].energy_residual_rel < 2e-4
+    assert runs[1].energy_residual_rel < 0.2 * runs[0].energy_residual_rel
+    flight = [float(run.energy_residual[run.t < 0.02].abs().max()) for run in runs]
+    assert max(flight) < 1e-9 * float(runs[0].injected[-1])

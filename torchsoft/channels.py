@@ -78,14 +78,6 @@ UNITS = {
 """Units by dimension, and what they are in SI."""
 
 
-def unit(channel: str) -> str:
-    """SI unit of a channel: of the paper's from the table, of another rig's from how its key begins."""
-    if channel in CHANNELS:
-        return CHANNELS[channel].unit
-    prefixes = {"v_": "m/s", "omega_": "rad/s", "theta_": "rad", "x_": "m", "y_": "m", "F_": "N"}
-    return next((u for prefix, u in prefixes.items() if channel.startswith(prefix)), "")
-
-
 MEASURED = ("x_C", "y_C", "theta", "x_Br", "y_Br", "v_x", "v_y", "omega", "v_x_Br", "v_y_Br", "F_x", "F_y")
 """Channels that a sensor can measure: poses, their rates in the same order, and the controllers' forces."""
 

@@ -45,8 +45,10 @@ class Watch(Trace):
         if not isinstance(result, Tensor) or not self.holds(result):
             return result
         after = self._owners(self.nodes(result))
-        moved = isinstance(given, Tensor) and given.shape == result.shape and self.holds(given)
-        if (after == MIXED).any() or (moved and _swapped(self._owners(self.nodes(given)), after)):
+        before = after
+        if isinstance(given, Tensor) and given.shape == result.shape and self.holds(given):
+            before = self._owners(self.nodes(given))
+        if (after == MIXED).any() or _swapped(before, after):
             raise self.refused(f"the operation {func}, which couples contact points", REMEDY)
         return result
 

@@ -76,6 +76,11 @@ class Contact(nn.Module):
         self.pad, self.body, self.law, self.may_leave = pad, body, law, may_leave
 
 
+def coordinate_unit(name: str) -> str:
+    """SI unit of a coordinate such as "disc.theta"."""
+    return "rad" if name.endswith("theta") else "m"
+
+
 def law_name(law: Callable[..., Tensor]) -> str:
     """What a law is called: a function by its own name, a module by that of its class."""
     return getattr(law, "__qualname__", type(law).__name__)
@@ -152,9 +157,11 @@ class Actuator(nn.Module):
 
     def gain_unit(self, rate: bool) -> str:
         """Unit of the effort per measured coordinate, or per its rate."""
-        effort, coordinate = ("N.m" if self.pushes.endswith(".theta") else "N"), self.measured.endswith(".theta")
-        per = "/rad" if coordinate else "/m"
-        return f"{effort}{'.s' if rate else ''}{per}"
+        return f"{self.effort_unit}{'.s' if rate else ''}/{coordinate_unit(self.measured)}"
+
+    @property
+    def effort_unit(self) -> str:
+        return "N.m" if self.pushes.endswith(".theta") else "N"
 
     @property
     def inputs(self) -> int:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchsoft.channels import MEASURED, PADS, VARIABLES
 from torchsoft.files import replacing, sealed, unsealed
-from torchsoft.physics.parts import COORDINATES
+from torchsoft.physics.parts import COORDINATES, coordinate_unit
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import Layout, State
 
@@ -193,7 +193,7 @@ def units(rig: Rig) -> dict[str, str]:
 
     for name, symbol in rig.symbols.items():
         for i, axis in enumerate(COORDINATES):
-            unit = "rad" if axis == "theta" else "m"
+            unit = coordinate_unit(axis)
             key = f"{axis}_{symbol}"
             out[key], out[rate_channel(key)] = unit, f"{unit}/s"
             if rig.bodies[name].freedom[axis] == "driven":
@@ -201,11 +201,10 @@ def units(rig: Rig) -> dict[str, str]:
         out[f"L_{symbol}"] = "kg.m2/s"
     for name, actuator in rig.actuators.items():
         for coordinate, setpoint in actuator.follows:
-            signal(setpoint, "rad" if coordinate.endswith(".theta") else "m")
-        effort = "N.m" if actuator.pushes.endswith(".theta") else "N"
+            signal(setpoint, coordinate_unit(coordinate))
         if actuator.feed_forward is not None:
-            signal(actuator.feed_forward, effort)
-        out[f"F_{name}"] = effort
+            signal(actuator.feed_forward, actuator.effort_unit)
+        out[f"F_{name}"] = actuator.effort_unit
     out |= {f"M_{name}": "N.m" for name in rig.pads}
     return {rig.renamed.get(key, key): unit for key, unit in out.items()}
 

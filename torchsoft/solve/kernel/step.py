@@ -216,11 +216,14 @@ def write_rows(
             b_1, b_2 = dense(parts[i])
             for j in range(y.size):
                 ys[i, j] = d.y[j] + h * (b_1 * d.K[0, j] + b_2 * d.K[1, j])
-            early = min(
-                parts[i], 1.0 - GAMMA
-            )  # what is dissipated never falls: a stage's power until its weight is used up
+            early = min(parts[i], 1.0 - GAMMA)
             for j in range(integrals.size):
-                d.at_row[j] = d.integrals[j] + h * (early * d.powers[0, j] + (parts[i] - early) * d.powers[1, j])
+                first_part, second_part = b_1, b_2
+                if (
+                    j < s.pad_base.size + 2
+                ):  # what is dissipated never falls: a stage's power until its weight is used up
+                    first_part, second_part = early, parts[i] - early
+                d.at_row[j] = d.integrals[j] + h * (first_part * d.powers[0, j] + second_part * d.powers[1, j])
             way = d.travelled[0] + h * (abs(b_1) * d.speed[0] + abs(b_2) * d.speed[1])
             scans = w.travelled[2]
             w.travelled[0] = way if scans == d.travelled[2] else np.inf

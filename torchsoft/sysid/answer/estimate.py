@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy import stats
 
-from torchsoft import channels
 from torchsoft.sysid.checks.misfit import whiteness
 from torchsoft.sysid.checks.parts import parts
 from torchsoft.sysid.problem.problem import Problem, Residuals
@@ -126,7 +125,7 @@ def quantities(problem: Problem, x: Array, free: NDArray[np.bool_]) -> Iterator[
             )  # fmt: skip
     for i, one in enumerate(c.all):
         if one.kind != "parameter" and free[i]:
-            name, where, unit = one._replace(recording=None).label, one.recording, nuisance_unit(one)
+            name, where, unit = one._replace(recording=None).label, one.recording, nuisance_unit(one, problem)
             slope, size, value = np.eye(len(c))[i], float(one.slope(x[i])), one.to_value(x[i])
             yield Quantity(name, one.kind, where, unit, value, one.nominal, size, slope, [i], one.prior)
 
@@ -147,12 +146,12 @@ def estimates(problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shi
     return out
 
 
-def nuisance_unit(one: Coordinate) -> str:
+def nuisance_unit(one: Coordinate, problem: Problem) -> str:
     """Unit of a start's coordinate, or of what is wrong with a sensor."""
     if one.kind == "start":
         axis = one.name.split(".")[2]
         return "rad/s" if axis == "v_theta" else "m/s" if axis.startswith("v_") else "rad" if axis == "theta" else "m"
-    own = channels.unit(one.name)
+    own = problem.unit(one.name)
     units = {"bias": own, "drift": f"{own}/s", "delay": "s", "gain": "1", "misalignment": "rad", "inertia": "kg"}
     return units[one.kind]
 

@@ -10,7 +10,6 @@ from typing import Literal, NamedTuple
 
 from torch import Tensor, nn
 
-from torchsoft.channels import unit
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact, at_once
 from torchsoft.physics.motion import Piecewise, Reference, Sampled
@@ -51,9 +50,9 @@ class Fault(NamedTuple):
         noise = {"noise": sensor.noise, "noise/s": sensor.noise / max(recording.duration, 1e-9)}
         return self.amount * noise.get(self.per, 1.0)
 
-    def assumption(self, channel: str, sensor: Sensor) -> "Assumption":
-        scale = {"s": (1e3, "ms"), "1": (1e2, "%"), "noise": (sensor.noise, unit(channel))}
-        factor, shown = scale.get(self.per, (sensor.noise, f"{unit(channel)} over a recording"))
+    def assumption(self, channel: str, unit: str, sensor: Sensor) -> "Assumption":
+        scale = {"s": (1e3, "ms"), "1": (1e2, "%"), "noise": (sensor.noise, unit)}
+        factor, shown = scale.get(self.per, (sensor.noise, f"{unit} over a recording"))
         return Assumption(f"{self.verb.split()[0]} {channel}", "sensor", f"{channel} has no unknown {self.verb.split()[0]}",
                           f"{channel} {self.verb.partition(' ')[2]}", factor * self.amount, shown)  # fmt: skip
 

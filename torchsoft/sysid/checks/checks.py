@@ -281,7 +281,9 @@ def columns_of(
                     block[:, len(names) + k] = by[kind] * FAULTS[kind].size(problem.sensors[channel], recording)
             blocks.append(problem.whitened(recording, channel, weight[:, None] * block))
     D = np.concatenate([*blocks, rows])
-    sensors = [FAULTS[kind].assumption(channel, problem.sensors[channel]) for channel, kind in faults]
+    sensors = [
+        FAULTS[kind].assumption(channel, problem.unit(channel), problem.sensors[channel]) for channel, kind in faults
+    ]
     out = [(one, d) for one, d in zip((*known, *sensors), D.T)]
     return [pair for k, pair in enumerate(out) if k < len(known) or faults[k - len(known)] not in have]
 

@@ -12,7 +12,6 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 import numpy as np
 import torch
 
-from torchsoft.channels import unit
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
@@ -109,7 +108,7 @@ def against_run(recording: Recording, sensors: Mapping[str, Sensor], expected: E
         if len(t) < 2 * MOVES:
             continue
         p, _, _ = one.expected(signals, t)
-        if (said := shape(name, t, y, p, sensors[name], one, signals)) is None:
+        if (said := shape(name, recording.units[name], t, y, p, sensors[name], one, signals)) is None:
             early[name] = (y - p)[t <= t[0] + EARLY]
         else:
             what, words, grave = said
@@ -119,7 +118,7 @@ def against_run(recording: Recording, sensors: Mapping[str, Sensor], expected: E
 
 
 def shape(
-    name: str, t: Array, y: Array, p: Array, sensor: Sensor, one: Readout, signals: Signals
+    name: str, unit: str, t: Array, y: Array, p: Array, sensor: Sensor, one: Readout, signals: Signals
 ) -> tuple[str, str, bool] | None:
     """What is wrong with a channel's motion, if anything is: what, words, and whether that is grave."""
     measured, run = float(np.std(y)), float(np.std(p))
@@ -128,7 +127,7 @@ def shape(
     ratio = measured / max(run, 1e-300)
     if not 1 / LARGER < ratio < LARGER and run > 0:
         words = f"{name} moves {ratio:.3g} times as much as in a run with the parameters of the start"
-        known = [(abs(math.log(ratio / factor)), said) for factor, said in confusions(name)]
+        known = [(abs(math.log(ratio / factor)), said) for factor, said in confusions(unit)]
         distance, said = min(known, default=(math.inf, ""))
         if distance < NEAR and not 1 / LARGER**1.5 < ratio < LARGER**1.5:
             return f"unit of {name}", f"{words}: {said}?", True
@@ -170,7 +169,7 @@ def zeros(recording: Recording, sensors: Mapping[str, Sensor], early: Mapping[st
             continue
         sensor, mean, count = sensors[name], float(early[name].mean()), len(early[name])
         if abs(mean) > surely(sensor, count) + sensor.bias:
-            words = f"{name} begins {mean:+.3g} {unit(name)} from {actuator.setpoint}: do both have the same zero?"
+            words = f"{name} begins {mean:+.3g} {recording.units[name]} from {actuator.setpoint}: do both have the same zero?"
             yield Finding(f"zero of {name}", recording.name, f"recording `{recording.name}`: {words}")
     if isinstance(rig, SoftGrasp) and {"x_C", "theta"} <= early.keys():
         R, (x, theta) = rig.settings.disc.radius, (sensors[name] for name in ("x_C", "theta"))

@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from torchsoft.channels import unit
 from torchsoft.tables import shown
 
 
@@ -52,8 +51,8 @@ MISTAKEN = {
 """What makes values of a dimension too large by a factor when it is taken for the other."""
 
 
-def confusions(channel: str) -> list[tuple[float, str]]:
-    """Factors by which a channel may be too large because of its unit, with what was taken for what."""
-    known = MISTAKEN.get(unit(channel).removesuffix("/s"), {})
+def confusions(unit: str) -> list[tuple[float, str]]:
+    """Factors by which a channel in `unit` may be too large, with the units that were confused."""
+    known = MISTAKEN.get(unit.removesuffix("/s"), {})
     over = [(factor, f"{a} taken for {b}") for factor, (a, b) in known.items()]
     return over + [(1 / factor, f"{b} taken for {a}") for factor, (a, b) in known.items()]

@@ -13,9 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from torchsoft.channels import unit
 from torchsoft.paper.rig import SoftGrasp
-from torchsoft.physics.parts import Actuator
+from torchsoft.physics.parts import Actuator, coordinate_unit
 from torchsoft.physics.rig import Rig
 from torchsoft.sysid.conventions.closed_loop import Loop, channel, sampled, windows
 from torchsoft.sysid.conventions.finding import Finding, confusions
@@ -82,7 +81,7 @@ def loop_findings(
             e = loop.force() - loop.given(loop.asked(), loop.found())
             text = (
                 f"recording `{recording.name}`: {found.said} (what the controller makes of {actuator.setpoint} and "
-                f"{loop.x.channel} differs from {loop.F.channel} by {rms(e):.3g} {unit(loop.F.channel)} rms, and would by "
+                f"{loop.x.channel} differs from {loop.F.channel} by {rms(e):.3g} {actuator.effort_unit} rms, and would by "
                 f"{rms(found.left):.3g})"
             )
             yield Finding(found.what, recording.name, text, found.grave)
@@ -165,17 +164,22 @@ def another_sense(rig: Rig, actuator: Actuator, body: str, other: str, left: Arr
 
 def offset(loop: Loop, e: Array) -> Change:
     """A constant more of the force, or of the coordinate."""
-    F, x, mean, gain = loop.F.channel, loop.x.channel, float(e.mean()), loop.noise.gain
-    zeros = (
-        f", or {x} and {loop.actuator.setpoint} have zeros {abs(mean) / gain:.3g} {unit(x)} apart" if gain > 0 else ""
+    loops, gain = loop.actuator, loop.noise.gain
+    F, x, mean, unit, own = (
+        loop.F.channel,
+        loop.x.channel,
+        float(e.mean()),
+        loops.effort_unit,
+        coordinate_unit(loops.measured),
     )
-    return Change(f"zero of {x}", f"{F} reads {mean:+.3g} {unit(F)} too much{zeros}", e - mean)
+    zeros = f", or {x} and {loops.setpoint} have zeros {abs(mean) / gain:.3g} {own} apart" if gain > 0 else ""
+    return Change(f"zero of {x}", f"{F} reads {mean:+.3g} {unit} too much{zeros}", e - mean)
 
 
 def resized(loop: Loop, F: Array, given: Array) -> Iterator[Change]:
     """A factor on the force: of a mistaken unit, or not much of one."""
     g, name = over(float(F @ given), float(given @ given)), loop.F.channel
-    for factor, words in confusions(name):
+    for factor, words in confusions(loop.actuator.effort_unit):
         said = f"{name} looks as if it were in another unit: {words}"
         yield Change(f"unit of {name}", said, loop.beyond(F / factor - given), True)
     if 1 / RESIZED < g < RESIZED:
@@ -228,8 +232,8 @@ def fed_forward(loop: Loop, e: Array) -> Change | None:
     if name is None or rms(slow) > max(SLOW * rms(e), 2 * loop.noise.white) or abs(began) > 0.5 * rms(e):
         return None
     said = (
-        f"{F} is {float(e.mean()):+.3g} {unit(F)} more, on the average, than the controller gives: was a force fed forward "
-        f"that {name} does not have?"
+        f"{F} is {float(e.mean()):+.3g} {loop.actuator.effort_unit} more, on the average, than the controller gives: was a force "
+        f"fed forward that {name} does not have?"
     )
     return Change(name, said, slow)
 

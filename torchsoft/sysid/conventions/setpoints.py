@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchsoft.channels import unit
 from torchsoft.physics.motion import Sampled, spline_rates
 from torchsoft.physics.parts import Actuator
 from torchsoft.sysid.conventions.closed_loop import channel
@@ -124,7 +123,7 @@ def sparse_finding(recording: Recording, sensors: Mapping[str, Sensor], name: st
     apart = float(signal.times.diff().max())
     enough = apart * (NOTICED / worst.noises) ** (1 / worst.order)
     rates = f", and its rate is not known (no column {setpoint}_dot)" if is_derived(signal) else ""
-    size = f"{worst.error:.2g} {unit(worst.channel)}, {worst.noises:.2g} times the noise of {worst.channel}"
+    size = f"{worst.error:.2g} {recording.units[worst.channel]}, {worst.noises:.2g} times the noise of {worst.channel}"
     text = (
         f"recording `{recording.name}`: set-points {setpoint} every {1e3 * apart:.3g} ms are too sparse for this motion"
         f"{rates}: what they leave open between them makes {size}; give them every {1e3 * enough:.2g} ms"

@@ -7,7 +7,6 @@ import torch
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from torchsoft.channels import unit
 from torchsoft.plot.figures import ACTUAL, DESIRED, OTHER, STYLE
 from torchsoft.sysid.design.design import Design
 from torchsoft.sysid.report.figures import SHOWN
@@ -22,7 +21,7 @@ def design_figure(design: Design) -> Figure:
     above, below = panels
     t = np.linspace(design.recording.times[0], design.recording.times[-1], 2000)
     for ax, name in zip(above.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0], names):
-        shown, scale = SHOWN.get(unit(name), (unit(name), 1.0))
+        shown, scale = SHOWN.get(own := design.recording.units[name], (own, 1.0))
         for one, colour, label in ((design.given, DESIRED, "given"), (design.recording, ACTUAL, "designed")):
             signal = one.rig.reference(torch.from_numpy(t), [name])[:, 0, 0].detach().numpy()
             ax.plot(t, scale * signal, color=colour, label=label)

@@ -154,6 +154,10 @@ class Problem:
                 out[channel] = readout(recording.rig, channel, sensor, values, span)
         return out
 
+    def unit(self, channel: str) -> str:
+        """SI unit of a channel that a sensor measures."""
+        return next(r.units[channel] for r in self.recordings if channel in r.units)
+
     def jobs(
         self, x: Array, which: Sequence[str], steps: StepsByName, free: NDArray[np.bool_] | None, adjoint: bool = False
     ) -> list[Job]:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.rig import Rig
-from torchsoft.solve.trajectory import measurable
+from torchsoft.solve.trajectory import measurable, units
 from torchsoft.sysid.problem.start import AtRest, Begin, Start, StartCoordinate
 
 Array = NDArray[np.float64]
@@ -79,6 +79,11 @@ class Recording:
     def channels(self) -> tuple[str, ...]:
         """What a sensor of this rig can measure."""
         return measurable(self.rig)
+
+    @cached_property
+    def units(self) -> dict[str, str]:
+        """SI units of the rig's channels and signals."""
+        return units(self.rig)
 
     @cached_property
     def times(self) -> Array:

@@ -9,7 +9,6 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator, PercentFormatter
 
-from torchsoft.channels import unit
 from torchsoft.plot.figures import ACTUAL, DESIRED, OTHER, STYLE
 from torchsoft.sysid.answer.answer import Answer
 from torchsoft.sysid.answer.estimate import IDENTIFIABLE, ChannelResiduals, Direction, Estimate
@@ -38,11 +37,12 @@ REST = "#bbbbbb"
 
 
 class Trace(NamedTuple):
-    """One channel of one recording: times (k,) [s], what was measured and predicted (k,), and residuals over the noise (k,), as
-    they are and whitened."""
+    """One channel of one recording: its unit, times (k,) [s], samples measured and predicted (k,), and residuals over the noise
+    (k,), as they are and whitened."""
 
     recording: str
     channel: str
+    unit: str
     t: Array
     measured: Array
     predicted: Array
@@ -219,8 +219,7 @@ def profile_figure(profile: Profile, unit: str) -> Figure:
 def trace_figure(trace: Trace, channel: ChannelResiduals | None, noise: Autoregression | None = None) -> Figure:
     """Measured and predicted, residuals over the noise, and the autocorrelation of those that are to be white, with its band;
     where the noise is coloured, that before and that of its model too."""
-    own = unit(trace.channel)
-    shown, scale = SHOWN.get(own, (own, 1.0))
+    shown, scale = SHOWN.get(trace.unit, (trace.unit, 1.0))
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     data, residual, correlation = figure.subplots(3, 1, height_ratios=(2.1, 1, 1))
     data.plot(trace.t, scale * trace.measured, ".", color="#999999", ms=3.5, label="measured")

@@ -47,7 +47,8 @@ def traces(result: Answer, problem: Problem, journal: Path | None) -> tuple[list
             t, measured = recording.samples[channel]
             y, _, _ = sensor.expected(signals, t)
             r, _ = sensor.residuals(y, measured)
-            out.append(Trace(recording.name, channel, t, measured, y, r, problem.whitened(recording, channel, r)))
+            white = problem.whitened(recording, channel, r)
+            out.append(Trace(recording.name, channel, recording.units[channel], t, measured, y, r, white))
     return out, lost
 
 
@@ -60,5 +61,9 @@ def page(result: Answer, drawn: list[Trace], lost: dict[str, str]) -> str:
         sections.taken_for_granted, sections.laws,
     )  # fmt: skip
     parts = [heading(head, 1), *(part for section in about for part in section(result))]
-    parts += [*sections.data(result, drawn, lost), *sections.cost(result), *sections.made(result)]
+    parts += [
+        *sections.data(result, drawn, lost),
+        *sections.cost(result),
+        *sections.made(result, {one.channel: one.unit for one in drawn}),
+    ]
     return document(head, parts)

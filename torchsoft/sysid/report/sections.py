@@ -1,12 +1,11 @@
 """Sections of a page about an identification, each from its answer and as HTML."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 
 import numpy as np
 
-from torchsoft.channels import unit
 from torchsoft.sysid.answer.answer import Answer
 from torchsoft.sysid.answer.estimate import Estimate
 from torchsoft.sysid.report.comparison_figure import plot
@@ -294,7 +293,7 @@ def cost(result: Answer) -> Iterator[str]:
     yield paragraph(f"{runs}; {result.cost['wall_s']:.1f} s in all.")
 
 
-def made(result: Answer) -> Iterator[str]:
+def made(result: Answer, units: Mapping[str, str]) -> Iterator[str]:
     """What was fitted to what, by what, and the command that repeats it."""
     yield heading("How it was made")
     rows = [
@@ -308,7 +307,7 @@ def made(result: Answer) -> Iterator[str]:
             ("method", f"{by['method']}, loss {by['loss']}"),
             ("tolerance", f"{by['rtol']:g}"),
             ("seed", str(by["seed"])),
-            ("sensors", ", ".join(f"{k} ± {s.noise:g} {unit(k)}" for k, s in result.sensors.items())),
+            ("sensors", ", ".join(f"{k} ± {s.noise:g} {units.get(k, '')}" for k, s in result.sensors.items())),
             ("versions", ", ".join(f"{name} {number}" for name, number in result.versions.items())),
             ("units", "SI throughout; pictures show lengths in mm"),
             ("written", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")),
