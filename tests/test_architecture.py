@@ -14,7 +14,7 @@ FLOWS = {
         channels files threads tables csvfile quantity codegen physics paper cost solve scenario excitation processes plot
         materials rigs sysid reduced datasets cli __main__
     """,
-    "codegen": "graph derivatives operations trace emit . invoke",
+    "codegen": "graph derivatives operations trace pointwise emit . invoke",
     "physics": """
         arguments mesh shapes contact retardation material pads motion multibond state parts controllers condensed validity rig
         energy statics .

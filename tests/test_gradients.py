@@ -36,7 +36,7 @@ ALONE = 1e-12
 """A sample alone against the same sample in a batch, relative."""
 JUDGED = (
     "contact.K_n", "contact.R_n", "contact.K_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.nu", "pad.tau",
-    "disc.radius", "disc.mass", "control.R_80",
+    "disc.radius", "disc.mass", "disc.inertia_ratio", "control.R_80",
 )  # fmt: skip
 """Parameters held against central differences, at least one of each law; the others follow from the other comparisons."""
 
@@ -207,7 +207,7 @@ def test_adjoint_equals_backpropagation_through_the_plain_step(name: str) -> Non
     w = WINDOWS[name]()
     y0 = w.y0.requires_grad_(True)
     wanted = [y0, *scalars(w.model).values()]
-    assert len(wanted) == 21
+    assert len(wanted) == 22
     adjoint = w.gradients(w.compiled(), wanted)
     plain = w.gradients(unrolled_solution(w.model, y0, w.t, step=w.step), wanted)
     largest = max(float((b * p.detach()).norm()) for b, p in zip(plain[1:], wanted[1:]))

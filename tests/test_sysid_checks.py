@@ -95,6 +95,10 @@ def late(data: Recording) -> Recording:
         (elsewhere, "x_C0", 30.0, "the data contradict that the disc begins at scenario.x_C0"),
         (turned, "bias theta", 2e-3, "the data contradict that theta has no unknown bias"),
         (late, "delay x_C", 1.0, "the data contradict that x_C has no unknown delay"),
+        (
+            lambda data: replace(data, samples=recorded(BASE.override({"disc.inertia_ratio": 1.2})).samples),
+            "disc.inertia_ratio", 20.0, "the data contradict that disc.inertia_ratio is 1",
+        ),
         pytest.param(
             lambda data: replace(data, samples=recorded(BASE.override({"disc.radius": 19.39e-3})).samples), "disc.radius",
             0.103, "the data contradict that disc.radius is 0.01937", marks=pytest.mark.slow,

@@ -73,8 +73,10 @@ def quantities(part: type) -> Mapping[str, Quantity]:
 
 
 def quantity_of(part: object, name: str) -> Quantity | None:
-    """Quantity of the parameter `name` of a part, if its constructor declares it: "tau_2" is an entry of "tau"."""
-    known, (stem, _, number) = quantities(type(part)), name.rpartition("_")
+    """Quantity of the parameter `name` of a part, if its constructor declares it: "tau_2" is an entry of "tau", "own_inertia"
+    the argument "inertia"."""
+    known, name = quantities(type(part)), name.removeprefix("own_")
+    stem, _, number = name.rpartition("_")
     return known.get(name, known.get(stem) if number.isdigit() else None)
 
 
@@ -92,6 +94,8 @@ Points = Annotated[Iterable[tuple[float, float]], Quantity("m", -100.0, 100.0)]
 Mass = Annotated[float, Quantity("kg", 1e-12, 1e5, "mass")]
 
 Inertia = Annotated[float, Quantity("kg.m2", 1e-24, 1e6, "moment of inertia about the centre of mass")]
+
+InertiaRatio = Annotated[float, Quantity("1", 1e-3, 1e3, "moment of inertia over that of a body of uniform density")]
 
 Depth = Annotated[float, Quantity("m", 1e-6, 10.0, "depth out of the plane")]
 

@@ -118,6 +118,7 @@ class ContactParameters(Table):
 class DiscParameters(Table):
     radius: float = of(Circle, "radius", 19.37e-3, "published", "radius of the disc")
     mass: float = of(Body, "mass", 0.4065, "assumed", MASS)
+    inertia_ratio: float = of(Body, "inertia_ratio", 1.0, "assumed")
 
 
 class BracketParameters(Table):

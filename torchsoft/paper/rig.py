@@ -27,6 +27,7 @@ NAMES = {
     "control.R_99": "control.y.Kd",
     "disc.radius": "disc.shape.radius",
     "disc.mass": "disc.mass",
+    "disc.inertia_ratio": "disc.inertia_ratio",
     "bracket.mass": "bracket.mass",
     "scenario.gravity": "gravity",
 }
@@ -56,7 +57,7 @@ class SoftGrasp(Rig):
         c, k = p.contact, p.control
         rubber = material or KelvinVoigt(p.pad.E, p.pad.nu, p.pad.rho, p.pad.tau, p.pad.depth)
         law = c.law(friction)
-        disc = Body(p.disc.mass, shape or Circle(p.disc.radius))
+        disc = Body(p.disc.mass, shape or Circle(p.disc.radius), inertia_ratio=p.disc.inertia_ratio)
         bracket = Body(p.bracket.mass, theta=0.0, weighted=False)
         control = nn.ModuleDict({"x": PD(k.K_81, k.R_80), "y": PD(k.K_98, k.R_99)})
         upper = replace(p.pad.mesh, bonded_sides=p.pad.enclosed)

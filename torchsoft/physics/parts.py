@@ -10,7 +10,7 @@ from torchsoft.physics.arguments import positive
 from torchsoft.physics.contact import SoftContact
 from torchsoft.physics.shapes import Shape, parameter
 from torchsoft.physics.state import State
-from torchsoft.quantity import DerivativeGain, Inertia, Mass, ProportionalGain
+from torchsoft.quantity import DerivativeGain, Inertia, InertiaRatio, Mass, ProportionalGain
 
 COORDINATES = ("x", "y", "theta")
 """The coordinates of a body [m, m, rad]."""
@@ -20,15 +20,17 @@ Freedom = Literal["free", "driven"] | float
 
 
 class Body(nn.Module):
-    """A rigid body: mass [kg], moment of inertia [kg.m2] (by default that of its shape), shape (None: nothing touches it).
+    """A rigid body: mass [kg], shape (None: nothing touches it), moment of inertia [kg.m2].
 
+    The moment of inertia is a parameter of its own, `own_inertia`, where it is given. Otherwise it follows mass and shape: it is
+    `inertia_ratio` [1] times that of a body of uniform density, 1 by default, about 2 for a ring.
     Each coordinate is "free", "driven" or a number at which it is fixed. Gravity acts along -y where `weighted`. Raises
     `ValueError` for another coordinate, or a body without shape and inertia that may turn.
     """
 
     def __init__(
         self, mass: Mass = 1.0, shape: Shape | None = None, *, x: Freedom = "free", y: Freedom = "free",
-        theta: Freedom = "free", inertia: Inertia | None = None, weighted: bool = True,
+        theta: Freedom = "free", inertia: Inertia | None = None, inertia_ratio: InertiaRatio = 1.0, weighted: bool = True,
     ) -> None:  # fmt: skip
         super().__init__()
         if shape is not None and not isinstance(shape, Shape):
@@ -42,6 +44,8 @@ class Body(nn.Module):
         self.fixed = nn.ParameterDict({name: parameter(float(value), trained=False) for name, value in fixed.items()})
         self.mass, self.shape, self.weighted = parameter(mass), shape, weighted
         self.own_inertia = None if inertia is None else parameter(inertia)
+        turns = self.freedom["theta"] == "free" and inertia is None and shape is not None
+        self.inertia_ratio = parameter(inertia_ratio) if turns else None
         if self.freedom["theta"] == "free" and shape is None and inertia is None:
             raise ValueError("a body that may turn needs an `inertia`, or a `shape` to compute it from")
 
@@ -57,7 +61,10 @@ class Body(nn.Module):
         """Moment of inertia about the centre of mass [kg.m2]."""
         if self.own_inertia is not None:
             return self.own_inertia
-        return torch.ones_like(self.mass) if self.shape is None else self.mass * self.shape.gyration()
+        if self.shape is None:
+            return torch.ones_like(self.mass)
+        uniform = self.mass * self.shape.gyration()
+        return uniform if self.inertia_ratio is None else self.inertia_ratio * uniform
 
     @property
     def masses(self) -> tuple[Tensor, Tensor, Tensor]:

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Self
 from pydantic import Field, model_validator
 
 from torchsoft.physics.parts import COORDINATES, Body
-from torchsoft.quantity import Density, Depth, Inertia, Mass, Place, Quantity
+from torchsoft.quantity import Density, Depth, Inertia, InertiaRatio, Mass, Place, Quantity
 from torchsoft.rigs.fields import Group, NumberOr, at_field
 from torchsoft.rigs.shapes import ShapeTable
 
@@ -53,6 +53,9 @@ class BodyTable(Group):
         default="free", description="anticlockwise"
     )
     inertia: Inertia | None = Field(default=None, description="moment of inertia; that of its shape if not given")
+    inertia_ratio: InertiaRatio = Field(
+        default=1.0, description="moment of inertia over that of a body of uniform density, where inertia is not given"
+    )
     weighted: bool = Field(default=True, description="whether gravity acts on it")
     symbol: str = Field(
         default="", description="what its channels are called: x_SYMBOL and so on; its name if not given"
@@ -83,6 +86,8 @@ class BodyTable(Group):
             raise ValueError(
                 f"mass is missing, but {' and '.join(self.free)} can move freely; give it, or density and depth"
             )
+        if self.inertia_ratio != 1.0 and (self.inertia is not None or self.shape is None):
+            raise ValueError("inertia_ratio has no effect beside inertia, or without a shape; leave it out")
         if "theta" in self.free and self.shape is None and self.inertia is None:
             raise ValueError("inertia is missing: theta is free, and there is no shape to compute it from")
         for (axis, kind), rate in zip(self.freedom.items(), ("v_x", "v_y", "omega")):
@@ -97,7 +102,12 @@ class BodyTable(Group):
     def build(self, folder: Path, held: dict[str, float] | None = None) -> Body:
         """The body; `held` are numbers at which coordinates are fixed in the place of their freedom. Raises `ValueError`."""
         freedom: dict[str, Any] = self.freedom | (held or {})
-        given: dict[str, Any] = {"inertia": self.inertia, "weighted": self.weighted, **freedom}
+        given: dict[str, Any] = {
+            "inertia": self.inertia,
+            "inertia_ratio": self.inertia_ratio,
+            "weighted": self.weighted,
+            **freedom,
+        }
         if self.shape is None:
             return Body(self.mass or 1.0, **given)
         with at_field("shape"):

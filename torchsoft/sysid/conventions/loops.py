@@ -232,8 +232,8 @@ def fed_forward(loop: Loop, e: Array) -> Change | None:
     if name is None or rms(slow) > max(SLOW * rms(e), 2 * loop.noise.white) or abs(began) > 0.5 * rms(e):
         return None
     said = (
-        f"{F} is {float(e.mean()):+.3g} {loop.actuator.effort_unit} more, on the average, than the controller gives: was a force "
-        f"fed forward that {name} does not have?"
+        f"{F} is {float(e.mean()):+.3g} {loop.actuator.effort_unit} more, on the average, than the controller gives: was a "
+        f"force fed forward that {name} does not have?"
     )
     return Change(name, said, slow)
 
