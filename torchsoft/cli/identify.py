@@ -72,7 +72,8 @@ def identify(options: argparse.Namespace) -> int:
             result = replace(result, command=options.command)
             result.save(options.out / "answer.json")
             report(result, case.problem, options.out / "report.html", checkpoint=unfinished)
-            forget(unfinished)
+            if not result.made_by["untried"]:
+                forget(unfinished)
             verdict = compared(case, fit, options) if case.laws else ""
         except Unreachable as error:
             return failed(measured.unreachable(error, tables))

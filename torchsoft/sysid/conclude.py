@@ -104,6 +104,7 @@ def conclude(
         correlation=(C_free / np.outer(sd, sd)).tolist(),
         directions=directions(labels, values, vectors),
         chi2=chi2,
+        chi2_stated=sum(float(one.raw @ one.raw) for one in left) / max(len(exact) - int(free.sum()), 1),
         converged=end.at_rest,
         residuals=residual_channels(problem, at, how.fitted),
         heldout=predicted,
@@ -116,7 +117,7 @@ def conclude(
         },
         made_by={
             "torchsoft": version("torchsoft"), **how.settings.model_dump(), "rtol": rtol, "rtol_asked": stage.rtol,
-            "meant": list(how.meant),
+            "meant": list(how.meant), "untried": list(checked.untried) if checked is not None else [],
             "unknowns": {name: u.model_dump() for name, u in problem.unknowns.items()},
             "sensors": {name: s.model_dump() for name, s in problem.sensors.items()},
             "recordings": {r.name: r.fingerprint for r in problem.recordings},
@@ -164,7 +165,7 @@ def notices_on(found: list[Any], converged: bool, rtol: float, unchecked: bool) 
         if not e.identifiable:
             change = f"a change by {e.relative_sd:.0%}" if e.relative_sd < 9 else "a change by a factor of ten"
             out.append(f"{e.label} is not identifiable from these data: {change} would not show in them")
-        if e.at_bound:
+        if e.at_bound and e.identifiable:
             out.append(f"{e.label} ended at a bound ({e.last:.4g}): widen the bound or question the model")
     worst = max(found, key=lambda e: abs(e.step_bias_sd), default=None)
     if unchecked:

@@ -1,5 +1,6 @@
 """`identify`: carry out a plan of stages, then state how certain the result is and what is not identifiable."""
 
+import sys
 import time as clock
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -7,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
 from torchsoft.sysid.answer.result import IdentificationResult
 from torchsoft.sysid.checks.colour import Coloured, allow_for_colour
@@ -62,6 +64,8 @@ def identify(
     fitted, began = [name for name in problem.names if name not in heldout], clock.perf_counter()
     runner = Runner(problem.recordings, workers, Path(checkpoint) if checkpoint is not None else None)
     looks = accepted(check(problem, runner, fitted), meant) if assumptions == "checked" else []
+    for look in looks if progress else ():
+        tqdm.write(f"note: {look}", file=sys.stderr)
     x, fit, stages = problem.coordinates.start, None, []
     with explained(looks):
         if plan is None:

@@ -29,8 +29,12 @@ from torchsoft.sysid.problem.prediction import set_parameters
 from torchsoft.sysid.problem.unknowns import Prior, Sensor, Unknown
 from torchsoft.tables import Number, line, refusing, shown
 
-SCHEMA = "torchsoft-answer-2"
+SCHEMA = "torchsoft-answer-3"
 """Name and version of the file's form."""
+
+
+UNEXPLAINED = 1.25
+"""RMS residual of a channel over its stated noise from which a report begins by saying that the model does not explain it."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +94,8 @@ class AssumptionCheck:
     asked_sd: Number
     suspected: bool
     unchecked: str
+    value: Number = float("nan")  # of a known parameter, as the data would have it
+    under: dict[str, Number] = field(default_factory=dict)  # estimates with that amount, by label
 
 
 @dataclass(frozen=True)
@@ -107,6 +113,9 @@ class Answer:
     correlation: list[list[Number]]
     directions: list[Direction]
     chi2: Number  # sum of squared residuals over degrees of freedom; 1 where model and noise are right
+    chi2_stated: (
+        Number  # the same over the noise that sensors state, white: colour that was found takes nothing from it
+    )
     converged: bool
     residuals: list[ChannelResiduals]
     heldout: dict[str, dict[str, Number]]  # NRMSE of recordings that were not fitted, by recording and channel
@@ -135,6 +144,19 @@ class Answer:
             if estimate.name == name:
                 return estimate
         raise KeyError(f"no estimate of `{name}`; there are {', '.join(e.name for e in self.estimates)}")
+
+    @property
+    def headline(self) -> str:
+        """First line of a report: whether the model explains the data, and how many parameters are identifiable."""
+        mine = [e for e in self.estimates if e.kind == "parameter"]
+        worst = max(self.residuals, key=lambda one: one.stated, default=None)
+        text = f"{sum(e.identifiable for e in mine)} of {len(mine)} parameters identifiable, χ² = {self.chi2:.3g}"
+        if not abs(self.chi2_stated - self.chi2) < 0.1 * self.chi2:
+            text += f", {self.chi2_stated:.3g} against the stated noise"
+        if worst is None or worst.stated < UNEXPLAINED:
+            return text
+        size = f"residuals of {worst.channel} are {worst.stated:.2g} times the stated noise"
+        return f"The model does not explain the data: {size}; {text}"
 
     def recorded(self, recording: str | None = None) -> RecordedRig:
         """A recording and its rig, the first one by default. Raises `ValueError` for one that is not there, and, without a
@@ -208,8 +230,8 @@ class Answer:
             partial.write_text(self.to_json(), encoding="utf-8")
 
     def table(self) -> str:
-        """One line an estimate."""
-        rows = [f"{'parameter':34s} {'estimate':>12s}   95 % interval"]
+        """The headline, and one line an estimate."""
+        rows = [self.headline, f"{'parameter':34s} {'estimate':>12s}   95 % interval"]
         for e in self.estimates:
             if e.value is None or e.ci95 is None:
                 rows.append(

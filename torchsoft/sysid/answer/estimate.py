@@ -72,6 +72,7 @@ class ChannelResiduals:
     rms: Number
     lag1: Number
     p_white: Number
+    stated: Number  # rms over the noise that the sensor states
 
 
 class Quantity(NamedTuple):
@@ -198,6 +199,7 @@ def residual_channels(problem: Problem, residuals: Residuals, which: list[str]) 
             part.channel,
             float(np.sqrt(np.mean((r := residuals.r[part.rows]) ** 2))),
             *whiteness(r, orders.get(part.channel, 0)),
+            float(np.sqrt(np.mean(part.raw**2))),
         )
         for part in parts(problem, residuals.r, which)
     ]

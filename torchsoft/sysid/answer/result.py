@@ -61,7 +61,7 @@ def described(
         "assumptions": [
             AssumptionCheck(
                 one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, dict(one.moves), one.gain, one.asked,
-                one.asked_sd, one.wanted, one.unchecked,
+                one.asked_sd, one.wanted, one.unchecked, one.value, dict(one.under),
             )
             for one in checks
         ],

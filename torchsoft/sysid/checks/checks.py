@@ -7,7 +7,7 @@ a coordinate more, with a standard normal prior on its amplitude, so that data t
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -46,6 +46,9 @@ BY_CHANCE = 2.0
 RIVALS = 3
 """Numbers of the rig that are taken to be unknown where a doubtful fit is repeated, one at a time."""
 
+UNDER = 8
+"""Estimates that a sentence states under an alternative."""
+
 MOVED = 0.5
 """Standard deviations by which a constant of the computation may move an estimate without a word."""
 
@@ -58,7 +61,8 @@ class Check:
     would fall if the data could choose the amplitude, to `left`, `asked` that amplitude [unit] and `asked_sd` its standard
     deviation; `significance` is the gain over the misfit per sample that would be left, `pattern` the part of the residuals'
     autocorrelation that would be left, 0 where there is none. `refitted`: that is of a fit with the whole variation, not to
-    first order. `unchecked` says why there is no answer.
+    first order. `unchecked` says why there is no answer. `value` is what the data would have for a `parameter`, `under` the
+    estimates with the amount that is asked for, by label.
     """
 
     name: str
@@ -76,6 +80,9 @@ class Check:
     pattern: float = 0.0
     refitted: bool = False
     unchecked: str = ""
+    parameter: str = ""
+    value: float = float("nan")
+    under: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def absurd(self) -> bool:
@@ -106,6 +113,8 @@ class Checked(NamedTuple):
     checks: list[Check]
     columns: Array
     J: Array
+    untried: tuple[str, ...] = ()
+    """What an interrupt left out."""
 
     def covariance(self) -> Array:
         """Covariance (n, n) of the free coordinates, which the constants of the computation enlarge."""
@@ -131,24 +140,34 @@ def check(
     recordings = [recording for recording in problem.recordings if recording.name in which]
     taken = assumptions(recordings, set(problem.coordinates.names))
     judge, checks, columns = Judge(problem, end), dict[str, Check](), []
-    for one in taken:
-        if one.vary is None:
-            continue
-        d, reason = difference(problem, end, one)
-        checks[one.name] = judge.unchecked(one, reason) if d is None else judge.column(one, d)
-        if one.kind == "numerical" and d is not None:
-            columns.append(d)
-    linear = columns_of(problem, Runner(problem.recordings, workers, journal), end, taken)
-    checks |= {one.name: judge.column(one, d) for one, d in linear if d.any()}
-    if doubtful and not end.base.lost and not judge.explained(checks.values()):
-        as_stated = refit(problem, end, None, loss, notify)
-        for one in doubted(taken, checks, end.far) if as_stated is not None else ():
-            again = refit(problem, end, one, loss, notify)
-            if again is not None and as_stated is not None:
-                checks[one.name] = judge.fit(one, again, as_stated, checks[one.name])
-            if judge.explained(checks.values()):
-                break
-    return Checked(list(checks.values()), np.stack(columns, 1) if columns else np.zeros((len(at.r), 0)), judge.J)
+    untried = [one.name for one in taken if one.vary is not None]
+    try:
+        linear = columns_of(problem, Runner(problem.recordings, workers, journal), end, taken)
+        checks |= {one.name: judge.column(one, d) for one, d in linear if d.any()}
+        for one in taken:
+            if one.vary is None:
+                continue
+            d, reason = difference(problem, end, one)
+            checks[one.name] = judge.unchecked(one, reason) if d is None else judge.column(one, d)
+            if one.kind == "numerical" and d is not None:
+                columns.append(d)
+            untried.remove(one.name)
+        if doubtful and not end.base.lost and not judge.explained(checks.values()):
+            again = doubted(taken, checks, end.far)
+            untried = [f"a new fit with another {one.name}" for one in again]
+            as_stated = refit(problem, end, None, loss, notify)
+            for one in again if as_stated is not None else ():
+                other = refit(problem, end, one, loss, notify)
+                if other is not None and as_stated is not None:
+                    checks[one.name] = judge.fit(one, other, as_stated, checks[one.name])
+                untried.pop(0)
+                if judge.explained(checks.values()):
+                    break
+            untried = []
+    except KeyboardInterrupt:  # the fit is done: what was tried is kept
+        pass
+    rows = np.stack(columns, 1) if columns else np.zeros((len(at.r), 0))
+    return Checked(list(checks.values()), rows, judge.J, tuple(untried))
 
 
 def doubted(taken: Sequence[Assumption], checks: Mapping[str, Check], far: bool) -> list[Assumption]:
@@ -168,7 +187,9 @@ class Judge:
         self.end, self.r, self.J = end, end.at.r, end.at.J[:, end.free]
         self.Q, _ = np.linalg.qr(self.J)
         self.sd = standard_deviations(self.J)
-        self.labels = [label for label, one in zip(problem.coordinates.labels, end.free) if one]
+        self.coordinates = [one for one, is_free in zip(problem.coordinates.all, end.free) if is_free]
+        self.labels = [one.label for one in self.coordinates]
+        self.given = problem.recordings[0].parameters
         self.places = [part.rows for part in parts(problem, self.r, end.which)]
         self.dof = max(sum(map(len, self.places)) - len(self.labels), 1)
         self.square = float(self.r @ self.r)
@@ -184,12 +205,15 @@ class Judge:
 
     def made(
         self, one: Assumption, moves: Array, gain: float, left: float, asked: float, asked_sd: float, rest: float,
-        pattern: float,
+        pattern: float, refitted: bool = False,
     ) -> Check:  # fmt: skip
         """Of a variation that leaves a sum of squares `left`, a misfit `rest` per sample."""
         by_label = dict(zip(self.labels, moves.tolist()))
+        x = self.end.x[self.end.free] + moves * self.sd * (1.0 if refitted else asked / one.amount)
+        under = {c.label: c.to_value(v) for c, v in zip(self.coordinates, x.clip(-700, 700).tolist())}
+        value = (1 + asked / 100) * self.given[one.parameter] if one.parameter else float("nan")
         return Check(one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, by_label, gain, left, asked, asked_sd,
-                     gain / rest, pattern)  # fmt: skip
+                     gain / rest, pattern, refitted, parameter=one.parameter, value=value, under=under)  # fmt: skip
 
     def column(self, one: Assumption, d: Array) -> Check:
         """Of what a variation adds to the residuals (m,), to first order in its amplitude."""
@@ -225,7 +249,7 @@ class Judge:
             asked = 100 * (np.exp(again.fit.x[k] - again.problem.coordinates.start[k]) - 1)
             sd = 100 * rest**0.5 * float(standard_deviations(at.J[:, again.free])[labels.index(one.parameter)])
         pattern = pattern_of(self.places, at.r, before.r)
-        return replace(self.made(one, moves / self.sd, gain, left, asked, sd, rest, pattern), refitted=True)
+        return self.made(one, moves / self.sd, gain, left, asked, sd, rest, pattern, True)
 
 
 def pattern_of(places: Sequence[NDArray[np.int_]], left: Array, r: Array) -> float:
@@ -291,16 +315,25 @@ def columns_of(
 def notices(checked: Checked) -> list[str]:
     """Sentences on what the data ask for, the strongest first, and on constants of the computation that estimates hang on."""
     out, checks = [], checked.checks
+    if checked.untried:
+        out.append(f"interrupted, so these were not tried: {', '.join(checked.untried)}; the same command tries them")
     asked = sorted((c for c in checks if c.wanted), key=lambda c: -c.gain)
     if asked:
         best = asked[0]
         rivals = [c.name for c in asked[1:] if c.gain > 0.5 * best.gain]
         label, move = best.most_moved
-        text = f"the data contradict that {best.stated}: the sum of squares {best.falls} if {best.otherwise}"
+        text = f"the data contradict that {best.stated}: the sum of squares {best.falls}"
+        if best.parameter:
+            text += f" with {best.parameter} = {best.value:.6g} ({best.asked:+.3g} {best.unit}, +- {best.asked_sd:.2g})"
+        else:
+            text += f" if {best.otherwise}"
+            if best.kind in ("known", "sensor"):
+                text += f" ({best.asked:+.3g} {best.unit} fit best, +- {best.asked_sd:.2g})"
         if best.kind in ("known", "sensor"):
-            text += f" ({best.asked:+.3g} {best.unit} fit best, +- {best.asked_sd:.2g})"
             move *= 1.0 if best.refitted else best.asked / best.amount
-        text += f"; {label} would move by {abs(move):.2g} standard deviations" if label else ""
+        if label:
+            under = ", ".join(f"{name} = {value:.4g}" for name, value in list(best.under.items())[:UNDER])
+            text += f"; {label} would move by {abs(move):.2g} standard deviations; estimates under it: {under}"
         out.append(text + (f"; so would it with others: {', '.join(rivals)}" if rivals else ""))
         out += [
             f"the data also ask for another value of what is stated: {c.stated} (the sum of squares {c.falls})"

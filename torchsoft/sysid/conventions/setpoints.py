@@ -123,6 +123,12 @@ def sparse_finding(recording: Recording, sensors: Mapping[str, Sensor], name: st
     apart = float(signal.times.diff().max())
     enough = apart * (NOTICED / worst.noises) ** (1 / worst.order)
     rates = f", and its rate is not known (no column {setpoint}_dot)" if is_derived(signal) else ""
+    if worst.order <= ORDERS[0] and not is_derived(signal):  # closer rows would not help
+        text = (
+            f"recording `{recording.name}`: values and rates of {setpoint} disagree however close the rows are, by "
+            f"{worst.noises:.2g} times the noise of {worst.channel}: is a clock, or a unit of time, a little off?"
+        )
+        return Finding(f"rate of {setpoint}", recording.name, text, worst.noises > HOPELESS)
     size = f"{worst.error:.2g} {recording.units[worst.channel]}, {worst.noises:.2g} times the noise of {worst.channel}"
     text = (
         f"recording `{recording.name}`: set-points {setpoint} every {1e3 * apart:.3g} ms are too sparse for this motion"

@@ -54,8 +54,7 @@ def traces(result: Answer, problem: Problem, journal: Path | None) -> tuple[list
 
 def page(result: Answer, drawn: list[Trace], lost: dict[str, str]) -> str:
     """The whole HTML text."""
-    mine = [e for e in result.estimates if e.kind == "parameter"]
-    head = f"{sum(e.identifiable for e in mine)} of {len(mine)} parameters identifiable, χ² = {result.chi2:.3g}"
+    head = result.headline
     about = (
         sections.summary, sections.estimates, sections.told, sections.identifiable, sections.profiles,
         sections.taken_for_granted, sections.laws,
