@@ -40,8 +40,8 @@ FLOWS = {
     "sysid.report": "figures comparison_figure page sections report .",
     "sysid.design": "criterion knots zigzags planner search design design_figure .",
     "rigs": """
-        fields recorded shapes materials bodies pads contacts network actuators motion outputs schema geometry build course
-        finding balance check written template pictures run .
+        fields recorded shapes materials bodies pads contacts network actuators motion outputs schema geometry build
+        course finding reach balance check written template pictures run .
     """,
     "cli": "failure results rigs identify material .",
     "solve.kernel": """

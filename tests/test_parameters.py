@@ -18,8 +18,8 @@ NAN, INF = math.nan, math.inf
 STIFFNESSES = ["pad.E", "contact.K_n", "contact.K_t", "control.K_81", "control.K_98"]
 POSITIVE = [
     "pad.length", "pad.height", "pad.depth", "pad.E", "pad.rho", "pad.tau", "contact.K_n", "contact.K_t", "contact.v_s",
-    "contact.epsilon", "contact.node_spacing", "disc.radius", "disc.mass", "disc.inertia_ratio", "bracket.mass", "scenario.y_Br_grasp",
-    "scenario.grasp_time", "scenario.roll_time",
+    "contact.epsilon", "contact.node_spacing", "disc.radius", "disc.mass", "disc.inertia_ratio", "bracket.mass",
+    "scenario.y_Br_grasp", "scenario.grasp_time", "scenario.roll_time",
 ]  # fmt: skip
 NOT_NEGATIVE = [
     "contact.R_n", "contact.R_t", "contact.mu_s", "contact.mu_k", "contact.eta", "control.K_81", "control.R_80",

@@ -88,8 +88,10 @@ def identify(options: argparse.Namespace) -> int:
     for notice in result.notices:
         print(f"note: {notice}")
     print(verdict, end="")
+    if result.made_by["untried"]:
+        print(f"\ninterrupted; the same command continues with what is in {unfinished}", file=sys.stderr)
     print(f"{result.cost['wall_s']:.0f} s; written to {options.out / 'answer.json'} and {options.out / 'report.html'}")
-    return 0
+    return 130 if result.made_by["untried"] else 0
 
 
 def compared(case: Any, fit: Any, options: argparse.Namespace) -> str:

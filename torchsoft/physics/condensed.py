@@ -81,35 +81,33 @@ def solve_rates(rig: Rig, name: str, own: Sequence[str], state: State, u: Tensor
     P_aa, free_a = P[dofs], free[..., loaded, :]
     spread = {key: pad.spread[which][:, loaded] for key, which in touching.items()}
 
+    def point_force(key: str, rate: Tensor) -> Tensor:
+        """At a contact's touching points (..., points, 2), for their rates."""
+        which, contact = touching[key], rig.contacts[key]
+        shape = rig.bodies[contact.body].shape
+        assert shape is not None
+        x = point_inputs(rig, key, state, pad.spread[which] @ u, rate, which, stage)
+        return interface_law(contact.law, shape, x)[..., :2]
+
     def force(u_dot: Tensor) -> Tensor:
         """Nodal forces for the loaded nodes' rates."""
-        total = torch.zeros_like(u_dot)
-        for key, which in touching.items():
-            contact = rig.contacts[key]
-            shape = rig.bodies[contact.body].shape
-            assert shape is not None
-            x = point_inputs(rig, key, state, pad.spread[which] @ u, spread[key] @ u_dot, which, stage)
-            total = total + spread[key].mT @ interface_law(contact.law, shape, x)[..., :2]
-        return total
+        each = [S.mT @ point_force(key, S @ u_dot) for key, S in spread.items()]
+        return sum(each[1:], each[0])
 
     def residual(u_dot: Tensor, F: Tensor) -> Tensor:
         return (u_dot - free_a).flatten(-2) - F.flatten(-2) @ P_aa.mT
 
     def linearise(u_dot: Tensor) -> tuple[Tensor, Tensor]:
-        """Residual and its Jacobian. A point reaches two nodes at the most, so every third node is probed at once."""
+        """Residual and its Jacobian: a point's force depends on its own rate only."""
         n = len(loaded)
-        F, pull = torch.func.vjp(force, u_dot)[:2]
-        G = torch.zeros(*u_dot.shape[:-2], n, 2, n, 2, dtype=u.dtype)
-        near = (loaded[:, None] - loaded).abs() <= 1  # columns that may reach a probed node
-        probes = torch.zeros(3, 2, *u_dot.shape, dtype=u.dtype)
-        for colour in range(3):
-            for axis in range(2):
-                probes[colour, axis, ..., loaded % 3 == colour, axis] = 1.0
-        (by,) = torch.func.vmap(pull)(probes.flatten(0, 1))
-        for colour in range(3):
-            rows, columns = torch.nonzero(near & (loaded[:, None] % 3 == colour), as_tuple=True)
-            for axis in range(2):
-                G[..., rows, axis, columns, :] = by[2 * colour + axis][..., columns, :]
+        F, G = torch.zeros_like(u_dot), torch.zeros(*u_dot.shape[:-2], n, 2, n, 2, dtype=u.dtype)
+        for key, S in spread.items():
+            with torch.enable_grad():
+                rate = (S @ u_dot.detach()).requires_grad_(True)
+                f = point_force(key, rate)
+                slopes = [torch.autograd.grad(f[..., i].sum(), rate, retain_graph=i == 0)[0] for i in range(2)]
+            F = F + S.mT @ f.detach()
+            G = G + torch.einsum("pn,...pij,pm->...nimj", S, torch.stack(slopes, -2), S)
         J = torch.eye(2 * n, dtype=u.dtype) - P_aa @ G.flatten(-2).flatten(-3, -2)
         return residual(u_dot, F), J
 

@@ -22,7 +22,7 @@ Freedom = Literal["free", "driven"] | float
 class Body(nn.Module):
     """A rigid body: mass [kg], shape (None: nothing touches it), moment of inertia [kg.m2].
 
-    The moment of inertia is a parameter of its own, `own_inertia`, where it is given. Otherwise it follows mass and shape: it is
+    The moment of inertia is a parameter of its own, `own_inertia`, where it is given. It else follows mass and shape: it is
     `inertia_ratio` [1] times that of a body of uniform density, 1 by default, about 2 for a ring.
     Each coordinate is "free", "driven" or a number at which it is fixed. Gravity acts along -y where `weighted`. Raises
     `ValueError` for another coordinate, or a body without shape and inertia that may turn.

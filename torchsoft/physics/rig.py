@@ -273,7 +273,7 @@ class Rig(nn.Module):
         state = self.unpack(y, signals)
         graph = self.evaluate(t, state, signals)
         effort = net_efforts(graph.ports, self.junctions)
-        pads, rates, velocity = {}, {}, {}
+        pads, rates = {}, {}
         for name, pad in self.pads.items():
             u_dot = graph.ports[f"pad_{name}"].transformer.flow(graph.flows)
             if pad.inertial:
@@ -283,12 +283,18 @@ class Rig(nn.Module):
             else:
                 f, (_, times) = graph.ports[f"pad_{name}"].effort, pad.material.chain()
                 pads[name] = (f[..., None, :, :] - state.pads[name]) / times[:, None, None]
-        for name, body in self.bodies.items():
-            force, moment = (effort.get(k, torch.zeros_like(graph.flows[k])) for k in (name, f"{name}_spin"))
-            load = torch.cat((force[..., 0, :], moment[..., 0, :]), -1)
-            velocity[name] = load / torch.stack(body.masses)  # (17), (18)
+        loads = self.loads(graph, effort)
+        velocity = {name: loads[name] / torch.stack(body.masses) for name, body in self.bodies.items()}  # (17), (18)
         stretch = {name: interface.out[..., 2] for name, interface in graph.interfaces.items()}
         return self.pack(State(pads, stretch, state.velocity, rates, velocity))
+
+    def loads(self, graph: Evaluation, effort: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Net forces and moments on the bodies (..., 3) [N, N, N.m], of the net efforts at the graph's junctions."""
+        out = {}
+        for name in self.bodies:
+            force, moment = (effort.get(k, torch.zeros_like(graph.flows[k])) for k in (name, f"{name}_spin"))
+            out[name] = torch.cat((force[..., 0, :], moment[..., 0, :]), -1)
+        return out
 
     @property
     def junctions(self) -> dict[str, Junction]:
@@ -307,8 +313,11 @@ class Rig(nn.Module):
             out[f"{name}_spin"] = Junction(1, 1, spin, f"1: {name} spin")
         return out
 
-    def evaluate(self, t: Tensor | float, state: State, signals: Tensor | None = None) -> Evaluation:
-        """The multibond graph at time t [s] and one state: every port with its transformer and effort, world axes."""
+    def evaluate(
+        self, t: Tensor | float, state: State, signals: Tensor | None = None, settled: bool = False
+    ) -> Evaluation:
+        """The multibond graph at time t [s] and one state: every port with its transformer and effort, world axes. `settled`
+        takes massless pads to have no rates, which are solved for otherwise."""
         like = next(iter(state.pose.values()))
         signals = (
             self.follow(torch.as_tensor(t, dtype=torch.float64).expand(like.shape[:-1])) if signals is None else signals
@@ -328,7 +337,7 @@ class Rig(nn.Module):
                 flows[f"pad_{name}"] = turned(state.rates[name], angle)
                 u_dot = turned(flows[f"pad_{name}"] - base_rate, -angle)
             else:
-                u_dot = solve_rates(self, name, own, state, u)
+                u_dot = torch.zeros_like(u) if settled else solve_rates(self, name, own, state, u)
                 flows[f"pad_{name}"] = base_rate + turned(u_dot, angle)
             for key in own:
                 interfaces[key] = self._interface(key, state, u, u_dot, flows)

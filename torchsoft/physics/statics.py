@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchsoft.physics.condensed import point_inputs
 from torchsoft.physics.contact import interface_law
+from torchsoft.physics.multibond import net_efforts
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
@@ -205,12 +206,10 @@ def resting(rig: Rig, pose: Mapping[str, Tensor], residual: float = RESIDUAL) ->
             name: torch.stack((one, one, (m[2] / m[0]).sqrt())) for name, m in masses.items() for one in [m[0] / m[0]]
         }
         scale = torch.cat([sizes[name][axes] for name, axes in free.items()])
-        inertia = torch.cat([masses[name][axes] for name, axes in free.items()])
         q = torch.cat([pose[name].detach()[axes] for name, axes in free.items()]) * scale
         mesh = min(pad.mesh.height for pad in soft.pads.values())
         softest = max(float(pad.compliance().diagonal().max()) for pad in soft.pads.values())
     counts = [len(axes) for axes in free.values()]
-    rates = soft.layout.rigid[len(q) :]
 
     def poses(q: Tensor) -> dict[str, Tensor]:
         parts = (q / scale).split(counts)
@@ -218,7 +217,9 @@ def resting(rig: Rig, pose: Mapping[str, Tensor], residual: float = RESIDUAL) ->
 
     def loads(q: Tensor) -> Tensor:
         """Net loads on the free coordinates (n,) [N]."""
-        return soft(0.0, settled(soft, poses(q), still, stretch))[rates] * inertia / scale
+        graph = soft.evaluate(0.0, soft.unpack(settled(soft, poses(q), still, stretch)), settled=True)
+        net = soft.loads(graph, net_efforts(graph.ports, soft.junctions))
+        return torch.cat([net[name][axes] for name, axes in free.items()]) / scale
 
     path: list[tuple[float, Tensor]] = []
     while len(path) < ITERATIONS and not stalled(path, STRIDE * mesh):

@@ -65,6 +65,15 @@ def at_moments(file: RigFile, ready: Ready, estimate: Estimate) -> list[Finding]
             )
             return found
         there.append(Moment(time, pose, y, hold(**signals(rig, time))))
+    if estimate.unbalanced:
+        time, why = next(iter(estimate.unbalanced.items()))
+        found.append(
+            Finding(
+                "warning", "motion",
+                f"nothing was found to be in balance at t = {time:.3g} s, so that strains and stability are not judged under "
+                f"the efforts there, only where set-points put bodies: {why}; push less, or leave bodies more room",
+            )
+        )  # fmt: skip
     return [*found, *presses(rig, there), *strains(rig, there), *swings(file, rig, there), *slips(file, rig, there)]
 
 

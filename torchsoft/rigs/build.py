@@ -27,6 +27,10 @@ UPWARDS = 0.1
 """Least upward part of the normal of a pad that something may rest on."""
 
 
+STIFF = 100.0
+"""How many times as stiff as a point of the pad a contact may be for statics to be sure of balance."""
+
+
 M = TypeVar("M", bound=nn.Module)
 
 
@@ -112,7 +116,7 @@ def starts(file: RigTables, driven: Mapping[str, float]) -> dict[str, Array]:
         name: {axis: float(at) for axis, at in zip(COORDINATES, row) if (name, axis) not in wanted}
         for name, row in pose.items()
     }
-    rig = assemble(file, held, loops=())
+    rig = assemble(file, held, loops=()).requires_grad_(False)
     for name, axis in wanted:
         if axis == "y":
             pose[name][1] = above(rig, name, pose)
@@ -120,8 +124,22 @@ def starts(file: RigTables, driven: Mapping[str, float]) -> dict[str, Array]:
         found = resting(rig, {name: torch.from_numpy(at) for name, at in pose.items()})
     except NoEquilibrium as error:
         name, axis = wanted[0]
-        raise ValueError(f"bodies.{name}.start.{axis}: {error}") from None
+        raise ValueError(too_stiff(file, rig) or f"bodies.{name}.start.{axis}: {error}") from None
     return {name: at.numpy() for name, at in found.items()}
+
+
+def too_stiff(file: RigTables, rig: Rig) -> str:
+    """The law of a contact so much stiffer than its pad that its force is rounding of its depth; empty if there is none."""
+    for name, contact in rig.contacts.items():
+        give = float(rig.pads[contact.pad].compliance().detach().diagonal().max())
+        ratio = float((rig.weight(name) * contact.law.K_n).detach().max()) * give
+        if ratio > STIFF:
+            law, K_n = file.contacts[name].law, contact.law.K_n.item()
+            return (
+                f"laws.{law}.K_n: no rest is found with {K_n:g} N/m, {ratio:.2g} times as stiff as the pad `{contact.pad}` that it "
+                f"presses; take {K_n * STIFF / ratio:.1g} N/m or less, the pad gives way long before the contact does"
+            )
+    return ""
 
 
 def above(rig: Rig, body: str, pose: Mapping[str, Array]) -> float:
@@ -134,6 +152,12 @@ def above(rig: Rig, body: str, pose: Mapping[str, Array]) -> float:
         x, places = float(pose[body][0]), points(rig.pads[contact.pad], pose)
         under = (places[:, 0] > x - beside[0]) & (places[:, 0] < x + beside[1])
         if contact.body == body and at.normal[1] > UPWARDS and places[:, 0].min() < x < places[:, 0].max():
+            if not under.any():
+                raise ValueError(
+                    f"bodies.{body}.shape: {1e3 * sum(beside):.3g} mm wide, it falls between points of `{contact.pad}`, which"
+                    f" are {1e3 * float(rig.pads[contact.pad].point_lengths.max()):.3g} mm apart; make it "
+                    f"larger, or give pads.{contact.pad} more elements or points"
+                )
             heights.append(float(places[under, 1].max()) + below)
     if not heights:
         raise ValueError(
@@ -200,7 +224,9 @@ class RigFile(RigTables):
         try:
             y0 = standing(rig, {name: torch.from_numpy(at) for name, at in pose.items()})
         except NoEquilibrium as error:
-            raise ValueError(f"bodies: the pads cannot settle where bodies start: {error}") from None
+            raise ValueError(
+                too_stiff(self, rig) or f"bodies: the pads cannot settle where bodies start: {error}"
+            ) from None
         for name, body in self.bodies.items():
             rates = [v for v, axis in zip(body.start.velocity, COORDINATES) if axis in body.free]
             y0[rig.layout.slices["velocity", name]] = torch.tensor(rates, dtype=torch.float64)

@@ -9,11 +9,12 @@ from torchsoft.physics.motion import Sampled
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.balance import at_moments
 from torchsoft.rigs.build import Ready, RigFile
-from torchsoft.rigs.course import Estimate, at, signals
+from torchsoft.rigs.course import Course, Estimate, at, signals
 from torchsoft.rigs.fields import Refused
 from torchsoft.rigs.finding import SEVERITIES, Finding
 from torchsoft.rigs.geometry import TOUCH, collision, corner, inside, nodes, overlap, pressed, surface, tied
 from torchsoft.rigs.motion import CsvTable
+from torchsoft.rigs.reach import apart, crossed, overloads, unreachable
 
 JUMP = {"m": 1e-4, "rad": 1e-2}
 """How far a set-point may be from its coordinate at the start without a warning."""
@@ -35,9 +36,12 @@ def check(file: RigFile) -> list[Finding]:
         field, _, sentence = str(error).partition(": ")
         return [Finding("error", field, sentence)]
     estimate = Estimate(file, ready)
+    course = estimate.sampled(SAMPLES)
     found = [
         *ties(file, ready.rig), *unseen(file, ready.rig), *recordings(file, ready), *jumps(file, ready, estimate),
-        *carried(file, ready, estimate), *overlaps(ready.rig, estimate), *corners(file, ready.rig),
+        *carried(file, ready, estimate), *overlaps(ready.rig, estimate, course), *corners(file, ready.rig),
+        *unreachable(file, ready.rig, estimate, course), *apart(file, ready.rig, estimate, course),
+        *crossed(file, ready.rig, estimate, course), *overloads(file, ready.rig, estimate),
     ]  # fmt: skip
     if not any(one.severity == "error" for one in found):
         found += at_moments(file, ready, estimate)
@@ -149,12 +153,12 @@ def corners(file: RigFile, rig: Rig) -> Iterator[Finding]:
             )  # fmt: skip
 
 
-def overlaps(rig: Rig, estimate: Estimate) -> Iterator[Finding]:
+def overlaps(rig: Rig, estimate: Estimate, course: list[tuple[float, Course]]) -> Iterator[Finding]:
     """Things that lie in each other without a contact between them: at the start, and those whose course is known later."""
     said: set[tuple[str, str]] = set()
     contacts = {(contact.pad, contact.body) for contact in rig.contacts.values()}
     shaped = [name for name, body in rig.bodies.items() if body.shape is not None]
-    for time, pose in estimate.sampled(SAMPLES):
+    for time, pose in course:
         sure = [name for name in shaped if time == 0 or estimate.known(name)]
         lying = [
             (f"bodies.{a}", f"bodies.{b}", max(overlap(rig, a, b, pose), overlap(rig, b, a, pose)))

@@ -42,6 +42,7 @@ class Estimate:
         self.measured = {one.measured for one in self.loops}
         self.own = [name for name, one in file.actuators.items() if one.measured == one.pushes]
         self._past: list[tuple[float, Course]] = []
+        self.unbalanced: dict[float, str] = {}
 
     def known(self, body: str) -> bool:
         """Whether no coordinate of a body is left to the run."""
@@ -73,7 +74,7 @@ class Estimate:
             for pair in facing(self.rig, name, pose):
                 n = surface(self.rig.pads[self.rig.contacts[pair[0]].pad], pose).normal
                 deep = [pressed(self.rig, key, pose) for key in pair]
-                if sum(deep) > 0 and all(abs(n[i]) < 0.1 or self._is_own(name, i) for i in (0, 1)):
+                if sum(deep) > 0 and all(abs(n[i]) < 0.1 or self.is_own(name, i) for i in (0, 1)):
                     pose[name][:2] += 0.5 * (deep[0] - deep[1]) * n
         return pose
 
@@ -86,10 +87,10 @@ class Estimate:
             was, now = (np.mean([at[base] for base in bases], 0) for at in (before, pose))
             turn = now[2] - was[2]
             moved = np.append(now[:2] + turned(before[name][:2] - was[:2], turn), before[name][2] + turn)
-            own = [self._is_own(name, axis) for axis in range(3)]
+            own = [self.is_own(name, axis) for axis in range(3)]
             pose[name] = np.where(own, moved, pose[name])
 
-    def _is_own(self, body: str, axis: int) -> bool:
+    def is_own(self, body: str, axis: int) -> bool:
         """Whether a coordinate is free, and no loop measures it."""
         name = f"{body}.{COORDINATES[axis]}"
         return COORDINATES[axis] in self.file.bodies[body].free and name not in self.measured
@@ -102,18 +103,19 @@ class Estimate:
         for name in self.rig.bodies:
             for one, _ in facing(self.rig, name, pose):
                 n = surface(self.rig.pads[self.rig.contacts[one].pad], pose).normal
-                freed |= {(name, i) for i in (0, 1) if abs(n[i]) > ALONG and self._is_own(name, i)}
+                freed |= {(name, i) for i in (0, 1) if abs(n[i]) > ALONG and self.is_own(name, i)}
         if not freed:
             return pose
         held = {
             name: {axis: float(x[i]) for i, axis in enumerate(COORDINATES) if (name, i) not in freed}
             for name, x in pose.items()
         }
-        rig = assemble(self.file, held, loops=self.own)
+        rig = assemble(self.file, held, loops=self.own).requires_grad_(False)
         rig.reference = hold(**signals(self.rig, time))
         try:
             found = resting(rig, {name: torch.from_numpy(x) for name, x in pose.items()}, BALANCED)
-        except NoEquilibrium:
+        except NoEquilibrium as error:
+            self.unbalanced[time] = str(error)
             return pose
         return {name: x.numpy() for name, x in found.items()}
 

@@ -7,7 +7,6 @@ combinations of gains, pad stiffness and pad damping.
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,7 +15,6 @@ from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.motion import Reference, hold
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.solve.rates import Rates
 
 DISPLACEMENT, VELOCITY = 1e-9, 1e-8
 """Perturbations [m or rad], [m/s or rad/s] of the central differences: small against penetrations, so that nodes stick."""
@@ -25,27 +23,27 @@ NEUTRAL = 0.1
 """Growth rate [1/s] up to which a mode counts as neutral; the disc's angle is one."""
 
 
+AT_ONCE = 64
+"""Components that are perturbed in one call, which bounds the memory."""
+
+
 @torch.no_grad()
 def linearised(model: Rig, y: Tensor, reference: Reference, only: Sequence[int] | None = None) -> Tensor:
     """dy'/dy (size, size) at a state y (size,) of rest, with touching and sticking as they are there; `only` takes some of the
-    components, of a rig whose pads are massless."""
+    components. In plain torch: compiling the kernels would take longer."""
     size = torch.full((model.layout.size,), DISPLACEMENT, dtype=torch.float64)
     for (part, name), where in model.layout.slices.items():
         if part == "pads" and not model.pads[name].inertial:  # forces, counted by the displacement they make
             size[where] = DISPLACEMENT / float(model.pads[name].compliance().diagonal().max())
         elif part in ("rates", "velocity"):
             size[where] = VELOCITY
-    if any(pad.inertial for pad in model.pads.values()):
-        ahead, behind = (model(0.0, y + sign * torch.diag(size), reference) for sign in (1, -1))
-        return ((ahead - behind) / (2 * size[:, None])).mT
-    which = np.arange(len(size)) if only is None else np.array(only)
-    rates, at, out = Rates(model, reference), y.numpy(), np.empty((len(which), len(which)))
-    for column, i in enumerate(which):
-        there, one = [at.copy(), at.copy()], float(size[i])
-        there[0][i] += one
-        there[1][i] -= one
-        out[:, column] = ((rates(0.0, there[0]) - rates(0.0, there[1])) / (2 * one))[which]
-    return torch.from_numpy(out)
+    which = torch.arange(len(size)) if only is None else torch.tensor(only)
+    columns = []
+    for some in which.split(AT_ONCE):
+        d = torch.diag(size)[some]
+        ahead, behind = (model(0.0, y + sign * d, reference) for sign in (1, -1))
+        columns.append((ahead - behind)[:, which] / (2 * size[some, None]))
+    return torch.cat(columns).mT
 
 
 class Modes(NamedTuple):

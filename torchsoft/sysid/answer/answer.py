@@ -94,8 +94,8 @@ class AssumptionCheck:
     asked_sd: Number
     suspected: bool
     unchecked: str
-    value: Number = float("nan")  # of a known parameter, as the data would have it
-    under: dict[str, Number] = field(default_factory=dict)  # estimates with that amount, by label
+    value: Number  # of a known parameter, as the data would have it
+    under: dict[str, Number]  # estimates with that amount, by label
 
 
 @dataclass(frozen=True)
