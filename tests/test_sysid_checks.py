@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
 from torchsoft.sysid.checks.assumptions import PLACE, Assumption, assumptions, coulomb, remeshed, scaled, unramped
 from torchsoft.sysid.checks.checks import Check, Checked, check, doubted, notices
-from torchsoft.sysid.checks.variation import AMOUNTS, ended, refit, varied
+from torchsoft.sysid.checks.variation import AMOUNTS, difference, ended, refit, varied
+from torchsoft.sysid.conclude import notices_on
 from torchsoft.sysid.problem.prediction import predict
 from torchsoft.sysid.problem.workers import Runner
 
@@ -112,6 +114,11 @@ def test_the_cause_is_named_with_its_amount(
     (one,) = (one for one in found.checks if one.name == name)
     assert one.wanted
     assert one.asked == pytest.approx(asked, rel=0.1, abs=4 * one.asked_sd)
+    if one.parameter:
+        assert one.value == pytest.approx((1 + one.asked / 100) * BASE.table()[name]["value"], rel=1e-9)
+        assert f"with {name} = {one.value:.6g} (" in notices(found)[0]
+    assert "estimates under it: pad.E = " in notices(found)[0]
+    assert one.under["pad.E"] == pytest.approx(TRUTH["pad.E"], rel=0.02)
     assert notices(found)[0].startswith(says)
 
 
@@ -236,3 +243,31 @@ def test_a_negative_mass_explains_nothing(asked: float, refitted: bool, unit: st
     """A number of the rig that would have to vanish is no cause, and ends no search for one."""
     one = Check("disc.mass", "known", "", "", 1.0, unit, {}, 1e6, 1e3, asked, 5.0, 1e6, refitted=refitted)
     assert one.wanted is wanted
+
+
+def test_an_interrupt_among_the_assumptions_keeps_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+
+    def interrupted(*args: object) -> object:
+        calls.append(args)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+        return difference(*args)  # pyright: ignore[reportArgumentType]
+
+    monkeypatch.setattr("torchsoft.sysid.checks.checks.difference", interrupted)
+    problem = Problem([recorded()], SENSORS, {name: Unknown() for name in TRUTH})
+    answer = identify(problem, plan=[Stage("all", problem.names, problem.coordinates.labels, RTOL)])
+    assert answer["pad.E"].value == pytest.approx(TRUTH["pad.E"], rel=0.01)
+    assert any("interrupted, so these were not tried: " in text for text in answer.notices)
+    assert answer.made_by["untried"][0] == "mesh phase"
+    assert {one.name for one in answer.assumptions} >= {"mesh", "contact points", "disc.radius"}
+
+
+def test_no_bound_is_to_be_widened_for_what_is_not_identifiable() -> None:
+    def one(identifiable: bool) -> SimpleNamespace:
+        return SimpleNamespace(
+            identifiable=identifiable, at_bound=True, relative_sd=2.0, label="a", last=1.0, step_bias_sd=0.0
+        )
+
+    assert not any("widen" in text for text in notices_on([one(False)], True, 1e-5, False))
+    assert any("widen" in text for text in notices_on([one(True)], True, 1e-5, False))

@@ -308,6 +308,16 @@ def test_a_rate_that_is_not_that_of_its_set_point_is_named(recordings: dict[str,
         assert words in found.sentence
 
 
+def test_a_clock_that_is_off_is_no_reason_for_closer_rows(recordings: dict[str, Recording]) -> None:
+    one = at_rows(recordings["shaking"], 1000.0, rates=True)
+    x_d = one.rig.reference["x_d"]
+    assert isinstance(x_d, Sampled)
+    other: Any = Sampled(1.001 * x_d.times, x_d.values.detach(), x_d.rates)
+    found = list(setpoint_findings(noted(one, x_d=other), SENSORS))
+    assert [f.what for f in found] == ["rate of x_d"]
+    assert "is a clock, or a unit of time, a little off?" in found[0].sentence
+
+
 def test_findings_of_a_kind_are_said_once_and_refused_unless_they_are_meant() -> None:
     found = together([
         Finding("sign of F_x", "a", "F_x looks wrong", grave=True), Finding("zero of F_y", "a", "F_y is off"),

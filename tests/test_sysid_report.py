@@ -81,6 +81,19 @@ def found() -> Found:
     return identify(problem, plan=plan, tightenings=0, heldout=["held"], assumptions="trusted"), problem
 
 
+def test_the_first_line_says_when_the_model_does_not_explain_the_data(found: Found) -> None:
+    """Whatever colour was found: it is the noise that sensors state that counts."""
+    answer, problem = found
+    assert answer.chi2_stated == pytest.approx(answer.chi2, rel=0.05)
+    assert answer.headline.startswith("4 of 6 parameters identifiable, ")
+    residuals = [replace(one, stated=29.0 if one.channel == "F_y" else 1.0) for one in answer.residuals]
+    bad = replace(answer, residuals=residuals, chi2_stated=200.0)
+    first = "The model does not explain the data: residuals of F_y are 29 times the stated noise"
+    assert bad.table().startswith(first)
+    assert "200 against the stated noise" in bad.headline
+    assert first in page(bad, *traces(bad, problem, None))
+
+
 def test_a_prediction_with_values_that_nothing_tells_says_so(found: Found) -> None:
     """Of the unknown that is the held-out recording's own."""
     answer, _ = found
@@ -94,7 +107,7 @@ def full(found: Found) -> IdentificationResult:
     answer, _ = found
     E = answer["pad.E"].last
     harmless = AssumptionCheck(
-        "a", "known", "<b> is so", "it were not", 2.0, "%", {"pad.E": 0.1}, 0.5, 0.3, 1.2, False, ""
+        "a", "known", "<b> is so", "it were not", 2.0, "%", {"pad.E": 0.1}, 0.5, 0.3, 1.2, False, "", 1.0, {}
     )
     checks = [
         harmless,

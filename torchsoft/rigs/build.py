@@ -136,8 +136,8 @@ def too_stiff(file: RigTables, rig: Rig) -> str:
         if ratio > STIFF:
             law, K_n = file.contacts[name].law, contact.law.K_n.item()
             return (
-                f"laws.{law}.K_n: no rest is found with {K_n:g} N/m, {ratio:.2g} times as stiff as the pad `{contact.pad}` that it "
-                f"presses; take {K_n * STIFF / ratio:.1g} N/m or less, the pad gives way long before the contact does"
+                f"laws.{law}.K_n: no rest is found with {K_n:g} N/m, {ratio:.2g} times as stiff as the pad `{contact.pad}`"
+                f" that it presses; take {K_n * STIFF / ratio:.1g} N/m or less, the pad gives way long before the contact does"
             )
     return ""
 
