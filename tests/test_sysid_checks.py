@@ -118,7 +118,7 @@ def test_the_cause_is_named_with_its_amount(
         assert one.value == pytest.approx((1 + one.asked / 100) * BASE.table()[name]["value"], rel=1e-9)
         assert f"with {name} = {one.value:.6g} (" in notices(found)[0]
     assert "estimates under it: pad.E = " in notices(found)[0]
-    assert one.under["pad.E"] == pytest.approx(TRUTH["pad.E"], rel=0.02)
+    assert one.under["pad.E"] == pytest.approx(TRUTH["pad.E"], rel=0.05)
     assert notices(found)[0].startswith(says)
 
 

@@ -53,6 +53,7 @@ from torchsoft.sysid.report.figures import (
     trace_figure,
 )
 from torchsoft.sysid.report.page import grouped, table
+from torchsoft.sysid.report.report import page as page_of
 from torchsoft.sysid.report.report import report, traces
 
 Found = tuple[IdentificationResult, Problem]
@@ -91,7 +92,7 @@ def test_the_first_line_says_when_the_model_does_not_explain_the_data(found: Fou
     first = "The model does not explain the data: residuals of F_y are 29 times the stated noise"
     assert bad.table().startswith(first)
     assert "200 against the stated noise" in bad.headline
-    assert first in page(bad, *traces(bad, problem, None))
+    assert first in page_of(bad, *traces(bad, problem, None))
 
 
 def test_a_prediction_with_values_that_nothing_tells_says_so(found: Found) -> None:
