@@ -1,15 +1,25 @@
 """Files appear whole or not at all, last, and leave nothing behind."""
 
+import errno
 import json
 import os
 import subprocess
 import sys
+import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from torchsoft.files import PARTIAL, remove_partials, replacing, sealed, unsealed, write_json
+from torchsoft import csvfile
+from torchsoft.files import PARTIAL, claim, remove_partials, replacing, sealed, unsealed, write_json
+from torchsoft.physics.mesh.file import read_quads
+from torchsoft.rigs.network import LOOP, read_network
+from torchsoft.rigs.recorded import read_column
+from torchsoft.solve.trajectory import load
+from torchsoft.sysid.answer.answer import load_answer
+from torchsoft.tables import line, plain, read_toml
 
 DIE = """
 import os, sys
@@ -108,3 +118,72 @@ def test_json_takes_numpys_numbers_and_leaves_out_what_is_not_finite(tmp_path: P
     content = {"a": np.int64(3), "b": [np.float64(0.5), np.float32(np.nan), np.bool_(True)], "c": (float("inf"), "x")}
     write_json(tmp_path / "file.json", content)
     assert json.loads((tmp_path / "file.json").read_text()) == {"a": 3, "b": [0.5, None, True], "c": [None, "x"]}
+
+
+@pytest.mark.parametrize(
+    ("read", "name"),
+    [
+        (read_toml, "a.toml"),
+        (lambda path: csvfile.read(path, {}, lambda *_: ""), "a.csv"),
+        (lambda path: read_column(path, "x", "m"), "a.csv"),
+        (lambda path: read_network(path, LOOP), "a.npz"),
+        (lambda path: read_quads(path, "m"), "a.msh"),
+        (load, "a.nc"),
+        (load_answer, "a.json"),
+    ],
+)
+def test_only_regular_files_of_a_stated_size_are_read(
+    read: Callable[[Path], object], name: str, tmp_path: Path
+) -> None:
+    pipe, device, large = (tmp_path / kind / name for kind in ("pipe", "device", "large"))
+    for path in (pipe, device, large):
+        path.parent.mkdir()
+    os.mkfifo(pipe)
+    device.symlink_to("/dev/zero")
+    with large.open("wb") as file:
+        file.truncate(2**42)  # a hole
+    for path, words in (
+        (pipe, "is no regular file"),
+        (device, "is no regular file"),
+        (large, "MB, but at most"),
+    ):
+        with pytest.raises(ValueError, match=words) as refusal:
+            read(path)
+        assert str(path) in str(refusal.value)
+
+
+def test_an_archive_that_declares_too_many_numbers_is_refused_unread(tmp_path: Path) -> None:
+    path = tmp_path / "law.npz"
+    with zipfile.ZipFile(path, "w") as archive, archive.open("0.weight.npy", "w") as member:
+        np.lib.format.write_array_header_1_0(
+            member, {"descr": "<f8", "fortran_order": False, "shape": (4_000_000, 1000)}
+        )
+    with pytest.raises(ValueError, match=r"law\.npz is not an \.npz file of numbers: it has more than 2000 numbers"):
+        read_network(path, LOOP)
+
+
+def test_a_full_disk_names_the_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("torchsoft.files.flush", full)
+    with pytest.raises(OSError, match="No space left") as refusal:
+        write_json(tmp_path / "summary.json", {})
+    assert refusal.value.filename == str(tmp_path / "summary.json")
+
+
+def test_a_folder_of_other_files_is_not_written_to(tmp_path: Path) -> None:
+    other, own = tmp_path / "other", tmp_path / "own"
+    other.mkdir()
+    (other / "summary.json").write_text("mine")
+    with pytest.raises(ValueError, match=r"--out: .*other holds summary\.json, which is no result .* say --force"):
+        claim(other)
+    claim(other, force=True)
+    for _ in range(2):
+        claim(own)
+        write_json(own / "summary.json", {"torchsoft": "0"})
+
+
+def test_characters_that_a_terminal_obeys_are_escaped() -> None:
+    assert plain("a\x1b[31mb\u202ec\u200b\nd é µ") == "a\\x1b[31mb\\u202ec\\u200b\nd é µ"
+    assert line("a\x07\n b") == "a\\x07 b"

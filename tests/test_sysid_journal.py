@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from torchsoft.sysid.problem import workers
-from torchsoft.sysid.problem.journal import MARKER, Journal, decoded, encoded, forget
+from torchsoft.sysid.problem.journal import CHECKPOINT, Journal, decoded, encoded, forget
 from torchsoft.sysid.problem.prediction import FailedRun, Frozen, Misfit, Prediction
 from torchsoft.sysid.problem.workers import Job, Runner
 
@@ -170,7 +170,7 @@ def test_only_its_own_files_are_removed(tmp_path: Path) -> None:
     for other in others:
         (folder / other).write_text("mine")
     forget(folder)
-    assert sorted(path.name for path in folder.iterdir()) == sorted([*others, MARKER])
+    assert sorted(path.name for path in folder.iterdir()) == sorted([*others, CHECKPOINT])
     journal(folder)  # it is still one of ours
     for other in others:
         (folder / other).unlink()

@@ -13,7 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchsoft.files import check_file
 from torchsoft.tables import line, shown
+
+LARGEST = 2e9
+"""Size [B] of a CSV file at the most."""
 
 Units = Mapping[str, float]
 """Units that a column may have, and what they are in SI."""
@@ -35,7 +39,7 @@ def read(path: Path, known: Mapping[str, Units], hint: Hint, ignore: Collection[
     values: list[list[float]] = []
     rows: list[int] = []
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with check_file(path, LARGEST).open(newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file)
             first = next(reader, [])
             head = heading(path, first, known, hint, ignore)

@@ -1,9 +1,11 @@
 """Files: written whole or not at all and made to last, and JSON without infinities."""
 
+import errno
 import json
 import os
 import re
 import secrets
+import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from glob import escape
@@ -20,6 +22,12 @@ except ImportError:  # no such locks: partial files are then left where they are
 
 SEAL, DIGEST = b"\ntorchsoft-sha256\n", 64
 """How a file with a checksum ends, and the length of the checksum before."""
+
+SEALED = 64e9
+"""Size [B] of a file with a checksum at the most."""
+
+CHECKPOINT = "torchsoft-checkpoint"
+"""File that marks a folder of unfinished runs."""
 
 PARTIAL = re.compile(r"\.[0-9a-f]{16}\.partial$")
 """How the name of a partial file ends, after the name of the file that it becomes."""
@@ -43,8 +51,10 @@ def replacing(path: str | Path) -> Iterator[Path]:
         yield partial
         flush(partial)
         partial.replace(path)
-    except BaseException:
+    except BaseException as error:
         partial.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename in (None, str(partial), partial):
+            error.filename = str(path)  # a full disk does not say for which file
         raise
     finally:
         os.close(handle)
@@ -86,6 +96,50 @@ def make_folder(path: Path) -> None:
         flush_folder(path.parent)
 
 
+MEGABYTE = 1e6
+
+RESULTS = {"summary.json": 100e6, "answer.json": 1e9}
+"""Files by which a folder of results is known, with their size [B] at the most."""
+
+
+def claim(folder: Path, force: bool = False) -> None:
+    """Make a folder for results, or take one that results were written to. Raises `ValueError` for a folder of anything else,
+    unless by `force`, and `OSError`."""
+    make_folder(folder)
+    if not force and not is_results(folder) and (there := sorted(folder.iterdir())):
+        raise ValueError(
+            f"--out: {folder} holds {there[0].name}, which is no result of torchsoft and might be overwritten; name a new "
+            "folder, or say --force"
+        )
+
+
+def is_results(folder: Path) -> bool:
+    """Whether results of this package were written to a folder, or were begun."""
+    for name, most in RESULTS.items():
+        with suppress(OSError, ValueError):
+            if b'"torchsoft' in check_file(folder / name, most).read_bytes():
+                return True
+    return any(folder.glob(f"*/{CHECKPOINT}"))
+
+
+def check_file(path: str | Path, most: float) -> Path:
+    """The path of a file that may be read whole. Raises `ValueError` for a device, a pipe, and a file of more than `most` [B];
+    `OSError` where there is none."""
+    status = os.stat(path)
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(status.st_mode):
+        raise ValueError(
+            f"{path} is no regular file but a device or a pipe; copy what it gives to a file, and name that"
+        )
+    if status.st_size > most:
+        raise ValueError(
+            f"{path} has {status.st_size / MEGABYTE:.3g} MB, but at most {most / MEGABYTE:.3g} MB are read of such a file; "
+            "is it the right one?"
+        )
+    return Path(path)
+
+
 def flush(path: Path) -> None:
     """Have the operating system write a file to the disk."""
     handle = os.open(path, os.O_RDONLY)
@@ -111,7 +165,7 @@ def unsealed(path: str | Path) -> bytes:
 
     The libraries that read a format may hang or crash with a damaged file, and say nothing of it.
     """
-    whole = Path(path).read_bytes()
+    whole = check_file(path, SEALED).read_bytes()
     content = whole[: -DIGEST - len(SEAL)]
     if not whole.endswith(SEAL):
         raise ValueError(

@@ -10,8 +10,11 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self, TypeVar
+from unicodedata import category
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Strict, ValidationError, WithJsonSchema
+
+from torchsoft.files import check_file
 
 T = TypeVar("T")
 
@@ -23,6 +26,9 @@ SHOWN = 3
 
 SEED = 2**63 - 1
 """Largest seed: the largest integer of TOML."""
+
+LARGEST = 10e6
+"""Size [B] of a TOML file at the most."""
 
 Number = Annotated[
     float,
@@ -134,14 +140,23 @@ def shown(value: Any) -> str:
     return line(SHORT.repr(value), 120)
 
 
+def plain(text: str) -> str:
+    """Text in which characters that a terminal obeys or that turn the direction of writing are escaped; lines stay."""
+    seen = (
+        c if c.isprintable() or c == "\n" or category(c) == "Zs" else c.encode("unicode_escape").decode() for c in text
+    )
+    return "".join(seen)
+
+
 def line(text: Any, length: int = 600) -> str:
-    """Text as one line of limited length."""
-    one = " ".join(str(text).split())
+    """Text as one line of limited length, without control characters."""
+    one = plain(" ".join(str(text).split()))
     return one if len(one) <= length else one[: length - 3] + "..."
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
     """A TOML file. Raises `ValueError` naming it for what is not TOML in UTF-8, and `OSError`."""
+    check_file(path, LARGEST)
     try:
         return tomllib.loads(Path(path).read_bytes().removeprefix(b"\xef\xbb\xbf").decode("utf-8"))
     except RecursionError:

@@ -17,7 +17,7 @@ from hostile.trial import Tally
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import IdentificationResult, Problem, Sensor, Unknown, identify, record
-from torchsoft.sysid.problem.journal import MARKER, Journal, forget
+from torchsoft.sysid.problem.journal import CHECKPOINT, Journal, forget
 from torchsoft.sysid.problem.workers import Runner
 
 pytestmark = pytest.mark.slow
@@ -197,9 +197,9 @@ def test_folders_of_others_are_left_alone(
             (folder / name).mkdir() if rng.random() < 0.3 else (folder / name).write_bytes(rng.bytes(9))
         if not ours:
             refused.call(f"{number}", lambda folder=folder: Runner([], journal=folder), (ValueError,))
-            refused.held(not (folder / MARKER).exists(), f"{number}: marked")
+            refused.held(not (folder / CHECKPOINT).exists(), f"{number}: marked")
         forget(folder)
-        left = sorted(path.name for path in folder.iterdir() if path.name != MARKER)
+        left = sorted(path.name for path in folder.iterdir() if path.name != CHECKPOINT)
         kept.held(left == sorted(others), f"{number}: {left} of {others}")
 
 

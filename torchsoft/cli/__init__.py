@@ -4,12 +4,53 @@ import argparse
 import io
 import os
 import shlex
+import signal
 import sys
+import threading
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from torchsoft.cli import identify, material, rigs
 from torchsoft.cli.failure import failed
+from torchsoft.cli.results import say
+
+GRACE = 1.5
+"""Time [s] that a command has to hear Ctrl-C, before its process ends at once: a factorisation does not hear it."""
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Ends the process `GRACE` after a Ctrl-C that Python has not come to hear, since it is inside a library's long call."""
+    ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if not ours or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    heard, (read, write) = threading.Event(), os.pipe()
+    os.set_blocking(write, False)
+
+    def hear(*_: object) -> None:
+        heard.set()
+        raise KeyboardInterrupt
+
+    def watch() -> None:
+        if os.read(read, 1) == bytes([signal.SIGINT]) and not heard.wait(GRACE):
+            os.write(2, b"\ninterrupted\n")
+            os._exit(130)
+
+    watcher = threading.Thread(target=watch, daemon=True)
+    before = signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+    signal.signal(signal.SIGINT, hear)
+    watcher.start()
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.set_wakeup_fd(before)
+        os.write(write, b"\0")
+        watcher.join()
+        os.close(read)
+        os.close(write)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -26,8 +67,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     options = parser.parse_args(given)
     options.command = shlex.join(["torchsoft", *(os.fsencode(one).decode("utf-8", "replace") for one in given)])
-    with warnings.catch_warnings():
-        warnings.showwarning = lambda message, *_, **__: print(f"torchsoft: note: {message}", file=sys.stderr)
+    with warnings.catch_warnings(), interruptible():
+        warnings.showwarning = lambda message, *_, **__: say(f"torchsoft: note: {message}", error=True)
         try:
             return options.run(options)
         except (ValueError, RuntimeError) as error:

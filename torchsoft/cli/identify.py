@@ -1,13 +1,12 @@
 """Identification from files."""
 
 import argparse
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from torchsoft.cli.failure import failed
-from torchsoft.cli.results import try_folder
+from torchsoft.cli.results import add_out, say, try_folder
 
 IDENTIFY = """\
 Which parameters explain these recordings, and how sure is that?
@@ -28,7 +27,7 @@ def add_commands(commands: Any) -> None:
     one.add_argument(
         "files", nargs="+", type=Path, metavar="DATA.csv ... CONFIG.toml", help="data files and one configuration"
     )
-    one.add_argument("--out", type=Path, default=Path("out/identify"), help="folder for the results (%(default)s)")
+    add_out(one, default=Path("out/identify"), help="folder for the results (%(default)s)")
     one.add_argument("--workers", type=int, help="threads, one recording each (fit.workers)")
     one.add_argument("--rtol", type=float, help="relative tolerance that chooses the simulation's steps (fit.rtol)")
     one.add_argument("--checkpoint", type=Path, help="folder for what is unfinished (OUT/unfinished)")
@@ -64,7 +63,7 @@ def identify(options: argparse.Namespace) -> int:
             priced = (fit.rtol, fit.starts, fit.workers, heldout, fit.method)
             expected = one_by_one(cost(problem, *priced) for problem in problems)
             agree(expected, options.yes, "take a larger rtol, fewer starts or less data")
-            try_folder(options.out)
+            try_folder(options.out, options.force)
             result = identify(
                 case.problem, heldout=heldout, meant=case.config.meant, checkpoint=unfinished,
                 progress=not options.no_progress, **fit.model_dump(),
@@ -82,15 +81,16 @@ def identify(options: argparse.Namespace) -> int:
         except OSError as error:
             return failed(f"{error.filename}: {error.strerror}" if error.filename else str(error))
     except KeyboardInterrupt:
-        print(f"\ninterrupted; what is done so far is in {unfinished}, and the same command continues", file=sys.stderr)
+        say(f"\ninterrupted; what is done so far is in {unfinished}, and the same command continues", error=True)
         return 130
-    print(result.table())
+    say(result.table())
     for notice in result.notices:
-        print(f"note: {notice}")
-    print(verdict, end="")
+        say(f"note: {notice}")
+    if verdict:
+        say(verdict)
     if result.made_by["untried"]:
-        print(f"\ninterrupted; the same command continues with what is in {unfinished}", file=sys.stderr)
-    print(f"{result.cost['wall_s']:.0f} s; written to {options.out / 'answer.json'} and {options.out / 'report.html'}")
+        say(f"\ninterrupted; the same command continues with what is in {unfinished}", error=True)
+    say(f"{result.cost['wall_s']:.0f} s; written to {options.out / 'answer.json'} and {options.out / 'report.html'}")
     return 130 if result.made_by["untried"] else 0
 
 
@@ -110,4 +110,4 @@ def compared(case: Any, fit: Any, options: argparse.Namespace) -> str:
         forget(folder / name)
     if folder.is_dir() and not any(folder.iterdir()):
         folder.rmdir()
-    return f"{answer.table()}\n{answer.verdict}\nwritten to {options.out / 'comparison.json'}\n"
+    return f"{answer.table()}\n{answer.verdict}\nwritten to {options.out / 'comparison.json'}"

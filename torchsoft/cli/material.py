@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.results import try_folder
+from torchsoft.cli.results import add_out, say, try_folder
 
 MATERIAL_FIT = """\
 Which material relaxes, or creeps, as this one did?
@@ -34,7 +34,7 @@ def add_material_commands(commands: Any) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     one.add_argument("file", type=Path, metavar="FILE.csv", help="the test")
-    one.add_argument("--out", type=Path, default=Path("out/material"), help="folder for the results (%(default)s)")
+    add_out(one, default=Path("out/material"), help="folder for the results (%(default)s)")
     one.add_argument(
         "--test", choices=("relaxation", "creep"), help="what was put on: strain, or stress (what was held)"
     )
@@ -63,15 +63,15 @@ def fit_material(options: argparse.Namespace) -> int:
     given = {name: getattr(options, name) for name in ("nu", "rho", "depth")}
     pad = Parameters().override({f"pad.{name}": x for name, x in given.items() if x is not None}).pad
     found = fit(read(options.file, **asked), terms=options.terms)
-    try_folder(options.out)
+    try_folder(options.out, options.force)
     write(found, options.out, {name: getattr(pad, name) for name in given}, {**asked, "terms": options.terms, **given})
-    print(printed(found))
-    print(f"written to {', '.join(str(options.out / name) for name in FILES)}")
+    say(printed(found))
+    say(f"written to {', '.join(str(options.out / name) for name in FILES)}")
     return 0
 
 
 def list_presets(options: argparse.Namespace) -> int:
     from torchsoft.materials.presets import PRESETS as presets
 
-    print("\n".join(one.described() for one in presets.values()))
+    say("\n".join(one.described() for one in presets.values()))
     return 0

@@ -1,15 +1,30 @@
 """The folder that a command writes its results to."""
 
+import sys
 from pathlib import Path
 from tempfile import TemporaryFile
+from typing import Any
 
-from torchsoft.files import make_folder
+from torchsoft.files import claim
+from torchsoft.tables import plain
 
 
-def try_folder(out: Path) -> None:
-    """Make the folder, and try that files can be written to it. Raises `ValueError` where they cannot."""
+def add_out(command: Any, **more: Any) -> None:
+    """The options on the folder."""
+    command.add_argument("--out", type=Path, **more)
+    command.add_argument("--force", action="store_true", help="write to a folder that holds other files")
+
+
+def say(*text: object, error: bool = False) -> None:
+    """Print text without characters that a terminal obeys."""
+    print(plain(" ".join(map(str, text))), file=sys.stderr if error else sys.stdout)
+
+
+def try_folder(out: Path, force: bool) -> None:
+    """Make the folder, and try that files can be written to it. Raises `ValueError` where they cannot, and for a folder of
+    other files, unless by `force`."""
     try:
-        make_folder(out)
+        claim(out, force)
         with TemporaryFile(dir=out):
             pass
     except OSError as error:

@@ -2,12 +2,11 @@
 
 import argparse
 import shlex
-import sys
 from pathlib import Path
 from typing import Any
 
 from torchsoft.cli.failure import failed
-from torchsoft.cli.results import try_folder
+from torchsoft.cli.results import add_out, say, try_folder
 
 RUN = """\
 Simulates the rig that a TOML file describes, and writes trajectory.nc, summary.json, figures and a video to a folder.
@@ -30,15 +29,17 @@ def add_commands(commands: Any) -> None:
         "run", help="simulate a rig file", description=RUN, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     one.add_argument("file", type=Path, metavar="RIG.toml", help="the rig")
-    one.add_argument("--out", type=Path, help="folder for the results (out/RIG)")
+    add_out(one, help="folder for the results (out/RIG)")
     one.add_argument("--anyway", action="store_true", help="run even what the check finds wrong")
     one.add_argument("--no-progress", action="store_true", help="show no progress")
+    one.add_argument("--yes", action="store_true", help="begin without asking, however long it takes")
     one.set_defaults(run=run_rig)
     one = commands.add_parser(
         "check", help="say what is wrong in a rig file", description=CHECK,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     one.add_argument("file", type=Path, metavar="RIG.toml", help="the rig")
+    one.add_argument("--yes", action="store_true", help="begin without asking, however long it takes")
     one.set_defaults(run=check_rig)
     one = commands.add_parser(
         "init", help="write a rig file to start from", description=INIT,
@@ -50,27 +51,30 @@ def add_commands(commands: Any) -> None:
 
 def run_rig(options: argparse.Namespace) -> int:
     """Check a rig file, simulate it, and write what came of it."""
+    from torchsoft.cost import agree
     from torchsoft.rigs import RigFile
     from torchsoft.rigs.check import check
+    from torchsoft.rigs.cost import cost
     from torchsoft.rigs.run import run
     from torchsoft.solve.progress import SimulationFailed
 
     out: Path = options.out or Path("out") / options.file.stem
     file = RigFile.from_toml(options.file)
+    agree(cost(file, runs=True), options.yes, "take fewer elements, a larger rtol or step, or a shorter duration")
     found = check(file)
     for one in found:
-        print(one, file=sys.stderr)
+        say(one, error=True)
     if any(one.severity == "error" for one in found) and not options.anyway:
         return failed(f"{options.file} is not run; mend what is wrong, or say --anyway")
-    try_folder(out)
+    try_folder(out, options.force)
     done = run(file, out, found=found, progress=not options.no_progress)
     if isinstance(done.stopped, SimulationFailed):
         return failed(f"{done.stopped.reason}; what was simulated until then is in {out}")
     if done.stopped is not None:
-        print(f"\ninterrupted; what was simulated until then is in {out}", file=sys.stderr)
+        say(f"\ninterrupted; what was simulated until then is in {out}", error=True)
         return 130
     stats = done.trajectory.stats
-    print(
+    say(
         f"{float(done.trajectory.t[-1]):g} s simulated in {stats.wall_s:.2g} s ({stats.steps} steps), energies balanced to "
         f"{done.trajectory.energy_residual_rel:.1e} of what was injected; written to {out}"
     )
@@ -79,14 +83,18 @@ def run_rig(options: argparse.Namespace) -> int:
 
 def check_rig(options: argparse.Namespace) -> int:
     """Say what is wrong in a rig file."""
+    from torchsoft.cost import agree
     from torchsoft.rigs import RigFile
     from torchsoft.rigs.check import check
+    from torchsoft.rigs.cost import cost
 
-    found = check(RigFile.from_toml(options.file))
+    file = RigFile.from_toml(options.file)
+    agree(cost(file, runs=False), options.yes, "take fewer elements")
+    found = check(file)
     for one in found:
-        print(one)
+        say(one)
     count = {kind: sum(one.severity == kind for one in found) for kind in ("error", "warning")}
-    print(f"{options.file}: {count['error']} errors, {count['warning']} warnings")
+    say(f"{options.file}: {count['error']} errors, {count['warning']} warnings")
     return 2 if count["error"] else 0
 
 
@@ -105,5 +113,5 @@ def init_rig(options: argparse.Namespace) -> int:
     except FileExistsError:
         return failed(f"{path} is there already; take another name")
     check, run = (shlex.join(["torchsoft", command, str(path)]) for command in ("check", "run"))
-    print(f"written to {path}; {check} looks it over, {run} simulates it")
+    say(f"written to {path}; {check} looks it over, {run} simulates it")
     return 0

@@ -1,6 +1,6 @@
 """Re-read a dataset and list what is wrong with it: `python -m data_gen.check DIR`.
 
-One line a finding; exit status 1 if there is any. Writes `coverage.png`, what the set covers.
+One line a finding; exit status 1 if there is any. `--picture FILE` draws what the set covers.
 """
 
 import argparse
@@ -170,7 +170,7 @@ def summary(url: str) -> str:
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m data_gen.check", description=__doc__)
     parser.add_argument("store", help="folder or fsspec URL")
-    parser.add_argument("--picture", type=Path, default=Path("coverage.png"), help="where to write the picture")
+    parser.add_argument("--picture", type=Path, help="where to write a picture of what the set covers")
     given = parser.parse_args(arguments)
     count = 0
     for count, finding in enumerate(check(given.store), 1):
@@ -178,8 +178,9 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         print(summary(given.store))
         config = Config.model_validate_json(json.dumps(Manifest.read(given.store).config))
-        save(figure(open_dataset(given.store, unfinished=True), config), given.picture, dpi=120)
-        print(f"picture in {given.picture}")
+        if given.picture is not None:
+            save(figure(open_dataset(given.store, unfinished=True), config), given.picture, dpi=120)
+            print(f"picture in {given.picture}")
     except Exception as error:  # a damaged store has been reported above; the picture must not hide it
         count += 1
         print(line(f"no summary or picture: {type(error).__name__}: {error}"))

@@ -1,20 +1,26 @@
 """Control laws that are networks, from files of weights: data that are computed with, never programs that are run."""
 
+import io
 import re
 import zipfile
 from collections.abc import Sequence
+from math import prod
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from torchsoft.files import check_file
 from torchsoft.physics.controllers import StateFeedback
 from torchsoft.physics.parts import PD
 from torchsoft.tables import line
 
 WEIGHTS = 2000
 """Numbers of a network at the most: every one of them becomes machine code."""
+
+LARGEST = 10e6
+"""Size [B] of a file of weights at the most."""
 
 PYTHON = (
     "a module of another kind is given in Python: torchsoft.Actuator(measures, pushes, module, setpoint=...) or "
@@ -64,7 +70,10 @@ def read_network(path: Path, inputs: Sequence[str], efforts: int = 1) -> nn.Sequ
             f"{path} is not an .npz file: weights are data, and other files may be programs, which are not run; save them by "
             f"numpy.savez(file, **network.state_dict()). {PYTHON}"
         )
+    check_file(path, LARGEST)
     try:
+        if declared(path) > WEIGHTS:
+            raise ValueError(f"it has more than {WEIGHTS} numbers, which are too many to be compiled")
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: np.asarray(file[name]) for name in file.files}
     except (ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
@@ -73,6 +82,20 @@ def read_network(path: Path, inputs: Sequence[str], efforts: int = 1) -> nn.Sequ
         return layers(arrays, inputs, efforts)
     except ValueError as error:
         raise ValueError(f"{path}: {error}. {PYTHON}") from None
+
+
+def declared(path: Path) -> int:
+    """Numbers that the headings of an .npz file declare, before any is read. Raises `ValueError` for another kind of file."""
+    total = 0
+    with zipfile.ZipFile(path) as archive:
+        for info in archive.infolist():
+            if info.file_size > LARGEST:  # unpacked
+                return WEIGHTS + 1
+            member = io.BytesIO(archive.read(info))
+            version = np.lib.format.read_magic(member)
+            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            total += prod(read(member)[0])
+    return total
 
 
 def layers(arrays: dict[str, np.ndarray], inputs: Sequence[str], efforts: int) -> nn.Sequential:

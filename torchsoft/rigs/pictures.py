@@ -9,6 +9,7 @@ from torchsoft.plot import figures, general
 from torchsoft.plot.animation import animate
 from torchsoft.rigs.build import RigFile
 from torchsoft.solve.trajectory import Trajectory
+from torchsoft.tables import plain
 
 SNAPSHOTS = 6
 """Pictures of the run where the file does not say when."""
@@ -18,7 +19,7 @@ def draw(file: RigFile, rig: Rig, run: Trajectory, out: Path, progress: bool) ->
     """Write the figures and the video that a file asks for to `out`; the names of the files written."""
     end, written = float(run.t[-1]), []
     times = [t for t in file.outputs.snapshots if t <= end] or [i * end / (SNAPSHOTS - 1) for i in range(SNAPSHOTS)]
-    title = file.title or "Bodies, pads and contact forces"
+    title = plain(file.title) or "Bodies, pads and contact forces"
     made = {
         "snapshots": lambda: figures.snapshots(run, rig, times, title),
         "motion": lambda: general.motions(run, rig),

@@ -7,6 +7,7 @@ import numpy as np
 
 from torchsoft import csvfile
 from torchsoft.channels import UNITS
+from torchsoft.files import check_file
 from torchsoft.tables import line
 
 
@@ -41,7 +42,7 @@ def read_column(path: Path, column: str, unit: str) -> tuple[list[float], list[f
 def names(path: Path) -> list[str]:
     """The names in the heading of a file, without their units."""
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
+        with check_file(path, csvfile.LARGEST).open(newline="", encoding="utf-8-sig") as file:
             return [cell.partition("[")[0].strip() for cell in next(csv.reader(file), [])]
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path} is not a CSV file in UTF-8: {line(error)}") from None

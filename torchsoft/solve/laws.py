@@ -115,15 +115,15 @@ def compiled_law(
             return tuple(graph.ops), repr(graph.args), tuple(outputs), shapes, linear, differentiated
 
         if not known:  # what somebody's own code does is known from running it only, and may change any time
-            check_backward(law, example, names)
             key = expressions()
-        if key not in _laws:
-            if not known and expressions() != key:
+            if expressions() != key:
                 raise UnknownOperation(
                     "The law is another one when it is called again, so it keeps something of a call."
                 )
+            check_backward(law, example, names)
             if points:
                 check_pointwise(law, example, names)
+        if key not in _laws:
             _laws[key] = compile_law(law, example, names, linear=linear, differentiated=differentiated)
         return _laws[key]
 

@@ -23,6 +23,7 @@ from torchsoft.sysid.problem.problem import Problem, Residuals
 from torchsoft.sysid.problem.recording import Array
 from torchsoft.sysid.problem.workers import Runner
 from torchsoft.sysid.settings import RTOL, Assumed, Settings
+from torchsoft.tables import plain
 
 
 def identify(
@@ -65,7 +66,7 @@ def identify(
     runner = Runner(problem.recordings, workers, Path(checkpoint) if checkpoint is not None else None)
     looks = accepted(check(problem, runner, fitted), meant) if assumptions == "checked" else []
     for look in looks if progress else ():
-        tqdm.write(f"note: {look}", file=sys.stderr)
+        tqdm.write(plain(f"note: {look}"), file=sys.stderr)
     x, fit, stages = problem.coordinates.start, None, []
     with explained(looks):
         if plan is None:

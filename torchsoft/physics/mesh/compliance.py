@@ -20,6 +20,10 @@ def banded(matrix: sparse.csr_array) -> Array:
     return out
 
 
+BLOCK = 5e8
+"""Entries of a factor times right-hand sides of one call: about a second."""
+
+
 @lru_cache(maxsize=16)
 def unit_compliance(mesh: Mesh, nu: float) -> tuple[Array, Array]:
     """Displacements of the surface per force on it, (K^-1)_ss for E depth = 1, and their derivative by nu, -K^-1 (dK/dnu) K^-1,
@@ -30,7 +34,14 @@ def unit_compliance(mesh: Mesh, nu: float) -> tuple[Array, Array]:
     K_lambda, K_mu, _ = mesh.matrices
     lame_lambda, lame_mu = lame_moduli(1.0, nu)
     factor = linalg.cholesky_banded(banded(mesh.assemble(lame_lambda * K_lambda + lame_mu * K_mu)), lower=True)
-    X = linalg.cho_solve_banded((factor, True), loads)
+    size = max(1, int(BLOCK / factor.size))  # right-hand sides of a call, between which an interrupt is heard
+    X = np.concatenate(
+        [
+            linalg.cho_solve_banded((factor, True), loads[:, k : k + size], check_finite=False)
+            for k in range(0, len(surface), size)
+        ],
+        1,
+    )
     with torch.inference_mode(False), torch.enable_grad():
         nu_ = torch.tensor(nu, dtype=torch.float64, requires_grad=True)
         moduli = lame_moduli(torch.ones_like(nu_), nu_)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from torchsoft.files import check_file
 from torchsoft.physics.arguments import LENGTHS
 from torchsoft.physics.mesh.element import Array
 from torchsoft.physics.mesh.mesh import Index
@@ -16,6 +17,10 @@ IGNORED = {"line", "vertex"}
 
 FLAT = 1e-9
 """How far the points may be from one plane, over the size of the mesh."""
+
+
+LARGEST = 2e9
+"""Size [B] of a mesh file at the most."""
 
 
 def read_quads(path: str | Path, unit: str) -> tuple[Array, Index, dict[str, Index]]:
@@ -28,7 +33,7 @@ def read_quads(path: str | Path, unit: str) -> tuple[Array, Index, dict[str, Ind
 
     if unit not in LENGTHS:
         raise ValueError(f"`unit` must be one of {', '.join(LENGTHS)}, but is {unit!r}")
-    with Path(path).open("rb"):  # what is not there, or not to be read, is an OSError
+    with check_file(path, LARGEST).open("rb"):  # what is not there, or not to be read, is an OSError
         pass
     try:
         with (

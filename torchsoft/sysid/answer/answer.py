@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from pydantic import ConfigDict, TypeAdapter
 
-from torchsoft.files import finite, replacing
+from torchsoft.files import check_file, finite, replacing
 from torchsoft.physics.rig import Rig
 from torchsoft.sysid.answer.comparison import Comparison
 from torchsoft.sysid.answer.contribution import Contribution
@@ -32,6 +32,9 @@ from torchsoft.tables import Number, line, refusing, shown
 SCHEMA = "torchsoft-answer-3"
 """Name and version of the file's form."""
 
+
+LARGEST = 1e9
+"""Size [B] of a file of an answer at the most."""
 
 UNEXPLAINED = 1.25
 """RMS residual of a channel over its stated noise from which a report begins by saying that the model does not explain it."""
@@ -282,6 +285,7 @@ def schema() -> dict[str, Any]:
 
 def load_answer(path: str | Path) -> Answer:
     """The answer in a file. Raises `ValueError` naming the file for one that is damaged, or no answer, and `OSError`."""
+    check_file(path, LARGEST)
     try:
         content = json.loads(Path(path).read_bytes().decode("utf-8"))
     except (ValueError, RecursionError) as error:

@@ -16,6 +16,7 @@ from torchsoft.sysid.fit.robust import Loss
 from torchsoft.sysid.problem.problem import Problem
 from torchsoft.sysid.problem.recording import Array
 from torchsoft.sysid.problem.workers import Runner
+from torchsoft.tables import plain
 
 Method = Literal["gauss_newton", "lbfgs", "adam"]
 
@@ -32,7 +33,7 @@ def stage_entry(name: str, stage: Stage, rtol: float, fit: Fit, began: float) ->
 @contextmanager
 def progress_bar(label: str, shown: bool) -> Iterator[Notify]:
     """Shows the progress of one stage: call it with chi2 after every evaluation."""
-    with tqdm(desc=label, unit=" evaluations", disable=not shown) as bar:
+    with tqdm(desc=plain(label), unit=" evaluations", disable=not shown) as bar:
 
         def notify(chi2: float) -> None:
             bar.set_postfix_str(f"chi2 = {chi2:.4g}", refresh=False)

@@ -15,13 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from torchsoft.files import make_folder, remove_partials, replacing
+from torchsoft.files import CHECKPOINT, SEALED, check_file, make_folder, remove_partials, replacing
 from torchsoft.solve.kernel.cache import digest
 from torchsoft.sysid.problem.prediction import FailedRun, Misfit, Prediction
 from torchsoft.sysid.problem.recording import Recording
-
-MARKER = "torchsoft-checkpoint"
-"""Name of the file that makes a folder a journal."""
 
 MEANING = "Runs of an identification that is not done; torchsoft removes the .run files in this folder when it is.\n"
 
@@ -71,10 +68,10 @@ class Journal:
         if self.folder.exists() and not self.folder.is_dir():
             raise ValueError(f"the checkpoint {self.folder} is a file; give a new or an empty folder")
         make_folder(self.folder)
-        if not (self.folder / MARKER).is_file():
+        if not (self.folder / CHECKPOINT).is_file():
             if any(self.folder.iterdir()):
                 raise ValueError(f"the checkpoint {self.folder} holds other files; give a new or an empty folder")
-            (self.folder / MARKER).write_text(MEANING, encoding="utf-8")
+            (self.folder / CHECKPOINT).write_text(MEANING, encoding="utf-8")
 
     def _place(self, run: object) -> tuple[bytes, Path]:
         """What the checksum of a run's file begins with, and the file."""
@@ -87,7 +84,7 @@ class Journal:
         if not path.is_file():
             return None
         try:
-            content = path.read_bytes()
+            content = check_file(path, SEALED).read_bytes()
             if content[:32] == sha256(name + content[32:]).digest():
                 return decoded(content[32:])
         except Exception:  # a reader meets a forged archive in a hundred ways
@@ -103,7 +100,7 @@ class Journal:
         """Write the result of a run, so that it lasts."""
         name, path = self._place(run)
         content = encoded(result)
-        if not (self.folder / MARKER).is_file():  # another identification was done with the folder
+        if not (self.folder / CHECKPOINT).is_file():  # another identification was done with the folder
             self._open()
         with replacing(path) as partial:
             partial.write_bytes(sha256(name + content).digest() + content)
@@ -111,12 +108,12 @@ class Journal:
 
 def forget(folder: Path) -> None:
     """Remove a journal's own files, and the folder unless it holds anything else; other folders are left alone."""
-    if not (folder / MARKER).is_file():
+    if not (folder / CHECKPOINT).is_file():
         return
     for path in folder.iterdir():
         if RUN.fullmatch(path.name) and path.is_file():
             path.unlink(missing_ok=True)
     remove_partials(path for path in folder.glob("*.partial") if RUN.match(path.name))
-    if [path.name for path in folder.iterdir()] == [MARKER]:
-        (folder / MARKER).unlink(missing_ok=True)
+    if [path.name for path in folder.iterdir()] == [CHECKPOINT]:
+        (folder / CHECKPOINT).unlink(missing_ok=True)
         folder.rmdir()

@@ -16,6 +16,7 @@ from torchsoft.sysid.certainty.profile import RISE, Profile
 from torchsoft.sysid.checks.misfit import LAGS, autocorrelation
 from torchsoft.sysid.problem.noise import Autoregression
 from torchsoft.sysid.problem.recording import Array
+from torchsoft.tables import plain
 
 SHOWN = {"m": ("mm", 1e3), "m/s": ("mm/s", 1e3)}
 """Units of pictures, and what one SI unit is in them; others stay as they are."""
@@ -64,7 +65,7 @@ def direction_name(d: Direction) -> str:
 
 def literal(text: str, width: int = 200) -> str:
     """Text as matplotlib must be given it, lest dollars begin a formula, in lines of `width` characters at most."""
-    return fill(text, width).replace("$", r"\$")
+    return fill(plain(text), width).replace("$", r"\$")
 
 
 @rc_context(STYLE)

@@ -3,15 +3,22 @@
 import base64
 import io
 from collections.abc import Iterable, Sequence
-from html import escape
+from html import escape as escaped
 from pathlib import Path
 
 from matplotlib.figure import Figure
+
+from torchsoft.tables import plain
 
 STYLE_SHEET = Path(__file__).with_name("report.css")
 
 Cell = str | tuple[str, str]
 """Text, or a class with text."""
+
+
+def escape(text: str) -> str:
+    """Text as HTML, without control characters."""
+    return escaped(plain(text))
 
 
 def document(title: str, parts: Iterable[str]) -> str:
