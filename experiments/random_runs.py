@@ -1,13 +1,13 @@
 """Question: does every run end, and say why, wherever the parameters lie?
 
-Random rigs and short motions (about 0.3 s), each run by tolerances and by equal steps. Parameters are drawn where a rig exists,
-far inside the bounds that `torchsoft.paper.parameters` declares: stiffnesses, dashpots, times, masses and gains by a factor of 10 up
-and down from their defaults (log-uniform, as is the touch-down depth, and a factor of 3 for the pad's depth), mu_s from 0.05 to
-2 with mu_k at 30 to 100 % of it, nu from 0 to 0.495, heights at 70 to 150 %, three meshes, both friction laws, contact points
-on nodes or two an element, whose x the loop senses. Motions are rolls, strokes, sines, chirps and presses after a grasp of 0.2
-to 2 mm within 0.1 s, and the beginning of the grasp and roll. A draw that gives no start (a disc so heavy that it sinks in
-deeper than the grasp, a bad geometry) is counted and drawn again. Gains and masses so drawn make many loops unstable: their
-runs end with the disc lost, which is an answer.
+Random rigs and short motions (about 0.3 s), each run by tolerances and by equal steps. Parameters are drawn where a rig
+exists, far inside the bounds that the parts' quantities declare: stiffnesses, dashpots, times, masses and gains by a
+factor of 10 up and down from their defaults (log-uniform, as is the touch-down depth, and a factor of 3 for the pad's
+depth), mu_s from 0.05 to 2 with mu_k at 30 to 100 % of it, nu from 0 to 0.495, heights at 70 to 150 %, three meshes,
+both friction laws, contact points on nodes or two an element, whose x the loop senses. Motions are rolls, strokes,
+sines, chirps and presses after a grasp of 0.2 to 2 mm within 0.1 s, and the beginning of the grasp and roll. A draw
+that gives no start (a disc so heavy that it sinks in deeper than the grasp, a bad geometry) is counted and drawn again.
+Gains and masses so drawn make many loops unstable: their runs end with the disc lost, which is an answer.
 
 Every run should be finite to its end or raise `SimulationFailed`, `NoEquilibrium` or `ValueError` with one sentence. A run
 that takes more than `limit` of the processor's time counts as hung, and its process is ended.
