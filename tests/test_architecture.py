@@ -34,11 +34,11 @@ FLOWS = {
     "sysid.conventions": "finding closed_loop loops setpoints conventions .",
     "sysid.checks": "parts misfit colour assumptions variation checks .",
     "sysid.laws": "evidence pattern compare .",
-    "sysid.certainty": "optimum profile summary posterior nuts calibration .",
+    "sysid.certainty": "optimum profile summary posterior nuts .",
     "sysid.answer": "comparison estimate contribution recorded answer result .",
     "sysid.files": "columns configuration measured cost .",
     "sysid.report": "figures comparison_figure page sections report .",
-    "sysid.design": "criterion knots zigzags planner search design design_figure .",
+    "sysid.design": "criterion knots planner search design design_figure .",
     "rigs": """
         fields recorded shapes materials bodies pads contacts network actuators motion outputs schema cost geometry build
         course finding reach balance check written template pictures run .

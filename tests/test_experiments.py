@@ -267,31 +267,3 @@ def test_the_theories_of_rolling_meet() -> None:
     thin = [theory.winkler(at, rubber, 5.0, v)[0] for v in speeds]
     assert moving == pytest.approx(thin, rel=0.03)
     assert theory.peak(speeds, moving)[0] == pytest.approx(theory.peak(speeds, thin)[0], rel=0.03)
-
-
-@pytest.mark.slow
-def test_designed_motion_smoke(tmp_path: Path) -> None:
-    """Bred from a few motions it tells more than gentle strokes, and an interval is given for every parameter."""
-    module = experiment("designed_motion")
-    module.main(module.Config(out=tmp_path, smoke=True))
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert set(summary["parameters"]) == {"pad.E", "pad.tau", "contact.K_n", "contact.mu_s"}
-    assert max(one["ratio"] for one in summary["parameters"].values()) < 0.5
-    assert summary["made_by"]["runs"] >= 5
-    again = module.Excitation.from_toml(tmp_path / "motion.toml")
-    assert again.duration == module.Config().duration
-    assert {"designed_motion.png", "motion.png", "table.md"} <= {path.name for path in tmp_path.iterdir()}
-
-
-@pytest.mark.slow
-def test_motion_phases_smoke(tmp_path: Path) -> None:
-    """A mixture of all phases is no worse than the best two of them."""
-    module = experiment("motion_phases")
-    module.main(module.Config(out=tmp_path, smoke=True))
-    summary = json.loads((tmp_path / "summary.json").read_text())
-    assert 2 <= summary["used"] <= summary["tried"] == 12
-    most = {name: max(of.values()) for name, of in summary["ratios"].items()}
-    assert 0 < most["put together"] < 1
-    assert 0 < most["all phases"] < most["two phases"] * (1 + 1e-4)
-    assert sum(one["share"] for one in summary["phases"]["two phases"]) == pytest.approx(1)
-    assert {"motion_phases.png", "table.md"} <= {path.name for path in tmp_path.iterdir()}

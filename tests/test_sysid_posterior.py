@@ -1,14 +1,11 @@
-"""Posteriors and their calibration against closed forms and quadrature; gradients and simulated data on a rig."""
+"""Posteriors against closed forms and quadrature; gradients and simulated data on a rig."""
 
 import json
 import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
-from dataclasses import replace
-from functools import partial
-from pathlib import Path
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -16,16 +13,13 @@ import pytest
 from closed_forms import WALL, ClosedForm, optimum
 from conftest import COARSE
 from scipy import stats
-from test_experiments import experiment
 
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Roll
-from torchsoft.sysid import RIG, Prior, Problem, Sensor, Unknown, Unreachable, record
-from torchsoft.sysid.certainty import calibration
-from torchsoft.sysid.certainty.calibration import calibrate, chi2_test, ecdf_test, envelope
+from torchsoft.sysid import RIG, Prior, Problem, Sensor, Unknown, record
 from torchsoft.sysid.certainty.nuts import Whitened, nuts
 from torchsoft.sysid.certainty.optimum import Optimum
-from torchsoft.sysid.certainty.posterior import Posterior, laplace
+from torchsoft.sysid.certainty.posterior import laplace
 from torchsoft.sysid.problem.noise import Autoregression
 
 STRAIGHT = np.random.default_rng(0).standard_normal((20, 3))
@@ -191,81 +185,6 @@ def test_nuts_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
         nuts(optimum(BENT, 0))
 
 
-def test_tests_of_ranks_know_flat_from_not_flat() -> None:
-    rng = np.random.default_rng(2)
-    p = np.array([(chi2_test(some, 99), ecdf_test(some, 99)) for some in rng.integers(0, 100, (200, 100))])
-    rejected = (p < 0.1).sum(0)  # 20 of 200 are expected
-    assert ((rejected > 6) & (rejected < 38)).all()
-    narrow, shifted = (rng.beta(a, b, 100) * 100 // 1 for a, b in ((2.2, 2.2), (1.6, 1)))
-    for ranks in (narrow, shifted):
-        assert ecdf_test(ranks.astype(int), 99) < 0.01
-    assert chi2_test(narrow.astype(int), 99) < 0.01
-    low, high = envelope(100, 99)
-    assert low[49] < 50 < high[49]
-    outside = [
-        ((np.array([(some < k).sum() for k in range(1, 100)]) - high > 0).any())
-        for some in rng.integers(0, 100, (100, 100))
-    ]
-    assert sum(outside) < 12
-    with pytest.raises(ValueError, match="equal bins"):
-        chi2_test(np.array([1, 2, 3]), 99)
-
-
-def linear(x: np.ndarray, e: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Residuals of data that x and the noise e make."""
-    return lambda z: STRAIGHT @ (z - x) - e
-
-
-@pytest.fixture
-def closed(monkeypatch: pytest.MonkeyPatch) -> ClosedForm:
-    """A linear problem with priors whose data and fits are formulas."""
-    prior = Prior(median=1.0, sd=0.5, kind="log-normal")
-
-    def simulated(problem: Any, x: np.ndarray, rtol: float, rng: Any) -> ClosedForm:
-        return ClosedForm(linear(x, rng.standard_normal(20)), 3, prior=prior)
-
-    def fitted(problem: Any, rtol: float) -> Optimum:
-        at = problem.residuals(None, np.zeros(3), None, None, np.ones(3))
-        return optimum(problem, *-np.linalg.lstsq(at.J, at.r, rcond=None)[0])
-
-    monkeypatch.setattr(calibration, "simulated", simulated)
-    monkeypatch.setattr(calibration, "fitted", fitted)
-    return ClosedForm(lambda x: np.zeros(20), 3, prior=prior)
-
-
-def drawn(o: Optimum, seed: int, width: float = 1.0) -> Posterior:
-    found = laplace(o, draws=100, seed=seed)
-    middle = o.values(o.x)
-    return replace(found, draws=middle * (found.draws / middle) ** width)
-
-
-def test_calibration_finds_right_posteriors_flat_and_wrong_ones_not(closed: ClosedForm) -> None:
-    ways = {"right": drawn, "narrow": partial(drawn, width=0.5), "wide": partial(drawn, width=2.0)}
-    found = calibrate(closed, ways, rtol=1e-4, workers=2)
-    right = found["right"]
-    assert right.flat, (right.p_chi2, right.p_ecdf)
-    assert np.array(right.ranks).shape == (100, 3)
-    assert np.array(right.ranks).max() <= 99
-    assert not found["narrow"].flat
-    assert not found["wide"].flat
-
-
-def test_calibration_counts_what_fails(closed: ClosedForm) -> None:
-    def rarely(o: Optimum, seed: int) -> Posterior:
-        if seed % 5 == 0:
-            raise ValueError("no posterior")
-        return drawn(o, seed)
-
-    found = calibrate(closed, {"rarely": rarely}, rtol=1e-4)["rarely"]
-    assert any("replications failed and are left out: no posterior" in notice for notice in found.notices)
-
-    def never(o: Optimum, seed: int) -> Posterior:
-        raise Unreachable({})
-
-    with pytest.raises(RuntimeError, match="only 0 of 20 replications"):
-        calibrate(closed, {"never": never}, rtol=1e-4, runs=20)
-
-
 @pytest.fixture(scope="module")
 def rolling() -> Problem:
     """A quarter of a second on the coarse rig, with coloured noise of the force, a bias and a saturated sensor."""
@@ -278,48 +197,9 @@ def rolling() -> Problem:
     return Problem([data], sensors, unknowns, {"F_x": Autoregression.stated((0.8,), 5e-3)})
 
 
-def test_simulated_data_have_the_truth_and_the_noise_of_the_sensors(rolling: Problem) -> None:
-    rng = np.random.default_rng(0)
-    x = np.array([calibration.truth(rolling, rng) for _ in range(200)])
-    assert np.log(0.75e6) - 0.03 < x[:, 0].mean() < np.log(0.75e6) + 0.03
-    assert x[:, 0].std() == pytest.approx(0.1, rel=0.2)
-    (low, high) = rolling.coordinates.bounds
-    assert ((x >= low) & (x <= high)).all()
-    data = calibration.simulated(rolling, x[0], 1e-5, rng)
-    assert isinstance(data, Problem)
-    t, y = data.recordings[0].samples["F_y"]
-    assert y.min() == -60.0
-    at = Optimum(data, x[0], rtol=1e-5).at
-    n = len(t)
-    assert len(at.r) == 7 * n + 1
-    parts = dict(zip(data.sensors, np.split(at.r[:-1], 7)))
-    for channel in ("x_C", "theta", "F_x"):
-        assert parts[channel].std() == pytest.approx(1.0, rel=0.35), channel
-    white = parts["F_x"] - parts["F_x"].mean()
-    assert abs(white[1:] @ white[:-1]) / (white @ white) < 0.4  # whitened; the colour is 0.8
-
-
 def test_the_density_on_a_rig_has_its_gradient(rolling: Problem) -> None:
     o = Optimum(rolling, rolling.coordinates.start, rtol=1e-4)
     white, z = Whitened.of(o), np.array([0.4, -0.3, 0.2])
     _, gradient = white.density(o, z)
     by = [(white.density(o, z + h)[0] - white.density(o, z - h)[0]) / 2e-4 for h in 1e-4 * np.eye(3)]
     np.testing.assert_allclose(gradient, by, rtol=1e-3, atol=1e-3 * np.abs(gradient).max())
-
-
-@pytest.mark.slow
-def test_calibration_smoke(tmp_path: Path) -> None:
-    """Ten truths are too few for a test to find anything; the posterior that is looked at is bent."""
-    pytest.importorskip("nutpie")
-    module = experiment("calibration")
-    module.main(module.Config(out=tmp_path, smoke=True))
-    case = json.loads((tmp_path / "summary.json").read_text())["cases"]["series"]
-    ranks = np.array(case["ways"]["Gaussian"]["ranks"])
-    assert ranks.shape == (10, 2)
-    assert ((ranks >= 0) & (ranks <= 19)).all()
-    stiffness, contact = case["profiles"]
-    assert any("no parabola" in notice for notice in stiffness["notices"])
-    low, high = contact["ci95"]
-    assert low < 1.2e5 < high
-    assert "pad.E * contact.K_n^" in case["combinations"][0]
-    assert {"posterior.png", "ranks_series.png", "table.md"} <= {path.name for path in tmp_path.iterdir()}

@@ -116,14 +116,15 @@ def compiled_law(
 
         if not known:  # what somebody's own code does is known from running it only, and may change any time
             key = expressions()
-            if expressions() != key:
+            if key in _laws:
+                check_backward(law, example, names)
+        if key not in _laws:
+            if not known and expressions() != key:
                 raise UnknownOperation(
                     "The law is another one when it is called again, so it keeps something of a call."
                 )
-            check_backward(law, example, names)
             if points:
                 check_pointwise(law, example, names)
-        if key not in _laws:
             _laws[key] = compile_law(law, example, names, linear=linear, differentiated=differentiated)
         return _laws[key]
 

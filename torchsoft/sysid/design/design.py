@@ -1,8 +1,8 @@
-"""Motions designed for the question: the knots of set-points, bred and moved by gradient until parameters are known best."""
+"""Motions designed for the question: the knots of set-points, moved by gradient until parameters are known best."""
 
 import time as clock
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any, Literal
 
@@ -14,7 +14,6 @@ from torchsoft.sysid.design.criterion import VOLUME, Criterion
 from torchsoft.sysid.design.knots import Bounds, Moves, profile
 from torchsoft.sysid.design.planner import Planner, Range
 from torchsoft.sysid.design.search import Search, Visit
-from torchsoft.sysid.design.zigzags import PHASES, Phase, Zigzags
 from torchsoft.sysid.problem.problem import Problem
 from torchsoft.sysid.problem.recording import Array, Recording
 
@@ -89,8 +88,8 @@ def draws(problem: Problem, count: int, *, spread: float | None = None, seed: in
 def design(
     problem: Problem, plan: str, bounds: Mapping[str, Bounds], *, limits: Mapping[str, Range] | None = None,
     criterion: Criterion = VOLUME, names: Sequence[str] | None = None, at: Sequence[Array] | None = None,
-    robust: Literal["mean", "worst"] = "mean", phases: Sequence[Phase] | int = PHASES, starts: int = 1, iterations: int = 100,
-    rate: float = 0.03, smoothing: float = 0.02, rtol: float = RTOL, seed: int = 0, workers: int = 1, progress: bool = False,
+    robust: Literal["mean", "worst"] = "mean", iterations: int = 100, rate: float = 0.03, smoothing: float = 0.02,
+    rtol: float = RTOL, seed: int = 0, workers: int = 1, progress: bool = False,
 ) -> Design:  # fmt: skip
     """Move the knots of the recording `plan` of a problem until the parameters `names` (all, by default) are known best.
 
@@ -101,21 +100,15 @@ def design(
     such as forces. `at` are points x of the coordinates (`draws`), by default the nominal one; the criterion's "mean" over them
     is lowered, or the "worst".
 
-    The search begins with the plan's own motion, or with the best of it and of `starts` - 1 others, `Zigzags` of some
-    `phases`: what evolution (CMA-ES) breeds from the phases given, or from the best of random ones, judged at the first point,
-    the best few by finer runs. A guess that has every parameter in it spares hundreds of motions. Each of the
-    `iterations` moves knots by at most about `rate` times what speed allows from one to the next, shifted at random by
-    `smoothing` times that, and takes a run with sensitivities and 2 n with the adjoint, of relative tolerance `rtol`. A
-    motion that cannot be run is left; with Ctrl-C the best so far is returned, with a notice. Raises `ValueError` for
+    The search begins with the plan's own motion. Each of the `iterations` moves knots by at most about `rate` times what speed
+    allows from one to the next, shifted at random by `smoothing` times that, and takes a run with sensitivities and 2 n
+    with the adjoint, of relative tolerance `rtol`. A     motion that cannot be run is left; with Ctrl-C the best so far is returned, with a notice. Raises `ValueError` for
     what does not fit together, and where the plan itself cannot be run.
     """
     if plan not in problem.names:
         raise ValueError(f"`plan` must be one of the recordings {list(problem.names)}, but is {plan!r}")
-    parts = phases if isinstance(phases, int) else len(phases)
-    if min(iterations, starts - 1, parts - 1) < 0 or not 0 < rate <= 1 or not 0 <= smoothing <= 1:
-        raise ValueError(
-            "`starts` and `phases` must be positive, `iterations` not negative, `rate` and `smoothing` parts of 1"
-        )
+    if iterations < 0 or not 0 < rate <= 1 or not 0 <= smoothing <= 1:
+        raise ValueError("`iterations` must not be negative, `rate` and `smoothing` must be parts of 1")
     points, recording = (
         [problem.coordinates.start] if at is None else list(at),
         problem.recordings[problem.names.index(plan)],
@@ -130,24 +123,16 @@ def design(
             )
     began = clock.perf_counter()
     moves = Moves(recording.rig.reference, bounds, float(recording.times[-1]))
-    family = Zigzags(moves, parts)
-    guess = None if isinstance(phases, int) else family.numbers(phases)
     planner = Planner(problem, plan, moves, limits or {}, criterion, names, rtol, workers)
     search = Search(planner, points, robust, rate, smoothing, seed)
     first = search.begin()
     before, given = planner.deviations(points[0], first), planner.made(moves.start, points[0], first)
-    with tqdm(total=starts - 1 + iterations, desc="design", disable=not progress) as bar:
-
-        def tried(best: float) -> None:
-            bar.set_postfix_str(f"criterion {best:.3f}", refresh=False)
-            bar.update()
-
+    with tqdm(total=iterations, desc="design", disable=not progress) as bar:
         try:
-            search.breed(family, guess, starts - 1, tried)
             while search.iteration < iterations:
                 search.move(iterations)
                 bar.set_postfix_str(f"criterion {search.best.value:.3f}", refresh=False)
-                bar.update(starts - 1 + search.iteration - bar.n)
+                bar.update(search.iteration - bar.n)
             search.look()
             notices = []
         except KeyboardInterrupt:
@@ -173,8 +158,7 @@ def design(
         made_by={
             "torchsoft": version("torchsoft"), "criterion": criterion.optimality, "targets": criterion.targets,
             "bounds": {name: one.model_dump() for name, one in bounds.items()}, "limits": dict(limits or {}),
-            "draws": len(points), "robust": robust, "iterations": search.iteration, "starts": starts, "rate": rate,
-            "phases": phases if isinstance(phases, int) else [asdict(phase) for phase in phases],
+            "draws": len(points), "robust": robust, "iterations": search.iteration, "rate": rate,
             "smoothing": smoothing, "rtol": rtol, "seed": seed, **planner.cost,
             "wall_s": clock.perf_counter() - began,
         },

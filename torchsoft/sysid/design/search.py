@@ -1,4 +1,4 @@
-"""The search for a motion: what evolution breeds, then Adam on the smoothed criterion; the best that was looked at is kept.
+"""The search for a motion: Adam on the smoothed criterion; the best motion evaluated is kept.
 
 The criterion's slopes (`planner`) are exact, and rough: points that touch, leave and slip earlier or later give it kinks at
 distances of micrometres, each a large slope that means nothing a tenth of a millimetre on. So what is lowered is the
@@ -6,22 +6,17 @@ criterion smoothed over small random motions and over draws of the parameters, b
 iteration takes one draw and one random shift, which makes the motion robust at no further cost.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
 
-import cma
 import numpy as np
 import torch
-from scipy.stats import qmc
 
 from torchsoft.solve.adjoint import GradientFailed
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.design.knots import Moves
 from torchsoft.sysid.design.planner import PRICE, Look, Planner
-from torchsoft.sysid.design.zigzags import Zigzags
 from torchsoft.sysid.problem.recording import Array
-from torchsoft.threads import side_by_side, single_threaded
 
 OUTLIER = 10.0
 """Slopes beyond so many medians are cut."""
@@ -31,28 +26,6 @@ MEMORY = 0.85, 0.97
 
 LOOK = 10
 """Iterations between two looks at the motion itself, with all draws and no random shift."""
-
-POPULATION = 24
-"""Motions that are tried at random, before others are bred from the best of them."""
-
-GENERATION = 12
-"""Motions of one generation."""
-
-SPREAD = 0.2
-"""Standard deviation, of the first generation, of the numbers from 0 to 1 that motions are bred by."""
-
-GUESSED = 0.03
-"""The same where they begin with a guess."""
-
-FINALISTS = 6
-"""Best motions bred, of which that is taken which is best by finer runs: what one is worth varies with the steps, most where
-points slip, and the best of many by coarse runs is often a lucky one."""
-
-FINER = 0.1
-"""Tolerance of those runs, over that of the search."""
-
-HOPELESS = 1e3
-"""What a motion that cannot be run counts in the evolution."""
 
 FAILURES = 5
 """Runs lost one after the other until the search goes back to the best motion so far."""
@@ -70,18 +43,6 @@ class Visit:
     def score(self) -> float:
         """The criterion, and a price of excess."""
         return self.value + PRICE * max(0.0, self.peak - 1.0)
-
-
-class Tried(NamedTuple):
-    """Knots of a motion, with the look at it at the first point."""
-
-    moves: Moves
-    look: Look
-
-    @property
-    def worth(self) -> float:
-        """The criterion, and what excess costs."""
-        return self.look.value + self.look.cost
 
 
 class Search:
@@ -109,61 +70,6 @@ class Search:
         self.adam = torch.optim.Adam([self.now], lr=self.rate, betas=MEMORY)
         self.best, _ = self.visit(self.z)
         self.history = [self.best]
-
-    def breed(self, family: Zigzags, guess: Array | None, count: int, tried: Callable[[float], None]) -> None:
-        """Tries so many zigzags, about, near a guess (n,) if there is one, and sets out from the best if it is better than the
-        motion given."""
-        given, best = family.moves, [Tried(family.moves, self.seen)]
-
-        def judged(u: Array) -> list[float]:
-            """What the motions of numbers (k, n) are worth."""
-            moves = [Moves(family.reference(one), given.bounds, given.end) for one in u]
-            worth = np.full(len(u), HOPELESS)
-            for i, look in self.looks(moves, None):
-                if look is None:
-                    self.lost += 1
-                else:
-                    best.append(Tried(moves[i], look))
-                    worth[i] = best[-1].worth
-                    best[:] = sorted(best, key=lambda one: one.worth)[:FINALISTS]
-                tried(best[0].look.value)
-            return worth.tolist()
-
-        def evolved(some: Array) -> None:
-            """Breeds from the best of them."""
-            evolution: Any = cma.CMAEvolutionStrategy(
-                some[int(np.argmin(judged(some)))], SPREAD if guess is None else GUESSED,
-                {"bounds": [0, 1], "popsize": GENERATION, "seed": np.nan, "verbose": -9,
-                 "randn": lambda *shape: self.rng.standard_normal(shape)},
-            )  # fmt: skip
-            while count - len(some) - evolution.countevals >= GENERATION:
-                bred = evolution.ask()
-                evolution.tell(bred, judged(np.array(bred)))
-
-        if count == 0:
-            return
-        with single_threaded():
-            try:
-                some = qmc.LatinHypercube(family.n, rng=self.rng).random(min(count, POPULATION))
-                evolved(some if guess is None else guess[None])
-                worth = np.full(len(best), np.inf)
-                for i, look in self.looks([one.moves for one in best], FINER * self.planner.rtol):
-                    worth[i] = np.inf if look is None else Tried(given, look).worth
-                best.insert(0, best[int(np.argmin(worth))])
-            finally:
-                if best[0].moves is not given:
-                    self.set_out(*best[0])
-
-    def looks(self, moves: Sequence[Moves], rtol: float | None) -> Iterator[tuple[int, Look | None]]:
-        """`tried` of some motions, by number, in the order of their ends."""
-        return side_by_side(lambda i: self.tried(moves[i], rtol), len(moves), self.planner.workers)
-
-    def tried(self, moves: Moves, rtol: float | None) -> Look | None:
-        """The look at a motion at the first point; None where it is lost."""
-        try:
-            return self.planner.of(moves).look(moves.start, self.points[0], rtol)
-        except SimulationFailed:
-            return None
 
     def visit(self, z: Array) -> tuple[Visit, Look | None]:
         """What a motion is worth over all points, infinite where it is lost, and the look at it at the first."""
