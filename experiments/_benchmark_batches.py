@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 from _benchmark_common import Config, interleaved, prepare
-from _experiment import grid, timed
+from torchsoft.experiment import grid, timed
 from torch import Tensor
 
 from torchsoft import SoftGrasp

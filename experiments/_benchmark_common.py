@@ -7,7 +7,7 @@ from statistics import median
 from typing import Any
 
 import torch
-from _experiment import timed
+from torchsoft.experiment import timed
 
 from torchsoft import Parameters, SoftGrasp, simulate
 from torchsoft.scenario import Manipulation, grasp_and_roll

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from _benchmark_batches import own_parameters
 from _benchmark_common import Config, median_time, prepare
-from _experiment import grid, markdown
+from torchsoft.experiment import grid, markdown
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator

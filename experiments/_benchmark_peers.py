@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 from _benchmark_common import Config, prepare
-from _experiment import markdown, timed
+from torchsoft.experiment import markdown, timed
 from scipy.integrate import odeint, solve_ivp
 from torch import Tensor
 from tqdm import tqdm

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from _experiment import COARSE
+from torchsoft.experiment import COARSE
 
 from torchsoft import Coulomb, Parameters, Reference, SoftGrasp, StandardLinearSolid
 from torchsoft.excitation import Excitation, MultiSine, Press, Roll, Strokes

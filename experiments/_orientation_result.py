@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from _experiment import markdown
+from torchsoft.experiment import markdown
 from _orientation_cases import DEGREES, Case, Gains, Outcome, Rigid
 
 from torchsoft import Trajectory

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from _experiment import timed
+from torchsoft.experiment import timed
 
 from torchsoft import Parameters, SoftGrasp, Trajectory
 from torchsoft.physics.contact import ramp

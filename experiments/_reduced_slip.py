@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from _experiment import COARSE, grid
+from torchsoft.experiment import COARSE, grid
 from _reduced_common import Config, attempt, compared, ensemble, law, rollout_time, slipping
 from tqdm import tqdm
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from _experiment import COARSE, grid
+from torchsoft.experiment import COARSE, grid
 from _reduced_common import Config, attempt, compared, ensemble, law, rollout_time, slipping, summary_of
 from scipy.signal import cont2discrete
 from tqdm import tqdm

@@ -31,7 +31,7 @@ from typing import Any
 from _benchmark_batches import batches
 from _benchmark_common import GRASP_FORCE, Config, interleaved, prepare, tasks, wall, ways
 from _benchmark_growth import Growth, growth, growth_figure, growth_table
-from _experiment import grid, made_by, markdown, options, write
+from torchsoft.experiment import grid, made_by, markdown, options, write
 from matplotlib.figure import Figure
 from step_accuracy import errors
 from tqdm import tqdm

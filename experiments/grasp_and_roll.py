@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from _experiment import COARSE, options
+from torchsoft.experiment import COARSE, options
 from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm

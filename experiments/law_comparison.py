@@ -24,7 +24,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from _experiment import markdown, options, raw_config, timed, write
+from torchsoft.experiment import markdown, options, raw_config, timed, write
 from _law_cases import RTOL, SETTINGS, Case, data, draw, plan, problems
 from identify_contact import FiniteDifferences
 from matplotlib.figure import Figure

@@ -17,7 +17,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import torch
-from _experiment import COARSE, at_the_points, options, write
+from torchsoft.experiment import COARSE, at_the_points, options, write
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 from tqdm import tqdm

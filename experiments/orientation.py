@@ -23,7 +23,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from _experiment import options, raw_config, timed, write
+from torchsoft.experiment import options, raw_config, timed, write
 from _orientation_cases import (
     DEGREES,
     FILE,

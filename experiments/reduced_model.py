@@ -29,7 +29,7 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
-from _experiment import made_by, markdown, options, write
+from torchsoft.experiment import made_by, markdown, options, write
 from _reduced_common import Config, smoke
 from _reduced_gain import study_gain
 from _reduced_slip import study_slip

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from _experiment import COARSE, made_by, markdown, options, timed, write
+from torchsoft.experiment import COARSE, made_by, markdown, options, timed, write
 from _shapes_figures import distributions, objects_figure, paths, resistance_figure, video
 from _shapes_resistance import HEIGHT, TAU, Resistance, Roll, cases, half_width, length, resistance, roll
 from _shapes_rolls import Rolled, leading_mode, numbers, objects, refused, rubbers, settings, steady_resistance

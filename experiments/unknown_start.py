@@ -21,7 +21,7 @@ from tempfile import TemporaryDirectory
 import identify_contact
 import numpy as np
 import torch
-from _experiment import COARSE, markdown, options, raw_config, timed, write
+from torchsoft.experiment import COARSE, markdown, options, raw_config, timed, write
 from identify_contact import TRUTH
 from matplotlib.figure import Figure
 from scipy import stats

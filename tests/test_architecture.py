@@ -12,7 +12,7 @@ ROOT = Path(torchsoft.__file__).parent
 FLOWS = {
     "": """
         channels files threads tables csvfile quantity codegen physics paper cost solve scenario excitation processes plot
-        materials rigs sysid reduced datasets cli __main__
+        materials rigs sysid reduced datasets experiment cli __main__
     """,
     "codegen": "graph derivatives operations trace pointwise emit . invoke",
     "physics": """
@@ -150,7 +150,7 @@ def test_applications_do_not_know_each_other(folder: str) -> None:
 
 def test_files_are_short() -> None:
     top = ROOT.parent
-    files = MODULES | {path.name: path for path in (top / "experiments").glob("*.py")}
+    files = MODULES | {path.name: path for path in (top / "experiments").rglob("*.py")}
     for name, path in files.items():
         assert len(path.read_text().splitlines()) <= LONGEST, path
     for path in (top / "data_gen").glob("*.py"):

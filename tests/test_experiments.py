@@ -13,12 +13,14 @@ import pytest
 from torchsoft import Ellipse, Prony
 
 EXPERIMENTS = Path(__file__).parents[1] / "experiments"
-sys.path.insert(0, str(EXPERIMENTS))  # as for a script; what experiments share lies beside them
+FOLDERS = EXPERIMENTS, EXPERIMENTS / "validation"
+sys.path[:0] = map(str, FOLDERS)  # as for a script; modules of an experiment lie beside it
 
 
 def experiment(name: str) -> ModuleType:
     """The experiment's file as a module; the folder is not a package."""
-    spec = importlib.util.spec_from_file_location(f"experiment_{name}", EXPERIMENTS / f"{name}.py")
+    (path,) = (folder / f"{name}.py" for folder in FOLDERS if (folder / f"{name}.py").exists())
+    spec = importlib.util.spec_from_file_location(f"experiment_{name}", path)
     assert spec
     assert spec.loader
     module = importlib.util.module_from_spec(spec)

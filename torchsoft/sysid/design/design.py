@@ -101,9 +101,9 @@ def design(
     is lowered, or the "worst".
 
     The search begins with the plan's own motion. Each of the `iterations` moves knots by at most about `rate` times what speed
-    allows from one to the next, shifted at random by `smoothing` times that, and takes a run with sensitivities and 2 n
-    with the adjoint, of relative tolerance `rtol`. A     motion that cannot be run is left; with Ctrl-C the best so far is returned, with a notice. Raises `ValueError` for
-    what does not fit together, and where the plan itself cannot be run.
+    allows from one to the next, shifted at random by `smoothing` times that, and takes a run with sensitivities and 2 n with
+    the adjoint, of relative tolerance `rtol`. A motion that cannot be run is left; with Ctrl-C the best so far is returned,
+    with a notice. Raises `ValueError` for what does not fit together, and where the plan itself cannot be run.
     """
     if plan not in problem.names:
         raise ValueError(f"`plan` must be one of the recordings {list(problem.names)}, but is {plan!r}")

@@ -21,7 +21,7 @@ Further: the literal Coulomb law, whose force jumps at break-away unless mu_s = 
 refined; d omega / d K_n before and after a node touches; and a window that starts at `rest`, where the upper pad's gap is
 exactly zero and central differences straddle the kink.
 
-Command: .venv/bin/python experiments/gradient_accuracy.py [--smoke]
+Command: .venv/bin/python experiments/validation/gradient_accuracy.py [--smoke]
 Expected, largest error of the discrete and forward routes among parameters whose central difference is itself known to 1e-6:
 6e-7 in each of the short windows, 6e-6 over 30 s and 180 node events; elsewhere within the judge's uncertainty. Unrolled equals
 discrete to 3e-8. Backward at 0.3 to 0.8 of the forward run. Coulomb's law with mu_s > mu_k: the adjoint calls dL/dmu_s 0, the
@@ -33,8 +33,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from _experiment import made_by, markdown, options
-from _experiment import write as write_files
+from torchsoft.experiment import made_by, markdown, options
+from torchsoft.experiment import write as write_files
 from _gradient_limits import coulomb, from_rest, refinement, touch_down
 from _gradients import FINER, RADIUS, Config, judge_window, smoke, windows
 from matplotlib.figure import Figure

@@ -4,7 +4,7 @@ The whole 30 s are run at several steps against a fine one; the first 10 s (gras
 with several viscosities eta, down to Coulomb's limit eta = 0. The per-node contact values refer to 1 mm of surface and
 scale with a node's tributary length, so that all meshes have the same contact.
 
-Command: .venv/bin/python experiments/refinement.py [--smoke]
+Command: .venv/bin/python experiments/validation/refinement.py [--smoke]
 Expected: at the default step of 2 ms the largest error is below 3e-4 of the range in the motion (in y_C, during the grasp)
 and below 0.5 % in the forces; x_C(10 s) does not depend on the mesh, y_C in the grasp changes by less than 0.03 mm, and
 the peak of F_x, which rides on node transitions, falls with the mesh. About one minute on one core.
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from _experiment import grid, made_by, markdown, options, write
+from torchsoft.experiment import grid, made_by, markdown, options, write
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 from torch import Tensor

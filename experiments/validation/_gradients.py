@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from _experiment import COARSE, at_the_points, timed
+from torchsoft.experiment import COARSE, at_the_points, timed
 from torch import Tensor
 
 from torchsoft import Parameters, Profile, Reference, SoftGrasp, press, simulate

@@ -7,7 +7,7 @@ or not; with N seeds the fraction of those that do is binomial, and so is its ow
 the predicted standard deviations should be normal with mean 0 and deviation 1. Seeds differ in the noise only, and fits begin
 where most parameters are some standard deviations off.
 
-Command: .venv/bin/python experiments/interval_coverage.py [--seeds 100] [--workers 2] [--smoke]
+Command: .venv/bin/python experiments/validation/interval_coverage.py [--seeds 100] [--workers 2] [--smoke]
 Expected: between 90 and 99 % for every parameter where colour is found or is not there, about half where it is ignored; a false
 alarm about one of a hundred recordings with white noise. About a quarter of an hour on two cores.
 """
@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import identify_contact
 import numpy as np
-from _experiment import COARSE, markdown, options, raw_config, write
+from torchsoft.experiment import COARSE, markdown, options, raw_config, write
 from identify_contact import FITTED, TRUTH
 from matplotlib.figure import Figure
 from scipy import stats

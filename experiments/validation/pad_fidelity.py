@@ -4,7 +4,7 @@ The manipulation is run with massless (statically condensed) and with inertial p
 force, and every output is subtracted; so is a fast stroke of 20 mm in 0.5 s. Condensation is exact but for inertia, because
 R = tau K; inertia should matter by about 1 / (tau omega)^2, some 4e-4 of the pads' part, since every pad mode is overdamped.
 
-Command: .venv/bin/python experiments/pad_fidelity.py [--smoke]
+Command: .venv/bin/python experiments/validation/pad_fidelity.py [--smoke]
 Expected: on the manipulation the disc differs by some nanometres and the forces by some millinewtons. About 20 s.
 """
 
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from _experiment import grid, made_by, markdown, options, write
+from torchsoft.experiment import grid, made_by, markdown, options, write
 from torch import Tensor
 
 from torchsoft import Parameters, Profile, SoftGrasp, Trajectory, simulate

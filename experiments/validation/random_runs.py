@@ -12,7 +12,7 @@ Gains and masses so drawn make many loops unstable: their runs end with the disc
 Every run should be finite to its end or raise `SimulationFailed`, `NoEquilibrium` or `ValueError` with one sentence. A run
 that takes more than `limit` of the processor's time counts as hung, and its process is ended.
 
-Command: .venv/bin/python experiments/random_runs.py [--smoke]
+Command: .venv/bin/python experiments/validation/random_runs.py [--smoke]
 Expected: no run hangs, none ends without a sentence or with numbers that are not finite. About twenty minutes on two cores.
 """
 
@@ -31,7 +31,7 @@ from time import monotonic, process_time, sleep
 from typing import Any
 
 import numpy as np
-from _experiment import made_by, markdown, options, write
+from torchsoft.experiment import made_by, markdown, options, write
 from _random_rigs import Drawn, draw
 from matplotlib.figure import Figure
 from tqdm import tqdm

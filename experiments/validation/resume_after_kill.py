@@ -13,7 +13,7 @@ for `wall_s` (of the whole and of every stage), `cost.remembered` (the number of
 back, so that equal text is equal bits. The pages are not compared: they show times. Nothing but both files may be
 left over, no process may be left, nothing executed.
 
-Command: .venv/bin/python experiments/resume_after_kill.py [--kills 20] [--workers 1] [--smoke]
+Command: .venv/bin/python experiments/validation/resume_after_kill.py [--kills 20] [--workers 1] [--smoke]
 Expected: 20 of 20. About a quarter of an hour on two cores.
 """
 
@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from _experiment import COARSE, markdown, options, raw_config, write
+from torchsoft.experiment import COARSE, markdown, options, raw_config, write
 from matplotlib.figure import Figure
 from tqdm import tqdm
 

@@ -6,7 +6,7 @@ way. K_n refers to 1 mm of surface and scales with a node's tributary length, so
 length and the force should converge to that of a continuous layer of springs, with the square of the spacing. Stiffer
 springs should converge to a rigid contact, with 1 / K_n.
 
-Command: .venv/bin/python experiments/statics.py [--smoke]
+Command: .venv/bin/python experiments/validation/statics.py [--smoke]
 Expected: at the full grasp 70.16 N on the upper pad with the default 1 mm nodes and K_n, 0.5 % below the limit of fine
 meshes (70.54 N), the difference falling fourfold per mesh; y_C between 23.194 and 23.197 mm on every mesh. The default
 K_n is not stiff enough to count as a mere penalty: a rigid contact takes 79.3 N, 13 % more. Light grasps, in which only
@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from _experiment import made_by, markdown, options
-from _experiment import write as write_files
+from torchsoft.experiment import made_by, markdown, options
+from torchsoft.experiment import write as write_files
 from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm

@@ -11,7 +11,7 @@ and forces between them and the nodes. Compared on 1 mm and 0.5 mm elements; a r
             largest difference from central differences over 1e-6 (is it exact?) and over 1 % (is it the trend?)
   cost      wall time of the 10 s, alone and with a Jacobian; one point an element makes as many points as nodes
 
-Command: .venv/bin/python experiments/contact_points.py [--smoke]
+Command: .venv/bin/python experiments/validation/contact_points.py [--smoke]
 Expected, 1 mm elements, nodes / 2 / 3 / 4 points: ripple of F_x 121 / 49 / 25 / 19 mN; gradient off the trend by up to
 15 / 5 / 2 / 2 %; time 1 / 1.4 / 1.7 / 1.8. Nodes 0.5 mm apart: 16 mN, 10 %, 2.4. About seven minutes on one core.
 """
@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from _experiment import grid, markdown, options, raw_config, write
+from torchsoft.experiment import grid, markdown, options, raw_config, write
 from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm

@@ -1,4 +1,4 @@
-"""What experiments share around their questions: options, output times, tables, the summary and the figures."""
+"""Frame of an experiment: options from the command line, output times, tables, the summary and the figures."""
 
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from _experiment import COARSE
+from torchsoft.experiment import COARSE
 from tqdm import tqdm
 
 from torchsoft import Parameters, Reference
@@ -20,7 +20,7 @@ from torchsoft.sysid import RIG
 from torchsoft.sysid.problem.recording import Array
 from torchsoft.threads import side_by_side
 
-TESTS = Path(__file__).parents[1] / "tests"
+TESTS = Path(__file__).parents[2] / "tests"
 sys.path.insert(0, str(TESTS))
 
 from foreign import Numbers, simulate  # noqa: E402  # pyright: ignore[reportMissingImports]

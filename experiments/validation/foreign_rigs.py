@@ -7,7 +7,7 @@ down (set-points at the samples only, F_ff left out, whose x the loop measures).
 parameters from each, with noise of 10 um, 0.5 mrad and 0.1 N at 200 Hz; every case has the same noise, so that cases differ
 by what is wrong and not by luck. An interval holds the truth or not; a warning names the cause or not.
 
-Command: .venv/bin/python experiments/foreign_rigs.py [--smoke] [--only "mesh 240 x 6"] [--workers 2]
+Command: .venv/bin/python experiments/validation/foreign_rigs.py [--smoke] [--only "mesh 240 x 6"] [--workers 2]
 Expected: every interval holds, or a warning names the cause; no case is silent. About a quarter of an hour on two cores, the
 recordings included, which are kept in the folder --out.
 """
@@ -19,7 +19,7 @@ from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
-from _experiment import markdown, options, raw_config, write
+from torchsoft.experiment import markdown, options, raw_config, write
 from _foreign_cases import CASES, Case
 from _foreign_recordings import SMOKE_UNKNOWNS, TRUTH, Made, Order, make_all
 from matplotlib.figure import Figure

@@ -4,7 +4,7 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from _experiment import grid
+from torchsoft.experiment import grid
 from torch import Tensor
 
 from torchsoft import Parameters, SoftGrasp
