@@ -6,10 +6,10 @@ from typing import Any
 
 import torch
 from _benchmark_common import Config, interleaved, prepare
-from torchsoft.experiment import grid, timed
 from torch import Tensor
 
 from torchsoft import SoftGrasp
+from torchsoft.experiment import grid, timed
 
 
 def own_parameters(model: SoftGrasp, count: int) -> dict[str, Tensor]:

@@ -7,9 +7,9 @@ from statistics import median
 from typing import Any
 
 import torch
-from torchsoft.experiment import timed
 
 from torchsoft import Parameters, SoftGrasp, simulate
+from torchsoft.experiment import timed
 from torchsoft.scenario import Manipulation, grasp_and_roll
 
 EIGHT = ("contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau")

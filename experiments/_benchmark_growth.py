@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 from _benchmark_batches import own_parameters
 from _benchmark_common import Config, median_time, prepare
-from torchsoft.experiment import grid, markdown
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
 from torchsoft import Parameters, simulate
+from torchsoft.experiment import grid, markdown
 
 DEPTHS = (0.5e-3, 1e-3, 1.5e-3, 2e-3, 2.5e-3)
 """By how much the grasp compresses both pads together [m]."""

@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 import torch
 from _benchmark_common import Config, prepare
-from torchsoft.experiment import markdown, timed
 from scipy.integrate import odeint, solve_ivp
 from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import SoftGrasp, simulate
+from torchsoft.experiment import markdown, timed
 from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.rates import Rates
 

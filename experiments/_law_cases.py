@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from torchsoft.experiment import COARSE
 
 from torchsoft import Coulomb, Parameters, Reference, SoftGrasp, StandardLinearSolid
 from torchsoft.excitation import Excitation, MultiSine, Press, Roll, Strokes
+from torchsoft.experiment import COARSE
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, Unknown, record
 
 NOMINAL = Parameters().override({"contact.v_s": 0.05, "contact.mu_s": 0.7, "contact.mu_k": 0.6} | COARSE)

@@ -4,10 +4,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from torchsoft.experiment import markdown
 from _orientation_cases import DEGREES, Case, Gains, Outcome, Rigid
 
 from torchsoft import Trajectory
+from torchsoft.experiment import markdown
 from torchsoft.rigs.balance import shown
 
 DISC, KINEMATICS = "disc", "disc, by kinematics"

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torchsoft.experiment import timed
 
 from torchsoft import Parameters, SoftGrasp, Trajectory
+from torchsoft.experiment import timed
 from torchsoft.physics.contact import ramp
 from torchsoft.reduced.fit import Choice, Recipe, assemble, choose, fit, rollout_of, score
 from torchsoft.reduced.ode import ReducedModel

@@ -4,12 +4,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from torchsoft.experiment import COARSE, grid
 from _reduced_common import Config, attempt, compared, ensemble, law, rollout_time, slipping
 from tqdm import tqdm
 
 from torchsoft import Parameters, simulate
 from torchsoft.excitation import Excitation, Strokes, begin
+from torchsoft.experiment import COARSE, grid
 from torchsoft.reduced.fit import Recipe, assemble, choose, rollout_of, score
 from torchsoft.reduced.ode import ReducedModel
 from torchsoft.reduced.records import Record, noisy, record, rolling_radius

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from torchsoft.experiment import COARSE, grid
 from _reduced_common import Config, attempt, compared, ensemble, law, rollout_time, slipping, summary_of
 from scipy.signal import cont2discrete
 from tqdm import tqdm
 
 from torchsoft import Parameters, Profile, Reference, SoftGrasp, Trajectory, hold, simulate
 from torchsoft.excitation import Waves, wave
+from torchsoft.experiment import COARSE, grid
 from torchsoft.reduced.fit import Recipe, assemble, choose, fit, score
 from torchsoft.reduced.ode import ReducedModel
 from torchsoft.reduced.records import STATES, Record, noisy, record, rolling_radius

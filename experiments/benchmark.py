@@ -31,12 +31,12 @@ from typing import Any
 from _benchmark_batches import batches
 from _benchmark_common import GRASP_FORCE, Config, interleaved, prepare, tasks, wall, ways
 from _benchmark_growth import Growth, growth, growth_figure, growth_table
-from torchsoft.experiment import grid, made_by, markdown, options, write
 from matplotlib.figure import Figure
 from step_accuracy import errors
 from tqdm import tqdm
 
 from torchsoft import simulate
+from torchsoft.experiment import grid, made_by, markdown, options, write
 
 ACCURACY = {"motion": 3e-4, "forces": 5e-3}
 """Largest errors over the range of what a step of 2 ms gives."""

@@ -22,13 +22,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from torchsoft.experiment import COARSE, options
 from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Interrupted, NoEquilibrium, Parameters, SimulationFailed, SoftGrasp, Trajectory, simulate
 from torchsoft.channels import PADS
+from torchsoft.experiment import COARSE, options
 from torchsoft.plot import diagram as drawn
 from torchsoft.plot import figures as draw
 from torchsoft.plot.animation import animate

@@ -17,12 +17,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from torchsoft.experiment import COARSE, markdown, options, raw_config, write
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes
+from torchsoft.experiment import COARSE, markdown, options, raw_config, write
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, identify, record
 from torchsoft.sysid.problem.journal import forget
 from torchsoft.sysid.problem.problem import Residuals, StepsByName

@@ -24,12 +24,12 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from torchsoft.experiment import markdown, options, raw_config, timed, write
 from _law_cases import RTOL, SETTINGS, Case, data, draw, plan, problems
 from identify_contact import FiniteDifferences
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
+from torchsoft.experiment import markdown, options, raw_config, timed, write
 from torchsoft.sysid import Problem
 from torchsoft.sysid.answer.comparison import Comparison
 from torchsoft.sysid.laws.compare import compare, fitted

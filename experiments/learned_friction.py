@@ -17,12 +17,12 @@ from importlib.metadata import version
 from pathlib import Path
 
 import torch
-from torchsoft.experiment import COARSE, at_the_points, options, write
 from matplotlib.figure import Figure
 from torch import Tensor, nn
 from tqdm import tqdm
 
 from torchsoft import Parameters, SmoothSlip, SoftGrasp, Trajectory, press, simulate
+from torchsoft.experiment import COARSE, at_the_points, options, write
 
 SWEEPS = 4
 """Fixed-point sweeps for mu(v) and v; each shrinks the error by about (mu_s - mu_k) F_N / ((eta + R) v_s), 0.1 here."""

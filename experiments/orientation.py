@@ -23,7 +23,6 @@ from dataclasses import replace
 from typing import Any
 
 import torch
-from torchsoft.experiment import options, raw_config, timed, write
 from _orientation_cases import (
     DEGREES,
     FILE,
@@ -48,6 +47,7 @@ from _orientation_result import DISC, KINEMATICS, Config, Result, capital, sente
 from tqdm import tqdm
 
 from torchsoft import Circle, Ellipse, RoundedBox, Shape, Trajectory
+from torchsoft.experiment import options, raw_config, timed, write
 from torchsoft.physics.motion import Piecewise, evaluate
 from torchsoft.plot.animation import animate
 from torchsoft.plot.figures import snapshots

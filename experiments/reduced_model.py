@@ -29,7 +29,6 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
-from torchsoft.experiment import made_by, markdown, options, write
 from _reduced_common import Config, smoke
 from _reduced_gain import study_gain
 from _reduced_slip import study_slip
@@ -38,6 +37,7 @@ from matplotlib.figure import Figure
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
+from torchsoft.experiment import made_by, markdown, options, write
 from torchsoft.files import finite
 from torchsoft.reduced.records import STATES
 

@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torchsoft.experiment import COARSE, made_by, markdown, options, timed, write
 from _shapes_figures import distributions, objects_figure, paths, resistance_figure, video
 from _shapes_resistance import HEIGHT, TAU, Resistance, Roll, cases, half_width, length, resistance, roll
 from _shapes_rolls import Rolled, leading_mode, numbers, objects, refused, rubbers, settings, steady_resistance
@@ -31,6 +30,7 @@ from _shapes_rolls import roll as grasp_and_roll
 from tqdm import tqdm
 
 from torchsoft import SimulationFailed, SoftGrasp
+from torchsoft.experiment import COARSE, made_by, markdown, options, timed, write
 
 AT_THE_PEAK = 0.7
 """De at which loads are compared."""

@@ -21,7 +21,6 @@ from tempfile import TemporaryDirectory
 import identify_contact
 import numpy as np
 import torch
-from torchsoft.experiment import COARSE, markdown, options, raw_config, timed, write
 from identify_contact import TRUTH
 from matplotlib.figure import Figure
 from scipy import stats
@@ -30,6 +29,7 @@ from tqdm import tqdm
 from torchsoft import Parameters, SoftGrasp, simulate
 from torchsoft.channels import CHANNELS
 from torchsoft.excitation import CATALOGUE, begin
+from torchsoft.experiment import COARSE, markdown, options, raw_config, timed, write
 from torchsoft.sysid import (
     RIG,
     AtRest,

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torchsoft.experiment import COARSE
 from tqdm import tqdm
 
 from torchsoft import Parameters, Reference
 from torchsoft.excitation import Chirp, Excitation, MultiSine, Press, Strokes, begin
+from torchsoft.experiment import COARSE
 from torchsoft.files import replacing
 from torchsoft.sysid import RIG
 from torchsoft.sysid.problem.recording import Array

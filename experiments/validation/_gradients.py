@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torchsoft.experiment import COARSE, at_the_points, timed
 from torch import Tensor
 
 from torchsoft import Parameters, Profile, Reference, SoftGrasp, press, simulate
+from torchsoft.experiment import COARSE, at_the_points, timed
 from torchsoft.paper.equilibrium import holding_force
 from torchsoft.scenario import grasp_and_roll, reference
 from torchsoft.solve.simulate import Route

@@ -4,11 +4,11 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from torchsoft.experiment import grid
 from torch import Tensor
 
 from torchsoft import Parameters, SoftGrasp
 from torchsoft.excitation import FADE, Begun, Chirp, Excitation, MultiSine, Press, Roll, Strokes, begin
+from torchsoft.experiment import grid
 from torchsoft.paper.equilibrium import holding_force, press, rest
 from torchsoft.scenario import reference
 

@@ -24,12 +24,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from torchsoft.experiment import grid, markdown, options, raw_config, write
 from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Parameters, Profile, Reference, SoftGrasp, press, rest, simulate
+from torchsoft.experiment import grid, markdown, options, raw_config, write
 from torchsoft.paper.equilibrium import holding_force
 from torchsoft.physics.motion import hold
 from torchsoft.scenario import Manipulation, grasp_and_roll

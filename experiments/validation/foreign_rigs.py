@@ -19,12 +19,12 @@ from time import perf_counter, process_time
 from typing import Any
 
 import numpy as np
-from torchsoft.experiment import markdown, options, raw_config, write
 from _foreign_cases import CASES, Case
 from _foreign_recordings import SMOKE_UNKNOWNS, TRUTH, Made, Order, make_all
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from torchsoft.experiment import markdown, options, raw_config, write
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Unknown, Unreachable, identify
 from torchsoft.sysid.problem.journal import forget
 from torchsoft.sysid.problem.workers import Runner

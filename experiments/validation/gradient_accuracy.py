@@ -33,12 +33,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torchsoft.experiment import made_by, markdown, options
-from torchsoft.experiment import write as write_files
 from _gradient_limits import coulomb, from_rest, refinement, touch_down
 from _gradients import FINER, RADIUS, Config, judge_window, smoke, windows
 from matplotlib.figure import Figure
 from tqdm import tqdm
+
+from torchsoft.experiment import made_by, markdown, options
+from torchsoft.experiment import write as write_files
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ from typing import NamedTuple
 
 import identify_contact
 import numpy as np
-from torchsoft.experiment import COARSE, markdown, options, raw_config, write
 from identify_contact import FITTED, TRUTH
 from matplotlib.figure import Figure
 from scipy import stats
@@ -28,6 +27,7 @@ from tqdm import tqdm
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes
+from torchsoft.experiment import COARSE, markdown, options, raw_config, write
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Stage, identify, record
 from torchsoft.sysid.answer.estimate import Estimate, estimates
 from torchsoft.sysid.fit.fit import chord

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torchsoft.experiment import grid, made_by, markdown, options, write
 from torch import Tensor
 
 from torchsoft import Parameters, Profile, SoftGrasp, Trajectory, simulate
+from torchsoft.experiment import grid, made_by, markdown, options, write
 from torchsoft.scenario import grasp_and_roll
 
 UNITS = {

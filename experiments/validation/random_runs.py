@@ -31,12 +31,12 @@ from time import monotonic, process_time, sleep
 from typing import Any
 
 import numpy as np
-from torchsoft.experiment import made_by, markdown, options, write
 from _random_rigs import Drawn, draw
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from torchsoft import NoEquilibrium, SimulationFailed, simulate
+from torchsoft.experiment import made_by, markdown, options, write
 from torchsoft.processes import THREADS, prepare_worker
 
 REASONS = {

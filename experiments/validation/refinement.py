@@ -14,13 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from torchsoft.experiment import grid, made_by, markdown, options, write
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Parameters, SoftGrasp, Trajectory, simulate
+from torchsoft.experiment import grid, made_by, markdown, options, write
 from torchsoft.scenario import grasp_and_roll
 
 

@@ -34,12 +34,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torchsoft.experiment import COARSE, markdown, options, raw_config, write
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Roll, Strokes
+from torchsoft.experiment import COARSE, markdown, options, raw_config, write
 from torchsoft.sysid import Recording, Sensor, record
 
 SENSORS = {"x_C": Sensor(noise=1e-5), "theta": Sensor(noise=5e-4), "y_Br": Sensor(noise=1e-5), "F_y": Sensor(noise=0.1)}

@@ -20,13 +20,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torchsoft.experiment import made_by, markdown, options
-from torchsoft.experiment import write as write_files
 from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Parameters, SoftGrasp, press
+from torchsoft.experiment import made_by, markdown, options
+from torchsoft.experiment import write as write_files
 from torchsoft.paper.equilibrium import holding_force
 
 MILLI, MICRO = 1e3, 1e6

@@ -16,7 +16,6 @@ from statistics import median
 from typing import Any
 
 import torch
-from torchsoft.experiment import grid, made_by, markdown, options, timed, write
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from torch import Tensor
@@ -24,6 +23,7 @@ from tqdm import tqdm
 
 from torchsoft import Parameters, SoftGrasp, Trajectory, simulate
 from torchsoft.excitation import Excitation, MultiSine, Strokes, begin
+from torchsoft.experiment import grid, made_by, markdown, options, timed, write
 from torchsoft.scenario import grasp_and_roll
 
 EIGHT = ("contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau")

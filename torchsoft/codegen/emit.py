@@ -61,20 +61,14 @@ def function(
             if g.value(node) == 0.0:
                 continue
             lines += _evaluation(g, node, text)
-            for needed in _operands(g, target):
+            for needed in g.operands(target):
                 lines += _evaluation(g, needed, text)
             place = f"%{letter}{index}"
-            lines += _address(g, target, letter, place, [text[a] for a in _operands(g, target)])
+            lines += _address(g, target, letter, place, [text[a] for a in g.operands(target)])
             lines.append(f"{place}.old = load double, {POINTER} {place}")
             lines.append(f"{place}.new = fadd double {place}.old, {text[node]}")
             lines.append(f"store double {place}.new, {POINTER} {place}")
     return "\n".join([*lines, "ret void", "}"])
-
-
-def _operands(g: Graph, node: int) -> tuple[int, ...]:
-    """The nodes whose values the instruction of `node` takes."""
-    op = g.ops[node]
-    return () if op in (*LEAVES, "constant") else g.args[node][:1] if op in (*NAMED, "lookup") else g.args[node]
 
 
 def _evaluation(g: Graph, root: int, text: dict[int, str]) -> Iterator[str]:
@@ -85,7 +79,7 @@ def _evaluation(g: Graph, root: int, text: dict[int, str]) -> Iterator[str]:
         if node in text:
             continue
         op = g.ops[node]
-        needed = _operands(g, node)
+        needed = g.operands(node)
         missing = [a for a in needed if a not in text]
         if missing:
             pending += [node, *reversed(missing)]

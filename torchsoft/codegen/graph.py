@@ -61,6 +61,11 @@ class Graph:
         value = float(value)
         return self._node("constant", (value,), ("constant", value.hex()), False, math.isfinite(value))
 
+    def operands(self, node: int) -> tuple[int, ...]:
+        """The nodes whose values the instruction of `node` takes."""
+        op, args = self.ops[node], self.args[node]
+        return () if op in (*LEAVES, "constant") else args[:1] if op in (*NAMED, "lookup") else args
+
     def value(self, node: int) -> float | None:
         """The value of a constant node, and None for every other node."""
         return self.args[node][0] if self.ops[node] == "constant" else None

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.codegen.graph import LEAVES, Graph
+from torchsoft.codegen.graph import Graph
 from torchsoft.codegen.operations import Nodes
 from torchsoft.codegen.trace import Trace, UnknownOperation, traced
 
@@ -31,12 +31,8 @@ class Watch(Trace):
     def points(self, node: int) -> frozenset[int]:
         """Points that a node depends on."""
         if node not in self._points:
-            op, args = self.graph.ops[node], self.graph.args[node]
-            if op == "x":
-                self._points[node] = frozenset((args[0] // self.size,))
-            else:
-                inner = () if op in LEAVES or op == "constant" else args
-                self._points[node] = frozenset().union(*(self.points(one) for one in inner if isinstance(one, int)))
+            own = (self.graph.args[node][0] // self.size,) if self.graph.ops[node] == "x" else ()
+            self._points[node] = frozenset(own).union(*map(self.points, self.graph.operands(node)))
         return self._points[node]
 
     def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: Any = None) -> Any:
