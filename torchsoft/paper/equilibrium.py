@@ -4,7 +4,6 @@ import warnings
 from typing import Any
 
 import torch
-from scipy.optimize import brentq
 from torch import Tensor
 
 from torchsoft.paper.rig import SoftGrasp
@@ -72,6 +71,8 @@ def touching(model: SoftGrasp, x: Tensor) -> State:
     top = model.settings.pad.height
     zero = torch.zeros((), dtype=torch.float64)
     below = float(model.shape.support(torch.tensor([0.0, -1.0]).double()).detach())
+    from scipy.optimize import brentq  # a third of a second, for inertial pads only
+
     side = Side(model, "L", torch.zeros(2, dtype=torch.float64), x)
 
     def deepest(height: Tensor) -> tuple[Tensor, Tensor]:

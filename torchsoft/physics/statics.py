@@ -80,8 +80,9 @@ def check_given(field: str, given: Mapping[str, Tensor], lengths: Mapping[str, i
 
 
 def carried(rig: Rig, name: str, state: State) -> Tensor:
-    """Nodal forces (branches, nodes, 2) [N] of a pad, by semi-smooth Newton from the undeformed pad.
+    """Nodal forces (..., branches, nodes, 2) [N] of a pad, by semi-smooth Newton from the undeformed pad.
 
+    Batch dimensions of `state` hold copies of one state: one backward pass then gives as many rows of a Jacobian.
     The last iteration is taken with the gradient on, which makes the derivative the implicit function theorem's.
     """
     pad = rig.pads[name]
@@ -89,25 +90,25 @@ def carried(rig: Rig, name: str, state: State) -> Tensor:
     C, branches = pad.compliance(), pad.material.branches
     if not own:
         return torch.zeros(branches, pad.nodes, 2, dtype=torch.float64)
-    points = torch.zeros(len(pad.point_nodes), 2, dtype=torch.float64)
+    one = first(state)
 
-    def force(u: Tensor) -> Tensor:
-        """On the points (points, 2) [N], for their displacements u (points, 2) [m]."""
+    def force(u: Tensor, state: State = one) -> Tensor:
+        """On the points (..., points, 2) [N], for their displacements u (..., points, 2) [m]."""
         return sum((point_forces(rig, key, state, u) for key in own), torch.zeros_like(u))
 
     def displaced(f: Tensor) -> Tensor:
-        """A f: displacements (points, 2) [m] under forces on the points (points, 2)."""
-        return pad.spread @ (C @ (pad.spread.mT @ f).flatten()).unflatten(0, (-1, 2))
+        """A f: displacements (..., points, 2) [m] under forces on the points (..., points, 2)."""
+        return pad.spread @ ((pad.spread.mT @ f).flatten(-2) @ C.mT).unflatten(-1, (-1, 2))
 
     def linearise(u: Tensor) -> tuple[Tensor, Tensor]:
         """Residual u - A f(u) and the slopes (points, 2, 2) of f: a point's force depends on its own displacement
         only."""
         with torch.enable_grad():
-            x = u.detach().requires_grad_(True)
+            x = u.detach().expand(2, -1, -1).clone().requires_grad_(True)  # a copy for each component of the force
             f = force(x)
-            rows = [torch.autograd.grad(f[:, i].sum(), x, retain_graph=i == 0, allow_unused=True)[0] for i in range(2)]
+            (rows,) = torch.autograd.grad(f[0, :, 0].sum() + f[1, :, 1].sum(), x, materialize_grads=True)
         with torch.no_grad():
-            return u - displaced(f), torch.stack([torch.zeros_like(u) if row is None else row for row in rows], 1)
+            return u - displaced(f[0]), rows.transpose(0, 1)
 
     def newton_step(r: Tensor, G: Tensor) -> Tensor:
         """(1 - A G)^-1 r: points that do not touch have no slope, and follow the others."""
@@ -119,11 +120,11 @@ def carried(rig: Rig, name: str, state: State) -> Tensor:
         A = C.detach().unflatten(0, (-1, 2)).unflatten(2, (-1, 2))[nodes][:, :, nodes]
         A_tt = torch.einsum("pn,niaj,qa->piqj", S[:, nodes], A, S[:, nodes])
         J = torch.eye(2 * len(t), dtype=r.dtype) - torch.einsum("piqj,qjk->piqk", A_tt, G[t]).reshape(2 * len(t), -1)
-        touching = torch.linalg.solve(J, r[t].flatten()[:, None]).unflatten(0, (-1, 2))
-        return r + displaced(torch.zeros_like(r).index_copy(0, t, (G[t] @ touching)[..., 0]))
+        touching = torch.linalg.solve(J, r[..., t, :].flatten(-2)[..., None]).unflatten(-2, (-1, 2))
+        return r + displaced(torch.zeros_like(r).index_copy(-2, t, (G[t] @ touching)[..., 0]))
 
     with torch.no_grad():
-        u = points
+        u = torch.zeros(len(pad.point_nodes), 2, dtype=torch.float64)
         r, G = linearise(u)
         for _ in range(SETTLING):
             if float(r.abs().max()) <= RESIDUAL:
@@ -140,8 +141,15 @@ def carried(rig: Rig, name: str, state: State) -> Tensor:
                 f"the massless pad `{name}` does not settle (residual {float(r.abs().max()):.2g} m after {SETTLING} "
                 "iterations); is a body deep in it, or are the stretches large?"
             )
-    u = u - newton_step(u - displaced(force(u)), G)
-    return (pad.spread.mT @ force(u)).expand(branches, -1, -1)
+    u = u - newton_step(u - displaced(force(u, state)), G)
+    f = pad.spread.mT @ force(u, state)
+    return f[..., None, :, :].expand(*f.shape[:-2], branches, -1, -1)
+
+
+def first(state: State) -> State:
+    """Of several copies of a state."""
+    batch = next(iter(state.pose.values())).ndim - 1
+    return State(*({name: value[(0,) * batch] for name, value in part.items()} for part in state))
 
 
 def point_forces(rig: Rig, key: str, state: State, u: Tensor) -> Tensor:
@@ -195,10 +203,6 @@ def resting(rig: Rig, pose: Mapping[str, Tensor], residual: float = RESIDUAL) ->
     soft = massless(rig)
     held, _ = soft.held(soft.follow(0.0))
     free = {name: torch.tensor(axes, dtype=torch.long) for name, axes in soft.layout.free.items()}
-    still = {name: torch.zeros(3, dtype=torch.float64) for name in soft.bodies}
-    stretch = {
-        name: torch.zeros(len(soft.pads[c.pad].point_nodes), dtype=torch.float64) for name, c in soft.contacts.items()
-    }
     with torch.no_grad():
         masses = {name: torch.stack(body.masses) for name, body in soft.bodies.items()}
         # an angle counts by the way of a point at the radius of gyration, so that all are lengths and forces
@@ -212,22 +216,30 @@ def resting(rig: Rig, pose: Mapping[str, Tensor], residual: float = RESIDUAL) ->
     counts = [len(axes) for axes in free.values()]
 
     def poses(q: Tensor) -> dict[str, Tensor]:
-        parts = (q / scale).split(counts)
-        return {name: held[name].detach().index_copy(0, free[name], part) for name, part in zip(free, parts)}
+        parts = (q / scale).split(counts, -1)
+        fixed = {name: held[name].detach().expand(*q.shape[:-1], 3) for name in free}
+        return held | {name: fixed[name].index_copy(-1, free[name], part) for name, part in zip(free, parts)}
 
     def loads(q: Tensor) -> Tensor:
-        """Net loads on the free coordinates (n,) [N]."""
-        graph = soft.evaluate(0.0, soft.unpack(settled(soft, poses(q), still, stretch)), settled=True)
+        """Net loads on the free coordinates (..., n) [N]."""
+        still = {name: torch.zeros(*q.shape[:-1], 3, dtype=q.dtype) for name in soft.bodies}
+        stretch = {
+            name: torch.zeros(*q.shape[:-1], len(soft.pads[c.pad].point_nodes), dtype=q.dtype)
+            for name, c in soft.contacts.items()
+        }
+        state = State({}, stretch, poses(q), {}, still)
+        state = state._replace(pads={name: carried(soft, name, state) for name in soft.pads})
+        graph = soft.evaluate(0.0, state, settled=True)
         net = soft.loads(graph, net_efforts(graph.ports, soft.junctions))
-        return torch.cat([net[name][axes] for name, axes in free.items()]) / scale
+        return torch.cat([net[name][..., axes] for name, axes in free.items()], -1) / scale
 
     path: list[tuple[float, Tensor]] = []
     while len(path) < ITERATIONS and not stalled(path, STRIDE * mesh):
         with torch.enable_grad():
-            x = q.detach().requires_grad_(True)
+            x = q.detach().expand(len(q), -1).clone().requires_grad_(True)  # a copy for each load
             F = loads(x)
-            rows = [torch.autograd.grad(one, x, retain_graph=True)[0] if one.requires_grad else None for one in F]
-        F, K = F.detach(), -torch.stack([torch.zeros_like(q) if row is None else row for row in rows])
+            (rows,) = torch.autograd.grad(F.diagonal().sum(), x, materialize_grads=True)
+        F, K = F[0].detach(), -rows
         size = float(F.norm())
         if size * softest <= residual:
             return {name: value.detach() for name, value in poses(q).items()}

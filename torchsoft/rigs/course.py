@@ -58,12 +58,13 @@ class Estimate:
     def _next(self, before: Course, time: float) -> Course:
         """At a time [s], after the poses of the knot before."""
         pose = {name: x.copy() for name, x in before.items()}
-        values = signals(self.rig, time)
-        held, _ = self.rig.held(self.rig.follow(time))
+        followed = self.rig.follow(time).detach()
+        values = dict(zip(self.rig.signals, followed[:, 0].tolist()))
+        held, _ = self.rig.held(followed)
         for body, axis, kind in self.file.coordinates():
             if kind != "free":
                 i = COORDINATES.index(axis)
-                pose[body][i] = float(held[body][i].detach())
+                pose[body][i] = float(held[body][i])
         for one in self.loops:
             (body, axis), (pushed, other) = at(one.measured), at(one.pushes)
             pose[body][axis] = values[one.setpoint]

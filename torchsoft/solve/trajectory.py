@@ -1,13 +1,14 @@
 """What a simulation leaves behind: times, states, nodal forces, efforts, energies, and how it was made."""
 
+from __future__ import annotations
+
 import json
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
-import xarray as xr
 from torch import Tensor
 
 from torchsoft.channels import MEASURED, PADS, VARIABLES
@@ -15,6 +16,9 @@ from torchsoft.files import replacing, sealed, unsealed
 from torchsoft.physics.parts import COORDINATES, coordinate_unit
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import Layout, State
+
+if TYPE_CHECKING:  # takes as long to import as all of this package
+    import xarray as xr
 
 
 @dataclass(frozen=True)
@@ -97,6 +101,8 @@ class Trajectory:
 
     def to_dataset(self) -> xr.Dataset:
         """The run as an xarray Dataset with named dimensions, units, and how it was made."""
+        import xarray as xr
+
         columns: dict[str, tuple[tuple[str, ...], Tensor, str, str]] = {}
         left = dict(self.channels)
         papers = all(name in left for name in MEASURED)  # another rig may call by these names what is something else
@@ -154,6 +160,8 @@ def save(data: xr.Dataset, path: str | Path) -> None:
 
 def load(path: str | Path) -> xr.Dataset:
     """What `save` wrote. Raises `ValueError` for any other file and for one that is damaged, and `OSError`."""
+    import xarray as xr
+
     content = BytesIO(unsealed(path))
     try:
         return xr.load_dataset(content, engine="h5netcdf", decode_times=False)

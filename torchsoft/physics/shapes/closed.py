@@ -1,14 +1,19 @@
 """Closed contours through given points: from a file, and as the control points of a periodic cubic B-spline."""
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from torchsoft import csvfile
 from torchsoft.physics.arguments import LENGTHS, places
 from torchsoft.physics.shapes.simple import crossing
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 Array = NDArray[np.float64]
 
@@ -66,6 +71,8 @@ def closed_spline(points: Array) -> tuple[CubicSpline, Array]:
         points = points[::-1]
     closed = np.concatenate((points, points[:1]))
     chords = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))))
+    from scipy.interpolate import CubicSpline  # a third of a second
+
     return CubicSpline(chords, closed, bc_type="periodic"), chords
 
 
@@ -75,6 +82,8 @@ def control_points(spline: CubicSpline, chords: Array, pieces: int) -> Array:
     t = np.linspace(0, chords[-1], FINE * max(pieces, len(chords)) + 1)
     speed = np.linalg.norm(spline(t, 1), axis=1)
     length = np.concatenate(([0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(t))))
+    from scipy.interpolate import CubicSpline
+
     at = CubicSpline(length, t)(np.linspace(0, length[-1], pieces, endpoint=False))
     turn = 2 * np.pi * np.arange(pieces) / pieces
     return np.fft.ifft(np.fft.fft(spline(at), axis=0) / ((4 + 2 * np.cos(turn)) / 6)[:, None], axis=0).real.copy()
