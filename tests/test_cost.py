@@ -1,5 +1,7 @@
 """The price of work: hours and memory need the user's word, minutes do not; estimates are of the right order."""
 
+import re
+import time
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -7,10 +9,15 @@ from unittest import mock
 
 import pytest
 
-from torchsoft import Parameters
+from torchsoft import PadMesh, Parameters
+from torchsoft.cli import main
 from torchsoft.cost import Cost, Costly, agree, duration, row_memory, step_seconds
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.cost import cost
+from torchsoft.physics.mesh import unit_compliance
+from torchsoft.rigs.cost import condensing_time
+from torchsoft.rigs.template import template
+from torchsoft.rigs.written import to_toml
 
 SMOKE = tomllib.loads((Path(__file__).parent.parent / "data_gen" / "configs" / "smoke.toml").read_text())
 CHEAP, LONG, LARGE = Cost(1e4, 60.0, 0.1), Cost(1e9, 2e5, 0.1), Cost(1e4, 60.0, 1e6)
@@ -58,3 +65,34 @@ def test_what_a_dataset_costs(change: dict[str, Any], seconds: tuple[float, floa
     assert seconds[0] < price.seconds < seconds[1]
     assert price.memory < 1.0
     assert (price.disk > 100.0) == ("trajectories" in change)
+
+
+def test_a_run_that_takes_long_asks_first(tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("rig.toml").write_text(to_toml(template("t").override(solver={"step": 1e-7}, outputs={"duration": 20.0})))
+    assert main(["run", "rig.toml", "--out", "out"]) == 2
+    error = capsys.readouterr().err
+    assert re.search(r"this takes about .* \(2e\+08 steps\)", error), error
+    assert "or say --yes to begin" in error
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize("command", [("check",), ("run", "--out", "out")], ids=["check", "run"])
+def test_a_rig_that_needs_the_machines_memory_asks_first(
+    command: tuple[str, ...], tmp_path: Path, monkeypatch: Any, capsys: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("rig.toml").write_text(to_toml(template("t").override(pads={"lower": {"elements_x": 80, "elements_y": 1000}})))
+    with mock.patch("torchsoft.cost.machine_memory", return_value=1.0):
+        assert main([command[0], "rig.toml", *command[1:]]) == 2
+    assert re.search(r"GiB of memory; .*or say --yes to begin", capsys.readouterr().err)
+
+
+def test_condensing_time_is_that_of_this_machine_within_a_factor() -> None:
+    """Of meshes far apart in size and shape; also under load."""
+    for length, height in ((240, 30), (60, 300)):
+        mesh = PadMesh(0.08, 0.01, length, height)
+        _ = mesh.matrices
+        began = time.process_time()
+        unit_compliance(mesh, 0.45)
+        assert condensing_time(mesh) / 10 < time.process_time() - began < 10 * condensing_time(mesh)

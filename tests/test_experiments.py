@@ -5,6 +5,7 @@ import json
 import math
 import sys
 from pathlib import Path
+from statistics import median
 from types import ModuleType
 
 import numpy as np
@@ -68,7 +69,9 @@ def test_step_accuracy_smoke(tmp_path: Path) -> None:
     loose, tight, equal = rows.values()
     for name in ("x_C", "F_y", "gradient"):
         assert tight[name] < loose[name]
-    assert tight["gradient"] < 0.15
+    usual = median(tight["gradients"].values())  # the worst, of mu_s, is as rough as the roundings
+    assert usual < 0.02
+    assert usual < 0.2 * median(loose["gradients"].values())
     assert loose["steps"] < tight["steps"]
     assert equal["refused"] == 0
     assert module.table(rows).count("|\n") == 4

@@ -192,6 +192,26 @@ DANGEROUS: dict[str, tuple[dict[str, Any], str]] = {
     "never touches": ({"motion__y_d__values": ("start", 50.05e-3), "motion__press__values": (0.0, 0.0)},
                       r"warning: contacts\.upper: `lower` and `upper` never press `disc`"),
     "slip": ({"laws__dry__friction__v_s": 1e-4}, r"warning: laws\.dry\.friction: slip is not single-valued"),
+    "out of reach": (
+        {"pads__upper__origin": (5.0, 0.0)},
+        r"warning: contacts\.upper: it cannot close: `disc` comes no nearer to `upper` than 4\.98 m; change pads",
+    ),
+    "a meganewton": (
+        {"motion__press__values": (0.0, -1e6)}, r"error: motion\.press: at t = 2 s it pushes `bracket` with 1e\+06 N, but"
+    ),
+    "off the pad": (
+        {"motion__x_d__values": ("start", 50.0)}, r"warning: motion\.x_d: at t = 0\.6 s it has taken `disc` .* m past the end"
+    ),
+    "through the disc": (
+        {"motion__y_d__values": ("start", -0.05)},
+        r"error: motion\.y_d: at t = .* it has taken the pads of contacts\.lower and contacts\.upper through each other",
+    ),
+    "between points": (
+        {"bodies__disc__shape__radius": 1e-5}, r"error: bodies\.disc\.shape: 0\.02 mm wide, it falls between points of `lower`"
+    ),
+    "too stiff to rest": (
+        {"laws__dry__K_n": 1e9}, r"error: laws\.dry\.K_n: no rest is found with 1e\+09 N/m, .* take 4e\+05 N/m or less"
+    ),
     "outputs": (
         {"motion__x_d": {"kind": "chirp", "amplitude": 1e-3, "first": 1.0, "last": 50.0}},
         r"warning: outputs\.interval: outputs every 0\.01 s do not show motion\.x_d, which goes up to 50 Hz; take 0\.005 s",
@@ -216,6 +236,8 @@ def test_what_is_dangerous_is_said_before_any_run(name: str) -> None:
     assert any(re.match(sentence, one) for one in found), found
     if sentence.startswith("error"):
         assert found[0].startswith("error")
+    quiet = [str(one) for one in check(coarse(template("t")))]
+    assert not any(re.match(sentence, one) for one in quiet)
 
 
 def test_a_loop_is_unstable_as_the_papers_modes_say() -> None:

@@ -55,7 +55,7 @@ def jerks() -> Recording:
 
 def test_its_parameters_are_found_beside_those_of_the_pads(jerks: Recording) -> None:
     problem = Problem([jerks], SENSORS, {name: Unknown() for name in (*TRUTH, "pad.E")})
-    plan = [Stage("all", ("jerks",), problem.coordinates.labels, 1e-5)]
+    plan = [Stage("all", ("jerks",), problem.coordinates.labels, 1e-6)]
     answer = identify(problem, plan=plan, assumptions="trusted")  # three sensors do not tell beta from the mesh
     assert answer.converged
     for name, value in (*TRUTH.items(), ("pad.E", 0.9e6)):

@@ -42,10 +42,10 @@ class Mesh:
 
     @property
     def memory(self) -> float:
-        """Memory [GiB] for condensing the mesh onto its surface, about: displacements under loads on the surface and their
-        products, the banded stiffness and its factor."""
+        """Memory [GiB] for condensing the mesh onto its surface, about: loads on the surface, displacements under them and their
+        products, and the blocks of the factor."""
         surface, free, band = self.counts()
-        return 8 * 4 * free * (6 * surface + 2 * band) / 2**30
+        return 8 * 4 * free * (4 * surface + 4 * min(band, free // band)) / 2**30
 
     def check_memory(self) -> None:
         """Raises `ValueError` for a mesh too fine to be condensed; inertial pads are condensed too, to find the start."""
