@@ -104,7 +104,6 @@ def test_benchmark_smoke(tmp_path: Path) -> None:
     loose, tight, *_ = (costs[way]["errors"]["x_C"] for way in module.ways(config))
     assert tight < loose
     result = module.run(module.Config(out=tmp_path, smoke=True))
-    assert result.figures["scenario_wall_s_before"] is None
     assert result.figures["batches"]["trajectories"]["failures"] == 0
     assert [one.over for one in result.growth][-1] == "runs of a batch"
     assert len(module.growth_figure(result.growth).axes) == 4

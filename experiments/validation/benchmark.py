@@ -2,34 +2,31 @@
 
 All in one process and one run, medians of repeated timings in turns, so that the ratios hold on a noisy machine:
 
-- the 30 s manipulation by two tolerances, by equal steps, and beside them an earlier version with `--before` a checkout of
-  it; errors against a run at rtol 1e-7; `scenario_wall_s` is that of the loosest tolerance with the accuracy of a step of 2 ms
-  (motion 3e-4, forces 0.5 % of their range);
+- the 30 s manipulation by two tolerances and by equal steps; errors against a run at rtol 1e-7; `scenario_wall_s` is that of
+  the loosest tolerance with the accuracy of a step of 2 ms (motion 3e-4, forces 0.5 % of their range);
 - over the run the sweep for the gradient of all parameters, and what the Jacobian for 8 parameters adds; peak memory;
 - 64 trajectories of 4 s and 1,000 of 0.3 s with parameters of their own, on one and two threads;
 - growth with the surface nodes, the nodes that touch, the simulated time and the size of a batch, with fitted exponents;
 - with `--peers` the same equations, compiled, under scipy's, torchdiffeq's and diffrax's integrators, equally exact.
 
-Command: .venv/bin/python experiments/benchmark.py [--peers] [--before CHECKOUT] [--smoke]
+Command: .venv/bin/python experiments/validation/benchmark.py [--peers] [--smoke]
 Expected: the sweep at most 0.6 of a run and the Jacobian at most 2 by tolerances, more by equal steps; forces need rtol 1e-4 to
 be as exact as by 2 ms. About five minutes, three more with `--peers`.
 """
 
 import cProfile
 import json
-import os
 import pstats
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 from _benchmark_batches import batches
-from _benchmark_common import GRASP_FORCE, Config, interleaved, prepare, tasks, wall, ways
+from _benchmark_common import Config, interleaved, prepare, tasks, wall, ways
 from _benchmark_growth import Growth, growth, growth_figure, growth_table
 from matplotlib.figure import Figure
 from step_accuracy import errors
@@ -52,43 +49,13 @@ class Result:
     growth: list[Growth]
 
 
-@contextmanager
-def earlier(config: Config) -> Iterator[Callable[[], float] | None]:
-    """A function that runs the manipulation once under an earlier version and returns its wall time [s]; None without one."""
-    if not config.before:
-        yield None
-        return
-    root = Path(config.before).resolve()
-    script = Path(__file__).with_name("_benchmark_before.py")
-    process = subprocess.Popen(
-        [sys.executable, str(script), *map(str, (config.duration, config.step, GRASP_FORCE))],
-        env=os.environ | {"PYTHONPATH": str(root)}, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-    )  # fmt: skip
-    assert process.stdin
-    assert process.stdout
-    try:
-        if not Path(process.stdout.readline().strip()).is_relative_to(root):
-            raise ValueError(f"{root} is not a checkout of torchsoft")
-
-        def once() -> float:
-            print(file=process.stdin, flush=True)
-            return float(process.stdout.readline())  # pyright: ignore[reportOptionalMemberAccess]
-
-        yield once
-    finally:
-        process.stdin.close()
-        process.wait()
-
-
 def costs(config: Config) -> dict[str, Any]:
-    """Times of the three tasks by every way, beside an earlier version's run, with errors and peak memory."""
+    """Times of the three tasks by every way, with errors and peak memory."""
     m, t = prepare(), grid(config.duration)
     exact = simulate(m.model, t, y0=m.y0, rtol=config.exact)
     every = {(way, name): task for way, steps in ways(config).items() for name, task in tasks(m, t, steps).items()}
-    with earlier(config) as before:
-        named = {f"{way}, {name}": wall(task) for (way, name), task in every.items()}
-        times = interleaved(named | ({"before": before} if before else {}), config.repeats)
-    out: dict[str, Any] = {"before_s": median(times["before"]) if config.before else None, "timings": times}
+    times = interleaved({f"{way}, {name}": wall(task) for (way, name), task in every.items()}, config.repeats)
+    out: dict[str, Any] = {"timings": times}
     for way, steps in ways(config).items():
         one = simulate(m.model, t, y0=m.y0, **steps)
         seconds = {name: median(times[f"{way}, {name}"]) for name in ("run", "gradient", "jacobian")}
@@ -154,8 +121,7 @@ def run(config: Config) -> Result:
     top = {
         "scenario_wall_s": scenario_s, "scenario_rtol": rtol, "scenario_wall_s_loose": chosen[0]["seconds"]["run"],
         "scenario_wall_s_tight": chosen[-1]["seconds"]["run"],
-        "scenario_wall_s_equal_steps": equal["seconds"]["run"], "scenario_wall_s_before": cost["before_s"],
-        "before_over_scenario": cost["before_s"] and scenario_s and cost["before_s"] / scenario_s,
+        "scenario_wall_s_equal_steps": equal["seconds"]["run"],
         **{name: own[name] for name in own if name.endswith("over_run")},
         **{f"{name}_equal_steps": equal[name] for name in equal if name.endswith("over_run")},
         "batch_sim_s_per_wall_s": batch["trajectories"]["simulated_per_wall"]["2"],
@@ -190,9 +156,6 @@ def cost_table(config: Config, numbers: dict[str, Any]) -> str:
         rows.append(
             (way, f"{one['seconds']['run']:.3g}", f"{motion:.1e}", f"{forces:.1e}", *(f"{one[r]:.2f}" for r in ratios))
         )  # fmt: skip
-    if config.before:
-        step = f"earlier version, step = {1e3 * config.step:g} ms"
-        rows.append((step, f"{numbers['costs']['before_s']:.3g}", *[""] * 6))
     peak = ", ".join(f"{name} {one:.0f}" for name, one in numbers["costs"]["peak_memory_MB"].items())
     return f"{markdown(head, rows)}\n\nPeak memory at {list(ways(config))[1]} [MB]: {peak}"
 
@@ -236,10 +199,6 @@ def figure(result: Result) -> Figure:
         bars = left.bar([k + 0.27 * (i - 1) for k in range(len(every))], seconds, 0.25, color=colour, label=label)
         left.bar_label(bars, fmt="%.2g", fontsize=8)
     names = [way.replace(" = ", "\n") for way in every]
-    if numbers["costs"]["before_s"]:
-        bars = left.bar([len(every)], [numbers["costs"]["before_s"]], 0.25, color="0.5", label="run, earlier version")
-        left.bar_label(bars, fmt="%.2g", fontsize=8)
-        names.append(f"earlier,\n{1e3 * result.config.step:g} ms")
     left.set_xticks(range(len(names)), names)
     left.margins(y=0.1)
     left.set(ylabel="wall time [s]", title=f"{result.config.duration:g} s of manipulation, one core")

@@ -26,7 +26,6 @@ class Config:
     step: float = 2e-3  # of the equal steps [s]
     exact: float = 1e-7  # relative tolerance of the run that errors are measured against
     repeats: int = 5  # timings of which the median is taken
-    before: str = ""  # a checkout of an earlier version, to be timed beside this one
     trajectories: int = 64  # of a batch
     batch_duration: float = 4.0  # simulated time of each of them [s]
     short_runs: int = 1000  # of the batch of short runs
