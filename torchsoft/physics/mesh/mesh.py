@@ -42,8 +42,8 @@ class Mesh:
 
     @property
     def memory(self) -> float:
-        """Memory [GiB] for condensing the mesh onto its surface, about: loads on the surface, displacements under them, their products, and
-        the blocks of the factor."""
+        """Memory [GiB] for condensing the mesh onto its surface, about: loads on the surface, displacements under them, their
+        products, and the blocks of the factor."""
         surface, free, band = self.counts()
         return 8 * 4 * free * (4 * surface + 4 * min(band, free // band)) / 2**30
 
