@@ -6,9 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchsoft import Body, Parameters, Reference, Rig, SoftGrasp, hold, press
+from torchsoft import Body, Parameters, Reference, Rig, SoftGrasp, hold, press, register_method
 from torchsoft.paper.equilibrium import holding_force
 from torchsoft.physics.state import State
+
+register_method()
 
 torch.set_num_threads(1)
 

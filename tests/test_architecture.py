@@ -23,7 +23,7 @@ FLOWS = {
     "physics.mesh": "element mesh compliance block fingertip file quads .",
     "physics.shapes": "shape area simple oval rounded closed contour .",
     "solve": """
-        grid kernel laws system progress tolerances rates stability stepper adjoint tangent unrolled continuous trajectory
+        grid kernel laws system progress tolerances rates stability stepper adjoint tangent trajectory
         ledger simulate batch torchdiffeq .
     """,
     "sysid": "problem fit conventions checks certainty answer settings conclude solve laws files report design .",

@@ -146,7 +146,7 @@ def test_a_run_that_fails_leaves_the_others_alone(start: tuple[SoftGrasp, Tensor
         ),
         ({"parameters": {"contact.K_n": K_n[0]}}, "must have one entry a run"),
         ({"parameters": {"contact.K_n": K_n.float()}}, "float64"),
-        ({"parameters": {"contact.K_n": K_n}, "gradient": "unrolled"}, "a batch takes gradient='none'"),
+        ({"parameters": {"contact.K_n": K_n}, "gradient": "continuous"}, "a batch takes gradient='none'"),
         ({"parameters": {"contact.K_n": K_n}, "rtol": -1.0}, "`rtol` must be positive"),
         *(
             (

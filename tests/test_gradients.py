@@ -10,6 +10,7 @@ from conftest import coarse, f64, grasped, random_state, times, turning
 from torch import Tensor, nn
 from torch.autograd import gradcheck
 from torchdiffeq import odeint
+from unrolled import unrolled_solution
 
 import torchsoft.solve.adjoint
 from torchsoft import METHOD, Parameters, Profile, Reference, Rig, SoftGrasp, simulate
@@ -17,7 +18,6 @@ from torchsoft.channels import MEASURED
 from torchsoft.paper.rig import NAMES
 from torchsoft.solve.adjoint import GradientFailed
 from torchsoft.solve.trajectory import channels
-from torchsoft.solve.unrolled import unrolled_solution
 
 NEWTON = 1e-10
 """Newton's tolerance of the compiled steps compared here [N]; 1e-11 is rounding, and not reached at every step."""

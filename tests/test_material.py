@@ -16,6 +16,7 @@ from conftest import COARSE, coarse, random_state, times
 from scipy.optimize import brentq
 from torch import Tensor
 from torch.autograd import gradcheck
+from unrolled import unrolled_solution
 
 from torchsoft import (
     Actuator,
@@ -336,11 +337,16 @@ def test_gradients_of_a_grasp_by_every_coefficient_equal_differences(name: str) 
 def test_the_adjoint_of_a_chain_equals_backpropagation() -> None:
     """Through the same steps in plain torch."""
     grads = []
-    for gradient in ("discrete", "unrolled"):
+    for compiled in (True, False):
         model = SoftGrasp(STABLE, material=MATERIALS["prony"]())
         y0, reference = rolling(model)
-        run = simulate(model, times(0.02, 2), y0=y0, reference=reference, step=2e-3, tolerance=1e-10, gradient=gradient)
-        run.state.pose["disc"][-1, 1].backward()
+        t, steps = times(0.02, 2), {"reference": reference, "step": 2e-3}
+        y = (
+            simulate(model, t, y0=y0, tolerance=1e-10, gradient="discrete", **steps).y
+            if compiled
+            else unrolled_solution(model, y0, t, **steps)
+        )
+        model.unpack(y[-1]).pose["disc"][1].backward()
         values = [value for name, value in model.pad.named_parameters() if name != "rho"]
         grads.append(torch.stack([value.grad * value.detach() for value in values if value.grad is not None]))
     assert len(grads[0]) == len(grads[1]) == 14

@@ -255,8 +255,6 @@ def test_ways_to_choose_steps_exclude_each_other() -> None:
         simulate(coarse(), T, rtol=-1.0)
     with pytest.raises(ValueError, match="`rtol` must be below 1, but is 2; where only `atol` is given"):
         simulate(coarse(), T, rtol=2.0)
-    with pytest.raises(ValueError, match="takes equal steps"):
-        simulate(coarse(), T, rtol=1e-4, gradient="unrolled")
 
 
 def test_torchdiffeqs_tolerances_are_the_steppers() -> None:

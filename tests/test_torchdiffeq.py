@@ -1,6 +1,8 @@
-"""torchdiffeq's verbs with the registered method, its own methods on a rig, and the guard of the continuous adjoint."""
+"""torchdiffeq's verbs with the registered method, its own methods on a rig."""
 
 import importlib
+import subprocess
+import sys
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -9,14 +11,21 @@ import torch
 from conftest import coarse, f64, grasped, times
 from torchdiffeq import odeint, odeint_adjoint
 
-from torchsoft import METHOD, SoftGrasp, register, simulate
+from torchsoft import METHOD, SoftGrasp, register_method, simulate
 from torchsoft.scenario import grasp_and_roll
-from torchsoft.solve.continuous import LONGEST, OutputsTooCoarse, stiffest_rate
 from torchsoft.solve.torchdiffeq import TorchdiffeqSolver
 
 OPTIONS = {"step_size": 2e-3, "tolerance": 1e-10}
 
 SOLVERS = importlib.import_module("torchdiffeq._impl.odeint").SOLVERS
+
+
+def test_an_import_leaves_torchdiffeq_alone() -> None:
+    code = (
+        "import torchdiffeq; from torchdiffeq._impl.odeint import SOLVERS; before = dict(SOLVERS); import torchsoft; "
+        "assert SOLVERS == before; torchsoft.register_method(); assert SOLVERS != before"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_torchdiffeq_runs_the_stepper() -> None:
@@ -79,8 +88,8 @@ def solver_of_theirs() -> Iterator[type]:
 
     before = SOLVERS[METHOD]
     SOLVERS[METHOD] = Theirs
-    register()
-    register()
+    register_method()
+    register_method()
     yield Theirs
     SOLVERS[METHOD] = before
 
@@ -158,11 +167,3 @@ def test_continuous_adjoint_agrees_on_a_short_window() -> None:
     for name in names:
         continuous, discrete = (result[name] for result in results)
         assert abs(continuous - discrete) < 1e-4 * abs(discrete), name
-
-
-def test_coarse_outputs_are_refused() -> None:
-    model, y0 = rolling()
-    rate = stiffest_rate(model, y0[0], 0.3)
-    t = torch.tensor([0.3, 0.3 + 1.2 * LONGEST / rate], dtype=torch.float64)
-    with pytest.raises(OutputsTooCoarse, match="loses the gradient"):
-        simulate(model, t, y0=y0[0], gradient="continuous")

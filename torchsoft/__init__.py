@@ -17,15 +17,13 @@ from torchsoft.solve.batch import Batch, SamplesFailed, simulate_batch
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import Interrupted, simulate
 from torchsoft.solve.stepper import METHOD
-from torchsoft.solve.torchdiffeq import register
+from torchsoft.solve.torchdiffeq import register_method
 from torchsoft.solve.trajectory import Trajectory
-
-register()
 
 __all__ = [
     "METHOD", "PD", "Actuator", "Batch", "Body", "Circle", "Contact", "Contour", "Coulomb", "CurvedPadMesh", "Ellipse",
     "FingertipMesh", "GeneralisedKelvin", "Interrupted", "KelvinVoigt", "NoEquilibrium", "Pad", "PadMesh", "Parameters",
     "Profile", "Prony", "QuadMesh", "Reference", "Rig", "RoundedBox", "RoundedPolygon", "Sampled", "SamplesFailed",
     "Shape", "SimulationFailed", "SmoothSlip", "SoftContact", "SoftGrasp", "StandardLinearSolid", "StateFeedback",
-    "Superellipse", "Trajectory", "controller", "hold", "press", "rest", "simulate", "simulate_batch",
+    "Superellipse", "Trajectory", "controller", "hold", "press", "register_method", "rest", "simulate", "simulate_batch",
 ]  # fmt: skip

@@ -1,6 +1,7 @@
 """Windows of motion, their loss, and the routes to its gradient, judged by central differences."""
 
 import statistics
+import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -9,13 +10,17 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from torchdiffeq import odeint_adjoint
 
 from torchsoft import Parameters, Profile, Reference, SoftGrasp, press, simulate
 from torchsoft.experiment import COARSE, at_the_points, timed
 from torchsoft.paper.equilibrium import holding_force
 from torchsoft.scenario import grasp_and_roll, reference
-from torchsoft.solve.simulate import Route
 from torchsoft.solve.trajectory import channels
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+
+from unrolled import unrolled_solution  # noqa: E402  # pyright: ignore[reportMissingImports]
 
 NEWTON = 1e-10  # Newton's tolerance of every run here [N].
 
@@ -86,10 +91,14 @@ def linspace(start: float, end: float, step: float) -> Tensor:
     return torch.linspace(start, end, round((end - start) / step) + 1, dtype=torch.float64)
 
 
-def states(window: Window, route: Route = "discrete") -> Tensor:
+def states(window: Window, route: str = "discrete") -> Tensor:
     """The run (T, size), differentiable if gradients are on."""
     w = window
-    return simulate(w.model, w.t, y0=w.y0, step=w.step, tolerance=NEWTON, gradient=route).y
+    if route == "unrolled":
+        return unrolled_solution(w.model, w.y0, w.t, step=w.step)
+    if route == "continuous":
+        return odeint_adjoint(w.model, w.y0, w.t, method="dopri5", rtol=1e-8, atol=1e-11)  # pyright: ignore[reportReturnType]
+    return simulate(w.model, w.t, y0=w.y0, step=w.step, tolerance=NEWTON, gradient=route).y  # pyright: ignore[reportArgumentType]
 
 
 def signals(model: SoftGrasp, y: Tensor, t: Tensor) -> Tensor:

@@ -18,7 +18,6 @@ from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
 from torchsoft.solve import tangent
 from torchsoft.solve.adjoint import TAPE_BYTES, Solved, attached, march, recorded
-from torchsoft.solve.continuous import continuous_solution
 from torchsoft.solve.grid import check_times
 from torchsoft.solve.ledger import doubts
 from torchsoft.solve.progress import Progress, SimulationFailed
@@ -26,9 +25,8 @@ from torchsoft.solve.stability import describe_instability
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
 from torchsoft.solve.system import independent
 from torchsoft.solve.trajectory import Stats, Trajectory, channels, units
-from torchsoft.solve.unrolled import unrolled_solution
 
-Route = Literal["none", "discrete", "forward", "unrolled", "continuous"]
+Route = Literal["none", "discrete", "forward"]
 """Ways to a derivative: none; the exact adjoint of the run; sensitivities along `wrt`; plain torch steps; torchdiffeq's own."""
 
 
@@ -69,8 +67,7 @@ def simulate(
     that were taken, which are not differentiated) by y0, every parameter and the reference; recorded nodal forces and energies
     do not. With "forward" `sensitivities` holds the derivatives by the n scalar parameters `wrt`, and dy0 (size, n) is that of
     the start; columns of dy0 beyond the n are directions of the start alone. `rigid` keeps the derivatives of the free
-    coordinates and their rates only. "unrolled" takes given steps in plain torch, "continuous" torchdiffeq's explicit steps
-    and adjoint: both slow, for cross checks over short windows.
+    coordinates and their rates only.
     Under `torch.no_grad()` no route records a graph.
 
     Raises `ValueError` for times that do not increase, a state of the wrong shape or dtype, an unknown route or parameter, two
@@ -81,8 +78,6 @@ def simulate(
         rig, t, y0=y0, reference=reference, rtol=rtol, atol=atol, step=step, knots=knots, tolerance=tolerance,
         gradient=gradient, wrt=wrt, dy0=dy0, rigid=rigid,
     )  # fmt: skip
-    if gradient in ("unrolled", "continuous"):
-        return _recorded(task.stepper, t, task.y0, gradient)
     trajectory = run(task, TAPE_BYTES, progress).trajectory()
     for doubt in doubts(trajectory, rig).values():
         warnings.warn(doubt, stacklevel=2)
@@ -112,10 +107,6 @@ def prepare(
     given = [f"`{name}`" for name, value in ways.items() if value is not None]
     if len(given) > 1:
         raise ValueError(f"{' and '.join(given)} each say which steps to take; give one of them")
-    if gradient in ("unrolled", "continuous"):
-        if given and step is None:
-            raise ValueError(f"gradient='{gradient}' takes equal steps of `step` [s] only")
-        step = STEP if step is None else step
     if rtol is None:
         rtol = RTOL if atol is None else 10 * atol
     stepper = ImplicitStepper(
@@ -230,20 +221,6 @@ def _rows(task: Task, tape_bytes: float) -> Iterator[tuple[Solved, Tensor | None
     kept = stepper.layout.rigid if task.rigid else list(range(size))
     for dy, out in tangent.iterate(stepper, task.y0, task.t, wanted, dy0, kept):
         yield Solved(stepper, task.y0, out, None), dy
-
-
-def _recorded(stepper: ImplicitStepper, t: Tensor, y0: Tensor, gradient: Route) -> Trajectory:
-    """The routes in torch, which record every operation: states and channels, without forces and work."""
-    began, rig, reference = clock.perf_counter(), stepper.rig, stepper.reference
-    solve = unrolled_solution if gradient == "unrolled" else continuous_solution
-    y = solve(rig, y0, t, reference, step=stepper.step or STEP)
-    signals = stepper.compiled.signals(t, reference)[..., : len(rig.signals), :]
-    state, nothing = rig.unpack(y, signals), torch.zeros(0, dtype=torch.float64)
-    return Trajectory(
-        t, y, state, channels(rig, state, signals), {}, {}, {}, {}, {}, {}, nothing,
-        Stats(0, 0, 0, 0, clock.perf_counter() - began), nothing, rig.layout, made_by(rig, gradient),
-        units=units(rig),
-    )  # fmt: skip
 
 
 def diagnose(rig: Rig, failure: SimulationFailed, trajectory: Trajectory) -> SimulationFailed:

@@ -1,4 +1,4 @@
-"""The stepper under torchdiffeq's own verbs: `odeint` and `odeint_adjoint`.
+"""The stepper under torchdiffeq's own verbs, `odeint` and `odeint_adjoint`, once `register_method()` has been called.
 
 `odeint(rig, y0, t, method="sdirk2")` has the discrete adjoint behind it already. `odeint_adjoint` works as well: it calls the
 same method once more, backwards and interval by interval, on its augmented dynamics, which the solver recognises and answers
@@ -164,8 +164,12 @@ def _innermost(func: Any) -> Any:
     return func
 
 
-def register() -> None:
-    """Add the stepper to torchdiffeq's table of solvers. The table is private, hence the check of what is there."""
+def register_method() -> None:
+    """Adds `method="sdirk2"` to the solvers of torchdiffeq in this process; called again it does nothing.
+
+    Functions that are no rig's keep a solver of this name that torchdiffeq has of its own. Raises `ImportError` for a
+    torchdiffeq that keeps its solvers elsewhere.
+    """
     solvers = getattr(importlib.import_module("torchdiffeq._impl.odeint"), "SOLVERS", None)
     if not isinstance(solvers, dict) or "dopri5" not in solvers:
         raise ImportError("this torchdiffeq keeps its solvers elsewhere; torchsoft was made for torchdiffeq 0.2.5")

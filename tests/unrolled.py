@@ -32,7 +32,7 @@ def unrolled_solution(
     """
     check_times(t)
     if any(pad.inertial for pad in rig.pads.values()):
-        raise NotImplementedError("the unrolled step is for massless pads; use gradient='discrete'")
+        raise NotImplementedError("the unrolled step is for massless pads")
     y, out = y0, [y0]
     for starts, lengths, ends, _ in equal_steps(t, step):
         h, keep = float(lengths[0]), np.isin(np.arange(len(starts)), ends)
