@@ -20,7 +20,7 @@ from torchsoft.solve.trajectory import channels
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
 
-from unrolled import unrolled_solution  # noqa: E402  # pyright: ignore[reportMissingImports]
+from unrolled import unrolled_solution  # pyright: ignore[reportMissingImports]
 
 NEWTON = 1e-10  # Newton's tolerance of every run here [N].
 
