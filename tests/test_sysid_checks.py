@@ -32,13 +32,15 @@ def recorded(truth: Parameters = BASE, excitation: Excitation = STROKES) -> Reco
     return record("strokes", excitation, truth.override(TRUTH), BASE, SENSORS, rtol=1e-6, seed=4)
 
 
-def checked(data: Recording, doubtful: bool = False, sensors: dict[str, Sensor] = SENSORS) -> Checked:
+def checked(
+    data: Recording, doubtful: bool = False, sensors: dict[str, Sensor] = SENSORS, explain: bool = True
+) -> Checked:
     problem = Problem([data], sensors, {name: Unknown() for name in TRUTH})
     free, runner = problem.coordinates.free, Runner(problem.recordings)
     answer = identify(problem, plan=[Stage("all", problem.names, problem.coordinates.labels, RTOL)])
     x = np.array(answer.x)
     at, _ = problem.freeze(runner, x, problem.names, RTOL, free)
-    return check(problem, x, at, free, problem.names, RTOL, doubtful=doubtful)
+    return check(problem, x, at, free, problem.names, RTOL, doubtful=doubtful, explain=explain)
 
 
 @pytest.fixture(scope="module")
@@ -160,12 +162,28 @@ def test_another_ramp_is_asked_for_by_data_that_it_made(vary: Callable[[Recordin
     assert any("ramp" in sentence for sentence in notices(found))
 
 
-def test_under_another_law_a_fit_that_is_far_off_begins_anew() -> None:
-    """Data of Coulomb's friction, and a fit with smooth friction that has ended where nothing can be learnt."""
+def far_off() -> tuple[Problem, Runner, np.ndarray]:
+    """Data of Coulomb's friction, and coordinates at which a fit with smooth friction has ended where nothing can be learnt."""
     known = BASE.override({"contact.mu_s": 0.1, "contact.mu_k": 0.07, "contact.v_s": 0.1, "contact.eta": 100.0})
     data = record("light", LIGHT, known.override(TRUTH), known, SENSORS, rtol=1e-5, noise=0.0)
     problem = Problem([made_by(coulomb(data), data)], SENSORS, {name: Unknown() for name in TRUTH})
-    free, runner, x = problem.coordinates.free, Runner(problem.recordings), problem.coordinates.start + [0.5, -0.7]
+    return problem, Runner(problem.recordings), problem.coordinates.start + [0.5, -0.7]
+
+
+def test_what_no_test_explains_has_candidates() -> None:
+    """Nothing is fitted again: a notice says what `explain` would try."""
+    problem, runner, x = far_off()
+    free = problem.coordinates.free
+    at, _ = problem.freeze(runner, x, problem.names, RTOL, free)
+    found = check(problem, x, at, free, problem.names, RTOL, doubtful=True)
+    assert not any(one.refitted for one in found.checks)
+    assert "Coulomb friction" in found.candidates
+    assert any("`explain` looks for the cause, with a new fit without each of " in text for text in notices(found))
+
+
+def test_under_another_law_a_fit_that_is_far_off_begins_anew() -> None:
+    problem, runner, x = far_off()
+    free = problem.coordinates.free
     at, _ = problem.freeze(runner, x, problem.names, RTOL, free)
     end = ended(problem, x, at, free, problem.names, RTOL, 1, None)
     law = next(one for one in assumptions(problem.recordings, set(TRUTH)) if one.name == "Coulomb friction")

@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from torchsoft.experiment import markdown, options, raw_config, write
-from torchsoft.sysid import RIG, IdentificationResult, Problem, Unknown, Unreachable, identify
+from torchsoft.sysid import RIG, IdentificationResult, Problem, Unknown, Unreachable, explain
 from torchsoft.sysid.problem.journal import forget
 from torchsoft.sysid.problem.workers import Runner
 
@@ -153,7 +153,7 @@ def study(case: Case, made: Mapping[Order, Made], config: Config) -> Outcome:
             for k, (name, one) in enumerate(zip(case.excitations, mine))
         ]
         problem = Problem(recordings, RIG, unknowns(config))
-        found = identify(
+        found = explain(
             problem, rtol=config.rtol, workers=config.workers, checkpoint=runs(case, config), progress=not config.smoke
         )
     except (Unreachable, ValueError) as error:

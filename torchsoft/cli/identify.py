@@ -18,12 +18,27 @@ Writes answer.json and report.html, and comparison.json where there are competin
 where it was."""
 
 
+EXPLAIN = """\
+Why does the model not explain these recordings?
+
+Identifies as `identify` does, and where a misfit is left that no test of an assumption explains to first order, fits again
+without one assumption after the other until one explains the data: minutes each, the progress names which. With
+the checkpoint of an identification it begins where that ended."""
+
+
 def add_commands(commands: Any) -> None:
-    """The command that identifies."""
-    one = commands.add_parser(
-        "identify", help="find parameters in recordings", description=IDENTIFY,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    """The commands that identify and that explain a misfit."""
+    for name, help, description in (
+        ("identify", "find parameters in recordings", IDENTIFY),
+        ("explain", "find what is wrong where a model does not explain recordings", EXPLAIN),
+    ):
+        add_command(commands.add_parser(
+            name, help=help, description=description, formatter_class=argparse.RawDescriptionHelpFormatter,
+        ))  # fmt: skip
+
+
+def add_command(one: argparse.ArgumentParser) -> None:
+    """Arguments of either."""
     one.add_argument(
         "files", nargs="+", type=Path, metavar="DATA.csv ... CONFIG.toml", help="data files and one configuration"
     )
@@ -33,7 +48,7 @@ def add_commands(commands: Any) -> None:
     one.add_argument("--checkpoint", type=Path, help="folder for what is unfinished (OUT/unfinished)")
     one.add_argument("--yes", action="store_true", help="begin even what takes hours, or much memory")
     one.add_argument("--no-progress", action="store_true", help="show no progress")
-    one.set_defaults(run=identify)
+    one.set_defaults(run=identify, explains=one.prog.endswith("explain"))
 
 
 def identify(options: argparse.Namespace) -> int:
@@ -57,7 +72,9 @@ def identify(options: argparse.Namespace) -> int:
         try:
             case = measured.load(data, configs[0])
             fit, tables = case.config.fit, case.tables
-            changed = {"rtol": options.rtol, "workers": options.workers}
+            changed = {
+                "rtol": options.rtol, "workers": options.workers, "assumptions": "explained" if options.explains else None,
+            }  # fmt: skip
             fit = Settings.model_validate(fit.model_dump() | {k: v for k, v in changed.items() if v is not None})
             problems, heldout = list(case.laws.values()) or [case.problem], case.config.heldout
             priced = (fit.rtol, fit.starts, fit.workers, heldout, fit.method)

@@ -13,9 +13,9 @@ from torchsoft.sysid.problem.start import AtRest, Known
 from torchsoft.sysid.problem.synthetic import RIG, record
 from torchsoft.sysid.problem.underway import Underway
 from torchsoft.sysid.problem.unknowns import Prior, Sensor, Unknown
-from torchsoft.sysid.solve import identify
+from torchsoft.sysid.solve import explain, identify
 
 __all__ = [
     "MEASURED", "RIG", "Answer", "AtRest", "Estimate", "IdentificationResult", "Known", "Prior", "Problem", "Recording",
-    "Sensor", "Stage", "Underway", "Unknown", "Unreachable", "begin_underway", "identify", "load_answer", "record",
+    "Sensor", "Stage", "Underway", "Unknown", "Unreachable", "begin_underway", "explain", "identify", "load_answer", "record",
 ]  # fmt: skip

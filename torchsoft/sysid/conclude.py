@@ -15,7 +15,6 @@ from torchsoft.sysid.checks import checks, misfit
 from torchsoft.sysid.checks.colour import Coloured, colour_notices, rewhitened
 from torchsoft.sysid.checks.parts import parts
 from torchsoft.sysid.fit import robust
-from torchsoft.sysid.fit.fit import Notify
 from torchsoft.sysid.fit.information import fisher
 from torchsoft.sysid.fit.plan import Stage
 from torchsoft.sysid.fit.robust import Loss
@@ -74,9 +73,8 @@ def conclude(
     colour, bound = bool(coloured.found.keys() - set(declared)), bool((free & c.at_bound(x)).any())
     doubtful = not end.at_rest or colour or bound or any(one.alarming for one in verdicts)
     checked = None
-    if how.settings.assumptions == "checked":
-        with progress_bar("check of what is taken for granted", progress) as notify:
-            checked = taken_for_granted(coloured, runner, end, stage, free, doubtful, how.loss, notify)
+    if how.settings.assumptions != "trusted":
+        checked = tested_assumptions(coloured, runner, end, stage, free, doubtful, how, progress)
     C, shift = np.zeros((len(x), len(x))), np.zeros(len(x)) if end.bias is None else end.bias
     C_fit = (
         C_free * max(1.0, chi2) if how.loss == "linear" else robust.covariance(J, at.r, how.loss, len(c.priors), exact)
@@ -118,6 +116,7 @@ def conclude(
         made_by={
             "torchsoft": version("torchsoft"), **how.settings.model_dump(), "rtol": rtol, "rtol_asked": stage.rtol,
             "meant": list(how.meant), "untried": list(checked.untried) if checked is not None else [],
+            "candidates": list(checked.candidates) if checked is not None else [],
             "unknowns": {name: u.model_dump() for name, u in problem.unknowns.items()},
             "sensors": {name: s.model_dump() for name, s in problem.sensors.items()},
             "recordings": {r.name: r.fingerprint for r in problem.recordings},
@@ -130,9 +129,9 @@ def conclude(
     )  # fmt: skip
 
 
-def taken_for_granted(
-    coloured: Coloured, runner: Runner, end: Settled, stage: Stage, free: NDArray[np.bool_], doubtful: bool, loss: Loss,
-    notify: Notify,
+def tested_assumptions(
+    coloured: Coloured, runner: Runner, end: Settled, stage: Stage, free: NDArray[np.bool_], doubtful: bool, how: How,
+    progress: bool,
 ) -> checks.Checked:  # fmt: skip
     """The checks at the end of a fit, on residuals with the colour that was declared and no other: what was found unasked may
     be the very trace of a wrong assumption. Their columns then get all the noise."""
@@ -140,8 +139,10 @@ def taken_for_granted(
     declared = {channel: noise for channel, noise in problem.noise.items() if problem.sensors[channel].colour == "ar"}
     plain = problem.with_noise(declared)
     finer = rewhitened(plain, end.finer, parts(problem, end.finer.r, which))
-    how: dict[str, Any] = {"workers": runner.workers, "journal": runner.folder, "notify": notify}
-    found = checks.check(plain, end.x, finer, free, which, end.rtol, doubtful=doubtful, loss=loss, **how)
+    found = checks.check(
+        plain, end.x, finer, free, which, end.rtol, doubtful=doubtful, explain=how.settings.assumptions == "explained",
+        loss=how.loss, workers=runner.workers, journal=runner.folder, progress=progress,
+    )  # fmt: skip
     rows = Residuals(found.columns[:, 0] if found.columns.size else finer.r, found.columns, {})
     columns: Array = rewhitened(problem, rows, parts(plain, rows.r, which)).J
     return found._replace(columns=columns, J=end.at.J[:, free])

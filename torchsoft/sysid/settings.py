@@ -12,8 +12,8 @@ RTOL = 1e-5
 """Relative tolerance of the last stage: derivatives are then right to some percent, and estimates to a fraction of a standard
 deviation where sensors are as good as `RIG`."""
 
-Assumed = Literal["checked", "trusted"]
-"""Whether what is taken for granted is varied at the end, or believed."""
+Assumed = Literal["checked", "explained", "trusted"]
+"""Whether assumptions are tested to first order, tested and followed by new fits that look for a cause, or believed."""
 
 
 class Settings(Table):

@@ -44,11 +44,11 @@ def identify(
     folder every run is kept there: an identification that was interrupted, called again with the same arguments, continues
     where it was.
 
-    At the end what was taken for granted (mesh, touch-down ramp, place of the disc, numbers that are called known, faults of
-    sensors, the friction law) is varied, a run each: `checks` tells what the data ask for in its place, and intervals
-    allow for constants of the computation that the data cannot tell. Before the fit recordings are held against what such a
-    rig can do at all: signs, units, delays, zeros, set-points, the body that a loop senses (`conventions`); `meant` names
-    findings that are no mistakes. With `assumptions` = "trusted" both are left out.
+    At the end the assumptions (mesh, touch-down ramp, place of the disc, numbers that are called known, faults of sensors, the
+    friction law) are tested to first order, a run each, and intervals allow for constants of the computation that the data
+    cannot tell. Where no test explains a misfit, a notice names the candidates, and `explain` tries them. Before the fit
+    recordings are held against what such a rig can do at all: signs, units, delays, zeros, set-points, the body that a loop
+    senses; `meant` names findings that are no mistakes. With `assumptions` = "trusted" both are left out.
 
     Raises `ValueError` for what `Settings` does not take, and for recordings that are not there or cannot be what they are
     taken for, `Unreachable` where the model cannot follow the data.
@@ -64,7 +64,7 @@ def identify(
         raise ValueError("`starts` and `rtol` are those of the default plan: say them of the stages of `plan` instead")
     fitted, began = [name for name in problem.names if name not in heldout], clock.perf_counter()
     runner = Runner(problem.recordings, workers, Path(checkpoint) if checkpoint is not None else None)
-    looks = accepted(check(problem, runner, fitted), meant) if assumptions == "checked" else []
+    looks = accepted(check(problem, runner, fitted), meant) if assumptions != "trusted" else []
     for look in looks if progress else ():
         tqdm.write(plain(f"note: {look}"), file=sys.stderr)
     x, fit, stages = problem.coordinates.start, None, []
@@ -87,6 +87,16 @@ def identify(
     ]
     how = How(fitted, tuple(heldout), tuple(meant), settings)
     return conclude(coloured, runner, plan[-1], stages, how, looks, began, progress)
+
+
+def explain(problem: Problem, **how: Any) -> IdentificationResult:
+    """Identify, and look for the cause of a misfit that no test of an assumption explains to first order.
+
+    The fit is repeated without one assumption after the other (another law, number, mesh, place, sensor) until one explains the
+    data: some minutes each, with progress that names it. Takes the arguments of `identify`, and with its `checkpoint` begins
+    where that ended; Ctrl-C keeps what was tried. Raises what `identify` does.
+    """
+    return identify(problem, **how, assumptions="explained")
 
 
 @contextmanager

@@ -6,7 +6,7 @@ residuals, how much of it the data ask for. A constant of the computation is not
 a coordinate more, with a standard normal prior on its amplitude, so that data that cannot tell it cost certainty.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -14,12 +14,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
+from tqdm import tqdm
 
 from torchsoft.sysid.checks.assumptions import FAULTS, Assumption, Kind, assumptions
 from torchsoft.sysid.checks.misfit import LEVEL
 from torchsoft.sysid.checks.parts import parts
 from torchsoft.sysid.checks.variation import End, Refit, difference, ended, refit
-from torchsoft.sysid.fit.fit import Notify
 from torchsoft.sysid.fit.information import fisher, shift, standard_deviations
 from torchsoft.sysid.fit.robust import Loss
 from torchsoft.sysid.problem.prediction import FailedRun
@@ -28,6 +28,7 @@ from torchsoft.sysid.problem.readout import Signals
 from torchsoft.sysid.problem.recording import Array
 from torchsoft.sysid.problem.unknowns import Nuisance
 from torchsoft.sysid.problem.workers import Runner
+from torchsoft.tables import plain
 
 ASKED = 20.0
 """Fall of chi2, over the misfit that is left per sample, from which the data ask for a variation: four and a half standard
@@ -115,6 +116,8 @@ class Checked(NamedTuple):
     J: Array
     untried: tuple[str, ...] = ()
     """What an interrupt left out."""
+    candidates: tuple[str, ...] = ()
+    """Assumptions without which a new fit may explain a misfit that no check explains to first order."""
 
     def covariance(self) -> Array:
         """Covariance (n, n) of the free coordinates, which the constants of the computation enlarge."""
@@ -130,13 +133,17 @@ class Checked(NamedTuple):
 
 def check(
     problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_], which: Sequence[str], rtol: float, *,
-    doubtful: bool = False, loss: Loss = "linear", workers: int = 1, journal: Path | None = None,
-    notify: Notify = lambda chi2: None,
+    doubtful: bool = False, explain: bool = False, loss: Loss = "linear", workers: int = 1, journal: Path | None = None,
+    progress: bool = False,
 ) -> Checked:  # fmt: skip
-    """Vary what was taken for granted at the estimates x (n,), where `at` holds residuals and Jacobian of the recordings
-    `which`. A fit that is `doubtful` is repeated under each variation that is no number of the rig, by `loss`, until one
-    explains what the fit left: what is true to first order is not where a fit has run far off."""
+    """Tests of the assumptions at the estimates x (n,), to first order, where `at` holds residuals and Jacobian of the
+    recordings `which`.
+
+    With `explain` a `doubtful` fit is repeated by `loss` without one assumption after the other, until one explains the misfit:
+    a test to first order says little where a fit has run far off.
+    """
     end = ended(problem, x, at, free, which, rtol, workers, journal)
+    candidates: list[Assumption] = []
     recordings = [recording for recording in problem.recordings if recording.name in which]
     taken = assumptions(recordings, set(problem.coordinates.names))
     judge, checks, columns = Judge(problem, end), dict[str, Check](), []
@@ -152,22 +159,41 @@ def check(
             if one.kind == "numerical" and d is not None:
                 columns.append(d)
             untried.remove(one.name)
-        if doubtful and not end.base.lost and not judge.explained(checks.values()):
-            again = doubted(taken, checks, end.far)
-            untried = [f"a new fit with another {one.name}" for one in again]
-            as_stated = refit(problem, end, None, loss, notify)
-            for one in again if as_stated is not None else ():
-                other = refit(problem, end, one, loss, notify)
-                if other is not None and as_stated is not None:
-                    checks[one.name] = judge.fit(one, other, as_stated, checks[one.name])
-                untried.pop(0)
-                if judge.explained(checks.values()):
-                    break
-            untried = []
+        unexplained = doubtful and not end.base.lost and not judge.explained(checks.values())
+        candidates = doubted(taken, checks, end.far) if unexplained else []
+        if explain and candidates:
+            untried = [f"a new fit with another {one.name}" for one in candidates]
+            for one in new_fits(problem, end, candidates, loss, judge, checks, progress):
+                untried.remove(f"a new fit with another {one.name}")
+            untried, candidates = [], []
     except KeyboardInterrupt:  # the fit is done: what was tried is kept
-        pass
+        candidates = []
     rows = np.stack(columns, 1) if columns else np.zeros((len(at.r), 0))
-    return Checked(list(checks.values()), rows, judge.J, tuple(untried))
+    return Checked(list(checks.values()), rows, judge.J, tuple(untried), tuple(one.name for one in candidates))
+
+
+def new_fits(
+    problem: Problem, end: End, candidates: Sequence[Assumption], loss: Loss, judge: "Judge", checks: dict[str, Check],
+    progress: bool,
+) -> Iterator[Assumption]:  # fmt: skip
+    """Repeats the fit without one assumption after the other, whose `checks` it replaces, until one explains the misfit."""
+    with tqdm(total=len(candidates) + 1, unit="fit", disable=not progress) as bar:
+
+        def notify(chi2: float) -> None:
+            bar.set_postfix_str(f"chi2 = {chi2:.4g}")
+
+        bar.set_description("new fit with all assumptions")
+        as_stated = refit(problem, end, None, loss, notify)
+        bar.update()
+        for one in candidates if as_stated is not None else ():
+            bar.set_description(plain(f"new fit with another {one.name}"))
+            other = refit(problem, end, one, loss, notify)
+            if other is not None and as_stated is not None:
+                checks[one.name] = judge.fit(one, other, as_stated, checks[one.name])
+            bar.update()
+            yield one
+            if judge.explained(checks.values()):
+                return
 
 
 def doubted(taken: Sequence[Assumption], checks: Mapping[str, Check], far: bool) -> list[Assumption]:
@@ -315,6 +341,11 @@ def columns_of(
 def notices(checked: Checked) -> list[str]:
     """Sentences on what the data ask for, the strongest first, and on constants of the computation that estimates hang on."""
     out, checks = [], checked.checks
+    if checked.candidates:
+        out.append(
+            "no assumption explains to first order what the fit left: `explain` looks for the cause, with a new fit without "
+            f"each of {', '.join(checked.candidates)}"
+        )
     if checked.untried:
         out.append(f"interrupted, so these were not tried: {', '.join(checked.untried)}; the same command tries them")
     asked = sorted((c for c in checks if c.wanted), key=lambda c: -c.gain)
