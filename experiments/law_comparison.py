@@ -36,7 +36,7 @@ from torchsoft.sysid.laws.compare import compare, fitted
 from torchsoft.sysid.laws.evidence import Evidence, FittedLaw
 from torchsoft.sysid.problem.workers import Runner
 from torchsoft.sysid.report.comparison_figure import plot
-from torchsoft.threads import side_by_side
+from torchsoft.threads import parallel_map
 
 TELLING = ("shaken until it slips", "one stroke that slips", "pressed at 8 Hz")
 """Motions that show the difference."""
@@ -121,7 +121,7 @@ def against_differences(seed: int) -> dict[str, tuple[float, float, float]]:
 def run(config: Config) -> Result:
     config = replace(config, workers=1) if config.smoke else config
     cases = [draw(name, k, config.seed) for name, number in counts(config).items() for k in range(number)]
-    work = side_by_side(lambda k: judge(cases[k]), len(cases), config.workers)
+    work = parallel_map(lambda k: judge(cases[k]), len(cases), config.workers)
     done = dict(tqdm(work, desc="cases", total=len(cases), disable=config.smoke))
     return Result(
         config, [done[k] for k in range(len(cases))], {} if config.smoke else against_differences(config.seed)

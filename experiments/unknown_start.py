@@ -2,7 +2,7 @@
 
 A rig with known parameters makes runs of which only what comes after a cut is given: in the middle of a roll, in the
 middle of the grasp, and half a second into fast strokes, where stretched springs keep what happened before.
-`begin_underway` makes coordinates of the poses, velocities and stretches at the cut, with priors from the first 50 ms
+`estimate_initial_state` makes coordinates of the poses, velocities and stretches at the cut, with priors from the first 50 ms
 of samples, which then do not count. Eight parameters are identified from each recording alone, with many noise seeds.
 Beside it stand the price, the deviations that would be predicted if the state at the cut were known, and what comes of
 assuming rest.
@@ -35,19 +35,19 @@ from torchsoft.sysid import (
     AtRest,
     IdentificationResult,
     Known,
+    MovingStart,
     Problem,
     Recording,
     Stage,
-    Underway,
     Unreachable,
-    begin_underway,
+    estimate_initial_state,
     identify,
 )
 from torchsoft.sysid.files.measured import load
 from torchsoft.sysid.fit.information import fisher
 from torchsoft.sysid.problem.recording import Array
 from torchsoft.sysid.problem.workers import Runner
-from torchsoft.threads import side_by_side
+from torchsoft.threads import parallel_map
 
 CUTS = {"mid-roll": ("strokes", 0.85), "mid-grasp": ("strokes", 0.2), "hidden history": ("fast strokes", 1.0)}
 """Motion, and when the recording of it begins [s]."""
@@ -147,9 +147,9 @@ def fit(recording: Recording, config: Config) -> IdentificationResult:
 
 def price(cut: Cut, config: Config) -> Price:
     """What the first seed's recording would tell with the start unknown and known, by Jacobians at the truth."""
-    recording = begin_underway(noisy(cut.recording, 0), RIG)
+    recording = estimate_initial_state(noisy(cut.recording, 0), RIG)
     start = recording.start
-    assert isinstance(start, Underway)
+    assert isinstance(start, MovingStart)
     stated = problem(recording, config, 1.0)
     runner, free, x = Runner(stated.recordings), stated.coordinates.free, at_the_truth(stated, start, cut)
     at, steps = stated.freeze(runner, x, stated.names, config.rtol, free)
@@ -163,7 +163,7 @@ def price(cut: Cut, config: Config) -> Price:
     return Price(sds[0], sds[1], len(x), exact, plain * (len(x) + 1))
 
 
-def at_the_truth(stated: Problem, start: Underway, cut: Cut) -> Array:
+def at_the_truth(stated: Problem, start: MovingStart, cut: Cut) -> Array:
     """The true coordinates: nodes are contact points here, and stretches are known at nodes."""
     state, x = cut.recording.rig.unpack(cut.y0), stated.coordinates.start
     values = {
@@ -242,9 +242,9 @@ def run(config: Config) -> Result:
 
     def work(k: int) -> tuple[IdentificationResult, float]:
         case, seed = jobs[k]
-        return timed(lambda: fit(begin_underway(noisy(cuts[case].recording, seed), RIG), config))
+        return timed(lambda: fit(estimate_initial_state(noisy(cuts[case].recording, seed), RIG), config))
 
-    done = tqdm(side_by_side(work, len(jobs), config.workers), desc="fits", total=len(jobs))
+    done = tqdm(parallel_map(work, len(jobs), config.workers), desc="fits", total=len(jobs))
     fits = {jobs[k]: one for k, one in done}
     found = {case: [fits[case, seed][0] for seed in range(config.seeds)] for case in cuts}
     wall = {case: float(np.median([fits[case, seed][1] for seed in range(config.seeds)])) for case in cuts}

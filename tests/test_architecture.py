@@ -26,12 +26,12 @@ FLOWS = {
         grid kernel laws system progress tolerances rates stability stepper adjoint tangent trajectory
         ledger simulate batch torchdiffeq .
     """,
-    "sysid": "problem fit conventions checks certainty answer settings conclude solve laws files report design .",
+    "sysid": "problem fit prechecks checks certainty answer settings conclude solve laws files report design .",
     "sysid.problem": """
-        start underway recording unknowns readout noise prediction journal workers problem first_samples synthetic .
+        start moving_start recording unknowns readout noise prediction journal workers problem first_samples synthetic .
     """,
     "sysid.fit": "information robust fit plan stages settle .",
-    "sysid.conventions": "finding closed_loop loops setpoints conventions .",
+    "sysid.prechecks": "finding closed_loop loops setpoints prechecks .",
     "sysid.checks": "parts misfit colour assumptions variation checks .",
     "sysid.laws": "evidence pattern compare .",
     "sysid.certainty": "optimum profile summary posterior nuts .",

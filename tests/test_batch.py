@@ -20,7 +20,7 @@ from torchsoft import (
     simulate,
     simulate_batch,
 )
-from torchsoft.threads import side_by_side
+from torchsoft.threads import parallel_map
 
 T = times(0.2, 9)
 K_n = f64(2e4, 3e4, 4.5e4)
@@ -184,8 +184,8 @@ def test_side_by_side_waits_and_stops() -> None:
         return i * i, torch.is_grad_enabled()
 
     with torch.no_grad():
-        assert dict(side_by_side(work, 2, 2)) == {0: (0, False), 1: (1, False)}
+        assert dict(parallel_map(work, 2, 2)) == {0: (0, False), 1: (1, False)}
     with pytest.raises(KeyError):
-        list(side_by_side(work, 500, 2))
+        list(parallel_map(work, 500, 2))
     assert len(begun) < 400
-    assert np.array_equal(sorted(k for k, _ in side_by_side(lambda i: i, 30, 4)), np.arange(30))
+    assert np.array_equal(sorted(k for k, _ in parallel_map(lambda i: i, 30, 4)), np.arange(30))

@@ -15,7 +15,7 @@ from foreign.pad import compliance
 from foreign.step import CREEP, node
 
 from torchsoft import PadMesh, Parameters, Trajectory, simulate
-from torchsoft.excitation import Begun, Excitation, MultiSine, begin
+from torchsoft.excitation import Excitation, MultiSine, RunContext, begin
 from torchsoft.physics.mesh import unit_compliance
 
 SETTLE, STEP = 0.02, 20e-6
@@ -30,7 +30,7 @@ CHANNELS = (*POSES, "v_x", "omega", "F_x", "F_y")
 
 
 @cache
-def begun() -> Begun:
+def begun() -> RunContext:
     return begin(SHAKEN, Parameters().override(RIG))
 
 

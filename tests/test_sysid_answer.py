@@ -72,7 +72,7 @@ def problem() -> Problem:
     recordings = [
         record(name, GRASP, truth, BASE, SENSORS, rtol=1e-3, seed=seed) for seed, name in enumerate(("first", "second"))
     ]
-    recordings[1] = replace(recordings[1], start=AtRest(x_sd=2e-5))
+    recordings[1] = replace(recordings[1], start=AtRest(position_sd=2e-5))
     return Problem(recordings, SENSORS, UNKNOWNS)
 
 
@@ -117,7 +117,7 @@ def test_what_was_saved_comes_back(result: IdentificationResult, path: Path) -> 
 
 def test_an_answer_says_what_was_asked_for(result: IdentificationResult) -> None:
     """The tolerance too, beside the one at which the fit ended."""
-    asked = Settings(tightenings=0, assumptions="trusted").model_dump() | {"rtol_asked": 1e-3, "meant": []}
+    asked = Settings(tightenings=0, assumptions="trusted").model_dump() | {"rtol_asked": 1e-3, "acknowledged": []}
     assert {name: result.made_by[name] for name in asked} == asked | {"rtol": 1e-3}
 
 

@@ -23,8 +23,8 @@ from torchsoft.sysid import MEASURED, Recording, Sensor, record
 from torchsoft.sysid.files.columns import COLUMNS, UNITS, read_table, read_tables
 from torchsoft.sysid.files.cost import cost, paper_settings
 from torchsoft.sysid.files.measured import STATED, known_parameters, load, read_recording, stem
+from torchsoft.sysid.problem.moving_start import MovingStart
 from torchsoft.sysid.problem.start import AtRest
-from torchsoft.sysid.problem.underway import Underway
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "identify"
 
@@ -141,7 +141,7 @@ BAD: dict[str, tuple[Change, str]] = {
     "another ground": (scale(Y_BR, 1.0, 3.0), r"row 2, column `y_Br`: it begins at .*, but the set-point y_d is 0.0501 m"),
     "moving": (
         lambda table: [cells.__setitem__(X_C, f"{60.3 + 0.3 * i}") for i, cells in enumerate(table[1:])],
-        r"row 3, column `x_C` moves already: a recording must begin at rest,.* or say start = \{kind = \"underway\"\}",
+        r"row 3, column `x_C` moves already: a recording must begin at rest,.* or say start = \{kind = \"moving\"\}",
     ),
     "in the grasp": (
         lambda table: [scale(k, 1.0, -0.6)(table) for k in (Y_D, Y_BR)],
@@ -200,11 +200,12 @@ BAD_CONFIG = {
     "a long delay": (CONFIG + "[sensors.theta]\nnoise = 1e-3\ndelay = 0.5\n", r"sensors\.theta\.delay should be less than"),
     "no such column": ('ignore = ["Temp"]\n' + CONFIG, r"rig\.toml, ignore: no file has a column `Temp`"),
     "another constant": (CONFIG + "[missing]\nF_x = 0.0\n", r"rig\.toml: missing\.F_x is not known here"),
-    "another start": (CONFIG + '[start]\nkind = "flying"\n', r"start\.kind should be one of 'rest', 'underway', not 'fl"),
+    "another start": (CONFIG + '[start]\nkind = "flying"\n', r"start\.kind should be one of 'rest', 'moving', not 'fl"),
     "a start that is hardly uncertain": (
-        CONFIG + '[start]\nkind = "rest"\nx_sd = 1e-300\n', r"start\.x_sd: should be 0, or at least 1e-12, but is 1e-300",
+        CONFIG + '[start]\nkind = "rest"\nposition_sd = 1e-300\n',
+        r"start\.position_sd: should be 0, or at least 1e-12, but is 1e-300",
     ),
-    "a start without a kind": (CONFIG + "[start]\nx_sd = 1e-4\n", r"start\.kind is missing"),
+    "a start without a kind": (CONFIG + "[start]\nposition_sd = 1e-4\n", r"start\.kind is missing"),
     "a parameter by both names": (
         CONFIG.replace('"pad.E"]\nnominal = 0.7e6', '"contact.friction.mu_s"]\n[unknowns."contact.mu_s"]'),
         r"unknowns\.contact\.mu_s is there twice: it is contact\.mu_s too",
@@ -519,10 +520,10 @@ def test_a_file_may_state_everything_that_a_problem_can_have(case: Callable[...,
         "F_x = {noise = 0.1, misalignment = 0.01, low = -50.0, high = 50.0}",
     )
     text = text.replace("contact.v_s = 0.05", "contact.friction.v_s = 0.05\ngravity = 9.8\ncontrol.y.Kp = 1.1e5")
-    made = load(*_split(case(config=text + '[start]\nkind = "rest"\nx_sd = 1e-4\n'))).problem
+    made = load(*_split(case(config=text + '[start]\nkind = "rest"\nposition_sd = 1e-4\n'))).problem
     settings = paper_settings(made.recordings[0])
     assert (settings.contact.v_s, settings.scenario.gravity, settings.control.K_98) == (0.05, 9.8, 1.1e5)
-    assert made.recordings[0].start == AtRest(x_sd=1e-4)
+    assert made.recordings[0].start == AtRest(position_sd=1e-4)
     labels = (
         "contact.K_n in data", "contact.mu_k / contact.mu_s", "pad.E", "start.disc.x in data", "gain of F_y in data",
         "drift of F_y in data", "inertia of F_y in data", "misalignment of F_x",
@@ -540,11 +541,11 @@ def test_a_recording_may_begin_anywhere_if_that_is_said(case: Callable[..., list
         del table[1:31]
 
     sensors = CONFIG.replace("F_y.noise", "theta.noise = 0.5e-3\nx_Br.noise = 10e-6\nF_y.noise")
-    with pytest.raises(ValueError, match=r"data\.csv, row 2, column `\w+`.* or say start = \{kind = \"underway\"\}"):
+    with pytest.raises(ValueError, match=r"data\.csv, row 2, column `\w+`.* or say start = \{kind = \"moving\"\}"):
         load(*_split(case(cut, sensors)))
-    text = sensors + '[start]\nkind = "underway"\nlead = 40e-3\ngiven = {"disc.y" = {mean = 23.5e-3, sd = 1e-4}}\n'
+    text = sensors + '[start]\nkind = "moving"\nlead = 40e-3\ngiven = {"disc.y" = {mean = 23.5e-3, sd = 1e-4}}\n'
     (one,) = load(*_split(case(cut, text))).problem.recordings
-    assert isinstance(one.start, Underway)
+    assert isinstance(one.start, MovingStart)
     assert one.start.lead == pytest.approx(0.04, abs=6e-3)
     assert one.start.bodies["disc.y"] == (23.5e-3, 1e-4)
     priced = cost(load(*_split(case(cut, text))).problem, 1e-3, 1, 1)

@@ -49,7 +49,7 @@ def strokes() -> Recording:
 
 def test_every_kind_of_coordinate_has_its_derivative(strokes: Recording) -> None:
     """Of parameters, a place of the disc, and of everything that a sensor may have; by differences, and by the adjoint."""
-    moved = replace(strokes, name="moved", start=AtRest(x_sd=1e-4))
+    moved = replace(strokes, name="moved", start=AtRest(position_sd=1e-4))
     unknowns = {
         "pad.E": Unknown(prior=Prior(median=8e5, sd=1e5)),
         "contact.epsilon": Unknown(prior=Prior(median=1e-6, sd=1.0, kind="log-normal")),

@@ -72,7 +72,7 @@ def found() -> Found:
         record(name, grasp.model_copy(update={"depth": depth}), truth, p, sensors, rtol=1e-3, seed=seed)
         for seed, (name, depth) in enumerate(depths.items())
     ]
-    recordings[1] = replace(recordings[1], start=AtRest(x_sd=2e-5))
+    recordings[1] = replace(recordings[1], start=AtRest(position_sd=2e-5))
     unknowns = {
         "contact.K_n": Unknown(), "pad.E": Unknown(prior=Prior(median=1e6, sd=0.5, kind="log-normal")),
         "contact.eta": Unknown(), "contact.R_n": Unknown(per="recording"),

@@ -31,9 +31,9 @@ from torchsoft.physics.material import KelvinVoigt
 from torchsoft.physics.motion import Profile, Reference
 from torchsoft.solve.simulate import simulate
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, Unknown, identify
-from torchsoft.sysid.problem.first_samples import WIDER, begin_underway, beginning, lasting_stretch
+from torchsoft.sysid.problem.first_samples import WIDER, beginning, estimate_initial_state, lasting_stretch
+from torchsoft.sysid.problem.moving_start import MovingStart, Stretch
 from torchsoft.sysid.problem.start import AtRest
-from torchsoft.sysid.problem.underway import Stretch, Underway
 from torchsoft.sysid.problem.workers import Runner
 
 MOTION = Excitation(motion=Strokes(travel=12e-3, stroke_time=0.3), duration=0.86, grasp_time=0.2, settle=0.05)
@@ -71,9 +71,9 @@ def true_bodies(recording: Recording, y0: Tensor) -> dict[str, float]:
     }
 
 
-def underway(recording: Recording) -> Underway:
+def underway(recording: Recording) -> MovingStart:
     start = recording.start
-    assert isinstance(start, Underway)
+    assert isinstance(start, MovingStart)
     return start
 
 
@@ -83,7 +83,7 @@ def tensors(values: Mapping[str, float]) -> dict[str, Tensor]:
 
 def test_the_first_samples_tell_where_a_run_begins_and_do_not_count(cut: Cut) -> None:
     recording, y0 = cut
-    out, truth = begin_underway(noisy(recording), RIG, lead=0.05), true_bodies(recording, y0)
+    out, truth = estimate_initial_state(noisy(recording), RIG, lead=0.05), true_bodies(recording, y0)
     start = underway(out)
     assert start.lead == pytest.approx(0.05)
     assert out.times[0] == pytest.approx(SINCE + 0.05)
@@ -119,18 +119,18 @@ def test_what_no_sensor_measures_is_assumed(cut: Cut) -> None:
     recording, y0 = cut
     truth = true_bodies(recording, y0)
     few = {channel: RIG[channel] for channel in ("x_C", "F_x", "F_y")}
-    start = underway(begin_underway(noisy(recording), few))
+    start = underway(estimate_initial_state(noisy(recording), few))
     assert start.bodies["disc.theta"] == (0.0, 0.0)  # a circle has no angle
     for name in ("disc.y", "bracket.x", "bracket.y", "disc.v_theta", "disc.v_y", "bracket.v_x"):
         mean, sd = start.bodies[name]
         assert abs(mean - truth[name]) < 2 * sd, name
     turn, _ = start.bodies["disc.v_theta"]
     assert turn == pytest.approx(truth["disc.v_theta"], rel=0.1)  # rolling
-    given = underway(begin_underway(noisy(recording), few, given={"disc.y": (0.0233, 1e-3)}))
+    given = underway(estimate_initial_state(noisy(recording), few, given={"disc.y": (0.0233, 1e-3)}))
     assert given.bodies["disc.y"] == (0.0233, 1e-3)
     none = {"F_x": RIG["F_x"], "theta": RIG["theta"]}
     with pytest.raises(ValueError, match=r"no sensor tells where `disc\.x` is"):
-        begin_underway(recording, none)
+        estimate_initial_state(recording, none)
 
 
 def test_stretches_last_as_long_as_friction_holds_them() -> None:
@@ -144,7 +144,7 @@ def test_stretches_last_as_long_as_friction_holds_them() -> None:
 
 def test_derivatives_of_the_state_are_those_of_differences(cut: Cut) -> None:
     recording, _ = cut
-    out = begin_underway(recording, RIG)
+    out = estimate_initial_state(recording, RIG)
     begun = out.begin()
     weights = torch.linspace(-1, 1, begun.rig.layout.size, dtype=torch.float64)
     means = {c.name: c.mean for c in out.start_coordinates}
@@ -164,7 +164,7 @@ def test_derivatives_of_the_state_are_those_of_differences(cut: Cut) -> None:
 
 def test_residuals_and_gradient_know_the_start(cut: Cut) -> None:
     recording, _ = cut
-    out = begin_underway(noisy(recording), RIG)
+    out = estimate_initial_state(noisy(recording), RIG)
     problem = Problem([out], RIG, {"pad.E": Unknown(), "contact.mu_s": Unknown()})
     c, runner = problem.coordinates, Runner(problem.recordings)
     at, steps = problem.freeze(runner, c.start, problem.names, 1e-4, c.free)
@@ -188,7 +188,7 @@ def test_residuals_and_gradient_know_the_start(cut: Cut) -> None:
 
 def test_the_start_does_not_depend_on_the_mesh(cut: Cut) -> None:
     recording, _ = cut
-    out = begin_underway(recording, RIG)
+    out = estimate_initial_state(recording, RIG)
     rig = recording.rig
     assert isinstance(rig, SoftGrasp)
     finer = SoftGrasp(rig.settings.override({"pad.elements_x": 120, "contact.points": 2}), rig.reference)
@@ -215,7 +215,7 @@ def test_another_rig_may_begin_underway() -> None:
     t = np.arange(0.2, 0.5, 5e-3)
     sensors = {"y_roll": Sensor(noise=1e-6)}
     recording = Recording("over a pad", rig, {"y_roll": (t, np.full(len(t), 0.0245))})
-    out = begin_underway(recording, sensors)
+    out = estimate_initial_state(recording, sensors)
     assert [c.name for c in out.start_coordinates][:2] == ["start.roll.y", "start.roll.v_y"]
     state = rig.unpack(out.begin().y0({}).detach(), t=float(t[0]))
     assert float(state.pose["roll"][0]) == pytest.approx(float(rig.follow(0.2)[0, 0]))
@@ -223,14 +223,14 @@ def test_another_rig_may_begin_underway() -> None:
 
 
 def test_a_run_that_cannot_begin_is_lost(cut: Cut) -> None:
-    out = begin_underway(cut[0], RIG)
+    out = estimate_initial_state(cut[0], RIG)
     far = {"start.disc.y": 0.01} | {c.name: 1e-3 for c in out.start_coordinates if ".L.stretch" in c.name}
     with pytest.raises(SimulationFailed, match="cannot begin there: the massless pad `L` does not settle"):
         out.begin().y0(tensors(far))
 
 
 def test_parameters_are_found_from_the_middle_of_a_roll(cut: Cut) -> None:
-    out = begin_underway(noisy(cut[0], seed=3), RIG)
+    out = estimate_initial_state(noisy(cut[0], seed=3), RIG)
     truth = {name: float(cut[0].rig.parameter(name).detach()) for name in ("pad.E", "pad.tau")}
     problem = Problem([out], RIG, {name: Unknown(nominal=1.1 * value) for name, value in truth.items()})
     plan = [Stage("all", problem.names, problem.coordinates.labels, 3e-4, tolerance=1e-3)]
@@ -245,10 +245,10 @@ def test_parameters_are_found_from_the_middle_of_a_roll(cut: Cut) -> None:
 
 def test_refusals(cut: Cut) -> None:
     recording, _ = cut
-    start = underway(begin_underway(recording, RIG))
+    start = underway(estimate_initial_state(recording, RIG))
     rig, samples = recording.rig, recording.samples
 
-    def refused(changed: Underway, match: str) -> None:
+    def refused(changed: MovingStart, match: str) -> None:
         with pytest.raises(ValueError, match=match):
             changed.coordinates(rig, samples)
 
@@ -261,15 +261,15 @@ def test_refusals(cut: Cut) -> None:
     with pytest.raises(
         ValueError, match=r"`x_C` of recording `roll` has 2 samples in the beginning.*take a longer `lead`"
     ):
-        begin_underway(recording, RIG, lead=0.01)
+        estimate_initial_state(recording, RIG, lead=0.01)
     with pytest.raises(ValueError, match="no two samples of `x_C` left"):
-        begin_underway(recording, RIG, lead=5.0)
+        estimate_initial_state(recording, RIG, lead=5.0)
     with pytest.raises(ValueError, match=r"`x_C` may come late by 0.08 s, but runs are known only from 0.05 s"):
-        begin_underway(recording, RIG | {"x_C": Sensor(noise=1e-5, delay=0.08)})
+        estimate_initial_state(recording, RIG | {"x_C": Sensor(noise=1e-5, delay=0.08)})
     with pytest.raises(ValueError, match=r"`given` speaks of `disc\.z`"):
-        begin_underway(recording, RIG, given={"disc.z": (0.0, 1.0)})
+        estimate_initial_state(recording, RIG, given={"disc.z": (0.0, 1.0)})
     deep = deepcopy(dict(start.bodies)) | {"disc.y": (-1.0, 1.0)}
-    assert Underway(deep, {}).coordinates(rig, samples)
+    assert MovingStart(deep, {}).coordinates(rig, samples)
 
 
 @pytest.mark.slow

@@ -206,7 +206,7 @@ CATALOGUE = {
 """Ready excitations by name, from gentle to hard; `experiments/experiment_design.py` ranks them."""
 
 
-class Begun(NamedTuple):
+class RunContext(NamedTuple):
     """A model with its reference, and its state (size,) at the start."""
 
     model: SoftGrasp
@@ -222,7 +222,7 @@ def start(model: SoftGrasp, x: Tensor | None = None) -> Tensor:
     return model.pack(state._replace(pose=state.pose | {"bracket": clear}))
 
 
-def begin(excitation: Excitation, p: Parameters, *, grasp_force: float | None = None) -> Begun:
+def begin(excitation: Excitation, p: Parameters, *, grasp_force: float | None = None) -> RunContext:
     """A model with the parameters p about to be excited; `grasp_force` [N] is fed forward, by default that of statics.
 
     Raises `ValueError` for an impossible grasp, `NoEquilibrium` where the disc finds no rest.
@@ -232,7 +232,7 @@ def begin(excitation: Excitation, p: Parameters, *, grasp_force: float | None = 
     if grasp_force is None:
         grasp_force = holding_force(model, press(model, model.settings.scenario.y_Br_grasp))
     model.reference = reference(excitation, model, float(model.unpack(y0).pose["bracket"][1]), grasp_force)
-    return Begun(model, y0)
+    return RunContext(model, y0)
 
 
 def reference(excitation: Excitation, model: SoftGrasp, y_Br: float, grasp_force: float) -> Reference:

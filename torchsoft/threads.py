@@ -52,7 +52,7 @@ def executor(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, "torchsoft", torch.set_num_threads, (1,))
 
 
-def side_by_side(work: Callable[[int], T], count: int, threads: int | None = None) -> Iterator[tuple[int, T]]:
+def parallel_map(work: Callable[[int], T], count: int, threads: int | None = None) -> Iterator[tuple[int, T]]:
     """`work(i)` for i below `count`, in so many threads (one a core by default), as (i, result) in the order of their ends.
 
     The threads inherit torch's grad mode; each computes on one core. An exception ends what has not begun, and so does Ctrl-C;

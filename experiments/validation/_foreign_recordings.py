@@ -18,7 +18,7 @@ from torchsoft.experiment import COARSE
 from torchsoft.files import replacing
 from torchsoft.sysid import RIG
 from torchsoft.sysid.problem.recording import Array
-from torchsoft.threads import side_by_side
+from torchsoft.threads import parallel_map
 
 TESTS = Path(__file__).parents[2] / "tests"
 sys.path.insert(0, str(TESTS))
@@ -151,7 +151,7 @@ def stepped(order: Order, step: float, smoke: bool, folder: Path) -> Made:
 def make_all(orders: Sequence[Order], step: float, smoke: bool, folder: Path, workers: int) -> dict[Order, Made]:
     """All runs, side by side in threads."""
     every = list(dict.fromkeys(orders))
-    work = side_by_side(lambda i: make(every[i], step, smoke, folder), len(every), workers)
+    work = parallel_map(lambda i: make(every[i], step, smoke, folder), len(every), workers)
     return {every[i]: made for i, made in tqdm(work, desc="recordings", total=len(every), unit=" runs")}
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from torch import Tensor
 
 from torchsoft import Parameters, SoftGrasp
-from torchsoft.excitation import FADE, Begun, Chirp, Excitation, MultiSine, Press, Roll, Strokes, begin
+from torchsoft.excitation import FADE, Chirp, Excitation, MultiSine, Press, Roll, RunContext, Strokes, begin
 from torchsoft.experiment import grid
 from torchsoft.paper.equilibrium import holding_force, press, rest
 from torchsoft.scenario import reference
@@ -61,7 +61,7 @@ def excitation(rng: np.random.Generator) -> Excitation:
 class Drawn(NamedTuple):
     """A model and its start, its output times (T,) [s], and what it does."""
 
-    begun: Begun
+    begun: RunContext
     t: Tensor
     motion: str
 
@@ -76,4 +76,4 @@ def draw(rng: np.random.Generator) -> Drawn:
     force = holding_force(model, press(model, model.settings.scenario.y_Br_grasp))
     y0 = rest(model).detach()
     model.reference = reference(model, y0, force)
-    return Drawn(Begun(model, y0), grid(GRASP + SETTLE + MOVING), "grasp_and_roll")
+    return Drawn(RunContext(model, y0), grid(GRASP + SETTLE + MOVING), "grasp_and_roll")

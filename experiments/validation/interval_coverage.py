@@ -34,7 +34,7 @@ from torchsoft.sysid.fit.fit import chord
 from torchsoft.sysid.fit.information import fisher
 from torchsoft.sysid.problem.recording import Array
 from torchsoft.sysid.problem.workers import Runner
-from torchsoft.threads import side_by_side
+from torchsoft.threads import parallel_map
 
 FEW = ("pad.E", "pad.tau", "contact.K_n", "contact.mu_s")
 """Parameters of the smoke test."""
@@ -150,7 +150,7 @@ def run(config: Config) -> Result:
     for case, rho, way in (
         (WHITE, 0.0, by_identify), (FOUND, config.rho, by_identify), (IGNORED, config.rho, by_white_least_squares),
     ):  # fmt: skip
-        work = side_by_side(
+        work = parallel_map(
             lambda seed, rho=rho, way=way: way(problem(recordings, truth, rho, seed), truth, config.rtol),
             config.seeds,
             config.workers,

@@ -63,10 +63,10 @@ def config(whole: bool = True) -> dict[str, Any]:
     tree["fit"] = {"rtol": RTOL, "starts": 1, "loss": "linear", "method": "gauss_newton", "workers": 1, "seed": 0}
     second = {"files": ["second.csv", "force.csv"], "name": "second", "settings": {"contact.v_s": 0.06}}
     tree["recordings"] = [second | {"missing": {"F_ff": 0.0}}]
-    tree |= {"heldout": ["second"], "ignore": ["Temp"], "meant": ["sign of F_x"], "missing": {"F_ff": -1.0}}
-    tree["start"] = {"kind": "rest", "x_sd": 1e-5}
+    tree |= {"heldout": ["second"], "ignore": ["Temp"], "acknowledged": ["sign of F_x"], "missing": {"F_ff": -1.0}}
+    tree["start"] = {"kind": "rest", "position_sd": 1e-5}
     if whole:
-        moving = {"kind": "underway", "lead": 40e-3, "given": {"disc.y": {"mean": 23.5e-3, "sd": 1e-4}}}
+        moving = {"kind": "moving", "lead": 40e-3, "given": {"disc.y": {"mean": 23.5e-3, "sd": 1e-4}}}
         tree["recordings"].append({"file": "third.csv", "name": "third", "start": moving})
         tree["pads"] = {"kind": "kelvin_voigt"}
         tree["compare"] = {

@@ -82,7 +82,7 @@ def identify(options: argparse.Namespace) -> int:
             agree(expected, options.yes, "take a larger rtol, fewer starts or less data")
             try_folder(options.out, options.force)
             result = identify(
-                case.problem, heldout=heldout, meant=case.config.meant, checkpoint=unfinished,
+                case.problem, heldout=heldout, acknowledged=case.config.acknowledged, checkpoint=unfinished,
                 progress=not options.no_progress, **fit.model_dump(),
             )  # fmt: skip
             result = replace(result, command=options.command)

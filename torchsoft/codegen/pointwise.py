@@ -72,12 +72,12 @@ def check_pointwise(
     graph, size = Graph(), x.numel()
     many = torch.stack([x.detach() * (1 + 0.1 * k) for k in range(POINTS)])
 
-    def side_by_side(flat: Tensor, values: dict[str, Tensor]) -> Tensor:
+    def parallel_map(flat: Tensor, values: dict[str, Tensor]) -> Tensor:
         return function(flat.unflatten(0, (POINTS, size)), values).flatten()
 
     watch = type("Watch", (Watch,), {"size": size})
     try:
-        together = traced(graph, side_by_side, many.flatten(), parameters, kind=watch)
+        together = traced(graph, parallel_map, many.flatten(), parameters, kind=watch)
         alone = [traced(graph, function, row, parameters, k * size) for k, row in enumerate(many)]
     except UnknownOperation as error:
         if "couples contact points" in str(error):

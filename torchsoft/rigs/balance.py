@@ -13,7 +13,7 @@ from torchsoft.physics.contact import SmoothSlip
 from torchsoft.physics.motion import Reference, hold
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import NoEquilibrium, massless, standing
-from torchsoft.rigs.build import Ready, RigFile
+from torchsoft.rigs.build import BuiltRig, RigFile
 from torchsoft.rigs.course import Course, Estimate, at, signals
 from torchsoft.rigs.finding import Finding
 from torchsoft.rigs.geometry import facing, pressed, surface, tied
@@ -49,7 +49,7 @@ class Moment(NamedTuple):
 
 
 @torch.no_grad()
-def at_moments(file: RigFile, ready: Ready, estimate: Estimate) -> list[Finding]:
+def at_moments(file: RigFile, ready: BuiltRig, estimate: Estimate) -> list[Finding]:
     """What comes of the rig in balance at some of its motions' knots: strains, modes, steps, friction."""
     rig, found, there = massless(ready.rig), list[Finding](), list[Moment]()
     for time in estimate.moments(MOMENTS):

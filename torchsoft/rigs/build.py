@@ -19,7 +19,7 @@ from torchsoft.physics.validity import sound
 from torchsoft.rigs.bodies import REST
 from torchsoft.rigs.fields import at_field
 from torchsoft.rigs.geometry import points, reach, surface
-from torchsoft.rigs.motion import Asked, flattened
+from torchsoft.rigs.motion import MotionContext, flattened
 from torchsoft.rigs.schema import RigTables
 from torchsoft.tables import from_toml
 
@@ -34,7 +34,7 @@ STIFF = 100.0
 M = TypeVar("M", bound=nn.Module)
 
 
-class Ready(NamedTuple):
+class BuiltRig(NamedTuple):
     """A rig with what it follows, its state y0 (size,) at the start, and the times t (T,) [s] of the outputs."""
 
     rig: Rig
@@ -88,7 +88,7 @@ def signal(file: RigTables, name: str, pose: Mapping[str, Array] | None) -> Piec
     if pose is not None and len(setpoints) == 1:
         body, _, axis = setpoints.pop().partition(".")
         start = float(pose[body][COORDINATES.index(axis)])
-    asked = Asked(name, file.unit(name), start, file.outputs.duration, file.folder)
+    asked = MotionContext(name, file.unit(name), start, file.outputs.duration, file.folder)
     try:
         return file.motion[name].build(asked)
     except ValueError as error:
@@ -208,7 +208,7 @@ class RigFile(RigTables):
         file._folder = self._folder
         return file
 
-    def build(self) -> Ready:
+    def build(self) -> BuiltRig:
         """What the file describes, ready for `simulate(rig, t, y0=y0)`.
 
         Pads are settled around the bodies where these start. Raises `ValueError` with the field's name: for motions that cannot
@@ -230,4 +230,4 @@ class RigFile(RigTables):
         for name, body in self.bodies.items():
             rates = [v for v, axis in zip(body.start.velocity, COORDINATES) if axis in body.free]
             y0[rig.layout.slices["velocity", name]] = torch.tensor(rates, dtype=torch.float64)
-        return Ready(rig, y0, output_times(self))
+        return BuiltRig(rig, y0, output_times(self))

@@ -8,7 +8,7 @@ import networkx as nx
 from torchsoft.physics.motion import Sampled
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.balance import at_moments
-from torchsoft.rigs.build import Ready, RigFile
+from torchsoft.rigs.build import BuiltRig, RigFile
 from torchsoft.rigs.course import Course, Estimate, at, signals
 from torchsoft.rigs.fields import Refused
 from torchsoft.rigs.finding import SEVERITIES, Finding
@@ -74,7 +74,7 @@ def unseen(file: RigFile, rig: Rig) -> Iterator[Finding]:
                 )  # fmt: skip
 
 
-def recordings(file: RigFile, ready: Ready) -> Iterator[Finding]:
+def recordings(file: RigFile, ready: BuiltRig) -> Iterator[Finding]:
     """Recorded motions that do not cover the run, and waves that outputs do not show."""
     end, interval = file.outputs.duration, file.outputs.interval
     for name, motion in file.motion.items():
@@ -101,7 +101,7 @@ def recordings(file: RigFile, ready: Ready) -> Iterator[Finding]:
             )  # fmt: skip
 
 
-def jumps(file: RigFile, ready: Ready, estimate: Estimate) -> Iterator[Finding]:
+def jumps(file: RigFile, ready: BuiltRig, estimate: Estimate) -> Iterator[Finding]:
     """Set-points that begin elsewhere than their coordinate."""
     values = signals(ready.rig, 0.0)
     state, followed = ready.rig.unpack(ready.y0), ready.rig.follow(0.0)
@@ -118,7 +118,7 @@ def jumps(file: RigFile, ready: Ready, estimate: Estimate) -> Iterator[Finding]:
             )  # fmt: skip
 
 
-def carried(file: RigFile, ready: Ready, estimate: Estimate) -> Iterator[Finding]:
+def carried(file: RigFile, ready: BuiltRig, estimate: Estimate) -> Iterator[Finding]:
     """Bodies that nothing carries against gravity."""
     rig, pose = ready.rig, estimate.start
     pushed = {*file.pushed().values()}

@@ -15,7 +15,7 @@ from torchsoft.physics.motion import Piecewise, hold
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import NoEquilibrium, resting
-from torchsoft.rigs.build import Ready, RigFile, assemble
+from torchsoft.rigs.build import BuiltRig, RigFile, assemble
 from torchsoft.rigs.geometry import facing, pressed, surface, turned
 
 Course = dict[str, Array]
@@ -34,7 +34,7 @@ KNOTS = 100
 class Estimate:
     """The poses of a rig's bodies at any time of its run."""
 
-    def __init__(self, file: RigFile, ready: Ready) -> None:
+    def __init__(self, file: RigFile, ready: BuiltRig) -> None:
         self.file, self.rig, self.end = file, ready.rig, float(ready.t[-1])
         with torch.no_grad():
             self.start = {name: x.numpy().copy() for name, x in self.rig.unpack(ready.y0).pose.items()}

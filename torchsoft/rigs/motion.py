@@ -29,7 +29,7 @@ Values = Annotated[tuple[Value, ...], LISTED, Field(min_length=1, max_length=100
 Frequency = Annotated[float, Quantity("Hz", 1e-6, 1e5)]
 
 
-class Asked(NamedTuple):
+class MotionContext(NamedTuple):
     """What a motion is made for: its name, its unit, where the coordinate that follows it starts (None: no coordinate that is
     free does), the end of the run [s], and the folder of the rig's file."""
 
@@ -54,7 +54,7 @@ class Asked(NamedTuple):
 class Motion(Group):
     """A function of time, in m or rad where a coordinate follows it, in N or N.m where it is fed forward."""
 
-    def build(self, asked: Asked) -> Piecewise:
+    def build(self, asked: MotionContext) -> Piecewise:
         """The signal. Raises `ValueError` naming the field."""
         raise NotImplementedError
 
@@ -69,7 +69,7 @@ class HoldTable(Motion):
     kind: Literal["hold"] = "hold"
     value: Value = Field(default=START, description=f'"{START}": where the coordinate that follows starts')
 
-    def build(self, asked: Asked) -> Piecewise:
+    def build(self, asked: MotionContext) -> Piecewise:
         return Profile([0.0], [asked.value("value", self.value)])
 
 
@@ -90,7 +90,7 @@ class Knots(Motion):
                 raise ValueError(f"times must increase, but {after:g} s follows {before:g} s")
         return self
 
-    def knots(self, asked: Asked) -> tuple[list[float], list[float]]:
+    def knots(self, asked: MotionContext) -> tuple[list[float], list[float]]:
         """Times and values."""
         return list(self.times), [asked.value("values", value) for value in self.values]
 
@@ -100,7 +100,7 @@ class ProfileTable(Knots):
 
     kind: Literal["profile"] = "profile"
 
-    def build(self, asked: Asked) -> Piecewise:
+    def build(self, asked: MotionContext) -> Piecewise:
         return Profile(*self.knots(asked))
 
 
@@ -109,7 +109,7 @@ class SplineTable(Knots):
 
     kind: Literal["spline"] = "spline"
 
-    def build(self, asked: Asked) -> Piecewise:
+    def build(self, asked: MotionContext) -> Piecewise:
         times, values = self.knots(asked)
         if len(times) == 1:
             return Profile(times, values)
@@ -117,7 +117,7 @@ class SplineTable(Knots):
         return Sampled(times, values, slopes.tolist())
 
 
-class Wavy(Knots):
+class ModulatedMotion(Knots):
     """Waves on top of a profile, from `since` to `until`, where they come and go."""
 
     times: Times = Field(default=(0.0,), description="of the profile that the waves are added to [s]")
@@ -129,7 +129,7 @@ class Wavy(Knots):
         default=None, description="when they have gone, again within 0.15 s; the end of the run if not given"
     )
 
-    def window(self, asked: Asked) -> tuple[float, float]:
+    def window(self, asked: MotionContext) -> tuple[float, float]:
         """Begin and end [s] of the waves. Raises `ValueError`."""
         until = asked.end if self.until is None else self.until
         if not until - self.since > 2 * FADE:
@@ -152,7 +152,7 @@ class ComponentTable(Group):
     phase: Annotated[float, Quantity("rad", -1e3, 1e3)] = Field(default=0.0, description="phase")
 
 
-class SinesTable(Wavy):
+class SinesTable(ModulatedMotion):
     """Sines on top of a profile."""
 
     kind: Literal["sines"] = "sines"
@@ -163,12 +163,12 @@ class SinesTable(Wavy):
     def fastest(self) -> float:
         return max(one.frequency for one in self.components)
 
-    def build(self, asked: Asked) -> Piecewise:
+    def build(self, asked: MotionContext) -> Piecewise:
         columns = np.array([(one.amplitude, one.frequency, 0.0, one.phase) for one in self.components]).T
         return Waves(self.knots(asked), *self.window(asked), wave(*columns))
 
 
-class ChirpTable(Wavy):
+class ChirpTable(ModulatedMotion):
     """A sine on top of a profile, its frequency going from `first` to `last`."""
 
     kind: Literal["chirp"] = "chirp"
@@ -179,7 +179,7 @@ class ChirpTable(Wavy):
     def fastest(self) -> float:
         return max(self.first, self.last)
 
-    def build(self, asked: Asked) -> Piecewise:
+    def build(self, asked: MotionContext) -> Piecewise:
         since, until = self.window(asked)
         sweep = (self.last - self.first) / (until - since)
         return Waves(self.knots(asked), since, until, wave(self.amplitude, self.first, sweep, 0.0))
@@ -195,7 +195,7 @@ class CsvTable(Motion):
         default=0.0, description=f'what is added; "{START}": where the coordinate that follows starts'
     )
 
-    def build(self, asked: Asked) -> Piecewise:
+    def build(self, asked: MotionContext) -> Piecewise:
         try:
             times, values = read_column(asked.folder / self.file, self.column, asked.unit)
         except ValueError as error:

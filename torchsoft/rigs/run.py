@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from torchsoft.files import make_folder, write_json
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.rigs.build import Ready, RigFile
+from torchsoft.rigs.build import BuiltRig, RigFile
 from torchsoft.rigs.check import Finding
 from torchsoft.rigs.pictures import draw
 from torchsoft.solve.ledger import doubts
@@ -17,15 +17,15 @@ from torchsoft.solve.simulate import Interrupted, simulate
 from torchsoft.solve.trajectory import Trajectory
 
 
-class Done(NamedTuple):
+class RunOutcome(NamedTuple):
     """A run, as far as it went, and what ended it early, if anything did."""
 
-    ready: Ready
+    ready: BuiltRig
     trajectory: Trajectory
     stopped: SimulationFailed | Interrupted | None
 
 
-def carry_out(file: RigFile, *, progress: bool = False) -> Done:
+def carry_out(file: RigFile, *, progress: bool = False) -> RunOutcome:
     """Simulate what a file describes. A failure and Ctrl-C end it early, with what was simulated until then.
 
     Raises `ValueError` for what cannot be built, and `KeyboardInterrupt` before anything was simulated.
@@ -45,11 +45,11 @@ def carry_out(file: RigFile, *, progress: bool = False) -> Done:
     except (SimulationFailed, Interrupted) as stop:
         if stop.trajectory is None:
             raise
-        return Done(ready, stop.trajectory, stop)
-    return Done(ready, run, None)
+        return RunOutcome(ready, stop.trajectory, stop)
+    return RunOutcome(ready, run, None)
 
 
-def run(file: RigFile, out: Path, *, found: list[Finding] | None = None, progress: bool = False) -> Done:
+def run(file: RigFile, out: Path, *, found: list[Finding] | None = None, progress: bool = False) -> RunOutcome:
     """Simulate and write everything to the folder `out`: data first, pictures only of a run that was not stopped. `found` are
     the check's findings, for the summary. Raises `OSError` for a folder that cannot be made, and what `carry_out` does."""
     began = time.perf_counter()
@@ -63,7 +63,7 @@ def run(file: RigFile, out: Path, *, found: list[Finding] | None = None, progres
     return done
 
 
-def summary(file: RigFile, done: Done, found: list[Finding]) -> dict[str, Any]:
+def summary(file: RigFile, done: RunOutcome, found: list[Finding]) -> dict[str, Any]:
     """The run in numbers, in SI units, and how it was made."""
     run, rig = done.trajectory, done.ready.rig
     stopped = done.stopped

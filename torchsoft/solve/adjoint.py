@@ -16,7 +16,7 @@ from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.scratch import cotangents, scratch
 from torchsoft.solve.progress import Progress, Segment
 from torchsoft.solve.stepper import ImplicitStepper
-from torchsoft.threads import side_by_side
+from torchsoft.threads import parallel_map
 
 TAPE_BYTES = 1e9
 """Tapes kept of one run [bytes]; beyond that the backward sweep makes each segment's again from where it began."""
@@ -85,7 +85,7 @@ class _Solutions(torch.autograd.Function):
             i, y_bar = asked[k]
             return run_adjoint(ctx.runs[i].stepper, ctx.runs[i].segments, y_bar)
 
-        for k, result in side_by_side(sweep, len(asked), ctx.threads):
+        for k, result in parallel_map(sweep, len(asked), ctx.threads):
             bars[3 * asked[k][0] : 3 * asked[k][0] + 3] = result
         return None, None, *bars
 

@@ -19,9 +19,9 @@ from torchsoft.solve.adjoint import TAPE_BYTES, attached
 from torchsoft.solve.laws import copied
 from torchsoft.solve.ledger import doubts
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.solve.simulate import Done, Route, prepare, run
+from torchsoft.solve.simulate import Route, RunOutcome, prepare, run
 from torchsoft.solve.trajectory import Trajectory
-from torchsoft.threads import cores, side_by_side, single_threaded
+from torchsoft.threads import cores, parallel_map, single_threaded
 
 
 class SamplesFailed(UserWarning):
@@ -111,7 +111,7 @@ def simulate_batch(
     began, threads = clock.perf_counter(), min(count, cores() if threads is None else whole("threads", threads, 1))
     budget = TAPE_BYTES / count
 
-    def work(i: int) -> Done | Exception:
+    def work(i: int) -> RunOutcome | Exception:
         try:
             task = prepare(
                 _own(rigs[i], parameters or {}, i), ts[i], y0=y0s[i], reference=references[i], knots=every_knots[i],
@@ -121,12 +121,12 @@ def simulate_batch(
         except (SimulationFailed, ValueError, np.linalg.LinAlgError) as failure:
             return failure
 
-    results: list[Done | Exception] = [ValueError("not run")] * count
+    results: list[RunOutcome | Exception] = [ValueError("not run")] * count
     with single_threaded(), tqdm(total=count, unit="run", disable=not progress) as bar:
-        for i, result in side_by_side(work, count, threads):
+        for i, result in parallel_map(work, count, threads):
             results[i] = result
             bar.update()
-    done = {i: result for i, result in enumerate(results) if isinstance(result, Done)}
+    done = {i: result for i, result in enumerate(results) if isinstance(result, RunOutcome)}
     failures = {i: result for i, result in enumerate(results) if isinstance(result, Exception)}
     if failures:
         first = min(failures)
@@ -139,7 +139,7 @@ def simulate_batch(
     states = dict(zip(done, attached([one.solved for one in done.values()], threads)))
     numbers = list(done)
     trajectories: list[Trajectory | None] = [None] * count
-    for k, trajectory in side_by_side(lambda k: done[numbers[k]].trajectory(states[numbers[k]]), len(numbers), threads):
+    for k, trajectory in parallel_map(lambda k: done[numbers[k]].trajectory(states[numbers[k]]), len(numbers), threads):
         trajectories[numbers[k]] = trajectory
     _doubt(rigs, trajectories)
     return Batch(tuple(trajectories), failures, tuple(len(one) for one in ts), clock.perf_counter() - began)

@@ -127,7 +127,7 @@ def prepare(
     return Task(stepper, t, y0, gradient, tuple(wrt), dy0, rigid)
 
 
-class Done(NamedTuple):
+class RunOutcome(NamedTuple):
     """A finished run: the states with what is needed to differentiate them, sensitivities where asked for, and its time [s]."""
 
     task: Task
@@ -141,7 +141,7 @@ class Done(NamedTuple):
         return gather(self.task, y, self.solved.out, self.wall, self.dy)
 
 
-def run(task: Task, tape_bytes: float, progress: bool = False, explained: bool = True) -> Done:
+def run(task: Task, tape_bytes: float, progress: bool = False, explained: bool = True) -> RunOutcome:
     """Carry out a task by one of the compiled routes; `explained` looks for the cause of a failure, which takes seconds.
 
     Raises `SimulationFailed` and `Interrupted` with what was simulated.
@@ -157,7 +157,7 @@ def run(task: Task, tape_bytes: float, progress: bool = False, explained: bool =
             task.gradient == "forward" or (task.gradient == "discrete" and torch.is_grad_enabled())
         ):
             for solved, dy in _rows(task, tape_bytes):
-                done = Done(task, solved, dy, clock.perf_counter() - began)
+                done = RunOutcome(task, solved, dy, clock.perf_counter() - began)
                 if bar is not None:
                     bar.n = float(t[solved.out.rows - 1] - t[0])
                     bar.refresh()

@@ -23,7 +23,7 @@ from torchsoft.solve.adjoint import Solved, attached, march, run_adjoint
 from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.progress import Segment
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
-from torchsoft.threads import cores, side_by_side
+from torchsoft.threads import cores, parallel_map
 
 REMEMBERED = 4
 """Runs of a model whose states are remembered: `odeint_adjoint` hands its solver only the later end of an interval."""
@@ -89,7 +89,7 @@ class TorchdiffeqSolver:
         def run(i: int) -> Solved:
             return deque(march(copy(self.stepper), samples[i], t), maxlen=1)[0]
 
-        for i, solved in side_by_side(run, len(samples)):
+        for i, solved in parallel_map(run, len(samples)):
             runs[i] = solved
         solution = torch.stack(attached(runs, cores()), 1)
         knots = [solved.out.knots for solved in runs]

@@ -31,7 +31,7 @@ class How(NamedTuple):
 
     fitted: list[str]
     heldout: tuple[str, ...]
-    meant: tuple[str, ...]
+    acknowledged: tuple[str, ...]
     settings: Settings
 
     @property
@@ -115,7 +115,7 @@ def conclude(
         },
         made_by={
             "torchsoft": version("torchsoft"), **how.settings.model_dump(), "rtol": rtol, "rtol_asked": stage.rtol,
-            "meant": list(how.meant), "untried": list(checked.untried) if checked is not None else [],
+            "acknowledged": list(how.acknowledged), "untried": list(checked.untried) if checked is not None else [],
             "candidates": list(checked.candidates) if checked is not None else [],
             "unknowns": {name: u.model_dump() for name, u in problem.unknowns.items()},
             "sensors": {name: s.model_dump() for name, s in problem.sensors.items()},

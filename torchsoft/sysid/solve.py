@@ -13,12 +13,12 @@ from tqdm import tqdm
 from torchsoft.sysid.answer.result import IdentificationResult
 from torchsoft.sysid.checks.colour import Coloured, allow_for_colour
 from torchsoft.sysid.conclude import How, conclude
-from torchsoft.sysid.conventions.conventions import check
-from torchsoft.sysid.conventions.finding import accepted
 from torchsoft.sysid.fit.fit import Fit, Notify, Unreachable, chord, descend, gauss_newton
 from torchsoft.sysid.fit.plan import Stage, default_plan
 from torchsoft.sysid.fit.robust import Loss
 from torchsoft.sysid.fit.stages import Method, progress_bar, run_stage, stage_entry
+from torchsoft.sysid.prechecks.finding import accepted
+from torchsoft.sysid.prechecks.prechecks import check
 from torchsoft.sysid.problem.problem import Problem, Residuals
 from torchsoft.sysid.problem.recording import Array
 from torchsoft.sysid.problem.workers import Runner
@@ -30,7 +30,7 @@ def identify(
     problem: Problem, *, rtol: float = RTOL, plan: Sequence[Stage] | None = None, starts: int = 1, loss: Loss = "linear",
     method: Method = "gauss_newton", heldout: Sequence[str] = (), workers: int = 1, checkpoint: str | Path | None = None,
     progress: bool = False, seed: int = 0, tightenings: int = 2, assumptions: Assumed = "checked",
-    meant: Sequence[str] = (),
+    acknowledged: Sequence[str] = (),
 ) -> IdentificationResult:  # fmt: skip
     """Find the unknown parameters of `problem`, with intervals, and find which of them the data do not determine.
 
@@ -48,7 +48,7 @@ def identify(
     friction law) are tested to first order, a run each, and intervals allow for constants of the computation that the data
     cannot tell. Where no test explains a misfit, a notice names the candidates, and `explain` tries them. Before the fit
     recordings are held against what such a rig can do at all: signs, units, delays, zeros, set-points, the body that a loop
-    senses; `meant` names findings that are no mistakes. With `assumptions` = "trusted" both are left out.
+    senses; `acknowledged` names findings that are no mistakes. With `assumptions` = "trusted" both are left out.
 
     Raises `ValueError` for what `Settings` does not take, and for recordings that are not there or cannot be what they are
     taken for, `Unreachable` where the model cannot follow the data.
@@ -64,7 +64,7 @@ def identify(
         raise ValueError("`starts` and `rtol` are those of the default plan: say them of the stages of `plan` instead")
     fitted, began = [name for name in problem.names if name not in heldout], clock.perf_counter()
     runner = Runner(problem.recordings, workers, Path(checkpoint) if checkpoint is not None else None)
-    looks = accepted(check(problem, runner, fitted), meant) if assumptions != "trusted" else []
+    looks = accepted(check(problem, runner, fitted), acknowledged) if assumptions != "trusted" else []
     for look in looks if progress else ():
         tqdm.write(plain(f"note: {look}"), file=sys.stderr)
     x, fit, stages = problem.coordinates.start, None, []
@@ -85,7 +85,7 @@ def identify(
     stages += [
         stage_entry("with the noise that was found", plan[-1], plan[-1].rtol, one, before) for one in coloured.fits
     ]
-    how = How(fitted, tuple(heldout), tuple(meant), settings)
+    how = How(fitted, tuple(heldout), tuple(acknowledged), settings)
     return conclude(coloured, runner, plan[-1], stages, how, looks, began, progress)
 
 

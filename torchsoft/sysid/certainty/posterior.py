@@ -19,7 +19,7 @@ from torchsoft.files import finite, replacing
 from torchsoft.sysid.certainty.optimum import CHOSEN_ANEW, Optimum
 from torchsoft.sysid.certainty.summary import MarginalSummary, PosteriorSummary
 from torchsoft.sysid.problem.recording import Array
-from torchsoft.threads import side_by_side, single_threaded
+from torchsoft.threads import parallel_map, single_threaded
 
 WITHIN = 1e-3
 """Least share of Gaussian draws that must lie within the bounds."""
@@ -159,7 +159,7 @@ def laplace(o: Optimum, *, draws: int = 400, seed: int = 0, progress: bool = Fal
         return measure(o, x)[0] - 0.5 * float(at.r @ at.r), ""
 
     with single_threaded(), tqdm(desc="Laplace", total=draws, disable=not progress) as bar:
-        for k, (value, reason) in side_by_side(density, draws, o.workers):
+        for k, (value, reason) in parallel_map(density, draws, o.workers):
             log_p[k], lost = value, [*lost, reason] if reason else lost
             bar.update()
     w, k_hat = importance(log_p - log_q)

@@ -17,7 +17,7 @@ from torchsoft.sysid.certainty.optimum import CHOSEN_ANEW, Optimum
 from torchsoft.sysid.fit.fit import Unreachable, gauss_newton, newton_step
 from torchsoft.sysid.problem.problem import Residuals
 from torchsoft.sysid.problem.recording import Array
-from torchsoft.threads import side_by_side, single_threaded
+from torchsoft.threads import parallel_map, single_threaded
 
 RISE = float(stats.chi2.ppf(0.95, 1))
 """2 Delta(-log posterior) where a 95 % interval ends."""
@@ -96,7 +96,7 @@ def profiles(optimum: Optimum, labels: Sequence[str] | None = None, *, progress:
     where = {label: i for i, label in enumerate(optimum.problem.coordinates.labels)}
     tasks = [(label, sign) for label in chosen for sign in (-1, 1)]
     with single_threaded():
-        work = side_by_side(lambda k: walk(optimum, where[tasks[k][0]], tasks[k][1]), len(tasks), optimum.workers)
+        work = parallel_map(lambda k: walk(optimum, where[tasks[k][0]], tasks[k][1]), len(tasks), optimum.workers)
         done = dict(tqdm(work, desc="profiles", total=len(tasks), disable=not progress))
     return [assemble(optimum, where[label], done[2 * k], done[2 * k + 1]) for k, label in enumerate(chosen)]
 

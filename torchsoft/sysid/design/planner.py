@@ -33,9 +33,9 @@ from torchsoft.sysid.fit.information import fisher
 from torchsoft.sysid.problem.prediction import Frozen, Prediction, Steps, choice, predict, prepared
 from torchsoft.sysid.problem.problem import Problem, Residuals
 from torchsoft.sysid.problem.readout import Signals
-from torchsoft.sysid.problem.recording import Array, Begun, Recording
+from torchsoft.sysid.problem.recording import Array, Recording, RunContext
 from torchsoft.sysid.problem.workers import Runner
-from torchsoft.threads import side_by_side, single_threaded
+from torchsoft.threads import parallel_map, single_threaded
 
 Range = tuple[float, float]
 """Least and largest value of a channel [its unit]."""
@@ -62,7 +62,7 @@ PRICE = 5.0
 """What a sample at twice the way to a limit costs, in units of the criterion."""
 
 
-class Look(NamedTuple):
+class DesignEvaluation(NamedTuple):
     """One motion at one x: the criterion, what excess costs, how much of the way to their limits channels go, the covariance C
     (n, n), the `errors` (k, s) of the parameters that the samples' not being linear makes, the criterion's derivative
     G (n, n) by the Fisher matrix, the rows J (m, n) of the samples, the steps, and the signals of the run."""
@@ -92,7 +92,7 @@ class Planner:
         self.grid = self.recording.grid(problem.interpolated)
         self._others = Runner(problem.recordings, workers)
         self._known: dict[bytes, Array] = {}
-        self._idle: list[Begun] = []
+        self._idle: list[RunContext] = []
         self._pulls = [problem.noise[ch].whitener(self.recording.samples[ch][0]) if ch in problem.noise else None
                        for ch in problem.sensors if ch in self.recording.samples]  # fmt: skip
         self.cost = Counter({"runs": 0, "gradients": 0})
@@ -118,7 +118,7 @@ class Planner:
         return self._known[x.tobytes()]
 
     @contextmanager
-    def _begun(self) -> Iterator[Begun]:
+    def _begun(self) -> Iterator[RunContext]:
         """The recording's rig, ready to run; not used again where a run fails."""
         begun = self._idle.pop() if self._idle else self.recording.begin()
         yield begun
@@ -135,7 +135,7 @@ class Planner:
         self.cost["runs"] += 1
         return p.gather(x, [job], [run]), run
 
-    def look(self, z: Array, x: Array, steps: Steps | None = None) -> Look:
+    def look(self, z: Array, x: Array, steps: Steps | None = None) -> DesignEvaluation:
         """The motion z at x, by the planner's tolerance or that of `steps`; on steps that are given without the errors. Raises
         `SimulationFailed`."""
         c, given = self.problem.coordinates, self.rtol if steps is None else steps
@@ -153,7 +153,7 @@ class Planner:
         frozen = Frozen(run.knots) if run.knots is not None else given
         assert isinstance(frozen, Frozen)
         J = at.J[: len(at.J) - len(c.priors)]
-        return Look(value, cost, peaks, C, errors, -C @ T.T @ S @ T @ C, J, frozen, signals)
+        return DesignEvaluation(value, cost, peaks, C, errors, -C @ T.T @ S @ T @ C, J, frozen, signals)
 
     def check_predictable(self, x: Array, J: Array, signals: Signals) -> None:
         """Raises `SimulationFailed` where a parameter that hardly changes would change the samples altogether: then their
@@ -191,7 +191,7 @@ class Planner:
             for name, (low, high) in self.limits.items()
         }
 
-    def slopes(self, z: Array, x: Array, at: Look) -> Array:
+    def slopes(self, z: Array, x: Array, at: DesignEvaluation) -> Array:
         """Derivative by z of the criterion and of what excess costs, on the steps of the look. Raises `SimulationFailed`."""
         c, W = self.problem.coordinates, 2 * at.J @ at.G
         low, high = c.bounds
@@ -212,7 +212,7 @@ class Planner:
             return self.adjoint(z, tasks[i][0], at.steps, tasks[i][1])
 
         with single_threaded():
-            return np.asarray(sum(part for _, part in side_by_side(swept, len(tasks), self.workers)))
+            return np.asarray(sum(part for _, part in parallel_map(swept, len(tasks), self.workers)))
 
     def adjoint(self, z: Array, x: Array, steps: Steps, weights: Array) -> Array:
         """Slopes by z of weights (G, channels) on the signals of the run at x. Raises `SimulationFailed`."""
@@ -245,16 +245,16 @@ class Planner:
             out[:, signals.names.index(name)] = 4 * PRICE * excess / (high - low)
         return out
 
-    def deviations(self, x: Array, at: Look) -> dict[str, float]:
+    def deviations(self, x: Array, at: DesignEvaluation) -> dict[str, float]:
         """Relative standard deviations of the parameters."""
         names, T = chosen(self.problem, x, self.names)
         return deviations(names, T, at.C)
 
-    def bent(self, x: Array, at: Look) -> dict[str, Array]:
+    def bent(self, x: Array, at: DesignEvaluation) -> dict[str, Array]:
         """The errors (k,) by parameter, over its standard deviation."""
         return {name: error / sd for (name, sd), error in zip(self.deviations(x, at).items(), at.errors.T)}
 
-    def made(self, z: Array, x: Array, at: Look) -> Recording:
+    def made(self, z: Array, x: Array, at: DesignEvaluation) -> Recording:
         """The recording that follows a motion, with the samples that its sensors would give without noise."""
         rig = deepcopy(self.recording.rig)
         with torch.no_grad():

@@ -15,7 +15,7 @@ import torch
 from torchsoft.solve.adjoint import GradientFailed
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.design.knots import Moves
-from torchsoft.sysid.design.planner import PRICE, Look, Planner
+from torchsoft.sysid.design.planner import PRICE, DesignEvaluation, Planner
 from torchsoft.sysid.problem.recording import Array
 
 OUTLIER = 10.0
@@ -54,7 +54,7 @@ class Search:
         self.planner, self.points, self.robust, self.rate, self.smoothing = planner, points, robust, rate, smoothing
         self.rng, self.iteration, self.lost, self.in_a_row = np.random.default_rng(seed), 0, 0, 0
 
-    def begin(self) -> Look:
+    def begin(self) -> DesignEvaluation:
         """The look at the motion given, which is the best so far. Raises `ValueError` where it cannot be run."""
         try:
             first = self.planner.look(self.planner.moves.start, self.points[0])
@@ -63,7 +63,7 @@ class Search:
         self.set_out(self.planner.moves, first)
         return first
 
-    def set_out(self, moves: Moves, seen: Look) -> None:
+    def set_out(self, moves: Moves, seen: DesignEvaluation) -> None:
         """From the motion of some knots on, by gradient."""
         self.planner, self.seen, self.z = self.planner.of(moves), seen, moves.start
         self.now = torch.from_numpy(self.z.copy()).requires_grad_(True)
@@ -71,7 +71,7 @@ class Search:
         self.best, _ = self.visit(self.z)
         self.history = [self.best]
 
-    def visit(self, z: Array) -> tuple[Visit, Look | None]:
+    def visit(self, z: Array) -> tuple[Visit, DesignEvaluation | None]:
         """What a motion is worth over all points, infinite where it is lost, and the look at it at the first."""
         try:
             looks = [self.planner.look(z, x) for x in self.points]

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from torchsoft.paper.rig import NAMES
 from torchsoft.physics.material import INSTANT
-from torchsoft.sysid.problem.underway import LEAD
+from torchsoft.sysid.problem.moving_start import LEAD
 from torchsoft.sysid.problem.unknowns import Sensor, Unknown
 from torchsoft.sysid.settings import Settings
 from torchsoft.tables import LISTED, Table, from_toml
@@ -32,11 +32,11 @@ def told_apart(sd: float, value: float = 1.0) -> float:
 
 
 class Rest(Table):
-    """A recording that begins at rest, the disc on the lower pad at `scenario.x_C0`, known to `x_sd` [m], and the bracket clear
-    of it."""
+    """A recording that begins at rest, the disc on the lower pad at `scenario.x_C0`, known to `position_sd` [m], and the
+    bracket clear of it."""
 
     kind: Literal["rest"] = "rest"
-    x_sd: Annotated[float, AfterValidator(told_apart)] = Field(default=0.0, ge=0, le=0.1)
+    position_sd: Annotated[float, AfterValidator(told_apart)] = Field(default=0.0, ge=0, le=0.1)
 
 
 class Known(Table):
@@ -55,7 +55,7 @@ class Moving(Table):
     """A recording that begins anywhere, in motion or in mid-grasp: its samples of the first `lead` [s] tell where, with what is
     `given` of coordinates such as "disc.x" and "disc.v_x"."""
 
-    kind: Literal["underway"] = "underway"
+    kind: Literal["moving"] = "moving"
     lead: float = Field(default=LEAD, gt=0, le=10)
     given: dict[Name, Known] = Field(default_factory=dict)
 
@@ -153,8 +153,8 @@ class Config(Table):
 
     `settings` are known numbers, by the groups and names of `Parameters`; `unknowns` and `sensors` are tables by the dotted
     names of parameters and by channels; `heldout` names recordings that are predicted and not fitted, `ignore` columns that
-    are left out, and `meant` findings that are no mistakes. `missing` and `start` hold for all recordings that say nothing
-    else. `compare` has competing laws by name.
+    are left out, and `acknowledged` findings that are no mistakes. `missing` and `start` hold for all recordings that say
+    nothing else. `compare` has competing laws by name.
     """
 
     unknowns: dict[str, Unknown]
@@ -168,7 +168,7 @@ class Config(Table):
     compare: dict[Name, Law] = Field(default_factory=dict)
     heldout: Annotated[tuple[str, ...], LISTED] = ()
     ignore: Annotated[tuple[str, ...], LISTED] = ()
-    meant: Annotated[tuple[str, ...], LISTED] = ()
+    acknowledged: Annotated[tuple[str, ...], LISTED] = ()
 
     @model_validator(mode="after")
     def _laws_have_likelihoods(self) -> "Config":

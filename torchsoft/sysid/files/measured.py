@@ -36,7 +36,7 @@ from torchsoft.sysid.files.configuration import (
     understood,
 )
 from torchsoft.sysid.fit.fit import Unreachable
-from torchsoft.sysid.problem.first_samples import begin_underway
+from torchsoft.sysid.problem.first_samples import estimate_initial_state
 from torchsoft.sysid.problem.problem import Problem
 from torchsoft.sysid.problem.recording import Recording
 from torchsoft.sysid.problem.start import BOUNDS, AtRest
@@ -52,7 +52,7 @@ APART = 1e-3
 SUNK = 3e-4
 """How far [m] below undeformed touch the bracket may begin: a disc sinks into its pad under its weight."""
 
-WAY_OUT = 'or say start = {kind = "underway"} for a recording that begins in motion or in mid-grasp'
+WAY_OUT = 'or say start = {kind = "moving"} for a recording that begins in motion or in mid-grasp'
 
 STATED = "as stated"
 """The name of the law of the file itself among competing ones."""
@@ -121,7 +121,7 @@ def check_plausible(tables: Tables, p: Parameters, sensors: Mapping[str, Sensor]
             )
 
 
-def check_rest(tables: Tables, p: Parameters, sensors: Mapping[str, Sensor], x_sd: float) -> None:
+def check_rest(tables: Tables, p: Parameters, sensors: Mapping[str, Sensor], position_sd: float) -> None:
     """Raises `ValueError` for a recording that does not begin at rest, with the disc where `scenario.x_C0` says and the bracket
     clear of it; it names row and column."""
     H, x_C0, first = apart(p), p.scenario.x_C0, tables.begin
@@ -134,7 +134,7 @@ def check_rest(tables: Tables, p: Parameters, sensors: Mapping[str, Sensor], x_s
             continue
         sensor, size = sensors.get(name), 1 / p.disc.radius if unit.startswith("rad") else 1.0
         slack, bias = (8 * sensor.noise, sensor.bias) if sensor else (0.0, 0.0)
-        reach = (APART + BOUNDS * x_sd) * size + slack + bias
+        reach = (APART + BOUNDS * position_sd) * size + slack + bias
         if name in begin and abs(column[here[0]] - begin[name]) > reach:
             what = "scenario.x_C0" if name.startswith("x") else "the set-point y_d" if name == "y_Br" else "the start"
             opposite = abs(column[here[0]] + begin[name]) <= reach
@@ -175,7 +175,7 @@ def recording(
     """The recording that tables hold, of a rig with the parameters p. Raises `ValueError` naming row and column."""
     check_plausible(tables, p, sensors)
     if isinstance(start, Rest):
-        check_rest(tables, p, sensors, start.x_sd)
+        check_rest(tables, p, sensors, start.position_sd)
     columns, samples, files = tables.columns, {}, ", ".join(str(table.path) for table in tables.tables)
     for channel in (c for c in MEASURED if c in columns):
         t, y = columns[channel]
@@ -194,8 +194,8 @@ def recording(
     if isinstance(start, Moving):
         given = {coordinate: (one.mean, one.sd) for coordinate, one in start.given.items()}
         used = {channel: sensors[channel] for channel in sensors if channel in samples}
-        return begin_underway(made, used, lead=start.lead, given=given)
-    return replace(made, start=AtRest(x_sd=start.x_sd))
+        return estimate_initial_state(made, used, lead=start.lead, given=given)
+    return replace(made, start=AtRest(position_sd=start.position_sd))
 
 
 def sampled(t: np.ndarray, y: np.ndarray, rate: tuple[np.ndarray, np.ndarray] | None) -> Sampled:

@@ -20,10 +20,10 @@ from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import NoEquilibrium, settled
 from torchsoft.solve.trajectory import measurable
+from torchsoft.sysid.problem.moving_start import LEAD, MovingStart, Normal, Stretch, along, free_coordinates, placed
 from torchsoft.sysid.problem.readout import partner
 from torchsoft.sysid.problem.recording import SAME, Array, Recording
 from torchsoft.sysid.problem.start import PREFIX
-from torchsoft.sysid.problem.underway import LEAD, Normal, Stretch, Underway, along, free_coordinates, placed
 from torchsoft.sysid.problem.unknowns import Sensor
 
 DEGREE = 3
@@ -40,7 +40,7 @@ SHORTEST, LONGEST = 1e-9, 1e-3
 """Standard deviations of stretches [m]: without friction, and where friction does not bound them."""
 
 
-def begin_underway(
+def estimate_initial_state(
     recording: Recording, sensors: Mapping[str, Sensor], *, lead: float = LEAD,
     given: Mapping[str, Normal] | None = None,
 ) -> Recording:  # fmt: skip
@@ -48,7 +48,7 @@ def begin_underway(
     where.
 
     Coordinates that `sensors` do not measure are `given`, mean and standard deviation by the names of
-    `Underway.bodies`, or assumed: what an actuator measures follows its set-point, the disc of the paper's rig lies
+    `MovingStart.bodies`, or assumed: what an actuator measures follows its set-point, the disc of the paper's rig lies
     midway between the pads or on the lower one, the angle of a round body is zero, and other rates are those with which
     the contacts roll.
 
@@ -70,7 +70,7 @@ def begin_underway(
     samples = {c: (t[late[c]], y[late[c]]) for c, (t, y) in recording.samples.items()}
     lead = min(float(t[0]) for t, _ in samples.values()) - first
     bodies = completed(rig, measured(rig, early, sensors, whose) | dict(given or {}), first)
-    return replace(recording, samples=samples, start=Underway(bodies, stretches(rig, bodies, first, lead), lead))
+    return replace(recording, samples=samples, start=MovingStart(bodies, stretches(rig, bodies, first, lead), lead))
 
 
 def measured(

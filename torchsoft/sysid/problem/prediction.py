@@ -14,7 +14,7 @@ from torchsoft.solve.simulate import simulate
 from torchsoft.solve.tangent import directions
 from torchsoft.solve.trajectory import Trajectory, channels, measurable
 from torchsoft.sysid.problem.readout import Signals
-from torchsoft.sysid.problem.recording import Array, Begun, Grid
+from torchsoft.sysid.problem.recording import Array, Grid, RunContext
 from torchsoft.sysid.problem.start import PREFIX
 
 TOLERANCE = 1e-8
@@ -83,7 +83,7 @@ class Run(NamedTuple):
     wanted: list[Tensor]
 
 
-def prepared(begun: Begun, values: Mapping[str, float], names: Sequence[str]) -> Run:
+def prepared(begun: RunContext, values: Mapping[str, float], names: Sequence[str]) -> Run:
     """Gives the rig its parameters, and makes the state where it begins, with its derivatives by `names`."""
     set_parameters(begun.rig, {name: value for name, value in values.items() if not name.startswith(PREFIX)})
     at = {
@@ -117,7 +117,9 @@ def choice(steps: Steps) -> dict[str, Any]:
     return chosen | {"tolerance": TOLERANCE}
 
 
-def predict(begun: Begun, values: Mapping[str, float], grid: Grid, names: Sequence[str], steps: Steps) -> Prediction:
+def predict(
+    begun: RunContext, values: Mapping[str, float], grid: Grid, names: Sequence[str], steps: Steps
+) -> Prediction:
     """Signals on the grid, and their derivatives by `names`, if there are any. Raises
     `SimulationFailed`."""
     rig, run = begun.rig, prepared(begun, values, names)
@@ -133,7 +135,7 @@ def predict(begun: Begun, values: Mapping[str, float], grid: Grid, names: Sequen
 
 
 def misfit(
-    begun: Begun, values: Mapping[str, float], grid: Grid, names: Sequence[str], steps: Steps, judge: Judge
+    begun: RunContext, values: Mapping[str, float], grid: Grid, names: Sequence[str], steps: Steps, judge: Judge
 ) -> Misfit:
     """The misfit that `judge` finds, with its gradient by `names`, by the discrete adjoint. Raises `SimulationFailed`."""
     rig, run = begun.rig, prepared(begun, values, names)

@@ -31,7 +31,7 @@ SAME = 1e-9
 """Times [s] closer than this are one time."""
 
 
-class Begun(NamedTuple):
+class RunContext(NamedTuple):
     """A rig of a run's own, and where the run begins."""
 
     rig: Rig
@@ -122,12 +122,12 @@ class Recording:
         numbers = {name: float(value.detach()) for name, value in scalars.items()}
         return numbers | {c.name: c.mean for c in self.start_coordinates}
 
-    def begin(self) -> Begun:
+    def begin(self) -> RunContext:
         """A copy of the rig, and where its runs begin."""
         rig = deepcopy(self.rig)
         for name, value in rig.named_parameters():
             value.requires_grad_(not name.startswith("reference."))
-        return Begun(rig, self.start.begin(rig, self.samples))
+        return RunContext(rig, self.start.begin(rig, self.samples))
 
     def on_a_grid(self, interpolated: bool) -> bool:
         """Whether a regular grid is simulated, every `BETWEEN`, in place of the samples' own times: where they are denser, or

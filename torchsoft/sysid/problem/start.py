@@ -71,12 +71,12 @@ class Start(Protocol):
 class AtRest(NamedTuple):
     """The disc of the paper's rig at rest on the lower pad at x [m], by default `scenario.x_C0`, and the bracket clear of it.
 
-    `x_sd` [m] is how well that is known: above zero the place of the disc is a coordinate, `start.disc.x`. The displacements of
-    the pads are those at the nominal parameters, whatever the others are: most of what that gets wrong has died away at the
-    first sample.
+    `position_sd` [m] is how well that is known: above zero the place of the disc is a coordinate, `start.disc.x`. The
+    displacements of the pads are those at the nominal parameters, whatever the others are: most of what that gets wrong
+    has died away at the first sample.
     """
 
-    x_sd: float = 0.0
+    position_sd: float = 0.0
     x: float | None = None
     lead: float = SETTLE
 
@@ -84,9 +84,9 @@ class AtRest(NamedTuple):
         if not isinstance(rig, SoftGrasp):
             raise ValueError("only the paper's rig has a rest of its own: give the recording another `start`")
         warn_of_memory(rig, self.lead)
-        if not 0 <= self.x_sd <= 0.1:
-            raise ValueError(f"`x_sd` must be from 0 to 0.1 m, but is {self.x_sd}")
-        return (StartCoordinate("start.disc.x", self.place(rig), self.x_sd),) if self.x_sd > 0 else ()
+        if not 0 <= self.position_sd <= 0.1:
+            raise ValueError(f"`position_sd` must be from 0 to 0.1 m, but is {self.position_sd}")
+        return (StartCoordinate("start.disc.x", self.place(rig), self.position_sd),) if self.position_sd > 0 else ()
 
     def place(self, rig: SoftGrasp) -> float:
         """x of the disc [m]."""
@@ -94,7 +94,7 @@ class AtRest(NamedTuple):
 
     def begin(self, rig: Rig, samples: Samples) -> Begin:
         assert isinstance(rig, SoftGrasp)
-        return Lying(rig, rig, self.place(rig))
+        return RestState(rig, rig, self.place(rig))
 
 
 class Known(NamedTuple):
@@ -114,7 +114,7 @@ class Known(NamedTuple):
         return f"Known({self.y0.tolist()}, {self.lead})"
 
 
-class Lying:
+class RestState:
     """The state of `AtRest`: displacements stay when parameters change, and massless pads get the forces that hold them so."""
 
     def __init__(self, nominal: SoftGrasp, rig: SoftGrasp, x: float) -> None:
@@ -139,7 +139,7 @@ class Lying:
 
 def held_start(nominal: SoftGrasp, rig: SoftGrasp) -> Tensor:
     """The state (size,) of `AtRest` for a rig that may have other parameters than the nominal one."""
-    return Lying(nominal, rig, AtRest().place(nominal))({})
+    return RestState(nominal, rig, AtRest().place(nominal))({})
 
 
 def warn_of_memory(rig: Rig, lead: float) -> None:

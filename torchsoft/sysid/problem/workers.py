@@ -16,9 +16,9 @@ from torchsoft.sysid.problem.journal import Journal
 from torchsoft.sysid.problem.noise import Autoregression
 from torchsoft.sysid.problem.prediction import FailedRun, Frozen, Prediction, Steps, misfit, predict
 from torchsoft.sysid.problem.readout import Readout, Signals
-from torchsoft.sysid.problem.recording import Array, Begun, Recording
+from torchsoft.sysid.problem.recording import Array, Recording, RunContext
 from torchsoft.sysid.problem.unknowns import NUISANCES
-from torchsoft.threads import side_by_side, single_threaded
+from torchsoft.threads import parallel_map, single_threaded
 
 
 class Job(NamedTuple):
@@ -45,7 +45,7 @@ class Runner:
         self.recordings, self.workers, self.folder = tuple(recordings), workers, journal
         self.simulations = self.jacobians = self.gradients = self.steps = self.remembered = 0
         self._journal = Journal(journal, self.recordings) if journal is not None else None
-        self._idle: list[list[Begun]] = [[] for _ in self.recordings]  # models that no thread is using
+        self._idle: list[list[RunContext]] = [[] for _ in self.recordings]  # models that no thread is using
 
     def run(self, jobs: Sequence[Job]) -> list[Any]:
         """Results in the order of the jobs: `Prediction`, `Misfit` or `FailedRun`."""
@@ -55,7 +55,7 @@ class Runner:
         todo = [i for i, result in enumerate(out) if result is None]
         todo.sort(key=lambda i: self._length(jobs[i]), reverse=True)  # the longest first
         with single_threaded():
-            for i, result in side_by_side(lambda k: self._made(jobs[todo[k]]), len(todo), self.workers):
+            for i, result in parallel_map(lambda k: self._made(jobs[todo[k]]), len(todo), self.workers):
                 out[todo[i]] = result
                 self.steps += result.steps if isinstance(result, Prediction) else 0
         return out
@@ -89,7 +89,7 @@ class Runner:
             self.simulations += 1
 
 
-def simulated(recording: Recording, begun: Begun, job: Job) -> Any:
+def simulated(recording: Recording, begun: RunContext, job: Job) -> Any:
     """A `Prediction`, a `Misfit`, or a `FailedRun`, by a rig that nobody else is using."""
     run = begun, job.values, recording.grid(job.interpolated), job.names, job.steps
     try:

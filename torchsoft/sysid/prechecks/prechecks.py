@@ -15,11 +15,11 @@ import torch
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.sysid.conventions.closed_loop import channel
-from torchsoft.sysid.conventions.finding import Finding, confusions, together
-from torchsoft.sysid.conventions.loops import another_sense, loop_findings
-from torchsoft.sysid.conventions.setpoints import setpoint_findings
 from torchsoft.sysid.fit.plan import LOOSE
+from torchsoft.sysid.prechecks.closed_loop import channel
+from torchsoft.sysid.prechecks.finding import Finding, confusions, together
+from torchsoft.sysid.prechecks.loops import another_sense, loop_findings
+from torchsoft.sysid.prechecks.setpoints import setpoint_findings
 from torchsoft.sysid.problem.prediction import Prediction
 from torchsoft.sysid.problem.problem import Problem
 from torchsoft.sysid.problem.readout import Readout, Signals

@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from torchsoft.physics.motion import Sampled, spline_rates
 from torchsoft.physics.parts import Actuator
-from torchsoft.sysid.conventions.closed_loop import channel
-from torchsoft.sysid.conventions.finding import Finding
+from torchsoft.sysid.prechecks.closed_loop import channel
+from torchsoft.sysid.prechecks.finding import Finding
 from torchsoft.sysid.problem.recording import Recording
 from torchsoft.sysid.problem.unknowns import Sensor
 

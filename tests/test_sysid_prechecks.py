@@ -15,12 +15,12 @@ from torchsoft import Parameters, Reference, SoftGrasp
 from torchsoft.excitation import Excitation, MultiSine, Press, Strokes
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Unknown, record
-from torchsoft.sysid.conventions.conventions import check, findings
-from torchsoft.sysid.conventions.finding import Finding, accepted, together
-from torchsoft.sysid.conventions.loops import loop_findings
-from torchsoft.sysid.conventions.setpoints import gaps, setpoint_findings
 from torchsoft.sysid.files.cost import paper_settings
 from torchsoft.sysid.fit.plan import LOOSE
+from torchsoft.sysid.prechecks.finding import Finding, accepted, together
+from torchsoft.sysid.prechecks.loops import loop_findings
+from torchsoft.sysid.prechecks.prechecks import check, findings
+from torchsoft.sysid.prechecks.setpoints import gaps, setpoint_findings
 from torchsoft.sysid.problem.readout import Signals, readout
 from torchsoft.sysid.problem.workers import Runner
 
@@ -325,16 +325,16 @@ def test_findings_of_a_kind_are_said_once_and_refused_unless_they_are_meant() ->
     ])  # fmt: skip
     assert [f.what for f in found] == ["sign of F_x", "zero of F_y"]
     assert found[0].sentence == "F_x looks wrong; so it is in `b`"
-    with pytest.raises(ValueError, match=r'if it is meant so, say meant = \["sign of F_x"\]'):
+    with pytest.raises(ValueError, match=r'if it is so, say acknowledged = \["sign of F_x"\]'):
         accepted(found, [])
     with pytest.raises(
         ValueError, match=r"called 'nonsense', so leave it out; what was found is sign of F_x, zero of F_y$"
     ):
         accepted(found, ["sign of F_x", "nonsense"])
     with pytest.raises(
-        ValueError, match=r"^meant: nothing was found that is called 'nonsense', .* nothing looks wrong$"
+        ValueError, match=r"^acknowledged: nothing was found that is called 'nonsense', .* nothing looks wrong$"
     ):
         accepted([], ["nonsense"])
     first, second = accepted(found, ["sign of F_x"])
-    assert first == "F_x looks wrong; so it is in `b` (you say that it is meant so)"
+    assert first == "F_x looks wrong; so it is in `b` (acknowledged)"
     assert second == "F_y is off"

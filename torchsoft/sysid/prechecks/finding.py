@@ -30,17 +30,19 @@ def together(found: Sequence[Finding]) -> list[Finding]:
     return out
 
 
-def accepted(found: Sequence[Finding], meant: Sequence[str]) -> list[str]:
+def accepted(found: Sequence[Finding], acknowledged: Sequence[str]) -> list[str]:
     """The sentences of what is not grave, or was said to be meant so. Raises `ValueError` for the others, and for what is meant
     and was not found."""
     names = dict.fromkeys(one.what for one in found)
-    if strange := [name for name in meant if name not in names]:
+    if strange := [name for name in acknowledged if name not in names]:
         there = f"what was found is {', '.join(names)}" if names else "nothing looks wrong"
-        raise ValueError(f"meant: nothing was found that is called {shown(strange[0])}, so leave it out; {there}")
+        raise ValueError(
+            f"acknowledged: nothing was found that is called {shown(strange[0])}, so leave it out; {there}"
+        )
     for one in found:
-        if one.grave and one.what not in meant:
-            raise ValueError(f'{one.sentence}; if it is meant so, say meant = ["{one.what}"]')
-    return [f"{f.sentence} (you say that it is meant so)" if f.what in meant else f.sentence for f in found]
+        if one.grave and one.what not in acknowledged:
+            raise ValueError(f'{one.sentence}; if it is so, say acknowledged = ["{one.what}"]')
+    return [f"{f.sentence} (acknowledged)" if f.what in acknowledged else f.sentence for f in found]
 
 
 MISTAKEN = {

@@ -45,7 +45,7 @@ def along(pad: Pad, positions: Tensor) -> Array:
     return (positions @ pad.axes[:, 0]).detach().numpy()
 
 
-class Underway(NamedTuple):
+class MovingStart(NamedTuple):
     """A run begins in motion, `lead` [s] before the first sample.
 
     `bodies` holds mean and standard deviation of every free coordinate by its name, "disc.x" [m, or rad], and of every

@@ -16,8 +16,8 @@ from scipy.optimize import minimize_scalar
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.parts import Actuator, coordinate_unit
 from torchsoft.physics.rig import Rig
-from torchsoft.sysid.conventions.closed_loop import Loop, channel, sampled, windows
-from torchsoft.sysid.conventions.finding import Finding, confusions
+from torchsoft.sysid.prechecks.closed_loop import Loop, channel, sampled, windows
+from torchsoft.sysid.prechecks.finding import Finding, confusions
 from torchsoft.sysid.problem.recording import Array, Recording
 from torchsoft.sysid.problem.unknowns import Sensor
 
