@@ -33,7 +33,7 @@ FLOWS = {
     "sysid.fit": "information robust fit plan stages settle .",
     "sysid.prechecks": "finding closed_loop loops setpoints prechecks .",
     "sysid.checks": "parts misfit colour assumptions variation checks .",
-    "sysid.laws": "evidence pattern compare .",
+    "sysid.laws": "evidence compare .",
     "sysid.certainty": "optimum profile summary posterior nuts .",
     "sysid.answer": "comparison estimate contribution recorded answer result .",
     "sysid.files": "columns configuration measured cost .",

@@ -553,7 +553,7 @@ def test_what_is_wrong_is_not_run_unless_it_is_meant(small: Path, tmp_path: Path
     assert main(["check", str(path)]) == 2
     assert "error: bodies.disc: it and bodies.stone overlap" in capsys.readouterr().out
     assert main(["run", str(path), "--out", str(tmp_path / "out"), "--no-progress"]) == 2
-    assert "wrong.toml is not run; mend what is wrong, or say --anyway" in capsys.readouterr().err
+    assert "wrong.toml is not run; fix what is wrong, or say --anyway" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     assert main(["run", str(path), "--out", str(tmp_path / "out"), "--no-progress", "--anyway"]) == 0
     assert "bodies.stone overlap" in capsys.readouterr().err

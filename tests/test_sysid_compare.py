@@ -16,16 +16,14 @@ from test_sysid_friction import Viscous
 from torchsoft import Parameters, Profile, Reference, SoftGrasp
 from torchsoft.excitation import Excitation, Roll, Strokes
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, record
-from torchsoft.sysid.answer.comparison import LawFit, Versus, judged
+from torchsoft.sysid.answer.comparison import LawFit, judged
 from torchsoft.sysid.checks.parts import Part
 from torchsoft.sysid.laws.compare import compare, versus
 from torchsoft.sysid.laws.evidence import Density, density, ratio
-from torchsoft.sysid.laws.pattern import Motion, shortest
 from torchsoft.sysid.problem.noise import Autoregression
 from torchsoft.sysid.report.comparison_figure import plot
 
 T: Any = np.arange(300) * 5e-3
-MOTION = Motion(T, np.zeros(300), np.zeros(300), ["slip"] * 150 + ["hold"] * 150)
 
 
 def law(name: str, r: np.ndarray, k: int = 3, held: np.ndarray | None = None) -> Any:
@@ -39,10 +37,6 @@ def law(name: str, r: np.ndarray, k: int = 3, held: np.ndarray | None = None) ->
     return SimpleNamespace(name=name, fitted=said(r, "one"), heldout=heldout, parameters=k, numerical=0.0)
 
 
-def against(best: Any, other: Any) -> Versus:
-    return versus(best, other, {"one": MOTION, "other": MOTION})
-
-
 def apart(D: float) -> np.ndarray:
     """A difference of two predictions, of norm D, as of one slip."""
     shape = np.exp(-0.5 * ((T - 0.7) / 0.05) ** 2)
@@ -53,7 +47,7 @@ def named(D: float, noise: np.ndarray) -> str:
     """Which of two laws that differ by D is named, where the first one made the data."""
     right, wrong = law("right", noise), law("wrong", noise + apart(D))
     best, other = sorted((right, wrong), key=lambda one: -one.fitted.log)
-    return "cannot tell" if against(best, other).doubts else best.name
+    return "cannot tell" if versus(best, other).doubts else best.name
 
 
 def shares(D: float, draws: list[np.ndarray]) -> dict[str, float]:
@@ -86,24 +80,24 @@ def test_with_coloured_noise_that_was_taken_for_white_the_wrong_law_is_not_named
 
 def test_a_law_is_not_named_for_having_fewer_parameters_and_pays_for_more() -> None:
     r = np.random.default_rng(2).standard_normal(len(T))
-    same = against(law("a", r, k=1), law("b", r.copy(), k=9))
+    same = versus(law("a", r, k=1), law("b", r.copy(), k=9))
     assert same.evidence == same.z == 0.0
     assert "these motions and sensors cannot tell them apart" in same.doubts[0]
-    fewer, more = (against(law("a", r, k=k), law("b", r + apart(6.0), k=3)) for k in (1, 6))
+    fewer, more = (versus(law("a", r, k=k), law("b", r + apart(6.0), k=3)) for k in (1, 6))
     assert fewer.evidence - more.evidence == pytest.approx(1.5 * np.log(len(T)))
 
 
 def test_heldout_recordings_count_and_may_contradict() -> None:
     rng = np.random.default_rng(3)
     r, held = rng.standard_normal((2, len(T)))
-    alone = against(law("a", r), law("b", r + apart(3.0)))
-    both = against(law("a", r, held=held), law("b", r + apart(3.0), held=held + apart(8.0)))
+    alone = versus(law("a", r), law("b", r + apart(3.0)))
+    both = versus(law("a", r, held=held), law("b", r + apart(3.0), held=held + apart(8.0)))
     assert both.evidence - alone.evidence == pytest.approx(both.heldout, rel=0.2)
     assert both.heldout is not None
     assert both.heldout_per_sample == pytest.approx((both.heldout / 300, 8.0 / 300), rel=0.2)
     assert alone.doubts
     assert not both.doubts
-    torn = against(law("a", r, held=held + apart(8.0)), law("b", r + apart(20.0), held=held))
+    torn = versus(law("a", r, held=held + apart(8.0)), law("b", r + apart(20.0), held=held))
     assert torn.z_heldout is not None
     assert torn.z_heldout < -2
     assert "held-out recordings speak for `b`" in torn.doubts[0]
@@ -117,7 +111,7 @@ def fitted(
 
 def test_no_law_is_named_that_leaves_more_than_noise_or_before_every_fit_has_converged() -> None:
     r = np.random.default_rng(4).standard_normal(len(T))
-    clear = against(law("a", r), law("b", r + apart(30.0)))
+    clear = versus(law("a", r), law("b", r + apart(30.0)))
     assert judged([fitted("a"), fitted("b", p=0.0)], [clear])[:2] == ("law", "a")
     outcome, none, verdict = judged([fitted("a", p=1e-6), fitted("b")], [clear])
     assert (outcome, none) == ("none fits", None)
@@ -129,21 +123,6 @@ def test_no_law_is_named_that_leaves_more_than_noise_or_before_every_fit_has_con
     assert "the fit of `b` has not converged" in verdict
     rough = replace(clear, numerical=clear.evidence)
     assert "take a tighter tolerance" in judged([fitted("a"), fitted("b")], [rough])[2]
-
-
-def test_where_the_evidence_stands() -> None:
-    r = np.random.default_rng(5).standard_normal(len(T))
-    found = against(law("a", r), law("b", r + apart(20.0))).where
-    assert found is not None
-    assert found.channels == {"F_x": pytest.approx(1.0)}
-    assert 0.6 < found.interval[0] < 0.7 < found.interval[1] < 0.8
-    assert found.phases["slip"].parting > 0.4 > 0.1 > abs(found.phases["hold"].evidence - 0.5) - 0.4
-    assert sum(one.time for one in found.phases.values()) == pytest.approx(1.0)
-    assert "`b` is off most from 0.6" in found.sentence
-    assert against(law("a", r), law("b", r)).where is None
-    few = np.where(np.abs(T - 1.0) < 0.001, 1.0, 0.0)
-    assert shortest([(T, few), (T, 1e-4 * T)]) == pytest.approx((1.0, 1.0))
-    assert MOTION.pieces == [(0.0, 0.75, "slip"), (0.75, T[-1], "hold")]
 
 
 BASE = Parameters().override(COARSE | {"contact.mu_s": 0.7, "contact.mu_k": 0.6})
@@ -201,10 +180,6 @@ def test_a_users_own_law_is_named_where_contacts_slip(stroke: dict[str, Problem]
     assert found["viscous"].weight > 0.999 > found["viscous"].p > 1e-3
     assert found["viscous"].estimates["contact.friction.alpha"] == pytest.approx(0.55, rel=0.02)
     assert found["smooth"].bic - found["viscous"].bic > 20
-    (one,) = found.against
-    assert one.where is not None
-    assert one.where.phases["slip"].parting > 2 * one.where.phases["slip"].time
-    assert {phase for _, _, phase in found.phases["one"]} >= {"apart", "loading", "slip"}
     content = json.loads(found.to_json())
     assert content["law"] == "viscous"
     assert len(content["series"][0]["residuals"]["smooth"]) == len(content["series"][0]["t"])

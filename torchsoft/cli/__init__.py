@@ -54,7 +54,7 @@ def interruptible() -> Iterator[None]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; the exit status is 0, 2 for what the user can mend, 130 for an interruption."""
+    """Run the command; the exit status is 0, 2 for what the user can fix, 130 for an interruption."""
     parser = argparse.ArgumentParser(
         prog="torchsoft", description="A differentiable simulator of soft contact manipulation."
     )

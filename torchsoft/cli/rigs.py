@@ -65,7 +65,7 @@ def run_rig(options: argparse.Namespace) -> int:
     for one in found:
         say(one, error=True)
     if any(one.severity == "error" for one in found) and not options.anyway:
-        return failed(f"{options.file} is not run; mend what is wrong, or say --anyway")
+        return failed(f"{options.file} is not run; fix what is wrong, or say --anyway")
     try_folder(out, options.force)
     done = run(file, out, found=found, progress=not options.no_progress)
     if isinstance(done.stopped, SimulationFailed):

@@ -1,5 +1,4 @@
-"""The answer of a comparison of laws, as plain data: how well each explains the recordings, which one did, and where the others
-fail.
+"""The answer of a comparison of laws, as plain data: how well each explains the recordings, and which one did.
 
 The rule. Against every other law b, a law a has the evidence, in nats,
 
@@ -80,31 +79,6 @@ class LawFit:
 
 
 @dataclass(frozen=True)
-class Share:
-    """A phase of the motion: its parts of the time, of the evidence, and of the way that the two laws' predictions part by."""
-
-    time: float
-    evidence: float
-    parting: float
-
-
-@dataclass(frozen=True)
-class Where:
-    """Where the other law fails: shares of the evidence by channel, and by phase of the motion; the shortest interval [s] of
-    one recording with half of its evidence, and that in a sentence.
-
-    Evidence stands where residuals are large, which may be long after what made them so: a disc that has slipped too far stays
-    there. Predictions part where the laws differ.
-    """
-
-    channels: dict[str, float]
-    phases: dict[str, Share]
-    recording: str
-    interval: tuple[float, float]
-    sentence: str
-
-
-@dataclass(frozen=True)
 class Versus:
     """The best law against another one: logarithms of the likelihood ratios of fitted and of held-out samples, the whitened
     distance D of the predictions, the inflation c of the variance, E and z of the rule, z of held-out recordings alone, and how
@@ -124,7 +98,6 @@ class Versus:
     z: float
     z_heldout: float | None
     numerical: float
-    where: Where | None
 
     @property
     def doubts(self) -> list[str]:
@@ -164,8 +137,6 @@ class Series:
 class Comparison:
     """Laws by how well they explain the recordings, the best one first, and the best against every other; `law` is the one that
     the data name, if they name one, and `verdict` says it in plain words.
-
-    `phases` are pieces (start [s], end [s], phase) of every recording's motion.
     """
 
     outcome: Outcome
@@ -175,7 +146,6 @@ class Comparison:
     against: list[Versus]
     samples: int
     heldout: list[str]
-    phases: dict[str, list[tuple[float, float, str]]] = field(repr=False)
     series: list[Series] = field(repr=False)
 
     def __getitem__(self, name: str) -> LawFit:
@@ -224,10 +194,7 @@ def judged(laws: list[LawFit], against: list[Versus]) -> tuple[Outcome, str | No
         return "cannot tell", None, "the data cannot tell: " + "; ".join((*doubts, *unsure)) + "."
     said = [f"`{best.name}` made these data"]
     for versus in against:
-        said.append(
-            f"`{versus.other}` is behind by {versus.evidence:.3g} nats, {versus.z:.2g} standard deviations"
-            + (f"; {versus.where.sentence}" if versus.where is not None else "")
-        )
+        said.append(f"`{versus.other}` is behind by {versus.evidence:.3g} nats, {versus.z:.2g} standard deviations")
     said += [f"But beware: {sentence}" for sentence in best.left]
     return "law", best.name, ". ".join(said) + "."
 

@@ -2,7 +2,7 @@
 
 One run a recording and variation, at the estimates, on the same steps: the difference d (m,) that it makes to the residuals is
 one more column beside the Jacobian J. Its projection on J says how far estimates would move; the rest of it, along the
-residuals, how much of it the data ask for. A constant of the computation is not known to be right: it enters the intervals as
+residuals, how much of it the data favour. A constant of the computation is not known to be right: it enters the intervals as
 a coordinate more, with a standard normal prior on its amplitude, so that data that cannot tell it cost certainty.
 """
 
@@ -31,11 +31,11 @@ from torchsoft.sysid.problem.workers import Runner
 from torchsoft.tables import plain
 
 ASKED = 20.0
-"""Fall of chi2, over the misfit that is left per sample, from which the data ask for a variation: four and a half standard
+"""Fall of chi2, over the misfit that is left per sample, from which the data favour a variation: four and a half standard
 deviations, for some twenty variations are looked at."""
 
 PATTERN = 0.5
-"""Part of the residuals' autocorrelation that a variation may leave and yet count as what the data ask for: a cause takes the
+"""Part of the residuals' autocorrelation that a variation may leave and yet count as what the data favour: a cause takes the
 pattern away with it, while coloured noise lines up with anything slow."""
 
 LAGS = 10
@@ -92,7 +92,7 @@ class Check:
 
     @property
     def wanted(self) -> bool:
-        """Whether the data ask for it."""
+        """Whether the data favour it."""
         either_side = self.kind in ("known", "sensor")
         enough = self.significance > ASKED and self.pattern < PATTERN
         return enough and (either_side or self.asked > 0) and not self.absurd
@@ -221,7 +221,7 @@ class Judge:
         self.square = float(self.r @ self.r)
 
     def explained(self, checks: Iterable[Check]) -> bool:
-        """Whether the data ask for something with which residuals are no larger than the noise."""
+        """Whether the data favour something with which residuals are no larger than the noise."""
         left = min((one.left for one in checks if one.wanted), default=np.inf)
         return float(stats.chi2.sf(left, self.dof)) > LEVEL
 
@@ -339,7 +339,7 @@ def columns_of(
 
 
 def notices(checked: Checked) -> list[str]:
-    """Sentences on what the data ask for, the strongest first, and on constants of the computation that estimates hang on."""
+    """Sentences on what the data favour, the strongest first, and on constants of the computation that estimates hang on."""
     out, checks = [], checked.checks
     if checked.candidates:
         out.append(
@@ -367,7 +367,7 @@ def notices(checked: Checked) -> list[str]:
             text += f"; {label} would move by {abs(move):.2g} standard deviations; estimates under it: {under}"
         out.append(text + (f"; so would it with others: {', '.join(rivals)}" if rivals else ""))
         out += [
-            f"the data also ask for another value of what is stated: {c.stated} (the sum of squares {c.falls})"
+            f"the data also favour another value than stated: {c.stated} (the sum of squares {c.falls})"
             for c in asked[1:4]
             if c.gain <= 0.5 * best.gain and c.gain > 0.1 * best.gain
         ]

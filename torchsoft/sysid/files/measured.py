@@ -140,7 +140,7 @@ def check_rest(tables: Tables, p: Parameters, sensors: Mapping[str, Sensor], pos
             opposite = abs(column[here[0]] + begin[name]) <= reach
             raise ValueError(
                 f"{table.at(int(here[0]))}, column `{name}`: it begins at {column[here[0]]:.5g} {unit}, but {what} is "
-                f"{begin[name]:.5g} {unit}" + ("; is its sign opposite?" if opposite else f"; mend that, {WAY_OUT}")
+                f"{begin[name]:.5g} {unit}" + ("; is its sign opposite?" if opposite else f"; fix that, {WAY_OUT}")
             )
         t = t[here]
         early = (t <= first + BEGINNING) | (np.arange(len(t)) < 2)
@@ -156,7 +156,7 @@ def check_rest(tables: Tables, p: Parameters, sensors: Mapping[str, Sensor], pos
     if (y := down.values["y_d"][0]) < H - SUNK:
         raise ValueError(
             f"{down.at(0)}, column `y_d`: the bracket must begin clear of the disc, but begins at {1e3 * y:.4g} mm, and the "
-            f"pads touch the disc at {1e3 * H:.4g} mm ({STACK}); mend that, {WAY_OUT}"
+            f"pads touch the disc at {1e3 * H:.4g} mm ({STACK}); fix that, {WAY_OUT}"
         )
 
 

@@ -7,17 +7,14 @@ import numpy as np
 import torch
 from scipy import stats
 
-from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.answer.comparison import Comparison, LawFit, Series, Versus, judged
 from torchsoft.sysid.checks.colour import ROUNDS, colours
 from torchsoft.sysid.checks.misfit import notices
 from torchsoft.sysid.checks.parts import parts
 from torchsoft.sysid.fit.fit import Fit, Unreachable, gauss_newton
 from torchsoft.sysid.fit.plan import Stage, default_plan
-from torchsoft.sysid.fit.settle import FINER
 from torchsoft.sysid.fit.stages import progress_bar, run_stage
 from torchsoft.sysid.laws.evidence import Evidence, FittedLaw, ratio
-from torchsoft.sysid.laws.pattern import Motion, motion, where
 from torchsoft.sysid.problem.problem import Problem
 from torchsoft.sysid.problem.recording import Recording
 from torchsoft.sysid.problem.workers import Runner
@@ -166,36 +163,19 @@ def most_likely(evidence: Mapping[str, Evidence]) -> str:
 def gathered(evidence: Mapping[str, Evidence], heldout: list[str]) -> Comparison:
     """The answer."""
     best = evidence[most_likely(evidence)]
-    motions = moved(best, heldout)
-    against = [versus(best, one, motions) for name, one in evidence.items() if name != best.name]
+    against = [versus(best, one) for name, one in evidence.items() if name != best.name]
     laws = sorted(law_fits(evidence), key=lambda one: -evidence[one.name].total)
     outcome, law, verdict = judged(laws, against)
-    return Comparison(
-        outcome, law, verdict, laws, against, len(best.fitted.r), heldout,
-        {name: one.pieces for name, one in motions.items()}, series(evidence),
-    )  # fmt: skip
+    return Comparison(outcome, law, verdict, laws, against, len(best.fitted.r), heldout, series(evidence))
 
 
-def moved(best: Evidence, heldout: Sequence[str]) -> dict[str, Motion]:
-    """How every recording moves, by the best law."""
-    law, out = best.law, {}
-    for k, name in enumerate(law.problem.names):
-        if name in (*best.which, *heldout):
-            try:
-                out[name] = motion(law.problem, law.x, k, FINER * law.rtol)
-            except SimulationFailed as failure:
-                raise ValueError(f"the law `{law.name}` cannot be run at its estimates: {failure}") from None
-    return out
-
-
-def versus(best: Evidence, other: Evidence, motions: Mapping[str, Motion]) -> Versus:
+def versus(best: Evidence, other: Evidence) -> Versus:
     """The best law against another, by the rule of `torchsoft.sysid.answer.comparison`."""
     fitted, n = ratio(best.fitted, other.fitted), len(best.fitted.r)
-    pairs, evidence = [(best.fitted, other.fitted)], fitted.log / fitted.inflation
+    evidence = fitted.log / fitted.inflation
     log, stated, variance, told, z = fitted.log, fitted.stated, fitted.variance, None, None
     if best.heldout is not None and other.heldout is not None:
         ahead, m = ratio(best.heldout, other.heldout), len(best.heldout.r)
-        pairs.append((best.heldout, other.heldout))
         evidence, log = evidence + ahead.log / ahead.inflation, log + ahead.log
         stated, variance = stated + ahead.stated, variance + ahead.variance
         told, z = (ahead.log / m, ahead.variance**0.5 / m), ahead.z
@@ -203,7 +183,7 @@ def versus(best: Evidence, other: Evidence, motions: Mapping[str, Motion]) -> Ve
     return Versus(
         best.name, other.name, fitted.log, None if told is None else log - fitted.log, told, stated**0.5,
         variance / stated if stated > 0 else 1.0, evidence, log / variance**0.5 if variance > 0 else 0.0, z,
-        (best.numerical + other.numerical) / fitted.inflation, where(other.name, pairs, motions),
+        (best.numerical + other.numerical) / fitted.inflation,
     )  # fmt: skip
 
 

@@ -2,16 +2,11 @@
 
 import numpy as np
 from matplotlib import rc_context
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch
 
 from torchsoft.plot.figures import ACTUAL, OTHER, STYLE
 from torchsoft.sysid.answer.comparison import Comparison, Series, Versus
 from torchsoft.sysid.report.figures import literal
-
-PHASES = {"apart": "#ffffff", "loading": "#e8f1f7", "slip": "#fbe3d2", "rolling": "#e9f3e6", "hold": "#f2f2f2"}
-"""Colours behind the phases of a motion."""
 
 MOST = 4
 """Recordings that are shown, those with most of the evidence first."""
@@ -40,8 +35,6 @@ def plot(comparison: Comparison, other: str | None = None) -> Figure:
     figure.suptitle(literal(f"{versus.best} against {versus.other}: {versus.evidence:.3g} nats, z = {versus.z:.2g}"))
     for (left, right), name in zip(figure.subplots(len(names), 2, squeeze=False, sharex="row"), names):
         told = sorted(by_recording[name], key=lambda s: -abs(growth(s, versus)[-1]))
-        for axes in (left, right):
-            shade(axes, comparison.phases[name])
         t = np.unique(np.concatenate([s.t for s in told]))
         left.plot(t, sum(np.interp(t, s.t, growth(s, versus)) for s in told), color="k", lw=2, label="all")
         for s in told[:3]:
@@ -55,13 +48,6 @@ def plot(comparison: Comparison, other: str | None = None) -> Figure:
         right.legend()
         for axes in (left, right):
             axes.set(xlabel="time [s]", xlim=(t[0], t[-1]))
-    seen = {phase for name in names for _, _, phase in comparison.phases[name]}
-    patches = [
-        Patch(facecolor=colour, edgecolor="#999999", lw=0.5, label=name)
-        for name, colour in PHASES.items()
-        if name in seen
-    ]
-    figure.legend(handles=patches, loc="outside lower center", ncols=len(patches))
     return figure
 
 
@@ -69,8 +55,3 @@ def growth(s: Series, versus: Versus) -> np.ndarray:
     """Evidence up to each sample [nats]."""
     a, b = (np.array(s.residuals[law]) for law in (versus.best, versus.other))
     return np.cumsum(0.5 * (b**2 - a**2))
-
-
-def shade(axes: Axes, pieces: list[tuple[float, float, str]]) -> None:
-    for start, end, phase in pieces:
-        axes.axvspan(start, end, color=PHASES[phase], lw=0, zorder=0)

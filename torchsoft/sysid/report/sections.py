@@ -217,9 +217,9 @@ def taken_for_granted(result: Answer) -> Iterator[str]:
     yield heading("What was taken for granted")
     yield paragraph(
         "How far the estimate that moves most would move (in its standard deviations) if something that was stated were "
-        "otherwise, and how much of that the data ask for."
+        "otherwise, and how much of that the data favour."
     )
-    head = ["taken for granted", "if", "would move", "do the data ask for it?"]
+    head = ["taken for granted", "if", "would move", "do the data favour it?"]
     if first:
         yield table(head, first)
     if rest:
@@ -242,8 +242,7 @@ def laws(result: Answer) -> Iterator[str]:
     ]  # fmt: skip
     yield table(["law", "parameters", "χ²", "log likelihood", "ΔAICc", "ΔBIC", "held out, per sample", "fits"], rows)
     if compared.series and compared.against:
-        alt = "; ".join(one.where.sentence for one in compared.against if one.where is not None)
-        yield picture(plot(compared), f"Where in the motion the evidence stands. {alt}", kind="broad")
+        yield picture(plot(compared), "Where in the motion the evidence stands.", kind="broad")
 
 
 def data(result: Answer, drawn: Sequence[Trace], lost: dict[str, str]) -> Iterator[str]:
