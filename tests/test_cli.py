@@ -39,6 +39,20 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.parametrize("code", ["import torchsoft", "from torchsoft.cli import main; main(['--help'])"])
+def test_neither_an_import_nor_help_waits_for_torch(code: str) -> None:
+    slow = "'torch', 'scipy', 'numba', 'matplotlib', 'xarray'"
+    code = f"import sys\ntry: {code}\nexcept SystemExit: pass\nassert not sys.modules.keys() & {{{slow}}}"
+    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
+
+
+def test_all_names_are_there() -> None:
+    import torchsoft
+
+    assert all(hasattr(torchsoft, name) for name in torchsoft.__all__)
+    assert {"Rig", "simulate", "simulate_batch", "Trajectory"} < set(torchsoft.__all__)
+
+
 def test_help_names_every_command_argument_and_option(capsys: Any) -> None:
     for arguments, words in (
         (["--help"], ("identify", "material")),
@@ -49,6 +63,8 @@ def test_help_names_every_command_argument_and_option(capsys: Any) -> None:
         ),
         (["material", "presets", "--help"], ("published",)),
         (["identify", "--help"], ("DATA.csv", "CONFIG.toml", *OPTIONS)),
+        (["explain", "--help"], ("DATA.csv", "CONFIG.toml", *OPTIONS)),
+        (["--version"], ("torchsoft 0.",)),
     ):
         with pytest.raises(SystemExit) as end:
             main(arguments)

@@ -10,6 +10,7 @@ import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from importlib.metadata import version
 
 from torchsoft.cli import identify, material, rigs
 from torchsoft.cli.failure import failed
@@ -58,6 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="torchsoft", description="A differentiable simulator of soft contact manipulation."
     )
+    parser.add_argument("--version", action="version", version=f"torchsoft {version('torchsoft')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for group in (rigs, identify, material):
         group.add_commands(commands)
