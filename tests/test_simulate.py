@@ -391,6 +391,11 @@ def test_an_unknown_route_is_refused(route: str) -> None:
         simulate(coarse(), T, gradient=route)  # pyright: ignore[reportArgumentType]
 
 
+def test_a_run_without_an_end_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"ask for 1e\+300 steps, .*by tolerance no step is longer than 0\.1 s"):
+        simulate(coarse(), f64(0.0, 1e299), y0=grasped(coarse()))
+
+
 def test_no_grad_is_honoured() -> None:
     model = coarse()
     y0 = grasped(model, (0.01, 0.0)).requires_grad_()

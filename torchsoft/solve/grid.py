@@ -44,6 +44,9 @@ class Plan(NamedTuple):
         return self.starts[self.out_step] + self.out_part * self.h[self.out_step]
 
 
+LONGEST = 0.1
+"""Longest step [s] by tolerance."""
+
 MOST_STEPS = 100_000_000
 """Steps that one run may take at the most."""
 
@@ -54,7 +57,7 @@ SHORTEST = 1e-12
 
 def check_times(t: Tensor, step: float | None = None) -> None:
     """Raises `ValueError` unless t is a float64 vector of at least two finite, strictly increasing times, no more than
-    `MOST_STEPS` steps of `step` [s] apart in all."""
+    `MOST_STEPS` steps of `step` [s], or of the longest by tolerance, apart in all."""
     check_array("t", t)
     if t.ndim != 1 or len(t) < 2:
         raise ValueError(
@@ -67,10 +70,10 @@ def check_times(t: Tensor, step: float | None = None) -> None:
         raise ValueError(
             f"`t` must increase strictly and be finite, but t[{bad}:{bad + 2}] = {t[bad : bad + 2].tolist()}"
         )
-    if step is not None and float(t[-1] - t[0]) / step > MOST_STEPS:
-        count = float(t[-1] - t[0]) / step
+    if (count := float(t[-1] - t[0]) / (LONGEST if step is None else step)) > MOST_STEPS:
         raise ValueError(
-            f"`t` and `step` ask for {count:.3g} steps, but at most {MOST_STEPS:.3g} can be taken in one run"
+            f"`t` and `step` ask for {count:.3g} steps, but at most {MOST_STEPS:.3g} can be taken in one run; take less time"
+            + (f" (by tolerance no step is longer than {LONGEST:g} s)" if step is None else " or longer steps")
         )
     finest = max(SHORTEST, 16 * torch.finfo(torch.float64).eps * float(t.abs().max()))
     if float(t.diff().min()) < finest or (step is not None and step < finest):

@@ -13,7 +13,7 @@ from torchsoft.physics.arguments import positive, whole
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
-from torchsoft.solve.grid import CHUNK, Plan, check_knots, check_times, equal_steps, given_steps
+from torchsoft.solve.grid import CHUNK, LONGEST, Plan, check_knots, check_times, equal_steps, given_steps
 from torchsoft.solve.kernel.arrays import NO_ERRORS, NO_SIGNALS, Array, Tape, empty_tape
 from torchsoft.solve.kernel.run import run
 from torchsoft.solve.kernel.scratch import Step, Work, empty_step, scratch
@@ -65,7 +65,7 @@ class ImplicitStepper:
     def __init__(
         self, rig: Rig, reference: Reference | None = None, *, step: float | None = None, rtol: float = 1e-3,
         atol: float = 1e-4, knots: Tensor | None = None, tolerance: float = 1e-9, max_iterations: int = 40,
-        window: float = 2e-3, longest: float = 0.1, landing: bool = False,
+        window: float = 2e-3, longest: float = LONGEST, landing: bool = False,
     ) -> None:  # fmt: skip
         if not isinstance(rig, Rig):
             raise ValueError(f"`rig` must be a Rig, but is {rig if isinstance(rig, type) else type(rig).__name__}")
