@@ -6,6 +6,7 @@ whether a number that it reads has changed since.
 
 import threading
 from collections.abc import Callable, Mapping
+from types import FunctionType
 from typing import Any, NamedTuple
 
 import torch
@@ -56,8 +57,8 @@ class _Called(nn.Module):
 
 def structure(module: object) -> Any:
     """What decides a module's law beside its parameters' values, hashable: two modules of one structure have one law.
-    None where that cannot be told: code that is neither this package's nor torch's, hooks, other attributes than numbers and
-    text."""
+    None where that cannot be told: code that is neither this package's nor torch's, hooks, other attributes than numbers,
+    text and functions of this package."""
     if isinstance(module, nn.Module) and type(module).__module__.startswith(("torchsoft.", "torch.nn.")):
         kind = type(module)
         own = {k: v for k, v in vars(module).items() if not k.startswith("_")}
@@ -65,15 +66,18 @@ def structure(module: object) -> Any:
         parts = tuple((k, structure(v)) for k, v in module._modules.items())
         buffers = tuple((k, v.dtype, v.numpy().tobytes()) for k, v in module._buffers.items() if v is not None)
         shapes = tuple((k, tuple(v.shape)) for k, v in module._parameters.items() if v is not None)
-        plain = all(
-            isinstance(one, bool | int | float | str | None)
-            for v in own.values()
-            for one in (v if isinstance(v, tuple) else (v,))
-        )
+        plain = all(_plain(one) for v in own.values() for one in (v if isinstance(v, tuple) else (v,)))
         hooked = any(v for k, v in vars(module).items() if k.endswith("_hooks"))
         if plain and not hooked and all(part is not None for _, part in parts):
             return kind, kind.forward, tuple(sorted((given | own).items())), parts, buffers, shapes
     return None
+
+
+def _plain(value: object) -> bool:
+    """Whether an attribute says all of itself: a number, text, or a function of this package without a closure."""
+    if isinstance(value, FunctionType):
+        return value.__module__.startswith("torchsoft.") and value.__closure__ is None
+    return isinstance(value, bool | int | float | str | None)
 
 
 _laws: dict[Any, Law] = {}

@@ -14,6 +14,7 @@ import torch
 from scipy import linalg, sparse
 from torch import Tensor
 
+from torchsoft.physics.contact import Friction
 from torchsoft.physics.mesh import banded
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.parts import COORDINATES
@@ -237,7 +238,8 @@ class Compiled:
             key = id(contact.law), id(shape)
             if key not in self._known:
                 check_shape(contact.body, shape)
-                own, slip = structure(contact.law) is None, contact.law.friction
+                slip = contact.law.friction
+                own = structure(contact.law) is None or not isinstance(slip, Friction)
                 stiffness = contact.law.R_t.item() + NOMINAL * contact.law.K_t.item()
                 if own:
                     slip_rates(name, slip, torch.ones(()).double(), torch.ones(()).double(), stiffness)
