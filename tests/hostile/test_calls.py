@@ -123,7 +123,7 @@ def of_simulate() -> Iterator[Call]:
             torch.full((size, 1), NAN).double(),
             3,
             "x",
-            torch.zeros(size, 2).double(),
+            torch.zeros(size + 1, 1).double(),
         ]
     ):
         yield f"dy0 #{i}", lambda odd=odd: run(gradient="forward", wrt=["pad.E"], dy0=odd)

@@ -12,7 +12,7 @@ import pytest
 from hostile.asked import in_time
 from hostile.mutation import toml
 from hostile.test_inputs import datasets
-from hostile.test_inputs_recordings import config, table, written
+from hostile.test_inputs_recordings import EXAMPLE, config, table, written
 from hostile.trial import Tally, count, random
 from torchsoft import cli
 from torchsoft.datasets import generate as generation
@@ -59,7 +59,7 @@ PATHS = (
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "data.csv").write_bytes(written(table()))
     (tmp_path / "second.csv").write_bytes(written(table()))
-    (tmp_path / "rig.toml").write_text(toml(config()))
+    (tmp_path / "rig.toml").write_bytes((EXAMPLE / "rolling.toml").read_bytes())
     (tmp_path / "set.toml").write_text(toml(datasets()[2]))
     monkeypatch.chdir(tmp_path)
     return tmp_path
