@@ -58,7 +58,8 @@ PATHS = (
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "data.csv").write_bytes(written(table()))
-    (tmp_path / "second.csv").write_bytes(written(table()))
+    for name in ("second", "checking"):
+        (tmp_path / f"{name}.csv").write_bytes(written(table()))
     (tmp_path / "rig.toml").write_bytes((EXAMPLE / "rolling.toml").read_bytes())
     (tmp_path / "set.toml").write_text(toml(datasets()[2]))
     monkeypatch.chdir(tmp_path)
