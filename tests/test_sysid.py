@@ -296,7 +296,7 @@ def test_data_out_of_reach_name_the_recording() -> None:
         ({"loss": "cauchy", "method": "adam"}, "^the method 'adam' has no robust loss"),
         ({"loss": "Huber"}, "^loss should be 'linear', .* or 'arctan', not 'Huber'"),
         ({"method": "LBFGS"}, "^method should be 'gauss_newton', 'lbfgs' or 'adam', not 'LBFGS'"),
-        ({"assumptions": "check"}, "^assumptions should be 'checked' or 'trusted', not 'check'"),
+        ({"assumptions": "check"}, "^assumptions should be 'checked', 'explained' or 'trusted', not 'check'"),
         ({"seed": -1}, "^seed should be greater than or equal to 0, not -1"),
         ({"rtol": "1e-5"}, "^rtol should be a valid number, not '1e-5'"),
         ({"rtol": float("nan")}, "^rtol should be a finite number, not nan"),

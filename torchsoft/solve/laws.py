@@ -76,7 +76,7 @@ def structure(module: object) -> Any:
 def _plain(value: object) -> bool:
     """Whether an attribute says all of itself: a number, text, or a function of this package without a closure."""
     if isinstance(value, FunctionType):
-        return value.__module__.startswith("torchsoft.") and value.__closure__ is None
+        return (value.__module__ or "").startswith("torchsoft.") and value.__closure__ is None
     return isinstance(value, bool | int | float | str | None)
 
 
