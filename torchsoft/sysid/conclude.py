@@ -71,7 +71,8 @@ def conclude(
     )  # fmt: skip
     declared = [name for name, one in problem.sensors.items() if one.colour == "ar"]
     colour, bound = bool(coloured.found.keys() - set(declared)), bool((free & c.at_bound(x)).any())
-    doubtful = not end.at_rest or colour or bound or any(one.alarming for one in verdicts)
+    larger = any(one.alarming and not (one.test == "level" and one.size < 1) for one in verdicts)
+    doubtful = not end.at_rest or colour or bound or larger
     checked = None
     if how.settings.assumptions != "trusted":
         checked = tested_assumptions(coloured, runner, end, stage, free, doubtful, how, progress)
