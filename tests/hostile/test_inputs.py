@@ -18,8 +18,8 @@ from hostile.trial import SEED, Tally, count, random
 from torchsoft import Parameters, SoftGrasp, rest, simulate
 from torchsoft.cost import Costly, agree
 from torchsoft.datasets.config import Config
-from torchsoft.datasets.cost import cost
-from torchsoft.datasets.design import excitation, points, task
+from torchsoft.datasets.generate import cost
+from torchsoft.datasets.simulation import excitation, points, task
 from torchsoft.excitation import Excitation, begin
 from torchsoft.tables import Table, from_toml
 

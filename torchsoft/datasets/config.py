@@ -13,6 +13,8 @@ from torchsoft.excitation import MOST
 from torchsoft.paper.parameters import Parameters, check
 from torchsoft.tables import LISTED, SEED, Table, from_toml, line
 
+SPLITS = ("train", "validation", "test")
+
 RATIO = "contact.mu_k/contact.mu_s"
 """The one derived parameter: a range for the ratio keeps mu_k below a ranged mu_s."""
 
