@@ -87,14 +87,14 @@ def check_arrays(data: xr.Dataset, config: Config) -> Iterator[str]:
         if name not in data:
             yield f"{name}: missing"
             continue
-        array = data[name]
-        if dict(array.sizes) != variable.sizes:
-            yield f"{name}: has sizes {dict(array.sizes)}, not {variable.sizes}"
-        if (units := array.attrs.get("units")) != variable.unit:
-            yield f"{name}: units are {units!r}, not {variable.unit!r}"
-        shard = array.encoding["shards"] or array.encoding["chunks"]
-        if shard[0] != config.trajectories_per_shard:
-            yield f"{name}: its shards hold {shard[0]} trajectories, not one task's"
+        array, size = data[name], config.trajectories_per_shard
+        for what, there, expected in (
+            ("sizes", dict(array.sizes), variable.sizes),
+            ("units", array.attrs.get("units"), variable.unit),
+            ("trajectories of a shard", (array.encoding["shards"] or array.encoding["chunks"])[0], size),
+        ):
+            if there != expected:
+                yield f"{name}: {what} are {there!r}, not {expected!r}"
 
 
 def check_shard(data: xr.Dataset, config: Config, shard: int, design: np.ndarray[Any, Any]) -> Iterator[str]:
@@ -120,7 +120,7 @@ def check_trajectory(config: Config, one: dict[str, Any], labels: dict[str, Any]
         if one[name] != value:
             yield f"{name} is {one[name]}, but the design has {value}"
     if one["failed"]:
-        series = [name for name, v in variables(config).items() if v.empty != v.empty and len(v.shape) > 1]
+        series = [name for name, v in variables(config).items() if v.kept.kind == "f" and len(v.shape) > 1]
         if not one["reason"]:
             yield "failed without a reason"
         elif filled := [name for name in series if not np.isnan(one[name]).all()]:
@@ -168,33 +168,29 @@ def figure(data: xr.Dataset, config: Config) -> Figure:
         "grasp_depth": config.grasp_depth
     }
     names, rows = list(ranged), -(-len(ranged) // 4)
-    split, kind, failed = (data[name].values for name in ("split", "kind", "failed"))
-    groups = {name: (split == name) & (failed == 0) for name in SPLITS} | {"failed": failed == 1}
+    table = data[[*names, "kind", "split", "failed"]].to_dataframe().reset_index()
+    table["split"] = table["split"].where(table["failed"] == 0, "failed")
     fig = Figure(figsize=(13, 2.9 * (rows + 1)), layout="constrained")
-    fig.suptitle(f"{config.title}: {len(failed)} trajectories, {failed.sum()} failed")
+    fig.suptitle(f"{config.title}: {len(table)} trajectories, {table['failed'].sum()} failed")
     panels = fig.subplots(rows + 1, 4, squeeze=False)
     for ax, x, y in zip(panels.flat, names, [*names[1:], names[0]]):
-        for name, here in groups.items():
-            ax.plot(data[x][here], data[y][here], "x" if name == "failed" else ".", ms=4, label=name)
+        for name, some in table.groupby("split"):
+            ax.plot(some[x], some[y], "x" if name == "failed" else ".", ms=4)
         label, other = (f"{name} [{data[name].units}]" for name in (x, y))
         ax.set(xlabel=label, ylabel=other, xscale=ranged[x].scale, yscale=ranged[y].scale)
     for ax in panels.flat[len(names) : -4]:
         ax.set_axis_off()
-    count, *motions = panels[-1]
-    kinds, below = sorted(set(kind)), 0
-    for name, here in groups.items():
-        count.bar(kinds, height := np.array([(here & (kind == k)).sum() for k in kinds]), bottom=below, label=name)
-        below += height
-    count.set(ylabel="trajectories [1]")
-    for ax, channel in zip(motions, map(CHANNELS.__getitem__, MOTIONS)):
-        for colour, k in enumerate(kinds):
-            some = np.flatnonzero((kind == k) & (failed == 0))[:3]
-            lines = ax.plot(data.time, channel.of(data[channel.variable][some]).T, color=f"C{colour}", lw=0.7)
-            for one in lines[:1]:
-                one.set_label(k)
+    table.groupby(["kind", "split"]).size().unstack().plot.bar(
+        stacked=True, ax=panels[-1, 0], ylabel="trajectories [1]"
+    )
+    for ax, channel in zip(panels[-1, 1:], map(CHANNELS.__getitem__, MOTIONS)):
+        for n, (kind, some) in enumerate(table[table["failed"] == 0].groupby("kind")):
+            for i in some.index[:3]:
+                ax.plot(data.time, channel.of(data[channel.variable][i]), lw=0.7, color=f"C{n}", label=kind)
+                kind = None  # named once
         ax.set(xlabel="time [s]", ylabel=f"${channel.symbol}$ [{channel.unit}]")
-    for ax in (count, motions[0]):
-        ax.legend(fontsize=7)
+        if ax.lines:
+            ax.legend(fontsize=7)
     for ax in fig.axes:
         ax.tick_params(axis="x", labelsize=7, which="both", rotation=20)
     return fig

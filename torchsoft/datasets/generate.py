@@ -12,10 +12,8 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
-import numpy as np
 from tqdm import tqdm
 
 from torchsoft import threads
@@ -58,8 +56,7 @@ def cost(config: Config, workers: int) -> Cost:
     else:  # an output between two steps takes half the time of a step
         steps = seconds * steps_per_second(config.steps["rtol"]) + 0.5 * config.samples
     kept = sum(  # of one trajectory [GiB]
-        (8 if v.dtype == "str" else np.dtype(v.dtype).itemsize) * math.prod(v.shape[1:]) / 2**30
-        for v in variables(config).values()
+        v.kept.itemsize * math.prod(v.shape[1:]) / 2**30 for v in variables(config).values()
     )
     shard = 2 * kept * min(config.trajectories_per_shard, config.trajectories) + config.samples * row_memory(p)
     design = 8 * 2 * config.trajectories * (len(config.parameters) + 8) / 2**30
@@ -76,10 +73,7 @@ class Serial(Executor):
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
         future: Future[Any] = Future()
-        try:
-            future.set_result(fn(*args, **kwargs))
-        except Exception as error:
-            future.set_exception(error)
+        future.set_result(fn(*args, **kwargs))
         return future
 
 
@@ -98,29 +92,24 @@ def generate(config: Config, url: str, executor: Executor, workers: int = 1, pro
     At most a few shards a worker are submitted at a time, so that Ctrl-C is heard and memory is bounded. Raises `StoreError`.
     """
     store, design = open_or_create(url, config), points(config)
-    todo = store.unfinished()
-    left, failed, running = iter(todo), 0, set[Future[tuple[int, int]]]()
-    finished = config.trajectories - sum(len(store.rows(shard)) for shard in todo)
-    bar = tqdm(total=config.trajectories, initial=finished, unit="traj", disable=not progress, smoothing=0.05)
-    began, made = perf_counter(), 0
-    try:
-        while True:
-            while len(running) < 3 * max(workers, 1) and (shard := next(left, None)) is not None:
-                here = store.rows(shard)
-                running.add(executor.submit(run_shard, store, shard, design[here.start : here.stop]))
-            if not running:
-                return failed
-            done, running = wait(running, return_when=FIRST_COMPLETED)
-            for future in done:
-                count, bad = future.result()
-                made, failed = made + count, failed + bad
-                rate = made * config.duration / (perf_counter() - began)
-                bar.set_postfix_str(f"{rate:.3g} simulated s/s, {failed} failed", refresh=False)
-                bar.update(count)
-    finally:
-        for future in running:
-            future.cancel()
-        bar.close()
+    left, failed, running = store.unfinished()[::-1], 0, set[Future[tuple[int, int]]]()
+    finished = config.trajectories - sum(len(store.rows(shard)) for shard in left)
+    what: Any = {"unit": " simulated s", "unit_scale": config.duration, "disable": not progress, "smoothing": 0.05}
+    with tqdm(total=config.trajectories, initial=finished, **what) as bar:
+        try:
+            while left or running:
+                while left and len(running) < 3 * max(workers, 1):
+                    here = store.rows(shard := left.pop())
+                    running.add(executor.submit(run_shard, store, shard, design[here.start : here.stop]))
+                done, running = wait(running, return_when=FIRST_COMPLETED)
+                for count, bad in (future.result() for future in done):
+                    failed += bad
+                    bar.set_postfix_str(f"{failed} failed", refresh=False)
+                    bar.update(count)
+        finally:
+            for future in running:
+                future.cancel()
+    return failed
 
 
 def local_workers(workers: int) -> AbstractContextManager[Executor]:
@@ -162,8 +151,7 @@ def main(arguments: list[str] | None = None) -> int:
         with dask_cluster(given.scheduler) if given.scheduler else local_workers(workers) as executor:
             failed = generate(config, given.out, executor, workers)
     except (ValueError, StoreError, OSError) as error:
-        said = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else error
-        print(f"error: {line(said, 2000)}", file=sys.stderr)
+        print(f"error: {line(error, 2000)}", file=sys.stderr)
         return 2
     except BrokenProcessPool:
         print("error: a worker was killed, perhaps for memory; start again to make what is missing", file=sys.stderr)

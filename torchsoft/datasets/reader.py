@@ -1,7 +1,7 @@
 """Datasets of trajectories in a zarr store, for torch's `DataLoader` and for xarray. What was not written so is refused."""
 
 import os
-from collections.abc import AsyncGenerator, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -62,10 +62,7 @@ class Vouched(WrapperStore[Store]):
     ) -> list[Buffer | None]:
         return [await self.get(key, prototype, byte_range) for key, byte_range in key_ranges]
 
-    def _get_many(
-        self, requests: Iterable[tuple[str, BufferPrototype, ByteRequest | None]]
-    ) -> AsyncGenerator[tuple[str, Buffer | None], None]:
-        return Store._get_many(self, requests)  # which asks `get`
+    _get_many = Store._get_many  # which asks `get`
 
     def data(self, **how: Any) -> xr.Dataset:
         """The arrays, lazily."""
@@ -105,6 +102,7 @@ class Trajectories(Dataset[dict[str, Tensor]]):
         stride: int | None = None, dtype: torch.dtype = torch.float64, unfinished: bool = False,
     ) -> None:  # fmt: skip
         self.url, self.variables, self.dtype, self.unfinished = str(url), tuple(variables), dtype, unfinished
+        self._opened = dict[int, xr.Dataset]()
         if dtype not in DTYPES:
             raise ValueError(f"`dtype` must be one of {', '.join(map(str, DTYPES))}, but is {dtype!r}")
         if split is not None and split not in SPLITS:
@@ -128,13 +126,12 @@ class Trajectories(Dataset[dict[str, Tensor]]):
     @property
     def data(self) -> xr.Dataset:
         """The store, opened on first use; once more after a fork, which connections do not survive."""
-        if self.__dict__.get("_opened_by") != os.getpid():
-            self._data = Vouched(self.url, unfinished=self.unfinished).data(chunks=None)
-            self._opened_by = os.getpid()
-        return self._data
+        if os.getpid() not in self._opened:
+            self._opened = {os.getpid(): Vouched(self.url, unfinished=self.unfinished).data(chunks=None)}
+        return self._opened[os.getpid()]
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_data": None, "_opened_by": None}
+        return self.__dict__ | {"_opened": {}}
 
     def __len__(self) -> int:
         return len(self.trajectories) * len(self.starts)

@@ -1,6 +1,5 @@
 """Every array of a dataset: name, dimensions, unit, meaning and type."""
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,9 +46,14 @@ class Variable:
         return tuple(self.sizes.values())
 
     @property
+    def kept(self) -> np.dtype[Any]:
+        """Type in memory."""
+        return np.dtype(object if self.dtype == "str" else self.dtype)
+
+    @property
     def empty(self) -> Any:
         """What stands where nothing is known."""
-        return "" if self.dtype == "str" else math.nan if self.dtype.startswith("float") else 0
+        return {"O": "", "f": np.nan}.get(self.kept.kind, 0)
 
 
 def energies(config: Config) -> dict[str, tuple[str, tuple[str, ...]]]:
@@ -94,5 +98,5 @@ def variables(config: Config) -> dict[str, Variable]:
 
 def not_finite(config: Config, row: dict[str, Any]) -> list[str]:
     """Names of the arrays that are not finite in a trajectory, unless it is marked as failed."""
-    known = (name for name, v in variables(config).items() if v.empty != v.empty and name != "failure_time")
+    known = (name for name, v in variables(config).items() if v.kept.kind == "f" and name != "failure_time")
     return [] if row["failed"] else [name for name in known if not np.isfinite(row[name]).all()]

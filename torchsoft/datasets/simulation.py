@@ -1,7 +1,6 @@
 """Trajectory number `index`: parameters and motion by the configuration alone, then the run, or why there is none."""
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -9,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from torchsoft.channels import PADS
-from torchsoft.datasets.config import RATIO, SPLITS, Config, Kind, MultiSine, ranges
+from torchsoft.datasets.config import RATIO, SPLITS, Config, MultiSine
 from torchsoft.datasets.schema import KEPT, energies, not_finite, variables
 from torchsoft.excitation import Excitation, reference
 from torchsoft.paper.equilibrium import holding_force, press, rest
@@ -31,26 +30,13 @@ COUNTS = ("steps", "newton_iterations")
 Row = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Task:
-    """One trajectory: its parameters, the kind of its motion with the kind's quantities, and a seed of its own."""
+class Task(NamedTuple):
+    """One trajectory: its parameters, its motion, and what is known of it before it is simulated."""
 
     index: int
     parameters: Parameters
-    sampled: dict[str, float]
-    grasp_depth: float
-    kind: Kind
-    excitation: dict[str, float]
-    seed: tuple[int, int]
-    split: str
-
-    @property
-    def labels(self) -> Row:
-        """What is known before the simulation."""
-        sampled = {name.replace("/", "_over_"): value for name, value in self.sampled.items()}
-        if RATIO in self.sampled:
-            sampled["contact.mu_k"] = self.parameters.contact.mu_k
-        return sampled | {"grasp_depth": self.grasp_depth, "kind": self.kind.kind, "split": self.split}
+    excitation: Excitation
+    labels: Row
 
 
 def points(config: Config) -> NDArray[np.floating]:
@@ -58,7 +44,7 @@ def points(config: Config) -> NDArray[np.floating]:
 
     A Sobol sequence is a prefix of every longer one of the same seed; a Latin hypercube belongs to its size.
     """
-    dimensions = len(config.parameters) + 2 + max(len(ranges(kind)) for kind in config.kinds)
+    dimensions = len(config.parameters) + 2 + max(len(kind.ranges) for kind in config.kinds)
     rng = np.random.default_rng(config.seed)
     if config.method == "latin_hypercube":
         return qmc.LatinHypercube(dimensions, rng=rng).random(config.trajectories)
@@ -68,19 +54,29 @@ def points(config: Config) -> NDArray[np.floating]:
 
 def task(config: Config, index: int, u: NDArray[np.floating]) -> Task:
     """Trajectory `index` at the point u (dimensions,) of the design."""
-    own, n = u.tolist(), len(config.parameters)
+    n, rng = len(config.parameters), np.random.default_rng((config.seed, index))
+    *own, common, which = u[: n + 2].tolist()
     sampled = {name: r.at(x) for (name, r), x in zip(config.parameters.items(), own)}
-    kind = config.kinds[pick([kind.weight for kind in config.kinds], own[n + 1])]
-    excitation = {name: r.at(x) for (name, r), x in zip(ranges(kind).items(), own[n + 2 :])}
-    depth = excitation.pop("depth", config.grasp_depth.at(own[n]))  # a kind may have a range of its own
+    edges = np.cumsum([kind.weight for kind in config.kinds])
+    kind = config.kinds[min(int(np.searchsorted(edges, which * edges[-1], side="right")), len(edges) - 1)]
+    motion: Any = {name: r.at(x) for (name, r), x in zip(kind.ranges.items(), u[n + 2 :].tolist())}
+    depth = motion.pop("depth", config.grasp_depth.at(common))  # a kind may have a range of its own
+    side = float(rng.choice((-1.0, 1.0)))
+    if "travel" in motion:
+        motion["travel"] *= side
+    if isinstance(kind, MultiSine):
+        motion |= {"frequency": (kind.frequency.low, kind.frequency.high), "components": kind.components}
+        motion["seed"] = int(rng.integers(2**31))
     p = config.physics(sampled | kind.sets, depth)
-    return Task(index, p, sampled, depth, kind, excitation, (config.seed, index), split(config, index))
-
-
-def pick(weights: list[float], u: float) -> int:
-    """One of so many at u in [0, 1), each in proportion to its weight."""
-    edges = np.cumsum(weights)
-    return min(int(np.searchsorted(edges, u * edges[-1], side="right")), len(weights) - 1)
+    excitation = Excitation(
+        motion=motion | {"kind": kind.motion or kind.kind}, duration=config.duration, depth=depth,
+        senses=p.control.senses, grasp_time=p.scenario.grasp_time, settle=config.settle, x_C0=p.scenario.x_C0,
+    )  # fmt: skip
+    labels: Row = {name.replace("/", "_over_"): value for name, value in sampled.items()}
+    if RATIO in sampled:
+        labels["contact.mu_k"] = p.contact.mu_k
+    labels |= {"grasp_depth": depth, "kind": kind.kind, "split": split(config, index)}
+    return Task(index, p, excitation, labels)
 
 
 def split(config: Config, index: int) -> str:
@@ -88,23 +84,6 @@ def split(config: Config, index: int) -> str:
     u = (np.random.default_rng((config.seed, 0)).random() + index * GOLDEN) % 1.0
     edges = (config.splits.train, config.splits.train + config.splits.validation)
     return SPLITS[int(np.searchsorted(edges, u, side="right"))]
-
-
-def excitation(config: Config, task: Task) -> Excitation:
-    """The motion that the controllers of this task follow."""
-    p, rng = task.parameters, np.random.default_rng(task.seed)
-    side = float(rng.choice((-1.0, 1.0)))
-    motion: Any = task.excitation | {"kind": task.kind.motion or task.kind.kind}
-    if "travel" in motion:  # to either side
-        motion["travel"] *= side
-    if isinstance(task.kind, MultiSine):
-        band = task.kind.frequency
-        motion |= {"frequency": (band.low, band.high), "components": task.kind.components}
-        motion["seed"] = int(rng.integers(2**31))
-    return Excitation(
-        motion=motion, duration=config.duration, depth=task.grasp_depth, senses=p.control.senses,
-        grasp_time=p.scenario.grasp_time, settle=config.settle, x_C0=p.scenario.x_C0,
-    )  # fmt: skip
 
 
 def simulate_task(config: Config, task: Task) -> Row:
@@ -123,7 +102,7 @@ def simulate_task(config: Config, task: Task) -> Row:
             force = holding_force(model, press(model, task.parameters.scenario.y_Br_grasp))
         force = round(force, FORCE)
         y_Br = float(model.unpack(y0).pose["bracket"][1])
-        motion = reference(excitation(config, task), model, y_Br, force)
+        motion = reference(task.excitation, model, y_Br, force)
         run = simulate(model, t, y0=y0, reference=motion, **config.steps)
     except SimulationFailed as failure:
         done = {name: getattr(failure.trajectory.stats, name) for name in COUNTS} if failure.trajectory else {}

@@ -30,7 +30,7 @@ from torchsoft.datasets.files import (
     store_errors,
     write_bytes,
 )  # fmt: skip
-from torchsoft.datasets.schema import Variable, not_finite, variables
+from torchsoft.datasets.schema import not_finite, variables
 from torchsoft.files import PARTIAL, finite, remove_partials
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp
@@ -79,8 +79,7 @@ class Store:
                 array = group[name]
                 assert isinstance(array, zarr.Array)
                 values = np.stack([np.broadcast_to(row[name], variable.shape[1:]) for row in rows])
-                values = values.astype(object if variable.dtype == "str" else variable.dtype)
-                array.with_config({"write_empty_chunks": True})[here.start : here.stop] = values
+                array.with_config({"write_empty_chunks": True})[here.start : here.stop] = values.astype(variable.kept)
                 data = encoded.pop(key).to_bytes()
                 write_bytes(self.url, key, data)
                 digests[key] = digest(data)
@@ -122,10 +121,8 @@ def create(url: str, config: Config) -> None:
 def is_part(url: str, content: dict[str, bytes]) -> bool:
     """Whether all that is at `url` are files of this content, whole or partial, as a killed run leaves them behind."""
     fs, root = filesystem(url)
-    names = {Path(path).name for path in fs.ls(root, detail=False)} if fs.exists(root) else set()
-    if not {PARTIAL.sub("", name) for name in names} <= {key.partition("/")[0] for key in content}:
-        return False  # without a look at all that is below
-    return all(
+    names = {PARTIAL.sub("", Path(path).name) for path in fs.ls(root, detail=False)} if fs.exists(root) else set()
+    return names <= {key.partition("/")[0] for key in content} and all(  # before a look at all that is below
         PARTIAL.sub("", key) in content if PARTIAL.search(key) else read_bytes(url, key) == content.get(key)
         for key in keys(url)
     )
@@ -135,50 +132,42 @@ def laid_out(config: Config) -> dict[str, bytes]:
     """The content of every file of an empty dataset by its key: the metadata of every array, and the coordinates. It follows
     from the configuration, so that several may lay out one folder."""
     content: dict[str, Buffer] = {}
-    attributes: dict[str, Any] = {"title": config.title, "description": config.description, "config_hash": config.hash}
-    group = zarr.create_group(MemoryStore(content), zarr_format=3, attributes=attributes)
+    about: Any = {"title": config.title, "description": config.description, "config_hash": config.hash}
+    group = zarr.create_group(MemoryStore(content), zarr_format=3, attributes=about)
+    size = config.trajectories_per_shard
     for name, variable in variables(config).items():
         _, *series = variable.shape
-        how: dict[str, Any] = {"chunks": (config.trajectories_per_shard,), "compressors": SMALL}
+        how: dict[str, Any] = {"chunks": (size,), "compressors": SMALL}
         if series:  # a chunk is one trajectory's stretch of time, a shard is one task's
             time, *rest = series
             samples = min(config.samples_per_chunk, time)
-            shard = (config.trajectories_per_shard, samples * -(-time // samples), *rest)
+            shard = (size, samples * -(-time // samples), *rest)
             how = {"chunks": (1, samples, *rest), "shards": shard, "compressors": LARGE}
-        empty = int(name == "failed") or variable.empty  # what was never written counts as failed
-        create_array(group, name, variable, fill_value=empty, **how)
+        attributes: dict[str, Any] = {"units": variable.unit, "long_name": variable.meaning}
+        if variable.components:
+            attributes["components"] = list(variable.components)
+        group.create_array(
+            name, shape=variable.shape, dtype=variable.dtype, dimension_names=tuple(variable.sizes), attributes=attributes,
+            fill_value=int(name == "failed") or variable.empty, **how,  # what was never written counts as failed
+        )  # fmt: skip
     pads = SoftGrasp(Parameters().override(config.fixed)).pads
-    x = {f"{pad}_surface": pads[k].point_positions[:, 0].numpy() for k, pad in PADS.items()}
-    columns = {
+    lower, upper = (pads[key].point_positions[:, 0].numpy() for key in PADS)
+    columns: dict[str, tuple[Any, str, str]] = {
         "time": (np.arange(config.samples) * config.sample_interval, "s", "time since the start"),
-        "lower_surface": (x["lower_surface"], "m", "x of the lower pad's surface nodes, undeformed"),
-        "upper_surface": (x["upper_surface"], "m", "x of the upper pad's, relative to the bracket's centre"),
-        "trajectory": (np.arange(config.trajectories), "1", "number of the trajectory in the design", "int64"),
-        "axis": (np.array(["x", "y"], object), "1", "names of the axes", "str"),
+        "lower_surface": (lower, "m", "x of the lower pad's surface nodes, undeformed"),
+        "upper_surface": (upper, "m", "x of the upper pad's, relative to the bracket's centre"),
+        "trajectory": (np.arange(config.trajectories), "1", "number of the trajectory in the design"),
+        "axis": (np.array(["x", "y"], np.dtypes.StringDType()), "1", "names of the axes"),
     }
-    for name, (values, *meaning) in columns.items():
-        coordinate = Variable({name: len(values)}, *meaning)
-        how = {"chunks": values.shape, "compressors": SMALL, "config": {"write_empty_chunks": True}}
-        create_array(group, name, coordinate, **how)[:] = values
+    for name, (values, unit, meaning) in columns.items():
+        group.create_array(
+            name, data=values, chunks=values.shape, dimension_names=(name,), compressors=SMALL,
+            attributes={"units": unit, "long_name": meaning}, config={"write_empty_chunks": True},
+        )  # fmt: skip
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # consolidated metadata is zarr-python's and xarray's own addition
         zarr.consolidate_metadata(group.store)
     return {key: data.to_bytes() for key, data in content.items()}
-
-
-def create_array(group: zarr.Group, name: str, variable: Variable, **how: Any) -> zarr.Array[Any]:
-    """One empty array."""
-    attributes: dict[str, Any] = {"units": variable.unit, "long_name": variable.meaning}
-    if variable.components:
-        attributes["components"] = list(variable.components)
-    return group.create_array(
-        name,
-        shape=variable.shape,
-        dtype=variable.dtype,
-        dimension_names=tuple(variable.sizes),
-        attributes=attributes,
-        **how,
-    )
 
 
 def manifest(config: Config, content: dict[str, bytes]) -> Manifest:
