@@ -12,7 +12,6 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from torchsoft.channels import CHANNELS
 from torchsoft.datasets.config import SPLITS, Config
 from torchsoft.datasets.files import MANIFEST, Manifest, StoreError, filesystem, keys, record_key
 from torchsoft.datasets.reader import Vouched, open_dataset
@@ -22,8 +21,8 @@ from torchsoft.files import PARTIAL
 from torchsoft.plot.figures import save
 from torchsoft.tables import line
 
-MOTIONS = ("x_C", "y_Br", "F_y")
-"""Channels that the picture shows over time."""
+MOTIONS = {"disc_position": 0, "bracket_position": 1, "control_force": 1}
+"""Variables that the picture shows over time, and which of their components."""
 
 
 def check(url: str) -> Iterator[str]:
@@ -99,8 +98,7 @@ def check_arrays(data: xr.Dataset, config: Config) -> Iterator[str]:
 
 def check_shard(data: xr.Dataset, config: Config, shard: int, design: np.ndarray[Any, Any]) -> Iterator[str]:
     """Everything about the trajectories of one finished shard."""
-    schema, columns, size = variables(config), dict[str, Any](), config.trajectories_per_shard
-    here = range(shard * size, min((shard + 1) * size, config.trajectories))
+    schema, columns, here = variables(config), dict[str, Any](), config.rows(shard)
     for name in schema:
         try:
             columns[name] = data[name][here.start : here.stop].values
@@ -183,14 +181,10 @@ def figure(data: xr.Dataset, config: Config) -> Figure:
     table.groupby(["kind", "split"]).size().unstack().plot.bar(
         stacked=True, ax=panels[-1, 0], ylabel="trajectories [1]"
     )
-    for ax, channel in zip(panels[-1, 1:], map(CHANNELS.__getitem__, MOTIONS)):
-        for n, (kind, some) in enumerate(table[table["failed"] == 0].groupby("kind")):
-            for i in some.index[:3]:
-                ax.plot(data.time, channel.of(data[channel.variable][i]), lw=0.7, color=f"C{n}", label=kind)
-                kind = None  # named once
-        ax.set(xlabel="time [s]", ylabel=f"${channel.symbol}$ [{channel.unit}]")
-        if ax.lines:
-            ax.legend(fontsize=7)
+    some = table[table["failed"] == 0].groupby("kind").head(3).index
+    for ax, (name, axis) in zip(panels[-1, 1:], MOTIONS.items()):
+        ax.plot(data.time, data[name][some, :, axis].T, lw=0.7)
+        ax.set(xlabel="time [s]", ylabel=f"{name}, {'xy'[axis]} [{data[name].units}]")
     for ax in fig.axes:
         ax.tick_params(axis="x", labelsize=7, which="both", rotation=20)
     return fig

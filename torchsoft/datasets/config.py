@@ -206,6 +206,11 @@ class Config(Table):
     def shards(self) -> int:
         return -(-self.trajectories // self.trajectories_per_shard)
 
+    def rows(self, shard: int) -> range:
+        """The trajectories of a shard."""
+        size = self.trajectories_per_shard
+        return range(shard * size, min((shard + 1) * size, self.trajectories))
+
     @property
     def hash(self) -> str:
         """Of everything in the file."""

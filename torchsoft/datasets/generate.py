@@ -79,9 +79,9 @@ class Serial(Executor):
 
 def run_shard(store: Store, shard: int, design: Any) -> tuple[int, int]:
     """Simulate and write one shard; how many trajectories it holds and how many of them failed."""
+    config = store.config
     with threads.single_threaded():
-        tasks = (task(store.config, i, u) for i, u in zip(store.rows(shard), design, strict=True))
-        rows = [simulate_task(store.config, one) for one in tasks]
+        rows = [simulate_task(config, task(config, i, u)) for i, u in zip(config.rows(shard), design, strict=True)]
     store.write(shard, rows)
     return len(rows), sum(int(row["failed"]) for row in rows)
 
@@ -93,13 +93,13 @@ def generate(config: Config, url: str, executor: Executor, workers: int = 1, pro
     """
     store, design = open_or_create(url, config), points(config)
     left, failed, running = store.unfinished()[::-1], 0, set[Future[tuple[int, int]]]()
-    finished = config.trajectories - sum(len(store.rows(shard)) for shard in left)
+    finished = config.trajectories - sum(len(config.rows(shard)) for shard in left)
     what: Any = {"unit": " simulated s", "unit_scale": config.duration, "disable": not progress, "smoothing": 0.05}
     with tqdm(total=config.trajectories, initial=finished, **what) as bar:
         try:
             while left or running:
                 while left and len(running) < 3 * max(workers, 1):
-                    here = store.rows(shard := left.pop())
+                    here = config.rows(shard := left.pop())
                     running.add(executor.submit(run_shard, store, shard, design[here.start : here.stop]))
                 done, running = wait(running, return_when=FIRST_COMPLETED)
                 for count, bad in (future.result() for future in done):

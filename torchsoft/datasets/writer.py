@@ -50,11 +50,6 @@ class Store:
         self.url, self.config = url, config
         self.manifest = Manifest.read(url)
 
-    def rows(self, shard: int) -> range:
-        """The trajectories of a shard."""
-        size = self.config.trajectories_per_shard
-        return range(shard * size, min((shard + 1) * size, self.config.trajectories))
-
     def unfinished(self) -> list[int]:
         """Shards that have no record."""
         return sorted(set(range(self.config.shards)) - self.manifest.layout.finished(self.url))
@@ -62,9 +57,7 @@ class Store:
     def write(self, shard: int, rows: list[dict[str, Any]]) -> None:
         """Write a whole shard, then its record. Raises `StoreError` when there is no room or no permission, and
         `ValueError` for a trajectory that is neither finite nor failed."""
-        here, digests = self.rows(shard), dict[str, str]()
-        if len(rows) != len(here):
-            raise ValueError(f"shard {shard} holds {len(here)} trajectories, but {len(rows)} were given")
+        here, digests = self.config.rows(shard), dict[str, str]()
         for index, row in zip(here, rows, strict=True):
             if bad := not_finite(self.config, row):
                 raise ValueError(f"trajectory {index} is not marked as failed, but not finite: {', '.join(bad)}")
