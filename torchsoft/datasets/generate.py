@@ -151,7 +151,8 @@ def main(arguments: list[str] | None = None) -> int:
         with dask_cluster(given.scheduler) if given.scheduler else local_workers(workers) as executor:
             failed = generate(config, given.out, executor, workers)
     except (ValueError, StoreError, OSError) as error:
-        print(f"error: {line(error, 2000)}", file=sys.stderr)
+        said = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else error
+        print(f"error: {line(said, 2000)}", file=sys.stderr)
         return 2
     except BrokenProcessPool:
         print("error: a worker was killed, perhaps for memory; start again to make what is missing", file=sys.stderr)
