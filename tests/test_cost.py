@@ -13,7 +13,7 @@ from torchsoft import PadMesh, Parameters
 from torchsoft.cli import main
 from torchsoft.cost import Cost, Costly, agree, duration, row_memory, step_seconds
 from torchsoft.datasets.config import Config
-from torchsoft.datasets.cost import cost
+from torchsoft.datasets.generate import cost
 from torchsoft.physics.mesh import unit_compliance
 from torchsoft.rigs.cost import condensing_time
 from torchsoft.rigs.template import template

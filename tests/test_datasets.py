@@ -20,16 +20,14 @@ import torch
 import xarray as xr
 import zarr
 
-from torchsoft.datasets import layout, simulation
+from torchsoft.datasets import simulation
 from torchsoft.datasets.check import check
 from torchsoft.datasets.config import Config
-from torchsoft.datasets.design import points, split, task
+from torchsoft.datasets.files import Manifest, StoreError, digest, record, record_key, write_bytes
 from torchsoft.datasets.generate import Serial, generate, local_processes, local_workers, main
-from torchsoft.datasets.manifest import Manifest, digest, record, record_key
 from torchsoft.datasets.reader import Trajectories, open_dataset
-from torchsoft.datasets.simulation import simulate_task
-from torchsoft.datasets.storage import StoreError, write_bytes
-from torchsoft.datasets.store import Store, create, open_or_create
+from torchsoft.datasets.simulation import points, simulate_task, split, task
+from torchsoft.datasets.writer import Store, create, laid_out, open_or_create
 from torchsoft.files import replacing
 
 ROOT = Path(__file__).parent.parent
@@ -471,7 +469,7 @@ def test_leftovers_of_the_dead_are_removed_and_files_of_the_living_are_not(
 ) -> None:
     """At the next start: partial files of a killed run, in the layout too, but none that somebody is writing."""
     config, folder = made[1], tmp_path / "set"
-    content = layout.files(config)
+    content = laid_out(config)
     for key, data in list(content.items())[:5]:
         write_bytes(str(folder), key, data)
     (folder / "zarr.json.0123456789abcdef.partial").write_bytes(b"half")
@@ -571,7 +569,7 @@ def test_a_file_size_limit_is_said_and_costs_nothing(made: tuple[Path, Config], 
 FULL = """
 mount -t tmpfs -o size={size} tmpfs {disk} || exit 77
 {generate}; echo "first $?"
-{python} -c 'from torchsoft.datasets.config import Config; from torchsoft.datasets.store import Store
+{python} -c 'from torchsoft.datasets.config import Config; from torchsoft.datasets.writer import Store
 print("unfinished", len(Store("{disk}/set", Config.from_toml("{config}")).unfinished()))'
 mount -o remount,size=64m {disk}
 {generate}; echo "second $?"

@@ -12,9 +12,8 @@ import torch
 import zarr
 from torch.utils.data import DataLoader
 
-from torchsoft.datasets.manifest import MANIFEST, Layout, Manifest, digest, record, record_key
+from torchsoft.datasets.files import MANIFEST, Layout, Manifest, digest, keys, record, record_key, write_bytes
 from torchsoft.datasets.reader import Trajectories, open_dataset
-from torchsoft.datasets.storage import keys, write_bytes
 
 COUNT, SAMPLES = 10, 21
 

@@ -13,7 +13,7 @@ from hostile.small import config, make, restore
 from hostile.trial import Tally
 from torchsoft.datasets import Trajectories, open_dataset
 from torchsoft.datasets.check import check
-from torchsoft.datasets.storage import StoreError
+from torchsoft.datasets.files import StoreError
 from torchsoft.paper.equilibrium import rest
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp

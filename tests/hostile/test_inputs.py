@@ -18,8 +18,8 @@ from hostile.trial import SEED, Tally, count, random
 from torchsoft import Parameters, SoftGrasp, rest, simulate
 from torchsoft.cost import Costly, agree
 from torchsoft.datasets.config import Config
-from torchsoft.datasets.cost import cost
-from torchsoft.datasets.design import excitation, points, task
+from torchsoft.datasets.generate import cost
+from torchsoft.datasets.simulation import points, task
 from torchsoft.excitation import Excitation, begin
 from torchsoft.tables import Table, from_toml
 
@@ -100,10 +100,9 @@ def design_briefly(config: Config) -> None:
     few = config.model_copy(update={"trajectories": min(config.trajectories, 4)})
     for i, u in enumerate(points(few)):
         one = task(few, i, u)
-        assert np.isfinite(list(one.sampled.values())).all()
-        excitation(few, one)
+        assert np.isfinite([value for value in one.labels.values() if not isinstance(value, str)]).all()
     if one.parameters.pad.memory <= SMALL:
-        excite_briefly(excitation(few, one))
+        excite_briefly(one.excitation)
 
 
 KINDS: dict[str, tuple[type[Table], Callable[[], list[dict[str, Any]]], int, int, Follow]] = {

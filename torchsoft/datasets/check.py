@@ -4,27 +4,25 @@ One line a finding; exit status 1 if there is any. `--picture FILE` draws what t
 """
 
 import argparse
-import json
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import zarr
+import xarray as xr
+from matplotlib.figure import Figure
 
-from torchsoft.datasets.config import Config
-from torchsoft.datasets.coverage import figure
-from torchsoft.datasets.design import SPLITS, points, task
-from torchsoft.datasets.manifest import COPY, MANIFEST, Manifest, digest, finished, record_key
-from torchsoft.datasets.reader import open_dataset, opened
-from torchsoft.datasets.schema import not_finite, sizes, variables
-from torchsoft.datasets.simulation import labels
-from torchsoft.datasets.storage import StoreError, filesystem, keys, read_bytes
-from torchsoft.datasets.vouched import Vouched
+from torchsoft.datasets.config import SPLITS, Config
+from torchsoft.datasets.files import MANIFEST, Manifest, StoreError, filesystem, keys, record_key
+from torchsoft.datasets.reader import Vouched, open_dataset
+from torchsoft.datasets.schema import not_finite, variables
+from torchsoft.datasets.simulation import points, task
 from torchsoft.files import PARTIAL
 from torchsoft.plot.figures import save
 from torchsoft.tables import line
+
+MOTIONS = {"disc_position": 0, "bracket_position": 1, "control_force": 1}
+"""Variables that the picture shows over time, and which of their components."""
 
 
 def check(url: str) -> Iterator[str]:
@@ -41,7 +39,7 @@ def findings(url: str) -> Iterator[str]:
     """Every finding; raises what keeps it from going on."""
     manifest = Manifest.read(url)
     try:
-        config = Config.model_validate_json(json.dumps(manifest.config))
+        config = Config.model_validate(manifest.config)
     except ValueError as error:
         yield f"{MANIFEST}: its configuration is impossible: {error}"
         return
@@ -52,119 +50,144 @@ def findings(url: str) -> Iterator[str]:
         return  # nothing else can be held against a configuration that was changed
     if manifest.seed != config.seed:
         yield f"{MANIFEST}: seed is {manifest.seed}, but the configuration's is {config.seed}"
-    damaged = list(check_files(url, manifest))
-    yield from damaged
-    if damaged:
+    if damaged := list(check_files(url, manifest)):
+        yield from damaged
         return
-    store = Vouched(url, manifest, finished(url, manifest.layout))
-    structure = list(check_arrays(opened(store), config))
-    yield from structure
-    if structure:
+    store = Vouched(url, unfinished=True)
+    data = store.data(chunks=None)
+    if wrong := list(check_arrays(data, config)):
+        yield from wrong
         return
     if unfinished := sorted(set(range(config.shards)) - store.finished):
         yield f"{len(unfinished)} of {config.shards} shards are not finished, the first is shard {unfinished[0]}"
     design = points(config)
     for shard in sorted(store.finished):
-        yield from check_shard(store, config, shard, design)
+        yield from check_shard(data, config, shard, design)
 
 
 def check_files(url: str, manifest: Manifest) -> Iterator[str]:
     """Files laid out at the start that are missing or damaged, and files that do not belong there."""
     layout, there = manifest.layout, keys(url)
-    for key, expected in manifest.digests.items():
-        data = read_bytes(url, key)
-        if data is None or digest(data) != expected:
-            yield f"{url}/{key} is {'missing' if data is None else 'damaged'}; {COPY}"
-    known = {MANIFEST, *manifest.digests, *(record_key(shard) for shard in range(layout.shards))}
-    running = len(finished(url, layout)) < layout.shards
+    for key in manifest.digests:
+        try:
+            manifest.laid_out(url, key)
+        except StoreError as error:
+            yield str(error)
+    running = len(layout.finished(url)) < layout.shards
     for key in there:
-        if key not in known and layout.shard(key) is None and not (running and PARTIAL.search(key)):
+        known = key in (MANIFEST, *manifest.digests) or layout.shard(key) is not None
+        if not known and not (running and PARTIAL.search(key)):
             yield f"{url}/{key} does not belong to the dataset; remove it"
 
 
-def check_arrays(group: zarr.Group, config: Config) -> Iterator[str]:
+def check_arrays(data: xr.Dataset, config: Config) -> Iterator[str]:
     """Arrays, their shapes, dimensions and units."""
-    length = sizes(config)
     for name, variable in variables(config).items():
-        array = group.get(name)
-        if not isinstance(array, zarr.Array):
+        if name not in data:
             yield f"{name}: missing"
             continue
-        dims = getattr(array.metadata, "dimension_names", None)
-        shape = tuple(length[dim] for dim in variable.dims)
-        if array.shape != shape or tuple(dims or ()) != variable.dims:
-            yield f"{name}: has shape {array.shape} over {dims}, not {shape} over {variable.dims}"
-        if array.attrs.get("units") != variable.unit:
-            yield f"{name}: units are {array.attrs.get('units')!r}, not {variable.unit!r}"
-        if (array.shards or array.chunks)[0] != config.trajectories_per_shard:
-            yield f"{name}: its shards hold {(array.shards or array.chunks)[0]} trajectories, not one task's"
+        array, size = data[name], config.trajectories_per_shard
+        for what, there, expected in (
+            ("sizes", dict(array.sizes), variable.sizes),
+            ("units", array.attrs.get("units"), variable.unit),
+            ("trajectories of a shard", (array.encoding["shards"] or array.encoding["chunks"])[0], size),
+        ):
+            if there != expected:
+                yield f"{name}: {what} are {there!r}, not {expected!r}"
 
 
-def check_shard(store: Vouched, config: Config, shard: int, design: np.ndarray[Any, Any]) -> Iterator[str]:
+def check_shard(data: xr.Dataset, config: Config, shard: int, design: np.ndarray[Any, Any]) -> Iterator[str]:
     """Everything about the trajectories of one finished shard."""
-    schema, group, data = variables(config), opened(store), dict[str, Any]()
-    size = config.trajectories_per_shard
-    here = range(shard * size, min((shard + 1) * size, config.trajectories))
+    schema, columns, here = variables(config), dict[str, Any](), config.rows(shard)
     for name in schema:
         try:
-            array = group[name]
-            assert isinstance(array, zarr.Array)
-            data[name] = np.asarray(array[here.start : here.stop])
+            columns[name] = data[name][here.start : here.stop].values
         except StoreError as error:
             yield str(error)
             if record_key(shard) in str(error).partition(";")[0]:
                 return  # nothing vouches for the others either
-    if len(data) < len(schema):
-        return
-    for row, index in enumerate(here):
-        one = {name: values[row] for name, values in data.items()}
-        finding = f"trajectory {index}: ".__add__
-        for name, value in labels(task(config, index, design[index])).items():
-            if one[name] != value:
-                yield finding(f"{name} is {one[name]}, but the design has {value}")
-        if one["failed"]:
-            series = [name for name, v in schema.items() if v.dtype.startswith("float") and len(v.dims) > 1]
-            filled = [name for name in series if not np.isnan(one[name]).all()]
-            if not one["reason"]:
-                yield finding("failed without a reason")
-            elif filled:
-                yield finding(f"failed, but {', '.join(filled)} hold numbers")
-        elif bad := not_finite(config, one):
-            yield finding(f"not finite: {', '.join(bad)}")
-        else:
-            yield from map(finding, check_physics(config, one))
+    for row, index in enumerate(here if len(columns) == len(schema) else []):
+        one = {name: values[row] for name, values in columns.items()}
+        for finding in check_trajectory(config, one, task(config, index, design[index]).labels):
+            yield f"trajectory {index}: {finding}"
+
+
+def check_trajectory(config: Config, one: dict[str, Any], labels: dict[str, Any]) -> Iterator[str]:
+    """What the design says of it; that it is finite, or failed for a reason; energy and contact."""
+    for name, value in labels.items():
+        if one[name] != value:
+            yield f"{name} is {one[name]}, but the design has {value}"
+    if one["failed"]:
+        series = [name for name, v in variables(config).items() if v.kept.kind == "f" and len(v.shape) > 1]
+        if not one["reason"]:
+            yield "failed without a reason"
+        elif filled := [name for name in series if not np.isnan(one[name]).all()]:
+            yield f"failed, but {', '.join(filled)} hold numbers"
+    elif bad := not_finite(config, one):
+        yield f"not finite: {', '.join(bad)}"
+    else:
+        yield from check_physics(config, one)
 
 
 def check_physics(config: Config, one: dict[str, Any]) -> Iterator[str]:
     """The energy balance, and contact where there is force."""
     stored, dissipated, supplied = (one[f"{x}_energy"].sum(-1) for x in ("stored", "dissipated", "supplied"))
-    residual = stored - stored[0] - supplied + dissipated
-    scale = max(np.abs(stored).max(), one["injected_energy"][-1])
-    if np.abs(residual - one["energy_residual"]).max() > 1e-9 * scale:
+    residual, injected = stored - stored[0] - supplied + dissipated, one["injected_energy"][-1]
+    if np.abs(residual - one["energy_residual"]).max() > 1e-9 * max(np.abs(stored).max(), injected):
         yield "energy_residual is not stored - supplied + dissipated"
         return
-    relative = np.abs(residual).max() / one["injected_energy"][-1]
-    if abs(relative - one["energy_residual_rel"]) > 1e-9:
-        yield f"energy_residual_rel is {one['energy_residual_rel']:.3g}, but the series have {relative:.3g}"
+    relative, booked = np.abs(residual).max() / injected, one["energy_residual_rel"]
+    if abs(relative - booked) > 1e-9:
+        yield f"energy_residual_rel is {booked:.3g}, but the series have {relative:.3g}"
     if relative > config.ledger_tolerance:
         yield f"energy residual is {relative:.2g} of the energy injected, above {config.ledger_tolerance}"
     for pad in ("lower", "upper"):
-        if (one[f"normal_force_{pad}"] < 0).any():
+        force = one[f"normal_force_{pad}"]
+        if (force < 0).any():
             yield f"normal_force_{pad} pulls"
-        if ((one[f"normal_force_{pad}"] > 0) & (one[f"contact_{pad}"] == 0)).any():
+        if ((force > 0) & (one[f"contact_{pad}"] == 0)).any():
             yield f"normal_force_{pad} acts where contact_{pad} is 0"
 
 
-def summary(url: str) -> str:
+def summary(url: str, data: xr.Dataset) -> str:
     """Sizes and counts."""
-    data, (fs, root) = open_dataset(url, unfinished=True), filesystem(url)
-    files = fs.find(root, detail=True)
-    stored, failed = sum(info["size"] for info in files.values()), int(data.failed.sum())
+    fs, root = filesystem(url)
+    stored = [info["size"] for info in fs.find(root, detail=True).values()]
     counts = ", ".join(f"{int((data.split == name).sum())} {name}" for name in SPLITS)
     return (
-        f"{data.sizes['trajectory']} trajectories ({counts}; {failed} failed) of {data.sizes['time']} samples, "
-        f"{data.nbytes / 1e6:.1f} MB of arrays in {stored / 1e6:.1f} MB and {len(files)} files"
+        f"{data.sizes['trajectory']} trajectories ({counts}; {int(data.failed.sum())} failed) of {data.sizes['time']} "
+        f"samples, {data.nbytes / 1e6:.1f} MB of arrays in {sum(stored) / 1e6:.1f} MB and {len(stored)} files"
     )
+
+
+def figure(data: xr.Dataset, config: Config) -> Figure:
+    """Each parameter over the next by split, failures crossed; trajectories of each kind; some sound motions of each kind."""
+    ranged = {name.replace("/", "_over_"): r for name, r in config.parameters.items()} | {
+        "grasp_depth": config.grasp_depth
+    }
+    names, rows = list(ranged), -(-len(ranged) // 4)
+    table = data[[*names, "kind", "split", "failed"]].to_dataframe().reset_index()
+    table["split"] = table["split"].where(table["failed"] == 0, "failed")
+    fig = Figure(figsize=(13, 2.9 * (rows + 1)), layout="constrained")
+    fig.suptitle(f"{config.title}: {len(table)} trajectories, {table['failed'].sum()} failed")
+    panels = fig.subplots(rows + 1, 4, squeeze=False)
+    for ax, x, y in zip(panels.flat, names, [*names[1:], names[0]]):
+        for name, some in table.groupby("split"):
+            ax.plot(some[x], some[y], "x" if name == "failed" else ".", ms=4)
+        label, other = (f"{name} [{data[name].units}]" for name in (x, y))
+        ax.set(xlabel=label, ylabel=other, xscale=ranged[x].scale, yscale=ranged[y].scale)
+    for ax in panels.flat[len(names) : -4]:
+        ax.set_axis_off()
+    table.groupby(["kind", "split"]).size().unstack().plot.bar(
+        stacked=True, ax=panels[-1, 0], ylabel="trajectories [1]"
+    )
+    some = table[table["failed"] == 0].groupby("kind").head(3).index
+    for ax, (name, axis) in zip(panels[-1, 1:], MOTIONS.items()):
+        ax.plot(data.time, data[name][some, :, axis].T, lw=0.7)
+        ax.set(xlabel="time [s]", ylabel=f"{name}, {'xy'[axis]} [{data[name].units}]")
+    for ax in fig.axes:
+        ax.tick_params(axis="x", labelsize=7, which="both", rotation=20)
+    return fig
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -176,17 +199,14 @@ def main(arguments: list[str] | None = None) -> int:
     for count, finding in enumerate(check(given.store), 1):
         print(finding)
     try:
-        print(summary(given.store))
-        config = Config.model_validate_json(json.dumps(Manifest.read(given.store).config))
+        data = open_dataset(given.store, unfinished=True)
+        print(summary(given.store, data))
         if given.picture is not None:
-            save(figure(open_dataset(given.store, unfinished=True), config), given.picture, dpi=120)
+            config = Config.model_validate(Manifest.read(given.store).config)
+            save(figure(data, config), given.picture, dpi=120)
             print(f"picture in {given.picture}")
     except Exception as error:  # a damaged store has been reported above; the picture must not hide it
         count += 1
         print(line(f"no summary or picture: {type(error).__name__}: {error}"))
     print("sound" if count == 0 else f"{count} findings")
     return int(count > 0)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

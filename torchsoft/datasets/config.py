@@ -5,13 +5,17 @@ import itertools
 import math
 import warnings
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
 
 from pydantic import Field, model_validator
 
-from torchsoft.excitation import MOST
+from torchsoft.excitation import MOST, Frequency, Time
 from torchsoft.paper.parameters import Parameters, check
 from torchsoft.tables import LISTED, SEED, Table, from_toml, line
+
+T = TypeVar("T", bound=float)
+
+SPLITS = ("train", "validation", "test")
 
 RATIO = "contact.mu_k/contact.mu_s"
 """The one derived parameter: a range for the ratio keeps mu_k below a ranged mu_s."""
@@ -34,11 +38,11 @@ STEP = 0.02
 """Largest step [s] of the stepper: twice the pads' own time, and the energy balance is off by percents."""
 
 
-class Range(Table):
+class Range(Table, Generic[T]):
     """From `low` to `high`, uniformly in the value or in its logarithm."""
 
-    low: float
-    high: float
+    low: T
+    high: T
     scale: Literal["linear", "log"] = "linear"
 
     @model_validator(mode="after")
@@ -51,31 +55,27 @@ class Range(Table):
 
     def at(self, u: float) -> float:
         """The value at u in [0, 1]."""
+        low, high = self.low, self.high
         if self.scale == "log":
-            value = math.exp(math.log(self.low) + u * (math.log(self.high) - math.log(self.low)))
-            return min(max(value, self.low), self.high)  # the ends are not rounded beyond themselves
-        return self.low + u * (self.high - self.low)
+            value = math.exp(math.log(low) + u * (math.log(high) - math.log(low)))
+            return min(max(value, low), high)  # the ends are not rounded beyond themselves
+        return low + u * (high - low)
+
+    def ends(self, where: str) -> dict[str, float]:
+        """Both ends by what messages call them."""
+        return {f"{where}.low": self.low, f"{where}.high": self.high}
 
 
-class Lengths(Range):
+class Lengths(Range[Annotated[float, Field(ge=1e-9, le=10.0)]]):
     """A range of lengths [m]."""
 
-    low: float = Field(ge=1e-9)
-    high: float = Field(le=10.0)
 
-
-class Times(Range):
+class Times(Range[Time]):
     """A range of times [s]."""
 
-    low: float = Field(ge=1e-6)
-    high: float = Field(le=1e5)
 
-
-class Frequencies(Range):
+class Frequencies(Range[Frequency]):
     """A range of frequencies [Hz]."""
-
-    low: float = Field(ge=1e-6)
-    high: float = Field(le=1e5)
 
 
 class RandomMotion(Table):
@@ -85,6 +85,11 @@ class RandomMotion(Table):
     weight: float = Field(1.0, ge=1e-6, le=1e6)
     motion: ClassVar[str | None] = None
     sets: ClassVar[dict[str, Any]] = {}  # parameters that this kind needs
+
+    @property
+    def ranges(self) -> dict[str, Range]:
+        """What is drawn for every trajectory, by name."""
+        return {name: value for name, value in self if isinstance(value, Range)}
 
 
 class SlowRoll(RandomMotion):
@@ -147,12 +152,6 @@ class Jerk(RandomMotion):
 Kind = Annotated[SlowRoll | Strokes | MultiSine | Chirp | Press | Jerk, Field(discriminator="kind")]
 
 
-def ranges(kind: Kind) -> dict[str, Range]:
-    """The ranged quantities of a kind, by name."""
-    values = {name: getattr(kind, name) for name in type(kind).model_fields}
-    return {name: value for name, value in values.items() if isinstance(value, Range)}
-
-
 class Fractions(Table):
     """Fractions of the trajectories; the rest is for testing."""
 
@@ -207,6 +206,11 @@ class Config(Table):
     def shards(self) -> int:
         return -(-self.trajectories // self.trajectories_per_shard)
 
+    def rows(self, shard: int) -> range:
+        """The trajectories of a shard."""
+        size = self.trajectories_per_shard
+        return range(shard * size, min((shard + 1) * size, self.trajectories))
+
     @property
     def hash(self) -> str:
         """Of everything in the file."""
@@ -214,51 +218,41 @@ class Config(Table):
 
     def physics(self, values: dict[str, Any], grasp_depth: float) -> Parameters:
         """Parameters of one trajectory: defaults, then `fixed`, then `values`, the bracket lowered by `grasp_depth`."""
-        tree = dict(self.fixed) | values
-        ratio = tree.pop(RATIO, None)
-        if ratio is not None:
-            tree["contact.mu_k"] = ratio * tree.get("contact.mu_s", DEFAULTS["contact.mu_s"])
-        height, radius, centre = (
-            tree.get(name, DEFAULTS[name]) for name in ("pad.height", "disc.radius", "bracket.cm_height")
-        )
-        grasped = 2 * (height + radius) + centre - grasp_depth
+        tree = DEFAULTS | self.fixed | values
+        if (ratio := tree.pop(RATIO, None)) is not None:
+            tree["contact.mu_k"] = ratio * tree["contact.mu_s"]
+        grasped = 2 * (tree["pad.height"] + tree["disc.radius"]) + tree["bracket.cm_height"] - grasp_depth
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a steep friction law fails in simulation, with its reason, or does not
             return Parameters().override(tree | {"scenario.y_Br_grasp": grasped, "scenario.travel": 0.0})
 
-    def ends(self, name: str) -> tuple[float, float]:
+    def extremes(self, name: str) -> tuple[float, float]:
         """The least and the largest value of a parameter."""
         value = self.fixed.get(name, DEFAULTS[name])
-        r = self.parameters.get(name)
-        return (r.low, r.high) if r else (value, value)
+        return (r.low, r.high) if (r := self.parameters.get(name)) else (value, value)
 
     @model_validator(mode="after")
     def _values_are_possible(self) -> Self:
-        for where, names in (("parameters", self.parameters), ("fixed", self.fixed)):
-            for name in names:
-                if name in DECIDED:
-                    raise ValueError(
-                        f"{where}.{name} has no part in a dataset: grasp_depth, kinds and duration decide it"
-                    )
-                if name not in DEFAULTS and not (where == "parameters" and name == RATIO):
-                    raise ValueError(
-                        f"{where}.{line(name, 80)} is not a parameter; known: {', '.join(DEFAULTS)}, {RATIO}"
-                    )
+        for name in (*self.parameters, *self.fixed):
+            where = f"{'parameters' if name in self.parameters else 'fixed'}.{line(name, 80)}"
+            if name in DECIDED:
+                raise ValueError(f"{where} has no part in a dataset: grasp_depth, kinds and duration decide it")
+            if name not in DEFAULTS and where != f"parameters.{RATIO}":
+                raise ValueError(f"{where} is not a parameter; known: {', '.join(DEFAULTS)}, {RATIO}")
+            if name in self.parameters and name in self.fixed:
+                raise ValueError(f"{where} is in `fixed` as well; leave one of them out")
         for name, value in self.fixed.items():
             check(name, value, f"fixed.{name}")
         for name, r in self.parameters.items():
-            if name in self.fixed:
-                raise ValueError(f"parameters.{name} is in `fixed` as well")
             if name in SHAPING or not isinstance(DEFAULTS.get(name, 0.0), float):
                 raise ValueError(f"parameters.{name} must be the same in every trajectory; set it in `fixed`")
-            for end in ("low", "high"):
-                value, where = getattr(r, end), f"parameters.{name}.{end}"
+            for where, value in r.ends(f"parameters.{name}").items():
                 if name != RATIO:
                     check(name, value, where)
                 elif not 0 <= value <= 1:
                     raise ValueError(f"{where} must lie in [0, 1], but is {value}")
         if RATIO in self.parameters and "contact.mu_k" in {*self.parameters, *self.fixed}:
-            raise ValueError(f"parameters.{RATIO} and contact.mu_k exclude each other")
+            raise ValueError(f"parameters.{RATIO} and contact.mu_k exclude each other; leave one of them out")
         return self
 
     @model_validator(mode="after")
@@ -273,7 +267,7 @@ class Config(Table):
             )
         if self.step is not None and self.step > self.sample_interval:
             raise ValueError(f"step = {self.step} s exceeds sample_interval = {self.sample_interval} s")
-        grasp = self.ends("scenario.grasp_time")[1]
+        grasp = self.extremes("scenario.grasp_time")[1]
         begin = grasp + self.settle
         if self.duration < begin + MOTION:
             raise ValueError(
@@ -290,23 +284,22 @@ class Config(Table):
 
     @model_validator(mode="after")
     def _ranges_are_possible(self) -> Self:
-        length, starts = self.ends("pad.length")[1], self.ends("scenario.x_C0")
+        length, starts = self.extremes("pad.length")[1], self.extremes("scenario.x_C0")
+        depths = self.grasp_depth.ends("grasp_depth")
         for i, kind in enumerate(self.kinds):
-            travel = ranges(kind).get("travel")
+            travel = kind.ranges.get("travel")
             if travel and (starts[0] - travel.high < 0 or starts[1] + travel.high > length):
                 raise ValueError(
                     f"kinds.{i}.travel.high = {travel.high} m leaves the pad: scenario.x_C0 is between {starts[0]} and "
                     f"{starts[1]} m, and pad.length = {length} m"
                 )
-        depths = {f"grasp_depth.{end}": getattr(self.grasp_depth, end) for end in ("low", "high")}
-        for i, kind in enumerate(self.kinds):
             if isinstance(kind, Jerk):
-                depths |= {f"kinds.{i}.depth.{end}": getattr(kind.depth, end) for end in ("low", "high")}
+                depths |= kind.depth.ends(f"kinds.{i}.depth")
         ratio = {RATIO: self.parameters[RATIO].low} if RATIO in self.parameters else {}
-        pairs = sorted(itertools.combinations_with_replacement(self.parameters, 2), key=lambda pair: pair[0] != pair[1])
-        for a, b in pairs or [("", "")]:
-            for u, v, (where, depth) in itertools.product((0, 1), (0, 1), depths.items()):
-                ends = {name: self.parameters[name].at(w) for name, w in ((a, u), (b, v)) if name}
+        few = (1, 2) if self.parameters else (0,)  # at a time
+        for names in itertools.chain.from_iterable(itertools.combinations(self.parameters, n) for n in few):
+            for u, (where, depth) in itertools.product(itertools.product((0, 1), repeat=len(names)), depths.items()):
+                ends = {name: self.parameters[name].at(end) for name, end in zip(names, u)}
                 try:
                     self.physics(ratio | ends, depth)
                 except ValueError as error:
@@ -317,9 +310,7 @@ class Config(Table):
     @property
     def steps(self) -> dict[str, Any]:
         """How `simulate` is to choose its steps."""
-        if self.step is not None:
-            return {"step": self.step}
-        return {"rtol": RTOL if self.rtol is None else self.rtol}
+        return {"step": self.step} if self.step else {"rtol": self.rtol or RTOL}
 
     @classmethod
     def from_toml(cls, path: str | Path) -> "Config":

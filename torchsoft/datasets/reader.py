@@ -1,35 +1,85 @@
 """Datasets of trajectories in a zarr store, for torch's `DataLoader` and for xarray. What was not written so is refused."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 import xarray as xr
-import zarr
 from torch import Tensor
 from torch.utils.data import Dataset
+from zarr.abc.store import ByteRequest, Store
+from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.storage import FsspecStore, LocalStore, WrapperStore
 
-from torchsoft.datasets.manifest import Manifest, finished
-from torchsoft.datasets.storage import StoreError
-from torchsoft.datasets.vouched import Vouched
+from torchsoft.datasets.config import SPLITS
+from torchsoft.datasets.files import Manifest, StoreError, digest, folder, read_record, record_key
 from torchsoft.physics.arguments import whole
 
 DTYPES = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
 """What numbers may be given as."""
 
 
-def vouched(url: str, *, unfinished: bool = False) -> Vouched:
-    """The store for reading. Raises `StoreError` for a dataset that is damaged, or not finished unless that is allowed."""
-    manifest = Manifest.read(url)
-    there = finished(url, manifest.layout)
-    if (lacking := manifest.layout.shards - len(there)) and not unfinished:
-        raise StoreError(
-            f"{url}: {lacking} of {manifest.layout.shards} shards are not finished; start `python -m data_gen.generate` "
-            "again to make them, or give `unfinished=True` to leave their trajectories out"
-        )
-    return Vouched(url, manifest, there)
+class Vouched(WrapperStore[Store]):
+    """Reads the files laid out at the start and those of the `finished` shards, each checked against its digest when it is
+    first touched; what no digest vouches for is not there.
+
+    Raises `StoreError` for a file that is missing or not what was written (zarr alone would give its fill value), and for a
+    dataset that is not finished unless that is allowed.
+    """
+
+    def __init__(self, url: str, *, unfinished: bool = False) -> None:
+        manifest = Manifest.read(url)
+        self.url, self.layout, self.digests = url, manifest.layout, dict(manifest.digests)
+        self.finished = self.layout.finished(url)
+        if (lacking := self.layout.shards - len(self.finished)) and not unfinished:
+            raise StoreError(
+                f"{url}: {lacking} of {self.layout.shards} shards are not finished; start `python -m data_gen.generate` "
+                "again to make them, or give `unfinished=True` to leave their trajectories out"
+            )
+        here = folder(url)
+        super().__init__(LocalStore(here, read_only=True) if here else FsspecStore.from_url(url, read_only=True))
+        self.unread, self.checked = set(self.finished), set[str]()
+
+    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
+        shard = self.layout.shard(key)
+        if shard in self.unread:
+            data = await self._store.get(record_key(shard), prototype)
+            self.digests |= read_record(self.url, self.layout, shard, None if data is None else data.to_bytes())
+            self.unread.discard(shard)
+        if key not in self.digests:
+            return None
+        first = key not in self.checked
+        found = await self._store.get(key, prototype, None if first else byte_range)
+        sound = found is not None and not (first and digest(found.to_bytes()) != self.digests[key])
+        found = self.layout.vouch(self.url, key, found, sound)
+        self.checked.add(key)
+        return await self.get(key, prototype, byte_range) if first and byte_range is not None else found
+
+    async def get_partial_values(
+        self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
+    ) -> list[Buffer | None]:
+        return [await self.get(key, prototype, byte_range) for key, byte_range in key_ranges]
+
+    _get_many = Store._get_many  # which asks `get`
+
+    def data(self, **how: Any) -> xr.Dataset:
+        """The arrays, lazily."""
+        return xr.open_zarr(self, consolidated=True, zarr_format=3, **how)
+
+
+def open_dataset(url: str, *, unfinished: bool = False) -> xr.Dataset:
+    """The whole store, lazily, with named dimensions and units; without unfinished trajectories where that is allowed.
+
+    Raises `StoreError` for a dataset that is damaged or unfinished; the same when a damaged file is first touched.
+    """
+    store = Vouched(url, unfinished=unfinished)
+    data = store.data()
+    if len(store.finished) < store.layout.shards:
+        shard = np.arange(data.sizes["trajectory"]) // store.layout.trajectories_per_shard
+        data = data.isel(trajectory=np.isin(shard, list(store.finished)))
+    return data
 
 
 class Trajectories(Dataset[dict[str, Tensor]]):
@@ -52,50 +102,36 @@ class Trajectories(Dataset[dict[str, Tensor]]):
         stride: int | None = None, dtype: torch.dtype = torch.float64, unfinished: bool = False,
     ) -> None:  # fmt: skip
         self.url, self.variables, self.dtype, self.unfinished = str(url), tuple(variables), dtype, unfinished
+        self._opened = dict[int, xr.Dataset]()
         if dtype not in DTYPES:
             raise ValueError(f"`dtype` must be one of {', '.join(map(str, DTYPES))}, but is {dtype!r}")
-        self._group: zarr.Group | None = None
-        self._opened_by = 0
+        if split is not None and split not in SPLITS:
+            raise ValueError(f"`split` must be one of {', '.join(map(repr, SPLITS))}, but is {split!r}")
+        arrays, samples = self.data.variables, self.data.sizes["time"]
+        known = [k for k, v in arrays.items() if v.dims[:1] == ("trajectory",) and v.dtype.kind in "fiu"]
         for name in self.variables:
-            if name not in self.group or self.dims(name)[0] != "trajectory" or self.array(name).dtype.kind not in "fiu":
-                known = [k for k, a in self.group.arrays() if self.dims(k)[0] == "trajectory" and a.dtype.kind in "fiu"]
-                raise ValueError(f"`variables` has no numbers named {name!r}; known: {', '.join(sorted(known))}")
-        samples = self.array("time").shape[0]
+            if name not in known:
+                raise ValueError(
+                    f"`variables` has no numbers named {name!r}; known: {', '.join(sorted(map(str, known)))}"
+                )
         self.window = samples if window is None else whole("window", window, 1)
         if self.window > samples:
             raise ValueError(f"`window` must be 1 to {samples} samples, but is {window}")
-        step = self.window if stride is None else whole("stride", stride, 1)
-        self.starts = range(0, samples - self.window + 1, step)
-        self.trajectories = self._usable(split)
-
-    def _usable(self, split: str | None) -> np.ndarray[Any, Any]:
-        """Numbers of the trajectories that are sound and in the split; those of unfinished shards count as failed."""
-        usable = np.asarray(self.array("failed")[:]) == 0
+        self.starts = range(0, samples - self.window + 1, self.window if stride is None else whole("stride", stride, 1))
+        usable = arrays["failed"].values == 0  # so that those of unfinished shards are not
         if split is not None:
-            if split not in ("train", "validation", "test"):
-                raise ValueError(f"`split` must be 'train', 'validation' or 'test', but is {split!r}")
-            usable &= np.asarray(self.array("split")[:]) == split
-        return np.flatnonzero(usable)
+            usable &= arrays["split"].values == split
+        self.trajectories = np.flatnonzero(usable)
 
     @property
-    def group(self) -> zarr.Group:
+    def data(self) -> xr.Dataset:
         """The store, opened on first use; once more after a fork, which connections do not survive."""
-        if self._group is None or self._opened_by != os.getpid():
-            self._group = opened(vouched(self.url, unfinished=self.unfinished))
-            self._opened_by = os.getpid()
-        return self._group
-
-    def array(self, name: str) -> zarr.Array[Any]:
-        found = self.group[name]
-        assert isinstance(found, zarr.Array)
-        return found
-
-    def dims(self, name: str) -> tuple[str | None, ...]:
-        """Names of a variable's dimensions."""
-        return tuple(getattr(self.array(name).metadata, "dimension_names", None) or (None,))
+        if os.getpid() not in self._opened:
+            self._opened = {os.getpid(): Vouched(self.url, unfinished=self.unfinished).data(chunks=None)}
+        return self._opened[os.getpid()]
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_group": None}
+        return self.__dict__ | {"_opened": {}}
 
     def __len__(self) -> int:
         return len(self.trajectories) * len(self.starts)
@@ -106,10 +142,9 @@ class Trajectories(Dataset[dict[str, Tensor]]):
         which, window = divmod(index % len(self), len(self.starts))
         trajectory, start = int(self.trajectories[which]), self.starts[window]
         item = {"trajectory": torch.tensor(trajectory), "start": torch.tensor(start)}
+        at = {"trajectory": trajectory, "time": slice(start, start + self.window)}
         for name in self.variables:
-            array = self.array(name)
-            at = (trajectory, slice(start, start + self.window)) if array.ndim > 1 else trajectory
-            given = torch.from_numpy(np.array(array[at], dtype=float))
+            given = torch.from_numpy(np.array(self.data.variables[name].isel(at, missing_dims="ignore"), dtype=float))
             item[name] = given.to(self.dtype)
             lost = given[item[name].isinf() & given.isfinite()]
             if len(lost):
@@ -118,21 +153,3 @@ class Trajectories(Dataset[dict[str, Tensor]]):
                     "`dtype`"
                 )
         return item
-
-
-def opened(store: Vouched) -> zarr.Group:
-    """The arrays."""
-    return zarr.open_group(store, mode="r", zarr_format=3, use_consolidated=True)
-
-
-def open_dataset(url: str, *, unfinished: bool = False) -> xr.Dataset:
-    """The whole store, lazily, with named dimensions and units; without unfinished trajectories where that is allowed.
-
-    Raises `StoreError` for a dataset that is damaged or unfinished; the same when a damaged file is first touched.
-    """
-    store = vouched(url, unfinished=unfinished)
-    data = xr.open_zarr(store, consolidated=True, zarr_format=3)
-    if len(store.finished) < store.layout.shards:
-        shard = np.arange(data.sizes["trajectory"]) // store.layout.trajectories_per_shard
-        data = data.isel(trajectory=np.isin(shard, list(store.finished)))
-    return data

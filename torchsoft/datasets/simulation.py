@@ -1,35 +1,97 @@
-"""One task simulated: the arrays of one trajectory, or the reason why there are none."""
+"""Trajectory number `index`: parameters and motion by the configuration alone, then the run, or why there is none."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.stats import qmc
 
 from torchsoft.channels import PADS
-from torchsoft.datasets.config import RATIO, Config
-from torchsoft.datasets.design import Task, excitation
-from torchsoft.datasets.schema import KEPT, energies, not_finite, sizes, variables
-from torchsoft.excitation import reference
+from torchsoft.datasets.config import RATIO, SPLITS, Config, MultiSine
+from torchsoft.datasets.schema import KEPT, energies, not_finite, variables
+from torchsoft.excitation import Excitation, reference
 from torchsoft.paper.equilibrium import holding_force, press, rest
+from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.scenario import find_grasp_force
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import simulate
 from torchsoft.solve.trajectory import Trajectory
 
-Row = dict[str, Any]
+GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 POSITION, NODAL_FORCE, FORCE = 10, 8, 4
 """Decimals that starting poses and displacements [m], nodal forces [N] and grasping forces [N] are rounded to: linear solvers
 differ in the last bits with the alignment of memory, and a run may amplify that."""
 
+COUNTS = ("steps", "newton_iterations")
+
+Row = dict[str, Any]
+
+
+class Task(NamedTuple):
+    """One trajectory: its parameters, its motion, and what is known of it before it is simulated."""
+
+    index: int
+    parameters: Parameters
+    excitation: Excitation
+    labels: Row
+
+
+def points(config: Config) -> NDArray[np.floating]:
+    """The design in the unit cube, shape (trajectories, dimensions).
+
+    A Sobol sequence is a prefix of every longer one of the same seed; a Latin hypercube belongs to its size.
+    """
+    dimensions = len(config.parameters) + 2 + max(len(kind.ranges) for kind in config.kinds)
+    rng = np.random.default_rng(config.seed)
+    if config.method == "latin_hypercube":
+        return qmc.LatinHypercube(dimensions, rng=rng).random(config.trajectories)
+    power = int(np.ceil(np.log2(config.trajectories)))
+    return qmc.Sobol(dimensions, scramble=True, rng=rng).random_base2(power)[: config.trajectories]
+
+
+def task(config: Config, index: int, u: NDArray[np.floating]) -> Task:
+    """Trajectory `index` at the point u (dimensions,) of the design."""
+    n, rng = len(config.parameters), np.random.default_rng((config.seed, index))
+    *own, common, which = u[: n + 2].tolist()
+    sampled = {name: r.at(x) for (name, r), x in zip(config.parameters.items(), own)}
+    edges = np.cumsum([kind.weight for kind in config.kinds])
+    kind = config.kinds[min(int(np.searchsorted(edges, which * edges[-1], side="right")), len(edges) - 1)]
+    motion: Any = {name: r.at(x) for (name, r), x in zip(kind.ranges.items(), u[n + 2 :].tolist())}
+    depth = motion.pop("depth", config.grasp_depth.at(common))  # a kind may have a range of its own
+    side = float(rng.choice((-1.0, 1.0)))
+    if "travel" in motion:
+        motion["travel"] *= side
+    if isinstance(kind, MultiSine):
+        motion |= {"frequency": (kind.frequency.low, kind.frequency.high), "components": kind.components}
+        motion["seed"] = int(rng.integers(2**31))
+    p = config.physics(sampled | kind.sets, depth)
+    excitation = Excitation(
+        motion=motion | {"kind": kind.motion or kind.kind}, duration=config.duration, depth=depth,
+        senses=p.control.senses, grasp_time=p.scenario.grasp_time, settle=config.settle, x_C0=p.scenario.x_C0,
+    )  # fmt: skip
+    labels: Row = {name.replace("/", "_over_"): value for name, value in sampled.items()}
+    if RATIO in sampled:
+        labels["contact.mu_k"] = p.contact.mu_k
+    labels |= {"grasp_depth": depth, "kind": kind.kind, "split": split(config, index)}
+    return Task(index, p, excitation, labels)
+
+
+def split(config: Config, index: int) -> str:
+    """Train, validation or test: the golden-ratio sequence from a seeded start, so that small sets keep the fractions."""
+    u = (np.random.default_rng((config.seed, 0)).random() + index * GOLDEN) % 1.0
+    edges = (config.splits.train, config.splits.train + config.splits.validation)
+    return SPLITS[int(np.searchsorted(edges, u, side="right"))]
+
 
 def simulate_task(config: Config, task: Task) -> Row:
     """Every variable of the schema for one trajectory, without its first dimension.
 
-    A simulation that fails leaves NaN (and no contact) in its series, and its reason.
+    A simulation that fails has NaN (and no contact) for its series, and its reason.
     """
-    out = empty_row(config) | labels(task)
+    out = {name: variable.empty for name, variable in variables(config).items()} | task.labels | {"failed": 1}
     t = torch.arange(config.samples, dtype=torch.float64) * config.sample_interval
     try:
         model = SoftGrasp(task.parameters)
@@ -40,18 +102,16 @@ def simulate_task(config: Config, task: Task) -> Row:
             force = holding_force(model, press(model, task.parameters.scenario.y_Br_grasp))
         force = round(force, FORCE)
         y_Br = float(model.unpack(y0).pose["bracket"][1])
-        motion = reference(excitation(config, task), model, y_Br, force)
+        motion = reference(task.excitation, model, y_Br, force)
         run = simulate(model, t, y0=y0, reference=motion, **config.steps)
     except SimulationFailed as failure:
-        stats = failure.trajectory.stats if failure.trajectory is not None else None
-        done = {"steps": stats.steps, "newton_iterations": stats.newton_iterations} if stats else {}
-        return out | done | {"failed": 1, "reason": failure.reason, "failure_time": failure.time}
+        done = {name: getattr(failure.trajectory.stats, name) for name in COUNTS} if failure.trajectory else {}
+        return out | done | {"reason": failure.reason, "failure_time": failure.time}
     except (np.linalg.LinAlgError, RuntimeError, ValueError) as failure:
-        return out | {"failed": 1, "reason": f"{type(failure).__name__}: {failure}"}
-    row = out | series(config, model, run) | {"grasp_force": force}
-    if bad := not_finite(config, row):
-        return out | {"failed": 1, "reason": f"not finite: {', '.join(bad)}"}
-    return row
+        return out | {"reason": f"{type(failure).__name__}: {failure}"}
+    row = out | series(config, model, run) | {"grasp_force": force, "failed": 0}
+    bad = not_finite(config, row)
+    return out | {"reason": f"not finite: {', '.join(bad)}"} if bad else row
 
 
 def start(model: SoftGrasp) -> torch.Tensor:
@@ -63,43 +123,17 @@ def start(model: SoftGrasp) -> torch.Tensor:
     return y0
 
 
-def empty_row(config: Config) -> Row:
-    """A trajectory of nothing: NaN, and zero where there is no NaN."""
-    length, out = sizes(config), {}
-    for name, variable in variables(config).items():
-        shape = tuple(length[dim] for dim in variable.dims[1:])
-        if variable.dtype == "str":
-            out[name] = ""
-        else:
-            out[name] = np.full(shape, np.nan if variable.dtype.startswith("float") else 0, variable.dtype)
-    return out
-
-
-def labels(task: Task) -> Row:
-    """What is known before the simulation."""
-    sampled = {name.replace("/", "_over_"): value for name, value in task.sampled.items()}
-    if RATIO in task.sampled:
-        sampled["contact.mu_k"] = task.parameters.contact.mu_k
-    return sampled | {"grasp_depth": task.grasp_depth, "kind": task.kind.kind, "split": task.split}
-
-
 @torch.no_grad()
 def series(config: Config, model: SoftGrasp, run: Trajectory) -> Row:
     """The series and numbers of a finished run."""
     data = run.to_dataset()
-    out = {name: data[name].values for name in KEPT}
+    kept = [*KEPT, *(f"{force}_force_{pad}" for force in ("normal", "friction") for pad in PADS.values())]
+    out: Row = {name: data[name].values for name in (*kept, "energy_residual")}
+    out["injected_energy"], out["energy_residual_rel"] = run.injected.numpy(), run.energy_residual_rel
     for kind, (_, parts) in energies(config).items():
         prefix = "energy" if kind == "stored" else kind
         out[f"{kind}_energy"] = np.stack([data[f"{prefix}_{part}"].values for part in parts], -1)
     for key, pad in PADS.items():
-        for name in ("normal_force", "friction_force"):
-            out[f"{name}_{pad}"] = data[f"{name}_{pad}"].values
         out[f"displacement_{pad}"] = (model.pads[key].spread @ run.displacement[key]).numpy()
         out[f"contact_{pad}"] = (model.penetration(key, run.state) > 0).numpy().astype(np.uint8)
-    return out | {
-        "injected_energy": run.injected.numpy(),
-        "energy_residual": run.energy_residual.numpy(),
-        "energy_residual_rel": run.energy_residual_rel,
-        "steps": run.stats.steps,
-        "newton_iterations": run.stats.newton_iterations,
-    }
+    return out | {name: getattr(run.stats, name) for name in COUNTS}
