@@ -47,7 +47,7 @@ HELP = "take fewer trajectories, a looser rtol or a shorter duration"
 
 def cost(config: Config, workers: int) -> Cost:
     """Of the whole dataset, made by that many workers."""
-    p, side_by_side = config.physics({}, config.grasp_depth.low), max(min(workers, config.shards), 1)
+    p, at_once = config.physics({}, config.grasp_depth.low), max(min(workers, config.shards), 1)
     seconds = config.duration
     if config.feed_forward == "found":
         seconds += FOUND * (p.scenario.grasp_time + SETTLE)
@@ -62,8 +62,8 @@ def cost(config: Config, workers: int) -> Cost:
     design = 8 * 2 * config.trajectories * (len(config.parameters) + 8) / 2**30
     return Cost(
         steps=config.trajectories * steps,
-        seconds=config.trajectories * (steps * step_seconds(p) + RUN) / side_by_side,
-        memory=design + shard * side_by_side,
+        seconds=config.trajectories * (steps * step_seconds(p) + RUN) / at_once,
+        memory=design + shard * at_once,
         disk=kept * config.trajectories,
     )
 
