@@ -174,7 +174,7 @@ def figure(data: xr.Dataset, config: Config) -> Figure:
     for ax, x, y in zip(panels.flat, names, [*names[1:], names[0]]):
         for name, some in table.groupby("split"):
             ax.plot(some[x], some[y], "x" if name == "failed" else ".", ms=4)
-        label, other = (f"{name.replace('_over_', ' over\n')} [{data[name].units}]" for name in (x, y))
+        label, other = (f"{name} [{data[name].units}]".replace("_over_", " over\n") for name in (x, y))
         ax.set(xlabel=label, ylabel=other, xscale=ranged[x].scale, yscale=ranged[y].scale)
     for ax in panels.flat[len(names) : -4]:
         ax.set_axis_off()
