@@ -227,9 +227,9 @@ def test_orientation_smoke(tmp_path: Path) -> None:
 
 def test_orientation_rig_has_the_gains_of_its_design() -> None:
     """The gains in the file are those of the experiment's bandwidth; rigid statics are the closed form of an ellipse."""
-    module = experiment("_orientation_cases")
+    module = experiment("orientation")
     file = module.RigFile.from_toml(module.FILE)
-    for name, gains in module.design(file, 150.0).table.items():
+    for name, gains in module.design(file, 150.0).items():
         assert file.actuators[name].Kp == pytest.approx(gains["Kp"], rel=1e-2)
         assert file.actuators[name].Kd == pytest.approx(gains["Kd"], rel=1e-2)
     asks = module.rigid(Ellipse(20e-3, 10e-3), 10.0, 0.0)
