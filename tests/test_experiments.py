@@ -259,7 +259,7 @@ def test_shapes_and_materials_smoke(tmp_path: Path) -> None:
 def test_the_theories_of_rolling_meet() -> None:
     """Long waves compress a layer uniaxially, short ones see a half-plane; on a thin layer the moving contact is the closed
     form's, with the same peak."""
-    theory = experiment("_shapes_theory")
+    theory = experiment("_shapes_resistance")
     h, nu = 4e-3, 0.3
     long, deep, deeper = theory.layer_compliance(np.array([1e-3, 11.9, 12.1]) / h, h, nu)
     assert long[1, 1].real == pytest.approx(h * (1 + nu) * (1 - 2 * nu) / (1 - nu), rel=1e-5)
