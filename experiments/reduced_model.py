@@ -6,15 +6,12 @@ Stick. Both pads stick to the disc: each is a spring k and a dashpot c on its sl
     m_Br x_Br'' =  F_x - k (x_Br - x_C + r theta) - c (...)'
 with F_x known from the control law. What mechanics expects of k, c, r and c_r is computed from the full model, linearised in
 the grasp: pads and stretches condensed at rest ("static"), and, because that condensation is not quite a spring and a dashpot
-at every frequency, the same regression on the linearised full model under the same motions ("in band"). Slow rolling does not
-excite k and c (m x_C'' is nothing), so the training motions are taps: small random velocities of disc and bracket and a broad
-multi-sine, some micrometres large. The radius comes from one roll to the other side. Held out: the paper's manipulation.
+at every frequency, the same regression on the linearised full model under the same motions ("in band"). The
+training motions are taps: small random velocities of disc and bracket and a broad multi-sine, some micrometres large. The
+radius comes from one roll to the other side. Held out: the paper's manipulation.
 
 Slip. A light grasp, the horizontal loop on the bracket, strokes ever faster: the disc rolls on the lower pad and the upper one
-slips. Then F_U = mu_k N_U + eta n s_U' and x_C = -r theta, so that x_C'' = 2 F_U / (m + I / r^2). Held out: other strokes.
-
-Errors are root mean squares over the signal's range, worst of the six states; `summary.json` has those over the standard
-deviation as well.
+slips. Held out: other strokes. Errors are root mean squares over the signal's range, worst of the six states.
 
 Command: .venv/bin/python experiments/reduced_model.py [--smoke]
 Expected: stick: 8 terms, the very ones above; held-out error 0.3 % of range (node transitions in the spin), more than 100 times
@@ -24,22 +21,396 @@ first. Slip: 5 terms, 1 % up to 80 m/s2, 4 % at 300 m/s2, where the normal force
 in a grasp of another depth, which is another mode. Two minutes on one core.
 """
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from importlib.metadata import version
-from typing import Any
+from itertools import takewhile
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
-from _reduced_common import Config, smoke
-from _reduced_gain import study_gain
-from _reduced_slip import study_slip
-from _reduced_stick import study_stick
+import torch
 from matplotlib.figure import Figure
+from scipy.optimize import brentq
+from scipy.signal import cont2discrete
 from threadpoolctl import threadpool_limits
-from tqdm import tqdm
 
-from torchsoft.experiment import made_by, markdown, options, write
+from torchsoft import Parameters, Profile, Reference, SoftGrasp, Trajectory, hold, simulate
+from torchsoft.excitation import Excitation, Strokes, Waves, begin, wave
+from torchsoft.experiment import COARSE, grid, made_by, markdown, options, timed, write
 from torchsoft.files import finite
-from torchsoft.reduced.records import STATES
+from torchsoft.physics.contact import ramp
+from torchsoft.reduced.fit import Recipe, assemble, choose, fit, rollout_of, score
+from torchsoft.reduced.ode import ReducedModel, Term
+from torchsoft.reduced.records import STATES, Record, noisy, record, rolling_radius
+from torchsoft.reduced.terms import friction, joined, mechanics
+from torchsoft.scenario import grasp_and_roll
+from torchsoft.solve.stability import linearised
+
+
+@dataclass(frozen=True)
+class Config:
+    out: Path = Path("out/reduced_model")
+    taps: int = 12
+    tap_time: float = 0.3  # length of a tap [s]
+    wave: float = 1e-5  # root mean square of a tap's multi-sine, over sqrt(2) [m]
+    kick: float = 2e-3  # root mean square of a tap's initial velocities [m/s]
+    band: tuple[float, float] = (3.0, 150.0)  # of the multi-sine [Hz]
+    validation: float = 5e-5  # of the multi-sine by which thresholds are chosen, as `wave` [m]
+    scenario: float = 1.0  # the manipulation's times, as parts of the paper's
+    thresholds: tuple[float, ...] = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.3)
+    models: int = 50  # members of an ensemble
+    noise: tuple[float, ...] = (0.0, 0.005, 0.01, 0.02, 0.05)  # standard deviations, in parts of the signals' own
+    draws: int = 3  # of the noise
+    depth: float = 3e-4  # of the light grasp [m]
+    stroke_times: tuple[float, ...] = (0.12, 0.08, 0.065, 0.05, 0.04, 0.03)  # of the training strokes of 20 mm [s]
+    checking_times: tuple[float, ...] = (0.07, 0.04)  # of those of 15 mm to the other side that choose thresholds [s]
+    other_times: tuple[float, ...] = (0.15, 0.1, 0.055, 0.045, 0.035, 0.03, 0.025, 0.02)  # held out [s]
+    speeds: tuple[float, ...] = (0.005, 0.01, 0.02)  # that tanh(s' / speed) is tried with [m/s]
+    gains: int = 60  # of the sweep
+    seed: int = 0
+    smoke: bool = False  # a size that takes seconds
+
+
+def law(p: Parameters, R_80: float | None = None) -> dict[str, dict[str, float]]:
+    """The horizontal loop as feedback of the reduced model (Eq. 33, 34)."""
+    K, R = p.control.K_81, R_80 or p.control.R_80
+    x, v = ("x_C", "v_C") if p.control.senses == "disc" else ("x_Br", "v_Br")
+    return {"F_x": {"x_d": K, "x_d_dot": R, x: -K, v: -R}}
+
+
+def slipping(model: SoftGrasp, run: Trajectory) -> float:
+    """Part of the touching nodes of the upper pad that slip faster than 1 mm/s, over time."""
+    with torch.no_grad():
+        at = model.evaluate(0.0, model.unpack(run.y[::20])).interfaces["U"]
+        touching = at.frame.g > 0
+        slip = ramp(at.frame.g, model.contacts["U"].law.epsilon) * at.flow[..., 1] - at.out[..., 2]
+        return float((touching & (slip.abs() > 1e-3)).sum() / touching.sum())
+
+
+def compared(model: ReducedModel, static: dict[tuple[str, str], float], banded: ReducedModel) -> list[dict[str, Any]]:
+    """The coefficients beside what is expected of them; None where mechanics has no such term."""
+    rows = model.coefficient_table()
+    for row, other in zip(rows, banded.coefficient_table()):
+        value, near = static.get((row["equation"], row["term"])), other["value"]
+        row |= {"expected": value, "error": None if value is None else row["value"] / value - 1,
+                "expected_in_band": near, "error_in_band": row["value"] / near - 1}  # fmt: skip
+    return rows
+
+
+def refit(records: Sequence[Record], model: ReducedModel, recipe: Recipe, **how: Any) -> ReducedModel:
+    """A regression on just the terms of a model, in which none is left out."""
+    terms = {target: [term for term, _ in pairs] for target, pairs in model.equations().items()}
+    return fit(assemble(records, terms, recipe), replace(recipe, threshold=0.0, **how), model.feedback)
+
+
+def rollout_time(model: ReducedModel, on: Record, repeats: int = 9) -> float:
+    """Wall time of a rollout [s], the least, which other work on the machine disturbs least."""
+    return min(timed(lambda: rollout_of(model, on))[1] for _ in range(repeats))
+
+
+SETTLED = 1.0  # Time [s] at which the grasp has settled.
+
+
+@dataclass(frozen=True)
+class Grasp:
+    """The paper's grasp, settled: the model, its state, and what holds it there."""
+
+    p: Parameters
+    y: torch.Tensor
+    force: float
+
+    def model(self, **changed: float) -> SoftGrasp:
+        return SoftGrasp(self.p.override({f"control.{k}": v for k, v in changed.items()}))
+
+    def move(self, x: Profile, duration: float, *, step: float, sample: float, **changed: float) -> Trajectory:
+        """The run in which the disc is to follow x_d(t) from the settled grasp."""
+        y, force = Profile([0.0], [self.p.scenario.y_Br_grasp]), Profile([0.0], [-self.force])
+        t, reference = grid(duration, sample), Reference(x_d=x, y_d=y, F_ff=force)
+        return simulate(self.model(**changed), t, y0=self.y, reference=reference, step=step)
+
+
+def settle(p: Parameters) -> Grasp:
+    model = SoftGrasp(p)
+    whole = grasp_and_roll(model)
+    grasped = Reference(x_d=Profile([0.0], [p.scenario.x_C0]), y_d=model.reference["y_d"], F_ff=model.reference["F_ff"])
+    y = simulate(model, torch.tensor([0.0, SETTLED], dtype=torch.float64), y0=whole.y0, reference=grasped).y[-1]
+    return Grasp(p, y, whole.grasp_force)
+
+
+def sines(config: Config, p: Parameters, size: float, band: tuple[float, float], seed: int, duration: float) -> Waves:
+    """A multi-sine about where the disc is, under way from the first instant."""
+    n, rng = 12, np.random.default_rng((config.seed, seed))
+    f = band[0] * (band[1] / band[0]) ** ((np.arange(n) + rng.random(n)) / n)
+    components = wave(np.full(n, size / n**0.5), f, np.zeros(n), rng.uniform(0, 2 * np.pi, n))
+    return Waves(([0.0], [p.scenario.x_C0]), -1.0, duration + 1.0, components)
+
+
+def tapped(grasp: Grasp, config: Config) -> tuple[list[Record], np.ndarray]:
+    """The taps, and the initial velocities of x_C, theta and x_Br that they began with (taps, 3)."""
+    rng, (_, v, _), out, kicks = np.random.default_rng(config.seed), indices(grasp.model()), [], []
+    for i in range(config.taps):
+        kick = config.kick * rng.standard_normal(3) / (1.0, grasp.p.disc.radius, 1.0)
+        y = grasp.y.clone()
+        y[v] += torch.from_numpy(kick)
+        x = sines(config, grasp.p, config.wave, config.band, i, config.tap_time)
+        out.append(record(replace(grasp, y=y).move(x, config.tap_time, step=2.5e-4, sample=2.5e-4)))
+        kicks.append(kick)
+    return out, np.array(kicks)
+
+
+def indices(model: SoftGrasp) -> tuple[list[int], list[int], int]:
+    """Indices of x_C, theta, x_Br and of their rates in the state, and the number of internal states before them."""
+    at = model.layout.slices
+    starts = [(at[part, "disc"].start, at[part, "bracket"].start) for part in ("pose", "velocity")]
+    q, v = ([disc, disc + 2, bracket] for disc, bracket in starts)
+    return q, v, q[0]
+
+
+def expected(grasp: Grasp, A: np.ndarray, frequency: float = 1.0) -> dict[str, float]:
+    """k, c, r and c_r of the linearised full model, pads and stretches condensed at a low frequency [Hz]."""
+    model, w = grasp.model(), 2j * np.pi * frequency
+    q, v, inner = indices(model)
+    inner = slice(0, inner)
+    disc, bracket = model.bodies["disc"], model.bodies["bracket"]
+    masses = np.array([disc.mass.item(), disc.inertia.item(), bracket.mass.item()])
+    followed = np.linalg.solve(w * np.eye(inner.stop) - A[inner, inner], A[inner, q] + w * A[inner, v])
+    Z = masses[:, None] * (A[np.ix_(v, q)] + w * A[np.ix_(v, v)] + A[v, inner] @ followed)  # force, moment per motion
+    spring = -Z[0, 0] / 2  # k + i omega c
+    r = (Z[1, 2] / -spring).real
+    rolling = -(Z[1, 1] + 2 * r**2 * spring)
+    names = ("m", "I", "m_Br", "k", "c", "r", "c_r")
+    return dict(zip(names, (*masses, spring.real, spring.imag / w.imag, r, rolling.imag / w.imag)))
+
+
+def in_band(grasp: Grasp, A: np.ndarray, taps: Sequence[Record], kicks: np.ndarray) -> list[Record]:
+    """The taps as the linearised full model makes them."""
+    model, p = grasp.model(), grasp.p
+    q, v, _ = indices(model)
+    B = np.zeros((len(A), 2))
+    B[v[2]] = np.array([p.control.K_81, p.control.R_80]) / p.bracket.mass
+    discrete: Any = cont2discrete((A, B, np.eye(len(A)), 0 * B), taps[0].step, method="foh")
+    F, G, _, D, _ = discrete
+    u = np.stack([tap.columns(("x_d", "x_d_dot")) for tap in taps], 1)  # (T, taps, 2)
+    x = np.zeros((len(taps), len(A)))
+    x[:, v] = kicks
+    x -= u[0] @ D.T
+    rows = []
+    for now in u:
+        rows.append((x + now @ D.T)[:, [*q, *v]])
+        x = x @ F.T + now @ G.T
+    out = []
+    for i, tap in enumerate(taps):
+        series = dict(zip(STATES, np.array(rows)[:, i].T))
+        series |= {name: tap.series[name] for name in ("x_d", "x_d_dot")}
+        series["F_x"] = sum(gain * series[name] for name, gain in law(p)["F_x"].items())
+        out.append(Record(tap.t, series))
+    return out
+
+
+def by_mechanics(e: dict[str, float]) -> dict[tuple[str, str], float]:
+    """What mechanics expects of every coefficient, by equation and term."""
+    spin = -e["r"] / e["I"]
+    return {
+        ("v_C", "x_Br - 2 x_C"): e["k"] / e["m"],
+        ("v_C", "v_Br - 2 v_C"): e["c"] / e["m"],
+        ("omega", "x_Br + 2 r theta"): spin * e["k"],
+        ("omega", "v_Br + 2 r omega"): spin * e["c"],
+        ("omega", "omega"): -e["c_r"] / e["I"],
+        ("v_Br", "x_Br - x_C + r theta"): -e["k"] / e["m_Br"],
+        ("v_Br", "v_Br - v_C + r omega"): -e["c"] / e["m_Br"],
+        ("v_Br", "F_x"): 1 / e["m_Br"],
+    }
+
+
+def study_stick(config: Config) -> tuple[dict[str, Any], Grasp, ReducedModel]:
+    changes: dict[str, Any] = COARSE if config.smoke else {}
+    times = {"roll_time": 10.0, "hold_time": 5.0, "rest_time": 5.0}
+    p = Parameters().override(changes | {f"scenario.{name}": config.scenario * value for name, value in times.items()})
+    grasp = settle(p)
+    x_0, far = p.scenario.x_C0, p.scenario.x_C0 + 20e-3
+    taps, kicks = tapped(grasp, config)
+    roll_time = 5.0 * max(config.scenario, 0.2)
+    far_roll = Profile([0.0, roll_time, 1.1 * roll_time], [x_0, far, far])
+    roll = record(grasp.move(far_roll, 1.1 * roll_time, step=2e-3, sample=4e-3))
+    waves = record(grasp.move(sines(config, p, config.validation, (2.0, 60.0), 1000, 1.0), 1.0, step=5e-4, sample=1e-3))
+    stroke = record(grasp.move(Profile([0.0, 1.0, 1.2], [x_0, x_0 + 6e-3, x_0 + 6e-3]), 1.2, step=2e-3, sample=4e-3))
+    model = SoftGrasp(p)
+    whole = grasp_and_roll(model, grasp_force=grasp.force)
+    runs = [simulate(model, grid(p.scenario.duration, 2e-3), y0=whole.y0) for _ in range(1 if config.smoke else 3)]
+    full, wall = runs[0], min(run.stats.wall_s for run in runs)
+    held = record(full)
+
+    r, feedback = rolling_radius([roll]), law(p)
+    recipe = Recipe(width=0.004, window=config.tap_time, seed=config.seed)
+    tests, library = [waves, stroke], mechanics(r)
+    choice = choose(assemble(taps, library, recipe), tests, recipe, config.thresholds, feedback)
+    model_ = refit(taps, choice.model, recipe, models=config.models)
+    A = linearised(model, grasp.y, hold(x_d=x_0, y_d=p.scenario.y_Br_grasp, F_ff=-grasp.force)).numpy()
+    parts = expected(grasp, A)
+    banded, static = refit(in_band(grasp, A, taps, kicks), model_, recipe), by_mechanics(parts)
+    result = score(model_, held)
+    noise = []
+    for level in config.noise:
+        rows = []
+        for draw in range(config.draws if level else 1):
+            rough = [noisy(tap, level, config.seed + 100 * draw + i) for i, tap in enumerate(taps)]
+            try:
+                found = choose(assemble(rough, library, recipe), tests, recipe, config.thresholds, feedback).model
+                row: dict[str, Any] = {"terms": len(found.terms), "heldout_nrmse": score(found, held).worst}
+            except ValueError as error:
+                row = {"terms": None, "heldout_nrmse": None, "failure": str(error)}
+            row["refitted"] = {
+                f"{equation}: {term}": one["value"] / static[equation, term]
+                for one in refit(rough, model_, recipe).coefficient_table()
+                if (equation := one["equation"], term := one["term"]) in static
+            }
+            rows.append(row)
+        noise.append({"noise": level, "draws": rows})
+
+    fast = rollout_time(model_, held)
+    summary = {
+        "terms": len(model_.terms), "heldout_nrmse": result.worst, "heldout_nrmse_by_state": result.nrmse,
+        "validation_nrmse": choice.tried[choice.index]["nrmse"], "speedup": wall / fast, "wall_full_s": wall,
+        "wall_reduced_s": fast, "equations": model_.text(), "latex": model_.latex(),
+        "rolling_radius_mm": {"found": 1e3 * r, "expected": 1e3 * parts["r"]}, "mechanics": parts,
+        "coefficients": compared(model_, static, banded), "noise": noise, "thresholds": choice.tried,
+    }  # fmt: skip
+    return summary, grasp, model_
+
+
+def step_response(t: np.ndarray, x: np.ndarray, height: float, begun: float) -> dict[str, float]:
+    """Overshoot over the step's height, and the time after which x stays within 2 % of it [s]."""
+    away = np.abs(x - height) > 0.02 * height
+    last = len(x) - 1 - int(away[::-1].argmax()) if away.any() else 0
+    return {"overshoot": float(x.max() / height - 1), "settling_s": float(t[last] - begun)}
+
+
+def study_gain(config: Config, grasp: Grasp, model: ReducedModel) -> dict[str, Any]:
+    """R_80 swept on the reduced model; a step of 50 um with the own gain and the best one confirmed on the full one."""
+    p, height, begun = grasp.p, 5e-5, 0.01
+    x = Profile([begun, 2 * begun], [0.0, height])
+    t = np.linspace(0.0, 0.4, 1601)
+    u = np.column_stack([part.numpy() for part in x(torch.from_numpy(t))])
+
+    def growth(R: float) -> float:
+        modes = np.linalg.eigvals(model.with_feedback(law(p, R_80=R)).state_space()[0])
+        return float(modes[np.abs(modes) > 1.0].real.max())
+
+    def response(R: float) -> dict[str, float]:
+        out = model.with_feedback(law(p, R_80=R)).rollout(t, np.zeros(6), u)
+        return step_response(t, out.y[:, 0], height, begun) if growth(R) < 0 else {}
+
+    gains = np.geomspace(3.0, 30_000.0, config.gains)
+    rows, cost = timed(lambda: [{"R_80": float(R), "growth_1_s": growth(R), **response(R)} for R in gains])
+    signs = np.sign([row["growth_1_s"] for row in rows])
+    limits: list[Any] = [brentq(growth, a, b) for a, b, s in zip(gains, gains[1:], np.diff(signs)) if s]
+    best = min((row for row in rows if "settling_s" in row), key=lambda row: row["settling_s"])
+    confirmed = []
+    for R in [p.control.R_80] if config.smoke else [p.control.R_80, best["R_80"]]:
+        x_full = Profile([begun, 2 * begun], [p.scenario.x_C0, p.scenario.x_C0 + height])
+        run = grasp.move(x_full, 0.4, step=2.5e-4, sample=2.5e-4, R_80=R)
+        x_C = (run["x_C"] - run["x_C"][0]).numpy()
+        early, late = (np.ptp(x_C[i:j]) for i, j in ((600, 1000), (1200, 1600)))
+        confirmed.append({
+            "R_80": R, "growth_reduced_1_s": growth(R), "reduced": response(R),
+            "full": step_response(t, x_C, height, begun), "full_dies_out": bool(late < max(early, 1e-2 * height)),
+        })  # fmt: skip
+    return {
+        "gain": "R_80 [N.s/m]", "limits": limits, "best": best, "sweep": rows, "sweep_wall_s": cost, "confirmed": confirmed,
+    }  # fmt: skip
+
+
+class Stroke(NamedTuple):
+    """Strokes in a light grasp: peak acceleration [m/s2], slipping part of the upper pad's touching nodes, mean normal
+    force there [N], and wall time of the full model [s]."""
+
+    record: Record
+    acceleration: float
+    slipping: float
+    load: float
+    wall_s: float
+
+
+def strokes(config: Config, travel: float, stroke_time: float, *, depth: float | None = None) -> Stroke:
+    """Strokes there and back from a light grasp with the horizontal loop on the bracket."""
+    motion = Strokes(travel=travel, stroke_time=stroke_time)
+    e = Excitation(motion=motion, duration=0.5 + 4 * stroke_time + 0.01, depth=depth or config.depth, senses="bracket")  # pyright: ignore[reportCallIssue]
+    changes: dict[str, Any] = {"contact.v_s": 0.05} | (COARSE if config.smoke else {})
+    model, y0 = begin(e, Parameters().override(changes))
+    t, start = grid(e.duration, 5e-4), 1000
+    run = simulate(model, t[: start + 1], y0=y0, step=5e-4)
+    rest = simulate(model, t[start:], y0=run.y[-1], step=5e-4)
+    peak = float(np.abs(np.gradient(rest["v_x_Br"].numpy(), 5e-4)).max())
+    load = float(rest.force["U"][..., 0].sum(-1).mean())
+    return Stroke(record(rest), peak, slipping(model, rest), load, rest.stats.wall_s)
+
+
+def sticking(model: ReducedModel) -> ReducedModel:
+    """The model's limit for small slip: every tanh(s' / speed) is s' / speed."""
+
+    def straight(term: Term) -> Term:
+        return replace(term, factors=tuple(part._replace(shape="linear") for part in term.factors))
+
+    equations = {name: [(straight(term), x) for term, x in pairs] for name, pairs in model.equations().items()}
+    return ReducedModel(
+        model.states, model.inputs, model.kinematics, equations, feedback=model.feedback, scale=model.scale
+    )
+
+
+def study_slip(config: Config) -> dict[str, Any]:
+    train = [strokes(config, -20e-3, T) for T in config.stroke_times]
+    other = {T: strokes(config, 15e-3, T) for T in (*config.checking_times, *config.other_times)}
+    p = Parameters().override({"control.senses": "bracket"})
+    gentle = max(config.stroke_times)
+    r, feedback = rolling_radius([train[config.stroke_times.index(gentle)].record]), law(p)
+    recipe = Recipe(width=0.004, window=min(config.stroke_times) * 4, seed=config.seed)
+    records, checks = [one.record for one in train], [other[T].record for T in config.checking_times]
+    held = {T: other[T] for T in config.other_times}
+
+    choices = []
+    for speed in config.speeds:
+        library = joined(mechanics(r, alike=False), friction(r, speed))
+        problem = assemble(records, library, recipe)
+        choices.append(choose(problem, checks, recipe, config.thresholds, feedback, each=False))
+    errors = [choice.tried[choice.index]["nrmse"] for choice in choices]
+    good = [one.model for one, error in zip(choices, errors) if error <= 1.1 * min(errors)]
+    model = refit(records, min(good, key=lambda one: len(one.terms)), recipe, models=config.models)
+    limit = sticking(model)
+
+    scores = {T: score(model, one.record) for T, one in other.items()}
+    deep = strokes(config, 15e-3, 0.04, depth=5 / 3 * config.depth)
+    fast = {T: rollout_time(model, one.record, 3) for T, one in other.items()}
+    by_stroke = [
+        {
+            "stroke_time_s": T, "acceleration_m_s2": one.acceleration, "slipping": one.slipping, "load_N": one.load,
+            "held_out": T in held, "nrmse": scores[T].worst, "rollout": str(scores[T].rollout),
+            "nrmse_linear": score(limit, one.record).worst, "speedup": one.wall_s / fast[T],
+        }
+        for T, one in sorted(other.items(), reverse=True)
+    ]  # fmt: skip
+    heldout = [row["nrmse"] for row in by_stroke if row["held_out"]]
+
+    def enough(key: str, allowed: float) -> float:
+        """Largest acceleration [m/s2] up to which all strokes are within `allowed`."""
+        rising = sorted(by_stroke, key=lambda row: row["acceleration_m_s2"])
+        fine = list(takewhile(lambda row: row[key] <= allowed, rising))
+        return fine[-1]["acceleration_m_s2"] if fine else 0.0
+
+    return {
+        "terms": len(model.terms), "heldout_nrmse": float(np.mean(heldout)), "heldout_nrmse_worst": float(np.max(heldout)),
+        "speedup": float(np.median([row["speedup"] for row in by_stroke])), "equations": model.text(), "latex": model.latex(),
+        "rolling_radius_mm": 1e3 * r, "coefficients": model.coefficient_table(), "by_stroke": by_stroke,
+        "enough_up_to_m_s2": {
+            f"{allowed:.0%}": {"with friction": enough("nrmse", allowed), "small-slip limit": enough("nrmse_linear", allowed)}
+            for allowed in (0.01, 0.02)
+        },
+        "another_grasp": {
+            "depth_mm": 5 / 3 * 1e3 * config.depth, "load_N": deep.load, "slipping": deep.slipping,
+            "nrmse": score(model, deep.record).worst, "rollout": str(score(model, deep.record).rollout),
+        },
+        "thresholds": [row for choice in choices for row in choice.tried],
+    }  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -48,17 +419,19 @@ class Result:
     stick: dict[str, Any]
     slip: dict[str, Any]
     gain: dict[str, Any]
-    traces: dict[str, Any] = field(repr=False)
 
 
 def run(config: Config) -> Result:
-    config = smoke(config) if config.smoke else config
-    bar = tqdm(total=12, unit="part")
-    stick, traces, grasp, A, model = study_stick(config, bar)
-    gain = study_gain(config, grasp, A, model, bar)
-    slip, more = study_slip(config, bar)
-    bar.close()
-    return Result(config, stick, slip, gain, {"stick": traces, "slip": more})
+    if config.smoke:
+        config = replace(
+            config, taps=6, tap_time=0.15, validation=2e-4, scenario=0.2, thresholds=(0.03, 0.07, 0.14), models=10,
+            noise=(0.0, 0.02), draws=1, stroke_times=(0.08, 0.05, 0.03), checking_times=(0.06,), other_times=(0.025,),
+            speeds=(0.01,), gains=8,
+        )  # fmt: skip
+    stick, grasp, model = study_stick(config)
+    gain = study_gain(config, grasp, model)
+    slip = study_slip(config)
+    return Result(config, stick, slip, gain)
 
 
 def summary(result: Result) -> dict[str, Any]:
@@ -84,67 +457,30 @@ def table(result: Result) -> str:
 
 
 def figure(result: Result) -> Figure:
-    """Held-out manipulation, its error, the choice of the threshold; coefficients, slip, gain sweep."""
-    fig = Figure(figsize=(15, 8.5), layout="constrained")
-    (a, b, c), (d, e, f) = fig.subplots(2, 3)
-    held, out = result.traces["stick"]["held"], result.traces["stick"]["rollout"]
-    shown = (("x_C", 1e3, "mm"), ("x_Br", 1e3, "mm"), ("theta", 10.0, "0.1 rad"))
-    for i, (name, size, unit) in enumerate(shown):
-        a.plot(held.t, size * held.series[name], f"C{i}", lw=3, alpha=0.35)
-        a.plot(held.t, size * out.y[:, STATES.index(name)], f"C{i}--", lw=1, label=f"{name} [{unit}]")
-    a.set(xlabel="time [s]", title="Stick: held out; wide full, dashed reduced")
-    a.legend()
-    for i, name in enumerate(STATES):
-        scale = np.ptp(held.series[name])
-        b.plot(held.t, 100 * (out.y[:, i] - held.series[name]) / scale, lw=0.7, label=name)
-    b.set(xlabel="time [s]", ylabel="error over range [%]", title="Stick: error of the held-out rollout")
-    b.legend(ncols=3, fontsize="small")
-    tried = [row for row in result.stick["thresholds"] if np.isfinite(row["nrmse"])]
-    c.semilogy([row["terms"] for row in tried], [100 * row["nrmse"] for row in tried], ".", color="0.6", label="tried")
-    chosen = {"mfc": "none", "ms": 12, "color": "C3", "label": "chosen"}
-    c.semilogy(result.stick["terms"], 100 * result.stick["validation_nrmse"], "o", **chosen)
-    c.set(xlabel="terms", ylabel="NRMSE of validation rollouts [%]", title="Stick: thresholds by rollout error")
-    c.legend()
+    """Coefficients beside mechanics, errors under slip, and the gain sweep."""
+    fig = Figure(figsize=(15, 4.5), layout="constrained")
+    coefficients, slip, sweep = fig.subplots(1, 3)
     rows = [row for row in result.stick["coefficients"] if row["expected"]]
     for i, row in enumerate(rows):
-        low, high = sorted(x / row["expected"] for x in row["interval"])
-        d.plot([low, high], [i, i], "C0", lw=3, alpha=0.5)
-        d.plot(row["value"] / row["expected"], i, "oC0", label="found" if i == 0 else None)
-        d.plot(row["expected_in_band"] / row["expected"], i, "xC1", label="expected in band" if i == 0 else None)
-    d.axvspan(0.9, 1.1, color="0.92", zorder=0)
-    d.axvline(1.0, color="k", lw=0.8)
-    d.set_yticks(range(len(rows)), [f"{row['equation']}': {row['term']}" for row in rows])
-    d.invert_yaxis()
-    d.set(xlabel="over the static expectation", title="Stick: coefficients and mechanics")
-    d.legend(loc="best", fontsize="small")
+        coefficients.plot([x / row["expected"] for x in row["interval"]], [i, i], "C0", lw=3, alpha=0.5)
+        coefficients.plot(row["value"] / row["expected"], i, "oC0")
+        coefficients.plot(row["expected_in_band"] / row["expected"], i, "xC1")
+    coefficients.axvline(1.0, color="k", lw=0.8)
+    coefficients.set_yticks(range(len(rows)), [f"{row['equation']}': {row['term']}" for row in rows])
+    coefficients.set(xlabel="over the static expectation (x: expected in band)", title="Stick: coefficients")
     by = result.slip["by_stroke"]
-    acceleration = [row["acceleration_m_s2"] for row in by]
-    e.loglog(
-        acceleration, [100 * row["nrmse"] for row in by], "o-C0", label=f"with friction, {result.slip['terms']} terms"
-    )
-    linear = [row["nrmse_linear"] for row in by]
-    e.loglog(acceleration, [100 * min(x, 10.0) for x in linear], "s-C1", label="its limit for small slip (linear)")
-    deep = result.slip["another_grasp"]
-    e.axhline(100 * min(deep["nrmse"], 10.0), color="C3", ls=":", label=f"same, grasp of {deep['depth_mm']:.2g} mm")
-    e.set(
-        xlabel="peak acceleration of the bracket [m/s$^2$]", ylabel="NRMSE [%]", title="Slip: rollouts of other strokes"
-    )
-    part = e.twinx()
-    part.fill_between(acceleration, [100 * row["slipping"] for row in by], color="0.5", alpha=0.2, lw=0)
-    part.set(ylabel="slipping nodes of the upper pad [%] (grey)", ylim=(0, 100))
-    e.set_zorder(part.get_zorder() + 1)
-    e.patch.set_visible(False)
-    e.legend(loc="upper left", fontsize="small")
-    sweep = result.gain["sweep"]
-    f.semilogx([row["R_80"] for row in sweep], [row["growth_1_s"] for row in sweep], "C0", label="reduced")
-    f.axhline(0.0, color="k", lw=0.8)
-    for i, row in enumerate(result.gain["confirmed"]):
-        label = None if i else "full, linearised\n(filled: dies out in a run)"
-        f.plot(row["R_80"], row["growth_full_1_s"], "oC3", mfc="C3" if row["full_dies_out"] else "w", label=label)
-    f.set(
+    for key, label in (("nrmse", "with friction"), ("nrmse_linear", "its limit for small slip (linear)")):
+        slip.loglog(
+            [row["acceleration_m_s2"] for row in by], [100 * min(row[key], 10.0) for row in by], "o-", label=label
+        )
+    slip.set(xlabel="peak acceleration of the bracket [m/s$^2$]", ylabel="NRMSE [%]", title="Slip: other strokes")
+    slip.legend()
+    gains = result.gain["sweep"]
+    sweep.semilogx([row["R_80"] for row in gains], [row["growth_1_s"] for row in gains])
+    sweep.axhline(0.0, color="k", lw=0.8)
+    sweep.set(
         xlabel="gain $R_{80}$ [N s/m]", ylabel="growth of the slowest mode [1/s]", title="Gain sweep", ylim=(None, 30)
     )
-    f.legend(fontsize="small", loc="upper center")
     return fig
 
 

@@ -31,5 +31,5 @@ def test_reduced_model_smoke(tmp_path: Path) -> None:
     confirmed = gain["confirmed"][0]
     assert confirmed["full_dies_out"]
     assert confirmed["reduced"]["overshoot"] == pytest.approx(confirmed["full"]["overshoot"], abs=0.02)
-    assert len(module.figure(result).axes) == 7
+    assert len(module.figure(result).axes) == 3
     assert "| stick |" in module.table(result)

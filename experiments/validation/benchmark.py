@@ -4,42 +4,360 @@ All in one process and one run, medians of repeated timings in turns, so that th
 
 - the 30 s manipulation by two tolerances and by equal steps; errors against a run at rtol 1e-7; `scenario_wall_s` is that of
   the loosest tolerance with the accuracy of a step of 2 ms (motion 3e-4, forces 0.5 % of their range);
-- over the run the sweep for the gradient of all parameters, and what the Jacobian for 8 parameters adds; peak memory;
+- over the run the sweep for the gradient of all parameters, and what the Jacobian for 8 parameters adds;
 - 64 trajectories of 4 s and 1,000 of 0.3 s with parameters of their own, on one and two threads;
-- growth with the surface nodes, the nodes that touch, the simulated time and the size of a batch, with fitted exponents;
-- with `--peers` the same equations, compiled, under scipy's, torchdiffeq's and diffrax's integrators, equally exact.
+- growth with the surface nodes and the size of a batch, with fitted exponents;
+- with `--peers` the same equations under scipy's, torchdiffeq's and diffrax's integrators over a window in mid-roll. All call
+  the compiled right-hand side (`torchsoft.solve.rates`). Every method is run by a series of tolerances, from loose to tight,
+  until it is as exact as the stepper, in the disc's place and in the nodal forces; that run is timed, without compiling.
 
 Command: .venv/bin/python experiments/validation/benchmark.py [--peers] [--smoke]
 Expected: the sweep at most 0.6 of a run and the Jacobian at most 2 by tolerances, more by equal steps; forces need rtol 1e-4 to
 be as exact as by 2 ms. About five minutes, three more with `--peers`.
 """
 
-import cProfile
 import json
-import pstats
-import subprocess
-import sys
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from _benchmark_batches import batches
-from _benchmark_common import Config, interleaved, prepare, tasks, wall, ways
-from _benchmark_growth import Growth, growth, growth_figure, growth_table
+import numpy as np
+import torch
 from matplotlib.figure import Figure
+from scipy.integrate import odeint, solve_ivp
 from step_accuracy import errors
+from torch import Tensor
 from tqdm import tqdm
 
-from torchsoft import simulate
-from torchsoft.experiment import grid, made_by, markdown, options, write
+from torchsoft import Parameters, SoftGrasp, simulate, simulate_batch
+from torchsoft.experiment import grid, made_by, markdown, options, timed, write
+from torchsoft.scenario import Manipulation, grasp_and_roll
+from torchsoft.solve.kernel.arrays import Array
+from torchsoft.solve.rates import Rates
 
-ACCURACY = {"motion": 3e-4, "forces": 5e-3}
-"""Largest errors over the range of what a step of 2 ms gives."""
+EIGHT = ("contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau")
 
-MEASURED = ("nothing", "run", "gradient", "jacobian")
-"""Tasks of which the peak memory is taken."""
+GRASP_FORCE = 80.66  # That holds the grasp of the usual rig [N]; it need not be searched for.
+
+
+@dataclass(frozen=True)
+class Config:
+    out: Path = Path("out/benchmark")
+    duration: float = 30.0  # simulated time of the manipulation [s]
+    rtols: tuple[float, float, float] = (1e-3, 1e-4, 1e-5)  # relative tolerances, the loosest first
+    step: float = 2e-3  # of the equal steps [s]
+    exact: float = 1e-7  # relative tolerance of the run that errors are measured against
+    repeats: int = 5  # timings of which the median is taken
+    trajectories: int = 64  # of a batch
+    batch_duration: float = 4.0  # simulated time of each of them [s]
+    short_runs: int = 1000  # of the batch of short runs
+    short_duration: float = 0.3  # simulated time of each of them [s]
+    elements_x: tuple[int, ...] = (60, 120, 240, 480)  # meshes, a thirtieth of that through the pad
+    peers: bool = False  # the same equations under other integrators; needs `pip install torchsoft[peers]`
+    window: float = 0.1  # simulated time that the other integrators get, in mid-roll [s]
+    smoke: bool = False  # a size that takes seconds
+
+
+def prepare(elements_x: int = 120) -> Manipulation:
+    """The manipulation on a mesh of so many elements."""
+    mesh = {"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30}
+    return grasp_and_roll(SoftGrasp(Parameters().override(mesh)), grasp_force=GRASP_FORCE)
+
+
+def ways(config: Config) -> dict[str, dict[str, Any]]:
+    """How steps are chosen: by tolerances, and equal ones."""
+    equal = {f"step = {1e3 * config.step:g} ms": {"step": config.step}}
+    return {f"rtol = {rtol:g}": {"rtol": rtol} for rtol in config.rtols} | equal
+
+
+def tasks(m: Manipulation, t: torch.Tensor, steps: Mapping[str, Any]) -> dict[str, Callable[[], object]]:
+    """The run, the run with its gradient by all parameters, the run with its Jacobian by eight."""
+
+    def gradient() -> None:
+        m.model.zero_grad()
+        run = simulate(m.model, t, y0=m.y0, gradient="discrete", **steps)
+        (run["theta"].square().sum() + 1e3 * run.together("x_C", "y_C").square().sum()).backward()
+
+    return {
+        "run": lambda: simulate(m.model, t, y0=m.y0, **steps),
+        "gradient": gradient,
+        "jacobian": lambda: simulate(m.model, t, y0=m.y0, gradient="forward", wrt=EIGHT, rigid=True, **steps),
+    }
+
+
+def interleaved(tasks: Mapping[str, Callable[[], float]], repeats: int) -> dict[str, list[float]]:
+    """What each task returns, so many times in turns after one warm-up each: noise that comes and goes hits them all."""
+    for task in tasks.values():
+        task()
+    out: dict[str, list[float]] = {name: [] for name in tasks}
+    for _ in range(repeats):
+        for name, task in tasks.items():
+            out[name].append(task())
+    return out
+
+
+def own_batch(m: Manipulation, config: Config, count: int, duration: float, threads: int) -> Callable[[], int]:
+    """A batch in which every run has its own stiffness, dashpot and retardation time, up to 20 % to either side of the
+    model's; it returns how many failed."""
+    part, t = torch.linspace(0.8, 1.2, count, dtype=torch.float64), grid(duration)
+    names = ("contact.K_n", "contact.R_t", "pad.tau")
+    own = {name: m.model.parameter(name).detach() * part.roll(i * count // 3) for i, name in enumerate(names)}
+    how: dict[str, Any] = {"y0": m.y0, "parameters": own, "threads": threads, "rtol": config.rtols[0]}
+    return lambda: len(simulate_batch(m.model, t, **how).failures)
+
+
+def batches(config: Config) -> dict[str, Any]:
+    """Simulated seconds per wall second of long and of short runs on one and two threads."""
+    m, failures = prepare(), dict[str, int]()
+    sizes = {
+        "trajectories": (config.trajectories, config.batch_duration),
+        "short runs": (config.short_runs, config.short_duration),
+    }
+
+    def task(name: str, threads: int) -> Callable[[], float]:
+        batch = own_batch(m, config, *sizes[name], threads)
+
+        def one() -> float:
+            failures[name], wall = timed(batch)
+            return wall
+
+        return one
+
+    every = interleaved({f"{name}, {n}": task(name, n) for name in sizes for n in (1, 2)}, max(1, config.repeats // 2))
+    out: dict[str, Any] = {}
+    for name, (count, duration) in sizes.items():
+        seconds = {str(threads): median(every[f"{name}, {threads}"]) for threads in (1, 2)}
+        out[name] = {
+            "runs": count, "simulated_s": duration, "failures": failures[name], "wall_s": seconds,
+            "simulated_per_wall": {threads: count * duration / s for threads, s in seconds.items()},
+            "runs_per_wall_s": {threads: count / s for threads, s in seconds.items()},
+            "two_threads_over_one": seconds["1"] / seconds["2"],
+        }  # fmt: skip
+    return out
+
+
+@dataclass
+class Growth:
+    """Median wall times [s] over something that is counted."""
+
+    over: str
+    values: list[int]
+    wall_s: list[float]
+
+    @property
+    def exponent(self) -> float:
+        """Slope of log time over log value, by least squares."""
+        return float(np.polyfit(np.log(self.values), np.log(self.wall_s), 1)[0])
+
+
+def growth(config: Config) -> list[Growth]:
+    """Of a run with the mesh and of a batch with its runs, at the loosest tolerance."""
+    rtol, repeats, m = config.rtols[0], min(config.repeats, 3), prepare()
+
+    def run(elements_x: int) -> Callable[[], object]:
+        made, t = prepare(elements_x), grid(config.batch_duration)
+        return lambda: simulate(made.model, t, y0=made.y0, rtol=rtol)
+
+    out = []
+    meshes, counts = {n + 1: run(n) for n in config.elements_x}, (2, 4) if config.smoke else (4, 16, 64, 256)
+    for over, tasks in {
+        "surface nodes of a pad": meshes,
+        "runs of a batch": {n: own_batch(m, config, n, config.short_duration, 1) for n in counts},
+    }.items():
+        times = interleaved({str(n): lambda task=task: timed(task)[1] for n, task in tasks.items()}, repeats)
+        out.append(Growth(over, list(tasks), [median(some) for some in times.values()]))
+    return out
+
+
+def growth_table(every: list[Growth]) -> str:
+    """One row a measurement, with the exponents."""
+    rows = [
+        (one.over, value, f"{wall:.3g}", f"{one.exponent:.2f}") for one in every for value, wall in zip(one.values, one.wall_s)
+    ]  # fmt: skip
+    return markdown(("growth with", "value", "wall time [s]", "exponent"), rows)
+
+
+BEGIN = 2.0  # Where the window of the other integrators begins [s].
+RTOLS = tuple(10.0**-n for n in range(2, 9))  # Tolerances tried.
+OURS = "torchsoft (SDIRK2)"
+
+
+@dataclass(frozen=True)
+class Attempt:
+    """One method at one tolerance: wall time of the window [s], right-hand sides, largest errors."""
+
+    method: str
+    rtol: float
+    wall_s: float
+    calls: int
+    position_nm: float
+    force: float  # over the largest
+
+
+class Window:
+    """The piece of the roll: start, output times, sizes of the state's components, the exact states, the right-hand side."""
+
+    def __init__(self, config: Config) -> None:
+        m = prepare()
+        self.model: SoftGrasp = m.model
+        to_begin = torch.tensor([0.0, BEGIN], dtype=torch.float64)
+        self.y0: Tensor = simulate(self.model, to_begin, y0=m.y0, rtol=1e-6).y[-1]
+        self.t = torch.linspace(BEGIN, BEGIN + config.window, 11, dtype=torch.float64)
+        self.exact: Array = simulate(self.model, self.t, y0=self.y0, rtol=1e-8).y.numpy()
+        slices = self.model.layout.slices
+        self.size = np.ones(self.model.layout.size)
+        for (part, _), here in slices.items():
+            values = self.exact[:, here] - (self.exact[0, here] if part == "pose" else 0.0)
+            self.size[here] = np.abs(values).max()
+        self.place = slices["pose", "disc"].start + np.arange(2)
+        self.pads = np.concatenate([np.arange(s.start, s.stop) for (part, _), s in slices.items() if part == "pads"])
+        self.f = Rates(self.model)
+
+    def attempt(self, method: str, rtol: float, solve: Callable[[], Array], repeats: int) -> Attempt:
+        """Run and time one method; repeated runs are timed after the first."""
+        self.f.calls = 0
+        try:
+            y, first = timed(solve)
+        except (RuntimeError, AssertionError):  # a trial state without forces, or steps that underflow
+            return Attempt(method, rtol, np.inf, self.f.calls, np.inf, np.inf)
+        if y.shape != self.exact.shape:  # given up on the way
+            return Attempt(method, rtol, first, self.f.calls, np.inf, np.inf)
+        calls = self.f.calls
+        walls = [timed(solve)[1] for _ in range(repeats)] or [first]
+        position = 1e9 * float(np.abs(y - self.exact)[:, self.place].max())
+        off = np.linalg.norm((y - self.exact)[:, self.pads], axis=1).max()
+        force = float(off / np.linalg.norm(self.exact[:, self.pads], axis=1).max())
+        return Attempt(method, rtol, median(walls), calls, position, force)
+
+
+Solver = Callable[[float], Callable[[], Array]]
+"""A method: the integration (T, size) at a relative tolerance."""
+
+
+def scipy_solvers(w: Window) -> dict[str, Solver]:
+    """scipy's own: LSODA by its Fortran loop, the others by `solve_ivp`; they difference the Jacobian themselves."""
+    y0, t = w.y0.numpy(), w.t.numpy()
+
+    def ivp(method: str) -> Solver:
+        return lambda rtol: (
+            lambda: solve_ivp(w.f, (t[0], t[-1]), y0, method=method, t_eval=t, rtol=rtol, atol=rtol * w.size).y.T
+        )
+
+    lsoda: Solver = lambda rtol: lambda: odeint(w.f, y0, t, tfirst=True, rtol=rtol, atol=rtol * w.size, mxstep=100_000)
+    return {"scipy LSODA": lsoda} | {f"scipy {name}": ivp(name) for name in ("BDF", "Radau", "RK23", "RK45")}
+
+
+def torchdiffeq_solvers(w: Window) -> dict[str, Solver]:
+    """torchdiffeq's explicit methods on the compiled right-hand side; it has no adaptive implicit one."""
+    from torchdiffeq import odeint as integrate
+
+    def f(t: Tensor, y: Tensor) -> Tensor:
+        return torch.from_numpy(w.f(float(t), y.numpy()))
+
+    def solver(method: str) -> Solver:
+        def solve(rtol: float) -> Array:
+            atol: Any = rtol * torch.from_numpy(w.size)
+            out: Any = integrate(f, w.y0, w.t, rtol=rtol, atol=atol, method=method)
+            return out.numpy()
+
+        return lambda rtol: lambda: solve(rtol)
+
+    return {f"torchdiffeq {name}": solver(name) for name in ("adaptive_heun", "bosh3", "dopri5")}
+
+
+def diffrax_solvers(w: Window) -> dict[str, Solver]:
+    """diffrax's explicit methods, jitted, with the right-hand side as a callback."""
+    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+    import diffrax  # pyright: ignore[reportMissingImports]
+    import jax  # pyright: ignore[reportMissingImports]
+
+    jax.config.update("jax_enable_x64", True)
+    shape, size = jax.ShapeDtypeStruct(w.size.shape, np.float64), jax.numpy.asarray(w.size)
+
+    def rhs(t: Any, y: Any) -> Any:
+        return jax.pure_callback(lambda t, y: w.f(float(t), np.asarray(y)), shape, t, y, vmap_method="sequential")
+
+    term, t, y0 = diffrax.ODETerm(lambda t, y, _: rhs(t, y)), w.t.numpy(), jax.numpy.asarray(w.y0.numpy())
+
+    def solver(make: Any) -> Solver:
+        @jax.jit
+        def integrate(y: Any, rtol: Any) -> Any:
+            control = diffrax.PIDController(rtol=rtol, atol=rtol * size)
+            saved = diffrax.SaveAt(ts=jax.numpy.asarray(t))
+            return diffrax.diffeqsolve(
+                term, make(), t[0], t[-1], 1e-4, y, saveat=saved, stepsize_controller=control, max_steps=100_000
+            ).ys
+
+        return lambda rtol: lambda: np.asarray(integrate(y0, rtol))
+
+    made = [diffrax.Heun, diffrax.Bosh3, diffrax.Tsit5]
+    return {f"diffrax {one.__name__}": solver(one) for one in made}
+
+
+def peers(config: Config) -> dict[str, Any]:
+    """For each of the stepper's tolerances every method at its loosest tolerance that is as exact."""
+    w, repeats = Window(config), min(config.repeats, 3)
+    solvers = scipy_solvers(w) | torchdiffeq_solvers(w) | diffrax_solvers(w)
+    goals = {
+        rtol: w.attempt(
+            OURS, rtol, lambda rtol=rtol: simulate(w.model, w.t, y0=w.y0, rtol=rtol).y.numpy(), max(repeats, 9)
+        )
+        for rtol in config.rtols
+    }
+    hardest, attempts = goals[min(goals)], dict[str, list[Attempt]]()
+    for name, solver in tqdm(solvers.items(), unit="integrator", leave=False):
+        attempts[name] = []
+        for rtol in RTOLS[:: 2 if config.smoke else 1]:
+            attempts[name].append(w.attempt(name, rtol, solver(rtol), 0))
+            if as_exact(attempts[name][-1], hardest):
+                break
+    out: dict[str, Any] = {"window_s": config.window, "begin_s": BEGIN, "equal": {}}
+
+    def described(one: Attempt, goal: Attempt) -> dict[str, Any]:
+        over = {"wall_per_simulated": one.wall_s / config.window, "over_torchsoft": one.wall_s / goal.wall_s}
+        return asdict(one) | over
+
+    for rtol, goal in goals.items():
+        rows: dict[str, Any] = {OURS: described(goal, goal)}
+        for name, some in attempts.items():
+            rows[name] = None
+            for found in (one for one in some if as_exact(one, goal)):  # timed again, it has to be as exact again
+                again = w.attempt(name, found.rtol, solvers[name](found.rtol), repeats if found.wall_s < 2 else 1)
+                if as_exact(again, goal):
+                    rows[name] = described(again, goal)
+                    break
+        out["equal"][f"rtol = {rtol:g}"] = rows
+    out["attempts"] = {name: [asdict(one) for one in some] for name, some in attempts.items()}
+    return out
+
+
+def as_exact(one: Attempt, goal: Attempt) -> bool:
+    return one.position_nm <= goal.position_nm and one.force <= goal.force
+
+
+def peers_table(numbers: dict[str, Any]) -> str:
+    """One table for every accuracy."""
+    head = (
+        "integrator", "its rtol", "wall time [s] per simulated s", "over torchsoft", "right-hand sides",
+        "error of place [nm]", "error of forces [1]",
+    )  # fmt: skip
+    out = []
+    for way, rows in numbers["equal"].items():
+        lines = [
+            (
+                name, f"{one['rtol']:.2g}", f"{one['wall_per_simulated']:.3g}", f"{one['over_torchsoft']:.3g}",
+                one["calls"] if name != OURS else "", f"{one['position_nm']:.2g}", f"{one['force']:.1e}",
+            ) if one is not None else (name, "", "not reached", "", "", "", "")
+            for name, one in rows.items()
+        ]  # fmt: skip
+        out.append(f"As exact as torchsoft at {way}\n\n{markdown(head, lines)}")
+    return "\n\n".join(out)
+
+
+ACCURACY = {"motion": 3e-4, "forces": 5e-3}  # Largest errors over the range of what a step of 2 ms gives.
 
 
 @dataclass(frozen=True)
@@ -50,11 +368,13 @@ class Result:
 
 
 def costs(config: Config) -> dict[str, Any]:
-    """Times of the three tasks by every way, with errors and peak memory."""
+    """Times of the three tasks by every way, with errors."""
     m, t = prepare(), grid(config.duration)
     exact = simulate(m.model, t, y0=m.y0, rtol=config.exact)
     every = {(way, name): task for way, steps in ways(config).items() for name, task in tasks(m, t, steps).items()}
-    times = interleaved({f"{way}, {name}": wall(task) for (way, name), task in every.items()}, config.repeats)
+    times = interleaved(
+        {f"{way}, {name}": lambda task=task: timed(task)[1] for (way, name), task in every.items()}, config.repeats
+    )
     out: dict[str, Any] = {"timings": times}
     for way, steps in ways(config).items():
         one = simulate(m.model, t, y0=m.y0, **steps)
@@ -66,36 +386,7 @@ def costs(config: Config) -> dict[str, Any]:
             "gradient_over_run": part("gradient") - 1, "jacobian8_total_over_run": part("jacobian"),
             "jacobian8_over_run": part("jacobian") - 1,
         }  # fmt: skip
-    return out | {"peak_memory_MB": memory(config)}
-
-
-def memory(config: Config) -> dict[str, float]:
-    """Peak memory [MB] of processes that do one task each, at the tighter tolerance."""
-    out, way = {}, list(ways(config))[1]
-    for name in MEASURED:
-        flags = [f"--measure={name}, {way}", f"--duration={config.duration}", f"--step={config.step}"]
-        done = subprocess.run([sys.executable, __file__, *flags], capture_output=True, text=True, check=True)
-        out[name] = float(done.stdout.split()[-1])
     return out
-
-
-def peak_memory(config: Config) -> None:
-    """Do one task once and print this process's peak resident memory [MB] (Linux: VmHWM, which starts anew at exec)."""
-    name, way = config.measure.split(", ")
-    m = prepare()
-    if name != "nothing":
-        tasks(m, grid(config.duration), ways(config)[way])[name]()
-    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-    print(next(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1024)
-
-
-def profile(config: Config) -> dict[str, float]:
-    """Part of a run's time that is spent in the compiled kernel, by a deterministic profiler."""
-    m, (way, *_) = prepare(), ways(config).values()
-    profiler = cProfile.Profile()
-    profiler.runcall(tasks(m, grid(config.duration), way)["run"])
-    rows = pstats.Stats(profiler).get_stats_profile()
-    return {"kernel_share": rows.func_profiles["run"].tottime / rows.total_tt}
 
 
 def run(config: Config) -> Result:
@@ -104,13 +395,8 @@ def run(config: Config) -> Result:
             config, duration=0.5, exact=1e-5, repeats=1, trajectories=2, batch_duration=0.2, short_runs=3,
             short_duration=0.05, elements_x=(60, 120), window=5e-3,
         )  # fmt: skip
-    parts: dict[str, Callable[[Config], Any]] = {
-        "costs": costs, "batches": batches, "growth": growth, "profile": profile,
-    }  # fmt: skip
-    if config.peers:
-        from _benchmark_peers import peers
-
-        parts["peers"] = peers
+    parts: dict[str, Callable[[Config], Any]] = {"costs": costs, "batches": batches, "growth": growth}
+    parts |= {"peers": peers} if config.peers else {}
     done = {name: part(config) for name, part in tqdm(parts.items(), unit="part")}
     grown: list[Growth] = done.pop("growth")
     cost, batch = done["costs"], done["batches"]
@@ -128,7 +414,7 @@ def run(config: Config) -> Result:
         "batch_sim_s_per_wall_s_one_thread": batch["trajectories"]["simulated_per_wall"]["1"],
         "batch_two_threads_over_one": batch["trajectories"]["two_threads_over_one"],
     }  # fmt: skip
-    return Result(config, top | done | {"growth": [one.summary() for one in grown]}, grown)
+    return Result(config, top | done | {"growth": [asdict(one) | {"exponent": one.exponent} for one in grown]}, grown)
 
 
 def worst(errors: dict[str, float]) -> dict[str, float]:
@@ -143,21 +429,19 @@ def exact_enough(errors: dict[str, float]) -> bool:
 
 
 def cost_table(config: Config, numbers: dict[str, Any]) -> str:
-    """Every way with its times, errors and memory."""
+    """Every way with its times and errors."""
     head = (
         "steps by", "run [s]", "error of motion [1]", "error of forces [1]", "gradient: sweep over run", "total",
         "Jacobian for 8: added over run", "total",
     )  # fmt: skip
-    rows: list[tuple[object, ...]] = []
+    rows = []
     for way in ways(config):
         one = numbers["costs"][way]
         motion, forces = worst(one["errors"]).values()
         ratios = ("gradient_over_run", "gradient_total_over_run", "jacobian8_over_run", "jacobian8_total_over_run")
-        rows.append(
-            (way, f"{one['seconds']['run']:.3g}", f"{motion:.1e}", f"{forces:.1e}", *(f"{one[r]:.2f}" for r in ratios))
-        )  # fmt: skip
-    peak = ", ".join(f"{name} {one:.0f}" for name, one in numbers["costs"]["peak_memory_MB"].items())
-    return f"{markdown(head, rows)}\n\nPeak memory at {list(ways(config))[1]} [MB]: {peak}"
+        run_s = f"{one['seconds']['run']:.3g}"
+        rows.append((way, run_s, f"{motion:.1e}", f"{forces:.1e}", *(f"{one[r]:.2f}" for r in ratios)))
+    return markdown(head, rows)
 
 
 def batch_table(numbers: dict[str, Any]) -> str:
@@ -177,67 +461,38 @@ def batch_table(numbers: dict[str, Any]) -> str:
 
 def tables(result: Result) -> str:
     """All tables."""
-    parts = [
-        cost_table(result.config, result.figures), batch_table(result.figures), growth_table(result.growth)
-    ]  # fmt: skip
-    if "peers" in result.figures:
-        from _benchmark_peers import peers_table
-
-        parts.append(peers_table(result.figures["peers"]))
-    return "\n\n".join(parts)
+    numbers = result.figures
+    parts = [cost_table(result.config, numbers), batch_table(numbers), growth_table(result.growth)]
+    return "\n\n".join([*parts, peers_table(numbers["peers"])] if "peers" in numbers else parts)
 
 
 def figure(result: Result) -> Figure:
-    """Wall times of the tasks by every way; batches; the other integrators, if any."""
-    numbers, colours = result.figures, ("#0072b2", "#e69f00", "#009e73")
-    fig = Figure(figsize=(13, 4.2), layout="constrained")
-    left, middle, right = fig.subplots(1, 3, width_ratios=(1.6, 0.7, 1.3))
+    """Wall times of the tasks by every way, of batches, and as they grow."""
+    numbers = result.figures
+    fig = Figure(figsize=(13, 4), layout="constrained")
+    left, middle, right = fig.subplots(1, 3)
     every = list(ways(result.config))
-    for i, (name, colour) in enumerate(zip(("run", "gradient", "jacobian"), colours)):
-        label = {"run": "run", "gradient": "with gradient of all", "jacobian": "with Jacobian for 8"}[name]
-        seconds = [numbers["costs"][way]["seconds"][name] for way in every]
-        bars = left.bar([k + 0.27 * (i - 1) for k in range(len(every))], seconds, 0.25, color=colour, label=label)
-        left.bar_label(bars, fmt="%.2g", fontsize=8)
-    names = [way.replace(" = ", "\n") for way in every]
-    left.set_xticks(range(len(names)), names)
-    left.margins(y=0.1)
-    left.set(ylabel="wall time [s]", title=f"{result.config.duration:g} s of manipulation, one core")
-    left.legend(fontsize=8)
-    batch = numbers["batches"]
-    for i, threads in enumerate(("1", "2")):
-        rates = [one["simulated_per_wall"][threads] for one in batch.values()]
-        bars = middle.bar(
-            [k + 0.36 * (i - 0.5) for k in range(2)], rates, 0.34, color=colours[i], label=f"{threads} thread{'s' * i}"
-        )
-        middle.bar_label(bars, fmt="%.3g", fontsize=8)
-    middle.set_xticks(range(2), [f"{one['runs']} runs\nof {one['simulated_s']:g} s" for one in batch.values()])
-    middle.margins(y=0.12)
-    middle.set(ylabel="simulated s per wall s [1]", title="Batches")
-    middle.legend(fontsize=8)
-    if "peers" not in numbers:
-        right.set_axis_off()
-        return fig
-    way = list(numbers["peers"]["equal"])[-1]
-    reached = {name: one["wall_per_simulated"] for name, one in numbers["peers"]["equal"][way].items() if one}
-    bars = right.barh(list(reached), list(reached.values()), color="#0072b2", log=True)
-    right.bar_label(bars, fmt="%.2g", padding=3, fontsize=8)
-    right.set_xlim(right=4 * max(reached.values()))
-    right.invert_yaxis()
-    right.set(xlabel="wall time [s] per simulated s", title=f"Same equations, as exact as {way}")
+    for name in ("run", "gradient", "jacobian"):
+        left.plot(every, [numbers["costs"][way]["seconds"][name] for way in every], "o", label=name)
+    left.set(ylabel="wall time [s]", title=f"{result.config.duration:g} s of manipulation, one core", ylim=(0, None))
+    for threads in ("1", "2"):
+        rates = {name: one["simulated_per_wall"][threads] for name, one in numbers["batches"].items()}
+        middle.plot(list(rates), list(rates.values()), "o", label=f"threads: {threads}")
+    middle.set(ylabel="simulated s per wall s [1]", title="Batches", ylim=(0, None))
+    for one in result.growth:
+        right.loglog(one.values, one.wall_s, "o-", label=f"{one.over}: exponent {one.exponent:.2f}")
+    right.set(ylabel="wall time [s]", title="Growth")
+    for axes in (left, middle, right):
+        axes.legend(fontsize=8)
     return fig
 
 
 def main() -> None:
-    config = options(Config, __doc__)
-    if config.measure:
-        peak_memory(config)
-        return
-    result = run(config)
+    result = run(options(Config, __doc__))
     print(json.dumps({k: v for k, v in result.figures.items() if not isinstance(v, dict | list)}, indent=2))
     print(tables(result))
-    content = result.figures | {"made_by": made_by(config)}
-    drawn = {"benchmark": figure(result), "growth": growth_figure(result.growth)}
-    write(config.out, content, drawn, tables(result))
+    content = result.figures | {"made_by": made_by(result.config)}
+    write(result.config.out, content, {"benchmark": figure(result)}, tables(result))
 
 
 if __name__ == "__main__":

@@ -17,9 +17,8 @@ manipulation). The unrolled and the continuous route are slow, so they are run o
 the window's first event, against central differences over that sub-window; the continuous one solves the ODE and not the
 steps, so it is compared with the discrete adjoint at a step of 1 us.
 
-Further: the literal Coulomb law, whose force jumps at break-away unless mu_s = mu_k; dL/dp through slip as the step is
-refined; d omega / d K_n before and after a node touches; and a window that starts at `rest`, where the upper pad's gap is
-exactly zero and central differences straddle the kink.
+Further: the literal Coulomb law, whose force jumps at break-away unless mu_s = mu_k; and dL/dp through slip as the step is
+refined.
 
 Command: .venv/bin/python experiments/validation/gradient_accuracy.py [--smoke]
 Expected, largest error of the discrete and forward routes among parameters whose central difference is itself known to 1e-6:
@@ -29,17 +28,374 @@ loss falls with a slope of -0.105 +- 0.01; with mu_s = mu_k they agree to 2e-4. 
 seven minutes on one core.
 """
 
-from dataclasses import dataclass
+import statistics
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import torch
-from _gradient_limits import coulomb, from_rest, refinement, touch_down
-from _gradients import FINER, RADIUS, Config, judge_window, smoke, windows
 from matplotlib.figure import Figure
+from torch import Tensor
+from torchdiffeq import odeint_adjoint
 from tqdm import tqdm
 
-from torchsoft.experiment import made_by, markdown, options
+from torchsoft import Parameters, Profile, Reference, SoftGrasp, press, simulate
+from torchsoft.experiment import COARSE, at_the_points, made_by, markdown, options, timed
 from torchsoft.experiment import write as write_files
+from torchsoft.paper.equilibrium import holding_force
+from torchsoft.scenario import grasp_and_roll, reference
+from torchsoft.solve.trajectory import channels
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
+
+from unrolled import unrolled_solution  # pyright: ignore[reportMissingImports]
+
+NEWTON = 1e-10  # Newton's tolerance of every run here [N].
+
+
+FLOOR = (1e-7, 1e-7, 1e-6, 1e-6, 1e-6, 1e-5, 1e-7, 1e-7, 1e-3, 1e-3)
+"""Smallest scale of each signal in the loss: m, m, rad, m/s, m/s, rad/s, m, m, N, N."""
+
+
+CHANNELS = ("x_C", "y_C", "theta", "v_x", "v_y", "omega", "x_Br", "y_Br", "F_x", "F_y")
+
+
+INERT = ("pad.rho",)  # Parameters that massless pads do not use.
+
+
+RADIUS = "disc.radius"
+
+
+FINER = {RADIUS: 1e-2}  # Factors on the relative steps of central differences.
+
+
+INSENSITIVE = 1e-6
+"""Part of the largest p dL/dp below which the continuous adjoint's gradient is not compared in relative terms."""
+Gradient = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Config:
+    out: Path = Path("out/gradient_accuracy")
+    steps: tuple[float, ...] = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 1e-6)
+    """relative steps of the central differences; a hundredth of them for the radius, of which 1e-4 is two ramps"""
+    full_steps: tuple[float, ...] = (3e-5, 1e-5)  # the same over the whole manipulation, where a run takes a second
+    coulomb_ms: float = 0.02  # step of the runs with Coulomb's law [ms]
+    coulomb_runs: int = 81  # runs over which the slope of its loss is averaged
+    refinement_ms: tuple[float, ...] = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125, 0.0625)
+    """steps of the convergence through slip [ms]; half the last is the reference"""
+    continuous_ms: float = 0.3
+    """length of the continuous adjoint's sub-window, with two outputs [ms]: 14 / tau times their spacing is 0.2"""
+    repeats: int = 5  # runs of which a time is the median (three for the continuous adjoint)
+    duration: float = 30.0  # of the full window [s]
+    only: tuple[str, ...] = ()  # scalar parameters; all of them if none is named
+    changes: tuple[tuple[str, float | int], ...] = ()  # parameter overrides, a coarser mesh for instance
+    smoke: bool = False  # a size that takes seconds
+
+
+@dataclass(frozen=True)
+class Window:
+    """A run whose gradient is computed: from y0 (size,) through the outputs t (T,) [s] in steps of `step` [s]."""
+
+    name: str
+    model: SoftGrasp
+    y0: Tensor
+    t: Tensor
+    step: float
+
+
+def linspace(start: float, end: float, step: float) -> Tensor:
+    return torch.linspace(start, end, round((end - start) / step) + 1, dtype=torch.float64)
+
+
+def states(window: Window, route: str = "discrete") -> Tensor:
+    """The run (T, size), differentiable if gradients are on."""
+    w = window
+    if route == "unrolled":
+        return unrolled_solution(w.model, w.y0, w.t, step=w.step)
+    if route == "continuous":
+        return odeint_adjoint(w.model, w.y0, w.t, method="dopri5", rtol=1e-8, atol=1e-11)  # pyright: ignore[reportReturnType]
+    return simulate(w.model, w.t, y0=w.y0, step=w.step, tolerance=NEWTON, gradient=route).y  # pyright: ignore[reportArgumentType]
+
+
+def signals(model: SoftGrasp, y: Tensor, t: Tensor) -> Tensor:
+    """(T, 10): pose and velocity of the disc, pose of the bracket, control force."""
+    follow = model.follow(t)
+    values = channels(model, model.unpack(y, follow), follow)
+    return torch.stack([values[name] for name in CHANNELS], -1)
+
+
+@torch.no_grad()
+def make_loss(window: Window) -> Callable[[Tensor], Tensor]:
+    """The loss of the docstring as a function of the states, its constants from the nominal run."""
+    model, t = window.model, window.t
+    nominal = signals(model, states(window), t)
+    centre, scale = nominal.mean(0), torch.maximum(nominal.std(0), torch.tensor(FLOOR, dtype=torch.float64))
+    weight = (0.5 + (t - t[0]) / (t[-1] - t[0]))[:, None]
+
+    def loss(y: Tensor) -> Tensor:
+        z = (signals(model, y, t) - centre) / scale
+        return (weight * (z + 0.5 * z**2)).mean()
+
+    return loss
+
+
+def scalars(model: SoftGrasp, config: Config) -> dict[str, Tensor]:
+    """The trained scalar parameters, called as in `Parameters`."""
+    own = dict(model.named_parameters())
+    every = {name: own[path] for name, path in model.aliases.items() if path in own and name not in INERT}
+    chosen = {name: p for name, p in every.items() if not config.only or name in config.only}
+    return {name: p for name, p in chosen.items() if p.requires_grad}
+
+
+def collect(model: SoftGrasp, names: Iterable[str]) -> Gradient:
+    """The parameters' gradients, taken away from them."""
+    out = {n: 0.0 if (g := model.parameter(n).grad) is None else g.item() for n in names}
+    model.zero_grad(set_to_none=True)
+    return out
+
+
+def richardson(values: list[float], steps: tuple[float, ...]) -> tuple[float, float]:
+    """Plateau and uncertainty of central differences at falling steps: median and spread of the three neighbouring
+    extrapolations that agree best; with fewer, the last one and how far the two last values are apart."""
+    ratios = [(a / b) ** 2 for a, b in pairwise(steps)]
+    better = [b + (b - a) / (r - 1) for a, b, r in zip(values, values[1:], ratios)]
+    if len(better) < 3:
+        found = better if len(better) > 1 else values
+        return better[-1], abs(found[-1] - found[0])
+    triples = [sorted(better[k : k + 3]) for k in range(len(better) - 2)]
+    low, middle, high = min(triples, key=lambda x: x[2] - x[0])
+    return middle, high - low
+
+
+@torch.no_grad()
+def central_differences(
+    window: Window, loss: Callable[[Tensor], Tensor], config: Config, steps: tuple[float, ...]
+) -> tuple[Gradient, Gradient]:
+    """dL/dp by central differences, and the judge's uncertainty over it."""
+    value, unsure = {}, {}
+    for name, p in scalars(window.model, config).items():
+        keep, at = p.clone(), []
+        for relative in steps:
+            ends, got = [keep * (1 + sign * relative * FINER.get(name, 1.0)) for sign in (1, -1)], []
+            for end in ends:
+                p.copy_(end)
+                got.append(loss(states(window)).item())
+            at.append((got[0] - got[1]) / (ends[0] - ends[1]).item())
+        p.copy_(keep)
+        value[name], spread = richardson(at, steps)
+        unsure[name] = spread / abs(value[name]) if value[name] else 0.0
+    return value, unsure
+
+
+def relative_errors(got: Gradient, judge: Gradient, floor: Gradient | None = None) -> Gradient:
+    """|got - judge| / max(|judge|, floor); a gradient that both call exactly zero has no error."""
+    size = {n: max(abs(x), floor[n] if floor else 0.0) for n, x in judge.items()}
+    return {n: 0.0 if got[n] == x else abs(got[n] - x) / size[n] if size[n] else float("inf") for n, x in judge.items()}
+
+
+def by_backward(
+    window: Window, loss: Callable[[Tensor], Tensor], run: Callable[[], Tensor], config: Config
+) -> tuple[Gradient, dict[str, float]]:
+    """Gradient of a route that is a forward run and a backward pass, and its median times over its own plain run."""
+    seconds: list[tuple[float, float, float]] = []
+    gradient: Gradient = {}
+    for _ in range(config.repeats):
+        with torch.no_grad():
+            _, plain = timed(run)
+        value, forward = timed(lambda: loss(run()))
+        _, backward = timed(value.backward)
+        gradient = collect(window.model, scalars(window.model, config))
+        seconds.append((plain, backward, forward + backward))
+    plain, backward, total = (statistics.median(x) for x in zip(*seconds))
+    return gradient, {"forward_s": plain, "gradient": backward / plain, "total": total / plain}
+
+
+def by_sensitivities(
+    window: Window, loss: Callable[[Tensor], Tensor], config: Config
+) -> tuple[Gradient, dict[str, float]]:
+    """Gradient by forward sensitivities of all parameters at once, and its median times over the plain run."""
+    chosen, seconds = scalars(window.model, config), []
+    gradient: Gradient = {}
+    for _ in range(config.repeats):
+        with torch.no_grad():
+            _, plain = timed(lambda: states(window))
+
+        def contract() -> Tensor:
+            w, how = window, {"tolerance": NEWTON, "gradient": "forward", "wrt": list(chosen)}
+            run = simulate(w.model, w.t, y0=w.y0, step=w.step, **how)  # pyright: ignore[reportArgumentType]
+            assert run.sensitivities is not None
+            y = run.y.clone().requires_grad_(True)
+            y_bar, *direct = torch.autograd.grad(loss(y), (y, *chosen.values()), allow_unused=True)
+            explicit = torch.stack([torch.zeros_like(y_bar[0, 0]) if g is None else g for g in direct])
+            return torch.einsum("ti,tin->n", y_bar, run.sensitivities) + explicit
+
+        total, spent = timed(contract)
+        gradient = dict(zip(chosen, total.tolist()))
+        seconds.append((plain, spent - plain, spent))
+    plain, extra, spent = (statistics.median(x) for x in zip(*seconds))
+    return gradient, {"forward_s": plain, "gradient": extra / plain, "total": spent / plain}
+
+
+@torch.no_grad()
+def events(window: Window, y: Tensor) -> dict[str, Any]:
+    """Nodes that touch, leave, slip and begin to slip between the outputs, and the first row with such an event."""
+    parts = [at_the_points(window.model, window.t[rows], y[rows]) for rows in torch.arange(len(y)).split(200)]
+    depth, speed = (torch.cat(part) for part in zip(*parts))
+    on = depth > 0
+    slipping = (speed > 0) & on
+    touch, leave, onset = on[1:] & ~on[:-1], on[:-1] & ~on[1:], slipping[1:] & ~slipping[:-1]
+    first = (touch | leave | onset).any(1).nonzero()[:, 0]
+    return {
+        "steps": len(y) - 1, "touching": on.sum(1).max().item(), "touch": touch.sum().item(),
+        "leave": leave.sum().item(), "slipping": slipping.any(0).sum().item(), "slip_onsets": onset.sum().item(),
+        "fastest_slip_mm_s": 1e3 * (speed * on).max().item(), "first_row": first[0].item() if len(first) else 0,
+    }  # fmt: skip
+
+
+def stroke(config: Config, end: float, step: float, changes: dict[str, Any], every: float | None = None) -> Window:
+    """A 2 mm stroke in 20 ms out of a frictionless grasp, with little friction: nodes break away one after another."""
+    slippery = {"contact.v_s": 0.05, "contact.mu_s": 0.3, "contact.mu_k": 0.2}
+    model = SoftGrasp(Parameters().override({**slippery, **dict(config.changes), **changes}))
+    y0 = press(model, height := model.settings.scenario.y_Br_grasp).detach()
+    load = -holding_force(model, y0)
+    x = model.unpack(y0).pose["disc"][0].item()
+    model.reference = Reference(
+        x_d=Profile([0.0, 0.02], [x, x - 2e-3]), y_d=Profile([0.0], [height]), F_ff=Profile([0.0], [load])
+    )
+    return Window("slip", model, y0, linspace(0.0, end, every or step), step)
+
+
+def windows(config: Config) -> list[Window]:
+    """The five windows."""
+    model = SoftGrasp(Parameters().override(dict(config.changes)))
+    manipulation = grasp_and_roll(model, grasp_force=75.0 if config.smoke else None)
+    roll = 0.5 if config.smoke else 4.5
+    with torch.no_grad():
+        path = states(Window("path", model, manipulation.y0, linspace(0.0, roll, 0.01), 2e-3))
+    above = manipulation.y0.clone()
+    above[model.layout.slices["pose", "bracket"].stop - 1] += 2e-5
+    lowered = SoftGrasp(model.settings)
+    lowered.reference = reference(lowered, above, manipulation.grasp_force)
+    stick, grasp = (0.01, 0.2) if config.smoke else (0.05, 0.4)
+    early = 0.5 if config.smoke else 0.6
+    out = [
+        Window("stick", model, path[round(100 * early)], linspace(early, early + stick, 1e-3), 1e-3),
+        stroke(config, 6e-3, 2.5e-4, {}),
+        Window("make-break", model, path[-1], linspace(roll, roll + (0.05 if config.smoke else 0.5), 2e-3), 2e-3),
+        Window("grasp", lowered, above, linspace(0.0, grasp, 2e-3), 2e-3),
+    ]
+    return [*out, Window("full", model, manipulation.y0, linspace(0.0, config.duration, 0.01), 2e-3)]
+
+
+def judge_window(window: Window, config: Config) -> dict[str, Any]:
+    """Errors and costs of the routes over one window, the slow routes over the few steps about its first event."""
+    full = window.name == "full"
+    loss = make_loss(window)
+    with torch.no_grad():
+        y = states(window)
+    found = events(window, y)
+    judge, unsure = central_differences(window, loss, config, config.full_steps if full else config.steps)
+    gradients, costs = {}, {}
+    gradients["discrete"], costs["discrete"] = by_backward(window, loss, lambda: states(window), config)
+    gradients["forward"], costs["forward"] = by_sensitivities(window, loss, config)
+    out: dict[str, Any] = {
+        "events": found, "gradient": judge, "judge_uncertainty": unsure,
+        "relative_error": {route: relative_errors(g, judge) for route, g in gradients.items()},
+        "discrete_against_forward": relative_errors(gradients["forward"], gradients["discrete"]), "cost_ratio": costs,
+    }  # fmt: skip
+    if full or (config.smoke and window.name != "slip"):
+        return out
+    begin = max(0, min(found["first_row"] - 1, len(window.t) - 4))
+    part = replace(window, y0=y[begin].clone(), t=window.t[begin : begin + 4])
+    loss = make_loss(part)
+    with torch.no_grad():
+        out["sub_window_events"] = events(part, states(part))
+    judge, unsure = central_differences(part, loss, config, config.steps)
+    out["judge_uncertainty_sub_window"] = unsure
+    exact, _ = by_backward(part, loss, lambda: states(part), config)
+    got, costs["unrolled"] = by_backward(part, loss, lambda: states(part, "unrolled"), config)
+    out["relative_error"]["unrolled"] = relative_errors(got, judge)
+    out["unrolled_against_discrete"] = relative_errors(got, exact)
+    with torch.no_grad():
+        start = states(part)[1 if begin else 0].clone()
+    t = part.t[1 if begin else 0] + 1e-3 * linspace(0.0, config.continuous_ms, config.continuous_ms / 2)
+    fine = replace(part, y0=start, t=t, step=1e-6)
+    loss = make_loss(fine)
+    exact, _ = by_backward(fine, loss, lambda: states(fine), replace(config, repeats=1))
+
+    few = replace(config, repeats=min(config.repeats, 3))
+    got, costs["continuous"] = by_backward(fine, loss, lambda: states(fine, "continuous"), few)
+    values = {n: p.item() for n, p in scalars(fine.model, config).items()}
+    largest = max(abs(values[n] * x) for n, x in exact.items())
+    floor = {n: INSENSITIVE * largest / value for n, value in values.items()}
+    out["relative_error"]["continuous"] = relative_errors(got, exact, floor)
+    with torch.no_grad():
+        out["continuous_events"] = events(fine, states(fine))
+    return out
+
+
+WIDTHS = (0.04, 0.02, 0.01)  # Relative half-widths over which the slope of a loss with steps is averaged.
+
+
+def coulomb(config: Config) -> dict[str, Any]:
+    """The adjoint's bias with the literal Coulomb law, by least squares over L(mu), which has steps, at several widths.
+
+    With mu_s = mu_k both are varied together.
+    """
+    out: dict[str, Any] = {}
+    h = 1e-3 * config.coulomb_ms
+    for label, mu_k, varied in (
+        ("mu_s, of mu_s > mu_k", 0.2, ("mu_s",)),
+        ("mu_k, of mu_s > mu_k", 0.2, ("mu_k",)),
+        ("mu_s = mu_k", 0.3, ("mu_s", "mu_k")),
+    ):
+        window = stroke(config, 8e-3, h, {"contact.friction": "coulomb", "contact.mu_k": mu_k}, every=2.5e-4)
+        loss, parameters = make_loss(window), {name: window.model.parameter(f"contact.{name}") for name in varied}
+        y = states(window)
+        loss(y).backward()
+        adjoint = sum(parameters[name].grad.item() for name in varied)  # pyright: ignore[reportOptionalMemberAccess]
+        middle, scan = parameters[varied[0]].item(), []
+        changes = torch.linspace(-max(WIDTHS), max(WIDTHS), config.coulomb_runs, dtype=torch.float64)
+        with torch.no_grad():
+            for change in changes:
+                for name in varied:
+                    parameters[name].fill_(middle * (1 + change.item()))
+                scan.append(loss(states(window)).item())
+            for name in varied:
+                parameters[name].fill_(middle)
+        slopes = []
+        for width in WIDTHS:
+            near = changes.abs() <= width * (1 + 1e-9)
+            x = middle * changes[near]
+            slopes.append(((x * torch.tensor(scan, dtype=torch.float64)[near]).sum() / x.square().sum()).item())
+        slope = sum(slopes) / len(slopes)
+        out[label] = {
+            "events": events(window, y.detach()), "adjoint": adjoint, "slope": slope, "slopes": slopes, "widths": WIDTHS,
+            "uncertainty": (max(slopes) - min(slopes)) / 2, "mu": (middle * (1 + changes)).tolist(), "loss": scan,
+        }  # fmt: skip
+    return out
+
+
+def refinement(config: Config) -> dict[str, Any]:
+    """dL/dp through slip, at the same outputs, as the step is refined; errors against the finest step's."""
+    steps = [1e-3 * h for h in (*config.refinement_ms, config.refinement_ms[-1] / 2)]
+    names = ("contact.mu_s", "contact.mu_k", "contact.K_t")
+    base = stroke(config, 16e-3, steps[-1], {}, every=4e-3)
+    loss, table = make_loss(base), {}
+    for h in steps:
+        value = loss(states(replace(base, step=h)))
+        value.backward()
+        table[f"{1e3 * h:g}"] = {"loss": value.item(), **collect(base.model, names)}
+    with torch.no_grad():
+        dense = replace(base, t=linspace(0.0, 16e-3, 2.5e-4), step=2.5e-4)
+        found = events(dense, states(dense))
+    exact = list(table.values())[-1]
+    error = {key: {n: abs(row[n] - exact[n]) / abs(exact[n]) for n in exact} for key, row in list(table.items())[:-1]}
+    return {"events": found, "gradient": table, "relative_error": error}
 
 
 @dataclass(frozen=True)
@@ -48,24 +404,17 @@ class Result:
     windows: dict[str, dict[str, Any]]
     coulomb: dict[str, Any]
     refinement: dict[str, Any]
-    touch_down: dict[str, Any]
-    rest: dict[str, Any]
 
 
 def run(config: Config) -> Result:
-    config = smoke(config) if config.smoke else config
-    bar = tqdm(total=4 * 4 + 2 + 4, unit="part")
-    every = windows(config)
-    judged = {}
-    for window in every:
-        bar.set_description(window.name)
-        judged[window.name] = judge_window(window, config, bar)
-    rest = []
-    for part in (coulomb, refinement, lambda c: touch_down(c, every[2]), from_rest):
-        rest.append(part(config))
-        bar.update()
-    bar.close()
-    return Result(config, judged, *rest)
+    if config.smoke:  # the same questions for three parameters on a coarse mesh
+        config = replace(
+            config, steps=(3e-4, 1e-4, 3e-5), full_steps=(1e-4, 1e-5), coulomb_ms=0.25, coulomb_runs=17, continuous_ms=0.1,
+            refinement_ms=(2.0, 1.0), repeats=1, duration=0.6, only=("contact.K_n", "contact.mu_s", "pad.E"),
+            changes=tuple(COARSE.items()),
+        )  # fmt: skip
+    judged = {window.name: judge_window(window, config) for window in tqdm(windows(config), unit="window")}
+    return Result(config, judged, coulomb(config), refinement(config))
 
 
 def table(result: Result) -> str:
@@ -97,79 +446,38 @@ def table(result: Result) -> str:
     names = list(next(iter(refined.values())))
     rows = [(step, *(f"{errors[n]:.1e}" for n in names)) for step, errors in refined.items()]
     tables.append(markdown(("step [ms]", *names), rows))
-    rows = [
-        (label, f"{h:g}", f"{jump:.2f}", f"{end:.3g}", f"{before:.0e}", f"{after:.0e}")
-        for label, row in result.touch_down.items()
-        for h, jump, end, before, after in zip(
-            *(row[key] for key in ("step_ms", "jump", "end", "before_error", "after_error"))
-        )
-    ]
-    head = ("ramp", "step [ms]", "largest change in a step / range", "end value", "error before", "error after")
-    tables.append(markdown(head, rows))
-    head = ("start", "adjoint dL/dradius", *(f"d = {FINER[RADIUS] * d:g}" for d in result.config.steps))
-    rows = [(k, f"{r['adjoint']:.6g}", *(f"{x:.6g}" for x in r["central_differences"])) for k, r in result.rest.items()]
-    return "\n\n".join([*tables, markdown(head, rows)])
+    return "\n\n".join(tables)
 
 
 def figure(result: Result) -> Figure:
-    """Errors per parameter and window; convergence through slip; Coulomb's jumps; both sides of a touch-down."""
-    fig = Figure(figsize=(13, 11), layout="constrained")
-    grid = fig.add_gridspec(2, 3, height_ratios=(1.2, 1.0))
-    top, below = fig.add_subplot(grid[0, :]), [fig.add_subplot(grid[1, k]) for k in range(3)]
-    names = list(next(iter(result.windows.values()))["gradient"])
-    smallest = 1e-16
-    markers = {"discrete": "o", "forward": "x", "unrolled": "s", "continuous": "^"}
-    for i, (window, numbers) in enumerate(result.windows.items()):
-        for route, errors in numbers["relative_error"].items():
-            x = [k + 0.16 * (i - 2) for k in range(len(names))]
-            hollow = {} if route == "forward" else {"markerfacecolor": "none"}
-            top.semilogy(
-                x, [max(errors[n], smallest) for n in names], markers[route], color=f"C{i}", ms=6, ls="none", **hollow
-            )
-        top.plot([], [], "-", color=f"C{i}", label=window, lw=4)
-    for route, marker in markers.items():
-        top.plot([], [], marker, color="k", ls="none", markerfacecolor="none" if marker != "x" else "k", label=route)
-    for k in range(len(names) - 1):
-        top.axvline(k + 0.5, color="0.9", lw=0.8, zorder=0)
-    top.set_xticks(range(len(names)), [n.split(".")[-1] for n in names], rotation=45)
-    top.set(
-        ylabel="relative error [1]", title=f"Gradient against central differences ({smallest:g}: both exactly zero)"
-    )
-    top.set_xlim(-0.6, len(names) - 0.4)
-    top.legend(ncols=9, fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.16))
-    errors = result.refinement["relative_error"]
-    h = [float(key) for key in errors]
-    for (n, label), marker in zip((("contact.mu_s", "mu_s"), ("contact.mu_k", "mu_k"),
-                                   ("contact.K_t", "K_t"), ("loss", "the loss itself")), "osvD"):  # fmt: skip
-        below[0].loglog(h, [row[n] for row in errors.values()], marker=marker, label=label)
-    below[0].loglog(h, [errors[f"{h[0]:g}"]["loss"] * (x / h[0]) ** 2 for x in h], "k--", label="second order")
-    below[0].set(xlabel="step [ms]", ylabel="relative error [1]", title="dL/dp through slip against the finest step")
-    below[0].set_xticks(h, [f"{x:g}" for x in h])
-    below[0].minorticks_off()
-    below[0].legend()
+    """Errors of the discrete adjoint per parameter and window; convergence through slip; Coulomb's jumps."""
+    fig = Figure(figsize=(15, 5), layout="constrained")
+    errors, refined, jumps = fig.subplots(1, 3)
+    for name, numbers in result.windows.items():
+        row = numbers["relative_error"]["discrete"]
+        errors.semilogy([n.split(".")[-1] for n in row], [max(e, 1e-16) for e in row.values()], "o", label=name)
+    errors.tick_params(axis="x", rotation=45)
+    errors.set(ylabel="relative error [1]", title="Discrete adjoint against central differences")
+    steps = result.refinement["relative_error"]
+    for name in next(iter(steps.values())):
+        refined.loglog([float(h) for h in steps], [row[name] for row in steps.values()], "o-", label=name)
+    refined.set(xlabel="step [ms]", ylabel="relative error [1]", title="dL/dp through slip against the finest step")
     for k, (label, c) in enumerate(result.coulomb.items()):
-        if label.startswith("mu_k"):
-            continue
         mu, L = torch.tensor(c["mu"]), torch.tensor(c["loss"])
-        shift = mu - mu[len(mu) // 2]
-        below[1].plot(mu, L - L.mean(), f"C{k}.", ms=3, label=f"L by {label}")
-        below[1].plot(mu, c["adjoint"] * shift, f"C{k}-", label="adjoint's slope")
-        below[1].plot(mu, c["slope"] * shift, f"C{k}--", label="L's own slope")
-    below[1].set(xlabel="mu [1]", ylabel="L less its mean [1]", title="Coulomb's law to the letter")
-    below[1].legend(fontsize=8)
-    for k, (label, row) in enumerate(result.touch_down.items()):
-        below[2].plot(row["time_ms"], row["trace"], f"C{k}.-", ms=2, lw=0.8, label=f"ramp of {label}")
-    below[2].axvline(0, color="0.7", lw=0.8)
-    below[2].set(xlabel="end of the window after a node touched [ms]", ylabel="d omega / d K_n [rad/s per N/m]",
-                 xlim=(-1.0, 2.0), title="Both sides of a touch-down")  # fmt: skip
-    below[2].legend(fontsize=8)
+        jumps.plot(mu, L - L.mean(), f"C{k}.", ms=3, label=f"L by {label}")
+        jumps.plot(mu, c["adjoint"] * (mu - mu.mean()), f"C{k}-")
+    jumps.set(
+        xlabel="mu [1]", ylabel="L less its mean [1]", title="Coulomb's law to the letter; lines: the adjoint's slope"
+    )
+    for axes in (errors, refined, jumps):
+        axes.legend(fontsize=8)
     return fig
 
 
 def write(result: Result) -> None:
     """summary.json, table.md and gradient_accuracy.png into the output folder."""
-    parts = {k: getattr(result, k) for k in ("windows", "coulomb", "refinement", "touch_down", "rest")}
-    files = {**parts, "made_by": made_by(result.config)}
+    parts = {name: getattr(result, name) for name in ("windows", "coulomb", "refinement")}
+    files = parts | {"made_by": made_by(result.config)}
     write_files(result.config.out, files, {"gradient_accuracy": figure(result)}, table(result))
 
 
