@@ -17,7 +17,6 @@ from typing import Any
 
 import torch
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullFormatter
 from torch import Tensor
 from tqdm import tqdm
 
@@ -126,22 +125,16 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
 
 
 def figure(result: Result) -> Figure:
-    """Accuracy against cost: of the motion, the forces and the gradients."""
+    """Accuracy against cost: of a motion, a force and the gradients."""
     fig = Figure(figsize=(4.5 * len(result.motions), 4), layout="constrained")
     for ax, (title, rows) in zip(fig.subplots(1, len(result.motions), squeeze=False)[0], result.motions.items()):
-        for kind, line in (("rtol", "-"), ("step", "--")):
+        for kind, line in (("rtol", "o-"), ("step", "o--")):
             chosen = [row for key, row in rows.items() if key.startswith(kind)]
-            cost = [row["wall_s"] for row in chosen]
-            for (name, columns), colour in zip(
-                {"motion": ("x_C", "y_C", "theta"), "forces": ("F_x", "F_y"), "gradient": ("gradient",)}.items(), "kbr"
-            ):
-                worst = [max(row[c] for c in columns) for row in chosen]
-                label = f"{name}, {'by tolerance' if kind == 'rtol' else 'equal steps'}"
-                ax.loglog(cost, worst, f"{colour}o{line}", ms=3, label=label)
+            for name, colour in (("theta", "k"), ("F_x", "b"), ("gradient", "r")):
+                cost, error = zip(*((row["wall_s"], row[name]) for row in chosen))
+                ax.loglog(cost, error, line, color=colour, ms=3, label=f"{name}, by {kind}")
         ax.set(title=title, xlabel="wall time of the run [s]", ylabel="largest relative error [1]")
-        ax.grid(alpha=0.3, which="both")
-        ax.xaxis.set_minor_formatter(NullFormatter())
-    fig.legend(*fig.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6, fontsize=8)
+    fig.axes[0].legend(fontsize=8)
     return fig
 
 
