@@ -77,8 +77,8 @@ def design(file: RigFile, bandwidth: float) -> Gains:
     assert m is not None and m_J is not None and shape is not None  # noqa: PT018
     disc = shape.build(file.folder)
     assert isinstance(disc, Circle)
-    R, moved = float(disc.radius.detach()), m + 2 * m_J
-    turn = m_J * R + m * float(disc.gyration().detach()) / (2 * R)
+    R, moved = disc.radius.item(), m + 2 * m_J
+    turn = m_J * R + m * disc.gyration().item() / (2 * R)
     inertia = dict.fromkeys(LOOPS[:2], moved / 2) | dict.fromkeys(LOOPS[2:], turn) | {"lift": moved}
     return {loop: {"Kp": bandwidth**2 * M, "Kd": 2 * bandwidth * M} for loop, M in inertia.items()}
 
@@ -186,7 +186,7 @@ def by_kinematics(case: Case, gains: Gains, R: float) -> Case:
         signals[f"{jaw}_d"] = Sampled(times, float(start[jaw][0]) + x_d + sign * R * theta_d)
         jaws[f"carry_{jaw}"] = Actuator(f"{jaw}.x", f"{jaw}.x", PD(**gains[f"carry_{jaw}"]), setpoint=f"{jaw}_d")
     own = {name: rig.actuators[name] for name in ("lift", "grip")}
-    gravity = float(rig.gravity.detach())
+    gravity = rig.gravity.item()
     alone = Rig(bodies=rig.bodies, pads=rig.pads, contacts=rig.contacts, actuators=jaws | own, gravity=gravity)
     return Case(alone, case.y0, signals, case.end)
 
@@ -409,13 +409,13 @@ def run(config: Config) -> Result:
     base = case_of(file)
     hurried, disc, slip = faster(base, config.disc_speed), base.rig.bodies["disc"], friction_of(base)
     assert isinstance(disc.shape, Circle)
-    R, mass = float(disc.shape.radius.detach()), float(disc.mass.detach())
-    weight = float(base.rig.gravity.detach()) * mass
+    R, mass = disc.shape.radius.item(), disc.mass.item()
+    weight = base.rig.gravity.item() * mass
     grip = -float(base.signals["grip"](torch.tensor(base.end, dtype=torch.float64))[0].detach())
-    inertia = float(disc.inertia.detach())
+    inertia = disc.inertia.item()
     carrying = mass * peak(hurried.signals["x_d"]) / (2 * grip)
     turning = inertia * peak(hurried.signals["theta_d"]) / (2 * R * grip)
-    result = Result(config, gains, grip, float(slip.mu_s.detach()), carrying, turning)
+    result = Result(config, gains, grip, slip.mu_s.item(), carrying, turning)
     bar = tqdm(unit="run")
 
     def attempt(case: Case, name: str = "") -> tuple[Trajectory, Outcome]:

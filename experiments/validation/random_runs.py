@@ -17,16 +17,17 @@ Expected: no run hangs, none ends without a sentence or with numbers that are no
 """
 
 import math
-import multiprocessing
 import os
 import threading
 import warnings
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
-from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from signal import SIGKILL
+from queue import Empty, SimpleQueue
 from statistics import median
 from time import monotonic, process_time, sleep
 from typing import Any, NamedTuple
@@ -40,8 +41,9 @@ from torchsoft import NoEquilibrium, Parameters, SimulationFailed, SoftGrasp, si
 from torchsoft.excitation import FADE, Begun, Chirp, Excitation, MultiSine, Press, Roll, Strokes, begin
 from torchsoft.experiment import grid, made_by, markdown, options, write
 from torchsoft.paper.equilibrium import holding_force, press, rest
-from torchsoft.processes import THREADS, prepare_worker
+from torchsoft.processes import local_processes
 from torchsoft.scenario import reference
+from torchsoft.threads import side_by_side
 
 SCALED = (
     "pad.E", "pad.tau", "contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.eta", "contact.v_s",
@@ -125,8 +127,7 @@ REASONS = {
 DRAWS = 50
 """How often a run is drawn until there is one that can begin."""
 
-STILL, HUNG_STATUS = 3600.0, 75
-"""Wall time [s] after which a run has hung even if it takes no processor time; exit status of a process that ends itself."""
+STILL = 3600.0  # Wall time [s] after which a run has hung even if it takes no processor time.
 
 FINISHED, NOT_FINITE, HUNG = "finished", "finished with numbers that are not finite", "hung: its process was ended"
 
@@ -219,11 +220,16 @@ def outcome(drawn: Drawn, steps: dict[str, Any]) -> Outcome:
 Ends = tuple[str, dict[str, Outcome], list[Outcome]]
 """What a run does, its outcomes by way, and the draws before it that had no start."""
 
-WAYS = ("tolerances", "equal steps")
+WAYS: tuple[str, ...] = ("tolerances", "equal steps")
+
+
+CLOCKS = [0.0, 0.0]
+"""Of a worker process: its processor time and the wall time when its run began."""
 
 
 def both(number: int, config: Config) -> Ends:
     """Run `number` by both ways."""
+    CLOCKS[:] = process_time(), monotonic()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         drawn, refusals = prepare(number, config.seed)
@@ -231,85 +237,44 @@ def both(number: int, config: Config) -> Ends:
     return drawn.motion, {way: outcome(drawn, how) for way, how in zip(WAYS, steps)}, refusals
 
 
-def watch(began: list[float], limit: float) -> None:
-    """End the process when its run has taken too much of the processor's time; kernels do not keep this thread waiting."""
-    while process_time() - began[0] < limit:
-        sleep(0.5)
-    os._exit(HUNG_STATUS)
+def watched(limit: float) -> None:
+    """Begin a worker process that ends itself when its run takes too long; kernels do not keep that thread waiting."""
+    CLOCKS[:] = process_time(), monotonic()
 
+    def watch() -> None:
+        while process_time() - CLOCKS[0] < limit and monotonic() - CLOCKS[1] < STILL:
+            sleep(0.5)
+        os._exit(1)
 
-def work(connection: Connection, config: Config) -> None:
-    """A worker process: numbers of runs in, outcomes out."""
-    prepare_worker()
-    began = [process_time()]
-    threading.Thread(target=watch, args=(began, config.limit), daemon=True).start()
-    while True:
-        number = connection.recv()
-        began[0] = process_time()
-        try:
-            connection.send(both(number, config))
-        except Exception as error:
-            unsaid = Outcome(f"error without a sentence: {type(error).__name__}", str(error)[:200])
-            connection.send(("unknown", dict.fromkeys(WAYS, unsaid), []))
-
-
-class Worker:
-    """A process that does one run after the other, and the run that it is at."""
-
-    def __init__(self, config: Config) -> None:
-        self.connection, other = multiprocessing.get_context("spawn").Pipe()
-        self.process = multiprocessing.get_context("spawn").Process(target=work, args=(other, config), daemon=True)
-        self.process.start()
-        other.close()
-        self.number, self.began = -1, monotonic()
-
-    def give(self, number: int) -> None:
-        self.number, self.began = number, monotonic()
-        self.connection.send(number)
-
-    @property
-    def late(self) -> bool:
-        """Whether its run neither ends nor takes the processor's time."""
-        return monotonic() - self.began > STILL
-
-    def end(self) -> int | None:
-        """End the process, if it has not; its exit status."""
-        self.process.join(1.0)
-        self.process.kill()
-        self.process.join()
-        return self.process.exitcode
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def outcomes(config: Config) -> Iterator[tuple[int, Ends]]:
-    """All runs in the order of their ends. A worker whose run has hung is replaced."""
-    for name in THREADS:
-        os.environ[name] = "1"
-    todo, began = iter(range(config.first, config.first + config.runs)), monotonic()
-    workers = [Worker(config) for _ in range(config.workers)]
-    for worker, number in zip(workers, todo):
-        worker.give(number)
-    while busy := [worker for worker in workers if worker.number >= 0]:
-        ready = wait([worker.connection for worker in busy], 1.0)
-        for at, worker in enumerate(workers):
-            if worker.number < 0 or not (worker.connection in ready or worker.late):
-                continue
-            number, again = worker.number, worker
+    """All runs in the order of their ends, every thread with a process of its own. One whose run has hung is replaced."""
+    last, pools = monotonic() + 60 * config.minutes, SimpleQueue[ProcessPoolExecutor]()
+    with ExitStack() as stack:
+
+        def attempt(k: int) -> Ends | None:
+            if (began := monotonic()) > last:
+                return None
             try:
-                if worker.connection not in ready:
-                    raise EOFError
-                ends: Ends = worker.connection.recv()
-            except (EOFError, ConnectionError):
-                hung = worker.end() in (HUNG_STATUS, -SIGKILL)
-                ends = "unknown", dict.fromkeys(WAYS, Outcome(HUNG if hung else "its process died")), []
-                again = workers[at] = Worker(config)
-            yield number, ends
-            following = next(todo, -1) if monotonic() - began < 60 * config.minutes else -1
-            if following >= 0:
-                again.give(following)
-            else:
-                again.number = -1
-    for worker in workers:
-        worker.end()
+                pool = pools.get_nowait()
+            except Empty:
+                pool = stack.enter_context(local_processes(1, watched, config.limit))
+            try:
+                ends = pool.submit(both, config.first + k, config).result()
+            except BrokenProcessPool:
+                end = HUNG if monotonic() - began >= config.limit else "its process died"
+                return "unknown", dict.fromkeys(WAYS, Outcome(end)), []
+            except Exception as error:
+                unsaid = Outcome(f"error without a sentence: {type(error).__name__}", str(error)[:200])
+                ends = "unknown", dict.fromkeys(WAYS, unsaid), []
+            pools.put(pool)
+            return ends
+
+        for k, ends in side_by_side(attempt, config.runs, config.workers):
+            if ends is not None:
+                yield config.first + k, ends
 
 
 def run(config: Config) -> Result:
