@@ -153,16 +153,10 @@ def faster(case: Case, speed: float) -> Case:
     return Case(case.rig, case.y0, signals, GRIPPED + (case.end - GRIPPED) / speed)
 
 
-def friction_of(case: Case) -> SmoothSlip:
-    """The friction law that both contacts share."""
+def rubbed(case: Case, mu: float) -> None:
+    """Give the law that both contacts share a static coefficient of friction, the kinetic one in the same ratio as before."""
     slip = case.rig.contacts["lower"].law.friction
     assert isinstance(slip, SmoothSlip)
-    return slip
-
-
-def rubbed(case: Case, mu: float) -> None:
-    """Give the law of both contacts a static coefficient of friction, the kinetic one in the same ratio as before."""
-    slip = friction_of(case)
     with torch.no_grad():
         slip.mu_k.mul_(mu / slip.mu_s)
         slip.mu_s.fill_(mu)
@@ -273,7 +267,6 @@ class Result:
     config: Config
     gains: Gains
     grip: float  # [N]
-    mu: float  # coefficient of friction of the rig
     carrying: float  # the coefficient of friction m a / 2 N that carrying the disc asks for at `disc_speed`
     turning: float  # and I alpha / 2 R N, turning it
     rigid: dict[str, Rigid] = field(default_factory=dict)  # predictions by shape
@@ -334,17 +327,6 @@ def sentences(result: Result) -> Iterator[str]:
     swept = [("Disc, times as fast", result.speeds, True, "")]
     asks = f" Rigid, it asks for {result.turning:.4f} to be turned and for {result.carrying:.4f} to be carried."
     swept.append((f"Disc, {c.disc_speed:g} times as fast, mu", result.disc_frictions, False, asks))
-    for name in (name for name in result.rigid if name != DISC):
-        one, asked = result.alone[name], result.rigid[name]
-        rigid_deg = DEGREES * asked.effort / result.gains["turn_lower"]["Kp"]
-        came = f"lost ({one.stopped})" if one.stopped else (
-            f"{one.position_mm:.3f} mm and {one.angle_deg:.2f} deg, friction over normal force {one.friction:.3f}, jaws "
-            f"{one.opening_mm:.2f} mm farther apart: {result.verdict(one)} the tolerance"
-        )  # fmt: skip
-        yield (
-            f"{name.capitalize()}, by loops alone: {came}. Rigid statics: {rigid_deg:.2f} deg, friction {asked.friction:.3f} "
-            f"of {result.mu:g}, jaws {asked.opening_mm:.2f} mm."
-        )
     name = f"ellipse {c.slipping_aspect:g}"
     if result.frictions:
         asks = f" Its friction cone asks for {result.rigid[name].friction:.3f}."
@@ -407,7 +389,7 @@ def run(config: Config) -> Result:
     gains = design(RigFile.from_toml(FILE), config.bandwidth)
     file = file_of(gains, pads={"lower": mesh, "upper": mesh}) if config.smoke else file_of(gains)
     base = case_of(file)
-    hurried, disc, slip = faster(base, config.disc_speed), base.rig.bodies["disc"], friction_of(base)
+    hurried, disc = faster(base, config.disc_speed), base.rig.bodies["disc"]
     assert isinstance(disc.shape, Circle)
     R, mass = disc.shape.radius.item(), disc.mass.item()
     weight = base.rig.gravity.item() * mass
@@ -415,7 +397,7 @@ def run(config: Config) -> Result:
     inertia = disc.inertia.item()
     carrying = mass * peak(hurried.signals["x_d"]) / (2 * grip)
     turning = inertia * peak(hurried.signals["theta_d"]) / (2 * R * grip)
-    result = Result(config, gains, grip, slip.mu_s.item(), carrying, turning)
+    result = Result(config, gains, grip, carrying, turning)
     bar = tqdm(unit="run")
 
     def attempt(case: Case, name: str = "") -> tuple[Trajectory, Outcome]:

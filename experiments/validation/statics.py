@@ -93,7 +93,7 @@ def half_width(x: Tensor, g: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def indent(elements_x: int, stiffening: float, compressions: Tensor, bar: tqdm) -> Curve:
+def indent(elements_x: int, stiffening: float, compressions: Tensor) -> Curve:
     """Press the disc to each of the compressions (points,) [m]."""
     K_n = stiffening * Parameters().contact.K_n
     p = Parameters().override({"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30, "contact.K_n": K_n})
@@ -106,7 +106,6 @@ def indent(elements_x: int, stiffening: float, compressions: Tensor, bar: tqdm) 
         x = (pad.positions + model.displacement("U", state))[:, 0] + bracket[0] - disc[0]
         force = torch.tensor(holding_force(model, y), dtype=torch.float64)
         rows.append((force, half_width(x, g), g.max(), disc[1], (g > 0).sum()))
-        bar.update()
     force, width, penetration, y_C, touching = (torch.stack(column) for column in zip(*rows))
     return Curve(compressions, force, width, penetration, y_C, touching)
 
@@ -118,9 +117,7 @@ def run(config: Config) -> Result:
     compressions = fraction * Parameters().compression
     default = Parameters().pad.elements_x
     cases = [(n, 1.0) for n in config.elements_x] + [(default, k) for k in config.stiffenings]
-    unique = dict.fromkeys(cases)
-    with tqdm(total=len(unique) * config.points, unit="equilibrium") as bar:
-        curves = {case: indent(*case, compressions, bar) for case in unique}
+    curves = {case: indent(*case, compressions) for case in tqdm(dict.fromkeys(cases), unit="curve")}
     meshes = {f"{n} x {n // 30}": curves[n, 1.0] for n in config.elements_x}
     return Result(config, meshes, {f"{k:g}": curves[default, k] for k in config.stiffenings})
 

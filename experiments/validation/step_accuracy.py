@@ -13,7 +13,7 @@ some are a thousand times smaller than others, at 1e-7 (200 % at 2 ms). About tw
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from matplotlib.figure import Figure
@@ -45,8 +45,7 @@ class Result:
     motions: dict[str, dict[str, dict[str, Any]]]
 
 
-@dataclass(frozen=True)
-class Motion:
+class Motion(NamedTuple):
     """A model that follows its reference from y0 (size,) through the times t (T,)."""
 
     model: SoftGrasp
@@ -89,12 +88,10 @@ def run(config: Config) -> Result:
     ways: dict[str, dict[str, Any]] = {f"rtol = {rtol:g}": {"rtol": rtol} for rtol in config.rtols}
     ways |= {f"step = {h:g} ms": {"step": 1e-3 * h} for h in config.steps_ms}
     every = motions(config)
-    bar = tqdm(total=len(every) * (len(ways) + 1), unit="way")
     out: dict[str, dict[str, dict[str, Any]]] = {}
-    for title, motion in every.items():
+    for title, motion in tqdm(every.items(), unit="motion"):
         exact = simulate(motion.model, motion.t, y0=motion.y0, rtol=config.exact)
         wanted = gradient(motion, rtol=config.exact)
-        bar.update()
         out[title] = {}
         for key, steps in ways.items():
             simulated = lambda: simulate(motion.model, motion.t, y0=motion.y0, **steps)  # noqa: B023
@@ -111,8 +108,6 @@ def run(config: Config) -> Result:
                 "gradient": off.max().item(),
                 "gradients": dict(zip(EIGHT, off.tolist())),
             }
-            bar.update()
-    bar.close()
     return Result(config, out)
 
 
