@@ -161,27 +161,15 @@ def table(rows: list[Row]) -> str:
 
 
 def figure(result: Result) -> Figure:
-    """Standard deviations [%] as a heat map: single excitations above, the best combinations below."""
-    best = result.together[:8]
-    groups = [group for group in (result.single, best) if group]
-    fig = Figure(figsize=(10, 1.6 + 0.36 * sum(map(len, groups))), layout="constrained")
-    axes = fig.subplots(len(groups), 1, squeeze=False, gridspec_kw={"height_ratios": [len(g) for g in groups]})[:, 0]
-    image = None
-    for ax, group, title in zip(axes, groups, ("one excitation", f"together, at most {result.config.longest:g} s")):
-        values = np.array(
-            [[100 * np.hypot(row.sd[name], row.shift[name]) if row.sd else np.nan for name in NAMES] for row in group]
-        )
-        image = ax.imshow(values, norm=LogNorm(0.1, 100.0), cmap="RdYlGn_r", aspect="auto")
-        for i, j in np.ndindex(*values.shape):
-            text = "lost" if np.isnan(values[i, j]) else f"{values[i, j]:.2g}" if values[i, j] < 100 else ">100"
-            ax.text(j, i, text, ha="center", va="center", fontsize=8)
-        labels = [" + ".join(row.names) + (" (dropped)" if row.dropped else "") for row in group]
-        ax.set(yticks=range(len(group)), xticks=range(len(NAMES)), title=title)
-        ax.set_yticklabels(labels, fontsize=8)
-        ax.set_xticklabels([name.split(".")[1] for name in NAMES])
-        ax.tick_params(length=0)
-    assert image is not None
-    fig.colorbar(image, ax=axes, label="root of (standard deviation² + shift by the steps²) [%]", shrink=0.6)
+    """Standard deviations with the shift by the steps [%], as a heat map."""
+    every = result.single + result.together[:8]
+    fig = Figure(figsize=(10, 1.6 + 0.36 * len(every)), layout="constrained")
+    axes = fig.subplots()
+    values = [[100 * np.hypot(row.sd[n], row.shift[n]) if row.sd else np.nan for n in NAMES] for row in every]
+    image = axes.imshow(np.array(values), norm=LogNorm(0.1, 100.0), cmap="RdYlGn_r", aspect="auto")
+    axes.set_yticks(range(len(every)), [" + ".join(row.names) + (" (dropped)" if row.dropped else "") for row in every])
+    axes.set_xticks(range(len(NAMES)), [name.split(".")[1] for name in NAMES])
+    fig.colorbar(image, label="root of (standard deviation² + shift by the steps²) [%]")
     return fig
 
 

@@ -16,8 +16,7 @@ import json
 import shlex
 import sys
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
-from importlib.metadata import version
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,7 +27,8 @@ from tqdm import tqdm
 
 from torchsoft import Interrupted, NoEquilibrium, Parameters, SimulationFailed, SoftGrasp, Trajectory, simulate
 from torchsoft.channels import PADS
-from torchsoft.experiment import COARSE, options
+from torchsoft.experiment import COARSE, markdown, options, raw_config
+from torchsoft.files import write_json
 from torchsoft.plot import diagram as drawn
 from torchsoft.plot import figures as draw
 from torchsoft.plot.animation import animate
@@ -157,8 +157,7 @@ def summary(run: Run) -> dict[str, Any]:
 def summaries(result: Result) -> dict[str, Any]:
     """`summary.json`: the chosen friction set at the top, the other under "paper_like", and how both were made."""
     first, *others = map(summary, result.runs.values())
-    config = {name: str(value) if isinstance(value, Path) else value for name, value in asdict(result.config).items()}
-    made = {"torchsoft": version("torchsoft"), "command": command(result.config), "config": config}
+    made = raw_config(result.config) | {"command": command(result.config)}
     return first | {"paper_like": others[0] if others else None} | made
 
 
@@ -167,10 +166,10 @@ def command(config: Config) -> str:
     words = ["python", "experiments/grasp_and_roll.py"]
     for field in fields(config):
         value, flag = getattr(config, field.name), field.name
-        if isinstance(value, bool) and value != field.default:
-            words.append(f"--{flag}" if value else f"--no-{flag}")
-        elif value != field.default:
-            words += [f"--{flag}", str(value)]
+        if value != field.default:
+            words += (
+                [f"--{flag}" if value else f"--no-{flag}"] if isinstance(value, bool) else [f"--{flag}", str(value)]
+            )
     return shlex.join(words)
 
 
@@ -200,7 +199,7 @@ ROWS = (  # what, published value, key, format
 
 
 def table(numbers: Mapping[str, Any]) -> str:
-    """The published values beside the run's, as Markdown that is also legible as it is."""
+    """The published values beside the run's, as Markdown."""
 
     def cell(source: Mapping[str, Any], key: str, form: str) -> str:
         value: Any = source
@@ -213,12 +212,8 @@ def table(numbers: Mapping[str, Any]) -> str:
         return f"{value:{form}}" + (f" ({source['newton_per_step']:.2f})" if key == "steps" else "")
 
     columns = [numbers] + ([numbers["paper_like"]] if numbers["paper_like"] else [])
-    head = ["", "paper", *(f"{c['friction']} friction" for c in columns)]
-    rows = [[what, paper, *(cell(c, key, form) for c in columns)] for what, paper, key, form in ROWS]
-    widths = [max(len(row[i]) for row in [head, *rows]) for i in range(len(head))]
-    lines = [" | ".join(text.ljust(width) for text, width in zip(row, widths)) for row in [head, *rows]]
-    lines.insert(1, " | ".join("-" * width for width in widths))
-    return "\n".join(f"| {line} |" for line in lines)
+    head = ("", "paper", *(f"{c['friction']} friction" for c in columns))
+    return markdown(head, [(what, paper, *(cell(c, key, form) for c in columns)) for what, paper, key, form in ROWS])
 
 
 def figures(result: Result) -> dict[str, Figure]:
@@ -250,7 +245,7 @@ def write(result: Result) -> None:
     for friction, done in result.runs.items():
         name = "trajectory.nc" if done is first else f"trajectory_{friction.replace('-', '_')}.nc"
         done.trajectory.save(config.out / name)
-    (config.out / "summary.json").write_text(json.dumps(summaries(result), indent=2) + "\n", encoding="utf-8")
+    write_json(config.out / "summary.json", summaries(result))
     (config.out / "multibond.dot").write_text(drawn.dot(first.model), encoding="utf-8")
     if result.stopped:
         return

@@ -19,7 +19,6 @@ from pathlib import Path
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from torchsoft import Parameters, SmoothSlip, SoftGrasp, Trajectory, press, simulate
 from torchsoft.experiment import COARSE, at_the_points, options, write
@@ -39,10 +38,6 @@ class Config:
     samples: int = 8
     seed: int = 0
     smoke: bool = False  # a size that takes seconds
-
-
-def smoke(config: Config) -> Config:
-    return replace(config, evaluations=9, samples=3)
 
 
 @dataclass(frozen=True)
@@ -88,7 +83,7 @@ def disc(run: Trajectory) -> Tensor:
 
 
 def run(config: Config) -> Result:
-    config = smoke(config) if config.smoke else config
+    config = replace(config, evaluations=9, samples=3) if config.smoke else config
     torch.manual_seed(config.seed)
     law = {"contact.mu_s": 0.8, "contact.mu_k": 0.3, "contact.v_s": 0.05}
     model = SoftGrasp(Parameters().override(COARSE | law))
@@ -114,20 +109,16 @@ def run(config: Config) -> Result:
         student.parameters(), max_iter=config.evaluations, max_eval=config.evaluations, line_search_fn="strong_wolfe"
     )
     losses: list[float] = []
-    bar = tqdm(total=config.evaluations, desc="learning mu(v)", unit="run")
 
     def misfit() -> Tensor:
         optimiser.zero_grad()
         loss = (disc(simulate(learner, t, y0=y0, step=step, gradient="discrete")) - data).square().mean()
         loss.backward()
         losses.append(loss.item())
-        bar.set_postfix(loss=f"{min(losses):.3g}")
-        bar.update()
         return loss
 
     optimiser.step(misfit)
     misfit()  # where it ended
-    bar.close()
     with torch.no_grad():
         learned = student.mu(v)
     return Result(config, losses, v, start, learned, exact, (float(excited.quantile(0.1)), float(excited.max())))

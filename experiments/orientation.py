@@ -77,8 +77,8 @@ def design(file: RigFile, bandwidth: float) -> Gains:
     assert m is not None and m_J is not None and shape is not None  # noqa: PT018
     disc = shape.build(file.folder)
     assert isinstance(disc, Circle)
-    R, moved = float(disc.radius.detach()), m + 2 * m_J
-    turn = m_J * R + m * float(disc.gyration().detach()) / (2 * R)
+    R, moved = disc.radius.item(), m + 2 * m_J
+    turn = m_J * R + m * disc.gyration().item() / (2 * R)
     inertia = dict.fromkeys(LOOPS[:2], moved / 2) | dict.fromkeys(LOOPS[2:], turn) | {"lift": moved}
     return {loop: {"Kp": bandwidth**2 * M, "Kd": 2 * bandwidth * M} for loop, M in inertia.items()}
 
@@ -153,16 +153,10 @@ def faster(case: Case, speed: float) -> Case:
     return Case(case.rig, case.y0, signals, GRIPPED + (case.end - GRIPPED) / speed)
 
 
-def friction_of(case: Case) -> SmoothSlip:
-    """The friction law that both contacts share."""
+def rubbed(case: Case, mu: float) -> None:
+    """Give the law that both contacts share a static coefficient of friction, the kinetic one in the same ratio as before."""
     slip = case.rig.contacts["lower"].law.friction
     assert isinstance(slip, SmoothSlip)
-    return slip
-
-
-def rubbed(case: Case, mu: float) -> None:
-    """Give the law of both contacts a static coefficient of friction, the kinetic one in the same ratio as before."""
-    slip = friction_of(case)
     with torch.no_grad():
         slip.mu_k.mul_(mu / slip.mu_s)
         slip.mu_s.fill_(mu)
@@ -186,7 +180,7 @@ def by_kinematics(case: Case, gains: Gains, R: float) -> Case:
         signals[f"{jaw}_d"] = Sampled(times, float(start[jaw][0]) + x_d + sign * R * theta_d)
         jaws[f"carry_{jaw}"] = Actuator(f"{jaw}.x", f"{jaw}.x", PD(**gains[f"carry_{jaw}"]), setpoint=f"{jaw}_d")
     own = {name: rig.actuators[name] for name in ("lift", "grip")}
-    gravity = float(rig.gravity.detach())
+    gravity = rig.gravity.item()
     alone = Rig(bodies=rig.bodies, pads=rig.pads, contacts=rig.contacts, actuators=jaws | own, gravity=gravity)
     return Case(alone, case.y0, signals, case.end)
 
@@ -273,7 +267,6 @@ class Result:
     config: Config
     gains: Gains
     grip: float  # [N]
-    mu: float  # coefficient of friction of the rig
     carrying: float  # the coefficient of friction m a / 2 N that carrying the disc asks for at `disc_speed`
     turning: float  # and I alpha / 2 R N, turning it
     rigid: dict[str, Rigid] = field(default_factory=dict)  # predictions by shape
@@ -334,17 +327,6 @@ def sentences(result: Result) -> Iterator[str]:
     swept = [("Disc, times as fast", result.speeds, True, "")]
     asks = f" Rigid, it asks for {result.turning:.4f} to be turned and for {result.carrying:.4f} to be carried."
     swept.append((f"Disc, {c.disc_speed:g} times as fast, mu", result.disc_frictions, False, asks))
-    for name in (name for name in result.rigid if name != DISC):
-        one, asked = result.alone[name], result.rigid[name]
-        rigid_deg = DEGREES * asked.effort / result.gains["turn_lower"]["Kp"]
-        came = f"lost ({one.stopped})" if one.stopped else (
-            f"{one.position_mm:.3f} mm and {one.angle_deg:.2f} deg, friction over normal force {one.friction:.3f}, jaws "
-            f"{one.opening_mm:.2f} mm farther apart: {result.verdict(one)} the tolerance"
-        )  # fmt: skip
-        yield (
-            f"{name.capitalize()}, by loops alone: {came}. Rigid statics: {rigid_deg:.2f} deg, friction {asked.friction:.3f} "
-            f"of {result.mu:g}, jaws {asked.opening_mm:.2f} mm."
-        )
     name = f"ellipse {c.slipping_aspect:g}"
     if result.frictions:
         asks = f" Its friction cone asks for {result.rigid[name].friction:.3f}."
@@ -407,15 +389,15 @@ def run(config: Config) -> Result:
     gains = design(RigFile.from_toml(FILE), config.bandwidth)
     file = file_of(gains, pads={"lower": mesh, "upper": mesh}) if config.smoke else file_of(gains)
     base = case_of(file)
-    hurried, disc, slip = faster(base, config.disc_speed), base.rig.bodies["disc"], friction_of(base)
+    hurried, disc = faster(base, config.disc_speed), base.rig.bodies["disc"]
     assert isinstance(disc.shape, Circle)
-    R, mass = float(disc.shape.radius.detach()), float(disc.mass.detach())
-    weight = float(base.rig.gravity.detach()) * mass
+    R, mass = disc.shape.radius.item(), disc.mass.item()
+    weight = base.rig.gravity.item() * mass
     grip = -float(base.signals["grip"](torch.tensor(base.end, dtype=torch.float64))[0].detach())
-    inertia = float(disc.inertia.detach())
+    inertia = disc.inertia.item()
     carrying = mass * peak(hurried.signals["x_d"]) / (2 * grip)
     turning = inertia * peak(hurried.signals["theta_d"]) / (2 * R * grip)
-    result = Result(config, gains, grip, float(slip.mu_s.detach()), carrying, turning)
+    result = Result(config, gains, grip, carrying, turning)
     bar = tqdm(unit="run")
 
     def attempt(case: Case, name: str = "") -> tuple[Trajectory, Outcome]:

@@ -98,10 +98,6 @@ class Result:
         return [name for name, sd in self.prices[case].unknown.items() if sd < SHOWN]
 
 
-def smoke(config: Config) -> Config:
-    return replace(config, seeds=1, workers=1)
-
-
 def cut(case: str, config: Config) -> Cut:
     """What the rig gives after the cut of a case; half of the usual mesh."""
     name, since = CUTS[case]
@@ -234,7 +230,7 @@ def holds(found: IdentificationResult, name: str) -> bool:
 
 
 def run(config: Config) -> Result:
-    config = smoke(config) if config.smoke else config
+    config = replace(config, seeds=1, workers=1) if config.smoke else config
     cuts = {case: cut(case, config) for case in (["hidden history"] if config.smoke else CUTS)}
     prices = {case: price(one, config) for case, one in cuts.items()}
     rest = {case: at_rest(one, config) for case, one in cuts.items()}
@@ -252,31 +248,14 @@ def run(config: Config) -> Result:
 
 
 def figure(result: Result) -> Figure:
-    """By case, errors over their standard deviations, and predicted deviations with the start known and unknown."""
-    fig = Figure(figsize=(4.0 * len(result.found), 6.0), layout="constrained")
-    axes = fig.subplots(2, len(result.found), squeeze=False, height_ratios=(1.6, 1))
-    for (above, below), (case, found) in zip(axes.T, result.found.items()):
-        names = result.shown(case)
-        for i, name in enumerate(names):
-            errors = np.array([np.log(one[name].last / TRUTH[name]) / one[name].relative_sd for one in found])
-            places = i + np.linspace(-0.3, 0.3, len(found) + 2)[1:-1]
-            inside = np.array([holds(one, name) for one in found])
-            above.plot(errors[inside], places[inside], "o", color="C0", ms=3)
-            above.plot(errors[~inside], places[~inside], "x", color="C3", ms=5)
-        above.axvspan(-1.96, 1.96, color="0.93", zorder=0)
-        above.axvline(0.0, color="k", lw=0.5)
-        above.set(xlim=(-5, 5), xlabel="error of ln(estimate), in its standard deviations", title=case)
-        above.set_yticks(range(len(names)), [name.split(".")[1] for name in names])
-        above.set_ylim(len(names) - 0.4, -0.6)
-        every = list(result.prices[case].unknown)
-        for kind, colour, shift in (("unknown", "C0", -0.2), ("known", "0.6", 0.2)):
-            sds = [100 * getattr(result.prices[case], kind)[name] for name in every]
-            below.bar(np.arange(len(every)) + shift, sds, 0.4, color=colour, label=f"start {kind}")
-        below.axhline(100 * SHOWN, color="k", lw=0.5, ls=":")
-        below.set(yscale="log", ylim=(0.1, 1000))
-        below.set_xticks(range(len(every)), [name.split(".")[1] for name in every], rotation=45)
-    axes[1, 0].set_ylabel("predicted sd [%]")
-    axes[1, 0].legend(loc="upper left")
+    """By case, errors of the parameters that are shown, over their standard deviations."""
+    fig = Figure(figsize=(4.0 * len(result.found), 4.0), layout="constrained")
+    for axes, (case, found) in zip(fig.subplots(1, len(result.found), squeeze=False)[0], result.found.items()):
+        for name in result.shown(case):
+            errors = [np.log(one[name].last / TRUTH[name]) / one[name].relative_sd for one in found]
+            axes.plot(errors, [name.split(".")[1]] * len(errors), "o", ms=3)
+        axes.axvspan(-1.96, 1.96, color="0.93", zorder=0)
+        axes.set(xlim=(-5, 5), xlabel="error of ln(estimate), in its standard deviations", title=case)
     return fig
 
 

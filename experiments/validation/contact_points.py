@@ -4,22 +4,19 @@ The paper puts one contact point on every surface node, so that a rolling disc p
 time. With `contact.points` = n they lie at n Gauss points an element, and the pad's shape functions carry displacements
 and forces between them and the nodes. Compared on 1 mm and 0.5 mm elements; a ripple is half of the peak-to-peak.
   static    the disc pressed 0 to 1 mm beside a node, without friction: ripples of the force along the lower pad and of
-            y_C (the upper pad stays centred over the disc); holding force of the paper's and of a light (0.15 mm) grasp
-  valley    a disc left free 0.1 mm beside a node, the upper pad away: the farthest that it rolls in 1 s
+            y_C (the upper pad stays centred over the disc)
   rolling   the manipulation: peak of F_x, its ripple between 5 and 7 s less a cubic trend, theta, energy residual
   gradient  of y_C and theta after 0.3 s of pressing and rolling, from several places, by K_n, E and K_t: the adjoint's
             largest difference from central differences over 1e-6 (is it exact?) and over 1 % (is it the trend?)
-  cost      wall time of the 10 s, alone and with a Jacobian; one point an element makes as many points as nodes
 
 Command: .venv/bin/python experiments/validation/contact_points.py [--smoke]
 Expected, 1 mm elements, nodes / 2 / 3 / 4 points: ripple of F_x 121 / 49 / 25 / 19 mN; gradient off the trend by up to
-15 / 5 / 2 / 2 %; time 1 / 1.4 / 1.7 / 1.8. Nodes 0.5 mm apart: 16 mN, 10 %, 2.4. About seven minutes on one core.
+15 / 5 / 2 / 2 %. Nodes 0.5 mm apart: 16 mN, 10 %. About seven minutes on one core.
 """
 
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -28,11 +25,10 @@ from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
-from torchsoft import Parameters, Profile, Reference, SoftGrasp, press, rest, simulate
+from torchsoft import Parameters, Profile, Reference, SoftGrasp, press, simulate
 from torchsoft.experiment import grid, markdown, options, raw_config, write
 from torchsoft.paper.equilibrium import holding_force
-from torchsoft.physics.motion import hold
-from torchsoft.scenario import Manipulation, grasp_and_roll
+from torchsoft.scenario import grasp_and_roll
 
 Key = tuple[int, int]  # elements along the pad, contact points an element
 TRAINED = ("contact.K_n", "pad.E", "contact.K_t")
@@ -48,7 +44,6 @@ class Config:
     gradient_mm: tuple[float, ...] = (0.0, 0.35, 0.7)  # starts of the runs with gradients, from there [mm]
     duration: float = 10.0  # of the manipulation [s]
     window: tuple[float, float] = (5.0, 7.0)  # in which the ripple of F_x is taken [s]
-    repeats: int = 3  # of the runs that are timed
     smoke: bool = False  # a size that takes seconds
 
 
@@ -56,13 +51,7 @@ class Config:
 class Result:
     config: Config
     numbers: dict[Key, dict[str, float]]
-    curves: dict[Key, dict[str, Tensor]]  # place [mm], force [N], y_C [m]; t [s], F_x [N]
-
-
-def smoke(config: Config) -> Config:
-    """The same question in a few seconds."""
-    return replace(config, elements_x=(120,), points=(0, 2), places=5, gradient_mm=(0.0,), duration=0.8,
-                   window=(0.5, 0.8), repeats=1)  # fmt: skip
+    curves: dict[Key, tuple[Tensor, Tensor]]  # times [s] and F_x less its trend [N]
 
 
 def build(elements_x: int, points: int, changes: dict[str, Any] | None = None) -> SoftGrasp:
@@ -77,32 +66,16 @@ def detrended(t: Tensor, x: Tensor, window: tuple[float, float]) -> tuple[Tensor
 
 
 @torch.no_grad()
-def static(config: Config, case: Key) -> tuple[dict[str, float], dict[str, Tensor]]:
-    """Force along the lower pad and height of the disc pressed at the places; holding forces of two grasps."""
+def static(config: Config, case: Key) -> dict[str, float]:
+    """Ripples of the force along the lower pad and of the height of the disc pressed at the places."""
     places = np.linspace(config.node_mm, config.node_mm + 1, config.places)
     models = [build(*case, {"scenario.x_C0": 1e-3 * x}) for x in places.tolist()]
-    model, low = models[0], models[0].settings.scenario.y_Br_grasp
-    light = low + model.settings.compression - 0.15e-3
-    states = [model.unpack(press(model, low)) for model in models]
+    states = [model.unpack(press(model, model.settings.scenario.y_Br_grasp)) for model in models]
     force, y_C = (torch.stack(x) for x in zip(*((s.pads["L"][0, :, 0].sum(), s.pose["disc"][1]) for s in states)))
     return {
         "static ripple of the force along the pad [mN]": 0.5e3 * float(np.ptp(force.numpy())),
         "static ripple of y_C [um]": 0.5e6 * float(np.ptp(y_C.numpy())),
-        "holding force, the paper's grasp [N]": holding_force(model, press(model, low)),
-        "holding force, light grasp [N]": holding_force(model, press(model, light)),
-    }, {"place": torch.from_numpy(places), "force": force, "y_C": y_C}
-
-
-@torch.no_grad()
-def valley(config: Config, case: Key) -> float:
-    """The farthest [um] that a disc left free beside a node of the lower pad rolls in 1 s."""
-    x = 1e-3 * (config.node_mm + 0.1)
-    model = build(*case, {"scenario.x_C0": x, "control.senses": "bracket"})
-    state = model.unpack(rest(model))
-    bracket = state.pose["bracket"] + torch.tensor([0.0, 5e-3, 0.0], dtype=torch.float64)
-    y0 = model.pack(state._replace(pose=state.pose | {"bracket": bracket}))
-    run = simulate(model, grid(1.0), y0=y0, reference=hold(x_d=x, y_d=bracket[1].item(), F_ff=0.0))
-    return 1e6 * (run["x_C"] - x).abs().max().item()
+    }
 
 
 def gradient(case: Key, x: float) -> dict[float, float]:
@@ -127,38 +100,26 @@ def gradient(case: Key, x: float) -> dict[float, float]:
     return errors
 
 
-def wall(config: Config, ready: dict[Key, Manipulation], **route: Any) -> dict[Key, float]:
-    """Median wall time [s] of the manipulation; the cases take turns."""
-    times: dict[Key, list[float]] = {case: [] for case in ready}
-    for _, (case, m) in product(range(config.repeats), ready.items()):
-        times[case].append(simulate(m.model, grid(config.duration), y0=m.y0, **route).stats.wall_s)
-    return {case: median(several) for case, several in times.items()}
-
-
 def run(config: Config) -> Result:
-    config = smoke(config) if config.smoke else config
-    numbers, curves, ready = {}, {}, {}
+    if config.smoke:
+        config = replace(config, elements_x=(120,), points=(0, 2), places=5, gradient_mm=(0.0,), duration=0.8,
+                         window=(0.5, 0.8))  # fmt: skip
+    numbers, curves = {}, {}
     for case in tqdm(list(product(config.elements_x, config.points)), unit="case"):
-        numbers[case], curves[case] = static(config, case)
-        ready[case] = grasp_and_roll(build(*case))
-        rolled = simulate(ready[case].model, grid(config.duration, 5e-3), y0=ready[case].y0)
+        numbers[case] = static(config, case)
+        m = grasp_and_roll(build(*case))
+        rolled = simulate(m.model, grid(config.duration, 5e-3), y0=m.y0)
         F_x = rolled["F_x"]
+        curves[case] = detrended(rolled.t, F_x, config.window)
         errors = [gradient(case, 1e-3 * (config.node_mm + x)) for x in config.gradient_mm]
         numbers[case] |= {
-            "valley: rolls [um]": valley(config, case),
             "peak of F_x [mN]": 1e3 * F_x.abs().max().item(),
-            "ripple of F_x [mN]": 0.5e3 * float(np.ptp(detrended(rolled.t, F_x, config.window)[1].numpy())),
+            "ripple of F_x [mN]": 0.5e3 * float(np.ptp(curves[case][1].numpy())),
             "theta at the end [rad]": rolled["theta"][-1].item(),
             "energy residual, relative": rolled.energy_residual_rel,
             "points that touch at the end": sum((force[-1, :, 0] > 0).sum().item() for force in rolled.force.values()),
             "Newton iterations a step": rolled.stats.newton_per_step,
         } | {f"gradient from differences over {d:g}": max(e[d] for e in errors) for d in errors[0]}
-        curves[case] |= {"t": rolled.t, "F_x": F_x}
-    alone, jacobian = wall(config, ready), wall(config, ready, gradient="forward", wrt=TRAINED, rigid=True)
-    for case, seconds in alone.items():
-        nodes = alone[case[0], config.points[0]]
-        numbers[case] |= {"run [s]": seconds, "run / on nodes": seconds / nodes}
-        numbers[case]["with Jacobian / on nodes"] = jacobian[case] / nodes
     return Result(config, numbers, curves)
 
 
@@ -167,21 +128,13 @@ def label(case: Key) -> str:
 
 
 def figure(result: Result) -> Figure:
-    fig = Figure(figsize=(12, 8), layout="constrained")
-    (force, height), (whole, part) = fig.subplots(2, 2)
-    for case, c in result.curves.items():
-        coarse = case[0] == result.config.elements_x[0]
-        style: dict[str, Any] = {"color": f"C{case[1]}", "ls": "-" if coarse else "--", "lw": 1, "label": label(case)}
-        force.plot(c["place"], 1e3 * c["force"], **style)
-        height.plot(c["place"], 1e6 * (c["y_C"] - c["y_C"].mean()), **style)
-        if coarse and case[1] in (0, 2, 4):
-            whole.plot(c["t"], 1e3 * c["F_x"], **style)
-            part.plot(*detrended(c["t"], 1e3 * c["F_x"], result.config.window), **style)
-    force.set(xlabel="$x_C$ [mm]", ylabel="force along the lower pad [mN]", title="Pressed without friction")
-    height.set(xlabel="$x_C$ [mm]", ylabel="$y_C$ less its mean [um]", title="Pressed without friction")
-    whole.set(xlabel="time [s]", ylabel="$F_x$ [mN]", title="Manipulation")
-    part.set(xlabel="time [s]", ylabel="$F_x$ less a cubic trend [mN]", title="Manipulation")
-    force.legend(fontsize="small", ncols=2)
+    """F_x of the manipulation, less its trend."""
+    fig = Figure(figsize=(8, 4.5), layout="constrained")
+    axes = fig.subplots()
+    for case, (t, F_x) in result.curves.items():
+        axes.plot(t, 1e3 * F_x, lw=1, label=label(case))
+    axes.set(xlabel="time [s]", ylabel="$F_x$ less a cubic trend [mN]")
+    axes.legend(fontsize="small", ncols=2)
     return fig
 
 

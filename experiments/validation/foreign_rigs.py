@@ -12,31 +12,266 @@ Expected: every interval holds, or a warning names the cause; no case is silent.
 recordings included, which are kept in the folder --out.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from hashlib import sha256
 from pathlib import Path
 from time import perf_counter, process_time
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from _foreign_cases import CASES, Case
-from _foreign_recordings import SMOKE_UNKNOWNS, TRUTH, Made, Order, make_all
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
+import torch
+from tqdm import tqdm
 
-from torchsoft.experiment import markdown, options, raw_config, write
-from torchsoft.sysid import RIG, IdentificationResult, Problem, Unknown, Unreachable, explain
+from torchsoft import Parameters, Reference, SoftGrasp
+from torchsoft.excitation import Chirp, Excitation, MultiSine, Press, Strokes, begin
+from torchsoft.experiment import COARSE, markdown, options, raw_config, write
+from torchsoft.files import replacing
+from torchsoft.physics.motion import Profile, Sampled
+from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, Unreachable, explain
 from torchsoft.sysid.problem.journal import forget
+from torchsoft.sysid.problem.recording import Array
 from torchsoft.sysid.problem.workers import Runner
+from torchsoft.threads import parallel_map
 
-VERDICTS = {
-    "holds": "C0",
-    "cause named": "C2",
-    "warned, cause not named": "C1",
-    "silent": "C3",
-}
-"""What may be said of a case, and its colour: every interval holds the truth; one does not, and a warning names the cause, or
-says only that something is wrong; or nothing is said."""
+TESTS = Path(__file__).parents[2] / "tests"
+sys.path.insert(0, str(TESTS))
+
+from foreign import Numbers, simulate  # noqa: E402  # pyright: ignore[reportMissingImports]
+
+TRUTH = {
+    "contact.K_n": 1.6e5, "contact.R_n": 300.0, "contact.K_t": 0.8e5, "contact.R_t": 600.0, "contact.mu_s": 0.65,
+    "contact.mu_k": 0.5, "pad.E": 0.9e6, "pad.tau": 0.012,
+}  # fmt: skip
+
+SMOKE_UNKNOWNS = ("contact.mu_s", "contact.K_n", "pad.E", "pad.tau")
+
+SIGNALS = ("x_d", "y_d", "F_ff")
+
+SETTLE = 0.2
+"""Time [s] that the rig is simulated before the first sample: the disc has been put down then."""
+
+KEPT = 1e-3
+"""Spacing [s] of the rows that are kept."""
+
+RATE = 200.0
+"""Samples a second."""
+
+
+def excitations(smoke: bool) -> dict[str, Excitation]:
+    """Motions of a second or so: three gentle ones, which show all eight parameters together, and hard ones."""
+    if smoke:
+        return {
+            "pressing": Excitation(motion=Press(amplitude=4e-4, frequency=12.0, travel=8e-3), duration=0.7, grasp_time=0.15),
+            "shaking": Excitation(
+                motion=MultiSine(amplitude_x=6e-3, amplitude_y=2e-4, frequency=(4.0, 17.0)), duration=0.7, depth=4e-4,
+                grasp_time=0.15,
+            ),
+        }  # fmt: skip
+    shaking = MultiSine(amplitude_x=6e-3, amplitude_y=2e-4, frequency=(4.0, 20.0))
+    return {
+        "deep pressing": Excitation(
+            motion=Press(amplitude=8e-4, frequency=17.0, travel=20e-3), duration=1.2, depth=2.5e-3
+        ),
+        "light shaking": Excitation(motion=shaking, duration=1.2, depth=3e-4),
+        "light jerks": Excitation(motion=Strokes(travel=80e-3, stroke_time=0.2), duration=1.0, depth=2e-4),
+        "deep chirp": Excitation(
+            motion=Chirp(amplitude_x=5e-3, amplitude_y=5e-4, start=1.0, end=25.0), duration=1.3, depth=2.5e-3
+        ),
+        "hard shaking": Excitation(
+            motion=MultiSine(amplitude_x=12.5e-3, amplitude_y=2e-4, frequency=(4.0, 20.0)), duration=1.2, depth=3e-4
+        ),
+    }
+
+
+def nominal(smoke: bool) -> Parameters:
+    """What the laboratory knows; the unknown numbers are the usual ones."""
+    known = [name for name in TRUTH if name not in SMOKE_UNKNOWNS]
+    less = COARSE | {name: TRUTH[name] for name in known} if smoke else {}
+    return Parameters().override({"contact.v_s": 0.05} | less)
+
+
+class Made(NamedTuple):
+    """One run: times (n,) [s] every `KEPT`, channels (n,) by name, the fastest slip [m/s], and the wall time [s]."""
+
+    t: Array
+    channels: dict[str, Array]
+    slip: float
+    wall_s: float
+
+
+class Order(NamedTuple):
+    """One run that is to be made: an excitation by name, and how the rig differs, by the names of `foreign.Numbers`."""
+
+    excitation: str
+    differs: tuple[tuple[str, Any], ...] = ()
+
+
+def planned(excitation: Excitation, smoke: bool) -> tuple[Parameters, Reference]:
+    """What the laboratory has planned with the nominal numbers: settings and reference."""
+    model = begin(excitation, nominal(smoke)).model
+    return model.settings, model.reference
+
+
+def numbers(settings: Parameters, differs: Mapping[str, Any]) -> Numbers:
+    """The stranger's rig: the known numbers, the truth of the unknown ones, and what differs."""
+    pad, contact, control = settings.pad, settings.contact, settings.control
+    known = {
+        "v_s": contact.v_s, "eta": contact.eta, "epsilon": contact.epsilon, "spacing": contact.node_spacing, "nu": pad.nu,
+        "length": pad.length, "height": pad.height, "depth": pad.depth, "across": pad.elements_x, "through": pad.elements_y,
+        "radius": settings.disc.radius, "mass": settings.disc.mass, "bracket_mass": settings.bracket.mass,
+        "cm_height": settings.bracket.cm_height, "gravity": settings.scenario.gravity, "x_C0": settings.scenario.x_C0,
+        "K_x": control.K_81, "R_x": control.R_80, "K_y": control.K_98, "R_y": control.R_99,
+        "senses_disc": control.senses == "disc",
+    }  # fmt: skip
+    return Numbers(**known | {name.split(".")[1]: value for name, value in TRUTH.items()} | dict(differs))
+
+
+def make(order: Order, step: float, smoke: bool, folder: Path) -> Made:
+    """A run of the stranger's simulator, read where it has been made before: on steps of `step` and of twice that, extrapolated
+    to none, for the error of backward Euler is of first order. The literal law jumps, and is not extrapolated."""
+    fine = stepped(order, step, smoke, folder)
+    if dict(order.differs).get("literal"):
+        return fine
+    coarse = stepped(order, 2 * step, smoke, folder)
+    channels = {name: 2 * value - coarse.channels[name] for name, value in fine.channels.items()}
+    return fine._replace(channels=channels, wall_s=fine.wall_s + coarse.wall_s)
+
+
+def stepped(order: Order, step: float, smoke: bool, folder: Path) -> Made:
+    """A run of the stranger's simulator on steps of `step` [s]."""
+    excitation = excitations(smoke)[order.excitation]
+    settings, reference = planned(excitation, smoke)
+    p = numbers(settings, dict(order.differs))
+    source = b"".join(path.read_bytes() for path in sorted((TESTS / "foreign").glob("*.py")))
+    about = json.dumps([p._asdict(), excitation.model_dump(mode="json"), step])
+    file = folder / f"{sha256(about.encode() + source).hexdigest()[:16]}.npz"
+    if not file.is_file():
+        count = round((excitation.duration + SETTLE) / step)
+        t = step * (np.arange(count + 1) - round(SETTLE / step))
+        signals = reference(torch.from_numpy(t), SIGNALS).detach().numpy()
+        began = perf_counter()
+        run = simulate(p, t, signals, round(KEPT / step))
+        rows = {"t": run.t, "slip": run.slip, "wall_s": np.array(perf_counter() - began), **run.channels}
+        folder.mkdir(parents=True, exist_ok=True)
+        with replacing(file) as partial, partial.open("wb") as stream:
+            np.savez(stream, **rows)
+    with np.load(file) as kept:
+        rows = {name: kept[name] for name in kept.files}
+    t, slip, wall = rows.pop("t"), rows.pop("slip"), float(rows.pop("wall_s"))
+    return Made(t, rows, float(slip.max()), wall)
+
+
+def make_all(orders: Sequence[Order], step: float, smoke: bool, folder: Path, workers: int) -> dict[Order, Made]:
+    """All runs, side by side in threads."""
+    every = list(dict.fromkeys(orders))
+    work = parallel_map(lambda i: make(every[i], step, smoke, folder), len(every), workers)
+    return {every[i]: made for i, made in tqdm(work, desc="recordings", total=len(every), unit=" runs")}
+
+
+Samples = dict[str, tuple[Array, Array]]
+"""Times (k,) [s] and values (k,) by channel."""
+
+
+def sampled(made: Made, seed: int, delay: Mapping[str, float], colour: float) -> Samples:
+    """What the sensors `RIG` give at `RATE` from t = 0 on, some of them late by a `delay` [s] (a multiple of `KEPT`).
+
+    Their noise has their own deviation and the first autocorrelation `colour`; it is the same for the same seed.
+    """
+    rng, out = np.random.default_rng(seed), {}
+    every, first = round(1 / RATE / KEPT), int(np.searchsorted(made.t, -0.5 * KEPT))
+    for channel, sensor in RIG.items():
+        at = np.arange(first, len(made.t), every)
+        white = rng.standard_normal(len(at))
+        noise = white.copy()
+        for i in range(1, len(at)):
+            noise[i] = colour * noise[i - 1] + np.sqrt(1 - colour**2) * white[i]
+        exact = made.channels[channel][at - round(delay.get(channel, 0.0) / KEPT)]
+        out[channel] = (made.t[at], exact + sensor.noise * noise)
+    return out
+
+
+GENTLE = ("deep pressing", "light shaking", "light jerks")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A rig that `differs` by the names of `foreign.Numbers`, sensors that are late or coloured or have an `offset`, `flipped`
+    channels, and what the laboratory notes wrongly: other settings, no `F_ff`, set-points at the samples only.
+
+    `cause` are words one of which a warning must have to name what is wrong; none where nothing is.
+    """
+
+    name: str
+    cause: tuple[str, ...] = ()
+    excitations: tuple[str, ...] = GENTLE
+    differs: Mapping[str, Any] = field(default_factory=dict)
+    delay: Mapping[str, float] = field(default_factory=dict)
+    offset: Mapping[str, float] = field(default_factory=dict)
+    colour: float = 0.0
+    flipped: tuple[str, ...] = ()
+    noted: Mapping[str, Any] = field(default_factory=dict)
+    no_feed_forward: bool = False
+    sparse: bool = False
+
+    def orders(self) -> list[Order]:
+        """The runs that its recordings are sampled from."""
+        return [Order(name, tuple(sorted(self.differs.items()))) for name in self.excitations]
+
+    def samples(self, made: Made, seed: int) -> Samples:
+        """What its sensors give of one run."""
+        out = sampled(made, seed, self.delay, self.colour)
+        for channel, offset in self.offset.items():
+            out[channel] = (out[channel][0], out[channel][1] + offset)
+        for channel in self.flipped:
+            out[channel] = (out[channel][0], -out[channel][1])
+        return out
+
+    def recording(self, excitation: str, made: Made, seed: int, smoke: bool) -> Recording:
+        """One run as the laboratory hands it over."""
+        one = excitations(smoke)[excitation]
+        settings, reference = planned(one, smoke)
+        if self.sparse:
+            reference = at_samples(reference, one.duration)
+        if self.no_feed_forward:
+            signals = {name: reference[name] for name in ("x_d", "y_d")}
+            reference = Reference(**signals, F_ff=Profile([0.0], [0.0]))
+        rig = SoftGrasp(settings.override(dict(self.noted)), reference)
+        return Recording(excitation, rig, self.samples(made, seed))
+
+
+def at_samples(reference: Reference, duration: float) -> Reference:
+    """The reference as a file at the sensors' rate has it: values, and splines between them."""
+    t = torch.from_numpy(np.arange(0.0, duration + 0.5 / RATE, 1 / RATE))
+    values = reference(t, SIGNALS)[..., 0].detach()
+    return Reference(**{name: Sampled(t, values[:, i]) for i, name in enumerate(SIGNALS)})
+
+
+CASES = (
+    Case("same assumptions, gentle"),
+    Case("same assumptions, hard", excitations=("deep chirp", "light shaking", "light jerks")),
+    Case("slip at 0.15 m/s", excitations=("deep pressing", "light shaking", "hard shaking")),
+    Case("mesh 240 x 6", ("mesh", "element"), differs={"across": 240, "through": 6}),
+    Case("literal Coulomb", ("friction", "Coulomb", "slip law"), differs={"literal": True}),
+    Case("no ramp in the stretch rate", ("ramp", "epsilon", "touch-down"), differs={"ramp_stretch": False}),
+    Case("epsilon 0.1 um", ("epsilon", "ramp", "touch-down"), differs={"epsilon": 1e-7}),
+    Case("x_C0 off by 40 um", ("x_C0",), differs={"x_C0": 60.34e-3}),
+    Case("theta zeroed elsewhere", ("theta",), offset={"theta": 0.02}),
+    Case("set-points at 200 Hz", ("set-point", "setpoint"), sparse=True),
+    Case("F_ff left out", ("F_ff", "fed forward", "feed-forward"), no_feed_forward=True),
+    Case("loop convention wrong", ("senses", "x_d"), noted={"control.senses": "disc"}),
+    Case("sign of F_x flipped", ("sign",), flipped=("F_x",)),
+    Case("AR(1) noise of 0.9", ("colour", "white", "AR(", "autocorrel"), colour=0.9),
+    Case("camera 2 ms late", ("delay", "late"), delay={"x_C": 2e-3, "y_C": 2e-3, "theta": 2e-3}),
+    Case("radius off by 0.5 %", ("radius",), differs={"radius": 1.005 * 19.37e-3}),
+)
+
+
+VERDICTS = ("holds", "cause named", "warned, cause not named", "silent")
+"""What may be said of a case: every interval holds the truth; one does not, and a warning names the cause, or says only that
+something is wrong; or nothing is said."""
 
 START = 1.6
 """Every parameter begins off by this factor, one up and the next one down."""
@@ -48,7 +283,7 @@ SMOKE = ("same assumptions, gentle", "sign of F_x flipped")
 class Config:
     out: Path = Path("out/foreign_rigs")
     rtol: float = 1e-5  # of the fits' last stage
-    step: float = 20e-6  # of the stranger's simulator [s]
+    step: float = 20e-6  # of the stranger's simulator [s]; 1 ms is a multiple of twice as much
     seed: int = 7  # of the noise
     workers: int = 2
     only: tuple[str, ...] = ()  # names of cases; all of them by default
@@ -173,7 +408,7 @@ def a_run(problem: Problem, config: Config) -> float:
 
 def run(config: Config) -> list[Outcome]:
     """All cases; the summary is written anew after each."""
-    config = replace(config, workers=1, step=2 * config.step) if config.smoke else config
+    config = replace(config, workers=1, step=5e-5) if config.smoke else config
     cases = chosen(config)
     orders = [order for case in cases for order in case.orders()]
     made = make_all(orders, config.step, config.smoke, config.out / "recordings", config.workers)
@@ -181,7 +416,7 @@ def run(config: Config) -> list[Outcome]:
     for case in cases:
         outcomes.append(study(case, made, config))
         print(f"\n{case.name}: {outcomes[-1].verdict}", *outcomes[-1].warnings, sep="\n  ")
-        write(config.out, summary(config, outcomes), {"foreign_rigs": figure(outcomes)}, table(outcomes))
+        write(config.out, summary(config, outcomes), table=table(outcomes))
     for case in cases:
         forget(runs(case, config))
     return outcomes
@@ -213,49 +448,6 @@ def table(outcomes: list[Outcome]) -> str:
         rows.append((one.case.name, *cells, chi2, one.verdict, f"{one.wall_s:.0f}", said.replace("|", "/")))
     short = [name.split(".")[1] for name in (outcomes[0].truth if outcomes else TRUTH)]
     return markdown(("case", *(f"{name} [%]" for name in short), "chi2", "verdict", "wall [s]", "warnings"), rows)
-
-
-REACH = 3.0
-"""The figure shows estimates up to this factor off the truth; beyond it an arrow stands at the edge."""
-
-
-def figure(outcomes: list[Outcome]) -> Figure:
-    """Estimates and intervals over the truth, a panel a parameter, a row a case."""
-    names = list(outcomes[0].truth)
-    fig = Figure(figsize=(3.0 + 1.55 * len(names), 1.6 + 0.36 * len(outcomes)), layout="constrained")
-    axes = fig.subplots(1, len(names), sharey=True, squeeze=False)[0]
-    for ax, name in zip(axes, names):
-        ax.axvline(0.0, color="0.6", lw=0.8)
-        for i, one in enumerate(outcomes):
-            row, colour = one.parameters()[name], VERDICTS[one.verdict]
-            if row["estimate"] is None:
-                ax.text(0.0, i, "refused" if one.found is None else "not seen", ha="center", va="center", fontsize=7,
-                        color=colour, bbox={"fc": "w", "ec": "none", "pad": 0.5})  # fmt: skip
-                continue
-            low, value, high = np.log([row["ci95"][0], row["estimate"], row["ci95"][1]]) - np.log(row["truth"])
-            edge = np.log(REACH)
-            if abs(value) > edge:
-                ax.plot(np.sign(value) * edge * 0.97, i, ">" if value > 0 else "<", color=colour, ms=7)
-                continue
-            ax.plot(np.clip([low, high], -edge, edge), [i, i], color=colour, lw=2.2, solid_capstyle="butt")
-            ax.plot(value, i, "o" if row["inside"] else "X", color=colour, ms=4 if row["inside"] else 7)
-        ax.set(xlim=(-np.log(REACH), np.log(REACH)), title=name.split(".")[1])
-        ax.set_xscale("symlog", linthresh=0.02)
-        percent = (-50, -10, -1, 0, 1, 10, 100)
-        ax.set_xticks(np.log([1 + p / 100 for p in percent]), [f"{p:g}" for p in percent], fontsize=7)
-        ax.minorticks_off()
-        ax.tick_params(axis="y", length=0)
-        ax.grid(axis="x", lw=0.3)
-    axes[0].set_yticks(range(len(outcomes)), [one.case.name for one in outcomes], fontsize=8)
-    axes[0].set_ylim(len(outcomes) - 0.5, -0.5)
-    for i, one in enumerate(outcomes):
-        said = "warned" if one.warnings else "no warning"
-        axes[-1].text(1.06, i, said, transform=axes[-1].get_yaxis_transform(), va="center", fontsize=8)
-    marks = [Line2D([], [], color=colour, marker="o", lw=2.2, label=verdict) for verdict, colour in VERDICTS.items()]
-    marks.append(Line2D([], [], color="0.4", marker="X", ls="", ms=7, label="interval without the truth"))
-    fig.legend(handles=marks, loc="outside lower center", ncols=len(marks), fontsize=8, frameon=False)
-    fig.suptitle("Estimates and 95 % intervals: off the truth by so many percent", fontsize=10)
-    return fig
 
 
 def main(config: Config) -> None:

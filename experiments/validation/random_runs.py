@@ -16,28 +16,101 @@ Command: .venv/bin/python experiments/validation/random_runs.py [--smoke]
 Expected: no run hangs, none ends without a sentence or with numbers that are not finite. About twenty minutes on two cores.
 """
 
-import multiprocessing
+import math
 import os
 import threading
 import warnings
 from collections import Counter
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
-from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from signal import SIGKILL
+from queue import Empty, SimpleQueue
 from statistics import median
 from time import monotonic, process_time, sleep
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from _random_rigs import Drawn, draw
 from matplotlib.figure import Figure
+from torch import Tensor
 from tqdm import tqdm
 
-from torchsoft import NoEquilibrium, SimulationFailed, simulate
-from torchsoft.experiment import made_by, markdown, options, write
-from torchsoft.processes import THREADS, prepare_worker
+from torchsoft import NoEquilibrium, Parameters, SimulationFailed, SoftGrasp, simulate
+from torchsoft.excitation import FADE, Chirp, Excitation, MultiSine, Press, Roll, RunContext, Strokes, begin
+from torchsoft.experiment import grid, made_by, markdown, options, write
+from torchsoft.paper.equilibrium import holding_force, press, rest
+from torchsoft.processes import local_processes
+from torchsoft.scenario import reference
+from torchsoft.threads import parallel_map
+
+SCALED = (
+    "pad.E", "pad.tau", "contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.eta", "contact.v_s",
+    "contact.epsilon", "disc.mass", "bracket.mass", "control.K_81", "control.R_80", "control.K_98", "control.R_99",
+)  # fmt: skip
+"""Drawn log-uniformly by a factor of 10 about their defaults."""
+
+GRASP, SETTLE, MOVING = 0.1, 0.02, 0.18
+"""Times [s] of the grasp, of the pause and of the motion after it; waves take what their fading needs more."""
+
+
+def settings(rng: np.random.Generator) -> Parameters:
+    """Random parameters; raises `ValueError` for a rig that does not exist."""
+    defaults, changes = Parameters().table(), dict[str, Any]()
+    for name in SCALED:
+        changes[name] = defaults[name]["value"] * 10.0 ** rng.uniform(-1, 1)
+    changes["contact.mu_s"] = math.exp(rng.uniform(math.log(0.05), math.log(2.0)))
+    changes["contact.mu_k"] = changes["contact.mu_s"] * rng.uniform(0.3, 1.0)
+    changes["pad.nu"] = rng.uniform(0.0, 0.495)
+    changes["pad.depth"] = defaults["pad.depth"]["value"] * 3.0 ** rng.uniform(-1, 1)
+    changes["pad.height"] = defaults["pad.height"]["value"] * rng.uniform(0.7, 1.5)
+    wide = 2 * changes["pad.height"] + 2 * defaults["disc.radius"]["value"] + defaults["bracket.cm_height"]["value"]
+    changes["scenario.y_Br_grasp"] = wide - 1e-3  # every excitation has its own
+    changes["pad.elements_x"], changes["pad.elements_y"] = [(40, 2), (60, 2), (120, 4)][rng.integers(3)]
+    changes["contact.friction"] = rng.choice(["smooth", "coulomb"], p=[0.75, 0.25]).item()
+    changes["contact.points"] = int(rng.choice([0, 2], p=[0.75, 0.25]))
+    return Parameters().override(changes)
+
+
+def excitation(rng: np.random.Generator) -> Excitation:
+    """A random motion after a random grasp."""
+    low, high = sorted(np.exp(rng.uniform(math.log(1.0), math.log(40.0), 2)))
+    x, y = np.exp(rng.uniform(np.log([2e-4, 2e-5]), np.log([1e-2, 3e-4])))
+    waves = MOVING + FADE
+    motion, moving = [
+        (Roll(travel=x), MOVING),
+        (Strokes(travel=2 * x, stroke_time=math.exp(rng.uniform(math.log(0.02), math.log(0.18)))), MOVING),
+        (MultiSine(amplitude_x=x, amplitude_y=y, frequency=(low, high), seed=int(rng.integers(1000))), waves),
+        (Chirp(amplitude_x=x, amplitude_y=y, start=low, end=high), waves),
+        (Press(amplitude=y, frequency=high, travel=x), waves),
+    ][rng.integers(5)]
+    return Excitation(
+        motion=motion, duration=GRASP + SETTLE + moving, grasp_time=GRASP, settle=SETTLE,
+        depth=math.exp(rng.uniform(math.log(2e-4), math.log(2e-3))), senses=rng.choice(["bracket", "disc"]).item(),
+    )  # fmt: skip
+
+
+class Drawn(NamedTuple):
+    """A model and its start, its output times (T,) [s], and what it does."""
+
+    begun: RunContext
+    t: Tensor
+    motion: str
+
+
+def draw(rng: np.random.Generator) -> Drawn:
+    """A random run; raises `ValueError` or `NoEquilibrium` if it has no start."""
+    wanted, p = excitation(rng), settings(rng)
+    if rng.random() < 0.8:
+        return Drawn(begin(wanted, p), grid(wanted.duration), wanted.motion.kind)
+    own = {"scenario.grasp_time": GRASP, "scenario.roll_time": 0.5, "scenario.travel": -2e-3}
+    model = SoftGrasp(p.override(own))
+    force = holding_force(model, press(model, model.settings.scenario.y_Br_grasp))
+    y0 = rest(model).detach()
+    model.reference = reference(model, y0, force)
+    return Drawn(RunContext(model, y0), grid(GRASP + SETTLE + MOVING), "grasp_and_roll")
+
 
 REASONS = {
     "disc was lost": "the disc was lost: unstable loop",
@@ -54,8 +127,7 @@ REASONS = {
 DRAWS = 50
 """How often a run is drawn until there is one that can begin."""
 
-STILL, HUNG_STATUS = 3600.0, 75
-"""Wall time [s] after which a run has hung even if it takes no processor time; exit status of a process that ends itself."""
+STILL = 3600.0  # Wall time [s] after which a run has hung even if it takes no processor time.
 
 FINISHED, NOT_FINITE, HUNG = "finished", "finished with numbers that are not finite", "hung: its process was ended"
 
@@ -148,11 +220,16 @@ def outcome(drawn: Drawn, steps: dict[str, Any]) -> Outcome:
 Ends = tuple[str, dict[str, Outcome], list[Outcome]]
 """What a run does, its outcomes by way, and the draws before it that had no start."""
 
-WAYS = ("tolerances", "equal steps")
+WAYS: tuple[str, ...] = ("tolerances", "equal steps")
+
+
+CLOCKS = [0.0, 0.0]
+"""Of a worker process: its processor time and the wall time when its run began."""
 
 
 def both(number: int, config: Config) -> Ends:
     """Run `number` by both ways."""
+    CLOCKS[:] = process_time(), monotonic()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         drawn, refusals = prepare(number, config.seed)
@@ -160,85 +237,44 @@ def both(number: int, config: Config) -> Ends:
     return drawn.motion, {way: outcome(drawn, how) for way, how in zip(WAYS, steps)}, refusals
 
 
-def watch(began: list[float], limit: float) -> None:
-    """End the process when its run has taken too much of the processor's time; kernels do not keep this thread waiting."""
-    while process_time() - began[0] < limit:
-        sleep(0.5)
-    os._exit(HUNG_STATUS)
+def watched(limit: float) -> None:
+    """Begin a worker process that ends itself when its run takes too long; kernels do not keep that thread waiting."""
+    CLOCKS[:] = process_time(), monotonic()
 
+    def watch() -> None:
+        while process_time() - CLOCKS[0] < limit and monotonic() - CLOCKS[1] < STILL:
+            sleep(0.5)
+        os._exit(1)
 
-def work(connection: Connection, config: Config) -> None:
-    """A worker process: numbers of runs in, outcomes out."""
-    prepare_worker()
-    began = [process_time()]
-    threading.Thread(target=watch, args=(began, config.limit), daemon=True).start()
-    while True:
-        number = connection.recv()
-        began[0] = process_time()
-        try:
-            connection.send(both(number, config))
-        except Exception as error:
-            unsaid = Outcome(f"error without a sentence: {type(error).__name__}", str(error)[:200])
-            connection.send(("unknown", dict.fromkeys(WAYS, unsaid), []))
-
-
-class Worker:
-    """A process that does one run after the other, and the run that it is at."""
-
-    def __init__(self, config: Config) -> None:
-        self.connection, other = multiprocessing.get_context("spawn").Pipe()
-        self.process = multiprocessing.get_context("spawn").Process(target=work, args=(other, config), daemon=True)
-        self.process.start()
-        other.close()
-        self.number, self.began = -1, monotonic()
-
-    def give(self, number: int) -> None:
-        self.number, self.began = number, monotonic()
-        self.connection.send(number)
-
-    @property
-    def late(self) -> bool:
-        """Whether its run neither ends nor takes the processor's time."""
-        return monotonic() - self.began > STILL
-
-    def end(self) -> int | None:
-        """End the process, if it has not; its exit status."""
-        self.process.join(1.0)
-        self.process.kill()
-        self.process.join()
-        return self.process.exitcode
+    threading.Thread(target=watch, daemon=True).start()
 
 
 def outcomes(config: Config) -> Iterator[tuple[int, Ends]]:
-    """All runs in the order of their ends. A worker whose run has hung is replaced."""
-    for name in THREADS:
-        os.environ[name] = "1"
-    todo, began = iter(range(config.first, config.first + config.runs)), monotonic()
-    workers = [Worker(config) for _ in range(config.workers)]
-    for worker, number in zip(workers, todo):
-        worker.give(number)
-    while busy := [worker for worker in workers if worker.number >= 0]:
-        ready = wait([worker.connection for worker in busy], 1.0)
-        for at, worker in enumerate(workers):
-            if worker.number < 0 or not (worker.connection in ready or worker.late):
-                continue
-            number, again = worker.number, worker
+    """All runs in the order of their ends, every thread with a process of its own. One whose run has hung is replaced."""
+    last, pools = monotonic() + 60 * config.minutes, SimpleQueue[ProcessPoolExecutor]()
+    with ExitStack() as stack:
+
+        def attempt(k: int) -> Ends | None:
+            if (began := monotonic()) > last:
+                return None
             try:
-                if worker.connection not in ready:
-                    raise EOFError
-                ends: Ends = worker.connection.recv()
-            except (EOFError, ConnectionError):
-                hung = worker.end() in (HUNG_STATUS, -SIGKILL)
-                ends = "unknown", dict.fromkeys(WAYS, Outcome(HUNG if hung else "its process died")), []
-                again = workers[at] = Worker(config)
-            yield number, ends
-            following = next(todo, -1) if monotonic() - began < 60 * config.minutes else -1
-            if following >= 0:
-                again.give(following)
-            else:
-                again.number = -1
-    for worker in workers:
-        worker.end()
+                pool = pools.get_nowait()
+            except Empty:
+                pool = stack.enter_context(local_processes(1, watched, config.limit))
+            try:
+                ends = pool.submit(both, config.first + k, config).result()
+            except BrokenProcessPool:
+                end = HUNG if monotonic() - began >= config.limit else "its process died"
+                return "unknown", dict.fromkeys(WAYS, Outcome(end)), []
+            except Exception as error:
+                unsaid = Outcome(f"error without a sentence: {type(error).__name__}", str(error)[:200])
+                ends = "unknown", dict.fromkeys(WAYS, unsaid), []
+            pools.put(pool)
+            return ends
+
+        for k, ends in parallel_map(attempt, config.runs, config.workers):
+            if ends is not None:
+                yield config.first + k, ends
 
 
 def run(config: Config) -> Result:
@@ -255,38 +291,26 @@ def run(config: Config) -> Result:
 
 def summary(result: Result) -> dict[str, Any]:
     """Counts by kind, the longest runs, and one example of every kind."""
+
+    def counted(ends: list[tuple[int, Outcome]]) -> dict[str, Any]:
+        examples = {one.kind: {"run": n, "sentence": one.sentence} for n, one in sorted(ends, key=lambda end: -end[0])}
+        return {"kinds": dict(Counter(one.kind for _, one in ends).most_common()), "examples": examples}
+
     out: dict[str, Any] = {
-        "runs": len(result.motions),
-        "seconds": result.seconds,
-        "motions": Counter(result.motions.values()),
-    }
+        "runs": len(result.motions), "seconds": result.seconds, "motions": Counter(result.motions.values()),
+        "draws without a start": counted(result.refusals),
+    }  # fmt: skip
     for way, ends in result.outcomes.items():
         slowest = sorted(ends, key=lambda n: -ends[n].cpu_s)[:10]
-        done = [one for one in ends.values() if one.kind == FINISHED]
-        out[way] = {
-            "kinds": dict(Counter(one.kind for one in ends.values()).most_common()),
+        every, done = list(ends.values()), [one for one in ends.values() if one.kind == FINISHED]
+        out[way] = counted(list(ends.items())) | {
             "median_cpu_s": median(one.cpu_s for one in done) if done else None,
-            "longest_wall_s": max((one.wall_s for one in ends.values()), default=0.0),
-            "longest_cpu_s": max((one.cpu_s for one in ends.values()), default=0.0),
-            "longest_stepping_s": max((one.stepping_s for one in ends.values()), default=0.0),
-            "most_steps": max((one.steps + one.refused for one in ends.values()), default=0),
-            "with_doubts": sum(one.doubts > 0 for one in done),
-            "slowest": {str(n): asdict(ends[n]) for n in slowest},
-            "examples": {
-                one.kind: {"run": n, "sentence": one.sentence} for n, one in sorted(ends.items(), reverse=True)
-            },
-        }
-    out["draws without a start"] = {
-        "kinds": dict(Counter(one.kind for _, one in result.refusals).most_common()),
-        "examples": {one.kind: {"run": n, "sentence": one.sentence} for n, one in reversed(result.refusals)},
-    }
-    tolerances, equal = (result.outcomes[way] for way in WAYS)
-    out["kinds"] = {str(n): [ends[n].kind for ends in (tolerances, equal)] for n in sorted(result.motions)}
-    pairs = Counter((equal[n].kind == FINISHED, tolerances[n].kind == FINISHED) for n in equal if n in tolerances)
-    out["finished"] = {
-        "by both": pairs[True, True], "by tolerances alone": pairs[False, True],
-        "by equal steps alone": pairs[True, False], "by neither": pairs[False, False],
-    }  # fmt: skip
+            "longest_wall_s": max((one.wall_s for one in every), default=0.0),
+            "longest_cpu_s": max((one.cpu_s for one in every), default=0.0),
+            "longest_stepping_s": max((one.stepping_s for one in every), default=0.0),
+            "most_steps": max((one.steps + one.refused for one in every), default=0),
+            "with_doubts": sum(one.doubts > 0 for one in done), "slowest": {str(n): asdict(ends[n]) for n in slowest},
+        }  # fmt: skip
     return out
 
 
@@ -307,28 +331,14 @@ def table(numbers: dict[str, Any]) -> str:
 
 
 def figure(result: Result) -> Figure:
-    """How runs ended, and how long they took."""
-    fig = Figure(figsize=(12, 4), layout="constrained")
-    left, right = fig.subplots(1, 2, width_ratios=(1.3, 1))
-    colours = {"tolerances": "#0072b2", "equal steps": "#e69f00"}
-    kinds = list(dict.fromkeys(one.kind for ends in result.outcomes.values() for one in ends.values()))
-    kinds.sort(key=lambda kind: -sum(one.kind == kind for one in result.outcomes["tolerances"].values()))
-    for shift, (way, ends) in zip((-0.2, 0.2), result.outcomes.items()):
+    """How runs ended."""
+    fig = Figure(figsize=(9, 4), layout="constrained")
+    axes = fig.subplots()
+    for height, (way, ends) in zip((0.8, 0.4), result.outcomes.items()):
         counts = Counter(one.kind for one in ends.values())
-        at = np.arange(len(kinds)) + shift
-        bars = left.barh(at, [max(counts[k], 0.5) for k in kinds], 0.4, color=colours[way], label=f"by {way}", log=True)
-        left.bar_label(bars, [str(counts[k]) for k in kinds], padding=3, fontsize=8)
-        walls = np.array([one.cpu_s for one in ends.values() if one.cpu_s > 0])
-        if len(walls):
-            bins = np.geomspace(walls.min(), walls.max() * 1.01, 40)
-            right.hist(walls, bins.tolist(), histtype="step", color=colours[way], label=f"by {way}", log=True)
-    left.set_yticks(np.arange(len(kinds)), kinds)
-    left.invert_yaxis()
-    left.margins(x=0.1)
-    left.set(xlabel="runs", title=f"How {len(result.motions)} random runs ended")
-    right.set(xscale="log", xlabel="processor time of a run [s]", ylabel="runs", title="How long they took")
-    right.legend()
-    left.legend()
+        axes.barh(list(counts), list(counts.values()), height, label=f"by {way}", log=True)
+    axes.set(xlabel="runs", title=f"How {len(result.motions)} random runs ended")
+    axes.legend()
     return fig
 
 
@@ -336,12 +346,8 @@ def main() -> None:
     result = run(options(Config, __doc__))
     numbers = summary(result)
     print(table(numbers))
-    write(
-        result.config.out,
-        numbers | {"made_by": made_by(result.config)},
-        {"random_runs": figure(result)},
-        table(numbers),
-    )
+    content = numbers | {"made_by": made_by(result.config)}
+    write(result.config.out, content, {"random_runs": figure(result)}, table(numbers))
 
 
 if __name__ == "__main__":

@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullLocator
-from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Parameters, SoftGrasp, Trajectory, simulate
 from torchsoft.experiment import grid, made_by, markdown, options, write
 from torchsoft.scenario import grasp_and_roll
+
+SIGNALS = ("x_C", "y_C", "theta", "F_x", "F_y")
 
 
 @dataclass(frozen=True)
@@ -42,15 +42,6 @@ class Result:
     steps: dict[str, dict[str, float]]
     meshes: dict[str, dict[str, float]]
     etas: dict[str, dict[str, float]]
-    traces: dict[str, tuple[Tensor, Tensor]]
-
-
-def smoke(config: Config) -> Config:
-    """The same questions in a few seconds."""
-    return Config(
-        out=config.out, steps_ms=(4.0, 2.0), reference_ms=0.5, elements_x=(60, 120), etas=(10.0, 0.0), duration=0.6,
-        roll=0.6, smoke=True,
-    )  # fmt: skip
 
 
 def manipulate(changes: dict[str, Any], step: float, duration: float, grasp_force: float | None = None) -> Trajectory:
@@ -58,10 +49,6 @@ def manipulate(changes: dict[str, Any], step: float, duration: float, grasp_forc
     model = SoftGrasp(Parameters().override(changes))
     manipulation = grasp_and_roll(model, grasp_force=grasp_force)
     return simulate(model, grid(duration), y0=manipulation.y0, step=step)
-
-
-def signals(run: Trajectory) -> dict[str, Tensor]:
-    return {name: run[name] for name in ("x_C", "y_C", "theta", "F_x", "F_y")}
 
 
 def figures_of_merit(run: Trajectory) -> dict[str, float]:
@@ -84,30 +71,26 @@ def figures_of_merit(run: Trajectory) -> dict[str, float]:
 
 
 def run(config: Config) -> Result:
-    config = smoke(config) if config.smoke else config
-    bar = tqdm(total=1 + len(config.steps_ms) + len(config.elements_x) + len(config.etas), unit="run")
+    if config.smoke:
+        config = Config(out=config.out, steps_ms=(4.0, 2.0), reference_ms=0.5, elements_x=(60, 120), etas=(10.0, 0.0),
+                        duration=0.6, roll=0.6, smoke=True)  # fmt: skip
     force = grasp_and_roll(SoftGrasp()).grasp_force
-    fine = manipulate({}, 1e-3 * config.reference_ms, config.duration, force)
-    bar.update()
-    steps, traces = {}, {f"{config.reference_ms} ms": (fine.t, fine["F_x"])}
-    for step in config.steps_ms:
+    fine, steps = manipulate({}, 1e-3 * config.reference_ms, config.duration, force), {}
+    for step in tqdm(config.steps_ms, "steps"):
         coarse = manipulate({}, 1e-3 * step, config.duration, force)
-        exact, got = signals(fine), signals(coarse)
-        error = {name: ((got[name] - x).abs().max() / (x.max() - x.min())).item() for name, x in exact.items()}
+        exact = {name: fine[name] for name in SIGNALS}
+        error = {name: ((coarse[name] - x).abs().max() / (x.max() - x.min())).item() for name, x in exact.items()}
         steps[f"{step} ms"] = error | {k: v for k, v in figures_of_merit(coarse).items() if k[:2] in ("en", "ne", "wa")}
-        traces[f"{step} ms"] = (coarse.t, coarse["F_x"])
-        bar.update()
-    meshes, etas = {}, {}
-    for n in config.elements_x:
-        meshes[f"{n} x {n // 30}"] = figures_of_merit(
-            manipulate({"pad.elements_x": n, "pad.elements_y": n // 30}, 2e-3, config.roll)
-        )
-        bar.update()
-    for eta in config.etas:
-        etas[f"{eta:g}"] = figures_of_merit(manipulate({"contact.eta": eta}, 2e-3, config.roll))
-        bar.update()
-    bar.close()
-    return Result(config, steps, meshes, etas, traces)
+
+    def merit(changes: dict[str, Any]) -> dict[str, float]:
+        return figures_of_merit(manipulate(changes, 2e-3, config.roll))
+
+    meshes = {
+        f"{n} x {n // 30}": merit({"pad.elements_x": n, "pad.elements_y": n // 30})
+        for n in tqdm(config.elements_x, "meshes")
+    }
+    etas = {f"{eta:g}": merit({"contact.eta": eta}) for eta in tqdm(config.etas, "etas")}
+    return Result(config, steps, meshes, etas)
 
 
 def table(title: str, rows: dict[str, dict[str, float]]) -> str:
@@ -117,22 +100,14 @@ def table(title: str, rows: dict[str, dict[str, float]]) -> str:
 
 
 def figure(result: Result) -> Figure:
-    """Largest errors against the step; the horizontal force's error in time."""
-    fig = Figure(figsize=(10, 4), layout="constrained")
-    left, right = fig.subplots(1, 2)
+    """Largest errors against the step."""
+    fig = Figure(figsize=(6, 4), layout="constrained")
+    axes = fig.subplots()
     h = [float(key.split()[0]) for key in result.steps]
-    for name, marker in zip(("x_C", "y_C", "theta", "F_x", "F_y"), "os^vD"):
-        left.loglog(h, [row[name] for row in result.steps.values()], marker=marker, label=name)
-    left.loglog(h, [1e-4 * (x / h[0]) ** 2 for x in h], "k--", label="second order")
-    left.set(xlabel="step [ms]", ylabel="largest error over range [1]", title="Step refinement of the manipulation")
-    left.legend()
-    left.set_xticks(h, [f"{x:g}" for x in h])
-    left.xaxis.set_minor_locator(NullLocator())
-    (t, exact), *others = result.traces.values()
-    for key, (_, F_x) in zip(result.steps, others):
-        right.semilogy(t, (F_x - exact).abs().clamp(min=1e-9), label=key, lw=0.6)
-    right.set(xlabel="time [s]", ylabel="error of $F_x$ [N]", title="Error of the horizontal control force")
-    right.legend()
+    for name in SIGNALS:
+        axes.loglog(h, [row[name] for row in result.steps.values()], "o-", label=name)
+    axes.set(xlabel="step [ms]", ylabel="largest error over range [1]", title="Step refinement of the manipulation")
+    axes.legend()
     return fig
 
 

@@ -17,7 +17,6 @@ Command: .venv/bin/python experiments/validation/resume_after_kill.py [--kills 2
 Expected: 20 of 20. About a quarter of an hour on two cores.
 """
 
-import csv
 import json
 import os
 import pickle
@@ -25,7 +24,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
@@ -34,10 +32,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from torchsoft import Parameters
+from torchsoft.channels import CHANNELS
 from torchsoft.excitation import Excitation, Roll, Strokes
 from torchsoft.experiment import COARSE, markdown, options, raw_config, write
 from torchsoft.sysid import Recording, Sensor, record
@@ -110,12 +108,9 @@ def table(recording: Recording, path: Path) -> None:
     with torch.no_grad():
         x_d, y_d, F_ff = recording.rig.reference(torch.from_numpy(t), ("x_d", "y_d", "F_ff"))[..., 0].T.numpy()
     known = {"t [s]": t, "x_d [m]": x_d, "y_d [m]": y_d, "F_ff [N]": F_ff}
-    units = {"x_C": "m", "theta": "rad", "y_Br": "m", "F_y": "N"}
-    columns = known | {f"{name} [{units[name]}]": y for name, (_, y) in recording.samples.items()}
-    with path.open("w", newline="", encoding="utf-8") as file:
-        out = csv.writer(file, lineterminator="\n")
-        out.writerow(columns)
-        out.writerows([repr(float(cell)) for cell in row] for row in zip(*columns.values()))
+    columns = known | {f"{name} [{CHANNELS[name].unit}]": y for name, (_, y) in recording.samples.items()}
+    head = ",".join(columns)
+    np.savetxt(path, np.stack(list(columns.values()), -1), "%.17g", delimiter=",", header=head, comments="")
 
 
 class Command:
@@ -126,12 +121,8 @@ class Command:
         command = [sys.executable, "-m", "torchsoft", "identify", *files, "--out", str(out), "--workers", str(workers)]
         self.out, self.began, self.said = out, time.monotonic(), folder / f"{out.name}.txt"
         with self.said.open("ab") as said:
-            self.process = subprocess.Popen(
-                [*command, "--no-progress", "--yes"],
-                stdout=said,
-                stderr=said,
-                env=os.environ | {"OMP_NUM_THREADS": "1"},
-            )
+            env = os.environ | {"OMP_NUM_THREADS": "1"}
+            self.process = subprocess.Popen([*command, "--no-progress", "--yes"], stdout=said, stderr=said, env=env)
 
     @property
     def seconds(self) -> float:
@@ -249,31 +240,8 @@ def run(config: Config) -> Result:
         time.sleep(5e-3)
     command.end(config.limit)
     whole = answer(command.out)[0], command.seconds, runs
-    cases = [case(config, k, whole) for k in bar(config)]
+    cases = [case(config, k, whole) for k in tqdm(range(config.kills), desc="kills", disable=config.smoke)]
     return Result(config, whole[1], runs, cases)
-
-
-def bar(config: Config) -> Iterator[int]:
-    yield from tqdm(range(config.kills), desc="kills", disable=config.smoke)
-
-
-def figure(result: Result) -> Figure:
-    """When every case was killed, and how much it had kept."""
-    fig = Figure(figsize=(7.0, 3.6), layout="constrained")
-    ax = fig.subplots()
-    for writing, marker in ((False, "o"), (True, "s")):
-        for held, colour in ((True, "C0"), (False, "C3")):
-            some = [one for one in result.cases if one.writing == writing and (not one.wrong) == held]
-            label = f"{'while a file was written' if writing else 'between writes'}, {'same bits' if held else 'not the same'}"
-            if some:
-                ax.plot([one.at for one in some], [one.kept for one in some], marker, color=colour, label=label)
-    for one in result.cases:
-        if one.planted:
-            ax.plot(one.at, one.kept, "o", mfc="none", mec="k", ms=11)
-    ax.axhline(result.runs, color="0.7", lw=1)
-    ax.set(xlabel="killed after [s] (circle: a pickle planted)", ylabel=f"runs kept, of {result.runs}")
-    ax.legend()
-    return fig
 
 
 def main(config: Config) -> None:
@@ -301,7 +269,7 @@ def main(config: Config) -> None:
         **raw_config(result.config), "undisturbed_s": result.seconds, "runs": result.runs, "same": same,
         "cases": [one._asdict() for one in result.cases],
     }  # fmt: skip
-    write(result.config.out, summary, {"resume_after_kill": figure(result)}, shown)
+    write(result.config.out, summary, table=shown)
 
 
 if __name__ == "__main__":

@@ -85,11 +85,6 @@ class Result:
         }
 
 
-def smoke(config: Config) -> Config:
-    """The same question in two seconds."""
-    return Config(out=config.out, elements_x=(60, 120), stiffenings=(1.0, 4.0), points=3, smoke=True)
-
-
 def half_width(x: Tensor, g: Tensor) -> Tensor:
     """Where the penetration g (nodes,) falls through zero right of the disc's centre [m], between nodes at x [m]."""
     last = torch.nonzero(g > 0).max()
@@ -98,7 +93,7 @@ def half_width(x: Tensor, g: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def indent(elements_x: int, stiffening: float, compressions: Tensor, bar: tqdm) -> Curve:
+def indent(elements_x: int, stiffening: float, compressions: Tensor) -> Curve:
     """Press the disc to each of the compressions (points,) [m]."""
     K_n = stiffening * Parameters().contact.K_n
     p = Parameters().override({"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30, "contact.K_n": K_n})
@@ -111,20 +106,18 @@ def indent(elements_x: int, stiffening: float, compressions: Tensor, bar: tqdm) 
         x = (pad.positions + model.displacement("U", state))[:, 0] + bracket[0] - disc[0]
         force = torch.tensor(holding_force(model, y), dtype=torch.float64)
         rows.append((force, half_width(x, g), g.max(), disc[1], (g > 0).sum()))
-        bar.update()
     force, width, penetration, y_C, touching = (torch.stack(column) for column in zip(*rows))
     return Curve(compressions, force, width, penetration, y_C, touching)
 
 
 def run(config: Config) -> Result:
-    config = smoke(config) if config.smoke else config
+    if config.smoke:
+        config = Config(out=config.out, elements_x=(60, 120), stiffenings=(1.0, 4.0), points=3, smoke=True)
     fraction = torch.arange(1, config.points + 1, dtype=torch.float64) / config.points
     compressions = fraction * Parameters().compression
     default = Parameters().pad.elements_x
     cases = [(n, 1.0) for n in config.elements_x] + [(default, k) for k in config.stiffenings]
-    unique = dict.fromkeys(cases)
-    with tqdm(total=len(unique) * config.points, unit="equilibrium") as bar:
-        curves = {case: indent(*case, compressions, bar) for case in unique}
+    curves = {case: indent(*case, compressions) for case in tqdm(dict.fromkeys(cases), unit="curve")}
     meshes = {f"{n} x {n // 30}": curves[n, 1.0] for n in config.elements_x}
     return Result(config, meshes, {f"{k:g}": curves[default, k] for k in config.stiffenings})
 
@@ -164,33 +157,22 @@ def table(title: str, curves: dict[str, Curve]) -> str:
 
 
 def figure(result: Result) -> Figure:
-    """Force, contact half-width and penetration against compression, and the force's approach to its limits."""
-    fig = Figure(figsize=(11, 8), layout="constrained")
-    (force, approach), (width, depth) = fig.subplots(2, 2)
-    meshes = {f"{name} elements": c for name, c in result.meshes.items()}
-    penalties = {f"{name} $K_n$, 1 mm nodes": c for name, c in result.penalties.items() if name != "1"}
-    colours = iter(f"C{i}" for i in range(10))
-    for curves, line in ((meshes, "-"), (penalties, "--")):
-        for name, c in curves.items():
-            style: dict[str, Any] = {"ls": line, "color": next(colours), "marker": ".", "label": name}
-            force.plot(MILLI * c.compression, c.force, **style)
-            width.plot(MILLI * c.compression, MILLI * c.half_width, **style)
-            depth.semilogy(MILLI * c.compression, MICRO * c.penetration, **style)
-    for (name, family), marker in zip(result.families.items(), ("o-", "s--")):
-        x = torch.tensor(family.coarseness)
-        error = torch.stack([(c.force[-1] / family.limit - 1).abs() for c in family.curves.values()])
-        approach.loglog(x, error, marker, label=f"{name}, limit {family.limit:.2f} N")
-        approach.loglog(x, error[-1] * (x / x[-1]) ** family.order, "k:", lw=0.8)
-    approach.set(
-        xlabel="node spacing / 1 mm, default $K_n$ / $K_n$",
-        ylabel="force from its limit, relative",
-        title="Full grasp (dotted: second and first order)",
-    )
-    approach.legend()
-    force.set(xlabel="compression [mm]", ylabel="force on the upper pad [N]", title="Force")
-    force.legend(fontsize="small")
-    width.set(xlabel="compression [mm]", ylabel="half-width [mm]", title="Contact half-width, upper pad")
-    depth.set(xlabel="compression [mm]", ylabel="largest penetration [µm]", title="Penetration, upper pad")
+    """Force against compression, and its approach to its limits."""
+    fig = Figure(figsize=(11, 4), layout="constrained")
+    force, approach = fig.subplots(1, 2)
+    for name, c in result.meshes.items():
+        force.plot(MILLI * c.compression, c.force, ".-", label=f"{name} elements")
+    for name, c in result.penalties.items():
+        force.plot(MILLI * c.compression, c.force, ".--", label=f"{name} $K_n$")
+    for name, family in result.families.items():
+        error = [abs(c.force[-1].item() / family.limit - 1) for c in family.curves.values()]
+        approach.loglog(
+            family.coarseness, error, "o-", label=f"{name}, limit {family.limit:.2f} N, order {family.order}"
+        )
+    approach.set(xlabel="node spacing / 1 mm, default $K_n$ / $K_n$", ylabel="force from its limit, relative")
+    force.set(xlabel="compression [mm]", ylabel="force on the upper pad [N]")
+    for axes in (force, approach):
+        axes.legend(fontsize="small")
     return fig
 
 
