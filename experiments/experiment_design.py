@@ -27,11 +27,11 @@ from torchsoft.excitation import CATALOGUE, Excitation, Strokes
 from torchsoft.experiment import markdown, options, raw_config, write
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import RIG, Problem, Unknown, record
-from torchsoft.sysid.fit.information import shift, standard_deviations
-from torchsoft.sysid.fit.settle import FINER
-from torchsoft.sysid.problem.problem import Residuals
-from torchsoft.sysid.problem.recording import Array
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.fit import shift, standard_deviations
+from torchsoft.sysid.plan import FINER
+from torchsoft.sysid.problem import Residuals
+from torchsoft.sysid.recording import Array
+from torchsoft.sysid.runs import Runner
 
 NAMES: tuple[str, ...] = (
     "contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau",

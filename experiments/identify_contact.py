@@ -24,11 +24,10 @@ from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes
 from torchsoft.experiment import COARSE, markdown, options, raw_config, write
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, identify, record
-from torchsoft.sysid.problem.journal import forget
-from torchsoft.sysid.problem.problem import Residuals, StepsByName
-from torchsoft.sysid.problem.recording import Array
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.problem import Residuals, StepsByName
+from torchsoft.sysid.recording import Array
 from torchsoft.sysid.report.report import report
+from torchsoft.sysid.runs import Runner, forget
 
 TRUTH = {
     "contact.K_n": 1.6e5, "contact.R_n": 300.0, "contact.K_t": 0.8e5, "contact.R_t": 600.0, "contact.mu_s": 0.65,

@@ -35,7 +35,7 @@ from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, Unknown, rec
 from torchsoft.sysid.answer.comparison import Comparison
 from torchsoft.sysid.laws.compare import compare, fitted
 from torchsoft.sysid.laws.evidence import Evidence, FittedLaw
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.runs import Runner
 from torchsoft.threads import parallel_map
 
 NOMINAL = Parameters().override({"contact.v_s": 0.05, "contact.mu_s": 0.7, "contact.mu_k": 0.6} | COARSE)

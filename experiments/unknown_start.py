@@ -44,9 +44,9 @@ from torchsoft.sysid import (
     identify,
 )
 from torchsoft.sysid.files.measured import load
-from torchsoft.sysid.fit.information import fisher
-from torchsoft.sysid.problem.recording import Array
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.fit import fisher
+from torchsoft.sysid.recording import Array
+from torchsoft.sysid.runs import Runner
 from torchsoft.threads import parallel_map
 
 CUTS = {"mid-roll": ("strokes", 0.85), "mid-grasp": ("strokes", 0.2), "hidden history": ("fast strokes", 1.0)}

@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from torchsoft.sysid.certainty.optimum import Optimum
-from torchsoft.sysid.problem.prediction import FailedRun
-from torchsoft.sysid.problem.problem import Residuals
-from torchsoft.sysid.problem.unknowns import Coordinate, Coordinates, Prior
+from torchsoft.sysid.prediction import FailedRun
+from torchsoft.sysid.problem import Residuals
+from torchsoft.sysid.unknowns import Coordinate, Coordinates, Prior
 
 WALL = "the disc has left the pads"
 

@@ -26,16 +26,13 @@ FLOWS = {
         grid kernel laws system progress tolerances rates stability stepper adjoint tangent trajectory
         ledger simulate batch torchdiffeq .
     """,
-    "sysid": "problem fit prechecks checks certainty answer settings conclude solve laws files report design .",
-    "sysid.problem": """
-        start moving_start recording unknowns readout noise prediction journal workers problem first_samples synthetic .
+    "sysid": """
+        initial_state recording unknowns prediction noise runs problem first_samples synthetic fit plan loops prechecks
+        residual_tests assumptions sensitivity certainty estimate answer result identification laws files report design .
     """,
-    "sysid.fit": "information robust fit plan stages settle .",
-    "sysid.prechecks": "finding closed_loop loops setpoints prechecks .",
-    "sysid.checks": "parts misfit colour assumptions variation checks .",
     "sysid.laws": "evidence compare .",
     "sysid.certainty": "optimum profile summary posterior nuts .",
-    "sysid.answer": "comparison estimate contribution recorded answer result .",
+    "sysid.answer": "comparison .",
     "sysid.files": "columns configuration measured cost .",
     "sysid.report": "figures comparison_figure page sections report .",
     "sysid.design": "criterion knots planner search design design_figure .",

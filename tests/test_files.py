@@ -18,7 +18,7 @@ from torchsoft.physics.mesh.file import read_quads
 from torchsoft.rigs.network import LOOP, read_network
 from torchsoft.rigs.recorded import read_column
 from torchsoft.solve.trajectory import load
-from torchsoft.sysid.answer.answer import load_answer
+from torchsoft.sysid.result import load_answer
 from torchsoft.tables import line, plain, read_toml
 
 DIE = """

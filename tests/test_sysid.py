@@ -18,13 +18,11 @@ from conftest import COARSE
 from torchsoft import Parameters, Profile, Sampled
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, Unreachable, identify, record
-from torchsoft.sysid.checks.misfit import whiteness
-from torchsoft.sysid.fit.fit import descend, gauss_newton, newton_step
-from torchsoft.sysid.fit.information import fisher, shift, standard_deviations
-from torchsoft.sysid.fit.plan import default_plan, tie_ratios, visible
-from torchsoft.sysid.fit.stages import sobol
-from torchsoft.sysid.problem.problem import Residuals
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.fit import descend, fisher, gauss_newton, newton_step, shift, standard_deviations
+from torchsoft.sysid.plan import default_plan, sobol, tie_ratios, visible
+from torchsoft.sysid.problem import Residuals
+from torchsoft.sysid.residual_tests import whiteness
+from torchsoft.sysid.runs import Runner
 
 BASE = Parameters().override(COARSE)
 RTOL = 1e-4

@@ -20,12 +20,10 @@ from torchsoft import Parameters, SoftGrasp, simulate
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.physics.motion import Reference
 from torchsoft.sysid import AtRest, IdentificationResult, Prior, Problem, Sensor, Stage, Unknown, identify, record
-from torchsoft.sysid.answer.answer import Answer, FittedCoordinate, checksum, load_answer, schema
-from torchsoft.sysid.answer.contribution import contributions
-from torchsoft.sysid.answer.estimate import Number, estimates
-from torchsoft.sysid.answer.recorded import recorded_rigs
-from torchsoft.sysid.problem.workers import Runner
-from torchsoft.sysid.settings import Settings
+from torchsoft.sysid.estimate import Number, contributions, estimates
+from torchsoft.sysid.identification import Settings
+from torchsoft.sysid.result import Answer, FittedCoordinate, checksum, load_answer, recorded_rigs, schema
+from torchsoft.sysid.runs import Runner
 
 ROOT = Path(__file__).parents[1]
 PUBLISH = "from torchsoft.files import write_json; write_json('docs/answer.schema.json', schema())"

@@ -11,12 +11,24 @@ from conftest import COARSE
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
-from torchsoft.sysid.checks.assumptions import PLACE, Assumption, assumptions, coulomb, remeshed, scaled, unramped
-from torchsoft.sysid.checks.checks import Check, Checked, check, doubted, notices
-from torchsoft.sysid.checks.variation import AMOUNTS, difference, ended, refit, varied
-from torchsoft.sysid.conclude import notices_on
-from torchsoft.sysid.problem.prediction import predict
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.assumptions import (
+    AMOUNTS,
+    PLACE,
+    Assumption,
+    assumptions,
+    coulomb,
+    difference,
+    ended,
+    refit,
+    remeshed,
+    scaled,
+    unramped,
+    varied,
+)
+from torchsoft.sysid.identification import notices_on
+from torchsoft.sysid.prediction import predict
+from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.sensitivity import Check, Checked, assumption_notices, check_assumptions, doubted
 
 BASE = Parameters().override(COARSE)
 TRUTH = {"pad.E": 0.85e6, "contact.K_n": 1.3e5}
@@ -40,7 +52,7 @@ def checked(
     answer = identify(problem, plan=[Stage("all", problem.names, problem.coordinates.labels, RTOL)])
     x = np.array(answer.x)
     at, _ = problem.freeze(runner, x, problem.names, RTOL, free)
-    return check(problem, x, at, free, problem.names, RTOL, doubtful=doubtful, explain=explain)
+    return check_assumptions(problem, x, at, free, problem.names, RTOL, doubtful=doubtful, explain=explain)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +62,7 @@ def same() -> Checked:
 
 
 def test_nothing_is_said_of_what_is_right(same: Checked) -> None:
-    assert not notices(same)
+    assert not assumption_notices(same)
     names = {one.name for one in same.checks}
     assert {
         "mesh",
@@ -118,10 +130,10 @@ def test_the_cause_is_named_with_its_amount(
     assert one.asked == pytest.approx(asked, rel=0.1, abs=4 * one.asked_sd)
     if one.parameter:
         assert one.value == pytest.approx((1 + one.asked / 100) * BASE.table()[name]["value"], rel=1e-9)
-        assert f"with {name} = {one.value:.6g} (" in notices(found)[0]
-    assert "estimates under it: pad.E = " in notices(found)[0]
+        assert f"with {name} = {one.value:.6g} (" in assumption_notices(found)[0]
+    assert "estimates under it: pad.E = " in assumption_notices(found)[0]
     assert one.under["pad.E"] == pytest.approx(TRUTH["pad.E"], rel=0.05)
-    assert notices(found)[0].startswith(says)
+    assert assumption_notices(found)[0].startswith(says)
 
 
 def made_by(other: Recording | None, data: Recording, sensors: dict[str, Sensor] = SENSORS) -> Recording:
@@ -142,7 +154,7 @@ def test_a_finer_mesh_is_asked_for_by_data_that_one_made() -> None:
     (mesh,) = (one for one in found.checks if one.name == "mesh")
     assert mesh.wanted
     assert mesh.asked == pytest.approx(1.0, abs=0.2)
-    assert any("elements" in sentence for sentence in notices(found))
+    assert any("elements" in sentence for sentence in assumption_notices(found))
 
 
 LIGHT = Excitation(motion=Strokes(travel=30e-3, stroke_time=0.15), duration=0.9, depth=3e-4)
@@ -159,7 +171,7 @@ def test_another_ramp_is_asked_for_by_data_that_it_made(vary: Callable[[Recordin
     (one,) = (one for one in found.checks if one.name == name)
     assert one.wanted
     assert 0.5 < one.asked < 1.5
-    assert any("ramp" in sentence for sentence in notices(found))
+    assert any("ramp" in sentence for sentence in assumption_notices(found))
 
 
 def far_off() -> tuple[Problem, Runner, np.ndarray]:
@@ -175,10 +187,12 @@ def test_what_no_test_explains_has_candidates() -> None:
     problem, runner, x = far_off()
     free = problem.coordinates.free
     at, _ = problem.freeze(runner, x, problem.names, RTOL, free)
-    found = check(problem, x, at, free, problem.names, RTOL, doubtful=True)
+    found = check_assumptions(problem, x, at, free, problem.names, RTOL, doubtful=True)
     assert not any(one.refitted for one in found.checks)
     assert "Coulomb friction" in found.candidates
-    assert any("`explain` looks for the cause, with a new fit without each of " in text for text in notices(found))
+    assert any(
+        "`explain` looks for the cause, with a new fit without each of " in text for text in assumption_notices(found)
+    )
 
 
 def test_under_another_law_a_fit_that_is_far_off_begins_anew() -> None:
@@ -245,11 +259,11 @@ def test_a_variation_that_cannot_be_run_is_said(monkeypatch: pytest.MonkeyPatch)
     def bare(*_: object) -> list[Assumption]:
         return [Assumption("mesh", "numerical", "the pads have few elements", "they had more", vary=lambda r: None)]
 
-    monkeypatch.setattr("torchsoft.sysid.checks.checks.assumptions", bare)
+    monkeypatch.setattr("torchsoft.sysid.sensitivity.assumptions", bare)
     found = checked(recorded())
     assert any(
         sentence.startswith("it could not be checked what it does that the pads have few elements")
-        for sentence in notices(found)
+        for sentence in assumption_notices(found)
     )
 
 
@@ -272,7 +286,7 @@ def test_an_interrupt_among_the_assumptions_keeps_the_fit(monkeypatch: pytest.Mo
             raise KeyboardInterrupt
         return difference(*args)  # pyright: ignore[reportArgumentType]
 
-    monkeypatch.setattr("torchsoft.sysid.checks.checks.difference", interrupted)
+    monkeypatch.setattr("torchsoft.sysid.sensitivity.difference", interrupted)
     problem = Problem([recorded()], SENSORS, {name: Unknown() for name in TRUTH})
     answer = identify(problem, plan=[Stage("all", problem.names, problem.coordinates.labels, RTOL)])
     assert answer["pad.E"].value == pytest.approx(TRUTH["pad.E"], rel=0.01)

@@ -10,10 +10,9 @@ from test_sysid_noise import made
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
-from torchsoft.sysid.checks.colour import rewhitened
-from torchsoft.sysid.checks.parts import parts
-from torchsoft.sysid.problem.noise import Autoregression
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.noise import Autoregression
+from torchsoft.sysid.residual_tests import parts, rewhitened
+from torchsoft.sysid.runs import Runner
 
 BASE = Parameters().override(COARSE)
 TRUTH = {"pad.E": 0.8e6, "pad.tau": 0.011}

@@ -17,11 +17,11 @@ from torchsoft import Parameters, Profile, Reference, SoftGrasp
 from torchsoft.excitation import Excitation, Roll, Strokes
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, record
 from torchsoft.sysid.answer.comparison import LawFit, judged
-from torchsoft.sysid.checks.parts import Part
 from torchsoft.sysid.laws.compare import compare, versus
 from torchsoft.sysid.laws.evidence import Density, density, ratio
-from torchsoft.sysid.problem.noise import Autoregression
+from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.report.comparison_figure import plot
+from torchsoft.sysid.residual_tests import Part
 
 T: Any = np.arange(300) * 5e-3
 

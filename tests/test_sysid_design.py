@@ -18,9 +18,9 @@ from torchsoft.sysid.design.design import BENT, Design, design, draws
 from torchsoft.sysid.design.design_figure import design_figure
 from torchsoft.sysid.design.knots import Bounds, Moves, profile
 from torchsoft.sysid.design.planner import LEFT, Planner
-from torchsoft.sysid.fit.information import fisher
-from torchsoft.sysid.problem.recording import Array
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.fit import fisher
+from torchsoft.sysid.recording import Array
+from torchsoft.sysid.runs import Runner
 
 P = Parameters().override(COARSE)
 PLAN = Excitation(

@@ -16,8 +16,8 @@ from torchsoft.excitation import Excitation, Strokes
 from torchsoft.physics.contact import SlipLaw
 from torchsoft.physics.shapes import parameter
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
-from torchsoft.sysid.problem.synthetic import Build
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.synthetic import Build
 
 BASE = Parameters().override(COARSE)
 SENSORS = {"x_C": Sensor(noise=1e-5), "theta": Sensor(noise=5e-4), "F_x": Sensor(noise=0.1)}

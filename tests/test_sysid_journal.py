@@ -15,10 +15,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from torchsoft.sysid.problem import workers
-from torchsoft.sysid.problem.journal import CHECKPOINT, Journal, decoded, encoded, forget
-from torchsoft.sysid.problem.prediction import FailedRun, Frozen, Misfit, Prediction
-from torchsoft.sysid.problem.workers import Job, Runner
+from torchsoft.sysid import runs
+from torchsoft.sysid.prediction import FailedRun, Frozen, Misfit, Prediction
+from torchsoft.sysid.runs import CHECKPOINT, Job, Journal, Runner, decoded, encoded, forget
 
 ODD = np.array([0.0, -0.0, np.nan, np.inf, -np.inf, 5e-324, 0.1 + 0.2, 1e308])
 PREDICTION = Prediction(
@@ -200,7 +199,7 @@ def test_what_is_done_is_kept_at_an_interruption(tmp_path: Path, monkeypatch: py
         time.sleep(0.1)
         return PREDICTION._replace(steps=int(job.values["pad.E"]))
 
-    monkeypatch.setattr(workers, "simulated", made)
+    monkeypatch.setattr(runs, "simulated", made)
     recordings: Any = [SimpleNamespace(fingerprint="a", duration=1.0, begin=lambda: None)]
     with pytest.raises(KeyboardInterrupt):
         Runner(recordings, workers=count, journal=tmp_path).run(jobs)

@@ -23,8 +23,7 @@ from torchsoft.sysid import MEASURED, Recording, Sensor, record
 from torchsoft.sysid.files.columns import COLUMNS, UNITS, read_table, read_tables
 from torchsoft.sysid.files.cost import cost, paper_settings
 from torchsoft.sysid.files.measured import STATED, known_parameters, load, read_recording, stem
-from torchsoft.sysid.problem.moving_start import MovingStart
-from torchsoft.sysid.problem.start import AtRest
+from torchsoft.sysid.initial_state import AtRest, MovingStart
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "identify"
 

@@ -7,10 +7,20 @@ import pytest
 from scipy import signal, stats
 from test_sysid_noise import made
 
-from torchsoft.sysid.checks.colour import colour_notices, colours, correlation
-from torchsoft.sysid.checks.misfit import LEVEL, Verdict, autocorrelation, holm, judge, notices, whiteness
-from torchsoft.sysid.checks.parts import Part
-from torchsoft.sysid.problem.noise import Autoregression
+from torchsoft.sysid.noise import Autoregression
+from torchsoft.sysid.residual_tests import (
+    LEVEL,
+    Part,
+    Verdict,
+    autocorrelation,
+    colour_notices,
+    colours,
+    correlation,
+    holm,
+    judge_residuals,
+    residual_notices,
+    whiteness,
+)
 
 H = 5e-3
 CHANNELS = ("x_C", "theta", "F_x")
@@ -29,7 +39,7 @@ class Case:
 
     def judged(self, robust: bool = False) -> list[Verdict]:
         parts, r, J = self.fitted()
-        return judge(parts, r, J, robust=robust)
+        return judge_residuals(parts, r, J, robust=robust)
 
     def fitted(self) -> tuple[list[Part], np.ndarray, np.ndarray]:
         rng, at = np.random.default_rng(self.seed), 0
@@ -90,8 +100,8 @@ def test_the_level_is_judged_by_how_many_samples_there_are() -> None:
     (overall,) = [f for f in alarms(many, "level") if f.recording is None]
     assert overall.p < 1e-9
     assert overall.size == pytest.approx(1.058, abs=0.02)
-    assert notices(many)[0].startswith("residuals are larger than the noise that was stated")
-    assert "all of them together 1.0" in notices(many)[0]
+    assert residual_notices(many)[0].startswith("residuals are larger than the noise that was stated")
+    assert "all of them together 1.0" in residual_notices(many)[0]
     few = Case(0, lengths=(13, 13), scale=1.12**0.5).judged()
     assert not alarms(few, "level")
 
@@ -101,8 +111,8 @@ def test_one_channel_that_is_too_loud_is_named_and_one_too_quiet_as_well() -> No
     loud = Case(1, fault={("run 1", "theta"): 0.9 * rng.standard_normal(400)}).judged()
     named = [f for f in alarms(loud, "level") if f.recording]
     assert [(f.recording, f.channel) for f in named] == [("run 1", "theta")]
-    assert "theta of `run 1` 1.27 times" in notices(loud)[0]
-    quiet = notices(Case(1, scale=0.4).judged())
+    assert "theta of `run 1` 1.27 times" in residual_notices(loud)[0]
+    quiet = residual_notices(Case(1, scale=0.4).judged())
     assert len(quiet) == 1  # its pattern is not judged
     assert quiet[0].startswith("residuals are smaller than the noise that was stated")
     assert "and 4 more" in quiet[0]
@@ -131,7 +141,7 @@ def test_what_follows_the_motion_is_named(kind: str, words: str) -> None:
     named = alarms(found, "motion")
     assert {(f.recording, f.channel) for f in named} == {where}
     assert any(words in f.words for f in named), [f.words for f in named]
-    assert any(words in notice for notice in notices(found))
+    assert any(words in notice for notice in residual_notices(found))
 
 
 def test_colour_is_noticed_found_allowed_for_and_named() -> None:
@@ -146,7 +156,7 @@ def test_colour_is_noticed_found_allowed_for_and_named() -> None:
     assert f"x_C (order 1, neighbouring samples correlate by {correlation(found['x_C'].noise):.2f})" in sentence
     assert not colour_notices(found, CHANNELS)
     assert "theta" not in colour_notices(found, ["theta"])[0]
-    assert not notices(Case(3, noise=noise, assumed=found["theta"].noise).judged())
+    assert not residual_notices(Case(3, noise=noise, assumed=found["theta"].noise).judged())
 
 
 def test_white_noise_is_hardly_ever_called_coloured() -> None:
@@ -193,9 +203,9 @@ def test_saturated_samples_and_ends_that_cannot_be_tested() -> None:
         some.append(
             p._replace(t=p.t[inside], rows=p.rows[inside], raw=p.raw[inside], reading=p.reading[inside], saturated=100)
         )
-    assert not [f for f in judge(some, quiet, np.where((quiet == 0)[:, None], 0.0, J)) if f.alarming]
+    assert not [f for f in judge_residuals(some, quiet, np.where((quiet == 0)[:, None], 0.0, J)) if f.alarming]
     assert not colours(some, J)
-    short = judge([p._replace(t=p.t[:3], rows=np.arange(3 * i, 3 * i + 3), raw=p.raw[:3], reading=p.reading[:3])
+    short = judge_residuals([p._replace(t=p.t[:3], rows=np.arange(3 * i, 3 * i + 3), raw=p.raw[:3], reading=p.reading[:3])
                    for i, p in enumerate(parts)], r[:18], np.zeros((18, 4)))  # fmt: skip
     assert not [f for f in short if f.alarming]
 
@@ -206,13 +216,15 @@ def test_a_prior_that_the_data_contradict_is_named() -> None:
         (parts, r, J), row = Case(6).fitted(), np.eye(4)[:1] / 0.05
         both, at = np.concatenate((J, row)), np.append(r, -far / 0.05)
         x = np.linalg.lstsq(both, -at, rcond=None)[0]
-        verdicts = judge(parts, at + both @ x, both, priors=["pad.E"])
+        verdicts = judge_residuals(parts, at + both @ x, both, priors=["pad.E"])
         z = abs(far - 0.0) / np.hypot(0.05, np.linalg.inv(J.T @ J)[0, 0] ** 0.5)  # the fit without it is at zero
         (one,) = [v for v in verdicts if v.test == "priors"]
         assert one.size == pytest.approx(z, rel=1e-6, abs=1e-9)
         assert one.alarming == (far > 0)
-        assert any("contradict what was known before, pad.E by" in notice for notice in notices(verdicts)) == (far > 0)
-    unseen = judge(
+        assert any("contradict what was known before, pad.E by" in notice for notice in residual_notices(verdicts)) == (
+            far > 0
+        )
+    unseen = judge_residuals(
         parts, np.append(r, 0.0), np.concatenate((np.delete(J, 0, 1) @ np.eye(4)[1:], np.eye(4)[:1])), priors=["pad.E"]
     )
     assert not alarms(unseen, "priors")

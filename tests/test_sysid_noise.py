@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from scipy import linalg, optimize, signal, stats
 
-from torchsoft.sysid.fit.information import fisher
-from torchsoft.sysid.fit.robust import EFFICIENCY, REACH, Loss, covariance, rho, spared
-from torchsoft.sysid.problem.noise import Autoregression, coefficients, fit_noise, log_det, reflections, spacing
+from torchsoft.sysid.fit import EFFICIENCY, REACH, Loss, covariance, fisher, rho, spared
+from torchsoft.sysid.noise import Autoregression, coefficients, fit_noise, log_det, reflections, spacing
 
 H = 5e-3
 PROCESSES = {"one": (0.9,), "two": (1.6, -0.8), "four": (0.5, -0.3, 0.2, 0.1)}

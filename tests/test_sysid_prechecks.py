@@ -16,13 +16,12 @@ from torchsoft.excitation import Excitation, MultiSine, Press, Strokes
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Unknown, record
 from torchsoft.sysid.files.cost import paper_settings
-from torchsoft.sysid.fit.plan import LOOSE
-from torchsoft.sysid.prechecks.finding import Finding, accepted, together
-from torchsoft.sysid.prechecks.loops import loop_findings
-from torchsoft.sysid.prechecks.prechecks import check, findings
-from torchsoft.sysid.prechecks.setpoints import gaps, setpoint_findings
-from torchsoft.sysid.problem.readout import Signals, readout
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.loops import loop_findings
+from torchsoft.sysid.plan import LOOSE
+from torchsoft.sysid.loops import Finding, accepted, together
+from torchsoft.sysid.prechecks import findings, gaps, precheck, setpoint_findings
+from torchsoft.sysid.prediction import Signals, readout
+from torchsoft.sysid.runs import Runner
 
 NOMINAL = Parameters().override(COARSE)
 SENSORS = RIG | {"omega": Sensor(noise=0.02)}
@@ -71,7 +70,7 @@ def looked_at(
     mine = {name: sensor for name, sensor in sensors.items() if name in recording.samples}
     if run is None:
         problem = Problem([recording], mine, {"pad.E": Unknown()})
-        return check(problem, Runner(problem.recordings))
+        return precheck(problem, Runner(problem.recordings))
     span = float(recording.times[0]), float(recording.times[-1])
     readouts = {name: readout(recording.rig, name, sensor, {}, span) for name, sensor in mine.items()}
     return findings(recording, mine, {name: (one, run) for name, one in readouts.items()})

@@ -11,11 +11,11 @@ from conftest import COARSE
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Roll
 from torchsoft.sysid import RIG, Problem, Stage, Unknown, identify, record
-from torchsoft.sysid.answer.answer import load_answer
 from torchsoft.sysid.certainty.optimum import Optimum
 from torchsoft.sysid.certainty.posterior import laplace
 from torchsoft.sysid.certainty.profile import RISE, profiles
-from torchsoft.sysid.fit.information import Combination, combinations
+from torchsoft.sysid.fit import Combination, combinations
+from torchsoft.sysid.result import load_answer
 
 RNG = np.random.default_rng(0)
 STRAIGHT = RNG.standard_normal((20, 3))

@@ -27,9 +27,9 @@ from torchsoft import (
 )
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import AtRest, Known, Prior, Problem, Recording, Sensor, Stage, Unknown, identify, record
-from torchsoft.sysid.checks.parts import CLEAR, parts, predicted
-from torchsoft.sysid.problem.readout import Readout
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.prediction import Readout
+from torchsoft.sysid.residual_tests import CLEAR, parts, predicted
+from torchsoft.sysid.runs import Runner
 
 BASE = Parameters().override(COARSE)
 STROKES = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.9)

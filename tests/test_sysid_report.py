@@ -31,17 +31,13 @@ from torchsoft.sysid import (
     identify,
     record,
 )
-from torchsoft.sysid.answer.answer import AssumptionCheck, ChannelNoise, load_answer
 from torchsoft.sysid.answer.comparison import Comparison
-from torchsoft.sysid.answer.estimate import Direction
-from torchsoft.sysid.answer.recorded import untold
 from torchsoft.sysid.certainty.profile import RISE, Profile
-from torchsoft.sysid.checks.misfit import autocorrelation
+from torchsoft.sysid.estimate import Direction
 from torchsoft.sysid.files.cost import paper_settings
-from torchsoft.sysid.fit.information import Combination
-from torchsoft.sysid.problem.noise import Autoregression
-from torchsoft.sysid.problem.prediction import FailedRun
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.fit import Combination
+from torchsoft.sysid.noise import Autoregression
+from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.report import sections
 from torchsoft.sysid.report.figures import (
     contributions_figure,
@@ -55,6 +51,9 @@ from torchsoft.sysid.report.figures import (
 from torchsoft.sysid.report.page import grouped, table
 from torchsoft.sysid.report.report import page as page_of
 from torchsoft.sysid.report.report import report, traces
+from torchsoft.sysid.residual_tests import autocorrelation
+from torchsoft.sysid.result import AssumptionCheck, ChannelNoise, load_answer, untold
+from torchsoft.sysid.runs import Runner
 
 Found = tuple[IdentificationResult, Problem]
 NOISE = Autoregression((0.8,), 0.7, 5e-3)

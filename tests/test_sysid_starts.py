@@ -31,10 +31,9 @@ from torchsoft.physics.material import KelvinVoigt
 from torchsoft.physics.motion import Profile, Reference
 from torchsoft.solve.simulate import simulate
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, Unknown, identify
-from torchsoft.sysid.problem.first_samples import WIDER, beginning, estimate_initial_state, lasting_stretch
-from torchsoft.sysid.problem.moving_start import MovingStart, Stretch
-from torchsoft.sysid.problem.start import AtRest
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.first_samples import WIDER, beginning, estimate_initial_state, lasting_stretch
+from torchsoft.sysid.initial_state import AtRest, MovingStart, Stretch
+from torchsoft.sysid.runs import Runner
 
 MOTION = Excitation(motion=Strokes(travel=12e-3, stroke_time=0.3), duration=0.86, grasp_time=0.2, settle=0.05)
 COARSE = {"pad.elements_x": 60, "pad.elements_y": 2, "contact.v_s": 0.05}

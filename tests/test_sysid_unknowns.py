@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from torchsoft.paper.rig import SoftGrasp
-from torchsoft.sysid.problem.unknowns import Coordinates, Prior, Unknown
+from torchsoft.sysid.unknowns import Coordinates, Prior, Unknown
 from torchsoft.tables import InvalidTable
 
 RIG = SoftGrasp()

@@ -31,9 +31,8 @@ from torchsoft.experiment import COARSE, markdown, options, raw_config, write
 from torchsoft.files import replacing
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, Unreachable, explain
-from torchsoft.sysid.problem.journal import forget
-from torchsoft.sysid.problem.recording import Array
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.recording import Array
+from torchsoft.sysid.runs import Runner, forget
 from torchsoft.threads import parallel_map
 
 TESTS = Path(__file__).parents[2] / "tests"

@@ -28,11 +28,10 @@ from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes
 from torchsoft.experiment import COARSE, markdown, options, raw_config, write
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Stage, identify, record
-from torchsoft.sysid.answer.estimate import Estimate, estimates
-from torchsoft.sysid.fit.fit import chord
-from torchsoft.sysid.fit.information import fisher
-from torchsoft.sysid.problem.recording import Array
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.estimate import Estimate, estimates
+from torchsoft.sysid.fit import chord, fisher
+from torchsoft.sysid.recording import Array
+from torchsoft.sysid.runs import Runner
 from torchsoft.threads import parallel_map
 
 sys.path.insert(0, str(Path(__file__).parents[1]))

@@ -17,8 +17,7 @@ from hostile.trial import Tally
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import IdentificationResult, Problem, Sensor, Unknown, identify, record
-from torchsoft.sysid.problem.journal import CHECKPOINT, Journal, forget
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.runs import CHECKPOINT, Journal, Runner, forget
 
 pytestmark = pytest.mark.slow
 
@@ -213,6 +212,6 @@ def test_folders_of_others_are_left_alone(
 
 
 def other(rng: np.random.Generator) -> Any:
-    from torchsoft.sysid.problem.prediction import FailedRun
+    from torchsoft.sysid.prediction import FailedRun
 
     return FailedRun("lost", float(rng.random()))

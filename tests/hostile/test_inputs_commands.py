@@ -17,7 +17,7 @@ from hostile.test_inputs_recordings import EXAMPLE, table, written
 from hostile.trial import Tally, count, random
 from torchsoft import cli
 from torchsoft.datasets import generate as generation
-from torchsoft.sysid import solve
+from torchsoft.sysid import identification
 
 pytestmark = pytest.mark.slow
 
@@ -77,7 +77,7 @@ def test_random_arguments(folder: Path, tally: Callable[[str], Tally], capsys: p
         ("generate", tally("command lines: generate"), generation.main, both),
     ):
         with (
-            mock.patch.object(solve, "identify", side_effect=begun),
+            mock.patch.object(identification, "identify", side_effect=begun),
             mock.patch.object(generation, "generate", return_value=0),
         ):
             for _ in range(count(400)):

@@ -26,7 +26,7 @@ from torchsoft.files import sealed, unsealed
 from torchsoft.sysid.files import measured
 from torchsoft.sysid.files.columns import COLUMNS, read_table
 from torchsoft.sysid.files.cost import cost, paper_settings
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.runs import Runner
 
 pytestmark = pytest.mark.slow
 

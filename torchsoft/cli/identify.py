@@ -62,11 +62,10 @@ def identify(options: argparse.Namespace) -> int:
         from torchsoft.cost import agree
         from torchsoft.sysid.files import measured
         from torchsoft.sysid.files.cost import cost, one_by_one
-        from torchsoft.sysid.fit.fit import Unreachable
-        from torchsoft.sysid.problem.journal import forget
+        from torchsoft.sysid.fit import Unreachable
+        from torchsoft.sysid.identification import Settings, identify
         from torchsoft.sysid.report.report import report
-        from torchsoft.sysid.settings import Settings
-        from torchsoft.sysid.solve import identify
+        from torchsoft.sysid.runs import forget
 
         tables: dict[str, Any] = {}
         try:
@@ -114,7 +113,7 @@ def identify(options: argparse.Namespace) -> int:
 def compared(case: Any, fit: Any, options: argparse.Namespace) -> str:
     """Fits the competing laws, and says which one made the data."""
     from torchsoft.sysid.laws.compare import compare
-    from torchsoft.sysid.problem.journal import forget
+    from torchsoft.sysid.runs import forget
 
     unfinished: Path = options.checkpoint or options.out / "unfinished"
     folder = unfinished.with_name(f"{unfinished.name}-laws")

@@ -1,19 +1,17 @@
 """Identification: which parameters, from which recordings, with what certainty."""
 
 from torchsoft.channels import MEASURED
-from torchsoft.sysid.answer.answer import Answer, load_answer
-from torchsoft.sysid.answer.estimate import Estimate
-from torchsoft.sysid.answer.result import IdentificationResult
-from torchsoft.sysid.fit.fit import Unreachable
-from torchsoft.sysid.fit.plan import Stage
-from torchsoft.sysid.problem.first_samples import estimate_initial_state
-from torchsoft.sysid.problem.moving_start import MovingStart
-from torchsoft.sysid.problem.problem import Problem
-from torchsoft.sysid.problem.recording import Recording
-from torchsoft.sysid.problem.start import AtRest, Known
-from torchsoft.sysid.problem.synthetic import RIG, record
-from torchsoft.sysid.problem.unknowns import Prior, Sensor, Unknown
-from torchsoft.sysid.solve import explain, identify
+from torchsoft.sysid.estimate import Estimate
+from torchsoft.sysid.first_samples import estimate_initial_state
+from torchsoft.sysid.fit import Unreachable
+from torchsoft.sysid.identification import explain, identify
+from torchsoft.sysid.initial_state import AtRest, Known, MovingStart
+from torchsoft.sysid.plan import Stage
+from torchsoft.sysid.problem import Problem
+from torchsoft.sysid.recording import Recording
+from torchsoft.sysid.result import Answer, IdentificationResult, load_answer
+from torchsoft.sysid.synthetic import RIG, record
+from torchsoft.sysid.unknowns import Prior, Sensor, Unknown
 
 __all__ = [
     "MEASURED",

@@ -44,7 +44,7 @@ class LawFit:
     squared whitened residuals over the degrees of freedom with its p-value, criteria, Akaike weight (of AICc), and the log
     density per sample that it predicts for held-out recordings, with the p-value of their sum of squares. `numerical` is how
     far a tenth of the tolerance changes the log likelihood; `left` has sentences on what is left of the data that is no noise
-    as stated, by the tests of `torchsoft.sysid.checks.misfit`, and `patterned` says whether it follows the motion."""
+    as stated, by the tests of `torchsoft.sysid.residual_tests`, and `patterned` says whether it follows the motion."""
 
     name: str
     parameters: int

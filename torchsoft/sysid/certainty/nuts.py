@@ -24,7 +24,7 @@ from torchsoft.sysid.certainty.posterior import (
     notices_on_steps,
     steps_off,
 )
-from torchsoft.sysid.problem.recording import Array
+from torchsoft.sysid.recording import Array
 from torchsoft.threads import single_threaded
 
 EDGE = 1e-3

@@ -9,14 +9,13 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from torchsoft.sysid.fit.fit import Unreachable
-from torchsoft.sysid.fit.information import fisher
-from torchsoft.sysid.problem.problem import Problem, Residuals
-from torchsoft.sysid.problem.recording import Array
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.fit import Unreachable, fisher
+from torchsoft.sysid.problem import Problem, Residuals
+from torchsoft.sysid.recording import Array
+from torchsoft.sysid.runs import Runner
 
 if TYPE_CHECKING:
-    from torchsoft.sysid.answer.answer import Answer
+    from torchsoft.sysid.result import Answer
 
 CHOSEN_ANEW = 1.0
 """Change of |r|^2 by steps that are chosen anew, in place of those of the optimum, above which these are too far off."""

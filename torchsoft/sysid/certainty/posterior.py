@@ -18,7 +18,7 @@ from tqdm import tqdm
 from torchsoft.files import finite, replacing
 from torchsoft.sysid.certainty.optimum import CHOSEN_ANEW, Optimum
 from torchsoft.sysid.certainty.summary import MarginalSummary, PosteriorSummary
-from torchsoft.sysid.problem.recording import Array
+from torchsoft.sysid.recording import Array
 from torchsoft.threads import parallel_map, single_threaded
 
 WITHIN = 1e-3

@@ -14,9 +14,9 @@ from scipy.interpolate import PchipInterpolator
 from tqdm import tqdm
 
 from torchsoft.sysid.certainty.optimum import CHOSEN_ANEW, Optimum
-from torchsoft.sysid.fit.fit import Unreachable, gauss_newton, newton_step
-from torchsoft.sysid.problem.problem import Residuals
-from torchsoft.sysid.problem.recording import Array
+from torchsoft.sysid.fit import Unreachable, gauss_newton, newton_step
+from torchsoft.sysid.problem import Residuals
+from torchsoft.sysid.recording import Array
 from torchsoft.threads import parallel_map, single_threaded
 
 RISE = float(stats.chi2.ppf(0.95, 1))

@@ -6,11 +6,11 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from torchsoft.sysid.fit.information import fisher
-from torchsoft.sysid.problem.problem import Problem
-from torchsoft.sysid.problem.recording import Array, Recording
-from torchsoft.sysid.problem.start import PREFIX
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.fit import fisher
+from torchsoft.sysid.initial_state import PREFIX
+from torchsoft.sysid.problem import Problem
+from torchsoft.sysid.recording import Array, Recording
+from torchsoft.sysid.runs import Runner
 
 Optimality = Literal["D", "A", "worst"]
 

@@ -14,8 +14,8 @@ from torchsoft.sysid.design.criterion import VOLUME, Criterion
 from torchsoft.sysid.design.knots import Bounds, Moves, profile
 from torchsoft.sysid.design.planner import Planner, Range
 from torchsoft.sysid.design.search import Search, Visit
-from torchsoft.sysid.problem.problem import Problem
-from torchsoft.sysid.problem.recording import Array, Recording
+from torchsoft.sysid.problem import Problem
+from torchsoft.sysid.recording import Array, Recording
 
 RTOL = 1e-3
 """Relative tolerance of the runs: standard deviations are right to some percent."""

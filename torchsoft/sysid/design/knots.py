@@ -14,7 +14,7 @@ from scipy.optimize import linprog
 from torch import Tensor
 
 from torchsoft.physics.motion import Profile, Reference
-from torchsoft.sysid.problem.recording import Array
+from torchsoft.sysid.recording import Array
 from torchsoft.tables import Table
 
 PEAK = 35 / 16

@@ -29,12 +29,11 @@ from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import simulate
 from torchsoft.sysid.design.criterion import Criterion, chosen, deviations
 from torchsoft.sysid.design.knots import Moves
-from torchsoft.sysid.fit.information import fisher
-from torchsoft.sysid.problem.prediction import Frozen, Prediction, Steps, choice, predict, prepared
-from torchsoft.sysid.problem.problem import Problem, Residuals
-from torchsoft.sysid.problem.readout import Signals
-from torchsoft.sysid.problem.recording import Array, Recording, RunContext
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.fit import fisher
+from torchsoft.sysid.prediction import Frozen, Prediction, Signals, Steps, choice, predict, prepared
+from torchsoft.sysid.problem import Problem, Residuals
+from torchsoft.sysid.recording import Array, Recording, RunContext
+from torchsoft.sysid.runs import Runner
 from torchsoft.threads import parallel_map, single_threaded
 
 Range = tuple[float, float]

@@ -16,7 +16,7 @@ from torchsoft.solve.adjoint import GradientFailed
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.design.knots import Moves
 from torchsoft.sysid.design.planner import PRICE, DesignEvaluation, Planner
-from torchsoft.sysid.problem.recording import Array
+from torchsoft.sysid.recording import Array
 
 OUTLIER = 10.0
 """Slopes beyond so many medians are cut."""

@@ -15,7 +15,7 @@ import xarray as xr
 from torchsoft import csvfile
 from torchsoft.channels import CHANNELS, FEED_FORWARD, MEASURED, SETPOINTS, UNITS, VARIABLES
 from torchsoft.solve.trajectory import load
-from torchsoft.sysid.problem.recording import Array
+from torchsoft.sysid.recording import Array
 from torchsoft.tables import shown
 
 COLUMNS = ("t", *SETPOINTS, *FEED_FORWARD, *MEASURED)

@@ -8,9 +8,9 @@ from pydantic import AfterValidator, Field, model_validator
 
 from torchsoft.paper.rig import NAMES
 from torchsoft.physics.material import INSTANT
-from torchsoft.sysid.problem.moving_start import LEAD
-from torchsoft.sysid.problem.unknowns import Sensor, Unknown
-from torchsoft.sysid.settings import Settings
+from torchsoft.sysid.identification import Settings
+from torchsoft.sysid.initial_state import LEAD
+from torchsoft.sysid.unknowns import Sensor, Unknown
 from torchsoft.tables import LISTED, Table, from_toml
 
 VOCABULARY = {own: name for name, own in NAMES.items()}

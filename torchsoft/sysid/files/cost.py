@@ -5,10 +5,9 @@ from collections.abc import Iterable
 from torchsoft.cost import RUN, Cost, row_memory, step_seconds, steps_per_second
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp
-from torchsoft.sysid.fit.plan import ALL, FIRST, FREE, LAST, LOOSE, USUAL
-from torchsoft.sysid.fit.settle import FINER
-from torchsoft.sysid.problem.problem import Problem
-from torchsoft.sysid.problem.recording import Recording
+from torchsoft.sysid.plan import ALL, FINER, FIRST, FREE, LAST, LOOSE, USUAL
+from torchsoft.sysid.problem import Problem
+from torchsoft.sysid.recording import Recording
 
 CHECKED = 30
 """Runs that a recording is asked for to check what is taken for granted."""

@@ -35,12 +35,12 @@ from torchsoft.sysid.files.configuration import (
     read_config,
     understood,
 )
-from torchsoft.sysid.fit.fit import Unreachable
-from torchsoft.sysid.problem.first_samples import estimate_initial_state
-from torchsoft.sysid.problem.problem import Problem
-from torchsoft.sysid.problem.recording import Recording
-from torchsoft.sysid.problem.start import BOUNDS, AtRest
-from torchsoft.sysid.problem.unknowns import Sensor, Unknown
+from torchsoft.sysid.first_samples import estimate_initial_state
+from torchsoft.sysid.fit import Unreachable
+from torchsoft.sysid.initial_state import BOUNDS, AtRest
+from torchsoft.sysid.problem import Problem
+from torchsoft.sysid.recording import Recording
+from torchsoft.sysid.unknowns import Sensor, Unknown
 from torchsoft.tables import InvalidTable, line, refusing, shown
 
 BEGINNING, CREEP = 10e-3, 20e-3

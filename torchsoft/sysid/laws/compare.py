@@ -8,17 +8,14 @@ import torch
 from scipy import stats
 
 from torchsoft.sysid.answer.comparison import Comparison, LawFit, Series, Versus, judged
-from torchsoft.sysid.checks.colour import ROUNDS, colours
-from torchsoft.sysid.checks.misfit import notices
-from torchsoft.sysid.checks.parts import parts
-from torchsoft.sysid.fit.fit import Fit, Unreachable, gauss_newton
-from torchsoft.sysid.fit.plan import Stage, default_plan
-from torchsoft.sysid.fit.stages import progress_bar, run_stage
+from torchsoft.sysid.fit import Fit, Unreachable, gauss_newton
+from torchsoft.sysid.identification import RTOL
 from torchsoft.sysid.laws.evidence import Evidence, FittedLaw, ratio
-from torchsoft.sysid.problem.problem import Problem
-from torchsoft.sysid.problem.recording import Recording
-from torchsoft.sysid.problem.workers import Runner
-from torchsoft.sysid.settings import RTOL
+from torchsoft.sysid.plan import Stage, default_plan, progress_bar, run_stage
+from torchsoft.sysid.problem import Problem
+from torchsoft.sysid.recording import Recording
+from torchsoft.sysid.residual_tests import ROUNDS, colours, parts, residual_notices
+from torchsoft.sysid.runs import Runner
 
 SAME = 1e-6
 """Part of its range by which a signal of two references may differ."""
@@ -202,7 +199,7 @@ def law_fits(evidence: Mapping[str, Evidence]) -> list[LawFit]:
                 name, int(k[i]), {a.label: a.to_value(x) for a, x, free in zip(c.all, one.law.x, one.law.free) if free},
                 one.fitted.log, square / one.dof, float(stats.chi2.sf(square, one.dof)), float(aic[i]), float(aicc[i]),
                 float(bic[i]), float(weight[i] / weight.sum()), None if held is None else held.log / len(held.r),
-                None if held is None else held.p, one.numerical, one.law.converged, notices(one.verdicts),
+                None if held is None else held.p, one.numerical, one.law.converged, residual_notices(one.verdicts),
                 any(verdict.alarming and verdict.test == "motion" for verdict in one.verdicts),
             )
         )  # fmt: skip

@@ -8,14 +8,13 @@ from numpy.typing import NDArray
 from scipy import stats
 from scipy.sparse.linalg import spsolve_triangular
 
-from torchsoft.sysid.checks.misfit import judge
-from torchsoft.sysid.checks.parts import Part, parts
-from torchsoft.sysid.fit.fit import Unreachable
-from torchsoft.sysid.fit.settle import FINER
-from torchsoft.sysid.problem.noise import Autoregression, fit_noise, log_det
-from torchsoft.sysid.problem.problem import Problem, Residuals
-from torchsoft.sysid.problem.recording import Array
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.fit import Unreachable
+from torchsoft.sysid.noise import Autoregression, fit_noise, log_det
+from torchsoft.sysid.plan import FINER
+from torchsoft.sysid.problem import Problem, Residuals
+from torchsoft.sysid.recording import Array
+from torchsoft.sysid.residual_tests import Part, judge_residuals, parts
+from torchsoft.sysid.runs import Runner
 
 COLOUR = 3
 """Largest order of the autoregression by which residuals tell how much their colour moves a likelihood ratio."""
@@ -82,7 +81,7 @@ class Evidence:
         usual = self._at(which, law.rtol, False).r[:m]
         r, J, _ = self._at(which, FINER * law.rtol, True)
         self.fitted = density(problem, which, r[:m])
-        self.verdicts = judge(self.fitted.parts, r, J[:, free])
+        self.verdicts = judge_residuals(self.fitted.parts, r, J[:, free])
         self.numerical = abs(0.5 * float(usual @ usual - self.fitted.r @ self.fitted.r))
         self.dof, self.heldout = max(self.fitted.samples - int(free.sum()), 1), None
         if heldout:

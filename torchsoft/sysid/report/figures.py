@@ -10,12 +10,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator, PercentFormatter
 
 from torchsoft.plot.figures import ACTUAL, DESIRED, OTHER, STYLE
-from torchsoft.sysid.answer.answer import Answer
-from torchsoft.sysid.answer.estimate import IDENTIFIABLE, ChannelResiduals, Direction, Estimate
 from torchsoft.sysid.certainty.profile import RISE, Profile
-from torchsoft.sysid.checks.misfit import LAGS, autocorrelation
-from torchsoft.sysid.problem.noise import Autoregression
-from torchsoft.sysid.problem.recording import Array
+from torchsoft.sysid.estimate import IDENTIFIABLE, ChannelResiduals, Direction, Estimate
+from torchsoft.sysid.noise import Autoregression
+from torchsoft.sysid.recording import Array
+from torchsoft.sysid.residual_tests import LAGS, autocorrelation
+from torchsoft.sysid.result import Answer
 from torchsoft.tables import plain
 
 SHOWN = {"m": ("mm", 1e3), "m/s": ("mm/s", 1e3)}

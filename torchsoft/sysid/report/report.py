@@ -5,14 +5,13 @@ from pathlib import Path
 import numpy as np
 
 from torchsoft.files import replacing
-from torchsoft.sysid.answer.answer import Answer
-from torchsoft.sysid.problem.prediction import FailedRun
-from torchsoft.sysid.problem.problem import Problem
-from torchsoft.sysid.problem.readout import Signals
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.prediction import FailedRun, Signals
+from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.report import sections
 from torchsoft.sysid.report.figures import Trace
 from torchsoft.sysid.report.page import document, heading
+from torchsoft.sysid.result import Answer
+from torchsoft.sysid.runs import Runner
 
 
 def report(result: Answer, problem: Problem, path: str | Path, *, checkpoint: str | Path | None = None) -> None:

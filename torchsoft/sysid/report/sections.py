@@ -6,8 +6,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 
-from torchsoft.sysid.answer.answer import Answer
-from torchsoft.sysid.answer.estimate import Estimate
+from torchsoft.sysid.estimate import Estimate
 from torchsoft.sysid.report.comparison_figure import plot
 from torchsoft.sysid.report.figures import (
     Trace,
@@ -33,6 +32,7 @@ from torchsoft.sysid.report.page import (
     table,
     verbatim,
 )
+from torchsoft.sysid.result import Answer
 
 MOVED = 0.5
 """Standard deviations by which something that was taken for granted may move an estimate and still be folded away."""

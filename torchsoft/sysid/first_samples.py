@@ -20,11 +20,10 @@ from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import NoEquilibrium, settled
 from torchsoft.solve.trajectory import measurable
-from torchsoft.sysid.problem.moving_start import LEAD, MovingStart, Normal, Stretch, along, free_coordinates, placed
-from torchsoft.sysid.problem.readout import partner
-from torchsoft.sysid.problem.recording import SAME, Array, Recording
-from torchsoft.sysid.problem.start import PREFIX
-from torchsoft.sysid.problem.unknowns import Sensor
+from torchsoft.sysid.initial_state import LEAD, PREFIX, MovingStart, Normal, Stretch, along, free_coordinates, placed
+from torchsoft.sysid.prediction import partner
+from torchsoft.sysid.recording import SAME, Array, Recording
+from torchsoft.sysid.unknowns import Sensor
 
 DEGREE = 3
 """Of the polynomial in time through the first samples of a channel."""

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, optimize, signal, sparse
 
-from torchsoft.sysid.problem.recording import Array
+from torchsoft.sysid.recording import Array
 
 JITTER = 0.05
 """Part of the spacing by which samples may be off their grid."""

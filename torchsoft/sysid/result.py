@@ -1,33 +1,126 @@
-"""The answer of an identification: what was found, how, and of what rig, as plain data; `answer.json` holds it.
-
-The file's schema, `schema()`, is published as `docs/answer.schema.json`. A checksum of the content, in which numbers count and
-not how they are written, tells a damaged file from a whole one.
-"""
+"""The rigs of recordings as plain data, from which those of this package are built again."""
 
 import json
+import platform
 import warnings
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import cache
 from hashlib import sha256
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import ConfigDict, TypeAdapter
 
 from torchsoft.files import check_file, finite, replacing
+from torchsoft.paper.parameters import Parameters
+from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.rig import Rig
 from torchsoft.sysid.answer.comparison import Comparison
-from torchsoft.sysid.answer.contribution import Contribution
-from torchsoft.sysid.answer.estimate import ChannelResiduals, Direction, Estimate
-from torchsoft.sysid.answer.recorded import RecordedRig, known, untold
 from torchsoft.sysid.certainty.profile import Profile
 from torchsoft.sysid.certainty.summary import PosteriorSummary
-from torchsoft.sysid.fit.information import Combination
-from torchsoft.sysid.problem.noise import Autoregression
-from torchsoft.sysid.problem.prediction import set_parameters
-from torchsoft.sysid.problem.unknowns import Prior, Sensor, Unknown
+from torchsoft.sysid.estimate import ChannelResiduals, Contribution, Direction, Estimate, contributions
+from torchsoft.sysid.fit import Combination, combinations
+from torchsoft.sysid.initial_state import PREFIX
+from torchsoft.sysid.noise import Autoregression, Score
+from torchsoft.sysid.prediction import set_parameters
+from torchsoft.sysid.problem import Problem
+from torchsoft.sysid.recording import Array, identity
+from torchsoft.sysid.sensitivity import Check
+from torchsoft.sysid.unknowns import Prior, Sensor, Unknown
 from torchsoft.tables import Number, line, refusing, shown
+
+
+@dataclass(frozen=True)
+class RecordedRig:
+    """A recording and its rig: what tells it from others, its length [s], where it began, the rig's class, its numbers and laws
+    before the fit (`description`), and the values that were `identified` of it, with those of where it `began`.
+
+    `settings` are those from which `SoftGrasp` makes the very same rig; none where another rig, or laws of the user's own, are
+    needed.
+    """
+
+    name: str
+    fitted: bool
+    fingerprint: str
+    samples: int
+    duration: float
+    start: str
+    rig: str
+    description: dict[str, Any]
+    settings: Parameters | None
+    identified: dict[str, float]
+    began: dict[str, float]
+
+    @property
+    def known(self) -> dict[str, Any]:
+        """Numbers and laws that were not identified, without those of a scenario."""
+        return known(self.description, self.identified)
+
+    def rebuilt(self) -> Rig:
+        """The rig before the fit, whose reference holds still. Raises `ValueError` where only its maker has its laws."""
+        if self.settings is None:
+            raise ValueError(
+                f"the rig of recording `{self.name}` is a {self.rig} with parts of its own, which no file holds: build it "
+                "as it was built for the fit, and call `applied_to(rig)`"
+            )
+        return SoftGrasp(self.settings)
+
+
+def known(description: dict[str, Any], identified: dict[str, float]) -> dict[str, Any]:
+    """A rig's description as one table, without what is identified and without the scenario."""
+    parameters = {name: value for name, value in description["parameters"].items() if name not in identified}
+    parts = {part: laws for part, laws in description.items() if part != "parameters"}
+    laws = {f"{part} of {name}": law for part, laws in parts.items() for name, law in laws.items()}
+    scenario = {name for name in parameters if name.startswith("scenario.") and name != "scenario.gravity"}
+    return {name: value for name, value in (parameters | laws).items() if name not in scenario}
+
+
+def untold(values: Mapping[str, float]) -> str:
+    """What is said of values that the data do not tell."""
+    said = ", ".join(f"{name} = {value:.3g}" for name, value in values.items())
+    return f"not identifiable from the data, and so only where the search ended: {said}"
+
+
+def rebuildable(rig: Rig) -> bool:
+    """Whether `SoftGrasp` makes the same rig from its settings, and these are valid."""
+    if type(rig) is not SoftGrasp:
+        return False
+    settings = rig.settings
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of a steep friction law
+            Parameters.model_validate(settings.model_dump())
+    except ValueError:
+        return False
+    return identity(SoftGrasp(settings)) == identity(rig)
+
+
+def recorded_rigs(problem: Problem, x: Array, fitted: Sequence[str]) -> list[RecordedRig]:
+    """Of every recording, with its values at x (n,)."""
+    out, seen = list[RecordedRig](), dict[bytes, bool]()
+    for k, recording in enumerate(problem.recordings):
+        values, rig, key = problem.values(x, k), recording.rig, identity(recording.rig)
+        if key not in seen:
+            seen[key] = rebuildable(rig)
+        settings = rig.settings if isinstance(rig, SoftGrasp) and seen[key] else None
+        identified = {name: value for name, value in values.items() if not name.startswith(PREFIX)}
+        began = {name: value for name, value in values.items() if name.startswith(PREFIX)}
+        start = line(repr(recording.start), 300)
+        one = RecordedRig(
+            recording.name, recording.name in fitted, recording.fingerprint, problem.samples([recording.name]),
+            recording.duration, start, type(rig).__qualname__, rig.description(), settings, identified, began,
+        )  # fmt: skip
+        out.append(one)
+    return out
+
+
+# The answer of an identification: what was found, how, and of what rig, as plain data; `answer.json` holds it.
+
 
 SCHEMA = "torchsoft-answer-3"
 """Name and version of the file's form."""
@@ -308,3 +401,65 @@ def load_answer(path: str | Path) -> Answer:
     with refusing(content, str(path)), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a steep friction law, which was fitted nevertheless
         return adapter().validate_json(json.dumps(content))
+
+
+# The result of an identification: its answer, and the rigs that it speaks of.
+
+
+BLURRED = 0.1
+"""Relative standard deviation of a combination of parameters from which it is looked for what the data see in its place."""
+
+
+@dataclass(frozen=True)
+class IdentificationResult(Answer):
+    """The result of `identify`: an `Answer`, and the recordings' rigs, so that `model` gives back any of them, with its laws
+    and the reference that it followed."""
+
+    rigs: Mapping[str, Rig] = field(default_factory=dict, repr=False, compare=False)
+
+    def _rig(self, one: RecordedRig) -> Rig:
+        return deepcopy(self.rigs[one.name]) if one.name in self.rigs else super()._rig(one)
+
+
+def described(
+    problem: Problem, x: Array, free: NDArray[np.bool_], J: Array, C: Array, fitted: Sequence[str], *,
+    tried: Mapping[str, Sequence[Score]] | None = None, checks: Sequence[Check] = (),
+) -> dict[str, Any]:  # fmt: skip
+    """Fields of a result that say what was fitted and how, at x (n,) with covariance C (n, n): `problem` has the noise that was
+    found, J (m, n) is the Jacobian of the residuals of the recordings `fitted`, `tried` the orders of noise by channel."""
+    c, tried = problem.coordinates, tried or {}
+    coordinates = [
+        FittedCoordinate(
+            one.label, one.name, one.kind, one.recording, one.nominal, one.low, one.high, one.scale, one.ratio_to,
+            not is_free, one.prior, one.to_value(x[i]), float(np.sqrt(C[i, i])),
+        )
+        for i, (one, is_free) in enumerate(zip(c.all, free))
+    ]  # fmt: skip
+    noise = [
+        ChannelNoise(channel, model, [OrderTried(*score) for score in tried.get(channel, ())])
+        for channel, model in problem.noise.items()
+    ]
+    packages = ("torchsoft", "torch", "numpy", "scipy", "numba")
+    return {
+        "recordings": recorded_rigs(problem, x, fitted), "unknowns": dict(problem.unknowns), "sensors": dict(problem.sensors),
+        "coordinates": coordinates, "contributions": contributions(problem, x, free, J, fitted),
+        "combinations": seen_together(problem, free, C), "noise": noise,
+        "assumptions": [
+            AssumptionCheck(
+                one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, dict(one.moves), one.gain, one.asked,
+                one.asked_sd, one.wanted, one.unchecked, one.value, dict(one.under),
+            )
+            for one in checks
+        ],
+        "versions": {"python": platform.python_version()} | {name: version(name) for name in packages},
+        "rigs": {recording.name: recording.rig for recording in problem.recordings},
+    }  # fmt: skip
+
+
+def seen_together(problem: Problem, free: NDArray[np.bool_], C: Array) -> list[Combination]:
+    """Products of powers of parameters that the data see better than each of them."""
+    mine = [
+        i for i, one in enumerate(problem.coordinates.all) if free[i] and one.kind == "parameter" and one.scale == "log"
+    ]
+    labels = [problem.coordinates.labels[i] for i in mine]
+    return combinations(labels, C[np.ix_(mine, mine)], BLURRED) if len(mine) > 1 else []

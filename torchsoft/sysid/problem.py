@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from torchsoft.paper.rig import NAMES, SoftGrasp
 from torchsoft.physics.validity import check_values
-from torchsoft.sysid.problem.noise import Autoregression
-from torchsoft.sysid.problem.prediction import FailedRun, Frozen, Prediction, set_parameters
-from torchsoft.sysid.problem.readout import Readout, Signals, readout
-from torchsoft.sysid.problem.recording import Array, Recording
-from torchsoft.sysid.problem.unknowns import NUISANCES, Coordinates, Nuisance, Sensor, Unknown
-from torchsoft.sysid.problem.workers import Job, Runner
+from torchsoft.sysid.noise import Autoregression
+from torchsoft.sysid.prediction import FailedRun, Frozen, Prediction, Readout, Signals, readout, set_parameters
+from torchsoft.sysid.recording import Array, Recording
+from torchsoft.sysid.runs import Job, Runner
+from torchsoft.sysid.unknowns import NUISANCES, Coordinates, Nuisance, Sensor, Unknown
 from torchsoft.tables import line
 
 StepsByName = float | Mapping[str, Frozen]

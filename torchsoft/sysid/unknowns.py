@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from torchsoft.sysid.problem.recording import REACH, Array, Recording
-from torchsoft.sysid.problem.start import BOUNDS, PREFIX
+from torchsoft.sysid.initial_state import BOUNDS, PREFIX
+from torchsoft.sysid.recording import REACH, Array, Recording
 from torchsoft.tables import Table, line, shown
 
 SPREAD = 10.0

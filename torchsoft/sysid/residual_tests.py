@@ -1,31 +1,96 @@
-"""Is what a fit left over noise? Tests of its residuals, each with a p-value for as many samples as there are.
+"""What a fit left, channel by channel: residuals whose noise is normal, and the reading that the model predicts beside them."""
 
-The residuals r (m,) are whitened with the noise that is assumed, J (m, n) is their Jacobian. Where model and noise are
-right they are independent, normal, of variance one, but for the n directions that the fit took out. Every test speaks of one
-channel in one recording where it can:
-
-    level     the sum of squares is chi-squared: residuals are as large as the noise that was stated
-    white     Ljung and Box: nothing is left that lasts longer than a sample
-    motion    F: they do not line up with the reading that the model predicts, nor with its rates, nor with other channels'
-    channels  Bartlett: those of different channels, at one time, have nothing to do with each other
-    outliers  Grubbs, and the kurtosis: tails are those of a normal distribution
-    priors    normal: estimates are where their priors expect them, as far as the data know better
-
-p-values are adjusted by Holm's method, so that with a right model one of them or more falls below `LEVEL` in as many of all
-identifications. What the noise was allowed to explain is not tested again: colour that a user has declared is no verdict, and
-colour that was found unasked is one, although intervals allow for it, because a sensor may have made it, or a wrong model.
-"""
-
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from functools import partial
+from typing import Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats
 from scipy.interpolate import CubicSpline
+from scipy.sparse.linalg import spsolve_triangular
+from scipy.special import ndtri_exp
 
-from torchsoft.sysid.checks.parts import Part
-from torchsoft.sysid.problem.recording import Array
+from torchsoft.sysid.fit import Fit, settled
+from torchsoft.sysid.noise import Autoregression, NoiseFit, fit_noise
+from torchsoft.sysid.problem import Problem, Residuals
+from torchsoft.sysid.recording import Array
+from torchsoft.sysid.unknowns import Sensor
+
+CLEAR = 4.0
+"""Standard deviations of the noise that a prediction must be within the range of a sensor that is saturated, so that its
+residual has a normal distribution; and from the prediction, beyond which a sample counts wherever it is."""
+
+FEWEST = 4
+"""Samples that are left of a sensor that is saturated, below which nothing is said of it."""
+
+
+class Part(NamedTuple):
+    """One channel of one recording at the fit, without what saturation has changed: times t (m,) [s], the rows (m,) of r and J
+    that are its own, the residuals `raw` (m,) over the noise that the sensor states, the `reading` (m,) that the model
+    predicts [unit], the noise that is assumed (white as stated, if None), whether its level was `found` from such residuals,
+    what whitens (m,) or (m, k), and how many samples were `saturated`."""
+
+    recording: str
+    channel: str
+    t: Array
+    rows: NDArray[np.int_]
+    raw: Array
+    reading: Array
+    noise: Autoregression | None = None
+    found: bool = False
+    whitened: Callable[[Array], Array] = lambda rows: rows
+    saturated: int = 0
+
+    @property
+    def name(self) -> str:
+        """As sentences name it."""
+        return f"{self.channel} of `{self.recording}`"
+
+
+def parts(problem: Problem, r: Array, which: Sequence[str]) -> list[Part]:
+    """The parts of residuals r of `Problem.residuals`, whitened by the problem's noise; none of a channel that is saturated
+    but for less than `FEWEST` samples.
+
+    Of a sensor that is saturated samples are left out where the prediction is near the end of its range or beyond, whether
+    they are saturated or not: the noise of those that are not is not normal. What is far from the prediction stays."""
+    out, at = [], 0
+    for recording in problem.recordings:
+        for channel, sensor in problem.sensors.items() if recording.name in which else ():
+            if channel not in recording.samples:
+                continue
+            t, measured = recording.samples[channel]
+            rows, noise = at + np.arange(len(t)), problem.noise.get(channel)
+            at += len(t)
+            raw = r[rows] if noise is None else spsolve_triangular(noise.whitener(t), r[rows])
+            reading, found = predicted(sensor, measured, raw), noise is not None
+            saturated = int(sensor.saturated(measured).sum())
+            if saturated:
+                near = sensor.saturated(reading - CLEAR * sensor.noise) | sensor.saturated(
+                    reading + CLEAR * sensor.noise
+                )
+                kept = ~near | (np.abs(raw) > CLEAR)
+                if kept.sum() < FEWEST:
+                    continue
+                t, rows, raw, reading = t[kept], rows[kept], raw[kept], reading[kept]
+            whitened = partial(problem.whitened, recording, channel)
+            out.append(Part(recording.name, channel, t, rows, raw, reading, noise, found, whitened, saturated))
+    return out
+
+
+def predicted(sensor: Sensor, measured: Array, raw: Array) -> Array:
+    """Readings without noise (m,), from samples and residuals over the noise: infinite where a saturated one leaves nothing."""
+    y = measured + sensor.noise * raw
+    for limit, sign in ((sensor.high, 1.0), (sensor.low, -1.0)):
+        if limit is not None:
+            at = sign * measured >= sign * limit
+            y[at] = limit + sign * sensor.noise * ndtri_exp(-0.5 * raw[at] ** 2)
+    return y
+
+
+# Is what a fit left over noise? Tests of its residuals, each with a p-value for as many samples as there are.
+
 
 LEVEL = 0.01
 """Part of all identifications with a right model and right noise in which a test gives a false alarm."""
@@ -67,7 +132,7 @@ class Verdict:
         return self.adjusted < LEVEL
 
 
-def judge(
+def judge_residuals(
     parts: Sequence[Part], r: Array, J: Array, *, robust: bool = False, priors: Sequence[str] = ()
 ) -> list[Verdict]:
     """All tests of a fit's whitened residuals r (m,), the last of them those of `priors`, which are named, with their Jacobian
@@ -269,7 +334,7 @@ SENTENCES: dict[str, str] = {
 }  # fmt: skip
 
 
-def notices(verdicts: Sequence[Verdict], widened: float = 1.0) -> list[str]:
+def residual_notices(verdicts: Sequence[Verdict], widened: float = 1.0) -> list[str]:
     """A sentence for each kind of alarm, naming recordings and channels, the clearest first; intervals are `widened` [1] for
     residuals that are too large."""
     kinds: dict[str, list[Verdict]] = {kind: [] for kind in SENTENCES}
@@ -285,3 +350,101 @@ def named(words: Sequence[str]) -> str:
     """The first of them, and how many more there are."""
     more = len(words) - MOST
     return ", ".join(words[:MOST]) + (f" and {more} more" if more > 0 else "")
+
+
+# Colour that is found in residuals: where, of which order, and what a reader must know of it.
+
+
+ROUNDS = 2
+"""How often noise is found: in what the fit leaves, and in what the fit with that noise leaves."""
+
+
+class Coloured(NamedTuple):
+    """A problem with the noise that was found, its fit, the noise by channel with every order that was tried, and the fits
+    on the way."""
+
+    problem: Problem
+    fit: Fit
+    found: dict[str, NoiseFit]
+    fits: list[Fit]
+
+
+def allow_for_colour(
+    problem: Problem, fit: Fit, free: NDArray[np.bool_], which: Sequence[str], refit: Callable[[Problem, Fit, int], Fit]
+) -> Coloured:
+    """Find the noise that a fit leaves in the recordings `which`, and fit again with it, by `refit(problem, fit, round)`, from
+    there, while coordinates that are `free` (n,) move.
+
+    The fit must have its residuals, with their Jacobian. Where all noise is white nothing is changed.
+    """
+    declared = [channel for channel, sensor in problem.sensors.items() if sensor.colour == "ar"]
+    found, fits = dict[str, NoiseFit](), list[Fit]()
+    for number in range(ROUNDS):
+        assert fit.at is not None
+        now = parts(problem, fit.at.r, which)
+        found = colours(now, fit.at.J[:, free], declared)
+        if not found and not problem.noise:
+            break
+        problem = problem.with_noise({channel: one.noise for channel, one in found.items()})
+        at = rewhitened(problem, fit.at, now)
+        fit = fit._replace(at=at, chi2=float(np.mean(at.r**2)))
+        if settled(problem, fit.x, at, free):
+            break
+        fit = refit(problem, fit, number)
+        fits.append(fit)
+    return Coloured(problem, fit, found, fits)
+
+
+def rewhitened(problem: Problem, at: Residuals, now: Sequence[Part]) -> Residuals:
+    """Residuals and their Jacobian with the noise of the problem in place of that of the parts."""
+    r, J = at.r.copy(), at.J.copy()
+    recordings = {recording.name: recording for recording in problem.recordings}
+    for part in now:
+        rows = J[part.rows] if part.noise is None else spsolve_triangular(part.noise.whitener(part.t), J[part.rows])
+        r[part.rows] = problem.whitened(recordings[part.recording], part.channel, part.raw)
+        J[part.rows] = problem.whitened(recordings[part.recording], part.channel, rows)
+    return Residuals(r, J, at.lost)
+
+
+def colours(parts: Sequence[Part], J: Array, declared: Sequence[str] = ()) -> dict[str, NoiseFit]:
+    """The noise of channels whose residuals, all recordings together, are not white, by channel; J (m, n) is the Jacobian.
+
+    White noise is refused by the ratio of likelihoods, at `LEVEL` for all channels and orders together; that of `declared`
+    channels by the Bayesian criterion alone. Noise is never taken to be less than the sensor states. That of channels with
+    saturated samples stays white: what their residuals have of colour is a verdict, with its sentence.
+    """
+    Q, out = np.linalg.qr(J)[0], {}
+    channels = list(dict.fromkeys(part.channel for part in parts))
+    for channel in channels:
+        mine = [part for part in parts if part.channel == channel]
+        if any(part.saturated for part in mine):
+            continue
+        if float(np.mean(np.concatenate([part.raw for part in mine]) ** 2)) < FAINT**2:
+            continue
+        fitted = sum(float(np.sum(Q[part.rows] ** 2)) for part in mine)
+        found = fit_noise([(part.t, part.raw) for part in mine], fitted)
+        p, ratio = found.noise.order, found.scores[0].deviance - found.scores[found.noise.order].deviance
+        tests = len(channels) * max(len(found.scores) - 1, 1)
+        if p > 0 and (channel in declared or tests * stats.chi2.sf(ratio, p) < LEVEL):
+            out[channel] = found._replace(noise=found.noise.at_least(1.0))
+    return out
+
+
+def colour_notices(found: Mapping[str, NoiseFit], declared: Sequence[str] = ()) -> list[str]:
+    """Sentences on colour that intervals allow for although nobody has declared it."""
+    names = [
+        f"{channel} (order {fit.noise.order}, neighbouring samples correlate by {correlation(fit.noise):.2f})"
+        for channel, fit in found.items() if channel not in declared
+    ]  # fmt: skip
+    if not names:
+        return []
+    return [
+        f"what the fit left is coloured in {named(names)}, which nobody has declared: intervals allow for it as noise, but a "
+        "wrong model leaves such residuals too; where it is the sensor, declare its `colour`"
+    ]
+
+
+def correlation(noise: Autoregression) -> float:
+    """Of neighbouring samples."""
+    gamma = noise.autocovariance(2)
+    return float(gamma[1] / gamma[0])

@@ -1,6 +1,6 @@
 """Estimates with intervals, what is identifiable, and what the fit left in the residuals."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
 
@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy import stats
 
-from torchsoft.sysid.checks.misfit import whiteness
-from torchsoft.sysid.checks.parts import parts
-from torchsoft.sysid.problem.problem import Problem, Residuals
-from torchsoft.sysid.problem.recording import Array
-from torchsoft.sysid.problem.start import PREFIX
-from torchsoft.sysid.problem.unknowns import Coordinate, Prior
+from torchsoft.sysid.fit import fisher
+from torchsoft.sysid.initial_state import PREFIX
+from torchsoft.sysid.problem import Problem, Residuals
+from torchsoft.sysid.recording import Array
+from torchsoft.sysid.residual_tests import parts, whiteness
+from torchsoft.sysid.unknowns import Coordinate, Prior
 from torchsoft.tables import Number
 
 CONFIDENCE = 0.95
@@ -203,3 +203,50 @@ def residual_channels(problem: Problem, residuals: Residuals, which: list[str]) 
         )
         for part in parts(problem, residuals.r, which)
     ]
+
+
+# How much each recording, and the priors, told about what was estimated.
+
+
+@dataclass(frozen=True)
+class Contribution:
+    """What one recording told about the estimates, or what the priors did (`source` is None then): its share of the weight in
+    each, by label, all sources together being 1, and how many times larger the standard deviation would be without it; none
+    where the others do not determine the estimate."""
+
+    source: str | None
+    rows: int
+    shares: dict[str, float]
+    without: dict[str, float | None]
+
+
+def contributions(
+    problem: Problem, x: Array, free: NDArray[np.bool_], J: Array, fitted: Sequence[str]
+) -> list[Contribution]:
+    """Of the recordings `fitted`, whose rows the whitened Jacobian J (m, n) at x (n,) has, before those of the priors."""
+    rows, at = dict[str | None, slice](), 0
+    for (name, _), part in split(problem, J, list(fitted)).items():
+        begin = rows[name].start if name in rows else at
+        at += len(part)
+        rows[name] = slice(begin, at)
+    if at < len(J):
+        rows[None] = slice(at, len(J))
+    J = J[:, free]
+    C, wanted = fisher(J)[0], {one.label: one.slope[free] for one in quantities(problem, x, free)}
+    sd = {label: float(np.sqrt(g @ C @ g)) for label, g in wanted.items()}
+    parts = {
+        name: {label: float(np.sum((J[own] @ (C @ g)) ** 2)) for label, g in wanted.items()}
+        for name, own in rows.items()
+    }
+    total = {label: max(sum(part[label] for part in parts.values()), 1e-300) for label in wanted}
+    out = []
+    for name, own in rows.items():
+        left = fisher(np.delete(J, own, 0))[0] if len(rows) > 1 else None
+        without: dict[str, float | None] = dict.fromkeys(wanted)
+        for label, g in wanted.items():
+            alone = float(np.sqrt(g @ left @ g)) if left is not None else np.inf
+            if alone < IDENTIFIABLE and sd[label] > 0:
+                without[label] = alone / sd[label]
+        shares = {label: parts[name][label] / total[label] for label in wanted}
+        out.append(Contribution(name, own.stop - own.start, shares, without))
+    return out

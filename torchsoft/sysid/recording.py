@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.trajectory import measurable, units
-from torchsoft.sysid.problem.start import AtRest, Begin, Start, StartCoordinate
+from torchsoft.sysid.initial_state import AtRest, Begin, Start, StartCoordinate
 
 Array = NDArray[np.float64]
 

@@ -16,18 +16,14 @@ from numpy.typing import NDArray
 from scipy import stats
 from tqdm import tqdm
 
-from torchsoft.sysid.checks.assumptions import FAULTS, Assumption, Kind, assumptions
-from torchsoft.sysid.checks.misfit import LEVEL
-from torchsoft.sysid.checks.parts import parts
-from torchsoft.sysid.checks.variation import End, Refit, difference, ended, refit
-from torchsoft.sysid.fit.information import fisher, shift, standard_deviations
-from torchsoft.sysid.fit.robust import Loss
-from torchsoft.sysid.problem.prediction import FailedRun
-from torchsoft.sysid.problem.problem import Problem, Residuals
-from torchsoft.sysid.problem.readout import Signals
-from torchsoft.sysid.problem.recording import Array
-from torchsoft.sysid.problem.unknowns import Nuisance
-from torchsoft.sysid.problem.workers import Runner
+from torchsoft.sysid.assumptions import FAULTS, Assumption, End, Kind, Refit, assumptions, difference, ended, refit
+from torchsoft.sysid.fit import Loss, fisher, shift, standard_deviations
+from torchsoft.sysid.prediction import FailedRun, Signals
+from torchsoft.sysid.problem import Problem, Residuals
+from torchsoft.sysid.recording import Array
+from torchsoft.sysid.residual_tests import LEVEL, parts
+from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.unknowns import Nuisance
 from torchsoft.tables import plain
 
 ASKED = 20.0
@@ -131,7 +127,7 @@ class Checked(NamedTuple):
         return self.covariance() - fisher(self.J)[0]
 
 
-def check(
+def check_assumptions(
     problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_], which: Sequence[str], rtol: float, *,
     doubtful: bool = False, explain: bool = False, loss: Loss = "linear", workers: int = 1, journal: Path | None = None,
     progress: bool = False,
@@ -338,7 +334,7 @@ def columns_of(
     return [pair for k, pair in enumerate(out) if k < len(known) or faults[k - len(known)] not in have]
 
 
-def notices(checked: Checked) -> list[str]:
+def assumption_notices(checked: Checked) -> list[str]:
     """Sentences on what the data favour, the strongest first, and on constants of the computation that estimates hang on."""
     out, checks = [], checked.checks
     if checked.candidates:

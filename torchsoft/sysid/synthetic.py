@@ -10,10 +10,10 @@ from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.motion import Reference
 from torchsoft.solve.simulate import simulate
-from torchsoft.sysid.problem.prediction import choice, set_parameters
-from torchsoft.sysid.problem.recording import Recording
-from torchsoft.sysid.problem.start import AtRest, held_start
-from torchsoft.sysid.problem.unknowns import Sensor
+from torchsoft.sysid.initial_state import AtRest, held_start
+from torchsoft.sysid.prediction import choice, set_parameters
+from torchsoft.sysid.recording import Recording
+from torchsoft.sysid.unknowns import Sensor
 
 Build = Callable[[Parameters, Reference], SoftGrasp]
 """Makes a rig from settings and a reference: `SoftGrasp` itself, or a function that gives it laws of the user's own, such as a

@@ -1,1 +1,0 @@
-"""Ways down the misfit, in stages, and what a Jacobian tells."""

@@ -1,0 +1,309 @@
+"""Stages: which data, which unknowns, which ties, in which order.
+
+A fit of everything at once, from far away, ends in a local minimum or in runs that cannot be simulated. So: first the
+slowest recording, for what it can identify; then all of them, with ratios (kinetic over static friction) tied at their upper
+bound, because friction that does not fall with slip always has a solution; then a scan over each ratio, and everything free.
+Tolerances are loose in the beginning, and the last stage takes the full one.
+"""
+
+import time as clock
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import qmc
+from tqdm import tqdm
+
+from torchsoft.sysid.fit import (
+    Fit,
+    Loss,
+    Notify,
+    Unreachable,
+    chord,
+    descend,
+    gauss_newton,
+    settled,
+    shift,
+    standard_deviations,
+)
+from torchsoft.sysid.problem import Problem, Residuals, StepsByName
+from torchsoft.sysid.recording import Array
+from torchsoft.sysid.runs import Runner
+from torchsoft.tables import plain
+
+FIRST_LOOK = 0.1
+"""A coordinate takes part in the first look if its predicted standard deviation [1] is below this: one that is barely
+identifiable would run off to make up for what is still wrong elsewhere."""
+
+LOOSE, USUAL = 1e-3, 1e-4
+"""Relative tolerances of the stages with ratios tied, and of those before the last one."""
+
+FIRST, ALL, FREE, LAST = 8, 15, 30, 20
+"""Evaluations that each of the stages may take."""
+
+SCANNED = (1.0, 0.85, 0.7, 0.55)
+"""Parts of its upper bound at which a ratio is tried before it is set free."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One fit: recordings, free coordinates by label, the relative tolerance that chooses its steps, how long, and what is set
+    or scanned before it.
+
+    `tied` sets coordinates to values; `scanned` tries each value, by `LOOSE`, the others held, and keeps the best. With
+    `starts` above one, that many Sobol points within a factor `spread` of the start are fitted, and the best end goes on.
+    """
+
+    name: str
+    recordings: tuple[str, ...]
+    free: tuple[str, ...]
+    rtol: float
+    evaluations: int = 30
+    tolerance: float = 1e-6
+    tied: tuple[tuple[str, float], ...] = ()
+    scanned: tuple[tuple[str, tuple[float, ...]], ...] = ()
+    starts: int = 1
+    spread: float = 3.0
+
+
+def tie_ratios(problem: Problem, x: Array) -> Array:
+    """x with every free ratio at its upper bound."""
+    x, (_, high) = x.copy(), problem.coordinates.bounds
+    for i, c in enumerate(problem.coordinates.all):
+        if c.ratio_to and not c.fixed:
+            x[i] = high[i]
+    return x
+
+
+def visible(J: Array, candidates: NDArray[np.bool_], limit: float = FIRST_LOOK) -> NDArray[np.bool_]:
+    """The largest set, found greedily, whose members are all known to better than `limit` when the rest is held."""
+    out = candidates.copy()
+    while out.any():
+        sd = standard_deviations(J[:, out])
+        if sd.max() <= limit:
+            break
+        out[np.flatnonzero(out)[sd.argmax()]] = False
+    return out
+
+
+def told(problem: Problem, which: Sequence[str]) -> NDArray[np.bool_]:
+    """Coordinates (n,) that recordings may tell something of: not those of other recordings, nor of sensors that they lack."""
+    channels = {channel for recording in problem.recordings if recording.name in which for channel in recording.samples}
+    return np.array(
+        [
+            one.recording in (None, *which) and (one.of_the_rig or one.name in channels)
+            for one in problem.coordinates.all
+        ]
+    )
+
+
+def default_plan(problem: Problem, runner: Runner, rtol: float, which: Sequence[str], starts: int = 1) -> list[Stage]:
+    """Stages for some recordings: the slowest first, for what its Fisher matrix at the start makes identifiable.
+
+    Raises `Unreachable` where that recording cannot be simulated from the start.
+    """
+    c, free = problem.coordinates, problem.coordinates.free & told(problem, which)
+    ratios = np.array([bool(one.ratio_to) for one in c.all]) & free
+    x, labels = tie_ratios(problem, c.start), np.array(c.labels, object)
+    speed = {recording.name: recording.speed for recording in problem.recordings}
+    order = sorted(which, key=lambda name: speed[name])
+    loose, usual = max(LOOSE, rtol), max(USUAL, rtol)
+    look = problem.residuals(runner, x, order[:1], loose, free)
+    if look.lost:
+        raise Unreachable(look.lost)
+    ties = tuple((c.all[i].label, c.all[i].high) for i in np.flatnonzero(ratios))
+    slowest, first = (order[0],), tuple(labels[visible(look.J, free & ~ratios)])
+    plan = [Stage(f"{order[0]}: first look", slowest, first, loose, FIRST, 1e-2, ties, starts=starts)]
+    if len(order) > 1 or ratios.any():
+        plan.append(Stage("all data, ratios tied", tuple(order), tuple(labels[free & ~ratios]), loose, ALL, 1e-2))
+    scans = tuple((c.all[i].label, tuple(part * c.all[i].high for part in SCANNED)) for i in np.flatnonzero(ratios))
+    every, last = (tuple(order), tuple(labels[free])), rtol >= USUAL
+    plan.append(Stage("everything", *every, usual, FREE, 1e-3 if last else 1e-2, scanned=scans))
+    if not last:
+        plan.append(Stage("everything, full tolerance", *every, rtol, LAST, 1e-3))
+    return plan
+
+
+# How one stage of an identification is carried out: ties, scans, starts, and a fit on frozen steps.
+
+
+Method = Literal["gauss_newton", "lbfgs", "adam"]
+
+
+def stage_entry(name: str, stage: Stage, rtol: float, fit: Fit, began: float) -> dict[str, Any]:
+    """The result's entry on a stage that began at `began` on the clock [s]."""
+    return {
+        "name": name, "recordings": list(stage.recordings), "free": list(stage.free), "rtol": rtol,
+        "evaluations": fit.evaluations, "chi2": fit.chi2, "converged": fit.converged,
+        "wall_s": clock.perf_counter() - began,
+    }  # fmt: skip
+
+
+@contextmanager
+def progress_bar(label: str, shown: bool) -> Iterator[Notify]:
+    """Shows the progress of one stage: call it with chi2 after every evaluation."""
+    with tqdm(desc=plain(label), unit=" evaluations", disable=not shown) as bar:
+
+        def notify(chi2: float) -> None:
+            bar.set_postfix_str(f"chi2 = {chi2:.4g}", refresh=False)
+            bar.update()
+
+        yield notify
+
+
+def run_stage(
+    problem: Problem, runner: Runner, stage: Stage, x: Array, loss: Loss, method: Method, seed: int, notify: Any
+) -> Fit:
+    """One stage from x: ties, scans, Sobol starts, fit on the steps of each start; the best fit. Raises `Unreachable` where no
+    start can be simulated."""
+    c = problem.coordinates
+    for label in (*stage.free, *(label for label, _ in (*stage.tied, *stage.scanned))):
+        if label not in c.labels:
+            raise ValueError(f"stage `{stage.name}` names {label!r}; the coordinates are {', '.join(c.labels)}")
+    free, x = np.isin(c.labels, stage.free), x.copy()
+    for label, value in stage.tied:
+        i = c.labels.index(label)
+        x[i] = c.all[i].to_x(value)
+    for label, values in stage.scanned:
+        x = scan(problem, runner, stage, x, c.labels.index(label), values, notify)
+    best: Fit | None = None
+    failure: Unreachable | None = None
+    for start in (x, *sobol(problem, x, free, stage, seed)):
+        try:
+            wanted = free if method == "gauss_newton" else None
+            first, steps = problem.freeze(runner, start, stage.recordings, stage.rtol, wanted)
+            if first.lost:
+                raise Unreachable(first.lost)
+            common: dict[str, Any] = {"which": stage.recordings, "free": free, "steps": steps, "notify": notify}
+            if method == "gauss_newton":
+                fit = gauss_newton(
+                    problem, runner, start, evaluations=stage.evaluations, tolerance=stage.tolerance, loss=loss, first=first,
+                    **common,
+                )  # fmt: skip
+            else:
+                fit = descend(problem, runner, start, method=method, evaluations=4 * stage.evaluations, **common)
+        except Unreachable as lost:
+            failure = failure or lost
+            continue
+        if best is None or fit.chi2 < best.chi2:
+            best = fit
+    if best is None:
+        assert failure is not None
+        raise failure
+    return best
+
+
+def scan(
+    problem: Problem, runner: Runner, stage: Stage, x: Array, i: int, values: Sequence[float], notify: Notify
+) -> Array:
+    """x with the one of the values for coordinate number i that fits best, the others held; all are run side by side."""
+    rtol = max(LOOSE, stage.rtol)
+    trials = [x.copy() for _ in values]
+    for trial, value in zip(trials, values):
+        trial[i] = problem.coordinates.all[i].to_x(value)
+    jobs = [problem.jobs(trial, stage.recordings, rtol, None) for trial in trials]
+    runs = iter(runner.run([job for some in jobs for job in some]))
+    misfits = []
+    for trial, some in zip(trials, jobs):
+        misfits.append(float(np.mean(problem.gather(trial, some, [next(runs) for _ in some]).r ** 2)))
+        notify(misfits[-1])
+    return trials[int(np.argmin(misfits))]
+
+
+def sobol(problem: Problem, x: Array, free: NDArray[np.bool_], stage: Stage, seed: int) -> list[Array]:
+    """`stage.starts` - 1 more points within the stage's spread of x, in the free coordinates and within the bounds."""
+    if stage.starts == 1:
+        return []
+    low, high = problem.coordinates.bounds
+    reach = np.array([np.log(stage.spread) if c.scale == "log" else 0.5 for c in problem.coordinates.all])
+    low, high = np.maximum(low, x - reach), np.minimum(high, x + reach)
+    power = (stage.starts - 1).bit_length()
+    points = qmc.Sobol(int(free.sum()), rng=np.random.default_rng(seed)).random_base2(power)[: stage.starts - 1]
+    out = []
+    for u in points:
+        start = x.copy()
+        start[free] = low[free] + u * (high - low)[free]
+        out.append(start)
+    return out
+
+
+# The end of a fit: are its frozen steps still those that the tolerance would choose, and is the tolerance tight enough?
+
+
+STEP_BIAS = 0.5
+"""Shift of an estimate by the finite steps, over its standard deviation, above which the tolerance is called too coarse."""
+
+FINER = 0.1
+"""The tolerance of the check over the one that is checked."""
+
+REFITS, EXACT = 15, 1e-6
+"""Evaluations with Jacobians of their own that such a fit may take, and its relative tolerance."""
+
+ROUNDS = 3
+"""How often a fit goes on with steps chosen anew at its end."""
+
+
+class Settled(NamedTuple):
+    """A fit at its end: coordinates x (n,), residuals there by steps that `rtol` chooses at x, with the last Jacobian; how far
+    the steps have moved every coordinate (n,), None where that could not be checked; the fits on other steps since; the
+    residuals by a tenth of the tolerance, those of `at` where these could not be had; and whether the fit is `at_rest`: with
+    steps chosen anew no coordinate would move by more than `SETTLED` standard deviations (where steps are only checked:
+    whether the fit has converged)."""
+
+    x: Array
+    at: Residuals
+    rtol: float
+    bias: Array | None
+    fits: list[tuple[float, Fit]]
+    finer: Residuals
+    at_rest: bool
+
+
+def settle(
+    problem: Problem, runner: Runner, stage: Stage, fit: Fit, free: NDArray[np.bool_], tightenings: int, notify: Notify
+) -> Settled:
+    """Go on from a fit, by its Jacobian and a few runs: with steps chosen anew until they do not matter, and with a tighter
+    tolerance, at most so many times, where a tenth of it shifts an estimate by more than `STEP_BIAS`. With none the steps
+    are kept, and only checked."""
+    x, which, rtol, left, fits = fit.x, stage.recordings, stage.rtol, tightenings, []
+    at = fit.at or problem.residuals(runner, x, which, fit.steps, free)
+    rounds = ROUNDS if tightenings else 0
+
+    def along(start: Residuals, steps: StepsByName) -> bool:
+        """A fit on other steps from residuals on them, by new Jacobians where the last one does not lead to its end; whether
+        it came any further."""
+        nonlocal x, at
+        common: dict[str, Any] = {"which": which, "free": free, "steps": steps, "notify": notify}
+        end = chord(problem, runner, x, start._replace(J=at.J), **common)
+        if not end.converged:
+            end = gauss_newton(problem, runner, end.x, evaluations=REFITS, tolerance=EXACT, **common)
+        assert end.at is not None
+        if further := bool((end.x != x).any()):
+            fits.append((rtol, end))
+            x, at = end.x, end.at
+        return further
+
+    while True:
+        fresh, steps = problem.freeze(runner, x, which, rtol)
+        if fresh.lost:
+            return Settled(x, at, rtol, None, fits, at, at_rest=False)
+        end = fresh._replace(J=at.J)
+        at_rest = settled(problem, x, end, free) if tightenings else fit.converged
+        if rounds and not at_rest:
+            rounds -= 1
+            if along(fresh, steps):
+                continue
+        finer, steps = problem.freeze(runner, x, which, FINER * rtol)
+        if finer.lost:
+            return Settled(x, end, rtol, None, fits, end, at_rest)
+        J, bias = at.J[:, free], np.zeros(len(x))
+        bias[free] = shift(J, finer.r - at.r)
+        if left and not (at_rest and (np.abs(bias[free]) <= STEP_BIAS * standard_deviations(J)).all()):
+            left, rounds, rtol = left - 1, ROUNDS, FINER * rtol
+            if along(finer, steps):
+                continue
+            rtol /= FINER
+        return Settled(x, end, rtol, bias, fits, finer._replace(J=at.J), at_rest)

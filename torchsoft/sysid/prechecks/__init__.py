@@ -1,1 +1,0 @@
-"""Before a fit: can recordings be what they are taken for?"""

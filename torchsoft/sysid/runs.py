@@ -1,0 +1,227 @@
+"""Results of runs on disk, as data with checksums: what makes an identification resume, to the bit.
+
+A journal is a folder of its own, which a marker says, so that nothing of others' is ever taken for a result or removed. A file
+that is damaged, or holds the result of another run, is not used: its run is made again.
+"""
+
+import io
+import re
+import warnings
+from collections.abc import Sequence
+from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from torchsoft.cost import steps_per_second
+from torchsoft.files import CHECKPOINT, SEALED, check_file, make_folder, remove_partials, replacing
+from torchsoft.solve.kernel.cache import digest
+from torchsoft.solve.progress import SimulationFailed
+from torchsoft.sysid.noise import Autoregression
+from torchsoft.sysid.prediction import FailedRun, Frozen, Misfit, Prediction, Readout, Signals, Steps, misfit, predict
+from torchsoft.sysid.recording import Array, Recording, RunContext
+from torchsoft.sysid.unknowns import NUISANCES
+from torchsoft.threads import parallel_map, single_threaded
+
+MEANING = "Runs of an identification that is not done; torchsoft removes the .run files in this folder when it is.\n"
+
+RUN = re.compile(r"[0-9a-f]{64}\.run")
+"""Names of the results."""
+
+KINDS = {kind.__name__: kind for kind in (Prediction, Misfit, FailedRun)}
+"""What can be the result of a run."""
+
+PROGRAM = (
+    digest(Path(__file__).parents[2]),
+    *(version(name) for name in ("torchsoft", "torch", "numpy", "scipy", "numba")),
+)
+"""Everything but the data that decides a run."""
+
+
+def encoded(result: Any) -> bytes:
+    """A result as numpy's archive of its fields, without those that are None."""
+    fields = {name: np.asarray(value) for name, value in result._asdict().items() if value is not None}
+    archive = io.BytesIO()
+    contents: Any = {"kind": np.asarray(type(result).__name__)} | fields
+    np.savez(archive, **contents)
+    return archive.getvalue()
+
+
+def decoded(content: bytes) -> Any:
+    """The result that `encoded` was given, to the bit."""
+    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+        fields = {name: archive[name] if archive[name].ndim else archive[name].item() for name in archive.files}
+    kind: Any = KINDS[fields.pop("kind")]
+    return kind(**fields)
+
+
+class Journal:
+    """The results of runs of some recordings in a folder, by the run, which is any object whose `repr` says all of it.
+
+    Raises `ValueError` for a folder that holds anything else.
+    """
+
+    def __init__(self, folder: Path, recordings: Sequence[Recording]) -> None:
+        self.folder, self._warned = folder, False
+        self._own = repr((PROGRAM, [recording.fingerprint for recording in recordings]))
+        self._open()
+
+    def _open(self) -> None:
+        """Make the folder, and mark it unless it is someone else's."""
+        if self.folder.exists() and not self.folder.is_dir():
+            raise ValueError(f"the checkpoint {self.folder} is a file; give a new or an empty folder")
+        make_folder(self.folder)
+        if not (self.folder / CHECKPOINT).is_file():
+            if any(self.folder.iterdir()):
+                raise ValueError(f"the checkpoint {self.folder} holds other files; give a new or an empty folder")
+            (self.folder / CHECKPOINT).write_text(MEANING, encoding="utf-8")
+
+    def _place(self, run: object) -> tuple[bytes, Path]:
+        """What the checksum of a run's file begins with, and the file."""
+        name = sha256((self._own + repr(run)).encode())
+        return name.digest(), self.folder / f"{name.hexdigest()}.run"
+
+    def recall(self, run: object) -> Any:
+        """The result of a run; None where it is not there, or damaged."""
+        name, path = self._place(run)
+        if not path.is_file():
+            return None
+        try:
+            content = check_file(path, SEALED).read_bytes()
+            if content[:32] == sha256(name + content[32:]).digest():
+                return decoded(content[32:])
+        except Exception:  # a reader meets a forged archive in a hundred ways
+            pass
+        if not self._warned:
+            warnings.warn(
+                f"the checkpoint {self.folder} holds damaged results, whose runs are made again", stacklevel=2
+            )
+            self._warned = True
+        return None
+
+    def keep(self, run: object, result: Any) -> None:
+        """Write the result of a run, so that it lasts."""
+        name, path = self._place(run)
+        content = encoded(result)
+        if not (self.folder / CHECKPOINT).is_file():  # another identification was done with the folder
+            self._open()
+        with replacing(path) as partial:
+            partial.write_bytes(sha256(name + content).digest() + content)
+
+
+def forget(folder: Path) -> None:
+    """Remove a journal's own files, and the folder unless it holds anything else; other folders are left alone."""
+    if not (folder / CHECKPOINT).is_file():
+        return
+    for path in folder.iterdir():
+        if RUN.fullmatch(path.name) and path.is_file():
+            path.unlink(missing_ok=True)
+    remove_partials(path for path in folder.glob("*.partial") if RUN.match(path.name))
+    if [path.name for path in folder.iterdir()] == [CHECKPOINT]:
+        (folder / CHECKPOINT).unlink(missing_ok=True)
+        folder.rmdir()
+
+
+# Runs of the model, side by side in threads, each result kept on disk until the identification is done.
+
+
+class Job(NamedTuple):
+    """One run: which recording, the values of what is unknown, the names to differentiate by, and the steps.
+
+    `interpolated` asks for a grid between the samples; `judged` asks for the misfit and its gradient in place of the signals:
+    by every sensor's readout and the colour of its noise.
+    """
+
+    recording: int
+    values: dict[str, float]
+    names: tuple[str, ...]
+    steps: Steps
+    interpolated: bool = False
+    judged: tuple[tuple[Readout, Autoregression | None], ...] | None = None
+
+
+class Runner:
+    """Runs jobs in `workers` threads (in this one, if it is one), and remembers their results in the folder `journal`."""
+
+    def __init__(self, recordings: Sequence[Recording], workers: int = 1, journal: Path | None = None) -> None:
+        if workers < 1:
+            raise ValueError(f"`workers` must be positive, but is {workers}")
+        self.recordings, self.workers, self.folder = tuple(recordings), workers, journal
+        self.simulations = self.jacobians = self.gradients = self.steps = self.remembered = 0
+        self._journal = Journal(journal, self.recordings) if journal is not None else None
+        self._idle: list[list[RunContext]] = [[] for _ in self.recordings]  # models that no thread is using
+
+    def run(self, jobs: Sequence[Job]) -> list[Any]:
+        """Results in the order of the jobs: `Prediction`, `Misfit` or `FailedRun`."""
+        out = [self._journal.recall(job) if self._journal is not None else None for job in jobs]
+        for job, result in zip(jobs, out):
+            self._count(job, result is not None)
+        todo = [i for i, result in enumerate(out) if result is None]
+        todo.sort(key=lambda i: self._length(jobs[i]), reverse=True)  # the longest first
+        with single_threaded():
+            for i, result in parallel_map(lambda k: self._made(jobs[todo[k]]), len(todo), self.workers):
+                out[todo[i]] = result
+                self.steps += result.steps if isinstance(result, Prediction) else 0
+        return out
+
+    def _made(self, job: Job) -> Any:
+        """The result of a run that is made now, and kept even if an interruption is waiting for its end."""
+        idle = self._idle[job.recording]
+        try:
+            begun = idle.pop()
+        except IndexError:
+            begun = self.recordings[job.recording].begin()
+        result = simulated(self.recordings[job.recording], begun, job)
+        idle.append(begun)
+        if self._journal is not None:
+            self._journal.keep(job, result)
+        return result
+
+    def _length(self, job: Job) -> float:
+        """Steps of a run [1], by experience where they are not chosen yet."""
+        if isinstance(job.steps, Frozen):
+            return len(job.steps.knots) - 1
+        return steps_per_second(job.steps) * self.recordings[job.recording].duration
+
+    def _count(self, job: Job, remembered: bool) -> None:
+        self.remembered += remembered
+        if job.judged is not None:
+            self.gradients += 1
+        elif job.names:
+            self.jacobians += 1
+        else:
+            self.simulations += 1
+
+
+def simulated(recording: Recording, begun: RunContext, job: Job) -> Any:
+    """A `Prediction`, a `Misfit`, or a `FailedRun`, by a rig that nobody else is using."""
+    run = begun, job.values, recording.grid(job.interpolated), job.names, job.steps
+    try:
+        if job.judged is None:
+            return predict(*run)
+        return misfit(*run, lambda signals: judge(recording, job.judged or (), signals))
+    except SimulationFailed as failure:
+        return FailedRun(failure.reason, failure.time)
+
+
+def judge(
+    recording: Recording, judged: Sequence[tuple[Readout, Autoregression | None]], signals: Signals
+) -> tuple[float, Array, Array]:
+    """Half the sum of squared residuals, its derivatives by the signals (G, channels), and by the nuisances of every readout
+    (readouts, nuisances)."""
+    loss, on_signals, on_nuisances = 0.0, np.zeros(signals.values.shape), np.zeros((len(judged), len(NUISANCES)))
+    for k, (one, noise) in enumerate(judged):
+        t, measured = recording.samples[one.channel]
+        y, _, by = one.expected(signals, t)
+        r, weight = one.residuals(y, measured)
+        if noise is not None:
+            W = noise.whitener(t)
+            r = W @ r
+            v = weight * (W.T @ r)
+        else:
+            v = weight * r
+        loss, on_signals = loss + 0.5 * float(r @ r), on_signals + one.pulled_back(signals, t, v)
+        on_nuisances[k] = [v @ by[kind] if kind in by else 0.0 for kind in NUISANCES]
+    return loss, on_signals, on_nuisances
