@@ -14,7 +14,7 @@ from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify
 from torchsoft.sysid.assumptions import (
     AMOUNTS,
     PLACE,
-    Assumption,
+    Variation,
     assumptions,
     coulomb,
     difference,
@@ -28,7 +28,14 @@ from torchsoft.sysid.assumptions import (
 from torchsoft.sysid.identification import notices_on
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.runs import Runner
-from torchsoft.sysid.sensitivity import Check, Checked, assumption_notices, check_assumptions, doubted
+from torchsoft.sysid.sensitivity import (
+    AssumptionTest,
+    Checked,
+    assumption_notices,
+    assumption_test,
+    check_assumptions,
+    doubted,
+)
 
 BASE = Parameters().override(COARSE)
 TRUTH = {"pad.E": 0.85e6, "contact.K_n": 1.3e5}
@@ -106,7 +113,7 @@ def late(data: Recording) -> Recording:
 
 
 @pytest.mark.parametrize(
-    ("made", "name", "asked", "says"),
+    ("made", "name", "favoured", "says"),
     [
         (elsewhere, "x_C0", 30.0, "the data contradict that the disc begins at scenario.x_C0"),
         (turned, "bias theta", 2e-3, "the data contradict that theta has no unknown bias"),
@@ -122,14 +129,14 @@ def late(data: Recording) -> Recording:
     ],
 )  # fmt: skip
 def test_the_cause_is_named_with_its_amount(
-    made: Callable[[Recording], Recording], name: str, asked: float, says: str
+    made: Callable[[Recording], Recording], name: str, favoured: float, says: str
 ) -> None:
     found = checked(made(recorded()), doubtful=True)
     (one,) = (one for one in found.checks if one.name == name)
-    assert one.wanted
-    assert one.asked == pytest.approx(asked, rel=0.1, abs=4 * one.asked_sd)
+    assert one.suspected
+    assert one.favoured == pytest.approx(favoured, rel=0.1, abs=4 * one.favoured_sd)
     if one.parameter:
-        assert one.value == pytest.approx((1 + one.asked / 100) * BASE.table()[name]["value"], rel=1e-9)
+        assert one.value == pytest.approx((1 + one.favoured / 100) * BASE.table()[name]["value"], rel=1e-9)
         assert f"with {name} = {one.value:.6g} (" in assumption_notices(found)[0]
     assert "estimates under it: pad.E = " in assumption_notices(found)[0]
     assert one.under["pad.E"] == pytest.approx(TRUTH["pad.E"], rel=0.05)
@@ -152,8 +159,8 @@ def test_a_finer_mesh_is_asked_for_by_data_that_one_made() -> None:
     data = recorded()
     found = checked(made_by(remeshed(data, 2, 0), data))
     (mesh,) = (one for one in found.checks if one.name == "mesh")
-    assert mesh.wanted
-    assert mesh.asked == pytest.approx(1.0, abs=0.2)
+    assert mesh.suspected
+    assert mesh.favoured == pytest.approx(1.0, abs=0.2)
     assert any("elements" in sentence for sentence in assumption_notices(found))
 
 
@@ -169,8 +176,8 @@ def test_another_ramp_is_asked_for_by_data_that_it_made(vary: Callable[[Recordin
     data = recorded(excitation=LIGHT)
     found = checked(made_by(vary(data), data, QUIET), doubtful=True, sensors=QUIET)
     (one,) = (one for one in found.checks if one.name == name)
-    assert one.wanted
-    assert 0.5 < one.asked < 1.5
+    assert one.suspected
+    assert 0.5 < one.favoured < 1.5
     assert any("ramp" in sentence for sentence in assumption_notices(found))
 
 
@@ -225,10 +232,12 @@ def test_a_number_is_varied_as_far_as_there_is_a_rig() -> None:
 @pytest.mark.parametrize(("far", "numbers"), [(False, "abc"), (True, "fed")])
 def test_which_numbers_a_doubtful_fit_is_repeated_without(far: bool, numbers: str) -> None:
     """What would explain most; far off, where that says nothing, what the data would see first."""
-    taken = [Assumption(name, "known", "", "", parameter=name) for name in "abcdef"]
-    taken.append(Assumption("law", "law", "", "", vary=lambda r: r))
+    taken = [Variation(name, "known", "", "", parameter=name) for name in "abcdef"]
+    taken.append(Variation("law", "law", "", "", vary=lambda r: r))
     checks = {
-        one.name: Check(one.name, "known", "", "", 1.0, "%", {}, 100.0 - k, 900.0, 1.0, 10.0 - k, 100.0 - k)
+        one.name: assumption_test(
+            one, gain=100.0 - k, left=900.0, favoured=1.0, favoured_sd=10.0 - k, significance=100.0 - k
+        )
         for k, one in enumerate(taken)
     }
     assert {one.name for one in doubted(taken, checks, far)} == {*numbers, "law"}
@@ -256,8 +265,8 @@ def test_what_is_unknown_is_not_taken_for_granted() -> None:
 
 
 def test_a_variation_that_cannot_be_run_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
-    def bare(*_: object) -> list[Assumption]:
-        return [Assumption("mesh", "numerical", "the pads have few elements", "they had more", vary=lambda r: None)]
+    def bare(*_: object) -> list[Variation]:
+        return [Variation("mesh", "numerical", "the pads have few elements", "they had more", vary=lambda r: None)]
 
     monkeypatch.setattr("torchsoft.sysid.sensitivity.assumptions", bare)
     found = checked(recorded())
@@ -268,13 +277,15 @@ def test_a_variation_that_cannot_be_run_is_said(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize(
-    ("asked", "refitted", "unit", "wanted"),
+    ("favoured", "refitted", "unit", "suspected"),
     [(24.0, False, "%", True), (-208.0, False, "%", False), (-208.0, True, "%", True), (124.0, False, "N", True)],
 )
-def test_a_negative_mass_explains_nothing(asked: float, refitted: bool, unit: str, wanted: bool) -> None:
+def test_a_negative_mass_explains_nothing(favoured: float, refitted: bool, unit: str, suspected: bool) -> None:
     """A number of the rig that would have to vanish is no cause, and ends no search for one."""
-    one = Check("disc.mass", "known", "", "", 1.0, unit, {}, 1e6, 1e3, asked, 5.0, 1e6, refitted=refitted)
-    assert one.wanted is wanted
+    one = AssumptionTest(
+        "disc.mass", "known", "", "", 1.0, unit, favoured=favoured, significance=1e6, refitted=refitted
+    )
+    assert one.suspected is suspected
 
 
 def test_an_interrupt_among_the_assumptions_keeps_the_fit(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,9 +16,8 @@ from torchsoft.excitation import Excitation, MultiSine, Press, Strokes
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Unknown, record
 from torchsoft.sysid.files.cost import paper_settings
-from torchsoft.sysid.loops import loop_findings
+from torchsoft.sysid.loops import Finding, accepted, loop_findings, together
 from torchsoft.sysid.plan import LOOSE
-from torchsoft.sysid.loops import Finding, accepted, together
 from torchsoft.sysid.prechecks import findings, gaps, precheck, setpoint_findings
 from torchsoft.sysid.prediction import Signals, readout
 from torchsoft.sysid.runs import Runner

@@ -52,8 +52,9 @@ from torchsoft.sysid.report.page import grouped, table
 from torchsoft.sysid.report.report import page as page_of
 from torchsoft.sysid.report.report import report, traces
 from torchsoft.sysid.residual_tests import autocorrelation
-from torchsoft.sysid.result import AssumptionCheck, ChannelNoise, load_answer, untold
+from torchsoft.sysid.result import ChannelNoise, load_answer, untold
 from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.sensitivity import AssumptionTest
 
 Found = tuple[IdentificationResult, Problem]
 NOISE = Autoregression((0.8,), 0.7, 5e-3)
@@ -106,13 +107,14 @@ def full(found: Found) -> IdentificationResult:
     """The result with whatever else an answer may hold."""
     answer, _ = found
     E = answer["pad.E"].last
-    harmless = AssumptionCheck(
-        "a", "known", "<b> is so", "it were not", 2.0, "%", {"pad.E": 0.1}, 0.5, 0.3, 1.2, False, "", 1.0, {}
-    )
+    harmless = AssumptionTest(
+        "a", "known", "<b> is so", "it were not", 2.0, "%", moves={"pad.E": 0.1}, gain=0.5, favoured=0.3, favoured_sd=1.2,
+        value=1.0,
+    )  # fmt: skip
     checks = [
         harmless,
         replace(
-            harmless, name="b", stated="the disc weighs 1 kg", moves={"pad.E": -4.2}, gain=99.0, asked=-3.1, suspected=True
+            harmless, name="b", stated="the disc weighs 1 kg", moves={"pad.E": -4.2}, gain=99.0, favoured=-3.1, suspected=True
         ),
         replace(harmless, name="c", kind="law", stated="slip is smooth", moves={}, unchecked="a run failed"),
     ]  # fmt: skip

@@ -9,14 +9,13 @@ from torchsoft.sysid.initial_state import AtRest, Known, MovingStart
 from torchsoft.sysid.plan import Stage
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Recording
-from torchsoft.sysid.result import Answer, IdentificationResult, load_answer
+from torchsoft.sysid.result import IdentificationResult, load_answer
 from torchsoft.sysid.synthetic import RIG, record
 from torchsoft.sysid.unknowns import Prior, Sensor, Unknown
 
 __all__ = [
     "MEASURED",
     "RIG",
-    "Answer",
     "AtRest",
     "Estimate",
     "IdentificationResult",

@@ -58,10 +58,10 @@ class Fault(NamedTuple):
         noise = {"noise": sensor.noise, "noise/s": sensor.noise / max(recording.duration, 1e-9)}
         return self.amount * noise.get(self.per, 1.0)
 
-    def assumption(self, channel: str, unit: str, sensor: Sensor) -> "Assumption":
+    def assumption(self, channel: str, unit: str, sensor: Sensor) -> "Variation":
         scale = {"s": (1e3, "ms"), "1": (1e2, "%"), "noise": (sensor.noise, unit)}
         factor, shown = scale.get(self.per, (sensor.noise, f"{unit} over a recording"))
-        return Assumption(f"{self.verb.split()[0]} {channel}", "sensor", f"{channel} has no unknown {self.verb.split()[0]}",
+        return Variation(f"{self.verb.split()[0]} {channel}", "sensor", f"{channel} has no unknown {self.verb.split()[0]}",
                           f"{channel} {self.verb.partition(' ')[2]}", factor * self.amount, shown)  # fmt: skip
 
 
@@ -76,11 +76,10 @@ FAULTS: dict[Nuisance, Fault] = {
 
 @dataclass(frozen=True)
 class Assumption:
-    """One thing that is taken for granted: `stated` says what, `otherwise` what the variation makes of it, as clauses.
+    """An assumption of a fit as the clause `stated`, and its variation as the clause `otherwise`.
 
-    `vary` gives another recording, None where that has no meaning for it; or `parameter` is varied by the amount
-    [%]. What is known, and what a sensor is, may be otherwise by any part of the `amount` [unit], and to either side; a law
-    or a constant of the computation either is so, or is not.
+    A known number, or a property of a sensor, may differ by any part of the `amount` [unit], to either side; a law or a
+    constant of the computation holds or does not. `parameter` is the number that is varied, by the amount [%].
     """
 
     name: str
@@ -89,11 +88,17 @@ class Assumption:
     otherwise: str
     amount: float = 1.0
     unit: str = ""
-    vary: Callable[[Recording], Recording | None] | None = None
     parameter: str = ""
 
 
-def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Assumption]:
+@dataclass(frozen=True)
+class Variation(Assumption):
+    """An assumption with its variation: `vary` gives another recording, None where that has no meaning for it."""
+
+    vary: Callable[[Recording], Recording | None] | None = None
+
+
+def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Variation]:
     """Everything that the runs of some recordings take for granted and that can be varied; `unknown` are the parameters, and
     coordinates of starts, that are identified."""
     first, *_ = recordings
@@ -102,26 +107,26 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Assu
     nx, ny, points = pad.mesh.elements_x, pad.mesh.elements_y, pad.points
     at = f"{points} points an element" if points else "on the nodes"
     out = [
-        Assumption("mesh", "numerical", f"the pads have {nx} x {ny} elements", f"they had {2 * nx} x {2 * ny}",
+        Variation("mesh", "numerical", f"the pads have {nx} x {ny} elements", f"they had {2 * nx} x {2 * ny}",
                    vary=lambda r: remeshed(r, 2, points)),
-        Assumption("contact points", "numerical", f"contact is computed {at}", f"it were at {points + 2} points an element",
+        Variation("contact points", "numerical", f"contact is computed {at}", f"it were at {points + 2} points an element",
                    vary=lambda r: remeshed(r, 1, points + 2)),
-        Assumption("mesh phase", "numerical", "a node lies where the mesh puts it", "nodes lay a quarter of an element on",
+        Variation("mesh phase", "numerical", "a node lies where the mesh puts it", "nodes lay a quarter of an element on",
                    vary=lambda r: shifted(r, 0.25)),
     ]  # fmt: skip
     ramps = {name: float(value) for name, value in first.parameters.items() if name.split(".")[-1] == "epsilon"}
     if not ramps.keys() & unknown:
         small = ", ".join(f"{SMALLER_RAMP * value:.3g}" for value in ramps.values())
         stated = ", ".join(f"{value:.3g}" for value in ramps.values())
-        out.append(Assumption("ramp", "numerical", f"forces are ramped in at touch-down over epsilon = {stated} m",
+        out.append(Variation("ramp", "numerical", f"forces are ramped in at touch-down over epsilon = {stated} m",
                               f"epsilon were {small} m", vary=lambda r: scaled(r, tuple(ramps), SMALLER_RAMP)))  # fmt: skip
-    out.append(Assumption("ramp of the sliding", "law", "sliding stretches the tangential springs by the ramp of touch-down",
+    out.append(Variation("ramp of the sliding", "law", "sliding stretches the tangential springs by the ramp of touch-down",
                           "it did in full from touch-down on, without a ramp", vary=unramped))  # fmt: skip
     if any(isinstance(one, Sampled) for one in rig.reference.signals.values()):
-        out.append(Assumption("set-points", "numerical", "set-points are what a smooth curve through the recorded ones says",
+        out.append(Variation("set-points", "numerical", "set-points are what a smooth curve through the recorded ones says",
                               "only every second one were known", vary=sparser))  # fmt: skip
     if any(actuator.feed_forward is not None for actuator in rig.actuators.values()):
-        out.append(Assumption("feed-forward", "known", "what was fed forward is known", f"it were {FORCE} N more", FORCE, "N",
+        out.append(Variation("feed-forward", "known", "what was fed forward is known", f"it were {FORCE} N more", FORCE, "N",
                               vary=lambda r: raised(r, FORCE)))  # fmt: skip
     if isinstance(rig, SoftGrasp):
         out += of_the_paper(first, rig, unknown)
@@ -129,20 +134,20 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Assu
         if name in unknown or value == 0.0 or name in ramps or name.startswith("start.") or "fixed" in name:
             continue
         part = RADIUS if name.endswith("radius") else KNOWN
-        out.append(Assumption(name, "known", f"{name} is {value:.6g}", f"{name} were {(1 + part) * value:.6g}",
+        out.append(Variation(name, "known", f"{name} is {value:.6g}", f"{name} were {(1 + part) * value:.6g}",
                               100 * part, "%", parameter=name))  # fmt: skip
     return out
 
 
-def of_the_paper(recording: Recording, rig: SoftGrasp, unknown: set[str]) -> list[Assumption]:
+def of_the_paper(recording: Recording, rig: SoftGrasp, unknown: set[str]) -> list[Variation]:
     """What the paper's rig takes for granted besides."""
     out, start = [], recording.start
     if isinstance(start, AtRest) and "start.disc.x" not in unknown:
-        out.append(Assumption("x_C0", "known", "the disc begins at scenario.x_C0", f"it began {1e6 * PLACE:g} um further right",
+        out.append(Variation("x_C0", "known", "the disc begins at scenario.x_C0", f"it began {1e6 * PLACE:g} um further right",
                               1e6 * PLACE, "um", vary=placed))  # fmt: skip
     law = rig.contacts["L"].law.friction
     if isinstance(law, SmoothSlip):
-        out.append(Assumption("Coulomb friction", "law", "slip is smooth (contact.friction = \"smooth\")",
+        out.append(Variation("Coulomb friction", "law", "slip is smooth (contact.friction = \"smooth\")",
                               "it were Coulomb's", vary=coulomb))  # fmt: skip
     return out
 
@@ -306,7 +311,7 @@ def ended(
     return End(x, at, free, tuple(which), base, steps, rtol, workers, journal)
 
 
-def varied(problem: Problem, which: Sequence[str], one: Assumption) -> Problem | str:
+def varied(problem: Problem, which: Sequence[str], one: Variation) -> Problem | str:
     """The problem with one assumption otherwise in the recordings `which`, or why there is none. A parameter that is called
     known becomes one more unknown."""
     made, unknowns = [], dict(problem.unknowns)
@@ -337,7 +342,7 @@ def farthest(recordings: Sequence[Recording], name: str, value: float, part: flo
     raise ValueError(f"{name} = {value:g} can hardly be varied")
 
 
-def difference(problem: Problem, end: End, one: Assumption) -> tuple[Array | None, str]:
+def difference(problem: Problem, end: End, one: Variation) -> tuple[Array | None, str]:
     """What a variation adds to the residuals (m,), on the same steps, or None and why that is not known."""
     if end.base.lost:
         return None, "the estimates cannot be simulated by the tolerance of the checks"
@@ -362,7 +367,7 @@ class Refit(NamedTuple):
         return float(self.fit.x[self.problem.coordinates.labels.index(label)])
 
 
-def refit(problem: Problem, end: End, one: Assumption | None, loss: Loss, notify: Notify) -> Refit | None:
+def refit(problem: Problem, end: End, one: Variation | None, loss: Loss, notify: Notify) -> Refit | None:
     """The fit with one assumption otherwise, or with all as stated, on steps of its own; None where it cannot begin.
 
     It begins where the fit ended; ratios that ended at a bound are looked for again over all of their range. With another law

@@ -1,7 +1,7 @@
 """Estimates with intervals, what is identifiable, and what the fit left in the residuals."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -126,7 +126,7 @@ def quantities(problem: Problem, x: Array, free: NDArray[np.bool_]) -> Iterator[
             )  # fmt: skip
     for i, one in enumerate(c.all):
         if one.kind != "parameter" and free[i]:
-            name, where, unit = one._replace(recording=None).label, one.recording, nuisance_unit(one, problem)
+            name, where, unit = replace(one, recording=None).label, one.recording, nuisance_unit(one, problem)
             slope, size, value = np.eye(len(c))[i], float(one.slope(x[i])), one.to_value(x[i])
             yield Quantity(name, one.kind, where, unit, value, one.nominal, size, slope, [i], one.prior)
 

@@ -180,7 +180,8 @@ def log_det(W: sparse.csr_array) -> float:
     return -2 * float(np.log(W.diagonal()).sum())
 
 
-class Score(NamedTuple):
+@dataclass(frozen=True)
+class Score:
     """One order that was tried: -2 log likelihood of all samples, and the criteria of Akaike, corrected, and of Bayes."""
 
     order: int

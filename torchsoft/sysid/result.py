@@ -10,11 +10,11 @@ from functools import cache
 from hashlib import sha256
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, TypeAdapter
+from pydantic import ConfigDict, Field, TypeAdapter
 
 from torchsoft.files import check_file, finite, replacing
 from torchsoft.paper.parameters import Parameters
@@ -30,8 +30,8 @@ from torchsoft.sysid.noise import Autoregression, Score
 from torchsoft.sysid.prediction import set_parameters
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array, identity
-from torchsoft.sysid.sensitivity import Check
-from torchsoft.sysid.unknowns import Prior, Sensor, Unknown
+from torchsoft.sysid.sensitivity import AssumptionTest
+from torchsoft.sysid.unknowns import Coordinate, Sensor, Unknown
 from torchsoft.tables import Number, line, refusing, shown
 
 
@@ -122,7 +122,7 @@ def recorded_rigs(problem: Problem, x: Array, fitted: Sequence[str]) -> list[Rec
 # The answer of an identification: what was found, how, and of what rig, as plain data; `answer.json` holds it.
 
 
-SCHEMA = "torchsoft-answer-3"
+SCHEMA = "torchsoft-answer-4"
 """Name and version of the file's form."""
 
 
@@ -134,74 +134,23 @@ UNEXPLAINED = 1.25
 
 
 @dataclass(frozen=True)
-class FittedCoordinate:
-    """One entry of the vector that the fit moved in: its bounds and nominal value in physical units, its value there, and the
-    standard deviation of the entry itself, which is the logarithm of the value or the value over the width of its bounds."""
-
-    label: str
-    name: str
-    kind: str
-    recording: str | None
-    nominal: float
-    low: float
-    high: float
-    scale: Literal["log", "linear"]
-    ratio_to: str | None
-    fixed: bool
-    prior: Prior | None
-    value: float
-    sd: Number
-
-
-@dataclass(frozen=True)
-class OrderTried:
-    """One order of autoregressive noise, with -2 log likelihood and the criteria of Akaike, corrected, and of Bayes."""
-
-    order: int
-    deviance: float
-    aicc: float
-    bic: float
-
-
-@dataclass(frozen=True)
 class ChannelNoise:
     """Coloured noise of one channel: the model that residuals were whitened by, and the orders that were tried."""
 
     channel: str
     model: Autoregression
-    tried: list[OrderTried]
+    tried: list[Score]
 
 
 @dataclass(frozen=True)
-class AssumptionCheck:
-    """One thing that was taken for granted: how far each coordinate would move, in its standard deviations, were it
-    otherwise by `amount` [unit]; by how much the sum of squares would fall if the data could choose the amount, which they
-    ask for, and its standard deviation. `suspected` says that they do ask, `unchecked` why there is no answer."""
+class IdentificationResult:
+    """Estimates, correlations, directions, residuals, predictions, and how they were made.
 
-    name: str
-    kind: str
-    stated: str
-    otherwise: str
-    amount: float
-    unit: str
-    moves: dict[str, Number]
-    gain: Number
-    asked: Number
-    asked_sd: Number
-    suspected: bool
-    unchecked: str
-    value: Number  # of a known parameter, as the data would have it
-    under: dict[str, Number]  # estimates with that amount, by label
-
-
-@dataclass(frozen=True)
-class Answer:
-    """What an identification found: estimates, correlations, directions, residuals, predictions, and how it was made.
-
-    `x` and `covariance` are in `coordinates`, `correlation` and `directions` in those of them that were free (`labels`).
+    `x` and `covariance` are in `coordinates`, `correlation` and `directions` in those of them that were free (`labels`). `rigs`
+    are those of the recordings, with their laws and the references that they followed; a file does not hold them.
     """
 
-    __pydantic_config__ = ConfigDict(strict=True, extra="forbid")
+    __pydantic_config__ = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
 
     estimates: list[Estimate]
     labels: list[str]
@@ -223,16 +172,17 @@ class Answer:
     recordings: list[RecordedRig] = field(default_factory=list, repr=False)
     unknowns: dict[str, Unknown] = field(default_factory=dict, repr=False)
     sensors: dict[str, Sensor] = field(default_factory=dict, repr=False)
-    coordinates: list[FittedCoordinate] = field(default_factory=list, repr=False)
+    coordinates: list[Coordinate] = field(default_factory=list, repr=False)
     contributions: list[Contribution] = field(default_factory=list, repr=False)
     combinations: list[Combination] = field(default_factory=list, repr=False)
     noise: list[ChannelNoise] = field(default_factory=list, repr=False)
-    assumptions: list[AssumptionCheck] = field(default_factory=list, repr=False)
+    assumptions: list[AssumptionTest] = field(default_factory=list, repr=False)
     profiles: list[Profile] = field(default_factory=list, repr=False)
     posterior: PosteriorSummary | None = field(default=None, repr=False)
     comparison: Comparison | None = field(default=None, repr=False)
     versions: dict[str, str] = field(default_factory=dict, repr=False)
     command: str = ""
+    rigs: Annotated[dict[str, Any], Field(exclude=True)] = field(default_factory=dict, repr=False, compare=False)
 
     def __getitem__(self, name: str) -> Estimate:
         """The first estimate of that name."""
@@ -296,7 +246,7 @@ class Answer:
 
     def _rig(self, one: RecordedRig) -> Rig:
         """A rig of its own with the numbers of before the fit."""
-        return one.rebuilt()
+        return deepcopy(self.rigs[one.name]) if one.name in self.rigs else one.rebuilt()
 
     def _identified(self, rig: Rig, one: RecordedRig) -> Rig:
         set_parameters(rig, one.identified)
@@ -339,8 +289,8 @@ class Answer:
 
 
 @cache
-def adapter() -> TypeAdapter[Answer]:
-    return TypeAdapter(Answer)
+def adapter() -> TypeAdapter[IdentificationResult]:
+    return TypeAdapter(IdentificationResult)
 
 
 def checksum(content: Any) -> str:
@@ -358,7 +308,8 @@ def checksum(content: Any) -> str:
 
 def schema() -> dict[str, Any]:
     """The JSON Schema (2020-12) of the file."""
-    said = adapter().json_schema(by_alias=True, mode="serialization")
+    said = finite(adapter().json_schema(by_alias=True, mode="serialization"))
+    said["properties"].pop("rigs", None)
     head = {
         "schema": {"const": SCHEMA, "description": "Name and version of the file's form."},
         "checksum": {
@@ -376,7 +327,7 @@ def schema() -> dict[str, Any]:
     }
 
 
-def load_answer(path: str | Path) -> Answer:
+def load_answer(path: str | Path) -> IdentificationResult:
     """The answer in a file. Raises `ValueError` naming the file for one that is damaged, or no answer, and `OSError`."""
     check_file(path, LARGEST)
     try:
@@ -403,54 +354,25 @@ def load_answer(path: str | Path) -> Answer:
         return adapter().validate_json(json.dumps(content))
 
 
-# The result of an identification: its answer, and the rigs that it speaks of.
-
-
 BLURRED = 0.1
 """Relative standard deviation of a combination of parameters from which it is looked for what the data see in its place."""
 
 
-@dataclass(frozen=True)
-class IdentificationResult(Answer):
-    """The result of `identify`: an `Answer`, and the recordings' rigs, so that `model` gives back any of them, with its laws
-    and the reference that it followed."""
-
-    rigs: Mapping[str, Rig] = field(default_factory=dict, repr=False, compare=False)
-
-    def _rig(self, one: RecordedRig) -> Rig:
-        return deepcopy(self.rigs[one.name]) if one.name in self.rigs else super()._rig(one)
-
-
 def described(
     problem: Problem, x: Array, free: NDArray[np.bool_], J: Array, C: Array, fitted: Sequence[str], *,
-    tried: Mapping[str, Sequence[Score]] | None = None, checks: Sequence[Check] = (),
+    tried: Mapping[str, Sequence[Score]] | None = None, checks: Sequence[AssumptionTest] = (),
 ) -> dict[str, Any]:  # fmt: skip
     """Fields of a result that say what was fitted and how, at x (n,) with covariance C (n, n): `problem` has the noise that was
     found, J (m, n) is the Jacobian of the residuals of the recordings `fitted`, `tried` the orders of noise by channel."""
     c, tried = problem.coordinates, tried or {}
-    coordinates = [
-        FittedCoordinate(
-            one.label, one.name, one.kind, one.recording, one.nominal, one.low, one.high, one.scale, one.ratio_to,
-            not is_free, one.prior, one.to_value(x[i]), float(np.sqrt(C[i, i])),
-        )
-        for i, (one, is_free) in enumerate(zip(c.all, free))
-    ]  # fmt: skip
-    noise = [
-        ChannelNoise(channel, model, [OrderTried(*score) for score in tried.get(channel, ())])
-        for channel, model in problem.noise.items()
-    ]
+    noise = [ChannelNoise(channel, model, list(tried.get(channel, ()))) for channel, model in problem.noise.items()]
     packages = ("torchsoft", "torch", "numpy", "scipy", "numba")
     return {
         "recordings": recorded_rigs(problem, x, fitted), "unknowns": dict(problem.unknowns), "sensors": dict(problem.sensors),
-        "coordinates": coordinates, "contributions": contributions(problem, x, free, J, fitted),
+        "coordinates": [replace(one, fixed=not is_free) for one, is_free in zip(c.all, free)],
+        "contributions": contributions(problem, x, free, J, fitted),
         "combinations": seen_together(problem, free, C), "noise": noise,
-        "assumptions": [
-            AssumptionCheck(
-                one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, dict(one.moves), one.gain, one.asked,
-                one.asked_sd, one.wanted, one.unchecked, one.value, dict(one.under),
-            )
-            for one in checks
-        ],
+        "assumptions": list(checks),
         "versions": {"python": platform.python_version()} | {name: version(name) for name in packages},
         "rigs": {recording.name: recording.rig for recording in problem.recordings},
     }  # fmt: skip

@@ -7,16 +7,16 @@ a coordinate more, with a standard normal prior on its amplitude, so that data t
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 from tqdm import tqdm
 
-from torchsoft.sysid.assumptions import FAULTS, Assumption, End, Kind, Refit, assumptions, difference, ended, refit
+from torchsoft.sysid.assumptions import FAULTS, Assumption, End, Refit, Variation, assumptions, difference, ended, refit
 from torchsoft.sysid.fit import Loss, fisher, shift, standard_deviations
 from torchsoft.sysid.prediction import FailedRun, Signals
 from torchsoft.sysid.problem import Problem, Residuals
@@ -24,9 +24,9 @@ from torchsoft.sysid.recording import Array
 from torchsoft.sysid.residual_tests import LEVEL, parts
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.unknowns import Nuisance
-from torchsoft.tables import plain
+from torchsoft.tables import Number, plain
 
-ASKED = 20.0
+EVIDENT = 20.0
 """Fall of chi2, over the misfit that is left per sample, from which the data favour a variation: four and a half standard
 deviations, for some twenty variations are looked at."""
 
@@ -51,47 +51,40 @@ MOVED = 0.5
 
 
 @dataclass(frozen=True)
-class Check:
-    """One thing that was taken for granted, and what a variation of it by `amount` [unit] does.
+class AssumptionTest(Assumption):
+    """Test of one assumption: the effect of its variation by `amount` [unit].
 
-    `moves` is how far each coordinate would move, in its standard deviations, by label; `gain` by how much the sum of squares
-    would fall if the data could choose the amplitude, to `left`, `asked` that amplitude [unit] and `asked_sd` its standard
-    deviation; `significance` is the gain over the misfit per sample that would be left, `pattern` the part of the residuals'
-    autocorrelation that would be left, 0 where there is none. `refitted`: that is of a fit with the whole variation, not to
-    first order. `unchecked` says why there is no answer. `value` is what the data would have for a `parameter`, `under` the
-    estimates with the amount that is asked for, by label.
+    `moves` is the shift of each estimate in its standard deviations, by label; `gain` the fall of the sum of squares, to
+    `left`, by the amplitude that the data favour: `favoured` [unit] with the standard deviation `favoured_sd`.
+    `significance` is the gain over the misfit per sample that would be left, `pattern` the part of the residuals'
+    autocorrelation that would be left, 0 where there is none. With `refitted` that is the result of a new fit, else it is
+    to first order. `unchecked` is the reason why there is no test. `value` is the favoured value of the `parameter`,
+    `under` are the estimates with the favoured amplitude, by label. `suspected`: the data favour the variation.
     """
 
-    name: str
-    kind: Kind
-    stated: str
-    otherwise: str
-    amount: float
-    unit: str
-    moves: dict[str, float]
-    gain: float
-    left: float
-    asked: float
-    asked_sd: float
-    significance: float
-    pattern: float = 0.0
+    moves: dict[str, Number] = field(default_factory=dict)
+    gain: Number = 0.0
+    left: Number = 0.0
+    favoured: Number = 0.0
+    favoured_sd: Number = float("inf")
+    significance: Number = 0.0
+    pattern: Number = 0.0
     refitted: bool = False
     unchecked: str = ""
-    parameter: str = ""
-    value: float = float("nan")
-    under: Mapping[str, float] = field(default_factory=dict)
+    value: Number = float("nan")
+    under: dict[str, Number] = field(default_factory=dict)
+    suspected: bool | None = None
+
+    def __post_init__(self) -> None:
+        if self.suspected is None:
+            either_side = self.kind in ("known", "sensor")
+            enough = self.significance > EVIDENT and self.pattern < PATTERN and (either_side or self.favoured > 0)
+            object.__setattr__(self, "suspected", enough and not self.absurd)
 
     @property
     def absurd(self) -> bool:
-        """Whether a number of the rig would have to vanish, or be twice itself: what is so to first order says nothing then."""
-        return self.kind == "known" and self.unit == "%" and not self.refitted and abs(self.asked) >= 100
-
-    @property
-    def wanted(self) -> bool:
-        """Whether the data favour it."""
-        either_side = self.kind in ("known", "sensor")
-        enough = self.significance > ASKED and self.pattern < PATTERN
-        return enough and (either_side or self.asked > 0) and not self.absurd
+        """Whether a number of the rig would have to vanish or to double: a test to first order says nothing then."""
+        return self.kind == "known" and self.unit == "%" and not self.refitted and abs(self.favoured) >= 100
 
     @property
     def falls(self) -> str:
@@ -104,10 +97,15 @@ class Check:
         return max(self.moves.items(), key=lambda item: abs(item[1]), default=("", 0.0))
 
 
+def assumption_test(one: Assumption, **outcome: Any) -> AssumptionTest:
+    """The test of an assumption with this outcome."""
+    return AssumptionTest(**{each.name: getattr(one, each.name) for each in fields(Assumption)}, **outcome)
+
+
 class Checked(NamedTuple):
     """All checks; columns (m, k) of the constants of the computation, and those of the free coordinates' Jacobian (m, n)."""
 
-    checks: list[Check]
+    checks: list[AssumptionTest]
     columns: Array
     J: Array
     untried: tuple[str, ...] = ()
@@ -139,10 +137,10 @@ def check_assumptions(
     a test to first order says little where a fit has run far off.
     """
     end = ended(problem, x, at, free, which, rtol, workers, journal)
-    candidates: list[Assumption] = []
+    candidates: list[Variation] = []
     recordings = [recording for recording in problem.recordings if recording.name in which]
     taken = assumptions(recordings, set(problem.coordinates.names))
-    judge, checks, columns = Judge(problem, end), dict[str, Check](), []
+    judge, checks, columns = Judge(problem, end), dict[str, AssumptionTest](), []
     untried = [one.name for one in taken if one.vary is not None]
     try:
         linear = columns_of(problem, Runner(problem.recordings, workers, journal), end, taken)
@@ -169,9 +167,9 @@ def check_assumptions(
 
 
 def new_fits(
-    problem: Problem, end: End, candidates: Sequence[Assumption], loss: Loss, judge: "Judge", checks: dict[str, Check],
+    problem: Problem, end: End, candidates: Sequence[Variation], loss: Loss, judge: "Judge", checks: dict[str, AssumptionTest],
     progress: bool,
-) -> Iterator[Assumption]:  # fmt: skip
+) -> Iterator[Variation]:  # fmt: skip
     """Repeats the fit without one assumption after the other, whose `checks` it replaces, until one explains the misfit."""
     with tqdm(total=len(candidates) + 1, unit="fit", disable=not progress) as bar:
 
@@ -192,13 +190,13 @@ def new_fits(
                 return
 
 
-def doubted(taken: Sequence[Assumption], checks: Mapping[str, Check], far: bool) -> list[Assumption]:
+def doubted(taken: Sequence[Variation], checks: Mapping[str, AssumptionTest], far: bool) -> list[Variation]:
     """What a fit is repeated without, the likeliest first: all that either is so or is not, and `RIVALS` of the rig's numbers,
     those that would explain most or, where a fit ended `far` off, those whose variation would make the greatest misfit."""
     by_gain = sorted((one for one in taken if one.name in checks), key=lambda one: -checks[one.name].gain)
-    numbers = [one for one in by_gain if one.parameter and (far or checks[one.name].significance > ASKED)]
+    numbers = [one for one in by_gain if one.parameter and (far or checks[one.name].significance > EVIDENT)]
     if far:
-        numbers.sort(key=lambda one: checks[one.name].asked_sd / one.amount)
+        numbers.sort(key=lambda one: checks[one.name].favoured_sd / one.amount)
     return [one for one in by_gain if one.vary is not None or one in numbers[:RIVALS]]
 
 
@@ -216,28 +214,29 @@ class Judge:
         self.dof = max(sum(map(len, self.places)) - len(self.labels), 1)
         self.square = float(self.r @ self.r)
 
-    def explained(self, checks: Iterable[Check]) -> bool:
+    def explained(self, checks: Iterable[AssumptionTest]) -> bool:
         """Whether the data favour something with which residuals are no larger than the noise."""
-        left = min((one.left for one in checks if one.wanted), default=np.inf)
+        left = min((one.left for one in checks if one.suspected), default=np.inf)
         return float(stats.chi2.sf(left, self.dof)) > LEVEL
 
-    def unchecked(self, one: Assumption, reason: str) -> Check:
-        return Check(one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, {}, 0.0, self.square, 0.0,
-                     float("inf"), 0.0, unchecked=reason)  # fmt: skip
+    def unchecked(self, one: Assumption, reason: str) -> AssumptionTest:
+        return assumption_test(one, left=self.square, unchecked=reason)
 
     def made(
-        self, one: Assumption, moves: Array, gain: float, left: float, asked: float, asked_sd: float, rest: float,
+        self, one: Assumption, moves: Array, gain: float, left: float, favoured: float, favoured_sd: float, rest: float,
         pattern: float, refitted: bool = False,
-    ) -> Check:  # fmt: skip
+    ) -> AssumptionTest:  # fmt: skip
         """Of a variation that leaves a sum of squares `left`, a misfit `rest` per sample."""
         by_label = dict(zip(self.labels, moves.tolist()))
-        x = self.end.x[self.end.free] + moves * self.sd * (1.0 if refitted else asked / one.amount)
+        x = self.end.x[self.end.free] + moves * self.sd * (1.0 if refitted else favoured / one.amount)
         under = {c.label: c.to_value(v) for c, v in zip(self.coordinates, x.clip(-700, 700).tolist())}
-        value = (1 + asked / 100) * self.given[one.parameter] if one.parameter else float("nan")
-        return Check(one.name, one.kind, one.stated, one.otherwise, one.amount, one.unit, by_label, gain, left, asked, asked_sd,
-                     gain / rest, pattern, refitted, parameter=one.parameter, value=value, under=under)  # fmt: skip
+        value = (1 + favoured / 100) * self.given[one.parameter] if one.parameter else float("nan")
+        return assumption_test(
+            one, moves=by_label, gain=gain, left=left, favoured=favoured, favoured_sd=favoured_sd, significance=gain / rest,
+            pattern=pattern, refitted=refitted, value=value, under=under,
+        )  # fmt: skip
 
-    def column(self, one: Assumption, d: Array) -> Check:
+    def column(self, one: Assumption, d: Array) -> AssumptionTest:
         """Of what a variation adds to the residuals (m,), to first order in its amplitude."""
         across = d - self.Q @ (self.Q.T @ d)
         size, along = float(across @ across), float(across @ self.r)
@@ -252,7 +251,7 @@ class Judge:
         )
         return self.made(one, moves, gain, self.square - gain, alpha * one.amount, sd * one.amount, rest, pattern)
 
-    def fit(self, one: Assumption, again: Refit, as_stated: Refit, linear: Check) -> Check:
+    def fit(self, one: Assumption, again: Refit, as_stated: Refit, linear: AssumptionTest) -> AssumptionTest:
         """Of a fit that was repeated with it, beside one that was repeated without; or what is known to first order, if that is
         worth more."""
         at, before = again.fit.at, as_stated.fit.at
@@ -264,14 +263,14 @@ class Judge:
         left = float(at.r @ at.r)
         rest = max(1.0, left / self.dof)
         moves = np.array([again.of(label) for label in self.labels]) - self.end.x[self.end.free]
-        asked, sd = one.amount, (rest / gain) ** 0.5 * one.amount
+        favoured, sd = one.amount, (rest / gain) ** 0.5 * one.amount
         if one.parameter:
             labels = [label for label, is_free in zip(again.problem.coordinates.labels, again.free) if is_free]
             k = again.problem.coordinates.labels.index(one.parameter)
-            asked = 100 * (np.exp(again.fit.x[k] - again.problem.coordinates.start[k]) - 1)
+            favoured = 100 * (np.exp(again.fit.x[k] - again.problem.coordinates.start[k]) - 1)
             sd = 100 * rest**0.5 * float(standard_deviations(at.J[:, again.free])[labels.index(one.parameter)])
         pattern = pattern_of(self.places, at.r, before.r)
-        return self.made(one, moves / self.sd, gain, left, asked, sd, rest, pattern, True)
+        return self.made(one, moves / self.sd, gain, left, favoured, sd, rest, pattern, True)
 
 
 def pattern_of(places: Sequence[NDArray[np.int_]], left: Array, r: Array) -> float:
@@ -294,9 +293,7 @@ def pattern_of(places: Sequence[NDArray[np.int_]], left: Array, r: Array) -> flo
     return (max(after - rest, 0.0) / (before - by_chance)) ** 0.5
 
 
-def columns_of(
-    problem: Problem, runner: Runner, end: End, taken: Sequence[Assumption]
-) -> list[tuple[Assumption, Array]]:
+def columns_of(problem: Problem, runner: Runner, end: End, taken: Sequence[Variation]) -> list[tuple[Variation, Array]]:
     """What other values of known parameters, and faults of sensors that are not unknown, would add to the residuals, to first
     order: of one run a recording, with its derivatives. Nothing where a run fails."""
     if end.base.lost:
@@ -344,33 +341,33 @@ def assumption_notices(checked: Checked) -> list[str]:
         )
     if checked.untried:
         out.append(f"interrupted, so these were not tried: {', '.join(checked.untried)}; the same command tries them")
-    asked = sorted((c for c in checks if c.wanted), key=lambda c: -c.gain)
-    if asked:
-        best = asked[0]
-        rivals = [c.name for c in asked[1:] if c.gain > 0.5 * best.gain]
+    favoured = sorted((c for c in checks if c.suspected), key=lambda c: -c.gain)
+    if favoured:
+        best = favoured[0]
+        rivals = [c.name for c in favoured[1:] if c.gain > 0.5 * best.gain]
         label, move = best.most_moved
         text = f"the data contradict that {best.stated}: the sum of squares {best.falls}"
         if best.parameter:
-            text += f" with {best.parameter} = {best.value:.6g} ({best.asked:+.3g} {best.unit}, +- {best.asked_sd:.2g})"
+            text += f" with {best.parameter} = {best.value:.6g} ({best.favoured:+.3g} {best.unit}, +- {best.favoured_sd:.2g})"
         else:
             text += f" if {best.otherwise}"
             if best.kind in ("known", "sensor"):
-                text += f" ({best.asked:+.3g} {best.unit} fit best, +- {best.asked_sd:.2g})"
+                text += f" ({best.favoured:+.3g} {best.unit} fit best, +- {best.favoured_sd:.2g})"
         if best.kind in ("known", "sensor"):
-            move *= 1.0 if best.refitted else best.asked / best.amount
+            move *= 1.0 if best.refitted else best.favoured / best.amount
         if label:
             under = ", ".join(f"{name} = {value:.4g}" for name, value in list(best.under.items())[:UNDER])
             text += f"; {label} would move by {abs(move):.2g} standard deviations; estimates under it: {under}"
         out.append(text + (f"; so would it with others: {', '.join(rivals)}" if rivals else ""))
         out += [
             f"the data also favour another value than stated: {c.stated} (the sum of squares {c.falls})"
-            for c in asked[1:4]
+            for c in favoured[1:4]
             if c.gain <= 0.5 * best.gain and c.gain > 0.1 * best.gain
         ]
     for c in checks:
         if c.kind == "numerical" and c.unchecked:
             out.append(f"it could not be checked what it does that {c.stated}: {c.unchecked}")
-        elif c.kind == "numerical" and not c.wanted and c.asked_sd > MOVED:
+        elif c.kind == "numerical" and not c.suspected and c.favoured_sd > MOVED:
             label, move = c.most_moved
             if abs(move) > MOVED:
                 out.append(

@@ -6,7 +6,8 @@ a relative one either way.
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Literal, NamedTuple, Self, get_args
+from dataclasses import dataclass
+from typing import Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,7 +134,8 @@ class Sensor(Table):
         return out
 
 
-class Coordinate(NamedTuple):
+@dataclass(frozen=True)
+class Coordinate:
     """One entry of the vector: what it belongs to, its bounds and start in physical units, its scale, and its prior."""
 
     name: str

@@ -15,7 +15,7 @@ from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import Runner
 
 if TYPE_CHECKING:
-    from torchsoft.sysid.result import Answer
+    from torchsoft.sysid.result import IdentificationResult
 
 CHOSEN_ANEW = 1.0
 """Change of |r|^2 by steps that are chosen anew, in place of those of the optimum, above which these are too far off."""
@@ -49,7 +49,7 @@ class Optimum:
         self.square = float(self.at.r @ self.at.r)
 
     @classmethod
-    def of(cls, problem: Problem, answer: "Answer", workers: int = 1) -> Self:
+    def of(cls, problem: Problem, answer: "IdentificationResult", workers: int = 1) -> Self:
         """Where the identification of `problem` ended, with the noise that it found. Raises `ValueError` for another problem's
         answer, or one of a robust loss, which says nothing of a likelihood."""
         last, labels = answer.stages[-1], problem.coordinates.labels

@@ -90,7 +90,7 @@ class Posterior:
 
     @property
     def summary(self) -> PosteriorSummary:
-        """What an `Answer` holds of it."""
+        """What an `IdentificationResult` holds of it."""
         return PosteriorSummary(self.method, self.weights.size, self.marginals, self.checks, self.notices)
 
     def to_json(self) -> str:

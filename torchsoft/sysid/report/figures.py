@@ -15,7 +15,7 @@ from torchsoft.sysid.estimate import IDENTIFIABLE, ChannelResiduals, Direction, 
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.residual_tests import LAGS, autocorrelation
-from torchsoft.sysid.result import Answer
+from torchsoft.sysid.result import IdentificationResult
 from torchsoft.tables import plain
 
 SHOWN = {"m": ("mm", 1e3), "m/s": ("mm/s", 1e3)}
@@ -106,7 +106,7 @@ def estimates_figure(estimates: Sequence[Estimate]) -> Figure | None:
 
 
 @rc_context(STYLE)
-def correlation_figure(result: Answer) -> Figure:
+def correlation_figure(result: IdentificationResult) -> Figure:
     """The correlation matrix of the coordinates."""
     n, C = len(result.labels), np.array(result.correlation, float)
     figure = Figure(figsize=(WIDTH, max(2.2, 0.7 + 0.42 * n)), layout="constrained")
@@ -128,7 +128,7 @@ def correlation_figure(result: Answer) -> Figure:
 
 
 @rc_context(STYLE)
-def spectrum_figure(result: Answer) -> Figure:
+def spectrum_figure(result: IdentificationResult) -> Figure:
     """Standard deviation along each eigenvector of the Fisher matrix, its name above its bar; orange: not identifiable."""
     n = len(result.directions)
     figure = Figure(figsize=(WIDTH, 1.0 + 0.5 * n), layout="constrained")
@@ -157,7 +157,7 @@ def spectrum_figure(result: Answer) -> Figure:
 
 
 @rc_context(STYLE)
-def contributions_figure(result: Answer) -> Figure | None:
+def contributions_figure(result: IdentificationResult) -> Figure | None:
     """Weight of every recording, and of the priors, in what is identifiable; None where there is only one source."""
     labels = [e.label for e in result.estimates if e.identifiable and e.kind == "parameter"]
     sources = result.contributions

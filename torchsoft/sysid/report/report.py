@@ -10,11 +10,13 @@ from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.report import sections
 from torchsoft.sysid.report.figures import Trace
 from torchsoft.sysid.report.page import document, heading
-from torchsoft.sysid.result import Answer
+from torchsoft.sysid.result import IdentificationResult
 from torchsoft.sysid.runs import Runner
 
 
-def report(result: Answer, problem: Problem, path: str | Path, *, checkpoint: str | Path | None = None) -> None:
+def report(
+    result: IdentificationResult, problem: Problem, path: str | Path, *, checkpoint: str | Path | None = None
+) -> None:
     """Write the page about `result`, which `identify` found for `problem`. It appears whole or not at all.
 
     Every recording is simulated once more, unless the `checkpoint` folder has it. Raises `ValueError` where the result
@@ -27,7 +29,7 @@ def report(result: Answer, problem: Problem, path: str | Path, *, checkpoint: st
         partial.write_text(page(result, drawn, lost), encoding="utf-8")
 
 
-def traces(result: Answer, problem: Problem, journal: Path | None) -> tuple[list[Trace], dict[str, str]]:
+def traces(result: IdentificationResult, problem: Problem, journal: Path | None) -> tuple[list[Trace], dict[str, str]]:
     """Measured and predicted samples of every recording at the result, and why others could not be simulated."""
     if result.noise:
         problem = problem.with_noise({one.channel: one.model for one in result.noise})
@@ -51,7 +53,7 @@ def traces(result: Answer, problem: Problem, journal: Path | None) -> tuple[list
     return out, lost
 
 
-def page(result: Answer, drawn: list[Trace], lost: dict[str, str]) -> str:
+def page(result: IdentificationResult, drawn: list[Trace], lost: dict[str, str]) -> str:
     """The whole HTML text."""
     head = result.headline
     about = (

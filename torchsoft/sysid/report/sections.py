@@ -32,13 +32,13 @@ from torchsoft.sysid.report.page import (
     table,
     verbatim,
 )
-from torchsoft.sysid.result import Answer
+from torchsoft.sysid.result import IdentificationResult
 
 MOVED = 0.5
 """Standard deviations by which something that was taken for granted may move an estimate and still be folded away."""
 
 
-def summary(result: Answer) -> Iterator[str]:
+def summary(result: IdentificationResult) -> Iterator[str]:
     """What was fitted, and what a reader must know first."""
     fitted = ", ".join(one.name for one in result.recordings if one.fitted)
     yield paragraph(
@@ -58,7 +58,7 @@ def summary(result: Answer) -> Iterator[str]:
         yield paragraph("Converged, residuals white, steps fine enough: there is nothing to warn of.", "fine")
 
 
-def estimates(result: Answer) -> Iterator[str]:
+def estimates(result: IdentificationResult) -> Iterator[str]:
     """Parameters, those of single recordings, starts and sensors, apart from each other."""
     of = [e for e in result.estimates if e.kind == "parameter"]
     yield heading("Estimates")
@@ -118,7 +118,7 @@ def prior(e: Estimate) -> Cell:
     return "", f"{grouped(e.prior.median)} {sd}"
 
 
-def told(result: Answer) -> Iterator[str]:
+def told(result: IdentificationResult) -> Iterator[str]:
     """How much each recording told."""
     figure = contributions_figure(result)
     if figure is None:
@@ -142,7 +142,7 @@ def told(result: Answer) -> Iterator[str]:
     yield table(["parameter", *sources], rows)
 
 
-def identifiable(result: Answer) -> Iterator[str]:
+def identifiable(result: IdentificationResult) -> Iterator[str]:
     """Directions and correlations, in words first."""
     yield heading("What is identifiable, and what is not")
     weak = [direction_name(d) for d in result.directions if not d.identifiable]
@@ -164,7 +164,7 @@ def identifiable(result: Answer) -> Iterator[str]:
     yield paragraph(f"Strong correlations: {strong}.")
 
 
-def correlations(result: Answer) -> str:
+def correlations(result: IdentificationResult) -> str:
     """The strong ones, in words."""
     C, labels = result.correlation, result.labels
     strong = [
@@ -176,7 +176,7 @@ def correlations(result: Answer) -> str:
     return "; ".join(strong) or "none is beyond 0.7"
 
 
-def profiles(result: Answer) -> Iterator[str]:
+def profiles(result: IdentificationResult) -> Iterator[str]:
     """Profile likelihoods, if there are any."""
     if not result.profiles:
         return
@@ -193,7 +193,7 @@ def profiles(result: Answer) -> Iterator[str]:
     yield f'<div class="grid">{"".join(shown)}</div>'
 
 
-def taken_for_granted(result: Answer) -> Iterator[str]:
+def taken_for_granted(result: IdentificationResult) -> Iterator[str]:
     """What estimates hang on, and what the data say of it; the harmless ones are folded away."""
     if not result.assumptions:
         return
@@ -203,9 +203,9 @@ def taken_for_granted(result: Answer) -> Iterator[str]:
         one = result.assumptions[i]
         label = max(one.moves, key=lambda name: abs(one.moves[name]), default="")
         amount, measured = "", one.kind in ("known", "sensor")
-        if np.isfinite(one.asked_sd) and not one.unchecked:
+        if np.isfinite(one.favoured_sd) and not one.unchecked:
             by = one.unit if measured else "of that"
-            amount = f" {signed(one.asked)} ± {grouped(one.asked_sd, 2)} {by}".rstrip()
+            amount = f" {signed(one.favoured)} ± {grouped(one.favoured_sd, 2)} {by}".rstrip()
         asks: Cell = f"no:{amount}" if amount else "they cannot tell"
         if one.suspected:
             asks = "weak", f"yes{amount}: the sum of squares would fall by {one.gain:.0f}"
@@ -226,7 +226,7 @@ def taken_for_granted(result: Answer) -> Iterator[str]:
         yield folded(f"{len(rest)} that move nothing by more than {MOVED:g} standard deviations", table(head, rest))
 
 
-def laws(result: Answer) -> Iterator[str]:
+def laws(result: IdentificationResult) -> Iterator[str]:
     """Competing laws, if there are any."""
     compared = result.comparison
     if compared is None:
@@ -245,7 +245,7 @@ def laws(result: Answer) -> Iterator[str]:
         yield picture(plot(compared), "Where in the motion the evidence stands.", kind="broad")
 
 
-def data(result: Answer, drawn: Sequence[Trace], lost: dict[str, str]) -> Iterator[str]:
+def data(result: IdentificationResult, drawn: Sequence[Trace], lost: dict[str, str]) -> Iterator[str]:
     """Samples against predictions, residuals and their colour, held-out recordings."""
     within = {(one.recording, one.channel): one for one in result.residuals}
     noise = {one.channel: one.model for one in result.noise}
@@ -276,7 +276,7 @@ def data(result: Answer, drawn: Sequence[Trace], lost: dict[str, str]) -> Iterat
         yield f'<div class="grid">{shown}</div>'
 
 
-def cost(result: Answer) -> Iterator[str]:
+def cost(result: IdentificationResult) -> Iterator[str]:
     """Stages, and what they took."""
     rows = [
         [s["name"], ", ".join(s["free"]), f"{s['rtol']:g}", f"{s['evaluations']}", f"{s['chi2']:.4g}",
@@ -292,7 +292,7 @@ def cost(result: Answer) -> Iterator[str]:
     yield paragraph(f"{runs}; {result.cost['wall_s']:.1f} s in all.")
 
 
-def made(result: Answer, units: Mapping[str, str]) -> Iterator[str]:
+def made(result: IdentificationResult, units: Mapping[str, str]) -> Iterator[str]:
     """What was fitted to what, by what, and the command that repeats it."""
     yield heading("How it was made")
     rows = [
