@@ -11,8 +11,8 @@ import torchsoft
 ROOT = Path(torchsoft.__file__).parent
 FLOWS = {
     "": """
-        channels files threads tables csvfile quantity codegen physics paper cost solve scenario excitation processes plot
-        materials rigs sysid reduced datasets experiment cli __main__
+        channels diagnostic files threads tables csvfile quantity codegen physics paper cost solve scenario excitation processes
+        plot materials rigs sysid reduced datasets experiment cli __main__
     """,
     "codegen": "graph derivatives operations trace pointwise emit . invoke",
     "physics": """
@@ -27,7 +27,7 @@ FLOWS = {
         ledger simulate batch torchdiffeq .
     """,
     "sysid": """
-        initial_state recording unknowns prediction noise runs problem first_samples synthetic fit plan loops prechecks
+        initial_state recording unknowns prediction noise runs problem first_samples synthetic fit plan setpoints prechecks
         residual_tests assumptions sensitivity certainty estimate answer result identification laws files report design .
     """,
     "sysid.laws": "evidence compare .",

@@ -42,6 +42,9 @@ KNOWN = 1e-2
 FORCE = 0.5
 """Variation of forces that are fed forward [N]."""
 
+CLOCK = 1e-4
+"""Variation of the time at which set-points are given [s]."""
+
 SMALLER_RAMP = 0.1
 """Factor by which the depth epsilon of the touch-down ramp is made smaller."""
 
@@ -125,6 +128,8 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
     if any(isinstance(one, Sampled) for one in rig.reference.signals.values()):
         out.append(Variation("set-points", "numerical", "set-points are what a smooth curve through the recorded ones says",
                               "only every second one were known", vary=sparser))  # fmt: skip
+    out.append(Variation("clock of the set-points", "known", "set-points and sensors have one clock",
+                         "set-points came later", 1e3 * CLOCK, "ms", vary=lambda r: delayed(r, CLOCK)))  # fmt: skip
     if any(actuator.feed_forward is not None for actuator in rig.actuators.values()):
         out.append(Variation("feed-forward", "known", "what was fed forward is known", f"it were {FORCE} N more", FORCE, "N",
                               vary=lambda r: raised(r, FORCE)))  # fmt: skip
@@ -240,6 +245,17 @@ def sparser(recording: Recording) -> Recording:
     for name, one in recording.rig.reference.signals.items():
         if isinstance(one, Sampled) and len(one.times) > 3:
             signals[name.replace(":", ".")] = Sampled(one.times[::2], one.values[::2])
+    return with_reference(recording, **signals)
+
+
+def delayed(recording: Recording, by: float) -> Recording | None:
+    """Every signal later by a time [s]; None where a signal has no times."""
+    signals = {name.replace(":", "."): deepcopy(one) for name, one in recording.rig.reference.signals.items()}
+    for one in signals.values():
+        times = dict(one.named_buffers()).get("times")
+        if times is None:
+            return None
+        times += by
     return with_reference(recording, **signals)
 
 

@@ -15,7 +15,6 @@ from tqdm import tqdm
 
 from torchsoft.sysid.estimate import directions, estimates, nrmse, residual_channels
 from torchsoft.sysid.fit import Fit, Loss, Notify, Unreachable, chord, covariance, descend, fisher, gauss_newton
-from torchsoft.sysid.loops import accepted
 from torchsoft.sysid.plan import (
     FINER,
     STEP_BIAS,
@@ -28,7 +27,7 @@ from torchsoft.sysid.plan import (
     settle,
     stage_entry,
 )
-from torchsoft.sysid.prechecks import precheck
+from torchsoft.sysid.prechecks import accepted, precheck
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.residual_tests import (

@@ -1,4 +1,10 @@
-"""Comparison of recordings with the capability of their rig, before any fit: signs, units, set-points, delays, zeros."""
+"""Comparison of recordings with their rig, before any fit: set-points, control loops, signs and units.
+
+The law of an actuator is known. So a recording of its force and of the coordinate that it measures is held against it
+without a run: means over windows of time, which need no derivative of measured samples, agree within the noise of the
+sensors. Where they do not, one thing at a time is tried: the sign of the force, its unit, the body that the loop
+senses, the force that is fed forward. Other channels are held against a run with the parameters of the start.
+"""
 
 import math
 import warnings
@@ -7,161 +13,252 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from scipy.interpolate import CubicSpline
 
+from torchsoft.diagnostic import Diagnostic
 from torchsoft.paper.rig import SoftGrasp
-from torchsoft.physics.motion import Sampled, spline_rates
 from torchsoft.physics.parts import COORDINATES, Actuator
 from torchsoft.physics.rig import Rig
-from torchsoft.sysid.initial_state import PREFIX, AtRest
-from torchsoft.sysid.loops import Finding, another_sense, channel, confusions, loop_findings, together
+from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.plan import LOOSE
 from torchsoft.sysid.prediction import Prediction, Readout, Signals
 from torchsoft.sysid.problem import Problem
-from torchsoft.sysid.recording import REACH, Array, Recording
+from torchsoft.sysid.recording import BETWEEN, Array, Recording
 from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.setpoints import channel, found, setpoint_findings
 from torchsoft.sysid.unknowns import Sensor
-
-# Are recorded set-points close enough together for their motion, and are their rates theirs?
-
-
-NOTICED = 0.2
-"""Part of a sensor's noise from which what happens between rows is said: residuals would be off by it everywhere."""
-
-HOPELESS, ORDERLESS = 100.0, 1.0
-"""Times a sensor's noise by which the unknown between rows makes a fit worthless, if it does not even fall by this order where
-rows are closer."""
-
-ORDERS = (0.5, 4.0)
-"""Least and largest order that is believed; a cubic through exact values has the largest."""
-
-BETWEEN = (0.0, 0.25, 0.5, 0.75)
-"""Where between rows signals are compared."""
-
-OTHER_RATE = 0.25
-"""Part of a rate by which it may differ from that of the spline through the values, which must be sure to half of it."""
+from torchsoft.tables import shown
 
 
-class Gap(NamedTuple):
-    """What happens between rows: an error [SI], rms, in units of the noise of a channel, and the order with which it falls."""
-
-    channel: str
-    error: float
-    noises: float
-    order: float
-
-
-def cubic(signal: Sampled, every: int, derived: bool) -> Sampled:
-    """The signal by one in so many rows; rates that were `derived` from all rows are derived from these."""
-    rates = None if derived else signal.rates.detach()[::every]
-    return Sampled(signal.times[::every], signal.values.detach()[::every], rates)
-
-
-def is_derived(signal: Sampled) -> bool:
-    """Whether its rates are those of the spline through its values."""
-    own = spline_rates(signal.times, signal.values)
-    return bool(torch.allclose(own, signal.rates, rtol=1e-9, atol=1e-12))
-
-
-def extrapolated(by: Mapping[int, Tensor]) -> tuple[float, float]:
-    """RMS error of a quantity at every row, from those by every row, every second and every fourth; and the observed order."""
-    half, quarter = (float((by[2 * k] - by[k]).square().mean().sqrt()) for k in (1, 2))
-    order = float(np.clip(np.log2(max(quarter, 1e-300) / max(half, 1e-300)), *ORDERS))
-    return half / (2**order - 1), order
-
-
-def gaps(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> list[Gap]:
-    """What the rows of an actuator's set-point leave open, in the channels that have sensors."""
-    rig, out = recording.rig, []
-    actuator = rig.actuators[name]
-    signal = rig.reference[actuator.setpoint]
-    if not isinstance(signal, Sampled) or len(signal.times) < 9:
-        return []
-    feed = rig.reference[actuator.feed_forward] if actuator.feed_forward else None
-    t, derived = signal.times, is_derived(signal)
-    inside = torch.cat([t[:-1] + part * t.diff() for part in BETWEEN]).sort().values
-    inside = inside[inside <= t[4 * ((len(t) - 1) // 4)]]
-    x, v = signal(inside)
-    places, efforts = {}, {}
-    for every in (1, 2, 4):
-        places[every], rate = cubic(signal, every, derived)(inside)
-        efforts[every] = demanded(actuator, feed, every, inside, places[every], rate, x, v)
-    for own, by in ((channel(rig, actuator.measured), places), (channel(rig, name), efforts)):
-        if own in sensors and own in recording.samples:
-            error, order = extrapolated(by)
-            out.append(Gap(own, error, error / sensors[own].noise, order))
+def together(every: Sequence[Diagnostic]) -> list[Diagnostic]:
+    """One diagnostic of every code: the first, with the names of the other recordings."""
+    out: list[Diagnostic] = []
+    for code in dict.fromkeys(one.code for one in every):
+        first, *others = sorted((one for one in every if one.code == code), key=lambda one: one.severity)
+        names = ", ".join(f"`{name}`" for name in dict.fromkeys(one.where for one in others) if name != first.where)
+        out.append(first._replace(message=first.message + (f"; so it is in {names}" if names else "")))
     return out
 
 
-@torch.no_grad()
-def demanded(
-    actuator: Actuator, feed: nn.Module | None, every: int, t: Tensor, place: Tensor, rate: Tensor, x: Tensor, v: Tensor
-) -> Tensor:
-    """What the controller makes (n,) of a set-point while its coordinate is at x and moves at v."""
-    known = cubic(feed, every, is_derived(feed)) if isinstance(feed, Sampled) else feed
-    more = torch.zeros_like(x) if known is None else known(t)[0]
-    return actuator(torch.stack((place, rate, more, x, v), -1))
-
-
-def setpoint_findings(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Finding]:
-    """What looks wrong with the set-points of a recording. Of laws of several coordinates only rates are judged here: that
-    they are too sparse shows when every second one is left out (`checks`)."""
-    rig = recording.rig
-    recorded = {n for one in rig.actuators.values() for n in one.setpoints if isinstance(rig.reference[n], Sampled)}
-    findings = {name: other_rate(recording, name) for name in sorted(recorded)}
-    yield from (one for one in findings.values() if one is not None)
-    for name, actuator in rig.loops.items():
-        if actuator.setpoint in recorded and findings[actuator.setpoint] is None:
-            sparse = sparse_finding(recording, sensors, name)
-            if sparse is not None:
-                yield sparse
-
-
-def sparse_finding(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> Finding | None:
-    """The words on set-points that are too far apart."""
-    found = gaps(recording, sensors, name)
-    if not found or (worst := max(found, key=lambda gap: gap.noises)).noises <= NOTICED:
-        return None
-    setpoint = recording.rig.actuators[name].setpoint
-    signal = recording.rig.reference[setpoint]
-    assert isinstance(signal, Sampled)
-    apart = float(signal.times.diff().max())
-    enough = apart * (NOTICED / worst.noises) ** (1 / worst.order)
-    rates = f", and its rate is not known (no column {setpoint}_dot)" if is_derived(signal) else ""
-    if worst.order <= ORDERS[0] and not is_derived(signal):  # closer rows would not help
-        text = (
-            f"recording `{recording.name}`: values and rates of {setpoint} disagree however close the rows are, by "
-            f"{worst.noises:.2g} times the noise of {worst.channel}: is a clock, or a unit of time, a little off?"
+def accepted(every: Sequence[Diagnostic], acknowledged: Sequence[str]) -> list[str]:
+    """Messages of warnings, and of errors that are acknowledged. Raises `ValueError` for other errors, and for a code
+    that was acknowledged and not found."""
+    codes = dict.fromkeys(one.code for one in every)
+    if strange := [code for code in acknowledged if code not in codes]:
+        there = f"what was found is {', '.join(codes)}" if codes else "nothing looks wrong"
+        raise ValueError(
+            f"acknowledged: nothing was found that is called {shown(strange[0])}, so leave it out; {there}"
         )
-        return Finding(f"rate of {setpoint}", recording.name, text, worst.noises > HOPELESS)
-    size = f"{worst.error:.2g} {recording.units[worst.channel]}, {worst.noises:.2g} times the noise of {worst.channel}"
-    text = (
-        f"recording `{recording.name}`: set-points {setpoint} every {1e3 * apart:.3g} ms are too sparse for this motion"
-        f"{rates}: what they leave open between them makes {size}; give them every {1e3 * enough:.2g} ms"
-    )
-    return Finding(f"set-points {setpoint}", recording.name, text, worst.noises > HOPELESS and worst.order <= ORDERLESS)
+    for one in every:
+        if one.severity == "error" and one.code not in acknowledged:
+            raise ValueError(f'{one.message}; if it is so, say acknowledged = ["{one.code}"]')
+    return [f"{one.message} (acknowledged)" if one.code in acknowledged else one.message for one in every]
 
 
-def other_rate(recording: Recording, setpoint: str) -> Finding | None:
-    """The words on rates that are not those of the values."""
-    signal = recording.rig.reference[setpoint]
-    assert isinstance(signal, Sampled)
-    times, values = signal.times, signal.values.detach()
-    given, own = signal.rates.detach().numpy(), spline_rates(times, values).numpy()
-    fewer = spline_rates(times[::2], values[::2]).numpy()
-    size, off, unsure = (float(np.sqrt(np.mean(e**2))) for e in (own, given - own, fewer - own[::2]))
-    if off <= OTHER_RATE * max(size, float(np.sqrt(np.mean(given**2)))) or unsure > OTHER_RATE / 2 * size:
+MISTAKEN = {
+    "rad": {180 / math.pi: ("degrees", "radians"), 1e3: ("milliradians", "radians")},
+    "m": {1e2: ("centimetres", "metres"), 1e3: ("millimetres", "metres"), 1e6: ("micrometres", "metres")},
+    "N": {1e3: ("millinewtons", "newtons"), 1 / 9.81: ("kilograms", "newtons")},
+}
+"""What makes values of a dimension too large by a factor when it is taken for the other."""
+
+
+def confusions(unit: str) -> list[tuple[float, str]]:
+    """Factors by which a channel in `unit` may be too large, with the units that were confused."""
+    known = MISTAKEN.get(unit.removesuffix("/s"), {})
+    over = [(factor, f"{a} taken for {b}") for factor, (a, b) in known.items()]
+    return over + [(1 / factor, f"{b} taken for {a}") for factor, (a, b) in known.items()]
+
+
+class Signal(NamedTuple):
+    """A channel's samples: times (k,) [s], values (k,), and the sensor."""
+
+    channel: str
+    t: Array
+    y: Array
+    sensor: Sensor
+
+    @property
+    def spacing(self) -> float:
+        return float(np.median(np.diff(self.t)))
+
+    @property
+    def faulty(self) -> bool:
+        """Whether a fault of the sensor is declared that a fit will estimate."""
+        one = self.sensor
+        return any((one.bias, one.delay, one.gain, one.drift))
+
+
+def sampled(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> Signal | None:
+    """The samples of a coordinate or a force whose sensor sees nothing else and is never saturated, or None."""
+    own = channel(recording.rig, name)
+    if own not in recording.samples or own not in sensors:
         return None
-    factor = float(given @ own) / max(float(own @ own), 1e-300)
-    looks = "its sign looks opposite" if factor < 0 else f"it is {factor:.3g} times that"
-    text = (
-        f"recording `{recording.name}`: {setpoint}_dot is not the rate of {setpoint}: it differs by {off:.3g} rms from that "
-        f"of a spline through it, {size:.3g}; {looks}"
+    one, (t, y) = sensors[own], recording.samples[own]
+    clean = one.inertia == 0 and one.misalignment == 0 and not one.saturated(y).any() and len(t) > 3
+    return Signal(own, t, y, one) if clean else None
+
+
+WINDOW = 20e-3
+"""Length [s] of a window, or four samples where that is longer."""
+
+FEWEST = 8
+"""Windows without which nothing is said."""
+
+ROUGH = 0.03
+"""Part of the force by which both sides of a loop may differ besides the noise: drives are not exact."""
+
+EXPLAINED = 0.15
+"""Part of a disagreement, and of the force, that may be left by its explanation."""
+
+SLOW = 0.3
+"""Part of a disagreement by which it may change from window to window where a force fed forward is missing."""
+
+
+class Loop(NamedTuple):
+    """Both sides of a loop as means over n windows: the measured force F (n,), and `given` (n,) by the actuator of its
+    setpoint, the setpoint's rate, the force fed forward, the coordinate and its rate, which are `inputs` (n, 5)."""
+
+    actuator: Actuator
+    F: Array
+    inputs: Array
+    signals: tuple[Signal, Signal]
+    width: Array
+
+    def given(self, feed_forward: float = 1.0) -> Array:
+        """The effort (n,) of the actuator, with the force fed forward times a factor."""
+        inputs = torch.from_numpy(self.inputs * [1.0, 1.0, feed_forward, 1.0, 1.0])
+        return self.actuator(inputs).detach().numpy()
+
+    @property
+    def noise(self) -> tuple[float, float]:
+        """Standard deviation [N] of a mean of the disagreement by white noise, and by noise that outlasts a window."""
+        inputs = torch.from_numpy(self.inputs).requires_grad_(True)
+        (slope,) = torch.autograd.grad(self.actuator(inputs).sum(), inputs)
+        by_x, by_v, (F, x) = slope[:, 3].numpy(), slope[:, 4].numpy(), self.signals
+        parts = [(one.spacing / self.width, 1.0) for one in (F, x)]
+        white, lasting = (
+            float(
+                np.sqrt(
+                    np.mean(F.sensor.noise**2 * f + x.sensor.noise**2 * (by_x**2 * c + 2 * by_v**2 / self.width**2))
+                )
+            )
+            for f, c in zip(*parts)
+        )
+        return white, lasting
+
+
+def windows(recording: Recording, actuator: Actuator, F: Signal | None, x: Signal | None) -> Loop | None:
+    """The loop of two signals over windows that both have samples in; None where there are too few of them."""
+    if F is None or x is None:
+        return None
+    length = max(WINDOW, 4 * F.spacing, 4 * x.spacing)
+    first, last = max(F.t[0], x.t[0]), min(F.t[-1], x.t[-1])
+    edges = first + length * np.arange(int((last - first) / length) + 1)
+    if len(edges) <= FEWEST:
+        return None
+    keep = np.logical_and.reduce([np.diff(np.searchsorted(s.t, edges)) * s.spacing > 0.5 * length for s in (F, x)])
+    width, t = np.diff(edges)[keep], np.arange(first, last + BETWEEN, BETWEEN)
+    names = [actuator.setpoint, *([actuator.feed_forward] if actuator.feed_forward else [])]
+    reference = recording.rig.reference(torch.from_numpy(t), names).detach().numpy()[..., 0]
+    setpoint, measured = CubicSpline(t, reference[:, 0]), CubicSpline(x.t, x.y)
+    feed = CubicSpline(t, reference[:, 1] if actuator.feed_forward else np.zeros(len(t)))
+    integrals = (setpoint.antiderivative(), setpoint, feed.antiderivative(), measured.antiderivative(), measured)
+    inputs = np.stack([np.diff(one(edges))[keep] / width for one in integrals], -1)
+    force = np.diff(CubicSpline(F.t, F.y).antiderivative()(edges))[keep] / width
+    return Loop(actuator, force, inputs, (F, x), width) if keep.sum() >= FEWEST else None
+
+
+class Change(NamedTuple):
+    """One thing that may be otherwise: its code, a clause, the disagreement (n,) [N] that is left, and whether it is
+    grave."""
+
+    code: str
+    clause: str
+    left: Array
+    grave: bool = True
+
+
+def rms(e: Array) -> float:
+    return float(np.sqrt(np.mean(e**2)))
+
+
+def loop_findings(
+    recording: Recording, sensors: Mapping[str, Sensor], unknown: Collection[str] = ()
+) -> Iterator[Diagnostic]:
+    """Diagnostics on the control loops of a recording whose force and coordinate were measured; `unknown` are the names
+    of unknown parameters."""
+    rig = recording.rig
+    tensors = {id(rig.parameter(name)) for name in unknown}
+    for name, actuator in rig.loops.items():
+        F = sampled(recording, sensors, name)
+        loop = windows(recording, actuator, F, sampled(recording, sensors, actuator.measured))
+        if loop is None:
+            continue
+        body, _, axis = actuator.measured.partition(".")
+        rivals = {}
+        for other in (one for one in rig.bodies if one != body):
+            rival = windows(recording, actuator, F, sampled(recording, sensors, f"{other}.{axis}"))
+            rivals |= {other: rival} if rival is not None else {}
+        free = any(id(p) in tensors for p in actuator.parameters())
+        change = disagreement(rig, loop, body, rivals, free)
+        if change is not None:
+            e, (F, x) = rms(loop.F - loop.given()), loop.signals
+            text = (
+                f"{change.clause} (what the controller makes of {actuator.setpoint} and {x.channel} differs from {F.channel} "
+                f"by {e:.3g} {actuator.effort_unit} rms, and would by {rms(change.left):.3g})"
+            )
+            yield found(change.code, recording, text, change.grave)
+
+
+def disagreement(rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop], free: bool) -> Change | None:
+    """The cause of a disagreement of a loop about a body, if there is one; gains that are `free` may all be larger or
+    smaller."""
+
+    def left(one: Loop, F: Array, feed_forward: float = 1.0) -> Array:
+        given = one.given(feed_forward)
+        gain = max(float(F @ given) / max(float(given @ given), 1e-300), 0.0) if free else 1.0
+        return F - gain * given
+
+    F, name, unit, feed = loop.F, loop.signals[0].channel, loop.actuator.effort_unit, loop.actuator.feed_forward
+    e = left(loop, F)
+    white, lasting = (2 * sd + ROUGH * rms(F) for sd in loop.noise)
+    if rms(e) <= white:
+        return None
+    opposite = "looks as if its sign were opposite"
+    changes = [Change(f"sign of {name}", f"{name} {opposite}", left(loop, -F))]
+    changes += [another_sense(rig, loop.actuator, body, other, left(its, its.F)) for other, its in rivals.items()]
+    if not free:
+        changes += [
+            Change(f"unit of {name}", f"{name} looks as if it were in another unit: {words}", left(loop, F / factor))
+            for factor, words in confusions(unit)
+        ]
+        changes += [Change(f"sign of {feed}", f"{feed} {opposite}", left(loop, F, -1.0))] if feed else []
+    best = min(changes, key=lambda change: rms(change.left))
+    enough = 0.5 * rms(F) if free else max(white, EXPLAINED * min(rms(e), rms(F)))
+    if rms(best.left) <= enough and rms(best.left) < 0.5 * rms(e):
+        return best
+    faulty = any(one.faulty for one in loop.signals)
+    if free or faulty or rms(e) <= (white if feed and not loop.inputs[:, 2].any() else lasting):
+        return None
+    slow, began = np.diff(e) / np.sqrt(2), float(e[: max(2, len(e) // 20)].mean())
+    if feed and rms(slow) <= max(SLOW * rms(e), white) and abs(began) <= 0.5 * rms(e):
+        words = f"{name} is {float(e.mean()):+.3g} {unit} more, on the average, than the controller gives"
+        return Change(feed, f"{words}: was a force fed forward that {feed} does not have?", slow, grave=False)
+    words = f"{name} is not what the controller gives: are its gains, units, zeros, times and set-points right?"
+    return Change(f"loop of {name}", words, e, grave=False)
+
+
+def another_sense(rig: Rig, actuator: Actuator, body: str, other: str, left: Array) -> Change:
+    """The set-point is that of another body."""
+    axis = actuator.measured.partition(".")[2]
+    paper = isinstance(rig, SoftGrasp) and axis == "x"
+    remedy = f' (say control.senses = "{other}")' if paper else ""
+    clause = (
+        f"{actuator.setpoint} looks like the set-point of the {other}, not of the {body}{remedy}; or are "
+        f"{channel(rig, f'{body}.{axis}')} and {channel(rig, f'{other}.{axis}')} exchanged?"
     )
-    return Finding(f"rate of {setpoint}", recording.name, text, grave=True)
-
-
-# Do recordings mean what the model takes them to mean? Looked at before a fit, which would give wrong numbers without a word.
+    return Change("control.senses" if paper else f"what {actuator.setpoint} is of", clause, left)
 
 
 MOVES = 5.0
@@ -176,26 +273,17 @@ LARGER = 8.0
 NEAR = math.log(4.0)
 """How near such a factor must be to one of mistaken units, in its logarithm."""
 
-LATE = 40e-3
-"""Delay [s] from which wrong parameters do not explain it."""
+SAME, APART = 0.1, 0.3
+"""Part of its motion by which a coordinate that follows a set-point may differ from it, and by which another one
+differs."""
 
-SAME = 0.1
-"""Part of its motion by which what follows a set-point may differ from it."""
-
-APART = 0.3
-"""And by which what does not follow it differs."""
-
-EARLY = 10e-3
-"""Time [s] from the first sample on in which nothing moves that begins at rest."""
-
-SURE, COLOURED = 5.0, 3.5
-"""Standard deviations from which a mean is called different: those of a mean, and those of one sample, which a mean of
-coloured noise may have."""
+Expected = Mapping[str, tuple[Readout, Signals]]
+"""The sensors of a run, with its signals."""
 
 
-def precheck(problem: Problem, runner: Runner, which: Sequence[str] | None = None) -> list[Finding]:
-    """What looks wrong in some recordings of a problem, or in all: one finding of every kind."""
-    found, x = list[Finding](), problem.coordinates.start
+def precheck(problem: Problem, runner: Runner, which: Sequence[str] | None = None) -> list[Diagnostic]:
+    """Diagnostics on some recordings of a problem, or on all: one of every code."""
+    every, x = list[Diagnostic](), problem.coordinates.start
     which = problem.names if which is None else which
     unknown = [name for name in problem.coordinates.names if not name.startswith(PREFIX)]
     jobs = problem.jobs(x, which, LOOSE, None)
@@ -207,176 +295,95 @@ def precheck(problem: Problem, runner: Runner, which: Sequence[str] | None = Non
         if isinstance(got, Prediction):
             signals = Signals(got.t, recording.channels, got.signals, None)
             expected = {name: (one, signals) for name, one in problem.readouts(x, job.recording).items()}
-        found += findings(recording, problem.sensors, expected, unknown)
-    return together(found)
-
-
-Expected = Mapping[str, tuple[Readout, Signals]]
-"""The sensors of a run, with its signals."""
+        every += findings(recording, problem.sensors, expected, unknown)
+    return together(every)
 
 
 def findings(
     recording: Recording, sensors: Mapping[str, Sensor], expected: Expected, unknown: Collection[str] = ()
-) -> list[Finding]:
-    """What looks wrong in one recording, which is expected to look as in a run from the start, if there is one; `unknown` are
-    the parameters whose values are not known. Nothing is held against the run where something grave is found without it."""
-    found = [*setpoint_findings(recording, sensors), *loop_findings(recording, sensors, unknown)]
-    if not any(one.grave for one in found):
-        found += another_body(recording, sensors, expected)
-    if any(one.grave for one in found):
-        return found
-    blamed = {one.what for one in found}
-    return found + [one for one in against_run(recording, sensors, expected) if one.what not in blamed]
+) -> list[Diagnostic]:
+    """Diagnostics on one recording, beside a run from the start, if there is one; `unknown` are the names of unknown
+    parameters. A recording with an error is not held against the run."""
+    every = [*setpoint_findings(recording, sensors), *loop_findings(recording, sensors, unknown)]
+    if not any(one.severity == "error" for one in every):
+        every += another_body(recording, sensors, expected)
+    if any(one.severity == "error" for one in every):
+        return every
+    codes = {one.code for one in every}
+    return every + [one for one in against_run(recording, sensors, expected) if one.code not in codes]
 
 
-def samples(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> tuple[Array, Array]:
+def unsaturated(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> tuple[Array, Array]:
     """Times and values of a channel, without those that are saturated."""
     t, y = recording.samples[name]
     inside = ~sensors[name].saturated(y)
     return t[inside], y[inside]
 
 
-def against_run(recording: Recording, sensors: Mapping[str, Sensor], expected: Expected) -> Iterator[Finding]:
-    """Signs, units, delays and zeros of channels that cannot be what the run has."""
-    early = {}
+def against_run(recording: Recording, sensors: Mapping[str, Sensor], expected: Expected) -> Iterator[Diagnostic]:
+    """Signs and units of channels that cannot be those of the run."""
     for name, (one, signals) in expected.items():
-        t, y = samples(recording, sensors, name)
+        (t, y), noise = unsaturated(recording, sensors, name), sensors[name].noise
         if len(t) < 2 * MOVES:
             continue
-        p, _, _ = one.expected(signals, t)
-        if (said := shape(name, recording.units[name], t, y, p, sensors[name], one, signals)) is None:
-            early[name] = (y - p)[t <= t[0] + EARLY]
-        else:
-            what, words, grave = said
-            yield Finding(what, recording.name, f"recording `{recording.name}`: {words}", grave)
-    if isinstance(recording.start, AtRest):
-        yield from zeros(recording, sensors, early)
-
-
-def shape(
-    name: str, unit: str, t: Array, y: Array, p: Array, sensor: Sensor, one: Readout, signals: Signals
-) -> tuple[str, str, bool] | None:
-    """What is wrong with a channel's motion, if anything is: what, words, and whether that is grave."""
-    measured, run = float(np.std(y)), float(np.std(p))
-    if max(measured, run) < MOVES * sensor.noise:
-        return None
-    ratio = measured / max(run, 1e-300)
-    if not 1 / LARGER < ratio < LARGER and run > 0:
-        words = f"{name} moves {ratio:.3g} times as much as in a run with the parameters of the start"
-        known = [(abs(math.log(ratio / factor)), said) for factor, said in confusions(unit)]
-        distance, said = min(known, default=(math.inf, ""))
-        if distance < NEAR and not 1 / LARGER**1.5 < ratio < LARGER**1.5:
-            return f"unit of {name}", f"{words}: {said}?", True
-        return f"size of {name}", f"{words}: is its unit right, and are these parameters?", False
-    if min(measured, run) < MOVES * sensor.noise:
-        return None
-    correlation = alike(y, p)
-    if correlation < OPPOSITE:
-        words = (
-            f"{name} looks as if its sign were opposite: its correlation with a run from the start is {correlation:.2f}"
-        )
-        return f"sign of {name}", words, True
-    shifts = np.linspace(-REACH, REACH, 41)
-    inside = (t - REACH >= signals.t[0]) & (t + REACH <= signals.t[-1])
-    if inside.sum() < 2 * MOVES:
-        return None
-    by = [alike(y[inside], one.expected(signals, t[inside] - late)[0]) for late in shifts]
-    late = float(shifts[int(np.argmax(by))])
-    if abs(late) >= LATE + sensor.delay and 1 - max(by) < 0.2 * (1 - alike(y[inside], p[inside])):
-        side = "late" if late > 0 else "early"
-        words = f"{name} is about {1e3 * abs(late):.0f} ms {side}: are its times counted from the same beginning?"
-        return f"time of {name}", words, False
-    return None
-
-
-def alike(y: Array, p: Array) -> float:
-    """Correlation [1]."""
-    size = float(np.std(y) * np.std(p))
-    return float(np.mean((y - y.mean()) * (p - p.mean()))) / size if size > 0 else 0.0
-
-
-def zeros(recording: Recording, sensors: Mapping[str, Sensor], early: Mapping[str, Array]) -> Iterator[Finding]:
-    """Of the coordinates that controllers hold at their set-points in the beginning, and of the disc's angle: it rolls into the
-    dent that it makes, so that its angle and its place belong together."""
-    rig = recording.rig
-    for actuator in rig.loops.values():
-        name = channel(rig, actuator.measured)
-        if name not in early or actuator.measured != actuator.pushes:
+        p = one.expected(signals, t)[0]
+        measured, run = float(np.std(y)), float(np.std(p))
+        if max(measured, run) < MOVES * noise:
             continue
-        sensor, mean, count = sensors[name], float(early[name].mean()), len(early[name])
-        if abs(mean) > surely(sensor, count) + sensor.bias:
-            words = f"{name} begins {mean:+.3g} {recording.units[name]} from {actuator.setpoint}: do both have the same zero?"
-            yield Finding(f"zero of {name}", recording.name, f"recording `{recording.name}`: {words}")
-    if isinstance(rig, SoftGrasp) and {"x_C", "theta"} <= early.keys():
-        R, (x, theta) = rig.settings.disc.radius, (sensors[name] for name in ("x_C", "theta"))
-        off = float(early["theta"].mean() + early["x_C"].mean() / R)
-        sure = math.hypot(surely(theta, len(early["theta"])), surely(x, len(early["x_C"])) / R)
-        if abs(off) > sure + theta.bias + x.bias / R:
-            words = (
-                f"theta begins {off:+.3g} rad from where the disc would have it that has rolled to its x_C: is zero its "
-                "angle as it is put down at scenario.x_C0, and is that its x?"
-            )
-            yield Finding("zero of theta", recording.name, f"recording `{recording.name}`: {words}")
+        ratio = measured / max(run, 1e-300)
+        if not 1 / LARGER < ratio < LARGER and run > 0:
+            text = f"{name} moves {ratio:.3g} times as much as in a run with the parameters of the start"
+            known = [(abs(math.log(ratio / factor)), said) for factor, said in confusions(recording.units[name])]
+            distance, said = min(known, default=(math.inf, ""))
+            if distance < NEAR and not 1 / LARGER**1.5 < ratio < LARGER**1.5:
+                yield found(f"unit of {name}", recording, f"{text}: {said}?", grave=True)
+            else:
+                yield found(f"size of {name}", recording, f"{text}: is its unit right, and are these parameters?")
+        elif min(measured, run) >= MOVES * noise:
+            alike = float(np.mean((y - y.mean()) * (p - p.mean()))) / (measured * run)
+            if alike < OPPOSITE:
+                text = f"{name} looks as if its sign were opposite: its correlation with a run from the start is {alike:.2f}"
+                yield found(f"sign of {name}", recording, text, grave=True)
 
 
-def surely(sensor: Sensor, count: int) -> float:
-    """What a mean of so many samples is by noise at most, be it coloured."""
-    return sensor.noise * max(SURE / math.sqrt(count), COLOURED)
-
-
-def another_body(recording: Recording, sensors: Mapping[str, Sensor], expected: Expected) -> Iterator[Finding]:
-    """A set-point that another body follows than the one whose coordinate the loop is taken to measure; or that this one
-    does not follow, as it does in the run."""
+def another_body(recording: Recording, sensors: Mapping[str, Sensor], expected: Expected) -> Iterator[Diagnostic]:
+    """A set-point that another body follows than the one whose coordinate the loop is taken to measure; or that this
+    one does not follow, as it does in the run."""
     rig = recording.rig
+    movable = {f"{body}.{COORDINATES[axis]}" for body, axes in rig.layout.free.items() for axis in axes}
     for actuator in rig.loops.values():
         body, _, axis = actuator.measured.partition(".")
-        own, asked = channel(rig, actuator.measured), actuator.setpoint
-        mine, run = off(recording, sensors, asked, own), off_in_run(recording, sensors, asked, own, expected)
-        others = [name for name in rig.bodies if name != body and f"{name}.{axis}" in movable(rig)]
+        own, setpoint = channel(rig, actuator.measured), actuator.setpoint
+        mine, run = (apart(recording, sensors, setpoint, own, by) for by in (None, expected))
+        others = [name for name in rig.bodies if name != body and f"{name}.{axis}" in movable]
         for other in others:
             its = channel(rig, f"{other}.{axis}")
-            far, there = off(recording, sensors, asked, its), off_in_run(recording, sensors, asked, its, expected)
-            if below(far, SAME) and not below(mine, APART) and not below(there, APART):
+            far, there = (apart(recording, sensors, setpoint, its, by) for by in (None, expected))
+            if far is not None and far < SAME and not small(mine) and not small(there):
                 said = f"{its} follows it to {far:.1%} of its motion"
             elif mine is not None and mine > APART and far is None and (run is None or run < SAME) and len(others) == 1:
                 said = f"{own} does not follow it, and differs by {mine:.0%} of its motion"
             else:
                 continue
             change = another_sense(rig, actuator, body, other, np.zeros(1))
-            yield Finding(
-                change.what, recording.name, f"recording `{recording.name}`: {change.said} ({said})", grave=True
-            )
+            yield found(change.code, recording, f"{change.clause} ({said})", grave=True)
 
 
-def below(part: float | None, limit: float) -> bool:
-    """Whether something is known, and below a limit."""
-    return part is not None and part < limit
+def small(part: float | None) -> bool:
+    return part is not None and part < APART
 
 
-def movable(rig: Rig) -> list[str]:
-    """Coordinates that are free, such as "disc.x"."""
-    return [f"{body}.{COORDINATES[axis]}" for body, axes in rig.layout.free.items() for axis in axes]
-
-
-def off(recording: Recording, sensors: Mapping[str, Sensor], setpoint: str, name: str) -> float | None:
-    """How far a channel is from a set-point, over how far that moves; None without samples, or where it hardly moves."""
-    if name not in recording.samples or name not in sensors:
-        return None
-    t, y = samples(recording, sensors, name)
-    return parted(recording, setpoint, t, y, sensors[name].noise)
-
-
-def off_in_run(
-    recording: Recording, sensors: Mapping[str, Sensor], setpoint: str, name: str, expected: Expected
+def apart(
+    recording: Recording, sensors: Mapping[str, Sensor], setpoint: str, name: str, expected: Expected | None
 ) -> float | None:
-    """The same of the run from the start."""
-    if name not in expected:
+    """Distance of a channel, as it is measured or expected, from a set-point, over the motion of that; None without
+    samples, or where it hardly moves."""
+    if name not in (recording.samples.keys() & sensors.keys() if expected is None else expected):
         return None
-    (one, signals), (t, _) = expected[name], samples(recording, sensors, name)
-    return parted(recording, setpoint, t, one.expected(signals, t)[0], sensors[name].noise)
-
-
-def parted(recording: Recording, setpoint: str, t: Array, y: Array, noise: float) -> float | None:
+    t, y = unsaturated(recording, sensors, name)
+    if expected is not None:
+        one, signals = expected[name]
+        y = one.expected(signals, t)[0]
     asked = recording.rig.reference(torch.from_numpy(t), [setpoint]).detach().numpy()[:, 0, 0]
     moved = float(np.std(asked))
-    return float(np.std(asked - y)) / moved if moved > MOVES * noise else None
+    return float(np.std(asked - y)) / moved if moved > MOVES * sensors[name].noise else None
