@@ -1,22 +1,42 @@
-"""The README's Python, run as it stands but for a shorter manipulation."""
+"""Python of the README and of every page of the documentation, run as it stands but for a shorter manipulation; links exist."""
 
 import re
 from pathlib import Path
 
 import pytest
 
-README = Path(__file__).parents[1] / "README.md"
-SHORTER = {"torch.linspace(0, 30, 3001": "torch.linspace(0, 0.5, 51", 'theta"][1000]': 'theta"][50]'}
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+LINKED = [*PAGES, *(ROOT / folder / "README.md" for folder in ("experiments", "experiments/validation", "data_gen"))]
+SHORTER = {"torch.linspace(0, 30, 3001": "torch.linspace(0, 0.5, 101", 'theta"][1000]': 'theta"][50]'}
+LONGEST = 150
+"""Lines of the README."""
 
 
-def test_the_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    code = "\n".join(re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL))
+def code(page: Path) -> str:
+    blocks = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    text = "\n".join(blocks)
     for long, short in SHORTER.items():
-        assert long in code
-        code = code.replace(long, short)
-    (tmp_path / "rigs").symlink_to(README.parent / "rigs")
+        text = text.replace(long, short)
+    return text
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if code(page)], ids=lambda page: page.stem)
+def test_the_examples_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "rigs").symlink_to(ROOT / "rigs")
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
-    exec(code, names)
-    assert names["s"].sensitivities.shape == (51, 10, 2)  # pyright: ignore[reportAttributeAccessIssue]
-    assert (tmp_path / "rolling.nc").stat().st_size > 0
+    exec(code(page), names)
+    if page.stem == "running":
+        assert names["s"].sensitivities.shape == (101, 10, 2)  # pyright: ignore[reportAttributeAccessIssue]
+        assert (tmp_path / "rolling.nc").stat().st_size > 0
+
+
+@pytest.mark.parametrize("page", LINKED, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8")):
+        assert target.startswith("http") or (page.parent / target).exists(), target
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= LONGEST
