@@ -3,10 +3,10 @@
 Two pairs of laws: friction that falls smoothly with the speed of slip or Coulomb's with one coefficient; rubber of
 Kelvin and Voigt, or in series with a spring (the standard linear solid). Truths are drawn about the nominal
 parameters, each law by turns; both laws are fitted to the noisy recording, from the nominal parameters, with 2 to 4
-unknowns, and `torchsoft.sysid.laws.compare` judges. Three motions show the difference, two hardly do with sensors 4 and 5
+unknowns, and `torchsoft.sysid.compare` judges. Three motions show the difference, two hardly do with sensors 4 and 5
 times worse, and two do not: gentle rolling without slip, and a slow roll with sensors 10 times worse. Whether data
 can tell is measured without their noise: the wrong law is fitted to the exact recording, and what it leaves is D
-times the noise of one sample. By the rule (`torchsoft.sysid.answer.comparison`) the right law should be named in more than
+times the noise of one sample. By the rule (`torchsoft.sysid.comparison`) the right law should be named in more than
 95 % of cases from D = 7.3 on, and a wrong one in no more than 0.06 %, whatever D.
 
 Coulomb's law has one coefficient here: with two, efforts jump where slip begins and gradients are biased. The smooth
@@ -32,9 +32,8 @@ from torchsoft import Coulomb, Parameters, Reference, SoftGrasp, StandardLinearS
 from torchsoft.excitation import Excitation, MultiSine, Press, Roll, Strokes
 from torchsoft.experiment import COARSE, markdown, options, raw_config, timed, write
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, Unknown, record
-from torchsoft.sysid.answer.comparison import Comparison
-from torchsoft.sysid.laws.compare import compare, fitted
-from torchsoft.sysid.laws.evidence import Evidence, FittedLaw
+from torchsoft.sysid.compare import Evidence, FittedLaw, compare, fitted
+from torchsoft.sysid.comparison import Comparison
 from torchsoft.sysid.runs import Runner
 from torchsoft.threads import parallel_map
 

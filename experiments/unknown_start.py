@@ -43,8 +43,8 @@ from torchsoft.sysid import (
     estimate_initial_state,
     identify,
 )
-from torchsoft.sysid.files.measured import load
 from torchsoft.sysid.fit import fisher
+from torchsoft.sysid.measured import load
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import Runner
 from torchsoft.threads import parallel_map

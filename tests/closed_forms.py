@@ -5,9 +5,9 @@ from typing import Any
 
 import numpy as np
 
-from torchsoft.sysid.certainty.optimum import Optimum
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.problem import Residuals
+from torchsoft.sysid.profile import Optimum
 from torchsoft.sysid.unknowns import Coordinate, Coordinates, Prior
 
 WALL = "the disc has left the pads"

@@ -28,14 +28,9 @@ FLOWS = {
     """,
     "sysid": """
         initial_state recording unknowns prediction noise runs problem first_samples synthetic fit plan setpoints prechecks
-        residual_tests assumptions sensitivity certainty estimate answer result identification laws files report design .
+        residual_tests assumptions sensitivity profile posterior nuts estimate comparison result identification compare
+        columns configuration measured criterion planner design figures report .
     """,
-    "sysid.laws": "evidence compare .",
-    "sysid.certainty": "optimum profile summary posterior nuts .",
-    "sysid.answer": "comparison .",
-    "sysid.files": "columns configuration measured cost .",
-    "sysid.report": "figures comparison_figure page sections report .",
-    "sysid.design": "criterion knots planner search design design_figure .",
     "rigs": """
         fields recorded shapes materials bodies pads contacts network actuators motion outputs schema cost geometry build
         course finding reach balance check written template pictures run .

@@ -18,7 +18,7 @@ from test_sysid_measured import CONFIG, EXAMPLE, F_Y, X_C, X_D, Table, scale, wr
 
 from torchsoft.cli import main
 from torchsoft.sysid import Unreachable
-from torchsoft.sysid.files.measured import load, unreachable
+from torchsoft.sysid.measured import load, unreachable
 from torchsoft.sysid.prediction import FailedRun
 
 OPTIONS = ("--out", "--workers", "--rtol", "--checkpoint", "--yes", "--no-progress")

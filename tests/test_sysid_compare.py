@@ -16,11 +16,10 @@ from test_sysid_friction import Viscous
 from torchsoft import Parameters, Profile, Reference, SoftGrasp
 from torchsoft.excitation import Excitation, Roll, Strokes
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, record
-from torchsoft.sysid.answer.comparison import LawFit, judged
-from torchsoft.sysid.laws.compare import compare, versus
-from torchsoft.sysid.laws.evidence import Density, density, ratio
+from torchsoft.sysid.compare import Density, compare, density, ratio, versus
+from torchsoft.sysid.comparison import LawFit, judged
+from torchsoft.sysid.figures import plot
 from torchsoft.sysid.noise import Autoregression
-from torchsoft.sysid.report.comparison_figure import plot
 from torchsoft.sysid.residual_tests import Part
 
 T: Any = np.arange(300) * 5e-3
@@ -74,7 +73,7 @@ def test_with_coloured_noise_that_was_taken_for_white_the_wrong_law_is_not_named
     L = np.linalg.cholesky(colour.autocovariance(len(T))[np.abs(np.subtract.outer(*2 * [np.arange(len(T))]))])
     draws = [L @ rng.standard_normal(len(T)) for _ in range(60)]
     assert shares(5.0, draws)["wrong"] <= 0.02
-    monkeypatch.setattr("torchsoft.sysid.laws.evidence.fit_noise", lambda series, most: SimpleNamespace(noise=None))
+    monkeypatch.setattr("torchsoft.sysid.compare.fit_noise", lambda series, most: SimpleNamespace(noise=None))
     assert shares(5.0, draws)["wrong"] > 0.05
 
 

@@ -13,12 +13,11 @@ from torchsoft import Parameters, Profile, Reference
 from torchsoft.excitation import Excitation, Knots, Strokes, begin
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import RIG, Known, Problem, Recording, Sensor, Unknown, record
-from torchsoft.sysid.design.criterion import Criterion, Outlook, chosen, deviations, next_recording
-from torchsoft.sysid.design.design import BENT, Design, design, draws
-from torchsoft.sysid.design.design_figure import design_figure
-from torchsoft.sysid.design.knots import Bounds, Moves, profile
-from torchsoft.sysid.design.planner import LEFT, Planner
+from torchsoft.sysid.criterion import Bounds, Criterion, Moves, Outlook, chosen, deviations, next_recording, profile
+from torchsoft.sysid.design import BENT, Design, design, draws
+from torchsoft.sysid.figures import design_figure
 from torchsoft.sysid.fit import fisher
+from torchsoft.sysid.planner import LEFT, Planner
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import Runner
 
@@ -73,7 +72,7 @@ def test_slopes_are_those_of_differences(
     plan: Recording, sensors: dict[str, Sensor], rel: float, monkeypatch: Any
 ) -> None:
     """Of values and times of the knots, with what excess costs; a sensor's gain and bias are fitted beside the parameters."""
-    monkeypatch.setattr("torchsoft.sysid.design.planner.DIFFERENCE", 1e-4)
+    monkeypatch.setattr("torchsoft.sysid.planner.DIFFERENCE", 1e-4)
     stated = Problem([plan], SENSORS | sensors, {"pad.E": Unknown(), "contact.K_n": Unknown()})
     one = planner(stated, Criterion("A"), F_y=(-30.0, 30.0))
     z, x = one.moves.start, stated.coordinates.start

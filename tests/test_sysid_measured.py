@@ -20,10 +20,9 @@ from torchsoft.physics.contact import Coulomb
 from torchsoft.physics.material import StandardLinearSolid
 from torchsoft.solve.trajectory import save
 from torchsoft.sysid import MEASURED, Recording, Sensor, record
-from torchsoft.sysid.files.columns import COLUMNS, UNITS, read_table, read_tables
-from torchsoft.sysid.files.cost import cost, paper_settings
-from torchsoft.sysid.files.measured import STATED, known_parameters, load, read_recording, stem
+from torchsoft.sysid.columns import COLUMNS, UNITS, read_table, read_tables
 from torchsoft.sysid.initial_state import AtRest, MovingStart
+from torchsoft.sysid.measured import STATED, cost, known_parameters, load, paper_settings, read_recording, stem
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "identify"
 

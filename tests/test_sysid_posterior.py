@@ -17,10 +17,10 @@ from scipy import stats
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Roll
 from torchsoft.sysid import RIG, Prior, Problem, Sensor, Unknown, record
-from torchsoft.sysid.certainty.nuts import Whitened, nuts
-from torchsoft.sysid.certainty.optimum import Optimum
-from torchsoft.sysid.certainty.posterior import laplace
 from torchsoft.sysid.noise import Autoregression
+from torchsoft.sysid.nuts import Whitened, nuts
+from torchsoft.sysid.posterior import laplace
+from torchsoft.sysid.profile import Optimum
 
 STRAIGHT = np.random.default_rng(0).standard_normal((20, 3))
 BENT = ClosedForm(lambda x: [np.sinh(x[0]) + 0.3 * x[0] ** 2], 1)

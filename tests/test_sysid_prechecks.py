@@ -16,7 +16,7 @@ from torchsoft.diagnostic import Diagnostic
 from torchsoft.excitation import Excitation, MultiSine, Press, Strokes
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Unknown, record
-from torchsoft.sysid.files.cost import paper_settings
+from torchsoft.sysid.measured import paper_settings
 from torchsoft.sysid.plan import LOOSE
 from torchsoft.sysid.prechecks import accepted, findings, loop_findings, precheck, together
 from torchsoft.sysid.prediction import Signals, readout

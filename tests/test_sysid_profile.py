@@ -11,10 +11,9 @@ from conftest import COARSE
 from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Roll
 from torchsoft.sysid import RIG, Problem, Stage, Unknown, identify, record
-from torchsoft.sysid.certainty.optimum import Optimum
-from torchsoft.sysid.certainty.posterior import laplace
-from torchsoft.sysid.certainty.profile import RISE, profiles
 from torchsoft.sysid.fit import Combination, combinations
+from torchsoft.sysid.posterior import laplace
+from torchsoft.sysid.profile import RISE, Optimum, profiles
 from torchsoft.sysid.result import load_answer
 
 RNG = np.random.default_rng(0)

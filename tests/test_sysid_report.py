@@ -31,15 +31,11 @@ from torchsoft.sysid import (
     identify,
     record,
 )
-from torchsoft.sysid.answer.comparison import Comparison
-from torchsoft.sysid.certainty.profile import RISE, Profile
+from torchsoft.sysid import report as page_of
+from torchsoft.sysid import report as sections
+from torchsoft.sysid.comparison import Comparison
 from torchsoft.sysid.estimate import Direction
-from torchsoft.sysid.files.cost import paper_settings
-from torchsoft.sysid.fit import Combination
-from torchsoft.sysid.noise import Autoregression
-from torchsoft.sysid.prediction import FailedRun
-from torchsoft.sysid.report import sections
-from torchsoft.sysid.report.figures import (
+from torchsoft.sysid.figures import (
     contributions_figure,
     correlation_figure,
     direction_name,
@@ -48,9 +44,12 @@ from torchsoft.sysid.report.figures import (
     spectrum_figure,
     trace_figure,
 )
-from torchsoft.sysid.report.page import grouped, table
-from torchsoft.sysid.report.report import page as page_of
-from torchsoft.sysid.report.report import report, traces
+from torchsoft.sysid.fit import Combination
+from torchsoft.sysid.measured import paper_settings
+from torchsoft.sysid.noise import Autoregression
+from torchsoft.sysid.prediction import FailedRun
+from torchsoft.sysid.profile import RISE, Profile
+from torchsoft.sysid.report import grouped, report, table, traces
 from torchsoft.sysid.residual_tests import autocorrelation
 from torchsoft.sysid.result import ChannelNoise, load_answer, untold
 from torchsoft.sysid.runs import Runner

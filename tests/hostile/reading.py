@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchsoft.sysid.files.columns import read_table
+from torchsoft.sysid.columns import read_table
 
 warnings.simplefilter("ignore")
 print("ready", flush=True)

@@ -21,7 +21,7 @@ from torchsoft.excitation import Excitation, Strokes
 from torchsoft.paper.equilibrium import rest
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.sysid import Problem, Sensor, Unknown, identify, record
-from torchsoft.sysid.report import report as page
+from torchsoft.sysid import report as page
 
 pytestmark = pytest.mark.slow
 

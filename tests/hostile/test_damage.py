@@ -18,7 +18,7 @@ from torchsoft.paper.equilibrium import rest
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.solve.simulate import simulate
-from torchsoft.sysid.files.columns import read_table
+from torchsoft.sysid.columns import read_table
 
 pytestmark = pytest.mark.slow
 

@@ -23,9 +23,9 @@ from hostile.trial import Tally, count, random, sentence
 from torchsoft import Parameters, simulate
 from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.files import sealed, unsealed
-from torchsoft.sysid.files import measured
-from torchsoft.sysid.files.columns import COLUMNS, read_table
-from torchsoft.sysid.files.cost import cost, paper_settings
+from torchsoft.sysid import measured
+from torchsoft.sysid.columns import COLUMNS, read_table
+from torchsoft.sysid.measured import cost, paper_settings
 from torchsoft.sysid.runs import Runner
 
 pytestmark = pytest.mark.slow

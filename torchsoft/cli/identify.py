@@ -60,11 +60,10 @@ def identify(options: argparse.Namespace) -> int:
     try:
         # these take seconds to import, so that `--help` does without
         from torchsoft.cost import agree
-        from torchsoft.sysid.files import measured
-        from torchsoft.sysid.files.cost import cost, one_by_one
+        from torchsoft.sysid import measured, report
         from torchsoft.sysid.fit import Unreachable
         from torchsoft.sysid.identification import Settings, identify
-        from torchsoft.sysid.report.report import report
+        from torchsoft.sysid.measured import cost, one_by_one
         from torchsoft.sysid.runs import forget
 
         tables: dict[str, Any] = {}
@@ -112,7 +111,7 @@ def identify(options: argparse.Namespace) -> int:
 
 def compared(case: Any, fit: Any, options: argparse.Namespace) -> str:
     """Fits the competing laws, and says which one made the data."""
-    from torchsoft.sysid.laws.compare import compare
+    from torchsoft.sysid.compare import compare
     from torchsoft.sysid.runs import forget
 
     unfinished: Path = options.checkpoint or options.out / "unfinished"

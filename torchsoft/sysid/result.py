@@ -20,15 +20,14 @@ from torchsoft.files import check_file, finite, replacing
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.rig import Rig
-from torchsoft.sysid.answer.comparison import Comparison
-from torchsoft.sysid.certainty.profile import Profile
-from torchsoft.sysid.certainty.summary import PosteriorSummary
+from torchsoft.sysid.comparison import Comparison
 from torchsoft.sysid.estimate import ChannelResiduals, Contribution, Direction, Estimate, contributions
 from torchsoft.sysid.fit import Combination, combinations
 from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.noise import Autoregression, Score
 from torchsoft.sysid.prediction import set_parameters
 from torchsoft.sysid.problem import Problem
+from torchsoft.sysid.profile import PosteriorSummary, Profile
 from torchsoft.sysid.recording import Array, identity
 from torchsoft.sysid.sensitivity import AssumptionTest
 from torchsoft.sysid.unknowns import Coordinate, Sensor, Unknown

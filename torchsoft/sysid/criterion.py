@@ -1,11 +1,8 @@
-"""What a designed motion may do: knots of a reference's profiles as variables, within bounds of travel, speed and duration.
+"""How well parameters would be known: criteria of optimal design, and a ranking of what could be recorded next."""
 
-Between knots a profile is monotone and its speed peaks at `PEAK` times the mean one: the bounds hold everywhere when they hold
-from knot to knot, and are linear in values and times of the knots.
-"""
-
-from collections.abc import Mapping
-from typing import Any, Self
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 import torch
@@ -14,8 +11,142 @@ from scipy.optimize import linprog
 from torch import Tensor
 
 from torchsoft.physics.motion import Profile, Reference
-from torchsoft.sysid.recording import Array
+from torchsoft.sysid.fit import fisher
+from torchsoft.sysid.initial_state import PREFIX
+from torchsoft.sysid.problem import Problem
+from torchsoft.sysid.recording import Array, Recording
+from torchsoft.sysid.runs import Runner
 from torchsoft.tables import Table
+
+Optimality = Literal["D", "A", "worst"]
+
+SHARPNESS = 12.0
+"""Of the smooth maximum: it exceeds the largest logarithm by ln(parameters) over this at most."""
+
+
+@dataclass(frozen=True)
+class Criterion:
+    """One number for a covariance C (s, s) of parameters' relative errors: the logarithm of a standard deviation, the smaller
+    the better.
+
+    "D" is the mean logarithm along the axes of the ellipsoid of errors, its volume; "A" the root mean square of the standard
+    deviations over `targets` (s,), 1 where there are none; "worst" the largest of them, smoothed. With one parameter the three
+    are the same, and are called c-optimality. Raises `ValueError`.
+    """
+
+    optimality: Optimality = "D"
+    targets: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if self.optimality not in get_args(Optimality):
+            raise ValueError(f"`optimality` must be one of {', '.join(get_args(Optimality))}, not {self.optimality!r}")
+        if self.targets is not None and not (np.isfinite(self.targets).all() and np.min(self.targets) > 0):
+            raise ValueError(f"`targets` must be positive standard deviations, but are {self.targets}")
+
+    def __call__(self, C: Array) -> tuple[float, Array]:
+        """Its value and derivative (s, s) by C."""
+        if self.optimality == "D":
+            return 0.5 * float(np.linalg.slogdet(C)[1]) / len(C), 0.5 * np.linalg.inv(C) / len(C)
+        scaled = np.diag(C) / np.square(1.0 if self.targets is None else self.targets)
+        if self.optimality == "A":
+            return 0.5 * float(np.log(scaled.mean())), np.diag(0.5 * scaled / np.diag(C) / scaled.sum())
+        logs = 0.5 * np.log(scaled)
+        parts = np.exp(SHARPNESS * (logs - logs.max()))
+        value = float(logs.max() + np.log(parts.sum()) / SHARPNESS)
+        return value, np.diag(0.5 * parts / parts.sum() / np.diag(C))
+
+    def check(self, names: Sequence[str]) -> None:
+        """Raises `ValueError` unless there is a target for every parameter, or none."""
+        if self.targets is not None and len(self.targets) != len(names):
+            raise ValueError(f"`targets` has {len(self.targets)} standard deviations for the {len(names)} of {names}")
+
+
+VOLUME = Criterion()
+
+
+def chosen(problem: Problem, x: Array, names: Sequence[str] | None) -> tuple[tuple[str, ...], Array]:
+    """The parameters `names`, by default every free one that all recordings share, and what their relative errors (s,) are of
+    those of the coordinates x (n,): a matrix (s, n). Raises `ValueError` for others."""
+    c, one = problem.coordinates, problem.recordings[0]
+    values = c.values(x, one.name, one.parameters)
+    rows = c.jacobian(x, one.name, values) * c.free / np.array([[values[name]] for name in c.names])
+    own = {a.name for a in c.all if a.recording is not None}
+    known = [name for name, row in zip(c.names, rows) if row.any() and name not in own and not name.startswith(PREFIX)]
+    wanted = tuple(known if names is None else names)
+    if not wanted or len(set(wanted)) < len(wanted) or not set(wanted) <= set(known):
+        raise ValueError(f"`names` must be some of the parameters {', '.join(known)}, each once, but is {list(wanted)}")
+    return wanted, np.stack([rows[c.names.index(name)] for name in wanted])
+
+
+def deviations(names: Sequence[str], T: Array, C: Array) -> dict[str, float]:
+    """Relative standard deviations of parameters, T (s, n) being what they are of coordinates with the covariance C."""
+    return dict(zip(names, np.sqrt(np.diag(T @ C @ T.T)).tolist()))
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """A recording that could be made: its duration [s], the relative standard deviations that parameters have without it and
+    would have with it, and the criterion's gain, a logarithm of standard deviations. `lost` says why it cannot be made."""
+
+    name: str
+    seconds: float
+    before: dict[str, float]
+    after: dict[str, float]
+    gain: float
+    lost: str = ""
+
+
+def next_recording(
+    problem: Problem, x: Array, candidates: Sequence[Recording], *, names: Sequence[str] | None = None,
+    criterion: Criterion = VOLUME, per_second: bool = False, rtol: float = 1e-4, workers: int = 1,
+) -> list[Outlook]:  # fmt: skip
+    """What should be recorded after the recordings of `problem`, whose coordinates are x (n,), say at the end of a fit?
+
+    Every candidate's Fisher matrix is added to theirs; of its samples only the times count. The best comes first, by what it
+    takes off the `criterion` of the parameters `names`, or by that per second. A prediction: it holds as far as the model
+    does, and for small errors. Raises `ValueError` for candidates that do not fit the problem.
+    """
+    if not candidates:
+        raise ValueError("there is no candidate to rank")
+    both = Problem([*problem.recordings, *candidates], problem.sensors, problem.unknowns, problem.noise)
+    known = dict(zip(problem.coordinates.labels, x))
+    c, x = (
+        both.coordinates,
+        np.array([known.get(a.label, s) for a, s in zip(both.coordinates.all, both.coordinates.start)]),
+    )
+    names, T = chosen(both, x, names)
+    criterion.check(names)
+    runner, priors = Runner(both.recordings, workers), len(c.priors)
+    have = both.residuals(runner, x, problem.names, rtol, c.free)
+    if have.lost:
+        reasons = "; ".join(f"`{name}`: {lost.reason}" for name, lost in have.lost.items())
+        raise ValueError(f"`x` does not reproduce what was recorded: {reasons}")
+
+    def covariance(J: Array, those: Sequence[str]) -> Array:
+        """Of the coordinates that matter to some recordings; zero for the others."""
+        mine = np.array([a.recording in (None, *those) for a in c.all]) & c.free
+        rows = np.ones(len(J), bool)
+        rows[len(J) - priors :] = [mine[i] for i, _ in c.priors]
+        C = np.zeros((len(x), len(x)))
+        C[np.ix_(mine, mine)] = fisher(J[np.ix_(rows, mine)])[0]
+        return C
+
+    C = covariance(have.J, problem.names)
+    before, out = deviations(names, T, C), []
+    for one in candidates:
+        new = both.residuals(runner, x, [one.name], rtol, c.free)
+        if new.lost:
+            out.append(Outlook(one.name, one.duration, before, before, 0.0, new.lost[one.name].reason))
+            continue
+        J = np.concatenate((have.J[: len(have.J) - priors], new.J))
+        after = covariance(J, [*problem.names, one.name])
+        gain = criterion(T @ C @ T.T)[0] - criterion(T @ after @ T.T)[0]
+        out.append(Outlook(one.name, one.duration, before, deviations(names, T, after), gain))
+    return sorted(out, key=lambda o: (bool(o.lost), -o.gain / (o.seconds if per_second else 1.0)))
+
+
+# What a designed motion may do: knots of a reference's profiles as variables, within bounds of travel, speed and duration.
+
 
 PEAK = 35 / 16
 """Largest over mean speed of the 7th-order profile."""

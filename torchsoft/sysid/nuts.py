@@ -15,15 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import expit, log_expit, logit
 
-from torchsoft.sysid.certainty.optimum import Optimum
-from torchsoft.sysid.certainty.posterior import (
-    CHECKED,
-    Posterior,
-    measure,
-    notices_on_runs,
-    notices_on_steps,
-    steps_off,
-)
+from torchsoft.sysid.posterior import CHECKED, Posterior, measure, notices_on_runs, notices_on_steps, steps_off
+from torchsoft.sysid.profile import Optimum
 from torchsoft.sysid.recording import Array
 from torchsoft.threads import single_threaded
 

@@ -2,17 +2,20 @@
 
 from collections.abc import Sequence
 from textwrap import fill, shorten
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator, PercentFormatter
 
 from torchsoft.plot.figures import ACTUAL, DESIRED, OTHER, STYLE
-from torchsoft.sysid.certainty.profile import RISE, Profile
+from torchsoft.sysid.comparison import Comparison, Series, Versus
+from torchsoft.sysid.design import Design
 from torchsoft.sysid.estimate import IDENTIFIABLE, ChannelResiduals, Direction, Estimate
 from torchsoft.sysid.noise import Autoregression
+from torchsoft.sysid.profile import RISE, Profile
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.residual_tests import LAGS, autocorrelation
 from torchsoft.sysid.result import IdentificationResult
@@ -255,4 +258,89 @@ def trace_figure(trace: Trace, channel: ChannelResiduals | None, noise: Autoregr
     correlation.xaxis.set_major_locator(MaxNLocator(integer=True))
     for axes in (data, residual, correlation):
         axes.yaxis.set_major_locator(MaxNLocator(5 if axes is data else 3))
+    return figure
+
+
+# The picture of a comparison of laws: where in the motion the evidence against the others comes from.
+
+
+MOST = 4
+"""Recordings that are shown, those with most of the evidence first."""
+
+
+@rc_context(STYLE)
+def plot(comparison: Comparison, other: str | None = None) -> Figure:
+    """The evidence against `other` (by default the law next to the best) as it grows along each recording, in all and by the
+    channels that tell most, and both laws' residuals of the channel that tells most. Raises `ValueError` for a law that was
+    not compared with the best, and where the residuals have not been kept."""
+    chosen = [v for v in comparison.against if other in (None, v.other)]
+    if not chosen:
+        raise ValueError(
+            f"the best law was not compared with `{other}`, but with {', '.join(v.other for v in comparison.against)}"
+        )
+    if not comparison.series:
+        raise ValueError(
+            "the comparison was kept without its residuals, so there is nothing to draw: compare once more"
+        )
+    versus = min(chosen, key=lambda v: v.evidence)
+    by_recording: dict[str, list[Series]] = {}
+    for one in comparison.series:
+        by_recording.setdefault(one.recording, []).append(one)
+    names = sorted(by_recording, key=lambda name: -sum(growth(s, versus)[-1] for s in by_recording[name]))[:MOST]
+    figure = Figure(figsize=(10.5, 0.9 + 2.6 * len(names)), layout="constrained")
+    figure.suptitle(literal(f"{versus.best} against {versus.other}: {versus.evidence:.3g} nats, z = {versus.z:.2g}"))
+    for (left, right), name in zip(figure.subplots(len(names), 2, squeeze=False, sharex="row"), names):
+        told = sorted(by_recording[name], key=lambda s: -abs(growth(s, versus)[-1]))
+        t = np.unique(np.concatenate([s.t for s in told]))
+        left.plot(t, sum(np.interp(t, s.t, growth(s, versus)) for s in told), color="k", lw=2, label="all")
+        for s in told[:3]:
+            left.plot(s.t, growth(s, versus), lw=1, label=s.channel)
+        held = "" if told[0].fitted else ", held out"
+        left.set_title(literal(f"evidence against {versus.other} in {name}{held} [nats]"))
+        left.legend(loc="upper left")
+        for law, colour in ((versus.other, OTHER), (versus.best, ACTUAL)):
+            right.plot(told[0].t, told[0].residuals[law], ".-", color=colour, lw=0.6, ms=3, label=literal(law))
+        right.set_title(f"residual over noise in {told[0].channel}")
+        right.legend()
+        for axes in (left, right):
+            axes.set(xlabel="time [s]", xlim=(t[0], t[-1]))
+    return figure
+
+
+def growth(s: Series, versus: Versus) -> np.ndarray:
+    """Evidence up to each sample [nats]."""
+    a, b = (np.array(s.residuals[law]) for law in (versus.best, versus.other))
+    return np.cumsum(0.5 * (b**2 - a**2))
+
+
+# A designed motion in one picture: set-points before and after, standard deviations, and the criterion as it went.
+
+
+@rc_context(STYLE)
+def design_figure(design: Design) -> Figure:
+    """The signals whose knots moved, above; relative standard deviations and the criterion below."""
+    names, bounds = tuple(design.made_by["bounds"]), design.made_by["bounds"]
+    figure = Figure(figsize=(9.0, 1.8 * len(names) + 3.2), layout="constrained")
+    panels: Any = figure.subfigures(2, 1, height_ratios=(1.8 * len(names), 3.2))
+    above, below = panels
+    t = np.linspace(design.recording.times[0], design.recording.times[-1], 2000)
+    for ax, name in zip(above.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0], names):
+        shown, scale = SHOWN.get(own := design.recording.units[name], (own, 1.0))
+        for one, colour, label in ((design.given, DESIRED, "given"), (design.recording, ACTUAL, "designed")):
+            signal = one.rig.reference(torch.from_numpy(t), [name])[:, 0, 0].detach().numpy()
+            ax.plot(t, scale * signal, color=colour, label=label)
+        for end in ("low", "high"):
+            ax.axhline(scale * bounds[name][end], color=OTHER, lw=0.8, ls=":")
+        ax.set_ylabel(f"{name} [{shown}]")
+    above.axes[0].legend(loc="upper right", ncols=2)
+    above.axes[-1].set_xlabel("time [s]")
+    left, right = below.subplots(1, 2, width_ratios=(3, 2))
+    at = np.arange(len(design.before))
+    for offset, sds, colour in ((-0.2, design.before, DESIRED), (0.2, design.after, ACTUAL)):
+        left.bar(at + offset, [100 * sd for sd in sds.values()], 0.38, color=colour)
+    left.set_yscale("log")
+    left.set_xticks(at, [name.split(".")[-1] for name in design.before])
+    left.set_ylabel("standard deviation [%]")
+    right.plot([v.iteration for v in design.history], [v.value for v in design.history], "o-", color=ACTUAL, ms=3)
+    right.set(xlabel="iteration", ylabel=f"criterion {design.made_by['criterion']}")
     return figure

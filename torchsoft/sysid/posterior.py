@@ -16,8 +16,7 @@ import numpy as np
 from tqdm import tqdm
 
 from torchsoft.files import finite, replacing
-from torchsoft.sysid.certainty.optimum import CHOSEN_ANEW, Optimum
-from torchsoft.sysid.certainty.summary import MarginalSummary, PosteriorSummary
+from torchsoft.sysid.profile import CHOSEN_ANEW, MarginalSummary, Optimum, PosteriorSummary
 from torchsoft.sysid.recording import Array
 from torchsoft.threads import parallel_map, single_threaded
 

@@ -1,1 +1,0 @@
-"""What an identification found, in memory and as a file."""

@@ -1,1 +1,0 @@
-"""How well parameters are known: profiles, posteriors, and whether these are calibrated."""

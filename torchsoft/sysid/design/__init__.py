@@ -1,1 +1,0 @@
-"""Which motion to record next."""

@@ -1,1 +1,0 @@
-"""Identification from files: a configuration, and measured recordings."""

@@ -1,1 +1,0 @@
-"""An answer on one page, with its figures."""
