@@ -31,7 +31,6 @@ from torchsoft.sysid import (
     identify,
     record,
 )
-from torchsoft.sysid import report as page_of
 from torchsoft.sysid import report as sections
 from torchsoft.sysid.comparison import Comparison
 from torchsoft.sysid.estimate import Direction
@@ -50,6 +49,7 @@ from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.prediction import FailedRun
 from torchsoft.sysid.profile import RISE, Profile
 from torchsoft.sysid.report import grouped, report, table, traces
+from torchsoft.sysid.report import page as page_of
 from torchsoft.sysid.residual_tests import autocorrelation
 from torchsoft.sysid.result import ChannelNoise, load_answer, untold
 from torchsoft.sysid.runs import Runner

@@ -60,10 +60,11 @@ def identify(options: argparse.Namespace) -> int:
     try:
         # these take seconds to import, so that `--help` does without
         from torchsoft.cost import agree
-        from torchsoft.sysid import measured, report
+        from torchsoft.sysid import measured
         from torchsoft.sysid.fit import Unreachable
         from torchsoft.sysid.identification import Settings, identify
         from torchsoft.sysid.measured import cost, one_by_one
+        from torchsoft.sysid.report import report
         from torchsoft.sysid.runs import forget
 
         tables: dict[str, Any] = {}
@@ -112,7 +113,8 @@ def identify(options: argparse.Namespace) -> int:
 def compared(case: Any, fit: Any, options: argparse.Namespace) -> str:
     """Fits the competing laws, and says which one made the data."""
     from torchsoft.sysid.compare import compare
-    from torchsoft.sysid.runs import forget
+    from torchsoft.sysid.report import report
+        from torchsoft.sysid.runs import forget
 
     unfinished: Path = options.checkpoint or options.out / "unfinished"
     folder = unfinished.with_name(f"{unfinished.name}-laws")
