@@ -113,8 +113,7 @@ def identify(options: argparse.Namespace) -> int:
 def compared(case: Any, fit: Any, options: argparse.Namespace) -> str:
     """Fits the competing laws, and says which one made the data."""
     from torchsoft.sysid.compare import compare
-    from torchsoft.sysid.report import report
-        from torchsoft.sysid.runs import forget
+    from torchsoft.sysid.runs import forget
 
     unfinished: Path = options.checkpoint or options.out / "unfinished"
     folder = unfinished.with_name(f"{unfinished.name}-laws")

@@ -102,8 +102,8 @@ class Variation(Assumption):
 
 
 def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Variation]:
-    """Everything that the runs of some recordings take for granted and that can be varied; `unknown` are the parameters, and
-    coordinates of starts, that are identified."""
+    """Everything that the runs of some recordings take for granted and that can be varied; `unknown` are the
+    parameters, and coordinates of starts, that are identified."""
     first, *_ = recordings
     rig = first.rig
     pad = next(iter(rig.pads.values()))
@@ -276,13 +276,13 @@ def raised(recording: Recording, by: float) -> Recording | None:
 
 
 REFITS, ROUGH = 20, 1e-3
-"""Evaluations that a fit under another assumption may take, and its relative tolerance: it has to find out whether the misfit
-goes away, not where exactly."""
+"""Evaluations that a fit under another assumption may take, and its relative tolerance: it has to find out whether the
+misfit goes away, not where exactly."""
 
 
 FAR = 2.0
-"""Misfit per sample from which where a fit ended tells nothing: under another assumption it begins where the first one began,
-too."""
+"""Misfit per sample from which where a fit ended tells nothing: under another assumption it begins where the first one
+began, too."""
 
 AMOUNTS = 10.0
 """How many amounts of a variation a number of the rig may be off where a fit is repeated."""
@@ -292,8 +292,8 @@ HALVINGS = 10
 
 
 class End(NamedTuple):
-    """A fit in whose place another is held: coordinates x (n,), residuals there, the free coordinates (n,), the recordings that
-    were fitted, residuals and steps of runs by the tolerance `rtol`, and how runs are made and kept."""
+    """A fit in whose place another is held: coordinates x (n,), residuals there, the free coordinates (n,), the
+    recordings that were fitted, residuals and steps of runs by the tolerance `rtol`, and how runs are made and kept."""
 
     x: Array
     at: Residuals
@@ -315,8 +315,8 @@ def ended(
     problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_], which: Sequence[str], rtol: float, workers: int,
     journal: Path | None,
 ) -> End:  # fmt: skip
-    """The end of a fit, which took steps by `rtol`, with a run a recording by the tolerance of the variations: `USUAL`, or that
-    of the fit, if runs are lost with it."""
+    """The end of a fit, which took steps by `rtol`, with a run a recording by the tolerance of the variations: `USUAL`,
+    or that of the fit, if runs are lost with it."""
     runner = Runner(problem.recordings, workers, journal)
     usual = max(rtol, USUAL)
     base, steps = problem.freeze(runner, x, which, usual)
@@ -328,8 +328,8 @@ def ended(
 
 
 def varied(problem: Problem, which: Sequence[str], one: Variation) -> Problem | str:
-    """The problem with one assumption otherwise in the recordings `which`, or why there is none. A parameter that is called
-    known becomes one more unknown."""
+    """The problem with one assumption otherwise in the recordings `which`, or why there is none. A parameter that is
+    called known becomes one more unknown."""
     made, unknowns = [], dict(problem.unknowns)
     for recording in problem.recordings:
         other = one.vary(recording) if one.vary is not None and recording.name in which else recording
@@ -347,8 +347,8 @@ def varied(problem: Problem, which: Sequence[str], one: Variation) -> Problem | 
 
 
 def farthest(recordings: Sequence[Recording], name: str, value: float, part: float) -> float:
-    """A number of the rig that is off by a relative `part`, or by half of that, a quarter and so on until there is such a rig:
-    a smaller disc may leave the pads apart. Raises `ValueError` where there is none."""
+    """A number of the rig that is off by a relative `part`, or by half of that, a quarter and so on until there is such
+    a rig: a smaller disc may leave the pads apart. Raises `ValueError` where there is none."""
     for _ in range(HALVINGS):
         with suppress(ValueError):
             for recording in recordings:
@@ -386,8 +386,9 @@ class Refit(NamedTuple):
 def refit(problem: Problem, end: End, one: Variation | None, loss: Loss, notify: Notify) -> Refit | None:
     """The fit with one assumption otherwise, or with all as stated, on steps of its own; None where it cannot begin.
 
-    It begins where the fit ended; ratios that ended at a bound are looked for again over all of their range. With another law
-    or number, and a misfit above `FAR`, it begins where the first fit began as well, and the better end counts.
+    It begins where the fit ended; ratios that ended at a bound are looked for again over all of their range. With
+    another law or number, and a misfit above `FAR`, it begins where the first fit began as well, and the better end
+    counts.
     """
     other = varied(problem, end.which, one) if one is not None else problem
     if isinstance(other, str):

@@ -33,8 +33,8 @@ GAP = 0.1
 
 @dataclass(frozen=True)
 class Columns:
-    """A table in SI units: `values` (n,) by column, NaN where a sample is missing, the number of every row in the file, and the
-    names of columns that were left out."""
+    """A table in SI units: `values` (n,) by column, NaN where a sample is missing, the number of every row in the file,
+    and the names of columns that were left out."""
 
     path: Path
     values: dict[str, Array]
@@ -56,8 +56,8 @@ class Columns:
 
 @dataclass(frozen=True)
 class Tables:
-    """The tables of one recording, each with times of its own; a column stands in one of them. `constants` are columns that
-    were stated in the place of missing ones."""
+    """The tables of one recording, each with times of its own; a column stands in one of them. `constants` are columns
+    that were stated in the place of missing ones."""
 
     tables: tuple[Columns, ...]
     constants: tuple[str, ...] = ()
@@ -159,7 +159,8 @@ def hint(name: str, columns: int) -> str:
 
 
 def read_csv(path: Path, ignore: Collection[str] = ()) -> Columns:
-    """A table of numbers under `name [unit]`. Raises `ValueError` naming the row (the heading is row 1) and the column."""
+    """A table of numbers under `name [unit]`. Raises `ValueError` naming the row (the heading is row 1) and the
+    column."""
     table = csvfile.read(path, {name: UNITS[CHANNELS[name].unit] for name in COLUMNS}, hint, ignore)
     return check_table(Columns(path, table.values, table.rows, ignored=table.ignored))
 

@@ -1,4 +1,5 @@
-"""How probable recordings are under a law, and how far noise alone would move the ratio of two such probabilities."""
+"""Comparison of competing laws: each is fitted to the recordings, and the evidence is judged by the rule of
+`comparison`."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,8 +26,8 @@ COLOUR = 3
 
 
 class Density(NamedTuple):
-    """What a law says of some recordings: whitened residuals r (m,), s = S^-1 r with S = 1 + J C J' the covariance of the
-    prediction in units of the noise, and the logarithm of the samples' density, in SI units."""
+    """What a law says of some recordings: whitened residuals r (m,), s = S^-1 r with S = 1 + J C J' the covariance of
+    the prediction in units of the noise, and the logarithm of the samples' density, in SI units."""
 
     parts: list[Part]
     r: Array
@@ -59,8 +60,8 @@ def density(problem: Problem, which: Sequence[str], r: Array, spread: Array | No
 
 
 class FittedLaw(NamedTuple):
-    """A law, and where its fit ended: coordinates x (n,), which of them were `free` (n,), by which tolerance, and whether it
-    had converged. The problem has the noise that was found."""
+    """A law, and where its fit ended: coordinates x (n,), which of them were `free` (n,), by which tolerance, and
+    whether it had converged. The problem has the noise that was found."""
 
     name: str
     problem: Problem
@@ -73,8 +74,8 @@ class FittedLaw(NamedTuple):
 class Evidence:
     """A fitted law's densities of the recordings `which` it was fitted to and of those that were held out.
 
-    They are those of runs with a tenth of the fit's tolerance; `numerical` is what that changes. Raises `ValueError` where one
-    cannot be made.
+    They are those of runs with a tenth of the fit's tolerance; `numerical` is what that changes. Raises `ValueError`
+    where one cannot be made.
     """
 
     def __init__(self, law: FittedLaw, runner: Runner, which: Sequence[str], heldout: Sequence[str]) -> None:
@@ -129,9 +130,9 @@ class Ratio(NamedTuple):
 def ratio(a: Density, b: Density) -> Ratio:
     """Of two laws, by the noise about the first one.
 
-    The logarithm changes with the samples by the difference of the scores, and its variance is what the noise gives that: as
-    stated, and with the size and the colour that the residuals of the first law have besides, as an autoregression of the
-    order that they choose. The larger one is taken.
+    The logarithm changes with the samples by the difference of the scores, and its variance is what the noise gives
+    that: as stated, and with the size and the colour that the residuals of the first law have besides, as an
+    autoregression of the order that they choose. The larger one is taken.
     """
     stated = variance = 0.0
     for mine, its in zip(a.parts, b.parts):
@@ -146,7 +147,8 @@ def ratio(a: Density, b: Density) -> Ratio:
 
 
 def coloured(score: Array, noise: Autoregression | None, t: Array) -> Array:
-    """W'^-1 score (m,) for samples at t (m,) [s], W being what whitens noise: its square is the variance of score' noise."""
+    """W'^-1 score (m,) for samples at t (m,) [s], W being what whitens noise: its square is the variance of score'
+    noise."""
     if noise is None:
         return score
     return spsolve_triangular(noise.whitener(t).T.tocsr(), score, lower=False)
@@ -167,15 +169,15 @@ def compare(
     rtol: float = RTOL, starts: int = 1, again: bool = True, workers: int = 1, checkpoint: str | Path | None = None,
     progress: bool = False,
 ) -> Comparison:  # fmt: skip
-    """Fit every law to the same recordings, and say which one made them, or that the data cannot tell: `Comparison.verdict`, by
-    the rule of `torchsoft.sysid.comparison`.
+    """Fit every law to the same recordings, and say which one made them, or that the data cannot tell:
+    `Comparison.verdict`, by the rule of `torchsoft.sysid.comparison`.
 
-    `laws` are problems by name with the same recordings and sensors, on rigs with other laws, and with unknowns of their
-    own: `dataclasses.replace(recording, rig=...)` makes such a recording. Bounds belong to the law: one that contains
-    another (a standard linear solid with any instantaneous modulus contains Kelvin and Voigt's) is never behind it by
-    more than its penalty, unless its bounds keep it away from the other. Noise is what the sensors state: where one
-    declares its `colour` it is found for every law, but no law may explain what it misses as noise that nobody
-    declared.
+    `laws` are problems by name with the same recordings and sensors, on rigs with other laws, and with unknowns of
+    their own: `dataclasses.replace(recording, rig=...)` makes such a recording. Bounds belong to the law: one that
+    contains another (a standard linear solid with any instantaneous modulus contains Kelvin and Voigt's) is never
+    behind it by more than its penalty, unless its bounds keep it away from the other. Noise is what the sensors state:
+    where one declares its `colour` it is found for every law, but no law may explain what it misses as noise that
+    nobody declared.
 
     Recordings named in `heldout` are predicted, not fitted. `plans`, `rtol`, `starts`, `workers` and the folder
     `checkpoint` are those of `identify`. With `again` every law but the best is fitted once more from where the best
@@ -236,7 +238,8 @@ def fitted(
     name: str, problem: Problem, runner: Runner, which: Sequence[str], plan: Sequence[Stage] | None, rtol: float,
     starts: int, progress: bool,
 ) -> FittedLaw:  # fmt: skip
-    """A law where the plan ends, and with the noise of its sensors, where they declare a colour. Raises `Unreachable`."""
+    """A law where the plan ends, and with the noise of its sensors, where they declare a colour. Raises
+    `Unreachable`."""
     if plan is None:
         plan = default_plan(problem, runner, rtol, which, starts)
     if not plan or list(plan[-1].recordings) != list(which):
@@ -266,8 +269,8 @@ def ended(name: str, problem: Problem, fit: Fit, free: np.ndarray, rtol: float) 
 
 
 def refitted(law: FittedLaw, best: FittedLaw, runner: Runner, which: Sequence[str]) -> FittedLaw | None:
-    """The law fitted once more, from the values that another one ended with; None where they share none, or it cannot be run
-    there."""
+    """The law fitted once more, from the values that another one ended with; None where they share none, or it cannot
+    be run there."""
     c, x = law.problem.coordinates, law.x.copy()
     known = {
         label: one.to_value(v)

@@ -40,11 +40,12 @@ Outcome = Literal["law", "cannot tell", "none fits"]
 
 @dataclass(frozen=True)
 class LawFit:
-    """One law at its estimates: the number of its parameters, the log likelihood of the fitted samples in SI units, the sum of
-    squared whitened residuals over the degrees of freedom with its p-value, criteria, Akaike weight (of AICc), and the log
-    density per sample that it predicts for held-out recordings, with the p-value of their sum of squares. `numerical` is how
-    far a tenth of the tolerance changes the log likelihood; `left` has sentences on what is left of the data that is no noise
-    as stated, by the tests of `torchsoft.sysid.residual_tests`, and `patterned` says whether it follows the motion."""
+    """One law at its estimates: the number of its parameters, the log likelihood of the fitted samples in SI units, the
+    sum of squared whitened residuals over the degrees of freedom with its p-value, criteria, Akaike weight (of AICc),
+    and the log density per sample that it predicts for held-out recordings, with the p-value of their sum of squares.
+    `numerical` is how far a tenth of the tolerance changes the log likelihood; `left` has sentences on what is left of
+    the data that is no noise as stated, by the tests of `torchsoft.sysid.residual_tests`, and `patterned` says whether
+    it follows the motion."""
 
     name: str
     parameters: int
@@ -74,15 +75,16 @@ class LawFit:
 
     @property
     def fits(self) -> bool:
-        """Whether residuals are as large as the noise, those of held-out recordings too, and do not follow the motion."""
+        """Whether residuals are as large as the noise, those of held-out recordings too, and do not follow the
+        motion."""
         return not self.misses
 
 
 @dataclass(frozen=True)
 class Versus:
-    """The best law against another one: logarithms of the likelihood ratios of fitted and of held-out samples, the whitened
-    distance D of the predictions, the inflation c of the variance, E and z of the rule, z of held-out recordings alone, and how
-    far a tenth of the tolerance changes E.
+    """The best law against another one: logarithms of the likelihood ratios of fitted and of held-out samples, the
+    whitened distance D of the predictions, the inflation c of the variance, E and z of the rule, z of held-out
+    recordings alone, and how far a tenth of the tolerance changes E.
 
     `heldout_per_sample` is the difference of the log densities per held-out sample with its standard error.
     """
@@ -135,8 +137,8 @@ class Series:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Laws by how well they explain the recordings, the best one first, and the best against every other; `law` is the one that
-    the data name, if they name one, and `verdict` says it in plain words.
+    """Laws by how well they explain the recordings, the best one first, and the best against every other; `law` is the
+    one that the data name, if they name one, and `verdict` says it in plain words.
     """
 
     outcome: Outcome

@@ -32,8 +32,8 @@ def told_apart(sd: float, value: float = 1.0) -> float:
 
 
 class Rest(Table):
-    """A recording that begins at rest, the disc on the lower pad at `scenario.x_C0`, known to `position_sd` [m], and the
-    bracket clear of it."""
+    """A recording that begins at rest, the disc on the lower pad at `scenario.x_C0`, known to `position_sd` [m], and
+    the bracket clear of it."""
 
     kind: Literal["rest"] = "rest"
     position_sd: Annotated[float, AfterValidator(told_apart)] = Field(default=0.0, ge=0, le=0.1)
@@ -52,8 +52,8 @@ class Known(Table):
 
 
 class Moving(Table):
-    """A recording that begins anywhere, in motion or in mid-grasp: its samples of the first `lead` [s] tell where, with what is
-    `given` of coordinates such as "disc.x" and "disc.v_x"."""
+    """A recording that begins anywhere, in motion or in mid-grasp: its samples of the first `lead` [s] tell where, with
+    what is `given` of coordinates such as "disc.x" and "disc.v_x"."""
 
     kind: Literal["moving"] = "moving"
     lead: float = Field(default=LEAD, gt=0, le=10)
@@ -103,7 +103,8 @@ class GeneralisedKelvinPads(Table):
 
 
 class PronyPads(Table):
-    """Pads with a relaxation series: `moduli` [Pa] on top of `pad.E`, the relaxed one, that fade in the times `tau` [s]."""
+    """Pads with a relaxation series: `moduli` [Pa] on top of `pad.E`, the relaxed one, that fade in the times `tau`
+    [s]."""
 
     kind: Literal["prony"] = "prony"
     moduli: Annotated[tuple[Annotated[float, Field(ge=1e-6, le=1e13)], ...], LISTED]
@@ -115,8 +116,9 @@ Pads = Annotated[KelvinVoigtPads | StandardLinearPads | GeneralisedKelvinPads | 
 
 
 class Entry(Table):
-    """One more recording, called `name` or like its file: its columns stand in `file`, or in several `files` next to the
-    configuration, each with times of its own. Without a file it has what is particular about the recording of that name."""
+    """One more recording, called `name` or like its file: its columns stand in `file`, or in several `files` next to
+    the configuration, each with times of its own. Without a file it has what is particular about the recording of that
+    name."""
 
     name: Name | None = None
     file: File | None = None
@@ -139,8 +141,8 @@ class Entry(Table):
 
 
 class Law(Table):
-    """A competing law: `settings` that differ, such as `contact.friction`, another material of the `pads`, `unknowns` that
-    it has besides or with other bounds, and those that it is `without`."""
+    """A competing law: `settings` that differ, such as `contact.friction`, another material of the `pads`, `unknowns`
+    that it has besides or with other bounds, and those that it is `without`."""
 
     settings: dict[str, Any] = Field(default_factory=dict)
     pads: Pads | None = None
@@ -151,10 +153,10 @@ class Law(Table):
 class Config(Table):
     """An identification as a TOML file states it.
 
-    `settings` are known numbers, by the groups and names of `Parameters`; `unknowns` and `sensors` are tables by the dotted
-    names of parameters and by channels; `heldout` names recordings that are predicted and not fitted, `ignore` columns that
-    are left out, and `acknowledged` findings that are no mistakes. `missing` and `start` hold for all recordings that say
-    nothing else. `compare` has competing laws by name.
+    `settings` are known numbers, by the groups and names of `Parameters`; `unknowns` and `sensors` are tables by the
+    dotted names of parameters and by channels; `heldout` names recordings that are predicted and not fitted, `ignore`
+    columns that are left out, and `acknowledged` findings that are no mistakes. `missing` and `start` hold for all
+    recordings that say nothing else. `compare` has competing laws by name.
     """
 
     unknowns: dict[str, Unknown]
@@ -203,7 +205,8 @@ def understood(name: str) -> str:
 
 
 def in_one_vocabulary(unknowns: Mapping[str, Unknown]) -> dict[str, Unknown]:
-    """Unknowns by their names among `Parameters`, where they have one. Raises `ValueError` for one that is there by both."""
+    """Unknowns by their names among `Parameters`, where they have one. Raises `ValueError` for one that is there by
+    both."""
     out: dict[str, Unknown] = {}
     for name, one in unknowns.items():
         if understood(name) in out:

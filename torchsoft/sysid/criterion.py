@@ -1,4 +1,4 @@
-"""How well parameters would be known: criteria of optimal design, and a ranking of what could be recorded next."""
+"""Criteria of optimal design, a ranking of recordings that could be made next, and the bounds of a designed motion."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,12 +26,12 @@ SHARPNESS = 12.0
 
 @dataclass(frozen=True)
 class Criterion:
-    """One number for a covariance C (s, s) of parameters' relative errors: the logarithm of a standard deviation, the smaller
-    the better.
+    """One number for a covariance C (s, s) of parameters' relative errors: the logarithm of a standard deviation, the
+    smaller the better.
 
-    "D" is the mean logarithm along the axes of the ellipsoid of errors, its volume; "A" the root mean square of the standard
-    deviations over `targets` (s,), 1 where there are none; "worst" the largest of them, smoothed. With one parameter the three
-    are the same, and are called c-optimality. Raises `ValueError`.
+    "D" is the mean logarithm along the axes of the ellipsoid of errors, its volume; "A" the root mean square of the
+    standard deviations over `targets` (s,), 1 where there are none; "worst" the largest of them, smoothed. With one
+    parameter the three are the same, and are called c-optimality. Raises `ValueError`.
     """
 
     optimality: Optimality = "D"
@@ -65,8 +65,8 @@ VOLUME = Criterion()
 
 
 def chosen(problem: Problem, x: Array, names: Sequence[str] | None) -> tuple[tuple[str, ...], Array]:
-    """The parameters `names`, by default every free one that all recordings share, and what their relative errors (s,) are of
-    those of the coordinates x (n,): a matrix (s, n). Raises `ValueError` for others."""
+    """The parameters `names`, by default every free one that all recordings share, and what their relative errors (s,)
+    are of those of the coordinates x (n,): a matrix (s, n). Raises `ValueError` for others."""
     c, one = problem.coordinates, problem.recordings[0]
     values = c.values(x, one.name, one.parameters)
     rows = c.jacobian(x, one.name, values) * c.free / np.array([[values[name]] for name in c.names])
@@ -85,8 +85,9 @@ def deviations(names: Sequence[str], T: Array, C: Array) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Outlook:
-    """A recording that could be made: its duration [s], the relative standard deviations that parameters have without it and
-    would have with it, and the criterion's gain, a logarithm of standard deviations. `lost` says why it cannot be made."""
+    """A recording that could be made: its duration [s], the relative standard deviations that parameters have without
+    it and would have with it, and the criterion's gain, a logarithm of standard deviations. `lost` says why it cannot
+    be made."""
 
     name: str
     seconds: float
@@ -102,9 +103,9 @@ def next_recording(
 ) -> list[Outlook]:  # fmt: skip
     """What should be recorded after the recordings of `problem`, whose coordinates are x (n,), say at the end of a fit?
 
-    Every candidate's Fisher matrix is added to theirs; of its samples only the times count. The best comes first, by what it
-    takes off the `criterion` of the parameters `names`, or by that per second. A prediction: it holds as far as the model
-    does, and for small errors. Raises `ValueError` for candidates that do not fit the problem.
+    Every candidate's Fisher matrix is added to theirs; of its samples only the times count. The best comes first, by
+    what it takes off the `criterion` of the parameters `names`, or by that per second. A prediction: it holds as far as
+    the model does, and for small errors. Raises `ValueError` for candidates that do not fit the problem.
     """
     if not candidates:
         raise ValueError("there is no candidate to rank")
@@ -145,7 +146,8 @@ def next_recording(
     return sorted(out, key=lambda o: (bool(o.lost), -o.gain / (o.seconds if per_second else 1.0)))
 
 
-# What a designed motion may do: knots of a reference's profiles as variables, within bounds of travel, speed and duration.
+# What a designed motion may do: knots of a reference's profiles as variables, within bounds of travel, speed and
+# duration.
 
 
 PEAK = 35 / 16
@@ -155,7 +157,8 @@ PEAK = 35 / 16
 class Bounds(Table):
     """What a signal of the reference may do: values from `low` to `high` [its unit], at `speed` [its unit/s] at most.
 
-    Knots later than `after` [s] are free. Their times are free too if `shortest` [s] is given, the least time between two.
+    Knots later than `after` [s] are free. Their times are free too if `shortest` [s] is given, the least time between
+    two.
     """
 
     low: float
@@ -183,8 +186,9 @@ def profile(reference: Reference, name: str) -> Profile:
 
 
 class Moves:
-    """The variables z (n,) of a motion: values, and times where they are free, of the free knots of some signals, which end by
-    `end` [s]; each over a unit of its own, the way or the time between two knots that are as far apart as speed allows.
+    """The variables z (n,) of a motion: values, and times where they are free, of the free knots of some signals, which
+    end by `end` [s]; each over a unit of its own, the way or the time between two knots that are as far apart as speed
+    allows.
 
     Raises `ValueError` for signals without free knots, and where the motion given is more than the bounds leave to it.
     """
@@ -256,8 +260,8 @@ class Moves:
         return np.concatenate(rows)
 
     def nearest(self, z: Array) -> Array:
-        """The motion within the bounds that is nearest to z, by the sum of what variables move. Raises `ValueError` where there
-        is none."""
+        """The motion within the bounds that is nearest to z, by the sum of what variables move. Raises `ValueError`
+        where there is none."""
         if (self.A @ z <= self.b + 1e-9 * np.abs(self.A).max(1)).all():
             return z
         I, scale = np.eye(self.n), np.abs(self.A).max(1)

@@ -1,10 +1,4 @@
-"""The search for a motion: Adam on the smoothed criterion; the best motion evaluated is kept.
-
-The criterion's slopes (`planner`) are exact, and rough: points that touch, leave and slip earlier or later give it kinks at
-distances of micrometres, each a large slope that means nothing a tenth of a millimetre on. So what is lowered is the
-criterion smoothed over small random motions and over draws of the parameters, by stochastic gradients (Adam): each
-iteration takes one draw and one random shift, which makes the motion robust at no further cost.
-"""
+"""Motions designed for parameters of interest: the knots of set-points, moved by gradient."""
 
 import time as clock
 from collections.abc import Mapping, Sequence
@@ -39,7 +33,8 @@ FAILURES = 5
 
 @dataclass(frozen=True)
 class Visit:
-    """The motion after some iterations: the criterion over all draws, and how much of the way to its limit a channel goes."""
+    """The motion after some iterations: the criterion over all draws, and how much of the way to its limit a channel
+    goes."""
 
     iteration: int
     value: float
@@ -142,10 +137,10 @@ BENT = 1.0
 class Design:
     """A motion and what it is worth.
 
-    `recording` follows it, and has the samples that the rig would give at the first draw of the parameters, without noise; so
-    has `given`, the motion that the search began with. `before` and `after` are the relative standard deviations with either,
-    from other recordings and priors too. `history` has the criterion as it went, `limits` names what holds the motion back,
-    `notices` what a reader must know.
+    `recording` follows it, and has the samples that the rig would give at the first draw of the parameters, without
+    noise; so has `given`, the motion that the search began with. `before` and `after` are the relative standard
+    deviations with either, from other recordings and priors too. `history` has the criterion as it went, `limits` names
+    what holds the motion back, `notices` what a reader must know.
     """
 
     given: Recording
@@ -158,7 +153,8 @@ class Design:
     made_by: dict[str, Any]
 
     def excitation(self, given: Excitation) -> Excitation:
-        """The motion as an excitation of the paper's rig, after the grasp of the one `given` that the search began with."""
+        """The motion as an excitation of the paper's rig, after the grasp of the one `given` that the search began
+        with."""
         since = given.grasp_time + given.settle
 
         def course(name: str) -> tuple[tuple[float, float], ...]:
@@ -179,9 +175,9 @@ class Design:
 
 
 def draws(problem: Problem, count: int, *, spread: float | None = None, seed: int = 0) -> list[Array]:
-    """`count` points x (n,) of the coordinates, the first the nominal one, the others drawn from their priors, or with the
-    standard deviation `spread` [1] of the logarithm of parameters that have none. Raises `ValueError` where there is
-    neither."""
+    """`count` points x (n,) of the coordinates, the first the nominal one, the others drawn from their priors, or with
+    the standard deviation `spread` [1] of the logarithm of parameters that have none. Raises `ValueError` where there
+    is neither."""
     c, rng = problem.coordinates, np.random.default_rng(seed)
     low, high = c.bounds
     out = [c.start]
@@ -205,19 +201,21 @@ def design(
     robust: Literal["mean", "worst"] = "mean", iterations: int = 100, rate: float = 0.03, smoothing: float = 0.02,
     rtol: float = RTOL, seed: int = 0, workers: int = 1, progress: bool = False,
 ) -> Design:  # fmt: skip
-    """Move the knots of the recording `plan` of a problem until the parameters `names` (all, by default) are known best.
+    """Move the knots of the recording `plan` of a problem until the parameters `names` (all, by default) are known
+    best.
 
     Of the plan's samples only the times count; the other recordings and the priors count with what they tell. Sensors'
     biases and the like are nuisances: what the criterion sees is what is left when they are fitted too; and, beside the
     covariance, how far finite steps and bent samples would lead a fit astray (`Planner.errors`). `bounds` holds the
-    travel, speed and free knots of signals of the reference, `limits` the ranges (low, high) [unit] of channels of the run,
-    such as forces. `at` are points x of the coordinates (`draws`), by default the nominal one; the criterion's "mean" over them
-    is lowered, or the "worst".
+    travel, speed and free knots of signals of the reference, `limits` the ranges (low, high) [unit] of channels of the
+    run, such as forces. `at` are points x of the coordinates (`draws`), by default the nominal one; the criterion's
+    "mean" over them is lowered, or the "worst".
 
-    The search begins with the plan's own motion. Each of the `iterations` moves knots by at most about `rate` times what speed
-    allows from one to the next, shifted at random by `smoothing` times that, and takes a run with sensitivities and 2 n with
-    the adjoint, of relative tolerance `rtol`. A motion that cannot be run is left; with Ctrl-C the best so far is returned,
-    with a notice. Raises `ValueError` for what does not fit together, and where the plan itself cannot be run.
+    The search begins with the plan's own motion. Each of the `iterations` moves knots by at most about `rate` times
+    what speed allows from one to the next, shifted at random by `smoothing` times that, and takes a run with
+    sensitivities and 2 n with the adjoint, of relative tolerance `rtol`. A motion that cannot be run is left; with
+    Ctrl-C the best so far is returned, with a notice. Raises `ValueError` for what does not fit together, and where the
+    plan itself cannot be run.
     """
     if plan not in problem.names:
         raise ValueError(f"`plan` must be one of the recordings {list(problem.names)}, but is {plan!r}")

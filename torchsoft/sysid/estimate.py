@@ -20,7 +20,8 @@ from torchsoft.tables import Number
 CONFIDENCE = 0.95
 
 IDENTIFIABLE = 0.5
-"""Standard deviation of a coordinate [1] above which it counts as not identifiable: its interval spans a factor of seven."""
+"""Standard deviation of a coordinate [1] above which it counts as not identifiable: its interval spans a factor of
+seven."""
 
 Seen = Annotated[bool, Field(alias="seen")]
 """Called `seen` in files, since the first version of them."""
@@ -28,10 +29,11 @@ Seen = Annotated[bool, Field(alias="seen")]
 
 @dataclass(frozen=True)
 class Estimate:
-    """One parameter (or a coordinate of a start, or something wrong with a sensor) in one recording or in all: value, 95 %
-    interval, standard deviation over the value. One that is not identifiable has neither value nor interval, but `last`,
-    where the search happened to end. `kind` is "parameter", "start", or what is wrong with the sensor, `start` where the
-    search began, and `step_bias_sd` what the steps of the simulation shift the estimate by, in standard deviations."""
+    """One parameter (or a coordinate of a start, or something wrong with a sensor) in one recording or in all: value,
+    95 % interval, standard deviation over the value. One that is not identifiable has neither value nor interval, but
+    `last`, where the search happened to end. `kind` is "parameter", "start", or what is wrong with the sensor, `start`
+    where the search began, and `step_bias_sd` what the steps of the simulation shift the estimate by, in standard
+    deviations."""
 
     name: str
     unit: str
@@ -55,7 +57,8 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Direction:
-    """An eigenvector of the Fisher matrix in the coordinates: its standard deviation and its largest components by label."""
+    """An eigenvector of the Fisher matrix in the coordinates: its standard deviation and its largest components by
+    label."""
 
     sd: float
     identifiable: Seen
@@ -64,8 +67,8 @@ class Direction:
 
 @dataclass(frozen=True)
 class ChannelResiduals:
-    """Residuals of one channel in one recording, over the noise and whitened, without what saturation has changed: their rms,
-    the first autocorrelation, and the Ljung-Box p-value of their whiteness."""
+    """Residuals of one channel in one recording, over the noise and whitened, without what saturation has changed:
+    their rms, the first autocorrelation, and the Ljung-Box p-value of their whiteness."""
 
     recording: str
     channel: str
@@ -76,8 +79,8 @@ class ChannelResiduals:
 
 
 class Quantity(NamedTuple):
-    """Something that is estimated: its value, that at the start, and how it moves with the coordinates (n,): its logarithm, or
-    the value over `size`. `places` are the coordinates that move it."""
+    """Something that is estimated: its value, that at the start, and how it moves with the coordinates (n,): its
+    logarithm, or the value over `size`. `places` are the coordinates that move it."""
 
     name: str
     kind: str
@@ -169,7 +172,8 @@ def directions(labels: list[str], values: Array, vectors: Array) -> list[Directi
 
 
 def split(problem: Problem, r: Array, which: list[str]) -> dict[tuple[str, str], Array]:
-    """Rows (m, ...) of residuals, or of their Jacobian, by recording and channel, in the order of `Problem.residuals`."""
+    """Rows (m, ...) of residuals, or of their Jacobian, by recording and channel, in the order of
+    `Problem.residuals`."""
     out, at = {}, 0
     for recording in problem.recordings:
         for channel in problem.sensors if recording.name in which else ():
@@ -181,7 +185,8 @@ def split(problem: Problem, r: Array, which: list[str]) -> dict[tuple[str, str],
 
 
 def nrmse(problem: Problem, r: Array, which: list[str]) -> dict[str, dict[str, float]]:
-    """RMS residual over the range of what was measured, by recording and channel, without what saturation has changed."""
+    """RMS residual over the range of what was measured, by recording and channel, without what saturation has
+    changed."""
     out: dict[str, dict[str, float]] = {name: {} for name in which}
     measured = {recording.name: recording.samples for recording in problem.recordings}
     for part in parts(problem.with_noise({}), r, which):
@@ -210,9 +215,9 @@ def residual_channels(problem: Problem, residuals: Residuals, which: list[str]) 
 
 @dataclass(frozen=True)
 class Contribution:
-    """What one recording told about the estimates, or what the priors did (`source` is None then): its share of the weight in
-    each, by label, all sources together being 1, and how many times larger the standard deviation would be without it; none
-    where the others do not determine the estimate."""
+    """What one recording told about the estimates, or what the priors did (`source` is None then): its share of the
+    weight in each, by label, all sources together being 1, and how many times larger the standard deviation would be
+    without it; none where the others do not determine the estimate."""
 
     source: str | None
     rows: int
@@ -223,7 +228,8 @@ class Contribution:
 def contributions(
     problem: Problem, x: Array, free: NDArray[np.bool_], J: Array, fitted: Sequence[str]
 ) -> list[Contribution]:
-    """Of the recordings `fitted`, whose rows the whitened Jacobian J (m, n) at x (n,) has, before those of the priors."""
+    """Of the recordings `fitted`, whose rows the whitened Jacobian J (m, n) at x (n,) has, before those of the
+    priors."""
     rows, at = dict[str | None, slice](), 0
     for (name, _), part in split(problem, J, list(fitted)).items():
         begin = rows[name].start if name in rows else at

@@ -1,4 +1,5 @@
-"""Pictures of an identification: estimates, what recordings told, the Fisher spectrum, correlations, profiles, residuals."""
+"""Pictures of an identification: estimates, what recordings told, the Fisher spectrum, correlations, profiles,
+residuals."""
 
 from collections.abc import Sequence
 from textwrap import fill, shorten
@@ -41,8 +42,8 @@ REST = "#bbbbbb"
 
 
 class Trace(NamedTuple):
-    """One channel of one recording: its unit, times (k,) [s], samples measured and predicted (k,), and residuals over the noise
-    (k,), as they are and whitened."""
+    """One channel of one recording: its unit, times (k,) [s], samples measured and predicted (k,), and residuals over
+    the noise (k,), as they are and whitened."""
 
     recording: str
     channel: str
@@ -132,7 +133,8 @@ def correlation_figure(result: IdentificationResult) -> Figure:
 
 @rc_context(STYLE)
 def spectrum_figure(result: IdentificationResult) -> Figure:
-    """Standard deviation along each eigenvector of the Fisher matrix, its name above its bar; orange: not identifiable."""
+    """Standard deviation along each eigenvector of the Fisher matrix, its name above its bar; orange: not
+    identifiable."""
     n = len(result.directions)
     figure = Figure(figsize=(WIDTH, 1.0 + 0.5 * n), layout="constrained")
     axes = figure.subplots()
@@ -221,8 +223,8 @@ def profile_figure(profile: Profile, unit: str) -> Figure:
 
 @rc_context(STYLE)
 def trace_figure(trace: Trace, channel: ChannelResiduals | None, noise: Autoregression | None = None) -> Figure:
-    """Measured and predicted, residuals over the noise, and the autocorrelation of those that are to be white, with its band;
-    where the noise is coloured, that before and that of its model too."""
+    """Measured and predicted, residuals over the noise, and the autocorrelation of those that are to be white, with its
+    band; where the noise is coloured, that before and that of its model too."""
     shown, scale = SHOWN.get(trace.unit, (trace.unit, 1.0))
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     data, residual, correlation = figure.subplots(3, 1, height_ratios=(2.1, 1, 1))
@@ -270,9 +272,9 @@ MOST = 4
 
 @rc_context(STYLE)
 def plot(comparison: Comparison, other: str | None = None) -> Figure:
-    """The evidence against `other` (by default the law next to the best) as it grows along each recording, in all and by the
-    channels that tell most, and both laws' residuals of the channel that tells most. Raises `ValueError` for a law that was
-    not compared with the best, and where the residuals have not been kept."""
+    """The evidence against `other` (by default the law next to the best) as it grows along each recording, in all and
+    by the channels that tell most, and both laws' residuals of the channel that tells most. Raises `ValueError` for a
+    law that was not compared with the best, and where the residuals have not been kept."""
     chosen = [v for v in comparison.against if other in (None, v.other)]
     if not chosen:
         raise ValueError(

@@ -1,5 +1,5 @@
-"""The information in a Jacobian: covariance of the coordinates, their shift by an error of the model, and which combinations
-of parameters are seen where each of them is not."""
+"""Least squares on frozen steps: Gauss-Newton on exact sensitivities, descent on the adjoint, covariance and robust
+losses."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,13 +25,14 @@ def fisher(J: Array) -> tuple[Array, Array, Array]:
 
 
 def standard_deviations(J: Array) -> Array:
-    """Cramer-Rao: standard deviations (n,) of the coordinates of a whitened Jacobian (m, n); huge without information."""
+    """Cramer-Rao: standard deviations (n,) of the coordinates of a whitened Jacobian (m, n); huge without
+    information."""
     return np.sqrt(np.diag(fisher(J)[0]))
 
 
 def shift(J: Array, difference: Array) -> Array:
-    """How far coordinates (n,) at a least-squares fit are from those of a finer model: `difference` (m,) is what the residuals
-    of the finer one, at the fit, have more."""
+    """How far coordinates (n,) at a least-squares fit are from those of a finer model: `difference` (m,) is what the
+    residuals of the finer one, at the fit, have more."""
     return np.asarray(np.linalg.lstsq(J, difference, rcond=None)[0], np.float64)
 
 
@@ -45,14 +46,14 @@ MINE = 0.7
 """Correlation of a parameter with a direction above which its uncertainty comes from there."""
 
 EXPONENTS = {1.0: 0.1, 0.5: 0.1, 0.1: 0.2, 0.05: 0.2}
-"""What exponents are rounded to multiples of, the roundest first, and the part of its parameters' least standard deviation that
-a combination may then have whatever it had."""
+"""What exponents are rounded to multiples of, the roundest first, and the part of its parameters' least standard
+deviation that a combination may then have whatever it had."""
 
 
 @dataclass(frozen=True)
 class Combination:
-    """A product of powers of parameters that data see better than each of its factors: exponents and standard deviations of
-    the parameters by label, and the standard deviation of the product, all relative."""
+    """A product of powers of parameters that data see better than each of its factors: exponents and standard
+    deviations of the parameters by label, and the standard deviation of the product, all relative."""
 
     exponents: dict[str, float]
     sds: dict[str, float]
@@ -78,12 +79,12 @@ def percent(sd: float) -> str:
 
 
 def combinations(labels: Sequence[str], C: Array, blurred: float) -> list[Combination]:
-    """What is seen of parameters that are not: for every direction in which they are less certain than `blurred` together, the
-    best determined product of powers of the parameters that take part.
+    """What is seen of parameters that are not: for every direction in which they are less certain than `blurred`
+    together, the best determined product of powers of the parameters that take part.
 
-    C (n, n) is the covariance of the logarithms of the parameters `labels`, whatever else was fitted being left out of it. A
-    direction whose product is not `CLOSER` times better known than each of its factors is left out: its parameters are not
-    seen at all.
+    C (n, n) is the covariance of the logarithms of the parameters `labels`, whatever else was fitted being left out of
+    it. A direction whose product is not `CLOSER` times better known than each of its factors is left out: its
+    parameters are not seen at all.
     """
     values, vectors = np.linalg.eigh(C)
     out: list[Combination] = []
@@ -147,7 +148,8 @@ def rho(loss: Loss, z: Array) -> Array:
 
 
 def spared(loss: Loss, priors: int) -> Callable[[Array], Array]:
-    """The loss as `least_squares` takes it, linear in the last rows, which are `priors`; its `f_scale` is `REACH[loss]`."""
+    """The loss as `least_squares` takes it, linear in the last rows, which are `priors`; its `f_scale` is
+    `REACH[loss]`."""
 
     def rows(z: Array) -> Array:
         data = len(z) - priors
@@ -157,13 +159,13 @@ def spared(loss: Loss, priors: int) -> Callable[[Array], Array]:
 
 
 def covariance(J: Array, r: Array, loss: Loss, priors: int = 0, exact: NDArray[np.int_] | None = None) -> Array:
-    """Of the coordinates (n, n) where a robust fit has ended: J (m, n) and residuals r (m,) there, the last rows `priors`.
+    """Of the coordinates (n, n) where a robust fit has ended: J (m, n) and residuals r (m,) there, the last rows
+    `priors`.
 
-    With psi = rho' r, A = E[psi'] J'J and B = E[psi^2] J'J, both with the priors' own J'J, it is A^-1 B A^-1; expectations are
-    means over the residuals, that of psi^2 over the degrees of freedom; over those `exact` (k,) only, where some samples are
-    saturated. They are not taken below what Gaussian noise as stated
-    gives, 1 over the loss's efficiency. Raises `ValueError` where so many residuals are outliers that nothing holds the
-    estimates.
+    With psi = rho' r, A = E[psi'] J'J and B = E[psi^2] J'J, both with the priors' own J'J, it is A^-1 B A^-1;
+    expectations are means over the residuals, that of psi^2 over the degrees of freedom; over those `exact` (k,) only,
+    where some samples are saturated. They are not taken below what Gaussian noise as stated gives, 1 over the loss's
+    efficiency. Raises `ValueError` where so many residuals are outliers that nothing holds the estimates.
     """
     m, n = len(r) - priors, J.shape[1]
     own = r[:m] if exact is None else r[exact]
@@ -189,8 +191,8 @@ SETTLED = 0.2
 
 
 class Unreachable(RuntimeError):
-    """The model cannot follow a recording with the parameters that a fit starts from; `lost` has reason and time, `looks`
-    what looked wrong with the recordings themselves."""
+    """The model cannot follow a recording with the parameters that a fit starts from; `lost` has reason and time,
+    `looks` what looked wrong with the recordings themselves."""
 
     def __init__(self, lost: dict[str, FailedRun], looks: Sequence[str] = ()) -> None:
         reasons = "; ".join(f"recording `{name}`: {loss.reason}" for name, loss in lost.items())
@@ -200,8 +202,8 @@ class Unreachable(RuntimeError):
 
 
 class Fit(NamedTuple):
-    """Where a fit on `steps` ended: coordinates x (n,), chi2 (sum of squared residuals over their number), evaluations, whether
-    it converged, and the residuals there with their Jacobian, if that was computed."""
+    """Where a fit on `steps` ended: coordinates x (n,), chi2 (sum of squared residuals over their number), evaluations,
+    whether it converged, and the residuals there with their Jacobian, if that was computed."""
 
     x: Array
     chi2: float
@@ -216,12 +218,12 @@ def gauss_newton(
     evaluations: int = 30, tolerance: float = 1e-6, loss: Loss = "linear", notify: Notify = lambda chi2: None,
     first: Residuals | None = None,
 ) -> Fit:  # fmt: skip
-    """`scipy.optimize.least_squares` (trust-region reflective, bounded, robust `loss` but for priors) on the coordinates that
-    are `free`.
+    """`scipy.optimize.least_squares` (trust-region reflective, bounded, robust `loss` but for priors) on the
+    coordinates that are `free`.
 
-    `tolerance` is relative, on the misfit and on the coordinates. A trial that cannot be simulated shortens the step. `first`
-    holds residuals and Jacobian at x, if they are known.
-    Raises `Unreachable` where the start cannot be simulated.
+    `tolerance` is relative, on the misfit and on the coordinates. A trial that cannot be simulated shortens the step.
+    `first` holds residuals and Jacobian at x, if they are known. Raises `Unreachable` where the start cannot be
+    simulated.
     """
     low, high = problem.coordinates.bounds
     gap = 1e-9 * (high - low)
@@ -259,9 +261,9 @@ def chord(
     problem: Problem, runner: Runner, x: Array, at: Residuals, *, which: Sequence[str], free: NDArray[np.bool_],
     steps: StepsByName, rounds: int = 5, notify: Notify = lambda chi2: None,
 ) -> Fit:  # fmt: skip
-    """From a fit on other steps to the one on these: `at` holds the residuals at x on these steps, and the Jacobian on the
-    others, which is kept; until a coordinate would move by less than `SETTLED` standard deviations. A round costs a run, not
-    a Jacobian. It ends where a run fails or the misfit grows.
+    """From a fit on other steps to the one on these: `at` holds the residuals at x on these steps, and the Jacobian on
+    the others, which is kept; until a coordinate would move by less than `SETTLED` standard deviations. A round costs a
+    run, not a Jacobian. It ends where a run fails or the misfit grows.
     """
     count = 0
     while not (converged := settled(problem, x, at, free)) and count < rounds:
@@ -276,8 +278,8 @@ def chord(
 
 
 def newton_step(problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_]) -> Array:
-    """What Gauss-Newton adds to the free coordinates at x: the least squares within their bounds. To clip the free step would
-    not do: what is held at a bound leaves the others where they are."""
+    """What Gauss-Newton adds to the free coordinates at x: the least squares within their bounds. To clip the free step
+    would not do: what is held at a bound leaves the others where they are."""
     low, high = (bound[free] - x[free] for bound in problem.coordinates.bounds)
     step = -shift(at.J[:, free], at.r)
     if ((low <= step) & (step <= high)).all():
@@ -296,10 +298,11 @@ def descend(
     method: Literal["lbfgs", "adam"] = "lbfgs", evaluations: int = 100, rate: float = 0.05,
     notify: Notify = lambda chi2: None,
 ) -> Fit:  # fmt: skip
-    """torch's LBFGS (strong Wolfe) or Adam (learning `rate`) on the misfit, bounds kept by a sigmoid; the best point visited.
+    """torch's LBFGS (strong Wolfe) or Adam (learning `rate`) on the misfit, bounds kept by a sigmoid; the best point
+    visited.
 
-    For many unknowns: a gradient costs less than one run more, however many there are. For a handful `gauss_newton` needs far
-    fewer runs. Raises `Unreachable` where the start cannot be simulated.
+    For many unknowns: a gradient costs less than one run more, however many there are. For a handful `gauss_newton`
+    needs far fewer runs. Raises `Unreachable` where the start cannot be simulated.
     """
     low, high = (torch.from_numpy(b) for b in problem.coordinates.bounds)
     mask, fraction = torch.from_numpy(free), (torch.from_numpy(x) - low) / (high - low)

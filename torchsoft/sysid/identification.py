@@ -1,4 +1,4 @@
-"""How to fit: what may be said of it in a call and in a file, and what goes together."""
+"""`identify`: a plan of stages, the tests at their end, and the result with its notices; `explain`."""
 
 import sys
 import time as clock
@@ -45,8 +45,8 @@ from torchsoft.sysid.sensitivity import Checked, assumption_notices, check_assum
 from torchsoft.tables import SEED, Table, plain
 
 RTOL = 1e-5
-"""Relative tolerance of the last stage: derivatives are then right to some percent, and estimates to a fraction of a standard
-deviation where sensors are as good as `RIG`."""
+"""Relative tolerance of the last stage: derivatives are then right to some percent, and estimates to a fraction of a
+standard deviation where sensors are as good as `RIG`."""
 
 Assumed = Literal["checked", "explained", "trusted"]
 """Whether assumptions are tested to first order, tested and followed by new fits that look for a cause, or believed."""
@@ -83,7 +83,8 @@ class Settings(Table):
         return self
 
 
-# What is known at the end of a fit: intervals, verdicts on the misfit and on what was taken for granted, and the result.
+# What is known at the end of a fit: intervals, verdicts on the misfit and on what was taken for granted, and the
+# result.
 
 
 class How(NamedTuple):
@@ -192,8 +193,8 @@ def tested_assumptions(
     coloured: Coloured, runner: Runner, end: Settled, stage: Stage, free: NDArray[np.bool_], doubtful: bool, how: How,
     progress: bool,
 ) -> Checked:  # fmt: skip
-    """The checks at the end of a fit, on residuals with the colour that was declared and no other: what was found unasked may
-    be the very trace of a wrong assumption. Their columns then get all the noise."""
+    """The checks at the end of a fit, on residuals with the colour that was declared and no other: what was found
+    unasked may be the very trace of a wrong assumption. Their columns then get all the noise."""
     problem, which = coloured.problem, stage.recordings
     declared = {channel: noise for channel, noise in problem.noise.items() if problem.sensors[channel].colour == "ar"}
     plain = problem.with_noise(declared)
@@ -208,7 +209,8 @@ def tested_assumptions(
 
 
 def guesses(problem: Problem, x: Array, heldout: Sequence[str]) -> list[str]:
-    """Sentences on recordings that were predicted with values of their own, which no recording that was fitted tells."""
+    """Sentences on recordings that were predicted with values of their own, which no recording that was fitted
+    tells."""
     out = []
     for k in (k for k, name in enumerate(problem.names) if name in heldout):
         mine = [c for c in problem.coordinates.all if c.recording == problem.names[k] and not c.fixed]
@@ -252,24 +254,24 @@ def identify(
 ) -> IdentificationResult:  # fmt: skip
     """Find the unknown parameters of `problem`, with intervals, and find which of them the data do not determine.
 
-    Every stage of the `plan` (`default_plan` by default, whose first stage is begun from `starts` Sobol points by `seed`)
-    freezes the steps that its tolerance chooses at its start, one sequence a recording, so that residuals are smooth in the
-    unknowns. `rtol` is the last stage's. At the end a run with a tenth of it tells how far the steps shift the estimates:
-    where that is more than `STEP_BIAS` standard deviations, the fit goes on with a tenth of the tolerance, up to
-    `tightenings` times (with the linear loss). `loss` is scipy's robust loss; `method` may descend on the adjoint instead,
-    with the linear loss only.
-    Recordings named in `heldout` are predicted, not fitted; `workers` threads run side by side. With a `checkpoint`
-    folder every run is kept there: an identification that was interrupted, called again with the same arguments, continues
-    where it was.
+    Every stage of the `plan` (`default_plan` by default, whose first stage is begun from `starts` Sobol points by
+    `seed`) freezes the steps that its tolerance chooses at its start, one sequence a recording, so that residuals are
+    smooth in the unknowns. `rtol` is the last stage's. At the end a run with a tenth of it tells how far the steps
+    shift the estimates: where that is more than `STEP_BIAS` standard deviations, the fit goes on with a tenth of the
+    tolerance, up to `tightenings` times (with the linear loss). `loss` is scipy's robust loss; `method` may descend on
+    the adjoint instead, with the linear loss only. Recordings named in `heldout` are predicted, not fitted; `workers`
+    threads run side by side. With a `checkpoint` folder every run is kept there: an identification that was
+    interrupted, called again with the same arguments, continues where it was.
 
-    At the end the assumptions (mesh, touch-down ramp, place of the disc, numbers that are called known, faults of sensors, the
-    friction law) are tested to first order, a run each, and intervals allow for constants of the computation that the data
-    cannot tell. Where no test explains a misfit, a notice names the candidates, and `explain` tries them. Before the fit
-    recordings are held against what such a rig can do at all: signs, units, delays, zeros, set-points, the body that a loop
-    senses; `acknowledged` names findings that are no mistakes. With `assumptions` = "trusted" both are left out.
+    At the end the assumptions (mesh, touch-down ramp, place of the disc, numbers that are called known, faults of
+    sensors, the friction law) are tested to first order, a run each, and intervals allow for constants of the
+    computation that the data cannot tell. Where no test explains a misfit, a notice names the candidates, and `explain`
+    tries them. Before the fit recordings are held against what such a rig can do at all: signs, units, delays, zeros,
+    set-points, the body that a loop senses; `acknowledged` names findings that are no mistakes. With `assumptions` =
+    "trusted" both are left out.
 
-    Raises `ValueError` for what `Settings` does not take, and for recordings that are not there or cannot be what they are
-    taken for, `Unreachable` where the model cannot follow the data.
+    Raises `ValueError` for what `Settings` does not take, and for recordings that are not there or cannot be what they
+    are taken for, `Unreachable` where the model cannot follow the data.
     """
     unknown = set(heldout) - set(problem.names)
     if unknown or len(set(heldout)) == len(problem.recordings):
@@ -310,9 +312,9 @@ def identify(
 def explain(problem: Problem, **how: Any) -> IdentificationResult:
     """Identify, and look for the cause of a misfit that no test of an assumption explains to first order.
 
-    The fit is repeated without one assumption after the other (another law, number, mesh, place, sensor) until one explains the
-    data: some minutes each, with progress that names it. Takes the arguments of `identify`, and with its `checkpoint` begins
-    where that ended; Ctrl-C keeps what was tried. Raises what `identify` does.
+    The fit is repeated without one assumption after the other (another law, number, mesh, place, sensor) until one
+    explains the data: some minutes each, with progress that names it. Takes the arguments of `identify`, and with its
+    `checkpoint` begins where that ended; Ctrl-C keeps what was tried. Raises what `identify` does.
     """
     return identify(problem, **how, assumptions="explained")
 

@@ -1,7 +1,7 @@
 """Where the run of a recording begins: at rest in a known place, in a known state, or where some coordinates tell.
 
-A start adds coordinates of its own to a problem, called `start.<body>.<axis>` and the like, each with a prior; their values
-travel with those of the parameters, and the state at the beginning is differentiable in both.
+A start adds coordinates of its own to a problem, called `start.<body>.<axis>` and the like, each with a prior; their
+values travel with those of the parameters, and the state at the beginning is differentiable in both.
 """
 
 import warnings
@@ -32,7 +32,8 @@ PREFIX = "start."
 """How the names of a start's coordinates begin."""
 
 SETTLE = 0.2
-"""Time [s] that a disc at rest is given, before the first sample, to sink into the pad: twenty of the pads' own times tau."""
+"""Time [s] that a disc at rest is given, before the first sample, to sink into the pad: twenty of the pads' own times
+tau."""
 
 FORGOTTEN = 3.0
 """Longest retardation times of the pads after which what a start gets wrong of their displacements counts as gone."""
@@ -42,7 +43,8 @@ BOUNDS = 8.0
 
 
 class StartCoordinate(NamedTuple):
-    """One coordinate of a start: its name, its prior's mean, where the search begins, and its standard deviation [SI]."""
+    """One coordinate of a start: its name, its prior's mean, where the search begins, and its standard deviation
+    [SI]."""
 
     name: str
     mean: float
@@ -72,7 +74,8 @@ class Start(Protocol):
 
 
 class AtRest(NamedTuple):
-    """The disc of the paper's rig at rest on the lower pad at x [m], by default `scenario.x_C0`, and the bracket clear of it.
+    """The disc of the paper's rig at rest on the lower pad at x [m], by default `scenario.x_C0`, and the bracket clear
+    of it.
 
     `position_sd` [m] is how well that is known: above zero the place of the disc is a coordinate, `start.disc.x`. The
     displacements of the pads are those at the nominal parameters, whatever the others are: most of what that gets wrong
@@ -118,7 +121,8 @@ class Known(NamedTuple):
 
 
 class RestState:
-    """The state of `AtRest`: displacements stay when parameters change, and massless pads get the forces that hold them so."""
+    """The state of `AtRest`: displacements stay when parameters change, and massless pads get the forces that hold them
+    so."""
 
     def __init__(self, nominal: SoftGrasp, rig: SoftGrasp, x: float) -> None:
         self.rig, self.nominal = rig, deepcopy(nominal).requires_grad_(False)
@@ -158,11 +162,11 @@ def warn_of_memory(rig: Rig, lead: float) -> None:
 
 
 def held_forces(pad: Pad, z: Tensor, nominal: Pad) -> Tensor:
-    """Forces (branches, nodes, 2) [N] that make, with the pad's present material, the displacements that z makes with the
-    nominal one.
+    """Forces (branches, nodes, 2) [N] that make, with the pad's present material, the displacements that z makes with
+    the nominal one.
 
-    They are in proportion to E depth, which needs no linear solve: a solve's last bits differ from call to call, and a run that
-    is made again must be the same.
+    They are in proportion to E depth, which needs no linear solve: a solve's last bits differ from call to call, and a
+    run that is made again must be the same.
     """
     material, was = pad.material, nominal.material
     if float(material.nu.detach()) != float(was.nu):

@@ -1,4 +1,7 @@
-"""What an identification will cost."""
+"""Recordings and problems as files state them, and the cost of an identification.
+
+Every error is a `ValueError` in a sentence that names the file, and the row and column or the field.
+"""
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -57,8 +60,8 @@ def cost(
     heldout: tuple[str, ...] = (),
     method: str = "gauss_newton",
 ) -> Cost:
-    """Of `default_plan` where every stage takes all its evaluations, and of the checks before and after it; descents on the
-    adjoint take more of them, and memory for a matrix that interpolates between the rows. For the paper's rig."""
+    """Of `default_plan` where every stage takes all its evaluations, and of the checks before and after it; descents on
+    the adjoint take more of them, and memory for a matrix that interpolates between the rows. For the paper's rig."""
     fitted = [r for r in problem.recordings if r.name not in heldout]
     slowest = min(fitted, key=lambda r: r.speed)
     rows = {r.name: len(r.grid(problem.interpolated).t) for r in problem.recordings}
@@ -123,8 +126,8 @@ STATED = "as stated"
 
 @dataclass(frozen=True)
 class Case:
-    """A problem as its files state it; `tables` are the recordings' by name; `laws`, if there are competing ones, are that
-    problem and those with the others."""
+    """A problem as its files state it; `tables` are the recordings' by name; `laws`, if there are competing ones, are
+    that problem and those with the others."""
 
     problem: Problem
     config: Config
@@ -133,7 +136,8 @@ class Case:
 
 
 def known_parameters(config: Path, name: str, tables: Tables, *settings: dict[str, Any]) -> Parameters:
-    """Parameters of the recording `name`: the settings, the later ones first, with the reach of its set-points as scenario.
+    """Parameters of the recording `name`: the settings, the later ones first, with the reach of its set-points as
+    scenario.
 
     Raises `ValueError` naming the configuration and the field, or the row where nothing is grasped.
     """
@@ -185,8 +189,8 @@ def check_plausible(tables: Tables, p: Parameters, sensors: Mapping[str, Sensor]
 
 
 def check_rest(tables: Tables, p: Parameters, sensors: Mapping[str, Sensor], position_sd: float) -> None:
-    """Raises `ValueError` for a recording that does not begin at rest, with the disc where `scenario.x_C0` says and the bracket
-    clear of it; it names row and column."""
+    """Raises `ValueError` for a recording that does not begin at rest, with the disc where `scenario.x_C0` says and the
+    bracket clear of it; it names row and column."""
     H, x_C0, first = apart(p), p.scenario.x_C0, tables.begin
     down = tables.of("y_d")
     begin = {"x_d": x_C0, "x_C": x_C0, "x_Br": x_C0, "theta": 0.0, "y_Br": down.values["y_d"][0]}
@@ -268,7 +272,8 @@ def sampled(t: np.ndarray, y: np.ndarray, rate: tuple[np.ndarray, np.ndarray] | 
 
 
 def rig(p: Parameters, reference: Reference, pads: Pads) -> SoftGrasp:
-    """The paper's rig, on pads of the material that is stated. Raises `ValueError` for moduli that do not fit together."""
+    """The paper's rig, on pads of the material that is stated. Raises `ValueError` for moduli that do not fit
+    together."""
     q, material = p.pad, None
     if isinstance(pads, StandardLinearPads):
         if pads.E_instant <= p.pad.E:
@@ -290,7 +295,8 @@ def stem(path: Path) -> str:
 
 
 def sources(data: Sequence[str | Path], config: Path, stated: Config) -> dict[str, tuple[Entry, list[Path]]]:
-    """What is particular about every recording, and its files, by name. Raises `ValueError` for names that do not fit."""
+    """What is particular about every recording, and its files, by name. Raises `ValueError` for names that do not
+    fit."""
     own = {entry.name or stem(Path(entry.paths[0])): entry for entry in stated.recordings}
     files = [(stem(Path(file)), [Path(file)]) for file in data]
     files += [(name, [config.parent / path for path in entry.paths]) for name, entry in own.items() if entry.paths]
@@ -310,7 +316,8 @@ def sources(data: Sequence[str | Path], config: Path, stated: Config) -> dict[st
 
 
 def load(data: Sequence[str | Path], config: str | Path) -> Case:
-    """The problem that data files and a configuration state. Raises `ValueError`, and `OSError` for what cannot be read."""
+    """The problem that data files and a configuration state. Raises `ValueError`, and `OSError` for what cannot be
+    read."""
     config = Path(config)
     stated = read_config(config)
     entries, tables = sources(data, config, stated), dict[str, Tables]()

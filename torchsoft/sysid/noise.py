@@ -4,8 +4,8 @@ Residuals (m,) of one channel are in units of the noise that its sensor states. 
 
     u_k = phi_1 u_(k-1) + ... + phi_p u_(k-p) + scale e_k,        e_k independent, normal, of variance 1,
 
-on a regular grid, of which samples may be missing. Its whitener W has W' W = K^-1, K the covariance of the samples that are
-there, so |W r|^2 + log det K is -2 log likelihood, but for a constant, and W J is the Jacobian that belongs to W r.
+on a regular grid, of which samples may be missing. Its whitener W has W' W = K^-1, K the covariance of the samples that
+are there, so |W r|^2 + log det K is -2 log likelihood, but for a constant, and W J is the Jacobian that belongs to W r.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,8 @@ JITTER = 0.05
 """Part of the spacing by which samples may be off their grid."""
 
 MEMORY = 200
-"""Most samples of the past that a whitened one looks back at. Fewer do exactly, as soon as p of them follow each other."""
+"""Most samples of the past that a whitened one looks back at. Fewer do exactly, as soon as p of them follow each
+other."""
 
 ORDERS = 12
 """Largest order that a fit of the noise tries."""
@@ -40,8 +41,8 @@ def spacing(t: Array) -> float:
 
 
 def positions(t: Array, h: float) -> tuple[Array, bool]:
-    """Sample times t (m,) [s] over the spacing h [s], from 0, and whether they are whole numbers, but for `JITTER`; then
-    rounded."""
+    """Sample times t (m,) [s] over the spacing h [s], from 0, and whether they are whole numbers, but for `JITTER`;
+    then rounded."""
     apart = np.diff(t) / h
     whole = np.round(apart)
     regular = bool((np.abs(apart - whole) <= JITTER).all() and (whole >= 1).all())
@@ -69,8 +70,9 @@ def reflections(phi: Sequence[float]) -> Array:
 
 @dataclass(frozen=True)
 class Autoregression:
-    """Coloured noise of one channel: coefficients `phi` (p,), the standard deviation `scale` of the innovations, in units of
-    the noise that the sensor states, and the `spacing` [s] of the samples that they belong to; white without coefficients.
+    """Coloured noise of one channel: coefficients `phi` (p,), the standard deviation `scale` of the innovations, in
+    units of the noise that the sensor states, and the `spacing` [s] of the samples that they belong to; white without
+    coefficients.
 
     Raises `ValueError` where it is not stationary.
     """
@@ -129,9 +131,9 @@ class Autoregression:
     def whitener(self, t: Array) -> sparse.csr_array:
         """W (m, m), lower triangular, for samples at t (m,) [s].
 
-        A row is the sample less what the past predicts, over the standard deviation of that; gaps in the grid are exact, but
-        for what lies more than `MEMORY` samples back. Off a regular grid only order 1 has a meaning, as phi to the power of
-        the time between samples over `spacing`. Raises `ValueError` for higher orders there.
+        A row is the sample less what the past predicts, over the standard deviation of that; gaps in the grid are
+        exact, but for what lies more than `MEMORY` samples back. Off a regular grid only order 1 has a meaning, as phi
+        to the power of the time between samples over `spacing`. Raises `ValueError` for higher orders there.
         """
         k, regular = positions(t, self.spacing)
         m, p = len(t), self.order
@@ -166,8 +168,8 @@ class Autoregression:
 
 
 def pasts(grid: NDArray[np.int_], p: int) -> NDArray[np.int_]:
-    """For samples at the points `grid` (m,): the first one that has to be known to predict each from its past (m,). What came
-    before p in a row does not matter."""
+    """For samples at the points `grid` (m,): the first one that has to be known to predict each from its past (m,).
+    What came before p in a row does not matter."""
     i = np.arange(len(grid))
     begins = np.concatenate(([True], np.diff(grid) != 1))
     run = i - np.maximum.accumulate(np.where(begins, i, 0)) + 1  # samples in a row, up to this one
@@ -182,7 +184,8 @@ def log_det(W: sparse.csr_array) -> float:
 
 @dataclass(frozen=True)
 class Score:
-    """One order that was tried: -2 log likelihood of all samples, and the criteria of Akaike, corrected, and of Bayes."""
+    """One order that was tried: -2 log likelihood of all samples, and the criteria of Akaike, corrected, and of
+    Bayes."""
 
     order: int
     deviance: float
@@ -200,10 +203,10 @@ class NoiseFit(NamedTuple):
 def fit_noise(series: Sequence[tuple[Array, Array]], parameters: float = 0.0, most: int = ORDERS) -> NoiseFit:
     """Noise of one channel from its residuals: times (m,) [s] and residuals (m,) of each recording.
 
-    Every order up to `most`, as far as the samples go, is fitted by Burg's method for segments (de Waele and Broersen, 2000),
-    which gives stationary noise only, and the one with the least Bayesian criterion is taken; its likelihood is exact, with
-    gaps, and where a recording is sampled at a whole part of the highest rate. `parameters` is how many unknowns these
-    residuals have been fitted with. Without such a grid the orders are 0 and 1, by maximum likelihood.
+    Every order up to `most`, as far as the samples go, is fitted by Burg's method for segments (de Waele and Broersen,
+    2000), which gives stationary noise only, and the one with the least Bayesian criterion is taken; its likelihood is
+    exact, with gaps, and where a recording is sampled at a whole part of the highest rate. `parameters` is how many
+    unknowns these residuals have been fitted with. Without such a grid the orders are 0 and 1, by maximum likelihood.
     """
     h, m = min(spacing(t) for t, _ in series), sum(len(t) for t, _ in series)
     if all(positions(t, h)[1] for t, _ in series):
@@ -230,8 +233,8 @@ def segments(t: Array, r: Array, h: float) -> list[Array]:
 
 
 def burg(parts: Sequence[Array], most: int) -> Array:
-    """Reflection coefficients (most,) that forward and backward prediction errors within the pieces, together, make smallest;
-    fewer where the pieces are too short."""
+    """Reflection coefficients (most,) that forward and backward prediction errors within the pieces, together, make
+    smallest; fewer where the pieces are too short."""
     forward, backward, out = [p.copy() for p in parts], [p.copy() for p in parts], []
     for _ in range(most):
         pairs = [(f[1:], b[:-1]) for f, b in zip(forward, backward) if len(f) > 1]

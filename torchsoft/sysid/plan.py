@@ -1,9 +1,9 @@
 """Stages: which data, which unknowns, which ties, in which order.
 
 A fit of everything at once, from far away, ends in a local minimum or in runs that cannot be simulated. So: first the
-slowest recording, for what it can identify; then all of them, with ratios (kinetic over static friction) tied at their upper
-bound, because friction that does not fall with slip always has a solution; then a scan over each ratio, and everything free.
-Tolerances are loose in the beginning, and the last stage takes the full one.
+slowest recording, for what it can identify; then all of them, with ratios (kinetic over static friction) tied at their
+upper bound, because friction that does not fall with slip always has a solution; then a scan over each ratio, and
+everything free. Tolerances are loose in the beginning, and the last stage takes the full one.
 """
 
 import time as clock
@@ -50,11 +50,12 @@ SCANNED = (1.0, 0.85, 0.7, 0.55)
 
 @dataclass(frozen=True)
 class Stage:
-    """One fit: recordings, free coordinates by label, the relative tolerance that chooses its steps, how long, and what is set
-    or scanned before it.
+    """One fit: recordings, free coordinates by label, the relative tolerance that chooses its steps, how long, and what
+    is set or scanned before it.
 
     `tied` sets coordinates to values; `scanned` tries each value, by `LOOSE`, the others held, and keeps the best. With
-    `starts` above one, that many Sobol points within a factor `spread` of the start are fitted, and the best end goes on.
+    `starts` above one, that many Sobol points within a factor `spread` of the start are fitted, and the best end goes
+    on.
     """
 
     name: str
@@ -90,7 +91,8 @@ def visible(J: Array, candidates: NDArray[np.bool_], limit: float = FIRST_LOOK) 
 
 
 def told(problem: Problem, which: Sequence[str]) -> NDArray[np.bool_]:
-    """Coordinates (n,) that recordings may tell something of: not those of other recordings, nor of sensors that they lack."""
+    """Coordinates (n,) that recordings may tell something of: not those of other recordings, nor of sensors that they
+    lack."""
     channels = {channel for recording in problem.recordings if recording.name in which for channel in recording.samples}
     return np.array(
         [
@@ -157,8 +159,8 @@ def progress_bar(label: str, shown: bool) -> Iterator[Notify]:
 def run_stage(
     problem: Problem, runner: Runner, stage: Stage, x: Array, loss: Loss, method: Method, seed: int, notify: Any
 ) -> Fit:
-    """One stage from x: ties, scans, Sobol starts, fit on the steps of each start; the best fit. Raises `Unreachable` where no
-    start can be simulated."""
+    """One stage from x: ties, scans, Sobol starts, fit on the steps of each start; the best fit. Raises `Unreachable`
+    where no start can be simulated."""
     c = problem.coordinates
     for label in (*stage.free, *(label for label, _ in (*stage.tied, *stage.scanned))):
         if label not in c.labels:
@@ -199,7 +201,8 @@ def run_stage(
 def scan(
     problem: Problem, runner: Runner, stage: Stage, x: Array, i: int, values: Sequence[float], notify: Notify
 ) -> Array:
-    """x with the one of the values for coordinate number i that fits best, the others held; all are run side by side."""
+    """x with the one of the values for coordinate number i that fits best, the others held; all are run side by
+    side."""
     rtol = max(LOOSE, stage.rtol)
     trials = [x.copy() for _ in values]
     for trial, value in zip(trials, values):
@@ -234,7 +237,8 @@ def sobol(problem: Problem, x: Array, free: NDArray[np.bool_], stage: Stage, see
 
 
 STEP_BIAS = 0.5
-"""Shift of an estimate by the finite steps, over its standard deviation, above which the tolerance is called too coarse."""
+"""Shift of an estimate by the finite steps, over its standard deviation, above which the tolerance is called too
+coarse."""
 
 FINER = 0.1
 """The tolerance of the check over the one that is checked."""
@@ -247,11 +251,11 @@ ROUNDS = 3
 
 
 class Settled(NamedTuple):
-    """A fit at its end: coordinates x (n,), residuals there by steps that `rtol` chooses at x, with the last Jacobian; how far
-    the steps have moved every coordinate (n,), None where that could not be checked; the fits on other steps since; the
-    residuals by a tenth of the tolerance, those of `at` where these could not be had; and whether the fit is `at_rest`: with
-    steps chosen anew no coordinate would move by more than `SETTLED` standard deviations (where steps are only checked:
-    whether the fit has converged)."""
+    """A fit at its end: coordinates x (n,), residuals there by steps that `rtol` chooses at x, with the last Jacobian;
+    how far the steps have moved every coordinate (n,), None where that could not be checked; the fits on other steps
+    since; the residuals by a tenth of the tolerance, those of `at` where these could not be had; and whether the fit is
+    `at_rest`: with steps chosen anew no coordinate would move by more than `SETTLED` standard deviations (where steps
+    are only checked: whether the fit has converged)."""
 
     x: Array
     at: Residuals
@@ -265,16 +269,16 @@ class Settled(NamedTuple):
 def settle(
     problem: Problem, runner: Runner, stage: Stage, fit: Fit, free: NDArray[np.bool_], tightenings: int, notify: Notify
 ) -> Settled:
-    """Go on from a fit, by its Jacobian and a few runs: with steps chosen anew until they do not matter, and with a tighter
-    tolerance, at most so many times, where a tenth of it shifts an estimate by more than `STEP_BIAS`. With none the steps
-    are kept, and only checked."""
+    """Go on from a fit, by its Jacobian and a few runs: with steps chosen anew until they do not matter, and with a
+    tighter tolerance, at most so many times, where a tenth of it shifts an estimate by more than `STEP_BIAS`. With none
+    the steps are kept, and only checked."""
     x, which, rtol, left, fits = fit.x, stage.recordings, stage.rtol, tightenings, []
     at = fit.at or problem.residuals(runner, x, which, fit.steps, free)
     rounds = ROUNDS if tightenings else 0
 
     def along(start: Residuals, steps: StepsByName) -> bool:
-        """A fit on other steps from residuals on them, by new Jacobians where the last one does not lead to its end; whether
-        it came any further."""
+        """A fit on other steps from residuals on them, by new Jacobians where the last one does not lead to its end;
+        whether it came any further."""
         nonlocal x, at
         common: dict[str, Any] = {"which": which, "free": free, "steps": steps, "notify": notify}
         end = chord(problem, runner, x, start._replace(J=at.J), **common)

@@ -1,17 +1,18 @@
 """The criterion of a motion that could be made, and its slopes by the knots: exact, by 2 n runs of the adjoint.
 
-With the whitened Jacobian J (m, n) of the samples by the coordinates x, the covariance is C = (J'J)^-1; for a criterion phi
-and G = d phi / d(J'J), its derivative by a knot k is
+With the whitened Jacobian J (m, n) of the samples by the coordinates x, the covariance is C = (J'J)^-1; for a criterion
+phi and G = d phi / d(J'J), its derivative by a knot k is
 
     d phi / dk = sum_j W_j . d/dx_j (dr/dk),        W = 2 J G held fixed,
 
-the difference along each x_j of what the discrete adjoint gives by the knots for the weights W_j: 2 n runs, however many
-knots there are.
+the difference along each x_j of what the discrete adjoint gives by the knots for the weights W_j: 2 n runs, however
+many knots there are.
 
-A covariance is what a fit ends with if samples are linear in the parameters, as far as the intervals reach, and runs exact.
-Both fail where a motion is chaotic, whose sensitivities are large and no use. So phi is that of C + mean(e e'), e being a part
-of the errors of one Gauss-Newton step that begins a standard deviation away; its derivative leaves e as it is. Where chaos is
-such that a small change of a parameter changes samples altogether, a motion is refused (`check_predictable`).
+A covariance is what a fit ends with if samples are linear in the parameters, as far as the intervals reach, and runs
+exact. Both fail where a motion is chaotic, whose sensitivities are large and no use. So phi is that of C + mean(e e'),
+e being a part of the errors of one Gauss-Newton step that begins a standard deviation away; its derivative leaves e as
+it is. Where chaos is such that a small change of a parameter changes samples altogether, a motion is refused
+(`check_predictable`).
 """
 
 from collections import Counter
@@ -45,7 +46,8 @@ MARGIN = 0.97
 """Part of the way to a limit from which on it costs, since peaks lie between samples."""
 
 PREDICTABLE = 10.0
-"""Change of a sample with the logarithm of a parameter, over the largest of its channel, above which a motion is no use."""
+"""Change of a sample with the logarithm of a parameter, over the largest of its channel, above which a motion is no
+use."""
 
 FARTHEST = 0.1
 """Relative error of a parameter, at most, with which a fit is tried."""
@@ -61,9 +63,10 @@ PRICE = 5.0
 
 
 class DesignEvaluation(NamedTuple):
-    """One motion at one x: the criterion, what excess costs, how much of the way to their limits channels go, the covariance C
-    (n, n), the `errors` (k, s) of the parameters that the samples' not being linear makes, the criterion's derivative
-    G (n, n) by the Fisher matrix, the rows J (m, n) of the samples, the steps, and the signals of the run."""
+    """One motion at one x: the criterion, what excess costs, how much of the way to their limits channels go, the
+    covariance C (n, n), the `errors` (k, s) of the parameters that the samples' not being linear makes, the criterion's
+    derivative G (n, n) by the Fisher matrix, the rows J (m, n) of the samples, the steps, and the signals of the
+    run."""
 
     value: float
     cost: float
@@ -123,7 +126,8 @@ class Planner:
         self._idle.append(begun)
 
     def run(self, z: Array, x: Array, steps: Steps, free: NDArray[np.bool_] | None) -> tuple[Residuals, Prediction]:
-        """Residuals of the motion z at x, the last of them those of the priors, and the run. Raises `SimulationFailed`."""
+        """Residuals of the motion z at x, the last of them those of the priors, and the run. Raises
+        `SimulationFailed`."""
         p = self.problem
         by_name = {self.recording.name: steps} if isinstance(steps, Frozen) else steps
         (job,) = p.jobs(x, [self.recording.name], by_name, free)
@@ -134,8 +138,8 @@ class Planner:
         return p.gather(x, [job], [run]), run
 
     def look(self, z: Array, x: Array, steps: Steps | None = None) -> DesignEvaluation:
-        """The motion z at x, by the planner's tolerance or that of `steps`; on steps that are given without the errors. Raises
-        `SimulationFailed`."""
+        """The motion z at x, by the planner's tolerance or that of `steps`; on steps that are given without the errors.
+        Raises `SimulationFailed`."""
         c, given = self.problem.coordinates, self.rtol if steps is None else steps
         at, run = self.run(z, x, given, c.free)
         C = np.zeros((len(x), len(x)))
@@ -154,8 +158,8 @@ class Planner:
         return DesignEvaluation(value, cost, peaks, C, errors, -C @ T.T @ S @ T @ C, J, frozen, signals)
 
     def check_predictable(self, x: Array, J: Array, signals: Signals) -> None:
-        """Raises `SimulationFailed` where a parameter that hardly changes would change the samples altogether: then their
-        information is that of chaos, which no fit can use."""
+        """Raises `SimulationFailed` where a parameter that hardly changes would change the samples altogether: then
+        their information is that of chaos, which no fit can use."""
         c, at = self.problem.coordinates, 0
         rig = [one.of_the_rig and one.scale == "log" for one in c.all]
         for channel, one in self.problem.readouts(x, self.k).items():
@@ -170,9 +174,9 @@ class Planner:
             at += len(t)
 
     def errors(self, z: Array, x: Array, rtol: float, at: Residuals, C: Array, T: Array) -> Array:
-        """How far (k, s) relative to the parameters a Gauss-Newton step without noise ends from the truth, that begins a
-        standard deviation from it at points of different signs, on steps of their own: nothing where samples are linear over
-        an interval, and steps fine enough; much where the motion is chaotic. Raises `SimulationFailed`."""
+        """How far (k, s) relative to the parameters a Gauss-Newton step without noise ends from the truth, that begins
+        a standard deviation from it at points of different signs, on steps of their own: nothing where samples are
+        linear over an interval, and steps fine enough; much where the motion is chaotic. Raises `SimulationFailed`."""
         out, (low, high) = [], self.problem.coordinates.bounds
         sd = np.minimum(np.sqrt(np.diag(T @ C @ T.T)), FARTHEST)
         for k in range(TRIED):
@@ -190,7 +194,8 @@ class Planner:
         }
 
     def slopes(self, z: Array, x: Array, at: DesignEvaluation) -> Array:
-        """Derivative by z of the criterion and of what excess costs, on the steps of the look. Raises `SimulationFailed`."""
+        """Derivative by z of the criterion and of what excess costs, on the steps of the look. Raises
+        `SimulationFailed`."""
         c, W = self.problem.coordinates, 2 * at.J @ at.G
         low, high = c.bounds
         tasks, beside = list[tuple[Array, Array]](), self.overload(at.signals)  # points x, weights on the signals there

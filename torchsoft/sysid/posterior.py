@@ -1,7 +1,7 @@
 """Posterior draws: by Laplace's approximation, checked and corrected by importance, and by NUTS on the exact gradients.
 
-The density is that of the coordinates: exp(-|r|^2 / 2), priors being rows of r, within the bounds. A coordinate without a prior
-is uniform between its bounds.
+The density is that of the coordinates: exp(-|r|^2 / 2), priors being rows of r, within the bounds. A coordinate without
+a prior is uniform between its bounds.
 """
 
 import importlib
@@ -47,8 +47,8 @@ CHECKED = 8
 
 @dataclass(frozen=True)
 class Posterior:
-    """Draws (chains, draws, n) of the free coordinates `labels` in physical units, and their normalised `weights` (chains,
-    draws); what was checked, what a reader must know, what it cost, how it was made.
+    """Draws (chains, draws, n) of the free coordinates `labels` in physical units, and their normalised `weights`
+    (chains, draws); what was checked, what a reader must know, what it cost, how it was made.
 
     A run that was interrupted has fewer draws than were asked for.
     """
@@ -122,8 +122,8 @@ def quantile(values: Array, weights: Array, part: float) -> float:
 
 
 def measure(o: Optimum, x: Array) -> tuple[float, Array]:
-    """What a density of values has more, as one of coordinates x (n,), and its gradient by the free ones: the logarithm of
-    d value / d x where a prior is normal on a logarithmic scale, or log-normal on a linear one."""
+    """What a density of values has more, as one of coordinates x (n,), and its gradient by the free ones: the logarithm
+    of d value / d x where a prior is normal on a logarithmic scale, or log-normal on a linear one."""
     total, gradient = 0.0, np.zeros(len(x))
     for i, prior in o.problem.coordinates.priors:
         c = o.problem.coordinates.all[i]
@@ -138,9 +138,9 @@ def measure(o: Optimum, x: Array) -> tuple[float, Array]:
 def laplace(o: Optimum, *, draws: int = 400, seed: int = 0, progress: bool = False) -> Posterior:
     """Draws of the Gaussian at the optimum, with the covariance of the Fisher matrix, within the bounds.
 
-    The exact density at every draw, a run each, gives them importance weights, Pareto-smoothed: they correct the Gaussian where
-    it is roughly right, and their k-hat says where it is not. Raises `ValueError` where hardly a draw is within the bounds: the
-    data do not determine all coordinates; and for fewer draws than `FEWEST`.
+    The exact density at every draw, a run each, gives them importance weights, Pareto-smoothed: they correct the
+    Gaussian where it is roughly right, and their k-hat says where it is not. Raises `ValueError` where hardly a draw is
+    within the bounds: the data do not determine all coordinates; and for fewer draws than `FEWEST`.
     """
     if draws < FEWEST:
         raise ValueError(f"Laplace's approximation is checked by at least {FEWEST} draws, not by {draws}")
@@ -183,8 +183,8 @@ def laplace(o: Optimum, *, draws: int = 400, seed: int = 0, progress: bool = Fal
 
 
 def importance(log_weights: Array) -> tuple[Array, float]:
-    """Normalised weights (draws,), Pareto-smoothed, and the shape k of their tail, infinite where a few draws have all the
-    weight. Draws without density have none."""
+    """Normalised weights (draws,), Pareto-smoothed, and the shape k of their tail, infinite where a few draws have all
+    the weight. Draws without density have none."""
     known = np.isfinite(log_weights)
     log_w, k_hat = log_weights[known] - log_weights[known].max(), -np.inf
     if np.ptp(log_w) > SAME:
@@ -197,7 +197,8 @@ def importance(log_weights: Array) -> tuple[Array, float]:
 
 
 def inside(rng: np.random.Generator, mean: Array, C: Array, low: Array, high: Array, count: int) -> tuple[Array, Array]:
-    """Normal draws (count, n) with covariance C (n, n) that lie between bounds, and the standard normal ones behind them."""
+    """Normal draws (count, n) with covariance C (n, n) that lie between bounds, and the standard normal ones behind
+    them."""
     L, kept, tried = np.linalg.cholesky(C).T, np.zeros((0, len(mean))), 0
     while len(kept) < count and tried < count / WITHIN:
         noise = rng.standard_normal((4 * count, len(mean)))
@@ -212,7 +213,8 @@ def inside(rng: np.random.Generator, mean: Array, C: Array, low: Array, high: Ar
 
 
 def steps_off(o: Optimum, z: Array) -> float:
-    """Largest change of |r|^2 at free coordinates z (k, free coordinates) by steps chosen anew; infinite where a run fails."""
+    """Largest change of |r|^2 at free coordinates z (k, free coordinates) by steps chosen anew; infinite where a run
+    fails."""
     off = [o.off(o.place(one)) for one in z]
     return float(np.max(np.where(np.isnan(off), np.inf, np.abs(off))))
 

@@ -1,8 +1,4 @@
-"""What sensors make of a run: samples with gain, bias, drift, delay, misalignment and inertia, and their derivatives.
-
-A reading is y(t) = (1 + error of the gain) * sum of a_k S_k(t - delay) + bias + drift (t - middle), where S_k are channels, or
-rates of channels, of the run.
-"""
+"""Predicted signals of a recording, and the readings of sensors that see them."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -36,7 +32,8 @@ class Signals(NamedTuple):
 
 
 class Term(NamedTuple):
-    """A part of a reading: `factor` times the `order`-th rate of a channel, and the derivative of the factor by a nuisance."""
+    """A part of a reading: `factor` times the `order`-th rate of a channel, and the derivative of the factor by a
+    nuisance."""
 
     channel: str
     order: int
@@ -46,7 +43,8 @@ class Term(NamedTuple):
 
 @dataclass(frozen=True)
 class Readout:
-    """One channel as its sensor gives it, for given values of what is wrong with the sensor; its `repr` says all of it."""
+    """One channel as its sensor gives it, for given values of what is wrong with the sensor; its `repr` says all of
+    it."""
 
     channel: str
     noise: float
@@ -60,8 +58,8 @@ class Readout:
     terms: tuple[Term, ...]
 
     def expected(self, signals: Signals, times: Array) -> tuple[Array, Array | None, dict[Nuisance, Array]]:
-        """The reading (k,) at `times` without noise, its derivatives (k, n) by what the run was differentiated by, and by the
-        nuisances."""
+        """The reading (k,) at `times` without noise, its derivatives (k, n) by what the run was differentiated by, and
+        by the nuisances."""
         y, rate, slopes = np.zeros(len(times)), np.zeros(len(times)), None
         by: dict[Nuisance, Array] = {}
         for term in self.terms:
@@ -87,8 +85,9 @@ class Readout:
     def residuals(self, y: Array, measured: Array) -> tuple[Array, Array]:
         """Expected less measured over the noise (k,), and its derivative by the expected.
 
-        Of a saturated sample half the square is the negative logarithm of the probability that value and noise are together
-        beyond the limit (Tobin, 1958)."""
+        Of a saturated sample half the square is the negative logarithm of the probability that value and noise are
+        together beyond the limit (Tobin, 1958).
+        """
         r, weight = (y - measured) / self.noise, np.full(len(y), 1 / self.noise)
         for limit, sign in ((self.high, 1.0), (self.low, -1.0)):
             if limit is not None:
@@ -108,8 +107,8 @@ class Readout:
 
 
 def censored(z: Array) -> tuple[Array, Array]:
-    """-sqrt(-2 ln Phi(z)) (k,), where values are expected z standard deviations beyond a limit, and its derivative; Phi is the
-    normal distribution function. It is z far short of the limit, and nothing far beyond."""
+    """-sqrt(-2 ln Phi(z)) (k,), where values are expected z standard deviations beyond a limit, and its derivative; Phi
+    is the normal distribution function. It is z far short of the limit, and nothing far beyond."""
     log = log_ndtr(z)
     r = -np.sqrt(-2 * log)
     density = np.exp(-0.5 * z**2 - log) / np.sqrt(2 * np.pi)
@@ -153,8 +152,8 @@ def pushed(rig: Rig, channel: str) -> str:
 def readout(
     rig: Rig, channel: str, sensor: Sensor, values: Mapping[Nuisance, float], span: tuple[float, float]
 ) -> Readout:
-    """The readout of a sensor with the nuisances' `values`, in a recording over the times `span` [s]. Raises `ValueError` for
-    a nuisance that the channel cannot have."""
+    """The readout of a sensor with the nuisances' `values`, in a recording over the times `span` [s]. Raises
+    `ValueError` for a nuisance that the channel cannot have."""
     at = {kind: values.get(kind, float(kind == "gain")) for kind in NUISANCES}
     c, s = np.cos(at["misalignment"]), np.sin(at["misalignment"])
     if sensor.misalignment > 0:
@@ -177,7 +176,8 @@ def readout(
 
 
 TOLERANCE = 1e-8
-"""Newton tolerance [N] of the runs that fits are made of: far below any sensor, above rounding with the largest dashpots."""
+"""Newton tolerance [N] of the runs that fits are made of: far below any sensor, above rounding with the largest
+dashpots."""
 
 
 class Frozen:
@@ -206,8 +206,8 @@ class Prediction(NamedTuple):
 
 
 class Misfit(NamedTuple):
-    """Half the sum of squared residuals of one recording, its derivatives by the run's parameters (n,), and by every channel's
-    nuisances (channels, nuisances), and the stepper's steps."""
+    """Half the sum of squared residuals of one recording, its derivatives by the run's parameters (n,), and by every
+    channel's nuisances (channels, nuisances), and the stepper's steps."""
 
     loss: float
     parameters: Array
@@ -257,8 +257,8 @@ def prepared(begun: RunContext, values: Mapping[str, float], names: Sequence[str
 
 
 def derivatives(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
-    """Derivatives (T, channels, n) of the channels `names` by the run's parameters and start: along the motion of the bodies,
-    and of the controllers' own parameters."""
+    """Derivatives (T, channels, n) of the channels `names` by the run's parameters and start: along the motion of the
+    bodies, and of the controllers' own parameters."""
     assert run.sensitivities is not None
     bodies, signals = Layout({}, {}, rig.layout.free, {}), rig.follow(run.t, rig.reference).detach()
     along = [torch.zeros((), dtype=torch.float64, requires_grad=True) for _ in range(run.sensitivities.shape[-1])]
@@ -296,7 +296,8 @@ def predict(
 def misfit(
     begun: RunContext, values: Mapping[str, float], grid: Grid, names: Sequence[str], steps: Steps, judge: Judge
 ) -> Misfit:
-    """The misfit that `judge` finds, with its gradient by `names`, by the discrete adjoint. Raises `SimulationFailed`."""
+    """The misfit that `judge` finds, with its gradient by `names`, by the discrete adjoint. Raises
+    `SimulationFailed`."""
     rig, run = begun.rig, prepared(begun, values, names)
     out = simulate(rig, grid.t, y0=run.y0, gradient="discrete", **choice(steps))
     keys, rows = measurable(rig), slice(grid.early, None)

@@ -22,9 +22,10 @@ StepsByName = float | Mapping[str, Frozen]
 
 
 class Residuals(NamedTuple):
-    """Residuals r (m,) over the sensors' noise, whitened where its colour is known, then those of the priors; their Jacobian
-    J (m, n) by the coordinates (zero where not free), and what was lost: recordings that could not be simulated, with the
-    reason. With a loss r and J are infinite. |r|^2 / 2 is the negative logarithm of the posterior density, but for a constant.
+    """Residuals r (m,) over the sensors' noise, whitened where its colour is known, then those of the priors; their
+    Jacobian J (m, n) by the coordinates (zero where not free), and what was lost: recordings that could not be
+    simulated, with the reason. With a loss r and J are infinite. |r|^2 / 2 is the negative logarithm of the posterior
+    density, but for a constant.
     """
 
     r: Array
@@ -33,7 +34,8 @@ class Residuals(NamedTuple):
 
 
 def check_ends(coordinates: Coordinates, recordings: Sequence[Recording]) -> None:
-    """Raises `ValueError` where the bounds of an unknown leave no rig: a disc that does not fit between the pads, say."""
+    """Raises `ValueError` where the bounds of an unknown leave no rig: a disc that does not fit between the pads,
+    say."""
     for c in coordinates.all:
         if c.kind != "parameter" or c.ratio_to:
             continue
@@ -62,8 +64,9 @@ def check_value(recording: Recording, name: str, value: float) -> None:
 class Problem:
     """Which parameters explain these recordings?
 
-    `recordings` have names of their own; `sensors` are the channels that count, with their noise; `unknowns` the parameters;
-    `noise` the colour of a channel's noise, white where there is none. Raises `ValueError` where these do not fit together.
+    `recordings` have names of their own; `sensors` are the channels that count, with their noise; `unknowns` the
+    parameters; `noise` the colour of a channel's noise, white where there is none. Raises `ValueError` where these do
+    not fit together.
     """
 
     def __init__(
@@ -95,8 +98,8 @@ class Problem:
         self.check_saturated()
 
     def check_saturated(self) -> None:
-        """Raises `ValueError` where noise is coloured and samples are saturated: of such neighbours no likelihood is known that
-        can be computed."""
+        """Raises `ValueError` where noise is coloured and samples are saturated: of such neighbours no likelihood is
+        known that can be computed."""
         for recording in self.recordings:
             for channel, sensor in self.sensors.items():
                 coloured = sensor.colour == "ar" or channel in self.noise
@@ -160,7 +163,8 @@ class Problem:
     def jobs(
         self, x: Array, which: Sequence[str], steps: StepsByName, free: NDArray[np.bool_] | None, adjoint: bool = False
     ) -> list[Job]:
-        """One run a recording; with `free` they are differentiated by the parameters that free coordinates (n,) move."""
+        """One run a recording; with `free` they are differentiated by the parameters that free coordinates (n,)
+        move."""
         c, out = self.coordinates, []
         for k, recording in enumerate(self.recordings):
             if recording.name not in which:
@@ -179,8 +183,8 @@ class Problem:
     def residuals(
         self, runner: Runner, x: Array, which: Sequence[str], steps: StepsByName, free: NDArray[np.bool_] | None = None
     ) -> Residuals:
-        """Residuals of some recordings at x (n,); the Jacobian's columns of `free` coordinates. On frozen steps they are smooth
-        in x."""
+        """Residuals of some recordings at x (n,); the Jacobian's columns of `free` coordinates. On frozen steps they
+        are smooth in x."""
         jobs = self.jobs(x, which, steps, free)
         return self.gather(x, jobs, runner.run(jobs))
 

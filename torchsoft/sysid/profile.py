@@ -1,7 +1,4 @@
-"""Where a fit ended, and the posterior density around it on steps that are frozen there, so that it is smooth.
-
-Profiles and posteriors look at the same thing: |r|^2 / 2, the negative logarithm of the posterior density in the coordinates.
-"""
+"""Profile likelihoods: the misfit where one coordinate is held and all others are fitted again."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -24,13 +21,14 @@ if TYPE_CHECKING:
     from torchsoft.sysid.result import IdentificationResult
 
 CHOSEN_ANEW = 1.0
-"""Change of |r|^2 by steps that are chosen anew, in place of those of the optimum, above which these are too far off."""
+"""Change of |r|^2 by steps that are chosen anew, in place of those of the optimum, above which these are too far
+off."""
 
 
 class Optimum:
-    """Coordinates x (n,) where a fit of the recordings `which` (all by default) ended, with the steps that `rtol` chooses
-    there. `free` (n,) are the coordinates that were fitted. `variance` is what the noise's is larger than it was stated, and
-    widens profiles. `workers` threads may look at it side by side.
+    """Coordinates x (n,) where a fit of the recordings `which` (all by default) ended, with the steps that `rtol`
+    chooses there. `free` (n,) are the coordinates that were fitted. `variance` is what the noise's is larger than it
+    was stated, and widens profiles. `workers` threads may look at it side by side.
 
     Raises `Unreachable` where x cannot be simulated.
     """
@@ -56,8 +54,8 @@ class Optimum:
 
     @classmethod
     def of(cls, problem: Problem, answer: "IdentificationResult", workers: int = 1) -> Self:
-        """Where the identification of `problem` ended, with the noise that it found. Raises `ValueError` for another problem's
-        answer, or one of a robust loss, which says nothing of a likelihood."""
+        """Where the identification of `problem` ended, with the noise that it found. Raises `ValueError` for another
+        problem's answer, or one of a robust loss, which says nothing of a likelihood."""
         last, labels = answer.stages[-1], problem.coordinates.labels
         if [one.label for one in answer.coordinates] != list(labels):
             raise ValueError("this answer belongs to another problem: it does not have the same coordinates")
@@ -109,20 +107,21 @@ class Optimum:
         return self.problem.residuals(self.runner, x, self.which, self.steps, self.free if derivatives else None)
 
     def misfit(self, x: Array) -> tuple[float, Array, str]:
-        """|r|^2 / 2 at x (n,) with its gradient by the free coordinates, by the adjoint; where a run is lost, infinite, with
-        the reason."""
+        """|r|^2 / 2 at x (n,) with its gradient by the free coordinates, by the adjoint; where a run is lost, infinite,
+        with the reason."""
         value, gradient, lost = self.problem.misfit(self.runner, x, self.which, self.steps, self.free)
         return value, gradient[self.free], next((one.reason for one in lost.values()), "")
 
     def off(self, x: Array) -> float:
-        """How much larger |r|^2 at x (n,) is by steps that the tolerance chooses there than by those of the optimum; NaN where
-        one of the two fails."""
+        """How much larger |r|^2 at x (n,) is by steps that the tolerance chooses there than by those of the optimum;
+        NaN where one of the two fails."""
         frozen = self.residuals(x)
         fresh, _ = self.problem.freeze(self.runner, x, self.which, self.rtol)
         return float("nan") if fresh.lost or frozen.lost else float(fresh.r @ fresh.r - frozen.r @ frozen.r)
 
 
-# Profile likelihood: how the misfit rises when one coordinate is held away from its optimum and all others are fitted again.
+# Profile likelihood: how the misfit rises when one coordinate is held away from its optimum and all others are fitted
+# again.
 
 
 RISE = float(stats.chi2.ppf(0.95, 1))
@@ -155,11 +154,12 @@ DIFFERENT = 0.2
 
 @dataclass(frozen=True)
 class Profile:
-    """The profile of one coordinate: its values in physical units, ascending, and the `rises` of 2 (-log posterior) there.
+    """The profile of one coordinate: its values in physical units, ascending, and the `rises` of 2 (-log posterior)
+    there.
 
-    `others` holds, by label, where the other coordinates went, in physical units. `ci95` has None for an end that was not
-    found, and `notices` says why; `wald95` is what the covariance says. `variance` is what the rises were divided by: above one
-    where residuals are larger than the noise that was given.
+    `others` holds, by label, where the other coordinates went, in physical units. `ci95` has None for an end that was
+    not found, and `notices` says why; `wald95` is what the covariance says. `variance` is what the rises were divided
+    by: above one where residuals are larger than the noise that was given.
     """
 
     label: str
@@ -182,7 +182,8 @@ class Point(NamedTuple):
 
 
 class Side(NamedTuple):
-    """The points to one side of the optimum, outwards, why it ended before the interval did, and what else there is to say."""
+    """The points to one side of the optimum, outwards, why it ended before the interval did, and what else there is to
+    say."""
 
     points: list[Point]
     ended: str
@@ -242,7 +243,8 @@ def walk(o: Optimum, i: int, sign: int) -> Side:
 
 
 def refit(o: Optimum, i: int, here: Point, aim: float) -> tuple[Point | None, str]:
-    """The others' optimum with coordinate number i at `aim`, begun along the tangent of the profile; or why there is none."""
+    """The others' optimum with coordinate number i at `aim`, begun along the tangent of the profile; or why there is
+    none."""
     others, (low, high) = o.free.copy(), o.problem.coordinates.bounds
     others[i] = False
     x = here.x.copy()

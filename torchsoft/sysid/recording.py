@@ -21,8 +21,8 @@ from torchsoft.sysid.initial_state import AtRest, Begin, Start, StartCoordinate
 Array = NDArray[np.float64]
 
 BETWEEN = 1e-3
-"""Spacing [s] of the regular grid that is simulated where samples are needed between (an unknown delay), or are denser than it;
-a cubic spline lies between its points."""
+"""Spacing [s] of the regular grid that is simulated where samples are needed between (an unknown delay), or are denser
+than it; a cubic spline lies between its points."""
 
 REACH = 0.1
 """Largest delay [s] of a sensor: for so long before the first sample and after the last one runs are known."""
@@ -52,10 +52,10 @@ REST = AtRest()
 class Recording:
     """One run of a rig, seen by sensors.
 
-    `rig` has the known numbers and the nominal ones of what is unknown, the laws, and the reference that the run followed; runs
-    are made of copies of it. `samples` holds times (k,) [s] and values (k,) by channel, each with times of its own; channels
-    are those of the rig's trajectories that `measurable` names. `start` says where the run begins. `dataclasses.replace`
-    makes variants, with another law, say.
+    `rig` has the known numbers and the nominal ones of what is unknown, the laws, and the reference that the run
+    followed; runs are made of copies of it. `samples` holds times (k,) [s] and values (k,) by channel, each with times
+    of its own; channels are those of the rig's trajectories that `measurable` names. `start` says where the run begins.
+    `dataclasses.replace` makes variants, with another law, say.
     """
 
     name: str
@@ -98,7 +98,8 @@ class Recording:
 
     @cached_property
     def speed(self) -> float:
-        """Root mean square of the speed of the horizontal setpoints and drives [m/s]: slow recordings are the easy ones."""
+        """Root mean square of the speed of the horizontal setpoints and drives [m/s]: slow recordings are the easy
+        ones."""
         pairs = [pair for a in self.rig.actuators.values() for pair in a.follows]
         names = [setpoint for coordinate, setpoint in pairs if coordinate.endswith(".x")]
         names += [name for name in self.rig.signals if name.endswith(".x")]
@@ -114,8 +115,8 @@ class Recording:
 
     @cached_property
     def parameters(self) -> dict[str, float]:
-        """Every number that can be identified: the rig's scalar parameters, by their aliases where they have one, and the
-        start's coordinates."""
+        """Every number that can be identified: the rig's scalar parameters, by their aliases where they have one, and
+        the start's coordinates."""
         names = {own: name for name, own in self.rig.aliases.items()}
         mine = [(own, value) for own, value in self.rig.named_parameters() if not own.startswith("reference.")]
         scalars = {names.get(own, own): value for own, value in mine if value.ndim == 0}
@@ -130,13 +131,13 @@ class Recording:
         return RunContext(rig, self.start.begin(rig, self.samples))
 
     def on_a_grid(self, interpolated: bool) -> bool:
-        """Whether a regular grid is simulated, every `BETWEEN`, in place of the samples' own times: where they are denser, or
-        values between them are needed (`interpolated`)."""
+        """Whether a regular grid is simulated, every `BETWEEN`, in place of the samples' own times: where they are
+        denser, or values between them are needed (`interpolated`)."""
         return interpolated or self.duration < 0.99 * BETWEEN * (len(self.times) - 1)
 
     def grid(self, interpolated: bool) -> Grid:
-        """The times to simulate: the beginning, where that is before the samples, then the samples' own times, or a regular
-        grid from `REACH` before the first, but not from before the beginning, to `REACH` after the last."""
+        """The times to simulate: the beginning, where that is before the samples, then the samples' own times, or a
+        regular grid from `REACH` before the first, but not from before the beginning, to `REACH` after the last."""
         t, lead = self.times, self.start.lead
         if self.on_a_grid(interpolated):
             t = np.arange(t[0] - min(REACH, lead), t[-1] + REACH + BETWEEN, BETWEEN)
@@ -154,8 +155,8 @@ class Recording:
 
 
 def identity(rig: Rig) -> bytes:
-    """What a rig is made of: its parts' numbers and plain attributes, but for the reference, and the files with the code of
-    parts that are the user's own."""
+    """What a rig is made of: its parts' numbers and plain attributes, but for the reference, and the files with the
+    code of parts that are the user's own."""
     parts = [(name, part) for name, part in rig.named_modules() if name.split(".")[0] != "reference"]
     text = [f"{name} {type(part).__qualname__} {plain(part)}" for name, part in parts]
     functions = [value for _, part in parts for value in vars(part).values() if inspect.isfunction(value)]

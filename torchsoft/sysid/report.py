@@ -1,4 +1,4 @@
-"""Pieces of a page: text, tables and pictures as HTML that stands alone. Everything that is given is escaped."""
+"""Report of an identification: one HTML file with its pictures inside, that any browser opens without a network."""
 
 import base64
 import io

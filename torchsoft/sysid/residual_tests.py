@@ -1,4 +1,20 @@
-"""What a fit left, channel by channel: residuals whose noise is normal, and the reading that the model predicts beside them."""
+"""Tests of the residuals of a fit, each with a p-value that counts the independent samples.
+
+The residuals r (m,) are whitened with the assumed noise, J (m, n) is their Jacobian. With the right model and noise
+they are independent, normal, of variance one, but for the n directions that the fit took out. Every test is of one
+channel in one recording where it can be:
+
+    level     the sum of squares is chi-squared: residuals are as large as the stated noise
+    white     Ljung and Box: no correlation is left from sample to sample
+    motion    F: no correlation with the predicted reading, its rates, or other channels
+    channels  Bartlett: no correlation between channels at one time
+    outliers  Grubbs, and the kurtosis: tails are those of a normal distribution
+    priors    normal: estimates are where their priors expect them
+
+p-values are adjusted by Holm's method: with a right model one of them or more falls below `LEVEL` in as many of all
+identifications. Declared colour is not tested again; colour that was found without a declaration is a finding, although
+intervals allow for it: a sensor may have made it, or a wrong model.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,18 +35,18 @@ from torchsoft.sysid.recording import Array
 from torchsoft.sysid.unknowns import Sensor
 
 CLEAR = 4.0
-"""Standard deviations of the noise that a prediction must be within the range of a sensor that is saturated, so that its
-residual has a normal distribution; and from the prediction, beyond which a sample counts wherever it is."""
+"""Standard deviations of the noise that a prediction must be within the range of a sensor that is saturated, so that
+its residual has a normal distribution; and from the prediction, beyond which a sample counts wherever it is."""
 
 FEWEST = 4
 """Samples that are left of a sensor that is saturated, below which nothing is said of it."""
 
 
 class Part(NamedTuple):
-    """One channel of one recording at the fit, without what saturation has changed: times t (m,) [s], the rows (m,) of r and J
-    that are its own, the residuals `raw` (m,) over the noise that the sensor states, the `reading` (m,) that the model
-    predicts [unit], the noise that is assumed (white as stated, if None), whether its level was `found` from such residuals,
-    what whitens (m,) or (m, k), and how many samples were `saturated`."""
+    """One channel of one recording at the fit, without what saturation has changed: times t (m,) [s], the rows (m,) of
+    r and J that are its own, the residuals `raw` (m,) over the noise that the sensor states, the `reading` (m,) that
+    the model predicts [unit], the noise that is assumed (white as stated, if None), whether its level was `found` from
+    such residuals, what whitens (m,) or (m, k), and how many samples were `saturated`."""
 
     recording: str
     channel: str
@@ -50,11 +66,13 @@ class Part(NamedTuple):
 
 
 def parts(problem: Problem, r: Array, which: Sequence[str]) -> list[Part]:
-    """The parts of residuals r of `Problem.residuals`, whitened by the problem's noise; none of a channel that is saturated
-    but for less than `FEWEST` samples.
+    """The parts of residuals r of `Problem.residuals`, whitened by the problem's noise; none of a channel that is
+    saturated but for less than `FEWEST` samples.
 
-    Of a sensor that is saturated samples are left out where the prediction is near the end of its range or beyond, whether
-    they are saturated or not: the noise of those that are not is not normal. What is far from the prediction stays."""
+    Of a sensor that is saturated samples are left out where the prediction is near the end of its range or beyond,
+    whether they are saturated or not: the noise of those that are not is not normal. What is far from the prediction
+    stays.
+    """
     out, at = [], 0
     for recording in problem.recordings:
         for channel, sensor in problem.sensors.items() if recording.name in which else ():
@@ -80,7 +98,8 @@ def parts(problem: Problem, r: Array, which: Sequence[str]) -> list[Part]:
 
 
 def predicted(sensor: Sensor, measured: Array, raw: Array) -> Array:
-    """Readings without noise (m,), from samples and residuals over the noise: infinite where a saturated one leaves nothing."""
+    """Readings without noise (m,), from samples and residuals over the noise: infinite where a saturated one leaves
+    nothing."""
     y = measured + sensor.noise * raw
     for limit, sign in ((sensor.high, 1.0), (sensor.low, -1.0)):
         if limit is not None:
@@ -99,8 +118,8 @@ LAGS = 20
 """Autocorrelations that are shown, at most, and at most a quarter of the samples."""
 
 TESTED = 10
-"""Autocorrelations that are tested, at most, and at most one in twenty samples: the sum of more is not yet chi-squared in its
-tail, where alarms are."""
+"""Autocorrelations that are tested, at most, and at most one in twenty samples: the sum of more is not yet chi-squared
+in its tail, where alarms are."""
 
 FAINT = 0.5
 """Residuals over the noise below which their pattern is not judged: the noise is overstated, and that is said."""
@@ -116,8 +135,8 @@ Test = Literal["level", "white", "motion", "channels", "outliers", "priors"]
 
 @dataclass(frozen=True)
 class Verdict:
-    """One test of one channel in one recording (of all, where they are None): its p-value, the one that is adjusted for all
-    tests together, the size of what it looks at, and that in words."""
+    """One test of one channel in one recording (of all, where they are None): its p-value, the one that is adjusted for
+    all tests together, the size of what it looks at, and that in words."""
 
     test: Test
     recording: str | None
@@ -135,8 +154,8 @@ class Verdict:
 def judge_residuals(
     parts: Sequence[Part], r: Array, J: Array, *, robust: bool = False, priors: Sequence[str] = ()
 ) -> list[Verdict]:
-    """All tests of a fit's whitened residuals r (m,), the last of them those of `priors`, which are named, with their Jacobian
-    J (m, n) by what was free.
+    """All tests of a fit's whitened residuals r (m,), the last of them those of `priors`, which are named, with their
+    Jacobian J (m, n) by what was free.
 
     With a `robust` loss outliers are expected: the level is that of the median residual, and tails are not tested.
     """
@@ -178,10 +197,11 @@ def two_sided(square: float, dof: float) -> float:
 
 
 def level(part: Part, r: Array, Q: Array, robust: bool) -> tuple[Verdict, float, float]:
-    """Is the sum of squares that of the noise as stated? With it that sum, and how many independent samples it is worth.
+    """Is the sum of squares that of the noise as stated? With it that sum, and how many independent samples it is
+    worth.
 
-    Where the noise's level was found from these residuals, so that whitened ones tell nothing, the raw ones have it, which are
-    worth `Autoregression.effective` samples (Satterthwaite).
+    Where the noise's level was found from these residuals, so that whitened ones tell nothing, the raw ones have it,
+    which are worth `Autoregression.effective` samples (Satterthwaite).
     """
     raw = part.found and part.noise is not None
     rows = part.raw if raw else r[part.rows]
@@ -206,7 +226,8 @@ def autocorrelation(r: Array) -> Array:
 
 
 def whiteness(r: Array, coefficients: int = 0) -> tuple[float, float]:
-    """First autocorrelation and Ljung-Box p-value of one channel's residuals (m,), after so many coefficients were fitted."""
+    """First autocorrelation and Ljung-Box p-value of one channel's residuals (m,), after so many coefficients were
+    fitted."""
     rho, m = autocorrelation(r), len(r)
     lags = min(max(TESTED, coefficients + 3), m // 20)
     if not rho.any() or lags <= coefficients:
@@ -223,9 +244,9 @@ def white(part: Part, r: Array) -> Verdict:
 
 
 def explained(part: Part, Z: Array, r: Array, Q: Array) -> tuple[float, float, Array]:
-    """What residuals have in common with Z (m, k), signals at the samples of a part: the F test's p-value of fitting them
-    besides the unknowns, against the variance of the part itself, the share of that which they take, and what each alone
-    would take, signed (k,)."""
+    """What residuals have in common with Z (m, k), signals at the samples of a part: the F test's p-value of fitting
+    them besides the unknowns, against the variance of the part itself, the share of that which they take, and what each
+    alone would take, signed (k,)."""
     size = np.linalg.norm(Z, axis=0)
     columns = np.zeros((len(r), Z.shape[1]))
     columns[part.rows] = part.whitened(Z / np.where(size > 0, size, 1.0))
@@ -247,8 +268,8 @@ def explained(part: Part, Z: Array, r: Array, Q: Array) -> tuple[float, float, A
 
 
 def lines_up(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[Verdict]:
-    """Do residuals line up with the reading that the model predicts, as a wrong sensor would make them, or with those of the
-    other channels and their rates, as a wrong law would?"""
+    """Do residuals line up with the reading that the model predicts, as a wrong sensor would make them, or with those
+    of the other channels and their rates, as a wrong law would?"""
     out, t = [], part.t
     y = spline(part)
     own = {
@@ -295,7 +316,8 @@ def outliers(part: Part, r: Array) -> Verdict:
 
 
 def together(recording: str, parts: Sequence[Part], r: Array, Q: Array) -> list[Verdict]:
-    """Do residuals of different channels, where they are sampled at the same times, have something in common (Bartlett)?"""
+    """Do residuals of different channels, where they are sampled at the same times, have something in common
+    (Bartlett)?"""
     longest = max((p.t for p in parts), key=len)
     alike = [p for p in parts if np.array_equal(p.t, longest) and float(np.mean(p.raw**2)) >= FAINT**2]
     k = len(alike)
@@ -335,8 +357,8 @@ SENTENCES: dict[str, str] = {
 
 
 def residual_notices(verdicts: Sequence[Verdict], widened: float = 1.0) -> list[str]:
-    """A sentence for each kind of alarm, naming recordings and channels, the clearest first; intervals are `widened` [1] for
-    residuals that are too large."""
+    """A sentence for each kind of alarm, naming recordings and channels, the clearest first; intervals are `widened`
+    [1] for residuals that are too large."""
     kinds: dict[str, list[Verdict]] = {kind: [] for kind in SENTENCES}
     for verdict in sorted((f for f in verdicts if f.alarming), key=lambda f: (f.recording is None, f.p)):
         kinds[verdict.test if verdict.test != "level" else "larger" if verdict.size > 1 else "smaller"].append(verdict)
@@ -360,8 +382,8 @@ ROUNDS = 2
 
 
 class Coloured(NamedTuple):
-    """A problem with the noise that was found, its fit, the noise by channel with every order that was tried, and the fits
-    on the way."""
+    """A problem with the noise that was found, its fit, the noise by channel with every order that was tried, and the
+    fits on the way."""
 
     problem: Problem
     fit: Fit
@@ -372,8 +394,8 @@ class Coloured(NamedTuple):
 def allow_for_colour(
     problem: Problem, fit: Fit, free: NDArray[np.bool_], which: Sequence[str], refit: Callable[[Problem, Fit, int], Fit]
 ) -> Coloured:
-    """Find the noise that a fit leaves in the recordings `which`, and fit again with it, by `refit(problem, fit, round)`, from
-    there, while coordinates that are `free` (n,) move.
+    """Find the noise that a fit leaves in the recordings `which`, and fit again with it, by `refit(problem, fit,
+    round)`, from there, while coordinates that are `free` (n,) move.
 
     The fit must have its residuals, with their Jacobian. Where all noise is white nothing is changed.
     """
@@ -407,11 +429,12 @@ def rewhitened(problem: Problem, at: Residuals, now: Sequence[Part]) -> Residual
 
 
 def colours(parts: Sequence[Part], J: Array, declared: Sequence[str] = ()) -> dict[str, NoiseFit]:
-    """The noise of channels whose residuals, all recordings together, are not white, by channel; J (m, n) is the Jacobian.
+    """The noise of channels whose residuals, all recordings together, are not white, by channel; J (m, n) is the
+    Jacobian.
 
-    White noise is refused by the ratio of likelihoods, at `LEVEL` for all channels and orders together; that of `declared`
-    channels by the Bayesian criterion alone. Noise is never taken to be less than the sensor states. That of channels with
-    saturated samples stays white: what their residuals have of colour is a verdict, with its sentence.
+    White noise is refused by the ratio of likelihoods, at `LEVEL` for all channels and orders together; that of
+    `declared` channels by the Bayesian criterion alone. Noise is never taken to be less than the sensor states. That of
+    channels with saturated samples stays white: what their residuals have of colour is a verdict, with its sentence.
     """
     Q, out = np.linalg.qr(J)[0], {}
     channels = list(dict.fromkeys(part.channel for part in parts))

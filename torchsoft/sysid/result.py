@@ -1,4 +1,8 @@
-"""The rigs of recordings as plain data, from which those of this package are built again."""
+"""Result of an identification as plain data, with the rigs of its recordings; `answer.json` holds it.
+
+The schema of the file, `schema()`, is published as `docs/answer.schema.json`. A checksum of the content tells a damaged
+file.
+"""
 
 import json
 import platform
@@ -36,11 +40,12 @@ from torchsoft.tables import Number, line, refusing, shown
 
 @dataclass(frozen=True)
 class RecordedRig:
-    """A recording and its rig: what tells it from others, its length [s], where it began, the rig's class, its numbers and laws
-    before the fit (`description`), and the values that were `identified` of it, with those of where it `began`.
+    """A recording and its rig: what tells it from others, its length [s], where it began, the rig's class, its numbers
+    and laws before the fit (`description`), and the values that were `identified` of it, with those of where it
+    `began`.
 
-    `settings` are those from which `SoftGrasp` makes the very same rig; none where another rig, or laws of the user's own, are
-    needed.
+    `settings` are those from which `SoftGrasp` makes the very same rig; none where another rig, or laws of the user's
+    own, are needed.
     """
 
     name: str
@@ -61,7 +66,8 @@ class RecordedRig:
         return known(self.description, self.identified)
 
     def rebuilt(self) -> Rig:
-        """The rig before the fit, whose reference holds still. Raises `ValueError` where only its maker has its laws."""
+        """The rig before the fit, whose reference holds still. Raises `ValueError` where only its maker has its
+        laws."""
         if self.settings is None:
             raise ValueError(
                 f"the rig of recording `{self.name}` is a {self.rig} with parts of its own, which no file holds: build it "
@@ -129,7 +135,8 @@ LARGEST = 1e9
 """Size [B] of a file of an answer at the most."""
 
 UNEXPLAINED = 1.25
-"""RMS residual of a channel over its stated noise from which a report begins by saying that the model does not explain it."""
+"""RMS residual of a channel over its stated noise from which a report begins by saying that the model does not explain
+it."""
 
 
 @dataclass(frozen=True)
@@ -145,8 +152,9 @@ class ChannelNoise:
 class IdentificationResult:
     """Estimates, correlations, directions, residuals, predictions, and how they were made.
 
-    `x` and `covariance` are in `coordinates`, `correlation` and `directions` in those of them that were free (`labels`). `rigs`
-    are those of the recordings, with their laws and the references that they followed; a file does not hold them.
+    `x` and `covariance` are in `coordinates`, `correlation` and `directions` in those of them that were free
+    (`labels`). `rigs` are those of the recordings, with their laws and the references that they followed; a file does
+    not hold them.
     """
 
     __pydantic_config__ = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
@@ -204,8 +212,8 @@ class IdentificationResult:
         return f"The model does not explain the data: {size}; {text}"
 
     def recorded(self, recording: str | None = None) -> RecordedRig:
-        """A recording and its rig, the first one by default. Raises `ValueError` for one that is not there, and, without a
-        name, where rigs differ from recording to recording."""
+        """A recording and its rig, the first one by default. Raises `ValueError` for one that is not there, and,
+        without a name, where rigs differ from recording to recording."""
         known = ", ".join(f"`{one.name}`" for one in self.recordings)
         if recording is None and self.recordings:
             first = self.recordings[0]
@@ -220,14 +228,15 @@ class IdentificationResult:
     def model(self, recording: str | None = None) -> Rig:
         """The identified rig, ready to run: that of a recording, which is needed where they differ.
 
-        The paper's rig from a file holds still until it is given a reference. Warns of parameters that are not identifiable.
-        Raises `ValueError` for a rig that a file cannot hold: `applied_to` says what to do then.
+        The paper's rig from a file holds still until it is given a reference. Warns of parameters that are not
+        identifiable. Raises `ValueError` for a rig that a file cannot hold: `applied_to` says what to do then.
         """
         one = self.recorded(recording)
         return self._identified(self._rig(one), one)
 
     def applied_to(self, rig: Rig, recording: str | None = None) -> Rig:
-        """A copy of `rig` with the values that were identified: those of a recording, which is needed where they differ.
+        """A copy of `rig` with the values that were identified: those of a recording, which is needed where they
+        differ.
 
         Warns of parameters that are not identifiable, and of numbers and laws that are not those of the fit. Raises
         `ValueError` for a rig that has no such parameters.
@@ -327,7 +336,8 @@ def schema() -> dict[str, Any]:
 
 
 def load_answer(path: str | Path) -> IdentificationResult:
-    """The answer in a file. Raises `ValueError` naming the file for one that is damaged, or no answer, and `OSError`."""
+    """The answer in a file. Raises `ValueError` naming the file for one that is damaged, or no answer, and
+    `OSError`."""
     check_file(path, LARGEST)
     try:
         content = json.loads(Path(path).read_bytes().decode("utf-8"))
@@ -354,15 +364,17 @@ def load_answer(path: str | Path) -> IdentificationResult:
 
 
 BLURRED = 0.1
-"""Relative standard deviation of a combination of parameters from which it is looked for what the data see in its place."""
+"""Relative standard deviation of a combination of parameters from which it is looked for what the data see in its
+place."""
 
 
 def described(
     problem: Problem, x: Array, free: NDArray[np.bool_], J: Array, C: Array, fitted: Sequence[str], *,
     tried: Mapping[str, Sequence[Score]] | None = None, checks: Sequence[AssumptionTest] = (),
 ) -> dict[str, Any]:  # fmt: skip
-    """Fields of a result that say what was fitted and how, at x (n,) with covariance C (n, n): `problem` has the noise that was
-    found, J (m, n) is the Jacobian of the residuals of the recordings `fitted`, `tried` the orders of noise by channel."""
+    """Fields of a result that say what was fitted and how, at x (n,) with covariance C (n, n): `problem` has the noise
+    that was found, J (m, n) is the Jacobian of the residuals of the recordings `fitted`, `tried` the orders of noise by
+    channel."""
     c, tried = problem.coordinates, tried or {}
     noise = [ChannelNoise(channel, model, list(tried.get(channel, ()))) for channel, model in problem.noise.items()]
     packages = ("torchsoft", "torch", "numpy", "scipy", "numba")

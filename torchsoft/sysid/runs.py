@@ -1,7 +1,8 @@
-"""Results of runs on disk, as data with checksums: what makes an identification resume, to the bit.
+"""Runs of the model in threads, and their results on disk.
 
-A journal is a folder of its own, which a marker says, so that nothing of others' is ever taken for a result or removed. A file
-that is damaged, or holds the result of another run, is not used: its run is made again.
+A fit is a deterministic function of its runs: started again it reads the results that it has, to the bit, and goes on
+from there. Results are data with checksums in a marked folder of their own; a damaged file, or that of another run, is
+made again.
 """
 
 import io
@@ -130,8 +131,8 @@ def forget(folder: Path) -> None:
 class Job(NamedTuple):
     """One run: which recording, the values of what is unknown, the names to differentiate by, and the steps.
 
-    `interpolated` asks for a grid between the samples; `judged` asks for the misfit and its gradient in place of the signals:
-    by every sensor's readout and the colour of its noise.
+    `interpolated` asks for a grid between the samples; `judged` asks for the misfit and its gradient in place of the
+    signals: by every sensor's readout and the colour of its noise.
     """
 
     recording: int
@@ -143,7 +144,8 @@ class Job(NamedTuple):
 
 
 class Runner:
-    """Runs jobs in `workers` threads (in this one, if it is one), and remembers their results in the folder `journal`."""
+    """Runs jobs in `workers` threads (in this one, if it is one), and remembers their results in the folder
+    `journal`."""
 
     def __init__(self, recordings: Sequence[Recording], workers: int = 1, journal: Path | None = None) -> None:
         if workers < 1:
@@ -209,8 +211,8 @@ def simulated(recording: Recording, begun: RunContext, job: Job) -> Any:
 def judge(
     recording: Recording, judged: Sequence[tuple[Readout, Autoregression | None]], signals: Signals
 ) -> tuple[float, Array, Array]:
-    """Half the sum of squared residuals, its derivatives by the signals (G, channels), and by the nuisances of every readout
-    (readouts, nuisances)."""
+    """Half the sum of squared residuals, its derivatives by the signals (G, channels), and by the nuisances of every
+    readout (readouts, nuisances)."""
     loss, on_signals, on_nuisances = 0.0, np.zeros(signals.values.shape), np.zeros((len(judged), len(NUISANCES)))
     for k, (one, noise) in enumerate(judged):
         t, measured = recording.samples[one.channel]

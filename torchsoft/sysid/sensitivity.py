@@ -1,9 +1,10 @@
 """Do the data agree with what was taken for granted, and how far would estimates move if it were otherwise?
 
-One run a recording and variation, at the estimates, on the same steps: the difference d (m,) that it makes to the residuals is
-one more column beside the Jacobian J. Its projection on J says how far estimates would move; the rest of it, along the
-residuals, how much of it the data favour. A constant of the computation is not known to be right: it enters the intervals as
-a coordinate more, with a standard normal prior on its amplitude, so that data that cannot tell it cost certainty.
+One run a recording and variation, at the estimates, on the same steps: the difference d (m,) that it makes to the
+residuals is one more column beside the Jacobian J. Its projection on J says how far estimates would move; the rest of
+it, along the residuals, how much of it the data favour. A constant of the computation is not known to be right: it
+enters the intervals as a coordinate more, with a standard normal prior on its amplitude, so that data that cannot tell
+it cost certainty.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -27,12 +28,12 @@ from torchsoft.sysid.unknowns import Nuisance
 from torchsoft.tables import Number, plain
 
 EVIDENT = 20.0
-"""Fall of chi2, over the misfit that is left per sample, from which the data favour a variation: four and a half standard
-deviations, for some twenty variations are looked at."""
+"""Fall of chi2, over the misfit that is left per sample, from which the data favour a variation: four and a half
+standard deviations, for some twenty variations are looked at."""
 
 PATTERN = 0.5
-"""Part of the residuals' autocorrelation that a variation may leave and yet count as what the data favour: a cause takes the
-pattern away with it, while coloured noise lines up with anything slow."""
+"""Part of the residuals' autocorrelation that a variation may leave and yet count as what the data favour: a cause
+takes the pattern away with it, while coloured noise lines up with anything slow."""
 
 LAGS = 10
 """Autocorrelations that are looked at."""
@@ -54,11 +55,11 @@ MOVED = 0.5
 class AssumptionTest(Assumption):
     """Test of one assumption: the effect of its variation by `amount` [unit].
 
-    `moves` is the shift of each estimate in its standard deviations, by label; `gain` the fall of the sum of squares, to
-    `left`, by the amplitude that the data favour: `favoured` [unit] with the standard deviation `favoured_sd`.
+    `moves` is the shift of each estimate in its standard deviations, by label; `gain` the fall of the sum of squares,
+    to `left`, by the amplitude that the data favour: `favoured` [unit] with the standard deviation `favoured_sd`.
     `significance` is the gain over the misfit per sample that would be left, `pattern` the part of the residuals'
-    autocorrelation that would be left, 0 where there is none. With `refitted` that is the result of a new fit, else it is
-    to first order. `unchecked` is the reason why there is no test. `value` is the favoured value of the `parameter`,
+    autocorrelation that would be left, 0 where there is none. With `refitted` that is the result of a new fit, else it
+    is to first order. `unchecked` is the reason why there is no test. `value` is the favoured value of the `parameter`,
     `under` are the estimates with the favoured amplitude, by label. `suspected`: the data favour the variation.
     """
 
@@ -103,7 +104,8 @@ def assumption_test(one: Assumption, **outcome: Any) -> AssumptionTest:
 
 
 class Checked(NamedTuple):
-    """All checks; columns (m, k) of the constants of the computation, and those of the free coordinates' Jacobian (m, n)."""
+    """All checks; columns (m, k) of the constants of the computation, and those of the free coordinates' Jacobian (m,
+    n)."""
 
     checks: list[AssumptionTest]
     columns: Array
@@ -133,8 +135,8 @@ def check_assumptions(
     """Tests of the assumptions at the estimates x (n,), to first order, where `at` holds residuals and Jacobian of the
     recordings `which`.
 
-    With `explain` a `doubtful` fit is repeated by `loss` without one assumption after the other, until one explains the misfit:
-    a test to first order says little where a fit has run far off.
+    With `explain` a `doubtful` fit is repeated by `loss` without one assumption after the other, until one explains the
+    misfit: a test to first order says little where a fit has run far off.
     """
     end = ended(problem, x, at, free, which, rtol, workers, journal)
     candidates: list[Variation] = []
@@ -170,7 +172,8 @@ def new_fits(
     problem: Problem, end: End, candidates: Sequence[Variation], loss: Loss, judge: "Judge", checks: dict[str, AssumptionTest],
     progress: bool,
 ) -> Iterator[Variation]:  # fmt: skip
-    """Repeats the fit without one assumption after the other, whose `checks` it replaces, until one explains the misfit."""
+    """Repeats the fit without one assumption after the other, whose `checks` it replaces, until one explains the
+    misfit."""
     with tqdm(total=len(candidates) + 1, unit="fit", disable=not progress) as bar:
 
         def notify(chi2: float) -> None:
@@ -191,8 +194,9 @@ def new_fits(
 
 
 def doubted(taken: Sequence[Variation], checks: Mapping[str, AssumptionTest], far: bool) -> list[Variation]:
-    """What a fit is repeated without, the likeliest first: all that either is so or is not, and `RIVALS` of the rig's numbers,
-    those that would explain most or, where a fit ended `far` off, those whose variation would make the greatest misfit."""
+    """What a fit is repeated without, the likeliest first: all that either is so or is not, and `RIVALS` of the rig's
+    numbers, those that would explain most or, where a fit ended `far` off, those whose variation would make the
+    greatest misfit."""
     by_gain = sorted((one for one in taken if one.name in checks), key=lambda one: -checks[one.name].gain)
     numbers = [one for one in by_gain if one.parameter and (far or checks[one.name].significance > EVIDENT)]
     if far:
@@ -252,8 +256,8 @@ class Judge:
         return self.made(one, moves, gain, self.square - gain, alpha * one.amount, sd * one.amount, rest, pattern)
 
     def fit(self, one: Assumption, again: Refit, as_stated: Refit, linear: AssumptionTest) -> AssumptionTest:
-        """Of a fit that was repeated with it, beside one that was repeated without; or what is known to first order, if that is
-        worth more."""
+        """Of a fit that was repeated with it, beside one that was repeated without; or what is known to first order, if
+        that is worth more."""
         at, before = again.fit.at, as_stated.fit.at
         assert at is not None
         assert before is not None
@@ -274,11 +278,12 @@ class Judge:
 
 
 def pattern_of(places: Sequence[NDArray[np.int_]], left: Array, r: Array) -> float:
-    """What is left of the autocovariances of residuals r beyond those of white noise, by the root of the sum of their squares;
-    0 where r has none beyond chance."""
+    """What is left of the autocovariances of residuals r beyond those of white noise, by the root of the sum of their
+    squares; 0 where r has none beyond chance."""
 
     def statistic(r: Array) -> tuple[float, float]:
-        """That of Box and Pierce, over the stated noise in place of the residuals' own, and its mean for white residuals."""
+        """That of Box and Pierce, over the stated noise in place of the residuals' own, and its mean for white
+        residuals."""
         total = white = 0.0
         for rows in places:
             own, n = r[rows], len(r[rows])
@@ -294,8 +299,8 @@ def pattern_of(places: Sequence[NDArray[np.int_]], left: Array, r: Array) -> flo
 
 
 def columns_of(problem: Problem, runner: Runner, end: End, taken: Sequence[Variation]) -> list[tuple[Variation, Array]]:
-    """What other values of known parameters, and faults of sensors that are not unknown, would add to the residuals, to first
-    order: of one run a recording, with its derivatives. Nothing where a run fails."""
+    """What other values of known parameters, and faults of sensors that are not unknown, would add to the residuals, to
+    first order: of one run a recording, with its derivatives. Nothing where a run fails."""
     if end.base.lost:
         return []
     known = [one for one in taken if one.parameter]
@@ -332,7 +337,8 @@ def columns_of(problem: Problem, runner: Runner, end: End, taken: Sequence[Varia
 
 
 def assumption_notices(checked: Checked) -> list[str]:
-    """Sentences on what the data favour, the strongest first, and on constants of the computation that estimates hang on."""
+    """Sentences on what the data favour, the strongest first, and on constants of the computation that estimates hang
+    on."""
     out, checks = [], checked.checks
     if checked.candidates:
         out.append(

@@ -1,9 +1,9 @@
 """Are recorded set-points close enough together for their motion, and are their rates theirs?
 
-A recorded signal is known at its rows only; a cubic stands between them. Its error is estimated from the rows: without every
-second one, and without three in four, the cubic has more of it, by an order that is observed. It is stated by its effect: the
-error of the set-point, against the noise of the sensor of that coordinate, and that of the effort, against the noise of the
-force.
+A recorded signal is known at its rows only; a cubic stands between them. Its error is estimated from the rows: without
+every second one, and without three in four, the cubic has more of it, by an order that is observed. It is stated by its
+effect: the error of the set-point, against the noise of the sensor of that coordinate, and that of the effort, against
+the noise of the force.
 """
 
 from collections.abc import Iterator, Mapping

@@ -16,8 +16,8 @@ from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.unknowns import Sensor
 
 Build = Callable[[Parameters, Reference], SoftGrasp]
-"""Makes a rig from settings and a reference: `SoftGrasp` itself, or a function that gives it laws of the user's own, such as a
-friction law."""
+"""Makes a rig from settings and a reference: `SoftGrasp` itself, or a function that gives it laws of the user's own,
+such as a friction law."""
 
 RIG = {
     channel: Sensor(noise=noise)
@@ -38,10 +38,10 @@ def record(
 ) -> Recording:  # fmt: skip
     """What a rig with the parameters `truth` gives under an excitation that was planned with the `nominal` ones.
 
-    The disc is set down, as the nominal parameters would have it lie, before the first sample, as `AtRest` assumes. Sampled at
-    `rate` [Hz] from a run whose steps `rtol` chooses, with Gaussian noise of `noise` times each sensor's own. `build` makes
-    the rig, and `values` are the truth of what `Parameters` does not have. The recording holds nothing of the truth but the
-    samples. Raises `SimulationFailed`.
+    The disc is set down, as the nominal parameters would have it lie, before the first sample, as `AtRest` assumes.
+    Sampled at `rate` [Hz] from a run whose steps `rtol` chooses, with Gaussian noise of `noise` times each sensor's
+    own. `build` makes the rig, and `values` are the truth of what `Parameters` does not have. The recording holds
+    nothing of the truth but the samples. Raises `SimulationFailed`.
     """
     planned = begin(excitation, nominal).model
     rig = build(planned.settings, planned.reference)

@@ -1,7 +1,7 @@
 """What is unknown: parameters with bounds and scales, and the vector of coordinates that the fits move in.
 
-A coordinate is the logarithm of a value, or the value over the width of its bounds; so a coordinate's standard deviation is
-a relative one either way.
+A coordinate is the logarithm of a value, or the value over the width of its bounds; so a coordinate's standard
+deviation is a relative one either way.
 """
 
 import math
@@ -52,12 +52,13 @@ class Prior(Table):
 
 
 class Unknown(Table):
-    """One parameter to be identified: of the rig, a user's law included, by its name there, or by its alias in `Parameters`.
+    """One parameter to be identified: of the rig, a user's law included, by its name there, or by its alias in
+    `Parameters`.
 
     `nominal` is where the search starts, by default the value of the recordings' own rigs; with `ratio_to` the value,
-    nominal, bounds and prior are those of the ratio to that other parameter, and `fixed` besides ties the two. Bounds end where
-    the parameter's own do (`Rig.quantity`): wider ones are errors. With `per` = "recording" every recording has
-    a value of its own. A `prior` counts as one more measurement.
+    nominal, bounds and prior are those of the ratio to that other parameter, and `fixed` besides ties the two. Bounds
+    end where the parameter's own do (`Rig.quantity`): wider ones are errors. With `per` = "recording" every recording
+    has a value of its own. A `prior` counts as one more measurement.
     """
 
     nominal: float | None = None
@@ -90,14 +91,16 @@ NUISANCES: tuple[Nuisance, ...] = get_args(Nuisance)
 
 
 class Sensor(Table):
-    """A measured channel: standard deviation of its noise [the channel's unit], what may be wrong with it, and where it ends.
+    """A measured channel: standard deviation of its noise [the channel's unit], what may be wrong with it, and where it
+    ends.
 
-    How large may be a constant `bias` [unit], a `delay` [s], the error of its `gain` [1], a `drift` [unit/s] from the middle of
-    the recording on, its `misalignment` [rad] about the axis out of the plane; the `inertia` [kg] between a force sensor and
-    what it pushes, whose acceleration it does not feel. Zero leaves them out, otherwise they are identified too, one for all
-    recordings or one for each (`per`). Samples at `low` or `high` [unit] or beyond are saturated: they only say that value and
-    noise together are there or beyond (Tobin's likelihood), and that noise must be white. `colour` says whether the noise is
-    known to be independent ("white"), or may be an autoregression ("ar"), whose order and coefficients are then found.
+    How large may be a constant `bias` [unit], a `delay` [s], the error of its `gain` [1], a `drift` [unit/s] from the
+    middle of the recording on, its `misalignment` [rad] about the axis out of the plane; the `inertia` [kg] between a
+    force sensor and what it pushes, whose acceleration it does not feel. Zero leaves them out, otherwise they are
+    identified too, one for all recordings or one for each (`per`). Samples at `low` or `high` [unit] or beyond are
+    saturated: they only say that value and noise together are there or beyond (Tobin's likelihood), and that noise must
+    be white. `colour` says whether the noise is known to be independent ("white"), or may be an autoregression ("ar"),
+    whose order and coefficients are then found.
     """
 
     noise: float = Field(ge=1e-15, le=1e6)
@@ -192,7 +195,8 @@ def limits(name: str, unknowns: Mapping[str, Unknown], recording: Recording) -> 
 
 
 def own_value(name: str, u: Unknown, recordings: Sequence[Recording]) -> float:
-    """Of an unknown, or its ratio, in the rigs of all recordings. Raises `ValueError` where they do not have the same."""
+    """Of an unknown, or its ratio, in the rigs of all recordings. Raises `ValueError` where they do not have the
+    same."""
     own = [r.parameters[name] / (r.parameters[u.ratio_to] if u.ratio_to else 1.0) for r in recordings]
     for r, value in zip(recordings, own):
         if not math.isclose(value, own[0], rel_tol=1e-9):
@@ -208,11 +212,11 @@ AT_BOUND = 1e-4
 
 
 class Coordinates:
-    """All coordinates of a problem, in a fixed order, and the way from their vector x (n,) to parameters of the rig, of where
-    runs begin, and of the sensors.
+    """All coordinates of a problem, in a fixed order, and the way from their vector x (n,) to parameters of the rig, of
+    where runs begin, and of the sensors.
 
-    Raises `ValueError` for unknowns that some recording's rig has not, a ratio to something that is not there, or a nominal
-    value or the median of a prior out of bounds.
+    Raises `ValueError` for unknowns that some recording's rig has not, a ratio to something that is not there, or a
+    nominal value or the median of a prior out of bounds.
     """
 
     def __init__(
