@@ -51,7 +51,7 @@ from torchsoft.sysid.profile import RISE, Profile
 from torchsoft.sysid.report import grouped, report, table, traces
 from torchsoft.sysid.report import page as page_of
 from torchsoft.sysid.residual_tests import autocorrelation
-from torchsoft.sysid.result import ChannelNoise, load_answer, untold
+from torchsoft.sysid.result import ChannelNoise, load_answer, undetermined
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import AssumptionTest
 
@@ -97,7 +97,7 @@ def test_the_first_line_says_when_the_model_does_not_explain_the_data(found: Fou
 def test_a_prediction_with_values_that_nothing_tells_says_so(found: Found) -> None:
     """Of the unknown that is the held-out recording's own."""
     answer, _ = found
-    said = untold({"contact.R_n": answer.recorded("held").identified["contact.R_n"]})
+    said = undetermined({"contact.R_n": answer.recorded("held").identified["contact.R_n"]})
     assert f"held-out recording `held` is predicted with what is {said}" in answer.notices
 
 
@@ -218,7 +218,7 @@ def test_starts_and_sensors_are_apart_from_parameters(page: Page) -> None:
     order = [
         "\nEstimates\n", "\npad.E\n", "\ncontact.eta\n", "\nParameters of which each recording has its own\n",
         f"\ncontact.R_n\n{HOSTILE}\n", "\ncontact.R_n\nshallow\n", "\nWhere the runs began\n",
-        "\nstart.disc.x\nshallow\n", "\nWhat the sensors add\n", "\nbias of y_Br\n", "\nHow much each recording told\n",
+        "\nstart.disc.x\nshallow\n", "\nWhat the sensors add\n", "\nbias of y_Br\n", "\nContribution of each recording\n",
     ]  # fmt: skip
     places = [page.text.index(text) for text in order]
     assert sorted(places) == places
@@ -332,7 +332,7 @@ def test_a_lost_recording_is_named_and_a_clean_answer_has_no_warnings(
     assert f"theta of {HOSTILE}" in alts
     assert "theta of held" not in alts
     assert "nothing to warn of" in page.text
-    for heading in ("How much each recording told", "Profiles", "What was taken for granted", "Which law"):
+    for heading in ("Contribution of each recording", "Profiles", "What was taken for granted", "Which law"):
         assert f"\n{heading}\n" not in page.text  # where there is nothing to say
 
 

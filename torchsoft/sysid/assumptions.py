@@ -272,7 +272,7 @@ def raised(recording: Recording, by: float) -> Recording | None:
     return with_reference(recording, **signals)
 
 
-# A problem in which one assumption is otherwise: what that adds to the residuals of a fit, and where the fit would end.
+# Problems with one assumption varied
 
 
 REFITS, ROUGH = 20, 1e-3

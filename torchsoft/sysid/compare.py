@@ -154,7 +154,7 @@ def coloured(score: Array, noise: Autoregression | None, t: Array) -> Array:
     return spsolve_triangular(noise.whitener(t).T.tocsr(), score, lower=False)
 
 
-# Which law made the data? Competing laws, each with its own unknowns, fitted to the same recordings and compared.
+# Competing laws, each with its own unknowns
 
 
 SAME = 1e-6

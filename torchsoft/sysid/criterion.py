@@ -146,8 +146,7 @@ def next_recording(
     return sorted(out, key=lambda o: (bool(o.lost), -o.gain / (o.seconds if per_second else 1.0)))
 
 
-# What a designed motion may do: knots of a reference's profiles as variables, within bounds of travel, speed and
-# duration.
+# Bounds of a designed motion: travel, speed and duration of the knots
 
 
 PEAK = 35 / 16

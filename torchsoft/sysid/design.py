@@ -25,7 +25,7 @@ MEMORY = 0.85, 0.97
 """How much of its slopes, and of their squares, Adam remembers from one iteration to the next."""
 
 LOOK = 10
-"""Iterations between two looks at the motion itself, with all draws and no random shift."""
+"""Iterations between two evaluations at the motion itself, with all draws and no random shift."""
 
 FAILURES = 5
 """Runs lost one after the other until the search goes back to the best motion so far."""
@@ -58,7 +58,7 @@ class Search:
     def begin(self) -> DesignEvaluation:
         """The look at the motion given, which is the best so far. Raises `ValueError` where it cannot be run."""
         try:
-            first = self.planner.look(self.planner.moves.start, self.points[0])
+            first = self.planner.evaluate(self.planner.moves.start, self.points[0])
         except SimulationFailed as failure:
             raise ValueError(f"the motion given cannot be run, so that nothing can begin with it: {failure}") from None
         self.set_out(self.planner.moves, first)
@@ -75,13 +75,13 @@ class Search:
     def visit(self, z: Array) -> tuple[Visit, DesignEvaluation | None]:
         """What a motion is worth over all points, infinite where it is lost, and the look at it at the first."""
         try:
-            looks = [self.planner.look(z, x) for x in self.points]
+            evaluations = [self.planner.evaluate(z, x) for x in self.points]
         except SimulationFailed:
             return Visit(self.iteration, np.inf, np.inf), None
-        values = [one.value for one in looks]
-        peak = max(max(one.peaks.values(), default=0.0) for one in looks)
+        values = [one.value for one in evaluations]
+        peak = max(max(one.peaks.values(), default=0.0) for one in evaluations)
         value = max(values) if self.robust == "worst" else float(np.mean(values))
-        return Visit(self.iteration, value, peak), looks[0]
+        return Visit(self.iteration, value, peak), evaluations[0]
 
     def look(self) -> None:
         """Keeps the motion as it is now, if it is the best."""
@@ -97,12 +97,12 @@ class Search:
         try:
             shifted = moves.nearest(z + self.smoothing * self.rng.standard_normal(moves.n))
             if self.robust == "worst":
-                looks = [self.planner.look(shifted, x) for x in self.points]
-                k = int(np.argmax([one.value for one in looks]))
-                x, there = self.points[k], looks[k]
+                evaluations = [self.planner.evaluate(shifted, x) for x in self.points]
+                k = int(np.argmax([one.value for one in evaluations]))
+                x, there = self.points[k], evaluations[k]
             else:
                 x = self.points[int(self.rng.integers(len(self.points)))]
-                there = self.planner.look(shifted, x)
+                there = self.planner.evaluate(shifted, x)
             slopes = self.planner.slopes(shifted, x, there)
         except (SimulationFailed, GradientFailed):
             self.lost, self.in_a_row = self.lost + 1, self.in_a_row + 1
@@ -123,7 +123,7 @@ class Search:
             self.look()
 
 
-# Motions designed for the question: the knots of set-points, moved by gradient until parameters are known best.
+# The design of a motion
 
 
 RTOL = 1e-3

@@ -210,7 +210,7 @@ def residual_channels(problem: Problem, residuals: Residuals, which: list[str]) 
     ]
 
 
-# How much each recording, and the priors, told about what was estimated.
+# Contributions of recordings and priors to the estimates
 
 
 @dataclass(frozen=True)

@@ -263,7 +263,7 @@ def trace_figure(trace: Trace, channel: ChannelResiduals | None, noise: Autoregr
     return figure
 
 
-# The picture of a comparison of laws: where in the motion the evidence against the others comes from.
+# Comparison of laws
 
 
 MOST = 4
@@ -315,7 +315,7 @@ def growth(s: Series, versus: Versus) -> np.ndarray:
     return np.cumsum(0.5 * (b**2 - a**2))
 
 
-# A designed motion in one picture: set-points before and after, standard deviations, and the criterion as it went.
+# Designed motion
 
 
 @rc_context(STYLE)

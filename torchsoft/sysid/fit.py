@@ -117,7 +117,7 @@ def rounded(direction: Array, C: Array) -> Array:
     return np.round(exact, 3)
 
 
-# Robust losses: what they do to outliers, and the covariance that belongs to them.
+# Robust losses and their covariance
 
 
 Loss = Literal["linear", "soft_l1", "huber", "cauchy", "arctan"]
@@ -181,7 +181,7 @@ def covariance(J: Array, r: Array, loss: Loss, priors: int = 0, exact: NDArray[n
     return inverse @ (max(power, least) * J[:m].T @ J[:m] + J[m:].T @ J[m:]) @ inverse
 
 
-# Two ways down the same misfit: Gauss-Newton on exact sensitivities, and gradient descent on the discrete adjoint.
+# Gauss-Newton and gradient descent
 
 
 Notify = Callable[[float], None]
@@ -192,13 +192,13 @@ SETTLED = 0.2
 
 class Unreachable(RuntimeError):
     """The model cannot follow a recording with the parameters that a fit starts from; `lost` has reason and time,
-    `looks` what looked wrong with the recordings themselves."""
+    `findings` what looked wrong with the recordings themselves."""
 
-    def __init__(self, lost: dict[str, FailedRun], looks: Sequence[str] = ()) -> None:
+    def __init__(self, lost: dict[str, FailedRun], findings: Sequence[str] = ()) -> None:
         reasons = "; ".join(f"recording `{name}`: {loss.reason}" for name, loss in lost.items())
-        behind = f"; what may be behind it: {'; '.join(looks)}" if looks else ""
+        behind = f"; what may be behind it: {'; '.join(findings)}" if findings else ""
         super().__init__(f"the model cannot reach the data from this start: {reasons}{behind}")
-        self.lost, self.looks = lost, tuple(looks)
+        self.lost, self.findings = lost, tuple(findings)
 
 
 class Fit(NamedTuple):

@@ -39,7 +39,7 @@ from torchsoft.sysid.residual_tests import (
     residual_notices,
     rewhitened,
 )
-from torchsoft.sysid.result import IdentificationResult, described, untold
+from torchsoft.sysid.result import IdentificationResult, described, undetermined
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import Checked, assumption_notices, check_assumptions
 from torchsoft.tables import SEED, Table, plain
@@ -83,8 +83,7 @@ class Settings(Table):
         return self
 
 
-# What is known at the end of a fit: intervals, verdicts on the misfit and on what was taken for granted, and the
-# result.
+# Conclusion of a fit
 
 
 class How(NamedTuple):
@@ -106,10 +105,10 @@ class How(NamedTuple):
 
 
 def conclude(
-    coloured: Coloured, runner: Runner, stage: Stage, stages: list[dict[str, Any]], how: How, looks: list[str],
+    coloured: Coloured, runner: Runner, stage: Stage, stages: list[dict[str, Any]], how: How, findings: list[str],
     began: float, progress: bool,
 ) -> IdentificationResult:  # fmt: skip
-    """The result, from the fit of the last stage with the noise that was found; `looks` are sentences on the recordings
+    """The result, from the fit of the last stage with the noise that was found; `findings` are sentences on the recordings
     themselves, `began` is on the clock [s]."""
     problem, fit = coloured.problem, coloured.fit
     c = problem.coordinates
@@ -142,7 +141,7 @@ def conclude(
     C[np.ix_(free, free)] = C_fit + (checked.widening() if checked is not None else 0.0)
     labels = [label for label, one in zip(c.labels, free) if one]
     found = estimates(problem, x, free, C, shift)
-    predicted, notices = {}, list(looks)
+    predicted, notices = {}, list(findings)
     if how.heldout:
         held = problem.with_noise({}).residuals(runner, x, how.heldout, rtol)
         if held.lost:
@@ -216,7 +215,7 @@ def guesses(problem: Problem, x: Array, heldout: Sequence[str]) -> list[str]:
         mine = [c for c in problem.coordinates.all if c.recording == problem.names[k] and not c.fixed]
         values = problem.values(x, k)
         if own := {c.name: values[c.name] for c in mine if c.kind == "parameter"}:
-            out.append(f"held-out recording `{problem.names[k]}` is predicted with what is {untold(own)}")
+            out.append(f"held-out recording `{problem.names[k]}` is predicted with what is {undetermined(own)}")
     return out
 
 
@@ -243,7 +242,7 @@ def notices_on(found: list[Any], converged: bool, rtol: float, unchecked: bool) 
     return out
 
 
-# `identify`: carry out a plan of stages, then state how certain the result is and what is not identifiable.
+# Identification and explanation
 
 
 def identify(
@@ -284,11 +283,11 @@ def identify(
         raise ValueError("`starts` and `rtol` are those of the default plan: say them of the stages of `plan` instead")
     fitted, began = [name for name in problem.names if name not in heldout], clock.perf_counter()
     runner = Runner(problem.recordings, workers, Path(checkpoint) if checkpoint is not None else None)
-    looks = accepted(precheck(problem, runner, fitted), acknowledged) if assumptions != "trusted" else []
-    for look in looks if progress else ():
+    findings = accepted(precheck(problem, runner, fitted), acknowledged) if assumptions != "trusted" else []
+    for look in findings if progress else ():
         tqdm.write(plain(f"note: {look}"), file=sys.stderr)
     x, fit, stages = problem.coordinates.start, None, []
-    with explained(looks):
+    with explained(findings):
         if plan is None:
             plan = default_plan(problem, runner, rtol, fitted, starts)
         for number, stage in enumerate(plan):
@@ -306,7 +305,7 @@ def identify(
         stage_entry("with the noise that was found", plan[-1], plan[-1].rtol, one, before) for one in coloured.fits
     ]
     how = How(fitted, tuple(heldout), tuple(acknowledged), settings)
-    return conclude(coloured, runner, plan[-1], stages, how, looks, began, progress)
+    return conclude(coloured, runner, plan[-1], stages, how, findings, began, progress)
 
 
 def explain(problem: Problem, **how: Any) -> IdentificationResult:
@@ -320,12 +319,12 @@ def explain(problem: Problem, **how: Any) -> IdentificationResult:
 
 
 @contextmanager
-def explained(looks: Sequence[str]) -> Iterator[None]:
+def explained(findings: Sequence[str]) -> Iterator[None]:
     """Tells whom the model cannot follow the data what looked wrong with the recordings themselves."""
     try:
         yield
     except Unreachable as error:
-        raise Unreachable(error.lost, looks) from None
+        raise Unreachable(error.lost, findings) from None
 
 
 def with_its_noise(

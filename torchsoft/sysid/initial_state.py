@@ -181,7 +181,7 @@ def held_forces(pad: Pad, z: Tensor, nominal: Pad) -> Tensor:
     return scaled + by_nu * (material.nu - material.nu.detach())
 
 
-# Runs that begin anywhere, in motion or in mid-grasp: poses, velocities and stretches are unknown.
+# Starts in motion or in mid-grasp
 
 
 LEAD = 50e-3

@@ -106,7 +106,7 @@ def paper_settings(recording: Recording) -> Parameters:
     return recording.rig.settings
 
 
-# Recordings and problems as files state them: tables of measurements, and a TOML file (`configuration`).
+# Recordings and problems
 
 
 BEGINNING, CREEP = 10e-3, 20e-3

@@ -90,8 +90,8 @@ def visible(J: Array, candidates: NDArray[np.bool_], limit: float = FIRST_LOOK) 
     return out
 
 
-def told(problem: Problem, which: Sequence[str]) -> NDArray[np.bool_]:
-    """Coordinates (n,) that recordings may tell something of: not those of other recordings, nor of sensors that they
+def informative(problem: Problem, which: Sequence[str]) -> NDArray[np.bool_]:
+    """Mask (n,) of coordinates that recordings can constrain: not those of other recordings, nor of sensors that they
     lack."""
     channels = {channel for recording in problem.recordings if recording.name in which for channel in recording.samples}
     return np.array(
@@ -107,7 +107,7 @@ def default_plan(problem: Problem, runner: Runner, rtol: float, which: Sequence[
 
     Raises `Unreachable` where that recording cannot be simulated from the start.
     """
-    c, free = problem.coordinates, problem.coordinates.free & told(problem, which)
+    c, free = problem.coordinates, problem.coordinates.free & informative(problem, which)
     ratios = np.array([bool(one.ratio_to) for one in c.all]) & free
     x, labels = tie_ratios(problem, c.start), np.array(c.labels, object)
     speed = {recording.name: recording.speed for recording in problem.recordings}
@@ -129,7 +129,7 @@ def default_plan(problem: Problem, runner: Runner, rtol: float, which: Sequence[
     return plan
 
 
-# How one stage of an identification is carried out: ties, scans, starts, and a fit on frozen steps.
+# Stages: ties, scans, starts, and a fit on frozen steps
 
 
 Method = Literal["gauss_newton", "lbfgs", "adam"]
@@ -233,7 +233,7 @@ def sobol(problem: Problem, x: Array, free: NDArray[np.bool_], stage: Stage, see
     return out
 
 
-# The end of a fit: are its frozen steps still those that the tolerance would choose, and is the tolerance tight enough?
+# Steps at the end of a fit
 
 
 STEP_BIAS = 0.5

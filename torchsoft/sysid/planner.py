@@ -137,7 +137,7 @@ class Planner:
         self.cost["runs"] += 1
         return p.gather(x, [job], [run]), run
 
-    def look(self, z: Array, x: Array, steps: Steps | None = None) -> DesignEvaluation:
+    def evaluate(self, z: Array, x: Array, steps: Steps | None = None) -> DesignEvaluation:
         """The motion z at x, by the planner's tolerance or that of `steps`; on steps that are given without the errors.
         Raises `SimulationFailed`."""
         c, given = self.problem.coordinates, self.rtol if steps is None else steps

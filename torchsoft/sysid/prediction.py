@@ -172,7 +172,7 @@ def readout(
     )  # fmt: skip
 
 
-# One run of a recording's rig for given parameters: signals with derivatives, or the misfit with its gradient.
+# Runs: signals with derivatives, or the misfit with its gradient
 
 
 TOLERANCE = 1e-8

@@ -120,8 +120,7 @@ class Optimum:
         return float("nan") if fresh.lost or frozen.lost else float(fresh.r @ fresh.r - frozen.r @ frozen.r)
 
 
-# Profile likelihood: how the misfit rises when one coordinate is held away from its optimum and all others are fitted
-# again.
+# Profiles
 
 
 RISE = float(stats.chi2.ppf(0.95, 1))
@@ -322,7 +321,7 @@ def assemble(o: Optimum, i: int, below: Side, above: Side) -> Profile:
     )  # fmt: skip
 
 
-# What an answer keeps of posterior draws.
+# Summary of a posterior
 
 
 @dataclass(frozen=True)

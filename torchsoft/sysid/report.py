@@ -129,7 +129,7 @@ def interval(low: float | None, high: float | None) -> str:
     return f"{'open' if low is None else grouped(low)} … {'open' if high is None else grouped(high)}"
 
 
-# Sections of a page about an identification, each from its answer and as HTML.
+# Sections
 
 
 MOVED = 0.5
@@ -216,12 +216,12 @@ def prior(e: Estimate) -> Cell:
     return "", f"{grouped(e.prior.median)} {sd}"
 
 
-def told(result: IdentificationResult) -> Iterator[str]:
-    """How much each recording told."""
+def contributions_section(result: IdentificationResult) -> Iterator[str]:
+    """Contribution of each recording."""
     figure = contributions_figure(result)
     if figure is None:
         return
-    yield heading("How much each recording told")
+    yield heading("Contribution of each recording")
     yield paragraph(
         "The weight that each recording has in an estimate, and in brackets how many times larger the standard deviation "
         "would be without it; “only here” where the others do not determine the parameter."
@@ -291,7 +291,7 @@ def profiles(result: IdentificationResult) -> Iterator[str]:
     yield f'<div class="grid">{"".join(shown)}</div>'
 
 
-def taken_for_granted(result: IdentificationResult) -> Iterator[str]:
+def assumptions_section(result: IdentificationResult) -> Iterator[str]:
     """What estimates hang on, and what the data say of it; the harmless ones are folded away."""
     if not result.assumptions:
         return
@@ -312,12 +312,12 @@ def taken_for_granted(result: IdentificationResult) -> Iterator[str]:
         moved = f"{signed(one.moves[label])} sd of {label}" if label else ""
         row: list[Cell] = [one.stated, one.otherwise, ("", moved), asks]
         (first if one.suspected or most[i] > MOVED or one.unchecked else rest).append(row)
-    yield heading("What was taken for granted")
+    yield heading("Assumptions")
     yield paragraph(
         "How far the estimate that moves most would move (in its standard deviations) if something that was stated were "
         "otherwise, and how much of that the data favour."
     )
-    head = ["taken for granted", "if", "would move", "do the data favour it?"]
+    head = ["assumption", "if", "would move", "do the data favour it?"]
     if first:
         yield table(head, first)
     if rest:
@@ -416,7 +416,7 @@ def made(result: IdentificationResult, units: Mapping[str, str]) -> Iterator[str
     yield folded("Everything that decides the result", verbatim(json.dumps(by, indent=1, ensure_ascii=False)))
 
 
-# A page about an identification: one HTML file with its pictures inside, that any browser opens without a network.
+# The page
 
 
 def report(
@@ -462,8 +462,8 @@ def page(result: IdentificationResult, drawn: list[Trace], lost: dict[str, str])
     """The whole HTML text."""
     head = result.headline
     about = (
-        summary, estimates, told, identifiable, profiles,
-        taken_for_granted, laws,
+        summary, estimates, contributions_section, identifiable, profiles,
+        assumptions_section, laws,
     )  # fmt: skip
     parts = [heading(head, 1), *(part for section in about for part in section(result))]
     parts += [

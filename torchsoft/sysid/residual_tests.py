@@ -108,7 +108,7 @@ def predicted(sensor: Sensor, measured: Array, raw: Array) -> Array:
     return y
 
 
-# Is what a fit left over noise? Tests of its residuals, each with a p-value for as many samples as there are.
+# Tests
 
 
 LEVEL = 0.01
@@ -374,7 +374,7 @@ def named(words: Sequence[str]) -> str:
     return ", ".join(words[:MOST]) + (f" and {more} more" if more > 0 else "")
 
 
-# Colour that is found in residuals: where, of which order, and what a reader must know of it.
+# Coloured noise
 
 
 ROUNDS = 2

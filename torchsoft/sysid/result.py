@@ -85,7 +85,7 @@ def known(description: dict[str, Any], identified: dict[str, float]) -> dict[str
     return {name: value for name, value in (parameters | laws).items() if name not in scenario}
 
 
-def untold(values: Mapping[str, float]) -> str:
+def undetermined(values: Mapping[str, float]) -> str:
     """What is said of values that the data do not tell."""
     said = ", ".join(f"{name} = {value:.3g}" for name, value in values.items())
     return f"not identifiable from the data, and so only where the search ended: {said}"
@@ -124,7 +124,7 @@ def recorded_rigs(problem: Problem, x: Array, fitted: Sequence[str]) -> list[Rec
     return out
 
 
-# The answer of an identification: what was found, how, and of what rig, as plain data; `answer.json` holds it.
+# The result
 
 
 SCHEMA = "torchsoft-answer-4"
@@ -269,7 +269,7 @@ class IdentificationResult:
             if c.fixed and c.kind == "parameter" and c.recording == one.name and not self.unknowns[c.name].fixed
         ]
         if weak:
-            warnings.warn(untold({name: one.identified[name] for name in weak}), stacklevel=3)
+            warnings.warn(undetermined({name: one.identified[name] for name in weak}), stacklevel=3)
         return rig
 
     def to_json(self) -> str:

@@ -125,7 +125,7 @@ def forget(folder: Path) -> None:
         folder.rmdir()
 
 
-# Runs of the model, side by side in threads, each result kept on disk until the identification is done.
+# Runs in threads
 
 
 class Job(NamedTuple):

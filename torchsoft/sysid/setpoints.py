@@ -170,7 +170,3 @@ def other_rate(recording: Recording, setpoint: str) -> Diagnostic | None:
         f"of a spline through it, {size:.3g}; {looks}"
     )
     return found(f"rate of {setpoint}", recording, text, grave=True)
-
-
-# Do recordings mean what the model takes them to mean? Looked at before a fit, which would give wrong numbers without a
-# word.
