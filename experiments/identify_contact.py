@@ -23,9 +23,10 @@ from numpy.typing import NDArray
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes
 from torchsoft.experiment import COARSE, markdown, options, raw_config, write
-from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, identify, record, report
+from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, identify, record
 from torchsoft.sysid.problem import Residuals, StepsByName
 from torchsoft.sysid.recording import Array
+from torchsoft.sysid.report import report
 from torchsoft.sysid.runs import Runner, forget
 
 TRUTH = {

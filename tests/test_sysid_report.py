@@ -332,7 +332,7 @@ def test_a_lost_recording_is_named_and_a_clean_answer_has_no_warnings(
     assert f"theta of {HOSTILE}" in alts
     assert "theta of held" not in alts
     assert "nothing to warn of" in page.text
-    for heading in ("Contribution of each recording", "Profiles", "What was taken for granted", "Which law"):
+    for heading in ("Contribution of each recording", "Profiles", "Assumptions", "Which law"):
         assert f"\n{heading}\n" not in page.text  # where there is nothing to say
 
 
