@@ -76,10 +76,10 @@ def test_slopes_are_those_of_differences(
     stated = Problem([plan], SENSORS | sensors, {"pad.E": Unknown(), "contact.K_n": Unknown()})
     one = planner(stated, Criterion("A"), F_y=(-30.0, 30.0))
     z, x = one.moves.start, stated.coordinates.start
-    at = one.look(z, x)
+    at = one.evaluate(z, x)
     slopes, direction, h = one.slopes(z, x, at), np.random.default_rng(1).standard_normal(one.moves.n), 3e-5
     assert at.peaks["F_y"] > 1
-    ahead, behind = (one.look(z + s * h * direction, x, at.steps) for s in (1, -1))
+    ahead, behind = (one.evaluate(z + s * h * direction, x, at.steps) for s in (1, -1))
     wanted = (ahead.value + ahead.cost - behind.value - behind.cost) / (2 * h)
     assert slopes @ direction == pytest.approx(wanted, rel=rel)
 
@@ -91,7 +91,7 @@ def test_what_finite_steps_and_bent_samples_do_to_a_fit_counts(plan: Recording) 
         sensors = {name: Sensor(noise=one.noise / better) for name, one in SENSORS.items()}
         stated = Problem([plan], sensors, {"pad.E": Unknown(), "contact.K_n": Unknown()})
         one = planner(stated, Criterion("A"))
-        at = one.look(one.moves.start, stated.coordinates.start)
+        at = one.evaluate(one.moves.start, stated.coordinates.start)
         sd = np.array(list(one.deviations(stated.coordinates.start, at).values()))
         assert at.errors.shape == (2, 2)
         assert at.value == pytest.approx(0.5 * np.log(np.mean(sd**2 + LEFT**2 * (at.errors**2).mean(0))))
@@ -232,7 +232,7 @@ def test_any_rig_with_profiles() -> None:
 
 def test_what_cannot_be_run_is_left(problem: Problem, monkeypatch: Any) -> None:
     """In the search; the motion given is refused."""
-    look, count = Planner.look, [0]
+    look, count = Planner.evaluate, [0]
 
     def sometimes(self: Planner, *given: Any) -> Any:
         count[0] += 1
@@ -240,11 +240,11 @@ def test_what_cannot_be_run_is_left(problem: Problem, monkeypatch: Any) -> None:
             raise SimulationFailed("the disc was lost", 0.1)
         return look(self, *given)
 
-    monkeypatch.setattr(Planner, "look", sometimes)
+    monkeypatch.setattr(Planner, "evaluate", sometimes)
     found = design(problem, "plan", BOUNDS, iterations=2)
     assert any("could not be run" in notice for notice in found.notices)
     assert found.made_by["iterations"] == 2
-    monkeypatch.setattr(Planner, "look", never)
+    monkeypatch.setattr(Planner, "evaluate", never)
     with pytest.raises(ValueError, match="the motion given cannot be run"):
         design(problem, "plan", BOUNDS, iterations=3)
 
