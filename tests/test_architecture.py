@@ -39,10 +39,7 @@ FLOWS = {
     "sysid.files": "columns configuration measured cost .",
     "sysid.report": "figures comparison_figure page sections report .",
     "sysid.design": "criterion knots planner search design design_figure .",
-    "rigs": """
-        fields recorded shapes materials bodies pads contacts network actuators motion outputs schema cost geometry build
-        course finding reach balance check written template pictures run .
-    """,
+    "rigs": "fields parts control motion geometry build course balance check written pictures run .",
     "cli": "failure results rigs identify material .",
     "solve.kernel": """
         cache . arrays scratch linear inertia interface stage finish step taped run rates adjoint_pads adjoint tangent

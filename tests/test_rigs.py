@@ -22,8 +22,7 @@ from torchsoft.rigs import run as running
 from torchsoft.rigs.check import check
 from torchsoft.rigs.course import Estimate
 from torchsoft.rigs.motion import flattened
-from torchsoft.rigs.template import template
-from torchsoft.rigs.written import to_toml
+from torchsoft.rigs.written import template, to_toml
 from torchsoft.scenario import grasp_and_roll
 from torchsoft.solve.simulate import Interrupted
 from torchsoft.solve.stability import linearised, loop_modes, modes

@@ -5,16 +5,22 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from torchsoft.cost import Cost, row_bytes, step_time, steps_per_second
 from torchsoft.files import make_folder, write_json
+from torchsoft.physics.mesh import Mesh
+from torchsoft.physics.mesh.compliance import SMALLEST_BLOCK
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import BuiltRig, RigFile
-from torchsoft.rigs.check import Finding
+from torchsoft.rigs.fields import Finding, at_field
 from torchsoft.rigs.pictures import draw
 from torchsoft.solve.ledger import doubts
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.solve.simulate import Interrupted, simulate
+from torchsoft.solve.simulate import RTOL, Interrupted, simulate
 from torchsoft.solve.trajectory import Trajectory
+
+FLOPS = 1e10
+"""Operations a second [1/s] of products of blocks on one core of a usual machine."""
 
 
 class RunOutcome(NamedTuple):
@@ -114,3 +120,30 @@ def coordinates(rig: Rig, run: Trajectory, body: str) -> dict[str, dict[str, flo
 def effort(rig: Rig, actuator: str) -> str:
     """The channel of an actuator's effort."""
     return rig.renamed.get(f"F_{actuator}", f"F_{actuator}")
+
+
+def condensing_time(mesh: Mesh) -> float:
+    """Time [s] for condensing a mesh onto its surface: a factorisation in the order of the smallest band, and as many solutions
+    as surface coordinates."""
+    surface, free, band = mesh.counts()
+    width = max(2 * min(band, free // band), SMALLEST_BLOCK)
+    return 2 * free * width * (4 * width + 12 * surface) / FLOPS
+
+
+def cost(file: RigFile, runs: bool) -> Cost:
+    """Cost of a check, and of a run after it. Raises `ValueError` for a mesh file that cannot be read."""
+    meshes = []
+    for name, table in file.pads.items():
+        with at_field(f"pads.{name}"):
+            meshes.append(table.mesh(file.folder))
+    seconds = sum(condensing_time(mesh) for mesh in set(meshes))
+    memory, steps = max(mesh.memory for mesh in meshes), 0.0
+    if runs:
+        span, s = file.outputs.duration, file.solver
+        steps = span / s.step if s.step is not None else span * steps_per_second(s.rtol or RTOL)
+        for mesh, table in zip(meshes, file.pads.values()):
+            surface, free, _ = mesh.counts()
+            points = table.points * surface
+            seconds += 0.5 * steps * step_time(surface, points, free if table.inertial else 0)
+            memory += span / file.outputs.interval * row_bytes(free if table.inertial else surface, points) / 2**30
+    return Cost(steps, seconds, memory)
