@@ -16,12 +16,11 @@ FLOWS = {
     """,
     "codegen": "graph derivatives operations trace pointwise emit . invoke",
     "physics": """
-        arguments mesh shapes contact retardation material pads motion multibond state parts controllers condensed validity rig
-        energy statics .
+        arguments mesh shapes contact material pads motion multibond state parts condensed validity rig energy statics .
     """,
     "paper": "parameters rig equilibrium .",
-    "physics.mesh": "element mesh compliance block fingertip file quads .",
-    "physics.shapes": "shape area simple oval rounded closed contour .",
+    "physics.mesh": "mesh compliance block quads .",
+    "physics.shapes": "shape oval rounded contour .",
     "solve": """
         grid kernel laws system progress tolerances rates stability stepper adjoint tangent trajectory
         ledger simulate batch torchdiffeq .

@@ -14,7 +14,7 @@ import pytest
 
 from torchsoft import csvfile
 from torchsoft.files import PARTIAL, claim, remove_partials, replacing, sealed, unsealed, write_json
-from torchsoft.physics.mesh.file import read_quads
+from torchsoft.physics.mesh.quads import read_quads
 from torchsoft.rigs.control import LOOP, read_network
 from torchsoft.rigs.motion import read_column
 from torchsoft.solve.trajectory import load

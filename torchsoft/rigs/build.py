@@ -354,7 +354,7 @@ class RigFile(Group):
             raise ValueError(f"{prefix}{error}") from None
 
     def _starts(self, rig: Rig, driven: Mapping[str, float]) -> dict[str, Array]:
-        """Poses (3,) [m, m, rad] by body at the start, those at rest solved for; `driven` are where driven coordinates begin."""
+        """Poses (3,) [m, m, rad] by body at the start, solved for where bodies rest; `driven` are the driven ones'."""
         pose = {name: np.zeros(3) for name in self.bodies}
         wanted: dict[str, list[int]] = {}
         for name, axis, kind in self.coordinates():

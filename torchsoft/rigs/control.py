@@ -17,8 +17,7 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from torchsoft.files import check_file
-from torchsoft.physics.controllers import StateFeedback, controller
-from torchsoft.physics.parts import PD, Actuator, ReversedPD
+from torchsoft.physics.parts import PD, Actuator, ReversedPD, StateFeedback, controller
 from torchsoft.quantity import DerivativeGain, ProportionalGain, Quantity
 from torchsoft.rigs.fields import Group, at_field
 from torchsoft.tables import LISTED, line

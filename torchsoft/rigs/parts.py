@@ -13,7 +13,7 @@ from torchsoft.physics.mesh import CurvedPadMesh, FingertipMesh, Mesh, PadMesh, 
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES, Body, Contact
 from torchsoft.physics.shapes import Circle, Contour, Ellipse, RoundedBox, RoundedPolygon, Superellipse
-from torchsoft.physics.shapes.closed import read_points
+from torchsoft.physics.shapes.contour import read_points
 from torchsoft.quantity import Angle, Density, Depth, Inertia, InertiaRatio, Mass, Place, Quantity
 from torchsoft.rigs.fields import Group, NumberOr, PartTable, at_field, one_of, table_of
 from torchsoft.tables import LISTED, line, read_toml, refusing
