@@ -38,7 +38,7 @@ FLOWS = {
     "sysid.files": "columns configuration measured cost .",
     "sysid.report": "figures comparison_figure page sections report .",
     "sysid.design": "criterion knots planner search design design_figure .",
-    "rigs": "fields parts control motion geometry build course balance check written pictures run .",
+    "rigs": "fields parts control motion geometry build course balance check written run .",
     "cli": "failure results rigs identify material .",
     "solve.kernel": """
         cache . arrays scratch linear inertia interface stage finish step taped run rates adjoint_pads adjoint tangent
@@ -134,7 +134,7 @@ def test_rigs_are_drawn_in_one_room() -> None:
     """Whatever else they do needs no matplotlib."""
     drawing = {name for name, path in MODULES.items() if layer(name, "") == "rigs" and "plot" in
                {layer(other, "") for other in imports(path)}}  # fmt: skip
-    assert drawing == {"rigs.pictures"}
+    assert drawing == {"rigs.run"}
 
 
 @pytest.mark.parametrize("folder", APART)

@@ -11,9 +11,8 @@ from scipy.interpolate import CubicSpline
 
 from torchsoft import csvfile
 from torchsoft.channels import UNITS
-from torchsoft.excitation import FADE, Waves, wave
 from torchsoft.files import check_file
-from torchsoft.physics.motion import Piecewise, Profile, Sampled
+from torchsoft.physics.motion import FADE, Piecewise, Profile, Sampled, Waves, wave
 from torchsoft.quantity import Quantity, Time
 from torchsoft.rigs.fields import Group, NumberOr
 from torchsoft.tables import LISTED, line, shown

@@ -5,19 +5,26 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from tqdm import tqdm
+
 from torchsoft.cost import Cost, row_bytes, step_time, steps_per_second
 from torchsoft.files import make_folder, write_json
 from torchsoft.physics.mesh import Mesh
 from torchsoft.physics.mesh.compliance import SMALLEST_BLOCK
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
+from torchsoft.plot import figures, general
+from torchsoft.plot.animation import animate
 from torchsoft.rigs.build import BuiltRig, RigFile
 from torchsoft.rigs.fields import Finding, at_field
-from torchsoft.rigs.pictures import draw
 from torchsoft.solve.ledger import doubts
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import RTOL, Interrupted, simulate
 from torchsoft.solve.trajectory import Trajectory
+from torchsoft.tables import plain
+
+SNAPSHOTS = 6
+"""Pictures of the run where the file does not say when."""
 
 FLOPS = 1e10
 """Operations a second [1/s] of products of blocks on one core of a usual machine."""
@@ -147,3 +154,29 @@ def cost(file: RigFile, runs: bool) -> Cost:
             seconds += 0.5 * steps * step_time(surface, points, free if table.inertial else 0)
             memory += span / file.outputs.interval * row_bytes(free if table.inertial else surface, points) / 2**30
     return Cost(steps, seconds, memory)
+
+
+def draw(file: RigFile, rig: Rig, run: Trajectory, out: Path, progress: bool) -> list[str]:
+    """Write the figures and the video that a file asks for to `out`; the names of the files written."""
+    end, written = float(run.t[-1]), []
+    times = [t for t in file.outputs.snapshots if t <= end] or [i * end / (SNAPSHOTS - 1) for i in range(SNAPSHOTS)]
+    title = plain(file.title) or "Bodies, pads and contact forces"
+    made = {
+        "snapshots": lambda: figures.snapshots(run, rig, times, title),
+        "motion": lambda: general.motions(run, rig),
+        "forces": lambda: general.efforts(run, rig),
+        "power": lambda: general.power_balance(run),
+        "energy": lambda: figures.energy_balance(run),
+    }
+    if file.outputs.figures:
+        for name, figure in tqdm(made.items(), "figures", unit="figure", disable=not progress):
+            figures.save(figure(), out / f"{name}.png")
+            written.append(f"{name}.png")
+    if file.outputs.video != "none":
+        name = f"video.{file.outputs.video}"
+        animate(
+            run, rig, out / name, frames=file.outputs.frames, progress=progress, title=title, even=True,
+            follow=file.outputs.follow or general.liveliest(run, rig),
+        )  # fmt: skip
+        written.append(name)
+    return written
