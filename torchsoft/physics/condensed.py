@@ -36,59 +36,51 @@ def nodal_forces(
     residual that is left of x.
 
     A (2 nodes, 2 nodes) is the pad's compliance or mobility, N (points, nodes) its shape functions at the points. Semi-smooth
-    Newton from `free`, in which the force on a point depends on its own x only, so that only the points with a slope are
+    Newton from no force, in which the force on a point depends on its own x only, so that only the points with a slope are
     unknowns. The last iteration is taken with the gradient on, which makes the derivative the implicit function theorem's.
     """
+    relation = A.detach()
 
-    def residual(x: Tensor, f: Tensor) -> Tensor:
-        return x - N @ (free + nodal(A, N.mT @ f))
-
-    def linearise(x: Tensor) -> tuple[Tensor, Tensor]:
-        """Residual and the slopes (..., points, 2, 2) of the law."""
+    def linearise(f: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Mismatch, what it makes of x, and the slopes (..., points, 2, 2) of the law."""
+        x = N @ (free + nodal(relation, N.mT @ f))
         with torch.enable_grad():
             x = x.detach().requires_grad_()
-            f = law(x)
+            at = law(x)
             rows = [
-                torch.autograd.grad(f[..., i].sum(), x, retain_graph=i == 0, materialize_grads=True) for i in (0, 1)
+                torch.autograd.grad(at[..., i].sum(), x, retain_graph=i == 0, materialize_grads=True) for i in (0, 1)
             ]
-        return residual(x, f).detach(), torch.stack([row for (row,) in rows], -2)
+        v = at.detach() - f
+        return v, N @ nodal(relation, N.mT @ v), torch.stack([row for (row,) in rows], -2)
 
-    def step(r: Tensor, G: Tensor) -> Tensor:
-        """(1 - N A N^T G)^-1 r: points without a slope follow the others."""
+    def correction(v: Tensor, G: Tensor) -> Tensor:
+        """(1 - G B)^-1 v with B = N A N^T."""
         sloped = torch.nonzero(G.flatten(-2).any(-1).reshape(-1, len(N)).any(0))[:, 0]
         if not len(sloped):
-            return r
-        S, G = N[sloped], G[..., sloped, :, :]
-        used = torch.nonzero(S.any(0))[:, 0]
-        blocks = A.detach().unflatten(0, (-1, 2)).unflatten(2, (-1, 2))[used][:, :, used]
-        between = torch.einsum("pn,niaj,qa->piqj", S[:, used], blocks, S[:, used])
-        size = 2 * len(sloped)
-        coupled = torch.einsum("piqj,...qjk->...piqk", between, G).reshape(*G.shape[:-3], size, size)
-        J = torch.eye(size, dtype=r.dtype) - coupled
-        own = torch.linalg.solve(J, r[..., sloped, :].flatten(-2)[..., None]).unflatten(-2, (-1, 2))
-        return r + N @ nodal(A.detach(), S.mT @ (G @ own)[..., 0])
-
-    def corrected(f: Tensor, G: Tensor) -> Tensor:
-        """A step in forces, which stiff contacts need: law(N (free + A F)) is f to rounding."""
-        v = law(N @ (free + nodal(A, N.mT @ f))) - f
-        return f + v + (G @ step(N @ nodal(A.detach(), N.mT @ v), G)[..., None])[..., 0]
+            return v
+        G, spread = G[..., sloped, :, :], torch.kron(N[sloped], torch.eye(2, dtype=N.dtype))
+        B = (spread @ relation @ spread.mT).unflatten(-1, (-1, 2))
+        J = torch.eye(len(spread), dtype=v.dtype) - torch.einsum("rpj,...pjk->...rpk", B, G).flatten(-2)
+        x = torch.linalg.solve(J, (N @ nodal(relation, N.mT @ v))[..., sloped, :].flatten(-2)[..., None])
+        return v.index_add(-2, sloped, (G @ x.unflatten(-2, (-1, 2)))[..., 0])
 
     with torch.no_grad():
-        x = N @ free
-        r, G = linearise(x)
+        f = torch.zeros(*free.shape[:-2], len(N), 2, dtype=free.dtype)
+        v, r, G = linearise(f)
         for _ in range(iterations):
             size = r.flatten(-2).norm(dim=-1)
             going = r.abs().amax((-2, -1)) > tolerance
             if not bool(going.any()):
                 break
-            way = step(r, G) * going[..., None, None]
+            way = correction(v, G) * going[..., None, None]
             for _ in range(HALVINGS):  # sample by sample, until the residual falls
-                r, G = linearise(x - way)
+                v, r, G = linearise(f + way)
                 worse = going & ~(r.flatten(-2).norm(dim=-1) < size)
                 if not bool(worse.any()):
                     break
                 way = way * torch.where(worse, 0.5, 1.0)[..., None, None]
-            x = x - way
+            f = f + way
         left = float(r.abs().max())
-        f = corrected(law(x), G)
-    return N.mT @ corrected(f, G), left
+        f = f + correction(v, G)
+    v = law(N @ (free + nodal(A, N.mT @ f))) - f
+    return N.mT @ (f + correction(v, G)), left
