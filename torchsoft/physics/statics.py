@@ -145,25 +145,25 @@ def resting(
     what `settled` does.
     """
     soft = massless(rig)
-    free = {k: torch.tensor(axes, dtype=torch.long) for k, axes in (free or soft.layout.free).items() if len(axes)}
+    sought = {k: torch.tensor(axes, dtype=torch.long) for k, axes in (free or soft.layout.free).items() if len(axes)}
     followed = soft.follow(0.0) if signals is None else signals
     off = {f"control_{name}" for name in soft.actuators if actuators is not None and name not in actuators}
     with torch.no_grad():
-        masses = {name: torch.stack(soft.bodies[name].masses) for name in free}
+        masses = {name: torch.stack(soft.bodies[name].masses) for name in sought}
         # an angle counts by the way of a point at the radius of gyration, so that all are lengths and forces
         sizes = {
             name: torch.stack((one, one, (m[2] / m[0]).sqrt())) for name, m in masses.items() for one in [m[0] / m[0]]
         }
-        scale = torch.cat([sizes[name][axes] for name, axes in free.items()])
-        q = torch.cat([pose[name][axes] for name, axes in free.items()]) * scale
+        scale = torch.cat([sizes[name][axes] for name, axes in sought.items()])
+        q = torch.cat([pose[name][axes] for name, axes in sought.items()]) * scale
         stride = STRIDE * min(pad.mesh.height for pad in soft.pads.values())
         softest = max(float(pad.compliance().diagonal().max()) for pad in soft.pads.values())
-    counts = [len(axes) for axes in free.values()]
+    counts = [len(axes) for axes in sought.values()]
 
     def poses(q: Tensor) -> dict[str, Tensor]:
-        parts = dict(zip(free, (q / scale).split(counts, -1)))
+        parts = dict(zip(sought, (q / scale).split(counts, -1)))
         at = {name: value.expand(*q.shape[:-1], 3) for name, value in pose.items()}
-        return at | {name: at[name].index_copy(-1, axes, parts[name]) for name, axes in free.items()}
+        return at | {name: at[name].index_copy(-1, axes, parts[name]) for name, axes in sought.items()}
 
     def loads(q: Tensor) -> Tensor:
         """Net loads on the free coordinates (..., n) [N]."""
@@ -174,7 +174,7 @@ def resting(
         graph = soft.evaluate(0.0, state, followed.expand(*batch, -1, -1), settled=True)
         ports = {name: port for name, port in graph.ports.items() if name not in off}
         net = soft.loads(graph, net_efforts(ports, soft.junctions))
-        return torch.cat([net[name][..., axes] for name, axes in free.items()], -1) / scale
+        return torch.cat([net[name][..., axes] for name, axes in sought.items()], -1) / scale
 
     path: list[tuple[float, Tensor]] = []
     while len(path) < ITERATIONS and not stalled(path, stride):
@@ -190,7 +190,7 @@ def resting(
         # as stiff as keeps the step short, which vanishes with the load: quadratic at the end
         q = q + torch.linalg.solve(K + size / stride * torch.eye(len(q), dtype=q.dtype), F)
     worst = int(F.abs().argmax())
-    names = [f"{name}.{COORDINATES[int(axis)]}" for name, axes in free.items() for axis in axes]
+    names = [f"{name}.{COORDINATES[int(axis)]}" for name, axes in sought.items() for axis in axes]
     raise NoEquilibrium(
         f"nothing is at rest: after {len(path)} steps {float(F.abs().max()):.2g} N still push {names[worst]}; is there a pad "
         "to carry it?"

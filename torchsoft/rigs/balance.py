@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.physics.contact import SmoothSlip
 from torchsoft.physics.motion import Reference, hold
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import NoEquilibrium, massless, standing
@@ -217,15 +216,8 @@ def slips(e: Estimate, there: list[Moment]) -> Iterator[Finding]:
     """Friction that falls with slip faster than is single-valued."""
     rig = there[0].scene.rig
     for key, contact in rig.contacts.items():
-        law, slip = contact.law, contact.law.friction
-        if not isinstance(slip, SmoothSlip) or rig.pads[contact.pad].points:
+        if rig.pads[contact.pad].points:
             continue
         force = max(float(m.state.pads[contact.pad][0].norm(dim=-1).max()) for m in there)
-        largest = force / float(rig.weight(key).max())
-        falls, damps = float((slip.mu_s - slip.mu_k) * largest / slip.v_s), float(slip.eta + law.R_t)
-        if damps < falls:
-            yield Finding(
-                "warning", f"laws.{e.file.contacts[key].law}.friction",
-                f"slip is not single-valued at a normal force of {largest:.3g} N: eta + R_t = {damps:.3g} N.s/m is below "
-                f"(mu_s - mu_k) F_N / v_s = {falls:.3g}; raise v_s or eta",
-            )  # fmt: skip
+        if why := contact.law.jumps(force / float(rig.weight(key).max())):
+            yield Finding("warning", f"laws.{e.file.contacts[key].law}.friction", f"{why}; raise v_s or eta")

@@ -4,11 +4,11 @@ commented out."""
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_origin
+from typing import Any, get_args
 
 from pydantic.fields import FieldInfo
 
-from torchsoft.quantity import Quantity
+from torchsoft.quantity import Quantity, metadata
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import Group, NumberOr
 from torchsoft.tables import read_toml
@@ -72,19 +72,10 @@ def commented(row: str, remark: str) -> str:
 
 def remark(field: FieldInfo) -> str:
     """Meaning and unit of a field."""
-    unit = next(
-        (one.unit for one in metadata(field) if isinstance(one, Quantity | NumberOr) and one.unit not in ("", "1")), ""
-    )
+    said = (*field.metadata, *metadata(field.annotation))
+    unit = next((one.unit for one in said if isinstance(one, Quantity | NumberOr) and one.unit not in ("", "1")), "")
     meaning = field.description or ""
     return meaning if not unit or f"[{unit}]" in meaning else f"{meaning} [{unit}]"
-
-
-def metadata(field: FieldInfo) -> Iterator[Any]:
-    """What the annotation of a field says besides its type."""
-    yield from field.metadata
-    for one in get_args(field.annotation):
-        if get_origin(one) is Annotated:
-            yield from one.__metadata__
 
 
 def tables(annotation: Any) -> Iterator[type[Group]]:

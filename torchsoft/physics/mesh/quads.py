@@ -140,7 +140,7 @@ class QuadMesh(FreeMesh):
             used = [(corner, weight) for corner, weight in zip(corners, weights) if weight]
             number = known.setdefault(frozenset(used), len(points))
             if number == len(points):
-                points.append(sum(w * np.array(self.points[i]) for i, w in used) / sum(weights))
+                points.append(np.average([self.points[i] for i, _ in used], axis=0, weights=[w for _, w in used]))
             return number
 
         n, quads = range(finer + 1), list[list[int]]()
