@@ -43,18 +43,9 @@ def carry_out(file: RigFile, *, progress: bool = False) -> RunOutcome:
 
     Raises `ValueError` for what cannot be built, and `KeyboardInterrupt` before anything was simulated.
     """
-    ready, s = file.build(), file.solver
+    ready = file.build()
     try:
-        run = simulate(
-            ready.rig,
-            ready.t,
-            y0=ready.y0,
-            rtol=s.rtol,
-            atol=s.atol,
-            step=s.step,
-            tolerance=s.tolerance,
-            progress=progress,
-        )
+        run = simulate(ready.rig, ready.t, y0=ready.y0, **file.solver.model_dump(), progress=progress)
     except (SimulationFailed, Interrupted) as stop:
         if stop.trajectory is None:
             raise
@@ -99,7 +90,7 @@ def summary(file: RigFile, done: RunOutcome, found: list[Finding]) -> dict[str, 
             name: {"largest_displacement_over_height": float(u.norm(dim=-1).max()) / rig.pads[name].mesh.height}
             for name, u in run.displacement.items()
         },
-        "actuators": {name: {"largest_effort": float(run[effort(rig, name)].abs().max())} for name in rig.actuators},
+        "actuators": {name: {"largest_effort": float(run[f"F_{name}"].abs().max())} for name in rig.actuators},
         "energy": {
             "injected_J": float(run.injected[-1]),
             "dissipated_J": {name: float(work[-1]) for name, work in run.dissipated.items()},
@@ -116,17 +107,11 @@ def summary(file: RigFile, done: RunOutcome, found: list[Finding]) -> dict[str, 
 
 def coordinates(rig: Rig, run: Trajectory, body: str) -> dict[str, dict[str, float]]:
     """Start, end, least and largest value of a body's coordinates that are not fixed [m, rad]."""
-    rows = {}
-    for i, axis in enumerate(COORDINATES):
-        if rig.bodies[body].freedom[axis] != "fixed":
-            place = run.state.pose[body][:, i].detach()
-            rows[axis] = {"start": place[0], "end": place[-1], "least": place.min(), "largest": place.max()}
-    return {axis: {name: float(value) for name, value in row.items()} for axis, row in rows.items()}
-
-
-def effort(rig: Rig, actuator: str) -> str:
-    """The channel of an actuator's effort."""
-    return rig.renamed.get(f"F_{actuator}", f"F_{actuator}")
+    rows = zip(COORDINATES, run.state.pose[body].detach().mT.tolist())
+    return {
+        axis: {"start": place[0], "end": place[-1], "least": min(place), "largest": max(place)}
+        for axis, place in rows if rig.bodies[body].freedom[axis] != "fixed"
+    }  # fmt: skip
 
 
 def condensing_time(mesh: Mesh) -> float:
