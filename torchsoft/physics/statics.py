@@ -117,7 +117,8 @@ def standing(rig: Rig, pose: Mapping[str, Tensor]) -> Tensor:
     y = settled(soft, pose, still, unstretched(soft, ()))
     if soft is rig:
         return y
-    state, own = soft.layout.unpack(y, pose, still), rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64))
+    state = soft.layout.unpack(y, pose, still)
+    own = rig.layout.unpack(torch.zeros(rig.layout.size, dtype=torch.float64), pose, still)
     pads = {
         name: pad.static_displacement(state.pads[name][0]) if pad.inertial else state.pads[name]
         for name, pad in rig.pads.items()
