@@ -53,7 +53,6 @@ from torchsoft.physics.statics import resting, standing
 from torchsoft.plot.animation import animate
 from torchsoft.plot.figures import ACTUAL, OTHER, STYLE, snapshots
 from torchsoft.rigs import RigFile
-from torchsoft.rigs.build import assemble
 
 FILE = Path(__file__).parents[1] / "rigs" / "orientation.toml"
 
@@ -130,14 +129,14 @@ def case_of(file: RigFile, shape: Shape | None = None) -> Case:
     lower = float((disc.support(down) - shape.support(down)).detach())
     start["disc"][1] -= lower
     start["upper"][1] -= 2 * lower
-    held = {name: {"x": float(start[name][0]), "y": float(start[name][1])} for name in ("lower", "upper")}
-    still = assemble(file, held, loops=())
-    ready.rig.bodies["disc"].shape = still.bodies["disc"].shape = shape
-    rest = resting(still, start)
+    ready.rig.bodies["disc"].shape = shape
+    with torch.no_grad():
+        rest = resting(ready.rig, start, {"disc": (0, 1, 2)}, actuators=())
+        y0 = standing(ready.rig, rest)
     profile, y = signals["y_d"], float(rest["disc"][1])
     assert isinstance(profile, Profile)
     shifted = Profile(profile.times, profile.values.detach() + y - profile.values.detach()[0])
-    return Case(ready.rig, standing(ready.rig, rest), signals | {"y_d": shifted}, case.end)
+    return Case(ready.rig, y0, signals | {"y_d": shifted}, case.end)
 
 
 def faster(case: Case, speed: float) -> Case:

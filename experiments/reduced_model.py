@@ -36,10 +36,11 @@ from scipy.signal import cont2discrete
 from threadpoolctl import threadpool_limits
 
 from torchsoft import Parameters, Profile, Reference, SoftGrasp, Trajectory, hold, simulate
-from torchsoft.excitation import Excitation, Strokes, Waves, begin, wave
+from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.experiment import COARSE, grid, made_by, markdown, options, timed, write
 from torchsoft.files import finite
 from torchsoft.physics.contact import ramp
+from torchsoft.physics.motion import Waves, wave
 from torchsoft.reduced.fit import Recipe, assemble, choose, fit, rollout_of, score
 from torchsoft.reduced.ode import ReducedModel, Term
 from torchsoft.reduced.records import STATES, Record, noisy, record, rolling_radius

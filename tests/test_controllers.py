@@ -28,8 +28,7 @@ from torchsoft import (
 from torchsoft.rigs import RigFile
 from torchsoft.rigs import run as running
 from torchsoft.rigs.check import check
-from torchsoft.rigs.template import template
-from torchsoft.rigs.written import to_toml
+from torchsoft.rigs.written import template, to_toml
 from torchsoft.solve.rates import Rates
 
 WHOLE = [f"{body}.{axis}" for body in ("bracket", "disc") for axis in ("x", "y", "theta")]

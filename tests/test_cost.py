@@ -15,9 +15,8 @@ from torchsoft.cost import Cost, Costly, agree, duration, row_memory, step_secon
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.generate import cost
 from torchsoft.physics.mesh import unit_compliance
-from torchsoft.rigs.cost import condensing_time
-from torchsoft.rigs.template import template
-from torchsoft.rigs.written import to_toml
+from torchsoft.rigs.run import condensing_time
+from torchsoft.rigs.written import template, to_toml
 
 SMOKE = tomllib.loads((Path(__file__).parent.parent / "data_gen" / "configs" / "smoke.toml").read_text())
 CHEAP, LONG, LARGE = Cost(1e4, 60.0, 0.1), Cost(1e9, 2e5, 0.1), Cost(1e4, 60.0, 1e6)

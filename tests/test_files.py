@@ -14,9 +14,9 @@ import pytest
 
 from torchsoft import csvfile
 from torchsoft.files import PARTIAL, claim, remove_partials, replacing, sealed, unsealed, write_json
-from torchsoft.physics.mesh.file import read_quads
-from torchsoft.rigs.network import LOOP, read_network
-from torchsoft.rigs.recorded import read_column
+from torchsoft.physics.mesh.quads import read_quads
+from torchsoft.rigs.control import LOOP, read_network
+from torchsoft.rigs.motion import read_column
 from torchsoft.solve.trajectory import load
 from torchsoft.sysid.result import load_answer
 from torchsoft.tables import line, plain, read_toml

@@ -41,8 +41,7 @@ from torchsoft import (
     simulate,
 )
 from torchsoft.physics.energy import dissipated, stored, supplied
-from torchsoft.physics.material import KINDS, Material
-from torchsoft.physics.retardation import retarded
+from torchsoft.physics.material import KINDS, Material, retarded
 from torchsoft.plot.diagram import graph_of
 from torchsoft.solve.trajectory import load
 from torchsoft.sysid import AtRest, Known, Problem, Recording, Sensor, Unknown, identify

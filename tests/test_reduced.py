@@ -17,7 +17,7 @@ from torchsoft.reduced.ode import BEYOND, Factor, Held, ReducedModel, Term
 from torchsoft.reduced.records import KINEMATICS, STATES, Record, noisy, record, rolling_radius
 from torchsoft.reduced.rollout import recursion
 from torchsoft.reduced.terms import friction, joined, mechanics, polynomials, variable
-from torchsoft.rigs.template import template
+from torchsoft.rigs.written import template
 
 R = 0.0183
 TRUTH = {

@@ -24,8 +24,7 @@ from torchsoft.rigs import RigFile
 from torchsoft.rigs import run as running
 from torchsoft.rigs.check import check
 from torchsoft.rigs.geometry import collision, surface
-from torchsoft.rigs.template import template
-from torchsoft.rigs.written import to_toml
+from torchsoft.rigs.written import template, to_toml
 
 SQUARE = [[-20e-3, -20e-3], [20e-3, -20e-3], [16e-3, 20e-3], [-16e-3, 20e-3]]
 RUBBER = {"E": 0.75e6, "depth": 44e-3}

@@ -22,8 +22,7 @@ from torchsoft.rigs import run as running
 from torchsoft.rigs.check import check
 from torchsoft.rigs.course import Estimate
 from torchsoft.rigs.motion import flattened
-from torchsoft.rigs.template import template
-from torchsoft.rigs.written import to_toml
+from torchsoft.rigs.written import template, to_toml
 from torchsoft.scenario import grasp_and_roll
 from torchsoft.solve.simulate import Interrupted
 from torchsoft.solve.stability import linearised, loop_modes, modes
@@ -439,6 +438,7 @@ def test_a_body_rests_where_nothing_accelerates_it(inertial: bool) -> None:
     assert float(hovering.y0[hovering.rig.layout.slices["pads", "lower"]].abs().max()) == 0.0
 
 
+@torch.no_grad()
 def test_a_body_comes_down_to_its_rest_from_far_above_and_in_every_coordinate() -> None:
     file = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "drop")))
     rig = file.build().rig

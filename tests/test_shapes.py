@@ -35,7 +35,7 @@ from torchsoft import (
     simulate,
 )
 from torchsoft.physics.contact import interface_law
-from torchsoft.physics.shapes.area import moments
+from torchsoft.physics.shapes.shape import moments
 from torchsoft.physics.validity import check_shape
 from torchsoft.solve.laws import contact_laws
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.physics.condensed import free_rates, point_inputs
+from torchsoft.physics.condensed import free_rates
 from torchsoft.physics.contact import cross, free_law, interface_law, turned
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
@@ -81,7 +81,7 @@ def _stage(
             u_dot = spread[:, nodes] @ rates[contact.pad]
             shape = rig.bodies[contact.body].shape
             assert shape is not None
-            x = point_inputs(rig, key, at, spread @ u_star[contact.pad] + a * u_dot, u_dot, near[key], a)
+            x = rig.point_inputs(key, at, spread @ u_star[contact.pad] + a * u_dot, u_dot, near[key], a)
             out[key] = x, interface_law(contact.law, shape, x)
         return out
 

@@ -4,12 +4,11 @@ from .paper.equilibrium import press, rest
 from .paper.parameters import Parameters
 from .paper.rig import SoftGrasp
 from .physics.contact import Coulomb, SmoothSlip, SoftContact
-from .physics.controllers import StateFeedback, controller
 from .physics.material import GeneralisedKelvin, KelvinVoigt, Prony, StandardLinearSolid
 from .physics.mesh import CurvedPadMesh, FingertipMesh, PadMesh, QuadMesh
 from .physics.motion import Profile, Reference, Sampled, hold
 from .physics.pads import Pad
-from .physics.parts import PD, Actuator, Body, Contact
+from .physics.parts import PD, Actuator, Body, Contact, StateFeedback, controller
 from .physics.rig import Rig
 from .physics.shapes import Circle, Contour, Ellipse, RoundedBox, RoundedPolygon, Shape, Superellipse
 from .physics.statics import NoEquilibrium

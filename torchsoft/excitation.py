@@ -5,10 +5,9 @@ reference that its controllers follow.
 """
 
 import json
-import math
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal, NamedTuple, Self
+from typing import Annotated, Literal, NamedTuple, Self
 
 import numpy as np
 import torch
@@ -18,11 +17,8 @@ from torch import Tensor
 from torchsoft.paper.equilibrium import holding_force, press, rest
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp, apart
-from torchsoft.physics.motion import Pieces, Profile, Reference, evaluate, hermite
+from torchsoft.physics.motion import FADE, Knotted, Profile, Reference, Wave, Waves, wave
 from torchsoft.tables import LISTED, SEED, Table, from_toml
-
-FADE = 0.15
-"""Time [s] over which waves come and go."""
 
 MOST = 10_000
 """Strokes in one motion."""
@@ -244,11 +240,7 @@ def reference(excitation: Excitation, model: SoftGrasp, y_Br: float, grasp_force
     return Reference(x_d=x, y_d=y, F_ff=Profile([0.0, p.grasp_time], [0.0, -grasp_force]))
 
 
-Points = tuple[list[float], list[float]]
-"""Times [s] and values."""
-
-
-def moved(motion: Motion, still: Points, grasp: Points, since: float, until: float) -> tuple[Profile, Profile]:
+def moved(motion: Motion, still: Knotted, grasp: Knotted, since: float, until: float) -> tuple[Profile, Profile]:
     """x_d and y_Br,d of a motion from `since` to `until` [s], on top of a still x and the grasp."""
     x_0 = still[1][-1]
     match motion:
@@ -281,61 +273,3 @@ def moved(motion: Motion, still: Points, grasp: Points, since: float, until: flo
         case Press():
             x = Profile([since, until], [x_0, x_0 + motion.travel])
             return x, Waves(grasp, since, until, wave(motion.amplitude, motion.frequency, 0.0, 0.0))
-
-
-class Wave(NamedTuple):
-    """Amplitudes [m], frequencies [Hz], sweeps [Hz/s] and phases [rad], each (components,)."""
-
-    amplitude: Tensor
-    frequency: Tensor
-    sweep: Tensor
-    phase: Tensor
-
-
-def wave(*columns: object) -> Wave:
-    """A `Wave` of arrays or numbers."""
-    return Wave(*(torch.from_numpy(np.atleast_1d(np.asarray(column, dtype=np.float64))) for column in columns))
-
-
-class Waves(Profile):
-    """A profile with sines on top: sum of a sin(phi + 2 pi (f tau + r tau^2 / 2)), tau [s] being the time since `since`;
-    faded in from there and out until `until` [s].
-
-    In pieces of degree 7, `PIECES` to the shortest period, that have the value and three derivatives of this at either end:
-    no further from it than 1e-11 times the amplitude.
-    """
-
-    PIECES: ClassVar = 24
-    fine: Tensor
-
-    def __init__(self, profile: Points, since: float, until: float, wave: Wave) -> None:
-        super().__init__(*profile)
-        self.since, self.wave = since, wave
-        self.window = Profile([since, since + FADE, until - FADE, until], [0.0, 1.0, 1.0, 0.0])
-        fastest = float(torch.maximum(wave.frequency, wave.frequency + wave.sweep * (until - since)).max())
-        count = self.PIECES * max(2.0, fastest * (until - since))
-        every = torch.linspace(since, until, math.ceil(count) + 1, dtype=torch.float64)
-        self.register_buffer("fine", torch.cat((every, self.times, self.window.times)).unique())
-
-    @property
-    def stops(self) -> Tensor:
-        """Times [s] that no step chosen by tolerances passes."""
-        return torch.cat((self.times, self.window.times))
-
-    def pieces(self) -> Pieces:
-        """The polynomials; constant before the first and after the last."""
-        window, wave = evaluate(self.window.pieces(), self.fine, 3), self.sines(self.fine - self.since)
-        jets = evaluate(super().pieces(), self.fine, 3)
-        for n in range(4):
-            jets[n] = jets[n] + sum(math.comb(n, k) * window[k] * wave[n - k] for k in range(n + 1))
-        return hermite(self.fine, jets)
-
-    def sines(self, tau: Tensor) -> list[Tensor]:
-        """The sum of sines and its first three derivatives at tau (...) [s]."""
-        amplitude, frequency, sweep, phase = self.wave
-        tau = tau[..., None]
-        angle = phase + 2 * torch.pi * (frequency * tau + 0.5 * sweep * tau**2)
-        w, w_dot = 2 * torch.pi * (frequency + sweep * tau), 2 * torch.pi * sweep
-        s, c = angle.sin(), angle.cos()
-        jets = s, c * w, c * w_dot - s * w**2, -c * w**3 - 3 * s * w * w_dot
-        return [(amplitude * jet).sum(-1) for jet in jets]

@@ -38,9 +38,10 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import NoEquilibrium, Parameters, SimulationFailed, SoftGrasp, simulate
-from torchsoft.excitation import FADE, Chirp, Excitation, MultiSine, Press, Roll, RunContext, Strokes, begin
+from torchsoft.excitation import Chirp, Excitation, MultiSine, Press, Roll, RunContext, Strokes, begin
 from torchsoft.experiment import grid, made_by, markdown, options, write
 from torchsoft.paper.equilibrium import holding_force, press, rest
+from torchsoft.physics.motion import FADE
 from torchsoft.processes import local_processes
 from torchsoft.scenario import reference
 from torchsoft.threads import parallel_map

@@ -54,8 +54,7 @@ def run_rig(options: argparse.Namespace) -> int:
     from torchsoft.cost import agree
     from torchsoft.rigs import RigFile
     from torchsoft.rigs.check import check
-    from torchsoft.rigs.cost import cost
-    from torchsoft.rigs.run import run
+    from torchsoft.rigs.run import cost, run
     from torchsoft.solve.progress import SimulationFailed
 
     out: Path = options.out or Path("out") / options.file.stem
@@ -86,7 +85,7 @@ def check_rig(options: argparse.Namespace) -> int:
     from torchsoft.cost import agree
     from torchsoft.rigs import RigFile
     from torchsoft.rigs.check import check
-    from torchsoft.rigs.cost import cost
+    from torchsoft.rigs.run import cost
 
     file = RigFile.from_toml(options.file)
     agree(cost(file, runs=False), options.yes, "take fewer elements")
@@ -100,8 +99,7 @@ def check_rig(options: argparse.Namespace) -> int:
 
 def init_rig(options: argparse.Namespace) -> int:
     """Write a rig file to start from."""
-    from torchsoft.rigs.template import template
-    from torchsoft.rigs.written import to_toml
+    from torchsoft.rigs.written import template, to_toml
 
     path = Path(options.name.removesuffix(".toml") + ".toml")
     if not path.name.removesuffix(".toml").strip("."):

@@ -214,12 +214,10 @@ class Parameters(Table):
 
     @model_validator(mode="after")
     def _slip_is_single_valued(self) -> Self:
-        c, force = self.contact, 10.0 * self.contact.node_spacing / 1e-3  # [N], middle node of the full grasp
-        if c.friction == "smooth" and c.eta + c.R_t < (c.mu_s - c.mu_k) * force / c.v_s:
+        force = 10.0 * self.contact.node_spacing / 1e-3  # [N], middle node of the full grasp
+        if why := self.contact.law().jumps(force):
             warnings.warn(
-                f"the slip law is not single-valued at a normal force of {force:.3g} N: eta + R_t = {c.eta + c.R_t:.3g} "
-                f"N.s/m is below (mu_s - mu_k) F_N / v_s = {(c.mu_s - c.mu_k) * force / c.v_s:.3g}; the slip rate, and "
-                "every gradient, jumps at slip onset. Raise contact.v_s or contact.eta.",
+                f"{why}; the slip rate, and every gradient, jumps at slip onset. Raise contact.v_s or contact.eta.",
                 stacklevel=2,
             )
         return self

@@ -183,6 +183,20 @@ class SoftContact(nn.Module):
             return "Coulomb's friction needs R_t > 0, since the stretch is re-anchored through the dashpot"
         return ""
 
+    def jumps(self, F_N: float) -> str:
+        """Why the slip rate jumps under a normal force F_N [N] per reference spacing: friction falls with slip faster than the
+        dashpots balance. Empty if it does not."""
+        slip = self.friction
+        if not isinstance(slip, SmoothSlip):
+            return ""
+        falls, damps = ((slip.mu_s - slip.mu_k) * F_N / slip.v_s).item(), (slip.eta + self.R_t).item()
+        if damps >= falls:
+            return ""
+        return (
+            f"slip is not single-valued at a normal force of {F_N:.3g} N: eta + R_t = {damps:.3g} N.s/m is below (mu_s - mu_k) "
+            f"F_N / v_s = {falls:.3g}"
+        )
+
     def forward(
         self,
         g: Tensor,

@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 from itertools import pairwise
-from math import perm
-from typing import Any, ClassVar
+from math import ceil, comb, perm
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -11,6 +11,12 @@ from scipy.linalg import solve_banded
 from torch import Tensor, nn
 
 from torchsoft.physics.arguments import line
+
+FADE = 0.15
+"""Time [s] over which waves come and go."""
+
+Knotted = tuple[list[float], list[float]]
+"""Times [s] and values."""
 
 
 class Piecewise(nn.Module):
@@ -110,6 +116,64 @@ class Profile(Piecewise):
     def control(self) -> Tensor:
         """Control points of every piece (k - 1, 8): four at either knot, which makes (20) with (22)-(24)."""
         return torch.cat((self.values[:-1, None].expand(-1, 4), self.values[1:, None].expand(-1, 4)), -1)
+
+
+class Wave(NamedTuple):
+    """Amplitudes [m], frequencies [Hz], sweeps [Hz/s] and phases [rad], each (components,)."""
+
+    amplitude: Tensor
+    frequency: Tensor
+    sweep: Tensor
+    phase: Tensor
+
+
+def wave(*columns: object) -> Wave:
+    """A `Wave` of arrays or numbers."""
+    return Wave(*(torch.from_numpy(np.atleast_1d(np.asarray(column, dtype=np.float64))) for column in columns))
+
+
+class Waves(Profile):
+    """A profile with sines on top: sum of a sin(phi + 2 pi (f tau + r tau^2 / 2)), tau [s] being the time since `since`;
+    faded in from there and out until `until` [s].
+
+    In pieces of degree 7, `PIECES` to the shortest period, that have the value and three derivatives of this at either end:
+    no further from it than 1e-11 times the amplitude.
+    """
+
+    PIECES: ClassVar = 24
+    fine: Tensor
+
+    def __init__(self, profile: Knotted, since: float, until: float, wave: Wave) -> None:
+        super().__init__(*profile)
+        self.since, self.wave = since, wave
+        self.window = Profile([since, since + FADE, until - FADE, until], [0.0, 1.0, 1.0, 0.0])
+        fastest = float(torch.maximum(wave.frequency, wave.frequency + wave.sweep * (until - since)).max())
+        count = self.PIECES * max(2.0, fastest * (until - since))
+        every = torch.linspace(since, until, ceil(count) + 1, dtype=torch.float64)
+        self.register_buffer("fine", torch.cat((every, self.times, self.window.times)).unique())
+
+    @property
+    def stops(self) -> Tensor:
+        """Times [s] that no step chosen by tolerances passes."""
+        return torch.cat((self.times, self.window.times))
+
+    def pieces(self) -> Pieces:
+        """The polynomials; constant before the first and after the last."""
+        window, wave = evaluate(self.window.pieces(), self.fine, 3), self.sines(self.fine - self.since)
+        jets = evaluate(super().pieces(), self.fine, 3)
+        for n in range(4):
+            jets[n] = jets[n] + sum(comb(n, k) * window[k] * wave[n - k] for k in range(n + 1))
+        return hermite(self.fine, jets)
+
+    def sines(self, tau: Tensor) -> list[Tensor]:
+        """The sum of sines and its first three derivatives at tau (...) [s]."""
+        amplitude, frequency, sweep, phase = self.wave
+        tau = tau[..., None]
+        angle = phase + 2 * torch.pi * (frequency * tau + 0.5 * sweep * tau**2)
+        w, w_dot = 2 * torch.pi * (frequency + sweep * tau), 2 * torch.pi * sweep
+        s, c = angle.sin(), angle.cos()
+        jets = s, c * w, c * w_dot - s * w**2, -c * w**3 - 3 * s * w * w_dot
+        return [(amplitude * jet).sum(-1) for jet in jets]
 
 
 class Sampled(Piecewise):

@@ -4,14 +4,14 @@ The equations of motion are not written down anywhere: `forward` evaluates the p
 and integrates what is left over at its 1-junctions.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from torchsoft.physics.condensed import point_inputs, solve_rates
+from torchsoft.physics.condensed import free_rates, nodal, nodal_forces
 from torchsoft.physics.contact import Frame, cross, interface_law, moving_frame, turned
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import Block, Junction, Port, Transformer, identity, net_efforts
@@ -22,6 +22,9 @@ from torchsoft.physics.state import Layout, State
 from torchsoft.quantity import Gravity, Quantity, quantity_of
 
 GROUND = "ground"
+
+RATE_TOLERANCE, RATE_ITERATIONS = 1e-13, 30
+"""Residual [m/s] to which the rates of massless pads are solved, and steps of Newton's method for it at the most."""
 
 
 class Interface(NamedTuple):
@@ -337,7 +340,7 @@ class Rig(nn.Module):
                 flows[f"pad_{name}"] = turned(state.rates[name], angle)
                 u_dot = turned(flows[f"pad_{name}"] - base_rate, -angle)
             else:
-                u_dot = torch.zeros_like(u) if settled else solve_rates(self, name, own, state, u)
+                u_dot = torch.zeros_like(u) if settled else self._rates(name, own, state, u)
                 flows[f"pad_{name}"] = base_rate + turned(u_dot, angle)
             for key in own:
                 interfaces[key] = self._interface(key, state, u, u_dot, flows)
@@ -346,12 +349,56 @@ class Rig(nn.Module):
             ports[f"pad_{name}"] = self._pad_port(name, own, ports, u, u_dot, moment_arm, angle)
         return Evaluation(ports | self._sources(state, signals), flows, interfaces)
 
+    def point_inputs(
+        self, key: str, state: State, u: Tensor, u_dot: Tensor, which: Tensor | None = None, stage: float = 0.0
+    ) -> Tensor:
+        """Inputs x (..., points, 9) of a contact's law: u and u_dot (..., points, 2) are the points' own, in the base's frame.
+        `which` takes some of the points; `stage` is the law's a h [s]."""
+        contact = self.contacts[key]
+        X, weight, s = self.pads[contact.pad].point_positions, self.weight(key), state.stretch[key]
+        if which is not None:
+            X, weight, s = X[which], weight[which], s[..., which]
+        r_B, v_B = self.base_motion(contact.pad, state)
+        r_C, v_C = state.pose[contact.body], state.velocity[contact.body]
+        angle = r_B[..., 2]
+        centre, glide = turned(r_C[..., :2] - r_B[..., :2], -angle), turned(v_C[..., :2] - v_B[..., :2], -angle)
+        p = X + u
+        d = p - centre[..., None, :]
+        w = glide[..., None, :] - v_B[..., None, 2:] * cross(p) - u_dot
+        one = torch.ones_like(d[..., 0])
+        parts = (v_C[..., 2:] * one, d, (r_C[..., 2:] - r_B[..., 2:]) * one, s * one, weight * one, stage * one)
+        return torch.cat([part if part.ndim == d.ndim else part[..., None] for part in (w, *parts)], -1)
+
+    def point_forces(self, own: Sequence[str], state: State, u: Tensor, u_dot: Tensor) -> Tensor:
+        """Sum of the forces of some contacts on the points of their pad (..., points, 2) [N], in the base's frame."""
+        total = torch.zeros_like(u)
+        for key in own:
+            contact = self.contacts[key]
+            shape = self.bodies[contact.body].shape
+            assert shape is not None
+            total = total + interface_law(contact.law, shape, self.point_inputs(key, state, u, u_dot))[..., :2]
+        return total
+
+    def _rates(self, name: str, own: Sequence[str], state: State, u: Tensor) -> Tensor:
+        """Rates u' (..., nodes, 2) [m/s] of a massless pad's nodes; u their displacements. Raises `RuntimeError` where Newton's
+        method does not converge."""
+        pad = self.pads[name]
+        free, P = free_rates(pad, state.pads[name], 0.0)
+        law = lambda rate: self.point_forces(own, state, pad.spread @ u, rate)
+        F, left = nodal_forces(P, pad.spread, free, law, RATE_TOLERANCE, RATE_ITERATIONS)
+        if not left <= 1e3 * RATE_TOLERANCE:
+            raise RuntimeError(
+                f"the rates of the massless pad `{name}` did not converge: residual {left:.2g} m/s after {RATE_ITERATIONS} "
+                "iterations; is v_s large enough for the pads' damping to balance the fall of friction with slip?"
+            )
+        return free + nodal(P, F)
+
     def _interface(self, key: str, state: State, u: Tensor, u_dot: Tensor, flows: Mapping[str, Tensor]) -> Interface:
         contact = self.contacts[key]
         pad, body = self.pads[contact.pad], self.bodies[contact.body]
         assert body.shape is not None
         r_B, _ = self.base_motion(contact.pad, state)
-        x = point_inputs(self, key, state, pad.spread @ u, pad.spread @ u_dot)
+        x = self.point_inputs(key, state, pad.spread @ u, pad.spread @ u_dot)
         d, angle = x[..., 3:5], r_B[..., 2, None]
         local = moving_frame(body.shape, d, x[..., 5])
         n, moment_arm = turned(local.n, angle), turned(d, angle)

@@ -5,13 +5,12 @@ At the contact points that is u = A f(u), with A the pad's compliance from point
 any rate, at the bodies' given poses and the points' given stretches.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 
 import torch
 from torch import Tensor
 
-from torchsoft.physics.condensed import point_inputs
-from torchsoft.physics.contact import interface_law
+from torchsoft.physics.condensed import nodal_forces
 from torchsoft.physics.multibond import net_efforts
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
@@ -83,82 +82,21 @@ def carried(rig: Rig, name: str, state: State) -> Tensor:
     """Nodal forces (..., branches, nodes, 2) [N] of a pad, by semi-smooth Newton from the undeformed pad.
 
     Batch dimensions of `state` hold copies of one state: one backward pass then gives as many rows of a Jacobian.
-    The last iteration is taken with the gradient on, which makes the derivative the implicit function theorem's.
     """
     pad = rig.pads[name]
     own = [key for key, contact in rig.contacts.items() if contact.pad == name]
-    C, branches = pad.compliance(), pad.material.branches
-    if not own:
-        return torch.zeros(branches, pad.nodes, 2, dtype=torch.float64)
-    one = first(state)
-
-    def force(u: Tensor, state: State = one) -> Tensor:
-        """On the points (..., points, 2) [N], for their displacements u (..., points, 2) [m]."""
-        return sum((point_forces(rig, key, state, u) for key in own), torch.zeros_like(u))
-
-    def displaced(f: Tensor) -> Tensor:
-        """A f: displacements (..., points, 2) [m] under forces on the points (..., points, 2)."""
-        return pad.spread @ ((pad.spread.mT @ f).flatten(-2) @ C.mT).unflatten(-1, (-1, 2))
-
-    def linearise(u: Tensor) -> tuple[Tensor, Tensor]:
-        """Residual u - A f(u) and the slopes (points, 2, 2) of f: a point's force depends on its own displacement
-        only."""
-        with torch.enable_grad():
-            x = u.detach().expand(2, -1, -1).clone().requires_grad_(True)  # a copy for each component of the force
-            f = force(x)
-            (rows,) = torch.autograd.grad(f[0, :, 0].sum() + f[1, :, 1].sum(), x, materialize_grads=True)
-        with torch.no_grad():
-            return u - displaced(f[0]), rows.transpose(0, 1)
-
-    def newton_step(r: Tensor, G: Tensor) -> Tensor:
-        """(1 - A G)^-1 r: points that do not touch have no slope, and follow the others."""
-        t = torch.nonzero(G.flatten(1).any(1))[:, 0]
-        if not len(t):
-            return r
-        S = pad.spread[t]
-        nodes = torch.nonzero(S.any(0))[:, 0]
-        A = C.detach().unflatten(0, (-1, 2)).unflatten(2, (-1, 2))[nodes][:, :, nodes]
-        A_tt = torch.einsum("pn,niaj,qa->piqj", S[:, nodes], A, S[:, nodes])
-        J = torch.eye(2 * len(t), dtype=r.dtype) - torch.einsum("piqj,qjk->piqk", A_tt, G[t]).reshape(2 * len(t), -1)
-        touching = torch.linalg.solve(J, r[..., t, :].flatten(-2)[..., None]).unflatten(-2, (-1, 2))
-        return r + displaced(torch.zeros_like(r).index_copy(-2, t, (G[t] @ touching)[..., 0]))
-
-    with torch.no_grad():
-        u = torch.zeros(len(pad.point_nodes), 2, dtype=torch.float64)
-        r, G = linearise(u)
-        for _ in range(SETTLING):
-            if float(r.abs().max()) <= RESIDUAL:
-                break
-            step = newton_step(r, G)
-            for _ in range(12):  # halve until the residual falls
-                trial = linearise(u - step)
-                if float(trial[0].norm()) < float(r.norm()):
-                    break
-                step = 0.5 * step
-            u, (r, G) = u - step, trial
-        else:
-            raise NoEquilibrium(
-                f"the massless pad `{name}` does not settle (residual {float(r.abs().max()):.2g} m after {SETTLING} "
-                "iterations); is a body deep in it, or are the stretches large?"
-            )
-    u = u - newton_step(u - displaced(force(u, state)), G)
-    f = pad.spread.mT @ force(u, state)
-    return f[..., None, :, :].expand(*f.shape[:-2], branches, -1, -1)
-
-
-def first(state: State) -> State:
-    """Of several copies of a state."""
-    batch = next(iter(state.pose.values())).ndim - 1
-    return State(*({name: value[(0,) * batch] for name, value in part.items()} for part in state))
-
-
-def point_forces(rig: Rig, key: str, state: State, u: Tensor) -> Tensor:
-    """Of one contact on its pad (points, 2) [N], for the points' displacements u (points, 2) [m] at rest."""
-    contact = rig.contacts[key]
-    shape = rig.bodies[contact.body].shape
-    assert shape is not None
-    x = point_inputs(rig, key, state, u, torch.zeros_like(u))
-    return interface_law(contact.law, shape, x)[..., :2]
+    batch = next(iter(state.pose.values())).shape[:-1]
+    law = lambda u: rig.point_forces(own, state, u, torch.zeros_like(u))
+    undeformed = torch.zeros(*batch, pad.nodes, 2, dtype=torch.float64)
+    F, left = (
+        nodal_forces(pad.compliance(), pad.spread, undeformed, law, RESIDUAL, SETTLING) if own else (undeformed, 0.0)
+    )
+    if not left <= RESIDUAL:
+        raise NoEquilibrium(
+            f"the massless pad `{name}` does not settle (residual {left:.2g} m after {SETTLING} iterations); is a body deep in "
+            "it, or are the stretches large?"
+        )
+    return F[..., None, :, :].expand(*batch, pad.material.branches, -1, -1)
 
 
 def massless(rig: Rig) -> Rig:
@@ -171,20 +109,16 @@ def massless(rig: Rig) -> Rig:
     )  # fmt: skip
 
 
-@torch.no_grad()
 def standing(rig: Rig, pose: Mapping[str, Tensor]) -> Tensor:
     """State (size,) of bodies that stand at `pose` [m, m, rad], by body (3,), with pads settled around them and no point
-    stretched. Raises what `settled` does, but takes inertial pads."""
+    stretched. Differentiable and raises as `settled`, but takes inertial pads."""
     soft = massless(rig)
     still = {name: torch.zeros(3, dtype=torch.float64) for name in soft.bodies}
-    stretch = {
-        name: torch.zeros(len(soft.pads[c.pad].point_nodes), dtype=torch.float64) for name, c in soft.contacts.items()
-    }
-    with torch.enable_grad():
-        y = settled(soft, pose, still, stretch).detach()
+    y = settled(soft, pose, still, unstretched(soft, ()))
     if soft is rig:
         return y
-    state, own = soft.layout.unpack(y, pose, still), rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64))
+    state = soft.layout.unpack(y, pose, still)
+    own = rig.layout.unpack(torch.zeros(rig.layout.size, dtype=torch.float64), pose, still)
     pads = {
         name: pad.static_displacement(state.pads[name][0]) if pad.inertial else state.pads[name]
         for name, pad in rig.pads.items()
@@ -192,62 +126,72 @@ def standing(rig: Rig, pose: Mapping[str, Tensor]) -> Tensor:
     return rig.pack(own._replace(pads=pads, pose=state.pose))
 
 
-def resting(rig: Rig, pose: Mapping[str, Tensor], residual: float = RESIDUAL) -> dict[str, Tensor]:
-    """Poses (3,) [m, m, rad] by body of a rig at rest, looked for from `pose`; fixed and driven coordinates are what they are
-    at t = 0, whatever `pose` says.
+def unstretched(rig: Rig, batch: Sequence[int]) -> dict[str, Tensor]:
+    """No stretch (*batch, points) [m] at any contact."""
+    counts = {name: len(rig.pads[contact.pad].point_nodes) for name, contact in rig.contacts.items()}
+    return {name: torch.zeros(*batch, count, dtype=torch.float64) for name, count in counts.items()}
+
+
+def resting(
+    rig: Rig, pose: Mapping[str, Tensor], free: Mapping[str, Sequence[int]] | None = None, *,
+    signals: Tensor | None = None, actuators: Container[str] | None = None, residual: float = RESIDUAL,
+) -> dict[str, Tensor]:  # fmt: skip
+    """Poses (3,) [m, m, rad] by body of a rig at rest, looked for from `pose`: the coordinates `free`, numbers by body (by
+    default all that can move), are brought into balance, and all others stay as given.
 
     Newton's method on the net loads of the free coordinates, each step no longer than `STRIDE`: a body above its pad comes down
-    to it. Done when net loads, counted by the compliance of the softest pad, are below `residual` [m]. Raises `NoEquilibrium`
-    where there is no balance, and what `settled` does.
+    to it. Done when net loads, counted by the compliance of the softest pad, are below `residual` [m]. `actuators` names those
+    that push, by default all, by `signals` (signals, 2), by default the reference's at t = 0. Differentiable once in the given
+    pose and in the rig's parameters, by the implicit function theorem. Raises `NoEquilibrium` where there is no balance, and
+    what `settled` does.
     """
     soft = massless(rig)
-    held, _ = soft.held(soft.follow(0.0))
-    free = {name: torch.tensor(axes, dtype=torch.long) for name, axes in soft.layout.free.items()}
+    sought = {k: torch.tensor(axes, dtype=torch.long) for k, axes in (free or soft.layout.free).items() if len(axes)}
+    followed = soft.follow(0.0) if signals is None else signals
+    off = {f"control_{name}" for name in soft.actuators if actuators is not None and name not in actuators}
     with torch.no_grad():
-        masses = {name: torch.stack(body.masses) for name, body in soft.bodies.items()}
+        masses = {name: torch.stack(soft.bodies[name].masses) for name in sought}
         # an angle counts by the way of a point at the radius of gyration, so that all are lengths and forces
         sizes = {
             name: torch.stack((one, one, (m[2] / m[0]).sqrt())) for name, m in masses.items() for one in [m[0] / m[0]]
         }
-        scale = torch.cat([sizes[name][axes] for name, axes in free.items()])
-        q = torch.cat([pose[name].detach()[axes] for name, axes in free.items()]) * scale
-        mesh = min(pad.mesh.height for pad in soft.pads.values())
+        scale = torch.cat([sizes[name][axes] for name, axes in sought.items()])
+        q = torch.cat([pose[name][axes] for name, axes in sought.items()]) * scale
+        stride = STRIDE * min(pad.mesh.height for pad in soft.pads.values())
         softest = max(float(pad.compliance().diagonal().max()) for pad in soft.pads.values())
-    counts = [len(axes) for axes in free.values()]
+    counts = [len(axes) for axes in sought.values()]
 
     def poses(q: Tensor) -> dict[str, Tensor]:
-        parts = (q / scale).split(counts, -1)
-        fixed = {name: held[name].detach().expand(*q.shape[:-1], 3) for name in free}
-        return held | {name: fixed[name].index_copy(-1, free[name], part) for name, part in zip(free, parts)}
+        parts = dict(zip(sought, (q / scale).split(counts, -1)))
+        at = {name: value.expand(*q.shape[:-1], 3) for name, value in pose.items()}
+        return at | {name: at[name].index_copy(-1, axes, parts[name]) for name, axes in sought.items()}
 
     def loads(q: Tensor) -> Tensor:
         """Net loads on the free coordinates (..., n) [N]."""
-        still = {name: torch.zeros(*q.shape[:-1], 3, dtype=q.dtype) for name in soft.bodies}
-        stretch = {
-            name: torch.zeros(*q.shape[:-1], len(soft.pads[c.pad].point_nodes), dtype=q.dtype)
-            for name, c in soft.contacts.items()
-        }
-        state = State({}, stretch, poses(q), {}, still)
+        batch = q.shape[:-1]
+        still = {name: torch.zeros(*batch, 3, dtype=q.dtype) for name in soft.bodies}
+        state = State({}, unstretched(soft, batch), poses(q), {}, still)
         state = state._replace(pads={name: carried(soft, name, state) for name in soft.pads})
-        graph = soft.evaluate(0.0, state, settled=True)
-        net = soft.loads(graph, net_efforts(graph.ports, soft.junctions))
-        return torch.cat([net[name][..., axes] for name, axes in free.items()], -1) / scale
+        graph = soft.evaluate(0.0, state, followed.expand(*batch, -1, -1), settled=True)
+        ports = {name: port for name, port in graph.ports.items() if name not in off}
+        net = soft.loads(graph, net_efforts(ports, soft.junctions))
+        return torch.cat([net[name][..., axes] for name, axes in sought.items()], -1) / scale
 
     path: list[tuple[float, Tensor]] = []
-    while len(path) < ITERATIONS and not stalled(path, STRIDE * mesh):
+    while len(path) < ITERATIONS and not stalled(path, stride):
         with torch.enable_grad():
-            x = q.detach().expand(len(q), -1).clone().requires_grad_(True)  # a copy for each load
+            x = q.expand(len(q), -1).clone().requires_grad_(True)  # a copy for each load
             F = loads(x)
             (rows,) = torch.autograd.grad(F.diagonal().sum(), x, materialize_grads=True)
         F, K = F[0].detach(), -rows
         size = float(F.norm())
         if size * softest <= residual:
-            return {name: value.detach() for name, value in poses(q).items()}
+            return poses(q + torch.linalg.solve(K, loads(q)) if torch.is_grad_enabled() else q)
         path.append((size, q))
         # as stiff as keeps the step short, which vanishes with the load: quadratic at the end
-        q = q + torch.linalg.solve(K + size / (STRIDE * mesh) * torch.eye(len(q), dtype=q.dtype), F)
+        q = q + torch.linalg.solve(K + size / stride * torch.eye(len(q), dtype=q.dtype), F)
     worst = int(F.abs().argmax())
-    names = [f"{name}.{COORDINATES[int(axis)]}" for name, axes in free.items() for axis in axes]
+    names = [f"{name}.{COORDINATES[int(axis)]}" for name, axes in sought.items() for axis in axes]
     raise NoEquilibrium(
         f"nothing is at rest: after {len(path)} steps {float(F.abs().max()):.2g} N still push {names[worst]}; is there a pad "
         "to carry it?"

@@ -1,37 +1,116 @@
 """A rig file: tables, from TOML or from Python, and what is built from them: the rig with its reference, its state at the
 start, and the times of its outputs."""
 
-from collections.abc import Callable, Collection, Mapping
-from functools import partial
+import re
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
 import torch
+from pydantic import Field, PrivateAttr, model_validator
 from torch import Tensor, nn
 
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Piecewise, Reference
-from torchsoft.physics.parts import COORDINATES
+from torchsoft.physics.parts import COORDINATES, coordinate_unit
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import NoEquilibrium, resting, standing
 from torchsoft.physics.validity import sound
-from torchsoft.rigs.bodies import REST
-from torchsoft.rigs.fields import at_field
-from torchsoft.rigs.geometry import points, reach, surface
-from torchsoft.rigs.motion import MotionContext, flattened
-from torchsoft.rigs.schema import RigTables
-from torchsoft.tables import from_toml
+from torchsoft.quantity import Gravity, Quantity, Time
+from torchsoft.rigs.control import ActuatorTable, ControllerTable, Loop
+from torchsoft.rigs.fields import Group, at_field
+from torchsoft.rigs.geometry import Scene
+from torchsoft.rigs.motion import MotionContext, MotionTable, flattened
+from torchsoft.rigs.parts import REST, AnyPad, BodyTable, ContactTable, LawTable, MaterialTable
+from torchsoft.tables import LISTED, from_toml, line
+
+M = TypeVar("M")
+
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+TAKEN = frozenset(dir(nn.ModuleDict()))
+"""Names that parts of a torch module cannot have."""
+
+ROWS = 1_000_000
+"""Outputs of one run at the most."""
 
 UPWARDS = 0.1
 """Least upward part of the normal of a pad that something may rest on."""
 
-
 STIFF = 100.0
 """How many times as stiff as a point of the pad a contact may be for statics to be sure of balance."""
 
+REFERENCES = (
+    ("pads", "material", "materials"), ("pads", "base", "bodies"), ("contacts", "pad", "pads"),
+    ("contacts", "body", "bodies"), ("contacts", "law", "laws"),
+)  # fmt: skip
+"""Tables and fields that name another table, and where that is."""
 
-M = TypeVar("M", bound=nn.Module)
+USED = {
+    "materials": ("pads", "material", "no pad is made of it; name it as the material of one"),
+    "laws": ("contacts", "law", "no contact follows it; name it as the law of one"),
+}
+"""Tables that something must name, and by which field."""
+
+
+class OutputsTable(Group):
+    """How long the run lasts, and what is written."""
+
+    duration: Annotated[float, Quantity("s", 1e-3, 1e5)] = Field(description="of the run")
+    interval: Annotated[float, Quantity("s", 1e-6, 1e3)] = Field(default=0.01, description="between outputs")
+    figures: bool = Field(default=True, description="write the figures")
+    snapshots: Annotated[tuple[Time, ...], LISTED, Field(max_length=12)] = Field(
+        default=(), description="times of the pictures in snapshots.png; six over the whole run if none is given [s]"
+    )
+    video: Literal["gif", "mp4", "none"] = Field(
+        default="gif", description="kind of the video; mp4 needs imageio-ffmpeg"
+    )
+    frames: Annotated[int, Field(ge=2, le=10_000)] = Field(
+        default=150, description="pictures of the video, 12 a second"
+    )
+    follow: str = Field(
+        default="", description='coordinate under the video, such as "disc.x"; the one that moves most if not given'
+    )
+
+    @model_validator(mode="after")
+    def _are_possible(self) -> Self:
+        if self.interval > self.duration:
+            raise ValueError(f"interval = {self.interval:g} s is longer than duration = {self.duration:g} s")
+        if self.duration / self.interval > ROWS:
+            raise ValueError(f"interval = {self.interval:g} s makes more than {ROWS} outputs in {self.duration:g} s")
+        if late := [time for time in self.snapshots if time > self.duration]:
+            raise ValueError(f"snapshots: {late[0]:g} s is after the end of the run, duration = {self.duration:g} s")
+        return self
+
+    def times(self) -> Tensor:
+        """Equal intervals, and the times of snapshots [s]."""
+        count = max(1, round(self.duration / self.interval)) + 1
+        grid = torch.linspace(0, self.duration, count, dtype=torch.float64)
+        more = [t for t in self.snapshots if float((grid - t).abs().min()) > 1e-6]
+        return torch.cat((grid, torch.tensor(more, dtype=torch.float64))).sort().values
+
+
+class SolverTable(Group):
+    """How steps are chosen: by tolerance, or equal ones."""
+
+    rtol: Annotated[float, Quantity("1", 1e-9, 1e-1)] | None = Field(
+        default=None, description="relative tolerance; 1e-5 if not given"
+    )
+    atol: Annotated[float, Quantity("1", 1e-12, 1.0)] | None = Field(
+        default=None, description="absolute tolerance, in N, mm and rad; a tenth of rtol if not given"
+    )
+    step: Annotated[float, Quantity("s", 1e-7, 1.0)] | None = Field(
+        default=None, description="equal steps no longer than this instead"
+    )
+    tolerance: Annotated[float, Quantity("N", 1e-10, 1e-3)] = Field(
+        default=1e-9, description="Newton's, on every nodal force"
+    )
+
+    @model_validator(mode="after")
+    def _choose_once(self) -> Self:
+        if self.step is not None and (self.rtol or self.atol) is not None:
+            raise ValueError("step and rtol (or atol) each say which steps to take; give one of them")
+        return self
 
 
 class BuiltRig(NamedTuple):
@@ -42,142 +121,23 @@ class BuiltRig(NamedTuple):
     t: Tensor
 
 
-def assemble(
-    file: RigTables, held: Mapping[str, Mapping[str, float]] | None = None, loops: Collection[str] | None = None
-) -> Rig:
-    """The rig without a reference; `held` are coordinates that are fixed, by body and axis, and `loops` names its actuators
-    (none of a controller), all by default."""
-    actuators = {
-        name: made(f"actuators.{name}", partial(one.build, file.folder))
-        for name, one in file.actuators.items() if loops is None or name in loops
-    }  # fmt: skip
-    for name, one in file.controllers.items() if loops is None else ():
-        with at_field(f"controllers.{name}"):
-            actuators |= one.build(name, file.folder)
-    materials = {
-        name: made(f"materials.{name}", partial(one.build, file.folder)) for name, one in file.materials.items()
-    }
-    laws = {name: table.build(file.folder) for name, table in file.laws.items()}
-    held = held or {}
-    return Rig(
-        bodies={
-            name: made(f"bodies.{name}", partial(one.build, file.folder, dict(held.get(name, {}))))
-            for name, one in file.bodies.items()
-        },
-        pads={
-            name: made(f"pads.{name}", partial(one.build, materials[one.material], file.folder))
-            for name, one in file.pads.items()
-        },
-        contacts={name: one.build(laws) for name, one in file.contacts.items()},
-        actuators=actuators,
-        gravity=file.gravity,
-        symbols={name: one.symbol or name for name, one in file.bodies.items()},
-    )  # fmt: skip
-
-
-def made(field: str, build: Callable[[], M]) -> M:
-    """What `build` makes, with parameters that are physical together. Raises `ValueError` with the field's name."""
-    with at_field(field):
-        return sound(build())
-
-
-def signal(file: RigTables, name: str, pose: Mapping[str, Array] | None) -> Piecewise:
-    """One motion, with bodies that start at `pose` (3,)."""
-    setpoints = {coordinate for role, coordinate in file.followers()[name] if role == "setpoint"}
-    start = None
-    if pose is not None and len(setpoints) == 1:
-        body, _, axis = setpoints.pop().partition(".")
-        start = float(pose[body][COORDINATES.index(axis)])
-    asked = MotionContext(name, file.unit(name), start, file.outputs.duration, file.folder)
-    try:
-        return file.motion[name].build(asked)
-    except ValueError as error:
-        prefix = "" if str(error).startswith("motion.") else f"motion.{name}: "
-        raise ValueError(f"{prefix}{error}") from None
-
-
-def starts(file: RigTables, driven: Mapping[str, float]) -> dict[str, Array]:
-    """Poses (3,) [m, m, rad] by body at the start, those that rest solved for; `driven` are where driven coordinates begin."""
-    pose: dict[str, Array] = {}
-    wanted: list[tuple[str, str]] = []
-    for name, body in file.bodies.items():
-        row = []
-        for axis, kind in body.freedom.items():
-            place = (
-                getattr(body.start, axis) if kind == "free" else driven[f"{name}.{axis}"] if kind == "driven" else kind
-            )
-            if place == REST:
-                wanted.append((name, axis))
-            row.append(0.0 if place is None or place == REST else float(place))
-        pose[name] = np.array(row)
-    if not wanted:
-        return pose
-    held = {
-        name: {axis: float(at) for axis, at in zip(COORDINATES, row) if (name, axis) not in wanted}
-        for name, row in pose.items()
-    }
-    rig = assemble(file, held, loops=()).requires_grad_(False)
-    for name, axis in wanted:
-        if axis == "y":
-            pose[name][1] = above(rig, name, pose)
-    try:
-        found = resting(rig, {name: torch.from_numpy(at) for name, at in pose.items()})
-    except NoEquilibrium as error:
-        name, axis = wanted[0]
-        raise ValueError(too_stiff(file, rig) or f"bodies.{name}.start.{axis}: {error}") from None
-    return {name: at.numpy() for name, at in found.items()}
-
-
-def too_stiff(file: RigTables, rig: Rig) -> str:
-    """The law of a contact so much stiffer than its pad that its force is rounding of its depth; empty if there is none."""
-    for name, contact in rig.contacts.items():
-        give = float(rig.pads[contact.pad].compliance().detach().diagonal().max())
-        ratio = float((rig.weight(name) * contact.law.K_n).detach().max()) * give
-        if ratio > STIFF:
-            law, K_n = file.contacts[name].law, contact.law.K_n.item()
-            return (
-                f"laws.{law}.K_n: no rest is found with {K_n:g} N/m, {ratio:.2g} times as stiff as the pad `{contact.pad}`"
-                f" that it presses; take {K_n * STIFF / ratio:.1g} N/m or less, the pad gives way long before the contact does"
-            )
-    return ""
-
-
-def above(rig: Rig, body: str, pose: Mapping[str, Array]) -> float:
-    """A height [m] at which a body is clear of the pads under it. Raises `ValueError` where there is none."""
-    below = reach(rig, body, pose, np.array([0.0, -1.0]))
-    beside = [reach(rig, body, pose, np.array([side, 0.0])) for side in (-1.0, 1.0)]
-    heights = []
-    for contact in rig.contacts.values():
-        at = surface(rig.pads[contact.pad], pose)
-        x, places = float(pose[body][0]), points(rig.pads[contact.pad], pose)
-        under = (places[:, 0] > x - beside[0]) & (places[:, 0] < x + beside[1])
-        if contact.body == body and at.normal[1] > UPWARDS and places[:, 0].min() < x < places[:, 0].max():
-            if not under.any():
-                raise ValueError(
-                    f"bodies.{body}.shape: {1e3 * sum(beside):.3g} mm wide, it falls between points of `{contact.pad}`, which"
-                    f" are {1e3 * float(rig.pads[contact.pad].point_lengths.max()):.3g} mm apart; make it "
-                    f"larger, or give pads.{contact.pad} more elements or points"
-                )
-            heights.append(float(places[under, 1].max()) + below)
-    if not heights:
-        raise ValueError(
-            f'bodies.{body}.start.y: "{REST}", but no pad that it has a contact with lies under x = {pose[body][0]:g} m; '
-            "place it over one, or say at which height it starts"
-        )
-    return max(heights)
-
-
-def output_times(file: RigTables) -> Tensor:
-    """Equal intervals, and the times of snapshots [s]."""
-    o = file.outputs
-    grid = torch.linspace(0, o.duration, max(1, round(o.duration / o.interval)) + 1, dtype=torch.float64)
-    more = [t for t in o.snapshots if float((grid - t).abs().min()) > 1e-6]
-    return torch.cat((grid, torch.tensor(more, dtype=torch.float64))).sort().values
-
-
-class RigFile(RigTables):
+class RigFile(Group):
     """A rig and its run. SI units throughout: m, kg, s, N, rad, Pa; 4.59e-3 is 4.59 mm. The model is planar: x to the right, y
     upwards, theta anticlockwise."""
+
+    title: str = Field(default="", description="what it is")
+    gravity: Gravity = Field(default=9.81, description="acts downwards")
+    bodies: dict[str, BodyTable] = Field(min_length=1)
+    materials: dict[str, MaterialTable] = Field(min_length=1)
+    pads: dict[str, AnyPad] = Field(min_length=1)
+    laws: dict[str, LawTable] = Field(min_length=1)
+    contacts: dict[str, ContactTable] = Field(min_length=1)
+    actuators: dict[str, ActuatorTable] = Field(default_factory=dict)
+    controllers: dict[str, ControllerTable] = Field(default_factory=dict)
+    motion: dict[str, MotionTable] = Field(default_factory=dict)
+    outputs: OutputsTable
+    solver: SolverTable = SolverTable()
+    _folder: Path = PrivateAttr(default_factory=Path)
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:
@@ -198,9 +158,8 @@ class RigFile(RigTables):
         A table of another kind replaces the whole of the old one. Raises `ValueError`."""
 
         def merged(old: Any, new: Any) -> Any:
-            if not (isinstance(old, dict) and isinstance(new, dict)) or new.get("kind", old.get("kind")) != old.get(
-                "kind"
-            ):
+            both = isinstance(old, dict) and isinstance(new, dict)
+            if not both or new.get("kind", old.get("kind")) != old.get("kind"):
                 return new
             return old | {key: merged(old.get(key), value) for key, value in new.items()}
 
@@ -208,19 +167,167 @@ class RigFile(RigTables):
         file._folder = self._folder
         return file
 
+    @property
+    def folder(self) -> Path:
+        """Where files that it names are looked for: its own folder, or the working directory."""
+        return self._folder
+
+    def coordinates(self) -> Iterator[tuple[str, str, float | str]]:
+        """Body, axis and freedom of every coordinate."""
+        for name, body in self.bodies.items():
+            for axis, kind in body.freedom.items():
+                yield name, axis, kind
+
+    def loops(self) -> list[Loop]:
+        """What follows motions, by actuators and by controllers."""
+        groups = *self.actuators.items(), *self.controllers.items()
+        return [loop for name, one in groups for loop in one.loops(name)]
+
+    def followers(self) -> dict[str, list[tuple[str, str]]]:
+        """What follows each motion: roles ("setpoint", "feed_forward" or "driven") and coordinates by the motion's name."""
+        fed = [(one.feed_forward, "feed_forward", one.pushes) for one in self.actuators.values() if one.feed_forward]
+        driven = [f"{body}.{axis}" for body, axis, kind in self.coordinates() if kind == "driven"]
+        out: dict[str, list[tuple[str, str]]] = {}
+        for motion, role, coordinate in (
+            *((loop.setpoint, "setpoint", loop.measured) for loop in self.loops()), *fed,
+            *((name, "driven", name) for name in driven),
+        ):  # fmt: skip
+            out.setdefault(motion, []).append((role, coordinate))
+        return out
+
+    def unit(self, motion: str) -> str:
+        """Unit of a motion, from what follows it."""
+        (role, coordinate), *_ = self.followers()[motion]
+        return (
+            coordinate_unit(coordinate) if role != "feed_forward" else "N.m" if coordinate.endswith(".theta") else "N"
+        )
+
+    @model_validator(mode="after")
+    def _names_are_names(self) -> Self:
+        for group in ("bodies", "materials", "pads", "laws", "contacts", "actuators", "controllers"):
+            for name in getattr(self, group):
+                if name in TAKEN:
+                    raise ValueError(f"{group}.{line(name, 80)}: the name is taken by torch; take another one")
+                if not NAME.fullmatch(name):
+                    raise ValueError(f"{group}.{line(name, 80)}: the name should be letters, digits and underscores")
+        return self
+
+    @model_validator(mode="after")
+    def _names_are_there(self) -> Self:
+        for group, field, others in REFERENCES:
+            there = getattr(self, others)
+            for key, table in getattr(self, group).items():
+                name = getattr(table, field)
+                if name is not None and name not in there:
+                    raise ValueError(
+                        f"{group}.{key}.{field}: there is no `{line(name, 80)}` among {others}; there is "
+                        f"{', '.join(there) or 'nothing'}"
+                    )
+        for name, pad in self.pads.items():
+            if pad.inertial and pad.base is not None and not isinstance(self.bodies[pad.base].theta, float):
+                raise ValueError(
+                    f"pads.{name}.inertial: the base `{pad.base}` may turn, which inertial pads cannot; fix its theta"
+                )
+        for name, contact in self.contacts.items():
+            if self.bodies[contact.body].shape is None:
+                raise ValueError(
+                    f"contacts.{name}.body: `{contact.body}` has no shape to touch anything with; give it one"
+                )
+            if self.pads[contact.pad].base == contact.body:
+                raise ValueError(
+                    f"contacts.{name}: the pad `{contact.pad}` is bonded to the body `{contact.body}` itself"
+                )
+        for group, (others, field, why) in USED.items():
+            named = {getattr(other, field) for other in getattr(self, others).values()}
+            for name in sorted(getattr(self, group).keys() - named):
+                raise ValueError(f"{group}.{name}: {why}, or leave it out")
+        return self
+
+    @model_validator(mode="after")
+    def _coordinates_are_free(self) -> Self:
+        for group in ("actuators", "controllers"):
+            for name, one in getattr(self, group).items():
+                for field in ("pushes", "measures"):
+                    given = getattr(one, field) or ()
+                    for coordinate in (given,) if isinstance(given, str) else given:
+                        self._check_coordinate(f"{group}.{name}.{field}", coordinate)
+        for name, one in self.controllers.items():
+            for taken in sorted(one.actuators(name).keys() & self.actuators.keys()):
+                raise ValueError(f"controllers.{name}: one of its efforts would be called `{taken}`, as an actuator is")
+        return self
+
+    def _check_coordinate(self, field: str, coordinate: str) -> None:
+        """Raises `ValueError` for what a loop can neither measure nor push."""
+        kinds = {f"{body}.{axis}": kind for body, axis, kind in self.coordinates()}
+        if coordinate not in kinds:
+            there = ", ".join(name for name, kind in kinds.items() if kind == "free") or "none"
+            raise ValueError(f"{field}: `{line(coordinate, 80)}` is not a coordinate; free ones are {there}")
+        if (kind := kinds[coordinate]) != "free":
+            how = "driven by its motion" if kind == "driven" else f"fixed at {kind:g}"
+            verb = "push" if field.endswith("pushes") else "learn"
+            raise ValueError(
+                f"{field}: {coordinate} is {how}, so that there is nothing to {verb}; make it free, or leave this out"
+            )
+
+    @model_validator(mode="after")
+    def _motions_are_followed(self) -> Self:
+        followers = self.followers()
+        for name, who in followers.items():
+            role, coordinate = who[0]
+            if name not in self.motion:
+                why = {
+                    "setpoint": f"{coordinate} is to follow it", "feed_forward": f"{coordinate} is to be pushed by it",
+                    "driven": "the coordinate is driven by it",
+                }[role]  # fmt: skip
+                raise ValueError(f"motion.{line(name, 80)} is missing: {why}")
+            if len({(r == "feed_forward", c.endswith(".theta")) for r, c in who}) > 1:
+                raise ValueError(
+                    f"motion.{name} would be in two units: {' and '.join(f'{r} of {c}' for r, c in who)} use it"
+                )
+        for name in self.motion:
+            if name not in followers:
+                raise ValueError(
+                    f"motion.{line(name, 80)}: nothing follows it; name it as setpoint or feed_forward of an actuator, or make "
+                    'a coordinate of that name "driven"'
+                )
+        return self
+
+    def assemble(self) -> Rig:
+        """The rig without a reference. Raises `ValueError` with the field's name for parts that are not physical."""
+        folder = self.folder
+
+        def made(group: str, build: Callable[[Any], M]) -> dict[str, M]:
+            found = {}
+            for name, table in getattr(self, group).items():
+                with at_field(f"{group}.{name}"):
+                    found[name] = sound(build(table))
+            return found
+
+        actuators = made("actuators", lambda one: one.build(folder))
+        for name, one in self.controllers.items():
+            with at_field(f"controllers.{name}"):
+                actuators |= one.build(name, folder)
+        materials, laws = (made(group, lambda one: one.build(folder)) for group in ("materials", "laws"))
+        return Rig(
+            bodies=made("bodies", lambda one: one.build(folder)),
+            pads=made("pads", lambda one: one.build(materials[one.material], folder)),
+            contacts=made("contacts", lambda one: one.build(laws)),
+            actuators=actuators,
+            gravity=self.gravity,
+            symbols={name: one.symbol or name for name, one in self.bodies.items()},
+        )
+
+    @torch.no_grad()
     def build(self) -> BuiltRig:
         """What the file describes, ready for `simulate(rig, t, y0=y0)`.
 
         Pads are settled around the bodies where these start. Raises `ValueError` with the field's name: for motions that cannot
         be, recorded ones that cannot be read, bodies that find no rest, and bodies too deep in a pad for it to settle.
         """
-        known = {name: signal(self, name, None) for name, who in self.followers().items() if who[0][0] == "driven"}
-        pose = starts(
-            self, {name: float(one(torch.zeros((), dtype=torch.float64))[0].detach()) for name, one in known.items()}
-        )
-        signals = {name: known.get(name) or signal(self, name, pose) for name in self.motion}
-        rig = assemble(self)
-        rig.reference = Reference(**signals)
+        known = {name: self._signal(name, None) for name, who in self.followers().items() if who[0][0] == "driven"}
+        rig, zero = self.assemble(), torch.zeros((), dtype=torch.float64)
+        pose = self._starts(rig, {name: float(one(zero)[0]) for name, one in known.items()})
+        rig.reference = Reference(**{name: known.get(name) or self._signal(name, pose) for name in self.motion})
         try:
             y0 = standing(rig, {name: torch.from_numpy(at) for name, at in pose.items()})
         except NoEquilibrium as error:
@@ -230,4 +337,81 @@ class RigFile(RigTables):
         for name, body in self.bodies.items():
             rates = [v for v, axis in zip(body.start.velocity, COORDINATES) if axis in body.free]
             y0[rig.layout.slices["velocity", name]] = torch.tensor(rates, dtype=torch.float64)
-        return BuiltRig(rig, y0, output_times(self))
+        return BuiltRig(rig, y0, self.outputs.times())
+
+    def _signal(self, name: str, pose: Mapping[str, Array] | None) -> Piecewise:
+        """One motion, with bodies that start at `pose` (3,)."""
+        setpoints = {coordinate for role, coordinate in self.followers()[name] if role == "setpoint"}
+        start = None
+        if pose is not None and len(setpoints) == 1:
+            body, _, axis = setpoints.pop().partition(".")
+            start = float(pose[body][COORDINATES.index(axis)])
+        asked = MotionContext(name, self.unit(name), start, self.outputs.duration, self.folder)
+        try:
+            return self.motion[name].build(asked)
+        except ValueError as error:
+            prefix = "" if str(error).startswith("motion.") else f"motion.{name}: "
+            raise ValueError(f"{prefix}{error}") from None
+
+    def _starts(self, rig: Rig, driven: Mapping[str, float]) -> dict[str, Array]:
+        """Poses (3,) [m, m, rad] by body at the start, solved for where bodies rest; `driven` are the driven ones'."""
+        pose = {name: np.zeros(3) for name in self.bodies}
+        wanted: dict[str, list[int]] = {}
+        for name, axis, kind in self.coordinates():
+            free = getattr(self.bodies[name].start, axis)
+            place = free if kind == "free" else driven[f"{name}.{axis}"] if kind == "driven" else kind
+            if place == REST:
+                wanted.setdefault(name, []).append(COORDINATES.index(axis))
+            else:
+                pose[name][COORDINATES.index(axis)] = place or 0.0
+        if not wanted:
+            return pose
+        for name, axes in wanted.items():
+            if 1 in axes:
+                pose[name][1] = above(Scene(rig, pose), name)
+        places = {name: torch.from_numpy(at) for name, at in pose.items()}
+        try:
+            found = resting(rig, places, wanted, signals=torch.zeros(len(rig.signals), 2).double(), actuators=())
+        except NoEquilibrium as error:
+            name, (axis, *_) = next(iter(wanted.items()))
+            raise ValueError(too_stiff(self, rig) or f"bodies.{name}.start.{COORDINATES[axis]}: {error}") from None
+        return {name: at.numpy() for name, at in found.items()}
+
+
+def too_stiff(file: RigFile, rig: Rig) -> str:
+    """The law of a contact so much stiffer than its pad that its force is rounding of its depth; empty if there is none."""
+    for name, contact in rig.contacts.items():
+        give = float(rig.pads[contact.pad].compliance().diagonal().max())
+        ratio = float((rig.weight(name) * contact.law.K_n).max()) * give
+        if ratio > STIFF:
+            law, K_n = file.contacts[name].law, contact.law.K_n.item()
+            return (
+                f"laws.{law}.K_n: no rest is found with {K_n:g} N/m, {ratio:.2g} times as stiff as the pad `{contact.pad}`"
+                f" that it presses; take {K_n * STIFF / ratio:.1g} N/m or less, the pad gives way long before the contact does"
+            )
+    return ""
+
+
+def above(scene: Scene, body: str) -> float:
+    """A height [m] at which a body is clear of the pads under it. Raises `ValueError` where there is none."""
+    below, *beside = (scene.reach(body, np.array(way)) for way in ([0.0, -1.0], [-1.0, 0.0], [1.0, 0.0]))
+    x, heights = float(scene.pose[body][0]), []
+    for key, contact in scene.rig.contacts.items():
+        at, pad = scene.points(key), scene.pad(key)
+        on = contact.body == body and scene.surface(key).normal[1] > UPWARDS
+        if not on or not at[:, 0].min() < x < at[:, 0].max():
+            continue
+        under = at[(at[:, 0] > x - beside[0]) & (at[:, 0] < x + beside[1])]
+        if not len(under):
+            raise ValueError(
+                f"bodies.{body}.shape: {1e3 * sum(beside):.3g} mm wide, it falls between points of `{contact.pad}`, which"
+                f" are {1e3 * float(pad.point_lengths.max()):.3g} mm apart; make it larger, or give pads.{contact.pad} more "
+                "elements or points"
+            )
+        heights.append(float(under[:, 1].max()) + below)
+    if not heights:
+        raise ValueError(
+            f'bodies.{body}.start.y: "{REST}", but no pad that it has a contact with lies under x = {x:g} m; '
+            "place it over one, or say at which height it starts"
+        )
+    return max(heights)

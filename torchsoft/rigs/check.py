@@ -1,26 +1,31 @@
-"""What is wrong or dangerous in a rig file, said before any run: findings, each with its severity, its field and a sentence."""
+"""What is wrong or dangerous in a rig file, said before any run: findings, each with its severity, its field and a sentence.
+
+Every check is a function of the estimated course of the bodies. What comes of the rig in balance is in `balance`.
+"""
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import networkx as nx
+import numpy as np
+import torch
 
+from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Sampled
-from torchsoft.physics.rig import Rig
+from torchsoft.physics.pads import Pad
 from torchsoft.rigs.balance import at_moments
-from torchsoft.rigs.build import BuiltRig, RigFile
-from torchsoft.rigs.course import Course, Estimate, at, signals
-from torchsoft.rigs.fields import Refused
-from torchsoft.rigs.finding import SEVERITIES, Finding
-from torchsoft.rigs.geometry import TOUCH, collision, corner, inside, nodes, overlap, pressed, surface, tied
+from torchsoft.rigs.build import RigFile
+from torchsoft.rigs.course import Estimate, at, signals
+from torchsoft.rigs.fields import SEVERITIES, Finding, Refused
+from torchsoft.rigs.geometry import Scene, Surface, collision, nodes, tied
 from torchsoft.rigs.motion import CsvTable
-from torchsoft.rigs.reach import apart, crossed, overloads, unreachable
+from torchsoft.solve.ledger import COMPRESSED
 
 JUMP = {"m": 1e-4, "rad": 1e-2}
 """How far a set-point may be from its coordinate at the start without a warning."""
 
-SAMPLES = 61
-"""Times at which the course of the bodies is looked at, besides the motions' knots."""
+TOUCH = 1e-6
+"""Depth [m] up to which things that touch do not overlap."""
 
 OUTPUTS_PER_PERIOD = 4
 """Outputs that a period of a motion needs at the least."""
@@ -29,88 +34,70 @@ OUTPUTS_PER_PERIOD = 4
 def check(file: RigFile) -> list[Finding]:
     """Findings on a rig file, errors first. Takes some seconds."""
     try:
-        ready = file.build()
+        estimate = Estimate(file, file.build())
     except Refused as error:
         return [Finding("error", error.field, error.sentence)]
     except ValueError as error:
         field, _, sentence = str(error).partition(": ")
         return [Finding("error", field, sentence)]
-    estimate = Estimate(file, ready)
-    course = estimate.sampled(SAMPLES)
-    found = [
-        *ties(file, ready.rig), *unseen(file, ready.rig), *recordings(file, ready), *jumps(file, ready, estimate),
-        *carried(file, ready, estimate), *overlaps(ready.rig, estimate, course), *corners(file, ready.rig),
-        *unreachable(file, ready.rig, estimate, course), *apart(file, ready.rig, estimate, course),
-        *crossed(file, ready.rig, estimate, course), *overloads(file, ready.rig, estimate),
-    ]  # fmt: skip
+    found = [one for look in CHECKS for one in look(estimate)]
     if not any(one.severity == "error" for one in found):
-        found += at_moments(file, ready, estimate)
+        found += at_moments(estimate)
     return sorted(found, key=lambda one: SEVERITIES.index(one.severity))
 
 
-def ties(file: RigFile, rig: Rig) -> Iterator[Finding]:
-    """Loops that measure a body which they cannot move."""
-    graph = tied(rig, rig.contacts)
-    for loop in file.loops():
-        (measured, _), (pushed, _) = at(loop.measured), at(loop.pushes)
-        if not nx.has_path(graph, measured, pushed):
+def ties(e: Estimate) -> Iterator[Finding]:
+    """Loops that measure a body which they cannot move, and efforts of controllers that move nothing of what these see."""
+    graph = tied(e.rig, e.rig.contacts)
+    wanted = [(one.field, one.pushes, (one.measured,)) for one in e.loops]
+    wanted += [
+        (f"controllers.{k}.pushes", pushed, one.measures)
+        for k, one in e.file.controllers.items()
+        for pushed in one.pushes
+    ]
+    for field, pushed, measured in wanted:
+        bodies = [at(one)[0] for one in measured]
+        if not any(nx.has_path(graph, body, at(pushed)[0]) for body in bodies):
             yield Finding(
-                "error", loop.field,
-                f"it measures {loop.measured} and pushes {loop.pushes}, but no pad and contact tie `{pushed}` to "
-                f"`{measured}`: whatever it does, it moves nothing that it sees; add a contact, or measure {loop.pushes}",
+                "error", field,
+                f"it measures {', '.join(measured)} and pushes {pushed}, but no pad and contact tie `{at(pushed)[0]}` to "
+                f"`{'`, `'.join(bodies)}`: whatever it does, it moves nothing that it sees; add a contact, or measure {pushed}",
             )  # fmt: skip
 
 
-def unseen(file: RigFile, rig: Rig) -> Iterator[Finding]:
-    """Efforts of controllers that move nothing of what these see."""
-    graph = tied(rig, rig.contacts)
-    for name, one in file.controllers.items():
-        for pushed in one.pushes:
-            if not any(nx.has_path(graph, at(measured)[0], at(pushed)[0]) for measured in one.measures):
-                yield Finding(
-                    "error", f"controllers.{name}.pushes",
-                    f"no pad and contact tie `{at(pushed)[0]}` to anything that it measures: pushing {pushed} moves nothing "
-                    "that it sees; add a contact, or measure it",
-                )  # fmt: skip
-
-
-def recordings(file: RigFile, ready: BuiltRig) -> Iterator[Finding]:
+def recordings(e: Estimate) -> Iterator[Finding]:
     """Recorded motions that do not cover the run, and waves that outputs do not show."""
-    end, interval = file.outputs.duration, file.outputs.interval
-    for name, motion in file.motion.items():
-        one = ready.rig.reference[name]
+    interval = e.file.outputs.interval
+    for name, motion in e.file.motion.items():
+        one, fastest = e.rig.reference[name], motion.fastest()
         if isinstance(motion, CsvTable) and isinstance(one, Sampled):
             first, last = float(one.times[0]), float(one.times[-1])
-            if last < end * (1 - 1e-9):
+            if last < e.file.outputs.duration * (1 - 1e-9):
                 yield Finding(
                     "error", f"motion.{name}.file",
-                    f"{motion.file} ends at {last:g} s, but the run lasts until {end:g} s: nothing says what is wanted then; "
-                    f"shorten outputs.duration to {last:g}, or record longer",
+                    f"{motion.file} ends at {last:g} s, but the run lasts until {e.file.outputs.duration:g} s: nothing says "
+                    f"what is wanted then; shorten outputs.duration to {last:g}, or record longer",
                 )  # fmt: skip
             if first > 0:
-                yield Finding(
-                    "warning",
-                    f"motion.{name}.file",
-                    f"{motion.file} begins at {first:g} s; until then its first value holds",
-                )
-        if motion.fastest() * interval * OUTPUTS_PER_PERIOD > 1:
+                sentence = f"{motion.file} begins at {first:g} s; until then its first value holds"
+                yield Finding("warning", f"motion.{name}.file", sentence)
+        if fastest * interval * OUTPUTS_PER_PERIOD > 1:
             yield Finding(
                 "warning", "outputs.interval",
-                f"outputs every {interval:g} s do not show motion.{name}, which goes up to {motion.fastest():g} Hz; take "
-                f"{1 / (OUTPUTS_PER_PERIOD * motion.fastest()):.2g} s or less",
+                f"outputs every {interval:g} s do not show motion.{name}, which goes up to {fastest:g} Hz; take "
+                f"{1 / (OUTPUTS_PER_PERIOD * fastest):.2g} s or less",
             )  # fmt: skip
 
 
-def jumps(file: RigFile, ready: BuiltRig, estimate: Estimate) -> Iterator[Finding]:
+def jumps(e: Estimate) -> Iterator[Finding]:
     """Set-points that begin elsewhere than their coordinate."""
-    values = signals(ready.rig, 0.0)
-    state, followed = ready.rig.unpack(ready.y0), ready.rig.follow(0.0)
-    for loop in file.loops():
+    values, followed = signals(e.rig, 0.0), e.rig.follow(0.0)
+    for loop in e.loops:
         body, axis = at(loop.measured)
-        unit = file.unit(loop.setpoint)
-        here, wanted = estimate.start[body][axis], values[loop.setpoint]
+        unit, here, wanted = e.file.unit(loop.setpoint), e.start[body][axis], values[loop.setpoint]
         if abs(wanted - here) > JUMP[unit]:
-            efforts = [float(ready.rig.actuator_effort(name, state, followed).detach()) for name in loop.actuators]
+            state = e.rig.unpack(e.y0, followed)
+            efforts = [float(e.rig.actuator_effort(name, state, followed).detach()) for name in loop.actuators]
             yield Finding(
                 "warning", f"motion.{loop.setpoint}",
                 f"it begins at {wanted:.6g} {unit}, but {loop.measured} at {here:.6g} {unit}: `{loop.field}` pushes "
@@ -118,19 +105,17 @@ def jumps(file: RigFile, ready: BuiltRig, estimate: Estimate) -> Iterator[Findin
             )  # fmt: skip
 
 
-def carried(file: RigFile, ready: BuiltRig, estimate: Estimate) -> Iterator[Finding]:
+def carried(e: Estimate) -> Iterator[Finding]:
     """Bodies that nothing carries against gravity."""
-    rig, pose = ready.rig, estimate.start
-    pushed = {*file.pushed().values()}
-    for name, body in file.bodies.items():
-        if file.gravity == 0 or not body.weighted or "y" not in body.free or f"{name}.y" in pushed:
+    scene = Scene(e.rig, e.start)
+    pushed = {one.pushes for one in e.file.actuators.values()}
+    pushed |= {coordinate for one in e.file.controllers.values() for coordinate in one.pushes}
+    for name, body in e.file.bodies.items():
+        if e.file.gravity == 0 or not body.weighted or "y" not in body.free or f"{name}.y" in pushed:
             continue
-        own = [key for key, contact in rig.contacts.items() if contact.body == name]
-        at_pads = {key: surface(rig.pads[rig.contacts[key].pad], pose) for key in own}
-        under = [
-            s for s in at_pads.values() if s.normal[1] > 0.3 and s.off(pose[name][:2]) < 0 < -s.depth(pose[name][:2])
-        ]
-        if under or any(pressed(rig, key, pose) > 0 and s.off(pose[name][:2]) < 0 for key, s in at_pads.items()):
+        own, place = [key for key, contact in e.rig.contacts.items() if contact.body == name], e.start[name][:2]
+        over = {key: s for key in own if (s := scene.surface(key)).off(place) < 0}
+        if any((s.normal[1] > 0.3 and s.depth(place) < 0) or scene.pressed(key) > 0 for key, s in over.items()):
             continue
         why = "no pad that it has a contact with lies under it" if own else "it has no contact with any pad"
         yield Finding(
@@ -140,10 +125,41 @@ def carried(file: RigFile, ready: BuiltRig, estimate: Estimate) -> Iterator[Find
         )  # fmt: skip
 
 
-def corners(file: RigFile, rig: Rig) -> Iterator[Finding]:
+def overlaps(e: Estimate) -> Iterator[Finding]:
+    """Things that lie in each other without a contact between them: at the start, and those whose course is known later."""
+    said, rig = set[tuple[str, str]](), e.rig
+    contacts = {(contact.pad, contact.body) for contact in rig.contacts.values()}
+    for time, scene in e.course:
+        sure = [name for name, body in rig.bodies.items() if body.shape is not None and (time == 0 or e.known(name))]
+        depths = {
+            (f"bodies.{a}", f"bodies.{b}"): max(scene.inside(b, scene.outline(a)), scene.inside(a, scene.outline(b)))
+            for a, b in itertools.combinations(sure, 2)
+        }
+        depths |= {
+            (f"bodies.{body}", f"pads.{name}"): scene.inside(body, nodes(pad, scene.pose))
+            for body in sure for name, pad in rig.pads.items() if (name, body) not in contacts and pad.base != body
+        }  # fmt: skip
+        depths |= {
+            (f"pads.{a}", f"pads.{b}"): collision(rig.pads[a], rig.pads[b], scene.pose)
+            for a, b in itertools.combinations(rig.pads, 2)
+        }
+        for (one, other), depth in depths.items():
+            if depth > TOUCH and (one, other) not in said:
+                said.add((one, other))
+                yield Finding(
+                    "error", one,
+                    f"it and {other} overlap by {1e3 * depth:.3g} mm at t = {time:.3g} s, and no contact is between them: they "
+                    "would pass through each other; move one of them, or let a pad be between",
+                )  # fmt: skip
+
+
+def corners(e: Estimate) -> Iterator[Finding]:
     """Corners that fall between contact points."""
-    for contact in rig.contacts.values():
-        spacing, sharpest = float(rig.pads[contact.pad].point_lengths.max()), corner(rig, contact.body)
+    for contact in e.rig.contacts.values():
+        spacing, sharpest = (
+            float(e.rig.pads[contact.pad].point_lengths.max()),
+            Scene(e.rig, e.start).corner(contact.body),
+        )
         if sharpest < spacing:
             yield Finding(
                 "warning", f"bodies.{contact.body}.shape",
@@ -153,31 +169,124 @@ def corners(file: RigFile, rig: Rig) -> Iterator[Finding]:
             )  # fmt: skip
 
 
-def overlaps(rig: Rig, estimate: Estimate, course: list[tuple[float, Course]]) -> Iterator[Finding]:
-    """Things that lie in each other without a contact between them: at the start, and those whose course is known later."""
-    said: set[tuple[str, str]] = set()
-    contacts = {(contact.pad, contact.body) for contact in rig.contacts.values()}
-    shaped = [name for name, body in rig.bodies.items() if body.shape is not None]
-    for time, pose in course:
-        sure = [name for name in shaped if time == 0 or estimate.known(name)]
-        lying = [
-            (f"bodies.{a}", f"bodies.{b}", max(overlap(rig, a, b, pose), overlap(rig, b, a, pose)))
-            for a, b in itertools.combinations(sure, 2)
-        ]
-        lying += [
-            (f"bodies.{body}", f"pads.{name}", inside(rig, body, pose, nodes(pad, pose)))
-            for body in sure for name, pad in rig.pads.items()
-            if (name, body) not in contacts and pad.base != body
-        ]  # fmt: skip
-        lying += [
-            (f"pads.{a}", f"pads.{b}", collision(rig.pads[a], rig.pads[b], pose))
-            for a, b in itertools.combinations(rig.pads, 2)
-        ]
-        for one, other, depth in lying:
-            if depth > TOUCH and (one, other) not in said:
-                said.add((one, other))
+def unreachable(e: Estimate) -> Iterator[Finding]:
+    """Contacts whose body comes nowhere near the pad on its way."""
+    slack = wanders(e)
+    for key, contact in e.rig.contacts.items():
+        pad = e.rig.pads[contact.pad]
+        free = slack[contact.body] + (0.0 if pad.base is None else slack[pad.base])
+        gaps = []
+        for _, scene in e.course:
+            body, there = scene.outline(contact.body), nodes(pad, scene.pose)
+            apart = np.maximum(there.min(0) - body.max(0), body.min(0) - there.max(0))
+            gaps.append(float((apart - np.where(free > 0, free, pad.mesh.height)).max()))
+        if min(gaps) > 0:
+            near = min(-scene.pressed(key) for _, scene in e.course)
+            yield Finding(
+                "warning", f"contacts.{key}",
+                f"it cannot close: `{contact.body}` comes no nearer to `{contact.pad}` than {near:.3g} m; change "
+                f"pads.{contact.pad}.origin, the starts or the motions, or leave the contact out",
+            )  # fmt: skip
+
+
+def wanders(e: Estimate) -> dict[str, Array]:
+    """How far bodies may go in x and y (2,) [m] besides their course: along a coordinate that no motion holds, with the others
+    and the pads, and as they are thrown or fall."""
+    travel = sum(float(np.ptp([scene.pose[name][:2] for _, scene in e.course], 0).sum()) for name in e.rig.bodies)
+    travel += sum(pad.mesh.length + pad.mesh.height for pad in e.rig.pads.values())
+    out = {}
+    for name, body in e.file.bodies.items():
+        thrown = np.abs(body.start.velocity[:2]) * e.end
+        thrown[1] += 0.5 * e.file.gravity * e.end**2 * body.weighted
+        out[name] = np.where([e.is_own(name, axis) for axis in (0, 1)], travel + thrown, 0.0)
+    return out
+
+
+def departures(e: Estimate) -> Iterator[Finding]:
+    """Motions that take a body past the end of a pad that it had touched. A body that no motion holds may be anywhere on
+    the pad opposite."""
+    closed, said = set[str](), set[str]()
+    for time, scene in e.course:
+        closed |= {key for key in e.rig.contacts if scene.pressed(key) > 0}
+        at_pads = {key: scene.surface(key) for key in closed}
+        for key in sorted(closed):
+            body, own, base = e.rig.contacts[key].body, at_pads[key], scene.pad(key).base
+            there = {body: (scene.pose[body][:2], 0.0)} | {
+                scene.pad(other).base: (face.middle, face.half) for other, face in at_pads.items()
+                if e.rig.contacts[other].body == body and face.faces(own)
+            }  # fmt: skip
+            off = {by: own.off(middle) - half for by, (middle, half) in there.items() if holds(e, by, own)}
+            presses = own.depth(scene.pose[body][:2]) + scene.reach(body, -own.normal) > 0
+            if body not in said and presses and holds(e, base, own) and max(off.values(), default=0.0) > 0:
+                said.add(body)
+                by = max(off, key=lambda one: off[one])
                 yield Finding(
-                    "error", one,
-                    f"it and {other} overlap by {1e3 * depth:.3g} mm at t = {time:.3g} s, and no contact is between them: they "
-                    "would pass through each other; move one of them, or let a pad be between",
+                    "warning", f"motion.{mover(e, scene, {by, base})}",
+                    f"at t = {time:.3g} s it has taken `{body}` {off[by]:.3g} m past the end of `{e.rig.contacts[key].pad}`, "
+                    f"which contacts.{key} presses until then; let it go less far, or take a longer pad",
                 )  # fmt: skip
+
+
+def crossings(e: Estimate) -> Iterator[Finding]:
+    """Motions that take a pad through the body between it and another one."""
+    for body in e.rig.bodies:
+        for pair in e.course[0][1].facing(body):
+            for time, scene in e.course:
+                a, b = (scene.surface(key) for key in pair)
+                if a.depth(b.middle) > a.height and a.off(b.middle) < b.half and a.faces(b):
+                    yield Finding(
+                        "error", f"motion.{mover(e, scene, {body, *(scene.pad(key).base for key in pair)})}",
+                        f"at t = {time:.3g} s it has taken the pads of contacts.{pair[0]} and contacts.{pair[1]} through "
+                        f"each other, and through `{body}` between them; let it go less far",
+                    )  # fmt: skip
+                    break
+
+
+def holds(e: Estimate, body: str | None, on: Surface) -> bool:
+    """Whether motions or fixed values hold a body along a surface; they do the ground."""
+    return body is None or not any(abs(on.along[axis]) > 0.1 and e.is_own(body, axis) for axis in (0, 1))
+
+
+def mover(e: Estimate, scene: Scene, bodies: set[str | None]) -> str:
+    """The motion that has taken some bodies furthest."""
+    follow = {one.measured: one.setpoint for one in e.loops}
+    follow |= {f"{body}.{axis}": f"{body}.{axis}" for body, axis, kind in e.file.coordinates() if kind == "driven"}
+    way = {
+        name: abs(scene.pose[body][axis] - e.start[body][axis])
+        for coordinate, name in follow.items() for body, axis in [at(coordinate)] if body in bodies and axis < 2
+    }  # fmt: skip
+    return max(way, key=lambda name: way[name])
+
+
+def overloads(e: Estimate) -> Iterator[Finding]:
+    """Efforts that would press the pads of a body in too far, however they were spread over them."""
+    for actuator in e.file.actuators.values():
+        body, axis = at(actuator.pushes)
+        pads = {
+            one.pad: e.rig.pads[one.pad]
+            for one in e.rig.contacts.values()
+            if body in (one.body, e.rig.pads[one.pad].base)
+        }
+        if actuator.feed_forward is None or axis == 2 or not pads:
+            continue
+        effort, time = max((abs(signals(e.rig, time)[actuator.feed_forward]), time) for time in e.knots())
+        most = sum(map(bears, pads.values())) + actuator.Kp * max(pad.mesh.height for pad in pads.values())
+        if effort > most:
+            yield Finding(
+                "error", f"motion.{actuator.feed_forward}",
+                f"at t = {time:.3g} s it pushes `{body}` with {effort:.3g} N, but {most:.3g} N press its pads in by "
+                f"{COMPRESSED:.0%} of their height wherever they touch, far beyond linear elasticity; push less, or take "
+                "stiffer pads",
+            )  # fmt: skip
+
+
+def bears(pad: Pad) -> float:
+    """The force [N] that presses the whole face of a pad in by the most that can be run."""
+    C = pad.compliance().detach()[1::2, 1::2]
+    return float(torch.linalg.solve(C, torch.ones(len(C), dtype=C.dtype)).sum()) * COMPRESSED * pad.mesh.height
+
+
+CHECKS: tuple[Callable[[Estimate], Iterator[Finding]], ...] = (
+    ties, recordings, jumps, carried, overlaps, corners, unreachable, departures, crossings, overloads,
+)  # fmt: skip
+"""Another check is one more of these."""

@@ -6,17 +6,14 @@ from typing import NamedTuple
 import networkx as nx
 import numpy as np
 import torch
-from scipy.spatial import ConvexHull
 
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.rig import Rig
+from torchsoft.physics.shapes import Shape
 
 FACING = -0.9
 """Product of two surfaces' normals below which they face each other."""
-
-TOUCH = 1e-6
-"""Depth [m] up to which things that touch do not overlap."""
 
 CORNERS = 1440
 """Points of an outline at which its curvature is looked at."""
@@ -42,9 +39,13 @@ class Surface(NamedTuple):
         outwards = np.interp((place - self.middle) @ self.along, *self.profile.T)
         return outwards - (place - self.middle) @ self.normal
 
-    def off(self, place: Array) -> Array:
-        """How far places (..., 2) lie beyond the pad's ends [m]; negative between them."""
-        return np.abs((place - self.middle) @ self.along) - self.half
+    def off(self, place: Array) -> float:
+        """How far a place (2,) lies beyond the pad's ends [m]; negative between them."""
+        return float(abs((place - self.middle) @ self.along) - self.half)
+
+    def faces(self, other: "Surface") -> bool:
+        """Whether two surfaces look at each other."""
+        return bool(self.normal @ other.normal < FACING)
 
 
 def turned(v: Array, angle: float) -> Array:
@@ -53,10 +54,10 @@ def turned(v: Array, angle: float) -> Array:
     return v @ np.array([[c, s], [-s, c]])
 
 
-def in_world(pad: Pad, pose: Poses, own: Array) -> Array:
-    """Places (..., 2) in a pad's own frame [m], in the world."""
-    base = np.zeros(3) if pad.base is None else np.asarray(pose[pad.base])
-    return base[:2] + turned(pad.placed(own), base[2])
+def in_world(pad: Pad, pose: Poses, placed: Array) -> Array:
+    """Places (..., 2) in the frame of a pad's base [m], in the world."""
+    base = np.zeros(3) if pad.base is None else pose[pad.base]
+    return base[:2] + turned(placed, base[2])
 
 
 def surface(pad: Pad, pose: Poses) -> Surface:
@@ -65,131 +66,97 @@ def surface(pad: Pad, pose: Poses) -> Surface:
     own = mesh.nodes[mesh.free[mesh.surface]]
     left, right, top = own[:, 0].min(), own[:, 0].max(), own[:, 1].max()
     middle = np.array([0.5 * (left + right), top])
-    origin, along, normal = (in_world(pad, pose, middle + step) for step in ([0.0, 0.0], [1.0, 0.0], [0.0, 1.0]))
+    origin, along, normal = in_world(pad, pose, pad.placed(middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])))
     profile = (own - middle)[np.argsort(own[:, 0], kind="stable")]
     return Surface(origin, normal - origin, along - origin, 0.5 * (right - left), mesh.height, profile)
 
 
-def reach(rig: Rig, body: str, pose: Poses, direction: Array) -> float:
-    """How far a body reaches from its centre along a unit vector of the world [m]."""
-    shape = rig.bodies[body].shape
-    assert shape is not None
-    with torch.no_grad():
-        return float(shape.support(torch.from_numpy(turned(direction, -pose[body][2]))))
-
-
-def inside(rig: Rig, body: str, pose: Poses, places: Array) -> float:
-    """How deep the deepest of some places (n, 2) of the world is in a body [m]; negative where all are outside."""
-    shape = rig.bodies[body].shape
-    assert shape is not None
-    own = turned(places - pose[body][:2], -pose[body][2])
-    with torch.no_grad():
-        return -float(shape(torch.from_numpy(own))[0].min())
-
-
-def points(pad: Pad, pose: Poses) -> Array:
-    """The contact points (points, 2) of an undeformed pad in the world [m]."""
-    base = np.zeros(3) if pad.base is None else np.asarray(pose[pad.base])
-    return base[:2] + turned(pad.point_positions.numpy(), base[2])
-
-
-def pressed(rig: Rig, contact: str, pose: Poses) -> float:
-    """How deep the undeformed pad of a contact is in the body [m]; negative where they are apart."""
-    one = rig.contacts[contact]
-    return inside(rig, one.body, pose, points(rig.pads[one.pad], pose))
-
-
-def outline(rig: Rig, body: str, pose: Poses) -> Array:
-    """Points around a body (points, 2) [m]."""
-    shape = rig.bodies[body].shape
-    assert shape is not None
-    return pose[body][:2] + turned(shape.outline().numpy(), pose[body][2])
-
-
-def overlap(rig: Rig, one: str, other: str, pose: Poses) -> float:
-    """How deep the outline of a body reaches into another body [m]; negative where they are apart."""
-    return inside(rig, other, pose, outline(rig, one, pose))
-
-
 def nodes(pad: Pad, pose: Poses) -> Array:
     """All nodes (nodes, 2) of an undeformed pad in the world [m]."""
-    return in_world(pad, pose, pad.mesh.nodes)
-
-
-def hull(pad: Pad, pose: Poses) -> Array:
-    """The corners (corners, 2), around, of the convex hull of an undeformed pad [m]."""
-    places = nodes(pad, pose)
-    return places[ConvexHull(places).vertices]
-
-
-def crossing(one: Array, other: Array) -> float:
-    """How far two convex polygons (corners, 2), around, overlap along the direction in which they overlap least [m]."""
-    least = np.inf
-    for corners in (one, other):
-        for edge in np.roll(corners, -1, 0) - corners:
-            n = np.array([edge[1], -edge[0]]) / np.hypot(*edge)
-            a, b = one @ n, other @ n
-            least = min(least, a.max() - b.min(), b.max() - a.min())
-    return float(least)
-
-
-def around(pad: Pad, pose: Poses) -> Array:
-    """The corners (corners, 2), around, of an undeformed pad [m], which may be hollow."""
-    return in_world(pad, pose, pad.mesh.nodes[pad.mesh.outline])
-
-
-def within(places: Array, corners: Array) -> bool:
-    """Whether any of some places (n, 2) is inside a polygon (corners, 2): a line to the right crosses it an odd number of
-    times."""
-    (x, y), (ax, ay) = places.T[:, :, None], corners.T
-    bx, by = np.roll(corners, -1, 0).T
-    level = (ay > y) != (by > y)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        right = ax + (y - ay) / (by - ay) * (bx - ax) > x
-    return bool(((level & right).sum(1) % 2 == 1).any())
+    return in_world(pad, pose, pad.placed(pad.mesh.nodes))
 
 
 def collision(one: Pad, other: Pad, pose: Poses) -> float:
-    """How far two undeformed pads overlap, as their convex hulls do [m]; zero where something lies in the hollow of another."""
-    deep = crossing(hull(one, pose), hull(other, pose))
-    if deep <= TOUCH or (is_convex(one) and is_convex(other)):
-        return deep
-    lie = within(nodes(one, pose), around(other, pose)) or within(nodes(other, pose), around(one, pose))
-    return deep if lie else 0.0
+    """How deep the deepest node of two undeformed pads, which may be hollow, lies inside the other pad [m]; 0 where they are
+    apart."""
+    at = nodes(one, pose), nodes(other, pose)
+    return max(depth_inside(at[0], at[1][other.mesh.outline]), depth_inside(at[1], at[0][one.mesh.outline]))
 
 
-def is_convex(pad: Pad) -> bool:
-    """Whether a pad is its convex hull, but for rounding."""
-    x, y = pad.mesh.nodes[pad.mesh.outline].T
-    area = 0.5 * abs(float((x * np.roll(y, -1) - y * np.roll(x, -1)).sum()))
-    return area > (1 - 1e-6) * ConvexHull(pad.mesh.nodes).volume  # of a plane body the area
+def depth_inside(places: Array, corners: Array) -> float:
+    """How far the innermost of some places (n, 2) inside a polygon (corners, 2) is from its sides; 0 where all are outside. A
+    line to the right of what is inside crosses the sides an odd number of times."""
+    places = places[((places > corners.min(0)) & (places < corners.max(0))).all(1)]
+    way = np.roll(corners, -1, 0) - corners
+    to = places[:, None] - corners
+    part = ((to * way).sum(-1) / (way**2).sum(-1)).clip(0.0, 1.0)
+    distance = np.linalg.norm(to - part[..., None] * way, axis=-1).min(1)
+    level = (to[..., 1] < 0) != (to[..., 1] < way[:, 1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        right = to[..., 1] * way[:, 0] / way[:, 1] > to[..., 0]
+    return float(distance[(level & right).sum(1) % 2 == 1].max(initial=0.0))
 
 
-def corner(rig: Rig, body: str) -> float:
-    """The smallest radius of curvature of a body where it bulges outwards [m]."""
-    shape = rig.bodies[body].shape
-    assert shape is not None
-    return 1 / float(shape.curvature(shape.outline(CORNERS)).max())
+class Scene(NamedTuple):
+    """A rig with its bodies at given poses and its pads undeformed."""
+
+    rig: Rig
+    pose: Poses
+
+    def shape(self, body: str) -> Shape:
+        """Shape of a body that has a contact."""
+        shape = self.rig.bodies[body].shape
+        assert shape is not None
+        return shape
+
+    def pad(self, contact: str) -> Pad:
+        return self.rig.pads[self.rig.contacts[contact].pad]
+
+    def surface(self, contact: str) -> Surface:
+        """Of a contact's pad."""
+        return surface(self.pad(contact), self.pose)
+
+    def points(self, contact: str) -> Array:
+        """The contact points (points, 2) of the pad of a contact in the world [m]."""
+        pad = self.pad(contact)
+        return in_world(pad, self.pose, pad.point_positions.numpy())
+
+    def reach(self, body: str, direction: Array) -> float:
+        """How far a body reaches from its centre along a unit vector of the world [m]."""
+        return float(self.shape(body).support(torch.from_numpy(turned(direction, -self.pose[body][2]))).detach())
+
+    def inside(self, body: str, places: Array) -> float:
+        """How deep the deepest of some places (n, 2) of the world is in a body [m]; negative where all are outside."""
+        own = turned(places - self.pose[body][:2], -self.pose[body][2])
+        return -float(self.shape(body)(torch.from_numpy(own))[0].detach().min())
+
+    def pressed(self, contact: str) -> float:
+        """How deep the undeformed pad of a contact is in the body [m]; negative where they are apart."""
+        return self.inside(self.rig.contacts[contact].body, self.points(contact))
+
+    def outline(self, body: str) -> Array:
+        """Points around a body (points, 2) [m]."""
+        return self.pose[body][:2] + turned(self.shape(body).outline().numpy(), self.pose[body][2])
+
+    def corner(self, body: str) -> float:
+        """The smallest radius of curvature of a body where it bulges outwards [m]."""
+        return 1 / float(self.shape(body).curvature(self.shape(body).outline(CORNERS)).max())
+
+    def facing(self, body: str) -> list[tuple[str, str]]:
+        """Pairs of contacts between whose pads, which face each other, a body is."""
+        at = {key: self.surface(key) for key, contact in self.rig.contacts.items() if contact.body == body}
+        own = list(at)
+        return [
+            (a, b) for i, a in enumerate(own) for b in own[i + 1 :]
+            if at[a].faces(at[b]) and at[a].depth(at[b].middle) < at[a].height
+            and abs((at[b].middle - at[a].middle) @ at[a].along) < at[a].half + at[b].half
+        ]  # fmt: skip
 
 
 def tied(rig: Rig, contacts: Iterable[str]) -> nx.Graph:
     """Bodies, with an edge where one of the contacts is between a body and a pad of the other; the ground ties nothing."""
     graph = nx.Graph()
     graph.add_nodes_from(rig.bodies)
-    for key in contacts:
-        base = rig.pads[rig.contacts[key].pad].base
-        if base is not None:
-            graph.add_edge(base, rig.contacts[key].body)
+    pairs = ((rig.pads[rig.contacts[key].pad].base, rig.contacts[key].body) for key in contacts)
+    graph.add_edges_from((base, body) for base, body in pairs if base is not None)
     return graph
-
-
-def facing(rig: Rig, body: str, pose: Poses) -> list[tuple[str, str]]:
-    """Pairs of contacts between whose pads, which face each other, a body is."""
-    own = [key for key, contact in rig.contacts.items() if contact.body == body]
-    at = {key: surface(rig.pads[rig.contacts[key].pad], pose) for key in own}
-    pairs = [(a, b) for i, a in enumerate(own) for b in own[i + 1 :]]
-    return [
-        (a, b) for a, b in pairs
-        if at[a].normal @ at[b].normal < FACING and at[a].depth(at[b].middle) < at[a].height
-        and (abs((at[b].middle - at[a].middle) @ at[a].along) < at[a].half + at[b].half)
-    ]  # fmt: skip

@@ -5,16 +5,29 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from tqdm import tqdm
+
+from torchsoft.cost import Cost, row_bytes, step_time, steps_per_second
 from torchsoft.files import make_folder, write_json
+from torchsoft.physics.mesh import Mesh
+from torchsoft.physics.mesh.compliance import SMALLEST_BLOCK
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
+from torchsoft.plot import figures, general
+from torchsoft.plot.animation import animate
 from torchsoft.rigs.build import BuiltRig, RigFile
-from torchsoft.rigs.check import Finding
-from torchsoft.rigs.pictures import draw
+from torchsoft.rigs.fields import Finding, at_field
 from torchsoft.solve.ledger import doubts
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.solve.simulate import Interrupted, simulate
+from torchsoft.solve.simulate import RTOL, Interrupted, simulate
 from torchsoft.solve.trajectory import Trajectory
+from torchsoft.tables import plain
+
+SNAPSHOTS = 6
+"""Pictures of the run where the file does not say when."""
+
+FLOPS = 1e10
+"""Operations a second [1/s] of products of blocks on one core of a usual machine."""
 
 
 class RunOutcome(NamedTuple):
@@ -30,18 +43,9 @@ def carry_out(file: RigFile, *, progress: bool = False) -> RunOutcome:
 
     Raises `ValueError` for what cannot be built, and `KeyboardInterrupt` before anything was simulated.
     """
-    ready, s = file.build(), file.solver
+    ready = file.build()
     try:
-        run = simulate(
-            ready.rig,
-            ready.t,
-            y0=ready.y0,
-            rtol=s.rtol,
-            atol=s.atol,
-            step=s.step,
-            tolerance=s.tolerance,
-            progress=progress,
-        )
+        run = simulate(ready.rig, ready.t, y0=ready.y0, **file.solver.model_dump(), progress=progress)
     except (SimulationFailed, Interrupted) as stop:
         if stop.trajectory is None:
             raise
@@ -86,7 +90,7 @@ def summary(file: RigFile, done: RunOutcome, found: list[Finding]) -> dict[str, 
             name: {"largest_displacement_over_height": float(u.norm(dim=-1).max()) / rig.pads[name].mesh.height}
             for name, u in run.displacement.items()
         },
-        "actuators": {name: {"largest_effort": float(run[effort(rig, name)].abs().max())} for name in rig.actuators},
+        "actuators": {name: {"largest_effort": float(run[f"F_{name}"].abs().max())} for name in rig.actuators},
         "energy": {
             "injected_J": float(run.injected[-1]),
             "dissipated_J": {name: float(work[-1]) for name, work in run.dissipated.items()},
@@ -103,14 +107,61 @@ def summary(file: RigFile, done: RunOutcome, found: list[Finding]) -> dict[str, 
 
 def coordinates(rig: Rig, run: Trajectory, body: str) -> dict[str, dict[str, float]]:
     """Start, end, least and largest value of a body's coordinates that are not fixed [m, rad]."""
-    rows = {}
-    for i, axis in enumerate(COORDINATES):
-        if rig.bodies[body].freedom[axis] != "fixed":
-            place = run.state.pose[body][:, i].detach()
-            rows[axis] = {"start": place[0], "end": place[-1], "least": place.min(), "largest": place.max()}
-    return {axis: {name: float(value) for name, value in row.items()} for axis, row in rows.items()}
+    rows = zip(COORDINATES, run.state.pose[body].detach().mT.tolist())
+    return {
+        axis: {"start": place[0], "end": place[-1], "least": min(place), "largest": max(place)}
+        for axis, place in rows if rig.bodies[body].freedom[axis] != "fixed"
+    }  # fmt: skip
 
 
-def effort(rig: Rig, actuator: str) -> str:
-    """The channel of an actuator's effort."""
-    return rig.renamed.get(f"F_{actuator}", f"F_{actuator}")
+def condensing_time(mesh: Mesh) -> float:
+    """Time [s] for condensing a mesh onto its surface: a factorisation in the order of the smallest band, and as many solutions
+    as surface coordinates."""
+    surface, free, band = mesh.counts()
+    width = max(2 * min(band, free // band), SMALLEST_BLOCK)
+    return 2 * free * width * (4 * width + 12 * surface) / FLOPS
+
+
+def cost(file: RigFile, runs: bool) -> Cost:
+    """Cost of a check, and of a run after it. Raises `ValueError` for a mesh file that cannot be read."""
+    meshes = []
+    for name, table in file.pads.items():
+        with at_field(f"pads.{name}"):
+            meshes.append(table.mesh(file.folder))
+    seconds = sum(condensing_time(mesh) for mesh in set(meshes))
+    memory, steps = max(mesh.memory for mesh in meshes), 0.0
+    if runs:
+        span, s = file.outputs.duration, file.solver
+        steps = span / s.step if s.step is not None else span * steps_per_second(s.rtol or RTOL)
+        for mesh, table in zip(meshes, file.pads.values()):
+            surface, free, _ = mesh.counts()
+            points = table.points * surface
+            seconds += 0.5 * steps * step_time(surface, points, free if table.inertial else 0)
+            memory += span / file.outputs.interval * row_bytes(free if table.inertial else surface, points) / 2**30
+    return Cost(steps, seconds, memory)
+
+
+def draw(file: RigFile, rig: Rig, run: Trajectory, out: Path, progress: bool) -> list[str]:
+    """Write the figures and the video that a file asks for to `out`; the names of the files written."""
+    end, written = float(run.t[-1]), []
+    times = [t for t in file.outputs.snapshots if t <= end] or [i * end / (SNAPSHOTS - 1) for i in range(SNAPSHOTS)]
+    title = plain(file.title) or "Bodies, pads and contact forces"
+    made = {
+        "snapshots": lambda: figures.snapshots(run, rig, times, title),
+        "motion": lambda: general.motions(run, rig),
+        "forces": lambda: general.efforts(run, rig),
+        "power": lambda: general.power_balance(run),
+        "energy": lambda: figures.energy_balance(run),
+    }
+    if file.outputs.figures:
+        for name, figure in tqdm(made.items(), "figures", unit="figure", disable=not progress):
+            figures.save(figure(), out / f"{name}.png")
+            written.append(f"{name}.png")
+    if file.outputs.video != "none":
+        name = f"video.{file.outputs.video}"
+        animate(
+            run, rig, out / name, frames=file.outputs.frames, progress=progress, title=title, even=True,
+            follow=file.outputs.follow or general.liveliest(run, rig),
+        )  # fmt: skip
+        written.append(name)
+    return written

@@ -3,19 +3,21 @@ commented out."""
 
 import json
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, get_args, get_origin
+from pathlib import Path
+from typing import Any, get_args
 
 from pydantic.fields import FieldInfo
 
-from torchsoft.quantity import Quantity
+from torchsoft.quantity import Quantity, metadata
+from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import Group, NumberOr
-from torchsoft.rigs.schema import RigTables
+from torchsoft.tables import read_toml
 
 COLUMN = 44
 """Where comments begin."""
 
 
-def to_toml(file: RigTables) -> str:
+def to_toml(file: RigFile) -> str:
     """The text of a TOML file that `RigFile.from_toml` reads."""
     seen: set[type[Group]] = set()
     lines = [*heading(type(file)), "", *scalars(file, [], seen)]
@@ -70,19 +72,10 @@ def commented(row: str, remark: str) -> str:
 
 def remark(field: FieldInfo) -> str:
     """Meaning and unit of a field."""
-    unit = next(
-        (one.unit for one in metadata(field) if isinstance(one, Quantity | NumberOr) and one.unit not in ("", "1")), ""
-    )
+    said = (*field.metadata, *metadata(field.annotation))
+    unit = next((one.unit for one in said if isinstance(one, Quantity | NumberOr) and one.unit not in ("", "1")), "")
     meaning = field.description or ""
     return meaning if not unit or f"[{unit}]" in meaning else f"{meaning} [{unit}]"
-
-
-def metadata(field: FieldInfo) -> Iterator[Any]:
-    """What the annotation of a field says besides its type."""
-    yield from field.metadata
-    for one in get_args(field.annotation):
-        if get_origin(one) is Annotated:
-            yield from one.__metadata__
 
 
 def tables(annotation: Any) -> Iterator[type[Group]]:
@@ -109,3 +102,8 @@ def text(value: Any) -> str:
     if isinstance(value, float):
         return repr(value)
     return json.dumps(value, ensure_ascii=False)
+
+
+def template(title: str) -> RigFile:
+    """A rig that is meant to be changed: a disc that is pressed between two pads and rolled."""
+    return RigFile.from_tree(read_toml(Path(__file__).with_name("template.toml")) | {"title": title})

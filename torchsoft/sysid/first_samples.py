@@ -13,7 +13,6 @@ from scipy.optimize import brentq
 from torch import Tensor
 
 from torchsoft.paper.rig import SoftGrasp
-from torchsoft.physics.condensed import point_inputs
 from torchsoft.physics.contact import cross
 from torchsoft.physics.parts import Contact
 from torchsoft.physics.rig import Rig
@@ -167,7 +166,7 @@ def rolling(rig: Rig, known: Mapping[str, Normal], missing: list[str], signals: 
         for name, F_N in forces.items():
             pad = rig.contacts[name].pad
             u = rig.pads[pad].at_points(rig.displacement(pad, state))
-            x = point_inputs(rig, name, moving, u, torch.zeros_like(u))
+            x = rig.point_inputs(name, moving, u, torch.zeros_like(u))
             rows.append(F_N.sqrt()[:, None] * (x[:, :2] + x[:, 2:3] * cross(x[:, 3:5])))
         return torch.cat(rows).detach().numpy().ravel()
 

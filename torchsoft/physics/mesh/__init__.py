@@ -5,11 +5,9 @@ integrated at the element's centre and the shear part at 2 x 2 points (selective
 of volumetric locking and of hourglass modes.
 """
 
-from torchsoft.physics.mesh.block import CurvedPadMesh, PadMesh
+from torchsoft.physics.mesh.block import CurvedPadMesh, FingertipMesh, PadMesh
 from torchsoft.physics.mesh.compliance import banded, unit_compliance
-from torchsoft.physics.mesh.element import Array, element_matrices, lame_moduli
-from torchsoft.physics.mesh.fingertip import FingertipMesh
-from torchsoft.physics.mesh.mesh import Mesh
+from torchsoft.physics.mesh.mesh import Array, Mesh, element_matrices, lame_moduli
 from torchsoft.physics.mesh.quads import QuadMesh
 
 __all__ = [

@@ -7,8 +7,7 @@ import torch
 from scipy import sparse
 from scipy.sparse import csgraph
 
-from torchsoft.physics.mesh.element import Array, lame_moduli
-from torchsoft.physics.mesh.mesh import Mesh
+from torchsoft.physics.mesh.mesh import Array, Mesh, lame_moduli
 
 
 def banded(matrix: sparse.csr_array) -> Array:

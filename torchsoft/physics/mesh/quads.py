@@ -1,6 +1,8 @@
-"""Any mesh of quadrilaterals."""
+"""Any mesh of quadrilaterals, from numbers or from a file."""
 
-from collections.abc import Iterable
+import contextlib
+import io
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -11,10 +13,18 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from torchsoft.physics.arguments import places
-from torchsoft.physics.mesh.element import CORNERS, Array, gradients
-from torchsoft.physics.mesh.file import read_quads
-from torchsoft.physics.mesh.mesh import FreeMesh, Index, Mesh, boundary, edges, in_band
+from torchsoft.files import check_file
+from torchsoft.physics.arguments import LENGTHS, places
+from torchsoft.physics.mesh.mesh import CORNERS, Array, FreeMesh, Index, Mesh, boundary, edges, gradients, in_band
+
+IGNORED = {"line", "vertex"}
+"""Kinds of cells beside the quadrilaterals."""
+
+FLAT = 1e-9
+"""How far the points may be from one plane, over the size of the mesh."""
+
+LARGEST = 2e9
+"""Size [B] of a mesh file at the most."""
 
 Numbers = tuple[tuple[int, ...], ...]
 
@@ -122,35 +132,81 @@ class QuadMesh(FreeMesh):
 
     def refined(self, finer: int) -> Mesh:
         """Every quadrilateral divided; curved edges stay as straight between the points as they are."""
-        known: dict[tuple[int, ...], int] = {}
+        known: dict[frozenset[tuple[int, int]], int] = {}
         points: list[Array] = []
 
-        def on_side(a: int, b: int, k: int) -> int:
-            at = (a, b, k) if a < b else (b, a, finer - k)
-            key = (at[0],) if at[2] == 0 else (at[1],) if at[2] == finer else at
-            if key not in known:
-                known[key] = len(points)
-                first, last = (np.array(self.points[i]) for i in at[:2])
-                points.append(first + at[2] / finer * (last - first))
-            return known[key]
+        def at(corners: Sequence[int], weights: Sequence[int]) -> int:
+            """Number of a new point between corners; it is the same from every element."""
+            used = [(corner, weight) for corner, weight in zip(corners, weights) if weight]
+            number = known.setdefault(frozenset(used), len(points))
+            if number == len(points):
+                points.append(np.average([self.points[i] for i, _ in used], axis=0, weights=[w for _, w in used]))
+            return number
 
-        def inside(low: Array, high: Array, part: float) -> int:
-            points.append(low + part * (high - low))
-            return len(points) - 1
-
-        quads = []
-        for a, b, c, d in self.quads:
-            number = np.empty((finer + 1, finer + 1), np.int64)
-            for k in range(finer + 1):
-                number[k, 0], number[k, -1] = on_side(a, b, k), on_side(d, c, k)
-                number[0, k], number[-1, k] = on_side(a, d, k), on_side(b, c, k)
-            for i in range(1, finer):
-                for j in range(1, finer):
-                    number[i, j] = inside(points[number[i, 0]], points[number[i, -1]], j / finer)
+        n, quads = range(finer + 1), list[list[int]]()
+        for quad in self.quads:
+            number = np.array(
+                [[at(quad, ((finer - i) * (finer - j), i * (finer - j), i * j, (finer - i) * j)) for j in n] for i in n]
+            )
             corners = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
             quads += np.stack(corners, -1).reshape(-1, 4).tolist()
         sides = [
-            [(on_side(a, b, k), on_side(a, b, k + 1)) for a, b in old for k in range(finer)]
+            [
+                [at(side, (finer * (finer - k - i), finer * (k + i))) for i in (0, 1)]
+                for side in old
+                for k in range(finer)
+            ]
             for old in (self.face_sides, self.bonded_sides)
         ]
         return QuadMesh.of(np.array(points), quads, *sides)
+
+
+def read_quads(path: str | Path, unit: str) -> tuple[Array, Index, dict[str, Index]]:
+    """Points (n, 2) [m], quadrilaterals (m, 4) and, by their names, groups of lines (., 2) of a file that meshio reads.
+
+    Raises `ValueError` naming the file for one that it cannot read, another unit, cells of another kind, and points that are
+    not in a plane of constant z, and `OSError`.
+    """
+    import meshio  # takes half a second, and few need it
+
+    if unit not in LENGTHS:
+        raise ValueError(f"`unit` must be one of {', '.join(LENGTHS)}, but is {unit!r}")
+    with check_file(path, LARGEST).open("rb"):  # what is not there, or not to be read, is an OSError
+        pass
+    try:
+        with (
+            contextlib.redirect_stdout(io.StringIO()),
+            contextlib.redirect_stderr(io.StringIO()),
+        ):  # it prints, and exits
+            mesh: Any = meshio.read(path)
+    except (Exception, SystemExit) as error:
+        raise ValueError(f"{path} is not a mesh that can be read: {error or 'its format is not known'}") from None
+    kinds = {block.type for block in mesh.cells} - IGNORED
+    if kinds != {"quad"}:
+        raise ValueError(
+            f"{path} must be a mesh of quadrilaterals with four points, but has {', '.join(sorted(kinds)) or 'none'}; in gmsh "
+            "recombine the triangles"
+        )
+    x = np.asarray(mesh.points, np.float64)
+    if not np.isfinite(x).all() or (x.shape[1] > 2 and np.ptp(x[:, 2]) > FLAT * np.ptp(x[:, :2])):
+        raise ValueError(f"{path} must have finite points in a plane of constant z")
+    quads = np.concatenate([block.data for block in mesh.cells if block.type == "quad"])
+    return LENGTHS[unit] * x[:, :2], quads, groups_of_lines(mesh)
+
+
+def groups_of_lines(mesh: Any) -> dict[str, Index]:
+    """Sides (., 2) by the names of their groups: meshio's cell sets, and gmsh's physical curves of older files."""
+    groups: dict[str, list[Index]] = {}
+    tags = mesh.cell_data.get("gmsh:physical", [None] * len(mesh.cells))
+    curves = {name: tag for name, (tag, dimension) in mesh.field_data.items() if dimension == 1}
+    for k, block in enumerate(mesh.cells):
+        if block.type != "line":
+            continue
+        for name, chosen in mesh.cell_sets.items():
+            if chosen[k] is not None and len(chosen[k]):
+                groups.setdefault(name, []).append(block.data[chosen[k]])
+        for name, tag in curves.items():
+            if tags[k] is not None and name not in mesh.cell_sets and (tags[k] == tag).any():
+                groups.setdefault(name, []).append(block.data[tags[k] == tag])
+    groups.pop("gmsh:bounding_entities", None)
+    return {name: np.concatenate(sides) for name, sides in groups.items()}

@@ -1,17 +1,24 @@
 """A body inside any smooth closed contour: a periodic cubic spline."""
 
 from pathlib import Path
-from typing import Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from torchsoft.physics.arguments import positive
-from torchsoft.physics.shapes.area import Moments, gauss, moments
-from torchsoft.physics.shapes.closed import closed_spline, contour_points, control_points, read_points
-from torchsoft.physics.shapes.shape import Prepared, Shape, note_centre
-from torchsoft.physics.shapes.simple import crossing, reach
+from torchsoft import csvfile
+from torchsoft.physics.arguments import LENGTHS, places, positive
+from torchsoft.physics.shapes.shape import Array, Moments, Outlined, Prepared, Shape, crossing, gauss, moments, reach
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
+
+FINE = 64
+"""Intervals a piece in which lengths along a spline are summed up."""
+
+LEAST, STEEPEST = 8, np.radians(60)
+"""Points that are a contour, and by how much it may turn at one of them [rad]: a spline would swing around a corner."""
 
 PIECES = (32, 64, 128, 256, 512)
 """How many pieces a contour may have; as many are taken as its tolerance asks for."""
@@ -29,7 +36,7 @@ EXACT = 1e-9
 """How exact distances [m] and normals [1] must be found up to half as far as the nearest point is the only one."""
 
 
-class Contour(Shape):
+class Contour(Outlined):
     """A body inside a periodic cubic B-spline through points (n, 2) [m] of its contour in their order, which may be given about
     any point: the body's own frame has its origin at the centre of mass, and a note says where that is.
 
@@ -42,6 +49,7 @@ class Contour(Shape):
     tolerance, crosses itself, or is so sharp, narrow or intricate that the nearest points cannot be told apart.
     """
 
+    given: ClassVar = "points"
     POINTS = 6
     """Of the quadrature along a piece: its moments are polynomials of degree 11."""
 
@@ -64,7 +72,7 @@ class Contour(Shape):
             )
         if wrong := self.well_posed():
             raise ValueError(f"`points` cannot be used as a contour: {wrong}")
-        note_centre("points", self.moments().centre)
+        self.note_centre()
 
     @classmethod
     def from_csv(cls, path: str | Path, *, tolerance: float = 1e-6) -> Self:
@@ -135,15 +143,6 @@ class Contour(Shape):
         k = self.cubics()
         return Pieces.of(cubics=torch.cat((k[:, :1] - self.moments().centre, k[:, 1:]), 1).flatten(1))
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        return self.prepared()(x)
-
-    def area(self) -> Tensor:
-        return self.moments().area
-
-    def gyration(self) -> Tensor:
-        return self.moments().gyration
-
     def support(self, direction: Tensor) -> Tensor:
         k = torch.einsum("pjx,...x->...pj", self.cubics(), direction)
         with torch.no_grad():  # where the contour's component has no slope: the roots of a quadratic a piece
@@ -155,11 +154,9 @@ class Contour(Shape):
         heights = sum(k[..., j, None] * flat**j for j in range(4))
         return torch.as_tensor(heights).flatten(-2).amax(-1) - direction @ self.moments().centre
 
-    @torch.no_grad()
-    def outline(self, points: int = 181) -> Tensor:
+    def boundary(self, points: int) -> Tensor:
         part = torch.arange(max(1, points // len(self.control)), dtype=torch.float64)
-        around = self.along(part / len(part))[0].flatten(0, 1) - self.moments().centre
-        return torch.cat((around, around[:1]))
+        return self.along(part / len(part))[0].flatten(0, 1)
 
 
 class Pieces(Prepared):
@@ -223,3 +220,67 @@ class Pieces(Prepared):
             inside = (slope > 0) & (s >= low - self.ROUNDING) & (s <= high + self.ROUNDING)
             s = torch.where(inside, s, 0.5 * (low + high))
         return s
+
+
+def contour_points(points: object) -> Array:
+    """Points (n, 2) [m] around a contour, the first of which is not there again at the end. Raises `ValueError` for what is not
+    enough points, or points of which some are the same, turn by more than `STEEPEST`, or go along lines that cross."""
+    given = places("points", points).numpy()
+    if len(given) > 1 and np.array_equal(given[0], given[-1]):
+        given = given[:-1]
+    if len(given) < LEAST:
+        raise ValueError(f"`points` must be at least {LEAST} places around a contour, but are {len(given)}")
+    x, y = (np.roll(given, -1, 0) - given).T
+    if not (np.hypot(x, y) > 0).all():
+        raise ValueError(
+            f"`points` has the same place twice: point {int(np.hypot(x, y).argmin())} and the one after it"
+        )
+    turn = np.arctan2(np.roll(x, 1) * y - np.roll(y, 1) * x, np.roll(x, 1) * x + np.roll(y, 1) * y)
+    sharpest = int(np.abs(turn).argmax())
+    if abs(turn[sharpest]) > STEEPEST:
+        raise ValueError(
+            f"`points` turns by {abs(np.degrees(turn[sharpest])):.3g} degrees at point {sharpest}, a smooth contour by "
+            f"{np.degrees(STEEPEST):.3g} at most; give more points there, or a RoundedPolygon"
+        )
+    if crossing(given):
+        raise ValueError("`points` go along a contour that crosses itself")
+    return given
+
+
+def read_points(path: str | Path) -> Array:
+    """Points (n, 2) [m] of a CSV file with columns x and y whose headings have units in brackets. Raises `ValueError` naming
+    file and row for anything else, and `OSError`."""
+    needed = "the columns must be `x [mm]` and `y [mm]`, in m, cm or mm"
+    table = csvfile.read(Path(path), dict.fromkeys("xy", LENGTHS), lambda *_: f": {needed}")
+    if table.values.keys() != {"x", "y"}:
+        raise ValueError(f"{path}, row 1: {needed}, but are {', '.join(table.values) or 'none'}")
+    points = np.stack((table.values["x"], table.values["y"]), -1)
+    if (empty := np.flatnonzero(np.isnan(points).any(1))).size:
+        raise ValueError(f"{path}, row {table.rows[empty[0]]} has an empty cell; a point needs x and y")
+    return points
+
+
+def closed_spline(points: Array) -> "tuple[CubicSpline, Array]":
+    """The periodic cubic spline through points (n, 2) [m] over the lengths of their chords, anticlockwise, and these lengths
+    from the first point on to the first point again (n + 1,) [m]."""
+    x, y = points.T
+    if (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() < 0:
+        points = points[::-1]
+    closed = np.concatenate((points, points[:1]))
+    chords = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))))
+    from scipy.interpolate import CubicSpline  # a third of a second
+
+    return CubicSpline(chords, closed, bc_type="periodic"), chords
+
+
+def control_points(spline: "CubicSpline", chords: Array, pieces: int) -> Array:
+    """Control points (pieces, 2) [m] of the uniform periodic cubic B-spline that meets a closed spline where its pieces do, at
+    places equally far apart along it."""
+    t = np.linspace(0, chords[-1], FINE * max(pieces, len(chords)) + 1)
+    speed = np.linalg.norm(spline(t, 1), axis=1)
+    length = np.concatenate(([0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(t))))
+    from scipy.interpolate import CubicSpline
+
+    at = CubicSpline(length, t)(np.linspace(0, length[-1], pieces, endpoint=False))
+    turn = 2 * np.pi * np.arange(pieces) / pieces
+    return np.fft.ifft(np.fft.fft(spline(at), axis=0) / ((4 + 2 * np.cos(turn)) / 6)[:, None], axis=0).real.copy()

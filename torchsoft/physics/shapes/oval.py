@@ -36,59 +36,6 @@ class Circle(Shape):
         return self.radius * torch.linalg.vector_norm(direction, dim=-1)
 
 
-class Ellipse(Shape):
-    """An ellipse with half-axes a and b [m] along the body's x and y.
-
-    The nearest point of the boundary is found by `ITERATIONS` steps of a fixed-point iteration on the evolute and one Newton
-    step with derivatives, exact to rounding where the axes differ by less than a factor of three. Not smooth on the evolute's
-    inner part of the axes, far from the boundary.
-    """
-
-    ITERATIONS, SLIM = 12, 3
-
-    def __init__(self, a: HalfAxisX, b: HalfAxisY) -> None:
-        super().__init__()
-        self.a, self.b = parameter(a), parameter(b)
-
-    def well_posed(self) -> str:
-        """What is wrong with the parameters together; empty if nothing is."""
-        low, high = sorted((self.a.item(), self.b.item()))
-        return f"the axes a and b differ by more than a factor of {self.SLIM}" if high > self.SLIM * low else ""
-
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        a, b = self.a, self.b
-        px, py = x[..., 0], x[..., 1]
-        with torch.no_grad():  # cos and sin of the parameter of the nearest point, in the quadrant of x
-            X, Y, A, B = px.detach().abs(), py.detach().abs(), a.detach(), b.detach()
-            c = s = torch.full_like(X, 0.5**0.5)
-            for _ in range(self.ITERATIONS):
-                ex, ey = (A * A - B * B) * c**3 / A, (B * B - A * A) * s**3 / B
-                rx, ry, qx, qy = A * c - ex, B * s - ey, X - ex, Y - ey
-                ratio = torch.sqrt((rx * rx + ry * ry) / (qx * qx + qy * qy))
-                c, s = ((qx * ratio + ex) / A).clamp(0.0, 1.0), ((qy * ratio + ey) / B).clamp(0.0, 1.0)
-                size = torch.sqrt(c * c + s * s)
-                c, s = c / size, s / size
-            c, s = torch.where(px.detach() < 0, -c, c), torch.where(py.detach() < 0, -s, s)
-        # one Newton step on the stationarity of the distance carries the derivatives
-        slope = (b * b - a * a) * s * c + a * px * s - b * py * c
-        turn = -slope / ((b * b - a * a) * (c * c - s * s) + a * px * c + b * py * s)
-        cos, sin = torch.cos(turn), torch.sin(turn)
-        c, s = c * cos - s * sin, s * cos + c * sin
-        nx, ny = b * c, a * s
-        size = torch.sqrt(nx * nx + ny * ny)
-        nx, ny = nx / size, ny / size
-        return (px - a * c) * nx + (py - b * s) * ny, torch.stack((nx, ny), -1)
-
-    def area(self) -> Tensor:
-        return torch.pi * self.a * self.b
-
-    def gyration(self) -> Tensor:
-        return 0.25 * (self.a**2 + self.b**2)
-
-    def support(self, direction: Tensor) -> Tensor:
-        return torch.sqrt((self.a * direction[..., 0]) ** 2 + (self.b * direction[..., 1]) ** 2)
-
-
 class Superellipse(Shape):
     """The body inside |x / a|^n + |y / b|^n = 1 with half-axes a and b [m] along its x and y: an ellipse where n = 2, with
     flatter sides and sharper corners the larger n is. It may be from 2 to 20, the axes differ by a factor of three.
@@ -170,3 +117,18 @@ class Superellipse(Shape):
     def support(self, direction: Tensor) -> Tensor:
         m = self.n / (self.n - 1)
         return ((self.a * direction[..., 0]).abs() ** m + (self.b * direction[..., 1]).abs() ** m) ** (1 / m)
+
+
+class Ellipse(Superellipse):
+    """An ellipse with half-axes a and b [m] along the body's x and y, which differ by a factor of three at the most."""
+
+    def __init__(self, a: HalfAxisX, b: HalfAxisY) -> None:
+        super().__init__(a, b, 2.0)
+        del self.n
+        self.register_buffer("n", torch.tensor(2.0, dtype=torch.float64), persistent=False)
+
+    def area(self) -> Tensor:
+        return torch.pi * self.a * self.b
+
+    def gyration(self) -> Tensor:
+        return 0.25 * (self.a**2 + self.b**2)

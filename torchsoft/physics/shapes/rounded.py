@@ -4,68 +4,14 @@ Their boundaries are segments and arcs that continue each other's tangents. Dist
 point is the only one, in particular down to the corners' radius; the curvature jumps where an arc begins.
 """
 
-from typing import Annotated, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from torchsoft.physics.arguments import places, positive
-from torchsoft.physics.shapes.area import Moments, gauss, moments
-from torchsoft.physics.shapes.shape import Prepared, Shape, note_centre, parameter
-from torchsoft.physics.shapes.simple import crossing
+from torchsoft.physics.shapes.shape import Moments, Outlined, Prepared, Shape, crossing, gauss, moments, parameter
 from torchsoft.quantity import Length, Points
-
-
-class RoundedBox(Shape):
-    """A box with half of its width and of its height [m] along the body's x and y, and corners rounded to `radius` [m]: a
-    circle where all three are equal."""
-
-    def __init__(
-        self,
-        half_width: Annotated[Length, "half of the size along the body's own x"],
-        half_height: Annotated[Length, "half of the size along the body's own y"],
-        radius: Annotated[Length, "radius of the corners, at most the smaller half size"],
-    ) -> None:
-        super().__init__()
-        self.half_width, self.half_height, self.radius = (
-            parameter(value) for value in (half_width, half_height, radius)
-        )
-
-    def well_posed(self) -> str:
-        """What is wrong with the parameters together; empty if nothing is."""
-        most = min(self.half_width.item(), self.half_height.item())
-        radius = self.radius.item()
-        return f"the corners' radius {radius:g} is larger than half of the box, {most:g}" if radius > most else ""
-
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        left, below = x[..., 0].detach() < 0, x[..., 1].detach() < 0
-        qx = torch.where(left, -x[..., 0], x[..., 0]) - (self.half_width - self.radius)
-        qy = torch.where(below, -x[..., 1], x[..., 1]) - (self.half_height - self.radius)
-        corner, side = (qx >= 0) & (qy >= 0) & (qx + qy > 0), qx > qy
-        far = torch.sqrt(torch.where(corner, qx * qx + qy * qy, 1.0))
-        one, zero = torch.ones_like(far), torch.zeros_like(far)
-        nx = torch.where(corner, qx / far, torch.where(side, one, zero))
-        ny = torch.where(corner, qy / far, torch.where(side, zero, one))
-        phi = torch.where(corner, far, torch.where(side, qx, qy)) - self.radius
-        return phi, torch.stack((torch.where(left, -nx, nx), torch.where(below, -ny, ny)), -1)
-
-    def area(self) -> Tensor:
-        return 4 * self.half_width * self.half_height - (4 - torch.pi) * self.radius**2
-
-    def gyration(self) -> Tensor:
-        a, b, r = self.half_width, self.half_height, self.radius
-        square = 4 / 3 * a * b * (a**2 + b**2)  # of the box, whose corners are then exchanged for quarters of a disc
-        for side in (a, b):
-            c = side - r
-            square = square + torch.pi * r**2 * (c**2 + r**2 / 4) + 8 / 3 * c * r**3 - 4 / 3 * r * (side**3 - c**3)
-        return square / self.area()
-
-    def support(self, direction: Tensor) -> Tensor:
-        dx, dy = direction.abs().unbind(-1)
-        r = self.radius
-        return (
-            (self.half_width - r) * dx + (self.half_height - r) * dy + r * torch.linalg.vector_norm(direction, dim=-1)
-        )
 
 
 class Sides(NamedTuple):
@@ -82,44 +28,14 @@ class Sides(NamedTuple):
     bulge: Tensor
 
 
-class RoundedPolygon(Shape):
-    """A polygon with `vertices` (n, 2) [m] in their order, whose corners, inner ones too, are rounded to `radius` [m].
+class Rounded(Outlined):
+    """A polygon of segments and arcs, from its `vertices` (n, 2) [m] before rounding and the `radius` [m] of its corners."""
 
-    The arcs touch the sides that meet at a vertex, so that the sides stay where they are. The vertices may be given about any
-    point: the body's own frame has its origin at the centre of mass, wherever the vertices move it, and the note that says so
-    tells where that is. They are one parameter with the shape (n, 2), which gradients reach; only `radius` is a scalar that can
-    be asked for by name in a Jacobian or an identification. Raises `ValueError` for anything but from 3 to `MOST` places, for
-    corners that do not fit on their sides, and for sides that cross.
-    """
+    ARC = 16
+    """Points of the quadrature along an arc: exact to rounding up to half a turn."""
 
-    MOST, ARC = 64, 16
-    """Vertices, and points of the quadrature along an arc: exact to rounding up to half a turn."""
-
-    def __init__(
-        self,
-        vertices: Annotated[Points, "corners before rounding, in their order, [x, y] each"],
-        radius: Annotated[Length, "radius of the corners, inner ones too"],
-    ) -> None:
-        super().__init__()
-        given = places("vertices", vertices)
-        if not 3 <= len(given) <= self.MOST:
-            raise ValueError(f"`vertices` must be 3 to {self.MOST} places, but are {len(given)}")
-        self.vertices, self.radius = nn.Parameter(given), parameter(positive("radius", radius))
-        if wrong := self.well_posed():
-            raise ValueError(f"`vertices` cannot be used as a polygon: {wrong}")
-        note_centre("vertices", self.moments().centre)
-
-    def well_posed(self) -> str:
-        """What is wrong with the parameters together; empty if nothing is."""
-        sides, r = self.sides(), self.radius.item()
-        short = sides.length.detach() / self.vertices.detach().abs().max()
-        if not bool((short > -1e-12).all()):
-            worst = int(torch.nan_to_num(short, nan=-torch.inf).argmin())
-            return (
-                f"corners of radius {r:g} do not fit on side {worst} of the polygon (from 0 on, anticlockwise): there it is "
-                "too short, or folds back"
-            )
-        return "the polygon crosses itself" if crossing(self.boundary(181).numpy()) else ""
+    vertices: Tensor
+    radius: Tensor
 
     def sides(self) -> Sides:
         v = self.vertices
@@ -156,23 +72,6 @@ class RoundedPolygon(Shape):
         steps = (halves[:, None] * way[:, None], (weight * length[:, None])[..., None] * on)
         return moments(*(torch.cat([x.flatten(0, 1) for x in parts]) for parts in ((on_sides, on_arcs), steps)))
 
-    def prepared(self) -> Shape:
-        sides, origin = self.sides(), self.moments().centre
-        start = sides.start - origin
-        offset = [(axis * start).sum(-1, keepdim=True) for axis in (sides.tangent, sides.normal)]
-        edges = torch.cat((sides.tangent, *offset, sides.length[:, None]), -1)
-        arcs = torch.cat((sides.centre - origin, sides.bulge[:, None]), -1)
-        return SidesAndArcs.of(edges=edges, arcs=arcs, radius=self.radius)
-
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        return self.prepared()(x)
-
-    def area(self) -> Tensor:
-        return self.moments().area
-
-    def gyration(self) -> Tensor:
-        return self.moments().gyration
-
     def support(self, direction: Tensor) -> Tensor:
         sides = self.sides()
         centre = (sides.centre - self.moments().centre)[sides.bulge > 0]
@@ -184,10 +83,94 @@ class RoundedPolygon(Shape):
         part = torch.linspace(0, 1, max(2, points // len(self.vertices)), dtype=torch.float64)
         return self.along_arcs(self.sides(), part)[0].flatten(0, 1)
 
-    @torch.no_grad()
-    def outline(self, points: int = 181) -> Tensor:
-        around = self.boundary(points) - self.moments().centre
-        return torch.cat((around, around[:1]))
+
+class RoundedBox(Rounded):
+    """A box with half of its width and of its height [m] along the body's x and y, and corners rounded to `radius` [m]: a
+    circle where all three are equal."""
+
+    def __init__(
+        self,
+        half_width: Annotated[Length, "half of the size along the body's own x"],
+        half_height: Annotated[Length, "half of the size along the body's own y"],
+        radius: Annotated[Length, "radius of the corners, at most the smaller half size"],
+    ) -> None:
+        super().__init__()
+        self.half_width, self.half_height, self.radius = (
+            parameter(value) for value in (half_width, half_height, radius)
+        )
+
+    def well_posed(self) -> str:
+        """What is wrong with the parameters together; empty if nothing is."""
+        most = min(self.half_width.item(), self.half_height.item())
+        radius = self.radius.item()
+        return f"the corners' radius {radius:g} is larger than half of the box, {most:g}" if radius > most else ""
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        left, below = x[..., 0].detach() < 0, x[..., 1].detach() < 0
+        qx = torch.where(left, -x[..., 0], x[..., 0]) - (self.half_width - self.radius)
+        qy = torch.where(below, -x[..., 1], x[..., 1]) - (self.half_height - self.radius)
+        corner, side = (qx >= 0) & (qy >= 0) & (qx + qy > 0), qx > qy
+        far = torch.sqrt(torch.where(corner, qx * qx + qy * qy, 1.0))
+        one, zero = torch.ones_like(far), torch.zeros_like(far)
+        nx = torch.where(corner, qx / far, torch.where(side, one, zero))
+        ny = torch.where(corner, qy / far, torch.where(side, zero, one))
+        phi = torch.where(corner, far, torch.where(side, qx, qy)) - self.radius
+        return phi, torch.stack((torch.where(left, -nx, nx), torch.where(below, -ny, ny)), -1)
+
+    outline = Shape.outline
+
+    @property
+    def vertices(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
+        a, b = self.half_width, self.half_height
+        return torch.stack([torch.stack(corner) for corner in ((-a, -b), (a, -b), (a, b), (-a, b))])
+
+
+class RoundedPolygon(Rounded):
+    """A polygon with `vertices` (n, 2) [m] in their order, whose corners, inner ones too, are rounded to `radius` [m].
+
+    The arcs touch the sides that meet at a vertex, so that the sides stay where they are. The vertices may be given about any
+    point: the body's own frame has its origin at the centre of mass, wherever the vertices move it, and the note that says so
+    tells where that is. They are one parameter with the shape (n, 2), which gradients reach; only `radius` is a scalar that can
+    be asked for by name in a Jacobian or an identification. Raises `ValueError` for anything but from 3 to `MOST` places, for
+    corners that do not fit on their sides, and for sides that cross.
+    """
+
+    given: ClassVar = "vertices"
+    MOST = 64
+
+    def __init__(
+        self,
+        vertices: Annotated[Points, "corners before rounding, in their order, [x, y] each"],
+        radius: Annotated[Length, "radius of the corners, inner ones too"],
+    ) -> None:
+        super().__init__()
+        given = places("vertices", vertices)
+        if not 3 <= len(given) <= self.MOST:
+            raise ValueError(f"`vertices` must be 3 to {self.MOST} places, but are {len(given)}")
+        self.vertices, self.radius = nn.Parameter(given), parameter(positive("radius", radius))
+        if wrong := self.well_posed():
+            raise ValueError(f"`vertices` cannot be used as a polygon: {wrong}")
+        self.note_centre()
+
+    def well_posed(self) -> str:
+        """What is wrong with the parameters together; empty if nothing is."""
+        sides, r = self.sides(), self.radius.item()
+        short = sides.length.detach() / self.vertices.detach().abs().max()
+        if not bool((short > -1e-12).all()):
+            worst = int(torch.nan_to_num(short, nan=-torch.inf).argmin())
+            return (
+                f"corners of radius {r:g} do not fit on side {worst} of the polygon (from 0 on, anticlockwise): there it is "
+                "too short, or folds back"
+            )
+        return "the polygon crosses itself" if crossing(self.boundary(181).numpy()) else ""
+
+    def prepared(self) -> Shape:
+        sides, origin = self.sides(), self.moments().centre
+        start = sides.start - origin
+        offset = [(axis * start).sum(-1, keepdim=True) for axis in (sides.tangent, sides.normal)]
+        edges = torch.cat((sides.tangent, *offset, sides.length[:, None]), -1)
+        arcs = torch.cat((sides.centre - origin, sides.bulge[:, None]), -1)
+        return SidesAndArcs.of(edges=edges, arcs=arcs, radius=self.radius)
 
 
 class SidesAndArcs(Prepared):

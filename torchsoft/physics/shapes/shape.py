@@ -1,10 +1,13 @@
-"""What a rig asks of the shape of a rigid body."""
+"""What a rig asks of the shape of a rigid body, and what closed curves have in common: moments by Green's theorem, whether they
+cross themselves, and how far from them the nearest point stays the only one."""
 
 import logging
 import math
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from torchsoft.physics.arguments import number
@@ -17,17 +20,10 @@ def parameter(value: float, trained: bool = True) -> nn.Parameter:
 
 log = logging.getLogger("torchsoft")
 
+Array = NDArray[np.float64]
+
 NOTED = 1e-9
 """Distance [m] from the origin of given coordinates from which on a centre of mass is told."""
-
-
-def note_centre(field: str, centre: Tensor) -> None:
-    """Say where in the coordinates of `field` the centre of mass (2,) [m] is, which poses speak of, if not at their origin."""
-    x, y = centre.tolist()
-    if max(abs(x), abs(y)) > NOTED:
-        log.warning(
-            "the centre of mass is at (%.9g, %.9g) m of `%s`: the body's pose is that of this point", x, y, field
-        )
 
 
 class Shape(nn.Module):
@@ -96,3 +92,102 @@ class Prepared(Shape):
         parameters: dict[str, Any] = shape._parameters  # where torch itself puts leaves of graphs only
         parameters.update(tensors)
         return shape
+
+
+class Outlined(Shape):
+    """A shape given by points around it, whatever point they are about: its own frame has its origin at the centre of mass."""
+
+    given: ClassVar = ""
+    """Name of the constructor's argument with the points."""
+
+    def moments(self) -> "Moments":
+        """In the coordinates of the given points."""
+        raise NotImplementedError
+
+    def boundary(self, points: int) -> Tensor:
+        """About so many points around (points, 2) [m], in the coordinates of the given ones."""
+        raise NotImplementedError
+
+    def note_centre(self) -> None:
+        """Say where among the given points the centre of mass (2,) [m] is, which poses speak of, if not at their origin."""
+        x, y = self.moments().centre.tolist()
+        if max(abs(x), abs(y)) > NOTED:
+            log.warning(
+                "the centre of mass is at (%.9g, %.9g) m of `%s`: the body's pose is that of this point",
+                x,
+                y,
+                self.given,
+            )
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        return self.prepared()(x)
+
+    def area(self) -> Tensor:
+        return self.moments().area
+
+    def gyration(self) -> Tensor:
+        return self.moments().gyration
+
+    @torch.no_grad()
+    def outline(self, points: int = 181) -> Tensor:
+        around = self.boundary(points) - self.moments().centre
+        return torch.cat((around, around[:1]))
+
+
+class Moments(NamedTuple):
+    """Area [m2], centre of mass (2,) [m], and squared radius of gyration about it [m2]."""
+
+    area: Tensor
+    centre: Tensor
+    gyration: Tensor
+
+
+def gauss(points: int) -> tuple[Tensor, Tensor]:
+    """Places and weights (points,) of Gauss' quadrature from 0 to 1."""
+    place, weight = np.polynomial.legendre.leggauss(points)
+    return torch.from_numpy(0.5 * (1 + place)), torch.from_numpy(0.5 * weight)
+
+
+def moments(x: Tensor, dx: Tensor) -> Moments:
+    """Of what lies to the left of a closed contour, from points x (points, 2) [m] of a quadrature along it, and its tangents
+    there times their weights, dx (points, 2) [m]: the integral of x^k dA is that of x^(k+1) dy / (k+1)."""
+    middle = x.detach().mean(0)
+    x, y = (x - middle).unbind(-1)
+    dx, dy = dx.unbind(-1)
+    area = 0.5 * (x * dy - y * dx).sum()
+    centre = torch.stack(((x**2 * dy).sum(), -(y**2 * dx).sum())) / (2 * area)
+    square = ((x**3 * dy).sum() - (y**3 * dx).sum()) / (3 * area)
+    return Moments(area, centre + middle, square - (centre**2).sum())
+
+
+SAME = 1e-9
+"""Distance, over the curve's size, at which points next to each other are one."""
+
+
+def crossing(points: Array) -> bool:
+    """Whether the closed polygon through points (n, 2) crosses itself."""
+    size = np.ptp(points, 0).max()
+    points = points[np.linalg.norm(points - np.roll(points, 1, 0), axis=1) > SAME * size]
+    start, way = points, np.roll(points, -1, 0) - points
+    way_x, way_y = way.T
+    to = start[None] - start[:, None]
+    begins = (
+        way_x[:, None] * to[..., 1] - way_y[:, None] * to[..., 0]
+    )  # on which side of a row's segment a column's begins
+    ends = np.roll(begins, -1, 1)
+    divided = (begins > 0) != (ends > 0)
+    count = np.arange(len(points))
+    apart = np.abs(count[:, None] - count)
+    return bool((divided & divided.T & (apart > 1) & (apart < len(points) - 1)).any())
+
+
+def reach(points: Array, normals: Array, curvature: Array) -> float:
+    """How far [m] from a smooth closed curve the nearest point on it is the only one, from points of it (n, 2) [m], normals
+    (n, 2) and curvature (n,) [1/m] there: the smallest radius of a circle that touches it at one of the points and passes
+    through another (Federer 1959, Curvature measures, Theorem 4.18), or of curvature."""
+    to = points[None] - points[:, None]
+    off = np.abs((to * normals[:, None]).sum(-1))
+    np.fill_diagonal(off, 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        radius = np.where(off > 0, (to**2).sum(-1) / (2 * off), np.inf)
+    return float(min(radius.min(), 1 / np.abs(curvature).max()))
