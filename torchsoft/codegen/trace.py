@@ -159,8 +159,9 @@ class Trace(TorchDispatchMode):
         arrays = [self.nodes(v) if isinstance(v, Tensor) else self._constant(v) for v in values]
         entries = [i for i, array in enumerate(arrays) if array is not None]
 
-        if len(entries) == len(args) and not kwargs:
-            return mapped(partial(rule, self.graph), *arrays)
+        given = [array for array in arrays if array is not None]
+        if len(given) == len(args) == len(values):
+            return mapped(partial(rule, self.graph), *given)
 
         def one(*nodes: int) -> int:
             filled = list(values)
