@@ -43,7 +43,7 @@ FLOWS = {
         fields recorded shapes materials bodies pads contacts network actuators motion outputs schema cost geometry build
         course finding reach balance check written template pictures run .
     """,
-    "cli": "failure results rigs identify material .",
+    "cli": "results rigs identify material .",
     "solve.kernel": """
         cache . arrays scratch linear inertia interface stage finish step taped run rates adjoint_pads adjoint tangent
     """,

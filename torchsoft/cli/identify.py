@@ -5,8 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.failure import failed
-from torchsoft.cli.results import add_out, say, try_folder
+from torchsoft.cli.results import add_out, failed, say, try_folder
 
 IDENTIFY = """\
 Which parameters explain these recordings, and how sure is that?
