@@ -28,17 +28,15 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from scipy.integrate import odeint, solve_ivp
-from step_accuracy import errors
+from step_accuracy import EIGHT, errors
 from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Parameters, SoftGrasp, simulate, simulate_batch
-from torchsoft.experiment import grid, made_by, markdown, options, timed, write
+from torchsoft.experiment import grid, markdown, options, timed, write
 from torchsoft.scenario import Manipulation, grasp_and_roll
 from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.rates import Rates
-
-EIGHT = ("contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau")
 
 GRASP_FORCE = 80.66  # That holds the grasp of the usual rig [N]; it need not be searched for.
 
@@ -490,9 +488,7 @@ def figure(result: Result) -> Figure:
 def main() -> None:
     result = run(options(Config, __doc__))
     print(json.dumps({k: v for k, v in result.figures.items() if not isinstance(v, dict | list)}, indent=2))
-    print(tables(result))
-    content = result.figures | {"made_by": made_by(result.config)}
-    write(result.config.out, content, {"benchmark": figure(result)}, tables(result))
+    write(result.config, result.figures, {"benchmark": figure(result)}, tables(result))
 
 
 if __name__ == "__main__":

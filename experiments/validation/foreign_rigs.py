@@ -27,24 +27,19 @@ from tqdm import tqdm
 
 from torchsoft import Parameters, Reference, SoftGrasp
 from torchsoft.excitation import Chirp, Excitation, MultiSine, Press, Strokes, begin
-from torchsoft.experiment import COARSE, markdown, options, raw_config, write
+from torchsoft.experiment import COARSE, markdown, options, write
 from torchsoft.files import replacing
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, Unreachable, explain
 from torchsoft.sysid.problem.journal import forget
 from torchsoft.sysid.problem.recording import Array
-from torchsoft.sysid.problem.workers import Runner
 from torchsoft.threads import parallel_map
 
 TESTS = Path(__file__).parents[2] / "tests"
-sys.path.insert(0, str(TESTS))
+sys.path[:0] = str(TESTS), str(Path(__file__).parents[1])
 
 from foreign import Numbers, simulate  # noqa: E402  # pyright: ignore[reportMissingImports]
-
-TRUTH = {
-    "contact.K_n": 1.6e5, "contact.R_n": 300.0, "contact.K_t": 0.8e5, "contact.R_t": 600.0, "contact.mu_s": 0.65,
-    "contact.mu_k": 0.5, "pad.E": 0.9e6, "pad.tau": 0.012,
-}  # fmt: skip
+from identify_contact import TRUTH  # noqa: E402
 
 SMOKE_UNKNOWNS = ("contact.mu_s", "contact.K_n", "pad.E", "pad.tau")
 
@@ -301,8 +296,6 @@ class Outcome:
     refused: str
     wall_s: float
     cpu_s: float
-    differences_s: float
-    """Processor time that the fit's Jacobians alone would take by forward differences: a measured run for each unknown."""
 
     @property
     def warnings(self) -> list[str]:
@@ -345,7 +338,7 @@ class Outcome:
             "naming_the_cause": self.naming, "wrong": self.wrong, "refused": found is None,
             "chi2": None if found is None else found.chi2, "converged": None if found is None else found.converged,
             "recordings": list(case.excitations), "fastest_slip": max(one.slip for one in self.made),
-            "identify_wall_s": self.wall_s, "identify_cpu_s": self.cpu_s, "jacobians_by_differences_cpu_s": self.differences_s,
+            "identify_wall_s": self.wall_s, "identify_cpu_s": self.cpu_s,
             "recordings_wall_s": sum(one.wall_s for one in self.made),
         }  # fmt: skip
 
@@ -381,7 +374,7 @@ def runs(case: Case, config: Config) -> Path:
 def study(case: Case, made: Mapping[Order, Made], config: Config) -> Outcome:
     """Identify one case."""
     mine, began = [made[order] for order in case.orders()], (perf_counter(), process_time())
-    found, refused, problem = None, "", None
+    found, refused = None, ""
     try:
         recordings = [
             case.recording(name, one, config.seed + 10 * k, config.smoke)
@@ -393,17 +386,8 @@ def study(case: Case, made: Mapping[Order, Made], config: Config) -> Outcome:
         )
     except (Unreachable, ValueError) as error:
         refused = str(error)
-    wall, cpu, differences = perf_counter() - began[0], process_time() - began[1], 0.0
-    if found is not None and problem is not None:
-        differences = found.cost["jacobians"] * (len(problem.coordinates) + 1) * a_run(problem, config)
-    return Outcome(case, truths(config), mine, found, refused, wall, cpu, differences)
-
-
-def a_run(problem: Problem, config: Config) -> float:
-    """Processor time of the mean recording's run [s], where the fit begins."""
-    began = process_time()
-    problem.residuals(Runner(problem.recordings), problem.coordinates.start, problem.names, config.rtol)
-    return (process_time() - began) / len(problem.recordings)
+    wall, cpu = perf_counter() - began[0], process_time() - began[1]
+    return Outcome(case, truths(config), mine, found, refused, wall, cpu)
 
 
 def run(config: Config) -> list[Outcome]:
@@ -416,16 +400,15 @@ def run(config: Config) -> list[Outcome]:
     for case in cases:
         outcomes.append(study(case, made, config))
         print(f"\n{case.name}: {outcomes[-1].verdict}", *outcomes[-1].warnings, sep="\n  ")
-        write(config.out, summary(config, outcomes), table=table(outcomes))
+        write(config, summary(outcomes))
     for case in cases:
         forget(runs(case, config))
     return outcomes
 
 
-def summary(config: Config, outcomes: list[Outcome]) -> dict[str, Any]:
+def summary(outcomes: list[Outcome]) -> dict[str, Any]:
     verdicts = [one.verdict for one in outcomes]
     return {
-        **raw_config(config),
         "noise": {channel: sensor.noise for channel, sensor in RIG.items()},
         "verdicts": {verdict: verdicts.count(verdict) for verdict in VERDICTS},
         "cases": [one.summary() for one in outcomes],
@@ -452,7 +435,7 @@ def table(outcomes: list[Outcome]) -> str:
 
 def main(config: Config) -> None:
     outcomes = run(config)
-    print("\n" + table(outcomes))
+    write(config, summary(outcomes), table=table(outcomes))
 
 
 if __name__ == "__main__":

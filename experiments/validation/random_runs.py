@@ -39,7 +39,7 @@ from tqdm import tqdm
 
 from torchsoft import NoEquilibrium, Parameters, SimulationFailed, SoftGrasp, simulate
 from torchsoft.excitation import FADE, Chirp, Excitation, MultiSine, Press, Roll, RunContext, Strokes, begin
-from torchsoft.experiment import grid, made_by, markdown, options, write
+from torchsoft.experiment import grid, markdown, options, write
 from torchsoft.paper.equilibrium import holding_force, press, rest
 from torchsoft.processes import local_processes
 from torchsoft.scenario import reference
@@ -345,9 +345,7 @@ def figure(result: Result) -> Figure:
 def main() -> None:
     result = run(options(Config, __doc__))
     numbers = summary(result)
-    print(table(numbers))
-    content = numbers | {"made_by": made_by(result.config)}
-    write(result.config.out, content, {"random_runs": figure(result)}, table(numbers))
+    write(result.config, numbers, {"random_runs": figure(result)}, table(numbers))
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from torchsoft import Parameters, SoftGrasp, Trajectory, simulate
-from torchsoft.experiment import grid, made_by, markdown, options, write
+from torchsoft.experiment import grid, numbers, options, write
 from torchsoft.scenario import grasp_and_roll
 
 SIGNALS = ("x_C", "y_C", "theta", "F_x", "F_y")
@@ -93,12 +93,6 @@ def run(config: Config) -> Result:
     return Result(config, steps, meshes, etas)
 
 
-def table(title: str, rows: dict[str, dict[str, float]]) -> str:
-    """A Markdown table."""
-    names = list(next(iter(rows.values())))
-    return markdown((title, *names), [(key, *(f"{row[name]:.5g}" for name in names)) for key, row in rows.items()])
-
-
 def figure(result: Result) -> Figure:
     """Largest errors against the step."""
     fig = Figure(figsize=(6, 4), layout="constrained")
@@ -114,9 +108,9 @@ def figure(result: Result) -> Figure:
 def main() -> None:
     result = run(options(Config, __doc__))
     parts = {"steps": result.steps, "meshes": result.meshes, "etas": result.etas}
-    for title, rows in zip(("step", "mesh", "eta [N.s/m]"), parts.values()):
-        print("\n" + table(title, rows))
-    write(result.config.out, {**parts, "made_by": made_by(result.config)}, {"refinement": figure(result)})
+    titles = "step", "mesh", "eta [N.s/m]"
+    tables = "\n\n".join(numbers(title, rows, 5) for title, rows in zip(titles, parts.values()))
+    write(result.config, parts, {"refinement": figure(result)}, tables)
 
 
 if __name__ == "__main__":
