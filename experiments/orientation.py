@@ -285,7 +285,7 @@ class Result:
 
 
 def table(result: Result) -> str:
-    """Every run in a row."""
+    """Every run in a row, and what rigid parts ask for."""
     head = ("run", "centre [mm]", "angle [deg]", "at rest [mm]", "[deg]", "friction / normal", "effort [N]", "verdict")
     named: list[tuple[str, Outcome]] = [(name, one) for name, one in result.alone.items()]
     named += [(f"{name}, efforts fed forward", one) for name, one in result.known.items()]
@@ -298,7 +298,11 @@ def table(result: Result) -> str:
          f"{x.effort:.3g}", result.verdict(x))
         for name, x in named
     ]  # fmt: skip
-    return markdown(head, rows)
+    fast = f"disc, {result.config.disc_speed:g} times as fast"
+    cones = {name: one.friction for name, one in result.rigid.items()}
+    cones |= {f"{fast}, turned": result.turning, f"{fast}, carried": result.carrying}
+    asked = markdown(("rigid", "asks for a friction of"), [(name, f"{mu:.3g}") for name, mu in cones.items()])
+    return f"{markdown(head, rows)}\n\n{asked}"
 
 
 @rc_context(STYLE)

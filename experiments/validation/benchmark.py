@@ -2,8 +2,7 @@
 
 All in one process and one run, medians of repeated timings in turns, so that the ratios hold on a noisy machine:
 
-- the 30 s manipulation by two tolerances and by equal steps; errors against a run at rtol 1e-7; `scenario_wall_s` is that of
-  the loosest tolerance with the accuracy of a step of 2 ms (motion 3e-4, forces 0.5 % of their range);
+- the 30 s manipulation by two tolerances and by equal steps; errors against a run at rtol 1e-7;
 - over the run the sweep for the gradient of all parameters, and what the Jacobian for 8 parameters adds;
 - 64 trajectories of 4 s and 1,000 of 0.3 s with parameters of their own, on one and two threads;
 - growth with the surface nodes and the size of a batch, with fitted exponents;
@@ -355,9 +354,6 @@ def peers_table(numbers: dict[str, Any]) -> str:
     return "\n\n".join(out)
 
 
-ACCURACY = {"motion": 3e-4, "forces": 5e-3}  # Largest errors over the range of what a step of 2 ms gives.
-
-
 @dataclass(frozen=True)
 class Result:
     config: Config
@@ -397,33 +393,13 @@ def run(config: Config) -> Result:
     parts |= {"peers": peers} if config.peers else {}
     done = {name: part(config) for name, part in tqdm(parts.items(), unit="part")}
     grown: list[Growth] = done.pop("growth")
-    cost, batch = done["costs"], done["batches"]
-    *chosen, equal = (cost[way] for way in ways(config))
-    rtol = next((r for r, one in zip(config.rtols, chosen) if exact_enough(one["errors"])), None)
-    own = chosen[-1] if rtol is None else cost[f"rtol = {rtol:g}"]
-    scenario_s = None if rtol is None else own["seconds"]["run"]
-    top = {
-        "scenario_wall_s": scenario_s, "scenario_rtol": rtol, "scenario_wall_s_loose": chosen[0]["seconds"]["run"],
-        "scenario_wall_s_tight": chosen[-1]["seconds"]["run"],
-        "scenario_wall_s_equal_steps": equal["seconds"]["run"],
-        **{name: own[name] for name in own if name.endswith("over_run")},
-        **{f"{name}_equal_steps": equal[name] for name in equal if name.endswith("over_run")},
-        "batch_sim_s_per_wall_s": batch["trajectories"]["simulated_per_wall"]["2"],
-        "batch_sim_s_per_wall_s_one_thread": batch["trajectories"]["simulated_per_wall"]["1"],
-        "batch_two_threads_over_one": batch["trajectories"]["two_threads_over_one"],
-    }  # fmt: skip
-    return Result(config, top | done | {"growth": [asdict(one) | {"exponent": one.exponent} for one in grown]}, grown)
+    return Result(config, done | {"growth": [asdict(one) | {"exponent": one.exponent} for one in grown]}, grown)
 
 
 def worst(errors: dict[str, float]) -> dict[str, float]:
     """The largest errors of the motion and of the forces."""
     parts = {"motion": ("x_C", "y_C", "theta"), "forces": ("F_x", "F_y")}
     return {part: max(errors[name] for name in names) for part, names in parts.items()}
-
-
-def exact_enough(errors: dict[str, float]) -> bool:
-    """Whether a run is as exact as by a step of 2 ms."""
-    return all(error <= ACCURACY[part] for part, error in worst(errors).items())
 
 
 def cost_table(config: Config, numbers: dict[str, Any]) -> str:

@@ -89,12 +89,11 @@ def nominal(smoke: bool) -> Parameters:
 
 
 class Made(NamedTuple):
-    """One run: times (n,) [s] every `KEPT`, channels (n,) by name, the fastest slip [m/s], and the wall time [s]."""
+    """One run: times (n,) [s] every `KEPT`, channels (n,) by name, and the fastest slip [m/s]."""
 
     t: Array
     channels: dict[str, Array]
     slip: float
-    wall_s: float
 
 
 class Order(NamedTuple):
@@ -132,7 +131,7 @@ def make(order: Order, step: float, smoke: bool, folder: Path) -> Made:
         return fine
     coarse = stepped(order, 2 * step, smoke, folder)
     channels = {name: 2 * value - coarse.channels[name] for name, value in fine.channels.items()}
-    return fine._replace(channels=channels, wall_s=fine.wall_s + coarse.wall_s)
+    return fine._replace(channels=channels)
 
 
 def stepped(order: Order, step: float, smoke: bool, folder: Path) -> Made:
@@ -147,16 +146,15 @@ def stepped(order: Order, step: float, smoke: bool, folder: Path) -> Made:
         count = round((excitation.duration + SETTLE) / step)
         t = step * (np.arange(count + 1) - round(SETTLE / step))
         signals = reference(torch.from_numpy(t), SIGNALS).detach().numpy()
-        began = perf_counter()
         run = simulate(p, t, signals, round(KEPT / step))
-        rows = {"t": run.t, "slip": run.slip, "wall_s": np.array(perf_counter() - began), **run.channels}
+        rows = {"t": run.t, "slip": run.slip, **run.channels}
         folder.mkdir(parents=True, exist_ok=True)
         with replacing(file) as partial, partial.open("wb") as stream:
             np.savez(stream, **rows)
     with np.load(file) as kept:
         rows = {name: kept[name] for name in kept.files}
-    t, slip, wall = rows.pop("t"), rows.pop("slip"), float(rows.pop("wall_s"))
-    return Made(t, rows, float(slip.max()), wall)
+    t, slip = rows.pop("t"), rows.pop("slip")
+    return Made(t, rows, float(slip.max()))
 
 
 def make_all(orders: Sequence[Order], step: float, smoke: bool, folder: Path, workers: int) -> dict[Order, Made]:
@@ -339,7 +337,6 @@ class Outcome:
             "chi2": None if found is None else found.chi2, "converged": None if found is None else found.converged,
             "recordings": list(case.excitations), "fastest_slip": max(one.slip for one in self.made),
             "identify_wall_s": self.wall_s, "identify_cpu_s": self.cpu_s,
-            "recordings_wall_s": sum(one.wall_s for one in self.made),
         }  # fmt: skip
 
 
