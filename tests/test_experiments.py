@@ -79,17 +79,13 @@ def test_step_accuracy_smoke(tmp_path: Path) -> None:
 
 
 def test_refinement_smoke(tmp_path: Path) -> None:
-    """Halving the step lessens the error of every signal; the mesh moves the grasp by little; eta not at all."""
+    """The mesh moves the grasp by little; eta not at all."""
     module = experiment("refinement")
     result = module.run(module.Config(out=tmp_path, smoke=True))
-    coarse, fine = result.steps.values()
-    assert all(fine[name] < coarse[name] for name in ("x_C", "y_C", "theta", "F_y", "energy_residual_rel"))
-    assert fine["F_y"] < 1e-2
     two, one = result.meshes.values()
     assert abs(two["y_C_grasp_mm"] - one["y_C_grasp_mm"]) < 0.03
     smooth, limit = result.etas.values()
     assert abs(smooth["F_y_grasp_N"] - limit["F_y_grasp_N"]) < 0.01
-    assert module.figure(result).axes
 
 
 @pytest.mark.slow

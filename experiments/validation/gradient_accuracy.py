@@ -13,14 +13,14 @@ Windows: `stick` (gentle rolling in the grasp), `slip` (a 2 mm stroke in 20 ms w
 `make-break` (rolling at 4.4 mm/s), `grasp` (the bracket coming down from 20 um above touching) and `full` (the 30 s
 manipulation).
 
-Further: the literal Coulomb law, whose force jumps at break-away unless mu_s = mu_k; and dL/dp through slip as the step is
-refined.
+Further: the literal Coulomb law, whose force jumps at break-away unless mu_s = mu_k. How far gradients depend on the step is in
+`step_accuracy.py`.
 
 Command: .venv/bin/python experiments/validation/gradient_accuracy.py [--smoke]
 Expected, largest error of both routes among parameters whose central difference is itself known to 1e-6: 6e-7 in each of the
 short windows, 6e-6 over 30 s and 180 node events; elsewhere within the judge's uncertainty. With the adjoint a run takes 1.3
 to 1.9 times as long. Coulomb's law with mu_s > mu_k: it calls dL/dmu_s 0, the loss falls with a slope of -0.105 +- 0.01;
-with mu_s = mu_k they agree to 2e-4. Through slip dL/dmu_s is 9 % off at 2 ms. About seven minutes on one core.
+with mu_s = mu_k they agree to 2e-4. About seven minutes on one core.
 """
 
 import statistics
@@ -72,8 +72,6 @@ class Config:
     full_steps: tuple[float, ...] = (3e-5, 1e-5)  # the same over the whole manipulation, where a run takes a second
     coulomb_ms: float = 0.02  # step of the runs with Coulomb's law [ms]
     coulomb_runs: int = 81  # runs over which the slope of its loss is averaged
-    refinement_ms: tuple[float, ...] = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125, 0.0625)
-    """steps of the convergence through slip [ms]; half the last is the reference"""
     repeats: int = 5  # runs of which a time is the median
     duration: float = 30.0  # of the full window [s]
     only: tuple[str, ...] = ()  # scalar parameters; all of them if none is named
@@ -321,45 +319,26 @@ def coulomb(config: Config) -> dict[str, Any]:
     return out
 
 
-def refinement(config: Config) -> dict[str, Any]:
-    """dL/dp through slip, at the same outputs, as the step is refined; errors against the finest step's."""
-    steps = [1e-3 * h for h in (*config.refinement_ms, config.refinement_ms[-1] / 2)]
-    names = ("contact.mu_s", "contact.mu_k", "contact.K_t")
-    base = stroke(config, 16e-3, steps[-1], {}, every=4e-3)
-    loss, table = make_loss(base), {}
-    for h in steps:
-        value = loss(states(replace(base, step=h)))
-        value.backward()
-        table[f"{1e3 * h:g}"] = {"loss": value.item(), **collect(base.model, names)}
-    with torch.no_grad():
-        dense = replace(base, t=linspace(0.0, 16e-3, 2.5e-4), step=2.5e-4)
-        found = events(dense, states(dense))
-    exact = list(table.values())[-1]
-    error = {key: {n: abs(row[n] - exact[n]) / abs(exact[n]) for n in exact} for key, row in list(table.items())[:-1]}
-    return {"events": found, "gradient": table, "relative_error": error}
-
-
 @dataclass(frozen=True)
 class Result:
     config: Config
     windows: dict[str, dict[str, Any]]
     coulomb: dict[str, Any]
-    refinement: dict[str, Any]
 
 
 def run(config: Config) -> Result:
     if config.smoke:  # the same questions for three parameters on a coarse mesh
         config = replace(
-            config, steps=(3e-4, 1e-4, 3e-5), full_steps=(1e-4, 1e-5), coulomb_ms=0.25, coulomb_runs=17,
-            refinement_ms=(2.0, 1.0), repeats=1, duration=0.6, only=("contact.K_n", "contact.mu_s", "pad.E"),
+            config, steps=(3e-4, 1e-4, 3e-5), full_steps=(1e-4, 1e-5), coulomb_ms=0.25, coulomb_runs=17, repeats=1,
+            duration=0.6, only=("contact.K_n", "contact.mu_s", "pad.E"),
             changes=tuple(COARSE.items()),
         )  # fmt: skip
     judged = {window.name: judge_window(window, config) for window in tqdm(windows(config), unit="window")}
-    return Result(config, judged, coulomb(config), refinement(config))
+    return Result(config, judged, coulomb(config))
 
 
 def table(result: Result) -> str:
-    """Markdown: per window and route the largest error and the cost; then the Coulomb bias and the convergence."""
+    """Markdown: per window and route the largest error and the cost; then the Coulomb bias."""
     rows = []
     for name, window in result.windows.items():
         for route, errors in window["relative_error"].items():
@@ -378,26 +357,18 @@ def table(result: Result) -> str:
         for label, c in result.coulomb.items()
     ]  # fmt: skip
     tables.append(markdown(("Coulomb, literal: dL/dmu", "adjoint", "slope of L", "by width"), rows))
-    refined = result.refinement["relative_error"]
-    names = list(next(iter(refined.values())))
-    rows = [(step, *(f"{errors[n]:.1e}" for n in names)) for step, errors in refined.items()]
-    tables.append(markdown(("step [ms]", *names), rows))
     return "\n\n".join(tables)
 
 
 def figure(result: Result) -> Figure:
-    """Errors of the discrete adjoint per parameter and window; convergence through slip; Coulomb's jumps."""
-    fig = Figure(figsize=(15, 5), layout="constrained")
-    errors, refined, jumps = fig.subplots(1, 3)
+    """Errors of the discrete adjoint per parameter and window; Coulomb's jumps."""
+    fig = Figure(figsize=(11, 5), layout="constrained")
+    errors, jumps = fig.subplots(1, 2)
     for name, numbers in result.windows.items():
         row = numbers["relative_error"]["discrete"]
         errors.semilogy([n.split(".")[-1] for n in row], [max(e, 1e-16) for e in row.values()], "o", label=name)
     errors.tick_params(axis="x", rotation=45)
     errors.set(ylabel="relative error [1]", title="Discrete adjoint against central differences")
-    steps = result.refinement["relative_error"]
-    for name in next(iter(steps.values())):
-        refined.loglog([float(h) for h in steps], [row[name] for row in steps.values()], "o-", label=name)
-    refined.set(xlabel="step [ms]", ylabel="relative error [1]", title="dL/dp through slip against the finest step")
     for k, (label, c) in enumerate(result.coulomb.items()):
         mu, L = torch.tensor(c["mu"]), torch.tensor(c["loss"])
         jumps.plot(mu, L - L.mean(), f"C{k}.", ms=3, label=f"L by {label}")
@@ -405,14 +376,14 @@ def figure(result: Result) -> Figure:
     jumps.set(
         xlabel="mu [1]", ylabel="L less its mean [1]", title="Coulomb's law to the letter; lines: the adjoint's slope"
     )
-    for axes in (errors, refined, jumps):
+    for axes in (errors, jumps):
         axes.legend(fontsize=8)
     return fig
 
 
 def write(result: Result) -> None:
     """summary.json, table.md and gradient_accuracy.png into the output folder."""
-    parts = {name: getattr(result, name) for name in ("windows", "coulomb", "refinement")}
+    parts = {name: getattr(result, name) for name in ("windows", "coulomb")}
     write_files(result.config, parts, {"gradient_accuracy": figure(result)}, table(result))
 
 
