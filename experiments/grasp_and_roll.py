@@ -13,10 +13,9 @@ contact; energy residual 3e-5. About 20 s on one core with figures and animation
 """
 
 import json
-import shlex
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -154,21 +153,9 @@ def summary(run: Run) -> dict[str, Any]:
 
 
 def summaries(result: Result) -> dict[str, Any]:
-    """`summary.json`: the chosen friction set at the top, the other under "paper_like", and how both were made."""
+    """`summary.json`: the chosen friction set at the top, the other under "paper_like"."""
     first, *others = map(summary, result.runs.values())
-    return first | {"paper_like": others[0] if others else None, "command": command(result.config)}
-
-
-def command(config: Config) -> str:
-    """The command line that makes this configuration."""
-    words = ["python", "experiments/grasp_and_roll.py"]
-    for field in fields(config):
-        value, flag = getattr(config, field.name), field.name
-        if value != field.default:
-            words += (
-                [f"--{flag}" if value else f"--no-{flag}"] if isinstance(value, bool) else [f"--{flag}", str(value)]
-            )
-    return shlex.join(words)
+    return first | {"paper_like": others[0] if others else None}
 
 
 ROWS = (  # what, published value, key, format

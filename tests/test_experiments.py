@@ -41,7 +41,7 @@ def test_grasp_and_roll_smoke(tmp_path: Path) -> None:
     assert numbers["x_C_mm"]["0"] == 60.0
     assert numbers["x_C_mm"]["10"] is None
     assert numbers["energy_residual_rel"] < 2e-4
-    assert "--smoke" in numbers["command"]
+    assert numbers["config"]["smoke"] is True
     names = {path.name for path in tmp_path.iterdir()}
     assert {"trajectory.nc", "multibond.dot", "animation.gif", "snapshots.png", "friction_sets.png"} <= names
     assert not [name for name in names if "partial" in name]

@@ -9,14 +9,12 @@ by what is wrong and not by luck. An interval holds the truth or not; a warning 
 
 Command: .venv/bin/python experiments/validation/foreign_rigs.py [--smoke] [--only "mesh 240 x 6"] [--workers 2]
 Expected: every interval holds, or a warning names the cause; no case is silent. About a quarter of an hour on two cores, the
-recordings included, which are kept in the folder --out.
+recordings included.
 """
 
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from hashlib import sha256
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any, NamedTuple
@@ -28,7 +26,6 @@ from tqdm import tqdm
 from torchsoft import Parameters, Reference, SoftGrasp
 from torchsoft.excitation import Chirp, Excitation, MultiSine, Press, Strokes, begin
 from torchsoft.experiment import COARSE, markdown, options, write
-from torchsoft.files import replacing
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, Unreachable, explain
 from torchsoft.sysid.problem.journal import forget
@@ -123,44 +120,31 @@ def numbers(settings: Parameters, differs: Mapping[str, Any]) -> Numbers:
     return Numbers(**known | {name.split(".")[1]: value for name, value in TRUTH.items()} | dict(differs))
 
 
-def make(order: Order, step: float, smoke: bool, folder: Path) -> Made:
-    """A run of the stranger's simulator, read where it has been made before: on steps of `step` and of twice that, extrapolated
-    to none, for the error of backward Euler is of first order. The literal law jumps, and is not extrapolated."""
-    fine = stepped(order, step, smoke, folder)
+def make(order: Order, step: float, smoke: bool) -> Made:
+    """A run of the stranger's simulator on steps of `step` and of twice that, extrapolated to none, for the error of backward
+    Euler is of first order. The literal law jumps, and is not extrapolated."""
+    fine = stepped(order, step, smoke)
     if dict(order.differs).get("literal"):
         return fine
-    coarse = stepped(order, 2 * step, smoke, folder)
-    channels = {name: 2 * value - coarse.channels[name] for name, value in fine.channels.items()}
-    return fine._replace(channels=channels)
+    coarse = stepped(order, 2 * step, smoke)
+    return fine._replace(channels={name: 2 * value - coarse.channels[name] for name, value in fine.channels.items()})
 
 
-def stepped(order: Order, step: float, smoke: bool, folder: Path) -> Made:
+def stepped(order: Order, step: float, smoke: bool) -> Made:
     """A run of the stranger's simulator on steps of `step` [s]."""
     excitation = excitations(smoke)[order.excitation]
     settings, reference = planned(excitation, smoke)
-    p = numbers(settings, dict(order.differs))
-    source = b"".join(path.read_bytes() for path in sorted((TESTS / "foreign").glob("*.py")))
-    about = json.dumps([p._asdict(), excitation.model_dump(mode="json"), step])
-    file = folder / f"{sha256(about.encode() + source).hexdigest()[:16]}.npz"
-    if not file.is_file():
-        count = round((excitation.duration + SETTLE) / step)
-        t = step * (np.arange(count + 1) - round(SETTLE / step))
-        signals = reference(torch.from_numpy(t), SIGNALS).detach().numpy()
-        run = simulate(p, t, signals, round(KEPT / step))
-        rows = {"t": run.t, "slip": run.slip, **run.channels}
-        folder.mkdir(parents=True, exist_ok=True)
-        with replacing(file) as partial, partial.open("wb") as stream:
-            np.savez(stream, **rows)
-    with np.load(file) as kept:
-        rows = {name: kept[name] for name in kept.files}
-    t, slip = rows.pop("t"), rows.pop("slip")
-    return Made(t, rows, float(slip.max()))
+    count = round((excitation.duration + SETTLE) / step)
+    t = step * (np.arange(count + 1) - round(SETTLE / step))
+    signals = reference(torch.from_numpy(t), SIGNALS).detach().numpy()
+    run = simulate(numbers(settings, dict(order.differs)), t, signals, round(KEPT / step))
+    return Made(run.t, run.channels, float(np.max(run.slip)))
 
 
-def make_all(orders: Sequence[Order], step: float, smoke: bool, folder: Path, workers: int) -> dict[Order, Made]:
+def make_all(orders: Sequence[Order], step: float, smoke: bool, workers: int) -> dict[Order, Made]:
     """All runs, side by side in threads."""
     every = list(dict.fromkeys(orders))
-    work = parallel_map(lambda i: make(every[i], step, smoke, folder), len(every), workers)
+    work = parallel_map(lambda i: make(every[i], step, smoke), len(every), workers)
     return {every[i]: made for i, made in tqdm(work, desc="recordings", total=len(every), unit=" runs")}
 
 
@@ -392,7 +376,7 @@ def run(config: Config) -> list[Outcome]:
     config = replace(config, workers=1, step=5e-5) if config.smoke else config
     cases = chosen(config)
     orders = [order for case in cases for order in case.orders()]
-    made = make_all(orders, config.step, config.smoke, config.out / "recordings", config.workers)
+    made = make_all(orders, config.step, config.smoke, config.workers)
     outcomes = []
     for case in cases:
         outcomes.append(study(case, made, config))

@@ -92,10 +92,6 @@ def identify(options: argparse.Namespace) -> int:
             verdict = compared(case, fit, options) if case.laws else ""
         except Unreachable as error:
             return failed(measured.unreachable(error, tables))
-        except (ValueError, RuntimeError) as error:  # a model without equilibrium, a worker that was killed
-            return failed(str(error))
-        except OSError as error:
-            return failed(f"{error.filename}: {error.strerror}" if error.filename else str(error))
     except KeyboardInterrupt:
         say(f"\ninterrupted; what is done so far is in {unfinished}, and the same command continues", error=True)
         return 130
