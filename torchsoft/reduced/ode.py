@@ -7,6 +7,7 @@ being reduced.
 """
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter
@@ -54,12 +55,16 @@ class Factor(NamedTuple):
 
 @dataclass(frozen=True)
 class Term:
-    """A candidate term: the product of its factors, with its name, LaTeX and unit."""
+    """A candidate term: the product of its factors, with its formula as text and its unit."""
 
     text: str
-    latex: str
     unit: str
     factors: tuple[Factor, ...]
+
+    @property
+    def latex(self) -> str:
+        """The formula with the symbols of its variables."""
+        return re.sub(r"tanh|\w+", lambda m: r"\tanh" if m[0] == "tanh" else symbol(m[0])[0], self.text)
 
     @property
     def linear(self) -> bool:
