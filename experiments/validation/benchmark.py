@@ -15,7 +15,6 @@ Expected: the sweep at most 0.6 of a run and the Jacobian at most 2 by tolerance
 be as exact as by 2 ms. About five minutes, three more with `--peers`.
 """
 
-import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -25,7 +24,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from scipy.integrate import odeint, solve_ivp
 from step_accuracy import EIGHT, errors
 from torch import Tensor
@@ -136,22 +134,9 @@ def batches(config: Config) -> dict[str, Any]:
     return out
 
 
-@dataclass
-class Growth:
-    """Median wall times [s] over something that is counted."""
-
-    over: str
-    values: list[int]
-    wall_s: list[float]
-
-    @property
-    def exponent(self) -> float:
-        """Slope of log time over log value, by least squares."""
-        return float(np.polyfit(np.log(self.values), np.log(self.wall_s), 1)[0])
-
-
-def growth(config: Config) -> list[Growth]:
-    """Of a run with the mesh and of a batch with its runs, at the loosest tolerance."""
+def growth(config: Config) -> list[dict[str, Any]]:
+    """Median wall times [s] of a run over the mesh and of a batch over its runs, at the loosest tolerance, and the slopes of
+    their logarithms by least squares."""
     rtol, repeats, m = config.rtols[0], min(config.repeats, 3), prepare()
 
     def run(elements_x: int) -> Callable[[], object]:
@@ -165,14 +150,17 @@ def growth(config: Config) -> list[Growth]:
         "runs of a batch": {n: own_batch(m, config, n, config.short_duration, 1) for n in counts},
     }.items():
         times = interleaved({str(n): lambda task=task: timed(task)[1] for n, task in tasks.items()}, repeats)
-        out.append(Growth(over, list(tasks), [median(some) for some in times.values()]))
+        wall = [median(some) for some in times.values()]
+        exponent = float(np.polyfit(np.log(list(tasks)), np.log(wall), 1)[0])
+        out.append({"over": over, "values": list(tasks), "wall_s": wall, "exponent": exponent})
     return out
 
 
-def growth_table(every: list[Growth]) -> str:
+def growth_table(every: list[dict[str, Any]]) -> str:
     """One row a measurement, with the exponents."""
     rows = [
-        (one.over, value, f"{wall:.3g}", f"{one.exponent:.2f}") for one in every for value, wall in zip(one.values, one.wall_s)
+        (one["over"], value, f"{wall:.3g}", f"{one['exponent']:.2f}")
+        for one in every for value, wall in zip(one["values"], one["wall_s"])
     ]  # fmt: skip
     return markdown(("growth with", "value", "wall time [s]", "exponent"), rows)
 
@@ -357,8 +345,7 @@ def peers_table(numbers: dict[str, Any]) -> str:
 @dataclass(frozen=True)
 class Result:
     config: Config
-    figures: dict[str, Any]
-    growth: list[Growth]
+    numbers: dict[str, Any]
 
 
 def costs(config: Config) -> dict[str, Any]:
@@ -391,9 +378,7 @@ def run(config: Config) -> Result:
         )  # fmt: skip
     parts: dict[str, Callable[[Config], Any]] = {"costs": costs, "batches": batches, "growth": growth}
     parts |= {"peers": peers} if config.peers else {}
-    done = {name: part(config) for name, part in tqdm(parts.items(), unit="part")}
-    grown: list[Growth] = done.pop("growth")
-    return Result(config, done | {"growth": [asdict(one) | {"exponent": one.exponent} for one in grown]}, grown)
+    return Result(config, {name: part(config) for name, part in tqdm(parts.items(), unit="part")})
 
 
 def worst(errors: dict[str, float]) -> dict[str, float]:
@@ -435,36 +420,14 @@ def batch_table(numbers: dict[str, Any]) -> str:
 
 def tables(result: Result) -> str:
     """All tables."""
-    numbers = result.figures
-    parts = [cost_table(result.config, numbers), batch_table(numbers), growth_table(result.growth)]
+    numbers = result.numbers
+    parts = [cost_table(result.config, numbers), batch_table(numbers), growth_table(numbers["growth"])]
     return "\n\n".join([*parts, peers_table(numbers["peers"])] if "peers" in numbers else parts)
-
-
-def figure(result: Result) -> Figure:
-    """Wall times of the tasks by every way, of batches, and as they grow."""
-    numbers = result.figures
-    fig = Figure(figsize=(13, 4), layout="constrained")
-    left, middle, right = fig.subplots(1, 3)
-    every = list(ways(result.config))
-    for name in ("run", "gradient", "jacobian"):
-        left.plot(every, [numbers["costs"][way]["seconds"][name] for way in every], "o", label=name)
-    left.set(ylabel="wall time [s]", title=f"{result.config.duration:g} s of manipulation, one core", ylim=(0, None))
-    for threads in ("1", "2"):
-        rates = {name: one["simulated_per_wall"][threads] for name, one in numbers["batches"].items()}
-        middle.plot(list(rates), list(rates.values()), "o", label=f"threads: {threads}")
-    middle.set(ylabel="simulated s per wall s [1]", title="Batches", ylim=(0, None))
-    for one in result.growth:
-        right.loglog(one.values, one.wall_s, "o-", label=f"{one.over}: exponent {one.exponent:.2f}")
-    right.set(ylabel="wall time [s]", title="Growth")
-    for axes in (left, middle, right):
-        axes.legend(fontsize=8)
-    return fig
 
 
 def main() -> None:
     result = run(options(Config, __doc__))
-    print(json.dumps({k: v for k, v in result.figures.items() if not isinstance(v, dict | list)}, indent=2))
-    write(result.config, result.figures, {"benchmark": figure(result)}, tables(result))
+    write(result.config, result.numbers, table=tables(result))
 
 
 if __name__ == "__main__":

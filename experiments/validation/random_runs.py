@@ -33,7 +33,6 @@ from time import monotonic, process_time, sleep
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
@@ -321,22 +320,10 @@ def table(numbers: dict[str, Any]) -> str:
     return markdown((f"of {numbers['runs']} runs", *ways), rows)
 
 
-def figure(result: Result) -> Figure:
-    """How runs ended."""
-    fig = Figure(figsize=(9, 4), layout="constrained")
-    axes = fig.subplots()
-    for height, (way, ends) in zip((0.8, 0.4), result.outcomes.items()):
-        counts = Counter(one.kind for one in ends.values())
-        axes.barh(list(counts), list(counts.values()), height, label=f"by {way}", log=True)
-    axes.set(xlabel="runs", title=f"How {len(result.motions)} random runs ended")
-    axes.legend()
-    return fig
-
-
 def main() -> None:
     result = run(options(Config, __doc__))
     numbers = summary(result)
-    write(result.config, numbers, {"random_runs": figure(result)}, table(numbers))
+    write(result.config, numbers, table=table(numbers))
 
 
 if __name__ == "__main__":
