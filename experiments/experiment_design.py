@@ -18,13 +18,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
+from identify_contact import TRUTH
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, Strokes
-from torchsoft.experiment import markdown, options, raw_config, write
+from torchsoft.experiment import markdown, options, write
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import RIG, Problem, Unknown, record
 from torchsoft.sysid.fit import shift, standard_deviations
@@ -33,9 +34,7 @@ from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import Runner
 
-NAMES: tuple[str, ...] = (
-    "contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau",
-)  # fmt: skip
+NAMES = tuple(TRUTH)
 CONSISTENT = 0.01
 """Difference between J and a finite difference, over their size, above which an excitation is dropped."""
 DIFFERENCE = 1e-5  # Step of that finite difference in the logarithms.
@@ -175,10 +174,10 @@ def figure(result: Result) -> Figure:
 
 def main(config: Config) -> None:
     result = run(config)
-    print(table(result.single), "", table(result.together[:8]), sep="\n")
     rows = {"single": result.single, "together": result.together[:20]}
-    summary = raw_config(result.config) | {name: [asdict(row) for row in some] for name, some in rows.items()}
-    write(result.config.out, summary, {"experiment_design": figure(result)})
+    summary = {name: [asdict(row) for row in some] for name, some in rows.items()}
+    tables = f"{table(result.single)}\n\n{table(result.together[:8])}"
+    write(result.config, summary, {"experiment_design": figure(result)}, tables)
 
 
 if __name__ == "__main__":

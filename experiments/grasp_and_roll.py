@@ -13,22 +13,20 @@ contact; energy residual 3e-5. About 20 s on one core with figures and animation
 """
 
 import json
-import shlex
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
-from tqdm import tqdm
 
 from torchsoft import Interrupted, NoEquilibrium, Parameters, SimulationFailed, SoftGrasp, Trajectory, simulate
 from torchsoft.channels import PADS
-from torchsoft.experiment import COARSE, markdown, options, raw_config
-from torchsoft.files import write_json
+from torchsoft.experiment import COARSE, markdown, options
+from torchsoft.experiment import write as write_files
 from torchsoft.plot import diagram as drawn
 from torchsoft.plot import figures as draw
 from torchsoft.plot.animation import animate
@@ -155,22 +153,9 @@ def summary(run: Run) -> dict[str, Any]:
 
 
 def summaries(result: Result) -> dict[str, Any]:
-    """`summary.json`: the chosen friction set at the top, the other under "paper_like", and how both were made."""
+    """`summary.json`: the chosen friction set at the top, the other under "paper_like"."""
     first, *others = map(summary, result.runs.values())
-    made = raw_config(result.config) | {"command": command(result.config)}
-    return first | {"paper_like": others[0] if others else None} | made
-
-
-def command(config: Config) -> str:
-    """The command line that makes this configuration."""
-    words = ["python", "experiments/grasp_and_roll.py"]
-    for field in fields(config):
-        value, flag = getattr(config, field.name), field.name
-        if value != field.default:
-            words += (
-                [f"--{flag}" if value else f"--no-{flag}"] if isinstance(value, bool) else [f"--{flag}", str(value)]
-            )
-    return shlex.join(words)
+    return first | {"paper_like": others[0] if others else None}
 
 
 ROWS = (  # what, published value, key, format
@@ -245,12 +230,12 @@ def write(result: Result) -> None:
     for friction, done in result.runs.items():
         name = "trajectory.nc" if done is first else f"trajectory_{friction.replace('-', '_')}.nc"
         done.trajectory.save(config.out / name)
-    write_json(config.out / "summary.json", summaries(result))
     (config.out / "multibond.dot").write_text(drawn.dot(first.model), encoding="utf-8")
+    content = summaries(result)
     if result.stopped:
+        write_files(config, content)
         return
-    for name, figure in tqdm(figures(result).items(), "figures", unit="figure"):
-        draw.save(figure, config.out / f"{name}.png")
+    write_files(config, content, figures(result), table(content))
     if config.animation:
         frames = 12 if config.smoke else 150
         animate(first.trajectory, first.model, config.out / "animation.gif", frames=frames)
@@ -273,7 +258,6 @@ def main() -> None:
         sys.exit(130)
     if isinstance(result.stopped, SimulationFailed):
         sys.exit(f"the simulation failed: {result.stopped.reason}\nwhat was simulated until then is in {config.out}")
-    print(f"\n{table(summaries(result))}\n\nwritten to {config.out}")
     if result.stopped:
         print("interrupted: the files hold what was simulated until then", file=sys.stderr)
         sys.exit(130)

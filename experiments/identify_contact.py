@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes
-from torchsoft.experiment import COARSE, markdown, options, raw_config, write
+from torchsoft.experiment import COARSE, markdown, options, write
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, identify, record
 from torchsoft.sysid.problem import Residuals, StepsByName
 from torchsoft.sysid.recording import Array
@@ -207,7 +207,6 @@ def main(config: Config) -> None:
         )  # fmt: skip
     wall = {row["case"]: row["wall_s"] for row in reversed(rows)}
     summary = {
-        **raw_config(config),
         "noise": {channel: sensor.noise for channel, sensor in RIG.items()},
         "cases": rows,
         "baseline_over_exact": wall["finite differences"] / wall["noisy"] if "finite differences" in wall else None,
@@ -220,8 +219,7 @@ def main(config: Config) -> None:
             (case.name, f"{error:.2%}", f"{sd:.2%}", row["simulations"], row["jacobians"], f"{row['wall_s']:.0f}")
         )
     head = ("case", "worst error", "worst predicted sd", "simulations", "Jacobians", "wall [s]")
-    print("\n" + markdown(head, cells))
-    write(config.out, summary, {"identify_contact": figure(result)})
+    write(config, summary, {"identify_contact": figure(result)}, markdown(head, cells))
 
 
 if __name__ == "__main__":

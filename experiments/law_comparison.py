@@ -30,7 +30,7 @@ from tqdm import tqdm
 
 from torchsoft import Coulomb, Parameters, Reference, SoftGrasp, StandardLinearSolid
 from torchsoft.excitation import Excitation, MultiSine, Press, Roll, Strokes
-from torchsoft.experiment import COARSE, markdown, options, raw_config, timed, write
+from torchsoft.experiment import COARSE, markdown, options, timed, write
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, Unknown, record
 from torchsoft.sysid.compare import Evidence, FittedLaw, compare, fitted
 from torchsoft.sysid.comparison import Comparison
@@ -283,7 +283,6 @@ def main(config: Config) -> None:
         D = " / ".join(f"{v:.2g}" for v in row["D"])
         cells.append((row["group"], row["cases"], D, *(row[k] for k in ANSWERS)))
     table = markdown(("data", "cases", "D least / median / most", *ANSWERS), cells)
-    print(table)
     cases = [
         {
             "motion": one.case.setting, "law": one.case.law, "truth": one.case.truth, "seed": one.case.seed, "D": one.apart,
@@ -292,8 +291,7 @@ def main(config: Config) -> None:
         }
         for one in result.judged
     ]  # fmt: skip
-    summary = {**raw_config(result.config), "groups": summed, "cases": cases}
-    write(result.config.out, summary, {"law_comparison": figure(result)}, table)
+    write(result.config, {"groups": summed, "cases": cases}, {"law_comparison": figure(result)}, table)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,6 @@ and nothing is claimed. About twenty seconds on one core.
 """
 
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 
 import torch
@@ -21,7 +20,7 @@ from matplotlib.figure import Figure
 from torch import Tensor, nn
 
 from torchsoft import Parameters, SmoothSlip, SoftGrasp, Trajectory, press, simulate
-from torchsoft.experiment import COARSE, at_the_points, options, write
+from torchsoft.experiment import COARSE, at_the_points, markdown, options, write
 
 SWEEPS = 4
 """Fixed-point sweeps for mu(v) and v; each shrinks the error by about (mu_s - mu_k) F_N / ((eta + R) v_s), 0.1 here."""
@@ -159,10 +158,10 @@ def figure(result: Result) -> Figure:
 
 def main() -> None:
     result = run(options(Config, __doc__))
-    for name, value in numbers(result).items():
-        print(f"{name}: {value:.4g}")
-    summary = {**numbers(result), "made_by": {"torchsoft": version("torchsoft"), "losses": result.losses}}
-    write(result.config.out, summary, {"learned_friction": figure(result)})
+    found = numbers(result)
+    rows = [(name, f"{value:.4g}") for name, value in found.items()]
+    table = markdown(("", "learned"), rows)
+    write(result.config, {**found, "losses": result.losses}, {"learned_friction": figure(result)}, table)
 
 
 if __name__ == "__main__":

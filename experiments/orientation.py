@@ -18,7 +18,7 @@ a disc, which efforts fed forward mend for 1.1, 1.3 and the box; the ellipse of 
 below; the ellipse of 2, which asks for 0.82 and has 0.8, and is lost. Little more than a minute on one core.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -47,7 +47,7 @@ from torchsoft import (
     Trajectory,
 )
 from torchsoft import simulate as simulated
-from torchsoft.experiment import markdown, options, raw_config, timed, write
+from torchsoft.experiment import markdown, options, timed, write
 from torchsoft.physics.motion import Piecewise, evaluate
 from torchsoft.physics.statics import resting, standing
 from torchsoft.plot.animation import animate
@@ -284,7 +284,7 @@ class Result:
 
 
 def table(result: Result) -> str:
-    """Every run in a row."""
+    """Every run in a row, and what rigid parts ask for."""
     head = ("run", "centre [mm]", "angle [deg]", "at rest [mm]", "[deg]", "friction / normal", "effort [N]", "verdict")
     named: list[tuple[str, Outcome]] = [(name, one) for name, one in result.alone.items()]
     named += [(f"{name}, efforts fed forward", one) for name, one in result.known.items()]
@@ -297,40 +297,11 @@ def table(result: Result) -> str:
          f"{x.effort:.3g}", result.verdict(x))
         for name, x in named
     ]  # fmt: skip
-    return markdown(head, rows)
-
-
-def fails(result: Result, outcomes: dict[float, Outcome], rising: bool) -> str:
-    """Where a sweep leaves the tolerance, in words."""
-    order = sorted(outcomes, reverse=not rising)
-    bad = next((key for key in order if result.verdict(outcomes[key]) != "within"), None)
-    good = order if bad is None else order[: order.index(bad)]
-    lost = next((key for key in order if outcomes[key].stopped), None)
-    parts = [f"within the tolerance to {good[-1]:g}"] if good else []
-    if bad is not None and not (one := outcomes[bad]).stopped:
-        parts.append(f"beyond it at {bad:g} ({one.position_mm:.3f} mm and {one.angle_deg:.3f} deg)")
-    if lost is not None:
-        parts.append(f"lost at {lost:g} ({outcomes[lost].stopped})")
-    return ", ".join(parts)
-
-
-def sentences(result: Result) -> Iterator[str]:
-    """What came out, what failed included."""
-    c, disc, blind = result.config, result.alone[DISC], result.alone[KINEMATICS]
-    yield (
-        f"Disc, by PD loops of {c.bandwidth:g} rad/s: centre within {disc.position_mm:.4f} mm, orientation within "
-        f"{disc.angle_deg:.3f} deg, at rest {disc.rest_mm:.4f} mm and {disc.rest_deg:.4f} deg: {result.verdict(disc)} the "
-        f"tolerance of {c.position_mm:g} mm and {c.angle_deg:g} deg; by the kinematics of rigid rolling without a loop on it: "
-        f"{blind.angle_deg:.2f} deg, {blind.rest_deg:.2f} deg at rest."
-    )
-    swept = [("Disc, times as fast", result.speeds, True, "")]
-    asks = f" Rigid, it asks for {result.turning:.4f} to be turned and for {result.carrying:.4f} to be carried."
-    swept.append((f"Disc, {c.disc_speed:g} times as fast, mu", result.disc_frictions, False, asks))
-    name = f"ellipse {c.slipping_aspect:g}"
-    if result.frictions:
-        asks = f" Its friction cone asks for {result.rigid[name].friction:.3f}."
-        swept.append((f"{name.capitalize()}, efforts fed forward, mu", result.frictions, False, asks))
-    yield from (f"{what}: {fails(result, some, rising)}.{more}" for what, some, rising, more in swept if some)
+    fast = f"disc, {result.config.disc_speed:g} times as fast"
+    cones = {name: one.friction for name, one in result.rigid.items()}
+    cones |= {f"{fast}, turned": result.turning, f"{fast}, carried": result.carrying}
+    asked = markdown(("rigid", "asks for a friction of"), [(name, f"{mu:.3g}") for name, mu in cones.items()])
+    return f"{markdown(head, rows)}\n\n{asked}"
 
 
 @rc_context(STYLE)
@@ -442,8 +413,7 @@ def summary(result: Result) -> dict[str, Any]:
     def rows(outcomes: Mapping[Any, Outcome]) -> dict[str, Any]:
         return {str(key): one._asdict() | {"verdict": result.verdict(one)} for key, one in outcomes.items()}
 
-    return raw_config(result.config) | {
-        "sentences": list(sentences(result)),
+    return {
         "gains": result.gains,
         "grip_N": result.grip,
         "rigid": {name: one._asdict() for name, one in result.rigid.items()},
@@ -459,12 +429,10 @@ def summary(result: Result) -> dict[str, Any]:
 
 def main(config: Config) -> None:
     result, wall = timed(lambda: run(config))
-    rows = table(result)
-    print(f"\n{rows}\n")
-    print(*sentences(result), f"Wall time of all runs: {wall:.0f} s.", sep="\n")
     case, done = result.runs[DISC]
     stills = snapshots(done, case.rig, (0.5, 1.1, 1.5, 2.5, 3.5, 4.5), "Turned by 90 degrees, then carried")
-    write(config.out, summary(result) | {"wall_s": wall}, {"orientation": figure(result), "snapshots": stills}, rows)
+    figures = {"orientation": figure(result), "snapshots": stills}
+    write(result.config, summary(result) | {"wall_s": wall}, figures, table(result))
     aspect = f"ellipse {config.slipping_aspect:g}"
     videos = {
         "orientation.gif": (DISC, "A disc turned by 90 degrees between two jaws, then carried"),

@@ -52,7 +52,7 @@ from torchsoft import (
     rest,
     simulate,
 )
-from torchsoft.experiment import COARSE, made_by, markdown, options, timed, write
+from torchsoft.experiment import COARSE, markdown, options, timed, write
 from torchsoft.materials.presets import PRESETS
 from torchsoft.physics.material import Material
 from torchsoft.plot.animation import animate
@@ -314,7 +314,7 @@ def run(config: Config) -> Result:
 
 def summary(result: Result) -> dict[str, Any]:
     """Everything in numbers."""
-    config, moments = result.config, result.config.moments
+    moments = result.config.moments
     materials = rubbers()
     curves = {}
     for name, one in result.resistance.items():
@@ -347,7 +347,6 @@ def summary(result: Result) -> dict[str, Any]:
             }
             for load, r in result.loads.items()
         },
-        "made_by": made_by(config),
     }
 
 
@@ -395,8 +394,6 @@ def main(config: Config) -> None:
     torch.set_num_threads(1)
     result, wall = timed(lambda: run(config))
     content = summary(result) | {"wall_s": wall}
-    text = tables(content)
-    print(f"\n{text}\n")
     moments = result.config.moments
     figures = {
         "objects": distributions(result.objects, moments, f"Objects between the paper's pads, {FORCE:g} N"),
@@ -404,7 +401,7 @@ def main(config: Config) -> None:
         "paths": paths(result.objects | result.rubbers),
         "resistance": resistance_figure(result.resistance, result.loads),
     }
-    write(config.out, content, figures, text)
+    write(result.config, content, figures, tables(content))
     for name, one in result.objects.items() if result.config.video else ():
         path, title = config.out / f"{name.replace(' ', '_')}.gif", f"{name.capitalize()}, {FORCE:g} N"
         animate(one.run, one.model, path, frames=72, title=title, follow="disc.theta", even=True)

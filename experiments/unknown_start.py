@@ -29,7 +29,7 @@ from tqdm import tqdm
 from torchsoft import Parameters, SoftGrasp, simulate
 from torchsoft.channels import CHANNELS
 from torchsoft.excitation import CATALOGUE, begin
-from torchsoft.experiment import COARSE, markdown, options, raw_config, timed, write
+from torchsoft.experiment import COARSE, markdown, options, timed, write
 from torchsoft.sysid import (
     RIG,
     AtRest,
@@ -283,10 +283,9 @@ def main(config: Config) -> None:
         }  # fmt: skip
     head = ("recording", "parameter", "predicted sd", "start known", "price", "intervals that hold the truth")
     table = markdown(head, cells)
-    print("\n" + table)
     for case, rest in result.rest.items():
         print(f"\n{case}, rest assumed, read from a file: {rest['file']}\nin the library: {rest['library']}")
-    write(result.config.out, {**raw_config(result.config), "cases": cases}, {"unknown_start": figure(result)}, table)
+    write(result.config, {"cases": cases}, {"unknown_start": figure(result)}, table)
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ FLOWS = {
         columns configuration measured criterion planner design figures report .
     """,
     "rigs": "fields parts control motion geometry build course balance check written run .",
-    "cli": "failure results rigs identify material .",
+    "cli": "results rigs identify material .",
     "solve.kernel": """
         cache . arrays scratch linear inertia interface stage finish step taped run rates adjoint_pads adjoint tangent
     """,

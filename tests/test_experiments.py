@@ -41,7 +41,7 @@ def test_grasp_and_roll_smoke(tmp_path: Path) -> None:
     assert numbers["x_C_mm"]["0"] == 60.0
     assert numbers["x_C_mm"]["10"] is None
     assert numbers["energy_residual_rel"] < 2e-4
-    assert "--smoke" in numbers["command"]
+    assert numbers["config"]["smoke"] is True
     names = {path.name for path in tmp_path.iterdir()}
     assert {"trajectory.nc", "multibond.dot", "animation.gif", "snapshots.png", "friction_sets.png"} <= names
     assert not [name for name in names if "partial" in name]
@@ -79,22 +79,18 @@ def test_step_accuracy_smoke(tmp_path: Path) -> None:
 
 
 def test_refinement_smoke(tmp_path: Path) -> None:
-    """Halving the step lessens the error of every signal; the mesh moves the grasp by little; eta not at all."""
+    """The mesh moves the grasp by little; eta not at all."""
     module = experiment("refinement")
     result = module.run(module.Config(out=tmp_path, smoke=True))
-    coarse, fine = result.steps.values()
-    assert all(fine[name] < coarse[name] for name in ("x_C", "y_C", "theta", "F_y", "energy_residual_rel"))
-    assert fine["F_y"] < 1e-2
     two, one = result.meshes.values()
     assert abs(two["y_C_grasp_mm"] - one["y_C_grasp_mm"]) < 0.03
     smooth, limit = result.etas.values()
     assert abs(smooth["F_y_grasp_N"] - limit["F_y_grasp_N"]) < 0.01
-    assert module.figure(result).axes
 
 
 @pytest.mark.slow
 def test_benchmark_smoke(tmp_path: Path) -> None:
-    """A sweep costs less than two runs, a Jacobian less than four; every part has its place in the summary and a figure."""
+    """A sweep costs less than two runs, a Jacobian less than four; every part has its place in the summary."""
     module = experiment("benchmark")
     config = module.Config(out=tmp_path, duration=3.0, exact=1e-6, repeats=3)
     costs = module.costs(config)
@@ -104,10 +100,9 @@ def test_benchmark_smoke(tmp_path: Path) -> None:
     loose, tight, *_ = (costs[way]["errors"]["x_C"] for way in module.ways(config))
     assert tight < loose
     result = module.run(module.Config(out=tmp_path, smoke=True))
-    assert result.figures["batches"]["trajectories"]["failures"] == 0
-    assert [one.over for one in result.growth][-1] == "runs of a batch"
+    assert result.numbers["batches"]["trajectories"]["failures"] == 0
+    assert result.numbers["growth"][-1]["over"] == "runs of a batch"
     assert "| 2 runs of 0.2 s | 2 |" in module.tables(result)
-    assert module.figure(result).axes
 
 
 @pytest.mark.slow
@@ -133,7 +128,6 @@ def test_random_runs_smoke(tmp_path: Path) -> None:
         assert not [kind for kind in kinds if kind in (module.NOT_FINITE, module.HUNG) or "without a sentence" in kind]
         assert all(one.sentence for one in result.outcomes[way].values() if one.kind != module.FINISHED)
     assert f"of {numbers['runs']} runs" in module.table(numbers)
-    assert module.figure(result).axes
     short = module.run(module.Config(out=tmp_path, runs=1, workers=1, limit=0.01))
     assert module.summary(short)["tolerances"]["kinds"] == {module.HUNG: 1}
 
@@ -216,9 +210,7 @@ def test_orientation_smoke(tmp_path: Path) -> None:
     assert summary["frictions"]["0.2"]["verdict"] == "lost"  # its friction cone asks for 0.29
     assert summary["speeds"]["6.0"]["verdict"] == "beyond"
     assert summary["speeds"]["6.0"]["position_mm"] == pytest.approx(summary["inertia_alone_mm_deg"]["6.0"][0], rel=0.2)
-    sentences = " ".join(summary["sentences"])
-    assert "within the tolerance of 0.1 mm and 0.5 deg" in sentences
-    assert "mu: lost at 0.2 (at t = " in sentences
+    assert summary["frictions"]["0.2"]["stopped"].startswith("at t = ")
     assert {"orientation.png", "snapshots.png", "orientation.gif", "ellipse.gif"} <= {
         x.name for x in tmp_path.iterdir()
     }

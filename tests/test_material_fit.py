@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 
 from torchsoft.cli import main
-from torchsoft.materials.fit import Fit, fit
+from torchsoft.materials.fit import Fit, faded, fit, responses
 from torchsoft.materials.measured import Measured, read
 from torchsoft.materials.presets import PRESETS, from_shore_a
-from torchsoft.materials.series import faded, responses
 from torchsoft.materials.written import FILES
 from torchsoft.physics.material import KINDS, GeneralisedKelvin, Prony
 

@@ -20,10 +20,8 @@ def test_reduced_model_smoke(tmp_path: Path) -> None:
     for term in ("x_Br - 2 x_C", "v_Br - 2 v_C"):
         row = found["v_C", term]
         assert abs(row["error"]) < 0.1
-        assert abs(row["error_in_band"]) < 0.03
         assert row["interval"][0] < row["value"] < row["interval"][1]
     assert found["v_Br", "F_x"]["value"] == pytest.approx(1 / 0.4065, rel=0.05)
-    assert len(stick["noise"]) == 2
     assert slip["heldout_nrmse"] < 0.1
     fastest = min(slip["by_stroke"], key=lambda row: row["stroke_time_s"])
     assert fastest["slipping"] > 0.5

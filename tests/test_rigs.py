@@ -526,7 +526,7 @@ def test_run_writes_everything(small: Path, tmp_path: Path, capsys: Any) -> None
     assert "0.1 s simulated" in out
     assert "note: actuators: stable" in err
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    figures = {f"{name}.png" for name in ("snapshots", "motion", "forces", "power", "energy")}
+    figures = {f"{name}.png" for name in ("snapshots", "motion", "forces", "energy")}
     assert names == {"trajectory.nc", "summary.json", "video.gif"} | figures
     for name in figures:
         with Image.open(tmp_path / "out" / name) as picture:

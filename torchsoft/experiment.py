@@ -59,17 +59,6 @@ def timed(function: Callable[[], T]) -> tuple[T, float]:
     return out, perf_counter() - start
 
 
-def made_by(config: Any, **more: Any) -> dict[str, Any]:
-    """Version and configuration, as text, of what has made a summary."""
-    return {"torchsoft": version("torchsoft"), **more, "config": {k: str(v) for k, v in asdict(config).items()}}
-
-
-def raw_config(config: Any) -> dict[str, Any]:
-    """Version and configuration as JSON values, at the top of a summary."""
-    values = {name: str(one) if isinstance(one, Path) else one for name, one in asdict(config).items()}
-    return {"torchsoft": version("torchsoft"), "config": values}
-
-
 @torch.no_grad()
 def at_the_points(rig: Rig, t: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
     """Penetration [m] and slip speed [m/s] of all contact points, (T, points) each, in the states y (T, size)."""
@@ -88,12 +77,24 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
     return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
 
 
-def write(out: Path, summary: Mapping[str, Any], figures: Mapping[str, Figure] | None = None, table: str = "") -> None:
-    """`summary.json`, figures by name, and `table.md` if there is a table, each whole or not at all."""
-    write_json(out / "summary.json", summary)
+def numbers(title: str, rows: Mapping[str, Mapping[str, float]], digits: int = 4) -> str:
+    """A Markdown table of numbers: a line for each of the rows, a column for each name in the first of them."""
+    names = list(next(iter(rows.values())))
+    cells = [(key, *(f"{row[name]:.{digits}g}" if name in row else "" for name in names)) for key, row in rows.items()]
+    return markdown((title, *names), cells)
+
+
+def write(
+    config: Any, content: Mapping[str, Any], figures: Mapping[str, Figure] | None = None, table: str = ""
+) -> None:
+    """Write to the configured folder `summary.json`, with version and configuration at the top, figures by name, and `table.md`
+    if there is a table, which is printed too; each file appears whole or not at all."""
+    options = {name: str(one) if isinstance(one, Path) else one for name, one in asdict(config).items()}
+    write_json(config.out / "summary.json", {"torchsoft": version("torchsoft"), "config": options, **content})
     for name, figure in (figures or {}).items():
-        save(figure, out / f"{name}.png")
+        save(figure, config.out / f"{name}.png")
     if table:
-        with replacing(out / "table.md") as partial:
+        print(f"\n{table}\n")
+        with replacing(config.out / "table.md") as partial:
             partial.write_text(table + "\n", encoding="utf-8")
-    print(f"written to {out}")
+    print(f"written to {config.out}")

@@ -2,8 +2,7 @@
 
 All in one process and one run, medians of repeated timings in turns, so that the ratios hold on a noisy machine:
 
-- the 30 s manipulation by two tolerances and by equal steps; errors against a run at rtol 1e-7; `scenario_wall_s` is that of
-  the loosest tolerance with the accuracy of a step of 2 ms (motion 3e-4, forces 0.5 % of their range);
+- the 30 s manipulation by two tolerances and by equal steps; errors against a run at rtol 1e-7;
 - over the run the sweep for the gradient of all parameters, and what the Jacobian for 8 parameters adds;
 - 64 trajectories of 4 s and 1,000 of 0.3 s with parameters of their own, on one and two threads;
 - growth with the surface nodes and the size of a batch, with fitted exponents;
@@ -16,7 +15,6 @@ Expected: the sweep at most 0.6 of a run and the Jacobian at most 2 by tolerance
 be as exact as by 2 ms. About five minutes, three more with `--peers`.
 """
 
-import json
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -26,19 +24,16 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from scipy.integrate import odeint, solve_ivp
-from step_accuracy import errors
+from step_accuracy import EIGHT, errors
 from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Parameters, SoftGrasp, simulate, simulate_batch
-from torchsoft.experiment import grid, made_by, markdown, options, timed, write
+from torchsoft.experiment import grid, markdown, options, timed, write
 from torchsoft.scenario import Manipulation, grasp_and_roll
 from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.rates import Rates
-
-EIGHT = ("contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau")
 
 GRASP_FORCE = 80.66  # That holds the grasp of the usual rig [N]; it need not be searched for.
 
@@ -139,22 +134,9 @@ def batches(config: Config) -> dict[str, Any]:
     return out
 
 
-@dataclass
-class Growth:
-    """Median wall times [s] over something that is counted."""
-
-    over: str
-    values: list[int]
-    wall_s: list[float]
-
-    @property
-    def exponent(self) -> float:
-        """Slope of log time over log value, by least squares."""
-        return float(np.polyfit(np.log(self.values), np.log(self.wall_s), 1)[0])
-
-
-def growth(config: Config) -> list[Growth]:
-    """Of a run with the mesh and of a batch with its runs, at the loosest tolerance."""
+def growth(config: Config) -> list[dict[str, Any]]:
+    """Median wall times [s] of a run over the mesh and of a batch over its runs, at the loosest tolerance, and the slopes of
+    their logarithms by least squares."""
     rtol, repeats, m = config.rtols[0], min(config.repeats, 3), prepare()
 
     def run(elements_x: int) -> Callable[[], object]:
@@ -168,14 +150,17 @@ def growth(config: Config) -> list[Growth]:
         "runs of a batch": {n: own_batch(m, config, n, config.short_duration, 1) for n in counts},
     }.items():
         times = interleaved({str(n): lambda task=task: timed(task)[1] for n, task in tasks.items()}, repeats)
-        out.append(Growth(over, list(tasks), [median(some) for some in times.values()]))
+        wall = [median(some) for some in times.values()]
+        exponent = float(np.polyfit(np.log(list(tasks)), np.log(wall), 1)[0])
+        out.append({"over": over, "values": list(tasks), "wall_s": wall, "exponent": exponent})
     return out
 
 
-def growth_table(every: list[Growth]) -> str:
+def growth_table(every: list[dict[str, Any]]) -> str:
     """One row a measurement, with the exponents."""
     rows = [
-        (one.over, value, f"{wall:.3g}", f"{one.exponent:.2f}") for one in every for value, wall in zip(one.values, one.wall_s)
+        (one["over"], value, f"{wall:.3g}", f"{one['exponent']:.2f}")
+        for one in every for value, wall in zip(one["values"], one["wall_s"])
     ]  # fmt: skip
     return markdown(("growth with", "value", "wall time [s]", "exponent"), rows)
 
@@ -357,14 +342,10 @@ def peers_table(numbers: dict[str, Any]) -> str:
     return "\n\n".join(out)
 
 
-ACCURACY = {"motion": 3e-4, "forces": 5e-3}  # Largest errors over the range of what a step of 2 ms gives.
-
-
 @dataclass(frozen=True)
 class Result:
     config: Config
-    figures: dict[str, Any]
-    growth: list[Growth]
+    numbers: dict[str, Any]
 
 
 def costs(config: Config) -> dict[str, Any]:
@@ -397,35 +378,13 @@ def run(config: Config) -> Result:
         )  # fmt: skip
     parts: dict[str, Callable[[Config], Any]] = {"costs": costs, "batches": batches, "growth": growth}
     parts |= {"peers": peers} if config.peers else {}
-    done = {name: part(config) for name, part in tqdm(parts.items(), unit="part")}
-    grown: list[Growth] = done.pop("growth")
-    cost, batch = done["costs"], done["batches"]
-    *chosen, equal = (cost[way] for way in ways(config))
-    rtol = next((r for r, one in zip(config.rtols, chosen) if exact_enough(one["errors"])), None)
-    own = chosen[-1] if rtol is None else cost[f"rtol = {rtol:g}"]
-    scenario_s = None if rtol is None else own["seconds"]["run"]
-    top = {
-        "scenario_wall_s": scenario_s, "scenario_rtol": rtol, "scenario_wall_s_loose": chosen[0]["seconds"]["run"],
-        "scenario_wall_s_tight": chosen[-1]["seconds"]["run"],
-        "scenario_wall_s_equal_steps": equal["seconds"]["run"],
-        **{name: own[name] for name in own if name.endswith("over_run")},
-        **{f"{name}_equal_steps": equal[name] for name in equal if name.endswith("over_run")},
-        "batch_sim_s_per_wall_s": batch["trajectories"]["simulated_per_wall"]["2"],
-        "batch_sim_s_per_wall_s_one_thread": batch["trajectories"]["simulated_per_wall"]["1"],
-        "batch_two_threads_over_one": batch["trajectories"]["two_threads_over_one"],
-    }  # fmt: skip
-    return Result(config, top | done | {"growth": [asdict(one) | {"exponent": one.exponent} for one in grown]}, grown)
+    return Result(config, {name: part(config) for name, part in tqdm(parts.items(), unit="part")})
 
 
 def worst(errors: dict[str, float]) -> dict[str, float]:
     """The largest errors of the motion and of the forces."""
     parts = {"motion": ("x_C", "y_C", "theta"), "forces": ("F_x", "F_y")}
     return {part: max(errors[name] for name in names) for part, names in parts.items()}
-
-
-def exact_enough(errors: dict[str, float]) -> bool:
-    """Whether a run is as exact as by a step of 2 ms."""
-    return all(error <= ACCURACY[part] for part, error in worst(errors).items())
 
 
 def cost_table(config: Config, numbers: dict[str, Any]) -> str:
@@ -461,38 +420,14 @@ def batch_table(numbers: dict[str, Any]) -> str:
 
 def tables(result: Result) -> str:
     """All tables."""
-    numbers = result.figures
-    parts = [cost_table(result.config, numbers), batch_table(numbers), growth_table(result.growth)]
+    numbers = result.numbers
+    parts = [cost_table(result.config, numbers), batch_table(numbers), growth_table(numbers["growth"])]
     return "\n\n".join([*parts, peers_table(numbers["peers"])] if "peers" in numbers else parts)
-
-
-def figure(result: Result) -> Figure:
-    """Wall times of the tasks by every way, of batches, and as they grow."""
-    numbers = result.figures
-    fig = Figure(figsize=(13, 4), layout="constrained")
-    left, middle, right = fig.subplots(1, 3)
-    every = list(ways(result.config))
-    for name in ("run", "gradient", "jacobian"):
-        left.plot(every, [numbers["costs"][way]["seconds"][name] for way in every], "o", label=name)
-    left.set(ylabel="wall time [s]", title=f"{result.config.duration:g} s of manipulation, one core", ylim=(0, None))
-    for threads in ("1", "2"):
-        rates = {name: one["simulated_per_wall"][threads] for name, one in numbers["batches"].items()}
-        middle.plot(list(rates), list(rates.values()), "o", label=f"threads: {threads}")
-    middle.set(ylabel="simulated s per wall s [1]", title="Batches", ylim=(0, None))
-    for one in result.growth:
-        right.loglog(one.values, one.wall_s, "o-", label=f"{one.over}: exponent {one.exponent:.2f}")
-    right.set(ylabel="wall time [s]", title="Growth")
-    for axes in (left, middle, right):
-        axes.legend(fontsize=8)
-    return fig
 
 
 def main() -> None:
     result = run(options(Config, __doc__))
-    print(json.dumps({k: v for k, v in result.figures.items() if not isinstance(v, dict | list)}, indent=2))
-    print(tables(result))
-    content = result.figures | {"made_by": made_by(result.config)}
-    write(result.config.out, content, {"benchmark": figure(result)}, tables(result))
+    write(result.config, result.numbers, table=tables(result))
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Parameters, Profile, Reference, SoftGrasp, press, simulate
-from torchsoft.experiment import grid, markdown, options, raw_config, write
+from torchsoft.experiment import grid, numbers, options, write
 from torchsoft.paper.equilibrium import holding_force
 from torchsoft.scenario import grasp_and_roll
 
@@ -104,15 +104,15 @@ def run(config: Config) -> Result:
     if config.smoke:
         config = replace(config, elements_x=(120,), points=(0, 2), places=5, gradient_mm=(0.0,), duration=0.8,
                          window=(0.5, 0.8))  # fmt: skip
-    numbers, curves = {}, {}
+    found, curves = {}, {}
     for case in tqdm(list(product(config.elements_x, config.points)), unit="case"):
-        numbers[case] = static(config, case)
+        found[case] = static(config, case)
         m = grasp_and_roll(build(*case))
         rolled = simulate(m.model, grid(config.duration, 5e-3), y0=m.y0)
         F_x = rolled["F_x"]
         curves[case] = detrended(rolled.t, F_x, config.window)
         errors = [gradient(case, 1e-3 * (config.node_mm + x)) for x in config.gradient_mm]
-        numbers[case] |= {
+        found[case] |= {
             "peak of F_x [mN]": 1e3 * F_x.abs().max().item(),
             "ripple of F_x [mN]": 0.5e3 * float(np.ptp(curves[case][1].numpy())),
             "theta at the end [rad]": rolled["theta"][-1].item(),
@@ -120,7 +120,7 @@ def run(config: Config) -> Result:
             "points that touch at the end": sum((force[-1, :, 0] > 0).sum().item() for force in rolled.force.values()),
             "Newton iterations a step": rolled.stats.newton_per_step,
         } | {f"gradient from differences over {d:g}": max(e[d] for e in errors) for d in errors[0]}
-    return Result(config, numbers, curves)
+    return Result(config, found, curves)
 
 
 def label(case: Key) -> str:
@@ -140,11 +140,10 @@ def figure(result: Result) -> Figure:
 
 def main(config: Config) -> None:
     result = run(config)
-    cases = {label(case): numbers for case, numbers in result.numbers.items()}
-    rows = [(name, *(f"{numbers[name]:.4g}" for numbers in cases.values())) for name in next(iter(cases.values()))]
-    table = markdown(("elements, points", *cases), rows)
-    print(f"\n{table}\n")
-    write(config.out, raw_config(config) | {"cases": cases}, {"contact_points": figure(result)}, table)
+    cases = {label(case): one for case, one in result.numbers.items()}
+    rows = {name: {case: one[name] for case, one in cases.items()} for name in next(iter(cases.values()))}
+    figures = {"contact_points": figure(result)}
+    write(config, {"cases": cases}, figures, numbers("elements, points", rows))
 
 
 if __name__ == "__main__":

@@ -9,14 +9,12 @@ by what is wrong and not by luck. An interval holds the truth or not; a warning 
 
 Command: .venv/bin/python experiments/validation/foreign_rigs.py [--smoke] [--only "mesh 240 x 6"] [--workers 2]
 Expected: every interval holds, or a warning names the cause; no case is silent. About a quarter of an hour on two cores, the
-recordings included, which are kept in the folder --out.
+recordings included.
 """
 
-import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from hashlib import sha256
 from pathlib import Path
 from time import perf_counter, process_time
 from typing import Any, NamedTuple
@@ -27,23 +25,18 @@ from tqdm import tqdm
 
 from torchsoft import Parameters, Reference, SoftGrasp
 from torchsoft.excitation import Chirp, Excitation, MultiSine, Press, Strokes, begin
-from torchsoft.experiment import COARSE, markdown, options, raw_config, write
-from torchsoft.files import replacing
+from torchsoft.experiment import COARSE, markdown, options, write
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, Unreachable, explain
 from torchsoft.sysid.recording import Array
-from torchsoft.sysid.runs import Runner, forget
+from torchsoft.sysid.runs import forget
 from torchsoft.threads import parallel_map
 
 TESTS = Path(__file__).parents[2] / "tests"
-sys.path.insert(0, str(TESTS))
+sys.path[:0] = str(TESTS), str(Path(__file__).parents[1])
 
 from foreign import Numbers, simulate  # noqa: E402  # pyright: ignore[reportMissingImports]
-
-TRUTH = {
-    "contact.K_n": 1.6e5, "contact.R_n": 300.0, "contact.K_t": 0.8e5, "contact.R_t": 600.0, "contact.mu_s": 0.65,
-    "contact.mu_k": 0.5, "pad.E": 0.9e6, "pad.tau": 0.012,
-}  # fmt: skip
+from identify_contact import TRUTH  # noqa: E402
 
 SMOKE_UNKNOWNS = ("contact.mu_s", "contact.K_n", "pad.E", "pad.tau")
 
@@ -93,12 +86,11 @@ def nominal(smoke: bool) -> Parameters:
 
 
 class Made(NamedTuple):
-    """One run: times (n,) [s] every `KEPT`, channels (n,) by name, the fastest slip [m/s], and the wall time [s]."""
+    """One run: times (n,) [s] every `KEPT`, channels (n,) by name, and the fastest slip [m/s]."""
 
     t: Array
     channels: dict[str, Array]
     slip: float
-    wall_s: float
 
 
 class Order(NamedTuple):
@@ -128,45 +120,31 @@ def numbers(settings: Parameters, differs: Mapping[str, Any]) -> Numbers:
     return Numbers(**known | {name.split(".")[1]: value for name, value in TRUTH.items()} | dict(differs))
 
 
-def make(order: Order, step: float, smoke: bool, folder: Path) -> Made:
-    """A run of the stranger's simulator, read where it has been made before: on steps of `step` and of twice that, extrapolated
-    to none, for the error of backward Euler is of first order. The literal law jumps, and is not extrapolated."""
-    fine = stepped(order, step, smoke, folder)
+def make(order: Order, step: float, smoke: bool) -> Made:
+    """A run of the stranger's simulator on steps of `step` and of twice that, extrapolated to none, for the error of backward
+    Euler is of first order. The literal law jumps, and is not extrapolated."""
+    fine = stepped(order, step, smoke)
     if dict(order.differs).get("literal"):
         return fine
-    coarse = stepped(order, 2 * step, smoke, folder)
-    channels = {name: 2 * value - coarse.channels[name] for name, value in fine.channels.items()}
-    return fine._replace(channels=channels, wall_s=fine.wall_s + coarse.wall_s)
+    coarse = stepped(order, 2 * step, smoke)
+    return fine._replace(channels={name: 2 * value - coarse.channels[name] for name, value in fine.channels.items()})
 
 
-def stepped(order: Order, step: float, smoke: bool, folder: Path) -> Made:
+def stepped(order: Order, step: float, smoke: bool) -> Made:
     """A run of the stranger's simulator on steps of `step` [s]."""
     excitation = excitations(smoke)[order.excitation]
     settings, reference = planned(excitation, smoke)
-    p = numbers(settings, dict(order.differs))
-    source = b"".join(path.read_bytes() for path in sorted((TESTS / "foreign").glob("*.py")))
-    about = json.dumps([p._asdict(), excitation.model_dump(mode="json"), step])
-    file = folder / f"{sha256(about.encode() + source).hexdigest()[:16]}.npz"
-    if not file.is_file():
-        count = round((excitation.duration + SETTLE) / step)
-        t = step * (np.arange(count + 1) - round(SETTLE / step))
-        signals = reference(torch.from_numpy(t), SIGNALS).detach().numpy()
-        began = perf_counter()
-        run = simulate(p, t, signals, round(KEPT / step))
-        rows = {"t": run.t, "slip": run.slip, "wall_s": np.array(perf_counter() - began), **run.channels}
-        folder.mkdir(parents=True, exist_ok=True)
-        with replacing(file) as partial, partial.open("wb") as stream:
-            np.savez(stream, **rows)
-    with np.load(file) as kept:
-        rows = {name: kept[name] for name in kept.files}
-    t, slip, wall = rows.pop("t"), rows.pop("slip"), float(rows.pop("wall_s"))
-    return Made(t, rows, float(slip.max()), wall)
+    count = round((excitation.duration + SETTLE) / step)
+    t = step * (np.arange(count + 1) - round(SETTLE / step))
+    signals = reference(torch.from_numpy(t), SIGNALS).detach().numpy()
+    run = simulate(numbers(settings, dict(order.differs)), t, signals, round(KEPT / step))
+    return Made(run.t, run.channels, float(np.max(run.slip)))
 
 
-def make_all(orders: Sequence[Order], step: float, smoke: bool, folder: Path, workers: int) -> dict[Order, Made]:
+def make_all(orders: Sequence[Order], step: float, smoke: bool, workers: int) -> dict[Order, Made]:
     """All runs, side by side in threads."""
     every = list(dict.fromkeys(orders))
-    work = parallel_map(lambda i: make(every[i], step, smoke, folder), len(every), workers)
+    work = parallel_map(lambda i: make(every[i], step, smoke), len(every), workers)
     return {every[i]: made for i, made in tqdm(work, desc="recordings", total=len(every), unit=" runs")}
 
 
@@ -300,8 +278,6 @@ class Outcome:
     refused: str
     wall_s: float
     cpu_s: float
-    differences_s: float
-    """Processor time that the fit's Jacobians alone would take by forward differences: a measured run for each unknown."""
 
     @property
     def warnings(self) -> list[str]:
@@ -344,8 +320,7 @@ class Outcome:
             "naming_the_cause": self.naming, "wrong": self.wrong, "refused": found is None,
             "chi2": None if found is None else found.chi2, "converged": None if found is None else found.converged,
             "recordings": list(case.excitations), "fastest_slip": max(one.slip for one in self.made),
-            "identify_wall_s": self.wall_s, "identify_cpu_s": self.cpu_s, "jacobians_by_differences_cpu_s": self.differences_s,
-            "recordings_wall_s": sum(one.wall_s for one in self.made),
+            "identify_wall_s": self.wall_s, "identify_cpu_s": self.cpu_s,
         }  # fmt: skip
 
 
@@ -380,7 +355,7 @@ def runs(case: Case, config: Config) -> Path:
 def study(case: Case, made: Mapping[Order, Made], config: Config) -> Outcome:
     """Identify one case."""
     mine, began = [made[order] for order in case.orders()], (perf_counter(), process_time())
-    found, refused, problem = None, "", None
+    found, refused = None, ""
     try:
         recordings = [
             case.recording(name, one, config.seed + 10 * k, config.smoke)
@@ -392,17 +367,8 @@ def study(case: Case, made: Mapping[Order, Made], config: Config) -> Outcome:
         )
     except (Unreachable, ValueError) as error:
         refused = str(error)
-    wall, cpu, differences = perf_counter() - began[0], process_time() - began[1], 0.0
-    if found is not None and problem is not None:
-        differences = found.cost["jacobians"] * (len(problem.coordinates) + 1) * a_run(problem, config)
-    return Outcome(case, truths(config), mine, found, refused, wall, cpu, differences)
-
-
-def a_run(problem: Problem, config: Config) -> float:
-    """Processor time of the mean recording's run [s], where the fit begins."""
-    began = process_time()
-    problem.residuals(Runner(problem.recordings), problem.coordinates.start, problem.names, config.rtol)
-    return (process_time() - began) / len(problem.recordings)
+    wall, cpu = perf_counter() - began[0], process_time() - began[1]
+    return Outcome(case, truths(config), mine, found, refused, wall, cpu)
 
 
 def run(config: Config) -> list[Outcome]:
@@ -410,21 +376,20 @@ def run(config: Config) -> list[Outcome]:
     config = replace(config, workers=1, step=5e-5) if config.smoke else config
     cases = chosen(config)
     orders = [order for case in cases for order in case.orders()]
-    made = make_all(orders, config.step, config.smoke, config.out / "recordings", config.workers)
+    made = make_all(orders, config.step, config.smoke, config.workers)
     outcomes = []
     for case in cases:
         outcomes.append(study(case, made, config))
         print(f"\n{case.name}: {outcomes[-1].verdict}", *outcomes[-1].warnings, sep="\n  ")
-        write(config.out, summary(config, outcomes), table=table(outcomes))
+        write(config, summary(outcomes))
     for case in cases:
         forget(runs(case, config))
     return outcomes
 
 
-def summary(config: Config, outcomes: list[Outcome]) -> dict[str, Any]:
+def summary(outcomes: list[Outcome]) -> dict[str, Any]:
     verdicts = [one.verdict for one in outcomes]
     return {
-        **raw_config(config),
         "noise": {channel: sensor.noise for channel, sensor in RIG.items()},
         "verdicts": {verdict: verdicts.count(verdict) for verdict in VERDICTS},
         "cases": [one.summary() for one in outcomes],
@@ -451,7 +416,7 @@ def table(outcomes: list[Outcome]) -> str:
 
 def main(config: Config) -> None:
     outcomes = run(config)
-    print("\n" + table(outcomes))
+    write(config, summary(outcomes), table=table(outcomes))
 
 
 if __name__ == "__main__":

@@ -1,35 +1,29 @@
-"""Question: how exact are the four routes to a gradient, in every contact mode, and what do they cost?
+"""Question: how exact are the two routes to a gradient, in every contact mode, and what do they cost?
 
 The loss over a window of outputs t_k is L = mean over k and i of (1/2 + (t_k - t_0)/(t_T - t_0)) (z_ki + z_ki^2 / 2), with
 z = (q - mean q) / std q of the nominal run, constants both, and q = (x_C, y_C, theta, v_C, omega, x_Br, y_Br, F_x, F_y).
 dL/dp for every scalar parameter p, the state at t_0 held, comes from
   discrete     the discrete adjoint of the implicit stepper,
   forward      forward sensitivities of the same steps, contracted with dL/dy,
-  unrolled     backpropagation through the plain torch step,
-  continuous   `torchdiffeq.odeint_adjoint` with dopri5 on the right-hand side,
 and is judged by central differences D(d) = (L(p + d) - L(p - d)) / 2d of the stepper at a Newton tolerance of 1e-10 N. Each
 neighbouring pair of relative steps d gives a Richardson value; the three in a row that agree best are the plateau, and their
 spread is the judge's own uncertainty. No gradient is looked at to choose the step.
 
 Windows: `stick` (gentle rolling in the grasp), `slip` (a 2 mm stroke in 20 ms with mu_s = 0.3, mu_k = 0.2, v_s = 50 mm/s),
 `make-break` (rolling at 4.4 mm/s), `grasp` (the bracket coming down from 20 um above touching) and `full` (the 30 s
-manipulation). The unrolled and the continuous route are slow, so they are run over a sub-window of a few steps about
-the window's first event, against central differences over that sub-window; the continuous one solves the ODE and not the
-steps, so it is compared with the discrete adjoint at a step of 1 us.
+manipulation).
 
-Further: the literal Coulomb law, whose force jumps at break-away unless mu_s = mu_k; and dL/dp through slip as the step is
-refined.
+Further: the literal Coulomb law, whose force jumps at break-away unless mu_s = mu_k. How far gradients depend on the step is in
+`step_accuracy.py`.
 
 Command: .venv/bin/python experiments/validation/gradient_accuracy.py [--smoke]
-Expected, largest error of the discrete and forward routes among parameters whose central difference is itself known to 1e-6:
-6e-7 in each of the short windows, 6e-6 over 30 s and 180 node events; elsewhere within the judge's uncertainty. Unrolled equals
-discrete to 3e-8. Backward at 0.3 to 0.8 of the forward run. Coulomb's law with mu_s > mu_k: the adjoint calls dL/dmu_s 0, the
-loss falls with a slope of -0.105 +- 0.01; with mu_s = mu_k they agree to 2e-4. Through slip dL/dmu_s is 9 % off at 2 ms. About
-seven minutes on one core.
+Expected, largest error of both routes among parameters whose central difference is itself known to 1e-6: 6e-7 in each of the
+short windows, 6e-6 over 30 s and 180 node events; elsewhere within the judge's uncertainty. With the adjoint a run takes 1.3
+to 1.9 times as long. Coulomb's law with mu_s > mu_k: it calls dL/dmu_s 0, the loss falls with a slope of -0.105 +- 0.01;
+with mu_s = mu_k they agree to 2e-4. About seven minutes on one core.
 """
 
 import statistics
-import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -39,19 +33,14 @@ from typing import Any
 import torch
 from matplotlib.figure import Figure
 from torch import Tensor
-from torchdiffeq import odeint_adjoint
 from tqdm import tqdm
 
 from torchsoft import Parameters, Profile, Reference, SoftGrasp, press, simulate
-from torchsoft.experiment import COARSE, at_the_points, made_by, markdown, options, timed
+from torchsoft.experiment import COARSE, at_the_points, markdown, options, timed
 from torchsoft.experiment import write as write_files
 from torchsoft.paper.equilibrium import holding_force
 from torchsoft.scenario import grasp_and_roll, reference
 from torchsoft.solve.trajectory import channels
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tests"))
-
-from unrolled import unrolled_solution  # pyright: ignore[reportMissingImports]
 
 NEWTON = 1e-10  # Newton's tolerance of every run here [N].
 
@@ -72,8 +61,6 @@ RADIUS = "disc.radius"
 FINER = {RADIUS: 1e-2}  # Factors on the relative steps of central differences.
 
 
-INSENSITIVE = 1e-6
-"""Part of the largest p dL/dp below which the continuous adjoint's gradient is not compared in relative terms."""
 Gradient = dict[str, float]
 
 
@@ -85,11 +72,7 @@ class Config:
     full_steps: tuple[float, ...] = (3e-5, 1e-5)  # the same over the whole manipulation, where a run takes a second
     coulomb_ms: float = 0.02  # step of the runs with Coulomb's law [ms]
     coulomb_runs: int = 81  # runs over which the slope of its loss is averaged
-    refinement_ms: tuple[float, ...] = (4.0, 2.0, 1.0, 0.5, 0.25, 0.125, 0.0625)
-    """steps of the convergence through slip [ms]; half the last is the reference"""
-    continuous_ms: float = 0.3
-    """length of the continuous adjoint's sub-window, with two outputs [ms]: 14 / tau times their spacing is 0.2"""
-    repeats: int = 5  # runs of which a time is the median (three for the continuous adjoint)
+    repeats: int = 5  # runs of which a time is the median
     duration: float = 30.0  # of the full window [s]
     only: tuple[str, ...] = ()  # scalar parameters; all of them if none is named
     changes: tuple[tuple[str, float | int], ...] = ()  # parameter overrides, a coarser mesh for instance
@@ -111,14 +94,10 @@ def linspace(start: float, end: float, step: float) -> Tensor:
     return torch.linspace(start, end, round((end - start) / step) + 1, dtype=torch.float64)
 
 
-def states(window: Window, route: str = "discrete") -> Tensor:
+def states(window: Window) -> Tensor:
     """The run (T, size), differentiable if gradients are on."""
     w = window
-    if route == "unrolled":
-        return unrolled_solution(w.model, w.y0, w.t, step=w.step)
-    if route == "continuous":
-        return odeint_adjoint(w.model, w.y0, w.t, method="dopri5", rtol=1e-8, atol=1e-11)  # pyright: ignore[reportReturnType]
-    return simulate(w.model, w.t, y0=w.y0, step=w.step, tolerance=NEWTON, gradient=route).y  # pyright: ignore[reportArgumentType]
+    return simulate(w.model, w.t, y0=w.y0, step=w.step, tolerance=NEWTON, gradient="discrete").y
 
 
 def signals(model: SoftGrasp, y: Tensor, t: Tensor) -> Tensor:
@@ -191,68 +170,58 @@ def central_differences(
     return value, unsure
 
 
-def relative_errors(got: Gradient, judge: Gradient, floor: Gradient | None = None) -> Gradient:
-    """|got - judge| / max(|judge|, floor); a gradient that both call exactly zero has no error."""
-    size = {n: max(abs(x), floor[n] if floor else 0.0) for n, x in judge.items()}
-    return {n: 0.0 if got[n] == x else abs(got[n] - x) / size[n] if size[n] else float("inf") for n, x in judge.items()}
+def relative_errors(got: Gradient, judge: Gradient) -> Gradient:
+    """|got - judge| / |judge|; a gradient that both call exactly zero has no error."""
+    return {n: 0.0 if got[n] == x else abs(got[n] - x) / abs(x) if x else float("inf") for n, x in judge.items()}
 
 
-def by_backward(
-    window: Window, loss: Callable[[Tensor], Tensor], run: Callable[[], Tensor], config: Config
+def by_backward(window: Window, loss: Callable[[Tensor], Tensor], config: Config) -> Gradient:
+    """Gradient by the discrete adjoint."""
+    loss(states(window)).backward()
+    return collect(window.model, scalars(window.model, config))
+
+
+def by_sensitivities(window: Window, loss: Callable[[Tensor], Tensor], config: Config) -> Gradient:
+    """Gradient by forward sensitivities of all parameters at once."""
+    chosen, w = scalars(window.model, config), window
+    how: dict[str, Any] = {"tolerance": NEWTON, "gradient": "forward", "wrt": list(chosen)}
+    run = simulate(w.model, w.t, y0=w.y0, step=w.step, **how)
+    assert run.sensitivities is not None
+    y = run.y.clone().requires_grad_(True)
+    y_bar, *direct = torch.autograd.grad(loss(y), (y, *chosen.values()), allow_unused=True)
+    explicit = torch.stack([torch.zeros_like(y_bar[0, 0]) if g is None else g for g in direct])
+    return dict(zip(chosen, (torch.einsum("ti,tin->n", y_bar, run.sensitivities) + explicit).tolist()))
+
+
+ROUTES = {"discrete": by_backward, "forward": by_sensitivities}
+
+
+def priced(
+    window: Window, loss: Callable[[Tensor], Tensor], config: Config, route: str
 ) -> tuple[Gradient, dict[str, float]]:
-    """Gradient of a route that is a forward run and a backward pass, and its median times over its own plain run."""
-    seconds: list[tuple[float, float, float]] = []
-    gradient: Gradient = {}
+    """Gradient of a route, the median time of a plain run [s], and the median time with the gradient over it."""
+    plain, total, gradient = [], [], Gradient()
     for _ in range(config.repeats):
         with torch.no_grad():
-            _, plain = timed(run)
-        value, forward = timed(lambda: loss(run()))
-        _, backward = timed(value.backward)
-        gradient = collect(window.model, scalars(window.model, config))
-        seconds.append((plain, backward, forward + backward))
-    plain, backward, total = (statistics.median(x) for x in zip(*seconds))
-    return gradient, {"forward_s": plain, "gradient": backward / plain, "total": total / plain}
-
-
-def by_sensitivities(
-    window: Window, loss: Callable[[Tensor], Tensor], config: Config
-) -> tuple[Gradient, dict[str, float]]:
-    """Gradient by forward sensitivities of all parameters at once, and its median times over the plain run."""
-    chosen, seconds = scalars(window.model, config), []
-    gradient: Gradient = {}
-    for _ in range(config.repeats):
-        with torch.no_grad():
-            _, plain = timed(lambda: states(window))
-
-        def contract() -> Tensor:
-            w, how = window, {"tolerance": NEWTON, "gradient": "forward", "wrt": list(chosen)}
-            run = simulate(w.model, w.t, y0=w.y0, step=w.step, **how)  # pyright: ignore[reportArgumentType]
-            assert run.sensitivities is not None
-            y = run.y.clone().requires_grad_(True)
-            y_bar, *direct = torch.autograd.grad(loss(y), (y, *chosen.values()), allow_unused=True)
-            explicit = torch.stack([torch.zeros_like(y_bar[0, 0]) if g is None else g for g in direct])
-            return torch.einsum("ti,tin->n", y_bar, run.sensitivities) + explicit
-
-        total, spent = timed(contract)
-        gradient = dict(zip(chosen, total.tolist()))
-        seconds.append((plain, spent - plain, spent))
-    plain, extra, spent = (statistics.median(x) for x in zip(*seconds))
-    return gradient, {"forward_s": plain, "gradient": extra / plain, "total": spent / plain}
+            plain.append(timed(lambda: states(window))[1])
+        gradient, spent = timed(lambda: ROUTES[route](window, loss, config))
+        total.append(spent)
+    forward_s = statistics.median(plain)
+    return gradient, {"forward_s": forward_s, "total": statistics.median(total) / forward_s}
 
 
 @torch.no_grad()
 def events(window: Window, y: Tensor) -> dict[str, Any]:
-    """Nodes that touch, leave, slip and begin to slip between the outputs, and the first row with such an event."""
+    """Nodes that touch, leave, slip and begin to slip between the outputs."""
     parts = [at_the_points(window.model, window.t[rows], y[rows]) for rows in torch.arange(len(y)).split(200)]
     depth, speed = (torch.cat(part) for part in zip(*parts))
     on = depth > 0
     slipping = (speed > 0) & on
     touch, leave, onset = on[1:] & ~on[:-1], on[:-1] & ~on[1:], slipping[1:] & ~slipping[:-1]
-    first = (touch | leave | onset).any(1).nonzero()[:, 0]
     return {
         "steps": len(y) - 1, "touching": on.sum(1).max().item(), "touch": touch.sum().item(),
         "leave": leave.sum().item(), "slipping": slipping.any(0).sum().item(), "slip_onsets": onset.sum().item(),
-        "fastest_slip_mm_s": 1e3 * (speed * on).max().item(), "first_row": first[0].item() if len(first) else 0,
+        "fastest_slip_mm_s": 1e3 * (speed * on).max().item(),
     }  # fmt: skip
 
 
@@ -292,50 +261,20 @@ def windows(config: Config) -> list[Window]:
 
 
 def judge_window(window: Window, config: Config) -> dict[str, Any]:
-    """Errors and costs of the routes over one window, the slow routes over the few steps about its first event."""
-    full = window.name == "full"
+    """Errors and costs of the routes over one window."""
     loss = make_loss(window)
     with torch.no_grad():
-        y = states(window)
-    found = events(window, y)
-    judge, unsure = central_differences(window, loss, config, config.full_steps if full else config.steps)
-    gradients, costs = {}, {}
-    gradients["discrete"], costs["discrete"] = by_backward(window, loss, lambda: states(window), config)
-    gradients["forward"], costs["forward"] = by_sensitivities(window, loss, config)
-    out: dict[str, Any] = {
+        found = events(window, states(window))
+    steps = config.full_steps if window.name == "full" else config.steps
+    judge, unsure = central_differences(window, loss, config, steps)
+    routes = {route: priced(window, loss, config, route) for route in ROUTES}
+    gradients = {route: gradient for route, (gradient, _) in routes.items()}
+    return {
         "events": found, "gradient": judge, "judge_uncertainty": unsure,
         "relative_error": {route: relative_errors(g, judge) for route, g in gradients.items()},
-        "discrete_against_forward": relative_errors(gradients["forward"], gradients["discrete"]), "cost_ratio": costs,
+        "discrete_against_forward": relative_errors(gradients["forward"], gradients["discrete"]),
+        "cost_ratio": {route: cost for route, (_, cost) in routes.items()},
     }  # fmt: skip
-    if full or (config.smoke and window.name != "slip"):
-        return out
-    begin = max(0, min(found["first_row"] - 1, len(window.t) - 4))
-    part = replace(window, y0=y[begin].clone(), t=window.t[begin : begin + 4])
-    loss = make_loss(part)
-    with torch.no_grad():
-        out["sub_window_events"] = events(part, states(part))
-    judge, unsure = central_differences(part, loss, config, config.steps)
-    out["judge_uncertainty_sub_window"] = unsure
-    exact, _ = by_backward(part, loss, lambda: states(part), config)
-    got, costs["unrolled"] = by_backward(part, loss, lambda: states(part, "unrolled"), config)
-    out["relative_error"]["unrolled"] = relative_errors(got, judge)
-    out["unrolled_against_discrete"] = relative_errors(got, exact)
-    with torch.no_grad():
-        start = states(part)[1 if begin else 0].clone()
-    t = part.t[1 if begin else 0] + 1e-3 * linspace(0.0, config.continuous_ms, config.continuous_ms / 2)
-    fine = replace(part, y0=start, t=t, step=1e-6)
-    loss = make_loss(fine)
-    exact, _ = by_backward(fine, loss, lambda: states(fine), replace(config, repeats=1))
-
-    few = replace(config, repeats=min(config.repeats, 3))
-    got, costs["continuous"] = by_backward(fine, loss, lambda: states(fine, "continuous"), few)
-    values = {n: p.item() for n, p in scalars(fine.model, config).items()}
-    largest = max(abs(values[n] * x) for n, x in exact.items())
-    floor = {n: INSENSITIVE * largest / value for n, value in values.items()}
-    out["relative_error"]["continuous"] = relative_errors(got, exact, floor)
-    with torch.no_grad():
-        out["continuous_events"] = events(fine, states(fine))
-    return out
 
 
 WIDTHS = (0.04, 0.02, 0.01)  # Relative half-widths over which the slope of a loss with steps is averaged.
@@ -380,61 +319,37 @@ def coulomb(config: Config) -> dict[str, Any]:
     return out
 
 
-def refinement(config: Config) -> dict[str, Any]:
-    """dL/dp through slip, at the same outputs, as the step is refined; errors against the finest step's."""
-    steps = [1e-3 * h for h in (*config.refinement_ms, config.refinement_ms[-1] / 2)]
-    names = ("contact.mu_s", "contact.mu_k", "contact.K_t")
-    base = stroke(config, 16e-3, steps[-1], {}, every=4e-3)
-    loss, table = make_loss(base), {}
-    for h in steps:
-        value = loss(states(replace(base, step=h)))
-        value.backward()
-        table[f"{1e3 * h:g}"] = {"loss": value.item(), **collect(base.model, names)}
-    with torch.no_grad():
-        dense = replace(base, t=linspace(0.0, 16e-3, 2.5e-4), step=2.5e-4)
-        found = events(dense, states(dense))
-    exact = list(table.values())[-1]
-    error = {key: {n: abs(row[n] - exact[n]) / abs(exact[n]) for n in exact} for key, row in list(table.items())[:-1]}
-    return {"events": found, "gradient": table, "relative_error": error}
-
-
 @dataclass(frozen=True)
 class Result:
     config: Config
     windows: dict[str, dict[str, Any]]
     coulomb: dict[str, Any]
-    refinement: dict[str, Any]
 
 
 def run(config: Config) -> Result:
     if config.smoke:  # the same questions for three parameters on a coarse mesh
         config = replace(
-            config, steps=(3e-4, 1e-4, 3e-5), full_steps=(1e-4, 1e-5), coulomb_ms=0.25, coulomb_runs=17, continuous_ms=0.1,
-            refinement_ms=(2.0, 1.0), repeats=1, duration=0.6, only=("contact.K_n", "contact.mu_s", "pad.E"),
+            config, steps=(3e-4, 1e-4, 3e-5), full_steps=(1e-4, 1e-5), coulomb_ms=0.25, coulomb_runs=17, repeats=1,
+            duration=0.6, only=("contact.K_n", "contact.mu_s", "pad.E"),
             changes=tuple(COARSE.items()),
         )  # fmt: skip
     judged = {window.name: judge_window(window, config) for window in tqdm(windows(config), unit="window")}
-    return Result(config, judged, coulomb(config), refinement(config))
+    return Result(config, judged, coulomb(config))
 
 
 def table(result: Result) -> str:
-    """Markdown: per window and route the largest error and the cost; then the Coulomb bias and the convergence."""
+    """Markdown: per window and route the largest error and the cost; then the Coulomb bias."""
     rows = []
     for name, window in result.windows.items():
         for route, errors in window["relative_error"].items():
             worst, cost = max(errors, key=lambda n: errors[n]), window["cost_ratio"][route]
-            key = {"unrolled": "sub_window_events", "continuous": "continuous_events"}.get(route, "events")
-            e, unsure = window[key], window["judge_uncertainty" + ("" if key == "events" else "_sub_window")]
-            if route == "continuous":  # judged by the discrete adjoint
-                unsure = dict.fromkeys(errors, 0.0)
+            e, unsure = window["events"], window["judge_uncertainty"]
             known = max((errors[n] for n in errors if unsure[n] <= 1e-6), default=float("nan"))
             counts = f"{e['touch']} / {e['leave']} / {e['slip_onsets']}"
             largest = f"{errors[worst]:.1e} ({worst}, {unsure[worst]:.0e})"
-            rows.append(
-                (name, counts, route, largest, f"{known:.1e}", f"{cost['gradient']:.2f}", f"{cost['total']:.2f}")
-            )
+            rows.append((name, counts, route, largest, f"{known:.1e}", f"{cost['total']:.2f}"))
     head = ("window", "touch / leave / slip onsets", "route", "largest error (parameter, judge's own uncertainty)",
-            "largest where the judge knows 1e-6", "gradient / forward", "total / forward")  # fmt: skip
+            "largest where the judge knows 1e-6", "total / forward")  # fmt: skip
     tables = [markdown(head, rows)]
     rows = [
         (label, f"{c['adjoint']:.4g}", f"{c['slope']:.3g} +- {c['uncertainty']:.1g}",
@@ -442,26 +357,18 @@ def table(result: Result) -> str:
         for label, c in result.coulomb.items()
     ]  # fmt: skip
     tables.append(markdown(("Coulomb, literal: dL/dmu", "adjoint", "slope of L", "by width"), rows))
-    refined = result.refinement["relative_error"]
-    names = list(next(iter(refined.values())))
-    rows = [(step, *(f"{errors[n]:.1e}" for n in names)) for step, errors in refined.items()]
-    tables.append(markdown(("step [ms]", *names), rows))
     return "\n\n".join(tables)
 
 
 def figure(result: Result) -> Figure:
-    """Errors of the discrete adjoint per parameter and window; convergence through slip; Coulomb's jumps."""
-    fig = Figure(figsize=(15, 5), layout="constrained")
-    errors, refined, jumps = fig.subplots(1, 3)
+    """Errors of the discrete adjoint per parameter and window; Coulomb's jumps."""
+    fig = Figure(figsize=(11, 5), layout="constrained")
+    errors, jumps = fig.subplots(1, 2)
     for name, numbers in result.windows.items():
         row = numbers["relative_error"]["discrete"]
         errors.semilogy([n.split(".")[-1] for n in row], [max(e, 1e-16) for e in row.values()], "o", label=name)
     errors.tick_params(axis="x", rotation=45)
     errors.set(ylabel="relative error [1]", title="Discrete adjoint against central differences")
-    steps = result.refinement["relative_error"]
-    for name in next(iter(steps.values())):
-        refined.loglog([float(h) for h in steps], [row[name] for row in steps.values()], "o-", label=name)
-    refined.set(xlabel="step [ms]", ylabel="relative error [1]", title="dL/dp through slip against the finest step")
     for k, (label, c) in enumerate(result.coulomb.items()):
         mu, L = torch.tensor(c["mu"]), torch.tensor(c["loss"])
         jumps.plot(mu, L - L.mean(), f"C{k}.", ms=3, label=f"L by {label}")
@@ -469,21 +376,19 @@ def figure(result: Result) -> Figure:
     jumps.set(
         xlabel="mu [1]", ylabel="L less its mean [1]", title="Coulomb's law to the letter; lines: the adjoint's slope"
     )
-    for axes in (errors, refined, jumps):
+    for axes in (errors, jumps):
         axes.legend(fontsize=8)
     return fig
 
 
 def write(result: Result) -> None:
     """summary.json, table.md and gradient_accuracy.png into the output folder."""
-    parts = {name: getattr(result, name) for name in ("windows", "coulomb", "refinement")}
-    files = parts | {"made_by": made_by(result.config)}
-    write_files(result.config.out, files, {"gradient_accuracy": figure(result)}, table(result))
+    parts = {name: getattr(result, name) for name in ("windows", "coulomb")}
+    write_files(result.config, parts, {"gradient_accuracy": figure(result)}, table(result))
 
 
 def main() -> None:
     result = run(options(Config, __doc__))
-    print("\n" + table(result) + "\n")
     write(result)
 
 

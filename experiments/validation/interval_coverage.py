@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from torchsoft import Parameters
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes
-from torchsoft.experiment import COARSE, markdown, options, raw_config, write
+from torchsoft.experiment import COARSE, markdown, options, write
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Stage, identify, record
 from torchsoft.sysid.estimate import Estimate, estimates
 from torchsoft.sysid.fit import chord, fisher
@@ -206,11 +206,9 @@ def main(config: Config) -> None:
         "sd of that",
     )
     table = markdown(head, cells)
-    print(table)
     for case, row in rows.items():
         print(f"{case}: notices {row['notices']}, orders found {row['orders']}")
-    summary = {**raw_config(result.config), "seeds": n, "cases": rows}
-    write(result.config.out, summary, {"interval_coverage": figure(result)}, table)
+    write(result.config, {"seeds": n, "cases": rows}, {"interval_coverage": figure(result)}, table)
 
 
 if __name__ == "__main__":

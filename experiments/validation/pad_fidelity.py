@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from torchsoft import Parameters, Profile, SoftGrasp, Trajectory, simulate
-from torchsoft.experiment import grid, made_by, markdown, options, write
+from torchsoft.experiment import grid, markdown, options, write
 from torchsoft.scenario import grasp_and_roll
 
 UNITS = {
@@ -91,9 +91,7 @@ def table(result: Result) -> str:
 
 def main() -> None:
     result = run(options(Config, __doc__))
-    print(table(result), end="\n\n")
-    summary = {"differences": result.differences, "made_by": made_by(result.config)}
-    write(result.config.out, summary, table=table(result))
+    write(result.config, {"differences": result.differences}, table=table(result))
 
 
 if __name__ == "__main__":

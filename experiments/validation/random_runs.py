@@ -33,13 +33,12 @@ from time import monotonic, process_time, sleep
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib.figure import Figure
 from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import NoEquilibrium, Parameters, SimulationFailed, SoftGrasp, simulate
 from torchsoft.excitation import Chirp, Excitation, MultiSine, Press, Roll, RunContext, Strokes, begin
-from torchsoft.experiment import grid, made_by, markdown, options, write
+from torchsoft.experiment import grid, markdown, options, write
 from torchsoft.paper.equilibrium import holding_force, press, rest
 from torchsoft.physics.motion import FADE
 from torchsoft.processes import local_processes
@@ -149,19 +148,15 @@ class Config:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended: its kind, the sentence if it failed, the simulated time it reached [s], its wall time [s], the
-    processor's time [s], the wall time of its steps [s], and counters."""
+    """How a run ended: its kind, the sentence if it failed, its wall time [s], the processor's time [s], steps and those
+    refused."""
 
     kind: str
     sentence: str = ""
-    reached: float = 0.0
     wall_s: float = 0.0
     cpu_s: float = 0.0
-    stepping_s: float = 0.0
     steps: int = 0
     refused: int = 0
-    failed: int = 0
-    doubts: int = 0
 
 
 @dataclass(frozen=True)
@@ -200,8 +195,8 @@ def prepare(number: int, seed: int) -> tuple[Drawn, list[Outcome]]:
 
 def outcome(drawn: Drawn, steps: dict[str, Any]) -> Outcome:
     """One run by one way."""
-    with warnings.catch_warnings(record=True) as doubts:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
         began, ticked = monotonic(), process_time()
         try:
             run, end, said = simulate(drawn.begun.model, drawn.t, y0=drawn.begun.y0, **steps), FINISHED, ""
@@ -212,10 +207,7 @@ def outcome(drawn: Drawn, steps: dict[str, Any]) -> Outcome:
         return Outcome(end, said, wall_s=wall, cpu_s=cpu)
     if end == FINISHED and not (run.y.isfinite().all() and all(x.isfinite().all() for x in run.channels.values())):
         end = NOT_FINITE
-    s = run.stats
-    return Outcome(
-        end, said, float(run.t[-1]), wall, cpu, s.wall_s, s.steps, s.refused_steps, s.failed_steps, len(doubts)
-    )
+    return Outcome(end, said, wall, cpu, run.stats.steps, run.stats.refused_steps)
 
 
 Ends = tuple[str, dict[str, Outcome], list[Outcome]]
@@ -308,9 +300,8 @@ def summary(result: Result) -> dict[str, Any]:
             "median_cpu_s": median(one.cpu_s for one in done) if done else None,
             "longest_wall_s": max((one.wall_s for one in every), default=0.0),
             "longest_cpu_s": max((one.cpu_s for one in every), default=0.0),
-            "longest_stepping_s": max((one.stepping_s for one in every), default=0.0),
             "most_steps": max((one.steps + one.refused for one in every), default=0),
-            "with_doubts": sum(one.doubts > 0 for one in done), "slowest": {str(n): asdict(ends[n]) for n in slowest},
+            "slowest": {str(n): asdict(ends[n]) for n in slowest},
         }  # fmt: skip
     return out
 
@@ -324,31 +315,16 @@ def table(numbers: dict[str, Any]) -> str:
         "median processor time of those finished [s]": "median_cpu_s",
         "longest processor time [s]": "longest_cpu_s",
         "longest wall time [s]": "longest_wall_s",
-        "longest wall time in steps [s]": "longest_stepping_s",
         "most steps, refused ones included": "most_steps",
     }
     rows += [(title, *(f"{numbers[way][key] or 0:.3g}" for way in ways)) for title, key in measured.items()]
     return markdown((f"of {numbers['runs']} runs", *ways), rows)
 
 
-def figure(result: Result) -> Figure:
-    """How runs ended."""
-    fig = Figure(figsize=(9, 4), layout="constrained")
-    axes = fig.subplots()
-    for height, (way, ends) in zip((0.8, 0.4), result.outcomes.items()):
-        counts = Counter(one.kind for one in ends.values())
-        axes.barh(list(counts), list(counts.values()), height, label=f"by {way}", log=True)
-    axes.set(xlabel="runs", title=f"How {len(result.motions)} random runs ended")
-    axes.legend()
-    return fig
-
-
 def main() -> None:
     result = run(options(Config, __doc__))
     numbers = summary(result)
-    print(table(numbers))
-    content = numbers | {"made_by": made_by(result.config)}
-    write(result.config.out, content, {"random_runs": figure(result)}, table(numbers))
+    write(result.config, numbers, table=table(numbers))
 
 
 if __name__ == "__main__":

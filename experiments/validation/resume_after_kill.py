@@ -37,7 +37,7 @@ from tqdm import tqdm
 from torchsoft import Parameters
 from torchsoft.channels import CHANNELS
 from torchsoft.excitation import Excitation, Roll, Strokes
-from torchsoft.experiment import COARSE, markdown, options, raw_config, write
+from torchsoft.experiment import COARSE, markdown, options, write
 from torchsoft.sysid import Recording, Sensor, record
 
 SENSORS = {"x_C": Sensor(noise=1e-5), "theta": Sensor(noise=5e-4), "y_Br": Sensor(noise=1e-5), "F_y": Sensor(noise=0.1)}
@@ -263,13 +263,12 @@ def main(config: Config) -> None:
         "answer",
     )
     shown = markdown(head, rows)
-    print(shown)
     print(f"{same} of {len(result.cases)} the same to the bit; undisturbed {result.seconds:.1f} s, {result.runs} runs")
     summary = {
-        **raw_config(result.config), "undisturbed_s": result.seconds, "runs": result.runs, "same": same,
+        "undisturbed_s": result.seconds, "runs": result.runs, "same": same,
         "cases": [one._asdict() for one in result.cases],
     }  # fmt: skip
-    write(result.config.out, summary, table=shown)
+    write(result.config, summary, table=shown)
 
 
 if __name__ == "__main__":

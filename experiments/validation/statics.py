@@ -25,7 +25,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import Parameters, SoftGrasp, press
-from torchsoft.experiment import made_by, markdown, options
+from torchsoft.experiment import numbers, options
 from torchsoft.experiment import write as write_files
 from torchsoft.paper.equilibrium import holding_force
 
@@ -145,15 +145,15 @@ def full_grasp(curves: dict[str, Curve]) -> dict[str, dict[str, float]]:
     }
 
 
-def table(title: str, curves: dict[str, Curve]) -> str:
-    """The full grasp as a Markdown table, with the relative difference from the next row."""
-    rows, steps = full_grasp(curves), successive(curves)
-    names = list(next(iter(rows.values())))
-    cells = []
-    for key, row in rows.items():
-        step = f"{steps[key]['full_grasp']:.2%}" if key in steps else ""
-        cells.append((key, *(f"{row[name]:.5g}" for name in names), step))
-    return markdown((title, *names, "to the next"), cells)
+def table(result: Result) -> str:
+    """The full grasps as Markdown tables, with the relative difference from the next row."""
+    out = []
+    for name, family in result.families.items():
+        rows = full_grasp(family.curves)
+        for key, step in successive(family.curves).items():
+            rows[key]["to the next"] = step["full_grasp"]
+        out.append(f"{numbers(name, rows, 5)}\n\nlimit: {family.limit:.2f} N")
+    return "\n\n".join(out)
 
 
 def figure(result: Result) -> Figure:
@@ -187,18 +187,16 @@ def summary(result: Result) -> dict[str, Any]:
         }
         for name, family in result.families.items()
     }
-    return out | {"made_by": made_by(result.config)}
+    return out
 
 
 def write(result: Result) -> None:
-    """`summary.json` and `statics.png` in the configured folder."""
-    write_files(result.config.out, summary(result), {"statics": figure(result)})
+    """`summary.json`, `table.md` and `statics.png` in the configured folder."""
+    write_files(result.config, summary(result), {"statics": figure(result)}, table(result))
 
 
 def main() -> None:
     result = run(options(Config, __doc__))
-    for name, family in result.families.items():
-        print(f"\n{table(name, family.curves)}\n\nlimit: {family.limit:.2f} N")
     write(result)
 
 

@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from torchsoft import Parameters, SoftGrasp, Trajectory, simulate
 from torchsoft.excitation import Excitation, MultiSine, Strokes, begin
-from torchsoft.experiment import grid, made_by, markdown, options, timed, write
+from torchsoft.experiment import grid, numbers, options, timed, write
 from torchsoft.scenario import grasp_and_roll
 
 EIGHT = ("contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau")
@@ -116,7 +116,7 @@ COLUMNS = ("steps", "wall_s", "with_gradient_s", "x_C", "y_C", "theta", "F_x", "
 
 def table(rows: dict[str, dict[str, Any]]) -> str:
     """A Markdown table of one motion."""
-    return markdown(("", *COLUMNS), [(key, *(f"{row[name]:.3g}" for name in COLUMNS)) for key, row in rows.items()])
+    return numbers("", {key: {name: row[name] for name in COLUMNS} for key, row in rows.items()}, 3)
 
 
 def figure(result: Result) -> Figure:
@@ -135,11 +135,8 @@ def figure(result: Result) -> Figure:
 
 def main() -> None:
     result = run(options(Config, __doc__))
-    for title, rows in result.motions.items():
-        print(f"\n{title}\n\n{table(rows)}")
-    content = {"motions": result.motions, "made_by": made_by(result.config)}
     tables = "\n\n".join(f"{title}\n\n{table(rows)}" for title, rows in result.motions.items())
-    write(result.config.out, content, {"step_accuracy": figure(result)}, tables)
+    write(result.config, {"motions": result.motions}, {"step_accuracy": figure(result)}, tables)
 
 
 if __name__ == "__main__":

@@ -13,8 +13,7 @@ from contextlib import contextmanager
 from importlib.metadata import version
 
 from torchsoft.cli import identify, material, rigs
-from torchsoft.cli.failure import failed
-from torchsoft.cli.results import say
+from torchsoft.cli.results import failed, say
 
 GRACE = 1.5
 """Time [s] that a command has to hear Ctrl-C, before its process ends at once: a factorisation does not hear it."""

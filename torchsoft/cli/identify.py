@@ -5,8 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.failure import failed
-from torchsoft.cli.results import add_out, say, try_folder
+from torchsoft.cli.results import add_out, failed, say, try_folder
 
 IDENTIFY = """\
 Which parameters explain these recordings, and how sure is that?
@@ -92,10 +91,6 @@ def identify(options: argparse.Namespace) -> int:
             verdict = compared(case, fit, options) if case.laws else ""
         except Unreachable as error:
             return failed(measured.unreachable(error, tables))
-        except (ValueError, RuntimeError) as error:  # a model without equilibrium, a worker that was killed
-            return failed(str(error))
-        except OSError as error:
-            return failed(f"{error.filename}: {error.strerror}" if error.filename else str(error))
     except KeyboardInterrupt:
         say(f"\ninterrupted; what is done so far is in {unfinished}, and the same command continues", error=True)
         return 130

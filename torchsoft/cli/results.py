@@ -1,4 +1,4 @@
-"""The folder that a command writes its results to."""
+"""Results of a command: the folder that they are written to, and sentences on the terminal."""
 
 import sys
 from pathlib import Path
@@ -6,7 +6,7 @@ from tempfile import TemporaryFile
 from typing import Any
 
 from torchsoft.files import claim
-from torchsoft.tables import plain
+from torchsoft.tables import line, plain
 
 
 def add_out(command: Any, **more: Any) -> None:
@@ -18,6 +18,12 @@ def add_out(command: Any, **more: Any) -> None:
 def say(*text: object, error: bool = False) -> None:
     """Print text without characters that a terminal obeys."""
     print(plain(" ".join(map(str, text))), file=sys.stderr if error else sys.stdout)
+
+
+def failed(reason: str) -> int:
+    """Say why a command failed; its exit status."""
+    print(f"torchsoft: error: {line(reason, 2000)}", file=sys.stderr)
+    return 2
 
 
 def try_folder(out: Path, force: bool) -> None:

@@ -5,8 +5,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from torchsoft.cli.failure import failed
-from torchsoft.cli.results import add_out, say, try_folder
+from torchsoft.cli.results import add_out, failed, say, try_folder
 
 RUN = """\
 Simulates the rig that a TOML file describes, and writes trajectory.nc, summary.json, figures and a video to a folder.

@@ -85,14 +85,14 @@ class Graph:
             total = self("add", total, node)
         return total
 
-    def lookup(self, index: int, entries: Sequence[int]) -> int:
+    def lookup(self, entries: Sequence[int], index: int) -> int:
         """entries[index] of a whole number, entry 0 where there is none of that number. Parameters that stand equally far apart
         are read from their place; other entries are chosen among."""
         place = self.value(index)
         if place is not None:
             return entries[int(place)]
         if all(self.ops[entry] == "stop" for entry in entries):
-            return self("stop", self.lookup(index, [self.args[entry][0] for entry in entries]))
+            return self("stop", self.lookup([self.args[entry][0] for entry in entries], index))
         first, *rest = (self.args[entry][0] if self.ops[entry] == "p" else -1 for entry in entries)
         stride = rest[0] - first if rest else 1
         if first >= 0 and rest == [first + stride * (i + 1) for i in range(len(rest))]:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchsoft.codegen.graph import Graph
-from torchsoft.codegen.operations import CONSTANT, ELEMENTWISE, MOVES, READS, WHOLE, Nodes, mapped
+from torchsoft.codegen.operations import COMPOSED, CONSTANT, ELEMENTWISE, MOVES, READS, WHOLE, Nodes, mapped
 
 try:
     from torch.overrides import TorchFunctionMode
@@ -112,9 +112,12 @@ class Trace(TorchDispatchMode):
         if func._schema.is_mutable and name not in MOVES:
             raise self.refused(f"the in-place operation {func}", "make a new tensor, for example by torch.stack")
         whole = any(isinstance(x, Tensor) and x.dtype == torch.int64 for x in tree_leaves((args, kwargs)))
-        if (name not in MOVES and name not in WHOLE and name not in ELEMENTWISE) or (whole and name in _BITWISE):
+        if not any(name in table for table in (MOVES, WHOLE, ELEMENTWISE, COMPOSED)) or (whole and name in _BITWISE):
             raise self.refused(f"the operation {func}", "it has no rule, so write it with other operations")
         try:
+            if name in COMPOSED:
+                with self:
+                    return COMPOSED[name](*args, **kwargs)
             nodes = self._recorded(name, func, args, kwargs)
         except UnknownOperation:
             raise
@@ -156,13 +159,17 @@ class Trace(TorchDispatchMode):
         arrays = [self.nodes(v) if isinstance(v, Tensor) else self._constant(v) for v in values]
         entries = [i for i, array in enumerate(arrays) if array is not None]
 
+        given = [array for array in arrays if array is not None]
+        if len(given) == len(args) == len(values):
+            return mapped(partial(rule, self.graph), *given)
+
         def one(*nodes: int) -> int:
             filled = list(values)
             for i, node in zip(entries, nodes):
                 filled[i] = node
             return rule(self.graph, *filled[: len(args)], **dict(zip(kwargs, filled[len(args) :])))
 
-        return mapped(one, *(array for array in arrays if array is not None))
+        return mapped(one, *given)
 
     def _constant(self, value: Any) -> Nodes | None:
         return np.asarray(self.graph.constant(value)) if isinstance(value, bool | int | float) else None

@@ -96,7 +96,10 @@ def read(
                 raise ValueError(f"{path}: nothing is to be divided by the `{name}`")
         strain, stress = (one, values["modulus"]) if own == "relaxation" else (values["compliance"], one)
         return Measured(path, own, values["t"], strain, stress, per_load=True)
-    strain, stress = strain_of(path, values, length), stress_of(path, values, area)
+    gauge = "an elongation needs the gauge length, `length` [m]"
+    section = "a force needs the cross-section, `area` [m2]"
+    strain = nominal(path, values, ("strain", "stretch", "elongation"), "length", length, gauge)
+    stress = nominal(path, values, ("stress", "force"), "area", area, section)
     for name, x in (("strain", strain), ("stress", stress)):
         if not np.abs(x).max() > 0:
             raise ValueError(f"{path}: the {name} is zero throughout")
@@ -112,35 +115,21 @@ def held(strain: Array, stress: Array) -> Test:
     return "relaxation" if change[0] <= change[1] else "creep"
 
 
-def strain_of(path: Path, values: dict[str, Array], length: float | None) -> Array:
-    """Nominal strain (n,) [1]. Raises `ValueError` unless it is given in one way."""
-    name = only(path, values, "strain", "stretch", "elongation")
-    if (length is not None) != (name == "elongation"):
-        needs = (
-            "an elongation needs the gauge length, `length` [m]" if length is None else f"`{name}` needs no `length`"
-        )
-        raise ValueError(f"{path}: {needs}")
-    if name == "elongation":
-        return values[name] / positive("length", length)
-    return values[name] - 1.0 if name == "stretch" else values[name]
-
-
-def stress_of(path: Path, values: dict[str, Array], area: float | None) -> Array:
-    """Nominal stress (n,) [Pa]. Raises `ValueError` unless it is given in one way."""
-    name = only(path, values, "stress", "force")
-    if (area is not None) != (name == "force"):
-        needs = "a force needs the cross-section, `area` [m2]" if area is None else f"`{name}` needs no `area`"
-        raise ValueError(f"{path}: {needs}")
-    return values[name] / positive("area", area) if name == "force" else values[name]
-
-
-def only(path: Path, values: dict[str, Array], *names: str) -> str:
-    """The one of the columns that is there. Raises `ValueError` for none, and for several."""
+def nominal(
+    path: Path, values: dict[str, Array], names: tuple[str, ...], option: str, size: float | None, needs: str
+) -> Array:
+    """Nominal strain [1] or stress [Pa] (n,) from the one of the columns `names` that is there, the last over `size`. Raises
+    `ValueError` unless it is given in one way."""
     there = [name for name in names if name in values]
     if len(there) != 1:
         found = f"has {' and '.join(there)}" if there else "has none of them"
         raise ValueError(f"{path} needs one of the columns {', '.join(names)}, but {found}")
-    return there[0]
+    (name,), divided = there, there[0] == names[-1]
+    if (size is not None) != divided:
+        raise ValueError(f"{path}: {needs if size is None else f'`{name}` needs no `{option}`'}")
+    if divided:
+        return values[name] / positive(option, size)
+    return values[name] - 1.0 if name == "stretch" else values[name]
 
 
 def check_rows(path: Path, table: csvfile.Numbers) -> None:

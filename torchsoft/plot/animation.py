@@ -1,17 +1,14 @@
 """Videos: bodies, deformed pads and contact forces over the whole run, of any rig; the paper's among them."""
 
 import importlib.util
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.artist import Artist
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
-from matplotlib.text import Text
 from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
@@ -20,7 +17,7 @@ from torchsoft.files import replacing
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.rig import Rig
 from torchsoft.plot.figures import ACTUAL, DESIRED, STYLE, timeline
-from torchsoft.plot.general import Curve, curves
+from torchsoft.plot.general import curves
 from torchsoft.plot.scene import (
     DISC,
     FRICTION,
@@ -29,7 +26,6 @@ from torchsoft.plot.scene import (
     NORMAL,
     PAD,
     STEEL,
-    Instant,
     Scene,
     force_scale,
     instants,
@@ -55,55 +51,39 @@ def frame_times(trajectory: Trajectory, frames: int, even: bool = False) -> Arra
     return np.concatenate((np.linspace(start, slow, grasp), np.linspace(slow, end, frames - grasp + 1)[1:]))
 
 
-class Stage(NamedTuple):
-    """The picture's canvas, and what moves on it."""
-
-    canvas: FigureCanvasAgg
-    scene: Scene
-    cursor: Line2D
-    clock: Text
-
-
-@rc_context(STYLE)
-def set_stage(trajectory: Trajectory, rig: Rig, shown: Sequence[Instant], dpi: int, title: str, follow: Curve) -> Stage:
-    """Everything that stays: axes, legend, the curve of a coordinate over time."""
+def render(trajectory: Trajectory, rig: Rig, times: Array, dpi: int, title: str, follow: str) -> Iterator[Picture]:
+    """RGB pictures (height, width, 3) at `times` [s]: the scene, and a coordinate over time under it. The axes are drawn once;
+    per picture only what moves."""
+    shown = instants(rig, trajectory, times.tolist())
+    curve = next(curve for curve in curves(trajectory, rig) if curve.name == follow)
     scale = force_scale(rig, shown)
     x_limits, y_limits = Scene(Figure().subplots(), rig, curves=scale).limits(shown)
     tall = (y_limits[1] - y_limits[0]) / (x_limits[1] - x_limits[0])
-    figure = Figure(figsize=(8.0, min(max(5.8, 7.0 * tall + 2.2), 8.6)), dpi=dpi, layout="constrained")
-    canvas = FigureCanvasAgg(figure)
-    whole, strip = figure.subplots(2, 1, height_ratios=(figure.get_figheight() - 1.26, 1.26))
-    scene = Scene(whole, rig, columns=5, curves=scale)
-    whole.set(xlim=x_limits, ylim=y_limits, xlabel="x [mm]", ylabel="y [mm]")
-    scene.scale_bar(whole)
-    whole.set_title(title)
-    whole.grid(False)
-    whole.plot([], [], "o-", color=NORMAL, ms=3, label="normal force")
-    whole.plot([], [], color=FRICTION, label=f"friction ({outwards(rig, shown[0])})")
-    whole.legend(loc="lower left")
-    t = timeline(strip, follow.label, trajectory)
-    if follow.setpoint is not None:
-        strip.plot(t, follow.setpoint, color=DESIRED, lw=3, label="desired")
-    strip.plot(t, follow.values, color=ACTUAL, lw=1, label="actual")
-    if follow.setpoint is not None:
-        strip.legend(loc="lower right", ncols=2)
-    strip.set_xlabel("time [s]")
-    (cursor,) = strip.plot([], [], "o", color=INK, ms=6)
-    clock = whole.text(0.012, 0.97, "", transform=whole.transAxes, va="top", family="monospace", fontsize=12)
-    clock.set_bbox({"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 2})
-    return Stage(canvas, scene, cursor, clock)
-
-
-def render(trajectory: Trajectory, rig: Rig, times: Array, dpi: int, title: str, follow: str) -> Iterator[Picture]:
-    """RGB pictures (height, width, 3) at `times` [s]. The axes are drawn once; per picture only what moves."""
-    shown = instants(rig, trajectory, times.tolist())
-    curve = next(curve for curve in curves(trajectory, rig) if curve.name == follow)
-    canvas, scene, cursor, clock = set_stage(trajectory, rig, shown, dpi, title, curve)
+    with rc_context(STYLE):
+        figure = Figure(figsize=(8.0, min(max(5.8, 7.0 * tall + 2.2), 8.6)), dpi=dpi, layout="constrained")
+        canvas = FigureCanvasAgg(figure)
+        whole, strip = figure.subplots(2, 1, height_ratios=(figure.get_figheight() - 1.26, 1.26))
+        scene = Scene(whole, rig, columns=5, curves=scale)
+        whole.set(xlim=x_limits, ylim=y_limits, xlabel="x [mm]", ylabel="y [mm]", title=title)
+        scene.scale_bar(whole)
+        whole.grid(False)
+        whole.plot([], [], "o-", color=NORMAL, ms=3, label="normal force")
+        whole.plot([], [], color=FRICTION, label=f"friction ({outwards(rig, shown[0])})")
+        whole.legend(loc="lower left")
+        t = timeline(strip, curve.label, trajectory)
+        if curve.setpoint is not None:
+            strip.plot(t, curve.setpoint, color=DESIRED, lw=3, label="desired")
+        strip.plot(t, curve.values, color=ACTUAL, lw=1, label="actual")
+        if curve.setpoint is not None:
+            strip.legend(loc="lower right", ncols=2)
+        (cursor,) = strip.plot([], [], "o", color=INK, ms=6)
+        clock = whole.text(0.012, 0.97, "", transform=whole.transAxes, va="top", family="monospace", fontsize=12)
+        clock.set_bbox({"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 2})
     moving: list[Artist] = [*scene.moving, clock, cursor]
     for artist in moving:
         artist.set_animated(True)
     canvas.draw()
-    background = canvas.copy_from_bbox(canvas.figure.bbox)
+    background = canvas.copy_from_bbox(figure.bbox)
     for instant in shown:
         scene.show(instant)
         cursor.set_data([instant.time], [curve.values[trajectory.at(instant.time)]])

@@ -83,6 +83,9 @@ def new_figure(title: str, width: float, height: float) -> Figure:
 def timeline(axes: Axes, label: str, trajectory: Trajectory) -> NDArray[np.float64]:
     """Label an axis over time, and return the times [s]."""
     axes.set_ylabel(label)
+    place = axes.get_subplotspec()
+    if place is not None and place.is_last_row():
+        axes.set_xlabel("time [s]")
     t = trajectory.t.numpy()
     axes.set_xlim(float(t[0]), float(t[-1]) * 1.01)
     return t
@@ -104,7 +107,6 @@ def motion(trajectory: Trajectory) -> Figure:
         upper.set_title(title)
         lower.plot(timeline(lower, error, trajectory), MM * (actual - desired).numpy(), color=ACTUAL, lw=0.8)
         lower.set_title("actual less desired")
-        lower.set_xlabel("time [s]")
     axes[0, 0].legend()
     figure.align_ylabels()
     return figure
@@ -123,7 +125,6 @@ def control_forces(trajectory: Trajectory) -> Figure:
         t = timeline(axes, label, trajectory)
         axes.plot(t, trajectory[channel].numpy(), color=ACTUAL, lw=1.1)
         axes.set_title(title)
-        axes.set_xlabel("time [s]")
     if trajectory.t[-1] > 2:  # the grasp takes one eightieth of the axis: show it again
         grasp = panels[0].inset_axes((0.35, 0.38, 0.55, 0.5))
         first = trajectory.t <= 1
@@ -141,7 +142,6 @@ def one_curve(trajectory: Trajectory, title: str, label: str, values: Tensor) ->
     axes = figure.subplots()
     axes.axhline(0, color=INK, lw=0.6)
     axes.plot(timeline(axes, label, trajectory), values.numpy(), color=ACTUAL, lw=1.1)
-    axes.set_xlabel("time [s]")
     return figure
 
 
@@ -269,26 +269,21 @@ def snapshots(
 
 def energy_groups(trajectory: Trajectory) -> list[tuple[str, Array, str]]:
     """Label, energy [mJ] (T,) and colour of what is stored (pads, springs, motion) and dissipated (pads, dashpots, slip)."""
-    stored, lost = dict(trajectory.energy), dict(trajectory.dissipated)
-
-    def pads(
-        energies: dict[str, Tensor], prefix: str, what: str, colours: Sequence[str]
-    ) -> list[tuple[str, Tensor, str]]:
-        names = [name.removeprefix(prefix) for name in energies if name.startswith(prefix)]
-        return [
-            (f"{PADS.get(name, name)} pad, {what}", energies.pop(prefix + name), colours[i % len(colours)])
-            for i, name in enumerate(names)
-        ]
-
-    kept = pads(stored, "strain_", "strain", STRAIN)
-    kept.append(("contact springs", stored.pop("normal_springs") + stored.pop("tangential_springs"), "#9ecae1"))
-    kept.append(("kinetic", sum(stored.values(), torch.zeros_like(trajectory.t)), "#deebf7"))
-    gone = pads(lost, "pad_", "damping", DAMPING)
-    gone += [
-        (name.replace("_", " "), value, colour) for (name, value), colour in zip(lost.items(), ("#fdae6b", "#fee6ce"))
-    ]
-    groups = [(f"stored: {name}", value, colour) for name, value, colour in kept]
-    groups += [(f"dissipated: {name}", value, colour) for name, value, colour in gone]
+    stored, lost, groups = dict(trajectory.energy), dict(trajectory.dissipated), []
+    for energies, prefix, label, colours in (
+        (stored, "strain_", "stored: {} pad, strain", STRAIN),
+        (lost, "pad_", "dissipated: {} pad, damping", DAMPING),
+    ):
+        names = [name for name in energies if name.startswith(prefix)]
+        for i, name in enumerate(names):
+            pad = name.removeprefix(prefix)
+            groups.append((label.format(PADS.get(pad, pad)), energies.pop(name), colours[i % len(colours)]))
+        if energies is stored:
+            springs = stored.pop("normal_springs") + stored.pop("tangential_springs")
+            groups.append(("stored: contact springs", springs, "#9ecae1"))
+            groups.append(("stored: kinetic", sum(stored.values(), torch.zeros_like(trajectory.t)), "#deebf7"))
+    for (name, energy), colour in zip(lost.items(), ("#fdae6b", "#fee6ce")):
+        groups.append((f"dissipated: {name.replace('_', ' ')}", energy, colour))
     return [(f"{name} (up to {MM * float(x.max()):.2g} mJ)", MM * x.numpy(), colour) for name, x, colour in groups]
 
 
@@ -308,7 +303,6 @@ def energy_balance(trajectory: Trajectory) -> Figure:
     figure.legend(handles[::-1], names[::-1], loc="outside right center")  # in the order of the stack
     residual.plot(timeline(residual, "residual [mJ]", trajectory), MM * trajectory.energy_residual.numpy(), color=INK)
     residual.set_title(f"residual: at most {trajectory.energy_residual_rel:.1e} of what the sources injected")
-    residual.set_xlabel("time [s]")
     figure.align_ylabels()
     return figure
 
@@ -343,7 +337,5 @@ def friction_comparison(runs: Mapping[str, tuple[Rig, Trajectory]]) -> Figure:
         axes[2, 1].plot(timeline(axes[2, 1], "$F_x$ [N]", trajectory), trajectory["F_x"].numpy(), **line)
     axes[2, 0].set_title("sum of |friction| over sum of normal force")
     axes[2, 1].set_title("horizontal control force")
-    for panel in axes[2]:
-        panel.set_xlabel("time [s]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=3)
     return figure

@@ -1,6 +1,6 @@
-"""Figures of a run of any rig: where its bodies went, what touched and pushed, and whether its power balances.
+"""Figures of a run of any rig: where its bodies went, what touched and pushed.
 
-Times in s, lengths in mm, angles in rad, forces in N, moments in N mm, powers in W.
+Times in s, lengths in mm, angles in rad, forces in N, moments in N mm.
 """
 
 from collections.abc import Iterator
@@ -20,8 +20,8 @@ from torchsoft.solve.trajectory import Trajectory
 COLOURS = ("#0077bb", "#ee7733", "#009988", "#cc3311", "#33bbee", "#ee3377", "#bbbbbb")
 """One after the other for bodies, contacts and actuators."""
 
-STILL = {"x": 1e-6, "y": 1e-6, "theta": 1e-6}
-"""Ranges [m, m, rad] below which a coordinate has not moved."""
+STILL = 1e-3
+"""Range [mm, or rad] below which a coordinate has not moved."""
 
 
 class Curve(NamedTuple):
@@ -69,7 +69,7 @@ def liveliest(trajectory: Trajectory, rig: Rig) -> str:
 @rc_context(STYLE)
 def motions(trajectory: Trajectory, rig: Rig) -> Figure:
     """Every coordinate that moves, a panel each, with the set-point of its loop."""
-    shown = [c for c in curves(trajectory, rig) if np.ptp(c.values) > STILL[c.name.rpartition(".")[2]] * MM]
+    shown = [c for c in curves(trajectory, rig) if np.ptp(c.values) > STILL]
     shown = shown or list(curves(trajectory, rig))[:1]
     columns = min(3, len(shown))
     rows = -(-len(shown) // columns)
@@ -116,37 +116,5 @@ def efforts(trajectory: Trajectory, rig: Rig) -> Figure:
         axes.axhline(0, color=INK, lw=0.5, zorder=1)
         if axes not in panels[1:3]:
             axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    panels[-1].set_xlabel("time [s]")
     figure.align_ylabels(panels)
-    return figure
-
-
-@rc_context(STYLE)
-def power_balance(trajectory: Trajectory) -> Figure:
-    """What sources supply, what is stored and what is dissipated, each as a power averaged between outputs, and the energies'
-    residual."""
-    figure = new_figure("Power: supplied, stored and dissipated", 8.5, 5.6)
-    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
-    t = trajectory.t.numpy()
-    middle, span = 0.5 * (t[1:] + t[:-1]), np.diff(t)
-    sums = {
-        "supplied by sources": (sum(x.detach().numpy() for x in trajectory.supplied.values()), INK),
-        "stored": (sum(x.detach().numpy() for x in trajectory.energy.values()), ACTUAL),
-        "dissipated in pads": (sum(x.numpy() for k, x in trajectory.dissipated.items() if k.startswith("pad_")), "#e6550d"),
-        "dissipated in contacts": (
-            sum(x.numpy() for k, x in trajectory.dissipated.items() if not k.startswith("pad_")), "#fdae6b"
-        ),
-    }  # fmt: skip
-    timeline(upper, "power [W]", trajectory)
-    upper.axhline(0, color=INK, lw=0.5)
-    for label, (energy, colour) in sums.items():
-        style = {"lw": 2.2, "ls": (0, (4, 2))} if colour == INK else {"lw": 1.1}
-        upper.plot(middle, np.diff(energy) / span, color=colour, label=label, **style)
-    upper.legend(loc="upper right")
-    lower.plot(timeline(lower, "residual [mJ]", trajectory), MM * trajectory.energy_residual.numpy(), color=INK, lw=1.0)
-    lower.set_title(
-        f"stored - supplied + dissipated: at most {trajectory.energy_residual_rel:.1e} of what sources injected"
-    )
-    lower.set_xlabel("time [s]")
-    figure.align_ylabels()
     return figure

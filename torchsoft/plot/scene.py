@@ -177,7 +177,7 @@ def plates(rig: Rig) -> dict[str, float]:
         if pad.base is not None:
             behind = (
                 2 * MM * float((pad.placed(np.zeros(2)) @ pad.axes.numpy())[1])
-            )  # the face's height over the base's centre
+            )  # height of the face over the base's centre
             if rig.bodies[pad.base].shape is not None:
                 out[name] = 0.0
             elif behind > 1e-6:
@@ -187,7 +187,7 @@ def plates(rig: Rig) -> dict[str, float]:
 
 
 class Scene:
-    """The artists of one picture on `axes`; `show` moves them to another instant.
+    """The artists of one picture on `axes`; `show` puts the `moving` ones, in drawing order, where another instant has them.
 
     `columns` is the spacing, in elements, of the vertical mesh lines; every layer is drawn. With `curves` = (mm per N,
     scale bar in N) the contact forces stand behind the pads, normal force red with filled circles, friction blue.
@@ -221,11 +221,6 @@ class Scene:
         for k in rig.contacts if curves else ():
             (self.friction[k],) = axes.plot([], [], color=FRICTION, lw=1.1)
             (self.normal[k],) = axes.plot([], [], color=NORMAL, lw=1.1, marker="o", ms=1.8)
-        axes.set_aspect("equal")
-
-    @property
-    def moving(self) -> list[Artist]:
-        """The artists that `show` changes, in drawing order."""
         groups = (
             self.plates,
             self.outlines,
@@ -236,7 +231,8 @@ class Scene:
             self.friction,
             self.normal,
         )
-        return [artist for group in groups for artist in group.values()]
+        self.moving: list[Artist] = [artist for group in groups for artist in group.values()]
+        axes.set_aspect("equal")
 
     def show(self, instant: Instant) -> None:
         """Put everything where it is at `instant`."""

@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -29,14 +29,11 @@ DEPENDENT = 1e-9
 class Recipe:
     """How to fit. threshold: the smallest part of a rate's root mean square that a term may account for.
 
-    form: "weak" (integrals against test functions of half-width `width` [s], `domains` a window of `window` [s]) or
-    "derivative" (fourth-order differences of the velocities). models: ensemble members, 0 for none. Coefficients of an
-    ensemble are medians, their intervals the 5th and 95th percentiles: how much the fit depends on the choice of rows, which
-    overlap, and not how wrong the form of the equation may be.
+    Rows are integrals against test functions of half-width `width` [s], `domains` a window of `window` [s]. models: ensemble
+    members, 0 for none. Coefficients of an ensemble are medians, their intervals the 5th and 95th percentiles: how much the
+    fit depends on the choice of rows, which overlap, and not how wrong the form of the equation may be.
     """
 
-    optimizer: Literal["stlsq", "sr3"] = "stlsq"
-    form: Literal["weak", "derivative"] = "weak"
     threshold: float = 0.02
     models: int = 0
     width: float = 0.015
@@ -58,7 +55,7 @@ class Regression:
 
 @dataclass(frozen=True)
 class Problem:
-    """The regressions of all equations, which every threshold and optimizer shares."""
+    """The regressions of all equations, which every threshold shares."""
 
     regressions: dict[str, Regression]
     states: tuple[str, ...]
@@ -69,7 +66,7 @@ class Problem:
 def assemble(
     records: Sequence[Record], candidates: Candidates, recipe: Recipe, *, inputs: Sequence[str] = ("F_x",)
 ) -> Problem:
-    """Columns and rates of the records, in weak form or by differences.
+    """Columns and rates of the records in weak form.
 
     States without candidates are rates of none: with inputs ("x_Br", "v_Br") and candidates for v_C and omega, the bracket
     is what drives. Raises `ValueError` for records of different steps, values that are not finite, constant columns,
@@ -96,10 +93,7 @@ def assemble(
             raise ValueError(
                 f"column `{term.text}` of {target}' is constant ({values[0]:g}); leave it out, or excite it"
             )
-    if recipe.form == "weak":
-        phi, rate = _weak(columns, velocities, steps[0], recipe)
-    else:
-        phi, rate = _differences(columns, velocities, steps[0])
+    phi, rate = _weak(columns, velocities, steps[0], recipe)
     out = {}
     for j, target in enumerate(targets):
         mine = [i for i, name in enumerate(model.targets) if name == target]
@@ -274,28 +268,11 @@ def _weak(
     return np.concatenate([np.asarray(x) for x in phi]), np.concatenate([np.asarray(x) for x in rates])
 
 
-def _differences(columns: list[np.ndarray], velocities: list[np.ndarray], step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and differentiated velocities, sample by sample."""
-    import pysindy
-
-    difference: Any = pysindy.FiniteDifference(order=4)
-    with _quiet_pysindy(0):
-        rates = [np.asarray(difference(one, step * np.arange(len(one)))) for one in velocities]
-    return np.concatenate(columns), np.concatenate(rates)
-
-
 def _optimizer(recipe: Recipe) -> Any:
     import pysindy
 
-    if recipe.optimizer == "stlsq":
-        one: Any = pysindy.STLSQ(threshold=recipe.threshold, alpha=1e-10)
-    else:  # its hard threshold is sqrt(2 lambda nu)
-        one = pysindy.SR3(
-            reg_weight_lam=0.5 * recipe.threshold**2, relax_coeff_nu=1.0, max_iter=2000, tol=1e-8, unbias=True
-        )
-    if recipe.models:
-        return pysindy.EnsembleOptimizer(one, bagging=True, n_models=recipe.models)
-    return one
+    one: Any = pysindy.STLSQ(threshold=recipe.threshold, alpha=1e-10)
+    return pysindy.EnsembleOptimizer(one, bagging=True, n_models=recipe.models) if recipe.models else one
 
 
 @contextlib.contextmanager

@@ -1,9 +1,13 @@
 """Small ordinary differential equations y' = S y + C phi(y, u): their text, their torch module, their fast rollout.
 
 One list of terms is all there is: `Term` holds what it is made of, and the equations in text and LaTeX, the right-hand
-side that torchdiffeq integrates and the rollout in numpy are read off it.
+side that torchdiffeq integrates and the compiled rollout are read off it. A linear model is rolled out by an exact recursion,
+every other one by an L-stable step: scipy's stiff solvers call Python at every step and cost more than the simulator that is
+being reduced.
 """
 
+import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter
@@ -11,16 +15,28 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
+from numba import njit
+from scipy.signal import cont2discrete
 from torch import Tensor, nn
 
 from torchsoft.channels import CHANNELS
-from torchsoft.reduced.rollout import linear_rollout, nonlinear_rollout
+from torchsoft.codegen import compile_law
+from torchsoft.codegen.invoke import call_linearise, call_value
 
 ALIASES = {"v_C": "v_x", "v_Br": "v_x_Br"}
 """Channels by a reduced model's name for them, which leaves the only direction out."""
 
 BEYOND = 100.0
 """A rollout that leaves this many times the states' scale has diverged."""
+
+GAMMA = 1 + 1 / math.sqrt(2)
+"""Of the Rosenbrock method ROS2: second order, L-stable."""
+
+TOLERANCE = 1e-3
+"""Largest difference, in parts of the states' scale, between a rollout and that with half its step."""
+
+HALVINGS = 8
+"""Halvings of the step after which a rollout is taken as it is."""
 
 
 def symbol(name: str) -> tuple[str, str]:
@@ -39,12 +55,16 @@ class Factor(NamedTuple):
 
 @dataclass(frozen=True)
 class Term:
-    """A candidate term: the product of its factors, with its name, LaTeX and unit."""
+    """A candidate term: the product of its factors, with its formula as text and its unit."""
 
     text: str
-    latex: str
     unit: str
     factors: tuple[Factor, ...]
+
+    @property
+    def latex(self) -> str:
+        """The formula with the symbols of its variables."""
+        return re.sub(r"tanh|\w+", lambda m: r"\tanh" if m[0] == "tanh" else symbol(m[0])[0], self.text)
 
     @property
     def linear(self) -> bool:
@@ -52,15 +72,15 @@ class Term:
 
 
 class Table(NamedTuple):
-    """A list of terms as arrays: forms (terms * factors, variables), and where a factor is a tanh or a modulus."""
+    """A list of terms: forms (terms * factors, variables), and where a factor is a tanh or a modulus (terms, factors)."""
 
-    forms: Any
-    tanh: Any
-    modulus: Any
+    forms: Tensor
+    tanh: Tensor
+    modulus: Tensor
 
 
 def tabulate(terms: Sequence[Term], variables: Sequence[str]) -> Table:
-    """Terms as arrays over `variables`, to which "1" is added. Raises `ValueError` for a variable that is not there."""
+    """Terms as tensors over `variables`, to which "1" is added. Raises `ValueError` for a variable that is not there."""
     names, most = [*variables, "1"], max((len(term.factors) for term in terms), default=1)
     forms = np.zeros((len(terms), most, len(names)))
     shapes = np.full((len(terms), most), "linear", dtype=object)
@@ -73,13 +93,14 @@ def tabulate(terms: Sequence[Term], variables: Sequence[str]) -> Table:
                 if name not in names:
                     raise ValueError(f"term `{term.text}` needs the variable {name!r}; known: {', '.join(names)}")
                 forms[i, j, names.index(name)] = weight / factor.scale
-    return Table(forms.reshape(-1, len(names)), shapes == "tanh", shapes == "abs")
+    arrays = forms.reshape(-1, len(names)), np.asarray(shapes == "tanh"), np.asarray(shapes == "abs")
+    return Table(*map(torch.from_numpy, arrays))
 
 
-def features(z: Any, table: Table, xp: Any) -> Any:
-    """phi (..., terms) of the variables z (..., variables + 1); `xp` is torch or numpy, whichever z belongs to."""
-    factor = (z @ table.forms.T).reshape(*z.shape[:-1], *table.tanh.shape)
-    return xp.where(table.tanh, xp.tanh(factor), xp.where(table.modulus, abs(factor), factor)).prod(-1)
+def features(z: Tensor, table: Table) -> Tensor:
+    """phi (..., terms) of the variables z (..., variables + 1)."""
+    factor = (z @ table.forms.mT).reshape(*z.shape[:-1], *table.tanh.shape)
+    return torch.where(table.tanh, factor.tanh(), torch.where(table.modulus, factor.abs(), factor)).prod(-1)
 
 
 class Held(nn.Module):
@@ -146,8 +167,7 @@ class ReducedModel(nn.Module):
         )
         self.scale = np.asarray(scale if scale is not None else np.ones(len(self.states)), dtype=float)
         self.signal: nn.Module | None = None
-        table = tabulate(self.terms, (*self.states, *self.inputs))
-        self._numpy, self._torch = table, Table(*(torch.from_numpy(np.asarray(part)) for part in table))
+        self._table = tabulate(self.terms, (*self.states, *self.inputs))
         entries = [(self.states.index(target), i) for i, target in enumerate(self.targets)]
         self._entries = tuple(torch.tensor(index, dtype=torch.long) for index in zip(*entries)) if entries else None
         law = [
@@ -200,23 +220,18 @@ class ReducedModel(nn.Module):
 
     def rates(self, yw: Tensor) -> Tensor:
         """dy/dt (..., states) from states and outer inputs (..., states + outer)."""
-        return _rates(yw, self._torch, tuple(part.mT for part in self.matrices()), torch)
+        return _rates(yw, self._table, *self.matrices())
 
     def phi(self, yu: np.ndarray) -> np.ndarray:
         """The terms (T, terms) at states and inputs (T, states + inputs)."""
-        return features(np.column_stack((yu, np.ones(len(yu)))), self._numpy, np)
-
-    def numpy_rates(self) -> Any:
-        """`rates` as a function of numpy arrays, with the present coefficients."""
-        parts = tuple(part.detach().numpy().T.copy() for part in self.matrices())
-        return lambda yw: _rates(yw, self._numpy, parts, np)
+        return features(torch.from_numpy(np.column_stack((yu, np.ones(len(yu))))), self._table).numpy()
 
     def state_space(self) -> tuple[np.ndarray, np.ndarray]:
         """A (states, states) and B (states, outer + 1) of y' = A y + B (u, 1). Raises `ValueError` unless linear."""
         if not self.linear:
             raise ValueError("the model has terms that are not linear; it has no A and B")
         n, size = len(self.states), len(self.states) + len(self.outer)
-        f = self.numpy_rates()(np.vstack((np.zeros(size), np.eye(size))))
+        f = self.rates(torch.eye(size + 1, size, dtype=torch.float64).roll(1, 0)).detach().numpy()
         slopes = (f[1:] - f[0]).T
         return slopes[:, :n], np.column_stack((slopes[:, n:], f[0]))
 
@@ -238,10 +253,12 @@ class ReducedModel(nn.Module):
             with np.errstate(over="ignore", invalid="ignore"):
                 y = linear_rollout(*self.state_space(), t[1] - t[0], y0, np.column_stack((u, np.ones(len(t)))))
         else:
-            S, C, K = (part.detach().numpy() for part in self.matrices())
-            shapes = self._numpy.tanh + 2 * self._numpy.modulus
-            forms = self._numpy.forms.reshape(*shapes.shape, -1)
-            y = nonlinear_rollout((S, C, K, forms, shapes), t, y0, u, limit, size)
+            parts = [part.detach() for part in self.matrices()]
+            law = compile_law(
+                lambda x, _: _rates(x, self._table, *parts), torch.ones(len(y0) + u.shape[1]).double(), {},
+                differentiated=len(y0),
+            )  # fmt: skip
+            y = nonlinear_rollout(law.value, law.linearise, t, y0, u, limit, size)
         wild, ended = ~(np.abs(y) <= limit).all(-1), None
         if wild.any():
             y[wild.argmax() :], ended = np.nan, float(t[wild.argmax()])
@@ -274,11 +291,10 @@ class ReducedModel(nn.Module):
         return rows
 
 
-def _rates(yw: Any, table: Table, parts: tuple[Any, ...], xp: Any) -> Any:
-    S_T, C_T, K_T = parts
-    n = S_T.shape[0]
-    z = xp.concatenate((yw[..., :n], yw @ K_T, xp.ones_like(yw[..., :1])), -1)
-    return yw[..., :n] @ S_T + features(z, table, xp) @ C_T
+def _rates(yw: Tensor, table: Table, S: Tensor, C: Tensor, K: Tensor) -> Tensor:
+    y = yw[..., : len(S)]
+    z = torch.cat((y, yw @ K.mT, torch.ones_like(yw[..., :1])), -1)
+    return y @ S.mT + features(z, table) @ C.mT
 
 
 def _bracketed(text: str) -> str:
@@ -288,3 +304,74 @@ def _bracketed(text: str) -> str:
 def _power(value: float) -> str:
     mantissa, _, exponent = f"{value:.4g}".partition("e")
     return rf"{mantissa}\cdot 10^{{{int(exponent)}}}" if exponent else mantissa
+
+
+def linear_rollout(A: np.ndarray, B: np.ndarray, h: float, y0: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """y' = A y + B w (T, states) from y0 at steps of h [s], w (T, inputs) straight between them: exact."""
+    n = len(A)
+    discrete: Any = cont2discrete((A, B, np.eye(n), np.zeros_like(B)), h, method="foh")
+    F, G, _, D, _ = discrete
+    return recursion(F, w @ G.T, y0 - D @ w[0]) + w @ D.T
+
+
+@njit(cache=True)
+def recursion(F, f, x0):
+    """x[k+1] = F x[k] + f[k] from x[0] = x0, as (T, n) with f (T, n)."""
+    T, n = f.shape
+    x = np.empty((T, n))
+    x[0] = x0
+    for k in range(T - 1):
+        for i in range(n):
+            total = f[k, i]
+            for j in range(n):
+                total += F[i, j] * x[k, j]
+            x[k + 1, i] = total
+    return x
+
+
+def nonlinear_rollout(
+    value: int, linearise: int, t: np.ndarray, y0: np.ndarray, w: np.ndarray, limit: np.ndarray, scale: np.ndarray
+) -> np.ndarray:
+    """y (T, states) at t (T,) [s], NaN once it is beyond `limit` (states,); the step is halved until nothing changes.
+
+    value, linearise: addresses of the compiled rates of (y, w), differentiated by y.
+    """
+
+    def stepped(pieces: int) -> np.ndarray:
+        step: Any = _rosenbrock
+        return step(value, linearise, t, y0, w, limit, pieces)
+
+    y = stepped(1)
+    for halving in range(1, HALVINGS + 1):
+        coarse, y = y, stepped(2**halving)
+        error = np.abs(y - coarse) / scale
+        if np.isfinite(y).all() and np.isfinite(coarse).all() and error.max() <= TOLERANCE:
+            break
+        if halving >= 3 and np.isnan(y[-1, 0]) and np.isnan(coarse[-1, 0]):
+            break  # it diverges at either step
+    return y
+
+
+@njit(cache=True)
+def _rosenbrock(value, linearise, t, y0, w, limit, pieces):
+    n = len(y0)
+    out = np.full((len(t), n), np.nan)
+    out[0] = y0
+    y, f, later, J, one, none = y0.copy(), np.empty(n), np.empty(n), np.empty((n, n)), np.eye(n), np.empty(0)
+    for k in range(len(t) - 1):
+        h, rise = (t[k + 1] - t[k]) / pieces, (w[k + 1] - w[k]) / pieces
+        for piece in range(pieces):
+            here = w[k] + rise * piece
+            call_linearise(linearise, np.concatenate((y, here)), none, f, J)
+            call_value(value, np.concatenate((y, here + rise)), none, later)
+            drift = GAMMA * (later - f)
+            inverse = np.linalg.inv(one - GAMMA * h * J)
+            k1 = inverse @ (f + drift)
+            call_value(value, np.concatenate((y + h * k1, here + rise)), none, later)
+            k2 = inverse @ (later - 2 * k1 - drift)
+            y = y + h * (1.5 * k1 + 0.5 * k2)
+            for i in range(n):
+                if not abs(y[i]) <= limit[i]:
+                    return out
+        out[k + 1] = y
+    return out

@@ -24,27 +24,25 @@ Candidates = Mapping[str, Sequence[Term]]
 """Terms by the state whose rate they may make."""
 
 
-def slip(text: str, latex: str, **form: float) -> tuple[Term, Term]:
+def slip(text: str, **form: float) -> tuple[Term, Term]:
     """The term of a combination of positions [m], and that of its rate."""
     rates = {KINEMATICS[name]: value for name, value in form.items()}
-    dotted = latex.replace("x", r"\dot x").replace(r"\theta", r"\dot\theta")
     rate_text = text.replace("x_C", "v_C").replace("x_Br", "v_Br").replace("theta", "omega")
-    return Term(text, latex, "m", (Factor(form),)), Term(rate_text, dotted, "m/s", (Factor(rates),))
+    return Term(text, "m", (Factor(form),)), Term(rate_text, "m/s", (Factor(rates),))
 
 
 def variable(name: str) -> Term:
     """The term that is a variable itself."""
-    latex, unit = symbol(name)
-    return Term(name, latex, unit, (Factor({name: 1.0}),))
+    return Term(name, symbol(name)[1], (Factor({name: 1.0}),))
 
 
 def slips(r: float) -> dict[str, tuple[Term, Term]]:
     """The slips s_L and s_U of a rolling radius r [m], their difference s_U - s_L and their sum, each with its rate."""
     return {
-        "lower": slip("x_C + r theta", r"x_C + r \theta", x_C=1.0, theta=r),
-        "upper": slip("x_Br - x_C + r theta", r"x_{Br} - x_C + r \theta", x_Br=1.0, x_C=-1.0, theta=r),
-        "difference": slip("x_Br - 2 x_C", r"x_{Br} - 2 x_C", x_Br=1.0, x_C=-2.0),
-        "sum": slip("x_Br + 2 r theta", r"x_{Br} + 2 r \theta", x_Br=1.0, theta=2 * r),
+        "lower": slip("x_C + r theta", x_C=1.0, theta=r),
+        "upper": slip("x_Br - x_C + r theta", x_Br=1.0, x_C=-1.0, theta=r),
+        "difference": slip("x_Br - 2 x_C", x_Br=1.0, x_C=-2.0),
+        "sum": slip("x_Br + 2 r theta", x_Br=1.0, theta=2 * r),
     }
 
 
@@ -67,27 +65,19 @@ def mechanics(r: float, *, alike: bool = True) -> dict[str, list[Term]]:
 def friction(r: float, speed: float) -> dict[str, list[Term]]:
     """Saturating candidates tanh(s' / speed) of the slips below and above, `speed` [m/s] a small one."""
     lower, upper = (
-        Term(
-            f"tanh(({rate.text})/{speed:g})", rf"\tanh\frac{{{rate.latex}}}{{{speed:g}}}", "1",
-            (Factor(rate.factors[0].form, "tanh", speed),),
-        )
+        Term(f"tanh(({rate.text})/{speed:g})", "1", (Factor(rate.factors[0].form, "tanh", speed),))
         for rate in (slips(r)[side][1] for side in ("lower", "upper"))
-    )  # fmt: skip
+    )
     return {"v_C": [lower, upper], "omega": [lower, upper], "v_Br": [upper]}
 
 
 def polynomials(names: Sequence[str], degree: int) -> list[Term]:
     """Every monomial of the variables up to `degree`: the library that knows no mechanics."""
-    out = []
-    for d in range(1, degree + 1):
-        for chosen in combinations_with_replacement(names, d):
-            out.append(
-                Term(
-                    " ".join(chosen), " ".join(symbol(name)[0] for name in chosen),
-                    " ".join(symbol(name)[1] for name in chosen), tuple(Factor({name: 1.0}) for name in chosen),
-                )
-            )  # fmt: skip
-    return out
+    every = (chosen for d in range(1, degree + 1) for chosen in combinations_with_replacement(names, d))
+    return [
+        Term(" ".join(some), " ".join(symbol(name)[1] for name in some), tuple(Factor({name: 1.0}) for name in some))
+        for some in every
+    ]
 
 
 def joined(*libraries: Candidates) -> dict[str, list[Term]]:

@@ -150,7 +150,6 @@ def draw(file: RigFile, rig: Rig, run: Trajectory, out: Path, progress: bool) ->
         "snapshots": lambda: figures.snapshots(run, rig, times, title),
         "motion": lambda: general.motions(run, rig),
         "forces": lambda: general.efforts(run, rig),
-        "power": lambda: general.power_balance(run),
         "energy": lambda: figures.energy_balance(run),
     }
     if file.outputs.figures:
