@@ -64,23 +64,27 @@ def grasped(model: SoftGrasp, velocity: tuple[float, float] = (0.0, 0.0)) -> Ten
 
 
 def random_state(rig: Rig, seed: int, slip: float = 0.02) -> Tensor:
-    """A grasped state (size,) shaken about: touching and separated nodes, stick and slip, stretched springs."""
-    generator = torch.Generator().manual_seed(seed)
+    """A grasped state (size,) of the paper's rigs shaken about."""
     model = rig if isinstance(rig, SoftGrasp) else rig.fixed()
-    state = model.unpack(press(model, model.settings.scenario.y_Br_grasp).detach())
+    return shaken(rig, model.unpack(press(model, model.settings.scenario.y_Br_grasp).detach()), seed, slip)
 
-    def shaken(part: dict[str, Tensor], scale: float | Tensor) -> dict[str, Tensor]:
+
+def shaken(rig: Rig, state: State, seed: int, slip: float = 0.02) -> Tensor:
+    """A state (size,) shaken about: touching and separated nodes, stick and slip, stretched springs."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def moved(part: dict[str, Tensor], scale: float | Tensor) -> dict[str, Tensor]:
         noise = {name: torch.randn(x.shape, generator=generator, dtype=torch.float64) for name, x in part.items()}
         return {name: x + scale * noise[name] for name, x in part.items()}
 
     force = 2e-5 if any(pad.inertial for pad in rig.pads.values()) else 0.5  # [m] or [N]
     return rig.pack(
         State(
-            pads=shaken(state.pads, force),
-            stretch=shaken(state.stretch, 2e-5),
-            pose=shaken(state.pose, f64(1e-4, 1e-4, 0.02)),
-            rates=shaken(state.rates, 0.01 * slip),
-            velocity=shaken(state.velocity, slip * f64(1.0, 1.0, 50.0)),
+            pads=moved(state.pads, force),
+            stretch=moved(state.stretch, 2e-5),
+            pose=moved(state.pose, f64(1e-4, 1e-4, 0.02)),
+            rates=moved(state.rates, 0.01 * slip),
+            velocity=moved(state.velocity, slip * f64(1.0, 1.0, 50.0)),
         )
     )
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import grasped, random_state, times, turning
+from conftest import grasped, times, turning
 from torch import Tensor, nn
 
 from torchsoft import (
@@ -30,7 +30,6 @@ from torchsoft.rigs import run as running
 from torchsoft.rigs.check import check
 from torchsoft.rigs.template import template
 from torchsoft.rigs.written import to_toml
-from torchsoft.solve.rates import Rates
 
 WHOLE = [f"{body}.{axis}" for body in ("bracket", "disc") for axis in ("x", "y", "theta")]
 PUSHES = {"x": "bracket.x", "y": "bracket.y", "turn": "bracket.theta"}
@@ -90,64 +89,6 @@ def test_efforts_are_those_of_the_module() -> None:
         assert float(wanted[:, i].abs().max()) > 0.1
     assert (run.units["theta_d"], run.units["F_turn"], run.units["y_d"]) == ("rad", "N.m", "m")
     assert run.energy_residual_rel < 1e-3
-
-
-def test_compiled_rates_are_those_of_the_module() -> None:
-    rig, _ = controlled(Policy())
-    f = Rates(rig)
-    for seed in range(3):
-        y = random_state(rig, seed)
-        with torch.no_grad():
-            wanted = rig(0.01, y)
-        for here in rig.layout.slices.values():
-            assert torch.allclose(
-                torch.from_numpy(f(0.01, y.numpy()))[here],
-                wanted[here],
-                rtol=0,
-                atol=1e-9 * float(wanted[here].abs().max()),
-            )
-
-
-def test_gradients_into_weights_and_gains_equal_differences() -> None:
-    """By the adjoint for all of them, by forward sensitivities for a number."""
-    policy = Policy()
-    rig, y0 = controlled(policy)
-    t = times(0.03, 4)
-    run = simulate(rig, t, y0=y0, rtol=1e-4, tolerance=1e-10, gradient="discrete")
-
-    def ends(trajectory: Any) -> Tensor:
-        return 1e3 * trajectory["x_disc"][-1] + 1e2 * trajectory["theta_bracket"][-1] + 1e-2 * trajectory["F_y"][-1]
-
-    ends(run).backward()
-    entries = [
-        ("net.0.weight", (2, 7)),
-        ("net.0.bias", (1,)),
-        ("net.2.weight", (1, 0)),
-        ("Kp", (2,)),
-        ("Kd", (0,)),
-        ("size", ()),
-    ]
-    for name, at in entries:
-        parameter = policy.get_parameter(name)
-        value, found = parameter.detach()[at].item(), []
-        h = 3e-4 * max(abs(value), 0.1)
-        for shift in (h, -h, 2 * h, -2 * h):
-            with torch.no_grad():
-                parameter[at] = value + shift
-            found.append(float(ends(simulate(rig, t, y0=y0, knots=run.knots, tolerance=1e-10))))
-            with torch.no_grad():
-                parameter[at] = value
-        slope = (8 * (found[0] - found[1]) - (found[2] - found[3])) / (12 * h)
-        assert parameter.grad is not None
-        assert float(parameter.grad[at]) == pytest.approx(slope, rel=1e-6), name
-    own = next(name for name, one in rig.named_parameters() if one is policy.size)
-    forward = simulate(rig, t, y0=y0, knots=run.knots, tolerance=1e-10, gradient="forward", wrt=[own])
-    states = simulate(rig, t, y0=y0, knots=run.knots, tolerance=1e-10, gradient="discrete")
-    assert forward.sensitivities is not None
-    columns = forward.sensitivities[-1, :, 0]
-    for k in (-1, -6, -12):  # the disc's spin and place, the nodes' last force
-        (slope,) = torch.autograd.grad(states.y[-1, k], policy.size, retain_graph=True)
-        assert float(columns[k]) == pytest.approx(float(slope), rel=1e-8)
 
 
 def test_feedback_on_the_diagonal_is_two_loops() -> None:

@@ -1,27 +1,19 @@
 """The compiled side equals the torch module: the laws of a point with their derivatives, and the stages of taken steps."""
 
-from collections.abc import Callable
-
 import numba
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, f64, random_state, times
+from conftest import coarse, f64, times
 from torch import Tensor, nn
 
-from torchsoft import Ellipse, Rig, Shape, simulate
+from torchsoft import Ellipse, Shape, simulate
 from torchsoft.codegen.invoke import call_linearise, call_pullback, call_value
 from torchsoft.physics.contact import distance_law, free_law, interface_law
 from torchsoft.scenario import grasp_and_roll
-from torchsoft.solve.kernel.step import GAMMA
-from torchsoft.solve.progress import Segment
-from torchsoft.solve.stepper import ImplicitStepper
 from torchsoft.solve.system import contact_laws
 
 POINTS = 450
-
-NEWTON = 1e-10
-"""Newton's tolerance of the steps below [N]."""
 
 
 @numba.njit
@@ -114,41 +106,6 @@ def test_the_law_away_from_contact_equals_the_module() -> None:
         np.testing.assert_allclose(out, free_law(model.contact, x).detach(), rtol=1e-14, atol=0)
         rate = -1.2e5 / (10.0 + 441.7149 + x[2].item() * 1.2e5)
         assert J[0, 0] == pytest.approx(rate, rel=1e-13)
-
-
-def taken_step(rig: Rig, y: Tensor, h: float) -> Segment:
-    segments: list[Segment] = []
-    stepper = ImplicitStepper(rig, step=h, tolerance=NEWTON)
-    *_, last = stepper.integrate(y, f64(0.0, h), segments, float("inf"))
-    assert last.steps == 1
-    segments[0].tape = stepper.tape(segments[0])
-    segments[0].y = last.y[-1]
-    return segments[0]
-
-
-@torch.no_grad()
-@pytest.mark.parametrize(("seed", "senses", "points"), [(0, "disc", 0), (1, "disc", 3), (2, "bracket", 0)])
-def test_stages_of_a_step_satisfy_the_modules_equation(
-    build: Callable[..., Rig], friction: str, seed: int, senses: str, points: int
-) -> None:
-    """Y = y* + a h f(t, Y) at both stages: pads, contacts, friction, bodies and control all at once."""
-    rig = build(contact__friction=friction, control__senses=senses, contact__points=points)
-    y, h = random_state(rig, seed, slip=0.01), 5e-4
-    step = taken_step(rig, y, h)
-    assert step.tape is not None
-    star, a = torch.from_numpy(step.tape.y), GAMMA * h
-    assert torch.equal(star[0], y)
-    first = y + a / (h - a) * (star[1] - y)
-    for begin, end, time in ((y, first, a), (star[1], torch.from_numpy(step.y), h)):
-        got, expected = (end - begin) / a, rig(time, end)
-        for (part, name), where in rig.layout.slices.items():
-            scale = float(expected[where].abs().max()) + 1e-9
-            noise = 4e-15 * float(end[where].abs().max()) / a
-            if part == "rates":
-                noise += NEWTON / float(rig.pads[name].masses().min())
-            elif part == "velocity":  # Newton's tolerance at a few nodes, on the spin
-                noise += 3 * NEWTON * 0.02 / float(rig.bodies[name].inertia)
-            assert float((got - expected)[where].abs().max()) < 1e-9 * scale + noise, (part, name, time)
 
 
 @torch.no_grad()

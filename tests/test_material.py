@@ -4,7 +4,6 @@ import json
 import math
 import re
 from collections.abc import Callable, Sequence
-from copy import deepcopy
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from conftest import COARSE, coarse, random_state, times
 from scipy.optimize import brentq
 from torch import Tensor
 from torch.autograd import gradcheck
-from unrolled import unrolled_solution
 
 from torchsoft import (
     Actuator,
@@ -40,7 +38,6 @@ from torchsoft import (
     rest,
     simulate,
 )
-from torchsoft.physics.energy import dissipated, stored, supplied
 from torchsoft.physics.material import KINDS, Material
 from torchsoft.physics.retardation import retarded
 from torchsoft.plot.diagram import graph_of
@@ -207,40 +204,6 @@ def test_relaxation_under_a_held_indentation_is_the_closed_form(material: Materi
     closed(run, run.load["punch"][:, 1], 5e-5 * relaxed(1 / STIFFNESS, softness(rig) * J, tau, SAMPLED))
 
 
-WEIGHED = [1, 2, -1]
-"""Outputs of which the sum is differentiated: 1, 6 and 1000 ms after the force."""
-
-
-def test_gradients_of_creep_by_every_coefficient_equal_differences(material: Material) -> None:
-    """The adjoint along frozen steps, in logarithms; sensitivities the same."""
-    names = [f"rubber.{name}" for name, _ in material.named_parameters() if name != "rho"]
-    t = torch.cat((torch.zeros(1).double(), torch.logspace(-3, 0, 5, dtype=torch.float64)))
-
-    def run(changes: dict[str, float], gradient: str, knots: Tensor | None = None) -> tuple[Rig, Trajectory]:
-        rig, y0 = punch(deepcopy(material), force=1.0)
-        with torch.no_grad():
-            for name, value in changes.items():
-                rig.parameter(name).mul_(math.exp(value))
-        how = {"knots": knots} if knots is not None else {"rtol": 1e-6}
-        wrt = {"wrt": names, "rigid": True} if gradient == "forward" else {}
-        return rig, simulate(rig, t, y0=y0, gradient=gradient, tolerance=1e-10, **how, **wrt)
-
-    rig, made = run({}, "discrete")
-    made["y_punch"][WEIGHED].sum().backward()
-    sensitivities = run({}, "forward", made.knots)[1].sensitivities
-    assert sensitivities is not None
-    size, eps = float((made["y_punch"][0] - made["y_punch"][-1]).detach()), 1e-4
-    for k, name in enumerate(names):
-        value, grad = rig.parameter(name), rig.parameter(name).grad
-        assert grad is not None
-        ends = [run({name: s * eps}, "none", made.knots)[1]["y_punch"][WEIGHED].sum() for s in (1, -1)]
-        expected = float((ends[0] - ends[1]).detach()) / (2 * eps)
-        slope = float(grad * value.detach())
-        assert abs(slope) > 1e-4 * size, name
-        assert abs(slope - expected) < 1e-6 * abs(slope), name
-        assert float(sensitivities[WEIGHED, 0, k].sum()) == pytest.approx(float(grad), rel=1e-9, abs=1e-12 * size), name
-
-
 def test_every_coefficient_of_a_series_is_identified() -> None:
     """From the punch's height under a held force, without noise, from starts a third away."""
     t = torch.cat((torch.zeros(1).double(), torch.logspace(-3, 0.5, 120, dtype=torch.float64)))
@@ -294,63 +257,6 @@ def test_energy_is_balanced_with_every_material(material: Material, tmp_path: Pa
     own = {f"pad.{name}": value.item() for name, value in material.named_parameters()}
     assert {name: said["parameters"][name] for name in own} == own
     assert ("pad.tau" in said["parameters"]) == hasattr(material, "tau")
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_power_is_balanced_at_random_states(material: Material, seed: int) -> None:
-    """dH/dt = supplied - dissipated to rounding, with all branches of the chain shaken, and no R field supplies power."""
-    rig = SoftGrasp(STABLE, material=material)
-    y = random_state(rig, seed, slip=0.05).requires_grad_(True)
-    (slope,) = torch.autograd.grad(torch.stack(list(stored(rig, rig.unpack(y)).values())).sum(), y)
-    with torch.no_grad():
-        H_dot, state = (slope * rig(0.0, y)).sum(), rig.unpack(y)
-        graph = rig.evaluate(0.0, state)
-        supply, loss = (torch.stack(list(p.values())) for p in (supplied(graph), dissipated(rig, state, graph)))
-    assert abs(float(H_dot - supply.sum() + loss.sum())) < 1e-9 * float(supply.abs().sum() + loss.abs().sum())
-    assert float(loss.min()) > -1e-12 * float(loss.sum())
-
-
-@pytest.mark.parametrize("name", ["generalised_kelvin", "prony"])
-def test_gradients_of_a_grasp_by_every_coefficient_equal_differences(name: str) -> None:
-    """Height of the pressed and rolled disc [mm], along frozen steps, in logarithms. The differences are small, so that no
-    point begins to touch between them; their rounding is 1e-8."""
-    y0, reference = rolling(SoftGrasp(STABLE, material=MATERIALS[name]()))
-
-    def height(changes: dict[str, float], **how: Any) -> tuple[Material, Trajectory]:
-        solid = MATERIALS[name]()
-        with torch.no_grad():
-            for own, change in changes.items():
-                solid.get_parameter(own).mul_(math.exp(change))
-        model = SoftGrasp(STABLE, material=solid)
-        return solid, simulate(model, times(0.2, 3), y0=y0, reference=reference, tolerance=1e-10, **how)
-
-    solid, made = height({}, gradient="discrete", rtol=1e-5)
-    (1e3 * made["y_C"][-1]).backward()
-    for own, value in solid.named_parameters():
-        if own == "rho":
-            continue
-        assert value.grad is not None
-        up, down = (1e3 * float(height({own: s * 1e-6}, knots=made.knots)[1]["y_C"][-1]) for s in (1, -1))
-        assert float(value.grad * value.detach()) == pytest.approx((up - down) / 2e-6, rel=1e-6, abs=1e-8), own
-
-
-def test_the_adjoint_of_a_chain_equals_backpropagation() -> None:
-    """Through the same steps in plain torch."""
-    grads = []
-    for compiled in (True, False):
-        model = SoftGrasp(STABLE, material=MATERIALS["prony"]())
-        y0, reference = rolling(model)
-        t, steps = times(0.02, 2), {"reference": reference, "step": 2e-3}
-        y = (
-            simulate(model, t, y0=y0, tolerance=1e-10, gradient="discrete", **steps).y
-            if compiled
-            else unrolled_solution(model, y0, t, **steps)
-        )
-        model.unpack(y[-1]).pose["disc"][1].backward()
-        values = [value for name, value in model.pad.named_parameters() if name != "rho"]
-        grads.append(torch.stack([value.grad * value.detach() for value in values if value.grad is not None]))
-    assert len(grads[0]) == len(grads[1]) == 14
-    assert float((grads[0] - grads[1]).abs().max()) < 1e-9 * float(grads[0].abs().max())
 
 
 @torch.no_grad()

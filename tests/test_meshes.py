@@ -8,27 +8,16 @@ import meshio
 import numpy as np
 import pytest
 import torch
-from conftest import f64, times
 from fem_oracle import dilatation, mass, shear
 from skfem import Basis, ElementQuad1, ElementQuad2, ElementVector, FacetBasis, LinearForm, MeshQuad, condense, solve
-from torch import Tensor
 
 from torchsoft import (
-    Body,
-    Circle,
-    Contact,
     CurvedPadMesh,
     FingertipMesh,
     KelvinVoigt,
     Pad,
     PadMesh,
-    Profile,
     QuadMesh,
-    Reference,
-    Rig,
-    SmoothSlip,
-    SoftContact,
-    simulate,
 )
 from torchsoft.physics.mesh import Array, Mesh, lame_moduli
 
@@ -245,91 +234,6 @@ def test_a_fingertip_gives_way_as_in_scikit_fem(nu: float, bound: float) -> None
 
 
 # --- runs --------------------------------------------------------------------------------------------------------------------
-
-DISC = 12e-3
-
-
-def finger(tip: Mesh, inertial: bool = False, points: int = 0, **parameters: float) -> tuple[Rig, Tensor]:
-    """A disc on a flat pad under a pad that hangs from a driven body: pressed by 0.6 mm, then rolled by 3 mm."""
-    floor, soft = PadMesh(40e-3, 5e-3, 40, 3), rubber()
-    law = SoftContact(1.2e5, 441.7, 1.2e5, 441.7, friction=SmoothSlip(0.8, 0.7, 5e-2, 10.0))
-    top = 5e-3 + 2 * DISC + tip.height
-    rig = Rig(
-        bodies={
-            "disc": Body(0.2, Circle(DISC)),
-            "hand": Body(x="driven", y="driven", theta=0.0, weighted=False),
-        },
-        pads={
-            "floor": Pad(floor, soft, origin=(-20e-3, 0.0), points=points),
-            "tip": Pad(
-                tip, soft, base="hand", origin=(-0.5 * tip.length, 0.0), mirrored=True, inertial=inertial, points=points
-            ),
-        },
-        contacts={name: Contact(name, "disc", law) for name in ("floor", "tip")},
-        reference=Reference(
-            **{
-                "hand.x": Profile([0.05, 0.15], [0.0, 3e-3]),
-                "hand.y": Profile([0.0, 0.05], [top + 1e-5, top - 6e-4]),
-            }
-        ),
-        groups={"rubber": soft, "contact": law},
-    )
-    with torch.no_grad():
-        for name, value in parameters.items():
-            rig.parameter(name.replace("__", ".")).fill_(value)
-    state = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64))
-    return rig, rig.pack(state._replace(pose=state.pose | {"disc": f64(3e-4, 5e-3 + DISC - 2e-5, 0.0)}))
-
-
-TIPS: dict[str, Callable[[], Mesh]] = {
-    "fingertip": lambda: FingertipMesh(RADIUS, 24),
-    "crowned": lambda: CurvedPadMesh(30e-3, 6e-3, 30, 3, radius=40e-3),
-    "trapezium": lambda: trapezium().refined(2),
-}
-
-
-@pytest.mark.parametrize("name", TIPS)
-@pytest.mark.parametrize("points", [0, 2])
-def test_runs_keep_their_energy_and_roll_the_disc(name: str, points: int) -> None:
-    rig, y0 = finger(TIPS[name](), points=points)
-    run = simulate(rig, times(0.15, 31), y0=y0, step=5e-4)
-    assert run.energy_residual_rel < 2e-3
-    assert float(run["x_disc"][-1] - run["x_disc"][0]) > 1e-3
-    touching = run.force["tip"][-1, :, 0] > 0
-    assert int(touching.sum()) >= (1 if name == "trapezium" else 2)
-    state = rig.unpack(run.y[-1], t=run.t[-1])
-    assert torch.equal(rig.penetration("tip", state) > 0, touching)
-    load = run.load["disc"][-1]
-    rate = rig(run.t[-1], run.y[-1].detach())[rig.layout.slices["velocity", "disc"]].detach()
-    expected = rate * f64(0.2, 0.2, 0.2 * DISC**2 / 2) + f64(0.0, 0.2 * 9.81, 0.0)
-    assert torch.allclose(load, expected, rtol=1e-6, atol=1e-6)  # what runs is what torch says
-
-
-@pytest.mark.parametrize("name", ["fingertip", "crowned"])
-def test_gradients_are_those_of_differences(name: str) -> None:
-    def end(gradient: str = "none", **parameters: float) -> tuple[Rig, Tensor]:
-        rig, y0 = finger(TIPS[name](), points=2, **parameters)
-        run = simulate(rig, times(0.15, 4), y0=y0, step=1e-3, tolerance=1e-10, gradient=gradient)
-        return rig, 1e3 * run["x_disc"][-1] + run["theta_disc"][-1]
-
-    rig, value = end("discrete")
-    value.backward()
-    for parameter in ("rubber.E", "rubber.nu", "contact.K_n"):
-        p = rig.parameter(parameter)
-        here, h = float(p.detach()), 1e-6
-        key = parameter.replace(".", "__")
-        up, down = (float(end(**{key: here * (1 + s * h)})[1].detach()) for s in (1, -1))
-        assert float(p.grad * here) == pytest.approx((up - down) / (2 * h), rel=2e-5, abs=1e-7), parameter
-
-
-def test_an_inertial_fingertip_moves_like_a_massless_one() -> None:
-    runs = []
-    for inertial in (False, True):
-        rig, y0 = finger(FingertipMesh(RADIUS, 16), inertial=inertial)
-        runs.append(simulate(rig, times(0.15, 16), y0=y0, step=1e-3))
-    for key, bound in (("x_disc", 1e-6), ("y_disc", 1e-6), ("theta_disc", 1e-4)):
-        assert float((runs[0][key] - runs[1][key]).abs().max()) < bound, key
-    assert runs[1].energy_residual_rel < 1e-2
 
 
 # --- files -------------------------------------------------------------------------------------------------------------------

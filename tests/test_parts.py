@@ -2,11 +2,10 @@
 
 import pytest
 import torch
-from conftest import coarse, f64, grasped, times
-from torch import Tensor
+from conftest import coarse, f64, grasped
 from torch.autograd import gradcheck
 
-from torchsoft import PD, Actuator, Body, Circle, Ellipse, SoftGrasp, simulate
+from torchsoft import PD, Actuator, Body, Circle, Ellipse, SoftGrasp
 
 
 def test_pd_by_hand() -> None:
@@ -50,39 +49,6 @@ def test_bodies_name_what_is_wrong() -> None:
     with pytest.raises(ValueError, match="needs an `inertia`, or a `shape`"):
         Body(1.0)
     assert Body(1.0, theta=0.0).freedom == {"x": "free", "y": "free", "theta": "fixed"}
-
-
-class Saturated(torch.nn.Module):
-    """A control law of somebody's own: PD up to an effort that it learns."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.pd, self.most = PD(1.2e5, 441.7149), torch.nn.Parameter(f64(2.0)[0])
-
-    def forward(self, *x: Tensor) -> Tensor:
-        return self.most * torch.tanh(self.pd(*x) / self.most)
-
-
-@pytest.mark.parametrize("law", [Saturated(), lambda w, w_dot, feed, q, q_dot: 5e4 * (w - q) ** 3 - 400.0 * q_dot])
-def test_any_control_law_runs_compiled_with_exact_gradients(law: torch.nn.Module) -> None:
-    """A module or a function: the effort is its own, and its parameters' gradients are those of differences."""
-    model = coarse()
-    y0 = grasped(model, (0.03, 0.0))
-    model.actuators["x"] = Actuator("disc.x", "bracket.x", law, setpoint="x_d")
-    del model.control["x"]
-    run = simulate(model, times(0.02, 11), y0=y0, step=2e-3, tolerance=1e-10, gradient="discrete")
-    w, w_dot = model.reference["x_d"](run.t)
-    expected = law(w, w_dot, torch.zeros_like(w), run["x_C"], run["v_x"])
-    assert torch.allclose(run["F_x"], expected, rtol=1e-12, atol=1e-12)
-    assert float(run["F_x"].detach().abs().max()) > 0.1
-    if isinstance(law, Saturated):
-        (slope,) = torch.autograd.grad(run["x_Br"][-1], law.most)
-        ends = []
-        for h in (1e-3, -1e-3):
-            with torch.no_grad():
-                law.most.fill_(2.0 + h)
-            ends.append(float(simulate(model, run.t, y0=y0, knots=run.knots, tolerance=1e-10)["x_Br"][-1]))
-        assert float(slope) == pytest.approx((ends[0] - ends[1]) / 2e-3, rel=1e-5)
 
 
 def test_actuators_name_what_is_wrong() -> None:

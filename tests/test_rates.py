@@ -6,39 +6,8 @@ import torch
 from conftest import coarse, grasped, random_state, times
 from scipy.integrate import solve_ivp
 
-from torchsoft import Profile, Reference, Rig, Sampled, SimulationFailed, simulate
+from torchsoft import Profile, Reference, Sampled, SimulationFailed, simulate
 from torchsoft.solve.rates import Rates
-
-MASSLESS = {"smooth": {}, "coulomb": {"contact__friction": "coulomb"}, "two points": {"contact__points": 2}}
-"""Changes of the coarse rig."""
-
-
-def moving() -> Reference:
-    """A reference on its way: setpoints and a feed-forward that change."""
-    return Reference(
-        x_d=Profile([0.0, 1.0], [60e-3, 61e-3]), y_d=Profile([0.0, 1.0], [48e-3, 48.2e-3]),
-        F_ff=Profile([0.0, 1.0], [-50.0, -60.0]),
-    )  # fmt: skip
-
-
-def agree(rig: Rig, f: Rates, t: float, y: torch.Tensor) -> None:
-    """Both right-hand sides, part by part of the state, within 1e-9 of the part's largest rate."""
-    with torch.no_grad():
-        wanted, got = rig(t, y).numpy(), f(t, y.numpy())
-    for here in rig.layout.slices.values():
-        size = np.abs(wanted[here]).max(initial=0.0)
-        np.testing.assert_allclose(got[here], wanted[here], rtol=0, atol=1e-9 * size + 1e-12)
-
-
-@pytest.mark.parametrize("changes", MASSLESS.values(), ids=MASSLESS)
-def test_rates_equal_the_module(changes: dict[str, object]) -> None:
-    """At shaken states in any order: nodes that touch and do not, stick and slip, bodies that move."""
-    model = coarse(**changes)
-    model.reference = moving()
-    f = Rates(model)
-    for seed in range(6):
-        agree(model, f, 0.4 + 0.05 * seed, random_state(model, seed))
-    assert f.calls == 6
 
 
 def test_another_integrator_reaches_the_steppers_solution() -> None:

@@ -26,61 +26,6 @@ from torchsoft import (
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import NAMES
 
-STEP = 1e-5
-"""Relative step of the central differences."""
-
-
-def test_batches_equal_single_states(build: Callable[..., Rig]) -> None:
-    """Any leading dimensions; a sample does not depend on its neighbours."""
-    rig = build()
-    y = torch.stack([random_state(rig, seed) for seed in range(6)]).reshape(2, 3, -1)
-    with torch.no_grad():
-        together = rig(torch.tensor(0.1, dtype=torch.float64), y)
-        alone = torch.stack([rig(0.1, sample) for sample in y.reshape(6, -1)]).reshape(2, 3, -1)
-    scale = alone.abs().amax(-1, keepdim=True)
-    assert together.shape == y.shape
-    assert float(((together - alone) / scale).abs().max()) < 1e-12
-
-
-def test_gradient_reaches_every_parameter(build: Callable[..., Rig]) -> None:
-    """Autograd through forward against central differences, parameter by parameter (the law is smooth at this state)."""
-    rig = build()
-    rig.requires_grad_(True)
-    y = random_state(rig, 5)
-    weight = torch.randn(rig.layout.size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    with torch.no_grad():
-        weight /= rig(0.0, y).abs().clamp(min=1e-3)
-    (weight * rig(0.0, y)).sum().backward()
-    inertial = any(pad.inertial for pad in rig.pads.values())
-    for name, parameter in rig.named_parameters():
-        if name.endswith(".rho") and not inertial:
-            assert parameter.grad is None
-            continue
-        h = STEP * (1e-2 if name.endswith("radius") else 1.0) * max(abs(float(parameter.detach().flatten()[0])), 1e-3)
-        values = []
-        for sign in (1, -1):
-            with torch.no_grad():
-                parameter += sign * h
-                values.append(float((weight * rig(0.0, y)).sum()))
-                parameter -= sign * h
-        expected = (values[0] - values[1]) / (2 * h)
-        assert parameter.grad is not None, name
-        got = float(parameter.grad.flatten()[0])
-        assert got == pytest.approx(expected, rel=2e-5, abs=1e-8 * max(abs(v) for v in values) / h), name
-
-
-def test_gradient_reaches_the_state(build: Callable[..., Rig]) -> None:
-    rig = build()
-    y = random_state(rig, 7).requires_grad_(True)
-    direction = random_state(rig, 8).detach() - y.detach()
-    rate = rig(0.0, y)
-    weight = 1 / rate.detach().abs().clamp(min=1e-3)
-    (gradient,) = torch.autograd.grad((weight * rate).sum(), y)
-    with torch.no_grad():
-        h = 1e-6
-        ahead, behind = ((weight * rig(0.0, y + s * h * direction)).sum() for s in (1, -1))
-    assert float(gradient @ direction) == pytest.approx(float((ahead - behind) / (2 * h)), rel=1e-5)
-
 
 def test_rest_is_an_equilibrium_of_forward(fidelity: str) -> None:
     """At rest nothing accelerates; gravity is what a kilogram feels otherwise, 9.81."""
@@ -90,15 +35,6 @@ def test_rest_is_an_equilibrium_of_forward(fidelity: str) -> None:
     with torch.no_grad():
         rate = model.unpack(model(0.0, y))
     assert max(float(v.abs().max()) for v in rate.velocity.values()) < 1e-8
-
-
-def test_state_dict_round_trip() -> None:
-    model, other = coarse(), coarse(contact__K_n=2e5)
-    other.load_state_dict(model.state_dict())
-    y = random_state(model, 1)
-    with torch.no_grad():
-        assert torch.equal(model(0.0, y), other(0.0, y))
-    assert isinstance(other, SoftGrasp)
 
 
 def test_a_rig_of_lists_is_the_papers() -> None:
@@ -199,14 +135,6 @@ def test_names_that_do_not_fit_are_refused(changes: dict[str, Callable[..., obje
     with pytest.raises(ValueError, match=match):
         small(**changes)
     assert small().layout.size == 9 * 3 + 6
-
-
-def test_an_inertial_pad_on_a_base_that_turns_is_refused() -> None:
-    with pytest.raises(NotImplementedError, match="pad `P` is inertial and its base `hand` may turn"):
-        small(
-            bodies=lambda m, r, c: {"hand": Body(0.4, inertia=1e-3)},
-            pads=lambda m, r, c: {"P": Pad(m, r, base="hand", inertial=True)},
-        )
 
 
 def test_a_signal_that_is_not_there_is_named() -> None:

@@ -12,9 +12,9 @@ import meshio
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import nn
 
-from torchsoft import Body, Circle, PadMesh, Profile, Reference, Rig, Trajectory, simulate
+from torchsoft import Body, Circle, PadMesh, Trajectory
 from torchsoft.cli import main
 from torchsoft.materials.presets import PRESETS
 from torchsoft.physics.material import GeneralisedKelvin, KelvinVoigt, Prony
@@ -305,50 +305,6 @@ def test_weights_that_are_no_network_are_refused(tmp_path: Path, arrays: dict[st
     (found,) = check(rig(tmp_path, actuators={"x": {"network": "law.npz"}}))
     assert (found.severity, found.field) == ("error", "actuators.x.network")
     assert re.search(sentence, found.sentence), found.sentence
-
-
-class Learned(nn.Module):
-    """A user's law: a PD loop whose stiffness and bias a network corrects, by state and set-point."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.Kp, self.Kd = (nn.Parameter(torch.tensor(x, dtype=torch.float64)) for x in (1e5, 400.0))
-        self.net = network()
-
-    def forward(self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor) -> Tensor:
-        correction = self.net(torch.stack((w, w_dot, q, q_dot), -1))[..., 0]
-        return (self.Kp + 1e3 * correction) * (w - q) + self.Kd * (w_dot - q_dot) + 5 * correction + feed_forward
-
-
-def test_gradients_into_a_network_gains_and_knots_equal_differences(folder: Path) -> None:
-    """A controller that is a module: every gain, every layer and every knot, along the same steps."""
-    ready = rig(folder, bodies={"disc": {"start": {"y": 24.9e-3}}, "bracket": {"start": {"y": 49.5e-3}}}).build()
-    made: Rig = ready.rig
-    law = made.actuators["x"].law = Learned()
-    knots = Profile([0.0, 0.03, 0.1], [0.0, 1e-3, 3e-3])
-    made.reference = Reference(x_d=knots, y_d=Profile([0.0], [49.4e-3]), press=Profile([0.0], [-5.0]))
-    knots.values.requires_grad_(True)
-    t = torch.linspace(0, 0.06, 4, dtype=torch.float64)
-
-    def loss(**how: Any) -> tuple[Tensor, Trajectory]:
-        run = simulate(made, t, y0=ready.y0, tolerance=1e-10, **how)
-        return 1e3 * run["x_disc"][-1] + 10 * run["theta_disc"][-1] + 0.1 * run["x_bracket"][1], run
-
-    value, first = loss(gradient="discrete", rtol=1e-5)
-    assert float(first.force["upper"][:, :, 0].sum(-1).min()) > 1.0  # it is gripped all the time
-    value.backward()
-    generator = torch.Generator().manual_seed(5)
-    for name, p in [*law.named_parameters(), ("knots", knots.values)]:
-        assert p.grad is not None
-        way = p.detach().abs().mean() * torch.randn(p.shape, generator=generator, dtype=torch.float64)
-        keep, found = p.detach().clone(), []
-        for by in (1e-4, -1e-4):
-            with torch.no_grad():
-                p.add_(by * way)
-                found.append(float(loss(knots=first.knots)[0]))
-                p.copy_(keep)
-        slope = (found[0] - found[1]) / 2e-4
-        assert float((p.grad * way).sum()) == pytest.approx(slope, rel=1e-6, abs=1e-9), name
 
 
 # rigs that make no sense ---------------------------------------------------------------------------------------------

@@ -30,7 +30,6 @@ from torchsoft import (
     SoftContact,
     SoftGrasp,
     Superellipse,
-    press,
     rest,
     simulate,
 )
@@ -443,52 +442,6 @@ def grasp(model: SoftGrasp, y0: Tensor) -> Reference:
         y_d=Profile([0.0, 0.05], [top, top - 1e-3]),
         F_ff=Profile([0.0], [0.0]),
     )
-
-
-def directed(shape: nn.Module, name: str) -> Tensor:
-    """A direction in which a parameter is varied: its own size, or a change of a form that is no motion and no scaling."""
-    p = dict(shape.named_parameters())[name].detach()
-    return p.clone() if p.ndim == 0 else 1e-2 * torch.sin(torch.arange(p.numel()).double()).reshape(p.shape)
-
-
-RUNS: dict[str, Callable[[], Shape]] = {
-    "superellipse": lambda: Superellipse(20e-3, 18.5e-3, 2.6),
-    "box": lambda: RoundedBox(18e-3, 17e-3, 12e-3),
-    "polygon": lambda: RoundedPolygon(
-        [[20e-3 * np.sin(t), 20e-3 * np.cos(t)] for t in np.arange(0.5, 8) * np.pi / 4], 9e-3
-    ),
-    "contour": lambda: Contour(
-        [[20e-3 * np.cos(t), 18e-3 * np.sin(t)] for t in np.arange(24) * np.pi / 12], tolerance=1e-5
-    ),
-}
-
-
-@pytest.mark.parametrize("name", RUNS)
-def test_gradients_of_a_run_are_those_of_differences(name: str) -> None:
-    settings = COARSE.override({"control.senses": "bracket"})
-    model = SoftGrasp(settings, shape=RUNS[name]())
-    touching = model.unpack(rest(model).detach()).pose["bracket"][1].item()
-    y0 = press(model, touching - 5e-4).detach()  # just touching, it would start at a kink
-    reference = grasp(model, y0)
-
-    def run(parameter: str = "", by: float = 0.0, gradient: str = "none") -> tuple[Shape, Tensor]:
-        shape = RUNS[name]()
-        if parameter:
-            with torch.no_grad():
-                shape.get_parameter(parameter).add_(by * directed(shape, parameter))
-        model = SoftGrasp(settings, shape=shape)
-        run = simulate(model, times(0.12, 7), y0=y0, reference=reference, step=1e-3, tolerance=1e-10, gradient=gradient)
-        assert float(run.force["U"][-1, :, 0].sum()) > 10  # it is grasped
-        return shape, 1e3 * run["y_C"][-1] + 10 * run["theta"][-1]
-
-    shape, value = run(gradient="discrete")
-    value.backward()
-    for parameter, p in shape.named_parameters():
-        h = 1e-7
-        up, down = (float(run(parameter, sign * h)[1].detach()) for sign in (1, -1))
-        assert p.grad is not None
-        slope = float((p.grad * directed(shape, parameter)).sum())
-        assert slope == pytest.approx((up - down) / (2 * h), rel=1e-6, abs=1e-6), parameter
 
 
 # --- what is refused, and what is said ---------------------------------------------------------------------------------------

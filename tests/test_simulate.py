@@ -1,6 +1,5 @@
 """`simulate` and its trajectory: what runs is what is saved, gradients reach what was put in, and nothing unphysical runs."""
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,8 +16,6 @@ from torchsoft import (
     Actuator,
     Coulomb,
     Ellipse,
-    KelvinVoigt,
-    Parameters,
     Profile,
     Reference,
     Shape,
@@ -30,7 +27,7 @@ from torchsoft import (
     rest,
     simulate,
 )  # fmt: skip
-from torchsoft.excitation import Excitation, MultiSine, begin, start
+from torchsoft.excitation import Excitation, MultiSine, begin
 from torchsoft.solve.adjoint import GradientFailed
 from torchsoft.solve.progress import SimulationFailed
 
@@ -239,23 +236,6 @@ def test_a_knot_with_a_graph_receives_its_gradient() -> None:
         with torch.no_grad():
             ends.append(float(theta(Reference(x_d=moved, y_d=model.reference["y_d"], F_ff=model.reference["F_ff"]))))
     assert float(slope) == pytest.approx((ends[0] - ends[1]) / 2e-7, rel=1e-5)
-
-
-def test_values_moved_in_place_after_the_run_do_not_change_the_gradient() -> None:
-    """Also those that torch's graphs keep to multiply with, moved behind torch's back or not."""
-    model = coarse()
-    run = rolled(model, gradient="discrete")
-    wanted = [model.pad.E, model.pad.depth, model.disc.mass, model.control["x"].Kp]
-    value = run["theta"][-1] + 1e-3 * run["F_x"][-1] + 1e3 * run["angular_momentum"][-1]
-    before = torch.autograd.grad(value, wanted, retain_graph=True)
-    for parameter in wanted:
-        parameter.data.mul_(2.0)
-    after = torch.autograd.grad(value, wanted, retain_graph=True)
-    with torch.no_grad():
-        for parameter in wanted:
-            parameter.mul_(2.0)
-    last = torch.autograd.grad(value, wanted)
-    assert all(torch.equal(a, b) and torch.equal(a, c) for a, b, c in zip(before, after, last))
 
 
 def test_the_angular_momentum_has_the_gradient_of_the_inertia() -> None:
@@ -550,38 +530,3 @@ def test_a_law_that_turns_nan_never_converges() -> None:
 
 
 # materials ----------------------------------------------------------------------------------------------------------
-
-
-def test_a_solid_with_equal_moduli_is_kelvin_and_voigts() -> None:
-    """E_instant -> E leaves one branch of the chain, whose time is then tau_instant."""
-    p = Parameters()
-    numbers = {"nu": p.pad.nu, "rho": p.pad.rho, "depth": p.pad.depth}
-    solid = StandardLinearSolid(p.pad.E, p.pad.E * (1 + 1e-12), tau=0.05, tau_instant=p.pad.tau, **numbers)
-    one = SoftGrasp(coarse().settings, material=solid)
-    other = SoftGrasp(coarse().settings, material=KelvinVoigt(p.pad.E, tau=p.pad.tau, **numbers))
-    a, b = rolled(one), rolled(other)
-    assert a.state.pads["L"].shape[1] == 2
-    for name in ("x_C", "theta", "F_y"):
-        assert torch.allclose(a[name], b[name], rtol=0, atol=1e-9 * float(b[name].abs().max()))
-
-
-def test_a_standard_solid_creeps_from_its_instant_to_its_relaxed_modulus() -> None:
-    """A disc put down where E_instant bears it sinks with the time tau to where E does, and the energies are balanced."""
-    tau, without = (
-        0.05,
-        lambda **changes: coarse(contact__mu_s=0.0, contact__mu_k=0.0, **changes),
-    )  # friction would lock
-    settings = without().settings
-    model = SoftGrasp(settings, material=StandardLinearSolid(3e5, 6e5, 0.45, 1100.0, tau, 0.044, tau_instant=1e-3))
-    with torch.no_grad():
-        stiff, soft = (m.unpack(start(m)) for m in (without(pad__E=6e5), without(pad__E=3e5)))
-        pads = {k: torch.cat((z, torch.zeros_like(z))) for k, z in stiff.pads.items()}
-        y0 = model.pack(stiff._replace(pads=pads))
-    run = simulate(model, times(8 * tau, 161), y0=y0, step=1e-3)
-    high, low = (float(state.pose["disc"][1]) for state in (stiff, soft))
-    assert high - low > 2e-5
-    left = (run["y_C"] - low) / (high - low)
-    assert float(left[0]) == pytest.approx(1.0, abs=1e-12)
-    assert float(left[-1]) == pytest.approx(0.0, abs=2e-3)
-    assert float(left[20] / left[60]) == pytest.approx(math.exp(2), rel=0.05)  # two times tau
-    assert run.energy_residual_rel < 2e-3

@@ -8,10 +8,6 @@ import torch
 from conftest import COARSE, coarse, f64, grasped, times
 
 from torchsoft import (
-    PD,
-    Actuator,
-    Body,
-    Contact,
     Parameters,
     Profile,
     Reference,
@@ -20,7 +16,6 @@ from torchsoft import (
     SoftGrasp,
     simulate,
 )
-from torchsoft.physics.energy import stored
 from torchsoft.scenario import grasp_and_roll
 from torchsoft.solve.progress import Segment
 from torchsoft.solve.stepper import ImplicitStepper
@@ -177,26 +172,3 @@ def test_the_adjoint_follows_halved_steps(monkeypatch: pytest.MonkeyPatch) -> No
         E.copy_(value)
     assert ahead[1] == behind[1] == failed
     assert slope.item() == pytest.approx((ahead[0] - behind[0]).item() / (2 * h), rel=1e-4)
-
-
-def test_a_driven_body_follows_its_signal_and_its_work_is_counted() -> None:
-    """A disc pressed by a prescribed height into one pad while an actuator rolls it: the drive pays for what is stored."""
-    model = coarse()
-    disc = Body(0.4, model.shape, y="driven", theta="free")
-    rig = Rig(
-        bodies={"disc": disc}, pads={"L": model.pads["L"]}, contacts={"L": Contact("L", "disc", model.contact)},
-        actuators={"x": Actuator("disc.x", "disc.x", PD(1e4, 400.0), setpoint="w")},
-        reference=Reference(
-            **{"disc.y": Profile([0.0, 0.05], [24.0e-3, 23.4e-3]), "w": Profile([0.05, 0.2], [0.06, 0.064])}
-        ),
-    )  # fmt: skip
-    y0 = torch.zeros(rig.layout.size, dtype=torch.float64)
-    y0[rig.layout.slices["pose", "disc"]] = f64(0.06, 0.0)
-    run = simulate(rig, times(0.2, 41), y0=y0, step=5e-4)
-    assert torch.equal(run.state.pose["disc"][:, 1], rig.reference["disc.y"](run.t)[0])
-    assert float(run["x_disc"][-1]) == pytest.approx(0.064, abs=2e-5)
-    assert float(run["theta_disc"][-1]) < -0.1  # rolls to the right, clockwise
-    work = float(run.supplied["drive_disc"][20])
-    assert work > 0.5 * float(run.energy["strain_L"][20]) > 1e-3
-    assert run.energy_residual_rel < 2e-3
-    assert set(run.energy) == set(stored(rig, run.state))

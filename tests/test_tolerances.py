@@ -1,11 +1,9 @@
 """Steps by tolerance: accuracy, dense output, frozen steps and their gradients, and what cannot be met."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, grasped, times, turning
+from conftest import coarse, grasped, times
 from torch import Tensor, nn
 from torchdiffeq import odeint, odeint_adjoint
 
@@ -102,50 +100,6 @@ def test_outputs_lie_within_their_steps_however_these_differ() -> None:
     (plan,) = given_steps(t, knots)
     assert plan.out_step.tolist() == [0, 0, 1, 1, 2]
     assert plan.out_part.tolist() == pytest.approx([0.5, 1.0, 0.05, 1.0, 1.0])
-
-
-@pytest.mark.parametrize("make", [coarse, turning])
-def test_gradients_are_those_of_the_frozen_steps(make: Callable[..., SoftGrasp]) -> None:
-    """Also of outputs between the knots, by both routes, against differences over the same steps."""
-    model = make()
-    base = model if isinstance(model, SoftGrasp) else model.fixed()
-    y0 = grasped(base, (0.03, 0.0))
-    if model is not base:
-        state = base.unpack(y0)
-        y0 = model.pack(state)
-    reference = base.reference
-    t = torch.tensor([0.0, 0.004, 0.0115, 0.02], dtype=torch.float64)
-    run = simulate(model, t, y0=y0, reference=reference, rtol=1e-4, gradient="discrete", tolerance=1e-10)
-    inside = ~torch.isin(t[1:], run.knots)
-    assert bool(inside.any())
-    weights = torch.linspace(1.0, 2.0, len(t), dtype=torch.float64)
-    stiffness = "pad.E" if model is base else "pads.L.material.E"
-    loss = lambda r: (weights[:, None] * r.state.pose["disc"] * torch.tensor([30.0, 0.0, 1.0])).sum()
-    model.zero_grad()
-    loss(run).backward()
-    forward = simulate(
-        model, t, y0=y0, reference=reference, knots=run.knots, gradient="forward", wrt=[stiffness], tolerance=1e-10
-    )
-    for name in ("pad.E", "contact.K_t", "contact.mu_s") if model is base else (stiffness,):
-        p = model.parameter(name)
-        ends, value = [], float(p.detach())
-        for sign in (1, -1):
-            with torch.no_grad():
-                p.fill_(value * (1 + sign * 1e-6))
-            frozen = simulate(model, t, y0=y0, reference=reference, knots=run.knots, tolerance=1e-10)
-            ends.append(float(loss(frozen)))
-        with torch.no_grad():
-            p.fill_(value)
-        slope = (ends[0] - ends[1]) / (2e-6 * value)
-        assert float(p.grad) == pytest.approx(slope, rel=1e-4)
-    i = run.layout.slices["pose", "disc"]
-    adjoint = torch.autograd.grad(
-        simulate(model, t, y0=y0, reference=reference, knots=run.knots, gradient="discrete", tolerance=1e-10).y[
-            1, i.start + 2
-        ],
-        [model.parameter(stiffness)],
-    )[0]
-    assert float(forward.sensitivities[1, i.start + 2, 0]) == pytest.approx(float(adjoint), rel=1e-9)
 
 
 class Wave(nn.Module):
