@@ -168,29 +168,6 @@ def test_an_object_store_holds_the_same_bytes(made: tuple[Path, Config]) -> None
         open_or_create("memory://sets/thesis", config)
 
 
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-def test_s3_holds_the_same_bytes(made: tuple[Path, Config], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two processes over s3fs against a local server that speaks S3's protocol; `pip install s3fs 'moto[server]'`."""
-    pytest.importorskip("s3fs")
-    server = pytest.importorskip("moto.server").ThreadedMotoServer(port=0)
-    server.start()
-    try:
-        host, port = server.get_host_and_port()
-        access = {"AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": "x", "AWS_DEFAULT_REGION": "us-east-1"}
-        for name, value in (access | {"AWS_ENDPOINT_URL": f"http://{host}:{port}"}).items():
-            monkeypatch.setenv(name, value)
-        fsspec.filesystem("s3").mkdir("sets")
-        folder, config = made
-        url = "s3://sets/rolling"
-        with local_processes(2) as executor:
-            generate(config, url, executor, 2, progress=False)
-        assert objects(url) == files(folder)
-        read_everywhere(url, folder)
-    finally:
-        server.stop()
-
-
 def test_urls_that_are_refused(made: tuple[Path, Config], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(write_config(tmp_path)), "--out", "nowhere://set", "--workers", "0"]) == 2
     assert "Protocol not known: nowhere" in capsys.readouterr().err
@@ -563,42 +540,6 @@ def test_a_file_size_limit_is_said_and_costs_nothing(made: tuple[Path, Config], 
     assert "Traceback" not in run.stderr
     assert Store(str(tmp_path / "set"), made[1]).unfinished() == [0, 1, 2]
     assert main(command[2:]) == 0
-    assert files(tmp_path / "set") == files(made[0])
-
-
-FULL = """
-mount -t tmpfs -o size={size} tmpfs {disk} || exit 77
-{generate}; echo "first $?"
-{python} -c 'from torchsoft.datasets.config import Config; from torchsoft.datasets.writer import Store
-print("unfinished", len(Store("{disk}/set", Config.from_toml("{config}")).unfinished()))'
-mount -o remount,size=64m {disk}
-{generate}; echo "second $?"
-cp -r {disk}/set {out}
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(shutil.which("unshare") is None, reason="needs Linux's mount namespaces")
-def test_a_full_disk_is_said_and_costs_nothing(made: tuple[Path, Config], tmp_path: Path) -> None:
-    """A disk of its own that is too small for the set, then made larger."""
-    path, disk = write_config(tmp_path), tmp_path / "disk"
-    disk.mkdir()
-    size = sum(-(-len(data) // 4096) * 4096 for data in files(made[0]).values())
-    done = {"finished/2.sha256", *(name for name in files(made[0]) if re.search(r"/c/2(/|$)", name))}
-    room = size - sum(-(-len(files(made[0])[name]) // 4096) * 4096 for name in done) // 2
-    generate_it = f"{sys.executable} -m data_gen.generate {path} --out {disk}/set --workers 0"
-    script = FULL.format(
-        size=room, disk=disk, generate=generate_it, python=sys.executable, config=path, out=tmp_path / "set"
-    )
-    command = ["unshare", "--map-root-user", "--mount", "sh", "-c", script]
-    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    if run.returncode == 77 or "unshare failed" in run.stderr or "unshare:" in run.stderr:
-        pytest.skip(f"may not mount a disk: {run.stderr.strip()}")
-    assert [line for line in run.stdout.splitlines() if line.split()[0] in ("first", "unfinished", "second")] == [
-        "first 2", "unfinished 1", "second 0",
-    ]  # fmt: skip
-    assert "the disk is full; make room and start again" in run.stderr
-    assert "Traceback" not in run.stderr
     assert files(tmp_path / "set") == files(made[0])
 
 

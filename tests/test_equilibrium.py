@@ -1,7 +1,5 @@
 """Static equilibria: forces in balance, symmetry, derivatives by the implicit function theorem, and refusals."""
 
-import itertools
-
 import pytest
 import torch
 from conftest import coarse as build
@@ -22,22 +20,6 @@ def contact_force(model: SoftGrasp, y: Tensor, which: str) -> Tensor:
     """Force of one pad's contact on the disc (2,) [N], by the multibond graph and not by the equilibrium solver."""
     port = model.evaluate(0.0, model.unpack(y)).ports[f"contact_{which}"]
     return net_efforts({"contact": port}, model.junctions)["disc"][0]
-
-
-@pytest.mark.parametrize("fidelity", ["massless", "inertial"])
-@pytest.mark.parametrize("at", ["rest", "grasp"])
-@torch.no_grad()
-def test_contact_forces_balance_the_weight(fidelity: str, at: str) -> None:
-    model = build(pad__fidelity=fidelity)
-    y = rest(model) if at == "rest" else press(model, GRASP)
-    weight = float(model.disc.mass.detach() * model.gravity.detach())
-    lower, upper = contact_force(model, y, "L"), contact_force(model, y, "U")
-    assert float(lower[1] + upper[1]) == pytest.approx(weight, rel=BALANCE)
-    assert float((lower[0] + upper[0]).abs()) < BALANCE * weight
-    if at == "rest":
-        assert torch.equal(upper, torch.zeros_like(upper))
-    else:
-        assert float(lower[1]) > 10 * weight
 
 
 @pytest.mark.parametrize("fidelity", ["massless", "inertial"])
@@ -69,14 +51,6 @@ def test_at_rest_the_upper_pad_just_touches_the_disc() -> None:
     assert int((g > -1e-9).sum()) == 1
     assert float(state.pose["bracket"][0]) == float(state.pose["disc"][0]) == Parameters().scenario.x_C0
     assert float(state.pose["disc"][2]) == 0.0
-
-
-@torch.no_grad()
-def test_a_weightless_disc_rests_without_sinking() -> None:
-    model = build(scenario__gravity=0.0)
-    state = model.unpack(rest(model))
-    assert float(state.pose["disc"][1]) == pytest.approx(Parameters().pad.height + Parameters().disc.radius, abs=1e-12)
-    assert float(model.displacement("L", state).abs().max()) < 1e-12
 
 
 @torch.no_grad()
@@ -130,13 +104,6 @@ def test_fidelities_agree_and_the_grasp_is_the_papers() -> None:
     assert int((massless.penetration("L", one) > 0).sum()) == 11
 
 
-@torch.no_grad()
-def test_a_lower_bracket_needs_more_force() -> None:
-    model = build()
-    forces = [float(contact_force(model, press(model, h), "U")[1]) for h in (49.8e-3, 49.2e-3, 48.6e-3, 47e-3)]
-    assert all(0 > a > b for a, b in itertools.pairwise(forces))
-
-
 # derivatives --------------------------------------------------------------------------------------------------------
 
 PARAMETERS = ("pad.E", "pad.nu", "pad.depth", "contact.K_n", "disc.radius", "disc.mass")
@@ -170,13 +137,6 @@ def test_derivatives_by_autograd_are_those_by_differences(at: str, name: str) ->
     assert float(exact.abs().max()) > 0.1
     # measured: 1e-8 and 7e-7 (um, N), the residuals of 1e-13 m divided by the step
     assert torch.allclose(exact, differences, rtol=1e-7, atol=5e-6)
-
-
-@torch.no_grad()
-def test_the_height_of_the_grasped_bracket_is_given() -> None:
-    model = build()
-    state = model.unpack(press(model, GRASP))
-    assert float(state.pose["bracket"][1]) == GRASP
 
 
 # refusals -----------------------------------------------------------------------------------------------------------

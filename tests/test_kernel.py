@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from torchsoft import Ellipse, Shape, simulate
 from torchsoft.codegen.invoke import call_linearise, call_pullback, call_value
-from torchsoft.physics.contact import distance_law, free_law, interface_law
+from torchsoft.physics.contact import distance_law, interface_law
 from torchsoft.scenario import grasp_and_roll
 from torchsoft.solve.system import contact_laws
 
@@ -93,19 +93,6 @@ def test_the_law_of_a_point_equals_the_module(friction: str, shape: Shape | None
     assert np.all(np.abs(got - expected) <= 1e-10 * np.abs(expected) + 1e-11 * np.abs(expected).max(0))
     idle = {names[i] for i in np.flatnonzero(np.abs(expected).max(0) == 0)}
     assert idle == ({"law.friction.mu_s"} if friction == "coulomb" else set())  # Coulomb's mu_s only says when
-
-
-def test_the_law_away_from_contact_equals_the_module() -> None:
-    model = coarse()
-    laws = contact_laws(model.contact, model.shape)
-    p = np.array([v.item() for v in laws.parameters.values()])
-    for x in (f64(0.0, 1.0, 0.0), f64(2e-5, 0.5, 6e-4), f64(-3e-6, 2.0, 6e-4)):
-        out, again, J, p_bar = np.empty(3), np.empty(3), np.empty((1, 1)), np.zeros(len(p))
-        law = laws.free
-        call_all(law.value, law.linearise, law.pullback, x.numpy(), p, np.ones(1), out, again, J, p_bar)
-        np.testing.assert_allclose(out, free_law(model.contact, x).detach(), rtol=1e-14, atol=0)
-        rate = -1.2e5 / (10.0 + 441.7149 + x[2].item() * 1.2e5)
-        assert J[0, 0] == pytest.approx(rate, rel=1e-13)
 
 
 @torch.no_grad()

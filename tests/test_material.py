@@ -1,11 +1,9 @@
 """Materials of the pads: closed forms of creep and relaxation, the exact conversion, energy, gradients, what is refused."""
 
-import json
 import math
 import re
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,13 +33,11 @@ from torchsoft import (
     SoftGrasp,
     StandardLinearSolid,
     Trajectory,
-    rest,
     simulate,
 )
 from torchsoft.physics.material import KINDS, Material
 from torchsoft.physics.retardation import retarded
 from torchsoft.plot.diagram import graph_of
-from torchsoft.solve.trajectory import load
 from torchsoft.sysid import AtRest, Known, Problem, Recording, Sensor, Unknown, identify
 
 COMMON = {"E": 7.5e5, "nu": 0.45, "rho": 1100.0, "depth": 0.044}
@@ -226,47 +222,6 @@ def test_every_coefficient_of_a_series_is_identified() -> None:
 # --- the grasp --------------------------------------------------------------------------------------------------------------
 
 STABLE = Parameters().override(COARSE | {"control.senses": "bracket"})
-
-
-def rolling(model: SoftGrasp) -> tuple[Tensor, Reference]:
-    """The disc at rest (size,), and 0.2 s that press and roll it."""
-    y0 = rest(model).detach()
-    pose = model.unpack(y0).pose
-    x, y = float(pose["bracket"][0]), float(pose["bracket"][1])
-    signals = {"x_d": Profile([0.0, 0.2], [x, x - 2e-3]), "y_d": Profile([0.0, 0.1], [y, y - 1e-3])}
-    return y0, Reference(**signals, F_ff=Profile([0.0], [0.0]))
-
-
-def grasping(material: Material, **how: Any) -> Trajectory:
-    """The paper's coarse rig on pads of a material."""
-    model = SoftGrasp(STABLE, material=material)
-    y0, reference = rolling(model)
-    return simulate(model, times(0.2, 41), y0=y0, reference=reference, **how)
-
-
-@torch.no_grad()
-def test_energy_is_balanced_with_every_material(material: Material, tmp_path: Path) -> None:
-    """And the run is saved, with the numbers and the name of its material."""
-    run = grasping(material)
-    assert run.energy_residual_rel < 1e-3
-    lost = [work.diff().min() for name, work in run.dissipated.items() if name.startswith("pad")]
-    assert float(min(lost)) > -1e-12
-    run.save(tmp_path / "run.nc")
-    said = {key: json.loads(text) for key, text in load(tmp_path / "run.nc").attrs.items()}
-    assert said["material"] == {name: type(material).__name__ for name in ("L", "U")}
-    own = {f"pad.{name}": value.item() for name, value in material.named_parameters()}
-    assert {name: said["parameters"][name] for name in own} == own
-    assert ("pad.tau" in said["parameters"]) == hasattr(material, "tau")
-
-
-@torch.no_grad()
-def test_a_chain_of_one_element_is_kelvin_and_voigts() -> None:
-    """To rounding: nothing is left for the instantaneous spring."""
-    chain = GeneralisedKelvin(**COMMON, J=[1.0], tau=[0.01])
-    mine, its = grasping(chain, step=1e-3), grasping(MATERIALS["kelvin_voigt"](), step=1e-3)
-    assert mine.state.pads["L"].shape[-3] == 2
-    for name in ("x_C", "y_C", "theta", "F_x", "F_y"):
-        assert float((mine[name] - its[name]).abs().max()) <= 1e-13 * float(its[name].abs().max()), name
 
 
 @torch.no_grad()

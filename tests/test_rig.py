@@ -20,21 +20,9 @@ from torchsoft import (
     SmoothSlip,
     SoftContact,
     SoftGrasp,
-    hold,
-    rest,
 )  # fmt: skip
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import NAMES
-
-
-def test_rest_is_an_equilibrium_of_forward(fidelity: str) -> None:
-    """At rest nothing accelerates; gravity is what a kilogram feels otherwise, 9.81."""
-    model = coarse(pad__fidelity=fidelity)
-    y = rest(model).detach()
-    model.reference = hold(x_d=0.06, y_d=float(model.unpack(y).pose["bracket"][1]), F_ff=0.0)
-    with torch.no_grad():
-        rate = model.unpack(model(0.0, y))
-    assert max(float(v.abs().max()) for v in rate.velocity.values()) < 1e-8
 
 
 def test_a_rig_of_lists_is_the_papers() -> None:

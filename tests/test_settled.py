@@ -61,16 +61,6 @@ def test_no_node_moves(build: Callable[[], Rig], seed: int) -> None:
     assert rates(rig, y) < 1e-9
 
 
-def test_velocities_stand_in_the_state_and_change_nothing_else() -> None:
-    model = coarse()
-    state = shaken(model)
-    moving = state._replace(velocity={"disc": f64(0.1, 0.0, -5.0), "bracket": f64(0.2, 0.0, 0.0)})
-    y, still = around(model, moving), around(model, state)
-    there = model.layout.slices["velocity", "disc"]
-    assert torch.equal(y[there], f64(0.1, 0.0, -5.0))
-    assert torch.equal(y[: there.start], still[: there.start])
-
-
 def test_derivatives_are_those_of_differences() -> None:
     """By poses, stretches and every kind of parameter, in one random direction of the state each."""
     model, names = coarse(), ("pad.E", "pad.nu", "contact.K_t", "contact.mu_s", "disc.radius")

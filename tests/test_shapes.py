@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import f64, times
+from conftest import f64
 from matplotlib.path import Path as Polygon
 from numpy.typing import NDArray
-from scipy.integrate import quad
 from scipy.interpolate import BSpline, CubicSpline
 from scipy.optimize import minimize_scalar
 from torch import Tensor, nn
@@ -26,17 +25,12 @@ from torchsoft import (
     RoundedBox,
     RoundedPolygon,
     Shape,
-    SmoothSlip,
-    SoftContact,
     SoftGrasp,
     Superellipse,
     rest,
-    simulate,
 )
-from torchsoft.physics.contact import interface_law
 from torchsoft.physics.shapes.area import moments
 from torchsoft.physics.validity import check_shape
-from torchsoft.solve.laws import contact_laws
 
 Array = NDArray[np.float64]
 Boundary = Callable[[Array], Array]
@@ -208,33 +202,6 @@ def test_curvature_is_that_of_the_boundary(case: tuple[Shape, Boundary]) -> None
         assert np.median(np.abs(kappa.numpy() - expected)) * size < 2e-5
 
 
-@pytest.mark.parametrize("depth", [0.0, -2e-4, 3e-4])
-def test_curvature_is_exact(depth: float) -> None:
-    """Of a superellipse by the formula of its equation, of a contour by its spline's derivatives, of a box by its corners."""
-    s = 0.013 + np.arange(40) / 40
-    a, b, n = 20e-3, 14e-3, 4.0
-    x, y = superellipse(a, b, n)(s).T
-    fx, fy = np.sign(x) * np.abs(x / a) ** (n - 1) / a, np.sign(y) * np.abs(y / b) ** (n - 1) / b
-    fxx, fyy = (n - 1) * np.abs(x / a) ** (n - 2) / a**2, (n - 1) * np.abs(y / b) ** (n - 2) / b**2
-    speed = np.hypot(fx, fy)
-    of_superellipse = np.stack((x, y, fx / speed, fy / speed, (fxx * fy**2 + fyy * fx**2) / speed**3), -1)
-    control = contour().control.detach().numpy() - contour().moments().centre.detach().numpy()
-    count = len(control)
-    curve = BSpline(np.arange(-3.0, count + 4), np.concatenate((control[-1:], control, control[:2])), 3)
-    (x, y), (tx, ty), (bx, by) = (curve(s * count, k).T for k in range(3))
-    speed = np.hypot(tx, ty)
-    of_contour = np.stack((x, y, ty / speed, -tx / speed, (tx * by - ty * bx) / speed**3), -1)
-    corner = np.sqrt(0.5)
-    of_box = np.array(
-        [[18e-3 + 2e-3 * corner, 7e-3 + 2e-3 * corner, corner, corner, 500.0], [3e-3, -9e-3, 0.0, -1.0, 0.0]]
-    )
-    for shape, expected in (
-        (Superellipse(a, b, n), of_superellipse), (contour(), of_contour), (RoundedBox(20e-3, 9e-3, 2e-3), of_box),
-    ):  # fmt: skip
-        kappa = shape.curvature(torch.from_numpy(expected[:, :2] + depth * expected[:, 2:4]))
-        assert kappa.numpy() == pytest.approx(expected[:, 4], rel=1e-9, abs=1e-9)
-
-
 # --- limits ----------------------------------------------------------------------------------------------------------------
 
 R = 19.37e-3
@@ -289,20 +256,6 @@ def test_two_ways_to_one_body(one: Callable[[], Shape], other: Callable[[], Shap
     assert one.size() == pytest.approx(other.size(), rel=1e-9)
 
 
-def test_full_rounding_runs_like_the_circle() -> None:
-    plain = SoftGrasp(COARSE)
-    y0 = rest(plain).detach()
-    reference, step = grasp(plain, y0), {"step": 1e-3}
-    expected = simulate(plain, times(0.1, 11), y0=y0, reference=reference, **step)
-    for shape in (RoundedBox(R, R, R), Superellipse(R, R, 2.0), RoundedPolygon(HEXAGON, R)):
-        model = SoftGrasp(COARSE, shape=shape)
-        assert torch.allclose(rest(model).detach(), y0, rtol=0, atol=1e-12)
-        run = simulate(model, expected.t, y0=y0, reference=reference, **step)
-        for key in ("x_C", "y_C", "theta", "x_Br", "y_Br"):
-            scale = float(expected[key].max() - expected[key].min())
-            assert float((run[key] - expected[key]).abs().max()) <= 1e-9 * max(scale, 1e-3), key
-
-
 # --- area, centre of mass, inertia -------------------------------------------------------------------------------------------
 
 
@@ -324,17 +277,6 @@ def test_moments_by_green_are_those_of_a_disc() -> None:
     assert float(of.area) == pytest.approx(0.09 * np.pi, rel=1e-13)
     assert torch.allclose(of.centre, f64(5.0, -7.0), rtol=1e-14)
     assert float(of.gyration) == pytest.approx(0.045, rel=1e-11)
-
-
-@torch.no_grad()
-def test_a_superellipse_has_the_moments_of_its_integrals() -> None:
-    a, b, n = 0.3, 0.2, 3.7
-    shape = Superellipse(a, b, n)
-    height = lambda x: b * (1 - (x / a) ** n) ** (1 / n)
-    area = 4 * quad(height, 0, a, epsabs=1e-13)[0]
-    square = 4 * quad(lambda x: x**2 * height(x) + height(x) ** 3 / 3, 0, a, epsabs=1e-13)[0]
-    assert float(shape.area()) == pytest.approx(area, rel=1e-9)
-    assert float(shape.gyration()) == pytest.approx(square / area, rel=1e-9)
 
 
 def test_a_uniform_body_has_mass_and_inertia_of_its_shape() -> None:
@@ -401,33 +343,6 @@ def test_derivatives_are_those_of_differences(case: tuple[Shape, Boundary]) -> N
         error = (slope - expected).abs().amax(-1) / expected.abs().max()
         assert float(error.median()) < 1e-8, name
         assert int((error > 1e-6).sum()) <= 2, name  # of thirty points, some come from a side onto an arc
-
-
-LAW = SoftContact(1.2e5, 440.0, 1.1e5, 430.0, friction=SmoothSlip(0.8, 0.7, 5e-2, 10.0))
-
-
-def test_compiled_laws_are_those_of_torch(case: tuple[Shape, Boundary]) -> None:
-    """Value, derivatives by what moves, and by the parameters that the shape was made of."""
-    from test_codegen import _compiled_results
-
-    shape, boundary = case
-    prepared = shape.prepared()
-    laws = contact_laws(LAW, prepared)
-    p = torch.cat([value.reshape(-1) for value in laws.parameters.values()])
-    own = list(shape.parameters())
-    for k, d in enumerate(near(boundary, 20, 2e-4, seed=5)):
-        x = f64(0.02, -0.03, 1.5, *d, 0.3, 1e-5, 1.0, 2e-4)
-        x[3:5] = f64(np.cos(0.3) * d[0] - np.sin(0.3) * d[1], np.sin(0.3) * d[0] + np.cos(0.3) * d[1])
-        at = x.clone().requires_grad_()
-        expected = interface_law(LAW, shape, at)
-        weight = f64(0.5, 1.1, -0.7)
-        rows = [torch.autograd.grad(expected[i], at, retain_graph=True)[0][:7].numpy() for i in range(3)]
-        slopes = torch.autograd.grad((expected[:3] * weight).sum(), own, retain_graph=True)
-        out, J, p_bar = _compiled_results(laws.interface, x.numpy(), p.detach().numpy(), weight.numpy())
-        pulled = torch.autograd.grad(p, own, torch.from_numpy(p_bar), retain_graph=True)
-        for mine, its in ((out, expected.detach().numpy()), (J, np.stack(rows)), *zip(pulled, slopes)):
-            mine, its = np.asarray(mine), np.asarray(its)
-            assert np.abs(mine - its).max() <= 1e-10 * max(1e-2, np.abs(its).max()), k
 
 
 COARSE = Parameters().override({"pad.elements_x": 60, "pad.elements_y": 3})
@@ -557,16 +472,6 @@ def test_a_centre_of_mass_off_the_origin_is_told(caplog: pytest.LogCaptureFixtur
     assert caplog.text == ""
     RoundedPolygon(np.array(box(20e-3, 9e-3)) + [0.5, 0.25], 2e-3)
     assert "the centre of mass is at (0.5, 0.25) m of `vertices`: the body's pose is that of this point" in caplog.text
-
-
-def test_the_centre_of_mass_follows_the_vertices() -> None:
-    """Moving them all is no change of the body; moving one moves the others away from the centre."""
-    shape = RoundedPolygon(ANGLED, 2e-3)
-    x = torch.from_numpy(near(known("angle")[1], 40, BAND))
-    phi = shape(x)[0]
-    (slope,) = torch.autograd.grad(phi.sum(), shape.vertices)
-    assert float(slope.sum(0).abs().max()) < 1e-12
-    assert float(slope.abs().max()) > 1e-2
 
 
 def test_an_object_that_its_pads_would_turn_is_told_of() -> None:

@@ -23,7 +23,6 @@ from torchsoft import (
     SoftGrasp,
     StandardLinearSolid,
     hold,
-    press,
     rest,
     simulate,
 )  # fmt: skip
@@ -59,38 +58,6 @@ def test_values_set_on_the_module_run_and_are_saved(tmp_path: Path) -> None:
         assert '"contact.K_n": 200000.0' in saved.attrs["parameters"]
         np.testing.assert_array_equal(saved["disc_position"][:, 0], run["x_C"])
         np.testing.assert_array_equal(saved["disc_angle"], run["theta"])
-
-
-def test_a_radius_set_on_the_module_is_the_radius() -> None:
-    """In statics, in what the bracket's height means, and in the run."""
-    model, other = coarse(), coarse(disc__radius=19.5e-3)
-    with torch.no_grad():
-        model.shape.radius.fill_(19.5e-3)
-        assert float(model.touch_height(0.02)) == float(other.touch_height(0.02)) != float(coarse().touch_height(0.02))
-        assert torch.equal(rest(model), rest(other))
-        assert torch.equal(press(model, 48.8e-3), press(other, 48.8e-3))
-    assert model.settings.disc.radius == 19.5e-3
-    assert torch.equal(rolled(model).y, rolled(other).y)
-    assert float(model.disc.inertia.detach()) == float(other.disc.inertia.detach())
-
-
-class Oval(Ellipse):
-    """An ellipse that also has what a circle has."""
-
-    def __init__(self) -> None:
-        super().__init__(19.8e-3, 19.1e-3)
-        self.radius = torch.tensor(19.37e-3, dtype=torch.float64)
-
-
-@pytest.mark.filterwarnings("ignore:the energies of the run")  # the bracket starts off its set-point
-def test_a_shape_with_a_radius_runs_as_itself() -> None:
-    oval, ellipse = (SoftGrasp(coarse().settings, shape=shape) for shape in (Oval(), Ellipse(19.8e-3, 19.1e-3)))
-    with torch.no_grad():
-        assert torch.equal(rest(oval), rest(ellipse))
-        y0 = rest(ellipse)
-    assert not torch.allclose(y0, rest(coarse()).detach(), rtol=0, atol=1e-6)
-    runs = [simulate(model, T, y0=y0).y for model in (oval, ellipse)]
-    assert torch.equal(*runs)
 
 
 class Polygonal(Shape):

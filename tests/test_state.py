@@ -1,21 +1,10 @@
 """The state vector: what stands where, taken apart and put together."""
 
-from collections.abc import Callable
-
 import pytest
 import torch
 from conftest import coarse, f64, turning
 
 from torchsoft import Body, Circle, Rig, hold
-
-
-def test_every_component_belongs_to_one_part(build: Callable[..., Rig]) -> None:
-    layout = build().layout
-    count = torch.zeros(layout.size)
-    for where in layout.slices.values():
-        count[where] += 1
-    assert bool((count == 1).all())
-    assert list(layout.slices) == sorted(layout.slices, key=lambda key: layout.slices[key].start)
 
 
 def test_sizes_of_the_papers_rig() -> None:

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, coarse, f64, grasped, times
+from conftest import COARSE, coarse, grasped, times
 
 from torchsoft import (
     Parameters,
@@ -61,15 +61,6 @@ def test_one_model_in_two_threads_under_two_references_with_gradients() -> None:
     for got, expected in zip(both, [*alone, *alone]):
         assert all(torch.equal(a, b) for a, b in zip(got, expected))
     assert model.reference is steady
-
-
-def test_irregular_output_times_do_not_matter() -> None:
-    """Outputs only cut the steps: the same instants reached with other outputs agree to the stepper's accuracy."""
-    manipulation = grasp_and_roll(coarse(), grasp_force=75.0)
-    model, y0 = manipulation.model, manipulation.y0
-    even = simulate(model, times(0.4, 5), y0=y0, step=5e-4)
-    odd = simulate(model, f64(0, 0.1003, 0.17, 0.3, 0.4), y0=y0, step=5e-4)
-    assert float((even.state.pose["disc"][-1, :2] - odd.state.pose["disc"][-1, :2]).abs().max()) < 1e-8
 
 
 @pytest.mark.parametrize(
