@@ -12,8 +12,6 @@ from torch import Tensor, nn
 from torchsoft import (
     PD,
     Actuator,
-    Body,
-    Circle,
     Parameters,
     Profile,
     Reference,
@@ -21,7 +19,6 @@ from torchsoft import (
     SoftGrasp,
     StateFeedback,
     controller,
-    hold,
     press,
     simulate,
 )
@@ -124,27 +121,6 @@ def test_coordinates_without_set_points_are_regulated() -> None:
     assert efforts.item() == pytest.approx(1.5 - 2.5 + 250.0 - 125.0, rel=1e-15)
 
 
-def test_what_cannot_be_honoured_is_refused() -> None:
-    law = StateFeedback([[1.0, 1.0]])
-    one = {"measures": ["disc.x"], "setpoints": ["w"], "pushes": {"x": "disc.x"}}
-    for given, sentence in (
-        (
-            one | {"pushes": {"x": "disc.x", "y": "disc.y"}},
-            r"gives \(1,\) for one state, but must give one effort for each of",
-        ),
-        (one | {"measures": "disc.x"}, "are sequences of names"),
-        (one | {"feed_forward": {"z": "F"}}, "`feed_forward` names z, but `pushes` has x"),
-        (one | {"setpoints": ["w", "v"]}, "measures 1 coordinates and follows 2 set-points"),
-        (one | {"measures": [3]}, "must be a name, or a sequence of them"),
-    ):
-        with pytest.raises(ValueError, match=sentence):
-            controller(law, **given)
-    with pytest.raises(ValueError, match="must be a torch module"):
-        controller(lambda w, q: q, **one)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="rows of one length"):
-        StateFeedback([[1.0, 2.0], [1.0]])
-
-
 def file(**changes: Any) -> RigFile:
     """The ready template, coarse, with one controller in the place of its loops."""
     tree = template("t").model_dump(exclude_unset=True)
@@ -158,31 +134,6 @@ def file(**changes: Any) -> RigFile:
     }  # fmt: skip
     tree["outputs"] = {"duration": 0.6, "interval": 0.02}
     return RigFile.from_tree(tree)
-
-
-def test_a_law_of_ones_own_that_is_none_is_refused_with_its_actuator() -> None:
-    """Before the run, with what it must take and return."""
-    kept: list[torch.Tensor] = []
-
-    def keeping(w: Any, w_dot: Any, feed_forward: Any, q: Any, q_dot: Any) -> torch.Tensor:
-        kept.append(q)
-        return 100.0 * (w - kept[0])
-
-    must = r"the law of `actuators.x` must take five tensors .* and return the effort, .* but "
-    for law, message in (
-        (lambda w, w_dot, feed_forward, q, q_dot: None, must + "TypeError: for one state it gives None"),
-        (lambda w, w_dot, feed_forward, q, q_dot: 3.0, must + r"TypeError: for one state it gives 3\.0"),
-        (lambda w, w_dot, feed_forward, q, q_dot: torch.stack((w, q)), must + r".* a tensor of shape \(2,\)"),
-        (lambda w, q: w - q, must + "TypeError: .* takes 2 positional arguments but 5 were given"),
-        (lambda w, w_dot, feed_forward, q, q_dot: (w - q)[3], must + "IndexError"),
-        (keeping, "`actuators.x`: The law is another one when it is called again"),
-    ):
-        rig = Rig(
-            bodies={"disc": Body(1.0, Circle(0.02), weighted=False)}, pads={}, contacts={}, reference=hold(x_d=0.0),
-            actuators={"x": Actuator("disc.x", "disc.x", law, setpoint="x_d")},
-        )  # fmt: skip
-        with pytest.raises(TypeError, match=message):
-            simulate(rig, times(0.01, 2), y0=torch.zeros(6, dtype=torch.float64))
 
 
 def test_a_controller_in_a_file_is_the_loops_that_it_stands_for(tmp_path: Path) -> None:

@@ -142,12 +142,6 @@ def test_derivatives_by_autograd_are_those_by_differences(at: str, name: str) ->
 # refusals -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("height", [60e-3, 50.2e-3, 50.1e-3])
-def test_a_bracket_above_the_disc_is_refused(height: float) -> None:
-    with pytest.raises(NoEquilibrium, match=rf"{height} m is too high"):
-        press(build(), height)
-
-
 def test_a_bracket_above_the_sunken_disc_is_refused() -> None:
     model = build()
     with torch.no_grad():

@@ -204,21 +204,3 @@ def test_a_cotangent_that_is_not_finite_is_refused(bad: float) -> None:
     cotangent[3, w.model.layout.slices["velocity", "disc"]] = bad
     with pytest.raises(GradientFailed, match="the cotangent of output 3 is not finite"):
         solution.backward(cotangent)
-
-
-def test_simulate_names_what_is_wrong_with_what_is_wanted() -> None:
-    w = stick()
-
-    def forward(wrt: list[str], model: SoftGrasp = w.model, **more: Tensor) -> None:
-        simulate(model, w.t, y0=w.y0, step=w.step, gradient="forward", wrt=wrt, **more)
-
-    with pytest.raises(ValueError, match=r"`contact.K_x` is not a parameter of this rig; known: .*contact.K_n"):
-        forward(["contact.K_n", "contact.K_x"])
-    with pytest.raises(ValueError, match="gradient='forward' needs the parameters' names `wrt`, or directions `dy0`"):
-        forward([])
-    with pytest.raises(ValueError, match="`wrt` names the parameters of gradient='forward'"):
-        simulate(w.model, w.t, y0=w.y0, step=w.step, gradient="discrete", wrt=["contact.K_n"])
-    with pytest.raises(ValueError, match=r"`dy0` must have shape \(376, 1\), or more columns, but has"):
-        forward(["contact.K_n"], dy0=torch.zeros(3, 1, dtype=torch.float64))
-    with pytest.raises(ValueError, match=r"`contact\.epsilon` must be a scalar parameter that requires a gradient"):
-        forward(["contact.epsilon"])

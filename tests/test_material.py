@@ -1,10 +1,7 @@
 """Materials of the pads: closed forms of creep and relaxation, the exact conversion, energy, gradients, what is refused."""
 
-import math
-import re
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
@@ -233,83 +230,6 @@ def test_the_graph_has_the_fields_of_the_chain(material: Material) -> None:
 
 
 # --- what is refused ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Prony(**COMMON, moduli=[1e5], tau=[0.1, 1.0]), "as many `moduli` as `tau`, from 1 to 20, but has 1 and 2"),
-        (lambda: GeneralisedKelvin(**COMMON, J=[], tau=[]), "as many `J` as `tau`, from 1 to 20, but has 0 and 0"),
-        (lambda: Prony(**COMMON, moduli="12", tau=[0.1, 1.0]), "`E` must be a list of numbers, but is '12'"),
-        (lambda: Prony(**COMMON, moduli=[1e5], tau=0.1), "`tau` must be a list of numbers, but is 0.1"),  # pyright: ignore
-        (lambda: GeneralisedKelvin(**COMMON, J=[0.1, True], tau=[1, 2]), "`J_2` must be a number, but is True"),
-    ],
-)  # fmt: skip
-def test_a_series_that_is_none_is_refused(make: Callable[[], Material], message: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(message)):
-        make()
-
-
-@pytest.mark.parametrize(
-    ("solid", "message"),
-    [
-        (Prony(**COMMON, moduli=[1e5, 2e5], tau=[0.1, 0.1]), "two relaxation times are equal"),
-        (
-            Prony(**COMMON, moduli=[1e5, -2e5], tau=[0.1, 0.2]),
-            "parameter `pad.E_2` must be from 1 to 1e+13 Pa, but is -200000",
-        ),
-        (Prony(**COMMON, moduli=[1e5], tau=[5e-5]), "tau_instant = 0.0001 s must be below the shortest tau, 5e-05 s"),
-        (GeneralisedKelvin(**COMMON, J=[0.6, 0.5], tau=[0.1, 1]), "the fractions J sum to 1.1, above one"),
-        (
-            GeneralisedKelvin(**COMMON, J=[0.6], tau=[0.0]),
-            "parameter `pad.tau_1` must be from 1e-09 to 1e+06 s, but is 0",
-        ),
-        (GeneralisedKelvin(**COMMON, J=[math.nan], tau=[0.1]), "parameter `pad.J_1` must be finite, but is nan"),
-    ],
-)
-def test_unphysical_coefficients_are_refused_before_a_run(solid: Material, message: str) -> None:
-    model = SoftGrasp(STABLE, material=solid)
-    y0 = torch.zeros(model.layout.size, dtype=torch.float64)
-    with pytest.raises(ValueError, match=re.escape(message)):
-        simulate(model, times(0.1, 2), y0=y0)
-
-
-class Chain(Material):
-    """A material with the chain that it is given."""
-
-    def __init__(self, *given: object) -> None:
-        super().__init__(**COMMON)
-        self.given = given
-
-    def chain(self) -> Any:
-        return tuple(torch.tensor(x, dtype=torch.float64) if isinstance(x, list) else x for x in self.given)
-
-    @property
-    def branches(self) -> int:
-        return 2
-
-
-@pytest.mark.parametrize(
-    ("chain", "message"),
-    [
-        (([0.7, 0.5], [0.01, 0.1]), "must sum to one, but [0.7, 0.5] sum to 1.2; divide both J and E by that sum"),
-        (([1.2, -0.2], [0.01, 0.1]), "the fractions J of the material of `L` must not be negative"),
-        (([0.5, math.nan], [0.01, 0.1]), "the fractions J of the material of `L` must not be negative"),
-        (([0.5, 0.5], [0.01, 0.0]), "the retardation times tau of the material of `L` must be positive and finite"),
-        (([0.5, 0.5], [0.01, math.inf]), "the retardation times tau of the material of `L` must be positive and finite"),
-        (([0.5, 0.5], [0.01]), "`tau` of the material of `L` must have shape (branches,) = (2,), one at least, but has (1,)"),
-        (([0.2, 0.3, 0.5], [0.01, 0.1, 1.0]), "`J` of the material of `L` must have shape (branches,) = (2,)"),
-        (([[0.5, 0.5]], [0.01, 0.1]), "`J` of the material of `L` must have shape"),
-        (([0.5, 0.5], 0.01), "`tau of the material of L` must be a float64 tensor, but is float"),
-        (([0.5, 0.5], torch.ones(2)), "`tau of the material of L` must be float64"),
-        (([1.0, 0.0],), "`chain` of the material of `L` must give two tensors, J and tau"),
-    ],
-)  # fmt: skip
-def test_a_chain_that_is_none_is_refused_before_a_run(chain: tuple[Any, ...], message: str) -> None:
-    model = SoftGrasp(STABLE, material=Chain(*chain))
-    y0 = torch.zeros(model.layout.size, dtype=torch.float64)
-    with pytest.raises(ValueError, match=re.escape(message)):
-        simulate(model, times(0.1, 2), y0=y0)
 
 
 @pytest.mark.parametrize("name", [name for name in MATERIALS if name != "kelvin_voigt"])

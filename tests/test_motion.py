@@ -41,29 +41,6 @@ def test_profile_goes_through_its_knots_and_stays_outside_them() -> None:
     assert torch.equal(rate, torch.zeros_like(rate))
 
 
-@pytest.mark.parametrize("kind", [Profile, Sampled])
-@pytest.mark.parametrize(
-    ("times", "values", "match"),
-    [
-        ([0.0, 0.0], [1.0, 2.0], "increase strictly"),
-        ([0.0, -1.0], [1.0, 2.0], "increase strictly"),
-        ([0.0, float("nan")], [1.0, 2.0], "increase strictly"),
-        ([0.0, 1.0], [1.0], "per time"),
-        ([0.0], [float("nan")], "finite"),
-        ([], [], "from one time on"),
-    ],
-)
-def test_bad_knots_are_refused(kind: type[Profile], times: list[float], values: list[float], match: str) -> None:
-    with pytest.raises(ValueError, match=match):
-        kind(times, values)
-
-
-def test_bad_rates_are_refused() -> None:
-    for rates in ([0.0], [0.0, float("inf")]):
-        with pytest.raises(ValueError, match="`rates` must hold one finite number per time"):
-            Sampled([0.0, 1.0], [1.0, 2.0], rates)
-
-
 @pytest.mark.parametrize("knots", [2, 3, 4])
 def test_sampled_is_the_cubic_spline_and_stays_outside_it(knots: int) -> None:
     signal, spline = Sampled(TIMES[:knots], VALUES[:knots]), CubicSpline(TIMES[:knots], VALUES[:knots])
@@ -181,10 +158,3 @@ def test_reference_gives_named_signals_side_by_side() -> None:
     assert torch.equal(got[:, 0], got[:, 2])
     assert reference(t, ()).shape == (5, 0, 2)
     assert hold(x=1.0, y=-2.0)(f64(3.0), ("x", "y"))[0].tolist() == [[1.0, 0.0], [-2.0, 0.0]]
-
-
-def test_reference_names_what_is_wrong() -> None:
-    with pytest.raises(ValueError, match="has no signal `z`; it has x, y"):
-        hold(x=0.0, y=0.0)(f64(0.0), ("z",))
-    with pytest.raises(ValueError, match="the signal `x` must be a module such as `Profile`, but is float"):
-        Reference(x=0.1)  # pyright: ignore[reportArgumentType]

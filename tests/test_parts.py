@@ -4,7 +4,7 @@ import pytest
 import torch
 from conftest import coarse, f64, grasped
 
-from torchsoft import PD, Actuator, Body, Circle, Ellipse, SoftGrasp
+from torchsoft import PD, Body, Circle, Ellipse
 
 
 def test_pd_by_hand() -> None:
@@ -34,20 +34,3 @@ def test_bodies_know_their_inertia() -> None:
     radius = Body(2.0, Circle(0.1))
     (slope,) = torch.autograd.grad(radius.inertia, radius.shape.radius)
     assert float(slope) == pytest.approx(2.0 * 0.1, rel=1e-15)
-
-
-def test_bodies_name_what_is_wrong() -> None:
-    with pytest.raises(ValueError, match=r"`y` must be 'free', 'driven' or a number, but is 'loose'"):
-        Body(1.0, Circle(0.1), y="loose")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="needs an `inertia`, or a `shape`"):
-        Body(1.0)
-    assert Body(1.0, theta=0.0).freedom == {"x": "free", "y": "free", "theta": "fixed"}
-
-
-def test_actuators_name_what_is_wrong() -> None:
-    for measures in ("disc.z", "disk.x", "x"):
-        model = coarse()
-        model.actuators["x"] = Actuator(measures, "bracket.x", PD(1.0, 1.0), setpoint="x_d")
-        with pytest.raises(ValueError, match=rf"speaks of `{measures}`, which is not a coordinate; there are disc\.x"):
-            model.check_names()
-    assert isinstance(model, SoftGrasp)

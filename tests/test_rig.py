@@ -1,7 +1,5 @@
 """A rig as an ODE's right-hand side: batches, gradients, names, and what cannot be put together."""
 
-from collections.abc import Callable
-
 import pytest
 import torch
 from conftest import coarse, random_state
@@ -74,58 +72,3 @@ def test_parameters_have_the_names_of_the_settings() -> None:
     rolling = SoftGrasp(Parameters().override({"contact.friction": "coulomb"}))
     with pytest.raises(ValueError, match=r"`contact.v_s` is not a parameter"):
         rolling.parameter("contact.v_s")
-
-
-def small(**changes: object) -> Rig:
-    """A disc on a pad on the ground."""
-    mesh, rubber = PadMesh(0.04, 4e-3, 8, 2), KelvinVoigt(7e5, 0.45, 1100.0, 0.01, 0.044)
-    law = SoftContact(1e5, 400.0, 1e5, 400.0, friction=SmoothSlip(0.8, 0.7, 0.05, 10.0))
-    parts: dict[str, dict[str, torch.nn.Module]] = {
-        "bodies": {"disc": Body(0.4, Circle(0.02))}, "pads": {"P": Pad(mesh, rubber)},
-        "contacts": {"c": Contact("P", "disc", law)}, "actuators": {},
-    }  # fmt: skip
-    for name, change in changes.items():
-        parts[name] |= change(mesh, rubber, law)  # pyright: ignore[reportCallIssue]
-    return Rig(**parts)  # pyright: ignore[reportArgumentType]
-
-
-@pytest.mark.parametrize(
-    ("changes", "match"),
-    [
-        (
-            {"pads": lambda m, r, c: {"P": Pad(m, r, base="hand")}},
-            "pad `P` is bonded to `hand`, but the bodies are disc",
-        ),
-        ({"pads": lambda m, r, c: {"P": Pad(m, r, base="disc")}}, "is bonded to the body `disc` itself"),
-        (
-            {"contacts": lambda m, r, c: {"d": Contact("Q", "disc", c)}},
-            "contact `d` is between `Q` and `disc`, which are not",
-        ),
-        (
-            {"contacts": lambda m, r, c: {"d": Contact("P", "dish", c)}},
-            "contact `d` is between `P` and `dish`, which are not",
-        ),
-        (
-            {"contacts": lambda m, r, c: {"d": Contact("P", "disc", c)}},
-            r"contacts\.d: it is between the same pad and body as `c`; leave one out",
-        ),
-        (
-            {"bodies": lambda m, r, c: {"disc": Body(0.4, theta=0.0)}},
-            "contact `c` needs a shape, but the body `disc` has none",
-        ),
-        (
-            {"actuators": lambda m, r, c: {"a": Actuator("disc.x", "disc.up", PD(1.0, 1.0), setpoint="w")}},
-            r"actuator `a` speaks of `disc\.up`, which is not a coordinate; there are disc\.x, disc\.y, disc\.theta",
-        ),
-    ],
-)
-def test_names_that_do_not_fit_are_refused(changes: dict[str, Callable[..., object]], match: str) -> None:
-    with pytest.raises(ValueError, match=match):
-        small(**changes)
-    assert small().layout.size == 9 * 3 + 6
-
-
-def test_a_signal_that_is_not_there_is_named() -> None:
-    rig = small(actuators=lambda m, r, c: {"a": Actuator("disc.x", "disc.x", PD(1.0, 1.0), setpoint="w")})
-    with pytest.raises(ValueError, match="the reference has no signal `w`; it has none"):
-        rig(0.0, torch.zeros(rig.layout.size, dtype=torch.float64))

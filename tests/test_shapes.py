@@ -362,66 +362,6 @@ def grasp(model: SoftGrasp, y0: Tensor) -> Reference:
 # --- what is refused, and what is said ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("shape", "match"),
-    [
-        (lambda: Superellipse(20e-3, 20e-3, 1.9), "`disc.shape.n` must be from 2 to 20, but is 1.9"),
-        (lambda: Superellipse(20e-3, 20e-3, 21.0), "`disc.shape.n` must be from 2 to 20, but is 21"),
-        (lambda: Superellipse(20e-3, 6e-3, 4.0), "differ by more than a factor of 3"),
-        (lambda: Superellipse(20e-3, 20e-3, float("nan")), "`disc.shape.n` must be finite"),
-        (lambda: RoundedBox(20e-3, 9e-3, 9.1e-3), "the corners' radius 0.0091 is larger than half of the box, 0.009"),
-        (lambda: RoundedBox(20e-3, 9e-3, 0.0), "`disc.shape.radius` must be from 1e-06 to 10 m, but is 0"),
-    ],
-)
-def test_shapes_that_are_none_are_refused(shape: Callable[[], Shape], match: str) -> None:
-    with pytest.raises(ValueError, match=match):
-        rest(SoftGrasp(COARSE, shape=shape()))
-
-
-CIRCLE = [[20e-3 * np.cos(t), 20e-3 * np.sin(t)] for t in np.arange(24) * np.pi / 12]
-EIGHT = [[np.sin(2 * t), np.sin(t)] for t in (np.arange(200) + 0.3) * np.pi / 100]
-NECK = [[np.cos(t), np.sin(t) * (0.005 + np.cos(t) ** 2)] for t in np.arange(400) * np.pi / 200]
-
-
-@pytest.mark.parametrize(
-    ("made", "match"),
-    [
-        (lambda: Contour(CIRCLE[:7]), "must be at least 8 places around a contour, but are 7"),
-        (lambda: Contour([*CIRCLE, CIRCLE[-1]]), "has the same place twice: point 23"),
-        (
-            lambda: Contour([*CIRCLE[:-1], [0.1, float("inf")]]),
-            r"`points` must be finite numbers of the shape \(n, 2\)",
-        ),
-        (lambda: Contour([[1.0, 2.0, 3.0]]), r"of the shape \(n, 2\), but is \[\[1.0, 2.0, 3.0\]\]"),
-        (lambda: Contour("pear.csv"), r"of the shape \(n, 2\), but is 'pear.csv'"),
-        (
-            lambda: Contour(np.concatenate((CIRCLE[:12], np.linspace([-0.02, 0], [0.02, 0], 9)[1:]))),
-            "turns by .* degrees",
-        ),
-        (lambda: Contour(EIGHT), "a contour that crosses itself"),
-        (lambda: Contour(NECK, tolerance=1e-3), "so sharp, or so narrow, that the nearest point is the only one up to"),
-        (
-            lambda: Contour(pear(500), tolerance=1e-12),
-            "a contour of 512 pieces still passes the points, or the spline .*, at .*e-.* m",
-        ),
-        (lambda: Contour(CIRCLE, tolerance=0), "`tolerance` must be positive and finite, but is 0"),
-        (lambda: RoundedPolygon(TRIANGLE, 9e-3), "corners of radius 0.009 do not fit on side . of the polygon"),
-        (lambda: RoundedPolygon([[0, 0], [1, 0], [0, 0], [0, 1]], 0.01), "do not fit on side . of the polygon"),
-        (lambda: RoundedPolygon([[0, 0], [2, 2], [2, 0], [0, 1]], 0.01), "the polygon crosses itself"),
-        (
-            lambda: RoundedPolygon([[-2, -2], [1.6, 2], [2, -2], [-1.6, 2]], 0.1),
-            "the polygon crosses itself",
-        ),  # no area
-        (lambda: RoundedPolygon(TRIANGLE, 0.0), "`radius` must be positive and finite, but is 0"),
-        (lambda: RoundedPolygon([[0, 0], [1, 0]], 0.1), "`vertices` must be 3 to 64 places, but are 2"),
-        (lambda: RoundedPolygon([[0, 0], [1, 0], [True, "a"]], 0.1), "`vertices` must be finite numbers"),
-    ],
-)
-def test_points_that_are_no_contour_are_refused(made: Callable[[], Shape], match: str) -> None:
-    with pytest.raises(ValueError, match=match):
-        made()
-
-
 def test_control_points_that_were_spoilt_are_refused() -> None:
     shape = Contour(pear())
     with torch.no_grad():
@@ -468,7 +408,7 @@ def test_a_contour_from_a_file(tmp_path: Path) -> None:
 
 def test_a_centre_of_mass_off_the_origin_is_told(caplog: pytest.LogCaptureFixture) -> None:
     RoundedPolygon(box(20e-3, 9e-3), 2e-3)
-    Contour(CIRCLE)
+    ROUND["contour"]()
     assert caplog.text == ""
     RoundedPolygon(np.array(box(20e-3, 9e-3)) + [0.5, 0.25], 2e-3)
     assert "the centre of mass is at (0.5, 0.25) m of `vertices`: the body's pose is that of this point" in caplog.text

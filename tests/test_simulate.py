@@ -332,17 +332,6 @@ def test_other_settings_of_the_process_do_not_matter() -> None:
 # routes -------------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("route", ["adjoint", "", "Discrete"])
-def test_an_unknown_route_is_refused(route: str) -> None:
-    with pytest.raises(ValueError, match=r"`gradient` must be one of none, discrete, forward, but is"):
-        simulate(coarse(), T, gradient=route)  # pyright: ignore[reportArgumentType]
-
-
-def test_a_run_without_an_end_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"ask for 1e\+300 steps, .*by tolerance no step is longer than 0\.1 s"):
-        simulate(coarse(), f64(0.0, 1e299), y0=grasped(coarse()))
-
-
 def test_no_grad_is_honoured() -> None:
     model = coarse()
     y0 = grasped(model, (0.01, 0.0)).requires_grad_()
@@ -371,100 +360,6 @@ def test_routes_agree_on_the_run() -> None:
 
 
 # nothing unphysical runs --------------------------------------------------------------------------------------------
-
-
-class TurnsNaN(Profile):
-    """Constant until 10 ms, then not a number."""
-
-    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        value, rate = super().forward(t)
-        return torch.where(t > 0.01, torch.nan, value), rate
-
-
-def test_a_reference_that_turns_nan_is_refused() -> None:
-    model = coarse()
-    y0 = grasped(model)
-    bad = Reference(x_d=TurnsNaN([0.0], [0.06]), y_d=model.reference["y_d"], F_ff=model.reference["F_ff"])
-    for route in ("none", "discrete"):
-        with pytest.raises(ValueError, match=r"the signal `x_d` of the reference is not finite at t = 0\.01"):
-            simulate(model, T, y0=y0, reference=bad, gradient=route)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "match"),
-    [
-        ("pad.E", 0.0, r"parameter `.*\.E` must be from 1 to 1e\+13 Pa, but is 0"),
-        ("contact.K_n", -1.2e5, r"parameter `.*K_n` must be from 0.001 to 1e\+12 N/m, but is -120000"),
-        ("contact.K_n", float("nan"), r"parameter `.*K_n` must be finite, but is nan"),
-        ("contact.mu_s", -0.1, r"parameter `.*mu_s` must be from 0 to 100"),
-        ("pad.nu", 0.5, r"parameter `.*nu` must be from -0\.999 to 0\.4999"),
-        ("disc.radius", -1e-3, r"parameter `.*radius` must be from 1e-06 to 10 m"),
-        ("disc.mass", float("inf"), r"parameter `.*mass` must be finite"),
-        ("control.K_81", -1.0, r"parameter `.*Kp` must be from 0 to 1e\+12"),
-        ("scenario.gravity", float("nan"), r"parameter `gravity` must be finite"),
-    ],
-)
-def test_unphysical_values_set_in_place_are_refused_by_name(name: str, value: float, match: str) -> None:
-    model = coarse()
-    y0 = grasped(model)
-    with torch.no_grad():
-        model.parameter(name).fill_(value)
-    with pytest.raises(ValueError, match=match):
-        simulate(model, T, y0=y0)
-
-
-class Noisy(Profile):
-    """Another value at every call."""
-
-    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        value, rate = super().forward(t)
-        return value + 1e-6 * torch.rand_like(t), rate
-
-
-class Single(Profile):
-    """In another dtype."""
-
-    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        value, rate = super().forward(t)
-        return value.float(), rate
-
-
-@pytest.mark.parametrize(
-    ("signal", "match"),
-    [(Noisy, "gives other values when asked again"), (Single, "the signal `x_d` must give float64")],
-)
-def test_signals_that_are_no_functions_of_time_are_refused(signal: type[Profile], match: str) -> None:
-    model = coarse()
-    y0 = grasped(model)
-    bad = Reference(x_d=signal([0.0], [0.06]), y_d=model.reference["y_d"], F_ff=model.reference["F_ff"])
-    with pytest.raises(ValueError, match=match):
-        simulate(model, T, y0=y0, reference=bad)
-
-
-def test_what_belongs_to_another_route_and_what_is_no_number_is_refused() -> None:
-    model = coarse()
-    y0 = grasped(model)
-    size = model.layout.size
-    cases: list[tuple[dict[str, object], str]] = [
-        ({"wrt": "pad.E", "gradient": "forward"}, "`wrt` must be a list of parameters' names"),
-        ({"rigid": True}, "belong to gradient='forward'"),
-        ({"dy0": torch.zeros(size, 1).double()}, "belong to gradient='forward'"),
-        ({"gradient": "forward", "wrt": ["pad.E"], "dy0": torch.zeros(size, 1)}, "`dy0` must be float64"),
-        ({"reference": {}}, "`reference` must be a Reference, but is dict"),
-        ({"step": True}, "`step` must be positive and finite, but is True"),
-        ({"step": 1e-300}, "at most 1e[+]08 can be taken"),
-        ({"tolerance": 1e-14}, "`tolerance` must be at least 1e-10 N"),
-        ({"y0": y0.numpy()}, "`y0` must be a float64 tensor, but is ndarray"),
-        ({"t": [0.0, 1.0]}, "`t` must be a float64 tensor, but is list"),
-        ({"t": T.clone().requires_grad_()}, "`t` must not require a gradient"),
-        ({"t": 1e-300 * T}, "must be further apart than 1e-12 s"),
-        ({"rig": SoftGrasp}, "`rig` must be a Rig"),
-    ]
-    for changes, match in cases:
-        with pytest.raises(ValueError, match=match):
-            simulate(**({"rig": model, "t": T, "y0": y0} | changes))  # pyright: ignore[reportArgumentType]
-    with torch.inference_mode(), pytest.raises(ValueError, match=r"torch.inference_mode\(\) has not"):
-        simulate(model, T, y0=y0, gradient="forward", wrt=["pad.E"])
 
 
 def test_parts_replaced_after_a_run_run() -> None:

@@ -63,35 +63,6 @@ def test_one_model_in_two_threads_under_two_references_with_gradients() -> None:
     assert model.reference is steady
 
 
-@pytest.mark.parametrize(
-    ("t", "match"),
-    [
-        ([0.0, 0.1, 0.1], "increase strictly"),
-        ([0.0, 0.2, 0.1], r"t\[1:3\]"),
-        ([0.0], "two times or more"),
-        ([0.0, float("nan")], "finite"),
-    ],
-)
-def test_bad_times_are_refused(t: list[float], match: str) -> None:
-    with pytest.raises(ValueError, match=match):
-        simulate(coarse(), torch.tensor(t, dtype=torch.float64))
-
-
-def test_bad_states_and_settings_are_refused() -> None:
-    model, t = coarse(), times(0.1, 2)
-    with pytest.raises(ValueError, match="must be float64"):
-        simulate(model, t, y0=torch.zeros(model.layout.size))
-    with pytest.raises(ValueError, match="must be float64 of shape"):
-        simulate(model, t, y0=torch.zeros(3, dtype=torch.float64))
-    with pytest.raises(ValueError, match="must be finite, but component 0"):
-        simulate(model, t, y0=torch.full((model.layout.size,), torch.nan, dtype=torch.float64))
-    for value in (0.0, -1e-3, float("nan")):
-        with pytest.raises(ValueError, match="`step` must be positive and finite"):
-            simulate(model, t, step=value)
-        with pytest.raises(ValueError, match="`tolerance` must be positive and finite"):
-            simulate(model, t, tolerance=value)
-
-
 def test_an_unstable_loop_ends_in_an_error_that_says_so() -> None:
     """E = 60 kPa, tau = 5 ms with the paper's gains."""
     model = SoftGrasp(Parameters().override(COARSE | {"pad.E": 6e4, "pad.tau": 5e-3}))

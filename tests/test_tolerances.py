@@ -202,15 +202,6 @@ def test_inertial_pads_take_steps_by_tolerance() -> None:
     assert float((again.y - loose.y).abs().max()) < 1e-9
 
 
-def test_ways_to_choose_steps_exclude_each_other() -> None:
-    with pytest.raises(ValueError, match="`step` and `rtol or atol` each say which steps to take"):
-        simulate(coarse(), T, step=1e-3, rtol=1e-4)
-    with pytest.raises(ValueError, match="`rtol` must be positive"):
-        simulate(coarse(), T, rtol=-1.0)
-    with pytest.raises(ValueError, match="`rtol` must be below 1, but is 2; where only `atol` is given"):
-        simulate(coarse(), T, rtol=2.0)
-
-
 def test_torchdiffeqs_tolerances_are_the_steppers() -> None:
     model = coarse()
     y0 = grasped(model, (0.03, 0.0))

@@ -59,13 +59,6 @@ def test_explicit_methods_agree(method: str) -> None:
         assert float((part(explicit) - part(last)).abs().max()) < 1e-4 * float(moved)
 
 
-def test_only_rigs_are_integrated() -> None:
-    with pytest.raises(TypeError, match=r"integrates a torchsoft\.Rig, but got Identity"):
-        odeint(torch.nn.Identity(), torch.zeros(3, dtype=torch.float64), times(1.0, 2), method=METHOD)
-    with pytest.raises(ValueError, match=r"has no option \['stepsize'\]; it has step_size"):
-        odeint(coarse(), grasped(coarse()), times(1.0, 2), method=METHOD, options={"stepsize": 1e-3})
-
-
 @pytest.fixture
 def solver_of_theirs() -> Iterator[type]:
     """torchdiffeq with a solver of its own under the name, and the stepper registered after it."""
