@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import grasped, times, turning
-from torch import Tensor, nn
+from conftest import grasped, times
+from torch import nn
 
 from torchsoft import (
     PD,
@@ -15,11 +15,9 @@ from torchsoft import (
     Parameters,
     Profile,
     Reference,
-    Rig,
     SoftGrasp,
     StateFeedback,
     controller,
-    press,
     simulate,
 )
 from torchsoft.rigs import RigFile
@@ -28,64 +26,7 @@ from torchsoft.rigs.check import check
 from torchsoft.rigs.template import template
 from torchsoft.rigs.written import to_toml
 
-WHOLE = [f"{body}.{axis}" for body in ("bracket", "disc") for axis in ("x", "y", "theta")]
-PUSHES = {"x": "bracket.x", "y": "bracket.y", "turn": "bracket.theta"}
 KP, KD = 1.2e5, 440.0
-
-
-class Policy(nn.Module):
-    """A loop of each of the bracket's coordinates, whose efforts a network of the whole state corrects."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        torch.manual_seed(3)
-        self.net = nn.Sequential(nn.Linear(18, 5), nn.Tanh(), nn.Linear(5, 3)).double()
-        self.size = nn.Parameter(torch.tensor(2.0, dtype=torch.float64))
-        self.Kp = nn.Parameter(torch.tensor([KP, KP, 60.0], dtype=torch.float64))
-        self.Kd = nn.Parameter(torch.tensor([KD, KD, 0.2], dtype=torch.float64))
-
-    def forward(self, setpoints: Tensor, state: Tensor) -> Tensor:
-        (w, w_dot), (q, q_dot) = setpoints.unflatten(-1, (2, 3)).unbind(-2), state.unflatten(-1, (2, 6)).unbind(-2)
-        seen = torch.cat((100.0 * (w - q[..., :3]), w_dot, 100.0 * q, q_dot), -1)
-        return self.Kp * (w - q[..., :3]) + self.Kd * (w_dot - q_dot[..., :3]) + self.size * self.net(seen)
-
-
-def controlled(module: nn.Module) -> tuple[Rig, Tensor]:
-    """The rig whose bracket may turn, pushed by a controller in x, y and theta; and its start."""
-    given = turning()
-    rig = Rig(
-        bodies=dict(given.bodies), pads=dict(given.pads), contacts=dict(given.contacts),
-        actuators=controller(
-            module, measures=WHOLE, setpoints=["x_d", "y_d", "theta_d"], pushes=PUSHES, feed_forward={"y": "F_ff"}
-        ),
-    )  # fmt: skip
-    rig.fixed = given.fixed
-    model = rig.fixed()
-    state = model.unpack(press(model, model.settings.scenario.y_Br_grasp).detach())
-    x, y, _ = state.pose["bracket"].tolist()
-    moves = {"x_d": (x, x + 2e-3), "y_d": (y, y - 2e-4), "theta_d": (0.0, 0.02), "F_ff": (-60.0, -70.0)}
-    rig.reference = Reference(**{name: Profile([0.0, 0.04], list(ends)) for name, ends in moves.items()})
-    return rig, rig.pack(state)
-
-
-def test_efforts_are_those_of_the_module() -> None:
-    rig, y0 = controlled(Policy())
-    run = simulate(rig, times(0.03, 7), y0=y0)
-    setpoints = torch.cat(
-        [run[name][:, None] for name in ("x_d", "y_d", "theta_d", "x_d_dot", "y_d_dot", "theta_d_dot")], 1
-    )
-    poses = [run[f"{axis}_bracket"] for axis in ("x", "y", "theta")] + [
-        run[f"{axis}_disc"] for axis in ("x", "y", "theta")
-    ]
-    rates = [run[f"{a}_{b}"] for b in ("bracket", "disc") for a in ("v_x", "v_y", "omega")]
-    module = rig.actuators["x"].law.module
-    wanted = module(setpoints, torch.stack((*poses, *rates), -1)).detach()
-    wanted[:, 1] += run["F_ff"]
-    for i, name in enumerate(PUSHES):
-        assert torch.allclose(run[f"F_{name}"], wanted[:, i], rtol=1e-12, atol=1e-12)
-        assert float(wanted[:, i].abs().max()) > 0.1
-    assert (run.units["theta_d"], run.units["F_turn"], run.units["y_d"]) == ("rad", "N.m", "m")
-    assert run.energy_residual_rel < 1e-3
 
 
 def test_feedback_on_the_diagonal_is_two_loops() -> None:

@@ -98,26 +98,6 @@ def test_ready_configs_are_valid_and_their_splits_keep_the_shares(path: Path) ->
     np.testing.assert_allclose(shares, [0.7, 0.15, 0.15], atol=0.01)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ('title = "Test"', 'title = "Test"\nworkers = 3', "workers"),
-        ("low = 7e5", "low = 9e5", r"parameters\.pad\.E"),
-        ("low = 7e5", "low = -1.0", r"parameters\.pad\.E"),
-        ('"pad.E"', '"pad.Young"', r"pad\.Young"),
-        ("low = 1.3e-3, high = 1.5e-3", "low = 1.3e-3, high = 0.02", r"grasp_depth\.high = 0\.02"),
-        ("low = 0.7, high = 0.9", "low = 0.3, high = 0.9", r"contact\.mu_s = 0\.3.*mu_k"),
-        ("low = 1e-3, high = 2e-3", "low = 1e-3, high = 0.2", r"kinds\.0\.travel"),
-        ("duration = 0.9", "duration = 0.5", "duration"),
-        ("step = 0.002", "step = 0.5", "step"),
-        ('kind = "slow_roll"', 'kind = "hop"', "kinds"),
-    ],
-)
-def test_a_wrong_config_is_refused_with_the_field(tmp_path: Path, old: str, new: str, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Config.from_toml(write_config(tmp_path, change=(old, new)))
-
-
 def test_a_sobol_design_is_a_prefix_of_a_longer_one(tmp_path: Path) -> None:
     short, long = (Config.from_toml(write_config(tmp_path, trajectories=n)) for n in (5, 40))
     np.testing.assert_array_equal(points(short), points(long)[:5])

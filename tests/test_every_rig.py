@@ -298,3 +298,33 @@ def test_a_turned_rig_moves_like_the_one_that_is_not() -> None:
         x, y, theta = simulate(rig, times(END, 5), y0=y0, step=1e-3, tolerance=1e-10).state.pose["disc"].unbind(-1)
         runs.append(torch.stack((c * x + s * y, c * y - s * x, theta - angle)))
     assert float((runs[0] - runs[1]).abs().max()) < 1e-9
+
+
+def test_efforts_of_a_policy_are_those_of_its_module() -> None:
+    """In the channels of a run, whose units are those of what is pushed."""
+    rig, y0 = RIGS["policy"]()
+    run = simulate(rig, times(END, 7), y0=y0)
+    signals = rig.follow(run.t)
+    state = rig.unpack(run.y, signals)
+    w, seen = (dict(zip(rig.signals, signals.unbind(-2)))[name] for name in SETPOINTS), (state.pose, state.velocity)
+    setpoints = torch.stack(list(w), -2).mT.flatten(-2)
+    poses = torch.cat([part[body] for part in seen for body in ("jaw", "disc")], -1)
+    wanted = rig.actuators["x"].law.module(setpoints, poses).detach()
+    wanted[:, 1] += run["F"]
+    for i, name in enumerate(PUSHES):
+        assert torch.allclose(run[f"F_{name}"], wanted[:, i], rtol=1e-12, atol=1e-12)
+        assert float(wanted[:, i].abs().max()) > 0.1
+    assert (run.units["theta_d"], run.units["F_turn"], run.units["y_d"]) == ("rad", "N.m", "m")
+
+
+def test_knots_with_a_graph_receive_their_gradient() -> None:
+    """A profile of tensors that require one: the chain rule through its values."""
+    d = f64(0.5, 1.0).requires_grad_()
+    knots = f64(0.0, 1.0).requires_grad_()
+    slopes = []
+    for values, leaf in ((torch.cat((d[:1] - 0.5, d[1:] ** 2)) * 1e-3, d), (knots * 1e-3, knots)):
+        rig, y0 = grip(motion={"jaw.x": Profile([0.0, 0.015], values)})
+        value = simulate(rig, times(END, 3), y0=y0, step=1e-3, gradient="discrete")["theta_disc"][-1]
+        slopes.append(torch.autograd.grad(value, leaf)[0])
+    assert torch.allclose(slopes[0], slopes[1] * f64(1.0, 2.0), rtol=1e-9)
+    assert float(slopes[0].abs().min()) > 0

@@ -22,8 +22,6 @@ SAME_STEPS = 1e-10
 """Adjoint against backpropagation, relative: two solutions of the same stages."""
 SMALL = 0.1
 """A gradient p dL/dp below this part of the largest one is the difference of larger terms."""
-SAME_TAPE = 1e-11
-"""Adjoint against sensitivities, relative: the same linear systems, transposed and not."""
 ALONE = 1e-12
 """A sample alone against the same sample in a batch, relative."""
 
@@ -142,24 +140,6 @@ def test_adjoint_equals_backpropagation_through_the_plain_step(name: str) -> Non
     for label, p, a, b in zip(["y0", *scalars(w.model)], wanted, adjoint, plain):
         floor = 0.0 if label == "y0" else SMALL * largest / float(p.detach().norm())
         assert float((a - b).norm()) <= SAME_STEPS * max(float(b.norm()), floor), (label, a, b)
-
-
-@pytest.mark.parametrize("name", WINDOWS)
-def test_adjoint_equals_sensitivities(name: str) -> None:
-    w = WINDOWS[name]()
-    names = list(scalars(w.model))
-    adjoint = w.gradients(w.compiled(), list(scalars(w.model).values()))
-    run = simulate(w.model, w.t, y0=w.y0, step=w.step, tolerance=NEWTON, gradient="forward", wrt=names)
-    assert run.sensitivities is not None
-    assert run.wrt == tuple(names)
-    y = run.y.clone().requires_grad_(True)
-    y_bar, *direct = w.gradients(y, [y, *scalars(w.model).values()])
-    forward = torch.einsum("ti,tin->n", y_bar, run.sensitivities) + torch.stack(direct)
-    for label, a, b in zip(names, adjoint, forward):
-        assert float((a - b).abs()) <= SAME_TAPE * float(b.abs()), (label, a, b)
-    rigid = simulate(w.model, w.t, y0=w.y0, step=w.step, tolerance=NEWTON, gradient="forward", wrt=names, rigid=True)
-    assert rigid.sensitivities is not None
-    assert torch.equal(rigid.sensitivities, run.sensitivities[:, -10:])
 
 
 def test_a_sample_does_not_depend_on_its_neighbours() -> None:

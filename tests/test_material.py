@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, coarse, random_state, times
+from conftest import COARSE
 from scipy.optimize import brentq
 from torch import Tensor
 from torch.autograd import gradcheck
@@ -230,22 +230,6 @@ def test_the_graph_has_the_fields_of_the_chain(material: Material) -> None:
 
 
 # --- what is refused ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", [name for name in MATERIALS if name != "kelvin_voigt"])
-def test_an_inertial_pad_of_several_times_is_refused(name: str) -> None:
-    """When the rig is made, before a run with a part replaced, and wherever its law is asked for."""
-    message = "the inertial pad `L` needs a Kelvin-Voigt material \\(one retardation time\\), but has"
-    with pytest.raises(NotImplementedError, match=message):
-        SoftGrasp(STABLE.override({"pad.fidelity": "inertial"}), material=MATERIALS[name]())
-    model = coarse(pad__fidelity="inertial")
-    y = random_state(model, 0)
-    for pad in model.pads.values():
-        pad.material = model.pad = MATERIALS[name]()
-    with pytest.raises(NotImplementedError, match=message):
-        model(0.0, y)
-    with pytest.raises(NotImplementedError, match=message):
-        simulate(model, times(0.1, 2), y0=y)
 
 
 def test_a_recording_that_begins_before_the_pads_forget_is_named() -> None:

@@ -1,15 +1,13 @@
 """Signals of time: the paper's profiles, recorded set-points, references, and where their gradients go."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, f64, grasped, times
+from conftest import f64
 from scipy.interpolate import CubicSpline
 from torch.autograd import gradcheck
 
-from torchsoft import Profile, Reference, Sampled, hold, simulate
+from torchsoft import Profile, Reference, Sampled, hold
 
 TIMES = [0.0, 0.4, 1.0, 1.5]
 VALUES = [0.06, 0.04, 0.05, 0.01]
@@ -67,23 +65,6 @@ def test_sampled_stays_the_spline_when_its_knots_are_changed() -> None:
         assert gradcheck(lambda *knots: torch.stack(Sampled(*knots)(f64(0.1, 0.3))), knots)
 
 
-@pytest.mark.parametrize("kind", [Profile, Sampled])
-def test_knots_that_are_none_any_more_are_refused(kind: type[Profile]) -> None:
-    """Wherever the signal is asked for by its reference, by a run too."""
-    reference = Reference(**{"jaw.x": kind([0.0, 0.1, 0.2], [0.0, 1.0, 2.0])})
-    reference["jaw.x"].times[2] = 0.05
-    message = "the signal `jaw.x` of the reference is none any more: `times` must increase strictly"
-    with pytest.raises(ValueError, match=message):
-        reference(f64(0.1), ("jaw.x",))
-    with pytest.raises(ValueError, match=message):
-        reference.plain(("jaw.x",))
-    model = coarse()
-    y0 = grasped(model)
-    model.reference["x_d"].times.fill_(float("nan"))
-    with pytest.raises(ValueError, match="the signal `x_d` of the reference is none any more"):
-        simulate(model, times(0.01, 2), y0=y0)
-
-
 def test_sampled_with_rates_is_hermites_cubic() -> None:
     """x^3 from its values and rates, exactly."""
     knots = f64(0.0, 0.5, 2.0)
@@ -128,25 +109,6 @@ def test_a_tensor_with_a_graph_given_as_a_knot_keeps_it() -> None:
     assert torch.allclose(slope, f64(0.0, 0.4))
     assert [p.requires_grad for p in Profile([0.0, 1.0], [0.06, 0.05]).parameters()] == [False]
     assert not list(Profile([0.0, 1.0], knots**2).parameters())
-
-
-@pytest.fixture(params=[torch.float32, torch.float64])
-def default(request: pytest.FixtureRequest) -> Iterator[torch.dtype]:
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(request.param)
-    yield request.param
-    torch.set_default_dtype(before)
-
-
-@pytest.mark.parametrize("kind", [Profile, Sampled])
-def test_values_do_not_depend_on_torchs_default_dtype(default: torch.dtype, kind: type[Profile]) -> None:
-    """0.1 is 0.1 in float64, whatever a tensor of Python numbers would be."""
-    signal = kind([0.1, 0.3], [0.1, 0.7])
-    value, rate = signal(torch.tensor([0.1, 0.3], dtype=torch.float64))
-    assert value.dtype == rate.dtype == torch.float64
-    assert value.tolist() == pytest.approx([0.1, 0.7], abs=1e-16)
-    assert signal.times.tolist() == [0.1, 0.3]
-    assert hold(x=0.1)["x"].values.item() == 0.1
 
 
 def test_reference_gives_named_signals_side_by_side() -> None:

@@ -266,6 +266,8 @@ PARTS: list[tuple[Call, str]] = [
     (lambda: chain([0.5, 0.5], 0.01), "`tau of the material of L` must be a float64 tensor, but is float"),
     (lambda: chain([0.5, 0.5], torch.ones(2)), "`tau of the material of L` must be float64"),
     (lambda: chain([1.0, 0.0]), "`chain` of the material of `L` must give two tensors, J and tau"),
+    (lambda: SoftGrasp(Parameters().override({"pad.fidelity": "inertial"}), material=Prony(**RUBBER, moduli=[1e5], tau=[0.1])),
+     r"inertial pad `L` needs a Kelvin-Voigt material \(one retardation time\), but has"),
     # laws of contact
     (lambda: SoftContact(1e5, 1.0, 1e5, 1.0, friction=None), "`friction` must be a function or a module"),
     (lambda: slipping(rated(lambda N: N.mean().expand_as(N))), r"aten\.mean\.default, which couples contact points at .*test_"),

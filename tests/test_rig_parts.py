@@ -140,20 +140,38 @@ def runs(file: RigFile) -> Trajectory:
 # shapes, materials, pads ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["rounded_box", *slow("superellipse", "rounded_polygon", "contour")])
-def test_every_shape_is_checked_and_runs(kind: str, folder: Path) -> None:
-    table, made = SHAPES[kind]
-    body = {"shape": {"kind": kind, **table}, "mass": None, "density": 7800.0, "depth": 20e-3}
-    file = rig(folder, bodies={"disc": body})
-    disc = file.build().rig.bodies["disc"]
-    assert type(disc.shape) is made
-    assert disc.mass.item() == pytest.approx(7800 * 20e-3 * disc.shape.area().item(), rel=1e-12)
-    assert disc.inertia.item() == pytest.approx(disc.mass.item() * disc.shape.gyration().item(), rel=1e-12)
-    run = runs(file)
-    weight = disc.mass.item() * 9.81
-    assert float(run.load["disc"][0, 1]) == pytest.approx(weight, rel=1e-3)  # it rests
+def in_a_rig(kind: str, table: dict[str, Any]) -> dict[str, Any]:
+    """Changes of the template that put a part of a kind into it."""
+    if kind in SHAPES:
+        return {"bodies": {"disc": {"shape": {"kind": kind} | table, "mass": None, "density": 7800.0, "depth": 20e-3}}}
+    if kind in MATERIALS:
+        return {"materials": {"rubber": {"kind": kind} | table}}
+    pads = {"lower": {"kind": kind} | table, "upper": {"kind": kind, "base": "bracket", "mirrored": True} | table}
+    higher = {"bodies": {"bracket": {"start": {"y": 80.1e-3}}}, "motion": {"y_d": {"values": ["start", 79e-3]}}}
+    return {"pads": pads} | (higher if kind == "fingertip" else {})
+
+
+RUN = ["rounded_box", "curved", *slow("superellipse", "rounded_polygon", "contour", "fingertip", "mesh")]
+
+
+@pytest.mark.parametrize("kind", [*MATERIALS, *RUN])
+def test_every_kind_of_part_is_built_written_and_runs(kind: str, folder: Path) -> None:
+    table, made = (SHAPES | MATERIALS | PADS)[kind]
+    file = rig(folder, **in_a_rig(kind, table))
+    built = file.build().rig
+    disc, pad = built.bodies["disc"], built.pads["lower"]
+    assert made in (type(disc.shape), type(pad.material), type(pad.mesh))
     again = RigFile.from_tree(tomllib.loads(to_toml(file)))
     assert again.model_dump() == file.model_dump()
+    if kind in SHAPES:
+        assert disc.mass.item() == pytest.approx(7800 * 20e-3 * disc.shape.area().item(), rel=1e-12)
+        assert disc.inertia.item() == pytest.approx(disc.mass.item() * disc.shape.gyration().item(), rel=1e-12)
+    if kind in MATERIALS:
+        assert pad.material.depth.item() == table["depth"]
+        assert kind != "preset" or pad.material.E.item() == PRESETS["Dragon Skin 20"].coefficients["E"].value
+        assert kind != "file" or pad.material.get_parameter("E_1").item() == 1e5
+    else:
+        assert float(runs(file).load["disc"][0, 1]) == pytest.approx(disc.mass.item() * 9.81, rel=1e-3)  # it rests
 
 
 def test_parts_of_two_builds_are_not_the_same(folder: Path) -> None:
@@ -164,39 +182,6 @@ def test_parts_of_two_builds_are_not_the_same(folder: Path) -> None:
     assert isinstance(other, Contour)
     assert one.control is not other.control
     assert torch.equal(one.control, other.control)
-
-
-@pytest.mark.parametrize("kind", MATERIALS)
-def test_every_material_is_built(kind: str, folder: Path) -> None:
-    table, made = MATERIALS[kind]
-    file = rig(folder, materials={"rubber": {"kind": kind, **table}})
-    found = file.build().rig.pads["lower"].material
-    assert type(found) is made
-    assert found.depth.item() == table["depth"]
-    if kind == "preset":
-        assert found.E.item() == PRESETS["Dragon Skin 20"].coefficients["E"].value
-    if kind == "file":
-        assert found.get_parameter("E_1").item() == 1e5
-    again = RigFile.from_tree(tomllib.loads(to_toml(file)))
-    assert again.model_dump() == file.model_dump()
-
-
-@pytest.mark.parametrize("kind", ["curved", *slow("fingertip", "mesh")])
-def test_every_pad_is_checked_and_runs(kind: str, folder: Path) -> None:
-    table, made = PADS[kind]
-    pad = {"kind": kind, **table}
-    start, motion = {}, {}
-    if kind == "fingertip":  # higher than a block
-        start = {"bracket": {"start": {"y": 80.1e-3}}}
-        motion = {"y_d": {"values": ["start", 79e-3]}}
-    file = rig(
-        folder, pads={"lower": pad, "upper": pad | {"base": "bracket", "mirrored": True}}, bodies=start, motion=motion
-    )
-    assert type(file.build().rig.pads["lower"].mesh) is made
-    run = runs(file)
-    assert float(run.load["disc"][0, 1]) == pytest.approx(0.4 * 9.81, rel=1e-3)
-    again = RigFile.from_tree(tomllib.loads(to_toml(file)))
-    assert again.model_dump() == file.model_dump()
 
 
 def test_a_mesh_from_a_file_is_the_block_that_it_was_made_of(folder: Path) -> None:

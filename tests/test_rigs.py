@@ -16,7 +16,7 @@ from PIL import Image
 
 from torchsoft import Parameters, SoftGrasp, press, simulate
 from torchsoft.cli import main
-from torchsoft.physics.statics import STALLED, resting, stalled, standing
+from torchsoft.physics.statics import resting, standing
 from torchsoft.rigs import RigFile
 from torchsoft.rigs import run as running
 from torchsoft.rigs.check import check
@@ -69,11 +69,6 @@ def test_a_ready_rig_checks_clean_and_runs(path: Path) -> None:
     assert done.stopped is None
     assert float(done.trajectory.t[-1]) == pytest.approx(0.1)
     assert done.trajectory.energy_residual_rel < 1e-3
-
-
-def test_there_are_ready_rigs() -> None:
-    ready = {"paper", "ellipse", "rounded_box", "two_fingers", "fingertips", "light_grasp", "orientation", "drop"}
-    assert ready <= {path.stem for path in READY}
 
 
 @pytest.mark.slow
@@ -225,17 +220,6 @@ def test_what_two_pads_grip_is_taken_along() -> None:
         box = estimate(time)["box"]
         assert box == pytest.approx([0.0, 45e-3, angle], abs=2e-4)
     assert estimate(0.5)["box"][1] < 22e-3  # not lifted yet
-
-
-def test_a_search_for_balance_that_goes_to_and_fro_is_given_up() -> None:
-    there = [torch.zeros(1), torch.ones(1)]
-    to_and_fro = [(1.0, there[i % 2]) for i in range(60)]
-    falling = [(1.0, torch.full((1,), float(i))) for i in range(60)]
-    better = [(1.0 / (1 + i), there[i % 2]) for i in range(60)]
-    assert stalled(to_and_fro, 2.0)
-    assert not stalled(to_and_fro[:STALLED], 2.0)
-    assert not stalled(falling, 2.0)
-    assert not stalled(better, 2.0)
 
 
 def test_driven_jaws_carry_a_disc() -> None:

@@ -188,32 +188,6 @@ def test_tied_parameters_get_the_sum_of_their_gradients() -> None:
     assert min(abs(float(x)) for x in (R_n, R_t, K_n, K_t, K_98)) > 0
 
 
-def test_a_knot_with_a_graph_receives_its_gradient() -> None:
-    model = coarse()
-    y0 = grasped(model)
-    d = f64(1e-3)[0].requires_grad_()
-    travel = Profile([0.0, 0.02], [0.06, 0.06 + d])
-    reference = Reference(x_d=travel, y_d=model.reference["y_d"], F_ff=model.reference["F_ff"])
-    run = lambda r: simulate(model, T, y0=y0, reference=r, step=2e-3, gradient="discrete", tolerance=1e-10)
-    theta = lambda r: run(r)["theta"][-1]
-    (slope,) = torch.autograd.grad(theta(reference), d)
-    ends = []
-    for h in (1e-7, -1e-7):
-        moved = Profile([0.0, 0.02], [0.06, 0.061 + h])
-        with torch.no_grad():
-            ends.append(float(theta(Reference(x_d=moved, y_d=model.reference["y_d"], F_ff=model.reference["F_ff"]))))
-    assert float(slope) == pytest.approx((ends[0] - ends[1]) / 2e-7, rel=1e-5)
-
-
-def test_the_angular_momentum_has_the_gradient_of_the_inertia() -> None:
-    model = coarse()
-    run = rolled(model, gradient="discrete")
-    L, omega, m = run["angular_momentum"][-1], run["omega"][-1], model.disc.mass
-    (by_L,), (by_omega,) = (torch.autograd.grad(x, m, retain_graph=True) for x in (L, omega))
-    I = model.disc.inertia.detach()
-    assert float(by_L) == pytest.approx(float(I * by_omega + I / m.detach() * omega.detach()), rel=1e-12)
-
-
 def test_what_has_no_gradient_says_so() -> None:
     """The recorded moments, and second derivatives; a moment of no weight in a sum is none."""
     model = coarse()

@@ -43,26 +43,6 @@ def test_same_run_twice_to_the_bit_and_in_two_threads_at_once() -> None:
     assert not torch.equal(*alone)
 
 
-def test_one_model_in_two_threads_under_two_references_with_gradients() -> None:
-    """A run does not touch the model: one rig follows two references at once, and each gradient is that of its own."""
-    model = coarse()
-    y0 = grasped(model)
-    steady = model.reference
-    signals = {name: steady[name] for name in ("y_d", "F_ff")}
-    references = [Reference(x_d=Profile([0.0, 0.1], [0.06, 0.06 + d]), **signals) for d in (1e-3, -2e-3)]
-
-    def slope(reference: Reference) -> tuple[torch.Tensor, torch.Tensor]:
-        run = simulate(model, times(0.1, 11), y0=y0, reference=reference, gradient="discrete")
-        return run.y.detach(), torch.autograd.grad(run["theta"][-1], model.pad.E)[0]
-
-    alone = [slope(reference) for reference in references]
-    with ThreadPoolExecutor(2) as pool:
-        both = list(pool.map(slope, [*references, *references]))
-    for got, expected in zip(both, [*alone, *alone]):
-        assert all(torch.equal(a, b) for a, b in zip(got, expected))
-    assert model.reference is steady
-
-
 def test_an_unstable_loop_ends_in_an_error_that_says_so() -> None:
     """E = 60 kPa, tau = 5 ms with the paper's gains."""
     model = SoftGrasp(Parameters().override(COARSE | {"pad.E": 6e4, "pad.tau": 5e-3}))

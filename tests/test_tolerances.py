@@ -102,6 +102,11 @@ def test_outputs_lie_within_their_steps_however_these_differ() -> None:
     assert plan.out_part.tolist() == pytest.approx([0.5, 1.0, 0.05, 1.0, 1.0])
 
 
+def towards(model: SoftGrasp, x_d: nn.Module) -> Reference:
+    """The model's reference with another horizontal set-point."""
+    return Reference(**{name: model.reference[name] for name in model.signals} | {"x_d": x_d})
+
+
 class Wave(nn.Module):
     """A signal that is no piecewise polynomial."""
 
@@ -112,16 +117,13 @@ class Wave(nn.Module):
 def test_a_signal_of_ones_own_is_followed() -> None:
     model = coarse()
     y0 = grasped(model)
-    own = Reference(**{name: model.reference[name] for name in model.signals if name != "x_d"}, x_d=Wave())
+    own = towards(model, Wave())
     t = times(0.1, 6)
     run, fine = (simulate(model, t, y0=y0, reference=own, rtol=rtol) for rtol in (1e-4, 1e-7))
     assert float((run["x_C"] - fine["x_C"]).abs().max()) < 1e-7
     knots = torch.linspace(0, 0.1, 2001, dtype=torch.float64)
     value, rate = Wave()(knots)
-    pieces = Reference(
-        **{name: model.reference[name] for name in model.signals if name != "x_d"},
-        x_d=Sampled(knots.tolist(), value.tolist(), rate.tolist()),
-    )
+    pieces = towards(model, Sampled(knots.tolist(), value.tolist(), rate.tolist()))
     same = simulate(model, t, y0=y0, reference=pieces, rtol=1e-7)
     assert float((same["x_C"] - fine["x_C"]).abs().max()) < 1e-9
 
@@ -136,7 +138,7 @@ class Broken(Wave):
 def test_what_a_signal_raises_is_raised() -> None:
     model = coarse()
     y0 = grasped(model)
-    own = Reference(**{name: model.reference[name] for name in model.signals if name != "x_d"}, x_d=Broken())
+    own = towards(model, Broken())
     with pytest.raises(RuntimeError, match="the table of this signal ends"):
         simulate(model, times(0.1, 6), y0=y0, reference=own, rtol=1e-4)
 
@@ -156,9 +158,7 @@ class Jump(Wave):
 def test_a_jump_is_stepped_over_or_said() -> None:
     model = coarse()
     y0 = grasped(model)
-    jump = lambda rate: Reference(
-        **{name: model.reference[name] for name in model.signals if name != "x_d"}, x_d=Jump(rate)
-    )
+    jump = lambda rate: towards(model, Jump(rate))
     run = simulate(model, times(0.1, 6), y0=y0, reference=jump(0.0), rtol=1e-4)
     short = run.knots.diff().argmin()
     assert float((run.knots[short] - 0.0512345).abs()) < 1e-3 > 10 * float(run.knots.diff().min())
@@ -173,10 +173,9 @@ def test_a_run_whose_steps_cannot_get_shorter_ends(at: float) -> None:
     """However the shortest step is rounded at that time."""
     model = coarse()
     y0 = grasped(model)
-    signals = {name: model.reference[name] for name in model.signals if name != "x_d"}
     t = torch.tensor([at - 0.1, at + 0.1], dtype=torch.float64)
     with pytest.raises(SimulationFailed, match="steps below 1e-09 s"):
-        simulate(model, t, y0=y0, reference=Reference(**signals, x_d=Jump(1e9, at)), rtol=1e-4)
+        simulate(model, t, y0=y0, reference=towards(model, Jump(1e9, at)), rtol=1e-4)
 
 
 def test_no_step_passes_a_knot_of_the_reference() -> None:
@@ -184,7 +183,7 @@ def test_no_step_passes_a_knot_of_the_reference() -> None:
     y0 = grasped(model)
     x = float(model.unpack(y0).pose["disc"][0])
     jerk = Profile([0.0, 0.501, 0.503, 0.505], [x, x, x + 1e-4, x])
-    own = Reference(**{name: model.reference[name] for name in model.signals if name != "x_d"}, x_d=jerk)
+    own = towards(model, jerk)
     run = simulate(model, times(0.6, 3), y0=y0, reference=own, rtol=1e-3)
     for time in (0.501, 0.503, 0.505):
         assert float((run.knots - time).abs().min()) < 1e-12
