@@ -6,19 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import grasped, times
 from torch import nn
 
 from torchsoft import (
-    PD,
-    Actuator,
-    Parameters,
-    Profile,
-    Reference,
-    SoftGrasp,
     StateFeedback,
-    controller,
-    simulate,
 )
 from torchsoft.rigs import RigFile
 from torchsoft.rigs import run as running
@@ -27,33 +18,6 @@ from torchsoft.rigs.template import template
 from torchsoft.rigs.written import to_toml
 
 KP, KD = 1.2e5, 440.0
-
-
-def test_feedback_on_the_diagonal_is_two_loops() -> None:
-    """A gain matrix with the gains of PD laws moves the paper's rig as these do."""
-    model = SoftGrasp(Parameters().override({"pad.elements_x": 60, "pad.elements_y": 2, "control.senses": "bracket"}))
-    y0 = grasped(model)
-    x, y, _ = model.unpack(y0).pose["bracket"].tolist()
-    model.reference = Reference(
-        x_d=Profile([0.0, 0.04], [x, x + 2e-3]), y_d=Profile([0.0, 0.04], [y, y - 2e-4]),
-        F_ff=Profile([0.0, 0.04], [-60.0, -70.0]),
-    )  # fmt: skip
-    model.actuators["x"] = Actuator("bracket.x", "bracket.x", PD(KP, KD), setpoint="x_d")
-    del model.control["x"]
-    t = times(0.03, 7)
-    loops = simulate(model, t, y0=y0, step=1e-3)
-    gain = [[KP, 0.0, KD, 0.0], [0.0, 1.2e5, 0.0, 441.7149]]
-    gain[1][1], gain[1][3] = (float(one.detach()) for one in (model.actuators["y"].law.Kp, model.actuators["y"].law.Kd))
-    made = controller(
-        StateFeedback(gain), measures=["bracket.x", "bracket.y"], setpoints=["x_d", "y_d"],
-        pushes={"x": "bracket.x", "y": "bracket.y"}, feed_forward={"y": "F_ff"},
-    )  # fmt: skip
-    del model.control["y"]
-    model.actuators.update(made)
-    matrix = simulate(model, t, y0=y0, step=1e-3)
-    assert float((loops["x_C"] - loops["x_C"][0]).abs().max()) > 1e-4
-    for name in ("x_C", "theta", "x_Br", "y_Br"):
-        assert torch.allclose(loops[name], matrix[name], rtol=0, atol=1e-10)
 
 
 def test_coordinates_without_set_points_are_regulated() -> None:

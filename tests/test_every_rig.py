@@ -201,6 +201,14 @@ def pd(measures: str = "jaw.x", x_law: nn.Module | None = None) -> dict[str, Act
     }
 
 
+def feedback(coupling: float = 0.0) -> dict[str, Actuator]:
+    gain = [[1.2e5, coupling, 441.7, 0.0], [0.0, 1.2e5, coupling, 441.7]]
+    return controller(
+        StateFeedback(gain), measures=["jaw.x", "jaw.y"], setpoints=["x_d", "y_d"], pushes={"x": "jaw.x", "y": "jaw.y"},
+        feed_forward={"y": "F"},
+    )  # fmt: skip
+
+
 RIGS: dict[str, Callable[[], Start]] = {
     "circle": grip,
     "ellipse": lambda: grip(Ellipse(R, 18.5e-3)),
@@ -233,12 +241,10 @@ RIGS: dict[str, Callable[[], Start]] = {
     "sampled motion": lambda: grip(motion={"jaw.x": Sampled([0.0, 0.004, 0.008, 0.015], [0.0, 1e-3, 3e-3, 3e-3])}),
     "motion of one's own": lambda: grip(motion={"jaw.x": Wave()}),
     "loops": lambda: loops(pd),
+    "loops by feedback": lambda: loops(feedback),
     "loop about the disc": lambda: loops(lambda: pd("disc.x", PD(2e4, 100.0))),
     "saturated loop": lambda: loops(lambda: pd(x_law=Saturated(3.0))),
-    "state feedback": lambda: loops(lambda: controller(
-        StateFeedback([[1.2e5, 10.0, 440.0, 0.0], [0.0, 1.2e5, 0.0, 440.0]]), measures=["jaw.x", "jaw.y"],
-        setpoints=["x_d", "y_d"], pushes={"x": "jaw.x", "y": "jaw.y"}, feed_forward={"y": "F"},
-    )),
+    "coupled feedback": lambda: loops(lambda: feedback(10.0)),
     "policy": lambda: loops(lambda: controller(
         Policy(), measures=WHOLE, setpoints=SETPOINTS, pushes=PUSHES, feed_forward={"y": "F"}), theta="free"),
 }  # fmt: skip
@@ -328,3 +334,10 @@ def test_knots_with_a_graph_receive_their_gradient() -> None:
         slopes.append(torch.autograd.grad(value, leaf)[0])
     assert torch.allclose(slopes[0], slopes[1] * f64(1.0, 2.0), rtol=1e-9)
     assert float(slopes[0].abs().min()) > 0
+
+
+def test_feedback_on_the_diagonal_is_two_loops() -> None:
+    runs = [
+        simulate(rig, times(END, 5), y0=y0, step=1e-3) for rig, y0 in (RIGS["loops"](), RIGS["loops by feedback"]())
+    ]
+    assert torch.allclose(runs[0].y, runs[1].y, rtol=0, atol=1e-9)
