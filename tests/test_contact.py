@@ -14,10 +14,6 @@ from torchsoft import Circle, Coulomb, SmoothSlip, SoftContact
 from torchsoft.physics.contact import (
     ContactState,
     SlipLaw,
-    cross,
-    distance_law,
-    free_law,
-    interface_law,
     moving_frame,
 )
 
@@ -186,42 +182,6 @@ def test_moving_frame_of_a_circle_by_hand() -> None:
     assert torch.allclose(frame.n, f64(0.0, -1.0, 0.6, 0.8).reshape(2, 2), rtol=0, atol=1e-15)
     assert torch.allclose(frame.t, f64(1.0, 0.0, -0.8, 0.6).reshape(2, 2), rtol=0, atol=1e-15)
     assert torch.allclose(frame.g, f64(1e-3, 0.0), rtol=0, atol=1e-17)
-
-
-def inputs(count: int, seed: int) -> Tensor:
-    """Inputs x (count, 9) of `interface_law` near the boundary of a body about 20 mm in size."""
-    generator = torch.Generator().manual_seed(seed)
-    normal = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)
-    angle = 2 * torch.pi * torch.rand(count, generator=generator, dtype=torch.float64)
-    d = (0.02 - 5e-5 * normal(count).abs())[:, None] * torch.stack((angle.cos(), angle.sin()), -1)
-    one = torch.ones(count, 1, dtype=torch.float64)
-    return torch.cat(
-        (0.01 * normal(count, 2), normal(count, 1), d, normal(count, 1), 1e-5 * normal(count, 1), one, 0 * one), -1
-    )
-
-
-def test_the_law_of_a_point_is_the_node_law_in_the_moving_frame() -> None:
-    """Eq. 4-7 by hand: g' and v_T are the body's velocity at the point along n and t."""
-    x, contact, shape = inputs(50, 1), law(), Circle(0.02)
-    with torch.no_grad():
-        out = interface_law(contact, shape, x)
-        n = x[:, 3:5] / x[:, 3:5].norm(dim=-1, keepdim=True)
-        v = x[:, :2] + x[:, 2:3] * cross(x[:, 3:5])
-        g, t = 0.02 - x[:, 3:5].norm(dim=-1), cross(n)
-        got = contact(g, (n * v).sum(-1), (t * v).sum(-1), x[:, 6], x[:, 7])
-        assert torch.allclose(out[:, :2], got.F_N[:, None] * n + got.F_T[:, None] * t, rtol=1e-12, atol=1e-12)
-        assert torch.allclose(out[:, 2:5], torch.stack((got.s_dot, got.F_N, got.F_T), -1), rtol=1e-12, atol=1e-12)
-        assert torch.allclose(distance_law(shape, x[0]), -g[:1], rtol=1e-12)
-
-
-def test_the_law_away_from_contact_is_the_law_of_a_separated_point() -> None:
-    x = f64(2e-5, 1.5, 6e-4)
-    with torch.no_grad():
-        s_dot, dashpots, slip = free_law(law(), x)
-    got = at(law(), g=-1.0, g_dot=0.0, v_T=0.0, s=2e-5, weight=1.5, stage=6e-4)
-    assert float(s_dot) == float(got.s_dot)
-    assert float(dashpots) == pytest.approx(1.5 * R / 2 * float(s_dot) ** 2, rel=1e-14)
-    assert float(slip) == pytest.approx(float(got.e * got.gamma_dot), rel=1e-14)
 
 
 # derivatives --------------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import random
 import re
 import shutil
@@ -19,6 +20,7 @@ import pytest
 import torch
 import xarray as xr
 import zarr
+from torch.utils.data import DataLoader
 
 from torchsoft.datasets import simulation
 from torchsoft.datasets.check import check
@@ -371,17 +373,6 @@ def test_a_file_behind_the_back_of_others_is_found_by_zarr_itself(made: tuple[Pa
             np.asarray(zarr.open_group(str(folder))[name.partition("/")[0]][:])
 
 
-def test_a_damaged_shard_is_made_anew(made: tuple[Path, Config], tmp_path: Path) -> None:
-    """As the finding says."""
-    folder = copy(made[0], tmp_path / "set")
-    edit("disc_angle/c/0/0", flipped)(folder)
-    record = re.search(r"remove (\S+) and start", next(x for x in check(str(folder)) if "no commit" not in x))
-    assert record is not None
-    Path(record[1]).unlink()
-    generate(made[1], str(folder), Serial(), progress=False)
-    assert files(folder) == files(made[0])
-
-
 def test_standard_tools_check_the_shards(made: tuple[Path, Config], tmp_path: Path) -> None:
     if (tool := shutil.which("sha256sum")) is None:
         pytest.skip("needs sha256sum")
@@ -578,8 +569,80 @@ def test_a_dask_cluster_that_loses_a_worker_makes_the_same_bytes(made: tuple[Pat
     assert files(tmp_path / "set") == files(tmp_path / "whole")
 
 
-def test_tasks_do_not_depend_on_each_other(made: tuple[Path, Config]) -> None:
-    config = made[1]
-    design, data = points(config), xr.open_zarr(made[0])
-    row = simulate_task(config, task(config, 4, design[4]))
-    np.testing.assert_allclose(row["disc_position"], data.disc_position[4], rtol=0, atol=1e-12)
+# the torch dataset -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def partial(made: tuple[Path, Config], tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The dataset with a trajectory that failed, a number that is infinite, and a last shard that is not finished."""
+    folder = copy(made[0], tmp_path_factory.mktemp("partial") / "set")
+    set_value("failed", (2,), 1)(folder)
+    set_value("grasp_force", (0,), np.inf)(folder)
+    vouch(folder)
+    remove("finished/2.sha256")(folder)
+    return str(folder)
+
+
+def reading(url: str, *what: Any, **how: Any) -> Trajectories:
+    """What is finished."""
+    return Trajectories(url, *what, **how, unfinished=True)
+
+
+def test_windows_hold_what_the_store_holds(partial: str) -> None:
+    data, stored = reading(partial, ["disc_position", "pad.E"], window=5, stride=40), xr.open_zarr(partial)
+    assert data.trajectories.tolist() == [0, 1, 3]  # 2 failed, 4 is unfinished
+    assert len(data) == 3 * 3
+    item = data[4]  # the second window of trajectory 1
+    assert (int(item["trajectory"]), int(item["start"])) == (1, 40)
+    np.testing.assert_array_equal(item["disc_position"], stored["disc_position"][1, 40:45])
+    assert item["pad.E"] == float(stored["pad.E"][1])
+    assert int(data[-1]["start"]) == 80
+
+
+def test_splits_are_those_of_the_design(partial: str, made: tuple[Path, Config]) -> None:
+    for name in ("train", "validation", "test"):
+        assert list(reading(partial, [], split=name).trajectories) == [
+            i for i in (0, 1, 3) if split(made[1], i) == name
+        ]
+
+
+def test_it_pickles_small_and_is_read_by_forked_workers_from_any_store(partial: str) -> None:
+    fsspec.filesystem("memory").put(partial, "/copy/set", recursive=True)
+    plain = reading(partial, ["disc_position", "pad.E"], window=30, dtype=torch.float32)
+    for url in (partial, "memory://copy/set"):
+        data = reading(url, ["disc_position", "pad.E"], window=30, dtype=torch.float32)
+        data[0]  # opened before the fork
+        assert len(pickle.dumps(data)) < 2000
+        batches = list(DataLoader(data, batch_size=4, num_workers=2, multiprocessing_context="fork", timeout=60))
+        for name in data.variables:
+            got = torch.cat([batch[name] for batch in batches])
+            assert got.dtype == torch.float32
+            torch.testing.assert_close(got, torch.stack([x[name] for x in plain]))
+
+
+@pytest.mark.parametrize(
+    ("names", "how", "message"),
+    [
+        (["disc_pose"], {}, r"no numbers named 'disc_pose'; known: .*disc_position"),
+        ([], {"window": 92}, "`window` must be 1 to 91"),
+        *(([], {name: value}, f"`{name}` must be a whole number from 1 on, but is {value}")
+          for name in ("window", "stride") for value in (0, 2.5)),
+        *(([], {"dtype": dtype}, r"`dtype` must be one of torch\.float64, .*, but is ")
+          for dtype in (torch.int32, torch.bool, torch.complex64, "float32")),
+        ([], {"split": "dev"}, "`split` must be"),
+    ],
+)  # fmt: skip
+def test_a_reading_that_is_none_is_refused(partial: str, names: list[str], how: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        reading(partial, names, **how)
+
+
+def test_numbers_that_the_dtype_cannot_hold_are_refused(partial: str) -> None:
+    """And those that are not finite in the store are given as they are."""
+    assert torch.isinf(reading(partial, ["grasp_force"], dtype=torch.float16)[0]["grasp_force"])
+    with pytest.raises(
+        ValueError, match=r"`pad.E` of trajectory 0 holds 7.*, which torch\.float16 cannot; take a wider `dtype`"
+    ):
+        reading(partial, ["pad.E"], dtype=torch.float16)[0]
+    with pytest.raises(IndexError):
+        reading(partial, ["pad.E"])[1000]

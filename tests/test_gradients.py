@@ -6,11 +6,10 @@ import pytest
 import torch
 from conftest import coarse, f64, grasped, times
 from torch import Tensor, nn
-from torchdiffeq import odeint
 from unrolled import unrolled_solution
 
 import torchsoft.solve.adjoint
-from torchsoft import METHOD, SoftGrasp, simulate
+from torchsoft import SoftGrasp, simulate
 from torchsoft.channels import MEASURED
 from torchsoft.paper.rig import NAMES
 from torchsoft.solve.adjoint import GradientFailed
@@ -22,8 +21,6 @@ SAME_STEPS = 1e-10
 """Adjoint against backpropagation, relative: two solutions of the same stages."""
 SMALL = 0.1
 """A gradient p dL/dp below this part of the largest one is the difference of larger terms."""
-ALONE = 1e-12
-"""A sample alone against the same sample in a batch, relative."""
 
 UNITS = f64(1e-5, 1e-5, 1e-3, 1e-5, 1e-5, 1e-3, 1e-3, 1e-1, 1e-3, 1e-3, 1.0, 1.0)
 """What counts as one unit of each measured channel in the loss: m, rad, m/s, rad/s, N."""
@@ -140,26 +137,6 @@ def test_adjoint_equals_backpropagation_through_the_plain_step(name: str) -> Non
     for label, p, a, b in zip(["y0", *scalars(w.model)], wanted, adjoint, plain):
         floor = 0.0 if label == "y0" else SMALL * largest / float(p.detach().norm())
         assert float((a - b).norm()) <= SAME_STEPS * max(float(b.norm()), floor), (label, a, b)
-
-
-def test_a_sample_does_not_depend_on_its_neighbours() -> None:
-    """Trajectory and gradient of a sample alone and in a batch, through torchdiffeq."""
-    w = slip()
-    other = w.y0.clone()
-    other[w.model.layout.slices["velocity", "disc"]] = f64(-0.02, 0.01, 0.0)
-
-    def solve(y: Tensor) -> tuple[Tensor, Tensor]:
-        y = y.clone().requires_grad_(True)
-        solution = odeint(w.model, y, w.t, method=METHOD, options={"step_size": w.step, "tolerance": NEWTON})
-        first = solution if solution.ndim == 2 else solution[:, 0]
-        return first.detach(), torch.autograd.grad(w.loss(first), y)[0]
-
-    alone, gradient = solve(w.y0)
-    for neighbours in ([other], [other, w.y0, 0.5 * (other + w.y0)]):
-        solution, bars = solve(torch.stack((w.y0, *neighbours)))
-        assert float((solution - alone).abs().max()) <= ALONE
-        assert float((bars[0] - gradient).norm()) <= ALONE * float(gradient.norm())
-        assert float(bars[1:].abs().max()) == 0.0
 
 
 def test_same_gradient_twice_and_from_checkpoints_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> None:

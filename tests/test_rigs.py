@@ -265,20 +265,6 @@ def test_orientation_is_controlled_through_another_body() -> None:
     assert "the rig is unstable" in check(wrong)[0].sentence
 
 
-def test_efforts_may_be_fed_forward_without_a_loop() -> None:
-    """A constant force on the disc accelerates it as Newton says, where nothing touches it."""
-    tree = coarse(template("t")).model_dump(exclude_unset=True)
-    tree["gravity"] = 0.0
-    tree["bodies"]["disc"]["start"] = {"x": 0.0, "y": 24.95e-3 + 5e-5}
-    tree["actuators"] = {"wind": {"pushes": "disc.x", "feed_forward": "F"}}
-    tree["motion"] = {"F": {"kind": "hold", "value": 0.2}}
-    tree["bodies"]["bracket"] = {"x": 0.0, "y": 60e-3, "theta": 0.0}
-    tree["outputs"] = {"duration": 0.1}
-    run = running.carry_out(RigFile.model_validate(tree)).trajectory
-    assert torch.allclose(run["x_disc"], 0.5 * 0.2 / 0.4 * run.t**2, rtol=1e-6, atol=1e-9)
-    assert run.units["F"] == "N"
-
-
 # starts and estimates ------------------------------------------------------------------------------------------------
 
 

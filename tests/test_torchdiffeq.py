@@ -41,7 +41,7 @@ def test_torchdiffeq_runs_the_stepper() -> None:
     assert torch.equal(solution[:, 1].detach(), simulate(model, t, y0=y0[1], step=2e-3).y)
 
 
-@pytest.mark.parametrize("method", ["rk4", "dopri5"])
+@pytest.mark.parametrize("method", ["rk4", pytest.param("dopri5", marks=pytest.mark.slow)])
 @torch.no_grad()
 def test_explicit_methods_agree(method: str) -> None:
     """torchdiffeq's own methods integrate the same forward and meet the stepper on a short window, slip included."""
