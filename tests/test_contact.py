@@ -4,11 +4,9 @@ import math
 
 import pytest
 import torch
-from conftest import coarse, f64
+from conftest import f64
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
-from torch.autograd import gradcheck
 
 from torchsoft import Circle, Coulomb, SmoothSlip, SoftContact
 from torchsoft.physics.contact import (
@@ -185,28 +183,3 @@ def test_moving_frame_of_a_circle_by_hand() -> None:
 
 
 # derivatives --------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("stage", [0.0, 6e-4])
-def test_contact_by_gradcheck(friction: str, stage: float) -> None:
-    """Forces and rates of a sticking, two slipping (either way) and a separated node, in units of um, mm/s and N."""
-    contact = coarse(contact__friction=friction).contact
-    names, scale = zip(*((name, p.item()) for name, p in contact.named_parameters() if p.requires_grad))
-    weight, units = torch.full((4,), 2.0, dtype=torch.float64), (1e-6, 1e-3, 1e-3, 1e-6)
-
-    def outputs(*x: Tensor) -> Tensor:
-        out = contact(*(a * b for a, b in zip(x, units)), weight, stage=stage)
-        return torch.stack((out.F_N, out.F_T, 1e3 * out.s_dot, 1e3 * out.gamma_dot))
-
-    x = (f64(60, 40, 40, -5), f64(5, -3, 2, 1), f64(1, 90, -80, 10), f64(3, 5, -5, 4))
-    slipping = outputs(*x)[3] != 0
-    assert slipping.tolist()[:3] == [False, True, True]
-    assert gradcheck(outputs, tuple(v.requires_grad_() for v in x), eps=1e-6, atol=1e-5, rtol=1e-5)
-    fixed = [v.detach() * unit for v, unit in zip(x, units)]
-
-    def by_parameters(*log: Tensor) -> Tensor:
-        values = dict(zip(names, (a * b.exp() for a, b in zip(scale, log))))
-        out = torch.func.functional_call(contact, values, (*fixed, weight), {"stage": stage})
-        return torch.stack((out.F_N, out.F_T, 1e3 * out.s_dot, 1e3 * out.gamma_dot))
-
-    assert gradcheck(by_parameters, tuple(f64(0.0)[0].requires_grad_() for _ in scale), eps=1e-6, atol=1e-5, rtol=1e-5)

@@ -62,35 +62,6 @@ def test_a_weightless_disc_between_nodes_rests_on_them(x_C0: float) -> None:
     assert float(model.displacement("L", state).abs().max()) < 1e-12
 
 
-def mirrored(u: Tensor) -> Tensor:
-    """Surface displacements (surface, 2) as seen in a mirror that stands on the disc's centre line."""
-    return u.flip(0) * torch.tensor([-1.0, 1.0], dtype=u.dtype)
-
-
-@torch.no_grad()
-def test_the_grasp_is_symmetric_left_to_right() -> None:
-    model = build()
-    state = model.unpack(press(model, GRASP))
-    for u in (model.displacement(name, state) for name in "LU"):
-        assert float(u.abs().max()) > 1e-4
-        assert float((u - mirrored(u)).abs().max()) < 1e-12
-
-
-@torch.no_grad()
-def test_the_weightless_grasp_is_symmetric_top_to_bottom() -> None:
-    model = build(scenario__gravity=0.0)
-    y = press(model, GRASP)
-    state, p = model.unpack(y), Parameters()
-    face = GRASP - p.bracket.cm_height
-    assert float(state.pose["disc"][1]) == pytest.approx(face / 2, abs=1e-13)
-    upside_down = torch.tensor([1.0, -1.0], dtype=torch.float64)
-    assert float((model.displacement("L", state) - model.displacement("U", state) * upside_down).abs().max()) < 1e-12
-    lower, upper = contact_force(model, y, "L"), contact_force(model, y, "U")
-    assert float(lower[1] + upper[1]) == pytest.approx(0.0, abs=1e-8)
-    heavy = build().unpack(press(build(), GRASP))
-    assert float(state.pose["disc"][1] - heavy.pose["disc"][1]) > 5e-6  # the symmetry is the missing weight's doing
-
-
 @torch.no_grad()
 def test_fidelities_agree_and_the_grasp_is_the_papers() -> None:
     default = {"pad__elements_x": 120, "pad__elements_y": 4}

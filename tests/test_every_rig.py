@@ -16,6 +16,7 @@ from rig_tester import (
     assert_rates_differentiable,
     assert_rigid_motion_is_free,
 )
+from test_meshes import trapezium
 from torch import Tensor, nn
 
 from torchsoft import (
@@ -35,7 +36,6 @@ from torchsoft import (
     PadMesh,
     Profile,
     Prony,
-    QuadMesh,
     Reference,
     Rig,
     RoundedBox,
@@ -116,19 +116,6 @@ class Wave(nn.Module):
 
 def law(friction: Any = None) -> SoftContact:
     return SoftContact(1.2e5, 441.7, 1.1e5, 430.0, friction=friction or SmoothSlip(0.5, 0.4, 5e-2, 10.0))
-
-
-def trapezium() -> QuadMesh:
-    """A skew mesh whose points are numbered at random."""
-    rng = np.random.default_rng(4)
-    s, t = np.meshgrid(np.linspace(0, 1, 17), np.linspace(0, 1, 4), indexing="ij")
-    points = np.stack((30e-3 * s + 4e-3 * t * (1 - 2 * s), 6e-3 * t + 1e-3 * s), -1).reshape(-1, 2)
-    number = rng.permutation(len(points)).reshape(s.shape)
-    shuffled = np.empty_like(points)
-    shuffled[number.ravel()] = points
-    quads = np.stack((number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]), -1).reshape(-1, 4)
-    face, base = (np.stack((row[:-1], row[1:]), -1) for row in (number[:, -1], number[:, 0]))
-    return QuadMesh.of(shuffled, quads, face, base)
 
 
 def grip(
@@ -226,7 +213,7 @@ RIGS: dict[str, Callable[[], Start]] = {
     "crowned pad": lambda: grip(tip=CurvedPadMesh(30e-3, 6e-3, 30, 3, radius=40e-3)),
     "fingertip": lambda: grip(Circle(12e-3), tip=FingertipMesh(8e-3, 24)),
     "fingertip, inertial": lambda: grip(Circle(12e-3), tip=FingertipMesh(8e-3, 12), inertial=True),
-    "mesh of quadrilaterals": lambda: grip(Circle(12e-3), tip=trapezium()),
+    "mesh of quadrilaterals": lambda: grip(Circle(12e-3), tip=trapezium().refined(2)),
     "enclosed pad": lambda: grip(tip=PadMesh(40e-3, 4.59e-3, 20, 2, bonded_sides=True)),
     "points between nodes": lambda: grip(points=2),
     "inertial pads": lambda: grip(inertial=True),

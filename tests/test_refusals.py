@@ -38,6 +38,7 @@ from torchsoft import (
     RoundedPolygon,
     Sampled,
     Shape,
+    SimulationFailed,
     SmoothSlip,
     SoftContact,
     SoftGrasp,
@@ -51,7 +52,8 @@ from torchsoft import (
     simulate,
 )
 from torchsoft.physics.material import Material
-from torchsoft.physics.validity import check_array, check_shape
+from torchsoft.physics.validity import check_array, check_shape, check_slip
+from torchsoft.solve.rates import Rates
 
 NAN, INF = float("nan"), float("inf")
 T = times(4e-3, 3)
@@ -477,3 +479,39 @@ def test_another_mode_or_device_of_torch_is_refused(start: tuple[SoftGrasp, Tens
             rest(model)
     with torch.autograd.forward_ad.dual_level(), pytest.raises(ValueError, match="has a tangent"):
         check_array("x", torch.autograd.forward_ad.make_dual(y0, y0))
+
+
+class Dropping(nn.Module):
+    """A law with a dropout."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.dropout = nn.Dropout(0.5)
+
+    def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
+        return self.dropout((E - 0.5 * F_N).clamp(min=0.0)) / (R + 10.0)
+
+
+def test_a_law_in_training_is_refused_after_it_ran_in_evaluation(start: tuple[SoftGrasp, Tensor]) -> None:
+    model = SoftGrasp(coarse().settings, friction=Dropping(), reference=start[0].reference)
+    simulate(model.eval(), T, y0=start[1])
+    with pytest.raises(TypeError, match="the random operation"):
+        simulate(model.train(), T, y0=start[1])
+
+
+def test_a_slip_law_that_supplies_power_is_told_of() -> None:
+    for right in (SmoothSlip(0.8, 0.7, 5e-3, 10.0), Coulomb(0.8, 0.7)):
+        assert check_slip("c", right, 500.0) == ""
+    for wrong in (lambda E, F_N, R: 1.5 * E / R, lambda E, F_N, R: E - F_N):
+        assert "must be from 0 to the effort" in check_slip("c", wrong, 500.0)
+
+
+def test_compiled_rates_refuse_what_they_cannot_give(start: tuple[SoftGrasp, Tensor]) -> None:
+    """Inertial pads, and states at which there are no forces; they go on after that."""
+    with pytest.raises(NotImplementedError, match="inertial pads"):
+        Rates(coarse(pad__fidelity="inertial"))
+    rates, y = Rates(start[0]), start[1].numpy()
+    fine = rates(0.0, y)
+    with pytest.raises(SimulationFailed, match="no forces"):
+        rates(0.0, np.full_like(y, np.nan))
+    np.testing.assert_allclose(rates(0.0, y), fine, rtol=1e-9, atol=1e-9 * np.abs(fine).max())

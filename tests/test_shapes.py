@@ -238,8 +238,6 @@ def test_full_rounding_is_the_circle(name: str) -> None:
 @pytest.mark.parametrize(
     ("one", "other"),
     [
-        (lambda: Superellipse(20e-3, 12e-3, 2.0), lambda: Ellipse(20e-3, 12e-3)),
-        (lambda: RoundedPolygon(box(20e-3, 9e-3), 2e-3), lambda: RoundedBox(20e-3, 9e-3, 2e-3)),
         (lambda: RoundedPolygon(np.array(ANGLED) + [3.0, -2.0], 2e-3), lambda: RoundedPolygon(ANGLED[::-1], 2e-3)),
         (lambda: Contour(pear(200)[::-1] - [0.5, 0.2], tolerance=1e-8), lambda: Contour(pear(200), tolerance=1e-8)),
     ],
