@@ -1,7 +1,5 @@
 """Shared rigs and states: at rest, in the grasp, rolling, and at random."""
 
-from collections.abc import Callable
-
 import pytest
 import torch
 from torch import Tensor
@@ -32,13 +30,6 @@ def turning(**changes: object) -> Rig:
     )  # fmt: skip
     rig.fixed = lambda: model  # the same rig with a bracket that does not turn
     return rig
-
-
-RIGS: dict[str, Callable[..., Rig]] = {
-    "massless": coarse,
-    "inertial": lambda **changes: coarse(pad__fidelity="inertial", **changes),
-    "turning": turning,
-}
 
 
 def times(end: float, n: int) -> Tensor:
@@ -92,14 +83,3 @@ def shaken(rig: Rig, state: State, seed: int, slip: float = 0.02) -> Tensor:
 @pytest.fixture(params=["massless", "inertial"])
 def fidelity(request: pytest.FixtureRequest) -> str:
     return request.param
-
-
-@pytest.fixture(params=["smooth", "coulomb"])
-def friction(request: pytest.FixtureRequest) -> str:
-    return request.param
-
-
-@pytest.fixture(params=list(RIGS))
-def build(request: pytest.FixtureRequest) -> Callable[..., Rig]:
-    """Makes the paper's rig, the one with inertial pads, or the one whose bracket turns."""
-    return RIGS[request.param]

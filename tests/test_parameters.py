@@ -15,7 +15,6 @@ from torchsoft.tables import InvalidTable
 
 NAN, INF = math.nan, math.inf
 
-STIFFNESSES = ["pad.E", "contact.K_n", "contact.K_t", "control.K_81", "control.K_98"]
 POSITIVE = [
     "pad.length", "pad.height", "pad.depth", "pad.E", "pad.rho", "pad.tau", "contact.K_n", "contact.K_t", "contact.v_s",
     "contact.epsilon", "contact.node_spacing", "disc.radius", "disc.mass", "disc.inertia_ratio", "bracket.mass",

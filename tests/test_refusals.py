@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, coarse, f64, grasped, times
+from conftest import COARSE, coarse, f64, grasped, random_state, times
 from torch import Tensor, nn
 from torchdiffeq import odeint
 
@@ -510,7 +510,7 @@ def test_compiled_rates_refuse_what_they_cannot_give(start: tuple[SoftGrasp, Ten
     """Inertial pads, and states at which there are no forces; they go on after that."""
     with pytest.raises(NotImplementedError, match="inertial pads"):
         Rates(coarse(pad__fidelity="inertial"))
-    rates, y = Rates(start[0]), start[1].numpy()
+    rates, y = Rates(start[0]), random_state(start[0], 0).numpy()
     fine = rates(0.0, y)
     with pytest.raises(SimulationFailed, match="no forces"):
         rates(0.0, np.full_like(y, np.nan))
