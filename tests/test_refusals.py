@@ -322,6 +322,8 @@ PARTS: list[tuple[Call, str]] = [
     (lambda: pushed(measures="dish.x"), r"actuator `a` speaks of `dish\.x`, which is not a coordinate"),
     (lambda: pushed()(0.0, torch.zeros(33, dtype=torch.float64)), "the reference has no signal `w`; it has none"),
     (lambda: coarse().parameter("pad.Young"), r"`pad.Young` is not a parameter of this rig; known: .*pad\.E"),
+    (lambda: coarse().unpack(f64(0.0)), "`y` must be float64 of shape"),
+    (lambda: coarse()(0.0, torch.zeros(376)), "`y` must be float64 of shape"),
     # verbs
     (lambda: press(coarse(), 60e-3), "0.06 m is too high"),
     (lambda: press(coarse(), 50.1e-3), "0.0501 m is too high"),
