@@ -1,7 +1,5 @@
 """Shared rigs and states: at rest, in the grasp, rolling, and at random."""
 
-from collections.abc import Callable
-
 import pytest
 import torch
 from torch import Tensor
@@ -34,13 +32,6 @@ def turning(**changes: object) -> Rig:
     return rig
 
 
-RIGS: dict[str, Callable[..., Rig]] = {
-    "massless": coarse,
-    "inertial": lambda **changes: coarse(pad__fidelity="inertial", **changes),
-    "turning": turning,
-}
-
-
 def times(end: float, n: int) -> Tensor:
     return torch.linspace(0, end, n, dtype=torch.float64)
 
@@ -64,23 +55,27 @@ def grasped(model: SoftGrasp, velocity: tuple[float, float] = (0.0, 0.0)) -> Ten
 
 
 def random_state(rig: Rig, seed: int, slip: float = 0.02) -> Tensor:
-    """A grasped state (size,) shaken about: touching and separated nodes, stick and slip, stretched springs."""
-    generator = torch.Generator().manual_seed(seed)
+    """A grasped state (size,) of the paper's rigs shaken about."""
     model = rig if isinstance(rig, SoftGrasp) else rig.fixed()
-    state = model.unpack(press(model, model.settings.scenario.y_Br_grasp).detach())
+    return shaken(rig, model.unpack(press(model, model.settings.scenario.y_Br_grasp).detach()), seed, slip)
 
-    def shaken(part: dict[str, Tensor], scale: float | Tensor) -> dict[str, Tensor]:
+
+def shaken(rig: Rig, state: State, seed: int, slip: float = 0.02) -> Tensor:
+    """A state (size,) shaken about: touching and separated nodes, stick and slip, stretched springs."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def moved(part: dict[str, Tensor], scale: float | Tensor) -> dict[str, Tensor]:
         noise = {name: torch.randn(x.shape, generator=generator, dtype=torch.float64) for name, x in part.items()}
         return {name: x + scale * noise[name] for name, x in part.items()}
 
     force = 2e-5 if any(pad.inertial for pad in rig.pads.values()) else 0.5  # [m] or [N]
     return rig.pack(
         State(
-            pads=shaken(state.pads, force),
-            stretch=shaken(state.stretch, 2e-5),
-            pose=shaken(state.pose, f64(1e-4, 1e-4, 0.02)),
-            rates=shaken(state.rates, 0.01 * slip),
-            velocity=shaken(state.velocity, slip * f64(1.0, 1.0, 50.0)),
+            pads=moved(state.pads, force),
+            stretch=moved(state.stretch, 2e-5),
+            pose=moved(state.pose, f64(1e-4, 1e-4, 0.02)),
+            rates=moved(state.rates, 0.01 * slip),
+            velocity=moved(state.velocity, slip * f64(1.0, 1.0, 50.0)),
         )
     )
 
@@ -88,14 +83,3 @@ def random_state(rig: Rig, seed: int, slip: float = 0.02) -> Tensor:
 @pytest.fixture(params=["massless", "inertial"])
 def fidelity(request: pytest.FixtureRequest) -> str:
     return request.param
-
-
-@pytest.fixture(params=["smooth", "coulomb"])
-def friction(request: pytest.FixtureRequest) -> str:
-    return request.param
-
-
-@pytest.fixture(params=list(RIGS))
-def build(request: pytest.FixtureRequest) -> Callable[..., Rig]:
-    """Makes the paper's rig, the one with inertial pads, or the one whose bracket turns."""
-    return RIGS[request.param]

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from test_material_fit import plain, relaxing
 from test_sysid_measured import CONFIG, EXAMPLE, F_Y, X_C, X_D, Table, scale, write
 
 from torchsoft.cli import main
@@ -98,51 +99,73 @@ def test_a_wrong_command_line_shows_the_usage_and_ends_with_2(arguments: list[st
 
 
 ERRORS: dict[str, tuple[list[str], str]] = {
-    "no config": (["data.csv"], "one CONFIG.toml is needed, but 0 were given"),
-    "two configs": (["data.csv", "rig.toml", "rig.toml"], "one CONFIG.toml is needed, but 2 were given"),
-    "no such file": (["other.csv", "rig.toml"], "other.csv: No such file or directory"),
-    "no such config": (["data.csv", "other.toml"], "other.toml: No such file or directory"),
-    "a folder": (["folder.csv", "rig.toml"], "folder.csv: Is a directory"),
-    "no data": (["rig.toml"], "there is nothing to identify from"),
-    "not a table": (["picture.csv", "rig.toml"], "picture.csv is not a CSV file in UTF-8"),
-    "empty": (["empty.csv", "rig.toml"], "empty.csv has no column `t`"),
-    "not TOML": (["data.csv", "broken.toml"], "broken.toml is not a TOML file"),
+    "no config": (["identify", "data.csv"], "one CONFIG.toml is needed, but 0 were given"),
+    "two configs": (["identify", "data.csv", "rig.toml", "rig.toml"], "one CONFIG.toml is needed, but 2 were given"),
+    "no such file": (["identify", "other.csv", "rig.toml"], "other.csv: No such file or directory"),
+    "no such config": (["identify", "data.csv", "other.toml"], "other.toml: No such file or directory"),
+    "a folder": (["identify", "folder.csv", "rig.toml"], "folder.csv: Is a directory"),
+    "no data": (["identify", "rig.toml"], "there is nothing to identify from"),
+    "not a table": (["identify", "picture.csv", "rig.toml"], "picture.csv is not a CSV file in UTF-8"),
+    "empty": (["identify", "empty.csv", "rig.toml"], "empty.csv has no column `t`"),
+    "not TOML": (["identify", "data.csv", "broken.toml"], "broken.toml is not a TOML file"),
     "unknown name": (
-        ["data.csv", "misspelt.toml"],
+        ["identify", "data.csv", "misspelt.toml"],
         "misspelt.toml: unknowns: `contact.K` cannot be identified; what can: ",
     ),
-    "rtol": (["data.csv", "rig.toml", "--rtol", "-1"], "rtol should be greater than or equal to 1e-08, not -1.0"),
+    "rtol": (
+        ["identify", "data.csv", "rig.toml", "--rtol", "-1"],
+        "rtol should be greater than or equal to 1e-08, not -1.0",
+    ),
     "tiny rtol": (
-        ["data.csv", "rig.toml", "--rtol", "1e-300"],
+        ["identify", "data.csv", "rig.toml", "--rtol", "1e-300"],
         "rtol should be greater than or equal to 1e-08, not 1e-300",
     ),
     "many starts": (
-        ["data.csv", "many.toml"],
+        ["identify", "data.csv", "many.toml"],
         "; take a larger rtol, fewer starts or less data, or say --yes to begin",
     ),
     "deep": (
-        ["data.csv", "deep.toml"],
+        ["identify", "data.csv", "deep.toml"],
         "deep.toml is not a TOML file that can be read: its tables are nested too deeply",
     ),
-    "another encoding": (["data.csv", "latin.toml"], "latin.toml is not a TOML file: 'utf-8' codec"),
-    "workers": (["data.csv", "rig.toml", "--workers", "0"], "workers should be greater than or equal to 1, not 0"),
-    "out is a file": (["data.csv", "rig.toml", "--out", "data.csv"], "--out: results cannot be written to data.csv ("),
+    "another encoding": (["identify", "data.csv", "latin.toml"], "latin.toml is not a TOML file: 'utf-8' codec"),
+    "workers": (
+        ["identify", "data.csv", "rig.toml", "--workers", "0"],
+        "workers should be greater than or equal to 1, not 0",
+    ),
+    "out is a file": (
+        ["identify", "data.csv", "rig.toml", "--out", "data.csv"],
+        "--out: results cannot be written to data.csv (",
+    ),
+    "material: no such file": (["material", "fit", "other.csv"], "other.csv: No such file or directory"),
+    "material: no table": (["material", "fit", "picture.csv"], "picture.csv is not a CSV file in UTF-8"),
+    "material: an area": (["material", "fit", "test.csv", "--area", "1e-5"], "`stress` needs no `area`"),
+    "material: many terms": (["material", "fit", "test.csv", "--terms", "50"], "`terms` must be from 1 to"),
+    "material: ratio": (
+        ["material", "fit", "test.csv", "--nu", "0.6"],
+        "pad.nu should be less than or equal to 0.4999",
+    ),
+    "material: out": (
+        ["material", "fit", "test.csv", "--out", "test.csv"],
+        "--out: results cannot be written to test.csv (",
+    ),
 }
 
 
 @pytest.mark.parametrize("name", ERRORS)
 def test_an_error_is_one_line_and_ends_with_2(folder: Path, name: str, capsys: Any) -> None:
     (folder / "folder.csv").mkdir()
-    (folder / "picture.csv").write_bytes(b"\x89PNG\r\n\x1a\n")
-    (folder / "empty.csv").write_text("")
-    (folder / "broken.toml").write_text("[[")
-    (folder / "deep.toml").write_text("a = " + "[" * 20_000)
-    (folder / "latin.toml").write_bytes("a = 'µ'".encode("latin-1"))
-    (folder / "many.toml").write_text(f"{CONFIG}starts = 1_000_000\n")
-    (folder / "misspelt.toml").write_text(CONFIG.replace("contact.K_n", "contact.K"))
+    contents = {
+        "picture.csv": b"\x89PNG\r\n\x1a\n", "empty.csv": b"", "broken.toml": b"[[", "deep.toml": b"a = " + b"[" * 20_000,
+        "latin.toml": "a = 'µ'".encode("latin-1"), "many.toml": f"{CONFIG}starts = 1_000_000\n".encode(),
+        "misspelt.toml": CONFIG.replace("contact.K_n", "contact.K").encode(),
+    }  # fmt: skip
+    for path, content in contents.items():
+        (folder / path).write_bytes(content)
+    plain(folder, relaxing(1e-3))
     before = sorted(folder.rglob("*"))
     arguments, message = ERRORS[name]
-    assert main(["identify", *arguments]) == 2
+    assert main(arguments) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert err.startswith("torchsoft: error: ")
@@ -170,13 +193,6 @@ def test_a_checkpoint_folder_of_others_is_refused_and_left_alone(folder: Path, c
     said = capsys.readouterr().err
     assert said == "torchsoft: error: the checkpoint mine holds other files; give a new or an empty folder\n"
     assert sorted(path.name for path in mine.iterdir()) == ["a.pickle", "b.partial"]
-
-
-def test_as_a_process_it_ends_with_the_same_status_and_without_a_traceback(folder: Path) -> None:
-    command = [sys.executable, "-m", "torchsoft", "identify", "data.csv"]
-    ended = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
-    assert ended.returncode == 2
-    assert ended.stderr == "torchsoft: error: one CONFIG.toml is needed, but 0 were given\n"
 
 
 def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(folder: Path, capsys: Any) -> None:

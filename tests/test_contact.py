@@ -4,24 +4,15 @@ import math
 
 import pytest
 import torch
-from conftest import coarse, f64
+from conftest import f64
 from hypothesis import given
 from hypothesis import strategies as st
-from torch import Tensor
-from torch.autograd import gradcheck
 
-from torchsoft import Circle, Coulomb, Ellipse, SmoothSlip, SoftContact
+from torchsoft import Circle, Coulomb, SmoothSlip, SoftContact
 from torchsoft.physics.contact import (
     ContactState,
     SlipLaw,
-    cross,
-    distance_law,
-    free_law,
-    interface_law,
     moving_frame,
-    normal_force,
-    ramp,
-    turned,
 )
 
 K, R = 1e5, 400.0
@@ -110,20 +101,6 @@ def test_a_stage_acts_through_the_stretch_at_its_end() -> None:
 # limits and continuity ----------------------------------------------------------------------------------------------
 
 
-def test_equal_coefficients_without_viscosity_are_coulombs_law() -> None:
-    E = torch.linspace(0, 30, 301, dtype=torch.float64)
-    F_N, dashpot = f64(10.0), f64(200.0)
-    with torch.no_grad():
-        one = smooth(mu_s=0.5, mu_k=0.5, eta=0.0)(E, F_N, dashpot)
-        assert torch.allclose(one, Coulomb(0.5, 0.5)(E, F_N, dashpot), rtol=1e-12, atol=1e-15)
-
-
-def test_fast_slip_tends_to_kinetic_friction() -> None:
-    with torch.no_grad():
-        x = smooth(v_s=1e-9)(f64(12.0), f64(10.0), f64(200.0))
-    assert float(x) == pytest.approx((12.0 - 5.0) / 220.0, rel=1e-6)
-
-
 @pytest.mark.parametrize("s", [0.0, 1e-5])
 @pytest.mark.parametrize("friction", [smooth(), Coulomb(0.8, 0.5)])
 def test_forces_are_continuous_at_touch_down(friction: SlipLaw, s: float) -> None:
@@ -205,129 +182,4 @@ def test_moving_frame_of_a_circle_by_hand() -> None:
     assert torch.allclose(frame.g, f64(1e-3, 0.0), rtol=0, atol=1e-17)
 
 
-def inputs(count: int, seed: int) -> Tensor:
-    """Inputs x (count, 9) of `interface_law` near the boundary of a body about 20 mm in size."""
-    generator = torch.Generator().manual_seed(seed)
-    normal = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)
-    angle = 2 * torch.pi * torch.rand(count, generator=generator, dtype=torch.float64)
-    d = (0.02 - 5e-5 * normal(count).abs())[:, None] * torch.stack((angle.cos(), angle.sin()), -1)
-    one = torch.ones(count, 1, dtype=torch.float64)
-    return torch.cat(
-        (0.01 * normal(count, 2), normal(count, 1), d, normal(count, 1), 1e-5 * normal(count, 1), one, 0 * one), -1
-    )
-
-
-@pytest.mark.parametrize("shape", [Circle(0.02), Ellipse(0.0205, 0.0195)], ids=["circle", "ellipse"])
-def test_the_law_turns_with_everything(shape: torch.nn.Module) -> None:
-    """Turning point, velocities and body by one angle turns the force and nothing else."""
-    x, angle = inputs(50, 0), torch.tensor(0.7, dtype=torch.float64)
-    other = torch.cat((turned(x[:, :2], angle), x[:, 2:3], turned(x[:, 3:5], angle), x[:, 5:6] + angle, x[:, 6:]), -1)
-    with torch.no_grad():
-        one, two = interface_law(law(), shape, x), interface_law(law(), shape, other)
-    scale = one.abs().amax(0)
-    assert float((turned(one[:, :2], angle) - two[:, :2]).abs().max()) < 1e-9 * float(scale[:2].max())
-    assert bool(((one[:, 2:] - two[:, 2:]).abs() <= 1e-9 * scale[2:]).all())
-    assert int((one[:, 3] > 0).sum()) > 10
-
-
-def test_the_law_of_a_point_is_the_node_law_in_the_moving_frame() -> None:
-    """Eq. 4-7 by hand: g' and v_T are the body's velocity at the point along n and t."""
-    x, contact, shape = inputs(50, 1), law(), Circle(0.02)
-    with torch.no_grad():
-        out = interface_law(contact, shape, x)
-        n = x[:, 3:5] / x[:, 3:5].norm(dim=-1, keepdim=True)
-        v = x[:, :2] + x[:, 2:3] * cross(x[:, 3:5])
-        g, t = 0.02 - x[:, 3:5].norm(dim=-1), cross(n)
-        got = contact(g, (n * v).sum(-1), (t * v).sum(-1), x[:, 6], x[:, 7])
-        assert torch.allclose(out[:, :2], got.F_N[:, None] * n + got.F_T[:, None] * t, rtol=1e-12, atol=1e-12)
-        assert torch.allclose(out[:, 2:5], torch.stack((got.s_dot, got.F_N, got.F_T), -1), rtol=1e-12, atol=1e-12)
-        assert torch.allclose(distance_law(shape, x[0]), -g[:1], rtol=1e-12)
-
-
-def test_the_law_away_from_contact_is_the_law_of_a_separated_point() -> None:
-    x = f64(2e-5, 1.5, 6e-4)
-    with torch.no_grad():
-        s_dot, dashpots, slip = free_law(law(), x)
-    got = at(law(), g=-1.0, g_dot=0.0, v_T=0.0, s=2e-5, weight=1.5, stage=6e-4)
-    assert float(s_dot) == float(got.s_dot)
-    assert float(dashpots) == pytest.approx(1.5 * R / 2 * float(s_dot) ** 2, rel=1e-14)
-    assert float(slip) == pytest.approx(float(got.e * got.gamma_dot), rel=1e-14)
-
-
 # derivatives --------------------------------------------------------------------------------------------------------
-
-
-def test_ramp_and_normal_force_by_gradcheck() -> None:
-    g, g_dot = f64(3e-6, 5e-5, -2e-5).requires_grad_(), f64(-1e-4, 2e-2, 1e-2).requires_grad_()
-    K_n, R_n, epsilon = f64(1.2e5).requires_grad_(), f64(441.0).requires_grad_(), f64(1e-6)
-    check = {"eps": 1e-9, "atol": 1e-3, "rtol": 1e-4}  # g is some micrometres, so steps are nanometres
-    assert gradcheck(lambda g: ramp(g, epsilon), (g,), **check)
-    assert gradcheck(lambda g, g_dot: normal_force(g, g_dot, ramp(g, epsilon), K_n, R_n), (g, g_dot), **check)
-    fixed = g.detach()
-    by_law = lambda K, R: normal_force(fixed, g_dot.detach(), ramp(fixed, epsilon), K, R)
-    assert gradcheck(by_law, (K_n, R_n), eps=1e-3, atol=1e-9)
-
-
-@pytest.mark.parametrize("E", [(3.0, 5.0), (9.0, 30.0)], ids=["stick", "slip"])
-def test_smooth_slip_by_gradcheck(E: tuple[float, float]) -> None:
-    """All arguments and parameters; at 10 N the cap is 8 N. Both forms of the root: 9 N and 30 N."""
-    friction = SmoothSlip(0.8, 0.7, 5e-3, 10.0)
-    arguments = (f64(*E).requires_grad_(), f64(10.0, 10.0).requires_grad_(), f64(441.0).requires_grad_())
-    rate = lambda E, F_N, R, *_: 1e3 * friction(E, F_N, R)  # [mm/s]
-    assert gradcheck(rate, (*arguments, *friction.parameters()), eps=1e-7, atol=1e-6)
-    assert bool((rate(*arguments) > 0).all()) == (E[0] > 8.0)
-
-
-@pytest.mark.parametrize("E", [3.0, 9.0], ids=["stick", "slip"])
-def test_coulomb_by_gradcheck(E: float) -> None:
-    friction = Coulomb(0.8, 0.7)
-    arguments = tuple(f64(x).requires_grad_() for x in (E, 10.0, 441.0))
-    assert gradcheck(lambda E, F_N, R, *_: 1e3 * friction(E, F_N, R), (*arguments, *friction.parameters()), atol=1e-6)
-
-
-@pytest.mark.parametrize("stage", [0.0, 6e-4])
-def test_contact_by_gradcheck(friction: str, stage: float) -> None:
-    """Forces and rates of a sticking, two slipping (either way) and a separated node, in units of um, mm/s and N."""
-    contact = coarse(contact__friction=friction).contact
-    names, scale = zip(*((name, p.item()) for name, p in contact.named_parameters() if p.requires_grad))
-    weight, units = torch.full((4,), 2.0, dtype=torch.float64), (1e-6, 1e-3, 1e-3, 1e-6)
-
-    def outputs(*x: Tensor) -> Tensor:
-        out = contact(*(a * b for a, b in zip(x, units)), weight, stage=stage)
-        return torch.stack((out.F_N, out.F_T, 1e3 * out.s_dot, 1e3 * out.gamma_dot))
-
-    x = (f64(60, 40, 40, -5), f64(5, -3, 2, 1), f64(1, 90, -80, 10), f64(3, 5, -5, 4))
-    slipping = outputs(*x)[3] != 0
-    assert slipping.tolist()[:3] == [False, True, True]
-    assert gradcheck(outputs, tuple(v.requires_grad_() for v in x), eps=1e-6, atol=1e-5, rtol=1e-5)
-    fixed = [v.detach() * unit for v, unit in zip(x, units)]
-
-    def by_parameters(*log: Tensor) -> Tensor:
-        values = dict(zip(names, (a * b.exp() for a, b in zip(scale, log))))
-        out = torch.func.functional_call(contact, values, (*fixed, weight), {"stage": stage})
-        return torch.stack((out.F_N, out.F_T, 1e3 * out.s_dot, 1e3 * out.gamma_dot))
-
-    assert gradcheck(by_parameters, tuple(f64(0.0)[0].requires_grad_() for _ in scale), eps=1e-6, atol=1e-5, rtol=1e-5)
-
-
-@pytest.mark.parametrize("shape", [Circle(0.019), Ellipse(0.02, 0.017)], ids=["circle", "ellipse"])
-def test_moving_frame_by_gradcheck(shape: torch.nn.Module) -> None:
-    """By place, angle and the shape's lengths, all in cm, so that gradcheck's step suits them."""
-    names = [name for name, _ in shape.named_parameters()]
-    d, theta = f64(1.15, -1.42, 0.05, -1.92).reshape(2, 2), f64(0.7)[0]
-
-    class Framed(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.shape = shape
-
-        def forward(self, d: Tensor, theta: Tensor) -> Tensor:
-            frame = moving_frame(self.shape, 1e-2 * d, theta)
-            return torch.cat((1e2 * frame.d, frame.n, frame.t, 1e2 * frame.g[..., None]), -1)
-
-    def frame(d: Tensor, theta: Tensor, *lengths: Tensor) -> Tensor:
-        changed = {f"shape.{name}": 1e-2 * length for name, length in zip(names, lengths)}
-        return torch.func.functional_call(Framed(), changed, (d, theta))
-
-    lengths = [1e2 * p.detach() for p in shape.parameters()]
-    assert gradcheck(frame, [x.requires_grad_() for x in (d, theta, *lengths)])

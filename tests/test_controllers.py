@@ -6,201 +6,23 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from conftest import grasped, random_state, times, turning
-from torch import Tensor, nn
+from torch import nn
 
 from torchsoft import (
-    PD,
-    Actuator,
-    Body,
-    Circle,
-    Parameters,
-    Profile,
-    Reference,
-    Rig,
-    SoftGrasp,
     StateFeedback,
-    controller,
-    hold,
-    press,
-    simulate,
 )
 from torchsoft.rigs import RigFile
 from torchsoft.rigs import run as running
 from torchsoft.rigs.check import check
 from torchsoft.rigs.written import template, to_toml
-from torchsoft.solve.rates import Rates
 
-WHOLE = [f"{body}.{axis}" for body in ("bracket", "disc") for axis in ("x", "y", "theta")]
-PUSHES = {"x": "bracket.x", "y": "bracket.y", "turn": "bracket.theta"}
 KP, KD = 1.2e5, 440.0
-
-
-class Policy(nn.Module):
-    """A loop of each of the bracket's coordinates, whose efforts a network of the whole state corrects."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        torch.manual_seed(3)
-        self.net = nn.Sequential(nn.Linear(18, 5), nn.Tanh(), nn.Linear(5, 3)).double()
-        self.size = nn.Parameter(torch.tensor(2.0, dtype=torch.float64))
-        self.Kp = nn.Parameter(torch.tensor([KP, KP, 60.0], dtype=torch.float64))
-        self.Kd = nn.Parameter(torch.tensor([KD, KD, 0.2], dtype=torch.float64))
-
-    def forward(self, setpoints: Tensor, state: Tensor) -> Tensor:
-        (w, w_dot), (q, q_dot) = setpoints.unflatten(-1, (2, 3)).unbind(-2), state.unflatten(-1, (2, 6)).unbind(-2)
-        seen = torch.cat((100.0 * (w - q[..., :3]), w_dot, 100.0 * q, q_dot), -1)
-        return self.Kp * (w - q[..., :3]) + self.Kd * (w_dot - q_dot[..., :3]) + self.size * self.net(seen)
-
-
-def controlled(module: nn.Module) -> tuple[Rig, Tensor]:
-    """The rig whose bracket may turn, pushed by a controller in x, y and theta; and its start."""
-    given = turning()
-    rig = Rig(
-        bodies=dict(given.bodies), pads=dict(given.pads), contacts=dict(given.contacts),
-        actuators=controller(
-            module, measures=WHOLE, setpoints=["x_d", "y_d", "theta_d"], pushes=PUSHES, feed_forward={"y": "F_ff"}
-        ),
-    )  # fmt: skip
-    rig.fixed = given.fixed
-    model = rig.fixed()
-    state = model.unpack(press(model, model.settings.scenario.y_Br_grasp).detach())
-    x, y, _ = state.pose["bracket"].tolist()
-    moves = {"x_d": (x, x + 2e-3), "y_d": (y, y - 2e-4), "theta_d": (0.0, 0.02), "F_ff": (-60.0, -70.0)}
-    rig.reference = Reference(**{name: Profile([0.0, 0.04], list(ends)) for name, ends in moves.items()})
-    return rig, rig.pack(state)
-
-
-def test_efforts_are_those_of_the_module() -> None:
-    rig, y0 = controlled(Policy())
-    run = simulate(rig, times(0.03, 7), y0=y0)
-    setpoints = torch.cat(
-        [run[name][:, None] for name in ("x_d", "y_d", "theta_d", "x_d_dot", "y_d_dot", "theta_d_dot")], 1
-    )
-    poses = [run[f"{axis}_bracket"] for axis in ("x", "y", "theta")] + [
-        run[f"{axis}_disc"] for axis in ("x", "y", "theta")
-    ]
-    rates = [run[f"{a}_{b}"] for b in ("bracket", "disc") for a in ("v_x", "v_y", "omega")]
-    module = rig.actuators["x"].law.module
-    wanted = module(setpoints, torch.stack((*poses, *rates), -1)).detach()
-    wanted[:, 1] += run["F_ff"]
-    for i, name in enumerate(PUSHES):
-        assert torch.allclose(run[f"F_{name}"], wanted[:, i], rtol=1e-12, atol=1e-12)
-        assert float(wanted[:, i].abs().max()) > 0.1
-    assert (run.units["theta_d"], run.units["F_turn"], run.units["y_d"]) == ("rad", "N.m", "m")
-    assert run.energy_residual_rel < 1e-3
-
-
-def test_compiled_rates_are_those_of_the_module() -> None:
-    rig, _ = controlled(Policy())
-    f = Rates(rig)
-    for seed in range(3):
-        y = random_state(rig, seed)
-        with torch.no_grad():
-            wanted = rig(0.01, y)
-        for here in rig.layout.slices.values():
-            assert torch.allclose(
-                torch.from_numpy(f(0.01, y.numpy()))[here],
-                wanted[here],
-                rtol=0,
-                atol=1e-9 * float(wanted[here].abs().max()),
-            )
-
-
-def test_gradients_into_weights_and_gains_equal_differences() -> None:
-    """By the adjoint for all of them, by forward sensitivities for a number."""
-    policy = Policy()
-    rig, y0 = controlled(policy)
-    t = times(0.03, 4)
-    run = simulate(rig, t, y0=y0, rtol=1e-4, tolerance=1e-10, gradient="discrete")
-
-    def ends(trajectory: Any) -> Tensor:
-        return 1e3 * trajectory["x_disc"][-1] + 1e2 * trajectory["theta_bracket"][-1] + 1e-2 * trajectory["F_y"][-1]
-
-    ends(run).backward()
-    entries = [
-        ("net.0.weight", (2, 7)),
-        ("net.0.bias", (1,)),
-        ("net.2.weight", (1, 0)),
-        ("Kp", (2,)),
-        ("Kd", (0,)),
-        ("size", ()),
-    ]
-    for name, at in entries:
-        parameter = policy.get_parameter(name)
-        value, found = parameter.detach()[at].item(), []
-        h = 3e-4 * max(abs(value), 0.1)
-        for shift in (h, -h, 2 * h, -2 * h):
-            with torch.no_grad():
-                parameter[at] = value + shift
-            found.append(float(ends(simulate(rig, t, y0=y0, knots=run.knots, tolerance=1e-10))))
-            with torch.no_grad():
-                parameter[at] = value
-        slope = (8 * (found[0] - found[1]) - (found[2] - found[3])) / (12 * h)
-        assert parameter.grad is not None
-        assert float(parameter.grad[at]) == pytest.approx(slope, rel=1e-6), name
-    own = next(name for name, one in rig.named_parameters() if one is policy.size)
-    forward = simulate(rig, t, y0=y0, knots=run.knots, tolerance=1e-10, gradient="forward", wrt=[own])
-    states = simulate(rig, t, y0=y0, knots=run.knots, tolerance=1e-10, gradient="discrete")
-    assert forward.sensitivities is not None
-    columns = forward.sensitivities[-1, :, 0]
-    for k in (-1, -6, -12):  # the disc's spin and place, the nodes' last force
-        (slope,) = torch.autograd.grad(states.y[-1, k], policy.size, retain_graph=True)
-        assert float(columns[k]) == pytest.approx(float(slope), rel=1e-8)
-
-
-def test_feedback_on_the_diagonal_is_two_loops() -> None:
-    """A gain matrix with the gains of PD laws moves the paper's rig as these do."""
-    model = SoftGrasp(Parameters().override({"pad.elements_x": 60, "pad.elements_y": 2, "control.senses": "bracket"}))
-    y0 = grasped(model)
-    x, y, _ = model.unpack(y0).pose["bracket"].tolist()
-    model.reference = Reference(
-        x_d=Profile([0.0, 0.04], [x, x + 2e-3]), y_d=Profile([0.0, 0.04], [y, y - 2e-4]),
-        F_ff=Profile([0.0, 0.04], [-60.0, -70.0]),
-    )  # fmt: skip
-    model.actuators["x"] = Actuator("bracket.x", "bracket.x", PD(KP, KD), setpoint="x_d")
-    del model.control["x"]
-    t = times(0.03, 7)
-    loops = simulate(model, t, y0=y0, step=1e-3)
-    gain = [[KP, 0.0, KD, 0.0], [0.0, 1.2e5, 0.0, 441.7149]]
-    gain[1][1], gain[1][3] = (float(one.detach()) for one in (model.actuators["y"].law.Kp, model.actuators["y"].law.Kd))
-    made = controller(
-        StateFeedback(gain), measures=["bracket.x", "bracket.y"], setpoints=["x_d", "y_d"],
-        pushes={"x": "bracket.x", "y": "bracket.y"}, feed_forward={"y": "F_ff"},
-    )  # fmt: skip
-    del model.control["y"]
-    model.actuators.update(made)
-    matrix = simulate(model, t, y0=y0, step=1e-3)
-    assert float((loops["x_C"] - loops["x_C"][0]).abs().max()) > 1e-4
-    for name in ("x_C", "theta", "x_Br", "y_Br"):
-        assert torch.allclose(loops[name], matrix[name], rtol=0, atol=1e-10)
 
 
 def test_coordinates_without_set_points_are_regulated() -> None:
     law = StateFeedback([[1.0, 10.0, 100.0, 1000.0]])
     efforts = law(torch.tensor([2.0, 3.0]).double(), torch.tensor([0.5, 0.25, 0.5, 0.125]).double())
     assert efforts.item() == pytest.approx(1.5 - 2.5 + 250.0 - 125.0, rel=1e-15)
-
-
-def test_what_cannot_be_honoured_is_refused() -> None:
-    law = StateFeedback([[1.0, 1.0]])
-    one = {"measures": ["disc.x"], "setpoints": ["w"], "pushes": {"x": "disc.x"}}
-    for given, sentence in (
-        (
-            one | {"pushes": {"x": "disc.x", "y": "disc.y"}},
-            r"gives \(1,\) for one state, but must give one effort for each of",
-        ),
-        (one | {"measures": "disc.x"}, "are sequences of names"),
-        (one | {"feed_forward": {"z": "F"}}, "`feed_forward` names z, but `pushes` has x"),
-        (one | {"setpoints": ["w", "v"]}, "measures 1 coordinates and follows 2 set-points"),
-        (one | {"measures": [3]}, "must be a name, or a sequence of them"),
-    ):
-        with pytest.raises(ValueError, match=sentence):
-            controller(law, **given)
-    with pytest.raises(ValueError, match="must be a torch module"):
-        controller(lambda w, q: q, **one)  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match="rows of one length"):
-        StateFeedback([[1.0, 2.0], [1.0]])
 
 
 def file(**changes: Any) -> RigFile:
@@ -216,31 +38,6 @@ def file(**changes: Any) -> RigFile:
     }  # fmt: skip
     tree["outputs"] = {"duration": 0.6, "interval": 0.02}
     return RigFile.from_tree(tree)
-
-
-def test_a_law_of_ones_own_that_is_none_is_refused_with_its_actuator() -> None:
-    """Before the run, with what it must take and return."""
-    kept: list[torch.Tensor] = []
-
-    def keeping(w: Any, w_dot: Any, feed_forward: Any, q: Any, q_dot: Any) -> torch.Tensor:
-        kept.append(q)
-        return 100.0 * (w - kept[0])
-
-    must = r"the law of `actuators.x` must take five tensors .* and return the effort, .* but "
-    for law, message in (
-        (lambda w, w_dot, feed_forward, q, q_dot: None, must + "TypeError: for one state it gives None"),
-        (lambda w, w_dot, feed_forward, q, q_dot: 3.0, must + r"TypeError: for one state it gives 3\.0"),
-        (lambda w, w_dot, feed_forward, q, q_dot: torch.stack((w, q)), must + r".* a tensor of shape \(2,\)"),
-        (lambda w, q: w - q, must + "TypeError: .* takes 2 positional arguments but 5 were given"),
-        (lambda w, w_dot, feed_forward, q, q_dot: (w - q)[3], must + "IndexError"),
-        (keeping, "`actuators.x`: The law is another one when it is called again"),
-    ):
-        rig = Rig(
-            bodies={"disc": Body(1.0, Circle(0.02), weighted=False)}, pads={}, contacts={}, reference=hold(x_d=0.0),
-            actuators={"x": Actuator("disc.x", "disc.x", law, setpoint="x_d")},
-        )  # fmt: skip
-        with pytest.raises(TypeError, match=message):
-            simulate(rig, times(0.01, 2), y0=torch.zeros(6, dtype=torch.float64))
 
 
 def test_a_controller_in_a_file_is_the_loops_that_it_stands_for(tmp_path: Path) -> None:

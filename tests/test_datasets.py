@@ -2,6 +2,7 @@
 
 import json
 import os
+import pickle
 import random
 import re
 import shutil
@@ -19,6 +20,7 @@ import pytest
 import torch
 import xarray as xr
 import zarr
+from torch.utils.data import DataLoader
 
 from torchsoft.datasets import simulation
 from torchsoft.datasets.check import check
@@ -98,26 +100,6 @@ def test_ready_configs_are_valid_and_their_splits_keep_the_shares(path: Path) ->
     np.testing.assert_allclose(shares, [0.7, 0.15, 0.15], atol=0.01)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ('title = "Test"', 'title = "Test"\nworkers = 3', "workers"),
-        ("low = 7e5", "low = 9e5", r"parameters\.pad\.E"),
-        ("low = 7e5", "low = -1.0", r"parameters\.pad\.E"),
-        ('"pad.E"', '"pad.Young"', r"pad\.Young"),
-        ("low = 1.3e-3, high = 1.5e-3", "low = 1.3e-3, high = 0.02", r"grasp_depth\.high = 0\.02"),
-        ("low = 0.7, high = 0.9", "low = 0.3, high = 0.9", r"contact\.mu_s = 0\.3.*mu_k"),
-        ("low = 1e-3, high = 2e-3", "low = 1e-3, high = 0.2", r"kinds\.0\.travel"),
-        ("duration = 0.9", "duration = 0.5", "duration"),
-        ("step = 0.002", "step = 0.5", "step"),
-        ('kind = "slow_roll"', 'kind = "hop"', "kinds"),
-    ],
-)
-def test_a_wrong_config_is_refused_with_the_field(tmp_path: Path, old: str, new: str, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Config.from_toml(write_config(tmp_path, change=(old, new)))
-
-
 def test_a_sobol_design_is_a_prefix_of_a_longer_one(tmp_path: Path) -> None:
     short, long = (Config.from_toml(write_config(tmp_path, trajectories=n)) for n in (5, 40))
     np.testing.assert_array_equal(points(short), points(long)[:5])
@@ -166,29 +148,6 @@ def test_an_object_store_holds_the_same_bytes(made: tuple[Path, Config]) -> None
     fs.pipe_file("/sets/thesis/text", b"mine")
     with pytest.raises(StoreError, match="not empty and holds no dataset"):
         open_or_create("memory://sets/thesis", config)
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore")
-def test_s3_holds_the_same_bytes(made: tuple[Path, Config], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two processes over s3fs against a local server that speaks S3's protocol; `pip install s3fs 'moto[server]'`."""
-    pytest.importorskip("s3fs")
-    server = pytest.importorskip("moto.server").ThreadedMotoServer(port=0)
-    server.start()
-    try:
-        host, port = server.get_host_and_port()
-        access = {"AWS_ACCESS_KEY_ID": "x", "AWS_SECRET_ACCESS_KEY": "x", "AWS_DEFAULT_REGION": "us-east-1"}
-        for name, value in (access | {"AWS_ENDPOINT_URL": f"http://{host}:{port}"}).items():
-            monkeypatch.setenv(name, value)
-        fsspec.filesystem("s3").mkdir("sets")
-        folder, config = made
-        url = "s3://sets/rolling"
-        with local_processes(2) as executor:
-            generate(config, url, executor, 2, progress=False)
-        assert objects(url) == files(folder)
-        read_everywhere(url, folder)
-    finally:
-        server.stop()
 
 
 def test_urls_that_are_refused(made: tuple[Path, Config], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -414,17 +373,6 @@ def test_a_file_behind_the_back_of_others_is_found_by_zarr_itself(made: tuple[Pa
             np.asarray(zarr.open_group(str(folder))[name.partition("/")[0]][:])
 
 
-def test_a_damaged_shard_is_made_anew(made: tuple[Path, Config], tmp_path: Path) -> None:
-    """As the finding says."""
-    folder = copy(made[0], tmp_path / "set")
-    edit("disc_angle/c/0/0", flipped)(folder)
-    record = re.search(r"remove (\S+) and start", next(x for x in check(str(folder)) if "no commit" not in x))
-    assert record is not None
-    Path(record[1]).unlink()
-    generate(made[1], str(folder), Serial(), progress=False)
-    assert files(folder) == files(made[0])
-
-
 def test_standard_tools_check_the_shards(made: tuple[Path, Config], tmp_path: Path) -> None:
     if (tool := shutil.which("sha256sum")) is None:
         pytest.skip("needs sha256sum")
@@ -566,42 +514,6 @@ def test_a_file_size_limit_is_said_and_costs_nothing(made: tuple[Path, Config], 
     assert files(tmp_path / "set") == files(made[0])
 
 
-FULL = """
-mount -t tmpfs -o size={size} tmpfs {disk} || exit 77
-{generate}; echo "first $?"
-{python} -c 'from torchsoft.datasets.config import Config; from torchsoft.datasets.writer import Store
-print("unfinished", len(Store("{disk}/set", Config.from_toml("{config}")).unfinished()))'
-mount -o remount,size=64m {disk}
-{generate}; echo "second $?"
-cp -r {disk}/set {out}
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(shutil.which("unshare") is None, reason="needs Linux's mount namespaces")
-def test_a_full_disk_is_said_and_costs_nothing(made: tuple[Path, Config], tmp_path: Path) -> None:
-    """A disk of its own that is too small for the set, then made larger."""
-    path, disk = write_config(tmp_path), tmp_path / "disk"
-    disk.mkdir()
-    size = sum(-(-len(data) // 4096) * 4096 for data in files(made[0]).values())
-    done = {"finished/2.sha256", *(name for name in files(made[0]) if re.search(r"/c/2(/|$)", name))}
-    room = size - sum(-(-len(files(made[0])[name]) // 4096) * 4096 for name in done) // 2
-    generate_it = f"{sys.executable} -m data_gen.generate {path} --out {disk}/set --workers 0"
-    script = FULL.format(
-        size=room, disk=disk, generate=generate_it, python=sys.executable, config=path, out=tmp_path / "set"
-    )
-    command = ["unshare", "--map-root-user", "--mount", "sh", "-c", script]
-    run = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    if run.returncode == 77 or "unshare failed" in run.stderr or "unshare:" in run.stderr:
-        pytest.skip(f"may not mount a disk: {run.stderr.strip()}")
-    assert [line for line in run.stdout.splitlines() if line.split()[0] in ("first", "unfinished", "second")] == [
-        "first 2", "unfinished 1", "second 0",
-    ]  # fmt: skip
-    assert "the disk is full; make room and start again" in run.stderr
-    assert "Traceback" not in run.stderr
-    assert files(tmp_path / "set") == files(made[0])
-
-
 def test_command_line_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([str(tmp_path / "none.toml"), "--out", str(tmp_path / "set")]) == 2
     assert "No such file" in capsys.readouterr().err
@@ -657,8 +569,80 @@ def test_a_dask_cluster_that_loses_a_worker_makes_the_same_bytes(made: tuple[Pat
     assert files(tmp_path / "set") == files(tmp_path / "whole")
 
 
-def test_tasks_do_not_depend_on_each_other(made: tuple[Path, Config]) -> None:
-    config = made[1]
-    design, data = points(config), xr.open_zarr(made[0])
-    row = simulate_task(config, task(config, 4, design[4]))
-    np.testing.assert_allclose(row["disc_position"], data.disc_position[4], rtol=0, atol=1e-12)
+# the torch dataset -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def partial(made: tuple[Path, Config], tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The dataset with a trajectory that failed, a number that is infinite, and a last shard that is not finished."""
+    folder = copy(made[0], tmp_path_factory.mktemp("partial") / "set")
+    set_value("failed", (2,), 1)(folder)
+    set_value("grasp_force", (0,), np.inf)(folder)
+    vouch(folder)
+    remove("finished/2.sha256")(folder)
+    return str(folder)
+
+
+def reading(url: str, *what: Any, **how: Any) -> Trajectories:
+    """What is finished."""
+    return Trajectories(url, *what, **how, unfinished=True)
+
+
+def test_windows_hold_what_the_store_holds(partial: str) -> None:
+    data, stored = reading(partial, ["disc_position", "pad.E"], window=5, stride=40), xr.open_zarr(partial)
+    assert data.trajectories.tolist() == [0, 1, 3]  # 2 failed, 4 is unfinished
+    assert len(data) == 3 * 3
+    item = data[4]  # the second window of trajectory 1
+    assert (int(item["trajectory"]), int(item["start"])) == (1, 40)
+    np.testing.assert_array_equal(item["disc_position"], stored["disc_position"][1, 40:45])
+    assert item["pad.E"] == float(stored["pad.E"][1])
+    assert int(data[-1]["start"]) == 80
+
+
+def test_splits_are_those_of_the_design(partial: str, made: tuple[Path, Config]) -> None:
+    for name in ("train", "validation", "test"):
+        assert list(reading(partial, [], split=name).trajectories) == [
+            i for i in (0, 1, 3) if split(made[1], i) == name
+        ]
+
+
+def test_it_pickles_small_and_is_read_by_forked_workers_from_any_store(partial: str) -> None:
+    fsspec.filesystem("memory").put(partial, "/copy/set", recursive=True)
+    plain = reading(partial, ["disc_position", "pad.E"], window=30, dtype=torch.float32)
+    for url in (partial, "memory://copy/set"):
+        data = reading(url, ["disc_position", "pad.E"], window=30, dtype=torch.float32)
+        data[0]  # opened before the fork
+        assert len(pickle.dumps(data)) < 2000
+        batches = list(DataLoader(data, batch_size=4, num_workers=2, multiprocessing_context="fork", timeout=60))
+        for name in data.variables:
+            got = torch.cat([batch[name] for batch in batches])
+            assert got.dtype == torch.float32
+            torch.testing.assert_close(got, torch.stack([x[name] for x in plain]))
+
+
+@pytest.mark.parametrize(
+    ("names", "how", "message"),
+    [
+        (["disc_pose"], {}, r"no numbers named 'disc_pose'; known: .*disc_position"),
+        ([], {"window": 92}, "`window` must be 1 to 91"),
+        *(([], {name: value}, f"`{name}` must be a whole number from 1 on, but is {value}")
+          for name in ("window", "stride") for value in (0, 2.5)),
+        *(([], {"dtype": dtype}, r"`dtype` must be one of torch\.float64, .*, but is ")
+          for dtype in (torch.int32, torch.bool, torch.complex64, "float32")),
+        ([], {"split": "dev"}, "`split` must be"),
+    ],
+)  # fmt: skip
+def test_a_reading_that_is_none_is_refused(partial: str, names: list[str], how: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        reading(partial, names, **how)
+
+
+def test_numbers_that_the_dtype_cannot_hold_are_refused(partial: str) -> None:
+    """And those that are not finite in the store are given as they are."""
+    assert torch.isinf(reading(partial, ["grasp_force"], dtype=torch.float16)[0]["grasp_force"])
+    with pytest.raises(
+        ValueError, match=r"`pad.E` of trajectory 0 holds 7.*, which torch\.float16 cannot; take a wider `dtype`"
+    ):
+        reading(partial, ["pad.E"], dtype=torch.float16)[0]
+    with pytest.raises(IndexError):
+        reading(partial, ["pad.E"])[1000]

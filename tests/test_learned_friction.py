@@ -2,11 +2,10 @@
 
 import pytest
 import torch
-from conftest import coarse, f64, grasp, times
+from conftest import coarse, f64
 from test_experiments import experiment
-from unrolled import unrolled_solution
 
-from torchsoft import SmoothSlip, SoftGrasp, simulate
+from torchsoft import SmoothSlip
 
 
 def test_learned_friction_smoke() -> None:
@@ -42,21 +41,3 @@ def test_the_true_law_in_the_learned_one_s_place_is_the_built_in_one() -> None:
     v = torch.tensor([0.0, law.v_s.item()], dtype=torch.float64)
     mu = module.true_mu(law, v)
     assert mu.tolist() == pytest.approx([0.8, 0.75])
-
-
-def test_the_compiled_stepper_has_the_network_s_gradient() -> None:
-    """Every weight's derivative through slip is that of the same steps in plain torch."""
-    module = experiment("learned_friction")
-    torch.manual_seed(0)
-    law = module.MuNetwork(20.0)
-    torch.nn.init.normal_(law.net[2].weight, std=0.1)
-    model = SoftGrasp(coarse().settings, friction=law)
-    y0, reference = grasp(model, (0.3, 0.0))
-    gradients = []
-    run = simulate(model, times(1e-3, 3), y0=y0, reference=reference, step=5e-4, gradient="discrete")
-    for y in (run.y, unrolled_solution(model, y0, times(1e-3, 3), reference, step=5e-4)):
-        velocity = model.unpack(y[-1]).velocity["disc"]
-        gradients.append(torch.autograd.grad(velocity[0] + 0.01 * velocity[2], list(law.parameters())))
-    for compiled, plain in zip(*gradients):
-        assert float(plain.abs().max()) > 1e-6
-        assert torch.allclose(compiled, plain, rtol=1e-7, atol=1e-10 * float(plain.abs().max()))

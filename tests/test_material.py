@@ -1,22 +1,15 @@
 """Materials of the pads: closed forms of creep and relaxation, the exact conversion, energy, gradients, what is refused."""
 
-import json
-import math
-import re
 from collections.abc import Callable, Sequence
-from copy import deepcopy
 from itertools import pairwise
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, coarse, random_state, times
+from conftest import COARSE
 from scipy.optimize import brentq
 from torch import Tensor
 from torch.autograd import gradcheck
-from unrolled import unrolled_solution
 
 from torchsoft import (
     Actuator,
@@ -37,13 +30,10 @@ from torchsoft import (
     SoftGrasp,
     StandardLinearSolid,
     Trajectory,
-    rest,
     simulate,
 )
-from torchsoft.physics.energy import dissipated, stored, supplied
 from torchsoft.physics.material import KINDS, Material, retarded
 from torchsoft.plot.diagram import graph_of
-from torchsoft.solve.trajectory import load
 from torchsoft.sysid import AtRest, Known, Problem, Recording, Sensor, Unknown, identify
 
 COMMON = {"E": 7.5e5, "nu": 0.45, "rho": 1100.0, "depth": 0.044}
@@ -206,40 +196,6 @@ def test_relaxation_under_a_held_indentation_is_the_closed_form(material: Materi
     closed(run, run.load["punch"][:, 1], 5e-5 * relaxed(1 / STIFFNESS, softness(rig) * J, tau, SAMPLED))
 
 
-WEIGHED = [1, 2, -1]
-"""Outputs of which the sum is differentiated: 1, 6 and 1000 ms after the force."""
-
-
-def test_gradients_of_creep_by_every_coefficient_equal_differences(material: Material) -> None:
-    """The adjoint along frozen steps, in logarithms; sensitivities the same."""
-    names = [f"rubber.{name}" for name, _ in material.named_parameters() if name != "rho"]
-    t = torch.cat((torch.zeros(1).double(), torch.logspace(-3, 0, 5, dtype=torch.float64)))
-
-    def run(changes: dict[str, float], gradient: str, knots: Tensor | None = None) -> tuple[Rig, Trajectory]:
-        rig, y0 = punch(deepcopy(material), force=1.0)
-        with torch.no_grad():
-            for name, value in changes.items():
-                rig.parameter(name).mul_(math.exp(value))
-        how = {"knots": knots} if knots is not None else {"rtol": 1e-6}
-        wrt = {"wrt": names, "rigid": True} if gradient == "forward" else {}
-        return rig, simulate(rig, t, y0=y0, gradient=gradient, tolerance=1e-10, **how, **wrt)
-
-    rig, made = run({}, "discrete")
-    made["y_punch"][WEIGHED].sum().backward()
-    sensitivities = run({}, "forward", made.knots)[1].sensitivities
-    assert sensitivities is not None
-    size, eps = float((made["y_punch"][0] - made["y_punch"][-1]).detach()), 1e-4
-    for k, name in enumerate(names):
-        value, grad = rig.parameter(name), rig.parameter(name).grad
-        assert grad is not None
-        ends = [run({name: s * eps}, "none", made.knots)[1]["y_punch"][WEIGHED].sum() for s in (1, -1)]
-        expected = float((ends[0] - ends[1]).detach()) / (2 * eps)
-        slope = float(grad * value.detach())
-        assert abs(slope) > 1e-4 * size, name
-        assert abs(slope - expected) < 1e-6 * abs(slope), name
-        assert float(sensitivities[WEIGHED, 0, k].sum()) == pytest.approx(float(grad), rel=1e-9, abs=1e-12 * size), name
-
-
 def test_every_coefficient_of_a_series_is_identified() -> None:
     """From the punch's height under a held force, without noise, from starts a third away."""
     t = torch.cat((torch.zeros(1).double(), torch.logspace(-3, 0.5, 120, dtype=torch.float64)))
@@ -264,104 +220,6 @@ def test_every_coefficient_of_a_series_is_identified() -> None:
 STABLE = Parameters().override(COARSE | {"control.senses": "bracket"})
 
 
-def rolling(model: SoftGrasp) -> tuple[Tensor, Reference]:
-    """The disc at rest (size,), and 0.2 s that press and roll it."""
-    y0 = rest(model).detach()
-    pose = model.unpack(y0).pose
-    x, y = float(pose["bracket"][0]), float(pose["bracket"][1])
-    signals = {"x_d": Profile([0.0, 0.2], [x, x - 2e-3]), "y_d": Profile([0.0, 0.1], [y, y - 1e-3])}
-    return y0, Reference(**signals, F_ff=Profile([0.0], [0.0]))
-
-
-def grasping(material: Material, **how: Any) -> Trajectory:
-    """The paper's coarse rig on pads of a material."""
-    model = SoftGrasp(STABLE, material=material)
-    y0, reference = rolling(model)
-    return simulate(model, times(0.2, 41), y0=y0, reference=reference, **how)
-
-
-@torch.no_grad()
-def test_energy_is_balanced_with_every_material(material: Material, tmp_path: Path) -> None:
-    """And the run is saved, with the numbers and the name of its material."""
-    run = grasping(material)
-    assert run.energy_residual_rel < 1e-3
-    lost = [work.diff().min() for name, work in run.dissipated.items() if name.startswith("pad")]
-    assert float(min(lost)) > -1e-12
-    run.save(tmp_path / "run.nc")
-    said = {key: json.loads(text) for key, text in load(tmp_path / "run.nc").attrs.items()}
-    assert said["material"] == {name: type(material).__name__ for name in ("L", "U")}
-    own = {f"pad.{name}": value.item() for name, value in material.named_parameters()}
-    assert {name: said["parameters"][name] for name in own} == own
-    assert ("pad.tau" in said["parameters"]) == hasattr(material, "tau")
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_power_is_balanced_at_random_states(material: Material, seed: int) -> None:
-    """dH/dt = supplied - dissipated to rounding, with all branches of the chain shaken, and no R field supplies power."""
-    rig = SoftGrasp(STABLE, material=material)
-    y = random_state(rig, seed, slip=0.05).requires_grad_(True)
-    (slope,) = torch.autograd.grad(torch.stack(list(stored(rig, rig.unpack(y)).values())).sum(), y)
-    with torch.no_grad():
-        H_dot, state = (slope * rig(0.0, y)).sum(), rig.unpack(y)
-        graph = rig.evaluate(0.0, state)
-        supply, loss = (torch.stack(list(p.values())) for p in (supplied(graph), dissipated(rig, state, graph)))
-    assert abs(float(H_dot - supply.sum() + loss.sum())) < 1e-9 * float(supply.abs().sum() + loss.abs().sum())
-    assert float(loss.min()) > -1e-12 * float(loss.sum())
-
-
-@pytest.mark.parametrize("name", ["generalised_kelvin", "prony"])
-def test_gradients_of_a_grasp_by_every_coefficient_equal_differences(name: str) -> None:
-    """Height of the pressed and rolled disc [mm], along frozen steps, in logarithms. The differences are small, so that no
-    point begins to touch between them; their rounding is 1e-8."""
-    y0, reference = rolling(SoftGrasp(STABLE, material=MATERIALS[name]()))
-
-    def height(changes: dict[str, float], **how: Any) -> tuple[Material, Trajectory]:
-        solid = MATERIALS[name]()
-        with torch.no_grad():
-            for own, change in changes.items():
-                solid.get_parameter(own).mul_(math.exp(change))
-        model = SoftGrasp(STABLE, material=solid)
-        return solid, simulate(model, times(0.2, 3), y0=y0, reference=reference, tolerance=1e-10, **how)
-
-    solid, made = height({}, gradient="discrete", rtol=1e-5)
-    (1e3 * made["y_C"][-1]).backward()
-    for own, value in solid.named_parameters():
-        if own == "rho":
-            continue
-        assert value.grad is not None
-        up, down = (1e3 * float(height({own: s * 1e-6}, knots=made.knots)[1]["y_C"][-1]) for s in (1, -1))
-        assert float(value.grad * value.detach()) == pytest.approx((up - down) / 2e-6, rel=1e-6, abs=1e-8), own
-
-
-def test_the_adjoint_of_a_chain_equals_backpropagation() -> None:
-    """Through the same steps in plain torch."""
-    grads = []
-    for compiled in (True, False):
-        model = SoftGrasp(STABLE, material=MATERIALS["prony"]())
-        y0, reference = rolling(model)
-        t, steps = times(0.02, 2), {"reference": reference, "step": 2e-3}
-        y = (
-            simulate(model, t, y0=y0, tolerance=1e-10, gradient="discrete", **steps).y
-            if compiled
-            else unrolled_solution(model, y0, t, **steps)
-        )
-        model.unpack(y[-1]).pose["disc"][1].backward()
-        values = [value for name, value in model.pad.named_parameters() if name != "rho"]
-        grads.append(torch.stack([value.grad * value.detach() for value in values if value.grad is not None]))
-    assert len(grads[0]) == len(grads[1]) == 14
-    assert float((grads[0] - grads[1]).abs().max()) < 1e-9 * float(grads[0].abs().max())
-
-
-@torch.no_grad()
-def test_a_chain_of_one_element_is_kelvin_and_voigts() -> None:
-    """To rounding: nothing is left for the instantaneous spring."""
-    chain = GeneralisedKelvin(**COMMON, J=[1.0], tau=[0.01])
-    mine, its = grasping(chain, step=1e-3), grasping(MATERIALS["kelvin_voigt"](), step=1e-3)
-    assert mine.state.pads["L"].shape[-3] == 2
-    for name in ("x_C", "y_C", "theta", "F_x", "F_y"):
-        assert float((mine[name] - its[name]).abs().max()) <= 1e-13 * float(its[name].abs().max()), name
-
-
 @torch.no_grad()
 def test_the_graph_has_the_fields_of_the_chain(material: Material) -> None:
     labels = {data["label"] for _, data in graph_of(SoftGrasp(STABLE, material=material)).nodes(data=True)}
@@ -371,99 +229,6 @@ def test_the_graph_has_the_fields_of_the_chain(material: Material) -> None:
 
 
 # --- what is refused ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Prony(**COMMON, moduli=[1e5], tau=[0.1, 1.0]), "as many `moduli` as `tau`, from 1 to 20, but has 1 and 2"),
-        (lambda: GeneralisedKelvin(**COMMON, J=[], tau=[]), "as many `J` as `tau`, from 1 to 20, but has 0 and 0"),
-        (lambda: Prony(**COMMON, moduli="12", tau=[0.1, 1.0]), "`E` must be a list of numbers, but is '12'"),
-        (lambda: Prony(**COMMON, moduli=[1e5], tau=0.1), "`tau` must be a list of numbers, but is 0.1"),  # pyright: ignore
-        (lambda: GeneralisedKelvin(**COMMON, J=[0.1, True], tau=[1, 2]), "`J_2` must be a number, but is True"),
-    ],
-)  # fmt: skip
-def test_a_series_that_is_none_is_refused(make: Callable[[], Material], message: str) -> None:
-    with pytest.raises(ValueError, match=re.escape(message)):
-        make()
-
-
-@pytest.mark.parametrize(
-    ("solid", "message"),
-    [
-        (Prony(**COMMON, moduli=[1e5, 2e5], tau=[0.1, 0.1]), "two relaxation times are equal"),
-        (
-            Prony(**COMMON, moduli=[1e5, -2e5], tau=[0.1, 0.2]),
-            "parameter `pad.E_2` must be from 1 to 1e+13 Pa, but is -200000",
-        ),
-        (Prony(**COMMON, moduli=[1e5], tau=[5e-5]), "tau_instant = 0.0001 s must be below the shortest tau, 5e-05 s"),
-        (GeneralisedKelvin(**COMMON, J=[0.6, 0.5], tau=[0.1, 1]), "the fractions J sum to 1.1, above one"),
-        (
-            GeneralisedKelvin(**COMMON, J=[0.6], tau=[0.0]),
-            "parameter `pad.tau_1` must be from 1e-09 to 1e+06 s, but is 0",
-        ),
-        (GeneralisedKelvin(**COMMON, J=[math.nan], tau=[0.1]), "parameter `pad.J_1` must be finite, but is nan"),
-    ],
-)
-def test_unphysical_coefficients_are_refused_before_a_run(solid: Material, message: str) -> None:
-    model = SoftGrasp(STABLE, material=solid)
-    y0 = torch.zeros(model.layout.size, dtype=torch.float64)
-    with pytest.raises(ValueError, match=re.escape(message)):
-        simulate(model, times(0.1, 2), y0=y0)
-
-
-class Chain(Material):
-    """A material with the chain that it is given."""
-
-    def __init__(self, *given: object) -> None:
-        super().__init__(**COMMON)
-        self.given = given
-
-    def chain(self) -> Any:
-        return tuple(torch.tensor(x, dtype=torch.float64) if isinstance(x, list) else x for x in self.given)
-
-    @property
-    def branches(self) -> int:
-        return 2
-
-
-@pytest.mark.parametrize(
-    ("chain", "message"),
-    [
-        (([0.7, 0.5], [0.01, 0.1]), "must sum to one, but [0.7, 0.5] sum to 1.2; divide both J and E by that sum"),
-        (([1.2, -0.2], [0.01, 0.1]), "the fractions J of the material of `L` must not be negative"),
-        (([0.5, math.nan], [0.01, 0.1]), "the fractions J of the material of `L` must not be negative"),
-        (([0.5, 0.5], [0.01, 0.0]), "the retardation times tau of the material of `L` must be positive and finite"),
-        (([0.5, 0.5], [0.01, math.inf]), "the retardation times tau of the material of `L` must be positive and finite"),
-        (([0.5, 0.5], [0.01]), "`tau` of the material of `L` must have shape (branches,) = (2,), one at least, but has (1,)"),
-        (([0.2, 0.3, 0.5], [0.01, 0.1, 1.0]), "`J` of the material of `L` must have shape (branches,) = (2,)"),
-        (([[0.5, 0.5]], [0.01, 0.1]), "`J` of the material of `L` must have shape"),
-        (([0.5, 0.5], 0.01), "`tau of the material of L` must be a float64 tensor, but is float"),
-        (([0.5, 0.5], torch.ones(2)), "`tau of the material of L` must be float64"),
-        (([1.0, 0.0],), "`chain` of the material of `L` must give two tensors, J and tau"),
-    ],
-)  # fmt: skip
-def test_a_chain_that_is_none_is_refused_before_a_run(chain: tuple[Any, ...], message: str) -> None:
-    model = SoftGrasp(STABLE, material=Chain(*chain))
-    y0 = torch.zeros(model.layout.size, dtype=torch.float64)
-    with pytest.raises(ValueError, match=re.escape(message)):
-        simulate(model, times(0.1, 2), y0=y0)
-
-
-@pytest.mark.parametrize("name", [name for name in MATERIALS if name != "kelvin_voigt"])
-def test_an_inertial_pad_of_several_times_is_refused(name: str) -> None:
-    """When the rig is made, before a run with a part replaced, and wherever its law is asked for."""
-    message = "the inertial pad `L` needs a Kelvin-Voigt material \\(one retardation time\\), but has"
-    with pytest.raises(NotImplementedError, match=message):
-        SoftGrasp(STABLE.override({"pad.fidelity": "inertial"}), material=MATERIALS[name]())
-    model = coarse(pad__fidelity="inertial")
-    y = random_state(model, 0)
-    for pad in model.pads.values():
-        pad.material = model.pad = MATERIALS[name]()
-    with pytest.raises(NotImplementedError, match=message):
-        model(0.0, y)
-    with pytest.raises(NotImplementedError, match=message):
-        simulate(model, times(0.1, 2), y0=y)
 
 
 def test_a_recording_that_begins_before_the_pads_forget_is_named() -> None:

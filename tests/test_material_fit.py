@@ -255,32 +255,6 @@ def test_the_command_writes_a_table_a_summary_and_a_figure(
     assert (out / "fit.png").read_bytes().startswith(b"\x89PNG")
 
 
-ERRORS: dict[str, tuple[list[str], str]] = {
-    "no such file": (["other.csv"], "other.csv: No such file or directory"),
-    "no csv": (["picture.csv"], "picture.csv is not a CSV file in UTF-8"),
-    "an area": (["test.csv", "--area", "1e-5"], "`stress` needs no `area`"),
-    "many terms": (["test.csv", "--terms", "50"], "`terms` must be from 1 to"),
-    "no such ratio": (["test.csv", "--nu", "0.6"], "pad.nu should be less than or equal to 0.4999, not 0.6"),
-    "out is a file": (["test.csv", "--out", "test.csv"], "--out: results cannot be written to test.csv ("),
-}
-
-
-@pytest.mark.parametrize("name", ERRORS)
-def test_an_error_of_the_command_is_one_line(name: str, tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
-    monkeypatch.chdir(tmp_path)
-    plain(tmp_path, relaxing(1e-3))
-    (tmp_path / "picture.csv").write_bytes(b"\x89PNG\r\n\x1a\n")
-    before = sorted(tmp_path.rglob("*"))
-    arguments, message = ERRORS[name]
-    assert main(["material", "fit", *arguments]) == 2
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert err.startswith("torchsoft: error: ")
-    assert message in err
-    assert err.count("\n") == 1
-    assert sorted(tmp_path.rglob("*")) == before
-
-
 # --- rubbers from the literature --------------------------------------------------------------------------------------
 
 

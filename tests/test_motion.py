@@ -1,15 +1,13 @@
 """Signals of time: the paper's profiles, recorded set-points, references, and where their gradients go."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import torch
-from conftest import coarse, f64, grasped, times
+from conftest import f64
 from scipy.interpolate import CubicSpline
 from torch.autograd import gradcheck
 
-from torchsoft import Profile, Reference, Sampled, hold, simulate
+from torchsoft import Profile, Reference, Sampled, hold
 
 TIMES = [0.0, 0.4, 1.0, 1.5]
 VALUES = [0.06, 0.04, 0.05, 0.01]
@@ -41,29 +39,6 @@ def test_profile_goes_through_its_knots_and_stays_outside_them() -> None:
     assert torch.equal(rate, torch.zeros_like(rate))
 
 
-@pytest.mark.parametrize("kind", [Profile, Sampled])
-@pytest.mark.parametrize(
-    ("times", "values", "match"),
-    [
-        ([0.0, 0.0], [1.0, 2.0], "increase strictly"),
-        ([0.0, -1.0], [1.0, 2.0], "increase strictly"),
-        ([0.0, float("nan")], [1.0, 2.0], "increase strictly"),
-        ([0.0, 1.0], [1.0], "per time"),
-        ([0.0], [float("nan")], "finite"),
-        ([], [], "from one time on"),
-    ],
-)
-def test_bad_knots_are_refused(kind: type[Profile], times: list[float], values: list[float], match: str) -> None:
-    with pytest.raises(ValueError, match=match):
-        kind(times, values)
-
-
-def test_bad_rates_are_refused() -> None:
-    for rates in ([0.0], [0.0, float("inf")]):
-        with pytest.raises(ValueError, match="`rates` must hold one finite number per time"):
-            Sampled([0.0, 1.0], [1.0, 2.0], rates)
-
-
 @pytest.mark.parametrize("knots", [2, 3, 4])
 def test_sampled_is_the_cubic_spline_and_stays_outside_it(knots: int) -> None:
     signal, spline = Sampled(TIMES[:knots], VALUES[:knots]), CubicSpline(TIMES[:knots], VALUES[:knots])
@@ -88,23 +63,6 @@ def test_sampled_stays_the_spline_when_its_knots_are_changed() -> None:
     for k in (2, 3, 4, 5):
         knots = at[:k].clone().requires_grad_(), values[:k].clone().requires_grad_()
         assert gradcheck(lambda *knots: torch.stack(Sampled(*knots)(f64(0.1, 0.3))), knots)
-
-
-@pytest.mark.parametrize("kind", [Profile, Sampled])
-def test_knots_that_are_none_any_more_are_refused(kind: type[Profile]) -> None:
-    """Wherever the signal is asked for by its reference, by a run too."""
-    reference = Reference(**{"jaw.x": kind([0.0, 0.1, 0.2], [0.0, 1.0, 2.0])})
-    reference["jaw.x"].times[2] = 0.05
-    message = "the signal `jaw.x` of the reference is none any more: `times` must increase strictly"
-    with pytest.raises(ValueError, match=message):
-        reference(f64(0.1), ("jaw.x",))
-    with pytest.raises(ValueError, match=message):
-        reference.plain(("jaw.x",))
-    model = coarse()
-    y0 = grasped(model)
-    model.reference["x_d"].times.fill_(float("nan"))
-    with pytest.raises(ValueError, match="the signal `x_d` of the reference is none any more"):
-        simulate(model, times(0.01, 2), y0=y0)
 
 
 def test_sampled_with_rates_is_hermites_cubic() -> None:
@@ -153,25 +111,6 @@ def test_a_tensor_with_a_graph_given_as_a_knot_keeps_it() -> None:
     assert not list(Profile([0.0, 1.0], knots**2).parameters())
 
 
-@pytest.fixture(params=[torch.float32, torch.float64])
-def default(request: pytest.FixtureRequest) -> Iterator[torch.dtype]:
-    before = torch.get_default_dtype()
-    torch.set_default_dtype(request.param)
-    yield request.param
-    torch.set_default_dtype(before)
-
-
-@pytest.mark.parametrize("kind", [Profile, Sampled])
-def test_values_do_not_depend_on_torchs_default_dtype(default: torch.dtype, kind: type[Profile]) -> None:
-    """0.1 is 0.1 in float64, whatever a tensor of Python numbers would be."""
-    signal = kind([0.1, 0.3], [0.1, 0.7])
-    value, rate = signal(torch.tensor([0.1, 0.3], dtype=torch.float64))
-    assert value.dtype == rate.dtype == torch.float64
-    assert value.tolist() == pytest.approx([0.1, 0.7], abs=1e-16)
-    assert signal.times.tolist() == [0.1, 0.3]
-    assert hold(x=0.1)["x"].values.item() == 0.1
-
-
 def test_reference_gives_named_signals_side_by_side() -> None:
     reference = Reference(x=Profile([0.0, 1.0], [0.0, 1.0]), y=Profile([0.0], [7.0]))
     t = torch.linspace(0, 1, 5, dtype=torch.float64)
@@ -181,10 +120,3 @@ def test_reference_gives_named_signals_side_by_side() -> None:
     assert torch.equal(got[:, 0], got[:, 2])
     assert reference(t, ()).shape == (5, 0, 2)
     assert hold(x=1.0, y=-2.0)(f64(3.0), ("x", "y"))[0].tolist() == [[1.0, 0.0], [-2.0, 0.0]]
-
-
-def test_reference_names_what_is_wrong() -> None:
-    with pytest.raises(ValueError, match="has no signal `z`; it has x, y"):
-        hold(x=0.0, y=0.0)(f64(0.0), ("z",))
-    with pytest.raises(ValueError, match="the signal `x` must be a module such as `Profile`, but is float"):
-        Reference(x=0.1)  # pyright: ignore[reportArgumentType]

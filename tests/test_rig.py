@@ -1,10 +1,8 @@
-"""A rig as an ODE's right-hand side: batches, gradients, names, and what cannot be put together."""
-
-from collections.abc import Callable
+"""A rig put together by hand, the names of its parameters, its bodies, loops and states."""
 
 import pytest
 import torch
-from conftest import coarse, random_state
+from conftest import coarse, f64, grasped, random_state, turning
 
 from torchsoft import (
     PD,
@@ -12,6 +10,7 @@ from torchsoft import (
     Body,
     Circle,
     Contact,
+    Ellipse,
     KelvinVoigt,
     Pad,
     PadMesh,
@@ -21,84 +20,9 @@ from torchsoft import (
     SoftContact,
     SoftGrasp,
     hold,
-    rest,
 )  # fmt: skip
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import NAMES
-
-STEP = 1e-5
-"""Relative step of the central differences."""
-
-
-def test_batches_equal_single_states(build: Callable[..., Rig]) -> None:
-    """Any leading dimensions; a sample does not depend on its neighbours."""
-    rig = build()
-    y = torch.stack([random_state(rig, seed) for seed in range(6)]).reshape(2, 3, -1)
-    with torch.no_grad():
-        together = rig(torch.tensor(0.1, dtype=torch.float64), y)
-        alone = torch.stack([rig(0.1, sample) for sample in y.reshape(6, -1)]).reshape(2, 3, -1)
-    scale = alone.abs().amax(-1, keepdim=True)
-    assert together.shape == y.shape
-    assert float(((together - alone) / scale).abs().max()) < 1e-12
-
-
-def test_gradient_reaches_every_parameter(build: Callable[..., Rig]) -> None:
-    """Autograd through forward against central differences, parameter by parameter (the law is smooth at this state)."""
-    rig = build()
-    rig.requires_grad_(True)
-    y = random_state(rig, 5)
-    weight = torch.randn(rig.layout.size, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    with torch.no_grad():
-        weight /= rig(0.0, y).abs().clamp(min=1e-3)
-    (weight * rig(0.0, y)).sum().backward()
-    inertial = any(pad.inertial for pad in rig.pads.values())
-    for name, parameter in rig.named_parameters():
-        if name.endswith(".rho") and not inertial:
-            assert parameter.grad is None
-            continue
-        h = STEP * (1e-2 if name.endswith("radius") else 1.0) * max(abs(float(parameter.detach().flatten()[0])), 1e-3)
-        values = []
-        for sign in (1, -1):
-            with torch.no_grad():
-                parameter += sign * h
-                values.append(float((weight * rig(0.0, y)).sum()))
-                parameter -= sign * h
-        expected = (values[0] - values[1]) / (2 * h)
-        assert parameter.grad is not None, name
-        got = float(parameter.grad.flatten()[0])
-        assert got == pytest.approx(expected, rel=2e-5, abs=1e-8 * max(abs(v) for v in values) / h), name
-
-
-def test_gradient_reaches_the_state(build: Callable[..., Rig]) -> None:
-    rig = build()
-    y = random_state(rig, 7).requires_grad_(True)
-    direction = random_state(rig, 8).detach() - y.detach()
-    rate = rig(0.0, y)
-    weight = 1 / rate.detach().abs().clamp(min=1e-3)
-    (gradient,) = torch.autograd.grad((weight * rate).sum(), y)
-    with torch.no_grad():
-        h = 1e-6
-        ahead, behind = ((weight * rig(0.0, y + s * h * direction)).sum() for s in (1, -1))
-    assert float(gradient @ direction) == pytest.approx(float((ahead - behind) / (2 * h)), rel=1e-5)
-
-
-def test_rest_is_an_equilibrium_of_forward(fidelity: str) -> None:
-    """At rest nothing accelerates; gravity is what a kilogram feels otherwise, 9.81."""
-    model = coarse(pad__fidelity=fidelity)
-    y = rest(model).detach()
-    model.reference = hold(x_d=0.06, y_d=float(model.unpack(y).pose["bracket"][1]), F_ff=0.0)
-    with torch.no_grad():
-        rate = model.unpack(model(0.0, y))
-    assert max(float(v.abs().max()) for v in rate.velocity.values()) < 1e-8
-
-
-def test_state_dict_round_trip() -> None:
-    model, other = coarse(), coarse(contact__K_n=2e5)
-    other.load_state_dict(model.state_dict())
-    y = random_state(model, 1)
-    with torch.no_grad():
-        assert torch.equal(model(0.0, y), other(0.0, y))
-    assert isinstance(other, SoftGrasp)
 
 
 def test_a_rig_of_lists_is_the_papers() -> None:
@@ -152,64 +76,57 @@ def test_parameters_have_the_names_of_the_settings() -> None:
         rolling.parameter("contact.v_s")
 
 
-def small(**changes: object) -> Rig:
-    """A disc on a pad on the ground."""
-    mesh, rubber = PadMesh(0.04, 4e-3, 8, 2), KelvinVoigt(7e5, 0.45, 1100.0, 0.01, 0.044)
-    law = SoftContact(1e5, 400.0, 1e5, 400.0, friction=SmoothSlip(0.8, 0.7, 0.05, 10.0))
-    parts: dict[str, dict[str, torch.nn.Module]] = {
-        "bodies": {"disc": Body(0.4, Circle(0.02))}, "pads": {"P": Pad(mesh, rubber)},
-        "contacts": {"c": Contact("P", "disc", law)}, "actuators": {},
-    }  # fmt: skip
-    for name, change in changes.items():
-        parts[name] |= change(mesh, rubber, law)  # pyright: ignore[reportCallIssue]
-    return Rig(**parts)  # pyright: ignore[reportArgumentType]
+# bodies, loops and states -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("changes", "match"),
-    [
-        (
-            {"pads": lambda m, r, c: {"P": Pad(m, r, base="hand")}},
-            "pad `P` is bonded to `hand`, but the bodies are disc",
-        ),
-        ({"pads": lambda m, r, c: {"P": Pad(m, r, base="disc")}}, "is bonded to the body `disc` itself"),
-        (
-            {"contacts": lambda m, r, c: {"d": Contact("Q", "disc", c)}},
-            "contact `d` is between `Q` and `disc`, which are not",
-        ),
-        (
-            {"contacts": lambda m, r, c: {"d": Contact("P", "dish", c)}},
-            "contact `d` is between `P` and `dish`, which are not",
-        ),
-        (
-            {"contacts": lambda m, r, c: {"d": Contact("P", "disc", c)}},
-            r"contacts\.d: it is between the same pad and body as `c`; leave one out",
-        ),
-        (
-            {"bodies": lambda m, r, c: {"disc": Body(0.4, theta=0.0)}},
-            "contact `c` needs a shape, but the body `disc` has none",
-        ),
-        (
-            {"actuators": lambda m, r, c: {"a": Actuator("disc.x", "disc.up", PD(1.0, 1.0), setpoint="w")}},
-            r"actuator `a` speaks of `disc\.up`, which is not a coordinate; there are disc\.x, disc\.y, disc\.theta",
-        ),
-    ],
-)
-def test_names_that_do_not_fit_are_refused(changes: dict[str, Callable[..., object]], match: str) -> None:
-    with pytest.raises(ValueError, match=match):
-        small(**changes)
-    assert small().layout.size == 9 * 3 + 6
+@torch.no_grad()
+def test_the_papers_controllers() -> None:
+    """Eq. 31-34: the horizontal loop measures the disc, the vertical one the bracket, and both push the bracket."""
+    model = coarse()
+    state = model.unpack(grasped(model, (0.02, -0.01)))
+    state = state._replace(pose=state.pose | {"bracket": state.pose["bracket"] + f64(1e-3, 2e-3, 0.0)})
+    t = f64(0.0)[0]
+    signals = model.follow(t)
+    F_x, F_y = (float(model.actuator_effort(name, state, signals)) for name in "xy")
+    x_d, y_d, F_ff = (float(model.reference[name](t)[0]) for name in ("x_d", "y_d", "F_ff"))
+    x, y = float(state.pose["disc"][0]), float(state.pose["bracket"][1])
+    assert F_x == pytest.approx(1.2e5 * (x_d - x) - 441.7149 * 0.02, rel=1e-13)
+    assert F_y == pytest.approx(1.2e5 * (y_d - y) + F_ff, rel=1e-13)
 
 
-def test_an_inertial_pad_on_a_base_that_turns_is_refused() -> None:
-    with pytest.raises(NotImplementedError, match="pad `P` is inertial and its base `hand` may turn"):
-        small(
-            bodies=lambda m, r, c: {"hand": Body(0.4, inertia=1e-3)},
-            pads=lambda m, r, c: {"P": Pad(m, r, base="hand", inertial=True)},
-        )
+def test_bodies_know_their_inertia() -> None:
+    assert Body(2.0, Circle(0.1)).inertia.item() == pytest.approx(0.5 * 2.0 * 0.01, rel=1e-15)
+    assert Body(2.0, Ellipse(0.3, 0.1)).inertia.item() == pytest.approx(0.25 * 2.0 * (0.09 + 0.01), rel=1e-15)
+    assert Body(2.0, Circle(0.1), inertia=0.7).inertia.item() == 0.7
+    radius = Body(2.0, Circle(0.1))
+    (slope,) = torch.autograd.grad(radius.inertia, radius.shape.radius)
+    assert float(slope) == pytest.approx(2.0 * 0.1, rel=1e-15)
 
 
-def test_a_signal_that_is_not_there_is_named() -> None:
-    rig = small(actuators=lambda m, r, c: {"a": Actuator("disc.x", "disc.x", PD(1.0, 1.0), setpoint="w")})
-    with pytest.raises(ValueError, match="the reference has no signal `w`; it has none"):
-        rig(0.0, torch.zeros(rig.layout.size, dtype=torch.float64))
+def test_sizes_of_the_papers_rig() -> None:
+    """61 surface nodes a pad: forces and stretches, five free coordinates and their rates."""
+    layout = coarse().layout
+    assert layout.size == 2 * (2 * 61 + 61) + 2 * 5
+    assert layout.shapes["pads", "L"] == (1, 61, 2)
+    assert layout.free == {"disc": [0, 1, 2], "bracket": [0, 1]}
+    inertial = coarse(pad__fidelity="inertial").layout
+    assert inertial.shapes["pads", "U"] == inertial.shapes["rates", "U"] == (122, 2)  # two elements high, the base held
+    assert turning().layout.size == layout.size + 2
+
+
+def test_what_is_not_free_is_filled_in() -> None:
+    """A driven coordinate comes from its signal at t, a fixed one from its number; neither is in the vector."""
+    rig = Rig(
+        bodies={"a": Body(1.0, Circle(0.01), x="driven", y=0.25), "b": Body(1.0, theta=0.1)}, pads={}, contacts={},
+        reference=hold(**{"a.x": 0.7}),
+    )  # fmt: skip
+    assert rig.signals == ("a.x",)
+    assert rig.layout.size == 2 * (1 + 2)
+    state = rig.unpack(f64(0.5, 3.0, 4.0, 0.05, 0.3, 0.4))
+    assert state.pose["a"].tolist() == [0.7, 0.25, 0.5]
+    assert state.pose["b"].tolist() == [3.0, 4.0, 0.1]
+    assert state.velocity["a"].tolist() == [0.0, 0.0, 0.05]
+    assert state.velocity["b"].tolist() == [0.3, 0.4, 0.0]
+    moved = rig.unpack(torch.zeros(6, dtype=torch.float64), f64(0.9, -2.0).reshape(1, 2))
+    assert moved.pose["a"].tolist() == [0.9, 0.25, 0.0]
+    assert moved.velocity["a"].tolist() == [-2.0, 0.0, 0.0]

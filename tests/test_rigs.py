@@ -16,12 +16,11 @@ from PIL import Image
 
 from torchsoft import Parameters, SoftGrasp, press, simulate
 from torchsoft.cli import main
-from torchsoft.physics.statics import STALLED, resting, stalled, standing
+from torchsoft.physics.statics import resting, standing
 from torchsoft.rigs import RigFile
 from torchsoft.rigs import run as running
 from torchsoft.rigs.check import check
 from torchsoft.rigs.course import Estimate
-from torchsoft.rigs.motion import flattened
 from torchsoft.rigs.written import template, to_toml
 from torchsoft.scenario import grasp_and_roll
 from torchsoft.solve.simulate import Interrupted
@@ -71,11 +70,6 @@ def test_a_ready_rig_checks_clean_and_runs(path: Path) -> None:
     assert done.trajectory.energy_residual_rel < 1e-3
 
 
-def test_there_are_ready_rigs() -> None:
-    ready = {"paper", "ellipse", "rounded_box", "two_fingers", "fingertips", "light_grasp", "orientation", "drop"}
-    assert ready <= {path.stem for path in READY}
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("path", READY, ids=lambda path: path.stem)
 def test_a_ready_rig_runs_to_its_end(path: Path) -> None:
@@ -120,123 +114,10 @@ def test_a_drop_is_not_missed() -> None:
     assert float(y.min()) > 12e-3 + 9e-3  # it lies on the pad
 
 
-# what makes no sense -------------------------------------------------------------------------------------------------
-
-
-SOFT = {"kind": "kelvin_voigt", "E": 1e5, "nu": 0.45, "tau": 10e-3, "depth": 44e-3}
-WET = {"K_n": 1e5, "R_n": 400.0, "K_t": 1e5, "R_t": 400.0, "friction": {"kind": "smooth", "mu_s": 0.2, "mu_k": 0.1}}
-
-REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "misspelt": ({"pads__lower__lenght": 0.1}, r"pads\.lower: `lenght` is not known here; is it `length`\?"),
-    "unknown": ({"gadgets": {}}, r"`gadgets` is not known here; known are title, gravity, bodies"),
-    "millimetres": ({"pads__lower__length": 80.0}, r"pads\.lower\.length: should be from 1e-06 to 10 m, not 80"),
-    "incompressible": ({"materials__rubber__nu": 0.5}, r"materials\.rubber\.nu: should be from -0\.999 to 0\.4999, not 0\.5"),
-    "text": ({"bodies__disc__mass": "heavy"}, r"bodies\.disc\.mass should be a valid number, not 'heavy'"),
-    "freedom": ({"bodies__bracket__theta": "locked"}, r'bodies\.bracket\.theta: should be "free", "driven" or a number'),
-    "friction": ({"laws__dry__friction__mu_k": 0.9}, r"laws\.dry\.friction.*: mu_k must not .* mu_k = 0\.9 > mu_s = 0\.8"),
-    "sort": ({"bodies__disc__shape__kind": "heart"}, r"bodies\.disc\.shape\.kind should be one of .*'circle'.*, not 'heart'"),
-    "no mass": ({"bodies__bracket__mass": None}, r"bodies\.bracket: mass is missing, but x and y can move freely"),
-    "no start": ({"bodies__bracket__start": {"y": None}}, r"bodies\.bracket: start\.y is missing: y is free"),
-    "start of what is fixed": ({"bodies__bracket__start__theta": 0.1}, r"bodies\.bracket: start\.theta has no meaning"),
-    "no such base": ({"pads__upper__base": "braket"}, r"pads\.upper\.base: there is no `braket` among bodies; there is disc"),
-    "pad on its own body": ({"pads__lower__base": "disc"}, r"contacts\.lower: the pad `lower` is bonded to the body `disc`"),
-    "nothing to touch with": ({"contacts__lower__body": "bracket"}, r"contacts\.lower\.body: `bracket` has no shape"),
-    "pushes what is fixed": ({"actuators__x__pushes": "bracket.theta"}, r"actuators\.x\.pushes: bracket\.theta is fixed at 0"),
-    "no such coordinate": ({"actuators__x__pushes": "bracket.z"}, r"`bracket\.z` is not a coordinate; free ones are disc\.x"),
-    "loop without a motion": ({"actuators__x__setpoint": None}, r"actuators\.x: setpoint is missing: the gains Kp and Kd need"),
-    "motion that nothing follows": ({"motion__wave": {"kind": "hold"}}, r"motion\.wave: nothing follows it"),
-    "material of nothing": ({"materials__gel": SOFT}, r"materials\.gel: no pad is made of it; name it as the material of one"),
-    "law of nothing": ({"laws__wet": WET}, r"laws\.wet: no contact follows it; name it as the law of one"),
-    "motion that is missing": ({"actuators__x__setpoint": "w"}, r"motion\.w is missing: bracket\.x is to follow it"),
-    "time goes back": ({"motion__x_d__times": (1.5, 0.5)}, r"motion\.x_d.*: times must increase, but 0\.5 s follows 1\.5 s"),
-    "two ways to step": ({"solver": {"step": 1e-3, "rtol": 1e-4}}, r"solver: step and rtol .*each say which steps to take"),
-    "one motion, two units": ({"actuators__y__feed_forward": "x_d"}, r"motion\.(x_d would be in two units|press: nothing)"),
-    "name": ({"bodies": {"my disc": {"x": 0.0, "y": 0.0, "theta": 0.0}}}, r"bodies\.my disc: the name should be letters"),
-    "taken": ({"bodies": {"keys": {"x": 0.0, "y": 0.0, "theta": 0.0}}}, r"bodies\.keys: the name is taken by torch"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_what_is_no_rig_is_refused_with_its_field(name: str) -> None:
-    changes, sentence = REFUSED[name]
-    with pytest.raises(ValueError, match=sentence) as refusal:
-        changed(template("t"), **changes)
-    assert "\n" not in str(refusal.value)
-
-
 STONE = {"x": 0.3e-3, "y": 30e-3, "theta": 0.0, "shape": {"kind": "circle", "radius": 5e-3}}
 
-DANGEROUS: dict[str, tuple[dict[str, Any], str]] = {
-    "overlap": ({"bodies": {"stone": STONE}}, r"error: bodies\.disc: it and bodies\.stone overlap by .* mm at t = 0 s"),
-    "no room": ({"motion__y_d__values": ("start", 40e-3)}, r"error: contacts\.upper: `disc` does not fit: at t = 0\.4 s"),
-    "strain": ({"motion__y_d__values": ("start", 45.8e-3)}, r"warning: pads\.\w+: the strain leaves linear elasticity: at"),
-    "steps": ({"solver": {"step": 0.05}}, r"warning: solver\.step: steps of 0\.05 s are too coarse: motion\.y_d goes"),
-    "nothing carries it": (
-        {"bodies": {"ball": {"mass": 0.1, "shape": {"kind": "circle", "radius": 5e-3}, "start": {"x": 0.0, "y": 0.1}}}},
-        r"error: bodies\.ball: nothing carries it: it has no contact with any pad",
-    ),
-    "beside the pad": (
-        {"bodies__disc__start": {"x": 0.1, "y": 0.03}},
-        r"error: bodies\.disc: nothing carries it: no pad that it has a contact with lies under it",
-    ),
-    "the same contact twice": (
-        {"contacts__again": {"pad": "lower", "body": "disc", "law": "dry"}},
-        r"error: contacts\.again: it is between the same pad and body as `lower`; leave one out",
-    ),
-    "no rest beside the pad": ({"bodies__disc__start__x": 0.1}, r'error: bodies\.disc\.start\.y: "rest", but no pad'),
-    "set-point elsewhere": (
-        {"motion__x_d__values": (10e-3, 20e-3)},
-        r"warning: motion\.x_d: it begins at 0\.01 m, but bracket\.x at 0 m: `actuators\.x` pushes with 1e\+03 at once",
-    ),
-    "never touches": ({"motion__y_d__values": ("start", 50.05e-3), "motion__press__values": (0.0, 0.0)},
-                      r"warning: contacts\.upper: `lower` and `upper` never press `disc`"),
-    "slip": ({"laws__dry__friction__v_s": 1e-4}, r"warning: laws\.dry\.friction: slip is not single-valued"),
-    "out of reach": (
-        {"pads__upper__origin": (5.0, 0.0)},
-        r"warning: contacts\.upper: it cannot close: `disc` comes no nearer to `upper` than 4\.98 m; change pads",
-    ),
-    "a meganewton": (
-        {"motion__press__values": (0.0, -1e6)}, r"error: motion\.press: at t = 2 s it pushes `bracket` with 1e\+06 N, but"
-    ),
-    "off the pad": (
-        {"motion__x_d__values": ("start", 50.0)}, r"warning: motion\.x_d: at t = 0\.6 s it has taken `disc` .* m past the end"
-    ),
-    "through the disc": (
-        {"motion__y_d__values": ("start", -0.05)},
-        r"error: motion\.y_d: at t = .* it has taken the pads of contacts\.lower and contacts\.upper through each other",
-    ),
-    "between points": (
-        {"bodies__disc__shape__radius": 1e-5}, r"error: bodies\.disc\.shape: 0\.02 mm wide, it falls between points of `lower`"
-    ),
-    "too stiff to rest": (
-        {"laws__dry__K_n": 1e9}, r"error: laws\.dry\.K_n: no rest is found with 1e\+09 N/m, .* take 4e\+05 N/m or less"
-    ),
-    "outputs": (
-        {"motion__x_d": {"kind": "chirp", "amplitude": 1e-3, "first": 1.0, "last": 50.0}},
-        r"warning: outputs\.interval: outputs every 0\.01 s do not show motion\.x_d, which goes up to 50 Hz; take 0\.005 s",
-    ),
-    "start of an effort": (
-        {"motion__press__values": ("start", -30.0)}, r'error: motion\.press\.values: "start" stands for where the one free'
-    ),
-    "no time for waves": (
-        {"motion__x_d": {"kind": "sines", "components": [{"amplitude": 1e-3, "frequency": 5.0}], "since": 1.9}},
-        r"error: motion\.x_d\.since = 1\.9 s leaves 0\.1 s until 2 s, but waves take 0\.3 s",
-    ),
-    "no file": (
-        {"motion__x_d": {"kind": "csv", "file": "none.csv", "column": "x_d"}}, r"error: motion\.x_d\.file: none\.csv: No such"
-    ),
-}  # fmt: skip
 
-
-@pytest.mark.parametrize("name", DANGEROUS)
-def test_what_is_dangerous_is_said_before_any_run(name: str) -> None:
-    changes, sentence = DANGEROUS[name]
-    found = [str(one) for one in check(changed(coarse(template("t")), **changes))]
-    assert any(re.match(sentence, one) for one in found), found
-    if sentence.startswith("error"):
-        assert found[0].startswith("error")
-    quiet = [str(one) for one in check(coarse(template("t")))]
-    assert not any(re.match(sentence, one) for one in quiet)
+# loops and steps -------
 
 
 def test_a_loop_is_unstable_as_the_papers_modes_say() -> None:
@@ -270,17 +151,6 @@ def test_steps_are_held_against_the_modes() -> None:
     paper = changed(paper, materials__rubber__tau=2e-3)
     sentences = [[one.sentence for one in check(paper.override(solver={"step": h}))] for h in (1e-3, 4e-3)]
     assert [any("a mode of the rig swings with" in one for one in found) for found in sentences] == [False, True]
-
-
-def test_a_loop_that_cannot_move_what_it_measures_is_found() -> None:
-    file = coarse(template("t"))
-    tree = file.model_dump(exclude_unset=True)
-    del tree["contacts"]["upper"]
-    tree["actuators"]["x"]["measures"] = "disc.x"
-    found = [str(one) for one in check(RigFile.model_validate(tree))]
-    assert any(
-        "actuators.x: it measures disc.x and pushes bracket.x, but no pad and contact tie" in one for one in found
-    )
 
 
 def test_a_body_that_flies_is_told_of_coarse_steps() -> None:
@@ -351,23 +221,6 @@ def test_what_two_pads_grip_is_taken_along() -> None:
     assert estimate(0.5)["box"][1] < 22e-3  # not lifted yet
 
 
-def test_a_search_for_balance_that_goes_to_and_fro_is_given_up() -> None:
-    there = [torch.zeros(1), torch.ones(1)]
-    to_and_fro = [(1.0, there[i % 2]) for i in range(60)]
-    falling = [(1.0, torch.full((1,), float(i))) for i in range(60)]
-    better = [(1.0 / (1 + i), there[i % 2]) for i in range(60)]
-    assert stalled(to_and_fro, 2.0)
-    assert not stalled(to_and_fro[:STALLED], 2.0)
-    assert not stalled(falling, 2.0)
-    assert not stalled(better, 2.0)
-
-
-def test_motions_of_driven_coordinates_may_nest() -> None:
-    hold = {"kind": "hold", "value": 0.0}
-    assert flattened({"w": hold, "upper": {"y": hold}}) == {"w": hold, "upper.y": hold}
-    assert flattened({"upper.y": hold}) == {"upper.y": hold}
-
-
 def test_driven_jaws_carry_a_disc() -> None:
     """Coordinates driven in x, y and theta, without a loop; the pads settle around a start that is a grasp."""
     jaw = {"x": "driven", "y": "driven", "theta": "driven"}
@@ -409,20 +262,6 @@ def test_orientation_is_controlled_through_another_body() -> None:
     assert float(run["x_bracket"][-1]) < -8e-3
     wrong = file.override(actuators={"x": {"reversed": False}})
     assert "the rig is unstable" in check(wrong)[0].sentence
-
-
-def test_efforts_may_be_fed_forward_without_a_loop() -> None:
-    """A constant force on the disc accelerates it as Newton says, where nothing touches it."""
-    tree = coarse(template("t")).model_dump(exclude_unset=True)
-    tree["gravity"] = 0.0
-    tree["bodies"]["disc"]["start"] = {"x": 0.0, "y": 24.95e-3 + 5e-5}
-    tree["actuators"] = {"wind": {"pushes": "disc.x", "feed_forward": "F"}}
-    tree["motion"] = {"F": {"kind": "hold", "value": 0.2}}
-    tree["bodies"]["bracket"] = {"x": 0.0, "y": 60e-3, "theta": 0.0}
-    tree["outputs"] = {"duration": 0.1}
-    run = running.carry_out(RigFile.model_validate(tree)).trajectory
-    assert torch.allclose(run["x_disc"], 0.5 * 0.2 / 0.4 * run.t**2, rtol=1e-6, atol=1e-9)
-    assert run.units["F"] == "N"
 
 
 # starts and estimates ------------------------------------------------------------------------------------------------

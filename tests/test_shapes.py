@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import f64, times
+from conftest import f64
 from matplotlib.path import Path as Polygon
 from numpy.typing import NDArray
-from scipy.integrate import quad
 from scipy.interpolate import BSpline, CubicSpline
 from scipy.optimize import minimize_scalar
 from torch import Tensor, nn
@@ -26,18 +25,12 @@ from torchsoft import (
     RoundedBox,
     RoundedPolygon,
     Shape,
-    SmoothSlip,
-    SoftContact,
     SoftGrasp,
     Superellipse,
-    press,
     rest,
-    simulate,
 )
-from torchsoft.physics.contact import interface_law
 from torchsoft.physics.shapes.shape import moments
 from torchsoft.physics.validity import check_shape
-from torchsoft.solve.laws import contact_laws
 
 Array = NDArray[np.float64]
 Boundary = Callable[[Array], Array]
@@ -209,33 +202,6 @@ def test_curvature_is_that_of_the_boundary(case: tuple[Shape, Boundary]) -> None
         assert np.median(np.abs(kappa.numpy() - expected)) * size < 2e-5
 
 
-@pytest.mark.parametrize("depth", [0.0, -2e-4, 3e-4])
-def test_curvature_is_exact(depth: float) -> None:
-    """Of a superellipse by the formula of its equation, of a contour by its spline's derivatives, of a box by its corners."""
-    s = 0.013 + np.arange(40) / 40
-    a, b, n = 20e-3, 14e-3, 4.0
-    x, y = superellipse(a, b, n)(s).T
-    fx, fy = np.sign(x) * np.abs(x / a) ** (n - 1) / a, np.sign(y) * np.abs(y / b) ** (n - 1) / b
-    fxx, fyy = (n - 1) * np.abs(x / a) ** (n - 2) / a**2, (n - 1) * np.abs(y / b) ** (n - 2) / b**2
-    speed = np.hypot(fx, fy)
-    of_superellipse = np.stack((x, y, fx / speed, fy / speed, (fxx * fy**2 + fyy * fx**2) / speed**3), -1)
-    control = contour().control.detach().numpy() - contour().moments().centre.detach().numpy()
-    count = len(control)
-    curve = BSpline(np.arange(-3.0, count + 4), np.concatenate((control[-1:], control, control[:2])), 3)
-    (x, y), (tx, ty), (bx, by) = (curve(s * count, k).T for k in range(3))
-    speed = np.hypot(tx, ty)
-    of_contour = np.stack((x, y, ty / speed, -tx / speed, (tx * by - ty * bx) / speed**3), -1)
-    corner = np.sqrt(0.5)
-    of_box = np.array(
-        [[18e-3 + 2e-3 * corner, 7e-3 + 2e-3 * corner, corner, corner, 500.0], [3e-3, -9e-3, 0.0, -1.0, 0.0]]
-    )
-    for shape, expected in (
-        (Superellipse(a, b, n), of_superellipse), (contour(), of_contour), (RoundedBox(20e-3, 9e-3, 2e-3), of_box),
-    ):  # fmt: skip
-        kappa = shape.curvature(torch.from_numpy(expected[:, :2] + depth * expected[:, 2:4]))
-        assert kappa.numpy() == pytest.approx(expected[:, 4], rel=1e-9, abs=1e-9)
-
-
 # --- limits ----------------------------------------------------------------------------------------------------------------
 
 R = 19.37e-3
@@ -272,8 +238,6 @@ def test_full_rounding_is_the_circle(name: str) -> None:
 @pytest.mark.parametrize(
     ("one", "other"),
     [
-        (lambda: Superellipse(20e-3, 12e-3, 2.0), lambda: Ellipse(20e-3, 12e-3)),
-        (lambda: RoundedPolygon(box(20e-3, 9e-3), 2e-3), lambda: RoundedBox(20e-3, 9e-3, 2e-3)),
         (lambda: RoundedPolygon(np.array(ANGLED) + [3.0, -2.0], 2e-3), lambda: RoundedPolygon(ANGLED[::-1], 2e-3)),
         (lambda: Contour(pear(200)[::-1] - [0.5, 0.2], tolerance=1e-8), lambda: Contour(pear(200), tolerance=1e-8)),
     ],
@@ -288,20 +252,6 @@ def test_two_ways_to_one_body(one: Callable[[], Shape], other: Callable[[], Shap
     for quantity in ("area", "gyration"):
         assert float(getattr(one, quantity)()) == pytest.approx(float(getattr(other, quantity)()), rel=1e-9)
     assert one.size() == pytest.approx(other.size(), rel=1e-9)
-
-
-def test_full_rounding_runs_like_the_circle() -> None:
-    plain = SoftGrasp(COARSE)
-    y0 = rest(plain).detach()
-    reference, step = grasp(plain, y0), {"step": 1e-3}
-    expected = simulate(plain, times(0.1, 11), y0=y0, reference=reference, **step)
-    for shape in (RoundedBox(R, R, R), Superellipse(R, R, 2.0), RoundedPolygon(HEXAGON, R)):
-        model = SoftGrasp(COARSE, shape=shape)
-        assert torch.allclose(rest(model).detach(), y0, rtol=0, atol=1e-12)
-        run = simulate(model, expected.t, y0=y0, reference=reference, **step)
-        for key in ("x_C", "y_C", "theta", "x_Br", "y_Br"):
-            scale = float(expected[key].max() - expected[key].min())
-            assert float((run[key] - expected[key]).abs().max()) <= 1e-9 * max(scale, 1e-3), key
 
 
 # --- area, centre of mass, inertia -------------------------------------------------------------------------------------------
@@ -325,17 +275,6 @@ def test_moments_by_green_are_those_of_a_disc() -> None:
     assert float(of.area) == pytest.approx(0.09 * np.pi, rel=1e-13)
     assert torch.allclose(of.centre, f64(5.0, -7.0), rtol=1e-14)
     assert float(of.gyration) == pytest.approx(0.045, rel=1e-11)
-
-
-@torch.no_grad()
-def test_a_superellipse_has_the_moments_of_its_integrals() -> None:
-    a, b, n = 0.3, 0.2, 3.7
-    shape = Superellipse(a, b, n)
-    height = lambda x: b * (1 - (x / a) ** n) ** (1 / n)
-    area = 4 * quad(height, 0, a, epsabs=1e-13)[0]
-    square = 4 * quad(lambda x: x**2 * height(x) + height(x) ** 3 / 3, 0, a, epsabs=1e-13)[0]
-    assert float(shape.area()) == pytest.approx(area, rel=1e-9)
-    assert float(shape.gyration()) == pytest.approx(square / area, rel=1e-9)
 
 
 def test_a_uniform_body_has_mass_and_inertia_of_its_shape() -> None:
@@ -404,33 +343,6 @@ def test_derivatives_are_those_of_differences(case: tuple[Shape, Boundary]) -> N
         assert int((error > 1e-6).sum()) <= 2, name  # of thirty points, some come from a side onto an arc
 
 
-LAW = SoftContact(1.2e5, 440.0, 1.1e5, 430.0, friction=SmoothSlip(0.8, 0.7, 5e-2, 10.0))
-
-
-def test_compiled_laws_are_those_of_torch(case: tuple[Shape, Boundary]) -> None:
-    """Value, derivatives by what moves, and by the parameters that the shape was made of."""
-    from test_codegen import _compiled_results
-
-    shape, boundary = case
-    prepared = shape.prepared()
-    laws = contact_laws(LAW, prepared)
-    p = torch.cat([value.reshape(-1) for value in laws.parameters.values()])
-    own = list(shape.parameters())
-    for k, d in enumerate(near(boundary, 20, 2e-4, seed=5)):
-        x = f64(0.02, -0.03, 1.5, *d, 0.3, 1e-5, 1.0, 2e-4)
-        x[3:5] = f64(np.cos(0.3) * d[0] - np.sin(0.3) * d[1], np.sin(0.3) * d[0] + np.cos(0.3) * d[1])
-        at = x.clone().requires_grad_()
-        expected = interface_law(LAW, shape, at)
-        weight = f64(0.5, 1.1, -0.7)
-        rows = [torch.autograd.grad(expected[i], at, retain_graph=True)[0][:7].numpy() for i in range(3)]
-        slopes = torch.autograd.grad((expected[:3] * weight).sum(), own, retain_graph=True)
-        out, J, p_bar = _compiled_results(laws.interface, x.numpy(), p.detach().numpy(), weight.numpy())
-        pulled = torch.autograd.grad(p, own, torch.from_numpy(p_bar), retain_graph=True)
-        for mine, its in ((out, expected.detach().numpy()), (J, np.stack(rows)), *zip(pulled, slopes)):
-            mine, its = np.asarray(mine), np.asarray(its)
-            assert np.abs(mine - its).max() <= 1e-10 * max(1e-2, np.abs(its).max()), k
-
-
 COARSE = Parameters().override({"pad.elements_x": 60, "pad.elements_y": 3})
 
 
@@ -445,113 +357,7 @@ def grasp(model: SoftGrasp, y0: Tensor) -> Reference:
     )
 
 
-def directed(shape: nn.Module, name: str) -> Tensor:
-    """A direction in which a parameter is varied: its own size, or a change of a form that is no motion and no scaling."""
-    p = dict(shape.named_parameters())[name].detach()
-    return p.clone() if p.ndim == 0 else 1e-2 * torch.sin(torch.arange(p.numel()).double()).reshape(p.shape)
-
-
-RUNS: dict[str, Callable[[], Shape]] = {
-    "superellipse": lambda: Superellipse(20e-3, 18.5e-3, 2.6),
-    "box": lambda: RoundedBox(18e-3, 17e-3, 12e-3),
-    "polygon": lambda: RoundedPolygon(
-        [[20e-3 * np.sin(t), 20e-3 * np.cos(t)] for t in np.arange(0.5, 8) * np.pi / 4], 9e-3
-    ),
-    "contour": lambda: Contour(
-        [[20e-3 * np.cos(t), 18e-3 * np.sin(t)] for t in np.arange(24) * np.pi / 12], tolerance=1e-5
-    ),
-}
-
-
-@pytest.mark.parametrize("name", RUNS)
-def test_gradients_of_a_run_are_those_of_differences(name: str) -> None:
-    settings = COARSE.override({"control.senses": "bracket"})
-    model = SoftGrasp(settings, shape=RUNS[name]())
-    touching = model.unpack(rest(model).detach()).pose["bracket"][1].item()
-    y0 = press(model, touching - 5e-4).detach()  # just touching, it would start at a kink
-    reference = grasp(model, y0)
-
-    def run(parameter: str = "", by: float = 0.0, gradient: str = "none") -> tuple[Shape, Tensor]:
-        shape = RUNS[name]()
-        if parameter:
-            with torch.no_grad():
-                shape.get_parameter(parameter).add_(by * directed(shape, parameter))
-        model = SoftGrasp(settings, shape=shape)
-        run = simulate(model, times(0.12, 7), y0=y0, reference=reference, step=1e-3, tolerance=1e-10, gradient=gradient)
-        assert float(run.force["U"][-1, :, 0].sum()) > 10  # it is grasped
-        return shape, 1e3 * run["y_C"][-1] + 10 * run["theta"][-1]
-
-    shape, value = run(gradient="discrete")
-    value.backward()
-    for parameter, p in shape.named_parameters():
-        h = 1e-7
-        up, down = (float(run(parameter, sign * h)[1].detach()) for sign in (1, -1))
-        assert p.grad is not None
-        slope = float((p.grad * directed(shape, parameter)).sum())
-        assert slope == pytest.approx((up - down) / (2 * h), rel=1e-6, abs=1e-6), parameter
-
-
 # --- what is refused, and what is said ---------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("shape", "match"),
-    [
-        (lambda: Superellipse(20e-3, 20e-3, 1.9), "`disc.shape.n` must be from 2 to 20, but is 1.9"),
-        (lambda: Superellipse(20e-3, 20e-3, 21.0), "`disc.shape.n` must be from 2 to 20, but is 21"),
-        (lambda: Superellipse(20e-3, 6e-3, 4.0), "differ by more than a factor of 3"),
-        (lambda: Superellipse(20e-3, 20e-3, float("nan")), "`disc.shape.n` must be finite"),
-        (lambda: RoundedBox(20e-3, 9e-3, 9.1e-3), "the corners' radius 0.0091 is larger than half of the box, 0.009"),
-        (lambda: RoundedBox(20e-3, 9e-3, 0.0), "`disc.shape.radius` must be from 1e-06 to 10 m, but is 0"),
-    ],
-)
-def test_shapes_that_are_none_are_refused(shape: Callable[[], Shape], match: str) -> None:
-    with pytest.raises(ValueError, match=match):
-        rest(SoftGrasp(COARSE, shape=shape()))
-
-
-CIRCLE = [[20e-3 * np.cos(t), 20e-3 * np.sin(t)] for t in np.arange(24) * np.pi / 12]
-EIGHT = [[np.sin(2 * t), np.sin(t)] for t in (np.arange(200) + 0.3) * np.pi / 100]
-NECK = [[np.cos(t), np.sin(t) * (0.005 + np.cos(t) ** 2)] for t in np.arange(400) * np.pi / 200]
-
-
-@pytest.mark.parametrize(
-    ("made", "match"),
-    [
-        (lambda: Contour(CIRCLE[:7]), "must be at least 8 places around a contour, but are 7"),
-        (lambda: Contour([*CIRCLE, CIRCLE[-1]]), "has the same place twice: point 23"),
-        (
-            lambda: Contour([*CIRCLE[:-1], [0.1, float("inf")]]),
-            r"`points` must be finite numbers of the shape \(n, 2\)",
-        ),
-        (lambda: Contour([[1.0, 2.0, 3.0]]), r"of the shape \(n, 2\), but is \[\[1.0, 2.0, 3.0\]\]"),
-        (lambda: Contour("pear.csv"), r"of the shape \(n, 2\), but is 'pear.csv'"),
-        (
-            lambda: Contour(np.concatenate((CIRCLE[:12], np.linspace([-0.02, 0], [0.02, 0], 9)[1:]))),
-            "turns by .* degrees",
-        ),
-        (lambda: Contour(EIGHT), "a contour that crosses itself"),
-        (lambda: Contour(NECK, tolerance=1e-3), "so sharp, or so narrow, that the nearest point is the only one up to"),
-        (
-            lambda: Contour(pear(500), tolerance=1e-12),
-            "a contour of 512 pieces still passes the points, or the spline .*, at .*e-.* m",
-        ),
-        (lambda: Contour(CIRCLE, tolerance=0), "`tolerance` must be positive and finite, but is 0"),
-        (lambda: RoundedPolygon(TRIANGLE, 9e-3), "corners of radius 0.009 do not fit on side . of the polygon"),
-        (lambda: RoundedPolygon([[0, 0], [1, 0], [0, 0], [0, 1]], 0.01), "do not fit on side . of the polygon"),
-        (lambda: RoundedPolygon([[0, 0], [2, 2], [2, 0], [0, 1]], 0.01), "the polygon crosses itself"),
-        (
-            lambda: RoundedPolygon([[-2, -2], [1.6, 2], [2, -2], [-1.6, 2]], 0.1),
-            "the polygon crosses itself",
-        ),  # no area
-        (lambda: RoundedPolygon(TRIANGLE, 0.0), "`radius` must be positive and finite, but is 0"),
-        (lambda: RoundedPolygon([[0, 0], [1, 0]], 0.1), "`vertices` must be 3 to 64 places, but are 2"),
-        (lambda: RoundedPolygon([[0, 0], [1, 0], [True, "a"]], 0.1), "`vertices` must be finite numbers"),
-    ],
-)
-def test_points_that_are_no_contour_are_refused(made: Callable[[], Shape], match: str) -> None:
-    with pytest.raises(ValueError, match=match):
-        made()
 
 
 def test_control_points_that_were_spoilt_are_refused() -> None:
@@ -600,20 +406,10 @@ def test_a_contour_from_a_file(tmp_path: Path) -> None:
 
 def test_a_centre_of_mass_off_the_origin_is_told(caplog: pytest.LogCaptureFixture) -> None:
     RoundedPolygon(box(20e-3, 9e-3), 2e-3)
-    Contour(CIRCLE)
+    ROUND["contour"]()
     assert caplog.text == ""
     RoundedPolygon(np.array(box(20e-3, 9e-3)) + [0.5, 0.25], 2e-3)
     assert "the centre of mass is at (0.5, 0.25) m of `vertices`: the body's pose is that of this point" in caplog.text
-
-
-def test_the_centre_of_mass_follows_the_vertices() -> None:
-    """Moving them all is no change of the body; moving one moves the others away from the centre."""
-    shape = RoundedPolygon(ANGLED, 2e-3)
-    x = torch.from_numpy(near(known("angle")[1], 40, BAND))
-    phi = shape(x)[0]
-    (slope,) = torch.autograd.grad(phi.sum(), shape.vertices)
-    assert float(slope.sum(0).abs().max()) < 1e-12
-    assert float(slope.abs().max()) > 1e-2
 
 
 def test_an_object_that_its_pads_would_turn_is_told_of() -> None:

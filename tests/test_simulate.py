@@ -1,6 +1,5 @@
 """`simulate` and its trajectory: what runs is what is saved, gradients reach what was put in, and nothing unphysical runs."""
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -17,8 +16,6 @@ from torchsoft import (
     Actuator,
     Coulomb,
     Ellipse,
-    KelvinVoigt,
-    Parameters,
     Profile,
     Reference,
     Shape,
@@ -26,11 +23,10 @@ from torchsoft import (
     SoftGrasp,
     StandardLinearSolid,
     hold,
-    press,
     rest,
     simulate,
 )  # fmt: skip
-from torchsoft.excitation import Excitation, MultiSine, begin, start
+from torchsoft.excitation import Excitation, MultiSine, begin
 from torchsoft.solve.adjoint import GradientFailed
 from torchsoft.solve.progress import SimulationFailed
 
@@ -62,38 +58,6 @@ def test_values_set_on_the_module_run_and_are_saved(tmp_path: Path) -> None:
         assert '"contact.K_n": 200000.0' in saved.attrs["parameters"]
         np.testing.assert_array_equal(saved["disc_position"][:, 0], run["x_C"])
         np.testing.assert_array_equal(saved["disc_angle"], run["theta"])
-
-
-def test_a_radius_set_on_the_module_is_the_radius() -> None:
-    """In statics, in what the bracket's height means, and in the run."""
-    model, other = coarse(), coarse(disc__radius=19.5e-3)
-    with torch.no_grad():
-        model.shape.radius.fill_(19.5e-3)
-        assert float(model.touch_height(0.02)) == float(other.touch_height(0.02)) != float(coarse().touch_height(0.02))
-        assert torch.equal(rest(model), rest(other))
-        assert torch.equal(press(model, 48.8e-3), press(other, 48.8e-3))
-    assert model.settings.disc.radius == 19.5e-3
-    assert torch.equal(rolled(model).y, rolled(other).y)
-    assert float(model.disc.inertia.detach()) == float(other.disc.inertia.detach())
-
-
-class Oval(Ellipse):
-    """An ellipse that also has what a circle has."""
-
-    def __init__(self) -> None:
-        super().__init__(19.8e-3, 19.1e-3)
-        self.radius = torch.tensor(19.37e-3, dtype=torch.float64)
-
-
-@pytest.mark.filterwarnings("ignore:the energies of the run")  # the bracket starts off its set-point
-def test_a_shape_with_a_radius_runs_as_itself() -> None:
-    oval, ellipse = (SoftGrasp(coarse().settings, shape=shape) for shape in (Oval(), Ellipse(19.8e-3, 19.1e-3)))
-    with torch.no_grad():
-        assert torch.equal(rest(oval), rest(ellipse))
-        y0 = rest(ellipse)
-    assert not torch.allclose(y0, rest(coarse()).detach(), rtol=0, atol=1e-6)
-    runs = [simulate(model, T, y0=y0).y for model in (oval, ellipse)]
-    assert torch.equal(*runs)
 
 
 class Polygonal(Shape):
@@ -224,49 +188,6 @@ def test_tied_parameters_get_the_sum_of_their_gradients() -> None:
     assert min(abs(float(x)) for x in (R_n, R_t, K_n, K_t, K_98)) > 0
 
 
-def test_a_knot_with_a_graph_receives_its_gradient() -> None:
-    model = coarse()
-    y0 = grasped(model)
-    d = f64(1e-3)[0].requires_grad_()
-    travel = Profile([0.0, 0.02], [0.06, 0.06 + d])
-    reference = Reference(x_d=travel, y_d=model.reference["y_d"], F_ff=model.reference["F_ff"])
-    run = lambda r: simulate(model, T, y0=y0, reference=r, step=2e-3, gradient="discrete", tolerance=1e-10)
-    theta = lambda r: run(r)["theta"][-1]
-    (slope,) = torch.autograd.grad(theta(reference), d)
-    ends = []
-    for h in (1e-7, -1e-7):
-        moved = Profile([0.0, 0.02], [0.06, 0.061 + h])
-        with torch.no_grad():
-            ends.append(float(theta(Reference(x_d=moved, y_d=model.reference["y_d"], F_ff=model.reference["F_ff"]))))
-    assert float(slope) == pytest.approx((ends[0] - ends[1]) / 2e-7, rel=1e-5)
-
-
-def test_values_moved_in_place_after_the_run_do_not_change_the_gradient() -> None:
-    """Also those that torch's graphs keep to multiply with, moved behind torch's back or not."""
-    model = coarse()
-    run = rolled(model, gradient="discrete")
-    wanted = [model.pad.E, model.pad.depth, model.disc.mass, model.control["x"].Kp]
-    value = run["theta"][-1] + 1e-3 * run["F_x"][-1] + 1e3 * run["angular_momentum"][-1]
-    before = torch.autograd.grad(value, wanted, retain_graph=True)
-    for parameter in wanted:
-        parameter.data.mul_(2.0)
-    after = torch.autograd.grad(value, wanted, retain_graph=True)
-    with torch.no_grad():
-        for parameter in wanted:
-            parameter.mul_(2.0)
-    last = torch.autograd.grad(value, wanted)
-    assert all(torch.equal(a, b) and torch.equal(a, c) for a, b, c in zip(before, after, last))
-
-
-def test_the_angular_momentum_has_the_gradient_of_the_inertia() -> None:
-    model = coarse()
-    run = rolled(model, gradient="discrete")
-    L, omega, m = run["angular_momentum"][-1], run["omega"][-1], model.disc.mass
-    (by_L,), (by_omega,) = (torch.autograd.grad(x, m, retain_graph=True) for x in (L, omega))
-    I = model.disc.inertia.detach()
-    assert float(by_L) == pytest.approx(float(I * by_omega + I / m.detach() * omega.detach()), rel=1e-12)
-
-
 def test_what_has_no_gradient_says_so() -> None:
     """The recorded moments, and second derivatives; a moment of no weight in a sum is none."""
     model = coarse()
@@ -345,17 +266,13 @@ def test_torchs_default_dtype_does_not_matter(dtype: torch.dtype) -> None:
 
     def answer() -> list[Tensor]:
         motion = MultiSine(amplitude_x=1e-3, frequency=(5.0, 20.0))
-        excitation = Excitation(motion=motion, duration=0.5, grasp_time=0.05, settle=0.02)
-        begun = begin(excitation, coarse().settings)
-        t = times(0.1, 6)
-        run = simulate(begun.model, t, y0=begun.y0, gradient="discrete")
-        forward = simulate(begun.model, t, y0=begun.y0, gradient="forward", wrt=["pad.E", "pad.nu"])
-        leaves = [p for p in begun.model.parameters() if p.requires_grad]
-        gradients = torch.autograd.grad(run["y_C"][-1], leaves, allow_unused=True)
+        begun = begin(Excitation(motion=motion, duration=0.5, grasp_time=0.05, settle=0.02), coarse().settings)
+        run = simulate(begun.model, times(0.1, 6), y0=begun.y0, gradient="discrete")
+        forward = simulate(begun.model, run.t, y0=begun.y0, gradient="forward", wrt=["pad.E", "pad.nu"])
+        gradients = torch.autograd.grad(run["y_C"][-1], [begun.model.pad.E, begun.model.contact.K_t])
         oval = SoftGrasp(begun.model.settings, shape=Ellipse(19.8e-3, 19.1e-3), friction=Coulomb(0.5, 0.4))
-        with torch.no_grad():
-            parts = [rest(oval), oval(0.0, rest(oval)), run.y, *run.channels.values(), *run.energy.values()]
-        return [*parts, *(g for g in gradients if g is not None), forward.sensitivities]  # pyright: ignore
+        parts = [rest(oval), oval(0.0, rest(oval)), run.y, *run.channels.values(), *run.energy.values()]
+        return [*parts, *gradients, forward.sensitivities]  # pyright: ignore[reportReturnType]
 
     expected, before = answer(), torch.get_default_dtype()
     torch.set_default_dtype(dtype)
@@ -383,17 +300,6 @@ def test_other_settings_of_the_process_do_not_matter() -> None:
 
 
 # routes -------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("route", ["adjoint", "", "Discrete"])
-def test_an_unknown_route_is_refused(route: str) -> None:
-    with pytest.raises(ValueError, match=r"`gradient` must be one of none, discrete, forward, but is"):
-        simulate(coarse(), T, gradient=route)  # pyright: ignore[reportArgumentType]
-
-
-def test_a_run_without_an_end_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"ask for 1e\+300 steps, .*by tolerance no step is longer than 0\.1 s"):
-        simulate(coarse(), f64(0.0, 1e299), y0=grasped(coarse()))
 
 
 def test_no_grad_is_honoured() -> None:
@@ -426,100 +332,6 @@ def test_routes_agree_on_the_run() -> None:
 # nothing unphysical runs --------------------------------------------------------------------------------------------
 
 
-class TurnsNaN(Profile):
-    """Constant until 10 ms, then not a number."""
-
-    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        value, rate = super().forward(t)
-        return torch.where(t > 0.01, torch.nan, value), rate
-
-
-def test_a_reference_that_turns_nan_is_refused() -> None:
-    model = coarse()
-    y0 = grasped(model)
-    bad = Reference(x_d=TurnsNaN([0.0], [0.06]), y_d=model.reference["y_d"], F_ff=model.reference["F_ff"])
-    for route in ("none", "discrete"):
-        with pytest.raises(ValueError, match=r"the signal `x_d` of the reference is not finite at t = 0\.01"):
-            simulate(model, T, y0=y0, reference=bad, gradient=route)
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "match"),
-    [
-        ("pad.E", 0.0, r"parameter `.*\.E` must be from 1 to 1e\+13 Pa, but is 0"),
-        ("contact.K_n", -1.2e5, r"parameter `.*K_n` must be from 0.001 to 1e\+12 N/m, but is -120000"),
-        ("contact.K_n", float("nan"), r"parameter `.*K_n` must be finite, but is nan"),
-        ("contact.mu_s", -0.1, r"parameter `.*mu_s` must be from 0 to 100"),
-        ("pad.nu", 0.5, r"parameter `.*nu` must be from -0\.999 to 0\.4999"),
-        ("disc.radius", -1e-3, r"parameter `.*radius` must be from 1e-06 to 10 m"),
-        ("disc.mass", float("inf"), r"parameter `.*mass` must be finite"),
-        ("control.K_81", -1.0, r"parameter `.*Kp` must be from 0 to 1e\+12"),
-        ("scenario.gravity", float("nan"), r"parameter `gravity` must be finite"),
-    ],
-)
-def test_unphysical_values_set_in_place_are_refused_by_name(name: str, value: float, match: str) -> None:
-    model = coarse()
-    y0 = grasped(model)
-    with torch.no_grad():
-        model.parameter(name).fill_(value)
-    with pytest.raises(ValueError, match=match):
-        simulate(model, T, y0=y0)
-
-
-class Noisy(Profile):
-    """Another value at every call."""
-
-    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        value, rate = super().forward(t)
-        return value + 1e-6 * torch.rand_like(t), rate
-
-
-class Single(Profile):
-    """In another dtype."""
-
-    def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
-        value, rate = super().forward(t)
-        return value.float(), rate
-
-
-@pytest.mark.parametrize(
-    ("signal", "match"),
-    [(Noisy, "gives other values when asked again"), (Single, "the signal `x_d` must give float64")],
-)
-def test_signals_that_are_no_functions_of_time_are_refused(signal: type[Profile], match: str) -> None:
-    model = coarse()
-    y0 = grasped(model)
-    bad = Reference(x_d=signal([0.0], [0.06]), y_d=model.reference["y_d"], F_ff=model.reference["F_ff"])
-    with pytest.raises(ValueError, match=match):
-        simulate(model, T, y0=y0, reference=bad)
-
-
-def test_what_belongs_to_another_route_and_what_is_no_number_is_refused() -> None:
-    model = coarse()
-    y0 = grasped(model)
-    size = model.layout.size
-    cases: list[tuple[dict[str, object], str]] = [
-        ({"wrt": "pad.E", "gradient": "forward"}, "`wrt` must be a list of parameters' names"),
-        ({"rigid": True}, "belong to gradient='forward'"),
-        ({"dy0": torch.zeros(size, 1).double()}, "belong to gradient='forward'"),
-        ({"gradient": "forward", "wrt": ["pad.E"], "dy0": torch.zeros(size, 1)}, "`dy0` must be float64"),
-        ({"reference": {}}, "`reference` must be a Reference, but is dict"),
-        ({"step": True}, "`step` must be positive and finite, but is True"),
-        ({"step": 1e-300}, "at most 1e[+]08 can be taken"),
-        ({"tolerance": 1e-14}, "`tolerance` must be at least 1e-10 N"),
-        ({"y0": y0.numpy()}, "`y0` must be a float64 tensor, but is ndarray"),
-        ({"t": [0.0, 1.0]}, "`t` must be a float64 tensor, but is list"),
-        ({"t": T.clone().requires_grad_()}, "`t` must not require a gradient"),
-        ({"t": 1e-300 * T}, "must be further apart than 1e-12 s"),
-        ({"rig": SoftGrasp}, "`rig` must be a Rig"),
-    ]
-    for changes, match in cases:
-        with pytest.raises(ValueError, match=match):
-            simulate(**({"rig": model, "t": T, "y0": y0} | changes))  # pyright: ignore[reportArgumentType]
-    with torch.inference_mode(), pytest.raises(ValueError, match=r"torch.inference_mode\(\) has not"):
-        simulate(model, T, y0=y0, gradient="forward", wrt=["pad.E"])
-
-
 def test_parts_replaced_after_a_run_run() -> None:
     """A material with more branches after the first run, in the group and in the pads."""
     model = coarse()
@@ -550,38 +362,3 @@ def test_a_law_that_turns_nan_never_converges() -> None:
 
 
 # materials ----------------------------------------------------------------------------------------------------------
-
-
-def test_a_solid_with_equal_moduli_is_kelvin_and_voigts() -> None:
-    """E_instant -> E leaves one branch of the chain, whose time is then tau_instant."""
-    p = Parameters()
-    numbers = {"nu": p.pad.nu, "rho": p.pad.rho, "depth": p.pad.depth}
-    solid = StandardLinearSolid(p.pad.E, p.pad.E * (1 + 1e-12), tau=0.05, tau_instant=p.pad.tau, **numbers)
-    one = SoftGrasp(coarse().settings, material=solid)
-    other = SoftGrasp(coarse().settings, material=KelvinVoigt(p.pad.E, tau=p.pad.tau, **numbers))
-    a, b = rolled(one), rolled(other)
-    assert a.state.pads["L"].shape[1] == 2
-    for name in ("x_C", "theta", "F_y"):
-        assert torch.allclose(a[name], b[name], rtol=0, atol=1e-9 * float(b[name].abs().max()))
-
-
-def test_a_standard_solid_creeps_from_its_instant_to_its_relaxed_modulus() -> None:
-    """A disc put down where E_instant bears it sinks with the time tau to where E does, and the energies are balanced."""
-    tau, without = (
-        0.05,
-        lambda **changes: coarse(contact__mu_s=0.0, contact__mu_k=0.0, **changes),
-    )  # friction would lock
-    settings = without().settings
-    model = SoftGrasp(settings, material=StandardLinearSolid(3e5, 6e5, 0.45, 1100.0, tau, 0.044, tau_instant=1e-3))
-    with torch.no_grad():
-        stiff, soft = (m.unpack(start(m)) for m in (without(pad__E=6e5), without(pad__E=3e5)))
-        pads = {k: torch.cat((z, torch.zeros_like(z))) for k, z in stiff.pads.items()}
-        y0 = model.pack(stiff._replace(pads=pads))
-    run = simulate(model, times(8 * tau, 161), y0=y0, step=1e-3)
-    high, low = (float(state.pose["disc"][1]) for state in (stiff, soft))
-    assert high - low > 2e-5
-    left = (run["y_C"] - low) / (high - low)
-    assert float(left[0]) == pytest.approx(1.0, abs=1e-12)
-    assert float(left[-1]) == pytest.approx(0.0, abs=2e-3)
-    assert float(left[20] / left[60]) == pytest.approx(math.exp(2), rel=0.05)  # two times tau
-    assert run.energy_residual_rel < 2e-3

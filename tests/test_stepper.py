@@ -5,13 +5,9 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
-from conftest import COARSE, coarse, f64, grasped, times
+from conftest import COARSE, coarse, grasped, times
 
 from torchsoft import (
-    PD,
-    Actuator,
-    Body,
-    Contact,
     Parameters,
     Profile,
     Reference,
@@ -20,7 +16,6 @@ from torchsoft import (
     SoftGrasp,
     simulate,
 )
-from torchsoft.physics.energy import stored
 from torchsoft.scenario import grasp_and_roll
 from torchsoft.solve.progress import Segment
 from torchsoft.solve.stepper import ImplicitStepper
@@ -46,64 +41,6 @@ def test_same_run_twice_to_the_bit_and_in_two_threads_at_once() -> None:
         both = list(pool.map(run, [*made, *made]))
     assert all(torch.equal(a, b) for a, b in zip(both, [*alone, *alone]))
     assert not torch.equal(*alone)
-
-
-def test_one_model_in_two_threads_under_two_references_with_gradients() -> None:
-    """A run does not touch the model: one rig follows two references at once, and each gradient is that of its own."""
-    model = coarse()
-    y0 = grasped(model)
-    steady = model.reference
-    signals = {name: steady[name] for name in ("y_d", "F_ff")}
-    references = [Reference(x_d=Profile([0.0, 0.1], [0.06, 0.06 + d]), **signals) for d in (1e-3, -2e-3)]
-
-    def slope(reference: Reference) -> tuple[torch.Tensor, torch.Tensor]:
-        run = simulate(model, times(0.1, 11), y0=y0, reference=reference, gradient="discrete")
-        return run.y.detach(), torch.autograd.grad(run["theta"][-1], model.pad.E)[0]
-
-    alone = [slope(reference) for reference in references]
-    with ThreadPoolExecutor(2) as pool:
-        both = list(pool.map(slope, [*references, *references]))
-    for got, expected in zip(both, [*alone, *alone]):
-        assert all(torch.equal(a, b) for a, b in zip(got, expected))
-    assert model.reference is steady
-
-
-def test_irregular_output_times_do_not_matter() -> None:
-    """Outputs only cut the steps: the same instants reached with other outputs agree to the stepper's accuracy."""
-    manipulation = grasp_and_roll(coarse(), grasp_force=75.0)
-    model, y0 = manipulation.model, manipulation.y0
-    even = simulate(model, times(0.4, 5), y0=y0, step=5e-4)
-    odd = simulate(model, f64(0, 0.1003, 0.17, 0.3, 0.4), y0=y0, step=5e-4)
-    assert float((even.state.pose["disc"][-1, :2] - odd.state.pose["disc"][-1, :2]).abs().max()) < 1e-8
-
-
-@pytest.mark.parametrize(
-    ("t", "match"),
-    [
-        ([0.0, 0.1, 0.1], "increase strictly"),
-        ([0.0, 0.2, 0.1], r"t\[1:3\]"),
-        ([0.0], "two times or more"),
-        ([0.0, float("nan")], "finite"),
-    ],
-)
-def test_bad_times_are_refused(t: list[float], match: str) -> None:
-    with pytest.raises(ValueError, match=match):
-        simulate(coarse(), torch.tensor(t, dtype=torch.float64))
-
-
-def test_bad_states_and_settings_are_refused() -> None:
-    model, t = coarse(), times(0.1, 2)
-    with pytest.raises(ValueError, match="must be float64"):
-        simulate(model, t, y0=torch.zeros(model.layout.size))
-    with pytest.raises(ValueError, match="must be float64 of shape"):
-        simulate(model, t, y0=torch.zeros(3, dtype=torch.float64))
-    with pytest.raises(ValueError, match="must be finite, but component 0"):
-        simulate(model, t, y0=torch.full((model.layout.size,), torch.nan, dtype=torch.float64))
-    for value in (0.0, -1e-3, float("nan")):
-        with pytest.raises(ValueError, match="`step` must be positive and finite"):
-            simulate(model, t, step=value)
-        with pytest.raises(ValueError, match="`tolerance` must be positive and finite"):
-            simulate(model, t, tolerance=value)
 
 
 def test_an_unstable_loop_ends_in_an_error_that_says_so() -> None:
@@ -177,26 +114,3 @@ def test_the_adjoint_follows_halved_steps(monkeypatch: pytest.MonkeyPatch) -> No
         E.copy_(value)
     assert ahead[1] == behind[1] == failed
     assert slope.item() == pytest.approx((ahead[0] - behind[0]).item() / (2 * h), rel=1e-4)
-
-
-def test_a_driven_body_follows_its_signal_and_its_work_is_counted() -> None:
-    """A disc pressed by a prescribed height into one pad while an actuator rolls it: the drive pays for what is stored."""
-    model = coarse()
-    disc = Body(0.4, model.shape, y="driven", theta="free")
-    rig = Rig(
-        bodies={"disc": disc}, pads={"L": model.pads["L"]}, contacts={"L": Contact("L", "disc", model.contact)},
-        actuators={"x": Actuator("disc.x", "disc.x", PD(1e4, 400.0), setpoint="w")},
-        reference=Reference(
-            **{"disc.y": Profile([0.0, 0.05], [24.0e-3, 23.4e-3]), "w": Profile([0.05, 0.2], [0.06, 0.064])}
-        ),
-    )  # fmt: skip
-    y0 = torch.zeros(rig.layout.size, dtype=torch.float64)
-    y0[rig.layout.slices["pose", "disc"]] = f64(0.06, 0.0)
-    run = simulate(rig, times(0.2, 41), y0=y0, step=5e-4)
-    assert torch.equal(run.state.pose["disc"][:, 1], rig.reference["disc.y"](run.t)[0])
-    assert float(run["x_disc"][-1]) == pytest.approx(0.064, abs=2e-5)
-    assert float(run["theta_disc"][-1]) < -0.1  # rolls to the right, clockwise
-    work = float(run.supplied["drive_disc"][20])
-    assert work > 0.5 * float(run.energy["strain_L"][20]) > 1e-3
-    assert run.energy_residual_rel < 2e-3
-    assert set(run.energy) == set(stored(rig, run.state))
