@@ -161,6 +161,7 @@ def test_gradients_through_torchdiffeq_are_those_of_the_rollout() -> None:
     assert slope == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-4)
 
 
+@pytest.mark.parametrize("nonlinear", [False, True])
 def test_divergence_is_reported_with_its_time(nonlinear: bool) -> None:
     """v' = a v from v = 1 leaves 100 times its scale at ln(100) / a; v' = v^2 blows up at t = 1."""
     square = Term("v_C v_C", "m2/s2", (Factor({"v_C": 1.0}), Factor({"v_C": 1.0})))
