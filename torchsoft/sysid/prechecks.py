@@ -116,57 +116,67 @@ SLOW = 0.3
 
 
 class Loop(NamedTuple):
-    """Both sides of a loop as means over n windows: the measured force F (n,), and `given` (n,) by the actuator of its
-    setpoint, the setpoint's rate, the force fed forward, the coordinate and its rate, which are `inputs` (n, 5)."""
+    """Both sides of a loop as means over n windows of a `width` (n,) [s]: the measured force F (n,), and `inputs` (n, k) of the
+    actuator. `signals` are those of the force and of the coordinates."""
 
     actuator: Actuator
     F: Array
     inputs: Array
-    signals: tuple[Signal, Signal]
+    signals: tuple[Signal, ...]
     width: Array
+
+    @property
+    def fed(self) -> int:
+        """Column of the force fed forward."""
+        return 2 * len(self.actuator.setpoints)
 
     def given(self, feed_forward: float = 1.0) -> Array:
         """The effort (n,) of the actuator, with the force fed forward times a factor."""
-        inputs = torch.from_numpy(self.inputs * [1.0, 1.0, feed_forward, 1.0, 1.0])
-        return self.actuator(inputs).detach().numpy()
+        inputs = self.inputs.copy()
+        inputs[:, self.fed] *= feed_forward
+        return self.actuator(torch.from_numpy(inputs)).detach().numpy()
 
     @property
     def noise(self) -> tuple[float, float]:
         """Standard deviation [N] of a mean of the disagreement by white noise, and by noise that outlasts a window."""
         inputs = torch.from_numpy(self.inputs).requires_grad_(True)
         (slope,) = torch.autograd.grad(self.actuator(inputs).sum(), inputs)
-        by_x, by_v, (F, x) = slope[:, 3].numpy(), slope[:, 4].numpy(), self.signals
-        parts = [(one.spacing / self.width, 1.0) for one in (F, x)]
+        by = slope.numpy()[:, self.fed + 1 :]
+        force, *coordinates = self.signals
         white, lasting = (
-            float(
-                np.sqrt(
-                    np.mean(F.sensor.noise**2 * f + x.sensor.noise**2 * (by_x**2 * c + 2 * by_v**2 / self.width**2))
-                )
-            )
-            for f, c in zip(*parts)
+            force.sensor.noise**2 * force.spacing / self.width,
+            np.full(len(self.width), force.sensor.noise**2),
         )
-        return white, lasting
+        for one, by_x, by_v in zip(coordinates, by.T[::2], by.T[1::2]):
+            rate = 2 * by_v**2 / self.width**2
+            white = white + one.sensor.noise**2 * (by_x**2 * one.spacing / self.width + rate)
+            lasting = lasting + one.sensor.noise**2 * (by_x**2 + rate)
+        return float(np.sqrt(np.mean(white))), float(np.sqrt(np.mean(lasting)))
 
 
-def windows(recording: Recording, actuator: Actuator, F: Signal | None, x: Signal | None) -> Loop | None:
-    """The loop of two signals over windows that both have samples in; None where there are too few of them."""
-    if F is None or x is None:
+def windows(recording: Recording, actuator: Actuator, signals: Sequence[Signal | None]) -> Loop | None:
+    """The loop of the force and the coordinates over windows that all have samples in; None where there are too few."""
+    known = tuple(one for one in signals if one is not None)
+    if len(known) < len(signals):
         return None
-    length = max(WINDOW, 4 * F.spacing, 4 * x.spacing)
-    first, last = max(F.t[0], x.t[0]), min(F.t[-1], x.t[-1])
-    edges = first + length * np.arange(int((last - first) / length) + 1)
-    if len(edges) <= FEWEST:
+    length = max(WINDOW, *(4 * one.spacing for one in known))
+    first, last = max(one.t[0] for one in known), min(one.t[-1] for one in known)
+    edges = first + length * np.arange(int(max(last - first, 0.0) / length) + 1)
+    keep = np.logical_and.reduce([np.diff(np.searchsorted(s.t, edges)) * s.spacing > 0.5 * length for s in known])
+    if keep.sum() < FEWEST:
         return None
-    keep = np.logical_and.reduce([np.diff(np.searchsorted(s.t, edges)) * s.spacing > 0.5 * length for s in (F, x)])
     width, t = np.diff(edges)[keep], np.arange(first, last + BETWEEN, BETWEEN)
-    names = [actuator.setpoint, *([actuator.feed_forward] if actuator.feed_forward else [])]
-    reference = recording.rig.reference(torch.from_numpy(t), names).detach().numpy()[..., 0]
-    setpoint, measured = CubicSpline(t, reference[:, 0]), CubicSpline(x.t, x.y)
-    feed = CubicSpline(t, reference[:, 1] if actuator.feed_forward else np.zeros(len(t)))
-    integrals = (setpoint.antiderivative(), setpoint, feed.antiderivative(), measured.antiderivative(), measured)
+    names = [*actuator.setpoints, *([actuator.feed_forward] if actuator.feed_forward else [])]
+    columns = [np.zeros(len(t))]
+    if names:
+        columns = [*recording.rig.reference(torch.from_numpy(t), names).detach().numpy()[..., 0].T, *columns]
+    asked = [CubicSpline(t, column) for column in columns[: len(actuator.setpoints)]]
+    force, *coordinates = [CubicSpline(one.t, one.y) for one in known]
+    integrals = [part for one in asked for part in (one.antiderivative(), one)]
+    integrals.append(CubicSpline(t, columns[len(asked)]).antiderivative())
+    integrals += [part for one in coordinates for part in (one.antiderivative(), one)]
     inputs = np.stack([np.diff(one(edges))[keep] / width for one in integrals], -1)
-    force = np.diff(CubicSpline(F.t, F.y).antiderivative()(edges))[keep] / width
-    return Loop(actuator, force, inputs, (F, x), width) if keep.sum() >= FEWEST else None
+    return Loop(actuator, np.diff(force.antiderivative()(edges))[keep] / width, inputs, known, width)
 
 
 class Change(NamedTuple):
@@ -190,23 +200,30 @@ def loop_findings(
     of unknown parameters."""
     rig = recording.rig
     tensors = {id(rig.parameter(name)) for name in unknown}
-    for name, actuator in rig.loops.items():
-        F = sampled(recording, sensors, name)
-        loop = windows(recording, actuator, F, sampled(recording, sensors, actuator.measured))
+    for name, actuator in rig.actuators.items():
+        F, coordinates = sampled(recording, sensors, name), [sampled(recording, sensors, x) for x in actuator.measures]
+        if F is not None and None in coordinates and not actuator.is_loop:
+            missing = channel(rig, actuator.measures[coordinates.index(None)])
+            yield Diagnostic(
+                "note", recording.name, f"recording `{recording.name}`: {F.channel} is not compared with its controller, since "
+                f"{missing} is not recorded", f"controller of {F.channel}",
+            )  # fmt: skip
+        loop = windows(recording, actuator, [F, *coordinates])
         if loop is None:
             continue
         body, _, axis = actuator.measured.partition(".")
         rivals = {}
-        for other in (one for one in rig.bodies if one != body):
-            rival = windows(recording, actuator, F, sampled(recording, sensors, f"{other}.{axis}"))
+        for other in (one for one in rig.bodies if one != body and actuator.is_loop):
+            rival = windows(recording, actuator, [F, sampled(recording, sensors, f"{other}.{axis}")])
             rivals |= {other: rival} if rival is not None else {}
         free = any(id(p) in tensors for p in actuator.parameters())
         change = disagreement(rig, loop, body, rivals, free)
         if change is not None:
-            e, (F, x) = rms(loop.F - loop.given()), loop.signals
+            e, (force, *others) = rms(loop.F - loop.given()), loop.signals
+            seen = ", ".join([*actuator.setpoints, *(one.channel for one in others)])
             text = (
-                f"{change.clause} (what the controller makes of {actuator.setpoint} and {x.channel} differs from {F.channel} "
-                f"by {e:.3g} {actuator.effort_unit} rms, and would by {rms(change.left):.3g})"
+                f"{change.clause} (what the controller makes of {seen} differs from {force.channel} by {e:.3g} "
+                f"{actuator.effort_unit} rms, and would by {rms(change.left):.3g})"
             )
             yield found(change.code, recording, text, change.grave)
 
@@ -239,7 +256,7 @@ def disagreement(rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop], fr
     if rms(best.left) <= enough and rms(best.left) < 0.5 * rms(e):
         return best
     faulty = any(one.faulty for one in loop.signals)
-    if free or faulty or rms(e) <= (white if feed and not loop.inputs[:, 2].any() else lasting):
+    if free or faulty or rms(e) <= (white if feed and not loop.inputs[:, loop.fed].any() else lasting):
         return None
     slow, began = np.diff(e) / np.sqrt(2), float(e[: max(2, len(e) // 20)].mean())
     if feed and rms(slow) <= max(SLOW * rms(e), white) and abs(began) <= 0.5 * rms(e):
