@@ -45,7 +45,7 @@ FLOWS = {
     """,
     "cli": "failure results rigs identify material .",
     "solve.kernel": """
-        cache . arrays scratch linear inertia interface stage finish step taped run rates adjoint_pads adjoint tangent
+        cache . arrays linear inertia interface stage step run adjoint tangent
     """,
 }
 """For every folder with layers its modules and folders from the top down; "." is what the folder's own file imports."""
