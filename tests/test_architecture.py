@@ -33,7 +33,7 @@ FLOWS = {
     "rigs": "fields parts control motion geometry build course balance check written run .",
     "cli": "results rigs identify material .",
     "solve.kernel": """
-        cache . arrays scratch linear inertia interface stage finish step taped run rates adjoint_pads adjoint tangent
+        cache . arrays linear inertia interface stage step run adjoint tangent
     """,
 }
 """For every folder with layers its modules and folders from the top down; "." is what the folder's own file imports."""

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from torchsoft.solve.kernel.adjoint import backward
-from torchsoft.solve.kernel.arrays import Array
-from torchsoft.solve.kernel.scratch import cotangents, scratch
+from torchsoft.solve.kernel.arrays import Array, room
 from torchsoft.solve.progress import Progress, Segment
 from torchsoft.solve.stepper import ImplicitStepper
 from torchsoft.threads import parallel_map
@@ -104,8 +103,8 @@ def run_adjoint(stepper: ImplicitStepper, segments: list[Segment], y_bar: Tensor
         plan, tape = segment.plan, stepper.tape(segment)
         s = stepper.compiled.system(float(plan.h[0]))
         failed = backward(
-            s, scratch(s, size), cotangents(s, size), plan.h, tape, segment.signals, plan.out_step, plan.out_part,
-            rows[segment.rows], carried, p_bar, signals_bar[number],
+            s, room("Work", s, size, columns=1), room("Cotangents", s, size), plan.h, tape, segment.signals,
+            plan.out_step, plan.out_part, rows[segment.rows], carried, p_bar, signals_bar[number],
         )  # fmt: skip
         if failed >= 0:
             raise GradientFailed(f"the gradient is not finite at t = {plan.starts[failed]:.4f} s")

@@ -7,8 +7,7 @@ import numpy as np
 
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.grid import Plan
-from torchsoft.solve.kernel.arrays import Array, Tape, first_stages
-from torchsoft.solve.kernel.scratch import Step, Work
+from torchsoft.solve.kernel.arrays import Array, first_stages
 
 
 class SimulationFailed(RuntimeError):
@@ -56,7 +55,7 @@ class Segment:
     V: Array
     u_dot: Array
     rows: slice
-    tape: Tape | None
+    tape: Any
 
 
 class Integrals:
@@ -76,8 +75,8 @@ class Marching:
     """A run on its way: the state, Newton's scratch, the last step, the integrals, and where its results go."""
 
     y: Array
-    work: Work
-    step: Step
+    work: Any
+    step: Any
     integrals: Array
     out: Progress
     segments: list[Segment] | None
@@ -96,7 +95,7 @@ class Marching:
 
     def keep(
         self, plan: Plan, signals: Array, at_outputs: Array, before: tuple[Array, Array, Array, Array], rows: slice,
-        tape: Tape | None,
+        tape: Any,
     ) -> None:  # fmt: skip
         """Note the steps that were taken, and what their derivatives need."""
         if len(plan.h) == 0:

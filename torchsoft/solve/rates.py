@@ -4,9 +4,8 @@ import numpy as np
 
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
-from torchsoft.solve.kernel.arrays import Array
-from torchsoft.solve.kernel.rates import rates
-from torchsoft.solve.kernel.scratch import scratch
+from torchsoft.solve.kernel.arrays import Array, room
+from torchsoft.solve.kernel.run import rates
 from torchsoft.solve.progress import Integrals, SimulationFailed
 from torchsoft.solve.system import Compiled
 from torchsoft.solve.tolerances import Followed
@@ -31,7 +30,7 @@ class Rates:
                 "the rates of inertial pads are not compiled for single states; use `rig.forward`"
             )
         self._system, self._limits = compiled.system(1.0), (tolerance, 40, margin)
-        self._work = scratch(self._system, compiled.size)
+        self._work = room("Work", self._system, compiled.size, columns=1)
         followed = rig.reference if reference is None else reference
         self._followed = Followed(lambda t: compiled.signals(t, followed), rig, followed)
         self._signals = np.zeros((1, compiled.signal_count, 2))

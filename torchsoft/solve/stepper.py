@@ -14,9 +14,8 @@ from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
 from torchsoft.solve.grid import CHUNK, LONGEST, Plan, check_knots, check_times, equal_steps, given_steps
-from torchsoft.solve.kernel.arrays import NO_ERRORS, NO_SIGNALS, Array, Tape, empty_tape
+from torchsoft.solve.kernel.arrays import NO_ERRORS, NO_SIGNALS, Array, room
 from torchsoft.solve.kernel.run import run
-from torchsoft.solve.kernel.scratch import Step, Work, empty_step, scratch
 from torchsoft.solve.kernel.step import (
     CONVERGED,
     GAMMA,
@@ -133,7 +132,8 @@ class ImplicitStepper:
         s, names = self._still, self.integrals.names
         extras = len(names) + len(s.pad_base) + len(s.body_free)
         out = Progress(np.zeros((len(t), len(y0))), np.zeros((len(t), len(s.point_X), 2)), np.zeros((len(t), extras)))
-        work, step = scratch(s, self.layout.size), empty_step(s, self.layout.size, len(names))
+        work = room("Work", s, self.layout.size, columns=1)
+        step = room("Step", s, self.layout.size, integrals=len(names))
         y, integrals = y0.numpy().copy(), np.zeros(len(names))
         set_velocities(s, work, y)
         self._start(y, t[0], work, step, out)
@@ -196,7 +196,7 @@ class ImplicitStepper:
             starts, h = np.zeros(CHUNK), np.zeros(CHUNK)
             signals, at_rows = np.zeros((CHUNK, 2, count, 2)), np.zeros((len(t), count, 2))
             before = now.copy()
-            tape = empty_tape(s, self.layout.size, 2 * CHUNK if now.taping else 0, self._cap)
+            tape = self._empty_tape(2 * CHUNK if now.taping else 0)
             now.work.travelled[0] = np.inf
             now.work.low[:] = now.work.high[:] = 0
             steps, done, status, solves, refused, failed, which = run(
@@ -219,14 +219,14 @@ class ImplicitStepper:
                 worst = part_name(self.rig, errors, which) if which >= 0 else "the state"
                 raise self._failure(status, float(clock[0]), float(clock[1]), worst)
 
-    def _start(self, y0: Array, time: Tensor, work: Work, step: Step, out: Progress) -> None:
+    def _start(self, y0: Array, time: Tensor, work: Any, step: Any, out: Progress) -> None:
         """Nodal forces, moments and loads at the start, the first row, and the rates there. Raises `SimulationFailed`."""
         signals = self.compiled.signals(time[None], self.reference).numpy()
         none = np.zeros(0)
         *_, status, _, _, _, _ = run(
             self._still, self._still, work, step, NO_SIGNALS, NO_ERRORS, True, y0, none, none, none, none, 0, 0.0,
             *self._limits, np.zeros(len(self.integrals.names)), out.y, out.forces, out.extras,
-            empty_tape(self._still, self.layout.size, 0, self._cap), none, none, np.zeros((0, 2, *signals.shape[1:])),
+            self._empty_tape(0), none, none, np.zeros((0, 2, *signals.shape[1:])),
             np.zeros(1, np.int64), np.zeros(1), signals,
         )  # fmt: skip
         if status != CONVERGED:
@@ -241,25 +241,28 @@ class ImplicitStepper:
         times = np.concatenate([np.zeros(0), *(plan.output_times for plan in todo)])
         return self.compiled.signals(torch.from_numpy(times), self.reference)
 
-    def tape(self, segment: Segment) -> Tape:
+    def tape(self, segment: Segment) -> Any:
         """The segment's tape, made again from where it began if it was not kept."""
         if segment.tape is not None:
             return segment.tape
         s, n = self.compiled.system(float(segment.plan.h[0])), len(segment.plan.out_step)
-        work, names = scratch(s, self.layout.size), len(self.integrals.names)
+        work, names = room("Work", s, self.layout.size, columns=1), len(self.integrals.names)
         work.V[:], work.u_dot[:] = segment.V, segment.u_dot
         extras = names + len(s.pad_base) + len(s.body_free)
         out = Progress(np.empty((n, self.layout.size)), np.empty((n, len(s.point_X), 2)), np.empty((n, extras)))
         again = Marching(
-            segment.y.copy(), work, empty_step(s, self.layout.size, names), np.zeros(names), out, None, 0.0
+            segment.y.copy(), work, room("Step", s, self.layout.size, integrals=names), np.zeros(names), out, None, 0.0
         )
         *_, tape = self._run(segment.plan, segment.signals, segment.at_outputs, again, slice(0, n), True)
         assert tape is not None
         return tape
 
+    def _empty_tape(self, stages: int) -> Any:
+        return room("Tape", self._still, self.layout.size, stages=stages, cap=self._cap)
+
     def _run(
         self, plan: Plan, signals: Array, at_outputs: Array, now: "Marching", rows: slice, taping: bool
-    ) -> tuple[int, int, int, int, Tape | None]:
+    ) -> tuple[int, int, int, int, Any]:
         """One compiled call; with `taping` once more with a longer tape if more points touch than it has room for."""
         s, steps, before = self.compiled.system(float(plan.h[0])), len(plan.h), now.copy()
         while True:
@@ -267,7 +270,7 @@ class ImplicitStepper:
                 np.inf
             )  # look for near points afresh, so that a segment made again has the same bits
             now.work.low[:] = now.work.high[:] = 0
-            tape = empty_tape(s, self.layout.size, 2 * steps if taping else 0, self._cap)
+            tape = self._empty_tape(2 * steps if taping else 0)
             done, rows_done, status, solves, *_ = run(
                 s, self._still, now.work, now.step, NO_SIGNALS, NO_ERRORS, True, now.y, *[np.zeros(3)] * 4, 0, 0.0,
                 *self._limits, now.integrals, now.out.y[rows], now.out.forces[rows], now.out.extras[rows], tape, plan.starts,
@@ -298,7 +301,7 @@ def stage_times(plan: Plan) -> Tensor:
     return torch.from_numpy((plan.starts[:, None] + plan.h[:, None] * np.array([GAMMA, 1.0])).ravel())
 
 
-def set_velocities(s: Any, work: Work, y: Array) -> None:
+def set_velocities(s: Any, work: Any, y: Array) -> None:
     """Newton's first guess: the velocities of the state."""
     for i, c in enumerate(s.body_coordinate):
         work.V[c] = y[s.body_V_start + i]

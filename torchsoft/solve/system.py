@@ -160,7 +160,8 @@ class Compiled:
             }
             mine = [i for i, c in enumerate(self._bodies.coordinate) if c // 3 * 3 in involved]
             columns[number, mine] = np.arange(len(mine))
-        contact_start = np.searchsorted(contact_pads, np.arange(len(rig.pads) + 1))
+        points = np.cumsum([0, *(len(rig.pads[contact.pad].point_nodes) for contact in rig.contacts.values())])
+        point_start = points[np.searchsorted(contact_pads, np.arange(len(rig.pads) + 1))]
         C, dC, reach = np.zeros(C_start[-1]), np.zeros(C_start[-1]), []
         for i, pad in enumerate(rig.pads.values()):
             if pad.inertial:
@@ -173,7 +174,7 @@ class Compiled:
                 dC[C_start[i] : C_start[i + 1]] = (by_nu * scale).numpy().ravel()
             reach.append(1.5 * np.abs(C[C_start[i] : C_start[i + 1]]).max())
         pads = Pads(
-            _ints(rows["base"]), _ints(node_start), _ints(contact_start), _ints(rows["y_start"]), _ints(rows["v_start"]),
+            _ints(rows["base"]), _ints(node_start), _ints(point_start), _ints(rows["y_start"]), _ints(rows["v_start"]),
             _ints(rows["chain_at"]), _ints(rows["branches"]), _ints(C_start), C, dC, np.array(reach), columns,
             (columns >= 0).sum(1),
         )  # fmt: skip
@@ -263,9 +264,14 @@ class Compiled:
             box = (*corners[:, 0][[corners[:, 0].argmin(), corners[:, 0].argmax()]], *np.sort(corners[:, 1])[[0, -1]])
             limits.append((-np.inf, np.inf, -np.inf, np.inf) if contact.may_leave else box)
         columns = [np.ascontiguousarray(x) for x in _ints(rows).reshape(-1, 8).T]
+        coordinate = np.stack((columns[1], self._pads.base[columns[0]]), 1)[..., None] + np.arange(3)
+        coordinate = np.ascontiguousarray(coordinate.reshape(-1, 6))
         make: Any = Contacts
         contacts = make(
-            *columns,
+            *columns[:2],
+            self._bodies.free[coordinate],
+            coordinate,
+            *columns[2:],
             _ints([*starts, self._count]),
             _ints(point_start),
             np.array(sizes),
@@ -273,7 +279,8 @@ class Compiled:
         )
         start = min((s.start for (part, _), s in rig.layout.slices.items() if part == "stretch"), default=0)
         points = Points(
-            np.concatenate([*X, np.zeros((0, 2))]), np.concatenate([*weight, np.zeros(0)]),
+            np.repeat(np.arange(len(rows)), np.diff(point_start)), np.concatenate([*X, np.zeros((0, 2))]),
+            np.concatenate([*weight, np.zeros(0)]),
             np.concatenate([*node, np.zeros((0, 2), np.int64)]), np.concatenate([*N, np.zeros((0, 2))]), start,
         )  # fmt: skip
         return contacts, points

@@ -6,8 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.solve.kernel.arrays import Array
-from torchsoft.solve.kernel.scratch import scratch, tangents
+from torchsoft.solve.kernel.arrays import Array, room
 from torchsoft.solve.kernel.tangent import forward
 from torchsoft.solve.progress import Progress, Segment
 from torchsoft.solve.stepper import ImplicitStepper
@@ -49,7 +48,7 @@ def iterate(
             segment = segments.pop()
             plan, tape = segment.plan, stepper.tape(segment)
             s, rows = stepper.compiled.system(float(plan.h[0])), np.empty((len(plan.out_step), size, n))
-            work, room = scratch(s, size, n), tangents(s, size, n)
-            forward(s, work, room, plan.h, tape, segment.signals, plan.out_step, plan.out_part, dy, dp, rows)
+            work, tangents = (room(kind, s, size, columns=n) for kind in ("Work", "Tangents"))
+            forward(s, work, tangents, plan.h, tape, segment.signals, plan.out_step, plan.out_part, dy, dp, rows)
             kept[segment.rows] = rows[:, columns]
         yield torch.from_numpy(kept), out

@@ -11,26 +11,181 @@ import numpy as np
 
 from torchsoft.codegen.invoke import call_linearise, call_pullback
 from torchsoft.solve.kernel import compiled, entry
-from torchsoft.solve.kernel.adjoint_pads import inertial_state, nodal_cotangent, pad_state
 from torchsoft.solve.kernel.arrays import Array
-from torchsoft.solve.kernel.interface import assemble
-from torchsoft.solve.kernel.linear import solve_dense
-from torchsoft.solve.kernel.stage import actuate, by_velocities
+from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
+from torchsoft.solve.kernel.interface import NEGLIGIBLE, assemble, restore
+from torchsoft.solve.kernel.linear import put, row_of, solve_dense
+from torchsoft.solve.kernel.stage import actuate, balance
 from torchsoft.solve.kernel.step import GAMMA, MIX, TINY, dense_states
-from torchsoft.solve.kernel.taped import restore
 
 
 @compiled
-def rigid_part(s: Any, w: Any, y: Array, signals: Array, a: float, Rv: Array) -> None:
-    """Derivative of the free coordinates' equations by their velocities without contact."""
-    Rv[:] = 0.0
-    for i in range(s.body_coordinate.size):
-        Rv[i, i] = -s.p[s.body_mass_at[i]] / a
-    for i in range(s.act_pushed.size):
-        number = s.body_free[s.act_pushed[i]]
-        if number >= 0:
-            actuate(s, i, w.q, w.V, signals, w.effort_x, w.effort, w.effort_J)
-            by_velocities(s, i, w.effort_J, a, Rv[number])
+def nodal_cotangent(
+    s: Any, w: Any, z: Any, pad: int, y_bar: Array, a: float, n: int, X: Array, full: Array, V_bar: Array
+) -> None:
+    """F_bar of the touched nodes into X[:, 0], from the cotangents of the pad's state and of the touching points' stretches."""
+    free = s.body_free
+    first, at = s.pad_node_start[pad], s.pad_point_start[pad]
+    b = z.surface[0, : 2 * n]
+    b[:] = 0.0
+    for i in range(w.actives[pad]):
+        k = w.active[at + i]
+        c = s.point_contact[k]
+        s_bar = a * y_bar[s.point_y_start + k]
+        for j in range(2):
+            if s.point_N[k, j] != 0.0:
+                row = 2 * w.slot[s.point_node[k, j]]
+                b[row] += s.point_N[k, j] * w.H[at + i, 2, 0] * s_bar
+                b[row + 1] += s.point_N[k, j] * w.H[at + i, 2, 1] * s_bar
+        for row in range(6):
+            number = s.contact_number[c, row]
+            if number >= 0:
+                V_bar[number] += w.H[at + i, 2, 2 + row] * s_bar
+    if s.pad_v_start[pad] >= 0:
+        i0, i1 = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1]
+        u_bar, v_bar = y_bar[s.pad_y_start[pad] :], y_bar[s.pad_v_start[pad] :]
+        own = full[i0:i1]
+        for i in range(i1 - i0):
+            own[i] = a * u_bar[i] + v_bar[i]
+        for i in range(n):
+            for r in range(2):
+                own[s.inertia_surface[2 * w.touched[first + i] + r]] += b[2 * i + r]
+        base = s.pad_base[pad]
+        cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
+        x_bar = y_axis = 0.0
+        for i in range(i1 - i0):
+            x_bar -= s.inertia_D[i0 + i, 0] * own[i]
+            y_axis -= s.inertia_D[i0 + i, 1] * own[i]
+            if i % 2 == 0:
+                x_bar += v_bar[i]
+            else:
+                y_axis += v_bar[i]
+        if free[base] >= 0:
+            V_bar[free[base]] += cos * x_bar - sin * y_axis
+        if free[base + 1] >= 0:
+            V_bar[free[base + 1]] += sin * x_bar + cos * y_axis
+        rates = z.dofs[0, i0:i1]
+        put(own, rates)
+        solve(s, pad, rates)
+        for i in range(n):
+            for r in range(2):
+                X[2 * i + r, 0] = rates[s.inertia_surface[2 * w.touched[first + i] + r]]
+        return
+    size, chain, branches = 2 * (s.pad_node_start[pad + 1] - first), s.pad_chain_at[pad], s.pad_branches[pad]
+    for i in range(n):
+        for r in range(2):
+            dof, total = 2 * (w.touched[first + i] - first) + r, 0.0
+            for m in range(2 * n):
+                total += w.P[2 * i + r, m] * b[m]
+            for branch in range(branches):
+                total += a * y_bar[s.pad_y_start[pad] + branch * size + dof] / (s.p[chain + branches + branch] + a)
+            X[2 * i + r, 0] = total
+
+
+@compiled
+def pad_state(
+    s: Any,
+    w: Any,
+    scratch: Any,
+    pad: int,
+    y: Array,
+    y_bar: Array,
+    a: float,
+    rate_bar: Array,
+    u_bar: Array,
+    p_bar: Array,
+) -> None:
+    """Cotangents of a massless pad's state at the stage's start, and of its material, from those of its nodal rates and
+    displacements (nodes, 2)."""
+    p, first, last, start = s.p, s.pad_node_start[pad], s.pad_node_start[pad + 1], s.pad_y_start[pad]
+    size, chain, branches = 2 * (last - first), s.pad_chain_at[pad], s.pad_branches[pad]
+    start_C, material, F = s.pad_C_start[pad], chain + 2 * branches, w.F.reshape(w.F.size)
+    by_rate, by_u, zeta, z_dot = scratch.surface[0], scratch.surface[1], scratch.surface[2], scratch.surface[3]
+    scratch.surface[:, :size] = 0.0
+    for node in range(w.low[pad], w.high[pad]):
+        for r in range(2):
+            c, d = rate_bar[node, r], u_bar[node, r]
+            if c != 0.0 or d != 0.0:
+                row = row_of(s.pad_C, start_C, 2 * (node - first) + r, size)
+                for m in range(size):
+                    by_rate[m] += row[m] * c
+                    by_u[m] += row[m] * d
+    scale_bar, left, right = 0.0, size, 0
+    for b in range(branches):
+        J, rest, z = p[chain + b], p[chain + branches + b] + a, start + b * size
+        J_bar = tau_bar = 0.0
+        for m in range(size):
+            loaded = 2 * w.low[pad] <= 2 * first + m < 2 * w.high[pad]
+            total = (a * y_bar[z + m] + J * by_rate[m]) / rest
+            if loaded or abs(y[z + m]) > NEGLIGIBLE:
+                rate = ((F[2 * first + m] if loaded else 0.0) - y[z + m]) / rest
+                left, right = min(left, m), m + 1 if m + 1 > right else right
+                zeta[m] += J * y[z + m]
+                z_dot[m] += J * rate
+                J_bar += by_rate[m] * rate + by_u[m] * y[z + m]
+                tau_bar -= total * rate
+            y_bar[z + m] += J * by_u[m] - total
+        p_bar[chain + b] += J_bar
+        p_bar[chain + branches + b] += tau_bar
+        scale_bar += J * J_bar
+    p_bar[material] += scale_bar / p[material]
+    for node in range(w.low[pad], w.high[pad]):
+        for r in range(2):
+            c, d = rate_bar[node, r], u_bar[node, r]
+            if c != 0.0 or d != 0.0:
+                row, by_nu = row_of(s.pad_dC, start_C, 2 * (node - first) + r, size), 0.0
+                for m in range(left, right):
+                    by_nu += row[m] * (c * z_dot[m] + d * zeta[m])
+                p_bar[material + 1] += by_nu
+
+
+@compiled
+def inertial_state(
+    s: Any, w: Any, z: Any, pad: int, y: Array, y_bar: Array, a: float, rate: Array, full: Array, rate_bar: Array,
+    u_bar: Array, nu: Array, V_bar: Array, p_bar: Array,
+) -> None:  # fmt: skip
+    """The same for an inertial pad; `rate` is its taped u', `full` what `nodal_cotangent` left, V_bar of all coordinates."""
+    free, at = s.body_free, s.inertia_material_at[pad]
+    i0, i1, base = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1], s.pad_base[pad]
+    U, W, mass = s.pad_y_start[pad], s.pad_v_start[pad], s.p[s.inertia_material_at[pad] + 3]
+    cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
+    nx = nu[free[base], 0] if free[base] >= 0 else 0.0
+    ny = nu[free[base + 1], 0] if free[base + 1] >= 0 else 0.0
+    own, strain, force, back = z.dofs[0, i0:i1], z.dofs[1, i0:i1], z.dofs[2, i0:i1], z.dofs[3, i0:i1]  # own: of u'
+    reaction, local = z.pair[0], z.pair[1]
+    reaction[0], reaction[1] = -(cos * nx + sin * ny), -(cos * ny - sin * nx)
+    for i in range(i1 - i0):
+        own[i] = a * y_bar[U + i] + y_bar[W + i] + mass * s.inertia_area[i0 + i] / a * reaction[i % 2]
+    for node in range(w.low[pad], w.high[pad]):
+        for r in range(2):
+            own[s.inertia_surface[2 * node + r]] += rate_bar[node, r]
+    solve(s, pad, own)  # now the multiplier of the pad's equation
+    vx, vy = base_velocity(s, pad, w.V, w.q)
+    here = rate[i0:i1]
+    stiffness_force(s, pad, here, force)
+    stiffness_force(s, pad, own, back)
+    for i in range(i1 - i0):
+        v = vx if i % 2 == 0 else vy
+        M = s.inertia_area[i0 + i] / a
+        change = here[i] + v - y[W + i]
+        p_bar[at + 2] -= own[i] * force[i]
+        p_bar[at + 3] += M * change * (reaction[i % 2] - own[i])
+        strain[i] = y[U + i] + (s.p[at + 2] + a) * here[i]
+    for k in range(i1 - i0):
+        for j in range(s.inertia_K_column.shape[1]):
+            product = own[k] * strain[s.inertia_K_column[i0 + k, j]]
+            p_bar[at] -= s.inertia_K_lambda[i0 + k, j] * product
+            p_bar[at + 1] -= s.inertia_K_mu[i0 + k, j] * product
+    local[:] = 0.0
+    for i in range(i1 - i0):
+        local[i % 2] += y_bar[W + i] + mass * s.inertia_area[i0 + i] / a * (reaction[i % 2] - own[i])
+        y_bar[U + i] -= back[i]
+        y_bar[W + i] = mass * s.inertia_area[i0 + i] / a * (own[i] - reaction[i % 2])
+    V_bar[base] += cos * local[0] - sin * local[1]
+    V_bar[base + 1] += sin * local[0] + cos * local[1]
+    for node in range(w.low[pad], w.high[pad]):
+        for r in range(2):
+            y_bar[U + s.inertia_surface[2 * node + r]] += u_bar[node, r]
 
 
 @compiled
@@ -42,7 +197,7 @@ def stage_adjoint(
     free, count, y = s.body_coordinate.size, s.pad_base.size, tape.y[row]
     restore(s, w, tape, row, a)
     Rv, matrix, nu, V_bar, full, rate_bar, u_bar = w.Rv, z.matrix, z.nu, z.V_bar, z.full, z.rate, z.u
-    rigid_part(s, w, y, signals, a, Rv)
+    balance(s, w, y, signals, a, w.r, Rv)
     matrix[:] = 0.0
     for i in range(free):
         V_bar[i] = y_bar[s.body_V_start + i] + a * y_bar[s.body_q_start + i]
@@ -75,8 +230,7 @@ def stage_adjoint(
     q_hat, V_hat, weights, by = z.q, z.V, z.weights, z.by
     q_hat[:], V_hat[:] = 0.0, 0.0
     for pad in range(count):
-        first, n, column = s.pad_node_start[pad], w.counts[pad], s.pad_column[pad]
-        at, c = s.contact_point_start[s.pad_contact_start[pad]], s.pad_contact_start[pad]
+        first, n, column, at = s.pad_node_start[pad], w.counts[pad], s.pad_column[pad], s.pad_point_start[pad]
         X = w.X[2 * first : 2 * (first + n)]
         for i in range(2 * n):
             for j in range(free):
@@ -86,11 +240,10 @@ def stage_adjoint(
             rate_bar[node, 0], rate_bar[node, 1], u_bar[node, 0], u_bar[node, 1] = 0.0, 0.0, 0.0, 0.0
         for i in range(w.actives[pad]):
             k = w.active[at + i]
-            while k >= s.contact_point_start[c + 1]:
-                c += 1
+            c = s.point_contact[k]
             H, S, G, L = w.H[at + i], w.S[at + i], w.G[at + i], w.L[at + i]
             for row_ in range(6):
-                number = s.body_free[s.contact_body[c] + row_] if row_ < 3 else s.body_free[s.pad_base[pad] + row_ - 3]
+                number = s.contact_number[c, row_]
                 by[row_] = nu[number, 0] if number >= 0 else 0.0
             for r in range(2):
                 weights[r] = 0.0
@@ -114,7 +267,7 @@ def stage_adjoint(
                         rate_bar[s.point_node[k, j], m] += s.point_N[k, j] * (velocity + a * position)
                         u_bar[s.point_node[k, j], m] += s.point_N[k, j] * position
                 else:
-                    coordinate = s.contact_body[c] + m - 2 if m < 5 else s.pad_base[pad] + m - 5
+                    coordinate = s.contact_coordinate[c, m - 2]
                     q_hat[coordinate] += position
                     V_hat[coordinate] += velocity
             s_bar = 0.0
@@ -162,22 +315,22 @@ def stage_adjoint(
 @compiled
 def free_stretches(s: Any, w: Any, z: Any, pad: int, y: Array, y_bar: Array, a: float, p_bar: Array) -> None:
     """Cotangents of the stretches away from contact, which decay."""
-    at, i = s.contact_point_start[s.pad_contact_start[pad]], 0
+    at, i = s.pad_point_start[pad], 0
     x, out, J, weight = z.decay_x, w.decay, z.decay_J, z.weights
-    for c in range(s.pad_contact_start[pad], s.pad_contact_start[pad + 1]):
-        own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
-        for k in range(s.contact_point_start[c], s.contact_point_start[c + 1]):
-            j = s.point_y_start + k
-            if i < w.actives[pad] and w.active[at + i] == k:
-                i += 1
-            elif y_bar[j] != 0.0:
-                x[0], x[1], x[2] = y[j], s.point_weight[k], a
-                call_linearise(s.contact_free_linearise[c], x, s.p[own], out, J)
-                weight[0] = a * y_bar[j]
-                call_pullback(s.contact_free_pullback[c], x, s.p[own], weight, p_bar[own])
-                y_bar[j] += J[0, 0] * weight[0]
-                if abs(y_bar[j]) < TINY:
-                    y_bar[j] = 0.0
+    for k in range(at, s.pad_point_start[pad + 1]):
+        j = s.point_y_start + k
+        if i < w.actives[pad] and w.active[at + i] == k:
+            i += 1
+        elif y_bar[j] != 0.0:
+            c = s.point_contact[k]
+            own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
+            x[0], x[1], x[2] = y[j], s.point_weight[k], a
+            call_linearise(s.contact_free_linearise[c], x, s.p[own], out, J)
+            weight[0] = a * y_bar[j]
+            call_pullback(s.contact_free_pullback[c], x, s.p[own], weight, p_bar[own])
+            y_bar[j] += J[0, 0] * weight[0]
+            if abs(y_bar[j]) < TINY:
+                y_bar[j] = 0.0
 
 
 @entry

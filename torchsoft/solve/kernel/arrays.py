@@ -48,7 +48,7 @@ class Actuators(NamedTuple):
 
 
 class Pads(NamedTuple):
-    """Per pad: base (its first coordinate), node_start, contact_start, y_start of its displacements' states, v_start of its
+    """Per pad: base (its first coordinate), node_start, point_start, y_start of its displacements' states, v_start of its
     velocities (-1: massless), chain_at of its branches' fractions and then times in p, branches, C_start in C, reach: the
     largest displacement per force; column, columns: free coordinates that its contacts involve, and their number.
 
@@ -57,7 +57,7 @@ class Pads(NamedTuple):
 
     base: Index
     node_start: Index
-    contact_start: Index
+    point_start: Index
     y_start: Index
     v_start: Index
     chain_at: Index
@@ -94,11 +94,14 @@ class Inertia(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """Per contact: pad, body (first coordinate), law addresses, p_start of its parameters, point_start, size of the body,
+    """Per contact: pad, body (first coordinate), free numbers of the coordinates of the body and of the pad's base (., 6) or
+    -1, and those coordinates; law addresses, p_start of its parameters, point_start, size of the body,
     limits (x from, x to, y from, y to) of the body's centre in the base's frame."""
 
     pad: Index
     body: Index
+    number: Index
+    coordinate: Index
     distance: Index
     linearise: Index
     pullback: Index
@@ -112,10 +115,11 @@ class Contacts(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Per contact point: undeformed place in the base's frame, weight, two surface nodes and their shape functions
+    """Per contact point: its contact, undeformed place in the base's frame, weight, two surface nodes and their shape functions
     there; y_start
     of the stretches."""
 
+    contact: Index
     X: Array
     weight: Array
     node: Index
@@ -173,30 +177,118 @@ NO_ERRORS = Errors(
 """What given steps are judged by: nothing."""
 
 
-class Tape(NamedTuple):
-    """What the derivatives need of every stage: y* (., size), q and V of all coordinates, the number of touching points of
-    every pad (., pads), their numbers (., cap), u, u' and f there (., cap, 6); of inertial pads u' of all dofs."""
+SCRATCH: dict[str, dict[str, str]] = {
+    "Work": {  # of a stage
+        "coordinates": "q V V_old load",
+        "contacts 7": "frame",
+        "dofs": "zeta zeta_rate",  # of a massless pad's chain
+        # displacement u*, rates (without contact, now, before and after a Newton step), forces by the law and by the linear
+        # relations (now, before, after)
+        "nodes 2": "u free u_dot u_dot_old u_dot_new F F_linear F_old F_new",
+        "points 9": "x",  # the law's inputs, outputs and Jacobian
+        "points 7": "out",
+        "points 3 7": "J",
+        "points 3 8": "H S",  # of the touching points in the order of `active`, see `interface`
+        "points 6 2": "G",
+        "points 6 8": "L",
+        "int points": "window active",  # numbers of points near and touching, from every pad's first point on
+        "int pads": "windows actives low high counts",  # numbers of those, nodes of the window, numbers of touched nodes
+        "int nodes": "slot touched",
+        "widest widest": "A P",  # one pad's share of Newton's system
+        "2 widest": "PB",
+        "6 8": "K",
+        "widest free": "Hc",
+        "free widest": "Rf",
+        "free 1": "r b",
+        "free free": "Rv",
+        "free": "dV",
+        "dofs columns+free": "X",  # left by Newton's elimination
+        "1": "phi effort",
+        "inputs": "effort_x",
+        "1 inputs": "effort_J",
+        "9": "probe",
+        "3": "decay travelled",  # way [m] since the last scan for near points, that scan's margin [m], number of scans
+        "4 inertial": "inertial",
+        "inertial": "full",  # u' of inertial pads
+        "state": "k",
+    },
+    "Step": {  # what one step leaves: its start with Newton's guesses; rates, powers, bounds of the speeds of its stages
+        "state": "y",
+        "integrals": "integrals at_row scrap",
+        "coordinates": "V guess_V",
+        "nodes 2": "u_dot guess",
+        "3": "travelled",
+        "2 state": "K",
+        "2 integrals": "powers",
+        "2": "speed",
+        "pads": "moments",
+    },
+    "Cotangents": {  # of u', rate and u, q and V, of a law's outputs and a point's bodies (by)
+        "4 widest": "surface",
+        "4 inertial": "dofs",
+        "2 2": "pair",
+        "free free": "matrix",
+        "free 1": "nu",
+        "free": "V_bar",
+        "inertial": "full",
+        "nodes 2": "rate u",
+        "coordinates": "q V",
+        "3": "weights decay_x",
+        "6": "by",
+        "1 1": "decay_J",
+        "3 state": "state",
+    },
+    "Tangents": {  # in so many directions (columns); span: dofs of every pad that count
+        "3": "weights decay_x",
+        "parameters": "gradient",
+        "3 columns": "change",
+        "free columns": "r V",
+        "nodes 2 columns": "u v own_rate",
+        "inertial columns": "free",
+        "int pads 2": "span",
+        "widest": "zeta rate",
+        "widest columns": "dzeta drate",
+        "2 columns": "base_rate known",
+        "points 3 columns": "e",
+        "6 columns": "q",
+        "1 1": "decay_J",
+        "state columns": "before first",
+    },
+    "Tape": {  # of every stage y*, q, V, the touching points of every pad, their numbers with u and u', inertial pads' u'
+        "stages state": "y",
+        "stages coordinates": "q V",
+        "int stages pads": "count",
+        "int stages cap": "point",
+        "stages cap 4": "state",
+        "stages inertial": "rate",
+    },
+}
+"""Arrays that the kernels write to, by name and shape: they allocate nothing."""
 
-    y: Array
-    q: Array
-    V: Array
-    count: Index
-    point: Index
-    state: Array
-    rate: Array
+KINDS: dict[str, Any] = {kind: namedtuple(kind, " ".join(shapes.values())) for kind, shapes in SCRATCH.items()}
+Work, Step, Cotangents, Tangents, Tape = KINDS.values()
 
 
-def empty_tape(s: Any, size: int, stages: int, cap: int) -> Tape:
-    """Room for that many stages, with `cap` touching points in all."""
-    coordinates, i = len(s.body_free), np.int64
-    return Tape(
-        np.zeros((stages, size)), np.zeros((stages, coordinates)), np.zeros((stages, coordinates)),
-        np.zeros((stages, len(s.pad_base)), i), np.zeros((stages, cap), i), np.zeros((stages, cap, 6)),
-        np.zeros((stages, int(s.inertia_dof_start[-1]))),
-    )  # fmt: skip
+def room(kind: str, s: Any, state: int, **sizes: int) -> Any:
+    """Zeros for one of `SCRATCH`, of a rig whose state has so many components; `sizes` are those that it does not decide."""
+    inputs = 1 + 2 * int((np.diff(s.act_setpoint_start) + np.diff(s.act_measured_start)).max(initial=0))
+    sizes |= {
+        "state": state, "coordinates": len(s.body_free), "free": len(s.body_coordinate), "contacts": len(s.contact_pad),
+        "points": len(s.point_X), "pads": len(s.pad_base), "nodes": int(s.pad_node_start[-1]), "inputs": inputs,
+        "dofs": 2 * int(s.pad_node_start[-1]), "widest": 2 * int(np.diff(s.pad_node_start).max(initial=0)),
+        "inertial": int(s.inertia_dof_start[-1]), "parameters": len(s.p),
+    }  # fmt: skip
+    made = {}
+    for shape, names in SCRATCH[kind].items():
+        whole = shape.startswith("int ")
+        lengths = [
+            sum(sizes[part] if part in sizes else int(part) for part in one.split("+"))
+            for one in shape.removeprefix("int ").split()
+        ]
+        made |= {name: np.zeros(lengths, np.int64 if whole else np.float64) for name in names.split()}
+    return KINDS[kind](**made)
 
 
-def first_stages(tape: Tape, stages: int) -> Tape:
+def first_stages(tape: Any, stages: int) -> Any:
     """The beginning of a tape, of a run that ended early."""
-    parts: Any = [part if len(part) == stages else part[:stages].copy() for part in tape]
-    return Tape(*parts)
+    return Tape(*(part if len(part) == stages else part[:stages].copy() for part in tape))

@@ -74,7 +74,7 @@ def couple_point(s: Any, w: Any, pad: int, k: int, c: int, K: Array, H: Array, R
                 for r in range(2):
                     w.Hc[row + r, column] -= s.point_N[k, j] * (H[r, 0] * Dx + H[r, 1] * Dy)
         for row in range(6):
-            number = free[s.contact_body[c] + row] if row < 3 else free[base + row - 3]
+            number = s.contact_number[c, row]
             if number >= 0:
                 Rv[number, towards] -= K[row, 0] * Dx + K[row, 1] * Dy
 

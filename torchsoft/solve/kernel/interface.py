@@ -21,7 +21,7 @@ from torchsoft.codegen.invoke import call_linearise, call_value
 from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.inertia import couple_base, couple_point, free_rates
-from torchsoft.solve.kernel.linear import row_of
+from torchsoft.solve.kernel.linear import put, row_of
 
 NEGLIGIBLE = 1e-14
 """Nodal force that has set in [N] below which a node counts as never loaded: its displacements are below rounding."""
@@ -41,14 +41,32 @@ def frames(s: Any, w: Any) -> None:
 
 
 @compiled
-def kinematics(
-    frame: Array, X: Array, ux: float, uy: float, vx: float, vy: float, spin: float, angle: float, x: Array
-) -> None:
-    """w, omega, d and theta of one point (Eq. 4-7) into x: the body's velocity less the point's, its spin, the moment arm from
+def kinematics(s: Any, w: Any, k: int, ux: float, uy: float, vx: float, vy: float, x: Array) -> None:
+    """w, omega, d and theta of point k (Eq. 4-7) into x: the body's velocity less the point's, its spin, the moment arm from
     its centre, its angle; (ux, uy) is the displacement and (vx, vy) its rate."""
-    px, py = X[0] + ux, X[1] + uy
-    x[0], x[1], x[2] = frame[4] + frame[6] * py - vx, frame[5] - frame[6] * px - vy, spin
-    x[3], x[4], x[5] = px - frame[2], py - frame[3], angle
+    c = s.point_contact[k]
+    frame, body, base = w.frame[c], s.contact_coordinate[c, 2], s.contact_coordinate[c, 5]
+    px, py = s.point_X[k, 0] + ux, s.point_X[k, 1] + uy
+    x[0], x[1], x[2] = frame[4] + frame[6] * py - vx, frame[5] - frame[6] * px - vy, w.V[body]
+    x[3], x[4], x[5] = px - frame[2], py - frame[3], w.q[body] - w.q[base]
+
+
+@compiled
+def at_point(s: Any, k: int, nodal: Array) -> tuple[float, float]:
+    """A nodal quantity (nodes, 2) at point k."""
+    n0, n1, N0, N1 = s.point_node[k, 0], s.point_node[k, 1], s.point_N[k, 0], s.point_N[k, 1]
+    return N0 * nodal[n0, 0] + N1 * nodal[n1, 0], N0 * nodal[n0, 1] + N1 * nodal[n1, 1]
+
+
+@compiled
+def apply_law(s: Any, w: Any, k: int, stretch: float, a: float) -> None:
+    """The law at point k with its derivatives, into w.out and w.J, and its force at the nodes, into w.F."""
+    c, x = s.point_contact[k], w.x[k]
+    x[6], x[7], x[8] = stretch, s.point_weight[k], a
+    call_linearise(s.contact_linearise[c], x, s.p[s.contact_p_start[c] : s.contact_p_start[c + 1]], w.out[k], w.J[k])
+    for j in range(2):
+        for r in range(2):
+            w.F[s.point_node[k, j], r] += s.point_N[k, j] * w.out[k, r]
 
 
 @compiled
@@ -117,19 +135,17 @@ def scan(s: Any, w: Any, y: Array, margin: float) -> None:
     for pad in range(s.pad_base.size):
         first, last = s.pad_node_start[pad], s.pad_node_start[pad + 1]
         displacements(s, w, pad, y, first, last)
-        at = s.contact_point_start[s.pad_contact_start[pad]]
+        at = s.pad_point_start[pad]
         count, low, high = 0, last, first
-        for c in range(s.pad_contact_start[pad], s.pad_contact_start[pad + 1]):
-            body, p = s.contact_body[c], s.p[s.contact_p_start[c] : s.contact_p_start[c + 1]]
-            for k in range(s.contact_point_start[c], s.contact_point_start[c + 1]):
-                n0, n1, N0, N1 = s.point_node[k, 0], s.point_node[k, 1], s.point_N[k, 0], s.point_N[k, 1]
-                ux, uy = N0 * w.u[n0, 0] + N1 * w.u[n1, 0], N0 * w.u[n0, 1] + N1 * w.u[n1, 1]
-                kinematics(w.frame[c], s.point_X[k], ux, uy, 0.0, 0.0, 0.0, w.q[body + 2] - w.q[s.pad_base[pad] + 2], x)
-                call_value(s.contact_distance[c], x, p, phi)
-                if not phi[0] > margin:
-                    w.window[at + count] = k
-                    count += 1
-                    low, high = min(low, min(n0, n1)), max(high, max(n0, n1) + 1)
+        for k in range(at, s.pad_point_start[pad + 1]):
+            c, n0, n1 = s.point_contact[k], s.point_node[k, 0], s.point_node[k, 1]
+            ux, uy = at_point(s, k, w.u)
+            kinematics(s, w, k, ux, uy, 0.0, 0.0, x)
+            call_value(s.contact_distance[c], x, s.p[s.contact_p_start[c] : s.contact_p_start[c + 1]], phi)
+            if not phi[0] > margin:
+                w.window[at + count] = k
+                count += 1
+                low, high = min(low, min(n0, n1)), max(high, max(n0, n1) + 1)
         for node in range(first, last):
             if node < w.low[pad] or node >= w.high[pad]:
                 w.u_dot[node, 0], w.u_dot[node, 1] = w.free[node, 0], w.free[node, 1]
@@ -144,29 +160,20 @@ def evaluate(s: Any, w: Any, pad: int, y: Array, a: float) -> tuple[float, float
     Returns how far these forces are from the ones that the linear relations were solved with: the largest difference [N], and
     the sum of squares [N2].
     """
-    at, count, actives, c = s.contact_point_start[s.pad_contact_start[pad]], w.windows[pad], 0, s.pad_contact_start[pad]
+    at, count, actives = s.pad_point_start[pad], w.windows[pad], 0
     for node in range(w.low[pad], w.high[pad]):
         w.F[node, 0], w.F[node, 1] = 0.0, 0.0
     phi = w.phi
     for i in range(count):
         k = w.window[at + i]
-        while k >= s.contact_point_start[c + 1]:
-            c += 1
-        body = s.contact_body[c]
-        n0, n1, N0, N1 = s.point_node[k, 0], s.point_node[k, 1], s.point_N[k, 0], s.point_N[k, 1]
-        vx, vy = N0 * w.u_dot[n0, 0] + N1 * w.u_dot[n1, 0], N0 * w.u_dot[n0, 1] + N1 * w.u_dot[n1, 1]
-        ux = N0 * w.u[n0, 0] + N1 * w.u[n1, 0] + a * vx
-        uy = N0 * w.u[n0, 1] + N1 * w.u[n1, 1] + a * vy
-        x, p = w.x[k], s.p[s.contact_p_start[c] : s.contact_p_start[c + 1]]
-        kinematics(w.frame[c], s.point_X[k], ux, uy, vx, vy, w.V[body + 2], w.q[body + 2] - w.q[s.pad_base[pad] + 2], x)
-        call_value(s.contact_distance[c], x, p, phi)
+        c = s.point_contact[k]
+        ux, uy = at_point(s, k, w.u)
+        vx, vy = at_point(s, k, w.u_dot)
+        kinematics(s, w, k, ux + a * vx, uy + a * vy, vx, vy, w.x[k])
+        call_value(s.contact_distance[c], w.x[k], s.p[s.contact_p_start[c] : s.contact_p_start[c + 1]], phi)
         if phi[0] >= 0.0:
             continue
-        x[6], x[7], x[8] = y[s.point_y_start + k], s.point_weight[k], a
-        call_linearise(s.contact_linearise[c], x, p, w.out[k], w.J[k])
-        for r in range(2):
-            w.F[n0, r] += N0 * w.out[k, r]
-            w.F[n1, r] += N1 * w.out[k, r]
+        apply_law(s, w, k, y[s.point_y_start + k], a)
         w.active[at + actives] = k
         actives += 1
     w.actives[pad] = actives
@@ -183,11 +190,10 @@ def evaluate(s: Any, w: Any, pad: int, y: Array, a: float) -> tuple[float, float
 @compiled
 def linearise(s: Any, w: Any, pad: int, a: float) -> None:
     """H, S, G and L of the touching points of a pad, from the law's Jacobians in `w.J`."""
-    at, c = s.contact_point_start[s.pad_contact_start[pad]], s.pad_contact_start[pad]
+    at = s.pad_point_start[pad]
     for i in range(w.actives[pad]):
         k = w.active[at + i]
-        while k >= s.contact_point_start[c + 1]:
-            c += 1
+        c = s.point_contact[k]
         cos, sin, rx, ry, vx, vy, spin = w.frame[c]
         dx, dy, fx, fy = w.x[k, 3], w.x[k, 4], w.out[k, 0], w.out[k, 1]
         px, py = dx + rx, dy + ry
@@ -215,8 +221,7 @@ def linearise(s: Any, w: Any, pad: int, a: float) -> None:
 def assemble(s: Any, w: Any, pad: int, a: float, Rv: Array) -> int:
     """The block of one pad: w.touched, w.slot, w.P, w.A, w.Hc, w.Rf, and its part in Rv (free, free). Returns how many
     nodes."""
-    free = s.body_free
-    at, c, first = s.contact_point_start[s.pad_contact_start[pad]], s.pad_contact_start[pad], s.pad_node_start[pad]
+    at, first = s.pad_point_start[pad], s.pad_node_start[pad]
     size, column = 2 * (s.pad_node_start[pad + 1] - first), s.pad_column[pad]
     n = 0
     for node in range(w.low[pad], w.high[pad]):
@@ -240,14 +245,12 @@ def assemble(s: Any, w: Any, pad: int, a: float, Rv: Array) -> int:
     for i in range(2 * n):
         A[i, : 2 * n] = 0.0
         A[i, i] = 1.0
-    K, PB, number = w.K, w.PB, w.number
+    K, PB = w.K, w.PB
     for i in range(w.actives[pad]):
         k = w.active[at + i]
-        while k >= s.contact_point_start[c + 1]:
-            c += 1
+        c = s.point_contact[k]
         H, G, L = w.H[at + i], w.G[at + i], w.L[at + i]
-        for m in range(3):
-            number[m], number[3 + m] = free[s.contact_body[c] + m], free[s.pad_base[pad] + m]
+        number = s.contact_number[c]
         PB[:, : 2 * n] = 0.0
         for j in range(2):
             N = s.point_N[k, j]
@@ -283,3 +286,32 @@ def assemble(s: Any, w: Any, pad: int, a: float, Rv: Array) -> int:
     if s.pad_v_start[pad] >= 0:
         couple_base(s, w, pad, n, Rv)
     return n
+
+
+@compiled
+def restore(s: Any, w: Any, tape: Any, row: int, a: float) -> None:
+    """Coordinates, touching points with the law's Jacobians there, H, S, G, L, nodal forces (w.F), displacements at the stage's
+    start (w.u) and rates (w.u_dot) of points, by point number in the first columns of w.x's scratch."""
+    put(tape.q[row], w.q)
+    put(tape.V[row], w.V)
+    frames(s, w)
+    slot = 0
+    for pad in range(s.pad_base.size):
+        at = s.pad_point_start[pad]
+        low, high = s.pad_node_start[pad + 1], s.pad_node_start[pad]
+        w.actives[pad] = tape.count[row, pad]
+        for i in range(w.actives[pad]):
+            for j in range(2):
+                node = s.point_node[tape.point[row, slot + i], j]
+                low, high = min(low, node), max(high, node + 1)
+        w.low[pad], w.high[pad] = min(low, high), high
+        for node in range(low, high):
+            w.F[node, 0], w.F[node, 1] = 0.0, 0.0
+        for i in range(w.actives[pad]):
+            k, state = tape.point[row, slot], tape.state[row, slot]
+            ux, uy = state[0] + a * state[2], state[1] + a * state[3]
+            kinematics(s, w, k, ux, uy, state[2], state[3], w.x[k])
+            apply_law(s, w, k, tape.y[row, s.point_y_start + k], a)
+            w.active[at + i] = k
+            slot += 1
+        linearise(s, w, pad, a)

@@ -13,6 +13,7 @@ from torchsoft.codegen.invoke import call_value
 from torchsoft.solve.kernel import compiled, entry
 from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.linear import put
+from torchsoft.solve.kernel.stage import actuate
 from torchsoft.solve.kernel.step import (
     CONVERGED,
     GAMMA,
@@ -21,6 +22,7 @@ from torchsoft.solve.kernel.step import (
     OFF_THE_RUNG,
     REFUSED,
     gone,
+    solve_near,
     take_back,
     take_step,
     write_rows,
@@ -139,7 +141,7 @@ def run(
     while (steps < h.size and (given or row < t_out.size)) or begin:
         t, wanted, end, error, last = clock[0], min(clock[1], longest), 0.0, 0.0, row
         if begin:  # the output at the start, where nothing has moved
-            d.K[:], d.powers[:], now, last = 0.0, 0.0, 0.0, row + 1
+            d.K[:], d.powers[:], w.travelled[0], now, last = 0.0, 0.0, np.inf, 0.0, row + 1
             put(y, d.y)
             put(integrals, d.integrals)
             put(w.travelled, d.travelled)
@@ -210,3 +212,34 @@ def enlarge(e: Any, y: Array) -> None:
         for i in range(e.first[part], e.last[part]):
             size += (y[i] - e.origin[i]) ** 2
         e.size[part] = max(e.size[part], np.sqrt(size))
+
+
+AT_ONCE = 1e-18
+"""Length a h [s] of the stage: no velocity changes in it by more than rounding does."""
+
+
+@entry
+def rates(
+    s: Any, w: Any, f: Any, t: float, y: Array, tolerance: float, max_iterations: int, margin: float, signals: Array,
+    powers: Array, moments: Array, out: Array,
+) -> bool:  # fmt: skip
+    """dy/dt of the state y at t [s] into out, of a rig whose pads are massless; False if Newton finds no forces there.
+
+    A stage of no length gives all rates; those of the velocities are a difference over its length
+    and come from the loads instead. signals (1, signals, 2) is scratch, as are powers and moments.
+    """
+    follow(f, t, t, signals)
+    for i in range(s.body_coordinate.size):
+        w.V[s.body_coordinate[i]] = y[s.body_V_start + i]
+    w.travelled[0] = np.inf  # the last state was any other one
+    converged, _, _ = solve_near(s, w, y, signals[0], AT_ONCE, tolerance, max_iterations, margin, powers, moments)
+    put(w.k, out)
+    for i in range(s.body_coordinate.size):
+        c, mass = s.body_coordinate[i], s.p[s.body_mass_at[i]]
+        load = w.load[c] - s.body_weight[i] * mass * s.p[s.body_gravity_at]
+        for a in range(s.act_pushed.size):
+            if s.act_pushed[a] == c:
+                load += actuate(s, a, w.q, w.V, signals[0], w.effort_x, w.effort, w.effort_J)
+        out[s.body_V_start + i] = load / mass  # (17), (18)
+        out[s.body_q_start + i] = y[s.body_V_start + i]
+    return converged

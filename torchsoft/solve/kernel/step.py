@@ -11,9 +11,9 @@ import numpy as np
 
 from torchsoft.solve.kernel import compiled, inlined
 from torchsoft.solve.kernel.arrays import Array
-from torchsoft.solve.kernel.finish import finish
+from torchsoft.solve.kernel.interface import at_point
 from torchsoft.solve.kernel.linear import put
-from torchsoft.solve.kernel.stage import actuate, solve_stage
+from torchsoft.solve.kernel.stage import actuate, finish, solve_stage
 
 GAMMA = 1.0 - 1.0 / np.sqrt(2.0)
 MIX = (1.0 - GAMMA) / GAMMA
@@ -36,20 +36,16 @@ def write_tape(s: Any, w: Any, tape: Any, row: int, y: Array) -> bool:
     put(w.full, tape.rate[row])
     slot = 0
     for pad in range(s.pad_base.size):
-        at = s.contact_point_start[s.pad_contact_start[pad]]
+        at = s.pad_point_start[pad]
         tape.count[row, pad] = w.actives[pad]
         if slot + w.actives[pad] > tape.point.shape[1]:
             return False
         for i in range(w.actives[pad]):
             k = w.active[at + i]
             tape.point[row, slot] = k
-            for r in range(2):
-                u = v = 0.0
-                for j in range(2):
-                    node, N = s.point_node[k, j], s.point_N[k, j]
-                    u += N * w.u[node, r]
-                    v += N * w.u_dot[node, r]
-                tape.state[row, slot, r], tape.state[row, slot, 2 + r], tape.state[row, slot, 4 + r] = u, v, w.out[k, r]
+            state = tape.state[row, slot]
+            state[0], state[1] = at_point(s, k, w.u)
+            state[2], state[3] = at_point(s, k, w.u_dot)
             slot += 1
     return True
 
@@ -58,7 +54,7 @@ def write_tape(s: Any, w: Any, tape: Any, row: int, y: Array) -> bool:
 def gone(s: Any, w: Any) -> int:
     """Whether a contact has reached the end of a pad, or a body has left the space over one."""
     for c in range(s.contact_pad.size):
-        at = s.contact_point_start[s.pad_contact_start[s.contact_pad[c]]]
+        at = s.pad_point_start[s.contact_pad[c]]
         for i in range(w.actives[s.contact_pad[c]]):
             if w.active[at + i] == s.contact_point_start[c] or w.active[at + i] == s.contact_point_start[c + 1] - 1:
                 return OFF_THE_PAD
@@ -100,7 +96,7 @@ def record(s: Any, w: Any, integrals: Array, moments: Array, forces: Array, extr
     """One row of output: (F_N, F_T) of every point; integrals, the pads' moments and the generalised contact forces."""
     forces[:] = 0.0
     for pad in range(s.pad_base.size):
-        at = s.contact_point_start[s.pad_contact_start[pad]]
+        at = s.pad_point_start[pad]
         for i in range(w.actives[pad]):
             k = w.active[at + i]
             forces[k, 0], forces[k, 1] = w.out[k, 3], w.out[k, 4]

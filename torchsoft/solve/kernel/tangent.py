@@ -10,14 +10,12 @@ import numpy as np
 
 from torchsoft.codegen.invoke import call_linearise, call_pullback
 from torchsoft.solve.kernel import compiled, entry
-from torchsoft.solve.kernel.adjoint import rigid_part
 from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
-from torchsoft.solve.kernel.interface import NEGLIGIBLE, assemble
+from torchsoft.solve.kernel.interface import NEGLIGIBLE, assemble, mobility_scale, restore
 from torchsoft.solve.kernel.linear import put, row_of, solve_dense
-from torchsoft.solve.kernel.stage import actuate, coordinates_at, eliminate
+from torchsoft.solve.kernel.stage import actuate, balance, coordinates_at, eliminate
 from torchsoft.solve.kernel.step import GAMMA, MIX, dense_states
-from torchsoft.solve.kernel.taped import restore
 
 NEGLIGIBLE_PART = 1e-17
 """Part of the largest derivative of nodal forces below which a node's counts as none."""
@@ -175,7 +173,7 @@ def stage_tangent(s: Any, w: Any, z: Any, tape: Any, row: int, a: float, signals
     free, count, y, m = s.body_coordinate.size, s.pad_base.size, tape.y[row], dy.shape[1]
     restore(s, w, tape, row, a)
     Rv, r, du, dv = w.Rv, z.r, z.u, z.v
-    rigid_part(s, w, y, signals, a, Rv)
+    balance(s, w, y, signals, a, w.r, Rv)
     for i in range(free):
         c, mass = s.body_coordinate[i], p[s.body_mass_at[i]]
         rate = (w.V[c] - y[s.body_V_start + i]) / a
@@ -211,18 +209,17 @@ def stage_tangent(s: Any, w: Any, z: Any, tape: Any, row: int, a: float, signals
         else:
             massless_part(s, w, z, pad, y, dy, dp, a)
         first, columns = s.pad_node_start[pad], s.pad_columns[pad]
-        at, c = s.contact_point_start[s.pad_contact_start[pad]], s.pad_contact_start[pad]
+        at = s.pad_point_start[pad]
         X = w.X[2 * first : 2 * (first + n)]
         X[:, :m] = 0.0
         for i in range(w.actives[pad]):
             k = w.active[at + i]
-            while k >= s.contact_point_start[c + 1]:
-                c += 1
+            c = s.point_contact[k]
             own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
             law_derivatives(z, s.contact_pullback[c], w.x[k], p[own], dp[own], 3, e[k])
             H, S, G, L = w.H[at + i], w.S[at + i], w.G[at + i], w.L[at + i]
             for o in range(6):
-                number = s.body_free[s.contact_body[c] + o] if o < 3 else s.body_free[s.pad_base[pad] + o - 3]
+                number = s.contact_number[c, o]
                 for d in range(m):
                     dq[o, d] = dy[s.body_q_start + number, d] if number >= 0 else 0.0
             n0, n1, N0, N1 = s.point_node[k, 0], s.point_node[k, 1], s.point_N[k, 0], s.point_N[k, 1]
@@ -240,7 +237,7 @@ def stage_tangent(s: Any, w: Any, z: Any, tape: Any, row: int, a: float, signals
                         if s.point_N[k, j] != 0.0:
                             X[2 * w.slot[s.point_node[k, j]] + o, d] += s.point_N[k, j] * e[k, o, d]
                 for o in range(6):
-                    number = s.body_free[s.contact_body[c] + o] if o < 3 else s.body_free[s.pad_base[pad] + o - 3]
+                    number = s.contact_number[c, o]
                     if number >= 0:
                         total = G[o, 0] * known[0, d] + G[o, 1] * known[1, d]
                         total += L[o, 0] * (ux + a * vx) + L[o, 1] * (uy + a * vy)
@@ -273,12 +270,9 @@ def advance_pad(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array,
     first, last, n, m = s.pad_node_start[pad], s.pad_node_start[pad + 1], w.counts[pad], dy.shape[1]
     size, column = 2 * (last - first), s.pad_column[pad]
     own_rate, base_rate, span, dV, e = z.own_rate, z.base_rate, z.span, z.V, z.e  # own_rate: of u', what is not in dv
-    X, at, start = w.X[2 * first : 2 * (first + n)], s.contact_point_start[s.pad_contact_start[pad]], s.pad_y_start[pad]
-    inertial, scale = s.pad_v_start[pad] >= 0, 0.0
+    X, at, start = w.X[2 * first : 2 * (first + n)], s.pad_point_start[pad], s.pad_y_start[pad]
+    inertial, scale = s.pad_v_start[pad] >= 0, mobility_scale(s, pad, a)
     chain, branches, base = s.pad_chain_at[pad], s.pad_branches[pad], s.pad_base[pad]
-    for b in range(branches):
-        scale += p[chain + b] / (p[chain + branches + b] + a)
-    scale = 1.0 if inertial else scale
     for number in range(column.size):
         if column[number] >= 0:
             for i in range(2 * n):
@@ -306,35 +300,34 @@ def advance_pad(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array,
                 for k in range(m):
                     own_rate[i, o, k] -= s.inertia_D[dof, 0] * base_rate[0, k] + s.inertia_D[dof, 1] * base_rate[1, k]
     i, x, out, J, change = 0, z.decay_x, w.decay, z.decay_J, z.change
-    for c in range(s.pad_contact_start[pad], s.pad_contact_start[pad + 1]):
+    for k in range(at, s.pad_point_start[pad + 1]):
+        j, c = s.point_y_start + k, s.point_contact[k]
         own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
-        for k in range(s.contact_point_start[c], s.contact_point_start[c + 1]):
-            j = s.point_y_start + k
-            if i < w.actives[pad] and w.active[at + i] == k:
-                H = w.H[at + i]
-                for d in range(m):
-                    total = e[k, 2, d]
-                    for q in range(2):
-                        if s.point_N[k, q] != 0.0:
-                            slot = w.slot[s.point_node[k, q]]
-                            total += s.point_N[k, q] * (H[2, 0] * own_rate[slot, 0, d] + H[2, 1] * own_rate[slot, 1, d])
-                    for o in range(6):
-                        number = s.body_free[s.contact_body[c] + o] if o < 3 else s.body_free[base + o - 3]
-                        if number >= 0:
-                            total += H[2, 2 + o] * dV[number, d]
-                    dy[j, d] += a * total
-                i += 1
-                continue
-            moved = False
+        if i < w.actives[pad] and w.active[at + i] == k:
+            H = w.H[at + i]
             for d in range(m):
-                moved |= dy[j, d] != 0.0
-            if moved or y[j] != 0.0:
-                x[0], x[1], x[2] = y[j], s.point_weight[k], a
-                call_linearise(s.contact_free_linearise[c], x, p[own], out, J)
-                law_derivatives(z, s.contact_free_pullback[c], x, p[own], dp[own], 1, change)
-                for d in range(m):
-                    new = dy[j, d] + a * (J[0, 0] * dy[j, d] + change[0, d])
-                    dy[j, d] = new if abs(new) > 1e-200 else 0.0
+                total = e[k, 2, d]
+                for q in range(2):
+                    if s.point_N[k, q] != 0.0:
+                        slot = w.slot[s.point_node[k, q]]
+                        total += s.point_N[k, q] * (H[2, 0] * own_rate[slot, 0, d] + H[2, 1] * own_rate[slot, 1, d])
+                for o in range(6):
+                    number = s.contact_number[c, o]
+                    if number >= 0:
+                        total += H[2, 2 + o] * dV[number, d]
+                dy[j, d] += a * total
+            i += 1
+            continue
+        moved = False
+        for d in range(m):
+            moved |= dy[j, d] != 0.0
+        if moved or y[j] != 0.0:
+            x[0], x[1], x[2] = y[j], s.point_weight[k], a
+            call_linearise(s.contact_free_linearise[c], x, p[own], out, J)
+            law_derivatives(z, s.contact_free_pullback[c], x, p[own], dp[own], 1, change)
+            for d in range(m):
+                new = dy[j, d] + a * (J[0, 0] * dy[j, d] + change[0, d])
+                dy[j, d] = new if abs(new) > 1e-200 else 0.0
     if inertial:
         advance_inertial(s, w, z, pad, a, dy)
         return
