@@ -20,7 +20,7 @@ from torchsoft.physics.motion import Piecewise, Reference, Sampled
 from torchsoft.physics.rig import Rig
 from torchsoft.sysid.fit import Fit, Loss, Notify, Unreachable
 from torchsoft.sysid.initial_state import AtRest
-from torchsoft.sysid.plan import SCANNED, USUAL, Stage, default_plan, run_stage
+from torchsoft.sysid.plan import SCANNED, USUAL, Stage, default_plan, run_plan
 from torchsoft.sysid.prediction import Frozen, set_parameters
 from torchsoft.sysid.problem import Problem, Residuals, check_value
 from torchsoft.sysid.recording import Array, Recording
@@ -404,15 +404,8 @@ def refit(problem: Problem, end: End, one: Variation | None, loss: Loss, notify:
 
     def carried_out(plan: Sequence[Stage], x: Array) -> Iterator[Fit]:
         """The fit of the last stage, if none is lost."""
-        fit = None
-        try:
-            for stage in plan:
-                fit = run_stage(other, runner, stage, x, loss, "gauss_newton", 0, notify)
-                x = fit.x
-        except Unreachable:
-            return
-        if fit is not None:
-            yield fit
+        with suppress(Unreachable):
+            yield run_plan(other, runner, plan, x, loss=loss, notify=notify)[0]
 
     fits = [*carried_out([Stage("once more", end.which, labels, end.rtol, REFITS, ROUGH, scanned=scans)], x)]
     if one is not None and one.kind in ("law", "known") and end.far:

@@ -12,10 +12,10 @@ from scipy import stats
 from scipy.sparse.linalg import spsolve_triangular
 
 from torchsoft.sysid.comparison import Comparison, LawFit, Series, Versus, judged
-from torchsoft.sysid.fit import Fit, Unreachable, gauss_newton
+from torchsoft.sysid.fit import Unreachable, gauss_newton
 from torchsoft.sysid.identification import RTOL
 from torchsoft.sysid.noise import Autoregression, fit_noise, log_det
-from torchsoft.sysid.plan import FINER, Stage, default_plan, progress_bar, run_stage
+from torchsoft.sysid.plan import FINER, Stage, default_plan, run_plan
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.residual_tests import ROUNDS, Part, colours, judge_residuals, parts, residual_notices
@@ -244,12 +244,7 @@ def fitted(
         plan = default_plan(problem, runner, rtol, which, starts)
     if not plan or list(plan[-1].recordings) != list(which):
         raise ValueError(f"the last stage of the plan of `{name}` must fit {', '.join(which)}")
-    x, fit = problem.coordinates.start, None
-    for number, stage in enumerate(plan):
-        with progress_bar(f"{name} {number + 1}/{len(plan)} {stage.name}", progress) as bar:
-            fit = run_stage(problem, runner, stage, x, "linear", "gauss_newton", number, bar)
-        x = fit.x
-    assert fit is not None
+    fit, _ = run_plan(problem, runner, plan, problem.coordinates.start, label=f"{name} ", progress=progress)
     assert fit.at is not None
     free = np.isin(problem.coordinates.labels, plan[-1].free)
     declared, given = [c for c, s in problem.sensors.items() if s.colour == "ar"], problem.noise
@@ -261,11 +256,7 @@ def fitted(
         problem = problem.with_noise(noise)
         fit = gauss_newton(problem, runner, fit.x, which=which, free=free, steps=fit.steps, tolerance=CLOSE)
         assert fit.at is not None
-    return ended(name, problem, fit, free, plan[-1].rtol)
-
-
-def ended(name: str, problem: Problem, fit: Fit, free: np.ndarray, rtol: float) -> FittedLaw:
-    return FittedLaw(name, problem, fit.x, free, rtol, fit.converged)
+    return FittedLaw(name, problem, fit.x, free, plan[-1].rtol, fit.converged)
 
 
 def refitted(law: FittedLaw, best: FittedLaw, runner: Runner, which: Sequence[str]) -> FittedLaw | None:
@@ -290,7 +281,7 @@ def refitted(law: FittedLaw, best: FittedLaw, runner: Runner, which: Sequence[st
         )
     except Unreachable:
         return None
-    return ended(law.name, law.problem, fit, law.free, law.rtol)
+    return FittedLaw(law.name, law.problem, fit.x, law.free, law.rtol, fit.converged)
 
 
 def most_likely(evidence: Mapping[str, Evidence]) -> str:

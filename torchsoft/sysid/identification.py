@@ -23,7 +23,7 @@ from torchsoft.sysid.plan import (
     Stage,
     default_plan,
     progress_bar,
-    run_stage,
+    run_plan,
     settle,
     stage_entry,
 )
@@ -286,18 +286,12 @@ def identify(
     findings = accepted(precheck(problem, runner, fitted), acknowledged) if assumptions != "trusted" else []
     for look in findings if progress else ():
         tqdm.write(plain(f"note: {look}"), file=sys.stderr)
-    x, fit, stages = problem.coordinates.start, None, []
     with explained(findings):
         if plan is None:
             plan = default_plan(problem, runner, rtol, fitted, starts)
-        for number, stage in enumerate(plan):
-            before = clock.perf_counter()
-            with progress_bar(f"{number + 1}/{len(plan)} {stage.name}", progress) as bar:
-                fit = run_stage(problem, runner, stage, x, loss, method, seed + number, bar)
-            x = fit.x
-            stages.append(stage_entry(stage.name, stage, stage.rtol, fit, before))
-    if fit is None:
-        raise ValueError("`plan` has no stages")
+        fit, stages = run_plan(
+            problem, runner, plan, problem.coordinates.start, loss=loss, method=method, seed=seed, progress=progress
+        )
     before = clock.perf_counter()
     with progress_bar("colour of the noise", progress) as bar:
         coloured = with_its_noise(problem, runner, plan[-1], fit, loss, method, bar)

@@ -156,6 +156,24 @@ def progress_bar(label: str, shown: bool) -> Iterator[Notify]:
         yield notify
 
 
+def run_plan(
+    problem: Problem, runner: Runner, plan: Sequence[Stage], x: Array, *, loss: Loss = "linear",
+    method: Method = "gauss_newton", seed: int = 0, label: str = "", progress: bool = False, notify: Notify | None = None,
+) -> tuple[Fit, list[dict[str, Any]]]:  # fmt: skip
+    """The fit of the last stage, each begun where the one before it ended, the first at x, and the result's entries on the
+    stages. Raises `Unreachable` where a stage cannot be simulated, and `ValueError` for a plan without stages."""
+    fit, entries = None, list[dict[str, Any]]()
+    for number, stage in enumerate(plan):
+        began = clock.perf_counter()
+        with progress_bar(f"{label}{number + 1}/{len(plan)} {stage.name}", progress) as bar:
+            fit = run_stage(problem, runner, stage, x, loss, method, seed + number, notify or bar)
+        x = fit.x
+        entries.append(stage_entry(stage.name, stage, stage.rtol, fit, began))
+    if fit is None:
+        raise ValueError("`plan` has no stages")
+    return fit, entries
+
+
 def run_stage(
     problem: Problem, runner: Runner, stage: Stage, x: Array, loss: Loss, method: Method, seed: int, notify: Any
 ) -> Fit:
