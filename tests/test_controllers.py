@@ -73,11 +73,11 @@ def test_a_network_of_the_state_in_a_file(tmp_path: Path) -> None:
     asked = file(network="law.npz", measures=["bracket.x", "bracket.y", "disc.x"], gain=None)
     asked._folder = tmp_path
     (found, *_) = check(asked)
-    assert (found.severity, found.field) == ("error", "controllers.jaw.network")
-    assert "has the shape (3, 8)" in found.sentence
+    assert (found.severity, found.where) == ("error", "controllers.jaw.network")
+    assert "has the shape (3, 8)" in found.message
     assert (
         "from 10 inputs (x_d, y_d, x_d', y_d', bracket.x, bracket.y, disc.x, bracket.x', bracket.y', disc.x')"
-        in found.sentence
+        in found.message
     )
 
 
@@ -102,4 +102,4 @@ def test_controllers_that_make_no_sense_are_refused(changes: dict[str, Any], sen
 
 def test_an_unstable_controller_is_found_before_the_run() -> None:
     found = check(file(gain=[[1e5, 0.0, -4000.0, 0.0], [0.0, 1e5, 0.0, 400.0]]))
-    assert any(one.severity == "error" and "the rig is unstable" in one.sentence for one in found)
+    assert any(one.severity == "error" and "the rig is unstable" in one.message for one in found)

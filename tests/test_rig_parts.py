@@ -295,8 +295,8 @@ def test_a_network_from_a_file_is_the_module_in_python(folder: Path) -> None:
 def test_weights_that_are_no_network_are_refused(tmp_path: Path, arrays: dict[str, Any], sentence: str) -> None:
     np.savez(tmp_path / "law.npz", allow_pickle=True, **arrays)
     (found,) = check(rig(tmp_path, actuators={"x": {"network": "law.npz"}}))
-    assert (found.severity, found.field) == ("error", "actuators.x.network")
-    assert re.search(sentence, found.sentence), found.sentence
+    assert (found.severity, found.where) == ("error", "actuators.x.network")
+    assert re.search(sentence, found.message), found.message
 
 
 # rigs that make no sense ---------------------------------------------------------------------------------------------

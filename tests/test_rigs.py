@@ -127,9 +127,9 @@ def test_a_loop_is_unstable_as_the_papers_modes_say() -> None:
     paper = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "paper")))
     (found,) = check(changed(paper, materials__rubber__tau=1e-3))
     assert found.severity == "error"
-    assert found.field == "actuators.x"
-    assert "the rig is unstable at t = 0.375 s: its leading mode is +" in found.sentence
-    words = found.sentence.partition("mode is ")[2].split()
+    assert found.where == "actuators.x"
+    assert "the rig is unstable at t = 0.375 s: its leading mode is +" in found.message
+    words = found.message.partition("mode is ")[2].split()
     assert float(words[0]) == pytest.approx(leading.real, rel=0.2)
     assert float(words[2].rstrip("j")) == pytest.approx(abs(leading.imag), rel=0.05)
 
@@ -149,13 +149,13 @@ def test_steps_are_held_against_the_modes() -> None:
     """With less damping the paper's loops swing with 600 rad/s: five steps a period are 2 ms."""
     paper = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "paper")))
     paper = changed(paper, materials__rubber__tau=2e-3)
-    sentences = [[one.sentence for one in check(paper.override(solver={"step": h}))] for h in (1e-3, 4e-3)]
+    sentences = [[one.message for one in check(paper.override(solver={"step": h}))] for h in (1e-3, 4e-3)]
     assert [any("a mode of the rig swings with" in one for one in found) for found in sentences] == [False, True]
 
 
 def test_a_body_that_flies_is_told_of_coarse_steps() -> None:
     file = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "drop")), solver={"step": 0.05})
-    assert any("a body comes flying and may be through a pad" in one.sentence for one in check(file))
+    assert any("a body comes flying and may be through a pad" in one.message for one in check(file))
 
 
 # motions -------------------------------------------------------------------------------------------------------------
@@ -207,8 +207,8 @@ def test_a_recorded_motion_that_cannot_be_is_named(tmp_path: Path, text: str, se
     file._folder = tmp_path
     (first, *_) = check(file)
     assert first.severity == "error"
-    assert first.field == "motion.x_d.file"
-    assert re.search(sentence, first.sentence), first.sentence
+    assert first.where == "motion.x_d.file"
+    assert re.search(sentence, first.message), first.message
 
 
 def test_what_two_pads_grip_is_taken_along() -> None:
@@ -252,7 +252,7 @@ def test_orientation_is_controlled_through_another_body() -> None:
     del tree["motion"]["x_d"]
     tree["outputs"] = {"duration": 1.3, "interval": 0.05}
     early = RigFile.model_validate(tree)  # before they touch
-    assert any("nothing that touches ties disc.theta" in one.sentence for one in check(early))
+    assert any("nothing that touches ties disc.theta" in one.message for one in check(early))
     tree["bodies"]["bracket"]["start"]["y"] = 49.5e-3
     tree["motion"]["y_d"] = {"kind": "hold"}
     file = RigFile.model_validate(tree)
@@ -261,7 +261,7 @@ def test_orientation_is_controlled_through_another_body() -> None:
     assert float(run["theta_disc"][-1]) == pytest.approx(0.3, abs=5e-3)
     assert float(run["x_bracket"][-1]) < -8e-3
     wrong = file.override(actuators={"x": {"reversed": False}})
-    assert "the rig is unstable" in check(wrong)[0].sentence
+    assert "the rig is unstable" in check(wrong)[0].message
 
 
 # starts and estimates ------------------------------------------------------------------------------------------------

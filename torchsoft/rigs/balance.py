@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchsoft.diagnostic import Diagnostic
 from torchsoft.physics.motion import Reference, hold
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import NoEquilibrium, massless, standing
 from torchsoft.rigs.course import Estimate, at, signals
-from torchsoft.rigs.fields import Finding
 from torchsoft.rigs.geometry import Scene, tied
 from torchsoft.rigs.motion import ProfileTable
 from torchsoft.solve.kernel.run import PASSED
@@ -49,23 +49,23 @@ class Moment(NamedTuple):
 
 
 @torch.no_grad()
-def at_moments(e: Estimate) -> list[Finding]:
+def at_moments(e: Estimate) -> list[Diagnostic]:
     """What comes of the rig in balance at some of its motions' knots: strains, modes, steps, friction."""
-    rig, found, there = massless(e.rig), list[Finding](), list[Moment]()
+    rig, found, there = massless(e.rig), list[Diagnostic](), list[Moment]()
     for time in e.moments(MOMENTS):
         scene = Scene(rig, e.balanced(time))
-        found += [one for one in fits(time, scene) if one.field not in {other.field for other in found}]
+        found += [one for one in fits(time, scene) if one.where not in {other.where for other in found}]
         if found:
             return found
         try:
             y = standing(rig, {name: torch.from_numpy(x) for name, x in scene.pose.items()})
         except NoEquilibrium as error:
-            return [Finding("error", "motion", f"pads cannot settle where bodies are at t = {time:.3g} s: {error}")]
+            return [Diagnostic("error", "motion", f"pads cannot settle where bodies are at t = {time:.3g} s: {error}")]
         reference = hold(**signals(rig, time))
         there.append(Moment(time, scene, y, rig.unpack(y, rig.follow(0.0, reference)), reference))
     for time, why in list(e.unbalanced.items())[:1]:
         found.append(
-            Finding(
+            Diagnostic(
                 "warning", "motion",
                 f"nothing was found to be in balance at t = {time:.3g} s, so that strains and stability are not judged under "
                 f"the efforts there, only where set-points put bodies: {why}; push less, or leave bodies more room",
@@ -74,7 +74,7 @@ def at_moments(e: Estimate) -> list[Finding]:
     return [*found, *presses(there), *strains(there), *swings(e, there), *slips(e, there)]
 
 
-def fits(time: float, scene: Scene) -> Iterator[Finding]:
+def fits(time: float, scene: Scene) -> Iterator[Diagnostic]:
     """Bodies that pads have no room for."""
     pairs = [pair for body in scene.rig.bodies for pair in scene.facing(body)]
     alone = [(key,) for key in scene.rig.contacts if not any(key in pair for pair in pairs)]
@@ -82,7 +82,7 @@ def fits(time: float, scene: Scene) -> Iterator[Finding]:
         give, height = room(scene, group), sum(scene.pad(key).mesh.height for key in group)
         if give / height >= COMPRESSED:
             body, pads = scene.rig.contacts[group[0]].body, named(scene, group)
-            yield Finding(
+            yield Diagnostic(
                 "error", f"contacts.{group[-1]}",
                 f"`{body}` does not fit: at t = {time:.3g} s it asks {pads} to give way by {1e3 * give:.3g} mm, "
                 f"{give / height:.0%} of their height, far beyond linear elasticity; leave it more room",
@@ -101,34 +101,34 @@ def room(scene: Scene, group: Sequence[str]) -> float:
     return -beside if beside > 0 else sum(scene.pressed(key) for key in group)
 
 
-def presses(there: list[Moment]) -> Iterator[Finding]:
+def presses(there: list[Moment]) -> Iterator[Diagnostic]:
     """Pads that face each other and never press what is between them."""
     scene = there[0].scene
     for pair in sorted({pair for moment in there for body in scene.rig.bodies for pair in moment.scene.facing(body)}):
         nearest = max(room(moment.scene, pair) for moment in there)
         if nearest <= 0:
-            yield Finding(
+            yield Diagnostic(
                 "warning", f"contacts.{pair[-1]}",
                 f"{named(scene, pair)} never press `{scene.rig.contacts[pair[0]].body}`: at the motions' knots they come no "
                 f"nearer than {-1e3 * nearest:.3g} mm",
             )  # fmt: skip
 
 
-def strains(there: list[Moment]) -> Iterator[Finding]:
+def strains(there: list[Moment]) -> Iterator[Diagnostic]:
     """Pads that are pressed in beyond linear elasticity."""
     rig = there[0].scene.rig
     for name, pad in rig.pads.items():
         parts = [float(rig.displacement(name, m.state).norm(dim=-1).max()) / pad.mesh.height for m in there]
         worst = int(np.argmax(parts))
         if parts[worst] > LINEAR:
-            yield Finding(
+            yield Diagnostic(
                 "warning", f"pads.{name}",
                 f"the strain leaves linear elasticity: at t = {there[worst].time:.3g} s it gives way by {parts[worst]:.0%} of "
                 f"its height, and above {LINEAR:.0%} forces are off; press less, or take a thicker or stiffer pad",
             )  # fmt: skip
 
 
-def swings(e: Estimate, there: list[Moment]) -> Iterator[Finding]:
+def swings(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
     """Loops that are unstable or not tied to what they measure, and steps that are too long. What goes off where no loop
     reaches is no loop's fault: a disc on the top of a node rolls off it."""
     rig, fastest, least = there[0].scene.rig, 0.0, (complex("-inf"), 0.0)
@@ -140,7 +140,7 @@ def swings(e: Estimate, there: list[Moment]) -> Iterator[Finding]:
         for one in e.loops:
             (measured, _), (pushed, _) = at(one.measured), at(one.pushes)
             if not nx.has_path(ties, measured, pushed):
-                yield Finding(
+                yield Diagnostic(
                     "warning", one.field,
                     f"at t = {moment.time:.3g} s nothing that touches ties {one.measured}, which it measures, to {one.pushes}: "
                     f"what `{measured}` does by itself drives `{pushed}` away; start where they touch, or measure {one.pushes}",
@@ -151,7 +151,7 @@ def swings(e: Estimate, there: list[Moment]) -> Iterator[Finding]:
         growing = complex(values[0])
         if growing.real > NEUTRAL and any(at(q)[0] in reached for one in e.loops for q in (one.measured, one.pushes)):
             across = [one.field for one in e.loops if one.measured != one.pushes]
-            yield Finding(
+            yield Diagnostic(
                 "error", (*across, "actuators")[0],
                 f"the rig is unstable at t = {moment.time:.3g} s: its leading mode is {shown(growing)}, mostly of {moves}, and "
                 f"grows by a factor of e in {1 / growing.real:.2g} s; lower the gains, raise the pads' tau or E, or measure "
@@ -162,7 +162,7 @@ def swings(e: Estimate, there: list[Moment]) -> Iterator[Finding]:
         if len(decaying) and float(decaying[0].real) > least[0].real:
             least = complex(decaying[0]), moment.time
     if e.loops and np.isfinite(least[0].real):
-        yield Finding(
+        yield Diagnostic(
             "note", "actuators", f"stable; the mode that lasts longest is {shown(least[0])}, at t = {least[1]:.3g} s"
         )
     if e.file.solver.step is not None:
@@ -185,7 +185,7 @@ def flight(e: Estimate, scene: Scene) -> float:
     return most
 
 
-def steps(e: Estimate, step: float, fastest: float, flies: float) -> Iterator[Finding]:
+def steps(e: Estimate, step: float, fastest: float, flies: float) -> Iterator[Diagnostic]:
     """Equal steps that are too long for the rig's modes, its motions, or a body that comes flying."""
     limits: list[tuple[float, str]] = []
     for name, motion in e.file.motion.items():
@@ -206,13 +206,13 @@ def steps(e: Estimate, step: float, fastest: float, flies: float) -> Iterator[Fi
             )
     for most, why in limits:
         if step > most:
-            yield Finding(
+            yield Diagnostic(
                 "warning", "solver.step",
                 f"steps of {step:g} s are too coarse: {why}, or leave step out and let rtol choose",
             )  # fmt: skip
 
 
-def slips(e: Estimate, there: list[Moment]) -> Iterator[Finding]:
+def slips(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
     """Friction that falls with slip faster than is single-valued."""
     rig = there[0].scene.rig
     for key, contact in rig.contacts.items():
@@ -220,4 +220,4 @@ def slips(e: Estimate, there: list[Moment]) -> Iterator[Finding]:
             continue
         force = max(float(m.state.pads[contact.pad][0].norm(dim=-1).max()) for m in there)
         if why := contact.law.jumps(force / float(rig.weight(key).max())):
-            yield Finding("warning", f"laws.{e.file.contacts[key].law}.friction", f"{why}; raise v_s or eta")
+            yield Diagnostic("warning", f"laws.{e.file.contacts[key].law}.friction", f"{why}; raise v_s or eta")

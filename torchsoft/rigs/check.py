@@ -10,13 +10,14 @@ import networkx as nx
 import numpy as np
 import torch
 
+from torchsoft.diagnostic import SEVERITIES, Diagnostic
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Sampled
 from torchsoft.physics.pads import Pad
 from torchsoft.rigs.balance import at_moments
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.course import Estimate, at, signals
-from torchsoft.rigs.fields import SEVERITIES, Finding, Refused
+from torchsoft.rigs.fields import Refused
 from torchsoft.rigs.geometry import Scene, Surface, collision, nodes, tied
 from torchsoft.rigs.motion import CsvTable
 from torchsoft.solve.ledger import COMPRESSED
@@ -31,22 +32,22 @@ OUTPUTS_PER_PERIOD = 4
 """Outputs that a period of a motion needs at the least."""
 
 
-def check(file: RigFile) -> list[Finding]:
+def check(file: RigFile) -> list[Diagnostic]:
     """Findings on a rig file, errors first. Takes some seconds."""
     try:
         estimate = Estimate(file, file.build())
     except Refused as error:
-        return [Finding("error", error.field, error.sentence)]
+        return [Diagnostic("error", error.field, error.sentence)]
     except ValueError as error:
         field, _, sentence = str(error).partition(": ")
-        return [Finding("error", field, sentence)]
+        return [Diagnostic("error", field, sentence)]
     found = [one for look in CHECKS for one in look(estimate)]
     if not any(one.severity == "error" for one in found):
         found += at_moments(estimate)
     return sorted(found, key=lambda one: SEVERITIES.index(one.severity))
 
 
-def ties(e: Estimate) -> Iterator[Finding]:
+def ties(e: Estimate) -> Iterator[Diagnostic]:
     """Loops that measure a body which they cannot move, and efforts of controllers that move nothing of what these see."""
     graph = tied(e.rig, e.rig.contacts)
     wanted = [(one.field, one.pushes, (one.measured,)) for one in e.loops]
@@ -58,14 +59,14 @@ def ties(e: Estimate) -> Iterator[Finding]:
     for field, pushed, measured in wanted:
         bodies = [at(one)[0] for one in measured]
         if not any(nx.has_path(graph, body, at(pushed)[0]) for body in bodies):
-            yield Finding(
+            yield Diagnostic(
                 "error", field,
                 f"it measures {', '.join(measured)} and pushes {pushed}, but no pad and contact tie `{at(pushed)[0]}` to "
                 f"`{'`, `'.join(bodies)}`: whatever it does, it moves nothing that it sees; add a contact, or measure {pushed}",
             )  # fmt: skip
 
 
-def recordings(e: Estimate) -> Iterator[Finding]:
+def recordings(e: Estimate) -> Iterator[Diagnostic]:
     """Recorded motions that do not cover the run, and waves that outputs do not show."""
     interval = e.file.outputs.interval
     for name, motion in e.file.motion.items():
@@ -73,23 +74,23 @@ def recordings(e: Estimate) -> Iterator[Finding]:
         if isinstance(motion, CsvTable) and isinstance(one, Sampled):
             first, last = float(one.times[0]), float(one.times[-1])
             if last < e.file.outputs.duration * (1 - 1e-9):
-                yield Finding(
+                yield Diagnostic(
                     "error", f"motion.{name}.file",
                     f"{motion.file} ends at {last:g} s, but the run lasts until {e.file.outputs.duration:g} s: nothing says "
                     f"what is wanted then; shorten outputs.duration to {last:g}, or record longer",
                 )  # fmt: skip
             if first > 0:
                 sentence = f"{motion.file} begins at {first:g} s; until then its first value holds"
-                yield Finding("warning", f"motion.{name}.file", sentence)
+                yield Diagnostic("warning", f"motion.{name}.file", sentence)
         if fastest * interval * OUTPUTS_PER_PERIOD > 1:
-            yield Finding(
+            yield Diagnostic(
                 "warning", "outputs.interval",
                 f"outputs every {interval:g} s do not show motion.{name}, which goes up to {fastest:g} Hz; take "
                 f"{1 / (OUTPUTS_PER_PERIOD * fastest):.2g} s or less",
             )  # fmt: skip
 
 
-def jumps(e: Estimate) -> Iterator[Finding]:
+def jumps(e: Estimate) -> Iterator[Diagnostic]:
     """Set-points that begin elsewhere than their coordinate."""
     values, followed = signals(e.rig, 0.0), e.rig.follow(0.0)
     for loop in e.loops:
@@ -98,14 +99,14 @@ def jumps(e: Estimate) -> Iterator[Finding]:
         if abs(wanted - here) > JUMP[unit]:
             state = e.rig.unpack(e.y0, followed)
             efforts = [float(e.rig.actuator_effort(name, state, followed).detach()) for name in loop.actuators]
-            yield Finding(
+            yield Diagnostic(
                 "warning", f"motion.{loop.setpoint}",
                 f"it begins at {wanted:.6g} {unit}, but {loop.measured} at {here:.6g} {unit}: `{loop.field}` pushes "
                 f'with {max(map(abs, efforts)):.3g} at once; begin at "start"',
             )  # fmt: skip
 
 
-def carried(e: Estimate) -> Iterator[Finding]:
+def carried(e: Estimate) -> Iterator[Diagnostic]:
     """Bodies that nothing carries against gravity."""
     scene = Scene(e.rig, e.start)
     pushed = {one.pushes for one in e.file.actuators.values()}
@@ -118,14 +119,14 @@ def carried(e: Estimate) -> Iterator[Finding]:
         if any((s.normal[1] > 0.3 and s.depth(place) < 0) or scene.pressed(key) > 0 for key, s in over.items()):
             continue
         why = "no pad that it has a contact with lies under it" if own else "it has no contact with any pad"
-        yield Finding(
+        yield Diagnostic(
             "error", f"bodies.{name}",
             f"nothing carries it: {why}, no actuator pushes {name}.y, and gravity pulls; it would fall out of the picture. Put "
             "a pad with a contact under it, fix y, or say weighted = false",
         )  # fmt: skip
 
 
-def overlaps(e: Estimate) -> Iterator[Finding]:
+def overlaps(e: Estimate) -> Iterator[Diagnostic]:
     """Things that lie in each other without a contact between them: at the start, and those whose course is known later."""
     said, rig = set[tuple[str, str]](), e.rig
     contacts = {(contact.pad, contact.body) for contact in rig.contacts.values()}
@@ -146,14 +147,14 @@ def overlaps(e: Estimate) -> Iterator[Finding]:
         for (one, other), depth in depths.items():
             if depth > TOUCH and (one, other) not in said:
                 said.add((one, other))
-                yield Finding(
+                yield Diagnostic(
                     "error", one,
                     f"it and {other} overlap by {1e3 * depth:.3g} mm at t = {time:.3g} s, and no contact is between them: they "
                     "would pass through each other; move one of them, or let a pad be between",
                 )  # fmt: skip
 
 
-def corners(e: Estimate) -> Iterator[Finding]:
+def corners(e: Estimate) -> Iterator[Diagnostic]:
     """Corners that fall between contact points."""
     for contact in e.rig.contacts.values():
         spacing, sharpest = (
@@ -161,7 +162,7 @@ def corners(e: Estimate) -> Iterator[Finding]:
             Scene(e.rig, e.start).corner(contact.body),
         )
         if sharpest < spacing:
-            yield Finding(
+            yield Diagnostic(
                 "warning", f"bodies.{contact.body}.shape",
                 f"its sharpest corner has a radius of {1e3 * sharpest:.3g} mm, but the contact points of `{contact.pad}` "
                 f"are up to {1e3 * spacing:.3g} mm apart: forces jump as it goes from one to the next; round it more, or give "
@@ -169,7 +170,7 @@ def corners(e: Estimate) -> Iterator[Finding]:
             )  # fmt: skip
 
 
-def unreachable(e: Estimate) -> Iterator[Finding]:
+def unreachable(e: Estimate) -> Iterator[Diagnostic]:
     """Contacts whose body comes nowhere near the pad on its way."""
     slack = wanders(e)
     for key, contact in e.rig.contacts.items():
@@ -182,7 +183,7 @@ def unreachable(e: Estimate) -> Iterator[Finding]:
             gaps.append(float((apart - np.where(free > 0, free, pad.mesh.height)).max()))
         if min(gaps) > 0:
             near = min(-scene.pressed(key) for _, scene in e.course)
-            yield Finding(
+            yield Diagnostic(
                 "warning", f"contacts.{key}",
                 f"it cannot close: `{contact.body}` comes no nearer to `{contact.pad}` than {near:.3g} m; change "
                 f"pads.{contact.pad}.origin, the starts or the motions, or leave the contact out",
@@ -202,7 +203,7 @@ def wanders(e: Estimate) -> dict[str, Array]:
     return out
 
 
-def departures(e: Estimate) -> Iterator[Finding]:
+def departures(e: Estimate) -> Iterator[Diagnostic]:
     """Motions that take a body past the end of a pad that it had touched. A body that no motion holds may be anywhere on
     the pad opposite."""
     closed, said = set[str](), set[str]()
@@ -220,21 +221,21 @@ def departures(e: Estimate) -> Iterator[Finding]:
             if body not in said and presses and holds(e, base, own) and max(off.values(), default=0.0) > 0:
                 said.add(body)
                 by = max(off, key=lambda one: off[one])
-                yield Finding(
+                yield Diagnostic(
                     "warning", f"motion.{mover(e, scene, {by, base})}",
                     f"at t = {time:.3g} s it has taken `{body}` {off[by]:.3g} m past the end of `{e.rig.contacts[key].pad}`, "
                     f"which contacts.{key} presses until then; let it go less far, or take a longer pad",
                 )  # fmt: skip
 
 
-def crossings(e: Estimate) -> Iterator[Finding]:
+def crossings(e: Estimate) -> Iterator[Diagnostic]:
     """Motions that take a pad through the body between it and another one."""
     for body in e.rig.bodies:
         for pair in e.course[0][1].facing(body):
             for time, scene in e.course:
                 a, b = (scene.surface(key) for key in pair)
                 if a.depth(b.middle) > a.height and a.off(b.middle) < b.half and a.faces(b):
-                    yield Finding(
+                    yield Diagnostic(
                         "error", f"motion.{mover(e, scene, {body, *(scene.pad(key).base for key in pair)})}",
                         f"at t = {time:.3g} s it has taken the pads of contacts.{pair[0]} and contacts.{pair[1]} through "
                         f"each other, and through `{body}` between them; let it go less far",
@@ -258,7 +259,7 @@ def mover(e: Estimate, scene: Scene, bodies: set[str | None]) -> str:
     return max(way, key=lambda name: way[name])
 
 
-def overloads(e: Estimate) -> Iterator[Finding]:
+def overloads(e: Estimate) -> Iterator[Diagnostic]:
     """Efforts that would press the pads of a body in too far, however they were spread over them."""
     for actuator in e.file.actuators.values():
         body, axis = at(actuator.pushes)
@@ -272,7 +273,7 @@ def overloads(e: Estimate) -> Iterator[Finding]:
         effort, time = max((abs(signals(e.rig, time)[actuator.feed_forward]), time) for time in e.knots())
         most = sum(map(bears, pads.values())) + actuator.Kp * max(pad.mesh.height for pad in pads.values())
         if effort > most:
-            yield Finding(
+            yield Diagnostic(
                 "error", f"motion.{actuator.feed_forward}",
                 f"at t = {time:.3g} s it pushes `{body}` with {effort:.3g} N, but {most:.3g} N press its pads in by "
                 f"{COMPRESSED:.0%} of their height wherever they touch, far beyond linear elasticity; push less, or take "
@@ -286,7 +287,7 @@ def bears(pad: Pad) -> float:
     return float(torch.linalg.solve(C, torch.ones(len(C), dtype=C.dtype)).sum()) * COMPRESSED * pad.mesh.height
 
 
-CHECKS: tuple[Callable[[Estimate], Iterator[Finding]], ...] = (
+CHECKS: tuple[Callable[[Estimate], Iterator[Diagnostic]], ...] = (
     ties, recordings, jumps, carried, overlaps, corners, unreachable, departures, crossings, overloads,
 )  # fmt: skip
 """Another check is one more of these."""

@@ -9,7 +9,7 @@ from functools import lru_cache, reduce
 from inspect import signature
 from operator import or_
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args, get_origin
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args, get_origin
 
 from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler, create_model, model_validator
 from pydantic_core import CoreSchema, core_schema
@@ -17,20 +17,6 @@ from pydantic_core import CoreSchema, core_schema
 from torchsoft.physics.validity import sound
 from torchsoft.quantity import metadata, quantity
 from torchsoft.tables import LISTED, Table, shown
-
-Severity = Literal["error", "warning", "note"]
-SEVERITIES: tuple[Severity, ...] = get_args(Severity)
-
-
-class Finding(NamedTuple):
-    """An "error" makes no sense or comes to a bad end, a "warning" may, a "note" is worth knowing."""
-
-    severity: Severity
-    field: str
-    sentence: str
-
-    def __str__(self) -> str:
-        return f"{self.severity}: {self.field}: {self.sentence}"
 
 
 class Refused(ValueError):

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from tqdm import tqdm
 
 from torchsoft.cost import Cost, row_bytes, step_time, steps_per_second
+from torchsoft.diagnostic import Diagnostic
 from torchsoft.files import make_folder, write_json
 from torchsoft.physics.mesh import Mesh
 from torchsoft.physics.mesh.compliance import SMALLEST_BLOCK
@@ -16,7 +17,7 @@ from torchsoft.physics.rig import Rig
 from torchsoft.plot import figures, general
 from torchsoft.plot.animation import animate
 from torchsoft.rigs.build import BuiltRig, RigFile
-from torchsoft.rigs.fields import Finding, at_field
+from torchsoft.rigs.fields import at_field
 from torchsoft.solve.ledger import doubts
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import RTOL, Interrupted, simulate
@@ -53,7 +54,7 @@ def carry_out(file: RigFile, *, progress: bool = False) -> RunOutcome:
     return RunOutcome(ready, run, None)
 
 
-def run(file: RigFile, out: Path, *, found: list[Finding] | None = None, progress: bool = False) -> RunOutcome:
+def run(file: RigFile, out: Path, *, found: list[Diagnostic] | None = None, progress: bool = False) -> RunOutcome:
     """Simulate and write everything to the folder `out`: data first, pictures only of a run that was not stopped. `found` are
     the check's findings, for the summary. Raises `OSError` for a folder that cannot be made, and what `carry_out` does."""
     began = time.perf_counter()
@@ -67,7 +68,7 @@ def run(file: RigFile, out: Path, *, found: list[Finding] | None = None, progres
     return done
 
 
-def summary(file: RigFile, done: RunOutcome, found: list[Finding]) -> dict[str, Any]:
+def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[str, Any]:
     """The run in numbers, in SI units, and how it was made."""
     run, rig = done.trajectory, done.ready.rig
     stopped = done.stopped
