@@ -143,7 +143,7 @@ def grip(
     pose = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64)).pose | {"disc": f64(3e-4, y, 0.0)}
     if jaw and loops:
         pose["jaw"] = f64(0.0, top, 0.0)
-    return rig, standing(rig, pose)
+    return rig, standing(rig, pose).detach()
 
 
 def loops(actuators: Callable[[], dict[str, Any]], theta: Any = 0.0) -> Start:
@@ -172,7 +172,7 @@ def jaws() -> Start:
         }),
     )  # fmt: skip
     pose = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64)).pose
-    return rig, standing(rig, pose | {"disc": f64(3e-4, reach, 0.0)})
+    return rig, standing(rig, pose | {"disc": f64(3e-4, reach, 0.0)}).detach()
 
 
 TURNING = {"x": "driven", "y": "driven", "theta": "driven", "weighted": False}
@@ -287,7 +287,7 @@ def test_a_turned_rig_moves_like_the_one_that_is_not() -> None:
         torch.nn.init.zeros_(rig.gravity)
         arm, off = MESH.height + R - DEPTH, 3e-4
         pose = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64)).pose
-        y0 = standing(rig, pose | {"disc": f64(c * off - s * arm, s * off + c * arm, angle)})
+        y0 = standing(rig, pose | {"disc": f64(c * off - s * arm, s * off + c * arm, angle)}).detach()
         x, y, theta = simulate(rig, times(END, 5), y0=y0, step=1e-3, tolerance=1e-10).state.pose["disc"].unbind(-1)
         runs.append(torch.stack((c * x + s * y, c * y - s * x, theta - angle)))
     assert float((runs[0] - runs[1]).abs().max()) < 1e-9

@@ -18,7 +18,7 @@ import pytest
 import torch
 from torch import nn
 
-from torchsoft import Body, Circle, PadMesh, Trajectory
+from torchsoft import Body, Circle, Pad, PadMesh, Trajectory
 from torchsoft.cli import main
 from torchsoft.materials.presets import PRESETS
 from torchsoft.physics.material import GeneralisedKelvin, KelvinVoigt, Prony
@@ -211,6 +211,17 @@ def test_the_middle_of_a_hollow_pad_is_below_its_ends(folder: Path) -> None:
         inner = inner.override(pads={"upper": {"origin": [-5e-3, bottom]}}, contacts={"upper": {"may_leave": True}})
         small = inner.pads["upper"].build(ready.rig.pads["lower"].material, folder)
         assert (collision(pads["lower"], small, pose) > 1e-6) == overlap
+
+
+def test_pads_that_cross_without_a_node_in_each_other_overlap() -> None:
+    """Like a plus: their sides cross."""
+    rubber = KelvinVoigt(E=1e6, nu=0.45, rho=1100.0, tau=0.01, depth=0.04)
+    mesh = PadMesh(length=60e-3, height=4e-3, elements_x=2, elements_y=1)
+    lying = Pad(mesh, rubber, origin=(-30e-3, -2e-3))
+    for x, depth in ((3e-3, 2e-3), (40e-3, 0.0)):
+        upright = Pad(mesh, rubber, origin=(x, -15e-3), angle=np.pi / 2)
+        assert collision(lying, upright, {}) == pytest.approx(depth, abs=2e-3 if depth else 0.0)
+        assert (collision(lying, upright, {}) > 0) == (depth > 0)
 
 
 @pytest.mark.parametrize(

@@ -76,11 +76,17 @@ def nodes(pad: Pad, pose: Poses) -> Array:
     return in_world(pad, pose, pad.placed(pad.mesh.nodes))
 
 
+PARTS = 32
+"""Points on a side of a pad's outline that are looked for inside another pad."""
+
+
 def collision(one: Pad, other: Pad, pose: Poses) -> float:
-    """How deep the deepest node of two undeformed pads, which may be hollow, lies inside the other pad [m]; 0 where they are
-    apart."""
-    at = nodes(one, pose), nodes(other, pose)
-    return max(depth_inside(at[0], at[1][other.mesh.outline]), depth_inside(at[1], at[0][one.mesh.outline]))
+    """Depth [m] of the deepest node, or point of a side, of two undeformed pads, which may be hollow, inside the other pad; 0
+    where they are apart."""
+    corners = [nodes(pad, pose)[pad.mesh.outline] for pad in (one, other)]
+    parts = np.linspace(0.0, 1.0, PARTS, endpoint=False)[:, None, None]
+    sides = [(ends + parts * (np.roll(ends, -1, 0) - ends)).reshape(-1, 2) for ends in corners]
+    return max(depth_inside(sides[0], corners[1]), depth_inside(sides[1], corners[0]))
 
 
 def depth_inside(places: Array, corners: Array) -> float:
