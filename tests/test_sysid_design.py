@@ -175,7 +175,7 @@ def test_bounds_and_criteria_are_checked() -> None:
 @pytest.fixture(scope="session")
 def found(problem: Problem) -> Design:
     return design(
-        problem, "plan", BOUNDS, limits={"F_y": (-60.0, 60.0)}, at=draws(problem, 2, spread=0.1), iterations=30, rate=0.3,
+        problem, "plan", BOUNDS, limits={"F_y": (-60.0, 60.0)}, at=draws(problem, 2, spread=0.1), iterations=60, rate=0.3,
         criterion=Criterion("worst", (0.01, 0.08)),
     )  # fmt: skip
 
