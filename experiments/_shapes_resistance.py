@@ -1,15 +1,17 @@
 """Rolling resistance, by theory and measured.
 
-The theory of steady rolling on a viscoelastic layer is by small deformations, and independent of the engine but for the
-material's complex modulus and chain.
+The theory of steady rolling on a viscoelastic layer is by small deformations, and independent of
+the engine but for the material's complex modulus and chain.
 
-In the frame of a body that moves at v every field is a function of xi = x - v t, so that a wave exp(i k xi) of the tractions
-is felt by the rubber at the angular frequency -k v. With one Poisson's ratio for all times the layer's surface then gives way
-by C(k) E / E*(-k v), C(k) its elastic compliance. Contact springs k_n, k_t per area stand between layer and body, as in the
-contact law; points stick. The resistance is what the lateral offset of the pressure's centre asks for.
+In the frame of a body that moves at v every field is a function of xi = x - v t, so that a wave
+exp(i k xi) of the tractions is felt by the rubber at the angular frequency -k v. With one Poisson's
+ratio for all times the layer's surface then gives way by C(k) E / E*(-k v), C(k) its elastic
+compliance. Contact springs k_n, k_t per area stand between layer and body, as in the contact law;
+points stick. The resistance is what the lateral offset of the pressure's centre asks for.
 
-Measured: a disc pressed onto one pad by a held force is driven along it at a constant speed and turns freely. Past its
-transients it is read over whole elements: the mean force that drives it, and what the ledger says was dissipated over the way.
+Measured: a disc pressed onto one pad by a held force is driven along it at a constant speed and
+turns freely. Past its transients it is read over whole elements: the mean force that drives it, and
+what the ledger says was dissipated over the way.
 """
 
 from collections.abc import Sequence
@@ -52,13 +54,14 @@ CELLS = 8192
 """Cells of the periodic surface; many more than the contact and its wake need."""
 
 WAYS, SETTLED = 60, 20
-"""Changes of the set of touching cells at the most; and after how many a cell at either edge may still come and go."""
+"""Changes of the set of touching cells at the most; and after how many a cell at either edge may
+still come and go."""
 
 
 @dataclass(frozen=True)
 class Rolling:
-    """A disc of `radius` [m] on a layer of `height` and `depth` [m], with contact springs K_n, K_t [N/m2], per length along
-    the layer and penetration."""
+    """A disc of `radius` [m] on a layer of `height` and `depth` [m], with contact springs K_n, K_t
+    [N/m2], per length along the layer and penetration."""
 
     radius: float
     height: float
@@ -77,8 +80,8 @@ class Steady:
 
 
 def layer_compliance(k: Array, height: float, nu: float) -> Array:
-    """Surface displacement over traction (n, 2, 2) [m/Pa] of a layer with E = 1 Pa in plane strain, bonded at its base, for
-    waves exp(i k x): the exact solution through the height.
+    """Surface displacement over traction (n, 2, 2) [m/Pa] of a layer with E = 1 Pa in plane strain,
+    bonded at its base, for waves exp(i k x): the exact solution through the height.
 
     The state (u_x, u_y, sigma_xy, sigma_yy) obeys d/dy state = A(k) state, with u = 0 at the base.
     """
@@ -110,15 +113,18 @@ def complex_modulus(material: Material, omega: Array) -> Array:
 def moving_contact(at: Rolling, material: Material, load: float, v: float) -> Steady:
     """Steady rolling at v [m/s] under a load [N], on cells of constant traction.
 
-    Touching cells: p / K_n + (C_yy p - C_yx q) = d - (R - sqrt(R^2 - xi^2)), and, for points that stick from the front on,
-    q / K_t + (C_xx q - C_xy p) = c_0 - c xi, with d, c_0 and the creep c from the load, no stretch in front, and no moment on
-    the disc. Raises `RuntimeError` where the contact is not found.
+    Touching cells: p / K_n + (C_yy p - C_yx q) = d - (R - sqrt(R^2 - xi^2)), and, for points that
+    stick from the front on, q / K_t + (C_xx q - C_xy p) = c_0 - c xi, with d, c_0 and the creep c
+    from the load, no stretch in front, and no moment on the disc. Raises `RuntimeError` where the
+    contact is not found.
     """
     cell = min(5e-3 * at.radius, at.height / 20)
     k: Array = 2 * np.pi * np.fft.fftfreq(CELLS, cell).astype(np.float64)
     modulus = complex_modulus(material, -k * v)[:, None, None]
     waves = layer_compliance(k, at.height, material.nu.item()) / modulus
-    kernel = np.fft.ifft(waves * np.sinc(0.5 * k * cell / np.pi)[:, None, None], axis=0).real / at.depth
+    kernel = (
+        np.fft.ifft(waves * np.sinc(0.5 * k * cell / np.pi)[:, None, None], axis=0).real / at.depth
+    )
     half = round(0.45 * at.radius / cell)
     xi: Array = cell * np.arange(-half, half + 1, dtype=np.float64)
     G = kernel[np.subtract.outer(np.arange(len(xi)), np.arange(len(xi))) % CELLS]
@@ -129,7 +135,12 @@ def moving_contact(at: Rolling, material: Material, load: float, v: float) -> St
         n, block = len(a), np.ix_(a, a)
         A, b = np.zeros((2 * n + 3, 2 * n + 3)), np.zeros(2 * n + 3)
         P, Q, (d, c, c_0) = slice(0, n), slice(n, 2 * n), range(2 * n, 2 * n + 3)
-        A[P, P], A[P, Q], A[P, d], b[P] = np.eye(n) / at.K_n + G[block][..., 1, 1], -G[block][..., 1, 0], -1.0, -gap[a]
+        A[P, P], A[P, Q], A[P, d], b[P] = (
+            np.eye(n) / at.K_n + G[block][..., 1, 1],
+            -G[block][..., 1, 0],
+            -1.0,
+            -gap[a],
+        )
         A[Q, Q], A[Q, P] = np.eye(n) / at.K_t + G[block][..., 0, 0], -G[block][..., 0, 1]
         A[Q, c], A[Q, c_0] = xi[a], -1.0
         A[2 * n, P], b[2 * n] = cell, load
@@ -144,14 +155,18 @@ def moving_contact(at: Rolling, material: Material, load: float, v: float) -> St
             resistance = float((p * xi).sum()) * cell / (at.radius * load)
             return Steady(resistance, float(xi[a[-1]]), -float(xi[a[0]]))
         touching = now
-    raise RuntimeError(f"the moving contact at {v:g} m/s and {load:g} N was not found in {WAYS} changes")
+    raise RuntimeError(
+        f"the moving contact at {v:g} m/s and {load:g} N was not found in {WAYS} changes"
+    )
 
 
 def foundation(at: Rolling, material: Material) -> tuple[float, Array, Array]:
-    """A thin layer as a foundation in uniaxial strain, with the contact springs before it: pressure per held depth,
-    k + sum of k_j exp(-t / t_j), as k, k_j (n,) [N/m3 per depth, so N/m2] and t_j (n,) [s].
+    """A thin layer as a foundation in uniaxial strain, with the contact springs before it: pressure
+    per held depth, k + sum of k_j exp(-t / t_j), as k, k_j (n,) [N/m3 per depth, so N/m2] and t_j
+    (n,) [s].
 
-    w = c_0 p + sum of x_i with tau_i x_i' + x_i = c_i p; with p eliminated x' = A x + (c / tau) w / c_0.
+    w = c_0 p + sum of x_i with tau_i x_i' + x_i = c_i p; with p eliminated x' = A x + (c / tau) w /
+    c_0.
     """
     J, tau = (part.detach().numpy() for part in material.chain())
     nu = material.nu.item()
@@ -165,9 +180,11 @@ def foundation(at: Rolling, material: Material) -> tuple[float, Array, Array]:
 
 
 def winkler(at: Rolling, material: Material, load: float, v: float) -> tuple[float, float]:
-    """Resistance over load [1] and the front's place a [m] of a disc on the foundation, from the pressure
+    """Resistance over load [1] and the front's place a [m] of a disc on the foundation, from the
+    pressure
 
-    p(xi) = k (a^2 - xi^2) / 2R + sum of k_j / R (l_j (xi + l_j) - l_j (a + l_j) exp((xi - a) / l_j)), l_j = v t_j,
+    p(xi) = k (a^2 - xi^2) / 2R + sum of k_j / R (l_j (xi + l_j) - l_j (a + l_j) exp((xi - a) /
+    l_j)), l_j = v t_j,
 
     which ends behind where it falls to zero.
     """
@@ -193,8 +210,8 @@ def winkler(at: Rolling, material: Material, load: float, v: float) -> tuple[flo
 
 
 def peak(v: Sequence[float], coefficient: Sequence[float]) -> tuple[float, float] | None:
-    """Speed and height of the largest coefficient, by a parabola through it and its neighbours over the logarithms; None
-    where it is the first or the last."""
+    """Speed and height of the largest coefficient, by a parabola through it and its neighbours over
+    the logarithms; None where it is the first or the last."""
     x, y = np.log(v), np.log(coefficient)
     top = int(np.argmax(y))
     if top in (0, len(y) - 1):
@@ -204,21 +221,22 @@ def peak(v: Sequence[float], coefficient: Sequence[float]) -> tuple[float, float
 
 
 RADIUS, HEIGHT, DEPTH = 19.37e-3, 4.59e-3, 44e-3  # The paper's disc and pads [m].
-STIFFNESS = (
-    1.2e5  # K_n and K_t [N/m] of a millimetre, as in the paper; no dashpots, so that the rubber alone dissipates.
-)
+STIFFNESS = 1.2e5  # K_n and K_t [N/m] of a millimetre, as in the paper; no dashpots, so that the rubber alone dissipates.
 TAU = 0.1  # Retardation time [s] of Kelvin-Voigt and of the standard linear solid: the only scale of time.
-SPRING_TIME = 1e-6  # Retardation time [s] of instantaneous springs: too short to show at any speed here.
+SPRING_TIME = (
+    1e-6  # Retardation time [s] of instantaneous springs: too short to show at any speed here.
+)
 MASS = 0.02  # Of the disc [kg], so light that its bounces die out at once.
 MARGIN, RAMP, SETTLING, WAKES = 15e-3, 4e-3, 12e-3, 4.0
-"""Pad kept free at its ends, way in which the speed is reached, and way before the reading [m]: `SETTLING`, or so many times
-v TAU, after which the wake behind the disc is as long as it gets."""
+"""Pad kept free at its ends, way in which the speed is reached, and way before the reading [m]:
+`SETTLING`, or so many times v TAU, after which the wake behind the disc is as long as it gets."""
 ELEMENTS, READINGS = 16, 16  # Elements over which a roll is read, and how often in each.
 
 
 @dataclass(frozen=True)
 class Case:
-    """A layer, how much the disc is pressed onto it [N], and elements along the pad [m] and through it."""
+    """A layer, how much the disc is pressed onto it [N], and elements along the pad [m] and through
+    it."""
 
     material: Material
     at: Rolling
@@ -228,8 +246,8 @@ class Case:
 
 
 class Roll(NamedTuple):
-    """One steady roll and its theory, resistances over the load [1]: mean force, power dissipated over N v, the
-    small-deformation theory, the thin layer's closed form; depth [m] of the disc."""
+    """One steady roll and its theory, resistances over the load [1]: mean force, power dissipated
+    over N v, the small-deformation theory, the thin layer's closed form; depth [m] of the disc."""
 
     speed: float
     force: float
@@ -242,18 +260,27 @@ class Roll(NamedTuple):
 
 
 def cases(load: float, element: float) -> dict[str, Case]:
-    """Three rubbers as the paper's pad under `load` [N], on elements of a length [m]; and a thin compressible layer, for which
-    theory has a closed form. Series have E = 0.75 MPa left at the end."""
+    """Three rubbers as the paper's pad under `load` [N], on elements of a length [m]; and a thin
+    compressible layer, for which theory has a closed form. Series have E = 0.75 MPa left at the
+    end."""
 
     def series(moduli: dict[float, float], nu: float = 0.45) -> Prony:
         return Prony(0.75e6, nu, 1100.0, DEPTH, moduli.values(), moduli, tau_instant=SPRING_TIME)
 
     def layer(height: float, load: float, material: Material, element: float, layers: int) -> Case:
-        return Case(material, Rolling(RADIUS, height, DEPTH, 1e3 * STIFFNESS, 1e3 * STIFFNESS), load, element, layers)
+        return Case(
+            material,
+            Rolling(RADIUS, height, DEPTH, 1e3 * STIFFNESS, 1e3 * STIFFNESS),
+            load,
+            element,
+            layers,
+        )
 
     rubbers = {
         "Kelvin-Voigt": KelvinVoigt(0.75e6, 0.45, 1100.0, TAU, DEPTH),
-        "standard linear solid": StandardLinearSolid(0.75e6, 1.5e6, 0.45, 1100.0, TAU, DEPTH, tau_instant=SPRING_TIME),
+        "standard linear solid": StandardLinearSolid(
+            0.75e6, 1.5e6, 0.45, 1100.0, TAU, DEPTH, tau_instant=SPRING_TIME
+        ),
         "relaxation series": series({5e-3: 0.25e6, 15e-3: 0.25e6, 50e-3: 0.25e6}),
     }
     thin = layer(1e-3, 0.25 * load, series({50e-3: 0.75e6}, 0.2), 0.5 * element, 4)
@@ -274,18 +301,27 @@ def length(case: Case, speeds: list[float]) -> float:
 
 
 def rig(case: Case, v: float, pad_length: float) -> tuple[Rig, float]:
-    """The disc, ready to roll at v [m/s] after a ramp, and when it has passed the transients [s]."""
+    """The disc, ready to roll at v [m/s] after a ramp, and when it has passed the transients
+    [s]."""
     at, duration = case.at, (pad_length - 2 * MARGIN) / v
     mesh = PadMesh(pad_length, at.height, round(pad_length / case.element), case.layers)
     law = SoftContact(STIFFNESS, 0.0, STIFFNESS, 0.0, friction=SmoothSlip(0.8, 0.8, 0.05, 10.0))
     ramped, before = 2 * RAMP / v, RAMP + max(SETTLING, WAKES * TAU * v)
-    way = Sampled([0.0, ramped, ramped + duration], [MARGIN, MARGIN + RAMP, MARGIN + RAMP + v * duration], [0.0, v, v])
+    way = Sampled(
+        [0.0, ramped, ramped + duration],
+        [MARGIN, MARGIN + RAMP, MARGIN + RAMP + v * duration],
+        [0.0, v, v],
+    )
     made = Rig(
         bodies={"disc": Body(MASS, Circle(at.radius), x="driven", weighted=False)},
         pads={"pad": Pad(mesh, case.material, points=2)},
         contacts={"pad": Contact("pad", "disc", law)},
-        actuators={"press": Actuator("disc.y", "disc.y", PD(0.0, 0.0), setpoint="y_d", feed_forward="load")},
-        reference=Reference(**{"disc.x": way, "y_d": Profile([0.0], [0.0]), "load": Profile([0.0], [-case.load])}),
+        actuators={
+            "press": Actuator("disc.y", "disc.y", PD(0.0, 0.0), setpoint="y_d", feed_forward="load")
+        },
+        reference=Reference(
+            **{"disc.x": way, "y_d": Profile([0.0], [0.0]), "load": Profile([0.0], [-case.load])}
+        ),
     )
     return made, ramped + (before - RAMP) / v
 
@@ -294,7 +330,9 @@ def rig(case: Case, v: float, pad_length: float) -> tuple[Rig, float]:
 def roll(case: Case, v: float, pad_length: float, rtol: float) -> Roll:
     """One steady roll at v [m/s], measured and by theory."""
     made, since = rig(case, v, pad_length)
-    start = torch.tensor([MARGIN, case.at.height + case.at.radius - 0.1 * case.at.height, 0.0], dtype=torch.float64)
+    start = torch.tensor(
+        [MARGIN, case.at.height + case.at.radius - 0.1 * case.at.height, 0.0], dtype=torch.float64
+    )
     y0 = standing(made, resting(made, {"disc": start}))
     way = ELEMENTS * case.element
     read = since + torch.linspace(0, way / v, ELEMENTS * READINGS + 1, dtype=torch.float64)
@@ -305,14 +343,15 @@ def roll(case: Case, v: float, pad_length: float, rtol: float) -> Roll:
     surface = case.at.height + case.at.radius
     theory = moving_contact(case.at, case.material, case.load, v).coefficient
     return Roll(
-        v, force, power, theory, winkler(case.at, case.material, case.load, v)[0], surface - run["y_disc"][1:].mean().item(),
-        run.energy_residual_rel, run.stats.steps,
+        v, force, power, theory, winkler(case.at, case.material, case.load, v)[0],
+        surface - run["y_disc"][1:].mean().item(), run.energy_residual_rel, run.stats.steps,
     )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Resistance:
-    """One rubber's curve: half-width of the contact at rest [m], its rolls, and both theories at speeds between [m/s]."""
+    """One rubber's curve: half-width of the contact at rest [m], its rolls, and both theories at
+    speeds between [m/s]."""
 
     half_width: float
     rolls: list[Roll]
@@ -332,7 +371,9 @@ class Resistance:
 def resistance(case: Case, slowest: float, fastest: float, speeds: int, rtol: float) -> Resistance:
     """Rolls at `speeds` speeds from `slowest` to `fastest`, as De."""
     a = half_width(case)
-    measured, between = ((np.geomspace(slowest, fastest, n) * a / TAU).tolist() for n in (speeds, 3 * speeds - 2))
+    measured, between = (
+        (np.geomspace(slowest, fastest, n) * a / TAU).tolist() for n in (speeds, 3 * speeds - 2)
+    )
     pad_length = length(case, measured)
     rolls = [roll(case, v, pad_length, rtol) for v in tqdm(measured, "speeds", leave=False)]
     theory = [moving_contact(case.at, case.material, case.load, v).coefficient for v in between]

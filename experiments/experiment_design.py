@@ -1,16 +1,17 @@
 """Question: which motions should a rig make, for its data to identify contact and pad parameters?
 
-For every excitation of `torchsoft.excitation.CATALOGUE` the Fisher matrix F = J^T J of the sensors' predicted samples (J: exact
-sensitivities over the sensors' noise, coordinates: logarithms of the parameters) gives the Cramer-Rao standard deviation
-sqrt(diag F^-1) of each parameter; F is additive, so combinations follow by summing. What a tenth of the tolerance changes,
-shifts an estimate by F^-1 J^T of it: what an excitation is worth is the root of both squared. Steps are frozen.
-Derivatives of hard slipping can be inconsistent: J is checked against a central difference along a random direction, and an
-excitation that fails is dropped.
+For every excitation of `torchsoft.excitation.CATALOGUE` the Fisher matrix F = J^T J of the sensors'
+predicted samples (J: exact sensitivities over the sensors' noise, coordinates: logarithms of the
+parameters) gives the Cramer-Rao standard deviation sqrt(diag F^-1) of each parameter; F is
+additive, so combinations follow by summing. What a tenth of the tolerance changes, shifts an
+estimate by F^-1 J^T of it: what an excitation is worth is the root of both squared. Steps are
+frozen. Derivatives of hard slipping can be inconsistent: J is checked against a central difference
+along a random direction, and an excitation that fails is dropped.
 
-Command: .venv/bin/python experiments/experiment_design.py [--smoke]
-Expected: no gentle motion identifies mu_k (above 50 %), jerks of a light grasp do to about 1 %; K_t and R_t are the weakest,
-and three excitations together, 5.4 s of data, bring the worst of the eight (R_t) to 3 % at a step of 0.5 ms;
-harder ones would identify more, but not at that step. About two minutes on one core.
+Command: .venv/bin/python experiments/experiment_design.py [--smoke] Expected: no gentle motion
+identifies mu_k (above 50 %), jerks of a light grasp do to about 1 %; K_t and R_t are the weakest,
+and three excitations together, 5.4 s of data, bring the worst of the eight (R_t) to 3 % at a step
+of 0.5 ms; harder ones would identify more, but not at that step. About two minutes on one core.
 """
 
 import itertools
@@ -36,7 +37,8 @@ from torchsoft.sysid.runs import Runner
 
 NAMES = tuple(TRUTH)
 CONSISTENT = 0.01
-"""Difference between J and a finite difference, over their size, above which an excitation is dropped."""
+"""Difference between J and a finite difference, over their size, above which an excitation is
+dropped."""
 DIFFERENCE = 1e-5  # Step of that finite difference in the logarithms.
 
 
@@ -53,8 +55,8 @@ class Config:
 
 @dataclass(frozen=True)
 class Row:
-    """Standard deviations and shifts by the steps [1] by parameter, of one excitation or of several together;
-    `inconsistency` of the derivative."""
+    """Standard deviations and shifts by the steps [1] by parameter, of one excitation or of several
+    together; `inconsistency` of the derivative."""
 
     names: tuple[str, ...]
     seconds: float
@@ -66,13 +68,29 @@ class Row:
     @property
     def worst(self) -> float:
         """The largest root of both squared."""
-        return max((float(np.hypot(self.sd[name], self.shift[name])) for name in self.sd), default=np.inf)
+        return max(
+            (float(np.hypot(self.sd[name], self.shift[name])) for name in self.sd), default=np.inf
+        )
 
 
-def row(names: tuple[str, ...], seconds: float, J: Array, error: Array, inconsistency: float, dropped: str = "") -> Row:
+def row(
+    names: tuple[str, ...],
+    seconds: float,
+    J: Array,
+    error: Array,
+    inconsistency: float,
+    dropped: str = "",
+) -> Row:
     """The row of a Jacobian and of what finer steps add to the residuals (m,)."""
     sd, off = standard_deviations(J), shift(J, error)
-    return Row(names, seconds, dict(zip(NAMES, sd.tolist())), dict(zip(NAMES, off.tolist())), inconsistency, dropped)
+    return Row(
+        names,
+        seconds,
+        dict(zip(NAMES, sd.tolist())),
+        dict(zip(NAMES, off.tolist())),
+        inconsistency,
+        dropped,
+    )
 
 
 @dataclass(frozen=True)
@@ -84,8 +102,13 @@ class Result:
 
 def smoke(config: Config) -> tuple[Config, dict[str, Excitation]]:
     roll = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.3), duration=0.9, senses="bracket")
-    jerk = Excitation(motion=Strokes(travel=30e-3, stroke_time=0.1), duration=0.9, depth=3e-4, senses="bracket")
-    return Config(config.out, 1e-4, config.v_s, 2.0, 2, config.seed, True), {"strokes": roll, "jerks, light": jerk}
+    jerk = Excitation(
+        motion=Strokes(travel=30e-3, stroke_time=0.1), duration=0.9, depth=3e-4, senses="bracket"
+    )
+    return Config(config.out, 1e-4, config.v_s, 2.0, 2, config.seed, True), {
+        "strokes": roll,
+        "jerks, light": jerk,
+    }
 
 
 def check(part: Residuals) -> Residuals:
@@ -96,17 +119,23 @@ def check(part: Residuals) -> Residuals:
 
 
 def assess(excitation: Excitation, p: Parameters, config: Config) -> tuple[Array, Array, float]:
-    """Whitened Jacobian (m, parameters), what finer steps add to the residuals (m,), and how far the Jacobian is, relatively,
-    from a central difference along one direction. Raises `SimulationFailed`."""
+    """Whitened Jacobian (m, parameters), what finer steps add to the residuals (m,), and how far
+    the Jacobian is, relatively, from a central difference along one direction. Raises
+    `SimulationFailed`."""
     recording = record("one", excitation, p, p, RIG, rtol=config.rtol, noise=0.0)
-    friction = 0.5 * (p.contact.mu_k + p.contact.mu_s)  # bounds that do not cross; nothing is searched here
+    friction = 0.5 * (
+        p.contact.mu_k + p.contact.mu_s
+    )  # bounds that do not cross; nothing is searched here
     apart = {"contact.mu_k": Unknown(high=friction), "contact.mu_s": Unknown(low=friction)}
     problem = Problem([recording], RIG, {name: Unknown() for name in NAMES} | apart)
     x, v = problem.coordinates.start, np.random.default_rng(config.seed).standard_normal(len(NAMES))
     runner = Runner(problem.recordings)
     at, steps = problem.freeze(runner, x, ["one"], config.rtol, problem.coordinates.free)
     check(at)
-    ahead, behind = (check(problem.residuals(runner, x + s * DIFFERENCE * v, ["one"], steps)) for s in (1.0, -1.0))
+    ahead, behind = (
+        check(problem.residuals(runner, x + s * DIFFERENCE * v, ["one"], steps))
+        for s in (1.0, -1.0)
+    )
     finer = check(problem.freeze(runner, x, ["one"], FINER * config.rtol)[0])
     slope = (ahead.r - behind.r) / (2 * DIFFERENCE)
     return at.J, finer.r - at.r, float(np.linalg.norm(at.J @ v - slope) / np.linalg.norm(slope))
@@ -137,7 +166,9 @@ def run(config: Config) -> Result:
                 J, error = (np.concatenate([usable[name][k] for name in names]) for k in (0, 1))
                 off = max(r.inconsistency for r in single if r.names[0] in names)
                 together.append(row(names, seconds, J, error, off))
-    return Result(config, sorted(single, key=lambda r: r.worst), sorted(together, key=lambda r: r.worst))
+    return Result(
+        config, sorted(single, key=lambda r: r.worst), sorted(together, key=lambda r: r.worst)
+    )
 
 
 def percent(value: float, sign: str = "") -> str:
@@ -151,12 +182,16 @@ def table(rows: list[Row]) -> str:
     lines = []
     for row in rows:
         cells = [
-            f"{percent(row.sd[name])} ({percent(row.shift[name], sign='+')})" if row.sd.get(name, np.inf) < 1 else "-"
+            f"{percent(row.sd[name])} ({percent(row.shift[name], sign='+')})"
+            if row.sd.get(name, np.inf) < 1
+            else "-"
             for name in NAMES
         ]
         off = row.dropped or f"{row.inconsistency:.0e}"
         lines.append((" + ".join(row.names), f"{row.seconds:.1f}", *cells, off))
-    return markdown(("excitation", "s", *(name.split(".")[1] for name in NAMES), "derivative off by"), lines)
+    return markdown(
+        ("excitation", "s", *(name.split(".")[1] for name in NAMES), "derivative off by"), lines
+    )
 
 
 def figure(result: Result) -> Figure:
@@ -164,9 +199,15 @@ def figure(result: Result) -> Figure:
     every = result.single + result.together[:8]
     fig = Figure(figsize=(10, 1.6 + 0.36 * len(every)), layout="constrained")
     axes = fig.subplots()
-    values = [[100 * np.hypot(row.sd[n], row.shift[n]) if row.sd else np.nan for n in NAMES] for row in every]
+    values = [
+        [100 * np.hypot(row.sd[n], row.shift[n]) if row.sd else np.nan for n in NAMES]
+        for row in every
+    ]
     image = axes.imshow(np.array(values), norm=LogNorm(0.1, 100.0), cmap="RdYlGn_r", aspect="auto")
-    axes.set_yticks(range(len(every)), [" + ".join(row.names) + (" (dropped)" if row.dropped else "") for row in every])
+    axes.set_yticks(
+        range(len(every)),
+        [" + ".join(row.names) + (" (dropped)" if row.dropped else "") for row in every],
+    )
     axes.set_xticks(range(len(NAMES)), [name.split(".")[1] for name in NAMES])
     fig.colorbar(image, label="root of (standard deviation² + shift by the steps²) [%]")
     return fig

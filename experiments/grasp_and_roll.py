@@ -1,15 +1,18 @@
-"""Question: does the model carry out the paper's manipulation, and where does it differ from the published numbers?
+"""Question: does the model carry out the paper's manipulation, and where does it differ from the
+published numbers?
 
-A disc on a soft pad is grasped by a second pad in a bracket (0 to 0.375 s), rolled 20 mm to the left within 10 s, held
-there for 5 s, rolled back within 10 s and left at rest for 5 s. References Eq. 20-30, controllers Eq. 31-34, contact
-Eq. 8-13, bracket moment Eq. 35. The paper prints no friction numbers: with the default set friction stays locked
-in, with the "paper-like" set (K_t = 100 N/m) it fades in the grasp, as the paper reports. Both are run.
+A disc on a soft pad is grasped by a second pad in a bracket (0 to 0.375 s), rolled 20 mm to the
+left within 10 s, held there for 5 s, rolled back within 10 s and left at rest for 5 s. References
+Eq. 20-30, controllers Eq. 31-34, contact Eq. 8-13, bracket moment Eq. 35. The paper prints no
+friction numbers: with the default set friction stays locked in, with the "paper-like" set (K_t =
+100 N/m) it fades in the grasp, as the paper reports. Both are run.
 
-Command: .venv/bin/python experiments/grasp_and_roll.py [--friction paper-like] [--fidelity inertial] [--smoke]
-Expected (default set; the paper's number in brackets): grasping force 80.66 N; x_C(10 s) = 40.000 mm (40);
-y_C in the grasp 23.199 mm (23.20); y_Br between 48.565 and 48.600 mm (48.6); theta(10 s) = 1.090 rad, anticlockwise,
--0.0035 rad at the end; peak speed 4.40 mm/s; peak F_x 0.42 N; peak bracket moment 1.55 N.m; 11 nodes of each pad in
-contact; energy residual 3e-5. About 20 s on one core with figures and animation; each simulation takes 2 s of that.
+Command: .venv/bin/python experiments/grasp_and_roll.py [--friction paper-like] [--fidelity
+inertial] [--smoke] Expected (default set; the paper's number in brackets): grasping force 80.66 N;
+x_C(10 s) = 40.000 mm (40); y_C in the grasp 23.199 mm (23.20); y_Br between 48.565 and 48.600 mm
+(48.6); theta(10 s) = 1.090 rad, anticlockwise, -0.0035 rad at the end; peak speed 4.40 mm/s; peak
+F_x 0.42 N; peak bracket moment 1.55 N.m; 11 nodes of each pad in contact; energy residual 3e-5.
+About 20 s on one core with figures and animation; each simulation takes 2 s of that.
 """
 
 import json
@@ -23,7 +26,15 @@ import torch
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from torchsoft import Interrupted, NoEquilibrium, Parameters, SimulationFailed, SoftGrasp, Trajectory, simulate
+from torchsoft import (
+    Interrupted,
+    NoEquilibrium,
+    Parameters,
+    SimulationFailed,
+    SoftGrasp,
+    Trajectory,
+    simulate,
+)
 from torchsoft.channels import PADS
 from torchsoft.experiment import COARSE, markdown, options
 from torchsoft.experiment import write as write_files
@@ -40,7 +51,9 @@ class Config:
     duration: float | None = None  # simulated time [s]; the whole manipulation (30 s) if not given
     friction: Literal["default", "paper-like"] = "default"
     """friction set; with the default one, the paper-like one is run as well and compared"""
-    fidelity: Literal["massless", "inertial"] | None = None  # of the pads; as in the parameters (massless) if not given
+    fidelity: Literal["massless", "inertial"] | None = (
+        None  # of the pads; as in the parameters (massless) if not given
+    )
     config: Path | None = None  # TOML file of parameters, a table per group
     animation: bool = True  # write the animation
     table: bool = False  # only print the table of the summary that is already in `out`
@@ -74,7 +87,9 @@ def parameters(config: Config, friction: str) -> Parameters:
         changes["pad.fidelity"] = config.fidelity
     if friction == "paper-like":
         changes["contact.K_t"] = Parameters.paper_like().contact.K_t
-    return (Parameters.from_toml(config.config) if config.config else Parameters()).override(changes)
+    return (Parameters.from_toml(config.config) if config.config else Parameters()).override(
+        changes
+    )
 
 
 def output_times(duration: float) -> Tensor:
@@ -89,7 +104,9 @@ def output_times(duration: float) -> Tensor:
 def manipulate(config: Config, friction: str) -> Run:
     """Find the grasping force and run the manipulation with one friction set."""
     model = SoftGrasp(parameters(config, friction))
-    t = output_times(model.settings.scenario.duration if config.duration is None else config.duration)
+    t = output_times(
+        model.settings.scenario.duration if config.duration is None else config.duration
+    )
     print(f"{friction} friction: finding the grasping force", flush=True)
     try:
         manipulation = grasp_and_roll(model, rtol=config.rtol)
@@ -98,13 +115,19 @@ def manipulate(config: Config, friction: str) -> Run:
     force = manipulation.grasp_force
     print(f"{friction} friction: {force:.3f} N hold the bracket; rolling", flush=True)
     try:
-        return Run(friction, model, simulate(model, t, y0=manipulation.y0, rtol=config.rtol, progress=True), force)
+        return Run(
+            friction,
+            model,
+            simulate(model, t, y0=manipulation.y0, rtol=config.rtol, progress=True),
+            force,
+        )
     except (SimulationFailed, Interrupted) as stop:
         return Run(friction, model, stop.trajectory, force, stop)
 
 
 def run(config: Config) -> Result:
-    """The chosen friction set, and the paper-like one beside the default. Ends with the run that stops early."""
+    """The chosen friction set, and the paper-like one beside the default. Ends with the run that
+    stops early."""
     if config.smoke:
         config = replace(config, duration=0.6)
     runs = {}
@@ -139,7 +162,9 @@ def summary(run: Run) -> dict[str, Any]:
         "F_x_peak_N": r["F_x"].abs().max().item(),
         "M_Br_peak_Nm": r["bracket_moment"].abs().max().item(),
         "contact_nodes": {name: at(5, count) for name, count in touching.items()},
-        "angular_momentum_sign_out": int(r["omega"][rolling_out].mean().sign()) if r.t[-1] >= 9 else None,
+        "angular_momentum_sign_out": int(r["omega"][rolling_out].mean().sign())
+        if r.t[-1] >= 9
+        else None,
         "energy_residual_rel": r.energy_residual_rel,
         "steps": r.stats.steps,
         "newton_per_step": r.stats.newton_per_step,
@@ -198,7 +223,10 @@ def table(numbers: Mapping[str, Any]) -> str:
 
     columns = [numbers] + ([numbers["paper_like"]] if numbers["paper_like"] else [])
     head = ("", "paper", *(f"{c['friction']} friction" for c in columns))
-    return markdown(head, [(what, paper, *(cell(c, key, form) for c in columns)) for what, paper, key, form in ROWS])
+    return markdown(
+        head,
+        [(what, paper, *(cell(c, key, form) for c in columns)) for what, paper, key, form in ROWS],
+    )
 
 
 def figures(result: Result) -> dict[str, Figure]:
@@ -257,7 +285,10 @@ def main() -> None:
     except KeyboardInterrupt:
         sys.exit(130)
     if isinstance(result.stopped, SimulationFailed):
-        sys.exit(f"the simulation failed: {result.stopped.reason}\nwhat was simulated until then is in {config.out}")
+        sys.exit(
+            f"the simulation failed: {result.stopped.reason}\nwhat was simulated until then is in "
+            f"{config.out}"
+        )
     if result.stopped:
         print("interrupted: the files hold what was simulated until then", file=sys.stderr)
         sys.exit(130)

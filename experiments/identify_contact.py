@@ -1,15 +1,18 @@
-"""Question: do 5.4 s of noisy rolling determine all eight contact and pad parameters, from starts off by factors of 2 to 3?
+"""Question: do 5.4 s of noisy rolling determine all eight contact and pad parameters, from starts
+off by factors of 2 to 3?
 
 A rig with known parameters (K_n, R_n, K_t, R_t, mu_s, mu_k, E, tau) makes the three recordings that
-`experiment_design.py` ranks first, with sensor noise of 10 um, 0.5 mrad and 0.1 N at 200 Hz and a tenth of the fit's tolerance;
-`torchsoft.sysid` finds the parameters in stages, on exact sensitivities, and predicts a fourth recording. The same once
-more without noise, and with the same stages on finite differences: `scipy.optimize.least_squares` with a Jacobian of one more
-run a parameter, all of them at once in the workers.
+`experiment_design.py` ranks first, with sensor noise of 10 um, 0.5 mrad and 0.1 N at 200 Hz and a
+tenth of the fit's tolerance; `torchsoft.sysid` finds the parameters in stages, on exact
+sensitivities, and predicts a fourth recording. The same once more without noise, and with the same
+stages on finite differences: `scipy.optimize.least_squares` with a Jacobian of one more run a
+parameter, all of them at once in the workers.
 
-Command: .venv/bin/python experiments/identify_contact.py [--smoke] [--workers 2]
-Expected: without noise every parameter within a tenth of the standard deviation that noise would give it, what the steps
-shift it by; with noise within what the Fisher matrix predicts, R_t the worst of them with a standard deviation of 3 %; both
-starts end at the same place. Each identification takes some 45 runs with sensitivities and 20 without.
+Command: .venv/bin/python experiments/identify_contact.py [--smoke] [--workers 2] Expected: without
+noise every parameter within a tenth of the standard deviation that noise would give it, what the
+steps shift it by; with noise within what the Fisher matrix predicts, R_t the worst of them with a
+standard deviation of 3 %; both starts end at the same place. Each identification takes some 45 runs
+with sensitivities and 20 without.
 """
 
 from collections.abc import Sequence
@@ -30,8 +33,8 @@ from torchsoft.sysid.report import report
 from torchsoft.sysid.runs import Runner, forget
 
 TRUTH = {
-    "contact.K_n": 1.6e5, "contact.R_n": 300.0, "contact.K_t": 0.8e5, "contact.R_t": 600.0, "contact.mu_s": 0.65,
-    "contact.mu_k": 0.5, "pad.E": 0.9e6, "pad.tau": 0.012,
+    "contact.K_n": 1.6e5, "contact.R_n": 300.0, "contact.K_t": 0.8e5, "contact.R_t": 600.0,
+    "contact.mu_s": 0.65, "contact.mu_k": 0.5, "pad.E": 0.9e6, "pad.tau": 0.012,
 }  # fmt: skip
 FITTED, HELD_OUT = ("deep pressing", "light shaking", "light jerks"), "shaking"
 DIFFERENCE = 1e-4  # Step of the finite differences in the logarithms.
@@ -43,7 +46,10 @@ class Config:
     rtol: float = 1e-5  # of the fit's last stage; nothing else says how long its steps are
     data_rtol: float = 1e-6  # of the runs that data are made of
     v_s: float = 0.05  # contact.v_s [m/s], known
-    starts: tuple[int, ...] = (0, 1)  # seeds of the starts: every parameter off by a factor of 2 to 3, up or down
+    starts: tuple[int, ...] = (
+        0,
+        1,
+    )  # seeds of the starts: every parameter off by a factor of 2 to 3, up or down
     workers: int = 2
     noise_seed: int = 0
     baseline: bool = True  # identify by finite differences as well, from the first start
@@ -65,7 +71,8 @@ class Case:
             e = self.found[name]
             out[name] = {
                 "truth": value, "start": self.start[name], "estimate": e.value, "ci95": e.ci95,
-                "relative_sd": e.relative_sd, "relative_error": None if e.value is None else e.value / value - 1,
+                "relative_sd": e.relative_sd,
+                "relative_error": None if e.value is None else e.value / value - 1,
                 "seen": e.identifiable,
             }  # fmt: skip
         return out
@@ -80,17 +87,25 @@ class Result:
 
 
 class FiniteDifferences(Problem):
-    """The same problem with forward differences in place of sensitivities, all perturbed runs handed over at once."""
+    """The same problem with forward differences in place of sensitivities, all perturbed runs
+    handed over at once."""
 
     def residuals(
-        self, runner: Runner, x: Array, which: Sequence[str], steps: StepsByName, free: NDArray[np.bool_] | None = None
+        self,
+        runner: Runner,
+        x: Array,
+        which: Sequence[str],
+        steps: StepsByName,
+        free: NDArray[np.bool_] | None = None,
     ) -> Residuals:
         if free is None:
             return super().residuals(runner, x, which, steps)
         moved = [x, *(x + DIFFERENCE * np.eye(len(x))[i] for i in np.flatnonzero(free))]
         jobs = [self.jobs(z, which, steps, None) for z in moved]
         results = iter(runner.run([job for some in jobs for job in some]))
-        at, *ahead = (self.gather(z, some, [next(results) for _ in some]) for z, some in zip(moved, jobs))
+        at, *ahead = (
+            self.gather(z, some, [next(results) for _ in some]) for z, some in zip(moved, jobs)
+        )
         J = np.zeros((len(at.r), len(x)))
         for i, one in zip(np.flatnonzero(free), ahead):
             J[:, i] = (one.r - at.r) / DIFFERENCE
@@ -103,7 +118,9 @@ def excitations(config: Config) -> dict[str, Excitation]:
         return {name: CATALOGUE[name] for name in (*FITTED, HELD_OUT)}
     shake = MultiSine(amplitude_x=6e-3, amplitude_y=1e-4, frequency=(2.0, 12.0))
     return {
-        "strokes": Excitation(motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.9, senses="bracket"),
+        "strokes": Excitation(
+            motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.9, senses="bracket"
+        ),
         "shaking": Excitation(motion=shake, duration=0.9, depth=8e-4, senses="bracket"),
     }
 
@@ -121,7 +138,16 @@ def record_all(config: Config, noise: float) -> list[Recording]:
     if config.smoke:
         nominal = nominal.override({"contact.mu_k": 0.5})
     return [
-        record(name, e, rig, nominal, RIG, rtol=config.data_rtol, noise=noise, seed=config.noise_seed + k)
+        record(
+            name,
+            e,
+            rig,
+            nominal,
+            RIG,
+            rtol=config.data_rtol,
+            noise=noise,
+            seed=config.noise_seed + k,
+        )
         for k, (name, e) in enumerate(excitations(config).items())
     ]
 
@@ -136,12 +162,16 @@ def start(config: Config, seed: int) -> dict[str, float]:
     return out
 
 
-def problem(recordings: list[Recording], begin: dict[str, float], kind: type[Problem] = Problem) -> Problem:
+def problem(
+    recordings: list[Recording], begin: dict[str, float], kind: type[Problem] = Problem
+) -> Problem:
     """Unknowns that begin there, mu_k as a part of mu_s."""
     unknowns = {name: Unknown(nominal=value) for name, value in begin.items()}
     if "contact.mu_k" in begin:
         ratio = begin["contact.mu_k"] / begin["contact.mu_s"]
-        unknowns["contact.mu_k"] = Unknown(nominal=ratio, ratio_to="contact.mu_s", low=0.1, high=1.0)
+        unknowns["contact.mu_k"] = Unknown(
+            nominal=ratio, ratio_to="contact.mu_s", low=0.1, high=1.0
+        )
     return kind(recordings, RIG, unknowns)
 
 
@@ -154,10 +184,18 @@ def run(config: Config) -> Result:
     def case(name: str, noise: float, seed: int, kind: type[Problem] = Problem) -> Problem:
         begin = start(config, seed)
         stated = problem(noisy if noise else exact, begin, kind)
-        print(f"\n{name}, start {seed}: off by factors of", *(f"{v / truths(config)[k]:.2f}" for k, v in begin.items()))
+        print(
+            f"\n{name}, start {seed}: off by factors of",
+            *(f"{v / truths(config)[k]:.2f}" for k, v in begin.items()),
+        )
         folder = config.out / f"runs-{name.replace(' ', '-')}-{seed}"
         found = identify(
-            stated, rtol=config.rtol, workers=config.workers, heldout=held, checkpoint=folder, progress=not config.smoke
+            stated,
+            rtol=config.rtol,
+            workers=config.workers,
+            heldout=held,
+            checkpoint=folder,
+            progress=not config.smoke,
         )
         forget(folder)
         cases.append(Case(name, noise, begin, found))
@@ -184,7 +222,9 @@ def figure(result: Result) -> Figure:
             e, label = case.found[name], name.split(".")[1]
             ax.plot(case.start[name] / truth, label, "o", mfc="none", color="0.6")
             ax.plot(e.last / truth, label, "o", color="C0" if e.identifiable else "C3", ms=4)
-            ax.plot([c / truth for c in e.ci95 or ()], [label] * len(e.ci95 or ()), color="C0", lw=2)
+            ax.plot(
+                [c / truth for c in e.ci95 or ()], [label] * len(e.ci95 or ()), color="C0", lw=2
+            )
         ax.axvline(1.0, color="k", lw=0.5)
         ax.set(xscale="log", xlim=(0.25, 4.0), xlabel="over the truth", title=case.name)
     return fig
@@ -193,15 +233,19 @@ def figure(result: Result) -> Figure:
 def main(config: Config) -> None:
     result = run(config)
     config = result.config
-    report([c.found for c in result.cases if c.name == "noisy"][-1], result.problem, config.out / "report.html")
+    report(
+        [c.found for c in result.cases if c.name == "noisy"][-1],
+        result.problem,
+        config.out / "report.html",
+    )
     rows = []
     for case in result.cases:
         cost = case.found.cost
         rows.append(
             {
                 "case": case.name, "noise": case.noise, "parameters": case.parameters(result.truth),
-                "chi2": case.found.chi2, "heldout_nrmse": case.found.heldout, "stages": case.found.stages,
-                "notices": case.found.notices,
+                "chi2": case.found.chi2, "heldout_nrmse": case.found.heldout,
+                "stages": case.found.stages, "notices": case.found.notices,
                 **{k: cost[k] for k in ("data_seconds", "simulations", "jacobians", "wall_s")},
             }
         )  # fmt: skip
@@ -209,14 +253,26 @@ def main(config: Config) -> None:
     summary = {
         "noise": {channel: sensor.noise for channel, sensor in RIG.items()},
         "cases": rows,
-        "baseline_over_exact": wall["finite differences"] / wall["noisy"] if "finite differences" in wall else None,
+        "baseline_over_exact": wall["finite differences"] / wall["noisy"]
+        if "finite differences" in wall
+        else None,
     }
     cells = []
     for case, row in zip(result.cases, rows):
         some = [case.found[name] for name in result.truth]
-        error, sd = max(abs(e.last / result.truth[e.name] - 1) for e in some), max(e.relative_sd for e in some)
+        error, sd = (
+            max(abs(e.last / result.truth[e.name] - 1) for e in some),
+            max(e.relative_sd for e in some),
+        )
         cells.append(
-            (case.name, f"{error:.2%}", f"{sd:.2%}", row["simulations"], row["jacobians"], f"{row['wall_s']:.0f}")
+            (
+                case.name,
+                f"{error:.2%}",
+                f"{sd:.2%}",
+                row["simulations"],
+                row["jacobians"],
+                f"{row['wall_s']:.0f}",
+            )
         )
     head = ("case", "worst error", "worst predicted sd", "simulations", "Jacobians", "wall [s]")
     write(config, summary, {"identify_contact": figure(result)}, markdown(head, cells))

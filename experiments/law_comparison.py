@@ -1,21 +1,23 @@
 """Question: do the data name the law that made them, and do they say so where they cannot tell?
 
-Two pairs of laws: friction that falls smoothly with the speed of slip or Coulomb's with one coefficient; rubber of
-Kelvin and Voigt, or in series with a spring (the standard linear solid). Truths are drawn about the nominal
-parameters, each law by turns; both laws are fitted to the noisy recording, from the nominal parameters, with 2 to 4
-unknowns, and `torchsoft.sysid.compare` judges. Three motions show the difference, two hardly do with sensors 4 and 5
-times worse, and two do not: gentle rolling without slip, and a slow roll with sensors 10 times worse. Whether data
-can tell is measured without their noise: the wrong law is fitted to the exact recording, and what it leaves is D
-times the noise of one sample. By the rule (`torchsoft.sysid.comparison`) the right law should be named in more than
-95 % of cases from D = 7.3 on, and a wrong one in no more than 0.06 %, whatever D.
+Two pairs of laws: friction that falls smoothly with the speed of slip or Coulomb's with one
+coefficient; rubber of Kelvin and Voigt, or in series with a spring (the standard linear solid).
+Truths are drawn about the nominal parameters, each law by turns; both laws are fitted to the noisy
+recording, from the nominal parameters, with 2 to 4 unknowns, and `torchsoft.sysid.compare` judges.
+Three motions show the difference, two hardly do with sensors 4 and 5 times worse, and two do not:
+gentle rolling without slip, and a slow roll with sensors 10 times worse. Whether data can tell is
+measured without their noise: the wrong law is fitted to the exact recording, and what it leaves is
+D times the noise of one sample. By the rule (`torchsoft.sysid.comparison`) the right law should be
+named in more than 95 % of cases from D = 7.3 on, and a wrong one in no more than 0.06 %, whatever
+D.
 
-Coulomb's law has one coefficient here: with two, efforts jump where slip begins and gradients are biased. The smooth
-law's mu_k / mu_s ends at 0.9 and the solid's E_instant / E at 4, because without such bounds either contains the
-other law.
+Coulomb's law has one coefficient here: with two, efforts jump where slip begins and gradients are
+biased. The smooth law's mu_k / mu_s ends at 0.9 and the solid's E_instant / E at 4, because without
+such bounds either contains the other law.
 
 Command: .venv/bin/python experiments/law_comparison.py [--cases 100] [--workers 2] [--smoke]
-Expected: at least 95 of 100 named right where motions show the difference, none named wrong anywhere, "cannot tell"
-where they do not. A quarter of an hour on two cores.
+Expected: at least 95 of 100 named right where motions show the difference, none named wrong
+anywhere, "cannot tell" where they do not. A quarter of an hour on two cores.
 """
 
 from collections import Counter
@@ -37,19 +39,23 @@ from torchsoft.sysid.comparison import Comparison
 from torchsoft.sysid.runs import Runner
 from torchsoft.threads import parallel_map
 
-NOMINAL = Parameters().override({"contact.v_s": 0.05, "contact.mu_s": 0.7, "contact.mu_k": 0.6} | COARSE)
+NOMINAL = Parameters().override(
+    {"contact.v_s": 0.05, "contact.mu_s": 0.7, "contact.mu_k": 0.6} | COARSE
+)
 RTOL = 1e-4
 DATA_RTOL = 1e-6
 FALLS = 0.9
-"""Largest kinetic over static friction of the smooth law: with any it would contain the other law but for eta."""
+"""Largest kinetic over static friction of the smooth law: with any it would contain the other law
+but for eta."""
 
 STIFFER = (1.3, 4.0)
-"""Bounds of instantaneous over relaxed modulus of the standard linear solid: with any it would contain the other law."""
+"""Bounds of instantaneous over relaxed modulus of the standard linear solid: with any it would
+contain the other law."""
 
 
 class Amontons(Coulomb):
-    """Coulomb's law with one coefficient, static and kinetic: with two, efforts jump where slip begins, and the gradient of a
-    run does not know it."""
+    """Coulomb's law with one coefficient, static and kinetic: with two, efforts jump where slip
+    begins, and the gradient of a run does not know it."""
 
     def __init__(self, mu: float) -> None:
         super().__init__(mu, mu)
@@ -61,9 +67,12 @@ def coulomb(settings: Parameters, reference: Reference) -> SoftGrasp:
 
 
 def solid(settings: Parameters, reference: Reference) -> SoftGrasp:
-    """The rubber in series with a spring; tau is longer, so that it creeps at low frequencies as the other law does."""
+    """The rubber in series with a spring; tau is longer, so that it creeps at low frequencies as
+    the other law does."""
     p = settings.pad
-    rubber = StandardLinearSolid(E=p.E, E_instant=2.2 * p.E, nu=p.nu, rho=p.rho, tau=1.8 * p.tau, depth=p.depth)
+    rubber = StandardLinearSolid(
+        E=p.E, E_instant=2.2 * p.E, nu=p.nu, rho=p.rho, tau=1.8 * p.tau, depth=p.depth
+    )
     return SoftGrasp(settings, reference, material=rubber)
 
 
@@ -99,11 +108,18 @@ class Setting:
 
 FRICTION, RUBBER = ("smooth", "coulomb"), ("kelvin_voigt", "solid")
 LIGHT: dict[str, Any] = {"depth": 2e-4, "grasp_time": 0.15, "settle": 0.05}
-SHAKEN = Excitation(motion=MultiSine(amplitude_x=4e-3, amplitude_y=1e-4, frequency=(4.0, 15.0)), duration=0.7, **LIGHT)
+SHAKEN = Excitation(
+    motion=MultiSine(amplitude_x=4e-3, amplitude_y=1e-4, frequency=(4.0, 15.0)),
+    duration=0.7,
+    **LIGHT,
+)
 STROKE = Excitation(motion=Strokes(travel=25e-3, stroke_time=0.15), duration=0.5, **LIGHT)
 GENTLE = Excitation(motion=Roll(travel=3e-3), duration=0.6, depth=1e-3, grasp_time=0.2, settle=0.05)
 PRESSED = Excitation(
-    motion=Press(amplitude=4e-4, frequency=8.0, travel=5e-3), duration=0.6, grasp_time=0.15, settle=0.05
+    motion=Press(amplitude=4e-4, frequency=8.0, travel=5e-3),
+    duration=0.6,
+    grasp_time=0.15,
+    settle=0.05,
 )
 SLOW = Excitation(motion=Roll(travel=3e-3), duration=1.0, grasp_time=0.6, settle=0.1)
 SETTINGS = {
@@ -130,9 +146,14 @@ def draw(setting: str, number: int, seed: int) -> Case:
     """The law by turns, parameters at random about the nominal ones."""
     rng = np.random.default_rng([seed, list(SETTINGS).index(setting), number])
     law = SETTINGS[setting].laws[number % 2]
-    nominal = {name: NOMINAL.table()[name]["value"] for name in ("pad.E", "contact.mu_s", "pad.tau", "contact.K_n")}
+    nominal = {
+        name: NOMINAL.table()[name]["value"]
+        for name in ("pad.E", "contact.mu_s", "pad.tau", "contact.K_n")
+    }
     near = {name: value for name, value in nominal.items() if name in UNKNOWNS[law]}
-    truth = {name: value * float(np.exp(0.1 * rng.standard_normal())) for name, value in near.items()}
+    truth = {
+        name: value * float(np.exp(0.1 * rng.standard_normal())) for name, value in near.items()
+    }
     if law == "smooth":
         truth["contact.mu_k"] = truth["contact.mu_s"] * float(rng.uniform(0.6, 0.85))
     if law == "solid":
@@ -145,8 +166,8 @@ def data(case: Case, noise: float) -> Recording:
     """What a rig with the true law gives; the true law's nominal rig is in it."""
     setting = SETTINGS[case.setting]
     return record(
-        "motion", setting.excitation, NOMINAL, NOMINAL, setting.sensors, rtol=DATA_RTOL, noise=noise, seed=case.seed,
-        build=BUILDS[case.law], values=case.truth,
+        "motion", setting.excitation, NOMINAL, NOMINAL, setting.sensors, rtol=DATA_RTOL,
+        noise=noise, seed=case.seed, build=BUILDS[case.law], values=case.truth,
     )  # fmt: skip
 
 
@@ -188,7 +209,8 @@ class Config:
 
 @dataclass(frozen=True)
 class Judged:
-    """One case: what the comparison said, and `apart`, the D of the wrong law on data without noise."""
+    """One case: what the comparison said, and `apart`, the D of the wrong law on data without
+    noise."""
 
     case: Case
     apart: float
@@ -220,21 +242,29 @@ def counts(config: Config) -> dict[str, int]:
 
 def judge(case: Case) -> Judged:
     laws = problems(case, data(case, 1.0))
-    found, wall = timed(lambda: compare(laws, plans={name: plan(one) for name, one in laws.items()}))
+    found, wall = timed(
+        lambda: compare(laws, plans={name: plan(one) for name, one in laws.items()})
+    )
     exact = problems(case, data(case, 0.0))
     wrong = next(name for name in exact if name != case.law)
-    left = Evidence(fit(wrong, exact[wrong]), Runner(exact[wrong].recordings), exact[wrong].names, [])
+    left = Evidence(
+        fit(wrong, exact[wrong]), Runner(exact[wrong].recordings), exact[wrong].names, []
+    )
     return Judged(case, float(np.linalg.norm(left.fitted.r)), found, wall)
 
 
 def fit(name: str, problem: Problem) -> FittedLaw:
     """One law, as `compare` fits it."""
-    return fitted(name, problem, Runner(problem.recordings), problem.names, plan(problem), RTOL, 1, False)
+    return fitted(
+        name, problem, Runner(problem.recordings), problem.names, plan(problem), RTOL, 1, False
+    )
 
 
 def run(config: Config) -> Result:
     config = replace(config, workers=1) if config.smoke else config
-    cases = [draw(name, k, config.seed) for name, number in counts(config).items() for k in range(number)]
+    cases = [
+        draw(name, k, config.seed) for name, number in counts(config).items() for k in range(number)
+    ]
     work = parallel_map(lambda k: judge(cases[k]), len(cases), config.workers)
     done = dict(tqdm(work, desc="cases", total=len(cases), disable=config.smoke))
     return Result(config, [done[k] for k in range(len(cases))])
@@ -252,16 +282,26 @@ def figure(result: Result) -> Figure:
     D = np.geomspace(0.05, max(one.apart for one in result.judged), 100)
     axes.plot(D, D / 2, "k", lw=1, label="expected, D / 2")
     axes.axhspan(-2, 2, color="#f6e3d6", lw=0, zorder=0)
-    axes.set(xscale="log", xlabel="D without noise", ylabel="z for the law that made the data", yscale="symlog")
+    axes.set(
+        xscale="log",
+        xlabel="D without noise",
+        ylabel="z for the law that made the data",
+        yscale="symlog",
+    )
     axes.legend()
     return fig
 
 
 def rows(result: Result) -> list[dict]:
     """By motion, then for all data that can tell, and all that cannot, by D."""
-    groups = {name: [one for one in result.judged if one.case.setting == name] for name in counts(result.config)}
+    groups = {
+        name: [one for one in result.judged if one.case.setting == name]
+        for name in counts(result.config)
+    }
     groups |= {
-        "motions that show the difference": [one for one in result.judged if one.case.setting in TELLING],
+        "motions that show the difference": [
+            one for one in result.judged if one.case.setting in TELLING
+        ],
         f"D of {ENOUGH:g} or more": [one for one in result.judged if one.apart >= ENOUGH],
         f"D below {ENOUGH:g}": [one for one in result.judged if one.apart < ENOUGH],
     }
@@ -285,13 +325,16 @@ def main(config: Config) -> None:
     table = markdown(("data", "cases", "D least / median / most", *ANSWERS), cells)
     cases = [
         {
-            "motion": one.case.setting, "law": one.case.law, "truth": one.case.truth, "seed": one.case.seed, "D": one.apart,
-            "answer": one.answer, "wall_s": one.wall_s, "verdict": one.said.verdict,
-            "laws": [asdict(law) for law in one.said.laws], "against": [asdict(v) for v in one.said.against],
+            "motion": one.case.setting, "law": one.case.law, "truth": one.case.truth,
+            "seed": one.case.seed, "D": one.apart, "answer": one.answer, "wall_s": one.wall_s,
+            "verdict": one.said.verdict, "laws": [asdict(law) for law in one.said.laws],
+            "against": [asdict(v) for v in one.said.against],
         }
         for one in result.judged
     ]  # fmt: skip
-    write(result.config, {"groups": summed, "cases": cases}, {"law_comparison": figure(result)}, table)
+    write(
+        result.config, {"groups": summed, "cases": cases}, {"law_comparison": figure(result)}, table
+    )
 
 
 if __name__ == "__main__":

@@ -1,15 +1,16 @@
 """Question: can a friction law that is a neural network be learned inside the simulator?
 
 `MuNetwork` is a user's law: mu(v), an unknown function of the slip speed, is a small network in
-(eta + R) |gamma'| = <E - mu(|gamma'|) F_N>+, solved by a few fixed-point sweeps. It is a module of (E, F_N, R) that gives the
-slip rate, and is handed to the model as its friction; nothing else of the model changes, and it runs compiled. It learns from
-the disc's motion alone (pose and velocity, a few milliseconds after a kick that makes it slip), made by the built-in law
-mu(v) = mu_k + (mu_s - mu_k) / (1 + v / v_s), by the discrete adjoint of the run.
+(eta + R) |gamma'| = <E - mu(|gamma'|) F_N>+, solved by a few fixed-point sweeps. It is a module of
+(E, F_N, R) that gives the slip rate, and is handed to the model as its friction; nothing else of
+the model changes, and it runs compiled. It learns from the disc's motion alone (pose and velocity,
+a few milliseconds after a kick that makes it slip), made by the built-in law mu(v) = mu_k + (mu_s -
+mu_k) / (1 + v / v_s), by the discrete adjoint of the run.
 
-Command: .venv/bin/python experiments/learned_friction.py [--smoke]
-Expected: the loss falls by more than 100 times in 40 runs of the model, and mu is learned to 0.01 on average over the slip
-speeds that occurred, worst (0.1) at the slowest, which leave the least trace in the motion. Beyond them nothing is known
-and nothing is claimed. About twenty seconds on one core.
+Command: .venv/bin/python experiments/learned_friction.py [--smoke] Expected: the loss falls by more
+than 100 times in 40 runs of the model, and mu is learned to 0.01 on average over the slip speeds
+that occurred, worst (0.1) at the slowest, which leave the least trace in the motion. Beyond them
+nothing is known and nothing is claimed. About twenty seconds on one core.
 """
 
 from dataclasses import dataclass, replace
@@ -23,7 +24,8 @@ from torchsoft import Parameters, SmoothSlip, SoftGrasp, Trajectory, press, simu
 from torchsoft.experiment import COARSE, at_the_points, markdown, options, write
 
 SWEEPS = 4
-"""Fixed-point sweeps for mu(v) and v; each shrinks the error by about (mu_s - mu_k) F_N / ((eta + R) v_s), 0.1 here."""
+"""Fixed-point sweeps for mu(v) and v; each shrinks the error by about (mu_s - mu_k) F_N / ((eta +
+R) v_s), 0.1 here."""
 SCALE = (1e-5, 1e-5, 1e-3, 1e-2, 1e-2, 1.0)
 """What counts as one unit of misfit: x, y [m], theta [rad], v_x, v_y [m/s], omega [rad/s]."""
 
@@ -47,11 +49,14 @@ class Result:
     mu_start: Tensor
     mu_learned: Tensor
     mu_true: Tensor
-    excited: tuple[float, float]  # slip speeds in the data, from the 10 % quantile to the largest [m/s]
+    excited: tuple[
+        float, float
+    ]  # slip speeds in the data, from the 10 % quantile to the largest [m/s]
 
 
 class MuNetwork(nn.Module):
-    """Friction whose coefficient is a network of the slip speed: mu(v) = 0.5 + 0.4 tanh(net(log(1 + v / v_0)))."""
+    """Friction whose coefficient is a network of the slip speed: mu(v) = 0.5 + 0.4 tanh(net(log(1 +
+    v / v_0)))."""
 
     def __init__(self, eta: float, v_0: float = 0.01, width: int = 8) -> None:
         super().__init__()
@@ -78,7 +83,9 @@ def true_mu(law: SmoothSlip, v: Tensor) -> Tensor:
 
 def disc(run: Trajectory) -> Tensor:
     """(T, 6): pose and velocity of the disc, in units of `SCALE`."""
-    return run.together("x_C", "y_C", "theta", "v_x", "v_y", "omega") / torch.tensor(SCALE, dtype=torch.float64)
+    return run.together("x_C", "y_C", "theta", "v_x", "v_y", "omega") / torch.tensor(
+        SCALE, dtype=torch.float64
+    )
 
 
 def run(config: Config) -> Result:
@@ -87,7 +94,9 @@ def run(config: Config) -> Result:
     law = {"contact.mu_s": 0.8, "contact.mu_k": 0.3, "contact.v_s": 0.05}
     model = SoftGrasp(Parameters().override(COARSE | law))
     y0 = press(model, model.settings.scenario.y_Br_grasp).detach()
-    y0[model.layout.slices["velocity", "disc"]] = torch.tensor([config.kick, 0.0, 0.0], dtype=torch.float64)
+    y0[model.layout.slices["velocity", "disc"]] = torch.tensor(
+        [config.kick, 0.0, 0.0], dtype=torch.float64
+    )
     step = 1e-3 * config.step_ms
     t = step * torch.arange(config.samples + 1, dtype=torch.float64)
 
@@ -105,13 +114,20 @@ def run(config: Config) -> Result:
     learner.requires_grad_(False)
     student.requires_grad_(True)
     optimiser = torch.optim.LBFGS(
-        student.parameters(), max_iter=config.evaluations, max_eval=config.evaluations, line_search_fn="strong_wolfe"
+        student.parameters(),
+        max_iter=config.evaluations,
+        max_eval=config.evaluations,
+        line_search_fn="strong_wolfe",
     )
     losses: list[float] = []
 
     def misfit() -> Tensor:
         optimiser.zero_grad()
-        loss = (disc(simulate(learner, t, y0=y0, step=step, gradient="discrete")) - data).square().mean()
+        loss = (
+            (disc(simulate(learner, t, y0=y0, step=step, gradient="discrete")) - data)
+            .square()
+            .mean()
+        )
         loss.backward()
         losses.append(loss.item())
         return loss
@@ -120,7 +136,15 @@ def run(config: Config) -> Result:
     misfit()  # where it ended
     with torch.no_grad():
         learned = student.mu(v)
-    return Result(config, losses, v, start, learned, exact, (float(excited.quantile(0.1)), float(excited.max())))
+    return Result(
+        config,
+        losses,
+        v,
+        start,
+        learned,
+        exact,
+        (float(excited.quantile(0.1)), float(excited.max())),
+    )
 
 
 def numbers(result: Result) -> dict[str, float]:
@@ -143,15 +167,24 @@ def figure(result: Result) -> Figure:
     fig = Figure(figsize=(10, 4), layout="constrained")
     left, right = fig.subplots(1, 2)
     left.semilogy(result.losses)
-    left.set(xlabel="run of the model", ylabel="mean squared misfit [1]", title="Learning from the disc's motion")
+    left.set(
+        xlabel="run of the model",
+        ylabel="mean squared misfit [1]",
+        title="Learning from the disc's motion",
+    )
     mm_s = 1e3 * result.slip_speeds
     right.axvspan(
-        1e3 * result.excited[0], 1e3 * result.excited[1], color="0.93", label="slip speeds in the data (90 %)"
+        1e3 * result.excited[0],
+        1e3 * result.excited[1],
+        color="0.93",
+        label="slip speeds in the data (90 %)",
     )
     right.plot(mm_s, result.mu_true, "k-", label="truth")
     right.plot(mm_s, result.mu_start, "C0:", label="before")
     right.plot(mm_s, result.mu_learned, "C1--", label="learned")
-    right.set(xlabel="slip speed [mm/s]", ylabel="mu [1]", title="Friction coefficient", ylim=(0.0, 1.0))
+    right.set(
+        xlabel="slip speed [mm/s]", ylabel="mu [1]", title="Friction coefficient", ylim=(0.0, 1.0)
+    )
     right.legend()
     return fig
 
@@ -161,7 +194,12 @@ def main() -> None:
     found = numbers(result)
     rows = [(name, f"{value:.4g}") for name, value in found.items()]
     table = markdown(("", "learned"), rows)
-    write(result.config, {**found, "losses": result.losses}, {"learned_friction": figure(result)}, table)
+    write(
+        result.config,
+        {**found, "losses": result.losses},
+        {"learned_friction": figure(result)},
+        table,
+    )
 
 
 if __name__ == "__main__":

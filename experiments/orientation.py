@@ -1,5 +1,6 @@
-"""Question: can PD loops turn a disc between two soft pads by 90 degrees with its centre held, then carry it with its
-orientation held, within 0.1 mm and 0.5 degrees; and where do loops alone no longer do it?
+"""Question: can PD loops turn a disc between two soft pads by 90 degrees with its centre held, then
+carry it with its orientation held, within 0.1 mm and 0.5 degrees; and where do loops alone no
+longer do it?
 
 The rig is `rigs/orientation.toml`: each pad on a jaw of its own; the loop on disc.x pushes both jaws the same way, the loop
 on disc.theta pushes them against each other, the loop on disc.y lifts the lower jaw, and a force grips from above. Gains by
@@ -11,11 +12,12 @@ design: one bandwidth w, damping 1, for the masses of rigid parts that roll. Err
   shape       ellipses of the disc's area and a rounded box: the grip turns them with F = max h'/h (N + W / 2) on either
               jaw, for which the loop needs an error F / Kp; then with the efforts of the run before fed forward
 
-Command: .venv/bin/python experiments/orientation.py [--smoke]
-Expected: the disc within 0.009 mm and 0.09 degrees, 0.0005 mm and 0.003 degrees at rest; by kinematics 2.1 degrees off.
-Beyond the tolerance: the disc four times as fast (inertia); by loops alone the ellipse of 1.1 and all that is farther from
-a disc, which efforts fed forward mend for 1.1, 1.3 and the box; the ellipse of 1.3 with mu near its friction cone of 0.29 or
-below; the ellipse of 2, which asks for 0.82 and has 0.8, and is lost. Little more than a minute on one core.
+Command: .venv/bin/python experiments/orientation.py [--smoke] Expected: the disc within 0.009 mm
+and 0.09 degrees, 0.0005 mm and 0.003 degrees at rest; by kinematics 2.1 degrees off. Beyond the
+tolerance: the disc four times as fast (inertia); by loops alone the ellipse of 1.1 and all that is
+farther from a disc, which efforts fed forward mend for 1.1, 1.3 and the box; the ellipse of 1.3
+with mu near its friction cone of 0.29 or below; the ellipse of 2, which asks for 0.82 and has 0.8,
+and is lost. Little more than a minute on one core.
 """
 
 from collections.abc import Mapping
@@ -70,8 +72,9 @@ Gains = dict[str, dict[str, float]]
 
 
 def design(file: RigFile, bandwidth: float) -> Gains:
-    """Kp = w^2 M and Kd = 2 w M, of damping 1, for the disc of a file rolling as rigid parts do: forces F on both jaws give
-    2 F = (m + 2 m_J) x'', forces +-F give F = (m_J R + I / 2 R) theta''."""
+    """Kp = w^2 M and Kd = 2 w M, of damping 1, for the disc of a file rolling as rigid parts do:
+    forces F on both jaws give 2 F = (m + 2 m_J) x'', forces +-F give F = (m_J R + I / 2 R)
+    theta''."""
     m, m_J, shape = file.bodies["disc"].mass, file.bodies["lower"].mass, file.bodies["disc"].shape
     assert m is not None and m_J is not None and shape is not None  # noqa: PT018
     disc = shape.build(file.folder)
@@ -93,7 +96,8 @@ class Case:
 
 
 class Outcome(NamedTuple):
-    """A run in numbers: errors from `GRIPPED` on, largest and where everything is at rest, and what pushed."""
+    """A run in numbers: errors from `GRIPPED` on, largest and where everything is at rest, and what
+    pushed."""
 
     position_mm: float
     angle_deg: float
@@ -109,14 +113,21 @@ class Outcome(NamedTuple):
 
 
 def file_of(gains: Gains, **groups: dict[str, Any]) -> RigFile:
-    """The rig file with gains by design, and with signals for efforts to be fed forward, which are zero at first."""
+    """The rig file with gains by design, and with signals for efforts to be fed forward, which are
+    zero at first."""
     loops = {loop: {"feed_forward": f"known_{loop}"} for loop in LOOPS}
     zero = {f"known_{loop}": {"kind": "profile", "times": [0.0], "values": [0.0]} for loop in LOOPS}
-    return RigFile.from_toml(FILE).override(**groups).override(actuators=loops, motion=zero).override(actuators=gains)
+    return (
+        RigFile.from_toml(FILE)
+        .override(**groups)
+        .override(actuators=loops, motion=zero)
+        .override(actuators=gains)
+    )
 
 
 def case_of(file: RigFile, shape: Shape | None = None) -> Case:
-    """The rig with another shape in place of the disc, between jaws that are as far from its surface."""
+    """The rig with another shape in place of the disc, between jaws that are as far from its
+    surface."""
     ready = file.build()
     signals = {name: ready.rig.reference[name] for name in ready.rig.signals}
     case = Case(ready.rig, ready.y0, signals, file.outputs.duration)
@@ -153,7 +164,8 @@ def faster(case: Case, speed: float) -> Case:
 
 
 def rubbed(case: Case, mu: float) -> None:
-    """Give the law that both contacts share a static coefficient of friction, the kinetic one in the same ratio as before."""
+    """Give the law that both contacts share a static coefficient of friction, the kinetic one in
+    the same ratio as before."""
     slip = case.rig.contacts["lower"].law.friction
     assert isinstance(slip, SmoothSlip)
     with torch.no_grad():
@@ -164,12 +176,17 @@ def rubbed(case: Case, mu: float) -> None:
 def fed(case: Case, run: Trajectory) -> Case:
     """The same, with the efforts of a run before fed forward."""
     efforts = {f"known_{loop}": run[f"F_{loop}"] for loop in LOOPS} | {"bear": run["F_lift"]}
-    return Case(case.rig, case.y0, case.signals | {k: Sampled(run.t, v.detach()) for k, v in efforts.items()}, case.end)
+    return Case(
+        case.rig,
+        case.y0,
+        case.signals | {k: Sampled(run.t, v.detach()) for k, v in efforts.items()},
+        case.end,
+    )
 
 
 def by_kinematics(case: Case, gains: Gains, R: float) -> Case:
-    """Jaws that follow what rolling of a rigid disc would be, each under a loop of its own that does not see the disc:
-    x_J = x_d +- R theta_d."""
+    """Jaws that follow what rolling of a rigid disc would be, each under a loop of its own that
+    does not see the disc: x_J = x_d +- R theta_d."""
     rig, signals = case.rig, dict(case.signals)
     start = rig.unpack(case.y0).pose
     times = torch.linspace(0.0, case.end, 901, dtype=torch.float64)
@@ -177,10 +194,18 @@ def by_kinematics(case: Case, gains: Gains, R: float) -> Case:
     jaws = {}
     for jaw, sign in (("lower", 1.0), ("upper", -1.0)):
         signals[f"{jaw}_d"] = Sampled(times, float(start[jaw][0]) + x_d + sign * R * theta_d)
-        jaws[f"carry_{jaw}"] = Actuator(f"{jaw}.x", f"{jaw}.x", PD(**gains[f"carry_{jaw}"]), setpoint=f"{jaw}_d")
+        jaws[f"carry_{jaw}"] = Actuator(
+            f"{jaw}.x", f"{jaw}.x", PD(**gains[f"carry_{jaw}"]), setpoint=f"{jaw}_d"
+        )
     own = {name: rig.actuators[name] for name in ("lift", "grip")}
     gravity = rig.gravity.item()
-    alone = Rig(bodies=rig.bodies, pads=rig.pads, contacts=rig.contacts, actuators=jaws | own, gravity=gravity)
+    alone = Rig(
+        bodies=rig.bodies,
+        pads=rig.pads,
+        contacts=rig.contacts,
+        actuators=jaws | own,
+        gravity=gravity,
+    )
     return Case(alone, case.y0, signals, case.end)
 
 
@@ -188,7 +213,9 @@ def simulate(case: Case, rtol: float) -> tuple[Trajectory, str]:
     """A run every 10 ms, or what there is of it, and why it ended early."""
     t = torch.linspace(0.0, case.end, round(100 * case.end) + 1, dtype=torch.float64)
     try:
-        return simulated(case.rig, t, y0=case.y0, reference=Reference(**case.signals), rtol=rtol), ""
+        return simulated(
+            case.rig, t, y0=case.y0, reference=Reference(**case.signals), rtol=rtol
+        ), ""
     except SimulationFailed as failure:
         if failure.trajectory is None:
             raise
@@ -205,15 +232,25 @@ def errors(case: Case, run: Trajectory) -> tuple[Tensor, Tensor]:
 def outcome(case: Case, run: Trajectory, stopped: str = "") -> Outcome:
     position, angle = errors(case, run)
     later = run.t >= GRIPPED - 1e-9
-    angle, effort = angle.abs(), run["F_turn_lower"] if "F_turn_lower" in run.channels else torch.zeros_like(run.t)
+    angle, effort = (
+        angle.abs(),
+        run["F_turn_lower"] if "F_turn_lower" in run.channels else torch.zeros_like(run.t),
+    )
     turn = case.signals["x_d"]
     assert isinstance(turn, Piecewise)
-    rests = [run.at(float(turn.times[0])), len(run.t) - 1]  # the turn has come to rest when the way begins
-    share = [f[later, :, 1].sum(-1).abs() / f[later, :, 0].sum(-1).clamp(min=1e-9) for f in run.force.values()]
+    rests = [
+        run.at(float(turn.times[0])),
+        len(run.t) - 1,
+    ]  # the turn has come to rest when the way begins
+    share = [
+        f[later, :, 1].sum(-1).abs() / f[later, :, 0].sum(-1).clamp(min=1e-9)
+        for f in run.force.values()
+    ]
     opening = run["y_upper"].detach() - run["y_lower"].detach()
     return Outcome(
-        float(position[later].max()), float(angle[later].max()), float(position[rests].max()), float(angle[rests].max()),
-        float(torch.stack(share).max()), float(effort.detach()[later].abs().max()),
+        float(position[later].max()), float(angle[later].max()), float(position[rests].max()),
+        float(angle[rests].max()), float(torch.stack(share).max()),
+        float(effort.detach()[later].abs().max()),
         MM * float((opening - opening[run.at(GRIPPED)])[later].abs().max()), stopped,
     )  # fmt: skip
 
@@ -227,12 +264,17 @@ class Rigid(NamedTuple):
 
 
 def rigid(shape: Shape, grip: float, weight: float) -> Rigid:
-    """With the support function h of the angle: the plates' normal forces N and N + W act h' beside the centre, and the
-    friction F on either plate balances their couple: 2 F h = (2 N + W) h'."""
+    """With the support function h of the angle: the plates' normal forces N and N + W act h' beside
+    the centre, and the friction F on either plate balances their couple: 2 F h = (2 N + W) h'."""
     points = shape.outline(1441).numpy()
     angle = np.linspace(0, 2 * np.pi, len(points))
-    n, t = (np.stack(axes, -1) for axes in ((np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))))
-    quarter = (angle >= np.pi) & (angle <= 1.5 * np.pi)  # the normals that look down in the course of the turn
+    n, t = (
+        np.stack(axes, -1)
+        for axes in ((np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle)))
+    )
+    quarter = (angle >= np.pi) & (
+        angle <= 1.5 * np.pi
+    )  # the normals that look down in the course of the turn
     h, slope = ((points * axes).sum(-1)[quarter] for axes in (n, t))
     F = (grip + weight / 2) * float(np.abs(slope / h).max())
     return Rigid(F / grip, F, 2 * MM * float(np.abs(h - h[-1]).max()))
@@ -246,10 +288,19 @@ class Config:
     out: Path = Path("out/orientation")
     position_mm: float = 0.1  # tolerance of the centre
     angle_deg: float = 0.5  # and of the orientation
-    bandwidth: float = 150.0  # of the loops [rad/s]; assumed, for the model has no delay that would limit it
+    bandwidth: float = (
+        150.0  # of the loops [rad/s]; assumed, for the model has no delay that would limit it
+    )
     speeds: tuple[float, ...] = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0)  # of the disc
     disc_speed: float = 3.0  # at which its friction is varied
-    disc_frictions: tuple[float, ...] = (0.8, 0.02, 0.01, 0.005, 0.002, 0.001)  # mu_s; mu_k in proportion
+    disc_frictions: tuple[float, ...] = (
+        0.8,
+        0.02,
+        0.01,
+        0.005,
+        0.002,
+        0.001,
+    )  # mu_s; mu_k in proportion
     aspects: tuple[float, ...] = (1.1, 1.3, 2.0)  # of the ellipses
     slipping_aspect: float = 1.3  # of the one whose friction is varied
     frictions: tuple[float, ...] = (0.5, 0.35, 0.32, 0.3, 0.28, 0.25, 0.2)
@@ -272,7 +323,9 @@ class Result:
     alone: dict[str, Outcome] = field(default_factory=dict)  # by shape, by loops alone
     known: dict[str, Outcome] = field(default_factory=dict)  # by shape, with efforts fed forward
     speeds: dict[float, Outcome] = field(default_factory=dict)
-    lags: dict[float, tuple[float, float]] = field(default_factory=dict)  # a / w^2 [mm, deg] by speed
+    lags: dict[float, tuple[float, float]] = field(
+        default_factory=dict
+    )  # a / w^2 [mm, deg] by speed
     disc_frictions: dict[float, Outcome] = field(default_factory=dict)
     frictions: dict[float, Outcome] = field(default_factory=dict)
     runs: dict[str, tuple[Case, Trajectory]] = field(default_factory=dict)  # for the figures
@@ -285,34 +338,59 @@ class Result:
 
 def table(result: Result) -> str:
     """Every run in a row, and what rigid parts ask for."""
-    head = ("run", "centre [mm]", "angle [deg]", "at rest [mm]", "[deg]", "friction / normal", "effort [N]", "verdict")
+    head = (
+        "run",
+        "centre [mm]",
+        "angle [deg]",
+        "at rest [mm]",
+        "[deg]",
+        "friction / normal",
+        "effort [N]",
+        "verdict",
+    )
     named: list[tuple[str, Outcome]] = [(name, one) for name, one in result.alone.items()]
     named += [(f"{name}, efforts fed forward", one) for name, one in result.known.items()]
-    named += [(f"disc, {speed:g} times as fast", one) for speed, one in result.speeds.items() if speed != 1]
-    named += [(f"disc, {result.config.disc_speed:g} times, mu = {mu:g}", x) for mu, x in result.disc_frictions.items()]
+    named += [
+        (f"disc, {speed:g} times as fast", one)
+        for speed, one in result.speeds.items()
+        if speed != 1
+    ]
+    named += [
+        (f"disc, {result.config.disc_speed:g} times, mu = {mu:g}", x)
+        for mu, x in result.disc_frictions.items()
+    ]
     aspect = f"{result.config.slipping_aspect:g}"
-    named += [(f"ellipse {aspect}, fed forward, mu = {mu:g}", one) for mu, one in result.frictions.items()]
+    named += [
+        (f"ellipse {aspect}, fed forward, mu = {mu:g}", one) for mu, one in result.frictions.items()
+    ]
     rows = [
-        (name, f"{x.position_mm:.4f}", f"{x.angle_deg:.3f}", f"{x.rest_mm:.4f}", f"{x.rest_deg:.4f}", f"{x.friction:.3g}",
+        (name, f"{x.position_mm:.4f}", f"{x.angle_deg:.3f}", f"{x.rest_mm:.4f}",
+        f"{x.rest_deg:.4f}", f"{x.friction:.3g}",
          f"{x.effort:.3g}", result.verdict(x))
         for name, x in named
     ]  # fmt: skip
     fast = f"disc, {result.config.disc_speed:g} times as fast"
     cones = {name: one.friction for name, one in result.rigid.items()}
     cones |= {f"{fast}, turned": result.turning, f"{fast}, carried": result.carrying}
-    asked = markdown(("rigid", "asks for a friction of"), [(name, f"{mu:.3g}") for name, mu in cones.items()])
+    asked = markdown(
+        ("rigid", "asks for a friction of"), [(name, f"{mu:.3g}") for name, mu in cones.items()]
+    )
     return f"{markdown(head, rows)}\n\n{asked}"
 
 
 @rc_context(STYLE)
 def figure(result: Result) -> Figure:
-    """Largest errors in parts of the tolerance: by shape, over speed and over friction; a cross where the body was lost."""
+    """Largest errors in parts of the tolerance: by shape, over speed and over friction; a cross
+    where the body was lost."""
     c = result.config
     fig = Figure(figsize=(13, 4), layout="constrained")
     shape, speed, friction = fig.subplots(1, 3, sharey=True)
 
     def draw(axes: Axes, label: str, outcomes: Mapping[Any, Outcome], colour: str) -> None:
-        error = [max(one.position_mm / c.position_mm, one.angle_deg / c.angle_deg) for one in outcomes.values()]
+        error = [
+            max(one.position_mm / c.position_mm, one.angle_deg / c.angle_deg)
+            for one in outcomes.values()
+        ]
         axes.plot(list(outcomes), error, "o", color=colour, label=label)
         lost = {key: one for (key, x), one in zip(outcomes.items(), error) if x.stopped}
         axes.plot(list(lost), list(lost.values()), "X", color="#cc3311", ms=9)
@@ -340,20 +418,24 @@ def peak(signal: Any) -> float:
 
 
 def shapes(config: Config, R: float) -> dict[str, Shape]:
-    found: dict[str, Shape] = {f"ellipse {k:g}": Ellipse(R * k**0.5, R / k**0.5) for k in config.aspects}
+    found: dict[str, Shape] = {
+        f"ellipse {k:g}": Ellipse(R * k**0.5, R / k**0.5) for k in config.aspects
+    }
     side = 0.9 * R
     return found | ({"rounded box": RoundedBox(side, side, side / 2)} if config.box else {})
 
 
 def inertia_alone(case: Case, bandwidth: float) -> tuple[float, float]:
-    """The errors a / w^2 of centre [mm] and orientation [deg] at the largest accelerations of the set-points."""
+    """The errors a / w^2 of centre [mm] and orientation [deg] at the largest accelerations of the
+    set-points."""
     x, y, theta = (peak(case.signals[name]) / bandwidth**2 for name in ("x_d", "y_d", "theta_d"))
     return MM * (x**2 + y**2) ** 0.5, DEGREES * theta
 
 
 def run(config: Config) -> Result:
     if config.smoke:
-        config = replace(config, speeds=(6.0,), disc_frictions=(), aspects=(1.3,), frictions=(0.2,), box=False, passes=1,
+        config = replace(config, speeds=(6.0,), disc_frictions=(), aspects=(1.3,), frictions=(0.2,),
+            box=False, passes=1,
                          rtol=1e-3, frames=2)  # fmt: skip
     mesh = {"elements_x": 35, "elements_y": 2}
     gains = design(RigFile.from_toml(FILE), config.bandwidth)
@@ -411,7 +493,10 @@ def summary(result: Result) -> dict[str, Any]:
     """What `summary.json` holds."""
 
     def rows(outcomes: Mapping[Any, Outcome]) -> dict[str, Any]:
-        return {str(key): one._asdict() | {"verdict": result.verdict(one)} for key, one in outcomes.items()}
+        return {
+            str(key): one._asdict() | {"verdict": result.verdict(one)}
+            for key, one in outcomes.items()
+        }
 
     return {
         "gains": result.gains,
@@ -430,18 +515,25 @@ def summary(result: Result) -> dict[str, Any]:
 def main(config: Config) -> None:
     result, wall = timed(lambda: run(config))
     case, done = result.runs[DISC]
-    stills = snapshots(done, case.rig, (0.5, 1.1, 1.5, 2.5, 3.5, 4.5), "Turned by 90 degrees, then carried")
+    stills = snapshots(
+        done, case.rig, (0.5, 1.1, 1.5, 2.5, 3.5, 4.5), "Turned by 90 degrees, then carried"
+    )
     figures = {"orientation": figure(result), "snapshots": stills}
     write(result.config, summary(result) | {"wall_s": wall}, figures, table(result))
     aspect = f"ellipse {config.slipping_aspect:g}"
     videos = {
         "orientation.gif": (DISC, "A disc turned by 90 degrees between two jaws, then carried"),
-        "ellipse.gif": (f"{aspect}, fed", f"{aspect.capitalize()}, with efforts fed forward: the jaws give way"),
+        "ellipse.gif": (
+            f"{aspect}, fed",
+            f"{aspect.capitalize()}, with efforts fed forward: the jaws give way",
+        ),
     }
     for file, (name, title) in videos.items():
         if config.animation and name in result.runs:
             (case, done), path, frames = result.runs[name], config.out / file, result.config.frames
-            animate(done, case.rig, path, frames=frames, title=title, follow="disc.theta", even=True)
+            animate(
+                done, case.rig, path, frames=frames, title=title, follow="disc.theta", even=True
+            )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
-"""Question: how small can an ordinary differential equation for disc and bracket be, and where does it stop being enough?
+"""Question: how small can an ordinary differential equation for disc and bracket be, and where does
+it stop being enough?
 
 Stick. Both pads stick to the disc: each is a spring k and a dashpot c on its slip (`torchsoft.reduced.terms`), so that
     m x_C''     =  k (x_Br - 2 x_C) + c (...)'
@@ -9,14 +10,16 @@ the grasp, with pads and stretches condensed at rest: not quite a spring and a d
 training motions are taps: small random velocities of disc and bracket and a broad multi-sine, some micrometres large. The
 radius comes from one roll to the other side. Held out: the paper's manipulation.
 
-Slip. A light grasp, the horizontal loop on the bracket, strokes ever faster: the disc rolls on the lower pad and the upper one
-slips. Held out: other strokes. Errors are root mean squares over the signal's range, worst of the six states.
+Slip. A light grasp, the horizontal loop on the bracket, strokes ever faster: the disc rolls on the
+lower pad and the upper one slips. Held out: other strokes. Errors are root mean squares over the
+signal's range, worst of the six states.
 
-Command: .venv/bin/python experiments/reduced_model.py [--smoke]
-Expected: stick: 8 terms, the very ones above; held-out error 0.3 % of range (node transitions in the spin), more than 100 times
-faster than the full model; k, c and the masses within 10 % of the expectation but for the spin's k (-14 %) and c_r (-18 %).
-Slip: 5 terms, 1 % up to 80 m/s2, 4 % at 300 m/s2, where the normal force is no longer that of the training strokes; 7 %
-in a grasp of another depth, which is another mode. Two minutes on one core.
+Command: .venv/bin/python experiments/reduced_model.py [--smoke] Expected: stick: 8 terms, the very
+ones above; held-out error 0.3 % of range (node transitions in the spin), more than 100 times faster
+than the full model; k, c and the masses within 10 % of the expectation but for the spin's k (-14 %)
+and c_r (-18 %). Slip: 5 terms, 1 % up to 80 m/s2, 4 % at 300 m/s2, where the normal force is no
+longer that of the training strokes; 7 % in a grasp of another depth, which is another mode. Two
+minutes on one core.
 """
 
 from collections.abc import Sequence
@@ -59,9 +62,28 @@ class Config:
     thresholds: tuple[float, ...] = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.14, 0.2, 0.3)
     models: int = 50  # members of an ensemble
     depth: float = 3e-4  # of the light grasp [m]
-    stroke_times: tuple[float, ...] = (0.12, 0.08, 0.065, 0.05, 0.04, 0.03)  # of the training strokes of 20 mm [s]
-    checking_times: tuple[float, ...] = (0.07, 0.04)  # of those of 15 mm to the other side that choose thresholds [s]
-    other_times: tuple[float, ...] = (0.15, 0.1, 0.055, 0.045, 0.035, 0.03, 0.025, 0.02)  # held out [s]
+    stroke_times: tuple[float, ...] = (
+        0.12,
+        0.08,
+        0.065,
+        0.05,
+        0.04,
+        0.03,
+    )  # of the training strokes of 20 mm [s]
+    checking_times: tuple[float, ...] = (
+        0.07,
+        0.04,
+    )  # of those of 15 mm to the other side that choose thresholds [s]
+    other_times: tuple[float, ...] = (
+        0.15,
+        0.1,
+        0.055,
+        0.045,
+        0.035,
+        0.03,
+        0.025,
+        0.02,
+    )  # held out [s]
     speeds: tuple[float, ...] = (0.005, 0.01, 0.02)  # that tanh(s' / speed) is tried with [m/s]
     gains: int = 60  # of the sweep
     seed: int = 0
@@ -93,10 +115,14 @@ def compared(model: ReducedModel, static: dict[tuple[str, str], float]) -> list[
     return rows
 
 
-def refit(records: Sequence[Record], model: ReducedModel, recipe: Recipe, **how: Any) -> ReducedModel:
+def refit(
+    records: Sequence[Record], model: ReducedModel, recipe: Recipe, **how: Any
+) -> ReducedModel:
     """A regression on just the terms of a model, in which none is left out."""
     terms = {target: [term for term, _ in pairs] for target, pairs in model.equations().items()}
-    return fit(assemble(records, terms, recipe), replace(recipe, threshold=0.0, **how), model.feedback)
+    return fit(
+        assemble(records, terms, recipe), replace(recipe, threshold=0.0, **how), model.feedback
+    )
 
 
 def rollout_time(model: ReducedModel, on: Record, repeats: int = 9) -> float:
@@ -118,7 +144,9 @@ class Grasp:
     def model(self, **changed: float) -> SoftGrasp:
         return SoftGrasp(self.p.override({f"control.{k}": v for k, v in changed.items()}))
 
-    def move(self, x: Profile, duration: float, *, step: float, sample: float, **changed: float) -> Trajectory:
+    def move(
+        self, x: Profile, duration: float, *, step: float, sample: float, **changed: float
+    ) -> Trajectory:
         """The run in which the disc is to follow x_d(t) from the settled grasp."""
         y, force = Profile([0.0], [self.p.scenario.y_Br_grasp]), Profile([0.0], [-self.force])
         t, reference = grid(duration, sample), Reference(x_d=x, y_d=y, F_ff=force)
@@ -128,12 +156,25 @@ class Grasp:
 def settle(p: Parameters) -> Grasp:
     model = SoftGrasp(p)
     whole = grasp_and_roll(model)
-    grasped = Reference(x_d=Profile([0.0], [p.scenario.x_C0]), y_d=model.reference["y_d"], F_ff=model.reference["F_ff"])
-    y = simulate(model, torch.tensor([0.0, SETTLED], dtype=torch.float64), y0=whole.y0, reference=grasped).y[-1]
+    grasped = Reference(
+        x_d=Profile([0.0], [p.scenario.x_C0]),
+        y_d=model.reference["y_d"],
+        F_ff=model.reference["F_ff"],
+    )
+    y = simulate(
+        model, torch.tensor([0.0, SETTLED], dtype=torch.float64), y0=whole.y0, reference=grasped
+    ).y[-1]
     return Grasp(p, y, whole.grasp_force)
 
 
-def sines(config: Config, p: Parameters, size: float, band: tuple[float, float], seed: int, duration: float) -> Waves:
+def sines(
+    config: Config,
+    p: Parameters,
+    size: float,
+    band: tuple[float, float],
+    seed: int,
+    duration: float,
+) -> Waves:
     """A multi-sine about where the disc is, under way from the first instant."""
     n, rng = 12, np.random.default_rng((config.seed, seed))
     f = band[0] * (band[1] / band[0]) ** ((np.arange(n) + rng.random(n)) / n)
@@ -154,7 +195,8 @@ def tapped(grasp: Grasp, config: Config) -> list[Record]:
 
 
 def indices(model: SoftGrasp) -> tuple[list[int], list[int], int]:
-    """Indices of x_C, theta, x_Br and of their rates in the state, and the number of internal states before them."""
+    """Indices of x_C, theta, x_Br and of their rates in the state, and the number of internal
+    states before them."""
     at = model.layout.slices
     starts = [(at[part, "disc"].start, at[part, "bracket"].start) for part in ("pose", "velocity")]
     q, v = ([disc, disc + 2, bracket] for disc, bracket in starts)
@@ -162,14 +204,19 @@ def indices(model: SoftGrasp) -> tuple[list[int], list[int], int]:
 
 
 def expected(grasp: Grasp, A: np.ndarray, frequency: float = 1.0) -> dict[str, float]:
-    """k, c, r and c_r of the linearised full model, pads and stretches condensed at a low frequency [Hz]."""
+    """k, c, r and c_r of the linearised full model, pads and stretches condensed at a low frequency
+    [Hz]."""
     model, w = grasp.model(), 2j * np.pi * frequency
     q, v, inner = indices(model)
     inner = slice(0, inner)
     disc, bracket = model.bodies["disc"], model.bodies["bracket"]
     masses = np.array([disc.mass.item(), disc.inertia.item(), bracket.mass.item()])
-    followed = np.linalg.solve(w * np.eye(inner.stop) - A[inner, inner], A[inner, q] + w * A[inner, v])
-    Z = masses[:, None] * (A[np.ix_(v, q)] + w * A[np.ix_(v, v)] + A[v, inner] @ followed)  # force, moment per motion
+    followed = np.linalg.solve(
+        w * np.eye(inner.stop) - A[inner, inner], A[inner, q] + w * A[inner, v]
+    )
+    Z = masses[:, None] * (
+        A[np.ix_(v, q)] + w * A[np.ix_(v, v)] + A[v, inner] @ followed
+    )  # force, moment per motion
     spring = -Z[0, 0] / 2  # k + i omega c
     r = (Z[1, 2] / -spring).real
     rolling = -(Z[1, 1] + 2 * r**2 * spring)
@@ -195,18 +242,31 @@ def by_mechanics(e: dict[str, float]) -> dict[tuple[str, str], float]:
 def study_stick(config: Config) -> tuple[dict[str, Any], Grasp, ReducedModel]:
     changes: dict[str, Any] = COARSE if config.smoke else {}
     times = {"roll_time": 10.0, "hold_time": 5.0, "rest_time": 5.0}
-    p = Parameters().override(changes | {f"scenario.{name}": config.scenario * value for name, value in times.items()})
+    p = Parameters().override(
+        changes | {f"scenario.{name}": config.scenario * value for name, value in times.items()}
+    )
     grasp = settle(p)
     x_0, far = p.scenario.x_C0, p.scenario.x_C0 + 20e-3
     taps = tapped(grasp, config)
     roll_time = 5.0 * max(config.scenario, 0.2)
     far_roll = Profile([0.0, roll_time, 1.1 * roll_time], [x_0, far, far])
     roll = record(grasp.move(far_roll, 1.1 * roll_time, step=2e-3, sample=4e-3))
-    waves = record(grasp.move(sines(config, p, config.validation, (2.0, 60.0), 1000, 1.0), 1.0, step=5e-4, sample=1e-3))
-    stroke = record(grasp.move(Profile([0.0, 1.0, 1.2], [x_0, x_0 + 6e-3, x_0 + 6e-3]), 1.2, step=2e-3, sample=4e-3))
+    waves = record(
+        grasp.move(
+            sines(config, p, config.validation, (2.0, 60.0), 1000, 1.0), 1.0, step=5e-4, sample=1e-3
+        )
+    )
+    stroke = record(
+        grasp.move(
+            Profile([0.0, 1.0, 1.2], [x_0, x_0 + 6e-3, x_0 + 6e-3]), 1.2, step=2e-3, sample=4e-3
+        )
+    )
     model = SoftGrasp(p)
     whole = grasp_and_roll(model, grasp_force=grasp.force)
-    runs = [simulate(model, grid(p.scenario.duration, 2e-3), y0=whole.y0) for _ in range(1 if config.smoke else 3)]
+    runs = [
+        simulate(model, grid(p.scenario.duration, 2e-3), y0=whole.y0)
+        for _ in range(1 if config.smoke else 3)
+    ]
     full, wall = runs[0], min(run.stats.wall_s for run in runs)
     held = record(full)
 
@@ -215,14 +275,18 @@ def study_stick(config: Config) -> tuple[dict[str, Any], Grasp, ReducedModel]:
     tests, library = [waves, stroke], mechanics(r)
     choice = choose(assemble(taps, library, recipe), tests, recipe, config.thresholds, feedback)
     model_ = refit(taps, choice.model, recipe, models=config.models)
-    A = linearised(model, grasp.y, hold(x_d=x_0, y_d=p.scenario.y_Br_grasp, F_ff=-grasp.force)).numpy()
+    A = linearised(
+        model, grasp.y, hold(x_d=x_0, y_d=p.scenario.y_Br_grasp, F_ff=-grasp.force)
+    ).numpy()
     parts = expected(grasp, A)
     result = score(model_, held)
     fast = rollout_time(model_, held)
     summary = {
-        "terms": len(model_.terms), "heldout_nrmse": result.worst, "heldout_nrmse_by_state": result.nrmse,
-        "validation_nrmse": choice.tried[choice.index]["nrmse"], "speedup": wall / fast, "wall_full_s": wall,
-        "wall_reduced_s": fast, "equations": model_.text(), "latex": model_.latex(),
+        "terms": len(model_.terms), "heldout_nrmse": result.worst,
+        "heldout_nrmse_by_state": result.nrmse,
+        "validation_nrmse": choice.tried[choice.index]["nrmse"], "speedup": wall / fast,
+        "wall_full_s": wall, "wall_reduced_s": fast, "equations": model_.text(),
+        "latex": model_.latex(),
         "rolling_radius_mm": {"found": 1e3 * r, "expected": 1e3 * parts["r"]}, "mechanics": parts,
         "coefficients": compared(model_, by_mechanics(parts)), "thresholds": choice.tried,
     }  # fmt: skip
@@ -237,7 +301,8 @@ def step_response(t: np.ndarray, x: np.ndarray, height: float, begun: float) -> 
 
 
 def study_gain(config: Config, grasp: Grasp, model: ReducedModel) -> dict[str, Any]:
-    """R_80 swept on the reduced model; a step of 50 um with the own gain and the best one confirmed on the full one."""
+    """R_80 swept on the reduced model; a step of 50 um with the own gain and the best one confirmed
+    on the full one."""
     p, height, begun = grasp.p, 5e-5, 0.01
     x = Profile([begun, 2 * begun], [0.0, height])
     t = np.linspace(0.0, 0.4, 1601)
@@ -252,9 +317,13 @@ def study_gain(config: Config, grasp: Grasp, model: ReducedModel) -> dict[str, A
         return step_response(t, out.y[:, 0], height, begun) if growth(R) < 0 else {}
 
     gains = np.geomspace(3.0, 30_000.0, config.gains)
-    rows, cost = timed(lambda: [{"R_80": float(R), "growth_1_s": growth(R), **response(R)} for R in gains])
+    rows, cost = timed(
+        lambda: [{"R_80": float(R), "growth_1_s": growth(R), **response(R)} for R in gains]
+    )
     signs = np.sign([row["growth_1_s"] for row in rows])
-    limits: list[Any] = [brentq(growth, a, b) for a, b, s in zip(gains, gains[1:], np.diff(signs)) if s]
+    limits: list[Any] = [
+        brentq(growth, a, b) for a, b, s in zip(gains, gains[1:], np.diff(signs)) if s
+    ]
     best = min((row for row in rows if "settling_s" in row), key=lambda row: row["settling_s"])
     confirmed = []
     for R in [p.control.R_80] if config.smoke else [p.control.R_80, best["R_80"]]:
@@ -264,16 +333,18 @@ def study_gain(config: Config, grasp: Grasp, model: ReducedModel) -> dict[str, A
         early, late = (np.ptp(x_C[i:j]) for i, j in ((600, 1000), (1200, 1600)))
         confirmed.append({
             "R_80": R, "growth_reduced_1_s": growth(R), "reduced": response(R),
-            "full": step_response(t, x_C, height, begun), "full_dies_out": bool(late < max(early, 1e-2 * height)),
+            "full": step_response(t, x_C, height, begun),
+            "full_dies_out": bool(late < max(early, 1e-2 * height)),
         })  # fmt: skip
     return {
-        "gain": "R_80 [N.s/m]", "limits": limits, "best": best, "sweep": rows, "sweep_wall_s": cost, "confirmed": confirmed,
+        "gain": "R_80 [N.s/m]", "limits": limits, "best": best, "sweep": rows, "sweep_wall_s": cost,
+        "confirmed": confirmed,
     }  # fmt: skip
 
 
 class Stroke(NamedTuple):
-    """Strokes in a light grasp: peak acceleration [m/s2], slipping part of the upper pad's touching nodes, mean normal
-    force there [N], and wall time of the full model [s]."""
+    """Strokes in a light grasp: peak acceleration [m/s2], slipping part of the upper pad's touching
+    nodes, mean normal force there [N], and wall time of the full model [s]."""
 
     record: Record
     acceleration: float
@@ -282,10 +353,17 @@ class Stroke(NamedTuple):
     wall_s: float
 
 
-def strokes(config: Config, travel: float, stroke_time: float, *, depth: float | None = None) -> Stroke:
+def strokes(
+    config: Config, travel: float, stroke_time: float, *, depth: float | None = None
+) -> Stroke:
     """Strokes there and back from a light grasp with the horizontal loop on the bracket."""
     motion = Strokes(travel=travel, stroke_time=stroke_time)
-    e = Excitation(motion=motion, duration=0.5 + 4 * stroke_time + 0.01, depth=depth or config.depth, senses="bracket")  # pyright: ignore[reportCallIssue]
+    e = Excitation(
+        motion=motion,
+        duration=0.5 + 4 * stroke_time + 0.01,
+        depth=depth or config.depth,
+        senses="bracket",
+    )  # pyright: ignore[reportCallIssue]
     changes: dict[str, Any] = {"contact.v_s": 0.05} | (COARSE if config.smoke else {})
     model, y0 = begin(e, Parameters().override(changes))
     t, start = grid(e.duration, 5e-4), 1000
@@ -302,9 +380,17 @@ def sticking(model: ReducedModel) -> ReducedModel:
     def straight(term: Term) -> Term:
         return replace(term, factors=tuple(part._replace(shape="linear") for part in term.factors))
 
-    equations = {name: [(straight(term), x) for term, x in pairs] for name, pairs in model.equations().items()}
+    equations = {
+        name: [(straight(term), x) for term, x in pairs]
+        for name, pairs in model.equations().items()
+    }
     return ReducedModel(
-        model.states, model.inputs, model.kinematics, equations, feedback=model.feedback, scale=model.scale
+        model.states,
+        model.inputs,
+        model.kinematics,
+        equations,
+        feedback=model.feedback,
+        scale=model.scale,
     )
 
 
@@ -315,7 +401,10 @@ def study_slip(config: Config) -> dict[str, Any]:
     gentle = max(config.stroke_times)
     r, feedback = rolling_radius([train[config.stroke_times.index(gentle)].record]), law(p)
     recipe = Recipe(width=0.004, window=min(config.stroke_times) * 4, seed=config.seed)
-    records, checks = [one.record for one in train], [other[T].record for T in config.checking_times]
+    records, checks = (
+        [one.record for one in train],
+        [other[T].record for T in config.checking_times],
+    )
     held = {T: other[T] for T in config.other_times}
 
     choices = []
@@ -333,9 +422,10 @@ def study_slip(config: Config) -> dict[str, Any]:
     fast = {T: rollout_time(model, one.record, 3) for T, one in other.items()}
     by_stroke = [
         {
-            "stroke_time_s": T, "acceleration_m_s2": one.acceleration, "slipping": one.slipping, "load_N": one.load,
-            "held_out": T in held, "nrmse": scores[T].worst, "rollout": str(scores[T].rollout),
-            "nrmse_linear": score(limit, one.record).worst, "speedup": one.wall_s / fast[T],
+            "stroke_time_s": T, "acceleration_m_s2": one.acceleration, "slipping": one.slipping,
+            "load_N": one.load, "held_out": T in held, "nrmse": scores[T].worst,
+            "rollout": str(scores[T].rollout), "nrmse_linear": score(limit, one.record).worst,
+            "speedup": one.wall_s / fast[T],
         }
         for T, one in sorted(other.items(), reverse=True)
     ]  # fmt: skip
@@ -348,16 +438,19 @@ def study_slip(config: Config) -> dict[str, Any]:
         return fine[-1]["acceleration_m_s2"] if fine else 0.0
 
     return {
-        "terms": len(model.terms), "heldout_nrmse": float(np.mean(heldout)), "heldout_nrmse_worst": float(np.max(heldout)),
-        "speedup": float(np.median([row["speedup"] for row in by_stroke])), "equations": model.text(), "latex": model.latex(),
-        "rolling_radius_mm": 1e3 * r, "coefficients": model.coefficient_table(), "by_stroke": by_stroke,
-        "enough_up_to_m_s2": {
-            f"{allowed:.0%}": {"with friction": enough("nrmse", allowed), "small-slip limit": enough("nrmse_linear", allowed)}
+        "terms": len(model.terms), "heldout_nrmse": float(np.mean(heldout)),
+        "heldout_nrmse_worst": float(np.max(heldout)),
+        "speedup": float(np.median([row["speedup"] for row in by_stroke])),
+        "equations": model.text(), "latex": model.latex(), "rolling_radius_mm": 1e3 * r,
+        "coefficients": model.coefficient_table(), "by_stroke": by_stroke, "enough_up_to_m_s2": {
+            f"{allowed:.0%}": {"with friction": enough("nrmse", allowed),
+            "small-slip limit": enough("nrmse_linear", allowed)}
             for allowed in (0.01, 0.02)
         },
         "another_grasp": {
             "depth_mm": 5 / 3 * 1e3 * config.depth, "load_N": deep.load, "slipping": deep.slipping,
-            "nrmse": score(model, deep.record).worst, "rollout": str(score(model, deep.record).rollout),
+            "nrmse": score(model, deep.record).worst,
+            "rollout": str(score(model, deep.record).rollout),
         },
         "thresholds": [row for choice in choices for row in choice.tried],
     }  # fmt: skip
@@ -374,9 +467,9 @@ class Result:
 def run(config: Config) -> Result:
     if config.smoke:
         config = replace(
-            config, taps=6, tap_time=0.15, validation=2e-4, scenario=0.2, thresholds=(0.03, 0.07, 0.14), models=10,
-            stroke_times=(0.08, 0.05, 0.03), checking_times=(0.06,), other_times=(0.025,),
-            speeds=(0.01,), gains=8,
+            config, taps=6, tap_time=0.15, validation=2e-4, scenario=0.2,
+            thresholds=(0.03, 0.07, 0.14), models=10, stroke_times=(0.08, 0.05, 0.03),
+            checking_times=(0.06,), other_times=(0.025,), speeds=(0.01,), gains=8,
         )  # fmt: skip
     stick, grasp, model = study_stick(config)
     gain = study_gain(config, grasp, model)
@@ -398,11 +491,19 @@ def table(result: Result) -> str:
     rows = []
     for row in result.stick["coefficients"]:
         low, high = row["interval"]
-        static = ("-", "-") if row["expected"] is None else (f"{row['expected']:.4g}", f"{row['error']:+.1%}")
+        static = (
+            ("-", "-")
+            if row["expected"] is None
+            else (f"{row['expected']:.4g}", f"{row['error']:+.1%}")
+        )
         found = f"{row['value']:.4g}", f"{low:.4g} to {high:.4g}"
         rows.append((f"{row['equation']}'", row["term"], *found, *static))
     head = ("equation", "term", "found", "5 to 95 %", "expected", "error")
-    return markdown(("regime", "terms", "held-out NRMSE", "speed-up"), regimes) + "\n\n" + markdown(head, rows)
+    return (
+        markdown(("regime", "terms", "held-out NRMSE", "speed-up"), regimes)
+        + "\n\n"
+        + markdown(head, rows)
+    )
 
 
 def figure(result: Result) -> Figure:
@@ -411,23 +512,40 @@ def figure(result: Result) -> Figure:
     coefficients, slip, sweep = fig.subplots(1, 3)
     rows = [row for row in result.stick["coefficients"] if row["expected"]]
     for i, row in enumerate(rows):
-        coefficients.plot([x / row["expected"] for x in row["interval"]], [i, i], "C0", lw=3, alpha=0.5)
+        coefficients.plot(
+            [x / row["expected"] for x in row["interval"]], [i, i], "C0", lw=3, alpha=0.5
+        )
         coefficients.plot(row["value"] / row["expected"], i, "oC0")
     coefficients.axvline(1.0, color="k", lw=0.8)
-    coefficients.set_yticks(range(len(rows)), [f"{row['equation']}': {row['term']}" for row in rows])
+    coefficients.set_yticks(
+        range(len(rows)), [f"{row['equation']}': {row['term']}" for row in rows]
+    )
     coefficients.set(xlabel="over the expectation", title="Stick: coefficients")
     by = result.slip["by_stroke"]
-    for key, label in (("nrmse", "with friction"), ("nrmse_linear", "its limit for small slip (linear)")):
+    for key, label in (
+        ("nrmse", "with friction"),
+        ("nrmse_linear", "its limit for small slip (linear)"),
+    ):
         slip.loglog(
-            [row["acceleration_m_s2"] for row in by], [100 * min(row[key], 10.0) for row in by], "o-", label=label
+            [row["acceleration_m_s2"] for row in by],
+            [100 * min(row[key], 10.0) for row in by],
+            "o-",
+            label=label,
         )
-    slip.set(xlabel="peak acceleration of the bracket [m/s$^2$]", ylabel="NRMSE [%]", title="Slip: other strokes")
+    slip.set(
+        xlabel="peak acceleration of the bracket [m/s$^2$]",
+        ylabel="NRMSE [%]",
+        title="Slip: other strokes",
+    )
     slip.legend()
     gains = result.gain["sweep"]
     sweep.semilogx([row["R_80"] for row in gains], [row["growth_1_s"] for row in gains])
     sweep.axhline(0.0, color="k", lw=0.8)
     sweep.set(
-        xlabel="gain $R_{80}$ [N s/m]", ylabel="growth of the slowest mode [1/s]", title="Gain sweep", ylim=(None, 30)
+        xlabel="gain $R_{80}$ [N s/m]",
+        ylabel="growth of the slowest mode [1/s]",
+        title="Gain sweep",
+        ylim=(None, 30),
     )
     return fig
 

@@ -1,17 +1,19 @@
-"""Question: what do recordings tell that begin in motion, in mid-grasp, or with friction that nobody saw locked in?
+"""Question: what do recordings tell that begin in motion, in mid-grasp, or with friction that
+nobody saw locked in?
 
-A rig with known parameters makes runs of which only what comes after a cut is given: in the middle of a roll, in the
-middle of the grasp, and half a second into fast strokes, where stretched springs keep what happened before.
-`estimate_initial_state` makes coordinates of the poses, velocities and stretches at the cut, with priors from the first 50 ms
-of samples, which then do not count. Eight parameters are identified from each recording alone, with many noise seeds.
-Beside it stand the price, the deviations that would be predicted if the state at the cut were known, and what comes of
+A rig with known parameters makes runs of which only what comes after a cut is given: in the middle
+of a roll, in the middle of the grasp, and half a second into fast strokes, where stretched springs
+keep what happened before. `estimate_initial_state` makes coordinates of the poses, velocities and
+stretches at the cut, with priors from the first 50 ms of samples, which then do not count. Eight
+parameters are identified from each recording alone, with many noise seeds. Beside it stand the
+price, the deviations that would be predicted if the state at the cut were known, and what comes of
 assuming rest.
 
 Command: .venv/bin/python experiments/unknown_start.py [--seeds 20] [--workers 2] [--smoke]
-Expected: every parameter that a recording shows (predicted deviation below 0.5) lies within its 95 % interval for 17 to
-20 of 20 seeds; not knowing the start makes deviations 1 to 3 times as large, those of K_t, K_n and E most. Rest assumed
-is refused where files are read; elsewhere nothing is identified without a warning. A fit takes half a minute on one
-core.
+Expected: every parameter that a recording shows (predicted deviation below 0.5) lies within its 95
+% interval for 17 to 20 of 20 seeds; not knowing the start makes deviations 1 to 3 times as large,
+those of K_t, K_n and E most. Rest assumed is refused where files are read; elsewhere nothing is
+identified without a warning. A fit takes half a minute on one core.
 """
 
 from dataclasses import dataclass, replace
@@ -49,11 +51,17 @@ from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import Runner
 from torchsoft.threads import parallel_map
 
-CUTS = {"mid-roll": ("strokes", 0.85), "mid-grasp": ("strokes", 0.2), "hidden history": ("fast strokes", 1.0)}
+CUTS = {
+    "mid-roll": ("strokes", 0.85),
+    "mid-grasp": ("strokes", 0.2),
+    "hidden history": ("fast strokes", 1.0),
+}
 """Motion, and when the recording of it begins [s]."""
 
 RATE = 200.0  # of the samples [Hz]
-SHOWN = 0.5  # Predicted standard deviation of a logarithm below which a recording shows a parameter.
+SHOWN = (
+    0.5  # Predicted standard deviation of a logarithm below which a recording shows a parameter.
+)
 
 
 @dataclass(frozen=True)
@@ -75,8 +83,8 @@ class Cut:
 
 @dataclass(frozen=True)
 class Price:
-    """Predicted standard deviations at the truth, where the start is unknown and where it is known, by parameter;
-    seconds of a Jacobian, and of the runs that make one by finite differences."""
+    """Predicted standard deviations at the truth, where the start is unknown and where it is known,
+    by parameter; seconds of a Jacobian, and of the runs that make one by finite differences."""
 
     unknown: dict[str, float]
     known: dict[str, float]
@@ -131,31 +139,47 @@ def noisy(recording: Recording, seed: int) -> Recording:
 
 def problem(recording: Recording, config: Config, off: float) -> Problem:
     """All parameters from one recording, begun `off` times the truth."""
-    return identify_contact.problem([recording], {name: off * value for name, value in sought(config).items()})
+    return identify_contact.problem(
+        [recording], {name: off * value for name, value in sought(config).items()}
+    )
 
 
 def fit(recording: Recording, config: Config) -> IdentificationResult:
     stated = problem(recording, config, 1.1)
     most = 6 if config.smoke else 40
-    plan = [Stage("everything", stated.names, stated.coordinates.labels, config.rtol, evaluations=most)]
+    plan = [
+        Stage("everything", stated.names, stated.coordinates.labels, config.rtol, evaluations=most)
+    ]
     return identify(stated, plan=plan, assumptions="trusted")
 
 
 def price(cut: Cut, config: Config) -> Price:
-    """What the first seed's recording would tell with the start unknown and known, by Jacobians at the truth."""
+    """What the first seed's recording would tell with the start unknown and known, by Jacobians at
+    the truth."""
     recording = estimate_initial_state(noisy(cut.recording, 0), RIG)
     start = recording.start
     assert isinstance(start, MovingStart)
     stated = problem(recording, config, 1.0)
-    runner, free, x = Runner(stated.recordings), stated.coordinates.free, at_the_truth(stated, start, cut)
+    runner, free, x = (
+        Runner(stated.recordings),
+        stated.coordinates.free,
+        at_the_truth(stated, start, cut),
+    )
     at, steps = stated.freeze(runner, x, stated.names, config.rtol, free)
     _, exact = timed(lambda: stated.residuals(runner, x, stated.names, steps, free))
     _, plain = timed(lambda: stated.residuals(runner, x, stated.names, steps))
     other = problem(replace(recording, start=Known(cut.y0, start.lead)), config, 1.0)
     better = other.residuals(
-        Runner(other.recordings), other.coordinates.start, other.names, config.rtol, other.coordinates.free
+        Runner(other.recordings),
+        other.coordinates.start,
+        other.names,
+        config.rtol,
+        other.coordinates.free,
     )
-    sds = [{name: deviation(p, J, name) for name in sought(config)} for p, J in ((stated, at.J), (other, better.J))]
+    sds = [
+        {name: deviation(p, J, name) for name in sought(config)}
+        for p, J in ((stated, at.J), (other, better.J))
+    ]
     return Price(sds[0], sds[1], len(x), exact, plain * (len(x) + 1))
 
 
@@ -168,11 +192,15 @@ def at_the_truth(stated: Problem, start: MovingStart, cut: Cut) -> Array:
         for i, axis in enumerate(("x", "y", "theta"))
     }
     values |= {
-        f"start.{b}.v_{axis}": v[i] for b, v in state.velocity.items() for i, axis in enumerate(("x", "y", "theta"))
+        f"start.{b}.v_{axis}": v[i]
+        for b, v in state.velocity.items()
+        for i, axis in enumerate(("x", "y", "theta"))
     }
     for name, stretch in start.stretch.items():
         points = torch.from_numpy(stretch.basis(cut.recording.rig.pads[name]).argmax(0))
-        values |= {f"start.{name}.stretch.{k}": state.stretch[name][p] for k, p in enumerate(points)}
+        values |= {
+            f"start.{name}.stretch.{k}": state.stretch[name][p] for k, p in enumerate(points)
+        }
     for i, c in enumerate(stated.coordinates.all):
         if c.name in values:
             x[i] = c.to_x(float(values[c.name]))
@@ -189,7 +217,8 @@ def deviation(stated: Problem, J: Array, name: str) -> float:
 
 
 def at_rest(cut: Cut, config: Config) -> dict[str, object]:
-    """What becomes of the first seed's recording where rest is assumed: in a file, and in the library."""
+    """What becomes of the first seed's recording where rest is assumed: in a file, and in the
+    library."""
     recording = noisy(cut.recording, 0)
     out: dict[str, object] = {"file": refusal(recording)}
     try:
@@ -208,11 +237,15 @@ def refusal(recording: Recording) -> str:
     columns = {"t": t} | {name: signals[:, i] for i, name in enumerate(recording.rig.signals)}
     columns |= {channel: y for channel, (_, y) in recording.samples.items()}
     stated = "[unknowns]\n'pad.E' = {}\n[sensors]\n"
-    stated += "".join(f"{channel} = {{noise = {sensor.noise}}}\n" for channel, sensor in RIG.items())
+    stated += "".join(
+        f"{channel} = {{noise = {sensor.noise}}}\n" for channel, sensor in RIG.items()
+    )
     with TemporaryDirectory() as folder:
         path, config = Path(folder) / "recording.csv", Path(folder) / "config.toml"
         head = ",".join(f"{name} [{CHANNELS[name].unit}]" for name in columns)
-        np.savetxt(path, np.stack(list(columns.values()), -1), delimiter=",", header=head, comments="")
+        np.savetxt(
+            path, np.stack(list(columns.values()), -1), delimiter=",", header=head, comments=""
+        )
         config.write_text(stated, encoding="utf-8")
         try:
             load([path], config)
@@ -222,7 +255,8 @@ def refusal(recording: Recording) -> str:
 
 
 def holds(found: IdentificationResult, name: str) -> bool:
-    """Whether the 95 % interval holds the truth; one that is not given holds it if the standard deviation says so."""
+    """Whether the 95 % interval holds the truth; one that is not given holds it if the standard
+    deviation says so."""
     e = found[name]
     if e.ci95 is None:
         return abs(np.log(e.last / TRUTH[name])) <= 1.96 * e.relative_sd
@@ -238,24 +272,33 @@ def run(config: Config) -> Result:
 
     def work(k: int) -> tuple[IdentificationResult, float]:
         case, seed = jobs[k]
-        return timed(lambda: fit(estimate_initial_state(noisy(cuts[case].recording, seed), RIG), config))
+        return timed(
+            lambda: fit(estimate_initial_state(noisy(cuts[case].recording, seed), RIG), config)
+        )
 
     done = tqdm(parallel_map(work, len(jobs), config.workers), desc="fits", total=len(jobs))
     fits = {jobs[k]: one for k, one in done}
     found = {case: [fits[case, seed][0] for seed in range(config.seeds)] for case in cuts}
-    wall = {case: float(np.median([fits[case, seed][1] for seed in range(config.seeds)])) for case in cuts}
+    wall = {
+        case: float(np.median([fits[case, seed][1] for seed in range(config.seeds)]))
+        for case in cuts
+    }
     return Result(config, found, prices, rest, wall)
 
 
 def figure(result: Result) -> Figure:
     """By case, errors of the parameters that are shown, over their standard deviations."""
     fig = Figure(figsize=(4.0 * len(result.found), 4.0), layout="constrained")
-    for axes, (case, found) in zip(fig.subplots(1, len(result.found), squeeze=False)[0], result.found.items()):
+    for axes, (case, found) in zip(
+        fig.subplots(1, len(result.found), squeeze=False)[0], result.found.items()
+    ):
         for name in result.shown(case):
             errors = [np.log(one[name].last / TRUTH[name]) / one[name].relative_sd for one in found]
             axes.plot(errors, [name.split(".")[1]] * len(errors), "o", ms=3)
         axes.axvspan(-1.96, 1.96, color="0.93", zorder=0)
-        axes.set(xlim=(-5, 5), xlabel="error of ln(estimate), in its standard deviations", title=case)
+        axes.set(
+            xlim=(-5, 5), xlabel="error of ln(estimate), in its standard deviations", title=case
+        )
     return fig
 
 
@@ -268,23 +311,35 @@ def main(config: Config) -> None:
             inside, shown = sum(holds(one, name) for one in found), name in result.shown(case)
             own = stats.binomtest(inside, n).proportion_ci(0.95)
             rows[name] = {
-                "shown": shown, "inside": inside, "ci95": [own.low, own.high], "sd_unknown": at.unknown[name],
-                "sd_known": at.known[name], "price": at.unknown[name] / at.known[name],
+                "shown": shown, "inside": inside, "ci95": [own.low, own.high],
+                "sd_unknown": at.unknown[name], "sd_known": at.known[name],
+                "price": at.unknown[name] / at.known[name],
                 "errors": [float(np.log(one[name].last / TRUTH[name])) / one[name].relative_sd for one in found],
             }  # fmt: skip
             cells.append(
-                (case, name, f"{at.unknown[name]:.1%}", f"{at.known[name]:.1%}", f"{rows[name]['price']:.2f}",
+                (case, name, f"{at.unknown[name]:.1%}", f"{at.known[name]:.1%}",
+                f"{rows[name]['price']:.2f}",
                  f"{inside} of {n}" if shown else "not shown")
             )  # fmt: skip
         cases[case] = {
-            "parameters": rows, "coordinates": at.coordinates, "fit_s": result.wall[case], "jacobian_s": at.exact_s,
-            "jacobian_by_differences_s": at.differences_s, "assuming_rest": result.rest[case],
-            "notices": [one.notices for one in found],
+            "parameters": rows, "coordinates": at.coordinates, "fit_s": result.wall[case],
+            "jacobian_s": at.exact_s, "jacobian_by_differences_s": at.differences_s,
+            "assuming_rest": result.rest[case], "notices": [one.notices for one in found],
         }  # fmt: skip
-    head = ("recording", "parameter", "predicted sd", "start known", "price", "intervals that hold the truth")
+    head = (
+        "recording",
+        "parameter",
+        "predicted sd",
+        "start known",
+        "price",
+        "intervals that hold the truth",
+    )
     table = markdown(head, cells)
     for case, rest in result.rest.items():
-        print(f"\n{case}, rest assumed, read from a file: {rest['file']}\nin the library: {rest['library']}")
+        print(
+            f"\n{case}, rest assumed, read from a file: {rest['file']}\nin the library: "
+            f"{rest['library']}"
+        )
     write(result.config, {"cases": cases}, {"unknown_start": figure(result)}, table)
 
 

@@ -14,36 +14,52 @@ WALL = "the disc has left the pads"
 
 
 class ClosedForm:
-    """A problem with n unknowns p0, p1, ..., logarithmic from 0.01 to 100, whose coordinates x (n,) have the residuals
-    `of(x)` (m,); where `fails(x)`, there are none. Priors are rows more."""
+    """A problem with n unknowns p0, p1, ..., logarithmic from 0.01 to 100, whose coordinates x (n,)
+    have the residuals `of(x)` (m,); where `fails(x)`, there are none. Priors are rows more."""
 
     names, recordings, noise = ("data",), (), {}
 
     def __init__(
-        self, of: Callable[[np.ndarray], Any], n: int, fails: Callable[[np.ndarray], bool] = lambda x: False,
-        low: float = 1e-2, high: float = 1e2, prior: Prior | None = None, scale: Any = "log",
+        self, of: Callable[[np.ndarray], Any], n: int,
+        fails: Callable[[np.ndarray], bool] = lambda x: False, low: float = 1e-2, high: float = 1e2,
+        prior: Prior | None = None, scale: Any = "log",
     ) -> None:  # fmt: skip
         self.of, self.fails = of, fails
         self.coordinates = Coordinates.__new__(Coordinates)
         middle = np.sqrt(low * high) if scale == "log" else 0.5 * (low + high)
         self.coordinates.all = [
-            Coordinate(f"p{i}", "parameter", None, middle, low, high, scale, prior=prior) for i in range(n)
+            Coordinate(f"p{i}", "parameter", None, middle, low, high, scale, prior=prior)
+            for i in range(n)
         ]
 
     def rows(self, x: np.ndarray) -> np.ndarray:
         c = self.coordinates
-        return np.append(self.of(x), [prior.row(c.all[i].to_value(x[i]))[0] for i, prior in c.priors])
+        return np.append(
+            self.of(x), [prior.row(c.all[i].to_value(x[i]))[0] for i, prior in c.priors]
+        )
 
     def samples(self, which: object = None) -> int:
         return len(self.of(self.coordinates.start))
 
-    def residuals(self, runner: Any, x: np.ndarray, which: object, steps: object, free: Any = None) -> Residuals:
+    def residuals(
+        self, runner: Any, x: np.ndarray, which: object, steps: object, free: Any = None
+    ) -> Residuals:
         r, J, h = self.rows(x), np.zeros((len(self.rows(x)), len(x))), 1e-6
         if free is not None:
-            J = np.stack([self.rows(x + h * e) - self.rows(x - h * e) for e in np.eye(len(x))], -1) / (2 * h) * free
-        return Residuals(r, J, {}) if not self.fails(x) else Residuals(r + np.inf, J, {"data": FailedRun(WALL, 0.1)})
+            J = (
+                np.stack([self.rows(x + h * e) - self.rows(x - h * e) for e in np.eye(len(x))], -1)
+                / (2 * h)
+                * free
+            )
+        return (
+            Residuals(r, J, {})
+            if not self.fails(x)
+            else Residuals(r + np.inf, J, {"data": FailedRun(WALL, 0.1)})
+        )
 
-    def freeze(self, runner: Any, x: np.ndarray, which: object, rtol: float, free: Any = None) -> Any:
+    def freeze(
+        self, runner: Any, x: np.ndarray, which: object, rtol: float, free: Any = None
+    ) -> Any:
         return self.residuals(runner, x, which, None, free), {}
 
     def misfit(self, runner: Any, x: np.ndarray, which: object, steps: object, free: Any) -> Any:

@@ -17,16 +17,19 @@ COARSE = {"pad.elements_x": 60, "pad.elements_y": 2, "contact.v_s": 0.05}
 
 def coarse(**changes: object) -> SoftGrasp:
     """A model on a coarse mesh (2 mm nodes), quick enough for hundreds of evaluations."""
-    return SoftGrasp(Parameters().override(COARSE | {k.replace("__", "."): v for k, v in changes.items()}))
+    return SoftGrasp(
+        Parameters().override(COARSE | {k.replace("__", "."): v for k, v in changes.items()})
+    )
 
 
 def turning(**changes: object) -> Rig:
-    """The coarse rig with a bracket that may turn and has weight, driven as before; its pads are massless."""
+    """The coarse rig with a bracket that may turn and has weight, driven as before; its pads are
+    massless."""
     model = coarse(**changes)
     bracket = Body(0.4, inertia=3e-4)
     rig = Rig(
-        bodies={"disc": model.disc, "bracket": bracket}, pads=dict(model.pads), contacts=dict(model.contacts),
-        actuators=dict(model.actuators), reference=model.reference,
+        bodies={"disc": model.disc, "bracket": bracket}, pads=dict(model.pads),
+        contacts=dict(model.contacts), actuators=dict(model.actuators), reference=model.reference,
     )  # fmt: skip
     rig.fixed = lambda: model  # the same rig with a bracket that does not turn
     return rig
@@ -41,11 +44,14 @@ def f64(*values: float) -> Tensor:
 
 
 def grasp(model: SoftGrasp, velocity: tuple[float, float] = (0.0, 0.0)) -> tuple[Tensor, Reference]:
-    """The frictionless grasp (size,) with the disc moving at `velocity` [m/s], and the reference that holds it there."""
+    """The frictionless grasp (size,) with the disc moving at `velocity` [m/s], and the reference
+    that holds it there."""
     y = press(model, model.settings.scenario.y_Br_grasp).detach()
     pose = model.unpack(y).pose
     y[model.layout.slices["velocity", "disc"]] = f64(*velocity, 0.0)
-    return y, hold(x_d=float(pose["disc"][0]), y_d=float(pose["bracket"][1]), F_ff=-holding_force(model, y))
+    return y, hold(
+        x_d=float(pose["disc"][0]), y_d=float(pose["bracket"][1]), F_ff=-holding_force(model, y)
+    )
 
 
 def grasped(model: SoftGrasp, velocity: tuple[float, float] = (0.0, 0.0)) -> Tensor:
@@ -57,15 +63,21 @@ def grasped(model: SoftGrasp, velocity: tuple[float, float] = (0.0, 0.0)) -> Ten
 def random_state(rig: Rig, seed: int, slip: float = 0.02) -> Tensor:
     """A grasped state (size,) of the paper's rigs shaken about."""
     model = rig if isinstance(rig, SoftGrasp) else rig.fixed()
-    return shaken(rig, model.unpack(press(model, model.settings.scenario.y_Br_grasp).detach()), seed, slip)
+    return shaken(
+        rig, model.unpack(press(model, model.settings.scenario.y_Br_grasp).detach()), seed, slip
+    )
 
 
 def shaken(rig: Rig, state: State, seed: int, slip: float = 0.02) -> Tensor:
-    """A state (size,) shaken about: touching and separated nodes, stick and slip, stretched springs."""
+    """A state (size,) shaken about: touching and separated nodes, stick and slip, stretched
+    springs."""
     generator = torch.Generator().manual_seed(seed)
 
     def moved(part: dict[str, Tensor], scale: float | Tensor) -> dict[str, Tensor]:
-        noise = {name: torch.randn(x.shape, generator=generator, dtype=torch.float64) for name, x in part.items()}
+        noise = {
+            name: torch.randn(x.shape, generator=generator, dtype=torch.float64)
+            for name, x in part.items()
+        }
         return {name: x + scale * noise[name] for name, x in part.items()}
 
     force = 2e-5 if any(pad.inertial for pad in rig.pads.values()) else 0.5  # [m] or [N]

@@ -1,4 +1,5 @@
-"""The finite elements of scikit-fem, against which those of the pads are held; meshed where a pad stands in the world."""
+"""The finite elements of scikit-fem, against which those of the pads are held; meshed where a pad
+stands in the world."""
 
 import numpy as np
 from skfem import Basis, BilinearForm, ElementQuad1, ElementVector, MeshQuad
@@ -27,7 +28,8 @@ def mass(u, v, _):
 
 
 def oracle(x: Array, y: Array, centred: bool = True) -> tuple[Array, Array, Array]:
-    """scikit-fem's K_lambda, K_mu, M on the grid x, y [m]; nodes column by column, dofs (x, y) node by node."""
+    """scikit-fem's K_lambda, K_mu, M on the grid x, y [m]; nodes column by column, dofs (x, y) node
+    by node."""
     mesh = MeshQuad.init_tensor(x, y)
     element = ElementVector(ElementQuad1())
     basis = Basis(mesh, element, intorder=2)
@@ -40,7 +42,8 @@ def oracle(x: Array, y: Array, centred: bool = True) -> tuple[Array, Array, Arra
 
 
 def world_stiffness(p: PadParameters, which: str) -> tuple[Array, Array]:
-    """Positions [m] (n, 2) and dense stiffness [N/m] of a pad's free nodes, meshed where it stands in the world."""
+    """Positions [m] (n, 2) and dense stiffness [N/m] of a pad's free nodes, meshed where it stands
+    in the world."""
     if which == "L":
         left, base, top = 0.0, 0.0, p.height
     else:

@@ -1,5 +1,6 @@
-"""The wheel with the newest versions of everything: built, installed without constraints into a fresh environment outside the
-checkout, and used from an empty folder. `python tests/newest.py PYTHON`; prints versions and times."""
+"""The wheel with the newest versions of everything: built, installed without constraints into a
+fresh environment outside the checkout, and used from an empty folder. `python tests/newest.py
+PYTHON`; prints versions and times."""
 
 import shutil
 import subprocess
@@ -49,24 +50,48 @@ def main(python: str) -> None:
     def run(*command: object, where: Path) -> None:
         start = time.monotonic()
         subprocess.run([str(one) for one in command], cwd=where, check=True)
-        print(f"[{time.monotonic() - start:6.1f} s] {' '.join(map(str, command))[:100]}", flush=True)
+        print(
+            f"[{time.monotonic() - start:6.1f} s] {' '.join(map(str, command))[:100]}", flush=True
+        )
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         source, work = folder / "source", folder / "empty"
         work.mkdir()
-        shutil.copytree(ROOT, source, ignore=shutil.ignore_patterns(".venv", ".git", "out", "__pycache__", "build"))
+        shutil.copytree(
+            ROOT,
+            source,
+            ignore=shutil.ignore_patterns(".venv", ".git", "out", "__pycache__", "build"),
+        )
         run(python, "-m", "venv", folder / "venv", where=folder)
         bin = folder / "venv" / "bin"
-        run(bin / "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", folder, source, where=folder)
+        run(
+            bin / "pip",
+            "wheel",
+            "--quiet",
+            "--no-deps",
+            "--wheel-dir",
+            folder,
+            source,
+            where=folder,
+        )
         run(bin / "pip", "install", "--quiet", next(folder.glob("*.whl")), where=folder)
-        run(bin / "python", "-c", f"from importlib.metadata import version as v; print({{p: v(p) for p in {PACKAGES}}})",
+        run(bin / "python", "-c", f"from importlib.metadata import version as v; print({{p: v(p) "
+                                  f"for p in {PACKAGES}}})",
             where=work)  # fmt: skip
         shutil.copytree(ROOT / "examples" / "identify", work / "identify")
         run(bin / "torchsoft", "init", "mine", where=work)
         run(bin / "torchsoft", "check", "mine.toml", where=work)
         run(bin / "torchsoft", "run", "mine.toml", "--out", "out", where=work)
-        run(bin / "torchsoft", "identify", "identify/rolling.csv", "identify/rolling.toml", "--out", "fit", where=work)
+        run(
+            bin / "torchsoft",
+            "identify",
+            "identify/rolling.csv",
+            "identify/rolling.toml",
+            "--out",
+            "fit",
+            where=work,
+        )
         run(bin / "python", "-c", GRADIENT, where=work)
     print(f"all of it in {time.monotonic() - begin:.0f} s")
 

@@ -1,4 +1,5 @@
-"""The tester of a rig: power and momentum, compiled steps, gradients and copies, whatever the rig is made of."""
+"""The tester of a rig: power and momentum, compiled steps, gradients and copies, whatever the rig
+is made of."""
 
 import pickle
 from copy import deepcopy
@@ -19,7 +20,8 @@ from torchsoft.solve.rates import Rates
 from torchsoft.solve.stepper import ImplicitStepper
 
 NEWTON = 1e-10
-"""Newton's tolerance of the compiled steps [N]; 1e-11 is rounding, and not reached at every step."""
+"""Newton's tolerance of the compiled steps [N]; 1e-11 is rounding, and not reached at every
+step."""
 
 Start = tuple[Rig, Tensor]
 """A rig with a reference that moves, and its initial state (size,)."""
@@ -30,13 +32,15 @@ def is_inertial(rig: Rig) -> bool:
 
 
 def at_random(start: Start, seed: int) -> Tensor:
-    """The initial state shaken about: touching and separated points, stick and slip, stretched springs."""
+    """The initial state shaken about: touching and separated points, stick and slip, stretched
+    springs."""
     rig, y0 = start
     return shaken(rig, rig.unpack(y0), seed)
 
 
 def assert_power_balanced(start: Start, seed: int, t: float = 0.01) -> None:
-    """dH/dt = supplied + driven - dissipated to rounding, no R field supplies power, and every transformer is dual."""
+    """dH/dt = supplied + driven - dissipated to rounding, no R field supplies power, and every
+    transformer is dual."""
     rig, y, now = start[0], at_random(start, seed).requires_grad_(), f64(t)[0].requires_grad_()
     H = sum(stored(rig, rig.unpack(y, t=now)).values())
     assert isinstance(H, Tensor)
@@ -47,30 +51,37 @@ def assert_power_balanced(start: Start, seed: int, t: float = 0.01) -> None:
         loads = rig.loads(graph, net_efforts(graph.ports, rig.junctions))
         drives = [
             -loads[name][i] * state.velocity[name][i]
-            for name, body in rig.bodies.items() for i, axis in enumerate(body.freedom) if body.freedom[axis] == "driven"
+            for name, body in rig.bodies.items() for i,
+            axis in enumerate(body.freedom) if body.freedom[axis] == "driven"
         ]  # fmt: skip
         loss = dissipated(rig, state, graph)
-        powers = torch.stack([*drives, *supplied(graph).values(), *(-power for power in loss.values())])
+        powers = torch.stack(
+            [*drives, *supplied(graph).values(), *(-power for power in loss.values())]
+        )
         H_dot = by_y @ rate + (0.0 if by_t is None else by_t)
     scale = float(powers.abs().sum())
     assert abs(float(H_dot - powers.sum())) < 1e-9 * scale
     assert min(float(power) for power in loss.values()) > -1e-12 * scale
     generator = torch.Generator().manual_seed(seed)
     flows = {
-        name: torch.randn(flow.shape, generator=generator, dtype=torch.float64) for name, flow in graph.flows.items()
+        name: torch.randn(flow.shape, generator=generator, dtype=torch.float64)
+        for name, flow in graph.flows.items()
     }
     for name, port in graph.ports.items():
         flow = port.transformer.flow(flows)
         effort = torch.randn(flow.shape, generator=generator, dtype=torch.float64)
         back = port.transformer.effort(effort, rig.junctions)
         dual = sum(float((back[junction] * flows[junction]).sum()) for junction in back)
-        assert abs(dual - float((effort * flow).sum())) < 1e-12 * (1 + float((effort * flow).abs().sum())), name
+        assert abs(dual - float((effort * flow).sum())) < 1e-12 * (
+            1 + float((effort * flow).abs().sum())
+        ), name
 
 
 @torch.no_grad()
 def assert_rigid_motion_is_free(start: Start, seed: int) -> None:
-    """Neither pads nor contacts see a velocity that all share, ground included, nor a common rotation about any point unless
-    the ground does: momentum and its moment are those of weights, actuators and drives alone."""
+    """Neither pads nor contacts see a velocity that all share, ground included, nor a common
+    rotation about any point unless the ground does: momentum and its moment are those of weights,
+    actuators and drives alone."""
     rig = start[0]
     state = rig.unpack(at_random(start, seed))
     graph = rig.evaluate(0.0, state)
@@ -78,7 +89,10 @@ def assert_rigid_motion_is_free(start: Start, seed: int) -> None:
         flow = lambda r, v=v, spin=spin: v + spin * torch.stack((-r[..., 1] + 0.01, r[..., 0]), -1)
         flows = {"ground": flow(f64(0.0, 0.01).reshape(1, 2))}
         for name in rig.bodies:
-            flows |= {name: flow(state.pose[name][None, :2]), f"{name}_spin": f64(spin).reshape(1, 1)}
+            flows |= {
+                name: flow(state.pose[name][None, :2]),
+                f"{name}_spin": f64(spin).reshape(1, 1),
+            }
         for name, pad in rig.pads.items():
             (place, _), u = rig.base_motion(name, state), rig.displacement(name, state)
             flows[f"pad_{name}"] = flow(place[:2] + turned(pad.positions + u, place[2]))
@@ -89,7 +103,8 @@ def assert_rigid_motion_is_free(start: Start, seed: int) -> None:
 
 @torch.no_grad()
 def assert_parts_are_kept(start: Start) -> None:
-    """States taken apart and put together, batches, and copies of the rig, to the bit or to rounding."""
+    """States taken apart and put together, batches, and copies of the rig, to the bit or to
+    rounding."""
     rig, _ = start
     y = torch.stack([at_random(start, seed) for seed in range(4)]).reshape(2, 2, -1)
     state = rig.unpack(y)
@@ -108,7 +123,8 @@ def assert_parts_are_kept(start: Start) -> None:
 
 
 def assert_rates_differentiable(start: Start, seed: int) -> None:
-    """Autograd through `forward`, along one direction of the state and of every parameter, against differences."""
+    """Autograd through `forward`, along one direction of the state and of every parameter, against
+    differences."""
     rig, y = start[0], at_random(start, seed)
     generator = torch.Generator().manual_seed(seed)
     weight = torch.randn(len(y), generator=generator, dtype=torch.float64)
@@ -116,7 +132,8 @@ def assert_rates_differentiable(start: Start, seed: int) -> None:
 
     def value(by: Tensor) -> Tensor:
         changed = {
-            name: p.detach() * (1 + by * (1 + 0.1 * (i % 7))) for i, (name, p) in enumerate(rig.named_parameters())
+            name: p.detach() * (1 + by * (1 + 0.1 * (i % 7)))
+            for i, (name, p) in enumerate(rig.named_parameters())
         }
         return weight @ torch.func.functional_call(rig, changed, (0.01, y + by * (y - start[1])))
 
@@ -128,20 +145,29 @@ def assert_rates_differentiable(start: Start, seed: int) -> None:
 
 @torch.no_grad()
 def assert_compiled_is_the_module(start: Start, seed: int, h: float = 2e-4) -> None:
-    """Y = y* + a h f(t, Y) at both stages of a step, with pads, contacts, friction, bodies and control; and rates."""
+    """Y = y* + a h f(t, Y) at both stages of a step, with pads, contacts, friction, bodies and
+    control; and rates."""
     rig, y = start[0], at_random(start, seed)
     parts = {key: where for key, where in rig.layout.slices.items() if where.start < where.stop}
     segments: list[Segment] = []
     stepper = ImplicitStepper(rig, step=h, tolerance=NEWTON)
     *_, last = stepper.integrate(y, f64(0.0, h), segments, float("inf"))
     assert last.steps == 1
-    star, a, end = torch.from_numpy(stepper.tape(segments[0]).y), GAMMA * h, torch.from_numpy(last.y[-1])
+    star, a, end = (
+        torch.from_numpy(stepper.tape(segments[0]).y),
+        GAMMA * h,
+        torch.from_numpy(last.y[-1]),
+    )
     assert torch.equal(star[0], y)
     first = y + a / (h - a) * (star[1] - y)
     for begin, stage, time in ((y, first, a), (star[1], end, h)):
         got, expected = (stage - begin) / a, rig(time, stage)
         for (part, name), where in parts.items():
-            noise = 1e-9 * float(expected[where].abs().max()) + 1e-9 + 4e-15 * float(stage[where].abs().max()) / a
+            noise = (
+                1e-9 * float(expected[where].abs().max())
+                + 1e-9
+                + 4e-15 * float(stage[where].abs().max()) / a
+            )
             if part == "rates":
                 noise += NEWTON / float(rig.pads[name].masses().min())
             elif part == "velocity":  # Newton's tolerance at a few nodes, on the spin
@@ -150,14 +176,22 @@ def assert_compiled_is_the_module(start: Start, seed: int, h: float = 2e-4) -> N
     if not is_inertial(rig):
         rates, expected = torch.from_numpy(Rates(rig)(0.01, y.numpy())), rig(0.01, y)
         for where in parts.values():
-            assert float((rates - expected)[where].abs().max()) <= 1e-9 * float(expected[where].abs().max()) + 1e-12
+            assert (
+                float((rates - expected)[where].abs().max())
+                <= 1e-9 * float(expected[where].abs().max()) + 1e-12
+            )
 
 
-def assert_gradients_exact(start: Start, t: Tensor, rtol: float = 1e-4, bound: float = 2e-6) -> Trajectory:
-    """A run whose ledger closes. Its discrete adjoint by the start, every parameter and every value of the reference is the
-    difference along the same steps, and its forward sensitivities are the adjoint.
+def assert_gradients_exact(
+    start: Start, t: Tensor, rtol: float = 1e-4, bound: float = 2e-6
+) -> Trajectory:
+    """A run whose ledger closes. Its discrete adjoint by the start, every parameter and every value
+    of the reference is the difference along the same steps, and its forward sensitivities are the
+    adjoint.
 
-    Differences are taken along one direction, in which all of these weigh alike as far as they weigh at all."""
+    Differences are taken along one direction, in which all of these weigh alike as far as they
+    weigh at all.
+    """
     rig, y0 = start
     kick, shake = f64(0.0)[0].requires_grad_(), at_random(start, 0) - y0
     leaves = {"start": kick} | {name: p for name, p in rig.named_parameters() if p.requires_grad}
@@ -177,14 +211,19 @@ def assert_gradients_exact(start: Start, t: Tensor, rtol: float = 1e-4, bound: f
     assert made.energy_residual_rel < 2e-3
     slopes = torch.autograd.grad(value, list(leaves.values()), allow_unused=True)
     wanted = [
-        name for name, p in leaves.items() if p.ndim == 0 and name != "start" and not name.startswith("reference")
+        name
+        for name, p in leaves.items()
+        if p.ndim == 0 and name != "start" and not name.startswith("reference")
     ]
     forward = simulate(
-        rig, t, y0=y0, knots=made.knots, tolerance=NEWTON, gradient="forward", wrt=wanted, dy0=torch.cat(
+        rig, t, y0=y0, knots=made.knots, tolerance=NEWTON, gradient="forward", wrt=wanted,
+        dy0=torch.cat(
             (torch.zeros(len(y0), len(wanted), dtype=torch.float64), shake[:, None]), -1),
     )  # fmt: skip
     assert forward.sensitivities is not None
-    by_forward = dict(zip([*wanted, "start"], torch.einsum("ti,tin->n", weights, forward.sensitivities[1:])))
+    by_forward = dict(
+        zip([*wanted, "start"], torch.einsum("ti,tin->n", weights, forward.sensitivities[1:]))
+    )
     ways, shares = {}, {}
     for (name, p), slope in zip(leaves.items(), slopes):
         if slope is None:
@@ -192,7 +231,10 @@ def assert_gradients_exact(start: Start, t: Tensor, rtol: float = 1e-4, bound: f
         way = torch.randn(p.shape, generator=generator, dtype=torch.float64).sign()
         ways[name] = way * (1.0 if name == "start" else p.detach().abs().mean() + 1e-6)
         shares[name] = float((slope * ways[name]).sum())
-    largest, kept = max(map(abs, shares.values())), {name: leaves[name].detach().clone() for name in ways}
+    largest, kept = (
+        max(map(abs, shares.values())),
+        {name: leaves[name].detach().clone() for name in ways},
+    )
     for name, slope in by_forward.items():
         found = float(slope * ways.get(name, torch.ones(())))
         assert found == pytest.approx(shares.get(name, 0.0), rel=1e-7, abs=1e-8 * largest), name

@@ -1,4 +1,5 @@
-"""One-way flow: a module or folder of torchsoft imports only from those above it in its list, and never in circles."""
+"""One-way flow: a module or folder of torchsoft imports only from those above it in its list, and
+never in circles."""
 
 import ast
 from graphlib import TopologicalSorter
@@ -36,7 +37,8 @@ FLOWS = {
         cache . arrays linear inertia interface stage step run adjoint tangent
     """,
 }
-"""For every folder with layers its modules and folders from the top down; "." is what the folder's own file imports."""
+"""For every folder with layers its modules and folders from the top down; "." is what the folder's
+own file imports."""
 APART = ("plot", "materials", "rigs", "sysid", "reduced", "datasets")
 """Folders over the engine; of these, only what is `SHARED` may be imported by another."""
 SHARED = ("plot", "materials.presets")
@@ -49,11 +51,13 @@ COMMAND = 20
 
 
 def imports(path: Path, *, lazy: bool = True) -> set[str]:
-    """Modules of torchsoft that a file imports; without `lazy` only those that it needs in order to be imported."""
+    """Modules of torchsoft that a file imports; without `lazy` only those that it needs in order to
+    be imported."""
     tree = ast.parse(path.read_text())
     inside = {
         node for outer in ast.walk(tree)
-        if isinstance(outer, ast.FunctionDef) or (isinstance(outer, ast.If) and "TYPE_CHECKING" in ast.dump(outer.test))
+        if isinstance(outer,
+        ast.FunctionDef) or (isinstance(outer, ast.If) and "TYPE_CHECKING" in ast.dump(outer.test))
         for node in ast.walk(outer)
     }  # fmt: skip
     found = set()
@@ -100,7 +104,9 @@ def test_imports_point_upwards(folder: str) -> None:
             continue
         for other in imports(path, lazy=False):
             its = layer(other, folder)
-            assert its is None or layers.index(its) <= layers.index(mine), f"{name} imports {other} from below it"
+            assert its is None or layers.index(its) <= layers.index(mine), (
+                f"{name} imports {other} from below it"
+            )
 
 
 def test_no_imports_in_circles() -> None:
@@ -112,14 +118,19 @@ def test_physics_does_not_know_how_it_is_solved() -> None:
     for name, path in MODULES.items():
         own, others = layer(name, ""), {layer(other, "") for other in imports(path)}
         if own in ("physics", "codegen"):
-            assert others <= ({"physics", "quantity", "csvfile", "files"} if own == "physics" else {"codegen"}), name
+            assert others <= (
+                {"physics", "quantity", "csvfile", "files"} if own == "physics" else {"codegen"}
+            ), name
 
 
 def test_the_kernels_know_no_law() -> None:
-    """They call compiled laws by address, and use nothing else of torchsoft; their cache writes files."""
+    """They call compiled laws by address, and use nothing else of torchsoft; their cache writes
+    files."""
     own = {name for name in MODULES if layer(name, "solve") == "kernel"}
     for name in own:
-        assert imports(MODULES[name]) <= own | {"files" if name == "solve.kernel.cache" else "codegen.invoke"}, name
+        assert imports(MODULES[name]) <= own | {
+            "files" if name == "solve.kernel.cache" else "codegen.invoke"
+        }, name
 
 
 def test_rigs_are_drawn_in_one_room() -> None:
@@ -131,7 +142,12 @@ def test_rigs_are_drawn_in_one_room() -> None:
 
 @pytest.mark.parametrize("folder", APART)
 def test_applications_do_not_know_each_other(folder: str) -> None:
-    used = {other for name, path in MODULES.items() if layer(name, "") == folder for other in imports(path)}
+    used = {
+        other
+        for name, path in MODULES.items()
+        if layer(name, "") == folder
+        for other in imports(path)
+    }
     apart = {layer(other, "") for other in used if not other.startswith(SHARED)}
     assert not apart & (set(APART) - {folder})
 
@@ -149,7 +165,11 @@ def opens_text(call: ast.Call) -> bool:
     """Whether a call opens, reads or writes a file as text."""
     name = call.func.attr if isinstance(call.func, ast.Attribute) else getattr(call.func, "id", "")
     low_level = isinstance(call.func, ast.Attribute) and getattr(call.func.value, "id", "") == "os"
-    modes = [x.value for x in (*call.args, *(k.value for k in call.keywords)) if isinstance(x, ast.Constant)]
+    modes = [
+        x.value
+        for x in (*call.args, *(k.value for k in call.keywords))
+        if isinstance(x, ast.Constant)
+    ]
     binary = any(isinstance(mode, str) and "b" in mode and len(mode) <= 3 for mode in modes)
     return name in ("open", "fdopen", "read_text", "write_text") and not low_level and not binary
 
@@ -157,9 +177,15 @@ def opens_text(call: ast.Call) -> bool:
 def test_text_names_its_encoding() -> None:
     """Or a file would be read and written otherwise where the terminal knows ASCII only."""
     found = []
-    for path in (path for folder in (ROOT, *(ROOT.parent / x for x in OUTSIDE)) for path in folder.rglob("*.py")):
+    for path in (
+        path
+        for folder in (ROOT, *(ROOT.parent / x for x in OUTSIDE))
+        for path in folder.rglob("*.py")
+    ):
         for call in (
-            node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)
+            node
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            if isinstance(node, ast.Call)
         ):
             if opens_text(call) and "encoding" not in {keyword.arg for keyword in call.keywords}:
                 found.append(f"{path.name}:{call.lineno}")

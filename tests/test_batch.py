@@ -1,4 +1,5 @@
-"""Batches: what one call gives for many runs is what each would give alone, and one that fails disturbs none."""
+"""Batches: what one call gives for many runs is what each would give alone, and one that fails
+disturbs none."""
 
 from time import sleep
 from typing import Any
@@ -42,11 +43,18 @@ def alone(model: SoftGrasp, i: int, y0: Tensor, **options: Any) -> Any:
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3])
-def test_every_run_is_the_one_it_would_be_alone(start: tuple[SoftGrasp, Tensor], threads: int) -> None:
+def test_every_run_is_the_one_it_would_be_alone(
+    start: tuple[SoftGrasp, Tensor], threads: int
+) -> None:
     model, y0 = start
     y0[1, model.layout.slices["velocity", "disc"]] = f64(-0.01, 0.0, 0.5)
     batch = simulate_batch(
-        model, T, parameters={"contact.K_n": K_n, "contact.mu_s": mu_s}, y0=y0, rtol=1e-4, threads=threads
+        model,
+        T,
+        parameters={"contact.K_n": K_n, "contact.mu_s": mu_s},
+        y0=y0,
+        rtol=1e-4,
+        threads=threads,
     )
     assert model.parameter("contact.K_n").item() == coarse().parameter("contact.K_n").item()
     for i in range(3):
@@ -58,13 +66,19 @@ def test_every_run_is_the_one_it_would_be_alone(start: tuple[SoftGrasp, Tensor],
 
 
 def test_gradients_reach_what_differs_from_run_to_run(start: tuple[SoftGrasp, Tensor]) -> None:
-    """The same as of the runs one by one, by parameters of each run, a shared one and the starts."""
+    """The same as of the runs one by one, by parameters of each run, a shared one and the
+    starts."""
     model, y0 = start
     rows, starts = K_n.clone().requires_grad_(), y0.clone().requires_grad_()
     E = model.parameter("pad.E")
     weights = torch.linspace(1, 2, 27, dtype=torch.float64).reshape(3, 9)
     batch = simulate_batch(
-        model, T, parameters={"contact.K_n": rows, "contact.mu_s": mu_s}, y0=starts, rtol=1e-4, gradient="discrete"
+        model,
+        T,
+        parameters={"contact.K_n": rows, "contact.mu_s": mu_s},
+        y0=starts,
+        rtol=1e-4,
+        gradient="discrete",
     )
     got = torch.autograd.grad((weights * batch["theta"]).sum(), [rows, starts, E])
     by_E = torch.zeros((), dtype=torch.float64)
@@ -84,8 +98,8 @@ def test_sensitivities_are_stacked(start: tuple[SoftGrasp, Tensor]) -> None:
     model, y0 = start
     wrt = ["contact.K_n", "pad.E"]
     batch = simulate_batch(
-        model, T, parameters={"contact.K_n": K_n.clone().requires_grad_(), "contact.mu_s": mu_s}, y0=y0, rtol=1e-4,
-        gradient="forward", wrt=wrt, rigid=True,
+        model, T, parameters={"contact.K_n": K_n.clone().requires_grad_(), "contact.mu_s": mu_s},
+        y0=y0, rtol=1e-4, gradient="forward", wrt=wrt, rigid=True,
     )  # fmt: skip
     for i in range(3):
         one = alone(model, i, y0[i], gradient="forward", wrt=wrt, rigid=True)
@@ -107,7 +121,9 @@ def test_references_times_and_rigs_of_their_own(start: tuple[SoftGrasp, Tensor])
     assert batch.mask.sum(1).tolist() == [9, 4]
     assert torch.isnan(batch["x_C"][1, 4:]).all()
     assert torch.isnan(batch.t[1, 4:]).all()
-    assert torch.equal(batch.y[1, :4], simulate(other, ts[1], y0=y0[1], reference=references[1], rtol=1e-3).y)
+    assert torch.equal(
+        batch.y[1, :4], simulate(other, ts[1], y0=y0[1], reference=references[1], rtol=1e-3).y
+    )
     loss = batch["y_C"][batch.mask].square().sum()
     assert torch.isfinite(loss)
     knots = [run.knots for run in batch.trajectories if run is not None]
@@ -116,12 +132,15 @@ def test_references_times_and_rigs_of_their_own(start: tuple[SoftGrasp, Tensor])
 
 
 def test_a_run_that_fails_leaves_the_others_alone(start: tuple[SoftGrasp, Tensor]) -> None:
-    """One that is lost on its way, with what it did until then, and one whose number is no parameter."""
+    """One that is lost on its way, with what it did until then, and one whose number is no
+    parameter."""
     model, y0 = start
     y0[1, model.layout.slices["velocity", "disc"]] = f64(20.0, 0.0, 0.0)
     E = f64(5e5, 5e5, -1.0).requires_grad_()
     with pytest.warns(SamplesFailed, match="2 of 3 runs failed; run 1: at t = "):
-        batch = simulate_batch(model, T, parameters={"pad.E": E}, y0=y0, rtol=1e-3, gradient="discrete")
+        batch = simulate_batch(
+            model, T, parameters={"pad.E": E}, y0=y0, rtol=1e-3, gradient="discrete"
+        )
     assert sorted(batch.failures) == [1, 2]
     lost = batch.failures[1]
     assert isinstance(lost, SimulationFailed)
@@ -138,7 +157,10 @@ def test_a_run_that_fails_leaves_the_others_alone(start: tuple[SoftGrasp, Tensor
     ("options", "match"),
     [
         ({}, "nothing differs from run to run"),
-        ({"parameters": {"contact.K_n": K_n}, "reference": [Reference()] * 2}, "reference 2, contact.K_n 3"),
+        (
+            {"parameters": {"contact.K_n": K_n}, "reference": [Reference()] * 2},
+            "reference 2, contact.K_n 3",
+        ),
         ({"parameters": {"contact.K": K_n}}, "`contact.K` is not a parameter of this rig"),
         (
             {"parameters": {"contact.K_n": K_n[:, None]}},
@@ -146,7 +168,10 @@ def test_a_run_that_fails_leaves_the_others_alone(start: tuple[SoftGrasp, Tensor
         ),
         ({"parameters": {"contact.K_n": K_n[0]}}, "must have one entry a run"),
         ({"parameters": {"contact.K_n": K_n.float()}}, "float64"),
-        ({"parameters": {"contact.K_n": K_n}, "gradient": "continuous"}, "a batch takes gradient='none'"),
+        (
+            {"parameters": {"contact.K_n": K_n}, "gradient": "continuous"},
+            "a batch takes gradient='none'",
+        ),
         ({"parameters": {"contact.K_n": K_n}, "rtol": -1.0}, "`rtol` must be positive"),
         *(
             (
@@ -157,13 +182,17 @@ def test_a_run_that_fails_leaves_the_others_alone(start: tuple[SoftGrasp, Tensor
         ),
     ],
 )
-def test_what_no_batch_can_be_is_refused(start: tuple[SoftGrasp, Tensor], options: dict[str, Any], match: str) -> None:
+def test_what_no_batch_can_be_is_refused(
+    start: tuple[SoftGrasp, Tensor], options: dict[str, Any], match: str
+) -> None:
     model, y0 = start
     with pytest.raises(ValueError, match=match):
         simulate_batch(model, T, y0=y0[0], **options)
 
 
-def test_rigs_of_different_sizes_have_channels_in_common_only(start: tuple[SoftGrasp, Tensor]) -> None:
+def test_rigs_of_different_sizes_have_channels_in_common_only(
+    start: tuple[SoftGrasp, Tensor],
+) -> None:
     model, y0 = start
     finer = coarse(pad__elements_x=80)
     batch: Batch = simulate_batch([model, finer], T, y0=[y0[0], grasped(finer)], rtol=1e-3)

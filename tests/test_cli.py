@@ -1,4 +1,5 @@
-"""The command `torchsoft`: help, errors in one line, one identification from files, interruption."""
+"""The command `torchsoft`: help, errors in one line, one identification from files,
+interruption."""
 
 import csv
 import json
@@ -33,14 +34,17 @@ def rows(count: int) -> Table:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The working directory, with the first 0.3 s of the example in data.csv and their configuration in rig.toml."""
+    """The working directory, with the first 0.3 s of the example in data.csv and their
+    configuration in rig.toml."""
     write(tmp_path / "data.csv", rows(62))
     (tmp_path / "rig.toml").write_text(CONFIG)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-@pytest.mark.parametrize("code", ["import torchsoft", "from torchsoft.cli import main; main(['--help'])"])
+@pytest.mark.parametrize(
+    "code", ["import torchsoft", "from torchsoft.cli import main; main(['--help'])"]
+)
 def test_neither_an_import_nor_help_waits_for_torch(code: str) -> None:
     slow = "'torch', 'scipy', 'numba', 'matplotlib', 'xarray'"
     code = f"import sys\ntry: {code}\nexcept SystemExit: pass\nassert not sys.modules.keys() & {{{slow}}}"
@@ -88,7 +92,9 @@ def test_help_names_every_command_argument_and_option(capsys: Any) -> None:
         (["identify", "rig.toml", "--rtol", "fast"], "invalid float value: 'fast'"),
     ],
 )
-def test_a_wrong_command_line_shows_the_usage_and_ends_with_2(arguments: list[str], message: str, capsys: Any) -> None:
+def test_a_wrong_command_line_shows_the_usage_and_ends_with_2(
+    arguments: list[str], message: str, capsys: Any
+) -> None:
     with pytest.raises(SystemExit) as end:
         main(arguments)
     assert end.value.code == 2
@@ -100,12 +106,21 @@ def test_a_wrong_command_line_shows_the_usage_and_ends_with_2(arguments: list[st
 
 ERRORS: dict[str, tuple[list[str], str]] = {
     "no config": (["identify", "data.csv"], "one CONFIG.toml is needed, but 0 were given"),
-    "two configs": (["identify", "data.csv", "rig.toml", "rig.toml"], "one CONFIG.toml is needed, but 2 were given"),
+    "two configs": (
+        ["identify", "data.csv", "rig.toml", "rig.toml"],
+        "one CONFIG.toml is needed, but 2 were given",
+    ),
     "no such file": (["identify", "other.csv", "rig.toml"], "other.csv: No such file or directory"),
-    "no such config": (["identify", "data.csv", "other.toml"], "other.toml: No such file or directory"),
+    "no such config": (
+        ["identify", "data.csv", "other.toml"],
+        "other.toml: No such file or directory",
+    ),
     "a folder": (["identify", "folder.csv", "rig.toml"], "folder.csv: Is a directory"),
     "no data": (["identify", "rig.toml"], "there is nothing to identify from"),
-    "not a table": (["identify", "picture.csv", "rig.toml"], "picture.csv is not a CSV file in UTF-8"),
+    "not a table": (
+        ["identify", "picture.csv", "rig.toml"],
+        "picture.csv is not a CSV file in UTF-8",
+    ),
     "empty": (["identify", "empty.csv", "rig.toml"], "empty.csv has no column `t`"),
     "not TOML": (["identify", "data.csv", "broken.toml"], "broken.toml is not a TOML file"),
     "unknown name": (
@@ -128,7 +143,10 @@ ERRORS: dict[str, tuple[list[str], str]] = {
         ["identify", "data.csv", "deep.toml"],
         "deep.toml is not a TOML file that can be read: its tables are nested too deeply",
     ),
-    "another encoding": (["identify", "data.csv", "latin.toml"], "latin.toml is not a TOML file: 'utf-8' codec"),
+    "another encoding": (
+        ["identify", "data.csv", "latin.toml"],
+        "latin.toml is not a TOML file: 'utf-8' codec",
+    ),
     "workers": (
         ["identify", "data.csv", "rig.toml", "--workers", "0"],
         "workers should be greater than or equal to 1, not 0",
@@ -137,10 +155,22 @@ ERRORS: dict[str, tuple[list[str], str]] = {
         ["identify", "data.csv", "rig.toml", "--out", "data.csv"],
         "--out: results cannot be written to data.csv (",
     ),
-    "material: no such file": (["material", "fit", "other.csv"], "other.csv: No such file or directory"),
-    "material: no table": (["material", "fit", "picture.csv"], "picture.csv is not a CSV file in UTF-8"),
-    "material: an area": (["material", "fit", "test.csv", "--area", "1e-5"], "`stress` needs no `area`"),
-    "material: many terms": (["material", "fit", "test.csv", "--terms", "50"], "`terms` must be from 1 to"),
+    "material: no such file": (
+        ["material", "fit", "other.csv"],
+        "other.csv: No such file or directory",
+    ),
+    "material: no table": (
+        ["material", "fit", "picture.csv"],
+        "picture.csv is not a CSV file in UTF-8",
+    ),
+    "material: an area": (
+        ["material", "fit", "test.csv", "--area", "1e-5"],
+        "`stress` needs no `area`",
+    ),
+    "material: many terms": (
+        ["material", "fit", "test.csv", "--terms", "50"],
+        "`terms` must be from 1 to",
+    ),
     "material: ratio": (
         ["material", "fit", "test.csv", "--nu", "0.6"],
         "pad.nu should be less than or equal to 0.4999",
@@ -156,8 +186,9 @@ ERRORS: dict[str, tuple[list[str], str]] = {
 def test_an_error_is_one_line_and_ends_with_2(folder: Path, name: str, capsys: Any) -> None:
     (folder / "folder.csv").mkdir()
     contents = {
-        "picture.csv": b"\x89PNG\r\n\x1a\n", "empty.csv": b"", "broken.toml": b"[[", "deep.toml": b"a = " + b"[" * 20_000,
-        "latin.toml": "a = 'µ'".encode("latin-1"), "many.toml": f"{CONFIG}starts = 1_000_000\n".encode(),
+        "picture.csv": b"\x89PNG\r\n\x1a\n", "empty.csv": b"", "broken.toml": b"[[",
+        "deep.toml": b"a = " + b"[" * 20_000, "latin.toml": "a = 'µ'".encode("latin-1"),
+        "many.toml": f"{CONFIG}starts = 1_000_000\n".encode(),
         "misspelt.toml": CONFIG.replace("contact.K_n", "contact.K").encode(),
     }  # fmt: skip
     for path, content in contents.items():
@@ -191,22 +222,33 @@ def test_a_checkpoint_folder_of_others_is_refused_and_left_alone(folder: Path, c
         (mine / name).write_text("mine", encoding="utf-8")
     assert main(["identify", "data.csv", "rig.toml", "--checkpoint", "mine"]) == 2
     said = capsys.readouterr().err
-    assert said == "torchsoft: error: the checkpoint mine holds other files; give a new or an empty folder\n"
+    assert (
+        said == "torchsoft: error: the checkpoint mine holds other files; give a new or an empty "
+        "folder\n"
+    )
     assert sorted(path.name for path in mine.iterdir()) == ["a.pickle", "b.partial"]
 
 
-def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(folder: Path, capsys: Any) -> None:
+def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(
+    folder: Path, capsys: Any
+) -> None:
     table = rows(122)
     for column in (X_D, X_C, 8):
         scale(column, 1.0, -0.3)(table)
     scale(X_D, 0.5, 30.0)(table)
-    write(folder / "data.csv", [cells[:2] + cells[3:] for cells in table])  # without the rate of x_d
+    write(
+        folder / "data.csv", [cells[:2] + cells[3:] for cells in table]
+    )  # without the rate of x_d
     config = CONFIG.replace('"bracket"', '"disc"').replace("60.3e-3", "60e-3")
-    (folder / "rig.toml").write_text(config.replace("[unknowns", "control.K_81 = 1e6\ncontrol.R_80 = 0\n[unknowns", 1))
+    (folder / "rig.toml").write_text(
+        config.replace("[unknowns", "control.K_81 = 1e6\ncontrol.R_80 = 0\n[unknowns", 1)
+    )
     assert main(["identify", "data.csv", "rig.toml", "--out", "out", "--no-progress"]) == 2
     message = capsys.readouterr().err
     where = r"data\.csv, row (\d+) \(t = (\S+) s\): the model cannot follow recording `data` here: "
-    found = re.search(where + r"the disc was lost at t = (\S+) s: the closed loop is unstable", message)
+    found = re.search(
+        where + r"the disc was lost at t = (\S+) s: the closed loop is unstable", message
+    )
     assert found, message
     row, t, inside = int(found[1]), float(found[2]), float(found[3])
     assert t == pytest.approx(inside, abs=1e-3)
@@ -236,7 +278,9 @@ def test_it_writes_answer_and_page(answered: tuple[Path, list[str]]) -> None:
     found = {e["name"]: e for e in answer["estimates"]}
     assert set(found) == {"contact.K_n", "pad.E"}
     assert answer["converged"]
-    command = shlex.join(["torchsoft", "identify", *answered[1], "--out", str(out), "--no-progress"])
+    command = shlex.join(
+        ["torchsoft", "identify", *answered[1], "--out", str(out), "--no-progress"]
+    )
     assert answer["command"] == command
     page = (out / "report.html").read_text()
     assert command in page
@@ -245,13 +289,30 @@ def test_it_writes_answer_and_page(answered: tuple[Path, list[str]]) -> None:
 
 
 @pytest.mark.xdist_group("identify-command")
-def test_options_come_before_the_configuration(answered: tuple[Path, list[str]], capsys: Any) -> None:
+def test_options_come_before_the_configuration(
+    answered: tuple[Path, list[str]], capsys: Any
+) -> None:
     folder, files = answered
     out, kept = folder / "coarser", folder / "kept"
-    command = ["identify", *files, "--out", str(out), "--rtol", "2e-3", "--checkpoint", str(kept), "--no-progress"]
+    command = [
+        "identify",
+        *files,
+        "--out",
+        str(out),
+        "--rtol",
+        "2e-3",
+        "--checkpoint",
+        str(kept),
+        "--no-progress",
+    ]
     assert main(command) == 0
-    first, second = (json.loads((folder / name / "answer.json").read_text()) for name in ("out", "coarser"))
-    assert [{stage["rtol"] for stage in one["stages"]} for one in (first, second)] == [{1e-3}, {2e-3}]
+    first, second = (
+        json.loads((folder / name / "answer.json").read_text()) for name in ("out", "coarser")
+    )
+    assert [{stage["rtol"] for stage in one["stages"]} for one in (first, second)] == [
+        {1e-3},
+        {2e-3},
+    ]
     assert not kept.exists()  # a checkpoint is removed once the answer is there
     text, err = capsys.readouterr()
     assert str(out / "answer.json") in text
@@ -260,7 +321,9 @@ def test_options_come_before_the_configuration(answered: tuple[Path, list[str]],
 
 
 @pytest.mark.xdist_group("identify-command")
-def test_an_interrupted_command_continues_and_ends_the_same(answered: tuple[Path, list[str]], capsys: Any) -> None:
+def test_an_interrupted_command_continues_and_ends_the_same(
+    answered: tuple[Path, list[str]], capsys: Any
+) -> None:
     folder, files = answered
     out = folder / "again"
     command = ["identify", *files, "--out", str(out), "--no-progress"]
@@ -271,7 +334,11 @@ def test_an_interrupted_command_continues_and_ends_the_same(answered: tuple[Path
     )
     child = subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE, text=True)
     began = time.monotonic()
-    while len(list(out.glob("unfinished/*.run"))) < 3 and child.poll() is None and time.monotonic() - began < 120:
+    while (
+        len(list(out.glob("unfinished/*.run"))) < 3
+        and child.poll() is None
+        and time.monotonic() - began < 120
+    ):
         time.sleep(0.02)
     child.send_signal(signal.SIGINT)
     _, message = child.communicate(timeout=60)
@@ -285,7 +352,9 @@ def test_an_interrupted_command_continues_and_ends_the_same(answered: tuple[Path
     assert main(command) == 0
     assert "contact.K_n" in capsys.readouterr().out
     assert not (out / "unfinished").exists()
-    first, second = (json.loads((folder / name / "answer.json").read_text()) for name in ("out", "again"))
+    first, second = (
+        json.loads((folder / name / "answer.json").read_text()) for name in ("out", "again")
+    )
     assert second["estimates"] == first["estimates"]
     assert second["cost"]["remembered"] >= first["cost"]["remembered"] + kept - 1
 
@@ -296,7 +365,9 @@ def test_a_recording_that_looks_wrong_is_refused_with_the_way_on(folder: Path, c
     write(folder / "data.csv", flipped)
     assert main(["identify", "data.csv", "rig.toml", "--out", "out", "--no-progress"]) == 2
     message = capsys.readouterr().err
-    assert message.startswith("torchsoft: error: recording `data`: F_y looks as if its sign were opposite (")
+    assert message.startswith(
+        "torchsoft: error: recording `data`: F_y looks as if its sign were opposite ("
+    )
     assert message.endswith('; if it is so, say acknowledged = ["sign of F_y"]\n')
     assert not (folder / "out" / "answer.json").exists()
 
@@ -310,4 +381,8 @@ def test_competing_laws_are_compared(folder: Path, capsys: Any) -> None:
     answer = json.loads((folder / "out" / "comparison.json").read_text())
     assert sorted(one["name"] for one in answer["laws"]) == ["as stated", "coulomb"]
     assert answer["verdict"] in text
-    assert sorted(path.name for path in (folder / "out").iterdir()) == ["answer.json", "comparison.json", "report.html"]
+    assert sorted(path.name for path in (folder / "out").iterdir()) == [
+        "answer.json",
+        "comparison.json",
+        "report.html",
+    ]

@@ -1,4 +1,5 @@
-"""The contact law of one point against numbers worked out by hand, its limits, its continuity, and its derivatives."""
+"""The contact law of one point against numbers worked out by hand, its limits, its continuity, and
+its derivatives."""
 
 import math
 
@@ -19,7 +20,9 @@ K, R = 1e5, 400.0
 """Springs [N/m] and dashpots [N.s/m] of the laws below."""
 
 
-def smooth(mu_s: float = 0.8, mu_k: float = 0.5, v_s: float = 0.01, eta: float = 20.0) -> SmoothSlip:
+def smooth(
+    mu_s: float = 0.8, mu_k: float = 0.5, v_s: float = 0.01, eta: float = 20.0
+) -> SmoothSlip:
     return SmoothSlip(mu_s, mu_k, v_s, eta)
 
 
@@ -28,16 +31,20 @@ def law(friction: SlipLaw | None = None, epsilon: float = 1e-6) -> SoftContact:
 
 
 @torch.no_grad()
-def at(contact: SoftContact, g: float, g_dot: float, v_T: float, s: float, **more: float) -> ContactState:
+def at(
+    contact: SoftContact, g: float, g_dot: float, v_T: float, s: float, **more: float
+) -> ContactState:
     return contact(*(f64(x)[0] for x in (g, g_dot, v_T, s)), **more)
 
 
-# by hand ------------------------------------------------------------------------------------------------------------
+# by hand
+# ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("g_dot", [-0.05, 0.0, 0.02])
 def test_a_separated_point_carries_nothing_and_its_spring_relaxes(g_dot: float) -> None:
-    """(eta + R_t) s' = -K_t s: nothing presses, so the spring slips home against the two viscosities."""
+    """(eta + R_t) s' = -K_t s: nothing presses, so the spring slips home against the two
+    viscosities."""
     got = at(law(), g=-1e-7, g_dot=g_dot, v_T=0.3, s=1e-5)
     assert (got.F_N, got.F_T, got.rho) == (0.0, 0.0, 0.0)
     assert float(got.s_dot) == pytest.approx(-2 * K * 1e-5 / (20.0 + R / 2), rel=1e-14)
@@ -62,7 +69,8 @@ def test_a_sticking_point_is_a_spring_and_a_dashpot() -> None:
 
 @pytest.mark.parametrize("side", [1.0, -1.0])
 def test_a_slipping_point_solves_the_quadratic(side: float) -> None:
-    """(eta + R) x = E - (mu_k + (mu_s - mu_k)/(1 + x/v_s)) F_N at F_N = 10 N, E = 12 N: 220 x^2 + (2.2 - 7) x - 0.04 = 0."""
+    """(eta + R) x = E - (mu_k + (mu_s - mu_k)/(1 + x/v_s)) F_N at F_N = 10 N, E = 12 N: 220 x^2 +
+    (2.2 - 7) x - 0.04 = 0."""
     g = 1e-4
     rho = g / (g + 1e-6)
     s = 12.0 / (2 * K)  # the trial effort, with v_T = 0
@@ -86,7 +94,9 @@ def test_coulomb_slips_with_kinetic_friction() -> None:
 
 def test_withdrawal_does_not_pull() -> None:
     assert float(at(law(), g=1e-5, g_dot=-0.1, v_T=0.0, s=0.0).F_N) == 0.0
-    assert float(at(law(), g=1e-5, g_dot=-1e-3, v_T=0.0, s=0.0).F_N) == pytest.approx(1.0 - 0.4 * 10 / 11, rel=1e-14)
+    assert float(at(law(), g=1e-5, g_dot=-1e-3, v_T=0.0, s=0.0).F_N) == pytest.approx(
+        1.0 - 0.4 * 10 / 11, rel=1e-14
+    )
 
 
 def test_a_stage_acts_through_the_stretch_at_its_end() -> None:
@@ -95,10 +105,13 @@ def test_a_stage_acts_through_the_stretch_at_its_end() -> None:
         stage = at(law(), g=5e-5, g_dot=1e-3, v_T=v_T, s=1e-6, stage=6e-4)
         now = at(law(), g=5e-5, g_dot=1e-3, v_T=v_T, s=1e-6 + 6e-4 * float(stage.s_dot))
         for name in ContactState._fields:
-            assert float(getattr(now, name)) == pytest.approx(float(getattr(stage, name)), rel=1e-11), name
+            assert float(getattr(now, name)) == pytest.approx(
+                float(getattr(stage, name)), rel=1e-11
+            ), name
 
 
-# limits and continuity ----------------------------------------------------------------------------------------------
+# limits and continuity
+# ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("s", [0.0, 1e-5])
@@ -120,14 +133,21 @@ def test_smooth_slip_begins_continuously_and_coulombs_does_not() -> None:
     with torch.no_grad():
         for part in (1e-6, 1e-9):
             E = 8.0 * (1 + part) * torch.ones(1, dtype=torch.float64)
-            assert 0.0 < float(smooth(v_s=0.05)(E, F_N, dashpot)) < 8.0 * part / (220.0 - 3.0 / 0.05) * 1.01
-        assert float(Coulomb(0.8, 0.5)(f64(8.0), F_N, dashpot)) == pytest.approx(3.0 / 200.0, rel=1e-14)
+            assert (
+                0.0
+                < float(smooth(v_s=0.05)(E, F_N, dashpot))
+                < 8.0 * part / (220.0 - 3.0 / 0.05) * 1.01
+            )
+        assert float(Coulomb(0.8, 0.5)(f64(8.0), F_N, dashpot)) == pytest.approx(
+            3.0 / 200.0, rel=1e-14
+        )
 
 
 FORCES, RATES, DEPTHS = st.floats(0.0, 100.0), st.floats(-1.0, 1.0), st.floats(-1e-4, 1e-3)
 
 
-@given(E=FORCES, F_N=FORCES, dashpot=st.floats(1.0, 1e4), mu_k=st.floats(0.0, 1.0), extra=st.floats(0.0, 1.0),
+@given(E=FORCES, F_N=FORCES, dashpot=st.floats(1.0, 1e4), mu_k=st.floats(0.0, 1.0),
+    extra=st.floats(0.0, 1.0),
        v_s=st.floats(1e-3, 1.0), eta=st.floats(0.0, 100.0))  # fmt: skip
 def test_smooth_slip_satisfies_its_equation(
     E: float, F_N: float, dashpot: float, mu_k: float, extra: float, v_s: float, eta: float
@@ -140,13 +160,21 @@ def test_smooth_slip_satisfies_its_equation(
         assert x == 0.0 or (mu_k + extra) * F_N == E
     else:
         mu = mu_k + extra / (1 + x / v_s)
-        assert (eta + dashpot) * x == pytest.approx(E - mu * F_N, rel=1e-9, abs=1e-11 * (E + F_N) + 1e-300)
+        assert (eta + dashpot) * x == pytest.approx(
+            E - mu * F_N, rel=1e-9, abs=1e-11 * (E + F_N) + 1e-300
+        )
 
 
 @pytest.mark.parametrize(
     "friction", [smooth(), smooth(eta=0.0), Coulomb(0.8, 0.5)], ids=["smooth", "no eta", "coulomb"]
 )
-@given(g=DEPTHS, g_dot=RATES, v_T=RATES, s=st.floats(-1e-3, 1e-3), weight=st.sampled_from([0.5, 1.0, 3.0]))
+@given(
+    g=DEPTHS,
+    g_dot=RATES,
+    v_T=RATES,
+    s=st.floats(-1e-3, 1e-3),
+    weight=st.sampled_from([0.5, 1.0, 3.0]),
+)
 def test_dissipation_is_never_negative(
     friction: SlipLaw, g: float, g_dot: float, v_T: float, s: float, weight: float
 ) -> None:
@@ -172,7 +200,8 @@ def test_friction_knows_no_direction(g: float, g_dot: float, v_T: float, s: floa
     assert (one.F_T, one.s_dot, one.gamma_dot) == (-other.F_T, -other.s_dot, -other.gamma_dot)
 
 
-# a point and a body -------------------------------------------------------------------------------------------------
+# a point and a body
+# ----------------------------------------------------------------------
 
 
 def test_moving_frame_of_a_circle_by_hand() -> None:
@@ -182,4 +211,5 @@ def test_moving_frame_of_a_circle_by_hand() -> None:
     assert torch.allclose(frame.g, f64(1e-3, 0.0), rtol=0, atol=1e-17)
 
 
-# derivatives --------------------------------------------------------------------------------------------------------
+# derivatives
+# ----------------------------------------------------------------------

@@ -28,11 +28,14 @@ def test_coordinates_without_set_points_are_regulated() -> None:
 def file(**changes: Any) -> RigFile:
     """The ready template, coarse, with one controller in the place of its loops."""
     tree = template("t").model_dump(exclude_unset=True)
-    tree["pads"] = {name: pad | {"elements_x": 40, "elements_y": 2} for name, pad in tree["pads"].items()}
+    tree["pads"] = {
+        name: pad | {"elements_x": 40, "elements_y": 2} for name, pad in tree["pads"].items()
+    }
     tree["actuators"] = {"press": {"pushes": "bracket.y", "feed_forward": "press"}}
     tree["controllers"] = {
         "jaw": {
-            "measures": ["bracket.x", "bracket.y"], "setpoints": ["x_d", "y_d"], "pushes": ["bracket.x", "bracket.y"],
+            "measures": ["bracket.x", "bracket.y"], "setpoints": ["x_d", "y_d"],
+            "pushes": ["bracket.x", "bracket.y"],
             "gain": [[1e5, 0.0, 400.0, 0.0], [0.0, 1e5, 0.0, 400.0]],
         } | changes
     }  # fmt: skip
@@ -57,16 +60,22 @@ def test_a_controller_in_a_file_is_the_loops_that_it_stands_for(tmp_path: Path) 
 
 
 def test_a_network_of_the_state_in_a_file(tmp_path: Path) -> None:
-    """Its weights, with the gain beside it, are what the module says in Python; another size is refused."""
+    """Its weights, with the gain beside it, are what the module says in Python; another size is
+    refused."""
     torch.manual_seed(1)
     net = nn.Sequential(nn.Linear(8, 3), nn.Tanh(), nn.Linear(3, 2)).double()
-    np.savez(tmp_path / "law.npz", **{name: value.detach().numpy() for name, value in net.state_dict().items()})
+    np.savez(
+        tmp_path / "law.npz",
+        **{name: value.detach().numpy() for name, value in net.state_dict().items()},
+    )
     asked = file(network="law.npz")
     asked._folder = tmp_path
     rig = asked.build().rig
     x = torch.linspace(-1.0, 1.0, 9, dtype=torch.float64)
     setpoints, state = x[[0, 2, 1, 3]], x[[5, 7, 6, 8]]
-    wanted = net(torch.cat((setpoints, state))) + StateFeedback(asked.controllers["jaw"].gain)(setpoints, state)
+    wanted = net(torch.cat((setpoints, state))) + StateFeedback(asked.controllers["jaw"].gain)(
+        setpoints, state
+    )
     x = torch.cat((x[:4], torch.zeros(1).double(), x[5:]))
     for i, name in enumerate(("jaw_bracket_x", "jaw_bracket_y")):
         assert torch.allclose(rig.actuators[name](x), wanted[i], rtol=1e-14)
@@ -76,8 +85,8 @@ def test_a_network_of_the_state_in_a_file(tmp_path: Path) -> None:
     assert (found.severity, found.where) == ("error", "controllers.jaw.network")
     assert "has the shape (3, 8)" in found.message
     assert (
-        "from 10 inputs (x_d, y_d, x_d', y_d', bracket.x, bracket.y, disc.x, bracket.x', bracket.y', disc.x')"
-        in found.message
+        "from 10 inputs (x_d, y_d, x_d', y_d', bracket.x, bracket.y, disc.x, bracket.x', "
+        "bracket.y', disc.x')" in found.message
     )
 
 
@@ -86,13 +95,23 @@ def test_a_network_of_the_state_in_a_file(tmp_path: Path) -> None:
     [
         (
             {"gain": [[1.0, 2.0]]},
-            r"controllers\.jaw.*gain: 2 efforts of 2 coordinates and their rates need 2 rows of 4 numbers",
+            r"controllers\.jaw.*gain: 2 efforts of 2 coordinates and their rates need 2 rows of 4 "
+            r"numbers",
         ),
         ({"gain": None}, r"controllers\.jaw.*it does nothing: give a gain, a network, or both"),
-        ({"setpoints": ["x_d", "y_d", "press"]}, r"setpoints: 3 motions, but it measures 2 coordinates to follow them"),
-        ({"measures": ["bracket.x", "disc.z"]}, r"controllers\.jaw\.measures: `disc\.z` is not a coordinate"),
+        (
+            {"setpoints": ["x_d", "y_d", "press"]},
+            r"setpoints: 3 motions, but it measures 2 coordinates to follow them",
+        ),
+        (
+            {"measures": ["bracket.x", "disc.z"]},
+            r"controllers\.jaw\.measures: `disc\.z` is not a coordinate",
+        ),
         ({"measures": ["bracket.x", "bracket.x"]}, r"measures: every name once"),
-        ({"pushes": ["bracket.x", "bracket.theta"]}, r"controllers\.jaw\.pushes: bracket\.theta is fixed at 0"),
+        (
+            {"pushes": ["bracket.x", "bracket.theta"]},
+            r"controllers\.jaw\.pushes: bracket\.theta is fixed at 0",
+        ),
     ],
 )
 def test_controllers_that_make_no_sense_are_refused(changes: dict[str, Any], sentence: str) -> None:

@@ -1,4 +1,5 @@
-"""The price of work: hours and memory need the user's word, minutes do not; estimates are of the right order."""
+"""The price of work: hours and memory need the user's word, minutes do not; estimates are of the
+right order."""
 
 import re
 import time
@@ -18,7 +19,9 @@ from torchsoft.physics.mesh import unit_compliance
 from torchsoft.rigs.run import condensing_time
 from torchsoft.rigs.written import template, to_toml
 
-SMOKE = tomllib.loads((Path(__file__).parent.parent / "data_gen" / "configs" / "smoke.toml").read_text())
+SMOKE = tomllib.loads(
+    (Path(__file__).parent.parent / "data_gen" / "configs" / "smoke.toml").read_text()
+)
 CHEAP, LONG, LARGE = Cost(1e4, 60.0, 0.1), Cost(1e9, 2e5, 0.1), Cost(1e4, 60.0, 1e6)
 
 
@@ -31,7 +34,9 @@ def test_hours_and_memory_need_the_users_word(price: Cost) -> None:
     agree(price, True, "take less")
     with mock.patch("sys.stdin") as keys, mock.patch("sys.stderr") as screen:
         keys.isatty.return_value = False
-        with pytest.raises(Costly, match=r"^this takes about .* GiB of memory; take less, or say --yes to begin$"):
+        with pytest.raises(
+            Costly, match=r"^this takes about .* GiB of memory; take less, or say --yes to begin$"
+        ):
             agree(price, False, "take less")
         keys.isatty.return_value = screen.isatty.return_value = True
         keys.readline.return_value = "n\n"
@@ -42,7 +47,13 @@ def test_hours_and_memory_need_the_users_word(price: Cost) -> None:
 
 
 def test_times_are_said_in_their_unit() -> None:
-    times = {0.5: "0.5 seconds", 80.0: "80 seconds", 600.0: "10 minutes", 2.5e5: "2.9 days", 1e9: "32 years"}
+    times = {
+        0.5: "0.5 seconds",
+        80.0: "80 seconds",
+        600.0: "10 minutes",
+        2.5e5: "2.9 days",
+        1e9: "32 years",
+    }
     assert {t: duration(t) for t in times} == times
 
 
@@ -57,7 +68,11 @@ def test_a_step_costs_more_on_a_finer_mesh_and_with_derivatives() -> None:
 
 @pytest.mark.parametrize(
     ("change", "seconds"),
-    [({}, (0.1, 10.0)), ({"trajectories": 1_000_000}, (2e4, 1e6)), ({"step": 1e-6}, (300.0, 3000.0))],
+    [
+        ({}, (0.1, 10.0)),
+        ({"trajectories": 1_000_000}, (2e4, 1e6)),
+        ({"step": 1e-6}, (300.0, 3000.0)),
+    ],
 )
 def test_what_a_dataset_costs(change: dict[str, Any], seconds: tuple[float, float]) -> None:
     price = cost(Config.model_validate(SMOKE | change), 2)
@@ -68,7 +83,9 @@ def test_what_a_dataset_costs(change: dict[str, Any], seconds: tuple[float, floa
 
 def test_a_run_that_takes_long_asks_first(tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("rig.toml").write_text(to_toml(template("t").override(solver={"step": 1e-7}, outputs={"duration": 20.0})))
+    Path("rig.toml").write_text(
+        to_toml(template("t").override(solver={"step": 1e-7}, outputs={"duration": 20.0}))
+    )
     assert main(["run", "rig.toml", "--out", "out"]) == 2
     error = capsys.readouterr().err
     assert re.search(r"this takes about .* \(2e\+08 steps\)", error), error
@@ -81,7 +98,9 @@ def test_a_rig_that_needs_the_machines_memory_asks_first(
     command: tuple[str, ...], tmp_path: Path, monkeypatch: Any, capsys: Any
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("rig.toml").write_text(to_toml(template("t").override(pads={"lower": {"elements_x": 80, "elements_y": 1000}})))
+    Path("rig.toml").write_text(
+        to_toml(template("t").override(pads={"lower": {"elements_x": 80, "elements_y": 1000}}))
+    )
     with mock.patch("torchsoft.cost.machine_memory", return_value=1.0):
         assert main([command[0], "rig.toml", *command[1:]]) == 2
     assert re.search(r"GiB of memory; .*or say --yes to begin", capsys.readouterr().err)

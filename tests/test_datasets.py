@@ -62,9 +62,12 @@ amplitude_y = {{ low = 1e-5, high = 3e-5 }}
 """
 
 
-def write_config(folder: Path, trajectories: int = 5, shard: int = 2, change: tuple[str, str] = ("", "")) -> Path:
+def write_config(
+    folder: Path, trajectories: int = 5, shard: int = 2, change: tuple[str, str] = ("", "")
+) -> Path:
     path = folder / f"config-{trajectories}-{shard}-{abs(hash(change))}.toml"
-    path.write_text(TOML.format(trajectories=trajectories, shard=shard).replace(*change, 1) if change[0] else
+    path.write_text(TOML.format(trajectories=trajectories, shard=shard).replace(*change,
+        1) if change[0] else
                     TOML.format(trajectories=trajectories, shard=shard))  # fmt: skip
     return path
 
@@ -79,9 +82,13 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Config]:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """Every file of a store, the manifest included, but for the commit and so the digest: the repository may move on during a
-    test."""
-    return {str(p.relative_to(folder)): same_commit(p.read_bytes()) for p in sorted(folder.rglob("*")) if p.is_file()}
+    """Every file of a store, the manifest included, but for the commit and so the digest: the
+    repository may move on during a test."""
+    return {
+        str(p.relative_to(folder)): same_commit(p.read_bytes())
+        for p in sorted(folder.rglob("*"))
+        if p.is_file()
+    }
 
 
 def same_commit(data: bytes) -> bytes:
@@ -96,7 +103,10 @@ def copy(source: Path, target: Path) -> Path:
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_ready_configs_are_valid_and_their_splits_keep_the_shares(path: Path) -> None:
     config = Config.from_toml(path)
-    shares = [sum(split(config, i) == name for i in range(1000)) / 1000 for name in ("train", "validation", "test")]
+    shares = [
+        sum(split(config, i) == name for i in range(1000)) / 1000
+        for name in ("train", "validation", "test")
+    ]
     np.testing.assert_allclose(shares, [0.7, 0.15, 0.15], atol=0.01)
 
 
@@ -126,7 +136,9 @@ def read_everywhere(url: str, folder: Path) -> None:
     """The check, xarray and torch see behind `url` what they see in `folder`."""
     assert [x for x in check(url) if "commit" not in x] == []
     assert open_dataset(url).load().identical(open_dataset(str(folder)).load())
-    here, there = (Trajectories(place, ["disc_position", "pad.E"], window=7) for place in (url, str(folder)))
+    here, there = (
+        Trajectories(place, ["disc_position", "pad.E"], window=7) for place in (url, str(folder))
+    )
     assert len(here) == len(there) == 5 * 13
     torch.testing.assert_close(here[20], there[20], rtol=0, atol=0)
 
@@ -150,7 +162,9 @@ def test_an_object_store_holds_the_same_bytes(made: tuple[Path, Config]) -> None
         open_or_create("memory://sets/thesis", config)
 
 
-def test_urls_that_are_refused(made: tuple[Path, Config], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_urls_that_are_refused(
+    made: tuple[Path, Config], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main([str(write_config(tmp_path)), "--out", "nowhere://set", "--workers", "0"]) == 2
     assert "Protocol not known: nowhere" in capsys.readouterr().err
 
@@ -180,10 +194,14 @@ def test_a_sound_dataset_has_no_finding(made: tuple[Path, Config]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fixed", "points", "stores"), [('"pad.fidelity" = "inertial"', 61, 9), ('"contact.points" = 2', 120, 7)]
+    ("fixed", "points", "stores"),
+    [('"pad.fidelity" = "inertial"', 61, 9), ('"contact.points" = 2', 120, 7)],
 )
-def test_other_pads_and_contacts_are_kept_whole(tmp_path: Path, fixed: str, points: int, stores: int) -> None:
-    """The kinetic energy of inertial pads is in the balance; series of nodes are then those of all contact points."""
+def test_other_pads_and_contacts_are_kept_whole(
+    tmp_path: Path, fixed: str, points: int, stores: int
+) -> None:
+    """The kinetic energy of inertial pads is in the balance; series of nodes are then those of all
+    contact points."""
     path = write_config(tmp_path, trajectories=1, change=("[parameters]", f"{fixed}\n[parameters]"))
     generate(Config.from_toml(path), str(tmp_path / "set"), Serial(), progress=False)
     assert [x for x in check(str(tmp_path / "set")) if "commit" not in x] == []
@@ -205,7 +223,11 @@ def vouch(folder: Path) -> None:
     """Digests of what is there now, so that something else has to find what is wrong with it."""
     path = folder / "manifest.json"
     manifest = Manifest.model_validate_json(path.read_bytes())
-    digests = {key: digest((folder / key).read_bytes()) for key in manifest.digests if (folder / key).exists()}
+    digests = {
+        key: digest((folder / key).read_bytes())
+        for key in manifest.digests
+        if (folder / key).exists()
+    }
     path.write_text(manifest.model_copy(update={"digests": digests}).text())
     for shard in range(manifest.layout.shards):
         (folder / record_key(shard)).write_bytes(
@@ -224,7 +246,9 @@ def change_json(name: str, change: Callable[[dict[str, Any]], Any]) -> Callable[
 
 def consolidated(name: str, change: Callable[[dict[str, Any]], Any]) -> Callable[[Path], None]:
     """In the copy of the metadata that readers open."""
-    return change_json("zarr.json", lambda group: change(group["consolidated_metadata"]["metadata"][name]))
+    return change_json(
+        "zarr.json", lambda group: change(group["consolidated_metadata"]["metadata"][name])
+    )
 
 
 def write(name: str, data: bytes) -> Callable[[Path], None]:
@@ -277,20 +301,37 @@ def open_ledger(folder: Path) -> None:
             "disc_angle: units are 'deg', not 'rad'",
         ),
         (
-            change_json("zarr.json", lambda g: g["consolidated_metadata"]["metadata"].pop("disc_spin")),
+            change_json(
+                "zarr.json", lambda g: g["consolidated_metadata"]["metadata"].pop("disc_spin")
+            ),
             "disc_spin: missing",
         ),
         (set_value("split", (1,), "test"), "trajectory 1: split is test, but the design has"),
         (set_value("split", (2,), "all"), "trajectory 2: split is"),
-        (open_ledger, r"trajectory 1: energy residual is [\d.]+ of the energy injected, above 0\.02"),
-        (set_value("energy_residual_rel", (2,), 1e-3), "trajectory 2: energy_residual_rel is 0.001, but the series"),
+        (
+            open_ledger,
+            r"trajectory 1: energy residual is [\d.]+ of the energy injected, above 0\.02",
+        ),
+        (
+            set_value("energy_residual_rel", (2,), 1e-3),
+            "trajectory 2: energy_residual_rel is 0.001, but the series",
+        ),
         (
             change_json("manifest.json", lambda m: m["config"].update(seed=99)),
             r"config_hash is \w+, but the configuration's",
         ),
-        (change_json("manifest.json", lambda m: m.update(seed=4)), "seed is 4, but the configuration's is 3"),
-        (change_json("manifest.json", lambda m: m["config"].update(duration=-1.0)), r"manifest\.json: .*duration"),
-        (set_value("normal_force_upper", (4, 60, 30), -1.0), "trajectory 4: normal_force_upper pulls"),
+        (
+            change_json("manifest.json", lambda m: m.update(seed=4)),
+            "seed is 4, but the configuration's is 3",
+        ),
+        (
+            change_json("manifest.json", lambda m: m["config"].update(duration=-1.0)),
+            r"manifest\.json: .*duration",
+        ),
+        (
+            set_value("normal_force_upper", (4, 60, 30), -1.0),
+            "trajectory 4: normal_force_upper pulls",
+        ),
         (set_value("disc_position", (0, 3, 1), np.inf), "trajectory 0: not finite: disc_position"),
         (set_value("disc_angle", (1, 7), np.nan), "trajectory 1: not finite: disc_angle"),
         (set_value("stored_energy", (1, 7, 2), 1.0), "trajectory 1: energy_residual is not"),
@@ -299,7 +340,9 @@ def open_ledger(folder: Path) -> None:
         (set_value("failed", (3,), 1), "failed without a reason"),
     ],
 )
-def test_wrong_content_is_found(made: tuple[Path, Config], tmp_path: Path, change: Any, message: str) -> None:
+def test_wrong_content_is_found(
+    made: tuple[Path, Config], tmp_path: Path, change: Any, message: str
+) -> None:
     """By the check, though every digest fits."""
     change(folder := copy(made[0], tmp_path / "set"))
     vouch(folder)
@@ -312,9 +355,15 @@ def test_wrong_content_is_found(made: tuple[Path, Config], tmp_path: Path, chang
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (edit("disc_angle/c/0/0", flipped), r"disc_angle/c/0/0 is damaged.*remove .*finished/0\.sha256 and start"),
+        (
+            edit("disc_angle/c/0/0", flipped),
+            r"disc_angle/c/0/0 is damaged.*remove .*finished/0\.sha256 and start",
+        ),
         (edit("disc_angle/c/0/0", lambda data: data[:-40]), "disc_angle/c/0/0 is damaged"),
-        (edit("feed_forward/c/1/0", lambda data: data[:9] + bytes(64) + data[73:]), "feed_forward/c/1/0 is damaged"),
+        (
+            edit("feed_forward/c/1/0", lambda data: data[:9] + bytes(64) + data[73:]),
+            "feed_forward/c/1/0 is damaged",
+        ),
         (edit("grasp_force/c/2", flipped), "grasp_force/c/2 is damaged"),
         (remove("disc_spin/c/1/0"), "disc_spin/c/1/0 is missing"),
         (swap("disc_spin/c/0/0", "disc_spin/c/1/0"), "disc_spin/c/0/0 is damaged"),
@@ -329,12 +378,17 @@ def test_wrong_content_is_found(made: tuple[Path, Config], tmp_path: Path, chang
         (write("manifest.json", b"\xff\xfe{"), r"manifest\.json is damaged"),
         (write("manifest.json", b"[" * 100_000), r"manifest\.json is damaged"),
         (change_json("manifest.json", lambda m: m.update(layout=3)), r"manifest\.json is damaged"),
-        (change_json("manifest.json", lambda m: m["config"].update(step=1e-3)), r"manifest\.json is damaged"),
+        (
+            change_json("manifest.json", lambda m: m["config"].update(step=1e-3)),
+            r"manifest\.json is damaged",
+        ),
         (edit("manifest.json", lambda data: data + b" "), r"manifest\.json is damaged"),
         (remove("manifest.json"), r"manifest\.json is missing"),
     ],
 )
-def test_damage_is_found(made: tuple[Path, Config], tmp_path: Path, damage: Any, message: str) -> None:
+def test_damage_is_found(
+    made: tuple[Path, Config], tmp_path: Path, damage: Any, message: str
+) -> None:
     """By the check, and by reading."""
     damage(folder := copy(made[0], tmp_path / "set"))
     findings = [x for x in check(str(folder)) if "no commit" not in x]
@@ -345,7 +399,9 @@ def test_damage_is_found(made: tuple[Path, Config], tmp_path: Path, damage: Any,
         open_dataset(str(folder)).load()
     assert "\n" not in str(refused.value)
     names = ["disc_angle", "feed_forward", "grasp_force", "disc_spin"]
-    if "time" not in message and "/c/1" not in message:  # what is damaged may be of an array that it does not read
+    if (
+        "time" not in message and "/c/1" not in message
+    ):  # what is damaged may be of an array that it does not read
         with pytest.raises(StoreError, match=r"is damaged|is missing|are not finished"):
             every_window(str(folder), names)
 
@@ -355,7 +411,9 @@ def every_window(url: str, names: list[str]) -> list[dict[str, torch.Tensor]]:
     return [windows[i] for i in range(len(windows))]
 
 
-@pytest.mark.parametrize("damage", [edit("disc_spin/zarr.json", flipped), write("disc_spin/copy", b"x")])
+@pytest.mark.parametrize(
+    "damage", [edit("disc_spin/zarr.json", flipped), write("disc_spin/copy", b"x")]
+)
 def test_damage_to_what_readers_do_not_open_is_found_by_the_check(
     made: tuple[Path, Config], tmp_path: Path, damage: Any
 ) -> None:
@@ -364,7 +422,9 @@ def test_damage_to_what_readers_do_not_open_is_found_by_the_check(
     assert open_dataset(str(folder)).load().identical(open_dataset(str(made[0])).load())
 
 
-def test_a_file_behind_the_back_of_others_is_found_by_zarr_itself(made: tuple[Path, Config], tmp_path: Path) -> None:
+def test_a_file_behind_the_back_of_others_is_found_by_zarr_itself(
+    made: tuple[Path, Config], tmp_path: Path
+) -> None:
     """By the checksums of the arrays, without this package's reader."""
     folder = copy(made[0], tmp_path / "set")
     for name in ("disc_angle/c/0/0", "grasp_force/c/1"):
@@ -383,7 +443,9 @@ def test_standard_tools_check_the_shards(made: tuple[Path, Config], tmp_path: Pa
     assert subprocess.run(command, cwd=folder, capture_output=True, check=False).returncode != 0
 
 
-def test_unfinished_shards_are_refused_or_left_out(made: tuple[Path, Config], tmp_path: Path) -> None:
+def test_unfinished_shards_are_refused_or_left_out(
+    made: tuple[Path, Config], tmp_path: Path
+) -> None:
     folder = copy(made[0], tmp_path / "set")
     remove("finished/1.sha256")(folder)
     for read in (open_dataset, lambda url: Trajectories(url, [])):
@@ -402,7 +464,9 @@ def test_what_is_not_finite_is_not_written(
     row = simulate_task(config, task(config, 4, design[4]))
     angle = row["disc_angle"].copy()
     angle[3] = np.nan
-    with pytest.raises(ValueError, match="trajectory 4 is not marked as failed, but not finite: disc_angle"):
+    with pytest.raises(
+        ValueError, match="trajectory 4 is not marked as failed, but not finite: disc_angle"
+    ):
         store.write(2, [row | {"disc_angle": angle}])
     assert store.unfinished() == [0, 1, 2]
     series = simulation.series
@@ -415,7 +479,8 @@ def test_what_is_not_finite_is_not_written(
 def test_leftovers_of_the_dead_are_removed_and_files_of_the_living_are_not(
     made: tuple[Path, Config], tmp_path: Path
 ) -> None:
-    """At the next start: partial files of a killed run, in the layout too, but none that somebody is writing."""
+    """At the next start: partial files of a killed run, in the layout too, but none that somebody
+    is writing."""
     config, folder = made[1], tmp_path / "set"
     content = laid_out(config)
     for key, data in list(content.items())[:5]:
@@ -431,8 +496,11 @@ def test_leftovers_of_the_dead_are_removed_and_files_of_the_living_are_not(
     assert files(folder) == files(made[0])
 
 
-def test_whoever_lays_a_folder_out_later_changes_nothing(made: tuple[Path, Config], tmp_path: Path) -> None:
-    """Two that begin at once both find no manifest; the slower one must not undo what the faster one made since."""
+def test_whoever_lays_a_folder_out_later_changes_nothing(
+    made: tuple[Path, Config], tmp_path: Path
+) -> None:
+    """Two that begin at once both find no manifest; the slower one must not undo what the faster
+    one made since."""
     config, folder = made[1], copy(made[0], tmp_path / "set")
     create(str(folder), config)
     assert files(folder) == files(made[0])
@@ -442,7 +510,9 @@ def test_whoever_lays_a_folder_out_later_changes_nothing(made: tuple[Path, Confi
     assert files(folder) == files(made[0])
 
 
-def test_check_draws_its_picture(made: tuple[Path, Config], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_draws_its_picture(
+    made: tuple[Path, Config], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     from torchsoft.datasets.check import main as check_main
 
     check_main([str(made[0]), "--picture", str(tmp_path / "coverage.png")])
@@ -451,7 +521,9 @@ def test_check_draws_its_picture(made: tuple[Path, Config], tmp_path: Path, caps
 
 
 def test_a_failed_simulation_is_recorded(tmp_path: Path) -> None:
-    path = write_config(tmp_path, trajectories=1, change=('"contact.v_s" = 0.05', '"pad.tau" = 1e-4'))
+    path = write_config(
+        tmp_path, trajectories=1, change=('"contact.v_s" = 0.05', '"pad.tau" = 1e-4')
+    )
     config = Config.from_toml(path)
     generate(config, str(tmp_path / "set"), Serial(), progress=False)
     data = xr.open_zarr(tmp_path / "set").load()
@@ -471,7 +543,9 @@ def test_only_unfinished_shards_are_made_again(made: tuple[Path, Config], tmp_pa
     generate(config, str(folder), Serial(), progress=False)
     assert files(folder) == files(made[0])
     written = {
-        p.relative_to(folder) for p in folder.rglob("c/**/*") if p.is_file() and before.get(p) != p.stat().st_mtime_ns
+        p.relative_to(folder)
+        for p in folder.rglob("c/**/*")
+        if p.is_file() and before.get(p) != p.stat().st_mtime_ns
     }
     assert written == {Path(name) for name in files(folder) if re.search(r"/c/1(/|$)", name)}
 
@@ -490,21 +564,44 @@ def test_folders_that_are_refused(made: tuple[Path, Config], tmp_path: Path) -> 
         open_or_create(str(tmp_path / "thesis.txt" / "set"), config)
 
 
-@pytest.mark.skipif(not Path("/sys").is_dir(), reason="needs a folder that not even root may write to")
+@pytest.mark.skipif(
+    not Path("/sys").is_dir(), reason="needs a folder that not even root may write to"
+)
 def test_an_unwritable_folder_is_refused(made: tuple[Path, Config]) -> None:
     with pytest.raises(StoreError, match="may not be written"):
         open_or_create("/sys/torchsoft-set", made[1])
 
 
-def test_a_file_size_limit_is_said_and_costs_nothing(made: tuple[Path, Config], tmp_path: Path) -> None:
-    """The operating system's own refusal, in the middle of a shard; without the limit the same command finishes."""
-    path, limit = write_config(tmp_path), max(len(data) for name, data in files(made[0]).items() if "/c/" in name) // 3
-    open_or_create(str(tmp_path / "set"), made[1])
-    command = ["-m", "data_gen.generate", str(path), "--out", str(tmp_path / "set"), "--workers", "0"]
-    limited = f"import resource, runpy, sys; sys.argv = {command[1:]}; import torchsoft.datasets.generate as g; " + (
-        f"resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit})); sys.exit(g.main(sys.argv[1:]))"
+def test_a_file_size_limit_is_said_and_costs_nothing(
+    made: tuple[Path, Config], tmp_path: Path
+) -> None:
+    """The operating system's own refusal, in the middle of a shard; without the limit the same
+    command finishes."""
+    path, limit = (
+        write_config(tmp_path),
+        max(len(data) for name, data in files(made[0]).items() if "/c/" in name) // 3,
     )
-    run = subprocess.run([sys.executable, "-c", limited], cwd=ROOT, capture_output=True, text=True, check=False)
+    open_or_create(str(tmp_path / "set"), made[1])
+    command = [
+        "-m",
+        "data_gen.generate",
+        str(path),
+        "--out",
+        str(tmp_path / "set"),
+        "--workers",
+        "0",
+    ]
+    limited = (
+        f"import resource, runpy, sys; sys.argv = {command[1:]}; import "
+        "torchsoft.datasets.generate as g; "
+        + (
+            f"resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit})); "
+            "sys.exit(g.main(sys.argv[1:]))"
+        )
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", limited], cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert run.returncode == 2, run.stderr
     assert "error: " in run.stderr
     assert "a file outgrew the limit on file sizes" in run.stderr
@@ -514,19 +611,32 @@ def test_a_file_size_limit_is_said_and_costs_nothing(made: tuple[Path, Config], 
     assert files(tmp_path / "set") == files(made[0])
 
 
-def test_command_line_errors_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_line_errors_are_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert main([str(tmp_path / "none.toml"), "--out", str(tmp_path / "set")]) == 2
     assert "No such file" in capsys.readouterr().err
 
 
 def kill_and_resume(folder: Path, config: Path, kills: range) -> None:
-    """Start again and again, SIGKILL after a random while past the first new file, every fifth time a random while after
-    the start; then let it finish."""
+    """Start again and again, SIGKILL after a random while past the first new file, every fifth time
+    a random while after the start; then let it finish."""
     rng, out = random.Random(len(kills)), folder / "set"
-    command = [sys.executable, "-m", "data_gen.generate", str(config), "--out", str(out), "--workers", "1"]
+    command = [
+        sys.executable,
+        "-m",
+        "data_gen.generate",
+        str(config),
+        "--out",
+        str(out),
+        "--workers",
+        "1",
+    ]
     for kill in kills:
         before = sum(1 for _ in out.rglob("*"))
-        process = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+        process = subprocess.Popen(
+            command, cwd=ROOT, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
+        )
         while process.poll() is None and kill % 5 and sum(1 for _ in out.rglob("*")) == before:
             time.sleep(0.01)
         time.sleep(rng.uniform(0, 6.0 if kill % 5 == 0 else 0.4))
@@ -535,7 +645,9 @@ def kill_and_resume(folder: Path, config: Path, kills: range) -> None:
     assert subprocess.run(command, cwd=ROOT, capture_output=True, check=False).returncode == 0
 
 
-@pytest.mark.parametrize("kills", [range(1, 2), pytest.param(range(10), marks=pytest.mark.slow)], ids=len)
+@pytest.mark.parametrize(
+    "kills", [range(1, 2), pytest.param(range(10), marks=pytest.mark.slow)], ids=len
+)
 def test_killed_runs_end_in_the_same_bytes(tmp_path: Path, kills: range) -> None:
     path = write_config(tmp_path, trajectories=2 * len(kills) + 2, shard=1)
     generate(Config.from_toml(path), str(tmp_path / "whole"), Serial(), progress=False)
@@ -545,7 +657,9 @@ def test_killed_runs_end_in_the_same_bytes(tmp_path: Path, kills: range) -> None
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_a_dask_cluster_that_loses_a_worker_makes_the_same_bytes(made: tuple[Path, Config], tmp_path: Path) -> None:
+def test_a_dask_cluster_that_loses_a_worker_makes_the_same_bytes(
+    made: tuple[Path, Config], tmp_path: Path
+) -> None:
     from distributed import Client, LocalCluster
 
     path = write_config(tmp_path, trajectories=12, shard=1)
@@ -569,12 +683,14 @@ def test_a_dask_cluster_that_loses_a_worker_makes_the_same_bytes(made: tuple[Pat
     assert files(tmp_path / "set") == files(tmp_path / "whole")
 
 
-# the torch dataset -----------------------------------------------------------------------------------------------------
+# the torch dataset
+# ----------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def partial(made: tuple[Path, Config], tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The dataset with a trajectory that failed, a number that is infinite, and a last shard that is not finished."""
+    """The dataset with a trajectory that failed, a number that is infinite, and a last shard that
+    is not finished."""
     folder = copy(made[0], tmp_path_factory.mktemp("partial") / "set")
     set_value("failed", (2,), 1)(folder)
     set_value("grasp_force", (0,), np.inf)(folder)
@@ -589,7 +705,10 @@ def reading(url: str, *what: Any, **how: Any) -> Trajectories:
 
 
 def test_windows_hold_what_the_store_holds(partial: str) -> None:
-    data, stored = reading(partial, ["disc_position", "pad.E"], window=5, stride=40), xr.open_zarr(partial)
+    data, stored = (
+        reading(partial, ["disc_position", "pad.E"], window=5, stride=40),
+        xr.open_zarr(partial),
+    )
     assert data.trajectories.tolist() == [0, 1, 3]  # 2 failed, 4 is unfinished
     assert len(data) == 3 * 3
     item = data[4]  # the second window of trajectory 1
@@ -613,7 +732,11 @@ def test_it_pickles_small_and_is_read_by_forked_workers_from_any_store(partial: 
         data = reading(url, ["disc_position", "pad.E"], window=30, dtype=torch.float32)
         data[0]  # opened before the fork
         assert len(pickle.dumps(data)) < 2000
-        batches = list(DataLoader(data, batch_size=4, num_workers=2, multiprocessing_context="fork", timeout=60))
+        batches = list(
+            DataLoader(
+                data, batch_size=4, num_workers=2, multiprocessing_context="fork", timeout=60
+            )
+        )
         for name in data.variables:
             got = torch.cat([batch[name] for batch in batches])
             assert got.dtype == torch.float32
@@ -632,7 +755,9 @@ def test_it_pickles_small_and_is_read_by_forked_workers_from_any_store(partial: 
         ([], {"split": "dev"}, "`split` must be"),
     ],
 )  # fmt: skip
-def test_a_reading_that_is_none_is_refused(partial: str, names: list[str], how: dict[str, Any], message: str) -> None:
+def test_a_reading_that_is_none_is_refused(
+    partial: str, names: list[str], how: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         reading(partial, names, **how)
 
@@ -641,7 +766,9 @@ def test_numbers_that_the_dtype_cannot_hold_are_refused(partial: str) -> None:
     """And those that are not finite in the store are given as they are."""
     assert torch.isinf(reading(partial, ["grasp_force"], dtype=torch.float16)[0]["grasp_force"])
     with pytest.raises(
-        ValueError, match=r"`pad.E` of trajectory 0 holds 7.*, which torch\.float16 cannot; take a wider `dtype`"
+        ValueError,
+        match=r"`pad.E` of trajectory 0 holds 7.*, which torch\.float16 cannot; take a wider "
+        r"`dtype`",
     ):
         reading(partial, ["pad.E"], dtype=torch.float16)[0]
     with pytest.raises(IndexError):

@@ -1,4 +1,5 @@
-"""Configurations of datasets: what cannot be carried out is refused by the field that says it, in one sentence."""
+"""Configurations of datasets: what cannot be carried out is refused by the field that says it, in
+one sentence."""
 
 import copy
 import tomllib
@@ -11,7 +12,9 @@ from torchsoft.datasets.config import Config, Range
 from torchsoft.datasets.generate import main
 from torchsoft.tables import InvalidTable
 
-SMOKE = tomllib.loads((Path(__file__).parent.parent / "data_gen" / "configs" / "smoke.toml").read_text())
+SMOKE = tomllib.loads(
+    (Path(__file__).parent.parent / "data_gen" / "configs" / "smoke.toml").read_text()
+)
 
 
 def changed(place: tuple[str | int, ...], value: Any) -> Any:
@@ -33,22 +36,42 @@ def test_numbers_that_are_whole_are_numbers() -> None:
     [
         (("fixed", "pad.height"), "abc", "fixed.pad.height should be a valid number, not 'abc'"),
         (("fixed", "pad.height"), True, "fixed.pad.height should be a valid number, not True"),
-        (("fixed", "pad.fidelity"), "firm", "fixed.pad.fidelity should be 'massless' or 'inertial', not 'firm'"),
+        (
+            ("fixed", "pad.fidelity"),
+            "firm",
+            "fixed.pad.fidelity should be 'massless' or 'inertial', not 'firm'",
+        ),
         (("fixed", "pad.elements_x"), 40_000, "pad.elements_x = 40000"),
         (("fixed", "pad.height"), 1e-3, "pad.height = 0.001 m"),
         (("fixed", "scenario.travel"), 1e-3, "fixed.scenario.travel has no part in a dataset"),
         (("fixed", "scenario.grasp_time"), 0.9, "scenario.grasp_time = 0.9 s"),
-        (("parameters", "pad.E", "low"), "1e5", "parameters.pad.E.low should be a valid number, not '1e5'"),
-        (("parameters", "pad.E", "high"), 1e300, "parameters.pad.E.high should be less than or equal to"),
+        (
+            ("parameters", "pad.E", "low"),
+            "1e5",
+            "parameters.pad.E.low should be a valid number, not '1e5'",
+        ),
+        (
+            ("parameters", "pad.E", "high"),
+            1e300,
+            "parameters.pad.E.high should be less than or equal to",
+        ),
         (
             ("parameters", "contact.mu_k/contact.mu_s", "high"),
             1.5,
             "parameters.contact.mu_k/contact.mu_s.high must lie in",
         ),
         (("kinds", 0, "kind"), "hop", "kinds.0.kind should be one of"),
-        (("kinds", 0, "travel", "low"), "far", "kinds.0.travel.low should be a valid number, not 'far'"),
+        (
+            ("kinds", 0, "travel", "low"),
+            "far",
+            "kinds.0.travel.low should be a valid number, not 'far'",
+        ),
         (("kinds", 0, "travel", "high"), 1.0, "kinds.0.travel.high = 1.0 m leaves the pad"),
-        (("kinds", 1, "stroke_time", "low"), 1e-6, "kinds.1.stroke_time.low = 1e-06 s makes more than"),
+        (
+            ("kinds", 1, "stroke_time", "low"),
+            1e-6,
+            "kinds.1.stroke_time.low = 1e-06 s makes more than",
+        ),
         (("kinds", 2, "amplitude_x"), 3, "kinds.2.amplitude_x should be a table, not 3"),
         (("workers",), 3, "workers is not known here"),
         (("parameters", "pad.E"), {"low": 9e5, "high": 8e5}, "parameters.pad.E"),
@@ -64,7 +87,9 @@ def test_numbers_that_are_whole_are_numbers() -> None:
         (("title",), 3, "title should be a valid string, not 3"),
     ],
 )
-def test_a_mistake_is_blamed_on_its_field(place: tuple[str | int, ...], value: Any, message: str) -> None:
+def test_a_mistake_is_blamed_on_its_field(
+    place: tuple[str | int, ...], value: Any, message: str
+) -> None:
     with pytest.raises(InvalidTable) as error:
         Config.model_validate(changed(place, value))
     assert message in str(error.value)
@@ -72,8 +97,14 @@ def test_a_mistake_is_blamed_on_its_field(place: tuple[str | int, ...], value: A
 
 
 def test_a_jerks_own_depth_is_tried_too() -> None:
-    jerk = {"kind": "jerk", "depth": {"low": 2e-4, "high": 9e-3}, "travel": {"low": 2e-2, "high": 3e-2}}
-    with pytest.raises(InvalidTable, match=r"kinds\.5\.depth\.high = 0\.009 is impossible: the disc does not fit"):
+    jerk = {
+        "kind": "jerk",
+        "depth": {"low": 2e-4, "high": 9e-3},
+        "travel": {"low": 2e-2, "high": 3e-2},
+    }
+    with pytest.raises(
+        InvalidTable, match=r"kinds\.5\.depth\.high = 0\.009 is impossible: the disc does not fit"
+    ):
         Config.model_validate(SMOKE | {"kinds": [*SMOKE["kinds"], jerk]})
 
 
@@ -87,12 +118,22 @@ def test_a_logarithmic_range_does_not_go_beyond_its_ends(high: float) -> None:
     ("change", "arguments", "status", "message"),
     [
         (("trajectories = 8", "trajectories = 1000000"), [], 2, "or say --yes to begin"),
-        (("trajectories = 8", "trajectories = '8'"), [], 2, "trajectories should be a valid integer, not '8'"),
+        (
+            ("trajectories = 8", "trajectories = '8'"),
+            [],
+            2,
+            "trajectories should be a valid integer, not '8'",
+        ),
         (("title", "\\u0000"), [], 2, "is not a TOML file"),
     ],
 )
 def test_the_command_refuses_in_one_line(
-    change: tuple[str, str], arguments: list[str], status: int, message: str, tmp_path: Path, capsys: Any
+    change: tuple[str, str],
+    arguments: list[str],
+    status: int,
+    message: str,
+    tmp_path: Path,
+    capsys: Any,
 ) -> None:
     path = tmp_path / "set.toml"
     text = (Path(__file__).parent.parent / "data_gen" / "configs" / "smoke.toml").read_text()

@@ -1,4 +1,5 @@
-"""Power balance, momentum balance, and nothing that creates energy: at random states of several rigs, without any stepper."""
+"""Power balance, momentum balance, and nothing that creates energy: at random states of several
+rigs, without any stepper."""
 
 import pytest
 import torch
@@ -16,19 +17,26 @@ def test_stored_energies_by_hand() -> None:
     state = rig.unpack(random_state(rig, 2))
     velocity = {"disc": f64(3e-2, 4e-2, 2.0), "bracket": f64(0.0, -0.1, 0.0)}
     with torch.no_grad():
-        energy = {name: float(x) for name, x in stored(rig, state._replace(velocity=velocity)).items()}
+        energy = {
+            name: float(x) for name, x in stored(rig, state._replace(velocity=velocity)).items()
+        }
         u = rig.displacement("U", state)
         force = torch.linalg.solve(rig.pads["U"].compliance(), u.flatten())
         depth = torch.cat([rig.penetration(k, state).clamp(min=0) for k in "LU"])
         weights, stretch = (
-            torch.cat([part[k] for k in "LU"]) for part in ({k: rig.weight(k) for k in "LU"}, state.stretch)
+            torch.cat([part[k] for k in "LU"])
+            for part in ({k: rig.weight(k) for k in "LU"}, state.stretch)
         )
     assert energy["disc"] == pytest.approx(0.5 * 0.4065 * 0.05**2, rel=1e-14)
     assert energy["bracket"] == pytest.approx(0.5 * 0.4065 * 0.1**2, rel=1e-14)
     assert energy["spin"] == pytest.approx(0.5 * 0.5 * 0.4065 * 19.37e-3**2 * 4.0, rel=1e-13)
     assert energy["strain_U"] == pytest.approx(0.5 * float(force @ u.flatten()), rel=1e-11)
-    assert energy["normal_springs"] == pytest.approx(float((0.5 * 1.2e5 * weights * depth**2).sum()), rel=1e-13)
-    assert energy["tangential_springs"] == pytest.approx(float((0.5 * 1.2e5 * weights * stretch**2).sum()), rel=1e-13)
+    assert energy["normal_springs"] == pytest.approx(
+        float((0.5 * 1.2e5 * weights * depth**2).sum()), rel=1e-13
+    )
+    assert energy["tangential_springs"] == pytest.approx(
+        float((0.5 * 1.2e5 * weights * stretch**2).sum()), rel=1e-13
+    )
 
 
 def test_a_run_balances_its_energies_better_with_smaller_steps() -> None:
@@ -36,7 +44,8 @@ def test_a_run_balances_its_energies_better_with_smaller_steps() -> None:
     manipulation = grasp_and_roll(coarse(), grasp_force=75.0)
     t = torch.linspace(0, 0.6, 61, dtype=torch.float64)
     residual = [
-        simulate(manipulation.model, t, y0=manipulation.y0, step=h).energy_residual_rel for h in (2e-3, 1e-3, 5e-4)
+        simulate(manipulation.model, t, y0=manipulation.y0, step=h).energy_residual_rel
+        for h in (2e-3, 1e-3, 5e-4)
     ]
     assert residual[0] < 1e-3
     assert residual[2] < residual[1] < residual[0]
@@ -45,7 +54,11 @@ def test_a_run_balances_its_energies_better_with_smaller_steps() -> None:
 
 def test_the_energy_residual_of_a_fall_falls_with_the_tolerance() -> None:
     """An ellipse in free flight and on a pad, with long steps between outputs."""
-    ready = RigFile.from_toml("rigs/drop.toml").override(outputs={"duration": 0.2, "snapshots": []}).build()
+    ready = (
+        RigFile.from_toml("rigs/drop.toml")
+        .override(outputs={"duration": 0.2, "snapshots": []})
+        .build()
+    )
     runs = [simulate(ready.rig, ready.t, y0=ready.y0, rtol=rtol) for rtol in (1e-4, 1e-6)]
     assert runs[0].energy_residual_rel < 2e-4
     assert runs[1].energy_residual_rel < 0.2 * runs[0].energy_residual_rel

@@ -1,4 +1,5 @@
-"""Static equilibria: forces in balance, symmetry, derivatives by the implicit function theorem, and refusals."""
+"""Static equilibria: forces in balance, symmetry, derivatives by the implicit function theorem, and
+refusals."""
 
 import pytest
 import torch
@@ -17,7 +18,8 @@ BALANCE = 1e-9
 
 
 def contact_force(model: SoftGrasp, y: Tensor, which: str) -> Tensor:
-    """Force of one pad's contact on the disc (2,) [N], by the multibond graph and not by the equilibrium solver."""
+    """Force of one pad's contact on the disc (2,) [N], by the multibond graph and not by the
+    equilibrium solver."""
     port = model.evaluate(0.0, model.unpack(y)).ports[f"contact_{which}"]
     return net_efforts({"contact": port}, model.junctions)["disc"][0]
 
@@ -31,7 +33,9 @@ def test_nothing_but_the_bracket_accelerates(fidelity: str, at: str) -> None:
     rate = model.unpack(model(0.0, y))
     gravity = float(model.gravity)
     assert float(rate.velocity["disc"][:2].abs().max()) < BALANCE * gravity
-    assert float(rate.velocity["disc"][2].abs()) < BALANCE * gravity / float(model.parameter("disc.radius"))
+    assert float(rate.velocity["disc"][2].abs()) < BALANCE * gravity / float(
+        model.parameter("disc.radius")
+    )
     creep = 1e-12 / float(model.pad.tau)  # [m/s]: residual over tau
     for name, pad in model.pads.items():
         u_dot = rate.pads[name] if pad.inertial else model.displacement(name, rate)
@@ -49,7 +53,11 @@ def test_at_rest_the_upper_pad_just_touches_the_disc() -> None:
     g = model.penetration("U", state)
     assert float(g.max().abs()) < 1e-15
     assert int((g > -1e-9).sum()) == 1
-    assert float(state.pose["bracket"][0]) == float(state.pose["disc"][0]) == Parameters().scenario.x_C0
+    assert (
+        float(state.pose["bracket"][0])
+        == float(state.pose["disc"][0])
+        == Parameters().scenario.x_C0
+    )
     assert float(state.pose["disc"][2]) == 0.0
 
 
@@ -69,24 +77,37 @@ def test_fidelities_agree_and_the_grasp_is_the_papers() -> None:
     y = press(massless, GRASP)
     one, other = massless.unpack(y), inertial.unpack(press(inertial, GRASP))
     assert float((one.pose["disc"] - other.pose["disc"]).abs().max()) < 1e-13
-    assert float((massless.displacement("U", one) - other.pads["U"][inertial.pads["U"].surface]).abs().max()) < 1e-13
-    assert float(one.pose["disc"][1]) == pytest.approx(23.20e-3, abs=5e-6)  # the paper's y_C, to the digits it prints
+    assert (
+        float(
+            (massless.displacement("U", one) - other.pads["U"][inertial.pads["U"].surface])
+            .abs()
+            .max()
+        )
+        < 1e-13
+    )
+    assert float(one.pose["disc"][1]) == pytest.approx(
+        23.20e-3, abs=5e-6
+    )  # the paper's y_C, to the digits it prints
     assert float(contact_force(massless, y, "L")[1]) == pytest.approx(74.15, abs=0.01)
     assert int((massless.penetration("L", one) > 0).sum()) == 11
 
 
-# derivatives --------------------------------------------------------------------------------------------------------
+# derivatives
+# ----------------------------------------------------------------------
 
 PARAMETERS = ("pad.E", "pad.nu", "pad.depth", "contact.K_n", "disc.radius", "disc.mass")
 
 
 def outcome(model: SoftGrasp, at: str) -> Tensor:
-    """Disc and bracket height, a surface displacement, and the force on the disc from below: in um and N."""
+    """Disc and bracket height, a surface displacement, and the force on the disc from below: in um
+    and N."""
     y = rest(model) if at == "rest" else press(model, GRASP)
     state = model.unpack(y)
     u = model.displacement("L", state)
     middle = len(u) // 2
-    lengths = torch.stack((state.pose["disc"][1], state.pose["bracket"][1], u[middle, 1], u[middle + 2, 0]))
+    lengths = torch.stack(
+        (state.pose["disc"][1], state.pose["bracket"][1], u[middle, 1], u[middle + 2, 0])
+    )
     return torch.cat((1e6 * lengths, contact_force(model, y, "L")[1:]))
 
 
@@ -97,12 +118,19 @@ def test_derivatives_by_autograd_are_those_by_differences(at: str, name: str) ->
     rows = outcome(model, at)
     parameter = model.parameter(name)
     gradient = [
-        torch.autograd.grad(row, parameter, retain_graph=True, allow_unused=True)[0] if row.requires_grad else None
+        torch.autograd.grad(row, parameter, retain_graph=True, allow_unused=True)[0]
+        if row.requires_grad
+        else None
         for row in rows
     ]
-    exact = torch.tensor([0.0 if g is None else float(g) for g in gradient], dtype=torch.float64) * value
+    exact = (
+        torch.tensor([0.0 if g is None else float(g) for g in gradient], dtype=torch.float64)
+        * value
+    )
     with torch.no_grad():
-        moved = {h: outcome(build(**{name: value * (1 + h)}), at) for h in (-1e-4, -5e-5, 5e-5, 1e-4)}
+        moved = {
+            h: outcome(build(**{name: value * (1 + h)}), at) for h in (-1e-4, -5e-5, 5e-5, 1e-4)
+        }
     wide, narrow = ((moved[h] - moved[-h]) / (2 * h) for h in (1e-4, 5e-5))
     differences = (4 * narrow - wide) / 3
     assert float(exact.abs().max()) > 0.1
@@ -110,7 +138,8 @@ def test_derivatives_by_autograd_are_those_by_differences(at: str, name: str) ->
     assert torch.allclose(exact, differences, rtol=1e-7, atol=5e-6)
 
 
-# refusals -----------------------------------------------------------------------------------------------------------
+# refusals
+# ----------------------------------------------------------------------
 
 
 def test_a_bracket_above_the_sunken_disc_is_refused() -> None:
@@ -118,15 +147,21 @@ def test_a_bracket_above_the_sunken_disc_is_refused() -> None:
     with torch.no_grad():
         touching = float(model.unpack(rest(model)).pose["bracket"][1])
     p = Parameters()
-    assert touching < 2 * (p.pad.height + p.disc.radius) + p.bracket.cm_height - 5e-5  # it sinks by 0.1 mm
+    assert (
+        touching < 2 * (p.pad.height + p.disc.radius) + p.bracket.cm_height - 5e-5
+    )  # it sinks by 0.1 mm
     with pytest.raises(NoEquilibrium, match="too high"):
         press(model, touching + 1e-6)
     with torch.no_grad():
         force = -float(contact_force(model, press(model, touching - 1e-6), "U")[1])
-    assert 0 < force < 0.24  # the middle node's spring of 0.24 N/um, in series with the pads: measured 0.018 N
+    assert (
+        0 < force < 0.24
+    )  # the middle node's spring of 0.24 N/um, in series with the pads: measured 0.018 N
 
 
-def test_no_equilibrium_is_reported_when_newton_does_not_converge(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_equilibrium_is_reported_when_newton_does_not_converge(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("torchsoft.paper.equilibrium.RESIDUAL", -1.0)
     with pytest.raises(NoEquilibrium, match="no static equilibrium found"):
         press(build(), GRASP)
@@ -136,4 +171,6 @@ def test_no_equilibrium_is_reported_when_newton_does_not_converge(monkeypatch: p
 def test_holding_force_is_what_the_upper_contact_presses_with(fidelity: str) -> None:
     model = build(pad__fidelity=fidelity)
     y = press(model, GRASP)
-    assert holding_force(model, y) == pytest.approx(-float(contact_force(model, y, "U")[1].detach()), rel=1e-9)
+    assert holding_force(model, y) == pytest.approx(
+        -float(contact_force(model, y, "U")[1].detach()), rel=1e-9
+    )

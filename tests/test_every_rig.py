@@ -93,18 +93,26 @@ class Saturated(nn.Module):
 
 
 class Policy(nn.Module):
-    """Loops of x, y and theta, whose efforts a network of set-points and the whole state corrects."""
+    """Loops of x, y and theta, whose efforts a network of set-points and the whole state
+    corrects."""
 
     def __init__(self) -> None:
         super().__init__()
         torch.manual_seed(3)
         self.net = nn.Sequential(nn.Linear(18, 5), nn.Tanh(), nn.Linear(5, 3)).double()
-        self.Kp, self.Kd = (nn.Parameter(f64(*x)) for x in ((1.2e5, 1.2e5, 60.0), (440.0, 440.0, 0.2)))
+        self.Kp, self.Kd = (
+            nn.Parameter(f64(*x)) for x in ((1.2e5, 1.2e5, 60.0), (440.0, 440.0, 0.2))
+        )
 
     def forward(self, setpoints: Tensor, state: Tensor) -> Tensor:
-        (w, w_dot), (q, q_dot) = setpoints.unflatten(-1, (2, 3)).unbind(-2), state.unflatten(-1, (2, 6)).unbind(-2)
+        (w, w_dot), (q, q_dot) = (
+            setpoints.unflatten(-1, (2, 3)).unbind(-2),
+            state.unflatten(-1, (2, 6)).unbind(-2),
+        )
         seen = torch.cat((100.0 * (w - q[..., :3]), w_dot, 100.0 * q, q_dot), -1)
-        return self.Kp * (w - q[..., :3]) + self.Kd * (w_dot - q_dot[..., :3]) + 2.0 * self.net(seen)
+        return (
+            self.Kp * (w - q[..., :3]) + self.Kd * (w_dot - q_dot[..., :3]) + 2.0 * self.net(seen)
+        )
 
 
 class Wave(nn.Module):
@@ -115,32 +123,45 @@ class Wave(nn.Module):
 
 
 def law(friction: Any = None) -> SoftContact:
-    return SoftContact(1.2e5, 441.7, 1.1e5, 430.0, friction=friction or SmoothSlip(0.5, 0.4, 5e-2, 10.0))
+    return SoftContact(
+        1.2e5, 441.7, 1.1e5, 430.0, friction=friction or SmoothSlip(0.5, 0.4, 5e-2, 10.0)
+    )
 
 
 def grip(
-    shape: nn.Module | None = None, material: Any = None, tip: Mesh = MESH, friction: Any = None, lower: Body | None = None,
-    jaw: Body | None = None, motion: dict[str, nn.Module] | None = None, loops: Callable[[float], dict[str, Any]] | None = None,
-    **pad: Any,
+    shape: nn.Module | None = None, material: Any = None, tip: Mesh = MESH, friction: Any = None,
+    lower: Body | None = None, jaw: Body | None = None, motion: dict[str, nn.Module] | None = None,
+    loops: Callable[[float], dict[str, Any]] | None = None, **pad: Any,
 ) -> Start:  # fmt: skip
-    """A body pressed between a pad below and one under a jaw, which is driven or pushed by loops; it is rolled and slips."""
-    shape, soft, contact = shape or Circle(R), material or KelvinVoigt(**RUBBER, tau=0.01), law(friction)
+    """A body pressed between a pad below and one under a jaw, which is driven or pushed by loops;
+    it is rolled and slips."""
+    shape, soft, contact = (
+        shape or Circle(R),
+        material or KelvinVoigt(**RUBBER, tau=0.01),
+        law(friction),
+    )
     down, up = shape.support(f64(0.0, -1.0, 0.0, 1.0).reshape(2, 2)).detach().tolist()
     y = MESH.height - DEPTH + down
     top = y + up - DEPTH + tip.height
-    reference = {"jaw.x": Profile([0.0, 0.015], [0.0, 2e-3]), "jaw.y": Profile([0.0, 0.015], [top, top - 1e-4])}
+    reference = {
+        "jaw.x": Profile([0.0, 0.015], [0.0, 2e-3]),
+        "jaw.y": Profile([0.0, 0.015], [top, top - 1e-4]),
+    }
     driven = Body(x="driven", y="driven", theta=0.0, weighted=False)
     rig = Rig(
-        bodies={"disc": Body(0.4, shape), "jaw": jaw or driven} | ({"lower": lower} if lower else {}),
-        pads={
+        bodies={"disc": Body(0.4, shape),
+        "jaw": jaw or driven} | ({"lower": lower} if lower else {}), pads={
             "lower": Pad(MESH, soft, base="lower" if lower else None, origin=(-30e-3, 0.0), **pad),
-            "upper": Pad(tip, soft, base="jaw", origin=(-tip.length / 2, 0.0), mirrored=True, **pad),
+            "upper": Pad(tip, soft, base="jaw", origin=(-tip.length / 2, 0.0), mirrored=True,
+            **pad),
         },
         contacts={name: Contact(name, "disc", contact) for name in ("lower", "upper")},
         actuators=loops(top) if loops else None, groups={"rubber": soft, "contact": contact},
         reference=Reference(**({} if jaw and loops else reference) | (motion(top) if callable(motion) else motion or {})),
     )  # fmt: skip
-    pose = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64)).pose | {"disc": f64(3e-4, y, 0.0)}
+    pose = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64)).pose | {
+        "disc": f64(3e-4, y, 0.0)
+    }
     if jaw and loops:
         pose["jaw"] = f64(0.0, top, 0.0)
     return rig, standing(rig, pose).detach()
@@ -152,7 +173,9 @@ def loops(actuators: Callable[[], dict[str, Any]], theta: Any = 0.0) -> Start:
         "x_d": Profile([0.0, 0.015], [0.0, 3e-3]), "y_d": Profile([0.0, 0.015], [top, top - 1e-4]),
         "theta_d": Profile([0.0, 0.015], [0.0, 0.02]), "F": Profile([0.0, 0.015], [-20.0, -25.0]),
     }  # fmt: skip
-    return grip(jaw=Body(0.4, inertia=3e-4, theta=theta), loops=lambda top: actuators(), motion=motion)
+    return grip(
+        jaw=Body(0.4, inertia=3e-4, theta=theta), loops=lambda top: actuators(), motion=motion
+    )
 
 
 def jaws() -> Start:
@@ -168,7 +191,8 @@ def jaws() -> Start:
         },
         contacts={name: Contact(name, "disc", contact) for name in ("floor", "left", "right")},
         reference=Reference(**{
-            "left.x": Profile([0.0, 0.015], [-reach, -reach + 4e-4]), "right.x": Profile([0.0, 0.015], [reach, reach - 1e-4])
+            "left.x": Profile([0.0, 0.015], [-reach, -reach + 4e-4]),
+            "right.x": Profile([0.0, 0.015], [reach, reach - 1e-4])
         }),
     )  # fmt: skip
     pose = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64)).pose
@@ -191,8 +215,8 @@ def pd(measures: str = "jaw.x", x_law: nn.Module | None = None) -> dict[str, Act
 def feedback(coupling: float = 0.0) -> dict[str, Actuator]:
     gain = [[1.2e5, coupling, 441.7, 0.0], [0.0, 1.2e5, coupling, 441.7]]
     return controller(
-        StateFeedback(gain), measures=["jaw.x", "jaw.y"], setpoints=["x_d", "y_d"], pushes={"x": "jaw.x", "y": "jaw.y"},
-        feed_forward={"y": "F"},
+        StateFeedback(gain), measures=["jaw.x", "jaw.y"], setpoints=["x_d", "y_d"],
+        pushes={"x": "jaw.x", "y": "jaw.y"}, feed_forward={"y": "F"},
     )  # fmt: skip
 
 
@@ -201,14 +225,17 @@ RIGS: dict[str, Callable[[], Start]] = {
     "ellipse": lambda: grip(Ellipse(R, 18.5e-3)),
     "superellipse": lambda: grip(Superellipse(20e-3, 18.5e-3, 2.6)),
     "rounded box": lambda: grip(RoundedBox(18e-3, 17e-3, 12e-3)),
-    "rounded polygon": lambda: grip(RoundedPolygon(along(np.arange(0.5, 8) * np.pi / 4, 20e-3, 20e-3), 9e-3)),
-    "contour": lambda: grip(Contour(along(np.arange(24) * np.pi / 12, 20e-3, 18e-3), tolerance=1e-5)),
-    "standard linear solid": lambda: grip(material=StandardLinearSolid(**RUBBER, E_instant=1.5e6, tau=0.02, tau_instant=1e-3)),
-    "generalised Kelvin": lambda: grip(
-        material=GeneralisedKelvin(**RUBBER, J=[0.3, 0.2, 0.1], tau=[4e-3, 0.02, 0.3], tau_instant=1e-3)
+    "rounded polygon": lambda: grip(RoundedPolygon(along(np.arange(0.5, 8) * np.pi / 4, 20e-3,
+    20e-3), 9e-3)), "contour": lambda: grip(Contour(along(np.arange(24) * np.pi / 12, 20e-3, 18e-3),
+    tolerance=1e-5)),
+    "standard linear solid": lambda: grip(material=StandardLinearSolid(**RUBBER, E_instant=1.5e6,
+    tau=0.02, tau_instant=1e-3)), "generalised Kelvin": lambda: grip(
+        material=GeneralisedKelvin(**RUBBER, J=[0.3, 0.2, 0.1], tau=[4e-3, 0.02, 0.3],
+        tau_instant=1e-3)
     ),
     "Prony": lambda: grip(
-        material=Prony(**RUBBER, moduli=[3e5, 2e5, 1e5, 5e4], tau=[3e-3, 0.01, 0.1, 0.5], tau_instant=1e-3)
+        material=Prony(**RUBBER, moduli=[3e5, 2e5, 1e5, 5e4], tau=[3e-3, 0.01, 0.1, 0.5],
+        tau_instant=1e-3)
     ),
     "crowned pad": lambda: grip(tip=CurvedPadMesh(30e-3, 6e-3, 30, 3, radius=40e-3)),
     "fingertip": lambda: grip(Circle(12e-3), tip=FingertipMesh(8e-3, 24)),
@@ -221,19 +248,21 @@ RIGS: dict[str, Callable[[], Start]] = {
     "network of friction": lambda: grip(friction=NetworkFriction()),
     "turning jaws": lambda: grip(
         jaw=Body(**TURNING), lower=Body(**TURNING),
-        motion={f"lower.{axis}": Profile([0.0, 0.015], [0.0, to]) for axis, to in (("x", -2e-3), ("y", 1e-4), ("theta", 0.03))}
+        motion={f"lower.{axis}": Profile([0.0, 0.015], [0.0, to]) for axis,
+        to in (("x", -2e-3), ("y", 1e-4), ("theta", 0.03))}
         | {"jaw.theta": Profile([0.0, 0.015], [0.0, 0.02])},
     ),
     "three pads": jaws,
-    "sampled motion": lambda: grip(motion={"jaw.x": Sampled([0.0, 0.004, 0.008, 0.015], [0.0, 1e-3, 3e-3, 3e-3])}),
-    "motion of one's own": lambda: grip(motion={"jaw.x": Wave()}),
+    "sampled motion": lambda: grip(motion={"jaw.x": Sampled([0.0, 0.004, 0.008, 0.015],
+    [0.0, 1e-3, 3e-3, 3e-3])}), "motion of one's own": lambda: grip(motion={"jaw.x": Wave()}),
     "loops": lambda: loops(pd),
     "loops by feedback": lambda: loops(feedback),
     "loop about the disc": lambda: loops(lambda: pd("disc.x", PD(2e4, 100.0))),
     "saturated loop": lambda: loops(lambda: pd(x_law=Saturated(3.0))),
     "coupled feedback": lambda: loops(lambda: feedback(10.0)),
     "policy": lambda: loops(lambda: controller(
-        Policy(), measures=WHOLE, setpoints=SETPOINTS, pushes=PUSHES, feed_forward={"y": "F"}), theta="free"),
+        Policy(), measures=WHOLE, setpoints=SETPOINTS, pushes=PUSHES, feed_forward={"y": "F"}),
+        theta="free"),
 }  # fmt: skip
 
 
@@ -263,7 +292,9 @@ def test_compiled_steps_are_the_modules(start: Start) -> None:
 
 def test_gradients_of_runs_are_exact(start: Start) -> None:
     made = assert_gradients_exact(start, times(END, 4))
-    assert all(float(force[-1, :, 0].sum()) > 1.0 for force in made.force.values())  # all pads touch
+    assert all(
+        float(force[-1, :, 0].sum()) > 1.0 for force in made.force.values()
+    )  # all pads touch
 
 
 def test_a_turned_rig_moves_like_the_one_that_is_not() -> None:
@@ -282,13 +313,20 @@ def test_a_turned_rig_moves_like_the_one_that_is_not() -> None:
         still = {f"lower.{axis}": Profile([0.0], [0.0]) for axis in "xy"}
         rig, _ = grip(
             jaw=Body(**TURNING), lower=Body(**TURNING),
-            motion=still | {name: Profile([0.0, 0.015], list(ends)) for name, ends in motion.items()},
+            motion=still | {name: Profile([0.0, 0.015], list(ends)) for name,
+            ends in motion.items()},
         )  # fmt: skip
         torch.nn.init.zeros_(rig.gravity)
         arm, off = MESH.height + R - DEPTH, 3e-4
         pose = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64)).pose
-        y0 = standing(rig, pose | {"disc": f64(c * off - s * arm, s * off + c * arm, angle)}).detach()
-        x, y, theta = simulate(rig, times(END, 5), y0=y0, step=1e-3, tolerance=1e-10).state.pose["disc"].unbind(-1)
+        y0 = standing(
+            rig, pose | {"disc": f64(c * off - s * arm, s * off + c * arm, angle)}
+        ).detach()
+        x, y, theta = (
+            simulate(rig, times(END, 5), y0=y0, step=1e-3, tolerance=1e-10)
+            .state.pose["disc"]
+            .unbind(-1)
+        )
         runs.append(torch.stack((c * x + s * y, c * y - s * x, theta - angle)))
     assert float((runs[0] - runs[1]).abs().max()) < 1e-9
 
@@ -299,7 +337,10 @@ def test_efforts_of_a_policy_are_those_of_its_module() -> None:
     run = simulate(rig, times(END, 7), y0=y0)
     signals = rig.follow(run.t)
     state = rig.unpack(run.y, signals)
-    w, seen = (dict(zip(rig.signals, signals.unbind(-2)))[name] for name in SETPOINTS), (state.pose, state.velocity)
+    w, seen = (
+        (dict(zip(rig.signals, signals.unbind(-2)))[name] for name in SETPOINTS),
+        (state.pose, state.velocity),
+    )
     setpoints = torch.stack(list(w), -2).mT.flatten(-2)
     poses = torch.cat([part[body] for part in seen for body in ("jaw", "disc")], -1)
     wanted = rig.actuators["x"].law.module(setpoints, poses).detach()
@@ -317,7 +358,9 @@ def test_knots_with_a_graph_receive_their_gradient() -> None:
     slopes = []
     for values, leaf in ((torch.cat((d[:1] - 0.5, d[1:] ** 2)) * 1e-3, d), (knots * 1e-3, knots)):
         rig, y0 = grip(motion={"jaw.x": Profile([0.0, 0.015], values)})
-        value = simulate(rig, times(END, 3), y0=y0, step=1e-3, gradient="discrete")["theta_disc"][-1]
+        value = simulate(rig, times(END, 3), y0=y0, step=1e-3, gradient="discrete")["theta_disc"][
+            -1
+        ]
         slopes.append(torch.autograd.grad(value, leaf)[0])
     assert torch.allclose(slopes[0], slopes[1] * f64(1.0, 2.0), rtol=1e-9)
     assert float(slopes[0].abs().min()) > 0
@@ -325,6 +368,7 @@ def test_knots_with_a_graph_receive_their_gradient() -> None:
 
 def test_feedback_on_the_diagonal_is_two_loops() -> None:
     runs = [
-        simulate(rig, times(END, 5), y0=y0, step=1e-3) for rig, y0 in (RIGS["loops"](), RIGS["loops by feedback"]())
+        simulate(rig, times(END, 5), y0=y0, step=1e-3)
+        for rig, y0 in (RIGS["loops"](), RIGS["loops by feedback"]())
     ]
     assert torch.allclose(runs[0].y, runs[1].y, rtol=0, atol=1e-9)

@@ -17,18 +17,25 @@ ROLL = {"kind": "slow_roll"}
 @pytest.mark.parametrize(
     ("tree", "message"),
     [
-        ({"motion": ROLL, "duration": 0.4}, "duration = 0.4 s leaves no motion: grasp_time = 0.375 s and settle = 0.125 s"),
+        ({"motion": ROLL, "duration": 0.4}, "duration = 0.4 s leaves no motion: grasp_time = 0.375 "
+                                            "s and settle = 0.125 s"),
         ({"motion": {"kind": "chirp"}, "duration": 0.7}, "chirp needs more than 0.3 s after them"),
         ({"motion": ROLL, "duration": 1e308}, "duration should be less than or equal to 100000"),
-        ({"motion": {"kind": "strokes", "stroke_time": 1e-5}, "duration": 9.0}, "motion.stroke_time = 1e-05 s makes more than"),
-        ({"motion": {"kind": "multi_sine", "frequency": [1.0, "2"]}}, "motion.frequency.1 should be a valid number, not '2'"),
+        ({"motion": {"kind": "strokes", "stroke_time": 1e-5}, "duration": 9.0},
+        "motion.stroke_time = 1e-05 s makes more than"),
+        ({"motion": {"kind": "multi_sine", "frequency": [1.0, "2"]}}, "motion.frequency.1 should "
+                                                                      "be a valid number, not '2'"),
         ({"motion": ROLL, "depth": True}, "depth should be a valid number, not True"),
         ({"motion": {"kind": "hop"}}, "motion.kind should be one of"),
-        ({"motion": {"kind": "knots", "x": [[0.1, 1e-3], [0.1, 0.0]]}}, "times of motion.x must increase, but 0.1 s"),
-        ({"motion": {"kind": "knots", "y": [[2.0, 1e-3]]}}, "duration = 2 s ends before the last knot of the motion, at 2.5 s"),
+        ({"motion": {"kind": "knots", "x": [[0.1, 1e-3], [0.1, 0.0]]}}, "times of motion.x must "
+                                                                        "increase, but 0.1 s"),
+        ({"motion": {"kind": "knots", "y": [[2.0, 1e-3]]}}, "duration = 2 s ends before the last "
+                                                            "knot of the motion, at 2.5 s"),
     ],
 )  # fmt: skip
-def test_an_impossible_excitation_is_refused_by_its_field(tree: dict[str, Any], message: str) -> None:
+def test_an_impossible_excitation_is_refused_by_its_field(
+    tree: dict[str, Any], message: str
+) -> None:
     with pytest.raises(InvalidTable) as error:
         Excitation.model_validate(tree)
     assert message in str(error.value)
@@ -48,12 +55,19 @@ def test_knots_are_reached_from_the_grasp() -> None:
     value, rate = reference(t, ["x_d", "y_d"]).unbind(-1)
     x, y = 60.3e-3, apart(p)
     assert value[:, 0].tolist() == pytest.approx([x, x, x + 4e-3, x + 1e-3, x - 2e-3, x - 2e-3])
-    assert value[:, 1].tolist() == pytest.approx([y, y - 1e-3, y - 1.05e-3, y - 1.1e-3, y - 1.1e-3, y - 1.1e-3])
+    assert value[:, 1].tolist() == pytest.approx(
+        [y, y - 1e-3, y - 1.05e-3, y - 1.1e-3, y - 1.1e-3, y - 1.1e-3]
+    )
     assert rate[[0, 1, 2, 4, 5], 0].abs().max() == 0
 
 
-@pytest.mark.parametrize("motion", [Knots(x=((0.1, 4e-3),)), *(one.motion for one in CATALOGUE.values())])
+@pytest.mark.parametrize(
+    "motion", [Knots(x=((0.1, 4e-3),)), *(one.motion for one in CATALOGUE.values())]
+)
 def test_a_file_holds_an_excitation_to_the_bit(motion: Any, tmp_path: Path) -> None:
-    excitation, path = Excitation(motion=motion, depth=1 / 3e3, duration=3.0), tmp_path / "excitation.toml"
+    excitation, path = (
+        Excitation(motion=motion, depth=1 / 3e3, duration=3.0),
+        tmp_path / "excitation.toml",
+    )
     path.write_text(excitation.to_toml(), encoding="utf-8")
     assert Excitation.from_toml(path) == excitation

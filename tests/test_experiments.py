@@ -37,13 +37,21 @@ def test_grasp_and_roll_smoke(tmp_path: Path) -> None:
     numbers = json.loads((tmp_path / "summary.json").read_text())
     assert numbers["y_C_grasp_mm"] == pytest.approx(23.20, abs=0.01)
     assert numbers["y_Br_hold_mm"]["max"] == pytest.approx(48.6, abs=0.002)
-    assert numbers["grasp_force_N"] > numbers["paper_like"]["grasp_force_N"] + 5  # locked-in friction stiffens the pads
+    assert (
+        numbers["grasp_force_N"] > numbers["paper_like"]["grasp_force_N"] + 5
+    )  # locked-in friction stiffens the pads
     assert numbers["x_C_mm"]["0"] == 60.0
     assert numbers["x_C_mm"]["10"] is None
     assert numbers["energy_residual_rel"] < 2e-4
     assert numbers["config"]["smoke"] is True
     names = {path.name for path in tmp_path.iterdir()}
-    assert {"trajectory.nc", "multibond.dot", "animation.gif", "snapshots.png", "friction_sets.png"} <= names
+    assert {
+        "trajectory.nc",
+        "multibond.dot",
+        "animation.gif",
+        "snapshots.png",
+        "friction_sets.png",
+    } <= names
     assert not [name for name in names if "partial" in name]
     lines = module.table(numbers).splitlines()
     assert lines[1].startswith("| ---")
@@ -51,7 +59,8 @@ def test_grasp_and_roll_smoke(tmp_path: Path) -> None:
 
 
 def test_pad_fidelity_smoke(tmp_path: Path) -> None:
-    """Inertia changes the disc by nanometres and the forces by millinewtons, and more in a fast stroke."""
+    """Inertia changes the disc by nanometres and the forces by millinewtons, and more in a fast
+    stroke."""
     module = experiment("pad_fidelity")
     result = module.run(module.Config(out=tmp_path, smoke=True))
     slow, fast = result.differences.values()
@@ -62,7 +71,8 @@ def test_pad_fidelity_smoke(tmp_path: Path) -> None:
 
 
 def test_step_accuracy_smoke(tmp_path: Path) -> None:
-    """Motion, forces and gradients come nearer with the tolerance; the table and the figure hold every way."""
+    """Motion, forces and gradients come nearer with the tolerance; the table and the figure hold
+    every way."""
     module = experiment("step_accuracy")
     result = module.run(module.Config(out=tmp_path, smoke=True))
     (rows,) = result.motions.values()
@@ -90,7 +100,8 @@ def test_refinement_smoke(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_benchmark_smoke(tmp_path: Path) -> None:
-    """A sweep costs less than two runs, a Jacobian less than four; every part has its place in the summary."""
+    """A sweep costs less than two runs, a Jacobian less than four; every part has its place in the
+    summary."""
     module = experiment("benchmark")
     config = module.Config(out=tmp_path, duration=3.0, exact=1e-6, repeats=3)
     costs = module.costs(config)
@@ -118,22 +129,32 @@ def test_peers_smoke() -> None:
 
 @pytest.mark.slow
 def test_random_runs_smoke(tmp_path: Path) -> None:
-    """Every run ends, finite or with a sentence; one that takes too much of the processor's time is ended."""
-    module = importlib.import_module("random_runs")  # by its own name, which worker processes import
+    """Every run ends, finite or with a sentence; one that takes too much of the processor's time is
+    ended."""
+    module = importlib.import_module(
+        "random_runs"
+    )  # by its own name, which worker processes import
     result = module.run(module.Config(out=tmp_path, smoke=True))
     numbers = module.summary(result)
     for way in module.WAYS:
         kinds = numbers[way]["kinds"]
         assert sum(kinds.values()) == numbers["runs"] == len(result.motions)
-        assert not [kind for kind in kinds if kind in (module.NOT_FINITE, module.HUNG) or "without a sentence" in kind]
-        assert all(one.sentence for one in result.outcomes[way].values() if one.kind != module.FINISHED)
+        assert not [
+            kind
+            for kind in kinds
+            if kind in (module.NOT_FINITE, module.HUNG) or "without a sentence" in kind
+        ]
+        assert all(
+            one.sentence for one in result.outcomes[way].values() if one.kind != module.FINISHED
+        )
     assert f"of {numbers['runs']} runs" in module.table(numbers)
     short = module.run(module.Config(out=tmp_path, runs=1, workers=1, limit=0.01))
     assert module.summary(short)["tolerances"]["kinds"] == {module.HUNG: 1}
 
 
 def test_experiment_design_smoke(tmp_path: Path) -> None:
-    """Jerks of a light grasp see friction and dashpots better than strokes; together they see more than either alone."""
+    """Jerks of a light grasp see friction and dashpots better than strokes; together they see more
+    than either alone."""
     module = experiment("experiment_design")
     module.main(module.Config(out=tmp_path, smoke=True))
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -147,7 +168,8 @@ def test_experiment_design_smoke(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_identify_contact_smoke(tmp_path: Path) -> None:
-    """Without noise the truth, with noise the truth within what was predicted, by differences the same at more runs."""
+    """Without noise the truth, with noise the truth within what was predicted, by differences the
+    same at more runs."""
     module = experiment("identify_contact")
     module.main(module.Config(out=tmp_path, smoke=True))
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -156,7 +178,9 @@ def test_identify_contact_smoke(tmp_path: Path) -> None:
     for name, p in cases["noisy"]["parameters"].items():
         assert abs(p["relative_error"]) < 3.5 * p["relative_sd"], name
         again = cases["finite differences"]["parameters"][name]
-        assert again["estimate"] == pytest.approx(p["estimate"], rel=0.4 * p["relative_sd"])  # each rests within 0.2
+        assert again["estimate"] == pytest.approx(
+            p["estimate"], rel=0.4 * p["relative_sd"]
+        )  # each rests within 0.2
     assert max(cases["noisy"]["heldout_nrmse"]["shaking"].values()) < 0.05
     assert cases["finite differences"]["simulations"] > 2 * cases["noisy"]["jacobians"]
     assert {"report.html", "identify_contact.png"} <= {path.name for path in tmp_path.iterdir()}
@@ -164,7 +188,8 @@ def test_identify_contact_smoke(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_interval_coverage_smoke(tmp_path: Path) -> None:
-    """Errors of a few standard deviations, not of many: two seeds are too few for a share. Colour is found where it is."""
+    """Errors of a few standard deviations, not of many: two seeds are too few for a share. Colour
+    is found where it is."""
     module = experiment("interval_coverage")
     module.main(module.Config(out=tmp_path, smoke=True))
     cases = json.loads((tmp_path / "summary.json").read_text())["cases"]
@@ -181,7 +206,8 @@ def test_interval_coverage_smoke(tmp_path: Path) -> None:
 
 
 def test_contact_points_smoke(tmp_path: Path) -> None:
-    """Two points an element take most of the nodes out of the force along the pad; gradients are exact with either."""
+    """Two points an element take most of the nodes out of the force along the pad; gradients are
+    exact with either."""
     module = experiment("contact_points")
     module.main(module.Config(out=tmp_path, smoke=True))
     cases = json.loads((tmp_path / "summary.json").read_text())["cases"]
@@ -194,13 +220,16 @@ def test_contact_points_smoke(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_orientation_smoke(tmp_path: Path) -> None:
-    """Loops turn and carry the disc within the tolerance; what they do not do is as rigid statics say, and is said."""
+    """Loops turn and carry the disc within the tolerance; what they do not do is as rigid statics
+    say, and is said."""
     module = experiment("orientation")
     module.main(module.Config(out=tmp_path, smoke=True))
     summary = json.loads((tmp_path / "summary.json").read_text())
     alone, fed = summary["loops_alone"], summary["efforts_fed_forward"]["ellipse 1.3"]
     assert alone["disc"]["verdict"] == fed["verdict"] == "within"
-    assert alone["disc, by kinematics"]["rest_deg"] > 1.0  # soft pads do not roll with the disc's radius
+    assert (
+        alone["disc, by kinematics"]["rest_deg"] > 1.0
+    )  # soft pads do not roll with the disc's radius
     ellipse, asks = alone["ellipse 1.3"], summary["rigid"]["ellipse 1.3"]
     stiffness = summary["gains"]["turn_lower"]["Kp"] * math.pi / 180  # [N/deg]
     assert ellipse["verdict"] == "beyond"
@@ -209,7 +238,9 @@ def test_orientation_smoke(tmp_path: Path) -> None:
     assert ellipse["opening_mm"] == pytest.approx(asks["opening_mm"], rel=0.05)
     assert summary["frictions"]["0.2"]["verdict"] == "lost"  # its friction cone asks for 0.29
     assert summary["speeds"]["6.0"]["verdict"] == "beyond"
-    assert summary["speeds"]["6.0"]["position_mm"] == pytest.approx(summary["inertia_alone_mm_deg"]["6.0"][0], rel=0.2)
+    assert summary["speeds"]["6.0"]["position_mm"] == pytest.approx(
+        summary["inertia_alone_mm_deg"]["6.0"][0], rel=0.2
+    )
     assert summary["frictions"]["0.2"]["stopped"].startswith("at t = ")
     assert {"orientation.png", "snapshots.png", "orientation.gif", "ellipse.gif"} <= {
         x.name for x in tmp_path.iterdir()
@@ -217,7 +248,8 @@ def test_orientation_smoke(tmp_path: Path) -> None:
 
 
 def test_orientation_rig_has_the_gains_of_its_design() -> None:
-    """The gains in the file are those of the experiment's bandwidth; rigid statics are the closed form of an ellipse."""
+    """The gains in the file are those of the experiment's bandwidth; rigid statics are the closed
+    form of an ellipse."""
     module = experiment("orientation")
     file = module.RigFile.from_toml(module.FILE)
     for name, gains in module.design(file, 150.0).items():
@@ -230,7 +262,8 @@ def test_orientation_rig_has_the_gains_of_its_design() -> None:
 
 @pytest.mark.slow
 def test_shapes_and_materials_smoke(tmp_path: Path) -> None:
-    """Force and power give one resistance, near theory's; a shape that would slide is refused, a hexagon rolls."""
+    """Force and power give one resistance, near theory's; a shape that would slide is refused, a
+    hexagon rolls."""
     module = experiment("shapes_and_materials")
     module.main(module.Config(out=tmp_path, smoke=True))
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -242,14 +275,17 @@ def test_shapes_and_materials_smoke(tmp_path: Path) -> None:
     low, top, high = (roll["force"] for roll in one["rolls"])
     assert top > 1.2 * max(low, high)  # the peak
     assert summary["by load"]["10 N"]["force over theory"] == pytest.approx(1.01, abs=0.02)
-    assert summary["rubbers"]["standard linear solid"]["the paper's loop on it, leading mode [1/s]"][0] > 50
+    assert (
+        summary["rubbers"]["standard linear solid"]["the paper's loop on it, leading mode [1/s]"][0]
+        > 50
+    )
     names = {path.name for path in tmp_path.iterdir()}
     assert {"objects.png", "rubbers.png", "paths.png", "resistance.png", "table.md"} <= names
 
 
 def test_the_theories_of_rolling_meet() -> None:
-    """Long waves compress a layer uniaxially, short ones see a half-plane; on a thin layer the moving contact is the closed
-    form's, with the same peak."""
+    """Long waves compress a layer uniaxially, short ones see a half-plane; on a thin layer the
+    moving contact is the closed form's, with the same peak."""
     theory = experiment("_shapes_resistance")
     h, nu = 4e-3, 0.3
     long, deep, deeper = theory.layer_compliance(np.array([1e-3, 11.9, 12.1]) / h, h, nu)

@@ -62,7 +62,9 @@ def test_a_folder_is_not_replaced_by_a_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("error", [OSError("disk full"), KeyboardInterrupt()])
-def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path: Path, error: BaseException) -> None:
+def test_an_error_leaves_the_old_file_and_nothing_else(
+    tmp_path: Path, error: BaseException
+) -> None:
     path = tmp_path / "file"
     write(path, b"old")
     with pytest.raises(type(error)):
@@ -87,16 +89,22 @@ def test_what_a_killed_writer_left_goes_with_the_next_one(tmp_path: Path) -> Non
     assert sorted(os.listdir(tmp_path)) == ["file", "file.old.partial", "file.partial"]
 
 
-def test_files_are_flushed_before_they_appear(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_are_flushed_before_they_appear(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Content first, then the name, then the folder that holds it, new folders in theirs."""
     done: list[str] = []
     flush, rename = os.fsync, Path.replace
 
     def name(handle: int) -> str:
-        return PARTIAL.sub(".partial", str(Path(os.readlink(f"/proc/self/fd/{handle}")).relative_to(tmp_path)))
+        return PARTIAL.sub(
+            ".partial", str(Path(os.readlink(f"/proc/self/fd/{handle}")).relative_to(tmp_path))
+        )
 
     monkeypatch.setattr(os, "fsync", lambda handle: (done.append(name(handle)), flush(handle)))
-    monkeypatch.setattr(Path, "replace", lambda self, to: (done.append("replace"), rename(self, to))[1])
+    monkeypatch.setattr(
+        Path, "replace", lambda self, to: (done.append("replace"), rename(self, to))[1]
+    )
     write(tmp_path / "a" / "b" / "file", b"x")
     assert done == [".", "a", "a/b/file.partial", "replace", "a/b"]
 
@@ -115,9 +123,17 @@ def test_a_sealed_file_is_read_as_it_was_written_or_not_at_all(tmp_path: Path) -
 
 
 def test_json_takes_numpys_numbers_and_leaves_out_what_is_not_finite(tmp_path: Path) -> None:
-    content = {"a": np.int64(3), "b": [np.float64(0.5), np.float32(np.nan), np.bool_(True)], "c": (float("inf"), "x")}
+    content = {
+        "a": np.int64(3),
+        "b": [np.float64(0.5), np.float32(np.nan), np.bool_(True)],
+        "c": (float("inf"), "x"),
+    }
     write_json(tmp_path / "file.json", content)
-    assert json.loads((tmp_path / "file.json").read_text()) == {"a": 3, "b": [0.5, None, True], "c": [None, "x"]}
+    assert json.loads((tmp_path / "file.json").read_text()) == {
+        "a": 3,
+        "b": [0.5, None, True],
+        "c": [None, "x"],
+    }
 
 
 @pytest.mark.parametrize(
@@ -158,7 +174,9 @@ def test_an_archive_that_declares_too_many_numbers_is_refused_unread(tmp_path: P
         np.lib.format.write_array_header_1_0(
             member, {"descr": "<f8", "fortran_order": False, "shape": (4_000_000, 1000)}
         )
-    with pytest.raises(ValueError, match=r"law\.npz is not an \.npz file of numbers: it has more than 2000 numbers"):
+    with pytest.raises(
+        ValueError, match=r"law\.npz is not an \.npz file of numbers: it has more than 2000 numbers"
+    ):
         read_network(path, LOOP)
 
 
@@ -176,7 +194,9 @@ def test_a_folder_of_other_files_is_not_written_to(tmp_path: Path) -> None:
     other, own = tmp_path / "other", tmp_path / "own"
     other.mkdir()
     (other / "summary.json").write_text("mine")
-    with pytest.raises(ValueError, match=r"--out: .*other holds summary\.json, which is no result .* say --force"):
+    with pytest.raises(
+        ValueError, match=r"--out: .*other holds summary\.json, which is no result .* say --force"
+    ):
         claim(other)
     claim(other, force=True)
     for _ in range(2):

@@ -1,5 +1,5 @@
-"""The stranger's simulator: it shares nothing with torchsoft, agrees with it where the assumptions are the same, and each of
-its own ways does what it says."""
+"""The stranger's simulator: it shares nothing with torchsoft, agrees with it where the assumptions
+are the same, and each of its own ways does what it says."""
 
 import ast
 from functools import cache
@@ -20,10 +20,16 @@ from torchsoft.physics.mesh import unit_compliance
 
 SETTLE, STEP = 0.02, 20e-6
 SHAKEN = Excitation(
-    motion=MultiSine(amplitude_x=10e-3, amplitude_y=2e-4, frequency=(5.0, 20.0)), duration=0.36, depth=3e-4,
-    grasp_time=0.04, settle=0.01,
+    motion=MultiSine(amplitude_x=10e-3, amplitude_y=2e-4, frequency=(5.0, 20.0)), duration=0.36,
+    depth=3e-4, grasp_time=0.04, settle=0.01,
 )  # fmt: skip
-RIG = {"pad.elements_x": 60, "pad.elements_y": 3, "contact.v_s": 0.05, "contact.mu_s": 0.6, "contact.mu_k": 0.4}
+RIG = {
+    "pad.elements_x": 60,
+    "pad.elements_y": 3,
+    "contact.v_s": 0.05,
+    "contact.mu_s": 0.6,
+    "contact.mu_k": 0.4,
+}
 OWN = Numbers(across=60, through=3, mu_s=0.6, mu_k=0.4, x_C0=SHAKEN.x_C0, senses_disc=False)
 POSES = ("x_C", "y_C", "theta", "x_Br", "y_Br")
 CHANNELS = (*POSES, "v_x", "omega", "F_x", "F_y")
@@ -50,19 +56,34 @@ def ours() -> Trajectory:
 
 def apart(own: dict[str, np.ndarray]) -> dict[str, float]:
     """Largest difference from torchsoft's run over the channel's range."""
-    return {c: float(np.abs(own[c] - ours()[c].numpy()).max() / np.ptp(ours()[c].numpy())) for c in CHANNELS}
+    return {
+        c: float(np.abs(own[c] - ours()[c].numpy()).max() / np.ptp(ours()[c].numpy()))
+        for c in CHANNELS
+    }
 
 
 def test_it_imports_nothing_of_torchsoft() -> None:
     for path in Path(foreign.__file__).parent.glob("*.py"):
         tree = ast.parse(path.read_text())
-        names = [alias.name for one in ast.walk(tree) if isinstance(one, ast.Import) for alias in one.names]
+        names = [
+            alias.name
+            for one in ast.walk(tree)
+            if isinstance(one, ast.Import)
+            for alias in one.names
+        ]
         names += [one.module or "" for one in ast.walk(tree) if isinstance(one, ast.ImportFrom)]
-        assert {name.split(".")[0] for name in names} <= {"foreign", "numpy", "scipy", "numba", "typing"}, path
+        assert {name.split(".")[0] for name in names} <= {
+            "foreign",
+            "numpy",
+            "scipy",
+            "numba",
+            "typing",
+        }, path
 
 
 def test_pads_are_as_soft() -> None:
-    """Kronecker products of bars and an assembly element by element are the same integrals; their solves differ by rounding."""
+    """Kronecker products of bars and an assembly element by element are the same integrals; their
+    solves differ by rounding."""
     mesh = PadMesh(OWN.length, OWN.height, OWN.across, OWN.through)
     C = unit_compliance(mesh, OWN.nu)[0] / (OWN.E * OWN.depth)
     np.testing.assert_allclose(compliance(OWN), C, rtol=0, atol=1e-10 * C.max())
@@ -70,8 +91,9 @@ def test_pads_are_as_soft() -> None:
 
 @pytest.mark.slow
 def test_motions_agree_with_equal_assumptions() -> None:
-    """Halving the step halves the difference from torchsoft; of two runs extrapolated to no step at all, poses are within 1e-4
-    of their ranges and rates and forces within 1e-3, slip of 0.1 m/s and touching and parting nodes included."""
+    """Halving the step halves the difference from torchsoft; of two runs extrapolated to no step at
+    all, poses are within 1e-4 of their ranges and rates and forces within 1e-3, slip of 0.1 m/s and
+    touching and parting nodes included."""
     coarse, fine = strange(2 * STEP), strange(STEP)
     first, second = apart(coarse.channels), apart(fine.channels)
     limit = apart({c: 2 * fine.channels[c] - coarse.channels[c] for c in CHANNELS})
@@ -85,8 +107,8 @@ def test_motions_agree_with_equal_assumptions() -> None:
 
 @pytest.mark.parametrize("slipping", [False, True])
 def test_the_literal_law(slipping: bool) -> None:
-    """A spring and a dashpot from the place of first contact; once the force in them has been above mu_s F_N, mu_k F_N against
-    the sliding, and the spring goes on stretching."""
+    """A spring and a dashpot from the place of first contact; once the force in them has been above
+    mu_s F_N, mu_k F_N against the sliding, and the spring goes on stretching."""
     p, h, depth = OWN._replace(literal=True), STEP, 5e-5
     for v, s in product((0.02, -0.02), (1e-6, 1e-3)):
         fx, fy, torque, stretch, slips, _ = node(
@@ -97,7 +119,9 @@ def test_the_literal_law(slipping: bool) -> None:
         assert -fy == pytest.approx(F_N)
         assert stretch == pytest.approx(s + h * ramp * v)
         assert slips == (abs(e) > p.mu_s * F_N)
-        assert fx == pytest.approx(ramp * (p.mu_k * F_N * v / np.hypot(v, CREEP) if slipping else e))
+        assert fx == pytest.approx(
+            ramp * (p.mu_k * F_N * v / np.hypot(v, CREEP) if slipping else e)
+        )
         assert torque == pytest.approx(-(p.radius - depth) * fx)
 
 
@@ -114,4 +138,10 @@ OTHERS = (
 def test_what_may_differ_makes_a_difference(differs: dict[str, float]) -> None:
     """More than sensors of 10 um and 0.1 N overlook."""
     own, other = strange(2 * STEP).channels, strange(2 * STEP, OWN._replace(**differs)).channels
-    assert max(np.abs(own["F_x"] - other["F_x"]).max() / 0.1, np.abs(own["x_C"] - other["x_C"]).max() / 1e-5) > 1
+    assert (
+        max(
+            np.abs(own["F_x"] - other["F_x"]).max() / 0.1,
+            np.abs(own["x_C"] - other["x_C"]).max() / 1e-5,
+        )
+        > 1
+    )

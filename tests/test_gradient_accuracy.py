@@ -23,5 +23,8 @@ def test_gradient_accuracy_smoke(tmp_path: Path) -> None:
     for window in (slip, stick):
         errors, unsure = window["relative_error"]["discrete"], window["judge_uncertainty"]
         assert max(errors[name] for name in errors if unsure[name] <= EXACT) <= EXACT
-    assert all(max(window["discrete_against_forward"].values()) < 1e-10 for window in numbers["windows"].values())
+    assert all(
+        max(window["discrete_against_forward"].values()) < 1e-10
+        for window in numbers["windows"].values()
+    )
     assert (tmp_path / "table.md").read_text().count("| discrete |") == 5

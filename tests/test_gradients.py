@@ -1,4 +1,5 @@
-"""Gradients of runs: adjoint, sensitivities and backpropagation equal; finite differences; reproducible to the bit."""
+"""Gradients of runs: adjoint, sensitivities and backpropagation equal; finite differences;
+reproducible to the bit."""
 
 from dataclasses import dataclass
 
@@ -16,7 +17,8 @@ from torchsoft.solve.adjoint import GradientFailed
 from torchsoft.solve.trajectory import channels
 
 NEWTON = 1e-10
-"""Newton's tolerance of the compiled steps compared here [N]; 1e-11 is rounding, and not reached at every step."""
+"""Newton's tolerance of the compiled steps compared here [N]; 1e-11 is rounding, and not reached at
+every step."""
 SAME_STEPS = 1e-10
 """Adjoint against backpropagation, relative: two solutions of the same stages."""
 SMALL = 0.1
@@ -28,7 +30,8 @@ UNITS = f64(1e-5, 1e-5, 1e-3, 1e-5, 1e-5, 1e-3, 1e-3, 1e-1, 1e-3, 1e-3, 1.0, 1.0
 
 @dataclass(frozen=True)
 class Window:
-    """A short run: model, initial state (size,), outputs t (T,) [s], step [s]; `origin` are the channels at the start."""
+    """A short run: model, initial state (size,), outputs t (T,) [s], step [s]; `origin` are the
+    channels at the start."""
 
     model: SoftGrasp
     y0: Tensor
@@ -39,7 +42,9 @@ class Window:
     def compiled(self, y0: Tensor | None = None) -> Tensor:
         """States (T, size) by the compiled stepper, the discrete adjoint behind them."""
         y0 = self.y0 if y0 is None else y0
-        return simulate(self.model, self.t, y0=y0, step=self.step, tolerance=NEWTON, gradient="discrete").y
+        return simulate(
+            self.model, self.t, y0=y0, step=self.step, tolerance=NEWTON, gradient="discrete"
+        ).y
 
     def loss(self, y: Tensor) -> Tensor:
         """Smooth, with another weight for every component: the measured channels, less `origin`."""
@@ -81,8 +86,14 @@ def make_break() -> Window:
 
 
 def jerk() -> Window:
-    """A light grasp, the horizontal loop about the bracket, and the bracket far from where that loop wants it."""
-    model = coarse(scenario__y_Br_grasp=49.7e-3, control__senses="bracket", contact__mu_s=0.3, contact__mu_k=0.2)
+    """A light grasp, the horizontal loop about the bracket, and the bracket far from where that
+    loop wants it."""
+    model = coarse(
+        scenario__y_Br_grasp=49.7e-3,
+        control__senses="bracket",
+        contact__mu_s=0.3,
+        contact__mu_k=0.2,
+    )
     y0 = grasped(model)
     with torch.no_grad():
         model.reference["x_d"].values += 2e-3
@@ -101,16 +112,21 @@ def modes(model: SoftGrasp, y: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def scalars(model: SoftGrasp) -> dict[str, nn.Parameter]:
-    """Every trained scalar parameter but the density, which massless pads do not use, by the names of `Parameters`."""
+    """Every trained scalar parameter but the density, which massless pads do not use, by the names
+    of `Parameters`."""
     known = {own: name for name, own in NAMES.items()}
-    found = {known[name]: p for name, p in model.named_parameters() if p.ndim == 0 and p.requires_grad}
+    found = {
+        known[name]: p for name, p in model.named_parameters() if p.ndim == 0 and p.requires_grad
+    }
     return {name: p for name, p in found.items() if name != "pad.rho"}
 
 
-# one step -----------------------------------------------------------------------------------------------------------
+# one step
+# ----------------------------------------------------------------------
 
 
-# runs ---------------------------------------------------------------------------------------------------------------
+# runs
+# ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", WINDOWS)
@@ -126,7 +142,8 @@ def test_windows_are_what_they_are_called(name: str) -> None:
 
 @pytest.mark.parametrize("name", WINDOWS)
 def test_adjoint_equals_backpropagation_through_the_plain_step(name: str) -> None:
-    """The initial state and every parameter; a gradient that is small by cancellation is held to the larger ones."""
+    """The initial state and every parameter; a gradient that is small by cancellation is held to
+    the larger ones."""
     w = WINDOWS[name]()
     y0 = w.y0.requires_grad_(True)
     wanted = [y0, *scalars(w.model).values()]
@@ -139,11 +156,15 @@ def test_adjoint_equals_backpropagation_through_the_plain_step(name: str) -> Non
         assert float((a - b).norm()) <= SAME_STEPS * max(float(b.norm()), floor), (label, a, b)
 
 
-def test_same_gradient_twice_and_from_checkpoints_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_same_gradient_twice_and_from_checkpoints_to_the_bit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Also when every tape is made again from where its segment began, over several segments."""
     model = coarse()
     y0 = grasped(model, (2e-3, 1e-3)).requires_grad_(True)
-    t = torch.cat((times(0.4, 201), f64(0.401, 0.402)))  # another step size at the end: another segment
+    t = torch.cat(
+        (times(0.4, 201), f64(0.401, 0.402))
+    )  # another step size at the end: another segment
     w = window(model, y0, t, 4e-4)
     wanted = [y0, *scalars(model).values()]
     first, second = (w.gradients(w.compiled(), wanted) for _ in range(2))

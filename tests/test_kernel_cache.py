@@ -1,4 +1,5 @@
-"""Compiled kernels on disk: named after what they are made from, checked before they are used, done without at need."""
+"""Compiled kernels on disk: named after what they are made from, checked before they are used, done
+without at need."""
 
 import os
 import pickle
@@ -81,11 +82,16 @@ def test_a_damaged_file_is_noticed_and_made_again(folder: Path, damage: str, cap
     path = only(folder)
     path.write_bytes(DAMAGES[damage](path.read_bytes()))
     assert made(start())
-    assert capsys.readouterr().err == f"torchsoft: note: {folder} holds damaged kernels, which are not used\n"
+    assert (
+        capsys.readouterr().err
+        == f"torchsoft: note: {folder} holds damaged kernels, which are not used\n"
+    )
     assert not made(start())
 
 
-def test_no_file_stands_for_another(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+def test_no_file_stands_for_another(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
     """Neither for another function's, nor for that of other sources."""
     start()
     thrice = compiled(lambda x: 3.0 * x, entry=True)
@@ -111,7 +117,9 @@ def test_what_others_may_change_is_not_used(folder: Path, capsys: Any) -> None:
     start()
     only(folder).chmod(0o666)
     assert made(start())
-    assert capsys.readouterr().err.endswith("holds kernels that other users may change, which are not used\n")
+    assert capsys.readouterr().err.endswith(
+        "holds kernels that other users may change, which are not used\n"
+    )
     if os.getuid() == 0:
         os.chown(only(folder), 12345, 12345)
         assert made(start())
@@ -123,7 +131,12 @@ def test_where_nothing_can_be_kept_it_says_so_once(folder: Path, capsys: Any) ->
     for _ in range(2):
         assert made(start())
     err = capsys.readouterr().err
-    assert err == 2 * f"torchsoft: note: compiled kernels cannot be kept in {folder}; compiling at every start\n"
+    assert (
+        err
+        == 2
+        * f"torchsoft: note: compiled kernels cannot be kept in {folder}; compiling at every "
+        "start\n"
+    )
 
 
 def test_a_folder_in_place_of_a_file_is_left_alone(folder: Path) -> None:
@@ -146,7 +159,9 @@ def test_a_second_folder_is_read_and_the_first_is_written(
     assert [path.parent.name for path in tmp_path.rglob("*.kernel")] == ["mine"]
 
 
-def test_the_name_says_everything_that_kernels_are_made_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_name_says_everything_that_kernels_are_made_from(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert cache.NAME in run.stats.cache_path
     names = {cache.made_from()}
     assert names == {cache.NAME}
@@ -159,7 +174,12 @@ def test_the_name_says_everything_that_kernels_are_made_from(tmp_path: Path, mon
     with monkeypatch.context() as patch:
         patch.setattr(numba.config, "OPT", 1)
         names.add(cache.made_from())
-    for name, text in (("law.py", "a = 1"), ("step.py", "b = 2"), ("law.py", "a = 3"), ("more/law.py", "a = 3")):
+    for name, text in (
+        ("law.py", "a = 1"),
+        ("step.py", "b = 2"),
+        ("law.py", "a = 3"),
+        ("more/law.py", "a = 3"),
+    ):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).write_text(text)
         monkeypatch.setattr(cache, "SOURCES", (tmp_path,))
@@ -170,12 +190,16 @@ def test_the_name_says_everything_that_kernels_are_made_from(tmp_path: Path, mon
 
 
 def test_kernels_call_no_code_that_is_not_in_their_name() -> None:
-    named = [path for root in cache.SOURCES for path in (root.rglob("*.py") if root.is_dir() else [root])]
+    named = [
+        path for root in cache.SOURCES for path in (root.rglob("*.py") if root.is_dir() else [root])
+    ]
     assert Path(run.py_func.__code__.co_filename) in named
     assert {path.name for path in named} >= {"stage.py", "interface.py", "invoke.py", "cache.py"}
 
 
-def test_code_that_changed_since_the_start_is_not_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_code_that_changed_since_the_start_is_not_kept(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(cache, "NAME", "older")
     start()
     assert not folder.exists()
@@ -191,7 +215,8 @@ def test_other_processors_have_other_files(folder: Path, monkeypatch: pytest.Mon
 
 
 def test_folders(monkeypatch: pytest.MonkeyPatch) -> None:
-    """NUMBA_CACHE_DIR alone, or beside the sources and in the user's cache, which not every user has."""
+    """NUMBA_CACHE_DIR alone, or beside the sources and in the user's cache, which not every user
+    has."""
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setattr(numba.config, "CACHE_DIR", "/chosen")
     assert cache.folders("name") == [Path("/chosen/torchsoft/name")]

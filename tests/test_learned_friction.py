@@ -1,4 +1,5 @@
-"""A friction law written by the user: learned through the compiled stepper, which gives its exact gradient."""
+"""A friction law written by the user: learned through the compiled stepper, which gives its exact
+gradient."""
 
 import pytest
 import torch
@@ -25,7 +26,10 @@ def test_the_learned_law_solves_its_own_equation() -> None:
     torch.manual_seed(0)
     law = module.MuNetwork(20.0)
     torch.nn.init.normal_(law.net[2].weight, std=0.1)
-    E, F_N = torch.linspace(0.0, 30.0, 31, dtype=torch.float64), torch.full((31,), 20.0, dtype=torch.float64)
+    E, F_N = (
+        torch.linspace(0.0, 30.0, 31, dtype=torch.float64),
+        torch.full((31,), 20.0, dtype=torch.float64),
+    )
     v = law(E, F_N, f64(880.0))
     stuck = law.mu(f64(0.0)) * F_N  # [N], what sticking can carry
     residual = (E - law.mu(v) * F_N).clamp(min=0.0) - 900.0 * v

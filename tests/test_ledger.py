@@ -9,7 +9,17 @@ import torch
 from conftest import coarse, grasped, times
 from torch import Tensor, nn
 
-from torchsoft import Body, Circle, Profile, Reference, Rig, SoftGrasp, hold, simulate, simulate_batch
+from torchsoft import (
+    Body,
+    Circle,
+    Profile,
+    Reference,
+    Rig,
+    SoftGrasp,
+    hold,
+    simulate,
+    simulate_batch,
+)
 from torchsoft.excitation import CATALOGUE, begin
 from torchsoft.solve.ledger import RESIDUAL, doubts
 
@@ -30,7 +40,8 @@ def test_hard_motions_pass_at_the_default_step_and_at_what_is_advised(name: str)
     t = times(excitation.duration, 2)
     assert told(begun.model, t=t, y0=begun.y0) == []
     begun.model.reference = Reference(
-        **{key: begun.model.reference[key] for key in ("y_d", "F_ff")}, x_d=Profile([0.6, 0.7, 0.8], [0.06, 0.08, 0.06])
+        **{key: begun.model.reference[key] for key in ("y_d", "F_ff")},
+        x_d=Profile([0.6, 0.7, 0.8], [0.06, 0.08, 0.06]),
     )
     (text,) = told(begun.model, t=t, y0=begun.y0, step=0.05)
     assert "the energies of the run do not balance" in text
@@ -67,10 +78,12 @@ def test_a_batch_tells_every_doubt_once_with_all_its_runs() -> None:
     references = [model.reference, pressed, model.reference, pressed]
     said = told(model, simulate_batch, t=times(0.02, 3), y0=y0, step=5e-4, reference=references)
     for pad, text in zip("LU", said, strict=True):
-        assert re.match(rf"runs 1, 3 \(numbers of run 1\): the pad `{pad}` of height .* gave way by", text), text
-    assert told(model, simulate_batch, t=times(0.02, 3), y0=y0, step=5e-4, reference=references[:2])[0].startswith(
-        "run 1: the pad"
-    )
+        assert re.match(
+            rf"runs 1, 3 \(numbers of run 1\): the pad `{pad}` of height .* gave way by", text
+        ), text
+    assert told(
+        model, simulate_batch, t=times(0.02, 3), y0=y0, step=5e-4, reference=references[:2]
+    )[0].startswith("run 1: the pad")
 
 
 def test_a_body_without_contact_or_energy_passes() -> None:

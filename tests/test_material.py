@@ -1,4 +1,5 @@
-"""Materials of the pads: closed forms of creep and relaxation, the exact conversion, energy, gradients, what is refused."""
+"""Materials of the pads: closed forms of creep and relaxation, the exact conversion, energy,
+gradients, what is refused."""
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
@@ -39,10 +40,12 @@ from torchsoft.sysid import AtRest, Known, Problem, Recording, Sensor, Unknown, 
 COMMON = {"E": 7.5e5, "nu": 0.45, "rho": 1100.0, "depth": 0.044}
 MATERIALS: dict[str, Callable[[], Material]] = {
     "kelvin_voigt": lambda: KelvinVoigt(**COMMON, tau=0.01),
-    "standard_linear_solid": lambda: StandardLinearSolid(**COMMON, E_instant=1.5e6, tau=0.02, tau_instant=1e-3),
-    "generalised_kelvin": lambda: GeneralisedKelvin(**COMMON, J=[0.3, 0.2, 0.1], tau=[4e-3, 0.02, 0.3], tau_instant=1e-3),
-    "prony": lambda: Prony(
-        **COMMON, moduli=[3e5, 2e5, 1e5, 5e4, 5e4], tau=[3e-3, 0.01, 0.1, 0.5, 4.0], tau_instant=1e-3
+    "standard_linear_solid": lambda: StandardLinearSolid(**COMMON, E_instant=1.5e6, tau=0.02,
+    tau_instant=1e-3),
+    "generalised_kelvin": lambda: GeneralisedKelvin(**COMMON, J=[0.3, 0.2, 0.1],
+    tau=[4e-3, 0.02, 0.3], tau_instant=1e-3), "prony": lambda: Prony(
+        **COMMON, moduli=[3e5, 2e5, 1e5, 5e4, 5e4], tau=[3e-3, 0.01, 0.1, 0.5, 4.0],
+        tau_instant=1e-3
     ),
 }  # fmt: skip
 CLOSED = 1e-6
@@ -56,7 +59,8 @@ def material(request: pytest.FixtureRequest) -> Material:
     return MATERIALS[request.param]()
 
 
-# --- the chain ------------------------------------------------------------------------------------------------------------
+# --- the chain
+# ----------------------------------------------------------------------
 
 
 def impedance(solid: Prony, s: Tensor) -> Tensor:
@@ -77,7 +81,8 @@ SERIES: dict[str, tuple[Sequence[float], Sequence[float]]] = {
 @torch.no_grad()
 @pytest.mark.parametrize("name", SERIES)
 def test_a_relaxation_series_is_its_chain_exactly(name: str) -> None:
-    """Compliance times modulus is one at every frequency, and retardation times interlace with relaxation times."""
+    """Compliance times modulus is one at every frequency, and retardation times interlace with
+    relaxation times."""
     moduli, tau = SERIES[name]
     solid = Prony(**COMMON, moduli=moduli, tau=tau, tau_instant=1e-9)
     J, late = retarded(solid.series()[0] / solid.E, solid.series()[1])
@@ -120,27 +125,43 @@ def test_creep_and_complex_modulus_have_their_limits(material: Material) -> None
     modulus = material.complex_modulus(torch.logspace(-4, 2, 25, dtype=torch.float64))
     assert modulus.real[0].item() == pytest.approx(E, rel=1e-3)
     assert bool((modulus.real.diff() > -1e-12 * E).all() and (modulus.imag > 0).all())
-    if isinstance(material, Prony):  # but for the instantaneous spring, which gives way in tau_instant
+    if isinstance(
+        material, Prony
+    ):  # but for the instantaneous spring, which gives way in tau_instant
         omega = torch.logspace(-4, 1, 9, dtype=torch.float64)
         expected = impedance(material, 1j * omega)
         assert float((material.complex_modulus(omega) / expected - 1).abs().max()) < 2e-2
         assert float(material.relaxation(ends[:1])) == pytest.approx(E + 7e5, rel=1e-14)
 
 
-# --- a pad under a held force and a held indentation --------------------------------------------------------------------------
+# --- a pad under a held force and a held indentation
+# ----------------------------------------------------------------------
 
 RADIUS, HEIGHT, STIFFNESS = 5e-3, 4.59e-3, 1.2e5
-"""Of the punch, so round that it touches one node of the 1 mm mesh, the pad, and the contact spring: m, m, N/m."""
+"""Of the punch, so round that it touches one node of the 1 mm mesh, the pad, and the contact
+spring: m, m, N/m."""
 
 
-def punch(material: Material, *, force: float | None = None, depth: float = 0.0) -> tuple[Rig, Tensor]:
-    """A punch without friction on the middle node of a pad, pushed by a force [N] or held at a depth [m]; and the state at
-    which it begins, with the contact spring pressed and the pad not yet. A dashpot stops the pushed one's hardly any mass
-    from ringing, and carries no force once punch and pad move together."""
+def punch(
+    material: Material, *, force: float | None = None, depth: float = 0.0
+) -> tuple[Rig, Tensor]:
+    """A punch without friction on the middle node of a pad, pushed by a force [N] or held at a
+    depth [m]; and the state at which it begins, with the contact spring pressed and the pad not
+    yet. A dashpot stops the pushed one's hardly any mass from ringing, and carries no force once
+    punch and pad move together."""
     mesh, R_n = PadMesh(6e-3, HEIGHT, 6, 2), 0.0 if force is None else 0.2
     law = SoftContact(STIFFNESS, R_n, STIFFNESS, 1.0, friction=SmoothSlip(0, 0, 1, 1))
-    body = Body(1e-7, Circle(RADIUS), x=3e-3, y="driven" if force is None else "free", theta=0.0, weighted=False)
-    push = Actuator("punch.y", "punch.y", lambda w, w_dot, f, q, q_dot: f, setpoint="y_d", feed_forward="F")
+    body = Body(
+        1e-7,
+        Circle(RADIUS),
+        x=3e-3,
+        y="driven" if force is None else "free",
+        theta=0.0,
+        weighted=False,
+    )
+    push = Actuator(
+        "punch.y", "punch.y", lambda w, w_dot, f, q, q_dot: f, setpoint="y_d", feed_forward="F"
+    )
     y = HEIGHT + RADIUS - (depth if force is None else force / STIFFNESS)
     signals = {"punch.y": y} if force is None else {"y_d": y, "F": -force}
     rig = Rig(
@@ -161,8 +182,8 @@ def softness(rig: Rig) -> float:
 
 
 def relaxed(first: float, J: Tensor, tau: Tensor, t: Tensor) -> Tensor:
-    """Stress per held strain (...) of a spring of the compliance `first` in series with Kelvin elements J, tau (n,): a
-    residue at every zero of the compliance."""
+    """Stress per held strain (...) of a spring of the compliance `first` in series with Kelvin
+    elements J, tau (n,): a residue at every zero of the compliance."""
     compliance = lambda r: first + float((J / (1 - r * tau)).sum())
     rates, out = sorted((1 / tau).tolist()), torch.full_like(t, 1 / (first + float(J.sum())))
     for low, high in pairwise([*rates, rates[-1] * (1 + 2 * float(J.sum()) / first)]):
@@ -185,7 +206,11 @@ def closed(run: Trajectory, found: Tensor, expected: Tensor) -> None:
 def test_creep_under_a_held_force_is_the_closed_form(material: Material) -> None:
     rig, y0 = punch(material, force=1.0)
     run = simulate(rig, SAMPLED, y0=y0, rtol=TIGHT, atol=1e-14)
-    closed(run, run["y_punch"][0] - run["y_punch"], softness(rig) * material.creep(SAMPLED) * material.E)
+    closed(
+        run,
+        run["y_punch"][0] - run["y_punch"],
+        softness(rig) * material.creep(SAMPLED) * material.E,
+    )
 
 
 @torch.no_grad()
@@ -193,7 +218,9 @@ def test_relaxation_under_a_held_indentation_is_the_closed_form(material: Materi
     rig, y0 = punch(material, depth=5e-5)
     run = simulate(rig, SAMPLED, y0=y0, rtol=TIGHT, atol=1e-14)
     J, tau = material.chain()
-    closed(run, run.load["punch"][:, 1], 5e-5 * relaxed(1 / STIFFNESS, softness(rig) * J, tau, SAMPLED))
+    closed(
+        run, run.load["punch"][:, 1], 5e-5 * relaxed(1 / STIFFNESS, softness(rig) * J, tau, SAMPLED)
+    )
 
 
 def test_every_coefficient_of_a_series_is_identified() -> None:
@@ -206,7 +233,10 @@ def test_every_coefficient_of_a_series_is_identified() -> None:
 
     rig, y0 = punch(solid(**values), force=1.0)
     y = simulate(rig, t, y0=y0, rtol=1e-7)["y_punch"].detach().numpy()
-    start = {name: value * factor for (name, value), factor in zip(values.items(), (1.3, 0.7, 1.4, 0.8, 0.75))}
+    start = {
+        name: value * factor
+        for (name, value), factor in zip(values.items(), (1.3, 0.7, 1.4, 0.8, 0.75))
+    }
     nominal, _ = punch(solid(**start), force=1.0)
     recording = Recording("creep", nominal, {"y_punch": (t.numpy(), y)}, Known(y0))
     unknowns = {f"rubber.{name}": Unknown() for name in values}
@@ -215,27 +245,32 @@ def test_every_coefficient_of_a_series_is_identified() -> None:
     assert found == pytest.approx(values, rel=1e-4)
 
 
-# --- the grasp --------------------------------------------------------------------------------------------------------------
+# --- the grasp
+# ----------------------------------------------------------------------
 
 STABLE = Parameters().override(COARSE | {"control.senses": "bracket"})
 
 
 @torch.no_grad()
 def test_the_graph_has_the_fields_of_the_chain(material: Material) -> None:
-    labels = {data["label"] for _, data in graph_of(SoftGrasp(STABLE, material=material)).nodes(data=True)}
+    labels = {
+        data["label"] for _, data in graph_of(SoftGrasp(STABLE, material=material)).nodes(data=True)
+    }
     own = "L" if material.branches == 1 else f"L,1..{material.branches}"
     assert {f"C: [K_{own}]^-1", f"R: [R_{own}]"} <= labels
     assert material.branches == len(material.chain()[0])
 
 
-# --- what is refused ----------------------------------------------------------------------------------------------------------
+# --- what is refused
+# ----------------------------------------------------------------------
 
 
 def test_a_recording_that_begins_before_the_pads_forget_is_named() -> None:
     model = SoftGrasp(STABLE, material=MATERIALS["prony"]())
     samples = {"y_C": (np.linspace(0, 1, 5), np.zeros(5))}
     with pytest.warns(
-        UserWarning, match=r"begins 0.2 s before the first sample, but the pad `.` creeps for 4.27 s"
+        UserWarning,
+        match=r"begins 0.2 s before the first sample, but the pad `.` creeps for 4.27 s",
     ) as said:
         _ = Recording("slow", model, samples, AtRest()).start_coordinates
     assert len(said) == 2

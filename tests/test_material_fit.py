@@ -1,4 +1,5 @@
-"""Materials fitted to relaxation and creep tests, the command that does it, and rubbers from the literature."""
+"""Materials fitted to relaxation and creep tests, the command that does it, and rubbers from the
+literature."""
 
 import json
 import math
@@ -25,7 +26,15 @@ from torchsoft.physics.material import KINDS, GeneralisedKelvin, Prony
 Array = NDArray[np.float64]
 REST = {"nu": 0.45, "rho": 1100.0, "depth": 0.044}
 MODULI, TIMES = np.array([3e5, 1e5, 5e4]), np.array([0.05, 2.0, 60.0])
-RELAXING = {"E": 2e5, "E_1": 3e5, "E_2": 1e5, "E_3": 5e4, "tau_1": 0.05, "tau_2": 2.0, "tau_3": 60.0}
+RELAXING = {
+    "E": 2e5,
+    "E_1": 3e5,
+    "E_2": 1e5,
+    "E_3": 5e4,
+    "tau_1": 0.05,
+    "tau_2": 2.0,
+    "tau_3": 60.0,
+}
 COMPLIANCES, LATE = np.array([1e-6, 0.5e-6, 2e-6]), np.array([0.3, 20.0])
 CREEPING = {"E": 1e6 / 3.5, "J_1": 0.5 / 3.5, "J_2": 2 / 3.5, "tau_1": 0.3, "tau_2": 20.0}
 T = np.concatenate(([0.0], np.geomspace(1e-2, 600, 200)))
@@ -56,10 +65,14 @@ def table(path: Path, **columns: Array) -> Path:
 
 
 def plain(folder: Path, measured: Measured, name: str = "test.csv") -> Path:
-    return table(folder / name, **{"t_[s]": measured.t, "strain_[1]": measured.strain, "stress_[Pa]": measured.stress})
+    return table(
+        folder / name,
+        **{"t_[s]": measured.t, "strain_[1]": measured.strain, "stress_[Pa]": measured.stress},
+    )
 
 
-# --- series and fits --------------------------------------------------------------------------------------------------
+# --- series and fits
+# ----------------------------------------------------------------------
 
 
 def test_what_has_faded_is_the_integral() -> None:
@@ -74,7 +87,9 @@ def test_what_has_faded_is_the_integral() -> None:
     h = faded(t, x, tau)
     for i in (0, 3, 11):
         for k, time in enumerate(tau):
-            parts = [quad(piece, t[j], t[j + 1], args=(i, j, time), epsabs=1e-13)[0] for j in range(i)]
+            parts = [
+                quad(piece, t[j], t[j + 1], args=(i, j, time), epsabs=1e-13)[0] for j in range(i)
+            ]
             assert h[i, k] == pytest.approx(sum(parts) + x[0] * math.exp(-t[i] / time), abs=1e-11)
 
 
@@ -93,18 +108,24 @@ def test_a_series_is_found_again_exactly(made: Measured, truth: dict[str, float]
         assert isinstance(solid, Prony)
         expected = torch.from_numpy(made.stress / 0.05)
         if made.strain[0] > 0:
-            assert torch.allclose(solid.relaxation(torch.from_numpy(T)).detach(), expected, rtol=1e-9)
+            assert torch.allclose(
+                solid.relaxation(torch.from_numpy(T)).detach(), expected, rtol=1e-9
+            )
     else:
         solid = found.material(**REST)
         assert isinstance(solid, GeneralisedKelvin)
         late = torch.from_numpy(T[T > 0.1])  # the instantaneous spring has given way
-        assert torch.allclose(solid.creep(late).detach(), torch.from_numpy(made.strain[T > 0.1] / 1e4), rtol=1e-9)
+        assert torch.allclose(
+            solid.creep(late).detach(), torch.from_numpy(made.strain[T > 0.1] / 1e4), rtol=1e-9
+        )
 
 
 @pytest.mark.parametrize(("make", "truth"), [(relaxing, RELAXING), (creeping, CREEPING)])
-def test_standard_deviations_are_those_of_the_errors(make: Callable[..., Measured], truth: dict[str, float]) -> None:
-    """Root mean square of the errors over their deviations, by coefficient, in 30 tests with noise of 0.5 %; and as many terms
-    are asked for as there are."""
+def test_standard_deviations_are_those_of_the_errors(
+    make: Callable[..., Measured], truth: dict[str, float]
+) -> None:
+    """Root mean square of the errors over their deviations, by coefficient, in 30 tests with noise
+    of 0.5 %; and as many terms are asked for as there are."""
     terms = (len(truth) - 1) // 2
     assert [fit(make(5e-3, seed)).terms for seed in range(3)] == [terms] * 3
     found = [fit(make(5e-3, seed), terms=terms) for seed in range(30)]
@@ -125,13 +146,16 @@ def test_a_solid_without_a_spring_creeps_from_nothing() -> None:
 
 
 def test_what_the_rows_do_not_tell_is_said() -> None:
-    """A time beyond the test counts to what remains; a pattern in the residuals, and large strains."""
+    """A time beyond the test counts to what remains; a pattern in the residuals, and large
+    strains."""
     made = relaxing(1e-3)
     early = made.t < 20
-    short = fit(Measured(made.path, "relaxation", made.t[early], made.strain[early], made.stress[early]))
+    short = fit(
+        Measured(made.path, "relaxation", made.t[early], made.strain[early], made.stress[early])
+    )
     assert (
-        "they do not tell what relaxes faster, and what relaxes slower counts to the relaxed modulus E"
-        in short.notices[0]
+        "they do not tell what relaxes faster, and what relaxes slower counts to the relaxed "
+        "modulus E" in short.notices[0]
     )
     assert short.values["E"] > 2.2e5  # of 2e5 and 5e4 exp(-20 / 60)
     assert len(fit(made).notices) == 1
@@ -140,20 +164,27 @@ def test_what_the_rows_do_not_tell_is_said() -> None:
     assert few.correlation > 0.8
     assert any("follow a pattern" in notice for notice in few.notices)
     large = fit(Measured(made.path, "relaxation", made.t, 10 * made.strain, 10 * made.stress))
-    assert any("strains go up to 50%, and the material is linear" in notice for notice in large.notices)
+    assert any(
+        "strains go up to 50%, and the material is linear" in notice for notice in large.notices
+    )
     noisy = fit(relaxing(0.1), terms=3)
-    assert any("hardly determined, with a standard deviation above 50%: " in notice for notice in noisy.notices)
+    assert any(
+        "hardly determined, with a standard deviation above 50%: " in notice
+        for notice in noisy.notices
+    )
 
 
-# --- files ------------------------------------------------------------------------------------------------------------
+# --- files
+# ----------------------------------------------------------------------
 
 
 def test_every_column_and_unit_reads_the_same(tmp_path: Path) -> None:
     made = relaxing()
     ways: list[tuple[dict[str, Array], dict[str, Any]]] = [
         ({"t_[s]": T, "strain_[1]": made.strain, "stress_[Pa]": made.stress}, {}),
-        ({"t_[ms]": 1e3 * T, "strain_[%]": 1e2 * made.strain, "stress_[MPa]": 1e-6 * made.stress}, {}),
-        ({"t_[min]": T / 60, "stretch_[1]": 1 + made.strain, "stress_[kPa]": 1e-3 * made.stress}, {}),
+        ({"t_[ms]": 1e3 * T, "strain_[%]": 1e2 * made.strain, "stress_[MPa]": 1e-6 * made.stress},
+        {}), ({"t_[min]": T / 60, "stretch_[1]": 1 + made.strain,
+        "stress_[kPa]": 1e-3 * made.stress}, {}),
         ({"t_[h]": T / 3600, "elongation_[mm]": 80 * made.strain, "force_[N]": 2e-5 * made.stress},
          {"length": 0.08, "area": 2e-5}),
         ({"t_[s]": T, "modulus_[GPa]": 1e-9 * made.stress / 0.05}, {}),
@@ -162,7 +193,11 @@ def test_every_column_and_unit_reads_the_same(tmp_path: Path) -> None:
         found = read(table(tmp_path / "test.csv", **columns), **how)
         assert found.test == "relaxation"
         scale = 0.05 if found.per_load else 1.0
-        for mine, its in ((found.t, T), (scale * found.strain, made.strain), (scale * found.stress, made.stress)):
+        for mine, its in (
+            (found.t, T),
+            (scale * found.strain, made.strain),
+            (scale * found.stress, made.stress),
+        ):
             assert np.allclose(mine, its, rtol=1e-12, atol=1e-15)
     made = creeping()
     for columns in (
@@ -177,31 +212,56 @@ def test_every_column_and_unit_reads_the_same(tmp_path: Path) -> None:
 ONES, ZEROS = np.ones(9), np.zeros(9)
 COUNT = np.arange(9.0)
 REFUSED: dict[str, tuple[dict[str, Array], dict[str, Any], str]] = {
-    "no strain": ({"t_[s]": COUNT, "stress_[Pa]": ONES}, {}, "needs one of the columns strain, stretch, elongation"),
-    "no stress": ({"t_[s]": COUNT, "strain_[1]": ONES}, {}, "needs one of the columns stress, force, but has none of them"),
+    "no strain": ({"t_[s]": COUNT, "stress_[Pa]": ONES}, {}, "needs one of the columns strain, "
+                                                             "stretch, elongation"),
+    "no stress": ({"t_[s]": COUNT, "strain_[1]": ONES}, {}, "needs one of the columns stress, "
+                                                            "force, but has none of them"),
     "two strains": (
-        {"t_[s]": COUNT, "strain_[1]": ONES, "stretch_[1]": ONES, "stress_[Pa]": ONES}, {}, "but has strain and stretch"
+        {"t_[s]": COUNT, "strain_[1]": ONES, "stretch_[1]": ONES, "stress_[Pa]": ONES}, {},
+        "but has strain and stretch"
     ),
     "no time": ({"strain_[1]": ONES, "stress_[Pa]": ONES}, {}, "has no column `t`"),
-    "no unit": ({"t": COUNT, "modulus_[Pa]": ONES}, {}, "row 1, column `t` has no unit: write `t [s]`"),
-    "another unit": ({"t_[s]": COUNT, "modulus_[psi]": ONES}, {}, "column `modulus` cannot be in 'psi'; it can be in Pa, kPa"),
-    "unknown column": ({"t_[s]": COUNT, "E_[Pa]": ONES}, {}, "row 1, column `E` is not known; columns and their units"),
-    "negative time": ({"t_[s]": COUNT - 1, "modulus_[Pa]": ONES}, {}, "row 2, column `t`: -1 s is before the load"),
-    "time goes back": ({"t_[s]": np.r_[COUNT[:-1], 3], "modulus_[Pa]": ONES}, {}, "row 10, column `t`: 3 s is not after 7 s"),
-    "time stands": ({"t_[s]": np.r_[0, COUNT[:-1]], "modulus_[Pa]": ONES}, {}, "row 3, column `t`: 0 s is not after 0 s"),
-    "few rows": ({"t_[s]": COUNT[:5], "modulus_[Pa]": ONES[:5]}, {}, "has 5 rows of numbers, but needs at least 8"),
-    "not a number": ({"t_[s]": COUNT, "modulus_[Pa]": ONES * np.nan}, {}, "column `modulus`: 'nan' is not a finite number"),
-    "no load": ({"t_[s]": COUNT, "strain_[1]": ZEROS, "stress_[Pa]": ONES}, {}, "the strain is zero throughout"),
-    "opposite": ({"t_[s]": COUNT, "strain_[1]": ONES, "stress_[Pa]": -ONES}, {}, "strain and stress are opposite"),
-    "no length": ({"t_[s]": COUNT, "elongation_[m]": ONES, "stress_[Pa]": ONES}, {}, "needs the gauge length, `length` [m]"),
-    "no area": ({"t_[s]": COUNT, "strain_[1]": ONES, "force_[N]": ONES}, {}, "a force needs the cross-section, `area` [m2]"),
-    "a length": ({"t_[s]": COUNT, "strain_[1]": ONES, "stress_[Pa]": ONES}, {"length": 1.0}, "`strain` needs no `length`"),
-    "negative area": (
-        {"t_[s]": COUNT, "strain_[1]": ONES, "force_[N]": ONES}, {"area": -1.0}, "`area` must be positive and finite, but is -1"
+    "no unit": ({"t": COUNT, "modulus_[Pa]": ONES}, {}, "row 1, column `t` has no unit: write `t "
+                                                        "[s]`"),
+    "another unit": ({"t_[s]": COUNT, "modulus_[psi]": ONES}, {}, "column `modulus` cannot be in "
+                                                                  "'psi'; it can be in Pa, kPa"),
+    "unknown column": ({"t_[s]": COUNT, "E_[Pa]": ONES}, {}, "row 1, column `E` is not known; "
+                                                             "columns and their units"),
+    "negative time": ({"t_[s]": COUNT - 1, "modulus_[Pa]": ONES}, {}, "row 2, column `t`: -1 s is "
+                                                                      "before the load"),
+    "time goes back": ({"t_[s]": np.r_[COUNT[:-1], 3], "modulus_[Pa]": ONES}, {}, "row 10, column "
+                                                                                  "`t`: 3 s is not "
+                                                                                  "after 7 s"),
+    "time stands": ({"t_[s]": np.r_[0, COUNT[:-1]], "modulus_[Pa]": ONES}, {}, "row 3, column `t`: "
+                                                                               "0 s is not after 0 "
+                                                                               "s"),
+    "few rows": ({"t_[s]": COUNT[:5], "modulus_[Pa]": ONES[:5]}, {}, "has 5 rows of numbers, but "
+                                                                     "needs at least 8"),
+    "not a number": ({"t_[s]": COUNT, "modulus_[Pa]": ONES * np.nan}, {}, "column `modulus`: 'nan' "
+                                                                          "is not a finite number"),
+    "no load": ({"t_[s]": COUNT, "strain_[1]": ZEROS, "stress_[Pa]": ONES}, {}, "the strain is "
+                                                                                "zero throughout"),
+    "opposite": ({"t_[s]": COUNT, "strain_[1]": ONES, "stress_[Pa]": -ONES}, {},
+    "strain and stress are opposite"),
+    "no length": ({"t_[s]": COUNT, "elongation_[m]": ONES, "stress_[Pa]": ONES}, {},
+    "needs the gauge length, `length` [m]"),
+    "no area": ({"t_[s]": COUNT, "strain_[1]": ONES, "force_[N]": ONES}, {}, "a force needs the "
+                                                                             "cross-section, "
+                                                                             "`area` [m2]"),
+    "a length": ({"t_[s]": COUNT, "strain_[1]": ONES, "stress_[Pa]": ONES}, {"length": 1.0},
+    "`strain` needs no `length`"), "negative area": (
+        {"t_[s]": COUNT, "strain_[1]": ONES, "force_[N]": ONES}, {"area": -1.0}, "`area` must be "
+                                                                                 "positive and "
+                                                                                 "finite, but is -1"
     ),
-    "modulus and strain": ({"t_[s]": COUNT, "modulus_[Pa]": ONES, "strain_[1]": ONES}, {}, "`modulus` stands alone beside `t`"),
-    "modulus, creep": ({"t_[s]": COUNT, "modulus_[Pa]": ONES}, {"test": "creep"}, "`modulus` is of a relaxation test, not"),
-    "modulus, area": ({"t_[s]": COUNT, "modulus_[Pa]": ONES}, {"area": 1.0}, "nothing is to be divided by the `area`"),
+    "modulus and strain": ({"t_[s]": COUNT, "modulus_[Pa]": ONES, "strain_[1]": ONES}, {},
+    "`modulus` stands alone beside `t`"),
+    "modulus, creep": ({"t_[s]": COUNT, "modulus_[Pa]": ONES}, {"test": "creep"}, "`modulus` is of "
+                                                                                  "a relaxation "
+                                                                                  "test, not"),
+    "modulus, area": ({"t_[s]": COUNT, "modulus_[Pa]": ONES}, {"area": 1.0}, "nothing is to be "
+                                                                             "divided by the "
+                                                                             "`area`"),
 }  # fmt: skip
 
 
@@ -221,16 +281,21 @@ def test_an_empty_cell_is_refused(tmp_path: Path) -> None:
 
 def test_what_cannot_be_fitted_is_refused() -> None:
     made = relaxing()
-    flowing = Measured(made.path, "relaxation", T, made.strain, made.strain * 1e5 * np.exp(-T / 2.0))
+    flowing = Measured(
+        made.path, "relaxation", T, made.strain, made.strain * 1e5 * np.exp(-T / 2.0)
+    )
     with pytest.raises(ValueError, match="no relaxed modulus remains, or nothing changes in time"):
         fit(flowing)
     with pytest.raises(ValueError, match="no relaxed modulus remains, or nothing changes in time"):
         fit(Measured(made.path, "relaxation", T, made.strain, 1e5 * made.strain))
-    with pytest.raises(ValueError, match="`terms` must be from 1 to 8 for what made resolves, but is 9"):
+    with pytest.raises(
+        ValueError, match="`terms` must be from 1 to 8 for what made resolves, but is 9"
+    ):
         fit(made, terms=9)
 
 
-# --- the command ------------------------------------------------------------------------------------------------------
+# --- the command
+# ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("make", [relaxing, creeping])
@@ -238,24 +303,32 @@ def test_the_command_writes_a_table_a_summary_and_a_figure(
     make: Callable[..., Measured], tmp_path: Path, capsys: Any
 ) -> None:
     file, out = plain(tmp_path, make(2e-3), "my rubber.csv"), tmp_path / "out"
-    assert main(["material", "fit", str(file), "--out", str(out), "--nu", "0.49", "--depth", "0.02"]) == 0
+    assert (
+        main(["material", "fit", str(file), "--out", str(out), "--nu", "0.49", "--depth", "0.02"])
+        == 0
+    )
     text, err = capsys.readouterr()
     assert err == ""
     assert sorted(path.name for path in out.iterdir()) == sorted(FILES)
     found: Fit = fit(read(file))
-    made = tomllib.loads((out / "material.toml").read_text(encoding="utf-8"))["materials"]["my rubber"]
+    made = tomllib.loads((out / "material.toml").read_text(encoding="utf-8"))["materials"][
+        "my rubber"
+    ]
     solid = KINDS[made.pop("kind")](**made)
     assert made == found.table() | {"nu": 0.49, "rho": 1100.0, "depth": 0.02}
     assert type(solid) is type(found.material(**REST))
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     assert summary["data"]["sha256"] == sha256(file.read_bytes()).hexdigest()
-    assert {name: one["value"] for name, one in summary["coefficients"].items()} == dict(found.values)
+    assert {name: one["value"] for name, one in summary["coefficients"].items()} == dict(
+        found.values
+    )
     assert summary["notices"] == list(found.notices)
     assert all(notice in text for notice in found.notices)
     assert (out / "fit.png").read_bytes().startswith(b"\x89PNG")
 
 
-# --- rubbers from the literature --------------------------------------------------------------------------------------
+# --- rubbers from the literature
+# ----------------------------------------------------------------------
 
 
 def test_presets_say_where_every_coefficient_is_from(capsys: Any) -> None:

@@ -6,13 +6,24 @@ from typing import Literal
 import numpy as np
 import pytest
 from fem_oracle import dilatation, shear
-from skfem import Basis, ElementQuad1, ElementQuad2, ElementVector, FacetBasis, LinearForm, MeshQuad, condense, solve
+from skfem import (
+    Basis,
+    ElementQuad1,
+    ElementQuad2,
+    ElementVector,
+    FacetBasis,
+    LinearForm,
+    MeshQuad,
+    condense,
+    solve,
+)
 
 from torchsoft import KelvinVoigt, Pad, PadMesh
 from torchsoft.physics.mesh import Array, banded, lame_moduli
 
 ROUNDING = 1e-13
-"""Relative to the largest entry: two assemblies of the same integrals, in another order of summation."""
+"""Relative to the largest entry: two assemblies of the same integrals, in another order of
+summation."""
 
 
 def stiffness(mesh: PadMesh, nu: float, E: float = 1.0, all_nodes: bool = True) -> Array:
@@ -22,7 +33,8 @@ def stiffness(mesh: PadMesh, nu: float, E: float = 1.0, all_nodes: bool = True) 
     return mesh.assemble(lame_lambda * K_lambda + lame_mu * K_mu, all_nodes).toarray()
 
 
-# the element --------------------------------------------------------------------------------------------------------
+# the element
+# ----------------------------------------------------------------------
 
 
 def test_banded_storage_holds_the_whole_matrix() -> None:
@@ -35,13 +47,15 @@ def test_banded_storage_holds_the_whole_matrix() -> None:
     assert np.abs(lower + np.tril(lower, -1).T - K).max() < ROUNDING * np.abs(K).max()
 
 
-# locking and order --------------------------------------------------------------------------------------------------
+# locking and order
+# ----------------------------------------------------------------------
 
 LENGTH, HEIGHT, WIDTH = 0.04, 4.59e-3, 3e-3
 
 
 def pressure(x: Array) -> Array:
-    """A smooth pressure [Pa], about as wide as the contact of the full grasp and far from the layer's ends."""
+    """A smooth pressure [Pa], about as wide as the contact of the full grasp and far from the
+    layer's ends."""
     return np.exp(-(((x - LENGTH / 2) / WIDTH) ** 2))
 
 
@@ -67,7 +81,9 @@ class Layer:
 
 def pad_work(nu: float, elements_x: int, elements_y: int) -> float:
     """The same work by the massless pad, the pressure lumped to its nodes as contact forces are."""
-    pad = Pad(PadMesh(LENGTH, HEIGHT, elements_x, elements_y), KelvinVoigt(1.0, nu, 1.0, 1.0, depth=1.0))
+    pad = Pad(
+        PadMesh(LENGTH, HEIGHT, elements_x, elements_y), KelvinVoigt(1.0, nu, 1.0, 1.0, depth=1.0)
+    )
     C = pad.compliance().detach().numpy()
     f = np.zeros((pad.nodes, 2))
     f[:, 1] = -pressure(pad.positions[:, 0].numpy()) * pad.mesh.tributary
@@ -76,9 +92,13 @@ def pad_work(nu: float, elements_x: int, elements_y: int) -> float:
 
 # full integration misses at least this share of the work on 1 mm elements; measured 17 and 93 %
 @pytest.mark.parametrize(("nu", "lost_by_full_integration"), [(0.49, 0.15), (0.4999, 0.9)])
-def test_a_nearly_incompressible_layer_does_not_lock(nu: float, lost_by_full_integration: float) -> None:
+def test_a_nearly_incompressible_layer_does_not_lock(
+    nu: float, lost_by_full_integration: float
+) -> None:
     reference = Layer(nu).work(160, 20, order=2)  # itself good to 3e-4 at nu = 0.4999
-    assert abs(pad_work(nu, 40, 4) / reference - 1) < 0.02  # the default 1 mm elements: measured 1.4 and 1.5 %
+    assert (
+        abs(pad_work(nu, 40, 4) / reference - 1) < 0.02
+    )  # the default 1 mm elements: measured 1.4 and 1.5 %
     assert Layer(nu).work(40, 4, order=1) / reference - 1 < -lost_by_full_integration
 
 

@@ -1,4 +1,5 @@
-"""Pads that are no rectangles: curved blocks, fingertips, meshes from files; against scikit-fem, each other, and in runs."""
+"""Pads that are no rectangles: curved blocks, fingertips, meshes from files; against scikit-fem,
+each other, and in runs."""
 
 from collections.abc import Callable
 from functools import cache
@@ -9,7 +10,17 @@ import numpy as np
 import pytest
 import torch
 from fem_oracle import dilatation, mass, shear
-from skfem import Basis, ElementQuad1, ElementQuad2, ElementVector, FacetBasis, LinearForm, MeshQuad, condense, solve
+from skfem import (
+    Basis,
+    ElementQuad1,
+    ElementQuad2,
+    ElementVector,
+    FacetBasis,
+    LinearForm,
+    MeshQuad,
+    condense,
+    solve,
+)
 
 from torchsoft import (
     CurvedPadMesh,
@@ -22,20 +33,27 @@ from torchsoft import (
 from torchsoft.physics.mesh import Array, Mesh, lame_moduli
 
 ROUNDING = 1e-12
-"""Relative to the largest entry: two assemblies of the same integrals, in another order of summation."""
+"""Relative to the largest entry: two assemblies of the same integrals, in another order of
+summation."""
 
 RADIUS = 8e-3
 
 
 def trapezium() -> QuadMesh:
-    """A skew, ragged mesh whose points are numbered at random, and some of whose quadrilaterals are clockwise."""
+    """A skew, ragged mesh whose points are numbered at random, and some of whose quadrilaterals are
+    clockwise."""
     rng = np.random.default_rng(4)
     s, t = np.meshgrid(np.linspace(0, 1, 9), np.linspace(0, 1, 4), indexing="ij")
     inner = (s * (1 - s) > 0) & (t * (1 - t) > 0)
-    s, t = s + 0.02 * inner * rng.standard_normal(s.shape), t + 0.05 * inner * rng.standard_normal(s.shape)
+    s, t = (
+        s + 0.02 * inner * rng.standard_normal(s.shape),
+        t + 0.05 * inner * rng.standard_normal(s.shape),
+    )
     points = np.stack((30e-3 * s + 4e-3 * t * (1 - 2 * s), 6e-3 * t + 1e-3 * s), -1).reshape(-1, 2)
     number = np.arange(len(points)).reshape(s.shape)
-    quads = np.stack((number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]), -1).reshape(-1, 4)
+    quads = np.stack(
+        (number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]), -1
+    ).reshape(-1, 4)
     quads[::3] = quads[::3, ::-1]
     face, base = (np.stack((row[:-1], row[1:]), -1) for row in (number[:, -1], number[:, 0]))
     mixed = rng.permutation(len(points) + 1)  # the last belongs to no quadrilateral
@@ -47,7 +65,9 @@ def trapezium() -> QuadMesh:
 MESHES: dict[str, Callable[[], Mesh]] = {
     "block": lambda: PadMesh(20e-3, 4.59e-3, 11, 4),
     "crowned": lambda: CurvedPadMesh(30e-3, 6e-3, 15, 3, radius=40e-3),
-    "hollow": lambda: CurvedPadMesh(30e-3, 4e-3, 15, 3, radius=-50e-3, bonded_edges=("base", "right")),
+    "hollow": lambda: CurvedPadMesh(
+        30e-3, 4e-3, 15, 3, radius=-50e-3, bonded_edges=("base", "right")
+    ),
     "fingertip": lambda: FingertipMesh(RADIUS, 12),
     "trapezium": trapezium,
 }
@@ -62,7 +82,8 @@ def rubber(nu: float = 0.45) -> KelvinVoigt:
     return KelvinVoigt(0.75e6, nu, 1100.0, 10e-3, 44e-3)
 
 
-# --- elements -----------------------------------------------------------------------------------------------------------
+# --- elements
+# ----------------------------------------------------------------------
 
 
 def in_scikit_fem(mesh: Mesh) -> MeshQuad:
@@ -77,12 +98,16 @@ def test_assembly_equals_scikit_fem(mesh: Mesh) -> None:
     order = basis.nodal_dofs.T.ravel()
     for mine, form, at in zip(mesh.matrices, (dilatation, shear, mass), (centre, basis, exact)):
         want = form.assemble(at).toarray()[order][:, order]
-        assert np.abs(mesh.assemble(mine, all_nodes=True).toarray() - want).max() < ROUNDING * np.abs(want).max()
+        assert (
+            np.abs(mesh.assemble(mine, all_nodes=True).toarray() - want).max()
+            < ROUNDING * np.abs(want).max()
+        )
 
 
 @pytest.mark.parametrize("nu", [0.0, 0.3, 0.4999])
 def test_patch_test(mesh: Mesh, nu: float) -> None:
-    """A linear displacement has a uniform stress: forces only at the boundary, each the stress on half of both its sides."""
+    """A linear displacement has a uniform stress: forces only at the boundary, each the stress on
+    half of both its sides."""
     gradient = np.array([[0.3, -0.7], [1.1, 0.4]])
     strain = (gradient + gradient.T) / 2
     lame_lambda, lame_mu = lame_moduli(1.0, nu)
@@ -93,18 +118,24 @@ def test_patch_test(mesh: Mesh, nu: float) -> None:
     sides = mesh.nodes[np.roll(around, -1)] - mesh.nodes[around]
     traction = np.stack((sides[:, 1], -sides[:, 0]), -1) @ stress
     np.add.at(expected, around, 0.5 * (traction + np.roll(traction, 1, 0)))
-    assert np.abs(force - expected).max() < ROUNDING * np.abs(K.toarray()).max() * np.abs(mesh.nodes).max()
+    assert (
+        np.abs(force - expected).max()
+        < ROUNDING * np.abs(K.toarray()).max() * np.abs(mesh.nodes).max()
+    )
 
 
 def test_only_rigid_motions_cost_no_energy(mesh: Mesh) -> None:
     lame_lambda, lame_mu = lame_moduli(1.0, 0.49)
-    K = mesh.assemble(lame_lambda * mesh.matrices[0] + lame_mu * mesh.matrices[1], all_nodes=True).toarray()
+    K = mesh.assemble(
+        lame_lambda * mesh.matrices[0] + lame_mu * mesh.matrices[1], all_nodes=True
+    ).toarray()
     values = np.linalg.eigvalsh(K)
     assert int((np.abs(values) < 1e-12 * values[-1]).sum()) == 3
     assert values[3] > 1e-5 * values[-1]
 
 
-# --- geometry -------------------------------------------------------------------------------------------------------------
+# --- geometry
+# ----------------------------------------------------------------------
 
 
 def test_face_and_base_are_where_they_should_be(mesh: Mesh) -> None:
@@ -118,7 +149,9 @@ def test_face_and_base_are_where_they_should_be(mesh: Mesh) -> None:
     assert mesh.tributary.sum() == pytest.approx(lengths.sum() - sum(held), rel=1e-13)
     x, y = mesh.nodes[mesh.outline].T
     area = 0.5 * (x * np.roll(y, -1) - y * np.roll(x, -1)).sum()
-    assert mesh.assemble(mesh.matrices[2], all_nodes=True).sum() / 2 == pytest.approx(area, rel=1e-13)
+    assert mesh.assemble(mesh.matrices[2], all_nodes=True).sum() / 2 == pytest.approx(
+        area, rel=1e-13
+    )
     low, high = mesh.space
     assert np.all(low <= mesh.nodes.min(0)) and np.all(mesh.nodes.max(0) <= high)  # noqa: PT018
 
@@ -130,7 +163,9 @@ def test_a_curved_block_has_an_arc() -> None:
         assert face[5] == pytest.approx([15e-3, middle], abs=1e-15)
         if ends is None:
             centre = np.array([15e-3, 6e-3 - radius])
-            assert np.linalg.norm(face - centre, axis=1) == pytest.approx(np.full(11, 40e-3), rel=1e-13)
+            assert np.linalg.norm(face - centre, axis=1) == pytest.approx(
+                np.full(11, 40e-3), rel=1e-13
+            )
         else:
             assert face[:, 1] == pytest.approx(np.full(11, ends), abs=1e-15)
 
@@ -158,11 +193,17 @@ def test_a_fingertip_is_half_a_disc() -> None:
         mesh = FingertipMesh(RADIUS, around)
         face = mesh.nodes[mesh.face]
         assert len(face) == around + 1
-        assert np.linalg.norm(face - [RADIUS, 0.0], axis=1) == pytest.approx(np.full(around + 1, RADIUS), rel=1e-14)
-        assert np.linalg.norm(np.diff(face, axis=0), axis=1) == pytest.approx(mesh.tributary.max(), rel=1e-12)
+        assert np.linalg.norm(face - [RADIUS, 0.0], axis=1) == pytest.approx(
+            np.full(around + 1, RADIUS), rel=1e-14
+        )
+        assert np.linalg.norm(np.diff(face, axis=0), axis=1) == pytest.approx(
+            mesh.tributary.max(), rel=1e-12
+        )
         assert np.array_equal(mesh.bonded, mesh.nodes[:, 1] == 0)
         assert mesh.refined(2) == FingertipMesh(RADIUS, 2 * around)
-        sides = np.linalg.norm(np.diff(mesh.nodes[mesh.elements[:, [0, 1, 2, 3, 0]]], axis=1), axis=-1)
+        sides = np.linalg.norm(
+            np.diff(mesh.nodes[mesh.elements[:, [0, 1, 2, 3, 0]]], axis=1), axis=-1
+        )
         assert (sides.max(1) / sides.min(1)).max() < 2.5
         areas.append(mesh.assemble(mesh.matrices[2], all_nodes=True).sum() / 2)
     errors = 1 - np.array(areas) / (0.5 * np.pi * RADIUS**2)
@@ -175,10 +216,14 @@ def test_refining_divides_every_quadrilateral() -> None:
         fine = coarse.refined(finer)
         assert len(fine.elements) == finer**2 * len(coarse.elements)
         assert len(fine.face) - 1 == finer * (len(coarse.face) - 1)
-        assert np.allclose(fine.nodes[fine.face][::finer], coarse.nodes[coarse.face], rtol=0, atol=1e-17)
+        assert np.allclose(
+            fine.nodes[fine.face][::finer], coarse.nodes[coarse.face], rtol=0, atol=1e-17
+        )
         mine, its = (m.assemble(m.matrices[2], all_nodes=True).sum() for m in (fine, coarse))
         assert mine == pytest.approx(its, rel=1e-13)
-    assert coarse.refined(1).nodes[coarse.refined(1).face] == pytest.approx(coarse.nodes[coarse.face])
+    assert coarse.refined(1).nodes[coarse.refined(1).face] == pytest.approx(
+        coarse.nodes[coarse.face]
+    )
 
 
 def test_equal_descriptions_are_one_mesh() -> None:
@@ -187,12 +232,14 @@ def test_equal_descriptions_are_one_mesh() -> None:
         assert hash(make()) == hash(make())
 
 
-# --- how they give way ----------------------------------------------------------------------------------------------------
+# --- how they give way
+# ----------------------------------------------------------------------
 
 
 @cache
 def fine_work(nu: float) -> float:
-    """Work of a smooth pressure downwards on a fingertip with E = 1 and unit depth: scikit-fem, quadratic elements."""
+    """Work of a smooth pressure downwards on a fingertip with E = 1 and unit depth: scikit-fem,
+    quadratic elements."""
     mesh = FingertipMesh(RADIUS, 96)
     theirs = in_scikit_fem(mesh).with_boundaries(
         {"face": lambda x: (x[0] - RADIUS) ** 2 + x[1] ** 2 > (0.999 * RADIUS) ** 2}
@@ -223,10 +270,12 @@ def test_a_fingertip_gives_way_as_in_scikit_fem(nu: float, bound: float) -> None
     assert np.all(np.log2(np.array(errors[:-1]) / errors[1:]) > 1.7)
 
 
-# --- runs --------------------------------------------------------------------------------------------------------------------
+# --- runs
+# ----------------------------------------------------------------------
 
 
-# --- files -------------------------------------------------------------------------------------------------------------------
+# --- files
+# ----------------------------------------------------------------------
 
 
 def written(path: Path, mesh: Mesh, z: float | Array = 0.25) -> Path:
@@ -238,7 +287,9 @@ def written(path: Path, mesh: Mesh, z: float | Array = 0.25) -> Path:
     cells = [("line", line), ("line", held), ("quad", mesh.elements)]
     tags = [np.full(len(block), k + 1) for k, (_, block) in enumerate(cells)]
     names = {"skin": np.array([1, 1]), "bone": np.array([2, 1]), "rubber": np.array([3, 2])}
-    file = meshio.Mesh(points, cells, cell_data={"gmsh:physical": tags, "gmsh:geometrical": tags}, field_data=names)
+    file = meshio.Mesh(
+        points, cells, cell_data={"gmsh:physical": tags, "gmsh:geometrical": tags}, field_data=names
+    )
     meshio.write(path, file, file_format="gmsh22")
     return path
 
@@ -291,7 +342,9 @@ $EndElements
 
 def test_a_mesh_from_a_file(tmp_path: Path) -> None:
     tip = FingertipMesh(RADIUS, 8)
-    mesh = QuadMesh.read(written(tmp_path / "tip.msh", tip), unit="mm", face="skin", bonded=["bone"])
+    mesh = QuadMesh.read(
+        written(tmp_path / "tip.msh", tip), unit="mm", face="skin", bonded=["bone"]
+    )
     C, expected = (Pad(m, rubber()).compliance().detach() for m in (mesh, tip))
     assert torch.allclose(C, expected, rtol=1e-8, atol=1e-10 * float(expected.abs().max()))
     file = tmp_path / "block.msh"
@@ -312,12 +365,18 @@ def test_files_that_are_no_meshes_are_refused(tmp_path: Path) -> None:
     for options, match in (
         ({"unit": "inch"}, "`unit` must be one of m, cm, mm, but is 'inch'"),
         ({"unit": "mm"}, "tip.msh: there is no group of lines `face`; there are skin, bone"),
-        ({"unit": "mm", "face": "skin", "bonded": ["rubber"]}, "there is no group of lines `rubber`"),
+        (
+            {"unit": "mm", "face": "skin", "bonded": ["rubber"]},
+            "there is no group of lines `rubber`",
+        ),
         (
             {"unit": "mm", "face": "skin", "bonded": []},
             "`bonded_sides` must be sides of quadrilaterals, but there are none",
         ),
-        ({"unit": "mm", "face": "skin", "bonded": ["skin"]}, "fewer than two points of the face are free"),
+        (
+            {"unit": "mm", "face": "skin", "bonded": ["skin"]},
+            "fewer than two points of the face are free",
+        ),
     ):
         with pytest.raises(ValueError, match=match):
             QuadMesh.read(file, **options)
@@ -325,7 +384,9 @@ def test_files_that_are_no_meshes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="points in a plane of constant z"):
         QuadMesh.read(file, unit="mm", face="skin", bonded=["bone"])
     meshio.write(file, meshio.Mesh(np.eye(3), [("triangle", [[0, 1, 2]])]), file_format="gmsh22")
-    with pytest.raises(ValueError, match="must be a mesh of quadrilaterals with four points, but has triangle"):
+    with pytest.raises(
+        ValueError, match="must be a mesh of quadrilaterals with four points, but has triangle"
+    ):
         QuadMesh.read(file, unit="mm")
     for name, text in (("tip.msh", "no mesh"), ("tip.mesh2", "no mesh"), ("tip.msh", GMSH[:300])):
         (tmp_path / name).write_text(text, encoding="ascii")

@@ -1,4 +1,5 @@
-"""Signals of time: the paper's profiles, recorded set-points, references, and where their gradients go."""
+"""Signals of time: the paper's profiles, recorded set-points, references, and where their gradients
+go."""
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ VALUES = [0.06, 0.04, 0.05, 0.01]
 
 
 def test_profile_is_the_papers_seventh_order_polynomial() -> None:
-    """Ends where it should, at rest with zero acceleration and jerk; peak speed 4.375 mm/s for 20 mm in 10 s."""
+    """Ends where it should, at rest with zero acceleration and jerk; peak speed 4.375 mm/s for 20
+    mm in 10 s."""
     profile = Profile([0.0, 10.0], [0.06, 0.04])
     t = torch.linspace(0, 10, 1001, dtype=torch.float64)
     value, rate = profile(t)
@@ -41,7 +43,10 @@ def test_profile_goes_through_its_knots_and_stays_outside_them() -> None:
 
 @pytest.mark.parametrize("knots", [2, 3, 4])
 def test_sampled_is_the_cubic_spline_and_stays_outside_it(knots: int) -> None:
-    signal, spline = Sampled(TIMES[:knots], VALUES[:knots]), CubicSpline(TIMES[:knots], VALUES[:knots])
+    signal, spline = (
+        Sampled(TIMES[:knots], VALUES[:knots]),
+        CubicSpline(TIMES[:knots], VALUES[:knots]),
+    )
     t = torch.linspace(0, TIMES[knots - 1], 301, dtype=torch.float64)
     value, rate = signal(t)
     np.testing.assert_allclose(value, spline(t), rtol=0, atol=1e-15)
@@ -52,14 +57,17 @@ def test_sampled_is_the_cubic_spline_and_stays_outside_it(knots: int) -> None:
 
 
 def test_sampled_stays_the_spline_when_its_knots_are_changed() -> None:
-    """In place, and by a gradient: that of what is computed by finite differences of the values and of the times."""
+    """In place, and by a gradient: that of what is computed by finite differences of the values and
+    of the times."""
     signal = Sampled([0.0, 0.1, 0.2, 0.3, 0.4], [1.0, 1.0, 1.0, 1.0, 1.0])
     at, values = f64(0.0, 0.4, 1.0, 1.5, 2.5), f64(0.06, 0.04, 0.05, 0.01, 0.02)
     with torch.no_grad():
         signal.times.copy_(at)
         signal.values.copy_(values)
     t = torch.linspace(0, 2.5, 101, dtype=torch.float64)
-    np.testing.assert_allclose(signal(t)[1].detach(), CubicSpline(at, values)(t, 1), rtol=0, atol=1e-13)
+    np.testing.assert_allclose(
+        signal(t)[1].detach(), CubicSpline(at, values)(t, 1), rtol=0, atol=1e-13
+    )
     for k in (2, 3, 4, 5):
         knots = at[:k].clone().requires_grad_(), values[:k].clone().requires_grad_()
         assert gradcheck(lambda *knots: torch.stack(Sampled(*knots)(f64(0.1, 0.3))), knots)
@@ -75,7 +83,9 @@ def test_sampled_with_rates_is_hermites_cubic() -> None:
     assert torch.allclose(rate, 3 * t**2, rtol=0, atol=1e-14)
 
 
-@pytest.mark.parametrize("signal", [Profile([0.3], [0.05]), Sampled([0.3], [0.05])], ids=["profile", "sampled"])
+@pytest.mark.parametrize(
+    "signal", [Profile([0.3], [0.05]), Sampled([0.3], [0.05])], ids=["profile", "sampled"]
+)
 def test_one_knot_is_a_constant(signal: Profile) -> None:
     value, rate = signal(f64(0.0, 0.3, 1.0))
     assert value.tolist() == [0.05] * 3
@@ -96,7 +106,8 @@ def test_signals_by_gradcheck(kind: type[Profile]) -> None:
 
 
 def test_a_tensor_with_a_graph_given_as_a_knot_keeps_it() -> None:
-    """One knot among numbers, and all knots at once; a plain number is a parameter that is not trained."""
+    """One knot among numbers, and all knots at once; a plain number is a parameter that is not
+    trained."""
     x = f64(0.04)[0].requires_grad_()
     value, _ = Profile([0.0, 1.0], [0.06, 2 * x])(f64(0.0, 0.5, 1.0))
     (slope,) = torch.autograd.grad(value.sum(), x)

@@ -1,4 +1,5 @@
-"""Parameters: every impossible value is refused by name, sources are kept, files and overrides round-trip."""
+"""Parameters: every impossible value is refused by name, sources are kept, files and overrides
+round-trip."""
 
 import math
 import warnings
@@ -16,13 +17,15 @@ from torchsoft.tables import InvalidTable
 NAN, INF = math.nan, math.inf
 
 POSITIVE = [
-    "pad.length", "pad.height", "pad.depth", "pad.E", "pad.rho", "pad.tau", "contact.K_n", "contact.K_t", "contact.v_s",
-    "contact.epsilon", "contact.node_spacing", "disc.radius", "disc.mass", "disc.inertia_ratio", "bracket.mass",
-    "scenario.y_Br_grasp", "scenario.grasp_time", "scenario.roll_time",
+    "pad.length", "pad.height", "pad.depth", "pad.E", "pad.rho", "pad.tau", "contact.K_n",
+    "contact.K_t", "contact.v_s", "contact.epsilon", "contact.node_spacing", "disc.radius",
+    "disc.mass", "disc.inertia_ratio", "bracket.mass", "scenario.y_Br_grasp", "scenario.grasp_time",
+    "scenario.roll_time",
 ]  # fmt: skip
 NOT_NEGATIVE = [
-    "contact.R_n", "contact.R_t", "contact.mu_s", "contact.mu_k", "contact.eta", "control.K_81", "control.R_80",
-    "control.K_98", "control.R_99", "scenario.gravity", "scenario.hold_time", "scenario.rest_time",
+    "contact.R_n", "contact.R_t", "contact.mu_s", "contact.mu_k", "contact.eta", "control.K_81",
+    "control.R_80", "control.K_98", "control.R_99", "scenario.gravity", "scenario.hold_time",
+    "scenario.rest_time",
 ]  # fmt: skip
 ANY_SIGN = ["pad.nu", "bracket.cm_height", "scenario.x_C0", "scenario.travel"]
 
@@ -37,32 +40,41 @@ def refusal(values: dict[str, Any]) -> str:
 
 
 BAD: list[tuple[list[str], list[object], str]] = [
-    ([*POSITIVE, *NOT_NEGATIVE, *ANY_SIGN], [True, "1_0", "0.1", None, [1.0], 10**400], " should be a valid number"),
+    ([*POSITIVE, *NOT_NEGATIVE, *ANY_SIGN], [True, "1_0", "0.1", None, [1.0], 10**400],
+    " should be a valid number"),
     ([*POSITIVE, *NOT_NEGATIVE, *ANY_SIGN], [1e300, -1e300, NAN, INF, -INF], ""),
-    ([*POSITIVE, *NOT_NEGATIVE], [-1e-3], ""),
-    (POSITIVE, [0.0], ""),
+    ([*POSITIVE, *NOT_NEGATIVE], [-1e-3], ""), (POSITIVE, [0.0], ""),
     (["pad.nu"], [0.5, 0.6, 1.0, -1.0, -2.0], ""),
-    (["pad.elements_x"], [3, 120.5], ""), (["pad.elements_y"], [0], ""), (["pad.enclosed"], ["perhaps"], ""),
-    (["pad.fidelity"], ["rigid"], ""), (["contact.friction"], ["stribeck"], ""),
+    (["pad.elements_x"], [3, 120.5], ""), (["pad.elements_y"], [0], ""),
+    (["pad.enclosed"], ["perhaps"], ""), (["pad.fidelity"], ["rigid"], ""),
+    (["contact.friction"], ["stribeck"], ""),
 ]  # fmt: skip
 """Fields, values that none of them takes, and what is said after the field's name."""
 
 
 @pytest.mark.parametrize(("names", "values", "words"), BAD)
-def test_impossible_values_are_refused_by_name(names: list[str], values: list[object], words: str) -> None:
+def test_impossible_values_are_refused_by_name(
+    names: list[str], values: list[object], words: str
+) -> None:
     for name in names:
         for value in values:
             assert f"{name}{words}" in refusal({name: value}), value
 
 
 def test_the_lists_above_cover_every_number() -> None:
-    numbers = {name for name, row in Parameters().table().items() if isinstance(row["value"], float)}
+    numbers = {
+        name for name, row in Parameters().table().items() if isinstance(row["value"], float)
+    }
     assert numbers == {*POSITIVE, *NOT_NEGATIVE, *ANY_SIGN}
-    assert Parameters().override({"pad.nu": 0.4999}).pad.nu == 0.4999  # just short of incompressible
+    assert (
+        Parameters().override({"pad.nu": 0.4999}).pad.nu == 0.4999
+    )  # just short of incompressible
 
 
 def test_a_mesh_that_would_not_fit_in_memory_is_refused() -> None:
-    assert "pad.elements_x = 40000 by elements_y = 4 take about" in refusal({"pad.elements_x": 40_000})
+    assert "pad.elements_x = 40000 by elements_y = 4 take about" in refusal(
+        {"pad.elements_x": 40_000}
+    )
     assert Parameters().override({"pad.elements_x": 1000}).pad.memory < 1.0
 
 
@@ -83,7 +95,9 @@ def test_kinetic_friction_above_static_is_refused() -> None:
     message = refusal({"contact.mu_k": 0.9})
     assert "contact" in message
     assert "mu_k = 0.9 > mu_s = 0.8" in message
-    assert Parameters().override({"contact.mu_k": 0.8}).contact.mu_k == 0.8  # equal is Coulomb's law
+    assert (
+        Parameters().override({"contact.mu_k": 0.8}).contact.mu_k == 0.8
+    )  # equal is Coulomb's law
 
 
 def test_a_slip_element_without_any_viscosity_is_refused() -> None:
@@ -117,7 +131,9 @@ def test_a_disc_that_does_not_fit_is_refused(values: dict[str, float], word: str
         {"scenario.travel": 60e-3},
         {"scenario.x_C0": 5e-3, "scenario.travel": 20e-3},
         {"scenario.x_C0": -5e-3},
-        {"scenario.travel": -56e-3},  # the centre stays on the pad, the contact's half-width of 5.4 mm does not
+        {
+            "scenario.travel": -56e-3
+        },  # the centre stays on the pad, the contact's half-width of 5.4 mm does not
         {"pad.length": 0.06},
     ],
 )
@@ -137,7 +153,8 @@ def test_parameters_are_frozen() -> None:
         Parameters().pad.E = 1.0
 
 
-# the warning --------------------------------------------------------------------------------------------------------
+# the warning
+# ----------------------------------------------------------------------
 
 
 def test_a_slip_law_that_is_not_single_valued_is_warned_about() -> None:
@@ -159,7 +176,8 @@ def test_default_and_paper_like_sets_do_not_warn() -> None:
         assert Parameters.paper_like().contact.K_t == 100.0
 
 
-# override and table -------------------------------------------------------------------------------------------------
+# override and table
+# ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["pad.Young", "pad", "pad.", "E", "pads.E", "pad.E.x", ""])
@@ -174,7 +192,9 @@ def test_override_leaves_the_original_and_the_rest_alone() -> None:
     after = before.override({"pad.E": 1e6}).override({"pad.nu": 0.4})
     assert before == Parameters()
     assert (after.pad.E, after.pad.nu) == (1e6, 0.4)
-    assert {name for name, row in after.table().items() if row["value"] != before.table()[name]["value"]} == {
+    assert {
+        name for name, row in after.table().items() if row["value"] != before.table()[name]["value"]
+    } == {
         "pad.E",
         "pad.nu",
     }
@@ -184,9 +204,10 @@ def test_table_tells_published_from_assumed() -> None:
     table = Parameters().table()
     published = {name for name, row in table.items() if row["source"] == "published"}
     assert published == {
-        "pad.length", "pad.height", "disc.radius", "control.K_81", "control.R_80", "control.K_98", "control.R_99",
-        "control.senses", "scenario.x_C0", "scenario.y_Br_grasp", "scenario.grasp_time", "scenario.travel",
-        "scenario.roll_time", "scenario.hold_time", "scenario.rest_time",
+        "pad.length", "pad.height", "disc.radius", "control.K_81", "control.R_80", "control.K_98",
+        "control.R_99", "control.senses", "scenario.x_C0", "scenario.y_Br_grasp",
+        "scenario.grasp_time", "scenario.travel", "scenario.roll_time", "scenario.hold_time",
+        "scenario.rest_time",
     }  # fmt: skip
     assert {row["source"] for row in table.values()} == {"published", "assumed"}
     assert table["disc.radius"] == {
@@ -199,7 +220,10 @@ def test_a_changed_value_is_assumed_and_a_restored_one_is_published_again() -> N
     changed = Parameters().override({"scenario.travel": -10e-3})
     assert changed.table()["scenario.travel"]["source"] == "assumed"
     assert changed.table()["scenario.x_C0"]["source"] == "published"
-    assert changed.override({"scenario.travel": -20e-3}).table()["scenario.travel"]["source"] == "published"
+    assert (
+        changed.override({"scenario.travel": -20e-3}).table()["scenario.travel"]["source"]
+        == "published"
+    )
 
 
 def test_published_numbers() -> None:
@@ -235,13 +259,17 @@ def test_overrides_arrive_in_the_table_and_undo(changes: dict[str, Any]) -> None
     table, default = changed.table(), Parameters().table()
     for name, row in table.items():
         assert row["value"] == changes.get(name, default[name]["value"])
-        assert row["source"] == (default[name]["source"] if row["value"] == default[name]["value"] else "assumed")
+        assert row["source"] == (
+            default[name]["source"] if row["value"] == default[name]["value"] else "assumed"
+        )
     assert changed.override({name: default[name]["value"] for name in changes}) == Parameters()
     assert Parameters().override({name: row["value"] for name, row in table.items()}) == changed
 
 
 @given(changes=CHANGES)
-def test_a_file_holds_the_same_parameters(changes: dict[str, Any], tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_a_file_holds_the_same_parameters(
+    changes: dict[str, Any], tmp_path_factory: pytest.TempPathFactory
+) -> None:
     changed = Parameters().override(changes)
     lines = [f"{name} = {toml(row['value'])}" for name, row in changed.table().items()]
     path = tmp_path_factory.getbasetemp() / "parameters.toml"
@@ -249,7 +277,8 @@ def test_a_file_holds_the_same_parameters(changes: dict[str, Any], tmp_path_fact
     assert Parameters.from_toml(path) == changed
 
 
-# files --------------------------------------------------------------------------------------------------------------
+# files
+# ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -267,7 +296,9 @@ def test_a_file_holds_the_same_parameters(changes: dict[str, Any], tmp_path_fact
         ("[pad]\nE = soft", "line 2"),
     ],
 )
-def test_a_file_that_is_wrong_is_refused_with_its_name(text: str, named: str, tmp_path: Path) -> None:
+def test_a_file_that_is_wrong_is_refused_with_its_name(
+    text: str, named: str, tmp_path: Path
+) -> None:
     path = tmp_path / "soft.toml"
     path.write_text(text)
     with pytest.raises(ValueError, match=r"soft\.toml") as error:
@@ -278,4 +309,6 @@ def test_a_file_that_is_wrong_is_refused_with_its_name(text: str, named: str, tm
 def test_a_file_changes_only_what_it_names(tmp_path: Path) -> None:
     path = tmp_path / "soft.toml"
     path.write_text("[pad]\nE = 60e3\n[contact]\nfriction = 'coulomb'\n")
-    assert Parameters.from_toml(path) == Parameters().override({"pad.E": 60e3, "contact.friction": "coulomb"})
+    assert Parameters.from_toml(path) == Parameters().override(
+        {"pad.E": 60e3, "contact.friction": "coulomb"}
+    )

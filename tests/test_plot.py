@@ -1,4 +1,5 @@
-"""Figures, diagram and animation of a short run: the reconstructed meshes are right, and everything draws something."""
+"""Figures, diagram and animation of a short run: the reconstructed meshes are right, and everything
+draws something."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -59,7 +60,9 @@ def test_a_spoke_ends_on_the_outline() -> None:
 
 @pytest.mark.parametrize("enclosed", [False, True])
 @pytest.mark.parametrize("which", ["L", "U"])
-def test_deformed_mesh_is_the_surface_and_an_interior_in_equilibrium(which: str, enclosed: bool) -> None:
+def test_deformed_mesh_is_the_surface_and_an_interior_in_equilibrium(
+    which: str, enclosed: bool
+) -> None:
     model, run = manipulated(pad__enclosed=enclosed)
     pad, u = model.pads[which], run.displacement[which]
     mesh = deformed_mesh(pad, u)
@@ -72,14 +75,18 @@ def test_deformed_mesh_is_the_surface_and_an_interior_in_equilibrium(which: str,
     assert np.abs(displacement[:, pad.mesh.bonded]).max() < 1e-15
     K_lambda, K_mu, _ = pad.mesh.matrices
     lame_lambda, lame_mu = lame_moduli(1.0, model.settings.pad.nu)
-    force = pad.mesh.assemble(lame_lambda * K_lambda + lame_mu * K_mu) @ displacement[-1, pad.mesh.free].ravel()
+    force = (
+        pad.mesh.assemble(lame_lambda * K_lambda + lame_mu * K_mu)
+        @ displacement[-1, pad.mesh.free].ravel()
+    )
     force = force.reshape(-1, 2)
     interior = np.delete(force, pad.mesh.surface, axis=0)
     assert np.abs(interior).max() < 1e-11 * np.abs(force).max()
 
 
 def test_friction_is_drawn_towards_the_right(done: Done) -> None:
-    """In the grasp the pads are squeezed outwards, so friction on them points inwards, whichever pad."""
+    """In the grasp the pads are squeezed outwards, so friction on them points inwards, whichever
+    pad."""
     (instant,) = instants(*done, [0.2])
     for k in "LU":
         x, friction = instant.points[k][:, 0], instant.force[k][:, 1]
@@ -88,10 +95,13 @@ def test_friction_is_drawn_towards_the_right(done: Done) -> None:
 
 
 def hand() -> Rig:
-    """An egg against a wall and a ball on the floor, and a finger that comes down from above and turns."""
+    """An egg against a wall and a ball on the floor, and a finger that comes down from above and
+    turns."""
     rubber = KelvinVoigt(1e6, 0.3, 1100.0, 0.05, 0.02)
     mesh = PadMesh(0.06, 0.006, 30, 3)
-    law = SoftContact(5e4, 20.0, 2e4, 5.0, friction=SmoothSlip(0.8, 0.5, 0.05, 10.0), node_spacing=2e-3)
+    law = SoftContact(
+        5e4, 20.0, 2e4, 5.0, friction=SmoothSlip(0.8, 0.5, 0.05, 10.0), node_spacing=2e-3
+    )
     return Rig(
         bodies={
             "egg": Body(0.2, Ellipse(0.02, 0.014)), "ball": Body(0.1, Circle(0.01)),
@@ -103,11 +113,13 @@ def hand() -> Rig:
             "tip": Pad(mesh, rubber, base="finger", angle=np.pi / 2, origin=(0.008, -0.03)),
         },
         contacts={
-            "egg on floor": Contact("floor", "egg", law), "ball on floor": Contact("floor", "ball", law),
+            "egg on floor": Contact("floor", "egg", law),
+            "ball on floor": Contact("floor", "ball", law),
             "egg at wall": Contact("wall", "egg", law), "egg at tip": Contact("tip", "egg", law),
         },
         reference=Reference(
-            **{"finger.x": Profile([0.0, 0.1], [-2e-3, -0.009]), "finger.theta": Profile([0.0, 0.1], [0.0, 0.08])}
+            **{"finger.x": Profile([0.0, 0.1], [-2e-3, -0.009]),
+            "finger.theta": Profile([0.0, 0.1], [0.0, 0.08])}
         ),
     )  # fmt: skip
 
@@ -118,7 +130,9 @@ def held() -> tuple[Rig, Trajectory]:
     rig = hand()
     state = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64))
     start = {"egg": [-0.0241, 0.0139, 0.0], "ball": [0.045, 0.0099, 0.0]}
-    pose = state.pose | {name: torch.tensor(place, dtype=torch.float64) for name, place in start.items()}
+    pose = state.pose | {
+        name: torch.tensor(place, dtype=torch.float64) for name, place in start.items()
+    }
     t = torch.linspace(0, 0.12, 13, dtype=torch.float64)
     return rig, simulate(rig, t, y0=rig.pack(state._replace(pose=pose)), step=1e-3)
 
@@ -129,17 +143,25 @@ def test_any_rig_is_drawn_where_its_bodies_are(held: tuple[Rig, Trajectory]) -> 
     assert all(bool((force[:, 0] > 0).any()) for force in instant.force.values())
     x, y, angle = run.state.pose["finger"][-1].tolist()
     c, s = np.cos(angle), np.sin(angle)
-    face = rig.pads["tip"].mesh.nodes[rig.pads["tip"].mesh.bonded] @ np.array([[0.0, 1.0], [-1.0, 0.0]]) + [
+    face = rig.pads["tip"].mesh.nodes[rig.pads["tip"].mesh.bonded] @ np.array(
+        [[0.0, 1.0], [-1.0, 0.0]]
+    ) + [
         0.008,
         -0.03,
     ]
     expected = 1e3 * (face @ np.array([[c, s], [-s, c]]) + [x, y])
-    np.testing.assert_allclose(instant.mesh["tip"][rig.pads["tip"].mesh.bonded], expected, atol=1e-9)
+    np.testing.assert_allclose(
+        instant.mesh["tip"][rig.pads["tip"].mesh.bonded], expected, atol=1e-9
+    )
     surface = instant.points["egg at tip"]
     touching = instant.force["egg at tip"][:, 0] > 0
     centre, turn = instant.pose["egg"][:2], instant.pose["egg"][2]
-    d = (surface[touching] - centre) @ np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    assert bool(((d / [20.0, 14.0]) ** 2).sum(-1).max() < 1)  # a point that is loaded is inside the egg
+    d = (surface[touching] - centre) @ np.array(
+        [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    )
+    assert bool(
+        ((d / [20.0, 14.0]) ** 2).sum(-1).max() < 1
+    )  # a point that is loaded is inside the egg
     figure = figures.snapshots(run, rig, [0.0, 0.12])
     axes = figure.axes[0]
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
@@ -173,7 +195,10 @@ DRAWN: dict[str, Callable[[Rig, Trajectory], Figure]] = {
 @pytest.mark.parametrize(
     ("rig", "name"),
     [*(("done", name) for name in DRAWN)]
-    + [("held", name) for name in ("snapshots", "force_distribution", "energy_balance", "multibond_graph")],
+    + [
+        ("held", name)
+        for name in ("snapshots", "force_distribution", "energy_balance", "multibond_graph")
+    ],
 )
 def test_figure_draws_something(rig: str, name: str, request: pytest.FixtureRequest) -> None:
     figure = DRAWN[name](*request.getfixturevalue(rig))
@@ -201,7 +226,9 @@ def test_save_writes_the_whole_file_or_none(done: Done, tmp_path: Path) -> None:
 def test_diagram_places_every_node_of_the_graph_by_itself(build: Callable[[], Rig]) -> None:
     rig = build()
     graph = graph_of(rig)
-    assert {"egg_spin", "contact_egg at tip", "pad_tip: field"} <= set(graph) or isinstance(rig, SoftGrasp)
+    assert {"egg_spin", "contact_egg at tip", "pad_tip: field"} <= set(graph) or isinstance(
+        rig, SoftGrasp
+    )
     at = positions(graph)
     assert set(at) == set(graph)
     points = np.array(list(at.values()))

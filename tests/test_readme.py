@@ -1,4 +1,5 @@
-"""Python of the README and of every page of the documentation, run as it stands but for a shorter manipulation; links exist."""
+"""Python of the README and of every page of the documentation, run as it stands but for a shorter
+manipulation; links exist."""
 
 import re
 from pathlib import Path
@@ -7,8 +8,17 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-LINKED = [*PAGES, *(ROOT / folder / "README.md" for folder in ("experiments", "experiments/validation", "data_gen"))]
-SHORTER = {"torch.linspace(0, 30, 3001": "torch.linspace(0, 0.5, 101", 'theta"][1000]': 'theta"][50]'}
+LINKED = [
+    *PAGES,
+    *(
+        ROOT / folder / "README.md"
+        for folder in ("experiments", "experiments/validation", "data_gen")
+    ),
+]
+SHORTER = {
+    "torch.linspace(0, 30, 3001": "torch.linspace(0, 0.5, 101",
+    'theta"][1000]': 'theta"][50]',
+}
 LONGEST = 150
 """Lines of the README."""
 

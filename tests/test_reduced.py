@@ -1,4 +1,5 @@
-"""Reduced models: known equations recovered, all routes through one list of terms equal, divergence and bad data reported."""
+"""Reduced models: known equations recovered, all routes through one list of terms equal, divergence
+and bad data reported."""
 
 import subprocess
 import sys
@@ -64,15 +65,25 @@ RECIPE = Recipe(width=0.004, window=0.3, threshold=0.01)
 def test_known_equations_are_recovered(motions: list[Record]) -> None:
     """Exactly the true terms, their coefficients to a few per cent."""
     model = fit(assemble(motions, mechanics(R), RECIPE), RECIPE)
-    found = {target: {term.text: x for term, x in pairs} for target, pairs in model.equations().items()}
-    assert {target: set(terms) for target, terms in found.items()} == {k: set(v) for k, v in TRUTH.items()}
+    found = {
+        target: {term.text: x for term, x in pairs} for target, pairs in model.equations().items()
+    }
+    assert {target: set(terms) for target, terms in found.items()} == {
+        k: set(v) for k, v in TRUTH.items()
+    }
     for target, terms in TRUTH.items():
         for text, value in terms.items():
             assert found[target][text] == pytest.approx(value, rel=0.05), text
 
 
 def test_the_choice_takes_the_true_terms_and_rolls_out(motions: list[Record]) -> None:
-    choice = choose(assemble(motions, mechanics(R), RECIPE), [motion(truth(), 50)], RECIPE, (1e-4, 0.01, 0.9), LAW)
+    choice = choose(
+        assemble(motions, mechanics(R), RECIPE),
+        [motion(truth(), 50)],
+        RECIPE,
+        (1e-4, 0.01, 0.9),
+        LAW,
+    )
     assert len(choice.model.terms) == 8
     assert choice.tried[choice.index]["nrmse"] < 5e-3
     assert score(choice.model, motion(truth(), 51)).worst < 5e-3
@@ -97,7 +108,9 @@ def test_saturating_friction_is_recovered() -> None:
     model = truth({"v_C": [(upper, 3.0)]})
     records = [motion(model, seed) for seed in range(6)]
     recipe = replace(RECIPE, threshold=0.02)
-    found = fit(assemble(records, joined(mechanics(R), {"v_C": [upper]}), recipe), recipe).equations()["v_C"]
+    found = fit(
+        assemble(records, joined(mechanics(R), {"v_C": [upper]}), recipe), recipe
+    ).equations()["v_C"]
     assert {term.text for term, _ in found} == {*TRUTH["v_C"], upper.text}
     assert found[-1][1] == pytest.approx(3.0, rel=0.05)
 
@@ -118,7 +131,8 @@ def test_ensembles_give_intervals_and_leave_the_global_generator(motions: list[R
 
 @pytest.mark.parametrize("nonlinear", [False, True])
 def test_all_routes_are_one(nonlinear: bool) -> None:
-    """Rollout, torchdiffeq and scipy through the same terms; the batched right-hand side as well."""
+    """Rollout, torchdiffeq and scipy through the same terms; the batched right-hand side as
+    well."""
     product = Term("x_C |v_C|", "m m/s", (Factor({"x_C": 1.0}), Factor({"v_C": 1.0}, "abs")))
     extra = {"v_C": [(friction(R, 0.01)["v_C"][1], 5.0), (product, -1e6)]} if nonlinear else None
     model = truth(extra)
@@ -129,12 +143,13 @@ def test_all_routes_are_one(nonlinear: bool) -> None:
     model.signal = Held(torch.from_numpy(t), torch.from_numpy(u))
     with torch.no_grad():
         slow = odeint(
-            model, torch.from_numpy(y0), torch.from_numpy(t), method="rk4", options={"step_size": 2e-5}
+            model, torch.from_numpy(y0), torch.from_numpy(t), method="rk4",
+            options={"step_size": 2e-5}
         ).numpy()  # fmt: skip
     rates = lambda yw: model.rates(yw).detach().numpy()
     scipys = solve_ivp(
-        lambda when, y: rates(torch.from_numpy(np.concatenate((y, [np.interp(when, t, column) for column in u.T])))),
-        (t[0], t[-1]), y0, "LSODA", t, rtol=1e-9, atol=1e-12,
+        lambda when, y: rates(torch.from_numpy(np.concatenate((y, [np.interp(when, t,
+        column) for column in u.T])))), (t[0], t[-1]), y0, "LSODA", t, rtol=1e-9, atol=1e-12,
     ).y.T  # fmt: skip
     size = np.abs(scipys).max(0)
     assert np.abs(slow - scipys).max(0) / size == pytest.approx(0, abs=1e-5)
@@ -144,19 +159,24 @@ def test_all_routes_are_one(nonlinear: bool) -> None:
 
 
 def test_gradients_through_torchdiffeq_are_those_of_the_rollout() -> None:
-    """d x_C(0.02 s) by a coefficient, a gain and y0, against central differences of the exact rollout."""
+    """d x_C(0.02 s) by a coefficient, a gain and y0, against central differences of the exact
+    rollout."""
     model, one = truth(), motion(truth(), 3, duration=0.02)
     t, u, y0 = one.t, one.columns(model.outer), one.columns(STATES)[0]
     model.signal = Held(torch.from_numpy(t), torch.from_numpy(u))
     start = torch.from_numpy(y0).requires_grad_()
-    odeint(model, start, torch.from_numpy(t), method="rk4", options={"step_size": 5e-5})[-1, 0].backward()
+    odeint(model, start, torch.from_numpy(t), method="rk4", options={"step_size": 5e-5})[
+        -1, 0
+    ].backward()
     with torch.no_grad():
         values, ends = [model.coefficients.clone(), model.gains.clone()], []
         for h in (1e-5, -1e-5):  # along all coefficients, gains and the start at once
             for parameter, value in zip((model.coefficients, model.gains), values):
                 parameter.copy_(value * (1 + h))
             ends.append(model.rollout(t, y0 * (1 + h), u).y[-1, 0])
-    pairs = zip((model.coefficients.grad, model.gains.grad, start.grad), (*values, torch.from_numpy(y0)))
+    pairs = zip(
+        (model.coefficients.grad, model.gains.grad, start.grad), (*values, torch.from_numpy(y0))
+    )
     slope = sum(float((grad * value).sum()) for grad, value in pairs if grad is not None)
     assert slope == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-4)
 
@@ -165,7 +185,9 @@ def test_gradients_through_torchdiffeq_are_those_of_the_rollout() -> None:
 def test_divergence_is_reported_with_its_time(nonlinear: bool) -> None:
     """v' = a v from v = 1 leaves 100 times its scale at ln(100) / a; v' = v^2 blows up at t = 1."""
     square = Term("v_C v_C", "m2/s2", (Factor({"v_C": 1.0}), Factor({"v_C": 1.0})))
-    term, value, when = (square, 1.0, 1 - 1 / BEYOND) if nonlinear else (variable("v_C"), 5.0, np.log(BEYOND) / 5)
+    term, value, when = (
+        (square, 1.0, 1 - 1 / BEYOND) if nonlinear else (variable("v_C"), 5.0, np.log(BEYOND) / 5)
+    )
     model = ReducedModel(("v_C",), (), {}, {"v_C": [(term, value)]})
     out = model.rollout(np.linspace(0, 2, 2001), np.array([1.0]), np.empty((2001, 0)))
     assert out.diverged_at == pytest.approx(when, abs=2e-3)
@@ -177,7 +199,9 @@ def test_divergence_is_reported_with_its_time(nonlinear: bool) -> None:
 def test_a_choice_of_divergent_models_fails_with_the_time(motions: list[Record]) -> None:
     away = {"F_x": {name: -gain for name, gain in LAW["F_x"].items()}}
     with pytest.raises(ValueError, match=r"rollouts stay bounded.*diverged at t = 0\.\d+ s"):
-        choose(assemble(motions, mechanics(R), RECIPE), [motion(truth(), 50)], RECIPE, (0.01,), away)
+        choose(
+            assemble(motions, mechanics(R), RECIPE), [motion(truth(), 50)], RECIPE, (0.01,), away
+        )
 
 
 def changed(one: Record, name: str, values: np.ndarray) -> Record:
@@ -185,25 +209,33 @@ def changed(one: Record, name: str, values: np.ndarray) -> Record:
 
 
 BAD: list[tuple[Callable[[Record, dict[str, list[Term]]], object], str]] = [
-    (lambda one, terms: assemble([changed(one, "omega", np.where(one.t > 0.1, np.nan, 0.0))], terms, RECIPE),
+    (lambda one, terms: assemble([changed(one, "omega", np.where(one.t > 0.1, np.nan, 0.0))], terms,
+    RECIPE),
      "'omega' has values that are not finite"),
     (lambda one, terms: assemble([changed(one, "F_x", np.full(len(one.t), 3.0))], terms, RECIPE),
      r"column `F_x` of v_Br' is constant \(3\)"),
-    (lambda one, terms: assemble([one], terms | {"v_C": [variable("x_C"), variable("x_Br"), terms["v_C"][0]]}, RECIPE),
+    (lambda one, terms: assemble([one], terms | {"v_C": [variable("x_C"), variable("x_Br"),
+    terms["v_C"][0]]}, RECIPE),
      r"column `.*` of v_C' is a combination of the other columns"),
     (lambda one, terms: assemble([one], terms, replace(RECIPE, domains=40)),
      r"too little data for v_C'.*`v_C`; at least 10 rows"),
-    (lambda one, terms: assemble([one, one.part(0, 10)], terms, RECIPE), "the shortest record is 10 samples"),
-    (lambda one, terms: assemble([one, Record(2 * one.t, one.series)], terms, RECIPE), "one time step"),
-    (lambda one, terms: assemble([Record(one.t, {k: v for k, v in one.series.items() if k != "F_x"})], terms, RECIPE),
+    (lambda one, terms: assemble([one, one.part(0, 10)], terms, RECIPE), "the shortest record is "
+                                                                         "10 samples"),
+    (lambda one, terms: assemble([one, Record(2 * one.t, one.series)], terms, RECIPE),
+    "one time step"),
+    (lambda one, terms: assemble([Record(one.t, {k: v for k,
+    v in one.series.items() if k != "F_x"})], terms, RECIPE),
      "no series F_x"),
-    (lambda one, terms: ReducedModel(("v_C",), (), {}, {"v_C": [(variable("F_y"), 1.0)]}), "needs the variable 'F_y'"),
+    (lambda one, terms: ReducedModel(("v_C",), (), {}, {"v_C": [(variable("F_y"), 1.0)]}),
+    "needs the variable 'F_y'"),
     (lambda one, terms: truth()(0.0, torch.zeros(6, dtype=torch.float64)), "set `signal`"),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("call", "sentence"), BAD)
-def test_bad_data_are_refused_by_name(motions: list[Record], call: Callable[..., object], sentence: str) -> None:
+def test_bad_data_are_refused_by_name(
+    motions: list[Record], call: Callable[..., object], sentence: str
+) -> None:
     with pytest.raises(ValueError, match=sentence):
         call(motions[0], mechanics(R))
 
@@ -224,7 +256,9 @@ def test_equations_read_in_text_and_latex() -> None:
     latex = model.latex()
     assert r"1.15\cdot 10^{5}\,(x_{Br} - 2 x_C)" in latex
     assert r"\frac{d}{dt} \dot\theta &= - 1.1\cdot 10^{7}\,(x_{Br} + 2 r \theta)" in latex
-    assert friction(R, 0.01)["v_Br"][0].latex == r"\tanh((\dot x_{Br} - \dot x_C + r \dot\theta)/0.01)"
+    assert (
+        friction(R, 0.01)["v_Br"][0].latex == r"\tanh((\dot x_{Br} - \dot x_C + r \dot\theta)/0.01)"
+    )
 
 
 def test_records_of_a_run_and_of_a_dataset_are_the_same() -> None:
@@ -233,7 +267,9 @@ def test_records_of_a_run_and_of_a_dataset_are_the_same() -> None:
     x_0, y_Br = (float(model.unpack(y0).pose[name][i]) for name, i in (("disc", 0), ("bracket", 1)))
     roll = Profile([0.0, 0.2], [x_0, x_0 + 1e-3])
     reference = Reference(x_d=roll, y_d=Profile([0.0], [y_Br]), F_ff=Profile([0.0], [-60.0]))
-    run = simulate(model, torch.linspace(0, 0.2, 101, dtype=torch.float64), y0=y0, reference=reference)
+    run = simulate(
+        model, torch.linspace(0, 0.2, 101, dtype=torch.float64), y0=y0, reference=reference
+    )
     one, series = record(run), run.to_dataset()
     other = record({name: torch.from_numpy(series[name].values) for name in series}, run.t)
     assert all(np.array_equal(one.series[name], other.series[name]) for name in one.series)
@@ -244,7 +280,9 @@ def test_records_of_a_run_and_of_a_dataset_are_the_same() -> None:
     assert (late.t[0], late.series["theta"][0]) == (pytest.approx(0.1), 0.0)
     rough = noisy(one, 0.05, 0)
     assert np.array_equal(rough.series["x_d"], one.series["x_d"])
-    assert np.std(rough.series["v_C"] - one.series["v_C"]) == pytest.approx(0.05 * one.series["v_C"].std(), rel=0.3)
+    assert np.std(rough.series["v_C"] - one.series["v_C"]) == pytest.approx(
+        0.05 * one.series["v_C"].std(), rel=0.3
+    )
     values = series["disc_spin"].values.copy()
     values[50] = np.nan
     with pytest.raises(ValueError, match=r"'omega' \(disc_spin\) .* first at t = 0.1 s"):
@@ -252,10 +290,15 @@ def test_records_of_a_run_and_of_a_dataset_are_the_same() -> None:
 
 
 def test_a_run_without_any_series_of_a_record_is_refused() -> None:
-    ready = template("t").override(outputs={"duration": 0.02, "interval": 5e-3, "snapshots": ()}).build()
+    ready = (
+        template("t")
+        .override(outputs={"duration": 0.02, "interval": 5e-3, "snapshots": ()})
+        .build()
+    )
     run = simulate(ready.rig, ready.t, y0=ready.y0)
     with pytest.raises(
-        ValueError, match=r"`source` has none of disc_position, .*, desired_x.*; take a run of `SoftGrasp`"
+        ValueError,
+        match=r"`source` has none of disc_position, .*, desired_x.*; take a run of `SoftGrasp`",
     ):
         record(run)
 

@@ -1,4 +1,5 @@
-"""The reduced models at smoke size: what is found agrees with mechanics, and with the full model where it is used."""
+"""The reduced models at smoke size: what is found agrees with mechanics, and with the full model
+where it is used."""
 
 import json
 from pathlib import Path
@@ -15,7 +16,9 @@ def test_reduced_model_smoke(tmp_path: Path) -> None:
     stick, slip, gain = numbers["stick"], numbers["slip"], numbers["gain_sweep"]
     assert stick["terms"] <= 10
     assert stick["heldout_nrmse"] < 0.02
-    assert stick["rolling_radius_mm"]["found"] == pytest.approx(stick["rolling_radius_mm"]["expected"], rel=0.03)
+    assert stick["rolling_radius_mm"]["found"] == pytest.approx(
+        stick["rolling_radius_mm"]["expected"], rel=0.03
+    )
     found = {(row["equation"], row["term"]): row for row in stick["coefficients"]}
     for term in ("x_Br - 2 x_C", "v_Br - 2 v_C"):
         row = found["v_C", term]
@@ -25,9 +28,13 @@ def test_reduced_model_smoke(tmp_path: Path) -> None:
     assert slip["heldout_nrmse"] < 0.1
     fastest = min(slip["by_stroke"], key=lambda row: row["stroke_time_s"])
     assert fastest["slipping"] > 0.5
-    assert fastest["nrmse_linear"] > 2 * fastest["nrmse"]  # saturation is what the faster strokes need
+    assert (
+        fastest["nrmse_linear"] > 2 * fastest["nrmse"]
+    )  # saturation is what the faster strokes need
     confirmed = gain["confirmed"][0]
     assert confirmed["full_dies_out"]
-    assert confirmed["reduced"]["overshoot"] == pytest.approx(confirmed["full"]["overshoot"], abs=0.02)
+    assert confirmed["reduced"]["overshoot"] == pytest.approx(
+        confirmed["full"]["overshoot"], abs=0.02
+    )
     assert len(module.figure(result).axes) == 3
     assert "| stick |" in module.table(result)

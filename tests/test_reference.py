@@ -1,4 +1,5 @@
-"""The paper's manipulation and light shaking as the first edition of the engine computed them, and their gradients."""
+"""The paper's manipulation and light shaking as the first edition of the engine computed them, and
+their gradients."""
 
 import json
 from pathlib import Path
@@ -24,7 +25,8 @@ RELATIVE = 1e-8
 
 
 def held_displacements(model: SoftGrasp, y0: Tensor) -> Tensor:
-    """y0 as a function of E, nu and depth that leaves the pads where they are: the reference's gradients hold displacements."""
+    """y0 as a function of E, nu and depth that leaves the pads where they are: the reference's
+    gradients hold displacements."""
     y = y0.clone()
     for name, pad in model.pads.items():
         C, where = pad.compliance(), model.layout.slices["pads", name]
@@ -38,7 +40,11 @@ def series(run: Trajectory) -> dict[str, Tensor]:
     out: dict[str, Tensor] = dict(run.channels)
     for kind in ("energy", "dissipated", "supplied"):
         out |= {f"{kind}.{name}": value for name, value in getattr(run, kind).items()}
-    out |= {f"sum_{n}_{k}": run.force[k][..., i].sum(1) for k in "LU" for i, n in enumerate(("F_N", "F_T"))}
+    out |= {
+        f"sum_{n}_{k}": run.force[k][..., i].sum(1)
+        for k in "LU"
+        for i, n in enumerate(("F_N", "F_T"))
+    }
     return {name: value.detach() for name, value in (out | {"injected": run.injected}).items()}
 
 
@@ -52,7 +58,8 @@ def manipulation() -> tuple[SoftGrasp, Trajectory]:
 
 
 def test_the_manipulation_is_the_reference(manipulation: tuple[SoftGrasp, Trajectory]) -> None:
-    """Poses, rates, efforts, sums of nodal forces, energies, dissipation and work at seven moments."""
+    """Poses, rates, efforts, sums of nodal forces, energies, dissipation and work at seven
+    moments."""
     _, run = manipulation
     found, reference = series(run), REFERENCE["manipulation"]
     rows = [run.at(time) for time in reference["t"]]
@@ -68,7 +75,9 @@ def test_the_manipulation_is_the_reference(manipulation: tuple[SoftGrasp, Trajec
         assert touching == [9, 11, 11 if k == "L" else 10, 10, 11, 11, 11]
 
 
-def test_gradients_of_the_manipulation_are_the_references(manipulation: tuple[SoftGrasp, Trajectory]) -> None:
+def test_gradients_of_the_manipulation_are_the_references(
+    manipulation: tuple[SoftGrasp, Trajectory],
+) -> None:
     model, run = manipulation
     reference = REFERENCE["gradient_of_theta_10s"]
     names = list(reference["by"])
@@ -77,14 +86,24 @@ def test_gradients_of_the_manipulation_are_the_references(manipulation: tuple[So
     assert len(sure) == 18
     for name, gradient in zip(names, found):
         bound = RELATIVE + 2 * reference["uncertainty"][name]
-        assert gradient.item() == pytest.approx(reference["by"][name], rel=RELATIVE if name in sure else bound), name
+        assert gradient.item() == pytest.approx(
+            reference["by"][name], rel=RELATIVE if name in sure else bound
+        ), name
 
 
 def test_light_shaking_is_the_reference() -> None:
-    """Nodes touch, leave and slip all along; the angle's derivatives by one pass forward, with those of the start."""
+    """Nodes touch, leave and slip all along; the angle's derivatives by one pass forward, with
+    those of the start."""
     reference = REFERENCE["light_shaking"]
-    excitation, y_Br = CATALOGUE["light shaking"], reference["y_Br_start"]  # to seven digits `apart`
-    model, y0 = begin(excitation, Parameters().override({"contact.v_s": 0.05}), grasp_force=reference["grasp_force"])
+    excitation, y_Br = (
+        CATALOGUE["light shaking"],
+        reference["y_Br_start"],
+    )  # to seven digits `apart`
+    model, y0 = begin(
+        excitation,
+        Parameters().override({"contact.v_s": 0.05}),
+        grasp_force=reference["grasp_force"],
+    )
     y0[model.layout.slices["pose", "bracket"].start + 1] = y_Br
     model.reference = excited(excitation, model, y_Br, reference["grasp_force"])
     names = list(reference["theta_end_by"])
@@ -95,10 +114,23 @@ def test_light_shaking_is_the_reference() -> None:
             held_displacements(model, y0),
             torch.zeros(model.layout.size, dtype=torch.float64, requires_grad=True),
         )
-        (pulled,) = torch.autograd.grad((keep * ones).sum(), p, create_graph=True, allow_unused=True)
-        columns.append(torch.zeros_like(y0) if pulled is None else torch.autograd.grad(pulled, ones)[0])
+        (pulled,) = torch.autograd.grad(
+            (keep * ones).sum(), p, create_graph=True, allow_unused=True
+        )
+        columns.append(
+            torch.zeros_like(y0) if pulled is None else torch.autograd.grad(pulled, ones)[0]
+        )
     t = torch.linspace(0, 2, 401, dtype=torch.float64)
-    run = simulate(model, t, y0=y0, step=5e-4, gradient="forward", wrt=names, dy0=torch.stack(columns, -1), rigid=True)
+    run = simulate(
+        model,
+        t,
+        y0=y0,
+        step=5e-4,
+        gradient="forward",
+        wrt=names,
+        dy0=torch.stack(columns, -1),
+        rigid=True,
+    )
     found = series(run)
     for name, value in reference["end"].items():
         extent = float(found[name].max() - found[name].min())
@@ -113,12 +145,18 @@ def test_statics_and_loop_modes_are_the_references(case: str, changes: dict[str,
     expected, model = REFERENCE["statics"][case], SoftGrasp(Parameters().override(changes))
     with torch.no_grad():
         y = press(model, model.settings.scenario.y_Br_grasp)
-        assert float(model.unpack(rest(model)).pose["disc"][1]) == pytest.approx(expected["rest_y_C"], abs=1e-12)
-        assert float(model.unpack(y).pose["disc"][1]) == pytest.approx(expected["press_y_C"], abs=1e-12)
+        assert float(model.unpack(rest(model)).pose["disc"][1]) == pytest.approx(
+            expected["rest_y_C"], abs=1e-12
+        )
+        assert float(model.unpack(y).pose["disc"][1]) == pytest.approx(
+            expected["press_y_C"], abs=1e-12
+        )
     assert holding_force(model, y) == pytest.approx(expected["holding_force"], rel=1e-9)
     modes = loop_modes(model)
     assert int((modes.abs() < NEUTRAL).sum()) == expected["neutral_modes"]
     creep = (modes + 1 / model.settings.pad.tau).abs() < 1e-3  # of nodes clear of the disc
     leading = modes[(modes.abs() > NEUTRAL) & ~creep & (modes.imag >= 0)][:4]
     got = torch.stack((leading.real, leading.imag), -1)
-    assert torch.allclose(got, torch.tensor(expected["leading_modes"], dtype=torch.float64), rtol=1e-4, atol=1e-2)
+    assert torch.allclose(
+        got, torch.tensor(expected["leading_modes"], dtype=torch.float64), rtol=1e-4, atol=1e-2
+    )

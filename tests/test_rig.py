@@ -33,12 +33,14 @@ def test_a_rig_of_lists_is_the_papers() -> None:
     law = SoftContact(c.K_n, c.R_n, c.K_t, c.R_t, friction=SmoothSlip(c.mu_s, c.mu_k, c.v_s, c.eta))
     mesh = PadMesh(p.pad.length, p.pad.height, p.pad.elements_x, p.pad.elements_y)
     rig = Rig(
-        bodies={"disc": Body(p.disc.mass, Circle(p.disc.radius)), "bracket": Body(p.bracket.mass, theta=0.0, weighted=False)},
-        pads={"L": Pad(mesh, rubber),
-              "U": Pad(mesh, rubber, base="bracket", origin=(-p.pad.length / 2, -p.bracket.cm_height), mirrored=True)},
+        bodies={"disc": Body(p.disc.mass, Circle(p.disc.radius)),
+        "bracket": Body(p.bracket.mass, theta=0.0, weighted=False)}, pads={"L": Pad(mesh, rubber),
+              "U": Pad(mesh, rubber, base="bracket",
+              origin=(-p.pad.length / 2, -p.bracket.cm_height), mirrored=True)},
         contacts={"U": Contact("U", "disc", law), "L": Contact("L", "disc", law)},
         actuators={"x": Actuator("disc.x", "bracket.x", PD(k.K_81, k.R_80), setpoint="x_d"),
-                   "y": Actuator("bracket.y", "bracket.y", PD(k.K_98, k.R_99), setpoint="y_d", feed_forward="F_ff")},
+                   "y": Actuator("bracket.y", "bracket.y", PD(k.K_98, k.R_99), setpoint="y_d",
+                   feed_forward="F_ff")},
         reference=model.reference,
     )  # fmt: skip
     y = random_state(model, 4)
@@ -46,7 +48,8 @@ def test_a_rig_of_lists_is_the_papers() -> None:
         assert torch.equal(rig(0.0, y), model(0.0, y))
 
 
-# names --------------------------------------------------------------------------------------------------------------
+# names
+# ----------------------------------------------------------------------
 
 
 def test_the_radius_of_a_box_is_not_the_discs() -> None:
@@ -68,23 +71,33 @@ def test_parameters_have_the_names_of_the_settings() -> None:
     own = {own for own, p in model.named_parameters() if p.ndim == 0 and p.requires_grad}
     assert own == {NAMES[name] for name in NAMES} - {NAMES["contact.epsilon"]}
     for name, module_name in NAMES.items():
-        assert model.parameter(name) is model.parameter(module_name) is model.get_parameter(module_name)
-    with pytest.raises(ValueError, match=r"`pad.Young` is not a parameter of this rig; known: .*pad\.E"):
+        assert (
+            model.parameter(name)
+            is model.parameter(module_name)
+            is model.get_parameter(module_name)
+        )
+    with pytest.raises(
+        ValueError, match=r"`pad.Young` is not a parameter of this rig; known: .*pad\.E"
+    ):
         model.parameter("pad.Young")
     rolling = SoftGrasp(Parameters().override({"contact.friction": "coulomb"}))
     with pytest.raises(ValueError, match=r"`contact.v_s` is not a parameter"):
         rolling.parameter("contact.v_s")
 
 
-# bodies, loops and states -------------------------------------------------------------------------------------------
+# bodies, loops and states
+# ----------------------------------------------------------------------
 
 
 @torch.no_grad()
 def test_the_papers_controllers() -> None:
-    """Eq. 31-34: the horizontal loop measures the disc, the vertical one the bracket, and both push the bracket."""
+    """Eq. 31-34: the horizontal loop measures the disc, the vertical one the bracket, and both push
+    the bracket."""
     model = coarse()
     state = model.unpack(grasped(model, (0.02, -0.01)))
-    state = state._replace(pose=state.pose | {"bracket": state.pose["bracket"] + f64(1e-3, 2e-3, 0.0)})
+    state = state._replace(
+        pose=state.pose | {"bracket": state.pose["bracket"] + f64(1e-3, 2e-3, 0.0)}
+    )
     t = f64(0.0)[0]
     signals = model.follow(t)
     F_x, F_y = (float(model.actuator_effort(name, state, signals)) for name in "xy")
@@ -96,7 +109,9 @@ def test_the_papers_controllers() -> None:
 
 def test_bodies_know_their_inertia() -> None:
     assert Body(2.0, Circle(0.1)).inertia.item() == pytest.approx(0.5 * 2.0 * 0.01, rel=1e-15)
-    assert Body(2.0, Ellipse(0.3, 0.1)).inertia.item() == pytest.approx(0.25 * 2.0 * (0.09 + 0.01), rel=1e-15)
+    assert Body(2.0, Ellipse(0.3, 0.1)).inertia.item() == pytest.approx(
+        0.25 * 2.0 * (0.09 + 0.01), rel=1e-15
+    )
     assert Body(2.0, Circle(0.1), inertia=0.7).inertia.item() == 0.7
     radius = Body(2.0, Circle(0.1))
     (slope,) = torch.autograd.grad(radius.inertia, radius.shape.radius)
@@ -110,15 +125,18 @@ def test_sizes_of_the_papers_rig() -> None:
     assert layout.shapes["pads", "L"] == (1, 61, 2)
     assert layout.free == {"disc": [0, 1, 2], "bracket": [0, 1]}
     inertial = coarse(pad__fidelity="inertial").layout
-    assert inertial.shapes["pads", "U"] == inertial.shapes["rates", "U"] == (122, 2)  # two elements high, the base held
+    assert (
+        inertial.shapes["pads", "U"] == inertial.shapes["rates", "U"] == (122, 2)
+    )  # two elements high, the base held
     assert turning().layout.size == layout.size + 2
 
 
 def test_what_is_not_free_is_filled_in() -> None:
-    """A driven coordinate comes from its signal at t, a fixed one from its number; neither is in the vector."""
+    """A driven coordinate comes from its signal at t, a fixed one from its number; neither is in
+    the vector."""
     rig = Rig(
-        bodies={"a": Body(1.0, Circle(0.01), x="driven", y=0.25), "b": Body(1.0, theta=0.1)}, pads={}, contacts={},
-        reference=hold(**{"a.x": 0.7}),
+        bodies={"a": Body(1.0, Circle(0.01), x="driven", y=0.25), "b": Body(1.0, theta=0.1)},
+        pads={}, contacts={}, reference=hold(**{"a.x": 0.7}),
     )  # fmt: skip
     assert rig.signals == ("a.x",)
     assert rig.layout.size == 2 * (1 + 2)

@@ -1,4 +1,5 @@
-"""Every shape, material, pad and control law that a rig file may have, and rigs that make no sense."""
+"""Every shape, material, pad and control law that a rig file may have, and rigs that make no
+sense."""
 
 import io
 import json
@@ -33,9 +34,16 @@ from torchsoft.rigs.written import template, to_toml
 SQUARE = [[-20e-3, -20e-3], [20e-3, -20e-3], [16e-3, 20e-3], [-16e-3, 20e-3]]
 RUBBER = {"E": 0.75e6, "depth": 44e-3}
 COARSE = {
-    "length": 80e-3, "height": 5e-3, "elements_x": 40, "elements_y": 2, "origin": [-40e-3, 0.0], "material": "rubber"
+    "length": 80e-3, "height": 5e-3, "elements_x": 40, "elements_y": 2, "origin": [-40e-3, 0.0],
+    "material": "rubber"
 }  # fmt: skip
-TIP = {"kind": "fingertip", "radius": 20e-3, "elements_around": 28, "origin": [-20e-3, 0.0], "material": "rubber"}
+TIP = {
+    "kind": "fingertip",
+    "radius": 20e-3,
+    "elements_around": 28,
+    "origin": [-20e-3, 0.0],
+    "material": "rubber",
+}
 
 SHAPES: dict[str, tuple[dict[str, Any], type]] = {
     "superellipse": ({"a": 20e-3, "b": 20e-3, "n": 3.0}, Superellipse),
@@ -52,7 +60,10 @@ MATERIALS: dict[str, tuple[dict[str, Any], type]] = {
 PADS: dict[str, tuple[dict[str, Any], type[Mesh]]] = {
     "curved": (COARSE | {"radius": 0.2}, CurvedPadMesh),
     "fingertip": (TIP, FingertipMesh),
-    "mesh": ({"file": "pad.msh", "unit": "mm", "material": "rubber", "origin": [-40e-3, 0.0]}, QuadMesh),
+    "mesh": (
+        {"file": "pad.msh", "unit": "mm", "material": "rubber", "origin": [-40e-3, 0.0]},
+        QuadMesh,
+    ),
 }
 
 
@@ -69,7 +80,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rows = [f"{x},{y}" for x, y in zip(r * np.cos(turn) + 3, r * np.sin(turn))]
     (path / "pear.csv").write_text("\n".join(["x [mm],y [mm]", *rows]), encoding="utf-8")
     (path / "material.toml").write_text(
-        '[materials.test]\nkind = "prony"\nE = 5e5\nmoduli = [1e5]\ntau = [0.1]\ndepth = 1e-2\n', encoding="utf-8"
+        '[materials.test]\nkind = "prony"\nE = 5e5\nmoduli = [1e5]\ntau = [0.1]\ndepth = 1e-2\n',
+        encoding="utf-8",
     )
     mesh = PadMesh(80e-3, 5e-3, 40, 2)
     sides = [np.stack((mesh.edge(name)[:-1], mesh.edge(name)[1:]), -1) for name in ("face", "base")]
@@ -108,7 +120,9 @@ def changed(tree: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
     for name, value in changes.items():
         old = tree.get(name)
         inner = (
-            isinstance(old, dict) and isinstance(value, dict) and value.get("kind", old.get("kind")) == old.get("kind")
+            isinstance(old, dict)
+            and isinstance(value, dict)
+            and value.get("kind", old.get("kind")) == old.get("kind")
         )
         tree[name] = changed(dict(old), value) if inner and isinstance(old, dict) else value
     return {name: value for name, value in tree.items() if value is not None}
@@ -117,7 +131,11 @@ def changed(tree: dict[str, Any], changes: dict[str, Any]) -> dict[str, Any]:
 def coarse_tree() -> dict[str, Any]:
     """The template on a coarse mesh."""
     tree = template("t").model_dump(exclude_unset=True)
-    return tree | {"pads": {name: pad | {"elements_x": 40, "elements_y": 2} for name, pad in tree["pads"].items()}}
+    return tree | {
+        "pads": {
+            name: pad | {"elements_x": 40, "elements_y": 2} for name, pad in tree["pads"].items()
+        }
+    }
 
 
 def rig(folder: Path, **changes: Any) -> RigFile:
@@ -136,21 +154,41 @@ def runs(file: RigFile) -> Trajectory:
     return done.trajectory
 
 
-# shapes, materials, pads ---------------------------------------------------------------------------------------------
+# shapes, materials, pads
+# ----------------------------------------------------------------------
 
 
 def in_a_rig(kind: str, table: dict[str, Any]) -> dict[str, Any]:
     """Changes of the template that put a part of a kind into it."""
     if kind in SHAPES:
-        return {"bodies": {"disc": {"shape": {"kind": kind} | table, "mass": None, "density": 7800.0, "depth": 20e-3}}}
+        return {
+            "bodies": {
+                "disc": {
+                    "shape": {"kind": kind} | table,
+                    "mass": None,
+                    "density": 7800.0,
+                    "depth": 20e-3,
+                }
+            }
+        }
     if kind in MATERIALS:
         return {"materials": {"rubber": {"kind": kind} | table}}
-    pads = {"lower": {"kind": kind} | table, "upper": {"kind": kind, "base": "bracket", "mirrored": True} | table}
-    higher = {"bodies": {"bracket": {"start": {"y": 80.1e-3}}}, "motion": {"y_d": {"values": ["start", 79e-3]}}}
+    pads = {
+        "lower": {"kind": kind} | table,
+        "upper": {"kind": kind, "base": "bracket", "mirrored": True} | table,
+    }
+    higher = {
+        "bodies": {"bracket": {"start": {"y": 80.1e-3}}},
+        "motion": {"y_d": {"values": ["start", 79e-3]}},
+    }
     return {"pads": pads} | (higher if kind == "fingertip" else {})
 
 
-RUN = ["rounded_box", "curved", *slow("superellipse", "rounded_polygon", "contour", "fingertip", "mesh")]
+RUN = [
+    "rounded_box",
+    "curved",
+    *slow("superellipse", "rounded_polygon", "contour", "fingertip", "mesh"),
+]
 
 
 @pytest.mark.parametrize("kind", [*MATERIALS, *RUN])
@@ -164,13 +202,20 @@ def test_every_kind_of_part_is_built_written_and_runs(kind: str, folder: Path) -
     assert again.model_dump() == file.model_dump()
     if kind in SHAPES:
         assert disc.mass.item() == pytest.approx(7800 * 20e-3 * disc.shape.area().item(), rel=1e-12)
-        assert disc.inertia.item() == pytest.approx(disc.mass.item() * disc.shape.gyration().item(), rel=1e-12)
+        assert disc.inertia.item() == pytest.approx(
+            disc.mass.item() * disc.shape.gyration().item(), rel=1e-12
+        )
     if kind in MATERIALS:
         assert pad.material.depth.item() == table["depth"]
-        assert kind != "preset" or pad.material.E.item() == PRESETS["Dragon Skin 20"].coefficients["E"].value
+        assert (
+            kind != "preset"
+            or pad.material.E.item() == PRESETS["Dragon Skin 20"].coefficients["E"].value
+        )
         assert kind != "file" or pad.material.get_parameter("E_1").item() == 1e5
     else:
-        assert float(runs(file).load["disc"][0, 1]) == pytest.approx(disc.mass.item() * 9.81, rel=1e-3)  # it rests
+        assert float(runs(file).load["disc"][0, 1]) == pytest.approx(
+            disc.mass.item() * 9.81, rel=1e-3
+        )  # it rests
 
 
 def test_parts_of_two_builds_are_not_the_same(folder: Path) -> None:
@@ -185,7 +230,10 @@ def test_parts_of_two_builds_are_not_the_same(folder: Path) -> None:
 
 def test_a_mesh_from_a_file_is_the_block_that_it_was_made_of(folder: Path) -> None:
     table = {"kind": "mesh", **PADS["mesh"][0]}
-    found = [float(rig(folder, **change).build().y0[:-12].abs().sum()) for change in ({}, {"pads": {"lower": table}})]
+    found = [
+        float(rig(folder, **change).build().y0[:-12].abs().sum())
+        for change in ({}, {"pads": {"lower": table}})
+    ]
     assert found[0] == pytest.approx(found[1], rel=1e-9)
 
 
@@ -207,8 +255,12 @@ def test_the_middle_of_a_hollow_pad_is_below_its_ends(folder: Path) -> None:
     assert at.depth(np.array([39.999e-3, 3e-3])) == pytest.approx(sag, rel=1e-2)
     pads = dict(ready.rig.pads)
     for bottom, overlap in ((6e-3, False), (2e-3, True)):
-        inner = file.override(pads={"upper": {"length": 10e-3, "elements_x": 8, "base": None, "mirrored": False}})
-        inner = inner.override(pads={"upper": {"origin": [-5e-3, bottom]}}, contacts={"upper": {"may_leave": True}})
+        inner = file.override(
+            pads={"upper": {"length": 10e-3, "elements_x": 8, "base": None, "mirrored": False}}
+        )
+        inner = inner.override(
+            pads={"upper": {"origin": [-5e-3, bottom]}}, contacts={"upper": {"may_leave": True}}
+        )
         small = inner.pads["upper"].build(ready.rig.pads["lower"].material, folder)
         assert (collision(pads["lower"], small, pose) > 1e-6) == overlap
 
@@ -238,7 +290,9 @@ def test_a_mesh_is_counted_before_it_is_built(mesh: Mesh) -> None:
     """As it is counted of itself, as of those in files."""
     assert mesh.counts()[:2] == (len(mesh.face), len(mesh.free))
     surface, free, band = Mesh.counts(mesh)
-    assert mesh.memory == pytest.approx(8 * 4 * free * (4 * surface + 4 * min(band, free // band)) / 2**30, rel=0.3)
+    assert mesh.memory == pytest.approx(
+        8 * 4 * free * (4 * surface + 4 * min(band, free // band)) / 2**30, rel=0.3
+    )
 
 
 CONDENSING = """
@@ -263,16 +317,21 @@ for mesh in (
 """
 
 
-@pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="the peak of memory is Linux's")
+@pytest.mark.skipif(
+    not Path("/proc/self/clear_refs").exists(), reason="the peak of memory is Linux's"
+)
 def test_the_memory_of_a_pad_is_estimated_before_it_is_built() -> None:
     """By the order of what condensing takes at its peak."""
-    lines = subprocess.run([sys.executable, "-c", CONDENSING], capture_output=True, text=True, check=True).stdout
+    lines = subprocess.run(
+        [sys.executable, "-c", CONDENSING], capture_output=True, text=True, check=True
+    ).stdout
     taken = [float(line) for line in lines.splitlines()]
     assert len(taken) == 3
     assert all(0.6 < one < 1.3 for one in taken), taken
 
 
-# control laws --------------------------------------------------------------------------------------------------------
+# control laws
+# ----------------------------------------------------------------------
 
 
 def test_a_network_from_a_file_is_the_module_in_python(folder: Path) -> None:
@@ -295,61 +354,114 @@ def test_a_network_from_a_file_is_the_module_in_python(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("arrays", "sentence"),
     [
-        ({"0.weight": np.zeros((1, 3)), "0.bias": np.zeros(1)}, r"0\.weight has the shape \(1, 3\)"),
+        (
+            {"0.weight": np.zeros((1, 3)), "0.bias": np.zeros(1)},
+            r"0\.weight has the shape \(1, 3\)",
+        ),
         ({"0.weight": np.zeros((2, 4)), "0.bias": np.zeros(2)}, r"must have \(1, 4\) and \(1,\)"),
         ({"a": np.zeros(3)}, r"it has a, but a network has 0\.weight, 0\.bias"),
-        ({"0.weight": np.full((1, 4), np.nan), "0.bias": np.zeros(1)}, r"0\.weight must be finite numbers"),
+        (
+            {"0.weight": np.full((1, 4), np.nan), "0.bias": np.zeros(1)},
+            r"0\.weight must be finite numbers",
+        ),
         ({"0.weight": np.zeros((600, 4)), "0.bias": np.zeros(600)}, r"more than 2000 numbers"),
-        ({"0.weight": np.array([object()]), "0.bias": np.zeros(1)}, r"is not an \.npz file of numbers: Object arrays"),
+        (
+            {"0.weight": np.array([object()]), "0.bias": np.zeros(1)},
+            r"is not an \.npz file of numbers: Object arrays",
+        ),
     ],
 )
-def test_weights_that_are_no_network_are_refused(tmp_path: Path, arrays: dict[str, Any], sentence: str) -> None:
+def test_weights_that_are_no_network_are_refused(
+    tmp_path: Path, arrays: dict[str, Any], sentence: str
+) -> None:
     np.savez(tmp_path / "law.npz", allow_pickle=True, **arrays)
     (found,) = check(rig(tmp_path, actuators={"x": {"network": "law.npz"}}))
     assert (found.severity, found.where) == ("error", "actuators.x.network")
     assert re.search(sentence, found.message), found.message
 
 
-# rigs that make no sense ---------------------------------------------------------------------------------------------
+# rigs that make no sense
+# ----------------------------------------------------------------------
 
 SOFT = {"kind": "kelvin_voigt", "E": 1e5, "nu": 0.45, "tau": 10e-3, "depth": 44e-3}
-WET = {"K_n": 1e5, "R_n": 400.0, "K_t": 1e5, "R_t": 400.0, "friction": {"kind": "smooth", "mu_s": 0.2, "mu_k": 0.1}}
+WET = {
+    "K_n": 1e5,
+    "R_n": 400.0,
+    "K_t": 1e5,
+    "R_t": 400.0,
+    "friction": {"kind": "smooth", "mu_s": 0.2, "mu_k": 0.1},
+}
 
 STONE = {"x": 0.3e-3, "y": 30e-3, "theta": 0.0, "shape": {"kind": "circle", "radius": 5e-3}}
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "misspelt": ({"pads__lower__lenght": 0.1}, r"pads\.lower: `lenght` is not known here; is it `length`\?"),
+    "misspelt": ({"pads__lower__lenght": 0.1}, r"pads\.lower: `lenght` is not known here; is it "
+                                               r"`length`\?"),
     "unknown": ({"gadgets": {}}, r"`gadgets` is not known here; known are title, gravity, bodies"),
-    "millimetres": ({"pads__lower__length": 80.0}, r"pads\.lower\.length: should be from 1e-06 to 10 m, not 80"),
-    "incompressible": ({"materials__rubber__nu": 0.5}, r"materials\.rubber\.nu: should be from -0\.999 to 0\.4999, not 0\.5"),
-    "text": ({"bodies__disc__mass": "heavy"}, r"bodies\.disc\.mass should be a valid number, not 'heavy'"),
-    "freedom": ({"bodies__bracket__theta": "locked"}, r'bodies\.bracket\.theta: should be "free", "driven" or a number'),
-    "friction": ({"laws__dry__friction__mu_k": 0.9}, r"laws\.dry\.friction.*: mu_k must not .* mu_k = 0\.9 > mu_s = 0\.8"),
-    "sort": ({"bodies__disc__shape__kind": "heart"}, r"bodies\.disc\.shape\.kind should be one of .*'circle'.*, not 'heart'"),
-    "no mass": ({"bodies__bracket__mass": None}, r"bodies\.bracket: mass is missing, but x and y can move freely"),
-    "no start": ({"bodies__bracket__start": {"y": None}}, r"bodies\.bracket: start\.y is missing: y is free"),
-    "start of what is fixed": ({"bodies__bracket__start__theta": 0.1}, r"bodies\.bracket: start\.theta has no meaning"),
-    "no such base": ({"pads__upper__base": "braket"}, r"pads\.upper\.base: there is no `braket` among bodies; there is disc"),
-    "pad on its own body": ({"pads__lower__base": "disc"}, r"contacts\.lower: the pad `lower` is bonded to the body `disc`"),
-    "nothing to touch with": ({"contacts__lower__body": "bracket"}, r"contacts\.lower\.body: `bracket` has no shape"),
-    "pushes what is fixed": ({"actuators__x__pushes": "bracket.theta"}, r"actuators\.x\.pushes: bracket\.theta is fixed at 0"),
-    "no such coordinate": ({"actuators__x__pushes": "bracket.z"}, r"`bracket\.z` is not a coordinate; free ones are disc\.x"),
-    "loop without a motion": ({"actuators__x__setpoint": None}, r"actuators\.x: setpoint is missing: the gains Kp and Kd need"),
-    "motion that nothing follows": ({"motion__wave": {"kind": "hold"}}, r"motion\.wave: nothing follows it"),
-    "material of nothing": ({"materials__gel": SOFT}, r"materials\.gel: no pad is made of it; name it as the material of one"),
-    "law of nothing": ({"laws__wet": WET}, r"laws\.wet: no contact follows it; name it as the law of one"),
-    "motion that is missing": ({"actuators__x__setpoint": "w"}, r"motion\.w is missing: bracket\.x is to follow it"),
-    "time goes back": ({"motion__x_d__times": (1.5, 0.5)}, r"motion\.x_d.*: times must increase, but 0\.5 s follows 1\.5 s"),
-    "two ways to step": ({"solver": {"step": 1e-3, "rtol": 1e-4}}, r"solver: step and rtol .*each say which steps to take"),
-    "one motion, two units": ({"actuators__y__feed_forward": "x_d"}, r"motion\.(x_d would be in two units|press: nothing)"),
-    "name": ({"bodies": {"my disc": {"x": 0.0, "y": 0.0, "theta": 0.0}}}, r"bodies\.my disc: the name should be letters"),
-    "taken": ({"bodies": {"keys": {"x": 0.0, "y": 0.0, "theta": 0.0}}}, r"bodies\.keys: the name is taken by torch"),
-    "overlap": ({"bodies": {"stone": STONE}}, r"error: bodies\.disc: it and bodies\.stone overlap by .* mm at t = 0 s"),
-    "no room": ({"motion__y_d__values": ("start", 40e-3)}, r"error: contacts\.upper: `disc` does not fit: at t = 0\.4 s"),
-    "strain": ({"motion__y_d__values": ("start", 45.8e-3)}, r"warning: pads\.\w+: the strain leaves linear elasticity: at"),
-    "steps": ({"solver": {"step": 0.05}}, r"warning: solver\.step: steps of 0\.05 s are too coarse: motion\.y_d goes"),
+    "millimetres": ({"pads__lower__length": 80.0}, r"pads\.lower\.length: should be from 1e-06 to "
+                                                   r"10 m, not 80"),
+    "incompressible": ({"materials__rubber__nu": 0.5}, r"materials\.rubber\.nu: should be from "
+                                                       r"-0\.999 to 0\.4999, not 0\.5"),
+    "text": ({"bodies__disc__mass": "heavy"}, r"bodies\.disc\.mass should be a valid number, not "
+                                              r"'heavy'"),
+    "freedom": ({"bodies__bracket__theta": "locked"}, r'bodies\.bracket\.theta: should be "free", '
+                                                      r'"driven" or a number'),
+    "friction": ({"laws__dry__friction__mu_k": 0.9}, r"laws\.dry\.friction.*: mu_k must not .* "
+                                                     r"mu_k = 0\.9 > mu_s = 0\.8"),
+    "sort": ({"bodies__disc__shape__kind": "heart"}, r"bodies\.disc\.shape\.kind should be one of "
+                                                     r".*'circle'.*, not 'heart'"),
+    "no mass": ({"bodies__bracket__mass": None}, r"bodies\.bracket: mass is missing, but x and y "
+                                                 r"can move freely"),
+    "no start": ({"bodies__bracket__start": {"y": None}}, r"bodies\.bracket: start\.y is missing: "
+                                                          r"y is free"),
+    "start of what is fixed": ({"bodies__bracket__start__theta": 0.1}, r"bodies\.bracket: "
+                                                                       r"start\.theta has no "
+                                                                       r"meaning"),
+    "no such base": ({"pads__upper__base": "braket"}, r"pads\.upper\.base: there is no `braket` "
+                                                      r"among bodies; there is disc"),
+    "pad on its own body": ({"pads__lower__base": "disc"}, r"contacts\.lower: the pad `lower` is "
+                                                           r"bonded to the body `disc`"),
+    "nothing to touch with": ({"contacts__lower__body": "bracket"}, r"contacts\.lower\.body: "
+                                                                    r"`bracket` has no shape"),
+    "pushes what is fixed": ({"actuators__x__pushes": "bracket.theta"}, r"actuators\.x\.pushes: "
+                                                                        r"bracket\.theta is fixed "
+                                                                        r"at 0"),
+    "no such coordinate": ({"actuators__x__pushes": "bracket.z"}, r"`bracket\.z` is not a "
+                                                                  r"coordinate; free ones are "
+                                                                  r"disc\.x"),
+    "loop without a motion": ({"actuators__x__setpoint": None}, r"actuators\.x: setpoint is "
+                                                                r"missing: the gains Kp and Kd "
+                                                                r"need"),
+    "motion that nothing follows": ({"motion__wave": {"kind": "hold"}}, r"motion\.wave: nothing "
+                                                                        r"follows it"),
+    "material of nothing": ({"materials__gel": SOFT}, r"materials\.gel: no pad is made of it; name "
+                                                      r"it as the material of one"),
+    "law of nothing": ({"laws__wet": WET}, r"laws\.wet: no contact follows it; name it as the law "
+                                           r"of one"),
+    "motion that is missing": ({"actuators__x__setpoint": "w"}, r"motion\.w is missing: bracket\.x "
+                                                                r"is to follow it"),
+    "time goes back": ({"motion__x_d__times": (1.5, 0.5)}, r"motion\.x_d.*: times must increase, "
+                                                           r"but 0\.5 s follows 1\.5 s"),
+    "two ways to step": ({"solver": {"step": 1e-3, "rtol": 1e-4}}, r"solver: step and rtol .*each "
+                                                                   r"say which steps to take"),
+    "one motion, two units": ({"actuators__y__feed_forward": "x_d"}, r"motion\.(x_d would be in "
+                                                                     r"two units|press: nothing)"),
+    "name": ({"bodies": {"my disc": {"x": 0.0, "y": 0.0, "theta": 0.0}}}, r"bodies\.my disc: the "
+                                                                          r"name should be "
+                                                                          r"letters"),
+    "taken": ({"bodies": {"keys": {"x": 0.0, "y": 0.0, "theta": 0.0}}}, r"bodies\.keys: the name "
+                                                                        r"is taken by torch"),
+    "overlap": ({"bodies": {"stone": STONE}}, r"error: bodies\.disc: it and bodies\.stone overlap "
+                                              r"by .* mm at t = 0 s"),
+    "no room": ({"motion__y_d__values": ("start", 40e-3)}, r"error: contacts\.upper: `disc` does "
+                                                           r"not fit: at t = 0\.4 s"),
+    "strain": ({"motion__y_d__values": ("start", 45.8e-3)}, r"warning: pads\.\w+: the strain "
+                                                            r"leaves linear elasticity: at"),
+    "steps": ({"solver": {"step": 0.05}}, r"warning: solver\.step: steps of 0\.05 s are too "
+                                          r"coarse: motion\.y_d goes"),
     "nothing carries it": (
-        {"bodies": {"ball": {"mass": 0.1, "shape": {"kind": "circle", "radius": 5e-3}, "start": {"x": 0.0, "y": 0.1}}}},
+        {"bodies": {"ball": {"mass": 0.1, "shape": {"kind": "circle", "radius": 5e-3},
+        "start": {"x": 0.0, "y": 0.1}}}},
         r"error: bodies\.ball: nothing carries it: it has no contact with any pad",
     ),
     "beside the pad": (
@@ -360,50 +472,65 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         {"contacts__again": {"pad": "lower", "body": "disc", "law": "dry"}},
         r"error: contacts\.again: it is between the same pad and body as `lower`; leave one out",
     ),
-    "no rest beside the pad": ({"bodies__disc__start__x": 0.1}, r'error: bodies\.disc\.start\.y: "rest", but no pad'),
+    "no rest beside the pad": ({"bodies__disc__start__x": 0.1}, r'error: bodies\.disc\.start\.y: '
+                                                                r'"rest", but no pad'),
     "set-point elsewhere": (
         {"motion__x_d__values": (10e-3, 20e-3)},
-        r"warning: motion\.x_d: it begins at 0\.01 m, but bracket\.x at 0 m: `actuators\.x` pushes with 1e\+03 at once",
+        r"warning: motion\.x_d: it begins at 0\.01 m, but bracket\.x at 0 m: `actuators\.x` pushes "
+        r"with 1e\+03 at once",
     ),
-    "never touches": ({"motion__y_d__values": ("start", 50.05e-3), "motion__press__values": (0.0, 0.0)},
+    "never touches": ({"motion__y_d__values": ("start", 50.05e-3),
+    "motion__press__values": (0.0, 0.0)},
                       r"warning: contacts\.upper: `lower` and `upper` never press `disc`"),
-    "slip": ({"laws__dry__friction__v_s": 1e-4}, r"warning: laws\.dry\.friction: slip is not single-valued"),
+    "slip": ({"laws__dry__friction__v_s": 1e-4}, r"warning: laws\.dry\.friction: slip is not "
+                                                 r"single-valued"),
     "out of reach": (
         {"pads__upper__origin": (5.0, 0.0)},
-        r"warning: contacts\.upper: it cannot close: `disc` comes no nearer to `upper` than 4\.98 m; change pads",
+        r"warning: contacts\.upper: it cannot close: `disc` comes no nearer to `upper` than 4\.98 "
+        r"m; change pads",
     ),
     "a meganewton": (
-        {"motion__press__values": (0.0, -1e6)}, r"error: motion\.press: at t = 2 s it pushes `bracket` with 1e\+06 N, but"
+        {"motion__press__values": (0.0, -1e6)}, r"error: motion\.press: at t = 2 s it pushes "
+                                                r"`bracket` with 1e\+06 N, but"
     ),
     "off the pad": (
-        {"motion__x_d__values": ("start", 50.0)}, r"warning: motion\.x_d: at t = 0\.6 s it has taken `disc` .* m past the end"
+        {"motion__x_d__values": ("start", 50.0)}, r"warning: motion\.x_d: at t = 0\.6 s it has "
+                                                  r"taken `disc` .* m past the end"
     ),
     "through the disc": (
         {"motion__y_d__values": ("start", -0.05)},
-        r"error: motion\.y_d: at t = .* it has taken the pads of contacts\.lower and contacts\.upper through each other",
+        r"error: motion\.y_d: at t = .* it has taken the pads of contacts\.lower and "
+        r"contacts\.upper through each other",
     ),
     "between points": (
-        {"bodies__disc__shape__radius": 1e-5}, r"error: bodies\.disc\.shape: 0\.02 mm wide, it falls between points of `lower`"
+        {"bodies__disc__shape__radius": 1e-5}, r"error: bodies\.disc\.shape: 0\.02 mm wide, it "
+                                               r"falls between points of `lower`"
     ),
     "too stiff to rest": (
-        {"laws__dry__K_n": 1e9}, r"error: laws\.dry\.K_n: no rest is found with 1e\+09 N/m, .* take 4e\+05 N/m or less"
+        {"laws__dry__K_n": 1e9}, r"error: laws\.dry\.K_n: no rest is found with 1e\+09 N/m, .* "
+                                 r"take 4e\+05 N/m or less"
     ),
     "outputs": (
         {"motion__x_d": {"kind": "chirp", "amplitude": 1e-3, "first": 1.0, "last": 50.0}},
-        r"warning: outputs\.interval: outputs every 0\.01 s do not show motion\.x_d, which goes up to 50 Hz; take 0\.005 s",
+        r"warning: outputs\.interval: outputs every 0\.01 s do not show motion\.x_d, which goes up "
+        r"to 50 Hz; take 0\.005 s",
     ),
     "start of an effort": (
-        {"motion__press__values": ("start", -30.0)}, r'error: motion\.press\.values: "start" stands for where the one free'
+        {"motion__press__values": ("start", -30.0)}, r'error: motion\.press\.values: "start" '
+                                                     r'stands for where the one free'
     ),
     "no time for waves": (
-        {"motion__x_d": {"kind": "sines", "components": [{"amplitude": 1e-3, "frequency": 5.0}], "since": 1.9}},
+        {"motion__x_d": {"kind": "sines", "components": [{"amplitude": 1e-3, "frequency": 5.0}],
+        "since": 1.9}},
         r"error: motion\.x_d\.since = 1\.9 s leaves 0\.1 s until 2 s, but waves take 0\.3 s",
     ),
     "no file": (
-        {"motion__x_d": {"kind": "csv", "file": "none.csv", "column": "x_d"}}, r"error: motion\.x_d\.file: .*none\.csv: No such"
+        {"motion__x_d": {"kind": "csv", "file": "none.csv", "column": "x_d"}},
+        r"error: motion\.x_d\.file: .*none\.csv: No such"
     ),
     "an unstable loop": (
-        {"materials": {"rubber": {"tau": 1e-4}}, "actuators": {"x": {"measures": "disc.x", "Kp": 1e6, "Kd": 10.0}},
+        {"materials": {"rubber": {"tau": 1e-4}},
+        "actuators": {"x": {"measures": "disc.x", "Kp": 1e6, "Kd": 10.0}},
          "bodies": {"bracket": {"start": {"y": 49.5e-3}}}, "motion": {"y_d": {"kind": "hold"}}},
         r"the rig is unstable at t = ",
     ),
@@ -412,28 +539,34 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         r"bodies\.disc\.shape: the axes a and b differ by more than a factor of 3",
     ),
     "too round": (
-        {"bodies": {"disc": {"shape": {"kind": "rounded_box", "half_width": 2e-2, "half_height": 1e-2, "radius": 15e-3}}}},
+        {"bodies": {"disc": {"shape": {"kind": "rounded_box", "half_width": 2e-2,
+        "half_height": 1e-2, "radius": 15e-3}}}},
         r"bodies\.disc\.shape: the corners' radius 0\.015 is larger than half of the box, 0\.01",
     ),
     "sides that cross": (
-        {"bodies": {"disc": {"shape": {"kind": "rounded_polygon", "vertices": [SQUARE[i] for i in (0, 2, 1, 3)],
+        {"bodies": {"disc": {"shape": {"kind": "rounded_polygon",
+        "vertices": [SQUARE[i] for i in (0, 2, 1, 3)],
                                        "radius": 1e-3}}}},
         r"bodies\.disc\.shape: `vertices` cannot be used as a polygon",
     ),
     "two masses": (
-        {"bodies": {"disc": {"density": 7800.0, "depth": 1e-2}}}, r"mass and density each say how heavy it is; give one"
+        {"bodies": {"disc": {"density": 7800.0, "depth": 1e-2}}}, r"mass and density each say how "
+                                                                  r"heavy it is; give one"
     ),
     "density of nothing": (
-        {"bodies": {"bracket": {"mass": None, "density": 7800.0, "depth": 1e-2}}}, r"bodies\.bracket: shape is missing"
+        {"bodies": {"bracket": {"mass": None, "density": 7800.0, "depth": 1e-2}}},
+        r"bodies\.bracket: shape is missing"
     ),
-    "depth without density": ({"bodies": {"disc": {"depth": 1e-2}}}, r"bodies\.disc: density is missing: depth is given"),
+    "depth without density": ({"bodies": {"disc": {"depth": 1e-2}}}, r"bodies\.disc: density is "
+                                                                     r"missing: depth is given"),
     "more than all": (
-        {"materials": {"rubber": {"kind": "generalised_kelvin", **RUBBER, "J": [0.8, 0.7], "tau": [0.1, 1.0]}}},
-        r"materials\.rubber: the fractions J sum to 1\.5, above one",
+        {"materials": {"rubber": {"kind": "generalised_kelvin", **RUBBER, "J": [0.8, 0.7],
+        "tau": [0.1, 1.0]}}}, r"materials\.rubber: the fractions J sum to 1\.5, above one",
     ),
     "a time too few": (
         {"materials": {"rubber": {"kind": "prony", **RUBBER, "moduli": [1e5, 1e5], "tau": [0.1]}}},
-        r"materials\.rubber: a series needs as many `moduli` as `tau`, from 1 to 20, but has 2 and 1",
+        r"materials\.rubber: a series needs as many `moduli` as `tau`, from 1 to 20, but has 2 and "
+        r"1",
     ),
     "no such rubber": (
         {"materials": {"rubber": {"kind": "preset", "name": "Dragon", "depth": 1e-2}}},
@@ -445,8 +578,8 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         r"error: pads\.lower\.inertial: an inertial pad has one retardation time",
     ),
     "more than memory": (
-        {"pads": {"lower": {"kind": "fingertip", "material": "rubber", "radius": 1e-2, "elements_around": 4000}}},
-        r"elements_around = 4000 take about",
+        {"pads": {"lower": {"kind": "fingertip", "material": "rubber", "radius": 1e-2,
+        "elements_around": 4000}}}, r"elements_around = 4000 take about",
     ),
     "an arc that is too short": (
         {"pads": {"lower": COARSE | {"kind": "curved", "radius": 30e-3}}},
@@ -457,30 +590,36 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         r"pads\.lower: `bonded_edges` must be some of base, left, right",
     ),
     "a mesh that is none": (
-        {"pads": {"lower": {"kind": "mesh", "material": "rubber", "file": "pear.csv", "unit": "mm"}}},
-        r"error: pads\.lower\.file:",
+        {"pads": {"lower": {"kind": "mesh", "material": "rubber", "file": "pear.csv",
+        "unit": "mm"}}}, r"error: pads\.lower\.file:",
     ),
     "a program for weights": (
         {"actuators": {"x": {"network": "law.pt"}}},
-        r"error: actuators\.x\.network: .*law\.pt is not an \.npz file: weights are data, and other files may be programs",
+        r"error: actuators\.x\.network: .*law\.pt is not an \.npz file: weights are data, and "
+        r"other files may be programs",
     ),
     "corners between the points": (
-        {"bodies": {"disc": {"shape": {"kind": "rounded_box", "half_width": 2e-2, "half_height": 2e-2, "radius": 5e-4}}}},
+        {"bodies": {"disc": {"shape": {"kind": "rounded_box", "half_width": 2e-2,
+        "half_height": 2e-2, "radius": 5e-4}}}},
         r"warning: bodies\.disc\.shape: its sharpest corner has a radius of 0\.5 mm",
     ),
 }  # fmt: skip
-"""Changes of the template, by nested names or by `__` for a dot, and the sentence that says what is wrong."""
+"""Changes of the template, by nested names or by `__` for a dot, and the sentence that says what is
+wrong."""
 
 
 @pytest.fixture(scope="module")
 def said(folder: Path) -> Callable[[dict[str, Any]], tuple[int, str]]:
-    """Status and words of `torchsoft check` on the template, changed: a file that TOML cannot write is one that JSON can."""
+    """Status and words of `torchsoft check` on the template, changed: a file that TOML cannot write
+    is one that JSON can."""
 
     def check_file(changes: dict[str, Any]) -> tuple[int, str]:
         tree = coarse_tree()
         for name, value in changes.items():
             *path, last = name.split("__")
-            tree = changed(tree, reduce(lambda inner, part: {part: inner}, reversed(path), {last: value}))
+            tree = changed(
+                tree, reduce(lambda inner, part: {part: inner}, reversed(path), {last: value})
+            )
         (folder / "asked.toml").write_text(toml(tree), encoding="utf-8")
         with redirect_stdout(io.StringIO()) as out, redirect_stderr(out):
             return main(["check", str(folder / "asked.toml")]), out.getvalue()
@@ -509,14 +648,22 @@ def toml(tree: dict[str, Any]) -> str:
 
     def value(x: Any) -> str:
         if isinstance(x, dict):
-            return "{" + ", ".join(f"{json.dumps(k)} = {value(v)}" for k, v in x.items() if v is not None) + "}"
+            return (
+                "{"
+                + ", ".join(f"{json.dumps(k)} = {value(v)}" for k, v in x.items() if v is not None)
+                + "}"
+            )
         return f"[{', '.join(map(value, x))}]" if isinstance(x, list | tuple) else json.dumps(x)
 
     return "".join(f"{key} = {value(x)}\n" for key, x in tree.items())
 
 
 def test_a_mass_by_density_is_pythons(folder: Path) -> None:
-    disc = rig(folder, bodies={"disc": {"mass": None, "density": 2700.0, "depth": 44e-3}}).build().rig.bodies["disc"]
+    disc = (
+        rig(folder, bodies={"disc": {"mass": None, "density": 2700.0, "depth": 44e-3}})
+        .build()
+        .rig.bodies["disc"]
+    )
     expected = Body.uniform(Circle(20e-3), 2700.0, 44e-3)
     assert disc.mass.item() == expected.mass.item()
     assert disc.inertia.item() == expected.inertia.item()

@@ -1,4 +1,5 @@
-"""Rigs in files: what is read, refused, checked, built, run and drawn, from Python and from the command line."""
+"""Rigs in files: what is read, refused, checked, built, run and drawn, from Python and from the
+command line."""
 
 import json
 import math
@@ -54,12 +55,16 @@ def changed(file: RigFile, **values: Any) -> RigFile:
     return file
 
 
-# ready rigs ----------------------------------------------------------------------------------------------------------
+# ready rigs
+# ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "path",
-    [pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem == "fingertips")) for path in READY],
+    [
+        pytest.param(path, id=path.stem, marks=[pytest.mark.slow] * (path.stem == "fingertips"))
+        for path in READY
+    ],
 )
 def test_a_ready_rig_checks_clean_and_runs(path: Path) -> None:
     file = coarse(RigFile.from_toml(path))
@@ -94,12 +99,19 @@ def test_the_papers_rig_is_soft_grasp() -> None:
         assert torch.equal(ready.rig(0.1, manipulation.y0), model(0.1, manipulation.y0))
     runs = [simulate(rig, t, y0=manipulation.y0) for rig in (model, ready.rig)]
     assert torch.equal(runs[0].y, runs[1].y)
-    for own, other in (("x_C", "x_C"), ("theta", "theta_C"), ("F_x", "F_x"), ("F_y", "F_y"), ("bracket_moment", "M_U")):
+    for own, other in (
+        ("x_C", "x_C"),
+        ("theta", "theta_C"),
+        ("F_x", "F_x"),
+        ("F_y", "F_y"),
+        ("bracket_moment", "M_U"),
+    ):
         assert torch.equal(runs[0][own], runs[1][other])
 
 
 def test_a_drop_is_not_missed() -> None:
-    """Steps chosen by tolerance would be through the pad; the first touch is where free fall says."""
+    """Steps chosen by tolerance would be through the pad; the first touch is where free fall
+    says."""
     file = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "drop")))
     file = changed(shorter(file, 0.3), outputs__interval=1e-3)
     run = running.carry_out(file).trajectory
@@ -149,19 +161,29 @@ def test_steps_are_held_against_the_modes() -> None:
     """With less damping the paper's loops swing with 600 rad/s: five steps a period are 2 ms."""
     paper = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "paper")))
     paper = changed(paper, materials__rubber__tau=2e-3)
-    sentences = [[one.message for one in check(paper.override(solver={"step": h}))] for h in (1e-3, 4e-3)]
-    assert [any("a mode of the rig swings with" in one for one in found) for found in sentences] == [False, True]
+    sentences = [
+        [one.message for one in check(paper.override(solver={"step": h}))] for h in (1e-3, 4e-3)
+    ]
+    assert [
+        any("a mode of the rig swings with" in one for one in found) for found in sentences
+    ] == [False, True]
 
 
 def test_a_body_that_flies_is_told_of_coarse_steps() -> None:
-    file = coarse(RigFile.from_toml(next(path for path in READY if path.stem == "drop")), solver={"step": 0.05})
+    file = coarse(
+        RigFile.from_toml(next(path for path in READY if path.stem == "drop")),
+        solver={"step": 0.05},
+    )
     assert any("a body comes flying and may be through a pad" in one.message for one in check(file))
 
 
-# motions -------------------------------------------------------------------------------------------------------------
+# motions
+# ----------------------------------------------------------------------
 
 
-def motion(table: dict[str, Any], folder: Path | None = None, duration: float = 2.0) -> Callable[[float], float]:
+def motion(
+    table: dict[str, Any], folder: Path | None = None, duration: float = 2.0
+) -> Callable[[float], float]:
     """A motion of the template's bracket in x, as a function of time."""
     file = changed(coarse(template("t")), motion__x_d=table, outputs__duration=duration)
     file._folder = folder or Path()
@@ -170,16 +192,21 @@ def motion(table: dict[str, Any], folder: Path | None = None, duration: float = 
 
 
 def test_motions_go_through_what_they_are_given(tmp_path: Path) -> None:
-    (tmp_path / "x.csv").write_text("\ufefft [ms], note [mm], x_d [mm]\n0,7,1\n500,,2\n1000,7,4\n", encoding="utf-8")
+    (tmp_path / "x.csv").write_text(
+        "\ufefft [ms], note [mm], x_d [mm]\n0,7,1\n500,,2\n1000,7,4\n", encoding="utf-8"
+    )
     knots = {"times": (0.2, 1.0), "values": ("start", 5e-3)}
     for table, expected in (
         ({"kind": "hold"}, {0.0: 0.0, 1.0: 0.0}),
         ({"kind": "hold", "value": 2e-3}, {1.0: 2e-3}),
         ({"kind": "profile", **knots}, {0.0: 0.0, 0.2: 0.0, 0.6: 2.5e-3, 1.0: 5e-3, 2.0: 5e-3}),
         ({"kind": "spline", **knots}, {0.0: 0.0, 0.2: 0.0, 0.6: 2.5e-3, 1.0: 5e-3, 2.0: 5e-3}),
-        ({"kind": "sines", "components": [{"amplitude": 1e-3, "frequency": 2.0}]}, {0.0: 0.0, 1.125: 1e-3, 2.0: 0.0}),
-        ({"kind": "chirp", "amplitude": 1e-3, "first": 1.0, "last": 1.0, "since": 0.5}, {0.5: 0.0, 1.25: -1e-3 * -1, 1.0: 0.0}),
-        ({"kind": "csv", "file": "x.csv", "column": "x_d", "offset": 1e-3}, {0.0: 2e-3, 0.5: 3e-3, 1.0: 5e-3, 2.0: 5e-3}),
+        ({"kind": "sines", "components": [{"amplitude": 1e-3, "frequency": 2.0}]},
+        {0.0: 0.0, 1.125: 1e-3, 2.0: 0.0}),
+        ({"kind": "chirp", "amplitude": 1e-3, "first": 1.0, "last": 1.0, "since": 0.5},
+        {0.5: 0.0, 1.25: -1e-3 * -1, 1.0: 0.0}),
+        ({"kind": "csv", "file": "x.csv", "column": "x_d", "offset": 1e-3},
+        {0.0: 2e-3, 0.5: 3e-3, 1.0: 5e-3, 2.0: 5e-3}),
     ):  # fmt: skip
         x = motion(table, tmp_path)
         for time, value in expected.items():
@@ -194,16 +221,23 @@ def test_motions_go_through_what_they_are_given(tmp_path: Path) -> None:
         ("t [s],x_d [mm]\n0,0\n1,1\n", r"x\.csv ends at 1 s, but the run lasts until 2 s"),
         ("t [s],x [mm]\n0,0\n1,1\n", r"x\.csv has no column `x_d \[m\]`; it has `t`, `x`"),
         ("t [s],x_d\n0,0\n1,1\n", r"row 1, column `x_d` has no unit: write `x_d \[m\]`"),
-        ("t [s],x_d [N]\n0,0\n1,1\n", r"row 1, column `x_d` cannot be in 'N'; it can be in m, cm, mm"),
+        (
+            "t [s],x_d [N]\n0,0\n1,1\n",
+            r"row 1, column `x_d` cannot be in 'N'; it can be in m, cm, mm",
+        ),
         ("t [s],x_d [mm]\n0,0\n1,one\n", r"row 3, column `x_d`: 'one' is not a finite number"),
         ("t [s],x_d [mm]\n0,0\n1,\n", r"row 3, column `x_d` is empty"),
         ("t [s],x_d [mm]\n1,0\n0,1\n", r"row 3, column `t`: 0 s follows 1 s; times must increase"),
         ("t [s],x_d [mm]\n0,0\n", r"has 1 rows of numbers"),
     ],
 )
-def test_a_recorded_motion_that_cannot_be_is_named(tmp_path: Path, text: str, sentence: str) -> None:
+def test_a_recorded_motion_that_cannot_be_is_named(
+    tmp_path: Path, text: str, sentence: str
+) -> None:
     (tmp_path / "x.csv").write_text(text, encoding="utf-8")
-    file = changed(coarse(template("t")), motion__x_d={"kind": "csv", "file": "x.csv", "column": "x_d"})
+    file = changed(
+        coarse(template("t")), motion__x_d={"kind": "csv", "file": "x.csv", "column": "x_d"}
+    )
     file._folder = tmp_path
     (first, *_) = check(file)
     assert first.severity == "error"
@@ -212,7 +246,8 @@ def test_a_recorded_motion_that_cannot_be_is_named(tmp_path: Path, text: str, se
 
 
 def test_what_two_pads_grip_is_taken_along() -> None:
-    """The estimate before a run: fingertips go around a box that they hold, and the box with them; the run agrees."""
+    """The estimate before a run: fingertips go around a box that they hold, and the box with them;
+    the run agrees."""
     file = RigFile.from_toml(next(path for path in READY if path.stem == "fingertips"))
     estimate = Estimate(file, file.build())
     for time, angle in ((2.0, -0.6), (3.4, 0.6), (4.4, 0.0)):
@@ -222,7 +257,8 @@ def test_what_two_pads_grip_is_taken_along() -> None:
 
 
 def test_driven_jaws_carry_a_disc() -> None:
-    """Coordinates driven in x, y and theta, without a loop; the pads settle around a start that is a grasp."""
+    """Coordinates driven in x, y and theta, without a loop; the pads settle around a start that is
+    a grasp."""
     jaw = {"x": "driven", "y": "driven", "theta": "driven"}
     tree = coarse(template("t")).model_dump(exclude_unset=True)
     tree["bodies"]["bracket"] = jaw
@@ -244,8 +280,16 @@ def test_driven_jaws_carry_a_disc() -> None:
 
 
 def test_orientation_is_controlled_through_another_body() -> None:
-    """A loop that measures the disc's angle and pushes the bracket sideways; the other way round it is unstable."""
-    loop = {"pushes": "bracket.x", "measures": "disc.theta", "setpoint": "w", "Kp": 1000.0, "Kd": 4.0, "reversed": True}
+    """A loop that measures the disc's angle and pushes the bracket sideways; the other way round it
+    is unstable."""
+    loop = {
+        "pushes": "bracket.x",
+        "measures": "disc.theta",
+        "setpoint": "w",
+        "Kp": 1000.0,
+        "Kd": 4.0,
+        "reversed": True,
+    }
     tree = coarse(template("t")).model_dump(exclude_unset=True)
     tree["actuators"]["x"] = loop
     tree["motion"] |= {"w": {"kind": "profile", "times": (0.5, 1.0), "values": ("start", 0.3)}}
@@ -264,7 +308,8 @@ def test_orientation_is_controlled_through_another_body() -> None:
     assert "the rig is unstable" in check(wrong)[0].message
 
 
-# starts and estimates ------------------------------------------------------------------------------------------------
+# starts and estimates
+# ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("inertial", [False, True])
@@ -297,7 +342,8 @@ def test_the_estimate_by_statics_is_where_the_run_ends() -> None:
         assert float(run[f"y_{name}"][-1]) == pytest.approx(expected[name][1], abs=3e-5)
 
 
-# writing and running -------------------------------------------------------------------------------------------------
+# writing and running
+# ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("path", READY, ids=lambda path: path.stem)
@@ -307,7 +353,9 @@ def test_what_is_written_is_what_was_read(path: Path) -> None:
     assert again.model_dump() == file.model_dump()
 
 
-def test_the_file_to_start_from_is_a_rig_with_a_comment_on_every_number(tmp_path: Path, capsys: Any) -> None:
+def test_the_file_to_start_from_is_a_rig_with_a_comment_on_every_number(
+    tmp_path: Path, capsys: Any
+) -> None:
     path = tmp_path / "mine.toml"
     assert main(["init", str(path.with_suffix(""))]) == 0
     text = path.read_text(encoding="utf-8")
@@ -337,13 +385,17 @@ def test_the_file_to_start_from_has_the_name_that_was_asked_for(
     assert main(["init", name]) == 0
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == [tmp_path / file]
     assert RigFile.from_toml(file).title == Path(file).stem
-    said = capsys.readouterr().out.removeprefix(f"written to {file}; ").partition(" looks it over, ")
+    said = (
+        capsys.readouterr().out.removeprefix(f"written to {file}; ").partition(" looks it over, ")
+    )
     commands = [shlex.split(text) for text in (said[0], said[2].removesuffix(" simulates it\n"))]
     assert commands == [["torchsoft", "check", file], ["torchsoft", "run", file]]
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "a/", "a/..", ".toml", "/"])
-def test_a_name_that_is_no_files_is_refused(name: str, tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
+def test_a_name_that_is_no_files_is_refused(
+    name: str, tmp_path: Path, monkeypatch: Any, capsys: Any
+) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["init", name]) == 2
     expected = f"torchsoft: error: NAME should be the name of a file, such as mine or mine.toml, not {name!r}\n"
@@ -381,11 +433,14 @@ def test_run_writes_everything(small: Path, tmp_path: Path, capsys: Any) -> None
     assert summary["doubts"] == []
     assert summary["energy"]["worst_imbalance_over_injected"] < 1e-3
     assert (
-        RigFile.model_validate_json(json.dumps(summary["file"])).model_dump() == RigFile.from_toml(small).model_dump()
+        RigFile.model_validate_json(json.dumps(summary["file"])).model_dump()
+        == RigFile.from_toml(small).model_dump()
     )
 
 
-def test_what_is_wrong_is_not_run_unless_it_is_meant(small: Path, tmp_path: Path, capsys: Any) -> None:
+def test_what_is_wrong_is_not_run_unless_it_is_meant(
+    small: Path, tmp_path: Path, capsys: Any
+) -> None:
     path = tmp_path / "wrong.toml"
     wrong = changed(RigFile.from_toml(small), bodies__stone=STONE, outputs__video="none")
     path.write_text(to_toml(changed(wrong, outputs__figures=False)), encoding="utf-8")
@@ -394,7 +449,9 @@ def test_what_is_wrong_is_not_run_unless_it_is_meant(small: Path, tmp_path: Path
     assert main(["run", str(path), "--out", str(tmp_path / "out"), "--no-progress"]) == 2
     assert "wrong.toml is not run; fix what is wrong, or say --anyway" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-    assert main(["run", str(path), "--out", str(tmp_path / "out"), "--no-progress", "--anyway"]) == 0
+    assert (
+        main(["run", str(path), "--out", str(tmp_path / "out"), "--no-progress", "--anyway"]) == 0
+    )
     assert "bodies.stone overlap" in capsys.readouterr().err
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"trajectory.nc", "summary.json"}
 
@@ -412,7 +469,9 @@ def test_where_results_cannot_be_written_nothing_is_run(
     assert (tmp_path / "taken").read_text(encoding="utf-8") == "mine"
 
 
-def test_an_interruption_keeps_what_was_simulated(small: Path, tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
+def test_an_interruption_keeps_what_was_simulated(
+    small: Path, tmp_path: Path, monkeypatch: Any, capsys: Any
+) -> None:
     def interrupted(*args: Any, **options: Any) -> None:
         raise Interrupted(simulate(*args, **options))
 
@@ -420,17 +479,29 @@ def test_an_interruption_keeps_what_was_simulated(small: Path, tmp_path: Path, m
     assert main(["run", str(small), "--out", str(tmp_path), "--no-progress"]) == 130
     assert "interrupted; what was simulated until then is in" in capsys.readouterr().err
     assert {path.name for path in tmp_path.iterdir()} == {"trajectory.nc", "summary.json"}
-    assert json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["stopped"] == "interrupted"
+    assert (
+        json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))["stopped"]
+        == "interrupted"
+    )
 
 
 def test_a_failure_keeps_what_was_simulated(small: Path, tmp_path: Path, capsys: Any) -> None:
     """A disc thrown off its pad."""
     path = tmp_path / "thrown.toml"
-    file = changed(RigFile.from_toml(small), bodies__disc__start__v_x=3.0, bodies__bracket__start__y=90e-3)
-    path.write_text(to_toml(changed(file, motion__y_d__values=("start", "start"))), encoding="utf-8")
-    assert main(["run", str(path), "--out", str(tmp_path / "out"), "--no-progress", "--anyway"]) == 2
+    file = changed(
+        RigFile.from_toml(small), bodies__disc__start__v_x=3.0, bodies__bracket__start__y=90e-3
+    )
+    path.write_text(
+        to_toml(changed(file, motion__y_d__values=("start", "start"))), encoding="utf-8"
+    )
+    assert (
+        main(["run", str(path), "--out", str(tmp_path / "out"), "--no-progress", "--anyway"]) == 2
+    )
     assert "the body was lost" in capsys.readouterr().err
-    assert "the body was lost" in json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))["stopped"]
+    assert (
+        "the body was lost"
+        in json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))["stopped"]
+    )
 
 
 def test_check_and_run_name_what_cannot_be_read(tmp_path: Path, capsys: Any) -> None:

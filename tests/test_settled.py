@@ -1,5 +1,5 @@
-"""Pads that have settled around given bodies: at rest by the graph, with exact derivatives, and the same bits every
-time."""
+"""Pads that have settled around given bodies: at rest by the graph, with exact derivatives, and the
+same bits every time."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -9,7 +9,18 @@ import torch
 from conftest import coarse, f64, turning
 from torch import Tensor
 
-from torchsoft import Body, Circle, Contact, NoEquilibrium, Pad, PadMesh, Rig, SoftContact, SoftGrasp, press
+from torchsoft import (
+    Body,
+    Circle,
+    Contact,
+    NoEquilibrium,
+    Pad,
+    PadMesh,
+    Rig,
+    SoftContact,
+    SoftGrasp,
+    press,
+)
 from torchsoft.paper.rig import NAMES
 from torchsoft.physics.contact import SmoothSlip
 from torchsoft.physics.material import StandardLinearSolid
@@ -21,16 +32,21 @@ HEIGHT = 48.6e-3
 
 
 def shaken(model: SoftGrasp, seed: int = 0, stretch: float = 5e-5) -> State:
-    """The grasp with bodies displaced by tenths of a millimetre and stretched points, sticking and slipping; nothing
-    moves."""
-    generator, state = torch.Generator().manual_seed(seed), model.unpack(press(model, HEIGHT).detach())
+    """The grasp with bodies displaced by tenths of a millimetre and stretched points, sticking and
+    slipping; nothing moves."""
+    generator, state = (
+        torch.Generator().manual_seed(seed),
+        model.unpack(press(model, HEIGHT).detach()),
+    )
 
     def noise(like: Tensor) -> Tensor:
         return torch.randn(like.shape, generator=generator, dtype=torch.float64)
 
     pose = {name: x + noise(x) * f64(1e-4, 2e-4, 0.02) for name, x in state.pose.items()}
     pose["bracket"][2] = 0.0
-    return state._replace(pose=pose, stretch={name: stretch * noise(s) for name, s in state.stretch.items()})
+    return state._replace(
+        pose=pose, stretch={name: stretch * noise(s) for name, s in state.stretch.items()}
+    )
 
 
 def around(rig: Rig, state: State) -> Tensor:
@@ -42,7 +58,8 @@ def rates(rig: Rig, y: Tensor) -> float:
     state = rig.unpack(y.detach())
     graph = rig.evaluate(0.0, state)
     return max(
-        float(graph.ports[f"pad_{name}"].transformer.flow(graph.flows).detach().abs().max()) for name in rig.pads
+        float(graph.ports[f"pad_{name}"].transformer.flow(graph.flows).detach().abs().max())
+        for name in rig.pads
     )
 
 
@@ -66,7 +83,9 @@ def test_derivatives_are_those_of_differences() -> None:
     """Along one direction of poses, stretches and every kind of parameter each."""
     model = coarse()
     state = shaken(model)
-    weights = torch.randn(model.layout.size, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    weights = torch.randn(
+        model.layout.size, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
     weights[model.layout.rigid] = 0.0  # what stands in the state as it was given
     steps = {"x": 1e-8, "y": 1e-8, "theta": 1e-6, "stretch": 1e-8}
     steps |= dict.fromkeys(("pad.E", "pad.nu", "contact.K_t", "contact.mu_s", "disc.radius"), 1e-6)
@@ -80,11 +99,18 @@ def test_derivatives_are_those_of_differences() -> None:
 
         def forward(self, by: dict[str, Tensor]) -> Tensor:
             disc = state.pose["disc"] + torch.stack([by[axis] for axis in ("x", "y", "theta")])
-            stretch = {k: s + by["stretch"] * torch.linspace(-1, 1, len(s)) for k, s in state.stretch.items()}
+            stretch = {
+                k: s + by["stretch"] * torch.linspace(-1, 1, len(s))
+                for k, s in state.stretch.items()
+            }
             return weights @ settled(model, state.pose | {"disc": disc}, state.velocity, stretch)
 
     def value(by: dict[str, Tensor]) -> Tensor:
-        scaled = {f"model.{NAMES[n]}": model.parameter(n).detach() * (1 + h) for n, h in by.items() if "." in n}
+        scaled = {
+            f"model.{NAMES[n]}": model.parameter(n).detach() * (1 + h)
+            for n, h in by.items()
+            if "." in n
+        }
         return torch.func.functional_call(Settled(), scaled, (by,))
 
     zeros = {name: f64(0.0)[0].requires_grad_() for name in steps}
@@ -92,9 +118,9 @@ def test_derivatives_are_those_of_differences() -> None:
     with torch.no_grad():
         for (name, h), slope in zip(steps.items(), exact):
             up, down = (float(value(zeros | {name: f64(by)[0]})) for by in (h, -h))
-            assert float(slope) == pytest.approx((up - down) / (2 * h), rel=1e-3 if "." in name else 1e-4, abs=1e-4), (
-                name
-            )
+            assert float(slope) == pytest.approx(
+                (up - down) / (2 * h), rel=1e-3 if "." in name else 1e-4, abs=1e-4
+            ), name
 
 
 def test_the_same_bits_come_again_from_other_threads_too() -> None:
@@ -108,10 +134,15 @@ def test_the_same_bits_come_again_from_other_threads_too() -> None:
 
 def test_two_bodies_on_one_pad_and_a_chain_of_branches() -> None:
     """Every branch carries the contacts' forces, and a body feels the dent of its neighbour."""
-    rubber = StandardLinearSolid(E=7.5e5, E_instant=1.5e6, nu=0.45, rho=1100.0, tau=0.01, depth=0.044)
-    law = SoftContact(1.2e5, 440.0, 1.2e5, 440.0, friction=SmoothSlip(0.8, 0.7, 0.05, 10.0), node_spacing=2e-3)
+    rubber = StandardLinearSolid(
+        E=7.5e5, E_instant=1.5e6, nu=0.45, rho=1100.0, tau=0.01, depth=0.044
+    )
+    law = SoftContact(
+        1.2e5, 440.0, 1.2e5, 440.0, friction=SmoothSlip(0.8, 0.7, 0.05, 10.0), node_spacing=2e-3
+    )
     rig = Rig(
-        bodies={name: Body(0.4, Circle(0.01)) for name in "ab"}, pads={"P": Pad(PadMesh(0.12, 4.59e-3, 60, 2), rubber)},
+        bodies={name: Body(0.4, Circle(0.01)) for name in "ab"},
+        pads={"P": Pad(PadMesh(0.12, 4.59e-3, 60, 2), rubber)},
         contacts={name: Contact("P", name, law) for name in "ab"},
     )  # fmt: skip
     still = {name: torch.zeros(3, dtype=torch.float64) for name in "ab"}
@@ -119,7 +150,9 @@ def test_two_bodies_on_one_pad_and_a_chain_of_branches() -> None:
     pressed = f64(0.05, 4.59e-3 + 0.01 - 3e-4, 0.0)
 
     def pad(x: float) -> Tensor:
-        return rig.unpack(settled(rig, {"a": pressed, "b": f64(x, float(pressed[1]), 0.0)}, still, stretch)).pads["P"]
+        return rig.unpack(
+            settled(rig, {"a": pressed, "b": f64(x, float(pressed[1]), 0.0)}, still, stretch)
+        ).pads["P"]
 
     near, far = pad(0.056).detach(), pad(0.1).detach()
     assert near.shape == (2, 61, 2)
@@ -133,10 +166,17 @@ def test_refusals() -> None:
     state = shaken(model)
     with pytest.raises(NotImplementedError, match="inertial"):
         around(coarse(pad__fidelity="inertial"), state)
-    with pytest.raises(ValueError, match=r"`pose` must be given by the names \['disc', 'bracket'\]"):
+    with pytest.raises(
+        ValueError, match=r"`pose` must be given by the names \['disc', 'bracket'\]"
+    ):
         settled(model, {"disc": state.pose["disc"]}, state.velocity, state.stretch)
     with pytest.raises(ValueError, match="61 finite numbers"):
-        settled(model, state.pose, state.velocity, state.stretch | {"L": torch.full((61,), torch.nan).double()})
+        settled(
+            model,
+            state.pose,
+            state.velocity,
+            state.stretch | {"L": torch.full((61,), torch.nan).double()},
+        )
     with pytest.raises(ValueError, match="3 finite numbers"):
         settled(model, state.pose | {"disc": f64(0.0, 0.0)}, state.velocity, state.stretch)
     with torch.inference_mode(), pytest.raises(ValueError, match="inference_mode"):

@@ -1,4 +1,5 @@
-"""Shapes of rigid bodies against boundaries that are written down here, closed forms, differences and each other."""
+"""Shapes of rigid bodies against boundaries that are written down here, closed forms, differences
+and each other."""
 
 from collections.abc import Callable
 from functools import cache
@@ -59,8 +60,8 @@ def superellipse(a: float, b: float, n: float) -> Boundary:
 
 
 def rounded(vertices: list[list[float]], radius: float) -> Boundary:
-    """Arcs and sides in turn, by their lengths; an arc's centre is where the lines meet that are its radius away from both
-    sides."""
+    """Arcs and sides in turn, by their lengths; an arc's centre is where the lines meet that are
+    its radius away from both sides."""
     v = np.array(vertices)
     ways = (np.roll(v, -1, 0) - v) / np.linalg.norm(np.roll(v, -1, 0) - v, axis=1)[:, None]
     centre, first, turn = np.empty_like(v), np.empty(len(v)), np.empty(len(v))
@@ -85,14 +86,18 @@ def rounded(vertices: list[list[float]], radius: float) -> Boundary:
         way = (s % 1.0) * before[-1]
         k = np.searchsorted(before, way, side="right") - 1
         i, part = k // 2, (way - before[k]) / lengths.ravel()[k]
-        return np.where((k % 2 == 0)[:, None], arc(i, part), begin[i] + part[:, None] * (end - begin)[i])
+        return np.where(
+            (k % 2 == 0)[:, None], arc(i, part), begin[i] + part[:, None] * (end - begin)[i]
+        )
 
     return at
 
 
 def spline(control: Array) -> Boundary:
     count = len(control)
-    curve = BSpline(np.arange(-3.0, count + 4), np.concatenate((control[-1:], control, control[:2])), 3)
+    curve = BSpline(
+        np.arange(-3.0, count + 4), np.concatenate((control[-1:], control, control[:2])), 3
+    )
     return lambda s: curve((s % 1.0) * count)
 
 
@@ -106,7 +111,8 @@ def contour() -> Contour:
 
 
 def centred(boundary: Boundary) -> tuple[Boundary, Array]:
-    """The boundary about the centre of mass of a polygon of very many of its points, and that centre."""
+    """The boundary about the centre of mass of a polygon of very many of its points, and that
+    centre."""
     x = boundary(np.arange(200_000) / 200_000)
     cross = x[:, 0] * np.roll(x[:, 1], -1) - x[:, 1] * np.roll(x[:, 0], -1)
     centre = ((x + np.roll(x, -1, 0)) * cross[:, None]).sum(0) / (3 * cross.sum())
@@ -116,10 +122,19 @@ def centred(boundary: Boundary) -> tuple[Boundary, Array]:
 CASES: dict[str, tuple[Callable[[], Shape], Callable[[], Boundary]]] = {
     "ellipse": (lambda: Ellipse(20e-3, 12e-3), lambda: superellipse(20e-3, 12e-3, 2.0)),
     "squircle": (lambda: Superellipse(20e-3, 14e-3, 4.0), lambda: superellipse(20e-3, 14e-3, 4.0)),
-    "nearly an ellipse": (lambda: Superellipse(12e-3, 20e-3, 2.3), lambda: superellipse(12e-3, 20e-3, 2.3)),
-    "nearly a box": (lambda: Superellipse(20e-3, 20e-3, 20.0), lambda: superellipse(20e-3, 20e-3, 20.0)),
+    "nearly an ellipse": (
+        lambda: Superellipse(12e-3, 20e-3, 2.3),
+        lambda: superellipse(12e-3, 20e-3, 2.3),
+    ),
+    "nearly a box": (
+        lambda: Superellipse(20e-3, 20e-3, 20.0),
+        lambda: superellipse(20e-3, 20e-3, 20.0),
+    ),
     "box": (lambda: RoundedBox(20e-3, 9e-3, 2e-3), lambda: rounded(box(20e-3, 9e-3), 2e-3)),
-    "stadium": (lambda: RoundedBox(20e-3, 9e-3, 9e-3), lambda: rounded(box(20e-3, 9e-3), 8.999999999e-3)),
+    "stadium": (
+        lambda: RoundedBox(20e-3, 9e-3, 9e-3),
+        lambda: rounded(box(20e-3, 9e-3), 8.999999999e-3),
+    ),
     "triangle": (lambda: RoundedPolygon(TRIANGLE, 3e-3), lambda: rounded(TRIANGLE, 3e-3)),
     "angle": (lambda: RoundedPolygon(ANGLED[::-1], 2e-3), lambda: rounded(ANGLED, 2e-3)),
     "pear": (contour, lambda: spline(contour().control.detach().numpy())),
@@ -145,7 +160,8 @@ def near(boundary: Boundary, count: int, band: float, seed: int = 0) -> Array:
 
 
 def distance(boundary: Boundary, x: Array) -> float:
-    """Signed distance: the nearest of many points, looked at again in between; inside by the polygon of these points."""
+    """Signed distance: the nearest of many points, looked at again in between; inside by the
+    polygon of these points."""
     s = np.arange(2000) / 2000
     dense = boundary(s)
     away = np.linalg.norm(dense - x, axis=1)
@@ -153,7 +169,9 @@ def distance(boundary: Boundary, x: Array) -> float:
     for k in np.argsort(away)[:4]:
         f = lambda t: float(np.linalg.norm(boundary(np.array([t]))[0] - x))
         found.append(
-            minimize_scalar(f, bounds=(s[k] - 1e-3, s[k] + 1e-3), method="bounded", options={"xatol": 1e-12}).fun
+            minimize_scalar(
+                f, bounds=(s[k] - 1e-3, s[k] + 1e-3), method="bounded", options={"xatol": 1e-12}
+            ).fun
         )
     return min(found) * (-1 if Polygon(dense).contains_point(x) else 1)
 
@@ -177,16 +195,23 @@ def test_normals_are_the_slopes_of_distances(case: tuple[Shape, Boundary]) -> No
     with torch.no_grad():
         n = shape(x)[1]
         ways = torch.eye(2, dtype=torch.float64)
-        slope = torch.stack([(shape(x + h * way)[0] - shape(x - h * way)[0]) / (2 * h) for way in ways], -1)
+        slope = torch.stack(
+            [(shape(x + h * way)[0] - shape(x - h * way)[0]) / (2 * h) for way in ways], -1
+        )
     assert torch.allclose(n.norm(dim=-1), torch.ones(200).double(), rtol=0, atol=1e-14)
-    assert float((n - slope).abs().max()) < 1e-6  # where an arc begins differences are of first order
+    assert (
+        float((n - slope).abs().max()) < 1e-6
+    )  # where an arc begins differences are of first order
     assert float((n - slope).abs().median()) < 1e-9
 
 
 def turning(boundary: Boundary, s: Array, h: float = 1e-5) -> tuple[Array, Array]:
     """Outward normals (n, 2) and curvature (n,) [1/m] from differences along the boundary."""
     before, here, after = boundary(s - h), boundary(s), boundary(s + h)
-    (x, y), (bend_x, bend_y) = ((after - before) / (2 * h)).T, ((after - 2 * here + before) / h**2).T
+    (x, y), (bend_x, bend_y) = (
+        ((after - before) / (2 * h)).T,
+        ((after - 2 * here + before) / h**2).T,
+    )
     speed = np.hypot(x, y)
     return np.stack((y, -x), -1) / speed[:, None], (x * bend_y - y * bend_x) / speed**3
 
@@ -202,11 +227,13 @@ def test_curvature_is_that_of_the_boundary(case: tuple[Shape, Boundary]) -> None
         assert np.median(np.abs(kappa.numpy() - expected)) * size < 2e-5
 
 
-# --- limits ----------------------------------------------------------------------------------------------------------------
+# --- limits
+# ----------------------------------------------------------------------
 
 R = 19.37e-3
 HEXAGON = [
-    [R / np.cos(np.pi / 6) * np.cos(k * np.pi / 3), R / np.cos(np.pi / 6) * np.sin(k * np.pi / 3)] for k in range(6)
+    [R / np.cos(np.pi / 6) * np.cos(k * np.pi / 3), R / np.cos(np.pi / 6) * np.sin(k * np.pi / 3)]
+    for k in range(6)
 ]
 ROUND = {
     "superellipse": lambda: Superellipse(R, R, 2.0),
@@ -214,7 +241,8 @@ ROUND = {
     "square": lambda: RoundedPolygon(box(R, R), R),
     "hexagon": lambda: RoundedPolygon(HEXAGON, R),
     "contour": lambda: Contour(
-        R * np.stack([f(np.arange(480) * np.pi / 240) for f in (np.cos, np.sin)], -1), tolerance=1e-10
+        R * np.stack([f(np.arange(480) * np.pi / 240) for f in (np.cos, np.sin)], -1),
+        tolerance=1e-10,
     ),
 }
 
@@ -238,8 +266,14 @@ def test_full_rounding_is_the_circle(name: str) -> None:
 @pytest.mark.parametrize(
     ("one", "other"),
     [
-        (lambda: RoundedPolygon(np.array(ANGLED) + [3.0, -2.0], 2e-3), lambda: RoundedPolygon(ANGLED[::-1], 2e-3)),
-        (lambda: Contour(pear(200)[::-1] - [0.5, 0.2], tolerance=1e-8), lambda: Contour(pear(200), tolerance=1e-8)),
+        (
+            lambda: RoundedPolygon(np.array(ANGLED) + [3.0, -2.0], 2e-3),
+            lambda: RoundedPolygon(ANGLED[::-1], 2e-3),
+        ),
+        (
+            lambda: Contour(pear(200)[::-1] - [0.5, 0.2], tolerance=1e-8),
+            lambda: Contour(pear(200), tolerance=1e-8),
+        ),
     ],
 )
 def test_two_ways_to_one_body(one: Callable[[], Shape], other: Callable[[], Shape]) -> None:
@@ -250,11 +284,14 @@ def test_two_ways_to_one_body(one: Callable[[], Shape], other: Callable[[], Shap
     for mine, its in zip(one(x), other(x)):
         assert float((mine - its)[outside].abs().max()) < 1e-9
     for quantity in ("area", "gyration"):
-        assert float(getattr(one, quantity)()) == pytest.approx(float(getattr(other, quantity)()), rel=1e-9)
+        assert float(getattr(one, quantity)()) == pytest.approx(
+            float(getattr(other, quantity)()), rel=1e-9
+        )
     assert one.size() == pytest.approx(other.size(), rel=1e-9)
 
 
-# --- area, centre of mass, inertia -------------------------------------------------------------------------------------------
+# --- area, centre of mass, inertia
+# ----------------------------------------------------------------------
 
 
 @torch.no_grad()
@@ -271,7 +308,9 @@ def test_moments_are_those_of_the_boundary(case: tuple[Shape, Boundary]) -> None
 def test_moments_by_green_are_those_of_a_disc() -> None:
     t = torch.arange(40, dtype=torch.float64) * torch.pi / 20
     circle = torch.stack((t.cos(), t.sin()), -1)
-    of = moments(0.3 * circle + f64(5.0, -7.0), 0.3 * torch.pi / 20 * torch.stack((-t.sin(), t.cos()), -1))
+    of = moments(
+        0.3 * circle + f64(5.0, -7.0), 0.3 * torch.pi / 20 * torch.stack((-t.sin(), t.cos()), -1)
+    )
     assert float(of.area) == pytest.approx(0.09 * np.pi, rel=1e-13)
     assert torch.allclose(of.centre, f64(5.0, -7.0), rtol=1e-14)
     assert float(of.gyration) == pytest.approx(0.045, rel=1e-11)
@@ -300,7 +339,9 @@ def test_support_outline_and_size_are_the_bodys(case: tuple[Shape, Boundary]) ->
     outline = shape.outline()
     assert float(shape(outline)[0].abs().max()) < 1e-9
     assert float((outline @ way.mT).amax(0).sub(shape.support(way)).abs().max()) < 1e-3
-    if not isinstance(shape, RoundedPolygon):  # whose inner corner is grazed by the rays that look for the boundary
+    if not isinstance(
+        shape, RoundedPolygon
+    ):  # whose inner corner is grazed by the rays that look for the boundary
         check_shape("body", shape_of_another(shape))
 
 
@@ -317,7 +358,8 @@ def shape_of_another(shape: Shape) -> Shape:
     return Own()
 
 
-# --- derivatives --------------------------------------------------------------------------------------------------------------
+# --- derivatives
+# ----------------------------------------------------------------------
 
 
 def test_derivatives_are_those_of_differences(case: tuple[Shape, Boundary]) -> None:
@@ -328,11 +370,15 @@ def test_derivatives_are_those_of_differences(case: tuple[Shape, Boundary]) -> N
         "x": torch.from_numpy(near(boundary, 30, BAND, 3))
     }
     for name, p in own.items():
-        way = torch.randn(p.shape, generator=generator, dtype=torch.float64) * (1.0 if name == "n" else 1e-3)
+        way = torch.randn(p.shape, generator=generator, dtype=torch.float64) * (
+            1.0 if name == "n" else 1e-3
+        )
 
         def value(by: Tensor, name: str = name, p: Tensor = p, way: Tensor = way) -> Tensor:
             moved = own | {name: p + by * way}
-            phi, n = torch.func.functional_call(shape, {k: v for k, v in moved.items() if k != "x"}, (moved["x"],))
+            phi, n = torch.func.functional_call(
+                shape, {k: v for k, v in moved.items() if k != "x"}, (moved["x"],)
+            )
             return torch.cat((1e2 * phi[:, None], n), -1)
 
         slope = torch.autograd.functional.jvp(value, f64(0.0)[0], f64(1.0)[0])[1]
@@ -340,7 +386,9 @@ def test_derivatives_are_those_of_differences(case: tuple[Shape, Boundary]) -> N
         expected = (4 * fine - coarse) / 3
         error = (slope - expected).abs().amax(-1) / expected.abs().max()
         assert float(error.median()) < 1e-8, name
-        assert int((error > 1e-6).sum()) <= 2, name  # of thirty points, some come from a side onto an arc
+        assert int((error > 1e-6).sum()) <= 2, (
+            name
+        )  # of thirty points, some come from a side onto an arc
 
 
 COARSE = Parameters().override({"pad.elements_x": 60, "pad.elements_y": 3})
@@ -357,7 +405,8 @@ def grasp(model: SoftGrasp, y0: Tensor) -> Reference:
     )
 
 
-# --- what is refused, and what is said ---------------------------------------------------------------------------------------
+# --- what is refused, and what is said
+# ----------------------------------------------------------------------
 
 
 def test_control_points_that_were_spoilt_are_refused() -> None:
@@ -381,7 +430,10 @@ def test_a_contour_follows_the_spline_through_its_points(tolerance: float) -> No
 
 def test_a_contour_from_a_file(tmp_path: Path) -> None:
     file, points = tmp_path / "pear.csv", pear()
-    file.write_text("y [cm], x [mm]\n" + "".join(f"{1e2 * y},{1e3 * x}\n\n" for x, y in points), encoding="utf-8")
+    file.write_text(
+        "y [cm], x [mm]\n" + "".join(f"{1e2 * y},{1e3 * x}\n\n" for x, y in points),
+        encoding="utf-8",
+    )
     shape = Contour.from_csv(file)
     assert torch.allclose(shape.control, Contour(points).control, rtol=0, atol=1e-12)
     assert shape.residual < 1e-6
@@ -409,12 +461,17 @@ def test_a_centre_of_mass_off_the_origin_is_told(caplog: pytest.LogCaptureFixtur
     ROUND["contour"]()
     assert caplog.text == ""
     RoundedPolygon(np.array(box(20e-3, 9e-3)) + [0.5, 0.25], 2e-3)
-    assert "the centre of mass is at (0.5, 0.25) m of `vertices`: the body's pose is that of this point" in caplog.text
+    assert (
+        "the centre of mass is at (0.5, 0.25) m of `vertices`: the body's pose is that of this "
+        "point" in caplog.text
+    )
 
 
 def test_an_object_that_its_pads_would_turn_is_told_of() -> None:
     wedge = RoundedPolygon([[-20e-3, -10e-3], [20e-3, -10e-3], [20e-3, 10e-3], [-20e-3, 0.0]], 2e-3)
-    with pytest.warns(UserWarning, match=r"held at theta = 0, where the pads turn it with -?[\d.e-]+ N.m"):
+    with pytest.warns(
+        UserWarning, match=r"held at theta = 0, where the pads turn it with -?[\d.e-]+ N.m"
+    ):
         rest(SoftGrasp(COARSE, shape=wedge))
 
 
@@ -424,4 +481,6 @@ def test_a_long_box_rests_on_its_whole_side() -> None:
     g = model.penetration("L", state)
     x = model.pads["L"].positions[:, 0] - state.pose["disc"][0]
     assert torch.equal(g > 0, x.abs() < 29.5e-3)
-    assert float(state.pads["L"][0, :, 1].sum()) == pytest.approx(-float(model.disc.mass.detach()) * 9.81, rel=1e-9)
+    assert float(state.pads["L"][0, :, 1].sum()) == pytest.approx(
+        -float(model.disc.mass.detach()) * 9.81, rel=1e-9
+    )

@@ -1,4 +1,5 @@
-"""`simulate` and its trajectory: what runs is what is saved, gradients reach what was put in, and nothing unphysical runs."""
+"""`simulate` and its trajectory: what runs is what is saved, gradients reach what was put in, and
+nothing unphysical runs."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -38,11 +39,13 @@ def rolled(model: SoftGrasp, **options: object):
     return simulate(model, T, y0=grasped(model, (0.05, 0.0)), step=2e-3, **options)  # pyright: ignore[reportArgumentType]
 
 
-# what runs is what is saved -----------------------------------------------------------------------------------------
+# what runs is what is saved
+# ----------------------------------------------------------------------
 
 
 def test_values_set_on_the_module_run_and_are_saved(tmp_path: Path) -> None:
-    """A number set in place is in the settings, in what the run says of itself, in its file, and in the run."""
+    """A number set in place is in the settings, in what the run says of itself, in its file, and in
+    the run."""
     model, other = coarse(), coarse(contact__K_n=2e5)
     y0 = grasped(other, (0.05, 0.0))
     model.reference = other.reference
@@ -82,21 +85,28 @@ def test_a_shape_and_a_friction_law_of_ones_own_run_with_gradients() -> None:
     """The same circle and the same law written anew: the same run, and the same gradients."""
     built_in = coarse()
     p = built_in.settings.contact
-    mine = SmoothSlip(p.mu_s, p.mu_k, p.v_s, p.eta).requires_grad_(False)  # captured, so a constant of the law
-    own = SoftGrasp(built_in.settings, friction=lambda E, F_N, R: mine(E, F_N, R), shape=Polygonal(19.37e-3))
+    mine = SmoothSlip(p.mu_s, p.mu_k, p.v_s, p.eta).requires_grad_(
+        False
+    )  # captured, so a constant of the law
+    own = SoftGrasp(
+        built_in.settings, friction=lambda E, F_N, R: mine(E, F_N, R), shape=Polygonal(19.37e-3)
+    )
     one, other = rolled(built_in, gradient="discrete"), rolled(own, gradient="discrete")
     assert float((one.y - other.y).detach().abs().max()) < 1e-9
     a, b = (
-        torch.autograd.grad(run["theta"][-1], r)[0] for run, r in ((one, built_in.shape.radius), (other, own.shape.r))
+        torch.autograd.grad(run["theta"][-1], r)[0]
+        for run, r in ((one, built_in.shape.radius), (other, own.shape.r))
     )
     assert float(a) == pytest.approx(float(b), rel=1e-6)
 
 
-# gradients reach what was put in ------------------------------------------------------------------------------------
+# gradients reach what was put in
+# ----------------------------------------------------------------------
 
 
 def test_what_becomes_of_the_reference_and_the_model_does_not_change_the_gradient() -> None:
-    """Between run and backward: another reference, knots moved in place, a parameter set in place."""
+    """Between run and backward: another reference, knots moved in place, a parameter set in
+    place."""
     model = coarse()
     run = rolled(model, gradient="discrete")
     wanted = [model.pad.E, model.parameter("contact.K_t"), model.parameter("control.R_80")]
@@ -118,7 +128,9 @@ class Simulated(nn.Module):
         self.model, self.options = model, options
 
     def forward(self, y0: Tensor) -> Tensor:
-        return simulate(self.model, T, y0=y0, step=2e-3, gradient="discrete", **self.options)["theta"][-1]  # pyright: ignore
+        return simulate(self.model, T, y0=y0, step=2e-3, gradient="discrete", **self.options)[
+            "theta"
+        ][-1]  # pyright: ignore
 
 
 def test_gradients_reach_the_tensors_of_a_functional_call() -> None:
@@ -154,13 +166,19 @@ class Exp(nn.Module):
 @pytest.mark.parametrize(
     ("owner", "name"),
     [
-        (lambda m: m.contact, "K_t"), (lambda m: m.contact.friction, "mu_s"), (lambda m: m.pad, "E"),
-        (lambda m: m.pad, "nu"), (lambda m: m.control["x"], "Kd"), (lambda m: m.shape, "radius"), (lambda m: m.disc, "mass"),
+        (lambda m: m.contact, "K_t"), (lambda m: m.contact.friction, "mu_s"),
+        (lambda m: m.pad, "E"), (lambda m: m.pad, "nu"), (lambda m: m.control["x"], "Kd"),
+        (lambda m: m.shape, "radius"), (lambda m: m.disc, "mass"),
     ],
 )  # fmt: skip
-def test_parametrized_parameters_get_their_gradients(owner: Callable[[SoftGrasp], nn.Module], name: str) -> None:
+def test_parametrized_parameters_get_their_gradients(
+    owner: Callable[[SoftGrasp], nn.Module], name: str
+) -> None:
     """d/d log p = p d/dp, for a parameter of every kind of part."""
-    plain, logarithmic = coarse(contact__mu_s=0.3, contact__mu_k=0.2), coarse(contact__mu_s=0.3, contact__mu_k=0.2)
+    plain, logarithmic = (
+        coarse(contact__mu_s=0.3, contact__mu_k=0.2),
+        coarse(contact__mu_s=0.3, contact__mu_k=0.2),
+    )
     y0 = grasped(plain, (0.08, 0.0))
     logarithmic.reference = plain.reference
     parametrize.register_parametrization(owner(logarithmic), name, Exp())
@@ -181,7 +199,9 @@ def test_tied_parameters_get_the_sum_of_their_gradients() -> None:
     tied.control["y"].Kp = tied.contact.K_n  # 1.2e5 N/m all of them
     tied.contact.K_t = tied.contact.K_n
     names = ("contact.R_n", "contact.R_t", "contact.K_n", "contact.K_t", "control.K_98")
-    R_n, R_t, K_n, K_t, K_98 = torch.autograd.grad(Simulated(plain)(y0), [plain.parameter(n) for n in names])
+    R_n, R_t, K_n, K_t, K_98 = torch.autograd.grad(
+        Simulated(plain)(y0), [plain.parameter(n) for n in names]
+    )
     R, K = torch.autograd.grad(Simulated(tied)(y0), [tied.contact.R_n, tied.contact.K_n])
     assert float(R) == pytest.approx(float(R_n + R_t), rel=1e-9)
     assert float(K) == pytest.approx(float(K_n + K_t + K_98), rel=1e-9)
@@ -212,7 +232,8 @@ class Sharing(nn.Module):
 
 
 def test_a_law_is_what_its_code_is_now() -> None:
-    """A global that it reads, and the number of iterations of a shape of the package, changed between two runs."""
+    """A global that it reads, and the number of iterations of a shape of the package, changed
+    between two runs."""
     model = SoftGrasp(coarse().settings, friction=Sharing())
     y0 = grasped(model, (0.08, 0.0))
     first = simulate(model, T, y0=y0)
@@ -228,7 +249,8 @@ def test_a_law_is_what_its_code_is_now() -> None:
 
 
 def test_what_is_saved_is_what_ran() -> None:
-    """Numbers behind parametrizations, laws and shapes that were replaced, an optimiser's step, what was loaded."""
+    """Numbers behind parametrizations, laws and shapes that were replaced, an optimiser's step,
+    what was loaded."""
     model, other = coarse(), coarse(contact__K_n=2e5)
     y0 = grasped(model, (0.05, 0.0))
     said = lambda: simulate(model, T, y0=y0).made_by
@@ -253,11 +275,14 @@ def test_what_is_saved_is_what_ran() -> None:
     described = oval.description()
     assert "disc.radius" not in described["parameters"]
     assert described["shape"] == {"disc": "Ellipse"}
-    oval.actuators["x"] = Actuator("disc.x", "bracket.x", lambda w, w_dot, f, q, q_dot: f - 1e3 * q, setpoint="x_d")
+    oval.actuators["x"] = Actuator(
+        "disc.x", "bracket.x", lambda w, w_dot, f, q, q_dot: f - 1e3 * q, setpoint="x_d"
+    )
     assert oval.description()["control"]["x"].endswith("<lambda>")
 
 
-# surroundings -------------------------------------------------------------------------------------------------------
+# surroundings
+# ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
@@ -266,12 +291,26 @@ def test_torchs_default_dtype_does_not_matter(dtype: torch.dtype) -> None:
 
     def answer() -> list[Tensor]:
         motion = MultiSine(amplitude_x=1e-3, frequency=(5.0, 20.0))
-        begun = begin(Excitation(motion=motion, duration=0.5, grasp_time=0.05, settle=0.02), coarse().settings)
+        begun = begin(
+            Excitation(motion=motion, duration=0.5, grasp_time=0.05, settle=0.02), coarse().settings
+        )
         run = simulate(begun.model, times(0.1, 6), y0=begun.y0, gradient="discrete")
-        forward = simulate(begun.model, run.t, y0=begun.y0, gradient="forward", wrt=["pad.E", "pad.nu"])
-        gradients = torch.autograd.grad(run["y_C"][-1], [begun.model.pad.E, begun.model.contact.K_t])
-        oval = SoftGrasp(begun.model.settings, shape=Ellipse(19.8e-3, 19.1e-3), friction=Coulomb(0.5, 0.4))
-        parts = [rest(oval), oval(0.0, rest(oval)), run.y, *run.channels.values(), *run.energy.values()]
+        forward = simulate(
+            begun.model, run.t, y0=begun.y0, gradient="forward", wrt=["pad.E", "pad.nu"]
+        )
+        gradients = torch.autograd.grad(
+            run["y_C"][-1], [begun.model.pad.E, begun.model.contact.K_t]
+        )
+        oval = SoftGrasp(
+            begun.model.settings, shape=Ellipse(19.8e-3, 19.1e-3), friction=Coulomb(0.5, 0.4)
+        )
+        parts = [
+            rest(oval),
+            oval(0.0, rest(oval)),
+            run.y,
+            *run.channels.values(),
+            *run.energy.values(),
+        ]
         return [*parts, *gradients, forward.sensitivities]  # pyright: ignore[reportReturnType]
 
     expected, before = answer(), torch.get_default_dtype()
@@ -299,7 +338,8 @@ def test_other_settings_of_the_process_do_not_matter() -> None:
         assert torch.equal(simulate(model, T, y0=y0, gradient="discrete").y, expected)
 
 
-# routes -------------------------------------------------------------------------------------------------------------
+# routes
+# ----------------------------------------------------------------------
 
 
 def test_no_grad_is_honoured() -> None:
@@ -320,16 +360,20 @@ def test_routes_agree_on_the_run() -> None:
     y0, t = grasped(model, (0.01, 0.0)), times(4e-3, 3)
     with torch.no_grad():
         none, discrete = (
-            simulate(model, t, y0=y0, step=2e-3, gradient=route, tolerance=1e-10).y for route in ("none", "discrete")
+            simulate(model, t, y0=y0, step=2e-3, gradient=route, tolerance=1e-10).y
+            for route in ("none", "discrete")
         )
         plain = unrolled_solution(model, y0, t, step=2e-3)
-    forward = simulate(model, t, y0=y0, step=2e-3, gradient="forward", wrt=["pad.E"], tolerance=1e-10)
+    forward = simulate(
+        model, t, y0=y0, step=2e-3, gradient="forward", wrt=["pad.E"], tolerance=1e-10
+    )
     assert torch.equal(none, discrete)
     assert torch.equal(none, forward.y)
     assert float((none - plain).abs().max()) < 1e-8  # [N]
 
 
-# nothing unphysical runs --------------------------------------------------------------------------------------------
+# nothing unphysical runs
+# ----------------------------------------------------------------------
 
 
 def test_parts_replaced_after_a_run_run() -> None:
@@ -348,7 +392,8 @@ def test_parts_replaced_after_a_run_run() -> None:
 
 
 def test_a_law_that_turns_nan_never_converges() -> None:
-    """The slip rate of an effort from 12 to 90 N is not a number: the run ends there, and says so."""
+    """The slip rate of an effort from 12 to 90 N is not a number: the run ends there, and says
+    so."""
 
     def broken(E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
         return torch.where((E > 12.0) & (E < 90.0), torch.nan, torch.zeros_like(E))
@@ -356,9 +401,12 @@ def test_a_law_that_turns_nan_never_converges() -> None:
     model = SoftGrasp(coarse().settings, friction=broken)
     y0, x_d = grasped(model), Profile([0.0, 0.2], [0.06, 0.09])
     pushed = Reference(x_d=x_d, y_d=model.reference["y_d"], F_ff=model.reference["F_ff"])
-    with pytest.raises(SimulationFailed, match=r"at t = .* s Newton's iteration did not converge") as caught:
+    with pytest.raises(
+        SimulationFailed, match=r"at t = .* s Newton's iteration did not converge"
+    ) as caught:
         simulate(model, times(0.2, 21), y0=y0, reference=pushed, step=2e-3)
     assert bool(torch.isfinite(caught.value.trajectory.y).all())
 
 
-# materials ----------------------------------------------------------------------------------------------------------
+# materials
+# ----------------------------------------------------------------------

@@ -1,4 +1,5 @@
-"""Statics: the experiment at smoke size, and a long box lying flat as a flat punch of another finite-element program."""
+"""Statics: the experiment at smoke size, and a long box lying flat as a flat punch of another
+finite-element program."""
 
 import json
 from types import ModuleType
@@ -30,18 +31,25 @@ def result(statics: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Any
 def test_the_full_grasp(statics: ModuleType, result: Any) -> None:
     grasp = statics.full_grasp(result.meshes)["120 x 4"]
     assert grasp["force_N"] == pytest.approx(70.16, abs=0.01)
-    assert grasp["y_C_mm"] == pytest.approx(23.20, abs=0.005)  # the paper's, to the digits it prints
+    assert grasp["y_C_mm"] == pytest.approx(
+        23.20, abs=0.005
+    )  # the paper's, to the digits it prints
     assert grasp["penetration_um"] == pytest.approx(82.2, abs=0.1)
     assert grasp["half_width_mm"] == pytest.approx(5.31, abs=0.01)
     assert grasp["nodes_touching"] == 11
 
 
 def test_the_force_converges_in_mesh_and_penalty(statics: ModuleType, result: Any) -> None:
-    # two curves and the expected order already foretell the limits of the whole experiment (70.54 and 79.33 N)
+    # two curves and the expected order already foretell the limits of the whole experiment (70.54
+    # and 79.33 N)
     assert result.families["mesh"].limit == pytest.approx(70.54, rel=2e-3)
     assert result.families["penalty"].limit == pytest.approx(79.33, rel=5e-3)
-    assert statics.successive(result.meshes)["60 x 2"]["full_grasp"] == pytest.approx(0.0141, abs=1e-4)
-    assert statics.successive(result.penalties)["1"]["full_grasp"] == pytest.approx(0.0869, abs=1e-4)
+    assert statics.successive(result.meshes)["60 x 2"]["full_grasp"] == pytest.approx(
+        0.0141, abs=1e-4
+    )
+    assert statics.successive(result.penalties)["1"]["full_grasp"] == pytest.approx(
+        0.0869, abs=1e-4
+    )
 
 
 def test_force_and_contact_grow_with_compression(result: Any) -> None:
@@ -68,7 +76,8 @@ def test_files(statics: ModuleType, result: Any) -> None:
     assert statics.table(result).splitlines()[2].startswith("| 60 x 2 | 69.175 |")
 
 
-# --- a flat punch ----------------------------------------------------------------------------------------------------------
+# --- a flat punch
+# ----------------------------------------------------------------------
 
 PUNCH = RoundedBox(half_width=15.5e-3, half_height=10e-3, radius=1e-3)
 FLAT = 14.5e-3
@@ -88,7 +97,8 @@ def punched(K_n: float, elements_x: int) -> tuple[SoftGrasp, State, float]:
 
 
 def test_a_long_box_is_a_flat_punch_on_springs() -> None:
-    """On the same mesh, assembled by scikit-fem, with a spring K_n between each node under the flat side and the box."""
+    """On the same mesh, assembled by scikit-fem, with a spring K_n between each node under the flat
+    side and the box."""
     model, state, force = punched(1.2e5, 120)
     pad = model.settings.pad
     nodes, K = world_stiffness(pad, "L")
@@ -101,18 +111,24 @@ def test_a_long_box_is_a_flat_punch_on_springs() -> None:
     assert len(under) == 29
     assert force == pytest.approx(carried.sum(), rel=1e-9)
     surface = nodes[:, 1] == pad.height
-    assert state.pads["L"][0, :, 1].numpy() == pytest.approx(-carried[1::2][surface], rel=1e-7, abs=1e-9)
+    assert state.pads["L"][0, :, 1].numpy() == pytest.approx(
+        -carried[1::2][surface], rel=1e-7, abs=1e-9
+    )
 
 
 def test_a_long_box_on_stiff_springs_is_a_rigid_flat_punch() -> None:
-    """Quadratic elements of a quarter of a millimetre under a rigid, smooth punch; ours are bilinear of half a millimetre."""
+    """Quadratic elements of a quarter of a millimetre under a rigid, smooth punch; ours are
+    bilinear of half a millimetre."""
     pad = Parameters().pad
     mesh = MeshQuad.init_tensor(np.linspace(0, pad.length, 481), np.linspace(0, pad.height, 17))
     basis = Basis(mesh, ElementVector(ElementQuad2()), intorder=4)
     lame_lambda, lame_mu = lame_moduli(pad.E, pad.nu)
     K = pad.depth * (lame_lambda * dilatation.assemble(basis) + lame_mu * shear.assemble(basis))
     x, y = basis.doflocs
-    vertical = np.isin(np.arange(basis.N), np.concatenate([dofs[1] for dofs in (basis.nodal_dofs, basis.facet_dofs)]))
+    vertical = np.isin(
+        np.arange(basis.N),
+        np.concatenate([dofs[1] for dofs in (basis.nodal_dofs, basis.facet_dofs)]),
+    )
     under = np.flatnonzero(vertical & (y == pad.height) & (np.abs(x - 60e-3) < FLAT + 1e-9))
     u = np.zeros(basis.N)
     u[under] = -DEPTH
@@ -120,4 +136,6 @@ def test_a_long_box_on_stiff_springs_is_a_rigid_flat_punch() -> None:
     rigid = -(K @ u)[under].sum()
     assert rigid == pytest.approx(66.17, abs=0.01)
     assert punched(1.2e8, 240)[2] == pytest.approx(rigid, rel=2e-3)
-    assert punched(1.2e8, 120)[2] == pytest.approx(rigid, rel=3e-2)  # the flat side ends between its nodes
+    assert punched(1.2e8, 120)[2] == pytest.approx(
+        rigid, rel=3e-2
+    )  # the flat side ends between its nodes

@@ -22,7 +22,8 @@ from torchsoft.solve.stepper import ImplicitStepper
 
 
 def test_second_order_on_a_smooth_motion(fidelity: str) -> None:
-    """A grasped disc set moving so gently that no node slips, touches or leaves: observed order >= 1.8."""
+    """A grasped disc set moving so gently that no node slips, touches or leaves: observed order >=
+    1.8."""
     model = coarse(pad__fidelity=fidelity)
     y0, t = grasped(model, (1e-4, 5e-5)), times(0.032, 2)
     place = lambda h: simulate(model, t, y0=y0, step=h).state.pose["disc"][-1, :2]
@@ -46,17 +47,24 @@ def test_same_run_twice_to_the_bit_and_in_two_threads_at_once() -> None:
 def test_an_unstable_loop_ends_in_an_error_that_says_so() -> None:
     """E = 60 kPa, tau = 5 ms with the paper's gains."""
     model = SoftGrasp(Parameters().override(COARSE | {"pad.E": 6e4, "pad.tau": 5e-3}))
-    with pytest.raises(SimulationFailed, match=r"disc was lost at t = .* s: the closed loop is unstable") as caught:
+    with pytest.raises(
+        SimulationFailed, match=r"disc was lost at t = .* s: the closed loop is unstable"
+    ) as caught:
         grasp_and_roll(model)
     assert 0 < caught.value.time < 1
     assert bool(torch.isfinite(caught.value.trajectory.y).all())
 
 
 def test_a_disc_rolled_off_the_pad_is_reported() -> None:
-    """Only the reference knows the pad's length; a model driven beyond it says where the run ended."""
+    """Only the reference knows the pad's length; a model driven beyond it says where the run
+    ended."""
     model = coarse()
     y0 = grasped(model)
-    beyond = Reference(x_d=Profile([0.0, 1.0], [0.06, 0.13]), y_d=model.reference["y_d"], F_ff=model.reference["F_ff"])
+    beyond = Reference(
+        x_d=Profile([0.0, 1.0], [0.06, 0.13]),
+        y_d=model.reference["y_d"],
+        F_ff=model.reference["F_ff"],
+    )
     with pytest.raises(SimulationFailed, match="contact reached the end of a pad") as caught:
         simulate(model, times(1.0, 101), y0=y0, reference=beyond)
     run = caught.value.trajectory
@@ -65,7 +73,8 @@ def test_a_disc_rolled_off_the_pad_is_reported() -> None:
 
 
 def test_a_step_that_newton_does_not_solve_is_halved() -> None:
-    """Too few iterations for the hardest steps: those are cut, the others are not, and the run ends where it should."""
+    """Too few iterations for the hardest steps: those are cut, the others are not, and the run ends
+    where it should."""
     model = coarse(contact__mu_s=0.3, contact__mu_k=0.2)
     y0, t = grasped(model, (0.15, 0.0)), times(0.02, 11)
     runs = []
@@ -87,7 +96,8 @@ def test_a_step_that_newton_does_not_solve_is_halved() -> None:
 
 
 def test_the_adjoint_follows_halved_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where steps were cut, the gradient is still that of the run; differences small enough to cut the same steps."""
+    """Where steps were cut, the gradient is still that of the run; differences small enough to cut
+    the same steps."""
     model = coarse(contact__mu_s=0.3, contact__mu_k=0.2)
     y0, t = grasped(model, (0.15, 0.0)), times(0.01, 6)
     E = model.pad.E
@@ -104,13 +114,17 @@ def test_the_adjoint_follows_halved_steps(monkeypatch: pytest.MonkeyPatch) -> No
 
     theta, failed = angle()
     (slope,) = torch.autograd.grad(theta, E)
-    run = simulate(model, t, y0=y0, step=2e-3, tolerance=1e-10, gradient="forward", wrt=["pad.E"], rigid=True)
+    run = simulate(
+        model, t, y0=y0, step=2e-3, tolerance=1e-10, gradient="forward", wrt=["pad.E"], rigid=True
+    )
     assert run.sensitivities is not None
     assert float(run.sensitivities[-1, 2, 0]) == pytest.approx(slope.item(), rel=1e-9)
     assert failed == run.stats.failed_steps > 0
     with torch.no_grad():
         value, h = E.clone(), 1e-5 * E.item()
-        ahead, behind = (angle() for E_near in (value + h, value - h) if E.copy_(E_near) is not None)
+        ahead, behind = (
+            angle() for E_near in (value + h, value - h) if E.copy_(E_near) is not None
+        )
         E.copy_(value)
     assert ahead[1] == behind[1] == failed
     assert slope.item() == pytest.approx((ahead[0] - behind[0]).item() / (2 * h), rel=1e-4)

@@ -1,4 +1,5 @@
-"""Identification on a coarse mesh: Jacobians, recovery, what is not identifiable, nuisances, resuming."""
+"""Identification on a coarse mesh: Jacobians, recovery, what is not identifiable, nuisances,
+resuming."""
 
 import json
 import signal
@@ -17,8 +18,24 @@ from conftest import COARSE
 
 from torchsoft import Parameters, Profile, Sampled
 from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
-from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, Unreachable, identify, record
-from torchsoft.sysid.fit import descend, fisher, gauss_newton, newton_step, shift, standard_deviations
+from torchsoft.sysid import (
+    Problem,
+    Recording,
+    Sensor,
+    Stage,
+    Unknown,
+    Unreachable,
+    identify,
+    record,
+)
+from torchsoft.sysid.fit import (
+    descend,
+    fisher,
+    gauss_newton,
+    newton_step,
+    shift,
+    standard_deviations,
+)
 from torchsoft.sysid.plan import default_plan, sobol, tie_ratios, visible
 from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.residual_tests import whiteness
@@ -26,13 +43,30 @@ from torchsoft.sysid.runs import Runner
 
 BASE = Parameters().override(COARSE)
 RTOL = 1e-4
-NOISE = {"x_C": 1e-5, "y_C": 1e-5, "theta": 5e-4, "x_Br": 1e-5, "y_Br": 1e-5, "F_x": 0.1, "F_y": 0.1}
+NOISE = {
+    "x_C": 1e-5,
+    "y_C": 1e-5,
+    "theta": 5e-4,
+    "x_Br": 1e-5,
+    "y_Br": 1e-5,
+    "F_x": 0.1,
+    "F_y": 0.1,
+}
 SENSORS = {channel: Sensor(noise=sigma) for channel, sigma in NOISE.items()}
 STROKES = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.9, senses="bracket")
 SHAKE = Excitation(
-    motion=MultiSine(amplitude_x=6e-3, amplitude_y=1e-4, frequency=(2, 12)), duration=0.9, depth=8e-4, senses="bracket"
+    motion=MultiSine(amplitude_x=6e-3, amplitude_y=1e-4, frequency=(2, 12)),
+    duration=0.9,
+    depth=8e-4,
+    senses="bracket",
 )
-TRUTH = {"pad.E": 0.9e6, "pad.tau": 0.012, "contact.K_n": 1.6e5, "contact.mu_s": 0.5, "contact.mu_k": 0.4}
+TRUTH = {
+    "pad.E": 0.9e6,
+    "pad.tau": 0.012,
+    "contact.K_n": 1.6e5,
+    "contact.mu_s": 0.5,
+    "contact.mu_k": 0.4,
+}
 TRUE = BASE.override(TRUTH)
 FOUR = ("pad.E", "pad.tau", "contact.K_n", "contact.mu_s")
 
@@ -51,14 +85,20 @@ def shake() -> Recording:
 def four(**changes: Unknown) -> dict[str, Unknown]:
     """E and tau from twice and half the nominal values."""
     start = {"pad.E": 1.5e6, "pad.tau": 5e-3}
-    return {name: Unknown(nominal=start.get(name)) for name in FOUR} | {"contact.mu_k": known("contact.mu_k")} | changes
+    return (
+        {name: Unknown(nominal=start.get(name)) for name in FOUR}
+        | {"contact.mu_k": known("contact.mu_k")}
+        | changes
+    )
 
 
 def known(name: str) -> Unknown:
     return Unknown(nominal=TRUTH[name], fixed=True)
 
 
-def test_jacobian_equals_central_differences_for_every_kind_of_coordinate(strokes: Recording, shake: Recording) -> None:
+def test_jacobian_equals_central_differences_for_every_kind_of_coordinate(
+    strokes: Recording, shake: Recording
+) -> None:
     sensors = SENSORS | {"theta": Sensor(noise=5e-4, bias=5e-3, delay=4e-3)}
     unknowns = {
         "pad.E": Unknown(),
@@ -71,8 +111,8 @@ def test_jacobian_equals_central_differences_for_every_kind_of_coordinate(stroke
     problem = Problem([strokes, shake], sensors, unknowns)
     c = problem.coordinates
     assert c.labels == (
-        "pad.E", "contact.mu_s", "contact.mu_k / contact.mu_s", "contact.R_n in strokes", "contact.R_n in shake",
-        "disc.mass", "control.R_80", "bias of theta", "delay of theta",
+        "pad.E", "contact.mu_s", "contact.mu_k / contact.mu_s", "contact.R_n in strokes",
+        "contact.R_n in shake", "disc.mass", "control.R_80", "bias of theta", "delay of theta",
     )  # fmt: skip
     x, both = c.start, problem.names
     x[-2:] = 0.1, 0.13
@@ -82,18 +122,32 @@ def test_jacobian_equals_central_differences_for_every_kind_of_coordinate(stroke
     assert np.abs(at.r - chosen.r).max() < 1e-6
     for i, label in enumerate(c.labels):
         assert off(problem, runner, x, both, steps, at.J, i) < 1e-5, label
-    assert off(problem, runner, x, both, RTOL, at.J, 0) > 0.1  # steps chosen anew jump: nothing to differentiate
+    assert (
+        off(problem, runner, x, both, RTOL, at.J, 0) > 0.1
+    )  # steps chosen anew jump: nothing to differentiate
     loss, gradient, lost = problem.misfit(runner, x, both, steps, c.free)
     assert not lost
     assert loss == pytest.approx(0.5 * at.r @ at.r, rel=1e-12)
-    np.testing.assert_allclose(gradient, at.J.T @ at.r, rtol=1e-8, atol=1e-8 * np.abs(gradient).max())
+    np.testing.assert_allclose(
+        gradient, at.J.T @ at.r, rtol=1e-8, atol=1e-8 * np.abs(gradient).max()
+    )
 
 
 def off(
-    problem: Problem, runner: Runner, x: np.ndarray, which: Any, steps: Any, J: np.ndarray, i: int, h: float = 1e-5
+    problem: Problem,
+    runner: Runner,
+    x: np.ndarray,
+    which: Any,
+    steps: Any,
+    J: np.ndarray,
+    i: int,
+    h: float = 1e-5,
 ) -> float:
-    """How far column i of a Jacobian is from a central difference, over its size; a larger h [1] passes kinks of contact."""
-    ahead, behind = (problem.residuals(runner, x + s * h * np.eye(len(x))[i], which, steps).r for s in (1, -1))
+    """How far column i of a Jacobian is from a central difference, over its size; a larger h [1]
+    passes kinks of contact."""
+    ahead, behind = (
+        problem.residuals(runner, x + s * h * np.eye(len(x))[i], which, steps).r for s in (1, -1)
+    )
     slope = (ahead - behind) / (2 * h)
     return float(np.linalg.norm(J[:, i] - slope) / np.linalg.norm(slope))
 
@@ -102,10 +156,14 @@ def off(
 def test_jacobian_of_either_kind_of_pads_at_the_start_of_a_grasp(fidelity: str) -> None:
     """The starting displacements are held, also where a pad's elasticity changes."""
     p = BASE.override({"pad.fidelity": fidelity})
-    short = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.1), duration=0.25, grasp_time=0.1, settle=0.0)
+    short = Excitation(
+        motion=Strokes(travel=8e-3, stroke_time=0.1), duration=0.25, grasp_time=0.1, settle=0.0
+    )
     data = record("short", short, p.override({"pad.E": 0.9e6}), p, SENSORS)
     problem = Problem(
-        [data], SENSORS, {"pad.E": Unknown(), "pad.nu": Unknown(low=0.4, high=0.49), "pad.tau": Unknown()}
+        [data],
+        SENSORS,
+        {"pad.E": Unknown(), "pad.nu": Unknown(low=0.4, high=0.49), "pad.tau": Unknown()},
     )
     x, runner = problem.coordinates.start, Runner(problem.recordings)
     _, steps = problem.freeze(runner, x, ["short"], RTOL)
@@ -113,11 +171,15 @@ def test_jacobian_of_either_kind_of_pads_at_the_start_of_a_grasp(fidelity: str) 
     _, gradient, _ = problem.misfit(runner, x, ["short"], steps, problem.coordinates.free)
     for i, label in enumerate(problem.coordinates.labels):
         assert off(problem, runner, x, ["short"], steps, at.J, i, 3e-6) < 1e-5, label
-    np.testing.assert_allclose(gradient, at.J.T @ at.r, rtol=1e-8, atol=1e-8 * np.abs(gradient).max())
+    np.testing.assert_allclose(
+        gradient, at.J.T @ at.r, rtol=1e-8, atol=1e-8 * np.abs(gradient).max()
+    )
 
 
 @pytest.mark.slow
-def test_noise_free_data_give_the_truth_back_and_intervals_hold_it(strokes: Recording, shake: Recording) -> None:
+def test_noise_free_data_give_the_truth_back_and_intervals_hold_it(
+    strokes: Recording, shake: Recording
+) -> None:
     answer = identify(Problem([strokes, shake], SENSORS, four()), heldout=["shake"])
     for name in FOUR:
         e = answer[name]
@@ -134,10 +196,16 @@ def test_noise_free_data_give_the_truth_back_and_intervals_hold_it(strokes: Reco
 
 
 def test_the_adjoint_route_ends_where_gauss_newton_does(strokes: Recording) -> None:
-    problem = Problem([strokes], SENSORS, {"pad.E": Unknown(nominal=1.0e6), "pad.tau": Unknown()} | rest_known())
+    problem = Problem(
+        [strokes], SENSORS, {"pad.E": Unknown(nominal=1.0e6), "pad.tau": Unknown()} | rest_known()
+    )
     runner = Runner(problem.recordings)
     _, steps = problem.freeze(runner, problem.coordinates.start, ["strokes"], RTOL)
-    common: dict[str, Any] = {"which": ["strokes"], "free": problem.coordinates.free, "steps": steps}
+    common: dict[str, Any] = {
+        "which": ["strokes"],
+        "free": problem.coordinates.free,
+        "steps": steps,
+    }
     newton = gauss_newton(problem, runner, problem.coordinates.start, **common)
     descent = descend(problem, runner, problem.coordinates.start, evaluations=40, **common)
     adam = descend(problem, runner, newton.x, method="adam", evaluations=2, **common)
@@ -152,7 +220,9 @@ def rest_known() -> dict[str, Unknown]:
 
 
 def test_what_the_data_do_not_determine_is_not_a_number() -> None:
-    gentle = Excitation(motion=Strokes(travel=1e-3, stroke_time=0.4), duration=0.9, senses="bracket")
+    gentle = Excitation(
+        motion=Strokes(travel=1e-3, stroke_time=0.4), duration=0.9, senses="bracket"
+    )
     data = record("gentle", gentle, BASE, BASE, SENSORS, seed=1)
     answer = identify(
         Problem([data], SENSORS, {"pad.E": Unknown(), "contact.mu_k": Unknown()}), rtol=RTOL,
@@ -176,7 +246,10 @@ def test_what_the_data_do_not_determine_is_not_a_number() -> None:
 def test_bias_and_delay_are_found_and_missing_samples_do_not_matter(strokes: Recording) -> None:
     t, theta = strokes.samples["theta"]
     late = np.interp(t - 1.5e-3, t, theta) + 2e-3
-    samples = strokes.samples | {"theta": (t[3::2], late[3::2]), "F_x": tuple(x[:60] for x in strokes.samples["F_x"])}
+    samples = strokes.samples | {
+        "theta": (t[3::2], late[3::2]),
+        "F_x": tuple(x[:60] for x in strokes.samples["F_x"]),
+    }
     data = replace(strokes, name="gaps", samples=samples)
     sensors = SENSORS | {"theta": Sensor(noise=5e-4, bias=0.02, delay=5e-3)}
     unknowns = {"pad.E": Unknown()} | rest_known() | {"pad.tau": known("pad.tau")}
@@ -199,7 +272,9 @@ def test_a_regular_grid_between_the_samples_changes_nothing(strokes: Recording) 
 def shaking() -> Recording:
     """Hard, by fine steps, without noise."""
     hard = Excitation(
-        motion=MultiSine(amplitude_x=4e-3, amplitude_y=2e-4, frequency=(10, 40)), duration=0.9, senses="bracket"
+        motion=MultiSine(amplitude_x=4e-3, amplitude_y=2e-4, frequency=(10, 40)),
+        duration=0.9,
+        senses="bracket",
     )
     return record("shaking", hard, BASE, BASE, SENSORS, rtol=1e-7, noise=0.0)
 
@@ -208,31 +283,47 @@ def test_a_tolerance_too_coarse_for_the_data_is_found_and_tightened(shaking: Rec
     problem = Problem([shaking], SENSORS, {"pad.E": Unknown(), "pad.tau": Unknown()})
     plan = [Stage("all", ("shaking",), ("pad.E", "pad.tau"), 8e-3)]
     coarse = identify(problem, plan=plan, tightenings=0, assumptions="trusted")
-    assert any("rtol = 0.008 is too coarse" in notice and "take rtol = 0.0008" in notice for notice in coarse.notices)
+    assert any(
+        "rtol = 0.008 is too coarse" in notice and "take rtol = 0.0008" in notice
+        for notice in coarse.notices
+    )
     worst = max(coarse.estimates, key=lambda e: abs(e.step_bias_sd))
     error = float(np.log(worst.last / BASE.table()[worst.name]["value"]))
     assert abs(error) > worst.relative_sd  # so the notice is needed
-    assert worst.step_bias_sd * worst.relative_sd == pytest.approx(error, rel=0.5)  # and its size is about right
+    assert worst.step_bias_sd * worst.relative_sd == pytest.approx(
+        error, rel=0.5
+    )  # and its size is about right
     better = identify(problem, plan=plan)
     assert not any("too coarse" in notice for notice in better.notices)
     assert better.made_by["rtol"] < 8e-3
-    assert abs(np.log(better[worst.name].last / BASE.table()[worst.name]["value"])) < 0.2 * abs(error)
+    assert abs(np.log(better[worst.name].last / BASE.table()[worst.name]["value"])) < 0.2 * abs(
+        error
+    )
 
 
 def test_a_coordinate_held_at_its_bound_leaves_the_others_at_rest() -> None:
-    """Two that correlate, the second held where the misfit still falls: the first is where it is least, beside it."""
+    """Two that correlate, the second held where the misfit still falls: the first is where it is
+    least, beside it."""
     J, x = np.array([[1.0, 0.9], [0.0, 0.3], [0.2, 0.1]]), np.array([0.0, 1.0])
     r = np.array([-0.9, -2.0, 0.0])
     r -= J[:, 0] * (J[:, 0] @ r) / (J[:, 0] @ J[:, 0])
-    problem: Any = SimpleNamespace(coordinates=SimpleNamespace(bounds=(np.array([-5.0, 0.0]), np.array([5.0, 1.0]))))
-    assert newton_step(problem, x, Residuals(r, J, {}), np.array([True, True])) == pytest.approx([0.0, 0.0], abs=1e-9)
-    wider: Any = SimpleNamespace(coordinates=SimpleNamespace(bounds=(np.array([-5.0, 0.0]), np.array([5.0, 9.0]))))
+    problem: Any = SimpleNamespace(
+        coordinates=SimpleNamespace(bounds=(np.array([-5.0, 0.0]), np.array([5.0, 1.0])))
+    )
+    assert newton_step(problem, x, Residuals(r, J, {}), np.array([True, True])) == pytest.approx(
+        [0.0, 0.0], abs=1e-9
+    )
+    wider: Any = SimpleNamespace(
+        coordinates=SimpleNamespace(bounds=(np.array([-5.0, 0.0]), np.array([5.0, 9.0])))
+    )
     assert abs(newton_step(wider, x, Residuals(r, J, {}), np.array([True, True]))).min() > 0.5
 
 
 def test_a_fit_that_went_far_goes_on_with_steps_of_its_own(strokes: Recording) -> None:
     """From a start so far off that the steps chosen there are the wrong ones in the end."""
-    unknowns = {name: Unknown(nominal=0.4 * TRUTH[name]) for name in FOUR} | {"contact.mu_k": known("contact.mu_k")}
+    unknowns = {name: Unknown(nominal=0.4 * TRUTH[name]) for name in FOUR} | {
+        "contact.mu_k": known("contact.mu_k")
+    }
     unknowns |= {"contact.mu_s": Unknown(nominal=0.9)}
     problem = Problem([strokes], SENSORS, unknowns)
     answer = identify(problem, plan=[Stage("all", ("strokes",), FOUR, 1e-3)])
@@ -247,7 +338,9 @@ def test_a_fit_that_went_far_goes_on_with_steps_of_its_own(strokes: Recording) -
 def test_interrupted_it_continues_and_ends_the_same(
     strokes: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    problem = Problem([strokes], SENSORS, {"pad.E": Unknown(nominal=1.4e6), "pad.tau": Unknown()} | rest_known())
+    problem = Problem(
+        [strokes], SENSORS, {"pad.E": Unknown(nominal=1.4e6), "pad.tau": Unknown()} | rest_known()
+    )
     whole = identify(problem, rtol=RTOL)
     inner, left = Runner.run, [4]
 
@@ -282,7 +375,9 @@ def test_threads_give_the_same_residuals(strokes: Recording, shake: Recording) -
 def test_data_out_of_reach_name_the_recording() -> None:
     about_disc = STROKES.model_copy(update={"senses": "disc", "x_C0": 60e-3})
     data = record("strokes", about_disc, BASE, BASE, SENSORS)
-    problem = Problem([data], SENSORS, {"pad.E": Unknown(nominal=4e4)})  # so soft that the loop is unstable
+    problem = Problem(
+        [data], SENSORS, {"pad.E": Unknown(nominal=4e4)}
+    )  # so soft that the loop is unstable
     with pytest.raises(Unreachable, match=r"recording `strokes`: .* t = .* s"):
         identify(problem, rtol=RTOL)
 
@@ -290,11 +385,13 @@ def test_data_out_of_reach_name_the_recording() -> None:
 @pytest.mark.parametrize(
     ("how", "message"),
     [
-        ({"loss": "huber", "method": "lbfgs"}, "^the method 'lbfgs' has no robust loss: for loss = 'huber' take"),
+        ({"loss": "huber", "method": "lbfgs"}, "^the method 'lbfgs' has no robust loss: for loss = "
+                                               "'huber' take"),
         ({"loss": "cauchy", "method": "adam"}, "^the method 'adam' has no robust loss"),
         ({"loss": "Huber"}, "^loss should be 'linear', .* or 'arctan', not 'Huber'"),
         ({"method": "LBFGS"}, "^method should be 'gauss_newton', 'lbfgs' or 'adam', not 'LBFGS'"),
-        ({"assumptions": "check"}, "^assumptions should be 'checked', 'explained' or 'trusted', not 'check'"),
+        ({"assumptions": "check"}, "^assumptions should be 'checked', 'explained' or 'trusted', "
+                                   "not 'check'"),
         ({"seed": -1}, "^seed should be greater than or equal to 0, not -1"),
         ({"rtol": "1e-5"}, "^rtol should be a valid number, not '1e-5'"),
         ({"rtol": float("nan")}, "^rtol should be a finite number, not nan"),
@@ -305,13 +402,17 @@ def test_data_out_of_reach_name_the_recording() -> None:
         ({"rtol": 1e-7, "plan": []}, "^`starts` and `rtol` are those of the default plan"),
     ],
 )  # fmt: skip
-def test_what_a_fit_cannot_honour_is_refused_before_it(strokes: Recording, how: dict[str, Any], message: str) -> None:
+def test_what_a_fit_cannot_honour_is_refused_before_it(
+    strokes: Recording, how: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ValueError, match=message):
         identify(Problem([strokes], SENSORS, four()), **how)
 
 
 def test_sobol_starts_stay_within_bounds_and_the_best_end_is_kept(strokes: Recording) -> None:
-    problem = Problem([strokes], SENSORS, {"pad.E": Unknown(nominal=1.0e6, low=0.5e6, high=2e6)} | rest_known())
+    problem = Problem(
+        [strokes], SENSORS, {"pad.E": Unknown(nominal=1.0e6, low=0.5e6, high=2e6)} | rest_known()
+    )
     stage = Stage("all", ("strokes",), ("pad.E",), RTOL, starts=4)
     free = np.array([c.name == "pad.E" for c in problem.coordinates.all])
     points = sobol(problem, problem.coordinates.start, free, stage, 0)
@@ -323,8 +424,12 @@ def test_sobol_starts_stay_within_bounds_and_the_best_end_is_kept(strokes: Recor
     assert answer["pad.E"].last == pytest.approx(TRUTH["pad.E"], rel=0.05)
 
 
-def test_plan_begins_slowly_ties_ratios_and_ends_with_everything(strokes: Recording, shake: Recording) -> None:
-    unknowns = four(**{"contact.mu_k": Unknown(ratio_to="contact.mu_s", nominal=0.7, low=0.3, high=1.0)})
+def test_plan_begins_slowly_ties_ratios_and_ends_with_everything(
+    strokes: Recording, shake: Recording
+) -> None:
+    unknowns = four(
+        **{"contact.mu_k": Unknown(ratio_to="contact.mu_s", nominal=0.7, low=0.3, high=1.0)}
+    )
     problem = Problem([shake, strokes], SENSORS, unknowns)
     runner = Runner(problem.recordings)
     plan = default_plan(problem, runner, 1e-5, problem.names)
@@ -338,7 +443,9 @@ def test_plan_begins_slowly_ties_ratios_and_ends_with_everything(strokes: Record
     assert dict(scanned.scanned)[ratio][0] == 1.0
     assert plan[0].rtol > plan[-1].rtol == 1e-5
     tied = tie_ratios(problem, problem.coordinates.start)
-    assert problem.values(tied, 0)["contact.mu_k"] == pytest.approx(problem.values(tied, 0)["contact.mu_s"])
+    assert problem.values(tied, 0)["contact.mu_k"] == pytest.approx(
+        problem.values(tied, 0)["contact.mu_s"]
+    )
 
 
 def test_visible_drops_what_cannot_be_separated_from_the_others() -> None:
@@ -355,7 +462,9 @@ def test_fisher_and_shift_of_a_linear_problem() -> None:
     C, values, _ = fisher(J)
     np.testing.assert_allclose(C, np.linalg.inv(J.T @ J), rtol=1e-10)
     assert (np.diff(values) >= 0).all()
-    np.testing.assert_allclose(shift(J, J @ x), x, rtol=1e-10)  # residuals that grow by J x are those of x ahead
+    np.testing.assert_allclose(
+        shift(J, J @ x), x, rtol=1e-10
+    )  # residuals that grow by J x are those of x ahead
 
 
 def test_whiteness_separates_noise_from_drift() -> None:
@@ -382,7 +491,9 @@ def test_whiteness_separates_noise_from_drift() -> None:
 )
 def test_wrong_unknowns_are_refused(strokes: Recording, unknowns: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Problem([strokes], SENSORS, {name: Unknown.model_validate(u) for name, u in unknowns.items()})
+        Problem(
+            [strokes], SENSORS, {name: Unknown.model_validate(u) for name, u in unknowns.items()}
+        )
 
 
 def test_wrong_recordings_and_sensors_are_refused(strokes: Recording) -> None:
@@ -454,7 +565,9 @@ def test_killed_in_mid_run_it_continues_and_ends_the_same(tmp_path: Path) -> Non
 
     def begin(folder: Path) -> subprocess.Popen[str]:
         command = [sys.executable, "-c", KILLED, str(folder)]
-        return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parent)
+        return subprocess.Popen(
+            command, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parent
+        )
 
     whole, _ = begin(tmp_path / "whole").communicate(timeout=200)
     cut = begin(tmp_path / "cut")

@@ -1,4 +1,5 @@
-"""The answer as a file: its published schema, damaged and other files, and the rig that comes back from it."""
+"""The answer as a file: its published schema, damaged and other files, and the rig that comes back
+from it."""
 
 import json
 import re
@@ -19,7 +20,17 @@ from test_sysid_friction import Viscous
 from torchsoft import Parameters, SoftGrasp, simulate
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.physics.motion import Reference
-from torchsoft.sysid import AtRest, IdentificationResult, Prior, Problem, Sensor, Stage, Unknown, identify, record
+from torchsoft.sysid import (
+    AtRest,
+    IdentificationResult,
+    Prior,
+    Problem,
+    Sensor,
+    Stage,
+    Unknown,
+    identify,
+    record,
+)
 from torchsoft.sysid.estimate import Number, contributions, estimates
 from torchsoft.sysid.identification import Settings
 from torchsoft.sysid.result import checksum, load_answer, recorded_rigs, schema
@@ -29,7 +40,11 @@ from torchsoft.sysid.unknowns import Coordinate
 ROOT = Path(__file__).parents[1]
 PUBLISH = "from torchsoft.files import write_json; write_json('docs/answer.schema.json', schema())"
 BASE = Parameters().override(COARSE)
-SENSORS = {"theta": Sensor(noise=5e-4, bias=0.02), "y_Br": Sensor(noise=1e-5), "F_y": Sensor(noise=0.1)}
+SENSORS = {
+    "theta": Sensor(noise=5e-4, bias=0.02),
+    "y_Br": Sensor(noise=1e-5),
+    "F_y": Sensor(noise=0.1),
+}
 GRASP = Excitation(motion=Strokes(), duration=0.25, depth=1.2e-3, senses="bracket", grasp_time=0.15)
 UNKNOWNS = {
     "contact.R_n": Unknown(per="recording"), "pad.E": Unknown(), "contact.eta": Unknown(),
@@ -41,10 +56,12 @@ HOSTILE = 'a<b> & "$x_1$"'
 
 
 def example(kind: Any) -> Any:
-    """Something of this type, with everything in it that it can hold; numbers that need not be finite are not."""
+    """Something of this type, with everything in it that it can hold; numbers that need not be
+    finite are not."""
     known = {
-        str: HOSTILE, float: 0.25, int: 3, bool: True, Any: {"a": [1]}, Number: nan, Parameters: Parameters(),
-        Prior: Prior(median=0.25, sd=0.25), Unknown: Unknown(low=0.1, high=0.3), Sensor: Sensor(noise=0.1),
+        str: HOSTILE, float: 0.25, int: 3, bool: True, Any: {"a": [1]}, Number: nan,
+        Parameters: Parameters(), Prior: Prior(median=0.25, sd=0.25),
+        Unknown: Unknown(low=0.1, high=0.3), Sensor: Sensor(noise=0.1),
     }  # fmt: skip
     if kind in known:
         return known[kind]
@@ -69,7 +86,8 @@ def problem() -> Problem:
     """Two short grasps, one of them from a place that is not known well."""
     truth = BASE.override({"contact.K_n": 1.6e5})
     recordings = [
-        record(name, GRASP, truth, BASE, SENSORS, rtol=1e-3, seed=seed) for seed, name in enumerate(("first", "second"))
+        record(name, GRASP, truth, BASE, SENSORS, rtol=1e-3, seed=seed)
+        for seed, name in enumerate(("first", "second"))
     ]
     recordings[1] = replace(recordings[1], start=AtRest(position_sd=2e-5))
     return Problem(recordings, SENSORS, UNKNOWNS)
@@ -101,7 +119,9 @@ def test_files_are_what_the_schema_says(path: Path) -> None:
         assert [error.message for error in check.iter_errors(content)] == []
         assert "more" in next(check.iter_errors(content | {"more": 1})).message
         content["estimates"][0]["seen"] = "yes"
-        assert [list(error.path) for error in check.iter_errors(content)] == [["estimates", 0, "seen"]]
+        assert [list(error.path) for error in check.iter_errors(content)] == [
+            ["estimates", 0, "seen"]
+        ]
 
 
 def test_what_was_saved_comes_back(result: IdentificationResult, path: Path) -> None:
@@ -116,7 +136,10 @@ def test_what_was_saved_comes_back(result: IdentificationResult, path: Path) -> 
 
 def test_an_answer_says_what_was_asked_for(result: IdentificationResult) -> None:
     """The tolerance too, beside the one at which the fit ended."""
-    asked = Settings(tightenings=0, assumptions="trusted").model_dump() | {"rtol_asked": 1e-3, "acknowledged": []}
+    asked = Settings(tightenings=0, assumptions="trusted").model_dump() | {
+        "rtol_asked": 1e-3,
+        "acknowledged": [],
+    }
     assert {name: result.made_by[name] for name in asked} == asked | {"rtol": 1e-3}
 
 
@@ -151,10 +174,13 @@ def forge(content: dict[str, Any]) -> None:
 
 
 DAMAGE: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
-    "a digit": (lambda c: c["estimates"][1].update(last=1.25), "is damaged: its content is not what was saved"),
-    "a name": (lambda c: c["recordings"][0].update(name="other"), "is damaged: its content is not what was saved"),
+    "a digit": (lambda c: c["estimates"][1].update(last=1.25), "is damaged: its content is not "
+                                                               "what was saved"),
+    "a name": (lambda c: c["recordings"][0].update(name="other"), "is damaged: its content is not "
+                                                                  "what was saved"),
     "no checksum": (lambda c: c.pop("checksum"), "is damaged: its content is not what was saved"),
-    "another form": (lambda c: c.update(schema="torchsoft-answer-9"), "its `schema` is 'torchsoft-answer-9'"),
+    "another form": (lambda c: c.update(schema="torchsoft-answer-9"), "its `schema` is "
+                                                                      "'torchsoft-answer-9'"),
     "an old one": (lambda c: c.pop("schema"), "an older version wrote it, so identify again"),
     "forged": (forge, r"\.x\.\d+ should be a valid number, not '0'"),
 }  # fmt: skip
@@ -185,15 +211,21 @@ def test_other_files_are_refused_with_a_sentence(path: Path, tmp_path: Path, tex
 
 
 @pytest.mark.filterwarnings("ignore:not identifiable")
-def test_the_rig_of_a_file_runs_to_the_bit_like_that_of_the_result(result: IdentificationResult, path: Path) -> None:
+def test_the_rig_of_a_file_runs_to_the_bit_like_that_of_the_result(
+    result: IdentificationResult, path: Path
+) -> None:
     mine, its = result.model("second"), load_answer(path).model("second")
     assert isinstance(its, SoftGrasp)
-    names = {name: value for name, value in mine.named_parameters() if not name.startswith("reference.")}
+    names = {
+        name: value for name, value in mine.named_parameters() if not name.startswith("reference.")
+    }
     for name, value in names.items():
         assert torch.equal(its.parameter(name), value), name
     assert float(its.parameter("pad.E").detach()) == result["pad.E"].last
     own = [e.last for e in result.estimates if e.name == "contact.R_n"]
-    assert [float(result.model(name).parameter("contact.R_n").detach()) for name in ("first", "second")] == own
+    assert [
+        float(result.model(name).parameter("contact.R_n").detach()) for name in ("first", "second")
+    ] == own
     assert own[0] != own[1]
     t = torch.linspace(0.0, 0.2, 30, dtype=torch.float64)
     begun = result.rigs["second"]
@@ -201,35 +233,49 @@ def test_the_rig_of_a_file_runs_to_the_bit_like_that_of_the_result(result: Ident
     runs = [simulate(rig, t, y0=y0, reference=begun.reference, rtol=1e-3).y for rig in (mine, its)]
     assert torch.equal(*runs)
     assert not torch.equal(runs[0], simulate(begun, t, y0=y0, rtol=1e-3).y)
-    assert torch.equal(mine.follow(t), begun.follow(t))  # the result's rig follows what the recording followed
+    assert torch.equal(
+        mine.follow(t), begun.follow(t)
+    )  # the result's rig follows what the recording followed
     assert mine is not begun
 
 
-def test_what_is_not_identifiable_is_named_when_it_is_used(result: IdentificationResult, path: Path) -> None:
+def test_what_is_not_identifiable_is_named_when_it_is_used(
+    result: IdentificationResult, path: Path
+) -> None:
     assert not result["contact.eta"].identifiable
     for answer in (result, load_answer(path)):
-        with pytest.warns(UserWarning, match=r"only where the search ended: contact\.eta = \S+$") as caught:
+        with pytest.warns(
+            UserWarning, match=r"only where the search ended: contact\.eta = \S+$"
+        ) as caught:
             answer.model("first")
         assert [Path(one.filename).name for one in caught] == [Path(__file__).name]
         assert "pad.E" not in str(caught[0].message)
 
 
-def test_a_recording_that_was_not_fitted_has_no_values_of_its_own(result: IdentificationResult) -> None:
+def test_a_recording_that_was_not_fitted_has_no_values_of_its_own(
+    result: IdentificationResult,
+) -> None:
     def left_out(c: Coordinate) -> Coordinate:
         return replace(c, fixed=True) if c.recording == "second" else c
 
     out = [e for e in result.estimates if e.recording != "second"]
     answer = replace(result, estimates=out, coordinates=[left_out(c) for c in result.coordinates])
-    with pytest.warns(UserWarning, match=r"only where the search ended: contact\.eta = \S+, contact\.R_n = \S+$"):
+    with pytest.warns(
+        UserWarning, match=r"only where the search ended: contact\.eta = \S+, contact\.R_n = \S+$"
+    ):
         answer.model("second")
     with pytest.warns(UserWarning, match=r"only where the search ended: contact\.eta = \S+$"):
         answer.model("first")
 
 
 def test_a_recording_must_be_named_where_rigs_differ(result: IdentificationResult) -> None:
-    with pytest.raises(ValueError, match="not the same in all recordings: say in which one, of `first`, `second`"):
+    with pytest.raises(
+        ValueError, match="not the same in all recordings: say in which one, of `first`, `second`"
+    ):
         result.model()
-    with pytest.raises(ValueError, match="there is no recording 'third'; there are `first`, `second`"):
+    with pytest.raises(
+        ValueError, match="there is no recording 'third'; there are `first`, `second`"
+    ):
         result.model("third")
 
 
@@ -242,20 +288,31 @@ def slippery(problem: Problem, result: IdentificationResult) -> IdentificationRe
     x, C[0, 0] = c.start + 0.1, 1.0
     found = estimates(mine, x, c.free, C, np.zeros(len(x)))
     rigs = {r.name: r.rig for r in own}
-    return replace(result, estimates=found, x=x.tolist(), recordings=recorded_rigs(mine, x, mine.names), rigs=rigs)
+    return replace(
+        result,
+        estimates=found,
+        x=x.tolist(),
+        recordings=recorded_rigs(mine, x, mine.names),
+        rigs=rigs,
+    )
 
 
 def slide(settings: Parameters, reference: Reference) -> SoftGrasp:
     return SoftGrasp(settings, reference, friction=Viscous(0.6, 30.0))
 
 
-def test_a_law_of_the_users_own_needs_the_users_rig(slippery: IdentificationResult, tmp_path: Path) -> None:
+def test_a_law_of_the_users_own_needs_the_users_rig(
+    slippery: IdentificationResult, tmp_path: Path
+) -> None:
     slippery.save(tmp_path / "answer.json")
     answer, reference = load_answer(tmp_path / "answer.json"), slippery.rigs["first"].reference
     said = r"SoftGrasp with parts of its own, which no file holds: .* `applied_to\(rig\)`"
     with pytest.raises(ValueError, match=said):
         answer.model()
-    mine, weak = slide(BASE, reference), r"only where the search ended: contact\.friction\.alpha = 0\.663$"
+    mine, weak = (
+        slide(BASE, reference),
+        r"only where the search ended: contact\.friction\.alpha = 0\.663$",
+    )
     with pytest.warns(UserWarning, match=weak) as caught:
         its = answer.applied_to(mine)
     assert len(caught) == 1  # it is the right rig
@@ -271,11 +328,15 @@ def test_a_law_of_the_users_own_needs_the_users_rig(slippery: IdentificationResu
         pytest.warns(UserWarning, match=r"its values may mislead: pad\.nu is 0\.4 and was 0\.45$"),
     ):
         answer.applied_to(another)
-    with pytest.raises(ValueError, match=r"`contact\.friction\.alpha` is not a parameter of this rig"):
+    with pytest.raises(
+        ValueError, match=r"`contact\.friction\.alpha` is not a parameter of this rig"
+    ):
         answer.applied_to(SoftGrasp(BASE))
 
 
-def test_contributions_are_those_of_the_inverse_matrices(problem: Problem, result: IdentificationResult) -> None:
+def test_contributions_are_those_of_the_inverse_matrices(
+    problem: Problem, result: IdentificationResult
+) -> None:
     """Against numpy's inverses of what Fisher's matrices of the recordings add up to."""
     x, free = np.array(result.x), problem.coordinates.free
     J = problem.residuals(Runner(problem.recordings), x, problem.names, 1e-3, free).J
@@ -290,16 +351,22 @@ def test_contributions_are_those_of_the_inverse_matrices(problem: Problem, resul
         assert one.rows == len(parts[one.source])
         left = np.linalg.pinv(sum(part for name, part in F.items() if name != one.source))
         for i, label in enumerate(k[i] for i in known):
-            assert one.shares[label] == pytest.approx((C @ F[one.source] @ C)[i, i] / C[i, i], rel=1e-6, abs=1e-9)
+            assert one.shares[label] == pytest.approx(
+                (C @ F[one.source] @ C)[i, i] / C[i, i], rel=1e-6, abs=1e-9
+            )
             if one.without[label] is not None:
-                assert one.without[label] == pytest.approx((left[i, i] / C[i, i]) ** 0.5, rel=1e-6), label
+                assert one.without[label] == pytest.approx(
+                    (left[i, i] / C[i, i]) ** 0.5, rel=1e-6
+                ), label
         if one.source == "second":
             assert one.without["contact.R_n in second"] is None  # nothing else sees it
             assert one.without["pad.E"] > 1.1
     assert [one.source for one in result.contributions] == list(parts)
 
 
-def test_estimates_of_tied_and_of_linear_parameters_are_those_of_their_coordinates(problem: Problem) -> None:
+def test_estimates_of_tied_and_of_linear_parameters_are_those_of_their_coordinates(
+    problem: Problem,
+) -> None:
     sure, unknowns = Prior(median=0.8, sd=0.1), {
         "contact.mu_s": Unknown(prior=Prior(median=0.8, sd=0.1)),
         "contact.mu_k": Unknown(nominal=0.5, ratio_to="contact.mu_s", fixed=True),
@@ -308,12 +375,19 @@ def test_estimates_of_tied_and_of_linear_parameters_are_those_of_their_coordinat
     own = Problem(problem.recordings[:1], {"theta": Sensor(noise=5e-4)}, unknowns)
     c = own.coordinates
     x = c.start + np.array([np.log(1.1), 0.0, -0.05 / 0.19])
-    found = {e.name: e for e in estimates(own, x, c.free, np.diag([0.1**2, 0.0, 0.2**2]), np.array([0.05, 0.0, 0.0]))}
+    found = {
+        e.name: e
+        for e in estimates(
+            own, x, c.free, np.diag([0.1**2, 0.0, 0.2**2]), np.array([0.05, 0.0, 0.0])
+        )
+    }
     assert list(found) == list(unknowns)
     for name, start in (("contact.mu_s", 0.8), ("contact.mu_k", 0.4)):
         e = found[name]
         assert (e.start, e.value) == pytest.approx((start, 1.1 * start))
-        assert e.ci95 == pytest.approx((1.1 * start * np.exp(-0.196), 1.1 * start * np.exp(0.196)), rel=1e-4)
+        assert e.ci95 == pytest.approx(
+            (1.1 * start * np.exp(-0.196), 1.1 * start * np.exp(0.196)), rel=1e-4
+        )
         assert e.step_bias_sd == pytest.approx(0.5)
     assert [e.prior for e in found.values()] == [sure, None, None]
     nu = found["pad.nu"]

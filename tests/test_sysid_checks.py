@@ -1,4 +1,5 @@
-"""What an identification takes for granted: data say where it is otherwise; intervals allow for what they cannot tell."""
+"""What an identification takes for granted: data say where it is otherwise; intervals allow for
+what they cannot tell."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -42,8 +43,8 @@ BASE = Parameters().override(COARSE)
 TRUTH = {"pad.E": 0.85e6, "contact.K_n": 1.3e5}
 STROKES = Excitation(motion=Strokes(travel=8e-3, stroke_time=0.2), duration=0.9)
 SENSORS = {
-    "x_C": Sensor(noise=1e-5), "theta": Sensor(noise=5e-4), "y_Br": Sensor(noise=1e-5), "F_x": Sensor(noise=0.1),
-    "F_y": Sensor(noise=0.1),
+    "x_C": Sensor(noise=1e-5), "theta": Sensor(noise=5e-4), "y_Br": Sensor(noise=1e-5),
+    "F_x": Sensor(noise=0.1), "F_y": Sensor(noise=0.1),
 }  # fmt: skip
 RTOL = 1e-4
 
@@ -53,14 +54,19 @@ def recorded(truth: Parameters = BASE, excitation: Excitation = STROKES) -> Reco
 
 
 def checked(
-    data: Recording, doubtful: bool = False, sensors: dict[str, Sensor] = SENSORS, explain: bool = True
+    data: Recording,
+    doubtful: bool = False,
+    sensors: dict[str, Sensor] = SENSORS,
+    explain: bool = True,
 ) -> Checked:
     problem = Problem([data], sensors, {name: Unknown() for name in TRUTH})
     free, runner = problem.coordinates.free, Runner(problem.recordings)
     answer = identify(problem, plan=[Stage("all", problem.names, problem.coordinates.labels, RTOL)])
     x = np.array(answer.x)
     at, _ = problem.freeze(runner, x, problem.names, RTOL, free)
-    return check_assumptions(problem, x, at, free, problem.names, RTOL, doubtful=doubtful, explain=explain)
+    return check_assumptions(
+        problem, x, at, free, problem.names, RTOL, doubtful=doubtful, explain=explain
+    )
 
 
 @pytest.fixture(scope="module")
@@ -118,14 +124,18 @@ def late(data: Recording) -> Recording:
     [
         (elsewhere, "x_C0", 30.0, "the data contradict that the disc begins at scenario.x_C0"),
         (turned, "bias theta", 2e-3, "the data contradict that theta has no unknown bias"),
-        (lambda data: delayed(data, -1e-3), "clock of the set-points", 1.0, "the data contradict that set-points and sensors"),
+        (lambda data: delayed(data, -1e-3), "clock of the set-points", 1.0, "the data contradict "
+                                                                            "that set-points and "
+                                                                            "sensors"),
         (late, "delay x_C", 1.0, "the data contradict that x_C has no unknown delay"),
         (
-            lambda data: replace(data, samples=recorded(BASE.override({"disc.inertia_ratio": 1.2})).samples),
+            lambda data: replace(data,
+            samples=recorded(BASE.override({"disc.inertia_ratio": 1.2})).samples),
             "disc.inertia_ratio", 20.0, "the data contradict that disc.inertia_ratio is 1",
         ),
         pytest.param(
-            lambda data: replace(data, samples=recorded(BASE.override({"disc.radius": 19.39e-3})).samples), "disc.radius",
+            lambda data: replace(data,
+            samples=recorded(BASE.override({"disc.radius": 19.39e-3})).samples), "disc.radius",
             0.103, "the data contradict that disc.radius is 0.01937", marks=pytest.mark.slow,
         ),
     ],
@@ -138,14 +148,18 @@ def test_the_cause_is_named_with_its_amount(
     assert one.suspected
     assert one.favoured == pytest.approx(favoured, rel=0.1, abs=4 * one.favoured_sd)
     if one.parameter:
-        assert one.value == pytest.approx((1 + one.favoured / 100) * BASE.table()[name]["value"], rel=1e-9)
+        assert one.value == pytest.approx(
+            (1 + one.favoured / 100) * BASE.table()[name]["value"], rel=1e-9
+        )
         assert f"with {name} = {one.value:.6g} (" in assumption_notices(found)[0]
     assert "estimates under it: pad.E = " in assumption_notices(found)[0]
     assert one.under["pad.E"] == pytest.approx(TRUTH["pad.E"], rel=0.05)
     assert assumption_notices(found)[0].startswith(says)
 
 
-def made_by(other: Recording | None, data: Recording, sensors: dict[str, Sensor] = SENSORS) -> Recording:
+def made_by(
+    other: Recording | None, data: Recording, sensors: dict[str, Sensor] = SENSORS
+) -> Recording:
     """The samples that another rig would have given, with noise."""
     assert other is not None
     run, rng = predict(other.begin(), TRUTH, other.grid(False), (), 1e-6), np.random.default_rng(0)
@@ -171,10 +185,17 @@ QUIET = {name: Sensor(noise=0.2 * one.noise) for name, one in SENSORS.items()}
 
 
 @pytest.mark.parametrize(
-    ("vary", "name"), [(unramped, "ramp of the sliding"), (lambda data: scaled(data, ["contact.epsilon"], 0.1), "ramp")]
+    ("vary", "name"),
+    [
+        (unramped, "ramp of the sliding"),
+        (lambda data: scaled(data, ["contact.epsilon"], 0.1), "ramp"),
+    ],
 )
-def test_another_ramp_is_asked_for_by_data_that_it_made(vary: Callable[[Recording], Recording], name: str) -> None:
-    """A light grasp that slips: many points are hardly in contact. The fit runs off, and is repeated."""
+def test_another_ramp_is_asked_for_by_data_that_it_made(
+    vary: Callable[[Recording], Recording], name: str
+) -> None:
+    """A light grasp that slips: many points are hardly in contact. The fit runs off, and is
+    repeated."""
     data = recorded(excitation=LIGHT)
     found = checked(made_by(vary(data), data, QUIET), doubtful=True, sensors=QUIET)
     (one,) = (one for one in found.checks if one.name == name)
@@ -184,8 +205,11 @@ def test_another_ramp_is_asked_for_by_data_that_it_made(vary: Callable[[Recordin
 
 
 def far_off() -> tuple[Problem, Runner, np.ndarray]:
-    """Data of Coulomb's friction, and coordinates at which a fit with smooth friction has ended where nothing can be learnt."""
-    known = BASE.override({"contact.mu_s": 0.1, "contact.mu_k": 0.07, "contact.v_s": 0.1, "contact.eta": 100.0})
+    """Data of Coulomb's friction, and coordinates at which a fit with smooth friction has ended
+    where nothing can be learnt."""
+    known = BASE.override(
+        {"contact.mu_s": 0.1, "contact.mu_k": 0.07, "contact.v_s": 0.1, "contact.eta": 100.0}
+    )
     data = record("light", LIGHT, known.override(TRUTH), known, SENSORS, rtol=1e-5, noise=0.0)
     problem = Problem([made_by(coulomb(data), data)], SENSORS, {name: Unknown() for name in TRUTH})
     return problem, Runner(problem.recordings), problem.coordinates.start + [0.5, -0.7]
@@ -200,7 +224,8 @@ def test_what_no_test_explains_has_candidates() -> None:
     assert not any(one.refitted for one in found.checks)
     assert "Coulomb friction" in found.candidates
     assert any(
-        "`explain` looks for the cause, with a new fit without each of " in text for text in assumption_notices(found)
+        "`explain` looks for the cause, with a new fit without each of " in text
+        for text in assumption_notices(found)
     )
 
 
@@ -209,8 +234,12 @@ def test_under_another_law_a_fit_that_is_far_off_begins_anew() -> None:
     free = problem.coordinates.free
     at, _ = problem.freeze(runner, x, problem.names, RTOL, free)
     end = ended(problem, x, at, free, problem.names, RTOL, 1, None)
-    law = next(one for one in assumptions(problem.recordings, set(TRUTH)) if one.name == "Coulomb friction")
-    as_stated, again = (refit(problem, end, one, "linear", lambda chi2: None) for one in (None, law))
+    law = next(
+        one for one in assumptions(problem.recordings, set(TRUTH)) if one.name == "Coulomb friction"
+    )
+    as_stated, again = (
+        refit(problem, end, one, "linear", lambda chi2: None) for one in (None, law)
+    )
     assert as_stated is not None
     assert again is not None
     assert as_stated.fit.chi2 > 1e3  # nothing can be done with smooth friction
@@ -222,7 +251,9 @@ def test_under_another_law_a_fit_that_is_far_off_begins_anew() -> None:
 def test_a_number_is_varied_as_far_as_there_is_a_rig() -> None:
     """A disc that is smaller by a hundredth leaves these pads apart."""
     problem = Problem([recorded(excitation=LIGHT)], SENSORS, {name: Unknown() for name in TRUTH})
-    (one,) = (one for one in assumptions(problem.recordings, set(TRUTH)) if one.name == "disc.radius")
+    (one,) = (
+        one for one in assumptions(problem.recordings, set(TRUTH)) if one.name == "disc.radius"
+    )
     other = varied(problem, problem.names, one)
     assert isinstance(other, Problem)
     radius = next(a for a in other.coordinates.all if a.name == "disc.radius")
@@ -238,7 +269,12 @@ def test_which_numbers_a_doubtful_fit_is_repeated_without(far: bool, numbers: st
     taken.append(Variation("law", "law", "", "", vary=lambda r: r))
     checks = {
         one.name: assumption_test(
-            one, gain=100.0 - k, left=900.0, favoured=1.0, favoured_sd=10.0 - k, significance=100.0 - k
+            one,
+            gain=100.0 - k,
+            left=900.0,
+            favoured=1.0,
+            favoured_sd=10.0 - k,
+            significance=100.0 - k,
         )
         for k, one in enumerate(taken)
     }
@@ -262,13 +298,23 @@ def test_every_pad_is_meshed_anew_where_it_was() -> None:
 def test_what_is_unknown_is_not_taken_for_granted() -> None:
     data = recorded()
     names = {one.name for one in assumptions([data], set())}
-    left = {one.name for one in assumptions([data], {"disc.radius", "contact.epsilon", "start.disc.x"})}
+    left = {
+        one.name for one in assumptions([data], {"disc.radius", "contact.epsilon", "start.disc.x"})
+    }
     assert names - left == {"disc.radius", "ramp", "x_C0"}
 
 
 def test_a_variation_that_cannot_be_run_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     def bare(*_: object) -> list[Variation]:
-        return [Variation("mesh", "numerical", "the pads have few elements", "they had more", vary=lambda r: None)]
+        return [
+            Variation(
+                "mesh",
+                "numerical",
+                "the pads have few elements",
+                "they had more",
+                vary=lambda r: None,
+            )
+        ]
 
     monkeypatch.setattr("torchsoft.sysid.sensitivity.assumptions", bare)
     found = checked(recorded())
@@ -280,12 +326,27 @@ def test_a_variation_that_cannot_be_run_is_said(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.parametrize(
     ("favoured", "refitted", "unit", "suspected"),
-    [(24.0, False, "%", True), (-208.0, False, "%", False), (-208.0, True, "%", True), (124.0, False, "N", True)],
+    [
+        (24.0, False, "%", True),
+        (-208.0, False, "%", False),
+        (-208.0, True, "%", True),
+        (124.0, False, "N", True),
+    ],
 )
-def test_a_negative_mass_explains_nothing(favoured: float, refitted: bool, unit: str, suspected: bool) -> None:
+def test_a_negative_mass_explains_nothing(
+    favoured: float, refitted: bool, unit: str, suspected: bool
+) -> None:
     """A number of the rig that would have to vanish is no cause, and ends no search for one."""
     one = AssumptionTest(
-        "disc.mass", "known", "", "", 1.0, unit, favoured=favoured, significance=1e6, refitted=refitted
+        "disc.mass",
+        "known",
+        "",
+        "",
+        1.0,
+        unit,
+        favoured=favoured,
+        significance=1e6,
+        refitted=refitted,
     )
     assert one.suspected is suspected
 
@@ -311,7 +372,12 @@ def test_an_interrupt_among_the_assumptions_keeps_the_fit(monkeypatch: pytest.Mo
 def test_no_bound_is_to_be_widened_for_what_is_not_identifiable() -> None:
     def one(identifiable: bool) -> SimpleNamespace:
         return SimpleNamespace(
-            identifiable=identifiable, at_bound=True, relative_sd=2.0, label="a", last=1.0, step_bias_sd=0.0
+            identifiable=identifiable,
+            at_bound=True,
+            relative_sd=2.0,
+            label="a",
+            last=1.0,
+            step_bias_sd=0.0,
         )
 
     assert not any("widen" in text for text in notices_on([one(False)], True, 1e-5, False))

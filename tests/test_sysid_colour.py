@@ -1,4 +1,5 @@
-"""Identification under coloured noise and under outliers: what is found, what intervals allow for, and what is said."""
+"""Identification under coloured noise and under outliers: what is found, what intervals allow for,
+and what is said."""
 
 from dataclasses import replace
 
@@ -31,7 +32,9 @@ def exact() -> Recording:
     return record("strokes", STROKES, BASE.override(TRUTH), BASE, sensors(), rtol=1e-6, noise=0.0)
 
 
-def noisy(exact: Recording, seed: int, noise: Autoregression | None, outliers: float = 0.0) -> Recording:
+def noisy(
+    exact: Recording, seed: int, noise: Autoregression | None, outliers: float = 0.0
+) -> Recording:
     """With noise as stated, of a colour, or with so many samples that are ten times off."""
     rng, samples = np.random.default_rng(seed), {}
     for channel, (t, y) in exact.samples.items():
@@ -42,7 +45,11 @@ def noisy(exact: Recording, seed: int, noise: Autoregression | None, outliers: f
 
 
 def problem(recording: Recording, colour: str = "white") -> Problem:
-    return Problem([recording], sensors(colour), {name: Unknown(nominal=1.01 * value) for name, value in TRUTH.items()})
+    return Problem(
+        [recording],
+        sensors(colour),
+        {name: Unknown(nominal=1.01 * value) for name, value in TRUTH.items()},
+    )
 
 
 def test_colour_that_nobody_declared_widens_intervals_and_is_said(exact: Recording) -> None:
@@ -68,7 +75,10 @@ def test_colour_that_nobody_declared_widens_intervals_and_is_said(exact: Recordi
 
 def test_residuals_and_the_adjoint_agree_on_coloured_noise(exact: Recording) -> None:
     """Rows whitened at once, and again from other noise; the gradient of half their squares."""
-    gaps = {c: (np.delete(t, slice(20, 30)), np.delete(y, slice(20, 30))) for c, (t, y) in exact.samples.items()}
+    gaps = {
+        c: (np.delete(t, slice(20, 30)), np.delete(y, slice(20, 30)))
+        for c, (t, y) in exact.samples.items()
+    }
     plain = problem(replace(exact, samples=gaps))
     coloured = plain.with_noise({"x_C": AR, "F_x": Autoregression((1.2, -0.5), 0.7, 5e-3)})
     runner, which, x = Runner(plain.recordings), ["strokes"], plain.coordinates.start
@@ -87,18 +97,26 @@ def test_residuals_and_the_adjoint_agree_on_coloured_noise(exact: Recording) -> 
 
 
 def test_a_robust_loss_sees_through_outliers(exact: Recording) -> None:
-    """Every twentieth sample is off by twenty standard deviations: least squares says so, and a robust loss is as exact as the
-    rest of the samples allow."""
+    """Every twentieth sample is off by twenty standard deviations: least squares says so, and a
+    robust loss is as exact as the rest of the samples allow."""
     bad = problem(noisy(exact, 2, None, outliers=0.05))
     clean, plain, robust = (
         identify(one, plan=[STAGE], loss=loss, assumptions="trusted")
-        for one, loss in ((problem(noisy(exact, 2, None)), "linear"), (bad, "linear"), (bad, "cauchy"))
+        for one, loss in (
+            (problem(noisy(exact, 2, None)), "linear"),
+            (bad, "linear"),
+            (bad, "cauchy"),
+        )
     )
     assert any("outliers" in notice for notice in plain.notices)
-    assert any("larger than the noise" in notice and "intervals are widened by" in notice for notice in plain.notices)
+    assert any(
+        "larger than the noise" in notice and "intervals are widened by" in notice
+        for notice in plain.notices
+    )
     assert not robust.notices
     for name, truth in TRUTH.items():
         assert abs(np.log(robust[name].last / truth)) < 3 * robust[name].relative_sd, name
-        # nine tenths as efficient, by an estimate from the residuals themselves, which scatters by some percent
+        # nine tenths as efficient, by an estimate from the residuals themselves, which scatters by
+        # some percent
         assert 0.9 < robust[name].relative_sd / clean[name].relative_sd < 1.25
         assert plain[name].relative_sd > 2 * robust[name].relative_sd

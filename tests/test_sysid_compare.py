@@ -1,4 +1,5 @@
-"""Which law: the rule, how often it is right where the answer is known, densities in closed form, and laws of friction."""
+"""Which law: the rule, how often it is right where the answer is known, densities in closed form,
+and laws of friction."""
 
 import json
 from dataclasses import replace
@@ -33,7 +34,9 @@ def law(name: str, r: np.ndarray, k: int = 3, held: np.ndarray | None = None) ->
         return Density([part], residuals, residuals, -0.5 * float(residuals @ residuals))
 
     heldout = None if held is None else said(held, "other")
-    return SimpleNamespace(name=name, fitted=said(r, "one"), heldout=heldout, parameters=k, numerical=0.0)
+    return SimpleNamespace(
+        name=name, fitted=said(r, "one"), heldout=heldout, parameters=k, numerical=0.0
+    )
 
 
 def apart(D: float) -> np.ndarray:
@@ -54,7 +57,9 @@ def shares(D: float, draws: list[np.ndarray]) -> dict[str, float]:
     return {one: said.count(one) / len(said) for one in ("right", "wrong", "cannot tell")}
 
 
-def test_with_white_noise_a_wrong_law_is_never_named_and_the_right_one_where_predictions_differ_enough() -> None:
+def test_with_white_noise_a_wrong_law_is_never_named_and_the_right_one_where_predictions_differ_enough() -> (
+    None
+):
     """As a normal distribution has it: z is (D / 2, 1) where the first law made the data."""
     rng = np.random.default_rng(0)
     draws = list(rng.standard_normal((50, len(T))))
@@ -68,12 +73,17 @@ def test_with_white_noise_a_wrong_law_is_never_named_and_the_right_one_where_pre
 def test_with_coloured_noise_that_was_taken_for_white_the_wrong_law_is_not_named(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The likelihood ratio is then some standard deviations of the stated noise from zero by chance."""
+    """The likelihood ratio is then some standard deviations of the stated noise from zero by
+    chance."""
     rng, colour = np.random.default_rng(1), Autoregression.stated((0.95,), 5e-3)
-    L = np.linalg.cholesky(colour.autocovariance(len(T))[np.abs(np.subtract.outer(*2 * [np.arange(len(T))]))])
+    L = np.linalg.cholesky(
+        colour.autocovariance(len(T))[np.abs(np.subtract.outer(*2 * [np.arange(len(T))]))]
+    )
     draws = [L @ rng.standard_normal(len(T)) for _ in range(60)]
     assert shares(5.0, draws)["wrong"] <= 0.02
-    monkeypatch.setattr("torchsoft.sysid.compare.fit_noise", lambda series, most: SimpleNamespace(noise=None))
+    monkeypatch.setattr(
+        "torchsoft.sysid.compare.fit_noise", lambda series, most: SimpleNamespace(noise=None)
+    )
     assert shares(5.0, draws)["wrong"] > 0.05
 
 
@@ -103,9 +113,15 @@ def test_heldout_recordings_count_and_may_contradict() -> None:
 
 
 def fitted(
-    name: str, p: float = 0.5, converged: bool = True, heldout_p: float | None = None, patterned: bool = False
+    name: str,
+    p: float = 0.5,
+    converged: bool = True,
+    heldout_p: float | None = None,
+    patterned: bool = False,
 ) -> LawFit:
-    return LawFit(name, 2, {}, 0.0, 1.0, p, 0.0, 0.0, 0.0, 0.5, None, heldout_p, 0.0, converged, [], patterned)
+    return LawFit(
+        name, 2, {}, 0.0, 1.0, p, 0.0, 0.0, 0.0, 0.5, None, heldout_p, 0.0, converged, [], patterned
+    )
 
 
 def test_no_law_is_named_that_leaves_more_than_noise_or_before_every_fit_has_converged() -> None:
@@ -116,7 +132,10 @@ def test_no_law_is_named_that_leaves_more_than_noise_or_before_every_fit_has_con
     assert (outcome, none) == ("none fits", None)
     assert "it is nearer than `b`, but that does not make it right" in verdict
     assert judged([fitted("a", heldout_p=1e-9), fitted("b")], [clear])[0] == "none fits"
-    assert "leaves residuals that follow the motion" in judged([fitted("a", patterned=True), fitted("b")], [clear])[2]
+    assert (
+        "leaves residuals that follow the motion"
+        in judged([fitted("a", patterned=True), fitted("b")], [clear])[2]
+    )
     outcome, _, verdict = judged([fitted("a"), fitted("b", converged=False)], [clear])
     assert outcome == "cannot tell"
     assert "the fit of `b` has not converged" in verdict
@@ -128,11 +147,18 @@ BASE = Parameters().override(COARSE | {"contact.mu_s": 0.7, "contact.mu_k": 0.6}
 NOISE = {"x_C": 1e-5, "theta": 5e-4, "F_x": 0.1}
 SENSORS = {channel: Sensor(noise=sigma) for channel, sigma in NOISE.items()}
 STROKE = Excitation(
-    motion=Strokes(travel=25e-3, stroke_time=0.15), duration=0.4, depth=2e-4, grasp_time=0.15, settle=0.05
+    motion=Strokes(travel=25e-3, stroke_time=0.15),
+    duration=0.4,
+    depth=2e-4,
+    grasp_time=0.15,
+    settle=0.05,
 )
-GENTLE = Excitation(motion=Roll(travel=1e-3), duration=0.4, depth=1e-3, grasp_time=0.15, settle=0.05)
+GENTLE = Excitation(
+    motion=Roll(travel=1e-3), duration=0.4, depth=1e-3, grasp_time=0.15, settle=0.05
+)
 UNKNOWNS = {
-    "smooth": {"contact.mu_s": Unknown(low=0.4, high=1.2), "contact.mu_k": Unknown(ratio_to="contact.mu_s", low=0.4, high=0.9)},
+    "smooth": {"contact.mu_s": Unknown(low=0.4, high=1.2),
+    "contact.mu_k": Unknown(ratio_to="contact.mu_s", low=0.4, high=0.9)},
     "viscous": {"contact.friction.alpha": Unknown(low=0.3, high=1.2)},
 }  # fmt: skip
 
@@ -153,9 +179,20 @@ def laws(recording: Recording, excitation: Excitation) -> dict[str, Problem]:
     }
 
 
-def made(excitation: Excitation, build: Any, values: dict[str, float], noise: float = 1.0) -> dict[str, Problem]:
+def made(
+    excitation: Excitation, build: Any, values: dict[str, float], noise: float = 1.0
+) -> dict[str, Problem]:
     recording = record(
-        "one", excitation, BASE, BASE, SENSORS, build=build, values=values, rtol=1e-5, noise=noise, seed=1
+        "one",
+        excitation,
+        BASE,
+        BASE,
+        SENSORS,
+        build=build,
+        values=values,
+        rtol=1e-5,
+        noise=noise,
+        seed=1,
     )
     return laws(recording, excitation)
 
@@ -203,18 +240,25 @@ def test_laws_that_were_not_given_the_same_data_are_refused(stroke: dict[str, Pr
     recording = p.recordings[0]
 
     def other(**changes: Any) -> dict[str, Problem]:
-        return {"a": one, "b": Problem([replace(recording, **changes)], SENSORS, UNKNOWNS["smooth"])}
+        return {
+            "a": one,
+            "b": Problem([replace(recording, **changes)], SENSORS, UNKNOWNS["smooth"]),
+        }
 
     with pytest.raises(ValueError, match="needs two laws or more, not 1"):
         compare({"a": one})
     with pytest.raises(ValueError, match="the laws `a` and `b` have other recordings: one and two"):
         compare(other(name="two"))
     noisier = {channel: (t, y + 1e-9) for channel, (t, y) in recording.samples.items()}
-    with pytest.raises(ValueError, match="recording `one` of the laws `a` and `b` has other samples"):
+    with pytest.raises(
+        ValueError, match="recording `one` of the laws `a` and `b` has other samples"
+    ):
         compare(other(samples=noisier))
     with pytest.raises(ValueError, match="have other sensors"):
         compare({"a": one, "b": Problem([recording], {"x_C": SENSORS["x_C"]}, UNKNOWNS["smooth"])})
-    moved = Reference(**{n: recording.rig.reference[n] for n in ("y_d", "F_ff")}, x_d=Profile([0.0], [60e-3]))
+    moved = Reference(
+        **{n: recording.rig.reference[n] for n in ("y_d", "F_ff")}, x_d=Profile([0.0], [60e-3])
+    )
     with pytest.raises(ValueError, match="follow another reference in recording `one`"):
         compare(other(rig=SoftGrasp(STROKE.settings(BASE), moved)))
     with pytest.raises(ValueError, match=r"`heldout` must name some of \['one'\], but not all"):
@@ -256,8 +300,18 @@ def test_law_comparison_smoke(tmp_path: Path) -> None:
     module = experiment("law_comparison")
     module.main(module.Config(out=tmp_path, smoke=True))
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert [case["answer"] for case in summary["cases"]] == ["right", "right", "cannot tell", "cannot tell"]
-    assert min(case["D"] for case in summary["cases"][:2]) > 20 > 1 > max(case["D"] for case in summary["cases"][2:])
+    assert [case["answer"] for case in summary["cases"]] == [
+        "right",
+        "right",
+        "cannot tell",
+        "cannot tell",
+    ]
+    assert (
+        min(case["D"] for case in summary["cases"][:2])
+        > 20
+        > 1
+        > max(case["D"] for case in summary["cases"][2:])
+    )
     assert (tmp_path / "law_comparison.png").stat().st_size > 10_000
 
 

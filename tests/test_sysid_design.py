@@ -1,4 +1,5 @@
-"""Designed motions: criteria and slopes against differences, bounds that hold everywhere, and what should be recorded next."""
+"""Designed motions: criteria and slopes against differences, bounds that hold everywhere, and what
+should be recorded next."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,16 @@ from torchsoft import Parameters, Profile, Reference
 from torchsoft.excitation import Excitation, Knots, Strokes, begin
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import RIG, Known, Problem, Recording, Sensor, Unknown, record
-from torchsoft.sysid.criterion import Bounds, Criterion, Moves, Outlook, chosen, deviations, next_recording, profile
+from torchsoft.sysid.criterion import (
+    Bounds,
+    Criterion,
+    Moves,
+    Outlook,
+    chosen,
+    deviations,
+    next_recording,
+    profile,
+)
 from torchsoft.sysid.design import BENT, Design, design, draws
 from torchsoft.sysid.figures import design_figure
 from torchsoft.sysid.fit import fisher
@@ -59,7 +69,9 @@ def test_a_criterion_has_the_derivative_of_its_differences(criterion: Criterion)
     value, slope = criterion(C)
     ahead, behind = (criterion(C + h * direction)[0] for h in (1e-6, -1e-6))
     assert np.sum(slope * direction) == pytest.approx((ahead - behind) / 2e-6, rel=1e-6)
-    assert criterion(4 * C)[0] == pytest.approx(value + np.log(2))  # a logarithm of standard deviations
+    assert criterion(4 * C)[0] == pytest.approx(
+        value + np.log(2)
+    )  # a logarithm of standard deviations
 
 
 def test_for_one_parameter_the_criteria_are_one() -> None:
@@ -67,17 +79,24 @@ def test_for_one_parameter_the_criteria_are_one() -> None:
     assert values == pytest.approx([np.log(0.2)] * 3)
 
 
-@pytest.mark.parametrize(("sensors", "rel"), [({}, 1e-3), ({"F_x": Sensor(noise=0.1, bias=1.0, gain=0.1)}, 1e-3)])
+@pytest.mark.parametrize(
+    ("sensors", "rel"), [({}, 1e-3), ({"F_x": Sensor(noise=0.1, bias=1.0, gain=0.1)}, 1e-3)]
+)
 def test_slopes_are_those_of_differences(
     plan: Recording, sensors: dict[str, Sensor], rel: float, monkeypatch: Any
 ) -> None:
-    """Of values and times of the knots, with what excess costs; a sensor's gain and bias are fitted beside the parameters."""
+    """Of values and times of the knots, with what excess costs; a sensor's gain and bias are fitted
+    beside the parameters."""
     monkeypatch.setattr("torchsoft.sysid.planner.DIFFERENCE", 1e-4)
     stated = Problem([plan], SENSORS | sensors, {"pad.E": Unknown(), "contact.K_n": Unknown()})
     one = planner(stated, Criterion("A"), F_y=(-30.0, 30.0))
     z, x = one.moves.start, stated.coordinates.start
     at = one.evaluate(z, x)
-    slopes, direction, h = one.slopes(z, x, at), np.random.default_rng(1).standard_normal(one.moves.n), 3e-5
+    slopes, direction, h = (
+        one.slopes(z, x, at),
+        np.random.default_rng(1).standard_normal(one.moves.n),
+        3e-5,
+    )
     assert at.peaks["F_y"] > 1
     ahead, behind = (one.evaluate(z + s * h * direction, x, at.steps) for s in (1, -1))
     wanted = (ahead.value + ahead.cost - behind.value - behind.cost) / (2 * h)
@@ -85,7 +104,8 @@ def test_slopes_are_those_of_differences(
 
 
 def test_what_finite_steps_and_bent_samples_do_to_a_fit_counts(plan: Recording) -> None:
-    """Sensors a thousand times as good see the steps, and what a covariance promises is not there."""
+    """Sensors a thousand times as good see the steps, and what a covariance promises is not
+    there."""
     parts, sds = [], []
     for better in (1.0, 1e3):
         sensors = {name: Sensor(noise=one.noise / better) for name, one in SENSORS.items()}
@@ -94,7 +114,9 @@ def test_what_finite_steps_and_bent_samples_do_to_a_fit_counts(plan: Recording) 
         at = one.evaluate(one.moves.start, stated.coordinates.start)
         sd = np.array(list(one.deviations(stated.coordinates.start, at).values()))
         assert at.errors.shape == (2, 2)
-        assert at.value == pytest.approx(0.5 * np.log(np.mean(sd**2 + LEFT**2 * (at.errors**2).mean(0))))
+        assert at.value == pytest.approx(
+            0.5 * np.log(np.mean(sd**2 + LEFT**2 * (at.errors**2).mean(0)))
+        )
         parts.append(np.abs(at.errors) / sd)
         sds.append(sd)
     assert parts[0].max() < 0.5 * BENT
@@ -104,7 +126,9 @@ def test_what_finite_steps_and_bent_samples_do_to_a_fit_counts(plan: Recording) 
 
 def test_nuisances_are_left_out_as_the_schur_complement(plan: Recording) -> None:
     stated = Problem(
-        [plan], {**SENSORS, "F_y": Sensor(noise=0.1, bias=1.0)}, {"pad.E": Unknown(), "contact.K_n": Unknown()}
+        [plan],
+        {**SENSORS, "F_y": Sensor(noise=0.1, bias=1.0)},
+        {"pad.E": Unknown(), "contact.K_n": Unknown()},
     )
     x, c = stated.coordinates.start, stated.coordinates
     J = stated.residuals(Runner([plan]), x, ["plan"], 1e-3, c.free).J
@@ -116,7 +140,10 @@ def test_nuisances_are_left_out_as_the_schur_complement(plan: Recording) -> None
 
 
 def test_a_ratio_counts_with_what_it_is_a_ratio_to(plan: Recording) -> None:
-    unknowns = {"contact.mu_s": Unknown(), "contact.mu_k": Unknown(nominal=0.5, ratio_to="contact.mu_s")}
+    unknowns = {
+        "contact.mu_s": Unknown(),
+        "contact.mu_k": Unknown(nominal=0.5, ratio_to="contact.mu_s"),
+    }
     stated = Problem([plan], SENSORS, unknowns)
     names, T = chosen(stated, stated.coordinates.start, ["contact.mu_k"])
     assert names == ("contact.mu_k",)
@@ -124,7 +151,10 @@ def test_a_ratio_counts_with_what_it_is_a_ratio_to(plan: Recording) -> None:
 
 
 def test_motions_keep_within_their_bounds_between_knots_too(plan: Recording) -> None:
-    moves, t = Moves(plan.rig.reference, BOUNDS, 0.25), torch.linspace(0.13, 0.3, 2000, dtype=torch.float64)
+    moves, t = (
+        Moves(plan.rig.reference, BOUNDS, 0.25),
+        torch.linspace(0.13, 0.3, 2000, dtype=torch.float64),
+    )
     rng = np.random.default_rng(0)
     far = moves.start + 5 * rng.standard_normal(moves.n)
     reference = moves.reference(torch.from_numpy(moves.nearest(far)))
@@ -145,10 +175,19 @@ def test_motions_keep_within_their_bounds_between_knots_too(plan: Recording) -> 
     [
         ({"plan": "other"}, "`plan` must be one of the recordings"),
         ({"bounds": {}}, "names no signal"),
-        ({"bounds": {"F_ff": Bounds(low=-9, high=0, speed=1, after=0.2)}}, "`F_ff` has no knot after 0.2 s"),
+        (
+            {"bounds": {"F_ff": Bounds(low=-9, high=0, speed=1, after=0.2)}},
+            "`F_ff` has no knot after 0.2 s",
+        ),
         ({"bounds": {"z_d": Bounds(low=0, high=1, speed=1)}}, "no Profile called `z_d`"),
-        ({"bounds": {"x_d": Bounds(low=0, high=1, speed=1, after=-1)}}, "must have a knot at or before -1 s"),
-        ({"bounds": {"x_d": Bounds(low=0, high=0.001, speed=1, after=0.13)}}, "no motion of these knots"),
+        (
+            {"bounds": {"x_d": Bounds(low=0, high=1, speed=1, after=-1)}},
+            "must have a knot at or before -1 s",
+        ),
+        (
+            {"bounds": {"x_d": Bounds(low=0, high=0.001, speed=1, after=0.13)}},
+            "no motion of these knots",
+        ),
         ({"limits": {"F_x": (1.0, -1.0)}}, r"limits.F_x = \(1.0, -1.0\)"),
         ({"limits": {"Fx": (-1.0, 1.0)}}, "limits.Fx"),
         ({"names": ["pad.nu"]}, "`names` must be some of the parameters pad.E, contact.K_n"),
@@ -157,7 +196,9 @@ def test_motions_keep_within_their_bounds_between_knots_too(plan: Recording) -> 
         ({"iterations": -1}, "`iterations` must not be negative"),
     ],
 )
-def test_what_does_not_fit_is_refused(problem: Problem, changes: dict[str, Any], message: str) -> None:
+def test_what_does_not_fit_is_refused(
+    problem: Problem, changes: dict[str, Any], message: str
+) -> None:
     given: dict[str, Any] = {"plan": "plan", "bounds": BOUNDS} | changes
     with pytest.raises(ValueError, match=message):
         design(problem, **given)
@@ -175,8 +216,8 @@ def test_bounds_and_criteria_are_checked() -> None:
 @pytest.fixture(scope="session")
 def found(problem: Problem) -> Design:
     return design(
-        problem, "plan", BOUNDS, limits={"F_y": (-60.0, 60.0)}, at=draws(problem, 2, spread=0.1), iterations=60, rate=0.3,
-        criterion=Criterion("worst", (0.01, 0.08)),
+        problem, "plan", BOUNDS, limits={"F_y": (-60.0, 60.0)}, at=draws(problem, 2, spread=0.1),
+        iterations=60, rate=0.3, criterion=Criterion("worst", (0.01, 0.08)),
     )  # fmt: skip
 
 
@@ -201,7 +242,9 @@ def test_a_design_is_an_excitation_in_a_file(found: Design, tmp_path: Path) -> N
     path.write_text(excitation.to_toml(), encoding="utf-8")
     again = begin(Excitation.from_toml(path), P).model.reference
     t = torch.linspace(0, 0.3, 200, dtype=torch.float64)
-    off = again(t, ["x_d", "y_d", "F_ff"]) - found.recording.rig.reference(t, ["x_d", "y_d", "F_ff"])
+    off = again(t, ["x_d", "y_d", "F_ff"]) - found.recording.rig.reference(
+        t, ["x_d", "y_d", "F_ff"]
+    )
     assert float(off[:, :2].abs().max()) < 1e-12
     assert float(off[:, 2].abs().max()) < 1e-6  # a force that was solved for
 
@@ -216,15 +259,31 @@ def test_any_rig_with_profiles() -> None:
     rig: Any = turning(control__senses="bracket")
     y, still = grasp(rig.fixed())
     x = float(profile(still, "x_d").values)
-    rig.reference = Reference(x_d=Profile([0.0, 0.04, 0.08], [x, x + 5e-4, x]), y_d=still["y_d"], F_ff=still["F_ff"])
-    t, sensors = np.linspace(0.0, 0.1, 21), {"x_disc": SENSORS["x_C"], "theta_disc": SENSORS["theta"]}
-    data = Recording(
-        "turning", rig, {name: (t, np.zeros(len(t))) for name in sensors}, Known(rig.pack(rig.fixed().unpack(y)))
+    rig.reference = Reference(
+        x_d=Profile([0.0, 0.04, 0.08], [x, x + 5e-4, x]), y_d=still["y_d"], F_ff=still["F_ff"]
     )
-    stated = Problem([data], sensors, {"pads.L.material.E": Unknown(), "pads.L.material.tau": Unknown()})
+    t, sensors = (
+        np.linspace(0.0, 0.1, 21),
+        {"x_disc": SENSORS["x_C"], "theta_disc": SENSORS["theta"]},
+    )
+    data = Recording(
+        "turning",
+        rig,
+        {name: (t, np.zeros(len(t))) for name in sensors},
+        Known(rig.pack(rig.fixed().unpack(y))),
+    )
+    stated = Problem(
+        [data], sensors, {"pads.L.material.E": Unknown(), "pads.L.material.tau": Unknown()}
+    )
     bounds = {"x_d": Bounds(low=x - 2e-3, high=x + 2e-3, speed=0.2, shortest=0.02)}
     found = design(
-        stated, "turning", bounds, names=["pads.L.material.tau"], iterations=4, rate=0.3, limits={"F_x": (-20.0, 20.0)}
+        stated,
+        "turning",
+        bounds,
+        names=["pads.L.material.tau"],
+        iterations=4,
+        rate=0.3,
+        limits={"F_x": (-20.0, 20.0)},
     )
     assert found.after["pads.L.material.tau"] < 0.9 * found.before["pads.L.material.tau"]
     assert found.made_by["gradients"] >= 4 * 4

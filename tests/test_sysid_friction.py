@@ -1,4 +1,5 @@
-"""A friction law of the user's own, with parameters that `Parameters` does not have, identified like any other."""
+"""A friction law of the user's own, with parameters that `Parameters` does not have, identified
+like any other."""
 
 import importlib.util
 import pickle
@@ -21,7 +22,13 @@ from torchsoft.sysid.synthetic import Build
 
 BASE = Parameters().override(COARSE)
 SENSORS = {"x_C": Sensor(noise=1e-5), "theta": Sensor(noise=5e-4), "F_x": Sensor(noise=0.1)}
-JERKS = Excitation(motion=Strokes(travel=30e-3, stroke_time=0.1), duration=0.6, depth=5e-4, grasp_time=0.2, settle=0.05)
+JERKS = Excitation(
+    motion=Strokes(travel=30e-3, stroke_time=0.1),
+    duration=0.6,
+    depth=5e-4,
+    grasp_time=0.2,
+    settle=0.05,
+)
 TRUTH = {"contact.friction.alpha": 0.45, "contact.friction.beta": 60.0}
 
 
@@ -56,11 +63,15 @@ def jerks() -> Recording:
 def test_its_parameters_are_found_beside_those_of_the_pads(jerks: Recording) -> None:
     problem = Problem([jerks], SENSORS, {name: Unknown() for name in (*TRUTH, "pad.E")})
     plan = [Stage("all", ("jerks",), problem.coordinates.labels, 1e-6)]
-    answer = identify(problem, plan=plan, assumptions="trusted")  # three sensors do not tell beta from the mesh
+    answer = identify(
+        problem, plan=plan, assumptions="trusted"
+    )  # three sensors do not tell beta from the mesh
     assert answer.converged
     for name, value in (*TRUTH.items(), ("pad.E", 0.9e6)):
         assert answer[name].identifiable, name
-        assert abs(answer[name].last / value - 1) < 0.1 * answer[name].relative_sd, name  # of the steps, which differ
+        assert abs(answer[name].last / value - 1) < 0.1 * answer[name].relative_sd, (
+            name
+        )  # of the steps, which differ
     assert answer["contact.friction.alpha"].unit == ""
 
 
@@ -73,13 +84,17 @@ def test_its_derivatives_by_both_routes_are_those_of_differences(jerks: Recordin
     _, steps = problem.freeze(runner, x, ["jerks"], 3e-5)
     at = problem.residuals(runner, x, ["jerks"], steps, free)
     for i, label in enumerate(problem.coordinates.labels):
-        ahead, behind = (problem.residuals(runner, x + s * h * np.eye(3)[i], ["jerks"], steps).r for s in (1, -1))
+        ahead, behind = (
+            problem.residuals(runner, x + s * h * np.eye(3)[i], ["jerks"], steps).r for s in (1, -1)
+        )
         slope = (ahead - behind) / (2 * h)
         assert np.linalg.norm(at.J[:, i] - slope) < 2e-4 * np.linalg.norm(slope), label
     loss, gradient, lost = problem.misfit(runner, x, ["jerks"], steps, free)
     assert not lost
     assert loss == pytest.approx(0.5 * at.r @ at.r, rel=1e-12)
-    np.testing.assert_allclose(gradient, at.J.T @ at.r, rtol=1e-8, atol=1e-8 * np.abs(gradient).max())
+    np.testing.assert_allclose(
+        gradient, at.J.T @ at.r, rtol=1e-8, atol=1e-8 * np.abs(gradient).max()
+    )
 
 
 def test_it_can_be_sent_to_another_process(jerks: Recording) -> None:
@@ -91,10 +106,14 @@ def test_it_can_be_sent_to_another_process(jerks: Recording) -> None:
 def test_only_what_the_model_has_can_be_identified(jerks: Recording) -> None:
     assert {*TRUTH, "pad.E", "control.R_99", "disc.radius"} <= set(jerks.parameters)
     for name in ("contact.mu_s", "contact.friction.gamma"):
-        with pytest.raises(ValueError, match=f"`{name}` cannot be identified; .*contact.friction.alpha"):
+        with pytest.raises(
+            ValueError, match=f"`{name}` cannot be identified; .*contact.friction.alpha"
+        ):
             Problem([jerks], SENSORS, {name: Unknown()})
     negative = built(jerks, partial(rig, alpha=-1.0))
-    with pytest.raises(ValueError, match=r"contact\.friction\.alpha = -1 is not on a logarithmic scale"):
+    with pytest.raises(
+        ValueError, match=r"contact\.friction\.alpha = -1 is not on a logarithmic scale"
+    ):
         Problem([negative], SENSORS, {"contact.friction.alpha": Unknown()})
 
 

@@ -21,7 +21,8 @@ from torchsoft.sysid.runs import CHECKPOINT, Job, Journal, Runner, decoded, enco
 
 ODD = np.array([0.0, -0.0, np.nan, np.inf, -np.inf, 5e-324, 0.1 + 0.2, 1e308])
 PREDICTION = Prediction(
-    ODD, np.stack([ODD, -ODD], 1), 12, np.asfortranarray(np.ones((8, 2, 3)) * ODD[:, None, None]), ODD[5:]
+    ODD, np.stack([ODD, -ODD], 1), 12, np.asfortranarray(np.ones((8, 2, 3)) * ODD[:, None, None]),
+    ODD[5:]
 )  # fmt: skip
 RESULTS = {
     "prediction": PREDICTION,
@@ -93,9 +94,15 @@ DAMAGES: dict[str, Callable[[bytes, bytes, Trap], bytes]] = {
     "a pickle": lambda name, content, trap: pickle.dumps(trap),
     "a pickle with a checksum": lambda name, content, trap: forged(name, pickle.dumps(trap)),
     "an object array with a checksum": lambda name, content, trap: forged(name, objects(trap)),
-    "another archive with a checksum": lambda name, content, trap: forged(name, other_archive(kind=np.asarray("Path"))),
-    "a kind that is no name": lambda name, content, trap: forged(name, other_archive(kind=np.ones(3))),
-    "no fields": lambda name, content, trap: forged(name, other_archive(kind=np.asarray("Prediction"))),
+    "another archive with a checksum": lambda name, content, trap: forged(
+        name, other_archive(kind=np.asarray("Path"))
+    ),
+    "a kind that is no name": lambda name, content, trap: forged(
+        name, other_archive(kind=np.ones(3))
+    ),
+    "no fields": lambda name, content, trap: forged(
+        name, other_archive(kind=np.asarray("Prediction"))
+    ),
     "unknown fields": lambda name, content, trap: forged(
         name, other_archive(kind=np.asarray("Prediction"), path=np.ones(2))
     ),
@@ -115,7 +122,9 @@ def objects(trap: Trap) -> bytes:
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_or_planted_file_is_noticed_and_never_executed(tmp_path: Path, damage: str) -> None:
+def test_a_damaged_or_planted_file_is_noticed_and_never_executed(
+    tmp_path: Path, damage: str
+) -> None:
     folder, trap = tmp_path / "runs", Trap(tmp_path / "executed")
     journal(folder).keep(RUN, PREDICTION)
     (path,) = files(folder)
@@ -152,9 +161,13 @@ def test_an_archive_is_no_pickle() -> None:
 
 def test_a_folder_of_others_is_refused(tmp_path: Path) -> None:
     (tmp_path / "thesis.pickle").write_text("mine")
-    with pytest.raises(ValueError, match=r"the checkpoint .* holds other files; give a new or an empty folder$"):
+    with pytest.raises(
+        ValueError, match=r"the checkpoint .* holds other files; give a new or an empty folder$"
+    ):
         journal(tmp_path)
-    with pytest.raises(ValueError, match=r"thesis.pickle is a file; give a new or an empty folder$"):
+    with pytest.raises(
+        ValueError, match=r"thesis.pickle is a file; give a new or an empty folder$"
+    ):
         journal(tmp_path / "thesis.pickle")
     forget(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.pickle"]
@@ -186,7 +199,9 @@ def test_it_goes_on_where_another_was_done_with_the_folder(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_what_is_done_is_kept_at_an_interruption(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+def test_what_is_done_is_kept_at_an_interruption(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, count: int
+) -> None:
     """What was done before it, and what another thread still runs when it comes."""
     jobs = [Job(0, {"pad.E": float(k)}, (), 1e-3) for k in range(4)]
     running = threading.Barrier(count)

@@ -1,4 +1,5 @@
-"""Measured data: what is read is what was written, every mistake is named with its place, and the command continues."""
+"""Measured data: what is read is what was written, every mistake is named with its place, and the
+command continues."""
 
 import csv
 import importlib.util
@@ -22,7 +23,15 @@ from torchsoft.solve.trajectory import save
 from torchsoft.sysid import MEASURED, Recording, Sensor, record
 from torchsoft.sysid.columns import COLUMNS, UNITS, read_table, read_tables
 from torchsoft.sysid.initial_state import AtRest, MovingStart
-from torchsoft.sysid.measured import STATED, cost, known_parameters, load, paper_settings, read_recording, stem
+from torchsoft.sysid.measured import (
+    STATED,
+    cost,
+    known_parameters,
+    load,
+    paper_settings,
+    read_recording,
+    stem,
+)
 
 EXAMPLE = Path(__file__).parent.parent / "examples" / "identify"
 
@@ -97,49 +106,71 @@ def drop(column: int) -> Change:
 T, X_D, Y_D, Y_D_DOT, F_FF, X_C, THETA, X_BR, Y_BR, F_X, F_Y = 0, 1, 3, 4, 5, 6, 7, 8, 9, 10, 11
 
 BAD: dict[str, tuple[Change, str]] = {
-    "no unit": (put(1, X_C, "x_C"), r"data\.csv, row 1, column `x_C` has no unit: write `x_C \[m\]`"),
-    "unknown unit": (put(1, X_C, "x_C [inch]"), r"row 1, column `x_C` cannot be in 'inch'; it can be in m, cm, mm"),
-    "wrong dimension": (put(1, THETA, "theta [mm]"), r"row 1, column `theta` cannot be in 'mm'; it can be in rad"),
+    "no unit": (put(1, X_C, "x_C"), r"data\.csv, row 1, column `x_C` has no unit: write `x_C "
+                                    r"\[m\]`"),
+    "unknown unit": (put(1, X_C, "x_C [inch]"), r"row 1, column `x_C` cannot be in 'inch'; it can "
+                                                r"be in m, cm, mm"),
+    "wrong dimension": (put(1, THETA, "theta [mm]"), r"row 1, column `theta` cannot be in 'mm'; it "
+                                                     r"can be in rad"),
     "unknown column": (
-        put(1, X_C, "x_c [mm]"), r"column `x_c` is not known: is it `x_C`\?.* ignore = \['x_c'\]; columns are t, x_d",
+        put(1, X_C, "x_c [mm]"), r"column `x_c` is not known: is it `x_C`\?.* ignore = \['x_c'\]; "
+                                 r"columns are t, x_d",
     ),
     "misspelt column": (put(1, F_FF, "Fff [N]"), r"column `Fff` is not known: is it `F_ff`\?"),
     "time": (put(1, T, "Time [s]"), r"column `Time` is not known: is it `t`\?"),
-    "another column": (put(1, X_C, "Ventil"), r"column `Ventil` is not known; if it has nothing to do with the motion, say"),
+    "another column": (put(1, X_C, "Ventil"), r"column `Ventil` is not known; if it has nothing to "
+                                              r"do with the motion, say"),
     "no feed-forward": (
         drop(F_FF),
-        r"data\.csv has no column `F_ff`, and nothing says which force was fed forward.* missing = \{F_ff = 0\.0\} where",
+        r"data\.csv has no column `F_ff`, and nothing says which force was fed forward.* missing = "
+        r"\{F_ff = 0\.0\} where",
     ),
     "column twice": (put(1, X_C, "x_Br [mm]"), r"row 1, column `x_Br` is there twice"),
     "no times": (drop(T), r"data\.csv has no column `t`"),
     "no set-point": (drop(Y_D), r"data\.csv has no column `y_d`"),
-    "no sensor": (put(1, X_C, "y_C [mm]"), r"rig\.toml: sensors: no recording has samples of `x_C`"),
+    "no sensor": (put(1, X_C, "y_C [mm]"), r"rig\.toml: sensors: no recording has samples of "
+                                           r"`x_C`"),
     "semicolons": (
         lambda table: table.__setitem__(slice(None), [[";".join(cells)] for cells in table]),
         "row 1.*separate columns with commas",
     ),
-    "a cell too many": (lambda table: table[6].append("1"), r"row 7 has 13 cells, but there are 12 columns"),
-    "text": (put(9, X_C, "n/a"), r"data\.csv, row 9, column `x_C`: 'n/a' is not a finite number; leave the cell empty"),
+    "a cell too many": (lambda table: table[6].append("1"), r"row 7 has 13 cells, but there are 12 "
+                                                            r"columns"),
+    "text": (put(9, X_C, "n/a"), r"data\.csv, row 9, column `x_C`: 'n/a' is not a finite number; "
+                                 r"leave the cell empty"),
     "nan": (put(9, F_Y, "NaN"), r"row 9, column `F_y`: 'NaN' is not a finite number"),
     "infinity": (put(9, F_Y, "-inf"), r"row 9, column `F_y`: '-inf' is not a finite number"),
     "grouped digits": (put(9, F_Y, "1_0"), r"row 9, column `F_y`: '1_0' is not a finite number"),
-    "digits of another script": (put(9, F_Y, "１２"), r"row 9, column `F_y`: '１２' is not a finite number"),
-    "times of a clock": (scale(T, 1.0, 1.7e9), r"row 2, column `t`: 1\.7e\+09 s is too far from zero; count times from"),
-    "empty time": (put(12, T, ""), r"row 12, column `t` is empty; only measured channels may have gaps"),
+    "digits of another script": (put(9, F_Y, "１２"), r"row 9, column `F_y`: '１２' is not a finite "
+                                                    r"number"),
+    "times of a clock": (scale(T, 1.0, 1.7e9), r"row 2, column `t`: 1\.7e\+09 s is too far from "
+                                               r"zero; count times from"),
+    "empty time": (put(12, T, ""), r"row 12, column `t` is empty; only measured channels may have "
+                                   r"gaps"),
     "empty set-point": (put(12, Y_D, " "), r"row 12, column `y_d` is empty"),
     "time twice": (put(12, T, "0.045"), r"row 12, column `t`: the time 0.045 s is there twice"),
-    "time goes back": (put(12, T, "0.01"), r"row 12, column `t`: time goes back, from 0.045 to 0.01 s"),
-    "rows missing": (lambda table: table.__delitem__(slice(10, 40)), r"row 11, column `t`: 0.155 s are missing before it"),
-    "few rows": (lambda table: table.__delitem__(slice(8, None)), r"has 7 rows of numbers, but needs at least 10"),
-    "mm under m": (put(1, X_C, "x_C [m]"), r"row 2, column `x_C`: 60.54 m is not plausible, .* between -0.12 and 0.24 m"),
+    "time goes back": (put(12, T, "0.01"), r"row 12, column `t`: time goes back, from 0.045 to "
+                                           r"0.01 s"),
+    "rows missing": (lambda table: table.__delitem__(slice(10, 40)), r"row 11, column `t`: 0.155 s "
+                                                                     r"are missing before it"),
+    "few rows": (lambda table: table.__delitem__(slice(8, None)), r"has 7 rows of numbers, but "
+                                                                  r"needs at least 10"),
+    "mm under m": (put(1, X_C, "x_C [m]"), r"row 2, column `x_C`: 60.54 m is not plausible, .* "
+                                           r"between -0.12 and 0.24 m"),
     "one spike": (put(30, Y_BR, "500"), r"row 30, column `y_Br`: 0.5 m is not plausible"),
-    "another start": (scale(X_C, 1.0, 5.0), r"row 2, column `x_C`: it begins at 0.065\d* m, but scenario.x_C0 is 0.0603 m"),
-    "another sign": (scale(X_C, -1.0), r"it begins at -0.0605\d* m, but scenario.x_C0 is 0.0603 m; is its sign opposite\?"),
-    "turned already": (scale(THETA, 1.0, 500.0), r"row 2, column `theta`: it begins at 0.48\d* rad, but the start is 0 rad"),
-    "another ground": (scale(Y_BR, 1.0, 3.0), r"row 2, column `y_Br`: it begins at .*, but the set-point y_d is 0.0501 m"),
+    "another start": (scale(X_C, 1.0, 5.0), r"row 2, column `x_C`: it begins at 0.065\d* m, but "
+                                            r"scenario.x_C0 is 0.0603 m"),
+    "another sign": (scale(X_C, -1.0), r"it begins at -0.0605\d* m, but scenario.x_C0 is 0.0603 m; "
+                                       r"is its sign opposite\?"),
+    "turned already": (scale(THETA, 1.0, 500.0), r"row 2, column `theta`: it begins at 0.48\d* "
+                                                 r"rad, but the start is 0 rad"),
+    "another ground": (scale(Y_BR, 1.0, 3.0), r"row 2, column `y_Br`: it begins at .*, but the "
+                                              r"set-point y_d is 0.0501 m"),
     "moving": (
-        lambda table: [cells.__setitem__(X_C, f"{60.3 + 0.3 * i}") for i, cells in enumerate(table[1:])],
-        r"row 3, column `x_C` moves already: a recording must begin at rest,.* or say start = \{kind = \"moving\"\}",
+        lambda table: [cells.__setitem__(X_C, f"{60.3 + 0.3 * i}") for i,
+        cells in enumerate(table[1:])],
+        r"row 3, column `x_C` moves already: a recording must begin at rest,.* or say start = "
+        r"\{kind = \"moving\"\}",
     ),
     "in the grasp": (
         lambda table: [scale(k, 1.0, -0.6)(table) for k in (Y_D, Y_BR)],
@@ -153,12 +184,15 @@ BAD: dict[str, tuple[Change, str]] = {
         lambda table: [cells.__setitem__(X_C, "") for cells in table[2:]],
         r"column `x_C` has 1 samples, but needs at least two",
     ),
-    "crushed": (scale(Y_D, 6.0, -250.5), r"rig\.toml, settings of `data`: the disc does not fit: scenario.y_Br_grasp"),
+    "crushed": (scale(Y_D, 6.0, -250.5), r"rig\.toml, settings of `data`: the disc does not fit: "
+                                         r"scenario.y_Br_grasp"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", BAD)
-def test_a_mistake_in_the_data_is_named_with_its_row_and_column(case: Callable[..., list[str]], name: str) -> None:
+def test_a_mistake_in_the_data_is_named_with_its_row_and_column(
+    case: Callable[..., list[str]], name: str
+) -> None:
     change, message = BAD[name]
     data, config = case(change)
     with pytest.raises(ValueError, match=message):
@@ -168,44 +202,72 @@ def test_a_mistake_in_the_data_is_named_with_its_row_and_column(case: Callable[.
 BAD_CONFIG = {
     "not TOML": (CONFIG + "[[", r"rig\.toml is not a TOML file"),
     "unknown table": (CONFIG + "[sensor]\n", r"rig\.toml: sensor is not known here"),
-    "unknown key": (CONFIG.replace("y_Br.noise", "y_Br.sigma"), r"y_Br\.noise is missing; sensors\.y_Br\.sigma is not known"),
-    "no noise": (CONFIG.replace("F_y.noise = 0.1", "F_y.noise = 0.0"), r"sensors\.F_y\.noise should be .* 1e-15, not 0\.0"),
-    "unknown channel": (CONFIG.replace("F_y.noise", "F_z.noise"), r"rig\.toml: sensors: `F_z` is not a channel"),
-    "unknown parameter": (CONFIG.replace("contact.K_n", "contact.K"), r"rig\.toml: unknowns: `contact.K` cannot be identified"),
-    "unknown setting": (CONFIG.replace("contact.v_s", "contact.vs"), r"settings of `data`: contact\.vs is not known here"),
-    "setting out of bounds": (CONFIG.replace("v_s = 0.05", "v_s = -1"), r"of `data`: contact\.v_s should be .*, not -1"),
-    "not a table": ("settings.disc = 3\n" + CONFIG.split("\n\n", 1)[1], r"of `data`: disc should be a table, not 3"),
-    "not a number": (CONFIG.replace("60.3e-3", '"here"'), r"scenario\.x_C0 should be a valid number, not 'here'"),
-    "other pads": (CONFIG.replace("contact.v_s", "pad.height = 3e-3\ncontact.v_s"), r"touch .* at 46.92 mm \(twice pad.height"),
-    "bounds": (CONFIG.replace("nominal = 1e5", "low = 2\nhigh = 1"), r"unknowns\.contact\.K_n: low = 2.0 must be below"),
+    "unknown key": (CONFIG.replace("y_Br.noise", "y_Br.sigma"), r"y_Br\.noise is missing; "
+                                                                r"sensors\.y_Br\.sigma is not "
+                                                                r"known"),
+    "no noise": (CONFIG.replace("F_y.noise = 0.1", "F_y.noise = 0.0"), r"sensors\.F_y\.noise "
+                                                                       r"should be .* 1e-15, not "
+                                                                       r"0\.0"),
+    "unknown channel": (CONFIG.replace("F_y.noise", "F_z.noise"), r"rig\.toml: sensors: `F_z` is "
+                                                                  r"not a channel"),
+    "unknown parameter": (CONFIG.replace("contact.K_n", "contact.K"), r"rig\.toml: unknowns: "
+                                                                      r"`contact.K` cannot be "
+                                                                      r"identified"),
+    "unknown setting": (CONFIG.replace("contact.v_s", "contact.vs"), r"settings of `data`: "
+                                                                     r"contact\.vs is not known "
+                                                                     r"here"),
+    "setting out of bounds": (CONFIG.replace("v_s = 0.05", "v_s = -1"), r"of `data`: contact\.v_s "
+                                                                        r"should be .*, not -1"),
+    "not a table": ("settings.disc = 3\n" + CONFIG.split("\n\n", 1)[1], r"of `data`: disc should "
+                                                                        r"be a table, not 3"),
+    "not a number": (CONFIG.replace("60.3e-3", '"here"'), r"scenario\.x_C0 should be a valid "
+                                                          r"number, not 'here'"),
+    "other pads": (CONFIG.replace("contact.v_s", "pad.height = 3e-3\ncontact.v_s"), r"touch .* at "
+                                                                                    r"46.92 mm \(twice pad.height"),
+    "bounds": (CONFIG.replace("nominal = 1e5", "low = 2\nhigh = 1"), r"unknowns\.contact\.K_n: low "
+                                                                     r"= 2.0 must be below"),
     "a prior beyond the bounds": (
-        CONFIG.replace("nominal = 1e5", "low = 8e4\nhigh = 1.4e5\nprior = {median = 1e6, sd = 1e3}"),
-        r"rig\.toml: unknowns\.contact\.K_n\.prior\.median = 1e\+06 is not between low = 80000 and high = 140000",
+        CONFIG.replace("nominal = 1e5", "low = 8e4\nhigh = 1.4e5\nprior = {median = 1e6, sd = "
+                                        "1e3}"),
+        r"rig\.toml: unknowns\.contact\.K_n\.prior\.median = 1e\+06 is not between low = 80000 and "
+        r"high = 140000",
     ),
-    "rtol": (CONFIG.replace("rtol = 1e-3", "rtol = -1"), r"fit\.rtol should be greater than or equal to 1e-08, not -1"),
-    "step": (CONFIG.replace("rtol = 1e-3", "step = 5e-3"), r"fit: .*tolerances choose the steps; leave it out, or give"),
+    "rtol": (CONFIG.replace("rtol = 1e-3", "rtol = -1"), r"fit\.rtol should be greater than or "
+                                                         r"equal to 1e-08, not -1"),
+    "step": (CONFIG.replace("rtol = 1e-3", "step = 5e-3"), r"fit: .*tolerances choose the steps; "
+                                                           r"leave it out, or give"),
     "method": (CONFIG + 'method = "magic"\n', r"fit\.method should be 'gauss_newton'"),
     "a loss that the method has not": (
-        CONFIG + 'loss = "huber"\nmethod = "lbfgs"\n', r"fit: the method 'lbfgs' has no robust loss: for loss = 'huber' take",
+        CONFIG + 'loss = "huber"\nmethod = "lbfgs"\n', r"fit: the method 'lbfgs' has no robust "
+                                                       r"loss: for loss = 'huber' take",
     ),
-    "text for a number": (CONFIG.replace("rtol = 1e-3", 'rtol = "1e-3"'), r"fit\.rtol should be a valid number, not '1e-3'"),
-    "truth for a number": (CONFIG.replace("nominal = 1e5", "nominal = true"), r"nominal should be a valid number, not True"),
+    "text for a number": (CONFIG.replace("rtol = 1e-3", 'rtol = "1e-3"'), r"fit\.rtol should be a "
+                                                                          r"valid number, not "
+                                                                          r"'1e-3'"),
+    "truth for a number": (CONFIG.replace("nominal = 1e5", "nominal = true"), r"nominal should be "
+                                                                              r"a valid number, "
+                                                                              r"not True"),
     "a disc that fits nowhere": (
         CONFIG.replace('unknowns."pad.E"]\nnominal = 0.7e6', 'unknowns."disc.radius"]'),
         r"unknowns\.disc\.radius\.low = 0\.001937 is impossible: the disc does not fit",
     ),
     "nothing to fit": ('heldout = ["data"]\n' + CONFIG, r"heldout: it names every recording"),
-    "a long delay": (CONFIG + "[sensors.theta]\nnoise = 1e-3\ndelay = 0.5\n", r"sensors\.theta\.delay should be less than"),
-    "no such column": ('ignore = ["Temp"]\n' + CONFIG, r"rig\.toml, ignore: no file has a column `Temp`"),
-    "another constant": (CONFIG + "[missing]\nF_x = 0.0\n", r"rig\.toml: missing\.F_x is not known here"),
-    "another start": (CONFIG + '[start]\nkind = "flying"\n', r"start\.kind should be one of 'rest', 'moving', not 'fl"),
+    "a long delay": (CONFIG + "[sensors.theta]\nnoise = 1e-3\ndelay = 0.5\n",
+    r"sensors\.theta\.delay should be less than"),
+    "no such column": ('ignore = ["Temp"]\n' + CONFIG, r"rig\.toml, ignore: no file has a column "
+                                                       r"`Temp`"),
+    "another constant": (CONFIG + "[missing]\nF_x = 0.0\n", r"rig\.toml: missing\.F_x is not known "
+                                                            r"here"),
+    "another start": (CONFIG + '[start]\nkind = "flying"\n', r"start\.kind should be one of "
+                                                             r"'rest', 'moving', not 'fl"),
     "a start that is hardly uncertain": (
         CONFIG + '[start]\nkind = "rest"\nposition_sd = 1e-300\n',
         r"start\.position_sd: should be 0, or at least 1e-12, but is 1e-300",
     ),
     "a start without a kind": (CONFIG + "[start]\nposition_sd = 1e-4\n", r"start\.kind is missing"),
     "a parameter by both names": (
-        CONFIG.replace('"pad.E"]\nnominal = 0.7e6', '"contact.friction.mu_s"]\n[unknowns."contact.mu_s"]'),
+        CONFIG.replace('"pad.E"]\nnominal = 0.7e6',
+        '"contact.friction.mu_s"]\n[unknowns."contact.mu_s"]'),
         r"unknowns\.contact\.mu_s is there twice: it is contact\.mu_s too",
     ),
     "soft at first": (
@@ -221,16 +283,22 @@ BAD_CONFIG = {
         r"compare\.coulomb\.without: `contact\.mu_s` is not an unknown",
     ),
     "a law's own mistake": (
-        CONFIG + '[compare.coulomb.unknowns."contact.eta"]\nlow = -1.0\nscale = "linear"\nhigh = 1.0\n',
-        r"rig\.toml, compare\.coulomb: unknowns\.contact\.eta\.low = -1 is beyond what contact\.eta may be",
+        CONFIG + '[compare.coulomb.unknowns."contact.eta"]\nlow = -1.0\nscale = "linear"\nhigh = '
+                 '1.0\n',
+        r"rig\.toml, compare\.coulomb: unknowns\.contact\.eta\.low = -1 is beyond what "
+        r"contact\.eta may be",
     ),
     "a law of the same name": (
-        CONFIG + '[compare."as stated"]\n', r"compare: the law of the file itself is called `as stated`",
+        CONFIG + '[compare."as stated"]\n', r"compare: the law of the file itself is called `as "
+                                            r"stated`",
     ),
     "file and files": (
-        CONFIG + '[[recordings]]\nfile = "b.csv"\nfiles = ["c.csv"]\n', r"recordings\.0: .*a `file` or `files`, not both",
+        CONFIG + '[[recordings]]\nfile = "b.csv"\nfiles = ["c.csv"]\n', r"recordings\.0: .*a "
+                                                                        r"`file` or `files`, not "
+                                                                        r"both",
     ),
-    "held out": ('heldout = ["other"]\n' + CONFIG, r"heldout: there is no recording `other`; the recordings' names are data"),
+    "held out": ('heldout = ["other"]\n' + CONFIG, r"heldout: there is no recording `other`; the "
+                                                   r"recordings' names are data"),
     "no such file": (
         CONFIG + '[[recordings]]\nname = "b"\nfiles = ["b.csv"]\n',
         r"rig\.toml, recordings: `files` of `b`: .*b\.csv: No such file or directory",
@@ -238,14 +306,18 @@ BAD_CONFIG = {
     "nameless": (CONFIG + "[[recordings]]\n", r"recordings\.0: a recording needs a `file`"),
     "a setting that is unknown": (
         CONFIG + '[[recordings]]\nname = "data"\nsettings.pad.E = 2e6\n',
-        r"recordings\.0\.settings: pad\.E is unknown, .* leave it out there, and say by unknowns\.\"pad\.E\"\.nominal where",
+        r"recordings\.0\.settings: pad\.E is unknown, .* leave it out there, and say by "
+        r"unknowns\.\"pad\.E\"\.nominal where",
     ),
-    "same name": (CONFIG + '[[recordings]]\nfile = "data.csv"\n', r"names of their own, but are called data, data"),
+    "same name": (CONFIG + '[[recordings]]\nfile = "data.csv"\n', r"names of their own, but are "
+                                                                  r"called data, data"),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", BAD_CONFIG)
-def test_a_mistake_in_the_configuration_is_named_with_its_field(case: Callable[..., list[str]], name: str) -> None:
+def test_a_mistake_in_the_configuration_is_named_with_its_field(
+    case: Callable[..., list[str]], name: str
+) -> None:
     config, message = BAD_CONFIG[name]
     files = case(config=config)
     with pytest.raises(ValueError, match=message):
@@ -272,10 +344,18 @@ def test_empty_cells_are_missing_samples(case: Callable[..., list[str]]) -> None
 def test_every_unit_is_understood(tmp_path: Path, name: str) -> None:
     dimension = CHANNELS[name].unit
     for unit, factor in UNITS[dimension].items():
-        table = [["t [ms]", "x_d [m]", "y_d [m]"]] + [[str(5 * i), "0.06", "0.05"] for i in range(10)]
+        table = [["t [ms]", "x_d [m]", "y_d [m]"]] + [
+            [str(5 * i), "0.06", "0.05"] for i in range(10)
+        ]
         if name in ("x_d", "y_d"):
-            table = [cells[:1] + [c for c, h in zip(cells[1:], ("x_d", "y_d")) if h != name] for cells in table]
-        table = [[*cells, f"{name} [{unit}]" if i == 0 else repr(0.03 / factor)] for i, cells in enumerate(table)]
+            table = [
+                cells[:1] + [c for c, h in zip(cells[1:], ("x_d", "y_d")) if h != name]
+                for cells in table
+            ]
+        table = [
+            [*cells, f"{name} [{unit}]" if i == 0 else repr(0.03 / factor)]
+            for i, cells in enumerate(table)
+        ]
         read = read_table(write(tmp_path / "units.csv", table))
         np.testing.assert_allclose(read.values[name], 0.03, rtol=1e-14)
         np.testing.assert_allclose(read.values["t"], 5e-3 * np.arange(10), rtol=1e-14)
@@ -290,12 +370,15 @@ def made() -> tuple[Any, Recording]:
     script = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(script)
     sensors = {channel: Sensor(noise=1e-5) for channel in MEASURED}
-    excitation = Excitation(motion=Strokes(travel=4e-3, stroke_time=0.15), duration=0.4, depth=1.2e-3, senses="bracket",
+    excitation = Excitation(motion=Strokes(travel=4e-3, stroke_time=0.15), duration=0.4,
+        depth=1.2e-3, senses="bracket",
                             grasp_time=0.15, settle=0.0)  # fmt: skip
     return script, record("short", excitation, script.TRUTH, script.NOMINAL, sensors, rtol=1e-4)
 
 
-def test_a_recording_survives_the_way_through_csv(made: tuple[Any, Recording], tmp_path: Path) -> None:
+def test_a_recording_survives_the_way_through_csv(
+    made: tuple[Any, Recording], tmp_path: Path
+) -> None:
     script, one = made
     script.UNITS["rad/s"] = ("deg/s", 180 / np.pi)
     script.write(one, tmp_path / "short.csv", digits=17)
@@ -334,7 +417,9 @@ def test_the_examples_files_are_what_its_script_makes(made: tuple[Any, Recording
 @pytest.fixture(scope="module")
 def run() -> Trajectory:
     """A grasp of 60 ms."""
-    excitation = Excitation(motion=Strokes(), senses="bracket", grasp_time=0.05, settle=0.0, depth=1e-3)
+    excitation = Excitation(
+        motion=Strokes(), senses="bracket", grasp_time=0.05, settle=0.0, depth=1e-3
+    )
     model, y0 = begin(excitation, Parameters().override({"contact.v_s": 0.05}))
     return simulate(model, torch.linspace(0, 0.06, 31, dtype=torch.float64), y0=y0, step=2e-3)
 
@@ -342,9 +427,15 @@ def run() -> Trajectory:
 def test_a_trajectory_file_is_a_recording(run: Trajectory, tmp_path: Path) -> None:
     run.save(tmp_path / "run.nc")
     tables = read_tables([tmp_path / "run.nc"], (), {})
-    settings = {"scenario": {"x_C0": 60.3e-3}, "control.senses": "bracket", "contact": {"v_s": 0.05}}
+    settings = {
+        "scenario": {"x_C0": 60.3e-3},
+        "control.senses": "bracket",
+        "contact": {"v_s": 0.05},
+    }
     sensors = {"x_C": Sensor(noise=1e-5)}
-    one = read_recording(tmp_path / "run.nc", "run", known_parameters(Path("c"), "run", tables, settings), sensors)
+    one = read_recording(
+        tmp_path / "run.nc", "run", known_parameters(Path("c"), "run", tables, settings), sensors
+    )
     assert list(one.samples) == list(MEASURED)
     for channel in MEASURED:
         np.testing.assert_array_equal(one.samples[channel][1], run[channel].detach())
@@ -358,7 +449,9 @@ def test_a_trajectory_file_is_a_recording(run: Trajectory, tmp_path: Path) -> No
     table = read_table(older)
     assert "y_d_dot" not in table.values
     with torch.no_grad():
-        got = read_recording(older, "older", paper_settings(one), sensors).rig.reference(run.t, SIGNALS)[:, 1, 1]
+        got = read_recording(older, "older", paper_settings(one), sensors).rig.reference(
+            run.t, SIGNALS
+        )[:, 1, 1]
     np.testing.assert_allclose(got, desired[:, 3], atol=2e-4)
 
 
@@ -368,7 +461,9 @@ def test_a_mistake_in_a_trajectory_file_is_named(run: Trajectory, tmp_path: Path
     with pytest.raises(ValueError, match=r"run\.nc has no checksum at its end"):
         read_table(path)
     save(xr.Dataset({"time": ("time", [0.0, 1.0])}), tmp_path / "other.nc")
-    with pytest.raises(ValueError, match=r"other\.nc is not a trajectory file: it has no desired_x, "):
+    with pytest.raises(
+        ValueError, match=r"other\.nc is not a trajectory file: it has no desired_x, "
+    ):
         read_table(tmp_path / "other.nc")
     data = run.to_dataset().copy(deep=True)
     data["disc_angle"][7] = np.nan
@@ -382,14 +477,21 @@ def test_a_mistake_in_a_trajectory_file_is_named(run: Trajectory, tmp_path: Path
         read_table(tmp_path / "units.nc")
     data = run.to_dataset().assign(desired_x=("time", ["here"] * 31))
     save(data, tmp_path / "text.nc")
-    with pytest.raises(ValueError, match=r"text\.nc is not a trajectory file: `desired_x` should be float64 over time"):
+    with pytest.raises(
+        ValueError,
+        match=r"text\.nc is not a trajectory file: `desired_x` should be float64 over time",
+    ):
         read_table(tmp_path / "text.nc")
     save(run.to_dataset().isel(time=[0, 1, 2, 2, *range(3, 31)]), tmp_path / "twice.nc")
-    with pytest.raises(ValueError, match=r"twice\.nc, sample 3, column `t`: the time 0.004 s is there twice"):
+    with pytest.raises(
+        ValueError, match=r"twice\.nc, sample 3, column `t`: the time 0.004 s is there twice"
+    ):
         read_table(tmp_path / "twice.nc")
 
 
-def test_samples_much_denser_than_the_motion_are_not_all_simulated(case: Callable[..., list[str]]) -> None:
+def test_samples_much_denser_than_the_motion_are_not_all_simulated(
+    case: Callable[..., list[str]],
+) -> None:
     (one,) = load(*_split(case())).problem.recordings
     t, x = one.samples["x_C"]
     dense = np.linspace(t[0], t[-1], 20_001)
@@ -414,11 +516,15 @@ def test_a_long_identification_is_priced(case: Callable[..., list[str]]) -> None
     assert cost(made, 1e-3, 1, 1).seconds < 60
     assert cost(made, 1e-3, 1_000_000, 1).seconds > 1e5
     assert cost(made, 1e-8, 1, 1).seconds > 3 * cost(made, 1e-5, 1, 1).seconds
-    delayed = load(*_split(case(config=CONFIG + "[sensors.theta]\nnoise = 1e-3\ndelay = 2e-3\n"))).problem
+    delayed = load(
+        *_split(case(config=CONFIG + "[sensors.theta]\nnoise = 1e-3\ndelay = 2e-3\n"))
+    ).problem
     assert cost(delayed, 1e-5, 1, 1, method="adam").memory > cost(delayed, 1e-5, 1, 1).memory
 
 
-def test_recordings_have_settings_of_their_own(case: Callable[..., list[str]], tmp_path: Path) -> None:
+def test_recordings_have_settings_of_their_own(
+    case: Callable[..., list[str]], tmp_path: Path
+) -> None:
     more = '[[recordings]]\nname = "data"\nsettings.disc.mass = 0.5\n[[recordings]]\nfile = "second.csv"\nname = "b"\n'
     data, config = case(config=CONFIG + more)
     (tmp_path / "second.csv").write_text(Path(data).read_text())
@@ -445,7 +551,9 @@ def test_columns_may_stand_in_any_order_beside_others(case: Callable[..., list[s
     assert one.fingerprint == plain.fingerprint
 
 
-def test_a_constant_stands_for_a_column_that_is_missing(case: Callable[..., list[str]], tmp_path: Path) -> None:
+def test_a_constant_stands_for_a_column_that_is_missing(
+    case: Callable[..., list[str]], tmp_path: Path
+) -> None:
     own = '[[recordings]]\nname = "data"\nmissing.F_ff = -2.5\n'
     for text, force in (("[missing]\nF_ff = 0.0\n", 0.0), ("[missing]\nF_ff = 0.0\n" + own, -2.5)):
         made = load(*_split(case(drop(F_FF), CONFIG + text)))
@@ -453,20 +561,31 @@ def test_a_constant_stands_for_a_column_that_is_missing(case: Callable[..., list
         at = one.rig.reference(torch.tensor([0.0, 0.1], dtype=torch.float64), ("F_ff",))
         np.testing.assert_array_equal(at[:, 0].detach(), [[force, 0.0]] * 2)
         assert made.tables["data"].constants == ("F_ff",)
-    for text, where in (("[missing]\nF_ff = 7.0\n", "missing"), (own, "recordings: missing of `data`")):
+    for text, where in (
+        ("[missing]\nF_ff = 7.0\n", "missing"),
+        (own, "recordings: missing of `data`"),
+    ):
         files = _split(case(config=CONFIG + text))
-        with pytest.raises(ValueError, match=rf"rig\.toml, {where}: F_ff is not missing, .* say ignore = \['F_ff'\]$"):
+        with pytest.raises(
+            ValueError,
+            match=rf"rig\.toml, {where}: F_ff is not missing, .* say ignore = \['F_ff'\]$",
+        ):
             load(*files)
     files = _split(case(config=f"ignore = ['F_ff']\n{CONFIG}[missing]\nF_ff = 7.0\n"))
     assert load(*files).tables["data"].constants == ("F_ff",)
 
 
-def test_a_constant_may_stand_for_the_column_of_one_of_the_recordings(case: Callable[..., list[str]]) -> None:
+def test_a_constant_may_stand_for_the_column_of_one_of_the_recordings(
+    case: Callable[..., list[str]],
+) -> None:
     more = '[missing]\nF_ff = 7.0\n[[recordings]]\nfile = "second.csv"\n'
     data, config = case(config=CONFIG + more)
     Path(data).with_name("second.csv").write_text(Path(data).read_text())
     made = load([case(drop(F_FF), CONFIG + more)[0]], config)
-    assert {name: one.constants for name, one in made.tables.items()} == {"data": ("F_ff",), "second": ()}
+    assert {name: one.constants for name, one in made.tables.items()} == {
+        "data": ("F_ff",),
+        "second": (),
+    }
 
 
 def parts(table: Table, *columns: list[int]) -> list[Table]:
@@ -475,11 +594,15 @@ def parts(table: Table, *columns: list[int]) -> list[Table]:
 
 
 def test_a_recording_may_stand_in_several_files(example: Table, tmp_path: Path) -> None:
-    asked, camera, force = parts(example, [T, X_D, 2, Y_D, Y_D_DOT, F_FF], [T, X_C, THETA], [T, X_BR, Y_BR, F_X, F_Y])
+    asked, camera, force = parts(
+        example, [T, X_D, 2, Y_D, Y_D_DOT, F_FF], [T, X_C, THETA], [T, X_BR, Y_BR, F_X, F_Y]
+    )
     slow = [camera[0], *camera[1::4]]
     for name, one in (("asked", asked), ("camera", slow), ("force", force)):
         write(tmp_path / f"{name}.csv", one)
-    text = CONFIG + '[[recordings]]\nname = "roll"\nfiles = ["asked.csv", "camera.csv", "force.csv"]\n'
+    text = (
+        CONFIG + '[[recordings]]\nname = "roll"\nfiles = ["asked.csv", "camera.csv", "force.csv"]\n'
+    )
     (tmp_path / "rig.toml").write_text(text)
     made = load([], tmp_path / "rig.toml")
     (one,) = made.problem.recordings
@@ -493,38 +616,54 @@ def test_a_recording_may_stand_in_several_files(example: Table, tmp_path: Path) 
         cells[0] = str(float(cells[0]) + 5.0)
     write(tmp_path / "camera.csv", late)
     with pytest.raises(
-        ValueError, match=r"camera\.csv, row 17, column `t`: 5\.3 s is 5 s outside the times of `x_d`, which ends"
+        ValueError,
+        match=r"camera\.csv, row 17, column `t`: 5\.3 s is 5 s outside the times of `x_d`, which "
+        r"ends",
     ):
         load([], tmp_path / "rig.toml")
     write(tmp_path / "camera.csv", parts(example, [T, X_C, F_X])[0])
     with pytest.raises(
-        ValueError, match=r"column `F_x` is in .*camera\.csv and in .*force\.csv: one recording has it once"
+        ValueError,
+        match=r"column `F_x` is in .*camera\.csv and in .*force\.csv: one recording has it once",
     ):
         load([], tmp_path / "rig.toml")
-    (tmp_path / "camera.csv").write_text("t [s],x_d_dot [mm/s]\n" + "".join(f"{0.01 * i},0\n" for i in range(20)))
+    (tmp_path / "camera.csv").write_text(
+        "t [s],x_d_dot [mm/s]\n" + "".join(f"{0.01 * i},0\n" for i in range(20))
+    )
     write(tmp_path / "asked.csv", parts(example, [T, X_D, Y_D, F_FF])[0])
     with pytest.raises(ValueError, match=r"the columns `x_d` and `x_d_dot` must be in one file"):
         load([], tmp_path / "rig.toml")
 
 
-def test_a_file_may_state_everything_that_a_problem_can_have(case: Callable[..., list[str]]) -> None:
+def test_a_file_may_state_everything_that_a_problem_can_have(
+    case: Callable[..., list[str]],
+) -> None:
     text = CONFIG.replace(
         '[unknowns."contact.K_n"]\nnominal = 1e5',
-        '[unknowns."contact.K_n"]\nnominal = 1e5\nper = "recording"\nprior = {median = 1e5, sd = 0.3, kind = "log-normal"}\n'
-        '[unknowns."contact.friction.mu_k"]\nratio_to = "contact.friction.mu_s"\nnominal = 0.9\nhigh = 1.0',
+        '[unknowns."contact.K_n"]\nnominal = 1e5\nper = "recording"\nprior = {median = 1e5, sd = '
+        '0.3, kind = "log-normal"}\n[unknowns."contact.friction.mu_k"]\nratio_to = '
+        '"contact.friction.mu_s"\nnominal = 0.9\nhigh = 1.0',
     ).replace(
         "F_y.noise = 0.1",
-        'F_y = {noise = 0.1, gain = 0.02, drift = 0.1, inertia = 0.4, per = "recording", colour = "ar"}\n'
+        'F_y = {noise = 0.1, gain = 0.02, drift = 0.1, inertia = 0.4, per = "recording", colour = '
+        '"ar"}\n'
         "F_x = {noise = 0.1, misalignment = 0.01, low = -50.0, high = 50.0}",
     )
-    text = text.replace("contact.v_s = 0.05", "contact.friction.v_s = 0.05\ngravity = 9.8\ncontrol.y.Kp = 1.1e5")
+    text = text.replace(
+        "contact.v_s = 0.05", "contact.friction.v_s = 0.05\ngravity = 9.8\ncontrol.y.Kp = 1.1e5"
+    )
     made = load(*_split(case(config=text + '[start]\nkind = "rest"\nposition_sd = 1e-4\n'))).problem
     settings = paper_settings(made.recordings[0])
-    assert (settings.contact.v_s, settings.scenario.gravity, settings.control.K_98) == (0.05, 9.8, 1.1e5)
+    assert (settings.contact.v_s, settings.scenario.gravity, settings.control.K_98) == (
+        0.05,
+        9.8,
+        1.1e5,
+    )
     assert made.recordings[0].start == AtRest(position_sd=1e-4)
     labels = (
-        "contact.K_n in data", "contact.mu_k / contact.mu_s", "pad.E", "start.disc.x in data", "gain of F_y in data",
-        "drift of F_y in data", "inertia of F_y in data", "misalignment of F_x",
+        "contact.K_n in data", "contact.mu_k / contact.mu_s", "pad.E", "start.disc.x in data",
+        "gain of F_y in data", "drift of F_y in data", "inertia of F_y in data",
+        "misalignment of F_x",
     )  # fmt: skip
     assert sorted(made.coordinates.labels) == sorted(labels)
     assert len(made.coordinates.priors) == 2
@@ -539,16 +678,24 @@ def test_a_recording_may_begin_anywhere_if_that_is_said(case: Callable[..., list
         del table[1:31]
 
     sensors = CONFIG.replace("F_y.noise", "theta.noise = 0.5e-3\nx_Br.noise = 10e-6\nF_y.noise")
-    with pytest.raises(ValueError, match=r"data\.csv, row 2, column `\w+`.* or say start = \{kind = \"moving\"\}"):
+    with pytest.raises(
+        ValueError, match=r"data\.csv, row 2, column `\w+`.* or say start = \{kind = \"moving\"\}"
+    ):
         load(*_split(case(cut, sensors)))
-    text = sensors + '[start]\nkind = "moving"\nlead = 40e-3\ngiven = {"disc.y" = {mean = 23.5e-3, sd = 1e-4}}\n'
+    text = (
+        sensors
+        + '[start]\nkind = "moving"\nlead = 40e-3\ngiven = {"disc.y" = {mean = 23.5e-3, sd = '
+        "1e-4}}\n"
+    )
     (one,) = load(*_split(case(cut, text))).problem.recordings
     assert isinstance(one.start, MovingStart)
     assert one.start.lead == pytest.approx(0.04, abs=6e-3)
     assert one.start.bodies["disc.y"] == (23.5e-3, 1e-4)
     priced = cost(load(*_split(case(cut, text))).problem, 1e-3, 1, 1)
     plain = cost(load(*_split(case(config=sensors))).problem, 1e-3, 1, 1)
-    assert priced.seconds / priced.steps > 2 * plain.seconds / plain.steps  # of many more coordinates
+    assert (
+        priced.seconds / priced.steps > 2 * plain.seconds / plain.steps
+    )  # of many more coordinates
     assert one.start.bodies["disc.x"][0] == pytest.approx(60.5e-3, abs=5e-4)
     with pytest.raises(ValueError, match=r"rig\.toml, recording `data`: .*disc\.z"):
         load(*_split(case(cut, text.replace("disc.y", "disc.z"))))
@@ -556,9 +703,10 @@ def test_a_recording_may_begin_anywhere_if_that_is_said(case: Callable[..., list
 
 def test_competing_laws_have_the_same_data(case: Callable[..., list[str]]) -> None:
     text = CONFIG + (
-        '[unknowns."contact.eta"]\n[compare.coulomb]\nsettings.contact.friction = "coulomb"\nwithout = ["contact.eta"]\n'
-        '[compare.solid]\npads = {kind = "standard_linear_solid", E_instant = 2e6}\n'
-        'unknowns."pad.E_instant" = {ratio_to = "pad.E", low = 1.01, high = 20.0}\n'
+        '[unknowns."contact.eta"]\n[compare.coulomb]\nsettings.contact.friction = '
+        '"coulomb"\nwithout = ["contact.eta"]\n[compare.solid]\npads = {kind = '
+        '"standard_linear_solid", E_instant = 2e6}\nunknowns."pad.E_instant" = {ratio_to = '
+        '"pad.E", low = 1.01, high = 20.0}\n'
     )
     made = load(*_split(case(config=text)))
     assert list(made.laws) == [STATED, "coulomb", "solid"]
@@ -578,16 +726,30 @@ def test_competing_laws_have_the_same_data(case: Callable[..., list[str]]) -> No
     [
         ('kind = "prony"\nmoduli = [2e5, 1e5]\ntau = [2e-3, 0.01]', ""),
         ('kind = "generalised_kelvin"\nJ = [0.3, 0.2]\ntau = [2e-3, 0.01]', ""),
-        ('kind = "prony"\nmoduli = [2e5, 1e5]\ntau = [2e-3]', "a series needs as many `moduli` as `tau`, from 1 to 20"),
-        ('kind = "prony"\nmoduli = [2e5]\ntau = [1e-5]', "pads: tau_instant = 0.0001 s must be below the shortest tau"),
-        ('kind = "generalised_kelvin"\nJ = [0.8, 0.5]\ntau = [1, 2]', "pads: the fractions J sum to 1.3, above one"),
-        ('kind = "prony"\nmoduli = [-2e5]\ntau = [1.0]', "pads.moduli.0 should be greater than or equal to"),
+        (
+            'kind = "prony"\nmoduli = [2e5, 1e5]\ntau = [2e-3]',
+            "a series needs as many `moduli` as `tau`, from 1 to 20",
+        ),
+        (
+            'kind = "prony"\nmoduli = [2e5]\ntau = [1e-5]',
+            "pads: tau_instant = 0.0001 s must be below the shortest tau",
+        ),
+        (
+            'kind = "generalised_kelvin"\nJ = [0.8, 0.5]\ntau = [1, 2]',
+            "pads: the fractions J sum to 1.3, above one",
+        ),
+        (
+            'kind = "prony"\nmoduli = [-2e5]\ntau = [1.0]',
+            "pads.moduli.0 should be greater than or equal to",
+        ),
     ],
 )
 def test_pads_may_be_of_any_series(case: Callable[..., list[str]], pads: str, message: str) -> None:
     """Of the relaxed modulus `pad.E`; their coefficients may be unknown."""
     symbol, bound = ("E", "") if "prony" in pads else ("J", "\nhigh = 0.7")
-    config = CONFIG.replace('[unknowns."contact.K_n"]\nnominal = 1e5', f'[unknowns."pad.{symbol}_1"]{bound}')
+    config = CONFIG.replace(
+        '[unknowns."contact.K_n"]\nnominal = 1e5', f'[unknowns."pad.{symbol}_1"]{bound}'
+    )
     files = _split(case(config=f"{config}[pads]\n{pads}\n"))
     if message:
         with pytest.raises(ValueError, match=re.escape(message)):

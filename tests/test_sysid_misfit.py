@@ -1,4 +1,5 @@
-"""What a fit leaves: no false alarms where model and noise are right, and for each fault the sentence that names it."""
+"""What a fit leaves: no false alarms where model and noise are right, and for each fault the
+sentence that names it."""
 
 from dataclasses import dataclass, field
 
@@ -28,7 +29,8 @@ CHANNELS = ("x_C", "theta", "F_x")
 
 @dataclass
 class Case:
-    """A linear fit of four unknowns to recordings of three channels, with noise and with what is done to it."""
+    """A linear fit of four unknowns to recordings of three channels, with noise and with what is
+    done to it."""
 
     seed: int
     lengths: tuple[int, ...] = (300, 400)
@@ -49,16 +51,21 @@ class Case:
             for channel in CHANNELS:
                 reading = signal.lfilter(*filtered, rng.standard_normal(m + 200))[200:]
                 e = rng.standard_normal(m) if self.noise is None else made(self.noise, m, rng)
-                columns.append(signal.lfilter(*filtered, rng.standard_normal((m + 200, 4)), axis=0)[200:])
+                columns.append(
+                    signal.lfilter(*filtered, rng.standard_normal((m + 200, 4)), axis=0)[200:]
+                )
                 rows.append(self.scale * e + self.fault.get((f"run {k}", channel), 0.0))
-                known.append((f"run {k}", channel, np.arange(m) * H, np.arange(at, at + m), reading))
+                known.append(
+                    (f"run {k}", channel, np.arange(m) * H, np.arange(at, at + m), reading)
+                )
                 at += m
         W = [None if self.assumed is None else self.assumed.whitener(t) for _, _, t, _, _ in known]
         J = np.concatenate([j if w is None else w @ j for w, j in zip(W, columns)])
         y = np.concatenate([x if w is None else w @ x for w, x in zip(W, rows)])
         x = np.linalg.lstsq(J, y, rcond=None)[0]
         parts = [
-            Part(*one[:4], raw=raw - j @ x, reading=one[4], noise=self.assumed, found=self.assumed is not None,
+            Part(*one[:4], raw=raw - j @ x, reading=one[4], noise=self.assumed,
+            found=self.assumed is not None,
                  whitened=(lambda rows: rows) if w is None else w.__matmul__)
             for one, raw, j, w in zip(known, rows, columns, W)
         ]  # fmt: skip
@@ -100,7 +107,9 @@ def test_the_level_is_judged_by_how_many_samples_there_are() -> None:
     (overall,) = [f for f in alarms(many, "level") if f.recording is None]
     assert overall.p < 1e-9
     assert overall.size == pytest.approx(1.058, abs=0.02)
-    assert residual_notices(many)[0].startswith("residuals are larger than the noise that was stated")
+    assert residual_notices(many)[0].startswith(
+        "residuals are larger than the noise that was stated"
+    )
     assert "all of them together 1.0" in residual_notices(many)[0]
     few = Case(0, lengths=(13, 13), scale=1.12**0.5).judged()
     assert not alarms(few, "level")
@@ -137,7 +146,9 @@ def test_what_follows_the_motion_is_named(kind: str, words: str) -> None:
         "offset": np.ones(400), "drift": t - t.mean(), "gain": own, "delay": np.gradient(own, H),
         "other": np.gradient(other, H), "inertia": np.gradient(np.gradient(other, H), H),
     }[kind]  # fmt: skip
-    found = Case(2, fault={where: 0.5 * fault / fault.std() if kind != "offset" else 0.5 * fault}).judged()
+    found = Case(
+        2, fault={where: 0.5 * fault / fault.std() if kind != "offset" else 0.5 * fault}
+    ).judged()
     named = alarms(found, "motion")
     assert {(f.recording, f.channel) for f in named} == {where}
     assert any(words in f.words for f in named), [f.words for f in named]
@@ -151,9 +162,14 @@ def test_colour_is_noticed_found_allowed_for_and_named() -> None:
     parts, _, J = case.fitted()
     found = colours(parts, J)
     assert set(found) == set(CHANNELS)
-    assert all(fit.noise.sd >= 1 - 1e-12 and 0.5 < correlation(fit.noise) < 0.7 for fit in found.values())
+    assert all(
+        fit.noise.sd >= 1 - 1e-12 and 0.5 < correlation(fit.noise) < 0.7 for fit in found.values()
+    )
     (sentence,) = colour_notices(found)
-    assert f"x_C (order 1, neighbouring samples correlate by {correlation(found['x_C'].noise):.2f})" in sentence
+    assert (
+        f"x_C (order 1, neighbouring samples correlate by {correlation(found['x_C'].noise):.2f})"
+        in sentence
+    )
     assert not colour_notices(found, CHANNELS)
     assert "theta" not in colour_notices(found, ["theta"])[0]
     assert not residual_notices(Case(3, noise=noise, assumed=found["theta"].noise).judged())
@@ -196,16 +212,29 @@ def test_an_outlier_is_named_with_its_time_and_expected_of_a_robust_loss() -> No
 
 def test_saturated_samples_and_ends_that_cannot_be_tested() -> None:
     parts, r, J = Case(0).fitted()
-    quiet = np.where(np.arange(len(r)) % 3 == 0, 0.0, r)  # a third is saturated, far beyond the range
+    quiet = np.where(
+        np.arange(len(r)) % 3 == 0, 0.0, r
+    )  # a third is saturated, far beyond the range
     some = []
     for p in parts:
         inside = p.rows % 3 != 0
         some.append(
-            p._replace(t=p.t[inside], rows=p.rows[inside], raw=p.raw[inside], reading=p.reading[inside], saturated=100)
+            p._replace(
+                t=p.t[inside],
+                rows=p.rows[inside],
+                raw=p.raw[inside],
+                reading=p.reading[inside],
+                saturated=100,
+            )
         )
-    assert not [f for f in judge_residuals(some, quiet, np.where((quiet == 0)[:, None], 0.0, J)) if f.alarming]
+    assert not [
+        f
+        for f in judge_residuals(some, quiet, np.where((quiet == 0)[:, None], 0.0, J))
+        if f.alarming
+    ]
     assert not colours(some, J)
-    short = judge_residuals([p._replace(t=p.t[:3], rows=np.arange(3 * i, 3 * i + 3), raw=p.raw[:3], reading=p.reading[:3])
+    short = judge_residuals([p._replace(t=p.t[:3], rows=np.arange(3 * i, 3 * i + 3), raw=p.raw[:3],
+        reading=p.reading[:3])
                    for i, p in enumerate(parts)], r[:18], np.zeros((18, 4)))  # fmt: skip
     assert not [f for f in short if f.alarming]
 
@@ -217,15 +246,21 @@ def test_a_prior_that_the_data_contradict_is_named() -> None:
         both, at = np.concatenate((J, row)), np.append(r, -far / 0.05)
         x = np.linalg.lstsq(both, -at, rcond=None)[0]
         verdicts = judge_residuals(parts, at + both @ x, both, priors=["pad.E"])
-        z = abs(far - 0.0) / np.hypot(0.05, np.linalg.inv(J.T @ J)[0, 0] ** 0.5)  # the fit without it is at zero
+        z = abs(far - 0.0) / np.hypot(
+            0.05, np.linalg.inv(J.T @ J)[0, 0] ** 0.5
+        )  # the fit without it is at zero
         (one,) = [v for v in verdicts if v.test == "priors"]
         assert one.size == pytest.approx(z, rel=1e-6, abs=1e-9)
         assert one.alarming == (far > 0)
-        assert any("contradict what was known before, pad.E by" in notice for notice in residual_notices(verdicts)) == (
-            far > 0
-        )
+        assert any(
+            "contradict what was known before, pad.E by" in notice
+            for notice in residual_notices(verdicts)
+        ) == (far > 0)
     unseen = judge_residuals(
-        parts, np.append(r, 0.0), np.concatenate((np.delete(J, 0, 1) @ np.eye(4)[1:], np.eye(4)[:1])), priors=["pad.E"]
+        parts,
+        np.append(r, 0.0),
+        np.concatenate((np.delete(J, 0, 1) @ np.eye(4)[1:], np.eye(4)[:1])),
+        priors=["pad.E"],
     )
     assert not alarms(unseen, "priors")
 

@@ -1,11 +1,19 @@
-"""Coloured noise: whitening against dense algebra, orders that are found, intervals that keep their coverage; robust losses."""
+"""Coloured noise: whitening against dense algebra, orders that are found, intervals that keep their
+coverage; robust losses."""
 
 import numpy as np
 import pytest
 from scipy import linalg, optimize, signal, stats
 
 from torchsoft.sysid.fit import EFFICIENCY, REACH, Loss, covariance, fisher, rho, spared
-from torchsoft.sysid.noise import Autoregression, coefficients, fit_noise, log_det, reflections, spacing
+from torchsoft.sysid.noise import (
+    Autoregression,
+    coefficients,
+    fit_noise,
+    log_det,
+    reflections,
+    spacing,
+)
 
 H = 5e-3
 PROCESSES = {"one": (0.9,), "two": (1.6, -0.8), "four": (0.5, -0.3, 0.2, 0.1)}
@@ -41,11 +49,15 @@ def test_a_half_empty_grid_looks_back_as_far_as_the_memory_goes() -> None:
 
 
 def test_autocovariance_of_known_processes() -> None:
-    np.testing.assert_allclose(Autoregression((0.9,), 2.0, H).autocovariance(5), 4 / 0.19 * 0.9 ** np.arange(5))
+    np.testing.assert_allclose(
+        Autoregression((0.9,), 2.0, H).autocovariance(5), 4 / 0.19 * 0.9 ** np.arange(5)
+    )
     a, b = 1.6, -0.8  # Yule and Walker by hand
     gamma = Autoregression((a, b), 1.0, H).autocovariance(4)
     rho1 = a / (1 - b)
-    np.testing.assert_allclose(gamma[1:] / gamma[0], [rho1, a * rho1 + b, a * (a * rho1 + b) + b * rho1])
+    np.testing.assert_allclose(
+        gamma[1:] / gamma[0], [rho1, a * rho1 + b, a * (a * rho1 + b) + b * rho1]
+    )
     assert gamma[0] == pytest.approx((1 - b) / ((1 + b) * ((1 - b) ** 2 - a**2)))
     np.testing.assert_allclose(Autoregression((), 0.5, H).autocovariance(3), [0.25, 0, 0])
     assert Autoregression.stated((a, b), H).sd == pytest.approx(1.0)
@@ -62,7 +74,9 @@ def test_off_a_grid_noise_decays_with_time() -> None:
     np.testing.assert_allclose(W @ K @ W.T, np.eye(300), atol=1e-10)
     with pytest.raises(ValueError, match="not on such a grid"):
         Autoregression((1.6, -0.8), 1.0, H).whitener(t)
-    found = fit_noise([(t, np.linalg.cholesky(K) @ rng.standard_normal(300)) for _ in range(3)]).noise
+    found = fit_noise(
+        [(t, np.linalg.cholesky(K) @ rng.standard_normal(300)) for _ in range(3)]
+    ).noise
     assert found.phi[0] ** (H / found.spacing) == pytest.approx(0.9, abs=0.04)
     assert fit_noise([(t, rng.standard_normal(300))]).noise.order == 0
 
@@ -83,7 +97,9 @@ def test_what_grows_is_refused() -> None:
 
 @pytest.mark.parametrize("kept", [1.0, 0.9])
 @pytest.mark.parametrize("phi", [(), *PROCESSES.values()], ids=["white", *PROCESSES])
-def test_order_and_coefficients_are_found_over_several_recordings(phi: tuple[float, ...], kept: float) -> None:
+def test_order_and_coefficients_are_found_over_several_recordings(
+    phi: tuple[float, ...], kept: float
+) -> None:
     rng, noise = np.random.default_rng(3), Autoregression(phi, 1.3, H)
     series = []
     for m in (600, 900, 700):
@@ -96,7 +112,9 @@ def test_order_and_coefficients_are_found_over_several_recordings(phi: tuple[flo
     assert found.noise.scale == pytest.approx(1.3, rel=0.05)
     assert found.noise.spacing == pytest.approx(H)
     true = sum(
-        2 * len(t) * np.log(1.3) + log_det(W := Autoregression(phi, 1.0, H).whitener(t)) + np.sum((W @ r / 1.3) ** 2)
+        2 * len(t) * np.log(1.3)
+        + log_det(W := Autoregression(phi, 1.0, H).whitener(t))
+        + np.sum((W @ r / 1.3) ** 2)
         for t, r in series
     )  # near the maximum of the likelihood, at which half the ratio's logarithm is chi-squared
     assert -1.0 < true - found.scores[len(phi)].deviance < stats.chi2.isf(1e-3, len(phi) + 1)
@@ -120,7 +138,8 @@ def test_so_many_samples_tell_the_level() -> None:
 
 
 def test_intervals_keep_their_coverage_under_coloured_noise() -> None:
-    """A linear model of three slow signals; white intervals would hold the truth in about half the cases."""
+    """A linear model of three slow signals; white intervals would hold the truth in about half the
+    cases."""
     rng, t, z = np.random.default_rng(0), np.arange(400) * H, {"found": [], "ignored": []}
     for _ in range(120):
         J = signal.lfilter(*signal.butter(2, 0.08), rng.standard_normal((600, 3)), axis=0)[200:]
@@ -128,8 +147,12 @@ def test_intervals_keep_their_coverage_under_coloured_noise() -> None:
         white = np.linalg.lstsq(J, r, rcond=None)[0]
         z["ignored"].append(white / np.sqrt(np.diag(fisher(J)[0])))
         W = fit_noise([(t, r - J @ white)], 3).noise.at_least(1.0).whitener(t)
-        z["found"].append(np.linalg.lstsq(W @ J, W @ r, rcond=None)[0] / np.sqrt(np.diag(fisher(W @ J)[0])))
-    inside = {name: float(np.mean(np.abs(some) < stats.norm.ppf(0.975))) for name, some in z.items()}
+        z["found"].append(
+            np.linalg.lstsq(W @ J, W @ r, rcond=None)[0] / np.sqrt(np.diag(fisher(W @ J)[0]))
+        )
+    inside = {
+        name: float(np.mean(np.abs(some) < stats.norm.ppf(0.975))) for name, some in z.items()
+    }
     assert 0.92 < inside["found"] < 0.98
     assert inside["ignored"] < 0.7
 
@@ -139,10 +162,18 @@ def test_losses_are_scipys(loss: Loss) -> None:
     z = np.linspace(0.0, 9.0, 200)
     h = 1e-6
     near = np.abs(z - 1) > 0.05  # of Huber's kink
-    np.testing.assert_allclose(((rho(loss, z + h) - rho(loss, z)) / h)[:2, near], rho(loss, z)[1:, near], atol=1e-4)
+    np.testing.assert_allclose(
+        ((rho(loss, z + h) - rho(loss, z)) / h)[:2, near], rho(loss, z)[1:, near], atol=1e-4
+    )
     rng = np.random.default_rng(0)
     J, y = rng.standard_normal((60, 2)), 3 * rng.standard_normal(60)
-    options: dict = {"x0": np.zeros(2), "jac": lambda x: J, "f_scale": REACH[loss], "xtol": 1e-14, "ftol": 1e-14}
+    options: dict = {
+        "x0": np.zeros(2),
+        "jac": lambda x: J,
+        "f_scale": REACH[loss],
+        "xtol": 1e-14,
+        "ftol": 1e-14,
+    }
     one = optimize.least_squares(lambda x: J @ x - y, loss=loss, **options)
     other = optimize.least_squares(lambda x: J @ x - y, loss=spared(loss, 0), **options)
     np.testing.assert_allclose(other.x, one.x, rtol=1e-12)
@@ -156,7 +187,8 @@ def test_losses_are_scipys(loss: Loss) -> None:
 @pytest.mark.parametrize("loss", ROBUST)
 @pytest.mark.parametrize("bad", [0.0, 0.1])
 def test_robust_covariance_is_that_of_many_fits(loss: Loss, bad: float) -> None:
-    """With Gaussian noise, at the efficiency that its reach was made for; and with one outlier in ten, ten times as large."""
+    """With Gaussian noise, at the efficiency that its reach was made for; and with one outlier in
+    ten, ten times as large."""
     rng = np.random.default_rng(0)
     J = rng.standard_normal((300, 4))
     ends, said, plain = [], [], []
@@ -164,14 +196,16 @@ def test_robust_covariance_is_that_of_many_fits(loss: Loss, bad: float) -> None:
         y = rng.standard_normal(300) * np.where(rng.random(300) < bad, 10.0, 1.0)
         start = np.linalg.lstsq(J, y, rcond=None)[0]
         fit = optimize.least_squares(
-            lambda x, y=y: J @ x - y, start if bad == 0 else 0 * start, jac=lambda x: J, loss=spared(loss, 0),
-            f_scale=REACH[loss],
+            lambda x, y=y: J @ x - y, start if bad == 0 else 0 * start, jac=lambda x: J,
+            loss=spared(loss, 0), f_scale=REACH[loss],
         )  # fmt: skip
         ends.append(fit.x)
         plain.append(start)
         said.append(np.diag(covariance(J, fit.fun, loss)))
     ends, said, plain = np.array(ends), np.array(said), np.array(plain)
-    assert np.mean(ends**2) == pytest.approx(np.mean(said), rel=0.1)  # 1200 squares: a standard deviation is 4 %
+    assert np.mean(ends**2) == pytest.approx(
+        np.mean(said), rel=0.1
+    )  # 1200 squares: a standard deviation is 4 %
     inside = np.mean(np.abs(ends) < stats.norm.ppf(0.975) * np.sqrt(said))
     assert 0.93 < inside < 0.97
     if bad:

@@ -69,16 +69,22 @@ def test_laplace_says_where_it_is_not_to_be_trusted_and_refuses_where_it_says_no
 
 
 def test_draws_that_cannot_be_simulated_have_no_weight() -> None:
-    found = laplace(optimum(ClosedForm(lambda x: [x[0]], 1, fails=lambda x: bool(x[0] > 0.5)), 0), draws=1000)
+    found = laplace(
+        optimum(ClosedForm(lambda x: [x[0]], 1, fails=lambda x: bool(x[0] > 0.5)), 0), draws=1000
+    )
     lost = found.draws[0, :, 0] > np.exp(0.5)
     assert (found.weights[0, lost] == 0).all()
     assert found.checks["failed"] == lost.sum()
-    assert any(f"{lost.sum()} of 1000 runs failed" in notice and WALL in notice for notice in found.notices)
+    assert any(
+        f"{lost.sum()} of 1000 runs failed" in notice and WALL in notice for notice in found.notices
+    )
 
 
 def test_residuals_too_large_for_the_noise_are_said() -> None:
     off = ClosedForm(lambda x: np.append(STRAIGHT @ x, np.full(40, 3.0)), 3)
-    assert any("larger than the noise" in notice for notice in laplace(optimum(off, 0, 0, 0)).notices)
+    assert any(
+        "larger than the noise" in notice for notice in laplace(optimum(off, 0, 0, 0)).notices
+    )
 
 
 @pytest.mark.parametrize("kind", ["normal", "log-normal"])
@@ -86,12 +92,19 @@ def test_residuals_too_large_for_the_noise_are_said() -> None:
 def test_the_density_that_nuts_sees_has_its_gradient(kind: Any, scale: Any) -> None:
     prior = Prior(median=2.0, sd=0.7, kind=kind)
     o = optimum(
-        ClosedForm(lambda x: [x[0] * x[1], np.sin(x[0])], 2, low=0.5, high=6.0, prior=prior, scale=scale), 0.3, 0.4
+        ClosedForm(
+            lambda x: [x[0] * x[1], np.sin(x[0])], 2, low=0.5, high=6.0, prior=prior, scale=scale
+        ),
+        0.3,
+        0.4,
     )
     white = Whitened.of(o)
     for z in np.random.default_rng(1).standard_normal((3, 2)):
         _, gradient = white.density(o, z)
-        by = [(white.density(o, z + h)[0] - white.density(o, z - h)[0]) / 2e-5 for h in 1e-5 * np.eye(2)]
+        by = [
+            (white.density(o, z + h)[0] - white.density(o, z - h)[0]) / 2e-5
+            for h in 1e-5 * np.eye(2)
+        ]
         np.testing.assert_allclose(gradient, by, rtol=1e-5, atol=1e-7)
 
 
@@ -142,7 +155,11 @@ def test_nuts_says_where_it_has_not_arrived() -> None:
 
 def test_nuts_takes_failing_runs_for_walls_and_says_so() -> None:
     pytest.importorskip("nutpie")
-    found = nuts(optimum(ClosedForm(lambda x: [x[0]], 1, fails=lambda x: bool(x[0] > 0.5)), 0), chains=2, draws=200)
+    found = nuts(
+        optimum(ClosedForm(lambda x: [x[0]], 1, fails=lambda x: bool(x[0] > 0.5)), 0),
+        chains=2,
+        draws=200,
+    )
     assert np.log(found.draws).max() <= 0.5
     assert found.checks["failed"] > 0
     assert any("runs failed" in notice and WALL in notice for notice in found.notices)
@@ -187,7 +204,8 @@ def test_nuts_says_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def rolling() -> Problem:
-    """A quarter of a second on the coarse rig, with coloured noise of the force, a bias and a saturated sensor."""
+    """A quarter of a second on the coarse rig, with coloured noise of the force, a bias and a
+    saturated sensor."""
     base = Parameters().override(COARSE)
     roll = Excitation(motion=Roll(travel=4e-3), duration=0.25, grasp_time=0.1, settle=0.0)
     sensors = RIG | {"F_x": Sensor(noise=0.1, bias=1.0), "F_y": Sensor(noise=0.1, low=-60.0)}
@@ -201,5 +219,7 @@ def test_the_density_on_a_rig_has_its_gradient(rolling: Problem) -> None:
     o = Optimum(rolling, rolling.coordinates.start, rtol=1e-4)
     white, z = Whitened.of(o), np.array([0.4, -0.3, 0.2])
     _, gradient = white.density(o, z)
-    by = [(white.density(o, z + h)[0] - white.density(o, z - h)[0]) / 2e-4 for h in 1e-4 * np.eye(3)]
+    by = [
+        (white.density(o, z + h)[0] - white.density(o, z - h)[0]) / 2e-4 for h in 1e-4 * np.eye(3)
+    ]
     np.testing.assert_allclose(gradient, by, rtol=1e-3, atol=1e-3 * np.abs(gradient).max())

@@ -1,4 +1,5 @@
-"""Recordings that do not mean what the model takes them to mean get the sentence that helps; those that do get none."""
+"""Recordings that do not mean what the model takes them to mean get the sentence that helps; those
+that do get none."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -26,19 +27,21 @@ from torchsoft.sysid.setpoints import gaps, setpoint_findings
 NOMINAL = Parameters().override(COARSE)
 SENSORS = RIG | {"omega": Sensor(noise=0.02)}
 FAR = {
-    "contact.K_n": 3.0, "contact.R_n": 0.4, "contact.K_t": 0.4, "contact.R_t": 2.5, "contact.mu_s": 0.7, "contact.mu_k": 0.6,
-    "pad.E": 0.5, "pad.tau": 2.5,
+    "contact.K_n": 3.0, "contact.R_n": 0.4, "contact.K_t": 0.4, "contact.R_t": 2.5,
+    "contact.mu_s": 0.7, "contact.mu_k": 0.6, "pad.E": 0.5, "pad.tau": 2.5,
 }  # fmt: skip
 """How far the truth is from where a fit would start."""
 
 MOTIONS = {
-    "rolling": Excitation(motion=Strokes(travel=15e-3, stroke_time=0.2), duration=0.9, grasp_time=0.2, settle=0.05),
-    "shaking": Excitation(
-        motion=MultiSine(amplitude_x=6e-3, amplitude_y=2e-4, frequency=(4.0, 17.0)), duration=0.9, depth=4e-4, grasp_time=0.2
+    "rolling": Excitation(motion=Strokes(travel=15e-3, stroke_time=0.2), duration=0.9,
+    grasp_time=0.2, settle=0.05), "shaking": Excitation(
+        motion=MultiSine(amplitude_x=6e-3, amplitude_y=2e-4, frequency=(4.0, 17.0)), duration=0.9,
+        depth=4e-4, grasp_time=0.2
     ),
-    "pressing": Excitation(motion=Press(amplitude=5e-4, frequency=12.0, travel=10e-3), duration=0.9, grasp_time=0.2),
-    "about the disc": Excitation(
-        motion=Strokes(travel=8e-3, stroke_time=0.25), duration=0.9, grasp_time=0.2, settle=0.05, senses="disc", x_C0=60e-3
+    "pressing": Excitation(motion=Press(amplitude=5e-4, frequency=12.0, travel=10e-3), duration=0.9,
+    grasp_time=0.2), "about the disc": Excitation(
+        motion=Strokes(travel=8e-3, stroke_time=0.25), duration=0.9, grasp_time=0.2, settle=0.05,
+        senses="disc", x_C0=60e-3
     ),
 }  # fmt: skip
 
@@ -66,18 +69,22 @@ def runs(recordings: dict[str, Recording]) -> dict[str, Signals]:
 def looked_at(
     recording: Recording, run: Signals | None = None, sensors: Mapping[str, Sensor] = SENSORS
 ) -> list[Diagnostic]:
-    """What is found with the sensors that the recording has, against a run that is there, or one of its own."""
+    """What is found with the sensors that the recording has, against a run that is there, or one of
+    its own."""
     mine = {name: sensor for name, sensor in sensors.items() if name in recording.samples}
     if run is None:
         problem = Problem([recording], mine, {"pad.E": Unknown()})
         return precheck(problem, Runner(problem.recordings))
     span = float(recording.times[0]), float(recording.times[-1])
-    readouts = {name: readout(recording.rig, name, sensor, {}, span) for name, sensor in mine.items()}
+    readouts = {
+        name: readout(recording.rig, name, sensor, {}, span) for name, sensor in mine.items()
+    }
     return findings(recording, mine, {name: (one, run) for name, one in readouts.items()})
 
 
 def changed(recording: Recording, **channels: Callable[[Any, Any], Any] | None) -> Recording:
-    """With other values of some channels, which are functions of times and values; None leaves a channel out."""
+    """With other values of some channels, which are functions of times and values; None leaves a
+    channel out."""
     samples = dict(recording.samples)
     for name, change in channels.items():
         t, y = samples.pop(name)
@@ -86,7 +93,9 @@ def changed(recording: Recording, **channels: Callable[[Any, Any], Any] | None) 
     return replace(recording, samples=samples)
 
 
-def noted(recording: Recording, settings: Mapping[str, Any] | None = None, **signals: Any) -> Recording:
+def noted(
+    recording: Recording, settings: Mapping[str, Any] | None = None, **signals: Any
+) -> Recording:
     """With other settings, and other signals of the reference."""
     p, old = paper_settings(recording), recording.rig.reference
     reference = Reference(**{name: signals.get(name, old[name]) for name in ("x_d", "y_d", "F_ff")})
@@ -115,56 +124,72 @@ class Mistake:
 NO_F = {"F_x": None, "F_y": None}
 MISTAKES = {
     "sign of a force": Mistake(
-        "rolling", lambda r: changed(r, F_x=scaled(-1)), "sign of F_x", "F_x looks as if its sign were opposite", True
+        "rolling", lambda r: changed(r, F_x=scaled(-1)), "sign of F_x", "F_x looks as if its sign "
+                                                                        "were opposite", True
     ),
     "sign of a force that only a run tells": Mistake(
-        "rolling", lambda r: changed(r, F_y=scaled(-1), y_Br=None), "sign of F_y", "correlation with a run from the start", True
+        "rolling", lambda r: changed(r, F_y=scaled(-1), y_Br=None), "sign of F_y", "correlation "
+                                                                                   "with a run from the start", True
     ),
     "sign of an angle": Mistake(
-        "rolling", lambda r: changed(r, theta=scaled(-1)), "sign of theta", "theta looks as if its sign were opposite", True
+        "rolling", lambda r: changed(r, theta=scaled(-1)), "sign of theta", "theta looks as if its "
+                                                                            "sign were opposite",
+                                                                            True
     ),
     "sign of a rate": Mistake(
-        "shaking", lambda r: changed(r, omega=scaled(-1)), "sign of omega", "omega looks as if its sign were opposite", True
+        "shaking", lambda r: changed(r, omega=scaled(-1)), "sign of omega", "omega looks as if its "
+                                                                            "sign were opposite",
+                                                                            True
     ),
     "millinewtons": Mistake(
-        "shaking", lambda r: changed(r, F_x=scaled(1e3)), "unit of F_x", "millinewtons taken for newtons", True
+        "shaking", lambda r: changed(r, F_x=scaled(1e3)), "unit of F_x", "millinewtons taken for "
+                                                                         "newtons", True
     ),
     "degrees": Mistake(
-        "rolling", lambda r: changed(r, theta=scaled(57.3)), "unit of theta", "degrees taken for radians", True
+        "rolling", lambda r: changed(r, theta=scaled(57.3)), "unit of theta", "degrees taken for "
+                                                                              "radians", True
     ),
     "radians": Mistake(
-        "rolling", lambda r: changed(r, theta=scaled(1 / 57.3)), "unit of theta", "radians taken for degrees", True
+        "rolling", lambda r: changed(r, theta=scaled(1 / 57.3)), "unit of theta", "radians taken "
+                                                                                  "for degrees",
+                                                                                  True
     ),
     "the disc's set-point taken for the bracket's": Mistake(
         "about the disc", lambda r: noted(r, {"control.senses": "bracket"}), "control.senses",
         'x_d looks like the set-point of the disc, not of the bracket (say control.senses = "disc")', True,
     ),
     "the bracket's taken for the disc's": Mistake(
-        "rolling", lambda r: noted(r, {"control.senses": "disc"}), "control.senses", "of the bracket, not of the disc", True
+        "rolling", lambda r: noted(r, {"control.senses": "disc"}), "control.senses",
+        "of the bracket, not of the disc", True
     ),
     "the bracket's taken for the disc's, no forces": Mistake(
-        "rolling", lambda r: changed(noted(r, {"control.senses": "disc"}), **NO_F), "control.senses", "x_Br follows it to", True
+        "rolling", lambda r: changed(noted(r, {"control.senses": "disc"}), **NO_F),
+        "control.senses", "x_Br follows it to", True
     ),
     "the bracket's taken for the disc's, the disc alone": Mistake(
-        "rolling", lambda r: changed(noted(r, {"control.senses": "disc"}), **NO_F, x_Br=None), "control.senses",
-        "x_C does not follow it", True,
+        "rolling", lambda r: changed(noted(r, {"control.senses": "disc"}), **NO_F, x_Br=None),
+        "control.senses", "x_C does not follow it", True,
     ),
     "exchanged columns": Mistake(
-        "rolling", lambda r: changed(r, x_C=lambda t, x: r.samples["x_Br"][1], x_Br=lambda t, x: r.samples["x_C"][1]),
-        "control.senses", "or are x_Br and x_C exchanged?", True,
+        "rolling", lambda r: changed(r, x_C=lambda t, x: r.samples["x_Br"][1], x_Br=lambda t,
+        x: r.samples["x_C"][1]), "control.senses", "or are x_Br and x_C exchanged?", True,
     ),
     "no force fed forward": Mistake(
-        "rolling", lambda r: noted(r, F_ff=Profile([0.0], [0.0])), "F_ff", "was a force fed forward that F_ff does", False
+        "rolling", lambda r: noted(r, F_ff=Profile([0.0], [0.0])), "F_ff", "was a force fed "
+                                                                           "forward that F_ff does",
+                                                                           False
     ),
     "its sign": Mistake(
-        "pressing", lambda r: noted(r, F_ff=opposite(r)), "sign of F_ff", "F_ff looks as if its sign were opposite", True
+        "pressing", lambda r: noted(r, F_ff=opposite(r)), "sign of F_ff", "F_ff looks as if its "
+                                                                          "sign were opposite", True
     ),
     "a zero": Mistake(
-        "rolling", lambda r: changed(r, x_Br=lambda t, x: x + 80e-6), "loop of F_x", "zeros, times and set-points right?", False
+        "rolling", lambda r: changed(r, x_Br=lambda t, x: x + 80e-6), "loop of F_x", "zeros, times "
+                                                                                     "and set-points right?", False
     ),
     "other gains": Mistake(
-        "pressing", lambda r: noted(r, {"control.K_98": 0.7e5, "control.R_99": 900.0}), "loop of F_y",
-        "F_y is not what the controller gives", False,
+        "pressing", lambda r: noted(r, {"control.K_98": 0.7e5, "control.R_99": 900.0}),
+        "loop of F_y", "F_y is not what the controller gives", False,
     ),
 }  # fmt: skip
 
@@ -181,7 +206,9 @@ def test_a_mistake_gets_the_sentence_that_helps(
 ) -> None:
     mistake = MISTAKES[name]
     one = mistake.change(recordings[mistake.motion])
-    found = looked_at(one, runs[mistake.motion] if one.rig is recordings[mistake.motion].rig else None)
+    found = looked_at(
+        one, runs[mistake.motion] if one.rig is recordings[mistake.motion].rig else None
+    )
     assert [f.code for f in found] == [mistake.what]
     assert mistake.words in found[0].message, found[0].message
     assert found[0].message.startswith(f"recording `{mistake.motion}`: ")
@@ -192,7 +219,8 @@ def test_a_mistake_gets_the_sentence_that_helps(
 def test_nothing_is_said_of_what_is_right(
     recordings: dict[str, Recording], runs: dict[str, Signals], motion: str
 ) -> None:
-    """With a start that is off by a factor of three, with fewer sensors, and with faults that were declared."""
+    """With a start that is off by a factor of three, with fewer sensors, and with faults that were
+    declared."""
     one, run = recordings[motion], runs[motion]
     assert looked_at(one, run) == []
     assert looked_at(changed(one, **NO_F), run) == []
@@ -202,32 +230,50 @@ def test_nothing_is_said_of_what_is_right(
         "F_x": Sensor(noise=0.1, delay=6e-3), "F_y": Sensor(noise=0.1, gain=0.2),
     }  # fmt: skip
     faulty = changed(
-        one, x_Br=lambda t, x: x + 40e-6, theta=lambda t, y: late(60e-3)(t, y) + 0.02, F_x=late(5e-3), F_y=scaled(1.15)
+        one,
+        x_Br=lambda t, x: x + 40e-6,
+        theta=lambda t, y: late(60e-3)(t, y) + 0.02,
+        F_x=late(5e-3),
+        F_y=scaled(1.15),
     )
     assert looked_at(faulty, run, declared) == []
 
 
 def test_gains_that_are_unknown_still_tell_a_sign(recordings: dict[str, Recording]) -> None:
     for factor in (0.3, 3.0):
-        gains = {"control.K_98": factor * NOMINAL.control.K_98, "control.R_99": factor * NOMINAL.control.R_99}
+        gains = {
+            "control.K_98": factor * NOMINAL.control.K_98,
+            "control.R_99": factor * NOMINAL.control.R_99,
+        }
         one = noted(recordings["rolling"], gains, F_ff=Profile([0.0], [0.0]))
         pressed = changed(
-            one, F_y=lambda t, F: F - recordings["rolling"].rig.reference["F_ff"](torch.from_numpy(t))[0].numpy()
+            one,
+            F_y=lambda t, F: (
+                F - recordings["rolling"].rig.reference["F_ff"](torch.from_numpy(t))[0].numpy()
+            ),
         )
         assert list(loop_findings(pressed, SENSORS, ["control.K_98"])) == []
         flipped = changed(pressed, F_y=scaled(-1))
-        assert [f.code for f in loop_findings(flipped, SENSORS, ["control.K_98"])] == ["sign of F_y"]
+        assert [f.code for f in loop_findings(flipped, SENSORS, ["control.K_98"])] == [
+            "sign of F_y"
+        ]
     about = noted(recordings["rolling"], {"control.senses": "disc"})
     assert [f.code for f in loop_findings(about, SENSORS, ["control.K_81"])] == ["control.senses"]
 
 
-def test_coloured_noise_is_no_mistake(recordings: dict[str, Recording], runs: dict[str, Signals]) -> None:
+def test_coloured_noise_is_no_mistake(
+    recordings: dict[str, Recording], runs: dict[str, Signals]
+) -> None:
     """First-order autoregressions of 0.9, where the fit does not know it."""
     rng = np.random.default_rng(0)
     for motion, one in recordings.items():
         for _ in range(3):
             samples = {
-                name: (t, y + lfilter([0.43], [1, -0.9], SENSORS[name].noise * rng.standard_normal(len(t))))
+                name: (
+                    t,
+                    y
+                    + lfilter([0.43], [1, -0.9], SENSORS[name].noise * rng.standard_normal(len(t))),
+                )
                 for name, (t, y) in one.samples.items()
             }
             assert looked_at(replace(one, samples=samples), runs[motion]) == []
@@ -253,8 +299,11 @@ def at_rows(recording: Recording, rate: float, *, rates: bool = False) -> Record
 
 
 @pytest.mark.parametrize("rates", [False, True])
-def test_sparse_set_points_are_told_by_what_they_do(recordings: dict[str, Recording], rates: bool) -> None:
-    """The estimate from the rows alone against what the exact set-points would have had the controller do."""
+def test_sparse_set_points_are_told_by_what_they_do(
+    recordings: dict[str, Recording], rates: bool
+) -> None:
+    """The estimate from the rows alone against what the exact set-points would have had the
+    controller do."""
     one, exact = recordings["shaking"], recordings["shaking"].rig.reference
     actuator = one.rig.actuators["x"]
     for rate in (200.0, 500.0):
@@ -262,14 +311,17 @@ def test_sparse_set_points_are_told_by_what_they_do(recordings: dict[str, Record
         t = torch.linspace(0.05, 0.85, 4001, dtype=torch.float64)
         signals = [d(t, ("x_d",)).detach()[:, 0] for d in (sparse.rig.reference, exact)]
         zero = torch.zeros_like(t)
-        efforts = [actuator(torch.stack((*d.unbind(-1), zero, zero, zero), -1)).detach() for d in signals]
+        efforts = [
+            actuator(torch.stack((*d.unbind(-1), zero, zero, zero), -1)).detach() for d in signals
+        ]
         real = float((efforts[0] - efforts[1]).square().mean().sqrt())
         told = {gap.channel: gap for gap in gaps(sparse, SENSORS, "x")}["F_x"]
         assert 0.5 * real < told.error < 2.5 * real
         assert told.noises == told.error / SENSORS["F_x"].noise
         assert 2.5 < told.order <= 4.0
     enough, few, hardly = (
-        list(setpoint_findings(at_rows(one, rate, rates=rates), SENSORS)) for rate in (500.0, 100.0, 30.0)
+        list(setpoint_findings(at_rows(one, rate, rates=rates), SENSORS))
+        for rate in (500.0, 100.0, 30.0)
     )
     assert enough == []
     (said,) = [f for f in few if f.code == "set-points x_d"]
@@ -279,7 +331,9 @@ def test_sparse_set_points_are_told_by_what_they_do(recordings: dict[str, Record
     assert any(f.code == "set-points x_d" and f.severity == "error" for f in hardly)
 
 
-def test_a_rate_that_is_not_that_of_its_set_point_is_named(recordings: dict[str, Recording]) -> None:
+def test_a_rate_that_is_not_that_of_its_set_point_is_named(
+    recordings: dict[str, Recording],
+) -> None:
     one = at_rows(recordings["rolling"], 500.0, rates=True)
     x_d = one.rig.reference["x_d"]
     assert isinstance(x_d, Sampled)
@@ -304,7 +358,8 @@ def test_a_clock_that_is_off_is_no_reason_for_closer_rows(recordings: dict[str, 
 
 def test_findings_of_a_kind_are_said_once_and_refused_unless_they_are_meant() -> None:
     found = together([
-        Diagnostic("error", "a", "F_x looks wrong", "sign of F_x"), Diagnostic("warning", "a", "F_y is off", "loop of F_y"),
+        Diagnostic("error", "a", "F_x looks wrong", "sign of F_x"),
+        Diagnostic("warning", "a", "F_y is off", "loop of F_y"),
         Diagnostic("error", "b", "F_x looks wrong too", "sign of F_x"),
     ])  # fmt: skip
     assert [f.code for f in found] == ["sign of F_x", "loop of F_y"]
@@ -312,11 +367,14 @@ def test_findings_of_a_kind_are_said_once_and_refused_unless_they_are_meant() ->
     with pytest.raises(ValueError, match=r'if it is so, say acknowledged = \["sign of F_x"\]'):
         accepted(found, [])
     with pytest.raises(
-        ValueError, match=r"called 'nonsense', so leave it out; what was found is sign of F_x, loop of F_y$"
+        ValueError,
+        match=r"called 'nonsense', so leave it out; what was found is sign of F_x, loop of F_y$",
     ):
         accepted(found, ["sign of F_x", "nonsense"])
     with pytest.raises(
-        ValueError, match=r"^acknowledged: nothing was found that is called 'nonsense', .* nothing looks wrong$"
+        ValueError,
+        match=r"^acknowledged: nothing was found that is called 'nonsense', .* nothing looks "
+        r"wrong$",
     ):
         accepted([], ["nonsense"])
     first, second = accepted(found, ["sign of F_x"])

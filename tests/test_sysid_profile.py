@@ -26,21 +26,28 @@ def test_of_a_linear_problem_the_profile_is_the_parabola_of_the_covariance() -> 
     for i, one in enumerate(profiles(o)):
         z = np.log(one.values) / sd[i]
         np.testing.assert_allclose(one.rises, z**2, atol=1e-6)
-        np.testing.assert_allclose(one.ci95, np.exp([-(RISE**0.5) * sd[i], RISE**0.5 * sd[i]]), rtol=1e-6)
+        np.testing.assert_allclose(
+            one.ci95, np.exp([-(RISE**0.5) * sd[i], RISE**0.5 * sd[i]]), rtol=1e-6
+        )
         np.testing.assert_allclose(one.wald95, one.ci95, rtol=1e-6)
         assert one.values == sorted(one.values)
         assert not one.notices
 
 
 def test_variance_of_residuals_above_the_stated_one_widens_the_profile() -> None:
-    (wide,) = profiles(optimum(ClosedForm(lambda x: STRAIGHT @ x, 3), 0, 0, 0, variance=4.0), ["p1"])
+    (wide,) = profiles(
+        optimum(ClosedForm(lambda x: STRAIGHT @ x, 3), 0, 0, 0, variance=4.0), ["p1"]
+    )
     (usual,) = profiles(optimum(ClosedForm(lambda x: STRAIGHT @ x, 3), 0, 0, 0), ["p1"])
     np.testing.assert_allclose(np.log(wide.ci95), 2 * np.log(usual.ci95), rtol=1e-6)  # type: ignore[arg-type]
 
 
 def test_a_curved_profile_has_the_exact_ends_and_says_that_the_covariance_has_others() -> None:
-    """(e^x - 1) / 0.3 is one residual, and p1 follows x^2: the others bend, the profile of p0 is known."""
-    o = optimum(ClosedForm(lambda x: [(np.exp(x[0]) - 1) / 0.3, 5 * (x[1] - x[0] ** 2)], 2), 0, 0, workers=2)
+    """(e^x - 1) / 0.3 is one residual, and p1 follows x^2: the others bend, the profile of p0 is
+    known."""
+    o = optimum(
+        ClosedForm(lambda x: [(np.exp(x[0]) - 1) / 0.3, 5 * (x[1] - x[0] ** 2)], 2), 0, 0, workers=2
+    )
     one, _ = profiles(o)
     assert one.ci95 == pytest.approx((1 - 0.3 * RISE**0.5, 1 + 0.3 * RISE**0.5), rel=2e-3)
     np.testing.assert_allclose(one.others["p1"], np.exp(np.log(one.values) ** 2), rtol=2e-2)
@@ -53,7 +60,10 @@ def test_an_end_that_is_not_there_is_open_and_says_why() -> None:
     (one,) = profiles(optimum(saturating, 0))
     assert one.ci95 == (None, None)
     assert one.values[-1] == pytest.approx(100)
-    assert any("no upper bound of its 95 % interval within 100: p0 may not be larger" in n for n in one.notices)
+    assert any(
+        "no upper bound of its 95 % interval within 100: p0 may not be larger" in n
+        for n in one.notices
+    )
     (cut,) = profiles(optimum(ClosedForm(lambda x: [x[0]], 1, fails=lambda x: bool(x[0] > 1.2)), 0))
     assert cut.ci95[1] is None
     assert cut.ci95[0] == pytest.approx(np.exp(-(RISE**0.5)), rel=1e-6)
@@ -73,7 +83,8 @@ def test_a_profile_of_what_is_not_free_is_refused() -> None:
 
 
 def seen(*rows: list[float]) -> list[Combination]:
-    """Combinations in the covariance of three parameters of which only some directions are seen, each to 1 %."""
+    """Combinations in the covariance of three parameters of which only some directions are seen,
+    each to 1 %."""
     J = np.array([*[[100 * v for v in row] for row in rows], *np.eye(3).tolist()])
     return combinations(["E", "K", "R"], np.linalg.inv(J.T @ J), 0.3)
 
@@ -91,14 +102,20 @@ def test_a_combination_names_what_is_seen_in_place_of_its_parameters() -> None:
 
 
 def test_profile_and_combination_of_stiffnesses_in_series(tmp_path: Path) -> None:
-    """Pads and contacts share the load: a motion that hardly slips sees their stiffness in series."""
+    """Pads and contacts share the load: a motion that hardly slips sees their stiffness in
+    series."""
     base = Parameters().override(COARSE)
     roll = Excitation(motion=Roll(travel=4e-3), duration=0.25, grasp_time=0.1, settle=0.0)
-    sensors = {name: sensor.model_copy(update={"noise": 3 * sensor.noise}) for name, sensor in RIG.items()}
+    sensors = {
+        name: sensor.model_copy(update={"noise": 3 * sensor.noise}) for name, sensor in RIG.items()
+    }
     data = record("roll", roll, base, base, sensors, seed=1)
     problem = Problem([data], sensors, {"pad.E": Unknown(), "contact.K_n": Unknown()})
     result = identify(
-        problem, rtol=1e-4, plan=[Stage("all", ("roll",), problem.coordinates.labels, 1e-4)], tightenings=0
+        problem,
+        rtol=1e-4,
+        plan=[Stage("all", ("roll",), problem.coordinates.labels, 1e-4)],
+        tightenings=0,
     )
     o = Optimum.of(problem, result)
     np.testing.assert_allclose(o.x, result.x)
@@ -107,11 +124,15 @@ def test_profile_and_combination_of_stiffnesses_in_series(tmp_path: Path) -> Non
     assert low is not None
     assert high is not None
     assert low < 0.75e6 < high
-    assert high - E.best > 1.3 * (E.best - low)  # soft contacts need stiffer pads than stiff contacts need soft ones
+    assert high - E.best > 1.3 * (
+        E.best - low
+    )  # soft contacts need stiffer pads than stiff contacts need soft ones
     assert any("no parabola" in notice for notice in E.notices)
     K = np.array(E.others["contact.K_n"])
     assert (np.diff(K) < 0).all()
-    straight = laplace(optimum(ClosedForm(lambda x: STRAIGHT @ x, 3), 0, 0, 0), draws=100)  # its k-hat is infinite
+    straight = laplace(
+        optimum(ClosedForm(lambda x: STRAIGHT @ x, 3), 0, 0, 0), draws=100
+    )  # its k-hat is infinite
     answer = replace(result, profiles=[E], posterior=straight.summary)
     answer.save(tmp_path / "answer.json")
     back = load_answer(tmp_path / "answer.json")

@@ -1,4 +1,5 @@
-"""What is wrong with sensors, and where runs begin, as coordinates: derivatives by both routes, priors, saturation, any rig."""
+"""What is wrong with sensors, and where runs begin, as coordinates: derivatives by both routes,
+priors, saturation, any rig."""
 
 from dataclasses import replace
 from typing import Any
@@ -26,7 +27,18 @@ from torchsoft import (
     simulate,
 )
 from torchsoft.excitation import Excitation, Strokes
-from torchsoft.sysid import AtRest, Known, Prior, Problem, Recording, Sensor, Stage, Unknown, identify, record
+from torchsoft.sysid import (
+    AtRest,
+    Known,
+    Prior,
+    Problem,
+    Recording,
+    Sensor,
+    Stage,
+    Unknown,
+    identify,
+    record,
+)
 from torchsoft.sysid.prediction import Readout
 from torchsoft.sysid.residual_tests import CLEAR, parts, predicted
 from torchsoft.sysid.runs import Runner
@@ -48,7 +60,8 @@ def strokes() -> Recording:
 
 
 def test_every_kind_of_coordinate_has_its_derivative(strokes: Recording) -> None:
-    """Of parameters, a place of the disc, and of everything that a sensor may have; by differences, and by the adjoint."""
+    """Of parameters, a place of the disc, and of everything that a sensor may have; by differences,
+    and by the adjoint."""
     moved = replace(strokes, name="moved", start=AtRest(position_sd=1e-4))
     unknowns = {
         "pad.E": Unknown(prior=Prior(median=8e5, sd=1e5)),
@@ -58,25 +71,32 @@ def test_every_kind_of_coordinate_has_its_derivative(strokes: Recording) -> None
     problem = Problem([strokes, moved], FAULTY, unknowns)
     c, runner = problem.coordinates, Runner(problem.recordings)
     assert c.labels == (
-        "pad.E", "contact.epsilon", "contact.R_n in strokes", "contact.R_n in moved", "start.disc.x in moved", "gain of x_C",
-        "drift of x_C", "misalignment of y_C", "bias of theta in strokes", "bias of theta in moved",
-        "delay of theta in strokes", "delay of theta in moved", "misalignment of F_x", "inertia of F_x",
+        "pad.E", "contact.epsilon", "contact.R_n in strokes", "contact.R_n in moved",
+        "start.disc.x in moved", "gain of x_C", "drift of x_C", "misalignment of y_C",
+        "bias of theta in strokes", "bias of theta in moved", "delay of theta in strokes",
+        "delay of theta in moved", "misalignment of F_x", "inertia of F_x",
     )  # fmt: skip
     low, high = c.bounds
-    x = c.start + 0.05 * np.random.default_rng(0).standard_normal(len(c)) * np.minimum(1, high - low)
+    x = c.start + 0.05 * np.random.default_rng(0).standard_normal(len(c)) * np.minimum(
+        1, high - low
+    )
     _, steps = problem.freeze(runner, x, problem.names, 1e-4, c.free)
     at = problem.residuals(runner, x, problem.names, steps, c.free)
     assert len(at.r) == problem.samples() + 3  # of the priors, the place's own among them
     assert any(one.saturated(strokes.samples[channel][1]).any() for channel, one in FAULTY.items())
     for i, label in enumerate(c.labels):
         h = 1e-5 * np.eye(len(c))[i]
-        ahead, behind = (problem.residuals(runner, x + s * h, problem.names, steps).r for s in (1, -1))
+        ahead, behind = (
+            problem.residuals(runner, x + s * h, problem.names, steps).r for s in (1, -1)
+        )
         slope = (ahead - behind) / 2e-5
         assert np.linalg.norm(at.J[:, i] - slope) < 2e-5 * np.linalg.norm(slope), label
     loss, gradient, lost = problem.misfit(runner, x, problem.names, steps, c.free)
     assert not lost
     assert loss == pytest.approx(0.5 * at.r @ at.r, rel=1e-12)
-    np.testing.assert_allclose(gradient, at.J.T @ at.r, rtol=1e-9, atol=1e-9 * np.abs(gradient).max())
+    np.testing.assert_allclose(
+        gradient, at.J.T @ at.r, rtol=1e-9, atol=1e-9 * np.abs(gradient).max()
+    )
 
 
 def test_a_prior_is_one_more_measurement(strokes: Recording) -> None:
@@ -94,7 +114,9 @@ def test_a_prior_is_one_more_measurement(strokes: Recording) -> None:
         ("x_C", Sensor(noise=1e-3, inertia=0.1), "not the force of an actuator"),
     ],
 )
-def test_what_a_channel_cannot_have_is_refused(strokes: Recording, channel: str, sensor: Sensor, sentence: str) -> None:
+def test_what_a_channel_cannot_have_is_refused(
+    strokes: Recording, channel: str, sensor: Sensor, sentence: str
+) -> None:
     with pytest.raises(ValueError, match=rf"sensors\.{channel}\..*{sentence}"):
         Problem([strokes], {channel: sensor}, {"pad.E": Unknown()})
 
@@ -111,16 +133,28 @@ def test_tables_that_make_no_sense_are_refused() -> None:
 @pytest.fixture(scope="module")
 def jaws() -> Rig:
     """A disc between two driven pads, without controllers."""
-    mesh, names = PadMesh(length=60e-3, height=4.59e-3, elements_x=30, elements_y=2), ("lower", "upper")
+    mesh, names = (
+        PadMesh(length=60e-3, height=4.59e-3, elements_x=30, elements_y=2),
+        ("lower", "upper"),
+    )
     rubber = KelvinVoigt(E=0.75e6, nu=0.45, rho=1100.0, tau=10e-3, depth=44e-3)
-    law = SoftContact(K_n=1.2e5, R_n=440.0, K_t=1.2e5, R_t=440.0, friction=SmoothSlip(0.8, 0.7, v_s=0.05, eta=10.0))
+    law = SoftContact(
+        K_n=1.2e5,
+        R_n=440.0,
+        K_t=1.2e5,
+        R_t=440.0,
+        friction=SmoothSlip(0.8, 0.7, v_s=0.05, eta=10.0),
+    )
     driven: dict[str, Any] = {"x": "driven", "y": "driven", "theta": "driven"}
     motion = {f"{jaw}.{axis}": Profile([0.0], [0.0]) for jaw in names for axis in driven}
     motion["upper.y"] = Profile([0.0, 0.06], [47.92e-3, 46.92e-3])
     motion["upper.x"] = Profile([0.06, 0.2], [0.0, 8e-3])
     return Rig(
         bodies={"disc": Body(0.4065, Circle(19.37e-3)), **{jaw: Body(**driven) for jaw in names}},
-        pads={jaw: Pad(mesh, rubber, base=jaw, origin=(-30e-3, 0.0), mirrored=jaw == "upper") for jaw in names},
+        pads={
+            jaw: Pad(mesh, rubber, base=jaw, origin=(-30e-3, 0.0), mirrored=jaw == "upper")
+            for jaw in names
+        },
         contacts={jaw: Contact(jaw, "disc", law) for jaw in names},
         reference=Reference(**motion),
         groups={"rubber": rubber, "contact": law},
@@ -129,32 +163,46 @@ def jaws() -> Rig:
 
 def test_another_rig_is_identified_by_its_own_names(jaws: Rig) -> None:
     y0 = torch.zeros(jaws.layout.size, dtype=torch.float64)
-    y0[jaws.layout.slices["pose", "disc"]] = torch.tensor([3e-4, 23.94e-3, 0.0], dtype=torch.float64)
+    y0[jaws.layout.slices["pose", "disc"]] = torch.tensor(
+        [3e-4, 23.94e-3, 0.0], dtype=torch.float64
+    )
     t = np.linspace(0.0, 0.2, 81)
     run, rng = simulate(jaws, torch.from_numpy(t), y0=y0, rtol=1e-6), np.random.default_rng(1)
-    sensors = {"x_disc": Sensor(noise=1e-5), "theta_disc": Sensor(noise=5e-4), "y_disc": Sensor(noise=1e-5)}
-    samples = {k: (t, run[k].numpy() + s.noise * rng.standard_normal(len(t))) for k, s in sensors.items()}
+    sensors = {
+        "x_disc": Sensor(noise=1e-5),
+        "theta_disc": Sensor(noise=5e-4),
+        "y_disc": Sensor(noise=1e-5),
+    }
+    samples = {
+        k: (t, run[k].numpy() + s.noise * rng.standard_normal(len(t))) for k, s in sensors.items()
+    }
     data = Recording("jaws", jaws, samples, Known(y0))
     unknowns = {"rubber.E": Unknown(nominal=0.9e6), "contact.K_n": Unknown(nominal=0.9e5)}
-    answer = identify(Problem([data], sensors, unknowns), plan=[Stage("all", ("jaws",), tuple(unknowns), 1e-5)])
+    answer = identify(
+        Problem([data], sensors, unknowns), plan=[Stage("all", ("jaws",), tuple(unknowns), 1e-5)]
+    )
     assert answer.converged
     for name, truth in (("rubber.E", 0.75e6), ("contact.K_n", 1.2e5)):
         low, high = answer[name].ci95 or (0.0, 0.0)
         assert low < truth < high, name
-    with pytest.raises(ValueError, match="`x_C` is not a channel of the rig of `jaws`; known: x_disc, y_disc"):
+    with pytest.raises(
+        ValueError, match="`x_C` is not a channel of the rig of `jaws`; known: x_disc, y_disc"
+    ):
         replace(data, samples={"x_C": samples["x_disc"]})
     with pytest.raises(ValueError, match="only the paper's rig has a rest of its own"):
         Problem([replace(data, start=AtRest())], sensors, unknowns)
 
 
 def test_saturated_samples_have_tobins_likelihood() -> None:
-    """An amplitude, of which a sensor cuts a third off: its likelihood is that of the normal distribution function, and with
-    many seeds errors are standard normal."""
+    """An amplitude, of which a sensor cuts a third off: its likelihood is that of the normal
+    distribution function, and with many seeds errors are standard normal."""
     t, limit, noise = np.arange(200) * 5e-3, 0.9, 0.1
     shape, z = np.sin(4 * np.pi * t), []
     one = Readout("F_x", noise, -limit, limit, 1.0, 0.0, 0.0, 0.0, 0.0, ())
     for seed in range(200):
-        y = np.clip(shape + noise * np.random.default_rng(seed).standard_normal(len(t)), -limit, limit)
+        y = np.clip(
+            shape + noise * np.random.default_rng(seed).standard_normal(len(t)), -limit, limit
+        )
         fit = least_squares(
             lambda a, y=y: one.residuals(a * shape, y)[0], [1.0],
             jac=lambda a, y=y: (one.residuals(a * shape, y)[1] * shape)[:, None],
@@ -163,10 +211,13 @@ def test_saturated_samples_have_tobins_likelihood() -> None:
         if seed < 3:
             expected = 1.02 * shape
             mine = np.where(
-                np.abs(y) < limit, stats.norm.logpdf((y - expected) / noise) + 0.5 * np.log(2 * np.pi),
+                np.abs(y) < limit,
+                stats.norm.logpdf((y - expected) / noise) + 0.5 * np.log(2 * np.pi),
                 stats.norm.logsf((limit - np.sign(y) * expected) / noise),
             )  # fmt: skip
-            np.testing.assert_allclose(-0.5 * one.residuals(expected, y)[0] ** 2, mine, rtol=1e-9, atol=1e-12)
+            np.testing.assert_allclose(
+                -0.5 * one.residuals(expected, y)[0] ** 2, mine, rtol=1e-9, atol=1e-12
+            )
     assert abs(np.mean(z)) < 3 / len(z) ** 0.5
     assert stats.kstest(z, "norm").pvalue > 0.01
     far, slope = one.residuals(np.array([50.0, -50.0]), np.array([limit, -limit]))
@@ -176,13 +227,16 @@ def test_saturated_samples_have_tobins_likelihood() -> None:
 
 def test_saturated_samples_cannot_have_coloured_noise(strokes: Recording) -> None:
     sensors = {"F_x": Sensor(noise=0.1, high=float(strokes.samples["F_x"][1].max()), colour="ar")}
-    with pytest.raises(ValueError, match=r"sensors\.F_x: in `strokes` samples are at its `low` or `high`"):
+    with pytest.raises(
+        ValueError, match=r"sensors\.F_x: in `strokes` samples are at its `low` or `high`"
+    ):
         Problem([strokes], sensors, {"pad.E": Unknown()})
 
 
 def test_what_saturation_has_changed_is_not_judged(strokes: Recording) -> None:
-    """Noise as stated and a sensor that is saturated most of the time: residuals near its range's end are not normal, those
-    well inside are; and one far from the prediction counts wherever it is."""
+    """Noise as stated and a sensor that is saturated most of the time: residuals near its range's
+    end are not normal, those well inside are; and one far from the prediction counts wherever it
+    is."""
     t, y = strokes.samples["F_x"]
     limit = float(np.quantile(np.abs(y), 0.4))
     noise = limit / 20

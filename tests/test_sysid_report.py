@@ -1,4 +1,5 @@
-"""The report: one page that stands alone, holds the whole result, and no number that the data do not determine."""
+"""The report: one page that stands alone, holds the whole result, and no number that the data do
+not determine."""
 
 import base64
 import json
@@ -61,24 +62,36 @@ NOISE = Autoregression((0.8,), 0.7, 5e-3)
 
 @pytest.fixture(scope="module")
 def found() -> Found:
-    """Two grasps, from which the viscosity of slip is not identifiable, and another one held out."""
+    """Two grasps, from which the viscosity of slip is not identifiable, and another one held
+    out."""
     p = Parameters().override(COARSE)
     truth = p.override({"contact.K_n": 1.6e5, "pad.E": 0.9e6})
-    sensors = {"theta": Sensor(noise=5e-4), "y_Br": Sensor(noise=1e-5, bias=1e-3), "F_y": Sensor(noise=0.1)}
-    grasp = Excitation(motion=Strokes(), duration=0.25, depth=1.2e-3, senses="bracket", grasp_time=0.15)
+    sensors = {
+        "theta": Sensor(noise=5e-4),
+        "y_Br": Sensor(noise=1e-5, bias=1e-3),
+        "F_y": Sensor(noise=0.1),
+    }
+    grasp = Excitation(
+        motion=Strokes(), duration=0.25, depth=1.2e-3, senses="bracket", grasp_time=0.15
+    )
     depths = {HOSTILE: 1.2e-3, "shallow": 0.9e-3, "held": 1e-3}
     recordings = [
-        record(name, grasp.model_copy(update={"depth": depth}), truth, p, sensors, rtol=1e-3, seed=seed)
+        record(
+            name, grasp.model_copy(update={"depth": depth}), truth, p, sensors, rtol=1e-3, seed=seed
+        )
         for seed, (name, depth) in enumerate(depths.items())
     ]
     recordings[1] = replace(recordings[1], start=AtRest(position_sd=2e-5))
     unknowns = {
-        "contact.K_n": Unknown(), "pad.E": Unknown(prior=Prior(median=1e6, sd=0.5, kind="log-normal")),
+        "contact.K_n": Unknown(),
+        "pad.E": Unknown(prior=Prior(median=1e6, sd=0.5, kind="log-normal")),
         "contact.eta": Unknown(), "contact.R_n": Unknown(per="recording"),
     }  # fmt: skip
     problem = Problem(recordings, sensors, unknowns)
     plan = [Stage("all", (HOSTILE, "shallow"), problem.coordinates.labels, 1e-3, evaluations=4)]
-    return identify(problem, plan=plan, tightenings=0, heldout=["held"], assumptions="trusted"), problem
+    return identify(
+        problem, plan=plan, tightenings=0, heldout=["held"], assumptions="trusted"
+    ), problem
 
 
 def test_the_first_line_says_when_the_model_does_not_explain_the_data(found: Found) -> None:
@@ -86,7 +99,9 @@ def test_the_first_line_says_when_the_model_does_not_explain_the_data(found: Fou
     answer, problem = found
     assert answer.chi2_stated == pytest.approx(answer.chi2, rel=0.05)
     assert answer.headline.startswith("4 of 6 parameters identifiable, ")
-    residuals = [replace(one, stated=29.0 if one.channel == "F_y" else 1.0) for one in answer.residuals]
+    residuals = [
+        replace(one, stated=29.0 if one.channel == "F_y" else 1.0) for one in answer.residuals
+    ]
     bad = replace(answer, residuals=residuals, chi2_stated=200.0)
     first = "The model does not explain the data: residuals of F_y are 29 times the stated noise"
     assert bad.table().startswith(first)
@@ -107,26 +122,31 @@ def full(found: Found) -> IdentificationResult:
     answer, _ = found
     E = answer["pad.E"].last
     harmless = AssumptionTest(
-        "a", "known", "<b> is so", "it were not", 2.0, "%", moves={"pad.E": 0.1}, gain=0.5, favoured=0.3, favoured_sd=1.2,
-        value=1.0,
+        "a", "known", "<b> is so", "it were not", 2.0, "%", moves={"pad.E": 0.1}, gain=0.5,
+        favoured=0.3, favoured_sd=1.2, value=1.0,
     )  # fmt: skip
     checks = [
         harmless,
         replace(
-            harmless, name="b", stated="the disc weighs 1 kg", moves={"pad.E": -4.2}, gain=99.0, favoured=-3.1, suspected=True
+            harmless, name="b", stated="the disc weighs 1 kg", moves={"pad.E": -4.2}, gain=99.0,
+            favoured=-3.1, suspected=True
         ),
-        replace(harmless, name="c", kind="law", stated="slip is smooth", moves={}, unchecked="a run failed"),
+        replace(harmless, name="c", kind="law", stated="slip is smooth", moves={},
+        unchecked="a run failed"),
     ]  # fmt: skip
     values = [E * (1 + 0.02 * k) for k in range(-4, 5)]
     profile = Profile(
-        "pad.E", E, values, [0.5 * k * k for k in range(-4, 5)], {}, (0.94 * E, None), (0.95 * E, E / 0.95), 1.0, ["<open> end"]
+        "pad.E", E, values, [0.5 * k * k for k in range(-4, 5)], {}, (0.94 * E, None),
+        (0.95 * E, E / 0.95), 1.0, ["<open> end"]
     )  # fmt: skip
     compared: Comparison = replace(
         example(Comparison), outcome="cannot tell", verdict="the data <cannot> tell", series=[]
     )
     return replace(
-        answer, assumptions=checks, profiles=[profile], noise=[ChannelNoise("F_y", NOISE, [])], comparison=compared,
-        combinations=[Combination({"pad.E": 1.0, "contact.K_n": -0.5}, {"pad.E": 0.3, "contact.K_n": 0.4}, 0.02)],
+        answer, assumptions=checks, profiles=[profile], noise=[ChannelNoise("F_y", NOISE, [])],
+        comparison=compared,
+        combinations=[Combination({"pad.E": 1.0, "contact.K_n": -0.5},
+        {"pad.E": 0.3, "contact.K_n": 0.4}, 0.02)],
         command="torchsoft identify '<a>.csv' rig.toml --out out",
     )  # fmt: skip
 
@@ -160,13 +180,17 @@ def written(answer: IdentificationResult, problem: Problem, folder: Path) -> Pag
 
 
 @pytest.fixture(scope="module")
-def page(full: IdentificationResult, found: Found, tmp_path_factory: pytest.TempPathFactory) -> Page:
+def page(
+    full: IdentificationResult, found: Found, tmp_path_factory: pytest.TempPathFactory
+) -> Page:
     return written(full, found[1], tmp_path_factory.mktemp("report") / "new")
 
 
 def test_the_page_stands_alone(page: Page) -> None:
     assert page.open == []
-    assert {"script", "link", "iframe", "object", "b", "a", "cannot", "open"}.isdisjoint(tag for tag, _ in page.tags)
+    assert {"script", "link", "iframe", "object", "b", "a", "cannot", "open"}.isdisjoint(
+        tag for tag, _ in page.tags
+    )
     pictures = [attributes for tag, attributes in page.tags if tag == "img"]
     assert len(pictures) == 5 + 3 * 3
     for attributes in pictures:
@@ -179,9 +203,14 @@ def test_the_page_stands_alone(page: Page) -> None:
         assert 600 < width < 1200
         assert 200 < height < 1600
         assert len(alt) > 20
-    addresses = [v for _, attributes in page.tags for k, v in attributes.items() if k in ("src", "href")]
+    addresses = [
+        v for _, attributes in page.tags for k, v in attributes.items() if k in ("src", "href")
+    ]
     assert len(addresses) == len(pictures)
-    assert ("meta", {"name": "viewport", "content": "width=device-width,initial-scale=1"}) in page.tags
+    assert (
+        "meta",
+        {"name": "viewport", "content": "width=device-width,initial-scale=1"},
+    ) in page.tags
 
 
 def test_the_page_holds_what_the_answer_holds(page: Page, full: IdentificationResult) -> None:
@@ -189,11 +218,16 @@ def test_the_page_holds_what_the_answer_holds(page: Page, full: IdentificationRe
     known = [e for e in full.estimates if e.identifiable]
     assert {e.name for e in known} >= {"pad.E", "start.disc.x", "bias of y_Br"}
     assert not full["contact.eta"].identifiable
-    assert f"{sum(e.identifiable for e in parameters)} of {len(parameters)} parameters identifiable" in page.text
+    assert (
+        f"{sum(e.identifiable for e in parameters)} of {len(parameters)} parameters identifiable"
+        in page.text
+    )
     for e in known:
         for value in (e.value, *(e.ci95 or ())):
             assert value is not None
-            assert f"{float(f'{value:.5g}'):.12g}" in page.text.replace("\u202f", "").replace("−", "-")
+            assert f"{float(f'{value:.5g}'):.12g}" in page.text.replace("\u202f", "").replace(
+                "−", "-"
+            )
     assert "\ncontact.eta\nnot identifiable\nnone\nN.s/m\n10\n" in page.text
     for channels in full.heldout.values():
         for value in channels.values():
@@ -216,9 +250,11 @@ def test_warnings_come_first_and_all_of_them(page: Page, full: IdentificationRes
 
 def test_starts_and_sensors_are_apart_from_parameters(page: Page) -> None:
     order = [
-        "\nEstimates\n", "\npad.E\n", "\ncontact.eta\n", "\nParameters of which each recording has its own\n",
+        "\nEstimates\n", "\npad.E\n", "\ncontact.eta\n", "\nParameters of which each recording has "
+                                                         "its own\n",
         f"\ncontact.R_n\n{HOSTILE}\n", "\ncontact.R_n\nshallow\n", "\nWhere the runs began\n",
-        "\nstart.disc.x\nshallow\n", "\nWhat the sensors add\n", "\nbias of y_Br\n", "\nContribution of each recording\n",
+        "\nstart.disc.x\nshallow\n", "\nWhat the sensors add\n", "\nbias of y_Br\n",
+        "\nContribution of each recording\n",
     ]  # fmt: skip
     places = [page.text.index(text) for text in order]
     assert sorted(places) == places
@@ -231,10 +267,16 @@ def test_what_recordings_told_is_in_the_table(page: Page, full: IdentificationRe
         cells = []
         for one in full.contributions:
             factor = one.without[label]
-            cells.append(f"{100 * one.shares[label]:.0f} % ({'only here' if factor is None else f'× {factor:.2f}'})")
+            cells.append(
+                f"{100 * one.shares[label]:.0f} % "
+                f"({'only here' if factor is None else f'× {factor:.2f}'})"
+            )
         assert "\n".join((label, *cells)) in page.text
     assert full.contributions[1].without["contact.R_n in shallow"] is None
-    assert "the data see pad.E / contact.K_n^0.5 to 2 %, not each (pad.E 30 %, contact.K_n 40 %)\n" in page.text
+    assert (
+        "the data see pad.E / contact.K_n^0.5 to 2 %, not each (pad.E 30 %, contact.K_n 40 %)\n"
+        in page.text
+    )
     weak = [direction_name(d) for d in full.directions if not d.identifiable]
     assert "contact.eta" in weak
     for name in weak:
@@ -243,12 +285,12 @@ def test_what_recordings_told_is_in_the_table(page: Page, full: IdentificationRe
 
 def test_assumptions_that_matter_stand_open_and_others_are_folded(page: Page) -> None:
     folded = page.text.index("\n1 that move nothing by more than 0.5 standard deviations\n")
-    said = (
-        "\nthe disc weighs 1 kg\nit were not\n−4.2 sd of pad.E\nyes −3.1 ± 1.2 %: the sum of squares would fall by 99\n"
-    )
+    said = "\nthe disc weighs 1 kg\nit were not\n−4.2 sd of pad.E\nyes −3.1 ± 1.2 %: the sum of squares would fall by 99\n"
     assert page.text.index(said) < folded
     assert page.text.index("\nslip is smooth\nit were not\nnot checked: a run failed\n") < folded
-    assert page.text.index("\n<b> is so\nit were not\n+0.1 sd of pad.E\nno: +0.3 ± 1.2 %\n") > folded
+    assert (
+        page.text.index("\n<b> is so\nit were not\n+0.1 sd of pad.E\nno: +0.3 ± 1.2 %\n") > folded
+    )
     assert ("details", {}) in page.tags
 
 
@@ -257,14 +299,20 @@ def test_predictions_are_the_models(found: Found) -> None:
     drawn, lost = traces(answer, problem, None)
     assert not lost
     assert len(drawn) == 3 * 3
-    own = problem.residuals(Runner(problem.recordings), np.array(answer.x), problem.names, answer.made_by["rtol"]).r
-    np.testing.assert_array_equal(np.concatenate([one.residual for one in drawn]), own[: problem.samples()])
+    own = problem.residuals(
+        Runner(problem.recordings), np.array(answer.x), problem.names, answer.made_by["rtol"]
+    ).r
+    np.testing.assert_array_equal(
+        np.concatenate([one.residual for one in drawn]), own[: problem.samples()]
+    )
     rms = {(one.recording, one.channel): float(np.sqrt(np.mean(one.residual**2))) for one in drawn}
     for channel in answer.residuals:
         assert rms[channel.recording, channel.channel] == pytest.approx(channel.rms, rel=1e-6)
     for trace in drawn:
         noise = problem.sensors[trace.channel].noise
-        np.testing.assert_allclose(trace.predicted - trace.measured, noise * trace.residual, atol=1e-12)
+        np.testing.assert_allclose(
+            trace.predicted - trace.measured, noise * trace.residual, atol=1e-12
+        )
         np.testing.assert_array_equal(trace.white, trace.residual)
         held = answer.heldout.get(trace.recording)
         if held is not None:
@@ -272,7 +320,9 @@ def test_predictions_are_the_models(found: Found) -> None:
             assert nrmse == pytest.approx(held[trace.channel], rel=1e-6)
 
 
-def test_coloured_residuals_are_whitened_by_the_noise_of_the_result(full: IdentificationResult, found: Found) -> None:
+def test_coloured_residuals_are_whitened_by_the_noise_of_the_result(
+    full: IdentificationResult, found: Found
+) -> None:
     drawn, _ = traces(full, found[1], None)
     for one in drawn:
         if one.channel == "F_y":
@@ -287,7 +337,13 @@ def test_starts_are_the_settings_values(found: Found) -> None:
     answer, problem = found
     known = paper_settings(problem.recordings[0]).table()
     for e in answer.estimates:
-        value = known[e.name]["value"] if e.kind == "parameter" else 60.0e-3 if e.kind == "start" else 0.0
+        value = (
+            known[e.name]["value"]
+            if e.kind == "parameter"
+            else 60.0e-3
+            if e.kind == "start"
+            else 0.0
+        )
         assert e.start == pytest.approx(value, abs=1e-3 if e.kind == "start" else 0.0)
 
 
@@ -305,7 +361,11 @@ def undrawn(figure: Figure, alt: str, caption: str = "", kind: str = "") -> str:
 
 
 def test_a_loaded_answer_makes_the_same_page(
-    full: IdentificationResult, found: Found, page: Page, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    full: IdentificationResult,
+    found: Found,
+    page: Page,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(sections, "picture", undrawn)
     full.save(tmp_path / "answer.json")
@@ -322,11 +382,16 @@ def test_a_lost_recording_is_named_and_a_clean_answer_has_no_warnings(
     run = Runner.run
 
     def losing(self: Runner, jobs: Any) -> list[Any]:
-        return [FailedRun("it < went", 0.1) if job.recording == 2 else one for job, one in zip(jobs, run(self, jobs))]
+        return [
+            FailedRun("it < went", 0.1) if job.recording == 2 else one
+            for job, one in zip(jobs, run(self, jobs))
+        ]
 
     monkeypatch.setattr(Runner, "run", losing)
     monkeypatch.setattr(sections, "picture", undrawn)
-    page = written(replace(answer, notices=[], contributions=answer.contributions[:1]), problem, tmp_path)
+    page = written(
+        replace(answer, notices=[], contributions=answer.contributions[:1]), problem, tmp_path
+    )
     alts = " ".join(str(attributes.get("alt")) for _, attributes in page.tags)
     assert "Could not be simulated: it < went" in page.text
     assert f"theta of {HOSTILE}" in alts
@@ -337,7 +402,9 @@ def test_a_lost_recording_is_named_and_a_clean_answer_has_no_warnings(
 
 
 def test_tables_leave_out_what_is_empty_and_escape_the_rest() -> None:
-    page = Page(table(["<h>", "none", "n"], [["1&b", "", "−1.5"], [("weak", "<i>"), "", "open … 3"]], "<c>"))
+    page = Page(
+        table(["<h>", "none", "n"], [["1&b", "", "−1.5"], [("weak", "<i>"), "", "open … 3"]], "<c>")
+    )
     assert page.text.split("\n")[:-1] == ["<c>", "<h>", "n", "1&b", "−1.5", "<i>", "open … 3"]
     cells = [attributes for tag, attributes in page.tags if tag == "td"]
     assert [one["class"] for one in cells] == ["", "n", "weak", "n"]
@@ -346,7 +413,13 @@ def test_tables_leave_out_what_is_empty_and_escape_the_rest() -> None:
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(159090.4, "159\u202f090"), (-12345.6, "−12\u202f346"), (-1.5e-7, "−1.5e-07"), (0.0, "0"), (12.3456789, "12.346")],
+    [
+        (159090.4, "159\u202f090"),
+        (-12345.6, "−12\u202f346"),
+        (-1.5e-7, "−1.5e-07"),
+        (0.0, "0"),
+        (12.3456789, "12.346"),
+    ],
 )
 def test_numbers_have_five_digits(value: float, text: str) -> None:
     assert grouped(value) == text
@@ -354,7 +427,10 @@ def test_numbers_have_five_digits(value: float, text: str) -> None:
 
 def test_directions_are_named_by_their_largest_parts() -> None:
     parts = {"pad.E": -0.8, "contact.K_n": 0.5, "pad.tau": -0.25, "contact.mu_s": 0.21}
-    assert direction_name(Direction(0.1, True, parts)) == "0.80 pad.E − 0.50 contact.K_n + 0.25 pad.tau …"
+    assert (
+        direction_name(Direction(0.1, True, parts))
+        == "0.80 pad.E − 0.50 contact.K_n + 0.25 pad.tau …"
+    )
     assert direction_name(Direction(0.1, True, {"pad.E": -0.9999})) == "pad.E"
 
 
@@ -377,7 +453,11 @@ def texts(figure: Figure) -> list[tuple[str, Any]]:
     for axes in figure.axes:
         for axis in (axes.xaxis, axes.yaxis):  # ticks that are there but not drawn
             low, high = sorted(axis.get_view_interval())
-            beyond |= {id(tick.label1) for tick in axis.get_major_ticks() if not low <= tick.get_loc() <= high}
+            beyond |= {
+                id(tick.label1)
+                for tick in axis.get_major_ticks()
+                if not low <= tick.get_loc() <= high
+            }
             beyond |= {id(tick.label1) for tick in axis.get_minor_ticks()}
     out = []
     for text in figure.findobj(Text):
@@ -393,13 +473,19 @@ FIGURES: dict[str, Callable[[IdentificationResult, Problem], Figure | None]] = {
     "correlation": lambda answer, _: correlation_figure(answer),
     "spectrum": lambda answer, _: spectrum_figure(answer),
     "profile": lambda answer, _: profile_figure(answer.profiles[0], "Pa"),
-    "trace": lambda answer, problem: trace_figure(traces(answer, problem, None)[0][0], answer.residuals[0]),
-    "coloured": lambda answer, problem: trace_figure(traces(answer, problem, None)[0][2], answer.residuals[2], NOISE),
+    "trace": lambda answer, problem: trace_figure(
+        traces(answer, problem, None)[0][0], answer.residuals[0]
+    ),
+    "coloured": lambda answer, problem: trace_figure(
+        traces(answer, problem, None)[0][2], answer.residuals[2], NOISE
+    ),
 }
 
 
 @pytest.mark.parametrize("which", FIGURES)
-def test_no_text_of_a_picture_is_cut_or_overlaps(full: IdentificationResult, found: Found, which: str) -> None:
+def test_no_text_of_a_picture_is_cut_or_overlaps(
+    full: IdentificationResult, found: Found, which: str
+) -> None:
     figure = FIGURES[which](full, found[1])
     assert figure is not None
     drawn, (width, height) = texts(figure), figure.canvas.get_width_height()
@@ -410,7 +496,12 @@ def test_no_text_of_a_picture_is_cut_or_overlaps(full: IdentificationResult, fou
         assert box.x1 < width + 1, text
         assert box.y1 < height + 1, text
         for other, its in drawn[:i]:
-            apart = box.x1 <= its.x0 + 1 or its.x1 <= box.x0 + 1 or box.y1 <= its.y0 + 1 or its.y1 <= box.y0 + 1
+            apart = (
+                box.x1 <= its.x0 + 1
+                or its.x1 <= box.x0 + 1
+                or box.y1 <= its.y0 + 1
+                or its.y1 <= box.y0 + 1
+            )
             assert apart, f"{text!r} lies over {other!r}"
 
 

@@ -1,5 +1,5 @@
-"""Recordings that begin in motion: where they begin, by their first samples; derivatives; and parameters found all the
-same."""
+"""Recordings that begin in motion: where they begin, by their first samples; derivatives; and
+parameters found all the same."""
 
 from collections.abc import Mapping
 from copy import deepcopy
@@ -35,7 +35,9 @@ from torchsoft.sysid.first_samples import WIDER, beginning, estimate_initial_sta
 from torchsoft.sysid.initial_state import AtRest, MovingStart, Stretch
 from torchsoft.sysid.runs import Runner
 
-MOTION = Excitation(motion=Strokes(travel=12e-3, stroke_time=0.3), duration=0.86, grasp_time=0.2, settle=0.05)
+MOTION = Excitation(
+    motion=Strokes(travel=12e-3, stroke_time=0.3), duration=0.86, grasp_time=0.2, settle=0.05
+)
 COARSE = {"pad.elements_x": 60, "pad.elements_y": 2, "contact.v_s": 0.05}
 SINCE = 0.4
 """When the recording begins [s]: in the middle of the first stroke."""
@@ -55,7 +57,10 @@ def cut() -> Cut:
 
 def noisy(recording: Recording, seed: int = 0) -> Recording:
     rng = np.random.default_rng(seed)
-    samples = {c: (t, y + RIG[c].noise * rng.standard_normal(len(t))) for c, (t, y) in recording.samples.items()}
+    samples = {
+        c: (t, y + RIG[c].noise * rng.standard_normal(len(t)))
+        for c, (t, y) in recording.samples.items()
+    }
     return replace(recording, samples=samples)
 
 
@@ -77,12 +82,18 @@ def underway(recording: Recording) -> MovingStart:
 
 
 def tensors(values: Mapping[str, float]) -> dict[str, Tensor]:
-    return {name: torch.tensor(value, dtype=torch.float64, requires_grad=True) for name, value in values.items()}
+    return {
+        name: torch.tensor(value, dtype=torch.float64, requires_grad=True)
+        for name, value in values.items()
+    }
 
 
 def test_the_first_samples_tell_where_a_run_begins_and_do_not_count(cut: Cut) -> None:
     recording, y0 = cut
-    out, truth = estimate_initial_state(noisy(recording), RIG, lead=0.05), true_bodies(recording, y0)
+    out, truth = (
+        estimate_initial_state(noisy(recording), RIG, lead=0.05),
+        true_bodies(recording, y0),
+    )
     start = underway(out)
     assert start.lead == pytest.approx(0.05)
     assert out.times[0] == pytest.approx(SINCE + 0.05)
@@ -95,7 +106,9 @@ def test_the_first_samples_tell_where_a_run_begins_and_do_not_count(cut: Cut) ->
     for name, s in state.stretch.items():
         basis, known = start.stretch[name].basis(recording.rig.pads[name]), start.stretch[name]
         touching = recording.rig.penetration(name, state).detach() > 0
-        assert basis[touching.numpy()].sum(1) == pytest.approx(1.0)  # every point that touches can be stretched
+        assert basis[touching.numpy()].sum(1) == pytest.approx(
+            1.0
+        )  # every point that touches can be stretched
         assert float(s[touching].abs().max()) < 2 * known.sd
 
 
@@ -125,7 +138,9 @@ def test_what_no_sensor_measures_is_assumed(cut: Cut) -> None:
         assert abs(mean - truth[name]) < 2 * sd, name
     turn, _ = start.bodies["disc.v_theta"]
     assert turn == pytest.approx(truth["disc.v_theta"], rel=0.1)  # rolling
-    given = underway(estimate_initial_state(noisy(recording), few, given={"disc.y": (0.0233, 1e-3)}))
+    given = underway(
+        estimate_initial_state(noisy(recording), few, given={"disc.y": (0.0233, 1e-3)})
+    )
     assert given.bodies["disc.y"] == (0.0233, 1e-3)
     none = {"F_x": RIG["F_x"], "theta": RIG["theta"]}
     with pytest.raises(ValueError, match=r"no sensor tells where `disc\.x` is"):
@@ -134,7 +149,9 @@ def test_what_no_sensor_measures_is_assumed(cut: Cut) -> None:
 
 def test_stretches_last_as_long_as_friction_holds_them() -> None:
     def contact(mu: float) -> Contact:
-        return Contact("L", "disc", SoftContact(1e5, 4e2, 1e5, 4e2, friction=SmoothSlip(mu, mu, 0.05, 1e-3)))
+        return Contact(
+            "L", "disc", SoftContact(1e5, 4e2, 1e5, 4e2, friction=SmoothSlip(mu, mu, 0.05, 1e-3))
+        )
 
     assert lasting_stretch(contact(0.8), 10.0, 0.05) == pytest.approx(0.8 * 10.0 / 1e5, rel=0.1)
     assert lasting_stretch(contact(0.0), 10.0, 0.05) < 1e-6
@@ -149,13 +166,17 @@ def test_derivatives_of_the_state_are_those_of_differences(cut: Cut) -> None:
     means = {c.name: c.mean for c in out.start_coordinates}
     names = ("start.disc.x", "start.bracket.y", "start.disc.v_theta", "start.L.stretch.3")
     values, E = tensors(means), begun.rig.parameter("pad.E")
-    *exact, by_E = torch.autograd.grad(weights @ begun.y0(values), [*(values[name] for name in names), E])
+    *exact, by_E = torch.autograd.grad(
+        weights @ begun.y0(values), [*(values[name] for name in names), E]
+    )
 
     def value(name: str, by: float) -> float:
         return float((weights @ begun.y0(tensors(means | {name: means[name] + by}))).detach())
 
     for name, slope in zip(names, exact):
-        assert float(slope) == pytest.approx((value(name, 1e-8) - value(name, -1e-8)) / 2e-8, rel=1e-4, abs=1e-5), name
+        assert float(slope) == pytest.approx(
+            (value(name, 1e-8) - value(name, -1e-8)) / 2e-8, rel=1e-4, abs=1e-5
+        ), name
     assert float(by_E) != 0.0
     again, before = out.begin(), begun.y0(values)
     assert torch.equal(before, again.y0(tensors(means)))
@@ -168,8 +189,12 @@ def test_residuals_and_gradient_know_the_start(cut: Cut) -> None:
     c, runner = problem.coordinates, Runner(problem.recordings)
     at, steps = problem.freeze(runner, c.start, problem.names, 1e-4, c.free)
     assert len(at.r) == problem.samples() + len(out.start_coordinates)
-    assert at.r[problem.samples() :] == pytest.approx(0.0, abs=1e-12)  # the search begins at the priors' means
-    moved = [c.labels.index(f"start.{name} in roll") for name in ("disc.y", "disc.v_x", "U.stretch.4")]
+    assert at.r[problem.samples() :] == pytest.approx(
+        0.0, abs=1e-12
+    )  # the search begins at the priors' means
+    moved = [
+        c.labels.index(f"start.{name} in roll") for name in ("disc.y", "disc.v_x", "U.stretch.4")
+    ]
     for i in (0, *moved):
         ends = []
         for sign in (1, -1):
@@ -177,7 +202,9 @@ def test_residuals_and_gradient_know_the_start(cut: Cut) -> None:
             x[i] += sign * 1e-5
             ends.append(problem.residuals(runner, x, problem.names, steps).r)
         difference = (ends[0] - ends[1]) / 2e-5
-        assert np.linalg.norm(at.J[:, i] - difference) < 1e-3 * np.linalg.norm(difference), c.labels[i]
+        assert np.linalg.norm(at.J[:, i] - difference) < 1e-3 * np.linalg.norm(difference), (
+            c.labels[i]
+        )
     x = c.start + 1e-3
     at = problem.residuals(runner, x, problem.names, steps, c.free)
     loss, gradient, _ = problem.misfit(runner, x, problem.names, steps, c.free)
@@ -190,26 +217,37 @@ def test_the_start_does_not_depend_on_the_mesh(cut: Cut) -> None:
     out = estimate_initial_state(recording, RIG)
     rig = recording.rig
     assert isinstance(rig, SoftGrasp)
-    finer = SoftGrasp(rig.settings.override({"pad.elements_x": 120, "contact.points": 2}), rig.reference)
+    finer = SoftGrasp(
+        rig.settings.override({"pad.elements_x": 120, "contact.points": 2}), rig.reference
+    )
     other = replace(out, rig=finer)
     assert other.start_coordinates == out.start_coordinates
-    values = {c.name: 1e-5 * k for k, c in enumerate(other.start_coordinates) if "stretch" in c.name}
+    values = {
+        c.name: 1e-5 * k for k, c in enumerate(other.start_coordinates) if "stretch" in c.name
+    }
     coarse, fine = (r.rig.unpack(r.begin().y0(tensors(values)).detach()) for r in (out, other))
     for name, s in coarse.stretch.items():
         at, knots = (one.pads[name].point_positions[:, 0].numpy() for one in (finer, rig))
-        assert fine.stretch[name].numpy() == pytest.approx(np.interp(at, knots, s.numpy()), abs=1e-15)
+        assert fine.stretch[name].numpy() == pytest.approx(
+            np.interp(at, knots, s.numpy()), abs=1e-15
+        )
         forces = [float(state.pads[name][0, :, 1].sum()) for state in (coarse, fine)]
         assert forces[0] == pytest.approx(forces[1], rel=0.1)
 
 
 def test_another_rig_may_begin_underway() -> None:
-    """A cylinder driven over a pad, of which only the place is free, from the samples of its rate."""
+    """A cylinder driven over a pad, of which only the place is free, from the samples of its
+    rate."""
     rubber = KelvinVoigt(E=7.5e5, nu=0.45, rho=1100.0, tau=0.01, depth=0.044)
-    law = SoftContact(1.2e5, 440.0, 1.2e5, 440.0, friction=SmoothSlip(0.8, 0.7, 0.05, 10.0), node_spacing=2e-3)
+    law = SoftContact(
+        1.2e5, 440.0, 1.2e5, 440.0, friction=SmoothSlip(0.8, 0.7, 0.05, 10.0), node_spacing=2e-3
+    )
     rig = Rig(
-        bodies={"roll": Body(0.4, Circle(0.02), x="driven", theta="driven")}, contacts={"P": Contact("P", "roll", law)},
+        bodies={"roll": Body(0.4, Circle(0.02), x="driven", theta="driven")},
+        contacts={"P": Contact("P", "roll", law)},
         pads={"P": Pad(PadMesh(0.12, 4.59e-3, 60, 2), rubber)},
-        reference=Reference(**{"roll.x": Profile([0.0, 1.0], [0.04, 0.08]), "roll.theta": hold(a=0.0)["a"]}),
+        reference=Reference(**{"roll.x": Profile([0.0, 1.0], [0.04, 0.08]),
+        "roll.theta": hold(a=0.0)["a"]}),
     )  # fmt: skip
     t = np.arange(0.2, 0.5, 5e-3)
     sensors = {"y_roll": Sensor(noise=1e-6)}
@@ -223,15 +261,21 @@ def test_another_rig_may_begin_underway() -> None:
 
 def test_a_run_that_cannot_begin_is_lost(cut: Cut) -> None:
     out = estimate_initial_state(cut[0], RIG)
-    far = {"start.disc.y": 0.01} | {c.name: 1e-3 for c in out.start_coordinates if ".L.stretch" in c.name}
-    with pytest.raises(SimulationFailed, match="cannot begin there: the massless pad `L` does not settle"):
+    far = {"start.disc.y": 0.01} | {
+        c.name: 1e-3 for c in out.start_coordinates if ".L.stretch" in c.name
+    }
+    with pytest.raises(
+        SimulationFailed, match="cannot begin there: the massless pad `L` does not settle"
+    ):
         out.begin().y0(tensors(far))
 
 
 def test_parameters_are_found_from_the_middle_of_a_roll(cut: Cut) -> None:
     out = estimate_initial_state(noisy(cut[0], seed=3), RIG)
     truth = {name: float(cut[0].rig.parameter(name).detach()) for name in ("pad.E", "pad.tau")}
-    problem = Problem([out], RIG, {name: Unknown(nominal=1.1 * value) for name, value in truth.items()})
+    problem = Problem(
+        [out], RIG, {name: Unknown(nominal=1.1 * value) for name, value in truth.items()}
+    )
     plan = [Stage("all", problem.names, problem.coordinates.labels, 3e-4, tolerance=1e-3)]
     found = identify(problem, plan=plan, tightenings=0, assumptions="trusted")
     for name, value in truth.items():
@@ -252,18 +296,31 @@ def test_refusals(cut: Cut) -> None:
             changed.coordinates(rig, samples)
 
     refused(start._replace(bodies={"disc.x": (0.0, 1.0)}), "`disc.y` is missing")
-    refused(start._replace(bodies={**start.bodies, "ball.x": (0.0, 1.0)}), "`ball.x` is none of them")
-    refused(start._replace(bodies={**start.bodies, "disc.x": (0.06, -1.0)}), "`start.disc.x` needs a finite mean")
-    refused(start._replace(stretch={"M": Stretch((0.06,), 1e-5)}), "speaks of `M`; the contacts are L, U")
-    refused(start._replace(stretch={"L": Stretch((0.06, 0.05), 1e-5)}), "must be finite and increase")
+    refused(
+        start._replace(bodies={**start.bodies, "ball.x": (0.0, 1.0)}), "`ball.x` is none of them"
+    )
+    refused(
+        start._replace(bodies={**start.bodies, "disc.x": (0.06, -1.0)}),
+        "`start.disc.x` needs a finite mean",
+    )
+    refused(
+        start._replace(stretch={"M": Stretch((0.06,), 1e-5)}),
+        "speaks of `M`; the contacts are L, U",
+    )
+    refused(
+        start._replace(stretch={"L": Stretch((0.06, 0.05), 1e-5)}), "must be finite and increase"
+    )
     refused(start._replace(lead=-0.1), "`lead` of the start must not be negative")
     with pytest.raises(
-        ValueError, match=r"`x_C` of recording `roll` has 2 samples in the beginning.*take a longer `lead`"
+        ValueError,
+        match=r"`x_C` of recording `roll` has 2 samples in the beginning.*take a longer `lead`",
     ):
         estimate_initial_state(recording, RIG, lead=0.01)
     with pytest.raises(ValueError, match="no two samples of `x_C` left"):
         estimate_initial_state(recording, RIG, lead=5.0)
-    with pytest.raises(ValueError, match=r"`x_C` may come late by 0.08 s, but runs are known only from 0.05 s"):
+    with pytest.raises(
+        ValueError, match=r"`x_C` may come late by 0.08 s, but runs are known only from 0.05 s"
+    ):
         estimate_initial_state(recording, RIG | {"x_C": Sensor(noise=1e-5, delay=0.08)})
     with pytest.raises(ValueError, match=r"`given` speaks of `disc\.z`"):
         estimate_initial_state(recording, RIG, given={"disc.z": (0.0, 1.0)})
@@ -273,8 +330,8 @@ def test_refusals(cut: Cut) -> None:
 
 @pytest.mark.slow
 def test_unknown_start_smoke(tmp_path: Path) -> None:
-    """The experiment: errors of a few standard deviations, a price for not knowing the start, and rest not assumed in
-    silence."""
+    """The experiment: errors of a few standard deviations, a price for not knowing the start, and
+    rest not assumed in silence."""
     module = experiment("unknown_start")
     result = module.run(module.Config(out=tmp_path, smoke=True))
     ((case, (found,)),) = result.found.items()

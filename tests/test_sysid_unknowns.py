@@ -10,7 +10,13 @@ from torchsoft.sysid.unknowns import Coordinates, Prior, Unknown
 from torchsoft.tables import InvalidTable
 
 RIG = SoftGrasp()
-GIVEN = {"pad.E": 0.75e6, "pad.nu": 0.45, "contact.mu_s": 0.8, "contact.mu_k": 0.7, "contact.friction.alpha": 2.0}
+GIVEN = {
+    "pad.E": 0.75e6,
+    "pad.nu": 0.45,
+    "contact.mu_s": 0.8,
+    "contact.mu_k": 0.7,
+    "contact.friction.alpha": 2.0,
+}
 
 
 def coordinates(*others: dict[str, float], **unknowns: dict[str, Any]) -> Coordinates:
@@ -44,19 +50,35 @@ def test_bounds_that_are_not_given_end_where_the_parameters_do() -> None:
     [
         (
             {"pad__nu": {"high": 4.5}},
-            r"^unknowns\.pad\.nu\.high = 4\.5 is beyond what pad\.nu may be, from -0\.999 to 0\.4999$",
+            r"^unknowns\.pad\.nu\.high = 4\.5 is beyond what pad\.nu may be, from -0\.999 to "
+            r"0\.4999$",
         ),
-        ({"pad__nu": {"scale": "linear", "low": -2.0, "high": 0.4}}, r"unknowns\.pad\.nu\.low = -2 is beyond"),
+        (
+            {"pad__nu": {"scale": "linear", "low": -2.0, "high": 0.4}},
+            r"unknowns\.pad\.nu\.low = -2 is beyond",
+        ),
         ({"pad__E": {"nominal": 1e20}}, r"unknowns\.pad\.E\.nominal = 1e\+20 is beyond"),
         ({"contact__mu_k": {"high": 0.9}}, r"unknowns\.contact\.mu_k\.high = 0\.9 is beyond"),
         (
             {"contact__mu_k": {"ratio_to": "contact.mu_s", "high": 1.2}},
             r"high = 1\.2 is beyond what contact\.mu_k / contact\.mu_s",
         ),
-        ({"contact__mu_k": {}, "contact__mu_s": {}}, r"give unknowns\.contact\.mu_k\.ratio_to = 'contact\.mu_s'"),
-        ({"pad__E": {"prior": Prior(median=1e8, sd=1e3)}}, r"^unknowns\.pad\.E\.prior\.median = 1e\+08 is not between"),
         (
-            {"pad__E": {"low": 8e4, "high": 1.4e6, "prior": Prior(median=1.5e6, sd=0.1, kind="log-normal")}},
+            {"contact__mu_k": {}, "contact__mu_s": {}},
+            r"give unknowns\.contact\.mu_k\.ratio_to = 'contact\.mu_s'",
+        ),
+        (
+            {"pad__E": {"prior": Prior(median=1e8, sd=1e3)}},
+            r"^unknowns\.pad\.E\.prior\.median = 1e\+08 is not between",
+        ),
+        (
+            {
+                "pad__E": {
+                    "low": 8e4,
+                    "high": 1.4e6,
+                    "prior": Prior(median=1.5e6, sd=0.1, kind="log-normal"),
+                }
+            },
             r"prior\.median = 1\.5e\+06 is not between low = 80000 and high = 1\.4e\+06$",
         ),
         ({"pad__Young": {}}, r"^unknowns: `pad\.Young` cannot be identified; what can: pad\.E, "),
@@ -67,12 +89,15 @@ def test_bounds_beyond_are_refused_by_their_field(unknowns: dict[str, Any], mess
         coordinates(**unknowns)
 
 
-@pytest.mark.parametrize("others", [({"contact.mu_s": 0.3},), ({}, {"contact.mu_s": 0.3}), ({"contact.mu_s": 0.3}, {})])
+@pytest.mark.parametrize(
+    "others", [({"contact.mu_s": 0.3},), ({}, {"contact.mu_s": 0.3}), ({"contact.mu_s": 0.3}, {})]
+)
 def test_bounds_hold_in_every_recording(others: tuple[dict[str, float], ...]) -> None:
     assert ends(coordinates(*others, contact__mu_k={"nominal": 0.2}), "contact.mu_k") == (0.02, 0.3)
     for field, value in (("high", 0.5), ("nominal", 0.5)):
         with pytest.raises(
-            ValueError, match=f"mu_k.{field} = 0.5 is beyond what .* may be in all recordings, from 0 to 0.3"
+            ValueError,
+            match=f"mu_k.{field} = 0.5 is beyond what .* may be in all recordings, from 0 to 0.3",
         ):
             coordinates(*others, contact__mu_k={"nominal": 0.2, field: value})
 
@@ -81,7 +106,8 @@ def test_a_search_starts_where_all_rigs_are() -> None:
     assert ends(coordinates({}, pad__E={}), "pad.E") == (0.75e5, 0.75e7)
     for others, second in ((({"pad.E": 1e6},), "two"), (({}, {"pad.E": 1e6}), "three")):
         with pytest.raises(
-            ValueError, match=f"`one` and 1e\\+06 in that of `{second}`: say by `nominal` where the search"
+            ValueError,
+            match=f"`one` and 1e\\+06 in that of `{second}`: say by `nominal` where the search",
         ):
             coordinates(*others, pad__E={})
         assert len(coordinates(*others, pad__E={"nominal": 1e6})) == 1

@@ -1,4 +1,5 @@
-"""Tables: refusals are one sentence that names the field, what was given and what is allowed; files of TOML are read alike."""
+"""Tables: refusals are one sentence that names the field, what was given and what is allowed; files
+of TOML are read alike."""
 
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -47,8 +48,14 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "bounds": ({"step": -1}, "step should be greater than 0, not -1"),
     "unknown": ({"steps": 1.0}, "steps is not known here"),
     "missing": ({"motions": [{"kind": "roll"}, {}]}, "motions.1.kind is missing"),
-    "another kind": ({"motions": [{"kind": "hop"}]}, "motions.0.kind should be one of 'roll', 'press', not 'hop'"),
-    "in a kind": ({"motions": [{"kind": "roll", "travel": -1}]}, "motions.0.travel should be greater than 0, not -1"),
+    "another kind": (
+        {"motions": [{"kind": "hop"}]},
+        "motions.0.kind should be one of 'roll', 'press', not 'hop'",
+    ),
+    "in a kind": (
+        {"motions": [{"kind": "roll", "travel": -1}]},
+        "motions.0.travel should be greater than 0, not -1",
+    ),
     "by name": (
         {"rolls": {"a.b": {"kind": "roll", "travel": "x"}}},
         "rolls.a.b.travel should be a valid number, not 'x'",

@@ -1,4 +1,5 @@
-"""Steps by tolerance: accuracy, dense output, frozen steps and their gradients, and what cannot be met."""
+"""Steps by tolerance: accuracy, dense output, frozen steps and their gradients, and what cannot be
+met."""
 
 import numpy as np
 import pytest
@@ -17,8 +18,14 @@ T = times(0.4, 9)
 
 @pytest.fixture(scope="module")
 def start() -> tuple[SoftGrasp, Tensor]:
-    """The paper's manipulation on a coarse mesh, quickened: its touch-down and grasp within 0.3 s."""
-    model = coarse(scenario__grasp_time=0.25, scenario__roll_time=0.5, scenario__hold_time=0.1, scenario__travel=4e-3)
+    """The paper's manipulation on a coarse mesh, quickened: its touch-down and grasp within 0.3
+    s."""
+    model = coarse(
+        scenario__grasp_time=0.25,
+        scenario__roll_time=0.5,
+        scenario__hold_time=0.1,
+        scenario__travel=4e-3,
+    )
     made = grasp_and_roll(model, grasp_force=80.0)
     return made.model, made.y0
 
@@ -47,12 +54,16 @@ def test_error_falls_with_the_tolerance(start: tuple[SoftGrasp, Tensor], exact: 
     assert errors[0] > 5 * errors[1] > 10 * errors[2]
 
 
-def test_steps_are_short_where_it_touches_down_and_long_where_it_rests(start: tuple[SoftGrasp, Tensor]) -> None:
+def test_steps_are_short_where_it_touches_down_and_long_where_it_rests(
+    start: tuple[SoftGrasp, Tensor],
+) -> None:
     model, y0 = start
     run = simulate(model, times(2.0, 5), y0=y0, rtol=1e-4)
     h = run.knots.diff()
     assert run.stats.refused_steps > 0
-    assert float(h[run.knots[:-1] > 1.5].min()) > 0.02 > 2e-3 > float(h[run.knots[:-1] < 0.25].min())
+    assert (
+        float(h[run.knots[:-1] > 1.5].min()) > 0.02 > 2e-3 > float(h[run.knots[:-1] < 0.25].min())
+    )
 
 
 def test_outputs_do_not_change_the_run(start: tuple[SoftGrasp, Tensor], exact: Trajectory) -> None:
@@ -61,22 +72,31 @@ def test_outputs_do_not_change_the_run(start: tuple[SoftGrasp, Tensor], exact: T
     few, many = (simulate(model, times(0.4, n), y0=y0, rtol=1e-4) for n in (9, 161))
     assert few.stats.steps == pytest.approx(many.stats.steps, rel=0.03)
     assert torch.allclose(few.knots[:40], many.knots[:40], rtol=1e-6)
-    apart = max(float((few[x] - many[x][::20]).abs().max() / np.ptp(exact[x].numpy())) for x in ("x_C", "y_C", "F_y"))
+    apart = max(
+        float((few[x] - many[x][::20]).abs().max() / np.ptp(exact[x].numpy()))
+        for x in ("x_C", "y_C", "F_y")
+    )
     assert apart < worst(few, exact)
 
 
 def test_dense_output_is_as_good_as_the_steps(start: tuple[SoftGrasp, Tensor]) -> None:
-    """Between its knots a run is as near to the exact one as at them, and the forces are those of the states."""
+    """Between its knots a run is as near to the exact one as at them, and the forces are those of
+    the states."""
     model, y0 = start
     t = times(0.4, 161)
     dense, fine = (simulate(model, t, y0=y0, rtol=rtol) for rtol in (1e-4, 1e-7))
     at_knots = simulate(model, dense.knots, y0=y0, knots=dense.knots)
     fine_there = simulate(model, dense.knots, y0=y0, rtol=1e-7)
     for x in ("x_C", "y_C", "y_Br", "F_y"):
-        between, ends = float((dense[x] - fine[x]).abs().max()), float((at_knots[x] - fine_there[x]).abs().max())
+        between, ends = (
+            float((dense[x] - fine[x]).abs().max()),
+            float((at_knots[x] - fine_there[x]).abs().max()),
+        )
         assert between < 3 * ends
     i = 121
-    alone = simulate(model, t[i:], y0=dense.y[i], step=1e-3)  # its first row is the forces that belong to that state
+    alone = simulate(
+        model, t[i:], y0=dense.y[i], step=1e-3
+    )  # its first row is the forces that belong to that state
     for name in "LU":
         assert float((alone.force[name][0] - dense.force[name][i]).abs().max()) < 1e-8
 
@@ -152,7 +172,9 @@ class Jump(Wave):
 
     def forward(self, t: Tensor) -> tuple[Tensor, Tensor]:
         value, rate = super().forward(t)
-        return value + torch.where(t > self.at, 1e-3, 0.0), rate + torch.where(t > self.at, self.rate, 0.0)
+        return value + torch.where(t > self.at, 1e-3, 0.0), rate + torch.where(
+            t > self.at, self.rate, 0.0
+        )
 
 
 def test_a_jump_is_stepped_over_or_said() -> None:
@@ -163,7 +185,8 @@ def test_a_jump_is_stepped_over_or_said() -> None:
     short = run.knots.diff().argmin()
     assert float((run.knots[short] - 0.0512345).abs()) < 1e-3 > 10 * float(run.knots.diff().min())
     with pytest.raises(
-        SimulationFailed, match=r"at t = 0\.0512 s .* steps below 1e-09 s for the velocity of body `bracket`"
+        SimulationFailed,
+        match=r"at t = 0\.0512 s .* steps below 1e-09 s for the velocity of body `bracket`",
     ):
         simulate(model, times(0.1, 6), y0=y0, reference=jump(1e9), rtol=1e-4)
 

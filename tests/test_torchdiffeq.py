@@ -22,8 +22,9 @@ SOLVERS = importlib.import_module("torchdiffeq._impl.odeint").SOLVERS
 
 def test_an_import_leaves_torchdiffeq_alone() -> None:
     code = (
-        "import torchdiffeq; from torchdiffeq._impl.odeint import SOLVERS; before = dict(SOLVERS); import torchsoft; "
-        "assert SOLVERS == before; torchsoft.register_method(); assert SOLVERS != before"
+        "import torchdiffeq; from torchdiffeq._impl.odeint import SOLVERS; before = dict(SOLVERS); "
+        "import torchsoft; assert SOLVERS == before; torchsoft.register_method(); assert SOLVERS "
+        "!= before"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 
@@ -44,7 +45,8 @@ def test_torchdiffeq_runs_the_stepper() -> None:
 @pytest.mark.parametrize("method", ["rk4", pytest.param("dopri5", marks=pytest.mark.slow)])
 @torch.no_grad()
 def test_explicit_methods_agree(method: str) -> None:
-    """torchdiffeq's own methods integrate the same forward and meet the stepper on a short window, slip included."""
+    """torchdiffeq's own methods integrate the same forward and meet the stepper on a short window,
+    slip included."""
     model = coarse()
     y0, t = grasped(model, (0.05, -0.01)), times(4e-4, 3)
     options = {"step_size": 2e-5} if method == "rk4" else {}
@@ -66,7 +68,9 @@ def solver_of_theirs() -> Iterator[type]:
     class Theirs:
         """Euler's method, one step an output."""
 
-        def __init__(self, func: object, y0: torch.Tensor, rtol: float, atol: float, **options: object) -> None:
+        def __init__(
+            self, func: object, y0: torch.Tensor, rtol: float, atol: float, **options: object
+        ) -> None:
             self.func, self.y0 = func, y0
 
         def integrate(self, t: torch.Tensor) -> torch.Tensor:
@@ -88,10 +92,13 @@ def solver_of_theirs() -> Iterator[type]:
 
 
 def test_a_solver_of_torchdiffeqs_own_is_left_to_other_functions(solver_of_theirs: type) -> None:
-    """A foreign function is integrated by theirs, a rig by the stepper; registering twice changes nothing."""
+    """A foreign function is integrated by theirs, a rig by the stepper; registering twice changes
+    nothing."""
     assert issubclass(SOLVERS[METHOD], TorchdiffeqSolver)
     assert SOLVERS[METHOD].theirs is solver_of_theirs
-    y = odeint(lambda t, y: -y, torch.ones(1, dtype=torch.float64), f64(0.0, 0.5, 1.0), method=METHOD)
+    y = odeint(
+        lambda t, y: -y, torch.ones(1, dtype=torch.float64), f64(0.0, 0.5, 1.0), method=METHOD
+    )
     assert y[:, 0].tolist() == [1.0, 0.5, 0.25]
     model = coarse()
     y0, t = grasped(model, (0.01, 0.0)), times(0.01, 3)
@@ -104,19 +111,27 @@ def rolling() -> tuple[SoftGrasp, torch.Tensor]:
     model = coarse()
     manipulation = grasp_and_roll(model, grasp_force=75.0)
     with torch.no_grad():
-        y = odeint(model, manipulation.y0, torch.tensor([0, 0.3, 0.5], dtype=torch.float64), method=METHOD)
+        y = odeint(
+            model, manipulation.y0, torch.tensor([0, 0.3, 0.5], dtype=torch.float64), method=METHOD
+        )
     y0 = torch.stack((y[1], y[2])).detach()
     y0[:, model.layout.slices["velocity", "disc"]] += f64(0.02, 0.0, 0.0)
     return model, y0
 
 
-def gradients(model: SoftGrasp, y0: torch.Tensor, verb: object) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+def gradients(
+    model: SoftGrasp, y0: torch.Tensor, verb: object
+) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     model.zero_grad(set_to_none=True)
     start = y0.clone().requires_grad_(True)
     t = torch.tensor([0.3, 0.31, 0.325, 0.34], dtype=torch.float64)
     y = verb(model, start, t, method=METHOD, options=dict(OPTIONS))  # pyright: ignore[reportCallIssue]
     state = model.unpack(y)
-    x, theta, speed = state.pose["disc"][..., 0], state.pose["disc"][..., 2], state.velocity["bracket"][..., 1]
+    x, theta, speed = (
+        state.pose["disc"][..., 0],
+        state.pose["disc"][..., 2],
+        state.velocity["bracket"][..., 1],
+    )
     (1e3 * x * t[:, None] + theta + speed).sum().backward()
     assert start.grad is not None
     return start.grad, {name: p.grad for name, p in model.named_parameters() if p.grad is not None}
@@ -143,7 +158,8 @@ def test_odeint_adjoint_of_a_forgotten_run_says_so() -> None:
 
 
 def test_continuous_adjoint_agrees_on_a_short_window() -> None:
-    """0.2 ms of a sticking grasp by rk4 and its continuous adjoint, against fine steps and the discrete adjoint."""
+    """0.2 ms of a sticking grasp by rk4 and its continuous adjoint, against fine steps and the
+    discrete adjoint."""
     model, y0 = rolling()
     start = y0[1]
     start[model.layout.slices["velocity", "disc"]] -= f64(0.0195, 0.0, 0.0)  # slow enough to stick
@@ -155,7 +171,9 @@ def test_continuous_adjoint_agrees_on_a_short_window() -> None:
         lambda y: odeint(model, y, t, method=METHOD, options={"step_size": 2e-6}),
     ):
         model.zero_grad(set_to_none=True)
-        model.unpack(solve(start.clone().requires_grad_(True))).velocity["disc"][:, 2].sum().backward()
+        model.unpack(solve(start.clone().requires_grad_(True))).velocity["disc"][
+            :, 2
+        ].sum().backward()
         results.append({name: model.parameter(name).grad.item() for name in names})
     for name in names:
         continuous, discrete = (result[name] for result in results)

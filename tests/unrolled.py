@@ -1,8 +1,9 @@
-"""The same implicit step in plain torch, every operation recorded by autograd: the reference of the compiled derivatives.
+"""The same implicit step in plain torch, every operation recorded by autograd: the reference of the
+compiled derivatives.
 
-One stage is solved by Newton's method with the Jacobian from forward-mode differentiation of the rig's own laws, and its last
-iteration is taken with the gradient on, so that backpropagation through many steps is exact. Slow, for short windows; massless
-pads, one state at a time.
+One stage is solved by Newton's method with the Jacobian from forward-mode differentiation of the
+rig's own laws, and its last iteration is taken with the gradient on, so that backpropagation
+through many steps is exact. Slow, for short windows; massless pads, one state at a time.
 """
 
 import numpy as np
@@ -22,13 +23,14 @@ WINDOW = 3e-4
 
 
 def unrolled_solution(
-    rig: Rig, y0: Tensor, t: Tensor, reference: Reference | None = None, *, step: float = 2e-3, tolerance: float = 1e-12,
-    max_iterations: int = 40,
+    rig: Rig, y0: Tensor, t: Tensor, reference: Reference | None = None, *, step: float = 2e-3,
+    tolerance: float = 1e-12, max_iterations: int = 40,
 ) -> Tensor:  # fmt: skip
     """States (T, size) at the times t (T,), by the steps that `simulate` takes.
 
-    `tolerance` is Newton's, on the residuals of nodal rates and free velocities [m/s, rad/s]. Raises `NotImplementedError` for
-    inertial pads and `RuntimeError` when Newton's method does not converge.
+    `tolerance` is Newton's, on the residuals of nodal rates and free velocities [m/s, rad/s].
+    Raises `NotImplementedError` for inertial pads and `RuntimeError` when Newton's method does not
+    converge.
     """
     check_times(t)
     if any(pad.inertial for pad in rig.pads.values()):
@@ -38,28 +40,45 @@ def unrolled_solution(
         h, keep = float(lengths[0]), np.isin(np.arange(len(starts)), ends)
         for start, output in zip(starts, keep):
             Y_1 = _stage(rig, y, start + GAMMA * h, GAMMA * h, reference, tolerance, max_iterations)
-            y = _stage(rig, y + MIX * (Y_1 - y), start + h, GAMMA * h, reference, tolerance, max_iterations)
+            y = _stage(
+                rig, y + MIX * (Y_1 - y), start + h, GAMMA * h, reference, tolerance, max_iterations
+            )
             if output:
                 out.append(y)
     return torch.stack(out)
 
 
 def _stage(
-    rig: Rig, y_star: Tensor, time: float, a: float, reference: Reference | None, tolerance: float, max_iterations: int
+    rig: Rig,
+    y_star: Tensor,
+    time: float,
+    a: float,
+    reference: Reference | None,
+    tolerance: float,
+    max_iterations: int,
 ) -> Tensor:
-    """Y = y* + a f(time, Y). Unknowns: u' of the nodes that may be loaded, pad by pad, and the free velocities."""
+    """Y = y* + a f(time, Y). Unknowns: u' of the nodes that may be loaded, pad by pad, and the free
+    velocities."""
     signals = rig.follow(torch.tensor(time, dtype=torch.float64), reference)
     star, free = rig.unpack(y_star, signals), rig.layout.free
     V_star = torch.cat([star.velocity[name][axes] for name, axes in free.items()])
-    inertia = torch.cat([torch.stack(list(rig.bodies[name].masses))[axes] for name, axes in free.items()])
+    inertia = torch.cat(
+        [torch.stack(list(rig.bodies[name].masses))[axes] for name, axes in free.items()]
+    )
     u_star = {name: rig.displacement(name, star) for name in rig.pads}
     near, loaded, relation = {}, {}, {}
     for key, contact in rig.contacts.items():
         with torch.no_grad():
             near[key] = torch.nonzero(rig.penetration(key, star) > -WINDOW)[:, 0]
     for name, pad in rig.pads.items():
-        touched = sum((pad.spread[near[key]] != 0).any(0) for key, c in rig.contacts.items() if c.pad == name)
-        loaded[name] = torch.nonzero(touched)[:, 0] if isinstance(touched, Tensor) else torch.zeros(0, dtype=torch.long)
+        touched = sum(
+            (pad.spread[near[key]] != 0).any(0) for key, c in rig.contacts.items() if c.pad == name
+        )
+        loaded[name] = (
+            torch.nonzero(touched)[:, 0]
+            if isinstance(touched, Tensor)
+            else torch.zeros(0, dtype=torch.long)
+        )
         relation[name] = free_rates(pad, star.pads[name], a)
     sizes = [*(2 * len(nodes) for nodes in loaded.values()), len(V_star)]
 
@@ -81,7 +100,9 @@ def _stage(
             u_dot = spread[:, nodes] @ rates[contact.pad]
             shape = rig.bodies[contact.body].shape
             assert shape is not None
-            x = rig.point_inputs(key, at, spread @ u_star[contact.pad] + a * u_dot, u_dot, near[key], a)
+            x = rig.point_inputs(
+                key, at, spread @ u_star[contact.pad] + a * u_dot, u_dot, near[key], a
+            )
             out[key] = x, interface_law(contact.law, shape, x)
         return out
 
@@ -98,7 +119,9 @@ def _stage(
         loads = {name: torch.zeros(3, dtype=torch.float64) for name in rig.bodies}
         for name, body in rig.bodies.items():
             if body.weighted:
-                loads[name] = loads[name] - body.mass * rig.gravity * torch.tensor([0.0, 1.0, 0.0]).double()
+                loads[name] = (
+                    loads[name] - body.mass * rig.gravity * torch.tensor([0.0, 1.0, 0.0]).double()
+                )
         for name, actuator in rig.actuators.items():
             body, _, axis = actuator.pushes.partition(".")
             along = torch.eye(3, dtype=torch.float64)[("x", "y", "theta").index(axis)]
@@ -108,7 +131,9 @@ def _stage(
             r_B, _ = rig.base_motion(contact.pad, at)
             d, f = inputs[:, 3:5], out[:, :2]
             total = turned(f.sum(0), r_B[2])  # (16), (19)
-            loads[contact.body] = loads[contact.body] - torch.cat((total, (cross(d) * f).sum()[None]))  # (18)
+            loads[contact.body] = loads[contact.body] - torch.cat(
+                (total, (cross(d) * f).sum()[None])
+            )  # (18)
             base = rig.pads[contact.pad].base
             if base is not None:
                 p = d + turned(at.pose[contact.body][:2] - r_B[:2], -r_B[2])
@@ -116,10 +141,16 @@ def _stage(
         for name in rig.pads:
             own, P = relation[name]
             dofs = (2 * loaded[name][:, None] + torch.arange(2)).flatten()
-            F = sum(forces(key, out) for key, (_, out) in found.items() if rig.contacts[key].pad == name)
+            F = sum(
+                forces(key, out) for key, (_, out) in found.items() if rig.contacts[key].pad == name
+            )
             if len(dofs):
                 assert isinstance(F, Tensor)
-                rows.append(rates[name].flatten() - own[loaded[name]].flatten() - P[dofs][:, dofs] @ F.flatten())
+                rows.append(
+                    rates[name].flatten()
+                    - own[loaded[name]].flatten()
+                    - P[dofs][:, dofs] @ F.flatten()
+                )
         load = torch.cat([loads[name][axes] for name, axes in free.items()])
         return torch.cat((*rows, V - V_star - a * load / inertia))
 
@@ -138,12 +169,18 @@ def _stage(
                 part *= 0.5
             x, r = x - part * change, trial
         else:
-            raise RuntimeError(f"the unrolled step did not converge at t = {time:.4f} s; try a smaller step")
-    x = x - torch.linalg.solve(J, residual(x)[:, None])[:, 0]  # the implicit function theorem's derivative
+            raise RuntimeError(
+                f"the unrolled step did not converge at t = {time:.4f} s; try a smaller step"
+            )
+    x = (
+        x - torch.linalg.solve(J, residual(x)[:, None])[:, 0]
+    )  # the implicit function theorem's derivative
 
     *parts, V = x.split(sizes)
     at = moved(V)
-    found = interfaces({name: part.unflatten(-1, (-1, 2)) for name, part in zip(rig.pads, parts)}, at)
+    found = interfaces(
+        {name: part.unflatten(-1, (-1, 2)) for name, part in zip(rig.pads, parts)}, at
+    )
     pads, stretch = {}, {}
     for name, pad in rig.pads.items():
         F = torch.zeros(pad.nodes, 2, dtype=torch.float64)
@@ -154,6 +191,8 @@ def _stage(
         pads[name] = star.pads[name] + a * (F - star.pads[name]) / (times + a)
     for key, (_, out) in found.items():
         s, weight = star.stretch[key], rig.weight(key)
-        far = free_law(rig.contacts[key].law, torch.stack((s, weight, torch.full_like(weight, a)), -1))[0]
+        far = free_law(
+            rig.contacts[key].law, torch.stack((s, weight, torch.full_like(weight, a)), -1)
+        )[0]
         stretch[key] = s + a * far.index_copy(0, near[key], out[:, 2])
     return rig.pack(at._replace(pads=pads, stretch=stretch))

@@ -10,7 +10,15 @@ from .physics.motion import Profile, Reference, Sampled, hold
 from .physics.pads import Pad
 from .physics.parts import PD, Actuator, Body, Contact, StateFeedback, controller
 from .physics.rig import Rig
-from .physics.shapes import Circle, Contour, Ellipse, RoundedBox, RoundedPolygon, Shape, Superellipse
+from .physics.shapes import (
+    Circle,
+    Contour,
+    Ellipse,
+    RoundedBox,
+    RoundedPolygon,
+    Shape,
+    Superellipse,
+)
 from .physics.statics import NoEquilibrium
 from .solve.batch import Batch, SamplesFailed, simulate_batch
 from .solve.progress import SimulationFailed

@@ -1,11 +1,13 @@
-"""Every channel of the rig: its key, the variable and component that hold it in files and datasets, unit, symbol."""
+"""Every channel of the rig: its key, the variable and component that hold it in files and datasets,
+unit, symbol."""
 
 import math
 from typing import Any, NamedTuple
 
 
 class Variable(NamedTuple):
-    """An array over time in files and datasets: SI unit, long name, and the LaTeX symbol of each component by its key.
+    """An array over time in files and datasets: SI unit, long name, and the LaTeX symbol of each
+    component by its key.
 
     Two components are those along x and y.
     """
@@ -16,7 +18,8 @@ class Variable(NamedTuple):
 
 
 class Channel(NamedTuple):
-    """One signal (T,): the variable that holds it and the component there, None for a scalar; SI unit, name, symbol."""
+    """One signal (T,): the variable that holds it and the component there, None for a scalar; SI
+    unit, name, symbol."""
 
     variable: str
     axis: int | None
@@ -36,15 +39,21 @@ VARIABLES = {
     "bracket_position": Variable(
         "m", "centre of mass of the bracket; it does not turn", {"x_Br": "x_{Br}", "y_Br": "y_{Br}"}
     ),
-    "disc_velocity": Variable("m/s", "velocity of the disc's centre", {"v_x": r"\dot x_C", "v_y": r"\dot y_C"}),
+    "disc_velocity": Variable(
+        "m/s", "velocity of the disc's centre", {"v_x": r"\dot x_C", "v_y": r"\dot y_C"}
+    ),
     "disc_spin": Variable("rad/s", "angular velocity of the disc", {"omega": r"\dot\theta"}),
     "bracket_velocity": Variable(
         "m/s", "velocity of the bracket", {"v_x_Br": r"\dot x_{Br}", "v_y_Br": r"\dot y_{Br}"}
     ),
     "control_force": Variable(
-        "N", "controllers' force on the bracket, feed-forward included (Eq. 32, 34)", {"F_x": "F_x", "F_y": "F_y"}
+        "N",
+        "controllers' force on the bracket, feed-forward included (Eq. 32, 34)",
+        {"F_x": "F_x", "F_y": "F_y"},
     ),
-    "bracket_moment": Variable("N.m", "moment on the bracket about its centre (Eq. 35)", {"bracket_moment": "M_{Br}"}),
+    "bracket_moment": Variable(
+        "N.m", "moment on the bracket about its centre (Eq. 35)", {"bracket_moment": "M_{Br}"}
+    ),
     "angular_momentum": Variable(
         "kg.m2/s", "angular momentum of the disc (Fig. 17)", {"angular_momentum": r"I_C \omega"}
     ),
@@ -78,8 +87,22 @@ UNITS = {
 """Units by dimension, and what they are in SI."""
 
 
-MEASURED = ("x_C", "y_C", "theta", "x_Br", "y_Br", "v_x", "v_y", "omega", "v_x_Br", "v_y_Br", "F_x", "F_y")
-"""Channels that a sensor can measure: poses, their rates in the same order, and the controllers' forces."""
+MEASURED = (
+    "x_C",
+    "y_C",
+    "theta",
+    "x_Br",
+    "y_Br",
+    "v_x",
+    "v_y",
+    "omega",
+    "v_x_Br",
+    "v_y_Br",
+    "F_x",
+    "F_y",
+)
+"""Channels that a sensor can measure: poses, their rates in the same order, and the controllers'
+forces."""
 
 SETPOINTS = ("x_d", "y_d")
 FEED_FORWARD = ("x_d_dot", "y_d_dot", "F_ff")

@@ -1,4 +1,5 @@
-"""What work will cost, said before it begins: hours, and more memory than there is, need the user's word.
+"""What work will cost, said before it begins: hours, and more memory than there is, need the user's
+word.
 
 The times are those of one core of a usual machine; they are meant to tell minutes from hours.
 """
@@ -30,9 +31,7 @@ class Cost(NamedTuple):
     @property
     def sentence(self) -> str:
         disk = f", and {self.disk:.3g} GiB on the disk" if self.disk >= 1 else ""
-        return (
-            f"this takes about {duration(self.seconds)} ({self.steps:.2g} steps), {self.memory:.2g} GiB of memory{disk}"
-        )
+        return f"this takes about {duration(self.seconds)} ({self.steps:.2g} steps), {self.memory:.2g} GiB of memory{disk}"
 
 
 class Costly(ValueError):
@@ -40,7 +39,8 @@ class Costly(ValueError):
 
 
 def agree(cost: Cost, yes: bool, help: str) -> None:
-    """Ask whether to begin where it costs much and `yes` was not said; where nobody can be asked that is `Costly`.
+    """Ask whether to begin where it costs much and `yes` was not said; where nobody can be asked
+    that is `Costly`.
 
     `help` says what makes it cost less.
     """
@@ -54,7 +54,8 @@ def agree(cost: Cost, yes: bool, help: str) -> None:
 
 
 def step_seconds(p: Parameters, differentiated: bool = False) -> float:
-    """Time of one step [s] of the paper's rig; `differentiated` with sensitivities by a few parameters."""
+    """Time of one step [s] of the paper's rig; `differentiated` with sensitivities by a few
+    parameters."""
     surface, free, _ = p.pad.mesh.counts()
     inertial = p.pad.fidelity == "inertial"
     plain = step_time(surface, p.pad.elements_x * p.contact.points, free if inertial else 0)
@@ -62,14 +63,15 @@ def step_seconds(p: Parameters, differentiated: bool = False) -> float:
 
 
 def step_time(surface: int, points: int, inertial: int) -> float:
-    """Time of one step [s] with two pads of so many nodes on the `surface`, contact `points` between nodes, and `inertial`
-    nodes each."""
+    """Time of one step [s] with two pads of so many nodes on the `surface`, contact `points`
+    between nodes, and `inertial` nodes each."""
     between = 0.5e-6 * points
     return between + (2.1e-6 * inertial if inertial else 50e-6 + 90e-6 * (surface / 121) ** 2)
 
 
 def steps_per_second(rtol: float) -> float:
-    """How many steps [1/s] a tolerance chooses where a disc is rolled and shaken, by experience; a gentle motion a tenth."""
+    """How many steps [1/s] a tolerance chooses where a disc is rolled and shaken, by experience; a
+    gentle motion a tenth."""
     return 3700.0 * (1e-5 / rtol) ** 0.3
 
 
@@ -94,7 +96,16 @@ def machine_memory() -> float:
 
 def duration(seconds: float) -> str:
     """A time as people say it."""
-    for size, unit in ((365.25 * 86400.0, "years"), (86400.0, "days"), (3600.0, "hours"), (60.0, "minutes")):
+    for size, unit in (
+        (365.25 * 86400.0, "years"),
+        (86400.0, "days"),
+        (3600.0, "hours"),
+        (60.0, "minutes"),
+    ):
         if seconds >= 1.5 * size:
-            return f"{seconds / size:.2g} {unit}" if seconds < 100 * size else f"{seconds / size:.0f} {unit}"
+            return (
+                f"{seconds / size:.2g} {unit}"
+                if seconds < 100 * size
+                else f"{seconds / size:.0f} {unit}"
+            )
     return f"{seconds:.2g} seconds"

@@ -1,6 +1,7 @@
 """CSV files of numbers under headings `name [unit]`, read in SI units.
 
-Every error is a `ValueError` in a sentence that names the file, the row (the heading is row 1) and the column.
+Every error is a `ValueError` in a sentence that names the file, the row (the heading is row 1) and
+the column.
 """
 
 import csv
@@ -27,15 +28,19 @@ Hint = Callable[[str, int], str]
 
 
 class Numbers(NamedTuple):
-    """Values (n,) by column, NaN where a cell is empty, the number of every row in the file, and the columns left out."""
+    """Values (n,) by column, NaN where a cell is empty, the number of every row in the file, and
+    the columns left out."""
 
     values: dict[str, NDArray[np.float64]]
     rows: list[int]
     ignored: tuple[str, ...]
 
 
-def read(path: Path, known: Mapping[str, Units], hint: Hint, ignore: Collection[str] = ()) -> Numbers:
-    """The columns `known` of a file, without those that are to be ignored. Raises `ValueError`, and `OSError`."""
+def read(
+    path: Path, known: Mapping[str, Units], hint: Hint, ignore: Collection[str] = ()
+) -> Numbers:
+    """The columns `known` of a file, without those that are to be ignored. Raises `ValueError`, and
+    `OSError`."""
     values: list[list[float]] = []
     rows: list[int] = []
     try:
@@ -48,7 +53,10 @@ def read(path: Path, known: Mapping[str, Units], hint: Hint, ignore: Collection[
                     continue
                 row = reader.line_num
                 if len(cells) != len(head):
-                    raise ValueError(f"{path}, row {row} has {len(cells)} cells, but there are {len(head)} columns")
+                    raise ValueError(
+                        f"{path}, row {row} has {len(cells)} cells, but there are {len(head)} "
+                        "columns"
+                    )
                 rows.append(row)
                 used = [(*one, cell) for one, cell in zip(head, cells) if one]
                 values.append([number(path, row, name, cell) * unit for name, unit, cell in used])
@@ -56,14 +64,21 @@ def read(path: Path, known: Mapping[str, Units], hint: Hint, ignore: Collection[
         raise ValueError(f"{path} is not a CSV file in UTF-8: {line(error)}") from None
     names = [one[0] for one in head if one]
     columns = np.array(values).reshape(len(rows), len(names)).T
-    left_out = tuple(cell.partition("[")[0].strip() for cell, one in zip(first, head) if one is None)
+    left_out = tuple(
+        cell.partition("[")[0].strip() for cell, one in zip(first, head) if one is None
+    )
     return Numbers(dict(zip(names, columns)), rows, left_out)
 
 
 def heading(
-    path: Path, cells: Sequence[str], known: Mapping[str, Units], hint: Hint, ignore: Collection[str]
+    path: Path,
+    cells: Sequence[str],
+    known: Mapping[str, Units],
+    hint: Hint,
+    ignore: Collection[str],
 ) -> list[tuple[str, float] | None]:
-    """Name of each column, and what its unit is in SI; None for those left out. Raises `ValueError` naming the column."""
+    """Name of each column, and what its unit is in SI; None for those left out. Raises `ValueError`
+    naming the column."""
     out: list[tuple[str, float] | None] = []
     for cell in cells:
         match = re.fullmatch(r"\s*([^\[\]]*?)\s*(?:\[\s*([^\[\]]*?)\s*\])?\s*", cell)
@@ -77,7 +92,9 @@ def heading(
         if unit is None:
             raise ValueError(f"{where} has no unit: write `{name} [{next(iter(known[name]))}]`")
         if unit not in known[name]:
-            raise ValueError(f"{where} cannot be in {shown(unit)}; it can be in {', '.join(known[name])}")
+            raise ValueError(
+                f"{where} cannot be in {shown(unit)}; it can be in {', '.join(known[name])}"
+            )
         if name in (one[0] for one in out if one):
             raise ValueError(f"{where} is there twice")
         out.append((name, known[name][unit]))
@@ -94,7 +111,7 @@ def number(path: Path, row: int, column: str, cell: str) -> float:
         value = math.nan
     if not math.isfinite(value):
         raise ValueError(
-            f"{path}, row {row}, column `{column}`: {shown(text)} is not a finite number; leave the cell empty "
-            "where a sample is missing"
+            f"{path}, row {row}, column `{column}`: {shown(text)} is not a finite number; leave "
+            "the cell empty where a sample is missing"
         )
     return value

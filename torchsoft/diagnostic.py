@@ -9,7 +9,8 @@ SEVERITIES: tuple[Severity, ...] = get_args(Severity)
 class Diagnostic(NamedTuple):
     """An "error" makes a result worthless, a "warning" may, a "note" is worth knowing.
 
-    `where` is the field of a file, or the recording; `code` is the name by which a user may acknowledge it.
+    `where` is the field of a file, or the recording; `code` is the name by which a user may
+    acknowledge it.
     """
 
     severity: Severity

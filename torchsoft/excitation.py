@@ -1,7 +1,8 @@
-"""Motions that make parameters visible: a grasp of a given depth, then strokes, sines, chirps, presses, jerks or knots.
+"""Motions that make parameters visible: a grasp of a given depth, then strokes, sines, chirps,
+presses, jerks or knots.
 
-An `Excitation` is plain validated data, so that it can stand in a TOML file; `begin` turns it into a model at rest with the
-reference that its controllers follow.
+An `Excitation` is plain validated data, so that it can stand in a TOML file; `begin` turns it into
+a model at rest with the reference that its controllers follow.
 """
 
 import json
@@ -50,8 +51,9 @@ class Strokes(Table):
 
 
 class MultiSine(Table):
-    """Sums of `components` sines in x and y, one in each part of the band `frequency` [Hz]; amplitudes [m] are of the
-    sum's peak at most. Phases, and frequencies within their part, come from `seed`."""
+    """Sums of `components` sines in x and y, one in each part of the band `frequency` [Hz];
+    amplitudes [m] are of the sum's peak at most. Phases, and frequencies within their part, come
+    from `seed`."""
 
     kind: Literal["multi_sine"] = "multi_sine"
     amplitude_x: Length = 4e-3
@@ -72,7 +74,8 @@ class Chirp(Table):
 
 
 class Press(Table):
-    """The bracket's height modulated by `amplitude` [m] at `frequency` [Hz] while the disc rolls by `travel` [m]."""
+    """The bracket's height modulated by `amplitude` [m] at `frequency` [Hz] while the disc rolls by
+    `travel` [m]."""
 
     kind: Literal["press"] = "press"
     amplitude: Length = 2e-4
@@ -85,8 +88,8 @@ Knot = Annotated[tuple[Time, Length], LISTED]
 
 
 class Knots(Table):
-    """From set-point to set-point along the paper's profiles, at rest at each: `x` and `y` are knots, times [s] since the
-    motion began and distances [m] from where the grasp ended."""
+    """From set-point to set-point along the paper's profiles, at rest at each: `x` and `y` are
+    knots, times [s] since the motion began and distances [m] from where the grasp ended."""
 
     kind: Literal["knots"] = "knots"
     x: Annotated[tuple[Knot, ...], LISTED] = ()
@@ -97,7 +100,10 @@ class Knots(Table):
         for name, knots in (("x", self.x), ("y", self.y)):
             for (before, _), (after, _) in pairwise(knots):
                 if after <= before:
-                    raise ValueError(f"the times of motion.{name} must increase, but {after:g} s follows {before:g} s")
+                    raise ValueError(
+                        f"the times of motion.{name} must increase, but {after:g} s follows "
+                        f"{before:g} s"
+                    )
         return self
 
 
@@ -105,13 +111,14 @@ Motion = Annotated[Roll | Strokes | MultiSine | Chirp | Press | Knots, Field(dis
 
 
 class Excitation(Table):
-    """A grasp that compresses both pads together by `depth` [m] within `grasp_time` [s], a pause of `settle` [s], then the
-    motion, until `duration` [s].
+    """A grasp that compresses both pads together by `depth` [m] within `grasp_time` [s], a pause of
+    `settle` [s], then the motion, until `duration` [s].
 
-    `senses` is whose x the horizontal loop measures: with "bracket" the disc may slip freely, which a light grasp and hard
-    strokes make it do ("forced slip"). `x_C0` [m] is off the nodes and the middle on purpose: an exactly symmetric start
-    breaks on rounding. Where the loop senses the disc it should be a node's place, such as 60 mm: while the upper pad is
-    clear of the disc nothing ties the two together, and the least roll of the disc sends the bracket off.
+    `senses` is whose x the horizontal loop measures: with "bracket" the disc may slip freely, which
+    a light grasp and hard strokes make it do ("forced slip"). `x_C0` [m] is off the nodes and the
+    middle on purpose: an exactly symmetric start breaks on rounding. Where the loop senses the disc
+    it should be a node's place, such as 60 mm: while the upper pad is clear of the disc nothing
+    ties the two together, and the least roll of the disc sends the bracket off.
     """
 
     motion: Motion
@@ -125,22 +132,31 @@ class Excitation(Table):
     @model_validator(mode="after")
     def _motion_has_time(self) -> Self:
         since, motion = self.grasp_time + self.settle, self.motion
-        needed = {"slow_roll": 0.0, "press": 2 * FADE, "multi_sine": 2 * FADE, "chirp": 2 * FADE}.get(motion.kind)
+        needed = {
+            "slow_roll": 0.0,
+            "press": 2 * FADE,
+            "multi_sine": 2 * FADE,
+            "chirp": 2 * FADE,
+        }.get(motion.kind)
         if needed is not None and self.duration <= since + needed:
             raise ValueError(
-                f"duration = {self.duration:g} s leaves no motion: grasp_time = {self.grasp_time:g} s and settle = "
-                f"{self.settle:g} s take {since:g} s, and {motion.kind} needs more than {needed:g} s after them"
+                f"duration = {self.duration:g} s leaves no motion: grasp_time = "
+                f"{self.grasp_time:g} s and settle = {self.settle:g} s take {since:g} s, and "
+                f"{motion.kind} needs more than {needed:g} s after them"
             )
         if isinstance(motion, Strokes) and (self.duration - since) / motion.stroke_time > MOST:
             raise ValueError(
-                f"duration = {self.duration:g} s at motion.stroke_time = {motion.stroke_time:g} s makes more than {MOST} "
-                "strokes; take fewer"
+                f"duration = {self.duration:g} s at motion.stroke_time = {motion.stroke_time:g} s "
+                f"makes more than {MOST} strokes; take fewer"
             )
         if isinstance(motion, Knots):
-            last = since + max((knots[-1][0] for knots in (motion.x, motion.y) if knots), default=0.0)
+            last = since + max(
+                (knots[-1][0] for knots in (motion.x, motion.y) if knots), default=0.0
+            )
             if last > self.duration * (1 + 1e-9):
                 raise ValueError(
-                    f"duration = {self.duration:g} s ends before the last knot of the motion, at {last:g} s"
+                    f"duration = {self.duration:g} s ends before the last knot of the motion, at "
+                    f"{last:g} s"
                 )
         return self
 
@@ -155,11 +171,18 @@ class Excitation(Table):
         motion = fields.pop("motion")
         rows = [f"{name} = {json.dumps(value)}" for name, value in fields.items()]
         return "\n".join(
-            [*rows, "", "[motion]", *(f"{name} = {json.dumps(value)}" for name, value in motion.items()), ""]
+            [
+                *rows,
+                "",
+                "[motion]",
+                *(f"{name} = {json.dumps(value)}" for name, value in motion.items()),
+                "",
+            ]
         )
 
     def settings(self, p: Parameters) -> Parameters:
-        """The parameters p with this excitation's grasp. Raises `ValueError` for a grasp that is not possible."""
+        """The parameters p with this excitation's grasp. Raises `ValueError` for a grasp that is
+        not possible."""
         return p.override(
             {
                 "scenario.y_Br_grasp": apart(p) - self.depth,
@@ -186,10 +209,12 @@ CATALOGUE = {
         motion=Press(amplitude=8e-4, frequency=25.0, travel=30e-3), duration=2.0, depth=2.5e-3
     ),
     "deep chirp": Excitation(
-        motion=Chirp(amplitude_x=5e-3, amplitude_y=5e-4, start=1.0, end=25.0), duration=2.0, depth=2.5e-3,
+        motion=Chirp(amplitude_x=5e-3, amplitude_y=5e-4, start=1.0, end=25.0), duration=2.0,
+        depth=2.5e-3,
     ),
     "light shaking": Excitation(
-        motion=MultiSine(amplitude_x=6e-3, amplitude_y=2e-4, frequency=(4.0, 20.0)), duration=2.0, depth=3e-4,
+        motion=MultiSine(amplitude_x=6e-3, amplitude_y=2e-4, frequency=(4.0, 20.0)), duration=2.0,
+        depth=3e-4,
     ),
     "light jerks": Excitation(
         motion=Strokes(travel=80e-3, stroke_time=0.25), duration=1.4, depth=2e-4
@@ -210,16 +235,17 @@ class RunContext(NamedTuple):
 
 
 def start(model: SoftGrasp, x: Tensor | None = None) -> Tensor:
-    """State (size,): the disc at rest under its weight, the bracket at `apart`, so that its pad is clear of the disc by
-    what the disc has sunk in. Differentiable in the model's parameters, and in the place x () [m] of the disc, x_C0 by default;
-    the bracket's place does not depend on them."""
+    """State (size,): the disc at rest under its weight, the bracket at `apart`, so that its pad is
+    clear of the disc by what the disc has sunk in. Differentiable in the model's parameters, and in
+    the place x () [m] of the disc, x_C0 by default; the bracket's place does not depend on them."""
     state, p = model.unpack(rest(model, x)), model.settings
     clear = torch.tensor([p.scenario.x_C0, apart(p), 0.0], dtype=torch.float64)
     return model.pack(state._replace(pose=state.pose | {"bracket": clear}))
 
 
 def begin(excitation: Excitation, p: Parameters, *, grasp_force: float | None = None) -> RunContext:
-    """A model with the parameters p about to be excited; `grasp_force` [N] is fed forward, by default that of statics.
+    """A model with the parameters p about to be excited; `grasp_force` [N] is fed forward, by
+    default that of statics.
 
     Raises `ValueError` for an impossible grasp, `NoEquilibrium` where the disc finds no rest.
     """
@@ -227,11 +253,15 @@ def begin(excitation: Excitation, p: Parameters, *, grasp_force: float | None = 
     y0 = start(model).detach()
     if grasp_force is None:
         grasp_force = holding_force(model, press(model, model.settings.scenario.y_Br_grasp))
-    model.reference = reference(excitation, model, float(model.unpack(y0).pose["bracket"][1]), grasp_force)
+    model.reference = reference(
+        excitation, model, float(model.unpack(y0).pose["bracket"][1]), grasp_force
+    )
     return RunContext(model, y0)
 
 
-def reference(excitation: Excitation, model: SoftGrasp, y_Br: float, grasp_force: float) -> Reference:
+def reference(
+    excitation: Excitation, model: SoftGrasp, y_Br: float, grasp_force: float
+) -> Reference:
     """The grasp from the height y_Br [m] with `grasp_force` [N] fed forward, then the motion."""
     p = model.settings.scenario
     since, until = p.grasp_time + excitation.settle, excitation.duration
@@ -240,7 +270,9 @@ def reference(excitation: Excitation, model: SoftGrasp, y_Br: float, grasp_force
     return Reference(x_d=x, y_d=y, F_ff=Profile([0.0, p.grasp_time], [0.0, -grasp_force]))
 
 
-def moved(motion: Motion, still: Knotted, grasp: Knotted, since: float, until: float) -> tuple[Profile, Profile]:
+def moved(
+    motion: Motion, still: Knotted, grasp: Knotted, since: float, until: float
+) -> tuple[Profile, Profile]:
     """x_d and y_Br,d of a motion from `since` to `until` [s], on top of a still x and the grasp."""
     x_0 = still[1][-1]
     match motion:
@@ -249,7 +281,9 @@ def moved(motion: Motion, still: Knotted, grasp: Knotted, since: float, until: f
         case Strokes():
             count = max(1, int((until - since) / motion.stroke_time + 1e-9))
             times = [since + i * motion.stroke_time for i in range(count + 1)]
-            return Profile(times, [x_0 + (i % 2) * motion.travel for i in range(count + 1)]), Profile(*grasp)
+            return Profile(
+                times, [x_0 + (i % 2) * motion.travel for i in range(count + 1)]
+            ), Profile(*grasp)
         case Knots():
             x, y = ([(since + t, at) for t, at in knots] for knots in (motion.x, motion.y))
             begin = [(since, 0.0)] if since > grasp[0][-1] else []
@@ -262,13 +296,17 @@ def moved(motion: Motion, still: Knotted, grasp: Knotted, since: float, until: f
 
             def sines(amplitude: Length) -> Wave:
                 frequency = np.exp(low + (np.arange(n) + rng.random(n)) / n * (high - low))
-                return wave(np.full(n, amplitude / n), frequency, np.zeros(n), rng.uniform(0, 2 * np.pi, n))
+                return wave(
+                    np.full(n, amplitude / n), frequency, np.zeros(n), rng.uniform(0, 2 * np.pi, n)
+                )
 
             waves = sines(motion.amplitude_x), sines(motion.amplitude_y)
             return Waves(still, since, until, waves[0]), Waves(grasp, since, until, waves[1])
         case Chirp():
             sweep = (motion.end - motion.start) / (until - since)
-            waves = [wave(a, motion.start, sweep, 0.0) for a in (motion.amplitude_x, motion.amplitude_y)]
+            waves = [
+                wave(a, motion.start, sweep, 0.0) for a in (motion.amplitude_x, motion.amplitude_y)
+            ]
             return Waves(still, since, until, waves[0]), Waves(grasp, since, until, waves[1])
         case Press():
             x = Profile([since, until], [x_0, x_0 + motion.travel])

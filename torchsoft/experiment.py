@@ -1,4 +1,5 @@
-"""Frame of an experiment: options from the command line, output times, tables, the summary and the figures."""
+"""Frame of an experiment: options from the command line, output times, tables, the summary and the
+figures."""
 
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -26,7 +27,10 @@ STEPS = (1e-6, 0.02)
 SMALLEST, LARGEST = 1e-9, 1e6
 """Of every other number; counts, seeds and entries of lists may be zero."""
 
-COARSE: dict[str, Any] = {"pad.elements_x": 60, "pad.elements_y": 2}  # Parameters of half the usual mesh.
+COARSE: dict[str, Any] = {
+    "pad.elements_x": 60,
+    "pad.elements_y": 2,
+}  # Parameters of half the usual mesh.
 
 
 def options(config: type[C], description: str | None) -> C:
@@ -42,7 +46,10 @@ def options(config: type[C], description: str | None) -> C:
             low, high = STEPS if name == "step" else (least, LARGEST)
             if isinstance(one, int | float) and not low <= one <= high:
                 option = f"--{name.replace('_', '-')}"
-                print(f"error: {option} should be from {low:g} to {high:g}, not {one!r}", file=sys.stderr)
+                print(
+                    f"error: {option} should be from {low:g} to {high:g}, not {one!r}",
+                    file=sys.stderr,
+                )
                 raise SystemExit(2)
     return given
 
@@ -61,12 +68,15 @@ def timed(function: Callable[[], T]) -> tuple[T, float]:
 
 @torch.no_grad()
 def at_the_points(rig: Rig, t: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-    """Penetration [m] and slip speed [m/s] of all contact points, (T, points) each, in the states y (T, size)."""
+    """Penetration [m] and slip speed [m/s] of all contact points, (T, points) each, in the states y
+    (T, size)."""
     state = rig.unpack(y, rig.follow(t))
     depths, speeds = [], []
     for name, interface in rig.evaluate(t, state).interfaces.items():
         depths.append(interface.frame.g)
-        at = rig.contacts[name].law(depths[-1], *interface.flow.unbind(-1), state.stretch[name], rig.weight(name))
+        at = rig.contacts[name].law(
+            depths[-1], *interface.flow.unbind(-1), state.stretch[name], rig.weight(name)
+        )
         speeds.append(at.gamma_dot.abs())
     return torch.cat(depths, -1), torch.cat(speeds, -1)
 
@@ -78,19 +88,32 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
 
 
 def numbers(title: str, rows: Mapping[str, Mapping[str, float]], digits: int = 4) -> str:
-    """A Markdown table of numbers: a line for each of the rows, a column for each name in the first of them."""
+    """A Markdown table of numbers: a line for each of the rows, a column for each name in the first
+    of them."""
     names = list(next(iter(rows.values())))
-    cells = [(key, *(f"{row[name]:.{digits}g}" if name in row else "" for name in names)) for key, row in rows.items()]
+    cells = [
+        (key, *(f"{row[name]:.{digits}g}" if name in row else "" for name in names))
+        for key, row in rows.items()
+    ]
     return markdown((title, *names), cells)
 
 
 def write(
-    config: Any, content: Mapping[str, Any], figures: Mapping[str, Figure] | None = None, table: str = ""
+    config: Any,
+    content: Mapping[str, Any],
+    figures: Mapping[str, Figure] | None = None,
+    table: str = "",
 ) -> None:
-    """Write to the configured folder `summary.json`, with version and configuration at the top, figures by name, and `table.md`
-    if there is a table, which is printed too; each file appears whole or not at all."""
-    options = {name: str(one) if isinstance(one, Path) else one for name, one in asdict(config).items()}
-    write_json(config.out / "summary.json", {"torchsoft": version("torchsoft"), "config": options, **content})
+    """Write to the configured folder `summary.json`, with version and configuration at the top,
+    figures by name, and `table.md` if there is a table, which is printed too; each file appears
+    whole or not at all."""
+    options = {
+        name: str(one) if isinstance(one, Path) else one for name, one in asdict(config).items()
+    }
+    write_json(
+        config.out / "summary.json",
+        {"torchsoft": version("torchsoft"), "config": options, **content},
+    )
     for name, figure in (figures or {}).items():
         save(figure, config.out / f"{name}.png")
     if table:

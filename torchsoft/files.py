@@ -35,11 +35,13 @@ PARTIAL = re.compile(r"\.[0-9a-f]{16}\.partial$")
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
-    """A path beside `path` to write to, which replaces `path` at the end: the file appears whole or not at all, and lasts.
+    """A path beside `path` to write to, which replaces `path` at the end: the file appears whole or
+    not at all, and lasts.
 
-    Missing folders are made. The partial file is removed when writing it fails; one that a killed process left is
-    removed by the next that writes the same file. Its writer holds a lock on it, so that nobody removes it before.
-    Raises `IsADirectoryError` before anything is written where `path` is a folder.
+    Missing folders are made. The partial file is removed when writing it fails; one that a killed
+    process left is removed by the next that writes the same file. Its writer holds a lock on it, so
+    that nobody removes it before. Raises `IsADirectoryError` before anything is written where
+    `path` is a folder.
     """
     path = Path(path)
     if path.is_dir():
@@ -66,7 +68,9 @@ def new_partial(path: Path) -> tuple[Path, int]:
     while True:
         partial = path.with_name(f"{path.name}.{secrets.token_hex(8)}.partial")
         handle = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        with suppress(OSError):  # where the file system has no locks, nobody removes partial files either
+        with suppress(
+            OSError
+        ):  # where the file system has no locks, nobody removes partial files either
             if fcntl is not None:
                 fcntl.flock(handle, fcntl.LOCK_EX)
         if partial.exists():
@@ -103,13 +107,13 @@ RESULTS = {"summary.json": 100e6, "answer.json": 1e9}
 
 
 def claim(folder: Path, force: bool = False) -> None:
-    """Make a folder for results, or take one that results were written to. Raises `ValueError` for a folder of anything else,
-    unless by `force`, and `OSError`."""
+    """Make a folder for results, or take one that results were written to. Raises `ValueError` for
+    a folder of anything else, unless by `force`, and `OSError`."""
     make_folder(folder)
     if not force and not is_results(folder) and (there := sorted(folder.iterdir())):
         raise ValueError(
-            f"--out: {folder} holds {there[0].name}, which is no result of torchsoft and might be overwritten; name a new "
-            "folder, or say --force"
+            f"--out: {folder} holds {there[0].name}, which is no result of torchsoft and might be "
+            "overwritten; name a new folder, or say --force"
         )
 
 
@@ -123,19 +127,20 @@ def is_results(folder: Path) -> bool:
 
 
 def check_file(path: str | Path, most: float) -> Path:
-    """The path of a file that may be read whole. Raises `ValueError` for a device, a pipe, and a file of more than `most` [B];
-    `OSError` where there is none."""
+    """The path of a file that may be read whole. Raises `ValueError` for a device, a pipe, and a
+    file of more than `most` [B]; `OSError` where there is none."""
     status = os.stat(path)
     if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     if not stat.S_ISREG(status.st_mode):
         raise ValueError(
-            f"{path} is no regular file but a device or a pipe; copy what it gives to a file, and name that"
+            f"{path} is no regular file but a device or a pipe; copy what it gives to a file, and "
+            "name that"
         )
     if status.st_size > most:
         raise ValueError(
-            f"{path} has {status.st_size / MEGABYTE:.3g} MB, but at most {most / MEGABYTE:.3g} MB are read of such a file; "
-            "is it the right one?"
+            f"{path} has {status.st_size / MEGABYTE:.3g} MB, but at most {most / MEGABYTE:.3g} MB "
+            "are read of such a file; is it the right one?"
         )
     return Path(path)
 
@@ -156,12 +161,14 @@ def flush_folder(path: Path) -> None:
 
 
 def sealed(content: bytes | memoryview) -> bytes:
-    """The content of a file with its checksum at the end, where formats such as HDF5 do not look."""
+    """The content of a file with its checksum at the end, where formats such as HDF5 do not
+    look."""
     return bytes(content) + sha256(content).hexdigest().encode() + SEAL
 
 
 def unsealed(path: str | Path) -> bytes:
-    """The content of such a file. Raises `ValueError` for one that does not end with the checksum of its content.
+    """The content of such a file. Raises `ValueError` for one that does not end with the checksum
+    of its content.
 
     The libraries that read a format may hang or crash with a damaged file, and say nothing of it.
     """
@@ -169,17 +176,20 @@ def unsealed(path: str | Path) -> bytes:
     content = whole[: -DIGEST - len(SEAL)]
     if not whole.endswith(SEAL):
         raise ValueError(
-            f"{path} has no checksum at its end: it is a file of another kind, or was cut or changed; save it anew"
+            f"{path} has no checksum at its end: it is a file of another kind, or was cut or "
+            "changed; save it anew"
         )
     if sealed(content) != whole:
         raise ValueError(
-            f"{path} is damaged: its content is not what was saved; save it anew or restore it from a copy"
+            f"{path} is damaged: its content is not what was saved; save it anew or restore it "
+            "from a copy"
         )
     return content
 
 
 def finite(value: Any) -> Any:
-    """The value with None for every number that is not finite, which JSON cannot express, and numpy's numbers as Python's."""
+    """The value with None for every number that is not finite, which JSON cannot express, and
+    numpy's numbers as Python's."""
     if isinstance(value, dict):
         return {k: finite(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
@@ -191,4 +201,6 @@ def finite(value: Any) -> Any:
 def write_json(path: str | Path, content: Any, indent: int = 2) -> None:
     """Write a JSON file, with null for numbers that are not finite."""
     with replacing(path) as partial:
-        partial.write_text(json.dumps(finite(content), indent=indent, allow_nan=False) + "\n", encoding="utf-8")
+        partial.write_text(
+            json.dumps(finite(content), indent=indent, allow_nan=False) + "\n", encoding="utf-8"
+        )

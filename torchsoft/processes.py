@@ -41,7 +41,9 @@ def local_processes(
     for name in THREADS:
         os.environ[name] = "1"
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(workers, context, initializer=prepare_worker, initargs=(prepare, *arguments))
+    pool = ProcessPoolExecutor(
+        workers, context, initializer=prepare_worker, initargs=(prepare, *arguments)
+    )
     try:
         yield pool
     finally:

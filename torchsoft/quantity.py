@@ -1,7 +1,8 @@
-"""Quantities: unit, bounds and meaning of a number, declared once, in the signature of the constructor that takes it.
+"""Quantities: unit, bounds and meaning of a number, declared once, in the signature of the
+constructor that takes it.
 
-Everything else that speaks of the number reads it there: the check of a module's parameters, the tables of rig files, the
-settings of the paper's rig, the bounds of an identification.
+Everything else that speaks of the number reads it there: the check of a module's parameters, the
+tables of rig files, the settings of the paper's rig, the bounds of an identification.
 """
 
 import inspect
@@ -14,8 +15,9 @@ from typing import Annotated, Any, get_args, get_origin
 
 @dataclass(frozen=True)
 class Quantity:
-    """Closed interval [`low`, `high`] in `unit`, and the meaning of the number; an annotation of a constructor's argument, and
-    of a pydantic field. Bounds are wide: they end where sums and products of such numbers would not be finite."""
+    """Closed interval [`low`, `high`] in `unit`, and the meaning of the number; an annotation of a
+    constructor's argument, and of a pydantic field. Bounds are wide: they end where sums and
+    products of such numbers would not be finite."""
 
     unit: str
     low: float
@@ -63,18 +65,21 @@ def quantity(hint: Any) -> Quantity | None:
 
 @cache
 def quantities(part: type) -> Mapping[str, Quantity]:
-    """Quantities of the arguments of a part's constructor, and of those of its base classes, by name."""
+    """Quantities of the arguments of a part's constructor, and of those of its base classes, by
+    name."""
     found: dict[str, Quantity] = {}
     for owner in reversed(part.__mro__):
-        arguments = inspect.signature(owner.__init__).parameters if "__init__" in vars(owner) else {}
+        arguments = (
+            inspect.signature(owner.__init__).parameters if "__init__" in vars(owner) else {}
+        )
         declared = {name: quantity(argument.annotation) for name, argument in arguments.items()}
         found |= {name: one for name, one in declared.items() if one is not None}
     return MappingProxyType(found)
 
 
 def quantity_of(part: object, name: str) -> Quantity | None:
-    """Quantity of the parameter `name` of a part, if its constructor declares it: "tau_2" is an entry of "tau", "own_inertia"
-    the argument "inertia"."""
+    """Quantity of the parameter `name` of a part, if its constructor declares it: "tau_2" is an
+    entry of "tau", "own_inertia" the argument "inertia"."""
     known, name = quantities(type(part)), name.removeprefix("own_")
     stem, _, number = name.rpartition("_")
     return known.get(name, known.get(stem) if number.isdigit() else None)
@@ -93,19 +98,27 @@ Points = Annotated[Iterable[tuple[float, float]], Quantity("m", -100.0, 100.0)]
 
 Mass = Annotated[float, Quantity("kg", 1e-12, 1e5, "mass")]
 
-Inertia = Annotated[float, Quantity("kg.m2", 1e-24, 1e6, "moment of inertia about the centre of mass")]
+Inertia = Annotated[
+    float, Quantity("kg.m2", 1e-24, 1e6, "moment of inertia about the centre of mass")
+]
 
-InertiaRatio = Annotated[float, Quantity("1", 1e-3, 1e3, "moment of inertia over that of a body of uniform density")]
+InertiaRatio = Annotated[
+    float, Quantity("1", 1e-3, 1e3, "moment of inertia over that of a body of uniform density")
+]
 
 Depth = Annotated[float, Quantity("m", 1e-6, 10.0, "depth out of the plane")]
 
-Modulus = Annotated[float, Quantity("Pa", 1.0, 1e13, "Young's modulus, relaxed; rubber has 0.1e6 to 10e6")]
+Modulus = Annotated[
+    float, Quantity("Pa", 1.0, 1e13, "Young's modulus, relaxed; rubber has 0.1e6 to 10e6")
+]
 
 PoissonRatio = Annotated[float, Quantity("1", -0.999, 0.4999, "Poisson's ratio")]
 
 Density = Annotated[float, Quantity("kg/m3", 1e-3, 1e6, "density")]
 
-Retardation = Annotated[float, Quantity("s", 1e-9, 1e6, "retardation time: the dashpot's viscosity over the modulus")]
+Retardation = Annotated[
+    float, Quantity("s", 1e-9, 1e6, "retardation time: the dashpot's viscosity over the modulus")
+]
 
 Stiffness = Annotated[float, Quantity("N/m", 1e-3, 1e12)]
 

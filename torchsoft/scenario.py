@@ -18,20 +18,24 @@ SETTLE = 0.5
 
 @dataclass(frozen=True)
 class Manipulation:
-    """A model that follows the paper's reference, its initial state (size,), and the grasping force [N] fed forward."""
+    """A model that follows the paper's reference, its initial state (size,), and the grasping force
+    [N] fed forward."""
 
     model: SoftGrasp
     y0: Tensor
     grasp_force: float
 
 
-def grasp_and_roll(model: SoftGrasp, *, grasp_force: float | None = None, **steps: Any) -> Manipulation:
-    """Give `model` the paper's reference, and find the grasping force that holds the bracket at y_Br(t_g).
+def grasp_and_roll(
+    model: SoftGrasp, *, grasp_force: float | None = None, **steps: Any
+) -> Manipulation:
+    """Give `model` the paper's reference, and find the grasping force that holds the bracket at
+    y_Br(t_g).
 
-    The force is fed forward along the grasp's own 7th-order profile and constant from t_g on. Friction locked in
-    during the grasp stiffens the pads, so a static estimate is too low: the grasp itself is simulated, by the secant
-    method, until the vertical loop holds the bracket within 1 um. Pass `grasp_force` [N] to skip that; `steps` say how
-    `simulate` chooses its steps.
+    The force is fed forward along the grasp's own 7th-order profile and constant from t_g on.
+    Friction locked in during the grasp stiffens the pads, so a static estimate is too low: the
+    grasp itself is simulated, by the secant method, until the vertical loop holds the bracket
+    within 1 um. Pass `grasp_force` [N] to skip that; `steps` say how `simulate` chooses its steps.
     """
     y0 = rest(model).detach()
     if grasp_force is None:
@@ -41,7 +45,8 @@ def grasp_and_roll(model: SoftGrasp, *, grasp_force: float | None = None, **step
 
 
 def reference(model: SoftGrasp, y0: Tensor, grasp_force: float) -> Reference:
-    """Eq. 20-30 from the state y0, with `grasp_force` [N] fed forward to the bracket (downwards)."""
+    """Eq. 20-30 from the state y0, with `grasp_force` [N] fed forward to the bracket
+    (downwards)."""
     p, pose = model.settings.scenario, model.unpack(y0).pose
     x_0, y_0 = float(pose["disc"][0]), float(pose["bracket"][1])
     times = [0.0, p.roll_time, p.roll_time + p.hold_time, 2 * p.roll_time + p.hold_time]
@@ -68,7 +73,9 @@ def find_grasp_force(model: SoftGrasp, y0: Tensor, tolerance: float = 1e-6, **st
         return float(run["y_Br"][-1]) - p.y_Br_grasp
 
     force, error = 0.0, height_error(0.0)
-    gain = 2.0 * float(model.parameter("control.K_98").detach())  # the pads are about as stiff as the loop
+    gain = 2.0 * float(
+        model.parameter("control.K_98").detach()
+    )  # the pads are about as stiff as the loop
     for _ in range(20):
         if abs(error) <= tolerance:
             return force
@@ -76,4 +83,6 @@ def find_grasp_force(model: SoftGrasp, y0: Tensor, tolerance: float = 1e-6, **st
         new_error = height_error(new)
         gain = (new - force) / (error - new_error)
         force, error = new, new_error
-    raise NoEquilibrium(f"no grasping force found: the bracket is still {error:.2g} m off at {force:.4g} N")
+    raise NoEquilibrium(
+        f"no grasping force found: the bracket is still {error:.2g} m off at {force:.4g} N"
+    )

@@ -1,4 +1,5 @@
-"""Tables: validated data, from Python or from a TOML file. What a table refuses it refuses in one sentence.
+"""Tables: validated data, from Python or from a TOML file. What a table refuses it refuses in one
+sentence.
 
 The sentence names every field that is wrong, what was given and what is allowed.
 """
@@ -52,7 +53,8 @@ def refusing(data: Any = None, within: str = "") -> Iterator[None]:
 
 
 class Table(BaseModel):
-    """A frozen table: unknown keys, numbers that are not finite, and text or booleans for numbers are `InvalidTable`."""
+    """A frozen table: unknown keys, numbers that are not finite, and text or booleans for numbers
+    are `InvalidTable`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=True)
 
@@ -80,8 +82,11 @@ class Table(BaseModel):
 
 
 def findings(error: ValidationError, data: Any = None, within: str = "") -> str:
-    """pydantic's findings in one sentence, each with its field (`within` another), what was given and what is allowed."""
-    found = list(dict.fromkeys(finding(one, data, within) for one in error.errors(include_url=False)))
+    """pydantic's findings in one sentence, each with its field (`within` another), what was given
+    and what is allowed."""
+    found = list(
+        dict.fromkeys(finding(one, data, within) for one in error.errors(include_url=False))
+    )
     more = len(found) - SHOWN
     return "; ".join(found[:SHOWN]) + (f"; and {more} more" if more > 0 else "")
 
@@ -89,7 +94,10 @@ def findings(error: ValidationError, data: Any = None, within: str = "") -> str:
 def finding(one: Mapping[str, Any], data: Any, within: str) -> str:
     """One finding: `pad.E should be greater than or equal to 1, not -1.0`."""
     kind = one["type"]
-    judged = kind in ("value_error", "assertion_error")  # a value that is there, not one that is missing or too many
+    judged = kind in (
+        "value_error",
+        "assertion_error",
+    )  # a value that is there, not one that is missing or too many
     place = ".".join(part for part in (within, path(one["loc"], data, judged)) if part)
     field, given, text = place or "what is given", shown(one["input"]), one["msg"]
     if kind == "extra_forbidden":
@@ -109,12 +117,16 @@ def finding(one: Mapping[str, Any], data: Any, within: str) -> str:
     if kind in ("dict_type", "model_type", "model_attributes_type"):
         return f"{field} should be a table, not {given}"
     text = SMALL.sub(lambda match: f"{float(match[0]):g}", text)  # as people write it: 1e-07
-    return f"{field} {text.removeprefix('Input ')}, not {given}" if text.startswith("Input ") else f"{field}: {text}"
+    return (
+        f"{field} {text.removeprefix('Input ')}, not {given}"
+        if text.startswith("Input ")
+        else f"{field}: {text}"
+    )
 
 
 def path(loc: tuple[int | str, ...], data: Any, there: bool) -> str:
-    """A place in `data`, which is `there` or not, as messages name it, without the names that pydantic gives to members of a
-    union."""
+    """A place in `data`, which is `there` or not, as messages name it, without the names that
+    pydantic gives to members of a union."""
     parts = []
     for i, part in enumerate(loc):
         if isinstance(data, Mapping) and part not in data and (there or i + 1 < len(loc)):
@@ -141,9 +153,13 @@ def shown(value: Any) -> str:
 
 
 def plain(text: str) -> str:
-    """Text in which characters that a terminal obeys or that turn the direction of writing are escaped; lines stay."""
+    """Text in which characters that a terminal obeys or that turn the direction of writing are
+    escaped; lines stay."""
     seen = (
-        c if c.isprintable() or c == "\n" or category(c) == "Zs" else c.encode("unicode_escape").decode() for c in text
+        c
+        if c.isprintable() or c == "\n" or category(c) == "Zs"
+        else c.encode("unicode_escape").decode()
+        for c in text
     )
     return "".join(seen)
 
@@ -160,7 +176,9 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     try:
         return tomllib.loads(Path(path).read_bytes().removeprefix(b"\xef\xbb\xbf").decode("utf-8"))
     except RecursionError:
-        raise ValueError(f"{path} is not a TOML file that can be read: its tables are nested too deeply") from None
+        raise ValueError(
+            f"{path} is not a TOML file that can be read: its tables are nested too deeply"
+        ) from None
     except ValueError as error:  # of TOML, of UTF-8, of integers with thousands of digits
         raise ValueError(f"{path} is not a TOML file: {line(error)}") from None
 

@@ -1,4 +1,5 @@
-"""Runs side by side in threads: the compiled kernels hold no lock, so runs of one process share its cores.
+"""Runs side by side in threads: the compiled kernels hold no lock, so runs of one process share its
+cores.
 
 What is not compiled does hold one; a run of a second has some twenty milliseconds of that.
 """
@@ -27,7 +28,8 @@ _entering = threading.Lock()
 
 @contextmanager
 def single_threaded() -> Iterator[None]:
-    """torch and the linear algebra libraries on one thread each, until everybody who asked for it is done.
+    """torch and the linear algebra libraries on one thread each, until everybody who asked for it
+    is done.
 
     Sums taken by more threads round differently, and contacts that stick amplify it.
     """
@@ -52,11 +54,14 @@ def executor(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, "torchsoft", torch.set_num_threads, (1,))
 
 
-def parallel_map(work: Callable[[int], T], count: int, threads: int | None = None) -> Iterator[tuple[int, T]]:
-    """`work(i)` for i below `count`, in so many threads (one a core by default), as (i, result) in the order of their ends.
+def parallel_map(
+    work: Callable[[int], T], count: int, threads: int | None = None
+) -> Iterator[tuple[int, T]]:
+    """`work(i)` for i below `count`, in so many threads (one a core by default), as (i, result) in
+    the order of their ends.
 
-    The threads inherit torch's grad mode; each computes on one core. An exception ends what has not begun, and so does Ctrl-C;
-    what runs is waited for.
+    The threads inherit torch's grad mode; each computes on one core. An exception ends what has not
+    begun, and so does Ctrl-C; what runs is waited for.
     """
     threads = min(count, cores() if threads is None else threads)
     if threads <= 1:

@@ -1,4 +1,5 @@
-"""Make the recordings of this folder: a rig whose parameters are `TRUTH`, measured by noisy sensors. Takes some seconds.
+"""Make the recordings of this folder: a rig whose parameters are `TRUTH`, measured by noisy
+sensors. Takes some seconds.
 
 python examples/identify/make.py
 """
@@ -18,7 +19,8 @@ HERE = Path(__file__).parent
 
 NOMINAL = Parameters().override({"contact.v_s": 0.05})
 TRUTH = NOMINAL.override(
-    {"contact.K_n": 1.6e5, "contact.mu_s": 0.6, "contact.mu_k": 0.5, "contact.R_t": 300.0, "pad.E": 0.9e6, "pad.tau": 12e-3}
+    {"contact.K_n": 1.6e5, "contact.mu_s": 0.6, "contact.mu_k": 0.5, "contact.R_t": 300.0,
+    "pad.E": 0.9e6, "pad.tau": 12e-3}
 )  # fmt: skip
 SENSORS = {"x_C": 10e-6, "theta": 0.5e-3, "x_Br": 10e-6, "y_Br": 10e-6, "F_x": 0.1, "F_y": 0.1}
 GRASP = {"duration": 1.2, "depth": 1.2e-3, "grasp_time": 0.25, "settle": 0.05, "senses": "bracket"}
@@ -30,13 +32,20 @@ UNITS = {"m": ("mm", 1e3), "rad": ("mrad", 1e3), "N": ("N", 1.0), "m/s": ("mm/s"
 
 
 def table(recording: Recording) -> dict[str, tuple[str, np.ndarray]]:
-    """Unit and values in SI by column: time, set-points with their rates, then what was measured."""
+    """Unit and values in SI by column: time, set-points with their rates, then what was
+    measured."""
     t = recording.times
     with torch.no_grad():
-        d = recording.rig.reference(torch.from_numpy(t), ("x_d", "y_d", "F_ff")).flatten(1).T.numpy()
+        d = (
+            recording.rig.reference(torch.from_numpy(t), ("x_d", "y_d", "F_ff"))
+            .flatten(1)
+            .T.numpy()
+        )
     reference = dict(zip(("x_d", "x_d_dot", "y_d", "y_d_dot", "F_ff"), d))
     out = {name: (CHANNELS[name].unit, value) for name, value in reference.items()}
-    return out | {name: (CHANNELS[name].unit, values) for name, (_, values) in recording.samples.items()}
+    return out | {
+        name: (CHANNELS[name].unit, values) for name, (_, values) in recording.samples.items()
+    }
 
 
 def write(recording: Recording, path: Path, digits: int = 7) -> None:
@@ -44,7 +53,9 @@ def write(recording: Recording, path: Path, digits: int = 7) -> None:
     columns = table(recording)
     with path.open("w", newline="", encoding="utf-8") as file:
         out = csv.writer(file, lineterminator="\n")
-        out.writerow(["t [s]", *(f"{name} [{UNITS[unit][0]}]" for name, (unit, _) in columns.items())])
+        out.writerow(
+            ["t [s]", *(f"{name} [{UNITS[unit][0]}]" for name, (unit, _) in columns.items())]
+        )
         for i, t in enumerate(recording.times):
             cells = [values[i] * UNITS[unit][1] for unit, values in columns.values()]
             out.writerow([f"{t:.9g}", *(f"{cell + 0.0:.{digits}g}" for cell in cells)])

@@ -1,6 +1,8 @@
-"""Question: what do a run, its gradient, its Jacobian and batches cost, how do they grow, and against what?
+"""Question: what do a run, its gradient, its Jacobian and batches cost, how do they grow, and
+against what?
 
-All in one process and one run, medians of repeated timings in turns, so that the ratios hold on a noisy machine:
+All in one process and one run, medians of repeated timings in turns, so that the ratios hold on a
+noisy machine:
 
 - the 30 s manipulation by two tolerances and by equal steps; errors against a run at rtol 1e-7;
 - over the run the sweep for the gradient of all parameters, and what the Jacobian for 8 parameters adds;
@@ -10,9 +12,9 @@ All in one process and one run, medians of repeated timings in turns, so that th
   the compiled right-hand side (`torchsoft.solve.rates`). Every method is run by a series of tolerances, from loose to tight,
   until it is as exact as the stepper, in the disc's place and in the nodal forces; that run is timed, without compiling.
 
-Command: .venv/bin/python experiments/validation/benchmark.py [--peers] [--smoke]
-Expected: the sweep at most 0.6 of a run and the Jacobian at most 2 by tolerances, more by equal steps; forces need rtol 1e-4 to
-be as exact as by 2 ms. About five minutes, three more with `--peers`.
+Command: .venv/bin/python experiments/validation/benchmark.py [--peers] [--smoke] Expected: the
+sweep at most 0.6 of a run and the Jacobian at most 2 by tolerances, more by equal steps; forces
+need rtol 1e-4 to be as exact as by 2 ms. About five minutes, three more with `--peers`.
 """
 
 import os
@@ -51,7 +53,9 @@ class Config:
     short_runs: int = 1000  # of the batch of short runs
     short_duration: float = 0.3  # simulated time of each of them [s]
     elements_x: tuple[int, ...] = (60, 120, 240, 480)  # meshes, a thirtieth of that through the pad
-    peers: bool = False  # the same equations under other integrators; needs `pip install torchsoft[peers]`
+    peers: bool = (
+        False  # the same equations under other integrators; needs `pip install torchsoft[peers]`
+    )
     window: float = 0.1  # simulated time that the other integrators get, in mid-roll [s]
     smoke: bool = False  # a size that takes seconds
 
@@ -68,7 +72,9 @@ def ways(config: Config) -> dict[str, dict[str, Any]]:
     return {f"rtol = {rtol:g}": {"rtol": rtol} for rtol in config.rtols} | equal
 
 
-def tasks(m: Manipulation, t: torch.Tensor, steps: Mapping[str, Any]) -> dict[str, Callable[[], object]]:
+def tasks(
+    m: Manipulation, t: torch.Tensor, steps: Mapping[str, Any]
+) -> dict[str, Callable[[], object]]:
     """The run, the run with its gradient by all parameters, the run with its Jacobian by eight."""
 
     def gradient() -> None:
@@ -79,12 +85,15 @@ def tasks(m: Manipulation, t: torch.Tensor, steps: Mapping[str, Any]) -> dict[st
     return {
         "run": lambda: simulate(m.model, t, y0=m.y0, **steps),
         "gradient": gradient,
-        "jacobian": lambda: simulate(m.model, t, y0=m.y0, gradient="forward", wrt=EIGHT, rigid=True, **steps),
+        "jacobian": lambda: simulate(
+            m.model, t, y0=m.y0, gradient="forward", wrt=EIGHT, rigid=True, **steps
+        ),
     }
 
 
 def interleaved(tasks: Mapping[str, Callable[[], float]], repeats: int) -> dict[str, list[float]]:
-    """What each task returns, so many times in turns after one warm-up each: noise that comes and goes hits them all."""
+    """What each task returns, so many times in turns after one warm-up each: noise that comes and
+    goes hits them all."""
     for task in tasks.values():
         task()
     out: dict[str, list[float]] = {name: [] for name in tasks}
@@ -94,13 +103,23 @@ def interleaved(tasks: Mapping[str, Callable[[], float]], repeats: int) -> dict[
     return out
 
 
-def own_batch(m: Manipulation, config: Config, count: int, duration: float, threads: int) -> Callable[[], int]:
-    """A batch in which every run has its own stiffness, dashpot and retardation time, up to 20 % to either side of the
-    model's; it returns how many failed."""
+def own_batch(
+    m: Manipulation, config: Config, count: int, duration: float, threads: int
+) -> Callable[[], int]:
+    """A batch in which every run has its own stiffness, dashpot and retardation time, up to 20 % to
+    either side of the model's; it returns how many failed."""
     part, t = torch.linspace(0.8, 1.2, count, dtype=torch.float64), grid(duration)
     names = ("contact.K_n", "contact.R_t", "pad.tau")
-    own = {name: m.model.parameter(name).detach() * part.roll(i * count // 3) for i, name in enumerate(names)}
-    how: dict[str, Any] = {"y0": m.y0, "parameters": own, "threads": threads, "rtol": config.rtols[0]}
+    own = {
+        name: m.model.parameter(name).detach() * part.roll(i * count // 3)
+        for i, name in enumerate(names)
+    }
+    how: dict[str, Any] = {
+        "y0": m.y0,
+        "parameters": own,
+        "threads": threads,
+        "rtol": config.rtols[0],
+    }
     return lambda: len(simulate_batch(m.model, t, **how).failures)
 
 
@@ -121,7 +140,10 @@ def batches(config: Config) -> dict[str, Any]:
 
         return one
 
-    every = interleaved({f"{name}, {n}": task(name, n) for name in sizes for n in (1, 2)}, max(1, config.repeats // 2))
+    every = interleaved(
+        {f"{name}, {n}": task(name, n) for name in sizes for n in (1, 2)},
+        max(1, config.repeats // 2),
+    )
     out: dict[str, Any] = {}
     for name, (count, duration) in sizes.items():
         seconds = {str(threads): median(every[f"{name}, {threads}"]) for threads in (1, 2)}
@@ -135,8 +157,8 @@ def batches(config: Config) -> dict[str, Any]:
 
 
 def growth(config: Config) -> list[dict[str, Any]]:
-    """Median wall times [s] of a run over the mesh and of a batch over its runs, at the loosest tolerance, and the slopes of
-    their logarithms by least squares."""
+    """Median wall times [s] of a run over the mesh and of a batch over its runs, at the loosest
+    tolerance, and the slopes of their logarithms by least squares."""
     rtol, repeats, m = config.rtols[0], min(config.repeats, 3), prepare()
 
     def run(elements_x: int) -> Callable[[], object]:
@@ -144,12 +166,17 @@ def growth(config: Config) -> list[dict[str, Any]]:
         return lambda: simulate(made.model, t, y0=made.y0, rtol=rtol)
 
     out = []
-    meshes, counts = {n + 1: run(n) for n in config.elements_x}, (2, 4) if config.smoke else (4, 16, 64, 256)
+    meshes, counts = (
+        {n + 1: run(n) for n in config.elements_x},
+        (2, 4) if config.smoke else (4, 16, 64, 256),
+    )
     for over, tasks in {
         "surface nodes of a pad": meshes,
         "runs of a batch": {n: own_batch(m, config, n, config.short_duration, 1) for n in counts},
     }.items():
-        times = interleaved({str(n): lambda task=task: timed(task)[1] for n, task in tasks.items()}, repeats)
+        times = interleaved(
+            {str(n): lambda task=task: timed(task)[1] for n, task in tasks.items()}, repeats
+        )
         wall = [median(some) for some in times.values()]
         exponent = float(np.polyfit(np.log(list(tasks)), np.log(wall), 1)[0])
         out.append({"over": over, "values": list(tasks), "wall_s": wall, "exponent": exponent})
@@ -172,7 +199,8 @@ OURS = "torchsoft (SDIRK2)"
 
 @dataclass(frozen=True)
 class Attempt:
-    """One method at one tolerance: wall time of the window [s], right-hand sides, largest errors."""
+    """One method at one tolerance: wall time of the window [s], right-hand sides, largest
+    errors."""
 
     method: str
     rtol: float
@@ -183,7 +211,8 @@ class Attempt:
 
 
 class Window:
-    """The piece of the roll: start, output times, sizes of the state's components, the exact states, the right-hand side."""
+    """The piece of the roll: start, output times, sizes of the state's components, the exact
+    states, the right-hand side."""
 
     def __init__(self, config: Config) -> None:
         m = prepare()
@@ -198,15 +227,22 @@ class Window:
             values = self.exact[:, here] - (self.exact[0, here] if part == "pose" else 0.0)
             self.size[here] = np.abs(values).max()
         self.place = slices["pose", "disc"].start + np.arange(2)
-        self.pads = np.concatenate([np.arange(s.start, s.stop) for (part, _), s in slices.items() if part == "pads"])
+        self.pads = np.concatenate(
+            [np.arange(s.start, s.stop) for (part, _), s in slices.items() if part == "pads"]
+        )
         self.f = Rates(self.model)
 
-    def attempt(self, method: str, rtol: float, solve: Callable[[], Array], repeats: int) -> Attempt:
+    def attempt(
+        self, method: str, rtol: float, solve: Callable[[], Array], repeats: int
+    ) -> Attempt:
         """Run and time one method; repeated runs are timed after the first."""
         self.f.calls = 0
         try:
             y, first = timed(solve)
-        except (RuntimeError, AssertionError):  # a trial state without forces, or steps that underflow
+        except (
+            RuntimeError,
+            AssertionError,
+        ):  # a trial state without forces, or steps that underflow
             return Attempt(method, rtol, np.inf, self.f.calls, np.inf, np.inf)
         if y.shape != self.exact.shape:  # given up on the way
             return Attempt(method, rtol, first, self.f.calls, np.inf, np.inf)
@@ -223,20 +259,30 @@ Solver = Callable[[float], Callable[[], Array]]
 
 
 def scipy_solvers(w: Window) -> dict[str, Solver]:
-    """scipy's own: LSODA by its Fortran loop, the others by `solve_ivp`; they difference the Jacobian themselves."""
+    """scipy's own: LSODA by its Fortran loop, the others by `solve_ivp`; they difference the
+    Jacobian themselves."""
     y0, t = w.y0.numpy(), w.t.numpy()
 
     def ivp(method: str) -> Solver:
         return lambda rtol: (
-            lambda: solve_ivp(w.f, (t[0], t[-1]), y0, method=method, t_eval=t, rtol=rtol, atol=rtol * w.size).y.T
+            lambda: (
+                solve_ivp(
+                    w.f, (t[0], t[-1]), y0, method=method, t_eval=t, rtol=rtol, atol=rtol * w.size
+                ).y.T
+            )
         )
 
-    lsoda: Solver = lambda rtol: lambda: odeint(w.f, y0, t, tfirst=True, rtol=rtol, atol=rtol * w.size, mxstep=100_000)
-    return {"scipy LSODA": lsoda} | {f"scipy {name}": ivp(name) for name in ("BDF", "Radau", "RK23", "RK45")}
+    lsoda: Solver = lambda rtol: (
+        lambda: odeint(w.f, y0, t, tfirst=True, rtol=rtol, atol=rtol * w.size, mxstep=100_000)
+    )
+    return {"scipy LSODA": lsoda} | {
+        f"scipy {name}": ivp(name) for name in ("BDF", "Radau", "RK23", "RK45")
+    }
 
 
 def torchdiffeq_solvers(w: Window) -> dict[str, Solver]:
-    """torchdiffeq's explicit methods on the compiled right-hand side; it has no adaptive implicit one."""
+    """torchdiffeq's explicit methods on the compiled right-hand side; it has no adaptive implicit
+    one."""
     from torchdiffeq import odeint as integrate
 
     def f(t: Tensor, y: Tensor) -> Tensor:
@@ -255,7 +301,9 @@ def torchdiffeq_solvers(w: Window) -> dict[str, Solver]:
 
 def diffrax_solvers(w: Window) -> dict[str, Solver]:
     """diffrax's explicit methods, jitted, with the right-hand side as a callback."""
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+    os.environ.setdefault(
+        "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+    )
     import diffrax  # pyright: ignore[reportMissingImports]
     import jax  # pyright: ignore[reportMissingImports]
 
@@ -263,9 +311,15 @@ def diffrax_solvers(w: Window) -> dict[str, Solver]:
     shape, size = jax.ShapeDtypeStruct(w.size.shape, np.float64), jax.numpy.asarray(w.size)
 
     def rhs(t: Any, y: Any) -> Any:
-        return jax.pure_callback(lambda t, y: w.f(float(t), np.asarray(y)), shape, t, y, vmap_method="sequential")
+        return jax.pure_callback(
+            lambda t, y: w.f(float(t), np.asarray(y)), shape, t, y, vmap_method="sequential"
+        )
 
-    term, t, y0 = diffrax.ODETerm(lambda t, y, _: rhs(t, y)), w.t.numpy(), jax.numpy.asarray(w.y0.numpy())
+    term, t, y0 = (
+        diffrax.ODETerm(lambda t, y, _: rhs(t, y)),
+        w.t.numpy(),
+        jax.numpy.asarray(w.y0.numpy()),
+    )
 
     def solver(make: Any) -> Solver:
         @jax.jit
@@ -273,7 +327,15 @@ def diffrax_solvers(w: Window) -> dict[str, Solver]:
             control = diffrax.PIDController(rtol=rtol, atol=rtol * size)
             saved = diffrax.SaveAt(ts=jax.numpy.asarray(t))
             return diffrax.diffeqsolve(
-                term, make(), t[0], t[-1], 1e-4, y, saveat=saved, stepsize_controller=control, max_steps=100_000
+                term,
+                make(),
+                t[0],
+                t[-1],
+                1e-4,
+                y,
+                saveat=saved,
+                stepsize_controller=control,
+                max_steps=100_000,
             ).ys
 
         return lambda rtol: lambda: np.asarray(integrate(y0, rtol))
@@ -283,12 +345,16 @@ def diffrax_solvers(w: Window) -> dict[str, Solver]:
 
 
 def peers(config: Config) -> dict[str, Any]:
-    """For each of the stepper's tolerances every method at its loosest tolerance that is as exact."""
+    """For each of the stepper's tolerances every method at its loosest tolerance that is as
+    exact."""
     w, repeats = Window(config), min(config.repeats, 3)
     solvers = scipy_solvers(w) | torchdiffeq_solvers(w) | diffrax_solvers(w)
     goals = {
         rtol: w.attempt(
-            OURS, rtol, lambda rtol=rtol: simulate(w.model, w.t, y0=w.y0, rtol=rtol).y.numpy(), max(repeats, 9)
+            OURS,
+            rtol,
+            lambda rtol=rtol: simulate(w.model, w.t, y0=w.y0, rtol=rtol).y.numpy(),
+            max(repeats, 9),
         )
         for rtol in config.rtols
     }
@@ -302,15 +368,22 @@ def peers(config: Config) -> dict[str, Any]:
     out: dict[str, Any] = {"window_s": config.window, "begin_s": BEGIN, "equal": {}}
 
     def described(one: Attempt, goal: Attempt) -> dict[str, Any]:
-        over = {"wall_per_simulated": one.wall_s / config.window, "over_torchsoft": one.wall_s / goal.wall_s}
+        over = {
+            "wall_per_simulated": one.wall_s / config.window,
+            "over_torchsoft": one.wall_s / goal.wall_s,
+        }
         return asdict(one) | over
 
     for rtol, goal in goals.items():
         rows: dict[str, Any] = {OURS: described(goal, goal)}
         for name, some in attempts.items():
             rows[name] = None
-            for found in (one for one in some if as_exact(one, goal)):  # timed again, it has to be as exact again
-                again = w.attempt(name, found.rtol, solvers[name](found.rtol), repeats if found.wall_s < 2 else 1)
+            for found in (
+                one for one in some if as_exact(one, goal)
+            ):  # timed again, it has to be as exact again
+                again = w.attempt(
+                    name, found.rtol, solvers[name](found.rtol), repeats if found.wall_s < 2 else 1
+                )
                 if as_exact(again, goal):
                     rows[name] = described(again, goal)
                     break
@@ -326,15 +399,16 @@ def as_exact(one: Attempt, goal: Attempt) -> bool:
 def peers_table(numbers: dict[str, Any]) -> str:
     """One table for every accuracy."""
     head = (
-        "integrator", "its rtol", "wall time [s] per simulated s", "over torchsoft", "right-hand sides",
-        "error of place [nm]", "error of forces [1]",
+        "integrator", "its rtol", "wall time [s] per simulated s", "over torchsoft",
+        "right-hand sides", "error of place [nm]", "error of forces [1]",
     )  # fmt: skip
     out = []
     for way, rows in numbers["equal"].items():
         lines = [
             (
-                name, f"{one['rtol']:.2g}", f"{one['wall_per_simulated']:.3g}", f"{one['over_torchsoft']:.3g}",
-                one["calls"] if name != OURS else "", f"{one['position_nm']:.2g}", f"{one['force']:.1e}",
+                name, f"{one['rtol']:.2g}", f"{one['wall_per_simulated']:.3g}",
+                f"{one['over_torchsoft']:.3g}", one["calls"] if name != OURS else "",
+                f"{one['position_nm']:.2g}", f"{one['force']:.1e}",
             ) if one is not None else (name, "", "not reached", "", "", "", "")
             for name, one in rows.items()
         ]  # fmt: skip
@@ -352,14 +426,21 @@ def costs(config: Config) -> dict[str, Any]:
     """Times of the three tasks by every way, with errors."""
     m, t = prepare(), grid(config.duration)
     exact = simulate(m.model, t, y0=m.y0, rtol=config.exact)
-    every = {(way, name): task for way, steps in ways(config).items() for name, task in tasks(m, t, steps).items()}
+    every = {
+        (way, name): task
+        for way, steps in ways(config).items()
+        for name, task in tasks(m, t, steps).items()
+    }
     times = interleaved(
-        {f"{way}, {name}": lambda task=task: timed(task)[1] for (way, name), task in every.items()}, config.repeats
+        {f"{way}, {name}": lambda task=task: timed(task)[1] for (way, name), task in every.items()},
+        config.repeats,
     )
     out: dict[str, Any] = {"timings": times}
     for way, steps in ways(config).items():
         one = simulate(m.model, t, y0=m.y0, **steps)
-        seconds = {name: median(times[f"{way}, {name}"]) for name in ("run", "gradient", "jacobian")}
+        seconds = {
+            name: median(times[f"{way}, {name}"]) for name in ("run", "gradient", "jacobian")
+        }
         part = lambda name, seconds=seconds: seconds[name] / seconds["run"]
         out[way] = {
             "seconds": seconds, "steps": one.stats.steps, "solves": one.stats.newton_iterations,
@@ -373,10 +454,14 @@ def costs(config: Config) -> dict[str, Any]:
 def run(config: Config) -> Result:
     if config.smoke:
         config = replace(
-            config, duration=0.5, exact=1e-5, repeats=1, trajectories=2, batch_duration=0.2, short_runs=3,
-            short_duration=0.05, elements_x=(60, 120), window=5e-3,
+            config, duration=0.5, exact=1e-5, repeats=1, trajectories=2, batch_duration=0.2,
+            short_runs=3, short_duration=0.05, elements_x=(60, 120), window=5e-3,
         )  # fmt: skip
-    parts: dict[str, Callable[[Config], Any]] = {"costs": costs, "batches": batches, "growth": growth}
+    parts: dict[str, Callable[[Config], Any]] = {
+        "costs": costs,
+        "batches": batches,
+        "growth": growth,
+    }
     parts |= {"peers": peers} if config.peers else {}
     return Result(config, {name: part(config) for name, part in tqdm(parts.items(), unit="part")})
 
@@ -390,28 +475,44 @@ def worst(errors: dict[str, float]) -> dict[str, float]:
 def cost_table(config: Config, numbers: dict[str, Any]) -> str:
     """Every way with its times and errors."""
     head = (
-        "steps by", "run [s]", "error of motion [1]", "error of forces [1]", "gradient: sweep over run", "total",
+        "steps by", "run [s]", "error of motion [1]", "error of forces [1]", "gradient: sweep over "
+                                                                             "run", "total",
         "Jacobian for 8: added over run", "total",
     )  # fmt: skip
     rows = []
     for way in ways(config):
         one = numbers["costs"][way]
         motion, forces = worst(one["errors"]).values()
-        ratios = ("gradient_over_run", "gradient_total_over_run", "jacobian8_over_run", "jacobian8_total_over_run")
+        ratios = (
+            "gradient_over_run",
+            "gradient_total_over_run",
+            "jacobian8_over_run",
+            "jacobian8_total_over_run",
+        )
         run_s = f"{one['seconds']['run']:.3g}"
-        rows.append((way, run_s, f"{motion:.1e}", f"{forces:.1e}", *(f"{one[r]:.2f}" for r in ratios)))
+        rows.append(
+            (way, run_s, f"{motion:.1e}", f"{forces:.1e}", *(f"{one[r]:.2f}" for r in ratios))
+        )
     return markdown(head, rows)
 
 
 def batch_table(numbers: dict[str, Any]) -> str:
     """Both batches on one and two threads."""
-    head = ("batch", "threads", "wall time [s]", "simulated s per wall s", "runs per wall s", "failures")
+    head = (
+        "batch",
+        "threads",
+        "wall time [s]",
+        "simulated s per wall s",
+        "runs per wall s",
+        "failures",
+    )
     return markdown(
         head,
         [
             (
-                f"{one['runs']} runs of {one['simulated_s']:g} s", threads, f"{one['wall_s'][threads]:.3g}",
-                f"{one['simulated_per_wall'][threads]:.3g}", f"{one['runs_per_wall_s'][threads]:.3g}", one["failures"],
+                f"{one['runs']} runs of {one['simulated_s']:g} s", threads,
+                f"{one['wall_s'][threads]:.3g}", f"{one['simulated_per_wall'][threads]:.3g}",
+                f"{one['runs_per_wall_s'][threads]:.3g}", one["failures"],
             )
             for one in numbers["batches"].values() for threads in ("1", "2")
         ],
@@ -421,7 +522,11 @@ def batch_table(numbers: dict[str, Any]) -> str:
 def tables(result: Result) -> str:
     """All tables."""
     numbers = result.numbers
-    parts = [cost_table(result.config, numbers), batch_table(numbers), growth_table(numbers["growth"])]
+    parts = [
+        cost_table(result.config, numbers),
+        batch_table(numbers),
+        growth_table(numbers["growth"]),
+    ]
     return "\n\n".join([*parts, peers_table(numbers["peers"])] if "peers" in numbers else parts)
 
 

@@ -9,9 +9,9 @@ and forces between them and the nodes. Compared on 1 mm and 0.5 mm elements; a r
   gradient  of y_C and theta after 0.3 s of pressing and rolling, from several places, by K_n, E and K_t: the adjoint's
             largest difference from central differences over 1e-6 (is it exact?) and over 1 % (is it the trend?)
 
-Command: .venv/bin/python experiments/validation/contact_points.py [--smoke]
-Expected, 1 mm elements, nodes / 2 / 3 / 4 points: ripple of F_x 121 / 49 / 25 / 19 mN; gradient off the trend by up to
-15 / 5 / 2 / 2 %. Nodes 0.5 mm apart: 16 mN, 10 %. About seven minutes on one core.
+Command: .venv/bin/python experiments/validation/contact_points.py [--smoke] Expected, 1 mm
+elements, nodes / 2 / 3 / 4 points: ripple of F_x 121 / 49 / 25 / 19 mN; gradient off the trend by
+up to 15 / 5 / 2 / 2 %. Nodes 0.5 mm apart: 16 mN, 10 %. About seven minutes on one core.
 """
 
 from dataclasses import dataclass, replace
@@ -37,11 +37,18 @@ TRAINED = ("contact.K_n", "pad.E", "contact.K_t")
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/contact_points")
-    elements_x: tuple[int, ...] = (120, 240)  # elements along the pad; a thirtieth of that through it
+    elements_x: tuple[int, ...] = (
+        120,
+        240,
+    )  # elements along the pad; a thirtieth of that through it
     points: tuple[int, ...] = (0, 1, 2, 3, 4)  # contact points an element; 0 is one on every node
     node_mm: float = 60.0  # place of a node [mm]
     places: int = 21  # of the disc, equally spaced over 1 mm from there
-    gradient_mm: tuple[float, ...] = (0.0, 0.35, 0.7)  # starts of the runs with gradients, from there [mm]
+    gradient_mm: tuple[float, ...] = (
+        0.0,
+        0.35,
+        0.7,
+    )  # starts of the runs with gradients, from there [mm]
     duration: float = 10.0  # of the manipulation [s]
     window: tuple[float, float] = (5.0, 7.0)  # in which the ripple of F_x is taken [s]
     smoke: bool = False  # a size that takes seconds
@@ -55,7 +62,11 @@ class Result:
 
 
 def build(elements_x: int, points: int, changes: dict[str, Any] | None = None) -> SoftGrasp:
-    mesh = {"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30, "contact.points": points}
+    mesh = {
+        "pad.elements_x": elements_x,
+        "pad.elements_y": elements_x // 30,
+        "contact.points": points,
+    }
     return SoftGrasp(Parameters().override(mesh | (changes or {})))
 
 
@@ -67,11 +78,15 @@ def detrended(t: Tensor, x: Tensor, window: tuple[float, float]) -> tuple[Tensor
 
 @torch.no_grad()
 def static(config: Config, case: Key) -> dict[str, float]:
-    """Ripples of the force along the lower pad and of the height of the disc pressed at the places."""
+    """Ripples of the force along the lower pad and of the height of the disc pressed at the
+    places."""
     places = np.linspace(config.node_mm, config.node_mm + 1, config.places)
     models = [build(*case, {"scenario.x_C0": 1e-3 * x}) for x in places.tolist()]
     states = [model.unpack(press(model, model.settings.scenario.y_Br_grasp)) for model in models]
-    force, y_C = (torch.stack(x) for x in zip(*((s.pads["L"][0, :, 0].sum(), s.pose["disc"][1]) for s in states)))
+    force, y_C = (
+        torch.stack(x)
+        for x in zip(*((s.pads["L"][0, :, 0].sum(), s.pose["disc"][1]) for s in states))
+    )
     return {
         "static ripple of the force along the pad [mN]": 0.5e3 * float(np.ptp(force.numpy())),
         "static ripple of y_C [um]": 0.5e6 * float(np.ptp(y_C.numpy())),
@@ -79,19 +94,26 @@ def static(config: Config, case: Key) -> dict[str, float]:
 
 
 def gradient(case: Key, x: float) -> dict[float, float]:
-    """Largest relative difference of the adjoint from central differences, by their relative step; x [m]: start."""
+    """Largest relative difference of the adjoint from central differences, by their relative step;
+    x [m]: start."""
     model = build(*case, {"scenario.x_C0": x})
     t, y = grid(0.3, 0.1), model.settings.scenario.y_Br_grasp
     y0 = press(model, y).detach()
-    reference = Reference(x_d=Profile([0.0, 0.3], [x, x - 2e-3]), y_d=Profile([0.0, 0.3], [y, y - 2e-4]),
+    reference = Reference(x_d=Profile([0.0, 0.3], [x, x - 2e-3]),
+        y_d=Profile([0.0, 0.3], [y, y - 2e-4]),
                           F_ff=Profile([0.0], [-holding_force(model, y0)]))  # fmt: skip
 
     def ends(model: SoftGrasp, route: Any = "none") -> Tensor:
-        run = simulate(model, t, y0=y0, reference=reference, step=1e-3, tolerance=1e-10, gradient=route)
+        run = simulate(
+            model, t, y0=y0, reference=reference, step=1e-3, tolerance=1e-10, gradient=route
+        )
         return torch.stack((run["y_C"][-1], run["theta"][-1]))
 
     wanted = [model.parameter(name) for name in TRAINED]
-    exact = [torch.stack(torch.autograd.grad(end, wanted, retain_graph=True)) for end in ends(model, "discrete")]
+    exact = [
+        torch.stack(torch.autograd.grad(end, wanted, retain_graph=True))
+        for end in ends(model, "discrete")
+    ]
     errors = {1e-6: 0.0, 1e-2: 0.0}
     for d, (i, p) in product(errors, enumerate(wanted)):
         up, down = (ends(build(*case, {TRAINED[i]: p.item() * (1 + sign * d)})) for sign in (1, -1))
@@ -102,7 +124,8 @@ def gradient(case: Key, x: float) -> dict[float, float]:
 
 def run(config: Config) -> Result:
     if config.smoke:
-        config = replace(config, elements_x=(120,), points=(0, 2), places=5, gradient_mm=(0.0,), duration=0.8,
+        config = replace(config, elements_x=(120,), points=(0, 2), places=5, gradient_mm=(0.0,),
+            duration=0.8,
                          window=(0.5, 0.8))  # fmt: skip
     found, curves = {}, {}
     for case in tqdm(list(product(config.elements_x, config.points)), unit="case"):
@@ -117,7 +140,9 @@ def run(config: Config) -> Result:
             "ripple of F_x [mN]": 0.5e3 * float(np.ptp(curves[case][1].numpy())),
             "theta at the end [rad]": rolled["theta"][-1].item(),
             "energy residual, relative": rolled.energy_residual_rel,
-            "points that touch at the end": sum((force[-1, :, 0] > 0).sum().item() for force in rolled.force.values()),
+            "points that touch at the end": sum(
+                (force[-1, :, 0] > 0).sum().item() for force in rolled.force.values()
+            ),
             "Newton iterations a step": rolled.stats.newton_per_step,
         } | {f"gradient from differences over {d:g}": max(e[d] for e in errors) for d in errors[0]}
     return Result(config, found, curves)
@@ -141,7 +166,10 @@ def figure(result: Result) -> Figure:
 def main(config: Config) -> None:
     result = run(config)
     cases = {label(case): one for case, one in result.numbers.items()}
-    rows = {name: {case: one[name] for case, one in cases.items()} for name in next(iter(cases.values()))}
+    rows = {
+        name: {case: one[name] for case, one in cases.items()}
+        for name in next(iter(cases.values()))
+    }
     figures = {"contact_points": figure(result)}
     write(config, {"cases": cases}, figures, numbers("elements, points", rows))
 

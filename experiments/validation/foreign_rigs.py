@@ -1,15 +1,18 @@
-"""Question: can an interval be wrong without a warning beside it, when the rig is not the one that the fit takes for granted?
+"""Question: can an interval be wrong without a warning beside it, when the rig is not the one that
+the fit takes for granted?
 
-A second simulator (`tests/foreign`: own finite elements, one dense Newton system, backward Euler at 20 us, no function shared
-with torchsoft) makes recordings of rigs that differ in what a laboratory would not know: the mesh, the friction law, the ramps
-at touch-down, the place of the disc, its radius. Others differ in the sensors (zero, sign, delay, colour) or in what is noted
-down (set-points at the samples only, F_ff left out, whose x the loop measures). `torchsoft.sysid` identifies eight
-parameters from each, with noise of 10 um, 0.5 mrad and 0.1 N at 200 Hz; every case has the same noise, so that cases differ
-by what is wrong and not by luck. An interval holds the truth or not; a warning names the cause or not.
+A second simulator (`tests/foreign`: own finite elements, one dense Newton system, backward Euler at
+20 us, no function shared with torchsoft) makes recordings of rigs that differ in what a laboratory
+would not know: the mesh, the friction law, the ramps at touch-down, the place of the disc, its
+radius. Others differ in the sensors (zero, sign, delay, colour) or in what is noted down
+(set-points at the samples only, F_ff left out, whose x the loop measures). `torchsoft.sysid`
+identifies eight parameters from each, with noise of 10 um, 0.5 mrad and 0.1 N at 200 Hz; every case
+has the same noise, so that cases differ by what is wrong and not by luck. An interval holds the
+truth or not; a warning names the cause or not.
 
-Command: .venv/bin/python experiments/validation/foreign_rigs.py [--smoke] [--only "mesh 240 x 6"] [--workers 2]
-Expected: every interval holds, or a warning names the cause; no case is silent. About a quarter of an hour on two cores, the
-recordings included.
+Command: .venv/bin/python experiments/validation/foreign_rigs.py [--smoke] [--only "mesh 240 x 6"]
+[--workers 2] Expected: every interval holds, or a warning names the cause; no case is silent. About
+a quarter of an hour on two cores, the recordings included.
 """
 
 import sys
@@ -27,7 +30,15 @@ from torchsoft import Parameters, Reference, SoftGrasp
 from torchsoft.excitation import Chirp, Excitation, MultiSine, Press, Strokes, begin
 from torchsoft.experiment import COARSE, markdown, options, write
 from torchsoft.physics.motion import Profile, Sampled
-from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, Unreachable, explain
+from torchsoft.sysid import (
+    RIG,
+    IdentificationResult,
+    Problem,
+    Recording,
+    Unknown,
+    Unreachable,
+    explain,
+)
 from torchsoft.sysid.recording import Array
 from torchsoft.sysid.runs import forget
 from torchsoft.threads import parallel_map
@@ -53,13 +64,14 @@ RATE = 200.0
 
 
 def excitations(smoke: bool) -> dict[str, Excitation]:
-    """Motions of a second or so: three gentle ones, which show all eight parameters together, and hard ones."""
+    """Motions of a second or so: three gentle ones, which show all eight parameters together, and
+    hard ones."""
     if smoke:
         return {
-            "pressing": Excitation(motion=Press(amplitude=4e-4, frequency=12.0, travel=8e-3), duration=0.7, grasp_time=0.15),
-            "shaking": Excitation(
-                motion=MultiSine(amplitude_x=6e-3, amplitude_y=2e-4, frequency=(4.0, 17.0)), duration=0.7, depth=4e-4,
-                grasp_time=0.15,
+            "pressing": Excitation(motion=Press(amplitude=4e-4, frequency=12.0, travel=8e-3),
+            duration=0.7, grasp_time=0.15), "shaking": Excitation(
+                motion=MultiSine(amplitude_x=6e-3, amplitude_y=2e-4, frequency=(4.0, 17.0)),
+                duration=0.7, depth=4e-4, grasp_time=0.15,
             ),
         }  # fmt: skip
     shaking = MultiSine(amplitude_x=6e-3, amplitude_y=2e-4, frequency=(4.0, 20.0))
@@ -68,12 +80,18 @@ def excitations(smoke: bool) -> dict[str, Excitation]:
             motion=Press(amplitude=8e-4, frequency=17.0, travel=20e-3), duration=1.2, depth=2.5e-3
         ),
         "light shaking": Excitation(motion=shaking, duration=1.2, depth=3e-4),
-        "light jerks": Excitation(motion=Strokes(travel=80e-3, stroke_time=0.2), duration=1.0, depth=2e-4),
+        "light jerks": Excitation(
+            motion=Strokes(travel=80e-3, stroke_time=0.2), duration=1.0, depth=2e-4
+        ),
         "deep chirp": Excitation(
-            motion=Chirp(amplitude_x=5e-3, amplitude_y=5e-4, start=1.0, end=25.0), duration=1.3, depth=2.5e-3
+            motion=Chirp(amplitude_x=5e-3, amplitude_y=5e-4, start=1.0, end=25.0),
+            duration=1.3,
+            depth=2.5e-3,
         ),
         "hard shaking": Excitation(
-            motion=MultiSine(amplitude_x=12.5e-3, amplitude_y=2e-4, frequency=(4.0, 20.0)), duration=1.2, depth=3e-4
+            motion=MultiSine(amplitude_x=12.5e-3, amplitude_y=2e-4, frequency=(4.0, 20.0)),
+            duration=1.2,
+            depth=3e-4,
         ),
     }
 
@@ -94,7 +112,8 @@ class Made(NamedTuple):
 
 
 class Order(NamedTuple):
-    """One run that is to be made: an excitation by name, and how the rig differs, by the names of `foreign.Numbers`."""
+    """One run that is to be made: an excitation by name, and how the rig differs, by the names of
+    `foreign.Numbers`."""
 
     excitation: str
     differs: tuple[tuple[str, Any], ...] = ()
@@ -110,24 +129,31 @@ def numbers(settings: Parameters, differs: Mapping[str, Any]) -> Numbers:
     """The stranger's rig: the known numbers, the truth of the unknown ones, and what differs."""
     pad, contact, control = settings.pad, settings.contact, settings.control
     known = {
-        "v_s": contact.v_s, "eta": contact.eta, "epsilon": contact.epsilon, "spacing": contact.node_spacing, "nu": pad.nu,
-        "length": pad.length, "height": pad.height, "depth": pad.depth, "across": pad.elements_x, "through": pad.elements_y,
-        "radius": settings.disc.radius, "mass": settings.disc.mass, "bracket_mass": settings.bracket.mass,
-        "cm_height": settings.bracket.cm_height, "gravity": settings.scenario.gravity, "x_C0": settings.scenario.x_C0,
-        "K_x": control.K_81, "R_x": control.R_80, "K_y": control.K_98, "R_y": control.R_99,
+        "v_s": contact.v_s, "eta": contact.eta, "epsilon": contact.epsilon,
+        "spacing": contact.node_spacing, "nu": pad.nu, "length": pad.length, "height": pad.height,
+        "depth": pad.depth, "across": pad.elements_x, "through": pad.elements_y,
+        "radius": settings.disc.radius, "mass": settings.disc.mass,
+        "bracket_mass": settings.bracket.mass, "cm_height": settings.bracket.cm_height,
+        "gravity": settings.scenario.gravity, "x_C0": settings.scenario.x_C0, "K_x": control.K_81,
+        "R_x": control.R_80, "K_y": control.K_98, "R_y": control.R_99,
         "senses_disc": control.senses == "disc",
     }  # fmt: skip
-    return Numbers(**known | {name.split(".")[1]: value for name, value in TRUTH.items()} | dict(differs))
+    return Numbers(
+        **known | {name.split(".")[1]: value for name, value in TRUTH.items()} | dict(differs)
+    )
 
 
 def make(order: Order, step: float, smoke: bool) -> Made:
-    """A run of the stranger's simulator on steps of `step` and of twice that, extrapolated to none, for the error of backward
-    Euler is of first order. The literal law jumps, and is not extrapolated."""
+    """A run of the stranger's simulator on steps of `step` and of twice that, extrapolated to none,
+    for the error of backward Euler is of first order. The literal law jumps, and is not
+    extrapolated."""
     fine = stepped(order, step, smoke)
     if dict(order.differs).get("literal"):
         return fine
     coarse = stepped(order, 2 * step, smoke)
-    return fine._replace(channels={name: 2 * value - coarse.channels[name] for name, value in fine.channels.items()})
+    return fine._replace(
+        channels={name: 2 * value - coarse.channels[name] for name, value in fine.channels.items()}
+    )
 
 
 def stepped(order: Order, step: float, smoke: bool) -> Made:
@@ -145,7 +171,9 @@ def make_all(orders: Sequence[Order], step: float, smoke: bool, workers: int) ->
     """All runs, side by side in threads."""
     every = list(dict.fromkeys(orders))
     work = parallel_map(lambda i: make(every[i], step, smoke), len(every), workers)
-    return {every[i]: made for i, made in tqdm(work, desc="recordings", total=len(every), unit=" runs")}
+    return {
+        every[i]: made for i, made in tqdm(work, desc="recordings", total=len(every), unit=" runs")
+    }
 
 
 Samples = dict[str, tuple[Array, Array]]
@@ -153,9 +181,11 @@ Samples = dict[str, tuple[Array, Array]]
 
 
 def sampled(made: Made, seed: int, delay: Mapping[str, float], colour: float) -> Samples:
-    """What the sensors `RIG` give at `RATE` from t = 0 on, some of them late by a `delay` [s] (a multiple of `KEPT`).
+    """What the sensors `RIG` give at `RATE` from t = 0 on, some of them late by a `delay` [s] (a
+    multiple of `KEPT`).
 
-    Their noise has their own deviation and the first autocorrelation `colour`; it is the same for the same seed.
+    Their noise has their own deviation and the first autocorrelation `colour`; it is the same for
+    the same seed.
     """
     rng, out = np.random.default_rng(seed), {}
     every, first = round(1 / RATE / KEPT), int(np.searchsorted(made.t, -0.5 * KEPT))
@@ -175,8 +205,9 @@ GENTLE = ("deep pressing", "light shaking", "light jerks")
 
 @dataclass(frozen=True)
 class Case:
-    """A rig that `differs` by the names of `foreign.Numbers`, sensors that are late or coloured or have an `offset`, `flipped`
-    channels, and what the laboratory notes wrongly: other settings, no `F_ff`, set-points at the samples only.
+    """A rig that `differs` by the names of `foreign.Numbers`, sensors that are late or coloured or
+    have an `offset`, `flipped` channels, and what the laboratory notes wrongly: other settings, no
+    `F_ff`, set-points at the samples only.
 
     `cause` are words one of which a warning must have to name what is wrong; none where nothing is.
     """
@@ -232,7 +263,11 @@ CASES = (
     Case("slip at 0.15 m/s", excitations=("deep pressing", "light shaking", "hard shaking")),
     Case("mesh 240 x 6", ("mesh", "element"), differs={"across": 240, "through": 6}),
     Case("literal Coulomb", ("friction", "Coulomb", "slip law"), differs={"literal": True}),
-    Case("no ramp in the stretch rate", ("ramp", "epsilon", "touch-down"), differs={"ramp_stretch": False}),
+    Case(
+        "no ramp in the stretch rate",
+        ("ramp", "epsilon", "touch-down"),
+        differs={"ramp_stretch": False},
+    ),
     Case("epsilon 0.1 um", ("epsilon", "ramp", "touch-down"), differs={"epsilon": 1e-7}),
     Case("x_C0 off by 40 um", ("x_C0",), differs={"x_C0": 60.34e-3}),
     Case("theta zeroed elsewhere", ("theta",), offset={"theta": 0.02}),
@@ -247,8 +282,8 @@ CASES = (
 
 
 VERDICTS = ("holds", "cause named", "warned, cause not named", "silent")
-"""What may be said of a case: every interval holds the truth; one does not, and a warning names the cause, or says only that
-something is wrong; or nothing is said."""
+"""What may be said of a case: every interval holds the truth; one does not, and a warning names the
+cause, or says only that something is wrong; or nothing is said."""
 
 START = 1.6
 """Every parameter begins off by this factor, one up and the next one down."""
@@ -285,14 +320,19 @@ class Outcome:
 
     @property
     def wrong(self) -> list[str]:
-        """Parameters whose interval does not hold the truth; one without an interval claims nothing."""
+        """Parameters whose interval does not hold the truth; one without an interval claims
+        nothing."""
         rows = self.parameters()
         return [name for name, row in rows.items() if row["inside"] is False]
 
     @property
     def naming(self) -> list[str]:
         """The warnings that name what is wrong."""
-        return [text for text in self.warnings if any(word.lower() in text.lower() for word in self.case.cause)]
+        return [
+            text
+            for text in self.warnings
+            if any(word.lower() in text.lower() for word in self.case.cause)
+        ]
 
     @property
     def verdict(self) -> str:
@@ -305,7 +345,13 @@ class Outcome:
     def parameters(self) -> dict[str, dict[str, Any]]:
         out = {}
         for name, truth in self.truth.items():
-            row: dict[str, Any] = {"truth": truth, "estimate": None, "ci95": None, "relative_sd": None, "inside": None}
+            row: dict[str, Any] = {
+                "truth": truth,
+                "estimate": None,
+                "ci95": None,
+                "relative_sd": None,
+                "inside": None,
+            }
             if self.found is not None:
                 e = self.found[name]
                 row |= {"estimate": e.value, "ci95": e.ci95, "relative_sd": e.relative_sd}
@@ -316,11 +362,13 @@ class Outcome:
     def summary(self) -> dict[str, Any]:
         case, found = self.case, self.found
         return {
-            "name": case.name, "parameters": self.parameters(), "warnings": self.warnings, "verdict": self.verdict,
-            "naming_the_cause": self.naming, "wrong": self.wrong, "refused": found is None,
-            "chi2": None if found is None else found.chi2, "converged": None if found is None else found.converged,
-            "recordings": list(case.excitations), "fastest_slip": max(one.slip for one in self.made),
-            "identify_wall_s": self.wall_s, "identify_cpu_s": self.cpu_s,
+            "name": case.name, "parameters": self.parameters(), "warnings": self.warnings,
+            "verdict": self.verdict, "naming_the_cause": self.naming, "wrong": self.wrong,
+            "refused": found is None, "chi2": None if found is None else found.chi2,
+            "converged": None if found is None else found.converged,
+            "recordings": list(case.excitations),
+            "fastest_slip": max(one.slip for one in self.made), "identify_wall_s": self.wall_s,
+            "identify_cpu_s": self.cpu_s,
         }  # fmt: skip
 
 
@@ -330,7 +378,10 @@ def truths(config: Config) -> dict[str, float]:
 
 def unknowns(config: Config) -> dict[str, Unknown]:
     """Starts off by `START`; mu_k by its ratio to mu_s."""
-    out = {name: Unknown(nominal=value * START ** (-1) ** i) for i, (name, value) in enumerate(truths(config).items())}
+    out = {
+        name: Unknown(nominal=value * START ** (-1) ** i)
+        for i, (name, value) in enumerate(truths(config).items())
+    }
     if "contact.mu_k" in out:
         out["contact.mu_k"] = Unknown(nominal=0.9, ratio_to="contact.mu_s", low=0.1, high=1.0)
     return out
@@ -343,12 +394,14 @@ def chosen(config: Config) -> list[Case]:
     if strange := [name for name in names if name not in known]:
         raise ValueError(f"there is no case {strange[0]!r}; the cases are {', '.join(known)}")
     return [
-        replace(known[name], excitations=("pressing", "shaking")) if config.smoke else known[name] for name in names
+        replace(known[name], excitations=("pressing", "shaking")) if config.smoke else known[name]
+        for name in names
     ]
 
 
 def runs(case: Case, config: Config) -> Path:
-    """Where the runs of a fit are kept until all cases are done: begun again, it goes through them in seconds."""
+    """Where the runs of a fit are kept until all cases are done: begun again, it goes through them
+    in seconds."""
     return config.out / f"runs-{case.name.replace(' ', '-').replace('/', '-')}"
 
 
@@ -363,7 +416,11 @@ def study(case: Case, made: Mapping[Order, Made], config: Config) -> Outcome:
         ]
         problem = Problem(recordings, RIG, unknowns(config))
         found = explain(
-            problem, rtol=config.rtol, workers=config.workers, checkpoint=runs(case, config), progress=not config.smoke
+            problem,
+            rtol=config.rtol,
+            workers=config.workers,
+            checkpoint=runs(case, config),
+            progress=not config.smoke,
         )
     except (Unreachable, ValueError) as error:
         refused = str(error)
@@ -408,10 +465,18 @@ def table(outcomes: list[Outcome]) -> str:
             text = f"{100 * (row['estimate'] / row['truth'] - 1):+.2g}"
             cells.append(text if row["inside"] else f"**{text}**")
         chi2 = "-" if one.found is None else f"{one.found.chi2:.3f}"
-        said = "; ".join(text if len(text) < 110 else text[:107] + "..." for text in one.warnings) or "-"
-        rows.append((one.case.name, *cells, chi2, one.verdict, f"{one.wall_s:.0f}", said.replace("|", "/")))
+        said = (
+            "; ".join(text if len(text) < 110 else text[:107] + "..." for text in one.warnings)
+            or "-"
+        )
+        rows.append(
+            (one.case.name, *cells, chi2, one.verdict, f"{one.wall_s:.0f}", said.replace("|", "/"))
+        )
     short = [name.split(".")[1] for name in (outcomes[0].truth if outcomes else TRUTH)]
-    return markdown(("case", *(f"{name} [%]" for name in short), "chi2", "verdict", "wall [s]", "warnings"), rows)
+    return markdown(
+        ("case", *(f"{name} [%]" for name in short), "chi2", "verdict", "wall [s]", "warnings"),
+        rows,
+    )
 
 
 def main(config: Config) -> None:

@@ -1,4 +1,5 @@
-"""Question: how exact are the two routes to a gradient, in every contact mode, and what do they cost?
+"""Question: how exact are the two routes to a gradient, in every contact mode, and what do they
+cost?
 
 The loss over a window of outputs t_k is L = mean over k and i of (1/2 + (t_k - t_0)/(t_T - t_0)) (z_ki + z_ki^2 / 2), with
 z = (q - mean q) / std q of the nominal run, constants both, and q = (x_C, y_C, theta, v_C, omega, x_Br, y_Br, F_x, F_y).
@@ -9,18 +10,19 @@ and is judged by central differences D(d) = (L(p + d) - L(p - d)) / 2d of the st
 neighbouring pair of relative steps d gives a Richardson value; the three in a row that agree best are the plateau, and their
 spread is the judge's own uncertainty. No gradient is looked at to choose the step.
 
-Windows: `stick` (gentle rolling in the grasp), `slip` (a 2 mm stroke in 20 ms with mu_s = 0.3, mu_k = 0.2, v_s = 50 mm/s),
-`make-break` (rolling at 4.4 mm/s), `grasp` (the bracket coming down from 20 um above touching) and `full` (the 30 s
-manipulation).
+Windows: `stick` (gentle rolling in the grasp), `slip` (a 2 mm stroke in 20 ms with mu_s = 0.3, mu_k
+= 0.2, v_s = 50 mm/s), `make-break` (rolling at 4.4 mm/s), `grasp` (the bracket coming down from 20
+um above touching) and `full` (the 30 s manipulation).
 
-Further: the literal Coulomb law, whose force jumps at break-away unless mu_s = mu_k. How far gradients depend on the step is in
-`step_accuracy.py`.
+Further: the literal Coulomb law, whose force jumps at break-away unless mu_s = mu_k. How far
+gradients depend on the step is in `step_accuracy.py`.
 
-Command: .venv/bin/python experiments/validation/gradient_accuracy.py [--smoke]
-Expected, largest error of both routes among parameters whose central difference is itself known to 1e-6: 6e-7 in each of the
-short windows, 6e-6 over 30 s and 180 node events; elsewhere within the judge's uncertainty. With the adjoint a run takes 1.3
-to 1.9 times as long. Coulomb's law with mu_s > mu_k: it calls dL/dmu_s 0, the loss falls with a slope of -0.105 +- 0.01;
-with mu_s = mu_k they agree to 2e-4. About seven minutes on one core.
+Command: .venv/bin/python experiments/validation/gradient_accuracy.py [--smoke] Expected, largest
+error of both routes among parameters whose central difference is itself known to 1e-6: 6e-7 in each
+of the short windows, 6e-6 over 30 s and 180 node events; elsewhere within the judge's uncertainty.
+With the adjoint a run takes 1.3 to 1.9 times as long. Coulomb's law with mu_s > mu_k: it calls
+dL/dmu_s 0, the loss falls with a slope of -0.105 +- 0.01; with mu_s = mu_k they agree to 2e-4.
+About seven minutes on one core.
 """
 
 import statistics
@@ -68,20 +70,27 @@ Gradient = dict[str, float]
 class Config:
     out: Path = Path("out/gradient_accuracy")
     steps: tuple[float, ...] = (1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5, 1e-5, 1e-6)
-    """relative steps of the central differences; a hundredth of them for the radius, of which 1e-4 is two ramps"""
-    full_steps: tuple[float, ...] = (3e-5, 1e-5)  # the same over the whole manipulation, where a run takes a second
+    """relative steps of the central differences; a hundredth of them for the radius, of which 1e-4
+    is two ramps"""
+    full_steps: tuple[float, ...] = (
+        3e-5,
+        1e-5,
+    )  # the same over the whole manipulation, where a run takes a second
     coulomb_ms: float = 0.02  # step of the runs with Coulomb's law [ms]
     coulomb_runs: int = 81  # runs over which the slope of its loss is averaged
     repeats: int = 5  # runs of which a time is the median
     duration: float = 30.0  # of the full window [s]
     only: tuple[str, ...] = ()  # scalar parameters; all of them if none is named
-    changes: tuple[tuple[str, float | int], ...] = ()  # parameter overrides, a coarser mesh for instance
+    changes: tuple[
+        tuple[str, float | int], ...
+    ] = ()  # parameter overrides, a coarser mesh for instance
     smoke: bool = False  # a size that takes seconds
 
 
 @dataclass(frozen=True)
 class Window:
-    """A run whose gradient is computed: from y0 (size,) through the outputs t (T,) [s] in steps of `step` [s]."""
+    """A run whose gradient is computed: from y0 (size,) through the outputs t (T,) [s] in steps of
+    `step` [s]."""
 
     name: str
     model: SoftGrasp
@@ -112,7 +121,10 @@ def make_loss(window: Window) -> Callable[[Tensor], Tensor]:
     """The loss of the docstring as a function of the states, its constants from the nominal run."""
     model, t = window.model, window.t
     nominal = signals(model, states(window), t)
-    centre, scale = nominal.mean(0), torch.maximum(nominal.std(0), torch.tensor(FLOOR, dtype=torch.float64))
+    centre, scale = (
+        nominal.mean(0),
+        torch.maximum(nominal.std(0), torch.tensor(FLOOR, dtype=torch.float64)),
+    )
     weight = (0.5 + (t - t[0]) / (t[-1] - t[0]))[:, None]
 
     def loss(y: Tensor) -> Tensor:
@@ -125,7 +137,9 @@ def make_loss(window: Window) -> Callable[[Tensor], Tensor]:
 def scalars(model: SoftGrasp, config: Config) -> dict[str, Tensor]:
     """The trained scalar parameters, called as in `Parameters`."""
     own = dict(model.named_parameters())
-    every = {name: own[path] for name, path in model.aliases.items() if path in own and name not in INERT}
+    every = {
+        name: own[path] for name, path in model.aliases.items() if path in own and name not in INERT
+    }
     chosen = {name: p for name, p in every.items() if not config.only or name in config.only}
     return {name: p for name, p in chosen.items() if p.requires_grad}
 
@@ -138,8 +152,9 @@ def collect(model: SoftGrasp, names: Iterable[str]) -> Gradient:
 
 
 def richardson(values: list[float], steps: tuple[float, ...]) -> tuple[float, float]:
-    """Plateau and uncertainty of central differences at falling steps: median and spread of the three neighbouring
-    extrapolations that agree best; with fewer, the last one and how far the two last values are apart."""
+    """Plateau and uncertainty of central differences at falling steps: median and spread of the
+    three neighbouring extrapolations that agree best; with fewer, the last one and how far the two
+    last values are apart."""
     ratios = [(a / b) ** 2 for a, b in pairwise(steps)]
     better = [b + (b - a) / (r - 1) for a, b, r in zip(values, values[1:], ratios)]
     if len(better) < 3:
@@ -159,7 +174,10 @@ def central_differences(
     for name, p in scalars(window.model, config).items():
         keep, at = p.clone(), []
         for relative in steps:
-            ends, got = [keep * (1 + sign * relative * FINER.get(name, 1.0)) for sign in (1, -1)], []
+            ends, got = (
+                [keep * (1 + sign * relative * FINER.get(name, 1.0)) for sign in (1, -1)],
+                [],
+            )
             for end in ends:
                 p.copy_(end)
                 got.append(loss(states(window)).item())
@@ -172,7 +190,10 @@ def central_differences(
 
 def relative_errors(got: Gradient, judge: Gradient) -> Gradient:
     """|got - judge| / |judge|; a gradient that both call exactly zero has no error."""
-    return {n: 0.0 if got[n] == x else abs(got[n] - x) / abs(x) if x else float("inf") for n, x in judge.items()}
+    return {
+        n: 0.0 if got[n] == x else abs(got[n] - x) / abs(x) if x else float("inf")
+        for n, x in judge.items()
+    }
 
 
 def by_backward(window: Window, loss: Callable[[Tensor], Tensor], config: Config) -> Gradient:
@@ -190,7 +211,9 @@ def by_sensitivities(window: Window, loss: Callable[[Tensor], Tensor], config: C
     y = run.y.clone().requires_grad_(True)
     y_bar, *direct = torch.autograd.grad(loss(y), (y, *chosen.values()), allow_unused=True)
     explicit = torch.stack([torch.zeros_like(y_bar[0, 0]) if g is None else g for g in direct])
-    return dict(zip(chosen, (torch.einsum("ti,tin->n", y_bar, run.sensitivities) + explicit).tolist()))
+    return dict(
+        zip(chosen, (torch.einsum("ti,tin->n", y_bar, run.sensitivities) + explicit).tolist())
+    )
 
 
 ROUTES = {"discrete": by_backward, "forward": by_sensitivities}
@@ -199,7 +222,8 @@ ROUTES = {"discrete": by_backward, "forward": by_sensitivities}
 def priced(
     window: Window, loss: Callable[[Tensor], Tensor], config: Config, route: str
 ) -> tuple[Gradient, dict[str, float]]:
-    """Gradient of a route, the median time of a plain run [s], and the median time with the gradient over it."""
+    """Gradient of a route, the median time of a plain run [s], and the median time with the
+    gradient over it."""
     plain, total, gradient = [], [], Gradient()
     for _ in range(config.repeats):
         with torch.no_grad():
@@ -213,27 +237,35 @@ def priced(
 @torch.no_grad()
 def events(window: Window, y: Tensor) -> dict[str, Any]:
     """Nodes that touch, leave, slip and begin to slip between the outputs."""
-    parts = [at_the_points(window.model, window.t[rows], y[rows]) for rows in torch.arange(len(y)).split(200)]
+    parts = [
+        at_the_points(window.model, window.t[rows], y[rows])
+        for rows in torch.arange(len(y)).split(200)
+    ]
     depth, speed = (torch.cat(part) for part in zip(*parts))
     on = depth > 0
     slipping = (speed > 0) & on
     touch, leave, onset = on[1:] & ~on[:-1], on[:-1] & ~on[1:], slipping[1:] & ~slipping[:-1]
     return {
         "steps": len(y) - 1, "touching": on.sum(1).max().item(), "touch": touch.sum().item(),
-        "leave": leave.sum().item(), "slipping": slipping.any(0).sum().item(), "slip_onsets": onset.sum().item(),
-        "fastest_slip_mm_s": 1e3 * (speed * on).max().item(),
+        "leave": leave.sum().item(), "slipping": slipping.any(0).sum().item(),
+        "slip_onsets": onset.sum().item(), "fastest_slip_mm_s": 1e3 * (speed * on).max().item(),
     }  # fmt: skip
 
 
-def stroke(config: Config, end: float, step: float, changes: dict[str, Any], every: float | None = None) -> Window:
-    """A 2 mm stroke in 20 ms out of a frictionless grasp, with little friction: nodes break away one after another."""
+def stroke(
+    config: Config, end: float, step: float, changes: dict[str, Any], every: float | None = None
+) -> Window:
+    """A 2 mm stroke in 20 ms out of a frictionless grasp, with little friction: nodes break away
+    one after another."""
     slippery = {"contact.v_s": 0.05, "contact.mu_s": 0.3, "contact.mu_k": 0.2}
     model = SoftGrasp(Parameters().override({**slippery, **dict(config.changes), **changes}))
     y0 = press(model, height := model.settings.scenario.y_Br_grasp).detach()
     load = -holding_force(model, y0)
     x = model.unpack(y0).pose["disc"][0].item()
     model.reference = Reference(
-        x_d=Profile([0.0, 0.02], [x, x - 2e-3]), y_d=Profile([0.0], [height]), F_ff=Profile([0.0], [load])
+        x_d=Profile([0.0, 0.02], [x, x - 2e-3]),
+        y_d=Profile([0.0], [height]),
+        F_ff=Profile([0.0], [load]),
     )
     return Window("slip", model, y0, linspace(0.0, end, every or step), step)
 
@@ -252,12 +284,23 @@ def windows(config: Config) -> list[Window]:
     stick, grasp = (0.01, 0.2) if config.smoke else (0.05, 0.4)
     early = 0.5 if config.smoke else 0.6
     out = [
-        Window("stick", model, path[round(100 * early)], linspace(early, early + stick, 1e-3), 1e-3),
+        Window(
+            "stick", model, path[round(100 * early)], linspace(early, early + stick, 1e-3), 1e-3
+        ),
         stroke(config, 6e-3, 2.5e-4, {}),
-        Window("make-break", model, path[-1], linspace(roll, roll + (0.05 if config.smoke else 0.5), 2e-3), 2e-3),
+        Window(
+            "make-break",
+            model,
+            path[-1],
+            linspace(roll, roll + (0.05 if config.smoke else 0.5), 2e-3),
+            2e-3,
+        ),
         Window("grasp", lowered, above, linspace(0.0, grasp, 2e-3), 2e-3),
     ]
-    return [*out, Window("full", model, manipulation.y0, linspace(0.0, config.duration, 0.01), 2e-3)]
+    return [
+        *out,
+        Window("full", model, manipulation.y0, linspace(0.0, config.duration, 0.01), 2e-3),
+    ]
 
 
 def judge_window(window: Window, config: Config) -> dict[str, Any]:
@@ -277,11 +320,16 @@ def judge_window(window: Window, config: Config) -> dict[str, Any]:
     }  # fmt: skip
 
 
-WIDTHS = (0.04, 0.02, 0.01)  # Relative half-widths over which the slope of a loss with steps is averaged.
+WIDTHS = (
+    0.04,
+    0.02,
+    0.01,
+)  # Relative half-widths over which the slope of a loss with steps is averaged.
 
 
 def coulomb(config: Config) -> dict[str, Any]:
-    """The adjoint's bias with the literal Coulomb law, by least squares over L(mu), which has steps, at several widths.
+    """The adjoint's bias with the literal Coulomb law, by least squares over L(mu), which has
+    steps, at several widths.
 
     With mu_s = mu_k both are varied together.
     """
@@ -292,13 +340,20 @@ def coulomb(config: Config) -> dict[str, Any]:
         ("mu_k, of mu_s > mu_k", 0.2, ("mu_k",)),
         ("mu_s = mu_k", 0.3, ("mu_s", "mu_k")),
     ):
-        window = stroke(config, 8e-3, h, {"contact.friction": "coulomb", "contact.mu_k": mu_k}, every=2.5e-4)
-        loss, parameters = make_loss(window), {name: window.model.parameter(f"contact.{name}") for name in varied}
+        window = stroke(
+            config, 8e-3, h, {"contact.friction": "coulomb", "contact.mu_k": mu_k}, every=2.5e-4
+        )
+        loss, parameters = (
+            make_loss(window),
+            {name: window.model.parameter(f"contact.{name}") for name in varied},
+        )
         y = states(window)
         loss(y).backward()
         adjoint = sum(parameters[name].grad.item() for name in varied)  # pyright: ignore[reportOptionalMemberAccess]
         middle, scan = parameters[varied[0]].item(), []
-        changes = torch.linspace(-max(WIDTHS), max(WIDTHS), config.coulomb_runs, dtype=torch.float64)
+        changes = torch.linspace(
+            -max(WIDTHS), max(WIDTHS), config.coulomb_runs, dtype=torch.float64
+        )
         with torch.no_grad():
             for change in changes:
                 for name in varied:
@@ -310,11 +365,16 @@ def coulomb(config: Config) -> dict[str, Any]:
         for width in WIDTHS:
             near = changes.abs() <= width * (1 + 1e-9)
             x = middle * changes[near]
-            slopes.append(((x * torch.tensor(scan, dtype=torch.float64)[near]).sum() / x.square().sum()).item())
+            slopes.append(
+                (
+                    (x * torch.tensor(scan, dtype=torch.float64)[near]).sum() / x.square().sum()
+                ).item()
+            )
         slope = sum(slopes) / len(slopes)
         out[label] = {
-            "events": events(window, y.detach()), "adjoint": adjoint, "slope": slope, "slopes": slopes, "widths": WIDTHS,
-            "uncertainty": (max(slopes) - min(slopes)) / 2, "mu": (middle * (1 + changes)).tolist(), "loss": scan,
+            "events": events(window, y.detach()), "adjoint": adjoint, "slope": slope,
+            "slopes": slopes, "widths": WIDTHS, "uncertainty": (max(slopes) - min(slopes)) / 2,
+            "mu": (middle * (1 + changes)).tolist(), "loss": scan,
         }  # fmt: skip
     return out
 
@@ -329,11 +389,13 @@ class Result:
 def run(config: Config) -> Result:
     if config.smoke:  # the same questions for three parameters on a coarse mesh
         config = replace(
-            config, steps=(3e-4, 1e-4, 3e-5), full_steps=(1e-4, 1e-5), coulomb_ms=0.25, coulomb_runs=17, repeats=1,
-            duration=0.6, only=("contact.K_n", "contact.mu_s", "pad.E"),
+            config, steps=(3e-4, 1e-4, 3e-5), full_steps=(1e-4, 1e-5), coulomb_ms=0.25,
+            coulomb_runs=17, repeats=1, duration=0.6, only=("contact.K_n", "contact.mu_s", "pad.E"),
             changes=tuple(COARSE.items()),
         )  # fmt: skip
-    judged = {window.name: judge_window(window, config) for window in tqdm(windows(config), unit="window")}
+    judged = {
+        window.name: judge_window(window, config) for window in tqdm(windows(config), unit="window")
+    }
     return Result(config, judged, coulomb(config))
 
 
@@ -348,7 +410,8 @@ def table(result: Result) -> str:
             counts = f"{e['touch']} / {e['leave']} / {e['slip_onsets']}"
             largest = f"{errors[worst]:.1e} ({worst}, {unsure[worst]:.0e})"
             rows.append((name, counts, route, largest, f"{known:.1e}", f"{cost['total']:.2f}"))
-    head = ("window", "touch / leave / slip onsets", "route", "largest error (parameter, judge's own uncertainty)",
+    head = ("window", "touch / leave / slip onsets", "route", "largest error (parameter, judge's "
+                                                              "own uncertainty)",
             "largest where the judge knows 1e-6", "total / forward")  # fmt: skip
     tables = [markdown(head, rows)]
     rows = [
@@ -366,7 +429,9 @@ def figure(result: Result) -> Figure:
     errors, jumps = fig.subplots(1, 2)
     for name, numbers in result.windows.items():
         row = numbers["relative_error"]["discrete"]
-        errors.semilogy([n.split(".")[-1] for n in row], [max(e, 1e-16) for e in row.values()], "o", label=name)
+        errors.semilogy(
+            [n.split(".")[-1] for n in row], [max(e, 1e-16) for e in row.values()], "o", label=name
+        )
     errors.tick_params(axis="x", rotation=45)
     errors.set(ylabel="relative error [1]", title="Discrete adjoint against central differences")
     for k, (label, c) in enumerate(result.coulomb.items()):
@@ -374,7 +439,9 @@ def figure(result: Result) -> Figure:
         jumps.plot(mu, L - L.mean(), f"C{k}.", ms=3, label=f"L by {label}")
         jumps.plot(mu, c["adjoint"] * (mu - mu.mean()), f"C{k}-")
     jumps.set(
-        xlabel="mu [1]", ylabel="L less its mean [1]", title="Coulomb's law to the letter; lines: the adjoint's slope"
+        xlabel="mu [1]",
+        ylabel="L less its mean [1]",
+        title="Coulomb's law to the letter; lines: the adjoint's slope",
     )
     for axes in (errors, jumps):
         axes.legend(fontsize=8)

@@ -1,15 +1,18 @@
-"""Question: do the 95 % intervals of eight parameters hold the truth in 95 % of repetitions, also where the noise is coloured?
+"""Question: do the 95 % intervals of eight parameters hold the truth in 95 % of repetitions, also
+where the noise is coloured?
 
-The three motions of `identify_contact.py`, 1.4 s of each, on half the usual mesh, many noise seeds: white noise, then noise
-that is an autoregression of order one (rho = 0.9, as large as stated), which nobody declares, so that `identify` has to find
-it; then the same recordings by white least squares, as if the colour were ignored. Each seed's intervals either hold the truth
-or not; with N seeds the fraction of those that do is binomial, and so is its own interval (Clopper-Pearson). The errors over
-the predicted standard deviations should be normal with mean 0 and deviation 1. Seeds differ in the noise only, and fits begin
-where most parameters are some standard deviations off.
+The three motions of `identify_contact.py`, 1.4 s of each, on half the usual mesh, many noise seeds:
+white noise, then noise that is an autoregression of order one (rho = 0.9, as large as stated),
+which nobody declares, so that `identify` has to find it; then the same recordings by white least
+squares, as if the colour were ignored. Each seed's intervals either hold the truth or not; with N
+seeds the fraction of those that do is binomial, and so is its own interval (Clopper-Pearson). The
+errors over the predicted standard deviations should be normal with mean 0 and deviation 1. Seeds
+differ in the noise only, and fits begin where most parameters are some standard deviations off.
 
-Command: .venv/bin/python experiments/validation/interval_coverage.py [--seeds 100] [--workers 2] [--smoke]
-Expected: between 90 and 99 % for every parameter where colour is found or is not there, about half where it is ignored; a false
-alarm about one of a hundred recordings with white noise. About a quarter of an hour on two cores.
+Command: .venv/bin/python experiments/validation/interval_coverage.py [--seeds 100] [--workers 2]
+[--smoke] Expected: between 90 and 99 % for every parameter where colour is found or is not there,
+about half where it is ignored; a false alarm about one of a hundred recordings with white noise.
+About a quarter of an hour on two cores.
 """
 
 import sys
@@ -49,9 +52,13 @@ OFF = 1.002
 """Where a fit begins, over the truth."""
 
 SHORT = {
-    "strokes": Excitation(motion=Strokes(travel=12e-3, stroke_time=0.2), duration=0.9, senses="bracket"),
+    "strokes": Excitation(
+        motion=Strokes(travel=12e-3, stroke_time=0.2), duration=0.9, senses="bracket"
+    ),
     "shaking": Excitation(
-        motion=MultiSine(amplitude_x=8e-3, amplitude_y=2e-4, frequency=(2.0, 12.0)), duration=0.9, senses="bracket"
+        motion=MultiSine(amplitude_x=8e-3, amplitude_y=2e-4, frequency=(2.0, 12.0)),
+        duration=0.9,
+        senses="bracket",
     ),
 }
 """Excitations of the smoke test."""
@@ -70,8 +77,8 @@ class Config:
 
 
 class Repetition(NamedTuple):
-    """One seed: by parameter its error over the predicted standard deviation and whether its interval holds; notices, and the
-    orders of the noise that was found, by channel."""
+    """One seed: by parameter its error over the predicted standard deviation and whether its
+    interval holds; notices, and the orders of the noise that was found, by channel."""
 
     errors: dict[str, tuple[float, bool]]
     notices: list[str]
@@ -85,7 +92,8 @@ class Result:
     cases: dict[str, list[Repetition]]
 
     def errors(self, case: str, name: str) -> list[float]:
-        """Logarithm of estimate over truth, over the predicted standard deviation, of every seed."""
+        """Logarithm of estimate over truth, over the predicted standard deviation, of every
+        seed."""
         return [one.errors[name][0] for one in self.cases[case]]
 
     def inside(self, case: str, name: str) -> int:
@@ -98,10 +106,16 @@ def exact(config: Config, truth: dict[str, float]) -> list[Recording]:
     rest = {"contact.mu_k": 0.5} if config.smoke else {}
     nominal = Parameters().override({"contact.v_s": 0.05} | rest | COARSE)
     shorter = {name: min(CATALOGUE[name].duration, LONGEST) for name in FITTED}
-    motions = {name: CATALOGUE[name].model_copy(update={"duration": duration}) for name, duration in shorter.items()}
+    motions = {
+        name: CATALOGUE[name].model_copy(update={"duration": duration})
+        for name, duration in shorter.items()
+    }
     rig = nominal.override(truth)
     motions = SHORT if config.smoke else motions
-    return [record(name, e, rig, nominal, RIG, rtol=1e-2 * config.rtol, noise=0.0) for name, e in motions.items()]
+    return [
+        record(name, e, rig, nominal, RIG, rtol=1e-2 * config.rtol, noise=0.0)
+        for name, e in motions.items()
+    ]
 
 
 def noise(rho: float, m: int, rng: np.random.Generator) -> Array:
@@ -115,7 +129,9 @@ def problem(recordings: list[Recording], truth: dict[str, float], rho: float, se
     """Noisy recordings, and where a fit begins."""
     rng, noisy = np.random.default_rng(seed), []
     for r in recordings:
-        samples = {c: (t, y + RIG[c].noise * noise(rho, len(t), rng)) for c, (t, y) in r.samples.items()}
+        samples = {
+            c: (t, y + RIG[c].noise * noise(rho, len(t), rng)) for c, (t, y) in r.samples.items()
+        }
         noisy.append(replace(r, samples=samples))
     return identify_contact.problem(noisy, {name: OFF * value for name, value in truth.items()})
 
@@ -151,10 +167,13 @@ def run(config: Config) -> Result:
     truth = {name: TRUTH[name] for name in FEW} if config.smoke else TRUTH
     recordings, out = exact(config, truth), {}
     for case, rho, way in (
-        (WHITE, 0.0, by_identify), (FOUND, config.rho, by_identify), (IGNORED, config.rho, by_white_least_squares),
+        (WHITE, 0.0, by_identify), (FOUND, config.rho, by_identify),
+        (IGNORED, config.rho, by_white_least_squares),
     ):  # fmt: skip
         work = parallel_map(
-            lambda seed, rho=rho, way=way: way(problem(recordings, truth, rho, seed), truth, config.rtol),
+            lambda seed, rho=rho, way=way: way(
+                problem(recordings, truth, rho, seed), truth, config.rtol
+            ),
             config.seeds,
             config.workers,
         )
@@ -171,9 +190,18 @@ def figure(result: Result) -> Figure:
     for k, case in enumerate(result.cases):
         y = np.arange(len(names)) + 0.22 * (k - 1)
         counts = [result.inside(case, name) for name in names]
-        own = np.array([stats.binomtest(inside, result.config.seeds).proportion_ci(0.95) for inside in counts])
+        own = np.array(
+            [stats.binomtest(inside, result.config.seeds).proportion_ci(0.95) for inside in counts]
+        )
         axes.plot(100 * own.T, np.stack((y, y)), color=f"C{k}", lw=1.5)
-        axes.plot([100 * inside / result.config.seeds for inside in counts], y, "o", color=f"C{k}", ms=5, label=case)
+        axes.plot(
+            [100 * inside / result.config.seeds for inside in counts],
+            y,
+            "o",
+            color=f"C{k}",
+            ms=5,
+            label=case,
+        )
     axes.set_yticks(range(len(names)), [name.split(".")[1] for name in names])
     axes.set(xlabel="intervals that hold the truth [%]", ylim=(len(names) - 0.5, -0.5))
     axes.legend(loc="lower left", frameon=False)
@@ -184,7 +212,9 @@ def main(config: Config) -> None:
     result = run(config)
     n, rows, cells = result.config.seeds, {}, []
     for case, repetitions in result.cases.items():
-        kinds = Counter(" ".join(notice.split()[:4]) for one in repetitions for notice in one.notices)
+        kinds = Counter(
+            " ".join(notice.split()[:4]) for one in repetitions for notice in one.notices
+        )
         orders = Counter(order for one in repetitions for order in one.orders.values())
         found = {str(k): v for k, v in sorted(orders.items())}
         rows[case] = {"notices": dict(kinds), "orders": found, "parameters": {}}
@@ -193,7 +223,8 @@ def main(config: Config) -> None:
             own = stats.binomtest(inside, n).proportion_ci(0.95)
             mean, spread = float(np.mean(off)), float(np.std(off, ddof=1))
             rows[case]["parameters"][name] = {
-                "inside": inside, "share": inside / n, "ci95": [own.low, own.high], "mean": mean, "sd": spread, "errors": off,
+                "inside": inside, "share": inside / n, "ci95": [own.low, own.high], "mean": mean,
+                "sd": spread, "errors": off,
             }  # fmt: skip
             share = f"{own.low:.0%} .. {own.high:.0%}"
             cells.append((case, name, f"{inside} of {n}", share, f"{mean:+.2f}", f"{spread:.2f}"))

@@ -1,19 +1,22 @@
 """Question: does every run end, and say why, wherever the parameters lie?
 
-Random rigs and short motions (about 0.3 s), each run by tolerances and by equal steps. Parameters are drawn where a rig
-exists, far inside the bounds that the parts' quantities declare: stiffnesses, dashpots, times, masses and gains by a
-factor of 10 up and down from their defaults (log-uniform, as is the touch-down depth, and a factor of 3 for the pad's
-depth), mu_s from 0.05 to 2 with mu_k at 30 to 100 % of it, nu from 0 to 0.495, heights at 70 to 150 %, three meshes,
-both friction laws, contact points on nodes or two an element, whose x the loop senses. Motions are rolls, strokes,
-sines, chirps and presses after a grasp of 0.2 to 2 mm within 0.1 s, and the beginning of the grasp and roll. A draw
-that gives no start (a disc so heavy that it sinks in deeper than the grasp, a bad geometry) is counted and drawn again.
-Gains and masses so drawn make many loops unstable: their runs end with the disc lost, which is an answer.
+Random rigs and short motions (about 0.3 s), each run by tolerances and by equal steps. Parameters
+are drawn where a rig exists, far inside the bounds that the parts' quantities declare: stiffnesses,
+dashpots, times, masses and gains by a factor of 10 up and down from their defaults (log-uniform, as
+is the touch-down depth, and a factor of 3 for the pad's depth), mu_s from 0.05 to 2 with mu_k at 30
+to 100 % of it, nu from 0 to 0.495, heights at 70 to 150 %, three meshes, both friction laws,
+contact points on nodes or two an element, whose x the loop senses. Motions are rolls, strokes,
+sines, chirps and presses after a grasp of 0.2 to 2 mm within 0.1 s, and the beginning of the grasp
+and roll. A draw that gives no start (a disc so heavy that it sinks in deeper than the grasp, a bad
+geometry) is counted and drawn again. Gains and masses so drawn make many loops unstable: their runs
+end with the disc lost, which is an answer.
 
-Every run should be finite to its end or raise `SimulationFailed`, `NoEquilibrium` or `ValueError` with one sentence. A run
-that takes more than `limit` of the processor's time counts as hung, and its process is ended.
+Every run should be finite to its end or raise `SimulationFailed`, `NoEquilibrium` or `ValueError`
+with one sentence. A run that takes more than `limit` of the processor's time counts as hung, and
+its process is ended.
 
-Command: .venv/bin/python experiments/validation/random_runs.py [--smoke]
-Expected: no run hangs, none ends without a sentence or with numbers that are not finite. About twenty minutes on two cores.
+Command: .venv/bin/python experiments/validation/random_runs.py [--smoke] Expected: no run hangs,
+none ends without a sentence or with numbers that are not finite. About twenty minutes on two cores.
 """
 
 import math
@@ -37,7 +40,16 @@ from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import NoEquilibrium, Parameters, SimulationFailed, SoftGrasp, simulate
-from torchsoft.excitation import Chirp, Excitation, MultiSine, Press, Roll, RunContext, Strokes, begin
+from torchsoft.excitation import (
+    Chirp,
+    Excitation,
+    MultiSine,
+    Press,
+    Roll,
+    RunContext,
+    Strokes,
+    begin,
+)
 from torchsoft.experiment import grid, markdown, options, write
 from torchsoft.paper.equilibrium import holding_force, press, rest
 from torchsoft.physics.motion import FADE
@@ -46,13 +58,15 @@ from torchsoft.scenario import reference
 from torchsoft.threads import parallel_map
 
 SCALED = (
-    "pad.E", "pad.tau", "contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.eta", "contact.v_s",
-    "contact.epsilon", "disc.mass", "bracket.mass", "control.K_81", "control.R_80", "control.K_98", "control.R_99",
+    "pad.E", "pad.tau", "contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.eta",
+    "contact.v_s", "contact.epsilon", "disc.mass", "bracket.mass", "control.K_81", "control.R_80",
+    "control.K_98", "control.R_99",
 )  # fmt: skip
 """Drawn log-uniformly by a factor of 10 about their defaults."""
 
 GRASP, SETTLE, MOVING = 0.1, 0.02, 0.18
-"""Times [s] of the grasp, of the pause and of the motion after it; waves take what their fading needs more."""
+"""Times [s] of the grasp, of the pause and of the motion after it; waves take what their fading
+needs more."""
 
 
 def settings(rng: np.random.Generator) -> Parameters:
@@ -65,9 +79,15 @@ def settings(rng: np.random.Generator) -> Parameters:
     changes["pad.nu"] = rng.uniform(0.0, 0.495)
     changes["pad.depth"] = defaults["pad.depth"]["value"] * 3.0 ** rng.uniform(-1, 1)
     changes["pad.height"] = defaults["pad.height"]["value"] * rng.uniform(0.7, 1.5)
-    wide = 2 * changes["pad.height"] + 2 * defaults["disc.radius"]["value"] + defaults["bracket.cm_height"]["value"]
+    wide = (
+        2 * changes["pad.height"]
+        + 2 * defaults["disc.radius"]["value"]
+        + defaults["bracket.cm_height"]["value"]
+    )
     changes["scenario.y_Br_grasp"] = wide - 1e-3  # every excitation has its own
-    changes["pad.elements_x"], changes["pad.elements_y"] = [(40, 2), (60, 2), (120, 4)][rng.integers(3)]
+    changes["pad.elements_x"], changes["pad.elements_y"] = [(40, 2), (60, 2), (120, 4)][
+        rng.integers(3)
+    ]
     changes["contact.friction"] = rng.choice(["smooth", "coulomb"], p=[0.75, 0.25]).item()
     changes["contact.points"] = int(rng.choice([0, 2], p=[0.75, 0.25]))
     return Parameters().override(changes)
@@ -80,14 +100,25 @@ def excitation(rng: np.random.Generator) -> Excitation:
     waves = MOVING + FADE
     motion, moving = [
         (Roll(travel=x), MOVING),
-        (Strokes(travel=2 * x, stroke_time=math.exp(rng.uniform(math.log(0.02), math.log(0.18)))), MOVING),
-        (MultiSine(amplitude_x=x, amplitude_y=y, frequency=(low, high), seed=int(rng.integers(1000))), waves),
+        (
+            Strokes(
+                travel=2 * x, stroke_time=math.exp(rng.uniform(math.log(0.02), math.log(0.18)))
+            ),
+            MOVING,
+        ),
+        (
+            MultiSine(
+                amplitude_x=x, amplitude_y=y, frequency=(low, high), seed=int(rng.integers(1000))
+            ),
+            waves,
+        ),
         (Chirp(amplitude_x=x, amplitude_y=y, start=low, end=high), waves),
         (Press(amplitude=y, frequency=high, travel=x), waves),
     ][rng.integers(5)]
     return Excitation(
         motion=motion, duration=GRASP + SETTLE + moving, grasp_time=GRASP, settle=SETTLE,
-        depth=math.exp(rng.uniform(math.log(2e-4), math.log(2e-3))), senses=rng.choice(["bracket", "disc"]).item(),
+        depth=math.exp(rng.uniform(math.log(2e-4), math.log(2e-3))),
+        senses=rng.choice(["bracket", "disc"]).item(),
     )  # fmt: skip
 
 
@@ -129,7 +160,11 @@ DRAWS = 50
 
 STILL = 3600.0  # Wall time [s] after which a run has hung even if it takes no processor time.
 
-FINISHED, NOT_FINITE, HUNG = "finished", "finished with numbers that are not finite", "hung: its process was ended"
+FINISHED, NOT_FINITE, HUNG = (
+    "finished",
+    "finished with numbers that are not finite",
+    "hung: its process was ended",
+)
 
 
 @dataclass(frozen=True)
@@ -148,8 +183,8 @@ class Config:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a run ended: its kind, the sentence if it failed, its wall time [s], the processor's time [s], steps and those
-    refused."""
+    """How a run ended: its kind, the sentence if it failed, its wall time [s], the processor's time
+    [s], steps and those refused."""
 
     kind: str
     sentence: str = ""
@@ -169,9 +204,14 @@ class Result:
 
 
 def sentence(error: Exception) -> str:
-    """What a run says when it ends early; raises what is not meant to be said to a user, or in more than one line."""
+    """What a run says when it ends early; raises what is not meant to be said to a user, or in more
+    than one line."""
     text = str(error)
-    if not isinstance(error, SimulationFailed | NoEquilibrium | ValueError) or not text or "\n" in text:
+    if (
+        not isinstance(error, SimulationFailed | NoEquilibrium | ValueError)
+        or not text
+        or "\n" in text
+    ):
         raise error
     return text
 
@@ -183,7 +223,8 @@ def kind(error: Exception) -> str:
 
 
 def prepare(number: int, seed: int) -> tuple[Drawn, list[Outcome]]:
-    """Run `number`, and how the draws before it were refused. Raises `RuntimeError` if none of many has a start."""
+    """Run `number`, and how the draws before it were refused. Raises `RuntimeError` if none of many
+    has a start."""
     rng, refusals = np.random.default_rng((seed, number)), list[Outcome]()
     for _ in range(DRAWS):
         try:
@@ -199,13 +240,19 @@ def outcome(drawn: Drawn, steps: dict[str, Any]) -> Outcome:
         warnings.simplefilter("ignore")
         began, ticked = monotonic(), process_time()
         try:
-            run, end, said = simulate(drawn.begun.model, drawn.t, y0=drawn.begun.y0, **steps), FINISHED, ""
+            run, end, said = (
+                simulate(drawn.begun.model, drawn.t, y0=drawn.begun.y0, **steps),
+                FINISHED,
+                "",
+            )
         except (SimulationFailed, ValueError) as error:
             run, end, said = getattr(error, "trajectory", None), kind(error), sentence(error)
         wall, cpu = monotonic() - began, process_time() - ticked
     if run is None:
         return Outcome(end, said, wall_s=wall, cpu_s=cpu)
-    if end == FINISHED and not (run.y.isfinite().all() and all(x.isfinite().all() for x in run.channels.values())):
+    if end == FINISHED and not (
+        run.y.isfinite().all() and all(x.isfinite().all() for x in run.channels.values())
+    ):
         end = NOT_FINITE
     return Outcome(end, said, wall, cpu, run.stats.steps, run.stats.refused_steps)
 
@@ -231,7 +278,8 @@ def both(number: int, config: Config) -> Ends:
 
 
 def watched(limit: float) -> None:
-    """Begin a worker process that ends itself when its run takes too long; kernels do not keep that thread waiting."""
+    """Begin a worker process that ends itself when its run takes too long; kernels do not keep that
+    thread waiting."""
     CLOCKS[:] = process_time(), monotonic()
 
     def watch() -> None:
@@ -243,7 +291,8 @@ def watched(limit: float) -> None:
 
 
 def outcomes(config: Config) -> Iterator[tuple[int, Ends]]:
-    """All runs in the order of their ends, every thread with a process of its own. One whose run has hung is replaced."""
+    """All runs in the order of their ends, every thread with a process of its own. One whose run
+    has hung is replaced."""
     last, pools = monotonic() + 60 * config.minutes, SimpleQueue[ProcessPoolExecutor]()
     with ExitStack() as stack:
 
@@ -260,7 +309,9 @@ def outcomes(config: Config) -> Iterator[tuple[int, Ends]]:
                 end = HUNG if monotonic() - began >= config.limit else "its process died"
                 return "unknown", dict.fromkeys(WAYS, Outcome(end)), []
             except Exception as error:
-                unsaid = Outcome(f"error without a sentence: {type(error).__name__}", str(error)[:200])
+                unsaid = Outcome(
+                    f"error without a sentence: {type(error).__name__}", str(error)[:200]
+                )
                 ends = "unknown", dict.fromkeys(WAYS, unsaid), []
             pools.put(pool)
             return ends
@@ -286,11 +337,18 @@ def summary(result: Result) -> dict[str, Any]:
     """Counts by kind, the longest runs, and one example of every kind."""
 
     def counted(ends: list[tuple[int, Outcome]]) -> dict[str, Any]:
-        examples = {one.kind: {"run": n, "sentence": one.sentence} for n, one in sorted(ends, key=lambda end: -end[0])}
-        return {"kinds": dict(Counter(one.kind for _, one in ends).most_common()), "examples": examples}
+        examples = {
+            one.kind: {"run": n, "sentence": one.sentence}
+            for n, one in sorted(ends, key=lambda end: -end[0])
+        }
+        return {
+            "kinds": dict(Counter(one.kind for _, one in ends).most_common()),
+            "examples": examples,
+        }
 
     out: dict[str, Any] = {
-        "runs": len(result.motions), "seconds": result.seconds, "motions": Counter(result.motions.values()),
+        "runs": len(result.motions), "seconds": result.seconds,
+        "motions": Counter(result.motions.values()),
         "draws without a start": counted(result.refusals),
     }  # fmt: skip
     for way, ends in result.outcomes.items():
@@ -310,14 +368,19 @@ def table(numbers: dict[str, Any]) -> str:
     """Counts of every kind of end, by equal steps and by tolerances."""
     ways = ("equal steps", "tolerances")
     kinds = dict.fromkeys(kind for way in ways for kind in numbers[way]["kinds"])
-    rows: list[tuple[object, ...]] = [(kind, *(numbers[way]["kinds"].get(kind, 0) for way in ways)) for kind in kinds]
+    rows: list[tuple[object, ...]] = [
+        (kind, *(numbers[way]["kinds"].get(kind, 0) for way in ways)) for kind in kinds
+    ]
     measured = {
         "median processor time of those finished [s]": "median_cpu_s",
         "longest processor time [s]": "longest_cpu_s",
         "longest wall time [s]": "longest_wall_s",
         "most steps, refused ones included": "most_steps",
     }
-    rows += [(title, *(f"{numbers[way][key] or 0:.3g}" for way in ways)) for title, key in measured.items()]
+    rows += [
+        (title, *(f"{numbers[way][key] or 0:.3g}" for way in ways))
+        for title, key in measured.items()
+    ]
     return markdown((f"of {numbers['runs']} runs", *ways), rows)
 
 

@@ -1,12 +1,13 @@
 """Question: how much of the paper's manipulation is the mesh and the slip element's viscosity?
 
-The first 10 s (grasp and roll out) are run on several meshes and with several viscosities eta, down to Coulomb's limit
-eta = 0. The per-node contact values refer to 1 mm of surface and scale with a node's tributary length, so that all meshes have
-the same contact. What the step decides is in `step_accuracy.py`.
+The first 10 s (grasp and roll out) are run on several meshes and with several viscosities eta, down
+to Coulomb's limit eta = 0. The per-node contact values refer to 1 mm of surface and scale with a
+node's tributary length, so that all meshes have the same contact. What the step decides is in
+`step_accuracy.py`.
 
-Command: .venv/bin/python experiments/validation/refinement.py [--smoke]
-Expected: x_C(10 s) does not depend on the mesh, y_C in the grasp changes by less than 0.03 mm, and the peak of F_x, which rides
-on node transitions, falls with the mesh. About half a minute on one core.
+Command: .venv/bin/python experiments/validation/refinement.py [--smoke] Expected: x_C(10 s) does
+not depend on the mesh, y_C in the grasp changes by less than 0.03 mm, and the peak of F_x, which
+rides on node transitions, falls with the mesh. About half a minute on one core.
 """
 
 from dataclasses import dataclass
@@ -23,8 +24,19 @@ from torchsoft.scenario import grasp_and_roll
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/refinement")
-    elements_x: tuple[int, ...] = (60, 120, 240, 480)  # elements along the pad; a thirtieth of that through it
-    etas: tuple[float, ...] = (100.0, 10.0, 1.0, 0.1, 0.0)  # viscosities of the slip element [N.s/m]
+    elements_x: tuple[int, ...] = (
+        60,
+        120,
+        240,
+        480,
+    )  # elements along the pad; a thirtieth of that through it
+    etas: tuple[float, ...] = (
+        100.0,
+        10.0,
+        1.0,
+        0.1,
+        0.0,
+    )  # viscosities of the slip element [N.s/m]
     roll: float = 10.0  # of the runs on other meshes and with other viscosities [s]
     smoke: bool = False  # a size that takes seconds
 
@@ -37,7 +49,8 @@ class Result:
 
 
 def manipulate(changes: dict[str, Any], duration: float) -> Trajectory:
-    """The paper's manipulation with some parameters changed, its first `duration` seconds on a 10 ms grid."""
+    """The paper's manipulation with some parameters changed, its first `duration` seconds on a 10
+    ms grid."""
     model = SoftGrasp(Parameters().override(changes))
     return simulate(model, grid(duration), y0=grasp_and_roll(model).y0, step=2e-3)
 
@@ -63,7 +76,9 @@ def figures_of_merit(run: Trajectory) -> dict[str, float]:
 
 def run(config: Config) -> Result:
     if config.smoke:
-        config = Config(out=config.out, elements_x=(60, 120), etas=(10.0, 0.0), roll=0.6, smoke=True)
+        config = Config(
+            out=config.out, elements_x=(60, 120), etas=(10.0, 0.0), roll=0.6, smoke=True
+        )
 
     def merit(changes: dict[str, Any]) -> dict[str, float]:
         return figures_of_merit(manipulate(changes, config.roll))

@@ -1,20 +1,23 @@
-"""Question: does an identification that is killed at any moment come to the same answer, to the bit, when it is started again?
+"""Question: does an identification that is killed at any moment come to the same answer, to the
+bit, when it is started again?
 
-`torchsoft identify`, a process of its own, fits three parameters to two noisy recordings of half a second and keeps
-its runs in a checkpoint. It is killed (SIGKILL) at random moments: every other time as soon as a file is being
-written, after so many runs, which may be the first, the last, the answer's or the report's; else at any time, from
-the start of the process to its end. In every fourth case the checkpoint is then damaged as well: a run's file becomes
-a pickle that would make a folder if it were read as one, under a checksum that is right. The same command is started
-again and ends.
+`torchsoft identify`, a process of its own, fits three parameters to two noisy recordings of half a
+second and keeps its runs in a checkpoint. It is killed (SIGKILL) at random moments: every other
+time as soon as a file is being written, after so many runs, which may be the first, the last, the
+answer's or the report's; else at any time, from the start of the process to its end. In every
+fourth case the checkpoint is then damaged as well: a run's file becomes a pickle that would make a
+folder if it were read as one, under a checksum that is right. The same command is started again and
+ends.
 
-The same means that `answer.json` is, number by number and word by word, that of an undisturbed identification, but
-for `wall_s` (of the whole and of every stage), `cost.remembered` (the number of runs that were read and not made),
-`command` (which names the folder) and the file's own `checksum`. JSON has the shortest digits that give a number
-back, so that equal text is equal bits. The pages are not compared: they show times. Nothing but both files may be
-left over, no process may be left, nothing executed.
+The same means that `answer.json` is, number by number and word by word, that of an undisturbed
+identification, but for `wall_s` (of the whole and of every stage), `cost.remembered` (the number of
+runs that were read and not made), `command` (which names the folder) and the file's own `checksum`.
+JSON has the shortest digits that give a number back, so that equal text is equal bits. The pages
+are not compared: they show times. Nothing but both files may be left over, no process may be left,
+nothing executed.
 
-Command: .venv/bin/python experiments/validation/resume_after_kill.py [--kills 20] [--workers 1] [--smoke]
-Expected: 20 of 20. About a quarter of an hour on two cores.
+Command: .venv/bin/python experiments/validation/resume_after_kill.py [--kills 20] [--workers 1]
+[--smoke] Expected: 20 of 20. About a quarter of an hour on two cores.
 """
 
 import json
@@ -40,7 +43,12 @@ from torchsoft.excitation import Excitation, Roll, Strokes
 from torchsoft.experiment import COARSE, markdown, options, write
 from torchsoft.sysid import Recording, Sensor, record
 
-SENSORS = {"x_C": Sensor(noise=1e-5), "theta": Sensor(noise=5e-4), "y_Br": Sensor(noise=1e-5), "F_y": Sensor(noise=0.1)}
+SENSORS = {
+    "x_C": Sensor(noise=1e-5),
+    "theta": Sensor(noise=5e-4),
+    "y_Br": Sensor(noise=1e-5),
+    "F_y": Sensor(noise=0.1),
+}
 GRASP: dict[str, Any] = {"duration": 0.5, "depth": 1e-3, "grasp_time": 0.15, "settle": 0.05}
 MOTIONS = {
     "strokes": Excitation(motion=Strokes(travel=6e-3, stroke_time=0.15), **GRASP),
@@ -83,8 +91,9 @@ class Config:
 
 
 class Killed(NamedTuple):
-    """One case: when it was killed [s], the runs kept by then of all that are, whether a file was being written, whether a
-    pickle was planted, how many runs were read when it went on, how long that took [s], and what was wrong."""
+    """One case: when it was killed [s], the runs kept by then of all that are, whether a file was
+    being written, whether a pickle was planted, how many runs were read when it went on, how long
+    that took [s], and what was wrong."""
 
     at: float
     kept: int
@@ -106,11 +115,17 @@ def table(recording: Recording, path: Path) -> None:
     """A recording as a CSV file."""
     t = recording.times
     with torch.no_grad():
-        x_d, y_d, F_ff = recording.rig.reference(torch.from_numpy(t), ("x_d", "y_d", "F_ff"))[..., 0].T.numpy()
+        x_d, y_d, F_ff = recording.rig.reference(torch.from_numpy(t), ("x_d", "y_d", "F_ff"))[
+            ..., 0
+        ].T.numpy()
     known = {"t [s]": t, "x_d [m]": x_d, "y_d [m]": y_d, "F_ff [N]": F_ff}
-    columns = known | {f"{name} [{CHANNELS[name].unit}]": y for name, (_, y) in recording.samples.items()}
+    columns = known | {
+        f"{name} [{CHANNELS[name].unit}]": y for name, (_, y) in recording.samples.items()
+    }
     head = ",".join(columns)
-    np.savetxt(path, np.stack(list(columns.values()), -1), "%.17g", delimiter=",", header=head, comments="")
+    np.savetxt(
+        path, np.stack(list(columns.values()), -1), "%.17g", delimiter=",", header=head, comments=""
+    )
 
 
 class Command:
@@ -118,11 +133,23 @@ class Command:
 
     def __init__(self, folder: Path, out: Path, workers: int) -> None:
         files = [*(str(folder / f"{name}.csv") for name in MOTIONS), str(folder / "rig.toml")]
-        command = [sys.executable, "-m", "torchsoft", "identify", *files, "--out", str(out), "--workers", str(workers)]
+        command = [
+            sys.executable,
+            "-m",
+            "torchsoft",
+            "identify",
+            *files,
+            "--out",
+            str(out),
+            "--workers",
+            str(workers),
+        ]
         self.out, self.began, self.said = out, time.monotonic(), folder / f"{out.name}.txt"
         with self.said.open("ab") as said:
             env = os.environ | {"OMP_NUM_THREADS": "1"}
-            self.process = subprocess.Popen([*command, "--no-progress", "--yes"], stdout=said, stderr=said, env=env)
+            self.process = subprocess.Popen(
+                [*command, "--no-progress", "--yes"], stdout=said, stderr=said, env=env
+            )
 
     @property
     def seconds(self) -> float:
@@ -135,12 +162,18 @@ class Command:
 
     @property
     def writing(self) -> bool:
-        return any(name.endswith(".partial") for place in (self.out, self.out / "unfinished") for name in names(place))
+        return any(
+            name.endswith(".partial")
+            for place in (self.out, self.out / "unfinished")
+            for name in names(place)
+        )
 
     def end(self, limit: float) -> None:
         """Wait for it. Raises `RuntimeError` where it fails."""
         if self.process.wait(limit) != 0:
-            raise RuntimeError(f"torchsoft identify failed: {self.said.read_text(encoding='utf-8')[-2000:]}")
+            raise RuntimeError(
+                f"torchsoft identify failed: {self.said.read_text(encoding='utf-8')[-2000:]}"
+            )
 
 
 def names(folder: Path) -> list[str]:
@@ -157,7 +190,9 @@ def answer(out: Path) -> tuple[str, int]:
         content.pop(key)
     for entry in (content["cost"], *content["stages"]):
         entry.pop("wall_s")
-    return json.dumps(content | {"cost": {**content["cost"], "remembered": None}}), int(content["cost"]["remembered"])
+    return json.dumps(content | {"cost": {**content["cost"], "remembered": None}}), int(
+        content["cost"]["remembered"]
+    )
 
 
 class Trap:
@@ -185,7 +220,10 @@ def survivors(command: Command) -> list[int]:
     found = []
     for process in Path("/proc").iterdir():
         try:
-            if process.name.isdigit() and str(command.out).encode() in (process / "cmdline").read_bytes():
+            if (
+                process.name.isdigit()
+                and str(command.out).encode() in (process / "cmdline").read_bytes()
+            ):
                 found.append(int(process.name))
         except OSError:
             continue
@@ -193,7 +231,8 @@ def survivors(command: Command) -> list[int]:
 
 
 def case(config: Config, number: int, whole: tuple[str, float, int]) -> Killed:
-    """Kill, damage perhaps, start again, compare with the undisturbed identification (its answer, time [s] and runs)."""
+    """Kill, damage perhaps, start again, compare with the undisturbed identification (its answer,
+    time [s] and runs)."""
     expected, seconds, runs = whole
     rng, out = np.random.default_rng([config.seed, number]), config.out / f"case-{number}"
     trap, in_a_write = config.out / f"executed-{number}", number % 2 == 1
@@ -202,14 +241,21 @@ def case(config: Config, number: int, whole: tuple[str, float, int]) -> Killed:
         rmtree(out, ignore_errors=True)
         command = Command(config.out, out, config.workers)
         while command.process.poll() is None:
-            if command.kept >= after and command.writing if in_a_write else command.seconds >= later:
+            if (
+                command.kept >= after and command.writing
+                if in_a_write
+                else command.seconds >= later
+            ):
                 break
             time.sleep(0 if in_a_write else 1e-3)
         command.process.send_signal(signal.SIGKILL)
         at, writing = command.seconds, command.writing
         if command.process.wait() == -signal.SIGKILL:
             break
-    kept, wrong = command.kept, [f"{len(left)} processes are left"] if (left := survivors(command)) else []
+    kept, wrong = (
+        command.kept,
+        [f"{len(left)} processes are left"] if (left := survivors(command)) else [],
+    )
     planted = number % DAMAGED == DAMAGED - 1 and plant(out, trap, rng)
     began = time.monotonic()
     Command(config.out, out, config.workers).end(config.limit)
@@ -229,7 +275,10 @@ def run(config: Config) -> Result:
     config = replace(config, kills=2) if config.smoke else config
     config.out.mkdir(parents=True, exist_ok=True)
     for seed, (name, excitation) in enumerate(MOTIONS.items()):
-        table(record(name, excitation, TRUTH, NOMINAL, SENSORS, rtol=1e-5, seed=seed), config.out / f"{name}.csv")
+        table(
+            record(name, excitation, TRUTH, NOMINAL, SENSORS, rtol=1e-5, seed=seed),
+            config.out / f"{name}.csv",
+        )
     (config.out / "rig.toml").write_text(CONFIG, encoding="utf-8")
     Command(config.out, config.out / "compiled", config.workers).end(
         config.limit
@@ -240,7 +289,10 @@ def run(config: Config) -> Result:
         time.sleep(5e-3)
     command.end(config.limit)
     whole = answer(command.out)[0], command.seconds, runs
-    cases = [case(config, k, whole) for k in tqdm(range(config.kills), desc="kills", disable=config.smoke)]
+    cases = [
+        case(config, k, whole)
+        for k in tqdm(range(config.kills), desc="kills", disable=config.smoke)
+    ]
     return Result(config, whole[1], runs, cases)
 
 
@@ -248,7 +300,8 @@ def main(config: Config) -> None:
     result = run(config)
     same = sum(not one.wrong for one in result.cases)
     rows = [
-        (k, f"{one.at:.1f}", one.kept, "yes" if one.writing else "", "yes" if one.planted else "", one.remembered,
+        (k, f"{one.at:.1f}", one.kept, "yes" if one.writing else "", "yes" if one.planted else "",
+        one.remembered,
          f"{one.resumed_s:.1f}", one.wrong or "same")
         for k, one in enumerate(result.cases)
     ]  # fmt: skip
@@ -263,7 +316,10 @@ def main(config: Config) -> None:
         "answer",
     )
     shown = markdown(head, rows)
-    print(f"{same} of {len(result.cases)} the same to the bit; undisturbed {result.seconds:.1f} s, {result.runs} runs")
+    print(
+        f"{same} of {len(result.cases)} the same to the bit; undisturbed {result.seconds:.1f} s, "
+        f"{result.runs} runs"
+    )
     summary = {
         "undisturbed_s": result.seconds, "runs": result.runs, "same": same,
         "cases": [one._asdict() for one in result.cases],

@@ -1,17 +1,19 @@
-"""Question: does the grasping force against indentation converge with the mesh and with the penalty?
+"""Question: does the grasping force against indentation converge with the mesh and with the
+penalty?
 
-The disc is pressed between the pads without friction, K_pad u = sum_i F_i n_i with F_i = K_n <g_i>+ per node (Eq. 8),
-at bracket heights from first touch to the paper's y_Br = 48.6 mm. Compression is how much the two pads together give
-way. K_n refers to 1 mm of surface and scales with a node's tributary length, so a finer mesh has the same springs per
-length and the force should converge to that of a continuous layer of springs, with the square of the spacing. Stiffer
-springs should converge to a rigid contact, with 1 / K_n.
+The disc is pressed between the pads without friction, K_pad u = sum_i F_i n_i with F_i = K_n <g_i>+
+per node (Eq. 8), at bracket heights from first touch to the paper's y_Br = 48.6 mm. Compression is
+how much the two pads together give way. K_n refers to 1 mm of surface and scales with a node's
+tributary length, so a finer mesh has the same springs per length and the force should converge to
+that of a continuous layer of springs, with the square of the spacing. Stiffer springs should
+converge to a rigid contact, with 1 / K_n.
 
-Command: .venv/bin/python experiments/validation/statics.py [--smoke]
-Expected: at the full grasp 70.16 N on the upper pad with the default 1 mm nodes and K_n, 0.5 % below the limit of fine
-meshes (70.54 N), the difference falling fourfold per mesh; y_C between 23.194 and 23.197 mm on every mesh. The default
-K_n is not stiff enough to count as a mere penalty: a rigid contact takes 79.3 N, 13 % more. Light grasps, in which only
-a few nodes touch, are far less accurate: at 0.15 mm, 0.53 N on 1 mm nodes against 0.79 N on the finest. 15 s on one
-core.
+Command: .venv/bin/python experiments/validation/statics.py [--smoke] Expected: at the full grasp
+70.16 N on the upper pad with the default 1 mm nodes and K_n, 0.5 % below the limit of fine meshes
+(70.54 N), the difference falling fourfold per mesh; y_C between 23.194 and 23.197 mm on every mesh.
+The default K_n is not stiff enough to count as a mere penalty: a rigid contact takes 79.3 N, 13 %
+more. Light grasps, in which only a few nodes touch, are far less accurate: at 0.15 mm, 0.53 N on 1
+mm nodes against 0.79 N on the finest. 15 s on one core.
 """
 
 from dataclasses import asdict, dataclass
@@ -35,16 +37,26 @@ MILLI, MICRO = 1e3, 1e6
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/statics")
-    elements_x: tuple[int, ...] = (60, 120, 240, 480)  # elements along the pad; a thirtieth of that through it
-    stiffenings: tuple[float, ...] = (0.25, 1.0, 4.0, 16.0)  # multiples of the default K_n, on the default mesh
+    elements_x: tuple[int, ...] = (
+        60,
+        120,
+        240,
+        480,
+    )  # elements along the pad; a thirtieth of that through it
+    stiffenings: tuple[float, ...] = (
+        0.25,
+        1.0,
+        4.0,
+        16.0,
+    )  # multiples of the default K_n, on the default mesh
     points: int = 10  # compressions, in equal steps up to the full grasp's
     smoke: bool = False  # a size that takes seconds
 
 
 @dataclass(frozen=True)
 class Curve:
-    """One mesh and penalty, each (points,): compression [m], force on the upper pad [N], half-width of its contact [m],
-    largest penetration [m], y_C [m], and nodes of the upper pad that touch."""
+    """One mesh and penalty, each (points,): compression [m], force on the upper pad [N], half-width
+    of its contact [m], largest penetration [m], y_C [m], and nodes of the upper pad that touch."""
 
     compression: Tensor
     force: Tensor
@@ -56,7 +68,8 @@ class Curve:
 
 @dataclass(frozen=True)
 class Family:
-    """Curves that approach a limit, how far each is from it, and the expected order of the approach."""
+    """Curves that approach a limit, how far each is from it, and the expected order of the
+    approach."""
 
     curves: dict[str, Curve]
     coarseness: list[float]
@@ -64,9 +77,12 @@ class Family:
 
     @property
     def limit(self) -> float:
-        """Force at the full grasp [N], extrapolated from the last two curves at the expected order."""
+        """Force at the full grasp [N], extrapolated from the last two curves at the expected
+        order."""
         before, last = (c.force[-1].item() for c in list(self.curves.values())[-2:])
-        return last + (last - before) / ((self.coarseness[-2] / self.coarseness[-1]) ** self.order - 1)
+        return last + (last - before) / (
+            (self.coarseness[-2] / self.coarseness[-1]) ** self.order - 1
+        )
 
 
 @dataclass(frozen=True)
@@ -77,7 +93,8 @@ class Result:
 
     @property
     def families(self) -> dict[str, Family]:
-        """Both families of curves: node spacing [mm], second order; default K_n over K_n, first order."""
+        """Both families of curves: node spacing [mm], second order; default K_n over K_n, first
+        order."""
         length = MILLI * Parameters().pad.length
         return {
             "mesh": Family(self.meshes, [length / n for n in self.config.elements_x], 2),
@@ -86,7 +103,8 @@ class Result:
 
 
 def half_width(x: Tensor, g: Tensor) -> Tensor:
-    """Where the penetration g (nodes,) falls through zero right of the disc's centre [m], between nodes at x [m]."""
+    """Where the penetration g (nodes,) falls through zero right of the disc's centre [m], between
+    nodes at x [m]."""
     last = torch.nonzero(g > 0).max()
     inside, outside = g[last], g[last + 1]
     return x[last] + (x[last + 1] - x[last]) * inside / (inside - outside)
@@ -96,7 +114,9 @@ def half_width(x: Tensor, g: Tensor) -> Tensor:
 def indent(elements_x: int, stiffening: float, compressions: Tensor) -> Curve:
     """Press the disc to each of the compressions (points,) [m]."""
     K_n = stiffening * Parameters().contact.K_n
-    p = Parameters().override({"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30, "contact.K_n": K_n})
+    p = Parameters().override(
+        {"pad.elements_x": elements_x, "pad.elements_y": elements_x // 30, "contact.K_n": K_n}
+    )
     model = SoftGrasp(p)
     pad, rows = model.pads["U"], []
     for compression in compressions.tolist():
@@ -112,18 +132,23 @@ def indent(elements_x: int, stiffening: float, compressions: Tensor) -> Curve:
 
 def run(config: Config) -> Result:
     if config.smoke:
-        config = Config(out=config.out, elements_x=(60, 120), stiffenings=(1.0, 4.0), points=3, smoke=True)
+        config = Config(
+            out=config.out, elements_x=(60, 120), stiffenings=(1.0, 4.0), points=3, smoke=True
+        )
     fraction = torch.arange(1, config.points + 1, dtype=torch.float64) / config.points
     compressions = fraction * Parameters().compression
     default = Parameters().pad.elements_x
     cases = [(n, 1.0) for n in config.elements_x] + [(default, k) for k in config.stiffenings]
-    curves = {case: indent(*case, compressions) for case in tqdm(dict.fromkeys(cases), unit="curve")}
+    curves = {
+        case: indent(*case, compressions) for case in tqdm(dict.fromkeys(cases), unit="curve")
+    }
     meshes = {f"{n} x {n // 30}": curves[n, 1.0] for n in config.elements_x}
     return Result(config, meshes, {f"{k:g}": curves[default, k] for k in config.stiffenings})
 
 
 def successive(curves: dict[str, Curve]) -> dict[str, dict[str, float]]:
-    """Relative difference of the force from the next finer (or stiffer) curve: at the full grasp, and the largest."""
+    """Relative difference of the force from the next finer (or stiffer) curve: at the full grasp,
+    and the largest."""
     out = {}
     for (name, coarse), (_, fine) in pairwise(curves.items()):
         difference = (coarse.force / fine.force - 1).abs()
@@ -167,9 +192,14 @@ def figure(result: Result) -> Figure:
     for name, family in result.families.items():
         error = [abs(c.force[-1].item() / family.limit - 1) for c in family.curves.values()]
         approach.loglog(
-            family.coarseness, error, "o-", label=f"{name}, limit {family.limit:.2f} N, order {family.order}"
+            family.coarseness,
+            error,
+            "o-",
+            label=f"{name}, limit {family.limit:.2f} N, order {family.order}",
         )
-    approach.set(xlabel="node spacing / 1 mm, default $K_n$ / $K_n$", ylabel="force from its limit, relative")
+    approach.set(
+        xlabel="node spacing / 1 mm, default $K_n$ / $K_n$", ylabel="force from its limit, relative"
+    )
     force.set(xlabel="compression [mm]", ylabel="force on the upper pad [N]")
     for axes in (force, approach):
         axes.legend(fontsize="small")
@@ -183,7 +213,10 @@ def summary(result: Result) -> dict[str, Any]:
             "full_grasp": full_grasp(family.curves),
             "relative_difference_to_the_next": successive(family.curves),
             "force_limit_N": family.limit,
-            "curves": {key: {k: v.tolist() for k, v in asdict(c).items()} for key, c in family.curves.items()},
+            "curves": {
+                key: {k: v.tolist() for k, v in asdict(c).items()}
+                for key, c in family.curves.items()
+            },
         }
         for name, family in result.families.items()
     }

@@ -1,13 +1,16 @@
-"""Question: which tolerance, and which step, means which accuracy of motion, force and gradient, and at what cost?
+"""Question: which tolerance, and which step, means which accuracy of motion, force and gradient,
+and at what cost?
 
-Three motions: the paper's grasp and roll out (10 s), light shaking (1 s), and a stroke of 2 mm in 20 ms. Each is run by
-tolerances and by equal steps against a run by a much smaller tolerance: largest errors of the disc's pose and of the forces
-over their range, and the relative errors of d theta(end) / d parameter for eight parameters, by the discrete adjoint.
+Three motions: the paper's grasp and roll out (10 s), light shaking (1 s), and a stroke of 2 mm in
+20 ms. Each is run by tolerances and by equal steps against a run by a much smaller tolerance:
+largest errors of the disc's pose and of the forces over their range, and the relative errors of d
+theta(end) / d parameter for eight parameters, by the discrete adjoint.
 
-Command: .venv/bin/python experiments/validation/step_accuracy.py [--smoke]
-Expected: rtol = 1e-3 is about as near as a step of 2 ms, for a third of its cost in the manipulation; gradients are right
-later: within 1 % of every parameter's at rtol = 1e-6 in the roll and in the stroke (10 and 42 % off at 2 ms), in shaking, where
-some are a thousand times smaller than others, at 1e-7 (200 % at 2 ms). About two minutes on one core.
+Command: .venv/bin/python experiments/validation/step_accuracy.py [--smoke] Expected: rtol = 1e-3 is
+about as near as a step of 2 ms, for a third of its cost in the manipulation; gradients are right
+later: within 1 % of every parameter's at rtol = 1e-6 in the roll and in the stroke (10 and 42 % off
+at 2 ms), in shaking, where some are a thousand times smaller than others, at 1e-7 (200 % at 2 ms).
+About two minutes on one core.
 """
 
 from dataclasses import dataclass
@@ -25,13 +28,28 @@ from torchsoft.excitation import Excitation, MultiSine, Strokes, begin
 from torchsoft.experiment import grid, numbers, options, timed, write
 from torchsoft.scenario import grasp_and_roll
 
-EIGHT = ("contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t", "contact.mu_s", "contact.mu_k", "pad.E", "pad.tau")
+EIGHT = (
+    "contact.K_n",
+    "contact.R_n",
+    "contact.K_t",
+    "contact.R_t",
+    "contact.mu_s",
+    "contact.mu_k",
+    "pad.E",
+    "pad.tau",
+)
 
 
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/step_accuracy")
-    rtols: tuple[float, ...] = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7)  # relative tolerances; a tenth of it is the absolute one
+    rtols: tuple[float, ...] = (
+        1e-3,
+        1e-4,
+        1e-5,
+        1e-6,
+        1e-7,
+    )  # relative tolerances; a tenth of it is the absolute one
     steps_ms: tuple[float, ...] = (2.0, 1.0, 0.5)  # equal steps [ms]
     exact: float = 1e-8  # relative tolerance of the run they are compared with
     roll: float = 10.0  # of the manipulation [s]
@@ -61,7 +79,9 @@ def motions(config: Config) -> dict[str, Motion]:
         return {"stroke of 2 mm in 20 ms": Motion(begun.model, begun.y0, grid(0.54, 0.005))}
     made = grasp_and_roll(SoftGrasp(Parameters()), grasp_force=80.66)
     out = {"grasp and roll out": Motion(made.model, made.y0, grid(config.roll))}
-    shaking = Excitation(motion=MultiSine(amplitude_x=1e-3, amplitude_y=5e-5, frequency=(2.0, 10.0)), duration=1.0)
+    shaking = Excitation(
+        motion=MultiSine(amplitude_x=1e-3, amplitude_y=5e-5, frequency=(2.0, 10.0)), duration=1.0
+    )
     for name, excitation in (("light shaking", shaking), ("stroke of 2 mm in 20 ms", stroke)):
         begun = begin(excitation, Parameters())
         out[name] = Motion(begun.model, begun.y0, grid(excitation.duration, 0.005))
@@ -79,12 +99,16 @@ def gradient(motion: Motion, **steps: Any) -> Tensor:
 def errors(run: Trajectory, exact: Trajectory) -> dict[str, float]:
     """Largest error of every signal over its range."""
     pairs = {name: (run[name], exact[name]) for name in ("x_C", "y_C", "theta", "F_x", "F_y")}
-    return {name: ((x - y).abs().max() / (y.max() - y.min())).item() for name, (x, y) in pairs.items()}
+    return {
+        name: ((x - y).abs().max() / (y.max() - y.min())).item() for name, (x, y) in pairs.items()
+    }
 
 
 def run(config: Config) -> Result:
     if config.smoke:
-        config = Config(out=config.out, rtols=(1e-3, 1e-5), steps_ms=(2.0,), exact=1e-7, repeats=1, smoke=True)
+        config = Config(
+            out=config.out, rtols=(1e-3, 1e-5), steps_ms=(2.0,), exact=1e-7, repeats=1, smoke=True
+        )
     ways: dict[str, dict[str, Any]] = {f"rtol = {rtol:g}": {"rtol": rtol} for rtol in config.rtols}
     ways |= {f"step = {h:g} ms": {"step": 1e-3 * h} for h in config.steps_ms}
     every = motions(config)
@@ -111,7 +135,18 @@ def run(config: Config) -> Result:
     return Result(config, out)
 
 
-COLUMNS = ("steps", "wall_s", "with_gradient_s", "x_C", "y_C", "theta", "F_x", "F_y", "energy_residual", "gradient")
+COLUMNS = (
+    "steps",
+    "wall_s",
+    "with_gradient_s",
+    "x_C",
+    "y_C",
+    "theta",
+    "F_x",
+    "F_y",
+    "energy_residual",
+    "gradient",
+)
 
 
 def table(rows: dict[str, dict[str, Any]]) -> str:
@@ -122,7 +157,9 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
 def figure(result: Result) -> Figure:
     """Accuracy against cost: of a motion, a force and the gradients."""
     fig = Figure(figsize=(4.5 * len(result.motions), 4), layout="constrained")
-    for ax, (title, rows) in zip(fig.subplots(1, len(result.motions), squeeze=False)[0], result.motions.items()):
+    for ax, (title, rows) in zip(
+        fig.subplots(1, len(result.motions), squeeze=False)[0], result.motions.items()
+    ):
         for kind, line in (("rtol", "o-"), ("step", "o--")):
             chosen = [row for key, row in rows.items() if key.startswith(kind)]
             for name, colour in (("theta", "k"), ("F_x", "b"), ("gradient", "r")):

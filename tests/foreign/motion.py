@@ -9,11 +9,25 @@ from foreign.numbers import Numbers
 from foreign.pad import Array, compliance
 from foreign.step import march
 
-COLUMNS = ("x_C", "y_C", "theta", "x_Br", "y_Br", "v_x", "v_y", "omega", "v_x_Br", "v_y_Br", "F_x", "F_y")
+COLUMNS = (
+    "x_C",
+    "y_C",
+    "theta",
+    "x_Br",
+    "y_Br",
+    "v_x",
+    "v_y",
+    "omega",
+    "v_x_Br",
+    "v_y_Br",
+    "F_x",
+    "F_y",
+)
 
 
 class Run(NamedTuple):
-    """Channels (n,) by name at times t (n,) [s], the fastest slip since the row before [m/s], and how many nodes touch."""
+    """Channels (n,) by name at times t (n,) [s], the fastest slip since the row before [m/s], and
+    how many nodes touch."""
 
     t: Array
     channels: dict[str, Array]
@@ -22,7 +36,8 @@ class Run(NamedTuple):
 
 
 def lying(p: Numbers, C: Array, X: Array, share: Array) -> tuple[float, Array]:
-    """Height of the disc [m] at rest on the lower pad, without friction, and the displacements (nodes, 2) [m] under it."""
+    """Height of the disc [m] at rest on the lower pad, without friction, and the displacements
+    (nodes, 2) [m] under it."""
     near = np.flatnonzero(np.abs(X[0, :, 0] - p.x_C0) < 0.3 * p.radius)
     dofs = (2 * near[:, None] + np.arange(2)).ravel()
     soft, weight = C[dofs][:, dofs], p.mass * p.gravity
@@ -49,8 +64,9 @@ def lying(p: Numbers, C: Array, X: Array, share: Array) -> tuple[float, Array]:
 def simulate(p: Numbers, t: Array, signals: Array, every: int = 1) -> Run:
     """A run on equal steps t (steps + 1,) [s], with rows every so many of them.
 
-    signals (steps + 1, 3, 2) are value and rate of x_d, y_d and F_ff there. The bracket begins at x_d and y_d, the
-    disc where it lies at rest without friction. Raises `RuntimeError` where a step cannot be solved.
+    signals (steps + 1, 3, 2) are value and rate of x_d, y_d and F_ff there. The bracket begins at
+    x_d and y_d, the disc where it lies at rest without friction. Raises `RuntimeError` where a step
+    cannot be solved.
     """
     C_L = compliance(p)
     mirror = np.tile([1.0, -1.0], len(C_L) // 2)
@@ -63,7 +79,9 @@ def simulate(p: Numbers, t: Array, signals: Array, every: int = 1) -> Run:
     y, under = lying(p, C[0], X, share)
     q, v = np.array([p.x_C0, y, 0.0, *signals[0, :2, 0]]), np.zeros(5)
     u = np.stack((under, np.zeros_like(under)))
-    rows, lost = march(p, float(t[1] - t[0]), C, X, share, q, v, u, np.ascontiguousarray(signals), every)
+    rows, lost = march(
+        p, float(t[1] - t[0]), C, X, share, q, v, u, np.ascontiguousarray(signals), every
+    )
     if lost >= 0:
         raise RuntimeError(f"the step that ends at t = {t[lost]:.6g} s was not solved")
     return Run(t[::every], dict(zip(COLUMNS, rows[:, :12].T)), rows[:, 12], rows[:, 13])

@@ -6,9 +6,10 @@ from typing import NamedTuple
 class Numbers(NamedTuple):
     """One rig. Contact numbers are those of a node that stands for `spacing` of surface.
 
-    `literal` takes Eq. 12-13 of the paper to the letter: a spring and a dashpot from the place of first contact until the force
-    in them is above mu_s F_N, then mu_k F_N against the sliding, and the spring goes on stretching. `ramp_stretch` brings the
-    sliding that stretches the spring in with g / (g + epsilon). `senses_disc`: the horizontal loop measures the disc.
+    `literal` takes Eq. 12-13 of the paper to the letter: a spring and a dashpot from the place of
+    first contact until the force in them is above mu_s F_N, then mu_k F_N against the sliding, and
+    the spring goes on stretching. `ramp_stretch` brings the sliding that stretches the spring in
+    with g / (g + epsilon). `senses_disc`: the horizontal loop measures the disc.
     """
 
     K_n: float = 1.2e5

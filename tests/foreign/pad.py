@@ -1,7 +1,9 @@
-"""The pad's surface compliance: bilinear plane-strain elements on a regular mesh, put together from bars in x and in y.
+"""The pad's surface compliance: bilinear plane-strain elements on a regular mesh, put together from
+bars in x and in y.
 
-On a regular mesh every integral over the pad is a product of one over x and one over y, so that the stiffness is a sum of
-Kronecker products of two one-dimensional matrices. The volume's part takes one point an element (its midpoint): no locking.
+On a regular mesh every integral over the pad is a product of one over x and one over y, so that the
+stiffness is a sum of Kronecker products of two one-dimensional matrices. The volume's part takes
+one point an element (its midpoint): no locking.
 """
 
 import numpy as np
@@ -15,7 +17,8 @@ Array = NDArray[np.float64]
 
 
 def bars(length: float, count: int) -> tuple[sparse.csr_array, ...]:
-    """Of two-node elements in a row: the integrals of N' N', N N, N' N, and of N N by the midpoint, (count + 1, count + 1)."""
+    """Of two-node elements in a row: the integrals of N' N', N N, N' N, and of N N by the midpoint,
+    (count + 1, count + 1)."""
     a = length / count
     elements = (
         np.array([[1.0, -1.0], [-1.0, 1.0]]) / a,
@@ -33,10 +36,12 @@ def bars(length: float, count: int) -> tuple[sparse.csr_array, ...]:
 
 
 def compliance(p: Numbers) -> Array:
-    """What unit forces on the free surface displace it by [m/N], (2 nodes, 2 nodes), x and y of one node after the other; the
-    base is bonded, the sides are free."""
+    """What unit forces on the free surface displace it by [m/N], (2 nodes, 2 nodes), x and y of one
+    node after the other; the base is bonded, the sides are free."""
     A_x, M_x, G_x, P_x = bars(p.length, p.across)
-    A_y, M_y, G_y, P_y = (one[1:, 1:] for one in bars(p.height, p.through))  # without the bonded row
+    A_y, M_y, G_y, P_y = (
+        one[1:, 1:] for one in bars(p.height, p.through)
+    )  # without the bonded row
     mu = p.E / (2 * (1 + p.nu))
     lam = 2 * mu * p.nu / (1 - 2 * p.nu)
     kron = sparse.kron

@@ -1,5 +1,6 @@
-"""Backward Euler of the whole rig: the end of every step solves one dense system for the velocities of the disc, the bracket
-and the nodes near the disc, by Newton's method with differences for derivatives. Compiled, since 50 000 steps make a second."""
+"""Backward Euler of the whole rig: the end of every step solves one dense system for the velocities
+of the disc, the bracket and the nodes near the disc, by Newton's method with differences for
+derivatives. Compiled, since 50 000 steps make a second."""
 
 import numpy as np
 from numba import njit
@@ -8,10 +9,12 @@ MARGIN = 30e-6
 """Nodes as near to the disc as this [m] may touch it by the end of the step."""
 
 DIFFERENCE, SOLVED, MOST, SHORTEST = 1e-9, 1e-9, 100, 1e-3
-"""Change of a speed that derivatives are taken by, the last change of Newton's [m/s], its iterations, and its shortest part."""
+"""Change of a speed that derivatives are taken by, the last change of Newton's [m/s], its
+iterations, and its shortest part."""
 
 CREEP = 1e-5
-"""Speed [m/s] below which the literal law's friction does not have its whole size: sgn(v) cannot be solved for."""
+"""Speed [m/s] below which the literal law's friction does not have its whole size: sgn(v) cannot be
+solved for."""
 
 
 @njit(cache=True, nogil=True)
@@ -22,10 +25,12 @@ def relaxed(p, h, s):
 
 @njit(cache=True, nogil=True)
 def node(p, h, rx, ry, omega, dx, dy, s, slipping):
-    """One node at the end of a step, for speeds rx, ry of the node against the disc's centre and the spin.
+    """One node at the end of a step, for speeds rx, ry of the node against the disc's centre and
+    the spin.
 
-    d is from the centre to the node at the beginning, s the stretch there. Returns the force on the node fx, fy, the torque on
-    the disc, the new stretch, whether it slips by the literal law, and the speed of slip.
+    d is from the centre to the node at the beginning, s the stretch there. Returns the force on the
+    node fx, fy, the torque on the disc, the new stretch, whether it slips by the literal law, and
+    the speed of slip.
     """
     dx, dy = dx + h * rx, dy + h * ry
     far = np.sqrt(dx * dx + dy * dy)
@@ -59,11 +64,14 @@ def node(p, h, rx, ry, omega, dx, dy, s, slipping):
 
 @njit(cache=True, nogil=True)
 def linearise(p, h, rx, ry, omega, dx, dy, s, slipping, share, f, slope):
-    """Force (fx, fy, torque) of a node that stands for `share` spacings of surface, and its slopes (3, 3) by rx, ry, omega."""
+    """Force (fx, fy, torque) of a node that stands for `share` spacings of surface, and its slopes
+    (3, 3) by rx, ry, omega."""
     at = node(p, h, rx, ry, omega, dx, dy, s, slipping)[:3]
     for b in range(3):
         by = DIFFERENCE if b < 2 else DIFFERENCE / p.radius
-        moved = node(p, h, rx + by * (b == 0), ry + by * (b == 1), omega + by * (b == 2), dx, dy, s, slipping)[:3]
+        moved = node(
+            p, h, rx + by * (b == 0), ry + by * (b == 1), omega + by * (b == 2), dx, dy, s, slipping
+        )[:3]
         for a in range(3):
             f[a] = share * at[a]
             slope[a, b] = share * (moved[a] - at[a]) / by
@@ -71,8 +79,9 @@ def linearise(p, h, rx, ry, omega, dx, dy, s, slipping, share, f, slope):
 
 @njit(cache=True, nogil=True)
 def control(p, q, w, z, h):
-    """Forces of the two loops on the bracket for velocities z at the end of a step, with their slopes by the velocities that
-    they measure. q are the poses (x_C, y_C, theta, x_Br, y_Br) before it, w (signals, 2) the reference after it."""
+    """Forces of the two loops on the bracket for velocities z at the end of a step, with their
+    slopes by the velocities that they measure. q are the poses (x_C, y_C, theta, x_Br, y_Br) before
+    it, w (signals, 2) the reference after it."""
     i = 0 if p.senses_disc else 3
     F_x = p.K_x * (w[0, 0] - q[i] - h * z[i]) + p.R_x * (w[0, 1] - z[i])
     F_y = p.K_y * (w[1, 0] - q[4] - h * z[4]) + p.R_y * (w[1, 1] - z[4]) + w[2, 0]
@@ -81,9 +90,14 @@ def control(p, q, w, z, h):
 
 @njit(cache=True, nogil=True)
 def near_nodes(p, X, share, q, u, margin):
-    """Pads and numbers (m,) of the nodes that may touch, and how they are from the centre, and their shares: (m, 2), (m,)."""
+    """Pads and numbers (m,) of the nodes that may touch, and how they are from the centre, and
+    their shares: (m, 2), (m,)."""
     count, m = X.shape[1], 0
-    which, d, shares = np.empty((2 * count, 2), np.int64), np.empty((2 * count, 2)), np.empty(2 * count)
+    which, d, shares = (
+        np.empty((2 * count, 2), np.int64),
+        np.empty((2 * count, 2)),
+        np.empty(2 * count),
+    )
     for k in range(2):
         for i in range(count):
             for a in range(2):
@@ -96,14 +110,23 @@ def near_nodes(p, X, share, q, u, margin):
 
 @njit(cache=True, nogil=True)
 def balance(p, h, C, which, d, shares, q, v, u, s, slipping, w, z, r, J):
-    """What is left over of all equations, r (n,), and its derivatives J (n, n), for the velocities z at the end of the step.
+    """What is left over of all equations, r (n,), and its derivatives J (n, n), for the velocities
+    z at the end of the step.
 
     z = (disc x, y, spin, bracket x, y, then x and y of each near node against its base).
     """
     J[:] = 0.0
     for a in range(len(z)):
         J[a, a] = 1.0
-    gain = np.array([h / p.mass, h / p.mass, h / (0.5 * p.mass * p.radius**2), h / p.bracket_mass, h / p.bracket_mass])
+    gain = np.array(
+        [
+            h / p.mass,
+            h / p.mass,
+            h / (0.5 * p.mass * p.radius**2),
+            h / p.bracket_mass,
+            h / p.bracket_mass,
+        ]
+    )
     F_x, F_y, by_x, by_y = control(p, q, w, z, h)
     for a in range(5):
         r[a] = z[a] - v[a]
@@ -119,7 +142,9 @@ def balance(p, h, C, which, d, shares, q, v, u, s, slipping, w, z, r, J):
     for j in range(len(which)):
         k, i = which[j]
         rx, ry = z[5 + 2 * j] + k * z[3] - z[0], z[6 + 2 * j] + k * z[4] - z[1]
-        linearise(p, h, rx, ry, z[2], d[j, 0], d[j, 1], s[k, i], slipping[k, i], shares[j], f, slope)
+        linearise(
+            p, h, rx, ry, z[2], d[j, 0], d[j, 1], s[k, i], slipping[k, i], shares[j], f, slope
+        )
         for a in range(2):
             load(r, J, a, gain[a], f[a], slope[a], j, k)
             if k == 1:
@@ -135,7 +160,8 @@ def balance(p, h, C, which, d, shares, q, v, u, s, slipping, w, z, r, J):
 
 @njit(cache=True, nogil=True)
 def load(r, J, row, gain, force, slope, j, k):
-    """Adds a force of near node j, on pad k, to an equation, with its slopes by the node's speeds and the spin."""
+    """Adds a force of near node j, on pad k, to an equation, with its slopes by the node's speeds
+    and the spin."""
     r[row] += gain * force
     for b in range(2):
         J[row, 5 + 2 * j + b] += gain * slope[b]
@@ -156,12 +182,20 @@ def largest(p, x):
 
 @njit(cache=True, nogil=True)
 def step(p, h, C, X, share, q, v, u, u_dot, s, slipping, w, margin):
-    """One step in place: poses q and velocities v (5,) of disc and bracket, and by pad (2, ...) displacements u (nodes, 2) with
-    their rates, stretches s and the literal law's flags. Returns whether it was solved, the fastest slip, and how many nodes
-    touch. Newton's change is halved where it would leave more over than there was."""
+    """One step in place: poses q and velocities v (5,) of disc and bracket, and by pad (2, ...)
+    displacements u (nodes, 2) with their rates, stretches s and the literal law's flags. Returns
+    whether it was solved, the fastest slip, and how many nodes touch. Newton's change is halved
+    where it would leave more over than there was."""
     which, d, shares = near_nodes(p, X, share, q, u, margin)
     n = 5 + 2 * len(which)
-    z, r, J, scale, change, before = np.empty(n), np.empty(n), np.empty((n, n)), 1.0, np.zeros(n), np.inf
+    z, r, J, scale, change, before = (
+        np.empty(n),
+        np.empty(n),
+        np.empty((n, n)),
+        1.0,
+        np.zeros(n),
+        np.inf,
+    )
     z[:5] = v
     for j in range(len(which)):
         z[5 + 2 * j : 7 + 2 * j] = u_dot[which[j, 0], which[j, 1]]
@@ -185,7 +219,11 @@ def step(p, h, C, X, share, q, v, u, u_dot, s, slipping, w, margin):
 def finish(p, h, C, X, shares, q, v, u, u_dot, s, slipping, z, which, d):
     """Takes the velocities z over, unless a node touches the disc that was not looked at."""
     forces, m, fastest, touching = np.empty((len(which), 2)), len(which), 0.0, 0
-    stretches, flags, looked = np.empty(s.shape), np.zeros(s.shape, np.bool_), np.zeros(s.shape, np.bool_)
+    stretches, flags, looked = (
+        np.empty(s.shape),
+        np.zeros(s.shape, np.bool_),
+        np.zeros(s.shape, np.bool_),
+    )
     for k in range(2):
         for i in range(s.shape[1]):
             stretches[k, i] = relaxed(p, h, s[k, i])
@@ -224,8 +262,9 @@ def finish(p, h, C, X, shares, q, v, u, u_dot, s, slipping, z, which, d):
 
 @njit(cache=True, nogil=True)
 def march(p, h, C, X, share, q, v, u, signals, every):
-    """All steps; rows every so many of them: poses, velocities, the loops' forces, the fastest slip since the last row, and the
-    nodes that touch (14 numbers). Returns the rows and the number of the step that could not be solved, or -1."""
+    """All steps; rows every so many of them: poses, velocities, the loops' forces, the fastest slip
+    since the last row, and the nodes that touch (14 numbers). Returns the rows and the number of
+    the step that could not be solved, or -1."""
     steps, count = len(signals) - 1, X.shape[1]
     u_dot, s, slipping = np.zeros(u.shape), np.zeros((2, count)), np.zeros((2, count), np.bool_)
     rows, fastest = np.zeros((steps // every + 1, 14)), 0.0
@@ -234,7 +273,9 @@ def march(p, h, C, X, share, q, v, u, signals, every):
         if i > 0:
             solved, margin = False, MARGIN
             for _ in range(4):
-                solved, slip, touching = step(p, h, C, X, share, q, v, u, u_dot, s, slipping, signals[i], margin)
+                solved, slip, touching = step(
+                    p, h, C, X, share, q, v, u, u_dot, s, slipping, signals[i], margin
+                )
                 if solved:
                     break
                 margin *= 4
@@ -244,6 +285,13 @@ def march(p, h, C, X, share, q, v, u, signals, every):
         if i % every == 0:
             F_x, F_y, _, _ = control(p, q, signals[i], v, 0.0)
             row = rows[i // every]
-            row[:5], row[5:10], row[10], row[11], row[12], row[13] = q, v, F_x, F_y, fastest, touching
+            row[:5], row[5:10], row[10], row[11], row[12], row[13] = (
+                q,
+                v,
+                F_x,
+                F_y,
+                fastest,
+                touching,
+            )
             fastest = 0.0
     return rows, -1

@@ -16,12 +16,14 @@ from torchsoft.cli import identify, material, rigs
 from torchsoft.cli.results import failed, say
 
 GRACE = 1.5
-"""Time [s] that a command has to hear Ctrl-C, before its process ends at once: a factorisation does not hear it."""
+"""Time [s] that a command has to hear Ctrl-C, before its process ends at once: a factorisation does
+not hear it."""
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """Ends the process `GRACE` after a Ctrl-C that Python has not come to hear, since it is inside a library's long call."""
+    """Ends the process `GRACE` after a Ctrl-C that Python has not come to hear, since it is inside
+    a library's long call."""
     ours = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if not ours or threading.current_thread() is not threading.main_thread():
         yield
@@ -54,7 +56,8 @@ def interruptible() -> Iterator[None]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; the exit status is 0, 2 for what the user can fix, 130 for an interruption."""
+    """Run the command; the exit status is 0, 2 for what the user can fix, 130 for an
+    interruption."""
     parser = argparse.ArgumentParser(
         prog="torchsoft", description="A differentiable simulator of soft contact manipulation."
     )
@@ -67,9 +70,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")
     given = sys.argv[1:] if arguments is None else arguments
     options = parser.parse_args(given)
-    options.command = shlex.join(["torchsoft", *(os.fsencode(one).decode("utf-8", "replace") for one in given)])
+    options.command = shlex.join(
+        ["torchsoft", *(os.fsencode(one).decode("utf-8", "replace") for one in given)]
+    )
     with warnings.catch_warnings(), interruptible():
-        warnings.showwarning = lambda message, *_, **__: say(f"torchsoft: note: {message}", error=True)
+        warnings.showwarning = lambda message, *_, **__: say(
+            f"torchsoft: note: {message}", error=True
+        )
         try:
             return options.run(options)
         except (ValueError, RuntimeError) as error:

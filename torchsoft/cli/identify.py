@@ -32,20 +32,33 @@ def add_commands(commands: Any) -> None:
         ("explain", "find what is wrong where a model does not explain recordings", EXPLAIN),
     ):
         add_command(commands.add_parser(
-            name, help=help, description=description, formatter_class=argparse.RawDescriptionHelpFormatter,
+            name, help=help, description=description,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
         ))  # fmt: skip
 
 
 def add_command(one: argparse.ArgumentParser) -> None:
     """Arguments of either."""
     one.add_argument(
-        "files", nargs="+", type=Path, metavar="DATA.csv ... CONFIG.toml", help="data files and one configuration"
+        "files",
+        nargs="+",
+        type=Path,
+        metavar="DATA.csv ... CONFIG.toml",
+        help="data files and one configuration",
     )
     add_out(one, default=Path("out/identify"), help="folder for the results (%(default)s)")
     one.add_argument("--workers", type=int, help="threads, one recording each (fit.workers)")
-    one.add_argument("--rtol", type=float, help="relative tolerance that chooses the simulation's steps (fit.rtol)")
-    one.add_argument("--checkpoint", type=Path, help="folder for what is unfinished (OUT/unfinished)")
-    one.add_argument("--yes", action="store_true", help="begin even what takes hours, or much memory")
+    one.add_argument(
+        "--rtol",
+        type=float,
+        help="relative tolerance that chooses the simulation's steps (fit.rtol)",
+    )
+    one.add_argument(
+        "--checkpoint", type=Path, help="folder for what is unfinished (OUT/unfinished)"
+    )
+    one.add_argument(
+        "--yes", action="store_true", help="begin even what takes hours, or much memory"
+    )
     one.add_argument("--no-progress", action="store_true", help="show no progress")
     one.set_defaults(run=identify, explains=one.prog.endswith("explain"))
 
@@ -71,17 +84,20 @@ def identify(options: argparse.Namespace) -> int:
             case = measured.load(data, configs[0])
             fit, tables = case.config.fit, case.tables
             changed = {
-                "rtol": options.rtol, "workers": options.workers, "assumptions": "explained" if options.explains else None,
+                "rtol": options.rtol, "workers": options.workers,
+                "assumptions": "explained" if options.explains else None,
             }  # fmt: skip
-            fit = Settings.model_validate(fit.model_dump() | {k: v for k, v in changed.items() if v is not None})
+            fit = Settings.model_validate(
+                fit.model_dump() | {k: v for k, v in changed.items() if v is not None}
+            )
             problems, heldout = list(case.laws.values()) or [case.problem], case.config.heldout
             priced = (fit.rtol, fit.starts, fit.workers, heldout, fit.method)
             expected = one_by_one(cost(problem, *priced) for problem in problems)
             agree(expected, options.yes, "take a larger rtol, fewer starts or less data")
             try_folder(options.out, options.force)
             result = identify(
-                case.problem, heldout=heldout, acknowledged=case.config.acknowledged, checkpoint=unfinished,
-                progress=not options.no_progress, **fit.model_dump(),
+                case.problem, heldout=heldout, acknowledged=case.config.acknowledged,
+                checkpoint=unfinished, progress=not options.no_progress, **fit.model_dump(),
             )  # fmt: skip
             result = replace(result, command=options.command)
             result.save(options.out / "answer.json")
@@ -92,7 +108,11 @@ def identify(options: argparse.Namespace) -> int:
         except Unreachable as error:
             return failed(measured.unreachable(error, tables))
     except KeyboardInterrupt:
-        say(f"\ninterrupted; what is done so far is in {unfinished}, and the same command continues", error=True)
+        say(
+            f"\ninterrupted; what is done so far is in {unfinished}, and the same command "
+            "continues",
+            error=True,
+        )
         return 130
     say(result.table())
     for notice in result.notices:
@@ -101,7 +121,10 @@ def identify(options: argparse.Namespace) -> int:
         say(verdict)
     if result.made_by["untried"]:
         say(f"\ninterrupted; the same command continues with what is in {unfinished}", error=True)
-    say(f"{result.cost['wall_s']:.0f} s; written to {options.out / 'answer.json'} and {options.out / 'report.html'}")
+    say(
+        f"{result.cost['wall_s']:.0f} s; written to {options.out / 'answer.json'} and "
+        f"{options.out / 'report.html'}"
+    )
     return 130 if result.made_by["untried"] else 0
 
 
@@ -113,8 +136,8 @@ def compared(case: Any, fit: Any, options: argparse.Namespace) -> str:
     unfinished: Path = options.checkpoint or options.out / "unfinished"
     folder = unfinished.with_name(f"{unfinished.name}-laws")
     answer = compare(
-        case.laws, heldout=case.config.heldout, rtol=fit.rtol, starts=fit.starts, workers=fit.workers,
-        checkpoint=folder, progress=not options.no_progress,
+        case.laws, heldout=case.config.heldout, rtol=fit.rtol, starts=fit.starts,
+        workers=fit.workers, checkpoint=folder, progress=not options.no_progress,
     )  # fmt: skip
     answer.save(options.out / "comparison.json")
     for name in case.laws:

@@ -36,19 +36,31 @@ def add_material_commands(commands: Any) -> None:
     one.add_argument("file", type=Path, metavar="FILE.csv", help="the test")
     add_out(one, default=Path("out/material"), help="folder for the results (%(default)s)")
     one.add_argument(
-        "--test", choices=("relaxation", "creep"), help="what was put on: strain, or stress (what was held)"
+        "--test",
+        choices=("relaxation", "creep"),
+        help="what was put on: strain, or stress (what was held)",
     )
     one.add_argument("--terms", type=int, help="terms of the series (as many as the data call for)")
-    one.add_argument("--length", type=float, help="gauge length [m], which `elongation` is divided by")
-    one.add_argument("--area", type=float, help="cross-section before the test [m2], which `force` is divided by")
+    one.add_argument(
+        "--length", type=float, help="gauge length [m], which `elongation` is divided by"
+    )
+    one.add_argument(
+        "--area", type=float, help="cross-section before the test [m2], which `force` is divided by"
+    )
     for name, meaning in (
         ("nu", "Poisson's ratio [1]"),
         ("rho", "density [kg/m3]"),
         ("depth", "depth of the pads [m]"),
     ):
-        one.add_argument(f"--{name}", type=float, help=f"{meaning}, which the test does not tell (as the paper's pads)")
+        one.add_argument(
+            f"--{name}",
+            type=float,
+            help=f"{meaning}, which the test does not tell (as the paper's pads)",
+        )
     one.set_defaults(run=fit_material)
-    one = commands.add_parser("presets", help="list rubbers from the literature", description=PRESETS)
+    one = commands.add_parser(
+        "presets", help="list rubbers from the literature", description=PRESETS
+    )
     one.set_defaults(run=list_presets)
 
 
@@ -61,10 +73,17 @@ def fit_material(options: argparse.Namespace) -> int:
 
     asked = {name: getattr(options, name) for name in ("test", "length", "area")}
     given = {name: getattr(options, name) for name in ("nu", "rho", "depth")}
-    pad = Parameters().override({f"pad.{name}": x for name, x in given.items() if x is not None}).pad
+    pad = (
+        Parameters().override({f"pad.{name}": x for name, x in given.items() if x is not None}).pad
+    )
     found = fit(read(options.file, **asked), terms=options.terms)
     try_folder(options.out, options.force)
-    write(found, options.out, {name: getattr(pad, name) for name in given}, {**asked, "terms": options.terms, **given})
+    write(
+        found,
+        options.out,
+        {name: getattr(pad, name) for name in given},
+        {**asked, "terms": options.terms, **given},
+    )
     say(printed(found))
     say(f"written to {', '.join(str(options.out / name) for name in FILES)}")
     return 0

@@ -12,7 +12,9 @@ from torchsoft.tables import line, plain
 def add_out(command: Any, **more: Any) -> None:
     """The options on the folder."""
     command.add_argument("--out", type=Path, **more)
-    command.add_argument("--force", action="store_true", help="write to a folder that holds other files")
+    command.add_argument(
+        "--force", action="store_true", help="write to a folder that holds other files"
+    )
 
 
 def say(*text: object, error: bool = False) -> None:
@@ -27,14 +29,14 @@ def failed(reason: str) -> int:
 
 
 def try_folder(out: Path, force: bool) -> None:
-    """Make the folder, and try that files can be written to it. Raises `ValueError` where they cannot, and for a folder of
-    other files, unless by `force`."""
+    """Make the folder, and try that files can be written to it. Raises `ValueError` where they
+    cannot, and for a folder of other files, unless by `force`."""
     try:
         claim(out, force)
         with TemporaryFile(dir=out):
             pass
     except OSError as error:
         raise ValueError(
-            f"--out: results cannot be written to {out} ({error.filename or out}: {error.strerror}); name a folder, a new one "
-            "or one that may be written to"
+            f"--out: results cannot be written to {out} ({error.filename or out}: "
+            f"{error.strerror}); name a folder, a new one or one that may be written to"
         ) from None

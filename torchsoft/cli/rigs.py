@@ -25,20 +25,27 @@ A folder that is not there is made."""
 def add_commands(commands: Any) -> None:
     """The commands on rig files."""
     one = commands.add_parser(
-        "run", help="simulate a rig file", description=RUN, formatter_class=argparse.RawDescriptionHelpFormatter
+        "run",
+        help="simulate a rig file",
+        description=RUN,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     one.add_argument("file", type=Path, metavar="RIG.toml", help="the rig")
     add_out(one, help="folder for the results (out/RIG)")
     one.add_argument("--anyway", action="store_true", help="run even what the check finds wrong")
     one.add_argument("--no-progress", action="store_true", help="show no progress")
-    one.add_argument("--yes", action="store_true", help="begin without asking, however long it takes")
+    one.add_argument(
+        "--yes", action="store_true", help="begin without asking, however long it takes"
+    )
     one.set_defaults(run=run_rig)
     one = commands.add_parser(
         "check", help="say what is wrong in a rig file", description=CHECK,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     one.add_argument("file", type=Path, metavar="RIG.toml", help="the rig")
-    one.add_argument("--yes", action="store_true", help="begin without asking, however long it takes")
+    one.add_argument(
+        "--yes", action="store_true", help="begin without asking, however long it takes"
+    )
     one.set_defaults(run=check_rig)
     one = commands.add_parser(
         "init", help="write a rig file to start from", description=INIT,
@@ -58,7 +65,11 @@ def run_rig(options: argparse.Namespace) -> int:
 
     out: Path = options.out or Path("out") / options.file.stem
     file = RigFile.from_toml(options.file)
-    agree(cost(file, runs=True), options.yes, "take fewer elements, a larger rtol or step, or a shorter duration")
+    agree(
+        cost(file, runs=True),
+        options.yes,
+        "take fewer elements, a larger rtol or step, or a shorter duration",
+    )
     found = check(file)
     for one in found:
         say(one, error=True)
@@ -73,8 +84,9 @@ def run_rig(options: argparse.Namespace) -> int:
         return 130
     stats = done.trajectory.stats
     say(
-        f"{float(done.trajectory.t[-1]):g} s simulated in {stats.wall_s:.2g} s ({stats.steps} steps), energies balanced to "
-        f"{done.trajectory.energy_residual_rel:.1e} of what was injected; written to {out}"
+        f"{float(done.trajectory.t[-1]):g} s simulated in {stats.wall_s:.2g} s ({stats.steps} "
+        f"steps), energies balanced to {done.trajectory.energy_residual_rel:.1e} of what was "
+        f"injected; written to {out}"
     )
     return 0
 
@@ -102,7 +114,9 @@ def init_rig(options: argparse.Namespace) -> int:
 
     path = Path(options.name.removesuffix(".toml") + ".toml")
     if not path.name.removesuffix(".toml").strip("."):
-        return failed(f"NAME should be the name of a file, such as mine or mine.toml, not {options.name!r}")
+        return failed(
+            f"NAME should be the name of a file, such as mine or mine.toml, not {options.name!r}"
+        )
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
         with path.open("x", encoding="utf-8") as file:

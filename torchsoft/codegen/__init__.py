@@ -1,7 +1,8 @@
-"""Machine code of physical laws that are written as torch functions: value, Jacobian, and pullback to the parameters.
+"""Machine code of physical laws that are written as torch functions: value, Jacobian, and pullback
+to the parameters.
 
-`compile_law` runs the function once, records its scalar expressions, differentiates them and compiles all three.
-`torchsoft.codegen.invoke` calls the result from functions that numba compiles.
+`compile_law` runs the function once, records its scalar expressions, differentiates them and
+compiles all three. `torchsoft.codegen.invoke` calls the result from functions that numba compiles.
 """
 
 import itertools
@@ -21,11 +22,12 @@ __all__ = ["Law", "UnknownOperation", "compile_law"]
 
 @dataclass(frozen=True)
 class Law:
-    """A compiled law; the addresses stay valid until the process ends, and mean nothing in another process.
+    """A compiled law; the addresses stay valid until the process ends, and mean nothing in another
+    process.
 
-    value: void(x, p, out), linearise: void(x, p, out, J), pullback: void(x, p, w, p_bar), all arguments double*:
-    x (inputs,), p (parameters,), out (outputs,), J (linear, differentiated) by rows, w (linear,), and p_bar
-    (parameters,), to which Σ w[o]·∂out[o]/∂p[j] is added.
+    value: void(x, p, out), linearise: void(x, p, out, J), pullback: void(x, p, w, p_bar), all
+    arguments double*: x (inputs,), p (parameters,), out (outputs,), J (linear, differentiated) by
+    rows, w (linear,), and p_bar (parameters,), to which Σ w[o]·∂out[o]/∂p[j] is added.
     """
 
     inputs: int
@@ -48,15 +50,17 @@ def compile_law(
     linear: int | None = None,
     differentiated: int | None = None,
 ) -> Law:
-    """Compile function(x, parameters), which gives an (outputs,) float64 tensor for x (inputs,) and float64 parameters.
+    """Compile function(x, parameters), which gives an (outputs,) float64 tensor for x (inputs,) and
+    float64 parameters.
 
-    The values of `x` and `parameters` are examples: the code holds for all values, since a function that reads them
-    is refused. Every other tensor that the function uses is a constant. The flat parameter vector is the parameters'
-    entries in the order of the mapping. The first `linear` outputs are differentiated, in all parameters and in the
-    first `differentiated` inputs; None stands for all.
+    The values of `x` and `parameters` are examples: the code holds for all values, since a function
+    that reads them is refused. Every other tensor that the function uses is a constant. The flat
+    parameter vector is the parameters' entries in the order of the mapping. The first `linear`
+    outputs are differentiated, in all parameters and in the first `differentiated` inputs; None
+    stands for all.
 
-    Raises UnknownOperation (a TypeError) naming the line of the function that cannot be compiled, and TypeError or
-    ValueError for arguments or results of another kind.
+    Raises UnknownOperation (a TypeError) naming the line of the function that cannot be compiled,
+    and TypeError or ValueError for arguments or results of another kind.
     """
     _check(x, parameters)
     check_backward(function, x, parameters)
@@ -65,17 +69,31 @@ def compile_law(
     elsewhere = {name: 0.9 * tensor.detach() + 0.01 for name, tensor in parameters.items()}
     if traced(graph, function, 0.9 * x.detach() + 0.01, elsewhere) != outputs:
         raise UnknownOperation(
-            "The law gives other expressions at other values, so it reads a tensor outside torch or keeps a state."
+            "The law gives other expressions at other values, so it reads a tensor outside torch "
+            "or keeps a state."
         )
     linear = _count("linear", linear, len(outputs))
     differentiated = _count("differentiated", differentiated, x.numel())
-    names = tuple(itertools.chain.from_iterable(_names(name, tensor) for name, tensor in parameters.items()))
+    names = tuple(
+        itertools.chain.from_iterable(_names(name, tensor) for name, tensor in parameters.items())
+    )
     engine = emit.compiled(_functions(graph, outputs, linear, differentiated, len(names)))
     addresses = [engine.get_function_address(name) for name in ("value", "linearise", "pullback")]
-    return Law(x.numel(), len(names), len(outputs), linear, differentiated, names, *addresses, nodes=len(graph.ops))
+    return Law(
+        x.numel(),
+        len(names),
+        len(outputs),
+        linear,
+        differentiated,
+        names,
+        *addresses,
+        nodes=len(graph.ops),
+    )
 
 
-def _functions(g: Graph, outputs: list[int], linear: int, differentiated: int, parameters: int) -> list[str]:
+def _functions(
+    g: Graph, outputs: list[int], linear: int, differentiated: int, parameters: int
+) -> list[str]:
     """IR of the three entry points."""
     x = [g.leaf("x", i) for i in range(differentiated)]
     p = [g.leaf("p", j) for j in range(parameters)]
@@ -84,12 +102,16 @@ def _functions(g: Graph, outputs: list[int], linear: int, differentiated: int, p
         weight = g.leaf("w", o)
         seeds[node] = g("add", seeds[node], weight) if node in seeds else weight
     J = itertools.chain.from_iterable(jacobian(g, outputs[:linear], x))
-    lookups = [node for node, op in enumerate(g.ops) if op == "lookup"]  # of parameters: known when it runs of which
+    lookups = [
+        node for node, op in enumerate(g.ops) if op == "lookup"
+    ]  # of parameters: known when it runs of which
     p_bar = adjoints(g, seeds, {}, dependent(g, p + lookups), p + lookups)
     return [
         emit.function(g, "value", ("x", "p", "out"), {"out": outputs}),
         emit.function(g, "linearise", ("x", "p", "out", "J"), {"out": outputs, "J": J}),
-        emit.function(g, "pullback", ("x", "p", "w", "p_bar"), {}, {"p_bar": zip(p + lookups, p_bar)}),
+        emit.function(
+            g, "pullback", ("x", "p", "w", "p_bar"), {}, {"p_bar": zip(p + lookups, p_bar)}
+        ),
     ]
 
 

@@ -1,4 +1,5 @@
-"""Derivatives of scalar expressions, as nodes of the same graph: torch's conventions at kinks and at zero adjoints."""
+"""Derivatives of scalar expressions, as nodes of the same graph: torch's conventions at kinks and
+at zero adjoints."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -50,8 +51,8 @@ def _norm(g: Graph, adj: int, y: int, value: int, *entries: int) -> tuple:
     return None, *(g.product(adj, g("select", flat, g.zero, g("div", a, value))) for a in entries)
 
 
-# operation -> function(graph, adjoint, node, *arguments) giving the adjoint passed to each argument, None for none;
-# an operation that is not named here has no derivative
+# operation -> function(graph, adjoint, node, *arguments) giving the adjoint passed to each
+# argument, None for none; an operation that is not named here has no derivative
 RULES: dict[str, Callable[..., tuple]] = {
     "add": lambda g, adj, y, a, b: (adj, adj),
     "sub": lambda g, adj, y, a, b: (adj, g("neg", adj)),
@@ -76,7 +77,11 @@ RULES: dict[str, Callable[..., tuple]] = {
     "log": lambda g, adj, y, a: (g.quotient(adj, a),),
     "log1p": lambda g, adj, y, a: (g.quotient(adj, g("add", a, g.one)),),
     "erf": lambda g, adj, y, a: (
-        g("mul", g("mul", adj, g.constant(2 / math.sqrt(math.pi))), g("exp", g("neg", g("mul", a, a)))),
+        g(
+            "mul",
+            g("mul", adj, g.constant(2 / math.sqrt(math.pi))),
+            g("exp", g("neg", g("mul", a, a))),
+        ),
     ),
     "sigmoid": lambda g, adj, y, value, a: (None, g.product(adj, g("mul", y, g("sub", g.one, y)))),
     "select": _select,
@@ -98,11 +103,17 @@ def dependent(g: Graph, targets: Iterable[int]) -> bytearray:
 
 
 def adjoints(
-    g: Graph, seeds: Mapping[int, int], rules: Mapping[int, Partials], marks: bytearray, targets: Sequence[int]
+    g: Graph,
+    seeds: Mapping[int, int],
+    rules: Mapping[int, Partials],
+    marks: bytearray,
+    targets: Sequence[int],
 ) -> list[int]:
-    """Σ seed·∂node/∂target for each target: one reverse sweep over the nodes that `marks` calls dependent.
+    """Σ seed·∂node/∂target for each target: one reverse sweep over the nodes that `marks` calls
+    dependent.
 
-    Where `rules` has the partial derivatives of a node, they are used instead of the operation's rule.
+    Where `rules` has the partial derivatives of a node, they are used instead of the operation's
+    rule.
     """
     total = dict(seeds)
     for node in range(max(seeds, default=-1), -1, -1):
@@ -114,7 +125,9 @@ def adjoints(
     return [total.get(target, g.zero) for target in targets]
 
 
-def _parts(g: Graph, node: int, adjoint: int, rules: Mapping[int, Partials]) -> Iterable[tuple[int, int | None]]:
+def _parts(
+    g: Graph, node: int, adjoint: int, rules: Mapping[int, Partials]
+) -> Iterable[tuple[int, int | None]]:
     """The arguments of a node and what each receives of its adjoint."""
     if node in rules:
         return [(arg, g.product(adjoint, partial)) for arg, partial in rules[node]]
@@ -123,7 +136,8 @@ def _parts(g: Graph, node: int, adjoint: int, rules: Mapping[int, Partials]) -> 
 
 
 def jacobian(g: Graph, outputs: Sequence[int], targets: Sequence[int]) -> list[list[int]]:
-    """∂output/∂target, one row per output: a reverse sweep each, sharing what several outputs have in common."""
+    """∂output/∂target, one row per output: a reverse sweep each, sharing what several outputs have
+    in common."""
     marks = dependent(g, targets)
     rules = _shared(g, set(outputs), marks) if len(outputs) > 1 else {}
     return [adjoints(g, {node: g.one}, rules, marks, targets) for node in outputs]
@@ -132,12 +146,15 @@ def jacobian(g: Graph, outputs: Sequence[int], targets: Sequence[int]) -> list[l
 def _shared(g: Graph, outputs: set[int], marks: bytearray) -> dict[int, Partials]:
     """Partial derivatives of the nodes through which alone the outputs depend on much of the graph.
 
-    Such a node, a network's result for example, is differentiated once, in the arguments of the part of the graph
-    that it alone uses (that it dominates), and no sweep of an output enters that part.
+    Such a node, a network's result for example, is differentiated once, in the arguments of the
+    part of the graph that it alone uses (that it dominates), and no sweep of an output enters that
+    part.
     """
     parents = _dominators(g, outputs, marks)
     inside: dict[int, set[int]] = {}
-    for node in (n for n in sorted(parents) if g.ops[n] in RULES):  # a node comes after all that it dominates
+    for node in (
+        n for n in sorted(parents) if g.ops[n] in RULES
+    ):  # a node comes after all that it dominates
         inside.setdefault(node, set()).add(node)
         inside.setdefault(parents[node], set()).update(inside[node])
     rules: dict[int, Partials] = {}
@@ -147,12 +164,15 @@ def _shared(g: Graph, outputs: set[int], marks: bytearray) -> dict[int, Partials
         edge = sorted({arg for n in part for arg in g.args[n] if marks[arg]} - part)
         if node not in hidden and len(part) > 2 * len(edge) + 2:
             hidden |= part
-            rules[node] = list(zip(edge, adjoints(g, {node: g.one}, {arg: [] for arg in edge}, marks, edge)))
+            rules[node] = list(
+                zip(edge, adjoints(g, {node: g.one}, {arg: [] for arg in edge}, marks, edge))
+            )
     return rules
 
 
 def _dominators(g: Graph, outputs: set[int], marks: bytearray) -> dict[int, int]:
-    """For every dependent node that an output uses, the first later node that all its ways to an output have in common.
+    """For every dependent node that an output uses, the first later node that all its ways to an
+    output have in common.
 
     The number after all nodes stands for the outputs together.
     """

@@ -1,7 +1,8 @@
 """Machine code of a law's entry points: LLVM IR written as text and compiled by llvmlite's MCJIT.
 
-There is no fast-math flag and no contraction, so a sum or product rounds as torch's does. The instructions are emitted
-once each, in the order of the graph, and no optimisation pass runs over them: shared expressions are shared already.
+There is no fast-math flag and no contraction, so a sum or product rounds as torch's does. The
+instructions are emitted once each, in the order of the graph, and no optimisation pass runs over
+them: shared expressions are shared already.
 """
 
 import ctypes.util
@@ -35,7 +36,9 @@ FUNCTIONS = {  # one argument, but for pow and atan2
     "abs": "llvm.fabs.f64",
     "sqrt": "llvm.sqrt.f64",
     "floor": "llvm.floor.f64",
-    **{name: name for name in ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh")},
+    **{
+        name: name for name in ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh")
+    },
     **{name: name for name in ("exp", "expm1", "log", "log1p", "erf", "pow", "atan2")},
 }
 _engines: dict[str, llvm.ExecutionEngine] = {}
@@ -45,16 +48,20 @@ def function(
     g: Graph, name: str, pointers: Iterable[str], results: Mapping[str, Iterable[int]],
     added: Mapping[str, Iterable[tuple[int, int]]] | None = None,
 ) -> str:  # fmt: skip
-    """IR of void `name`(pointers...), which stores the nodes of `results` where the pointer of that name points.
+    """IR of void `name`(pointers...), which stores the nodes of `results` where the pointer of that
+    name points.
 
-    `added` has pairs of nodes, a parameter or a look-up of one and what is added where it stands from that pointer on.
+    `added` has pairs of nodes, a parameter or a look-up of one and what is added where it stands
+    from that pointer on.
     """
     text: dict[int, str] = {}
     lines = [f"define void @{name}({', '.join(f'{POINTER} %{p}' for p in pointers)}) nounwind {{"]
     for letter, nodes in results.items():
         for index, node in enumerate(nodes):
             lines += _evaluation(g, node, text)
-            lines.append(f"%{letter}{index} = getelementptr double, {POINTER} %{letter}, i64 {index}")
+            lines.append(
+                f"%{letter}{index} = getelementptr double, {POINTER} %{letter}, i64 {index}"
+            )
             lines.append(f"store double {text[node]}, {POINTER} %{letter}{index}")
     for letter, pairs in (added or {}).items():
         for index, (target, node) in enumerate(pairs):
@@ -105,7 +112,8 @@ def _instruction(g: Graph, node: int, operands: list[str]) -> Iterator[str]:
 
 
 def _address(g: Graph, node: int, pointer: str, name: str, operands: list[str]) -> Iterator[str]:
-    """The place of a leaf or a look-up from `pointer` on; a number outside the table, or none, is the first entry's."""
+    """The place of a leaf or a look-up from `pointer` on; a number outside the table, or none, is
+    the first entry's."""
     if g.ops[node] in LEAVES:
         yield f"{name} = getelementptr double, {POINTER} %{pointer}, i64 {g.args[node][0]}"
         return
@@ -127,15 +135,19 @@ def _literal(value: float | bool) -> str:
 
 
 def compiled(functions: Iterable[str]) -> llvm.ExecutionEngine:
-    """The engine that holds the functions; the same text is compiled once a process and never freed."""
+    """The engine that holds the functions; the same text is compiled once a process and never
+    freed."""
     declarations = [
-        f"declare double @{name}({'double, double' if name in ('pow', 'atan2') else 'double'}) nounwind"
+        f"declare double @{name}({'double, double' if name in ('pow', 'atan2') else 'double'}) "
+        "nounwind"
         for name in FUNCTIONS.values()
     ]
     source = "\n".join([*declarations, *functions])
     key = hashlib.sha256(source.encode()).hexdigest()
     if key not in _engines:
-        _engines.setdefault(key, _engine(source))  # where threads were at it together, all take the first one's
+        _engines.setdefault(
+            key, _engine(source)
+        )  # where threads were at it together, all take the first one's
     return _engines[key]
 
 
@@ -145,8 +157,12 @@ def _engine(source: str) -> llvm.ExecutionEngine:
     _load_libm()
     target = llvm.Target.from_default_triple()
     features = llvm.get_host_cpu_features().flatten()
-    level = 2 if len(source) < 500_000 else 1  # half the compile time of a large network, about the same speed
-    machine = target.create_target_machine(cpu=llvm.get_host_cpu_name(), features=features, opt=level, jit=True)
+    level = (
+        2 if len(source) < 500_000 else 1
+    )  # half the compile time of a large network, about the same speed
+    machine = target.create_target_machine(
+        cpu=llvm.get_host_cpu_name(), features=features, opt=level, jit=True
+    )
     module = llvm.parse_assembly(source)
     module.triple = target.triple
     module.data_layout = str(machine.target_data)
@@ -157,6 +173,7 @@ def _engine(source: str) -> llvm.ExecutionEngine:
 
 
 def _load_libm() -> None:
-    """Make sure that the C mathematics library is among the libraries where symbols are looked up."""
+    """Make sure that the C mathematics library is among the libraries where symbols are looked
+    up."""
     if llvm.address_of_symbol("log1p") is None and (path := ctypes.util.find_library("m")):
         llvm.load_library_permanently(path)

@@ -1,7 +1,7 @@
 """The scalar expression graph of a law.
 
-A node is an integer; its operation and arguments stand in `Graph.ops` and `Graph.args`. Equal expressions are one node,
-and an argument always has a smaller number than the node that uses it.
+A node is an integer; its operation and arguments stand in `Graph.ops` and `Graph.args`. Equal
+expressions are one node, and an argument always has a smaller number than the node that uses it.
 """
 
 import math
@@ -24,7 +24,21 @@ COMMUTATIVE = {"add", "mul", "eq", "ne", "and", "or"}
 # the value is the first argument; the derivative rule speaks of the arguments after it
 NAMED = {"stop", "norm", "sigmoid", "maximum", "minimum"}
 # finite for every finite argument, overflow apart
-ENTIRE = {"add", "sub", "mul", "neg", "abs", "select", "sin", "cos", "tanh", "atan", "atan2", "erf", "floor"}
+ENTIRE = {
+    "add",
+    "sub",
+    "mul",
+    "neg",
+    "abs",
+    "select",
+    "sin",
+    "cos",
+    "tanh",
+    "atan",
+    "atan2",
+    "erf",
+    "floor",
+}
 
 
 class Graph:
@@ -47,7 +61,11 @@ class Graph:
         simpler = self._simplified(op, args)
         if simpler is not None:
             return simpler
-        finite = op in LEAVES or op == "sigmoid" or ((op in ENTIRE or op in NAMED) and self._all_finite(op, args))
+        finite = (
+            op in LEAVES
+            or op == "sigmoid"
+            or ((op in ENTIRE or op in NAMED) and self._all_finite(op, args))
+        )
         return self._node(op, args, (op, *args), op in COMPARISONS or op in LOGIC, finite)
 
     def leaf(self, kind: str, index: int) -> int:
@@ -59,7 +77,9 @@ class Graph:
         if isinstance(value, bool):
             return self._node("constant", (value,), ("constant", value, "truth"), True, True)
         value = float(value)
-        return self._node("constant", (value,), ("constant", value.hex()), False, math.isfinite(value))
+        return self._node(
+            "constant", (value,), ("constant", value.hex()), False, math.isfinite(value)
+        )
 
     def operands(self, node: int) -> tuple[int, ...]:
         """The nodes whose values the instruction of `node` takes."""
@@ -86,8 +106,8 @@ class Graph:
         return total
 
     def lookup(self, entries: Sequence[int], index: int) -> int:
-        """entries[index] of a whole number, entry 0 where there is none of that number. Parameters that stand equally far apart
-        are read from their place; other entries are chosen among."""
+        """entries[index] of a whole number, entry 0 where there is none of that number. Parameters
+        that stand equally far apart are read from their place; other entries are chosen among."""
         place = self.value(index)
         if place is not None:
             return entries[int(place)]
@@ -104,7 +124,8 @@ class Graph:
         return chosen
 
     def product(self, adjoint: int, local: int) -> int:
-        """adjoint·local, and 0 where the adjoint is exactly 0, however singular the local derivative is there."""
+        """adjoint·local, and 0 where the adjoint is exactly 0, however singular the local
+        derivative is there."""
         if self.value(local) == 0.0:
             return self.zero
         result = self("mul", adjoint, local)
@@ -141,7 +162,8 @@ class Graph:
         return tuple(self.number(a) for a in args) if any(self.boolean[a] for a in args) else args
 
     def _simplified(self, op: str, args: tuple[int, ...]) -> int | None:
-        """A node known to be equal, or None. Signed zeros count as equal; x·0 is 0 where x is certainly finite."""
+        """A node known to be equal, or None. Signed zeros count as equal; x·0 is 0 where x is
+        certainly finite."""
         values = [self.value(a) for a in args]
         if op in FOLDED and None not in values:
             return self.constant(FOLDED[op](*values))
@@ -166,7 +188,9 @@ class Graph:
                 return other
             if op == "mul" and value == -1.0:
                 return self("neg", other)
-            if (op == "mul" and value == 0.0 and self.finite[other]) or (op in LOGIC and value is (op == "or")):
+            if (op == "mul" and value == 0.0 and self.finite[other]) or (
+                op in LOGIC and value is (op == "or")
+            ):
                 return self.constant(value if op in LOGIC else 0.0)
         return None
 

@@ -1,9 +1,10 @@
 """Calls of a compiled law from numba functions, by address: no allocation, no Python, no lock.
 
-`call_value(address, x, p, out)`, `call_linearise(address, x, p, out, J)` and `call_pullback(address, x, p, w, p_bar)`
-can be used in any function that numba compiles, also in one that is cached on disk: an address is an ordinary integer
-argument. The arrays are C-contiguous float64 arrays of any number of dimensions, as long as the law reads and writes;
-their sizes are not checked, and an array that is written must not overlap another. An argument of another type is a
+`call_value(address, x, p, out)`, `call_linearise(address, x, p, out, J)` and
+`call_pullback(address, x, p, w, p_bar)` can be used in any function that numba compiles, also in
+one that is cached on disk: an address is an ordinary integer argument. The arrays are C-contiguous
+float64 arrays of any number of dimensions, as long as the law reads and writes; their sizes are not
+checked, and an array that is written must not overlap another. An argument of another type is a
 numba TypingError.
 """
 
@@ -21,7 +22,9 @@ def _call(address: Any, *arrays: Any) -> tuple[Any, Any]:
     if not isinstance(address, types.Integer):
         raise TypingError(f"the address of a law must be an integer, not {address}")
     for array in arrays:
-        if not (isinstance(array, types.Array) and array.dtype == types.float64 and array.layout == "C"):
+        if not (
+            isinstance(array, types.Array) and array.dtype == types.float64 and array.layout == "C"
+        ):
             raise TypingError(f"a compiled law takes C-contiguous float64 arrays, not {array}")
 
     def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:

@@ -1,7 +1,7 @@
 """Meanings of the torch operations for scalar nodes, at torch's conventions.
 
-`MOVES` only place entries anew. `ELEMENTWISE` have rules for one node of every tensor, `WHOLE` rules for tensors as int64
-arrays of nodes. `COMPOSED` are written with the others, in torch.
+`MOVES` only place entries anew. `ELEMENTWISE` have rules for one node of every tensor, `WHOLE`
+rules for tensors as int64 arrays of nodes. `COMPOSED` are written with the others, in torch.
 """
 
 import math
@@ -19,9 +19,10 @@ from torchsoft.codegen.graph import Graph, power, sign
 Nodes = NDArray[np.int64]
 
 _MOVES = (
-    "_reshape_alias _unsafe_view alias cat clone diagonal diag_embed expand expand_copy flip gather index index_select "
-    "lift_fresh lift_fresh_copy narrow permute repeat reshape roll select slice split split_with_sizes squeeze stack t "
-    "transpose tril triu unbind unfold unsqueeze view squeeze_ unsqueeze_ t_ transpose_"
+    "_reshape_alias _unsafe_view alias cat clone diagonal diag_embed expand expand_copy flip "
+    "gather index index_select lift_fresh lift_fresh_copy narrow permute repeat reshape roll "
+    "select slice split split_with_sizes squeeze stack t transpose tril triu unbind unfold "
+    "unsqueeze view squeeze_ unsqueeze_ t_ transpose_"
 )
 MOVES = set(_MOVES.split())
 # results that do not depend on the values of the arguments
@@ -68,14 +69,14 @@ def _primitive(op: str) -> Callable[..., int]:
     return lambda g, *args: g(op, *args)
 
 
-_SAME = (
-    "neg abs sqrt sin cos tan asin acos atan atan2 sinh cosh tanh exp expm1 log log1p erf floor mul lt le gt ge eq ne"
-)
+_SAME = "neg abs sqrt sin cos tan asin acos atan atan2 sinh cosh tanh exp expm1 log log1p erf floor mul lt le gt ge eq ne"
 _RENAMED = {"where": "select", "detach": "stop"} | {
     f"{kind}_{op}": op for kind in ("logical", "bitwise") for op in ("and", "or", "not")
 }
 ELEMENTWISE: dict[str, Callable[..., int]] = {
-    **{name: _primitive(op) for name, op in [*zip(_SAME.split(), _SAME.split()), *_RENAMED.items()]},
+    **{
+        name: _primitive(op) for name, op in [*zip(_SAME.split(), _SAME.split()), *_RENAMED.items()]
+    },
     "add": _add,
     "sub": partial(_add, op="sub"),
     "rsub": lambda g, a, b, alpha=None: _add(g, b, a, alpha, "sub"),
@@ -85,7 +86,9 @@ ELEMENTWISE: dict[str, Callable[..., int]] = {
     "sign": sign,
     "sgn": sign,
     "hypot": _norm,
-    "sigmoid": lambda g, a: g("sigmoid", g("div", g.one, g("add", g.one, g("exp", g("neg", a)))), a),
+    "sigmoid": lambda g, a: g(
+        "sigmoid", g("div", g.one, g("add", g.one, g("exp", g("neg", a)))), a
+    ),
     "maximum": _maximum,
     "minimum": _minimum,
     "logical_xor": lambda g, a, b: g("ne", g.truth(a), g.truth(b)),
@@ -96,13 +99,17 @@ ELEMENTWISE: dict[str, Callable[..., int]] = {
 }
 
 
-def _reduced(fold: Callable[..., int], g: Graph, x: Nodes, dim: Any = None, keepdim: bool = False, **_: Any) -> Nodes:
+def _reduced(
+    fold: Callable[..., int], g: Graph, x: Nodes, dim: Any = None, keepdim: bool = False, **_: Any
+) -> Nodes:
     """`fold(graph, entries)` over the axes `dim`; over all where it is None or empty."""
     axes = range(x.ndim) if dim is None else [dim] if isinstance(dim, int) else dim
     axes = sorted(a % x.ndim for a in axes) if x.ndim else []
     axes = axes or list(range(x.ndim))
     kept = [a for a in range(x.ndim) if a not in axes]
-    rows = x.transpose(kept + axes).reshape(*(x.shape[a] for a in kept), math.prod(x.shape[a] for a in axes))
+    rows = x.transpose(kept + axes).reshape(
+        *(x.shape[a] for a in kept), math.prod(x.shape[a] for a in axes)
+    )
     out = np.empty(rows.shape[:-1], np.int64)
     for index in np.ndindex(out.shape):
         out[index] = fold(g, rows[index].tolist())
@@ -142,7 +149,12 @@ def _vector_norm(g: Graph, x: Nodes, ord: float = 2, *axes: Any, **options: Any)
 
 
 def _looked_up(
-    g: Graph, table: Nodes, places: Nodes, padding: int = -1, scaled: bool = False, sparse: bool = False
+    g: Graph,
+    table: Nodes,
+    places: Nodes,
+    padding: int = -1,
+    scaled: bool = False,
+    sparse: bool = False,
 ) -> Nodes:
     """Rows table[places], (..., columns)."""
     if padding >= 0 or scaled:
@@ -200,7 +212,11 @@ def _gelu(a: Tensor, approximate: str = "none") -> Tensor:
 
 
 def _cumsum(x: Tensor, dim: int, **_: Any) -> Tensor:
-    return torch.stack([x.narrow(dim, 0, i + 1).sum(dim) for i in range(x.shape[dim])], dim) if x.ndim else x.clone()
+    return (
+        torch.stack([x.narrow(dim, 0, i + 1).sum(dim) for i in range(x.shape[dim])], dim)
+        if x.ndim
+        else x.clone()
+    )
 
 
 def _cross(a: Tensor, b: Tensor, dim: int = -1) -> Tensor:
@@ -214,7 +230,9 @@ COMPOSED: dict[str, Callable[..., Tensor]] = {
     "softplus": _softplus,
     "relu": lambda a: torch.where(a <= 0, 0, a),
     "leaky_relu": lambda a, slope=0.01: torch.where(a > 0, a, slope * a),
-    "elu": lambda a, alpha=1, scale=1, inner=1: torch.where(a <= 0, scale * alpha * (inner * a).expm1(), scale * a),
+    "elu": lambda a, alpha=1, scale=1, inner=1: torch.where(
+        a <= 0, scale * alpha * (inner * a).expm1(), scale * a
+    ),
     "gelu": _gelu,
     "hardtanh": _hardtanh,
     "clamp": _clamp,

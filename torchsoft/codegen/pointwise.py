@@ -1,4 +1,5 @@
-"""Whether a law is one of a single contact point: several points at once give what each of them gives alone."""
+"""Whether a law is one of a single contact point: several points at once give what each of them
+gives alone."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -14,13 +15,12 @@ from torchsoft.codegen.trace import Trace, UnknownOperation, traced
 POINTS = 3
 """Points that are traced side by side."""
 
-REMEDY = (
-    "a law is of one point, so leave the points' own dimension alone: mean(-1) of a stack of a point's numbers is fine"
-)
+REMEDY = "a law is of one point, so leave the points' own dimension alone: mean(-1) of a stack of a point's numbers is fine"
 
 
 class Watch(Trace):
-    """A trace of several points side by side, entry i of x of point i // `size`; refuses what couples them."""
+    """A trace of several points side by side, entry i of x of point i // `size`; refuses what
+    couples them."""
 
     size: int
 
@@ -35,7 +35,9 @@ class Watch(Trace):
             self._points[node] = frozenset(own).union(*map(self.points, self.graph.operands(node)))
         return self._points[node]
 
-    def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: tuple = (), kwargs: Any = None
+    ) -> Any:
         result = super().__torch_dispatch__(func, types, args, kwargs)
         given = args[0] if args else None
         if not isinstance(result, Tensor) or not self.holds(result):
@@ -65,10 +67,13 @@ def _swapped(before: Nodes, after: Nodes) -> bool:
 
 
 def check_pointwise(
-    function: Callable[[Tensor, dict[str, Tensor]], Tensor], x: Tensor, parameters: Mapping[str, Tensor]
+    function: Callable[[Tensor, dict[str, Tensor]], Tensor],
+    x: Tensor,
+    parameters: Mapping[str, Tensor],
 ) -> None:
-    """Raises UnknownOperation for function(x, parameters), an (..., outputs) tensor of x (..., inputs), whose value at a point
-    depends on other points; names the operation and its line. A law that fails otherwise is left to `traced`."""
+    """Raises UnknownOperation for function(x, parameters), an (..., outputs) tensor of x (...,
+    inputs), whose value at a point depends on other points; names the operation and its line. A law
+    that fails otherwise is left to `traced`."""
     graph, size = Graph(), x.numel()
     many = torch.stack([x.detach() * (1 + 0.1 * k) for k in range(POINTS)])
 
@@ -89,4 +94,6 @@ def check_pointwise(
         return
     see, each = watch(graph), len(together) // POINTS
     if any(see.points(node) - {i // each} for i, node in enumerate(together)):
-        raise UnknownOperation(f"The law cannot be compiled because it couples contact points; {REMEDY}.")
+        raise UnknownOperation(
+            f"The law cannot be compiled because it couples contact points; {REMEDY}."
+        )

@@ -14,7 +14,16 @@ import torch
 from torch import Tensor
 
 from torchsoft.codegen.graph import Graph
-from torchsoft.codegen.operations import COMPOSED, CONSTANT, ELEMENTWISE, MOVES, READS, WHOLE, Nodes, mapped
+from torchsoft.codegen.operations import (
+    COMPOSED,
+    CONSTANT,
+    ELEMENTWISE,
+    MOVES,
+    READS,
+    WHOLE,
+    Nodes,
+    mapped,
+)
 
 try:
     from torch.overrides import TorchFunctionMode
@@ -33,7 +42,8 @@ _BITWISE = {"bitwise_and", "bitwise_or", "bitwise_xor", "bitwise_not"}  # no rul
 
 
 class UnknownOperation(TypeError):
-    """The law does something that has no meaning as an expression of its inputs; the sentence says what and where."""
+    """The law does something that has no meaning as an expression of its inputs; the sentence says
+    what and where."""
 
 
 def _place() -> str:
@@ -52,25 +62,32 @@ class _Reads(TorchFunctionMode):
         super().__init__()
         self.trace = trace
 
-    def __torch_function__(self, func: Any, types: Any, args: tuple = (), kwargs: Any = None) -> Any:
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple = (), kwargs: Any = None
+    ) -> Any:
         if func in _PYTHON_READS and self.trace.holds((args, kwargs)):
             raise self.trace.refused(f"reading a value into Python ({func.__name__})", _BRANCH)
         return func(*args, **(kwargs or {}))
 
 
 class Trace(TorchDispatchMode):
-    """Runs every operation and, where it depends on a symbolic tensor, records what each entry of the result is: without
-    derivatives where torch records none, as under torch.no_grad()."""
+    """Runs every operation and, where it depends on a symbolic tensor, records what each entry of
+    the result is: without derivatives where torch records none, as under torch.no_grad()."""
 
     def __init__(self, graph: Graph) -> None:
         super().__init__()
         self.graph = graph
-        self._nodes: dict[int, tuple[Tensor, Nodes]] = {}  # the tensors are held, so no id is used twice
+        self._nodes: dict[
+            int, tuple[Tensor, Nodes]
+        ] = {}  # the tensors are held, so no id is used twice
         self.refusal: UnknownOperation | None = None
 
     def refused(self, what: str, remedy: str) -> UnknownOperation:
-        """The error for `what`. It is kept, since torch's operators swallow a TypeError and report another."""
-        self.refusal = UnknownOperation(f"The law cannot be compiled because of {what} at {_place()}; {remedy}.")
+        """The error for `what`. It is kept, since torch's operators swallow a TypeError and report
+        another."""
+        self.refusal = UnknownOperation(
+            f"The law cannot be compiled because of {what} at {_place()}; {remedy}."
+        )
         return self.refusal
 
     @classmethod
@@ -94,13 +111,22 @@ class Trace(TorchDispatchMode):
             raise self.refused(f"a constant of {tensor.dtype}", "make it float64")
         return mapped(self.graph.constant, tensor.detach().numpy())
 
-    def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: Any = None) -> Any:
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: tuple = (), kwargs: Any = None
+    ) -> Any:
         kwargs = kwargs or {}
         name = func._schema.name.partition("::")[2]
         if torch.Tag.nondeterministic_seeded in func.tags:
-            raise self.refused(f"the random operation {func}", "give random numbers as inputs or parameters")
+            raise self.refused(
+                f"the random operation {func}", "give random numbers as inputs or parameters"
+            )
         for leaf in tree_leaves((args, kwargs)):
-            if isinstance(leaf, Tensor) and leaf.requires_grad and id(leaf) not in self._nodes and name != "detach":
+            if (
+                isinstance(leaf, Tensor)
+                and leaf.requires_grad
+                and id(leaf) not in self._nodes
+                and name != "detach"
+            ):
                 raise self.refused(
                     "a tensor that requires a gradient and is no parameter of the law",
                     "make it an nn.Parameter of the law's module, or detach it",
@@ -110,10 +136,18 @@ class Trace(TorchDispatchMode):
         if name in READS:
             raise self.refused(f"reading a value into Python ({func})", _BRANCH)
         if func._schema.is_mutable and name not in MOVES:
-            raise self.refused(f"the in-place operation {func}", "make a new tensor, for example by torch.stack")
-        whole = any(isinstance(x, Tensor) and x.dtype == torch.int64 for x in tree_leaves((args, kwargs)))
-        if not any(name in table for table in (MOVES, WHOLE, ELEMENTWISE, COMPOSED)) or (whole and name in _BITWISE):
-            raise self.refused(f"the operation {func}", "it has no rule, so write it with other operations")
+            raise self.refused(
+                f"the in-place operation {func}", "make a new tensor, for example by torch.stack"
+            )
+        whole = any(
+            isinstance(x, Tensor) and x.dtype == torch.int64 for x in tree_leaves((args, kwargs))
+        )
+        if not any(name in table for table in (MOVES, WHOLE, ELEMENTWISE, COMPOSED)) or (
+            whole and name in _BITWISE
+        ):
+            raise self.refused(
+                f"the operation {func}", "it has no rule, so write it with other operations"
+            )
         try:
             if name in COMPOSED:
                 with self:
@@ -123,7 +157,8 @@ class Trace(TorchDispatchMode):
             raise
         except TypeError as error:
             raise self.refused(
-                f"the operation {func} ({error})", "it has no rule, so write it with other operations"
+                f"the operation {func} ({error})",
+                "it has no rule, so write it with other operations",
             ) from error
         result = func(*args, **kwargs)
         for tensor, entries in zip(tree_leaves(result), tree_leaves(nodes), strict=True):
@@ -132,13 +167,21 @@ class Trace(TorchDispatchMode):
 
     def _keep(self, func: Any, tensor: Tensor, nodes: Any) -> None:
         if tensor.dtype not in (torch.float64, torch.bool, torch.int64):
-            raise self.refused(f"the operation {func} with a result of {tensor.dtype}", "keep all numbers in float64")
+            raise self.refused(
+                f"the operation {func} with a result of {tensor.dtype}",
+                "keep all numbers in float64",
+            )
         typed = self.graph.truth if tensor.dtype == torch.bool else self.graph.number
         nodes = mapped(typed, np.asarray(nodes))
         if nodes.shape != tuple(tensor.shape):
-            raise RuntimeError(f"the rule of {func} gives shape {nodes.shape}, torch {tuple(tensor.shape)}")
+            raise RuntimeError(
+                f"the rule of {func} gives shape {nodes.shape}, torch {tuple(tensor.shape)}"
+            )
         if tensor.dtype == torch.float64 and not torch.is_grad_enabled():
-            nodes = mapped(lambda node: node if self.graph.ops[node] == "stop" else self.graph("stop", node), nodes)
+            nodes = mapped(
+                lambda node: node if self.graph.ops[node] == "stop" else self.graph("stop", node),
+                nodes,
+            )
         self.register(tensor, nodes)
 
     def _recorded(self, name: str, func: Any, args: tuple, kwargs: Mapping[str, Any]) -> Any:
@@ -146,15 +189,22 @@ class Trace(TorchDispatchMode):
             if self.holds((args[1:], kwargs)):
                 remedy = "use torch.where, or torch.nn.functional.embedding to look up rows of a parameter"
                 raise self.refused(f"{func} at places that depend on values", remedy)
-            place = lambda t: torch.from_numpy(np.array(self.nodes(t))) if isinstance(t, Tensor) else t
+            place = lambda t: (
+                torch.from_numpy(np.array(self.nodes(t))) if isinstance(t, Tensor) else t
+            )
             return func(tree_map(place, args[0]), *args[1:], **kwargs)
         if name in WHOLE:
             whole = lambda t: self.nodes(t) if isinstance(t, Tensor) else t
-            return WHOLE[name](self.graph, *map(whole, args), **{k: whole(v) for k, v in kwargs.items()})
+            return WHOLE[name](
+                self.graph, *map(whole, args), **{k: whole(v) for k, v in kwargs.items()}
+            )
         return self._elementwise(ELEMENTWISE[name], args, kwargs)
 
-    def _elementwise(self, rule: Callable[..., int], args: tuple, kwargs: Mapping[str, Any]) -> Nodes:
-        """The rule on every entry: tensors and numbers are broadcast, all other arguments are passed on."""
+    def _elementwise(
+        self, rule: Callable[..., int], args: tuple, kwargs: Mapping[str, Any]
+    ) -> Nodes:
+        """The rule on every entry: tensors and numbers are broadcast, all other arguments are
+        passed on."""
         values = [*args, *kwargs.values()]
         arrays = [self.nodes(v) if isinstance(v, Tensor) else self._constant(v) for v in values]
         entries = [i for i, array in enumerate(arrays) if array is not None]
@@ -172,7 +222,11 @@ class Trace(TorchDispatchMode):
         return mapped(one, *given)
 
     def _constant(self, value: Any) -> Nodes | None:
-        return np.asarray(self.graph.constant(value)) if isinstance(value, bool | int | float) else None
+        return (
+            np.asarray(self.graph.constant(value))
+            if isinstance(value, bool | int | float)
+            else None
+        )
 
 
 def traced(
@@ -183,10 +237,11 @@ def traced(
     first: int = 0,
     kind: type[Trace] = Trace,
 ) -> list[int]:
-    """The nodes of function(x, parameters), an (outputs,) float64 tensor, from one run at these values.
+    """The nodes of function(x, parameters), an (outputs,) float64 tensor, from one run at these
+    values.
 
-    Entry i of x is the leaf `first` + i. Raises UnknownOperation for what cannot be recorded, and TypeError for a result of
-    another kind.
+    Entry i of x is the leaf `first` + i. Raises UnknownOperation for what cannot be recorded, and
+    TypeError for a result of another kind.
     """
     trace = kind(graph)
     x = x.detach().clone()
@@ -207,16 +262,22 @@ def traced(
     if trace.refusal is not None:
         raise trace.refusal
     if not isinstance(out, Tensor) or out.ndim != 1 or out.dtype != torch.float64:
-        given = f"{out.dtype} of shape {tuple(out.shape)}" if isinstance(out, Tensor) else type(out).__name__
+        given = (
+            f"{out.dtype} of shape {tuple(out.shape)}"
+            if isinstance(out, Tensor)
+            else type(out).__name__
+        )
         raise TypeError(f"a law must return a 1-D float64 tensor, not {given}")
     return trace.nodes(out).tolist()
 
 
 def check_backward(
-    function: Callable[[Tensor, dict[str, Tensor]], Tensor], x: Tensor, parameters: Mapping[str, Tensor]
+    function: Callable[[Tensor, dict[str, Tensor]], Tensor],
+    x: Tensor,
+    parameters: Mapping[str, Tensor],
 ) -> None:
-    """Raises UnknownOperation for a law that applies a torch.autograd.Function of its own: a node of the graph of its result
-    that Python made. A law that fails otherwise is left to `traced`."""
+    """Raises UnknownOperation for a law that applies a torch.autograd.Function of its own: a node
+    of the graph of its result that Python made. A law that fails otherwise is left to `traced`."""
     given = {name: tensor.detach().clone().requires_grad_() for name, tensor in parameters.items()}
     try:
         with torch.enable_grad():
@@ -232,8 +293,9 @@ def check_backward(
         if isinstance(node, torch.autograd.function.FunctionCtx):
             name = node.name().removesuffix("Backward")
             raise UnknownOperation(
-                f"The law cannot be compiled because of the torch.autograd.Function {name} at {_defined(name)}; its own "
-                "backward cannot be compiled, so write it with torch's operations."
+                f"The law cannot be compiled because of the torch.autograd.Function {name} at "
+                f"{_defined(name)}; its own backward cannot be compiled, so write it with torch's "
+                "operations."
             )
         found += [following for following, _ in node.next_functions]
 

@@ -1,4 +1,5 @@
-"""Synthetic rolling datasets: designed, simulated, written shard by shard, checked, and read for training."""
+"""Synthetic rolling datasets: designed, simulated, written shard by shard, checked, and read for
+training."""
 
 from torchsoft.datasets.reader import Trajectories, open_dataset
 

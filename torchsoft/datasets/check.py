@@ -66,7 +66,8 @@ def findings(url: str) -> Iterator[str]:
 
 
 def check_files(url: str, manifest: Manifest) -> Iterator[str]:
-    """Files laid out at the start that are missing or damaged, and files that do not belong there."""
+    """Files laid out at the start that are missing or damaged, and files that do not belong
+    there."""
     layout, there = manifest.layout, keys(url)
     for key in manifest.digests:
         try:
@@ -90,13 +91,19 @@ def check_arrays(data: xr.Dataset, config: Config) -> Iterator[str]:
         for what, there, expected in (
             ("sizes", dict(array.sizes), variable.sizes),
             ("units", array.attrs.get("units"), variable.unit),
-            ("trajectories of a shard", (array.encoding["shards"] or array.encoding["chunks"])[0], size),
+            (
+                "trajectories of a shard",
+                (array.encoding["shards"] or array.encoding["chunks"])[0],
+                size,
+            ),
         ):
             if there != expected:
                 yield f"{name}: {what} are {there!r}, not {expected!r}"
 
 
-def check_shard(data: xr.Dataset, config: Config, shard: int, design: np.ndarray[Any, Any]) -> Iterator[str]:
+def check_shard(
+    data: xr.Dataset, config: Config, shard: int, design: np.ndarray[Any, Any]
+) -> Iterator[str]:
     """Everything about the trajectories of one finished shard."""
     schema, columns, here = variables(config), dict[str, Any](), config.rows(shard)
     for name in schema:
@@ -118,7 +125,9 @@ def check_trajectory(config: Config, one: dict[str, Any], labels: dict[str, Any]
         if one[name] != value:
             yield f"{name} is {one[name]}, but the design has {value}"
     if one["failed"]:
-        series = [name for name, v in variables(config).items() if v.kept.kind == "f" and len(v.shape) > 1]
+        series = [
+            name for name, v in variables(config).items() if v.kept.kind == "f" and len(v.shape) > 1
+        ]
         if not one["reason"]:
             yield "failed without a reason"
         elif filled := [name for name in series if not np.isnan(one[name]).all()]:
@@ -131,7 +140,9 @@ def check_trajectory(config: Config, one: dict[str, Any], labels: dict[str, Any]
 
 def check_physics(config: Config, one: dict[str, Any]) -> Iterator[str]:
     """The energy balance, and contact where there is force."""
-    stored, dissipated, supplied = (one[f"{x}_energy"].sum(-1) for x in ("stored", "dissipated", "supplied"))
+    stored, dissipated, supplied = (
+        one[f"{x}_energy"].sum(-1) for x in ("stored", "dissipated", "supplied")
+    )
     residual, injected = stored - stored[0] - supplied + dissipated, one["injected_energy"][-1]
     if np.abs(residual - one["energy_residual"]).max() > 1e-9 * max(np.abs(stored).max(), injected):
         yield "energy_residual is not stored - supplied + dissipated"
@@ -155,13 +166,15 @@ def summary(url: str, data: xr.Dataset) -> str:
     stored = [info["size"] for info in fs.find(root, detail=True).values()]
     counts = ", ".join(f"{int((data.split == name).sum())} {name}" for name in SPLITS)
     return (
-        f"{data.sizes['trajectory']} trajectories ({counts}; {int(data.failed.sum())} failed) of {data.sizes['time']} "
-        f"samples, {data.nbytes / 1e6:.1f} MB of arrays in {sum(stored) / 1e6:.1f} MB and {len(stored)} files"
+        f"{data.sizes['trajectory']} trajectories ({counts}; {int(data.failed.sum())} failed) of "
+        f"{data.sizes['time']} samples, {data.nbytes / 1e6:.1f} MB of arrays in "
+        f"{sum(stored) / 1e6:.1f} MB and {len(stored)} files"
     )
 
 
 def figure(data: xr.Dataset, config: Config) -> Figure:
-    """Each parameter over the next by split, failures crossed; trajectories of each kind; some sound motions of each kind."""
+    """Each parameter over the next by split, failures crossed; trajectories of each kind; some
+    sound motions of each kind."""
     ranged = {name.replace("/", "_over_"): r for name, r in config.parameters.items()} | {
         "grasp_depth": config.grasp_depth
     }
@@ -174,7 +187,9 @@ def figure(data: xr.Dataset, config: Config) -> Figure:
     for ax, x, y in zip(panels.flat, names, [*names[1:], names[0]]):
         for name, some in table.groupby("split"):
             ax.plot(some[x], some[y], "x" if name == "failed" else ".", ms=4)
-        label, other = (f"{name} [{data[name].units}]".replace("_over_", " over\n") for name in (x, y))
+        label, other = (
+            f"{name} [{data[name].units}]".replace("_over_", " over\n") for name in (x, y)
+        )
         ax.set(xlabel=label, ylabel=other, xscale=ranged[x].scale, yscale=ranged[y].scale)
     for ax in panels.flat[len(names) : -4]:
         ax.set_axis_off()
@@ -193,7 +208,9 @@ def figure(data: xr.Dataset, config: Config) -> Figure:
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m data_gen.check", description=__doc__)
     parser.add_argument("store", help="folder or fsspec URL")
-    parser.add_argument("--picture", type=Path, help="where to write a picture of what the set covers")
+    parser.add_argument(
+        "--picture", type=Path, help="where to write a picture of what the set covers"
+    )
     given = parser.parse_args(arguments)
     count = 0
     for count, finding in enumerate(check(given.store), 1):
@@ -205,7 +222,9 @@ def main(arguments: list[str] | None = None) -> int:
             config = Config.model_validate(Manifest.read(given.store).config)
             save(figure(data, config), given.picture, dpi=120)
             print(f"picture in {given.picture}")
-    except Exception as error:  # a damaged store has been reported above; the picture must not hide it
+    except (
+        Exception
+    ) as error:  # a damaged store has been reported above; the picture must not hide it
         count += 1
         print(line(f"no summary or picture: {type(error).__name__}: {error}"))
     print("sound" if count == 0 else f"{count} findings")

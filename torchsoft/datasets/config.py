@@ -23,8 +23,11 @@ RATIO = "contact.mu_k/contact.mu_s"
 SHAPING = ("pad.elements_x", "pad.elements_y", "pad.length", "pad.fidelity", "pad.enclosed")
 """Parameters that may not differ between trajectories, because the mesh is common."""
 
-DECIDED = tuple(f"scenario.{name}" for name in ("y_Br_grasp", "travel", "roll_time", "hold_time", "rest_time"))
-"""Parameters that have no part in a dataset: `grasp_depth`, `kinds` and `duration` are in their place."""
+DECIDED = tuple(
+    f"scenario.{name}" for name in ("y_Br_grasp", "travel", "roll_time", "hold_time", "rest_time")
+)
+"""Parameters that have no part in a dataset: `grasp_depth`, `kinds` and `duration` are in their
+place."""
 
 MOTION = 0.4
 """Shortest time [s] of a motion."""
@@ -32,10 +35,12 @@ MOTION = 0.4
 DEFAULTS = {name: row["value"] for name, row in Parameters().table().items()}
 
 RTOL = 1e-4
-"""Relative tolerance of the stepper where neither it nor a step is given: data are not differentiated."""
+"""Relative tolerance of the stepper where neither it nor a step is given: data are not
+differentiated."""
 
 STEP = 0.02
-"""Largest step [s] of the stepper: twice the pads' own time, and the energy balance is off by percents."""
+"""Largest step [s] of the stepper: twice the pads' own time, and the energy balance is off by
+percents."""
 
 
 class Range(Table, Generic[T]):
@@ -79,7 +84,8 @@ class Frequencies(Range[Frequency]):
 
 
 class RandomMotion(Table):
-    """A kind of motion, drawn in proportion to `weight`; `motion` is its name in `torchsoft.excitation`, its own by default."""
+    """A kind of motion, drawn in proportion to `weight`; `motion` is its name in
+    `torchsoft.excitation`, its own by default."""
 
     kind: str
     weight: float = Field(1.0, ge=1e-6, le=1e6)
@@ -108,7 +114,8 @@ class Strokes(RandomMotion):
 
 
 class MultiSine(RandomMotion):
-    """Sums of `components` sines of random phase in x and y; amplitudes [m] are of the sum's peak at most."""
+    """Sums of `components` sines of random phase in x and y; amplitudes [m] are of the sum's peak
+    at most."""
 
     kind: Literal["multi_sine"] = "multi_sine"
     amplitude_x: Lengths = Lengths(low=1e-3, high=4e-3)
@@ -129,7 +136,8 @@ class Chirp(RandomMotion):
 
 
 class Press(RandomMotion):
-    """The bracket's height modulated by `amplitude` [m] at `frequency` [Hz] while the disc rolls by `travel` [m]."""
+    """The bracket's height modulated by `amplitude` [m] at `frequency` [Hz] while the disc rolls by
+    `travel` [m]."""
 
     kind: Literal["press"] = "press"
     amplitude: Lengths = Lengths(low=5e-5, high=4e-4)
@@ -138,8 +146,8 @@ class Press(RandomMotion):
 
 
 class Jerk(RandomMotion):
-    """Forced slip: strokes of the bracket, whose own x the horizontal loop measures, over a disc grasped lightly, to `depth`
-    [m] in place of the common depth."""
+    """Forced slip: strokes of the bracket, whose own x the horizontal loop measures, over a disc
+    grasped lightly, to `depth` [m] in place of the common depth."""
 
     kind: Literal["jerk"] = "jerk"
     motion: ClassVar[str] = "strokes"
@@ -161,15 +169,17 @@ class Fractions(Table):
     @model_validator(mode="after")
     def _leave_some_for_testing(self) -> Self:
         if self.train + self.validation >= 1:
-            raise ValueError(f"train + validation must stay below 1, but is {self.train + self.validation}")
+            raise ValueError(
+                f"train + validation must stay below 1, but is {self.train + self.validation}"
+            )
         return self
 
 
 class Config(Table):
     """One dataset. `ValueError` names the field that is wrong.
 
-    Everything but `title` and `description` decides the data; `trajectories_per_shard` and `samples_per_chunk` decide
-    only where they lie.
+    Everything but `title` and `description` decides the data; `trajectories_per_shard` and
+    `samples_per_chunk` decide only where they lie.
     """
 
     title: str
@@ -181,11 +191,18 @@ class Config(Table):
     method: Literal["sobol", "latin_hypercube"] = "sobol"
     duration: float = Field(ge=1e-3, le=1e4)  # of every trajectory [s]
     sample_interval: float = Field(5e-3, ge=1e-6, le=1.0)  # between samples [s]
-    rtol: float | None = Field(None, ge=1e-9, le=1e-2)  # relative tolerance of the stepper, `RTOL` by default
-    step: float | None = Field(None, ge=1e-6, le=STEP)  # equal steps no longer than this [s] instead
-    settle: float = Field(0.125, ge=0, le=1e4)  # time between the end of the grasp and the start of the motion [s]
+    rtol: float | None = Field(
+        None, ge=1e-9, le=1e-2
+    )  # relative tolerance of the stepper, `RTOL` by default
+    step: float | None = Field(
+        None, ge=1e-6, le=STEP
+    )  # equal steps no longer than this [s] instead
+    settle: float = Field(
+        0.125, ge=0, le=1e4
+    )  # time between the end of the grasp and the start of the motion [s]
     feed_forward: Literal["pressed", "found"] = "pressed"
-    """grasping force of the frictionless statics, or found by simulating the grasp until the bracket holds its height"""
+    """grasping force of the frictionless statics, or found by simulating the grasp until the
+    bracket holds its height"""
     node_precision: Literal["float32", "float64"] = "float32"
     """of everything that is kept per node; the rest is float64"""
     ledger_tolerance: float = Field(0.02, ge=1e-12, le=1.0)
@@ -217,14 +234,21 @@ class Config(Table):
         return hashlib.sha256(self.model_dump_json().encode()).hexdigest()[:16]
 
     def physics(self, values: dict[str, Any], grasp_depth: float) -> Parameters:
-        """Parameters of one trajectory: defaults, then `fixed`, then `values`, the bracket lowered by `grasp_depth`."""
+        """Parameters of one trajectory: defaults, then `fixed`, then `values`, the bracket lowered
+        by `grasp_depth`."""
         tree = DEFAULTS | self.fixed | values
         if (ratio := tree.pop(RATIO, None)) is not None:
             tree["contact.mu_k"] = ratio * tree["contact.mu_s"]
-        grasped = 2 * (tree["pad.height"] + tree["disc.radius"]) + tree["bracket.cm_height"] - grasp_depth
+        grasped = (
+            2 * (tree["pad.height"] + tree["disc.radius"]) + tree["bracket.cm_height"] - grasp_depth
+        )
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a steep friction law fails in simulation, with its reason, or does not
-            return Parameters().override(tree | {"scenario.y_Br_grasp": grasped, "scenario.travel": 0.0})
+            warnings.simplefilter(
+                "ignore"
+            )  # a steep friction law fails in simulation, with its reason, or does not
+            return Parameters().override(
+                tree | {"scenario.y_Br_grasp": grasped, "scenario.travel": 0.0}
+            )
 
     def extremes(self, name: str) -> tuple[float, float]:
         """The least and the largest value of a parameter."""
@@ -236,49 +260,64 @@ class Config(Table):
         for name in (*self.parameters, *self.fixed):
             where = f"{'parameters' if name in self.parameters else 'fixed'}.{line(name, 80)}"
             if name in DECIDED:
-                raise ValueError(f"{where} has no part in a dataset: grasp_depth, kinds and duration decide it")
+                raise ValueError(
+                    f"{where} has no part in a dataset: grasp_depth, kinds and duration decide it"
+                )
             if name not in DEFAULTS and where != f"parameters.{RATIO}":
-                raise ValueError(f"{where} is not a parameter; known: {', '.join(DEFAULTS)}, {RATIO}")
+                raise ValueError(
+                    f"{where} is not a parameter; known: {', '.join(DEFAULTS)}, {RATIO}"
+                )
             if name in self.parameters and name in self.fixed:
                 raise ValueError(f"{where} is in `fixed` as well; leave one of them out")
         for name, value in self.fixed.items():
             check(name, value, f"fixed.{name}")
         for name, r in self.parameters.items():
             if name in SHAPING or not isinstance(DEFAULTS.get(name, 0.0), float):
-                raise ValueError(f"parameters.{name} must be the same in every trajectory; set it in `fixed`")
+                raise ValueError(
+                    f"parameters.{name} must be the same in every trajectory; set it in `fixed`"
+                )
             for where, value in r.ends(f"parameters.{name}").items():
                 if name != RATIO:
                     check(name, value, where)
                 elif not 0 <= value <= 1:
                     raise ValueError(f"{where} must lie in [0, 1], but is {value}")
         if RATIO in self.parameters and "contact.mu_k" in {*self.parameters, *self.fixed}:
-            raise ValueError(f"parameters.{RATIO} and contact.mu_k exclude each other; leave one of them out")
+            raise ValueError(
+                f"parameters.{RATIO} and contact.mu_k exclude each other; leave one of them out"
+            )
         return self
 
     @model_validator(mode="after")
     def _times_fit(self) -> Self:
         if abs(self.duration / self.sample_interval - (self.samples - 1)) > 1e-6:
             raise ValueError(
-                f"duration = {self.duration} s is not a whole number of sample_interval = {self.sample_interval} s"
+                f"duration = {self.duration} s is not a whole number of sample_interval = "
+                f"{self.sample_interval} s"
             )
         if self.step is not None and self.rtol is not None:
             raise ValueError(
-                f"rtol = {self.rtol:g} and step = {self.step:g} s each say which steps to take; give one of them"
+                f"rtol = {self.rtol:g} and step = {self.step:g} s each say which steps to take; "
+                "give one of them"
             )
         if self.step is not None and self.step > self.sample_interval:
-            raise ValueError(f"step = {self.step} s exceeds sample_interval = {self.sample_interval} s")
+            raise ValueError(
+                f"step = {self.step} s exceeds sample_interval = {self.sample_interval} s"
+            )
         grasp = self.extremes("scenario.grasp_time")[1]
         begin = grasp + self.settle
         if self.duration < begin + MOTION:
             raise ValueError(
-                f"duration = {self.duration} s leaves no motion: scenario.grasp_time = {grasp} s and settle = {self.settle} s "
-                f"take {begin:.6g} s, and a motion at least {MOTION} s"
+                f"duration = {self.duration} s leaves no motion: scenario.grasp_time = {grasp} s "
+                f"and settle = {self.settle} s take {begin:.6g} s, and a motion at least {MOTION} s"
             )
         for i, kind in enumerate(self.kinds):
-            if isinstance(kind, Strokes | Jerk) and (self.duration - begin) / kind.stroke_time.low > MOST:
+            if (
+                isinstance(kind, Strokes | Jerk)
+                and (self.duration - begin) / kind.stroke_time.low > MOST
+            ):
                 raise ValueError(
-                    f"kinds.{i}.stroke_time.low = {kind.stroke_time.low} s makes more than {MOST} strokes in duration = "
-                    f"{self.duration} s"
+                    f"kinds.{i}.stroke_time.low = {kind.stroke_time.low} s makes more than {MOST} "
+                    f"strokes in duration = {self.duration} s"
                 )
         return self
 
@@ -290,21 +329,27 @@ class Config(Table):
             travel = kind.ranges.get("travel")
             if travel and (starts[0] - travel.high < 0 or starts[1] + travel.high > length):
                 raise ValueError(
-                    f"kinds.{i}.travel.high = {travel.high} m leaves the pad: scenario.x_C0 is between {starts[0]} and "
-                    f"{starts[1]} m, and pad.length = {length} m"
+                    f"kinds.{i}.travel.high = {travel.high} m leaves the pad: scenario.x_C0 is "
+                    f"between {starts[0]} and {starts[1]} m, and pad.length = {length} m"
                 )
             if isinstance(kind, Jerk):
                 depths |= kind.depth.ends(f"kinds.{i}.depth")
         ratio = {RATIO: self.parameters[RATIO].low} if RATIO in self.parameters else {}
         few = (1, 2) if self.parameters else (0,)  # at a time
-        for names in itertools.chain.from_iterable(itertools.combinations(self.parameters, n) for n in few):
-            for u, (where, depth) in itertools.product(itertools.product((0, 1), repeat=len(names)), depths.items()):
+        for names in itertools.chain.from_iterable(
+            itertools.combinations(self.parameters, n) for n in few
+        ):
+            for u, (where, depth) in itertools.product(
+                itertools.product((0, 1), repeat=len(names)), depths.items()
+            ):
                 ends = {name: self.parameters[name].at(end) for name, end in zip(names, u)}
                 try:
                     self.physics(ratio | ends, depth)
                 except ValueError as error:
                     values = "".join(f"parameters.{name} = {x:g}, " for name, x in ends.items())
-                    raise ValueError(f"{values}{where} = {depth:g} is impossible: {error}") from None
+                    raise ValueError(
+                        f"{values}{where} = {depth:g} is impossible: {error}"
+                    ) from None
         return self
 
     @property
@@ -314,5 +359,6 @@ class Config(Table):
 
     @classmethod
     def from_toml(cls, path: str | Path) -> "Config":
-        """Read a TOML file. Raises `ValueError` naming the file and the field, `OSError` for one that cannot be read."""
+        """Read a TOML file. Raises `ValueError` naming the file and the field, `OSError` for one
+        that cannot be read."""
         return from_toml(path, cls.model_validate)

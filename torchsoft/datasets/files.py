@@ -1,8 +1,10 @@
-"""The files of a dataset: a folder, or what fsspec opens; how they were made, and a digest (SHA-256) of every one of them.
+"""The files of a dataset: a folder, or what fsspec opens; how they were made, and a digest
+(SHA-256) of every one of them.
 
-Digests of what is laid out at the start are in `manifest.json`, those of a shard's files in a record of its own, which is
-written after them and says that the shard is finished. A record has the form of `sha256sum`: `cd SET && sha256sum --check
---quiet finished/*.sha256` checks all shards. Errors say what to do about them.
+Digests of what is laid out at the start are in `manifest.json`, those of a shard's files in a
+record of its own, which is written after them and says that the shard is finished. A record has the
+form of `sha256sum`: `cd SET && sha256sum --check --quiet finished/*.sha256` checks all shards.
+Errors say what to do about them.
 """
 
 import errno
@@ -33,7 +35,8 @@ FILE = "a part of this path is a file; choose another folder"
 REMEDIES = {
     errno.ENOSPC: FULL,
     errno.EDQUOT: FULL,
-    errno.EFBIG: "a file outgrew the limit on file sizes (ulimit -f); raise it or make smaller shards",
+    errno.EFBIG: "a file outgrew the limit on file sizes (ulimit -f); raise it or make smaller "
+    "shards",
     errno.ENOTDIR: FILE,
     errno.EEXIST: FILE,
     errno.EROFS: "may not be written, the file system is read-only; choose another folder",
@@ -47,14 +50,17 @@ class StoreError(RuntimeError):
 
 @contextmanager
 def store_errors(url: str) -> Iterator[None]:
-    """Turn errors of the operating system, or of the client of an object store, into a `StoreError`."""
+    """Turn errors of the operating system, or of the client of an object store, into a
+    `StoreError`."""
     try:
         yield
     except IsADirectoryError as error:
         where = error.filename2 or error.filename or url
         raise StoreError(f"{where} is a folder where a file should be; remove it") from error
     except PermissionError as error:
-        raise StoreError(f"{url}: may not be written ({error.strerror or error}); choose another folder") from error
+        raise StoreError(
+            f"{url}: may not be written ({error.strerror or error}); choose another folder"
+        ) from error
     except OSError as error:
         raise StoreError(f"{url}: {REMEDIES.get(error.errno or 0, line(error, 2000))}") from error
     except Exception as error:
@@ -64,7 +70,8 @@ def store_errors(url: str) -> Iterator[None]:
 
 
 def filesystem(url: str) -> tuple[Any, str]:
-    """The filesystem and the path in it, with nothing remembered of what others may have written since."""
+    """The filesystem and the path in it, with nothing remembered of what others may have written
+    since."""
     try:
         fs, root = fsspec.url_to_fs(url)
     except ImportError as error:  # a known protocol whose package is not installed
@@ -80,7 +87,8 @@ def folder(url: str) -> Path | None:
 
 
 def read_bytes(url: str, key: str) -> bytes | None:
-    """A file of the dataset, None where there is none. Raises `StoreError` for what cannot be read."""
+    """A file of the dataset, None where there is none. Raises `StoreError` for what cannot be
+    read."""
     fs, root = filesystem(url)
     try:
         return fs.cat_file(f"{root}/{key}")
@@ -91,7 +99,8 @@ def read_bytes(url: str, key: str) -> bytes | None:
 
 
 def write_bytes(url: str, key: str, data: bytes) -> None:
-    """Write a file of the dataset, which appears whole or not at all; object stores put whole objects."""
+    """Write a file of the dataset, which appears whole or not at all; object stores put whole
+    objects."""
     if here := folder(url):
         with replacing(here / key) as partial:
             partial.write_bytes(data)
@@ -103,7 +112,9 @@ def write_bytes(url: str, key: str, data: bytes) -> None:
 def keys(url: str, under: str = "") -> list[str]:
     """Keys of all files, or of those in the folder `under`, in order."""
     fs, root = filesystem(url)
-    return sorted(path.removeprefix(root).lstrip("/") for path in fs.find(f"{root}/{under}".rstrip("/")))
+    return sorted(
+        path.removeprefix(root).lstrip("/") for path in fs.find(f"{root}/{under}".rstrip("/"))
+    )
 
 
 def digest(data: bytes) -> str:
@@ -112,7 +123,8 @@ def digest(data: bytes) -> str:
 
 
 class Layout(Table):
-    """Number and size of the shards, and the keys of a shard's files, with its number for `{shard}`."""
+    """Number and size of the shards, and the keys of a shard's files, with its number for
+    `{shard}`."""
 
     shards: Annotated[int, Ge(1)]
     trajectories_per_shard: Annotated[int, Ge(1)]
@@ -134,7 +146,8 @@ class Layout(Table):
         return {shard for key in keys(url, FINISHED) if (shard := self.shard(key)) is not None}
 
     def vouch(self, url: str, key: str, content: T | None, sound: bool) -> T:
-        """The content of a file if it is there and `sound`. Raises `StoreError` that says what to do otherwise."""
+        """The content of a file if it is there and `sound`. Raises `StoreError` that says what to
+        do otherwise."""
         if content is not None and sound:
             return content
         remedy = COPY
@@ -145,7 +158,8 @@ class Layout(Table):
 
 
 class Manifest(Table):
-    """How the dataset was made. `digests` are those of the files that were laid out, `digest` is that of all else in here."""
+    """How the dataset was made. `digests` are those of the files that were laid out, `digest` is
+    that of all else in here."""
 
     torchsoft: str
     commit: str
@@ -160,24 +174,34 @@ class Manifest(Table):
     def text(self) -> str:
         """The file, with its own digest."""
         content = self.model_dump(mode="json", exclude={"digest"})
-        return json.dumps(content | {"digest": digest(json.dumps(content).encode())}, indent=2) + "\n"
+        return (
+            json.dumps(content | {"digest": digest(json.dumps(content).encode())}, indent=2) + "\n"
+        )
 
     @classmethod
     def read(cls, url: str) -> Self:
-        """The manifest of the dataset. Raises `StoreError` where there is none, or one that is not what was written."""
+        """The manifest of the dataset. Raises `StoreError` where there is none, or one that is not
+        what was written."""
         data = read_bytes(url, MANIFEST)
         if data is None:
-            raise StoreError(f"{url}/{MANIFEST} is missing; this is no dataset, or not any more: {COPY}")
+            raise StoreError(
+                f"{url}/{MANIFEST} is missing; this is no dataset, or not any more: {COPY}"
+            )
         try:
             manifest = cls.model_validate_json(data)
         except InvalidTable as error:
-            raise StoreError(f"{url}/{MANIFEST} is damaged or of another version ({error}); {COPY}") from error
+            raise StoreError(
+                f"{url}/{MANIFEST} is damaged or of another version ({error}); {COPY}"
+            ) from error
         if manifest.text().encode(errors="replace") != data:
-            raise StoreError(f"{url}/{MANIFEST} is damaged: its digest is not that of its content; {COPY}")
+            raise StoreError(
+                f"{url}/{MANIFEST} is damaged: its digest is not that of its content; {COPY}"
+            )
         return manifest
 
     def laid_out(self, url: str, key: str) -> bytes:
-        """A file that was laid out at the start. Raises `StoreError` for one that is not what was written."""
+        """A file that was laid out at the start. Raises `StoreError` for one that is not what was
+        written."""
         data = read_bytes(url, key)
         return self.layout.vouch(url, key, data, digest(data or b"") == self.digests[key])
 
@@ -193,8 +217,14 @@ def record(digests: dict[str, str]) -> bytes:
 
 
 def read_record(url: str, layout: Layout, shard: int, data: bytes | None) -> dict[str, str]:
-    """Digests of a shard's files by their keys, from its record. Raises `StoreError` for one that is not what was written."""
+    """Digests of a shard's files by their keys, from its record. Raises `StoreError` for one that
+    is not what was written."""
     lines = re.findall(rb"([0-9a-f]{64})  (.+)\n", data or b"")
     digests = {key.decode(errors="replace"): found.decode() for found, key in lines}
-    layout.vouch(url, record_key(shard), data, record(digests) == data and set(digests) == set(layout.of(shard)))
+    layout.vouch(
+        url,
+        record_key(shard),
+        data,
+        record(digests) == data and set(digests) == set(layout.of(shard)),
+    )
     return digests

@@ -1,4 +1,5 @@
-"""Make a dataset: `python -m data_gen.generate CONFIG.toml --out DIR [--workers N] [--scheduler tcp://...]`.
+"""Make a dataset: `python -m data_gen.generate CONFIG.toml --out DIR [--workers N] [--scheduler
+tcp://...]`.
 
 Started again on the same folder it makes what is missing. Ctrl-C and kill are safe at any moment.
 """
@@ -34,7 +35,8 @@ MOST = 1000
 """Local workers."""
 
 THREADS = 3
-"""Threads of one process at the most: a third of a trajectory's time is not compiled, and holds the interpreter's lock."""
+"""Threads of one process at the most: a third of a trajectory's time is not compiled, and holds the
+interpreter's lock."""
 
 COARSE = 5e-3
 """Steps longer than this [s] get a note."""
@@ -58,7 +60,9 @@ def cost(config: Config, workers: int) -> Cost:
     kept = sum(  # of one trajectory [GiB]
         v.kept.itemsize * math.prod(v.shape[1:]) / 2**30 for v in variables(config).values()
     )
-    shard = 2 * kept * min(config.trajectories_per_shard, config.trajectories) + config.samples * row_memory(p)
+    shard = 2 * kept * min(
+        config.trajectories_per_shard, config.trajectories
+    ) + config.samples * row_memory(p)
     design = 8 * 2 * config.trajectories * (len(config.parameters) + 8) / 2**30
     return Cost(
         steps=config.trajectories * steps,
@@ -81,26 +85,39 @@ def run_shard(store: Store, shard: int, design: Any) -> tuple[int, int]:
     """Simulate and write one shard; how many trajectories it holds and how many of them failed."""
     config = store.config
     with threads.single_threaded():
-        rows = [simulate_task(config, task(config, i, u)) for i, u in zip(config.rows(shard), design, strict=True)]
+        rows = [
+            simulate_task(config, task(config, i, u))
+            for i, u in zip(config.rows(shard), design, strict=True)
+        ]
     store.write(shard, rows)
     return len(rows), sum(int(row["failed"]) for row in rows)
 
 
-def generate(config: Config, url: str, executor: Executor, workers: int = 1, progress: bool = True) -> int:
+def generate(
+    config: Config, url: str, executor: Executor, workers: int = 1, progress: bool = True
+) -> int:
     """Make every unfinished shard at `url`; the number of failed simulations among them.
 
-    At most a few shards a worker are submitted at a time, so that Ctrl-C is heard and memory is bounded. Raises `StoreError`.
+    At most a few shards a worker are submitted at a time, so that Ctrl-C is heard and memory is
+    bounded. Raises `StoreError`.
     """
     store, design = open_or_create(url, config), points(config)
     left, failed, running = store.unfinished()[::-1], 0, set[Future[tuple[int, int]]]()
     finished = config.trajectories - sum(len(config.rows(shard)) for shard in left)
-    what: Any = {"unit": " simulated s", "unit_scale": config.duration, "disable": not progress, "smoothing": 0.05}
+    what: Any = {
+        "unit": " simulated s",
+        "unit_scale": config.duration,
+        "disable": not progress,
+        "smoothing": 0.05,
+    }
     with tqdm(total=config.trajectories, initial=finished, **what) as bar:
         try:
             while left or running:
                 while left and len(running) < 3 * max(workers, 1):
                     here = config.rows(shard := left.pop())
-                    running.add(executor.submit(run_shard, store, shard, design[here.start : here.stop]))
+                    running.add(
+                        executor.submit(run_shard, store, shard, design[here.start : here.stop])
+                    )
                 done, running = wait(running, return_when=FIRST_COMPLETED)
                 for count, bad in (future.result() for future in done):
                     failed += bad
@@ -113,7 +130,8 @@ def generate(config: Config, url: str, executor: Executor, workers: int = 1, pro
 
 
 def local_workers(workers: int) -> AbstractContextManager[Executor]:
-    """So many threads of this process, which begin at once; processes where there are too many for one; with 0 neither."""
+    """So many threads of this process, which begin at once; processes where there are too many for
+    one; with 0 neither."""
     if workers > THREADS:
         return local_processes(workers)
     return threads.executor(workers) if workers else Serial()
@@ -121,7 +139,8 @@ def local_workers(workers: int) -> AbstractContextManager[Executor]:
 
 @contextmanager
 def dask_cluster(address: str) -> Iterator[Executor]:
-    """An existing Dask cluster behind the same interface; shards of a lost worker are made by the others."""
+    """An existing Dask cluster behind the same interface; shards of a lost worker are made by the
+    others."""
     try:
         from distributed import Client
     except ImportError:
@@ -137,7 +156,9 @@ def main(arguments: list[str] | None = None) -> int:
     workers = "threads, or processes if more than a few"
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help=workers)
     parser.add_argument("--scheduler", help="address of a Dask scheduler, such as tcp://host:8786")
-    parser.add_argument("--yes", action="store_true", help="begin even what takes hours, or much memory or disk")
+    parser.add_argument(
+        "--yes", action="store_true", help="begin even what takes hours, or much memory or disk"
+    )
     given = parser.parse_args(arguments)
     if not 0 <= given.workers <= MOST:
         parser.error(f"argument --workers: should be from 0 to {MOST}, not {given.workers}")
@@ -148,17 +169,32 @@ def main(arguments: list[str] | None = None) -> int:
         if config.step is not None and config.step > COARSE:
             note = f"note: step = {config.step:g} s is coarse: the energy balance may be off by percents"
             print(note, file=sys.stderr)
-        with dask_cluster(given.scheduler) if given.scheduler else local_workers(workers) as executor:
+        with (
+            dask_cluster(given.scheduler) if given.scheduler else local_workers(workers) as executor
+        ):
             failed = generate(config, given.out, executor, workers)
     except (ValueError, StoreError, OSError) as error:
-        said = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else error
+        said = (
+            f"{error.filename}: {error.strerror}"
+            if isinstance(error, OSError) and error.filename
+            else error
+        )
         print(f"error: {line(said, 2000)}", file=sys.stderr)
         return 2
     except BrokenProcessPool:
-        print("error: a worker was killed, perhaps for memory; start again to make what is missing", file=sys.stderr)
+        print(
+            "error: a worker was killed, perhaps for memory; start again to make what is missing",
+            file=sys.stderr,
+        )
         return 3
     except KeyboardInterrupt:
-        print("interrupted: finished shards are kept; start again to make what is missing", file=sys.stderr)
+        print(
+            "interrupted: finished shards are kept; start again to make what is missing",
+            file=sys.stderr,
+        )
         return 130
-    print(f"{config.trajectories} trajectories in {given.out}; {failed} of those made now failed, each with its reason")
+    print(
+        f"{config.trajectories} trajectories in {given.out}; {failed} of those made now failed, "
+        "each with its reason"
+    )
     return 0

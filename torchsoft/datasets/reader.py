@@ -1,4 +1,5 @@
-"""Datasets of trajectories in a zarr store, for torch's `DataLoader` and for xarray. What was not written so is refused."""
+"""Datasets of trajectories in a zarr store, for torch's `DataLoader` and for xarray. What was not
+written so is refused."""
 
 import os
 from collections.abc import Iterable, Sequence
@@ -22,11 +23,11 @@ DTYPES = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
 
 
 class Vouched(WrapperStore[Store]):
-    """Reads the files laid out at the start and those of the `finished` shards, each checked against its digest when it is
-    first touched; what no digest vouches for is not there.
+    """Reads the files laid out at the start and those of the `finished` shards, each checked
+    against its digest when it is first touched; what no digest vouches for is not there.
 
-    Raises `StoreError` for a file that is missing or not what was written (zarr alone would give its fill value), and for a
-    dataset that is not finished unless that is allowed.
+    Raises `StoreError` for a file that is missing or not what was written (zarr alone would give
+    its fill value), and for a dataset that is not finished unless that is allowed.
     """
 
     def __init__(self, url: str, *, unfinished: bool = False) -> None:
@@ -35,18 +36,25 @@ class Vouched(WrapperStore[Store]):
         self.finished = self.layout.finished(url)
         if (lacking := self.layout.shards - len(self.finished)) and not unfinished:
             raise StoreError(
-                f"{url}: {lacking} of {self.layout.shards} shards are not finished; start `python -m data_gen.generate` "
-                "again to make them, or give `unfinished=True` to leave their trajectories out"
+                f"{url}: {lacking} of {self.layout.shards} shards are not finished; start `python "
+                "-m data_gen.generate` again to make them, or give `unfinished=True` to leave "
+                "their trajectories out"
             )
         here = folder(url)
-        super().__init__(LocalStore(here, read_only=True) if here else FsspecStore.from_url(url, read_only=True))
+        super().__init__(
+            LocalStore(here, read_only=True) if here else FsspecStore.from_url(url, read_only=True)
+        )
         self.unread, self.checked = set(self.finished), set[str]()
 
-    async def get(self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None) -> Buffer | None:
+    async def get(
+        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
+    ) -> Buffer | None:
         shard = self.layout.shard(key)
         if shard in self.unread:
             data = await self._store.get(record_key(shard), prototype)
-            self.digests |= read_record(self.url, self.layout, shard, None if data is None else data.to_bytes())
+            self.digests |= read_record(
+                self.url, self.layout, shard, None if data is None else data.to_bytes()
+            )
             self.unread.discard(shard)
         if key not in self.digests:
             return None
@@ -55,7 +63,11 @@ class Vouched(WrapperStore[Store]):
         sound = found is not None and not (first and digest(found.to_bytes()) != self.digests[key])
         found = self.layout.vouch(self.url, key, found, sound)
         self.checked.add(key)
-        return await self.get(key, prototype, byte_range) if first and byte_range is not None else found
+        return (
+            await self.get(key, prototype, byte_range)
+            if first and byte_range is not None
+            else found
+        )
 
     async def get_partial_values(
         self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
@@ -70,9 +82,11 @@ class Vouched(WrapperStore[Store]):
 
 
 def open_dataset(url: str, *, unfinished: bool = False) -> xr.Dataset:
-    """The whole store, lazily, with named dimensions and units; without unfinished trajectories where that is allowed.
+    """The whole store, lazily, with named dimensions and units; without unfinished trajectories
+    where that is allowed.
 
-    Raises `StoreError` for a dataset that is damaged or unfinished; the same when a damaged file is first touched.
+    Raises `StoreError` for a dataset that is damaged or unfinished; the same when a damaged file is
+    first touched.
     """
     store = Vouched(url, unfinished=unfinished)
     data = store.data()
@@ -85,39 +99,58 @@ def open_dataset(url: str, *, unfinished: bool = False) -> xr.Dataset:
 class Trajectories(Dataset[dict[str, Tensor]]):
     """Windows of the trajectories of one split, read on access.
 
-    Item i holds every variable of `variables` in SI units, a series as (window, ...) and a number of the trajectory as (), in
-    one of `DTYPES`, besides `trajectory` and `start`, its origin. `window` is a number of samples, the whole run by
-    default; windows of a trajectory begin every `stride` samples, `window` by default. Failed simulations are left out, and
-    trajectories of unfinished shards too where `unfinished` says so. The object is small, can be pickled, and opens the store
-    in each process for itself, forked ones included. Each of these reads a file whole when it first touches it, to hold it
-    against its digest.
+    Item i holds every variable of `variables` in SI units, a series as (window, ...) and a number
+    of the trajectory as (), in one of `DTYPES`, besides `trajectory` and `start`, its origin.
+    `window` is a number of samples, the whole run by default; windows of a trajectory begin every
+    `stride` samples, `window` by default. Failed simulations are left out, and trajectories of
+    unfinished shards too where `unfinished` says so. The object is small, can be pickled, and opens
+    the store in each process for itself, forked ones included. Each of these reads a file whole
+    when it first touches it, to hold it against its digest.
 
-    Raises `ValueError` for an unknown variable or split, another dtype, or a window or stride that does not fit, and
-    `StoreError` for a dataset that is damaged or unfinished; the same when a damaged file is first touched, and `ValueError`
-    for an item with a number that is too large for the dtype.
+    Raises `ValueError` for an unknown variable or split, another dtype, or a window or stride that
+    does not fit, and `StoreError` for a dataset that is damaged or unfinished; the same when a
+    damaged file is first touched, and `ValueError` for an item with a number that is too large for
+    the dtype.
     """
 
     def __init__(
-        self, url: str, variables: Sequence[str], *, split: str | None = None, window: int | None = None,
-        stride: int | None = None, dtype: torch.dtype = torch.float64, unfinished: bool = False,
+        self, url: str, variables: Sequence[str], *, split: str | None = None,
+        window: int | None = None, stride: int | None = None, dtype: torch.dtype = torch.float64,
+        unfinished: bool = False,
     ) -> None:  # fmt: skip
-        self.url, self.variables, self.dtype, self.unfinished = str(url), tuple(variables), dtype, unfinished
+        self.url, self.variables, self.dtype, self.unfinished = (
+            str(url),
+            tuple(variables),
+            dtype,
+            unfinished,
+        )
         self._opened = dict[int, xr.Dataset]()
         if dtype not in DTYPES:
-            raise ValueError(f"`dtype` must be one of {', '.join(map(str, DTYPES))}, but is {dtype!r}")
+            raise ValueError(
+                f"`dtype` must be one of {', '.join(map(str, DTYPES))}, but is {dtype!r}"
+            )
         if split is not None and split not in SPLITS:
-            raise ValueError(f"`split` must be one of {', '.join(map(repr, SPLITS))}, but is {split!r}")
+            raise ValueError(
+                f"`split` must be one of {', '.join(map(repr, SPLITS))}, but is {split!r}"
+            )
         arrays, samples = self.data.variables, self.data.sizes["time"]
-        known = [k for k, v in arrays.items() if v.dims[:1] == ("trajectory",) and v.dtype.kind in "fiu"]
+        known = [
+            k for k, v in arrays.items() if v.dims[:1] == ("trajectory",) and v.dtype.kind in "fiu"
+        ]
         for name in self.variables:
             if name not in known:
                 raise ValueError(
-                    f"`variables` has no numbers named {name!r}; known: {', '.join(sorted(map(str, known)))}"
+                    f"`variables` has no numbers named {name!r}; known: "
+                    f"{', '.join(sorted(map(str, known)))}"
                 )
         self.window = samples if window is None else whole("window", window, 1)
         if self.window > samples:
             raise ValueError(f"`window` must be 1 to {samples} samples, but is {window}")
-        self.starts = range(0, samples - self.window + 1, self.window if stride is None else whole("stride", stride, 1))
+        self.starts = range(
+            0,
+            samples - self.window + 1,
+            self.window if stride is None else whole("stride", stride, 1),
+        )
         usable = arrays["failed"].values == 0  # so that those of unfinished shards are not
         if split is not None:
             usable &= arrays["split"].values == split
@@ -125,9 +158,12 @@ class Trajectories(Dataset[dict[str, Tensor]]):
 
     @property
     def data(self) -> xr.Dataset:
-        """The store, opened on first use; once more after a fork, which connections do not survive."""
+        """The store, opened on first use; once more after a fork, which connections do not
+        survive."""
         if os.getpid() not in self._opened:
-            self._opened = {os.getpid(): Vouched(self.url, unfinished=self.unfinished).data(chunks=None)}
+            self._opened = {
+                os.getpid(): Vouched(self.url, unfinished=self.unfinished).data(chunks=None)
+            }
         return self._opened[os.getpid()]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -144,12 +180,14 @@ class Trajectories(Dataset[dict[str, Tensor]]):
         item = {"trajectory": torch.tensor(trajectory), "start": torch.tensor(start)}
         at = {"trajectory": trajectory, "time": slice(start, start + self.window)}
         for name in self.variables:
-            given = torch.from_numpy(np.array(self.data.variables[name].isel(at, missing_dims="ignore"), dtype=float))
+            given = torch.from_numpy(
+                np.array(self.data.variables[name].isel(at, missing_dims="ignore"), dtype=float)
+            )
             item[name] = given.to(self.dtype)
             lost = given[item[name].isinf() & given.isfinite()]
             if len(lost):
                 raise ValueError(
-                    f"`{name}` of trajectory {trajectory} holds {float(lost[0]):.3g}, which {self.dtype} cannot; take a wider "
-                    "`dtype`"
+                    f"`{name}` of trajectory {trajectory} holds {float(lost[0]):.3g}, which "
+                    f"{self.dtype} cannot; take a wider `dtype`"
                 )
         return item

@@ -33,7 +33,8 @@ SINGLE = {
 
 @dataclass(frozen=True)
 class Variable:
-    """One array; `components` names the entries of its last dimension where that has no coordinate."""
+    """One array; `components` names the entries of its last dimension where that has no
+    coordinate."""
 
     sizes: dict[str, int]
     unit: str
@@ -82,21 +83,37 @@ def variables(config: Config) -> dict[str, Variable]:
         per, where = f"each {node} of the {pad} pad", series | {f"{pad}_surface": nodes}
         out[f"normal_force_{pad}"] = Variable(where, "N", f"normal force at {per}", precision)
         out[f"friction_force_{pad}"] = Variable(where, "N", f"friction force at {per}", precision)
-        out[f"contact_{pad}"] = Variable(where, "1", f"1 where the disc penetrates {per}, else 0", "uint8")
-        out[f"displacement_{pad}"] = Variable(where | axis, "m", f"displacement of {per}", precision)
+        out[f"contact_{pad}"] = Variable(
+            where, "1", f"1 where the disc penetrates {per}, else 0", "uint8"
+        )
+        out[f"displacement_{pad}"] = Variable(
+            where | axis, "m", f"displacement of {per}", precision
+        )
     for kind, (dimension, parts) in energies(config).items():
         meaning = "energy stored" if kind == "stored" else f"{kind} since t = 0"
-        out[f"{kind}_energy"] = Variable(series | {dimension: len(parts)}, "J", meaning, components=parts)
-    out["injected_energy"] = Variable(series, "J", "positive part of what the sources supplied since t = 0")
+        out[f"{kind}_energy"] = Variable(
+            series | {dimension: len(parts)}, "J", meaning, components=parts
+        )
+    out["injected_energy"] = Variable(
+        series, "J", "positive part of what the sources supplied since t = 0"
+    )
     out["energy_residual"] = Variable(series, "J", "stored - supplied + dissipated since t = 0")
-    table = Parameters().table() | {RATIO: {"unit": "1", "meaning": "ratio of the friction coefficients"}}
+    table = Parameters().table() | {
+        RATIO: {"unit": "1", "meaning": "ratio of the friction coefficients"}
+    }
     for name in (*config.parameters, *(["contact.mu_k"] if RATIO in config.parameters else [])):
         row = table[name]
-        out[name.replace("/", "_over_")] = Variable(single, row["unit"], f"parameter: {row['meaning']}")
+        out[name.replace("/", "_over_")] = Variable(
+            single, row["unit"], f"parameter: {row['meaning']}"
+        )
     return out | {name: Variable(single, *rest) for name, rest in SINGLE.items()}
 
 
 def not_finite(config: Config, row: dict[str, Any]) -> list[str]:
     """Names of the arrays that are not finite in a trajectory, unless it is marked as failed."""
-    known = (name for name, v in variables(config).items() if v.kept.kind == "f" and name != "failure_time")
+    known = (
+        name
+        for name, v in variables(config).items()
+        if v.kept.kind == "f" and name != "failure_time"
+    )
     return [] if row["failed"] else [name for name in known if not np.isfinite(row[name]).all()]

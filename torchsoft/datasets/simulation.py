@@ -1,4 +1,5 @@
-"""Trajectory number `index`: parameters and motion by the configuration alone, then the run, or why there is none."""
+"""Trajectory number `index`: parameters and motion by the configuration alone, then the run, or why
+there is none."""
 
 from typing import Any, NamedTuple
 
@@ -22,8 +23,9 @@ from torchsoft.solve.trajectory import Trajectory
 GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 
 POSITION, NODAL_FORCE, FORCE = 10, 8, 4
-"""Decimals that starting poses and displacements [m], nodal forces [N] and grasping forces [N] are rounded to: linear solvers
-differ in the last bits with the alignment of memory, and a run may amplify that."""
+"""Decimals that starting poses and displacements [m], nodal forces [N] and grasping forces [N] are
+rounded to: linear solvers differ in the last bits with the alignment of memory, and a run may
+amplify that."""
 
 COUNTS = ("steps", "newton_iterations")
 
@@ -31,7 +33,8 @@ Row = dict[str, Any]
 
 
 class Task(NamedTuple):
-    """One trajectory: its parameters, its motion, and what is known of it before it is simulated."""
+    """One trajectory: its parameters, its motion, and what is known of it before it is
+    simulated."""
 
     index: int
     parameters: Parameters
@@ -42,7 +45,8 @@ class Task(NamedTuple):
 def points(config: Config) -> NDArray[np.floating]:
     """The design in the unit cube, shape (trajectories, dimensions).
 
-    A Sobol sequence is a prefix of every longer one of the same seed; a Latin hypercube belongs to its size.
+    A Sobol sequence is a prefix of every longer one of the same seed; a Latin hypercube belongs to
+    its size.
     """
     dimensions = len(config.parameters) + 2 + max(len(kind.ranges) for kind in config.kinds)
     rng = np.random.default_rng(config.seed)
@@ -58,19 +62,25 @@ def task(config: Config, index: int, u: NDArray[np.floating]) -> Task:
     *own, common, which = u[: n + 2].tolist()
     sampled = {name: r.at(x) for (name, r), x in zip(config.parameters.items(), own)}
     edges = np.cumsum([kind.weight for kind in config.kinds])
-    kind = config.kinds[min(int(np.searchsorted(edges, which * edges[-1], side="right")), len(edges) - 1)]
+    kind = config.kinds[
+        min(int(np.searchsorted(edges, which * edges[-1], side="right")), len(edges) - 1)
+    ]
     motion: Any = {name: r.at(x) for (name, r), x in zip(kind.ranges.items(), u[n + 2 :].tolist())}
     depth = motion.pop("depth", config.grasp_depth.at(common))  # a kind may have a range of its own
     side = float(rng.choice((-1.0, 1.0)))
     if "travel" in motion:
         motion["travel"] *= side
     if isinstance(kind, MultiSine):
-        motion |= {"frequency": (kind.frequency.low, kind.frequency.high), "components": kind.components}
+        motion |= {
+            "frequency": (kind.frequency.low, kind.frequency.high),
+            "components": kind.components,
+        }
         motion["seed"] = int(rng.integers(2**31))
     p = config.physics(sampled | kind.sets, depth)
     excitation = Excitation(
         motion=motion | {"kind": kind.motion or kind.kind}, duration=config.duration, depth=depth,
-        senses=p.control.senses, grasp_time=p.scenario.grasp_time, settle=config.settle, x_C0=p.scenario.x_C0,
+        senses=p.control.senses, grasp_time=p.scenario.grasp_time, settle=config.settle,
+        x_C0=p.scenario.x_C0,
     )  # fmt: skip
     labels: Row = {name.replace("/", "_over_"): value for name, value in sampled.items()}
     if RATIO in sampled:
@@ -80,7 +90,8 @@ def task(config: Config, index: int, u: NDArray[np.floating]) -> Task:
 
 
 def split(config: Config, index: int) -> str:
-    """Train, validation or test: the golden-ratio sequence from a seeded start, so that small sets keep the fractions."""
+    """Train, validation or test: the golden-ratio sequence from a seeded start, so that small sets
+    keep the fractions."""
     u = (np.random.default_rng((config.seed, 0)).random() + index * GOLDEN) % 1.0
     edges = (config.splits.train, config.splits.train + config.splits.validation)
     return SPLITS[int(np.searchsorted(edges, u, side="right"))]
@@ -91,7 +102,11 @@ def simulate_task(config: Config, task: Task) -> Row:
 
     A simulation that fails has NaN (and no contact) for its series, and its reason.
     """
-    out = {name: variable.empty for name, variable in variables(config).items()} | task.labels | {"failed": 1}
+    out = (
+        {name: variable.empty for name, variable in variables(config).items()}
+        | task.labels
+        | {"failed": 1}
+    )
     t = torch.arange(config.samples, dtype=torch.float64) * config.sample_interval
     try:
         model = SoftGrasp(task.parameters)
@@ -105,7 +120,11 @@ def simulate_task(config: Config, task: Task) -> Row:
         motion = reference(task.excitation, model, y_Br, force)
         run = simulate(model, t, y0=y0, reference=motion, **config.steps)
     except SimulationFailed as failure:
-        done = {name: getattr(failure.trajectory.stats, name) for name in COUNTS} if failure.trajectory else {}
+        done = (
+            {name: getattr(failure.trajectory.stats, name) for name in COUNTS}
+            if failure.trajectory
+            else {}
+        )
         return out | done | {"reason": failure.reason, "failure_time": failure.time}
     except (np.linalg.LinAlgError, RuntimeError, ValueError) as failure:
         return out | {"reason": f"{type(failure).__name__}: {failure}"}
@@ -119,7 +138,9 @@ def start(model: SoftGrasp) -> torch.Tensor:
     y0 = rest(model).detach()
     for (part, name), where in model.layout.slices.items():
         forces = part == "pads" and not model.pads[name].inertial
-        y0[where] = torch.round(y0[where], decimals=NODAL_FORCE if forces else POSITION) + 0.0  # no negative zeros
+        y0[where] = (
+            torch.round(y0[where], decimals=NODAL_FORCE if forces else POSITION) + 0.0
+        )  # no negative zeros
     return y0
 
 
@@ -127,9 +148,15 @@ def start(model: SoftGrasp) -> torch.Tensor:
 def series(config: Config, model: SoftGrasp, run: Trajectory) -> Row:
     """The series and numbers of a finished run."""
     data = run.to_dataset()
-    kept = [*KEPT, *(f"{force}_force_{pad}" for force in ("normal", "friction") for pad in PADS.values())]
+    kept = [
+        *KEPT,
+        *(f"{force}_force_{pad}" for force in ("normal", "friction") for pad in PADS.values()),
+    ]
     out: Row = {name: data[name].values for name in (*kept, "energy_residual")}
-    out["injected_energy"], out["energy_residual_rel"] = run.injected.numpy(), run.energy_residual_rel
+    out["injected_energy"], out["energy_residual_rel"] = (
+        run.injected.numpy(),
+        run.energy_residual_rel,
+    )
     for kind, (_, parts) in energies(config).items():
         prefix = "energy" if kind == "stored" else kind
         out[f"{kind}_energy"] = np.stack([data[f"{prefix}_{part}"].values for part in parts], -1)

@@ -1,4 +1,5 @@
-"""The writing of a dataset: laid out whole at the start, then one shard at a time, each with its record after its data."""
+"""The writing of a dataset: laid out whole at the start, then one shard at a time, each with its
+record after its data."""
 
 import subprocess
 import warnings
@@ -37,13 +38,16 @@ from torchsoft.paper.rig import SoftGrasp
 
 SMALL = (ZstdCodec(level=3), Crc32cCodec())
 LARGE = (BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"), Crc32cCodec())
-"""Compression and checksum of the chunks of small arrays and of series. The index of a shard has a checksum by default."""
+"""Compression and checksum of the chunks of small arrays and of series. The index of a shard has a
+checksum by default."""
 
 
 class Store:
-    """A dataset at `url` (a folder, or what fsspec opens). Trajectories lie in shards of equal size, along `trajectory`.
+    """A dataset at `url` (a folder, or what fsspec opens). Trajectories lie in shards of equal
+    size, along `trajectory`.
 
-    Every array has the same shard boundaries, so that one task writes whole files only and no two tasks share one.
+    Every array has the same shard boundaries, so that one task writes whole files only and no two
+    tasks share one.
     """
 
     def __init__(self, url: str, config: Config) -> None:
@@ -55,12 +59,14 @@ class Store:
         return sorted(set(range(self.config.shards)) - self.manifest.layout.finished(self.url))
 
     def write(self, shard: int, rows: list[dict[str, Any]]) -> None:
-        """Write a whole shard, then its record. Raises `StoreError` when there is no room or no permission, and
-        `ValueError` for a trajectory that is neither finite nor failed."""
+        """Write a whole shard, then its record. Raises `StoreError` when there is no room or no
+        permission, and `ValueError` for a trajectory that is neither finite nor failed."""
         here, digests = self.config.rows(shard), dict[str, str]()
         for index, row in zip(here, rows, strict=True):
             if bad := not_finite(self.config, row):
-                raise ValueError(f"trajectory {index} is not marked as failed, but not finite: {', '.join(bad)}")
+                raise ValueError(
+                    f"trajectory {index} is not marked as failed, but not finite: {', '.join(bad)}"
+                )
         with store_errors(self.url):
             encoded: dict[str, Buffer] = {
                 "zarr.json": Content.from_bytes(self.manifest.laid_out(self.url, "zarr.json"))
@@ -72,7 +78,9 @@ class Store:
                 array = group[name]
                 assert isinstance(array, zarr.Array)
                 values = np.stack([np.broadcast_to(row[name], variable.shape[1:]) for row in rows])
-                array.with_config({"write_empty_chunks": True})[here.start : here.stop] = values.astype(variable.kept)
+                array.with_config({"write_empty_chunks": True})[here.start : here.stop] = (
+                    values.astype(variable.kept)
+                )
                 data = encoded.pop(key).to_bytes()
                 write_bytes(self.url, key, data)
                 digests[key] = digest(data)
@@ -80,7 +88,8 @@ class Store:
 
 
 def open_or_create(url: str, config: Config) -> Store:
-    """The store of this configuration: a new one in an empty place, or the unfinished one that is there.
+    """The store of this configuration: a new one in an empty place, or the unfinished one that is
+    there.
 
     Raises `StoreError` for a folder that holds anything else, or that cannot be written.
     """
@@ -90,7 +99,10 @@ def open_or_create(url: str, config: Config) -> Store:
         store = Store(url, config)
         for key, value in {"config_hash": config.hash, "torchsoft": version("torchsoft")}.items():
             if (there := getattr(store.manifest, key)) != value:
-                raise StoreError(f"{url} holds another dataset ({key} is {there}, not {value}); choose another folder")
+                raise StoreError(
+                    f"{url} holds another dataset ({key} is {there}, not {value}); choose another "
+                    "folder"
+                )
         if here := folder(url):
             remove_partials(here.rglob("*.partial"))  # that killed runs left behind
         return store
@@ -108,24 +120,39 @@ def create(url: str, config: Config) -> None:
             if read_bytes(url, key) is None:
                 write_bytes(url, key, data)
     elif read_bytes(url, MANIFEST) is None:  # or another process has laid it out meanwhile
-        raise StoreError(f"{url} is not empty and holds no dataset; choose an empty or a new folder")
+        raise StoreError(
+            f"{url} is not empty and holds no dataset; choose an empty or a new folder"
+        )
 
 
 def is_part(url: str, content: dict[str, bytes]) -> bool:
-    """Whether all that is at `url` are files of this content, whole or partial, as a killed run leaves them behind."""
+    """Whether all that is at `url` are files of this content, whole or partial, as a killed run
+    leaves them behind."""
     fs, root = filesystem(url)
-    names = {PARTIAL.sub("", Path(path).name) for path in fs.ls(root, detail=False)} if fs.exists(root) else set()
-    return names <= {key.partition("/")[0] for key in content} and all(  # before a look at all that is below
-        PARTIAL.sub("", key) in content if PARTIAL.search(key) else read_bytes(url, key) == content.get(key)
+    names = (
+        {PARTIAL.sub("", Path(path).name) for path in fs.ls(root, detail=False)}
+        if fs.exists(root)
+        else set()
+    )
+    return names <= {
+        key.partition("/")[0] for key in content
+    } and all(  # before a look at all that is below
+        PARTIAL.sub("", key) in content
+        if PARTIAL.search(key)
+        else read_bytes(url, key) == content.get(key)
         for key in keys(url)
     )
 
 
 def laid_out(config: Config) -> dict[str, bytes]:
-    """The content of every file of an empty dataset by its key: the metadata of every array, and the coordinates. It follows
-    from the configuration, so that several may lay out one folder."""
+    """The content of every file of an empty dataset by its key: the metadata of every array, and
+    the coordinates. It follows from the configuration, so that several may lay out one folder."""
     content: dict[str, Buffer] = {}
-    about: Any = {"title": config.title, "description": config.description, "config_hash": config.hash}
+    about: Any = {
+        "title": config.title,
+        "description": config.description,
+        "config_hash": config.hash,
+    }
     group = zarr.create_group(MemoryStore(content), zarr_format=3, attributes=about)
     size = config.trajectories_per_shard
     for name, variable in variables(config).items():
@@ -140,8 +167,9 @@ def laid_out(config: Config) -> dict[str, bytes]:
         if variable.components:
             attributes["components"] = list(variable.components)
         group.create_array(
-            name, shape=variable.shape, dtype=variable.dtype, dimension_names=tuple(variable.sizes), attributes=attributes,
-            fill_value=int(name == "failed") or variable.empty, **how,  # what was never written counts as failed
+            name, shape=variable.shape, dtype=variable.dtype, dimension_names=tuple(variable.sizes),
+            attributes=attributes, fill_value=int(name == "failed") or variable.empty, **how,
+            # what was never written counts as failed
         )  # fmt: skip
     pads = SoftGrasp(Parameters().override(config.fixed)).pads
     lower, upper = (pads[key].point_positions[:, 0].numpy() for key in PADS)
@@ -149,7 +177,11 @@ def laid_out(config: Config) -> dict[str, bytes]:
         "time": (np.arange(config.samples) * config.sample_interval, "s", "time since the start"),
         "lower_surface": (lower, "m", "x of the lower pad's surface nodes, undeformed"),
         "upper_surface": (upper, "m", "x of the upper pad's, relative to the bracket's centre"),
-        "trajectory": (np.arange(config.trajectories), "1", "number of the trajectory in the design"),
+        "trajectory": (
+            np.arange(config.trajectories),
+            "1",
+            "number of the trajectory in the design",
+        ),
         "axis": (np.array(["x", "y"], np.dtypes.StringDType()), "1", "names of the axes"),
     }
     for name, (values, unit, meaning) in columns.items():
@@ -158,14 +190,19 @@ def laid_out(config: Config) -> dict[str, bytes]:
             attributes={"units": unit, "long_name": meaning}, config={"write_empty_chunks": True},
         )  # fmt: skip
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # consolidated metadata is zarr-python's and xarray's own addition
+        warnings.simplefilter(
+            "ignore"
+        )  # consolidated metadata is zarr-python's and xarray's own addition
         zarr.consolidate_metadata(group.store)
     return {key: data.to_bytes() for key, data in content.items()}
 
 
 def manifest(config: Config, content: dict[str, bytes]) -> Manifest:
-    """How the dataset is made, and the digests of the files that are laid out. Every array has one file in each shard."""
-    files = (f"{name}/c/{{shard}}" + "/0" * (len(v.shape) - 1) for name, v in variables(config).items())
+    """How the dataset is made, and the digests of the files that are laid out. Every array has one
+    file in each shard."""
+    files = (
+        f"{name}/c/{{shard}}" + "/0" * (len(v.shape) - 1) for name, v in variables(config).items()
+    )
     size = config.trajectories_per_shard
     return Manifest(
         torchsoft=version("torchsoft"),
@@ -173,7 +210,12 @@ def manifest(config: Config, content: dict[str, bytes]) -> Manifest:
         seed=config.seed,
         config_hash=config.hash,
         config=finite(config.model_dump(mode="json")),
-        parameters=finite({name: row["value"] for name, row in Parameters().override(config.fixed).table().items()}),
+        parameters=finite(
+            {
+                name: row["value"]
+                for name, row in Parameters().override(config.fixed).table().items()
+            }
+        ),
         layout=Layout(shards=config.shards, trajectories_per_shard=size, files=tuple(files)),
         digests={key: digest(data) for key, data in sorted(content.items())},
     )
@@ -183,7 +225,9 @@ def commit() -> str:
     """The commit that made it, empty outside a repository."""
     try:
         here = Path(__file__).parent
-        found = subprocess.run(["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=False)
+        found = subprocess.run(
+            ["git", "rev-parse", "HEAD"], cwd=here, capture_output=True, text=True, check=False
+        )
     except OSError:
         return ""
     return found.stdout.strip()

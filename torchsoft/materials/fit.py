@@ -1,7 +1,9 @@
-"""A material fitted to a relaxation or creep test: nonnegative least squares on a grid of times, then the times themselves.
+"""A material fitted to a relaxation or creep test: nonnegative least squares on a grid of times,
+then the times themselves.
 
-A relaxation test gives a relaxation series (`Prony`), a creep test a chain of Kelvin elements (`GeneralisedKelvin`), in how
-many terms Schwarz's criterion (BIC) says. The residuals count alike at all rows.
+A relaxation test gives a relaxation series (`Prony`), a creep test a chain of Kelvin elements
+(`GeneralisedKelvin`), in how many terms Schwarz's criterion (BIC) says. The residuals count alike
+at all rows.
 """
 
 import math
@@ -22,10 +24,12 @@ STEP = 1e-5
 """Change of a time's logarithm by which its slopes are taken."""
 
 MOST = 12
-"""Terms that are tried at the most; at the most one for every decade that the rows resolve, and one more."""
+"""Terms that are tried at the most; at the most one for every decade that the rows resolve, and one
+more."""
 
 PATIENCE = 2
-"""Numbers of terms, one after the other, that may fit worse than the best one before no more are tried."""
+"""Numbers of terms, one after the other, that may fit worse than the best one before no more are
+tried."""
 
 UNSURE = 0.5
 """Relative standard deviation from which a coefficient is called hardly determined."""
@@ -34,7 +38,8 @@ COLOURED = 0.3
 """Correlation of neighbouring residuals from which they are called a pattern."""
 
 EDGE = 1.05
-"""A time within this factor of the shortest or longest one that the rows resolve stands at the edge."""
+"""A time within this factor of the shortest or longest one that the rows resolve stands at the
+edge."""
 
 VANISHED = 1e-6
 """Strength over the sum of all below which a term is none."""
@@ -48,10 +53,12 @@ INSTANT_PART = 0.1
 
 @dataclass(frozen=True)
 class Fit:
-    """A series fitted to a test: `values` of E [Pa] and of every E_i [Pa] or J_i [1], and tau_i [s], with their standard
-    deviations `sd`; the `fitted` answer (n,); and the criterion by the number of terms, the least being the best.
+    """A series fitted to a test: `values` of E [Pa] and of every E_i [Pa] or J_i [1], and tau_i
+    [s], with their standard deviations `sd`; the `fitted` answer (n,); and the criterion by the
+    number of terms, the least being the best.
 
-    Where residuals follow a pattern the deviations count as many independent rows as their correlation leaves.
+    Where residuals follow a pattern the deviations count as many independent rows as their
+    correlation leaves.
     """
 
     measured: Measured
@@ -96,8 +103,9 @@ class Fit:
 
 
 class Trial(NamedTuple):
-    """A fit with some number of times: coefficients c (1 + terms,) and the unit of each, times tau (terms,) [s], residuals (n,)
-    over the largest answer, and their slopes (n, 1 + 2 terms) by c in its units and by ln tau."""
+    """A fit with some number of times: coefficients c (1 + terms,) and the unit of each, times tau
+    (terms,) [s], residuals (n,) over the largest answer, and their slopes (n, 1 + 2 terms) by c in
+    its units and by ln tau."""
 
     c: Array
     unit: Array
@@ -112,15 +120,21 @@ class Trial(NamedTuple):
 
 
 def fit(measured: Measured, *, terms: int | None = None) -> Fit:
-    """The series with the least criterion, or with as many `terms` as asked for. Raises `ValueError` where the rows are too few
-    for these, or tell no modulus that remains."""
+    """The series with the least criterion, or with as many `terms` as asked for. Raises
+    `ValueError` where the rows are too few for these, or tell no modulus that remains."""
     shortest, longest = measured.window
     most = min(MOST, 2 + int(math.log10(longest / shortest)), (len(measured.t) - 2) // 2)
     if terms is not None and not 1 <= terms <= most:
-        raise ValueError(f"`terms` must be from 1 to {most} for what {measured.path} resolves, but is {terms}")
+        raise ValueError(
+            f"`terms` must be from 1 to {most} for what {measured.path} resolves, but is {terms}"
+        )
     tried: dict[int, Trial] = {}
     for count in range(1, most + 1) if terms is None else (terms,):
-        found = [trial for begin in beginnings(measured, count) if (trial := refined(measured, begin)) is not None]
+        found = [
+            trial
+            for begin in beginnings(measured, count)
+            if (trial := refined(measured, begin)) is not None
+        ]
         if found:
             tried[count] = min(found, key=lambda trial: trial.score)
         best = min(tried, key=lambda k: tried[k].score, default=count)
@@ -128,15 +142,15 @@ def fit(measured: Measured, *, terms: int | None = None) -> Fit:
             break
     if not tried:
         raise ValueError(
-            f"{measured.path}: no relaxed modulus remains, or nothing changes in time: a series needs an E above zero, and "
-            "terms; measure for longer, or look at the columns"
+            f"{measured.path}: no relaxed modulus remains, or nothing changes in time: a series "
+            "needs an E above zero, and terms; measure for longer, or look at the columns"
         )
     return concluded(measured, tried[best], {count: trial.score for count, trial in tried.items()})
 
 
 def beginnings(measured: Measured, count: int) -> list[Array]:
-    """Times [s] that a fit may begin with: spread evenly over the decades, and where nonnegative least squares on the grid
-    finds them, neighbours put together until so many are left."""
+    """Times [s] that a fit may begin with: spread evenly over the decades, and where nonnegative
+    least squares on the grid finds them, neighbours put together until so many are left."""
     low, high = (math.log(x) for x in measured.window)
     even = np.linspace(low, high, 2 * count + 1)[1::2]
     grid = np.linspace(low, high, max(2, round(GRID * (high - low) / math.log(10))))
@@ -152,14 +166,17 @@ def beginnings(measured: Measured, count: int) -> list[Array]:
 
 def coefficients(measured: Measured, tau: Array) -> Array:
     """Nonnegative coefficients (1 + terms,) of the series with given times."""
-    A, size = responses(measured.test, measured.t, measured.driven, tau), np.abs(measured.answer).max()
+    A, size = (
+        responses(measured.test, measured.t, measured.driven, tau),
+        np.abs(measured.answer).max(),
+    )
     scale = np.abs(A).max(0)
     return nnls(A / scale, measured.answer / size)[0] * size / scale
 
 
 def refined(measured: Measured, tau: Array) -> Trial | None:
-    """The least-squares fit from these times on, within what the rows resolve; None where a term, or the modulus that remains,
-    vanishes."""
+    """The least-squares fit from these times on, within what the rows resolve; None where a term,
+    or the modulus that remains, vanishes."""
     size, (low, high) = float(np.abs(measured.answer).max()), measured.window
     c = coefficients(measured, tau)
     scale = size / np.abs(responses(measured.test, measured.t, measured.driven, tau)).max(0)
@@ -197,7 +214,9 @@ def refined(measured: Measured, tau: Array) -> Trial | None:
 def concluded(measured: Measured, best: Trial, scores: Mapping[int, float]) -> Fit:
     """Values and standard deviations, and what the data cannot tell."""
     names, values, G = named(measured, best)
-    correlation = float(np.corrcoef(best.r[1:], best.r[:-1])[0, 1]) if np.ptp(best.r) > ROUNDING else 0.0
+    correlation = (
+        float(np.corrcoef(best.r[1:], best.r[:-1])[0, 1]) if np.ptp(best.r) > ROUNDING else 0.0
+    )
     n, parameters = best.J.shape
     independent = (1 - min(max(correlation, 0.0), 0.99)) / (1 + min(max(correlation, 0.0), 0.99))
     _, s, V = np.linalg.svd(best.J, full_matrices=False)
@@ -205,7 +224,14 @@ def concluded(measured: Measured, best: Trial, scores: Mapping[int, float]) -> F
     sd = np.sqrt((root**2).sum(1) * float(best.r @ best.r) / ((n - parameters) * independent))
     fitted = measured.answer + best.r * np.abs(measured.answer).max()
     made = dict(zip(names, values.tolist())), dict(zip(names, sd.tolist()))
-    return Fit(measured, *made, fitted, scores, correlation, tuple(notices(measured, *made, scores, correlation)))
+    return Fit(
+        measured,
+        *made,
+        fitted,
+        scores,
+        correlation,
+        tuple(notices(measured, *made, scores, correlation)),
+    )
 
 
 def named(measured: Measured, best: Trial) -> tuple[list[str], Array, Array]:
@@ -227,45 +253,61 @@ def named(measured: Measured, best: Trial) -> tuple[list[str], Array, Array]:
 
 
 def notices(
-    measured: Measured, values: Mapping[str, float], sd: Mapping[str, float], scores: Mapping[int, float], correlation: float
+    measured: Measured, values: Mapping[str, float], sd: Mapping[str, float],
+    scores: Mapping[int, float], correlation: float
 ) -> list[str]:  # fmt: skip
     """Sentences on what the data do not tell, and on what is taken for granted."""
     (shortest, longest), terms = measured.window, (len(values) - 1) // 2
     what = "relaxes" if measured.test == "relaxation" else "creeps"
     said = [
-        f"the rows resolve times from {shortest:.3g} to {longest:.3g} s: they do not tell what {what} faster, and what {what} "
-        "slower counts to the relaxed modulus E, which may be lower still"
+        f"the rows resolve times from {shortest:.3g} to {longest:.3g} s: they do not tell what "
+        f"{what} faster, and what {what} slower counts to the relaxed modulus E, which may be "
+        "lower still"
     ]
-    edge = [f"tau_{k}" for k in range(1, terms + 1) if not EDGE * shortest < values[f"tau_{k}"] < longest / EDGE]
+    edge = [
+        f"tau_{k}"
+        for k in range(1, terms + 1)
+        if not EDGE * shortest < values[f"tau_{k}"] < longest / EDGE
+    ]
     if edge:
         said.append(f"at the edge of what the rows resolve, or beyond: {', '.join(edge)}")
     unsure = [name for name in values if not sd[name] <= UNSURE * values[name]]
     if unsure:
-        said.append(f"hardly determined, with a standard deviation above {UNSURE:.0%}: {', '.join(unsure)}")
+        said.append(
+            f"hardly determined, with a standard deviation above {UNSURE:.0%}: {', '.join(unsure)}"
+        )
     if len(scores) > 1 and terms == max(scores):
-        said.append(f"more terms than {terms} might fit better still: the criterion was falling up to there")
+        said.append(
+            f"more terms than {terms} might fit better still: the criterion was falling up to there"
+        )
     if correlation > COLOURED:
         said.append(
-            f"the residuals follow a pattern (neighbours correlate by {correlation:.2f}): the series, or the theory, misses "
-            "something; the standard deviations count as many rows as that leaves independent, and are too small still"
+            f"the residuals follow a pattern (neighbours correlate by {correlation:.2f}): the "
+            "series, or the theory, misses something; the standard deviations count as many rows "
+            "as that leaves independent, and are too small still"
         )
     largest = float(np.abs(measured.strain).max())
     if measured.per_load:
-        said.append("the file does not say how large the strain was: the material is linear, and holds for small ones")
+        said.append(
+            "the file does not say how large the strain was: the material is linear, and holds for "
+            "small ones"
+        )
     elif largest > SMALL_STRAIN:
         said.append(
-            f"strains go up to {largest:.0%}, and the material is linear: these moduli are secants at that strain, and rubber "
-            "that is stretched less is another one"
+            f"strains go up to {largest:.0%}, and the material is linear: these moduli are secants "
+            "at that strain, and rubber that is stretched less is another one"
         )
     return said
 
 
 def faded(t: Array, x: Array, tau: Array) -> Array:
-    """The integral of exp(-(t - s) / tau) x'(s) over the past s, (n, terms), at times t (n,) [s] >= 0 of a history x (n,) that
-    steps to x[0] at t = 0, for times tau (terms,) [s]."""
+    """The integral of exp(-(t - s) / tau) x'(s) over the past s, (n, terms), at times t (n,) [s] >=
+    0 of a history x (n,) that steps to x[0] at t = 0, for times tau (terms,) [s]."""
     intervals = np.diff(t, prepend=0.0)[:, None] / tau
     a = np.exp(-intervals)
-    slow = np.where(intervals > 0, -np.expm1(-intervals) / np.where(intervals > 0, intervals, 1.0), 1.0)
+    slow = np.where(
+        intervals > 0, -np.expm1(-intervals) / np.where(intervals > 0, intervals, 1.0), 1.0
+    )
     b = np.diff(x, prepend=x[0])[:, None] * slow
     b[0] = x[0] * a[0]
     step = 1  # h_i = a_i h_{i-1} + b_i, twice as many terms summed in every pass
@@ -276,7 +318,8 @@ def faded(t: Array, x: Array, tau: Array) -> Array:
 
 
 def responses(test: str, t: Array, x: Array, tau: Array) -> Array:
-    """What each coefficient adds to the answer (n, 1 + terms): of a relaxation series E, E_i [Pa] to the stress under the
-    strain x; of a creep series J_0, J_i [1/Pa] to the strain under the stress x."""
+    """What each coefficient adds to the answer (n, 1 + terms): of a relaxation series E, E_i [Pa]
+    to the stress under the strain x; of a creep series J_0, J_i [1/Pa] to the strain under the
+    stress x."""
     h = faded(t, x, tau)
     return np.column_stack((x, h if test == "relaxation" else x[:, None] - h))

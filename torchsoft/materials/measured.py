@@ -1,8 +1,9 @@
-"""Relaxation and creep tests in one dimension: strain and nominal stress over time, read from CSV files in SI units.
+"""Relaxation and creep tests in one dimension: strain and nominal stress over time, read from CSV
+files in SI units.
 
-A file has the column `t` and one pair of these, each with its unit in the heading: `strain`, `stretch` or `elongation` with
-`stress` or `force`; or `modulus` alone, the stress over a strain put on at t = 0 and held; or `compliance` alone, the strain
-over a stress held so.
+A file has the column `t` and one pair of these, each with its unit in the heading: `strain`,
+`stretch` or `elongation` with `stress` or `force`; or `modulus` alone, the stress over a strain put
+on at t = 0 and held; or `compliance` alone, the strain over a stress held so.
 """
 
 from dataclasses import dataclass
@@ -43,10 +44,11 @@ SMALL_STRAIN = 0.1
 
 @dataclass(frozen=True)
 class Measured:
-    """A test: times t (n,) [s] since the load was put on, strain (n,) [1], nominal stress (n,) [Pa], and what was put on.
+    """A test: times t (n,) [s] since the load was put on, strain (n,) [1], nominal stress (n,)
+    [Pa], and what was put on.
 
-    Between rows what was put on is linear in time; it begins at t = 0 with a step to its value in the first row. Both may be
-    `per_load`, over what was put on, which nobody knows then.
+    Between rows what was put on is linear in time; it begins at t = 0 with a step to its value in
+    the first row. Both may be `per_load`, over what was put on, which nobody knows then.
     """
 
     path: Path
@@ -68,24 +70,32 @@ class Measured:
 
     @property
     def window(self) -> tuple[float, float]:
-        """The shortest and the longest time [s] that the rows resolve: the shortest interval, and all of the test."""
+        """The shortest and the longest time [s] that the rows resolve: the shortest interval, and
+        all of the test."""
         intervals = np.diff(self.t, prepend=0.0)
         return float(intervals[intervals > 0].min()), float(self.t[-1])
 
 
 def read(
-    path: str | Path, *, test: Test | None = None, length: float | None = None, area: float | None = None
+    path: str | Path,
+    *,
+    test: Test | None = None,
+    length: float | None = None,
+    area: float | None = None,
 ) -> Measured:
-    """The test in a CSV file. `length` [m] is the gauge length, which elongations are divided by, `area` [m2] the cross-section
-    before the test, for forces. Without `test`, that is what was held: of strain and stress, what changes less over the second
-    half of the rows. Raises `ValueError` naming file, row and column, and `OSError`.
+    """The test in a CSV file. `length` [m] is the gauge length, which elongations are divided by,
+    `area` [m2] the cross-section before the test, for forces. Without `test`, that is what was
+    held: of strain and stress, what changes less over the second half of the rows. Raises
+    `ValueError` naming file, row and column, and `OSError`.
     """
     path = Path(path)
     table = csvfile.read(path, KNOWN, hint)
     values = table.values
     check_rows(path, table)
     if (alone := {"modulus", "compliance"} & values.keys()) and len(values) > 2:
-        raise ValueError(f"{path}: `{min(alone)}` stands alone beside `t`, but there is {', '.join(values)}")
+        raise ValueError(
+            f"{path}: `{min(alone)}` stands alone beside `t`, but there is {', '.join(values)}"
+        )
     one = np.ones_like(values["t"])
     if alone:
         own: Test = "relaxation" if alone == {"modulus"} else "creep"
@@ -94,7 +104,9 @@ def read(
         for name, given in (("length", length), ("area", area)):
             if given is not None:
                 raise ValueError(f"{path}: nothing is to be divided by the `{name}`")
-        strain, stress = (one, values["modulus"]) if own == "relaxation" else (values["compliance"], one)
+        strain, stress = (
+            (one, values["modulus"]) if own == "relaxation" else (values["compliance"], one)
+        )
         return Measured(path, own, values["t"], strain, stress, per_load=True)
     gauge = "an elongation needs the gauge length, `length` [m]"
     section = "a force needs the cross-section, `area` [m2]"
@@ -104,7 +116,9 @@ def read(
         if not np.abs(x).max() > 0:
             raise ValueError(f"{path}: the {name} is zero throughout")
     if float(strain @ stress) <= 0:
-        raise ValueError(f"{path}: strain and stress are opposite; is one of them positive in compression?")
+        raise ValueError(
+            f"{path}: strain and stress are opposite; is one of them positive in compression?"
+        )
     return Measured(path, test or held(strain, stress), values["t"], strain, stress)
 
 
@@ -116,10 +130,15 @@ def held(strain: Array, stress: Array) -> Test:
 
 
 def nominal(
-    path: Path, values: dict[str, Array], names: tuple[str, ...], option: str, size: float | None, needs: str
+    path: Path,
+    values: dict[str, Array],
+    names: tuple[str, ...],
+    option: str,
+    size: float | None,
+    needs: str,
 ) -> Array:
-    """Nominal strain [1] or stress [Pa] (n,) from the one of the columns `names` that is there, the last over `size`. Raises
-    `ValueError` unless it is given in one way."""
+    """Nominal strain [1] or stress [Pa] (n,) from the one of the columns `names` that is there, the
+    last over `size`. Raises `ValueError` unless it is given in one way."""
     there = [name for name in names if name in values]
     if len(there) != 1:
         found = f"has {' and '.join(there)}" if there else "has none of them"
@@ -137,16 +156,23 @@ def check_rows(path: Path, table: csvfile.Numbers) -> None:
     if "t" not in table.values:
         raise ValueError(f"{path} has no column `t`{hint('t', 2)}")
     if len(table.rows) < LEAST:
-        raise ValueError(f"{path} has {len(table.rows)} rows of numbers, but needs at least {LEAST}")
+        raise ValueError(
+            f"{path} has {len(table.rows)} rows of numbers, but needs at least {LEAST}"
+        )
     for name, column in table.values.items():
         if (empty := np.flatnonzero(np.isnan(column))).size:
             raise ValueError(f"{path}, row {table.rows[empty[0]]}, column `{name}` is empty")
     t = table.values["t"]
     if t[0] < 0:
-        raise ValueError(f"{path}, row {table.rows[0]}, column `t`: {t[0]:g} s is before the load; count times from it")
+        raise ValueError(
+            f"{path}, row {table.rows[0]}, column `t`: {t[0]:g} s is before the load; count times "
+            "from it"
+        )
     if (back := np.flatnonzero(np.diff(t) <= 0)).size:
         i = back[0] + 1
-        raise ValueError(f"{path}, row {table.rows[i]}, column `t`: {t[i]:g} s is not after {t[i - 1]:g} s")
+        raise ValueError(
+            f"{path}, row {table.rows[i]}, column `t`: {t[i]:g} s is not after {t[i - 1]:g} s"
+        )
 
 
 def hint(name: str, columns: int) -> str:

@@ -1,7 +1,7 @@
 """Rubbers from the literature. Every coefficient is `published`, with where, or `assumed`.
 
-None of these sources gives retardation times: one Kelvin-Voigt time is assumed, and ought to be fitted to a relaxation or creep
-test, or identified.
+None of these sources gives retardation times: one Kelvin-Voigt time is assumed, and ought to be
+fitted to a relaxation or creep test, or identified.
 """
 
 from collections.abc import Mapping
@@ -12,17 +12,16 @@ from torchsoft.paper.parameters import Parameters, Source
 from torchsoft.physics.material import KelvinVoigt
 
 GENT = "A. N. Gent, On the relation between indentation hardness and Young's modulus, Rubber Chem. Technol. 31 (1958) 896-906"
-LINDLEY = (
-    "P. B. Lindley, Engineering Design with Natural Rubber, 4th ed., Malaysian Rubber Producers' Research Association"
-)
+LINDLEY = "P. B. Lindley, Engineering Design with Natural Rubber, 4th ed., Malaysian Rubber Producers' Research Association"
 JOHNSTON = (
-    "I. D. Johnston et al., Mechanical characterization of bulk Sylgard 184 for microfluidics and microengineering, "
-    "J. Micromech. Microeng. 24 (2014) 035017"
+    "I. D. Johnston et al., Mechanical characterization of bulk Sylgard 184 for microfluidics and "
+    "microengineering, J. Micromech. Microeng. 24 (2014) 035017"
 )
 SMOOTH_ON = "Smooth-On Inc., Dragon Skin series, technical bulletin"
 
 SHORE_A = (20.0, 80.0)
-"""Hardnesses for which the relation between Shore A and Young's modulus is taken: at the ends of the scale it is not one."""
+"""Hardnesses for which the relation between Shore A and Young's modulus is taken: at the ends of
+the scale it is not one."""
 
 
 class Coefficient(NamedTuple):
@@ -34,11 +33,13 @@ class Coefficient(NamedTuple):
 
 
 def from_shore_a(hardness: float) -> float:
-    """Young's modulus [Pa] of rubber of a Shore A hardness S, 0.0981 (56 + 7.62336 S) / (0.137505 (254 - 2.54 S)) MPa (Gent
-    1958). Raises `ValueError` outside `SHORE_A`."""
+    """Young's modulus [Pa] of rubber of a Shore A hardness S, 0.0981 (56 + 7.62336 S) / (0.137505
+    (254 - 2.54 S)) MPa (Gent 1958). Raises `ValueError` outside `SHORE_A`."""
     low, high = SHORE_A
     if not low <= hardness <= high:
-        raise ValueError(f"the hardness must be from {low:g} to {high:g} Shore A, but is {hardness:g}")
+        raise ValueError(
+            f"the hardness must be from {low:g} to {high:g} Shore A, but is {hardness:g}"
+        )
     return 1e6 * 0.0981 * (56 + 7.62336 * hardness) / (0.137505 * (254 - 2.54 * hardness))
 
 
@@ -51,12 +52,17 @@ class Preset:
 
     def material(self, depth: float) -> KelvinVoigt:
         """Pads of it, so deep [m] out of the plane."""
-        return KelvinVoigt(**{name: one.value for name, one in self.coefficients.items()}, depth=depth)
+        return KelvinVoigt(
+            **{name: one.value for name, one in self.coefficients.items()}, depth=depth
+        )
 
     def described(self) -> str:
         """Every coefficient with its unit, its source and where that is."""
         units = {"E": "Pa", "nu": "1", "rho": "kg/m3", "tau": "s"}
-        rows = [f"  {k:<4}{c.value:<9.4g} {units[k]:<6} {c.source}: {c.origin}" for k, c in self.coefficients.items()]
+        rows = [
+            f"  {k:<4}{c.value:<9.4g} {units[k]:<6} {c.source}: {c.origin}"
+            for k, c in self.coefficients.items()
+        ]
         return "\n".join([self.name, *rows])
 
 
@@ -68,20 +74,28 @@ def preset(name: str, E: float, origin: str) -> Preset:
         {
             "E": Coefficient(E, "published", origin),
             "nu": Coefficient(0.49, "assumed", "nearly incompressible, as rubber is"),
-            "rho": Coefficient(pad.rho, "assumed", "as the paper's pads; counts for inertial ones only"),
-            "tau": Coefficient(pad.tau, "assumed", "as the paper's pads; fit it to a test, or identify it"),
+            "rho": Coefficient(
+                pad.rho, "assumed", "as the paper's pads; counts for inertial ones only"
+            ),
+            "tau": Coefficient(
+                pad.tau, "assumed", "as the paper's pads; fit it to a test, or identify it"
+            ),
         },
     )
 
 
 def silicone(name: str, hardness: float, sheet: str) -> Preset:
     """A silicone by the Shore A hardness in its data sheet."""
-    return preset(name, from_shore_a(hardness), f"{hardness:g} Shore A ({sheet}), by the relation of {GENT}")
+    return preset(
+        name, from_shore_a(hardness), f"{hardness:g} Shore A ({sheet}), by the relation of {GENT}"
+    )
 
 
 def natural_rubber(hardness: int, E: float) -> Preset:
     """Natural rubber of an IRHD hardness with its Young's modulus [Pa]."""
-    return preset(f"natural rubber {hardness} IRHD", E, f"table of hardness and elastic moduli, {LINDLEY}")
+    return preset(
+        f"natural rubber {hardness} IRHD", E, f"table of hardness and elastic moduli, {LINDLEY}"
+    )
 
 
 PRESETS: Mapping[str, Preset] = {
@@ -90,9 +104,15 @@ PRESETS: Mapping[str, Preset] = {
         silicone("Dragon Skin 20", 20.0, SMOOTH_ON),
         silicone("Dragon Skin 30", 30.0, SMOOTH_ON),
         preset(
-            "Sylgard 184, softest", 1.32e6, f"44 Shore A, least of curing temperatures from 25 to 200 C, {JOHNSTON}"
+            "Sylgard 184, softest",
+            1.32e6,
+            f"44 Shore A, least of curing temperatures from 25 to 200 C, {JOHNSTON}",
         ),
-        preset("Sylgard 184, hardest", 2.97e6, f"54 Shore A, most of curing temperatures from 25 to 200 C, {JOHNSTON}"),
+        preset(
+            "Sylgard 184, hardest",
+            2.97e6,
+            f"54 Shore A, most of curing temperatures from 25 to 200 C, {JOHNSTON}",
+        ),
         natural_rubber(40, 1.50e6),
         natural_rubber(50, 2.20e6),
         natural_rubber(60, 4.45e6),

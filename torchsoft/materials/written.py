@@ -18,15 +18,26 @@ from torchsoft.plot.scene import INK
 
 MPA = 1e-6
 
-UNITS = {"E": "Pa", "moduli": "Pa", "J": "1", "tau": "s", "tau_instant": "s", "nu": "1", "rho": "kg/m3", "depth": "m"}
+UNITS = {
+    "E": "Pa",
+    "moduli": "Pa",
+    "J": "1",
+    "tau": "s",
+    "tau_instant": "s",
+    "nu": "1",
+    "rho": "kg/m3",
+    "depth": "m",
+}
 
 FILES = ("material.toml", "summary.json", "fit.png")
 """What is written."""
 
 
-def write(fit: Fit, folder: Path, assumed: Mapping[str, float], options: Mapping[str, object]) -> None:
-    """Write `FILES`. `assumed` are nu, rho and depth, which a test in one dimension does not tell; `options` are those of
-    the command. Each file appears whole or not at all."""
+def write(
+    fit: Fit, folder: Path, assumed: Mapping[str, float], options: Mapping[str, object]
+) -> None:
+    """Write `FILES`. `assumed` are nu, rho and depth, which a test in one dimension does not tell;
+    `options` are those of the command. Each file appears whole or not at all."""
     with replacing(folder / "material.toml") as partial:
         partial.write_text(toml(fit, assumed), encoding="utf-8")
     write_json(folder / "summary.json", summary(fit, assumed, options))
@@ -34,35 +45,43 @@ def write(fit: Fit, folder: Path, assumed: Mapping[str, float], options: Mapping
 
 
 def toml(fit: Fit, assumed: Mapping[str, float]) -> str:
-    """The material as a table with the names of the constructor's arguments, in comments what must be known of it."""
+    """The material as a table with the names of the constructor's arguments, in comments what must
+    be known of it."""
     name = fit.measured.path.stem
     key = name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
     rows = [f"[materials.{key}]", f'kind = "{fit.kind}"']
     for argument, value in fit.table().items():
         note = ", small: the instantaneous spring's" if argument == "tau_instant" else ""
         rows.append(f"{argument} = {value!r}  # [{UNITS[argument]}]{note}")
-    rows += [f"{name} = {value!r}  # [{UNITS[name]}] not of this test: assumed" for name, value in assumed.items()]
+    rows += [
+        f"{name} = {value!r}  # [{UNITS[name]}] not of this test: assumed"
+        for name, value in assumed.items()
+    ]
     head = [
-        f"Fitted to {fit.measured.path.name} ({fit.measured.test} test) by torchsoft {version('torchsoft')}.",
+        f"Fitted to {fit.measured.path.name} ({fit.measured.test} test) by torchsoft "
+        f"{version('torchsoft')}.",
         *fit.notices,
     ]
     return "\n".join([*(f"# {' '.join(text.split())}" for text in head), "", *rows]) + "\n"
 
 
-def summary(fit: Fit, assumed: Mapping[str, float], options: Mapping[str, object]) -> dict[str, object]:
+def summary(
+    fit: Fit, assumed: Mapping[str, float], options: Mapping[str, object]
+) -> dict[str, object]:
     """What was found, from what, and how, in SI units."""
     m = fit.measured
     return {
-        "made_by": {"torchsoft": version("torchsoft"), "command": "torchsoft material fit", "options": dict(options)},
-        "data": {
-            "file": m.path.name, "sha256": sha256(m.path.read_bytes()).hexdigest(), "rows": len(m.t), "test": m.test,
-            "resolved_s": list(m.window), "largest_strain": None if m.per_load else float(abs(m.strain).max()),
+        "made_by": {"torchsoft": version("torchsoft"), "command": "torchsoft material fit",
+        "options": dict(options)}, "data": {
+            "file": m.path.name, "sha256": sha256(m.path.read_bytes()).hexdigest(),
+            "rows": len(m.t), "test": m.test, "resolved_s": list(m.window),
+            "largest_strain": None if m.per_load else float(abs(m.strain).max()),
         },
-        "method": "nonnegative least squares on a logarithmic grid of times, then least squares in strengths and times "
-                  "together; the number of terms by Schwarz's criterion (BIC)",
+        "method": "nonnegative least squares on a logarithmic grid of times, then least squares in "
+                  "strengths and times together; the number of terms by Schwarz's criterion (BIC)",
         "kind": fit.kind,
-        "coefficients": {name: finite({"value": x, "sd": fit.sd[name]}) for name, x in fit.values.items()},
-        "assumed": dict(assumed),
+        "coefficients": {name: finite({"value": x, "sd": fit.sd[name]}) for name,
+        x in fit.values.items()}, "assumed": dict(assumed),
         "criterion": {str(count): score for count, score in fit.scores.items()},
         "residual_rms_over_largest": fit.rms,
         "residual_correlation": fit.correlation,
@@ -77,16 +96,15 @@ def printed(fit: Fit) -> str:
         f"{name:<7}{value:<12.5g}{units[name[0]]:<3}+- {196 * fit.sd[name] / value:.2g} %"
         for name, value in fit.values.items()
     ]
-    head = (
-        f"{fit.measured.path.name}: {fit.measured.test} test, {fit.kind} of {fit.terms} terms, residual {fit.rms:.2%}"
-    )
+    head = f"{fit.measured.path.name}: {fit.measured.test} test, {fit.kind} of {fit.terms} terms, residual {fit.rms:.2%}"
     return "\n".join([head, *rows, *(f"note: {notice}" for notice in fit.notices)])
 
 
 @rc_context(STYLE)
 def fitted(fit: Fit) -> Figure:
-    """Measured and fitted answer over time, their difference, and strengths over times with 95 % intervals; grey is what the
-    rows do not resolve. The time axis is logarithmic: a row at t = 0 is left out."""
+    """Measured and fitted answer over time, their difference, and strengths over times with 95 %
+    intervals; grey is what the rows do not resolve. The time axis is logarithmic: a row at t = 0 is
+    left out."""
     m, relaxes = fit.measured, fit.kind == "prony"
     seen = m.t > 0
     what, per, scale = ("stress", "MPa", MPA) if relaxes else ("strain", "1", 1.0)
@@ -95,14 +113,22 @@ def fitted(fit: Fit) -> Figure:
     series = "relaxation series" if relaxes else "generalised Kelvin chain"
     figure = new_figure(f"{m.path.name}: {m.test}, {series} of {fit.terms} terms", 9, 7.2)
     data, left, spectrum = figure.subplots(3, 1, height_ratios=(3, 1.4, 2), sharex=True)
-    data.plot(m.t[seen], scale * m.answer[seen], ".", color=INK, ms=4, label=f"measured, {len(m.t)} rows")
-    data.plot(m.t[seen], scale * fit.fitted[seen], color=OTHER, label=f"fitted, residual {fit.rms:.2%} of the largest")
+    data.plot(
+        m.t[seen], scale * m.answer[seen], ".", color=INK, ms=4, label=f"measured, {len(m.t)} rows"
+    )
+    data.plot(
+        m.t[seen],
+        scale * fit.fitted[seen],
+        color=OTHER,
+        label=f"fitted, residual {fit.rms:.2%} of the largest",
+    )
     data.set(ylabel=f"{what} [{per}]", title=f"a) {what}")
     data.legend()
     left.axhline(0.0, color=OTHER)
     left.plot(m.t[seen], scale * fit.residual[seen], ".", color=INK, ms=4)
     left.set(
-        ylabel=f"residual [{per}]", title=f"b) measured less fitted, neighbours correlate by {fit.correlation:.2f}"
+        ylabel=f"residual [{per}]",
+        title=f"b) measured less fitted, neighbours correlate by {fit.correlation:.2f}",
     )
     symbol, size, unit = ("E", MPA, " [MPa]") if relaxes else ("J", 1.0, " [1]")
     for k in range(1, fit.terms + 1):
@@ -111,12 +137,18 @@ def fitted(fit: Fit) -> Figure:
             (x, fit.sd[f"tau_{k}"]), (y, fit.sd[f"{symbol}_{k}"])
         )]  # fmt: skip
         across, along = ([[low], [high]] for low, high in spread)
-        spectrum.errorbar(x, size * y, size * np.array(along), across, fmt="o", color=ACTUAL, capsize=3)
+        spectrum.errorbar(
+            x, size * y, size * np.array(along), across, fmt="o", color=ACTUAL, capsize=3
+        )
     E = fit.values["E"]
     kept = f"E = {MPA * E:.4g} MPa ± {1.96 * fit.sd['E'] / E:.1%}"
     spectrum.margins(y=0.2)
     spectrum.set(
-        xscale="log", yscale="log", xlabel="time [s]", ylabel=f"${symbol}_i${unit}", title=f"c) terms; {kept}, relaxed"
+        xscale="log",
+        yscale="log",
+        xlabel="time [s]",
+        ylabel=f"${symbol}_i${unit}",
+        title=f"c) terms; {kept}, relaxed",
     )
     low, high = m.window
     ends = spectrum.get_xlim()

@@ -1,4 +1,5 @@
-"""Static, frictionless equilibria of the paper's rig: the object at rest under its weight, and pressed between the pads."""
+"""Static, frictionless equilibria of the paper's rig: the object at rest under its weight, and
+pressed between the pads."""
 
 import warnings
 
@@ -23,7 +24,8 @@ TOUCHING = 30
 
 
 def rest(model: SoftGrasp, x: Tensor | None = None) -> Tensor:
-    """State (size,): the object at rest on the lower pad under its weight, the upper pad just touching it from above.
+    """State (size,): the object at rest on the lower pad under its weight, the upper pad just
+    touching it from above.
 
     `x` () [m] is where, by default the scenario's x_C0; the state is differentiable in it.
     """
@@ -31,31 +33,47 @@ def rest(model: SoftGrasp, x: Tensor | None = None) -> Tensor:
     weightless = float((model.disc.mass * model.gravity).detach()) == 0.0
     at = torch.tensor(model.settings.scenario.x_C0, dtype=torch.float64) if x is None else x
     top, (below, above) = model.settings.pad.height, reaches(model)
-    start, away = top + below - 0.1 * top, torch.tensor(10 * (top + below + above), dtype=torch.float64)
+    start, away = (
+        top + below - 0.1 * top,
+        torch.tensor(10 * (top + below + above), dtype=torch.float64),
+    )
     state = touching(model, at, away) if weightless else balanced(model, at, start, away)
     x, y, _ = state.pose["disc"]
-    return model.pack(state._replace(pose=state.pose | {"bracket": place(x, model.touch_height(y) + CLEAR)}))
+    return model.pack(
+        state._replace(pose=state.pose | {"bracket": place(x, model.touch_height(y) + CLEAR)})
+    )
 
 
 def press(model: SoftGrasp, bracket_height: float) -> Tensor:
-    """State (size,): the object between the pads with the bracket held at `bracket_height` [m], without friction.
+    """State (size,): the object between the pads with the bracket held at `bracket_height` [m],
+    without friction.
 
-    Raises `NoEquilibrium` when the bracket is too high for its pad to touch the object, sunk in under its weight.
+    Raises `NoEquilibrium` when the bracket is too high for its pad to touch the object, sunk in
+    under its weight.
     """
     check_statics(model)
     number("bracket_height", bracket_height)
     p, (below, above) = model.settings, reaches(model)
     face, top = bracket_height - p.bracket.cm_height - p.pad.height, p.pad.height
-    x, y_Br = (torch.tensor(value, dtype=torch.float64) for value in (p.scenario.x_C0, bracket_height))
-    state = None if face >= top + below + above else balanced(model, x, 0.5 * (top + below + face - above), y_Br)
+    x, y_Br = (
+        torch.tensor(value, dtype=torch.float64) for value in (p.scenario.x_C0, bracket_height)
+    )
+    state = (
+        None
+        if face >= top + below + above
+        else balanced(model, x, 0.5 * (top + below + face - above), y_Br)
+    )
     if state is None or not bool(state.pads["U"].any()):
-        raise NoEquilibrium(f"the bracket at {bracket_height} m is too high for its pad to touch the disc; lower it")
+        raise NoEquilibrium(
+            f"the bracket at {bracket_height} m is too high for its pad to touch the disc; lower it"
+        )
     return model.pack(state)
 
 
 @torch.no_grad()
 def holding_force(model: SoftGrasp, y: Tensor) -> float:
-    """Force [N] on the bracket, downwards, that balances the upper pad's normal forces in the frictionless state y (size,)."""
+    """Force [N] on the bracket, downwards, that balances the upper pad's normal forces in the
+    frictionless state y (size,)."""
     pad, part = model.pads["U"], model.unpack(y).pads["U"]
     force = pad.elastic_force(part) if pad.inertial else part[0]
     return float(force[:, 1].sum())
@@ -64,7 +82,9 @@ def holding_force(model: SoftGrasp, y: Tensor) -> float:
 def check_statics(model: SoftGrasp) -> None:
     """Raises `ValueError` for a model whose statics would be nonsense, or have no graph."""
     if torch.is_inference_mode_enabled():
-        raise ValueError("statics need torch's graphs, which torch.inference_mode() has not; use torch.no_grad()")
+        raise ValueError(
+            "statics need torch's graphs, which torch.inference_mode() has not; use torch.no_grad()"
+        )
     check_values(model)
 
 
@@ -79,7 +99,8 @@ def place(x: Tensor, y: Tensor) -> Tensor:
 
 
 def touching(model: SoftGrasp, x: Tensor, y_Br: Tensor) -> State:
-    """The object where it just touches the undeformed lower pad: what a body without weight rests like."""
+    """The object where it just touches the undeformed lower pad: what a body without weight rests
+    like."""
     state = model.unpack(torch.zeros(model.layout.size, dtype=torch.float64))
     y = torch.tensor(model.settings.pad.height + 0.9 * reaches(model)[0], dtype=torch.float64)
     for _ in range(TOUCHING):
@@ -93,14 +114,15 @@ def touching(model: SoftGrasp, x: Tensor, y_Br: Tensor) -> State:
 
 
 def balanced(model: SoftGrasp, x: Tensor, y: float, y_Br: Tensor) -> State:
-    """The object in balance at x [m], looked for from the height y [m], with the bracket held at y_Br [m]. Warns where
-    the pads turn it."""
+    """The object in balance at x [m], looked for from the height y [m], with the bracket held at
+    y_Br [m]. Warns where the pads turn it."""
     pose = {"disc": place(x, torch.full_like(x, y)), "bracket": place(x, y_Br)}
     try:
         pose = resting(model, pose, {"disc": [1]}, actuators=(), residual=RESIDUAL)
     except NoEquilibrium as error:
         raise NoEquilibrium(
-            f"no static equilibrium found: {error}; are the contact springs far stiffer than the pads?"
+            f"no static equilibrium found: {error}; are the contact springs far stiffer than the "
+            "pads?"
         ) from None
     state = model.unpack(standing(model, pose))
     with torch.no_grad():
@@ -109,7 +131,8 @@ def balanced(model: SoftGrasp, x: Tensor, y: float, y_Br: Tensor) -> State:
         load = sum(float(interface.F_N.sum()) for interface in graph.interfaces.values())
     if abs(moment) > MOMENT_ARM * model.shape.size() * load:
         warnings.warn(
-            f"the object is held at theta = 0, where the pads turn it with {moment:.3g} N.m: a run from here begins with that",
+            f"the object is held at theta = 0, where the pads turn it with {moment:.3g} N.m: a run "
+            "from here begins with that",
             stacklevel=3,
         )
     return state

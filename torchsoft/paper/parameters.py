@@ -1,7 +1,8 @@
-"""Settings of the paper's rig: defaults and their sources; units, bounds and meanings are those of the parts' constructors.
+"""Settings of the paper's rig: defaults and their sources; units, bounds and meanings are those of
+the parts' constructors.
 
-Every number is `published` (printed in the paper) or `assumed` (chosen here, because the paper does not give it). A value that
-differs from its default is `assumed` whatever the default was.
+Every number is `published` (printed in the paper) or `assumed` (chosen here, because the paper does
+not give it). A value that differs from its default is `assumed` whatever the default was.
 """
 
 import math
@@ -26,15 +27,31 @@ from torchsoft.tables import Table, from_toml, line, refusing
 Source = Literal["published", "assumed"]
 
 
-def of(part: type, name: str, default: float, source: Source, note: str = "", unit: str = "") -> Any:
-    """A number of the paper's rig: an argument of a part's constructor, with its default and source; `note` says more."""
+def of(
+    part: type, name: str, default: float, source: Source, note: str = "", unit: str = ""
+) -> Any:
+    """A number of the paper's rig: an argument of a part's constructor, with its default and
+    source; `note` says more."""
     declared = quantities(part)[name]
-    return number(default, unit or declared.unit, source, note or declared.meaning, declared.low, declared.high)
+    return number(
+        default,
+        unit or declared.unit,
+        source,
+        note or declared.meaning,
+        declared.low,
+        declared.high,
+    )
 
 
 def number(default: float, unit: str, source: Source, meaning: str, low: float, high: float) -> Any:
     """A number with its bounds."""
-    return Field(default, description=meaning, json_schema_extra={"unit": unit, "source": source}, ge=low, le=high)
+    return Field(
+        default,
+        description=meaning,
+        json_schema_extra={"unit": unit, "source": source},
+        ge=low,
+        le=high,
+    )
 
 
 def choice(default: Any, source: Source, meaning: str) -> Any:
@@ -50,7 +67,13 @@ class PadParameters(Table):
 
     length: float = of(PadMesh, "length", 0.120, "published", "L_x")
     height: float = of(PadMesh, "height", 4.59e-3, "published", "L_y")
-    depth: float = of(KelvinVoigt, "depth", 0.044, "assumed", "out-of-plane depth; a steel disc of the assumed mass")
+    depth: float = of(
+        KelvinVoigt,
+        "depth",
+        0.044,
+        "assumed",
+        "out-of-plane depth; a steel disc of the assumed mass",
+    )
     E: float = of(KelvinVoigt, "E", 0.75e6, "assumed", "Young's modulus; Shore A 20 silicone")
     nu: float = of(KelvinVoigt, "nu", 0.45, "assumed")
     rho: float = of(KelvinVoigt, "rho", 1100.0, "assumed", "density (inertial pads only)")
@@ -74,29 +97,43 @@ class PadParameters(Table):
 
 
 class ContactParameters(Table):
-    """Penalty contact per surface node at the reference spacing; other spacings scale by tributary length."""
+    """Penalty contact per surface node at the reference spacing; other spacings scale by tributary
+    length."""
 
     K_n: float = of(SoftContact, "K_n", 1.2e5, "assumed", "normal spring, K_28 and K_64")
     R_n: float = of(SoftContact, "R_n", 441.7149, "assumed", "normal dashpot, R_29 and R_65")
-    K_t: float = of(SoftContact, "K_t", 1.2e5, "assumed", "momentary tangential spring, K_23 and K_59")
+    K_t: float = of(
+        SoftContact, "K_t", 1.2e5, "assumed", "momentary tangential spring, K_23 and K_59"
+    )
     R_t: float = of(SoftContact, "R_t", 441.7149, "assumed", "tangential dashpot, R_24 and R_60")
     mu_s: float = of(SmoothSlip, "mu_s", 0.8, "assumed")
     mu_k: float = of(SmoothSlip, "mu_k", 0.7, "assumed")
     eta: float = of(SmoothSlip, "eta", 10.0, "assumed")
     v_s: float = of(SmoothSlip, "v_s", 5e-3, "assumed")
     epsilon: float = of(SoftContact, "epsilon", 1e-6, "assumed")
-    node_spacing: float = of(SoftContact, "node_spacing", 1e-3, "assumed", "spacing the per-node values refer to")
+    node_spacing: float = of(
+        SoftContact, "node_spacing", 1e-3, "assumed", "spacing the per-node values refer to"
+    )
     friction: Literal["smooth", "coulomb"] = choice(
         "smooth", "assumed", "slip element, or Eq. 12-13 with the force's modulus and re-anchoring"
     )
     points: int = number(
-        0, "1", "assumed", "contact points an element; 0 puts one on every node, as the paper does", 0, 8
+        0,
+        "1",
+        "assumed",
+        "contact points an element; 0 puts one on every node, as the paper does",
+        0,
+        8,
     )
 
     def law(self, friction: SlipLaw | None = None) -> SoftContact:
         """Law of a contact point; `friction` replaces the one of the settings."""
         smooth = self.friction == "smooth"
-        slip = SmoothSlip(self.mu_s, self.mu_k, self.v_s, self.eta) if smooth else Coulomb(self.mu_s, self.mu_k)
+        slip = (
+            SmoothSlip(self.mu_s, self.mu_k, self.v_s, self.eta)
+            if smooth
+            else Coulomb(self.mu_s, self.mu_k)
+        )
         return SoftContact(
             self.K_n,
             self.R_n,
@@ -123,27 +160,43 @@ class DiscParameters(Table):
 
 class BracketParameters(Table):
     mass: float = of(Body, "mass", 0.4065, "assumed", MASS)
-    cm_height: float = number(2.18e-3, "m", "assumed", "centre of mass above the pad's bonded face", -10.0, 10.0)
+    cm_height: float = number(
+        2.18e-3, "m", "assumed", "centre of mass above the pad's bonded face", -10.0, 10.0
+    )
 
 
 class ControlParameters(Table):
-    K_81: float = of(PD, "Kp", 1.2e5, "published", "horizontal loop, proportional gain, Eq. 34", "N/m")
-    R_80: float = of(PD, "Kd", 441.7149, "published", "horizontal loop, derivative gain, Eq. 34", "N.s/m")
-    K_98: float = of(PD, "Kp", 1.2e5, "published", "vertical loop, proportional gain, Eq. 32", "N/m")
-    R_99: float = of(PD, "Kd", 441.7149, "published", "vertical loop, derivative gain, Eq. 32", "N.s/m")
+    K_81: float = of(
+        PD, "Kp", 1.2e5, "published", "horizontal loop, proportional gain, Eq. 34", "N/m"
+    )
+    R_80: float = of(
+        PD, "Kd", 441.7149, "published", "horizontal loop, derivative gain, Eq. 34", "N.s/m"
+    )
+    K_98: float = of(
+        PD, "Kp", 1.2e5, "published", "vertical loop, proportional gain, Eq. 32", "N/m"
+    )
+    R_99: float = of(
+        PD, "Kd", 441.7149, "published", "vertical loop, derivative gain, Eq. 32", "N.s/m"
+    )
     senses: Literal["disc", "bracket"] = choice(
-        "disc", "published", "whose x the horizontal loop measures; the bracket's makes the loop collocated"
+        "disc",
+        "published",
+        "whose x the horizontal loop measures; the bracket's makes the loop collocated",
     )
 
 
 class ScenarioParameters(Table):
     """Grasp, roll out, hold, roll back, rest."""
 
-    gravity: float = of(Rig, "gravity", 9.81, "assumed", "gravitational acceleration, acting on the disc (Eq. 17)")
+    gravity: float = of(
+        Rig, "gravity", 9.81, "assumed", "gravitational acceleration, acting on the disc (Eq. 17)"
+    )
     x_C0: float = number(60e-3, "m", "published", "x_C(0), Eq. 22", -100.0, 100.0)
     y_Br_grasp: float = number(48.6e-3, "m", "published", "y_Br(t_g), Eq. 30", 1e-4, 100.0)
     grasp_time: float = number(0.375, "s", "published", "t_g", 1e-6, 1e5)
-    travel: float = number(-20e-3, "m", "published", "displacement of the disc, Eq. 23", -100.0, 100.0)
+    travel: float = number(
+        -20e-3, "m", "published", "displacement of the disc, Eq. 23", -100.0, 100.0
+    )
     roll_time: float = number(10.0, "s", "published", "time of the roll, each way", 1e-6, 1e5)
     hold_time: float = number(5.0, "s", "published", "time at the far end", 0, 1e5)
     rest_time: float = number(5.0, "s", "published", "rest at the end", 0, 1e5)
@@ -157,9 +210,10 @@ class ScenarioParameters(Table):
 class Parameters(Table):
     """All numbers of one simulation.
 
-    Raises `InvalidTable`, a `ValueError` in one sentence that names the field, for a value out of bounds, an unknown name, a
-    disc that does not fit between the pads, a scenario that rolls off them, or a mesh that would not fit in memory. Warns where
-    the friction law is not single-valued at the full grasp.
+    Raises `InvalidTable`, a `ValueError` in one sentence that names the field, for a value out of
+    bounds, an unknown name, a disc that does not fit between the pads, a scenario that rolls off
+    them, or a mesh that would not fit in memory. Warns where the friction law is not single-valued
+    at the full grasp.
     """
 
     pad: PadParameters = PadParameters()
@@ -178,28 +232,32 @@ class Parameters(Table):
     @model_validator(mode="after")
     def _geometry_is_possible(self) -> Self:
         stack = (
-            f"scenario.y_Br_grasp = {self.scenario.y_Br_grasp} m, with bracket.cm_height = {self.bracket.cm_height} m, "
-            f"pad.height = {self.pad.height} m and disc.radius = {self.disc.radius} m,"
+            f"scenario.y_Br_grasp = {self.scenario.y_Br_grasp} m, with bracket.cm_height = "
+            f"{self.bracket.cm_height} m, pad.height = {self.pad.height} m and disc.radius = "
+            f"{self.disc.radius} m,"
         )
         if self.compression <= 0:
             raise ValueError(
-                f"the disc does not fit: {stack} leaves the pads {-self.compression:.3g} m apart from the disc; lower the "
-                "bracket"
+                f"the disc does not fit: {stack} leaves the pads {-self.compression:.3g} m apart "
+                "from the disc; lower the bracket"
             )
         if self.compression >= self.pad.height:
             raise ValueError(
-                f"the disc does not fit: {stack} asks the two pads to give way by {self.compression:.3g} m, but linear "
-                "elasticity ends well below half of both heights; raise the bracket or take a smaller disc"
+                f"the disc does not fit: {stack} asks the two pads to give way by "
+                f"{self.compression:.3g} m, but linear elasticity ends well below half of both "
+                "heights; raise the bracket or take a smaller disc"
             )
         half_width = math.sqrt(self.disc.radius * self.compression)
         ends = sorted((self.scenario.x_C0, self.scenario.x_C0 + self.scenario.travel))
         if ends[0] - half_width < 0 or ends[1] + half_width > self.pad.length:
             raise ValueError(
-                f"the trajectory leaves the pad: scenario.x_C0 = {self.scenario.x_C0} m and scenario.travel = "
-                f"{self.scenario.travel} m take the disc from {ends[0]:.6g} to {ends[1]:.6g} m, its contact is "
-                f"{half_width:.3g} m wide to each side (disc.radius = {self.disc.radius} m, scenario.y_Br_grasp = "
-                f"{self.scenario.y_Br_grasp} m, bracket.cm_height = {self.bracket.cm_height} m, pad.height = "
-                f"{self.pad.height} m), and the pad reaches from 0 to pad.length = {self.pad.length} m"
+                f"the trajectory leaves the pad: scenario.x_C0 = {self.scenario.x_C0} m and "
+                f"scenario.travel = {self.scenario.travel} m take the disc from {ends[0]:.6g} to "
+                f"{ends[1]:.6g} m, its contact is {half_width:.3g} m wide to each side "
+                f"(disc.radius = {self.disc.radius} m, scenario.y_Br_grasp = "
+                f"{self.scenario.y_Br_grasp} m, bracket.cm_height = {self.bracket.cm_height} m, "
+                f"pad.height = {self.pad.height} m), and the pad reaches from 0 to pad.length = "
+                f"{self.pad.length} m"
             )
         return self
 
@@ -217,7 +275,8 @@ class Parameters(Table):
         force = 10.0 * self.contact.node_spacing / 1e-3  # [N], middle node of the full grasp
         if why := self.contact.law().jumps(force):
             warnings.warn(
-                f"{why}; the slip rate, and every gradient, jumps at slip onset. Raise contact.v_s or contact.eta.",
+                f"{why}; the slip rate, and every gradient, jumps at slip onset. Raise contact.v_s "
+                "or contact.eta.",
                 stacklevel=2,
             )
         return self
@@ -228,22 +287,27 @@ class Parameters(Table):
         for name, value in values.items():
             group, _, field = str(name).partition(".")
             if group not in tree or field not in tree[group]:
-                raise ValueError(f"`{line(name, 80)}` is not a parameter; known names: {', '.join(self.table())}")
+                raise ValueError(
+                    f"`{line(name, 80)}` is not a parameter; known names: {', '.join(self.table())}"
+                )
             tree[group][field] = value
         return Parameters.model_validate(tree)
 
     @classmethod
     def paper_like(cls) -> "Parameters":
-        """The friction set whose lateral forces fade in the grasp, as the paper reports: dashpot-dominated."""
+        """The friction set whose lateral forces fade in the grasp, as the paper reports:
+        dashpot-dominated."""
         return cls().override({"contact.K_t": 100.0})
 
     @classmethod
     def from_toml(cls, path: str | Path) -> "Parameters":
-        """Read a TOML file with a table per group. Raises `ValueError` naming the file and the field."""
+        """Read a TOML file with a table per group. Raises `ValueError` naming the file and the
+        field."""
         return from_toml(path, cls.model_validate)
 
     def table(self) -> dict[str, dict[str, Any]]:
-        """Every parameter by its dotted name: value, unit, source (`published` or `assumed`) and meaning."""
+        """Every parameter by its dotted name: value, unit, source (`published` or `assumed`) and
+        meaning."""
         rows = {}
         for group_name in Parameters.model_fields:
             group = getattr(self, group_name)
@@ -270,6 +334,7 @@ def adapter(name: str) -> TypeAdapter[Any]:
 
 
 def check(name: str, value: Any, where: str) -> None:
-    """Raises `InvalidTable` naming `where` for a value that the parameter may not have, whatever the others are."""
+    """Raises `InvalidTable` naming `where` for a value that the parameter may not have, whatever
+    the others are."""
     with refusing(within=where):
         adapter(name).validate_python(value)

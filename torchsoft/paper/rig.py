@@ -1,4 +1,5 @@
-"""The paper's rig from the lists: a disc between two soft pads, the upper one in a bracket under two PD controllers."""
+"""The paper's rig from the lists: a disc between two soft pads, the upper one in a bracket under
+two PD controllers."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -35,23 +36,26 @@ NAMES = {
 
 
 class SoftGrasp(Rig):
-    """A rigid body between two soft pads, the upper one in a bracket; channels and signals have the paper's names.
+    """A rigid body between two soft pads, the upper one in a bracket; channels and signals have the
+    paper's names.
 
-    The reference's signals are x_d of the disc (or of the bracket, `control.senses`), y_d of the bracket and F_ff, the vertical
-    effort fed forward; by default the bracket and the disc stay where they start. `friction`, `shape` and `material` replace
-    those of the settings. Parts that both pads share are `pad` (the material), `contact`, `disc`, `bracket` and `control`.
+    The reference's signals are x_d of the disc (or of the bracket, `control.senses`), y_d of the
+    bracket and F_ff, the vertical effort fed forward; by default the bracket and the disc stay
+    where they start. `friction`, `shape` and `material` replace those of the settings. Parts that
+    both pads share are `pad` (the material), `contact`, `disc`, `bracket` and `control`.
     """
 
     renamed: Mapping[str, str] = {
-        "disc_spin": "spin", "theta_C": "theta", "v_x_C": "v_x", "v_y_C": "v_y", "omega_C": "omega", "M_U": "bracket_moment",
-        "L_C": "angular_momentum",
+        "disc_spin": "spin", "theta_C": "theta", "v_x_C": "v_x", "v_y_C": "v_y", "omega_C": "omega",
+        "M_U": "bracket_moment", "L_C": "angular_momentum",
     }  # fmt: skip
     disc: Body
     bracket: Body
 
     def __init__(
-        self, settings: Parameters | None = None, reference: Reference | None = None, *, friction: SlipLaw | None = None,
-        shape: Shape | None = None, material: Material | None = None,
+        self, settings: Parameters | None = None, reference: Reference | None = None, *,
+        friction: SlipLaw | None = None, shape: Shape | None = None,
+        material: Material | None = None,
     ) -> None:  # fmt: skip
         p = settings or Parameters()
         c, k = p.contact, p.control
@@ -61,11 +65,14 @@ class SoftGrasp(Rig):
         bracket = Body(p.bracket.mass, theta=0.0, weighted=False)
         control = nn.ModuleDict({"x": PD(k.K_81, k.R_80), "y": PD(k.K_98, k.R_99)})
         upper = replace(p.pad.mesh, bonded_sides=p.pad.enclosed)
-        common: dict[str, Any] = {"inertial": p.pad.fidelity == "inertial", "points": p.contact.points}
+        common: dict[str, Any] = {
+            "inertial": p.pad.fidelity == "inertial",
+            "points": p.contact.points,
+        }
         at_bracket = (-p.pad.length / 2, -p.bracket.cm_height)
         super().__init__(
-            groups={"pad": rubber, "contact": law, "disc": disc, "bracket": bracket, "control": control},
-            bodies={"disc": disc, "bracket": bracket},
+            groups={"pad": rubber, "contact": law, "disc": disc, "bracket": bracket,
+            "control": control}, bodies={"disc": disc, "bracket": bracket},
             pads={
                 "L": Pad(p.pad.mesh, rubber, **common),
                 "U": Pad(upper, rubber, base="bracket", origin=at_bracket, mirrored=True, **common),
@@ -73,7 +80,8 @@ class SoftGrasp(Rig):
             contacts={name: Contact(name, "disc", law) for name in ("L", "U")},
             actuators={
                 "x": Actuator(
-                    f"{k.senses}.x", "bracket.x", control["x"], setpoint="x_d", elements=("C: K_81^-1", "R: R_80")
+                    f"{k.senses}.x", "bracket.x", control["x"], setpoint="x_d",
+                    elements=("C: K_81^-1", "R: R_80")
                 ),
                 "y": Actuator(
                     "bracket.y", "bracket.y", control["y"], setpoint="y_d", feed_forward="F_ff",
@@ -88,11 +96,15 @@ class SoftGrasp(Rig):
 
     @property
     def aliases(self) -> Mapping[str, str]:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """`NAMES`, but for "disc.radius" where the object is not round: the radius of a box is that of its corners."""
-        return {name: own for name, own in NAMES.items() if name != "disc.radius" or self.shape.round}
+        """`NAMES`, but for "disc.radius" where the object is not round: the radius of a box is that
+        of its corners."""
+        return {
+            name: own for name, own in NAMES.items() if name != "disc.radius" or self.shape.round
+        }
 
     def _values(self) -> dict[str, float | int | str | bool]:
-        """The numbers of `Parameters` that stand in the modules, parametrised or not, as they are now."""
+        """The numbers of `Parameters` that stand in the modules, parametrised or not, as they are
+        now."""
         out: dict[str, float | int | str | bool] = {}
         for name, own in self.aliases.items():
             owner, _, last = own.rpartition(".")
@@ -101,7 +113,10 @@ class SoftGrasp(Rig):
             except AttributeError:  # a part of another kind, which has no such number
                 continue
         pad, upper, law = self.pads["L"], self.pads["U"].mesh, self.contacts["L"].law
-        out |= {f"pad.{name}": getattr(pad.mesh, name) for name in ("length", "height", "elements_x", "elements_y")}
+        out |= {
+            f"pad.{name}": getattr(pad.mesh, name)
+            for name in ("length", "height", "elements_x", "elements_y")
+        }
         out |= {
             "pad.enclosed": isinstance(upper, PadMesh) and upper.bonded_sides,
             "pad.fidelity": "inertial" if pad.inertial else "massless",
@@ -113,21 +128,29 @@ class SoftGrasp(Rig):
 
     @property
     def settings(self) -> Parameters:
-        """The numbers of this model as they are now, read from its modules; the scenario, and what other parts in the place of
-        the usual ones have not, as they were given."""
+        """The numbers of this model as they are now, read from its modules; the scenario, and what
+        other parts in the place of the usual ones have not, as they were given."""
         values: dict[str, dict[str, Any]] = {}
         for name, value in self._values().items():
             group, _, field = name.partition(".")
             values.setdefault(group, {})[field] = value
-        groups = {group: getattr(self._settings, group).model_copy(update=new) for group, new in values.items()}
+        groups = {
+            group: getattr(self._settings, group).model_copy(update=new)
+            for group, new in values.items()
+        }
         return self._settings.model_copy(update=groups)
 
     def description(self) -> dict[str, Any]:
-        """The numbers and laws as they are now; numbers of `Parameters` that this model has not are left out."""
+        """The numbers and laws as they are now; numbers of `Parameters` that this model has not are
+        left out."""
         own, said = self._values(), super().description()
         absent = {name for name in (*NAMES, "contact.friction") if name not in own}
-        values = {name: row["value"] for name, row in self.settings.table().items() if name not in absent}
-        others = {name: x for name, x in said["parameters"].items() if name not in self.aliases.values()}
+        values = {
+            name: row["value"] for name, row in self.settings.table().items() if name not in absent
+        }
+        others = {
+            name: x for name, x in said["parameters"].items() if name not in self.aliases.values()
+        }
         return said | {"parameters": values | others}
 
     @property
@@ -138,7 +161,8 @@ class SoftGrasp(Rig):
         return shape
 
     def touch_height(self, y_C: Tensor | float, theta: float = 0.0) -> Tensor:
-        """Height of the bracket's centre [m] at which its undeformed pad just touches the object at the height y_C [m]."""
+        """Height of the bracket's centre [m] at which its undeformed pad just touches the object at
+        the height y_C [m]."""
         angle = torch.tensor(theta, dtype=torch.float64)
         up = torch.stack((angle.sin(), angle.cos()))  # the world's y in the object's frame
         p = self._settings
@@ -146,5 +170,6 @@ class SoftGrasp(Rig):
 
 
 def apart(p: Parameters) -> float:
-    """Height [m] of the bracket over the ground at which undeformed pads just touch an undeformed disc."""
+    """Height [m] of the bracket over the ground at which undeformed pads just touch an undeformed
+    disc."""
     return 2 * (p.pad.height + p.disc.radius) + p.bracket.cm_height

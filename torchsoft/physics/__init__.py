@@ -1,1 +1,2 @@
-"""The physics of a rig: shapes, materials, pads, contact, bodies, actuators, and the multibond graph they make."""
+"""The physics of a rig: shapes, materials, pads, contact, bodies, actuators, and the multibond
+graph they make."""

@@ -21,7 +21,11 @@ def number(name: str, value: Any) -> float:
 
 def positive(name: str, value: Any) -> float:
     """Raises `ValueError` for what is not a positive, finite number."""
-    if not isinstance(value, Real) or isinstance(value, bool) or not (math.isfinite(value) and float(value) > 0):
+    if (
+        not isinstance(value, Real)
+        or isinstance(value, bool)
+        or not (math.isfinite(value) and float(value) > 0)
+    ):
         raise ValueError(f"`{name}` must be positive and finite, but is {value!r}")
     return float(value)
 
@@ -34,13 +38,21 @@ def whole(name: str, value: Any, least: int) -> int:
 
 
 def places(name: str, value: Any) -> Tensor:
-    """Places in the plane (n, 2) in float64, a copy. Raises `ValueError` for what is not such numbers."""
+    """Places in the plane (n, 2) in float64, a copy. Raises `ValueError` for what is not such
+    numbers."""
     try:
         given = np.array(value.detach() if isinstance(value, Tensor) else value)
     except (TypeError, ValueError):  # rows of different lengths
         given = np.zeros(0)
-    if given.ndim != 2 or given.shape[-1] != 2 or given.dtype.kind not in "iuf" or not np.isfinite(given).all():
-        raise ValueError(f"`{name}` must be finite numbers of the shape (n, 2), but is {line(value)}")
+    if (
+        given.ndim != 2
+        or given.shape[-1] != 2
+        or given.dtype.kind not in "iuf"
+        or not np.isfinite(given).all()
+    ):
+        raise ValueError(
+            f"`{name}` must be finite numbers of the shape (n, 2), but is {line(value)}"
+        )
     return torch.from_numpy(given.astype(np.float64))
 
 

@@ -1,7 +1,8 @@
-"""Massless pads: what moves at their contact points, from the relation between nodal forces and the contact law.
+"""Massless pads: what moves at their contact points, from the relation between nodal forces and the
+contact law.
 
-Rates are u' = free + P F with P = C sum of J / (tau + a h) and free = -C sum of J z / (tau + a h); `stage` = a h is zero for
-the ODE itself. Static displacements are u = C F.
+Rates are u' = free + P F with P = C sum of J / (tau + a h) and free = -C sum of J z / (tau + a h);
+`stage` = a h is zero for the ODE itself. Static displacements are u = C F.
 """
 
 from collections.abc import Callable
@@ -16,8 +17,8 @@ HALVINGS = 12
 
 
 def free_rates(pad: Pad, z: Tensor, stage: float) -> tuple[Tensor, Tensor]:
-    """Rates of a massless pad's nodes without contact (..., nodes, 2) [m/s] and its mobility P [m/(N.s)], for the forces
-    z (..., branches, nodes, 2) that have set in at the stage's start."""
+    """Rates of a massless pad's nodes without contact (..., nodes, 2) [m/s] and its mobility P
+    [m/(N.s)], for the forces z (..., branches, nodes, 2) that have set in at the stage's start."""
     fractions, times = pad.material.chain()
     C, rest = pad.compliance(), fractions / (times + stage)
     free = -((rest[:, None, None] * z).sum(-3).flatten(-2) @ C.mT).unflatten(-1, (-1, 2))
@@ -30,14 +31,20 @@ def nodal(A: Tensor, F: Tensor) -> Tensor:
 
 
 def nodal_forces(
-    A: Tensor, N: Tensor, free: Tensor, law: Callable[[Tensor], Tensor], tolerance: float, iterations: int
+    A: Tensor,
+    N: Tensor,
+    free: Tensor,
+    law: Callable[[Tensor], Tensor],
+    tolerance: float,
+    iterations: int,
 ) -> tuple[Tensor, float]:
-    """Forces F = N^T f (..., nodes, 2) [N] of a law f(x) at contact points x = N (free + A F) (..., points, 2), and the largest
-    residual that is left of x.
+    """Forces F = N^T f (..., nodes, 2) [N] of a law f(x) at contact points x = N (free + A F) (...,
+    points, 2), and the largest residual that is left of x.
 
-    A (2 nodes, 2 nodes) is the pad's compliance or mobility, N (points, nodes) its shape functions at the points. Semi-smooth
-    Newton from no force, in which the force on a point depends on its own x only, so that only the points with a slope are
-    unknowns. The last iteration is taken with the gradient on, which makes the derivative the implicit function theorem's.
+    A (2 nodes, 2 nodes) is the pad's compliance or mobility, N (points, nodes) its shape functions
+    at the points. Semi-smooth Newton from no force, in which the force on a point depends on its
+    own x only, so that only the points with a slope are unknowns. The last iteration is taken with
+    the gradient on, which makes the derivative the implicit function theorem's.
     """
     relation = A.detach()
 
@@ -48,7 +55,10 @@ def nodal_forces(
             x = x.detach().requires_grad_()
             at = law(x)
             rows = [
-                torch.autograd.grad(at[..., i].sum(), x, retain_graph=i == 0, materialize_grads=True) for i in (0, 1)
+                torch.autograd.grad(
+                    at[..., i].sum(), x, retain_graph=i == 0, materialize_grads=True
+                )
+                for i in (0, 1)
             ]
         v = at.detach() - f
         return v, N @ nodal(relation, N.mT @ v), torch.stack([row for (row,) in rows], -2)
@@ -60,8 +70,12 @@ def nodal_forces(
             return v
         G, spread = G[..., sloped, :, :], torch.kron(N[sloped], torch.eye(2, dtype=N.dtype))
         B = (spread @ relation @ spread.mT).unflatten(-1, (-1, 2))
-        J = torch.eye(len(spread), dtype=v.dtype) - torch.einsum("rpj,...pjk->...rpk", B, G).flatten(-2)
-        x = torch.linalg.solve(J, (N @ nodal(relation, N.mT @ v))[..., sloped, :].flatten(-2)[..., None])
+        J = torch.eye(len(spread), dtype=v.dtype) - torch.einsum(
+            "rpj,...pjk->...rpk", B, G
+        ).flatten(-2)
+        x = torch.linalg.solve(
+            J, (N @ nodal(relation, N.mT @ v))[..., sloped, :].flatten(-2)[..., None]
+        )
         return v.index_add(-2, sloped, (G @ x.unflatten(-2, (-1, 2)))[..., 0])
 
     with torch.no_grad():

@@ -1,9 +1,11 @@
-"""Contact at one point of a pad's surface: detection, the moving frame, penalty normal force and stick-slip friction.
+"""Contact at one point of a pad's surface: detection, the moving frame, penalty normal force and
+stick-slip friction.
 
-Equations of the paper in brackets. Everything else is generated from these functions: the compiled law with its Jacobian and
-its derivatives in every parameter. Departures from the paper keep forces and gradients continuous: the ramp
-rho = g / (g + epsilon), which takes the dashpots and the tangential branch in at touch-down, max(0, .), which removes
-adhesion, and the moving frame, which follows the point on the body nearest to the pad's instead of the first one touched.
+Equations of the paper in brackets. Everything else is generated from these functions: the compiled
+law with its Jacobian and its derivatives in every parameter. Departures from the paper keep forces
+and gradients continuous: the ramp rho = g / (g + epsilon), which takes the dashpots and the
+tangential branch in at touch-down, max(0, .), which removes adhesion, and the moving frame, which
+follows the point on the body nearest to the pad's instead of the first one touched.
 """
 
 from collections.abc import Callable
@@ -17,13 +19,14 @@ from torchsoft.physics.shapes import Shape, parameter
 from torchsoft.quantity import Dashpot, FrictionCoefficient, Quantity, Stiffness
 
 SlipLaw = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""Slip rate |gamma'| >= 0 [m/s] under a trial effort E >= 0 [N], a normal force F_N [N] and the dashpot R [N.s/m] that the slip
-relieves, each per reference spacing: a function or an `nn.Module`, in torch operations. The slip must not take more than the
-effort: R |gamma'| <= E."""
+"""Slip rate |gamma'| >= 0 [m/s] under a trial effort E >= 0 [N], a normal force F_N [N] and the
+dashpot R [N.s/m] that the slip relieves, each per reference spacing: a function or an `nn.Module`,
+in torch operations. The slip must not take more than the effort: R |gamma'| <= E."""
 
 
 class Frame(NamedTuple):
-    """The moving frame at points: moment arm d [m], normal n, tangent t (..., 2), penetration g [m] (...)."""
+    """The moving frame at points: moment arm d [m], normal n, tangent t (..., 2), penetration g [m]
+    (...)."""
 
     d: Tensor
     n: Tensor
@@ -32,7 +35,8 @@ class Frame(NamedTuple):
 
 
 class ContactState(NamedTuple):
-    """Per point, shape (...): forces [N], stretch rate s' and slip rate gamma' [m/s], effort e [N], ramp rho [1]."""
+    """Per point, shape (...): forces [N], stretch rate s' and slip rate gamma' [m/s], effort e [N],
+    ramp rho [1]."""
 
     F_N: Tensor
     F_T: Tensor
@@ -54,7 +58,8 @@ def turned(v: Tensor, angle: Tensor) -> Tensor:
 
 
 def moving_frame(shape: Shape, d: Tensor, theta: Tensor) -> Frame:
-    """Detection and frame (Eq. 1, 3) of points at d (..., 2) [m] from the centre of a body turned by theta (...)."""
+    """Detection and frame (Eq. 1, 3) of points at d (..., 2) [m] from the centre of a body turned
+    by theta (...)."""
     if shape.round:
         phi, n = shape(d)
     else:
@@ -70,7 +75,8 @@ def ramp(g: Tensor, epsilon: Tensor) -> Tensor:
 
 
 def normal_force(g: Tensor, g_dot: Tensor, rho: Tensor, K_n: Tensor, R_n: Tensor) -> Tensor:
-    """F_N = max(0, K_n g + R_n g' rho) while g > 0 (Eq. 8, 9) [N]. Not smooth at g = 0 and where the max cuts."""
+    """F_N = max(0, K_n g + R_n g' rho) while g > 0 (Eq. 8, 9) [N]. Not smooth at g = 0 and where
+    the max cuts."""
     return (K_n * g.clamp(min=0.0) + R_n * rho * g_dot).clamp(min=0.0)
 
 
@@ -91,21 +97,28 @@ class Friction(nn.Module):
     def well_posed(self) -> str:
         """The conflict between the parameters; empty where there is none."""
         mu_s, mu_k = self.mu_s.item(), self.mu_k.item()
-        return f"mu_k must not exceed mu_s, but mu_k = {mu_k:g} > mu_s = {mu_s:g}" if mu_k > mu_s else ""
+        return (
+            f"mu_k must not exceed mu_s, but mu_k = {mu_k:g} > mu_s = {mu_s:g}"
+            if mu_k > mu_s
+            else ""
+        )
 
 
 class SmoothSlip(Friction):
-    """The slip element: (eta + R) |gamma'| = <E - mu(gamma') F_N>+, mu = mu_k + (mu_s - mu_k) / (1 + |gamma'| / v_s).
+    """The slip element: (eta + R) |gamma'| = <E - mu(gamma') F_N>+, mu = mu_k + (mu_s - mu_k) / (1
+    + |gamma'| / v_s).
 
-    A quadratic in |gamma'|, with one positive root when E > mu_s F_N. Continuous, not smooth at slip onset; continuous
-    only if eta + R >= (mu_s - mu_k) F_N / v_s.
+    A quadratic in |gamma'|, with one positive root when E > mu_s F_N. Continuous, not smooth at
+    slip onset; continuous only if eta + R >= (mu_s - mu_k) F_N / v_s.
     """
 
     def __init__(
         self,
         mu_s: StaticFriction,
         mu_k: KineticFriction,
-        v_s: Annotated[float, Quantity("m/s", 1e-9, 1e3, "slip speed over which mu falls from mu_s to mu_k")] = 5e-3,
+        v_s: Annotated[
+            float, Quantity("m/s", 1e-9, 1e3, "slip speed over which mu falls from mu_s to mu_k")
+        ] = 5e-3,
         eta: Annotated[Dashpot, "viscosity of the slip element; 0 is Coulomb's limit"] = 10.0,
     ) -> None:
         super().__init__(mu_s, mu_k)
@@ -124,8 +137,8 @@ class SmoothSlip(Friction):
 class Coulomb(Friction):
     """Stick up to mu_s F_N, then mu_k F_N (Eq. 12-13 with the force's modulus).
 
-    The spring re-anchors so that the Voigt pair carries just mu_k F_N, |gamma'| = (E - mu_k F_N) / R. Discontinuous at slip
-    onset unless mu_s = mu_k: gradients across it are biased.
+    The spring re-anchors so that the Voigt pair carries just mu_k F_N, |gamma'| = (E - mu_k F_N) /
+    R. Discontinuous at slip onset unless mu_s = mu_k: gradients across it are biased.
     """
 
     def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
@@ -137,20 +150,22 @@ Sliding = Callable[[Tensor], Tensor]
 
 
 def ramped(rho: Tensor) -> Tensor:
-    """rho: as much of the sliding as of the force is taken in, which is the power that the element gets."""
+    """rho: as much of the sliding as of the force is taken in, which is the power that the element
+    gets."""
     return rho
 
 
 def at_once(rho: Tensor) -> Tensor:
-    """All of the sliding from touch-down on, while the force is ramped in: power (1 - rho) e v_T comes from nowhere. Not
-    continuous at touch-down."""
+    """All of the sliding from touch-down on, while the force is ramped in: power (1 - rho) e v_T
+    comes from nowhere. Not continuous at touch-down."""
     return torch.where(rho > 0, torch.ones_like(rho), torch.zeros_like(rho))
 
 
 class SoftContact(nn.Module):
-    """The contact elements of one point, per reference spacing: springs K_n, K_t [N/m], dashpots R_n, R_t [N.s/m], the ramp's
-    depth epsilon [m], and a friction law. `weight` scales them to the length of surface that a point stands for. `sliding`
-    other than `ramped` breaks the power balance."""
+    """The contact elements of one point, per reference spacing: springs K_n, K_t [N/m], dashpots
+    R_n, R_t [N.s/m], the ramp's depth epsilon [m], and a friction law. `weight` scales them to the
+    length of surface that a point stands for. `sliding` other than `ramped` breaks the power
+    balance."""
 
     def __init__(
         self,
@@ -160,41 +175,52 @@ class SoftContact(nn.Module):
         R_t: Annotated[Dashpot, "tangential dashpot"],
         *,
         friction: SlipLaw,
-        epsilon: Annotated[float, Quantity("m", 1e-12, 1.0, "touch-down depth of the ramp g / (g + epsilon)")] = 1e-6,
+        epsilon: Annotated[
+            float, Quantity("m", 1e-12, 1.0, "touch-down depth of the ramp g / (g + epsilon)")
+        ] = 1e-6,
         node_spacing: Annotated[
             float, Quantity("m", 1e-7, 1.0, "length of surface that the four numbers belong to")
         ] = 1e-3,
     ) -> None:
         super().__init__()
-        self.K_n, self.R_n, self.K_t, self.R_t = (parameter(value) for value in (K_n, R_n, K_t, R_t))
+        self.K_n, self.R_n, self.K_t, self.R_t = (
+            parameter(value) for value in (K_n, R_n, K_t, R_t)
+        )
         self.epsilon = parameter(epsilon, trained=False)
         if not callable(friction):
             raise ValueError(
-                f"`friction` must be a function or a module of (effort, normal force, dashpot), but is {friction!r}"
+                "`friction` must be a function or a module of (effort, normal force, dashpot), "
+                f"but is {friction!r}"
             )
         self.node_spacing, self.friction = positive("node_spacing", node_spacing), friction
         self.sliding: Sliding = ramped
 
     def well_posed(self) -> str:
         """What is wrong with the parameters together; empty if nothing is."""
-        if isinstance(self.friction, SmoothSlip) and self.R_t.item() + self.friction.eta.item() <= 0:
+        if (
+            isinstance(self.friction, SmoothSlip)
+            and self.R_t.item() + self.friction.eta.item() <= 0
+        ):
             return "eta + R_t must be positive, since the slip rate is effort / (eta + R_t)"
         if isinstance(self.friction, Coulomb) and self.R_t.item() <= 0:
             return "Coulomb's friction needs R_t > 0, since the stretch is re-anchored through the dashpot"
         return ""
 
     def jumps(self, F_N: float) -> str:
-        """Why the slip rate jumps under a normal force F_N [N] per reference spacing: friction falls with slip faster than the
-        dashpots balance. Empty if it does not."""
+        """Why the slip rate jumps under a normal force F_N [N] per reference spacing: friction
+        falls with slip faster than the dashpots balance. Empty if it does not."""
         slip = self.friction
         if not isinstance(slip, SmoothSlip):
             return ""
-        falls, damps = ((slip.mu_s - slip.mu_k) * F_N / slip.v_s).item(), (slip.eta + self.R_t).item()
+        falls, damps = (
+            ((slip.mu_s - slip.mu_k) * F_N / slip.v_s).item(),
+            (slip.eta + self.R_t).item(),
+        )
         if damps >= falls:
             return ""
         return (
-            f"slip is not single-valued at a normal force of {F_N:.3g} N: eta + R_t = {damps:.3g} N.s/m is below (mu_s - mu_k) "
-            f"F_N / v_s = {falls:.3g}"
+            f"slip is not single-valued at a normal force of {F_N:.3g} N: eta + R_t = {damps:.3g} "
+            f"N.s/m is below (mu_s - mu_k) F_N / v_s = {falls:.3g}"
         )
 
     def forward(
@@ -206,10 +232,12 @@ class SoftContact(nn.Module):
         weight: Tensor | float = 1.0,
         stage: Tensor | float = 0.0,
     ) -> ContactState:
-        """Forces and rates from penetration g [m], its rate, sliding speed v_T [m/s] and stretch s [m], all (...).
+        """Forces and rates from penetration g [m], its rate, sliding speed v_T [m/s] and stretch s
+        [m], all (...).
 
-        With `stage` = a h [s] the law at the end of an implicit stage: s is then its s*, and the stretch that acts is
-        s* + a h s', which turns the dashpot R_t into R_t + a h K_t and changes nothing else.
+        With `stage` = a h [s] the law at the end of an implicit stage: s is then its s*, and the
+        stretch that acts is s* + a h s', which turns the dashpot R_t into R_t + a h K_t and changes
+        nothing else.
         """
         R = self.R_t + stage * self.K_t
         rho = ramp(g, self.epsilon)
@@ -223,7 +251,9 @@ class SoftContact(nn.Module):
         e = self.K_t * s + R * s_dot
         return ContactState(weight * F_N, weight * rho * e, s_dot, gamma_dot, weight * e, rho)
 
-    def dissipated(self, at: ContactState, g: Tensor, g_dot: Tensor, weight: Tensor | float) -> tuple[Tensor, Tensor]:
+    def dissipated(
+        self, at: ContactState, g: Tensor, g_dot: Tensor, weight: Tensor | float
+    ) -> tuple[Tensor, Tensor]:
         """Powers [W] that dashpots and slip take out, shape (...), never negative."""
         spring = weight * self.K_n * g.clamp(min=0.0)
         return (at.F_N - spring) * g_dot + weight * self.R_t * at.s_dot**2, at.e * at.gamma_dot
@@ -234,19 +264,34 @@ class SoftContact(nn.Module):
 
 
 def interface_law(contact: SoftContact, shape: Shape, x: Tensor) -> Tensor:
-    """One point's law at a stage: (f, s', F_N, F_T, power of dashpots, of slip) (..., 7) of x (..., 9).
+    """One point's law at a stage: (f, s', F_N, F_T, power of dashpots, of slip) (..., 7) of x (...,
+    9).
 
-    x = (w, omega, d, theta, s*, weight, a h): the body's velocity at its centre less the point's, its spin, the point's
-    moment arm from the centre and the body's angle, all in the frame of the pad's base. f is the force on the pad [N].
+    x = (w, omega, d, theta, s*, weight, a h): the body's velocity at its centre less the point's,
+    its spin, the point's moment arm from the centre and the body's angle, all in the frame of the
+    pad's base. f is the force on the pad [N].
     """
-    w, omega, d, theta, s, weight, stage = x[..., :2], x[..., 2], x[..., 3:5], *x[..., 5:].unbind(-1)
+    w, omega, d, theta, s, weight, stage = (
+        x[..., :2],
+        x[..., 2],
+        x[..., 3:5],
+        *x[..., 5:].unbind(-1),
+    )
     frame = moving_frame(shape, d, theta)
     v = w + omega[..., None] * cross(d)  # (4)-(7)
     g_dot, v_T = (frame.n * v).sum(-1), (frame.t * v).sum(-1)
     at = contact(frame.g, g_dot, v_T, s, weight, stage)
     f = at.F_N[..., None] * frame.n + at.F_T[..., None] * frame.t
     return torch.stack(
-        (f[..., 0], f[..., 1], at.s_dot, at.F_N, at.F_T, *contact.dissipated(at, frame.g, g_dot, weight)), -1
+        (
+            f[..., 0],
+            f[..., 1],
+            at.s_dot,
+            at.F_N,
+            at.F_T,
+            *contact.dissipated(at, frame.g, g_dot, weight),
+        ),
+        -1,
     )
 
 

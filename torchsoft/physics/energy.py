@@ -1,7 +1,8 @@
 """Energies of a rig: what its C and I fields store, element by element, at given states.
 
-What is dissipated and supplied the stepper integrates beside the state, from the same laws; `powers` reads it off the ports of
-the multibond graph, so that the balance at one instant can be checked without any stepper.
+What is dissipated and supplied the stepper integrates beside the state, from the same laws;
+`powers` reads it off the ports of the multibond graph, so that the balance at one instant can be
+checked without any stepper.
 """
 
 from collections.abc import Mapping
@@ -14,10 +15,14 @@ from torchsoft.physics.rig import Evaluation, Rig
 from torchsoft.physics.state import State
 
 
-def stored(rig: Rig, state: State, displacement: Mapping[str, Tensor] | None = None) -> dict[str, Tensor]:
-    """Energies [J], each shaped like the batch: strain of every pad, contact springs, kinetic energies of what moves freely.
+def stored(
+    rig: Rig, state: State, displacement: Mapping[str, Tensor] | None = None
+) -> dict[str, Tensor]:
+    """Energies [J], each shaped like the batch: strain of every pad, contact springs, kinetic
+    energies of what moves freely.
 
-    `displacement` are those of the pads, where they are known already."""
+    `displacement` are those of the pads, where they are known already.
+    """
     known = displacement or {}
     energies = {}
     for name, pad in rig.pads.items():
@@ -31,25 +36,34 @@ def stored(rig: Rig, state: State, displacement: Mapping[str, Tensor] | None = N
                 energies[f"strain_{name}"] = 0.5 * (part[..., 0, :, :] * u).sum((-2, -1))
             else:
                 z = part.flatten(-2)
-                energies[f"strain_{name}"] = 0.5 * (fractions * ((z @ pad.compliance()) * z).sum(-1)).sum(-1)
+                energies[f"strain_{name}"] = 0.5 * (
+                    fractions * ((z @ pad.compliance()) * z).sum(-1)
+                ).sum(-1)
     zero = torch.zeros_like(next(iter(state.pose.values()))[..., 0])
     normal, tangential = zero, zero
     for name, contact in rig.contacts.items():
         parts = contact.law.stored(
-            rig.penetration(name, state, known.get(contact.pad)), state.stretch[name], rig.weight(name)
+            rig.penetration(name, state, known.get(contact.pad)),
+            state.stretch[name],
+            rig.weight(name),
         )
         normal, tangential = normal + parts[0].sum(-1), tangential + parts[1].sum(-1)
     energies["normal_springs"], energies["tangential_springs"] = normal, tangential
     for name, body in rig.bodies.items():
         free = [float(body.freedom[axis] == "free") for axis in COORDINATES]
-        kinetic = [0.5 * f * m * state.velocity[name][..., i] ** 2 for i, (f, m) in enumerate(zip(free, body.masses))]
+        kinetic = [
+            0.5 * f * m * state.velocity[name][..., i] ** 2
+            for i, (f, m) in enumerate(zip(free, body.masses))
+        ]
         if any(free[:2]):
             energies[name] = kinetic[0] + kinetic[1]
         if free[2]:
             energies[f"{name}_spin"] = kinetic[2]
     for name, pad in rig.pads.items():
         if pad.inertial:
-            energies[f"kinetic_{name}"] = 0.5 * (pad.masses()[:, None] * state.rates[name] ** 2).sum((-2, -1))
+            energies[f"kinetic_{name}"] = 0.5 * (
+                pad.masses()[:, None] * state.rates[name] ** 2
+            ).sum((-2, -1))
     return {rig.renamed.get(name, name): value for name, value in energies.items()}
 
 
@@ -60,13 +74,22 @@ def dissipated(rig: Rig, state: State, graph: Evaluation) -> dict[str, Tensor]:
         port = graph.ports[f"pad_{name}"]
         if pad.inertial:
             u_dot = port.transformer.flow(graph.flows)
-            powers[f"pad_{name}"] = (pad.retardation_time(name) * u_dot * pad.elastic_force(u_dot)).sum((-2, -1))
+            powers[f"pad_{name}"] = (
+                pad.retardation_time(name) * u_dot * pad.elastic_force(u_dot)
+            ).sum((-2, -1))
         else:
             fractions, times = pad.material.chain()
-            rate = ((port.effort[..., None, :, :] - state.pads[name]) / times[:, None, None]).flatten(-2)
-            powers[f"pad_{name}"] = (fractions * times * ((rate @ pad.compliance()) * rate).sum(-1)).sum(-1)
+            rate = (
+                (port.effort[..., None, :, :] - state.pads[name]) / times[:, None, None]
+            ).flatten(-2)
+            powers[f"pad_{name}"] = (
+                fractions * times * ((rate @ pad.compliance()) * rate).sum(-1)
+            ).sum(-1)
     for interface in graph.interfaces.values():
-        dashpots, slip = dashpots + interface.out[..., 5].sum(-1), slip + interface.out[..., 6].sum(-1)
+        dashpots, slip = (
+            dashpots + interface.out[..., 5].sum(-1),
+            slip + interface.out[..., 6].sum(-1),
+        )
     return powers | {"contact_dashpots": torch.as_tensor(dashpots), "slip": torch.as_tensor(slip)}
 
 

@@ -1,8 +1,8 @@
 """Materials of the pads: linear viscoelastic rubber as a chain of Kelvin elements.
 
-Every element of the chain has the same Poisson's ratio, so that a pad's displacement is u = C sum of J_b z_b: C the static
-compliance of the relaxed material, J_b the fractions of it, and z_b the part of the nodal forces that has set in,
-tau_b z_b' + z_b = f.
+Every element of the chain has the same Poisson's ratio, so that a pad's displacement is u = C sum
+of J_b z_b: C the static compliance of the relaxed material, J_b the fractions of it, and z_b the
+part of the nodal forces that has set in, tau_b z_b' + z_b = f.
 """
 
 from collections.abc import Iterable, Mapping
@@ -19,16 +19,19 @@ from torchsoft.physics.shapes import parameter
 from torchsoft.quantity import Density, Depth, Modulus, PoissonRatio, Quantity, Retardation
 
 INSTANT = 1e-4
-"""Retardation time [s] of an instantaneous spring, where none is given: small, not zero, so that the rates are functions of
-the state."""
+"""Retardation time [s] of an instantaneous spring, where none is given: small, not zero, so that
+the rates are functions of the state."""
 
 TERMS = 20
 """Terms of a series at the most."""
 
-InstantRetardation = Annotated[Retardation, "retardation time of the instantaneous spring: below every tau"]
+InstantRetardation = Annotated[
+    Retardation, "retardation time of the instantaneous spring: below every tau"
+]
 Retardations = Annotated[Iterable[float], Quantity("s", 1e-9, 1e6, "times, one per term")]
 Fractions = Annotated[
-    Iterable[float], Quantity("1", 1e-9, 1.0, "fractions of the relaxed compliance, one per tau, in sum at most 1")
+    Iterable[float],
+    Quantity("1", 1e-9, 1.0, "fractions of the relaxed compliance, one per tau, in sum at most 1"),
 ]
 Moduli = Annotated[Iterable[float], Quantity("Pa", 1.0, 1e13, "moduli that fade, one per tau")]
 
@@ -37,14 +40,16 @@ TOO_MUCH = 1e-12
 
 
 class Material(nn.Module):
-    """What a pad asks of its material: E [Pa] (relaxed), nu [1], rho [kg/m3], the out-of-plane depth [m], and a chain."""
+    """What a pad asks of its material: E [Pa] (relaxed), nu [1], rho [kg/m3], the out-of-plane
+    depth [m], and a chain."""
 
     def __init__(self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth) -> None:
         super().__init__()
         self.E, self.nu, self.rho, self.depth = (parameter(value) for value in (E, nu, rho, depth))
 
     def chain(self) -> tuple[Tensor, Tensor]:
-        """Fractions J [1], which sum to one, and retardation times tau [s] > 0, shape (branches,) each."""
+        """Fractions J [1], which sum to one, and retardation times tau [s] > 0, shape (branches,)
+        each."""
         raise NotImplementedError
 
     @property
@@ -74,7 +79,9 @@ class Material(nn.Module):
 class KelvinVoigt(Material):
     """One retardation time tau [s]: R = tau K, the paper's constant R field."""
 
-    def __init__(self, E: Modulus, nu: PoissonRatio, rho: Density, tau: Retardation, depth: Depth) -> None:
+    def __init__(
+        self, E: Modulus, nu: PoissonRatio, rho: Density, tau: Retardation, depth: Depth
+    ) -> None:
         super().__init__(E, nu, rho, depth)
         self.tau = parameter(tau)
 
@@ -87,17 +94,22 @@ class KelvinVoigt(Material):
 
 
 class StandardLinearSolid(Material):
-    """A spring in series with a Kelvin element: E [Pa] relaxed, E_instant [Pa] > E at first, retardation time tau [s].
+    """A spring in series with a Kelvin element: E [Pa] relaxed, E_instant [Pa] > E at first,
+    retardation time tau [s].
 
-    The spring's own retardation time tau_instant [s] is small, not zero, so that the rates are functions of the state.
+    The spring's own retardation time tau_instant [s] is small, not zero, so that the rates are
+    functions of the state.
     """
 
     def __init__(
-        self, E: Modulus, E_instant: Annotated[Modulus, "Young's modulus at first, above E"], nu: PoissonRatio, rho: Density,
-        tau: Retardation, depth: Depth, tau_instant: InstantRetardation = INSTANT,
+        self, E: Modulus, E_instant: Annotated[Modulus, "Young's modulus at first, above E"],
+        nu: PoissonRatio, rho: Density, tau: Retardation, depth: Depth,
+        tau_instant: InstantRetardation = INSTANT,
     ) -> None:  # fmt: skip
         super().__init__(E, nu, rho, depth)
-        self.E_instant, self.tau, self.tau_instant = (parameter(x) for x in (E_instant, tau, tau_instant))
+        self.E_instant, self.tau, self.tau_instant = (
+            parameter(x) for x in (E_instant, tau, tau_instant)
+        )
 
     def well_posed(self) -> str:
         return "E_instant is below E" if self.E_instant.item() < self.E.item() else ""
@@ -112,24 +124,27 @@ class StandardLinearSolid(Material):
 
 
 class Series(Material):
-    """A material of any number of terms, each a strength and a time: scalar parameters <symbol>_1, tau_1, <symbol>_2, ...
+    """A material of any number of terms, each a strength and a time: scalar parameters <symbol>_1,
+    tau_1, <symbol>_2, ...
 
-    An instantaneous spring stands before them in the chain, with the retardation time tau_instant [s], below every tau. Raises
-    `ValueError` unless there are as many strengths as times, and at least one.
+    An instantaneous spring stands before them in the chain, with the retardation time tau_instant
+    [s], below every tau. Raises `ValueError` unless there are as many strengths as times, and at
+    least one.
     """
 
     symbol = strength = ""
     """Names of a strength's parameters, and of the constructor's argument."""
 
     def __init__(
-        self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, strengths: Iterable[float], tau: Retardations,
-        tau_instant: InstantRetardation,
+        self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, strengths: Iterable[float],
+        tau: Retardations, tau_instant: InstantRetardation,
     ) -> None:  # fmt: skip
         super().__init__(E, nu, rho, depth)
         one, other = terms(self.symbol, strengths), terms("tau", tau)
         if len(one) != len(other) or not 1 <= len(one) <= TERMS:
             raise ValueError(
-                f"a series needs as many `{self.strength}` as `tau`, from 1 to {TERMS}, but has {len(one)} and {len(other)}"
+                f"a series needs as many `{self.strength}` as `tau`, from 1 to {TERMS}, but has "
+                f"{len(one)} and {len(other)}"
             )
         self.terms = len(one)
         for k, (strength, time) in enumerate(zip(one, other), 1):
@@ -140,7 +155,10 @@ class Series(Material):
     def series(self) -> tuple[Tensor, Tensor]:
         """Strengths and times [s] of the terms, (terms,) each."""
         numbers = range(1, self.terms + 1)
-        one, other = (tuple(getattr(self, f"{symbol}_{k}") for k in numbers) for symbol in (self.symbol, "tau"))
+        one, other = (
+            tuple(getattr(self, f"{symbol}_{k}") for k in numbers)
+            for symbol in (self.symbol, "tau")
+        )
         return torch.stack(one), torch.stack(other)
 
     def well_posed(self) -> str:
@@ -155,8 +173,9 @@ class Series(Material):
 
 
 class GeneralisedKelvin(Series):
-    """A spring in series with Kelvin elements: under a held stress, the fractions J (terms,) [1] of the relaxed compliance
-    1/E set in with the retardation times tau (terms,) [s], and what they leave of one at once.
+    """A spring in series with Kelvin elements: under a held stress, the fractions J (terms,) [1] of
+    the relaxed compliance 1/E set in with the retardation times tau (terms,) [s], and what they
+    leave of one at once.
 
     Parameters are called J_1, tau_1 and so on.
     """
@@ -164,14 +183,18 @@ class GeneralisedKelvin(Series):
     symbol = strength = "J"
 
     def __init__(
-        self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, J: Fractions, tau: Retardations,
-        tau_instant: InstantRetardation = INSTANT,
+        self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, J: Fractions,
+        tau: Retardations, tau_instant: InstantRetardation = INSTANT,
     ) -> None:  # fmt: skip
         super().__init__(E, nu, rho, depth, J, tau, tau_instant)
 
     def well_posed(self) -> str:
         total = float(self.series()[0].detach().sum())
-        return f"the fractions J sum to {total:.6g}, above one" if total > 1 + TOO_MUCH else super().well_posed()
+        return (
+            f"the fractions J sum to {total:.6g}, above one"
+            if total > 1 + TOO_MUCH
+            else super().well_posed()
+        )
 
     def chain(self) -> tuple[Tensor, Tensor]:
         J, tau = self.series()
@@ -179,24 +202,29 @@ class GeneralisedKelvin(Series):
 
 
 class Prony(Series):
-    """A relaxation series: after a step of strain the modulus is E + sum of E_i exp(-t / tau_i), with E [Pa] what remains,
-    `moduli` E_i (terms,) [Pa] what fades, and relaxation times tau (terms,) [s], no two of them equal.
+    """A relaxation series: after a step of strain the modulus is E + sum of E_i exp(-t / tau_i),
+    with E [Pa] what remains, `moduli` E_i (terms,) [Pa] what fades, and relaxation times tau
+    (terms,) [s], no two of them equal.
 
-    Parameters are called E_1, tau_1 and so on. The chain is this same solid, exactly (`retarded`), but for the instantaneous
-    spring, which takes tau_instant [s] to give way.
+    Parameters are called E_1, tau_1 and so on. The chain is this same solid, exactly (`retarded`),
+    but for the instantaneous spring, which takes tau_instant [s] to give way.
     """
 
     symbol, strength = "E", "moduli"
 
     def __init__(
-        self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, moduli: Moduli, tau: Retardations,
-        tau_instant: InstantRetardation = INSTANT,
+        self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth, moduli: Moduli,
+        tau: Retardations, tau_instant: InstantRetardation = INSTANT,
     ) -> None:  # fmt: skip
         super().__init__(E, nu, rho, depth, moduli, tau, tau_instant)
 
     def well_posed(self) -> str:
         times = self.series()[1].detach().tolist()
-        return "two relaxation times are equal" if len(set(times)) < len(times) else super().well_posed()
+        return (
+            "two relaxation times are equal"
+            if len(set(times)) < len(times)
+            else super().well_posed()
+        )
 
     def relaxation(self, t: Tensor) -> Tensor:
         """Stress per held strain [Pa] at times t (...) [s] after it was put on."""
@@ -210,20 +238,25 @@ class Prony(Series):
 
 
 def retarded(m: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-    """Fractions J (n + 1,) [1] of the relaxed compliance, which sum to one, and retardation times tau (n,) [s] of the solid
-    with moduli E m (n,), m > 0, and distinct relaxation times t (n,) [s]; J[0] is the instantaneous spring's.
+    """Fractions J (n + 1,) [1] of the relaxed compliance, which sum to one, and retardation times
+    tau (n,) [s] of the solid with moduli E m (n,), m > 0, and distinct relaxation times t (n,) [s];
+    J[0] is the instantaneous spring's.
 
-    With E(t) = E (1 + sum of m_i exp(-t / t_i)) stress over strain is E (1 + sum of m_i s t_i / (1 + s t_i)) at a complex
-    frequency s. Its zeros s = -1/tau are the rates of creep: tau are the roots of 1 = sum of m_i t_i / (tau - t_i), the
-    eigenvalues of diag(t) + v v^T with v_i^2 = m_i t_i. Each lies above its own relaxation time and below the next one.
+    With E(t) = E (1 + sum of m_i exp(-t / t_i)) stress over strain is E (1 + sum of m_i s t_i / (1
+    + s t_i)) at a complex frequency s. Its zeros s = -1/tau are the rates of creep: tau are the
+    roots of 1 = sum of m_i t_i / (tau - t_i), the eigenvalues of diag(t) + v v^T with v_i^2 = m_i
+    t_i. Each lies above its own relaxation time and below the next one.
 
-    The roots come from LAPACK's secular equation, with the distances tau - t_i to full relative precision, whatever
-    decades the times span; one Newton step with the gradient on makes their derivative the implicit function theorem's
-    (so a second derivative is not exact). Raises `ValueError` for moduli or times that are not positive, and equal times.
+    The roots come from LAPACK's secular equation, with the distances tau - t_i to full relative
+    precision, whatever decades the times span; one Newton step with the gradient on makes their
+    derivative the implicit function theorem's (so a second derivative is not exact). Raises
+    `ValueError` for moduli or times that are not positive, and equal times.
     """
     t, order = t.sort()
     if not (bool((m > 0).all()) and bool((t > 0).all()) and bool((t.diff() > 0).all())):
-        raise ValueError("a relaxation series needs positive moduli and positive times, no two of them equal")
+        raise ValueError(
+            "a relaxation series needs positive moduli and positive times, no two of them equal"
+        )
     m = m[order]
     with torch.no_grad():
         apart = distances(m, t)  # tau_k - t_i
@@ -263,4 +296,5 @@ KINDS: Mapping[str, type[Material]] = {
     "generalised_kelvin": GeneralisedKelvin,
     "prony": Prony,
 }
-"""The materials by what files call them; their tables have the names of the constructors' arguments."""
+"""The materials by what files call them; their tables have the names of the constructors'
+arguments."""

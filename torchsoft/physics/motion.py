@@ -1,4 +1,5 @@
-"""What a rig is asked to do: signals of time, such as the paper's 7th-order profiles (Eq. 20-29)."""
+"""What a rig is asked to do: signals of time, such as the paper's 7th-order profiles (Eq.
+20-29)."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -31,20 +32,41 @@ class Piecewise(nn.Module):
     def __init__(self, times: Sequence[float] | Tensor, values: Sequence[float] | Tensor) -> None:
         super().__init__()
         knots = torch.as_tensor(times, dtype=torch.float64).contiguous()
-        listed = values if isinstance(values, Tensor) else [torch.as_tensor(v, dtype=torch.float64) for v in values]
-        many = listed if isinstance(listed, Tensor) else torch.stack(listed) if listed else torch.zeros(0)
+        listed = (
+            values
+            if isinstance(values, Tensor)
+            else [torch.as_tensor(v, dtype=torch.float64) for v in values]
+        )
+        many = (
+            listed
+            if isinstance(listed, Tensor)
+            else torch.stack(listed)
+            if listed
+            else torch.zeros(0)
+        )
         self.register_buffer("times", knots)
-        # a tensor with a graph keeps it; anything else becomes a parameter that is not trained unless asked for
-        self.values = many.double() if many.requires_grad else nn.Parameter(many.double(), requires_grad=False)
+        # a tensor with a graph keeps it; anything else becomes a parameter that is not trained
+        # unless asked for
+        self.values = (
+            many.double()
+            if many.requires_grad
+            else nn.Parameter(many.double(), requires_grad=False)
+        )
         if wrong := self.ill_posed():
             raise ValueError(wrong)
         if not bool(torch.isfinite(many).all()):
             raise ValueError(f"`values` must be finite, but are {line(many.tolist())}")
 
     def ill_posed(self) -> str:
-        """What is wrong with the knots as they are now, but for values that are not finite; empty if nothing is."""
+        """What is wrong with the knots as they are now, but for values that are not finite; empty
+        if nothing is."""
         t = self.times.detach()
-        if t.ndim != 1 or len(t) == 0 or not bool((t.diff() > 0).all()) or not bool(t.isfinite().all()):
+        if (
+            t.ndim != 1
+            or len(t) == 0
+            or not bool((t.diff() > 0).all())
+            or not bool(t.isfinite().all())
+        ):
             return f"`times` must increase strictly, from one time on, but are {line(t.tolist())}"
         if self.values.shape != t.shape:
             return f"`values` must hold one number per time ({len(t)}), but have shape {tuple(self.values.shape)}"
@@ -72,11 +94,13 @@ class Piecewise(nn.Module):
 
 
 Pieces = tuple[Tensor, Tensor, Tensor]
-"""Start and span [s] of every piece (k,), and its control points in Bernstein's form (k, degree + 1)."""
+"""Start and span [s] of every piece (k,), and its control points in Bernstein's form (k, degree +
+1)."""
 
 
 def evaluate(pieces: Pieces, t: Tensor, order: int = 1) -> list[Tensor]:
-    """Value and derivatives up to `order` of polynomials at t (...), by de Casteljau's scheme, which is exact at the knots."""
+    """Value and derivatives up to `order` of polynomials at t (...), by de Casteljau's scheme,
+    which is exact at the knots."""
     at, span, control = pieces
     i = torch.searchsorted(at, t.detach().contiguous(), right=True).clamp(min=1) - 1
     u = (t - at[i]) / span[i]
@@ -96,7 +120,8 @@ def evaluate(pieces: Pieces, t: Tensor, order: int = 1) -> list[Tensor]:
 
 
 def hermite(times: Tensor, jets: Sequence[Tensor]) -> Pieces:
-    """The pieces of degree 7 between `times` (k,) [s] with given values, rates, second and third derivatives (k,)."""
+    """The pieces of degree 7 between `times` (k,) [s] with given values, rates, second and third
+    derivatives (k,)."""
     span = times.diff()
     y, v, a, j = (jet * scale for jet, scale in zip(jets, (1.0, 1 / 7, 1 / 42, 1 / 210)))
     ends = []
@@ -107,15 +132,19 @@ def hermite(times: Tensor, jets: Sequence[Tensor]) -> Pieces:
 
 
 class Profile(Piecewise):
-    """A signal that goes from value to value along 7th-order polynomials, at rest (rate, second and third derivative
-    zero) at every knot (Eq. 20-29); constant before the first knot and after the last.
+    """A signal that goes from value to value along 7th-order polynomials, at rest (rate, second and
+    third derivative zero) at every knot (Eq. 20-29); constant before the first knot and after the
+    last.
 
     times (k,) [s] strictly increasing, values (k,). Raises `ValueError` for anything else.
     """
 
     def control(self) -> Tensor:
-        """Control points of every piece (k - 1, 8): four at either knot, which makes (20) with (22)-(24)."""
-        return torch.cat((self.values[:-1, None].expand(-1, 4), self.values[1:, None].expand(-1, 4)), -1)
+        """Control points of every piece (k - 1, 8): four at either knot, which makes (20) with
+        (22)-(24)."""
+        return torch.cat(
+            (self.values[:-1, None].expand(-1, 4), self.values[1:, None].expand(-1, 4)), -1
+        )
 
 
 class Wave(NamedTuple):
@@ -129,15 +158,20 @@ class Wave(NamedTuple):
 
 def wave(*columns: object) -> Wave:
     """A `Wave` of arrays or numbers."""
-    return Wave(*(torch.from_numpy(np.atleast_1d(np.asarray(column, dtype=np.float64))) for column in columns))
+    return Wave(
+        *(
+            torch.from_numpy(np.atleast_1d(np.asarray(column, dtype=np.float64)))
+            for column in columns
+        )
+    )
 
 
 class Waves(Profile):
-    """A profile with sines on top: sum of a sin(phi + 2 pi (f tau + r tau^2 / 2)), tau [s] being the time since `since`;
-    faded in from there and out until `until` [s].
+    """A profile with sines on top: sum of a sin(phi + 2 pi (f tau + r tau^2 / 2)), tau [s] being
+    the time since `since`; faded in from there and out until `until` [s].
 
-    In pieces of degree 7, `PIECES` to the shortest period, that have the value and three derivatives of this at either end:
-    no further from it than 1e-11 times the amplitude.
+    In pieces of degree 7, `PIECES` to the shortest period, that have the value and three
+    derivatives of this at either end: no further from it than 1e-11 times the amplitude.
     """
 
     PIECES: ClassVar = 24
@@ -147,7 +181,9 @@ class Waves(Profile):
         super().__init__(*profile)
         self.since, self.wave = since, wave
         self.window = Profile([since, since + FADE, until - FADE, until], [0.0, 1.0, 1.0, 0.0])
-        fastest = float(torch.maximum(wave.frequency, wave.frequency + wave.sweep * (until - since)).max())
+        fastest = float(
+            torch.maximum(wave.frequency, wave.frequency + wave.sweep * (until - since)).max()
+        )
         count = self.PIECES * max(2.0, fastest * (until - since))
         every = torch.linspace(since, until, ceil(count) + 1, dtype=torch.float64)
         self.register_buffer("fine", torch.cat((every, self.times, self.window.times)).unique())
@@ -159,7 +195,10 @@ class Waves(Profile):
 
     def pieces(self) -> Pieces:
         """The polynomials; constant before the first and after the last."""
-        window, wave = evaluate(self.window.pieces(), self.fine, 3), self.sines(self.fine - self.since)
+        window, wave = (
+            evaluate(self.window.pieces(), self.fine, 3),
+            self.sines(self.fine - self.since),
+        )
         jets = evaluate(super().pieces(), self.fine, 3)
         for n in range(4):
             jets[n] = jets[n] + sum(comb(n, k) * window[k] * wave[n - k] for k in range(n + 1))
@@ -177,9 +216,9 @@ class Waves(Profile):
 
 
 class Sampled(Piecewise):
-    """A recorded set-point: the cubic through values (k,) at times (k,) [s] with the given rates (k,), or with those of the
-    natural choice, a cubic spline; constant before the first and after the last. A step chosen by tolerances passes
-    `KNOTS_PER_STEP` knots at most."""
+    """A recorded set-point: the cubic through values (k,) at times (k,) [s] with the given rates
+    (k,), or with those of the natural choice, a cubic spline; constant before the first and after
+    the last. A step chosen by tolerances passes `KNOTS_PER_STEP` knots at most."""
 
     KNOTS_PER_STEP: ClassVar = 4
     given: Tensor | None
@@ -192,13 +231,18 @@ class Sampled(Piecewise):
     ) -> None:
         super().__init__(times, values)
         slope = None if rates is None else torch.as_tensor(rates, dtype=torch.float64)
-        if slope is not None and (slope.shape != self.times.shape or not bool(torch.isfinite(slope).all())):
-            raise ValueError(f"`rates` must hold one finite number per time ({len(self.times)}), but are {rates}")
+        if slope is not None and (
+            slope.shape != self.times.shape or not bool(torch.isfinite(slope).all())
+        ):
+            raise ValueError(
+                f"`rates` must hold one finite number per time ({len(self.times)}), but are {rates}"
+            )
         self.register_buffer("given", slope)
 
     @property
     def rates(self) -> Tensor:
-        """Rates (k,) at the knots: the given ones, or the spline's through the values as they are now."""
+        """Rates (k,) at the knots: the given ones, or the spline's through the values as they are
+        now."""
         return spline_rates(self.times, self.values) if self.given is None else self.given
 
     @property
@@ -214,8 +258,9 @@ class Sampled(Piecewise):
 
 
 def spline_rates(t: Tensor, y: Tensor) -> Tensor:
-    """Rates (k,) at the knots of the cubic spline through y (k,) at times t (k,) [s] without a knot at the second time and at
-    the last but one: a parabola through three, a line through two. Differentiable in both."""
+    """Rates (k,) at the knots of the cubic spline through y (k,) at times t (k,) [s] without a knot
+    at the second time and at the last but one: a parabola through three, a line through two.
+    Differentiable in both."""
     h = t.diff()
     slope = y.diff() / h
     if len(t) < 3:
@@ -233,7 +278,8 @@ def spline_rates(t: Tensor, y: Tensor) -> Tensor:
 
 
 class Tridiagonal(torch.autograd.Function):
-    """The solution x (k,) of a tridiagonal system with right-hand side b (k,): O(k), differentiable in everything."""
+    """The solution x (k,) of a tridiagonal system with right-hand side b (k,): O(k), differentiable
+    in everything."""
 
     @staticmethod
     def forward(ctx: Any, lower: Tensor, diagonal: Tensor, upper: Tensor, b: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -251,7 +297,8 @@ class Tridiagonal(torch.autograd.Function):
 
 
 class Reference(nn.Module):
-    """What a rig is asked to do: named signals of time, setpoints, feed-forward efforts and driven coordinates.
+    """What a rig is asked to do: named signals of time, setpoints, feed-forward efforts and driven
+    coordinates.
 
     Raises `ValueError` for a signal that is not a module giving (value, rate) at t.
     """
@@ -261,12 +308,16 @@ class Reference(nn.Module):
         for name, signal in signals.items():
             if not isinstance(signal, nn.Module):
                 raise ValueError(
-                    f"the signal `{name}` must be a module such as `Profile`, but is {type(signal).__name__}"
+                    f"the signal `{name}` must be a module such as `Profile`, but is "
+                    f"{type(signal).__name__}"
                 )
-        self.signals = nn.ModuleDict({name.replace(".", ":"): signal for name, signal in signals.items()})
+        self.signals = nn.ModuleDict(
+            {name.replace(".", ":"): signal for name, signal in signals.items()}
+        )
 
     def forward(self, t: Tensor, names: Sequence[str]) -> Tensor:
-        """Values and rates (..., names, 2) at t (...) [s]. Raises `ValueError` for a signal that is not there, or is none."""
+        """Values and rates (..., names, 2) at t (...) [s]. Raises `ValueError` for a signal that is
+        not there, or is none."""
         rows = []
         for name in names:
             if name.replace(".", ":") not in self.signals:
@@ -278,29 +329,40 @@ class Reference(nn.Module):
     def _asked(self, name: str, t: Tensor) -> Tensor:
         """Value and rate (..., 2) of one signal."""
         given = self._now(name)(t)
-        if not isinstance(given, tuple) or len(given) != 2 or not all(isinstance(x, Tensor) for x in given):
+        if (
+            not isinstance(given, tuple)
+            or len(given) != 2
+            or not all(isinstance(x, Tensor) for x in given)
+        ):
             raise ValueError(
-                f"the signal `{name}` must give two tensors, value and rate, but gives {type(given).__name__}"
+                f"the signal `{name}` must give two tensors, value and rate, but gives "
+                f"{type(given).__name__}"
             )
         for x in given:
             if x.shape != t.shape or x.dtype != torch.float64:
                 raise ValueError(
-                    f"the signal `{name}` must give float64 of shape {tuple(t.shape)}, but gives {x.dtype} of {tuple(x.shape)}"
+                    f"the signal `{name}` must give float64 of shape {tuple(t.shape)}, but gives "
+                    f"{x.dtype} of {tuple(x.shape)}"
                 )
         return torch.stack(given, -1)
 
     def _now(self, name: str) -> nn.Module:
-        """A signal, whose knots may have been changed since it was made. Raises `ValueError` for those that are none."""
+        """A signal, whose knots may have been changed since it was made. Raises `ValueError` for
+        those that are none."""
         signal = self[name]
         if isinstance(signal, Piecewise) and (wrong := signal.ill_posed()):
             raise ValueError(f"the signal `{name}` of the reference is none any more: {wrong}")
         return signal
 
     def plain(self, names: Sequence[str]) -> list[Piecewise] | None:
-        """These signals, if all of them are polynomials of this package's and nothing else decides their values; else None.
-        Raises `ValueError` for knots that are none."""
+        """These signals, if all of them are polynomials of this package's and nothing else decides
+        their values; else None. Raises `ValueError` for knots that are none."""
         chosen = [self._now(name) for name in names]
-        if type(self).forward is not Reference.forward or self._forward_hooks or self._forward_pre_hooks:
+        if (
+            type(self).forward is not Reference.forward
+            or self._forward_hooks
+            or self._forward_pre_hooks
+        ):
             return None
         for one in chosen:
             if not isinstance(one, Piecewise) or not type(one).__module__.startswith("torchsoft."):

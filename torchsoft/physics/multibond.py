@@ -1,8 +1,10 @@
-"""Multibonds: 1-junctions, modulated transformers, ports, and the sums that make equations of motion of them.
+"""Multibonds: 1-junctions, modulated transformers, ports, and the sums that make equations of
+motion of them.
 
-Every I field (or massless body) owns a 1-junction with a flow vector per node. A port is one multibond: its flow is
-f = sum_j T_j v_j over the junctions its transformer touches, and the efforts it sends back are T_j^T e. Because the same
-T carries flow out and effort back, power is conserved bond by bond, whatever the moduli.
+Every I field (or massless body) owns a 1-junction with a flow vector per node. A port is one
+multibond: its flow is f = sum_j T_j v_j over the junctions its transformer touches, and the efforts
+it sends back are T_j^T e. Because the same T carries flow out and effort back, power is conserved
+bond by bond, whatever the moduli.
 """
 
 from collections.abc import Mapping
@@ -15,7 +17,8 @@ from torch import Tensor
 
 
 class Junction(NamedTuple):
-    """A 1-junction: `nodes` flow vectors of `width` components, what stores or sets its flow, and the paper's name."""
+    """A 1-junction: `nodes` flow vectors of `width` components, what stores or sets its flow, and
+    the paper's name."""
 
     nodes: int
     width: int
@@ -24,8 +27,9 @@ class Junction(NamedTuple):
 
 
 class Block(NamedTuple):
-    """One junction's modulus: matrix (..., bonds or 1, m, width), after an interpolation of the junction's nodes at the bonds,
-    spread (bonds, nodes); None where bonds are nodes, or the junction has only one."""
+    """One junction's modulus: matrix (..., bonds or 1, m, width), after an interpolation of the
+    junction's nodes at the bonds, spread (bonds, nodes); None where bonds are nodes, or the
+    junction has only one."""
 
     matrix: Tensor
     spread: Tensor | None = None
@@ -61,10 +65,11 @@ class Transformer:
 
 @dataclass(frozen=True)
 class Port:
-    """One multibond: its transformer, its effort (..., bonds, m), and the elements behind it, in the paper's names.
+    """One multibond: its transformer, its effort (..., bonds, m), and the elements behind it, in
+    the paper's names.
 
-    `source` ports (Se) push the junctions, the others load them. `senses` names junctions whose flow reaches the
-    element through an activated bond only, without power.
+    `source` ports (Se) push the junctions, the others load them. `senses` names junctions whose
+    flow reaches the element through an activated bond only, without power.
     """
 
     transformer: Transformer
@@ -79,7 +84,8 @@ class Port:
 
 
 def net_efforts(ports: Mapping[str, Port], junctions: Mapping[str, Junction]) -> dict[str, Tensor]:
-    """Effort left over at every 1-junction, what its I field integrates: sum of +-T^T e over the ports."""
+    """Effort left over at every 1-junction, what its I field integrates: sum of +-T^T e over the
+    ports."""
     total: dict[str, Tensor] = {}
     for port in ports.values():
         for name, effort in port.transformer.effort(port.effort, junctions).items():
@@ -94,15 +100,19 @@ def identity(width: int, like: Tensor, sign: float = 1.0) -> Tensor:
 
 
 def topology(ports: Mapping[str, Port], junctions: Mapping[str, Junction]) -> nx.DiGraph:
-    """The graph as drawn: junctions, their I fields and sources of flow, transformers, and the elements behind each port.
+    """The graph as drawn: junctions, their I fields and sources of flow, transformers, and the
+    elements behind each port.
 
-    Node attribute `kind` is one of "1", "MTF", "I", "C", "R", "Se", "Sf"; edge attribute `activated` marks signal bonds.
-    A port that shares a junction's name stands under "<name>: field".
+    Node attribute `kind` is one of "1", "MTF", "I", "C", "R", "Se", "Sf"; edge attribute
+    `activated` marks signal bonds. A port that shares a junction's name stands under "<name>:
+    field".
     """
     graph = nx.DiGraph()
     for name, junction in junctions.items():
         graph.add_node(name, kind="1", label=junction.label)
-        if junction.element.startswith("R"):  # a massless pad's flow is set by the R field that its own port shows
+        if junction.element.startswith(
+            "R"
+        ):  # a massless pad's flow is set by the R field that its own port shows
             continue
         own, kind = f"{name}: own", junction.element.split(":")[0]
         graph.add_node(own, kind=kind, label=junction.element)
@@ -122,7 +132,8 @@ def topology(ports: Mapping[str, Port], junctions: Mapping[str, Junction]) -> nx
 
 
 def to_dot(graph: nx.DiGraph) -> str:
-    """Graphviz text of `topology`: full arrows for power bonds, dashed ones for activated (signal) bonds."""
+    """Graphviz text of `topology`: full arrows for power bonds, dashed ones for activated (signal)
+    bonds."""
     lines = ["digraph multibond {", "  rankdir=LR; node [shape=plaintext];"]
     lines += [f'  "{node}" [label="{data["label"]}"];' for node, data in graph.nodes(data=True)]
     for tail, head, data in graph.edges(data=True):

@@ -1,7 +1,8 @@
 """Pads: a mesh of a material, bonded to a base, massless (condensed onto its surface) or inertial.
 
-Displacements are in the frame of the base, which turns with it. A massless pad's state are the parts z_b (nodes, 2) [N] of its
-nodal forces that have set in, branch by branch of its material's chain; an inertial pad's its displacements and velocities.
+Displacements are in the frame of the base, which turns with it. A massless pad's state are the
+parts z_b (nodes, 2) [N] of its nodal forces that have set in, branch by branch of its material's
+chain; an inertial pad's its displacements and velocities.
 """
 
 from typing import Any
@@ -18,12 +19,13 @@ from torchsoft.physics.mesh import Array, Mesh, lame_moduli, unit_compliance
 
 
 class Pad(nn.Module):
-    """`base` names the body that it is bonded to, None the ground; the mesh is mirrored if wanted (y upside down), turned by
-    `angle` [rad] and put with its own origin, a corner or the left end of its base, at `origin` [m] in the base's frame.
+    """`base` names the body that it is bonded to, None the ground; the mesh is mirrored if wanted
+    (y upside down), turned by `angle` [rad] and put with its own origin, a corner or the left end
+    of its base, at `origin` [m] in the base's frame.
 
-    `points` contact points an element of the surface lie at Gauss places; 0 puts one on every node, as in the paper.
-    `positions` are the undeformed places of the nodes in the state (nodes, 2) [m], `surface` numbers those on the surface.
-    Raises `ValueError` for a negative number of points.
+    `points` contact points an element of the surface lie at Gauss places; 0 puts one on every node,
+    as in the paper. `positions` are the undeformed places of the nodes in the state (nodes, 2) [m],
+    `surface` numbers those on the surface. Raises `ValueError` for a negative number of points.
     """
 
     positions: Tensor
@@ -32,8 +34,9 @@ class Pad(nn.Module):
     axes: Tensor
 
     def __init__(
-        self, mesh: Mesh, material: Material, *, base: str | None = None, origin: tuple[float, float] = (0.0, 0.0),
-        angle: float = 0.0, mirrored: bool = False, inertial: bool = False, points: int = 0,
+        self, mesh: Mesh, material: Material, *, base: str | None = None,
+        origin: tuple[float, float] = (0.0, 0.0), angle: float = 0.0, mirrored: bool = False,
+        inertial: bool = False, points: int = 0,
     ) -> None:  # fmt: skip
         super().__init__()
         self.points = whole("points", points, 0)
@@ -43,17 +46,24 @@ class Pad(nn.Module):
         axes = np.array([[c, -s], [s, c]]) @ np.diag([1.0, -1.0 if mirrored else 1.0])
         self.register_buffer("axes", torch.from_numpy(axes), persistent=False)
         self.register_buffer("origin", torch.tensor(origin, dtype=torch.float64), persistent=False)
-        self.register_buffer("positions", torch.from_numpy(self.placed(mesh.nodes[mesh.free][kept])), persistent=False)
+        self.register_buffer(
+            "positions",
+            torch.from_numpy(self.placed(mesh.nodes[mesh.free][kept])),
+            persistent=False,
+        )
         own = mesh.surface if inertial else np.arange(len(kept))
         self.register_buffer("surface", torch.from_numpy(own.copy()), persistent=False)
         self.point_nodes, self.point_shares, self.point_lengths = contact_points(mesh, points)
         spread = np.zeros((len(self.point_nodes), len(kept)))
         for j in (0, 1):
-            spread[np.arange(len(spread)), self.surface.numpy()[self.point_nodes[:, j]]] += self.point_shares[:, j]
+            spread[np.arange(len(spread)), self.surface.numpy()[self.point_nodes[:, j]]] += (
+                self.point_shares[:, j]
+            )
         self.register_buffer("spread", torch.from_numpy(spread), persistent=False)
 
     def remeshed(self, finer: int, points: int) -> "Pad":
-        """The same pad of `finer` times as many elements each way, with so many contact points an element."""
+        """The same pad of `finer` times as many elements each way, with so many contact points an
+        element."""
         return self._again(self.mesh.refined(finer), self.inertial, points)
 
     def condensed(self) -> "Pad":
@@ -63,8 +73,9 @@ class Pad(nn.Module):
     def _again(self, mesh: Mesh, inertial: bool, points: int) -> "Pad":
         c, s = self.axes[:, 0].tolist()
         return Pad(
-            mesh, self.material, base=self.base, origin=(float(self.origin[0]), float(self.origin[1])),
-            angle=float(np.arctan2(s, c)), mirrored=float(self.axes.det()) < 0, inertial=inertial, points=points,
+            mesh, self.material, base=self.base,
+            origin=(float(self.origin[0]), float(self.origin[1])), angle=float(np.arctan2(s, c)),
+            mirrored=float(self.axes.det()) < 0, inertial=inertial, points=points,
         )  # fmt: skip
 
     spread: Tensor
@@ -80,7 +91,8 @@ class Pad(nn.Module):
 
     @property
     def state_shape(self) -> tuple[int, ...]:
-        """Of its part of the state: displacements (nodes, 2), or forces that have set in (branches, nodes, 2)."""
+        """Of its part of the state: displacements (nodes, 2), or forces that have set in (branches,
+        nodes, 2)."""
         return (self.nodes, 2) if self.inertial else (self.material.branches, self.nodes, 2)
 
     def placed(self, own: Array) -> Array:
@@ -100,14 +112,17 @@ class Pad(nn.Module):
         return np.einsum("ij,ajbk,lk->aibl", R, blocks.reshape(n, 2, m, 2), R).reshape(blocks.shape)
 
     def unit_compliance(self) -> tuple[Tensor, Tensor]:
-        """C for E depth = 1 and its derivative by nu, at the material's own nu, in the base's frame."""
+        """C for E depth = 1 and its derivative by nu, at the material's own nu, in the base's
+        frame."""
         C, dC = unit_compliance(self.mesh, self.material.nu.item())
         return torch.from_numpy(self.rotated(C)), torch.from_numpy(self.rotated(dC))
 
     def compliance(self) -> Tensor:
-        """Static displacement of the surface nodes per force on them [m/N], (2 surface, 2 surface): (K^-1)_ss.
+        """Static displacement of the surface nodes per force on them [m/N], (2 surface, 2 surface):
+        (K^-1)_ss.
 
-        Proportional to 1 / (E depth); its derivative by nu is exact to first order (a second derivative comes out as zero).
+        Proportional to 1 / (E depth); its derivative by nu is exact to first order (a second
+        derivative comes out as zero).
         """
         C, dC = self.unit_compliance()
         material = self.material
@@ -116,22 +131,25 @@ class Pad(nn.Module):
         return C / (material.E * material.depth)
 
     def retardation_time(self, name: str) -> Tensor:
-        """tau [s] of an inertial pad, R = tau K. Raises `NotImplementedError` naming the pad for a material with several."""
+        """tau [s] of an inertial pad, R = tau K. Raises `NotImplementedError` naming the pad for a
+        material with several."""
         _, tau = self.material.chain()
         if len(tau) != 1:
             raise NotImplementedError(
-                f"the inertial pad `{name}` needs a Kelvin-Voigt material (one retardation time), but has {len(tau)}; take a "
-                "massless pad"
+                f"the inertial pad `{name}` needs a Kelvin-Voigt material (one retardation time), "
+                f"but has {len(tau)}; take a massless pad"
             )
         return tau[0]
 
     def elements(self, name: str) -> tuple[str, ...]:
-        """The pad of this name in the multibond graph: a C and an R field, those of all Kelvin elements of its chain."""
+        """The pad of this name in the multibond graph: a C and an R field, those of all Kelvin
+        elements of its chain."""
         own = name if self.material.branches == 1 else f"{name},1..{self.material.branches}"
         return f"C: [K_{own}]^-1", f"R: [R_{own}]"
 
     def masses(self) -> Tensor:
-        """Lumped mass of each node that moves [kg], (nodes,); the bonded nodes' masses are left out, as in the paper."""
+        """Lumped mass of each node that moves [kg], (nodes,); the bonded nodes' masses are left
+        out, as in the paper."""
         return self.material.rho * self.material.depth * torch.from_numpy(self.mesh.nodal_areas)
 
     def stiffness(self, modulus: int) -> sparse.csr_array:
@@ -140,8 +158,8 @@ class Pad(nn.Module):
         return sparse.csr_array(turn @ self.mesh.assemble(self.mesh.matrices[modulus]) @ turn.T)
 
     def static_displacement(self, F: Tensor) -> Tensor:
-        """Displacements (nodes, 2) [m] of an inertial pad's nodes under forces F (surface, 2) [N] on its surface, with their
-        derivative by E, depth and F; the one by nu is left out."""
+        """Displacements (nodes, 2) [m] of an inertial pad's nodes under forces F (surface, 2) [N]
+        on its surface, with their derivative by E, depth and F; the one by nu is left out."""
         moduli = lame_moduli(1.0, self.material.nu.item())
         K = (moduli[0] * self.stiffness(0) + moduli[1] * self.stiffness(1)).tocsc()
         columns = (2 * self.surface[:, None] + torch.arange(2)).flatten()
@@ -152,7 +170,8 @@ class Pad(nn.Module):
         return u.unflatten(0, (-1, 2))
 
     def elastic_force(self, u: Tensor) -> Tensor:
-        """K u of an inertial pad: displacements u (..., nodes, 2) [m] to forces of the same shape [N]."""
+        """K u of an inertial pad: displacements u (..., nodes, 2) [m] to forces of the same shape
+        [N]."""
         mesh, material = self.mesh, self.material
         lame_lambda, lame_mu = material.lame()
         K_lambda, K_mu = (torch.from_numpy(K) for K in mesh.matrices[:2])
@@ -162,14 +181,16 @@ class Pad(nn.Module):
         slot[mesh.free] = np.arange(len(mesh.free))
         connectivity = torch.from_numpy(slot[mesh.elements])
         padded = nn.functional.pad(u @ self.axes, (0, 0, 0, 1))
-        f_e = (padded[..., connectivity, :].flatten(-2)[..., None, :] @ K_e)[..., 0, :].unflatten(-1, (4, 2))
+        f_e = (padded[..., connectivity, :].flatten(-2)[..., None, :] @ K_e)[..., 0, :].unflatten(
+            -1, (4, 2)
+        )
         f = torch.zeros_like(padded).index_add(-2, connectivity.flatten(), f_e.flatten(-3, -2))
         return f[..., :-1, :] @ self.axes.mT
 
 
 def contact_points(mesh: Mesh, points: int) -> tuple[Any, Array, Array]:
-    """Two surface nodes of every contact point (points, 2), their shape functions there, and the length of surface that the
-    point stands for [m]."""
+    """Two surface nodes of every contact point (points, 2), their shape functions there, and the
+    length of surface that the point stands for [m]."""
     count = len(mesh.surface)
     if points == 0:
         nodes = np.stack((np.arange(count), np.arange(count)), -1)

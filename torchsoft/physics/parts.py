@@ -1,4 +1,5 @@
-"""The parts of a rig beside its pads: rigid bodies, contacts, and actuators with their control laws."""
+"""The parts of a rig beside its pads: rigid bodies, contacts, and actuators with their control
+laws."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, Self
@@ -16,21 +17,24 @@ COORDINATES = ("x", "y", "theta")
 """The coordinates of a body [m, m, rad]."""
 
 Freedom = Literal["free", "driven"] | float
-"""A coordinate is free, driven by the reference's signal "body.coordinate", or fixed at a number."""
+"""A coordinate is free, driven by the reference's signal "body.coordinate", or fixed at a
+number."""
 
 
 class Body(nn.Module):
     """A rigid body: mass [kg], shape (None: nothing touches it), moment of inertia [kg.m2].
 
-    The moment of inertia is a parameter of its own, `own_inertia`, where it is given. It else follows mass and shape: it is
-    `inertia_ratio` [1] times that of a body of uniform density, 1 by default, about 2 for a ring.
-    Each coordinate is "free", "driven" or a number at which it is fixed. Gravity acts along -y where `weighted`. Raises
-    `ValueError` for another coordinate, or a body without shape and inertia that may turn.
+    The moment of inertia is a parameter of its own, `own_inertia`, where it is given. It else
+    follows mass and shape: it is `inertia_ratio` [1] times that of a body of uniform density, 1 by
+    default, about 2 for a ring. Each coordinate is "free", "driven" or a number at which it is
+    fixed. Gravity acts along -y where `weighted`. Raises `ValueError` for another coordinate, or a
+    body without shape and inertia that may turn.
     """
 
     def __init__(
-        self, mass: Mass = 1.0, shape: Shape | None = None, *, x: Freedom = "free", y: Freedom = "free",
-        theta: Freedom = "free", inertia: Inertia | None = None, inertia_ratio: InertiaRatio = 1.0, weighted: bool = True,
+        self, mass: Mass = 1.0, shape: Shape | None = None, *, x: Freedom = "free",
+        y: Freedom = "free", theta: Freedom = "free", inertia: Inertia | None = None,
+        inertia_ratio: InertiaRatio = 1.0, weighted: bool = True,
     ) -> None:  # fmt: skip
         super().__init__()
         if shape is not None and not isinstance(shape, Shape):
@@ -41,19 +45,26 @@ class Body(nn.Module):
                 raise ValueError(f"`{name}` must be 'free', 'driven' or a number, but is {value!r}")
             self.freedom[name] = value if isinstance(value, str) else "fixed"
         fixed = {k: v for k, v in zip(COORDINATES, (x, y, theta)) if not isinstance(v, str)}
-        self.fixed = nn.ParameterDict({name: parameter(float(value), trained=False) for name, value in fixed.items()})
+        self.fixed = nn.ParameterDict(
+            {name: parameter(float(value), trained=False) for name, value in fixed.items()}
+        )
         self.mass, self.shape, self.weighted = parameter(mass), shape, weighted
         self.own_inertia = None if inertia is None else parameter(inertia)
         turns = self.freedom["theta"] == "free" and inertia is None and shape is not None
         self.inertia_ratio = parameter(inertia_ratio) if turns else None
         if self.freedom["theta"] == "free" and shape is None and inertia is None:
-            raise ValueError("a body that may turn needs an `inertia`, or a `shape` to compute it from")
+            raise ValueError(
+                "a body that may turn needs an `inertia`, or a `shape` to compute it from"
+            )
 
     @classmethod
     def uniform(cls, shape: Shape, density: float, depth: float, **given: Any) -> Self:
-        """A body of uniform `density` [kg/m3] over its `depth` [m]. Its mass is that of the shape as it is now, and a number of
-        its own from then on; its inertia follows the shape. Raises `ValueError` for numbers that are not positive."""
-        mass = positive("density", density) * positive("depth", depth) * float(shape.area().detach())
+        """A body of uniform `density` [kg/m3] over its `depth` [m]. Its mass is that of the shape
+        as it is now, and a number of its own from then on; its inertia follows the shape. Raises
+        `ValueError` for numbers that are not positive."""
+        mass = (
+            positive("density", density) * positive("depth", depth) * float(shape.area().detach())
+        )
         return cls(mass, shape, **given)
 
     @property
@@ -100,34 +111,45 @@ class PD(nn.Module):
         super().__init__()
         self.Kp, self.Kd = parameter(Kp), parameter(Kd)
 
-    def forward(self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor) -> Tensor:
+    def forward(
+        self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor
+    ) -> Tensor:
         return self.Kp * (w - q) + self.Kd * (w_dot - q_dot) + feed_forward
 
 
 class ReversedPD(PD):
-    """The same with the other sign, for a coordinate that falls where the one that is pushed rises: a bracket that goes to the
-    right turns a disc under it clockwise. Its feed-forward keeps the sign."""
+    """The same with the other sign, for a coordinate that falls where the one that is pushed rises:
+    a bracket that goes to the right turns a disc under it clockwise. Its feed-forward keeps the
+    sign."""
 
-    def forward(self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor) -> Tensor:
+    def forward(
+        self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor
+    ) -> Tensor:
         return feed_forward - self.Kp * (w - q) - self.Kd * (w_dot - q_dot)
 
 
 class Actuator(nn.Module):
     """Measures coordinates, such as "disc.x", and pushes one, such as "bracket.x", by a law.
 
-    `law` (set-point, its rate, feed-forward, coordinate, its rate) -> effort (...) [N or N.m] is torch code: a `PD`, a
-    function, or any module. `setpoint` and `feed_forward` name signals of the reference. A law of several coordinates is given
-    `measures` and `setpoint` as sequences of names, and sees them along a last dimension; set-points are those of the first
-    coordinates, in their order, and there may be none. Laws with several efforts: `controller`. `elements` are the graph's
-    names of what is behind it. Raises `ValueError` for what are no names, and for more set-points than coordinates.
+    `law` (set-point, its rate, feed-forward, coordinate, its rate) -> effort (...) [N or N.m] is
+    torch code: a `PD`, a function, or any module. `setpoint` and `feed_forward` name signals of the
+    reference. A law of several coordinates is given `measures` and `setpoint` as sequences of
+    names, and sees them along a last dimension; set-points are those of the first coordinates, in
+    their order, and there may be none. Laws with several efforts: `controller`. `elements` are the
+    graph's names of what is behind it. Raises `ValueError` for what are no names, and for more
+    set-points than coordinates.
     """
 
     def __init__(
-        self, measures: str | Sequence[str], pushes: str, law: Callable[..., Tensor], *, setpoint: str | Sequence[str],
-        feed_forward: str | None = None, elements: tuple[str, ...] = ("C: Kp", "R: Kd"),
+        self, measures: str | Sequence[str], pushes: str, law: Callable[..., Tensor], *,
+        setpoint: str | Sequence[str], feed_forward: str | None = None,
+        elements: tuple[str, ...] = ("C: Kp", "R: Kd"),
     ) -> None:  # fmt: skip
         super().__init__()
-        self.measures, self.setpoints = names_of("measures", measures), names_of("setpoint", setpoint)
+        self.measures, self.setpoints = (
+            names_of("measures", measures),
+            names_of("setpoint", setpoint),
+        )
         for name, value in (("pushes", pushes), ("feed_forward", feed_forward or "")):
             if not isinstance(value, str):
                 raise ValueError(f"`{name}` of an actuator must be a name, but is {value!r}")
@@ -135,11 +157,17 @@ class Actuator(nn.Module):
             raise ValueError(f"`law` of an actuator must be a function or a module, but is {law!r}")
         if not self.measures or len(self.setpoints) > len(self.measures):
             raise ValueError(
-                f"an actuator measures {len(self.measures)} coordinates and follows {len(self.setpoints)} set-points, but must "
-                "measure one at least, and what is to follow each set-point"
+                f"an actuator measures {len(self.measures)} coordinates and follows "
+                f"{len(self.setpoints)} set-points, but must measure one at least, and what is to "
+                "follow each set-point"
             )
         self.several = not isinstance(measures, str), not isinstance(setpoint, str)
-        self.pushes, self.law, self.feed_forward, self.elements = pushes, law, feed_forward, elements
+        self.pushes, self.law, self.feed_forward, self.elements = (
+            pushes,
+            law,
+            feed_forward,
+            elements,
+        )
 
     @property
     def follows(self) -> tuple[tuple[str, str], ...]:
@@ -179,7 +207,9 @@ class Actuator(nn.Module):
         """The law's inputs x (*batch, inputs), of signals by name (*batch, 2) and a state."""
         x = [part for name in self.setpoints for part in signals[name].unbind(-1)]
         fed = self.feed_forward
-        x.append(torch.zeros(tuple(batch), dtype=torch.float64) if fed is None else signals[fed][..., 0])
+        x.append(
+            torch.zeros(tuple(batch), dtype=torch.float64) if fed is None else signals[fed][..., 0]
+        )
         for coordinate in self.measures:
             body, _, axis = coordinate.partition(".")
             i = COORDINATES.index(axis)
@@ -187,9 +217,15 @@ class Actuator(nn.Module):
         return torch.stack(x, -1)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Effort (...) of x (..., inputs): every set-point and its rate, feed-forward, every coordinate and its rate."""
+        """Effort (...) of x (..., inputs): every set-point and its rate, feed-forward, every
+        coordinate and its rate."""
         feed = 2 * len(self.setpoints)
-        w, w_dot, q, q_dot = x[..., 0:feed:2], x[..., 1:feed:2], x[..., feed + 1 :: 2], x[..., feed + 2 :: 2]
+        w, w_dot, q, q_dot = (
+            x[..., 0:feed:2],
+            x[..., 1:feed:2],
+            x[..., feed + 1 :: 2],
+            x[..., feed + 2 :: 2],
+        )
         if not self.several[0]:
             q, q_dot = q[..., 0], q_dot[..., 0]
         if not self.several[1]:
@@ -199,26 +235,39 @@ class Actuator(nn.Module):
 
 def names_of(field: str, given: str | Sequence[str]) -> tuple[str, ...]:
     """One name, or several. Raises `ValueError`."""
-    names = (given,) if isinstance(given, str) else tuple(given) if isinstance(given, Sequence) else (given,)
+    names = (
+        (given,)
+        if isinstance(given, str)
+        else tuple(given)
+        if isinstance(given, Sequence)
+        else (given,)
+    )
     for name in names:
         if not isinstance(name, str):
-            raise ValueError(f"`{field}` of an actuator must be a name, or a sequence of them, but is {given!r}")
+            raise ValueError(
+                f"`{field}` of an actuator must be a name, or a sequence of them, but is {given!r}"
+            )
     return names
 
 
 class StateFeedback(nn.Module):
-    """Efforts K e of the errors e: set-points less coordinates, and their rates; without a set-point, less the coordinate.
+    """Efforts K e of the errors e: set-points less coordinates, and their rates; without a
+    set-point, less the coordinate.
 
-    `gain` K (k, 2 m) has a row for each effort, and columns for the m coordinates and then their rates: a regulator of linear
-    theory. Raises `ValueError` for another shape.
+    `gain` K (k, 2 m) has a row for each effort, and columns for the m coordinates and then their
+    rates: a regulator of linear theory. Raises `ValueError` for another shape.
     """
 
     def __init__(self, gain: Sequence[Sequence[float]]) -> None:
         super().__init__()
         rows = {len(row) for row in gain}
         if len(rows) != 1 or rows.pop() % 2:
-            raise ValueError("a gain has rows of one length, of a number for each coordinate and for each rate")
-        self.gain = nn.Parameter(torch.tensor([[float(one) for one in row] for row in gain], dtype=torch.float64))
+            raise ValueError(
+                "a gain has rows of one length, of a number for each coordinate and for each rate"
+            )
+        self.gain = nn.Parameter(
+            torch.tensor([[float(one) for one in row] for row in gain], dtype=torch.float64)
+        )
 
     def forward(self, setpoints: Tensor, state: Tensor) -> Tensor:
         given, there = setpoints.unflatten(-1, (2, -1)), state.unflatten(-1, (2, -1))
@@ -234,33 +283,42 @@ class OneEffort(nn.Module):
         super().__init__()
         self.module, self.number = module, number
 
-    def forward(self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor) -> Tensor:
+    def forward(
+        self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor
+    ) -> Tensor:
         efforts = self.module(torch.cat((w, w_dot), -1), torch.cat((q, q_dot), -1))
         return efforts[..., self.number] + feed_forward
 
 
 def controller(
-    module: nn.Module, *, measures: Sequence[str], setpoints: Sequence[str], pushes: Mapping[str, str],
-    feed_forward: Mapping[str, str] | None = None, element: str = "Se: controller",
+    module: nn.Module, *, measures: Sequence[str], setpoints: Sequence[str],
+    pushes: Mapping[str, str], feed_forward: Mapping[str, str] | None = None,
+    element: str = "Se: controller",
 ) -> dict[str, Actuator]:  # fmt: skip
-    """Actuators of one control law that sees several coordinates and gives several efforts, by their names.
+    """Actuators of one control law that sees several coordinates and gives several efforts, by
+    their names.
 
-    `module` (set-points, state) -> efforts (..., k) [N or N.m]: set-points (..., 2 s) and state (..., 2 m) hold all values
-    and then all rates, of the s signals `setpoints` and of the m coordinates that it `measures`, which may be all of all
-    bodies. `pushes` names the actuators and what each pushes, in the order of the efforts: {"x": "bracket.x"}; the channel of
-    the first is then F_x. `feed_forward` names signals that are added to efforts. The module is shared: its parameters are
-    those of the first of the actuators, and those of the rig's group if it is one (`Rig(groups=)`). Raises `ValueError` for
-    another number of efforts, and what `Actuator` does.
+    `module` (set-points, state) -> efforts (..., k) [N or N.m]: set-points (..., 2 s) and state
+    (..., 2 m) hold all values and then all rates, of the s signals `setpoints` and of the m
+    coordinates that it `measures`, which may be all of all bodies. `pushes` names the actuators and
+    what each pushes, in the order of the efforts: {"x": "bracket.x"}; the channel of the first is
+    then F_x. `feed_forward` names signals that are added to efforts. The module is shared: its
+    parameters are those of the first of the actuators, and those of the rig's group if it is one
+    (`Rig(groups=)`). Raises `ValueError` for another number of efforts, and what `Actuator` does.
     """
     several, fed = tuple(measures), dict(feed_forward or {})
     if not isinstance(module, nn.Module):
         raise ValueError(f"`module` of a controller must be a torch module, but is {module!r}")
     if isinstance(measures, str) or isinstance(setpoints, str) or not isinstance(pushes, Mapping):
         raise ValueError(
-            "`measures` and `setpoints` of a controller are sequences of names, and `pushes` names by names"
+            "`measures` and `setpoints` of a controller are sequences of names, and `pushes` names "
+            "by names"
         )
     if unknown := fed.keys() - pushes.keys():
-        raise ValueError(f"`feed_forward` names {', '.join(sorted(unknown))}, but `pushes` has {', '.join(pushes)}")
+        raise ValueError(
+            f"`feed_forward` names {', '.join(sorted(unknown))}, but `pushes` has "
+            f"{', '.join(pushes)}"
+        )
     made = {
         name: Actuator(
             several,
@@ -273,11 +331,14 @@ def controller(
         for i, (name, pushed) in enumerate(pushes.items())
     }
     with torch.no_grad():
-        example = (torch.zeros(2 * len(names), dtype=torch.float64) for names in (setpoints, measures))
+        example = (
+            torch.zeros(2 * len(names), dtype=torch.float64) for names in (setpoints, measures)
+        )
         efforts = module(*example)
     if not isinstance(efforts, Tensor) or efforts.shape != (len(pushes),):
         shown = tuple(efforts.shape) if isinstance(efforts, Tensor) else type(efforts).__name__
         raise ValueError(
-            f"the controller gives {shown} for one state, but must give one effort for each of {list(pushes)}"
+            f"the controller gives {shown} for one state, but must give one effort for each of "
+            f"{list(pushes)}"
         )
     return made

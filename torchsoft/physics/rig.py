@@ -1,7 +1,8 @@
-"""A rig as one torch module: lists of bodies, pads, contacts and actuators; `forward(t, y)` is the right-hand side of the ODE.
+"""A rig as one torch module: lists of bodies, pads, contacts and actuators; `forward(t, y)` is the
+right-hand side of the ODE.
 
-The equations of motion are not written down anywhere: `forward` evaluates the ports of the multibond graph at the state
-and integrates what is left over at its 1-junctions.
+The equations of motion are not written down anywhere: `forward` evaluates the ports of the
+multibond graph at the state and integrates what is left over at its 1-junctions.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,12 +25,14 @@ from torchsoft.quantity import Gravity, Quantity, quantity_of
 GROUND = "ground"
 
 RATE_TOLERANCE, RATE_ITERATIONS = 1e-13, 30
-"""Residual [m/s] to which the rates of massless pads are solved, and steps of Newton's method for it at the most."""
+"""Residual [m/s] to which the rates of massless pads are solved, and steps of Newton's method for
+it at the most."""
 
 
 class Interface(NamedTuple):
-    """One contact at one state: moving frame (world axes), law outputs `out` (..., points, 7) as `contact.interface_law` has
-    them, stretches, the port's transformer, and g', v_T (..., points, 2)."""
+    """One contact at one state: moving frame (world axes), law outputs `out` (..., points, 7) as
+    `contact.interface_law` has them, stretches, the port's transformer, and g', v_T (..., points,
+    2)."""
 
     frame: Frame
     out: Tensor
@@ -58,20 +61,23 @@ class Evaluation(NamedTuple):
 class Rig(nn.Module):
     """Rigid bodies, soft pads, contacts between them, and actuators.
 
-    Names are the mappings' keys; contacts are ordered by their pad. Every physical parameter is an `nn.Parameter` that
-    gradients reach. `reference` gives the signals that actuators and driven coordinates follow; a run may be given another.
-    `symbols` are the suffixes of the bodies' channels, the name by default; `groups` are parts that several of the lists share,
-    whose parameters are then called by the group's name.
+    Names are the mappings' keys; contacts are ordered by their pad. Every physical parameter is an
+    `nn.Parameter` that gradients reach. `reference` gives the signals that actuators and driven
+    coordinates follow; a run may be given another. `symbols` are the suffixes of the bodies'
+    channels, the name by default; `groups` are parts that several of the lists share, whose
+    parameters are then called by the group's name.
 
-    `forward(t, y)` follows torchdiffeq: y has shape (..., `layout.size`), float64, any batch dimensions. Not smooth where a
-    point touches, where the normal force is cut at zero and where a point begins to slip; continuous there with smooth laws.
-    Raises `ValueError` for names that do not fit together, and `NotImplementedError` for an inertial pad whose base turns or
-    whose material has several retardation times.
+    `forward(t, y)` follows torchdiffeq: y has shape (..., `layout.size`), float64, any batch
+    dimensions. Not smooth where a point touches, where the normal force is cut at zero and where a
+    point begins to slip; continuous there with smooth laws. Raises `ValueError` for names that do
+    not fit together, and `NotImplementedError` for an inertial pad whose base turns or whose
+    material has several retardation times.
     """
 
     def __init__(
-        self, *, bodies: Mapping[str, Body], pads: Mapping[str, Pad], contacts: Mapping[str, Contact],
-        actuators: Mapping[str, Actuator] | None = None, reference: Reference | None = None, gravity: Gravity = 9.81,
+        self, *, bodies: Mapping[str, Body], pads: Mapping[str, Pad],
+        contacts: Mapping[str, Contact], actuators: Mapping[str, Actuator] | None = None,
+        reference: Reference | None = None, gravity: Gravity = 9.81,
         symbols: Mapping[str, str] | None = None, groups: Mapping[str, nn.Module] | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
@@ -79,7 +85,10 @@ class Rig(nn.Module):
         for name, module in (groups or {}).items():
             self.add_module(name, module)
         order = sorted(
-            contacts, key=lambda name: list(pads).index(contacts[name].pad) if contacts[name].pad in pads else -1
+            contacts,
+            key=lambda name: (
+                list(pads).index(contacts[name].pad) if contacts[name].pad in pads else -1
+            ),
         )
         lists: Any = bodies, pads, {name: contacts[name] for name in order}, actuators or {}
         for name, parts in zip(("bodies", "pads", "contacts", "actuators"), lists):
@@ -98,44 +107,60 @@ class Rig(nn.Module):
         """Raises what the class does for parts that do not fit together."""
         for name, pad in self.pads.items():
             if pad.base is not None and pad.base not in self.bodies:
-                raise ValueError(f"pad `{name}` is bonded to `{pad.base}`, but the bodies are {', '.join(self.bodies)}")
+                raise ValueError(
+                    f"pad `{name}` is bonded to `{pad.base}`, but the bodies are "
+                    f"{', '.join(self.bodies)}"
+                )
             if not pad.inertial:
                 continue
             pad.retardation_time(name)
             if pad.base is not None and self.bodies[pad.base].freedom["theta"] != "fixed":
                 raise NotImplementedError(
-                    f"pad `{name}` is inertial and its base `{pad.base}` may turn: nodal accelerations in a turning frame are "
-                    "not modelled; fix the base's theta or take a massless pad"
+                    f"pad `{name}` is inertial and its base `{pad.base}` may turn: nodal "
+                    "accelerations in a turning frame are not modelled; fix the base's theta or "
+                    "take a massless pad"
                 )
         between = {(contact.pad, contact.body): name for name, contact in self.contacts.items()}
         for name, contact in self.contacts.items():
             if (twin := between[contact.pad, contact.body]) != name:
-                raise ValueError(f"contacts.{twin}: it is between the same pad and body as `{name}`; leave one out")
+                raise ValueError(
+                    f"contacts.{twin}: it is between the same pad and body as `{name}`; leave one "
+                    "out"
+                )
             if contact.pad not in self.pads or contact.body not in self.bodies:
                 raise ValueError(
-                    f"contact `{name}` is between `{contact.pad}` and `{contact.body}`, which are not both there"
+                    f"contact `{name}` is between `{contact.pad}` and `{contact.body}`, which are "
+                    "not both there"
                 )
             if self.bodies[contact.body].shape is None:
-                raise ValueError(f"contact `{name}` needs a shape, but the body `{contact.body}` has none")
+                raise ValueError(
+                    f"contact `{name}` needs a shape, but the body `{contact.body}` has none"
+                )
             if self.pads[contact.pad].base == contact.body:
                 raise ValueError(
-                    f"contact `{name}`: the pad `{contact.pad}` is bonded to the body `{contact.body}` itself"
+                    f"contact `{name}`: the pad `{contact.pad}` is bonded to the body "
+                    f"`{contact.body}` itself"
                 )
         for name, actuator in self.actuators.items():
             for coordinate in (*actuator.measures, actuator.pushes):
                 self.coordinate(coordinate, f"actuator `{name}`")
 
     def coordinate(self, name: str, owner: str = "`name`") -> int:
-        """Number of a coordinate such as "disc.x" among those of all bodies. Raises `ValueError`."""
+        """Number of a coordinate such as "disc.x" among those of all bodies. Raises
+        `ValueError`."""
         body, _, axis = name.partition(".")
         if body not in self.bodies or axis not in COORDINATES:
             known = ", ".join(f"{b}.{axis}" for b in self.bodies for axis in COORDINATES)
-            raise ValueError(f"{owner} speaks of `{name}`, which is not a coordinate; there are {known}")
+            raise ValueError(
+                f"{owner} speaks of `{name}`, which is not a coordinate; there are {known}"
+            )
         return 3 * list(self.bodies).index(body) + COORDINATES.index(axis)
 
-    def named_modules(self, memo: Any = None, prefix: str = "", remove_duplicate: bool = True) -> Any:
-        """Each module once, whatever is asked for: `torch.func.functional_call` would put back the wrong tensors of a part that
-        several of the lists share."""
+    def named_modules(
+        self, memo: Any = None, prefix: str = "", remove_duplicate: bool = True
+    ) -> Any:
+        """Each module once, whatever is asked for: `torch.func.functional_call` would put back the
+        wrong tensors of a part that several of the lists share."""
         return super().named_modules(memo, prefix, True)
 
     @property
@@ -151,18 +176,32 @@ class Rig(nn.Module):
 
     def description(self) -> dict[str, Any]:
         """The numbers and laws of the rig as they are now, for what is saved with a run."""
-        mine = {name: value for name, value in self.named_parameters() if not name.startswith("reference.")}
+        mine = {
+            name: value
+            for name, value in self.named_parameters()
+            if not name.startswith("reference.")
+        }
         return {
             "parameters": {name: value.detach().tolist() for name, value in mine.items()},
-            "friction": {name: law_name(contact.law.friction) for name, contact in self.contacts.items()},
+            "friction": {
+                name: law_name(contact.law.friction) for name, contact in self.contacts.items()
+            },
             "control": {name: law_name(actuator.law) for name, actuator in self.actuators.items()},
-            "shape": {name: type(body.shape).__name__ for name, body in self.bodies.items() if body.shape is not None},
+            "shape": {
+                name: type(body.shape).__name__
+                for name, body in self.bodies.items()
+                if body.shape is not None
+            },
             "material": {name: type(pad.material).__name__ for name, pad in self.pads.items()},
-            "mesh": {k: f"{type(pad.mesh).__name__}, {len(pad.mesh.nodes)} nodes" for k, pad in self.pads.items()},
+            "mesh": {
+                k: f"{type(pad.mesh).__name__}, {len(pad.mesh.nodes)} nodes"
+                for k, pad in self.pads.items()
+            },
         }
 
     def parameter(self, name: str) -> Tensor:
-        """A parameter by its name, or by another one in `aliases`. Raises `ValueError` for one that is not there."""
+        """A parameter by its name, or by another one in `aliases`. Raises `ValueError` for one that
+        is not there."""
         known = dict(self.named_parameters(remove_duplicate=False))
         found = known.get(self.aliases.get(name, name), known.get(name))
         if found is None:
@@ -176,17 +215,26 @@ class Rig(nn.Module):
         part = self.get_submodule(owner)
         found = quantity_of(part, last)
         loop = next((one for one in self.actuators.values() if one.law is part), None)
-        return found and (replace(found, unit=loop.gain_unit(last == "Kd")) if isinstance(part, PD) and loop else found)
+        return found and (
+            replace(found, unit=loop.gain_unit(last == "Kd"))
+            if isinstance(part, PD) and loop
+            else found
+        )
 
     @property
     def ordered(self) -> dict[str, str]:
         """Parameters that must not exceed another one, with the name of that one."""
         names = {own: name for name, own in self.aliases.items()}
-        pairs = [[f"{k}.{one}" for one in m.ordered] for k, m in self.named_modules() if k and hasattr(m, "ordered")]
+        pairs = [
+            [f"{k}.{one}" for one in m.ordered]
+            for k, m in self.named_modules()
+            if k and hasattr(m, "ordered")
+        ]
         return {names.get(lower, lower): names.get(upper, upper) for lower, upper in pairs}
 
     def weight(self, name: str) -> Tensor:
-        """What scales a contact's law at its points: the length of surface that each stands for over the law's spacing."""
+        """What scales a contact's law at its points: the length of surface that each stands for
+        over the law's spacing."""
         contact = self.contacts[name]
         return torch.from_numpy(self.pads[contact.pad].point_lengths / contact.law.node_spacing)
 
@@ -205,12 +253,15 @@ class Rig(nn.Module):
 
     @property
     def signals(self) -> tuple[str, ...]:
-        """The reference's signals that the rig follows: setpoints, feed-forward efforts, driven coordinates."""
+        """The reference's signals that the rig follows: setpoints, feed-forward efforts, driven
+        coordinates."""
         names: list[str | None] = []
         for actuator in self.actuators.values():
             names += [*actuator.setpoints, actuator.feed_forward]
         for body_name, body in self.bodies.items():
-            names += [f"{body_name}.{axis}" for axis in COORDINATES if body.freedom[axis] == "driven"]
+            names += [
+                f"{body_name}.{axis}" for axis in COORDINATES if body.freedom[axis] == "driven"
+            ]
         return tuple(dict.fromkeys(name for name in names if name is not None))
 
     def follow(self, t: Tensor | float, reference: Reference | None = None) -> Tensor:
@@ -219,7 +270,8 @@ class Rig(nn.Module):
         return followed(torch.as_tensor(t, dtype=torch.float64), self.signals)
 
     def held(self, signals: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Fixed and driven coordinates and their rates by body (..., 3), zero where a coordinate is free."""
+        """Fixed and driven coordinates and their rates by body (..., 3), zero where a coordinate is
+        free."""
         pose, velocity = {}, {}
         for name, body in self.bodies.items():
             rows = []
@@ -234,7 +286,8 @@ class Rig(nn.Module):
         return pose, velocity
 
     def unpack(self, y: Tensor, signals: Tensor | None = None, t: Tensor | float = 0.0) -> State:
-        """The state's parts by name; `signals` (..., signals, 2) place what is driven, by default the reference at t."""
+        """The state's parts by name; `signals` (..., signals, 2) place what is driven, by default
+        the reference at t."""
         return self.layout.unpack(y, *self.held(self.follow(t) if signals is None else signals))
 
     def pack(self, state: State) -> Tensor:
@@ -259,12 +312,19 @@ class Rig(nn.Module):
         return (zeta.flatten(-2) @ pad.compliance().mT).unflatten(-1, (-1, 2))
 
     def penetration(self, name: str, state: State, u: Tensor | None = None) -> Tensor:
-        """Depth of the points of a contact in the body [m], (..., points); negative where they are apart. `u` are the pad's
-        displacements, where they are known already."""
+        """Depth of the points of a contact in the body [m], (..., points); negative where they are
+        apart. `u` are the pad's displacements, where they are known already."""
         contact = self.contacts[name]
-        pad, shape, pose = self.pads[contact.pad], self.bodies[contact.body].shape, state.pose[contact.body]
+        pad, shape, pose = (
+            self.pads[contact.pad],
+            self.bodies[contact.body].shape,
+            state.pose[contact.body],
+        )
         assert shape is not None
-        (r_B, _), u = self.base_motion(contact.pad, state), self.displacement(contact.pad, state) if u is None else u
+        (r_B, _), u = (
+            self.base_motion(contact.pad, state),
+            self.displacement(contact.pad, state) if u is None else u,
+        )
         centre = turned(pose[..., :2] - r_B[..., :2], -r_B[..., 2])
         d = pad.point_positions + pad.at_points(u) - centre[..., None, :]
         return -shape(turned(d, r_B[..., 2, None] - pose[..., 2, None]))[0]
@@ -272,7 +332,9 @@ class Rig(nn.Module):
     def forward(self, t: Tensor | float, y: Tensor, reference: Reference | None = None) -> Tensor:
         """dy/dt, shaped like y. Raises `ValueError` for a state of another length or dtype."""
         self.layout.check(y)
-        signals = self.follow(torch.as_tensor(t, dtype=torch.float64).expand(y.shape[:-1]), reference)
+        signals = self.follow(
+            torch.as_tensor(t, dtype=torch.float64).expand(y.shape[:-1]), reference
+        )
         state = self.unpack(y, signals)
         graph = self.evaluate(t, state, signals)
         effort = net_efforts(graph.ports, self.junctions)
@@ -282,20 +344,27 @@ class Rig(nn.Module):
             if pad.inertial:
                 angle = self.base_motion(name, state)[0][..., 2]
                 pads[name] = u_dot
-                rates[name] = turned(effort[f"pad_{name}"], -angle[..., None]) / pad.masses()[:, None]
+                rates[name] = (
+                    turned(effort[f"pad_{name}"], -angle[..., None]) / pad.masses()[:, None]
+                )
             else:
                 f, (_, times) = graph.ports[f"pad_{name}"].effort, pad.material.chain()
                 pads[name] = (f[..., None, :, :] - state.pads[name]) / times[:, None, None]
         loads = self.loads(graph, effort)
-        velocity = {name: loads[name] / torch.stack(body.masses) for name, body in self.bodies.items()}  # (17), (18)
+        velocity = {
+            name: loads[name] / torch.stack(body.masses) for name, body in self.bodies.items()
+        }  # (17), (18)
         stretch = {name: interface.out[..., 2] for name, interface in graph.interfaces.items()}
         return self.pack(State(pads, stretch, state.velocity, rates, velocity))
 
     def loads(self, graph: Evaluation, effort: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Net forces and moments on the bodies (..., 3) [N, N, N.m], of the net efforts at the graph's junctions."""
+        """Net forces and moments on the bodies (..., 3) [N, N, N.m], of the net efforts at the
+        graph's junctions."""
         out = {}
         for name in self.bodies:
-            force, moment = (effort.get(k, torch.zeros_like(graph.flows[k])) for k in (name, f"{name}_spin"))
+            force, moment = (
+                effort.get(k, torch.zeros_like(graph.flows[k])) for k in (name, f"{name}_spin")
+            )
             out[name] = torch.cat((force[..., 0, :], moment[..., 0, :]), -1)
         return out
 
@@ -319,11 +388,14 @@ class Rig(nn.Module):
     def evaluate(
         self, t: Tensor | float, state: State, signals: Tensor | None = None, settled: bool = False
     ) -> Evaluation:
-        """The multibond graph at time t [s] and one state: every port with its transformer and effort, world axes. `settled`
-        takes massless pads to have no rates, which are solved for otherwise."""
+        """The multibond graph at time t [s] and one state: every port with its transformer and
+        effort, world axes. `settled` takes massless pads to have no rates, which are solved for
+        otherwise."""
         like = next(iter(state.pose.values()))
         signals = (
-            self.follow(torch.as_tensor(t, dtype=torch.float64).expand(like.shape[:-1])) if signals is None else signals
+            self.follow(torch.as_tensor(t, dtype=torch.float64).expand(like.shape[:-1]))
+            if signals is None
+            else signals
         )
         flows = {GROUND: torch.zeros_like(like)[..., None, :2]}
         for name in self.bodies:
@@ -344,16 +416,31 @@ class Rig(nn.Module):
                 flows[f"pad_{name}"] = base_rate + turned(u_dot, angle)
             for key in own:
                 interfaces[key] = self._interface(key, state, u, u_dot, flows)
-                element = (f"C: K_n,{key}", f"R: R_n,{key}", f"C: K_t,{key}", f"R: R_t,{key}", f"R: slip_{key}")
-                ports[f"contact_{key}"] = Port(interfaces[key].transformer, interfaces[key].out[..., 3:5], element)
+                element = (
+                    f"C: K_n,{key}",
+                    f"R: R_n,{key}",
+                    f"C: K_t,{key}",
+                    f"R: R_t,{key}",
+                    f"R: slip_{key}",
+                )
+                ports[f"contact_{key}"] = Port(
+                    interfaces[key].transformer, interfaces[key].out[..., 3:5], element
+                )
             ports[f"pad_{name}"] = self._pad_port(name, own, ports, u, u_dot, moment_arm, angle)
         return Evaluation(ports | self._sources(state, signals), flows, interfaces)
 
     def point_inputs(
-        self, key: str, state: State, u: Tensor, u_dot: Tensor, which: Tensor | None = None, stage: float = 0.0
+        self,
+        key: str,
+        state: State,
+        u: Tensor,
+        u_dot: Tensor,
+        which: Tensor | None = None,
+        stage: float = 0.0,
     ) -> Tensor:
-        """Inputs x (..., points, 9) of a contact's law: u and u_dot (..., points, 2) are the points' own, in the base's frame.
-        `which` takes some of the points; `stage` is the law's a h [s]."""
+        """Inputs x (..., points, 9) of a contact's law: u and u_dot (..., points, 2) are the
+        points' own, in the base's frame. `which` takes some of the points; `stage` is the law's a h
+        [s]."""
         contact = self.contacts[key]
         X, weight, s = self.pads[contact.pad].point_positions, self.weight(key), state.stretch[key]
         if which is not None:
@@ -361,39 +448,60 @@ class Rig(nn.Module):
         r_B, v_B = self.base_motion(contact.pad, state)
         r_C, v_C = state.pose[contact.body], state.velocity[contact.body]
         angle = r_B[..., 2]
-        centre, glide = turned(r_C[..., :2] - r_B[..., :2], -angle), turned(v_C[..., :2] - v_B[..., :2], -angle)
+        centre, glide = (
+            turned(r_C[..., :2] - r_B[..., :2], -angle),
+            turned(v_C[..., :2] - v_B[..., :2], -angle),
+        )
         p = X + u
         d = p - centre[..., None, :]
         w = glide[..., None, :] - v_B[..., None, 2:] * cross(p) - u_dot
         one = torch.ones_like(d[..., 0])
-        parts = (v_C[..., 2:] * one, d, (r_C[..., 2:] - r_B[..., 2:]) * one, s * one, weight * one, stage * one)
-        return torch.cat([part if part.ndim == d.ndim else part[..., None] for part in (w, *parts)], -1)
+        parts = (
+            v_C[..., 2:] * one,
+            d,
+            (r_C[..., 2:] - r_B[..., 2:]) * one,
+            s * one,
+            weight * one,
+            stage * one,
+        )
+        return torch.cat(
+            [part if part.ndim == d.ndim else part[..., None] for part in (w, *parts)], -1
+        )
 
     def point_forces(self, own: Sequence[str], state: State, u: Tensor, u_dot: Tensor) -> Tensor:
-        """Sum of the forces of some contacts on the points of their pad (..., points, 2) [N], in the base's frame."""
+        """Sum of the forces of some contacts on the points of their pad (..., points, 2) [N], in
+        the base's frame."""
         total = torch.zeros_like(u)
         for key in own:
             contact = self.contacts[key]
             shape = self.bodies[contact.body].shape
             assert shape is not None
-            total = total + interface_law(contact.law, shape, self.point_inputs(key, state, u, u_dot))[..., :2]
+            total = (
+                total
+                + interface_law(contact.law, shape, self.point_inputs(key, state, u, u_dot))[
+                    ..., :2
+                ]
+            )
         return total
 
     def _rates(self, name: str, own: Sequence[str], state: State, u: Tensor) -> Tensor:
-        """Rates u' (..., nodes, 2) [m/s] of a massless pad's nodes; u their displacements. Raises `RuntimeError` where Newton's
-        method does not converge."""
+        """Rates u' (..., nodes, 2) [m/s] of a massless pad's nodes; u their displacements. Raises
+        `RuntimeError` where Newton's method does not converge."""
         pad = self.pads[name]
         free, P = free_rates(pad, state.pads[name], 0.0)
         law = lambda rate: self.point_forces(own, state, pad.spread @ u, rate)
         F, left = nodal_forces(P, pad.spread, free, law, RATE_TOLERANCE, RATE_ITERATIONS)
         if not left <= 1e3 * RATE_TOLERANCE:
             raise RuntimeError(
-                f"the rates of the massless pad `{name}` did not converge: residual {left:.2g} m/s after {RATE_ITERATIONS} "
-                "iterations; is v_s large enough for the pads' damping to balance the fall of friction with slip?"
+                f"the rates of the massless pad `{name}` did not converge: residual {left:.2g} m/s "
+                f"after {RATE_ITERATIONS} iterations; is v_s large enough for the pads' damping to "
+                "balance the fall of friction with slip?"
             )
         return free + nodal(P, F)
 
-    def _interface(self, key: str, state: State, u: Tensor, u_dot: Tensor, flows: Mapping[str, Tensor]) -> Interface:
+    def _interface(
+        self, key: str, state: State, u: Tensor, u_dot: Tensor, flows: Mapping[str, Tensor]
+    ) -> Interface:
         contact = self.contacts[key]
         pad, body = self.pads[contact.pad], self.bodies[contact.body]
         assert body.shape is not None
@@ -405,15 +513,23 @@ class Rig(nn.Module):
         R = torch.stack((n, cross(n)), -2)  # world -> (normal, tangential), the rows of [iR0]
         arm = torch.einsum("...ij,...j->...i", R, cross(moment_arm))[..., None]
         transformer = Transformer(
-            {contact.body: Block(R), f"{contact.body}_spin": Block(arm), f"pad_{contact.pad}": Block(-R, pad.spread)}
+            {
+                contact.body: Block(R),
+                f"{contact.body}_spin": Block(arm),
+                f"pad_{contact.pad}": Block(-R, pad.spread),
+            }
         )
         frame = Frame(moment_arm, n, cross(n), local.g)
-        return Interface(frame, interface_law(contact.law, body.shape, x), transformer, transformer.flow(flows))
+        return Interface(
+            frame, interface_law(contact.law, body.shape, x), transformer, transformer.flow(flows)
+        )
 
     def _pad_port(
-        self, name: str, own: list[str], ports: Mapping[str, Port], u: Tensor, u_dot: Tensor, moment_arm: Tensor, angle: Tensor
+        self, name: str, own: list[str], ports: Mapping[str, Port], u: Tensor, u_dot: Tensor,
+        moment_arm: Tensor, angle: Tensor
     ) -> Port:  # fmt: skip
-        """The pad's viscoelastic field on its strain rate: node velocities less those of what it is bonded to (Fig. 7)."""
+        """The pad's viscoelastic field on its strain rate: node velocities less those of what it is
+        bonded to (Fig. 7)."""
         pad, key = self.pads[name], f"pad_{name}"
         eye = torch.eye(2, dtype=u.dtype).expand(*angle.shape, 2, 2)
         Q_T = torch.stack((turned(eye[..., 0], -angle), turned(eye[..., 1], -angle)), -1)
@@ -422,7 +538,9 @@ class Rig(nn.Module):
             blocks[GROUND] = Block(-Q_T)
         else:
             blocks[pad.base] = Block(-Q_T)
-            blocks[f"{pad.base}_spin"] = Block(-turned(cross(moment_arm), -angle)[..., None])  # (35)
+            blocks[f"{pad.base}_spin"] = Block(
+                -turned(cross(moment_arm), -angle)[..., None]
+            )  # (35)
         if pad.inertial:
             effort = pad.elastic_force(u + pad.retardation_time(name) * u_dot)
         else:  # no I field: the field's effort is whatever the contacts leave at the junction
@@ -437,11 +555,15 @@ class Rig(nn.Module):
             if body.weighted and body.freedom["y"] == "free":
                 force = -(body.mass * self.gravity).expand(signals.shape[:-2])
                 down = Transformer({name: Block(torch.eye(2, dtype=torch.float64)[None, 1:])})
-                out[f"weight_{name}"] = Port(down, force[..., None, None], (f"Se: m_{self.symbols[name]} g",), True)
+                out[f"weight_{name}"] = Port(
+                    down, force[..., None, None], (f"Se: m_{self.symbols[name]} g",), True
+                )
         for name, actuator in self.actuators.items():
             body, _, axis = actuator.pushes.partition(".")
             measured = (coordinate.partition(".") for coordinate in actuator.measures)
-            sensed = dict.fromkeys(f"{one}_spin" if of == "theta" else one for one, _, of in measured)
+            sensed = dict.fromkeys(
+                f"{one}_spin" if of == "theta" else one for one, _, of in measured
+            )
             force = self.actuator_effort(name, state, signals)
             spin = axis == "theta"
             own = f"{body}_spin" if spin else body

@@ -11,9 +11,10 @@ from torch import Tensor
 class State(NamedTuple):
     """One state, batch dimensions leading, every part by the name of what it belongs to. SI units.
 
-    pads: of massless pads the nodal forces that have set in (..., branches, nodes, 2) [N], of inertial pads the displacements
-    (..., nodes, 2) [m]; stretch: of contacts (..., points); pose, velocity: of bodies (..., 3), x, y and theta, those that are
-    fixed or driven included; rates: velocities of inertial pads' nodes (..., nodes, 2), absolute.
+    pads: of massless pads the nodal forces that have set in (..., branches, nodes, 2) [N], of
+    inertial pads the displacements (..., nodes, 2) [m]; stretch: of contacts (..., points); pose,
+    velocity: of bodies (..., 3), x, y and theta, those that are fixed or driven included; rates:
+    velocities of inertial pads' nodes (..., nodes, 2), absolute.
     """
 
     pads: dict[str, Tensor]
@@ -24,15 +25,17 @@ class State(NamedTuple):
 
 
 class Layout:
-    """Where each part stands in the flat vector: pads, stretches, free coordinates, pads' velocities, free velocities.
+    """Where each part stands in the flat vector: pads, stretches, free coordinates, pads'
+    velocities, free velocities.
 
-    `size` is the vector's length; `slices` and `shapes` are by (part, name), with part one of State's fields; the free
-    coordinates are ("pose", body) and ("velocity", body), `free` their places among (x, y, theta).
+    `size` is the vector's length; `slices` and `shapes` are by (part, name), with part one of
+    State's fields; the free coordinates are ("pose", body) and ("velocity", body), `free` their
+    places among (x, y, theta).
     """
 
     def __init__(
-        self, pads: Mapping[str, tuple[int, ...]], stretch: Mapping[str, int], free: Mapping[str, list[int]],
-        inertial: Mapping[str, tuple[int, ...]],
+        self, pads: Mapping[str, tuple[int, ...]], stretch: Mapping[str, int],
+        free: Mapping[str, list[int]], inertial: Mapping[str, tuple[int, ...]],
     ) -> None:  # fmt: skip
         self.free = {name: list(axes) for name, axes in free.items()}
         self.shapes: dict[tuple[str, str], tuple[int, ...]] = {}
@@ -50,26 +53,35 @@ class Layout:
     def rigid(self) -> list[int]:
         """Components of the bodies' free coordinates, then of their rates."""
         return [
-            i for (part, _), s in self.slices.items() if part in ("pose", "velocity") for i in range(s.start, s.stop)
+            i
+            for (part, _), s in self.slices.items()
+            if part in ("pose", "velocity")
+            for i in range(s.start, s.stop)
         ]
 
     def check(self, y: Tensor) -> None:
         """Raises `ValueError` for another length or dtype than float64."""
         if y.shape[-1:] != (self.size,) or y.dtype != torch.float64:
             raise ValueError(
-                f"`y` must be float64 of shape (..., {self.size}), but is {y.dtype} of shape {tuple(y.shape)}; "
-                "build it with `rest` or `Rig.pack`"
+                f"`y` must be float64 of shape (..., {self.size}), but is {y.dtype} of shape "
+                f"{tuple(y.shape)}; build it with `rest` or `Rig.pack`"
             )
 
-    def unpack(self, y: Tensor, held: Mapping[str, Tensor], held_rates: Mapping[str, Tensor]) -> State:
-        """The parts of y (..., size); `held` and `held_rates` (..., 3) fill in the coordinates of bodies that are not free."""
+    def unpack(
+        self, y: Tensor, held: Mapping[str, Tensor], held_rates: Mapping[str, Tensor]
+    ) -> State:
+        """The parts of y (..., size); `held` and `held_rates` (..., 3) fill in the coordinates of
+        bodies that are not free."""
         self.check(y)
         parts: dict[str, dict[str, Tensor]] = {name: {} for name in State._fields}
         for (part, name), shape in self.shapes.items():
             parts[part][name] = y[..., self.slices[part, name]].reshape((*y.shape[:-1], *shape))
         for part, others in (("pose", held), ("velocity", held_rates)):
             for name, axes in self.free.items():
-                own, rows = parts[part][name], list(others[name].expand(*y.shape[:-1], 3).unbind(-1))
+                own, rows = (
+                    parts[part][name],
+                    list(others[name].expand(*y.shape[:-1], 3).unbind(-1)),
+                )
                 for i, axis in enumerate(axes):
                     rows[axis] = own[..., i]
                 parts[part][name] = torch.stack(rows, -1)

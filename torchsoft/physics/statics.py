@@ -1,8 +1,10 @@
-"""Statics of any rig, without friction: pads settled around given bodies, and free coordinates in balance on them.
+"""Statics of any rig, without friction: pads settled around given bodies, and free coordinates in
+balance on them.
 
-Without rates all branches of a massless pad carry the contact force itself, z_b = f, and its displacements are u = C f.
-At the contact points that is u = A f(u), with A the pad's compliance from point to point and f the contact law, without
-any rate, at the bodies' given poses and the points' given stretches.
+Without rates all branches of a massless pad carry the contact force itself, z_b = f, and its
+displacements are u = C f. At the contact points that is u = A f(u), with A the pad's compliance
+from point to point and f the contact law, without any rate, at the bodies' given poses and the
+points' given stretches.
 """
 
 from collections.abc import Container, Mapping, Sequence
@@ -27,7 +29,8 @@ STRIDE = 0.2
 """Longest step of the search for balance over the height of the thinnest pad."""
 
 STALLED = 20
-"""Steps without smaller loads and without way, after which the search ends: loads to and fro over the edge of a contact."""
+"""Steps without smaller loads and without way, after which the search ends: loads to and fro over
+the edge of a contact."""
 
 ITERATIONS = 200
 """Steps of the search at the most: a body may start that many strides above its pad."""
@@ -38,50 +41,74 @@ class NoEquilibrium(RuntimeError):
 
 
 def settled(
-    rig: Rig, pose: Mapping[str, Tensor], velocity: Mapping[str, Tensor], stretch: Mapping[str, Tensor]
+    rig: Rig,
+    pose: Mapping[str, Tensor],
+    velocity: Mapping[str, Tensor],
+    stretch: Mapping[str, Tensor],
 ) -> Tensor:
-    """State (size,) with massless pads settled around bodies at `pose` [m, rad], by body (3,), and contacts whose
-    points are stretched by `stretch` [m], by contact (points,).
+    """State (size,) with massless pads settled around bodies at `pose` [m, rad], by body (3,), and
+    contacts whose points are stretched by `stretch` [m], by contact (points,).
 
-    The bodies move at `velocity` [m/s, rad/s], by body (3,), but the pads carry what they would if these stood still:
-    under a body that rolls at v the pads lag behind by v tau only, whereas pads at rest under it would meet all of its
-    dashpots. Differentiable once in all three and in the rig's parameters, by the implicit function theorem; not smooth
-    where a point touches or slips. Called again with the same numbers it gives the same bits.
+    The bodies move at `velocity` [m/s, rad/s], by body (3,), but the pads carry what they would if
+    these stood still: under a body that rolls at v the pads lag behind by v tau only, whereas pads
+    at rest under it would meet all of its dashpots. Differentiable once in all three and in the
+    rig's parameters, by the implicit function theorem; not smooth where a point touches or slips.
+    Called again with the same numbers it gives the same bits.
 
-    Raises `ValueError` for other shapes or a rig with parameters that are not physical, `NotImplementedError` for
-    inertial pads, `NoEquilibrium` where Newton's method fails.
+    Raises `ValueError` for other shapes or a rig with parameters that are not physical,
+    `NotImplementedError` for inertial pads, `NoEquilibrium` where Newton's method fails.
     """
     if torch.is_inference_mode_enabled():
-        raise ValueError("settled pads need torch's graphs, which torch.inference_mode() has not; use torch.no_grad()")
+        raise ValueError(
+            "settled pads need torch's graphs, which torch.inference_mode() has not; use "
+            "torch.no_grad()"
+        )
     check_values(rig)
     for name, pad in rig.pads.items():
         if pad.inertial:
-            raise NotImplementedError(f"pad `{name}` is inertial; only massless pads can be settled")
+            raise NotImplementedError(
+                f"pad `{name}` is inertial; only massless pads can be settled"
+            )
     check_given("pose", pose, dict.fromkeys(rig.bodies, 3))
     check_given("velocity", velocity, dict.fromkeys(rig.bodies, 3))
-    check_given("stretch", stretch, {name: len(rig.pads[c.pad].point_nodes) for name, c in rig.contacts.items()})
-    still = State({}, dict(stretch), dict(pose), {}, {name: torch.zeros_like(v) for name, v in velocity.items()})
+    check_given(
+        "stretch",
+        stretch,
+        {name: len(rig.pads[c.pad].point_nodes) for name, c in rig.contacts.items()},
+    )
+    still = State(
+        {},
+        dict(stretch),
+        dict(pose),
+        {},
+        {name: torch.zeros_like(v) for name, v in velocity.items()},
+    )
     pads = {name: carried(rig, name, still) for name in rig.pads}
     return rig.pack(still._replace(pads=pads, velocity=dict(velocity)))
 
 
 def check_given(field: str, given: Mapping[str, Tensor], lengths: Mapping[str, int]) -> None:
-    """Raises `ValueError` unless there is a finite float64 tensor of the right length by every name."""
+    """Raises `ValueError` unless there is a finite float64 tensor of the right length by every
+    name."""
     if set(given) != set(lengths):
-        raise ValueError(f"`{field}` must be given by the names {list(lengths)}, but is by {list(given)}")
+        raise ValueError(
+            f"`{field}` must be given by the names {list(lengths)}, but is by {list(given)}"
+        )
     for name, value in given.items():
         check_array(f"{field}[{name!r}]", value)
         if value.shape != (lengths[name],) or not bool(value.isfinite().all()):
             raise ValueError(
-                f"`{field}[{name!r}]` must hold {lengths[name]} finite numbers, but has shape {tuple(value.shape)}, "
-                f"{int(value.isfinite().sum())} of them finite"
+                f"`{field}[{name!r}]` must hold {lengths[name]} finite numbers, but has shape "
+                f"{tuple(value.shape)}, {int(value.isfinite().sum())} of them finite"
             )
 
 
 def carried(rig: Rig, name: str, state: State) -> Tensor:
-    """Nodal forces (..., branches, nodes, 2) [N] of a pad, by semi-smooth Newton from the undeformed pad.
+    """Nodal forces (..., branches, nodes, 2) [N] of a pad, by semi-smooth Newton from the
+    undeformed pad.
 
-    Batch dimensions of `state` hold copies of one state: one backward pass then gives as many rows of a Jacobian.
+    Batch dimensions of `state` hold copies of one state: one backward pass then gives as many rows
+    of a Jacobian.
     """
     pad = rig.pads[name]
     own = [key for key, contact in rig.contacts.items() if contact.pad == name]
@@ -89,29 +116,34 @@ def carried(rig: Rig, name: str, state: State) -> Tensor:
     law = lambda u: rig.point_forces(own, state, u, torch.zeros_like(u))
     undeformed = torch.zeros(*batch, pad.nodes, 2, dtype=torch.float64)
     F, left = (
-        nodal_forces(pad.compliance(), pad.spread, undeformed, law, RESIDUAL, SETTLING) if own else (undeformed, 0.0)
+        nodal_forces(pad.compliance(), pad.spread, undeformed, law, RESIDUAL, SETTLING)
+        if own
+        else (undeformed, 0.0)
     )
     if not left <= RESIDUAL:
         raise NoEquilibrium(
-            f"the massless pad `{name}` does not settle (residual {left:.2g} m after {SETTLING} iterations); is a body deep in "
-            "it, or are the stretches large?"
+            f"the massless pad `{name}` does not settle (residual {left:.2g} m after {SETTLING} "
+            "iterations); is a body deep in it, or are the stretches large?"
         )
     return F[..., None, :, :].expand(*batch, pad.material.branches, -1, -1)
 
 
 def massless(rig: Rig) -> Rig:
-    """The rig with its inertial pads condensed onto their surfaces, which in statics is the same; itself if it has none."""
+    """The rig with its inertial pads condensed onto their surfaces, which in statics is the same;
+    itself if it has none."""
     if not any(pad.inertial for pad in rig.pads.values()):
         return rig
     return Rig(
-        bodies=rig.bodies, pads={name: pad.condensed() for name, pad in rig.pads.items()}, contacts=rig.contacts,
-        actuators=rig.actuators, reference=rig.reference, gravity=float(rig.gravity.detach()), symbols=rig.symbols,
+        bodies=rig.bodies, pads={name: pad.condensed() for name, pad in rig.pads.items()},
+        contacts=rig.contacts, actuators=rig.actuators, reference=rig.reference,
+        gravity=float(rig.gravity.detach()), symbols=rig.symbols,
     )  # fmt: skip
 
 
 def standing(rig: Rig, pose: Mapping[str, Tensor]) -> Tensor:
-    """State (size,) of bodies that stand at `pose` [m, m, rad], by body (3,), with pads settled around them and no point
-    stretched. Differentiable and raises as `settled`, but takes inertial pads."""
+    """State (size,) of bodies that stand at `pose` [m, m, rad], by body (3,), with pads settled
+    around them and no point stretched. Differentiable and raises as `settled`, but takes inertial
+    pads."""
     soft = massless(rig)
     still = {name: torch.zeros(3, dtype=torch.float64) for name in soft.bodies}
     y = settled(soft, pose, still, unstretched(soft, ()))
@@ -128,32 +160,48 @@ def standing(rig: Rig, pose: Mapping[str, Tensor]) -> Tensor:
 
 def unstretched(rig: Rig, batch: Sequence[int]) -> dict[str, Tensor]:
     """No stretch (*batch, points) [m] at any contact."""
-    counts = {name: len(rig.pads[contact.pad].point_nodes) for name, contact in rig.contacts.items()}
+    counts = {
+        name: len(rig.pads[contact.pad].point_nodes) for name, contact in rig.contacts.items()
+    }
     return {name: torch.zeros(*batch, count, dtype=torch.float64) for name, count in counts.items()}
 
 
 def resting(
     rig: Rig, pose: Mapping[str, Tensor], free: Mapping[str, Sequence[int]] | None = None, *,
-    signals: Tensor | None = None, actuators: Container[str] | None = None, residual: float = RESIDUAL,
+    signals: Tensor | None = None, actuators: Container[str] | None = None,
+    residual: float = RESIDUAL,
 ) -> dict[str, Tensor]:  # fmt: skip
-    """Poses (3,) [m, m, rad] by body of a rig at rest, looked for from `pose`: the coordinates `free`, numbers by body (by
-    default all that can move), are brought into balance, and all others stay as given.
+    """Poses (3,) [m, m, rad] by body of a rig at rest, looked for from `pose`: the coordinates
+    `free`, numbers by body (by default all that can move), are brought into balance, and all others
+    stay as given.
 
-    Newton's method on the net loads of the free coordinates, each step no longer than `STRIDE`: a body above its pad comes down
-    to it. Done when net loads, counted by the compliance of the softest pad, are below `residual` [m]. `actuators` names those
-    that push, by default all, by `signals` (signals, 2), by default the reference's at t = 0. Differentiable once in the given
-    pose and in the rig's parameters, by the implicit function theorem. Raises `NoEquilibrium` where there is no balance, and
-    what `settled` does.
+    Newton's method on the net loads of the free coordinates, each step no longer than `STRIDE`: a
+    body above its pad comes down to it. Done when net loads, counted by the compliance of the
+    softest pad, are below `residual` [m]. `actuators` names those that push, by default all, by
+    `signals` (signals, 2), by default the reference's at t = 0. Differentiable once in the given
+    pose and in the rig's parameters, by the implicit function theorem. Raises `NoEquilibrium` where
+    there is no balance, and what `settled` does.
     """
     soft = massless(rig)
-    sought = {k: torch.tensor(axes, dtype=torch.long) for k, axes in (free or soft.layout.free).items() if len(axes)}
+    sought = {
+        k: torch.tensor(axes, dtype=torch.long)
+        for k, axes in (free or soft.layout.free).items()
+        if len(axes)
+    }
     followed = soft.follow(0.0) if signals is None else signals
-    off = {f"control_{name}" for name in soft.actuators if actuators is not None and name not in actuators}
+    off = {
+        f"control_{name}"
+        for name in soft.actuators
+        if actuators is not None and name not in actuators
+    }
     with torch.no_grad():
         masses = {name: torch.stack(soft.bodies[name].masses) for name in sought}
-        # an angle counts by the way of a point at the radius of gyration, so that all are lengths and forces
+        # an angle counts by the way of a point at the radius of gyration, so that all are lengths
+        # and forces
         sizes = {
-            name: torch.stack((one, one, (m[2] / m[0]).sqrt())) for name, m in masses.items() for one in [m[0] / m[0]]
+            name: torch.stack((one, one, (m[2] / m[0]).sqrt()))
+            for name, m in masses.items()
+            for one in [m[0] / m[0]]
         }
         scale = torch.cat([sizes[name][axes] for name, axes in sought.items()])
         q = torch.cat([pose[name][axes] for name, axes in sought.items()]) * scale
@@ -164,7 +212,9 @@ def resting(
     def poses(q: Tensor) -> dict[str, Tensor]:
         parts = dict(zip(sought, (q / scale).split(counts, -1)))
         at = {name: value.expand(*q.shape[:-1], 3) for name, value in pose.items()}
-        return at | {name: at[name].index_copy(-1, axes, parts[name]) for name, axes in sought.items()}
+        return at | {
+            name: at[name].index_copy(-1, axes, parts[name]) for name, axes in sought.items()
+        }
 
     def loads(q: Tensor) -> Tensor:
         """Net loads on the free coordinates (..., n) [N]."""
@@ -193,8 +243,8 @@ def resting(
     worst = int(F.abs().argmax())
     names = [f"{name}.{COORDINATES[int(axis)]}" for name, axes in sought.items() for axis in axes]
     raise NoEquilibrium(
-        f"nothing is at rest: after {len(path)} steps {float(F.abs().max()):.2g} N still push {names[worst]}; is there a pad "
-        "to carry it?"
+        f"nothing is at rest: after {len(path)} steps {float(F.abs().max()):.2g} N still push "
+        f"{names[worst]}; is there a pad to carry it?"
     )
 
 

@@ -1,6 +1,6 @@
-"""What a rig has to be before anything is computed with it: numbers in float64 on the CPU, finite and physical, materials whose
-fractions sum to one, shapes that measure distances, slip laws that take no more than the effort. Every refusal is one sentence
-that names what is wrong.
+"""What a rig has to be before anything is computed with it: numbers in float64 on the CPU, finite
+and physical, materials whose fractions sum to one, shapes that measure distances, slip laws that
+take no more than the effort. Every refusal is one sentence that names what is wrong.
 """
 
 import math
@@ -17,19 +17,23 @@ from torchsoft.quantity import quantities, quantity_of
 P = TypeVar("P")
 
 LARGEST = 1e100
-"""Largest magnitude of a parameter, in SI units: squares and products of a few stay finite numbers."""
+"""Largest magnitude of a parameter, in SI units: squares and products of a few stay finite
+numbers."""
 
 MISSING = 1e-9
 """By how much a material's fractions may miss one, or fall below zero: rounding."""
 
 DEPTHS = (1e-3, -1e-3)
-"""Distances from the boundary, over the body's size, at which a shape is tried: outside and inside."""
+"""Distances from the boundary, over the body's size, at which a shape is tried: outside and
+inside."""
 
 ALIKE = 1e-3
-"""By how much a shape's normal, the slope of its distance, and its reach (over its size) may differ from what they must be."""
+"""By how much a shape's normal, the slope of its distance, and its reach (over its size) may differ
+from what they must be."""
 
 ALIKE_POINTS = 1e-9
-"""By how much slip rates of several points at once may differ from those of each alone, relatively: rounding."""
+"""By how much slip rates of several points at once may differ from those of each alone, relatively:
+rounding."""
 
 EFFORTS, NORMALS = (1e-3, 0.1, 1.0, 10.0, 100.0), (0.0, 0.1, 1.0, 10.0)
 """Trial efforts and normal forces [N] at which a slip law is tried."""
@@ -44,41 +48,59 @@ def sound(part: P) -> P:
 
 
 def check_array(name: str, x: Any) -> None:
-    """Raises `ValueError` unless x is a dense float64 tensor on the CPU, without the tangents of forward-mode derivatives."""
+    """Raises `ValueError` unless x is a dense float64 tensor on the CPU, without the tangents of
+    forward-mode derivatives."""
     if not isinstance(x, Tensor):
         raise ValueError(f"`{name}` must be a float64 tensor, but is {type(x).__name__}")
     if is_functorch_wrapped_tensor(x):
         raise ValueError(
-            f"`{name}` is inside a transform of torch.func, which a run cannot be; use gradient='discrete'"
+            f"`{name}` is inside a transform of torch.func, which a run cannot be; use "
+            "gradient='discrete'"
         )
     if x.dtype != torch.float64 or x.device.type != "cpu" or x.layout != torch.strided:
-        raise ValueError(f"`{name}` must be float64, dense and on the CPU, but is {x.dtype}, {x.layout}, on {x.device}")
+        raise ValueError(
+            f"`{name}` must be float64, dense and on the CPU, but is {x.dtype}, {x.layout}, on "
+            f"{x.device}"
+        )
     if torch.autograd.forward_ad.unpack_dual(x).tangent is not None:
-        raise ValueError(f"`{name}` has a tangent of torch's forward mode, which runs drop; use gradient='forward'")
+        raise ValueError(
+            f"`{name}` has a tangent of torch's forward mode, which runs drop; use "
+            "gradient='forward'"
+        )
 
 
 def check_place() -> None:
     """Raises `ValueError` where torch makes its tensors elsewhere than on the CPU."""
     if torch.get_default_device().type != "cpu":
         raise ValueError(
-            f"torch's default device is {torch.get_default_device()}, but rigs are computed on the CPU; "
-            "call torch.set_default_device('cpu')"
+            f"torch's default device is {torch.get_default_device()}, but rigs are computed on the "
+            "CPU; call torch.set_default_device('cpu')"
         )
 
 
 def check_values(rig: Any) -> None:
-    """Raises `ValueError` naming a parameter of the rig or a tensor of its parts that is not a float64 number on the CPU, not
-    finite, out of the bounds of its quantity or not physical by its module's `well_posed`, or a material without a `chain`."""
+    """Raises `ValueError` naming a parameter of the rig or a tensor of its parts that is not a
+    float64 number on the CPU, not finite, out of the bounds of its quantity or not physical by its
+    module's `well_posed`, or a material without a `chain`."""
     check_place()
     for owner, module in rig.named_modules():
         path = f"{owner}." if owner else ""
         for name, value in module.named_parameters(recurse=False):
             check_array(f"{path}{name}", value)
             if value.is_inference():
-                raise ValueError(f"parameter `{path}{name}` was made under torch.inference_mode(); make it outside")
-            for must, fine in (("finite", value.isfinite()), (f"below {LARGEST:g}", value.abs() < LARGEST)):
+                raise ValueError(
+                    f"parameter `{path}{name}` was made under torch.inference_mode(); make it "
+                    "outside"
+                )
+            for must, fine in (
+                ("finite", value.isfinite()),
+                (f"below {LARGEST:g}", value.abs() < LARGEST),
+            ):
                 if not bool(fine.all()):
-                    raise ValueError(f"parameter `{path}{name}` must be {must}, but is {value[~fine][0].item():g}")
+                    raise ValueError(
+                        f"parameter `{path}{name}` must be {must}, but is "
+                        f"{value[~fine][0].item():g}"
+                    )
         for name, value in module.named_buffers(recurse=False):
             if value.is_floating_point():
                 check_array(f"{path}{name}", value)
@@ -90,11 +112,15 @@ def check_values(rig: Any) -> None:
                 continue
             numbers = torch.as_tensor(value, dtype=torch.float64).detach()
             if numbers.ndim and not isinstance(module, Shape):
-                raise ValueError(f"parameter `{path}{name}` must be one number, but has shape {tuple(numbers.shape)}")
+                raise ValueError(
+                    f"parameter `{path}{name}` must be one number, but has shape "
+                    f"{tuple(numbers.shape)}"
+                )
             wrong = numbers[~((declared.low <= numbers) & (numbers <= declared.high))]
             if wrong.numel():
                 raise ValueError(
-                    f"parameter `{path}{name}` must be {declared.range}, but is {wrong.flatten()[0].item():g}"
+                    f"parameter `{path}{name}` must be {declared.range}, but is "
+                    f"{wrong.flatten()[0].item():g}"
                 )
     for owner, module in rig.named_modules():
         well_posed = getattr(module, "well_posed", None)
@@ -106,57 +132,67 @@ def check_values(rig: Any) -> None:
 
 @torch.no_grad()
 def check_chain(where: str, material: Material) -> None:
-    """Raises `ValueError` naming the pad `where` unless its material's chain is one: fractions J that sum to one, and as many
-    positive retardation times tau."""
+    """Raises `ValueError` naming the pad `where` unless its material's chain is one: fractions J
+    that sum to one, and as many positive retardation times tau."""
     given = material.chain()
     if not isinstance(given, tuple) or len(given) != 2:
         raise ValueError(
-            f"`chain` of the material of `{where}` must give two tensors, J and tau, but gives {type(given).__name__}"
+            f"`chain` of the material of `{where}` must give two tensors, J and tau, but gives "
+            f"{type(given).__name__}"
         )
     J, tau = given
     for name, x in (("J", J), ("tau", tau)):
         check_array(f"{name} of the material of {where}", x)
         if x.shape != (material.branches,) or len(x) == 0:
             raise ValueError(
-                f"`{name}` of the material of `{where}` must have shape (branches,) = ({material.branches},), one at least, "
-                f"but has {tuple(x.shape)}"
+                f"`{name}` of the material of `{where}` must have shape (branches,) = "
+                f"({material.branches},), one at least, but has {tuple(x.shape)}"
             )
     if not bool((J >= -MISSING).all()):
-        raise ValueError(f"the fractions J of the material of `{where}` must not be negative, but are {J.tolist()}")
+        raise ValueError(
+            f"the fractions J of the material of `{where}` must not be negative, but are "
+            f"{J.tolist()}"
+        )
     if not abs(float(J.sum()) - 1) <= MISSING:
         raise ValueError(
-            f"the fractions J of the material of `{where}` must sum to one, but {J.tolist()} sum to {float(J.sum()):.10g}; "
-            "divide both J and E by that sum"
+            f"the fractions J of the material of `{where}` must sum to one, but {J.tolist()} sum "
+            f"to {float(J.sum()):.10g}; divide both J and E by that sum"
         )
     if not bool((tau > 0).all()) or not bool(tau.isfinite().all()):
         raise ValueError(
-            f"the retardation times tau of the material of `{where}` must be positive and finite, but are {tau.tolist()} s"
+            f"the retardation times tau of the material of `{where}` must be positive and finite, "
+            f"but are {tau.tolist()} s"
         )
 
 
 def check_groups(rig: Any) -> None:
-    """Raises `ValueError` for a part of one of the rig's groups that was replaced there or in the lists, but not in both."""
+    """Raises `ValueError` for a part of one of the rig's groups that was replaced there or in the
+    lists, but not in both."""
     lists = (rig.bodies, rig.pads, rig.contacts, rig.actuators)
     known = {id(value) for parts in lists for value in parts.parameters()}
     for group in rig.groups:
         for name, value in getattr(rig, group).named_parameters():
             if id(value) not in known:
                 raise ValueError(
-                    f"`{group}.{name}` belongs to no body, pad, contact or actuator; put a new part in both places, or "
-                    "remove the group's"
+                    f"`{group}.{name}` belongs to no body, pad, contact or actuator; put a new "
+                    "part in both places, or remove the group's"
                 )
 
 
 def check_shape(where: str, shape: Shape) -> None:
-    """Raises `ValueError` unless phi is a distance with the normal n as its slope, and `support` and `size` are the body's.
+    """Raises `ValueError` unless phi is a distance with the normal n as its slope, and `support`
+    and `size` are the body's.
 
-    Tried at some points near the boundary, which is looked for along rays from outside. The package's own are not tried.
+    Tried at some points near the boundary, which is looked for along rays from outside. The
+    package's own are not tried.
     """
     if type(shape).__module__.startswith("torchsoft."):
         return
     size = shape.size()
     if not (math.isfinite(size) and size > 0):
-        raise ValueError(f"the shape of `{where}` has the size {size}; `support` must be the body's reach")
+        raise ValueError(
+            f"the shape of `{where}` has the size {size}; `support` must be the body's reach"
+        )
     with torch.enable_grad():
         angle = torch.linspace(0.1, 0.1 + 2 * torch.pi, 182, dtype=torch.float64)[:-1]
         ray = torch.stack((angle.cos(), angle.sin()), -1)
@@ -169,8 +205,8 @@ def check_shape(where: str, shape: Shape) -> None:
         phi, n = shape(x)
         if phi.shape != x.shape[:-1] or n.shape != x.shape:
             raise ValueError(
-                f"the shape of `{where}` must give phi (...) and n (..., 2) at x (..., 2), but gives {tuple(phi.shape)} and "
-                f"{tuple(n.shape)} at {tuple(x.shape)}"
+                f"the shape of `{where}` must give phi (...) and n (..., 2) at x (..., 2), but "
+                f"gives {tuple(phi.shape)} and {tuple(n.shape)} at {tuple(x.shape)}"
             )
         slope = torch.autograd.grad(phi.sum(), x)[0] if phi.requires_grad else torch.zeros_like(x)
     n, support = n.detach(), shape.support(ray).detach()
@@ -181,26 +217,35 @@ def check_shape(where: str, shape: Shape) -> None:
         "its normal is not the slope of phi": (slope - n).norm(dim=-1),
         "the boundary is not where phi is zero": shape(boundary)[0].detach().abs() / size,
         "`support` is less than how far it reaches": (reach - support) / size,
-        "`support` is more than how far it reaches": 0.1 * (support - reach) / size,  # found at some points only
-        "it is called `round`, but is not": (boundary.norm(dim=-1) / size - 1).abs() * float(shape.round),
+        "`support` is more than how far it reaches": 0.1
+        * (support - reach)
+        / size,  # found at some points only
+        "it is called `round`, but is not": (boundary.norm(dim=-1) / size - 1).abs()
+        * float(shape.round),
         "`size` is smaller than it is": (boundary.norm(dim=-1).max() - size)[None] / size,
     }
     for fault, error in faults.items():
         worst = float(error.max())
         if not worst <= ALIKE:
             raise ValueError(
-                f"the shape of `{where}` ({type(shape).__name__}) cannot be used: {fault} (off by {worst:.2g})"
+                f"the shape of `{where}` ({type(shape).__name__}) cannot be used: {fault} (off by "
+                f"{worst:.2g})"
             )
 
 
 def check_slip(where: str, law: Any, R: float) -> str:
-    """What is wrong with a slip law at some efforts and normal forces, with the dashpot R [N.s/m]; empty if nothing is.
+    """What is wrong with a slip law at some efforts and normal forces, with the dashpot R [N.s/m];
+    empty if nothing is.
 
-    A slip that takes more than the effort, R gamma' > E, supplies power. Raises `ValueError` for what is no law of three
-    tensors, gives no number, or gives several points at once other rates than each alone.
+    A slip that takes more than the effort, R gamma' > E, supplies power. Raises `ValueError` for
+    what is no law of three tensors, gives no number, or gives several points at once other rates
+    than each alone.
     """
     E, F_N = (
-        x.flatten() for x in torch.meshgrid(*(torch.tensor(x).double() for x in (EFFORTS, NORMALS)), indexing="ij")
+        x.flatten()
+        for x in torch.meshgrid(
+            *(torch.tensor(x).double() for x in (EFFORTS, NORMALS)), indexing="ij"
+        )
     )
     together, alone = (
         slip_rates(where, law, E, F_N, R),
@@ -209,35 +254,41 @@ def check_slip(where: str, law: Any, R: float) -> str:
     if bool(alone.isnan().any()):
         k = int(alone.isnan().int().argmax())
         raise ValueError(
-            f"the slip law of `{where}` gives nan at an effort of {E[k]:g} N, a normal force of {F_N[k]:g} N and a dashpot of "
-            f"{R:.3g} N.s/m; make it finite there"
+            f"the slip law of `{where}` gives nan at an effort of {E[k]:g} N, a normal force of "
+            f"{F_N[k]:g} N and a dashpot of {R:.3g} N.s/m; make it finite there"
         )
     if not torch.allclose(together, alone, rtol=ALIKE_POINTS, atol=0.0):
         raise ValueError(
-            f"the slip law of `{where}` gives several points at once other rates than each of them alone; a law is of one "
-            "point, so it must not use the number of points (numel, shape, len) or mix them"
+            f"the slip law of `{where}` gives several points at once other rates than each of them "
+            "alone; a law is of one point, so it must not use the number of points (numel, shape, "
+            "len) or mix them"
         )
     wrong = torch.nonzero((R * alone < 0) | (R * alone > E * (1 + 1e-9)))[:, 0]
     if not len(wrong):
         return ""
     k = int(wrong[0])
     return (
-        f"the slip law of `{where}` gives {alone[k]:.3g} m/s at an effort of {E[k]:g} N and a normal force of {F_N[k]:g} N: "
-        f"times the dashpot, {R:.3g} N.s/m, that must be from 0 to the effort, or slip supplies power"
+        f"the slip law of `{where}` gives {alone[k]:.3g} m/s at an effort of {E[k]:g} N and a "
+        f"normal force of {F_N[k]:g} N: times the dashpot, {R:.3g} N.s/m, that must be from 0 to "
+        "the effort, or slip supplies power"
     )
 
 
 @torch.no_grad()
 def slip_rates(where: str, law: Any, E: Tensor, F_N: Tensor, R: float) -> Tensor:
-    """Slip rates [m/s] of efforts and normal forces (...). Raises `ValueError` for a law that gives no such tensor."""
+    """Slip rates [m/s] of efforts and normal forces (...). Raises `ValueError` for a law that gives
+    no such tensor."""
     try:
         rate = law(E, F_N, torch.tensor(R, dtype=torch.float64))
     except Exception as error:  # whatever somebody's own code raises
         raise ValueError(
-            f"the slip law of `{where}` must take three tensors (effort, normal force, dashpot) and give the slip rate, but "
-            f"{type(error).__name__}: {error}"
+            f"the slip law of `{where}` must take three tensors (effort, normal force, dashpot) "
+            f"and give the slip rate, but {type(error).__name__}: {error}"
         ) from error
     if not isinstance(rate, Tensor) or rate.shape != E.shape:
         given = f"shape {tuple(rate.shape)}" if isinstance(rate, Tensor) else type(rate).__name__
-        raise ValueError(f"the slip law of `{where}` must give a tensor of shape {tuple(E.shape)}, but gives {given}")
+        raise ValueError(
+            f"the slip law of `{where}` must give a tensor of shape {tuple(E.shape)}, but gives "
+            f"{given}"
+        )
     return rate

@@ -1,6 +1,7 @@
 """The multibond graph of the whole system as a drawing (the paper's Fig. 9) and as Graphviz text.
 
-Both come from `multibond.topology` of the rig's own ports, so they show what is simulated, whatever the rig.
+Both come from `multibond.topology` of the rig's own ports, so they show what is simulated, whatever
+the rig.
 """
 
 import re
@@ -78,17 +79,22 @@ SPACING, LAYER = 6.4, 3.4
 """Distances between the hubs of any other rig, along and across its layers."""
 
 FANS = ((270, 76, 1.5), (0, 30, 2.4), (0, 13, 3.0), (0, 30, 2.2), (90, 46, 1.6))
-"""Angle and step [deg] and radius of the fans in each layer: fields, pads, contacts, bodies, sources."""
+"""Angle and step [deg] and radius of the fans in each layer: fields, pads, contacts, bodies,
+sources."""
 
 
 def graph_of(rig: Rig) -> nx.DiGraph:
-    """The topology of the rig's ports; it does not depend on the state, here with the bodies far apart."""
+    """The topology of the rig's ports; it does not depend on the state, here with the bodies far
+    apart."""
     with torch.no_grad():
         signals = torch.zeros(len(rig.signals), 2, dtype=torch.float64)
         state = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64), signals)
         sizes = [body.shape.size() for body in rig.bodies.values() if body.shape is not None]
         far = 10 * sum((*sizes, *(pad.mesh.length + pad.mesh.height for pad in rig.pads.values())))
-        pose = {name: torch.tensor([0.0, (k + 1) * far, 0.0]).double() for k, name in enumerate(rig.bodies)}
+        pose = {
+            name: torch.tensor([0.0, (k + 1) * far, 0.0]).double()
+            for k, name in enumerate(rig.bodies)
+        }
         return topology(rig.evaluate(0.0, state._replace(pose=pose), signals).ports, rig.junctions)
 
 
@@ -103,7 +109,8 @@ def is_hub(kind: str) -> bool:
 
 
 def hubs_of(graph: nx.DiGraph) -> dict[str, Hub]:
-    """Place of every junction and transformer: as in `HUBS`, or layer by layer from the ground to the actuators."""
+    """Place of every junction and transformer: as in `HUBS`, or layer by layer from the ground to
+    the actuators."""
     hubs = [name for name, data in graph.nodes(data=True) if is_hub(data["kind"])]
     if set(hubs) == set(HUBS):
         return HUBS
@@ -111,13 +118,17 @@ def hubs_of(graph: nx.DiGraph) -> dict[str, Hub]:
     for name in hubs:
         pad, source = name.startswith("pad_"), name.startswith(("weight_", "control_"))
         field = name == GROUND or name.endswith(": field")
-        layers[0 if field else 1 if pad else 2 if name.startswith("contact_") else 4 if source else 3].append(name)
+        layers[
+            0 if field else 1 if pad else 2 if name.startswith("contact_") else 4 if source else 3
+        ].append(name)
     x = {name: float(i) for layer in layers for i, name in enumerate(layer)}
 
     def near(name: str) -> float:
         """Middle of a hub's neighbours; a body and its spin stay side by side."""
         pair = {name, name.removesuffix("_spin"), f"{name}_spin"} & set(graph)
-        own = [x[n] for one in pair for n in nx.all_neighbors(graph, one) if n in x and n not in pair]
+        own = [
+            x[n] for one in pair for n in nx.all_neighbors(graph, one) if n in x and n not in pair
+        ]
         return sum(own) / len(own) if own else 0.0
 
     for layer in (*layers, *layers[::-1], *layers):
@@ -127,7 +138,11 @@ def hubs_of(graph: nx.DiGraph) -> dict[str, Hub]:
         for name in layer:
             x[name] = max(wanted[name], free)
             free = x[name] + 1
-    return {name: (SPACING * x[name], LAYER * i, *FANS[i]) for i, layer in enumerate(layers) for name in layer}
+    return {
+        name: (SPACING * x[name], LAYER * i, *FANS[i])
+        for i, layer in enumerate(layers)
+        for name in layer
+    }
 
 
 def positions(graph: nx.DiGraph) -> dict[str, Array]:
@@ -149,17 +164,33 @@ def node_text(name: str, kind: str, label: str, captions: Mapping[str, str]) -> 
         return rf"$\mathbf{{{kind}}}$" + "\n" + caption
     _, _, law = label.strip().partition(": ")
     if name.startswith("contact_") and not captions:  # the contact's name stands at its hub
-        law = re.sub(r"[_,]" + re.escape(name.partition(":")[0].removeprefix("contact_")) + "$", "", law)
-    law = re.sub(r"_(.+?)(?=\]|\^| g$|$)", lambda m: "_{" + m[1].replace("_", r"\_").replace(" ", r"\ ") + "}", law)
-    law = law.replace("^-1", "^{-1}").replace("slip", r"\mathrm{slip}").replace("drive", r"\mathrm{drive}")
+        law = re.sub(
+            r"[_,]" + re.escape(name.partition(":")[0].removeprefix("contact_")) + "$", "", law
+        )
+    law = re.sub(
+        r"_(.+?)(?=\]|\^| g$|$)",
+        lambda m: "_{" + m[1].replace("_", r"\_").replace(" ", r"\ ") + "}",
+        law,
+    )
+    law = (
+        law.replace("^-1", "^{-1}")
+        .replace("slip", r"\mathrm{slip}")
+        .replace("drive", r"\mathrm{drive}")
+    )
     return rf"$\mathbf{{{kind[0]}}}" + (f"_{kind[1]}" if kind[1:] else "") + f": {law}$"
 
 
-def bond(axes: Axes, tail: Array, head: Array, sizes: tuple[Array, Array], signal_x: float | None) -> None:
-    """A bond between two boxes of half `sizes`: half arrow for power; dashed with a full arrow, by way of x = `signal_x`, for a
-    signal."""
+def bond(
+    axes: Axes, tail: Array, head: Array, sizes: tuple[Array, Array], signal_x: float | None
+) -> None:
+    """A bond between two boxes of half `sizes`: half arrow for power; dashed with a full arrow, by
+    way of x = `signal_x`, for a signal."""
     activated = signal_x is not None
-    path = np.array([tail, [signal_x, tail[1]], [signal_x, head[1]], head]) if activated else np.array([tail, head])
+    path = (
+        np.array([tail, [signal_x, tail[1]], [signal_x, head[1]], head])
+        if activated
+        else np.array([tail, head])
+    )
     for end, inner, size in ((0, 1, sizes[0]), (-1, -2, sizes[1])):
         way = path[inner] - path[end]
         path[end] = path[end] + way * np.min(size / np.maximum(np.abs(way), 1e-9))
@@ -168,7 +199,9 @@ def bond(axes: Axes, tail: Array, head: Array, sizes: tuple[Array, Array], signa
     along = (path[-1] - path[-2]) / np.linalg.norm(path[-1] - path[-2])
     across = np.array([-along[1], along[0]])
     for side in (1, -1) if activated else (1,):
-        axes.plot(*np.stack((path[-1], path[-1] - 0.24 * along + 0.13 * side * across), -1), **style)
+        axes.plot(
+            *np.stack((path[-1], path[-1] - 0.24 * along + 0.13 * side * across), -1), **style
+        )
 
 
 @rc_context(STYLE)
@@ -181,11 +214,22 @@ def multibond_graph(rig: Rig) -> Figure:
     low, high = (0.0, 17.6) if papers else (every[:, 1].min() - 1.0, every[:, 1].max() + 1.0)
     left = -3.6 if papers else every[:, 0].min() - 1.6
     width, height = 0.55 * (signal_x - left) + 0.1, 0.52 * (high - low) + 1.4
-    figure = new_figure("Multibond graph of bodies, pads, contacts and actuators (paper: Fig. 9)", width, height)
+    figure = new_figure(
+        "Multibond graph of bodies, pads, contacts and actuators (paper: Fig. 9)", width, height
+    )
     axes = figure.subplots()
     for i, (label, band) in enumerate(BANDS.items() if papers else ()):
         axes.axhspan(*band, color="#f4f4f1" if i % 2 else "#e9ebee", lw=0)
-        axes.text(-3.4, 0.5 * sum(band), label, va="center", ha="left", fontsize=10, weight="bold", color="#555555")
+        axes.text(
+            -3.4,
+            0.5 * sum(band),
+            label,
+            va="center",
+            ha="left",
+            fontsize=10,
+            weight="bold",
+            color="#555555",
+        )
     for name, data in graph.nodes(data=True):
         hub = is_hub(data["kind"])
         text = node_text(name, data["kind"], data["label"], CAPTIONS if papers else {})
@@ -196,12 +240,23 @@ def multibond_graph(rig: Rig) -> Figure:
         style = {"color": KINDS[data["kind"]][1], "fontsize": 9 if hub else 11, "bbox": white}
         axes.text(x, y, text, ha="center", va="center", **style)
     for tail, head, data in graph.edges(data=True):
-        bond(axes, at[tail], at[head], (half[tail], half[head]), signal_x if data["activated"] else None)
+        bond(
+            axes,
+            at[tail],
+            at[head],
+            (half[tail], half[head]),
+            signal_x if data["activated"] else None,
+        )
     axes.set(xlim=(left, signal_x + 0.5), ylim=(low, high))
     axes.set_aspect("equal")
     axes.set_axis_off()
-    keys = [Line2D([], [], ls="", marker="s", color=colour, label=meaning) for meaning, colour in KINDS.values()]
+    keys = [
+        Line2D([], [], ls="", marker="s", color=colour, label=meaning)
+        for meaning, colour in KINDS.values()
+    ]
     keys += [Line2D([], [], color=INK, lw=1.2, label="bond, half arrow towards positive power")]
-    keys += [Line2D([], [], color=INK, lw=1.2, ls=(0, (4, 3)), label="activated bond: information only")]
+    keys += [
+        Line2D([], [], color=INK, lw=1.2, ls=(0, (4, 3)), label="activated bond: information only")
+    ]
     figure.legend(handles=keys, loc="outside lower left", ncols=3)
     return figure

@@ -1,4 +1,5 @@
-"""The paper's figures, drawn from a run: each function takes a `Trajectory` and returns a matplotlib `Figure`.
+"""The paper's figures, drawn from a run: each function takes a `Trajectory` and returns a
+matplotlib `Figure`.
 
 Times in s, lengths in mm, forces in N, energies in mJ.
 """
@@ -93,19 +94,31 @@ def timeline(axes: Axes, label: str, trajectory: Trajectory) -> NDArray[np.float
 
 @rc_context(STYLE)
 def motion(trajectory: Trajectory) -> Figure:
-    """The disc's horizontal displacement and velocity, desired and actual, and what lies between them."""
+    """The disc's horizontal displacement and velocity, desired and actual, and what lies between
+    them."""
     figure = new_figure("Desired and actual motion of the disc (paper: Figs. 10 and 13)", 9, 5.6)
     axes = figure.subplots(2, 2, sharex=True, height_ratios=(2, 1))
     columns = (
         ("a) displacement", "x_C [mm]", trajectory["x_d"], trajectory["x_C"], "error [mm]"),
-        ("b) velocity", "velocity of C [mm/s]", trajectory["x_d_dot"], trajectory["v_x"], "error [mm/s]"),
+        (
+            "b) velocity",
+            "velocity of C [mm/s]",
+            trajectory["x_d_dot"],
+            trajectory["v_x"],
+            "error [mm/s]",
+        ),
     )
     for (upper, lower), (title, label, desired, actual, error) in zip(axes.T, columns):
         t = timeline(upper, label.replace("x_C", "$x_C$"), trajectory)
         upper.plot(t, MM * desired.numpy(), color=DESIRED, lw=4, label="desired")
         upper.plot(t, MM * actual.numpy(), color=ACTUAL, lw=1.1, label="actual")
         upper.set_title(title)
-        lower.plot(timeline(lower, error, trajectory), MM * (actual - desired).numpy(), color=ACTUAL, lw=0.8)
+        lower.plot(
+            timeline(lower, error, trajectory),
+            MM * (actual - desired).numpy(),
+            color=ACTUAL,
+            lw=0.8,
+        )
         lower.set_title("actual less desired")
     axes[0, 0].legend()
     figure.align_ylabels()
@@ -128,7 +141,9 @@ def control_forces(trajectory: Trajectory) -> Figure:
     if trajectory.t[-1] > 2:  # the grasp takes one eightieth of the axis: show it again
         grasp = panels[0].inset_axes((0.35, 0.38, 0.55, 0.5))
         first = trajectory.t <= 1
-        grasp.plot(trajectory.t[first].numpy(), trajectory["F_y"][first].numpy(), color=ACTUAL, lw=1.1)
+        grasp.plot(
+            trajectory.t[first].numpy(), trajectory["F_y"][first].numpy(), color=ACTUAL, lw=1.1
+        )
         grasp.set_title("the grasp", fontsize=9)
         grasp.set_xlim(0, 1)
         grasp.tick_params(labelsize=8)
@@ -148,7 +163,9 @@ def one_curve(trajectory: Trajectory, title: str, label: str, values: Tensor) ->
 def bracket_moment(trajectory: Trajectory) -> Figure:
     """Moment on the bracket about its centre of mass."""
     title = "Moment on the bracket about its centre of mass (paper: Fig. 12)"
-    return one_curve(trajectory, title, "$M_{Br}$ [N m], positive anticlockwise", trajectory["bracket_moment"])
+    return one_curve(
+        trajectory, title, "$M_{Br}$ [N m], positive anticlockwise", trajectory["bracket_moment"]
+    )
 
 
 def angular_momentum(trajectory: Trajectory) -> Figure:
@@ -159,23 +176,29 @@ def angular_momentum(trajectory: Trajectory) -> Figure:
 
 
 def contact_forces(axes: Axes, instant: Instant, contact: str) -> None:
-    """Normal force (red, filled circles) and friction (blue) at one contact's points [N] against x [mm]."""
+    """Normal force (red, filled circles) and friction (blue) at one contact's points [N] against x
+    [mm]."""
     x, force = around_contact(instant, contact)
     axes.axhline(0, color=INK, lw=0.6)
-    axes.plot(x, force[:, 1], "s-", color=FRICTION, ms=3.5, label="friction (positive to the right)")
+    axes.plot(
+        x, force[:, 1], "s-", color=FRICTION, ms=3.5, label="friction (positive to the right)"
+    )
     axes.plot(x, force[:, 0], "o-", color=NORMAL, ms=4.5, label="normal force on the pad's nodes")
     axes.set_ylabel("force [N]")
 
 
 def close_up(axes: Axes, rig: Rig, instant: Instant, contact: str, shared: bool) -> None:
-    """The deformed pad under one contact, and the body on it; a `shared` axis of x gives way to the equal aspect in y."""
+    """The deformed pad under one contact, and the body on it; a `shared` axis of x gives way to the
+    equal aspect in y."""
     Scene(axes, rig, columns=1).show(instant)
     name, body = rig.contacts[contact].pad, rig.contacts[contact].body
     shape, pose, pad = rig.bodies[body].shape, instant.pose[body], rig.pads[name]
     assert shape is not None
     inwards = -own_axes(pad, instant.base[name])[1]
     own = torch.from_numpy(in_world(inwards, np.array([0.0, 0.0, -pose[2]])))
-    reach = MM * (float(shape.support(own).detach()) + min(0.5 * pad.mesh.height, 2.5e-3 * unit(rig))) - 0.5 * unit(rig)
+    reach = MM * (
+        float(shape.support(own).detach()) + min(0.5 * pad.mesh.height, 2.5e-3 * unit(rig))
+    ) - 0.5 * unit(rig)
     x, y = pose[:2] + reach * inwards
     axes.set_xlim(x - CLOSE * unit(rig), x + CLOSE * unit(rig))
     axes.set_ylim(y - 3.3 * unit(rig), y + 3.3 * unit(rig), auto=True)
@@ -186,22 +209,35 @@ def close_up(axes: Axes, rig: Rig, instant: Instant, contact: str, shared: bool)
 
 @rc_context(STYLE)
 def force_distribution(trajectory: Trajectory, rig: Rig, time: float) -> Figure:
-    """Normal force and friction at every contact at the sample nearest to `time` [s], over the deformed pads."""
+    """Normal force and friction at every contact at the sample nearest to `time` [s], over the
+    deformed pads."""
     (instant,) = instants(rig, trajectory, [time])
     source = {0.125: " (paper: Fig. 14)", 5.0: " (paper: Fig. 15)"}.get(time, "")
     contacts = list(rig.contacts)[::-1]
     rows = [(key, close) for key in contacts for close in (False, True)]
     rows[-2:] = rows[:-3:-1]  # the forces come last, over the labels of the axis
-    figure = new_figure(f"Contact forces on the pads at t = {instant.time:g} s{source}", 10.5, 3.7 * len(contacts))
+    figure = new_figure(
+        f"Contact forces on the pads at t = {instant.time:g} s{source}", 10.5, 3.7 * len(contacts)
+    )
     grid = figure.add_gridspec(
-        len(rows), 2, width_ratios=(1, 1.1), height_ratios=[1.3 if close else 1 for _, close in rows]
+        len(rows),
+        2,
+        width_ratios=(1, 1.1),
+        height_ratios=[1.3 if close else 1 for _, close in rows],
     )
     body = rig.bodies[rig.contacts[contacts[-1]].body]
-    centre, radius = instant.pose[rig.contacts[contacts[-1]].body], MM * body.shape.size() if body.shape else 0.0
+    centre, radius = (
+        instant.pose[rig.contacts[contacts[-1]].body],
+        MM * body.shape.size() if body.shape else 0.0,
+    )
     whole = figure.add_subplot(grid[:, 0])
     Scene(whole, rig, columns=2).show(instant)
     whole.set(xlim=(centre[0] - 1.6 * radius, centre[0] + 1.6 * radius), title="b) bodies and pads")
-    whole.set(ylim=(centre[1] - 1.65 * radius, centre[1] + 1.85 * radius), xlabel="x [mm]", ylabel="y [mm]")
+    whole.set(
+        ylim=(centre[1] - 1.65 * radius, centre[1] + 1.85 * radius),
+        xlabel="x [mm]",
+        ylabel="y [mm]",
+    )
     whole.grid(False)
     spread = np.concatenate([around_contact(instant, k)[1].ravel() for k in contacts])
     low, high = float(spread.min(initial=0.0)), float(spread.max(initial=1e-3))
@@ -212,11 +248,17 @@ def force_distribution(trajectory: Trajectory, rig: Rig, time: float) -> Figure:
         level = bool(direction[0] > 0.999) and contact.body == shared
         axes = figure.add_subplot(grid[row, 1], sharex=first if level else None)
         if close:
-            axes.set_title(f"{PADS[key]} interface, close up" if key in PADS else f"{key}, close up")
+            axes.set_title(
+                f"{PADS[key]} interface, close up" if key in PADS else f"{key}, close up"
+            )
             close_up(axes, rig, instant, key, level)
         else:
             letter = {"U": "c) ", "L": "a) "}.get(key, "")
-            axes.set_title(f"{letter}forces on the {PADS[key]} pad" if key in PADS else f"{key}, forces on the pad")
+            axes.set_title(
+                f"{letter}forces on the {PADS[key]} pad"
+                if key in PADS
+                else f"{key}, forces on the pad"
+            )
             contact_forces(axes, instant, key)
             middle = float(instant.pose[contact.body][:2] @ direction)
             axes.set_xlim(middle - CLOSE * unit(rig), middle + CLOSE * unit(rig))
@@ -236,7 +278,8 @@ def snapshots(
     trajectory: Trajectory, rig: Rig, times: Sequence[float] = SNAPSHOTS,
     title: str = "Bodies, pads and contact forces over time (paper: Fig. 16)",
 ) -> Figure:  # fmt: skip
-    """Bodies, deformed pads and contact forces at `times` [s]; those after the end of the run are left out."""
+    """Bodies, deformed pads and contact forces at `times` [s]; those after the end of the run are
+    left out."""
     end = float(trajectory.t[-1]) + 1e-9
     shown = instants(rig, trajectory, [t for t in times if t <= end] or [end])
     columns = min(3, len(shown))
@@ -261,14 +304,18 @@ def snapshots(
     for axes in grid[:, 0]:
         axes.set_ylabel("y [mm]")
     first = grid.flat[0]
-    handles = [first.plot([], [], "o-", color=NORMAL, ms=3)[0], first.plot([], [], color=FRICTION)[0]]
+    handles = [
+        first.plot([], [], "o-", color=NORMAL, ms=3)[0],
+        first.plot([], [], color=FRICTION)[0],
+    ]
     labels = ["normal force on the nodes", f"friction on the pad ({outwards(rig, shown[0])})"]
     figure.legend(handles, labels, loc="outside lower center", ncols=min(2, columns))
     return figure
 
 
 def energy_groups(trajectory: Trajectory) -> list[tuple[str, Array, str]]:
-    """Label, energy [mJ] (T,) and colour of what is stored (pads, springs, motion) and dissipated (pads, dashpots, slip)."""
+    """Label, energy [mJ] (T,) and colour of what is stored (pads, springs, motion) and dissipated
+    (pads, dashpots, slip)."""
     stored, lost, groups = dict(trajectory.energy), dict(trajectory.dissipated), []
     for energies, prefix, label, colours in (
         (stored, "strain_", "stored: {} pad, strain", STRAIN),
@@ -277,19 +324,27 @@ def energy_groups(trajectory: Trajectory) -> list[tuple[str, Array, str]]:
         names = [name for name in energies if name.startswith(prefix)]
         for i, name in enumerate(names):
             pad = name.removeprefix(prefix)
-            groups.append((label.format(PADS.get(pad, pad)), energies.pop(name), colours[i % len(colours)]))
+            groups.append(
+                (label.format(PADS.get(pad, pad)), energies.pop(name), colours[i % len(colours)])
+            )
         if energies is stored:
             springs = stored.pop("normal_springs") + stored.pop("tangential_springs")
             groups.append(("stored: contact springs", springs, "#9ecae1"))
-            groups.append(("stored: kinetic", sum(stored.values(), torch.zeros_like(trajectory.t)), "#deebf7"))
+            groups.append(
+                ("stored: kinetic", sum(stored.values(), torch.zeros_like(trajectory.t)), "#deebf7")
+            )
     for (name, energy), colour in zip(lost.items(), ("#fdae6b", "#fee6ce")):
         groups.append((f"dissipated: {name.replace('_', ' ')}", energy, colour))
-    return [(f"{name} (up to {MM * float(x.max()):.2g} mJ)", MM * x.numpy(), colour) for name, x, colour in groups]
+    return [
+        (f"{name} (up to {MM * float(x.max()):.2g} mJ)", MM * x.numpy(), colour)
+        for name, x, colour in groups
+    ]
 
 
 @rc_context(STYLE)
 def energy_balance(trajectory: Trajectory) -> Figure:
-    """Energy stored and dissipated, stacked, against what the sources supplied, and the residual of that balance."""
+    """Energy stored and dissipated, stacked, against what the sources supplied, and the residual of
+    that balance."""
     figure = new_figure("Energy: stored and dissipated against supplied", 9.5, 6.2)
     stack, residual = figure.subplots(2, 1, sharex=True, height_ratios=(3, 1))
     t = timeline(stack, "energy [mJ]", trajectory)
@@ -297,12 +352,22 @@ def energy_balance(trajectory: Trajectory) -> Figure:
     stack.stackplot(t, *parts, labels=labels, colors=colours, lw=0)
     start = MM * sum(float(value[0]) for value in trajectory.energy.values())
     supplied = start + MM * sum(value.numpy() for value in trajectory.supplied.values())
-    stack.plot(t, supplied, color="black", lw=1.4, ls=(0, (4, 2)), label="stored at the start + supplied")
+    stack.plot(
+        t, supplied, color="black", lw=1.4, ls=(0, (4, 2)), label="stored at the start + supplied"
+    )
     stack.set_ylim(0, None)
     handles, names = stack.get_legend_handles_labels()
-    figure.legend(handles[::-1], names[::-1], loc="outside right center")  # in the order of the stack
-    residual.plot(timeline(residual, "residual [mJ]", trajectory), MM * trajectory.energy_residual.numpy(), color=INK)
-    residual.set_title(f"residual: at most {trajectory.energy_residual_rel:.1e} of what the sources injected")
+    figure.legend(
+        handles[::-1], names[::-1], loc="outside right center"
+    )  # in the order of the stack
+    residual.plot(
+        timeline(residual, "residual [mJ]", trajectory),
+        MM * trajectory.energy_residual.numpy(),
+        color=INK,
+    )
+    residual.set_title(
+        f"residual: at most {trajectory.energy_residual_rel:.1e} of what the sources injected"
+    )
     figure.align_ylabels()
     return figure
 
@@ -316,7 +381,8 @@ def friction_ratio(trajectory: Trajectory) -> Array:
 
 @rc_context(STYLE)
 def friction_comparison(runs: Mapping[str, tuple[Rig, Trajectory]]) -> Figure:
-    """Friction of several parameter sets: at two contacts in grasp and roll, its ratio to the normal force, and F_x."""
+    """Friction of several parameter sets: at two contacts in grasp and roll, its ratio to the
+    normal force, and F_x."""
     figure = new_figure("Two friction sets compared (paper: Figs. 11b, 14 and 15)", 10, 8)
     axes = figure.subplots(3, 2)
     for panel in axes[:2].flat[1:]:
@@ -333,8 +399,14 @@ def friction_comparison(runs: Mapping[str, tuple[Rig, Trajectory]]) -> Figure:
                 axes[row, column].set(xlabel="x [mm]", ylabel="friction, right + [N]")
     for (name, (_, trajectory)), (colour, marker) in zip(runs.items(), styles):
         line = {"color": colour, "ls": marker[1:], "lw": 1.1, "label": name}
-        axes[2, 0].plot(timeline(axes[2, 0], "friction / normal [%]", trajectory), friction_ratio(trajectory), **line)
-        axes[2, 1].plot(timeline(axes[2, 1], "$F_x$ [N]", trajectory), trajectory["F_x"].numpy(), **line)
+        axes[2, 0].plot(
+            timeline(axes[2, 0], "friction / normal [%]", trajectory),
+            friction_ratio(trajectory),
+            **line,
+        )
+        axes[2, 1].plot(
+            timeline(axes[2, 1], "$F_x$ [N]", trajectory), trajectory["F_x"].numpy(), **line
+        )
     axes[2, 0].set_title("sum of |friction| over sum of normal force")
     axes[2, 1].set_title("horizontal control force")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=3)

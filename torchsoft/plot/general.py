@@ -25,7 +25,8 @@ STILL = 1e-3
 
 
 class Curve(NamedTuple):
-    """A coordinate over the run: its name, its label and its values (T,) as drawn; the set-point, where a loop has one."""
+    """A coordinate over the run: its name, its label and its values (T,) as drawn; the set-point,
+    where a loop has one."""
 
     name: str
     label: str
@@ -46,7 +47,11 @@ def curves(trajectory: Trajectory, rig: Rig) -> Iterator[Curve]:
                 continue
             scale, unit = (1.0, "rad") if axis == "theta" else (MM, "mm")
             symbol, letter = rig.symbols[name], r"\theta" if axis == "theta" else axis
-            label = f"{axis} of {name} [{unit}]" if symbol == name else f"${letter}_{{{symbol}}}$ [{unit}]"
+            label = (
+                f"{axis} of {name} [{unit}]"
+                if symbol == name
+                else f"${letter}_{{{symbol}}}$ [{unit}]"
+            )
             setpoint, coordinate = None, f"{name}.{axis}"
             if coordinate in wanted:
                 setpoint = scale * trajectory[wanted[coordinate]].detach().numpy()
@@ -54,14 +59,17 @@ def curves(trajectory: Trajectory, rig: Rig) -> Iterator[Curve]:
 
 
 def liveliest(trajectory: Trajectory, rig: Rig) -> str:
-    """The free coordinate that moves most, an angle counting by the body's size; one without a loop if there is any."""
+    """The free coordinate that moves most, an angle counting by the body's size; one without a loop
+    if there is any."""
     looped = {actuator.pushes for actuator in rig.actuators.values()}
 
     def way(curve: Curve) -> tuple[bool, float]:
         body, _, axis = curve.name.partition(".")
         shape = rig.bodies[body].shape
         size = MM * shape.size() if axis == "theta" and shape is not None else 1.0
-        return rig.bodies[body].freedom[axis] == "free" and curve.name not in looped, size * float(np.ptp(curve.values))
+        return rig.bodies[body].freedom[axis] == "free" and curve.name not in looped, size * float(
+            np.ptp(curve.values)
+        )
 
     return max(curves(trajectory, rig), key=way).name
 
@@ -93,8 +101,13 @@ def motions(trajectory: Trajectory, rig: Rig) -> Figure:
 
 @rc_context(STYLE)
 def efforts(trajectory: Trajectory, rig: Rig) -> Figure:
-    """Sums of the forces at each contact, touching points and, where there are any, what the actuators push with."""
-    kinds = ("pushes", "turns") if any(a.pushes.endswith("theta") for a in rig.actuators.values()) else ("pushes",)
+    """Sums of the forces at each contact, touching points and, where there are any, what the
+    actuators push with."""
+    kinds = (
+        ("pushes", "turns")
+        if any(a.pushes.endswith("theta") for a in rig.actuators.values())
+        else ("pushes",)
+    )
     rows = 3 + (len(kinds) if rig.actuators else 0)
     figure = new_figure("Contact forces and efforts", 8.5, 1.75 * rows + 0.7)
     panels = list(figure.subplots(rows, 1, sharex=True))
@@ -102,15 +115,23 @@ def efforts(trajectory: Trajectory, rig: Rig) -> Figure:
     for (name, force), colour in zip(trajectory.force.items(), COLOURS * len(rig.contacts)):
         values = force[..., 0].sum(-1), force[..., 1].sum(-1), (force[..., 0] > 0).sum(-1)
         for axes, label, value in zip(panels, labels, values):
-            axes.plot(timeline(axes, label, trajectory), value.numpy(), color=colour, lw=1.1, label=name)
+            axes.plot(
+                timeline(axes, label, trajectory), value.numpy(), color=colour, lw=1.1, label=name
+            )
     for kind, axes in zip(kinds, panels[3:]):
         turns = kind == "turns"
         chosen = [(n, a) for n, a in rig.actuators.items() if a.pushes.endswith("theta") == turns]
         for (name, actuator), colour in zip(chosen, COLOURS * len(chosen)):
-            value = (MM if turns else 1.0) * trajectory[rig.renamed.get(f"F_{name}", f"F_{name}")].detach().numpy()
+            value = (MM if turns else 1.0) * trajectory[
+                rig.renamed.get(f"F_{name}", f"F_{name}")
+            ].detach().numpy()
             label = "efforts [N mm]" if turns else "efforts [N]"
             axes.plot(
-                timeline(axes, label, trajectory), value, color=colour, lw=1.1, label=f"{name}, on {actuator.pushes}"
+                timeline(axes, label, trajectory),
+                value,
+                color=colour,
+                lw=1.1,
+                label=f"{name}, on {actuator.pushes}",
             )
     for axes in panels:
         axes.axhline(0, color=INK, lw=0.5, zorder=1)

@@ -1,4 +1,5 @@
-"""The picture of one instant of any rig: deformed pads on their bases, bodies with a spoke, and the contact forces as curves.
+"""The picture of one instant of any rig: deformed pads on their bases, bodies with a spoke, and the
+contact forces as curves.
 
 Figures and animation share it. Everything on axes is in millimetres and newtons.
 """
@@ -31,7 +32,8 @@ MM = 1e3
 
 @lru_cache(maxsize=4)
 def interior_solver(mesh: Mesh, nu: float) -> tuple[SuperLU, NDArray[np.int64], Array]:
-    """Factorised K_ii, the free dofs that are interior, and K_is (dense), for the surface dofs in `mesh.surface` order.
+    """Factorised K_ii, the free dofs that are interior, and K_is (dense), for the surface dofs in
+    `mesh.surface` order.
 
     The interior follows the surface whatever E and depth, so both are taken as 1.
     """
@@ -46,10 +48,11 @@ def interior_solver(mesh: Mesh, nu: float) -> tuple[SuperLU, NDArray[np.int64], 
 
 
 def deformed_mesh(pad: Pad, u: Tensor) -> Array:
-    """Places (..., mesh nodes, 2) [m] of all nodes of the mesh, bonded ones too, in the frame of the pad's base.
+    """Places (..., mesh nodes, 2) [m] of all nodes of the mesh, bonded ones too, in the frame of
+    the pad's base.
 
-    u (..., nodes, 2) [m]: displacements as a run records them. A massless pad has only its surface there; the interior is
-    in equilibrium with it, u_i = -K_ii^-1 K_is u_s.
+    u (..., nodes, 2) [m]: displacements as a run records them. A massless pad has only its surface
+    there; the interior is in equilibrium with it, u_i = -K_ii^-1 K_is u_s.
     """
     mesh, batch = pad.mesh, tuple(u.shape[:-2])
     own = (u.detach().reshape(-1, pad.nodes, 2) @ pad.axes).flatten(1).numpy()
@@ -66,13 +69,15 @@ def deformed_mesh(pad: Pad, u: Tensor) -> Array:
 
 
 def in_world(places: Array, pose: Array) -> Array:
-    """Places (..., 2) in the frame of a body, in the world; pose (3,): the body's x, y and angle [rad]."""
+    """Places (..., 2) in the frame of a body, in the world; pose (3,): the body's x, y and angle
+    [rad]."""
     c, s = np.cos(pose[2]), np.sin(pose[2])
     return places @ np.array([[c, s], [-s, c]]) + pose[:2]
 
 
 def straight_up(outline: Array) -> Array:
-    """The highest place (2,) where a closed outline (points, 2) crosses the y axis; the origin if it does nowhere."""
+    """The highest place (2,) where a closed outline (points, 2) crosses the y axis; the origin if
+    it does nowhere."""
     (x, y), (x_next, y_next) = outline[:-1].T, outline[1:].T
     k = np.flatnonzero((x > 0) != (x_next > 0))
     crossed = y[k] + (y_next - y)[k] * x[k] / (x - x_next)[k]
@@ -80,11 +85,12 @@ def straight_up(outline: Array) -> Array:
 
 
 class Instant(NamedTuple):
-    """One sample as drawn: time [s], poses of the bodies and of the pads' bases (3,) [mm, mm, rad], places [mm], forces [N].
+    """One sample as drawn: time [s], poses of the bodies and of the pads' bases (3,) [mm, mm, rad],
+    places [mm], forces [N].
 
-    mesh: pad -> (mesh nodes, 2); points: contact -> (points, 2); force: contact -> (points, 2), normal
-    force and friction on the pad, the latter positive along `along_surface`; along: contact -> (points,), how far the points
-    are in that direction.
+    mesh: pad -> (mesh nodes, 2); points: contact -> (points, 2); force: contact -> (points, 2),
+    normal force and friction on the pad, the latter positive along `along_surface`; along: contact
+    -> (points,), how far the points are in that direction.
     """
 
     time: float
@@ -107,12 +113,20 @@ def instants(rig: Rig, trajectory: Trajectory, times: Sequence[float]) -> list[I
     meshes = {name: MM * deformed_mesh(pad, displacement[name]) for name, pad in rig.pads.items()}
     shown = []
     for i, row in enumerate(rows):
-        pose = {name: x[row].detach().numpy() * [MM, MM, 1.0] for name, x in trajectory.state.pose.items()}
-        base = {name: np.zeros(3) if pad.base is None else pose[pad.base] for name, pad in rig.pads.items()}
+        pose = {
+            name: x[row].detach().numpy() * [MM, MM, 1.0]
+            for name, x in trajectory.state.pose.items()
+        }
+        base = {
+            name: np.zeros(3) if pad.base is None else pose[pad.base]
+            for name, pad in rig.pads.items()
+        }
         points, force, along = {}, {}, {}
         for key, contact in rig.contacts.items():
             pad, own = rig.pads[contact.pad], base[contact.pad]
-            points[key] = in_world(MM * (pad.spread @ (pad.positions + displacement[contact.pad][i])).numpy(), own)
+            points[key] = in_world(
+                MM * (pad.spread @ (pad.positions + displacement[contact.pad][i])).numpy(), own
+            )
             direction, (_, y) = along_surface(pad, own), own_axes(pad, own)
             t = np.array([y[1], -y[0]])  # of the moving frame, whose normal points into the pad
             force[key] = trajectory.force[key][row].numpy() * [1.0, np.sign(direction @ t)]
@@ -123,7 +137,8 @@ def instants(rig: Rig, trajectory: Trajectory, times: Sequence[float]) -> list[I
 
 
 def own_axes(pad: Pad, base: Array) -> Array:
-    """A pad's own x and y (2, 2) as unit vectors of the world; base (3,) is the pose of what it is bonded to."""
+    """A pad's own x and y (2, 2) as unit vectors of the world; base (3,) is the pose of what it is
+    bonded to."""
     return in_world(pad.axes.numpy().T, base) - base[:2]
 
 
@@ -135,7 +150,9 @@ def along_surface(pad: Pad, base: Array) -> Array:
 
 def outwards(rig: Rig, instant: Instant) -> str:
     """Where friction points that is drawn outwards."""
-    steep = any(abs(along_surface(pad, instant.base[name])[0]) < 0.7 for name, pad in rig.pads.items())
+    steep = any(
+        abs(along_surface(pad, instant.base[name])[0]) < 0.7 for name, pad in rig.pads.items()
+    )
     return "outwards: to the right or up" if steep else "outwards: to the right"
 
 
@@ -145,7 +162,8 @@ def own_places(pad: Pad, base: Array, own: Array) -> Array:
 
 
 def around_contact(instant: Instant, contact: str) -> tuple[Array, Array]:
-    """Places along the pad's surface [mm] and forces [N] of the touching points and of one more on each side."""
+    """Places along the pad's surface [mm] and forces [N] of the touching points and of one more on
+    each side."""
     rows = instant.near(contact)
     return instant.along[contact][rows], instant.force[contact][rows]
 
@@ -161,17 +179,23 @@ def curve_height(rig: Rig) -> float:
 
 
 def force_scale(rig: Rig, shown: Sequence[Instant]) -> tuple[float, float]:
-    """mm per N at which the largest force is as high as `curve_height`, and a round force [N] for the scale bar."""
-    largest = max((float(np.abs(force).max()) for instant in shown for force in instant.force.values()), default=0.0)
+    """mm per N at which the largest force is as high as `curve_height`, and a round force [N] for
+    the scale bar."""
+    largest = max(
+        (float(np.abs(force).max()) for instant in shown for force in instant.force.values()),
+        default=0.0,
+    )
     if largest == 0:
         return 1.0, 1.0
     decade = 10.0 ** np.floor(np.log10(largest))
-    return curve_height(rig) / largest, float(max(m * decade for m in (1, 2, 5) if m * decade <= largest))
+    return curve_height(rig) / largest, float(
+        max(m * decade for m in (1, 2, 5) if m * decade <= largest)
+    )
 
 
 def plates(rig: Rig) -> dict[str, float]:
-    """Thickness [mm] of the plate behind each pad: symmetric about its base's centre, none on a base that has a shape, that of
-    the others where the centre is not behind the pad."""
+    """Thickness [mm] of the plate behind each pad: symmetric about its base's centre, none on a
+    base that has a shape, that of the others where the centre is not behind the pad."""
     out = {}
     for name, pad in rig.pads.items():
         if pad.base is not None:
@@ -187,10 +211,12 @@ def plates(rig: Rig) -> dict[str, float]:
 
 
 class Scene:
-    """The artists of one picture on `axes`; `show` puts the `moving` ones, in drawing order, where another instant has them.
+    """The artists of one picture on `axes`; `show` puts the `moving` ones, in drawing order, where
+    another instant has them.
 
-    `columns` is the spacing, in elements, of the vertical mesh lines; every layer is drawn. With `curves` = (mm per N,
-    scale bar in N) the contact forces stand behind the pads, normal force red with filled circles, friction blue.
+    `columns` is the spacing, in elements, of the vertical mesh lines; every layer is drawn. With
+    `curves` = (mm per N, scale bar in N) the contact forces stand behind the pads, normal force red
+    with filled circles, friction blue.
     """
 
     def __init__(
@@ -199,16 +225,25 @@ class Scene:
         self.rig, self.columns, self.curves = rig, columns, curves
         self.thickness = plates(rig)
         self.shapes = {
-            name: MM * body.shape.outline().numpy() for name, body in rig.bodies.items() if body.shape is not None
+            name: MM * body.shape.outline().numpy()
+            for name, body in rig.bodies.items()
+            if body.shape is not None
         }
 
-        def polygons(names: Sequence[str], face: str, edge: str, width: float) -> dict[str, Polygon]:
-            out = {k: Polygon(np.zeros((3, 2)), facecolor=face, edgecolor=edge, lw=width) for k in names}
+        def polygons(
+            names: Sequence[str], face: str, edge: str, width: float
+        ) -> dict[str, Polygon]:
+            out = {
+                k: Polygon(np.zeros((3, 2)), facecolor=face, edgecolor=edge, lw=width)
+                for k in names
+            }
             for polygon in out.values():
                 axes.add_patch(polygon)
             return out
 
-        self.plates = polygons([name for name, size in self.thickness.items() if size], STEEL, INK, 0.6)
+        self.plates = polygons(
+            [name for name, size in self.thickness.items() if size], STEEL, INK, 0.6
+        )
         self.outlines = polygons(list(rig.pads), PAD, "none", 0.0)
         self.layers = {k: LineCollection([], colors=LAYER, linewidths=0.5) for k in rig.pads}
         for lines in self.layers.values():
@@ -250,28 +285,38 @@ class Scene:
         for k in self.normal:
             name, rows = self.rig.contacts[k].pad, instant.near(k)
             pad, base, force = self.rig.pads[name], instant.base[name], instant.force[k][rows]
-            x = (instant.points[k][rows] - own_places(pad, base, np.zeros(2))) @ own_axes(pad, base)[0]
+            x = (instant.points[k][rows] - own_places(pad, base, np.zeros(2))) @ own_axes(
+                pad, base
+            )[0]
             foot = -self.thickness[name] - 5.0 * unit(self.rig)
             for line, values in ((self.normal[k], force[:, 0]), (self.friction[k], force[:, 1])):
                 assert self.curves
-                line.set_data(*own_places(pad, base, np.stack((x, foot - self.curves[0] * values), -1)).T)
+                line.set_data(
+                    *own_places(pad, base, np.stack((x, foot - self.curves[0] * values), -1)).T
+                )
 
     def behind(self, instant: Instant, name: str, side: float, depth: float) -> Array:
-        """Corners (4, 2) [mm] of the rectangle behind a pad's bonded face, wider than it by `side` [mm] on each side."""
+        """Corners (4, 2) [mm] of the rectangle behind a pad's bonded face, wider than it by `side`
+        [mm] on each side."""
         pad = self.rig.pads[name]
         (left, face), (right, _) = MM * pad.mesh.base + [[-side, 0.0], [side, 0.0]]
-        corners = np.array([[left, face - depth], [right, face - depth], [right, face], [left, face]])
+        corners = np.array(
+            [[left, face - depth], [right, face - depth], [right, face], [left, face]]
+        )
         return own_places(pad, instant.base[name], corners)
 
     def limits(self, shown: Sequence[Instant]) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Limits of x and y [mm] that hold every instant shown, with the force curves behind the pads."""
+        """Limits of x and y [mm] that hold every instant shown, with the force curves behind the
+        pads."""
         step, rows = unit(self.rig), []
         for instant in shown:
             for k, outline in self.shapes.items():
                 around = in_world(outline, instant.pose[k])
                 rows += [around - 2.0 * step, around + 2.0 * step]
             for k, mesh in instant.mesh.items():
-                depth = self.thickness[k] + (curve_height(self.rig) + 7.0 * step if self.curves else 4.0 * step)
+                depth = self.thickness[k] + (
+                    curve_height(self.rig) + 7.0 * step if self.curves else 4.0 * step
+                )
                 rows += [mesh.reshape(-1, 2), self.behind(instant, k, 4.0 * step, depth)]
         every = np.concatenate(rows)
         (left, low), (right, high) = every.min(0), every.max(0)
@@ -284,4 +329,11 @@ class Scene:
         step, (_, right), (_, high) = unit(self.rig), axes.get_xlim(), axes.get_ylim()
         x, y = right - 6.0 * step, high - curve_height(self.rig) - 2.0 * step
         axes.plot([x, x], [y, y + millimetres * force], color=INK, lw=1.5, solid_capstyle="butt")
-        axes.text(x - 2.0 * step, y + 0.5 * millimetres * force, f"{force:g} N", ha="right", va="center", fontsize=8)
+        axes.text(
+            x - 2.0 * step,
+            y + 0.5 * millimetres * force,
+            f"{force:g} N",
+            ha="right",
+            va="center",
+            fontsize=8,
+        )

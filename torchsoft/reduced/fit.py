@@ -1,7 +1,9 @@
-"""Sparse reduced models from records, with pysindy: regressions, fits, rollouts against records, the choice of thresholds.
+"""Sparse reduced models from records, with pysindy: regressions, fits, rollouts against records,
+the choice of thresholds.
 
 Records come from `records`, candidate terms from `terms`, the model is `ode.ReducedModel`. Nothing
-here uses the simulator: records are data. pysindy takes seconds to import, so it is imported where it is used.
+here uses the simulator: records are data. pysindy takes seconds to import, so it is imported where
+it is used.
 """
 
 import contextlib
@@ -27,11 +29,13 @@ DEPENDENT = 1e-9
 
 @dataclass(frozen=True)
 class Recipe:
-    """How to fit. threshold: the smallest part of a rate's root mean square that a term may account for.
+    """How to fit. threshold: the smallest part of a rate's root mean square that a term may account
+    for.
 
-    Rows are integrals against test functions of half-width `width` [s], `domains` a window of `window` [s]. models: ensemble
-    members, 0 for none. Coefficients of an ensemble are medians, their intervals the 5th and 95th percentiles: how much the
-    fit depends on the choice of rows, which overlap, and not how wrong the form of the equation may be.
+    Rows are integrals against test functions of half-width `width` [s], `domains` a window of
+    `window` [s]. models: ensemble members, 0 for none. Coefficients of an ensemble are medians,
+    their intervals the 5th and 95th percentiles: how much the fit depends on the choice of rows,
+    which overlap, and not how wrong the form of the equation may be.
     """
 
     threshold: float = 0.02
@@ -44,7 +48,8 @@ class Recipe:
 
 @dataclass(frozen=True)
 class Regression:
-    """Rows of one equation: columns (rows, terms) and rate (rows,), each of unit root mean square, and those sizes."""
+    """Rows of one equation: columns (rows, terms) and rate (rows,), each of unit root mean square,
+    and those sizes."""
 
     terms: list[Term]
     columns: np.ndarray
@@ -64,13 +69,18 @@ class Problem:
 
 
 def assemble(
-    records: Sequence[Record], candidates: Candidates, recipe: Recipe, *, inputs: Sequence[str] = ("F_x",)
+    records: Sequence[Record],
+    candidates: Candidates,
+    recipe: Recipe,
+    *,
+    inputs: Sequence[str] = ("F_x",),
 ) -> Problem:
     """Columns and rates of the records in weak form.
 
-    States without candidates are rates of none: with inputs ("x_Br", "v_Br") and candidates for v_C and omega, the bracket
-    is what drives. Raises `ValueError` for records of different steps, values that are not finite, constant columns,
-    columns that the others already span, and too few rows, naming the column.
+    States without candidates are rates of none: with inputs ("x_Br", "v_Br") and candidates for v_C
+    and omega, the bracket is what drives. Raises `ValueError` for records of different steps,
+    values that are not finite, constant columns, columns that the others already span, and too few
+    rows, naming the column.
     """
     states = tuple(name for name in STATES if name not in inputs)
     steps = [one.step for one in records]
@@ -83,7 +93,9 @@ def assemble(
     for one in data:
         broken = ~np.isfinite(one).all(0)
         if broken.any():
-            raise ValueError(f"series {names[int(broken.argmax())]!r} has values that are not finite")
+            raise ValueError(
+                f"series {names[int(broken.argmax())]!r} has values that are not finite"
+            )
     targets = list(candidates)
     columns = [model.phi(one) for one in data]
     velocities = [one[:, [names.index(target) for target in targets]] for one in data]
@@ -91,7 +103,8 @@ def assemble(
         values = np.concatenate([column[:, i] for column in columns])
         if np.ptp(values) <= 1e-12 * np.abs(values).max():
             raise ValueError(
-                f"column `{term.text}` of {target}' is constant ({values[0]:g}); leave it out, or excite it"
+                f"column `{term.text}` of {target}' is constant ({values[0]:g}); leave it out, or "
+                "excite it"
             )
     phi, rate = _weak(columns, velocities, steps[0], recipe)
     out = {}
@@ -100,17 +113,21 @@ def assemble(
         terms = [model.terms[i] for i in mine]
         if len(phi) < ROWS_PER_TERM * len(mine):
             raise ValueError(
-                f"too little data for {target}': {len(phi)} rows for {len(mine)} candidate terms, the last of which is "
-                f"`{terms[-1].text}`; at least {ROWS_PER_TERM} rows a term are needed"
+                f"too little data for {target}': {len(phi)} rows for {len(mine)} candidate terms, "
+                f"the last of which is `{terms[-1].text}`; at least {ROWS_PER_TERM} rows a term "
+                "are needed"
             )
-        size, rate_size = np.sqrt((phi[:, mine] ** 2).mean(0)), float(np.sqrt((rate[:, j] ** 2).mean()))
+        size, rate_size = (
+            np.sqrt((phi[:, mine] ** 2).mean(0)),
+            float(np.sqrt((rate[:, j] ** 2).mean())),
+        )
         scaled = phi[:, mine] / size
         pivoted: Any = scipy.linalg.qr(scaled, mode="economic", pivoting=True)
         _, R, order = pivoted
         if abs(R[-1, -1]) < DEPENDENT * abs(R[0, 0]):
             raise ValueError(
-                f"column `{terms[order[-1]].text}` of {target}' is a combination of the other columns in these data; "
-                "leave it out, or excite the system more richly"
+                f"column `{terms[order[-1]].text}` of {target}' is a combination of the other "
+                "columns in these data; leave it out, or excite the system more richly"
             )
         out[target] = Regression(terms, scaled, rate[:, j] / rate_size, size, rate_size)
     scale = np.max([np.abs(one[:, : len(states)]).max(0) for one in data], axis=0)
@@ -118,14 +135,16 @@ def assemble(
 
 
 class Equation(NamedTuple):
-    """(term, coefficient) pairs of one rate, SI units, and their intervals, if there is an ensemble."""
+    """(term, coefficient) pairs of one rate, SI units, and their intervals, if there is an
+    ensemble."""
 
     pairs: list[tuple[Term, float]]
     intervals: list[tuple[float, float]]
 
 
 def solve(problem: Problem, target: str, recipe: Recipe) -> Equation:
-    """The sparse equation of one state at the recipe's threshold; candidates whose coefficient is zero are left out."""
+    """The sparse equation of one state at the recipe's threshold; candidates whose coefficient is
+    zero are left out."""
     rows, optimizer = problem.regressions[target], _optimizer(recipe)
     with _quiet_pysindy(recipe.seed):
         optimizer.fit(rows.columns, rows.rate[:, None])
@@ -140,26 +159,35 @@ def solve(problem: Problem, target: str, recipe: Recipe) -> Equation:
 
 
 def build(
-    problem: Problem, equations: Mapping[str, Equation], feedback: Mapping[str, Mapping[str, float]] | None = None
+    problem: Problem,
+    equations: Mapping[str, Equation],
+    feedback: Mapping[str, Mapping[str, float]] | None = None,
 ) -> ReducedModel:
     """The model of one equation for each velocity."""
     intervals = [interval for equation in equations.values() for interval in equation.intervals]
     return ReducedModel(
-        problem.states, problem.inputs, {k: v for k, v in KINEMATICS.items() if k in problem.states},
-        {target: equation.pairs for target, equation in equations.items()}, feedback=feedback, scale=problem.scale,
-        intervals=intervals or None,
+        problem.states, problem.inputs,
+        {k: v for k, v in KINEMATICS.items() if k in problem.states},
+        {target: equation.pairs for target, equation in equations.items()}, feedback=feedback,
+        scale=problem.scale, intervals=intervals or None,
     )  # fmt: skip
 
 
-def fit(problem: Problem, recipe: Recipe, feedback: Mapping[str, Mapping[str, float]] | None = None) -> ReducedModel:
+def fit(
+    problem: Problem, recipe: Recipe, feedback: Mapping[str, Mapping[str, float]] | None = None
+) -> ReducedModel:
     """The sparse model of a problem at the recipe's threshold."""
-    return build(problem, {target: solve(problem, target, recipe) for target in problem.regressions}, feedback)
+    return build(
+        problem,
+        {target: solve(problem, target, recipe) for target in problem.regressions},
+        feedback,
+    )
 
 
 @dataclass(frozen=True)
 class Score:
-    """A rollout against its record: root mean square error by state, over the record's range and over its standard deviation;
-    infinite where it diverged."""
+    """A rollout against its record: root mean square error by state, over the record's range and
+    over its standard deviation; infinite where it diverged."""
 
     nrmse: dict[str, float]
     over_deviation: dict[str, float]
@@ -171,8 +199,12 @@ class Score:
 
 
 def rollout_of(model: ReducedModel, on: Record) -> Rollout:
-    """The model let go from the record's first sample, with the record's inputs and nothing else."""
-    inputs, states = on.columns(model.outer) if model.outer else np.empty((len(on.t), 0)), on.columns(model.states)
+    """The model let go from the record's first sample, with the record's inputs and nothing
+    else."""
+    inputs, states = (
+        on.columns(model.outer) if model.outer else np.empty((len(on.t), 0)),
+        on.columns(model.states),
+    )
     return model.rollout(on.t, states[0], inputs, scale=np.abs(states).max(0))
 
 
@@ -182,14 +214,16 @@ def score(model: ReducedModel, on: Record) -> Score:
     error = np.sqrt(((out.y - exact) ** 2).mean(0))
     error = np.where(np.isfinite(error), error, np.inf)
     over_range, over_deviation = (
-        dict(zip(model.states, (error / size).tolist())) for size in (np.ptp(exact, axis=0), exact.std(0))
+        dict(zip(model.states, (error / size).tolist()))
+        for size in (np.ptp(exact, axis=0), exact.std(0))
     )
     return Score(over_range, over_deviation, out)
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The chosen model, its index among those tried, and the results of each: thresholds, terms, nrmse, diverged."""
+    """The chosen model, its index among those tried, and the results of each: thresholds, terms,
+    nrmse, diverged."""
 
     model: ReducedModel
     index: int
@@ -198,35 +232,52 @@ class Choice:
 
 def choose(
     problem: Problem, validation: Sequence[Record], recipe: Recipe, thresholds: Sequence[float],
-    feedback: Mapping[str, Mapping[str, float]] | None = None, *, slack: float = 1.1, each: bool = True,
+    feedback: Mapping[str, Mapping[str, float]] | None = None, *, slack: float = 1.1,
+    each: bool = True,
 ) -> Choice:  # fmt: skip
-    """The fit with the fewest terms among those whose rollouts of the validation records come within `slack` of the best.
+    """The fit with the fewest terms among those whose rollouts of the validation records come
+    within `slack` of the best.
 
-    Every equation has its own threshold (all combinations that differ in their terms are rolled out), or all the same with
-    `each` off, for models that are slow to roll out. The error of a combination is the mean over the records of the states'
-    worst NRMSE. Raises `ValueError`, with the time, when all rollouts diverge.
+    Every equation has its own threshold (all combinations that differ in their terms are rolled
+    out), or all the same with `each` off, for models that are slow to roll out. The error of a
+    combination is the mean over the records of the states' worst NRMSE. Raises `ValueError`, with
+    the time, when all rollouts diverge.
     """
-    fits: dict[str, dict[tuple[str, ...], tuple[float, Equation]]] = {target: {} for target in problem.regressions}
+    fits: dict[str, dict[tuple[str, ...], tuple[float, Equation]]] = {
+        target: {} for target in problem.regressions
+    }
     levels: dict[float, dict[str, Equation]] = {}
     for threshold in thresholds:
-        levels[threshold] = {target: solve(problem, target, replace(recipe, threshold=threshold)) for target in fits}
+        levels[threshold] = {
+            target: solve(problem, target, replace(recipe, threshold=threshold)) for target in fits
+        }
         for target, equation in levels[threshold].items():
-            fits[target].setdefault(tuple(term.text for term, _ in equation.pairs), (threshold, equation))
+            fits[target].setdefault(
+                tuple(term.text for term, _ in equation.pairs), (threshold, equation)
+            )
     if each:
-        options = [dict(zip(fits, chosen)) for chosen in product(*(one.values() for one in fits.values()))]
+        options = [
+            dict(zip(fits, chosen)) for chosen in product(*(one.values() for one in fits.values()))
+        ]
     else:
         options = [{k: (threshold, x) for k, x in one.items()} for threshold, one in levels.items()]
-    scale = np.max([problem.scale, *(np.abs(one.columns(problem.states)).max(0) for one in validation)], axis=0)
+    scale = np.max(
+        [problem.scale, *(np.abs(one.columns(problem.states)).max(0) for one in validation)], axis=0
+    )
     problem, tried, models, last = replace(problem, scale=scale), [], [], ""
     for option in options:
-        model = build(problem, {target: equation for target, (_, equation) in option.items()}, feedback)
+        model = build(
+            problem, {target: equation for target, (_, equation) in option.items()}, feedback
+        )
         scores = [score(model, one) for one in validation]
         diverged = [str(one.rollout) for one in scores if one.rollout.diverged_at is not None]
         last = diverged[0] if diverged else last
         models.append(model)
         tried.append(
             {
-                "thresholds": {target: float(threshold) for target, (threshold, _) in option.items()},
+                "thresholds": {
+                    target: float(threshold) for target, (threshold, _) in option.items()
+                },
                 "terms": len(model.terms),
                 "nrmse": float(np.mean([one.worst for one in scores])),
                 "diverged": diverged,
@@ -234,7 +285,9 @@ def choose(
         )
     best = min(row["nrmse"] for row in tried)
     if not np.isfinite(best):
-        raise ValueError(f"no threshold gives a model whose rollouts stay bounded: the last one {last}")
+        raise ValueError(
+            f"no threshold gives a model whose rollouts stay bounded: the last one {last}"
+        )
     good = [i for i, row in enumerate(tried) if row["nrmse"] <= slack * best]
     chosen = min(good, key=lambda i: (tried[i]["terms"], tried[i]["nrmse"]))
     return Choice(models[chosen], chosen, tried)
@@ -243,14 +296,15 @@ def choose(
 def _weak(
     columns: list[np.ndarray], velocities: list[np.ndarray], step: float, recipe: Recipe
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Integrals of columns and rates against pysindy's test functions, over windows of one length."""
+    """Integrals of columns and rates against pysindy's test functions, over windows of one
+    length."""
     import pysindy
 
     length = min(round(recipe.window / step) + 1, *(len(one) for one in columns))
     if 2 * recipe.width > 0.9 * (length - 1) * step:
         raise ValueError(
-            f"too little data: the shortest record is {length} samples, {(length - 1) * step:g} s, shorter than the weak "
-            f"form's test functions, {2 * recipe.width:g} s"
+            f"too little data: the shortest record is {length} samples, {(length - 1) * step:g} s, "
+            f"shorter than the weak form's test functions, {2 * recipe.width:g} s"
         )
     axes: Any = {"ax_time": 0, "ax_coord": 1}
 
@@ -260,24 +314,32 @@ def _weak(
 
     with _quiet_pysindy(recipe.seed):
         library = pysindy.WeakPDELibrary(
-            function_library=pysindy.IdentityLibrary(), spatiotemporal_grid=step * np.arange(length),
-            K=recipe.domains, H_xt=[recipe.width], p=4,
+            function_library=pysindy.IdentityLibrary(),
+            spatiotemporal_grid=step * np.arange(length), K=recipe.domains, H_xt=[recipe.width],
+            p=4,
         )  # fmt: skip
         phi = library.fit_transform(windows(columns))
         rates = [library.convert_u_dot_integral(one) for one in windows(velocities)]
-    return np.concatenate([np.asarray(x) for x in phi]), np.concatenate([np.asarray(x) for x in rates])
+    return np.concatenate([np.asarray(x) for x in phi]), np.concatenate(
+        [np.asarray(x) for x in rates]
+    )
 
 
 def _optimizer(recipe: Recipe) -> Any:
     import pysindy
 
     one: Any = pysindy.STLSQ(threshold=recipe.threshold, alpha=1e-10)
-    return pysindy.EnsembleOptimizer(one, bagging=True, n_models=recipe.models) if recipe.models else one
+    return (
+        pysindy.EnsembleOptimizer(one, bagging=True, n_models=recipe.models)
+        if recipe.models
+        else one
+    )
 
 
 @contextlib.contextmanager
 def _quiet_pysindy(seed: int) -> Iterator[None]:
-    """pysindy draws from numpy's global generator: seeded here, and left as it was. Its own array class warns of itself."""
+    """pysindy draws from numpy's global generator: seeded here, and left as it was. Its own array
+    class warns of itself."""
     before = np.random.get_state()  # noqa: NPY002
     np.random.seed(seed)  # noqa: NPY002
     try:

@@ -1,9 +1,10 @@
-"""Small ordinary differential equations y' = S y + C phi(y, u): their text, their torch module, their fast rollout.
+"""Small ordinary differential equations y' = S y + C phi(y, u): their text, their torch module,
+their fast rollout.
 
-One list of terms is all there is: `Term` holds what it is made of, and the equations in text and LaTeX, the right-hand
-side that torchdiffeq integrates and the compiled rollout are read off it. A linear model is rolled out by an exact recursion,
-every other one by an L-stable step: scipy's stiff solvers call Python at every step and cost more than the simulator that is
-being reduced.
+One list of terms is all there is: `Term` holds what it is made of, and the equations in text and
+LaTeX, the right-hand side that torchdiffeq integrates and the compiled rollout are read off it. A
+linear model is rolled out by an exact recursion, every other one by an L-stable step: scipy's stiff
+solvers call Python at every step and cost more than the simulator that is being reduced.
 """
 
 import math
@@ -33,7 +34,8 @@ GAMMA = 1 + 1 / math.sqrt(2)
 """Of the Rosenbrock method ROS2: second order, L-stable."""
 
 TOLERANCE = 1e-3
-"""Largest difference, in parts of the states' scale, between a rollout and that with half its step."""
+"""Largest difference, in parts of the states' scale, between a rollout and that with half its
+step."""
 
 HALVINGS = 8
 """Halvings of the step after which a rollout is taken as it is."""
@@ -64,7 +66,9 @@ class Term:
     @property
     def latex(self) -> str:
         """The formula with the symbols of its variables."""
-        return re.sub(r"tanh|\w+", lambda m: r"\tanh" if m[0] == "tanh" else symbol(m[0])[0], self.text)
+        return re.sub(
+            r"tanh|\w+", lambda m: r"\tanh" if m[0] == "tanh" else symbol(m[0])[0], self.text
+        )
 
     @property
     def linear(self) -> bool:
@@ -72,7 +76,8 @@ class Term:
 
 
 class Table(NamedTuple):
-    """A list of terms: forms (terms * factors, variables), and where a factor is a tanh or a modulus (terms, factors)."""
+    """A list of terms: forms (terms * factors, variables), and where a factor is a tanh or a
+    modulus (terms, factors)."""
 
     forms: Tensor
     tanh: Tensor
@@ -80,7 +85,8 @@ class Table(NamedTuple):
 
 
 def tabulate(terms: Sequence[Term], variables: Sequence[str]) -> Table:
-    """Terms as tensors over `variables`, to which "1" is added. Raises `ValueError` for a variable that is not there."""
+    """Terms as tensors over `variables`, to which "1" is added. Raises `ValueError` for a variable
+    that is not there."""
     names, most = [*variables, "1"], max((len(term.factors) for term in terms), default=1)
     forms = np.zeros((len(terms), most, len(names)))
     shapes = np.full((len(terms), most), "linear", dtype=object)
@@ -91,16 +97,24 @@ def tabulate(terms: Sequence[Term], variables: Sequence[str]) -> Table:
             shapes[i, j] = factor.shape
             for name, weight in factor.form.items():
                 if name not in names:
-                    raise ValueError(f"term `{term.text}` needs the variable {name!r}; known: {', '.join(names)}")
+                    raise ValueError(
+                        f"term `{term.text}` needs the variable {name!r}; known: {', '.join(names)}"
+                    )
                 forms[i, j, names.index(name)] = weight / factor.scale
-    arrays = forms.reshape(-1, len(names)), np.asarray(shapes == "tanh"), np.asarray(shapes == "abs")
+    arrays = (
+        forms.reshape(-1, len(names)),
+        np.asarray(shapes == "tanh"),
+        np.asarray(shapes == "abs"),
+    )
     return Table(*map(torch.from_numpy, arrays))
 
 
 def features(z: Tensor, table: Table) -> Tensor:
     """phi (..., terms) of the variables z (..., variables + 1)."""
     factor = (z @ table.forms.mT).reshape(*z.shape[:-1], *table.tanh.shape)
-    return torch.where(table.tanh, factor.tanh(), torch.where(table.modulus, factor.abs(), factor)).prod(-1)
+    return torch.where(
+        table.tanh, factor.tanh(), torch.where(table.modulus, factor.abs(), factor)
+    ).prod(-1)
 
 
 class Held(nn.Module):
@@ -123,7 +137,8 @@ class Held(nn.Module):
 
 @dataclass(frozen=True)
 class Rollout:
-    """States y (T, states) at t (T,) [s], NaN from `diverged_at` [s] on if it diverged; wall time [s]."""
+    """States y (T, states) at t (T,) [s], NaN from `diverged_at` [s] on if it diverged; wall time
+    [s]."""
 
     t: np.ndarray
     y: np.ndarray
@@ -131,29 +146,38 @@ class Rollout:
     wall_s: float
 
     def __str__(self) -> str:
-        return "bounded" if self.diverged_at is None else f"diverged at t = {self.diverged_at:.4g} s"
+        return (
+            "bounded" if self.diverged_at is None else f"diverged at t = {self.diverged_at:.4g} s"
+        )
 
 
 class ReducedModel(nn.Module):
-    """y' = S y + C phi(y, u). `forward(t, y)` follows torchdiffeq, y (..., states); inputs come from `signal(t)`.
+    """y' = S y + C phi(y, u). `forward(t, y)` follows torchdiffeq, y (..., states); inputs come
+    from `signal(t)`.
 
-    states, inputs: names. kinematics: which state is the rate of which, as in {"x_C": "v_C"}. equations: for every other
-    state the (term, coefficient) pairs of its rate, SI units. feedback: for inputs that a control law makes, its gains on
-    states and on further inputs, {"F_x": {"x_d": K, "x_C": -K}}; those further inputs are then what `signal` gives.
-    Coefficients and gains are `nn.Parameter`s. scale (states,): sizes that belong to the states, for judging divergence.
+    states, inputs: names. kinematics: which state is the rate of which, as in {"x_C": "v_C"}.
+    equations: for every other state the (term, coefficient) pairs of its rate, SI units. feedback:
+    for inputs that a control law makes, its gains on states and on further inputs, {"F_x": {"x_d":
+    K, "x_C": -K}}; those further inputs are then what `signal` gives. Coefficients and gains are
+    `nn.Parameter`s. scale (states,): sizes that belong to the states, for judging divergence.
     intervals: for every term in order its (low, high), if an ensemble has found them.
     """
 
     def __init__(
         self, states: Sequence[str], inputs: Sequence[str], kinematics: Mapping[str, str],
-        equations: Mapping[str, Sequence[tuple[Term, float]]], *, feedback: Mapping[str, Mapping[str, float]] | None = None,
-        scale: np.ndarray | Sequence[float] | None = None, intervals: Sequence[tuple[float, float]] | None = None,
+        equations: Mapping[str, Sequence[tuple[Term, float]]], *,
+        feedback: Mapping[str, Mapping[str, float]] | None = None,
+        scale: np.ndarray | Sequence[float] | None = None,
+        intervals: Sequence[tuple[float, float]] | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         self.states, self.inputs, self.kinematics = tuple(states), tuple(inputs), dict(kinematics)
         missing = set(self.states) ^ (set(kinematics) | set(equations))
         if missing:
-            raise ValueError(f"every state needs one equation, but these have none or are no states: {sorted(missing)}")
+            raise ValueError(
+                "every state needs one equation, but these have none or are no states: "
+                f"{sorted(missing)}"
+            )
         self.targets = [target for target, pairs in equations.items() for _ in pairs]
         self.terms = [term for pairs in equations.values() for term, _ in pairs]
         values = [value for pairs in equations.values() for _, value in pairs]
@@ -161,20 +185,33 @@ class ReducedModel(nn.Module):
         self.intervals = None if intervals is None else [(float(a), float(b)) for a, b in intervals]
         self.feedback = {name: dict(law) for name, law in (feedback or {}).items()}
         made = [name for law in self.feedback.values() for name in law if name not in self.states]
-        self.outer = tuple(dict.fromkeys([name for name in inputs if name not in self.feedback] + made))
-        self.gains = nn.Parameter(
-            torch.tensor([gain for law in self.feedback.values() for gain in law.values()], dtype=torch.float64)
+        self.outer = tuple(
+            dict.fromkeys([name for name in inputs if name not in self.feedback] + made)
         )
-        self.scale = np.asarray(scale if scale is not None else np.ones(len(self.states)), dtype=float)
+        self.gains = nn.Parameter(
+            torch.tensor(
+                [gain for law in self.feedback.values() for gain in law.values()],
+                dtype=torch.float64,
+            )
+        )
+        self.scale = np.asarray(
+            scale if scale is not None else np.ones(len(self.states)), dtype=float
+        )
         self.signal: nn.Module | None = None
         self._table = tabulate(self.terms, (*self.states, *self.inputs))
         entries = [(self.states.index(target), i) for i, target in enumerate(self.targets)]
-        self._entries = tuple(torch.tensor(index, dtype=torch.long) for index in zip(*entries)) if entries else None
+        self._entries = (
+            tuple(torch.tensor(index, dtype=torch.long) for index in zip(*entries))
+            if entries
+            else None
+        )
         law = [
             (self.inputs.index(name), [*self.states, *self.outer].index(other))
             for name, gains in self.feedback.items() for other in gains
         ]  # fmt: skip
-        self._law = tuple(torch.tensor(index, dtype=torch.long) for index in zip(*law)) if law else None
+        self._law = (
+            tuple(torch.tensor(index, dtype=torch.long) for index in zip(*law)) if law else None
+        )
 
     @property
     def linear(self) -> bool:
@@ -183,19 +220,24 @@ class ReducedModel(nn.Module):
     def with_feedback(self, feedback: Mapping[str, Mapping[str, float]] | None) -> "ReducedModel":
         """The same equations under another control law."""
         return ReducedModel(
-            self.states, self.inputs, self.kinematics, self.equations(), feedback=feedback, scale=self.scale,
-            intervals=self.intervals,
+            self.states, self.inputs, self.kinematics, self.equations(), feedback=feedback,
+            scale=self.scale, intervals=self.intervals,
         )  # fmt: skip
 
     def equations(self) -> dict[str, list[tuple[Term, float]]]:
         """Terms and coefficients by the state whose rate they make."""
-        out: dict[str, list[tuple[Term, float]]] = {name: [] for name in self.states if name not in self.kinematics}
-        for target, term, value in zip(self.targets, self.terms, self.coefficients.detach().tolist()):
+        out: dict[str, list[tuple[Term, float]]] = {
+            name: [] for name in self.states if name not in self.kinematics
+        }
+        for target, term, value in zip(
+            self.targets, self.terms, self.coefficients.detach().tolist()
+        ):
             out[target].append((term, value))
         return out
 
     def matrices(self) -> tuple[Tensor, Tensor, Tensor]:
-        """S (states, states), C (states, terms) and the control law's K (inputs, states + outer inputs)."""
+        """S (states, states), C (states, terms) and the control law's K (inputs, states + outer
+        inputs)."""
         n, m = len(self.states), len(self.inputs)
         S = torch.zeros(n, n, dtype=torch.float64)
         for name, rate in self.kinematics.items():
@@ -210,11 +252,15 @@ class ReducedModel(nn.Module):
         return S, C, K if self._law is None else K.index_put(self._law, self.gains)
 
     def forward(self, t: Tensor | float, y: Tensor) -> Tensor:
-        """dy/dt, shaped like y (..., states). Raises `ValueError` when the model has inputs but no `signal`."""
+        """dy/dt, shaped like y (..., states). Raises `ValueError` when the model has inputs but no
+        `signal`."""
         w = y.new_zeros(*y.shape[:-1], 0)
         if self.outer:
             if self.signal is None:
-                raise ValueError(f"set `signal` to a module that gives {', '.join(self.outer)} at t, such as `Held`")
+                raise ValueError(
+                    f"set `signal` to a module that gives {', '.join(self.outer)} at t, such as "
+                    "`Held`"
+                )
             w = self.signal(t).expand(*y.shape[:-1], -1)
         return self.rates(torch.cat((y, w), -1))
 
@@ -224,10 +270,13 @@ class ReducedModel(nn.Module):
 
     def phi(self, yu: np.ndarray) -> np.ndarray:
         """The terms (T, terms) at states and inputs (T, states + inputs)."""
-        return features(torch.from_numpy(np.column_stack((yu, np.ones(len(yu))))), self._table).numpy()
+        return features(
+            torch.from_numpy(np.column_stack((yu, np.ones(len(yu))))), self._table
+        ).numpy()
 
     def state_space(self) -> tuple[np.ndarray, np.ndarray]:
-        """A (states, states) and B (states, outer + 1) of y' = A y + B (u, 1). Raises `ValueError` unless linear."""
+        """A (states, states) and B (states, outer + 1) of y' = A y + B (u, 1). Raises `ValueError`
+        unless linear."""
         if not self.linear:
             raise ValueError("the model has terms that are not linear; it has no A and B")
         n, size = len(self.states), len(self.states) + len(self.outer)
@@ -235,28 +284,38 @@ class ReducedModel(nn.Module):
         slopes = (f[1:] - f[0]).T
         return slopes[:, :n], np.column_stack((slopes[:, n:], f[0]))
 
-    def rollout(self, t: np.ndarray, y0: np.ndarray, u: np.ndarray, *, scale: np.ndarray | None = None) -> Rollout:
-        """Integrate from y0 (states,) at t[0] with outer inputs u (T, outer), straight between the times t (T,) [s].
+    def rollout(
+        self, t: np.ndarray, y0: np.ndarray, u: np.ndarray, *, scale: np.ndarray | None = None
+    ) -> Rollout:
+        """Integrate from y0 (states,) at t[0] with outer inputs u (T, outer), straight between the
+        times t (T,) [s].
 
-        Exact for linear models on equally spaced times, a compiled Rosenbrock method otherwise. A rollout that goes
-        `BEYOND` times `scale` (states,), the model's by default, has diverged: it is NaN from that time on.
+        Exact for linear models on equally spaced times, a compiled Rosenbrock method otherwise. A
+        rollout that goes `BEYOND` times `scale` (states,), the model's by default, has diverged: it
+        is NaN from that time on.
         """
-        t, y0, u = np.asarray(t, float), np.asarray(y0, float), np.asarray(u, float).reshape(len(t), -1)
+        t, y0, u = (
+            np.asarray(t, float),
+            np.asarray(y0, float),
+            np.asarray(u, float).reshape(len(t), -1),
+        )
         if u.shape[1] != len(self.outer) or y0.shape != (len(self.states),):
             raise ValueError(
-                f"`y0` must hold {', '.join(self.states)} and `u` one column each for {', '.join(self.outer) or 'nothing'}, "
-                f"but have shapes {y0.shape} and {u.shape}"
+                f"`y0` must hold {', '.join(self.states)} and `u` one column each for "
+                f"{', '.join(self.outer) or 'nothing'}, but have shapes {y0.shape} and {u.shape}"
             )
         size = self.scale if scale is None else np.asarray(scale, float)
         began, limit = perf_counter(), BEYOND * size
         if self.linear and len(t) > 2 and np.allclose(np.diff(t), t[1] - t[0], rtol=1e-6, atol=0):
             with np.errstate(over="ignore", invalid="ignore"):
-                y = linear_rollout(*self.state_space(), t[1] - t[0], y0, np.column_stack((u, np.ones(len(t)))))
+                y = linear_rollout(
+                    *self.state_space(), t[1] - t[0], y0, np.column_stack((u, np.ones(len(t))))
+                )
         else:
             parts = [part.detach() for part in self.matrices()]
             law = compile_law(
-                lambda x, _: _rates(x, self._table, *parts), torch.ones(len(y0) + u.shape[1]).double(), {},
-                differentiated=len(y0),
+                lambda x, _: _rates(x, self._table, *parts),
+                torch.ones(len(y0) + u.shape[1]).double(), {}, differentiated=len(y0),
             )  # fmt: skip
             y = nonlinear_rollout(law.value, law.linearise, t, y0, u, limit, size)
         wild, ended = ~(np.abs(y) <= limit).all(-1), None
@@ -268,7 +327,10 @@ class ReducedModel(nn.Module):
         """One equation a line, in SI units."""
         lines = [f"{name}' = {rate}" for name, rate in self.kinematics.items()]
         for target, pairs in self.equations().items():
-            body = " ".join(f"{'+-'[value < 0]} {abs(value):.4g} {_bracketed(term.text)}" for term, value in pairs)
+            body = " ".join(
+                f"{'+-'[value < 0]} {abs(value):.4g} {_bracketed(term.text)}"
+                for term, value in pairs
+            )
             lines.append(f"{target}' = {body.removeprefix('+ ') or '0'}")
         return lines
 
@@ -277,17 +339,30 @@ class ReducedModel(nn.Module):
         rows = []
         for target, pairs in self.equations().items():
             body = " ".join(
-                f"{'+-'[value < 0]} {_power(abs(value))}\\,{_bracketed(term.latex)}" for term, value in pairs
+                f"{'+-'[value < 0]} {_power(abs(value))}\\,{_bracketed(term.latex)}"
+                for term, value in pairs
             )
-            rows.append(rf"\frac{{d}}{{dt}} {symbol(target)[0]} &= {body.removeprefix('+ ') or '0'}")
+            rows.append(
+                rf"\frac{{d}}{{dt}} {symbol(target)[0]} &= {body.removeprefix('+ ') or '0'}"
+            )
         return "\\begin{aligned}\n" + " \\\\\n".join(rows) + "\n\\end{aligned}"
 
     def coefficient_table(self) -> list[dict[str, Any]]:
         """Every coefficient with its unit and, from an ensemble, its interval."""
         rows, intervals = [], self.intervals or [None] * len(self.terms)
-        for target, term, value, interval in zip(self.targets, self.terms, self.coefficients.tolist(), intervals):
+        for target, term, value, interval in zip(
+            self.targets, self.terms, self.coefficients.tolist(), intervals
+        ):
             unit = f"{symbol(target)[1]}/s per {term.unit}"
-            rows.append({"equation": target, "term": term.text, "value": value, "unit": unit, "interval": interval})
+            rows.append(
+                {
+                    "equation": target,
+                    "term": term.text,
+                    "value": value,
+                    "unit": unit,
+                    "interval": interval,
+                }
+            )
         return rows
 
 
@@ -306,8 +381,11 @@ def _power(value: float) -> str:
     return rf"{mantissa}\cdot 10^{{{int(exponent)}}}" if exponent else mantissa
 
 
-def linear_rollout(A: np.ndarray, B: np.ndarray, h: float, y0: np.ndarray, w: np.ndarray) -> np.ndarray:
-    """y' = A y + B w (T, states) from y0 at steps of h [s], w (T, inputs) straight between them: exact."""
+def linear_rollout(
+    A: np.ndarray, B: np.ndarray, h: float, y0: np.ndarray, w: np.ndarray
+) -> np.ndarray:
+    """y' = A y + B w (T, states) from y0 at steps of h [s], w (T, inputs) straight between them:
+    exact."""
     n = len(A)
     discrete: Any = cont2discrete((A, B, np.eye(n), np.zeros_like(B)), h, method="foh")
     F, G, _, D, _ = discrete
@@ -330,9 +408,16 @@ def recursion(F, f, x0):
 
 
 def nonlinear_rollout(
-    value: int, linearise: int, t: np.ndarray, y0: np.ndarray, w: np.ndarray, limit: np.ndarray, scale: np.ndarray
+    value: int,
+    linearise: int,
+    t: np.ndarray,
+    y0: np.ndarray,
+    w: np.ndarray,
+    limit: np.ndarray,
+    scale: np.ndarray,
 ) -> np.ndarray:
-    """y (T, states) at t (T,) [s], NaN once it is beyond `limit` (states,); the step is halved until nothing changes.
+    """y (T, states) at t (T,) [s], NaN once it is beyond `limit` (states,); the step is halved
+    until nothing changes.
 
     value, linearise: addresses of the compiled rates of (y, w), differentiated by y.
     """
@@ -357,7 +442,14 @@ def _rosenbrock(value, linearise, t, y0, w, limit, pieces):
     n = len(y0)
     out = np.full((len(t), n), np.nan)
     out[0] = y0
-    y, f, later, J, one, none = y0.copy(), np.empty(n), np.empty(n), np.empty((n, n)), np.eye(n), np.empty(0)
+    y, f, later, J, one, none = (
+        y0.copy(),
+        np.empty(n),
+        np.empty(n),
+        np.empty((n, n)),
+        np.eye(n),
+        np.empty(0),
+    )
     for k in range(len(t) - 1):
         h, rise = (t[k + 1] - t[k]) / pieces, (w[k + 1] - w[k]) / pieces
         for piece in range(pieces):

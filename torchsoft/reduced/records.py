@@ -1,4 +1,5 @@
-"""Records: the variables of a reduced model over time, from trajectories and datasets, with or without noise."""
+"""Records: the variables of a reduced model over time, from trajectories and datasets, with or
+without noise."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,7 +19,8 @@ VARIABLES = (*STATES, "F_x", "x_d", "x_d_dot")
 
 @dataclass(frozen=True)
 class Record:
-    """One motion: times t (T,) [s], equally spaced, and series (T,) by variable, SI units, positions from their start."""
+    """One motion: times t (T,) [s], equally spaced, and series (T,) by variable, SI units,
+    positions from their start."""
 
     t: np.ndarray
     series: dict[str, np.ndarray]
@@ -28,10 +30,13 @@ class Record:
         return float(self.t[1] - self.t[0])
 
     def columns(self, names: Sequence[str]) -> np.ndarray:
-        """Series side by side (T, names). Raises `ValueError` for one that the record does not have."""
+        """Series side by side (T, names). Raises `ValueError` for one that the record does not
+        have."""
         lacking = [name for name in names if name not in self.series]
         if lacking:
-            raise ValueError(f"the record has no series {', '.join(lacking)}; it has {', '.join(self.series)}")
+            raise ValueError(
+                f"the record has no series {', '.join(lacking)}; it has {', '.join(self.series)}"
+            )
         return np.column_stack([self.series[name] for name in names])
 
     def part(self, begin: int, end: int) -> "Record":
@@ -39,13 +44,16 @@ class Record:
         return Record(self.t[begin:end], {name: x[begin:end] for name, x in self.series.items()})
 
 
-def record(source: Trajectory | Mapping[Any, Any], t: Any = None, *, begin: float | None = None) -> Record:
-    """A record of a `Trajectory`, or of series by their names in a dataset (an `xarray.Dataset` of one trajectory or an
-    item of `torchsoft.datasets.Trajectories`) at times t [s].
+def record(
+    source: Trajectory | Mapping[Any, Any], t: Any = None, *, begin: float | None = None
+) -> Record:
+    """A record of a `Trajectory`, or of series by their names in a dataset (an `xarray.Dataset` of
+    one trajectory or an item of `torchsoft.datasets.Trajectories`) at times t [s].
 
-    Samples before `begin` [s] are left out, and positions and angle counted from the first one kept; x_d from the disc's.
-    What the source lacks the record lacks. Raises `ValueError` for times that are not equally spaced, for a value that is not
-    finite, naming the series, and for a source without any of them, such as the run of a rig that is not the paper's.
+    Samples before `begin` [s] are left out, and positions and angle counted from the first one
+    kept; x_d from the disc's. What the source lacks the record lacks. Raises `ValueError` for times
+    that are not equally spaced, for a value that is not finite, naming the series, and for a source
+    without any of them, such as the run of a rig that is not the paper's.
     """
     data: Mapping[Any, Any] = source.to_dataset() if isinstance(source, Trajectory) else source
     times = np.asarray(data["time"] if t is None else t, dtype=float)
@@ -61,12 +69,16 @@ def record(source: Trajectory | Mapping[Any, Any], t: Any = None, *, begin: floa
         if not np.isfinite(x).all():
             first = times[keep][~np.isfinite(x)][0]
             raise ValueError(
-                f"series {name!r} ({channel.variable}) has values that are not finite, first at t = {first:g} s"
+                f"series {name!r} ({channel.variable}) has values that are not finite, first at t "
+                f"= {first:g} s"
             )
         series[name] = x
     if not series:
         known = ", ".join(dict.fromkeys(channel.variable for channel in channels.values()))
-        raise ValueError(f"`source` has none of {known}; take a run of `SoftGrasp`, or give series by these names")
+        raise ValueError(
+            f"`source` has none of {known}; take a run of `SoftGrasp`, or give series by these "
+            "names"
+        )
     origin = {name: float(series[name][0]) for name in ("x_C", "theta", "x_Br") if name in series}
     if "x_d" in series and "x_C" in origin:
         origin["x_d"] = origin["x_C"]
@@ -74,11 +86,15 @@ def record(source: Trajectory | Mapping[Any, Any], t: Any = None, *, begin: floa
 
 
 def noisy(source: Record, level: float, seed: int) -> Record:
-    """The record with white noise on every measured series, `level` times its standard deviation; x_d is not measured."""
+    """The record with white noise on every measured series, `level` times its standard deviation;
+    x_d is not measured."""
     rng, clean = np.random.default_rng(seed), ("x_d", "x_d_dot")
     return Record(
         source.t,
-        {k: x if k in clean else x + level * x.std() * rng.standard_normal(x.shape) for k, x in source.series.items()},
+        {
+            k: x if k in clean else x + level * x.std() * rng.standard_normal(x.shape)
+            for k, x in source.series.items()
+        },
     )
 
 

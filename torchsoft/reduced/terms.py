@@ -1,17 +1,18 @@
 """Candidate terms for reduced models: what mechanics suggests, what saturates, and polynomials.
 
-Two pads join disc and bracket. While their contacts stick, each is a spring k and a dashpot c (pad and contact springs in
-series) on the slip that a rigid rolling disc would have, s_L = x_C + r theta below and s_U = x_Br - x_C + r theta above,
-positions relative to where they start. The friction forces on the disc are F_L = -(k s_L + c s_L') and
-F_U = k s_U + c s_U', so that
+Two pads join disc and bracket. While their contacts stick, each is a spring k and a dashpot c (pad
+and contact springs in series) on the slip that a rigid rolling disc would have, s_L = x_C + r theta
+below and s_U = x_Br - x_C + r theta above, positions relative to where they start. The friction
+forces on the disc are F_L = -(k s_L + c s_L') and F_U = k s_U + c s_U', so that
 
     m x_C''       = F_U + F_L      =  k (x_Br - 2 x_C) + c (...)'
     I theta''     = -r (F_U - F_L) - c_r theta' = -r [k (x_Br + 2 r theta) + c (...)'] - c_r theta'
     m_Br x_Br''   = F_x - F_U      =  F_x - k (x_Br - x_C + r theta) - c (...)'
 
-with c_r the rolling dashpot: the normal forces of a Voigt patch shift against the rolling. r is the rolling radius,
-smaller than the disc's. Those bracketed slips are the columns of `mechanics`; they are small differences of large
-positions, which is why they, and not the positions, are the columns. `friction` adds what saturates under slip.
+with c_r the rolling dashpot: the normal forces of a Voigt patch shift against the rolling. r is the
+rolling radius, smaller than the disc's. Those bracketed slips are the columns of `mechanics`; they
+are small differences of large positions, which is why they, and not the positions, are the columns.
+`friction` adds what saturates under slip.
 """
 
 from collections.abc import Mapping, Sequence
@@ -37,7 +38,8 @@ def variable(name: str) -> Term:
 
 
 def slips(r: float) -> dict[str, tuple[Term, Term]]:
-    """The slips s_L and s_U of a rolling radius r [m], their difference s_U - s_L and their sum, each with its rate."""
+    """The slips s_L and s_U of a rolling radius r [m], their difference s_U - s_L and their sum,
+    each with its rate."""
     return {
         "lower": slip("x_C + r theta", x_C=1.0, theta=r),
         "upper": slip("x_Br - x_C + r theta", x_Br=1.0, x_C=-1.0, theta=r),
@@ -47,11 +49,12 @@ def slips(r: float) -> dict[str, tuple[Term, Term]]:
 
 
 def mechanics(r: float, *, alike: bool = True) -> dict[str, list[Term]]:
-    """Linear candidates for x_C'', theta'' and x_Br'' with the rolling radius r [m]: for each body the slips of the pads that
-    touch it and their rates, drag on its own velocity, and the control force.
+    """Linear candidates for x_C'', theta'' and x_Br'' with the rolling radius r [m]: for each body
+    the slips of the pads that touch it and their rates, drag on its own velocity, and the control
+    force.
 
-    The two slips of the disc stand there as difference and sum if both pads are alike in what they do, as in stick, and one
-    by one if not, as when one slips.
+    The two slips of the disc stand there as difference and sum if both pads are alike in what they
+    do, as in stick, and one by one if not, as when one slips.
     """
     s = slips(r)
     first, second = ("difference", "sum") if alike else ("lower", "upper")
@@ -63,7 +66,8 @@ def mechanics(r: float, *, alike: bool = True) -> dict[str, list[Term]]:
 
 
 def friction(r: float, speed: float) -> dict[str, list[Term]]:
-    """Saturating candidates tanh(s' / speed) of the slips below and above, `speed` [m/s] a small one."""
+    """Saturating candidates tanh(s' / speed) of the slips below and above, `speed` [m/s] a small
+    one."""
     lower, upper = (
         Term(f"tanh(({rate.text})/{speed:g})", "1", (Factor(rate.factors[0].form, "tanh", speed),))
         for rate in (slips(r)[side][1] for side in ("lower", "upper"))
@@ -73,9 +77,15 @@ def friction(r: float, speed: float) -> dict[str, list[Term]]:
 
 def polynomials(names: Sequence[str], degree: int) -> list[Term]:
     """Every monomial of the variables up to `degree`: the library that knows no mechanics."""
-    every = (chosen for d in range(1, degree + 1) for chosen in combinations_with_replacement(names, d))
+    every = (
+        chosen for d in range(1, degree + 1) for chosen in combinations_with_replacement(names, d)
+    )
     return [
-        Term(" ".join(some), " ".join(symbol(name)[1] for name in some), tuple(Factor({name: 1.0}) for name in some))
+        Term(
+            " ".join(some),
+            " ".join(symbol(name)[1] for name in some),
+            tuple(Factor({name: 1.0}) for name in some),
+        )
         for some in every
     ]
 
@@ -83,4 +93,7 @@ def polynomials(names: Sequence[str], degree: int) -> list[Term]:
 def joined(*libraries: Candidates) -> dict[str, list[Term]]:
     """Several libraries as one."""
     targets = dict.fromkeys(target for library in libraries for target in library)
-    return {target: [term for library in libraries for term in library.get(target, ())] for target in targets}
+    return {
+        target: [term for library in libraries for term in library.get(target, ())]
+        for target in targets
+    }

@@ -1,4 +1,5 @@
-"""Rigs in files: a TOML file, or the same tables in Python, to a run with its figures, for somebody who writes no Python."""
+"""Rigs in files: a TOML file, or the same tables in Python, to a run with its figures, for somebody
+who writes no Python."""
 
 from torchsoft.rigs.build import BuiltRig, RigFile
 

@@ -1,4 +1,5 @@
-"""What comes of a rig in balance at some moments of its motions: room, strains, modes and steps, friction."""
+"""What comes of a rig in balance at some moments of its motions: room, strains, modes and steps,
+friction."""
 
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
@@ -21,8 +22,9 @@ from torchsoft.solve.ledger import COMPRESSED
 from torchsoft.solve.stability import NEUTRAL, modes
 
 LINEAR = 0.25
-"""Part of its height by which a pad may be pressed in without a warning (assumed): strains under a contact are of that order,
-and the stress of rubber leaves the straight line of small strains by some ten per cent there."""
+"""Part of its height by which a pad may be pressed in without a warning (assumed): strains under a
+contact are of that order, and the stress of rubber leaves the straight line of small strains by
+some ten per cent there."""
 
 MOMENTS = 5
 """Times at which the rig is brought into balance, at the most."""
@@ -38,8 +40,8 @@ STEPS_PER_PROFILE = 20
 
 
 class Moment(NamedTuple):
-    """The rig, pads without inertia, in balance at a time [s], before and after its pads have settled: state (size,) and its
-    parts, and the signals, held."""
+    """The rig, pads without inertia, in balance at a time [s], before and after its pads have
+    settled: state (size,) and its parts, and the signals, held."""
 
     time: float
     scene: Scene
@@ -50,25 +52,35 @@ class Moment(NamedTuple):
 
 @torch.no_grad()
 def at_moments(e: Estimate) -> list[Diagnostic]:
-    """What comes of the rig in balance at some of its motions' knots: strains, modes, steps, friction."""
+    """What comes of the rig in balance at some of its motions' knots: strains, modes, steps,
+    friction."""
     rig, found, there = massless(e.rig), list[Diagnostic](), list[Moment]()
     for time in e.moments(MOMENTS):
         scene = Scene(rig, e.balanced(time))
-        found += [one for one in fits(time, scene) if one.where not in {other.where for other in found}]
+        found += [
+            one for one in fits(time, scene) if one.where not in {other.where for other in found}
+        ]
         if found:
             return found
         try:
             y = standing(rig, {name: torch.from_numpy(x) for name, x in scene.pose.items()})
         except NoEquilibrium as error:
-            return [Diagnostic("error", "motion", f"pads cannot settle where bodies are at t = {time:.3g} s: {error}")]
+            return [
+                Diagnostic(
+                    "error",
+                    "motion",
+                    f"pads cannot settle where bodies are at t = {time:.3g} s: {error}",
+                )
+            ]
         reference = hold(**signals(rig, time))
         there.append(Moment(time, scene, y, rig.unpack(y, rig.follow(0.0, reference)), reference))
     for time, why in list(e.unbalanced.items())[:1]:
         found.append(
             Diagnostic(
                 "warning", "motion",
-                f"nothing was found to be in balance at t = {time:.3g} s, so that strains and stability are not judged under "
-                f"the efforts there, only where set-points put bodies: {why}; push less, or leave bodies more room",
+                f"nothing was found to be in balance at t = {time:.3g} s, so that strains and "
+                "stability are not judged under the efforts there, only where set-points put "
+                f"bodies: {why}; push less, or leave bodies more room",
             )
         )  # fmt: skip
     return [*found, *presses(there), *strains(there), *swings(e, there), *slips(e, there)]
@@ -84,8 +96,9 @@ def fits(time: float, scene: Scene) -> Iterator[Diagnostic]:
             body, pads = scene.rig.contacts[group[0]].body, named(scene, group)
             yield Diagnostic(
                 "error", f"contacts.{group[-1]}",
-                f"`{body}` does not fit: at t = {time:.3g} s it asks {pads} to give way by {1e3 * give:.3g} mm, "
-                f"{give / height:.0%} of their height, far beyond linear elasticity; leave it more room",
+                f"`{body}` does not fit: at t = {time:.3g} s it asks {pads} to give way by "
+                f"{1e3 * give:.3g} mm, {give / height:.0%} of their height, far beyond linear "
+                "elasticity; leave it more room",
             )  # fmt: skip
 
 
@@ -95,22 +108,31 @@ def named(scene: Scene, group: Sequence[str]) -> str:
 
 
 def room(scene: Scene, group: Sequence[str]) -> float:
-    """By how much the pads of some contacts of one body have to give way [m], together; negative where they are apart, or the
-    body is beyond the end of one."""
-    beside = max(scene.surface(key).off(scene.pose[scene.rig.contacts[key].body][:2]) for key in group)
+    """By how much the pads of some contacts of one body have to give way [m], together; negative
+    where they are apart, or the body is beyond the end of one."""
+    beside = max(
+        scene.surface(key).off(scene.pose[scene.rig.contacts[key].body][:2]) for key in group
+    )
     return -beside if beside > 0 else sum(scene.pressed(key) for key in group)
 
 
 def presses(there: list[Moment]) -> Iterator[Diagnostic]:
     """Pads that face each other and never press what is between them."""
     scene = there[0].scene
-    for pair in sorted({pair for moment in there for body in scene.rig.bodies for pair in moment.scene.facing(body)}):
+    for pair in sorted(
+        {
+            pair
+            for moment in there
+            for body in scene.rig.bodies
+            for pair in moment.scene.facing(body)
+        }
+    ):
         nearest = max(room(moment.scene, pair) for moment in there)
         if nearest <= 0:
             yield Diagnostic(
                 "warning", f"contacts.{pair[-1]}",
-                f"{named(scene, pair)} never press `{scene.rig.contacts[pair[0]].body}`: at the motions' knots they come no "
-                f"nearer than {-1e3 * nearest:.3g} mm",
+                f"{named(scene, pair)} never press `{scene.rig.contacts[pair[0]].body}`: at the "
+                f"motions' knots they come no nearer than {-1e3 * nearest:.3g} mm",
             )  # fmt: skip
 
 
@@ -118,19 +140,23 @@ def strains(there: list[Moment]) -> Iterator[Diagnostic]:
     """Pads that are pressed in beyond linear elasticity."""
     rig = there[0].scene.rig
     for name, pad in rig.pads.items():
-        parts = [float(rig.displacement(name, m.state).norm(dim=-1).max()) / pad.mesh.height for m in there]
+        parts = [
+            float(rig.displacement(name, m.state).norm(dim=-1).max()) / pad.mesh.height
+            for m in there
+        ]
         worst = int(np.argmax(parts))
         if parts[worst] > LINEAR:
             yield Diagnostic(
                 "warning", f"pads.{name}",
-                f"the strain leaves linear elasticity: at t = {there[worst].time:.3g} s it gives way by {parts[worst]:.0%} of "
-                f"its height, and above {LINEAR:.0%} forces are off; press less, or take a thicker or stiffer pad",
+                f"the strain leaves linear elasticity: at t = {there[worst].time:.3g} s it gives "
+                f"way by {parts[worst]:.0%} of its height, and above {LINEAR:.0%} forces are off; "
+                "press less, or take a thicker or stiffer pad",
             )  # fmt: skip
 
 
 def swings(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
-    """Loops that are unstable or not tied to what they measure, and steps that are too long. What goes off where no loop
-    reaches is no loop's fault: a disc on the top of a node rolls off it."""
+    """Loops that are unstable or not tied to what they measure, and steps that are too long. What
+    goes off where no loop reaches is no loop's fault: a disc on the top of a node rolls off it."""
     rig, fastest, least = there[0].scene.rig, 0.0, (complex("-inf"), 0.0)
     for moment in there:
         depth = {key: float(rig.penetration(key, moment.state).max()) for key in rig.contacts}
@@ -142,19 +168,23 @@ def swings(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
             if not nx.has_path(ties, measured, pushed):
                 yield Diagnostic(
                     "warning", one.field,
-                    f"at t = {moment.time:.3g} s nothing that touches ties {one.measured}, which it measures, to {one.pushes}: "
-                    f"what `{measured}` does by itself drives `{pushed}` away; start where they touch, or measure {one.pushes}",
+                    f"at t = {moment.time:.3g} s nothing that touches ties {one.measured}, which "
+                    f"it measures, to {one.pushes}: what `{measured}` does by itself drives "
+                    f"`{pushed}` away; start where they touch, or measure {one.pushes}",
                 )  # fmt: skip
         values, moves = modes(rig, moment.y, moment.reference)
         fastest = max([fastest, *values[values.imag.abs() > values.real.abs()].imag.abs().tolist()])
         reached = nx.node_connected_component(ties, moves.partition(".")[0])
         growing = complex(values[0])
-        if growing.real > NEUTRAL and any(at(q)[0] in reached for one in e.loops for q in (one.measured, one.pushes)):
+        if growing.real > NEUTRAL and any(
+            at(q)[0] in reached for one in e.loops for q in (one.measured, one.pushes)
+        ):
             across = [one.field for one in e.loops if one.measured != one.pushes]
             yield Diagnostic(
                 "error", (*across, "actuators")[0],
-                f"the rig is unstable at t = {moment.time:.3g} s: its leading mode is {shown(growing)}, mostly of {moves}, and "
-                f"grows by a factor of e in {1 / growing.real:.2g} s; lower the gains, raise the pads' tau or E, or measure "
+                f"the rig is unstable at t = {moment.time:.3g} s: its leading mode is "
+                f"{shown(growing)}, mostly of {moves}, and grows by a factor of e in "
+                f"{1 / growing.real:.2g} s; lower the gains, raise the pads' tau or E, or measure "
                 "what is pushed",
             )  # fmt: skip
             return
@@ -163,7 +193,9 @@ def swings(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
             least = complex(decaying[0]), moment.time
     if e.loops and np.isfinite(least[0].real):
         yield Diagnostic(
-            "note", "actuators", f"stable; the mode that lasts longest is {shown(least[0])}, at t = {least[1]:.3g} s"
+            "note",
+            "actuators",
+            f"stable; the mode that lasts longest is {shown(least[0])}, at t = {least[1]:.3g} s",
         )
     if e.file.solver.step is not None:
         yield from steps(e, e.file.solver.step, fastest, flight(e, there[0].scene))
@@ -176,17 +208,23 @@ def shown(mode: complex) -> str:
 
 
 def flight(e: Estimate, scene: Scene) -> float:
-    """The largest speed over its size [1/s] with which a body that starts in the air reaches a pad."""
+    """The largest speed over its size [1/s] with which a body that starts in the air reaches a
+    pad."""
     most = 0.0
     for key, contact in scene.rig.contacts.items():
         body = e.file.bodies[contact.body]
         fall = 2 * e.file.gravity * max(0.0, -scene.pressed(key)) if body.weighted else 0.0
-        most = max(most, (body.start.v_x**2 + body.start.v_y**2 + fall) ** 0.5 / scene.shape(contact.body).size())
+        most = max(
+            most,
+            (body.start.v_x**2 + body.start.v_y**2 + fall) ** 0.5
+            / scene.shape(contact.body).size(),
+        )
     return most
 
 
 def steps(e: Estimate, step: float, fastest: float, flies: float) -> Iterator[Diagnostic]:
-    """Equal steps that are too long for the rig's modes, its motions, or a body that comes flying."""
+    """Equal steps that are too long for the rig's modes, its motions, or a body that comes
+    flying."""
     limits: list[tuple[float, str]] = []
     for name, motion in e.file.motion.items():
         if isinstance(motion, ProfileTable) and len(motion.times) > 1:
@@ -197,12 +235,19 @@ def steps(e: Estimate, step: float, fastest: float, flies: float) -> Iterator[Di
         why = f"a body comes flying and may be through a pad between two of them; take {PASSED / flies:.2g} s or less"
         limits.append((PASSED / flies, why))
     swinging = {f"a mode of the rig swings with {fastest:.3g} rad/s": fastest}
-    swinging |= {f"motion.{k} goes up to {m.fastest():g} Hz": 2 * np.pi * m.fastest() for k, m in e.file.motion.items()}
+    swinging |= {
+        f"motion.{k} goes up to {m.fastest():g} Hz": 2 * np.pi * m.fastest()
+        for k, m in e.file.motion.items()
+    }
     for cause, w in swinging.items():
         if w > 0:
             most = 2 * np.pi / w / STEPS_PER_PERIOD
             limits.append(
-                (most, f"{cause}, and {STEPS_PER_PERIOD} steps a period take {most:.2g} s; take shorter ones")
+                (
+                    most,
+                    f"{cause}, and {STEPS_PER_PERIOD} steps a period take {most:.2g} s; take "
+                    "shorter ones",
+                )
             )
     for most, why in limits:
         if step > most:
@@ -220,4 +265,6 @@ def slips(e: Estimate, there: list[Moment]) -> Iterator[Diagnostic]:
             continue
         force = max(float(m.state.pads[contact.pad][0].norm(dim=-1).max()) for m in there)
         if why := contact.law.jumps(force / float(rig.weight(key).max())):
-            yield Diagnostic("warning", f"laws.{e.file.contacts[key].law}.friction", f"{why}; raise v_s or eta")
+            yield Diagnostic(
+                "warning", f"laws.{e.file.contacts[key].law}.friction", f"{why}; raise v_s or eta"
+            )

@@ -1,5 +1,5 @@
-"""A rig file: tables, from TOML or from Python, and what is built from them: the rig with its reference, its state at the
-start, and the times of its outputs."""
+"""A rig file: tables, from TOML or from Python, and what is built from them: the rig with its
+reference, its state at the start, and the times of its outputs."""
 
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -38,7 +38,8 @@ UPWARDS = 0.1
 """Least upward part of the normal of a pad that something may rest on."""
 
 STIFF = 100.0
-"""How many times as stiff as a point of the pad a contact may be for statics to be sure of balance."""
+"""How many times as stiff as a point of the pad a contact may be for statics to be sure of
+balance."""
 
 REFERENCES = (
     ("pads", "material", "materials"), ("pads", "base", "bodies"), ("contacts", "pad", "pads"),
@@ -57,10 +58,14 @@ class OutputsTable(Group):
     """How long the run lasts, and what is written."""
 
     duration: Annotated[float, Quantity("s", 1e-3, 1e5)] = Field(description="of the run")
-    interval: Annotated[float, Quantity("s", 1e-6, 1e3)] = Field(default=0.01, description="between outputs")
+    interval: Annotated[float, Quantity("s", 1e-6, 1e3)] = Field(
+        default=0.01, description="between outputs"
+    )
     figures: bool = Field(default=True, description="write the figures")
     snapshots: Annotated[tuple[Time, ...], LISTED, Field(max_length=12)] = Field(
-        default=(), description="times of the pictures in snapshots.png; six over the whole run if none is given [s]"
+        default=(),
+        description="times of the pictures in snapshots.png; six over the whole run if none is "
+        "given [s]",
     )
     video: Literal["gif", "mp4", "none"] = Field(
         default="gif", description="kind of the video; mp4 needs imageio-ffmpeg"
@@ -69,17 +74,27 @@ class OutputsTable(Group):
         default=150, description="pictures of the video, 12 a second"
     )
     follow: str = Field(
-        default="", description='coordinate under the video, such as "disc.x"; the one that moves most if not given'
+        default="",
+        description='coordinate under the video, such as "disc.x"; the one that moves most if not '
+        "given",
     )
 
     @model_validator(mode="after")
     def _are_possible(self) -> Self:
         if self.interval > self.duration:
-            raise ValueError(f"interval = {self.interval:g} s is longer than duration = {self.duration:g} s")
+            raise ValueError(
+                f"interval = {self.interval:g} s is longer than duration = {self.duration:g} s"
+            )
         if self.duration / self.interval > ROWS:
-            raise ValueError(f"interval = {self.interval:g} s makes more than {ROWS} outputs in {self.duration:g} s")
+            raise ValueError(
+                f"interval = {self.interval:g} s makes more than {ROWS} outputs in "
+                f"{self.duration:g} s"
+            )
         if late := [time for time in self.snapshots if time > self.duration]:
-            raise ValueError(f"snapshots: {late[0]:g} s is after the end of the run, duration = {self.duration:g} s")
+            raise ValueError(
+                f"snapshots: {late[0]:g} s is after the end of the run, duration = "
+                f"{self.duration:g} s"
+            )
         return self
 
     def times(self) -> Tensor:
@@ -97,7 +112,8 @@ class SolverTable(Group):
         default=None, description="relative tolerance; 1e-5 if not given"
     )
     atol: Annotated[float, Quantity("1", 1e-12, 1.0)] | None = Field(
-        default=None, description="absolute tolerance, in N, mm and rad; a tenth of rtol if not given"
+        default=None,
+        description="absolute tolerance, in N, mm and rad; a tenth of rtol if not given",
     )
     step: Annotated[float, Quantity("s", 1e-7, 1.0)] | None = Field(
         default=None, description="equal steps no longer than this instead"
@@ -109,12 +125,15 @@ class SolverTable(Group):
     @model_validator(mode="after")
     def _choose_once(self) -> Self:
         if self.step is not None and (self.rtol or self.atol) is not None:
-            raise ValueError("step and rtol (or atol) each say which steps to take; give one of them")
+            raise ValueError(
+                "step and rtol (or atol) each say which steps to take; give one of them"
+            )
         return self
 
 
 class BuiltRig(NamedTuple):
-    """A rig with what it follows, its state y0 (size,) at the start, and the times t (T,) [s] of the outputs."""
+    """A rig with what it follows, its state y0 (size,) at the start, and the times t (T,) [s] of
+    the outputs."""
 
     rig: Rig
     y0: Tensor
@@ -122,8 +141,8 @@ class BuiltRig(NamedTuple):
 
 
 class RigFile(Group):
-    """A rig and its run. SI units throughout: m, kg, s, N, rad, Pa; 4.59e-3 is 4.59 mm. The model is planar: x to the right, y
-    upwards, theta anticlockwise."""
+    """A rig and its run. SI units throughout: m, kg, s, N, rad, Pa; 4.59e-3 is 4.59 mm. The model
+    is planar: x to the right, y upwards, theta anticlockwise."""
 
     title: str = Field(default="", description="what it is")
     gravity: Gravity = Field(default=9.81, description="acts downwards")
@@ -141,7 +160,8 @@ class RigFile(Group):
 
     @classmethod
     def from_toml(cls, path: str | Path) -> Self:
-        """Read from a TOML file. Raises `ValueError` in one sentence with the file and the field, and `OSError`."""
+        """Read from a TOML file. Raises `ValueError` in one sentence with the file and the field,
+        and `OSError`."""
         file = from_toml(path, cls.from_tree)
         file._folder = Path(path).parent
         return file
@@ -154,8 +174,9 @@ class RigFile(Group):
         return cls.model_validate(tree)
 
     def override(self, **groups: dict[str, Any]) -> Self:
-        """Another file with some fields replaced: `override(outputs={"duration": 0.1}, pads={"lower": {"elements_x": 30}})`.
-        A table of another kind replaces the whole of the old one. Raises `ValueError`."""
+        """Another file with some fields replaced: `override(outputs={"duration": 0.1},
+        pads={"lower": {"elements_x": 30}})`. A table of another kind replaces the whole of the old
+        one. Raises `ValueError`."""
 
         def merged(old: Any, new: Any) -> Any:
             both = isinstance(old, dict) and isinstance(new, dict)
@@ -184,8 +205,13 @@ class RigFile(Group):
         return [loop for name, one in groups for loop in one.loops(name)]
 
     def followers(self) -> dict[str, list[tuple[str, str]]]:
-        """What follows each motion: roles ("setpoint", "feed_forward" or "driven") and coordinates by the motion's name."""
-        fed = [(one.feed_forward, "feed_forward", one.pushes) for one in self.actuators.values() if one.feed_forward]
+        """What follows each motion: roles ("setpoint", "feed_forward" or "driven") and coordinates
+        by the motion's name."""
+        fed = [
+            (one.feed_forward, "feed_forward", one.pushes)
+            for one in self.actuators.values()
+            if one.feed_forward
+        ]
         driven = [f"{body}.{axis}" for body, axis, kind in self.coordinates() if kind == "driven"]
         out: dict[str, list[tuple[str, str]]] = {}
         for motion, role, coordinate in (
@@ -199,17 +225,34 @@ class RigFile(Group):
         """Unit of a motion, from what follows it."""
         (role, coordinate), *_ = self.followers()[motion]
         return (
-            coordinate_unit(coordinate) if role != "feed_forward" else "N.m" if coordinate.endswith(".theta") else "N"
+            coordinate_unit(coordinate)
+            if role != "feed_forward"
+            else "N.m"
+            if coordinate.endswith(".theta")
+            else "N"
         )
 
     @model_validator(mode="after")
     def _names_are_names(self) -> Self:
-        for group in ("bodies", "materials", "pads", "laws", "contacts", "actuators", "controllers"):
+        for group in (
+            "bodies",
+            "materials",
+            "pads",
+            "laws",
+            "contacts",
+            "actuators",
+            "controllers",
+        ):
             for name in getattr(self, group):
                 if name in TAKEN:
-                    raise ValueError(f"{group}.{line(name, 80)}: the name is taken by torch; take another one")
+                    raise ValueError(
+                        f"{group}.{line(name, 80)}: the name is taken by torch; take another one"
+                    )
                 if not NAME.fullmatch(name):
-                    raise ValueError(f"{group}.{line(name, 80)}: the name should be letters, digits and underscores")
+                    raise ValueError(
+                        f"{group}.{line(name, 80)}: the name should be letters, digits and "
+                        "underscores"
+                    )
         return self
 
     @model_validator(mode="after")
@@ -220,22 +263,29 @@ class RigFile(Group):
                 name = getattr(table, field)
                 if name is not None and name not in there:
                     raise ValueError(
-                        f"{group}.{key}.{field}: there is no `{line(name, 80)}` among {others}; there is "
-                        f"{', '.join(there) or 'nothing'}"
+                        f"{group}.{key}.{field}: there is no `{line(name, 80)}` among {others}; "
+                        f"there is {', '.join(there) or 'nothing'}"
                     )
         for name, pad in self.pads.items():
-            if pad.inertial and pad.base is not None and not isinstance(self.bodies[pad.base].theta, float):
+            if (
+                pad.inertial
+                and pad.base is not None
+                and not isinstance(self.bodies[pad.base].theta, float)
+            ):
                 raise ValueError(
-                    f"pads.{name}.inertial: the base `{pad.base}` may turn, which inertial pads cannot; fix its theta"
+                    f"pads.{name}.inertial: the base `{pad.base}` may turn, which inertial pads "
+                    "cannot; fix its theta"
                 )
         for name, contact in self.contacts.items():
             if self.bodies[contact.body].shape is None:
                 raise ValueError(
-                    f"contacts.{name}.body: `{contact.body}` has no shape to touch anything with; give it one"
+                    f"contacts.{name}.body: `{contact.body}` has no shape to touch anything with; "
+                    "give it one"
                 )
             if self.pads[contact.pad].base == contact.body:
                 raise ValueError(
-                    f"contacts.{name}: the pad `{contact.pad}` is bonded to the body `{contact.body}` itself"
+                    f"contacts.{name}: the pad `{contact.pad}` is bonded to the body "
+                    f"`{contact.body}` itself"
                 )
         for group, (others, field, why) in USED.items():
             named = {getattr(other, field) for other in getattr(self, others).values()}
@@ -253,7 +303,10 @@ class RigFile(Group):
                         self._check_coordinate(f"{group}.{name}.{field}", coordinate)
         for name, one in self.controllers.items():
             for taken in sorted(one.actuators(name).keys() & self.actuators.keys()):
-                raise ValueError(f"controllers.{name}: one of its efforts would be called `{taken}`, as an actuator is")
+                raise ValueError(
+                    f"controllers.{name}: one of its efforts would be called `{taken}`, as an "
+                    "actuator is"
+                )
         return self
 
     def _check_coordinate(self, field: str, coordinate: str) -> None:
@@ -261,12 +314,15 @@ class RigFile(Group):
         kinds = {f"{body}.{axis}": kind for body, axis, kind in self.coordinates()}
         if coordinate not in kinds:
             there = ", ".join(name for name, kind in kinds.items() if kind == "free") or "none"
-            raise ValueError(f"{field}: `{line(coordinate, 80)}` is not a coordinate; free ones are {there}")
+            raise ValueError(
+                f"{field}: `{line(coordinate, 80)}` is not a coordinate; free ones are {there}"
+            )
         if (kind := kinds[coordinate]) != "free":
             how = "driven by its motion" if kind == "driven" else f"fixed at {kind:g}"
             verb = "push" if field.endswith("pushes") else "learn"
             raise ValueError(
-                f"{field}: {coordinate} is {how}, so that there is nothing to {verb}; make it free, or leave this out"
+                f"{field}: {coordinate} is {how}, so that there is nothing to {verb}; make it "
+                "free, or leave this out"
             )
 
     @model_validator(mode="after")
@@ -276,24 +332,29 @@ class RigFile(Group):
             role, coordinate = who[0]
             if name not in self.motion:
                 why = {
-                    "setpoint": f"{coordinate} is to follow it", "feed_forward": f"{coordinate} is to be pushed by it",
+                    "setpoint": f"{coordinate} is to follow it", "feed_forward": f"{coordinate} is "
+                                                                                 "to be pushed by "
+                                                                                 "it",
                     "driven": "the coordinate is driven by it",
                 }[role]  # fmt: skip
                 raise ValueError(f"motion.{line(name, 80)} is missing: {why}")
             if len({(r == "feed_forward", c.endswith(".theta")) for r, c in who}) > 1:
                 raise ValueError(
-                    f"motion.{name} would be in two units: {' and '.join(f'{r} of {c}' for r, c in who)} use it"
+                    f"motion.{name} would be in two units: "
+                    f"{' and '.join(f'{r} of {c}' for r, c in who)} use it"
                 )
         for name in self.motion:
             if name not in followers:
                 raise ValueError(
-                    f"motion.{line(name, 80)}: nothing follows it; name it as setpoint or feed_forward of an actuator, or make "
+                    f"motion.{line(name, 80)}: nothing follows it; name it as setpoint or "
+                    "feed_forward of an actuator, or make "
                     'a coordinate of that name "driven"'
                 )
         return self
 
     def assemble(self) -> Rig:
-        """The rig without a reference. Raises `ValueError` with the field's name for parts that are not physical."""
+        """The rig without a reference. Raises `ValueError` with the field's name for parts that are
+        not physical."""
         folder = self.folder
 
         def made(group: str, build: Callable[[Any], M]) -> dict[str, M]:
@@ -307,7 +368,9 @@ class RigFile(Group):
         for name, one in self.controllers.items():
             with at_field(f"controllers.{name}"):
                 actuators |= one.build(name, folder)
-        materials, laws = (made(group, lambda one: one.build(folder)) for group in ("materials", "laws"))
+        materials, laws = (
+            made(group, lambda one: one.build(folder)) for group in ("materials", "laws")
+        )
         return Rig(
             bodies=made("bodies", lambda one: one.build(folder)),
             pads=made("pads", lambda one: one.build(materials[one.material], folder)),
@@ -321,18 +384,26 @@ class RigFile(Group):
     def build(self) -> BuiltRig:
         """What the file describes, ready for `simulate(rig, t, y0=y0)`.
 
-        Pads are settled around the bodies where these start. Raises `ValueError` with the field's name: for motions that cannot
-        be, recorded ones that cannot be read, bodies that find no rest, and bodies too deep in a pad for it to settle.
+        Pads are settled around the bodies where these start. Raises `ValueError` with the field's
+        name: for motions that cannot be, recorded ones that cannot be read, bodies that find no
+        rest, and bodies too deep in a pad for it to settle.
         """
-        known = {name: self._signal(name, None) for name, who in self.followers().items() if who[0][0] == "driven"}
+        known = {
+            name: self._signal(name, None)
+            for name, who in self.followers().items()
+            if who[0][0] == "driven"
+        }
         rig, zero = self.assemble(), torch.zeros((), dtype=torch.float64)
         pose = self._starts(rig, {name: float(one(zero)[0]) for name, one in known.items()})
-        rig.reference = Reference(**{name: known.get(name) or self._signal(name, pose) for name in self.motion})
+        rig.reference = Reference(
+            **{name: known.get(name) or self._signal(name, pose) for name in self.motion}
+        )
         try:
             y0 = standing(rig, {name: torch.from_numpy(at) for name, at in pose.items()})
         except NoEquilibrium as error:
             raise ValueError(
-                too_stiff(self, rig) or f"bodies: the pads cannot settle where bodies start: {error}"
+                too_stiff(self, rig)
+                or f"bodies: the pads cannot settle where bodies start: {error}"
             ) from None
         for name, body in self.bodies.items():
             rates = [v for v, axis in zip(body.start.velocity, COORDINATES) if axis in body.free]
@@ -341,7 +412,9 @@ class RigFile(Group):
 
     def _signal(self, name: str, pose: Mapping[str, Array] | None) -> Piecewise:
         """One motion, with bodies that start at `pose` (3,)."""
-        setpoints = {coordinate for role, coordinate in self.followers()[name] if role == "setpoint"}
+        setpoints = {
+            coordinate for role, coordinate in self.followers()[name] if role == "setpoint"
+        }
         start = None
         if pose is not None and len(setpoints) == 1:
             body, _, axis = setpoints.pop().partition(".")
@@ -354,12 +427,15 @@ class RigFile(Group):
             raise ValueError(f"{prefix}{error}") from None
 
     def _starts(self, rig: Rig, driven: Mapping[str, float]) -> dict[str, Array]:
-        """Poses (3,) [m, m, rad] by body at the start, solved for where bodies rest; `driven` are the driven ones'."""
+        """Poses (3,) [m, m, rad] by body at the start, solved for where bodies rest; `driven` are
+        the driven ones'."""
         pose = {name: np.zeros(3) for name in self.bodies}
         wanted: dict[str, list[int]] = {}
         for name, axis, kind in self.coordinates():
             free = getattr(self.bodies[name].start, axis)
-            place = free if kind == "free" else driven[f"{name}.{axis}"] if kind == "driven" else kind
+            place = (
+                free if kind == "free" else driven[f"{name}.{axis}"] if kind == "driven" else kind
+            )
             if place == REST:
                 wanted.setdefault(name, []).append(COORDINATES.index(axis))
             else:
@@ -371,30 +447,39 @@ class RigFile(Group):
                 pose[name][1] = above(Scene(rig, pose), name)
         places = {name: torch.from_numpy(at) for name, at in pose.items()}
         try:
-            found = resting(rig, places, wanted, signals=torch.zeros(len(rig.signals), 2).double(), actuators=())
+            found = resting(
+                rig, places, wanted, signals=torch.zeros(len(rig.signals), 2).double(), actuators=()
+            )
         except NoEquilibrium as error:
             name, (axis, *_) = next(iter(wanted.items()))
-            raise ValueError(too_stiff(self, rig) or f"bodies.{name}.start.{COORDINATES[axis]}: {error}") from None
+            raise ValueError(
+                too_stiff(self, rig) or f"bodies.{name}.start.{COORDINATES[axis]}: {error}"
+            ) from None
         return {name: at.numpy() for name, at in found.items()}
 
 
 def too_stiff(file: RigFile, rig: Rig) -> str:
-    """The law of a contact so much stiffer than its pad that its force is rounding of its depth; empty if there is none."""
+    """The law of a contact so much stiffer than its pad that its force is rounding of its depth;
+    empty if there is none."""
     for name, contact in rig.contacts.items():
         give = float(rig.pads[contact.pad].compliance().diagonal().max())
         ratio = float((rig.weight(name) * contact.law.K_n).max()) * give
         if ratio > STIFF:
             law, K_n = file.contacts[name].law, contact.law.K_n.item()
             return (
-                f"laws.{law}.K_n: no rest is found with {K_n:g} N/m, {ratio:.2g} times as stiff as the pad `{contact.pad}`"
-                f" that it presses; take {K_n * STIFF / ratio:.1g} N/m or less, the pad gives way long before the contact does"
+                f"laws.{law}.K_n: no rest is found with {K_n:g} N/m, {ratio:.2g} times as stiff as "
+                f"the pad `{contact.pad}` that it presses; take {K_n * STIFF / ratio:.1g} N/m or "
+                "less, the pad gives way long before the contact does"
             )
     return ""
 
 
 def above(scene: Scene, body: str) -> float:
-    """A height [m] at which a body is clear of the pads under it. Raises `ValueError` where there is none."""
-    below, *beside = (scene.reach(body, np.array(way)) for way in ([0.0, -1.0], [-1.0, 0.0], [1.0, 0.0]))
+    """A height [m] at which a body is clear of the pads under it. Raises `ValueError` where there
+    is none."""
+    below, *beside = (
+        scene.reach(body, np.array(way)) for way in ([0.0, -1.0], [-1.0, 0.0], [1.0, 0.0])
+    )
     x, heights = float(scene.pose[body][0]), []
     for key, contact in scene.rig.contacts.items():
         at, pad = scene.points(key), scene.pad(key)
@@ -404,14 +489,15 @@ def above(scene: Scene, body: str) -> float:
         under = at[(at[:, 0] > x - beside[0]) & (at[:, 0] < x + beside[1])]
         if not len(under):
             raise ValueError(
-                f"bodies.{body}.shape: {1e3 * sum(beside):.3g} mm wide, it falls between points of `{contact.pad}`, which"
-                f" are {1e3 * float(pad.point_lengths.max()):.3g} mm apart; make it larger, or give pads.{contact.pad} more "
-                "elements or points"
+                f"bodies.{body}.shape: {1e3 * sum(beside):.3g} mm wide, it falls between points of "
+                f"`{contact.pad}`, which are {1e3 * float(pad.point_lengths.max()):.3g} mm apart; "
+                f"make it larger, or give pads.{contact.pad} more elements or points"
             )
         heights.append(float(under[:, 1].max()) + below)
     if not heights:
         raise ValueError(
-            f'bodies.{body}.start.y: "{REST}", but no pad that it has a contact with lies under x = {x:g} m; '
+            f'bodies.{body}.start.y: "{REST}", but no pad that it has a contact with lies under x '
+            f"= {x:g} m; "
             "place it over one, or say at which height it starts"
         )
     return max(heights)

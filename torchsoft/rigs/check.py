@@ -1,6 +1,8 @@
-"""What is wrong or dangerous in a rig file, said before any run: findings, each with its severity, its field and a sentence.
+"""What is wrong or dangerous in a rig file, said before any run: findings, each with its severity,
+its field and a sentence.
 
-Every check is a function of the estimated course of the bodies. What comes of the rig in balance is in `balance`.
+Every check is a function of the estimated course of the bodies. What comes of the rig in balance is
+in `balance`.
 """
 
 import itertools
@@ -48,7 +50,8 @@ def check(file: RigFile) -> list[Diagnostic]:
 
 
 def ties(e: Estimate) -> Iterator[Diagnostic]:
-    """Loops that measure a body which they cannot move, and efforts of controllers that move nothing of what these see."""
+    """Loops that measure a body which they cannot move, and efforts of controllers that move
+    nothing of what these see."""
     graph = tied(e.rig, e.rig.contacts)
     wanted = [(one.field, one.pushes, (one.measured,)) for one in e.loops]
     wanted += [
@@ -61,8 +64,9 @@ def ties(e: Estimate) -> Iterator[Diagnostic]:
         if not any(nx.has_path(graph, body, at(pushed)[0]) for body in bodies):
             yield Diagnostic(
                 "error", field,
-                f"it measures {', '.join(measured)} and pushes {pushed}, but no pad and contact tie `{at(pushed)[0]}` to "
-                f"`{'`, `'.join(bodies)}`: whatever it does, it moves nothing that it sees; add a contact, or measure {pushed}",
+                f"it measures {', '.join(measured)} and pushes {pushed}, but no pad and contact "
+                f"tie `{at(pushed)[0]}` to `{'`, `'.join(bodies)}`: whatever it does, it moves "
+                f"nothing that it sees; add a contact, or measure {pushed}",
             )  # fmt: skip
 
 
@@ -76,8 +80,9 @@ def recordings(e: Estimate) -> Iterator[Diagnostic]:
             if last < e.file.outputs.duration * (1 - 1e-9):
                 yield Diagnostic(
                     "error", f"motion.{name}.file",
-                    f"{motion.file} ends at {last:g} s, but the run lasts until {e.file.outputs.duration:g} s: nothing says "
-                    f"what is wanted then; shorten outputs.duration to {last:g}, or record longer",
+                    f"{motion.file} ends at {last:g} s, but the run lasts until "
+                    f"{e.file.outputs.duration:g} s: nothing says what is wanted then; shorten "
+                    f"outputs.duration to {last:g}, or record longer",
                 )  # fmt: skip
             if first > 0:
                 sentence = f"{motion.file} begins at {first:g} s; until then its first value holds"
@@ -85,8 +90,8 @@ def recordings(e: Estimate) -> Iterator[Diagnostic]:
         if fastest * interval * OUTPUTS_PER_PERIOD > 1:
             yield Diagnostic(
                 "warning", "outputs.interval",
-                f"outputs every {interval:g} s do not show motion.{name}, which goes up to {fastest:g} Hz; take "
-                f"{1 / (OUTPUTS_PER_PERIOD * fastest):.2g} s or less",
+                f"outputs every {interval:g} s do not show motion.{name}, which goes up to "
+                f"{fastest:g} Hz; take {1 / (OUTPUTS_PER_PERIOD * fastest):.2g} s or less",
             )  # fmt: skip
 
 
@@ -98,10 +103,14 @@ def jumps(e: Estimate) -> Iterator[Diagnostic]:
         unit, here, wanted = e.file.unit(loop.setpoint), e.start[body][axis], values[loop.setpoint]
         if abs(wanted - here) > JUMP[unit]:
             state = e.rig.unpack(e.y0, followed)
-            efforts = [float(e.rig.actuator_effort(name, state, followed).detach()) for name in loop.actuators]
+            efforts = [
+                float(e.rig.actuator_effort(name, state, followed).detach())
+                for name in loop.actuators
+            ]
             yield Diagnostic(
                 "warning", f"motion.{loop.setpoint}",
-                f"it begins at {wanted:.6g} {unit}, but {loop.measured} at {here:.6g} {unit}: `{loop.field}` pushes "
+                f"it begins at {wanted:.6g} {unit}, but {loop.measured} at {here:.6g} {unit}: "
+                f"`{loop.field}` pushes "
                 f'with {max(map(abs, efforts)):.3g} at once; begin at "start"',
             )  # fmt: skip
 
@@ -112,33 +121,57 @@ def carried(e: Estimate) -> Iterator[Diagnostic]:
     pushed = {one.pushes for one in e.file.actuators.values()}
     pushed |= {coordinate for one in e.file.controllers.values() for coordinate in one.pushes}
     for name, body in e.file.bodies.items():
-        if e.file.gravity == 0 or not body.weighted or "y" not in body.free or f"{name}.y" in pushed:
+        if (
+            e.file.gravity == 0
+            or not body.weighted
+            or "y" not in body.free
+            or f"{name}.y" in pushed
+        ):
             continue
-        own, place = [key for key, contact in e.rig.contacts.items() if contact.body == name], e.start[name][:2]
+        own, place = (
+            [key for key, contact in e.rig.contacts.items() if contact.body == name],
+            e.start[name][:2],
+        )
         over = {key: s for key in own if (s := scene.surface(key)).off(place) < 0}
-        if any((s.normal[1] > 0.3 and s.depth(place) < 0) or scene.pressed(key) > 0 for key, s in over.items()):
+        if any(
+            (s.normal[1] > 0.3 and s.depth(place) < 0) or scene.pressed(key) > 0
+            for key, s in over.items()
+        ):
             continue
-        why = "no pad that it has a contact with lies under it" if own else "it has no contact with any pad"
+        why = (
+            "no pad that it has a contact with lies under it"
+            if own
+            else "it has no contact with any pad"
+        )
         yield Diagnostic(
             "error", f"bodies.{name}",
-            f"nothing carries it: {why}, no actuator pushes {name}.y, and gravity pulls; it would fall out of the picture. Put "
-            "a pad with a contact under it, fix y, or say weighted = false",
+            f"nothing carries it: {why}, no actuator pushes {name}.y, and gravity pulls; it would "
+            "fall out of the picture. Put a pad with a contact under it, fix y, or say weighted = "
+            "false",
         )  # fmt: skip
 
 
 def overlaps(e: Estimate) -> Iterator[Diagnostic]:
-    """Things that lie in each other without a contact between them: at the start, and those whose course is known later."""
+    """Things that lie in each other without a contact between them: at the start, and those whose
+    course is known later."""
     said, rig = set[tuple[str, str]](), e.rig
     contacts = {(contact.pad, contact.body) for contact in rig.contacts.values()}
     for time, scene in e.course:
-        sure = [name for name, body in rig.bodies.items() if body.shape is not None and (time == 0 or e.known(name))]
+        sure = [
+            name
+            for name, body in rig.bodies.items()
+            if body.shape is not None and (time == 0 or e.known(name))
+        ]
         depths = {
-            (f"bodies.{a}", f"bodies.{b}"): max(scene.inside(b, scene.outline(a)), scene.inside(a, scene.outline(b)))
+            (f"bodies.{a}", f"bodies.{b}"): max(
+                scene.inside(b, scene.outline(a)), scene.inside(a, scene.outline(b))
+            )
             for a, b in itertools.combinations(sure, 2)
         }
         depths |= {
             (f"bodies.{body}", f"pads.{name}"): scene.inside(body, nodes(pad, scene.pose))
-            for body in sure for name, pad in rig.pads.items() if (name, body) not in contacts and pad.base != body
+            for body in sure for name,
+            pad in rig.pads.items() if (name, body) not in contacts and pad.base != body
         }  # fmt: skip
         depths |= {
             (f"pads.{a}", f"pads.{b}"): collision(rig.pads[a], rig.pads[b], scene.pose)
@@ -149,8 +182,9 @@ def overlaps(e: Estimate) -> Iterator[Diagnostic]:
                 said.add((one, other))
                 yield Diagnostic(
                     "error", one,
-                    f"it and {other} overlap by {1e3 * depth:.3g} mm at t = {time:.3g} s, and no contact is between them: they "
-                    "would pass through each other; move one of them, or let a pad be between",
+                    f"it and {other} overlap by {1e3 * depth:.3g} mm at t = {time:.3g} s, and no "
+                    "contact is between them: they would pass through each other; move one of "
+                    "them, or let a pad be between",
                 )  # fmt: skip
 
 
@@ -164,9 +198,10 @@ def corners(e: Estimate) -> Iterator[Diagnostic]:
         if sharpest < spacing:
             yield Diagnostic(
                 "warning", f"bodies.{contact.body}.shape",
-                f"its sharpest corner has a radius of {1e3 * sharpest:.3g} mm, but the contact points of `{contact.pad}` "
-                f"are up to {1e3 * spacing:.3g} mm apart: forces jump as it goes from one to the next; round it more, or give "
-                f"pads.{contact.pad} more elements or points",
+                f"its sharpest corner has a radius of {1e3 * sharpest:.3g} mm, but the contact "
+                f"points of `{contact.pad}` are up to {1e3 * spacing:.3g} mm apart: forces jump as "
+                f"it goes from one to the next; round it more, or give pads.{contact.pad} more "
+                "elements or points",
             )  # fmt: skip
 
 
@@ -185,15 +220,19 @@ def unreachable(e: Estimate) -> Iterator[Diagnostic]:
             near = min(-scene.pressed(key) for _, scene in e.course)
             yield Diagnostic(
                 "warning", f"contacts.{key}",
-                f"it cannot close: `{contact.body}` comes no nearer to `{contact.pad}` than {near:.3g} m; change "
-                f"pads.{contact.pad}.origin, the starts or the motions, or leave the contact out",
+                f"it cannot close: `{contact.body}` comes no nearer to `{contact.pad}` than "
+                f"{near:.3g} m; change pads.{contact.pad}.origin, the starts or the motions, or "
+                "leave the contact out",
             )  # fmt: skip
 
 
 def wanders(e: Estimate) -> dict[str, Array]:
-    """How far bodies may go in x and y (2,) [m] besides their course: along a coordinate that no motion holds, with the others
-    and the pads, and as they are thrown or fall."""
-    travel = sum(float(np.ptp([scene.pose[name][:2] for _, scene in e.course], 0).sum()) for name in e.rig.bodies)
+    """How far bodies may go in x and y (2,) [m] besides their course: along a coordinate that no
+    motion holds, with the others and the pads, and as they are thrown or fall."""
+    travel = sum(
+        float(np.ptp([scene.pose[name][:2] for _, scene in e.course], 0).sum())
+        for name in e.rig.bodies
+    )
     travel += sum(pad.mesh.length + pad.mesh.height for pad in e.rig.pads.values())
     out = {}
     for name, body in e.file.bodies.items():
@@ -204,8 +243,8 @@ def wanders(e: Estimate) -> dict[str, Array]:
 
 
 def departures(e: Estimate) -> Iterator[Diagnostic]:
-    """Motions that take a body past the end of a pad that it had touched. A body that no motion holds may be anywhere on
-    the pad opposite."""
+    """Motions that take a body past the end of a pad that it had touched. A body that no motion
+    holds may be anywhere on the pad opposite."""
     closed, said = set[str](), set[str]()
     for time, scene in e.course:
         closed |= {key for key in e.rig.contacts if scene.pressed(key) > 0}
@@ -216,15 +255,25 @@ def departures(e: Estimate) -> Iterator[Diagnostic]:
                 scene.pad(other).base: (face.middle, face.half) for other, face in at_pads.items()
                 if e.rig.contacts[other].body == body and face.faces(own)
             }  # fmt: skip
-            off = {by: own.off(middle) - half for by, (middle, half) in there.items() if holds(e, by, own)}
+            off = {
+                by: own.off(middle) - half
+                for by, (middle, half) in there.items()
+                if holds(e, by, own)
+            }
             presses = own.depth(scene.pose[body][:2]) + scene.reach(body, -own.normal) > 0
-            if body not in said and presses and holds(e, base, own) and max(off.values(), default=0.0) > 0:
+            if (
+                body not in said
+                and presses
+                and holds(e, base, own)
+                and max(off.values(), default=0.0) > 0
+            ):
                 said.add(body)
                 by = max(off, key=lambda one: off[one])
                 yield Diagnostic(
                     "warning", f"motion.{mover(e, scene, {by, base})}",
-                    f"at t = {time:.3g} s it has taken `{body}` {off[by]:.3g} m past the end of `{e.rig.contacts[key].pad}`, "
-                    f"which contacts.{key} presses until then; let it go less far, or take a longer pad",
+                    f"at t = {time:.3g} s it has taken `{body}` {off[by]:.3g} m past the end of "
+                    f"`{e.rig.contacts[key].pad}`, which contacts.{key} presses until then; let it "
+                    "go less far, or take a longer pad",
                 )  # fmt: skip
 
 
@@ -236,31 +285,41 @@ def crossings(e: Estimate) -> Iterator[Diagnostic]:
                 a, b = (scene.surface(key) for key in pair)
                 if a.depth(b.middle) > a.height and a.off(b.middle) < b.half and a.faces(b):
                     yield Diagnostic(
-                        "error", f"motion.{mover(e, scene, {body, *(scene.pad(key).base for key in pair)})}",
-                        f"at t = {time:.3g} s it has taken the pads of contacts.{pair[0]} and contacts.{pair[1]} through "
-                        f"each other, and through `{body}` between them; let it go less far",
+                        "error",
+                        f"motion.{mover(e, scene, {body, *(scene.pad(key).base for key in pair)})}",
+                        f"at t = {time:.3g} s it has taken the pads of contacts.{pair[0]} and "
+                        f"contacts.{pair[1]} through each other, and through `{body}` between "
+                        "them; let it go less far",
                     )  # fmt: skip
                     break
 
 
 def holds(e: Estimate, body: str | None, on: Surface) -> bool:
     """Whether motions or fixed values hold a body along a surface; they do the ground."""
-    return body is None or not any(abs(on.along[axis]) > 0.1 and e.is_own(body, axis) for axis in (0, 1))
+    return body is None or not any(
+        abs(on.along[axis]) > 0.1 and e.is_own(body, axis) for axis in (0, 1)
+    )
 
 
 def mover(e: Estimate, scene: Scene, bodies: set[str | None]) -> str:
     """The motion that has taken some bodies furthest."""
     follow = {one.measured: one.setpoint for one in e.loops}
-    follow |= {f"{body}.{axis}": f"{body}.{axis}" for body, axis, kind in e.file.coordinates() if kind == "driven"}
+    follow |= {
+        f"{body}.{axis}": f"{body}.{axis}"
+        for body, axis, kind in e.file.coordinates()
+        if kind == "driven"
+    }
     way = {
         name: abs(scene.pose[body][axis] - e.start[body][axis])
-        for coordinate, name in follow.items() for body, axis in [at(coordinate)] if body in bodies and axis < 2
+        for coordinate, name in follow.items() for body,
+        axis in [at(coordinate)] if body in bodies and axis < 2
     }  # fmt: skip
     return max(way, key=lambda name: way[name])
 
 
 def overloads(e: Estimate) -> Iterator[Diagnostic]:
-    """Efforts that would press the pads of a body in too far, however they were spread over them."""
+    """Efforts that would press the pads of a body in too far, however they were spread over
+    them."""
     for actuator in e.file.actuators.values():
         body, axis = at(actuator.pushes)
         pads = {
@@ -270,24 +329,33 @@ def overloads(e: Estimate) -> Iterator[Diagnostic]:
         }
         if actuator.feed_forward is None or axis == 2 or not pads:
             continue
-        effort, time = max((abs(signals(e.rig, time)[actuator.feed_forward]), time) for time in e.knots())
-        most = sum(map(bears, pads.values())) + actuator.Kp * max(pad.mesh.height for pad in pads.values())
+        effort, time = max(
+            (abs(signals(e.rig, time)[actuator.feed_forward]), time) for time in e.knots()
+        )
+        most = sum(map(bears, pads.values())) + actuator.Kp * max(
+            pad.mesh.height for pad in pads.values()
+        )
         if effort > most:
             yield Diagnostic(
                 "error", f"motion.{actuator.feed_forward}",
-                f"at t = {time:.3g} s it pushes `{body}` with {effort:.3g} N, but {most:.3g} N press its pads in by "
-                f"{COMPRESSED:.0%} of their height wherever they touch, far beyond linear elasticity; push less, or take "
-                "stiffer pads",
+                f"at t = {time:.3g} s it pushes `{body}` with {effort:.3g} N, but {most:.3g} N "
+                f"press its pads in by {COMPRESSED:.0%} of their height wherever they touch, far "
+                "beyond linear elasticity; push less, or take stiffer pads",
             )  # fmt: skip
 
 
 def bears(pad: Pad) -> float:
     """The force [N] that presses the whole face of a pad in by the most that can be run."""
     C = pad.compliance().detach()[1::2, 1::2]
-    return float(torch.linalg.solve(C, torch.ones(len(C), dtype=C.dtype)).sum()) * COMPRESSED * pad.mesh.height
+    return (
+        float(torch.linalg.solve(C, torch.ones(len(C), dtype=C.dtype)).sum())
+        * COMPRESSED
+        * pad.mesh.height
+    )
 
 
 CHECKS: tuple[Callable[[Estimate], Iterator[Diagnostic]], ...] = (
-    ties, recordings, jumps, carried, overlaps, corners, unreachable, departures, crossings, overloads,
+    ties, recordings, jumps, carried, overlaps, corners, unreachable, departures, crossings,
+    overloads,
 )  # fmt: skip
 """Another check is one more of these."""

@@ -1,4 +1,5 @@
-"""Actuators of a rig file: PD loops, networks, efforts that are fed forward, and controllers of several coordinates.
+"""Actuators of a rig file: PD loops, networks, efforts that are fed forward, and controllers of
+several coordinates.
 
 Networks come from files of weights: data that are computed with, never programs that are run.
 """
@@ -29,8 +30,8 @@ LARGEST = 10e6
 """Size [B] of a file of weights at the most."""
 
 PYTHON = (
-    "a module of another kind is given in Python: torchsoft.Actuator(measures, pushes, module, setpoint=...) or "
-    "torchsoft.controller(module, ...)"
+    "a module of another kind is given in Python: torchsoft.Actuator(measures, pushes, module, "
+    "setpoint=...) or torchsoft.controller(module, ...)"
 )
 
 LOOP = "set-point", "its rate", "coordinate", "its rate"
@@ -38,20 +39,27 @@ LOOP = "set-point", "its rate", "coordinate", "its rate"
 
 
 class NetworkPD(PD):
-    """A PD law and a network of (set-point, its rate, coordinate, its rate), whose efforts [N or N.m] are added."""
+    """A PD law and a network of (set-point, its rate, coordinate, its rate), whose efforts [N or
+    N.m] are added."""
 
     def __init__(self, Kp: float, Kd: float, network: nn.Module, reversed: bool = False) -> None:
         super().__init__(Kp, Kd)
         self.network, self.sign = network, -1.0 if reversed else 1.0
 
-    def forward(self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor) -> Tensor:
+    def forward(
+        self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor
+    ) -> Tensor:
         loop = self.Kp * (w - q) + self.Kd * (w_dot - q_dot)
-        return self.sign * loop + self.network(torch.stack((w, w_dot, q, q_dot), -1))[..., 0] + feed_forward
+        return (
+            self.sign * loop
+            + self.network(torch.stack((w, w_dot, q, q_dot), -1))[..., 0]
+            + feed_forward
+        )
 
 
 class FedNetwork(nn.Module):
-    """State feedback and a network of (set-points, their rates, coordinates, their rates), whose efforts [N or N.m] are added;
-    either may be missing."""
+    """State feedback and a network of (set-points, their rates, coordinates, their rates), whose
+    efforts [N or N.m] are added; either may be missing."""
 
     def __init__(self, feedback: StateFeedback | None, network: nn.Module | None) -> None:
         super().__init__()
@@ -66,20 +74,23 @@ class FedNetwork(nn.Module):
 
 
 def read_network(path: Path, inputs: Sequence[str], efforts: int = 1) -> nn.Sequential:
-    """Linear layers with tanh between them from an .npz file of their weights and biases, with the names of torch's
-    `Sequential(Linear, Tanh, Linear, ...)`: 0.weight, 0.bias, 2.weight, ... `inputs` are the words for what it sees.
+    """Linear layers with tanh between them from an .npz file of their weights and biases, with the
+    names of torch's `Sequential(Linear, Tanh, Linear, ...)`: 0.weight, 0.bias, 2.weight, ...
+    `inputs` are the words for what it sees.
 
     Raises `ValueError` naming the file for another kind of file, names or shapes, and `OSError`.
     """
     if path.suffix != ".npz":
         raise ValueError(
-            f"{path} is not an .npz file: weights are data, and other files may be programs, which are not run; save them by "
-            f"numpy.savez(file, **network.state_dict()). {PYTHON}"
+            f"{path} is not an .npz file: weights are data, and other files may be programs, which "
+            f"are not run; save them by numpy.savez(file, **network.state_dict()). {PYTHON}"
         )
     check_file(path, LARGEST)
     try:
         if declared(path) > WEIGHTS:
-            raise ValueError(f"it has more than {WEIGHTS} numbers, which are too many to be compiled")
+            raise ValueError(
+                f"it has more than {WEIGHTS} numbers, which are too many to be compiled"
+            )
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: np.asarray(file[name]) for name in file.files}
     except (ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
@@ -91,7 +102,8 @@ def read_network(path: Path, inputs: Sequence[str], efforts: int = 1) -> nn.Sequ
 
 
 def declared(path: Path) -> int:
-    """Numbers that the headings of an .npz file declare, before any is read. Raises `ValueError` for another kind of file."""
+    """Numbers that the headings of an .npz file declare, before any is read. Raises `ValueError`
+    for another kind of file."""
     total = 0
     with zipfile.ZipFile(path) as archive:
         for info in archive.infolist():
@@ -99,18 +111,26 @@ def declared(path: Path) -> int:
                 return WEIGHTS + 1
             member = io.BytesIO(archive.read(info))
             version = np.lib.format.read_magic(member)
-            read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            read = (
+                np.lib.format.read_array_header_1_0
+                if version == (1, 0)
+                else np.lib.format.read_array_header_2_0
+            )
             total += prod(read(member)[0])
     return total
 
 
 def layers(arrays: dict[str, np.ndarray], inputs: Sequence[str], efforts: int) -> nn.Sequential:
     """Raises `ValueError` for what is no network of such layers."""
-    found = sorted(int(name[1]) for name in (re.fullmatch(r"(\d{1,3})\.weight", name) for name in arrays) if name)
+    found = sorted(
+        int(name[1])
+        for name in (re.fullmatch(r"(\d{1,3})\.weight", name) for name in arrays)
+        if name
+    )
     if not found or {*arrays} != {f"{i}.{part}" for i in found for part in ("weight", "bias")}:
         raise ValueError(
-            f"it has {', '.join(line(name, 40) for name in arrays) or 'nothing'}, but a network has 0.weight, 0.bias, "
-            "2.weight, 2.bias and so on: linear layers with tanh between them"
+            f"it has {', '.join(line(name, 40) for name in arrays) or 'nothing'}, but a network "
+            "has 0.weight, 0.bias, 2.weight, 2.bias and so on: linear layers with tanh between them"
         )
     if sum(array.size for array in arrays.values()) > WEIGHTS:
         raise ValueError(f"it has more than {WEIGHTS} numbers, which are too many to be compiled")
@@ -126,8 +146,9 @@ def layers(arrays: dict[str, np.ndarray], inputs: Sequence[str], efforts: int) -
         ):
             raise ValueError(
                 f"{i}.weight has the shape {weight.shape} and {i}.bias {bias.shape}, but must have "
-                f"({efforts if last else 'n'}, {width}) and ({efforts if last else 'n'},): from {len(inputs)} inputs "
-                f"({', '.join(inputs)}) to {'one effort' if efforts == 1 else f'{efforts} efforts'}"
+                f"({efforts if last else 'n'}, {width}) and ({efforts if last else 'n'},): from "
+                f"{len(inputs)} inputs ({', '.join(inputs)}) to "
+                f"{'one effort' if efforts == 1 else f'{efforts} efforts'}"
             )
         for name, array in (("weight", weight), ("bias", bias)):
             if array.dtype.kind not in "iuf" or not np.isfinite(array).all():
@@ -147,7 +168,8 @@ Rows = Annotated[tuple[Annotated[tuple[Gains, ...], LISTED], ...], LISTED]
 
 
 class Loop(NamedTuple):
-    """A coordinate that is to follow a motion: the field that says so, what is pushed for it, by actuators of the rig."""
+    """A coordinate that is to follow a motion: the field that says so, what is pushed for it, by
+    actuators of the rig."""
 
     field: str
     measured: str
@@ -157,15 +179,18 @@ class Loop(NamedTuple):
 
 
 class ActuatorTable(Group):
-    """An effort on one free coordinate, Kp (w - q) + Kd (w' - q') + network(w, w', q, q') + what is fed forward. The coordinate
-    q that it measures may be another one, of another body, and of another kind: "disc.theta" through "bracket.x"."""
+    """An effort on one free coordinate, Kp (w - q) + Kd (w' - q') + network(w, w', q, q') + what is
+    fed forward. The coordinate q that it measures may be another one, of another body, and of
+    another kind: "disc.theta" through "bracket.x"."""
 
     pushes: str = Field(description='the coordinate that it pushes, such as "bracket.x"')
     measures: str | None = Field(
-        default=None, description="the coordinate q that it measures; the one that it pushes if not given"
+        default=None,
+        description="the coordinate q that it measures; the one that it pushes if not given",
     )
     setpoint: str | None = Field(
-        default=None, description="name of the motion w that q is to follow; none: no loop, only feed_forward"
+        default=None,
+        description="name of the motion w that q is to follow; none: no loop, only feed_forward",
     )
     feed_forward: str | None = Field(
         default=None, description="name of the motion that is added as an effort [N or N.m]"
@@ -173,12 +198,14 @@ class ActuatorTable(Group):
     Kp: ProportionalGain = Field(default=0.0, description="proportional gain")
     Kd: DerivativeGain = Field(default=0.0, description="derivative gain")
     reversed: bool = Field(
-        default=False, description="the gains push the other way, for a q that falls where the pushed coordinate rises"
+        default=False,
+        description="the gains push the other way, for a q that falls where the pushed coordinate "
+        "rises",
     )
     network: str | None = Field(
         default=None,
-        description="an .npz file of weights, from the folder of this one: layers 0.weight, 0.bias, 2.weight, ... with tanh "
-        "between them, from w, w', q, q' in SI units to an effort",
+        description="an .npz file of weights, from the folder of this one: layers 0.weight, "
+        "0.bias, 2.weight, ... with tanh between them, from w, w', q, q' in SI units to an effort",
     )
 
     @model_validator(mode="after")
@@ -186,10 +213,14 @@ class ActuatorTable(Group):
         if self.setpoint is None and (self.Kp or self.Kd):
             raise ValueError("setpoint is missing: the gains Kp and Kd need a motion to follow")
         if self.setpoint is None and self.network is not None:
-            raise ValueError("setpoint is missing: the network is one of a motion w and the coordinate that follows it")
+            raise ValueError(
+                "setpoint is missing: the network is one of a motion w and the coordinate that "
+                "follows it"
+            )
         if self.setpoint is not None and not (self.Kp or self.Kd or self.network):
             raise ValueError(
-                "Kp and Kd are both 0, so that the setpoint would have no effect; give a gain, or a network"
+                "Kp and Kd are both 0, so that the setpoint would have no effect; give a gain, or "
+                "a network"
             )
         if self.setpoint is None and self.feed_forward is None:
             raise ValueError("it does nothing: give a setpoint with gains, or feed_forward")
@@ -207,37 +238,49 @@ class ActuatorTable(Group):
 
     def build(self, folder: Path) -> Actuator:
         """The actuator; `folder` is where its network lies. Raises `ValueError`."""
-        followed = self.setpoint or self.feed_forward  # without gains it does not matter which signal is the set-point
+        followed = (
+            self.setpoint or self.feed_forward
+        )  # without gains it does not matter which signal is the set-point
         assert followed is not None
         law = ReversedPD(self.Kp, self.Kd) if self.reversed else PD(self.Kp, self.Kd)
         elements = ("C: Kp", "R: Kd")
         if self.network is not None:
             with at_field("network"):
-                law = NetworkPD(self.Kp, self.Kd, read_network(folder / self.network, LOOP), self.reversed)
+                law = NetworkPD(
+                    self.Kp, self.Kd, read_network(folder / self.network, LOOP), self.reversed
+                )
             elements = (*elements, "Se: network")
         return Actuator(
-            self.measured, self.pushes, law, setpoint=followed, feed_forward=self.feed_forward, elements=elements
+            self.measured, self.pushes, law, setpoint=followed, feed_forward=self.feed_forward,
+            elements=elements
         )  # fmt: skip
 
 
 class ControllerTable(Group):
-    """A law of several coordinates with several efforts: gain . (set-points less coordinates, and their rates) + network(...).
-    The efforts' actuators are called by the controller and by what they push: F_NAME_bracket_x of bracket.x."""
+    """A law of several coordinates with several efforts: gain . (set-points less coordinates, and
+    their rates) + network(...). The efforts' actuators are called by the controller and by what
+    they push: F_NAME_bracket_x of bracket.x."""
 
-    measures: Names = Field(min_length=1, description='coordinates that it sees, such as "disc.x", with their rates')
-    setpoints: Names = Field(
-        default=(), description="names of the motions that the first of these are to follow, in their order"
+    measures: Names = Field(
+        min_length=1, description='coordinates that it sees, such as "disc.x", with their rates'
     )
-    pushes: Names = Field(min_length=1, description="coordinates that it pushes, one for each effort")
+    setpoints: Names = Field(
+        default=(),
+        description="names of the motions that the first of these are to follow, in their order",
+    )
+    pushes: Names = Field(
+        min_length=1, description="coordinates that it pushes, one for each effort"
+    )
     gain: Rows | None = Field(
         default=None,
-        description="a row for each effort: gains of the coordinates' errors [N/m, N.m/rad, ...], then of their rates'; errors "
-        "are counted from zero where a coordinate has no set-point",
+        description="a row for each effort: gains of the coordinates' errors [N/m, N.m/rad, ...], "
+        "then of their rates'; errors are counted from zero where a coordinate has no set-point",
     )
     network: str | None = Field(
         default=None,
-        description="an .npz file of weights, from the folder of this one: layers 0.weight, 0.bias, 2.weight, ... with tanh "
-        "between them, from set-points, their rates, coordinates, their rates in SI units to the efforts",
+        description="an .npz file of weights, from the folder of this one: layers 0.weight, "
+        "0.bias, 2.weight, ... with tanh between them, from set-points, their rates, coordinates, "
+        "their rates in SI units to the efforts",
     )
 
     @model_validator(mode="after")
@@ -248,16 +291,23 @@ class ControllerTable(Group):
                 raise ValueError(f"{field}: every name once")
         if len(self.setpoints) > len(self.measures):
             raise ValueError(
-                f"setpoints: {len(self.setpoints)} motions, but it measures {len(self.measures)} coordinates to follow them"
+                f"setpoints: {len(self.setpoints)} motions, but it measures {len(self.measures)} "
+                "coordinates to follow them"
             )
         if self.gain is None and self.network is None:
             raise ValueError("it does nothing: give a gain, a network, or both")
-        if self.gain is not None and [len(row) for row in self.gain] != [2 * len(self.measures)] * len(self.pushes):
+        if self.gain is not None and [len(row) for row in self.gain] != [
+            2 * len(self.measures)
+        ] * len(self.pushes):
             raise ValueError(
-                f"gain: {len(self.pushes)} efforts of {len(self.measures)} coordinates and their rates need "
-                f"{len(self.pushes)} rows of {2 * len(self.measures)} numbers"
+                f"gain: {len(self.pushes)} efforts of {len(self.measures)} coordinates and their "
+                f"rates need {len(self.pushes)} rows of {2 * len(self.measures)} numbers"
             )
-        if self.gain is not None and not any(any(row) for row in self.gain) and self.network is None:
+        if (
+            self.gain is not None
+            and not any(any(row) for row in self.gain)
+            and self.network is None
+        ):
             raise ValueError("gain: all zeros, so that it does nothing")
         return self
 
@@ -266,15 +316,20 @@ class ControllerTable(Group):
         return {f"{name}_{pushed.replace('.', '_')}": pushed for pushed in self.pushes}
 
     def loops(self, name: str) -> list[Loop]:
-        """What follows what; pushed for it is the same coordinate where it is pushed, else one along the same axis, else the
-        first."""
+        """What follows what; pushed for it is the same coordinate where it is pushed, else one
+        along the same axis, else the first."""
 
         def towards(coordinate: str) -> str:
-            same = [one for one in self.pushes if one.partition(".")[2] == coordinate.partition(".")[2]]
+            same = [
+                one for one in self.pushes if one.partition(".")[2] == coordinate.partition(".")[2]
+            ]
             return coordinate if coordinate in self.pushes else (*same, *self.pushes)[0]
 
         field, made = f"controllers.{name}", tuple(self.actuators(name))
-        return [Loop(field, one, towards(one), motion, made) for one, motion in zip(self.measures, self.setpoints)]
+        return [
+            Loop(field, one, towards(one), motion, made)
+            for one, motion in zip(self.measures, self.setpoints)
+        ]
 
     def build(self, name: str, folder: Path) -> dict[str, Actuator]:
         """Its actuators; `folder` is where its network lies. Raises `ValueError`."""
@@ -285,5 +340,8 @@ class ControllerTable(Group):
                 network = read_network(folder / self.network, inputs, len(self.pushes))
         feedback = None if self.gain is None else StateFeedback(self.gain)
         return controller(
-            FedNetwork(feedback, network), measures=self.measures, setpoints=self.setpoints, pushes=self.actuators(name)
+            FedNetwork(feedback, network),
+            measures=self.measures,
+            setpoints=self.setpoints,
+            pushes=self.actuators(name),
         )

@@ -1,9 +1,10 @@
-"""Where bodies will be, before any run: what is driven, what loops follow, and what is gripped between two pads.
+"""Where bodies will be, before any run: what is driven, what loops follow, and what is gripped
+between two pads.
 
-Two estimates. By geometry alone, at any time: loops are taken to reach their set-points, a body between two pads that press
-it to be in their middle, and to go along with them if both are on bodies. By statics, at a few moments: loops and efforts
-that are fed forward press pads against bodies until both are in balance, without friction. Everything else is taken to stay
-where it is.
+Two estimates. By geometry alone, at any time: loops are taken to reach their set-points, a body
+between two pads that press it to be in their middle, and to go along with them if both are on
+bodies. By statics, at a few moments: loops and efforts that are fed forward press pads against
+bodies until both are in balance, without friction. Everything else is taken to stay where it is.
 """
 
 from functools import cached_property
@@ -37,7 +38,9 @@ class Estimate:
 
     def __init__(self, file: RigFile, ready: BuiltRig) -> None:
         self.file, self.rig, self.end = file, ready.rig, float(ready.t[-1])
-        self.start = {name: x.detach().numpy().copy() for name, x in self.rig.unpack(ready.y0).pose.items()}
+        self.start = {
+            name: x.detach().numpy().copy() for name, x in self.rig.unpack(ready.y0).pose.items()
+        }
         self.y0, self.loops = ready.y0, file.loops()
         self.measured = {one.measured for one in self.loops}
         self.unbalanced: dict[float, str] = {}
@@ -78,7 +81,9 @@ class Estimate:
             (body, axis), (pushed, other) = at(one.measured), at(one.pushes)
             pose[body][axis] = values[one.setpoint]
             if one.pushes not in self.measured and axis == other:  # it goes along
-                pose[pushed][axis] = self.start[pushed][axis] + values[one.setpoint] - self.start[body][axis]
+                pose[pushed][axis] = (
+                    self.start[pushed][axis] + values[one.setpoint] - self.start[body][axis]
+                )
         was, now = Scene(self.rig, before), Scene(self.rig, pose)
         for name in self.rig.bodies:
             self._carry(name, was, now)
@@ -89,21 +94,24 @@ class Estimate:
         return pose
 
     def _carry(self, name: str, was: Scene, now: Scene) -> None:
-        """Takes a body along with the two others between whose pads it was gripped: as they move in the mean."""
+        """Takes a body along with the two others between whose pads it was gripped: as they move in
+        the mean."""
         for pair in was.facing(name):
             bases = [base for key in pair if (base := was.pad(key).base) is not None]
             if len(bases) < 2 or min(was.pressed(key) for key in pair) <= 0:
                 continue
             old, new = (np.mean([scene.pose[base] for base in bases], 0) for scene in (was, now))
             turn = new[2] - old[2]
-            moved = np.append(new[:2] + turned(was.pose[name][:2] - old[:2], turn), was.pose[name][2] + turn)
+            moved = np.append(
+                new[:2] + turned(was.pose[name][:2] - old[:2], turn), was.pose[name][2] + turn
+            )
             own = [self.is_own(name, axis) for axis in range(3)]
             now.pose[name][own] = moved[own]
 
     @torch.no_grad()
     def balanced(self, time: float) -> dict[str, Array]:
-        """By statics: the coordinates in balance are those whose own loop pushes them, and bodies between pads along what these
-        press. By geometry where no balance is found."""
+        """By statics: the coordinates in balance are those whose own loop pushes them, and bodies
+        between pads along what these press. By geometry where no balance is found."""
         scene = Scene(self.rig, self(time))
         own = [name for name, one in self.file.actuators.items() if one.measured == one.pushes]
         freed = {at(self.file.actuators[name].pushes) for name in own}
@@ -117,14 +125,17 @@ class Estimate:
         followed = self.rig.follow(time) * torch.tensor([1.0, 0.0], dtype=torch.float64)
         pose = {name: torch.from_numpy(x) for name, x in scene.pose.items()}
         try:
-            found = resting(self.rig, pose, free, signals=followed, actuators=own, residual=BALANCED)
+            found = resting(
+                self.rig, pose, free, signals=followed, actuators=own, residual=BALANCED
+            )
         except NoEquilibrium as error:
             self.unbalanced[time] = str(error)
             return dict(scene.pose)
         return {name: x.numpy() for name, x in found.items()}
 
     def knots(self) -> list[float]:
-        """Times [s] at which motions begin or end, or are furthest out, and those of the run's begin and end."""
+        """Times [s] at which motions begin or end, or are furthest out, and those of the run's
+        begin and end."""
         found, fine = {0.0, self.end}, torch.linspace(0.0, self.end, 401, dtype=torch.float64)
         for name in self.rig.signals:
             one = self.rig.reference[name]
@@ -141,14 +152,19 @@ class Estimate:
         return [(float(time), Scene(self.rig, self(float(time)))) for time in times]
 
     def moments(self, most: int) -> list[float]:
-        """Up to so many of the knots [s] at which the rig is in different poses: the first, the one at which pads are pressed
-        most, and others."""
+        """Up to so many of the knots [s] at which the rig is in different poses: the first, the one
+        at which pads are pressed most, and others."""
         seen: list[tuple[float, Scene]] = []
         for time in self.knots():
             pose = self(time)
-            if not any(all(np.allclose(pose[k], old.pose[k], rtol=0, atol=1e-6) for k in pose) for _, old in seen):
+            if not any(
+                all(np.allclose(pose[k], old.pose[k], rtol=0, atol=1e-6) for k in pose)
+                for _, old in seen
+            ):
                 seen.append((time, Scene(self.rig, pose)))
-        grips = [max((scene.pressed(key) for key in self.rig.contacts), default=0.0) for _, scene in seen]
+        grips = [
+            max((scene.pressed(key) for key in self.rig.contacts), default=0.0) for _, scene in seen
+        ]
         spread = np.linspace(0, len(seen) - 1, min(most - 1, len(seen))).astype(int).tolist()
         return [seen[i][0] for i in sorted({0, int(np.argmax(grips)), *spread})][:most]
 

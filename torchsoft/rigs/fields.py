@@ -1,4 +1,5 @@
-"""Fields of rig files: tables made from constructors, numbers or words, and tables that know their own keys."""
+"""Fields of rig files: tables made from constructors, numbers or words, and tables that know their
+own keys."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -11,7 +12,13 @@ from operator import or_
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self, get_args, get_origin
 
-from pydantic import Field, GetCoreSchemaHandler, GetJsonSchemaHandler, create_model, model_validator
+from pydantic import (
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    create_model,
+    model_validator,
+)
 from pydantic_core import CoreSchema, core_schema
 
 from torchsoft.physics.validity import sound
@@ -35,7 +42,9 @@ def at_field(field: str) -> Iterator[None]:
     except Refused as error:
         raise Refused(f"{field}.{error.field}", error.sentence) from None
     except OSError as error:
-        raise Refused(field, f"{error.filename}: {error.strerror}" if error.filename else str(error)) from None
+        raise Refused(
+            field, f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        ) from None
     except (ValueError, NotImplementedError) as error:
         raise Refused(field, str(error)) from None
 
@@ -54,10 +63,14 @@ class NumberOr:
         said = ", ".join(f'"{word}"' for word in self.words)
         raise ValueError(f"should be {said} or a number [{self.unit}], not {shown(x)}")
 
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
         return core_schema.no_info_plain_validator_function(self.check)
 
-    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
         return {"anyOf": [{"enum": list(self.words)}, {"type": "number", "unit": self.unit}]}
 
 
@@ -71,7 +84,11 @@ class Group(Table):
             for key in data:
                 if key not in cls.model_fields:
                     near = get_close_matches(str(key), cls.model_fields, n=1)
-                    meant = f"is it `{near[0]}`?" if near else f"known are {', '.join(cls.model_fields)}"
+                    meant = (
+                        f"is it `{near[0]}`?"
+                        if near
+                        else f"known are {', '.join(cls.model_fields)}"
+                    )
                     raise ValueError(f"`{key}` is not known here; {meant}")
         return data
 
@@ -84,14 +101,18 @@ class Group(Table):
 
 
 class PartTable(Group):
-    """Table of a part: one field for each argument of its constructor, with the argument's quantity."""
+    """Table of a part: one field for each argument of its constructor, with the argument's
+    quantity."""
 
     part: ClassVar[Callable[..., Any]]
 
     def arguments(self, folder: Path) -> tuple[tuple[str, Any], ...]:
-        """Arguments of the constructor by name; `folder` is where a file that a table names lies."""
+        """Arguments of the constructor by name; `folder` is where a file that a table names
+        lies."""
         given = ((name, getattr(self, name)) for name in signature(self.part).parameters)
-        return tuple((name, one.build(folder) if isinstance(one, PartTable) else one) for name, one in given)
+        return tuple(
+            (name, one.build(folder) if isinstance(one, PartTable) else one) for name, one in given
+        )
 
     def build(self, folder: Path) -> Any:
         """The part, physical by itself. Raises `ValueError`."""
@@ -106,29 +127,39 @@ class PartTable(Group):
 
 @lru_cache(maxsize=32)
 def made(part: Callable[..., Any], arguments: tuple[tuple[str, Any], ...]) -> Any:
-    """A part, made once: what it logs is said once, and a contour takes a while. Raises `ValueError`."""
+    """A part, made once: what it logs is said once, and a contour takes a while. Raises
+    `ValueError`."""
     return sound(part(**dict(arguments)))
 
 
 def table_of(
     part: Callable[..., Any], kind: str = "", base: type[PartTable] = PartTable, **fields: Any
 ) -> type[PartTable]:
-    """The table of a part, called `kind` in files; `fields` are annotations, or defaults, in the place of the constructor's."""
+    """The table of a part, called `kind` in files; `fields` are annotations, or defaults, in the
+    place of the constructor's."""
     found: dict[str, Any] = {"kind": (Literal[kind], kind)} if kind else {}
     for name, argument in signature(part).parameters.items():
         given = fields.get(name, argument.default)
-        hint, default = (given, ...) if get_origin(given) is not None else (argument.annotation, given)
+        hint, default = (
+            (given, ...) if get_origin(given) is not None else (argument.annotation, given)
+        )
         declared = quantity(hint)
         texts = [one for one in metadata(hint) if isinstance(one, str)]
         meaning = texts[-1] if texts else declared.meaning if declared else None
-        found[name] = listed(hint), Field(... if default is argument.empty else default, description=meaning)
-    made = create_model(f"{getattr(part, '__name__', kind)}Table", __base__=base, __doc__=part.__doc__, **found)
+        found[name] = (
+            listed(hint),
+            Field(... if default is argument.empty else default, description=meaning),
+        )
+    made = create_model(
+        f"{getattr(part, '__name__', kind)}Table", __base__=base, __doc__=part.__doc__, **found
+    )
     made.part = part
     return made
 
 
 def listed(hint: Any) -> Any:
-    """The annotation of a field that lists what the constructor iterates over: a tuple, which TOML gives as a list."""
+    """The annotation of a field that lists what the constructor iterates over: a tuple, which TOML
+    gives as a list."""
     bare = get_args(hint)[0] if get_origin(hint) is Annotated else hint
     if get_origin(bare) is Iterable:
         (inner,), entry = get_args(bare), quantity(hint)
@@ -137,7 +168,9 @@ def listed(hint: Any) -> Any:
             if inner is float
             else listed(tuple[(Annotated[float, entry],) * len(get_args(inner))])
         )
-        return Annotated[tuple[one, ...], LISTED, Field(min_length=1, max_length=100_000), entry and entry.unit]
+        return Annotated[
+            tuple[one, ...], LISTED, Field(min_length=1, max_length=100_000), entry and entry.unit
+        ]
     return Annotated[hint, LISTED] if get_origin(bare) is tuple else hint
 
 

@@ -1,4 +1,5 @@
-"""Where things are: surfaces of pads and outlines of bodies in the world, gaps and overlaps, without any elasticity."""
+"""Where things are: surfaces of pads and outlines of bodies in the world, gaps and overlaps,
+without any elasticity."""
 
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
@@ -23,9 +24,9 @@ Poses = Mapping[str, Array]
 
 
 class Surface(NamedTuple):
-    """An undeformed pad in the world: the middle of its free surface, at its highest [m], outward normal, direction along it
-    (2,); half its length and its height [m]; the surface itself from left to right (nodes, 2) [m], along it from the middle
-    and outwards from there."""
+    """An undeformed pad in the world: the middle of its free surface, at its highest [m], outward
+    normal, direction along it (2,); half its length and its height [m]; the surface itself from
+    left to right (nodes, 2) [m], along it from the middle and outwards from there."""
 
     middle: Array
     normal: Array
@@ -35,7 +36,8 @@ class Surface(NamedTuple):
     profile: Array
 
     def depth(self, place: Array) -> Array:
-        """How deep places (..., 2) lie under the surface [m], along its middle's normal; negative above it."""
+        """How deep places (..., 2) lie under the surface [m], along its middle's normal; negative
+        above it."""
         outwards = np.interp((place - self.middle) @ self.along, *self.profile.T)
         return outwards - (place - self.middle) @ self.normal
 
@@ -66,9 +68,13 @@ def surface(pad: Pad, pose: Poses) -> Surface:
     own = mesh.nodes[mesh.free[mesh.surface]]
     left, right, top = own[:, 0].min(), own[:, 0].max(), own[:, 1].max()
     middle = np.array([0.5 * (left + right), top])
-    origin, along, normal = in_world(pad, pose, pad.placed(middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])))
+    origin, along, normal = in_world(
+        pad, pose, pad.placed(middle + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
+    )
     profile = (own - middle)[np.argsort(own[:, 0], kind="stable")]
-    return Surface(origin, normal - origin, along - origin, 0.5 * (right - left), mesh.height, profile)
+    return Surface(
+        origin, normal - origin, along - origin, 0.5 * (right - left), mesh.height, profile
+    )
 
 
 def nodes(pad: Pad, pose: Poses) -> Array:
@@ -81,8 +87,8 @@ PARTS = 32
 
 
 def collision(one: Pad, other: Pad, pose: Poses) -> float:
-    """Depth [m] of the deepest node, or point of a side, of two undeformed pads, which may be hollow, inside the other pad; 0
-    where they are apart."""
+    """Depth [m] of the deepest node, or point of a side, of two undeformed pads, which may be
+    hollow, inside the other pad; 0 where they are apart."""
     corners = [nodes(pad, pose)[pad.mesh.outline] for pad in (one, other)]
     parts = np.linspace(0.0, 1.0, PARTS, endpoint=False)[:, None, None]
     sides = [(ends + parts * (np.roll(ends, -1, 0) - ends)).reshape(-1, 2) for ends in corners]
@@ -90,8 +96,9 @@ def collision(one: Pad, other: Pad, pose: Poses) -> float:
 
 
 def depth_inside(places: Array, corners: Array) -> float:
-    """How far the innermost of some places (n, 2) inside a polygon (corners, 2) is from its sides; 0 where all are outside. A
-    line to the right of what is inside crosses the sides an odd number of times."""
+    """How far the innermost of some places (n, 2) inside a polygon (corners, 2) is from its sides;
+    0 where all are outside. A line to the right of what is inside crosses the sides an odd number
+    of times."""
     places = places[((places > corners.min(0)) & (places < corners.max(0))).all(1)]
     way = np.roll(corners, -1, 0) - corners
     to = places[:, None] - corners
@@ -129,15 +136,21 @@ class Scene(NamedTuple):
 
     def reach(self, body: str, direction: Array) -> float:
         """How far a body reaches from its centre along a unit vector of the world [m]."""
-        return float(self.shape(body).support(torch.from_numpy(turned(direction, -self.pose[body][2]))).detach())
+        return float(
+            self.shape(body)
+            .support(torch.from_numpy(turned(direction, -self.pose[body][2])))
+            .detach()
+        )
 
     def inside(self, body: str, places: Array) -> float:
-        """How deep the deepest of some places (n, 2) of the world is in a body [m]; negative where all are outside."""
+        """How deep the deepest of some places (n, 2) of the world is in a body [m]; negative where
+        all are outside."""
         own = turned(places - self.pose[body][:2], -self.pose[body][2])
         return -float(self.shape(body)(torch.from_numpy(own))[0].detach().min())
 
     def pressed(self, contact: str) -> float:
-        """How deep the undeformed pad of a contact is in the body [m]; negative where they are apart."""
+        """How deep the undeformed pad of a contact is in the body [m]; negative where they are
+        apart."""
         return self.inside(self.rig.contacts[contact].body, self.points(contact))
 
     def outline(self, body: str) -> Array:
@@ -150,7 +163,11 @@ class Scene(NamedTuple):
 
     def facing(self, body: str) -> list[tuple[str, str]]:
         """Pairs of contacts between whose pads, which face each other, a body is."""
-        at = {key: self.surface(key) for key, contact in self.rig.contacts.items() if contact.body == body}
+        at = {
+            key: self.surface(key)
+            for key, contact in self.rig.contacts.items()
+            if contact.body == body
+        }
         own = list(at)
         return [
             (a, b) for i, a in enumerate(own) for b in own[i + 1 :]
@@ -160,7 +177,8 @@ class Scene(NamedTuple):
 
 
 def tied(rig: Rig, contacts: Iterable[str]) -> nx.Graph:
-    """Bodies, with an edge where one of the contacts is between a body and a pad of the other; the ground ties nothing."""
+    """Bodies, with an edge where one of the contacts is between a body and a pad of the other; the
+    ground ties nothing."""
     graph = nx.Graph()
     graph.add_nodes_from(rig.bodies)
     pairs = ((rig.pads[rig.contacts[key].pad].base, rig.contacts[key].body) for key in contacts)

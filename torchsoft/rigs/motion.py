@@ -1,4 +1,5 @@
-"""Motions of a rig file: what loops follow, what is fed forward, and where driven coordinates go, as functions of time."""
+"""Motions of a rig file: what loops follow, what is fed forward, and where driven coordinates go,
+as functions of time."""
 
 import csv
 from itertools import pairwise
@@ -32,8 +33,9 @@ Frequency = Annotated[float, Quantity("Hz", 1e-6, 1e5)]
 
 
 class MotionContext(NamedTuple):
-    """What a motion is made for: its name, its unit, where the coordinate that follows it starts (None: no coordinate that is
-    free does), the end of the run [s], and the folder of the rig's file."""
+    """What a motion is made for: its name, its unit, where the coordinate that follows it starts
+    (None: no coordinate that is free does), the end of the run [s], and the folder of the rig's
+    file."""
 
     name: str
     unit: str
@@ -47,14 +49,16 @@ class MotionContext(NamedTuple):
             return value
         if self.start is None:
             raise ValueError(
-                f'motion.{self.name}.{field}: "{START}" stands for where the one free coordinate that follows a motion as its '
+                f'motion.{self.name}.{field}: "{START}" stands for where the one free coordinate '
+                "that follows a motion as its "
                 "set-point starts, and there is none such here; give a number"
             )
         return self.start
 
 
 class Motion(Group):
-    """A function of time, in m or rad where a coordinate follows it, in N or N.m where it is fed forward."""
+    """A function of time, in m or rad where a coordinate follows it, in N or N.m where it is fed
+    forward."""
 
     def build(self, asked: MotionContext) -> Piecewise:
         """The signal. Raises `ValueError` naming the field."""
@@ -69,7 +73,9 @@ class HoldTable(Motion):
     """Stays where it is."""
 
     kind: Literal["hold"] = "hold"
-    value: Value = Field(default=START, description=f'"{START}": where the coordinate that follows starts')
+    value: Value = Field(
+        default=START, description=f'"{START}": where the coordinate that follows starts'
+    )
 
     def build(self, asked: MotionContext) -> Piecewise:
         return Profile([0.0], [asked.value("value", self.value)])
@@ -79,13 +85,16 @@ class Knots(Motion):
     """Values at given times."""
 
     times: Times = Field(description="increasing; constant before the first and after the last [s]")
-    values: Values = Field(description=f'one per time; "{START}": where the coordinate that follows starts')
+    values: Values = Field(
+        description=f'one per time; "{START}": where the coordinate that follows starts'
+    )
 
     @model_validator(mode="after")
     def _are_pairs(self) -> Self:
         if len(self.times) != len(self.values):
             raise ValueError(
-                f"times has {len(self.times)} numbers, but values {len(self.values)}; give one value per time"
+                f"times has {len(self.times)} numbers, but values {len(self.values)}; give one "
+                "value per time"
             )
         for before, after in pairwise(self.times):
             if after <= before:
@@ -122,13 +131,17 @@ class SplineTable(Knots):
 class ModulatedMotion(Knots):
     """Waves on top of a profile, from `since` to `until`, where they come and go."""
 
-    times: Times = Field(default=(0.0,), description="of the profile that the waves are added to [s]")
+    times: Times = Field(
+        default=(0.0,), description="of the profile that the waves are added to [s]"
+    )
     values: Values = Field(
-        default=(START,), description=f'of the profile; "{START}": where the coordinate that follows starts'
+        default=(START,),
+        description=f'of the profile; "{START}": where the coordinate that follows starts',
     )
     since: Time = Field(default=0.0, description="when the waves begin; they come within 0.15 s")
     until: Time | None = Field(
-        default=None, description="when they have gone, again within 0.15 s; the end of the run if not given"
+        default=None,
+        description="when they have gone, again within 0.15 s; the end of the run if not given",
     )
 
     def window(self, asked: MotionContext) -> tuple[float, float]:
@@ -136,12 +149,13 @@ class ModulatedMotion(Knots):
         until = asked.end if self.until is None else self.until
         if not until - self.since > 2 * FADE:
             raise ValueError(
-                f"motion.{asked.name}.since = {self.since:g} s leaves {until - self.since:g} s until {until:g} s, but waves "
-                f"take {2 * FADE:g} s to come and go"
+                f"motion.{asked.name}.since = {self.since:g} s leaves {until - self.since:g} s "
+                f"until {until:g} s, but waves take {2 * FADE:g} s to come and go"
             )
         if self.fastest() * (until - self.since) > PERIODS:
             raise ValueError(
-                f"motion.{asked.name} has more than {PERIODS:g} periods; take a lower frequency or a shorter time"
+                f"motion.{asked.name} has more than {PERIODS:g} periods; take a lower frequency or "
+                "a shorter time"
             )
         return self.since, until
 
@@ -149,7 +163,9 @@ class ModulatedMotion(Knots):
 class ComponentTable(Group):
     """One sine."""
 
-    amplitude: Annotated[float, Quantity("m, rad, N or N.m", -1e6, 1e6)] = Field(description="amplitude")
+    amplitude: Annotated[float, Quantity("m, rad, N or N.m", -1e6, 1e6)] = Field(
+        description="amplitude"
+    )
     frequency: Frequency = Field(description="frequency")
     phase: Annotated[float, Quantity("rad", -1e3, 1e3)] = Field(default=0.0, description="phase")
 
@@ -158,15 +174,17 @@ class SinesTable(ModulatedMotion):
     """Sines on top of a profile."""
 
     kind: Literal["sines"] = "sines"
-    components: Annotated[tuple[ComponentTable, ...], LISTED, Field(min_length=1, max_length=100)] = Field(
-        description="amplitude, frequency [Hz] and phase [rad] of each sine"
-    )
+    components: Annotated[
+        tuple[ComponentTable, ...], LISTED, Field(min_length=1, max_length=100)
+    ] = Field(description="amplitude, frequency [Hz] and phase [rad] of each sine")
 
     def fastest(self) -> float:
         return max(one.frequency for one in self.components)
 
     def build(self, asked: MotionContext) -> Piecewise:
-        columns = np.array([(one.amplitude, one.frequency, 0.0, one.phase) for one in self.components]).T
+        columns = np.array(
+            [(one.amplitude, one.frequency, 0.0, one.phase) for one in self.components]
+        ).T
         return Waves(self.knots(asked), *self.window(asked), wave(*columns))
 
 
@@ -174,7 +192,9 @@ class ChirpTable(ModulatedMotion):
     """A sine on top of a profile, its frequency going from `first` to `last`."""
 
     kind: Literal["chirp"] = "chirp"
-    amplitude: Annotated[float, Quantity("m, rad, N or N.m", -1e6, 1e6)] = Field(description="amplitude")
+    amplitude: Annotated[float, Quantity("m, rad, N or N.m", -1e6, 1e6)] = Field(
+        description="amplitude"
+    )
     first: Frequency = Field(description="frequency at its begin")
     last: Frequency = Field(description="frequency at its end")
 
@@ -188,13 +208,15 @@ class ChirpTable(ModulatedMotion):
 
 
 class CsvTable(Motion):
-    """A recorded motion: a cubic spline through a column of a CSV file, with units in its heading: `t [s], x_d [mm]`."""
+    """A recorded motion: a cubic spline through a column of a CSV file, with units in its heading:
+    `t [s], x_d [mm]`."""
 
     kind: Literal["csv"] = "csv"
     file: str = Field(description="the file, from the folder of this one")
     column: str = Field(description="the column's name, without its unit")
     offset: Value = Field(
-        default=0.0, description=f'what is added; "{START}": where the coordinate that follows starts'
+        default=0.0,
+        description=f'what is added; "{START}": where the coordinate that follows starts',
     )
 
     def build(self, asked: MotionContext) -> Piecewise:
@@ -207,29 +229,38 @@ class CsvTable(Motion):
 
 
 def read_column(path: Path, column: str, unit: str) -> tuple[list[float], list[float]]:
-    """Times [s] and values, in SI units, of a column that is to be in `unit` or what is converted to it; other columns are
-    left out. Raises `ValueError` naming the file, the row (the heading is row 1) and the column.
+    """Times [s] and values, in SI units, of a column that is to be in `unit` or what is converted
+    to it; other columns are left out. Raises `ValueError` naming the file, the row (the heading is
+    row 1) and the column.
     """
     try:
         there = names(path)
         for name in ("t", column):
             if name not in there:
                 shown = ", ".join(f"`{line(one, 40)}`" for one in there) or "nothing"
-                raise ValueError(f"{path} has no column `{name} [{'s' if name == 't' else unit}]`; it has {shown}")
+                raise ValueError(
+                    f"{path} has no column `{name} [{'s' if name == 't' else unit}]`; it has "
+                    f"{shown}"
+                )
         known = {"t": UNITS["s"], column: UNITS[unit]}
-        table = csvfile.read(path, known, lambda *_: "", [name for name in there if name not in known])
+        table = csvfile.read(
+            path, known, lambda *_: "", [name for name in there if name not in known]
+        )
     except OSError as error:
         raise ValueError(f"{path}: {error.strerror}") from None
     times, values = table.values["t"], table.values[column]
     if len(times) < 2:
-        raise ValueError(f"{path} has {len(times)} rows of numbers, but a motion needs two at least")
+        raise ValueError(
+            f"{path} has {len(times)} rows of numbers, but a motion needs two at least"
+        )
     for name, one in (("t", times), (column, values)):
         if (empty := np.flatnonzero(np.isnan(one))).size:
             raise ValueError(f"{path}, row {table.rows[empty[0]]}, column `{name}` is empty")
     if (back := np.flatnonzero(np.diff(times) <= 0)).size:
         i = back[0]
         raise ValueError(
-            f"{path}, row {table.rows[i + 1]}, column `t`: {times[i + 1]:g} s follows {times[i]:g} s; times must increase"
+            f"{path}, row {table.rows[i + 1]}, column `t`: {times[i + 1]:g} s follows {times[i]:g} "
+            "s; times must increase"
         )
     return times.tolist(), values.tolist()
 
@@ -244,12 +275,14 @@ def names(path: Path) -> list[str]:
 
 
 MotionTable = Annotated[
-    HoldTable | ProfileTable | SplineTable | SinesTable | ChirpTable | CsvTable, Field(discriminator="kind")
+    HoldTable | ProfileTable | SplineTable | SinesTable | ChirpTable | CsvTable,
+    Field(discriminator="kind"),
 ]
 
 
 def flattened(motion: object, within: str = "") -> object:
-    """Motions by name, where TOML nests them: [motion.upper.y] is the motion of the coordinate "upper.y"."""
+    """Motions by name, where TOML nests them: [motion.upper.y] is the motion of the coordinate
+    "upper.y"."""
     if not isinstance(motion, dict):
         return motion
     out: dict[str, object] = {}

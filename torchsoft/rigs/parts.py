@@ -1,4 +1,5 @@
-"""Bodies with their shapes, materials, pads, laws and contacts of a rig file. Another kind is one more entry of its union."""
+"""Bodies with their shapes, materials, pads, laws and contacts of a rig file. Another kind is one
+more entry of its union."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -12,7 +13,14 @@ from torchsoft.physics.material import KINDS, Material
 from torchsoft.physics.mesh import CurvedPadMesh, FingertipMesh, Mesh, PadMesh, QuadMesh
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES, Body, Contact
-from torchsoft.physics.shapes import Circle, Contour, Ellipse, RoundedBox, RoundedPolygon, Superellipse
+from torchsoft.physics.shapes import (
+    Circle,
+    Contour,
+    Ellipse,
+    RoundedBox,
+    RoundedPolygon,
+    Superellipse,
+)
 from torchsoft.physics.shapes.contour import read_points
 from torchsoft.quantity import Angle, Density, Depth, Inertia, InertiaRatio, Mass, Place, Quantity
 from torchsoft.rigs.fields import Group, NumberOr, PartTable, at_field, one_of, table_of
@@ -20,9 +28,9 @@ from torchsoft.tables import LISTED, line, read_toml, refusing
 
 
 class ContourTable(PartTable):
-    """A smooth closed contour through the points of a CSV file with the columns x and y, which have units in their headings:
-    `x [mm],y [mm]`. They may be given about any point: the pose of the body is that of its centre of mass, and a note says
-    where that is among them."""
+    """A smooth closed contour through the points of a CSV file with the columns x and y, which have
+    units in their headings: `x [mm],y [mm]`. They may be given about any point: the pose of the
+    body is that of its centre of mass, and a note says where that is among them."""
 
     part = Contour
     kind: Literal["contour"] = "contour"
@@ -61,14 +69,18 @@ class StartTable(Group):
 
     x: Place | None = Field(default=None, description="centre of mass, to the right")
     y: Annotated[float | str | None, NumberOr("m", REST, optional=True)] = Field(
-        default=None, description='centre of mass, upwards; "rest": where it lies under its weight, the loops off'
+        default=None,
+        description='centre of mass, upwards; "rest": where it lies under its weight, the loops '
+        "off",
     )
     theta: Annotated[float | str | None, NumberOr("rad", REST, optional=True)] = Field(
         default=None, description='anticlockwise, 0 if not given; "rest" as for y'
     )
     v_x: Annotated[float, Quantity("m/s", -1e3, 1e3)] = Field(default=0.0, description="velocity")
     v_y: Annotated[float, Quantity("m/s", -1e3, 1e3)] = Field(default=0.0, description="velocity")
-    omega: Annotated[float, Quantity("rad/s", -1e5, 1e5)] = Field(default=0.0, description="angular velocity")
+    omega: Annotated[float, Quantity("rad/s", -1e5, 1e5)] = Field(
+        default=0.0, description="angular velocity"
+    )
 
     @property
     def velocity(self) -> tuple[float, float, float]:
@@ -76,30 +88,45 @@ class StartTable(Group):
 
 
 class BodyTable(Group):
-    """A rigid body: what is manipulated, or what carries a pad. Each coordinate is "free", "driven" by the motion of that name,
-    or a number at which it is fixed."""
+    """A rigid body: what is manipulated, or what carries a pad. Each coordinate is "free", "driven"
+    by the motion of that name, or a number at which it is fixed."""
 
     mass: Mass | None = Field(
-        default=None, description="mass, or density and depth; not needed where no coordinate is free"
+        default=None,
+        description="mass, or density and depth; not needed where no coordinate is free",
     )
     density: Density | None = Field(
-        default=None, description="density, which gives the mass of its shape; steel has 7800, aluminium 2700"
+        default=None,
+        description="density, which gives the mass of its shape; steel has 7800, aluminium 2700",
     )
-    depth: Depth | None = Field(default=None, description="how deep it is, out of the plane; goes with density")
-    x: Annotated[float | str, NumberOr("m", "free", "driven")] = Field(default="free", description="to the right")
-    y: Annotated[float | str, NumberOr("m", "free", "driven")] = Field(default="free", description="upwards")
+    depth: Depth | None = Field(
+        default=None, description="how deep it is, out of the plane; goes with density"
+    )
+    x: Annotated[float | str, NumberOr("m", "free", "driven")] = Field(
+        default="free", description="to the right"
+    )
+    y: Annotated[float | str, NumberOr("m", "free", "driven")] = Field(
+        default="free", description="upwards"
+    )
     theta: Annotated[float | str, NumberOr("rad", "free", "driven")] = Field(
         default="free", description="anticlockwise"
     )
-    inertia: Inertia | None = Field(default=None, description="moment of inertia; that of its shape if not given")
+    inertia: Inertia | None = Field(
+        default=None, description="moment of inertia; that of its shape if not given"
+    )
     inertia_ratio: InertiaRatio = Field(
-        default=1.0, description="moment of inertia over that of a body of uniform density, where inertia is not given"
+        default=1.0,
+        description="moment of inertia over that of a body of uniform density, where inertia is "
+        "not given",
     )
     weighted: bool = Field(default=True, description="whether gravity acts on it")
     symbol: str = Field(
-        default="", description="what its channels are called: x_SYMBOL and so on; its name if not given"
+        default="",
+        description="what its channels are called: x_SYMBOL and so on; its name if not given",
     )
-    shape: ShapeTable | None = Field(default=None, description="what touches pads; not needed where nothing touches it")
+    shape: ShapeTable | None = Field(
+        default=None, description="what touches pads; not needed where nothing touches it"
+    )
     start: StartTable = StartTable()
 
     @property
@@ -118,30 +145,47 @@ class BodyTable(Group):
             raise ValueError("mass and density each say how heavy it is; give one of them")
         if (self.density is None) != (self.depth is None):
             given, missing = ("density", "depth") if self.depth is None else ("depth", "density")
-            raise ValueError(f"{missing} is missing: {given} is given, and the mass is density times area times depth")
+            raise ValueError(
+                f"{missing} is missing: {given} is given, and the mass is density times area times "
+                "depth"
+            )
         if self.density is not None and self.shape is None:
-            raise ValueError("shape is missing: density is given, and the mass is density times its area times depth")
+            raise ValueError(
+                "shape is missing: density is given, and the mass is density times its area times "
+                "depth"
+            )
         if self.free and self.mass is None and self.density is None:
             raise ValueError(
-                f"mass is missing, but {' and '.join(self.free)} can move freely; give it, or density and depth"
+                f"mass is missing, but {' and '.join(self.free)} can move freely; give it, or "
+                "density and depth"
             )
         if self.inertia_ratio != 1.0 and (self.inertia is not None or self.shape is None):
-            raise ValueError("inertia_ratio has no effect beside inertia, or without a shape; leave it out")
+            raise ValueError(
+                "inertia_ratio has no effect beside inertia, or without a shape; leave it out"
+            )
         if "theta" in self.free and self.shape is None and self.inertia is None:
-            raise ValueError("inertia is missing: theta is free, and there is no shape to compute it from")
+            raise ValueError(
+                "inertia is missing: theta is free, and there is no shape to compute it from"
+            )
         for (axis, kind), rate in zip(self.freedom.items(), ("v_x", "v_y", "omega")):
             for name in (axis, rate):
                 if kind != "free" and getattr(self.start, name):
                     where = "the motion of that name" if kind == "driven" else "that number"
-                    raise ValueError(f"start.{name} has no meaning: {axis} is not free, and starts where {where} says")
+                    raise ValueError(
+                        f"start.{name} has no meaning: {axis} is not free, and starts where "
+                        f"{where} says"
+                    )
             if kind == "free" and axis != "theta" and getattr(self.start, axis) is None:
-                raise ValueError(f"start.{axis} is missing: {axis} is free, so say where it starts [m]")
+                raise ValueError(
+                    f"start.{axis} is missing: {axis} is free, so say where it starts [m]"
+                )
         return self
 
     def build(self, folder: Path) -> Body:
         """The body. Raises `ValueError`."""
         given: dict[str, Any] = {
-            "inertia": self.inertia, "inertia_ratio": self.inertia_ratio, "weighted": self.weighted, **self.freedom,
+            "inertia": self.inertia, "inertia_ratio": self.inertia_ratio, "weighted": self.weighted,
+            **self.freedom,
         }  # fmt: skip
         if self.shape is None:
             return Body(self.mass or 1.0, **given)
@@ -157,7 +201,8 @@ OWN = tuple(table_of(part, kind, nu=0.45, rho=1100.0) for kind, part in KINDS.it
 
 
 class PresetTable(Group):
-    """A rubber from the literature; `torchsoft material presets` lists them with the source of every coefficient."""
+    """A rubber from the literature; `torchsoft material presets` lists them with the source of
+    every coefficient."""
 
     kind: Literal["preset"] = "preset"
     name: str = Field(description='its name, such as "Dragon Skin 20"')
@@ -166,7 +211,9 @@ class PresetTable(Group):
     @model_validator(mode="after")
     def _is_known(self) -> Self:
         if self.name not in PRESETS:
-            raise ValueError(f"name: there is no preset `{line(self.name, 80)}`; there are {', '.join(PRESETS)}")
+            raise ValueError(
+                f"name: there is no preset `{line(self.name, 80)}`; there are {', '.join(PRESETS)}"
+            )
         return self
 
     def build(self, folder: Path) -> Material:
@@ -178,9 +225,12 @@ class FileTable(Group):
 
     kind: Literal["file"] = "file"
     file: str = Field(description="the file, from the folder of this one")
-    name: str | None = Field(default=None, description="which of its materials; not needed where it has one only")
+    name: str | None = Field(
+        default=None, description="which of its materials; not needed where it has one only"
+    )
     depth: Depth | None = Field(
-        default=None, description="depth of the pads, out of the plane; that of the file if not given"
+        default=None,
+        description="depth of the pads, out of the plane; that of the file if not given",
     )
 
     def build(self, folder: Path) -> Material:
@@ -190,11 +240,14 @@ class FileTable(Group):
             found = tree if isinstance(tree, dict) else {}
             if self.name is None and len(found) != 1:
                 raise ValueError(
-                    f"{path} has {len(found)} tables [materials.*]; say by name which one is meant, or one"
+                    f"{path} has {len(found)} tables [materials.*]; say by name which one is "
+                    "meant, or one"
                 )
             name = next(iter(found)) if self.name is None else self.name
             if name not in found:
-                raise ValueError(f"{path} has no [materials.{name}]; it has {', '.join(found) or 'none'}")
+                raise ValueError(
+                    f"{path} has no [materials.{name}]; it has {', '.join(found) or 'none'}"
+                )
             given = {} if self.depth is None else {"depth": self.depth}
             try:
                 with refusing(found[name], f"materials.{name}"):
@@ -215,24 +268,33 @@ else:
 
 
 class PadTable(PartTable):
-    """A soft pad, bonded to a body or to the ground. In its own frame its free surface looks up, along y; x goes along it."""
+    """A soft pad, bonded to a body or to the ground. In its own frame its free surface looks up,
+    along y; x goes along it."""
 
     material: str = Field(description="name of one of the materials")
-    base: str | None = Field(default=None, description="name of the body that it is bonded to; the ground if not given")
+    base: str | None = Field(
+        default=None, description="name of the body that it is bonded to; the ground if not given"
+    )
     origin: Annotated[tuple[Place, Place], LISTED] = Field(
         default=(0.0, 0.0), description="where its own origin is, in the base's own frame [m]"
     )
-    angle: Angle = Field(default=0.0, description="by which it is turned about its origin, anticlockwise")
-    mirrored: bool = Field(default=False, description="upside down: its free surface faces down (before it is turned)")
+    angle: Angle = Field(
+        default=0.0, description="by which it is turned about its origin, anticlockwise"
+    )
+    mirrored: bool = Field(
+        default=False, description="upside down: its free surface faces down (before it is turned)"
+    )
     inertial: bool = Field(
-        default=False, description="with mass at every node; true costs time and changes next to nothing"
+        default=False,
+        description="with mass at every node; true costs time and changes next to nothing",
     )
     points: Annotated[int, Field(ge=0, le=8)] = Field(
         default=0, description="contact points an element; 0 puts one on every node"
     )
 
     def mesh(self, folder: Path) -> Mesh:
-        """Finite elements; `folder` is where a file that a table names lies. Raises `ValueError`."""
+        """Finite elements; `folder` is where a file that a table names lies. Raises
+        `ValueError`."""
         mesh = PartTable.build(self, folder)
         mesh.check_memory()
         return mesh
@@ -242,12 +304,13 @@ class PadTable(PartTable):
         if self.inertial and material.branches > 1:
             with at_field("inertial"):
                 raise ValueError(
-                    f'an inertial pad has one retardation time (kind = "kelvin_voigt"), but `{self.material}` has '
+                    'an inertial pad has one retardation time (kind = "kelvin_voigt"), but '
+                    f"`{self.material}` has "
                     f"{material.branches}; say inertial = false, or take such a material"
                 )
         return Pad(
-            self.mesh(folder), material, base=self.base, origin=self.origin, angle=self.angle, mirrored=self.mirrored,
-            inertial=self.inertial, points=self.points,
+            self.mesh(folder), material, base=self.base, origin=self.origin, angle=self.angle,
+            mirrored=self.mirrored, inertial=self.inertial, points=self.points,
         )  # fmt: skip
 
     @model_validator(mode="after")
@@ -258,8 +321,8 @@ class PadTable(PartTable):
 
 
 class MeshTable(PadTable):
-    """A pad of quadrilaterals from a mesh file that meshio reads (gmsh, vtk, abaqus, ...), with named groups of lines; their
-    coordinates are its own frame, in which its face looks up."""
+    """A pad of quadrilaterals from a mesh file that meshio reads (gmsh, vtk, abaqus, ...), with
+    named groups of lines; their coordinates are its own frame, in which its face looks up."""
 
     part = QuadMesh.read
     kind: Literal["mesh"] = "mesh"
@@ -272,14 +335,20 @@ class MeshTable(PadTable):
 
     def mesh(self, folder: Path) -> Mesh:
         with at_field("file"):
-            mesh = QuadMesh.read(folder / self.file, unit=self.unit, face=self.face, bonded=self.bonded_edges)
+            mesh = QuadMesh.read(
+                folder / self.file, unit=self.unit, face=self.face, bonded=self.bonded_edges
+            )
             mesh.check_memory()
             return mesh
 
 
 def a_block_by_default(given: Any) -> Any:
     """A table without a kind is a block's."""
-    return {"kind": "block"} | dict(given) if isinstance(given, Mapping) and "kind" not in given else given
+    return (
+        {"kind": "block"} | dict(given)
+        if isinstance(given, Mapping) and "kind" not in given
+        else given
+    )
 
 
 if TYPE_CHECKING:
@@ -299,7 +368,9 @@ else:
 if TYPE_CHECKING:
     LawTable = PartTable
 else:
-    LawTable = table_of(SoftContact, friction=one_of(table_of(SmoothSlip, "smooth"), table_of(Coulomb, "coulomb")))
+    LawTable = table_of(
+        SoftContact, friction=one_of(table_of(SmoothSlip, "smooth"), table_of(Coulomb, "coulomb"))
+    )
 
 
 class ContactTable(Group):
@@ -309,7 +380,8 @@ class ContactTable(Group):
     body: str = Field(description="name of one of the bodies, with a shape")
     law: str = Field(description="name of one of the laws")
     may_leave: bool = Field(
-        default=False, description="true: the run goes on where the body leaves the space over the pad"
+        default=False,
+        description="true: the run goes on where the body leaves the space over the pad",
     )
 
     def build(self, laws: dict[str, SoftContact]) -> Contact:

@@ -1,4 +1,5 @@
-"""From a rig file to a folder of results: the trajectory, a summary in numbers with how it was made, figures and a video."""
+"""From a rig file to a folder of results: the trajectory, a summary in numbers with how it was
+made, figures and a video."""
 
 import time
 from importlib.metadata import version
@@ -40,13 +41,17 @@ class RunOutcome(NamedTuple):
 
 
 def carry_out(file: RigFile, *, progress: bool = False) -> RunOutcome:
-    """Simulate what a file describes. A failure and Ctrl-C end it early, with what was simulated until then.
+    """Simulate what a file describes. A failure and Ctrl-C end it early, with what was simulated
+    until then.
 
-    Raises `ValueError` for what cannot be built, and `KeyboardInterrupt` before anything was simulated.
+    Raises `ValueError` for what cannot be built, and `KeyboardInterrupt` before anything was
+    simulated.
     """
     ready = file.build()
     try:
-        run = simulate(ready.rig, ready.t, y0=ready.y0, **file.solver.model_dump(), progress=progress)
+        run = simulate(
+            ready.rig, ready.t, y0=ready.y0, **file.solver.model_dump(), progress=progress
+        )
     except (SimulationFailed, Interrupted) as stop:
         if stop.trajectory is None:
             raise
@@ -54,9 +59,12 @@ def carry_out(file: RigFile, *, progress: bool = False) -> RunOutcome:
     return RunOutcome(ready, run, None)
 
 
-def run(file: RigFile, out: Path, *, found: list[Diagnostic] | None = None, progress: bool = False) -> RunOutcome:
-    """Simulate and write everything to the folder `out`: data first, pictures only of a run that was not stopped. `found` are
-    the check's findings, for the summary. Raises `OSError` for a folder that cannot be made, and what `carry_out` does."""
+def run(
+    file: RigFile, out: Path, *, found: list[Diagnostic] | None = None, progress: bool = False
+) -> RunOutcome:
+    """Simulate and write everything to the folder `out`: data first, pictures only of a run that
+    was not stopped. `found` are the check's findings, for the summary. Raises `OSError` for a
+    folder that cannot be made, and what `carry_out` does."""
     began = time.perf_counter()
     make_folder(out)
     done = carry_out(file, progress=progress)
@@ -72,7 +80,13 @@ def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[st
     """The run in numbers, in SI units, and how it was made."""
     run, rig = done.trajectory, done.ready.rig
     stopped = done.stopped
-    why = None if stopped is None else stopped.reason if isinstance(stopped, SimulationFailed) else "interrupted"
+    why = (
+        None
+        if stopped is None
+        else stopped.reason
+        if isinstance(stopped, SimulationFailed)
+        else "interrupted"
+    )
     return {
         "title": file.title,
         "stopped": why,
@@ -88,10 +102,15 @@ def summary(file: RigFile, done: RunOutcome, found: list[Diagnostic]) -> dict[st
             for name, force in run.force.items()
         },
         "pads": {
-            name: {"largest_displacement_over_height": float(u.norm(dim=-1).max()) / rig.pads[name].mesh.height}
+            name: {
+                "largest_displacement_over_height": float(u.norm(dim=-1).max())
+                / rig.pads[name].mesh.height
+            }
             for name, u in run.displacement.items()
         },
-        "actuators": {name: {"largest_effort": float(run[f"F_{name}"].abs().max())} for name in rig.actuators},
+        "actuators": {
+            name: {"largest_effort": float(run[f"F_{name}"].abs().max())} for name in rig.actuators
+        },
         "energy": {
             "injected_J": float(run.injected[-1]),
             "dissipated_J": {name: float(work[-1]) for name, work in run.dissipated.items()},
@@ -116,15 +135,16 @@ def coordinates(rig: Rig, run: Trajectory, body: str) -> dict[str, dict[str, flo
 
 
 def condensing_time(mesh: Mesh) -> float:
-    """Time [s] for condensing a mesh onto its surface: a factorisation in the order of the smallest band, and as many solutions
-    as surface coordinates."""
+    """Time [s] for condensing a mesh onto its surface: a factorisation in the order of the smallest
+    band, and as many solutions as surface coordinates."""
     surface, free, band = mesh.counts()
     width = max(2 * min(band, free // band), SMALLEST_BLOCK)
     return 2 * free * width * (4 * width + 12 * surface) / FLOPS
 
 
 def cost(file: RigFile, runs: bool) -> Cost:
-    """Cost of a check, and of a run after it. Raises `ValueError` for a mesh file that cannot be read."""
+    """Cost of a check, and of a run after it. Raises `ValueError` for a mesh file that cannot be
+    read."""
     meshes = []
     for name, table in file.pads.items():
         with at_field(f"pads.{name}"):
@@ -138,14 +158,22 @@ def cost(file: RigFile, runs: bool) -> Cost:
             surface, free, _ = mesh.counts()
             points = table.points * surface
             seconds += 0.5 * steps * step_time(surface, points, free if table.inertial else 0)
-            memory += span / file.outputs.interval * row_bytes(free if table.inertial else surface, points) / 2**30
+            memory += (
+                span
+                / file.outputs.interval
+                * row_bytes(free if table.inertial else surface, points)
+                / 2**30
+            )
     return Cost(steps, seconds, memory)
 
 
 def draw(file: RigFile, rig: Rig, run: Trajectory, out: Path, progress: bool) -> list[str]:
-    """Write the figures and the video that a file asks for to `out`; the names of the files written."""
+    """Write the figures and the video that a file asks for to `out`; the names of the files
+    written."""
     end, written = float(run.t[-1]), []
-    times = [t for t in file.outputs.snapshots if t <= end] or [i * end / (SNAPSHOTS - 1) for i in range(SNAPSHOTS)]
+    times = [t for t in file.outputs.snapshots if t <= end] or [
+        i * end / (SNAPSHOTS - 1) for i in range(SNAPSHOTS)
+    ]
     title = plain(file.title) or "Bodies, pads and contact forces"
     made = {
         "snapshots": lambda: figures.snapshots(run, rig, times, title),
@@ -160,8 +188,8 @@ def draw(file: RigFile, rig: Rig, run: Trajectory, out: Path, progress: bool) ->
     if file.outputs.video != "none":
         name = f"video.{file.outputs.video}"
         animate(
-            run, rig, out / name, frames=file.outputs.frames, progress=progress, title=title, even=True,
-            follow=file.outputs.follow or general.liveliest(run, rig),
+            run, rig, out / name, frames=file.outputs.frames, progress=progress, title=title,
+            even=True, follow=file.outputs.follow or general.liveliest(run, rig),
         )  # fmt: skip
         written.append(name)
     return written

@@ -1,5 +1,5 @@
-"""A rig file as TOML text: every field with its unit and meaning as a comment, from the schema; what is left at its default is
-commented out."""
+"""A rig file as TOML text: every field with its unit and meaning as a comment, from the schema;
+what is left at its default is commented out."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -49,7 +49,8 @@ def section(table: Group, path: str, known: list[str], seen: set[type[Group]]) -
 
 
 def scalars(table: Group, known: list[str], seen: set[type[Group]]) -> Iterator[str]:
-    """A line for every field that is no table, with a comment; those at their default only in the first table of its sort."""
+    """A line for every field that is no table, with a comment; those at their default only in the
+    first table of its sort."""
     again = type(table) in seen
     seen.add(type(table))
     fields = type(table).model_fields
@@ -57,12 +58,18 @@ def scalars(table: Group, known: list[str], seen: set[type[Group]]) -> Iterator[
         yield commented(f"kind = {text(table.model_dump()['kind'])}", f"one of {', '.join(known)}")
     for name, field in fields.items():
         value = getattr(table, name)
-        if name == "kind" or isinstance(value, Group | Mapping) or (value is None and any(tables(field.annotation))):
+        if (
+            name == "kind"
+            or isinstance(value, Group | Mapping)
+            or (value is None and any(tables(field.annotation)))
+        ):
             continue
         if value is not None and (name in table.model_fields_set or field.is_required()):
             yield commented(f"{name} = {text(value)}", remark(field))
         elif not again:
-            yield commented(f"# {name} = {text(value)}" if value is not None else f"# {name} =", remark(field))
+            yield commented(
+                f"# {name} = {text(value)}" if value is not None else f"# {name} =", remark(field)
+            )
 
 
 def commented(row: str, remark: str) -> str:
@@ -73,7 +80,14 @@ def commented(row: str, remark: str) -> str:
 def remark(field: FieldInfo) -> str:
     """Meaning and unit of a field."""
     said = (*field.metadata, *metadata(field.annotation))
-    unit = next((one.unit for one in said if isinstance(one, Quantity | NumberOr) and one.unit not in ("", "1")), "")
+    unit = next(
+        (
+            one.unit
+            for one in said
+            if isinstance(one, Quantity | NumberOr) and one.unit not in ("", "1")
+        ),
+        "",
+    )
     meaning = field.description or ""
     return meaning if not unit or f"[{unit}]" in meaning else f"{meaning} [{unit}]"
 
@@ -88,14 +102,20 @@ def tables(annotation: Any) -> Iterator[type[Group]]:
 
 def kinds(field: FieldInfo) -> list[str]:
     """The kinds of table that a field may be."""
-    found = (one.model_fields["kind"].default for one in tables(field.annotation) if "kind" in one.model_fields)
+    found = (
+        one.model_fields["kind"].default
+        for one in tables(field.annotation)
+        if "kind" in one.model_fields
+    )
     return list(dict.fromkeys(found))
 
 
 def text(value: Any) -> str:
     """A value in TOML."""
     if isinstance(value, Group):
-        inner = ", ".join(f"{name} = {text(getattr(value, name))}" for name in type(value).model_fields)
+        inner = ", ".join(
+            f"{name} = {text(getattr(value, name))}" for name in type(value).model_fields
+        )
         return f"{{{inner}}}"
     if isinstance(value, list | tuple):
         return f"[{', '.join(text(one) for one in value)}]"
@@ -106,4 +126,6 @@ def text(value: Any) -> str:
 
 def template(title: str) -> RigFile:
     """A rig that is meant to be changed: a disc that is pressed between two pads and rolled."""
-    return RigFile.from_tree(read_toml(Path(__file__).with_name("template.toml")) | {"title": title})
+    return RigFile.from_tree(
+        read_toml(Path(__file__).with_name("template.toml")) | {"title": title}
+    )

@@ -1,7 +1,9 @@
-"""Exact gradients of a whole run: the discrete adjoint of the implicit stepper, swept backwards in the compiled kernels.
+"""Exact gradients of a whole run: the discrete adjoint of the implicit stepper, swept backwards in
+the compiled kernels.
 
-What a run was made with is fixed when it is made: the vector of parameters and the signals at its stages are inputs of one
-autograd function, and whatever these were computed from receives its gradient, whatever has become of the modules since.
+What a run was made with is fixed when it is made: the vector of parameters and the signals at its
+stages are inputs of one autograd function, and whatever these were computed from receives its
+gradient, whatever has become of the modules since.
 """
 
 from collections.abc import Iterator, Sequence
@@ -18,7 +20,8 @@ from torchsoft.solve.stepper import ImplicitStepper
 from torchsoft.threads import parallel_map
 
 TAPE_BYTES = 1e9
-"""Tapes kept of one run [bytes]; beyond that the backward sweep makes each segment's again from where it began."""
+"""Tapes kept of one run [bytes]; beyond that the backward sweep makes each segment's again from
+where it began."""
 
 
 class GradientFailed(RuntimeError):
@@ -26,7 +29,8 @@ class GradientFailed(RuntimeError):
 
 
 class Solved(NamedTuple):
-    """A run, finished or growing: what it was made with, what it left, and its segments if anything wants a gradient."""
+    """A run, finished or growing: what it was made with, what it left, and its segments if anything
+    wants a gradient."""
 
     stepper: ImplicitStepper
     y0: Tensor
@@ -39,16 +43,22 @@ class Solved(NamedTuple):
         return torch.from_numpy(self.out.y)
 
 
-def march(stepper: ImplicitStepper, y0: Tensor, t: Tensor, tape_bytes: float = TAPE_BYTES) -> Iterator[Solved]:
-    """The run from y0 (size,) through the times t (T,), after every compiled call; the last is complete."""
-    segments: list[Segment] | None = [] if torch.is_grad_enabled() and wants_gradient(stepper, y0) else None
+def march(
+    stepper: ImplicitStepper, y0: Tensor, t: Tensor, tape_bytes: float = TAPE_BYTES
+) -> Iterator[Solved]:
+    """The run from y0 (size,) through the times t (T,), after every compiled call; the last is
+    complete."""
+    segments: list[Segment] | None = (
+        [] if torch.is_grad_enabled() and wants_gradient(stepper, y0) else None
+    )
     for out in stepper.integrate(y0.detach(), t, segments, tape_bytes):
         yield Solved(stepper, y0, out, segments)
 
 
 def attached(runs: Sequence[Solved], threads: int = 1) -> list[Tensor]:
-    """The states (T, size) of finished runs with the discrete adjoint behind them, by y0, parameters and signals, but not by
-    the times, where anything wants it. The backward sweeps of several runs go side by side in so many threads."""
+    """The states (T, size) of finished runs with the discrete adjoint behind them, by y0,
+    parameters and signals, but not by the times, where anything wants it. The backward sweeps of
+    several runs go side by side in so many threads."""
     wanted = [run for run in runs if run.segments is not None]
     inputs: list[Tensor] = []
     for run in wanted:
@@ -68,15 +78,21 @@ class _Solutions(torch.autograd.Function):
     """Passes the solutions through; its backward is the discrete adjoint of each."""
 
     @staticmethod
-    def forward(ctx: Any, runs: Sequence[Solved], threads: int, *inputs: Tensor) -> tuple[Tensor, ...]:
+    def forward(
+        ctx: Any, runs: Sequence[Solved], threads: int, *inputs: Tensor
+    ) -> tuple[Tensor, ...]:
         ctx.runs, ctx.threads = runs, threads
         ctx.set_materialize_grads(False)
         return tuple(run.y.clone() for run in runs)
 
     @staticmethod
     def backward(ctx: Any, *y_bars: Tensor | None) -> Any:
-        if torch.is_grad_enabled():  # a graph of it would lack how the cotangents depend on what ran
-            raise GradientFailed("a run has no second derivative; ask for its gradient without create_graph")
+        if (
+            torch.is_grad_enabled()
+        ):  # a graph of it would lack how the cotangents depend on what ran
+            raise GradientFailed(
+                "a run has no second derivative; ask for its gradient without create_graph"
+            )
         bars: list[Tensor | None] = [None] * (3 * len(y_bars))
         asked = [(i, y_bar) for i, y_bar in enumerate(y_bars) if y_bar is not None]
 
@@ -89,12 +105,16 @@ class _Solutions(torch.autograd.Function):
         return None, None, *bars
 
 
-def run_adjoint(stepper: ImplicitStepper, segments: list[Segment], y_bar: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Cotangents of y0 (size,), of the parameters' vector and of the signals (stages, signals, 2), from those of the outputs,
-    y_bar (T, size). Raises `GradientFailed` where one is not finite."""
+def run_adjoint(
+    stepper: ImplicitStepper, segments: list[Segment], y_bar: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Cotangents of y0 (size,), of the parameters' vector and of the signals (stages, signals, 2),
+    from those of the outputs, y_bar (T, size). Raises `GradientFailed` where one is not finite."""
     rows: Array = np.ascontiguousarray(y_bar.numpy())
     if not np.isfinite(rows).all():
-        raise GradientFailed(f"the cotangent of output {int(np.argwhere(~np.isfinite(rows))[0][0])} is not finite")
+        raise GradientFailed(
+            f"the cotangent of output {int(np.argwhere(~np.isfinite(rows))[0][0])} is not finite"
+        )
     size = stepper.layout.size
     carried, p_bar = np.zeros(size), np.zeros(len(stepper.compiled.p))
     signals_bar = [np.zeros(segment.signals.shape) for segment in segments]
@@ -103,16 +123,22 @@ def run_adjoint(stepper: ImplicitStepper, segments: list[Segment], y_bar: Tensor
         plan, tape = segment.plan, stepper.tape(segment)
         s = stepper.compiled.system(float(plan.h[0]))
         failed = backward(
-            s, room("Work", s, size, columns=1), room("Cotangents", s, size), plan.h, tape, segment.signals,
-            plan.out_step, plan.out_part, rows[segment.rows], carried, p_bar, signals_bar[number],
+            s, room("Work", s, size, columns=1), room("Cotangents", s, size), plan.h, tape,
+            segment.signals, plan.out_step, plan.out_part, rows[segment.rows], carried, p_bar,
+            signals_bar[number],
         )  # fmt: skip
         if failed >= 0:
             raise GradientFailed(f"the gradient is not finite at t = {plan.starts[failed]:.4f} s")
-    return torch.from_numpy(carried) + y_bar[0], torch.from_numpy(p_bar), torch.from_numpy(np.concatenate(signals_bar))
+    return (
+        torch.from_numpy(carried) + y_bar[0],
+        torch.from_numpy(p_bar),
+        torch.from_numpy(np.concatenate(signals_bar)),
+    )
 
 
 class _Recorded(torch.autograd.Function):
-    """A recorded series beside the states that have a gradient: it has none, and says so when one is asked for."""
+    """A recorded series beside the states that have a gradient: it has none, and says so when one
+    is asked for."""
 
     @staticmethod
     def forward(ctx: Any, name: str, series: Tensor, y: Tensor) -> Tensor:
@@ -122,10 +148,13 @@ class _Recorded(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, bar: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         if bool((bar != 0).any()):
-            raise GradientFailed(f"the channel `{ctx.name}` is recorded and has no gradient; detach() it")
+            raise GradientFailed(
+                f"the channel `{ctx.name}` is recorded and has no gradient; detach() it"
+            )
         return None, None, None
 
 
 def recorded(name: str, series: Tensor, y: Tensor) -> Tensor:
-    """A series (T,) that came out of the run of states y (T, size), whose gradient would be wrong rather than zero."""
+    """A series (T,) that came out of the run of states y (T, size), whose gradient would be wrong
+    rather than zero."""
     return _Recorded.apply(name, series, y) if y.requires_grad else series  # pyright: ignore[reportReturnType]

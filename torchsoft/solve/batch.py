@@ -1,4 +1,5 @@
-"""Many runs in one call, each with parameters, start, reference and times of its own, side by side in threads."""
+"""Many runs in one call, each with parameters, start, reference and times of its own, side by side
+in threads."""
 
 import time as clock
 import warnings
@@ -30,10 +31,12 @@ class SamplesFailed(UserWarning):
 
 @dataclass(frozen=True)
 class Batch:
-    """The runs of a batch: their trajectories, None where a run failed, and why those failed, by number.
+    """The runs of a batch: their trajectories, None where a run failed, and why those failed, by
+    number.
 
-    What is stacked has one row a run; rows of failed runs, and times behind a run's last one, are NaN. `mask` (runs, T) says
-    where there is something; take losses over it: NaN times zero is NaN, in gradients too.
+    What is stacked has one row a run; rows of failed runs, and times behind a run's last one, are
+    NaN. `mask` (runs, T) says where there is something; take losses over it: NaN times zero is NaN,
+    in gradients too.
     """
 
     trajectories: tuple[Trajectory | None, ...] = field(repr=False)
@@ -65,57 +68,80 @@ class Batch:
 
     @property
     def y(self) -> Tensor:
-        """Flat states (runs, T, size). Raises `ValueError` where the rigs have states of different sizes."""
+        """Flat states (runs, T, size). Raises `ValueError` where the rigs have states of different
+        sizes."""
         return self._stacked([None if run is None else run.y for run in self.trajectories])
 
     @property
     def sensitivities(self) -> Tensor:
         """Derivatives (runs, T, components, n) of gradient="forward"."""
         if not all(run is None or run.wrt for run in self.trajectories):
-            raise ValueError("the batch was run without sensitivities; ask for them with gradient='forward' and `wrt`")
-        return self._stacked([None if run is None else run.sensitivities for run in self.trajectories])
+            raise ValueError(
+                "the batch was run without sensitivities; ask for them with gradient='forward' and "
+                "`wrt`"
+            )
+        return self._stacked(
+            [None if run is None else run.sensitivities for run in self.trajectories]
+        )
 
     def _stacked(self, parts: Sequence[Tensor | None]) -> Tensor:
         shapes = {part.shape[1:] for part in parts if part is not None}
         if len(shapes) > 1:
-            raise ValueError(f"the runs' rows have different shapes, {' and '.join(str(tuple(s)) for s in shapes)}")
-        nothing = torch.full((max(self.lengths), *next(iter(shapes), ())), torch.nan, dtype=torch.float64)
-        rows = [nothing if part is None else torch.cat((part, nothing[len(part) :])) for part in parts]
+            raise ValueError(
+                "the runs' rows have different shapes, "
+                f"{' and '.join(str(tuple(s)) for s in shapes)}"
+            )
+        nothing = torch.full(
+            (max(self.lengths), *next(iter(shapes), ())), torch.nan, dtype=torch.float64
+        )
+        rows = [
+            nothing if part is None else torch.cat((part, nothing[len(part) :])) for part in parts
+        ]
         return torch.stack(rows)
 
 
 def simulate_batch(
-    rig: Rig | Sequence[Rig], t: Tensor | Sequence[Tensor], *, parameters: Mapping[str, Tensor] | None = None,
-    y0: Tensor | Sequence[Tensor] | None = None, reference: Reference | Sequence[Reference] | None = None,
-    knots: Sequence[Tensor] | None = None, dy0: Tensor | Sequence[Tensor] | None = None, threads: int | None = None,
+    rig: Rig | Sequence[Rig], t: Tensor | Sequence[Tensor], *,
+    parameters: Mapping[str, Tensor] | None = None, y0: Tensor | Sequence[Tensor] | None = None,
+    reference: Reference | Sequence[Reference] | None = None, knots: Sequence[Tensor] | None = None,
+    dy0: Tensor | Sequence[Tensor] | None = None, threads: int | None = None,
     progress: bool = False, **options: Any,
 ) -> Batch:  # fmt: skip
     """`simulate` for many runs at once, in `threads` threads, one a core by default.
 
-    What differs from run to run has one entry for each: `parameters` by name (runs, ...), y0 (runs, size), dy0 (runs, size, n),
-    `reference`, t, `knots`, and even the rig; what they share is given once: one rig, t (T,), y0 (size,), one reference.
-    Results do not depend on the number of threads. `options` are those of `simulate`, the same for every run. With
-    gradient="discrete" what is computed from the batch has a gradient by `parameters`, y0 and whatever else went in; the
-    backward sweeps run in threads too.
+    What differs from run to run has one entry for each: `parameters` by name (runs, ...), y0 (runs,
+    size), dy0 (runs, size, n), `reference`, t, `knots`, and even the rig; what they share is given
+    once: one rig, t (T,), y0 (size,), one reference. Results do not depend on the number of
+    threads. `options` are those of `simulate`, the same for every run. With gradient="discrete"
+    what is computed from the batch has a gradient by `parameters`, y0 and whatever else went in;
+    the backward sweeps run in threads too.
 
-    A run that fails, or that cannot begin with its own parameters, is reported in `failures` and by a warning
-    (`SamplesFailed`), and leaves the others alone. `simulate` of that run alone says more, if its loop is unstable.
+    A run that fails, or that cannot begin with its own parameters, is reported in `failures` and by
+    a warning (`SamplesFailed`), and leaves the others alone. `simulate` of that run alone says
+    more, if its loop is unstable.
 
-    Raises `ValueError` for counts that do not agree and for options that no run could have. Ctrl-C ends the batch when the
-    runs on their way have ended.
+    Raises `ValueError` for counts that do not agree and for options that no run could have. Ctrl-C
+    ends the batch when the runs on their way have ended.
     """
-    rigs, ts, y0s, references, every_knots, dy0s, count = _spread(rig, t, parameters, y0, reference, knots, dy0)
+    rigs, ts, y0s, references, every_knots, dy0s, count = _spread(
+        rig, t, parameters, y0, reference, knots, dy0
+    )
     gradient: Route = options.get("gradient", "none")
     if gradient not in ("none", "discrete", "forward"):
-        raise ValueError(f"a batch takes gradient='none', 'discrete' or 'forward', not {gradient!r}")
-    began, threads = clock.perf_counter(), min(count, cores() if threads is None else whole("threads", threads, 1))
+        raise ValueError(
+            f"a batch takes gradient='none', 'discrete' or 'forward', not {gradient!r}"
+        )
+    began, threads = (
+        clock.perf_counter(),
+        min(count, cores() if threads is None else whole("threads", threads, 1)),
+    )
     budget = TAPE_BYTES / count
 
     def work(i: int) -> RunOutcome | Exception:
         try:
             task = prepare(
-                _own(rigs[i], parameters or {}, i), ts[i], y0=y0s[i], reference=references[i], knots=every_knots[i],
-                dy0=dy0s[i], **options,
+                _own(rigs[i], parameters or {}, i), ts[i], y0=y0s[i], reference=references[i],
+                knots=every_knots[i], dy0=dy0s[i], **options,
             )  # fmt: skip
             return run(task, budget, explained=False)
         except (SimulationFailed, ValueError, np.linalg.LinAlgError) as failure:
@@ -131,7 +157,8 @@ def simulate_batch(
     if failures:
         first = min(failures)
         if not done and all(
-            isinstance(one, ValueError) and str(one) == str(failures[first]) for one in failures.values()
+            isinstance(one, ValueError) and str(one) == str(failures[first])
+            for one in failures.values()
         ):
             raise failures[first]  # nothing of a single run
         message = f"{len(failures)} of {count} runs failed; run {first}: {failures[first]}"
@@ -139,34 +166,53 @@ def simulate_batch(
     states = dict(zip(done, attached([one.solved for one in done.values()], threads)))
     numbers = list(done)
     trajectories: list[Trajectory | None] = [None] * count
-    for k, trajectory in parallel_map(lambda k: done[numbers[k]].trajectory(states[numbers[k]]), len(numbers), threads):
+    for k, trajectory in parallel_map(
+        lambda k: done[numbers[k]].trajectory(states[numbers[k]]), len(numbers), threads
+    ):
         trajectories[numbers[k]] = trajectory
     _doubt(rigs, trajectories)
-    return Batch(tuple(trajectories), failures, tuple(len(one) for one in ts), clock.perf_counter() - began)
+    return Batch(
+        tuple(trajectories), failures, tuple(len(one) for one in ts), clock.perf_counter() - began
+    )
 
 
 def _doubt(rigs: Sequence[Rig], trajectories: Sequence[Trajectory | None]) -> None:
-    """Warn once of everything that is doubtful, naming its runs, in the words of the first of them."""
+    """Warn once of everything that is doubtful, naming its runs, in the words of the first of
+    them."""
     found: dict[str, dict[int, str]] = {}
     for i, trajectory in enumerate(trajectories):
         for subject, doubt in doubts(trajectory, rigs[i]).items() if trajectory is not None else ():
             found.setdefault(subject, {})[i] = doubt
     for runs in found.values():
         first, *others = runs
-        who = f"runs {', '.join(map(str, runs))} (numbers of run {first})" if others else f"run {first}"
+        who = (
+            f"runs {', '.join(map(str, runs))} (numbers of run {first})"
+            if others
+            else f"run {first}"
+        )
         warnings.warn(f"{who}: {runs[first]}", stacklevel=3)
 
 
 def _spread(
-    rig: Any, t: Any, parameters: Mapping[str, Tensor] | None, y0: Any, reference: Any, knots: Any, dy0: Any
+    rig: Any,
+    t: Any,
+    parameters: Mapping[str, Tensor] | None,
+    y0: Any,
+    reference: Any,
+    knots: Any,
+    dy0: Any,
 ) -> tuple[Any, Any, Any, Any, Any, Any, int]:
     """Every argument as one entry a run, and the number of runs."""
     if parameters is not None and not isinstance(parameters, Mapping):
-        raise ValueError(f"`parameters` must give tensors by name, but is {type(parameters).__name__}")
+        raise ValueError(
+            f"`parameters` must give tensors by name, but is {type(parameters).__name__}"
+        )
     for name, values in (parameters or {}).items():
         check_array(f"parameters[{name!r}]", values)
         if values.ndim == 0:
-            raise ValueError(f"`parameters[{name!r}]` must have one entry a run, but is a single number")
+            raise ValueError(
+                f"`parameters[{name!r}]` must have one entry a run, but is a single number"
+            )
     shared = {  # a single rig is a module, single times a vector, a single start too, a single reference a module
         "rig": (rig, isinstance(rig, nn.Module)),
         "t": (t, isinstance(t, Tensor) and t.ndim == 1),
@@ -179,11 +225,15 @@ def _spread(
     counts |= {name: len(values) for name, values in (parameters or {}).items()}
     if not counts:
         raise ValueError(
-            "nothing differs from run to run: give `parameters`, y0, t, references or rigs, one entry a run"
+            "nothing differs from run to run: give `parameters`, y0, t, references or rigs, one "
+            "entry a run"
         )
     if len(set(counts.values())) > 1 or 0 in counts.values():
         listed = ", ".join(f"{name} {number}" for name, number in counts.items())
-        raise ValueError(f"every argument must have one entry a run, and one run at least, but there are: {listed}")
+        raise ValueError(
+            "every argument must have one entry a run, and one run at least, but there are: "
+            f"{listed}"
+        )
     count = next(iter(counts.values()))
     entries = [[given] * count if single else list(given) for given, single in shared.values()]
     rigs, ts, y0s, references, every_knots, dy0s = entries
@@ -199,7 +249,8 @@ def _own(rig: Rig, parameters: Mapping[str, Tensor], i: int) -> Rig:
         old = rig.parameter(name)
         if rows[i].shape != old.shape:
             raise ValueError(
-                f"`{name}` has shape {tuple(old.shape)}, but is given rows of shape {tuple(rows[i].shape)}"
+                f"`{name}` has shape {tuple(old.shape)}, but is given rows of shape "
+                f"{tuple(rows[i].shape)}"
             )
         values[id(old)] = rows[i].double()
     return copied(rig, {}, values)  # pyright: ignore[reportReturnType]

@@ -1,7 +1,8 @@
-"""A rig's laws as compiled code: each is compiled once for all models that have it, whatever their parameters' values.
+"""A rig's laws as compiled code: each is compiled once for all models that have it, whatever their
+parameters' values.
 
-Laws of this package are known by their structure. Somebody's own code is run once more for every run, since nothing else tells
-whether a number that it reads has changed since.
+Laws of this package are known by their structure. Somebody's own code is run once more for every
+run, since nothing else tells whether a number that it reads has changed since.
 """
 
 import threading
@@ -30,14 +31,21 @@ class LawSet(NamedTuple):
     parameters: dict[str, Tensor]
 
 
-def copied(module: nn.Module, known: dict[int, nn.Module], values: Mapping[int, Tensor] | None = None) -> nn.Module:
-    """The same modules over the same tensors, or with `values` in the place of some parameters, by their id: tracing, and
-    runs side by side, put others in their place, which other threads must not meet."""
+def copied(
+    module: nn.Module, known: dict[int, nn.Module], values: Mapping[int, Tensor] | None = None
+) -> nn.Module:
+    """The same modules over the same tensors, or with `values` in the place of some parameters, by
+    their id: tracing, and runs side by side, put others in their place, which other threads must
+    not meet."""
     if id(module) not in known:
         out = known[id(module)] = module.__class__.__new__(module.__class__)
-        own: dict[str, Any] = {k: (values or {}).get(id(p), p) for k, p in module._parameters.items()}
+        own: dict[str, Any] = {
+            k: (values or {}).get(id(p), p) for k, p in module._parameters.items()
+        }
         out.__dict__ = module.__dict__ | {"_parameters": own, "_buffers": dict(module._buffers)}
-        out.__dict__["_modules"] = {k: m if m is None else copied(m, known, values) for k, m in module._modules.items()}
+        out.__dict__["_modules"] = {
+            k: m if m is None else copied(m, known, values) for k, m in module._modules.items()
+        }
     return known[id(module)]
 
 
@@ -56,17 +64,28 @@ class _Called(nn.Module):
 
 
 def structure(module: object) -> Any:
-    """What decides a module's law beside its parameters' values, hashable: two modules of one structure have one law.
-    None where that cannot be told: code that is neither this package's nor torch's, hooks, other attributes than numbers,
-    text and functions of this package."""
-    if isinstance(module, nn.Module) and type(module).__module__.startswith(("torchsoft.", "torch.nn.")):
+    """What decides a module's law beside its parameters' values, hashable: two modules of one
+    structure have one law. None where that cannot be told: code that is neither this package's nor
+    torch's, hooks, other attributes than numbers, text and functions of this package."""
+    if isinstance(module, nn.Module) and type(module).__module__.startswith(
+        ("torchsoft.", "torch.nn.")
+    ):
         kind = type(module)
         own = {k: v for k, v in vars(module).items() if not k.startswith("_")}
-        given = {k: v for base in kind.__mro__[::-1] for k, v in vars(base).items() if isinstance(v, int | float)}
+        given = {
+            k: v
+            for base in kind.__mro__[::-1]
+            for k, v in vars(base).items()
+            if isinstance(v, int | float)
+        }
         parts = tuple((k, structure(v)) for k, v in module._modules.items())
-        buffers = tuple((k, v.dtype, v.numpy().tobytes()) for k, v in module._buffers.items() if v is not None)
+        buffers = tuple(
+            (k, v.dtype, v.numpy().tobytes()) for k, v in module._buffers.items() if v is not None
+        )
         shapes = tuple((k, tuple(v.shape)) for k, v in module._parameters.items() if v is not None)
-        plain = all(_plain(one) for v in own.values() for one in (v if isinstance(v, tuple) else (v,)))
+        plain = all(
+            _plain(one) for v in own.values() for one in (v if isinstance(v, tuple) else (v,))
+        )
         hooked = any(v for k, v in vars(module).items() if k.endswith("_hooks"))
         if plain and not hooked and all(part is not None for _, part in parts):
             return kind, kind.forward, tuple(sorted((given | own).items())), parts, buffers, shapes
@@ -74,14 +93,16 @@ def structure(module: object) -> Any:
 
 
 def _plain(value: object) -> bool:
-    """Whether an attribute says all of itself: a number, text, or a function of this package without a closure."""
+    """Whether an attribute says all of itself: a number, text, or a function of this package
+    without a closure."""
     if isinstance(value, FunctionType):
         return (value.__module__ or "").startswith("torchsoft.") and value.__closure__ is None
     return isinstance(value, bool | int | float | str | None)
 
 
 _laws: dict[Any, Law] = {}
-"""Laws that have been compiled, by what decides them: the structure of their modules, else their traced expressions."""
+"""Laws that have been compiled, by what decides them: the structure of their modules, else their
+traced expressions."""
 
 _compiling = threading.Lock()
 
@@ -95,9 +116,10 @@ def compiled_law(
     points: bool = False,
     **modules: Any,
 ) -> Law:
-    """The law of a function of modules and x (size,), differentiable in the first inputs and in the parameters `names`,
-    of which it may not use all; `points` says that it is the law of a contact point, whatever the others do. Raises
-    `UnknownOperation` naming the line of a law that cannot be compiled."""
+    """The law of a function of modules and x (size,), differentiable in the first inputs and in the
+    parameters `names`, of which it may not use all; `points` says that it is the law of a contact
+    point, whatever the others do. Raises `UnknownOperation` naming the line of a law that cannot be
+    compiled."""
     decided = tuple((name, structure(module)) for name, module in modules.items())
     shapes = tuple((name, tuple(value.shape)) for name, value in names.items())
     with _compiling:
@@ -116,35 +138,53 @@ def compiled_law(
         def expressions() -> tuple[Any, ...]:
             graph = Graph()
             outputs = traced(graph, law, example, names)
-            return tuple(graph.ops), repr(graph.args), tuple(outputs), shapes, linear, differentiated
+            return (
+                tuple(graph.ops),
+                repr(graph.args),
+                tuple(outputs),
+                shapes,
+                linear,
+                differentiated,
+            )
 
-        if not known:  # what somebody's own code does is known from running it only, and may change any time
+        if (
+            not known
+        ):  # what somebody's own code does is known from running it only, and may change any time
             key = expressions()
             if key in _laws:
                 check_backward(law, example, names)
         if key not in _laws:
             if not known and expressions() != key:
                 raise UnknownOperation(
-                    "The law is another one when it is called again, so it keeps something of a call."
+                    "The law is another one when it is called again, so it keeps something of a "
+                    "call."
                 )
             if points:
                 check_pointwise(law, example, names)
-            _laws[key] = compile_law(law, example, names, linear=linear, differentiated=differentiated)
+            _laws[key] = compile_law(
+                law, example, names, linear=linear, differentiated=differentiated
+            )
         return _laws[key]
 
 
 def _effort(actuator: nn.Module, x: Tensor) -> Tensor:
     effort = actuator(x)
     if not isinstance(effort, Tensor) or effort.ndim:
-        shown = f"a tensor of shape {tuple(effort.shape)}" if isinstance(effort, Tensor) else repr(effort)
+        shown = (
+            f"a tensor of shape {tuple(effort.shape)}"
+            if isinstance(effort, Tensor)
+            else repr(effort)
+        )
         raise TypeError(f"for one state it gives {shown}")
     return effort[None]
 
 
 def actuator_law(name: str, actuator: Actuator, parameters: Mapping[str, Tensor]) -> Law:
-    """The law of an actuator: its effort by set-points and their rates, feed-forward, coordinates and their rates.
+    """The law of an actuator: its effort by set-points and their rates, feed-forward, coordinates
+    and their rates.
 
-    Raises `UnknownOperation` for one that cannot be compiled, `TypeError` for one that fails or gives no effort; with its name.
+    Raises `UnknownOperation` for one that cannot be compiled, `TypeError` for one that fails or
+    gives no effort; with its name.
     """
     try:
         return compiled_law(parameters, _effort, actuator.inputs, 1, actuator.inputs, law=actuator)
@@ -152,14 +192,17 @@ def actuator_law(name: str, actuator: Actuator, parameters: Mapping[str, Tensor]
         raise UnknownOperation(f"`actuators.{name}`: {error}") from error
     except Exception as error:  # whatever somebody's own code raises
         raise TypeError(
-            f"the law of `actuators.{name}` must take five tensors (set-point, its rate, feed-forward, coordinate, its rate) "
-            f"and return the effort, a tensor of a coordinate's shape, but {type(error).__name__}: {error}"
+            f"the law of `actuators.{name}` must take five tensors (set-point, its rate, "
+            "feed-forward, coordinate, its rate) and return the effort, a tensor of a "
+            f"coordinate's shape, but {type(error).__name__}: {error}"
         ) from error
 
 
 def contact_laws(law: Any, shape: Any) -> LawSet:
     """The laws of a contact of `law` on a body of `shape`."""
-    parameters: dict[str, Tensor] = dict(_Called(interface_law, law=law, shape=shape).named_parameters())
+    parameters: dict[str, Tensor] = dict(
+        _Called(interface_law, law=law, shape=shape).named_parameters()
+    )
     return LawSet(
         compiled_law(parameters, distance_law, INPUTS, 0, 0, shape=shape),
         compiled_law(parameters, interface_law, INPUTS, 3, 7, points=True, law=law, shape=shape),

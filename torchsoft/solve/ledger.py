@@ -1,11 +1,12 @@
-"""What a finished run says of itself: whether its energies balance, and whether its pads are pressed beyond the theory."""
+"""What a finished run says of itself: whether its energies balance, and whether its pads are
+pressed beyond the theory."""
 
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.trajectory import Trajectory
 
 RESIDUAL = 0.05
-"""Energy residual over the energy at the start and injected since, up to which a run passes without a warning: fifteen times
-what the hardest of the ready excitations leaves at steps of 2 ms."""
+"""Energy residual over the energy at the start and injected since, up to which a run passes without
+a warning: fifteen times what the hardest of the ready excitations leaves at steps of 2 ms."""
 
 NEGLIGIBLE = 1e-9
 """Energy [J] too small to be judged."""
@@ -18,7 +19,8 @@ COMPRESSED = 0.5
 
 
 def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
-    """Sentences on what is wrong with a finished run that has a ledger, by what they are about; none if nothing is."""
+    """Sentences on what is wrong with a finished run that has a ledger, by what they are about;
+    none if nothing is."""
     run, found = trajectory, {}
     stored = sum(float(part[0].detach()) for part in run.energy.values())
     scale = max(stored + float(run.injected[-1]), NEGLIGIBLE)
@@ -27,19 +29,22 @@ def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
         longest = float(run.knots.diff().max())
         better = 0.4 * longest * min(1.0, RESIDUAL / part)
         found["energies"] = (
-            f"the energies of the run do not balance: {part:.2%} of what was stored at the start and injected since is missing "
-            f"or too much, with steps of {longest:.3g} s; try steps of {better:.2g} s"
+            f"the energies of the run do not balance: {part:.2%} of what was stored at the start "
+            f"and injected since is missing or too much, with steps of {longest:.3g} s; try steps "
+            f"of {better:.2g} s"
         )
     for name, work in run.dissipated.items():
         back = -float(work.diff().min())
         if back > SUPPLIED * scale:
             found[f"dissipated {name}"] = (
-                f"`{name}` is to dissipate energy, but gave {back:.3g} J back between two outputs; check its law"
+                f"`{name}` is to dissipate energy, but gave {back:.3g} J back between two outputs; "
+                "check its law"
             )
     for name, u in run.displacement.items():
         deepest, height = float(u.detach().norm(dim=-1).max()), rig.pads[name].mesh.height
         if not deepest <= COMPRESSED * height:
             found[f"pad {name}"] = (
-                f"the pad `{name}` of height {height:.3g} m gave way by {deepest:.3g} m, beyond linear elasticity"
+                f"the pad `{name}` of height {height:.3g} m gave way by {deepest:.3g} m, beyond "
+                "linear elasticity"
             )
     return found

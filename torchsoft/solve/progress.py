@@ -11,7 +11,8 @@ from torchsoft.solve.kernel.arrays import Array, first_stages
 
 
 class SimulationFailed(RuntimeError):
-    """A run that ended early: when and why. `time` [s]; `trajectory` holds what was simulated until then, if any."""
+    """A run that ended early: when and why. `time` [s]; `trajectory` holds what was simulated until
+    then, if any."""
 
     def __init__(self, reason: str, time: float) -> None:
         super().__init__(reason)
@@ -23,7 +24,8 @@ class SimulationFailed(RuntimeError):
 class Progress:
     """What the stepper has produced so far: rows of the output grid, its steps, and its counters.
 
-    extras: running integrals, the pads' moments, the generalised contact forces on all coordinates (`Integrals` names them).
+    extras: running integrals, the pads' moments, the generalised contact forces on all coordinates
+    (`Integrals` names them).
     """
 
     y: Array
@@ -45,8 +47,8 @@ class Progress:
 
 @dataclass
 class Segment:
-    """One chunk of a taped run: where it began, the signals at its stages and outputs, and its tape, or None where it is to be
-    made again when needed."""
+    """One chunk of a taped run: where it began, the signals at its stages and outputs, and its
+    tape, or None where it is to be made again when needed."""
 
     plan: Plan
     signals: Array
@@ -59,20 +61,26 @@ class Segment:
 
 
 class Integrals:
-    """Names of the running integrals [J]: dissipated by, supplied by, and the positive part of what the sources supply."""
+    """Names of the running integrals [J]: dissipated by, supplied by, and the positive part of what
+    the sources supply."""
 
     def __init__(self, rig: Rig) -> None:
         self.dissipated = (*(f"pad_{name}" for name in rig.pads), "contact_dashpots", "slip")
         drives = tuple(f"drive_{name}" for name in rig.bodies)
         self.supplied = (*(f"control_{name}" for name in rig.actuators), "gravity", *drives)
         self.names = (*self.dissipated, *self.supplied, "injected")
-        driven = {f"drive_{name}" for name, body in rig.bodies.items() if "driven" in body.freedom.values()}
+        driven = {
+            f"drive_{name}"
+            for name, body in rig.bodies.items()
+            if "driven" in body.freedom.values()
+        }
         self.active = {name for name in self.supplied if not name.startswith("drive_")} | driven
 
 
 @dataclass
 class Marching:
-    """A run on its way: the state, Newton's scratch, the last step, the integrals, and where its results go."""
+    """A run on its way: the state, Newton's scratch, the last step, the integrals, and where its
+    results go."""
 
     y: Array
     work: Any
@@ -94,8 +102,8 @@ class Marching:
         self.y[:], self.work.V[:], self.work.u_dot[:], self.integrals[:] = before
 
     def keep(
-        self, plan: Plan, signals: Array, at_outputs: Array, before: tuple[Array, Array, Array, Array], rows: slice,
-        tape: Any,
+        self, plan: Plan, signals: Array, at_outputs: Array,
+        before: tuple[Array, Array, Array, Array], rows: slice, tape: Any,
     ) -> None:  # fmt: skip
         """Note the steps that were taken, and what their derivatives need."""
         if len(plan.h) == 0:

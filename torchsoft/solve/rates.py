@@ -1,4 +1,5 @@
-"""The compiled right-hand side of a rig, as a function of numpy arrays: what other integrators ask for."""
+"""The compiled right-hand side of a rig, as a function of numpy arrays: what other integrators ask
+for."""
 
 import numpy as np
 
@@ -12,17 +13,23 @@ from torchsoft.solve.tolerances import Followed
 
 
 class Rates:
-    """dy/dt = f(t, y) of a rig and its reference as they are now, compiled: tens of microseconds a call.
+    """dy/dt = f(t, y) of a rig and its reference as they are now, compiled: tens of microseconds a
+    call.
 
-    The same as `rig.forward` to Newton's `tolerance` [N], for one state y (size,) of numpy. `calls` counts. An object keeps
-    scratch of its own and the last forces as Newton's guess: one thread may call it at a time. `margin` [m] is how near a
-    point has to be to count as one that may touch.
+    The same as `rig.forward` to Newton's `tolerance` [N], for one state y (size,) of numpy. `calls`
+    counts. An object keeps scratch of its own and the last forces as Newton's guess: one thread may
+    call it at a time. `margin` [m] is how near a point has to be to count as one that may touch.
 
     Raises `NotImplementedError` for inertial pads.
     """
 
     def __init__(
-        self, rig: Rig, reference: Reference | None = None, *, tolerance: float = 1e-10, margin: float = 2e-3
+        self,
+        rig: Rig,
+        reference: Reference | None = None,
+        *,
+        tolerance: float = 1e-10,
+        margin: float = 2e-3,
     ) -> None:
         compiled = Compiled(rig)
         if compiled.inertial:
@@ -49,12 +56,14 @@ class Rates:
             raise self._followed.error
         if not found:
             self._work.u_dot[:] = 0.0
-            raise SimulationFailed(f"at t = {t:.6g} s Newton's iteration found no forces for the state", float(t))
+            raise SimulationFailed(
+                f"at t = {t:.6g} s Newton's iteration found no forces for the state", float(t)
+            )
         return out
 
     def _solve(self, t: float, y: Array, out: Array) -> bool:
         """Whether Newton found the forces; the rates go to `out`."""
         return rates(
-            self._system, self._work, self._followed.arrays, float(t), y, *self._limits, self._signals, self._powers,
-            self._moments, out,
+            self._system, self._work, self._followed.arrays, float(t), y, *self._limits,
+            self._signals, self._powers, self._moments, out,
         )  # fmt: skip

@@ -1,4 +1,5 @@
-"""`simulate`: run a rig over given times, by the route to a derivative that is wanted, into one `Trajectory`."""
+"""`simulate`: run a rig over given times, by the route to a derivative that is wanted, into one
+`Trajectory`."""
 
 import time as clock
 import warnings
@@ -27,7 +28,8 @@ from torchsoft.solve.system import independent
 from torchsoft.solve.trajectory import Stats, Trajectory, channels, units
 
 Route = Literal["none", "discrete", "forward"]
-"""Ways to a derivative: none; the exact adjoint of the run; sensitivities along `wrt`; plain torch steps; torchdiffeq's own."""
+"""Ways to a derivative: none; the exact adjoint of the run; sensitivities along `wrt`; plain torch
+steps; torchdiffeq's own."""
 
 
 VERSION = version("torchsoft")
@@ -48,35 +50,37 @@ class Interrupted(KeyboardInterrupt):
 
 
 def simulate(
-    rig: Rig, t: Tensor, *, y0: Tensor | None = None, reference: Reference | None = None, rtol: float | None = None,
-    atol: float | None = None, step: float | None = None, knots: Tensor | None = None, tolerance: float = 1e-9,
-    gradient: Route = "none", wrt: Sequence[str] = (), dy0: Tensor | None = None, rigid: bool = False, progress: bool = False,
+    rig: Rig, t: Tensor, *, y0: Tensor | None = None, reference: Reference | None = None,
+    rtol: float | None = None, atol: float | None = None, step: float | None = None,
+    knots: Tensor | None = None, tolerance: float = 1e-9, gradient: Route = "none",
+    wrt: Sequence[str] = (), dy0: Tensor | None = None, rigid: bool = False, progress: bool = False,
 ) -> Trajectory:  # fmt: skip
     """Integrate `rig` from y0 (size,) at t[0] through the times t (T,) [s].
 
     y0 defaults to the paper's rig at rest. `reference` is what the rig follows, its own by default.
 
-    Steps are chosen so that the error of each stays below rtol times the largest value so far plus atol, which counts nodal
-    forces in N, lengths in mm, angles in rad; either alone brings the other, a tenth of rtol being atol. A motion is right
-    long before its derivative is: rtol = 1e-3 holds positions to 1e-4 of their range and forces to 1 %; the default,
-    `RTOL`, ten times that and most derivatives to 1 %. With `step` [s] they are equal ones between the times t instead, no
-    longer than it. `knots` are the steps of another run (its `knots`), frozen: what a fit needs, whose residuals are
-    then smooth in the parameters. `tolerance` [N] is Newton's.
+    Steps are chosen so that the error of each stays below rtol times the largest value so far plus
+    atol, which counts nodal forces in N, lengths in mm, angles in rad; either alone brings the
+    other, a tenth of rtol being atol. A motion is right long before its derivative is: rtol = 1e-3
+    holds positions to 1e-4 of their range and forces to 1 %; the default, `RTOL`, ten times that
+    and most derivatives to 1 %. With `step` [s] they are equal ones between the times t instead, no
+    longer than it. `knots` are the steps of another run (its `knots`), frozen: what a fit needs,
+    whose residuals are then smooth in the parameters. `tolerance` [N] is Newton's.
 
-    gradient: with "discrete" the states and channels of the result carry the exact gradient of the discrete run (of the steps
-    that were taken, which are not differentiated) by y0, every parameter and the reference; recorded nodal forces and energies
-    do not. With "forward" `sensitivities` holds the derivatives by the n scalar parameters `wrt`, and dy0 (size, n) is that of
-    the start; columns of dy0 beyond the n are directions of the start alone. `rigid` keeps the derivatives of the free
-    coordinates and their rates only.
-    Under `torch.no_grad()` no route records a graph.
+    gradient: with "discrete" the states and channels of the result carry the exact gradient of the
+    discrete run (of the steps that were taken, which are not differentiated) by y0, every parameter
+    and the reference; recorded nodal forces and energies do not. With "forward" `sensitivities`
+    holds the derivatives by the n scalar parameters `wrt`, and dy0 (size, n) is that of the start;
+    columns of dy0 beyond the n are directions of the start alone. `rigid` keeps the derivatives of
+    the free coordinates and their rates only. Under `torch.no_grad()` no route records a graph.
 
-    Raises `ValueError` for times that do not increase, a state of the wrong shape or dtype, an unknown route or parameter, two
-    ways to choose steps at once; `SimulationFailed` (with the trajectory so far) when the run cannot go on; `Interrupted`
-    (likewise) on Ctrl-C.
+    Raises `ValueError` for times that do not increase, a state of the wrong shape or dtype, an
+    unknown route or parameter, two ways to choose steps at once; `SimulationFailed` (with the
+    trajectory so far) when the run cannot go on; `Interrupted` (likewise) on Ctrl-C.
     """
     task = prepare(
-        rig, t, y0=y0, reference=reference, rtol=rtol, atol=atol, step=step, knots=knots, tolerance=tolerance,
-        gradient=gradient, wrt=wrt, dy0=dy0, rigid=rigid,
+        rig, t, y0=y0, reference=reference, rtol=rtol, atol=atol, step=step, knots=knots,
+        tolerance=tolerance, gradient=gradient, wrt=wrt, dy0=dy0, rigid=rigid,
     )  # fmt: skip
     trajectory = run(task, TAPE_BYTES, progress).trajectory()
     for doubt in doubts(trajectory, rig).values():
@@ -97,9 +101,10 @@ class Task(NamedTuple):
 
 
 def prepare(
-    rig: Rig, t: Tensor, *, y0: Tensor | None = None, reference: Reference | None = None, rtol: float | None = None,
-    atol: float | None = None, step: float | None = None, knots: Tensor | None = None, tolerance: float = 1e-9,
-    gradient: Route = "none", wrt: Sequence[str] = (), dy0: Tensor | None = None, rigid: bool = False,
+    rig: Rig, t: Tensor, *, y0: Tensor | None = None, reference: Reference | None = None,
+    rtol: float | None = None, atol: float | None = None, step: float | None = None,
+    knots: Tensor | None = None, tolerance: float = 1e-9, gradient: Route = "none",
+    wrt: Sequence[str] = (), dy0: Tensor | None = None, rigid: bool = False,
 ) -> Task:  # fmt: skip
     """Checks what `simulate` is asked for; raises its `ValueError`s."""
     _check_wanted(gradient, wrt, dy0, rigid)
@@ -128,7 +133,8 @@ def prepare(
 
 
 class RunOutcome(NamedTuple):
-    """A finished run: the states with what is needed to differentiate them, sensitivities where asked for, and its time [s]."""
+    """A finished run: the states with what is needed to differentiate them, sensitivities where
+    asked for, and its time [s]."""
 
     task: Task
     solved: Solved
@@ -136,20 +142,26 @@ class RunOutcome(NamedTuple):
     wall: float
 
     def trajectory(self, y: Tensor | None = None) -> Trajectory:
-        """The trajectory of the states y (T, size), by default with the adjoint of this run behind them."""
+        """The trajectory of the states y (T, size), by default with the adjoint of this run behind
+        them."""
         y = attached([self.solved])[0] if y is None else y
         return gather(self.task, y, self.solved.out, self.wall, self.dy)
 
 
-def run(task: Task, tape_bytes: float, progress: bool = False, explained: bool = True) -> RunOutcome:
-    """Carry out a task by one of the compiled routes; `explained` looks for the cause of a failure, which takes seconds.
+def run(
+    task: Task, tape_bytes: float, progress: bool = False, explained: bool = True
+) -> RunOutcome:
+    """Carry out a task by one of the compiled routes; `explained` looks for the cause of a failure,
+    which takes seconds.
 
     Raises `SimulationFailed` and `Interrupted` with what was simulated.
     """
     stepper, t, bar = task.stepper, task.t, None
     if progress:
         bar = tqdm(
-            total=float(t[-1] - t[0]), unit="s", bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated [{elapsed}]"
+            total=float(t[-1] - t[0]),
+            unit="s",
+            bar_format="{l_bar}{bar}| {n:.2f}/{total:.2f} s simulated [{elapsed}]",
         )
     done, began = None, clock.perf_counter()
     try:
@@ -183,18 +195,27 @@ def run(task: Task, tape_bytes: float, progress: bool = False, explained: bool =
 def _check_wanted(gradient: Route, wrt: Sequence[str], dy0: Tensor | None, rigid: bool) -> None:
     """Raises `ValueError` for a route that there is not, and for what belongs to another route."""
     if gradient not in get_args(Route):
-        raise ValueError(f"`gradient` must be one of {', '.join(get_args(Route))}, but is {gradient!r}")
-    if isinstance(wrt, str) or not isinstance(wrt, Sequence) or not all(isinstance(name, str) for name in wrt):
+        raise ValueError(
+            f"`gradient` must be one of {', '.join(get_args(Route))}, but is {gradient!r}"
+        )
+    if (
+        isinstance(wrt, str)
+        or not isinstance(wrt, Sequence)
+        or not all(isinstance(name, str) for name in wrt)
+    ):
         raise ValueError(f"`wrt` must be a list of parameters' names, but is {type(wrt).__name__}")
     if wrt and gradient != "forward":
         raise ValueError("`wrt` names the parameters of gradient='forward', and of that only")
     if gradient == "forward" and not wrt and dy0 is None:
-        raise ValueError("gradient='forward' needs the parameters' names `wrt`, or directions `dy0` of the start")
+        raise ValueError(
+            "gradient='forward' needs the parameters' names `wrt`, or directions `dy0` of the start"
+        )
     if gradient != "forward" and (dy0 is not None or rigid):
         raise ValueError("`dy0` and `rigid` belong to gradient='forward', and to that only")
     if gradient == "forward" and torch.is_inference_mode_enabled():
         raise ValueError(
-            "gradient='forward' needs torch's graphs, which torch.inference_mode() has not; use torch.no_grad()"
+            "gradient='forward' needs torch's graphs, which torch.inference_mode() has not; use "
+            "torch.no_grad()"
         )
 
 
@@ -214,7 +235,8 @@ def _rows(task: Task, tape_bytes: float) -> Iterator[tuple[Solved, Tensor | None
         check_array("dy0", dy0)
         if dy0.ndim != 2 or len(dy0) != size or dy0.shape[1] < max(1, len(wrt)):
             raise ValueError(
-                f"`dy0` must have shape ({size}, {max(1, len(wrt))}), or more columns, but has {tuple(dy0.shape)}"
+                f"`dy0` must have shape ({size}, {max(1, len(wrt))}), or more columns, but has "
+                f"{tuple(dy0.shape)}"
             )
         if not bool(torch.isfinite(dy0).all()):
             raise ValueError("`dy0` must be finite, but has a component that is not")
@@ -224,7 +246,8 @@ def _rows(task: Task, tape_bytes: float) -> Iterator[tuple[Solved, Tensor | None
 
 
 def diagnose(rig: Rig, failure: SimulationFailed, trajectory: Trajectory) -> SimulationFailed:
-    """The failure with the run so far, and with the closed loop's instability as its cause if the loop is unstable."""
+    """The failure with the run so far, and with the closed loop's instability as its cause if the
+    loop is unstable."""
     try:
         cause = describe_instability(rig) if isinstance(rig, SoftGrasp) else ""
     except RuntimeError:  # a rig that cannot grasp has no grasp to linearise
@@ -244,11 +267,18 @@ def made_by(rig: Rig, method: str) -> dict[str, object]:
     return {"torchsoft": VERSION, "method": method, **rig.description()}
 
 
-def gather(task: Task, y: Tensor, out: Progress, wall: float, dy: Tensor | None = None) -> Trajectory:
-    """The trajectory of the rows that the stepper has finished; y (T, size) carries the gradient, if any is wanted."""
+def gather(
+    task: Task, y: Tensor, out: Progress, wall: float, dy: Tensor | None = None
+) -> Trajectory:
+    """The trajectory of the rows that the stepper has finished; y (T, size) carries the gradient,
+    if any is wanted."""
     stepper, t = task.stepper, task.t
     rig, rows = stepper.rig, out.rows
-    t, y, forces, extras = t[:rows], y[:rows], *(torch.from_numpy(x[:rows]) for x in (out.forces, out.extras))
+    t, y, forces, extras = (
+        t[:rows],
+        y[:rows],
+        *(torch.from_numpy(x[:rows]) for x in (out.forces, out.extras)),
+    )
     names = stepper.integrals
     columns = dict(zip((*names.names, *rig.pads), extras.unbind(-1)))
     loads = extras[:, len(columns) :].unflatten(-1, (-1, 3))
@@ -267,12 +297,13 @@ def gather(task: Task, y: Tensor, out: Progress, wall: float, dy: Tensor | None 
             count = len(rig.pads[contact.pad].point_nodes)
             force[name], at = forces[:, at : at + count], at + count
     return Trajectory(
-        t=t, y=y, state=state, channels=measured, force=force, load=dict(zip(rig.bodies, loads.unbind(1))),
-        displacement=displacement, energy=energy,
+        t=t, y=y, state=state, channels=measured, force=force,
+        load=dict(zip(rig.bodies, loads.unbind(1))), displacement=displacement, energy=energy,
         dissipated={name: columns[name] for name in names.dissipated},
         supplied={name: columns[name] for name in names.supplied if name in names.active},
         injected=columns["injected"],
-        stats=Stats(out.steps, out.solves, out.failed, out.refused, wall), knots=torch.from_numpy(out.knots), layout=rig.layout,
+        stats=Stats(out.steps, out.solves, out.failed, out.refused, wall),
+        knots=torch.from_numpy(out.knots), layout=rig.layout,
         made_by=made_by(rig, METHOD) | {"steps": steps}, wrt=task.wrt,
         sensitivities=None if dy is None else dy[:rows], units=units(rig),
     )  # fmt: skip

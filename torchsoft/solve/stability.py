@@ -1,7 +1,8 @@
-"""Stability of the closed loop: the linearised modes of any rig about a state of rest, of the grasped system about its own.
+"""Stability of the closed loop: the linearised modes of any rig about a state of rest, of the
+grasped system about its own.
 
-The horizontal loop senses the disc and pushes the bracket, through two soft pads: non-collocated, and unstable for many
-combinations of gains, pad stiffness and pad damping.
+The horizontal loop senses the disc and pushes the bracket, through two soft pads: non-collocated,
+and unstable for many combinations of gains, pad stiffness and pad damping.
 """
 
 from collections.abc import Sequence
@@ -17,7 +18,8 @@ from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 
 DISPLACEMENT, VELOCITY = 1e-9, 1e-8
-"""Perturbations [m or rad], [m/s or rad/s] of the central differences: small against penetrations, so that nodes stick."""
+"""Perturbations [m or rad], [m/s or rad/s] of the central differences: small against penetrations,
+so that nodes stick."""
 
 NEUTRAL = 0.1
 """Growth rate [1/s] up to which a mode counts as neutral; the disc's angle is one."""
@@ -28,12 +30,17 @@ AT_ONCE = 64
 
 
 @torch.no_grad()
-def linearised(model: Rig, y: Tensor, reference: Reference, only: Sequence[int] | None = None) -> Tensor:
-    """dy'/dy (size, size) at a state y (size,) of rest, with touching and sticking as they are there; `only` takes some of the
-    components. In plain torch: compiling the kernels would take longer."""
+def linearised(
+    model: Rig, y: Tensor, reference: Reference, only: Sequence[int] | None = None
+) -> Tensor:
+    """dy'/dy (size, size) at a state y (size,) of rest, with touching and sticking as they are
+    there; `only` takes some of the components. In plain torch: compiling the kernels would take
+    longer."""
     size = torch.full((model.layout.size,), DISPLACEMENT, dtype=torch.float64)
     for (part, name), where in model.layout.slices.items():
-        if part == "pads" and not model.pads[name].inertial:  # forces, counted by the displacement they make
+        if (
+            part == "pads" and not model.pads[name].inertial
+        ):  # forces, counted by the displacement they make
             size[where] = DISPLACEMENT / float(model.pads[name].compliance().diagonal().max())
         elif part in ("rates", "velocity"):
             size[where] = VELOCITY
@@ -47,7 +54,8 @@ def linearised(model: Rig, y: Tensor, reference: Reference, only: Sequence[int] 
 
 
 class Modes(NamedTuple):
-    """Eigenvalues [1/s], complex, the least stable first, and the coordinate that moves most in the first of them."""
+    """Eigenvalues [1/s], complex, the least stable first, and the coordinate that moves most in the
+    first of them."""
 
     values: Tensor
     moves: str
@@ -55,16 +63,18 @@ class Modes(NamedTuple):
 
 @torch.no_grad()
 def modes(rig: Rig, y: Tensor, reference: Reference) -> Modes:
-    """Of a rig with massless pads about a state y (size,) at rest, pads settled, with the constant `reference`; constant loads
-    out of balance there do not matter, touching and sticking points do.
+    """Of a rig with massless pads about a state y (size,) at rest, pads settled, with the constant
+    `reference`; constant loads out of balance there do not matter, touching and sticking points do.
 
-    Away from contact nodal forces and stretches fade by themselves, whatever the rest does: those modes are left out. An
-    angle counts by the radius of gyration.
+    Away from contact nodal forces and stretches fade by themselves, whatever the rest does: those
+    modes are left out. An angle counts by the radius of gyration.
     """
     state, layout = rig.unpack(y, rig.follow(0.0, reference)), rig.layout
     acting = torch.ones(layout.size, dtype=torch.bool)
     for name, forces in state.pads.items():
-        acting[layout.slices["pads", name]] = (forces != 0).any(-1, keepdim=True).expand(forces.shape).flatten()
+        acting[layout.slices["pads", name]] = (
+            (forces != 0).any(-1, keepdim=True).expand(forces.shape).flatten()
+        )
     for name in rig.contacts:
         acting[layout.slices["stretch", name]] = rig.penetration(name, state) > 0
     only = acting.nonzero()[:, 0].tolist()
@@ -75,7 +85,9 @@ def modes(rig: Rig, y: Tensor, reference: Reference) -> Modes:
         mass, _, inertia = (float(m.detach()) for m in rig.bodies[name].masses)
         for i, axis in enumerate(axes):
             at = only.index(layout.slices["pose", name].start + i)
-            size = float(vectors[at, order[0]].abs()) * ((inertia / mass) ** 0.5 if axis == 2 else 1.0)
+            size = float(vectors[at, order[0]].abs()) * (
+                (inertia / mass) ** 0.5 if axis == 2 else 1.0
+            )
             if size > most:
                 most, moves = size, f"{name}.{COORDINATES[axis]}"
     return Modes(values[order], moves)
@@ -83,14 +95,17 @@ def modes(rig: Rig, y: Tensor, reference: Reference) -> Modes:
 
 @torch.no_grad()
 def loop_modes(model: SoftGrasp) -> Tensor:
-    """Eigenvalues [1/s] of the linearised closed loop in the grasp, complex (size,), the least stable first.
+    """Eigenvalues [1/s] of the linearised closed loop in the grasp, complex (size,), the least
+    stable first.
 
-    The grasp is the frictionless equilibrium at the scenario's y_Br(t_g), with every touching node sticking. Raises
-    `NoEquilibrium` when that grasp does not exist.
+    The grasp is the frictionless equilibrium at the scenario's y_Br(t_g), with every touching node
+    sticking. Raises `NoEquilibrium` when that grasp does not exist.
     """
     y = press(model, model.settings.scenario.y_Br_grasp)
     pose = model.unpack(y).pose
-    reference = hold(x_d=float(pose["disc"][0]), y_d=float(pose["bracket"][1]), F_ff=-holding_force(model, y))
+    reference = hold(
+        x_d=float(pose["disc"][0]), y_d=float(pose["bracket"][1]), F_ff=-holding_force(model, y)
+    )
     modes = torch.linalg.eigvals(linearised(model, y, reference))
     return modes[modes.real.argsort(descending=True)]
 
@@ -100,9 +115,11 @@ def describe_instability(model: SoftGrasp) -> str:
     leading = complex(loop_modes(model)[0])
     if leading.real <= NEUTRAL:
         return ""
-    names = [name for name, _ in model.pads["L"].material.named_parameters() if name.startswith("tau")]
+    names = [
+        name for name, _ in model.pads["L"].material.named_parameters() if name.startswith("tau")
+    ]
     slower = ", ".join(f"pad.{name}" for name in names if name != "tau_instant")
     return (
-        f"the closed loop is unstable: its leading mode is {leading.real:+.3g} {leading.imag:+.3g}j 1/s; raise {slower} or "
-        "pad.E, or lower control.K_81"
+        f"the closed loop is unstable: its leading mode is {leading.real:+.3g} "
+        f"{leading.imag:+.3g}j 1/s; raise {slower} or pad.E, or lower control.K_81"
     )

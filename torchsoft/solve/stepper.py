@@ -13,7 +13,15 @@ from torchsoft.physics.arguments import positive, whole
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
-from torchsoft.solve.grid import CHUNK, LONGEST, Plan, check_knots, check_times, equal_steps, given_steps
+from torchsoft.solve.grid import (
+    CHUNK,
+    LONGEST,
+    Plan,
+    check_knots,
+    check_times,
+    equal_steps,
+    given_steps,
+)
 from torchsoft.solve.kernel.arrays import NO_ERRORS, NO_SIGNALS, Array, room
 from torchsoft.solve.kernel.run import run
 from torchsoft.solve.kernel.step import (
@@ -39,7 +47,8 @@ FIRST, SHORTEST = 1e-3, 1e-9
 """Length [s] of the first step that tolerances try, and the shortest that they may choose."""
 
 SMALLEST_TOLERANCE = 1e-10
-"""Newton tolerance [N] that the ready excitations can meet: at a tenth of it one step in ten is halved because of rounding."""
+"""Newton tolerance [N] that the ready excitations can meet: at a tenth of it one step in ten is
+halved because of rounding."""
 
 METHOD = "sdirk2"
 """Name under which `torchdiffeq.odeint` knows the stepper once torchsoft is imported."""
@@ -48,26 +57,32 @@ METHOD = "sdirk2"
 class ImplicitStepper:
     """SDIRK2 on one rig and reference as they are now: L-stable, second order, stiffly accurate.
 
-    Steps are chosen by `rtol` and `atol`, or given: `step` [s] cuts every output interval into equal steps no longer than it,
-    `knots` (n + 1,) [s] are the steps of another run. Tolerances hold the error that one step makes, in every part of the
-    state (a pad's nodal forces, a contact's stretches, a body's position, its angle), below atol units (`UNITS`) plus rtol
-    times the largest value so far; no step is longer than `longest` [s] or passes a knot of the reference, and with `landing`
-    a step ends at every output.
+    Steps are chosen by `rtol` and `atol`, or given: `step` [s] cuts every output interval into
+    equal steps no longer than it, `knots` (n + 1,) [s] are the steps of another run. Tolerances
+    hold the error that one step makes, in every part of the state (a pad's nodal forces, a
+    contact's stretches, a body's position, its angle), below atol units (`UNITS`) plus rtol times
+    the largest value so far; no step is longer than `longest` [s] or passes a knot of the
+    reference, and with `landing` a step ends at every output.
 
-    Newton stops when the contact law and the linear relations agree to `tolerance` [N] at every node. A given step that it
-    does not solve is taken as two of half the length, and so on up to `HALVINGS` times. `window` [m] is how near a point has to
-    be to count as one that may touch (checked after every stage; only speed depends on it).
+    Newton stops when the contact law and the linear relations agree to `tolerance` [N] at every
+    node. A given step that it does not solve is taken as two of half the length, and so on up to
+    `HALVINGS` times. `window` [m] is how near a point has to be to count as one that may touch
+    (checked after every stage; only speed depends on it).
 
     Raises `ValueError` for a tolerance below `SMALLEST_TOLERANCE` and an rtol that is not below 1.
     """
 
     def __init__(
-        self, rig: Rig, reference: Reference | None = None, *, step: float | None = None, rtol: float = 1e-3,
-        atol: float = 1e-4, knots: Tensor | None = None, tolerance: float = 1e-9, max_iterations: int = 40,
-        window: float = 2e-3, longest: float = LONGEST, landing: bool = False,
+        self, rig: Rig, reference: Reference | None = None, *, step: float | None = None,
+        rtol: float = 1e-3, atol: float = 1e-4, knots: Tensor | None = None,
+        tolerance: float = 1e-9, max_iterations: int = 40, window: float = 2e-3,
+        longest: float = LONGEST, landing: bool = False,
     ) -> None:  # fmt: skip
         if not isinstance(rig, Rig):
-            raise ValueError(f"`rig` must be a Rig, but is {rig if isinstance(rig, type) else type(rig).__name__}")
+            raise ValueError(
+                "`rig` must be a Rig, but is "
+                f"{rig if isinstance(rig, type) else type(rig).__name__}"
+            )
         followed = rig.reference if reference is None else reference
         if not isinstance(followed, Reference):
             raise ValueError(f"`reference` must be a Reference, but is {type(followed).__name__}")
@@ -75,14 +90,16 @@ class ImplicitStepper:
         self.rtol, self.atol = positive("rtol", rtol), positive("atol", atol)
         if self.rtol >= 1:
             raise ValueError(
-                f"`rtol` must be below 1, but is {self.rtol:g}; where only `atol` is given, it is ten times that"
+                f"`rtol` must be below 1, but is {self.rtol:g}; where only `atol` is given, it is "
+                "ten times that"
             )
         self.longest = positive("longest", longest)
         self.tolerance, self.window = positive("tolerance", tolerance), positive("window", window)
         self.max_iterations, self.landing = whole("max_iterations", max_iterations, 1), landing
         if self.tolerance < SMALLEST_TOLERANCE:
             raise ValueError(
-                f"`tolerance` must be at least {SMALLEST_TOLERANCE:g} N, but is {tolerance:g} N, which rounding hides"
+                f"`tolerance` must be at least {SMALLEST_TOLERANCE:g} N, but is {tolerance:g} N, "
+                "which rounding hides"
             )
         self.knots = None if knots is None else check_knots(knots)
         self.rig, self.reference = rig, followed
@@ -113,25 +130,37 @@ class ImplicitStepper:
         check_array("y0", y0)
         self.layout.check(y0)
         if y0.ndim != 1:
-            raise ValueError(f"`y0` must be one state, shape ({self.layout.size},), but has shape {tuple(y0.shape)}")
+            raise ValueError(
+                f"`y0` must be one state, shape ({self.layout.size},), but has shape "
+                f"{tuple(y0.shape)}"
+            )
         if not bool(torch.isfinite(y0).all()):
-            raise ValueError(f"`y0` must be finite, but component {int((~torch.isfinite(y0)).nonzero()[0, 0])} is not")
+            raise ValueError(
+                f"`y0` must be finite, but component {int((~torch.isfinite(y0)).nonzero()[0, 0])} "
+                "is not"
+            )
 
     @torch.no_grad()
     def integrate(
         self, y0: Tensor, t: Tensor, segments: list[Segment] | None = None, tape_bytes: float = 0.0
     ) -> Iterator[Progress]:
-        """Step from y0 (size,) through t (T,), yielding the same growing `Progress` after every compiled call.
+        """Step from y0 (size,) through t (T,), yielding the same growing `Progress` after every
+        compiled call.
 
-        The last yield is the complete run. With `segments` given, what the derivatives need is appended to it, tapes for as
-        long as they take less than `tape_bytes`. Raises `SimulationFailed`, and `ValueError` for a start that is not finite.
+        The last yield is the complete run. With `segments` given, what the derivatives need is
+        appended to it, tapes for as long as they take less than `tape_bytes`. Raises
+        `SimulationFailed`, and `ValueError` for a start that is not finite.
         """
         self.check_start(y0)
         check_times(t, self.step)
         self._still = self.compiled.system(INSTANT / GAMMA)
         s, names = self._still, self.integrals.names
         extras = len(names) + len(s.pad_base) + len(s.body_free)
-        out = Progress(np.zeros((len(t), len(y0))), np.zeros((len(t), len(s.point_X), 2)), np.zeros((len(t), extras)))
+        out = Progress(
+            np.zeros((len(t), len(y0))),
+            np.zeros((len(t), len(s.point_X), 2)),
+            np.zeros((len(t), extras)),
+        )
         work = room("Work", s, self.layout.size, columns=1)
         step = room("Step", s, self.layout.size, integrals=len(names))
         y, integrals = y0.numpy().copy(), np.zeros(len(names))
@@ -140,30 +169,48 @@ class ImplicitStepper:
         set_velocities(s, work, y)
         state = Marching(y, work, step, integrals, out, segments, tape_bytes)
         yield from (
-            self._by_tolerance(t, state) if self.step is None and self.knots is None else self._as_given(t, state)
+            self._by_tolerance(t, state)
+            if self.step is None and self.knots is None
+            else self._as_given(t, state)
         )
 
     def _as_given(self, t: Tensor, now: "Marching") -> Iterator[Progress]:
         """Take the steps of a plan."""
-        todo = list(given_steps(t, self.knots) if self.knots is not None else equal_steps(t, self.step or 0.0))
-        if self.compiled.inertial and self.knots is not None:  # their arrays belong to one step length
+        todo = list(
+            given_steps(t, self.knots)
+            if self.knots is not None
+            else equal_steps(t, self.step or 0.0)
+        )
+        if (
+            self.compiled.inertial and self.knots is not None
+        ):  # their arrays belong to one step length
             todo = [plan.part(i, i + 1) for plan in todo for i in range(len(plan.h))]
         signals, at_outputs = self.signals(todo).numpy(), self.signals_at_outputs(todo).numpy()
         ends, rows = (
-            np.cumsum([0, *sizes]) for sizes in ([2 * len(x.h) for x in todo], [len(x.out_step) for x in todo])
+            np.cumsum([0, *sizes])
+            for sizes in ([2 * len(x.h) for x in todo], [len(x.out_step) for x in todo])
         )
         pending = [
-            (plan, signals[ends[i] : ends[i + 1]], at_outputs[rows[i] : rows[i + 1]], 0) for i, plan in enumerate(todo)
+            (plan, signals[ends[i] : ends[i + 1]], at_outputs[rows[i] : rows[i + 1]], 0)
+            for i, plan in enumerate(todo)
         ][::-1]
         out = now.out
         while pending:
             plan, follow, at_rows, halvings = pending.pop()
             before = now.copy()
             here = slice(out.rows, out.rows + len(plan.out_step))
-            steps, rows_done, status, solves, tape = self._run(plan, follow, at_rows, now, here, now.taping)
+            steps, rows_done, status, solves, tape = self._run(
+                plan, follow, at_rows, now, here, now.taping
+            )
             here = slice(out.rows, out.rows + rows_done)
-            now.keep(plan.part(0, steps), follow[: 2 * steps], at_rows[:rows_done], before, here, tape)
-            out.rows, out.steps, out.solves = out.rows + rows_done, out.steps + steps, out.solves + solves
+            now.keep(
+                plan.part(0, steps), follow[: 2 * steps], at_rows[:rows_done], before, here, tape
+            )
+            out.rows, out.steps, out.solves = (
+                out.rows + rows_done,
+                out.steps + steps,
+                out.solves + solves,
+            )
             yield out
             if status == NEWTON_FAILED and halvings < HALVINGS:
                 out.failed += 1
@@ -171,7 +218,12 @@ class ImplicitStepper:
                 if steps + 1 < len(plan.h):
                     rest = plan.part(steps + 1, len(plan.h))
                     pending.append(
-                        (rest, follow[2 * steps + 2 :], at_rows[len(at_rows) - len(rest.out_step) :], halvings)
+                        (
+                            rest,
+                            follow[2 * steps + 2 :],
+                            at_rows[len(at_rows) - len(rest.out_step) :],
+                            halvings,
+                        )
                     )
                 half = plan.halved(steps)
                 new = self.signals([half]).numpy(), self.signals_at_outputs([half]).numpy()
@@ -182,7 +234,9 @@ class ImplicitStepper:
     def _by_tolerance(self, t: Tensor, now: "Marching") -> Iterator[Progress]:
         """Take steps whose lengths the tolerances choose."""
         times, out = t.numpy(), now.out
-        followed = Followed(lambda x: self.compiled.signals(x, self.reference), self.rig, self.reference)
+        followed = Followed(
+            lambda x: self.compiled.signals(x, self.reference), self.rig, self.reference
+        )
         stops = np.union1d(followed.stops, times[1:] if self.landing else times[-1:])
         stops = stops[(stops > times[0]) & (stops <= times[-1])]
         errors = error_parts(self.rig, now.y, self.atol)
@@ -200,9 +254,9 @@ class ImplicitStepper:
             now.work.travelled[0] = np.inf
             now.work.low[:] = now.work.high[:] = 0
             steps, done, status, solves, refused, failed, which = run(
-                s, self._still, now.work, now.step, followed.arrays, errors, False, now.y, k, clock, stops, times, out.rows,
-                rung, *self._limits, now.integrals, out.y, out.forces, out.extras, tape, starts, h, signals, row_step,
-                row_part, at_rows,
+                s, self._still, now.work, now.step, followed.arrays, errors, False, now.y, k, clock,
+                stops, times, out.rows, rung, *self._limits, now.integrals, out.y, out.forces,
+                out.extras, tape, starts, h, signals, row_step, row_part, at_rows,
             )  # fmt: skip
             if followed.error is not None:
                 raise followed.error
@@ -220,13 +274,14 @@ class ImplicitStepper:
                 raise self._failure(status, float(clock[0]), float(clock[1]), worst)
 
     def _start(self, y0: Array, time: Tensor, work: Any, step: Any, out: Progress) -> None:
-        """Nodal forces, moments and loads at the start, the first row, and the rates there. Raises `SimulationFailed`."""
+        """Nodal forces, moments and loads at the start, the first row, and the rates there. Raises
+        `SimulationFailed`."""
         signals = self.compiled.signals(time[None], self.reference).numpy()
         none = np.zeros(0)
         *_, status, _, _, _, _ = run(
-            self._still, self._still, work, step, NO_SIGNALS, NO_ERRORS, True, y0, none, none, none, none, 0, 0.0,
-            *self._limits, np.zeros(len(self.integrals.names)), out.y, out.forces, out.extras,
-            self._empty_tape(0), none, none, np.zeros((0, 2, *signals.shape[1:])),
+            self._still, self._still, work, step, NO_SIGNALS, NO_ERRORS, True, y0, none, none, none,
+            none, 0, 0.0, *self._limits, np.zeros(len(self.integrals.names)), out.y, out.forces,
+            out.extras, self._empty_tape(0), none, none, np.zeros((0, 2, *signals.shape[1:])),
             np.zeros(1, np.int64), np.zeros(1), signals,
         )  # fmt: skip
         if status != CONVERGED:
@@ -234,7 +289,9 @@ class ImplicitStepper:
 
     def signals(self, todo: Sequence[Plan]) -> Tensor:
         """The signals at all stages of some plans (stages, signals, 2)."""
-        return self.compiled.signals(torch.cat([stage_times(plan) for plan in todo]), self.reference)
+        return self.compiled.signals(
+            torch.cat([stage_times(plan) for plan in todo]), self.reference
+        )
 
     def signals_at_outputs(self, todo: Sequence[Plan]) -> Tensor:
         """The signals at all outputs of some plans (outputs, signals, 2)."""
@@ -249,11 +306,21 @@ class ImplicitStepper:
         work, names = room("Work", s, self.layout.size, columns=1), len(self.integrals.names)
         work.V[:], work.u_dot[:] = segment.V, segment.u_dot
         extras = names + len(s.pad_base) + len(s.body_free)
-        out = Progress(np.empty((n, self.layout.size)), np.empty((n, len(s.point_X), 2)), np.empty((n, extras)))
-        again = Marching(
-            segment.y.copy(), work, room("Step", s, self.layout.size, integrals=names), np.zeros(names), out, None, 0.0
+        out = Progress(
+            np.empty((n, self.layout.size)), np.empty((n, len(s.point_X), 2)), np.empty((n, extras))
         )
-        *_, tape = self._run(segment.plan, segment.signals, segment.at_outputs, again, slice(0, n), True)
+        again = Marching(
+            segment.y.copy(),
+            work,
+            room("Step", s, self.layout.size, integrals=names),
+            np.zeros(names),
+            out,
+            None,
+            0.0,
+        )
+        *_, tape = self._run(
+            segment.plan, segment.signals, segment.at_outputs, again, slice(0, n), True
+        )
         assert tape is not None
         return tape
 
@@ -261,9 +328,16 @@ class ImplicitStepper:
         return room("Tape", self._still, self.layout.size, stages=stages, cap=self._cap)
 
     def _run(
-        self, plan: Plan, signals: Array, at_outputs: Array, now: "Marching", rows: slice, taping: bool
+        self,
+        plan: Plan,
+        signals: Array,
+        at_outputs: Array,
+        now: "Marching",
+        rows: slice,
+        taping: bool,
     ) -> tuple[int, int, int, int, Any]:
-        """One compiled call; with `taping` once more with a longer tape if more points touch than it has room for."""
+        """One compiled call; with `taping` once more with a longer tape if more points touch than
+        it has room for."""
         s, steps, before = self.compiled.system(float(plan.h[0])), len(plan.h), now.copy()
         while True:
             now.work.travelled[0] = (
@@ -272,9 +346,11 @@ class ImplicitStepper:
             now.work.low[:] = now.work.high[:] = 0
             tape = self._empty_tape(2 * steps if taping else 0)
             done, rows_done, status, solves, *_ = run(
-                s, self._still, now.work, now.step, NO_SIGNALS, NO_ERRORS, True, now.y, *[np.zeros(3)] * 4, 0, 0.0,
-                *self._limits, now.integrals, now.out.y[rows], now.out.forces[rows], now.out.extras[rows], tape, plan.starts,
-                plan.h, signals.reshape(steps, 2, *signals.shape[1:]), plan.out_step, plan.out_part, at_outputs,
+                s, self._still, now.work, now.step, NO_SIGNALS, NO_ERRORS, True, now.y,
+                *[np.zeros(3)] * 4, 0, 0.0, *self._limits, now.integrals, now.out.y[rows],
+                now.out.forces[rows], now.out.extras[rows], tape, plan.starts, plan.h,
+                signals.reshape(steps, 2, *signals.shape[1:]), plan.out_step, plan.out_part,
+                at_outputs,
             )  # fmt: skip
             if status != TAPE_FULL:
                 return done, rows_done, status, solves, tape if taping else None
@@ -282,15 +358,20 @@ class ImplicitStepper:
             now.back(before)
 
     def _failure(self, status: int, time: float, h: float, worst: str = "") -> SimulationFailed:
-        tried = f"steps down to {SHORTEST:g} s" if worst else f"the step of {h:.3g} s, halved {HALVINGS} times"
+        tried = (
+            f"steps down to {SHORTEST:g} s"
+            if worst
+            else f"the step of {h:.3g} s, halved {HALVINGS} times"
+        )
         reasons = {
-            NEWTON_FAILED: f"Newton's iteration did not converge within {self.max_iterations} iterations in {tried}; try "
-            f"{'other tolerances' if worst else 'a smaller step'}, or a larger v_s of the friction law: where friction "
-            "falls with slip faster than the pads damp, massless pads have no unique velocity",
+            NEWTON_FAILED: f"Newton's iteration did not converge within {self.max_iterations} "
+            f"iterations in {tried}; try {'other tolerances' if worst else 'a smaller step'}, or a "
+            "larger v_s of the friction law: where friction falls with slip faster than the pads "
+            "damp, massless pads have no unique velocity",
             OFF_THE_PAD: "the body was lost: its contact reached the end of a pad",
             LOST: "the body was lost: it left the space over a pad",
-            REFUSED: f"the tolerances would need steps below {SHORTEST:g} s for {worst}; loosen rtol or atol, or look for a "
-            "jump in the reference or in a law there",
+            REFUSED: f"the tolerances would need steps below {SHORTEST:g} s for {worst}; loosen "
+            "rtol or atol, or look for a jump in the reference or in a law there",
             NOT_FINITE: "the state is not finite any more; check the parameters and the reference",
         }
         return SimulationFailed(f"at t = {time:.4f} s {reasons[status]}", time)
@@ -298,7 +379,9 @@ class ImplicitStepper:
 
 def stage_times(plan: Plan) -> Tensor:
     """Times of the stages of a plan (2 steps,) [s]."""
-    return torch.from_numpy((plan.starts[:, None] + plan.h[:, None] * np.array([GAMMA, 1.0])).ravel())
+    return torch.from_numpy(
+        (plan.starts[:, None] + plan.h[:, None] * np.array([GAMMA, 1.0])).ravel()
+    )
 
 
 def set_velocities(s: Any, work: Any, y: Array) -> None:

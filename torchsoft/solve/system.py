@@ -1,7 +1,9 @@
-"""A rig as the kernels take it: its laws compiled, its parameters as one vector, its lists as plain arrays.
+"""A rig as the kernels take it: its laws compiled, its parameters as one vector, its lists as plain
+arrays.
 
-Everything is read from the modules when a run begins, so that what ran is what the modules were then, whatever becomes of them;
-the vector of parameters keeps its graph, and so gradients reach whatever the values were made of.
+Everything is read from the modules when a run begins, so that what ran is what the modules were
+then, whatever becomes of them; the vector of parameters keeps its graph, and so gradients reach
+whatever the values were made of.
 """
 
 import warnings
@@ -19,8 +21,24 @@ from torchsoft.physics.mesh import banded
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.validity import check_array, check_groups, check_shape, check_slip, check_values, slip_rates
-from torchsoft.solve.kernel.arrays import Actuators, Bodies, Contacts, Index, Inertia, Pads, Points, system
+from torchsoft.physics.validity import (
+    check_array,
+    check_groups,
+    check_shape,
+    check_slip,
+    check_values,
+    slip_rates,
+)
+from torchsoft.solve.kernel.arrays import (
+    Actuators,
+    Bodies,
+    Contacts,
+    Index,
+    Inertia,
+    Pads,
+    Points,
+    system,
+)
 from torchsoft.solve.kernel.step import GAMMA
 from torchsoft.solve.laws import LawSet, actuator_law, contact_laws, structure
 
@@ -30,13 +48,15 @@ NOMINAL = 1e-3
 
 @contextmanager
 def independent() -> Iterator[None]:
-    """Graphs made inside keep copies of what they need backwards: what becomes of the modules does not reach them."""
+    """Graphs made inside keep copies of what they need backwards: what becomes of the modules does
+    not reach them."""
     with torch.autograd.graph.saved_tensors_hooks(lambda x: x.detach().clone(), lambda x: x):
         yield
 
 
 class Compiled:
-    """A rig at one moment: `p` (parameters,) with its graph, `names` of its entries, and `system(h)` for a step h [s]."""
+    """A rig at one moment: `p` (parameters,) with its graph, `names` of its entries, and
+    `system(h)` for a step h [s]."""
 
     def __init__(self, rig: Rig) -> None:
         rig.check_names()
@@ -61,7 +81,8 @@ class Compiled:
         check_array("p", self.p)
         if not bool(torch.isfinite(self.p).all()):
             raise ValueError(
-                "the parameters of the rig give numbers that are not finite; some are too large or too small"
+                "the parameters of the rig give numbers that are not finite; some are too large or "
+                "too small"
             )
 
     def _add(self, value: Tensor) -> int:
@@ -73,7 +94,11 @@ class Compiled:
 
     def _add_all(self, parameters: Mapping[str, Tensor]) -> int:
         """Append the parameters of a law."""
-        return self._add(torch.cat([torch.zeros(0).double(), *(value.reshape(-1) for value in parameters.values())]))
+        return self._add(
+            torch.cat(
+                [torch.zeros(0).double(), *(value.reshape(-1) for value in parameters.values())]
+            )
+        )
 
     def _make_bodies(self, gravity_at: int, mass_at: list[list[int]]) -> Bodies:
         rig, free, signal, coordinate, masses, weight = self.rig, [], [], [], [], []
@@ -83,7 +108,11 @@ class Compiled:
                 kind = body.freedom[axis]
                 free.append(len(coordinate) if kind == "free" else -1)
                 signal.append(
-                    rig.signals.index(f"{name}.{axis}") if kind == "driven" else fixed if kind == "fixed" else -1
+                    rig.signals.index(f"{name}.{axis}")
+                    if kind == "driven"
+                    else fixed
+                    if kind == "fixed"
+                    else -1
                 )
                 fixed += kind == "fixed"
                 if kind == "free":
@@ -96,8 +125,8 @@ class Compiled:
             for kind in ("pose", "velocity")
         ]
         return Bodies(
-            _ints([*free, -1, -1, -1]), _ints([*signal, -1, -1, -1]), _ints(coordinate), _ints(masses), np.array(weight),
-            gravity_at, *starts,
+            _ints([*free, -1, -1, -1]), _ints([*signal, -1, -1, -1]), _ints(coordinate),
+            _ints(masses), np.array(weight), gravity_at, *starts,
         )  # fmt: skip
 
     @property
@@ -112,17 +141,28 @@ class Compiled:
 
     @independent()
     def signals(self, t: Tensor, reference: Reference | None = None) -> Tensor:
-        """The signals that the kernels follow, fixed coordinates last: values and rates (..., signals, 2)."""
-        fixed = [body.fixed[axis] for body in self.rig.bodies.values() for axis in COORDINATES if axis in body.fixed]
+        """The signals that the kernels follow, fixed coordinates last: values and rates (...,
+        signals, 2)."""
+        fixed = [
+            body.fixed[axis]
+            for body in self.rig.bodies.values()
+            for axis in COORDINATES
+            if axis in body.fixed
+        ]
         followed = self.rig.follow(t, reference)
         if not bool(torch.isfinite(followed).all()):
             bad = torch.nonzero(~torch.isfinite(followed))[0].tolist()
             name, time = self.rig.signals[bad[-2]], float(t[tuple(bad[:-2])])
-            raise ValueError(f"the signal `{name}` of the reference is not finite at t = {time:g} s")
-        used = self.rig.reference if reference is None else reference
-        if used.plain(self.rig.signals) is None and not torch.equal(followed, self.rig.follow(t, reference)):
             raise ValueError(
-                "the reference gives other values when asked again; signals must be functions of time alone"
+                f"the signal `{name}` of the reference is not finite at t = {time:g} s"
+            )
+        used = self.rig.reference if reference is None else reference
+        if used.plain(self.rig.signals) is None and not torch.equal(
+            followed, self.rig.follow(t, reference)
+        ):
+            raise ValueError(
+                "the reference gives other values when asked again; signals must be functions of "
+                "time alone"
             )
         if not fixed:
             return followed
@@ -138,7 +178,9 @@ class Compiled:
         for number, (name, pad) in enumerate(rig.pads.items()):
             material, n = pad.material, len(pad.mesh.surface)
             fractions, times = material.chain()
-            rows["base"].append(3 * (len(rig.bodies) if pad.base is None else list(rig.bodies).index(pad.base)))
+            rows["base"].append(
+                3 * (len(rig.bodies) if pad.base is None else list(rig.bodies).index(pad.base))
+            )
             rows["branches"].append(len(fractions))
             rows["chain_at"].append(self._add(fractions))
             self._add(times)
@@ -146,21 +188,34 @@ class Compiled:
                 lame_lambda, lame_mu = material.lame()
                 density = material.rho * material.depth
                 material_at.append(
-                    self._add(torch.stack((material.depth * lame_lambda, material.depth * lame_mu, times[0], density)))
+                    self._add(
+                        torch.stack(
+                            (
+                                material.depth * lame_lambda,
+                                material.depth * lame_mu,
+                                times[0],
+                                density,
+                            )
+                        )
+                    )
                 )
             else:
-                material_at.append(self._add(torch.stack((1 / (material.E * material.depth), material.nu))))
+                material_at.append(
+                    self._add(torch.stack((1 / (material.E * material.depth), material.nu)))
+                )
             rows["y_start"].append(slices["pads", name].start)
             rows["v_start"].append(slices["rates", name].start if pad.inertial else -1)
             node_start.append(node_start[-1] + n)
             C_start.append(C_start[-1] + 4 * n * n)
             dofs.append(dofs[-1] + (2 * pad.nodes if pad.inertial else 0))
-            involved = {3 * list(rig.bodies).index(c.body) for c in rig.contacts.values() if c.pad == name} | {
-                rows["base"][-1]
-            }
+            involved = {
+                3 * list(rig.bodies).index(c.body) for c in rig.contacts.values() if c.pad == name
+            } | {rows["base"][-1]}
             mine = [i for i, c in enumerate(self._bodies.coordinate) if c // 3 * 3 in involved]
             columns[number, mine] = np.arange(len(mine))
-        points = np.cumsum([0, *(len(rig.pads[contact.pad].point_nodes) for contact in rig.contacts.values())])
+        points = np.cumsum(
+            [0, *(len(rig.pads[contact.pad].point_nodes) for contact in rig.contacts.values())]
+        )
         point_start = points[np.searchsorted(contact_pads, np.arange(len(rig.pads) + 1))]
         C, dC, reach = np.zeros(C_start[-1]), np.zeros(C_start[-1]), []
         for i, pad in enumerate(rig.pads.values()):
@@ -174,22 +229,31 @@ class Compiled:
                 dC[C_start[i] : C_start[i + 1]] = (by_nu * scale).numpy().ravel()
             reach.append(1.5 * np.abs(C[C_start[i] : C_start[i + 1]]).max())
         pads = Pads(
-            _ints(rows["base"]), _ints(node_start), _ints(point_start), _ints(rows["y_start"]), _ints(rows["v_start"]),
-            _ints(rows["chain_at"]), _ints(rows["branches"]), _ints(C_start), C, dC, np.array(reach), columns,
-            (columns >= 0).sum(1),
+            _ints(rows["base"]), _ints(node_start), _ints(point_start), _ints(rows["y_start"]),
+            _ints(rows["v_start"]), _ints(rows["chain_at"]), _ints(rows["branches"]),
+            _ints(C_start), C, dC, np.array(reach), columns, (columns >= 0).sum(1),
         )  # fmt: skip
         return pads, self._make_inertia(dofs, node_start, material_at)
 
-    def _make_inertia(self, dofs: list[int], node_start: list[int], material_at: list[int]) -> Inertia:
+    def _make_inertia(
+        self, dofs: list[int], node_start: list[int], material_at: list[int]
+    ) -> Inertia:
         total = dofs[-1]
         X, area, D = np.zeros(total), np.zeros(total), np.zeros((total, 2))
         moving = {i: pad for i, pad in enumerate(self.rig.pads.values()) if pad.inertial}
         both = {i: [pad.stiffness(modulus) for modulus in range(2)] for i, pad in moving.items()}
-        patterns = {i: sparse.csr_array(abs(K_lambda) + abs(K_mu)) for i, (K_lambda, K_mu) in both.items()}
+        patterns = {
+            i: sparse.csr_array(abs(K_lambda) + abs(K_mu)) for i, (K_lambda, K_mu) in both.items()
+        }
         for pattern in patterns.values():
             pattern.eliminate_zeros()
-        widest = max((pattern.count_nonzero(axis=1).max() for pattern in patterns.values()), default=0)
-        surface, column = np.zeros(2 * node_start[-1], np.int64), np.zeros((total, widest), np.int64)
+        widest = max(
+            (pattern.count_nonzero(axis=1).max() for pattern in patterns.values()), default=0
+        )
+        surface, column = (
+            np.zeros(2 * node_start[-1], np.int64),
+            np.zeros((total, widest), np.int64),
+        )
         K = [np.zeros((total, widest)) for _ in range(2)]
         for i, pad in moving.items():
             here = slice(dofs[i], dofs[i + 1])
@@ -204,8 +268,8 @@ class Compiled:
                     K[k][dofs[i] + row, : len(columns)] = stiffness[k][[row]].toarray()[0, columns]
         make: Any = Inertia
         return make(
-            _ints(dofs), surface, np.zeros((1, total)), np.ones(len(dofs) - 1, np.int64), X, area, column, *K, D,
-            np.zeros((len(dofs) - 1, 2, 2)), _ints(material_at),
+            _ints(dofs), surface, np.zeros((1, total)), np.ones(len(dofs) - 1, np.int64), X, area,
+            column, *K, D, np.zeros((len(dofs) - 1, 2, 2)), _ints(material_at),
         )  # fmt: skip
 
     def _make_actuators(self) -> Actuators:
@@ -214,11 +278,17 @@ class Compiled:
             parameters = {f"law.{k}": v for k, v in actuator.named_parameters()}
             law = actuator_law(name, actuator, parameters)
             starts.append(self._add_all(parameters))
-            feed = rig.signals.index(actuator.feed_forward) if actuator.feed_forward is not None else -1
+            feed = (
+                rig.signals.index(actuator.feed_forward)
+                if actuator.feed_forward is not None
+                else -1
+            )
             rows.append((law.linearise, law.pullback, rig.coordinate(actuator.pushes), feed))
             setpoints.append([rig.signals.index(one) for one in actuator.setpoints])
             measured.append([rig.coordinate(one) for one in actuator.measures])
-        linearise, pullback, pushed, feed_forward = (np.ascontiguousarray(x) for x in _ints(rows).reshape(-1, 4).T)
+        linearise, pullback, pushed, feed_forward = (
+            np.ascontiguousarray(x) for x in _ints(rows).reshape(-1, 4).T
+        )
         make: Any = Actuators
         return make(
             linearise,
@@ -243,15 +313,19 @@ class Compiled:
                 own = structure(contact.law) is None or not isinstance(slip, Friction)
                 stiffness = contact.law.R_t.item() + NOMINAL * contact.law.K_t.item()
                 if own:
-                    slip_rates(name, slip, torch.ones(()).double(), torch.ones(()).double(), stiffness)
+                    slip_rates(
+                        name, slip, torch.ones(()).double(), torch.ones(()).double(), stiffness
+                    )
                 self._known[key] = contact_laws(contact.law, shape.prepared())
                 if own and (wrong := check_slip(name, slip, stiffness)):
                     warnings.warn(wrong, stacklevel=2)
             laws = self._known[key]
             starts.append(self._add_all(laws.parameters))
             rows.append(
-                (list(rig.pads).index(contact.pad), 3 * list(rig.bodies).index(contact.body), laws.distance.value,
-                 laws.interface.linearise, laws.interface.pullback, laws.free.value, laws.free.linearise, laws.free.pullback)
+                (list(rig.pads).index(contact.pad), 3 * list(rig.bodies).index(contact.body),
+                laws.distance.value,
+                 laws.interface.linearise, laws.interface.pullback, laws.free.value,
+                 laws.free.linearise, laws.free.pullback)
             )  # fmt: skip
             first = self._pads.node_start[rows[-1][0]]
             X.append(pad.point_positions.numpy())
@@ -261,10 +335,15 @@ class Compiled:
             point_start.append(point_start[-1] + len(pad.point_nodes))
             sizes.append(shape.size())
             corners = pad.placed(np.stack(np.meshgrid(*pad.mesh.space.T), -1).reshape(-1, 2))
-            box = (*corners[:, 0][[corners[:, 0].argmin(), corners[:, 0].argmax()]], *np.sort(corners[:, 1])[[0, -1]])
+            box = (
+                *corners[:, 0][[corners[:, 0].argmin(), corners[:, 0].argmax()]],
+                *np.sort(corners[:, 1])[[0, -1]],
+            )
             limits.append((-np.inf, np.inf, -np.inf, np.inf) if contact.may_leave else box)
         columns = [np.ascontiguousarray(x) for x in _ints(rows).reshape(-1, 8).T]
-        coordinate = np.stack((columns[1], self._pads.base[columns[0]]), 1)[..., None] + np.arange(3)
+        coordinate = np.stack((columns[1], self._pads.base[columns[0]]), 1)[..., None] + np.arange(
+            3
+        )
         coordinate = np.ascontiguousarray(coordinate.reshape(-1, 6))
         make: Any = Contacts
         contacts = make(
@@ -277,11 +356,14 @@ class Compiled:
             np.array(sizes),
             np.array(limits).reshape(-1, 4),
         )
-        start = min((s.start for (part, _), s in rig.layout.slices.items() if part == "stretch"), default=0)
+        start = min(
+            (s.start for (part, _), s in rig.layout.slices.items() if part == "stretch"), default=0
+        )
         points = Points(
-            np.repeat(np.arange(len(rows)), np.diff(point_start)), np.concatenate([*X, np.zeros((0, 2))]),
-            np.concatenate([*weight, np.zeros(0)]),
-            np.concatenate([*node, np.zeros((0, 2), np.int64)]), np.concatenate([*N, np.zeros((0, 2))]), start,
+            np.repeat(np.arange(len(rows)), np.diff(point_start)),
+            np.concatenate([*X, np.zeros((0, 2))]), np.concatenate([*weight, np.zeros(0)]),
+            np.concatenate([*node, np.zeros((0, 2), np.int64)]),
+            np.concatenate([*N, np.zeros((0, 2))]), start,
         )  # fmt: skip
         return contacts, points
 
@@ -289,16 +371,20 @@ class Compiled:
         """The arrays for steps of h [s]; only inertial pads depend on it."""
         key = float(f"{h:.12g}") if self.inertial else 0.0
         if key not in self._systems:
-            if len(self._systems) > 32:  # an irregular output grid has many step sizes; each holds some megabytes
+            if (
+                len(self._systems) > 32
+            ):  # an irregular output grid has many step sizes; each holds some megabytes
                 self._systems.clear()
             pads, inertia = self._mobilities(GAMMA * key) if key else (self._pads, self._inertia)
             p = self.p.detach().numpy().copy()
-            self._systems[key] = system(self._bodies, self._actuators, pads, inertia, self._contacts, self._points, p=p)
+            self._systems[key] = system(
+                self._bodies, self._actuators, pads, inertia, self._contacts, self._points, p=p
+            )
         return self._systems[key]
 
     def _mobilities(self, a: float) -> tuple[Pads, Inertia]:
-        """Inertial pads' mobilities at the stage length a h [s]: surface rates per surface force, and per velocity of
-        the base."""
+        """Inertial pads' mobilities at the stage length a h [s]: surface rates per surface force,
+        and per velocity of the base."""
         pads, inertia = self._pads._replace(C=self._pads.C.copy()), self._inertia
         parts, p = [], self.p.detach().numpy()
         D, B = inertia.D.copy(), inertia.B.copy()
@@ -306,7 +392,9 @@ class Compiled:
             here = slice(inertia.dof_start[i], inertia.dof_start[i + 1])
             if not pad.inertial:
                 continue
-            lame_lambda, lame_mu, tau, density = p[inertia.material_at[i] : inertia.material_at[i] + 4]
+            lame_lambda, lame_mu, tau, density = p[
+                inertia.material_at[i] : inertia.material_at[i] + 4
+            ]
             K = lame_lambda * pad.stiffness(0) + lame_mu * pad.stiffness(1)
             M = density * inertia.area[here]
             A = banded((K * (tau + a)).tocsr())
@@ -332,7 +420,9 @@ class Compiled:
 
 def _ragged(lists: list[list[int]]) -> tuple[Index, Index]:
     """The ends of lists that are put one after the other, and all their numbers."""
-    return _ints([0, *np.cumsum([len(one) for one in lists])]), _ints([number for one in lists for number in one])
+    return _ints([0, *np.cumsum([len(one) for one in lists])]), _ints(
+        [number for one in lists for number in one]
+    )
 
 
 def _ints(values: Any) -> Index:

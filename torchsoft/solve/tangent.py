@@ -1,4 +1,5 @@
-"""Forward sensitivities: the derivative of a whole run along a handful of parameters, in one pass of the compiled kernels."""
+"""Forward sensitivities: the derivative of a whole run along a handful of parameters, in one pass
+of the compiled kernels."""
 
 from collections.abc import Iterator, Sequence
 
@@ -13,8 +14,8 @@ from torchsoft.solve.stepper import ImplicitStepper
 
 
 def directions(value: Tensor, wanted: Sequence[Tensor]) -> Array:
-    """d value / d (scalar tensors) (..., n) from the graph of `value` (...): its pullback is linear in the weights, so
-    differentiated by them it pushes forward."""
+    """d value / d (scalar tensors) (..., n) from the graph of `value` (...): its pullback is linear
+    in the weights, so differentiated by them it pushes forward."""
     out = np.zeros((*value.shape, len(wanted)))
     weights = torch.zeros_like(value, requires_grad=True)
     pulled = (
@@ -30,11 +31,17 @@ def directions(value: Tensor, wanted: Sequence[Tensor]) -> Array:
 
 
 def iterate(
-    stepper: ImplicitStepper, y0: Tensor, t: Tensor, wanted: Sequence[Tensor], dy0: Tensor | None, columns: list[int]
+    stepper: ImplicitStepper,
+    y0: Tensor,
+    t: Tensor,
+    wanted: Sequence[Tensor],
+    dy0: Tensor | None,
+    columns: list[int],
 ) -> Iterator[tuple[Tensor, Progress]]:
-    """Derivatives (T, components, n) of the states by the scalar tensors `wanted`, as the run grows; `columns` are
-    the components of the state that are kept. dy0 (size, n) is the derivative of the initial state, zero by default; its
-    columns beyond those of `wanted` are directions of the start alone."""
+    """Derivatives (T, components, n) of the states by the scalar tensors `wanted`, as the run
+    grows; `columns` are the components of the state that are kept. dy0 (size, n) is the derivative
+    of the initial state, zero by default; its columns beyond those of `wanted` are directions of
+    the start alone."""
     size = stepper.layout.size
     dy = np.zeros((size, len(wanted))) if dy0 is None else dy0.detach().numpy().copy()
     n = dy.shape[1]
@@ -47,8 +54,23 @@ def iterate(
         while segments:  # none if the first step of a chunk was not solved, and is to be halved
             segment = segments.pop()
             plan, tape = segment.plan, stepper.tape(segment)
-            s, rows = stepper.compiled.system(float(plan.h[0])), np.empty((len(plan.out_step), size, n))
+            s, rows = (
+                stepper.compiled.system(float(plan.h[0])),
+                np.empty((len(plan.out_step), size, n)),
+            )
             work, tangents = (room(kind, s, size, columns=n) for kind in ("Work", "Tangents"))
-            forward(s, work, tangents, plan.h, tape, segment.signals, plan.out_step, plan.out_part, dy, dp, rows)
+            forward(
+                s,
+                work,
+                tangents,
+                plan.h,
+                tape,
+                segment.signals,
+                plan.out_step,
+                plan.out_part,
+                dy,
+                dp,
+                rows,
+            )
             kept[segment.rows] = rows[:, columns]
         yield torch.from_numpy(kept), out

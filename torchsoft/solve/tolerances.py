@@ -1,4 +1,5 @@
-"""What step-size control needs to know of a rig: which errors count together and by what unit, and the reference's pieces."""
+"""What step-size control needs to know of a rig: which errors count together and by what unit, and
+the reference's pieces."""
 
 import ctypes
 from collections.abc import Callable
@@ -14,16 +15,24 @@ from torchsoft.physics.rig import Rig
 from torchsoft.solve.kernel.arrays import NO_SIGNALS, Array, Errors, Signals
 
 UNITS = {"force": 1.0, "length": 1e-3, "angle": 1.0}
-"""What `atol` is counted in: nodal forces [N], displacements, stretches and positions [m], angles [rad]."""
+"""What `atol` is counted in: nodal forces [N], displacements, stretches and positions [m], angles
+[rad]."""
 
 
 def error_parts(rig: Rig, y0: Array, atol: float) -> Errors:
-    """Parts of the state whose error is judged together: each pad's forces, each contact's stretches, a body's position, its
-    angle. A rate's error counts by what it displaces within a step. A position's size is how far it has come from y0."""
+    """Parts of the state whose error is judged together: each pad's forces, each contact's
+    stretches, a body's position, its angle. A rate's error counts by what it displaces within a
+    step. A position's size is how far it has come from y0."""
     first, last, rate, unit, size, origin = [], [], [], [], [], np.zeros(len(y0))
     for (kind, name), here in rig.layout.slices.items():
         if kind in ("pads", "stretch", "rates"):
-            parts = [(here.start, here.stop, "force" if kind == "pads" and not rig.pads[name].inertial else "length")]
+            parts = [
+                (
+                    here.start,
+                    here.stop,
+                    "force" if kind == "pads" and not rig.pads[name].inertial else "length",
+                )
+            ]
         else:
             axes = rig.layout.free[name]
             turning = "theta" in [COORDINATES[i] for i in axes]
@@ -39,16 +48,17 @@ def error_parts(rig: Rig, y0: Array, atol: float) -> Errors:
                 unit.append(UNITS[what])
                 size.append(np.linalg.norm(y0[begin:end] - origin[begin:end]))
     return Errors(
-        np.array(first, np.int64), np.array(last, np.int64), np.array(rate), atol * np.array(unit), np.array(size),
-        origin,
+        np.array(first, np.int64), np.array(last, np.int64), np.array(rate), atol * np.array(unit),
+        np.array(size), origin,
     )  # fmt: skip
 
 
 def part_name(rig: Rig, errors: Errors, number: int) -> str:
     """What the error of a part is of, in words."""
     what = {
-        "pads": "the nodal forces of pad", "stretch": "the stretches of contact", "pose": "the pose of body",
-        "rates": "the nodal velocities of pad", "velocity": "the velocity of body",
+        "pads": "the nodal forces of pad", "stretch": "the stretches of contact",
+        "pose": "the pose of body", "rates": "the nodal velocities of pad",
+        "velocity": "the velocity of body",
     }  # fmt: skip
     for (kind, name), here in rig.layout.slices.items():
         if here.start <= errors.first[number] < here.stop:
@@ -57,10 +67,11 @@ def part_name(rig: Rig, errors: Errors, number: int) -> str:
 
 
 class Followed:
-    """The signals of a run as the kernels evaluate them: `arrays`, and `stops` [s], times that no step may pass.
+    """The signals of a run as the kernels evaluate them: `arrays`, and `stops` [s], times that no
+    step may pass.
 
-    A reference of pieces (`Profile`, `Sampled`, `Waves`) is evaluated by the kernel, any other one by itself, called at every
-    stage; what it raises then is kept in `error`.
+    A reference of pieces (`Profile`, `Sampled`, `Waves`) is evaluated by the kernel, any other one
+    by itself, called at every stage; what it raises then is kept in `error`.
     """
 
     def __init__(self, signals: Callable[[Tensor], Tensor], rig: Rig, reference: Reference) -> None:
@@ -73,7 +84,12 @@ class Followed:
             return
         with torch.no_grad():
             pieces = [one.pieces() for one in chosen]
-            fixed = [body.fixed[axis] for body in rig.bodies.values() for axis in COORDINATES if axis in body.fixed]
+            fixed = [
+                body.fixed[axis]
+                for body in rig.bodies.values()
+                for axis in COORDINATES
+                if axis in body.fixed
+            ]
             one = torch.ones(1, dtype=torch.float64)
             pieces += [(0.0 * one, one, value.reshape(1, 1)) for value in fixed]
             widest = max((c.shape[1] for *_, c in pieces), default=1)
@@ -84,11 +100,15 @@ class Followed:
                 np.array([c.shape[1] for *_, c in pieces], np.int64),
                 torch.cat([empty, *(at for at, *_ in pieces)]).numpy(),
                 torch.cat([empty, *(span for _, span, _ in pieces)]).numpy(),
-                torch.cat([torch.zeros(0, widest, dtype=torch.float64), *padded]).contiguous().numpy(),
+                torch.cat([torch.zeros(0, widest, dtype=torch.float64), *padded])
+                .contiguous()
+                .numpy(),
                 0,
                 np.zeros(max(widest, 1)),
             )
-        self.stops = np.unique(np.concatenate([np.zeros(0), *(signal.stops.numpy() for signal in chosen)]))
+        self.stops = np.unique(
+            np.concatenate([np.zeros(0), *(signal.stops.numpy() for signal in chosen)])
+        )
 
     def _call(self, signals: Callable[[Tensor], Tensor]) -> int:
         """Address of a function that writes the signals at the time x[0] to out."""

@@ -1,8 +1,10 @@
-"""The stepper under torchdiffeq's own verbs, `odeint` and `odeint_adjoint`, once `register_method()` has been called.
+"""The stepper under torchdiffeq's own verbs, `odeint` and `odeint_adjoint`, once
+`register_method()` has been called.
 
-`odeint(rig, y0, t, method="sdirk2")` has the discrete adjoint behind it already. `odeint_adjoint` works as well: it calls the
-same method once more, backwards and interval by interval, on its augmented dynamics, which the solver recognises and answers
-with the discrete adjoint of the interval. That is exact too, but pays its overhead at every output time.
+`odeint(rig, y0, t, method="sdirk2")` has the discrete adjoint behind it already. `odeint_adjoint`
+works as well: it calls the same method once more, backwards and interval by interval, on its
+augmented dynamics, which the solver recognises and answers with the discrete adjoint of the
+interval. That is exact too, but pays its overhead at every output time.
 
 A solver of the same name that torchdiffeq has of its own is left to everybody else's functions.
 """
@@ -26,11 +28,13 @@ from torchsoft.solve.stepper import METHOD, ImplicitStepper
 from torchsoft.threads import cores, parallel_map
 
 REMEMBERED = 4
-"""Runs of a model whose states are remembered: `odeint_adjoint` hands its solver only the later end of an interval."""
+"""Runs of a model whose states are remembered: `odeint_adjoint` hands its solver only the later end
+of an interval."""
 
 
 class _Run(NamedTuple):
-    """Times (T,), states (T, samples, size), and every sample's steps; a step ends at every time."""
+    """Times (T,), states (T, samples, size), and every sample's steps; a step ends at every
+    time."""
 
     t: Tensor
     y: Tensor
@@ -41,12 +45,14 @@ _runs: WeakKeyDictionary[Rig, deque[_Run]] = WeakKeyDictionary()
 
 
 class TorchdiffeqSolver:
-    """`torchdiffeq.odeint(model, y0, t, method="sdirk2", rtol=1e-4, atol=1e-5)`, and the same for `odeint_adjoint`.
+    """`torchdiffeq.odeint(model, y0, t, method="sdirk2", rtol=1e-4, atol=1e-5)`, and the same for
+    `odeint_adjoint`.
 
-    Takes batches: y0 (..., size); each sample is stepped by itself, with steps of its own, so none depends on its neighbours.
-    rtol and atol mean what they mean in `simulate`; torchdiffeq's own defaults (1e-7, 1e-9) are strict for a motion with
-    contact. Options: `step_size` [s] for equal steps instead, and the stepper's own, such as Newton's `tolerance` [N]. Raises
-    `TypeError` for dynamics that are not a `Rig`'s.
+    Takes batches: y0 (..., size); each sample is stepped by itself, with steps of its own, so none
+    depends on its neighbours. rtol and atol mean what they mean in `simulate`; torchdiffeq's own
+    defaults (1e-7, 1e-9) are strict for a motion with contact. Options: `step_size` [s] for equal
+    steps instead, and the stepper's own, such as Newton's `tolerance` [N]. Raises `TypeError` for
+    dynamics that are not a `Rig`'s.
     """
 
     theirs: Any = None
@@ -57,10 +63,14 @@ class TorchdiffeqSolver:
             return cls.theirs(func, y0, *arguments, **options)
         return super().__new__(cls)
 
-    def __init__(self, func: Any, y0: Tensor, rtol: float, atol: float, norm: Any = None, **options: Any) -> None:
+    def __init__(
+        self, func: Any, y0: Tensor, rtol: float, atol: float, norm: Any = None, **options: Any
+    ) -> None:
         model, augmented = _rig_behind(func), _augmented(func)
         if not isinstance(model, Rig):
-            raise TypeError(f"method='{METHOD}' integrates a torchsoft.Rig, but got {type(model).__name__}")
+            raise TypeError(
+                f"method='{METHOD}' integrates a torchsoft.Rig, but got {type(model).__name__}"
+            )
         if "step_size" in options:
             options["step"] = options.pop("step_size")
         known = set(inspect.signature(ImplicitStepper).parameters) - {
@@ -73,12 +83,17 @@ class TorchdiffeqSolver:
         }
         if strange := set(options) - known:
             raise ValueError(
-                f"method='{METHOD}' has no option {sorted(strange)}; it has step_size, {', '.join(sorted(known))}"
+                f"method='{METHOD}' has no option {sorted(strange)}; it has step_size, "
+                f"{', '.join(sorted(known))}"
             )
         self.model, self.y0 = model, y0
         self.adjoint_params: tuple[Tensor, ...] | None = augmented.get("adjoint_params")
-        with torch.enable_grad():  # odeint_adjoint comes without; its parameters' gradients need the graph
-            self.stepper = ImplicitStepper(model, rtol=float(rtol), atol=float(atol), landing=True, **options)
+        with (
+            torch.enable_grad()
+        ):  # odeint_adjoint comes without; its parameters' gradients need the graph
+            self.stepper = ImplicitStepper(
+                model, rtol=float(rtol), atol=float(atol), landing=True, **options
+            )
 
     def integrate(self, t: Tensor) -> Tensor:
         if self.adjoint_params is not None:
@@ -99,7 +114,8 @@ class TorchdiffeqSolver:
         return solution.reshape(len(t), *self.y0.shape)
 
     def _augmented(self, t: Tensor, parameters: tuple[Tensor, ...]) -> Tensor:
-        """(0, y, y_bar, *parameter_bars) carried from the end of one output interval to its start; t is negated."""
+        """(0, y, y_bar, *parameter_bars) carried from the end of one output interval to its start;
+        t is negated."""
         tail = sum(p.numel() for p in parameters)
         size, end, start = self.model.layout.size, -t[0], -t[1]
         count = (len(self.y0) - 1 - tail) // 2
@@ -115,17 +131,24 @@ class TorchdiffeqSolver:
             y_bars[sample], *cotangents = run_adjoint(again, segments, outputs)
             if parameters:
                 with torch.enable_grad():
-                    made_of = again.compiled.p, again.signals([segment.plan for segment in segments])
-                    value = torch.cat([(x * cotangent).flatten() for x, cotangent in zip(made_of, cotangents)]).sum()
-                    parts = torch.autograd.grad(value, parameters, allow_unused=True, retain_graph=True)
+                    made_of = (
+                        again.compiled.p,
+                        again.signals([segment.plan for segment in segments]),
+                    )
+                    value = torch.cat(
+                        [(x * cotangent).flatten() for x, cotangent in zip(made_of, cotangents)]
+                    ).sum()
+                    parts = torch.autograd.grad(
+                        value, parameters, allow_unused=True, retain_graph=True
+                    )
                 parts = [torch.zeros_like(p) if g is None else g for p, g in zip(parameters, parts)]
                 bars = bars + torch.cat([part.flatten() for part in parts])
         carried = torch.cat((self.y0[:1], y_start.flatten(), y_bars.flatten(), bars))
         return torch.stack((self.y0, carried))
 
     def _state_before(self, start: Tensor, end: Tensor, y: Tensor) -> tuple[Tensor, list[Array]]:
-        """The remembered states (samples, size) at `start` of the run that has y (samples, size) at `end`, and each sample's
-        steps from there to the end."""
+        """The remembered states (samples, size) at `start` of the run that has y (samples, size) at
+        `end`, and each sample's steps from there to the end."""
         for run in reversed(_runs.get(self.model, deque())):
             i = int(torch.searchsorted(run.t, end))
             if i > 0 and run.t[i] == end and run.t[i - 1] == start and torch.equal(run.y[i], y):
@@ -134,8 +157,8 @@ class TorchdiffeqSolver:
                 inside = [k[(k > first + slack) & (k < last - slack)] for k in run.knots]
                 return run.y[i - 1], [np.concatenate([[first], k, [last]]) for k in inside]
         raise RuntimeError(
-            f"the run to differentiate is not among the last {REMEMBERED} of this model; call backward before running it "
-            "again, or use odeint, which keeps what it needs"
+            f"the run to differentiate is not among the last {REMEMBERED} of this model; call "
+            "backward before running it again, or use odeint, which keeps what it needs"
         )
 
     @classmethod
@@ -165,14 +188,17 @@ def _innermost(func: Any) -> Any:
 
 
 def register_method() -> None:
-    """Adds `method="sdirk2"` to the solvers of torchdiffeq in this process; called again it does nothing.
+    """Adds `method="sdirk2"` to the solvers of torchdiffeq in this process; called again it does
+    nothing.
 
-    Functions that are no rig's keep a solver of this name that torchdiffeq has of its own. Raises `ImportError` for a
-    torchdiffeq that keeps its solvers elsewhere.
+    Functions that are no rig's keep a solver of this name that torchdiffeq has of its own. Raises
+    `ImportError` for a torchdiffeq that keeps its solvers elsewhere.
     """
     solvers = getattr(importlib.import_module("torchdiffeq._impl.odeint"), "SOLVERS", None)
     if not isinstance(solvers, dict) or "dopri5" not in solvers:
-        raise ImportError("this torchdiffeq keeps its solvers elsewhere; torchsoft was made for torchdiffeq 0.2.5")
+        raise ImportError(
+            "this torchdiffeq keeps its solvers elsewhere; torchsoft was made for torchdiffeq 0.2.5"
+        )
     theirs = solvers.get(METHOD)
     if theirs is None:
         solvers[METHOD] = TorchdiffeqSolver

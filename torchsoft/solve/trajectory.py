@@ -1,4 +1,5 @@
-"""What a simulation leaves behind: times, states, nodal forces, efforts, energies, and how it was made."""
+"""What a simulation leaves behind: times, states, nodal forces, efforts, energies, and how it was
+made."""
 
 from __future__ import annotations
 
@@ -23,8 +24,8 @@ if TYPE_CHECKING:  # takes as long to import as all of this package
 
 @dataclass(frozen=True)
 class Stats:
-    """How the run went: steps, linear solves (Newton iterations), steps that Newton did not solve and that were taken shorter,
-    steps refused for their error, and wall time [s]."""
+    """How the run went: steps, linear solves (Newton iterations), steps that Newton did not solve
+    and that were taken shorter, steps refused for their error, and wall time [s]."""
 
     steps: int
     newton_iterations: int
@@ -41,17 +42,20 @@ class Stats:
 class Trajectory:
     """A run sampled at t (T,) [s]. SI units, every tensor float64 and shaped (T, ...).
 
-    y: flat states (T, size). channels: what can be measured or was asked for, by key, (T,) each. force: normal and friction
-    force (T, points, 2) [N] on the points of each contact, along n and t of their moving frames. load: what the contacts and
-    pads do to each body (T, 3), a force [N] and a moment about its centre [N.m], world axes. displacement: of the nodes of
-    each pad (T, nodes, 2) [m], in its base's frame. energy: stored [J]; dissipated, supplied and `injected` [J] since t[0].
+    y: flat states (T, size). channels: what can be measured or was asked for, by key, (T,) each.
+    force: normal and friction force (T, points, 2) [N] on the points of each contact, along n and t
+    of their moving frames. load: what the contacts and pads do to each body (T, 3), a force [N] and
+    a moment about its centre [N.m], world axes. displacement: of the nodes of each pad (T, nodes,
+    2) [m], in its base's frame. energy: stored [J]; dissipated, supplied and `injected` [J] since
+    t[0].
 
     units: of the channels, by key, as far as the rig knows them.
 
-    knots (steps + 1,): where the steps began and ended [s]; given to another run, that takes the same ones.
+    knots (steps + 1,): where the steps began and ended [s]; given to another run, that takes the
+    same ones.
 
-    sensitivities (T, components, n): derivatives of the state's last `components` by the n parameters `wrt`, and along the
-    further directions of the start, where asked for.
+    sensitivities (T, components, n): derivatives of the state's last `components` by the n
+    parameters `wrt`, and along the further directions of the start, where asked for.
     """
 
     t: Tensor
@@ -85,10 +89,16 @@ class Trajectory:
 
     @property
     def energy_residual(self) -> Tensor:
-        """Stored energy gained, less supplied, plus dissipated (T,) [J]; zero but for the integration error."""
+        """Stored energy gained, less supplied, plus dissipated (T,) [J]; zero but for the
+        integration error."""
         zero = torch.zeros_like(self.t)
         total = sum(self.energy.values(), zero)
-        return total - total[0] - sum(self.supplied.values(), zero) + sum(self.dissipated.values(), zero)
+        return (
+            total
+            - total[0]
+            - sum(self.supplied.values(), zero)
+            + sum(self.dissipated.values(), zero)
+        )
 
     @property
     def energy_residual_rel(self) -> float:
@@ -105,7 +115,9 @@ class Trajectory:
 
         columns: dict[str, tuple[tuple[str, ...], Tensor, str, str]] = {}
         left = dict(self.channels)
-        papers = all(name in left for name in MEASURED)  # another rig may call by these names what is something else
+        papers = all(
+            name in left for name in MEASURED
+        )  # another rig may call by these names what is something else
         for name, variable in VARIABLES.items() if papers else ():
             keys = list(variable.symbols)
             if all(key in left for key in keys):
@@ -114,15 +126,36 @@ class Trajectory:
                 value = torch.stack(parts, -1) if len(parts) == 2 else parts[0]
                 columns[name] = (dims, value, variable.unit, variable.meaning)
         columns |= {
-            name: (("time",), value, self.units.get(name, ""), "channel of the rig") for name, value in left.items()
+            name: (("time",), value, self.units.get(name, ""), "channel of the rig")
+            for name, value in left.items()
         }
-        columns["energy_injected"] = (("time",), self.injected, "J", "positive part of the sources' work")
-        columns["energy_residual"] = (("time",), self.energy_residual, "J", "stored - supplied + dissipated")
+        columns["energy_injected"] = (
+            ("time",),
+            self.injected,
+            "J",
+            "positive part of the sources' work",
+        )
+        columns["energy_residual"] = (
+            ("time",),
+            self.energy_residual,
+            "J",
+            "stored - supplied + dissipated",
+        )
         for key, force in self.force.items():
             name = PADS.get(key, key)
             points = ("time", f"{name}_surface")
-            columns[f"normal_force_{name}"] = (points, force[..., 0], "N", f"normal force at the contact {name}")
-            columns[f"friction_force_{name}"] = (points, force[..., 1], "N", f"friction at the contact {name}")
+            columns[f"normal_force_{name}"] = (
+                points,
+                force[..., 0],
+                "N",
+                f"normal force at the contact {name}",
+            )
+            columns[f"friction_force_{name}"] = (
+                points,
+                force[..., 1],
+                "N",
+                f"friction at the contact {name}",
+            )
             stretch = self.state.stretch[key]
             columns[f"stretch_{name}"] = (points, stretch, "m", "stretch of the momentary springs")
         for key, u in self.displacement.items():
@@ -144,7 +177,10 @@ class Trajectory:
             for name, (dims, value, unit, meaning) in columns.items()
         }
         coords = {"time": ("time", self.t.numpy(), {"units": "s"}), "axis": ["x", "y"]}
-        attrs = {"stats": json.dumps(vars(self.stats)), **{k: json.dumps(v) for k, v in self.made_by.items()}}
+        attrs = {
+            "stats": json.dumps(vars(self.stats)),
+            **{k: json.dumps(v) for k, v in self.made_by.items()},
+        }
         return xr.Dataset(data, coords, attrs)
 
     def save(self, path: str | Path) -> None:
@@ -153,13 +189,15 @@ class Trajectory:
 
 
 def save(data: xr.Dataset, path: str | Path) -> None:
-    """Write a trajectory's dataset, perhaps a changed one, as NetCDF with a checksum at the end of the file."""
+    """Write a trajectory's dataset, perhaps a changed one, as NetCDF with a checksum at the end of
+    the file."""
     with replacing(path) as partial:
         partial.write_bytes(sealed(data.to_netcdf(engine="h5netcdf")))
 
 
 def load(path: str | Path) -> xr.Dataset:
-    """What `save` wrote. Raises `ValueError` for any other file and for one that is damaged, and `OSError`."""
+    """What `save` wrote. Raises `ValueError` for any other file and for one that is damaged, and
+    `OSError`."""
     import xarray as xr
 
     content = BytesIO(unsealed(path))
@@ -169,11 +207,14 @@ def load(path: str | Path) -> xr.Dataset:
         raise ValueError(f"{path} is not a NetCDF file ({type(error).__name__})") from error
 
 
-def channels(rig: Rig, state: State, signals: Tensor, moments: dict[str, Tensor] | None = None) -> dict[str, Tensor]:
-    """Every channel of states (...) by its key: coordinates and rates of the bodies, signals, efforts, moments.
+def channels(
+    rig: Rig, state: State, signals: Tensor, moments: dict[str, Tensor] | None = None
+) -> dict[str, Tensor]:
+    """Every channel of states (...) by its key: coordinates and rates of the bodies, signals,
+    efforts, moments.
 
-    A moment is what the bonded nodes give (Eq. 35), with undeformed arms; the graph's, which a turning base feels and which
-    conserves power, has deformed ones.
+    A moment is what the bonded nodes give (Eq. 35), with undeformed arms; the graph's, which a
+    turning base feels and which conserves power, has deformed ones.
     """
     out: dict[str, Tensor] = {}
     for name in rig.bodies:
@@ -218,8 +259,8 @@ def units(rig: Rig) -> dict[str, str]:
 
 
 def measurable(rig: Rig) -> tuple[str, ...]:
-    """Channels that a sensor can measure, whose derivatives follow from the bodies' motion: free coordinates, their rates in
-    the same order, and the actuators' efforts."""
+    """Channels that a sensor can measure, whose derivatives follow from the bodies' motion: free
+    coordinates, their rates in the same order, and the actuators' efforts."""
     poses, rates = [], []
     for name, axes in rig.layout.free.items():
         for axis in axes:

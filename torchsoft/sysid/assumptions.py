@@ -1,6 +1,8 @@
-"""What an identification takes for granted: numerical constants, numbers called known, laws; and how to vary each.
+"""What an identification takes for granted: numerical constants, numbers called known, laws; and
+how to vary each.
 
-A variation makes the recordings, or their parameters, as they would be if one thing were otherwise by a stated amount.
+A variation makes the recordings, or their parameters, as they would be if one thing were otherwise
+by a stated amount.
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -28,7 +30,8 @@ from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.unknowns import Nuisance, Sensor, Unknown
 
 Kind = Literal["numerical", "known", "sensor", "law"]
-"""A constant of the computation; a number of the rig that is called known; what a sensor is taken to be; a law."""
+"""A constant of the computation; a number of the rig that is called known; what a sensor is taken
+to be; a law."""
 
 PLACE = 20e-6
 """How far x_C0 is varied [m]: what a careful hand places a disc to."""
@@ -50,7 +53,8 @@ SMALLER_RAMP = 0.1
 
 
 class Fault(NamedTuple):
-    """What a sensor may have and is not known to have: how large it is taken in a variation, in words."""
+    """What a sensor may have and is not known to have: how large it is taken in a variation, in
+    words."""
 
     amount: float
     per: str
@@ -64,8 +68,10 @@ class Fault(NamedTuple):
     def assumption(self, channel: str, unit: str, sensor: Sensor) -> "Variation":
         scale = {"s": (1e3, "ms"), "1": (1e2, "%"), "noise": (sensor.noise, unit)}
         factor, shown = scale.get(self.per, (sensor.noise, f"{unit} over a recording"))
-        return Variation(f"{self.verb.split()[0]} {channel}", "sensor", f"{channel} has no unknown {self.verb.split()[0]}",
-                          f"{channel} {self.verb.partition(' ')[2]}", factor * self.amount, shown)  # fmt: skip
+        return Variation(f"{self.verb.split()[0]} {channel}", "sensor", f"{channel} has no unknown "
+                                                                        f"{self.verb.split()[0]}",
+                          f"{channel} {self.verb.partition(' ')[2]}", factor * self.amount,
+                          shown)  # fmt: skip
 
 
 FAULTS: dict[Nuisance, Fault] = {
@@ -81,8 +87,9 @@ FAULTS: dict[Nuisance, Fault] = {
 class Assumption:
     """An assumption of a fit as the clause `stated`, and its variation as the clause `otherwise`.
 
-    A known number, or a property of a sensor, may differ by any part of the `amount` [unit], to either side; a law or a
-    constant of the computation holds or does not. `parameter` is the number that is varied, by the amount [%].
+    A known number, or a property of a sensor, may differ by any part of the `amount` [unit], to
+    either side; a law or a constant of the computation holds or does not. `parameter` is the number
+    that is varied, by the amount [%].
     """
 
     name: str
@@ -96,50 +103,74 @@ class Assumption:
 
 @dataclass(frozen=True)
 class Variation(Assumption):
-    """An assumption with its variation: `vary` gives another recording, None where that has no meaning for it."""
+    """An assumption with its variation: `vary` gives another recording, None where that has no
+    meaning for it."""
 
     vary: Callable[[Recording], Recording | None] | None = None
 
 
 def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Variation]:
-    """Everything that the runs of some recordings take for granted and that can be varied; `unknown` are the
-    parameters, and coordinates of starts, that are identified."""
+    """Everything that the runs of some recordings take for granted and that can be varied;
+    `unknown` are the parameters, and coordinates of starts, that are identified."""
     first, *_ = recordings
     rig = first.rig
     pad = next(iter(rig.pads.values()))
     nx, ny, points = pad.mesh.elements_x, pad.mesh.elements_y, pad.points
     at = f"{points} points an element" if points else "on the nodes"
     out = [
-        Variation("mesh", "numerical", f"the pads have {nx} x {ny} elements", f"they had {2 * nx} x {2 * ny}",
+        Variation("mesh", "numerical", f"the pads have {nx} x {ny} elements", f"they had {2 * nx} "
+                                                                              f"x {2 * ny}",
                    vary=lambda r: remeshed(r, 2, points)),
-        Variation("contact points", "numerical", f"contact is computed {at}", f"it were at {points + 2} points an element",
+        Variation("contact points", "numerical", f"contact is computed {at}",
+        f"it were at {points + 2} points an element",
                    vary=lambda r: remeshed(r, 1, points + 2)),
-        Variation("mesh phase", "numerical", "a node lies where the mesh puts it", "nodes lay a quarter of an element on",
+        Variation("mesh phase", "numerical", "a node lies where the mesh puts it", "nodes lay a "
+                                                                                   "quarter of an "
+                                                                                   "element on",
                    vary=lambda r: shifted(r, 0.25)),
     ]  # fmt: skip
-    ramps = {name: float(value) for name, value in first.parameters.items() if name.split(".")[-1] == "epsilon"}
+    ramps = {
+        name: float(value)
+        for name, value in first.parameters.items()
+        if name.split(".")[-1] == "epsilon"
+    }
     if not ramps.keys() & unknown:
         small = ", ".join(f"{SMALLER_RAMP * value:.3g}" for value in ramps.values())
         stated = ", ".join(f"{value:.3g}" for value in ramps.values())
-        out.append(Variation("ramp", "numerical", f"forces are ramped in at touch-down over epsilon = {stated} m",
-                              f"epsilon were {small} m", vary=lambda r: scaled(r, tuple(ramps), SMALLER_RAMP)))  # fmt: skip
-    out.append(Variation("ramp of the sliding", "law", "sliding stretches the tangential springs by the ramp of touch-down",
-                          "it did in full from touch-down on, without a ramp", vary=unramped))  # fmt: skip
+        out.append(Variation("ramp", "numerical", "forces are ramped in at touch-down over "
+                                                  f"epsilon = {stated} m",
+                              f"epsilon were {small} m",
+                              vary=lambda r: scaled(r, tuple(ramps), SMALLER_RAMP)))  # fmt: skip
+    out.append(Variation("ramp of the sliding", "law", "sliding stretches the tangential springs "
+                                                       "by the ramp of touch-down",
+                          "it did in full from touch-down on, without a ramp",
+                          vary=unramped))  # fmt: skip
     if any(isinstance(one, Sampled) for one in rig.reference.signals.values()):
-        out.append(Variation("set-points", "numerical", "set-points are what a smooth curve through the recorded ones says",
+        out.append(Variation("set-points", "numerical", "set-points are what a smooth curve "
+                                                        "through the recorded ones says",
                               "only every second one were known", vary=sparser))  # fmt: skip
-    out.append(Variation("clock of the set-points", "known", "set-points and sensors have one clock",
-                         "set-points came later", 1e3 * CLOCK, "ms", vary=lambda r: delayed(r, CLOCK)))  # fmt: skip
+    out.append(Variation("clock of the set-points", "known", "set-points and sensors have one "
+                                                             "clock",
+                         "set-points came later", 1e3 * CLOCK, "ms",
+                         vary=lambda r: delayed(r, CLOCK)))  # fmt: skip
     if any(actuator.feed_forward is not None for actuator in rig.actuators.values()):
-        out.append(Variation("feed-forward", "known", "what was fed forward is known", f"it were {FORCE} N more", FORCE, "N",
+        out.append(Variation("feed-forward", "known", "what was fed forward is known",
+            f"it were {FORCE} N more", FORCE, "N",
                               vary=lambda r: raised(r, FORCE)))  # fmt: skip
     if isinstance(rig, SoftGrasp):
         out += of_the_paper(first, rig, unknown)
     for name, value in first.parameters.items():
-        if name in unknown or value == 0.0 or name in ramps or name.startswith("start.") or "fixed" in name:
+        if (
+            name in unknown
+            or value == 0.0
+            or name in ramps
+            or name.startswith("start.")
+            or "fixed" in name
+        ):
             continue
         part = RADIUS if name.endswith("radius") else KNOWN
-        out.append(Variation(name, "known", f"{name} is {value:.6g}", f"{name} were {(1 + part) * value:.6g}",
+        out.append(Variation(name, "known", f"{name} is {value:.6g}", f"{name} were "
+                                                                      f"{(1 + part) * value:.6g}",
                               100 * part, "%", parameter=name))  # fmt: skip
     return out
 
@@ -148,11 +179,13 @@ def of_the_paper(recording: Recording, rig: SoftGrasp, unknown: set[str]) -> lis
     """What the paper's rig takes for granted besides."""
     out, start = [], recording.start
     if isinstance(start, AtRest) and "start.disc.x" not in unknown:
-        out.append(Variation("x_C0", "known", "the disc begins at scenario.x_C0", f"it began {1e6 * PLACE:g} um further right",
+        out.append(Variation("x_C0", "known", "the disc begins at scenario.x_C0",
+            f"it began {1e6 * PLACE:g} um further right",
                               1e6 * PLACE, "um", vary=placed))  # fmt: skip
     law = rig.contacts["L"].law.friction
     if isinstance(law, SmoothSlip):
-        out.append(Variation("Coulomb friction", "law", "slip is smooth (contact.friction = \"smooth\")",
+        out.append(Variation("Coulomb friction", "law", "slip is smooth (contact.friction = "
+                                                        "\"smooth\")",
                               "it were Coulomb's", vary=coulomb))  # fmt: skip
     return out
 
@@ -165,7 +198,8 @@ def with_rig(recording: Recording, change: Callable[[Rig], None]) -> Recording:
 
 
 def remeshed(recording: Recording, finer: int, points: int) -> Recording | None:
-    """Every pad of more elements, or with more contact points; None where the start is a state of this mesh."""
+    """Every pad of more elements, or with more contact points; None where the start is a state of
+    this mesh."""
     if not isinstance(recording.start, AtRest):
         return None
 
@@ -191,7 +225,10 @@ def shifted(recording: Recording, part: float) -> Recording:
 
 def scaled(recording: Recording, names: Collection[str], factor: float) -> Recording:
     """Parameters by a factor."""
-    return with_rig(recording, lambda rig: set_parameters(rig, {n: factor * recording.parameters[n] for n in names}))
+    return with_rig(
+        recording,
+        lambda rig: set_parameters(rig, {n: factor * recording.parameters[n] for n in names}),
+    )
 
 
 def placed(recording: Recording) -> Recording | None:
@@ -250,7 +287,10 @@ def sparser(recording: Recording) -> Recording:
 
 def delayed(recording: Recording, by: float) -> Recording | None:
     """Every signal later by a time [s]; None where a signal has no times."""
-    signals = {name.replace(":", "."): deepcopy(one) for name, one in recording.rig.reference.signals.items()}
+    signals = {
+        name.replace(":", "."): deepcopy(one)
+        for name, one in recording.rig.reference.signals.items()
+    }
     for one in signals.values():
         times = dict(one.named_buffers()).get("times")
         if times is None:
@@ -260,7 +300,8 @@ def delayed(recording: Recording, by: float) -> Recording | None:
 
 
 def raised(recording: Recording, by: float) -> Recording | None:
-    """More force [N] fed forward to every actuator; None where a signal is not made of polynomials."""
+    """More force [N] fed forward to every actuator; None where a signal is not made of
+    polynomials."""
     names = {a.feed_forward for a in recording.rig.actuators.values() if a.feed_forward is not None}
     known = {name: recording.rig.reference[name] for name in names}
     if not all(isinstance(one, Piecewise) for one in known.values()):
@@ -276,13 +317,13 @@ def raised(recording: Recording, by: float) -> Recording | None:
 
 
 REFITS, ROUGH = 20, 1e-3
-"""Evaluations that a fit under another assumption may take, and its relative tolerance: it has to find out whether the
-misfit goes away, not where exactly."""
+"""Evaluations that a fit under another assumption may take, and its relative tolerance: it has to
+find out whether the misfit goes away, not where exactly."""
 
 
 FAR = 2.0
-"""Misfit per sample from which where a fit ended tells nothing: under another assumption it begins where the first one
-began, too."""
+"""Misfit per sample from which where a fit ended tells nothing: under another assumption it begins
+where the first one began, too."""
 
 AMOUNTS = 10.0
 """How many amounts of a variation a number of the rig may be off where a fit is repeated."""
@@ -292,8 +333,9 @@ HALVINGS = 10
 
 
 class End(NamedTuple):
-    """A fit in whose place another is held: coordinates x (n,), residuals there, the free coordinates (n,), the
-    recordings that were fitted, residuals and steps of runs by the tolerance `rtol`, and how runs are made and kept."""
+    """A fit in whose place another is held: coordinates x (n,), residuals there, the free
+    coordinates (n,), the recordings that were fitted, residuals and steps of runs by the tolerance
+    `rtol`, and how runs are made and kept."""
 
     x: Array
     at: Residuals
@@ -307,16 +349,17 @@ class End(NamedTuple):
 
     @property
     def far(self) -> bool:
-        """Whether the fit left so much that what is so to first order where it ended says nothing."""
+        """Whether the fit left so much that what is so to first order where it ended says
+        nothing."""
         return float(np.mean(self.base.r**2)) > FAR
 
 
 def ended(
-    problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_], which: Sequence[str], rtol: float, workers: int,
-    journal: Path | None,
+    problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_], which: Sequence[str],
+    rtol: float, workers: int, journal: Path | None,
 ) -> End:  # fmt: skip
-    """The end of a fit, which took steps by `rtol`, with a run a recording by the tolerance of the variations: `USUAL`,
-    or that of the fit, if runs are lost with it."""
+    """The end of a fit, which took steps by `rtol`, with a run a recording by the tolerance of the
+    variations: `USUAL`, or that of the fit, if runs are lost with it."""
     runner = Runner(problem.recordings, workers, journal)
     usual = max(rtol, USUAL)
     base, steps = problem.freeze(runner, x, which, usual)
@@ -328,18 +371,25 @@ def ended(
 
 
 def varied(problem: Problem, which: Sequence[str], one: Variation) -> Problem | str:
-    """The problem with one assumption otherwise in the recordings `which`, or why there is none. A parameter that is
-    called known becomes one more unknown."""
+    """The problem with one assumption otherwise in the recordings `which`, or why there is none. A
+    parameter that is called known becomes one more unknown."""
     made, unknowns = [], dict(problem.unknowns)
     for recording in problem.recordings:
-        other = one.vary(recording) if one.vary is not None and recording.name in which else recording
+        other = (
+            one.vary(recording) if one.vary is not None and recording.name in which else recording
+        )
         if other is None:
             return f"it has no meaning where recording `{recording.name}` begins"
         made.append(other)
     try:
         if one.parameter:
-            value, reach = problem.recordings[0].parameters[one.parameter], AMOUNTS * one.amount / 100
-            low, high = sorted(farthest(problem.recordings, one.parameter, value, part) for part in (-reach, reach))
+            value, reach = (
+                problem.recordings[0].parameters[one.parameter],
+                AMOUNTS * one.amount / 100,
+            )
+            low, high = sorted(
+                farthest(problem.recordings, one.parameter, value, part) for part in (-reach, reach)
+            )
             unknowns[one.parameter] = Unknown(nominal=value, low=low, high=high)
         return Problem(made, problem.sensors, unknowns, problem.noise)
     except ValueError as error:  # an unknown that the varied rig has not, or that cannot be one
@@ -347,8 +397,9 @@ def varied(problem: Problem, which: Sequence[str], one: Variation) -> Problem | 
 
 
 def farthest(recordings: Sequence[Recording], name: str, value: float, part: float) -> float:
-    """A number of the rig that is off by a relative `part`, or by half of that, a quarter and so on until there is such
-    a rig: a smaller disc may leave the pads apart. Raises `ValueError` where there is none."""
+    """A number of the rig that is off by a relative `part`, or by half of that, a quarter and so on
+    until there is such a rig: a smaller disc may leave the pads apart. Raises `ValueError` where
+    there is none."""
     for _ in range(HALVINGS):
         with suppress(ValueError):
             for recording in recordings:
@@ -359,13 +410,16 @@ def farthest(recordings: Sequence[Recording], name: str, value: float, part: flo
 
 
 def difference(problem: Problem, end: End, one: Variation) -> tuple[Array | None, str]:
-    """What a variation adds to the residuals (m,), on the same steps, or None and why that is not known."""
+    """What a variation adds to the residuals (m,), on the same steps, or None and why that is not
+    known."""
     if end.base.lost:
         return None, "the estimates cannot be simulated by the tolerance of the checks"
     other = varied(problem, end.which, one)
     if isinstance(other, str):
         return None, other
-    got = other.residuals(Runner(other.recordings, end.workers, end.journal), end.x, end.which, end.steps)
+    got = other.residuals(
+        Runner(other.recordings, end.workers, end.journal), end.x, end.which, end.steps
+    )
     if got.lost:
         return None, f"a run failed: {next(iter(got.lost.values())).reason}"
     return got.r - end.base.r, ""
@@ -383,12 +437,15 @@ class Refit(NamedTuple):
         return float(self.fit.x[self.problem.coordinates.labels.index(label)])
 
 
-def refit(problem: Problem, end: End, one: Variation | None, loss: Loss, notify: Notify) -> Refit | None:
-    """The fit with one assumption otherwise, or with all as stated, on steps of its own; None where it cannot begin.
+def refit(
+    problem: Problem, end: End, one: Variation | None, loss: Loss, notify: Notify
+) -> Refit | None:
+    """The fit with one assumption otherwise, or with all as stated, on steps of its own; None where
+    it cannot begin.
 
-    It begins where the fit ended; ratios that ended at a bound are looked for again over all of their range. With
-    another law or number, and a misfit above `FAR`, it begins where the first fit began as well, and the better end
-    counts.
+    It begins where the fit ended; ratios that ended at a bound are looked for again over all of
+    their range. With another law or number, and a misfit above `FAR`, it begins where the first fit
+    began as well, and the better end counts.
     """
     other = varied(problem, end.which, one) if one is not None else problem
     if isinstance(other, str):
@@ -407,7 +464,11 @@ def refit(problem: Problem, end: End, one: Variation | None, loss: Loss, notify:
         with suppress(Unreachable):
             yield run_plan(other, runner, plan, x, loss=loss, notify=notify)[0]
 
-    fits = [*carried_out([Stage("once more", end.which, labels, end.rtol, REFITS, ROUGH, scanned=scans)], x)]
+    fits = [
+        *carried_out(
+            [Stage("once more", end.which, labels, end.rtol, REFITS, ROUGH, scanned=scans)], x
+        )
+    ]
     if one is not None and one.kind in ("law", "known") and end.far:
         with suppress(Unreachable):
             plan = default_plan(other, runner, end.rtol, end.which)

@@ -1,4 +1,5 @@
-"""Tables of measurements: CSV with units in the heading, and the trajectory files of this project, in SI units.
+"""Tables of measurements: CSV with units in the heading, and the trajectory files of this project,
+in SI units.
 
 Every error is a `ValueError` in a sentence that names the file, the row and the column.
 """
@@ -33,8 +34,8 @@ GAP = 0.1
 
 @dataclass(frozen=True)
 class Columns:
-    """A table in SI units: `values` (n,) by column, NaN where a sample is missing, the number of every row in the file,
-    and the names of columns that were left out."""
+    """A table in SI units: `values` (n,) by column, NaN where a sample is missing, the number of
+    every row in the file, and the names of columns that were left out."""
 
     path: Path
     values: dict[str, Array]
@@ -56,8 +57,8 @@ class Columns:
 
 @dataclass(frozen=True)
 class Tables:
-    """The tables of one recording, each with times of its own; a column stands in one of them. `constants` are columns
-    that were stated in the place of missing ones."""
+    """The tables of one recording, each with times of its own; a column stands in one of them.
+    `constants` are columns that were stated in the place of missing ones."""
 
     tables: tuple[Columns, ...]
     constants: tuple[str, ...] = ()
@@ -84,7 +85,9 @@ class Tables:
     def begin(self) -> float:
         """When the first sample was taken [s]."""
         measured = [t[np.isfinite(y)] for name, (t, y) in self.columns.items() if name in MEASURED]
-        return min((float(t[0]) for t in measured if len(t)), default=float(self.tables[0].values["t"][0]))
+        return min(
+            (float(t[0]) for t in measured if len(t)), default=float(self.tables[0].values["t"][0])
+        )
 
     def near(self, time: float) -> str:
         """Names the file with the set-points, and the first row at or after a time [s]."""
@@ -92,29 +95,37 @@ class Tables:
         return f"{table.path}, {table.near(time)}"
 
 
-def read_tables(paths: Sequence[Path], ignore: Collection[str], constants: Mapping[str, float]) -> Tables:
-    """The tables of one recording; a column that none has is a constant, where one is stated. Raises `ValueError` for a
-    column that is there twice, or is needed and missing, and for samples at times without set-points."""
+def read_tables(
+    paths: Sequence[Path], ignore: Collection[str], constants: Mapping[str, float]
+) -> Tables:
+    """The tables of one recording; a column that none has is a constant, where one is stated.
+    Raises `ValueError` for a column that is there twice, or is needed and missing, and for samples
+    at times without set-points."""
     tables = [read_table(path, ignore) for path in paths]
     names = ", ".join(str(path) for path in paths)
     for i, table in enumerate(tables):
         for other in tables[:i]:
             if twice := (table.values.keys() & other.values.keys()) - {"t"}:
                 raise ValueError(
-                    f"column `{min(twice)}` is in {other.path} and in {table.path}: one recording has it once"
+                    f"column `{min(twice)}` is in {other.path} and in {table.path}: one recording "
+                    "has it once"
                 )
     there = {name for table in tables for name in table.values}
     for name in SETPOINTS:
         if name not in there and name not in constants:
             raise ValueError(
-                f"{names} has no column `{name}`; it needs t, x_d, y_d and at least one of {', '.join(MEASURED)}"
+                f"{names} has no column `{name}`; it needs t, x_d, y_d and at least one of "
+                f"{', '.join(MEASURED)}"
             )
-        if f"{name}_dot" in there and not any({name, f"{name}_dot"} <= table.values.keys() for table in tables):
+        if f"{name}_dot" in there and not any(
+            {name, f"{name}_dot"} <= table.values.keys() for table in tables
+        ):
             raise ValueError(f"{names}: the columns `{name}` and `{name}_dot` must be in one file")
     if "F_ff" not in there and "F_ff" not in constants:
         raise ValueError(
-            f"{names} has no column `F_ff`, and nothing says which force was fed forward to the bracket: give the column, or "
-            "state a constant [N], missing = {F_ff = 0.0} where there was none"
+            f"{names} has no column `F_ff`, and nothing says which force was fed forward to the "
+            f"bracket: give the column, or state a constant [N], missing = {{F_ff = 0.0}} where "
+            "there was none"
         )
     most = max(range(len(tables)), key=lambda i: len({*SETPOINTS} & tables[i].values.keys()))
     stated = {name: value for name, value in constants.items() if name not in there}
@@ -137,14 +148,17 @@ def check_times(tables: Tables) -> None:
                 over = (t[0] - table.values["t"][0]) if i == 0 else (table.values["t"][-1] - t[-1])
                 if over > slack:
                     raise ValueError(
-                        f"{table.at(i)}, column `t`: {table.values['t'][i]:g} s is {over:.3g} s outside the times of `{name}`, "
-                        f"which {where} at {t[i]:g} s ({known.path}): nothing says what was asked for then"
+                        f"{table.at(i)}, column `t`: {table.values['t'][i]:g} s is {over:.3g} s "
+                        f"outside the times of `{name}`, which {where} at {t[i]:g} s "
+                        f"({known.path}): nothing says what was asked for then"
                     )
 
 
 def read_table(path: Path, ignore: Collection[str] = ()) -> Columns:
     """A CSV or NetCDF file, by its suffix, without the columns `ignore`."""
-    return read_trajectory(path, ignore) if path.suffix in (".nc", ".h5") else read_csv(path, ignore)
+    return (
+        read_trajectory(path, ignore) if path.suffix in (".nc", ".h5") else read_csv(path, ignore)
+    )
 
 
 def hint(name: str, columns: int) -> str:
@@ -159,14 +173,15 @@ def hint(name: str, columns: int) -> str:
 
 
 def read_csv(path: Path, ignore: Collection[str] = ()) -> Columns:
-    """A table of numbers under `name [unit]`. Raises `ValueError` naming the row (the heading is row 1) and the
-    column."""
+    """A table of numbers under `name [unit]`. Raises `ValueError` naming the row (the heading is
+    row 1) and the column."""
     table = csvfile.read(path, {name: UNITS[CHANNELS[name].unit] for name in COLUMNS}, hint, ignore)
     return check_table(Columns(path, table.values, table.rows, ignored=table.ignored))
 
 
 def read_trajectory(path: Path, ignore: Collection[str] = ()) -> Columns:
-    """The table in a file of `Trajectory.save`; rows are called samples, counted from 0. Raises `ValueError`."""
+    """The table in a file of `Trajectory.save`; rows are called samples, counted from 0. Raises
+    `ValueError`."""
     data = load(path)
     values = read_columns(data, path)
     left_out = tuple(name for name in values if name in ignore)
@@ -188,24 +203,40 @@ def read_columns(data: xr.Dataset, path: Path) -> dict[str, Array]:
         raise ValueError(f"{path} is not a trajectory file: it has no {', '.join(missing)}")
     for name, variable in variables.items():
         one, axes = data[name], ("time", "axis")[: 1 if len(variable.symbols) == 1 else 2]
-        if one.dims != axes or one.dtype != np.float64 or ("axis" in axes and one.sizes["axis"] != 2):
-            raise ValueError(f"{path} is not a trajectory file: `{name}` should be float64 over {' and '.join(axes)}")
+        if (
+            one.dims != axes
+            or one.dtype != np.float64
+            or ("axis" in axes and one.sizes["axis"] != 2)
+        ):
+            raise ValueError(
+                f"{path} is not a trajectory file: `{name}` should be float64 over "
+                f"{' and '.join(axes)}"
+            )
         if one.attrs.get("units") != variable.unit:
-            raise ValueError(f"{path}, `{name}` should be in {variable.unit}, not {shown(one.attrs.get('units'))}")
+            raise ValueError(
+                f"{path}, `{name}` should be in {variable.unit}, not "
+                f"{shown(one.attrs.get('units'))}"
+            )
     return {name: np.array(c.of(data[c.variable].values), float) for name, c in columns.items()}
 
 
 def check_table(table: Columns) -> Columns:
-    """The table, where its times and set-points can be used. Raises `ValueError` naming row and column."""
+    """The table, where its times and set-points can be used. Raises `ValueError` naming row and
+    column."""
     path, values = table.path, table.values
     if "t" not in values:
         raise ValueError(f"{path} has no column `t`")
     asked = [name for name in (*SETPOINTS, *FEED_FORWARD) if name in values]
     if len(table.rows) < (least := ROWS if asked else 2):
-        raise ValueError(f"{path} has {len(table.rows)} rows of numbers, but needs at least {least}")
+        raise ValueError(
+            f"{path} has {len(table.rows)} rows of numbers, but needs at least {least}"
+        )
     for name in ("t", *asked):
         if (empty := np.flatnonzero(np.isnan(values[name]))).size:
-            raise ValueError(f"{table.at(empty[0])}, column `{name}` is empty; only measured channels may have gaps")
+            raise ValueError(
+                f"{table.at(empty[0])}, column `{name}` is empty; only measured channels may have "
+                "gaps"
+            )
     apart_by = np.diff(values["t"])
     for i in np.flatnonzero(~((apart_by > 0) & (apart_by <= (GAP if asked else np.inf))))[:1]:
         t, before = values["t"][i + 1], values["t"][i]
@@ -218,6 +249,7 @@ def check_table(table: Columns) -> Columns:
         raise ValueError(f"{table.at(i + 1)}, column `t`: {what}")
     if (late := np.flatnonzero(np.abs(values["t"]) > LATE)).size:
         raise ValueError(
-            f"{table.at(late[0])}, column `t`: {values['t'][late[0]]:.9g} s is too far from zero; count times from the start"
+            f"{table.at(late[0])}, column `t`: {values['t'][late[0]]:.9g} s is too far from zero; "
+            "count times from the start"
         )
     return table

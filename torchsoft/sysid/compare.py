@@ -1,5 +1,5 @@
-"""Comparison of competing laws: each is fitted to the recordings, and the evidence is judged by the rule of
-`comparison`."""
+"""Comparison of competing laws: each is fitted to the recordings, and the evidence is judged by the
+rule of `comparison`."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,16 +18,25 @@ from torchsoft.sysid.noise import Autoregression, fit_noise, log_det
 from torchsoft.sysid.plan import FINER, Stage, default_plan, run_plan
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array, Recording
-from torchsoft.sysid.residual_tests import ROUNDS, Part, colours, judge_residuals, parts, residual_notices
+from torchsoft.sysid.residual_tests import (
+    ROUNDS,
+    Part,
+    colours,
+    judge_residuals,
+    parts,
+    residual_notices,
+)
 from torchsoft.sysid.runs import Runner
 
 COLOUR = 3
-"""Largest order of the autoregression by which residuals tell how much their colour moves a likelihood ratio."""
+"""Largest order of the autoregression by which residuals tell how much their colour moves a
+likelihood ratio."""
 
 
 class Density(NamedTuple):
-    """What a law says of some recordings: whitened residuals r (m,), s = S^-1 r with S = 1 + J C J' the covariance of
-    the prediction in units of the noise, and the logarithm of the samples' density, in SI units."""
+    """What a law says of some recordings: whitened residuals r (m,), s = S^-1 r with S = 1 + J C J'
+    the covariance of the prediction in units of the noise, and the logarithm of the samples'
+    density, in SI units."""
 
     parts: list[Part]
     r: Array
@@ -45,12 +54,18 @@ class Density(NamedTuple):
         return sum(len(part.t) for part in self.parts)
 
 
-def density(problem: Problem, which: Sequence[str], r: Array, spread: Array | None = None) -> Density:
-    """Of whitened residuals r (m,), where the estimates are as uncertain as `spread` (m, n) = J C^(1/2) says."""
+def density(
+    problem: Problem, which: Sequence[str], r: Array, spread: Array | None = None
+) -> Density:
+    """Of whitened residuals r (m,), where the estimates are as uncertain as `spread` (m, n) = J
+    C^(1/2) says."""
     mine, s, wider = parts(problem, r, which), r, 0.0
     if spread is not None:
         inner = np.eye(spread.shape[1]) + spread.T @ spread
-        s, wider = r - spread @ np.linalg.solve(inner, spread.T @ r), float(np.linalg.slogdet(inner)[1])
+        s, wider = (
+            r - spread @ np.linalg.solve(inner, spread.T @ r),
+            float(np.linalg.slogdet(inner)[1]),
+        )
     log = -0.5 * (float(r @ s) + wider)
     for one in mine:
         log -= len(one.t) * np.log(problem.sensors[one.channel].noise * (2 * np.pi) ** 0.5)
@@ -60,8 +75,8 @@ def density(problem: Problem, which: Sequence[str], r: Array, spread: Array | No
 
 
 class FittedLaw(NamedTuple):
-    """A law, and where its fit ended: coordinates x (n,), which of them were `free` (n,), by which tolerance, and
-    whether it had converged. The problem has the noise that was found."""
+    """A law, and where its fit ended: coordinates x (n,), which of them were `free` (n,), by which
+    tolerance, and whether it had converged. The problem has the noise that was found."""
 
     name: str
     problem: Problem
@@ -72,13 +87,16 @@ class FittedLaw(NamedTuple):
 
 
 class Evidence:
-    """A fitted law's densities of the recordings `which` it was fitted to and of those that were held out.
+    """A fitted law's densities of the recordings `which` it was fitted to and of those that were
+    held out.
 
-    They are those of runs with a tenth of the fit's tolerance; `numerical` is what that changes. Raises `ValueError`
-    where one cannot be made.
+    They are those of runs with a tenth of the fit's tolerance; `numerical` is what that changes.
+    Raises `ValueError` where one cannot be made.
     """
 
-    def __init__(self, law: FittedLaw, runner: Runner, which: Sequence[str], heldout: Sequence[str]) -> None:
+    def __init__(
+        self, law: FittedLaw, runner: Runner, which: Sequence[str], heldout: Sequence[str]
+    ) -> None:
         self.law, self.name, self.which, self._runner = law, law.name, list(which), runner
         problem, free = law.problem, law.free
         self.parameters = int(free.sum()) + sum(one.order + 1 for one in problem.noise.values())
@@ -91,7 +109,9 @@ class Evidence:
         self.dof, self.heldout = max(self.fitted.samples - int(free.sum()), 1), None
         if heldout:
             low, high = (bound[free] for bound in problem.coordinates.bounds)
-            F = J[:, free].T @ J[:, free] + np.diag(12 / (high - low) ** 2)  # what is unknown is between its bounds
+            F = J[:, free].T @ J[:, free] + np.diag(
+                12 / (high - low) ** 2
+            )  # what is unknown is between its bounds
             m = problem.samples(heldout)
             r, J, _ = self._at(heldout, FINER * law.rtol, True)
             spread = np.linalg.solve(np.linalg.cholesky(F), J[:m, free].T).T
@@ -99,20 +119,29 @@ class Evidence:
 
     def _at(self, which: Sequence[str], rtol: float, derivatives: bool) -> Residuals:
         """Residuals, and their Jacobian if wanted."""
-        at = self.law.problem.residuals(self._runner, self.law.x, which, rtol, self.law.free if derivatives else None)
+        at = self.law.problem.residuals(
+            self._runner, self.law.x, which, rtol, self.law.free if derivatives else None
+        )
         if at.lost:
-            raise ValueError(f"the law `{self.name}` cannot be run at its estimates: {Unreachable(at.lost)}")
+            raise ValueError(
+                f"the law `{self.name}` cannot be run at its estimates: {Unreachable(at.lost)}"
+            )
         return at
 
     @property
     def total(self) -> float:
         """Logarithm of the density of everything, less Schwarz's penalty."""
         penalty = 0.5 * self.parameters * np.log(len(self.fitted.r))
-        return self.fitted.log + (self.heldout.log if self.heldout is not None else 0.0) - float(penalty)
+        return (
+            self.fitted.log
+            + (self.heldout.log if self.heldout is not None else 0.0)
+            - float(penalty)
+        )
 
 
 class Ratio(NamedTuple):
-    """The logarithm of a ratio of densities, its variance by the noise as stated, and as the residuals have it."""
+    """The logarithm of a ratio of densities, its variance by the noise as stated, and as the
+    residuals have it."""
 
     log: float
     stated: float
@@ -130,15 +159,18 @@ class Ratio(NamedTuple):
 def ratio(a: Density, b: Density) -> Ratio:
     """Of two laws, by the noise about the first one.
 
-    The logarithm changes with the samples by the difference of the scores, and its variance is what the noise gives
-    that: as stated, and with the size and the colour that the residuals of the first law have besides, as an
-    autoregression of the order that they choose. The larger one is taken.
+    The logarithm changes with the samples by the difference of the scores, and its variance is what
+    the noise gives that: as stated, and with the size and the colour that the residuals of the
+    first law have besides, as an autoregression of the order that they choose. The larger one is
+    taken.
     """
     stated = variance = 0.0
     for mine, its in zip(a.parts, b.parts):
         score = b.s[its.rows] - a.s[mine.rows]
         if mine.noise != its.noise:
-            theirs = b.s[its.rows] if its.noise is None else its.noise.whitener(its.t).T @ b.s[its.rows]
+            theirs = (
+                b.s[its.rows] if its.noise is None else its.noise.whitener(its.t).T @ b.s[its.rows]
+            )
             score = coloured(theirs, mine.noise, mine.t) - a.s[mine.rows]
         left = fit_noise([(mine.t, a.r[mine.rows])], most=COLOUR).noise
         stated += float(score @ score)
@@ -147,8 +179,8 @@ def ratio(a: Density, b: Density) -> Ratio:
 
 
 def coloured(score: Array, noise: Autoregression | None, t: Array) -> Array:
-    """W'^-1 score (m,) for samples at t (m,) [s], W being what whitens noise: its square is the variance of score'
-    noise."""
+    """W'^-1 score (m,) for samples at t (m,) [s], W being what whitens noise: its square is the
+    variance of score' noise."""
     if noise is None:
         return score
     return spsolve_triangular(noise.whitener(t).T.tocsr(), score, lower=False)
@@ -165,34 +197,42 @@ CLOSE = 1e-3
 
 
 def compare(
-    laws: Mapping[str, Problem], *, heldout: Sequence[str] = (), plans: Mapping[str, Sequence[Stage]] | None = None,
-    rtol: float = RTOL, starts: int = 1, again: bool = True, workers: int = 1, checkpoint: str | Path | None = None,
+    laws: Mapping[str, Problem], *, heldout: Sequence[str] = (),
+    plans: Mapping[str, Sequence[Stage]] | None = None, rtol: float = RTOL, starts: int = 1,
+    again: bool = True, workers: int = 1, checkpoint: str | Path | None = None,
     progress: bool = False,
 ) -> Comparison:  # fmt: skip
-    """Fit every law to the same recordings, and say which one made them, or that the data cannot tell:
-    `Comparison.verdict`, by the rule of `torchsoft.sysid.comparison`.
+    """Fit every law to the same recordings, and say which one made them, or that the data cannot
+    tell: `Comparison.verdict`, by the rule of `torchsoft.sysid.comparison`.
 
-    `laws` are problems by name with the same recordings and sensors, on rigs with other laws, and with unknowns of
-    their own: `dataclasses.replace(recording, rig=...)` makes such a recording. Bounds belong to the law: one that
-    contains another (a standard linear solid with any instantaneous modulus contains Kelvin and Voigt's) is never
-    behind it by more than its penalty, unless its bounds keep it away from the other. Noise is what the sensors state:
-    where one declares its `colour` it is found for every law, but no law may explain what it misses as noise that
-    nobody declared.
+    `laws` are problems by name with the same recordings and sensors, on rigs with other laws, and
+    with unknowns of their own: `dataclasses.replace(recording, rig=...)` makes such a recording.
+    Bounds belong to the law: one that contains another (a standard linear solid with any
+    instantaneous modulus contains Kelvin and Voigt's) is never behind it by more than its penalty,
+    unless its bounds keep it away from the other. Noise is what the sensors state: where one
+    declares its `colour` it is found for every law, but no law may explain what it misses as noise
+    that nobody declared.
 
-    Recordings named in `heldout` are predicted, not fitted. `plans`, `rtol`, `starts`, `workers` and the folder
-    `checkpoint` are those of `identify`. With `again` every law but the best is fitted once more from where the best
-    one ended, as far as they share coordinates, and the better end is kept: no law is to lose by its start.
+    Recordings named in `heldout` are predicted, not fitted. `plans`, `rtol`, `starts`, `workers`
+    and the folder `checkpoint` are those of `identify`. With `again` every law but the best is
+    fitted once more from where the best one ended, as far as they share coordinates, and the better
+    end is kept: no law is to lose by its start.
 
-    Raises `ValueError` for laws that were not given the same data, and for a law that cannot follow the data.
+    Raises `ValueError` for laws that were not given the same data, and for a law that cannot follow
+    the data.
     """
     check_alike(laws, heldout)
     which = [name for name in next(iter(laws.values())).names if name not in heldout]
     folder = Path(checkpoint) if checkpoint is not None else None
     evidence, runners = dict[str, Evidence](), dict[str, Runner]()
     for name, problem in laws.items():
-        runners[name] = Runner(problem.recordings, workers, folder / name if folder is not None else None)
+        runners[name] = Runner(
+            problem.recordings, workers, folder / name if folder is not None else None
+        )
         try:
-            law = fitted(name, problem, runners[name], which, (plans or {}).get(name), rtol, starts, progress)
+            law = fitted(
+                name, problem, runners[name], which, (plans or {}).get(name), rtol, starts, progress
+            )
         except Unreachable as lost:
             raise ValueError(f"the law `{name}` cannot follow the recordings: {lost}") from None
         evidence[name] = Evidence(law, runners[name], which, heldout)
@@ -212,39 +252,56 @@ def check_alike(laws: Mapping[str, Problem], heldout: Sequence[str]) -> None:
         raise ValueError(f"a comparison needs two laws or more, not {len(laws)}")
     (first, one), *others = laws.items()
     if set(heldout) - set(one.names) or not set(one.names) - set(heldout):
-        raise ValueError(f"`heldout` must name some of {list(one.names)}, but not all; it is {list(heldout)}")
+        raise ValueError(
+            f"`heldout` must name some of {list(one.names)}, but not all; it is {list(heldout)}"
+        )
     for name, other in others:
         both = f"the laws `{first}` and `{name}`"
         if one.names != other.names:
-            raise ValueError(f"{both} have other recordings: {', '.join(one.names)} and {', '.join(other.names)}")
+            raise ValueError(
+                f"{both} have other recordings: {', '.join(one.names)} and {', '.join(other.names)}"
+            )
         if one.sensors != other.sensors:
-            raise ValueError(f"{both} have other sensors, so that their likelihoods are of other data")
+            raise ValueError(
+                f"{both} have other sensors, so that their likelihoods are of other data"
+            )
         for mine, its in zip(one.recordings, other.recordings):
             a, b = mine.samples, its.samples
-            if a.keys() != b.keys() or not all(np.array_equal(a[c][i], b[c][i]) for c in a for i in (0, 1)):
+            if a.keys() != b.keys() or not all(
+                np.array_equal(a[c][i], b[c][i]) for c in a for i in (0, 1)
+            ):
                 raise ValueError(f"recording `{mine.name}` of {both} has other samples")
             if not same_reference(mine, its):
-                raise ValueError(f"the rigs of {both} follow another reference in recording `{mine.name}`")
+                raise ValueError(
+                    f"the rigs of {both} follow another reference in recording `{mine.name}`"
+                )
 
 
 def same_reference(one: Recording, other: Recording) -> bool:
     """Whether what both rigs follow is the same, as far as both have the same signals."""
     t = torch.from_numpy(one.times)
-    a, b = (dict(zip(r.rig.signals, r.rig.follow(t).detach()[..., 0].unbind(-1))) for r in (one, other))
-    return all(float((a[k] - b[k]).abs().max()) <= SAME * float(a[k].abs().max()) for k in a.keys() & b.keys())
+    a, b = (
+        dict(zip(r.rig.signals, r.rig.follow(t).detach()[..., 0].unbind(-1))) for r in (one, other)
+    )
+    return all(
+        float((a[k] - b[k]).abs().max()) <= SAME * float(a[k].abs().max())
+        for k in a.keys() & b.keys()
+    )
 
 
 def fitted(
-    name: str, problem: Problem, runner: Runner, which: Sequence[str], plan: Sequence[Stage] | None, rtol: float,
-    starts: int, progress: bool,
+    name: str, problem: Problem, runner: Runner, which: Sequence[str], plan: Sequence[Stage] | None,
+    rtol: float, starts: int, progress: bool,
 ) -> FittedLaw:  # fmt: skip
-    """A law where the plan ends, and with the noise of its sensors, where they declare a colour. Raises
-    `Unreachable`."""
+    """A law where the plan ends, and with the noise of its sensors, where they declare a colour.
+    Raises `Unreachable`."""
     if plan is None:
         plan = default_plan(problem, runner, rtol, which, starts)
     if not plan or list(plan[-1].recordings) != list(which):
         raise ValueError(f"the last stage of the plan of `{name}` must fit {', '.join(which)}")
-    fit, _ = run_plan(problem, runner, plan, problem.coordinates.start, label=f"{name} ", progress=progress)
+    fit, _ = run_plan(
+        problem, runner, plan, problem.coordinates.start, label=f"{name} ", progress=progress
+    )
     assert fit.at is not None
     free = np.isin(problem.coordinates.labels, plan[-1].free)
     declared, given = [c for c, s in problem.sensors.items() if s.colour == "ar"], problem.noise
@@ -254,18 +311,24 @@ def fitted(
         if not noise:
             break
         problem = problem.with_noise(noise)
-        fit = gauss_newton(problem, runner, fit.x, which=which, free=free, steps=fit.steps, tolerance=CLOSE)
+        fit = gauss_newton(
+            problem, runner, fit.x, which=which, free=free, steps=fit.steps, tolerance=CLOSE
+        )
         assert fit.at is not None
     return FittedLaw(name, problem, fit.x, free, plan[-1].rtol, fit.converged)
 
 
-def refitted(law: FittedLaw, best: FittedLaw, runner: Runner, which: Sequence[str]) -> FittedLaw | None:
-    """The law fitted once more, from the values that another one ended with; None where they share none, or it cannot
-    be run there."""
+def refitted(
+    law: FittedLaw, best: FittedLaw, runner: Runner, which: Sequence[str]
+) -> FittedLaw | None:
+    """The law fitted once more, from the values that another one ended with; None where they share
+    none, or it cannot be run there."""
     c, x = law.problem.coordinates, law.x.copy()
     known = {
         label: one.to_value(v)
-        for label, one, v in zip(best.problem.coordinates.labels, best.problem.coordinates.all, best.x)
+        for label, one, v in zip(
+            best.problem.coordinates.labels, best.problem.coordinates.all, best.x
+        )
     }
     for i, one in enumerate(c.all):
         if law.free[i] and one.label in known:
@@ -277,7 +340,14 @@ def refitted(law: FittedLaw, best: FittedLaw, runner: Runner, which: Sequence[st
         if first.lost:
             return None
         fit = gauss_newton(
-            law.problem, runner, x, which=which, free=law.free, steps=steps, tolerance=CLOSE, first=first
+            law.problem,
+            runner,
+            x,
+            which=which,
+            free=law.free,
+            steps=steps,
+            tolerance=CLOSE,
+            first=first,
         )
     except Unreachable:
         return None
@@ -295,7 +365,9 @@ def gathered(evidence: Mapping[str, Evidence], heldout: list[str]) -> Comparison
     against = [versus(best, one) for name, one in evidence.items() if name != best.name]
     laws = sorted(law_fits(evidence), key=lambda one: -evidence[one.name].total)
     outcome, law, verdict = judged(laws, against)
-    return Comparison(outcome, law, verdict, laws, against, len(best.fitted.r), heldout, series(evidence))
+    return Comparison(
+        outcome, law, verdict, laws, against, len(best.fitted.r), heldout, series(evidence)
+    )
 
 
 def versus(best: Evidence, other: Evidence) -> Versus:
@@ -310,8 +382,9 @@ def versus(best: Evidence, other: Evidence) -> Versus:
         told, z = (ahead.log / m, ahead.variance**0.5 / m), ahead.z
     evidence -= 0.5 * max(best.parameters - other.parameters, 0) * float(np.log(n))
     return Versus(
-        best.name, other.name, fitted.log, None if told is None else log - fitted.log, told, stated**0.5,
-        variance / stated if stated > 0 else 1.0, evidence, log / variance**0.5 if variance > 0 else 0.0, z,
+        best.name, other.name, fitted.log, None if told is None else log - fitted.log, told,
+        stated**0.5, variance / stated if stated > 0 else 1.0, evidence,
+        log / variance**0.5 if variance > 0 else 0.0, z,
         (best.numerical + other.numerical) / fitted.inflation,
     )  # fmt: skip
 
@@ -319,19 +392,29 @@ def versus(best: Evidence, other: Evidence) -> Versus:
 def law_fits(evidence: Mapping[str, Evidence]) -> list[LawFit]:
     """Every law with its criteria."""
     k = np.array([one.parameters for one in evidence.values()])
-    n, deviance = len(next(iter(evidence.values())).fitted.r), np.array([-2 * e.fitted.log for e in evidence.values()])
+    n, deviance = (
+        len(next(iter(evidence.values())).fitted.r),
+        np.array([-2 * e.fitted.log for e in evidence.values()]),
+    )
     aic, bic = deviance + 2 * k, deviance + k * np.log(n)
     aicc = aic + 2 * k * (k + 1) / np.maximum(n - k - 1, 1)
     weight = np.exp(-0.5 * (aicc - aicc.min()))
     out = []
     for i, (name, one) in enumerate(evidence.items()):
-        square, held, c = float(one.fitted.r @ one.fitted.r), one.heldout, one.law.problem.coordinates
+        square, held, c = (
+            float(one.fitted.r @ one.fitted.r),
+            one.heldout,
+            one.law.problem.coordinates,
+        )
         out.append(
             LawFit(
-                name, int(k[i]), {a.label: a.to_value(x) for a, x, free in zip(c.all, one.law.x, one.law.free) if free},
-                one.fitted.log, square / one.dof, float(stats.chi2.sf(square, one.dof)), float(aic[i]), float(aicc[i]),
-                float(bic[i]), float(weight[i] / weight.sum()), None if held is None else held.log / len(held.r),
-                None if held is None else held.p, one.numerical, one.law.converged, residual_notices(one.verdicts),
+                name, int(k[i]),
+                {a.label: a.to_value(x) for a, x,
+                free in zip(c.all, one.law.x, one.law.free) if free}, one.fitted.log,
+                square / one.dof, float(stats.chi2.sf(square, one.dof)), float(aic[i]),
+                float(aicc[i]), float(bic[i]), float(weight[i] / weight.sum()),
+                None if held is None else held.log / len(held.r), None if held is None else held.p,
+                one.numerical, one.law.converged, residual_notices(one.verdicts),
                 any(verdict.alarming and verdict.test == "motion" for verdict in one.verdicts),
             )
         )  # fmt: skip

@@ -1,22 +1,25 @@
-"""The answer of a comparison of laws, as plain data: how well each explains the recordings, and which one did.
+"""The answer of a comparison of laws, as plain data: how well each explains the recordings, and
+which one did.
 
 The rule. Against every other law b, a law a has the evidence, in nats,
 
     E = LR_fitted / c + LR_heldout / c - max(0, k_a - k_b) ln(n) / 2,        z = LR / sd(LR),
 
-LR being the logarithm of the ratio of the likelihoods, k the number of what each has fitted, n the samples that were
-fitted. That is the logarithm of Bayes' factor, with Schwarz's approximation for the recordings that were fitted and
-the predictive density for those that were held out, but that no law is named for having fewer parameters. LR changes
-with the noise by sd(LR), which is the whitened distance D of the two predictions where the noise is as stated; c >= 1
-is how much its variance grows by what the residuals of a have of size and colour (quasi-likelihood: Burnham and
-Anderson 2002, section 2.5). z is Vuong's statistic (1989) for given motions: with samples drawn at random it would
-take evidence that stands in a few of them, as of one slip, for luck.
+LR being the logarithm of the ratio of the likelihoods, k the number of what each has fitted, n the
+samples that were fitted. That is the logarithm of Bayes' factor, with Schwarz's approximation for
+the recordings that were fitted and the predictive density for those that were held out, but that no
+law is named for having fewer parameters. LR changes with the noise by sd(LR), which is the whitened
+distance D of the two predictions where the noise is as stated; c >= 1 is how much its variance
+grows by what the residuals of a have of size and colour (quasi-likelihood: Burnham and Anderson
+2002, section 2.5). z is Vuong's statistic (1989) for given motions: with samples drawn at random it
+would take evidence that stands in a few of them, as of one slip, for luck.
 
-Law a is named if against every other law E >= `EVIDENCE` and z >= `APART`, whatever a tenth of the tolerance changes
-in E, if the held-out recordings do not speak against it (z_heldout > -`APART`), if every fit has converged, and if
-its own residuals are as large as the noise (chi-squared, p >= `FITS`) and do not follow the motion (`misfit`). With
-noise as stated a wrong law is named with a probability of at most 6e-4, whatever D, and the right one with 95 % from
-D = 7.3 on. Else the answer is that the data cannot tell, or that no law fits.
+Law a is named if against every other law E >= `EVIDENCE` and z >= `APART`, whatever a tenth of the
+tolerance changes in E, if the held-out recordings do not speak against it (z_heldout > -`APART`),
+if every fit has converged, and if its own residuals are as large as the noise (chi-squared, p >=
+`FITS`) and do not follow the motion (`misfit`). With noise as stated a wrong law is named with a
+probability of at most 6e-4, whatever D, and the right one with 95 % from D = 7.3 on. Else the
+answer is that the data cannot tell, or that no law fits.
 """
 
 import json
@@ -40,12 +43,13 @@ Outcome = Literal["law", "cannot tell", "none fits"]
 
 @dataclass(frozen=True)
 class LawFit:
-    """One law at its estimates: the number of its parameters, the log likelihood of the fitted samples in SI units, the
-    sum of squared whitened residuals over the degrees of freedom with its p-value, criteria, Akaike weight (of AICc),
-    and the log density per sample that it predicts for held-out recordings, with the p-value of their sum of squares.
-    `numerical` is how far a tenth of the tolerance changes the log likelihood; `left` has sentences on what is left of
-    the data that is no noise as stated, by the tests of `torchsoft.sysid.residual_tests`, and `patterned` says whether
-    it follows the motion."""
+    """One law at its estimates: the number of its parameters, the log likelihood of the fitted
+    samples in SI units, the sum of squared whitened residuals over the degrees of freedom with its
+    p-value, criteria, Akaike weight (of AICc), and the log density per sample that it predicts for
+    held-out recordings, with the p-value of their sum of squares. `numerical` is how far a tenth of
+    the tolerance changes the log likelihood; `left` has sentences on what is left of the data that
+    is no noise as stated, by the tests of `torchsoft.sysid.residual_tests`, and `patterned` says
+    whether it follows the motion."""
 
     name: str
     parameters: int
@@ -75,18 +79,20 @@ class LawFit:
 
     @property
     def fits(self) -> bool:
-        """Whether residuals are as large as the noise, those of held-out recordings too, and do not follow the
-        motion."""
+        """Whether residuals are as large as the noise, those of held-out recordings too, and do not
+        follow the motion."""
         return not self.misses
 
 
 @dataclass(frozen=True)
 class Versus:
-    """The best law against another one: logarithms of the likelihood ratios of fitted and of held-out samples, the
-    whitened distance D of the predictions, the inflation c of the variance, E and z of the rule, z of held-out
-    recordings alone, and how far a tenth of the tolerance changes E.
+    """The best law against another one: logarithms of the likelihood ratios of fitted and of
+    held-out samples, the whitened distance D of the predictions, the inflation c of the variance, E
+    and z of the rule, z of held-out recordings alone, and how far a tenth of the tolerance changes
+    E.
 
-    `heldout_per_sample` is the difference of the log densities per held-out sample with its standard error.
+    `heldout_per_sample` is the difference of the log densities per held-out sample with its
+    standard error.
     """
 
     best: str
@@ -106,19 +112,22 @@ class Versus:
         """Why the other law is not refuted, in clauses; empty if it is."""
         a, b, out = f"`{self.best}`", f"`{self.other}`", []
         if self.z_heldout is not None and self.z_heldout <= -APART:
-            out.append(f"held-out recordings speak for {b} and fitted ones for {a}, each by more than noise does")
+            out.append(
+                f"held-out recordings speak for {b} and fitted ones for {a}, each by more than "
+                "noise does"
+            )
         sure = self.evidence - self.numerical
         if sure < EVIDENCE or self.z < APART:
             said = (
-                f"the evidence for {a} over {b} is {self.evidence:.2g} nats ({EVIDENCE:g} are needed), and z = {self.z:.2g} "
-                f"({APART:g} is needed)"
+                f"the evidence for {a} over {b} is {self.evidence:.2g} nats ({EVIDENCE:g} are "
+                f"needed), and z = {self.z:.2g} ({APART:g} is needed)"
             )
             if self.evidence >= EVIDENCE > sure and self.z >= APART:
                 said += f", but the steps of the simulation move that by {self.numerical:.2g}: take a tighter tolerance"
             elif self.distance < 2 * APART:
                 said += (
-                    f"; their predictions differ by {self.distance:.2g} times the noise over all samples together, so that "
-                    "these motions and sensors cannot tell them apart"
+                    f"; their predictions differ by {self.distance:.2g} times the noise over all "
+                    "samples together, so that these motions and sensors cannot tell them apart"
                 )
             out.append(said)
         return out
@@ -137,8 +146,9 @@ class Series:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Laws by how well they explain the recordings, the best one first, and the best against every other; `law` is the
-    one that the data name, if they name one, and `verdict` says it in plain words.
+    """Laws by how well they explain the recordings, the best one first, and the best against every
+    other; `law` is the one that the data name, if they name one, and `verdict` says it in plain
+    words.
     """
 
     outcome: Outcome
@@ -154,7 +164,9 @@ class Comparison:
         for one in self.laws:
             if one.name == name:
                 return one
-        raise KeyError(f"no law `{name}` was compared; there are {', '.join(one.name for one in self.laws)}")
+        raise KeyError(
+            f"no law `{name}` was compared; there are {', '.join(one.name for one in self.laws)}"
+        )
 
     def to_json(self) -> str:
         return json.dumps(finite(asdict(self)), indent=1, allow_nan=False)
@@ -191,12 +203,19 @@ def judged(laws: list[LawFit], against: list[Versus]) -> tuple[Outcome, str | No
         said = f"none of the laws explains these data: the best, `{best.name}`, {best.misses}"
         if ahead:
             said += f"; it is nearer than {listed(ahead)}, but that does not make it right"
-        return "none fits", None, f"{said}. Or the noise is not as it was stated: it is larger, or coloured."
+        return (
+            "none fits",
+            None,
+            f"{said}. Or the noise is not as it was stated: it is larger, or coloured.",
+        )
     if doubts or unsure:
         return "cannot tell", None, "the data cannot tell: " + "; ".join((*doubts, *unsure)) + "."
     said = [f"`{best.name}` made these data"]
     for versus in against:
-        said.append(f"`{versus.other}` is behind by {versus.evidence:.3g} nats, {versus.z:.2g} standard deviations")
+        said.append(
+            f"`{versus.other}` is behind by {versus.evidence:.3g} nats, {versus.z:.2g} standard "
+            "deviations"
+        )
     said += [f"But beware: {sentence}" for sentence in best.left]
     return "law", best.name, ". ".join(said) + "."
 

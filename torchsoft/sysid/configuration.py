@@ -1,4 +1,5 @@
-"""What a TOML file states of an identification: what is known, what is unknown, and how good the sensors are."""
+"""What a TOML file states of an identification: what is known, what is unknown, and how good the
+sensors are."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -14,26 +15,29 @@ from torchsoft.sysid.unknowns import Sensor, Unknown
 from torchsoft.tables import LISTED, Table, from_toml
 
 VOCABULARY = {own: name for name, own in NAMES.items()}
-"""The rig's own names of parameters, by which they are understood too, with those of `Parameters`."""
+"""The rig's own names of parameters, by which they are understood too, with those of
+`Parameters`."""
 
 Name = Annotated[str, Field(min_length=1, max_length=100)]
 File = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
 SURE = 1e-12
-"""Standard deviations [SI], over the value where that is larger than one, below which a number is known: say 0."""
+"""Standard deviations [SI], over the value where that is larger than one, below which a number is
+known: say 0."""
 
 
 def told_apart(sd: float, value: float = 1.0) -> float:
-    """A standard deviation that is zero or can be computed with. Raises `ValueError` for another."""
+    """A standard deviation that is zero or can be computed with. Raises `ValueError` for
+    another."""
     if 0 < sd < (least := SURE * max(abs(value), 1.0)):
         raise ValueError(f"should be 0, or at least {least:g}, but is {sd}")
     return sd
 
 
 class Rest(Table):
-    """A recording that begins at rest, the disc on the lower pad at `scenario.x_C0`, known to `position_sd` [m], and
-    the bracket clear of it."""
+    """A recording that begins at rest, the disc on the lower pad at `scenario.x_C0`, known to
+    `position_sd` [m], and the bracket clear of it."""
 
     kind: Literal["rest"] = "rest"
     position_sd: Annotated[float, AfterValidator(told_apart)] = Field(default=0.0, ge=0, le=0.1)
@@ -52,8 +56,8 @@ class Known(Table):
 
 
 class Moving(Table):
-    """A recording that begins anywhere, in motion or in mid-grasp: its samples of the first `lead` [s] tell where, with
-    what is `given` of coordinates such as "disc.x" and "disc.v_x"."""
+    """A recording that begins anywhere, in motion or in mid-grasp: its samples of the first `lead`
+    [s] tell where, with what is `given` of coordinates such as "disc.x" and "disc.v_x"."""
 
     kind: Literal["moving"] = "moving"
     lead: float = Field(default=LEAD, gt=0, le=10)
@@ -72,7 +76,9 @@ class Missing(Table):
 
     def over(self, other: "Missing") -> dict[str, float]:
         """Those of this table, and of the other where this has none."""
-        both = other.model_dump() | {name: value for name, value in self.model_dump().items() if value is not None}
+        both = other.model_dump() | {
+            name: value for name, value in self.model_dump().items() if value is not None
+        }
         return {name: value for name, value in both.items() if value is not None}
 
 
@@ -83,7 +89,8 @@ class KelvinVoigtPads(Table):
 
 
 class StandardLinearPads(Table):
-    """Pads that are stiffer at first: `E_instant` [Pa] above `pad.E`, which is the relaxed modulus."""
+    """Pads that are stiffer at first: `E_instant` [Pa] above `pad.E`, which is the relaxed
+    modulus."""
 
     kind: Literal["standard_linear_solid"] = "standard_linear_solid"
     E_instant: float = Field(ge=1.0, le=1e13)
@@ -94,7 +101,8 @@ Times = Annotated[tuple[Annotated[float, Field(ge=1e-9, le=1e6)], ...], LISTED]
 
 
 class GeneralisedKelvinPads(Table):
-    """Pads that creep in several times `tau` [s], each by a fraction `J` of the relaxed compliance 1 / `pad.E`."""
+    """Pads that creep in several times `tau` [s], each by a fraction `J` of the relaxed compliance
+    1 / `pad.E`."""
 
     kind: Literal["generalised_kelvin"] = "generalised_kelvin"
     J: Annotated[tuple[Annotated[float, Field(gt=0, le=1)], ...], LISTED]
@@ -103,8 +111,8 @@ class GeneralisedKelvinPads(Table):
 
 
 class PronyPads(Table):
-    """Pads with a relaxation series: `moduli` [Pa] on top of `pad.E`, the relaxed one, that fade in the times `tau`
-    [s]."""
+    """Pads with a relaxation series: `moduli` [Pa] on top of `pad.E`, the relaxed one, that fade in
+    the times `tau` [s]."""
 
     kind: Literal["prony"] = "prony"
     moduli: Annotated[tuple[Annotated[float, Field(ge=1e-6, le=1e13)], ...], LISTED]
@@ -112,13 +120,16 @@ class PronyPads(Table):
     tau_instant: float = Field(default=INSTANT, ge=1e-9, le=1e6)
 
 
-Pads = Annotated[KelvinVoigtPads | StandardLinearPads | GeneralisedKelvinPads | PronyPads, Field(discriminator="kind")]
+Pads = Annotated[
+    KelvinVoigtPads | StandardLinearPads | GeneralisedKelvinPads | PronyPads,
+    Field(discriminator="kind"),
+]
 
 
 class Entry(Table):
-    """One more recording, called `name` or like its file: its columns stand in `file`, or in several `files` next to
-    the configuration, each with times of its own. Without a file it has what is particular about the recording of that
-    name."""
+    """One more recording, called `name` or like its file: its columns stand in `file`, or in
+    several `files` next to the configuration, each with times of its own. Without a file it has
+    what is particular about the recording of that name."""
 
     name: Name | None = None
     file: File | None = None
@@ -132,7 +143,9 @@ class Entry(Table):
         if self.file is not None and self.files:
             raise ValueError("a recording has a `file` or `files`, not both")
         if self.name is None and self.file is None:
-            raise ValueError("a recording needs a `file`, or the `name` of one that is given elsewhere")
+            raise ValueError(
+                "a recording needs a `file`, or the `name` of one that is given elsewhere"
+            )
         return self
 
     @property
@@ -141,8 +154,8 @@ class Entry(Table):
 
 
 class Law(Table):
-    """A competing law: `settings` that differ, such as `contact.friction`, another material of the `pads`, `unknowns`
-    that it has besides or with other bounds, and those that it is `without`."""
+    """A competing law: `settings` that differ, such as `contact.friction`, another material of the
+    `pads`, `unknowns` that it has besides or with other bounds, and those that it is `without`."""
 
     settings: dict[str, Any] = Field(default_factory=dict)
     pads: Pads | None = None
@@ -153,10 +166,11 @@ class Law(Table):
 class Config(Table):
     """An identification as a TOML file states it.
 
-    `settings` are known numbers, by the groups and names of `Parameters`; `unknowns` and `sensors` are tables by the
-    dotted names of parameters and by channels; `heldout` names recordings that are predicted and not fitted, `ignore`
-    columns that are left out, and `acknowledged` findings that are no mistakes. `missing` and `start` hold for all
-    recordings that say nothing else. `compare` has competing laws by name.
+    `settings` are known numbers, by the groups and names of `Parameters`; `unknowns` and `sensors`
+    are tables by the dotted names of parameters and by channels; `heldout` names recordings that
+    are predicted and not fitted, `ignore` columns that are left out, and `acknowledged` findings
+    that are no mistakes. `missing` and `start` hold for all recordings that say nothing else.
+    `compare` has competing laws by name.
     """
 
     unknowns: dict[str, Unknown]
@@ -175,7 +189,9 @@ class Config(Table):
     @model_validator(mode="after")
     def _laws_have_likelihoods(self) -> "Config":
         if self.compare and self.fit.loss != "linear":
-            raise ValueError(f"compare needs likelihoods: fit.loss must be 'linear', not '{self.fit.loss}'")
+            raise ValueError(
+                f"compare needs likelihoods: fit.loss must be 'linear', not '{self.fit.loss}'"
+            )
         known = {understood(name) for name in self.unknowns}
         for law, one in self.compare.items():
             if strange := [name for name in one.without if understood(name) not in known]:
@@ -188,14 +204,16 @@ class Config(Table):
         for i, entry in enumerate(self.recordings):
             if strange := [name for name, _ in flattened(entry.settings) if name in unknown]:
                 raise ValueError(
-                    f"recordings.{i}.settings: {strange[0]} is unknown, so that no recording can state it: leave it out there, "
+                    f"recordings.{i}.settings: {strange[0]} is unknown, so that no recording can "
+                    "state it: leave it out there, "
                     f'and say by unknowns."{unknown[strange[0]]}".nominal where the search starts'
                 )
         return self
 
 
 def read_config(path: str | Path) -> Config:
-    """Raises `ValueError` naming the file and the field, `OSError` for a file that cannot be read."""
+    """Raises `ValueError` naming the file and the field, `OSError` for a file that cannot be
+    read."""
     return from_toml(path, Config.model_validate)
 
 
@@ -205,14 +223,16 @@ def understood(name: str) -> str:
 
 
 def in_one_vocabulary(unknowns: Mapping[str, Unknown]) -> dict[str, Unknown]:
-    """Unknowns by their names among `Parameters`, where they have one. Raises `ValueError` for one that is there by
-    both."""
+    """Unknowns by their names among `Parameters`, where they have one. Raises `ValueError` for one
+    that is there by both."""
     out: dict[str, Unknown] = {}
     for name, one in unknowns.items():
         if understood(name) in out:
             raise ValueError(f"unknowns.{name} is there twice: it is {understood(name)} too")
         ratio = one.ratio_to
-        out[understood(name)] = one.model_copy(update={"ratio_to": understood(ratio)}) if ratio is not None else one
+        out[understood(name)] = (
+            one.model_copy(update={"ratio_to": understood(ratio)}) if ratio is not None else one
+        )
     return out
 
 

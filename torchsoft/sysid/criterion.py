@@ -1,4 +1,5 @@
-"""Criteria of optimal design, a ranking of recordings that could be made next, and the bounds of a designed motion."""
+"""Criteria of optimal design, a ranking of recordings that could be made next, and the bounds of a
+designed motion."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -26,12 +27,13 @@ SHARPNESS = 12.0
 
 @dataclass(frozen=True)
 class Criterion:
-    """One number for a covariance C (s, s) of parameters' relative errors: the logarithm of a standard deviation, the
-    smaller the better.
+    """One number for a covariance C (s, s) of parameters' relative errors: the logarithm of a
+    standard deviation, the smaller the better.
 
-    "D" is the mean logarithm along the axes of the ellipsoid of errors, its volume; "A" the root mean square of the
-    standard deviations over `targets` (s,), 1 where there are none; "worst" the largest of them, smoothed. With one
-    parameter the three are the same, and are called c-optimality. Raises `ValueError`.
+    "D" is the mean logarithm along the axes of the ellipsoid of errors, its volume; "A" the root
+    mean square of the standard deviations over `targets` (s,), 1 where there are none; "worst" the
+    largest of them, smoothed. With one parameter the three are the same, and are called
+    c-optimality. Raises `ValueError`.
     """
 
     optimality: Optimality = "D"
@@ -39,9 +41,16 @@ class Criterion:
 
     def __post_init__(self) -> None:
         if self.optimality not in get_args(Optimality):
-            raise ValueError(f"`optimality` must be one of {', '.join(get_args(Optimality))}, not {self.optimality!r}")
-        if self.targets is not None and not (np.isfinite(self.targets).all() and np.min(self.targets) > 0):
-            raise ValueError(f"`targets` must be positive standard deviations, but are {self.targets}")
+            raise ValueError(
+                f"`optimality` must be one of {', '.join(get_args(Optimality))}, not "
+                f"{self.optimality!r}"
+            )
+        if self.targets is not None and not (
+            np.isfinite(self.targets).all() and np.min(self.targets) > 0
+        ):
+            raise ValueError(
+                f"`targets` must be positive standard deviations, but are {self.targets}"
+            )
 
     def __call__(self, C: Array) -> tuple[float, Array]:
         """Its value and derivative (s, s) by C."""
@@ -49,7 +58,9 @@ class Criterion:
             return 0.5 * float(np.linalg.slogdet(C)[1]) / len(C), 0.5 * np.linalg.inv(C) / len(C)
         scaled = np.diag(C) / np.square(1.0 if self.targets is None else self.targets)
         if self.optimality == "A":
-            return 0.5 * float(np.log(scaled.mean())), np.diag(0.5 * scaled / np.diag(C) / scaled.sum())
+            return 0.5 * float(np.log(scaled.mean())), np.diag(
+                0.5 * scaled / np.diag(C) / scaled.sum()
+            )
         logs = 0.5 * np.log(scaled)
         parts = np.exp(SHARPNESS * (logs - logs.max()))
         value = float(logs.max() + np.log(parts.sum()) / SHARPNESS)
@@ -58,36 +69,50 @@ class Criterion:
     def check(self, names: Sequence[str]) -> None:
         """Raises `ValueError` unless there is a target for every parameter, or none."""
         if self.targets is not None and len(self.targets) != len(names):
-            raise ValueError(f"`targets` has {len(self.targets)} standard deviations for the {len(names)} of {names}")
+            raise ValueError(
+                f"`targets` has {len(self.targets)} standard deviations for the {len(names)} of "
+                f"{names}"
+            )
 
 
 VOLUME = Criterion()
 
 
-def chosen(problem: Problem, x: Array, names: Sequence[str] | None) -> tuple[tuple[str, ...], Array]:
-    """The parameters `names`, by default every free one that all recordings share, and what their relative errors (s,)
-    are of those of the coordinates x (n,): a matrix (s, n). Raises `ValueError` for others."""
+def chosen(
+    problem: Problem, x: Array, names: Sequence[str] | None
+) -> tuple[tuple[str, ...], Array]:
+    """The parameters `names`, by default every free one that all recordings share, and what their
+    relative errors (s,) are of those of the coordinates x (n,): a matrix (s, n). Raises
+    `ValueError` for others."""
     c, one = problem.coordinates, problem.recordings[0]
     values = c.values(x, one.name, one.parameters)
     rows = c.jacobian(x, one.name, values) * c.free / np.array([[values[name]] for name in c.names])
     own = {a.name for a in c.all if a.recording is not None}
-    known = [name for name, row in zip(c.names, rows) if row.any() and name not in own and not name.startswith(PREFIX)]
+    known = [
+        name
+        for name, row in zip(c.names, rows)
+        if row.any() and name not in own and not name.startswith(PREFIX)
+    ]
     wanted = tuple(known if names is None else names)
     if not wanted or len(set(wanted)) < len(wanted) or not set(wanted) <= set(known):
-        raise ValueError(f"`names` must be some of the parameters {', '.join(known)}, each once, but is {list(wanted)}")
+        raise ValueError(
+            f"`names` must be some of the parameters {', '.join(known)}, each once, but is "
+            f"{list(wanted)}"
+        )
     return wanted, np.stack([rows[c.names.index(name)] for name in wanted])
 
 
 def deviations(names: Sequence[str], T: Array, C: Array) -> dict[str, float]:
-    """Relative standard deviations of parameters, T (s, n) being what they are of coordinates with the covariance C."""
+    """Relative standard deviations of parameters, T (s, n) being what they are of coordinates with
+    the covariance C."""
     return dict(zip(names, np.sqrt(np.diag(T @ C @ T.T)).tolist()))
 
 
 @dataclass(frozen=True)
 class Outlook:
-    """A recording that could be made: its duration [s], the relative standard deviations that parameters have without
-    it and would have with it, and the criterion's gain, a logarithm of standard deviations. `lost` says why it cannot
-    be made."""
+    """A recording that could be made: its duration [s], the relative standard deviations that
+    parameters have without it and would have with it, and the criterion's gain, a logarithm of
+    standard deviations. `lost` says why it cannot be made."""
 
     name: str
     seconds: float
@@ -98,22 +123,29 @@ class Outlook:
 
 
 def next_recording(
-    problem: Problem, x: Array, candidates: Sequence[Recording], *, names: Sequence[str] | None = None,
-    criterion: Criterion = VOLUME, per_second: bool = False, rtol: float = 1e-4, workers: int = 1,
+    problem: Problem, x: Array, candidates: Sequence[Recording], *,
+    names: Sequence[str] | None = None, criterion: Criterion = VOLUME, per_second: bool = False,
+    rtol: float = 1e-4, workers: int = 1,
 ) -> list[Outlook]:  # fmt: skip
-    """What should be recorded after the recordings of `problem`, whose coordinates are x (n,), say at the end of a fit?
+    """What should be recorded after the recordings of `problem`, whose coordinates are x (n,), say
+    at the end of a fit?
 
-    Every candidate's Fisher matrix is added to theirs; of its samples only the times count. The best comes first, by
-    what it takes off the `criterion` of the parameters `names`, or by that per second. A prediction: it holds as far as
-    the model does, and for small errors. Raises `ValueError` for candidates that do not fit the problem.
+    Every candidate's Fisher matrix is added to theirs; of its samples only the times count. The
+    best comes first, by what it takes off the `criterion` of the parameters `names`, or by that per
+    second. A prediction: it holds as far as the model does, and for small errors. Raises
+    `ValueError` for candidates that do not fit the problem.
     """
     if not candidates:
         raise ValueError("there is no candidate to rank")
-    both = Problem([*problem.recordings, *candidates], problem.sensors, problem.unknowns, problem.noise)
+    both = Problem(
+        [*problem.recordings, *candidates], problem.sensors, problem.unknowns, problem.noise
+    )
     known = dict(zip(problem.coordinates.labels, x))
     c, x = (
         both.coordinates,
-        np.array([known.get(a.label, s) for a, s in zip(both.coordinates.all, both.coordinates.start)]),
+        np.array(
+            [known.get(a.label, s) for a, s in zip(both.coordinates.all, both.coordinates.start)]
+        ),
     )
     names, T = chosen(both, x, names)
     criterion.check(names)
@@ -137,7 +169,9 @@ def next_recording(
     for one in candidates:
         new = both.residuals(runner, x, [one.name], rtol, c.free)
         if new.lost:
-            out.append(Outlook(one.name, one.duration, before, before, 0.0, new.lost[one.name].reason))
+            out.append(
+                Outlook(one.name, one.duration, before, before, 0.0, new.lost[one.name].reason)
+            )
             continue
         J = np.concatenate((have.J[: len(have.J) - priors], new.J))
         after = covariance(J, [*problem.names, one.name])
@@ -154,10 +188,11 @@ PEAK = 35 / 16
 
 
 class Bounds(Table):
-    """What a signal of the reference may do: values from `low` to `high` [its unit], at `speed` [its unit/s] at most.
+    """What a signal of the reference may do: values from `low` to `high` [its unit], at `speed`
+    [its unit/s] at most.
 
-    Knots later than `after` [s] are free. Their times are free too if `shortest` [s] is given, the least time between
-    two.
+    Knots later than `after` [s] are free. Their times are free too if `shortest` [s] is given, the
+    least time between two.
     """
 
     low: float
@@ -180,16 +215,19 @@ def profile(reference: Reference, name: str) -> Profile:
     except KeyError:
         found = None
     if type(found) is not Profile:
-        raise ValueError(f"the reference has no Profile called `{name}`: only knots of profiles can be designed")
+        raise ValueError(
+            f"the reference has no Profile called `{name}`: only knots of profiles can be designed"
+        )
     return found
 
 
 class Moves:
-    """The variables z (n,) of a motion: values, and times where they are free, of the free knots of some signals, which
-    end by `end` [s]; each over a unit of its own, the way or the time between two knots that are as far apart as speed
-    allows.
+    """The variables z (n,) of a motion: values, and times where they are free, of the free knots of
+    some signals, which end by `end` [s]; each over a unit of its own, the way or the time between
+    two knots that are as far apart as speed allows.
 
-    Raises `ValueError` for signals without free knots, and where the motion given is more than the bounds leave to it.
+    Raises `ValueError` for signals without free knots, and where the motion given is more than the
+    bounds leave to it.
     """
 
     def __init__(self, reference: Reference, bounds: Mapping[str, Bounds], end: float) -> None:
@@ -206,7 +244,8 @@ class Moves:
                 raise ValueError(f"`{name}` has no knot after {one.after:g} s that could move")
             if first == 0 or times[-1] > end * (1 + 1e-9):
                 raise ValueError(
-                    f"`{name}` must have a knot at or before {one.after:g} s that stays, and none after {end:g} s"
+                    f"`{name}` must have a knot at or before {one.after:g} s that stays, and none "
+                    f"after {end:g} s"
                 )
             self.knots[name] = times, values, first
             spans = np.diff(times[first - 1 :])
@@ -217,13 +256,20 @@ class Moves:
                 z.append(times[first:])
         self.unit, flat = np.concatenate(units), np.concatenate(z)
         self.n, origin = len(flat), self._excess(np.zeros(len(flat)))
-        self.A = np.stack([self._excess(e) - origin for e in np.eye(self.n)], -1)  # excess is affine in z
+        self.A = np.stack(
+            [self._excess(e) - origin for e in np.eye(self.n)], -1
+        )  # excess is affine in z
         self.b = -origin
         self.start = self.nearest(flat / self.unit)
 
     def split(self, z: Any) -> dict[str, tuple[Any, Any]]:
-        """Times and values of the free knots by signal, of z over its units, as arrays or tensors."""
-        physical, out, at = z * (torch.from_numpy(self.unit) if isinstance(z, Tensor) else self.unit), {}, 0
+        """Times and values of the free knots by signal, of z over its units, as arrays or
+        tensors."""
+        physical, out, at = (
+            z * (torch.from_numpy(self.unit) if isinstance(z, Tensor) else self.unit),
+            {},
+            0,
+        )
         for name, (times, _, first) in self.knots.items():
             count = len(times) - first
             values, at = physical[at : at + count], at + count
@@ -246,7 +292,8 @@ class Moves:
         return Reference(**signals)
 
     def _excess(self, z: Array) -> Array:
-        """What must not be positive: beyond the bounds, faster than allowed, closer than `shortest`, too late."""
+        """What must not be positive: beyond the bounds, faster than allowed, closer than
+        `shortest`, too late."""
         rows = []
         for name, (times, values) in self.split(z).items():
             one, (known_times, known_values, first) = self.bounds[name], self.knots[name]
@@ -259,18 +306,23 @@ class Moves:
         return np.concatenate(rows)
 
     def nearest(self, z: Array) -> Array:
-        """The motion within the bounds that is nearest to z, by the sum of what variables move. Raises `ValueError`
-        where there is none."""
+        """The motion within the bounds that is nearest to z, by the sum of what variables move.
+        Raises `ValueError` where there is none."""
         if (self.A @ z <= self.b + 1e-9 * np.abs(self.A).max(1)).all():
             return z
         I, scale = np.eye(self.n), np.abs(self.A).max(1)
-        A = np.block([[self.A / scale[:, None], np.zeros((len(self.A), self.n))], [I, -I], [-I, -I]])
+        A = np.block(
+            [[self.A / scale[:, None], np.zeros((len(self.A), self.n))], [I, -I], [-I, -I]]
+        )
         out: Any = linprog(
-            np.append(np.zeros(self.n), np.ones(self.n)), A_ub=A, b_ub=np.concatenate((self.b / scale, z, -z)),
+            np.append(np.zeros(self.n), np.ones(self.n)), A_ub=A,
+            b_ub=np.concatenate((self.b / scale, z, -z)),
             bounds=[(None, None)] * self.n + [(0, None)] * self.n, method="highs",
         )  # fmt: skip
         if out.status != 0:
-            raise ValueError("no motion of these knots keeps within the bounds: allow more travel, speed or time")
+            raise ValueError(
+                "no motion of these knots keeps within the bounds: allow more travel, speed or time"
+            )
         return np.asarray(out.x[: self.n], np.float64)
 
     def active(self, z: Array) -> list[str]:
@@ -279,7 +331,9 @@ class Moves:
         for name, (times, values) in self.split(z).items():
             one, (known_times, known_values, first) = self.bounds[name], self.knots[name]
             way = np.diff(np.append(known_values[first - 1], values))
-            span: Array = np.ediff1d(np.append(known_times[first - 1], times)).astype(np.float64) * (one.speed / PEAK)
+            span: Array = np.ediff1d(np.append(known_times[first - 1], times)).astype(
+                np.float64
+            ) * (one.speed / PEAK)
             near = 1e-3 * (one.high - one.low)
             for what, count in (
                 (f"low = {one.low:g}", int(np.sum(values < one.low + near))),

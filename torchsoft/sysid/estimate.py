@@ -20,8 +20,8 @@ from torchsoft.tables import Number
 CONFIDENCE = 0.95
 
 IDENTIFIABLE = 0.5
-"""Standard deviation of a coordinate [1] above which it counts as not identifiable: its interval spans a factor of
-seven."""
+"""Standard deviation of a coordinate [1] above which it counts as not identifiable: its interval
+spans a factor of seven."""
 
 Seen = Annotated[bool, Field(alias="seen")]
 """Called `seen` in files, since the first version of them."""
@@ -29,10 +29,11 @@ Seen = Annotated[bool, Field(alias="seen")]
 
 @dataclass(frozen=True)
 class Estimate:
-    """One parameter (or a coordinate of a start, or something wrong with a sensor) in one recording or in all: value,
-    95 % interval, standard deviation over the value. One that is not identifiable has neither value nor interval, but
-    `last`, where the search happened to end. `kind` is "parameter", "start", or what is wrong with the sensor, `start`
-    where the search began, and `step_bias_sd` what the steps of the simulation shift the estimate by, in standard
+    """One parameter (or a coordinate of a start, or something wrong with a sensor) in one recording
+    or in all: value, 95 % interval, standard deviation over the value. One that is not identifiable
+    has neither value nor interval, but `last`, where the search happened to end. `kind` is
+    "parameter", "start", or what is wrong with the sensor, `start` where the search began, and
+    `step_bias_sd` what the steps of the simulation shift the estimate by, in standard
     deviations."""
 
     name: str
@@ -57,8 +58,8 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Direction:
-    """An eigenvector of the Fisher matrix in the coordinates: its standard deviation and its largest components by
-    label."""
+    """An eigenvector of the Fisher matrix in the coordinates: its standard deviation and its
+    largest components by label."""
 
     sd: float
     identifiable: Seen
@@ -67,8 +68,9 @@ class Direction:
 
 @dataclass(frozen=True)
 class ChannelResiduals:
-    """Residuals of one channel in one recording, over the noise and whitened, without what saturation has changed:
-    their rms, the first autocorrelation, and the Ljung-Box p-value of their whiteness."""
+    """Residuals of one channel in one recording, over the noise and whitened, without what
+    saturation has changed: their rms, the first autocorrelation, and the Ljung-Box p-value of their
+    whiteness."""
 
     recording: str
     channel: str
@@ -79,8 +81,9 @@ class ChannelResiduals:
 
 
 class Quantity(NamedTuple):
-    """Something that is estimated: its value, that at the start, and how it moves with the coordinates (n,): its
-    logarithm, or the value over `size`. `places` are the coordinates that move it."""
+    """Something that is estimated: its value, that at the start, and how it moves with the
+    coordinates (n,): its logarithm, or the value over `size`. `places` are the coordinates that
+    move it."""
 
     name: str
     kind: str
@@ -107,7 +110,8 @@ class Quantity(NamedTuple):
 
 
 def quantities(problem: Problem, x: Array, free: NDArray[np.bool_]) -> Iterator[Quantity]:
-    """Parameters in physical units, then coordinates of starts, and what is wrong with sensors, at x (n,)."""
+    """Parameters in physical units, then coordinates of starts, and what is wrong with sensors, at
+    x (n,)."""
     c = problem.coordinates
     for k, recording in enumerate(problem.recordings):
         values, before = problem.values(x, k), problem.values(c.start, k)
@@ -123,28 +127,40 @@ def quantities(problem: Problem, x: Array, free: NDArray[np.bool_]) -> Iterator[
                 size = first.high - first.low if alone else abs(value)
             declared = recording.rig.quantity(name)
             yield Quantity(
-                name, "parameter", recording.name if own else None, declared.unit if declared else "", value,
-                first.nominal if alone else before[name], size, chain[row] / (value if size is None else size), places,
+                name, "parameter", recording.name if own else None,
+                declared.unit if declared else "", value, first.nominal if alone else before[name],
+                size, chain[row] / (value if size is None else size), places,
                 first.prior if alone else None,
             )  # fmt: skip
     for i, one in enumerate(c.all):
         if one.kind != "parameter" and free[i]:
-            name, where, unit = replace(one, recording=None).label, one.recording, nuisance_unit(one, problem)
+            name, where, unit = (
+                replace(one, recording=None).label,
+                one.recording,
+                nuisance_unit(one, problem),
+            )
             slope, size, value = np.eye(len(c))[i], float(one.slope(x[i])), one.to_value(x[i])
-            yield Quantity(name, one.kind, where, unit, value, one.nominal, size, slope, [i], one.prior)
+            yield Quantity(
+                name, one.kind, where, unit, value, one.nominal, size, slope, [i], one.prior
+            )
 
 
-def estimates(problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shift: Array) -> list[Estimate]:
-    """Everything that was estimated, in physical units; C (n, n) and shift (n,) are of all coordinates."""
+def estimates(
+    problem: Problem, x: Array, free: NDArray[np.bool_], C: Array, shift: Array
+) -> list[Estimate]:
+    """Everything that was estimated, in physical units; C (n, n) and shift (n,) are of all
+    coordinates."""
     edge, out = free & problem.coordinates.at_bound(x), []
     for one in quantities(problem, x, free):
         sd = float(np.sqrt(max(one.slope @ C @ one.slope, 0.0)))
-        known = (one.value, one.interval(sd)) if (identifiable := sd < IDENTIFIABLE) else (None, None)
+        known = (
+            (one.value, one.interval(sd)) if (identifiable := sd < IDENTIFIABLE) else (None, None)
+        )
         relative = sd if one.size is None else sd * one.size / max(abs(one.value), 1e-300)
         bias = float(one.slope @ shift) / sd if sd > 0 else 0.0
         found = Estimate(
-            one.name, one.unit, one.recording, *known, relative, one.value, identifiable, bool(edge[one.places].any()), bias,
-            one.kind, one.start, one.prior,
+            one.name, one.unit, one.recording, *known, relative, one.value, identifiable,
+            bool(edge[one.places].any()), bias, one.kind, one.start, one.prior,
         )  # fmt: skip
         out.append(found)
     return out
@@ -154,9 +170,24 @@ def nuisance_unit(one: Coordinate, problem: Problem) -> str:
     """Unit of a start's coordinate, or of what is wrong with a sensor."""
     if one.kind == "start":
         axis = one.name.split(".")[2]
-        return "rad/s" if axis == "v_theta" else "m/s" if axis.startswith("v_") else "rad" if axis == "theta" else "m"
+        return (
+            "rad/s"
+            if axis == "v_theta"
+            else "m/s"
+            if axis.startswith("v_")
+            else "rad"
+            if axis == "theta"
+            else "m"
+        )
     own = problem.unit(one.name)
-    units = {"bias": own, "drift": f"{own}/s", "delay": "s", "gain": "1", "misalignment": "rad", "inertia": "kg"}
+    units = {
+        "bias": own,
+        "drift": f"{own}/s",
+        "delay": "s",
+        "gain": "1",
+        "misalignment": "rad",
+        "inertia": "kg",
+    }
     return units[one.kind]
 
 
@@ -185,8 +216,8 @@ def split(problem: Problem, r: Array, which: list[str]) -> dict[tuple[str, str],
 
 
 def nrmse(problem: Problem, r: Array, which: list[str]) -> dict[str, dict[str, float]]:
-    """RMS residual over the range of what was measured, by recording and channel, without what saturation has
-    changed."""
+    """RMS residual over the range of what was measured, by recording and channel, without what
+    saturation has changed."""
     out: dict[str, dict[str, float]] = {name: {} for name in which}
     measured = {recording.name: recording.samples for recording in problem.recordings}
     for part in parts(problem.with_noise({}), r, which):
@@ -196,7 +227,9 @@ def nrmse(problem: Problem, r: Array, which: list[str]) -> dict[str, dict[str, f
     return out
 
 
-def residual_channels(problem: Problem, residuals: Residuals, which: list[str]) -> list[ChannelResiduals]:
+def residual_channels(
+    problem: Problem, residuals: Residuals, which: list[str]
+) -> list[ChannelResiduals]:
     orders = {channel: noise.order for channel, noise in problem.noise.items()}
     return [
         ChannelResiduals(
@@ -215,9 +248,10 @@ def residual_channels(problem: Problem, residuals: Residuals, which: list[str]) 
 
 @dataclass(frozen=True)
 class Contribution:
-    """What one recording told about the estimates, or what the priors did (`source` is None then): its share of the
-    weight in each, by label, all sources together being 1, and how many times larger the standard deviation would be
-    without it; none where the others do not determine the estimate."""
+    """What one recording told about the estimates, or what the priors did (`source` is None then):
+    its share of the weight in each, by label, all sources together being 1, and how many times
+    larger the standard deviation would be without it; none where the others do not determine the
+    estimate."""
 
     source: str | None
     rows: int
@@ -228,8 +262,8 @@ class Contribution:
 def contributions(
     problem: Problem, x: Array, free: NDArray[np.bool_], J: Array, fitted: Sequence[str]
 ) -> list[Contribution]:
-    """Of the recordings `fitted`, whose rows the whitened Jacobian J (m, n) at x (n,) has, before those of the
-    priors."""
+    """Of the recordings `fitted`, whose rows the whitened Jacobian J (m, n) at x (n,) has, before
+    those of the priors."""
     rows, at = dict[str | None, slice](), 0
     for (name, _), part in split(problem, J, list(fitted)).items():
         begin = rows[name].start if name in rows else at

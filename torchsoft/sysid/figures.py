@@ -1,5 +1,5 @@
-"""Pictures of an identification: estimates, what recordings told, the Fisher spectrum, correlations, profiles,
-residuals."""
+"""Pictures of an identification: estimates, what recordings told, the Fisher spectrum,
+correlations, profiles, residuals."""
 
 from collections.abc import Sequence
 from textwrap import fill, shorten
@@ -9,7 +9,14 @@ import numpy as np
 import torch
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator, PercentFormatter
+from matplotlib.ticker import (
+    FixedLocator,
+    FuncFormatter,
+    MaxNLocator,
+    NullFormatter,
+    NullLocator,
+    PercentFormatter,
+)
 
 from torchsoft.plot.figures import ACTUAL, DESIRED, OTHER, STYLE
 from torchsoft.sysid.comparison import Comparison, Series, Versus
@@ -42,8 +49,8 @@ REST = "#bbbbbb"
 
 
 class Trace(NamedTuple):
-    """One channel of one recording: its unit, times (k,) [s], samples measured and predicted (k,), and residuals over
-    the noise (k,), as they are and whitened."""
+    """One channel of one recording: its unit, times (k,) [s], samples measured and predicted (k,),
+    and residuals over the noise (k,), as they are and whitened."""
 
     recording: str
     channel: str
@@ -68,7 +75,8 @@ def direction_name(d: Direction) -> str:
 
 
 def literal(text: str, width: int = 200) -> str:
-    """Text as matplotlib must be given it, lest dollars begin a formula, in lines of `width` characters at most."""
+    """Text as matplotlib must be given it, lest dollars begin a formula, in lines of `width`
+    characters at most."""
     return fill(plain(text), width).replace("$", r"\$")
 
 
@@ -85,7 +93,8 @@ def estimates_figure(estimates: Sequence[Estimate]) -> Figure | None:
     for row, (e, s) in enumerate(rows):
         if e.value is None or e.ci95 is None:
             axes.axhspan(row - 0.32, row + 0.32, color="#f6e3d6", lw=0)
-            axes.text(0.5, row, "not identifiable", transform=axes.get_yaxis_transform(), ha="center", va="center",
+            axes.text(0.5, row, "not identifiable", transform=axes.get_yaxis_transform(),
+                ha="center", va="center",
                       fontsize=9, color="#a34400")  # fmt: skip
             continue
         low, value, high = (max(v / s, 1e-6) for v in (e.ci95[0], e.value, e.ci95[1]))
@@ -99,7 +108,11 @@ def estimates_figure(estimates: Sequence[Estimate]) -> Figure | None:
     axes.set(xlim=(low, high), ylim=(len(rows) - 0.5, -0.5))
     figure.supxlabel("estimate over start value, 95 % interval", fontsize=10)
     axes.set_yticks(range(len(rows)), [literal(e.label, NAME) for e, _ in rows])
-    ticks = [v for v in (0.01, 0.03, 0.1, 0.2, 0.33, 0.5, 0.7, 1, 1.5, 2, 3, 5, 10, 30, 100) if low <= v <= high]
+    ticks = [
+        v
+        for v in (0.01, 0.03, 0.1, 0.2, 0.33, 0.5, 0.7, 1, 1.5, 2, 3, 5, 10, 30, 100)
+        if low <= v <= high
+    ]
     while len(ticks) > 7:
         ticks = [v for i, v in enumerate(ticks) if v == 1 or (i - ticks.index(1)) % 2 == 0]
     axes.xaxis.set_major_locator(FixedLocator(ticks))
@@ -125,7 +138,8 @@ def correlation_figure(result: IdentificationResult) -> Figure:
     for i in range(n if n <= 8 else 0):
         for j in range(n):
             dark = abs(C[i, j]) > 0.6
-            axes.text(j, i, f"{C[i, j]:.2f}".replace("-", "−"), ha="center", va="center", fontsize=8 if n <= 6 else 6.5,
+            axes.text(j, i, f"{C[i, j]:.2f}".replace("-", "−"), ha="center", va="center",
+                fontsize=8 if n <= 6 else 6.5,
                       color="white" if dark else "#1d2329")  # fmt: skip
     figure.colorbar(image, ax=axes, shrink=0.75, ticks=[-1, 0, 1])
     return figure
@@ -133,20 +147,25 @@ def correlation_figure(result: IdentificationResult) -> Figure:
 
 @rc_context(STYLE)
 def spectrum_figure(result: IdentificationResult) -> Figure:
-    """Standard deviation along each eigenvector of the Fisher matrix, its name above its bar; orange: not
-    identifiable."""
+    """Standard deviation along each eigenvector of the Fisher matrix, its name above its bar;
+    orange: not identifiable."""
     n = len(result.directions)
     figure = Figure(figsize=(WIDTH, 1.0 + 0.5 * n), layout="constrained")
     axes = figure.subplots()
     sds = [d.sd for d in result.directions]
-    low, high = 10 ** np.floor(np.log10(min(*sds, 0.1))), 10 ** np.ceil(np.log10(max(*sds, 2 * IDENTIFIABLE)))
+    low, high = (
+        10 ** np.floor(np.log10(min(*sds, 0.1))),
+        10 ** np.ceil(np.log10(max(*sds, 2 * IDENTIFIABLE))),
+    )
     for row, d in enumerate(result.directions):
         axes.barh(row + 0.18, d.sd, height=0.3, left=0, color=ACTUAL if d.identifiable else OTHER)
         text = literal(shorten(direction_name(d), 60, placeholder=" …")) + (
             "" if d.identifiable else ": not identifiable"
         )
-        axes.text(0.01, row - 0.17, text, transform=axes.get_yaxis_transform(), va="center", fontsize=9,
-                  color="#1d2329" if d.identifiable else "#a34400", bbox={"fc": "white", "ec": "none", "pad": 0.8})  # fmt: skip
+        axes.text(0.01, row - 0.17, text, transform=axes.get_yaxis_transform(), va="center",
+            fontsize=9,
+                  color="#1d2329" if d.identifiable else "#a34400",
+                  bbox={"fc": "white", "ec": "none", "pad": 0.8})  # fmt: skip
     axes.axvline(IDENTIFIABLE, color="#1d2329", lw=1, ls=(0, (4, 2)))
     axes.set_xscale("log")
     axes.set(
@@ -163,18 +182,24 @@ def spectrum_figure(result: IdentificationResult) -> Figure:
 
 @rc_context(STYLE)
 def contributions_figure(result: IdentificationResult) -> Figure | None:
-    """Weight of every recording, and of the priors, in what is identifiable; None where there is only one source."""
+    """Weight of every recording, and of the priors, in what is identifiable; None where there is
+    only one source."""
     labels = [e.label for e in result.estimates if e.identifiable and e.kind == "parameter"]
     sources = result.contributions
     if len(sources) < 2 or not labels:
         return None
     named = [one for one in sources if one.source is not None][: len(SOURCES)]
-    shares = [(one.source or "", SOURCES[i], [one.shares[label] for label in labels]) for i, one in enumerate(named)]
+    shares = [
+        (one.source or "", SOURCES[i], [one.shares[label] for label in labels])
+        for i, one in enumerate(named)
+    ]
     rest = [one for one in sources if one not in named]
     if rest:
         name = "priors" if rest[0].source is None else "the others"
         shares.append((name, REST, [sum(one.shares[label] for one in rest) for label in labels]))
-    figure = Figure(figsize=(WIDTH, 0.8 + 0.42 * len(labels) + 0.2 * len(shares)), layout="constrained")
+    figure = Figure(
+        figsize=(WIDTH, 0.8 + 0.42 * len(labels) + 0.2 * len(shares)), layout="constrained"
+    )
     axes, left = figure.subplots(), np.zeros(len(labels))
     for name, colour, part in shares:
         label = f" {literal(name, 60)}"  # matplotlib does not show those that begin with _
@@ -192,7 +217,8 @@ def contributions_figure(result: IdentificationResult) -> Figure | None:
 
 @rc_context(STYLE)
 def profile_figure(profile: Profile, unit: str) -> Figure:
-    """Rise of the misfit away from the optimum, the others fitted again, beside the parabola of the covariance."""
+    """Rise of the misfit away from the optimum, the others fitted again, beside the parabola of the
+    covariance."""
     figure = Figure(figsize=(WIDTH, 2.5), layout="constrained")
     axes, values, best = figure.subplots(), np.array(profile.values), profile.best
     low, high = profile.ci95
@@ -222,16 +248,21 @@ def profile_figure(profile: Profile, unit: str) -> Figure:
 
 
 @rc_context(STYLE)
-def trace_figure(trace: Trace, channel: ChannelResiduals | None, noise: Autoregression | None = None) -> Figure:
-    """Measured and predicted, residuals over the noise, and the autocorrelation of those that are to be white, with its
-    band; where the noise is coloured, that before and that of its model too."""
+def trace_figure(
+    trace: Trace, channel: ChannelResiduals | None, noise: Autoregression | None = None
+) -> Figure:
+    """Measured and predicted, residuals over the noise, and the autocorrelation of those that are
+    to be white, with its band; where the noise is coloured, that before and that of its model
+    too."""
     shown, scale = SHOWN.get(trace.unit, (trace.unit, 1.0))
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     data, residual, correlation = figure.subplots(3, 1, height_ratios=(2.1, 1, 1))
     data.plot(trace.t, scale * trace.measured, ".", color="#999999", ms=3.5, label="measured")
     data.plot(trace.t, scale * trace.predicted, color=ACTUAL, lw=1.1, label="predicted")
     data.set_title(literal(f"{trace.channel} [{shown}]" if shown else trace.channel))
-    data.legend(loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=2, handlelength=1.2, borderpad=0.2)
+    data.legend(
+        loc="lower right", bbox_to_anchor=(1.0, 0.97), ncols=2, handlelength=1.2, borderpad=0.2
+    )
     data.tick_params(labelbottom=False)
     rms, r = float(np.sqrt(np.mean(trace.residual**2))), trace.residual
     residual.axhspan(-1.96, 1.96, color="#e8f1f7", lw=0)
@@ -254,7 +285,9 @@ def trace_figure(trace: Trace, channel: ChannelResiduals | None, noise: Autoregr
         correlation.plot(lags, before, "o", color=OTHER, ms=3)
         most = max(most, float(np.abs(before).max(initial=0.0)))
         white = f"; orange: before order {noise.order} was taken out"
-    correlation.set_title(f"autocorrelation{'' if noise is not None else ' of the residual'}{white}")
+    correlation.set_title(
+        f"autocorrelation{'' if noise is not None else ' of the residual'}{white}"
+    )
     correlation.set(xlabel="lag [samples]", xlim=(0.3, LAGS + 0.7))
     correlation.set_ylim(-1.25 * most, 1.25 * most)
     correlation.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -272,36 +305,57 @@ MOST = 4
 
 @rc_context(STYLE)
 def plot(comparison: Comparison, other: str | None = None) -> Figure:
-    """The evidence against `other` (by default the law next to the best) as it grows along each recording, in all and
-    by the channels that tell most, and both laws' residuals of the channel that tells most. Raises `ValueError` for a
-    law that was not compared with the best, and where the residuals have not been kept."""
+    """The evidence against `other` (by default the law next to the best) as it grows along each
+    recording, in all and by the channels that tell most, and both laws' residuals of the channel
+    that tells most. Raises `ValueError` for a law that was not compared with the best, and where
+    the residuals have not been kept."""
     chosen = [v for v in comparison.against if other in (None, v.other)]
     if not chosen:
         raise ValueError(
-            f"the best law was not compared with `{other}`, but with {', '.join(v.other for v in comparison.against)}"
+            f"the best law was not compared with `{other}`, but with "
+            f"{', '.join(v.other for v in comparison.against)}"
         )
     if not comparison.series:
         raise ValueError(
-            "the comparison was kept without its residuals, so there is nothing to draw: compare once more"
+            "the comparison was kept without its residuals, so there is nothing to draw: compare "
+            "once more"
         )
     versus = min(chosen, key=lambda v: v.evidence)
     by_recording: dict[str, list[Series]] = {}
     for one in comparison.series:
         by_recording.setdefault(one.recording, []).append(one)
-    names = sorted(by_recording, key=lambda name: -sum(growth(s, versus)[-1] for s in by_recording[name]))[:MOST]
+    names = sorted(
+        by_recording, key=lambda name: -sum(growth(s, versus)[-1] for s in by_recording[name])
+    )[:MOST]
     figure = Figure(figsize=(10.5, 0.9 + 2.6 * len(names)), layout="constrained")
-    figure.suptitle(literal(f"{versus.best} against {versus.other}: {versus.evidence:.3g} nats, z = {versus.z:.2g}"))
-    for (left, right), name in zip(figure.subplots(len(names), 2, squeeze=False, sharex="row"), names):
+    figure.suptitle(
+        literal(
+            f"{versus.best} against {versus.other}: {versus.evidence:.3g} nats, z = {versus.z:.2g}"
+        )
+    )
+    for (left, right), name in zip(
+        figure.subplots(len(names), 2, squeeze=False, sharex="row"), names
+    ):
         told = sorted(by_recording[name], key=lambda s: -abs(growth(s, versus)[-1]))
         t = np.unique(np.concatenate([s.t for s in told]))
-        left.plot(t, sum(np.interp(t, s.t, growth(s, versus)) for s in told), color="k", lw=2, label="all")
+        left.plot(
+            t, sum(np.interp(t, s.t, growth(s, versus)) for s in told), color="k", lw=2, label="all"
+        )
         for s in told[:3]:
             left.plot(s.t, growth(s, versus), lw=1, label=s.channel)
         held = "" if told[0].fitted else ", held out"
         left.set_title(literal(f"evidence against {versus.other} in {name}{held} [nats]"))
         left.legend(loc="upper left")
         for law, colour in ((versus.other, OTHER), (versus.best, ACTUAL)):
-            right.plot(told[0].t, told[0].residuals[law], ".-", color=colour, lw=0.6, ms=3, label=literal(law))
+            right.plot(
+                told[0].t,
+                told[0].residuals[law],
+                ".-",
+                color=colour,
+                lw=0.6,
+                ms=3,
+                label=literal(law),
+            )
         right.set_title(f"residual over noise in {told[0].channel}")
         right.legend()
         for axes in (left, right):
@@ -320,7 +374,8 @@ def growth(s: Series, versus: Versus) -> np.ndarray:
 
 @rc_context(STYLE)
 def design_figure(design: Design) -> Figure:
-    """The signals whose knots moved, above; relative standard deviations and the criterion below."""
+    """The signals whose knots moved, above; relative standard deviations and the criterion
+    below."""
     names, bounds = tuple(design.made_by["bounds"]), design.made_by["bounds"]
     figure = Figure(figsize=(9.0, 1.8 * len(names) + 3.2), layout="constrained")
     panels: Any = figure.subfigures(2, 1, height_ratios=(1.8 * len(names), 3.2))
@@ -328,7 +383,10 @@ def design_figure(design: Design) -> Figure:
     t = np.linspace(design.recording.times[0], design.recording.times[-1], 2000)
     for ax, name in zip(above.subplots(len(names), 1, sharex=True, squeeze=False)[:, 0], names):
         shown, scale = SHOWN.get(own := design.recording.units[name], (own, 1.0))
-        for one, colour, label in ((design.given, DESIRED, "given"), (design.recording, ACTUAL, "designed")):
+        for one, colour, label in (
+            (design.given, DESIRED, "given"),
+            (design.recording, ACTUAL, "designed"),
+        ):
             signal = one.rig.reference(torch.from_numpy(t), [name])[:, 0, 0].detach().numpy()
             ax.plot(t, scale * signal, color=colour, label=label)
         for end in ("low", "high"):
@@ -343,6 +401,12 @@ def design_figure(design: Design) -> Figure:
     left.set_yscale("log")
     left.set_xticks(at, [name.split(".")[-1] for name in design.before])
     left.set_ylabel("standard deviation [%]")
-    right.plot([v.iteration for v in design.history], [v.value for v in design.history], "o-", color=ACTUAL, ms=3)
+    right.plot(
+        [v.iteration for v in design.history],
+        [v.value for v in design.history],
+        "o-",
+        color=ACTUAL,
+        ms=3,
+    )
     right.set(xlabel="iteration", ylabel=f"criterion {design.made_by['criterion']}")
     return figure

@@ -1,7 +1,9 @@
-"""Where a run begins, from the first samples of its recording: these tell it, and then do not count.
+"""Where a run begins, from the first samples of its recording: these tell it, and then do not
+count.
 
-Coordinates that sensors measure, and their rates, are those of a cubic through the samples, with several times its
-error and with what may be wrong with the sensor. Stretches are anything that friction lets stand.
+Coordinates that sensors measure, and their rates, are those of a cubic through the samples, with
+several times its error and with what may be wrong with the sensor. Stretches are anything that
+friction lets stand.
 """
 
 from collections.abc import Mapping
@@ -19,7 +21,16 @@ from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import NoEquilibrium, settled
 from torchsoft.solve.trajectory import measurable
-from torchsoft.sysid.initial_state import LEAD, PREFIX, MovingStart, Normal, Stretch, along, free_coordinates, placed
+from torchsoft.sysid.initial_state import (
+    LEAD,
+    PREFIX,
+    MovingStart,
+    Normal,
+    Stretch,
+    along,
+    free_coordinates,
+    placed,
+)
 from torchsoft.sysid.prediction import partner
 from torchsoft.sysid.recording import SAME, Array, Recording
 from torchsoft.sysid.unknowns import Sensor
@@ -28,53 +39,70 @@ DEGREE = 3
 """Of the polynomial in time through the first samples of a channel."""
 
 WIDER = 4.0
-"""How much wider a prior is than the error of that polynomial, whose noise is estimated from a few samples."""
+"""How much wider a prior is than the error of that polynomial, whose noise is estimated from a few
+samples."""
 
 MIDWAY, FOLLOWED, SPEED = 2e-4, 1e-3, 0.05
-"""Standard deviations of what no sensor measures: of a disc midway between two pads [m], of what follows a set-point
-[m], of a rate that makes the contacts roll [m/s]; those of angles are over the size of the body."""
+"""Standard deviations of what no sensor measures: of a disc midway between two pads [m], of what
+follows a set-point [m], of a rate that makes the contacts roll [m/s]; those of angles are over the
+size of the body."""
 
 SHORTEST, LONGEST = 1e-9, 1e-3
-"""Standard deviations of stretches [m]: without friction, and where friction does not bound them."""
+"""Standard deviations of stretches [m]: without friction, and where friction does not bound
+them."""
 
 
 def estimate_initial_state(
     recording: Recording, sensors: Mapping[str, Sensor], *, lead: float = LEAD,
     given: Mapping[str, Normal] | None = None,
 ) -> Recording:  # fmt: skip
-    """The recording, begun in motion at its first sample; the samples of the first `lead` [s] are left out, and tell
-    where.
+    """The recording, begun in motion at its first sample; the samples of the first `lead` [s] are
+    left out, and tell where.
 
-    Coordinates that `sensors` do not measure are `given`, mean and standard deviation by the names of
-    `MovingStart.bodies`, or assumed: what an actuator measures follows its set-point, the disc of the paper's rig lies
-    midway between the pads or on the lower one, the angle of a round body is zero, and other rates are those with which
-    the contacts roll.
+    Coordinates that `sensors` do not measure are `given`, mean and standard deviation by the names
+    of `MovingStart.bodies`, or assumed: what an actuator measures follows its set-point, the disc
+    of the paper's rig lies midway between the pads or on the lower one, the angle of a round body
+    is zero, and other rates are those with which the contacts roll.
 
-    Raises `ValueError` for fewer than four early samples of a channel or two later ones, a coordinate that is neither
-    measured nor given nor can be assumed, a delay that may be longer than `lead`, and pads that cannot be settled.
+    Raises `ValueError` for fewer than four early samples of a channel or two later ones, a
+    coordinate that is neither measured nor given nor can be assumed, a delay that may be longer
+    than `lead`, and pads that cannot be settled.
     """
     rig, first, whose = recording.rig, float(recording.times[0]), f"recording `{recording.name}`"
     late = {channel: t >= first + lead - SAME for channel, (t, _) in recording.samples.items()}
     if strange := [name for name in given or {} if name not in free_coordinates(rig)]:
-        raise ValueError(f"`given` speaks of `{strange[0]}`; there are {', '.join(free_coordinates(rig))}")
+        raise ValueError(
+            f"`given` speaks of `{strange[0]}`; there are {', '.join(free_coordinates(rig))}"
+        )
     if slow := [channel for channel, sensor in sensors.items() if sensor.delay > lead]:
         raise ValueError(
-            f"`{slow[0]}` may come late by {sensors[slow[0]].delay:g} s, but runs are known only from {lead:g} s before the "
-            "samples that count; take a longer `lead`"
+            f"`{slow[0]}` may come late by {sensors[slow[0]].delay:g} s, but runs are known only "
+            f"from {lead:g} s before the samples that count; take a longer `lead`"
         )
     if empty := [channel for channel, kept in late.items() if kept.sum() < 2]:
-        raise ValueError(f"{whose} has no two samples of `{empty[0]}` left after `lead` = {lead:g} s")
-    early = {c: (t[~late[c]] - first, y[~late[c]]) for c, (t, y) in recording.samples.items() if c in sensors}
+        raise ValueError(
+            f"{whose} has no two samples of `{empty[0]}` left after `lead` = {lead:g} s"
+        )
+    early = {
+        c: (t[~late[c]] - first, y[~late[c]])
+        for c, (t, y) in recording.samples.items()
+        if c in sensors
+    }
     samples = {c: (t[late[c]], y[late[c]]) for c, (t, y) in recording.samples.items()}
     lead = min(float(t[0]) for t, _ in samples.values()) - first
     bodies = completed(rig, measured(rig, early, sensors, whose) | dict(given or {}), first)
-    return replace(recording, samples=samples, start=MovingStart(bodies, stretches(rig, bodies, first, lead), lead))
+    return replace(
+        recording,
+        samples=samples,
+        start=MovingStart(bodies, stretches(rig, bodies, first, lead), lead),
+    )
 
 
 def measured(
     rig: Rig, early: Mapping[str, tuple[Array, Array]], sensors: Mapping[str, Sensor], whose: str
 ) -> dict[str, Normal]:
-    """Coordinates and rates at time zero that the `early` samples tell, each by the channel that tells it best."""
+    """Coordinates and rates at time zero that the `early` samples tell, each by the channel that
+    tells it best."""
     names, channels, found = free_coordinates(rig), measurable(rig), dict[str, Normal]()
     count = len(names) // 2
     for k, (name, channel) in enumerate(zip(names, channels)):
@@ -92,15 +120,15 @@ def measured(
 
 
 def beginning(what: str, t: Array, y: Array, sensor: Sensor, other: float) -> tuple[Normal, Normal]:
-    """Value and rate at t = 0 of a channel with samples y (k,) at t (k,) [s], by the polynomial through them; `other`
-    is the size of the channel at right angles that a misaligned sensor sees. Raises `ValueError` for too few
-    samples."""
+    """Value and rate at t = 0 of a channel with samples y (k,) at t (k,) [s], by the polynomial
+    through them; `other` is the size of the channel at right angles that a misaligned sensor sees.
+    Raises `ValueError` for too few samples."""
     inside = ~sensor.saturated(y)
     t, y = t[inside], y[inside]
     if len(t) < DEGREE + 1:
         raise ValueError(
-            f"{what} has {len(t)} samples in the beginning, but at least {DEGREE + 1} are needed to tell where the run "
-            "begins; take a longer `lead`"
+            f"{what} has {len(t)} samples in the beginning, but at least {DEGREE + 1} are needed "
+            "to tell where the run begins; take a longer `lead`"
         )
     degree, span = min(DEGREE, len(t) - 2), float(t[-1])
     V = np.vander(t / span, degree + 1, increasing=True)
@@ -112,12 +140,15 @@ def beginning(what: str, t: Array, y: Array, sensor: Sensor, other: float) -> tu
     wrong += sensor.misalignment * other if sensor.misalignment > 0 else 0.0
     wrong_rate = sensor.drift + sensor.gain * abs(rate) + sensor.delay * abs(bend)
     wrong_rate += sensor.misalignment * other / span if sensor.misalignment > 0 else 0.0
-    return (float(value), float(np.hypot(sd[0], wrong))), (float(rate), float(np.hypot(sd[1] / span, wrong_rate)))
+    return (float(value), float(np.hypot(sd[0], wrong))), (
+        float(rate),
+        float(np.hypot(sd[1] / span, wrong_rate)),
+    )
 
 
 def completed(rig: Rig, known: Mapping[str, Normal], at: float) -> dict[str, Normal]:
-    """All coordinates of the bodies at a time [s], where some are known. Raises `ValueError` for one that nothing
-    tells."""
+    """All coordinates of the bodies at a time [s], where some are known. Raises `ValueError` for
+    one that nothing tells."""
     out, names, signals = dict(known), free_coordinates(rig), rig.follow(at).detach()
     pairs = [pair for a in rig.actuators.values() for pair in a.follows]
     followed = {coordinate: rig.signals.index(setpoint) for coordinate, setpoint in pairs}
@@ -128,7 +159,9 @@ def completed(rig: Rig, known: Mapping[str, Normal], at: float) -> dict[str, Nor
             continue
         if name in followed:
             value, rate = signals[followed[name]].tolist()
-            out = {f"{body}.v_{axis}": (rate, SPEED / size)} | out | {name: (value, FOLLOWED / size)}
+            out = (
+                {f"{body}.v_{axis}": (rate, SPEED / size)} | out | {name: (value, FOLLOWED / size)}
+            )
         elif axis == "theta" and shape is not None and shape.round:
             out[name] = 0.0, 0.0
         elif isinstance(rig, SoftGrasp) and name == "disc.y" and "bracket.y" in out:
@@ -137,7 +170,8 @@ def completed(rig: Rig, known: Mapping[str, Normal], at: float) -> dict[str, Nor
             out[name] = min(0.5 * (out["bracket.y"][0] - p.bracket.cm_height), highest), MIDWAY
         else:
             raise ValueError(
-                f"no sensor tells where `{name}` is when the run begins: give its mean and standard deviation"
+                f"no sensor tells where `{name}` is when the run begins: give its mean and "
+                "standard deviation"
             )
     missing = [name for name in names if name not in out]
     out |= rolling(rig, out, missing, signals)
@@ -145,14 +179,17 @@ def completed(rig: Rig, known: Mapping[str, Normal], at: float) -> dict[str, Nor
 
 
 def reach(rig: Rig, body: str, axis: str) -> float:
-    """What a standard deviation in metres is divided by for a coordinate: the size of the body [m] for an angle, else
-    one."""
+    """What a standard deviation in metres is divided by for a coordinate: the size of the body [m]
+    for an angle, else one."""
     shape = rig.bodies[body].shape
     return shape.size() if axis == "theta" and shape is not None else 1.0
 
 
-def rolling(rig: Rig, known: Mapping[str, Normal], missing: list[str], signals: Tensor) -> dict[str, Normal]:
-    """The `missing` rates with which the points that touch glide least, weighted with their normal forces."""
+def rolling(
+    rig: Rig, known: Mapping[str, Normal], missing: list[str], signals: Tensor
+) -> dict[str, Normal]:
+    """The `missing` rates with which the points that touch glide least, weighted with their normal
+    forces."""
     if not missing:
         return {}
     bodies = dict(known) | dict.fromkeys(missing, (0.0, 0.0))
@@ -160,9 +197,16 @@ def rolling(rig: Rig, known: Mapping[str, Normal], missing: list[str], signals: 
     forces = loads(rig, state)
 
     def glide(rates: Array) -> Array:
-        """Weighted velocities of the bodies' points against the pads', linear in the missing rates."""
-        values = {PREFIX + name: torch.tensor(rate, dtype=torch.float64) for name, rate in zip(missing, rates)}
-        moving, rows = state._replace(velocity=placed(rig, signals, bodies, values)[1]), [torch.zeros(1, 2).double()]
+        """Weighted velocities of the bodies' points against the pads', linear in the missing
+        rates."""
+        values = {
+            PREFIX + name: torch.tensor(rate, dtype=torch.float64)
+            for name, rate in zip(missing, rates)
+        }
+        moving, rows = (
+            state._replace(velocity=placed(rig, signals, bodies, values)[1]),
+            [torch.zeros(1, 2).double()],
+        )
         for name, F_N in forces.items():
             pad = rig.contacts[name].pad
             u = rig.pads[pad].at_points(rig.displacement(pad, state))
@@ -174,11 +218,15 @@ def rolling(rig: Rig, known: Mapping[str, Normal], missing: list[str], signals: 
     J = np.stack([glide(row) - none for row in np.eye(len(missing))], -1)
     rates = np.linalg.lstsq(J, -none, rcond=None)[0]
     ends = [name.split(".v_") for name in missing]
-    return {name: (float(rate), SPEED / reach(rig, *end)) for name, rate, end in zip(missing, rates, ends)}
+    return {
+        name: (float(rate), SPEED / reach(rig, *end))
+        for name, rate, end in zip(missing, rates, ends)
+    }
 
 
 def unstretched(rig: Rig, pose: dict[str, Tensor], velocity: dict[str, Tensor]) -> State:
-    """The state with pads settled around bodies, without stretch. Raises `ValueError` where they do not settle."""
+    """The state with pads settled around bodies, without stretch. Raises `ValueError` where they do
+    not settle."""
     none = {name: torch.zeros_like(rig.weight(name)) for name in rig.contacts}
     try:
         y = settled(rig, pose, velocity, none).detach()
@@ -198,8 +246,9 @@ def loads(rig: Rig, state: State) -> dict[str, Tensor]:
 
 
 def stretches(rig: Rig, bodies: Mapping[str, Normal], at: float, time: float) -> dict[str, Stretch]:
-    """What may be stretched when a run begins at a time `at` [s], bodies being where the means say: each contact at the
-    nodes that are loaded and the next ones, by what its friction lets stand for a `time` [s]."""
+    """What may be stretched when a run begins at a time `at` [s], bodies being where the means say:
+    each contact at the nodes that are loaded and the next ones, by what its friction lets stand for
+    a `time` [s]."""
     out, state = {}, unstretched(rig, *placed(rig, rig.follow(at).detach(), bodies, {}))
     for name, F_N in loads(rig, state).items():
         contact, weight = rig.contacts[name], rig.weight(name)
@@ -210,13 +259,15 @@ def stretches(rig: Rig, bodies: Mapping[str, Normal], at: float, time: float) ->
         places = np.sort(along(pad, pad.positions[pad.surface]))
         touched = np.searchsorted(places, along(pad, pad.positions[loaded]))
         near = places[max(touched.min() - 1, 0) : touched.max() + 2]
-        out[name] = Stretch(tuple(near.tolist()), lasting_stretch(contact, float((F_N / weight).max()), time))
+        out[name] = Stretch(
+            tuple(near.tolist()), lasting_stretch(contact, float((F_N / weight).max()), time)
+        )
     return out
 
 
 def lasting_stretch(contact: Contact, F_N: float, time: float) -> float:
-    """The largest stretch [m] that a contact's friction lets stand for a `time` [s], at a normal force [N] per
-    reference spacing: mu_s F_N / K_t, by Coulomb's law."""
+    """The largest stretch [m] that a contact's friction lets stand for a `time` [s], at a normal
+    force [N] per reference spacing: mu_s F_N / K_t, by Coulomb's law."""
     law = contact.law
 
     def slips(s: float) -> float:

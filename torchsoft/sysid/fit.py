@@ -1,5 +1,5 @@
-"""Least squares on frozen steps: Gauss-Newton on exact sensitivities, descent on the adjoint, covariance and robust
-losses."""
+"""Least squares on frozen steps: Gauss-Newton on exact sensitivities, descent on the adjoint,
+covariance and robust losses."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,27 +17,29 @@ from torchsoft.sysid.runs import Runner
 
 
 def fisher(J: Array) -> tuple[Array, Array, Array]:
-    """Covariance (n, n) of the coordinates, eigenvalues (n,) and eigenvectors (n, n) of the Fisher matrix of a whitened
-    Jacobian J (m, n); directions without any information get a very large variance, not an infinite one."""
+    """Covariance (n, n) of the coordinates, eigenvalues (n,) and eigenvectors (n, n) of the Fisher
+    matrix of a whitened Jacobian J (m, n); directions without any information get a very large
+    variance, not an infinite one."""
     values, vectors = np.linalg.eigh(J.T @ J)
     floor = np.maximum(values, 1e-12 * max(values.max(initial=0.0), 1e-300))
     return (vectors / floor) @ vectors.T, values, vectors
 
 
 def standard_deviations(J: Array) -> Array:
-    """Cramer-Rao: standard deviations (n,) of the coordinates of a whitened Jacobian (m, n); huge without
-    information."""
+    """Cramer-Rao: standard deviations (n,) of the coordinates of a whitened Jacobian (m, n); huge
+    without information."""
     return np.sqrt(np.diag(fisher(J)[0]))
 
 
 def shift(J: Array, difference: Array) -> Array:
-    """How far coordinates (n,) at a least-squares fit are from those of a finer model: `difference` (m,) is what the
-    residuals of the finer one, at the fit, have more."""
+    """How far coordinates (n,) at a least-squares fit are from those of a finer model: `difference`
+    (m,) is what the residuals of the finer one, at the fit, have more."""
     return np.asarray(np.linalg.lstsq(J, difference, rcond=None)[0], np.float64)
 
 
 CLOSER = 3.0
-"""How many times better than each of its parameters a combination must be known, to be worth a sentence."""
+"""How many times better than each of its parameters a combination must be known, to be worth a
+sentence."""
 
 AS_GOOD = 1.3
 """How much larger the standard deviation of a combination may become by rounding its exponents."""
@@ -46,14 +48,15 @@ MINE = 0.7
 """Correlation of a parameter with a direction above which its uncertainty comes from there."""
 
 EXPONENTS = {1.0: 0.1, 0.5: 0.1, 0.1: 0.2, 0.05: 0.2}
-"""What exponents are rounded to multiples of, the roundest first, and the part of its parameters' least standard
-deviation that a combination may then have whatever it had."""
+"""What exponents are rounded to multiples of, the roundest first, and the part of its parameters'
+least standard deviation that a combination may then have whatever it had."""
 
 
 @dataclass(frozen=True)
 class Combination:
-    """A product of powers of parameters that data see better than each of its factors: exponents and standard
-    deviations of the parameters by label, and the standard deviation of the product, all relative."""
+    """A product of powers of parameters that data see better than each of its factors: exponents
+    and standard deviations of the parameters by label, and the standard deviation of the product,
+    all relative."""
 
     exponents: dict[str, float]
     sds: dict[str, float]
@@ -79,12 +82,12 @@ def percent(sd: float) -> str:
 
 
 def combinations(labels: Sequence[str], C: Array, blurred: float) -> list[Combination]:
-    """What is seen of parameters that are not: for every direction in which they are less certain than `blurred`
-    together, the best determined product of powers of the parameters that take part.
+    """What is seen of parameters that are not: for every direction in which they are less certain
+    than `blurred` together, the best determined product of powers of the parameters that take part.
 
-    C (n, n) is the covariance of the logarithms of the parameters `labels`, whatever else was fitted being left out of
-    it. A direction whose product is not `CLOSER` times better known than each of its factors is left out: its
-    parameters are not seen at all.
+    C (n, n) is the covariance of the logarithms of the parameters `labels`, whatever else was
+    fitted being left out of it. A direction whose product is not `CLOSER` times better known than
+    each of its factors is left out: its parameters are not seen at all.
     """
     values, vectors = np.linalg.eigh(C)
     out: list[Combination] = []
@@ -101,13 +104,18 @@ def combinations(labels: Sequence[str], C: Array, blurred: float) -> list[Combin
             {name: float(s) for name, s, p in zip(names, sds, exponents) if p},
             sd,
         )
-        if used.sum() > 1 and CLOSER * sd < (sds * np.abs(exponents))[used].min() and found not in out:
+        if (
+            used.sum() > 1
+            and CLOSER * sd < (sds * np.abs(exponents))[used].min()
+            and found not in out
+        ):
             out.append(found)
     return out
 
 
 def rounded(direction: Array, C: Array) -> Array:
-    """A direction (n,) whose largest component is 1, the others rounded as far as the variance in C (n, n) allows."""
+    """A direction (n,) whose largest component is 1, the others rounded as far as the variance in C
+    (n, n) allows."""
     exact = direction / direction[np.argmax(np.abs(direction))]
     own, least = float(exact @ C @ exact), float(np.diag(C).min())
     for part, small in EXPONENTS.items():
@@ -122,7 +130,13 @@ def rounded(direction: Array, C: Array) -> Array:
 
 Loss = Literal["linear", "soft_l1", "huber", "cauchy", "arctan"]
 
-REACH: dict[Loss, float] = {"linear": 1.0, "soft_l1": 1.287, "huber": 1.345, "cauchy": 2.385, "arctan": 2.571}
+REACH: dict[Loss, float] = {
+    "linear": 1.0,
+    "soft_l1": 1.287,
+    "huber": 1.345,
+    "cauchy": 2.385,
+    "arctan": 2.571,
+}
 """c of every loss, such that where the noise is Gaussian it has the `EFFICIENCY`."""
 
 EFFICIENCY = 0.95
@@ -140,7 +154,9 @@ def rho(loss: Loss, z: Array) -> Array:
             return np.stack((2 * (root - 1), 1 / root, -0.5 / root**3))
         case "huber":
             root, near = np.sqrt(np.maximum(z, 1.0)), z <= 1
-            return np.stack((np.where(near, z, 2 * root - 1), 1 / root, np.where(near, 0.0, -0.5 / root**3)))
+            return np.stack(
+                (np.where(near, z, 2 * root - 1), 1 / root, np.where(near, 0.0, -0.5 / root**3))
+            )
         case "cauchy":
             return np.stack((np.log1p(z), 1 / (1 + z), -1 / (1 + z) ** 2))
         case "arctan":
@@ -148,8 +164,8 @@ def rho(loss: Loss, z: Array) -> Array:
 
 
 def spared(loss: Loss, priors: int) -> Callable[[Array], Array]:
-    """The loss as `least_squares` takes it, linear in the last rows, which are `priors`; its `f_scale` is
-    `REACH[loss]`."""
+    """The loss as `least_squares` takes it, linear in the last rows, which are `priors`; its
+    `f_scale` is `REACH[loss]`."""
 
     def rows(z: Array) -> Array:
         data = len(z) - priors
@@ -158,23 +174,30 @@ def spared(loss: Loss, priors: int) -> Callable[[Array], Array]:
     return rows
 
 
-def covariance(J: Array, r: Array, loss: Loss, priors: int = 0, exact: NDArray[np.int_] | None = None) -> Array:
-    """Of the coordinates (n, n) where a robust fit has ended: J (m, n) and residuals r (m,) there, the last rows
-    `priors`.
+def covariance(
+    J: Array, r: Array, loss: Loss, priors: int = 0, exact: NDArray[np.int_] | None = None
+) -> Array:
+    """Of the coordinates (n, n) where a robust fit has ended: J (m, n) and residuals r (m,) there,
+    the last rows `priors`.
 
-    With psi = rho' r, A = E[psi'] J'J and B = E[psi^2] J'J, both with the priors' own J'J, it is A^-1 B A^-1;
-    expectations are means over the residuals, that of psi^2 over the degrees of freedom; over those `exact` (k,) only,
-    where some samples are saturated. They are not taken below what Gaussian noise as stated gives, 1 over the loss's
-    efficiency. Raises `ValueError` where so many residuals are outliers that nothing holds the estimates.
+    With psi = rho' r, A = E[psi'] J'J and B = E[psi^2] J'J, both with the priors' own J'J, it is
+    A^-1 B A^-1; expectations are means over the residuals, that of psi^2 over the degrees of
+    freedom; over those `exact` (k,) only, where some samples are saturated. They are not taken
+    below what Gaussian noise as stated gives, 1 over the loss's efficiency. Raises `ValueError`
+    where so many residuals are outliers that nothing holds the estimates.
     """
     m, n = len(r) - priors, J.shape[1]
     own = r[:m] if exact is None else r[exact]
     z = (own / REACH[loss]) ** 2
     _, first, second = rho(loss, z)
-    slope, power = float(np.mean(first + 2 * z * second)), float(np.sum((first * own) ** 2)) / max(len(own) - n, 1)
+    slope, power = (
+        float(np.mean(first + 2 * z * second)),
+        float(np.sum((first * own) ** 2)) / max(len(own) - n, 1),
+    )
     if slope <= 0:
         raise ValueError(
-            f"the loss `{loss}` holds on to nothing: most residuals count as outliers; state more noise, or take another loss"
+            f"the loss `{loss}` holds on to nothing: most residuals count as outliers; state more "
+            "noise, or take another loss"
         )
     inverse, _, _ = fisher(np.concatenate((slope**0.5 * J[:m], J[m:])))
     least = slope**2 / (1.0 if loss == "linear" else EFFICIENCY)
@@ -191,8 +214,8 @@ SETTLED = 0.2
 
 
 class Unreachable(RuntimeError):
-    """The model cannot follow a recording with the parameters that a fit starts from; `lost` has reason and time,
-    `findings` what looked wrong with the recordings themselves."""
+    """The model cannot follow a recording with the parameters that a fit starts from; `lost` has
+    reason and time, `findings` what looked wrong with the recordings themselves."""
 
     def __init__(self, lost: dict[str, FailedRun], findings: Sequence[str] = ()) -> None:
         reasons = "; ".join(f"recording `{name}`: {loss.reason}" for name, loss in lost.items())
@@ -202,8 +225,9 @@ class Unreachable(RuntimeError):
 
 
 class Fit(NamedTuple):
-    """Where a fit on `steps` ended: coordinates x (n,), chi2 (sum of squared residuals over their number), evaluations,
-    whether it converged, and the residuals there with their Jacobian, if that was computed."""
+    """Where a fit on `steps` ended: coordinates x (n,), chi2 (sum of squared residuals over their
+    number), evaluations, whether it converged, and the residuals there with their Jacobian, if that
+    was computed."""
 
     x: Array
     chi2: float
@@ -214,22 +238,24 @@ class Fit(NamedTuple):
 
 
 def gauss_newton(
-    problem: Problem, runner: Runner, x: Array, *, which: Sequence[str], free: NDArray[np.bool_], steps: StepsByName,
-    evaluations: int = 30, tolerance: float = 1e-6, loss: Loss = "linear", notify: Notify = lambda chi2: None,
-    first: Residuals | None = None,
+    problem: Problem, runner: Runner, x: Array, *, which: Sequence[str], free: NDArray[np.bool_],
+    steps: StepsByName, evaluations: int = 30, tolerance: float = 1e-6, loss: Loss = "linear",
+    notify: Notify = lambda chi2: None, first: Residuals | None = None,
 ) -> Fit:  # fmt: skip
-    """`scipy.optimize.least_squares` (trust-region reflective, bounded, robust `loss` but for priors) on the
-    coordinates that are `free`.
+    """`scipy.optimize.least_squares` (trust-region reflective, bounded, robust `loss` but for
+    priors) on the coordinates that are `free`.
 
-    `tolerance` is relative, on the misfit and on the coordinates. A trial that cannot be simulated shortens the step.
-    `first` holds residuals and Jacobian at x, if they are known. Raises `Unreachable` where the start cannot be
-    simulated.
+    `tolerance` is relative, on the misfit and on the coordinates. A trial that cannot be simulated
+    shortens the step. `first` holds residuals and Jacobian at x, if they are known. Raises
+    `Unreachable` where the start cannot be simulated.
     """
     low, high = problem.coordinates.bounds
     gap = 1e-9 * (high - low)
     begin = np.clip(x, low + gap, high - gap)
     zero = np.zeros(int(free.sum()))
-    seen = {zero.tobytes(): first} if first is not None and (begin == x).all() else {}  # the best and the latest
+    seen = (
+        {zero.tobytes(): first} if first is not None and (begin == x).all() else {}
+    )  # the best and the latest
 
     def moved(z: Array) -> Array:
         trial = begin.copy()
@@ -250,20 +276,25 @@ def gauss_newton(
         raise Unreachable(lost)
     solve: Any = least_squares
     out = solve(
-        lambda z: at(z).r, zero, jac=lambda z: at(z).J[:, free], bounds=(low[free] - begin[free], high[free] - begin[free]),
-        loss=spared(loss, len(problem.coordinates.priors)), f_scale=REACH[loss], max_nfev=evaluations, ftol=tolerance,
-        xtol=tolerance, gtol=1e-12,
+        lambda z: at(z).r, zero, jac=lambda z: at(z).J[:, free],
+        bounds=(low[free] - begin[free], high[free] - begin[free]),
+        loss=spared(loss, len(problem.coordinates.priors)), f_scale=REACH[loss],
+        max_nfev=evaluations, ftol=tolerance, xtol=tolerance, gtol=1e-12,
     )  # fmt: skip
-    return Fit(moved(out.x), float(np.mean(out.fun**2)), int(out.nfev), out.status > 0, steps, at(out.x))
+    return Fit(
+        moved(out.x), float(np.mean(out.fun**2)), int(out.nfev), out.status > 0, steps, at(out.x)
+    )
 
 
 def chord(
-    problem: Problem, runner: Runner, x: Array, at: Residuals, *, which: Sequence[str], free: NDArray[np.bool_],
-    steps: StepsByName, rounds: int = 5, notify: Notify = lambda chi2: None,
+    problem: Problem, runner: Runner, x: Array, at: Residuals, *, which: Sequence[str],
+    free: NDArray[np.bool_], steps: StepsByName, rounds: int = 5,
+    notify: Notify = lambda chi2: None,
 ) -> Fit:  # fmt: skip
-    """From a fit on other steps to the one on these: `at` holds the residuals at x on these steps, and the Jacobian on
-    the others, which is kept; until a coordinate would move by less than `SETTLED` standard deviations. A round costs a
-    run, not a Jacobian. It ends where a run fails or the misfit grows.
+    """From a fit on other steps to the one on these: `at` holds the residuals at x on these steps,
+    and the Jacobian on the others, which is kept; until a coordinate would move by less than
+    `SETTLED` standard deviations. A round costs a run, not a Jacobian. It ends where a run fails or
+    the misfit grows.
     """
     count = 0
     while not (converged := settled(problem, x, at, free)) and count < rounds:
@@ -278,8 +309,8 @@ def chord(
 
 
 def newton_step(problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_]) -> Array:
-    """What Gauss-Newton adds to the free coordinates at x: the least squares within their bounds. To clip the free step
-    would not do: what is held at a bound leaves the others where they are."""
+    """What Gauss-Newton adds to the free coordinates at x: the least squares within their bounds.
+    To clip the free step would not do: what is held at a bound leaves the others where they are."""
     low, high = (bound[free] - x[free] for bound in problem.coordinates.bounds)
     step = -shift(at.J[:, free], at.r)
     if ((low <= step) & (step <= high)).all():
@@ -290,19 +321,25 @@ def newton_step(problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool
 
 def settled(problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_]) -> bool:
     """Whether that is less than `SETTLED` standard deviations for all of them."""
-    return bool((np.abs(newton_step(problem, x, at, free)) <= SETTLED * standard_deviations(at.J[:, free])).all())
+    return bool(
+        (
+            np.abs(newton_step(problem, x, at, free))
+            <= SETTLED * standard_deviations(at.J[:, free])
+        ).all()
+    )
 
 
 def descend(
-    problem: Problem, runner: Runner, x: Array, *, which: Sequence[str], free: NDArray[np.bool_], steps: StepsByName,
-    method: Literal["lbfgs", "adam"] = "lbfgs", evaluations: int = 100, rate: float = 0.05,
-    notify: Notify = lambda chi2: None,
+    problem: Problem, runner: Runner, x: Array, *, which: Sequence[str], free: NDArray[np.bool_],
+    steps: StepsByName, method: Literal["lbfgs", "adam"] = "lbfgs", evaluations: int = 100,
+    rate: float = 0.05, notify: Notify = lambda chi2: None,
 ) -> Fit:  # fmt: skip
-    """torch's LBFGS (strong Wolfe) or Adam (learning `rate`) on the misfit, bounds kept by a sigmoid; the best point
-    visited.
+    """torch's LBFGS (strong Wolfe) or Adam (learning `rate`) on the misfit, bounds kept by a
+    sigmoid; the best point visited.
 
-    For many unknowns: a gradient costs less than one run more, however many there are. For a handful `gauss_newton`
-    needs far fewer runs. Raises `Unreachable` where the start cannot be simulated.
+    For many unknowns: a gradient costs less than one run more, however many there are. For a
+    handful `gauss_newton` needs far fewer runs. Raises `Unreachable` where the start cannot be
+    simulated.
     """
     low, high = (torch.from_numpy(b) for b in problem.coordinates.bounds)
     mask, fraction = torch.from_numpy(free), (torch.from_numpy(x) - low) / (high - low)
@@ -310,7 +347,9 @@ def descend(
     samples, best, count = problem.samples(which), (np.inf, x), 0
 
     def coordinates() -> torch.Tensor:
-        return torch.from_numpy(x).masked_scatter(mask, low[mask] + (high - low)[mask] * torch.sigmoid(z))
+        return torch.from_numpy(x).masked_scatter(
+            mask, low[mask] + (high - low)[mask] * torch.sigmoid(z)
+        )
 
     def closure() -> float:
         nonlocal best, count
@@ -328,8 +367,8 @@ def descend(
 
     if method == "lbfgs":
         optimiser: Any = torch.optim.LBFGS(
-            [z], max_iter=evaluations, max_eval=evaluations, line_search_fn="strong_wolfe", tolerance_change=1e-12,
-            tolerance_grad=1e-9, history_size=20,
+            [z], max_iter=evaluations, max_eval=evaluations, line_search_fn="strong_wolfe",
+            tolerance_change=1e-12, tolerance_grad=1e-9, history_size=20,
         )  # fmt: skip
         optimiser.step(closure)
     else:

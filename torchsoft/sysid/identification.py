@@ -1,4 +1,5 @@
-"""`identify`: a plan of stages, the tests at their end, and the result with its notices; `explain`."""
+"""`identify`: a plan of stages, the tests at their end, and the result with its notices;
+`explain`."""
 
 import sys
 import time as clock
@@ -14,7 +15,17 @@ from pydantic import Field, model_validator
 from tqdm import tqdm
 
 from torchsoft.sysid.estimate import directions, estimates, nrmse, residual_channels
-from torchsoft.sysid.fit import Fit, Loss, Notify, Unreachable, chord, covariance, descend, fisher, gauss_newton
+from torchsoft.sysid.fit import (
+    Fit,
+    Loss,
+    Notify,
+    Unreachable,
+    chord,
+    covariance,
+    descend,
+    fisher,
+    gauss_newton,
+)
 from torchsoft.sysid.plan import (
     FINER,
     STEP_BIAS,
@@ -45,11 +56,12 @@ from torchsoft.sysid.sensitivity import Checked, assumption_notices, check_assum
 from torchsoft.tables import SEED, Table, plain
 
 RTOL = 1e-5
-"""Relative tolerance of the last stage: derivatives are then right to some percent, and estimates to a fraction of a
-standard deviation where sensors are as good as `RIG`."""
+"""Relative tolerance of the last stage: derivatives are then right to some percent, and estimates
+to a fraction of a standard deviation where sensors are as good as `RIG`."""
 
 Assumed = Literal["checked", "explained", "trusted"]
-"""Whether assumptions are tested to first order, tested and followed by new fits that look for a cause, or believed."""
+"""Whether assumptions are tested to first order, tested and followed by new fits that look for a
+cause, or believed."""
 
 
 class Settings(Table):
@@ -69,8 +81,8 @@ class Settings(Table):
     def _has_no_step(cls, given: Any) -> Any:
         if isinstance(given, dict) and "step" in given:
             raise ValueError(
-                "there is no `step` any more: tolerances choose the steps; leave it out, or give the relative tolerance `rtol` "
-                f"({RTOL:g})"
+                "there is no `step` any more: tolerances choose the steps; leave it out, or give "
+                f"the relative tolerance `rtol` ({RTOL:g})"
             )
         return given
 
@@ -78,7 +90,8 @@ class Settings(Table):
     def _the_method_has_the_loss(self) -> "Settings":
         if self.loss != "linear" and self.method != "gauss_newton":
             raise ValueError(
-                f"the method '{self.method}' has no robust loss: for loss = '{self.loss}' take method = 'gauss_newton'"
+                f"the method '{self.method}' has no robust loss: for loss = '{self.loss}' take "
+                "method = 'gauss_newton'"
             )
         return self
 
@@ -87,7 +100,8 @@ class Settings(Table):
 
 
 class How(NamedTuple):
-    """How an identification goes about it, beside its stages; `identify` says what the fields mean."""
+    """How an identification goes about it, beside its stages; `identify` says what the fields
+    mean."""
 
     fitted: list[str]
     heldout: tuple[str, ...]
@@ -100,16 +114,17 @@ class How(NamedTuple):
 
     @property
     def tightenings(self) -> int:
-        """How often the tolerance may become tighter; a robust fit ends on the steps that it has."""
+        """How often the tolerance may become tighter; a robust fit ends on the steps that it
+        has."""
         return self.settings.tightenings if self.loss == "linear" else 0
 
 
 def conclude(
-    coloured: Coloured, runner: Runner, stage: Stage, stages: list[dict[str, Any]], how: How, findings: list[str],
-    began: float, progress: bool,
+    coloured: Coloured, runner: Runner, stage: Stage, stages: list[dict[str, Any]], how: How,
+    findings: list[str], began: float, progress: bool,
 ) -> IdentificationResult:  # fmt: skip
-    """The result, from the fit of the last stage with the noise that was found; `findings` are sentences on the recordings
-    themselves, `began` is on the clock [s]."""
+    """The result, from the fit of the last stage with the noise that was found; `findings` are
+    sentences on the recordings themselves, `began` is on the clock [s]."""
     problem, fit = coloured.problem, coloured.fit
     c = problem.coordinates
     free, start = np.isin(c.labels, stage.free), clock.perf_counter()
@@ -117,7 +132,11 @@ def conclude(
         end = settle(problem, runner, stage, fit, free, how.tightenings, notify)
     x, at, rtol = end.x, end.at, end.rtol
     for number, (by, one) in enumerate(end.fits):
-        name = "steps chosen anew" if by == (end.fits[number - 1][0] if number else stage.rtol) else "tighter tolerance"
+        name = (
+            "steps chosen anew"
+            if by == (end.fits[number - 1][0] if number else stage.rtol)
+            else "tighter tolerance"
+        )
         stages = [*stages, stage_entry(name, stage, by, one, start)]
     J = at.J[:, free]
     C_free, values, vectors = fisher(J)
@@ -137,7 +156,11 @@ def conclude(
     if how.settings.assumptions != "trusted":
         checked = tested_assumptions(coloured, runner, end, stage, free, doubtful, how, progress)
     C, shift = np.zeros((len(x), len(x))), np.zeros(len(x)) if end.bias is None else end.bias
-    C_fit = C_free * max(1.0, chi2) if how.loss == "linear" else covariance(J, at.r, how.loss, len(c.priors), exact)
+    C_fit = (
+        C_free * max(1.0, chi2)
+        if how.loss == "linear"
+        else covariance(J, at.r, how.loss, len(c.priors), exact)
+    )
     C[np.ix_(free, free)] = C_fit + (checked.widening() if checked is not None else 0.0)
     labels = [label for label, one in zip(c.labels, free) if one]
     found = estimates(problem, x, free, C, shift)
@@ -145,7 +168,10 @@ def conclude(
     if how.heldout:
         held = problem.with_noise({}).residuals(runner, x, how.heldout, rtol)
         if held.lost:
-            notices += [f"held-out recording `{k}` could not be simulated: {v.reason}" for k, v in held.lost.items()]
+            notices += [
+                f"held-out recording `{k}` could not be simulated: {v.reason}"
+                for k, v in held.lost.items()
+            ]
         else:
             predicted = nrmse(problem, held.r, list(how.heldout))
             notices += guesses(problem, x, how.heldout)
@@ -168,13 +194,15 @@ def conclude(
         notices=notices,
         stages=stages,
         cost={
-            "simulations": runner.simulations, "jacobians": runner.jacobians, "gradients": runner.gradients,
-            "remembered": runner.remembered, "samples": len(at.r), "wall_s": clock.perf_counter() - began,
+            "simulations": runner.simulations, "jacobians": runner.jacobians,
+            "gradients": runner.gradients, "remembered": runner.remembered, "samples": len(at.r),
+            "wall_s": clock.perf_counter() - began,
             "data_seconds": sum(r.duration for r in problem.recordings if r.name in how.fitted),
         },
         made_by={
-            "torchsoft": version("torchsoft"), **how.settings.model_dump(), "rtol": rtol, "rtol_asked": stage.rtol,
-            "acknowledged": list(how.acknowledged), "untried": list(checked.untried) if checked is not None else [],
+            "torchsoft": version("torchsoft"), **how.settings.model_dump(), "rtol": rtol,
+            "rtol_asked": stage.rtol, "acknowledged": list(how.acknowledged),
+            "untried": list(checked.untried) if checked is not None else [],
             "candidates": list(checked.candidates) if checked is not None else [],
             "unknowns": {name: u.model_dump() for name, u in problem.unknowns.items()},
             "sensors": {name: s.model_dump() for name, s in problem.sensors.items()},
@@ -182,25 +210,32 @@ def conclude(
         },
         covariance=C.tolist(),
         **described(
-            problem, x, free, at.J, C, how.fitted, tried={channel: one.scores for channel, one in coloured.found.items()},
+            problem, x, free, at.J, C, how.fitted,
+            tried={channel: one.scores for channel, one in coloured.found.items()},
             checks=checked.checks if checked is not None else (),
         ),
     )  # fmt: skip
 
 
 def tested_assumptions(
-    coloured: Coloured, runner: Runner, end: Settled, stage: Stage, free: NDArray[np.bool_], doubtful: bool, how: How,
-    progress: bool,
+    coloured: Coloured, runner: Runner, end: Settled, stage: Stage, free: NDArray[np.bool_],
+    doubtful: bool, how: How, progress: bool,
 ) -> Checked:  # fmt: skip
-    """The checks at the end of a fit, on residuals with the colour that was declared and no other: what was found
-    unasked may be the very trace of a wrong assumption. Their columns then get all the noise."""
+    """The checks at the end of a fit, on residuals with the colour that was declared and no other:
+    what was found unasked may be the very trace of a wrong assumption. Their columns then get all
+    the noise."""
     problem, which = coloured.problem, stage.recordings
-    declared = {channel: noise for channel, noise in problem.noise.items() if problem.sensors[channel].colour == "ar"}
+    declared = {
+        channel: noise
+        for channel, noise in problem.noise.items()
+        if problem.sensors[channel].colour == "ar"
+    }
     plain = problem.with_noise(declared)
     finer = rewhitened(plain, end.finer, parts(problem, end.finer.r, which))
     found = check_assumptions(
-        plain, end.x, finer, free, which, end.rtol, doubtful=doubtful, explain=how.settings.assumptions == "explained",
-        loss=how.loss, workers=runner.workers, journal=runner.folder, progress=progress,
+        plain, end.x, finer, free, which, end.rtol, doubtful=doubtful,
+        explain=how.settings.assumptions == "explained", loss=how.loss, workers=runner.workers,
+        journal=runner.folder, progress=progress,
     )  # fmt: skip
     rows = Residuals(found.columns[:, 0] if found.columns.size else finer.r, found.columns, {})
     columns: Array = rewhitened(problem, rows, parts(plain, rows.r, which)).J
@@ -208,14 +243,19 @@ def tested_assumptions(
 
 
 def guesses(problem: Problem, x: Array, heldout: Sequence[str]) -> list[str]:
-    """Sentences on recordings that were predicted with values of their own, which no recording that was fitted
-    tells."""
+    """Sentences on recordings that were predicted with values of their own, which no recording that
+    was fitted tells."""
     out = []
     for k in (k for k, name in enumerate(problem.names) if name in heldout):
-        mine = [c for c in problem.coordinates.all if c.recording == problem.names[k] and not c.fixed]
+        mine = [
+            c for c in problem.coordinates.all if c.recording == problem.names[k] and not c.fixed
+        ]
         values = problem.values(x, k)
         if own := {c.name: values[c.name] for c in mine if c.kind == "parameter"}:
-            out.append(f"held-out recording `{problem.names[k]}` is predicted with what is {undetermined(own)}")
+            out.append(
+                f"held-out recording `{problem.names[k]}` is predicted with what is "
+                f"{undetermined(own)}"
+            )
     return out
 
 
@@ -224,18 +264,29 @@ def notices_on(found: list[Any], converged: bool, rtol: float, unchecked: bool) 
     out = []
     for e in found:
         if not e.identifiable:
-            change = f"a change by {e.relative_sd:.0%}" if e.relative_sd < 9 else "a change by a factor of ten"
-            out.append(f"{e.label} is not identifiable from these data: {change} would not show in them")
+            change = (
+                f"a change by {e.relative_sd:.0%}"
+                if e.relative_sd < 9
+                else "a change by a factor of ten"
+            )
+            out.append(
+                f"{e.label} is not identifiable from these data: {change} would not show in them"
+            )
         if e.at_bound and e.identifiable:
-            out.append(f"{e.label} ended at a bound ({e.last:.4g}): widen the bound or question the model")
+            out.append(
+                f"{e.label} ended at a bound ({e.last:.4g}): widen the bound or question the model"
+            )
     worst = max(found, key=lambda e: abs(e.step_bias_sd), default=None)
     if unchecked:
-        out.append(f"the tolerance rtol = {rtol:g} could not be checked: a run failed that was made to check it")
+        out.append(
+            f"the tolerance rtol = {rtol:g} could not be checked: a run failed that was made to "
+            "check it"
+        )
     elif worst is not None and abs(worst.step_bias_sd) > STEP_BIAS:
         out.append(
-            f"the tolerance rtol = {rtol:g} is too coarse for these data: it shifts {worst.label} by "
-            f"{abs(worst.step_bias_sd):.2g} standard deviations ({worst.step_bias_sd * worst.relative_sd:+.2%}); take "
-            f"rtol = {FINER * rtol:g}"
+            f"the tolerance rtol = {rtol:g} is too coarse for these data: it shifts {worst.label} "
+            f"by {abs(worst.step_bias_sd):.2g} standard deviations "
+            f"({worst.step_bias_sd * worst.relative_sd:+.2%}); take rtol = {FINER * rtol:g}"
         )
     if not converged:
         out.append("the last stage stopped before it converged: give it more evaluations")
@@ -246,75 +297,101 @@ def notices_on(found: list[Any], converged: bool, rtol: float, unchecked: bool) 
 
 
 def identify(
-    problem: Problem, *, rtol: float = RTOL, plan: Sequence[Stage] | None = None, starts: int = 1, loss: Loss = "linear",
-    method: Method = "gauss_newton", heldout: Sequence[str] = (), workers: int = 1, checkpoint: str | Path | None = None,
-    progress: bool = False, seed: int = 0, tightenings: int = 2, assumptions: Assumed = "checked",
-    acknowledged: Sequence[str] = (),
+    problem: Problem, *, rtol: float = RTOL, plan: Sequence[Stage] | None = None, starts: int = 1,
+    loss: Loss = "linear", method: Method = "gauss_newton", heldout: Sequence[str] = (),
+    workers: int = 1, checkpoint: str | Path | None = None, progress: bool = False, seed: int = 0,
+    tightenings: int = 2, assumptions: Assumed = "checked", acknowledged: Sequence[str] = (),
 ) -> IdentificationResult:  # fmt: skip
-    """Find the unknown parameters of `problem`, with intervals, and find which of them the data do not determine.
+    """Find the unknown parameters of `problem`, with intervals, and find which of them the data do
+    not determine.
 
-    Every stage of the `plan` (`default_plan` by default, whose first stage is begun from `starts` Sobol points by
-    `seed`) freezes the steps that its tolerance chooses at its start, one sequence a recording, so that residuals are
-    smooth in the unknowns. `rtol` is the last stage's. At the end a run with a tenth of it tells how far the steps
-    shift the estimates: where that is more than `STEP_BIAS` standard deviations, the fit goes on with a tenth of the
-    tolerance, up to `tightenings` times (with the linear loss). `loss` is scipy's robust loss; `method` may descend on
-    the adjoint instead, with the linear loss only. Recordings named in `heldout` are predicted, not fitted; `workers`
-    threads run side by side. With a `checkpoint` folder every run is kept there: an identification that was
-    interrupted, called again with the same arguments, continues where it was.
+    Every stage of the `plan` (`default_plan` by default, whose first stage is begun from `starts`
+    Sobol points by `seed`) freezes the steps that its tolerance chooses at its start, one sequence
+    a recording, so that residuals are smooth in the unknowns. `rtol` is the last stage's. At the
+    end a run with a tenth of it tells how far the steps shift the estimates: where that is more
+    than `STEP_BIAS` standard deviations, the fit goes on with a tenth of the tolerance, up to
+    `tightenings` times (with the linear loss). `loss` is scipy's robust loss; `method` may descend
+    on the adjoint instead, with the linear loss only. Recordings named in `heldout` are predicted,
+    not fitted; `workers` threads run side by side. With a `checkpoint` folder every run is kept
+    there: an identification that was interrupted, called again with the same arguments, continues
+    where it was.
 
-    At the end the assumptions (mesh, touch-down ramp, place of the disc, numbers that are called known, faults of
-    sensors, the friction law) are tested to first order, a run each, and intervals allow for constants of the
-    computation that the data cannot tell. Where no test explains a misfit, a notice names the candidates, and `explain`
-    tries them. Before the fit recordings are held against what such a rig can do at all: signs, units, delays, zeros,
-    set-points, the body that a loop senses; `acknowledged` names findings that are no mistakes. With `assumptions` =
+    At the end the assumptions (mesh, touch-down ramp, place of the disc, numbers that are called
+    known, faults of sensors, the friction law) are tested to first order, a run each, and intervals
+    allow for constants of the computation that the data cannot tell. Where no test explains a
+    misfit, a notice names the candidates, and `explain` tries them. Before the fit recordings are
+    held against what such a rig can do at all: signs, units, delays, zeros, set-points, the body
+    that a loop senses; `acknowledged` names findings that are no mistakes. With `assumptions` =
     "trusted" both are left out.
 
-    Raises `ValueError` for what `Settings` does not take, and for recordings that are not there or cannot be what they
-    are taken for, `Unreachable` where the model cannot follow the data.
+    Raises `ValueError` for what `Settings` does not take, and for recordings that are not there or
+    cannot be what they are taken for, `Unreachable` where the model cannot follow the data.
     """
     unknown = set(heldout) - set(problem.names)
     if unknown or len(set(heldout)) == len(problem.recordings):
-        raise ValueError(f"`heldout` must name some of {list(problem.names)}, but not all; it is {list(heldout)}")
+        raise ValueError(
+            f"`heldout` must name some of {list(problem.names)}, but not all; it is {list(heldout)}"
+        )
     settings = Settings(
-        rtol=rtol, starts=starts, loss=loss, method=method, workers=workers, seed=seed, tightenings=tightenings,
-        assumptions=assumptions,
+        rtol=rtol, starts=starts, loss=loss, method=method, workers=workers, seed=seed,
+        tightenings=tightenings, assumptions=assumptions,
     )  # fmt: skip
     if plan is not None and (starts > 1 or rtol not in (RTOL, *(stage.rtol for stage in plan))):
-        raise ValueError("`starts` and `rtol` are those of the default plan: say them of the stages of `plan` instead")
+        raise ValueError(
+            "`starts` and `rtol` are those of the default plan: say them of the stages of `plan` "
+            "instead"
+        )
     fitted, began = [name for name in problem.names if name not in heldout], clock.perf_counter()
-    runner = Runner(problem.recordings, workers, Path(checkpoint) if checkpoint is not None else None)
-    findings = accepted(precheck(problem, runner, fitted), acknowledged) if assumptions != "trusted" else []
+    runner = Runner(
+        problem.recordings, workers, Path(checkpoint) if checkpoint is not None else None
+    )
+    findings = (
+        accepted(precheck(problem, runner, fitted), acknowledged)
+        if assumptions != "trusted"
+        else []
+    )
     for look in findings if progress else ():
         tqdm.write(plain(f"note: {look}"), file=sys.stderr)
     with explained(findings):
         if plan is None:
             plan = default_plan(problem, runner, rtol, fitted, starts)
         fit, stages = run_plan(
-            problem, runner, plan, problem.coordinates.start, loss=loss, method=method, seed=seed, progress=progress
+            problem,
+            runner,
+            plan,
+            problem.coordinates.start,
+            loss=loss,
+            method=method,
+            seed=seed,
+            progress=progress,
         )
     before = clock.perf_counter()
     with progress_bar("colour of the noise", progress) as bar:
         coloured = with_its_noise(problem, runner, plan[-1], fit, loss, method, bar)
     stages += [
-        stage_entry("with the noise that was found", plan[-1], plan[-1].rtol, one, before) for one in coloured.fits
+        stage_entry("with the noise that was found", plan[-1], plan[-1].rtol, one, before)
+        for one in coloured.fits
     ]
     how = How(fitted, tuple(heldout), tuple(acknowledged), settings)
     return conclude(coloured, runner, plan[-1], stages, how, findings, began, progress)
 
 
 def explain(problem: Problem, **how: Any) -> IdentificationResult:
-    """Identify, and look for the cause of a misfit that no test of an assumption explains to first order.
+    """Identify, and look for the cause of a misfit that no test of an assumption explains to first
+    order.
 
-    The fit is repeated without one assumption after the other (another law, number, mesh, place, sensor) until one
-    explains the data: some minutes each, with progress that names it. Takes the arguments of `identify`, and with its
-    `checkpoint` begins where that ended; Ctrl-C keeps what was tried. Raises what `identify` does.
+    The fit is repeated without one assumption after the other (another law, number, mesh, place,
+    sensor) until one explains the data: some minutes each, with progress that names it. Takes the
+    arguments of `identify`, and with its `checkpoint` begins where that ended; Ctrl-C keeps what
+    was tried. Raises what `identify` does.
     """
     return identify(problem, **how, assumptions="explained")
 
 
 @contextmanager
 def explained(findings: Sequence[str]) -> Iterator[None]:
-    """Tells whom the model cannot follow the data what looked wrong with the recordings themselves."""
+    """Tells whom the model cannot follow the data what looked wrong with the recordings
+    themselves."""
     try:
         yield
     except Unreachable as error:
@@ -322,9 +399,16 @@ def explained(findings: Sequence[str]) -> Iterator[None]:
 
 
 def with_its_noise(
-    problem: Problem, runner: Runner, stage: Stage, fit: Fit, loss: Loss, method: Method, notify: Notify
+    problem: Problem,
+    runner: Runner,
+    stage: Stage,
+    fit: Fit,
+    loss: Loss,
+    method: Method,
+    notify: Notify,
 ) -> Coloured:
-    """The fit of the last stage, gone on with whatever noise it leaves: by new Jacobians, then by the last one."""
+    """The fit of the last stage, gone on with whatever noise it leaves: by new Jacobians, then by
+    the last one."""
     free, which = np.isin(problem.coordinates.labels, stage.free), stage.recordings
     common: dict[str, Any] = {"which": which, "free": free, "steps": fit.steps, "notify": notify}
 
@@ -335,9 +419,17 @@ def with_its_noise(
         if number > 0 and loss == "linear" and last.at is not None:
             return chord(one, runner, last.x, last.at, **common)
         if method == "gauss_newton":
-            more: dict[str, Any] = {"evaluations": stage.evaluations, "tolerance": stage.tolerance, "loss": loss}
+            more: dict[str, Any] = {
+                "evaluations": stage.evaluations,
+                "tolerance": stage.tolerance,
+                "loss": loss,
+            }
             return gauss_newton(one, runner, last.x, first=last.at, **more, **common)
-        end = descend(one, runner, last.x, method=method, evaluations=4 * stage.evaluations, **common)
+        end = descend(
+            one, runner, last.x, method=method, evaluations=4 * stage.evaluations, **common
+        )
         return end._replace(at=residuals(one, end.x))
 
-    return allow_for_colour(problem, fit._replace(at=fit.at or residuals(problem, fit.x)), free, which, refit)
+    return allow_for_colour(
+        problem, fit._replace(at=fit.at or residuals(problem, fit.x)), free, which, refit
+    )

@@ -1,7 +1,9 @@
-"""Where the run of a recording begins: at rest in a known place, in a known state, or where some coordinates tell.
+"""Where the run of a recording begins: at rest in a known place, in a known state, or where some
+coordinates tell.
 
-A start adds coordinates of its own to a problem, called `start.<body>.<axis>` and the like, each with a prior; their
-values travel with those of the parameters, and the state at the beginning is differentiable in both.
+A start adds coordinates of its own to a problem, called `start.<body>.<axis>` and the like, each
+with a prior; their values travel with those of the parameters, and the state at the beginning is
+differentiable in both.
 """
 
 import warnings
@@ -32,19 +34,20 @@ PREFIX = "start."
 """How the names of a start's coordinates begin."""
 
 SETTLE = 0.2
-"""Time [s] that a disc at rest is given, before the first sample, to sink into the pad: twenty of the pads' own times
-tau."""
+"""Time [s] that a disc at rest is given, before the first sample, to sink into the pad: twenty of
+the pads' own times tau."""
 
 FORGOTTEN = 3.0
-"""Longest retardation times of the pads after which what a start gets wrong of their displacements counts as gone."""
+"""Longest retardation times of the pads after which what a start gets wrong of their displacements
+counts as gone."""
 
 BOUNDS = 8.0
 """Bounds of a start's coordinate: so many standard deviations of its prior to each side."""
 
 
 class StartCoordinate(NamedTuple):
-    """One coordinate of a start: its name, its prior's mean, where the search begins, and its standard deviation
-    [SI]."""
+    """One coordinate of a start: its name, its prior's mean, where the search begins, and its
+    standard deviation [SI]."""
 
     name: str
     mean: float
@@ -52,8 +55,8 @@ class StartCoordinate(NamedTuple):
 
 
 Begin = Callable[[Mapping[str, Tensor]], Tensor]
-"""The state (size,) at the beginning for values of the start's coordinates by name, differentiable in these and in the
-parameters of the rig that it was made for."""
+"""The state (size,) at the beginning for values of the start's coordinates by name, differentiable
+in these and in the parameters of the rig that it was made for."""
 
 
 class Start(Protocol):
@@ -69,17 +72,18 @@ class Start(Protocol):
         ...
 
     def begin(self, rig: Rig, samples: Samples) -> Begin:
-        """The state as a function, for a rig that has the nominal parameters now and may be given others later."""
+        """The state as a function, for a rig that has the nominal parameters now and may be given
+        others later."""
         ...
 
 
 class AtRest(NamedTuple):
-    """The disc of the paper's rig at rest on the lower pad at x [m], by default `scenario.x_C0`, and the bracket clear
-    of it.
+    """The disc of the paper's rig at rest on the lower pad at x [m], by default `scenario.x_C0`,
+    and the bracket clear of it.
 
-    `position_sd` [m] is how well that is known: above zero the place of the disc is a coordinate, `start.disc.x`. The
-    displacements of the pads are those at the nominal parameters, whatever the others are: most of what that gets wrong
-    has died away at the first sample.
+    `position_sd` [m] is how well that is known: above zero the place of the disc is a coordinate,
+    `start.disc.x`. The displacements of the pads are those at the nominal parameters, whatever the
+    others are: most of what that gets wrong has died away at the first sample.
     """
 
     position_sd: float = 0.0
@@ -88,11 +92,17 @@ class AtRest(NamedTuple):
 
     def coordinates(self, rig: Rig, samples: Samples) -> tuple[StartCoordinate, ...]:
         if not isinstance(rig, SoftGrasp):
-            raise ValueError("only the paper's rig has a rest of its own: give the recording another `start`")
+            raise ValueError(
+                "only the paper's rig has a rest of its own: give the recording another `start`"
+            )
         warn_of_memory(rig, self.lead)
         if not 0 <= self.position_sd <= 0.1:
             raise ValueError(f"`position_sd` must be from 0 to 0.1 m, but is {self.position_sd}")
-        return (StartCoordinate("start.disc.x", self.place(rig), self.position_sd),) if self.position_sd > 0 else ()
+        return (
+            (StartCoordinate("start.disc.x", self.place(rig), self.position_sd),)
+            if self.position_sd > 0
+            else ()
+        )
 
     def place(self, rig: SoftGrasp) -> float:
         """x of the disc [m]."""
@@ -121,8 +131,8 @@ class Known(NamedTuple):
 
 
 class RestState:
-    """The state of `AtRest`: displacements stay when parameters change, and massless pads get the forces that hold them
-    so."""
+    """The state of `AtRest`: displacements stay when parameters change, and massless pads get the
+    forces that hold them so."""
 
     def __init__(self, nominal: SoftGrasp, rig: SoftGrasp, x: float) -> None:
         self.rig, self.nominal = rig, deepcopy(nominal).requires_grad_(False)
@@ -145,28 +155,31 @@ class RestState:
 
 
 def held_start(nominal: SoftGrasp, rig: SoftGrasp) -> Tensor:
-    """The state (size,) of `AtRest` for a rig that may have other parameters than the nominal one."""
+    """The state (size,) of `AtRest` for a rig that may have other parameters than the nominal
+    one."""
     return RestState(nominal, rig, AtRest().place(nominal))({})
 
 
 def warn_of_memory(rig: Rig, lead: float) -> None:
-    """Warns of massless pads that do not forget their beginning before the first sample, `lead` [s] later."""
+    """Warns of massless pads that do not forget their beginning before the first sample, `lead` [s]
+    later."""
     for name, pad in rig.pads.items():
         longest = float(pad.material.chain()[1].detach().max())
         if not pad.inertial and lead < FORGOTTEN * longest:
             warnings.warn(
-                f"the run begins {lead:g} s before the first sample, but the pad `{name}` creeps for {longest:.3g} s: what "
-                f"is not known of its beginning reaches the samples; a `lead` of {FORGOTTEN * longest:.3g} s would do",
+                f"the run begins {lead:g} s before the first sample, but the pad `{name}` creeps "
+                f"for {longest:.3g} s: what is not known of its beginning reaches the samples; a "
+                f"`lead` of {FORGOTTEN * longest:.3g} s would do",
                 stacklevel=2,
             )
 
 
 def held_forces(pad: Pad, z: Tensor, nominal: Pad) -> Tensor:
-    """Forces (branches, nodes, 2) [N] that make, with the pad's present material, the displacements that z makes with
-    the nominal one.
+    """Forces (branches, nodes, 2) [N] that make, with the pad's present material, the displacements
+    that z makes with the nominal one.
 
-    They are in proportion to E depth, which needs no linear solve: a solve's last bits differ from call to call, and a
-    run that is made again must be the same.
+    They are in proportion to E depth, which needs no linear solve: a solve's last bits differ from
+    call to call, and a run that is made again must be the same.
     """
     material, was = pad.material, nominal.material
     if float(material.nu.detach()) != float(was.nu):
@@ -192,8 +205,9 @@ Normal = tuple[float, float]
 
 
 class Stretch(NamedTuple):
-    """The stretch of a contact's points is linear between `places` (k,) [m] along the pad's face, in the base's frame,
-    and zero a step beyond them. There it is normal with mean zero and the standard deviation `sd` [m]."""
+    """The stretch of a contact's points is linear between `places` (k,) [m] along the pad's face,
+    in the base's frame, and zero a step beyond them. There it is normal with mean zero and the
+    standard deviation `sd` [m]."""
 
     places: tuple[float, ...]
     sd: float
@@ -201,7 +215,11 @@ class Stretch(NamedTuple):
     def basis(self, pad: Pad) -> Array:
         """Stretches of the pad's contact points for one of 1 m at each place (points, k)."""
         at, knots = along(pad, pad.point_positions), np.array(self.places)
-        step = np.diff(knots).mean() if len(knots) > 1 else float(pad.mesh.length / pad.mesh.elements_x)
+        step = (
+            np.diff(knots).mean()
+            if len(knots) > 1
+            else float(pad.mesh.length / pad.mesh.elements_x)
+        )
         knots = np.concatenate(([knots[0] - step], knots, [knots[-1] + step]))
         return np.stack([np.interp(at, knots, row) for row in np.eye(len(knots))[1:-1]], -1)
 
@@ -214,10 +232,11 @@ def along(pad: Pad, positions: Tensor) -> Array:
 class MovingStart(NamedTuple):
     """A run begins in motion, `lead` [s] before the first sample.
 
-    `bodies` holds mean and standard deviation of every free coordinate by its name, "disc.x" [m, or rad], and of every
-    rate, "disc.v_x" [m/s, or rad/s]. What has a deviation above zero is a coordinate, "start.disc.x". `stretch` holds
-    by contact what is known of stretched springs, a coordinate a place, "start.L.stretch.0"; a contact left out has
-    none. Places are not points of a mesh, so that the same start serves other meshes.
+    `bodies` holds mean and standard deviation of every free coordinate by its name, "disc.x" [m, or
+    rad], and of every rate, "disc.v_x" [m/s, or rad/s]. What has a deviation above zero is a
+    coordinate, "start.disc.x". `stretch` holds by contact what is known of stretched springs, a
+    coordinate a place, "start.L.stretch.0"; a contact left out has none. Places are not points of a
+    mesh, so that the same start serves other meshes.
     """
 
     bodies: Mapping[str, Normal]
@@ -229,16 +248,23 @@ class MovingStart(NamedTuple):
         for name in self.stretch:
             if name not in rig.contacts:
                 raise ValueError(
-                    f"`stretch` of the start speaks of `{name}`; the contacts are {', '.join(rig.contacts)}"
+                    f"`stretch` of the start speaks of `{name}`; the contacts are "
+                    f"{', '.join(rig.contacts)}"
                 )
         out = [(f"{PREFIX}{name}", *normal) for name, normal in self.bodies.items()]
         for name, (places, sd) in self.stretch.items():
             if not places or not np.isfinite(places).all() or not (np.diff(places) > 0).all():
-                raise ValueError(f"the places of the stretch of `{name}` must be finite and increase, but are {places}")
+                raise ValueError(
+                    f"the places of the stretch of `{name}` must be finite and increase, but are "
+                    f"{places}"
+                )
             out += [(f"{PREFIX}{name}.stretch.{k}", 0.0, sd) for k in range(len(places))]
         for name, mean, sd in out:
             if not (np.isfinite(mean) and np.isfinite(sd) and sd >= 0):
-                raise ValueError(f"`{name}` needs a finite mean, and a deviation from 0 on, but has {mean} and {sd}")
+                raise ValueError(
+                    f"`{name}` needs a finite mean, and a deviation from 0 on, but has {mean} and "
+                    f"{sd}"
+                )
         if not (np.isfinite(self.lead) and self.lead >= 0):
             raise ValueError(f"`lead` of the start must not be negative, but is {self.lead}")
         warn_of_memory(rig, self.lead)
@@ -250,12 +276,17 @@ class MovingStart(NamedTuple):
         for name, contact in rig.contacts.items():
             pad = rig.pads[contact.pad]
             none = np.zeros((len(pad.point_nodes), 0))
-            basis[name] = torch.from_numpy(self.stretch[name].basis(pad) if name in self.stretch else none)
+            basis[name] = torch.from_numpy(
+                self.stretch[name].basis(pad) if name in self.stretch else none
+            )
 
         def state(values: Mapping[str, Tensor]) -> Tensor:
             stretch = {}
             for name, B in basis.items():
-                s = [values.get(f"{PREFIX}{name}.stretch.{k}", B.new_zeros(())) for k in range(B.shape[1])]
+                s = [
+                    values.get(f"{PREFIX}{name}.stretch.{k}", B.new_zeros(()))
+                    for k in range(B.shape[1])
+                ]
                 stretch[name] = B @ torch.stack([*s, B.new_zeros(())])[:-1]
             try:
                 return settled(rig, *placed(rig, signals, self.bodies, values), stretch)
@@ -266,8 +297,8 @@ class MovingStart(NamedTuple):
 
 
 def free_coordinates(rig: Rig) -> tuple[str, ...]:
-    """Names of the bodies' free coordinates, such as "disc.x", in the order of the state; with rates after them,
-    "disc.v_x"."""
+    """Names of the bodies' free coordinates, such as "disc.x", in the order of the state; with
+    rates after them, "disc.v_x"."""
     every = [(name, COORDINATES[axis]) for name, axes in rig.layout.free.items() for axis in axes]
     return tuple(f"{name}.{v}{axis}" for v in ("", "v_") for name, axis in every)
 
@@ -277,14 +308,16 @@ def check_names(rig: Rig, bodies: Mapping[str, Normal]) -> None:
     known = free_coordinates(rig)
     if wrong := [name for name in (*known, *bodies) if (name in known) != (name in bodies)]:
         fault = "is missing" if wrong[0] in known else "is none of them"
-        raise ValueError(f"`bodies` of a start must name {', '.join(known)}, but `{wrong[0]}` {fault}")
+        raise ValueError(
+            f"`bodies` of a start must name {', '.join(known)}, but `{wrong[0]}` {fault}"
+        )
 
 
 def placed(
     rig: Rig, signals: Tensor, bodies: Mapping[str, Normal], values: Mapping[str, Tensor]
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Poses and velocities by body (3,) for values of the coordinates, the means where there are none; signals
-    (signals, 2) place what is driven."""
+    """Poses and velocities by body (3,) for values of the coordinates, the means where there are
+    none; signals (signals, 2) place what is driven."""
     parts = rig.held(signals)
     for part, v in zip(parts, ("", "v_")):
         for name, axes in rig.layout.free.items():

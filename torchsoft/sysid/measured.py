@@ -1,6 +1,7 @@
 """Recordings and problems as files state them, and the cost of an identification.
 
-Every error is a `ValueError` in a sentence that names the file, and the row and column or the field.
+Every error is a `ValueError` in a sentence that names the file, and the row and column or the
+field.
 """
 
 import os
@@ -49,7 +50,8 @@ CHECKED = 30
 """Runs that a recording is asked for to check what is taken for granted."""
 
 FEW, COLUMN = 8, 0.09
-"""So many unknowns are a few; what each one more adds to the time of a step that is differentiated."""
+"""So many unknowns are a few; what each one more adds to the time of a step that is
+differentiated."""
 
 
 def cost(
@@ -60,8 +62,9 @@ def cost(
     heldout: tuple[str, ...] = (),
     method: str = "gauss_newton",
 ) -> Cost:
-    """Of `default_plan` where every stage takes all its evaluations, and of the checks before and after it; descents on
-    the adjoint take more of them, and memory for a matrix that interpolates between the rows. For the paper's rig."""
+    """Of `default_plan` where every stage takes all its evaluations, and of the checks before and
+    after it; descents on the adjoint take more of them, and memory for a matrix that interpolates
+    between the rows. For the paper's rig."""
     fitted = [r for r in problem.recordings if r.name not in heldout]
     slowest = min(fitted, key=lambda r: r.speed)
     rows = {r.name: len(r.grid(problem.interpolated).t) for r in problem.recordings}
@@ -70,22 +73,43 @@ def cost(
     def runs(recording: Recording) -> list[tuple[float, float, bool]]:
         """How many at which tolerance, and whether they are differentiated."""
         first = [(starts * FIRST, loose, True)] if recording is slowest else []
-        stages = [(ALL, loose, True), (FREE, usual, True), (LAST if rtol < usual else 0, rtol, True)]
-        return [*first, *stages, (1, loose, False), (1, FINER * rtol, False), (CHECKED, usual, False)]
+        stages = [
+            (ALL, loose, True),
+            (FREE, usual, True),
+            (LAST if rtol < usual else 0, rtol, True),
+        ]
+        return [
+            *first,
+            *stages,
+            (1, loose, False),
+            (1, FINER * rtol, False),
+            (CHECKED, usual, False),
+        ]
 
     descent, steps, seconds = method != "gauss_newton", 0.0, []
     for recording in fitted:
         seconds.append(0.0)
-        mine = [c for c in problem.coordinates.all if c.of_the_rig and c.recording in (None, recording.name)]
+        mine = [
+            c
+            for c in problem.coordinates.all
+            if c.of_the_rig and c.recording in (None, recording.name)
+        ]
         more = 1 + COLUMN * max(len(mine) - FEW, 0)
         for number, by, differentiated in runs(recording):
-            length = (recording.duration + recording.start.lead) * steps_per_second(by) + rows[recording.name]
+            length = (recording.duration + recording.start.lead) * steps_per_second(by) + rows[
+                recording.name
+            ]
             number *= 4 if descent and differentiated else 1
             steps += number * length
-            step = step_seconds(paper_settings(recording), differentiated) * (more if differentiated else 1.0)
+            step = step_seconds(paper_settings(recording), differentiated) * (
+                more if differentiated else 1.0
+            )
             seconds[-1] += number * (length * step + RUN)
     matrix = 3 * 8 / 2**30 if descent else 0.0
-    memory = sorted(rows[r.name] * (row_memory(paper_settings(r)) + matrix * rows[r.name]) for r in problem.recordings)
+    memory = sorted(
+        rows[r.name] * (row_memory(paper_settings(r)) + matrix * rows[r.name])
+        for r in problem.recordings
+    )
     at_once = max(1, min(workers, len(fitted)))
     return Cost(
         steps=steps,
@@ -97,7 +121,9 @@ def cost(
 def one_by_one(costs: Iterable[Cost]) -> Cost:
     """Of several identifications, such as those of competing laws."""
     every = list(costs)
-    return Cost(sum(c.steps for c in every), sum(c.seconds for c in every), max(c.memory for c in every))
+    return Cost(
+        sum(c.steps for c in every), sum(c.seconds for c in every), max(c.memory for c in every)
+    )
 
 
 def paper_settings(recording: Recording) -> Parameters:
@@ -110,13 +136,16 @@ def paper_settings(recording: Recording) -> Parameters:
 
 
 BEGINNING, CREEP = 10e-3, 20e-3
-"""For so long [s] nothing may move faster than this [m/s]: a disc put down on a pad still settles."""
+"""For so long [s] nothing may move faster than this [m/s]: a disc put down on a pad still
+settles."""
 
 APART = 1e-3
-"""How far [m] the first samples may be from where the run begins; the disc may roll into a dent while it settles."""
+"""How far [m] the first samples may be from where the run begins; the disc may roll into a dent
+while it settles."""
 
 SUNK = 3e-4
-"""How far [m] below undeformed touch the bracket may begin: a disc sinks into its pad under its weight."""
+"""How far [m] below undeformed touch the bracket may begin: a disc sinks into its pad under its
+weight."""
 
 WAY_OUT = 'or say start = {kind = "moving"} for a recording that begins in motion or in mid-grasp'
 
@@ -126,8 +155,8 @@ STATED = "as stated"
 
 @dataclass(frozen=True)
 class Case:
-    """A problem as its files state it; `tables` are the recordings' by name; `laws`, if there are competing ones, are
-    that problem and those with the others."""
+    """A problem as its files state it; `tables` are the recordings' by name; `laws`, if there are
+    competing ones, are that problem and those with the others."""
 
     problem: Problem
     config: Config
@@ -135,9 +164,11 @@ class Case:
     laws: dict[str, Problem] = field(default_factory=dict)
 
 
-def known_parameters(config: Path, name: str, tables: Tables, *settings: dict[str, Any]) -> Parameters:
-    """Parameters of the recording `name`: the settings, the later ones first, with the reach of its set-points as
-    scenario.
+def known_parameters(
+    config: Path, name: str, tables: Tables, *settings: dict[str, Any]
+) -> Parameters:
+    """Parameters of the recording `name`: the settings, the later ones first, with the reach of its
+    set-points as scenario.
 
     Raises `ValueError` naming the configuration and the field, or the row where nothing is grasped.
     """
@@ -151,21 +182,25 @@ def known_parameters(config: Path, name: str, tables: Tables, *settings: dict[st
     x, y = across.values["x_d"], down.values["y_d"]
     if y.min() >= (touch := apart(Parameters.model_construct(**made))):
         raise ValueError(
-            f"{down.at(int(y.argmin()))}, column `y_d`: the bracket never comes lower than {1e3 * y.min():.4g} mm, but "
-            f"the pads of {config} touch the disc at {1e3 * touch:.4g} mm ({STACK}): nothing is grasped"
+            f"{down.at(int(y.argmin()))}, column `y_d`: the bracket never comes lower than "
+            f"{1e3 * y.min():.4g} mm, but the pads of {config} touch the disc at {1e3 * touch:.4g} "
+            f"mm ({STACK}): nothing is grasped"
         )
     scenario = tree.get("scenario")
     given = scenario if isinstance(scenario, dict) else {}
     signed = x - (made["scenario"].x_C0 if "x_C0" in given else x[0])
-    part = 0.5 if made["control"].senses == "bracket" else 1.0  # a disc rolls half as far as the bracket
+    part = (
+        0.5 if made["control"].senses == "bracket" else 1.0
+    )  # a disc rolls half as far as the bracket
     lowest, farthest = int(y.argmin()), int(np.abs(signed).argmax())
     mine = {"y_Br_grasp": float(y[lowest]), "travel": part * float(signed[farthest])}
     try:
         return Parameters.model_validate(tree | {"scenario": mine | given})
     except InvalidTable as error:
         raise ValueError(
-            f"{whose}: {error} (scenario.y_Br_grasp and scenario.travel, unless given, are those of {down.at(lowest)}, column "
-            f"`y_d`, and of {across.row} {across.rows[farthest]}, column `x_d`)"
+            f"{whose}: {error} (scenario.y_Br_grasp and scenario.travel, unless given, are those "
+            f"of {down.at(lowest)}, column `y_d`, and of {across.row} {across.rows[farthest]}, "
+            "column `x_d`)"
         ) from None
 
 
@@ -183,19 +218,26 @@ def check_plausible(tables: Tables, p: Parameters, sensors: Mapping[str, Sensor]
         by = "" if unit in ranges else " (pad.length)" if name.startswith("x") else f" ({STACK})"
         for i in np.flatnonzero((column < low) | (column > high))[:1].tolist():
             raise ValueError(
-                f"{table.at(i)}, column `{name}`: {column[i]:.4g} {unit} is not plausible, it should be between {low:.3g} "
-                f"and {high:.3g} {unit}{by}; is the unit in the heading right?"
+                f"{table.at(i)}, column `{name}`: {column[i]:.4g} {unit} is not plausible, it "
+                f"should be between {low:.3g} and {high:.3g} {unit}{by}; is the unit in the "
+                "heading right?"
             )
 
 
-def check_rest(tables: Tables, p: Parameters, sensors: Mapping[str, Sensor], position_sd: float) -> None:
-    """Raises `ValueError` for a recording that does not begin at rest, with the disc where `scenario.x_C0` says and the
-    bracket clear of it; it names row and column."""
+def check_rest(
+    tables: Tables, p: Parameters, sensors: Mapping[str, Sensor], position_sd: float
+) -> None:
+    """Raises `ValueError` for a recording that does not begin at rest, with the disc where
+    `scenario.x_C0` says and the bracket clear of it; it names row and column."""
     H, x_C0, first = apart(p), p.scenario.x_C0, tables.begin
     down = tables.of("y_d")
     begin = {"x_d": x_C0, "x_C": x_C0, "x_Br": x_C0, "theta": 0.0, "y_Br": down.values["y_d"][0]}
     for name, (t, column) in tables.columns.items():
-        unit, table, here = CHANNELS[name].unit, tables.of(name), np.flatnonzero(np.isfinite(column))
+        unit, table, here = (
+            CHANNELS[name].unit,
+            tables.of(name),
+            np.flatnonzero(np.isfinite(column)),
+        )
         asked = name not in MEASURED
         if not here.size or unit == "N" or (not asked and t[here[0]] > first + BEGINNING):
             continue
@@ -203,11 +245,18 @@ def check_rest(tables: Tables, p: Parameters, sensors: Mapping[str, Sensor], pos
         slack, bias = (8 * sensor.noise, sensor.bias) if sensor else (0.0, 0.0)
         reach = (APART + BOUNDS * position_sd) * size + slack + bias
         if name in begin and abs(column[here[0]] - begin[name]) > reach:
-            what = "scenario.x_C0" if name.startswith("x") else "the set-point y_d" if name == "y_Br" else "the start"
+            what = (
+                "scenario.x_C0"
+                if name.startswith("x")
+                else "the set-point y_d"
+                if name == "y_Br"
+                else "the start"
+            )
             opposite = abs(column[here[0]] + begin[name]) <= reach
             raise ValueError(
-                f"{table.at(int(here[0]))}, column `{name}`: it begins at {column[here[0]]:.5g} {unit}, but {what} is "
-                f"{begin[name]:.5g} {unit}" + ("; is its sign opposite?" if opposite else f"; fix that, {WAY_OUT}")
+                f"{table.at(int(here[0]))}, column `{name}`: it begins at {column[here[0]]:.5g} "
+                f"{unit}, but {what} is {begin[name]:.5g} {unit}"
+                + ("; is its sign opposite?" if opposite else f"; fix that, {WAY_OUT}")
             )
         t = t[here]
         early = (t <= first + BEGINNING) | (np.arange(len(t)) < 2)
@@ -217,18 +266,22 @@ def check_rest(tables: Tables, p: Parameters, sensors: Mapping[str, Sensor], pos
             moving = np.abs(y - y[0]) > CREEP * size * (t - t[0]) + slack
         for i in np.flatnonzero(moving)[:1].tolist():
             raise ValueError(
-                f"{table.at(int(here[i]))}, column `{name}` moves already: a recording must begin at rest, the disc on the "
-                f"lower pad and the bracket clear of it, {WAY_OUT}"
+                f"{table.at(int(here[i]))}, column `{name}` moves already: a recording must begin "
+                f"at rest, the disc on the lower pad and the bracket clear of it, {WAY_OUT}"
             )
     if (y := down.values["y_d"][0]) < H - SUNK:
         raise ValueError(
-            f"{down.at(0)}, column `y_d`: the bracket must begin clear of the disc, but begins at {1e3 * y:.4g} mm, and the "
-            f"pads touch the disc at {1e3 * H:.4g} mm ({STACK}); fix that, {WAY_OUT}"
+            f"{down.at(0)}, column `y_d`: the bracket must begin clear of the disc, but begins at "
+            f"{1e3 * y:.4g} mm, and the pads touch the disc at {1e3 * H:.4g} mm ({STACK}); fix "
+            f"that, {WAY_OUT}"
         )
 
 
-def read_recording(path: str | Path, name: str, p: Parameters, sensors: dict[str, Sensor]) -> Recording:
-    """A recording of one CSV or NetCDF file with the given settings. Raises `ValueError` naming row and column."""
+def read_recording(
+    path: str | Path, name: str, p: Parameters, sensors: dict[str, Sensor]
+) -> Recording:
+    """A recording of one CSV or NetCDF file with the given settings. Raises `ValueError` naming row
+    and column."""
     return recording(read_tables([Path(path)], (), {}), name, p, sensors)
 
 
@@ -237,13 +290,23 @@ AT_REST, PLAIN = Rest(), KelvinVoigtPads()
 
 
 def recording(
-    tables: Tables, name: str, p: Parameters, sensors: dict[str, Sensor], start: Beginning = AT_REST, pads: Pads = PLAIN
+    tables: Tables,
+    name: str,
+    p: Parameters,
+    sensors: dict[str, Sensor],
+    start: Beginning = AT_REST,
+    pads: Pads = PLAIN,
 ) -> Recording:
-    """The recording that tables hold, of a rig with the parameters p. Raises `ValueError` naming row and column."""
+    """The recording that tables hold, of a rig with the parameters p. Raises `ValueError` naming
+    row and column."""
     check_plausible(tables, p, sensors)
     if isinstance(start, Rest):
         check_rest(tables, p, sensors, start.position_sd)
-    columns, samples, files = tables.columns, {}, ", ".join(str(table.path) for table in tables.tables)
+    columns, samples, files = (
+        tables.columns,
+        {},
+        ", ".join(str(table.path) for table in tables.tables),
+    )
     for channel in (c for c in MEASURED if c in columns):
         t, y = columns[channel]
         here = np.isfinite(y)
@@ -251,12 +314,15 @@ def recording(
             samples[channel] = (t[here], y[here])
         elif channel in sensors:
             raise ValueError(
-                f"{tables.of(channel).path}, column `{channel}` has {here.sum()} samples, but needs at least two"
+                f"{tables.of(channel).path}, column `{channel}` has {here.sum()} samples, but "
+                "needs at least two"
             )
     if not set(samples) & set(sensors):
         raise ValueError(f"{files} has no column for any of the sensors {', '.join(sensors)}")
     rates = {f"{name}_dot": columns.get(f"{name}_dot") for name in SETPOINTS}
-    signals = {name: sampled(*columns[name], rates.get(f"{name}_dot")) for name in (*SETPOINTS, "F_ff")}
+    signals = {
+        name: sampled(*columns[name], rates.get(f"{name}_dot")) for name in (*SETPOINTS, "F_ff")
+    }
     made = Recording(name, rig(p, Reference(**signals), pads), samples)
     if isinstance(start, Moving):
         given = {coordinate: (one.mean, one.sd) for coordinate, one in start.given.items()}
@@ -272,15 +338,18 @@ def sampled(t: np.ndarray, y: np.ndarray, rate: tuple[np.ndarray, np.ndarray] | 
 
 
 def rig(p: Parameters, reference: Reference, pads: Pads) -> SoftGrasp:
-    """The paper's rig, on pads of the material that is stated. Raises `ValueError` for moduli that do not fit
-    together."""
+    """The paper's rig, on pads of the material that is stated. Raises `ValueError` for moduli that
+    do not fit together."""
     q, material = p.pad, None
     if isinstance(pads, StandardLinearPads):
         if pads.E_instant <= p.pad.E:
             raise ValueError(
-                f"pads.E_instant = {pads.E_instant:g} must be above pad.E = {p.pad.E:g}, the relaxed modulus"
+                f"pads.E_instant = {pads.E_instant:g} must be above pad.E = {p.pad.E:g}, the "
+                "relaxed modulus"
             )
-        material = StandardLinearSolid(q.E, pads.E_instant, q.nu, q.rho, q.tau, q.depth, pads.tau_instant)
+        material = StandardLinearSolid(
+            q.E, pads.E_instant, q.nu, q.rho, q.tau, q.depth, pads.tau_instant
+        )
     elif not isinstance(pads, KelvinVoigtPads):
         series = pads.model_dump(exclude={"kind"})
         material = KINDS[pads.kind](E=q.E, nu=q.nu, rho=q.rho, depth=q.depth, **series)
@@ -294,30 +363,44 @@ def stem(path: Path) -> str:
     return os.fsencode(path.stem).decode("utf-8", "replace")
 
 
-def sources(data: Sequence[str | Path], config: Path, stated: Config) -> dict[str, tuple[Entry, list[Path]]]:
-    """What is particular about every recording, and its files, by name. Raises `ValueError` for names that do not
-    fit."""
+def sources(
+    data: Sequence[str | Path], config: Path, stated: Config
+) -> dict[str, tuple[Entry, list[Path]]]:
+    """What is particular about every recording, and its files, by name. Raises `ValueError` for
+    names that do not fit."""
     own = {entry.name or stem(Path(entry.paths[0])): entry for entry in stated.recordings}
     files = [(stem(Path(file)), [Path(file)]) for file in data]
-    files += [(name, [config.parent / path for path in entry.paths]) for name, entry in own.items() if entry.paths]
+    files += [
+        (name, [config.parent / path for path in entry.paths])
+        for name, entry in own.items()
+        if entry.paths
+    ]
     names = [name for name, _ in files]
     if not files:
-        raise ValueError(f"there is nothing to identify from: no data file, and no recording with a file in {config}")
+        raise ValueError(
+            "there is nothing to identify from: no data file, and no recording with a file in "
+            f"{config}"
+        )
     if len(own) < len(stated.recordings) or len(set(names)) < len(names):
-        raise ValueError(f"{config}: recordings need names of their own, but are called {line(', '.join(names))}")
+        raise ValueError(
+            f"{config}: recordings need names of their own, but are called {line(', '.join(names))}"
+        )
     if strange := [name for name in (*own, *stated.heldout) if name not in names]:
         where = "heldout" if strange[0] in stated.heldout else "recordings"
         raise ValueError(
-            f"{config}, {where}: there is no recording `{line(strange[0], 80)}`; the recordings' names are {', '.join(names)}"
+            f"{config}, {where}: there is no recording `{line(strange[0], 80)}`; the recordings' "
+            f"names are {', '.join(names)}"
         )
     if stated.heldout and set(stated.heldout) == set(names):
-        raise ValueError(f"{config}, heldout: it names every recording, so that nothing is left to fit")
+        raise ValueError(
+            f"{config}, heldout: it names every recording, so that nothing is left to fit"
+        )
     return {name: (own.get(name, Entry(name=name)), paths) for name, paths in files}
 
 
 def load(data: Sequence[str | Path], config: str | Path) -> Case:
-    """The problem that data files and a configuration state. Raises `ValueError`, and `OSError` for what cannot be
-    read."""
+    """The problem that data files and a configuration state. Raises `ValueError`, and `OSError` for
+    what cannot be read."""
     config = Path(config)
     stated = read_config(config)
     entries, tables = sources(data, config, stated), dict[str, Tables]()
@@ -329,35 +412,48 @@ def load(data: Sequence[str | Path], config: str | Path) -> Case:
                 raise
             own = "files" if entry.files else "file"
             raise ValueError(
-                f"{config}, recordings: `{own}` of `{name}`: {line(error.filename)}: {error.strerror}"
+                f"{config}, recordings: `{own}` of `{name}`: {line(error.filename)}: "
+                f"{error.strerror}"
             ) from None
     left_out = {name for one in tables.values() for table in one.tables for name in table.ignored}
     if strange := [name for name in stated.ignore if name not in left_out]:
         raise ValueError(f"{config}, ignore: no file has a column `{line(strange[0], 80)}`")
     for where, missing, of in (
         (f"{config}, missing", stated.missing, list(tables.values())),
-        *((f"{config}, recordings: missing of `{k}`", entry.missing, [tables[k]]) for k, (entry, _) in entries.items()),
+        *(
+            (f"{config}, recordings: missing of `{k}`", entry.missing, [tables[k]])
+            for k, (entry, _) in entries.items()
+        ),
     ):
         filled = {name for one in of for name in one.constants}
         if strange := [name for name in missing.over(Missing()) if name not in filled]:
             raise ValueError(
-                f"{where}: {strange[0]} is not missing, there is a column; leave the constant out, or the column: say "
-                f"ignore = [{shown(strange[0])}]"
+                f"{where}: {strange[0]} is not missing, there is a column; leave the constant out, "
+                f"or the column: say ignore = [{shown(strange[0])}]"
             )
 
     def problem(law: Law, what: str) -> Problem:
         made = []
         for name, (entry, _) in entries.items():
-            p = known_parameters(config, name, tables[name], stated.settings, entry.settings, law.settings)
+            p = known_parameters(
+                config, name, tables[name], stated.settings, entry.settings, law.settings
+            )
             try:
                 made.append(
                     recording(
-                        tables[name], name, p, stated.sensors, entry.start or stated.start, law.pads or stated.pads
+                        tables[name],
+                        name,
+                        p,
+                        stated.sensors,
+                        entry.start or stated.start,
+                        law.pads or stated.pads,
                     )
                 )
             except ValueError as error:
                 known = any(str(table.path) in str(error) for table in tables[name].tables)
-                raise error if known else ValueError(f"{config}{what}, recording `{name}`: {error}") from None
+                raise (
+                    error if known else ValueError(f"{config}{what}, recording `{name}`: {error}")
+                ) from None
         try:
             return Problem(made, stated.sensors, unknowns_of(stated, law))
         except ValueError as error:
@@ -367,7 +463,8 @@ def load(data: Sequence[str | Path], config: str | Path) -> Case:
     laws = {name: problem(law, f", compare.{name}") for name, law in stated.compare.items()}
     if STATED in laws:
         raise ValueError(
-            f"{config}, compare: the law of the file itself is called `{STATED}`; call the other one otherwise"
+            f"{config}, compare: the law of the file itself is called `{STATED}`; call the other "
+            "one otherwise"
         )
     return Case(main, stated, tables, {STATED: main, **laws} if laws else {})
 
@@ -382,6 +479,7 @@ def unknowns_of(stated: Config, law: Law) -> dict[str, Unknown]:
 def unreachable(error: Unreachable, tables: Mapping[str, Tables]) -> str:
     """Which recording the model could not follow, and the row of its file where the run ended."""
     return "; ".join(
-        f"{tables[name].near(lost.time)}: the model cannot follow recording `{name}` here: {lost.reason}"
+        f"{tables[name].near(lost.time)}: the model cannot follow recording `{name}` here: "
+        f"{lost.reason}"
         for name, lost in error.lost.items()
     )

@@ -1,11 +1,13 @@
 """Noise as it is: coloured, as an autoregression whose order the data choose.
 
-Residuals (m,) of one channel are in units of the noise that its sensor states. An autoregression of order p is
+Residuals (m,) of one channel are in units of the noise that its sensor states. An autoregression of
+order p is
 
     u_k = phi_1 u_(k-1) + ... + phi_p u_(k-p) + scale e_k,        e_k independent, normal, of variance 1,
 
-on a regular grid, of which samples may be missing. Its whitener W has W' W = K^-1, K the covariance of the samples that
-are there, so |W r|^2 + log det K is -2 log likelihood, but for a constant, and W J is the Jacobian that belongs to W r.
+on a regular grid, of which samples may be missing. Its whitener W has W' W = K^-1, K the covariance
+of the samples that are there, so |W r|^2 + log det K is -2 log likelihood, but for a constant, and
+W J is the Jacobian that belongs to W r.
 """
 
 from collections.abc import Sequence
@@ -22,8 +24,8 @@ JITTER = 0.05
 """Part of the spacing by which samples may be off their grid."""
 
 MEMORY = 200
-"""Most samples of the past that a whitened one looks back at. Fewer do exactly, as soon as p of them follow each
-other."""
+"""Most samples of the past that a whitened one looks back at. Fewer do exactly, as soon as p of
+them follow each other."""
 
 ORDERS = 12
 """Largest order that a fit of the noise tries."""
@@ -33,16 +35,16 @@ SAMPLES_AN_ORDER = 10
 
 
 def spacing(t: Array) -> float:
-    """Of the grid that sample times t (m,) [s] lie on, some of whose points may be empty: the mean of what lies between
-    neighbours."""
+    """Of the grid that sample times t (m,) [s] lie on, some of whose points may be empty: the mean
+    of what lies between neighbours."""
     apart = np.diff(t)
     near = apart[apart < 1.5 * np.quantile(apart, 0.1)]
     return float(near.mean())
 
 
 def positions(t: Array, h: float) -> tuple[Array, bool]:
-    """Sample times t (m,) [s] over the spacing h [s], from 0, and whether they are whole numbers, but for `JITTER`;
-    then rounded."""
+    """Sample times t (m,) [s] over the spacing h [s], from 0, and whether they are whole numbers,
+    but for `JITTER`; then rounded."""
     apart = np.diff(t) / h
     whole = np.round(apart)
     regular = bool((np.abs(apart - whole) <= JITTER).all() and (whole >= 1).all())
@@ -70,9 +72,9 @@ def reflections(phi: Sequence[float]) -> Array:
 
 @dataclass(frozen=True)
 class Autoregression:
-    """Coloured noise of one channel: coefficients `phi` (p,), the standard deviation `scale` of the innovations, in
-    units of the noise that the sensor states, and the `spacing` [s] of the samples that they belong to; white without
-    coefficients.
+    """Coloured noise of one channel: coefficients `phi` (p,), the standard deviation `scale` of the
+    innovations, in units of the noise that the sensor states, and the `spacing` [s] of the samples
+    that they belong to; white without coefficients.
 
     Raises `ValueError` where it is not stationary.
     """
@@ -83,10 +85,13 @@ class Autoregression:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.phi).all() and (np.abs(reflections(self.phi)) < 1).all()):
-            raise ValueError(f"noise with the coefficients {self.phi} grows without bound: it is not stationary")
+            raise ValueError(
+                f"noise with the coefficients {self.phi} grows without bound: it is not stationary"
+            )
         if not (self.scale > 0 and self.spacing > 0):
             raise ValueError(
-                f"`scale` and `spacing` of noise must be positive, but are {self.scale} and {self.spacing}"
+                f"`scale` and `spacing` of noise must be positive, but are {self.scale} and "
+                f"{self.spacing}"
             )
 
     @classmethod
@@ -108,7 +113,9 @@ class Autoregression:
         """At lags 0 to n - 1 (n,)."""
         p = self.order
         a = np.concatenate(([1.0], -np.array(self.phi)))
-        lag = np.abs(np.subtract.outer(np.arange(p + 1), np.arange(p + 1)))  # of Yule and Walker: sum_j a_j gamma_|i-j|
+        lag = np.abs(
+            np.subtract.outer(np.arange(p + 1), np.arange(p + 1))
+        )  # of Yule and Walker: sum_j a_j gamma_|i-j|
         equations = np.zeros((p + 1, p + 1))
         np.add.at(equations, (np.arange(p + 1)[:, None], lag), a)
         first = np.linalg.solve(equations, np.eye(p + 1)[0] * self.scale**2)
@@ -131,9 +138,10 @@ class Autoregression:
     def whitener(self, t: Array) -> sparse.csr_array:
         """W (m, m), lower triangular, for samples at t (m,) [s].
 
-        A row is the sample less what the past predicts, over the standard deviation of that; gaps in the grid are
-        exact, but for what lies more than `MEMORY` samples back. Off a regular grid only order 1 has a meaning, as phi
-        to the power of the time between samples over `spacing`. Raises `ValueError` for higher orders there.
+        A row is the sample less what the past predicts, over the standard deviation of that; gaps
+        in the grid are exact, but for what lies more than `MEMORY` samples back. Off a regular grid
+        only order 1 has a meaning, as phi to the power of the time between samples over `spacing`.
+        Raises `ValueError` for higher orders there.
         """
         k, regular = positions(t, self.spacing)
         m, p = len(t), self.order
@@ -141,7 +149,8 @@ class Autoregression:
             return sparse.csr_array(sparse.diags_array(np.full(m, 1 / self.scale)))
         if not regular and (p > 1 or self.phi[0] < 0):
             raise ValueError(
-                f"noise of order {p} is known every {self.spacing:g} s only, but the samples are not on such a grid"
+                f"noise of order {p} is known every {self.spacing:g} s only, but the samples are "
+                "not on such a grid"
             )
         if not regular:
             rho = self.phi[0] ** np.diff(k)
@@ -151,7 +160,9 @@ class Autoregression:
         grid = k.astype(int)
         first = pasts(grid, p)
         length = np.arange(m) - first + 1
-        own = (length == p + 1) & (grid - grid[first] == p)  # those whose past is the last p samples
+        own = (length == p + 1) & (
+            grid - grid[first] == p
+        )  # those whose past is the last p samples
         values, known = np.tile(np.append(-np.array(self.phi[::-1]), 1.0) / self.scale, (m, 1)), {}
         gamma, rows = self.autocovariance(grid[-1] + 1), list[Array](values)
         for i in np.flatnonzero(~own):
@@ -159,7 +170,11 @@ class Autoregression:
             key = lags.tobytes()
             if key not in known:
                 K = gamma[np.abs(np.subtract.outer(lags, lags))]
-                past = linalg.solve(K[:-1, :-1], K[:-1, -1], assume_a="pos") if len(lags) > 1 else np.zeros(0)
+                past = (
+                    linalg.solve(K[:-1, :-1], K[:-1, -1], assume_a="pos")
+                    if len(lags) > 1
+                    else np.zeros(0)
+                )
                 known[key] = np.append(-past, 1.0) / np.sqrt(K[-1, -1] - K[-1, :-1] @ past)
             rows[i] = known[key]
         ends = np.concatenate(([0], np.cumsum(length)))
@@ -168,8 +183,8 @@ class Autoregression:
 
 
 def pasts(grid: NDArray[np.int_], p: int) -> NDArray[np.int_]:
-    """For samples at the points `grid` (m,): the first one that has to be known to predict each from its past (m,).
-    What came before p in a row does not matter."""
+    """For samples at the points `grid` (m,): the first one that has to be known to predict each
+    from its past (m,). What came before p in a row does not matter."""
     i = np.arange(len(grid))
     begins = np.concatenate(([True], np.diff(grid) != 1))
     run = i - np.maximum.accumulate(np.where(begins, i, 0)) + 1  # samples in a row, up to this one
@@ -184,8 +199,8 @@ def log_det(W: sparse.csr_array) -> float:
 
 @dataclass(frozen=True)
 class Score:
-    """One order that was tried: -2 log likelihood of all samples, and the criteria of Akaike, corrected, and of
-    Bayes."""
+    """One order that was tried: -2 log likelihood of all samples, and the criteria of Akaike,
+    corrected, and of Bayes."""
 
     order: int
     deviance: float
@@ -200,17 +215,23 @@ class NoiseFit(NamedTuple):
     scores: tuple[Score, ...]
 
 
-def fit_noise(series: Sequence[tuple[Array, Array]], parameters: float = 0.0, most: int = ORDERS) -> NoiseFit:
+def fit_noise(
+    series: Sequence[tuple[Array, Array]], parameters: float = 0.0, most: int = ORDERS
+) -> NoiseFit:
     """Noise of one channel from its residuals: times (m,) [s] and residuals (m,) of each recording.
 
-    Every order up to `most`, as far as the samples go, is fitted by Burg's method for segments (de Waele and Broersen,
-    2000), which gives stationary noise only, and the one with the least Bayesian criterion is taken; its likelihood is
-    exact, with gaps, and where a recording is sampled at a whole part of the highest rate. `parameters` is how many
-    unknowns these residuals have been fitted with. Without such a grid the orders are 0 and 1, by maximum likelihood.
+    Every order up to `most`, as far as the samples go, is fitted by Burg's method for segments (de
+    Waele and Broersen, 2000), which gives stationary noise only, and the one with the least
+    Bayesian criterion is taken; its likelihood is exact, with gaps, and where a recording is
+    sampled at a whole part of the highest rate. `parameters` is how many unknowns these residuals
+    have been fitted with. Without such a grid the orders are 0 and 1, by maximum likelihood.
     """
     h, m = min(spacing(t) for t, _ in series), sum(len(t) for t, _ in series)
     if all(positions(t, h)[1] for t, _ in series):
-        found = burg([part for t, r in series for part in segments(t, r, h)], min(most, m // SAMPLES_AN_ORDER))
+        found = burg(
+            [part for t, r in series for part in segments(t, r, h)],
+            min(most, m // SAMPLES_AN_ORDER),
+        )
         candidates = [tuple(coefficients(found[:p])) for p in range(len(found) + 1)]
     else:
         candidates = [(), (by_time(series, h),)]
@@ -222,7 +243,14 @@ def fit_noise(series: Sequence[tuple[Array, Array]], parameters: float = 0.0, mo
         scale = max(square / max(m - parameters, 1.0), 1e-300) ** 0.5
         deviance = 2 * m * np.log(scale) + sum(log_det(w) for w in W) + square / scale**2
         out.append(Autoregression(phi, scale, h))
-        scores.append(Score(len(phi), deviance, deviance + 2 * q * m / max(m - q - 1, 1), deviance + q * np.log(m)))
+        scores.append(
+            Score(
+                len(phi),
+                deviance,
+                deviance + 2 * q * m / max(m - q - 1, 1),
+                deviance + q * np.log(m),
+            )
+        )
     return NoiseFit(out[int(np.argmin([score.bic for score in scores]))], tuple(scores))
 
 
@@ -233,8 +261,8 @@ def segments(t: Array, r: Array, h: float) -> list[Array]:
 
 
 def burg(parts: Sequence[Array], most: int) -> Array:
-    """Reflection coefficients (most,) that forward and backward prediction errors within the pieces, together, make
-    smallest; fewer where the pieces are too short."""
+    """Reflection coefficients (most,) that forward and backward prediction errors within the
+    pieces, together, make smallest; fewer where the pieces are too short."""
     forward, backward, out = [p.copy() for p in parts], [p.copy() for p in parts], []
     for _ in range(most):
         pairs = [(f[1:], b[:-1]) for f, b in zip(forward, backward) if len(f) > 1]

@@ -1,8 +1,8 @@
 """NUTS on the exact gradients: draws of the posterior where it is not Gaussian, too.
 
-A coordinate x between its bounds becomes y = logit((x - low) / (high - low)), whose density has dx/dy as a factor more,
-and y is whitened by the curvature at the optimum, so that the sampler sees something like a standard normal
-distribution.
+A coordinate x between its bounds becomes y = logit((x - low) / (high - low)), whose density has
+dx/dy as a factor more, and y is whitened by the curvature at the optimum, so that the sampler sees
+something like a standard normal distribution.
 """
 
 import importlib
@@ -16,17 +16,25 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import expit, log_expit, logit
 
-from torchsoft.sysid.posterior import CHECKED, Posterior, measure, notices_on_runs, notices_on_steps, steps_off
+from torchsoft.sysid.posterior import (
+    CHECKED,
+    Posterior,
+    measure,
+    notices_on_runs,
+    notices_on_steps,
+    steps_off,
+)
 from torchsoft.sysid.profile import Optimum
 from torchsoft.sysid.recording import Array
 from torchsoft.threads import single_threaded
 
 EDGE = 1e-3
-"""Nearest to a bound, as part of the way between the two, that the middle of the whitened coordinates may lie."""
+"""Nearest to a bound, as part of the way between the two, that the middle of the whitened
+coordinates may lie."""
 
 R_HAT, EFFECTIVE = 1.01, 100
-"""Largest R-hat of chains that have mixed (Vehtari et al. 2021), and the fewest independent draws that give an
-interval."""
+"""Largest R-hat of chains that have mixed (Vehtari et al. 2021), and the fewest independent draws
+that give an interval."""
 
 
 class Failed(RuntimeError):
@@ -49,7 +57,9 @@ class Whitened(NamedTuple):
         width = high - low
         u = np.clip((o.x[o.free] - low) / width, EDGE, 1 - EDGE)
         by_y = o.J * (width * u * (1 - u))
-        precision = by_y.T @ by_y + np.diag(2 * u * (1 - u))  # of the misfit, and of the factor dx/dy
+        precision = by_y.T @ by_y + np.diag(
+            2 * u * (1 - u)
+        )  # of the misfit, and of the factor dx/dy
         A: Any = np.linalg.inv(np.linalg.cholesky(precision)).T
         return cls(low, width, logit(u), A)
 
@@ -57,7 +67,8 @@ class Whitened(NamedTuple):
         return self.low + self.width * expit(self.middle + self.A @ z)
 
     def density(self, o: Optimum, z: Array) -> tuple[float, Array]:
-        """Logarithm of the posterior density of z, but for a constant, and its gradient (n,). Raises `Failed`."""
+        """Logarithm of the posterior density of z, but for a constant, and its gradient (n,).
+        Raises `Failed`."""
         y = self.middle + self.A @ z
         x, u = o.place(self.low + self.width * expit(y)), expit(y)
         value, gradient, reason = o.misfit(x)
@@ -80,23 +91,29 @@ def sampler() -> Any:
 
 
 def nuts(
-    o: Optimum, *, chains: int = 4, draws: int = 250, tune: int = 100, accept: float = 0.8, seed: int = 0,
-    progress: bool = False,
+    o: Optimum, *, chains: int = 4, draws: int = 250, tune: int = 100, accept: float = 0.8,
+    seed: int = 0, progress: bool = False,
 ) -> Posterior:  # fmt: skip
-    """Draws by the No-U-Turn sampler of nutpie, in `chains` that run side by side in the optimum's threads; `tune` more
-    draws of each, before, are for its step and scales. More shares `accept` of proposals that are taken need shorter
-    steps.
+    """Draws by the No-U-Turn sampler of nutpie, in `chains` that run side by side in the optimum's
+    threads; `tune` more draws of each, before, are for its step and scales. More shares `accept` of
+    proposals that are taken need shorter steps.
 
-    A run that fails counts as a wall. Ctrl-C ends it with the draws so far, if there are any. The same seed gives the
-    same draws. Raises `ImportError` without nutpie, and `RuntimeError` where no start near the optimum can be
-    simulated.
+    A run that fails counts as a wall. Ctrl-C ends it with the draws so far, if there are any. The
+    same seed gives the same draws. Raises `ImportError` without nutpie, and `RuntimeError` where no
+    start near the optimum can be simulated.
     """
     if chains < 1 or draws < 4 or tune < 20:
         raise ValueError(
-            f"NUTS needs a chain, 4 draws and 20 for tuning at least, but has {chains}, {draws} and {tune}"
+            f"NUTS needs a chain, 4 draws and 20 for tuning at least, but has {chains}, {draws} "
+            f"and {tune}"
         )
     package, white, lost = sampler(), Whitened.of(o), list[str]()
-    n, began, gradients, lock = len(white.low), clock.perf_counter(), o.runner.gradients, threading.Lock()
+    n, began, gradients, lock = (
+        len(white.low),
+        clock.perf_counter(),
+        o.runner.gradients,
+        threading.Lock(),
+    )
 
     def density(z: Array) -> tuple[float, Array]:
         try:
@@ -113,13 +130,19 @@ def nuts(
         return lambda z: {"x": white.coordinates(z)}
 
     model = package.compiled_pyfunc.from_pyfunc(
-        n, lambda: density, expand, [np.dtype("float64")], [(n,)], ["x"], make_initial_point_fn=start
+        n,
+        lambda: density,
+        expand,
+        [np.dtype("float64")],
+        [(n,)],
+        ["x"],
+        make_initial_point_fn=start,
     )
     with single_threaded(), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         trace = package.sample(
-            model, chains=chains, cores=min(chains, o.workers), draws=draws, tune=tune, target_accept=accept, seed=seed,
-            progress_bar=progress,
+            model, chains=chains, cores=min(chains, o.workers), draws=draws, tune=tune,
+            target_accept=accept, seed=seed, progress_bar=progress,
         )  # fmt: skip
     z, stats = complete(trace, draws)
     seconds = clock.perf_counter() - began
@@ -128,7 +151,8 @@ def nuts(
     notices = notices_on_runs(o, lost, spent)
     if z.shape[:2] != (chains, draws):
         notices.append(
-            f"interrupted: there are {z.shape[1]} of {draws} draws from {z.shape[0]} of {chains} chains; intervals are rough"
+            f"interrupted: there are {z.shape[1]} of {draws} draws from {z.shape[0]} of {chains} "
+            "chains; intervals are rough"
         )
     rng = np.random.default_rng(seed)
     off = steps_off(o, z.reshape(-1, n)[rng.choice(z.shape[0] * z.shape[1], CHECKED)])
@@ -150,8 +174,9 @@ def nuts(
 
 
 def complete(trace: Any, draws: int) -> tuple[Array, dict[str, Array]]:
-    """Free coordinates (chains, draws, n) and the sampler's own numbers (chains, draws): those chains, cut to one
-    length, that leave most draws. Raises `KeyboardInterrupt` where an interruption left none."""
+    """Free coordinates (chains, draws, n) and the sampler's own numbers (chains, draws): those
+    chains, cut to one length, that leave most draws. Raises `KeyboardInterrupt` where an
+    interruption left none."""
     z = trace.posterior["x"].values[:, :draws]
     length = np.isfinite(z).all(-1).sum(-1)
     order = np.argsort(-length, kind="stable")
@@ -167,15 +192,20 @@ def mixing(posterior: Posterior, divergences: int) -> list[str]:
     out, rows = [], posterior.marginals
     if divergences:
         out.append(
-            f"{divergences} of {posterior.weights.size} draws diverged: the posterior has places that NUTS did not reach; "
-            "take shorter steps (accept = 0.95), or tighter bounds and priors"
+            f"{divergences} of {posterior.weights.size} draws diverged: the posterior has places "
+            "that NUTS did not reach; take shorter steps (accept = 0.95), or tighter bounds and "
+            "priors"
         )
     worst = max(rows, key=lambda row: row.r_hat or 0.0)
     if not (worst.r_hat or np.inf) <= R_HAT:
-        out.append(f"the chains have not mixed: R-hat of {worst.label} is {worst.r_hat:.3f}; take more draws")
+        out.append(
+            f"the chains have not mixed: R-hat of {worst.label} is {worst.r_hat:.3f}; take more "
+            "draws"
+        )
     fewest = min(rows, key=lambda row: row.effective)
     if not fewest.effective >= EFFECTIVE:
         out.append(
-            f"there are only {fewest.effective:.0f} independent draws of {fewest.label}: its interval is rough; take more draws"
+            f"there are only {fewest.effective:.0f} independent draws of {fewest.label}: its "
+            "interval is rough; take more draws"
         )
     return out

@@ -1,9 +1,10 @@
 """Stages: which data, which unknowns, which ties, in which order.
 
-A fit of everything at once, from far away, ends in a local minimum or in runs that cannot be simulated. So: first the
-slowest recording, for what it can identify; then all of them, with ratios (kinetic over static friction) tied at their
-upper bound, because friction that does not fall with slip always has a solution; then a scan over each ratio, and
-everything free. Tolerances are loose in the beginning, and the last stage takes the full one.
+A fit of everything at once, from far away, ends in a local minimum or in runs that cannot be
+simulated. So: first the slowest recording, for what it can identify; then all of them, with ratios
+(kinetic over static friction) tied at their upper bound, because friction that does not fall with
+slip always has a solution; then a scan over each ratio, and everything free. Tolerances are loose
+in the beginning, and the last stage takes the full one.
 """
 
 import time as clock
@@ -35,8 +36,8 @@ from torchsoft.sysid.runs import Runner
 from torchsoft.tables import plain
 
 FIRST_LOOK = 0.1
-"""A coordinate takes part in the first look if its predicted standard deviation [1] is below this: one that is barely
-identifiable would run off to make up for what is still wrong elsewhere."""
+"""A coordinate takes part in the first look if its predicted standard deviation [1] is below this:
+one that is barely identifiable would run off to make up for what is still wrong elsewhere."""
 
 LOOSE, USUAL = 1e-3, 1e-4
 """Relative tolerances of the stages with ratios tied, and of those before the last one."""
@@ -50,12 +51,12 @@ SCANNED = (1.0, 0.85, 0.7, 0.55)
 
 @dataclass(frozen=True)
 class Stage:
-    """One fit: recordings, free coordinates by label, the relative tolerance that chooses its steps, how long, and what
-    is set or scanned before it.
+    """One fit: recordings, free coordinates by label, the relative tolerance that chooses its
+    steps, how long, and what is set or scanned before it.
 
-    `tied` sets coordinates to values; `scanned` tries each value, by `LOOSE`, the others held, and keeps the best. With
-    `starts` above one, that many Sobol points within a factor `spread` of the start are fitted, and the best end goes
-    on.
+    `tied` sets coordinates to values; `scanned` tries each value, by `LOOSE`, the others held, and
+    keeps the best. With `starts` above one, that many Sobol points within a factor `spread` of the
+    start are fitted, and the best end goes on.
     """
 
     name: str
@@ -79,8 +80,11 @@ def tie_ratios(problem: Problem, x: Array) -> Array:
     return x
 
 
-def visible(J: Array, candidates: NDArray[np.bool_], limit: float = FIRST_LOOK) -> NDArray[np.bool_]:
-    """The largest set, found greedily, whose members are all known to better than `limit` when the rest is held."""
+def visible(
+    J: Array, candidates: NDArray[np.bool_], limit: float = FIRST_LOOK
+) -> NDArray[np.bool_]:
+    """The largest set, found greedily, whose members are all known to better than `limit` when the
+    rest is held."""
     out = candidates.copy()
     while out.any():
         sd = standard_deviations(J[:, out])
@@ -91,9 +95,14 @@ def visible(J: Array, candidates: NDArray[np.bool_], limit: float = FIRST_LOOK) 
 
 
 def informative(problem: Problem, which: Sequence[str]) -> NDArray[np.bool_]:
-    """Mask (n,) of coordinates that recordings can constrain: not those of other recordings, nor of sensors that they
-    lack."""
-    channels = {channel for recording in problem.recordings if recording.name in which for channel in recording.samples}
+    """Mask (n,) of coordinates that recordings can constrain: not those of other recordings, nor of
+    sensors that they lack."""
+    channels = {
+        channel
+        for recording in problem.recordings
+        if recording.name in which
+        for channel in recording.samples
+    }
     return np.array(
         [
             one.recording in (None, *which) and (one.of_the_rig or one.name in channels)
@@ -102,8 +111,11 @@ def informative(problem: Problem, which: Sequence[str]) -> NDArray[np.bool_]:
     )
 
 
-def default_plan(problem: Problem, runner: Runner, rtol: float, which: Sequence[str], starts: int = 1) -> list[Stage]:
-    """Stages for some recordings: the slowest first, for what its Fisher matrix at the start makes identifiable.
+def default_plan(
+    problem: Problem, runner: Runner, rtol: float, which: Sequence[str], starts: int = 1
+) -> list[Stage]:
+    """Stages for some recordings: the slowest first, for what its Fisher matrix at the start makes
+    identifiable.
 
     Raises `Unreachable` where that recording cannot be simulated from the start.
     """
@@ -118,10 +130,24 @@ def default_plan(problem: Problem, runner: Runner, rtol: float, which: Sequence[
         raise Unreachable(look.lost)
     ties = tuple((c.all[i].label, c.all[i].high) for i in np.flatnonzero(ratios))
     slowest, first = (order[0],), tuple(labels[visible(look.J, free & ~ratios)])
-    plan = [Stage(f"{order[0]}: first look", slowest, first, loose, FIRST, 1e-2, ties, starts=starts)]
+    plan = [
+        Stage(f"{order[0]}: first look", slowest, first, loose, FIRST, 1e-2, ties, starts=starts)
+    ]
     if len(order) > 1 or ratios.any():
-        plan.append(Stage("all data, ratios tied", tuple(order), tuple(labels[free & ~ratios]), loose, ALL, 1e-2))
-    scans = tuple((c.all[i].label, tuple(part * c.all[i].high for part in SCANNED)) for i in np.flatnonzero(ratios))
+        plan.append(
+            Stage(
+                "all data, ratios tied",
+                tuple(order),
+                tuple(labels[free & ~ratios]),
+                loose,
+                ALL,
+                1e-2,
+            )
+        )
+    scans = tuple(
+        (c.all[i].label, tuple(part * c.all[i].high for part in SCANNED))
+        for i in np.flatnonzero(ratios)
+    )
     every, last = (tuple(order), tuple(labels[free])), rtol >= USUAL
     plan.append(Stage("everything", *every, usual, FREE, 1e-3 if last else 1e-2, scanned=scans))
     if not last:
@@ -158,10 +184,12 @@ def progress_bar(label: str, shown: bool) -> Iterator[Notify]:
 
 def run_plan(
     problem: Problem, runner: Runner, plan: Sequence[Stage], x: Array, *, loss: Loss = "linear",
-    method: Method = "gauss_newton", seed: int = 0, label: str = "", progress: bool = False, notify: Notify | None = None,
+    method: Method = "gauss_newton", seed: int = 0, label: str = "", progress: bool = False,
+    notify: Notify | None = None,
 ) -> tuple[Fit, list[dict[str, Any]]]:  # fmt: skip
-    """The fit of the last stage, each begun where the one before it ended, the first at x, and the result's entries on the
-    stages. Raises `Unreachable` where a stage cannot be simulated, and `ValueError` for a plan without stages."""
+    """The fit of the last stage, each begun where the one before it ended, the first at x, and the
+    result's entries on the stages. Raises `Unreachable` where a stage cannot be simulated, and
+    `ValueError` for a plan without stages."""
     fit, entries = None, list[dict[str, Any]]()
     for number, stage in enumerate(plan):
         began = clock.perf_counter()
@@ -175,14 +203,23 @@ def run_plan(
 
 
 def run_stage(
-    problem: Problem, runner: Runner, stage: Stage, x: Array, loss: Loss, method: Method, seed: int, notify: Any
+    problem: Problem,
+    runner: Runner,
+    stage: Stage,
+    x: Array,
+    loss: Loss,
+    method: Method,
+    seed: int,
+    notify: Any,
 ) -> Fit:
-    """One stage from x: ties, scans, Sobol starts, fit on the steps of each start; the best fit. Raises `Unreachable`
-    where no start can be simulated."""
+    """One stage from x: ties, scans, Sobol starts, fit on the steps of each start; the best fit.
+    Raises `Unreachable` where no start can be simulated."""
     c = problem.coordinates
     for label in (*stage.free, *(label for label, _ in (*stage.tied, *stage.scanned))):
         if label not in c.labels:
-            raise ValueError(f"stage `{stage.name}` names {label!r}; the coordinates are {', '.join(c.labels)}")
+            raise ValueError(
+                f"stage `{stage.name}` names {label!r}; the coordinates are {', '.join(c.labels)}"
+            )
     free, x = np.isin(c.labels, stage.free), x.copy()
     for label, value in stage.tied:
         i = c.labels.index(label)
@@ -197,14 +234,26 @@ def run_stage(
             first, steps = problem.freeze(runner, start, stage.recordings, stage.rtol, wanted)
             if first.lost:
                 raise Unreachable(first.lost)
-            common: dict[str, Any] = {"which": stage.recordings, "free": free, "steps": steps, "notify": notify}
+            common: dict[str, Any] = {
+                "which": stage.recordings,
+                "free": free,
+                "steps": steps,
+                "notify": notify,
+            }
             if method == "gauss_newton":
                 fit = gauss_newton(
-                    problem, runner, start, evaluations=stage.evaluations, tolerance=stage.tolerance, loss=loss, first=first,
-                    **common,
+                    problem, runner, start, evaluations=stage.evaluations,
+                    tolerance=stage.tolerance, loss=loss, first=first, **common,
                 )  # fmt: skip
             else:
-                fit = descend(problem, runner, start, method=method, evaluations=4 * stage.evaluations, **common)
+                fit = descend(
+                    problem,
+                    runner,
+                    start,
+                    method=method,
+                    evaluations=4 * stage.evaluations,
+                    **common,
+                )
         except Unreachable as lost:
             failure = failure or lost
             continue
@@ -217,10 +266,16 @@ def run_stage(
 
 
 def scan(
-    problem: Problem, runner: Runner, stage: Stage, x: Array, i: int, values: Sequence[float], notify: Notify
+    problem: Problem,
+    runner: Runner,
+    stage: Stage,
+    x: Array,
+    i: int,
+    values: Sequence[float],
+    notify: Notify,
 ) -> Array:
-    """x with the one of the values for coordinate number i that fits best, the others held; all are run side by
-    side."""
+    """x with the one of the values for coordinate number i that fits best, the others held; all are
+    run side by side."""
     rtol = max(LOOSE, stage.rtol)
     trials = [x.copy() for _ in values]
     for trial, value in zip(trials, values):
@@ -229,20 +284,29 @@ def scan(
     runs = iter(runner.run([job for some in jobs for job in some]))
     misfits = []
     for trial, some in zip(trials, jobs):
-        misfits.append(float(np.mean(problem.gather(trial, some, [next(runs) for _ in some]).r ** 2)))
+        misfits.append(
+            float(np.mean(problem.gather(trial, some, [next(runs) for _ in some]).r ** 2))
+        )
         notify(misfits[-1])
     return trials[int(np.argmin(misfits))]
 
 
-def sobol(problem: Problem, x: Array, free: NDArray[np.bool_], stage: Stage, seed: int) -> list[Array]:
-    """`stage.starts` - 1 more points within the stage's spread of x, in the free coordinates and within the bounds."""
+def sobol(
+    problem: Problem, x: Array, free: NDArray[np.bool_], stage: Stage, seed: int
+) -> list[Array]:
+    """`stage.starts` - 1 more points within the stage's spread of x, in the free coordinates and
+    within the bounds."""
     if stage.starts == 1:
         return []
     low, high = problem.coordinates.bounds
-    reach = np.array([np.log(stage.spread) if c.scale == "log" else 0.5 for c in problem.coordinates.all])
+    reach = np.array(
+        [np.log(stage.spread) if c.scale == "log" else 0.5 for c in problem.coordinates.all]
+    )
     low, high = np.maximum(low, x - reach), np.minimum(high, x + reach)
     power = (stage.starts - 1).bit_length()
-    points = qmc.Sobol(int(free.sum()), rng=np.random.default_rng(seed)).random_base2(power)[: stage.starts - 1]
+    points = qmc.Sobol(int(free.sum()), rng=np.random.default_rng(seed)).random_base2(power)[
+        : stage.starts - 1
+    ]
     out = []
     for u in points:
         start = x.copy()
@@ -255,8 +319,8 @@ def sobol(problem: Problem, x: Array, free: NDArray[np.bool_], stage: Stage, see
 
 
 STEP_BIAS = 0.5
-"""Shift of an estimate by the finite steps, over its standard deviation, above which the tolerance is called too
-coarse."""
+"""Shift of an estimate by the finite steps, over its standard deviation, above which the tolerance
+is called too coarse."""
 
 FINER = 0.1
 """The tolerance of the check over the one that is checked."""
@@ -269,11 +333,12 @@ ROUNDS = 3
 
 
 class Settled(NamedTuple):
-    """A fit at its end: coordinates x (n,), residuals there by steps that `rtol` chooses at x, with the last Jacobian;
-    how far the steps have moved every coordinate (n,), None where that could not be checked; the fits on other steps
-    since; the residuals by a tenth of the tolerance, those of `at` where these could not be had; and whether the fit is
-    `at_rest`: with steps chosen anew no coordinate would move by more than `SETTLED` standard deviations (where steps
-    are only checked: whether the fit has converged)."""
+    """A fit at its end: coordinates x (n,), residuals there by steps that `rtol` chooses at x, with
+    the last Jacobian; how far the steps have moved every coordinate (n,), None where that could not
+    be checked; the fits on other steps since; the residuals by a tenth of the tolerance, those of
+    `at` where these could not be had; and whether the fit is `at_rest`: with steps chosen anew no
+    coordinate would move by more than `SETTLED` standard deviations (where steps are only checked:
+    whether the fit has converged)."""
 
     x: Array
     at: Residuals
@@ -285,23 +350,31 @@ class Settled(NamedTuple):
 
 
 def settle(
-    problem: Problem, runner: Runner, stage: Stage, fit: Fit, free: NDArray[np.bool_], tightenings: int, notify: Notify
+    problem: Problem,
+    runner: Runner,
+    stage: Stage,
+    fit: Fit,
+    free: NDArray[np.bool_],
+    tightenings: int,
+    notify: Notify,
 ) -> Settled:
-    """Go on from a fit, by its Jacobian and a few runs: with steps chosen anew until they do not matter, and with a
-    tighter tolerance, at most so many times, where a tenth of it shifts an estimate by more than `STEP_BIAS`. With none
-    the steps are kept, and only checked."""
+    """Go on from a fit, by its Jacobian and a few runs: with steps chosen anew until they do not
+    matter, and with a tighter tolerance, at most so many times, where a tenth of it shifts an
+    estimate by more than `STEP_BIAS`. With none the steps are kept, and only checked."""
     x, which, rtol, left, fits = fit.x, stage.recordings, stage.rtol, tightenings, []
     at = fit.at or problem.residuals(runner, x, which, fit.steps, free)
     rounds = ROUNDS if tightenings else 0
 
     def along(start: Residuals, steps: StepsByName) -> bool:
-        """A fit on other steps from residuals on them, by new Jacobians where the last one does not lead to its end;
-        whether it came any further."""
+        """A fit on other steps from residuals on them, by new Jacobians where the last one does not
+        lead to its end; whether it came any further."""
         nonlocal x, at
         common: dict[str, Any] = {"which": which, "free": free, "steps": steps, "notify": notify}
         end = chord(problem, runner, x, start._replace(J=at.J), **common)
         if not end.converged:
-            end = gauss_newton(problem, runner, end.x, evaluations=REFITS, tolerance=EXACT, **common)
+            end = gauss_newton(
+                problem, runner, end.x, evaluations=REFITS, tolerance=EXACT, **common
+            )
         assert end.at is not None
         if further := bool((end.x != x).any()):
             fits.append((rtol, end))
@@ -323,7 +396,9 @@ def settle(
             return Settled(x, end, rtol, None, fits, end, at_rest)
         J, bias = at.J[:, free], np.zeros(len(x))
         bias[free] = shift(J, finer.r - at.r)
-        if left and not (at_rest and (np.abs(bias[free]) <= STEP_BIAS * standard_deviations(J)).all()):
+        if left and not (
+            at_rest and (np.abs(bias[free]) <= STEP_BIAS * standard_deviations(J)).all()
+        ):
             left, rounds, rtol = left - 1, ROUNDS, FINER * rtol
             if along(finer, steps):
                 continue

@@ -1,18 +1,19 @@
-"""The criterion of a motion that could be made, and its slopes by the knots: exact, by 2 n runs of the adjoint.
+"""The criterion of a motion that could be made, and its slopes by the knots: exact, by 2 n runs of
+the adjoint.
 
-With the whitened Jacobian J (m, n) of the samples by the coordinates x, the covariance is C = (J'J)^-1; for a criterion
-phi and G = d phi / d(J'J), its derivative by a knot k is
+With the whitened Jacobian J (m, n) of the samples by the coordinates x, the covariance is C =
+(J'J)^-1; for a criterion phi and G = d phi / d(J'J), its derivative by a knot k is
 
     d phi / dk = sum_j W_j . d/dx_j (dr/dk),        W = 2 J G held fixed,
 
-the difference along each x_j of what the discrete adjoint gives by the knots for the weights W_j: 2 n runs, however
-many knots there are.
+the difference along each x_j of what the discrete adjoint gives by the knots for the weights W_j: 2
+n runs, however many knots there are.
 
-A covariance is what a fit ends with if samples are linear in the parameters, as far as the intervals reach, and runs
-exact. Both fail where a motion is chaotic, whose sensitivities are large and no use. So phi is that of C + mean(e e'),
-e being a part of the errors of one Gauss-Newton step that begins a standard deviation away; its derivative leaves e as
-it is. Where chaos is such that a small change of a parameter changes samples altogether, a motion is refused
-(`check_predictable`).
+A covariance is what a fit ends with if samples are linear in the parameters, as far as the
+intervals reach, and runs exact. Both fail where a motion is chaotic, whose sensitivities are large
+and no use. So phi is that of C + mean(e e'), e being a part of the errors of one Gauss-Newton step
+that begins a standard deviation away; its derivative leaves e as it is. Where chaos is such that a
+small change of a parameter changes samples altogether, a motion is refused (`check_predictable`).
 """
 
 from collections import Counter
@@ -40,14 +41,15 @@ Range = tuple[float, float]
 """Least and largest value of a channel [its unit]."""
 
 DIFFERENCE = 1e-2
-"""Step of the difference along a coordinate [1]: wide, since slopes are rough where points touch, leave and slip."""
+"""Step of the difference along a coordinate [1]: wide, since slopes are rough where points touch,
+leave and slip."""
 
 MARGIN = 0.97
 """Part of the way to a limit from which on it costs, since peaks lie between samples."""
 
 PREDICTABLE = 10.0
-"""Change of a sample with the logarithm of a parameter, over the largest of its channel, above which a motion is no
-use."""
+"""Change of a sample with the logarithm of a parameter, over the largest of its channel, above
+which a motion is no use."""
 
 FARTHEST = 0.1
 """Relative error of a parameter, at most, with which a fit is tried."""
@@ -56,17 +58,18 @@ TRIED = 2
 """Points that are tried, each with signs of its own."""
 
 LEFT = 0.3
-"""Part of the errors there that the criterion counts: fits take finer steps than a search for motions."""
+"""Part of the errors there that the criterion counts: fits take finer steps than a search for
+motions."""
 
 PRICE = 5.0
 """What a sample at twice the way to a limit costs, in units of the criterion."""
 
 
 class DesignEvaluation(NamedTuple):
-    """One motion at one x: the criterion, what excess costs, how much of the way to their limits channels go, the
-    covariance C (n, n), the `errors` (k, s) of the parameters that the samples' not being linear makes, the criterion's
-    derivative G (n, n) by the Fisher matrix, the rows J (m, n) of the samples, the steps, and the signals of the
-    run."""
+    """One motion at one x: the criterion, what excess costs, how much of the way to their limits
+    channels go, the covariance C (n, n), the `errors` (k, s) of the parameters that the samples'
+    not being linear makes, the criterion's derivative G (n, n) by the Fisher matrix, the rows J (m,
+    n) of the samples, the steps, and the signals of the run."""
 
     value: float
     cost: float
@@ -83,11 +86,21 @@ class Planner:
     """The criterion of motions of one recording of a problem, and its slopes by their knots."""
 
     def __init__(
-        self, problem: Problem, plan: str, moves: Moves, limits: Mapping[str, Range], criterion: Criterion,
-        names: Sequence[str] | None, rtol: float, workers: int,
+        self, problem: Problem, plan: str, moves: Moves, limits: Mapping[str, Range],
+        criterion: Criterion, names: Sequence[str] | None, rtol: float, workers: int,
     ) -> None:  # fmt: skip
-        self.problem, self.k, self.moves, self.limits = problem, problem.names.index(plan), moves, dict(limits)
-        self.recording, self.criterion, self.rtol, self.workers = problem.recordings[self.k], criterion, rtol, workers
+        self.problem, self.k, self.moves, self.limits = (
+            problem,
+            problem.names.index(plan),
+            moves,
+            dict(limits),
+        )
+        self.recording, self.criterion, self.rtol, self.workers = (
+            problem.recordings[self.k],
+            criterion,
+            rtol,
+            workers,
+        )
         self.names, _ = chosen(problem, problem.coordinates.start, names)
         criterion.check(self.names)
         self.grid = self.recording.grid(problem.interpolated)
@@ -105,15 +118,23 @@ class Planner:
         return other
 
     def recorded(self, x: Array) -> Array:
-        """A root (.., n) of the Fisher matrix of the other recordings. Raises `ValueError` where they are lost."""
+        """A root (.., n) of the Fisher matrix of the other recordings. Raises `ValueError` where
+        they are lost."""
         if x.tobytes() not in self._known:
-            p, which = self.problem, [name for name in self.problem.names if name != self.recording.name]
+            p, which = (
+                self.problem,
+                [name for name in self.problem.names if name != self.recording.name],
+            )
             J = np.zeros((0, len(x)))
             if which:
                 at = p.residuals(self._others, x, which, self.rtol, p.coordinates.free)
                 if at.lost:
-                    reasons = "; ".join(f"`{name}`: {lost.reason}" for name, lost in at.lost.items())
-                    raise ValueError(f"a draw of the parameters does not reproduce what was recorded: {reasons}")
+                    reasons = "; ".join(
+                        f"`{name}`: {lost.reason}" for name, lost in at.lost.items()
+                    )
+                    raise ValueError(
+                        f"a draw of the parameters does not reproduce what was recorded: {reasons}"
+                    )
                 J = at.J[: len(at.J) - len(p.coordinates.priors)]
             self._known[x.tobytes()] = np.linalg.qr(J)[1]
         return self._known[x.tobytes()]
@@ -125,7 +146,9 @@ class Planner:
         yield begun
         self._idle.append(begun)
 
-    def run(self, z: Array, x: Array, steps: Steps, free: NDArray[np.bool_] | None) -> tuple[Residuals, Prediction]:
+    def run(
+        self, z: Array, x: Array, steps: Steps, free: NDArray[np.bool_] | None
+    ) -> tuple[Residuals, Prediction]:
         """Residuals of the motion z at x, the last of them those of the priors, and the run. Raises
         `SimulationFailed`."""
         p = self.problem
@@ -138,8 +161,8 @@ class Planner:
         return p.gather(x, [job], [run]), run
 
     def evaluate(self, z: Array, x: Array, steps: Steps | None = None) -> DesignEvaluation:
-        """The motion z at x, by the planner's tolerance or that of `steps`; on steps that are given without the errors.
-        Raises `SimulationFailed`."""
+        """The motion z at x, by the planner's tolerance or that of `steps`; on steps that are given
+        without the errors. Raises `SimulationFailed`."""
         c, given = self.problem.coordinates, self.rtol if steps is None else steps
         at, run = self.run(z, x, given, c.free)
         C = np.zeros((len(x), len(x)))
@@ -147,19 +170,27 @@ class Planner:
         _, T = chosen(self.problem, x, self.names)
         signals = Signals(run.t, self.recording.channels, run.signals, None)
         self.check_predictable(x, at.J, signals)
-        errors = np.zeros((1, len(T))) if isinstance(given, Frozen) else self.errors(z, x, given, at, C, T)
+        errors = (
+            np.zeros((1, len(T)))
+            if isinstance(given, Frozen)
+            else self.errors(z, x, given, at, C, T)
+        )
         value, S = self.criterion(T @ C @ T.T + LEFT**2 * errors.T @ errors / len(errors))
         reached = {name: np.abs(part) for name, part in self.reached(signals).items()}
         peaks = {name: float(part.max()) for name, part in reached.items()}
-        cost = PRICE * sum(float(np.sum(np.maximum(part - MARGIN, 0.0) ** 2)) for part in reached.values())
+        cost = PRICE * sum(
+            float(np.sum(np.maximum(part - MARGIN, 0.0) ** 2)) for part in reached.values()
+        )
         frozen = Frozen(run.knots) if run.knots is not None else given
         assert isinstance(frozen, Frozen)
         J = at.J[: len(at.J) - len(c.priors)]
-        return DesignEvaluation(value, cost, peaks, C, errors, -C @ T.T @ S @ T @ C, J, frozen, signals)
+        return DesignEvaluation(
+            value, cost, peaks, C, errors, -C @ T.T @ S @ T @ C, J, frozen, signals
+        )
 
     def check_predictable(self, x: Array, J: Array, signals: Signals) -> None:
-        """Raises `SimulationFailed` where a parameter that hardly changes would change the samples altogether: then
-        their information is that of chaos, which no fit can use."""
+        """Raises `SimulationFailed` where a parameter that hardly changes would change the samples
+        altogether: then their information is that of chaos, which no fit can use."""
         c, at = self.problem.coordinates, 0
         rig = [one.of_the_rig and one.scale == "log" for one in c.all]
         for channel, one in self.problem.readouts(x, self.k).items():
@@ -168,15 +199,17 @@ class Planner:
             of = np.abs(J[at : at + len(t)]).max(0) * rig / max(most, 1.0)
             if of.max() > PREDICTABLE:
                 raise SimulationFailed(
-                    f"a change of `{c.labels[int(of.argmax())]}` by 1 % would change `{channel}` by {of.max():.0f} % of its "
-                    "largest value: nothing that follows from it can be predicted", float(signals.t[-1]),
+                    f"a change of `{c.labels[int(of.argmax())]}` by 1 % would change `{channel}` "
+                    f"by {of.max():.0f} % of its largest value: nothing that follows from it can "
+                    "be predicted", float(signals.t[-1]),
                 )  # fmt: skip
             at += len(t)
 
     def errors(self, z: Array, x: Array, rtol: float, at: Residuals, C: Array, T: Array) -> Array:
-        """How far (k, s) relative to the parameters a Gauss-Newton step without noise ends from the truth, that begins
-        a standard deviation from it at points of different signs, on steps of their own: nothing where samples are
-        linear over an interval, and steps fine enough; much where the motion is chaotic. Raises `SimulationFailed`."""
+        """How far (k, s) relative to the parameters a Gauss-Newton step without noise ends from the
+        truth, that begins a standard deviation from it at points of different signs, on steps of
+        their own: nothing where samples are linear over an interval, and steps fine enough; much
+        where the motion is chaotic. Raises `SimulationFailed`."""
         out, (low, high) = [], self.problem.coordinates.bounds
         sd = np.minimum(np.sqrt(np.diag(T @ C @ T.T)), FARTHEST)
         for k in range(TRIED):
@@ -187,18 +220,22 @@ class Planner:
         return np.array(out)
 
     def reached(self, signals: Signals) -> dict[str, Array]:
-        """Where limited channels are (G,) between the middle of their range, 0, and its ends, -1 and 1."""
+        """Where limited channels are (G,) between the middle of their range, 0, and its ends, -1
+        and 1."""
         return {
             name: (2 * signals.values[:, signals.names.index(name)] - low - high) / (high - low)
             for name, (low, high) in self.limits.items()
         }
 
     def slopes(self, z: Array, x: Array, at: DesignEvaluation) -> Array:
-        """Derivative by z of the criterion and of what excess costs, on the steps of the look. Raises
-        `SimulationFailed`."""
+        """Derivative by z of the criterion and of what excess costs, on the steps of the look.
+        Raises `SimulationFailed`."""
         c, W = self.problem.coordinates, 2 * at.J @ at.G
         low, high = c.bounds
-        tasks, beside = list[tuple[Array, Array]](), self.overload(at.signals)  # points x, weights on the signals there
+        tasks, beside = (
+            list[tuple[Array, Array]](),
+            self.overload(at.signals),
+        )  # points x, weights on the signals there
         for j in np.flatnonzero(c.free & (np.abs(at.J).max(0) > 0)):
             ahead, behind = x.copy(), x.copy()
             ahead[j], behind[j] = min(x[j] + DIFFERENCE, high[j]), max(x[j] - DIFFERENCE, low[j])
@@ -215,15 +252,25 @@ class Planner:
             return self.adjoint(z, tasks[i][0], at.steps, tasks[i][1])
 
         with single_threaded():
-            return np.asarray(sum(part for _, part in parallel_map(swept, len(tasks), self.workers)))
+            return np.asarray(
+                sum(part for _, part in parallel_map(swept, len(tasks), self.workers))
+            )
 
     def adjoint(self, z: Array, x: Array, steps: Steps, weights: Array) -> Array:
-        """Slopes by z of weights (G, channels) on the signals of the run at x. Raises `SimulationFailed`."""
+        """Slopes by z of weights (G, channels) on the signals of the run at x. Raises
+        `SimulationFailed`."""
         variables = torch.tensor(z, requires_grad=True)
         reference = self.moves.reference(variables)
         with self._begun() as begun:
             y0 = prepared(begun, self.problem.values(x, self.k), ()).y0.detach()
-            run = simulate(begun.rig, self.grid.t, y0=y0, reference=reference, gradient="discrete", **choice(steps))
+            run = simulate(
+                begun.rig,
+                self.grid.t,
+                y0=y0,
+                reference=reference,
+                gradient="discrete",
+                **choice(steps),
+            )
             signals = run.together(*self.recording.channels)[self.grid.early :]
             (slopes,) = torch.autograd.grad(signals, variables, torch.from_numpy(weights))
         self.cost["gradients"] += 1
@@ -236,7 +283,10 @@ class Planner:
             t, measured = self.recording.samples[one.channel]
             own = w[at : at + len(t)] if W is None else W.T @ w[at : at + len(t)]
             y, _, _ = one.expected(signals, t)
-            out, at = out + one.pulled_back(signals, t, one.residuals(y, measured)[1] * own), at + len(t)
+            out, at = (
+                out + one.pulled_back(signals, t, one.residuals(y, measured)[1] * own),
+                at + len(t),
+            )
         return out
 
     def overload(self, signals: Signals) -> Array:
@@ -255,10 +305,14 @@ class Planner:
 
     def bent(self, x: Array, at: DesignEvaluation) -> dict[str, Array]:
         """The errors (k,) by parameter, over its standard deviation."""
-        return {name: error / sd for (name, sd), error in zip(self.deviations(x, at).items(), at.errors.T)}
+        return {
+            name: error / sd
+            for (name, sd), error in zip(self.deviations(x, at).items(), at.errors.T)
+        }
 
     def made(self, z: Array, x: Array, at: DesignEvaluation) -> Recording:
-        """The recording that follows a motion, with the samples that its sensors would give without noise."""
+        """The recording that follows a motion, with the samples that its sensors would give without
+        noise."""
         rig = deepcopy(self.recording.rig)
         with torch.no_grad():
             rig.reference = self.moves.reference(torch.from_numpy(z))

@@ -1,7 +1,8 @@
-"""Posterior draws: by Laplace's approximation, checked and corrected by importance, and by NUTS on the exact gradients.
+"""Posterior draws: by Laplace's approximation, checked and corrected by importance, and by NUTS on
+the exact gradients.
 
-The density is that of the coordinates: exp(-|r|^2 / 2), priors being rows of r, within the bounds. A coordinate without
-a prior is uniform between its bounds.
+The density is that of the coordinates: exp(-|r|^2 / 2), priors being rows of r, within the bounds.
+A coordinate without a prior is uniform between its bounds.
 """
 
 import importlib
@@ -24,10 +25,12 @@ WITHIN = 1e-3
 """Least share of Gaussian draws that must lie within the bounds."""
 
 K_HAT = 0.7
-"""Shape of the tail of the importance weights above which they cannot be trusted (Vehtari et al. 2024)."""
+"""Shape of the tail of the importance weights above which they cannot be trusted (Vehtari et al.
+2024)."""
 
 EFFICIENT = 0.5
-"""Effective over all draws, by their weights, below which Laplace's approximation is said to be rough."""
+"""Effective over all draws, by their weights, below which Laplace's approximation is said to be
+rough."""
 
 SAME = 1e-6
 """Difference of logarithms of weights below which they are all the same."""
@@ -47,8 +50,9 @@ CHECKED = 8
 
 @dataclass(frozen=True)
 class Posterior:
-    """Draws (chains, draws, n) of the free coordinates `labels` in physical units, and their normalised `weights`
-    (chains, draws); what was checked, what a reader must know, what it cost, how it was made.
+    """Draws (chains, draws, n) of the free coordinates `labels` in physical units, and their
+    normalised `weights` (chains, draws); what was checked, what a reader must know, what it cost,
+    how it was made.
 
     A run that was interrupted has fewer draws than were asked for.
     """
@@ -68,7 +72,8 @@ class Posterior:
         return self.draws.reshape(-1, len(self.labels)), self.weights.ravel()
 
     def pick(self, count: int, rng: np.random.Generator) -> Array:
-        """So many draws (count, n) by their weights: equally far apart in the chains where these are equal."""
+        """So many draws (count, n) by their weights: equally far apart in the chains where these
+        are equal."""
         draws, weights = self.flat
         if np.ptp(weights) == 0:
             return draws[np.linspace(0, len(draws) - 1, count).round().astype(int)]
@@ -83,14 +88,18 @@ class Posterior:
             sd = float(weights @ (draws[:, i] - mean) ** 2) ** 0.5
             r_hat, effective = None, 1.0 / float(weights @ weights)
             if self.method == "nuts":
-                r_hat, effective = (float(of(halves(self.draws[..., i]))) for of in (known.rhat, known.ess))
+                r_hat, effective = (
+                    float(of(halves(self.draws[..., i]))) for of in (known.rhat, known.ess)
+                )
             out.append(MarginalSummary(label, mean, sd, q[1], (q[0], q[2]), effective, r_hat))
         return out
 
     @property
     def summary(self) -> PosteriorSummary:
         """What an `IdentificationResult` holds of it."""
-        return PosteriorSummary(self.method, self.weights.size, self.marginals, self.checks, self.notices)
+        return PosteriorSummary(
+            self.method, self.weights.size, self.marginals, self.checks, self.notices
+        )
 
     def to_json(self) -> str:
         content = asdict(self) | {
@@ -122,8 +131,9 @@ def quantile(values: Array, weights: Array, part: float) -> float:
 
 
 def measure(o: Optimum, x: Array) -> tuple[float, Array]:
-    """What a density of values has more, as one of coordinates x (n,), and its gradient by the free ones: the logarithm
-    of d value / d x where a prior is normal on a logarithmic scale, or log-normal on a linear one."""
+    """What a density of values has more, as one of coordinates x (n,), and its gradient by the free
+    ones: the logarithm of d value / d x where a prior is normal on a logarithmic scale, or
+    log-normal on a linear one."""
     total, gradient = 0.0, np.zeros(len(x))
     for i, prior in o.problem.coordinates.priors:
         c = o.problem.coordinates.all[i]
@@ -136,14 +146,18 @@ def measure(o: Optimum, x: Array) -> tuple[float, Array]:
 
 
 def laplace(o: Optimum, *, draws: int = 400, seed: int = 0, progress: bool = False) -> Posterior:
-    """Draws of the Gaussian at the optimum, with the covariance of the Fisher matrix, within the bounds.
+    """Draws of the Gaussian at the optimum, with the covariance of the Fisher matrix, within the
+    bounds.
 
-    The exact density at every draw, a run each, gives them importance weights, Pareto-smoothed: they correct the
-    Gaussian where it is roughly right, and their k-hat says where it is not. Raises `ValueError` where hardly a draw is
-    within the bounds: the data do not determine all coordinates; and for fewer draws than `FEWEST`.
+    The exact density at every draw, a run each, gives them importance weights, Pareto-smoothed:
+    they correct the Gaussian where it is roughly right, and their k-hat says where it is not.
+    Raises `ValueError` where hardly a draw is within the bounds: the data do not determine all
+    coordinates; and for fewer draws than `FEWEST`.
     """
     if draws < FEWEST:
-        raise ValueError(f"Laplace's approximation is checked by at least {FEWEST} draws, not by {draws}")
+        raise ValueError(
+            f"Laplace's approximation is checked by at least {FEWEST} draws, not by {draws}"
+        )
     rng, (low, high) = np.random.default_rng(seed), o.bounds
     runs, began = o.runner.simulations, clock.perf_counter()
     z, noise = inside(rng, o.x[o.free], o.covariance, low, high, draws)
@@ -166,55 +180,75 @@ def laplace(o: Optimum, *, draws: int = 400, seed: int = 0, progress: bool = Fal
     notices = notices_on_runs(o, lost, draws)
     if k_hat > limit and share < ALIKE:
         notices.append(
-            f"Laplace's approximation is not to be trusted here: the tail of its importance weights has k = {k_hat:.2g} "
-            f"(at most {limit:.2g}); use NUTS"
+            "Laplace's approximation is not to be trusted here: the tail of its importance "
+            f"weights has k = {k_hat:.2g} (at most {limit:.2g}); use NUTS"
         )
     elif share < EFFICIENT:
         notices.append(
-            f"Laplace's approximation is rough here: its draws are worth {share:.0%} of as many; use them by their weights"
+            f"Laplace's approximation is rough here: its draws are worth {share:.0%} of as many; "
+            "use them by their weights"
         )
     off = steps_off(o, z[np.argsort(log_q)[: CHECKED // 2].tolist() + list(range(CHECKED // 2))])
     notices += notices_on_steps(o, off)
     checks = {"k_hat": k_hat, "efficiency": share, "failed": len(lost), "steps_off": off}
-    cost = {"simulations": o.runner.simulations - runs, "gradients": 0, "wall_s": clock.perf_counter() - began}
+    cost = {
+        "simulations": o.runner.simulations - runs,
+        "gradients": 0,
+        "wall_s": clock.perf_counter() - began,
+    }
     return Posterior(
-        "laplace", list(o.labels), o.values(z)[None], w[None], checks, notices, cost, {"seed": seed, "rtol": o.rtol}
+        "laplace",
+        list(o.labels),
+        o.values(z)[None],
+        w[None],
+        checks,
+        notices,
+        cost,
+        {"seed": seed, "rtol": o.rtol},
     )
 
 
 def importance(log_weights: Array) -> tuple[Array, float]:
-    """Normalised weights (draws,), Pareto-smoothed, and the shape k of their tail, infinite where a few draws have all
-    the weight. Draws without density have none."""
+    """Normalised weights (draws,), Pareto-smoothed, and the shape k of their tail, infinite where a
+    few draws have all the weight. Draws without density have none."""
     known = np.isfinite(log_weights)
     log_w, k_hat = log_weights[known] - log_weights[known].max(), -np.inf
     if np.ptp(log_w) > SAME:
         with np.errstate(divide="ignore", invalid="ignore"):
-            smoothed, k_hat = diagnostics().psislw(-np.maximum(log_w, LEAST))  # it takes weights' inverses
+            smoothed, k_hat = diagnostics().psislw(
+                -np.maximum(log_w, LEAST)
+            )  # it takes weights' inverses
         log_w, k_hat = (smoothed, k_hat) if np.isfinite(smoothed).all() else (log_w, np.inf)
     w = np.zeros(len(log_weights))
     w[known] = np.exp(log_w - np.max(log_w))
     return w / w.sum(), float(k_hat)
 
 
-def inside(rng: np.random.Generator, mean: Array, C: Array, low: Array, high: Array, count: int) -> tuple[Array, Array]:
-    """Normal draws (count, n) with covariance C (n, n) that lie between bounds, and the standard normal ones behind
-    them."""
+def inside(
+    rng: np.random.Generator, mean: Array, C: Array, low: Array, high: Array, count: int
+) -> tuple[Array, Array]:
+    """Normal draws (count, n) with covariance C (n, n) that lie between bounds, and the standard
+    normal ones behind them."""
     L, kept, tried = np.linalg.cholesky(C).T, np.zeros((0, len(mean))), 0
     while len(kept) < count and tried < count / WITHIN:
         noise = rng.standard_normal((4 * count, len(mean)))
         z = mean + noise @ L
-        kept, tried = np.concatenate((kept, noise[((z >= low) & (z <= high)).all(-1)])), tried + len(noise)
+        kept, tried = (
+            np.concatenate((kept, noise[((z >= low) & (z <= high)).all(-1)])),
+            tried + len(noise),
+        )
     if len(kept) < count:
         raise ValueError(
-            f"fewer than one in {1 / WITHIN:.0f} draws of the Gaussian at the optimum lie within the bounds: the data do not "
-            "determine all coordinates, and Laplace's approximation says nothing; use NUTS, or priors"
+            f"fewer than one in {1 / WITHIN:.0f} draws of the Gaussian at the optimum lie within "
+            "the bounds: the data do not determine all coordinates, and Laplace's approximation "
+            "says nothing; use NUTS, or priors"
         )
     return mean + kept[:count] @ L, kept[:count]
 
 
 def steps_off(o: Optimum, z: Array) -> float:
-    """Largest change of |r|^2 at free coordinates z (k, free coordinates) by steps chosen anew; infinite where a run
-    fails."""
+    """Largest change of |r|^2 at free coordinates z (k, free coordinates) by steps chosen anew;
+    infinite where a run fails."""
     off = [o.off(o.place(one)) for one in z]
     return float(np.max(np.where(np.isnan(off), np.inf, np.abs(off))))
 
@@ -223,7 +257,8 @@ def notices_on_steps(o: Optimum, off: float) -> list[str]:
     if off <= CHOSEN_ANEW:
         return []
     return [
-        f"steps chosen anew at some draws change |r|^2 by {off:.2g}: take a tighter tolerance than rtol = {o.rtol:g}"
+        f"steps chosen anew at some draws change |r|^2 by {off:.2g}: take a tighter tolerance than "
+        f"rtol = {o.rtol:g}"
     ]
 
 
@@ -235,7 +270,7 @@ def notices_on_runs(o: Optimum, lost: Sequence[str], runs: int) -> list[str]:
         out.append(f"{len(lost)} of {runs} runs failed, so the posterior ends there: {lost[0]}")
     if chi2 > 1 + 4 * np.sqrt(2 / m):
         out.append(
-            f"the residuals are larger than the noise that was given (chi2 = {chi2:.3g}): the model or the noise is wrong, "
-            "and the posterior with them"
+            f"the residuals are larger than the noise that was given (chi2 = {chi2:.3g}): the "
+            "model or the noise is wrong, and the posterior with them"
         )
     return out

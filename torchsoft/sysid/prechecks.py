@@ -1,9 +1,11 @@
-"""Comparison of recordings with their rig, before any fit: set-points, control loops, signs and units.
+"""Comparison of recordings with their rig, before any fit: set-points, control loops, signs and
+units.
 
-The law of an actuator is known. So a recording of its force and of the coordinate that it measures is held against it
-without a run: means over windows of time, which need no derivative of measured samples, agree within the noise of the
-sensors. Where they do not, one thing at a time is tried: the sign of the force, its unit, the body that the loop
-senses, the force that is fed forward. Other channels are held against a run with the parameters of the start.
+The law of an actuator is known. So a recording of its force and of the coordinate that it measures
+is held against it without a run: means over windows of time, which need no derivative of measured
+samples, agree within the noise of the sensors. Where they do not, one thing at a time is tried: the
+sign of the force, its unit, the body that the loop senses, the force that is fed forward. Other
+channels are held against a run with the parameters of the start.
 """
 
 import math
@@ -34,30 +36,46 @@ def together(every: Sequence[Diagnostic]) -> list[Diagnostic]:
     """One diagnostic of every code: the first, with the names of the other recordings."""
     out: list[Diagnostic] = []
     for code in dict.fromkeys(one.code for one in every):
-        first, *others = sorted((one for one in every if one.code == code), key=lambda one: one.severity)
-        names = ", ".join(f"`{name}`" for name in dict.fromkeys(one.where for one in others) if name != first.where)
-        out.append(first._replace(message=first.message + (f"; so it is in {names}" if names else "")))
+        first, *others = sorted(
+            (one for one in every if one.code == code), key=lambda one: one.severity
+        )
+        names = ", ".join(
+            f"`{name}`"
+            for name in dict.fromkeys(one.where for one in others)
+            if name != first.where
+        )
+        out.append(
+            first._replace(message=first.message + (f"; so it is in {names}" if names else ""))
+        )
     return out
 
 
 def accepted(every: Sequence[Diagnostic], acknowledged: Sequence[str]) -> list[str]:
-    """Messages of warnings, and of errors that are acknowledged. Raises `ValueError` for other errors, and for a code
-    that was acknowledged and not found."""
+    """Messages of warnings, and of errors that are acknowledged. Raises `ValueError` for other
+    errors, and for a code that was acknowledged and not found."""
     codes = dict.fromkeys(one.code for one in every)
     if strange := [code for code in acknowledged if code not in codes]:
         there = f"what was found is {', '.join(codes)}" if codes else "nothing looks wrong"
         raise ValueError(
-            f"acknowledged: nothing was found that is called {shown(strange[0])}, so leave it out; {there}"
+            f"acknowledged: nothing was found that is called {shown(strange[0])}, so leave it out; "
+            f"{there}"
         )
     for one in every:
         if one.severity == "error" and one.code not in acknowledged:
             raise ValueError(f'{one.message}; if it is so, say acknowledged = ["{one.code}"]')
-    return [f"{one.message} (acknowledged)" if one.code in acknowledged else one.message for one in every]
+    return [
+        f"{one.message} (acknowledged)" if one.code in acknowledged else one.message
+        for one in every
+    ]
 
 
 MISTAKEN = {
     "rad": {180 / math.pi: ("degrees", "radians"), 1e3: ("milliradians", "radians")},
-    "m": {1e2: ("centimetres", "metres"), 1e3: ("millimetres", "metres"), 1e6: ("micrometres", "metres")},
+    "m": {
+        1e2: ("centimetres", "metres"),
+        1e3: ("millimetres", "metres"),
+        1e6: ("micrometres", "metres"),
+    },
     "N": {1e3: ("millinewtons", "newtons"), 1 / 9.81: ("kilograms", "newtons")},
 }
 """What makes values of a dimension too large by a factor when it is taken for the other."""
@@ -90,7 +108,8 @@ class Signal(NamedTuple):
 
 
 def sampled(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> Signal | None:
-    """The samples of a coordinate or a force whose sensor sees nothing else and is never saturated, or None."""
+    """The samples of a coordinate or a force whose sensor sees nothing else and is never saturated,
+    or None."""
     own = channel(recording.rig, name)
     if own not in recording.samples or own not in sensors:
         return None
@@ -106,18 +125,21 @@ FEWEST = 8
 """Windows without which nothing is said."""
 
 ROUGH = 0.03
-"""Part of the force by which both sides of a loop may differ besides the noise: drives are not exact."""
+"""Part of the force by which both sides of a loop may differ besides the noise: drives are not
+exact."""
 
 EXPLAINED = 0.15
 """Part of a disagreement, and of the force, that may be left by its explanation."""
 
 SLOW = 0.3
-"""Part of a disagreement by which it may change from window to window where a force fed forward is missing."""
+"""Part of a disagreement by which it may change from window to window where a force fed forward is
+missing."""
 
 
 class Loop(NamedTuple):
-    """Both sides of a loop as means over n windows of a `width` (n,) [s]: the measured force F (n,), and `inputs` (n, k) of the
-    actuator. `signals` are those of the force and of the coordinates."""
+    """Both sides of a loop as means over n windows of a `width` (n,) [s]: the measured force F
+    (n,), and `inputs` (n, k) of the actuator. `signals` are those of the force and of the
+    coordinates."""
 
     actuator: Actuator
     F: Array
@@ -138,7 +160,8 @@ class Loop(NamedTuple):
 
     @property
     def noise(self) -> tuple[float, float]:
-        """Standard deviation [N] of a mean of the disagreement by white noise, and by noise that outlasts a window."""
+        """Standard deviation [N] of a mean of the disagreement by white noise, and by noise that
+        outlasts a window."""
         inputs = torch.from_numpy(self.inputs).requires_grad_(True)
         (slope,) = torch.autograd.grad(self.actuator(inputs).sum(), inputs)
         by = slope.numpy()[:, self.fed + 1 :]
@@ -154,34 +177,44 @@ class Loop(NamedTuple):
         return float(np.sqrt(np.mean(white))), float(np.sqrt(np.mean(lasting)))
 
 
-def windows(recording: Recording, actuator: Actuator, signals: Sequence[Signal | None]) -> Loop | None:
-    """The loop of the force and the coordinates over windows that all have samples in; None where there are too few."""
+def windows(
+    recording: Recording, actuator: Actuator, signals: Sequence[Signal | None]
+) -> Loop | None:
+    """The loop of the force and the coordinates over windows that all have samples in; None where
+    there are too few."""
     known = tuple(one for one in signals if one is not None)
     if len(known) < len(signals):
         return None
     length = max(WINDOW, *(4 * one.spacing for one in known))
     first, last = max(one.t[0] for one in known), min(one.t[-1] for one in known)
     edges = first + length * np.arange(int(max(last - first, 0.0) / length) + 1)
-    keep = np.logical_and.reduce([np.diff(np.searchsorted(s.t, edges)) * s.spacing > 0.5 * length for s in known])
+    keep = np.logical_and.reduce(
+        [np.diff(np.searchsorted(s.t, edges)) * s.spacing > 0.5 * length for s in known]
+    )
     if keep.sum() < FEWEST:
         return None
     width, t = np.diff(edges)[keep], np.arange(first, last + BETWEEN, BETWEEN)
     names = [*actuator.setpoints, *([actuator.feed_forward] if actuator.feed_forward else [])]
     columns = [np.zeros(len(t))]
     if names:
-        columns = [*recording.rig.reference(torch.from_numpy(t), names).detach().numpy()[..., 0].T, *columns]
+        columns = [
+            *recording.rig.reference(torch.from_numpy(t), names).detach().numpy()[..., 0].T,
+            *columns,
+        ]
     asked = [CubicSpline(t, column) for column in columns[: len(actuator.setpoints)]]
     force, *coordinates = [CubicSpline(one.t, one.y) for one in known]
     integrals = [part for one in asked for part in (one.antiderivative(), one)]
     integrals.append(CubicSpline(t, columns[len(asked)]).antiderivative())
     integrals += [part for one in coordinates for part in (one.antiderivative(), one)]
     inputs = np.stack([np.diff(one(edges))[keep] / width for one in integrals], -1)
-    return Loop(actuator, np.diff(force.antiderivative()(edges))[keep] / width, inputs, known, width)
+    return Loop(
+        actuator, np.diff(force.antiderivative()(edges))[keep] / width, inputs, known, width
+    )
 
 
 class Change(NamedTuple):
-    """One thing that may be otherwise: its code, a clause, the disagreement (n,) [N] that is left, and whether it is
-    grave."""
+    """One thing that may be otherwise: its code, a clause, the disagreement (n,) [N] that is left,
+    and whether it is grave."""
 
     code: str
     clause: str
@@ -196,17 +229,21 @@ def rms(e: Array) -> float:
 def loop_findings(
     recording: Recording, sensors: Mapping[str, Sensor], unknown: Collection[str] = ()
 ) -> Iterator[Diagnostic]:
-    """Diagnostics on the control loops of a recording whose force and coordinate were measured; `unknown` are the names
-    of unknown parameters."""
+    """Diagnostics on the control loops of a recording whose force and coordinate were measured;
+    `unknown` are the names of unknown parameters."""
     rig = recording.rig
     tensors = {id(rig.parameter(name)) for name in unknown}
     for name, actuator in rig.actuators.items():
-        F, coordinates = sampled(recording, sensors, name), [sampled(recording, sensors, x) for x in actuator.measures]
+        F, coordinates = (
+            sampled(recording, sensors, name),
+            [sampled(recording, sensors, x) for x in actuator.measures],
+        )
         if F is not None and None in coordinates and not actuator.is_loop:
             missing = channel(rig, actuator.measures[coordinates.index(None)])
             yield Diagnostic(
-                "note", recording.name, f"recording `{recording.name}`: {F.channel} is not compared with its controller, since "
-                f"{missing} is not recorded", f"controller of {F.channel}",
+                "note", recording.name, f"recording `{recording.name}`: {F.channel} is not "
+                f"compared with its controller, since {missing} is not recorded", "controller of "
+                                                                                  f"{F.channel}",
             )  # fmt: skip
         loop = windows(recording, actuator, [F, *coordinates])
         if loop is None:
@@ -214,7 +251,9 @@ def loop_findings(
         body, _, axis = actuator.measured.partition(".")
         rivals = {}
         for other in (one for one in rig.bodies if one != body and actuator.is_loop):
-            rival = windows(recording, actuator, [F, sampled(recording, sensors, f"{other}.{axis}")])
+            rival = windows(
+                recording, actuator, [F, sampled(recording, sensors, f"{other}.{axis}")]
+            )
             rivals |= {other: rival} if rival is not None else {}
         free = any(id(p) in tensors for p in actuator.parameters())
         change = disagreement(rig, loop, body, rivals, free)
@@ -222,46 +261,69 @@ def loop_findings(
             e, (force, *others) = rms(loop.F - loop.given()), loop.signals
             seen = ", ".join([*actuator.setpoints, *(one.channel for one in others)])
             text = (
-                f"{change.clause} (what the controller makes of {seen} differs from {force.channel} by {e:.3g} "
-                f"{actuator.effort_unit} rms, and would by {rms(change.left):.3g})"
+                f"{change.clause} (what the controller makes of {seen} differs from "
+                f"{force.channel} by {e:.3g} {actuator.effort_unit} rms, and would by "
+                f"{rms(change.left):.3g})"
             )
             yield found(change.code, recording, text, change.grave)
 
 
-def disagreement(rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop], free: bool) -> Change | None:
-    """The cause of a disagreement of a loop about a body, if there is one; gains that are `free` may all be larger or
-    smaller."""
+def disagreement(
+    rig: Rig, loop: Loop, body: str, rivals: Mapping[str, Loop], free: bool
+) -> Change | None:
+    """The cause of a disagreement of a loop about a body, if there is one; gains that are `free`
+    may all be larger or smaller."""
 
     def left(one: Loop, F: Array, feed_forward: float = 1.0) -> Array:
         given = one.given(feed_forward)
         gain = max(float(F @ given) / max(float(given @ given), 1e-300), 0.0) if free else 1.0
         return F - gain * given
 
-    F, name, unit, feed = loop.F, loop.signals[0].channel, loop.actuator.effort_unit, loop.actuator.feed_forward
+    F, name, unit, feed = (
+        loop.F,
+        loop.signals[0].channel,
+        loop.actuator.effort_unit,
+        loop.actuator.feed_forward,
+    )
     e = left(loop, F)
     white, lasting = (2 * sd + ROUGH * rms(F) for sd in loop.noise)
     if rms(e) <= white:
         return None
     opposite = "looks as if its sign were opposite"
     changes = [Change(f"sign of {name}", f"{name} {opposite}", left(loop, -F))]
-    changes += [another_sense(rig, loop.actuator, body, other, left(its, its.F)) for other, its in rivals.items()]
+    changes += [
+        another_sense(rig, loop.actuator, body, other, left(its, its.F))
+        for other, its in rivals.items()
+    ]
     if not free:
         changes += [
-            Change(f"unit of {name}", f"{name} looks as if it were in another unit: {words}", left(loop, F / factor))
+            Change(
+                f"unit of {name}",
+                f"{name} looks as if it were in another unit: {words}",
+                left(loop, F / factor),
+            )
             for factor, words in confusions(unit)
         ]
-        changes += [Change(f"sign of {feed}", f"{feed} {opposite}", left(loop, F, -1.0))] if feed else []
+        changes += (
+            [Change(f"sign of {feed}", f"{feed} {opposite}", left(loop, F, -1.0))] if feed else []
+        )
     best = min(changes, key=lambda change: rms(change.left))
     enough = 0.5 * rms(F) if free else max(white, EXPLAINED * min(rms(e), rms(F)))
     if rms(best.left) <= enough and rms(best.left) < 0.5 * rms(e):
         return best
     faulty = any(one.faulty for one in loop.signals)
-    if free or faulty or rms(e) <= (white if feed and not loop.inputs[:, loop.fed].any() else lasting):
+    if (
+        free
+        or faulty
+        or rms(e) <= (white if feed and not loop.inputs[:, loop.fed].any() else lasting)
+    ):
         return None
     slow, began = np.diff(e) / np.sqrt(2), float(e[: max(2, len(e) // 20)].mean())
     if feed and rms(slow) <= max(SLOW * rms(e), white) and abs(began) <= 0.5 * rms(e):
         words = f"{name} is {float(e.mean()):+.3g} {unit} more, on the average, than the controller gives"
-        return Change(feed, f"{words}: was a force fed forward that {feed} does not have?", slow, grave=False)
+        return Change(
+            feed, f"{words}: was a force fed forward that {feed} does not have?", slow, grave=False
+        )
     words = f"{name} is not what the controller gives: are its gains, units, zeros, times and set-points right?"
     return Change(f"loop of {name}", words, e, grave=False)
 
@@ -272,8 +334,8 @@ def another_sense(rig: Rig, actuator: Actuator, body: str, other: str, left: Arr
     paper = isinstance(rig, SoftGrasp) and axis == "x"
     remedy = f' (say control.senses = "{other}")' if paper else ""
     clause = (
-        f"{actuator.setpoint} looks like the set-point of the {other}, not of the {body}{remedy}; or are "
-        f"{channel(rig, f'{body}.{axis}')} and {channel(rig, f'{other}.{axis}')} exchanged?"
+        f"{actuator.setpoint} looks like the set-point of the {other}, not of the {body}{remedy}; "
+        f"or are {channel(rig, f'{body}.{axis}')} and {channel(rig, f'{other}.{axis}')} exchanged?"
     )
     return Change("control.senses" if paper else f"what {actuator.setpoint} is of", clause, left)
 
@@ -282,7 +344,8 @@ MOVES = 5.0
 """Times its noise that a channel moves, where its motion says something."""
 
 OPPOSITE = -0.5
-"""Correlation with the run below which a sign is called opposite: wrong parameters do not do that."""
+"""Correlation with the run below which a sign is called opposite: wrong parameters do not do
+that."""
 
 LARGER = 8.0
 """Factor between the sizes of motions from which parameters, off by three, do not explain it."""
@@ -291,14 +354,16 @@ NEAR = math.log(4.0)
 """How near such a factor must be to one of mistaken units, in its logarithm."""
 
 SAME, APART = 0.1, 0.3
-"""Part of its motion by which a coordinate that follows a set-point may differ from it, and by which another one
-differs."""
+"""Part of its motion by which a coordinate that follows a set-point may differ from it, and by
+which another one differs."""
 
 Expected = Mapping[str, tuple[Readout, Signals]]
 """The sensors of a run, with its signals."""
 
 
-def precheck(problem: Problem, runner: Runner, which: Sequence[str] | None = None) -> list[Diagnostic]:
+def precheck(
+    problem: Problem, runner: Runner, which: Sequence[str] | None = None
+) -> list[Diagnostic]:
     """Diagnostics on some recordings of a problem, or on all: one of every code."""
     every, x = list[Diagnostic](), problem.coordinates.start
     which = problem.names if which is None else which
@@ -311,33 +376,44 @@ def precheck(problem: Problem, runner: Runner, which: Sequence[str] | None = Non
         recording, expected = problem.recordings[job.recording], {}
         if isinstance(got, Prediction):
             signals = Signals(got.t, recording.channels, got.signals, None)
-            expected = {name: (one, signals) for name, one in problem.readouts(x, job.recording).items()}
+            expected = {
+                name: (one, signals) for name, one in problem.readouts(x, job.recording).items()
+            }
         every += findings(recording, problem.sensors, expected, unknown)
     return together(every)
 
 
 def findings(
-    recording: Recording, sensors: Mapping[str, Sensor], expected: Expected, unknown: Collection[str] = ()
+    recording: Recording,
+    sensors: Mapping[str, Sensor],
+    expected: Expected,
+    unknown: Collection[str] = (),
 ) -> list[Diagnostic]:
-    """Diagnostics on one recording, beside a run from the start, if there is one; `unknown` are the names of unknown
-    parameters. A recording with an error is not held against the run."""
+    """Diagnostics on one recording, beside a run from the start, if there is one; `unknown` are the
+    names of unknown parameters. A recording with an error is not held against the run."""
     every = [*setpoint_findings(recording, sensors), *loop_findings(recording, sensors, unknown)]
     if not any(one.severity == "error" for one in every):
         every += another_body(recording, sensors, expected)
     if any(one.severity == "error" for one in every):
         return every
     codes = {one.code for one in every}
-    return every + [one for one in against_run(recording, sensors, expected) if one.code not in codes]
+    return every + [
+        one for one in against_run(recording, sensors, expected) if one.code not in codes
+    ]
 
 
-def unsaturated(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> tuple[Array, Array]:
+def unsaturated(
+    recording: Recording, sensors: Mapping[str, Sensor], name: str
+) -> tuple[Array, Array]:
     """Times and values of a channel, without those that are saturated."""
     t, y = recording.samples[name]
     inside = ~sensors[name].saturated(y)
     return t[inside], y[inside]
 
 
-def against_run(recording: Recording, sensors: Mapping[str, Sensor], expected: Expected) -> Iterator[Diagnostic]:
+def against_run(
+    recording: Recording, sensors: Mapping[str, Sensor], expected: Expected
+) -> Iterator[Diagnostic]:
     """Signs and units of channels that cannot be those of the run."""
     for name, (one, signals) in expected.items():
         (t, y), noise = unsaturated(recording, sensors, name), sensors[name].noise
@@ -350,12 +426,19 @@ def against_run(recording: Recording, sensors: Mapping[str, Sensor], expected: E
         ratio = measured / max(run, 1e-300)
         if not 1 / LARGER < ratio < LARGER and run > 0:
             text = f"{name} moves {ratio:.3g} times as much as in a run with the parameters of the start"
-            known = [(abs(math.log(ratio / factor)), said) for factor, said in confusions(recording.units[name])]
+            known = [
+                (abs(math.log(ratio / factor)), said)
+                for factor, said in confusions(recording.units[name])
+            ]
             distance, said = min(known, default=(math.inf, ""))
             if distance < NEAR and not 1 / LARGER**1.5 < ratio < LARGER**1.5:
                 yield found(f"unit of {name}", recording, f"{text}: {said}?", grave=True)
             else:
-                yield found(f"size of {name}", recording, f"{text}: is its unit right, and are these parameters?")
+                yield found(
+                    f"size of {name}",
+                    recording,
+                    f"{text}: is its unit right, and are these parameters?",
+                )
         elif min(measured, run) >= MOVES * noise:
             alike = float(np.mean((y - y.mean()) * (p - p.mean()))) / (measured * run)
             if alike < OPPOSITE:
@@ -363,11 +446,15 @@ def against_run(recording: Recording, sensors: Mapping[str, Sensor], expected: E
                 yield found(f"sign of {name}", recording, text, grave=True)
 
 
-def another_body(recording: Recording, sensors: Mapping[str, Sensor], expected: Expected) -> Iterator[Diagnostic]:
-    """A set-point that another body follows than the one whose coordinate the loop is taken to measure; or that this
-    one does not follow, as it does in the run."""
+def another_body(
+    recording: Recording, sensors: Mapping[str, Sensor], expected: Expected
+) -> Iterator[Diagnostic]:
+    """A set-point that another body follows than the one whose coordinate the loop is taken to
+    measure; or that this one does not follow, as it does in the run."""
     rig = recording.rig
-    movable = {f"{body}.{COORDINATES[axis]}" for body, axes in rig.layout.free.items() for axis in axes}
+    movable = {
+        f"{body}.{COORDINATES[axis]}" for body, axes in rig.layout.free.items() for axis in axes
+    }
     for actuator in rig.loops.values():
         body, _, axis = actuator.measured.partition(".")
         own, setpoint = channel(rig, actuator.measured), actuator.setpoint
@@ -378,7 +465,13 @@ def another_body(recording: Recording, sensors: Mapping[str, Sensor], expected: 
             far, there = (apart(recording, sensors, setpoint, its, by) for by in (None, expected))
             if far is not None and far < SAME and not small(mine) and not small(there):
                 said = f"{its} follows it to {far:.1%} of its motion"
-            elif mine is not None and mine > APART and far is None and (run is None or run < SAME) and len(others) == 1:
+            elif (
+                mine is not None
+                and mine > APART
+                and far is None
+                and (run is None or run < SAME)
+                and len(others) == 1
+            ):
                 said = f"{own} does not follow it, and differs by {mine:.0%} of its motion"
             else:
                 continue
@@ -391,10 +484,14 @@ def small(part: float | None) -> bool:
 
 
 def apart(
-    recording: Recording, sensors: Mapping[str, Sensor], setpoint: str, name: str, expected: Expected | None
+    recording: Recording,
+    sensors: Mapping[str, Sensor],
+    setpoint: str,
+    name: str,
+    expected: Expected | None,
 ) -> float | None:
-    """Distance of a channel, as it is measured or expected, from a set-point, over the motion of that; None without
-    samples, or where it hardly moves."""
+    """Distance of a channel, as it is measured or expected, from a set-point, over the motion of
+    that; None without samples, or where it hardly moves."""
     if name not in (recording.samples.keys() & sensors.keys() if expected is None else expected):
         return None
     t, y = unsaturated(recording, sensors, name)

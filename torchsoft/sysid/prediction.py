@@ -22,8 +22,8 @@ from torchsoft.sysid.unknowns import NUISANCES, Nuisance, Sensor
 
 
 class Signals(NamedTuple):
-    """Channels of a run on a grid: t (G,) [s], values (G, channels) in the order of `names`, and their derivatives
-    (G, channels, n), if there are any."""
+    """Channels of a run on a grid: t (G,) [s], values (G, channels) in the order of `names`, and
+    their derivatives (G, channels, n), if there are any."""
 
     t: Array
     names: tuple[str, ...]
@@ -32,8 +32,8 @@ class Signals(NamedTuple):
 
 
 class Term(NamedTuple):
-    """A part of a reading: `factor` times the `order`-th rate of a channel, and the derivative of the factor by a
-    nuisance."""
+    """A part of a reading: `factor` times the `order`-th rate of a channel, and the derivative of
+    the factor by a nuisance."""
 
     channel: str
     order: int
@@ -43,8 +43,8 @@ class Term(NamedTuple):
 
 @dataclass(frozen=True)
 class Readout:
-    """One channel as its sensor gives it, for given values of what is wrong with the sensor; its `repr` says all of
-    it."""
+    """One channel as its sensor gives it, for given values of what is wrong with the sensor; its
+    `repr` says all of it."""
 
     channel: str
     noise: float
@@ -57,9 +57,11 @@ class Readout:
     middle: float
     terms: tuple[Term, ...]
 
-    def expected(self, signals: Signals, times: Array) -> tuple[Array, Array | None, dict[Nuisance, Array]]:
-        """The reading (k,) at `times` without noise, its derivatives (k, n) by what the run was differentiated by, and
-        by the nuisances."""
+    def expected(
+        self, signals: Signals, times: Array
+    ) -> tuple[Array, Array | None, dict[Nuisance, Array]]:
+        """The reading (k,) at `times` without noise, its derivatives (k, n) by what the run was
+        differentiated by, and by the nuisances."""
         y, rate, slopes = np.zeros(len(times)), np.zeros(len(times)), None
         by: dict[Nuisance, Array] = {}
         for term in self.terms:
@@ -71,7 +73,9 @@ class Readout:
                 kind, slope = term.by
                 by[kind] = by.get(kind, 0.0) + self.gain * slope * part
             if signals.derivatives is not None and term.factor != 0.0:
-                more = term.factor * CubicSpline(signals.t, signals.derivatives[:, j])(at, term.order)
+                more = term.factor * CubicSpline(signals.t, signals.derivatives[:, j])(
+                    at, term.order
+                )
                 slopes = more if slopes is None else slopes + more
         by |= {
             "gain": y,
@@ -85,8 +89,8 @@ class Readout:
     def residuals(self, y: Array, measured: Array) -> tuple[Array, Array]:
         """Expected less measured over the noise (k,), and its derivative by the expected.
 
-        Of a saturated sample half the square is the negative logarithm of the probability that value and noise are
-        together beyond the limit (Tobin, 1958).
+        Of a saturated sample half the square is the negative logarithm of the probability that
+        value and noise are together beyond the limit (Tobin, 1958).
         """
         r, weight = (y - measured) / self.noise, np.full(len(y), 1 / self.noise)
         for limit, sign in ((self.high, 1.0), (self.low, -1.0)):
@@ -107,8 +111,9 @@ class Readout:
 
 
 def censored(z: Array) -> tuple[Array, Array]:
-    """-sqrt(-2 ln Phi(z)) (k,), where values are expected z standard deviations beyond a limit, and its derivative; Phi
-    is the normal distribution function. It is z far short of the limit, and nothing far beyond."""
+    """-sqrt(-2 ln Phi(z)) (k,), where values are expected z standard deviations beyond a limit, and
+    its derivative; Phi is the normal distribution function. It is z far short of the limit, and
+    nothing far beyond."""
     log = log_ndtr(z)
     r = -np.sqrt(-2 * log)
     density = np.exp(-0.5 * z**2 - log) / np.sqrt(2 * np.pi)
@@ -116,10 +121,16 @@ def censored(z: Array) -> tuple[Array, Array]:
 
 
 def partner(rig: Rig, channel: str) -> tuple[str, float]:
-    """The channel at right angles, and the sign with which it enters when the sensor is turned. Raises `ValueError`."""
+    """The channel at right angles, and the sign with which it enters when the sensor is turned.
+    Raises `ValueError`."""
     names = {rig.renamed.get(key, key): key for key in every_key(rig)}
     key = names.get(channel, channel)
-    for a, b, sign in (("x_", "y_", 1.0), ("y_", "x_", -1.0), ("v_x_", "v_y_", 1.0), ("v_y_", "v_x_", -1.0)):
+    for a, b, sign in (
+        ("x_", "y_", 1.0),
+        ("y_", "x_", -1.0),
+        ("v_x_", "v_y_", 1.0),
+        ("v_y_", "v_x_", -1.0),
+    ):
         if key.startswith(a):
             other = b + key.removeprefix(a)
             if other in names.values():
@@ -130,17 +141,25 @@ def partner(rig: Rig, channel: str) -> tuple[str, float]:
         twin = next((k for k, a in rig.actuators.items() if a.pushes == f"{body}.{other}"), None)
         if key == f"F_{name}" and twin is not None:
             return rig.renamed.get(f"F_{twin}", f"F_{twin}"), 1.0 if axis == "x" else -1.0
-    raise ValueError(f"sensors.{channel}.misalignment: `{channel}` has no channel at right angles that it could see")
+    raise ValueError(
+        f"sensors.{channel}.misalignment: `{channel}` has no channel at right angles that it could "
+        "see"
+    )
 
 
 def every_key(rig: Rig) -> list[str]:
     """Keys of the free coordinates and their rates, before the rig renames any."""
-    poses = [f"{['x', 'y', 'theta'][i]}_{rig.symbols[b]}" for b, axes in rig.layout.free.items() for i in axes]
+    poses = [
+        f"{['x', 'y', 'theta'][i]}_{rig.symbols[b]}"
+        for b, axes in rig.layout.free.items()
+        for i in axes
+    ]
     return [*poses, *map(rate_channel, poses)]
 
 
 def pushed(rig: Rig, channel: str) -> str:
-    """The channel of the rate of what an effort's actuator pushes. Raises `ValueError` for what is not an effort."""
+    """The channel of the rate of what an effort's actuator pushes. Raises `ValueError` for what is
+    not an effort."""
     for name, actuator in rig.actuators.items():
         if channel == rig.renamed.get(f"F_{name}", f"F_{name}"):
             body, axis = actuator.pushes.split(".")
@@ -150,10 +169,14 @@ def pushed(rig: Rig, channel: str) -> str:
 
 
 def readout(
-    rig: Rig, channel: str, sensor: Sensor, values: Mapping[Nuisance, float], span: tuple[float, float]
+    rig: Rig,
+    channel: str,
+    sensor: Sensor,
+    values: Mapping[Nuisance, float],
+    span: tuple[float, float],
 ) -> Readout:
-    """The readout of a sensor with the nuisances' `values`, in a recording over the times `span` [s]. Raises
-    `ValueError` for a nuisance that the channel cannot have."""
+    """The readout of a sensor with the nuisances' `values`, in a recording over the times `span`
+    [s]. Raises `ValueError` for a nuisance that the channel cannot have."""
     at = {kind: values.get(kind, float(kind == "gain")) for kind in NUISANCES}
     c, s = np.cos(at["misalignment"]), np.sin(at["misalignment"])
     if sensor.misalignment > 0:
@@ -167,8 +190,8 @@ def readout(
     if sensor.inertia > 0:
         terms.append(Term(pushed(rig, channel), 1, -at["inertia"], ("inertia", -1.0)))
     return Readout(
-        channel, sensor.noise, sensor.low, sensor.high, at["gain"], at["bias"], at["drift"], at["delay"],
-        0.5 * (span[0] + span[1]), tuple(terms),
+        channel, sensor.noise, sensor.low, sensor.high, at["gain"], at["bias"], at["drift"],
+        at["delay"], 0.5 * (span[0] + span[1]), tuple(terms),
     )  # fmt: skip
 
 
@@ -176,12 +199,13 @@ def readout(
 
 
 TOLERANCE = 1e-8
-"""Newton tolerance [N] of the runs that fits are made of: far below any sensor, above rounding with the largest
-dashpots."""
+"""Newton tolerance [N] of the runs that fits are made of: far below any sensor, above rounding with
+the largest dashpots."""
 
 
 class Frozen:
-    """The steps of a run, to be taken again: their ends `knots` (steps + 1,) [s]. Its `repr` names them to the bit."""
+    """The steps of a run, to be taken again: their ends `knots` (steps + 1,) [s]. Its `repr` names
+    them to the bit."""
 
     def __init__(self, knots: Array) -> None:
         self.knots, self._name = knots, sha256(knots.tobytes()).hexdigest()
@@ -195,8 +219,9 @@ Steps = float | Frozen
 
 
 class Prediction(NamedTuple):
-    """Signals (G, channels) of `Recording.channels` on a grid t (G,) [s], the number of steps, the signals' derivatives
-    (G, channels, n), if there are any, and the steps' ends `knots` [s] where a tolerance chose them."""
+    """Signals (G, channels) of `Recording.channels` on a grid t (G,) [s], the number of steps, the
+    signals' derivatives (G, channels, n), if there are any, and the steps' ends `knots` [s] where a
+    tolerance chose them."""
 
     t: Array
     signals: Array
@@ -206,8 +231,8 @@ class Prediction(NamedTuple):
 
 
 class Misfit(NamedTuple):
-    """Half the sum of squared residuals of one recording, its derivatives by the run's parameters (n,), and by every
-    channel's nuisances (channels, nuisances), and the stepper's steps."""
+    """Half the sum of squared residuals of one recording, its derivatives by the run's parameters
+    (n,), and by every channel's nuisances (channels, nuisances), and the stepper's steps."""
 
     loss: float
     parameters: Array
@@ -223,7 +248,8 @@ class FailedRun(NamedTuple):
 
 
 Judge = Callable[[Signals], tuple[float, Array, Array]]
-"""Half the sum of squared residuals of a run's signals, its derivatives by them (G, channels), and by the nuisances."""
+"""Half the sum of squared residuals of a run's signals, its derivatives by them (G, channels), and
+by the nuisances."""
 
 
 @torch.no_grad()
@@ -234,8 +260,8 @@ def set_parameters(rig: Rig, values: Mapping[str, float]) -> None:
 
 
 class Run(NamedTuple):
-    """What a run begins with: the state y0 (size,), and the tensors by which it is differentiated, those of parameters
-    before those of the start."""
+    """What a run begins with: the state y0 (size,), and the tensors by which it is differentiated,
+    those of parameters before those of the start."""
 
     y0: Tensor
     parameters: tuple[str, ...]
@@ -243,8 +269,11 @@ class Run(NamedTuple):
 
 
 def prepared(begun: RunContext, values: Mapping[str, float], names: Sequence[str]) -> Run:
-    """Gives the rig its parameters, and makes the state where it begins, with its derivatives by `names`."""
-    set_parameters(begun.rig, {name: value for name, value in values.items() if not name.startswith(PREFIX)})
+    """Gives the rig its parameters, and makes the state where it begins, with its derivatives by
+    `names`."""
+    set_parameters(
+        begun.rig, {name: value for name, value in values.items() if not name.startswith(PREFIX)}
+    )
     at = {
         name: torch.tensor(value, dtype=torch.float64, requires_grad=name in names)
         for name, value in values.items()
@@ -257,11 +286,14 @@ def prepared(begun: RunContext, values: Mapping[str, float], names: Sequence[str
 
 
 def derivatives(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
-    """Derivatives (T, channels, n) of the channels `names` by the run's parameters and start: along the motion of the
-    bodies, and of the controllers' own parameters."""
+    """Derivatives (T, channels, n) of the channels `names` by the run's parameters and start: along
+    the motion of the bodies, and of the controllers' own parameters."""
     assert run.sensitivities is not None
     bodies, signals = Layout({}, {}, rig.layout.free, {}), rig.follow(run.t, rig.reference).detach()
-    along = [torch.zeros((), dtype=torch.float64, requires_grad=True) for _ in range(run.sensitivities.shape[-1])]
+    along = [
+        torch.zeros((), dtype=torch.float64, requires_grad=True)
+        for _ in range(run.sensitivities.shape[-1])
+    ]
     q = run.y[:, rig.layout.rigid].detach() + run.sensitivities @ torch.stack(along)
     known = channels(rig, bodies.unpack(q, *rig.held(signals)), signals)
     measured = torch.stack([known[name] for name in names], -1)
@@ -272,7 +304,9 @@ def derivatives(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
 
 def choice(steps: Steps) -> dict[str, Any]:
     """The arguments of `simulate` that say which steps to take, and how exactly."""
-    chosen = {"knots": torch.from_numpy(steps.knots)} if isinstance(steps, Frozen) else {"rtol": steps}
+    chosen = (
+        {"knots": torch.from_numpy(steps.knots)} if isinstance(steps, Frozen) else {"rtol": steps}
+    )
     return chosen | {"tolerance": TOLERANCE}
 
 
@@ -284,17 +318,28 @@ def predict(
     rig, run = begun.rig, prepared(begun, values, names)
     dy0 = torch.from_numpy(directions(run.y0, run.wanted)) if names else None
     out = simulate(
-        rig, grid.t, y0=run.y0, gradient="forward" if names else "none", wrt=run.parameters, dy0=dy0, rigid=bool(names),
-        **choice(steps),
+        rig, grid.t, y0=run.y0, gradient="forward" if names else "none", wrt=run.parameters,
+        dy0=dy0, rigid=bool(names), **choice(steps),
     )  # fmt: skip
     keys, rows = measurable(rig), slice(grid.early, None)
     slopes = derivatives(rig, out, keys)[rows] if names else None
     knots = None if isinstance(steps, Frozen) else out.knots.numpy()
-    return Prediction(grid.t[rows].numpy(), out.together(*keys)[rows].detach().numpy(), out.stats.steps, slopes, knots)
+    return Prediction(
+        grid.t[rows].numpy(),
+        out.together(*keys)[rows].detach().numpy(),
+        out.stats.steps,
+        slopes,
+        knots,
+    )
 
 
 def misfit(
-    begun: RunContext, values: Mapping[str, float], grid: Grid, names: Sequence[str], steps: Steps, judge: Judge
+    begun: RunContext,
+    values: Mapping[str, float],
+    grid: Grid,
+    names: Sequence[str],
+    steps: Steps,
+    judge: Judge,
 ) -> Misfit:
     """The misfit that `judge` finds, with its gradient by `names`, by the discrete adjoint. Raises
     `SimulationFailed`."""
@@ -302,7 +347,11 @@ def misfit(
     out = simulate(rig, grid.t, y0=run.y0, gradient="discrete", **choice(steps))
     keys, rows = measurable(rig), slice(grid.early, None)
     signals = out.together(*keys)[rows]
-    loss, weights, nuisances = judge(Signals(grid.t[rows].numpy(), keys, signals.detach().numpy(), None))
-    gradient = torch.autograd.grad(signals, run.wanted, torch.from_numpy(weights), allow_unused=True)
+    loss, weights, nuisances = judge(
+        Signals(grid.t[rows].numpy(), keys, signals.detach().numpy(), None)
+    )
+    gradient = torch.autograd.grad(
+        signals, run.wanted, torch.from_numpy(weights), allow_unused=True
+    )
     by = np.array([0.0 if g is None else float(g) for g in gradient])
     return Misfit(loss, by, nuisances, out.stats.steps)

@@ -1,4 +1,5 @@
-"""The least-squares problem: recordings, sensors and unknowns; residuals in units of the sensors' noise."""
+"""The least-squares problem: recordings, sensors and unknowns; residuals in units of the sensors'
+noise."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -11,7 +12,15 @@ from numpy.typing import NDArray
 from torchsoft.paper.rig import NAMES, SoftGrasp
 from torchsoft.physics.validity import check_values
 from torchsoft.sysid.noise import Autoregression
-from torchsoft.sysid.prediction import FailedRun, Frozen, Prediction, Readout, Signals, readout, set_parameters
+from torchsoft.sysid.prediction import (
+    FailedRun,
+    Frozen,
+    Prediction,
+    Readout,
+    Signals,
+    readout,
+    set_parameters,
+)
 from torchsoft.sysid.recording import Array, Recording
 from torchsoft.sysid.runs import Job, Runner
 from torchsoft.sysid.unknowns import NUISANCES, Coordinates, Nuisance, Sensor, Unknown
@@ -22,10 +31,10 @@ StepsByName = float | Mapping[str, Frozen]
 
 
 class Residuals(NamedTuple):
-    """Residuals r (m,) over the sensors' noise, whitened where its colour is known, then those of the priors; their
-    Jacobian J (m, n) by the coordinates (zero where not free), and what was lost: recordings that could not be
-    simulated, with the reason. With a loss r and J are infinite. |r|^2 / 2 is the negative logarithm of the posterior
-    density, but for a constant.
+    """Residuals r (m,) over the sensors' noise, whitened where its colour is known, then those of
+    the priors; their Jacobian J (m, n) by the coordinates (zero where not free), and what was lost:
+    recordings that could not be simulated, with the reason. With a loss r and J are infinite. |r|^2
+    / 2 is the negative logarithm of the posterior density, but for a constant.
     """
 
     r: Array
@@ -34,8 +43,8 @@ class Residuals(NamedTuple):
 
 
 def check_ends(coordinates: Coordinates, recordings: Sequence[Recording]) -> None:
-    """Raises `ValueError` where the bounds of an unknown leave no rig: a disc that does not fit between the pads,
-    say."""
+    """Raises `ValueError` where the bounds of an unknown leave no rig: a disc that does not fit
+    between the pads, say."""
     for c in coordinates.all:
         if c.kind != "parameter" or c.ratio_to:
             continue
@@ -46,7 +55,9 @@ def check_ends(coordinates: Coordinates, recordings: Sequence[Recording]) -> Non
                 try:
                     check_value(recording, c.name, value)
                 except ValueError as error:
-                    raise ValueError(f"unknowns.{c.name}.{field} = {value:g} is impossible: {error}") from None
+                    raise ValueError(
+                        f"unknowns.{c.name}.{field} = {value:g} is impossible: {error}"
+                    ) from None
 
 
 def check_value(recording: Recording, name: str, value: float) -> None:
@@ -64,33 +75,40 @@ def check_value(recording: Recording, name: str, value: float) -> None:
 class Problem:
     """Which parameters explain these recordings?
 
-    `recordings` have names of their own; `sensors` are the channels that count, with their noise; `unknowns` the
-    parameters; `noise` the colour of a channel's noise, white where there is none. Raises `ValueError` where these do
-    not fit together.
+    `recordings` have names of their own; `sensors` are the channels that count, with their noise;
+    `unknowns` the parameters; `noise` the colour of a channel's noise, white where there is none.
+    Raises `ValueError` where these do not fit together.
     """
 
     def __init__(
-        self, recordings: Sequence[Recording], sensors: dict[str, Sensor], unknowns: dict[str, Unknown],
-        noise: Mapping[str, Autoregression] | None = None,
+        self, recordings: Sequence[Recording], sensors: dict[str, Sensor],
+        unknowns: dict[str, Unknown], noise: Mapping[str, Autoregression] | None = None,
     ) -> None:  # fmt: skip
         names = [recording.name for recording in recordings]
         if not recordings or len(set(names)) < len(names):
             raise ValueError(f"recordings need names of their own, but are called {names}")
         for channel in sensors:
             if not any(channel in recording.channels for recording in recordings):
-                known = ", ".join(dict.fromkeys(c for recording in recordings for c in recording.channels))
+                known = ", ".join(
+                    dict.fromkeys(c for recording in recordings for c in recording.channels)
+                )
                 raise ValueError(f"sensors: `{line(channel, 80)}` is not a channel; known: {known}")
             if not any(channel in recording.samples for recording in recordings):
                 raise ValueError(f"sensors: no recording has samples of `{channel}`")
         for recording in recordings:
             if not set(sensors) & set(recording.samples):
-                raise ValueError(f"recording `{recording.name}` has samples of none of the sensors {list(sensors)}")
+                raise ValueError(
+                    f"recording `{recording.name}` has samples of none of the sensors "
+                    f"{list(sensors)}"
+                )
         self.recordings, self.sensors, self.unknowns = tuple(recordings), sensors, unknowns
         self.coordinates = Coordinates(unknowns, sensors, recordings)
         if not self.coordinates.free.any():
             raise ValueError("there is nothing to identify: no unknown is free")
         check_ends(self.coordinates, recordings)
-        self.interpolated = any(sensor.delay > 0 or sensor.inertia > 0 for sensor in sensors.values())
+        self.interpolated = any(
+            sensor.delay > 0 or sensor.inertia > 0 for sensor in sensors.values()
+        )
         self.noise = dict(noise or {})
         self._whiteners: dict[tuple[str, str], Any] = {}
         for k in range(len(recordings)):
@@ -98,15 +116,21 @@ class Problem:
         self.check_saturated()
 
     def check_saturated(self) -> None:
-        """Raises `ValueError` where noise is coloured and samples are saturated: of such neighbours no likelihood is
-        known that can be computed."""
+        """Raises `ValueError` where noise is coloured and samples are saturated: of such neighbours
+        no likelihood is known that can be computed."""
         for recording in self.recordings:
             for channel, sensor in self.sensors.items():
                 coloured = sensor.colour == "ar" or channel in self.noise
-                if coloured and channel in recording.samples and sensor.saturated(recording.samples[channel][1]).any():
+                if (
+                    coloured
+                    and channel in recording.samples
+                    and sensor.saturated(recording.samples[channel][1]).any()
+                ):
                     raise ValueError(
-                        f"sensors.{channel}: in `{recording.name}` samples are at its `low` or `high`, which cannot go "
-                        'together with noise of `colour = "ar"`; declare it "white", or record within the range'
+                        f"sensors.{channel}: in `{recording.name}` samples are at its `low` or "
+                        "`high`, which cannot go "
+                        'together with noise of `colour = "ar"`; declare it "white", or record '
+                        "within the range"
                     )
 
     def with_noise(self, noise: Mapping[str, Autoregression]) -> "Problem":
@@ -161,10 +185,15 @@ class Problem:
         return next(r.units[channel] for r in self.recordings if channel in r.units)
 
     def jobs(
-        self, x: Array, which: Sequence[str], steps: StepsByName, free: NDArray[np.bool_] | None, adjoint: bool = False
+        self,
+        x: Array,
+        which: Sequence[str],
+        steps: StepsByName,
+        free: NDArray[np.bool_] | None,
+        adjoint: bool = False,
     ) -> list[Job]:
-        """One run a recording; with `free` they are differentiated by the parameters that free coordinates (n,)
-        move."""
+        """One run a recording; with `free` they are differentiated by the parameters that free
+        coordinates (n,) move."""
         c, out = self.coordinates, []
         for k, recording in enumerate(self.recordings):
             if recording.name not in which:
@@ -175,23 +204,36 @@ class Problem:
                 names = tuple(name for name, moves in zip(c.names, moved) if moves)
             judged = None
             if adjoint:
-                judged = tuple((one, self.noise.get(one.channel)) for one in self.readouts(x, k).values())
+                judged = tuple(
+                    (one, self.noise.get(one.channel)) for one in self.readouts(x, k).values()
+                )
             mine = steps[recording.name] if isinstance(steps, Mapping) else steps
             out.append(Job(k, values, names, mine, self.interpolated, judged))
         return out
 
     def residuals(
-        self, runner: Runner, x: Array, which: Sequence[str], steps: StepsByName, free: NDArray[np.bool_] | None = None
+        self,
+        runner: Runner,
+        x: Array,
+        which: Sequence[str],
+        steps: StepsByName,
+        free: NDArray[np.bool_] | None = None,
     ) -> Residuals:
-        """Residuals of some recordings at x (n,); the Jacobian's columns of `free` coordinates. On frozen steps they
-        are smooth in x."""
+        """Residuals of some recordings at x (n,); the Jacobian's columns of `free` coordinates. On
+        frozen steps they are smooth in x."""
         jobs = self.jobs(x, which, steps, free)
         return self.gather(x, jobs, runner.run(jobs))
 
     def freeze(
-        self, runner: Runner, x: Array, which: Sequence[str], rtol: float, free: NDArray[np.bool_] | None = None
+        self,
+        runner: Runner,
+        x: Array,
+        which: Sequence[str],
+        rtol: float,
+        free: NDArray[np.bool_] | None = None,
     ) -> tuple[Residuals, dict[str, Frozen]]:
-        """`residuals` by runs whose steps `rtol` chooses, and those steps by recording; none where one is lost."""
+        """`residuals` by runs whose steps `rtol` chooses, and those steps by recording; none where
+        one is lost."""
         jobs = self.jobs(x, which, rtol, free)
         runs = runner.run(jobs)
         at = self.gather(x, jobs, runs)
@@ -201,14 +243,20 @@ class Problem:
     def gather(self, x: Array, jobs: Sequence[Job], results: Sequence[Any]) -> Residuals:
         """Residuals at x (n,) from the results of its jobs."""
         lost = {
-            self.recordings[job.recording].name: got for job, got in zip(jobs, results) if isinstance(got, FailedRun)
+            self.recordings[job.recording].name: got
+            for job, got in zip(jobs, results)
+            if isinstance(got, FailedRun)
         }
         if lost:
-            m = self.samples([self.recordings[job.recording].name for job in jobs]) + len(self.coordinates.priors)
+            m = self.samples([self.recordings[job.recording].name for job in jobs]) + len(
+                self.coordinates.priors
+            )
             return Residuals(np.full(m, np.inf), np.full((m, len(x)), np.inf), lost)
         parts = [self._compare(x, job, got) for job, got in zip(jobs, results)]
         parts.append(self._priors(x))
-        return Residuals(np.concatenate([r for r, _ in parts]), np.concatenate([J for _, J in parts]), {})
+        return Residuals(
+            np.concatenate([r for r, _ in parts]), np.concatenate([J for _, J in parts]), {}
+        )
 
     def _priors(self, x: Array) -> tuple[Array, Array]:
         """Residuals of the priors, and their Jacobian."""
@@ -222,8 +270,14 @@ class Problem:
     def _compare(self, x: Array, job: Job, prediction: Prediction) -> tuple[Array, Array]:
         """Residuals and Jacobian of one recording."""
         c, recording = self.coordinates, self.recordings[job.recording]
-        chain = c.jacobian(x, recording.name, job.values)[[c.names.index(name) for name in job.names]]
-        signals, rs, Js = Signals(prediction.t, recording.channels, prediction.signals, prediction.derivatives), [], []
+        chain = c.jacobian(x, recording.name, job.values)[
+            [c.names.index(name) for name in job.names]
+        ]
+        signals, rs, Js = (
+            Signals(prediction.t, recording.channels, prediction.signals, prediction.derivatives),
+            [],
+            [],
+        )
         for channel, one in self.readouts(x, job.recording).items():
             t, measured = recording.samples[channel]
             y, slopes, by = one.expected(signals, t)
@@ -238,9 +292,15 @@ class Problem:
         return np.concatenate(rs), np.concatenate(Js)
 
     def misfit(
-        self, runner: Runner, x: Array, which: Sequence[str], steps: StepsByName, free: NDArray[np.bool_]
+        self,
+        runner: Runner,
+        x: Array,
+        which: Sequence[str],
+        steps: StepsByName,
+        free: NDArray[np.bool_],
     ) -> tuple[float, Array, dict[str, FailedRun]]:
-        """Half the sum of squares and its gradient (n,), by the discrete adjoint; infinite where a run is lost."""
+        """Half the sum of squares and its gradient (n,), by the discrete adjoint; infinite where a
+        run is lost."""
         c, jobs = self.coordinates, self.jobs(x, which, steps, free, adjoint=True)
         total, gradient, lost = 0.0, np.zeros(len(x)), {}
         for job, got in zip(jobs, runner.run(jobs)):
@@ -249,7 +309,10 @@ class Problem:
                 lost[name] = got
                 continue
             rows = [c.names.index(n) for n in job.names]
-            total, gradient = total + got.loss, gradient + got.parameters @ c.jacobian(x, name, job.values)[rows]
+            total, gradient = (
+                total + got.loss,
+                gradient + got.parameters @ c.jacobian(x, name, job.values)[rows],
+            )
             for one, row in zip(self.readouts(x, job.recording), got.nuisances):
                 for kind, (_, at) in c.nuisances(x, one, name).items():
                     gradient[at] += row[NUISANCES.index(kind)] * c.all[at].slope(x[at])

@@ -21,14 +21,15 @@ if TYPE_CHECKING:
     from torchsoft.sysid.result import IdentificationResult
 
 CHOSEN_ANEW = 1.0
-"""Change of |r|^2 by steps that are chosen anew, in place of those of the optimum, above which these are too far
-off."""
+"""Change of |r|^2 by steps that are chosen anew, in place of those of the optimum, above which
+these are too far off."""
 
 
 class Optimum:
-    """Coordinates x (n,) where a fit of the recordings `which` (all by default) ended, with the steps that `rtol`
-    chooses there. `free` (n,) are the coordinates that were fitted. `variance` is what the noise's is larger than it
-    was stated, and widens profiles. `workers` threads may look at it side by side.
+    """Coordinates x (n,) where a fit of the recordings `which` (all by default) ended, with the
+    steps that `rtol` chooses there. `free` (n,) are the coordinates that were fitted. `variance` is
+    what the noise's is larger than it was stated, and widens profiles. `workers` threads may look
+    at it side by side.
 
     Raises `Unreachable` where x cannot be simulated.
     """
@@ -54,26 +55,32 @@ class Optimum:
 
     @classmethod
     def of(cls, problem: Problem, answer: "IdentificationResult", workers: int = 1) -> Self:
-        """Where the identification of `problem` ended, with the noise that it found. Raises `ValueError` for another
-        problem's answer, or one of a robust loss, which says nothing of a likelihood."""
+        """Where the identification of `problem` ended, with the noise that it found. Raises
+        `ValueError` for another problem's answer, or one of a robust loss, which says nothing of a
+        likelihood."""
         last, labels = answer.stages[-1], problem.coordinates.labels
         if [one.label for one in answer.coordinates] != list(labels):
-            raise ValueError("this answer belongs to another problem: it does not have the same coordinates")
+            raise ValueError(
+                "this answer belongs to another problem: it does not have the same coordinates"
+            )
         if answer.made_by["loss"] != "linear":
             raise ValueError(
-                f"the loss `{answer.made_by['loss']}` is no likelihood, so there is no profile and no posterior; identify with "
-                "loss = 'linear'"
+                f"the loss `{answer.made_by['loss']}` is no likelihood, so there is no profile and "
+                "no posterior; identify with loss = 'linear'"
             )
         noise = {one.channel: one.model for one in answer.noise}
         return cls(
             problem.with_noise(noise) if noise else problem, np.array(answer.x), rtol=last["rtol"],
-            which=last["recordings"], free=np.isin(labels, last["free"]), variance=max(1.0, answer.chi2), workers=workers,
+            which=last["recordings"], free=np.isin(labels, last["free"]),
+            variance=max(1.0, answer.chi2), workers=workers,
         )  # fmt: skip
 
     @property
     def labels(self) -> tuple[str, ...]:
         """Of the free coordinates."""
-        return tuple(label for label, free in zip(self.problem.coordinates.labels, self.free) if free)
+        return tuple(
+            label for label, free in zip(self.problem.coordinates.labels, self.free) if free
+        )
 
     @property
     def J(self) -> Array:
@@ -100,24 +107,34 @@ class Optimum:
     def values(self, z: Array) -> Array:
         """Free coordinates z (..., free coordinates) in physical units."""
         mine = [c for c, free in zip(self.problem.coordinates.all, self.free) if free]
-        return np.stack([np.vectorize(c.to_value, [float])(z[..., i]) for i, c in enumerate(mine)], -1)
+        return np.stack(
+            [np.vectorize(c.to_value, [float])(z[..., i]) for i, c in enumerate(mine)], -1
+        )
 
     def residuals(self, x: Array, derivatives: bool = False) -> Residuals:
         """Residuals at x (n,), on the steps of the optimum."""
-        return self.problem.residuals(self.runner, x, self.which, self.steps, self.free if derivatives else None)
+        return self.problem.residuals(
+            self.runner, x, self.which, self.steps, self.free if derivatives else None
+        )
 
     def misfit(self, x: Array) -> tuple[float, Array, str]:
-        """|r|^2 / 2 at x (n,) with its gradient by the free coordinates, by the adjoint; where a run is lost, infinite,
-        with the reason."""
-        value, gradient, lost = self.problem.misfit(self.runner, x, self.which, self.steps, self.free)
+        """|r|^2 / 2 at x (n,) with its gradient by the free coordinates, by the adjoint; where a
+        run is lost, infinite, with the reason."""
+        value, gradient, lost = self.problem.misfit(
+            self.runner, x, self.which, self.steps, self.free
+        )
         return value, gradient[self.free], next((one.reason for one in lost.values()), "")
 
     def off(self, x: Array) -> float:
-        """How much larger |r|^2 at x (n,) is by steps that the tolerance chooses there than by those of the optimum;
-        NaN where one of the two fails."""
+        """How much larger |r|^2 at x (n,) is by steps that the tolerance chooses there than by
+        those of the optimum; NaN where one of the two fails."""
         frozen = self.residuals(x)
         fresh, _ = self.problem.freeze(self.runner, x, self.which, self.rtol)
-        return float("nan") if fresh.lost or frozen.lost else float(fresh.r @ fresh.r - frozen.r @ frozen.r)
+        return (
+            float("nan")
+            if fresh.lost or frozen.lost
+            else float(fresh.r @ fresh.r - frozen.r @ frozen.r)
+        )
 
 
 # Profiles
@@ -127,7 +144,8 @@ RISE = float(stats.chi2.ppf(0.95, 1))
 """2 Delta(-log posterior) where a 95 % interval ends."""
 
 STRIDE = 0.5
-"""Change of the square root of the rise from one point of a profile to the next; its end is at 1.96."""
+"""Change of the square root of the rise from one point of a profile to the next; its end is at
+1.96."""
 
 POINTS = 12
 """Most points to either side."""
@@ -139,26 +157,30 @@ BEYOND = (RISE**0.5 + STRIDE) ** 2
 """Rise above which a point lies too far beyond the end of the interval to tell where that is."""
 
 SHORTER = 6
-"""How often, to either side, a stride is made shorter because a run fails or the rise goes too far."""
+"""How often, to either side, a stride is made shorter because a run fails or the rise goes too
+far."""
 
 FITTED = 0.02
-"""What the others may still gain in |r|^2 by another step of Gauss-Newton, which is then taken for true."""
+"""What the others may still gain in |r|^2 by another step of Gauss-Newton, which is then taken for
+true."""
 
 LOWER = 0.1
 """Fall of |r|^2 below the optimum's from which the fit was not at its optimum."""
 
 DIFFERENT = 0.2
-"""Difference of an end of the two intervals, over the half width of Wald's, above which they are called different."""
+"""Difference of an end of the two intervals, over the half width of Wald's, above which they are
+called different."""
 
 
 @dataclass(frozen=True)
 class Profile:
-    """The profile of one coordinate: its values in physical units, ascending, and the `rises` of 2 (-log posterior)
-    there.
+    """The profile of one coordinate: its values in physical units, ascending, and the `rises` of 2
+    (-log posterior) there.
 
-    `others` holds, by label, where the other coordinates went, in physical units. `ci95` has None for an end that was
-    not found, and `notices` says why; `wald95` is what the covariance says. `variance` is what the rises were divided
-    by: above one where residuals are larger than the noise that was given.
+    `others` holds, by label, where the other coordinates went, in physical units. `ci95` has None
+    for an end that was not found, and `notices` says why; `wald95` is what the covariance says.
+    `variance` is what the rises were divided by: above one where residuals are larger than the
+    noise that was given.
     """
 
     label: str
@@ -181,69 +203,89 @@ class Point(NamedTuple):
 
 
 class Side(NamedTuple):
-    """The points to one side of the optimum, outwards, why it ended before the interval did, and what else there is to
-    say."""
+    """The points to one side of the optimum, outwards, why it ended before the interval did, and
+    what else there is to say."""
 
     points: list[Point]
     ended: str
     notices: list[str]
 
 
-def profiles(optimum: Optimum, labels: Sequence[str] | None = None, *, progress: bool = False) -> list[Profile]:
-    """Profiles of some coordinates, or of all free ones, both sides of each side by side in the optimum's threads.
+def profiles(
+    optimum: Optimum, labels: Sequence[str] | None = None, *, progress: bool = False
+) -> list[Profile]:
+    """Profiles of some coordinates, or of all free ones, both sides of each side by side in the
+    optimum's threads.
 
     Raises `ValueError` for a label that is not a free coordinate's.
     """
     known = optimum.labels
     for label in labels or ():
         if label not in known:
-            raise ValueError(f"there is no free coordinate {label!r} to profile; there are {', '.join(known)}")
+            raise ValueError(
+                f"there is no free coordinate {label!r} to profile; there are {', '.join(known)}"
+            )
     chosen = list(known if labels is None else labels)
     where = {label: i for i, label in enumerate(optimum.problem.coordinates.labels)}
     tasks = [(label, sign) for label in chosen for sign in (-1, 1)]
     with single_threaded():
-        work = parallel_map(lambda k: walk(optimum, where[tasks[k][0]], tasks[k][1]), len(tasks), optimum.workers)
+        work = parallel_map(
+            lambda k: walk(optimum, where[tasks[k][0]], tasks[k][1]), len(tasks), optimum.workers
+        )
         done = dict(tqdm(work, desc="profiles", total=len(tasks), disable=not progress))
-    return [assemble(optimum, where[label], done[2 * k], done[2 * k + 1]) for k, label in enumerate(chosen)]
+    return [
+        assemble(optimum, where[label], done[2 * k], done[2 * k + 1])
+        for k, label in enumerate(chosen)
+    ]
 
 
 def walk(o: Optimum, i: int, sign: int) -> Side:
     """From the optimum outwards in coordinate number i, until the interval has ended."""
-    label, (low, high) = o.problem.coordinates.labels[i], (float(b[i]) for b in o.problem.coordinates.bounds)
+    label, (low, high) = (
+        o.problem.coordinates.labels[i],
+        (float(b[i]) for b in o.problem.coordinates.bounds),
+    )
     edge, inner = (high if sign > 0 else low), int(np.flatnonzero(np.flatnonzero(o.free) == i)[0])
     sd = float(np.sqrt(o.covariance[inner, inner] * o.variance))
     here, stride = Point(o.x, 0.0, o.at), min(STRIDE * sd, (high - low) / 8)
     points, notices, shorter = list[Point](), list[str](), 0
     while here.rise < RISE and len(points) < POINTS:
         if sign * (edge - here.x[i]) <= 1e-9 * (high - low):
-            return Side(points, f"{label} may not be {'larger' if sign > 0 else 'smaller'}", notices)
+            return Side(
+                points, f"{label} may not be {'larger' if sign > 0 else 'smaller'}", notices
+            )
         length = min(stride, sign * (edge - here.x[i]))
         there, reason = refit(o, i, here, here.x[i] + sign * length)
         if there is None and shorter == SHORTER:
             return Side(points, reason, notices)
         gained = 0.0 if there is None else max(there.rise, 0.0) ** 0.5 - max(here.rise, 0.0) ** 0.5
         if there is None or (there.rise > BEYOND and shorter < SHORTER):
-            stride, shorter = length * float(np.clip(STRIDE / max(gained, 1e-9), 0.1, 0.5)), shorter + 1
+            stride, shorter = (
+                length * float(np.clip(STRIDE / max(gained, 1e-9), 0.1, 0.5)),
+                shorter + 1,
+            )
             continue
         points.append(there)
         if there.rise * o.variance < -LOWER:
             value = o.problem.coordinates.all[i].to_value(there.x[i])
             notices.append(
-                f"the fit did not end at the optimum: with {label} = {value:.4g} the misfit |r|^2 is less by "
-                f"{-there.rise * o.variance:.2g}; fit again from there"
+                f"the fit did not end at the optimum: with {label} = {value:.4g} the misfit |r|^2 "
+                f"is less by {-there.rise * o.variance:.2g}; fit again from there"
             )
             return Side(points, "the fit did not end at the optimum", notices)
         if there.rise < here.rise - LOWER:
             notices.append(f"the profile of {label} is not monotone: there may be another optimum")
         stride, here = length * float(np.clip(STRIDE / max(gained, 1e-9), 0.3, 3.0)), there
     return Side(
-        points, "" if here.rise >= RISE else f"after {POINTS} points the rise is still {here.rise:.2g}", notices
+        points,
+        "" if here.rise >= RISE else f"after {POINTS} points the rise is still {here.rise:.2g}",
+        notices,
     )
 
 
 def refit(o: Optimum, i: int, here: Point, aim: float) -> tuple[Point | None, str]:
-    """The others' optimum with coordinate number i at `aim`, begun along the tangent of the profile; or why there is
-    none."""
+    """The others' optimum with coordinate number i at `aim`, begun along the tangent of the
+    profile; or why there is none."""
     others, (low, high) = o.free.copy(), o.problem.coordinates.bounds
     others[i] = False
     x = here.x.copy()
@@ -265,11 +307,13 @@ def refit(o: Optimum, i: int, here: Point, aim: float) -> tuple[Point | None, st
         ahead = x.copy()
         ahead[others] += step
         there = o.residuals(ahead, derivatives=True)
-        if there.lost or there.r @ there.r > square - 0.1 * gain:  # the Jacobian does not hold as far as that
+        if (
+            there.lost or there.r @ there.r > square - 0.1 * gain
+        ):  # the Jacobian does not hold as far as that
             try:
                 ahead = gauss_newton(
-                    o.problem, o.runner, x, which=o.which, free=others, steps=o.steps, first=at, evaluations=10,
-                    tolerance=0.1 * FITTED / square,
+                    o.problem, o.runner, x, which=o.which, free=others, steps=o.steps, first=at,
+                    evaluations=10, tolerance=0.1 * FITTED / square,
                 ).x  # fmt: skip
             except Unreachable as lost:
                 return None, str(lost)
@@ -289,17 +333,22 @@ def assemble(o: Optimum, i: int, below: Side, above: Side) -> Profile:
     for side, sign, name in ((below, -1, "lower"), (above, 1, "upper")):
         if side.ended or not side.points:
             last = one.to_value(side.points[-1].x[i] if side.points else o.x[i])
-            notices.append(f"{one.label} has no {name} bound of its 95 % interval within {last:.4g}: {side.ended}")
+            notices.append(
+                f"{one.label} has no {name} bound of its 95 % interval within {last:.4g}: "
+                f"{side.ended}"
+            )
             ends.append(None)
             continue
-        a, b = sorted((side.points[-1].x[i], side.points[-2].x[i] if len(side.points) > 1 else o.x[i]))
+        a, b = sorted(
+            (side.points[-1].x[i], side.points[-2].x[i] if len(side.points) > 1 else o.x[i])
+        )
         roots = PchipInterpolator(x, zeta).solve(sign * RISE**0.5)
         ends.append(float(roots[(roots >= a) & (roots <= b)][0]))
         off = o.off(side.points[-1].x)
         if not abs(off) < CHOSEN_ANEW * o.variance:
             notices.append(
-                f"the {name} end of the profile of {one.label} is uncertain: steps chosen anew there change |r|^2 by "
-                f"{off:.2g}; take a tighter tolerance than rtol = {o.rtol:g}"
+                f"the {name} end of the profile of {one.label} is uncertain: steps chosen anew "
+                f"there change |r|^2 by {off:.2g}; take a tighter tolerance than rtol = {o.rtol:g}"
             )
     inner = int(np.flatnonzero(np.flatnonzero(o.free) == i)[0])
     half = float(np.sqrt(o.covariance[inner, inner] * o.variance * RISE))
@@ -310,12 +359,14 @@ def assemble(o: Optimum, i: int, below: Side, above: Side) -> Profile:
     if worst > DIFFERENT:
         told = [f"{e:.4g}" if e is not None else "open" for e in physical]
         notices.append(
-            f"the misfit is no parabola in {one.label}: its profile's interval is {told[0]} .. {told[1]}, the covariance's "
-            f"{straight[0]:.4g} .. {straight[1]:.4g}; take the profile's"
+            f"the misfit is no parabola in {one.label}: its profile's interval is {told[0]} .. "
+            f"{told[1]}, the covariance's {straight[0]:.4g} .. {straight[1]:.4g}; take the "
+            "profile's"
         )
     every = [k for k in np.flatnonzero(o.free) if k != i]
     return Profile(
-        one.label, one.to_value(o.x[i]), [one.to_value(v) for v in x], [max(float(point.rise), 0.0) for point in points],
+        one.label, one.to_value(o.x[i]), [one.to_value(v) for v in x],
+        [max(float(point.rise), 0.0) for point in points],
         {c.labels[k]: [c.all[k].to_value(point.x[k]) for point in points] for k in every},
         (physical[0], physical[1]), straight, o.variance, list(dict.fromkeys(notices)),
     )  # fmt: skip

@@ -1,4 +1,5 @@
-"""A recording: the rig that was there, where its run began, and the samples of the sensors, which may have gaps."""
+"""A recording: the rig that was there, where its run began, and the samples of the sensors, which
+may have gaps."""
 
 import inspect
 from copy import deepcopy
@@ -21,11 +22,12 @@ from torchsoft.sysid.initial_state import AtRest, Begin, Start, StartCoordinate
 Array = NDArray[np.float64]
 
 BETWEEN = 1e-3
-"""Spacing [s] of the regular grid that is simulated where samples are needed between (an unknown delay), or are denser
-than it; a cubic spline lies between its points."""
+"""Spacing [s] of the regular grid that is simulated where samples are needed between (an unknown
+delay), or are denser than it; a cubic spline lies between its points."""
 
 REACH = 0.1
-"""Largest delay [s] of a sensor: for so long before the first sample and after the last one runs are known."""
+"""Largest delay [s] of a sensor: for so long before the first sample and after the last one runs
+are known."""
 
 SAME = 1e-9
 """Times [s] closer than this are one time."""
@@ -52,10 +54,11 @@ REST = AtRest()
 class Recording:
     """One run of a rig, seen by sensors.
 
-    `rig` has the known numbers and the nominal ones of what is unknown, the laws, and the reference that the run
-    followed; runs are made of copies of it. `samples` holds times (k,) [s] and values (k,) by channel, each with times
-    of its own; channels are those of the rig's trajectories that `measurable` names. `start` says where the run begins.
-    `dataclasses.replace` makes variants, with another law, say.
+    `rig` has the known numbers and the nominal ones of what is unknown, the laws, and the reference
+    that the run followed; runs are made of copies of it. `samples` holds times (k,) [s] and values
+    (k,) by channel, each with times of its own; channels are those of the rig's trajectories that
+    `measurable` names. `start` says where the run begins. `dataclasses.replace` makes variants,
+    with another law, say.
     """
 
     name: str
@@ -69,11 +72,19 @@ class Recording:
         known = measurable(self.rig)
         for channel, (t, y) in self.samples.items():
             if channel not in known:
-                raise ValueError(f"`{channel}` is not a channel of the rig of `{self.name}`; known: {', '.join(known)}")
+                raise ValueError(
+                    f"`{channel}` is not a channel of the rig of `{self.name}`; known: "
+                    f"{', '.join(known)}"
+                )
             if t.shape != y.shape or t.ndim != 1 or len(t) < 2:
-                raise ValueError(f"`{channel}` of `{self.name}` needs at least two samples, times and values alike")
+                raise ValueError(
+                    f"`{channel}` of `{self.name}` needs at least two samples, times and values "
+                    "alike"
+                )
             if not (np.isfinite(t).all() and np.isfinite(y).all() and (np.diff(t) > 0).all()):
-                raise ValueError(f"`{channel}` of `{self.name}` must have finite values at increasing times")
+                raise ValueError(
+                    f"`{channel}` of `{self.name}` must have finite values at increasing times"
+                )
 
     @cached_property
     def channels(self) -> tuple[str, ...]:
@@ -98,8 +109,8 @@ class Recording:
 
     @cached_property
     def speed(self) -> float:
-        """Root mean square of the speed of the horizontal setpoints and drives [m/s]: slow recordings are the easy
-        ones."""
+        """Root mean square of the speed of the horizontal setpoints and drives [m/s]: slow
+        recordings are the easy ones."""
         pairs = [pair for a in self.rig.actuators.values() for pair in a.follows]
         names = [setpoint for coordinate, setpoint in pairs if coordinate.endswith(".x")]
         names += [name for name in self.rig.signals if name.endswith(".x")]
@@ -115,10 +126,14 @@ class Recording:
 
     @cached_property
     def parameters(self) -> dict[str, float]:
-        """Every number that can be identified: the rig's scalar parameters, by their aliases where they have one, and
-        the start's coordinates."""
+        """Every number that can be identified: the rig's scalar parameters, by their aliases where
+        they have one, and the start's coordinates."""
         names = {own: name for name, own in self.rig.aliases.items()}
-        mine = [(own, value) for own, value in self.rig.named_parameters() if not own.startswith("reference.")]
+        mine = [
+            (own, value)
+            for own, value in self.rig.named_parameters()
+            if not own.startswith("reference.")
+        ]
         scalars = {names.get(own, own): value for own, value in mine if value.ndim == 0}
         numbers = {name: float(value.detach()) for name, value in scalars.items()}
         return numbers | {c.name: c.mean for c in self.start_coordinates}
@@ -131,13 +146,14 @@ class Recording:
         return RunContext(rig, self.start.begin(rig, self.samples))
 
     def on_a_grid(self, interpolated: bool) -> bool:
-        """Whether a regular grid is simulated, every `BETWEEN`, in place of the samples' own times: where they are
-        denser, or values between them are needed (`interpolated`)."""
+        """Whether a regular grid is simulated, every `BETWEEN`, in place of the samples' own times:
+        where they are denser, or values between them are needed (`interpolated`)."""
         return interpolated or self.duration < 0.99 * BETWEEN * (len(self.times) - 1)
 
     def grid(self, interpolated: bool) -> Grid:
-        """The times to simulate: the beginning, where that is before the samples, then the samples' own times, or a
-        regular grid from `REACH` before the first, but not from before the beginning, to `REACH` after the last."""
+        """The times to simulate: the beginning, where that is before the samples, then the samples'
+        own times, or a regular grid from `REACH` before the first, but not from before the
+        beginning, to `REACH` after the last."""
         t, lead = self.times, self.start.lead
         if self.on_a_grid(interpolated):
             t = np.arange(t[0] - min(REACH, lead), t[-1] + REACH + BETWEEN, BETWEEN)
@@ -150,29 +166,48 @@ class Recording:
         """Names everything that decides a run or a residual of this recording."""
         t = torch.from_numpy(np.linspace(self.times[0] - self.start.lead, self.times[-1], 2000))
         signals = self.rig.follow(t).detach().numpy().tobytes()
-        measured = b"".join(k.encode() + t.tobytes() + y.tobytes() for k, (t, y) in sorted(self.samples.items()))
-        return sha256(identity(self.rig) + signals + measured + repr(self.start).encode()).hexdigest()
+        measured = b"".join(
+            k.encode() + t.tobytes() + y.tobytes() for k, (t, y) in sorted(self.samples.items())
+        )
+        return sha256(
+            identity(self.rig) + signals + measured + repr(self.start).encode()
+        ).hexdigest()
 
 
 def identity(rig: Rig) -> bytes:
-    """What a rig is made of: its parts' numbers and plain attributes, but for the reference, and the files with the
-    code of parts that are the user's own."""
-    parts = [(name, part) for name, part in rig.named_modules() if name.split(".")[0] != "reference"]
+    """What a rig is made of: its parts' numbers and plain attributes, but for the reference, and
+    the files with the code of parts that are the user's own."""
+    parts = [
+        (name, part) for name, part in rig.named_modules() if name.split(".")[0] != "reference"
+    ]
     text = [f"{name} {type(part).__qualname__} {plain(part)}" for name, part in parts]
-    functions = [value for _, part in parts for value in vars(part).values() if inspect.isfunction(value)]
-    code = {f"{one.__module__}.{one.__qualname__}": one for one in (*(type(part) for _, part in parts), *functions)}
-    own = {name: one for name, one in code.items() if name.split(".")[0] not in ("torch", "torchsoft")}
+    functions = [
+        value for _, part in parts for value in vars(part).values() if inspect.isfunction(value)
+    ]
+    code = {
+        f"{one.__module__}.{one.__qualname__}": one
+        for one in (*(type(part) for _, part in parts), *functions)
+    }
+    own = {
+        name: one for name, one in code.items() if name.split(".")[0] not in ("torch", "torchsoft")
+    }
     return repr(text).encode() + b"".join(name.encode() + source(own[name]) for name in sorted(own))
 
 
 def plain(part: nn.Module) -> str:
-    """A part's own parameters and buffers, and its attributes that are numbers, text, arrays or tuples of them."""
-    tensors = {**dict(part.named_parameters(recurse=False)), **dict(part.named_buffers(recurse=False))}
+    """A part's own parameters and buffers, and its attributes that are numbers, text, arrays or
+    tuples of them."""
+    tensors = {
+        **dict(part.named_parameters(recurse=False)),
+        **dict(part.named_buffers(recurse=False)),
+    }
     known: dict[str, Any] = {name: value.tolist() for name, value in tensors.items()}
     for name, value in vars(part).items():
         if isinstance(value, np.ndarray | Tensor):
             known[name] = sha256(np.asarray(value).tobytes()).hexdigest()
-        elif not name.startswith("_") and isinstance(value, int | float | str | tuple | dict | None):
+        elif not name.startswith("_") and isinstance(
+            value, int | float | str | tuple | dict | None
+        ):
             known[name] = value
     if isinstance(part, Pad):
         known["mesh"] = part.mesh.nodes.tolist(), part.mesh.bonded.tolist()

@@ -1,4 +1,5 @@
-"""Report of an identification: one HTML file with its pictures inside, that any browser opens without a network."""
+"""Report of an identification: one HTML file with its pictures inside, that any browser opens
+without a network."""
 
 import base64
 import io
@@ -45,7 +46,8 @@ def document(title: str, parts: Iterable[str]) -> str:
     """The whole page."""
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta name="viewport" content="width=device-width,initial-scale=1"><title>{escape(title)}</title>'
+        '<meta name="viewport" '
+        f'content="width=device-width,initial-scale=1"><title>{escape(title)}</title>'
         f"<style>\n{STYLE_SHEET.read_text(encoding='utf-8')}</style></head><body><main>{''.join(parts)}</main></body></html>\n"
     )
 
@@ -72,7 +74,11 @@ def folded(summary: str, inside: str) -> str:
 
 
 def definitions(pairs: Iterable[tuple[str, str]]) -> str:
-    return "<dl>" + "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in pairs if v) + "</dl>"
+    return (
+        "<dl>"
+        + "".join(f"<dt>{escape(k)}</dt><dd>{escape(v)}</dd>" for k, v in pairs if v)
+        + "</dl>"
+    )
 
 
 def picture(figure: Figure, alt: str, caption: str = "", kind: str = "") -> str:
@@ -86,7 +92,8 @@ def picture(figure: Figure, alt: str, caption: str = "", kind: str = "") -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Cell]], caption: str = "") -> str:
-    """Numbers to the right, but for the first column; columns without anything in them are left out."""
+    """Numbers to the right, but for the first column; columns without anything in them are left
+    out."""
     kept = [i for i in range(len(head)) if any(text_of(row[i]) for row in rows)]
     numeric = {i for i in kept[1:] if any(kind_of(row[i]) == "n" for row in rows)}
 
@@ -94,7 +101,10 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Cell]], caption: str = ""
         kind = "" if i == kept[0] and isinstance(value, str) else kind_of(value)
         return f'<td class="{kind}" data-label="{escape(head[i])}">{escape(text_of(value))}</td>'
 
-    top = "".join(f'<th scope="col" class="{"n" if i in numeric else ""}">{escape(head[i])}</th>' for i in kept)
+    top = "".join(
+        f'<th scope="col" class="{"n" if i in numeric else ""}">{escape(head[i])}</th>'
+        for i in kept
+    )
     body = "".join(f"<tr>{''.join(cell(i, row[i]) for i in kept)}</tr>" for row in rows)
     above = f"<caption>{escape(caption)}</caption>" if caption else ""
     return f'<div class="wide"><table>{above}<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
@@ -108,7 +118,11 @@ def kind_of(cell: Cell) -> str:
     """Its class; "n" for what begins like a number, or like an interval."""
     if isinstance(cell, tuple):
         return cell[0]
-    return "n" if cell.strip(" −+×").removeprefix("open … ")[:1].isdigit() or cell == "open … open" else ""
+    return (
+        "n"
+        if cell.strip(" −+×").removeprefix("open … ")[:1].isdigit() or cell == "open … open"
+        else ""
+    )
 
 
 def grouped(value: float, digits: int = 5) -> str:
@@ -126,34 +140,42 @@ def signed(value: float, digits: int = 2) -> str:
 
 def interval(low: float | None, high: float | None) -> str:
     """Two numbers; an end that is not known is open."""
-    return f"{'open' if low is None else grouped(low)} … {'open' if high is None else grouped(high)}"
+    return (
+        f"{'open' if low is None else grouped(low)} … {'open' if high is None else grouped(high)}"
+    )
 
 
 # Sections
 
 
 MOVED = 0.5
-"""Standard deviations by which something that was taken for granted may move an estimate and still be folded away."""
+"""Standard deviations by which something that was taken for granted may move an estimate and still
+be folded away."""
 
 
 def summary(result: IdentificationResult) -> Iterator[str]:
     """What was fitted, and what a reader must know first."""
     fitted = ", ".join(one.name for one in result.recordings if one.fitted)
     yield paragraph(
-        f"{fitted}: {result.cost['data_seconds']:.3g} s of data, {result.cost['samples']:.0f} samples. χ² is the sum of "
-        "squared residuals over the noise, per degree of freedom: 1 where model and noise are right.",
+        f"{fitted}: {result.cost['data_seconds']:.3g} s of data, {result.cost['samples']:.0f} "
+        "samples. χ² is the sum of squared residuals over the noise, per degree of freedom: 1 "
+        "where model and noise are right.",
         "soft",
     )
     notices = [*result.notices, *(n for one in result.profiles for n in one.notices)]
     notices += result.posterior.notices if result.posterior is not None else []
     notices += (
-        [result.comparison.verdict] if result.comparison is not None and result.comparison.outcome != "law" else []
+        [result.comparison.verdict]
+        if result.comparison is not None and result.comparison.outcome != "law"
+        else []
     )
     if notices:
         inside = f"<strong>Read this first</strong>{listing(dict.fromkeys(notices))}"
         yield f'<div class="notices" role="note">{inside}</div>'
     else:
-        yield paragraph("Converged, residuals white, steps fine enough: there is nothing to warn of.", "fine")
+        yield paragraph(
+            "Converged, residuals white, steps fine enough: there is nothing to warn of.", "fine"
+        )
 
 
 def estimates(result: IdentificationResult) -> Iterator[str]:
@@ -162,12 +184,20 @@ def estimates(result: IdentificationResult) -> Iterator[str]:
     yield heading("Estimates")
     groups = {
         "": [e for e in of if e.recording is None],
-        "Parameters of which each recording has its own": [e for e in of if e.recording is not None],
+        "Parameters of which each recording has its own": [
+            e for e in of if e.recording is not None
+        ],
         "Where the runs began": [e for e in result.estimates if e.kind == "start"],
-        "What the sensors add": [e for e in result.estimates if e.kind not in ("parameter", "start")],
+        "What the sensors add": [
+            e for e in result.estimates if e.kind not in ("parameter", "start")
+        ],
     }
     profiled = {one.label: one.ci95 for one in result.profiles}
-    posterior = {one.label: one.ci95 for one in result.posterior.marginals} if result.posterior is not None else {}
+    posterior = (
+        {one.label: one.ci95 for one in result.posterior.marginals}
+        if result.posterior is not None
+        else {}
+    )
     head = [
         "name",
         "recording",
@@ -183,9 +213,11 @@ def estimates(result: IdentificationResult) -> Iterator[str]:
     for caption, group in groups.items():
         rows = [
             [
-                e.name, ("", e.recording or ""), *found(e), interval(*profiled[e.label]) if e.label in profiled else "",
-                interval(*posterior[e.label]) if e.label in posterior else "", "" if e.unit == "1" else e.unit,
-                "" if e.start is None else grouped(e.start), prior(e), ("weak", "at a bound") if e.at_bound else "",
+                e.name, ("", e.recording or ""), *found(e),
+                interval(*profiled[e.label]) if e.label in profiled else "",
+                interval(*posterior[e.label]) if e.label in posterior else "",
+                "" if e.unit == "1" else e.unit, "" if e.start is None else grouped(e.start),
+                prior(e), ("weak", "at a bound") if e.at_bound else "",
             ]
             for e in sorted(group, key=lambda e: e.name if e.recording else "")
         ]  # fmt: skip
@@ -223,8 +255,9 @@ def contributions_section(result: IdentificationResult) -> Iterator[str]:
         return
     yield heading("Contribution of each recording")
     yield paragraph(
-        "The weight that each recording has in an estimate, and in brackets how many times larger the standard deviation "
-        "would be without it; “only here” where the others do not determine the parameter."
+        "The weight that each recording has in an estimate, and in brackets how many times larger "
+        "the standard deviation would be without it; “only here” where the others do not determine "
+        "the parameter."
     )
     rows = []
     for e in (e for e in result.estimates if e.identifiable and e.kind == "parameter"):
@@ -235,7 +268,9 @@ def contributions_section(result: IdentificationResult) -> Iterator[str]:
             cells.append(f"{100 * one.shares[e.label]:.0f} % ({least})")
         rows.append([e.label, *cells])
     sources = [one.source or "priors" for one in result.contributions]
-    alt = "; ".join(f"{row[0]}: " + ", ".join(f"{s} {c}" for s, c in zip(sources, row[1:])) for row in rows)
+    alt = "; ".join(
+        f"{row[0]}: " + ", ".join(f"{s} {c}" for s, c in zip(sources, row[1:])) for row in rows
+    )
     yield picture(figure, f"Weight of the recordings in each estimate. {alt}")
     yield table(["parameter", *sources], rows)
 
@@ -250,14 +285,21 @@ def identifiable(result: IdentificationResult) -> Iterator[str]:
     if words:
         yield listing(words)
     yield paragraph(
-        "Each bar is a combination of parameters (of their logarithms) that the data determine on its own: the shorter, the "
-        "better. Long orange bars are combinations that may change without a trace in the data."
+        "Each bar is a combination of parameters (of their logarithms) that the data determine on "
+        "its own: the shorter, the better. Long orange bars are combinations that may change "
+        "without a trace in the data."
     )
-    spectrum = "; ".join(f"{direction_name(d)}: standard deviation {d.sd:.2g}" for d in result.directions)
+    spectrum = "; ".join(
+        f"{direction_name(d)}: standard deviation {d.sd:.2g}" for d in result.directions
+    )
     ends = f". Not identifiable: {'; '.join(weak)}" if weak else ". All are identifiable"
-    shown = picture(spectrum_figure(result), f"Fisher spectrum: {spectrum}{ends}", "Fisher spectrum")
+    shown = picture(
+        spectrum_figure(result), f"Fisher spectrum: {spectrum}{ends}", "Fisher spectrum"
+    )
     strong = correlations(result)
-    shown += picture(correlation_figure(result), f"Correlations: {strong}", "Correlation of the estimates")
+    shown += picture(
+        correlation_figure(result), f"Correlations: {strong}", "Correlation of the estimates"
+    )
     yield f'<div class="grid">{shown}</div>'
     yield paragraph(f"Strong correlations: {strong}.")
 
@@ -281,11 +323,15 @@ def profiles(result: IdentificationResult) -> Iterator[str]:
     units = {e.label: e.unit for e in result.estimates}
     yield heading("Profiles")
     yield paragraph(
-        "How the misfit rises when one parameter is held and all others are fitted again, beside the parabola that the "
-        "covariance stands for. Where the two part, the profile's interval (shaded) is the one to take."
+        "How the misfit rises when one parameter is held and all others are fitted again, beside "
+        "the parabola that the covariance stands for. Where the two part, the profile's interval "
+        "(shaded) is the one to take."
     )
     shown = [
-        picture(profile_figure(one, units.get(one.label, "")), f"Profile of {one.label}: {interval(*one.ci95)}")
+        picture(
+            profile_figure(one, units.get(one.label, "")),
+            f"Profile of {one.label}: {interval(*one.ci95)}",
+        )
         for one in result.profiles
     ]
     yield f'<div class="grid">{"".join(shown)}</div>'
@@ -296,7 +342,9 @@ def assumptions_section(result: IdentificationResult) -> Iterator[str]:
     if not result.assumptions:
         return
     first, rest = list[list[Cell]](), list[list[Cell]]()
-    most = [max((abs(move) for move in one.moves.values()), default=0.0) for one in result.assumptions]
+    most = [
+        max((abs(move) for move in one.moves.values()), default=0.0) for one in result.assumptions
+    ]
     for i in np.argsort([-m for m in most], kind="stable"):
         one = result.assumptions[i]
         label = max(one.moves, key=lambda name: abs(one.moves[name]), default="")
@@ -314,14 +362,17 @@ def assumptions_section(result: IdentificationResult) -> Iterator[str]:
         (first if one.suspected or most[i] > MOVED or one.unchecked else rest).append(row)
     yield heading("Assumptions")
     yield paragraph(
-        "How far the estimate that moves most would move (in its standard deviations) if something that was stated were "
-        "otherwise, and how much of that the data favour."
+        "How far the estimate that moves most would move (in its standard deviations) if something "
+        "that was stated were otherwise, and how much of that the data favour."
     )
     head = ["assumption", "if", "would move", "do the data favour it?"]
     if first:
         yield table(head, first)
     if rest:
-        yield folded(f"{len(rest)} that move nothing by more than {MOVED:g} standard deviations", table(head, rest))
+        yield folded(
+            f"{len(rest)} that move nothing by more than {MOVED:g} standard deviations",
+            table(head, rest),
+        )
 
 
 def laws(result: IdentificationResult) -> Iterator[str]:
@@ -333,17 +384,32 @@ def laws(result: IdentificationResult) -> Iterator[str]:
     yield paragraph(compared.verdict)
     best = compared.laws[0]
     rows = [
-        [one.name, str(one.parameters), f"{one.chi2:.3f}", f"{one.log_likelihood:.1f}", f"{one.aicc - best.aicc:.1f}",
+        [one.name, str(one.parameters), f"{one.chi2:.3f}", f"{one.log_likelihood:.1f}",
+        f"{one.aicc - best.aicc:.1f}",
          f"{one.bic - best.bic:.1f}", "" if one.heldout is None else f"{one.heldout:.3f}",
          "yes" if one.fits else ("weak", "no")]
         for one in compared.laws
     ]  # fmt: skip
-    yield table(["law", "parameters", "χ²", "log likelihood", "ΔAICc", "ΔBIC", "held out, per sample", "fits"], rows)
+    yield table(
+        [
+            "law",
+            "parameters",
+            "χ²",
+            "log likelihood",
+            "ΔAICc",
+            "ΔBIC",
+            "held out, per sample",
+            "fits",
+        ],
+        rows,
+    )
     if compared.series and compared.against:
         yield picture(plot(compared), "Where in the motion the evidence stands.", kind="broad")
 
 
-def data(result: IdentificationResult, drawn: Sequence[Trace], lost: dict[str, str]) -> Iterator[str]:
+def data(
+    result: IdentificationResult, drawn: Sequence[Trace], lost: dict[str, str]
+) -> Iterator[str]:
     """Samples against predictions, residuals and their colour, held-out recordings."""
     within = {(one.recording, one.channel): one for one in result.residuals}
     noise = {one.channel: one.model for one in result.noise}
@@ -354,22 +420,36 @@ def data(result: IdentificationResult, drawn: Sequence[Trace], lost: dict[str, s
         for one in result.residuals
     ]  # fmt: skip
     head = ["recording", "channel", "rms over noise", "lag-1 correlation", "p (white)", "noise"]
-    yield table(head, rows, "Residuals of what was fitted: 1, 0 and no small p where model and noise are right")
+    yield table(
+        head,
+        rows,
+        "Residuals of what was fitted: 1, 0 and no small p where model and noise are right",
+    )
     if result.heldout:
-        rows = [[r, c, f"{100 * v:.3g} %"] for r, channels in result.heldout.items() for c, v in channels.items()]
+        rows = [
+            [r, c, f"{100 * v:.3g} %"]
+            for r, channels in result.heldout.items()
+            for c, v in channels.items()
+        ]
         yield heading("Held-out recordings", 3)
         yield table(
-            ["recording", "channel", "NRMSE"], rows, "RMS error of the prediction over the range of what was measured"
+            ["recording", "channel", "NRMSE"],
+            rows,
+            "RMS error of the prediction over the range of what was measured",
         )
     for one in result.recordings:
-        yield heading(f"{one.name} ({'fitted' if one.fitted else 'held out: predicted, not fitted'})", 3)
+        yield heading(
+            f"{one.name} ({'fitted' if one.fitted else 'held out: predicted, not fitted'})", 3
+        )
         if one.name in lost:
             yield paragraph(f"Could not be simulated: {lost[one.name]}", "notices")
         shown = ""
         for trace in (trace for trace in drawn if trace.recording == one.name):
             rms = float(np.sqrt(np.mean(trace.residual**2)))
             alt = f"{trace.channel} of {one.name}, measured and predicted: residuals are {rms:.2f} times the noise"
-            figure = trace_figure(trace, within.get((one.name, trace.channel)), noise.get(trace.channel))
+            figure = trace_figure(
+                trace, within.get((one.name, trace.channel)), noise.get(trace.channel)
+            )
             shown += picture(figure, alt)
         yield f'<div class="grid">{shown}</div>'
 
@@ -377,7 +457,8 @@ def data(result: IdentificationResult, drawn: Sequence[Trace], lost: dict[str, s
 def cost(result: IdentificationResult) -> Iterator[str]:
     """Stages, and what they took."""
     rows = [
-        [s["name"], ", ".join(s["free"]), f"{s['rtol']:g}", f"{s['evaluations']}", f"{s['chi2']:.4g}",
+        [s["name"], ", ".join(s["free"]), f"{s['rtol']:g}", f"{s['evaluations']}",
+        f"{s['chi2']:.4g}",
          "yes" if s["converged"] else "no", f"{s['wall_s']:.1f} s"] for s in result.stages
     ]  # fmt: skip
     names = {
@@ -394,7 +475,8 @@ def made(result: IdentificationResult, units: Mapping[str, str]) -> Iterator[str
     """What was fitted to what, by what, and the command that repeats it."""
     yield heading("How it was made")
     rows = [
-        [one.name, "fitted" if one.fitted else "held out", f"{one.duration:.4g} s", str(one.samples), one.rig, one.start,
+        [one.name, "fitted" if one.fitted else "held out", f"{one.duration:.4g} s",
+        str(one.samples), one.rig, one.start,
          ("", one.fingerprint[:12])] for one in result.recordings
     ]  # fmt: skip
     yield table(["recording", "used", "length", "samples", "rig", "begins", "fingerprint"], rows)
@@ -404,7 +486,12 @@ def made(result: IdentificationResult, units: Mapping[str, str]) -> Iterator[str
             ("method", f"{by['method']}, loss {by['loss']}"),
             ("tolerance", f"{by['rtol']:g}"),
             ("seed", str(by["seed"])),
-            ("sensors", ", ".join(f"{k} ± {s.noise:g} {units.get(k, '')}" for k, s in result.sensors.items())),
+            (
+                "sensors",
+                ", ".join(
+                    f"{k} ± {s.noise:g} {units.get(k, '')}" for k, s in result.sensors.items()
+                ),
+            ),
             ("versions", ", ".join(f"{name} {number}" for name, number in result.versions.items())),
             ("units", "SI throughout; pictures show lengths in mm"),
             ("written", datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")),
@@ -413,19 +500,26 @@ def made(result: IdentificationResult, units: Mapping[str, str]) -> Iterator[str
     if result.command:
         yield paragraph("The command that repeats it:")
         yield verbatim(result.command)
-    yield folded("Everything that decides the result", verbatim(json.dumps(by, indent=1, ensure_ascii=False)))
+    yield folded(
+        "Everything that decides the result", verbatim(json.dumps(by, indent=1, ensure_ascii=False))
+    )
 
 
 # The page
 
 
 def report(
-    result: IdentificationResult, problem: Problem, path: str | Path, *, checkpoint: str | Path | None = None
+    result: IdentificationResult,
+    problem: Problem,
+    path: str | Path,
+    *,
+    checkpoint: str | Path | None = None,
 ) -> None:
-    """Write the page about `result`, which `identify` found for `problem`. It appears whole or not at all.
+    """Write the page about `result`, which `identify` found for `problem`. It appears whole or not
+    at all.
 
-    Every recording is simulated once more, unless the `checkpoint` folder has it. Raises `ValueError` where the result
-    belongs to another problem.
+    Every recording is simulated once more, unless the `checkpoint` folder has it. Raises
+    `ValueError` where the result belongs to another problem.
     """
     if result.made_by["recordings"] != {r.name: r.fingerprint for r in problem.recordings}:
         raise ValueError("the result was made from other recordings than the problem's")
@@ -434,8 +528,11 @@ def report(
         partial.write_text(page(result, drawn, lost), encoding="utf-8")
 
 
-def traces(result: IdentificationResult, problem: Problem, journal: Path | None) -> tuple[list[Trace], dict[str, str]]:
-    """Measured and predicted samples of every recording at the result, and why others could not be simulated."""
+def traces(
+    result: IdentificationResult, problem: Problem, journal: Path | None
+) -> tuple[list[Trace], dict[str, str]]:
+    """Measured and predicted samples of every recording at the result, and why others could not be
+    simulated."""
     if result.noise:
         problem = problem.with_noise({one.channel: one.model for one in result.noise})
     x, out, lost = np.array(result.x), list[Trace](), dict[str, str]()
@@ -454,7 +551,9 @@ def traces(result: IdentificationResult, problem: Problem, journal: Path | None)
             y, _, _ = sensor.expected(signals, t)
             r, _ = sensor.residuals(y, measured)
             white = problem.whitened(recording, channel, r)
-            out.append(Trace(recording.name, channel, recording.units[channel], t, measured, y, r, white))
+            out.append(
+                Trace(recording.name, channel, recording.units[channel], t, measured, y, r, white)
+            )
     return out, lost
 
 

@@ -1,8 +1,8 @@
 """Tests of the residuals of a fit, each with a p-value that counts the independent samples.
 
-The residuals r (m,) are whitened with the assumed noise, J (m, n) is their Jacobian. With the right model and noise
-they are independent, normal, of variance one, but for the n directions that the fit took out. Every test is of one
-channel in one recording where it can be:
+The residuals r (m,) are whitened with the assumed noise, J (m, n) is their Jacobian. With the right
+model and noise they are independent, normal, of variance one, but for the n directions that the fit
+took out. Every test is of one channel in one recording where it can be:
 
     level     the sum of squares is chi-squared: residuals are as large as the stated noise
     white     Ljung and Box: no correlation is left from sample to sample
@@ -11,9 +11,10 @@ channel in one recording where it can be:
     outliers  Grubbs, and the kurtosis: tails are those of a normal distribution
     priors    normal: estimates are where their priors expect them
 
-p-values are adjusted by Holm's method: with a right model one of them or more falls below `LEVEL` in as many of all
-identifications. Declared colour is not tested again; colour that was found without a declaration is a finding, although
-intervals allow for it: a sensor may have made it, or a wrong model.
+p-values are adjusted by Holm's method: with a right model one of them or more falls below `LEVEL`
+in as many of all identifications. Declared colour is not tested again; colour that was found
+without a declaration is a finding, although intervals allow for it: a sensor may have made it, or a
+wrong model.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -35,18 +36,20 @@ from torchsoft.sysid.recording import Array
 from torchsoft.sysid.unknowns import Sensor
 
 CLEAR = 4.0
-"""Standard deviations of the noise that a prediction must be within the range of a sensor that is saturated, so that
-its residual has a normal distribution; and from the prediction, beyond which a sample counts wherever it is."""
+"""Standard deviations of the noise that a prediction must be within the range of a sensor that is
+saturated, so that its residual has a normal distribution; and from the prediction, beyond which a
+sample counts wherever it is."""
 
 FEWEST = 4
 """Samples that are left of a sensor that is saturated, below which nothing is said of it."""
 
 
 class Part(NamedTuple):
-    """One channel of one recording at the fit, without what saturation has changed: times t (m,) [s], the rows (m,) of
-    r and J that are its own, the residuals `raw` (m,) over the noise that the sensor states, the `reading` (m,) that
-    the model predicts [unit], the noise that is assumed (white as stated, if None), whether its level was `found` from
-    such residuals, what whitens (m,) or (m, k), and how many samples were `saturated`."""
+    """One channel of one recording at the fit, without what saturation has changed: times t (m,)
+    [s], the rows (m,) of r and J that are its own, the residuals `raw` (m,) over the noise that the
+    sensor states, the `reading` (m,) that the model predicts [unit], the noise that is assumed
+    (white as stated, if None), whether its level was `found` from such residuals, what whitens (m,)
+    or (m, k), and how many samples were `saturated`."""
 
     recording: str
     channel: str
@@ -66,12 +69,12 @@ class Part(NamedTuple):
 
 
 def parts(problem: Problem, r: Array, which: Sequence[str]) -> list[Part]:
-    """The parts of residuals r of `Problem.residuals`, whitened by the problem's noise; none of a channel that is
-    saturated but for less than `FEWEST` samples.
+    """The parts of residuals r of `Problem.residuals`, whitened by the problem's noise; none of a
+    channel that is saturated but for less than `FEWEST` samples.
 
-    Of a sensor that is saturated samples are left out where the prediction is near the end of its range or beyond,
-    whether they are saturated or not: the noise of those that are not is not normal. What is far from the prediction
-    stays.
+    Of a sensor that is saturated samples are left out where the prediction is near the end of its
+    range or beyond, whether they are saturated or not: the noise of those that are not is not
+    normal. What is far from the prediction stays.
     """
     out, at = [], 0
     for recording in problem.recordings:
@@ -93,13 +96,26 @@ def parts(problem: Problem, r: Array, which: Sequence[str]) -> list[Part]:
                     continue
                 t, rows, raw, reading = t[kept], rows[kept], raw[kept], reading[kept]
             whitened = partial(problem.whitened, recording, channel)
-            out.append(Part(recording.name, channel, t, rows, raw, reading, noise, found, whitened, saturated))
+            out.append(
+                Part(
+                    recording.name,
+                    channel,
+                    t,
+                    rows,
+                    raw,
+                    reading,
+                    noise,
+                    found,
+                    whitened,
+                    saturated,
+                )
+            )
     return out
 
 
 def predicted(sensor: Sensor, measured: Array, raw: Array) -> Array:
-    """Readings without noise (m,), from samples and residuals over the noise: infinite where a saturated one leaves
-    nothing."""
+    """Readings without noise (m,), from samples and residuals over the noise: infinite where a
+    saturated one leaves nothing."""
     y = measured + sensor.noise * raw
     for limit, sign in ((sensor.high, 1.0), (sensor.low, -1.0)):
         if limit is not None:
@@ -112,31 +128,34 @@ def predicted(sensor: Sensor, measured: Array, raw: Array) -> Array:
 
 
 LEVEL = 0.01
-"""Part of all identifications with a right model and right noise in which a test gives a false alarm."""
+"""Part of all identifications with a right model and right noise in which a test gives a false
+alarm."""
 
 LAGS = 20
 """Autocorrelations that are shown, at most, and at most a quarter of the samples."""
 
 TESTED = 10
-"""Autocorrelations that are tested, at most, and at most one in twenty samples: the sum of more is not yet chi-squared
-in its tail, where alarms are."""
+"""Autocorrelations that are tested, at most, and at most one in twenty samples: the sum of more is
+not yet chi-squared in its tail, where alarms are."""
 
 FAINT = 0.5
-"""Residuals over the noise below which their pattern is not judged: the noise is overstated, and that is said."""
+"""Residuals over the noise below which their pattern is not judged: the noise is overstated, and
+that is said."""
 
 MOST = 3
 """Channels that a sentence names; it counts the others."""
 
 MEDIAN = 0.37
-"""How many residuals tell the level as exactly, by their squares, as one residual does by the median of all."""
+"""How many residuals tell the level as exactly, by their squares, as one residual does by the
+median of all."""
 
 Test = Literal["level", "white", "motion", "channels", "outliers", "priors"]
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """One test of one channel in one recording (of all, where they are None): its p-value, the one that is adjusted for
-    all tests together, the size of what it looks at, and that in words."""
+    """One test of one channel in one recording (of all, where they are None): its p-value, the one
+    that is adjusted for all tests together, the size of what it looks at, and that in words."""
 
     test: Test
     recording: str | None
@@ -154,10 +173,11 @@ class Verdict:
 def judge_residuals(
     parts: Sequence[Part], r: Array, J: Array, *, robust: bool = False, priors: Sequence[str] = ()
 ) -> list[Verdict]:
-    """All tests of a fit's whitened residuals r (m,), the last of them those of `priors`, which are named, with their
-    Jacobian J (m, n) by what was free.
+    """All tests of a fit's whitened residuals r (m,), the last of them those of `priors`, which are
+    named, with their Jacobian J (m, n) by what was free.
 
-    With a `robust` loss outliers are expected: the level is that of the median residual, and tails are not tested.
+    With a `robust` loss outliers are expected: the level is that of the median residual, and tails
+    are not tested.
     """
     Q, R = np.linalg.qr(J)
     seen = np.abs(np.diag(R)) > 1e-9 * max(np.abs(np.diag(R)).max(initial=0.0), 1e-300)
@@ -168,7 +188,9 @@ def judge_residuals(
     if len(exact) > 1:
         square, dof = (float(sum(some)) for some in zip(*exact))
         words = f"all of them together {(square / dof) ** 0.5:.3g} times, in {dof:.0f} samples"
-        out.append(Verdict("level", None, None, two_sided(square, dof), (square / dof) ** 0.5, words))
+        out.append(
+            Verdict("level", None, None, two_sided(square, dof), (square / dof) ** 0.5, words)
+        )
     for part in parts:
         if float(np.mean(part.raw**2)) < FAINT**2:
             continue
@@ -178,7 +200,10 @@ def judge_residuals(
             out.append(outliers(part, r))
     for recording in dict.fromkeys(part.recording for part in parts):
         out += together(recording, [part for part in parts if part.recording == recording], r, Q)
-    out += [contradicted(name, r[k], Q[k]) for name, k in zip(priors, range(len(r) - len(priors), len(r)))]
+    out += [
+        contradicted(name, r[k], Q[k])
+        for name, k in zip(priors, range(len(r) - len(priors), len(r)))
+    ]
     return holm(out)
 
 
@@ -197,11 +222,11 @@ def two_sided(square: float, dof: float) -> float:
 
 
 def level(part: Part, r: Array, Q: Array, robust: bool) -> tuple[Verdict, float, float]:
-    """Is the sum of squares that of the noise as stated? With it that sum, and how many independent samples it is
-    worth.
+    """Is the sum of squares that of the noise as stated? With it that sum, and how many independent
+    samples it is worth.
 
-    Where the noise's level was found from these residuals, so that whitened ones tell nothing, the raw ones have it,
-    which are worth `Autoregression.effective` samples (Satterthwaite).
+    Where the noise's level was found from these residuals, so that whitened ones tell nothing, the
+    raw ones have it, which are worth `Autoregression.effective` samples (Satterthwaite).
     """
     raw = part.found and part.noise is not None
     rows = part.raw if raw else r[part.rows]
@@ -209,25 +234,36 @@ def level(part: Part, r: Array, Q: Array, robust: bool) -> tuple[Verdict, float,
     free = max(1.0 - float(np.sum(Q[part.rows] ** 2)) / n, 1 / n)  # what the fit left of them
     mean, worth = float(rows @ rows) / n, float(n)
     if robust:
-        mean, worth = (float(np.median(np.abs(rows))) / float(stats.norm.ppf(0.75))) ** 2, MEDIAN * n
+        mean, worth = (
+            (float(np.median(np.abs(rows))) / float(stats.norm.ppf(0.75))) ** 2,
+            MEDIAN * n,
+        )
     if raw and part.noise is not None:
         worth *= part.noise.effective(n) / n
     dof = worth * free
     square, size = mean * worth, float((mean / free) ** 0.5)
     words = f"{part.name} {size:.3g} times"
-    return Verdict("level", part.recording, part.channel, two_sided(square, dof), size, words), square, dof
+    return (
+        Verdict("level", part.recording, part.channel, two_sided(square, dof), size, words),
+        square,
+        dof,
+    )
 
 
 def autocorrelation(r: Array) -> Array:
     """Of residuals r (m,) at lags 1, 2, ..., at most `LAGS` and a quarter of the samples."""
     c = r - r.mean()
     lags, power = min(LAGS, len(r) // 4), float(c @ c)
-    return np.array([c[k:] @ c[:-k] / power for k in range(1, lags + 1)]) if power > 0 else np.zeros(lags)
+    return (
+        np.array([c[k:] @ c[:-k] / power for k in range(1, lags + 1)])
+        if power > 0
+        else np.zeros(lags)
+    )
 
 
 def whiteness(r: Array, coefficients: int = 0) -> tuple[float, float]:
-    """First autocorrelation and Ljung-Box p-value of one channel's residuals (m,), after so many coefficients were
-    fitted."""
+    """First autocorrelation and Ljung-Box p-value of one channel's residuals (m,), after so many
+    coefficients were fitted."""
     rho, m = autocorrelation(r), len(r)
     lags = min(max(TESTED, coefficients + 3), m // 20)
     if not rho.any() or lags <= coefficients:
@@ -244,9 +280,9 @@ def white(part: Part, r: Array) -> Verdict:
 
 
 def explained(part: Part, Z: Array, r: Array, Q: Array) -> tuple[float, float, Array]:
-    """What residuals have in common with Z (m, k), signals at the samples of a part: the F test's p-value of fitting
-    them besides the unknowns, against the variance of the part itself, the share of that which they take, and what each
-    alone would take, signed (k,)."""
+    """What residuals have in common with Z (m, k), signals at the samples of a part: the F test's
+    p-value of fitting them besides the unknowns, against the variance of the part itself, the share
+    of that which they take, and what each alone would take, signed (k,)."""
     size = np.linalg.norm(Z, axis=0)
     columns = np.zeros((len(r), Z.shape[1]))
     columns[part.rows] = part.whitened(Z / np.where(size > 0, size, 1.0))
@@ -268,17 +304,22 @@ def explained(part: Part, Z: Array, r: Array, Q: Array) -> tuple[float, float, A
 
 
 def lines_up(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[Verdict]:
-    """Do residuals line up with the reading that the model predicts, as a wrong sensor would make them, or with those
-    of the other channels and their rates, as a wrong law would?"""
+    """Do residuals line up with the reading that the model predicts, as a wrong sensor would make
+    them, or with those of the other channels and their rates, as a wrong law would?"""
     out, t = [], part.t
     y = spline(part)
     own = {
-        "an offset": np.ones(len(t)), "a drift": t - t.mean(), "the reading itself, as an error of its gain would be": y(t),
+        "an offset": np.ones(len(t)), "a drift": t - t.mean(), "the reading itself, as an error of "
+                                                               "its gain would be": y(t),
         "its rate, as a delay would be": y(t, 1), "its acceleration": y(t, 2),
     }  # fmt: skip
     others = {}
     for other in beside:
-        if other.channel != part.channel and other.t[0] <= t[0] + 0.05 and other.t[-1] >= t[-1] - 0.05:
+        if (
+            other.channel != part.channel
+            and other.t[0] <= t[0] + 0.05
+            and other.t[-1] >= t[-1] - 0.05
+        ):
             s = spline(other)
             others |= {other.channel: s(t), f"the rate of {other.channel}": s(t, 1)}
             others |= {f"the acceleration of {other.channel}": s(t, 2)}
@@ -298,28 +339,40 @@ def spline(part: Part) -> CubicSpline:
 
 
 def outliers(part: Part, r: Array) -> Verdict:
-    """Is the largest residual larger than it may be (Grubbs), or are the tails too heavy (Anscombe and Glynn)?"""
+    """Is the largest residual larger than it may be (Grubbs), or are the tails too heavy (Anscombe
+    and Glynn)?"""
     rows = r[part.rows]
     m, at = len(rows), int(np.argmax(np.abs(rows)))
     sd = float(rows.std(ddof=1)) if m > 2 else 0.0
     if m < LAGS or sd == 0:
-        return Verdict("outliers", part.recording, part.channel, 1.0, 0.0, f"{part.name} (too short to tell)")
+        return Verdict(
+            "outliers", part.recording, part.channel, 1.0, 0.0, f"{part.name} (too short to tell)"
+        )
     G = float(np.abs(rows - rows.mean())[at]) / sd
     beyond = (m - 1) ** 2 - m * G**2
     t = G * (m * (m - 2) / beyond) ** 0.5 if beyond > 0 else np.inf
     grubbs = min(1.0, 2 * m * float(stats.t.sf(t, m - 2)))
     tails = float(stats.kurtosistest(rows, alternative="greater").pvalue)
-    words = f"{part.name} (the largest {abs(rows[at]):.1f} times the noise, at t = {part.t[at]:.4g} s)"
+    words = (
+        f"{part.name} (the largest {abs(rows[at]):.1f} times the noise, at t = {part.t[at]:.4g} s)"
+    )
     return Verdict(
-        "outliers", part.recording, part.channel, min(1.0, 2 * min(grubbs, tails)), abs(float(rows[at])), words
+        "outliers",
+        part.recording,
+        part.channel,
+        min(1.0, 2 * min(grubbs, tails)),
+        abs(float(rows[at])),
+        words,
     )
 
 
 def together(recording: str, parts: Sequence[Part], r: Array, Q: Array) -> list[Verdict]:
-    """Do residuals of different channels, where they are sampled at the same times, have something in common
-    (Bartlett)?"""
+    """Do residuals of different channels, where they are sampled at the same times, have something
+    in common (Bartlett)?"""
     longest = max((p.t for p in parts), key=len)
-    alike = [p for p in parts if np.array_equal(p.t, longest) and float(np.mean(p.raw**2)) >= FAINT**2]
+    alike = [
+        p for p in parts if np.array_equal(p.t, longest) and float(np.mean(p.raw**2)) >= FAINT**2
+    ]
     k = len(alike)
     if k < 2:
         return []
@@ -330,7 +383,9 @@ def together(recording: str, parts: Sequence[Part], r: Array, Q: Array) -> list[
     C = np.atleast_2d(np.corrcoef(rows))
     square = -(n - 1 - (2 * k + 5) / 6) * float(np.linalg.slogdet(C)[1])
     i, j = np.unravel_index(int(np.argmax(np.abs(np.triu(C, 1)))), C.shape)
-    words = f"{alike[i].channel} and {alike[j].channel} of `{recording}` (correlation {C[i, j]:.2f})"
+    words = (
+        f"{alike[i].channel} and {alike[j].channel} of `{recording}` (correlation {C[i, j]:.2f})"
+    )
     p = float(stats.chi2.sf(square, k * (k - 1) / 2))
     return [Verdict("channels", recording, None, p, float(C[i, j]), words)]
 
@@ -340,29 +395,46 @@ def contradicted(name: str, r: float, q: Array) -> Verdict:
     free = max(1.0 - float(q @ q), 0.0)
     z = float(r) / free**0.5 if free > 1e-9 else 0.0  # without data it is where the prior is
     return Verdict(
-        "priors", None, None, 2 * float(stats.norm.sf(abs(z))), abs(z), f"{name} by {abs(z):.2g} standard deviations"
+        "priors",
+        None,
+        None,
+        2 * float(stats.norm.sf(abs(z))),
+        abs(z),
+        f"{name} by {abs(z):.2g} standard deviations",
     )
 
 
 SENTENCES: dict[str, str] = {
-    "larger": "residuals are larger than the noise that was stated, {}: the model may be wrong, or the noise larger",
-    "smaller": "residuals are smaller than the noise that was stated, {}: state less of it, or intervals are too wide, and "
-    "faults of the model stay hidden",
-    "white": "residuals are not white in {}: something systematic is left, and intervals may be too narrow",
-    "motion": "residuals follow the motion in {}: a sensor is not as it was stated, or the model is wrong",
-    "channels": "residuals of different channels belong together, {}: the model leaves out something that moves both",
+    "larger": "residuals are larger than the noise that was stated, {}: the model may be wrong, or "
+              "the noise larger",
+    "smaller": "residuals are smaller than the noise that was stated, {}: state less of it, or "
+    "intervals are too wide, and faults of the model stay hidden",
+    "white": "residuals are not white in {}: something systematic is left, and intervals may be "
+             "too narrow",
+    "motion": "residuals follow the motion in {}: a sensor is not as it was stated, or the model "
+              "is wrong",
+    "channels": "residuals of different channels belong together, {}: the model leaves out "
+                "something that moves both",
     "outliers": "there are outliers in {}: look at these samples, or take a robust loss",
     "priors": "the data contradict what was known before, {}: the prior is wrong, or the model",
 }  # fmt: skip
 
 
 def residual_notices(verdicts: Sequence[Verdict], widened: float = 1.0) -> list[str]:
-    """A sentence for each kind of alarm, naming recordings and channels, the clearest first; intervals are `widened`
-    [1] for residuals that are too large."""
+    """A sentence for each kind of alarm, naming recordings and channels, the clearest first;
+    intervals are `widened` [1] for residuals that are too large."""
     kinds: dict[str, list[Verdict]] = {kind: [] for kind in SENTENCES}
-    for verdict in sorted((f for f in verdicts if f.alarming), key=lambda f: (f.recording is None, f.p)):
-        kinds[verdict.test if verdict.test != "level" else "larger" if verdict.size > 1 else "smaller"].append(verdict)
-    out = {kind: SENTENCES[kind].format(named([f.words for f in some])) for kind, some in kinds.items() if some}
+    for verdict in sorted(
+        (f for f in verdicts if f.alarming), key=lambda f: (f.recording is None, f.p)
+    ):
+        kinds[
+            verdict.test if verdict.test != "level" else "larger" if verdict.size > 1 else "smaller"
+        ].append(verdict)
+    out = {
+        kind: SENTENCES[kind].format(named([f.words for f in some]))
+        for kind, some in kinds.items()
+        if some
+    }
     if "larger" in out and widened > 1.0:
         out["larger"] += f"; intervals are widened by {widened:.3g}"
     return list(out.values())
@@ -382,8 +454,8 @@ ROUNDS = 2
 
 
 class Coloured(NamedTuple):
-    """A problem with the noise that was found, its fit, the noise by channel with every order that was tried, and the
-    fits on the way."""
+    """A problem with the noise that was found, its fit, the noise by channel with every order that
+    was tried, and the fits on the way."""
 
     problem: Problem
     fit: Fit
@@ -392,12 +464,17 @@ class Coloured(NamedTuple):
 
 
 def allow_for_colour(
-    problem: Problem, fit: Fit, free: NDArray[np.bool_], which: Sequence[str], refit: Callable[[Problem, Fit, int], Fit]
+    problem: Problem,
+    fit: Fit,
+    free: NDArray[np.bool_],
+    which: Sequence[str],
+    refit: Callable[[Problem, Fit, int], Fit],
 ) -> Coloured:
-    """Find the noise that a fit leaves in the recordings `which`, and fit again with it, by `refit(problem, fit,
-    round)`, from there, while coordinates that are `free` (n,) move.
+    """Find the noise that a fit leaves in the recordings `which`, and fit again with it, by
+    `refit(problem, fit, round)`, from there, while coordinates that are `free` (n,) move.
 
-    The fit must have its residuals, with their Jacobian. Where all noise is white nothing is changed.
+    The fit must have its residuals, with their Jacobian. Where all noise is white nothing is
+    changed.
     """
     declared = [channel for channel, sensor in problem.sensors.items() if sensor.colour == "ar"]
     found, fits = dict[str, NoiseFit](), list[Fit]()
@@ -422,19 +499,24 @@ def rewhitened(problem: Problem, at: Residuals, now: Sequence[Part]) -> Residual
     r, J = at.r.copy(), at.J.copy()
     recordings = {recording.name: recording for recording in problem.recordings}
     for part in now:
-        rows = J[part.rows] if part.noise is None else spsolve_triangular(part.noise.whitener(part.t), J[part.rows])
+        rows = (
+            J[part.rows]
+            if part.noise is None
+            else spsolve_triangular(part.noise.whitener(part.t), J[part.rows])
+        )
         r[part.rows] = problem.whitened(recordings[part.recording], part.channel, part.raw)
         J[part.rows] = problem.whitened(recordings[part.recording], part.channel, rows)
     return Residuals(r, J, at.lost)
 
 
 def colours(parts: Sequence[Part], J: Array, declared: Sequence[str] = ()) -> dict[str, NoiseFit]:
-    """The noise of channels whose residuals, all recordings together, are not white, by channel; J (m, n) is the
-    Jacobian.
+    """The noise of channels whose residuals, all recordings together, are not white, by channel; J
+    (m, n) is the Jacobian.
 
-    White noise is refused by the ratio of likelihoods, at `LEVEL` for all channels and orders together; that of
-    `declared` channels by the Bayesian criterion alone. Noise is never taken to be less than the sensor states. That of
-    channels with saturated samples stays white: what their residuals have of colour is a verdict, with its sentence.
+    White noise is refused by the ratio of likelihoods, at `LEVEL` for all channels and orders
+    together; that of `declared` channels by the Bayesian criterion alone. Noise is never taken to
+    be less than the sensor states. That of channels with saturated samples stays white: what their
+    residuals have of colour is a verdict, with its sentence.
     """
     Q, out = np.linalg.qr(J)[0], {}
     channels = list(dict.fromkeys(part.channel for part in parts))
@@ -446,7 +528,10 @@ def colours(parts: Sequence[Part], J: Array, declared: Sequence[str] = ()) -> di
             continue
         fitted = sum(float(np.sum(Q[part.rows] ** 2)) for part in mine)
         found = fit_noise([(part.t, part.raw) for part in mine], fitted)
-        p, ratio = found.noise.order, found.scores[0].deviance - found.scores[found.noise.order].deviance
+        p, ratio = (
+            found.noise.order,
+            found.scores[0].deviance - found.scores[found.noise.order].deviance,
+        )
         tests = len(channels) * max(len(found.scores) - 1, 1)
         if p > 0 and (channel in declared or tests * stats.chi2.sf(ratio, p) < LEVEL):
             out[channel] = found._replace(noise=found.noise.at_least(1.0))
@@ -456,14 +541,16 @@ def colours(parts: Sequence[Part], J: Array, declared: Sequence[str] = ()) -> di
 def colour_notices(found: Mapping[str, NoiseFit], declared: Sequence[str] = ()) -> list[str]:
     """Sentences on colour that intervals allow for although nobody has declared it."""
     names = [
-        f"{channel} (order {fit.noise.order}, neighbouring samples correlate by {correlation(fit.noise):.2f})"
+        f"{channel} (order {fit.noise.order}, neighbouring samples correlate by "
+        f"{correlation(fit.noise):.2f})"
         for channel, fit in found.items() if channel not in declared
     ]  # fmt: skip
     if not names:
         return []
     return [
-        f"what the fit left is coloured in {named(names)}, which nobody has declared: intervals allow for it as noise, but a "
-        "wrong model leaves such residuals too; where it is the sensor, declare its `colour`"
+        f"what the fit left is coloured in {named(names)}, which nobody has declared: intervals "
+        "allow for it as noise, but a wrong model leaves such residuals too; where it is the "
+        "sensor, declare its `colour`"
     ]
 
 

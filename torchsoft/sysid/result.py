@@ -1,7 +1,8 @@
-"""Result of an identification as plain data, with the rigs of its recordings; `answer.json` holds it.
+"""Result of an identification as plain data, with the rigs of its recordings; `answer.json` holds
+it.
 
-The schema of the file, `schema()`, is published as `docs/answer.schema.json`. A checksum of the content tells a damaged
-file.
+The schema of the file, `schema()`, is published as `docs/answer.schema.json`. A checksum of the
+content tells a damaged file.
 """
 
 import json
@@ -25,7 +26,13 @@ from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.rig import Rig
 from torchsoft.sysid.comparison import Comparison
-from torchsoft.sysid.estimate import ChannelResiduals, Contribution, Direction, Estimate, contributions
+from torchsoft.sysid.estimate import (
+    ChannelResiduals,
+    Contribution,
+    Direction,
+    Estimate,
+    contributions,
+)
 from torchsoft.sysid.fit import Combination, combinations
 from torchsoft.sysid.initial_state import PREFIX
 from torchsoft.sysid.noise import Autoregression, Score
@@ -40,12 +47,12 @@ from torchsoft.tables import Number, line, refusing, shown
 
 @dataclass(frozen=True)
 class RecordedRig:
-    """A recording and its rig: what tells it from others, its length [s], where it began, the rig's class, its numbers
-    and laws before the fit (`description`), and the values that were `identified` of it, with those of where it
-    `began`.
+    """A recording and its rig: what tells it from others, its length [s], where it began, the rig's
+    class, its numbers and laws before the fit (`description`), and the values that were
+    `identified` of it, with those of where it `began`.
 
-    `settings` are those from which `SoftGrasp` makes the very same rig; none where another rig, or laws of the user's
-    own, are needed.
+    `settings` are those from which `SoftGrasp` makes the very same rig; none where another rig, or
+    laws of the user's own, are needed.
     """
 
     name: str
@@ -66,22 +73,26 @@ class RecordedRig:
         return known(self.description, self.identified)
 
     def rebuilt(self) -> Rig:
-        """The rig before the fit, whose reference holds still. Raises `ValueError` where only its maker has its
-        laws."""
+        """The rig before the fit, whose reference holds still. Raises `ValueError` where only its
+        maker has its laws."""
         if self.settings is None:
             raise ValueError(
-                f"the rig of recording `{self.name}` is a {self.rig} with parts of its own, which no file holds: build it "
-                "as it was built for the fit, and call `applied_to(rig)`"
+                f"the rig of recording `{self.name}` is a {self.rig} with parts of its own, which "
+                "no file holds: build it as it was built for the fit, and call `applied_to(rig)`"
             )
         return SoftGrasp(self.settings)
 
 
 def known(description: dict[str, Any], identified: dict[str, float]) -> dict[str, Any]:
     """A rig's description as one table, without what is identified and without the scenario."""
-    parameters = {name: value for name, value in description["parameters"].items() if name not in identified}
+    parameters = {
+        name: value for name, value in description["parameters"].items() if name not in identified
+    }
     parts = {part: laws for part, laws in description.items() if part != "parameters"}
     laws = {f"{part} of {name}": law for part, laws in parts.items() for name, law in laws.items()}
-    scenario = {name for name in parameters if name.startswith("scenario.") and name != "scenario.gravity"}
+    scenario = {
+        name for name in parameters if name.startswith("scenario.") and name != "scenario.gravity"
+    }
     return {name: value for name, value in (parameters | laws).items() if name not in scenario}
 
 
@@ -117,8 +128,9 @@ def recorded_rigs(problem: Problem, x: Array, fitted: Sequence[str]) -> list[Rec
         began = {name: value for name, value in values.items() if name.startswith(PREFIX)}
         start = line(repr(recording.start), 300)
         one = RecordedRig(
-            recording.name, recording.name in fitted, recording.fingerprint, problem.samples([recording.name]),
-            recording.duration, start, type(rig).__qualname__, rig.description(), settings, identified, began,
+            recording.name, recording.name in fitted, recording.fingerprint,
+            problem.samples([recording.name]), recording.duration, start, type(rig).__qualname__,
+            rig.description(), settings, identified, began,
         )  # fmt: skip
         out.append(one)
     return out
@@ -135,13 +147,14 @@ LARGEST = 1e9
 """Size [B] of a file of an answer at the most."""
 
 UNEXPLAINED = 1.25
-"""RMS residual of a channel over its stated noise from which a report begins by saying that the model does not explain
-it."""
+"""RMS residual of a channel over its stated noise from which a report begins by saying that the
+model does not explain it."""
 
 
 @dataclass(frozen=True)
 class ChannelNoise:
-    """Coloured noise of one channel: the model that residuals were whitened by, and the orders that were tried."""
+    """Coloured noise of one channel: the model that residuals were whitened by, and the orders that
+    were tried."""
 
     channel: str
     model: Autoregression
@@ -152,9 +165,9 @@ class ChannelNoise:
 class IdentificationResult:
     """Estimates, correlations, directions, residuals, predictions, and how they were made.
 
-    `x` and `covariance` are in `coordinates`, `correlation` and `directions` in those of them that were free
-    (`labels`). `rigs` are those of the recordings, with their laws and the references that they followed; a file does
-    not hold them.
+    `x` and `covariance` are in `coordinates`, `correlation` and `directions` in those of them that
+    were free (`labels`). `rigs` are those of the recordings, with their laws and the references
+    that they followed; a file does not hold them.
     """
 
     __pydantic_config__ = ConfigDict(strict=True, extra="forbid", arbitrary_types_allowed=True)
@@ -165,12 +178,12 @@ class IdentificationResult:
     correlation: list[list[Number]]
     directions: list[Direction]
     chi2: Number  # sum of squared residuals over degrees of freedom; 1 where model and noise are right
-    chi2_stated: (
-        Number  # the same over the noise that sensors state, white: colour that was found takes nothing from it
-    )
+    chi2_stated: Number  # the same over the noise that sensors state, white: colour that was found takes nothing from it
     converged: bool
     residuals: list[ChannelResiduals]
-    heldout: dict[str, dict[str, Number]]  # NRMSE of recordings that were not fitted, by recording and channel
+    heldout: dict[
+        str, dict[str, Number]
+    ]  # NRMSE of recordings that were not fitted, by recording and channel
     notices: list[str]
     stages: list[dict[str, Any]]
     cost: dict[str, Number]
@@ -189,18 +202,23 @@ class IdentificationResult:
     comparison: Comparison | None = field(default=None, repr=False)
     versions: dict[str, str] = field(default_factory=dict, repr=False)
     command: str = ""
-    rigs: Annotated[dict[str, Any], Field(exclude=True)] = field(default_factory=dict, repr=False, compare=False)
+    rigs: Annotated[dict[str, Any], Field(exclude=True)] = field(
+        default_factory=dict, repr=False, compare=False
+    )
 
     def __getitem__(self, name: str) -> Estimate:
         """The first estimate of that name."""
         for estimate in self.estimates:
             if estimate.name == name:
                 return estimate
-        raise KeyError(f"no estimate of `{name}`; there are {', '.join(e.name for e in self.estimates)}")
+        raise KeyError(
+            f"no estimate of `{name}`; there are {', '.join(e.name for e in self.estimates)}"
+        )
 
     @property
     def headline(self) -> str:
-        """First line of a report: whether the model explains the data, and how many parameters are identifiable."""
+        """First line of a report: whether the model explains the data, and how many parameters are
+        identifiable."""
         mine = [e for e in self.estimates if e.kind == "parameter"]
         worst = max(self.residuals, key=lambda one: one.stated, default=None)
         text = f"{sum(e.identifiable for e in mine)} of {len(mine)} parameters identifiable, χ² = {self.chi2:.3g}"
@@ -212,13 +230,18 @@ class IdentificationResult:
         return f"The model does not explain the data: {size}; {text}"
 
     def recorded(self, recording: str | None = None) -> RecordedRig:
-        """A recording and its rig, the first one by default. Raises `ValueError` for one that is not there, and,
-        without a name, where rigs differ from recording to recording."""
+        """A recording and its rig, the first one by default. Raises `ValueError` for one that is
+        not there, and, without a name, where rigs differ from recording to recording."""
         known = ", ".join(f"`{one.name}`" for one in self.recordings)
         if recording is None and self.recordings:
             first = self.recordings[0]
-            if any((one.identified, one.known) != (first.identified, first.known) for one in self.recordings):
-                raise ValueError(f"the rig is not the same in all recordings: say in which one, of {known}")
+            if any(
+                (one.identified, one.known) != (first.identified, first.known)
+                for one in self.recordings
+            ):
+                raise ValueError(
+                    f"the rig is not the same in all recordings: say in which one, of {known}"
+                )
             return first
         for one in self.recordings:
             if one.name == recording:
@@ -228,27 +251,32 @@ class IdentificationResult:
     def model(self, recording: str | None = None) -> Rig:
         """The identified rig, ready to run: that of a recording, which is needed where they differ.
 
-        The paper's rig from a file holds still until it is given a reference. Warns of parameters that are not
-        identifiable. Raises `ValueError` for a rig that a file cannot hold: `applied_to` says what to do then.
+        The paper's rig from a file holds still until it is given a reference. Warns of parameters
+        that are not identifiable. Raises `ValueError` for a rig that a file cannot hold:
+        `applied_to` says what to do then.
         """
         one = self.recorded(recording)
         return self._identified(self._rig(one), one)
 
     def applied_to(self, rig: Rig, recording: str | None = None) -> Rig:
-        """A copy of `rig` with the values that were identified: those of a recording, which is needed where they
-        differ.
+        """A copy of `rig` with the values that were identified: those of a recording, which is
+        needed where they differ.
 
-        Warns of parameters that are not identifiable, and of numbers and laws that are not those of the fit. Raises
-        `ValueError` for a rig that has no such parameters.
+        Warns of parameters that are not identifiable, and of numbers and laws that are not those of
+        the fit. Raises `ValueError` for a rig that has no such parameters.
         """
         one, mine = self.recorded(recording), known(rig.description(), {})
         for name in one.identified:
             rig.parameter(name)
         other = [name for name, value in one.known.items() if mine.get(name) != value]
         if other:
-            said = ", ".join(f"{name} is {shown(mine.get(name))} and was {shown(one.known[name])}" for name in other)
+            said = ", ".join(
+                f"{name} is {shown(mine.get(name))} and was {shown(one.known[name])}"
+                for name in other
+            )
             warnings.warn(
-                f"this rig is not the one of the fit, so its values may mislead: {line(said, 300)}", stacklevel=2
+                f"this rig is not the one of the fit, so its values may mislead: {line(said, 300)}",
+                stacklevel=2,
             )
         return self._identified(deepcopy(rig), one)
 
@@ -266,7 +294,10 @@ class IdentificationResult:
         weak += [  # of a recording that was held out
             c.name
             for c in self.coordinates
-            if c.fixed and c.kind == "parameter" and c.recording == one.name and not self.unknowns[c.name].fixed
+            if c.fixed
+            and c.kind == "parameter"
+            and c.recording == one.name
+            and not self.unknowns[c.name].fixed
         ]
         if weak:
             warnings.warn(undetermined({name: one.identified[name] for name in weak}), stacklevel=3)
@@ -274,9 +305,15 @@ class IdentificationResult:
 
     def to_json(self) -> str:
         """The content of the file. A comparison of laws goes without its residuals."""
-        plain = replace(self, comparison=replace(self.comparison, series=[])) if self.comparison is not None else self
+        plain = (
+            replace(self, comparison=replace(self.comparison, series=[]))
+            if self.comparison is not None
+            else self
+        )
         content = finite(adapter().dump_python(plain, mode="json", by_alias=True))
-        return json.dumps({"schema": SCHEMA, "checksum": checksum(content)} | content, indent=1, allow_nan=False)
+        return json.dumps(
+            {"schema": SCHEMA, "checksum": checksum(content)} | content, indent=1, allow_nan=False
+        )
 
     def save(self, path: str | Path) -> None:
         """Write the JSON file. It appears whole or not at all."""
@@ -289,10 +326,13 @@ class IdentificationResult:
         for e in self.estimates:
             if e.value is None or e.ci95 is None:
                 rows.append(
-                    f"{e.label:34s} {'none':>12s}   not identifiable (the search ended at {e.last:.3g} {e.unit})"
+                    f"{e.label:34s} {'none':>12s}   not identifiable (the search ended at "
+                    f"{e.last:.3g} {e.unit})"
                 )
             else:
-                rows.append(f"{e.label:34s} {e.value:12.5g}   {e.ci95[0]:.5g} .. {e.ci95[1]:.5g} {e.unit}")
+                rows.append(
+                    f"{e.label:34s} {e.value:12.5g}   {e.ci95[0]:.5g} .. {e.ci95[1]:.5g} {e.unit}"
+                )
         return "\n".join(rows)
 
 
@@ -311,7 +351,9 @@ def checksum(content: Any) -> str:
             return [plain(one) for one in value]
         return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
-    return sha256(json.dumps(plain(content), sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    return sha256(
+        json.dumps(plain(content), sort_keys=True, separators=(",", ":")).encode()
+    ).hexdigest()
 
 
 def schema() -> dict[str, Any]:
@@ -336,8 +378,8 @@ def schema() -> dict[str, Any]:
 
 
 def load_answer(path: str | Path) -> IdentificationResult:
-    """The answer in a file. Raises `ValueError` naming the file for one that is damaged, or no answer, and
-    `OSError`."""
+    """The answer in a file. Raises `ValueError` naming the file for one that is damaged, or no
+    answer, and `OSError`."""
     check_file(path, LARGEST)
     try:
         content = json.loads(Path(path).read_bytes().decode("utf-8"))
@@ -353,10 +395,13 @@ def load_answer(path: str | Path) -> IdentificationResult:
             if form is None and older
             else f"its `schema` is {shown(form)}"
         )
-        raise ValueError(f"{path} is not an answer that this torchsoft reads, which are called {SCHEMA!r}: {why}")
+        raise ValueError(
+            f"{path} is not an answer that this torchsoft reads, which are called {SCHEMA!r}: {why}"
+        )
     if content.pop("checksum", None) != checksum(content):
         raise ValueError(
-            f"{path} is damaged: its content is not what was saved; restore it from a copy, or identify again"
+            f"{path} is damaged: its content is not what was saved; restore it from a copy, or "
+            "identify again"
         )
     with refusing(content, str(path)), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a steep friction law, which was fitted nevertheless
@@ -364,35 +409,40 @@ def load_answer(path: str | Path) -> IdentificationResult:
 
 
 BLURRED = 0.1
-"""Relative standard deviation of a combination of parameters from which it is looked for what the data see in its
-place."""
+"""Relative standard deviation of a combination of parameters from which it is looked for what the
+data see in its place."""
 
 
 def described(
-    problem: Problem, x: Array, free: NDArray[np.bool_], J: Array, C: Array, fitted: Sequence[str], *,
-    tried: Mapping[str, Sequence[Score]] | None = None, checks: Sequence[AssumptionTest] = (),
+    problem: Problem, x: Array, free: NDArray[np.bool_], J: Array, C: Array, fitted: Sequence[str],
+    *, tried: Mapping[str, Sequence[Score]] | None = None, checks: Sequence[AssumptionTest] = (),
 ) -> dict[str, Any]:  # fmt: skip
-    """Fields of a result that say what was fitted and how, at x (n,) with covariance C (n, n): `problem` has the noise
-    that was found, J (m, n) is the Jacobian of the residuals of the recordings `fitted`, `tried` the orders of noise by
-    channel."""
+    """Fields of a result that say what was fitted and how, at x (n,) with covariance C (n, n):
+    `problem` has the noise that was found, J (m, n) is the Jacobian of the residuals of the
+    recordings `fitted`, `tried` the orders of noise by channel."""
     c, tried = problem.coordinates, tried or {}
-    noise = [ChannelNoise(channel, model, list(tried.get(channel, ()))) for channel, model in problem.noise.items()]
+    noise = [
+        ChannelNoise(channel, model, list(tried.get(channel, ())))
+        for channel, model in problem.noise.items()
+    ]
     packages = ("torchsoft", "torch", "numpy", "scipy", "numba")
     return {
-        "recordings": recorded_rigs(problem, x, fitted), "unknowns": dict(problem.unknowns), "sensors": dict(problem.sensors),
+        "recordings": recorded_rigs(problem, x, fitted), "unknowns": dict(problem.unknowns),
+        "sensors": dict(problem.sensors),
         "coordinates": [replace(one, fixed=not is_free) for one, is_free in zip(c.all, free)],
         "contributions": contributions(problem, x, free, J, fitted),
         "combinations": seen_together(problem, free, C), "noise": noise,
         "assumptions": list(checks),
-        "versions": {"python": platform.python_version()} | {name: version(name) for name in packages},
-        "rigs": {recording.name: recording.rig for recording in problem.recordings},
+        "versions": {"python": platform.python_version()} | {name: version(name) for name in packages}, "rigs": {recording.name: recording.rig for recording in problem.recordings},
     }  # fmt: skip
 
 
 def seen_together(problem: Problem, free: NDArray[np.bool_], C: Array) -> list[Combination]:
     """Products of powers of parameters that the data see better than each of them."""
     mine = [
-        i for i, one in enumerate(problem.coordinates.all) if free[i] and one.kind == "parameter" and one.scale == "log"
+        i
+        for i, one in enumerate(problem.coordinates.all)
+        if free[i] and one.kind == "parameter" and one.scale == "log"
     ]
     labels = [problem.coordinates.labels[i] for i in mine]
     return combinations(labels, C[np.ix_(mine, mine)], BLURRED) if len(mine) > 1 else []

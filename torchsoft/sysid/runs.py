@@ -1,8 +1,8 @@
 """Runs of the model in threads, and their results on disk.
 
-A fit is a deterministic function of its runs: started again it reads the results that it has, to the bit, and goes on
-from there. Results are data with checksums in a marked folder of their own; a damaged file, or that of another run, is
-made again.
+A fit is a deterministic function of its runs: started again it reads the results that it has, to
+the bit, and goes on from there. Results are data with checksums in a marked folder of their own; a
+damaged file, or that of another run, is made again.
 """
 
 import io
@@ -21,7 +21,17 @@ from torchsoft.files import CHECKPOINT, SEALED, check_file, make_folder, remove_
 from torchsoft.solve.kernel.cache import digest
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.noise import Autoregression
-from torchsoft.sysid.prediction import FailedRun, Frozen, Misfit, Prediction, Readout, Signals, Steps, misfit, predict
+from torchsoft.sysid.prediction import (
+    FailedRun,
+    Frozen,
+    Misfit,
+    Prediction,
+    Readout,
+    Signals,
+    Steps,
+    misfit,
+    predict,
+)
 from torchsoft.sysid.recording import Array, Recording, RunContext
 from torchsoft.sysid.unknowns import NUISANCES
 from torchsoft.threads import parallel_map, single_threaded
@@ -43,7 +53,9 @@ PROGRAM = (
 
 def encoded(result: Any) -> bytes:
     """A result as numpy's archive of its fields, without those that are None."""
-    fields = {name: np.asarray(value) for name, value in result._asdict().items() if value is not None}
+    fields = {
+        name: np.asarray(value) for name, value in result._asdict().items() if value is not None
+    }
     archive = io.BytesIO()
     contents: Any = {"kind": np.asarray(type(result).__name__)} | fields
     np.savez(archive, **contents)
@@ -53,13 +65,17 @@ def encoded(result: Any) -> bytes:
 def decoded(content: bytes) -> Any:
     """The result that `encoded` was given, to the bit."""
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-        fields = {name: archive[name] if archive[name].ndim else archive[name].item() for name in archive.files}
+        fields = {
+            name: archive[name] if archive[name].ndim else archive[name].item()
+            for name in archive.files
+        }
     kind: Any = KINDS[fields.pop("kind")]
     return kind(**fields)
 
 
 class Journal:
-    """The results of runs of some recordings in a folder, by the run, which is any object whose `repr` says all of it.
+    """The results of runs of some recordings in a folder, by the run, which is any object whose
+    `repr` says all of it.
 
     Raises `ValueError` for a folder that holds anything else.
     """
@@ -72,11 +88,15 @@ class Journal:
     def _open(self) -> None:
         """Make the folder, and mark it unless it is someone else's."""
         if self.folder.exists() and not self.folder.is_dir():
-            raise ValueError(f"the checkpoint {self.folder} is a file; give a new or an empty folder")
+            raise ValueError(
+                f"the checkpoint {self.folder} is a file; give a new or an empty folder"
+            )
         make_folder(self.folder)
         if not (self.folder / CHECKPOINT).is_file():
             if any(self.folder.iterdir()):
-                raise ValueError(f"the checkpoint {self.folder} holds other files; give a new or an empty folder")
+                raise ValueError(
+                    f"the checkpoint {self.folder} holds other files; give a new or an empty folder"
+                )
             (self.folder / CHECKPOINT).write_text(MEANING, encoding="utf-8")
 
     def _place(self, run: object) -> tuple[bytes, Path]:
@@ -97,7 +117,8 @@ class Journal:
             pass
         if not self._warned:
             warnings.warn(
-                f"the checkpoint {self.folder} holds damaged results, whose runs are made again", stacklevel=2
+                f"the checkpoint {self.folder} holds damaged results, whose runs are made again",
+                stacklevel=2,
             )
             self._warned = True
         return None
@@ -106,14 +127,17 @@ class Journal:
         """Write the result of a run, so that it lasts."""
         name, path = self._place(run)
         content = encoded(result)
-        if not (self.folder / CHECKPOINT).is_file():  # another identification was done with the folder
+        if not (
+            self.folder / CHECKPOINT
+        ).is_file():  # another identification was done with the folder
             self._open()
         with replacing(path) as partial:
             partial.write_bytes(sha256(name + content).digest() + content)
 
 
 def forget(folder: Path) -> None:
-    """Remove a journal's own files, and the folder unless it holds anything else; other folders are left alone."""
+    """Remove a journal's own files, and the folder unless it holds anything else; other folders are
+    left alone."""
     if not (folder / CHECKPOINT).is_file():
         return
     for path in folder.iterdir():
@@ -129,10 +153,11 @@ def forget(folder: Path) -> None:
 
 
 class Job(NamedTuple):
-    """One run: which recording, the values of what is unknown, the names to differentiate by, and the steps.
+    """One run: which recording, the values of what is unknown, the names to differentiate by, and
+    the steps.
 
-    `interpolated` asks for a grid between the samples; `judged` asks for the misfit and its gradient in place of the
-    signals: by every sensor's readout and the colour of its noise.
+    `interpolated` asks for a grid between the samples; `judged` asks for the misfit and its
+    gradient in place of the signals: by every sensor's readout and the colour of its noise.
     """
 
     recording: int
@@ -144,16 +169,20 @@ class Job(NamedTuple):
 
 
 class Runner:
-    """Runs jobs in `workers` threads (in this one, if it is one), and remembers their results in the folder
-    `journal`."""
+    """Runs jobs in `workers` threads (in this one, if it is one), and remembers their results in
+    the folder `journal`."""
 
-    def __init__(self, recordings: Sequence[Recording], workers: int = 1, journal: Path | None = None) -> None:
+    def __init__(
+        self, recordings: Sequence[Recording], workers: int = 1, journal: Path | None = None
+    ) -> None:
         if workers < 1:
             raise ValueError(f"`workers` must be positive, but is {workers}")
         self.recordings, self.workers, self.folder = tuple(recordings), workers, journal
         self.simulations = self.jacobians = self.gradients = self.steps = self.remembered = 0
         self._journal = Journal(journal, self.recordings) if journal is not None else None
-        self._idle: list[list[RunContext]] = [[] for _ in self.recordings]  # models that no thread is using
+        self._idle: list[list[RunContext]] = [
+            [] for _ in self.recordings
+        ]  # models that no thread is using
 
     def run(self, jobs: Sequence[Job]) -> list[Any]:
         """Results in the order of the jobs: `Prediction`, `Misfit` or `FailedRun`."""
@@ -163,13 +192,16 @@ class Runner:
         todo = [i for i, result in enumerate(out) if result is None]
         todo.sort(key=lambda i: self._length(jobs[i]), reverse=True)  # the longest first
         with single_threaded():
-            for i, result in parallel_map(lambda k: self._made(jobs[todo[k]]), len(todo), self.workers):
+            for i, result in parallel_map(
+                lambda k: self._made(jobs[todo[k]]), len(todo), self.workers
+            ):
                 out[todo[i]] = result
                 self.steps += result.steps if isinstance(result, Prediction) else 0
         return out
 
     def _made(self, job: Job) -> Any:
-        """The result of a run that is made now, and kept even if an interruption is waiting for its end."""
+        """The result of a run that is made now, and kept even if an interruption is waiting for its
+        end."""
         idle = self._idle[job.recording]
         try:
             begun = idle.pop()
@@ -211,9 +243,13 @@ def simulated(recording: Recording, begun: RunContext, job: Job) -> Any:
 def judge(
     recording: Recording, judged: Sequence[tuple[Readout, Autoregression | None]], signals: Signals
 ) -> tuple[float, Array, Array]:
-    """Half the sum of squared residuals, its derivatives by the signals (G, channels), and by the nuisances of every
-    readout (readouts, nuisances)."""
-    loss, on_signals, on_nuisances = 0.0, np.zeros(signals.values.shape), np.zeros((len(judged), len(NUISANCES)))
+    """Half the sum of squared residuals, its derivatives by the signals (G, channels), and by the
+    nuisances of every readout (readouts, nuisances)."""
+    loss, on_signals, on_nuisances = (
+        0.0,
+        np.zeros(signals.values.shape),
+        np.zeros((len(judged), len(NUISANCES))),
+    )
     for k, (one, noise) in enumerate(judged):
         t, measured = recording.samples[one.channel]
         y, _, by = one.expected(signals, t)

@@ -1,9 +1,9 @@
 """Are recorded set-points close enough together for their motion, and are their rates theirs?
 
-A recorded signal is known at its rows only; a cubic stands between them. Its error is estimated from the rows: without
-every second one, and without three in four, the cubic has more of it, by an order that is observed. It is stated by its
-effect: the error of the set-point, against the noise of the sensor of that coordinate, and that of the effort, against
-the noise of the force.
+A recorded signal is known at its rows only; a cubic stands between them. Its error is estimated
+from the rows: without every second one, and without three in four, the cubic has more of it, by an
+order that is observed. It is stated by its effect: the error of the set-point, against the noise of
+the sensor of that coordinate, and that of the effort, against the noise of the force.
 """
 
 from collections.abc import Iterator, Mapping
@@ -23,7 +23,12 @@ from torchsoft.sysid.unknowns import Sensor
 
 def found(code: str, recording: Recording, message: str, grave: bool = False) -> Diagnostic:
     """A diagnostic on one recording; a `grave` one makes a fit worthless."""
-    return Diagnostic("error" if grave else "warning", recording.name, f"recording `{recording.name}`: {message}", code)
+    return Diagnostic(
+        "error" if grave else "warning",
+        recording.name,
+        f"recording `{recording.name}`: {message}",
+        code,
+    )
 
 
 def channel(rig: Rig, name: str) -> str:
@@ -34,11 +39,12 @@ def channel(rig: Rig, name: str) -> str:
 
 
 NOTICED = 0.2
-"""Part of a sensor's noise from which what happens between rows is said: residuals would be off by it everywhere."""
+"""Part of a sensor's noise from which what happens between rows is said: residuals would be off by
+it everywhere."""
 
 HOPELESS, ORDERLESS = 100.0, 1.0
-"""Times a sensor's noise by which the unknown between rows makes a fit worthless, if it does not even fall by this
-order where rows are closer."""
+"""Times a sensor's noise by which the unknown between rows makes a fit worthless, if it does not
+even fall by this order where rows are closer."""
 
 ORDERS = (0.5, 4.0)
 """Least and largest order that is believed; a cubic through exact values has the largest."""
@@ -47,13 +53,13 @@ PARTS = (0.0, 0.25, 0.5, 0.75)
 """Where between rows signals are compared."""
 
 OTHER_RATE = 0.25
-"""Part of a rate by which it may differ from that of the spline through the values, which must be sure to half of
-it."""
+"""Part of a rate by which it may differ from that of the spline through the values, which must be
+sure to half of it."""
 
 
 class Gap(NamedTuple):
-    """What happens between rows: an error [SI], rms, in units of the noise of a channel, and the order with which it
-    falls."""
+    """What happens between rows: an error [SI], rms, in units of the noise of a channel, and the
+    order with which it falls."""
 
     channel: str
     error: float
@@ -62,7 +68,8 @@ class Gap(NamedTuple):
 
 
 def cubic(signal: Sampled, every: int, derived: bool) -> Sampled:
-    """The signal by one in so many rows; rates that were `derived` from all rows are derived from these."""
+    """The signal by one in so many rows; rates that were `derived` from all rows are derived from
+    these."""
     rates = None if derived else signal.rates.detach()[::every]
     return Sampled(signal.times[::every], signal.values.detach()[::every], rates)
 
@@ -74,8 +81,8 @@ def is_derived(signal: Sampled) -> bool:
 
 
 def extrapolated(by: Mapping[int, Tensor]) -> tuple[float, float]:
-    """RMS error of a quantity at every row, from those by every row, every second and every fourth; and the observed
-    order."""
+    """RMS error of a quantity at every row, from those by every row, every second and every fourth;
+    and the observed order."""
     half, quarter = (float((by[2 * k] - by[k]).square().mean().sqrt()) for k in (1, 2))
     order = float(np.clip(np.log2(max(quarter, 1e-300) / max(half, 1e-300)), *ORDERS))
     return half / (2**order - 1), order
@@ -106,7 +113,14 @@ def gaps(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> list
 
 @torch.no_grad()
 def demanded(
-    actuator: Actuator, feed: nn.Module | None, every: int, t: Tensor, place: Tensor, rate: Tensor, x: Tensor, v: Tensor
+    actuator: Actuator,
+    feed: nn.Module | None,
+    every: int,
+    t: Tensor,
+    place: Tensor,
+    rate: Tensor,
+    x: Tensor,
+    v: Tensor,
 ) -> Tensor:
     """What the controller makes (n,) of a set-point while its coordinate is at x and moves at v."""
     known = cubic(feed, every, is_derived(feed)) if isinstance(feed, Sampled) else feed
@@ -115,10 +129,16 @@ def demanded(
 
 
 def setpoint_findings(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagnostic]:
-    """What looks wrong with the set-points of a recording. Of laws of several coordinates only rates are judged here:
-    that they are too sparse shows when every second one is left out (`checks`)."""
+    """What looks wrong with the set-points of a recording. Of laws of several coordinates only
+    rates are judged here: that they are too sparse shows when every second one is left out
+    (`checks`)."""
     rig = recording.rig
-    recorded = {n for one in rig.actuators.values() for n in one.setpoints if isinstance(rig.reference[n], Sampled)}
+    recorded = {
+        n
+        for one in rig.actuators.values()
+        for n in one.setpoints
+        if isinstance(rig.reference[n], Sampled)
+    }
     findings = {name: other_rate(recording, name) for name in sorted(recorded)}
     yield from (one for one in findings.values() if one is not None)
     for name, actuator in rig.loops.items():
@@ -128,7 +148,9 @@ def setpoint_findings(recording: Recording, sensors: Mapping[str, Sensor]) -> It
                 yield sparse
 
 
-def sparse_finding(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> Diagnostic | None:
+def sparse_finding(
+    recording: Recording, sensors: Mapping[str, Sensor], name: str
+) -> Diagnostic | None:
     """The words on set-points that are too far apart."""
     gap_list = gaps(recording, sensors, name)
     if not gap_list or (worst := max(gap_list, key=lambda gap: gap.noises)).noises <= NOTICED:
@@ -142,15 +164,22 @@ def sparse_finding(recording: Recording, sensors: Mapping[str, Sensor], name: st
     if worst.order <= ORDERS[0] and not is_derived(signal):  # closer rows would not help
         text = (
             f"values and rates of {setpoint} disagree however close the rows are, by "
-            f"{worst.noises:.2g} times the noise of {worst.channel}: is a clock, or a unit of time, a little off?"
+            f"{worst.noises:.2g} times the noise of {worst.channel}: is a clock, or a unit of "
+            "time, a little off?"
         )
         return found(f"rate of {setpoint}", recording, text, worst.noises > HOPELESS)
     size = f"{worst.error:.2g} {recording.units[worst.channel]}, {worst.noises:.2g} times the noise of {worst.channel}"
     text = (
         f"set-points {setpoint} every {1e3 * apart:.3g} ms are too sparse for this motion"
-        f"{rates}: what they leave open between them makes {size}; give them every {1e3 * enough:.2g} ms"
+        f"{rates}: what they leave open between them makes {size}; give them every "
+        f"{1e3 * enough:.2g} ms"
     )
-    return found(f"set-points {setpoint}", recording, text, grave=worst.noises > HOPELESS and worst.order <= ORDERLESS)
+    return found(
+        f"set-points {setpoint}",
+        recording,
+        text,
+        grave=worst.noises > HOPELESS and worst.order <= ORDERLESS,
+    )
 
 
 def other_rate(recording: Recording, setpoint: str) -> Diagnostic | None:
@@ -160,8 +189,13 @@ def other_rate(recording: Recording, setpoint: str) -> Diagnostic | None:
     times, values = signal.times, signal.values.detach()
     given, own = signal.rates.detach().numpy(), spline_rates(times, values).numpy()
     fewer = spline_rates(times[::2], values[::2]).numpy()
-    size, off, unsure = (float(np.sqrt(np.mean(e**2))) for e in (own, given - own, fewer - own[::2]))
-    if off <= OTHER_RATE * max(size, float(np.sqrt(np.mean(given**2)))) or unsure > OTHER_RATE / 2 * size:
+    size, off, unsure = (
+        float(np.sqrt(np.mean(e**2))) for e in (own, given - own, fewer - own[::2])
+    )
+    if (
+        off <= OTHER_RATE * max(size, float(np.sqrt(np.mean(given**2))))
+        or unsure > OTHER_RATE / 2 * size
+    ):
         return None
     factor = float(given @ own) / max(float(own @ own), 1e-300)
     looks = "its sign looks opposite" if factor < 0 else f"it is {factor:.3g} times that"

@@ -16,13 +16,14 @@ from torchsoft.sysid.recording import Recording
 from torchsoft.sysid.unknowns import Sensor
 
 Build = Callable[[Parameters, Reference], SoftGrasp]
-"""Makes a rig from settings and a reference: `SoftGrasp` itself, or a function that gives it laws of the user's own,
-such as a friction law."""
+"""Makes a rig from settings and a reference: `SoftGrasp` itself, or a function that gives it laws
+of the user's own, such as a friction law."""
 
 RIG = {
     channel: Sensor(noise=noise)
     for channel, noise in (
-        ("x_C", 1e-5), ("y_C", 1e-5), ("theta", 5e-4), ("x_Br", 1e-5), ("y_Br", 1e-5), ("F_x", 0.1), ("F_y", 0.1),
+        ("x_C", 1e-5), ("y_C", 1e-5), ("theta", 5e-4), ("x_Br", 1e-5), ("y_Br", 1e-5), ("F_x", 0.1),
+        ("F_y", 0.1),
     )
 }  # fmt: skip
 """Sensors of a good rig: poses to 10 um and 0.5 mrad, forces to 0.1 N."""
@@ -32,16 +33,18 @@ RTOL = 1e-6
 
 
 def record(
-    name: str, excitation: Excitation, truth: Parameters, nominal: Parameters, sensors: dict[str, Sensor], *,
-    rate: float = 200.0, rtol: float = RTOL, noise: float = 1.0, seed: int = 0, build: Build = SoftGrasp,
-    values: Mapping[str, float] | None = None,
+    name: str, excitation: Excitation, truth: Parameters, nominal: Parameters,
+    sensors: dict[str, Sensor], *, rate: float = 200.0, rtol: float = RTOL, noise: float = 1.0,
+    seed: int = 0, build: Build = SoftGrasp, values: Mapping[str, float] | None = None,
 ) -> Recording:  # fmt: skip
-    """What a rig with the parameters `truth` gives under an excitation that was planned with the `nominal` ones.
+    """What a rig with the parameters `truth` gives under an excitation that was planned with the
+    `nominal` ones.
 
-    The disc is set down, as the nominal parameters would have it lie, before the first sample, as `AtRest` assumes.
-    Sampled at `rate` [Hz] from a run whose steps `rtol` chooses, with Gaussian noise of `noise` times each sensor's
-    own. `build` makes the rig, and `values` are the truth of what `Parameters` does not have. The recording holds
-    nothing of the truth but the samples. Raises `SimulationFailed`.
+    The disc is set down, as the nominal parameters would have it lie, before the first sample, as
+    `AtRest` assumes. Sampled at `rate` [Hz] from a run whose steps `rtol` chooses, with Gaussian
+    noise of `noise` times each sensor's own. `build` makes the rig, and `values` are the truth of
+    what `Parameters` does not have. The recording holds nothing of the truth but the samples.
+    Raises `SimulationFailed`.
     """
     planned = begin(excitation, nominal).model
     rig = build(planned.settings, planned.reference)

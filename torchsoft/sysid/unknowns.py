@@ -1,7 +1,8 @@
-"""What is unknown: parameters with bounds and scales, and the vector of coordinates that the fits move in.
+"""What is unknown: parameters with bounds and scales, and the vector of coordinates that the fits
+move in.
 
-A coordinate is the logarithm of a value, or the value over the width of its bounds; so a coordinate's standard
-deviation is a relative one either way.
+A coordinate is the logarithm of a value, or the value over the width of its bounds; so a
+coordinate's standard deviation is a relative one either way.
 """
 
 import math
@@ -18,7 +19,8 @@ from torchsoft.sysid.recording import REACH, Array, Recording
 from torchsoft.tables import Table, line, shown
 
 SPREAD = 10.0
-"""Bounds of a logarithmic parameter that gives none: its nominal value divided and multiplied by this."""
+"""Bounds of a logarithmic parameter that gives none: its nominal value divided and multiplied by
+this."""
 
 
 Per = Literal["all", "recording"]
@@ -26,8 +28,8 @@ Per = Literal["all", "recording"]
 
 
 class Prior(Table):
-    """What is known of a value beforehand: a normal distribution with standard deviation `sd` about the `median`, or
-    ("log-normal") one of the logarithm, `sd` being that of ln."""
+    """What is known of a value beforehand: a normal distribution with standard deviation `sd` about
+    the `median`, or ("log-normal") one of the logarithm, `sd` being that of ln."""
 
     median: float
     sd: float = Field(gt=0, le=1e12)
@@ -40,7 +42,8 @@ class Prior(Table):
         return self
 
     def row(self, value: float) -> tuple[float, float]:
-        """The residual (value - median) / sd, or that of logarithms, and its derivative by the value."""
+        """The residual (value - median) / sd, or that of logarithms, and its derivative by the
+        value."""
         if self.kind == "log-normal":
             return math.log(value / self.median) / self.sd, 1 / (value * self.sd)
         return (value - self.median) / self.sd, 1 / self.sd
@@ -52,13 +55,14 @@ class Prior(Table):
 
 
 class Unknown(Table):
-    """One parameter to be identified: of the rig, a user's law included, by its name there, or by its alias in
-    `Parameters`.
+    """One parameter to be identified: of the rig, a user's law included, by its name there, or by
+    its alias in `Parameters`.
 
-    `nominal` is where the search starts, by default the value of the recordings' own rigs; with `ratio_to` the value,
-    nominal, bounds and prior are those of the ratio to that other parameter, and `fixed` besides ties the two. Bounds
-    end where the parameter's own do (`Rig.quantity`): wider ones are errors. With `per` = "recording" every recording
-    has a value of its own. A `prior` counts as one more measurement.
+    `nominal` is where the search starts, by default the value of the recordings' own rigs; with
+    `ratio_to` the value, nominal, bounds and prior are those of the ratio to that other parameter,
+    and `fixed` besides ties the two. Bounds end where the parameter's own do (`Rig.quantity`):
+    wider ones are errors. With `per` = "recording" every recording has a value of its own. A
+    `prior` counts as one more measurement.
     """
 
     nominal: float | None = None
@@ -91,16 +95,17 @@ NUISANCES: tuple[Nuisance, ...] = get_args(Nuisance)
 
 
 class Sensor(Table):
-    """A measured channel: standard deviation of its noise [the channel's unit], what may be wrong with it, and where it
-    ends.
+    """A measured channel: standard deviation of its noise [the channel's unit], what may be wrong
+    with it, and where it ends.
 
-    How large may be a constant `bias` [unit], a `delay` [s], the error of its `gain` [1], a `drift` [unit/s] from the
-    middle of the recording on, its `misalignment` [rad] about the axis out of the plane; the `inertia` [kg] between a
-    force sensor and what it pushes, whose acceleration it does not feel. Zero leaves them out, otherwise they are
-    identified too, one for all recordings or one for each (`per`). Samples at `low` or `high` [unit] or beyond are
-    saturated: they only say that value and noise together are there or beyond (Tobin's likelihood), and that noise must
-    be white. `colour` says whether the noise is known to be independent ("white"), or may be an autoregression ("ar"),
-    whose order and coefficients are then found.
+    How large may be a constant `bias` [unit], a `delay` [s], the error of its `gain` [1], a `drift`
+    [unit/s] from the middle of the recording on, its `misalignment` [rad] about the axis out of the
+    plane; the `inertia` [kg] between a force sensor and what it pushes, whose acceleration it does
+    not feel. Zero leaves them out, otherwise they are identified too, one for all recordings or one
+    for each (`per`). Samples at `low` or `high` [unit] or beyond are saturated: they only say that
+    value and noise together are there or beyond (Tobin's likelihood), and that noise must be white.
+    `colour` says whether the noise is known to be independent ("white"), or may be an
+    autoregression ("ar"), whose order and coefficients are then found.
     """
 
     noise: float = Field(ge=1e-15, le=1e6)
@@ -123,7 +128,10 @@ class Sensor(Table):
 
     def saturated(self, y: Array) -> NDArray[np.bool_]:
         """Which samples y (k,) [unit] are at the end of its range, or beyond."""
-        low, high = -math.inf if self.low is None else self.low, math.inf if self.high is None else self.high
+        low, high = (
+            -math.inf if self.low is None else self.low,
+            math.inf if self.high is None else self.high,
+        )
         return (y <= low) | (y >= high)
 
     @property
@@ -139,7 +147,8 @@ class Sensor(Table):
 
 @dataclass(frozen=True)
 class Coordinate:
-    """One entry of the vector: what it belongs to, its bounds and start in physical units, its scale, and its prior."""
+    """One entry of the vector: what it belongs to, its bounds and start in physical units, its
+    scale, and its prior."""
 
     name: str
     kind: Literal["parameter", "start"] | Nuisance
@@ -176,7 +185,8 @@ class Coordinate:
 
 
 def limits(name: str, unknowns: Mapping[str, Unknown], recording: Recording) -> tuple[float, float]:
-    """Bounds of an unknown, or of its ratio, whatever the others are: those that its part's constructor declares."""
+    """Bounds of an unknown, or of its ratio, whatever the others are: those that its part's
+    constructor declares."""
     given, ordered, ratio_to = recording.parameters, recording.rig.ordered, unknowns[name].ratio_to
     if ratio_to is not None:
         return (0.0, 1.0) if ordered.get(name) == ratio_to else (-math.inf, math.inf)
@@ -184,7 +194,10 @@ def limits(name: str, unknowns: Mapping[str, Unknown], recording: Recording) -> 
     if declared is None:
         return -math.inf, math.inf
     least, most = declared.low, declared.high
-    known = {**given, **{other: u.nominal for other, u in unknowns.items() if u.fixed and u.nominal is not None}}
+    known = {
+        **given,
+        **{other: u.nominal for other, u in unknowns.items() if u.fixed and u.nominal is not None},
+    }
     free = {other for other, u in unknowns.items() if not u.fixed}
     for lower, upper in ordered.items():
         if name == lower and upper in known and upper not in free:
@@ -195,14 +208,16 @@ def limits(name: str, unknowns: Mapping[str, Unknown], recording: Recording) -> 
 
 
 def own_value(name: str, u: Unknown, recordings: Sequence[Recording]) -> float:
-    """Of an unknown, or its ratio, in the rigs of all recordings. Raises `ValueError` where they do not have the
-    same."""
-    own = [r.parameters[name] / (r.parameters[u.ratio_to] if u.ratio_to else 1.0) for r in recordings]
+    """Of an unknown, or its ratio, in the rigs of all recordings. Raises `ValueError` where they do
+    not have the same."""
+    own = [
+        r.parameters[name] / (r.parameters[u.ratio_to] if u.ratio_to else 1.0) for r in recordings
+    ]
     for r, value in zip(recordings, own):
         if not math.isclose(value, own[0], rel_tol=1e-9):
             raise ValueError(
-                f"unknowns.{name}: it is {own[0]:g} in the rig of recording `{recordings[0].name}` and {value:g} in that of "
-                f"`{r.name}`: say by `nominal` where the search starts"
+                f"unknowns.{name}: it is {own[0]:g} in the rig of recording `{recordings[0].name}` "
+                f"and {value:g} in that of `{r.name}`: say by `nominal` where the search starts"
             )
     return own[0]
 
@@ -212,35 +227,52 @@ AT_BOUND = 1e-4
 
 
 class Coordinates:
-    """All coordinates of a problem, in a fixed order, and the way from their vector x (n,) to parameters of the rig, of
-    where runs begin, and of the sensors.
+    """All coordinates of a problem, in a fixed order, and the way from their vector x (n,) to
+    parameters of the rig, of where runs begin, and of the sensors.
 
-    Raises `ValueError` for unknowns that some recording's rig has not, a ratio to something that is not there, or a
-    nominal value or the median of a prior out of bounds.
+    Raises `ValueError` for unknowns that some recording's rig has not, a ratio to something that is
+    not there, or a nominal value or the median of a prior out of bounds.
     """
 
     def __init__(
-        self, unknowns: dict[str, Unknown], sensors: dict[str, Sensor], recordings: Sequence[Recording]
+        self,
+        unknowns: dict[str, Unknown],
+        sensors: dict[str, Sensor],
+        recordings: Sequence[Recording],
     ) -> None:
         self.recordings, self.all = tuple(r.name for r in recordings), list[Coordinate]()
-        given = {name: value for name, value in recordings[0].parameters.items() if not name.startswith(PREFIX)}
+        given = {
+            name: value
+            for name, value in recordings[0].parameters.items()
+            if not name.startswith(PREFIX)
+        }
         for name, u in unknowns.items():
             for one in given.keys() & {name, u.ratio_to}:
-                if without := next((r.name for r in recordings[1:] if one not in r.parameters), None):
-                    raise ValueError(f"unknowns: the rig of recording `{without}` has no `{line(one, 80)}`")
+                if without := next(
+                    (r.name for r in recordings[1:] if one not in r.parameters), None
+                ):
+                    raise ValueError(
+                        f"unknowns: the rig of recording `{without}` has no `{line(one, 80)}`"
+                    )
             if name not in given:
-                raise ValueError(f"unknowns: `{line(name, 80)}` cannot be identified; what can: {', '.join(given)}")
+                raise ValueError(
+                    f"unknowns: `{line(name, 80)}` cannot be identified; what can: "
+                    f"{', '.join(given)}"
+                )
             if u.ratio_to is not None and (u.ratio_to not in given or u.ratio_to == name):
                 raise ValueError(
-                    f"unknowns.{name}.ratio_to = {shown(u.ratio_to)} is not another parameter of the model"
+                    f"unknowns.{name}.ratio_to = {shown(u.ratio_to)} is not another parameter of "
+                    "the model"
                 )
             if u.ratio_to in unknowns and unknowns[u.ratio_to].ratio_to:
-                raise ValueError(f"unknowns.{name}.ratio_to = {shown(u.ratio_to)} is a ratio itself")
+                raise ValueError(
+                    f"unknowns.{name}.ratio_to = {shown(u.ratio_to)} is a ratio itself"
+                )
             nominal = own_value(name, u, recordings) if u.nominal is None else u.nominal
             if u.scale == "log" and nominal <= 0:
                 raise ValueError(
-                    f"unknowns.{name} = {nominal:g} is not on a logarithmic scale: give a positive `nominal`, or "
-                    "scale = 'linear'"
+                    f"unknowns.{name} = {nominal:g} is not on a logarithmic scale: give a positive "
+                    "`nominal`, or scale = 'linear'"
                 )
             ends = [limits(name, unknowns, r) for r in recordings]
             least, most = max(least for least, _ in ends), min(most for _, most in ends)
@@ -250,18 +282,34 @@ class Coordinates:
                     what = f"{name} / {u.ratio_to}" if u.ratio_to else name
                     where = " in all recordings" if len(set(ends)) > 1 else ""
                     raise ValueError(
-                        f"unknowns.{name}.{field} = {value:g} is beyond what {what} may be{where}, from {least:g} to {most:g}"
+                        f"unknowns.{name}.{field} = {value:g} is beyond what {what} may be{where}, "
+                        f"from {least:g} to {most:g}"
                     )
             low = max(nominal / SPREAD, least) if u.low is None else u.low
             high = min(nominal * SPREAD, most) if u.high is None else u.high
-            for field, value in (("nominal", nominal), ("prior.median", u.prior.median if u.prior else nominal)):
+            for field, value in (
+                ("nominal", nominal),
+                ("prior.median", u.prior.median if u.prior else nominal),
+            ):
                 if not low <= value <= high or low == high:
                     raise ValueError(
-                        f"unknowns.{name}.{field} = {value:g} is not between low = {low:g} and high = {high:g}"
+                        f"unknowns.{name}.{field} = {value:g} is not between low = {low:g} and "
+                        f"high = {high:g}"
                     )
             for where in (None,) if u.per == "all" else self.recordings:
                 self.all.append(
-                    Coordinate(name, "parameter", where, nominal, low, high, u.scale, u.ratio_to, u.fixed, u.prior)
+                    Coordinate(
+                        name,
+                        "parameter",
+                        where,
+                        nominal,
+                        low,
+                        high,
+                        u.scale,
+                        u.ratio_to,
+                        u.fixed,
+                        u.prior,
+                    )
                 )
         for pair in dict.fromkeys(pair for r in recordings for pair in r.rig.ordered.items()):
             self._check_order(*pair)
@@ -272,17 +320,23 @@ class Coordinates:
                 self.all.append(Coordinate(name, "start", r.name, mean, low, high, prior=prior))
         for channel, sensor in sensors.items():
             for kind, (low, nominal, high) in sensor.nuisances.items():
-                seen = [r.name for r in recordings if channel in r.samples] if sensor.per == "recording" else [None]
+                seen = (
+                    [r.name for r in recordings if channel in r.samples]
+                    if sensor.per == "recording"
+                    else [None]
+                )
                 self.all += [Coordinate(channel, kind, where, nominal, low, high) for where in seen]
         self.names = tuple(dict.fromkeys(c.name for c in self.all if c.of_the_rig))
 
     def _check_order(self, *names: str) -> None:
-        """Raises `ValueError` where a search could take the first of two parameters above the second."""
+        """Raises `ValueError` where a search could take the first of two parameters above the
+        second."""
         lower, upper = ({c.name: c for c in self.all if not c.fixed}.get(name) for name in names)
         if lower and upper and not lower.ratio_to and lower.high > upper.low:
             raise ValueError(
-                f"unknowns.{lower.name} must not exceed {upper.name}, but may be up to {lower.high:g} and the other down to "
-                f"{upper.low:g}: give unknowns.{lower.name}.ratio_to = '{upper.name}'"
+                f"unknowns.{lower.name} must not exceed {upper.name}, but may be up to "
+                f"{lower.high:g} and the other down to {upper.low:g}: give "
+                f"unknowns.{lower.name}.ratio_to = '{upper.name}'"
             )
 
     def __len__(self) -> int:
@@ -299,10 +353,13 @@ class Coordinates:
 
     @property
     def bounds(self) -> tuple[Array, Array]:
-        return np.array([c.to_x(c.low) for c in self.all]), np.array([c.to_x(c.high) for c in self.all])
+        return np.array([c.to_x(c.low) for c in self.all]), np.array(
+            [c.to_x(c.high) for c in self.all]
+        )
 
     def at_bound(self, x: Array) -> NDArray[np.bool_]:
-        """Which coordinates (n,) are as close to a bound as `AT_BOUND` of the way to the other one."""
+        """Which coordinates (n,) are as close to a bound as `AT_BOUND` of the way to the other
+        one."""
         low, high = self.bounds
         return np.minimum(x - low, high - x) < AT_BOUND * (high - low)
 
@@ -311,8 +368,13 @@ class Coordinates:
         return np.array([not c.fixed for c in self.all], bool)
 
     def values(self, x: Array, recording: str, given: Mapping[str, float]) -> dict[str, float]:
-        """Values of the unknown parameters in one recording; `given` holds those that a ratio may refer to."""
-        mine = [(i, c) for i, c in enumerate(self.all) if c.of_the_rig and c.recording in (None, recording)]
+        """Values of the unknown parameters in one recording; `given` holds those that a ratio may
+        refer to."""
+        mine = [
+            (i, c)
+            for i, c in enumerate(self.all)
+            if c.of_the_rig and c.recording in (None, recording)
+        ]
         out = {c.name: c.to_value(x[i]) for i, c in mine}
         for _, c in mine:
             if c.ratio_to:
@@ -320,19 +382,24 @@ class Coordinates:
         return out
 
     def jacobian(self, x: Array, recording: str, values: dict[str, float]) -> Array:
-        """d (parameters `names`) / d x (names, n) in one recording; `values` are those of `values(x, recording)`."""
+        """d (parameters `names`) / d x (names, n) in one recording; `values` are those of
+        `values(x, recording)`."""
         out = np.zeros((len(self.names), len(self.all)))
         for i, c in enumerate(self.all):
             if c.of_the_rig and c.recording in (None, recording):
                 row = self.names.index(c.name)
-                out[row, i] = c.slope(x[i]) * (values[c.name] / c.to_value(x[i]) if c.ratio_to else 1.0)
+                out[row, i] = c.slope(x[i]) * (
+                    values[c.name] / c.to_value(x[i]) if c.ratio_to else 1.0
+                )
                 for other in self.all:  # a ratio moves with what it is a ratio to
                     if other.ratio_to == c.name and other.recording in (None, recording):
                         part = values[other.name] / values[c.name]
                         out[self.names.index(other.name), i] += part * c.slope(x[i])
         return out
 
-    def nuisances(self, x: Array, channel: str, recording: str) -> dict[Nuisance, tuple[float, int]]:
+    def nuisances(
+        self, x: Array, channel: str, recording: str
+    ) -> dict[Nuisance, tuple[float, int]]:
         """Values of what is wrong with a sensor [SI] in one recording, and their places in x."""
         return {
             c.kind: (c.to_value(x[i]), i)

@@ -1,5 +1,5 @@
-"""Meshes from a few numbers: blocks, whose nodes are numbered column by column, which keeps the matrices banded, and half-round
-fingertips."""
+"""Meshes from a few numbers: blocks, whose nodes are numbered column by column, which keeps the
+matrices banded, and half-round fingertips."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,12 +19,14 @@ SIDES = ("base", "left", "right")
 
 @dataclass(frozen=True)
 class PadMesh(Mesh):
-    """A rectangular block with a corner at the origin: bonded at y = 0, free at y = `height` [m]. The sides at x = 0 and at
-    x = `length` [m] may be bonded as well."""
+    """A rectangular block with a corner at the origin: bonded at y = 0, free at y = `height` [m].
+    The sides at x = 0 and at x = `length` [m] may be bonded as well."""
 
     length: Annotated[Length, "length along the surface"]
     height: Annotated[Length, "thickness"]
-    elements_x: Annotated[int, Quantity("1", 1, 100_000, "finite elements along it; 1 mm each is usual")]
+    elements_x: Annotated[
+        int, Quantity("1", 1, 100_000, "finite elements along it; 1 mm each is usual")
+    ]
     elements_y: Annotated[int, Quantity("1", 1, 1000, "finite elements through it")]
     bonded_sides: Annotated[bool, "bonded at both ends as well"] = False
 
@@ -68,7 +70,12 @@ class PadMesh(Mesh):
     def edge(self, name: str) -> Index:
         """Numbers of the nodes on an edge of the block."""
         number = self.grid
-        return {"base": number[:, 0], "left": number[0], "right": number[-1], "face": number[:, -1]}[name]
+        return {
+            "base": number[:, 0],
+            "left": number[0],
+            "right": number[-1],
+            "face": number[:, -1],
+        }[name]
 
     def held(self) -> tuple[str, ...]:
         """Edges held by the ground or the bracket: the base, and the sides of an enclosed pad."""
@@ -103,20 +110,25 @@ class PadMesh(Mesh):
 
 
 FaceRadius = Annotated[
-    float, Quantity("m", -1e3, 1e3, "radius of the face, at least half of the length; negative: hollow")
+    float,
+    Quantity("m", -1e3, 1e3, "radius of the face, at least half of the length; negative: hollow"),
 ]
 
 
 @dataclass(frozen=True)
 class CurvedPadMesh(PadMesh):
-    """A block whose face is an arc of `radius` [m], flat where that is infinite: it bulges to the `height` [m] in the middle,
-    or with a negative radius is hollow down to it. `bonded_edges` are some of "base", "left" and "right".
+    """A block whose face is an arc of `radius` [m], flat where that is infinite: it bulges to the
+    `height` [m] in the middle, or with a negative radius is hollow down to it. `bonded_edges` are
+    some of "base", "left" and "right".
 
-    Raises `ValueError` for an arc that does not span the length, or leaves nothing of the sides or of the middle.
+    Raises `ValueError` for an arc that does not span the length, or leaves nothing of the sides or
+    of the middle.
     """
 
     radius: FaceRadius = inf
-    bonded_edges: Annotated[tuple[str, ...], 'edges that are bonded: of "base", "left", "right"'] = SIDES[:1]
+    bonded_edges: Annotated[
+        tuple[str, ...], 'edges that are bonded: of "base", "left", "right"'
+    ] = SIDES[:1]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -124,12 +136,18 @@ class CurvedPadMesh(PadMesh):
         number("radius", self.radius)
         if isnan(self.radius) or not abs(self.radius) >= 0.5 * self.length:
             raise ValueError(
-                f"`radius` must be at least half of the length, {0.5 * self.length:g} m, but is {self.radius!r}"
+                f"`radius` must be at least half of the length, {0.5 * self.length:g} m, but is "
+                f"{self.radius!r}"
             )
         if not self.profile(np.array([0.0]))[0] > 0:
-            raise ValueError(f"`radius` {self.radius:g} m makes the arc deeper than the `height` of {self.height:g} m")
+            raise ValueError(
+                f"`radius` {self.radius:g} m makes the arc deeper than the `height` of "
+                f"{self.height:g} m"
+            )
         if self.bonded_sides:
-            raise ValueError("`bonded_sides` must be left out: the edges are told by `bonded_edges`")
+            raise ValueError(
+                "`bonded_sides` must be left out: the edges are told by `bonded_edges`"
+            )
 
     def held(self) -> tuple[str, ...]:
         return self.bonded_edges
@@ -160,21 +178,30 @@ CORE = 0.5
 
 @dataclass(frozen=True)
 class FingertipMesh(FreeMesh):
-    """Half of a disc of `radius` [m], bonded along its diameter at y = 0 from x = 0 to 2 `radius`. Its face is the half circle,
-    of `elements_around` elements of equal length, a multiple of four.
+    """Half of a disc of `radius` [m], bonded along its diameter at y = 0 from x = 0 to 2 `radius`.
+    Its face is the half circle, of `elements_around` elements of equal length, a multiple of four.
 
-    Layers of elements, about as high as long, lead inwards to a core of rectangles. Raises `ValueError` for other numbers.
+    Layers of elements, about as high as long, lead inwards to a core of rectangles. Raises
+    `ValueError` for other numbers.
     """
 
     radius: Annotated[Length, "radius"]
     elements_around: Annotated[
-        int, Quantity("1", 4, 100_000, "finite elements along the half circle, a multiple of 4; 1 mm each is usual")
+        int,
+        Quantity(
+            "1",
+            4,
+            100_000,
+            "finite elements along the half circle, a multiple of 4; 1 mm each is usual",
+        ),
     ]
 
     def __post_init__(self) -> None:
         positive("radius", self.radius)
         if whole("elements_around", self.elements_around, 4) % 4:
-            raise ValueError(f"`elements_around` must be a multiple of 4, but is {self.elements_around}")
+            raise ValueError(
+                f"`elements_around` must be a multiple of 4, but is {self.elements_around}"
+            )
 
     @property
     def numbers(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -200,16 +227,22 @@ class FingertipMesh(FreeMesh):
         x, y = np.linspace(-CORE, CORE, 2 * k + 1) * R, np.linspace(0, CORE, k + 1) * R
         core = np.stack(np.meshgrid(x, y, indexing="ij"), -1).reshape(-1, 2)
         number = np.arange(len(core)).reshape(2 * k + 1, k + 1)
-        inner = np.concatenate((number[0, :-1], number[:-1, -1], number[-1, ::-1]))  # up, to the right, and down
+        inner = np.concatenate(
+            (number[0, :-1], number[:-1, -1], number[-1, ::-1])
+        )  # up, to the right, and down
         angle = np.pi * (1 - np.arange(4 * k + 1) / (4 * k))
         outer = R * np.stack((np.cos(angle), np.sin(angle)), -1)
         outer[[0, -1], 1] = 0.0
         part = np.arange(1, layers + 1)[:, None, None] / layers
         ring = core[inner] + part * (outer - core[inner])
-        rows = np.concatenate((inner[None], len(core) + np.arange(layers * (4 * k + 1)).reshape(layers, -1)))
+        rows = np.concatenate(
+            (inner[None], len(core) + np.arange(layers * (4 * k + 1)).reshape(layers, -1))
+        )
         squares = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
         sectors = rows[:-1, :-1], rows[:-1, 1:], rows[1:, 1:], rows[1:, :-1]
-        elements = np.concatenate([np.stack(corners, -1).reshape(-1, 4) for corners in (squares, sectors)])
+        elements = np.concatenate(
+            [np.stack(corners, -1).reshape(-1, 4) for corners in (squares, sectors)]
+        )
         nodes = np.concatenate((core, ring.reshape(-1, 2))) + [R, 0.0]
         order = in_band(nodes, elements)
         place = np.argsort(order)

@@ -26,8 +26,9 @@ SMALLEST_BLOCK = 96
 
 @torch.no_grad()
 def solved(matrix: sparse.csr_array, loads: Array) -> Array:
-    """X (n, k) of matrix X = loads for a symmetric positive definite sparse matrix: a block Cholesky factorisation in the
-    order of the smallest band, so that an interrupt is heard between any two blocks."""
+    """X (n, k) of matrix X = loads for a symmetric positive definite sparse matrix: a block
+    Cholesky factorisation in the order of the smallest band, so that an interrupt is heard between
+    any two blocks."""
     order = csgraph.reverse_cuthill_mckee(matrix, symmetric_mode=True)
     A = matrix[order][:, order]
     row, col = A.nonzero()
@@ -44,7 +45,11 @@ def solved(matrix: sparse.csr_array, loads: Array) -> Array:
         diagonal.append(torch.linalg.cholesky(D))
         X[k] = torch.linalg.solve_triangular(diagonal[k], X[k], upper=False)
         if k + 1 < len(blocks):
-            below.append(torch.linalg.solve_triangular(diagonal[k], dense(here, blocks[k + 1]), upper=False).mT)
+            below.append(
+                torch.linalg.solve_triangular(
+                    diagonal[k], dense(here, blocks[k + 1]), upper=False
+                ).mT
+            )
     for k in reversed(range(len(blocks))):
         if k + 1 < len(blocks):
             X[k] -= below[k].mT @ X[k + 1]
@@ -57,8 +62,8 @@ def solved(matrix: sparse.csr_array, loads: Array) -> Array:
 
 @lru_cache(maxsize=16)
 def unit_compliance(mesh: Mesh, nu: float) -> tuple[Array, Array]:
-    """Displacements of the surface per force on it, (K^-1)_ss for E depth = 1, and their derivative by nu, -K^-1 (dK/dnu) K^-1,
-    both (2 surface, 2 surface)."""
+    """Displacements of the surface per force on it, (K^-1)_ss for E depth = 1, and their derivative
+    by nu, -K^-1 (dK/dnu) K^-1, both (2 surface, 2 surface)."""
     surface = (2 * mesh.surface[:, None] + np.arange(2)).ravel()
     loads = np.zeros((2 * len(mesh.free), len(surface)))
     loads[surface, np.arange(len(surface))] = 1.0
@@ -68,6 +73,8 @@ def unit_compliance(mesh: Mesh, nu: float) -> tuple[Array, Array]:
     with torch.inference_mode(False), torch.enable_grad():
         nu_ = torch.tensor(nu, dtype=torch.float64, requires_grad=True)
         moduli = lame_moduli(torch.ones_like(nu_), nu_)
-    d_lambda, d_mu = (torch.autograd.grad(modulus, nu_, retain_graph=True)[0].item() for modulus in moduli)
+    d_lambda, d_mu = (
+        torch.autograd.grad(modulus, nu_, retain_graph=True)[0].item() for modulus in moduli
+    )
     dK = mesh.assemble(d_lambda * K_lambda + d_mu * K_mu)
     return X[surface], -(X.T @ (dK @ X))

@@ -28,13 +28,15 @@ def lame_moduli(E: Modulus, nu: Modulus) -> tuple[Modulus, Modulus]:
 
 
 def gradients(corners: Array, xi: float, zeta: float) -> tuple[Array, Array, Array]:
-    """Shape functions (4,) at a place of the square, their gradients (..., 4, 2) [1/m] in elements of `corners` (..., 4, 2)
-    [m], and the determinant of the map (...) [m2]."""
+    """Shape functions (4,) at a place of the square, their gradients (..., 4, 2) [1/m] in elements
+    of `corners` (..., 4, 2) [m], and the determinant of the map (...) [m2]."""
     across, along = 1 + CORNERS[:, 0] * xi, 1 + CORNERS[:, 1] * zeta
     slopes = np.stack((CORNERS[:, 0] * along, CORNERS[:, 1] * across), -1) / 4
     J = np.swapaxes(corners, -1, -2) @ slopes  # d(x, y) / d(xi, zeta)
     determinant = J[..., 0, 0] * J[..., 1, 1] - J[..., 0, 1] * J[..., 1, 0]
-    cofactors = np.stack((J[..., 1, 1], -J[..., 0, 1], -J[..., 1, 0], J[..., 0, 0]), -1).reshape(J.shape)
+    cofactors = np.stack((J[..., 1, 1], -J[..., 0, 1], -J[..., 1, 0], J[..., 0, 0]), -1).reshape(
+        J.shape
+    )
     inverse = cofactors / determinant[..., None, None]
     return across * along / 4, slopes @ inverse, determinant
 
@@ -48,8 +50,8 @@ def strains(gradient: Array) -> Array:
 
 
 def element_matrices(corners: Array) -> tuple[Array, Array, Array]:
-    """K_lambda, K_mu (per modulus and depth) [1] and the consistent M (per density and depth) [m2], each (..., 8, 8), of
-    elements with `corners` (..., 4, 2) [m] anticlockwise."""
+    """K_lambda, K_mu (per modulus and depth) [1] and the consistent M (per density and depth) [m2],
+    each (..., 8, 8), of elements with `corners` (..., 4, 2) [m] anticlockwise."""
     _, gradient, quarter = gradients(corners, 0.0, 0.0)
     divergence = gradient.reshape(*gradient.shape[:-2], 8)
     K_lambda = 4 * quarter[..., None, None] * divergence[..., :, None] * divergence[..., None, :]
@@ -64,11 +66,13 @@ def element_matrices(corners: Array) -> tuple[Array, Array, Array]:
 
 
 class Mesh:
-    """A pad's mesh in its own frame: it gives `nodes` (N, 2) [m], `elements` (n, 4) anticlockwise, which nodes are `bonded`,
-    and `face`, the nodes along the free surface from left to right; its extents `length` and `height` [m] along x and y, and
-    how many elements are along the face and, about, through it.
+    """A pad's mesh in its own frame: it gives `nodes` (N, 2) [m], `elements` (n, 4) anticlockwise,
+    which nodes are `bonded`, and `face`, the nodes along the free surface from left to right; its
+    extents `length` and `height` [m] along x and y, and how many elements are along the face and,
+    about, through it.
 
-    Meshes of the same description are equal and have one hash, so that what is computed of one serves all.
+    Meshes of the same description are equal and have one hash, so that what is computed of one
+    serves all.
     """
 
     nodes: Any
@@ -84,21 +88,24 @@ class Mesh:
     """Arguments that say how many elements it has, for messages."""
 
     def counts(self) -> tuple[int, int, int]:
-        """Nodes on the face, nodes that move, and the largest difference between node numbers of one element, about."""
+        """Nodes on the face, nodes that move, and the largest difference between node numbers of
+        one element, about."""
         return len(self.face), len(self.free), self.band
 
     @property
     def memory(self) -> float:
-        """Memory [GiB] for condensing the mesh onto its surface, about: loads on the surface, displacements under them, their
-        products, and the blocks of the factor."""
+        """Memory [GiB] for condensing the mesh onto its surface, about: loads on the surface,
+        displacements under them, their products, and the blocks of the factor."""
         surface, free, band = self.counts()
         return 8 * 4 * free * (4 * surface + 4 * min(band, free // band)) / 2**30
 
     def check_memory(self) -> None:
-        """Raises `ValueError` for a mesh too fine to be condensed; inertial pads are condensed too, to find the start."""
+        """Raises `ValueError` for a mesh too fine to be condensed; inertial pads are condensed too,
+        to find the start."""
         if (need := self.memory) > MEMORY:
             raise ValueError(
-                f"{self.numbers} take about {need:.3g} GiB of memory, but {MEMORY:g} GiB are the most; take fewer"
+                f"{self.numbers} take about {need:.3g} GiB of memory, but {MEMORY:g} GiB are the "
+                "most; take fewer"
             )
 
     def refined(self, finer: int) -> "Mesh":
@@ -128,7 +135,8 @@ class Mesh:
         return element_matrices(self.nodes[self.elements])
 
     def assemble(self, element: Array, all_nodes: bool = False) -> sparse.csr_array:
-        """Global matrix of element matrices (8, 8) or (elements, 8, 8), on the dofs of the free nodes or of all of them."""
+        """Global matrix of element matrices (8, 8) or (elements, 8, 8), on the dofs of the free
+        nodes or of all of them."""
         dofs = (2 * self.elements[:, :, None] + np.arange(2)).reshape(-1, 8)
         rows, cols = np.repeat(dofs, 8, 1).ravel(), np.tile(dofs, (1, 8)).ravel()
         entries = np.broadcast_to(element, (len(dofs), 8, 8)).ravel()
@@ -139,7 +147,8 @@ class Mesh:
 
     @cached_property
     def nodal_areas(self) -> Array:
-        """Lumped mass per density and depth of the free nodes [m2], shape (free,): row sums of the consistent M."""
+        """Lumped mass per density and depth of the free nodes [m2], shape (free,): row sums of the
+        consistent M."""
         return self.assemble(self.matrices[2], all_nodes=True).sum(1)[::2][self.free]
 
     @property
@@ -149,7 +158,8 @@ class Mesh:
 
     @property
     def space(self) -> Array:
-        """Two corners (2, 2) [m] of the rectangle in which the centre of a body must be to touch the pad."""
+        """Two corners (2, 2) [m] of the rectangle in which the centre of a body must be to touch
+        the pad."""
         low, high = self.nodes.min(0), self.nodes.max(0)
         return np.stack((low - self.length, high + self.length))
 
@@ -165,7 +175,8 @@ class Mesh:
         return around(self.elements)
 
     def lines(self, columns: int) -> list[Index]:
-        """Chains of nodes to draw: the elements' sides, or less of them where `columns` elements along the face are one."""
+        """Chains of nodes to draw: the elements' sides, or less of them where `columns` elements
+        along the face are one."""
         sides = np.sort(edges(self.elements), 1)
         return list(np.unique(sides, axis=0))
 
@@ -203,7 +214,8 @@ def boundary(elements: Index) -> Index:
 
 
 def around(elements: Index) -> Index:
-    """Numbers of the nodes around the elements, anticlockwise; the longest way round where there are several."""
+    """Numbers of the nodes around the elements, anticlockwise; the longest way round where there
+    are several."""
     after = {int(a): int(b) for a, b in boundary(elements)}
     loops: list[list[int]] = []
     while after:
@@ -217,7 +229,8 @@ def around(elements: Index) -> Index:
 
 
 def in_band(nodes: Array, elements: Index) -> Index:
-    """The order of the nodes in which those of one element are close to each other (reverse Cuthill-McKee)."""
+    """The order of the nodes in which those of one element are close to each other (reverse
+    Cuthill-McKee)."""
     pairs = np.array([(a, b) for a in range(4) for b in range(4) if a != b])
     rows, cols = elements[:, pairs[:, 0]].ravel(), elements[:, pairs[:, 1]].ravel()
     graph = sparse.csr_array((np.ones(len(rows)), (rows, cols)), shape=(len(nodes), len(nodes)))

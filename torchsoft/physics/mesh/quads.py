@@ -15,7 +15,17 @@ from scipy.sparse.csgraph import connected_components
 
 from torchsoft.files import check_file
 from torchsoft.physics.arguments import LENGTHS, places
-from torchsoft.physics.mesh.mesh import CORNERS, Array, FreeMesh, Index, Mesh, boundary, edges, gradients, in_band
+from torchsoft.physics.mesh.mesh import (
+    CORNERS,
+    Array,
+    FreeMesh,
+    Index,
+    Mesh,
+    boundary,
+    edges,
+    gradients,
+    in_band,
+)
 
 IGNORED = {"line", "vertex"}
 """Kinds of cells beside the quadrilaterals."""
@@ -31,11 +41,12 @@ Numbers = tuple[tuple[int, ...], ...]
 
 @dataclass(frozen=True)
 class QuadMesh(FreeMesh):
-    """Quadrilaterals, four numbers of `points` (x, y) [m] each, with the sides, two numbers each, that are its free face and
-    those that are bonded. The face looks up: from left to right, the pad is on its right hand.
+    """Quadrilaterals, four numbers of `points` (x, y) [m] each, with the sides, two numbers each,
+    that are its free face and those that are bonded. The face looks up: from left to right, the pad
+    is on its right hand.
 
-    Raises `ValueError` for quadrilaterals that are folded or not connected, for sides that are not on the boundary, for a face
-    that is not one open line, and for a pad that is bonded nowhere.
+    Raises `ValueError` for quadrilaterals that are folded or not connected, for sides that are not
+    on the boundary, for a face that is not one open line, and for a pad that is bonded nowhere.
     """
 
     points: tuple[tuple[float, float], ...]
@@ -47,19 +58,29 @@ class QuadMesh(FreeMesh):
     def of(cls, points: Any, quads: Any, face: Any, bonded: Any) -> Self:
         """From arrays: points (n, 2) [m], quads (m, 4), sides (., 2)."""
         x = tuple((float(x), float(y)) for x, y in places("points", points).tolist())
-        return cls(x, *(tuple(tuple(map(int, row)) for row in rows) for rows in (quads, face, bonded)))
+        return cls(
+            x, *(tuple(tuple(map(int, row)) for row in rows) for rows in (quads, face, bonded))
+        )
 
     @classmethod
-    def read(cls, path: str | Path, *, unit: str, face: str = "face", bonded: Iterable[str] = ("base",)) -> Self:
-        """From a file that meshio reads, with coordinates in `unit` (m, cm or mm): its quadrilaterals, and its groups of lines
-        (in gmsh physical curves) with the names of the face and of the bonded edges. Raises `ValueError` naming the file."""
+    def read(
+        cls, path: str | Path, *, unit: str, face: str = "face", bonded: Iterable[str] = ("base",)
+    ) -> Self:
+        """From a file that meshio reads, with coordinates in `unit` (m, cm or mm): its
+        quadrilaterals, and its groups of lines (in gmsh physical curves) with the names of the face
+        and of the bonded edges. Raises `ValueError` naming the file."""
         points, quads, groups = read_quads(path, unit)
         try:
             for name in (face, *bonded):
                 if name not in groups:
                     known = ", ".join(groups) or "none"
                     raise ValueError(f"there is no group of lines `{name}`; there are {known}")
-            return cls.of(points, quads, groups[face], np.concatenate([groups[name] for name in bonded] or [[]]))
+            return cls.of(
+                points,
+                quads,
+                groups[face],
+                np.concatenate([groups[name] for name in bonded] or [[]]),
+            )
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
 
@@ -70,27 +91,42 @@ class QuadMesh(FreeMesh):
         if given.min() < 0 or given.max() >= len(self.points):
             raise ValueError(f"`quads` must be numbers of the {len(self.points)} points, from 0 on")
         nodes, elements = self.nodes, self.elements
-        worst = np.min([gradients(nodes[elements], *corner)[2] for corner in CORNERS.tolist()], axis=0)
+        worst = np.min(
+            [gradients(nodes[elements], *corner)[2] for corner in CORNERS.tolist()], axis=0
+        )
         if not worst.min() > 0:
-            raise ValueError(f"quadrilateral {int(worst.argmin())} is folded: it has an angle of 180 degrees or more")
+            raise ValueError(
+                f"quadrilateral {int(worst.argmin())} is folded: it has an angle of 180 degrees or "
+                "more"
+            )
         sides = edges(elements)
-        graph = sparse.csr_array((np.ones(len(sides)), (sides[:, 0], sides[:, 1])), shape=(len(nodes), len(nodes)))
+        graph = sparse.csr_array(
+            (np.ones(len(sides)), (sides[:, 0], sides[:, 1])), shape=(len(nodes), len(nodes))
+        )
         if connected_components(graph, directed=False)[0] > 1:
-            raise ValueError("the quadrilaterals are not connected: points that are the same must have one number")
+            raise ValueError(
+                "the quadrilaterals are not connected: points that are the same must have one "
+                "number"
+            )
         outside = {frozenset(side) for side in boundary(elements).tolist()}
         for name in ("face_sides", "bonded_sides"):
             found = getattr(self, name)
             if not found:
                 raise ValueError(f"`{name}` must be sides of quadrilaterals, but there are none")
             for side in found:
-                if len(side) != 2 or not {*side} <= self.number.keys() or {self.number[i] for i in side} not in outside:
+                if (
+                    len(side) != 2
+                    or not {*side} <= self.number.keys()
+                    or {self.number[i] for i in side} not in outside
+                ):
                     raise ValueError(f"`{name}` has {side}, which is no side on the boundary")
         if len(self.surface) < 2:
             raise ValueError("fewer than two points of the face are free")
 
     @cached_property
     def number(self) -> dict[int, int]:
-        """Of the nodes by their points' numbers: points that belong to no quadrilateral are left out."""
+        """Of the nodes by their points' numbers: points that belong to no quadrilateral are left
+        out."""
         used, elements = np.unique(np.array(self.quads), return_inverse=True)
         order = in_band(np.array(self.points)[used], elements.reshape(-1, 4))
         return {int(used[old]): new for new, old in enumerate(order)}
@@ -112,7 +148,11 @@ class QuadMesh(FreeMesh):
     def face(self) -> Index:
         """Numbers of the nodes along the face."""
         mine = {frozenset(self.number[i] for i in side) for side in self.face_sides}
-        before = {int(b): int(a) for a, b in boundary(self.elements) if frozenset((int(a), int(b))) in mine}
+        before = {
+            int(b): int(a)
+            for a, b in boundary(self.elements)
+            if frozenset((int(a), int(b))) in mine
+        }
         starts = before.keys() - before.values()
         if len(starts) != 1:
             raise ValueError("`face_sides` must be one line with two ends")
@@ -131,7 +171,8 @@ class QuadMesh(FreeMesh):
         return held
 
     def refined(self, finer: int) -> Mesh:
-        """Every quadrilateral divided; curved edges stay as straight between the points as they are."""
+        """Every quadrilateral divided; curved edges stay as straight between the points as they
+        are."""
         known: dict[frozenset[tuple[int, int]], int] = {}
         points: list[Array] = []
 
@@ -140,13 +181,26 @@ class QuadMesh(FreeMesh):
             used = [(corner, weight) for corner, weight in zip(corners, weights) if weight]
             number = known.setdefault(frozenset(used), len(points))
             if number == len(points):
-                points.append(np.average([self.points[i] for i, _ in used], axis=0, weights=[w for _, w in used]))
+                points.append(
+                    np.average(
+                        [self.points[i] for i, _ in used], axis=0, weights=[w for _, w in used]
+                    )
+                )
             return number
 
         n, quads = range(finer + 1), list[list[int]]()
         for quad in self.quads:
             number = np.array(
-                [[at(quad, ((finer - i) * (finer - j), i * (finer - j), i * j, (finer - i) * j)) for j in n] for i in n]
+                [
+                    [
+                        at(
+                            quad,
+                            ((finer - i) * (finer - j), i * (finer - j), i * j, (finer - i) * j),
+                        )
+                        for j in n
+                    ]
+                    for i in n
+                ]
             )
             corners = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
             quads += np.stack(corners, -1).reshape(-1, 4).tolist()
@@ -162,16 +216,19 @@ class QuadMesh(FreeMesh):
 
 
 def read_quads(path: str | Path, unit: str) -> tuple[Array, Index, dict[str, Index]]:
-    """Points (n, 2) [m], quadrilaterals (m, 4) and, by their names, groups of lines (., 2) of a file that meshio reads.
+    """Points (n, 2) [m], quadrilaterals (m, 4) and, by their names, groups of lines (., 2) of a
+    file that meshio reads.
 
-    Raises `ValueError` naming the file for one that it cannot read, another unit, cells of another kind, and points that are
-    not in a plane of constant z, and `OSError`.
+    Raises `ValueError` naming the file for one that it cannot read, another unit, cells of another
+    kind, and points that are not in a plane of constant z, and `OSError`.
     """
     import meshio  # takes half a second, and few need it
 
     if unit not in LENGTHS:
         raise ValueError(f"`unit` must be one of {', '.join(LENGTHS)}, but is {unit!r}")
-    with check_file(path, LARGEST).open("rb"):  # what is not there, or not to be read, is an OSError
+    with check_file(path, LARGEST).open(
+        "rb"
+    ):  # what is not there, or not to be read, is an OSError
         pass
     try:
         with (
@@ -180,12 +237,14 @@ def read_quads(path: str | Path, unit: str) -> tuple[Array, Index, dict[str, Ind
         ):  # it prints, and exits
             mesh: Any = meshio.read(path)
     except (Exception, SystemExit) as error:
-        raise ValueError(f"{path} is not a mesh that can be read: {error or 'its format is not known'}") from None
+        raise ValueError(
+            f"{path} is not a mesh that can be read: {error or 'its format is not known'}"
+        ) from None
     kinds = {block.type for block in mesh.cells} - IGNORED
     if kinds != {"quad"}:
         raise ValueError(
-            f"{path} must be a mesh of quadrilaterals with four points, but has {', '.join(sorted(kinds)) or 'none'}; in gmsh "
-            "recombine the triangles"
+            f"{path} must be a mesh of quadrilaterals with four points, but has "
+            f"{', '.join(sorted(kinds)) or 'none'}; in gmsh recombine the triangles"
         )
     x = np.asarray(mesh.points, np.float64)
     if not np.isfinite(x).all() or (x.shape[1] > 2 and np.ptp(x[:, 2]) > FLAT * np.ptp(x[:, :2])):
@@ -195,7 +254,8 @@ def read_quads(path: str | Path, unit: str) -> tuple[Array, Index, dict[str, Ind
 
 
 def groups_of_lines(mesh: Any) -> dict[str, Index]:
-    """Sides (., 2) by the names of their groups: meshio's cell sets, and gmsh's physical curves of older files."""
+    """Sides (., 2) by the names of their groups: meshio's cell sets, and gmsh's physical curves of
+    older files."""
     groups: dict[str, list[Index]] = {}
     tags = mesh.cell_data.get("gmsh:physical", [None] * len(mesh.cells))
     curves = {name: tag for name, (tag, dimension) in mesh.field_data.items() if dimension == 1}

@@ -1,7 +1,8 @@
-"""Shapes of rigid bodies: signed distance and outward normal, in the body's own frame about its centre of mass.
+"""Shapes of rigid bodies: signed distance and outward normal, in the body's own frame about its
+centre of mass.
 
-The contact asks nothing else of a body, so another shape is another class with a `forward`, from which the compiled kernels are
-generated.
+The contact asks nothing else of a body, so another shape is another class with a `forward`, from
+which the compiled kernels are generated.
 """
 
 from torchsoft.physics.shapes.contour import Contour
@@ -9,4 +10,13 @@ from torchsoft.physics.shapes.oval import Circle, Ellipse, Superellipse
 from torchsoft.physics.shapes.rounded import RoundedBox, RoundedPolygon
 from torchsoft.physics.shapes.shape import Shape, parameter
 
-__all__ = ["Circle", "Contour", "Ellipse", "RoundedBox", "RoundedPolygon", "Shape", "Superellipse", "parameter"]
+__all__ = [
+    "Circle",
+    "Contour",
+    "Ellipse",
+    "RoundedBox",
+    "RoundedPolygon",
+    "Shape",
+    "Superellipse",
+    "parameter",
+]

@@ -9,7 +9,17 @@ from torch import Tensor, nn
 
 from torchsoft import csvfile
 from torchsoft.physics.arguments import LENGTHS, places, positive
-from torchsoft.physics.shapes.shape import Array, Moments, Outlined, Prepared, Shape, crossing, gauss, moments, reach
+from torchsoft.physics.shapes.shape import (
+    Array,
+    Moments,
+    Outlined,
+    Prepared,
+    Shape,
+    crossing,
+    gauss,
+    moments,
+    reach,
+)
 
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
@@ -18,7 +28,8 @@ FINE = 64
 """Intervals a piece in which lengths along a spline are summed up."""
 
 LEAST, STEEPEST = 8, np.radians(60)
-"""Points that are a contour, and by how much it may turn at one of them [rad]: a spline would swing around a corner."""
+"""Points that are a contour, and by how much it may turn at one of them [rad]: a spline would swing
+around a corner."""
 
 PIECES = (32, 64, 128, 256, 512)
 """How many pieces a contour may have; as many are taken as its tolerance asks for."""
@@ -33,20 +44,24 @@ JUDGED = 1024
 """About how many points of a contour are looked at to judge it."""
 
 EXACT = 1e-9
-"""How exact distances [m] and normals [1] must be found up to half as far as the nearest point is the only one."""
+"""How exact distances [m] and normals [1] must be found up to half as far as the nearest point is
+the only one."""
 
 
 class Contour(Outlined):
-    """A body inside a periodic cubic B-spline through points (n, 2) [m] of its contour in their order, which may be given about
-    any point: the body's own frame has its origin at the centre of mass, and a note says where that is.
+    """A body inside a periodic cubic B-spline through points (n, 2) [m] of its contour in their
+    order, which may be given about any point: the body's own frame has its origin at the centre of
+    mass, and a note says where that is.
 
-    The contour is smooth: curvature is continuous. It passes the points, and between them their periodic cubic spline over
-    the chords' lengths, at `residual` [m], which is at most the `tolerance` [m]. Its `control` points, (pieces, 2) [m], are
-    one parameter, which gradients reach. Distance and normal are exact up to half as far from the contour as the nearest point
-    is the only one, which the sharpest curvature and the narrowest neck decide.
+    The contour is smooth: curvature is continuous. It passes the points, and between them their
+    periodic cubic spline over the chords' lengths, at `residual` [m], which is at most the
+    `tolerance` [m]. Its `control` points, (pieces, 2) [m], are one parameter, which gradients
+    reach. Distance and normal are exact up to half as far from the contour as the nearest point is
+    the only one, which the sharpest curvature and the narrowest neck decide.
 
-    Raises `ValueError` for points that are too few or turn too sharply, and for a contour that passes them farther than the
-    tolerance, crosses itself, or is so sharp, narrow or intricate that the nearest points cannot be told apart.
+    Raises `ValueError` for points that are too few or turn too sharply, and for a contour that
+    passes them farther than the tolerance, crosses itself, or is so sharp, narrow or intricate that
+    the nearest points cannot be told apart.
     """
 
     given: ClassVar = "points"
@@ -55,7 +70,10 @@ class Contour(Outlined):
 
     def __init__(self, points: object, *, tolerance: float = 1e-6) -> None:
         super().__init__()
-        (spline, chords), tolerance = closed_spline(contour_points(points)), positive("tolerance", tolerance)
+        (spline, chords), tolerance = (
+            closed_spline(contour_points(points)),
+            positive("tolerance", tolerance),
+        )
         between = np.linspace(chords[:-1], chords[1:], BETWEEN, endpoint=False).ravel()
         given = torch.from_numpy(spline(between))
         self._judged = (b"", "")
@@ -67,8 +85,9 @@ class Contour(Outlined):
                 break
         else:
             raise ValueError(
-                f"a contour of {PIECES[-1]} pieces still passes the points, or the spline between them, at "
-                f"{self.residual:.2g} m; give a `tolerance` above that, or points with rounded corners"
+                f"a contour of {PIECES[-1]} pieces still passes the points, or the spline between "
+                f"them, at {self.residual:.2g} m; give a `tolerance` above that, or points with "
+                "rounded corners"
             )
         if wrong := self.well_posed():
             raise ValueError(f"`points` cannot be used as a contour: {wrong}")
@@ -76,8 +95,9 @@ class Contour(Outlined):
 
     @classmethod
     def from_csv(cls, path: str | Path, *, tolerance: float = 1e-6) -> Self:
-        """The contour through the points of a file: two columns with a unit in their heading, such as `x [mm],y [mm]`. Raises
-        `ValueError` naming file and row for anything else, and `OSError`."""
+        """The contour through the points of a file: two columns with a unit in their heading, such
+        as `x [mm],y [mm]`. Raises `ValueError` naming file and row for anything else, and
+        `OSError`."""
         points = read_points(path)
         try:
             return cls(points, tolerance=tolerance)
@@ -95,7 +115,9 @@ class Contour(Outlined):
     def judged(self) -> str:
         """What is wrong with the control points, which is looked for along the whole contour."""
         each = min(8, max(2, JUDGED // len(self.control)))
-        points, way, bend = (x.flatten(0, 1) for x in self.along(torch.arange(each, dtype=torch.float64) / each))
+        points, way, bend = (
+            x.flatten(0, 1) for x in self.along(torch.arange(each, dtype=torch.float64) / each)
+        )
         moments = self.moments()
         points = points - moments.centre
         size, speed = float(points.norm(dim=-1).max()), way.norm(dim=-1, keepdim=True)
@@ -106,8 +128,9 @@ class Contour(Outlined):
         unique = reach(points.numpy(), normals.numpy(), curvature.numpy())
         if unique < SHARPEST * size:
             return (
-                f"it is so sharp, or so narrow, that the nearest point is the only one up to {unique:.2g} m from it, which "
-                f"must be {SHARPEST:g} of its size, {SHARPEST * size:.2g} m"
+                "it is so sharp, or so narrow, that the nearest point is the only one up to "
+                f"{unique:.2g} m from it, which must be {SHARPEST:g} of its size, "
+                f"{SHARPEST * size:.2g} m"
             )
         shape = self.prepared()
         for depth in (-0.5 * unique, 0.5 * unique):
@@ -118,7 +141,8 @@ class Contour(Outlined):
         return ""
 
     def cubics(self) -> Tensor:
-        """Coefficients (pieces, 4, 2) [m] of the pieces' polynomials in the part of each from 0 to 1."""
+        """Coefficients (pieces, 4, 2) [m] of the pieces' polynomials in the part of each from 0 to
+        1."""
         before, here, after, last = (self.control.roll(by, 0) for by in (1, 0, -1, -2))
         parts = (
             (before + 4 * here + after) / 6,
@@ -129,10 +153,15 @@ class Contour(Outlined):
         return torch.stack(parts, 1)
 
     def along(self, part: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Places (pieces, parts, 2) [m] at these parts of every piece, and their first two derivatives by the part."""
+        """Places (pieces, parts, 2) [m] at these parts of every piece, and their first two
+        derivatives by the part."""
         t = part[:, None]
         k = self.cubics()[:, :, None].unbind(1)
-        return ((k[3] * t + k[2]) * t + k[1]) * t + k[0], (3 * k[3] * t + 2 * k[2]) * t + k[1], 6 * k[3] * t + 2 * k[2]
+        return (
+            ((k[3] * t + k[2]) * t + k[1]) * t + k[0],
+            (3 * k[3] * t + 2 * k[2]) * t + k[1],
+            6 * k[3] * t + 2 * k[2],
+        )
 
     def moments(self) -> Moments:
         part, weight = gauss(self.POINTS)
@@ -141,11 +170,15 @@ class Contour(Outlined):
 
     def prepared(self) -> Shape:
         k = self.cubics()
-        return Pieces.of(cubics=torch.cat((k[:, :1] - self.moments().centre, k[:, 1:]), 1).flatten(1))
+        return Pieces.of(
+            cubics=torch.cat((k[:, :1] - self.moments().centre, k[:, 1:]), 1).flatten(1)
+        )
 
     def support(self, direction: Tensor) -> Tensor:
         k = torch.einsum("pjx,...x->...pj", self.cubics(), direction)
-        with torch.no_grad():  # where the contour's component has no slope: the roots of a quadratic a piece
+        with (
+            torch.no_grad()
+        ):  # where the contour's component has no slope: the roots of a quadratic a piece
             _, b, c, d = k.unbind(-1)
             root = torch.sqrt((c * c - 3 * b * d).clamp(min=0.0))
             q = -(c + torch.where(c < 0, -root, root))
@@ -160,12 +193,15 @@ class Contour(Outlined):
 
 
 class Pieces(Prepared):
-    """What the law of a contour is compiled from: `cubics` (pieces, 8) [m], the coefficients of every piece's x and y."""
+    """What the law of a contour is compiled from: `cubics` (pieces, 8) [m], the coefficients of
+    every piece's x and y."""
 
     STARTS, ITERATIONS = 64, 8
-    """Points of the contour at the most among which the nearest is looked for, and steps of Newton's method from there."""
+    """Points of the contour at the most among which the nearest is looked for, and steps of
+    Newton's method from there."""
     ROUNDING = 1e-9
-    """How far a step of Newton's method may lead beyond known bounds [pieces]; farther, it goes to their middle."""
+    """How far a step of Newton's method may lead beyond known bounds [pieces]; farther, it goes to
+    their middle."""
 
     cubics: Tensor
 
@@ -181,7 +217,8 @@ class Pieces(Prepared):
         return (x[..., 0] - cx) * nx + (x[..., 1] - cy) * ny, torch.stack((nx, ny), -1)
 
     def place(self, s: Tensor) -> tuple[Tensor, Tensor]:
-        """Number of the piece, and the part of it, at s pieces from the start, around any number of times."""
+        """Number of the piece, and the part of it, at s pieces from the start, around any number of
+        times."""
         count = len(self.cubics)
         around = s - count * torch.floor(s / count)
         piece = torch.floor(around).clamp(max=count - 1.0)
@@ -198,7 +235,8 @@ class Pieces(Prepared):
         )
 
     def stationarity(self, row: Tensor, t: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Half of what the squared distance of x from the place t rises by with t [m2], and the slope of that."""
+        """Half of what the squared distance of x from the place t rises by with t [m2], and the
+        slope of that."""
         (cx, cy), (tx, ty), (bx, by) = self.curve(row, t)
         ex, ey = cx - x[..., 0], cy - x[..., 1]
         return ex * tx + ey * ty, tx * tx + ty * ty + ex * bx + ey * by
@@ -223,24 +261,29 @@ class Pieces(Prepared):
 
 
 def contour_points(points: object) -> Array:
-    """Points (n, 2) [m] around a contour, the first of which is not there again at the end. Raises `ValueError` for what is not
-    enough points, or points of which some are the same, turn by more than `STEEPEST`, or go along lines that cross."""
+    """Points (n, 2) [m] around a contour, the first of which is not there again at the end. Raises
+    `ValueError` for what is not enough points, or points of which some are the same, turn by more
+    than `STEEPEST`, or go along lines that cross."""
     given = places("points", points).numpy()
     if len(given) > 1 and np.array_equal(given[0], given[-1]):
         given = given[:-1]
     if len(given) < LEAST:
-        raise ValueError(f"`points` must be at least {LEAST} places around a contour, but are {len(given)}")
+        raise ValueError(
+            f"`points` must be at least {LEAST} places around a contour, but are {len(given)}"
+        )
     x, y = (np.roll(given, -1, 0) - given).T
     if not (np.hypot(x, y) > 0).all():
         raise ValueError(
-            f"`points` has the same place twice: point {int(np.hypot(x, y).argmin())} and the one after it"
+            f"`points` has the same place twice: point {int(np.hypot(x, y).argmin())} and the one "
+            "after it"
         )
     turn = np.arctan2(np.roll(x, 1) * y - np.roll(y, 1) * x, np.roll(x, 1) * x + np.roll(y, 1) * y)
     sharpest = int(np.abs(turn).argmax())
     if abs(turn[sharpest]) > STEEPEST:
         raise ValueError(
-            f"`points` turns by {abs(np.degrees(turn[sharpest])):.3g} degrees at point {sharpest}, a smooth contour by "
-            f"{np.degrees(STEEPEST):.3g} at most; give more points there, or a RoundedPolygon"
+            f"`points` turns by {abs(np.degrees(turn[sharpest])):.3g} degrees at point {sharpest}, "
+            f"a smooth contour by {np.degrees(STEEPEST):.3g} at most; give more points there, or a "
+            "RoundedPolygon"
         )
     if crossing(given):
         raise ValueError("`points` go along a contour that crosses itself")
@@ -248,21 +291,24 @@ def contour_points(points: object) -> Array:
 
 
 def read_points(path: str | Path) -> Array:
-    """Points (n, 2) [m] of a CSV file with columns x and y whose headings have units in brackets. Raises `ValueError` naming
-    file and row for anything else, and `OSError`."""
+    """Points (n, 2) [m] of a CSV file with columns x and y whose headings have units in brackets.
+    Raises `ValueError` naming file and row for anything else, and `OSError`."""
     needed = "the columns must be `x [mm]` and `y [mm]`, in m, cm or mm"
     table = csvfile.read(Path(path), dict.fromkeys("xy", LENGTHS), lambda *_: f": {needed}")
     if table.values.keys() != {"x", "y"}:
         raise ValueError(f"{path}, row 1: {needed}, but are {', '.join(table.values) or 'none'}")
     points = np.stack((table.values["x"], table.values["y"]), -1)
     if (empty := np.flatnonzero(np.isnan(points).any(1))).size:
-        raise ValueError(f"{path}, row {table.rows[empty[0]]} has an empty cell; a point needs x and y")
+        raise ValueError(
+            f"{path}, row {table.rows[empty[0]]} has an empty cell; a point needs x and y"
+        )
     return points
 
 
 def closed_spline(points: Array) -> "tuple[CubicSpline, Array]":
-    """The periodic cubic spline through points (n, 2) [m] over the lengths of their chords, anticlockwise, and these lengths
-    from the first point on to the first point again (n + 1,) [m]."""
+    """The periodic cubic spline through points (n, 2) [m] over the lengths of their chords,
+    anticlockwise, and these lengths from the first point on to the first point again (n + 1,)
+    [m]."""
     x, y = points.T
     if (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() < 0:
         points = points[::-1]
@@ -274,8 +320,8 @@ def closed_spline(points: Array) -> "tuple[CubicSpline, Array]":
 
 
 def control_points(spline: "CubicSpline", chords: Array, pieces: int) -> Array:
-    """Control points (pieces, 2) [m] of the uniform periodic cubic B-spline that meets a closed spline where its pieces do, at
-    places equally far apart along it."""
+    """Control points (pieces, 2) [m] of the uniform periodic cubic B-spline that meets a closed
+    spline where its pieces do, at places equally far apart along it."""
     t = np.linspace(0, chords[-1], FINE * max(pieces, len(chords)) + 1)
     speed = np.linalg.norm(spline(t, 1), axis=1)
     length = np.concatenate(([0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(t))))
@@ -283,4 +329,6 @@ def control_points(spline: "CubicSpline", chords: Array, pieces: int) -> Array:
 
     at = CubicSpline(length, t)(np.linspace(0, length[-1], pieces, endpoint=False))
     turn = 2 * np.pi * np.arange(pieces) / pieces
-    return np.fft.ifft(np.fft.fft(spline(at), axis=0) / ((4 + 2 * np.cos(turn)) / 6)[:, None], axis=0).real.copy()
+    return np.fft.ifft(
+        np.fft.fft(spline(at), axis=0) / ((4 + 2 * np.cos(turn)) / 6)[:, None], axis=0
+    ).real.copy()

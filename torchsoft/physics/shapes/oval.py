@@ -37,19 +37,22 @@ class Circle(Shape):
 
 
 class Superellipse(Shape):
-    """The body inside |x / a|^n + |y / b|^n = 1 with half-axes a and b [m] along its x and y: an ellipse where n = 2, with
-    flatter sides and sharper corners the larger n is. It may be from 2 to 20, the axes differ by a factor of three.
+    """The body inside |x / a|^n + |y / b|^n = 1 with half-axes a and b [m] along its x and y: an
+    ellipse where n = 2, with flatter sides and sharper corners the larger n is. It may be from 2 to
+    20, the axes differ by a factor of three.
 
-    An eighth of the boundary is a graph, (A u, B v) with v = (1 - u^n)^(1/n) over the half-axis A from the end of the other, B,
-    to the diagonal. There the nearest point is found by `ITERATIONS` steps of Newton's method between bounds, and one more
-    carries the derivatives: exact to rounding within a few sizes outside, and inside down to half of the smallest radius of
-    curvature, which is sqrt(2) a / (2^(1/n) (n - 1)) for equal axes, at the diagonal. The curvature vanishes at the ends of the
-    axes, with a cusp where n is below 3; below 2 it would be infinite there.
+    An eighth of the boundary is a graph, (A u, B v) with v = (1 - u^n)^(1/n) over the half-axis A
+    from the end of the other, B, to the diagonal. There the nearest point is found by `ITERATIONS`
+    steps of Newton's method between bounds, and one more carries the derivatives: exact to rounding
+    within a few sizes outside, and inside down to half of the smallest radius of curvature, which
+    is sqrt(2) a / (2^(1/n) (n - 1)) for equal axes, at the diagonal. The curvature vanishes at the
+    ends of the axes, with a cusp where n is below 3; below 2 it would be infinite there.
     """
 
     ITERATIONS, SLIM = 8, 3
     ROUNDING = 1e-12
-    """How far a step of Newton's method may lead beyond known bounds [1]; farther, it goes to their middle."""
+    """How far a step of Newton's method may lead beyond known bounds [1]; farther, it goes to their
+    middle."""
 
     def __init__(self, a: HalfAxisX, b: HalfAxisY, n: Exponent) -> None:
         super().__init__()
@@ -58,13 +61,19 @@ class Superellipse(Shape):
     def well_posed(self) -> str:
         """What is wrong with the parameters together; empty if nothing is."""
         low, high = sorted((self.a.item(), self.b.item()))
-        return f"the axes a and b differ by more than a factor of {self.SLIM}" if high > self.SLIM * low else ""
+        return (
+            f"the axes a and b differ by more than a factor of {self.SLIM}"
+            if high > self.SLIM * low
+            else ""
+        )
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         a, b, n = self.a, self.b, self.n
         left, below = x[..., 0].detach() < 0, x[..., 1].detach() < 0
         X, Y = torch.where(left, -x[..., 0], x[..., 0]), torch.where(below, -x[..., 1], x[..., 1])
-        corner = 0.5 ** (1 / n.detach())  # u and v where the halves of the quarter meet, on whose normal both begin
+        corner = 0.5 ** (
+            1 / n.detach()
+        )  # u and v where the halves of the quarter meet, on whose normal both begin
         over = (b * (Y - b * corner) - a * (X - a * corner)).detach() >= 0
         A, B, X, Y = (torch.where(over, *pair) for pair in ((a, b), (b, a), (X, Y), (Y, X)))
         u = self.nearest(A.detach(), B.detach(), n.detach(), X.detach(), Y.detach(), corner)
@@ -81,8 +90,11 @@ class Superellipse(Shape):
         return phi, torch.stack((torch.where(left, -nx, nx), torch.where(below, -ny, ny)), -1)
 
     @staticmethod
-    def stationarity(A: Tensor, B: Tensor, n: Tensor, X: Tensor, Y: Tensor, u: Tensor) -> tuple[Tensor, Tensor]:
-        """Half of what the squared distance of (X, Y) from (A u, B v) falls by with u [m2], and the slope of that in u."""
+    def stationarity(
+        A: Tensor, B: Tensor, n: Tensor, X: Tensor, Y: Tensor, u: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Half of what the squared distance of (X, Y) from (A u, B v) falls by with u [m2], and the
+        slope of that in u."""
         q = u ** (n - 2)
         w = 1 - q * u * u
         v = w ** (1 / n)
@@ -91,7 +103,9 @@ class Superellipse(Shape):
         return f, -(A * A) - (B * turn) ** 2 - B * (Y - B * v) * (n - 1) * q * v / (w * w)
 
     @torch.no_grad()
-    def nearest(self, A: Tensor, B: Tensor, n: Tensor, X: Tensor, Y: Tensor, corner: Tensor) -> Tensor:
+    def nearest(
+        self, A: Tensor, B: Tensor, n: Tensor, X: Tensor, Y: Tensor, corner: Tensor
+    ) -> Tensor:
         """u of the point nearest to (X, Y), between 0 and `corner`."""
         low = torch.zeros_like(X)
         high = low + corner
@@ -107,20 +121,34 @@ class Superellipse(Shape):
 
     def area(self) -> Tensor:
         n = self.n
-        return 4 * self.a * self.b * torch.exp(2 * torch.lgamma(1 / n) - torch.lgamma(1 + 2 / n)) / n**2
+        return (
+            4
+            * self.a
+            * self.b
+            * torch.exp(2 * torch.lgamma(1 / n) - torch.lgamma(1 + 2 / n))
+            / n**2
+        )
 
     def gyration(self) -> Tensor:
         n = self.n
-        log = torch.lgamma(3 / n) + torch.lgamma(1 + 2 / n) - torch.lgamma(1 / n) - torch.lgamma(1 + 4 / n)
+        log = (
+            torch.lgamma(3 / n)
+            + torch.lgamma(1 + 2 / n)
+            - torch.lgamma(1 / n)
+            - torch.lgamma(1 + 4 / n)
+        )
         return (self.a**2 + self.b**2) * torch.exp(log)
 
     def support(self, direction: Tensor) -> Tensor:
         m = self.n / (self.n - 1)
-        return ((self.a * direction[..., 0]).abs() ** m + (self.b * direction[..., 1]).abs() ** m) ** (1 / m)
+        return (
+            (self.a * direction[..., 0]).abs() ** m + (self.b * direction[..., 1]).abs() ** m
+        ) ** (1 / m)
 
 
 class Ellipse(Superellipse):
-    """An ellipse with half-axes a and b [m] along the body's x and y, which differ by a factor of three at the most."""
+    """An ellipse with half-axes a and b [m] along the body's x and y, which differ by a factor of
+    three at the most."""
 
     def __init__(self, a: HalfAxisX, b: HalfAxisY) -> None:
         super().__init__(a, b, 2.0)

@@ -1,7 +1,8 @@
 """Bodies with flat sides and rounded corners: boxes and polygons.
 
-Their boundaries are segments and arcs that continue each other's tangents. Distance and normal are exact wherever the nearest
-point is the only one, in particular down to the corners' radius; the curvature jumps where an arc begins.
+Their boundaries are segments and arcs that continue each other's tangents. Distance and normal are
+exact wherever the nearest point is the only one, in particular down to the corners' radius; the
+curvature jumps where an arc begins.
 """
 
 from typing import Annotated, ClassVar, NamedTuple
@@ -10,14 +11,23 @@ import torch
 from torch import Tensor, nn
 
 from torchsoft.physics.arguments import places, positive
-from torchsoft.physics.shapes.shape import Moments, Outlined, Prepared, Shape, crossing, gauss, moments, parameter
+from torchsoft.physics.shapes.shape import (
+    Moments,
+    Outlined,
+    Prepared,
+    Shape,
+    crossing,
+    gauss,
+    moments,
+    parameter,
+)
 from torchsoft.quantity import Length, Points
 
 
 class Sides(NamedTuple):
-    """A polygon's sides and the arcs before them, anticlockwise: unit tangents and outward normals (n, 2), where the sides
-    begin (n, 2) [m] and how long they are (n,) [m]; the arcs' centres (n, 2) [m], by how much they turn (n,) [rad], and 1
-    where they bulge outwards, else -1."""
+    """A polygon's sides and the arcs before them, anticlockwise: unit tangents and outward normals
+    (n, 2), where the sides begin (n, 2) [m] and how long they are (n,) [m]; the arcs' centres (n,
+    2) [m], by how much they turn (n,) [rad], and 1 where they bulge outwards, else -1."""
 
     tangent: Tensor
     normal: Tensor
@@ -29,7 +39,8 @@ class Sides(NamedTuple):
 
 
 class Rounded(Outlined):
-    """A polygon of segments and arcs, from its `vertices` (n, 2) [m] before rounding and the `radius` [m] of its corners."""
+    """A polygon of segments and arcs, from its `vertices` (n, 2) [m] before rounding and the
+    `radius` [m] of its corners."""
 
     ARC = 16
     """Points of the quadrature along an arc: exact to rounding up to half a turn."""
@@ -49,14 +60,21 @@ class Rounded(Outlined):
         cross = before[:, 0] * t[:, 1] - before[:, 1] * t[:, 0]
         dot = (before * t).sum(-1)
         bulge = torch.where(cross >= 0, 1.0, -1.0).double()
-        trim = self.radius * bulge * cross / (1 + dot)  # r tan(|turn| / 2): what an arc takes of both of its sides
+        trim = (
+            self.radius * bulge * cross / (1 + dot)
+        )  # r tan(|turn| / 2): what an arc takes of both of its sides
         normal, start = torch.stack((t[:, 1], -t[:, 0]), -1), v + trim[:, None] * t
         centre = start - (bulge * self.radius)[:, None] * normal
-        return Sides(t, normal, start, length - trim - trim.roll(-1), centre, torch.atan2(cross, dot), bulge)
+        return Sides(
+            t, normal, start, length - trim - trim.roll(-1), centre, torch.atan2(cross, dot), bulge
+        )
 
     def along_arcs(self, sides: Sides, part: Tensor) -> tuple[Tensor, Tensor]:
-        """Places (n, parts, 2) [m] on the arcs at these parts of their turn, and the directions in which they go on there."""
-        angle = (sides.turn[:, None] * (part - 1))[..., None]  # from the arc's end, where the side begins
+        """Places (n, parts, 2) [m] on the arcs at these parts of their turn, and the directions in
+        which they go on there."""
+        angle = (sides.turn[:, None] * (part - 1))[
+            ..., None
+        ]  # from the arc's end, where the side begins
         normal, tangent = (x[:, None] for x in (sides.normal, sides.tangent))
         out = angle.cos() * normal + angle.sin() * tangent
         on = angle.cos() * tangent - angle.sin() * normal
@@ -70,12 +88,16 @@ class Rounded(Outlined):
         on_arcs, on = self.along_arcs(sides, part)
         length = self.radius * sides.turn.abs()
         steps = (halves[:, None] * way[:, None], (weight * length[:, None])[..., None] * on)
-        return moments(*(torch.cat([x.flatten(0, 1) for x in parts]) for parts in ((on_sides, on_arcs), steps)))
+        return moments(
+            *(torch.cat([x.flatten(0, 1) for x in parts]) for parts in ((on_sides, on_arcs), steps))
+        )
 
     def support(self, direction: Tensor) -> Tensor:
         sides = self.sides()
         centre = (sides.centre - self.moments().centre)[sides.bulge > 0]
-        return (direction @ centre.mT).amax(-1) + self.radius * torch.linalg.vector_norm(direction, dim=-1)
+        return (direction @ centre.mT).amax(-1) + self.radius * torch.linalg.vector_norm(
+            direction, dim=-1
+        )
 
     @torch.no_grad()
     def boundary(self, points: int) -> Tensor:
@@ -85,8 +107,8 @@ class Rounded(Outlined):
 
 
 class RoundedBox(Rounded):
-    """A box with half of its width and of its height [m] along the body's x and y, and corners rounded to `radius` [m]: a
-    circle where all three are equal."""
+    """A box with half of its width and of its height [m] along the body's x and y, and corners
+    rounded to `radius` [m]: a circle where all three are equal."""
 
     def __init__(
         self,
@@ -103,7 +125,11 @@ class RoundedBox(Rounded):
         """What is wrong with the parameters together; empty if nothing is."""
         most = min(self.half_width.item(), self.half_height.item())
         radius = self.radius.item()
-        return f"the corners' radius {radius:g} is larger than half of the box, {most:g}" if radius > most else ""
+        return (
+            f"the corners' radius {radius:g} is larger than half of the box, {most:g}"
+            if radius > most
+            else ""
+        )
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         left, below = x[..., 0].detach() < 0, x[..., 1].detach() < 0
@@ -126,13 +152,15 @@ class RoundedBox(Rounded):
 
 
 class RoundedPolygon(Rounded):
-    """A polygon with `vertices` (n, 2) [m] in their order, whose corners, inner ones too, are rounded to `radius` [m].
+    """A polygon with `vertices` (n, 2) [m] in their order, whose corners, inner ones too, are
+    rounded to `radius` [m].
 
-    The arcs touch the sides that meet at a vertex, so that the sides stay where they are. The vertices may be given about any
-    point: the body's own frame has its origin at the centre of mass, wherever the vertices move it, and the note that says so
-    tells where that is. They are one parameter with the shape (n, 2), which gradients reach; only `radius` is a scalar that can
-    be asked for by name in a Jacobian or an identification. Raises `ValueError` for anything but from 3 to `MOST` places, for
-    corners that do not fit on their sides, and for sides that cross.
+    The arcs touch the sides that meet at a vertex, so that the sides stay where they are. The
+    vertices may be given about any point: the body's own frame has its origin at the centre of
+    mass, wherever the vertices move it, and the note that says so tells where that is. They are one
+    parameter with the shape (n, 2), which gradients reach; only `radius` is a scalar that can be
+    asked for by name in a Jacobian or an identification. Raises `ValueError` for anything but from
+    3 to `MOST` places, for corners that do not fit on their sides, and for sides that cross.
     """
 
     given: ClassVar = "vertices"
@@ -159,8 +187,8 @@ class RoundedPolygon(Rounded):
         if not bool((short > -1e-12).all()):
             worst = int(torch.nan_to_num(short, nan=-torch.inf).argmin())
             return (
-                f"corners of radius {r:g} do not fit on side {worst} of the polygon (from 0 on, anticlockwise): there it is "
-                "too short, or folds back"
+                f"corners of radius {r:g} do not fit on side {worst} of the polygon (from 0 on, "
+                "anticlockwise): there it is too short, or folds back"
             )
         return "the polygon crosses itself" if crossing(self.boundary(181).numpy()) else ""
 
@@ -176,8 +204,9 @@ class RoundedPolygon(Rounded):
 class SidesAndArcs(Prepared):
     """What the law of a rounded polygon is compiled from.
 
-    `edges` (n, 5): the sides' unit tangents, the tangents' and the normals' components of where they begin [m], their lengths
-    [m]; `arcs` (n, 3): the centres [m] of the arcs before them, and 1 where they bulge outwards, else -1; `radius` [m].
+    `edges` (n, 5): the sides' unit tangents, the tangents' and the normals' components of where
+    they begin [m], their lengths [m]; `arcs` (n, 3): the centres [m] of the arcs before them, and 1
+    where they bulge outwards, else -1; `radius` [m].
     """
 
     edges: Tensor
@@ -192,14 +221,19 @@ class SidesAndArcs(Prepared):
         cx, cy, bulge = nn.functional.embedding(side, self.arcs).unbind(-1)
         dx, dy = x[..., 0] - cx, x[..., 1] - cy
         far = torch.sqrt(torch.where(round_, dx * dx + dy * dy, 1.0))
-        phi = torch.where(round_, bulge * (far - self.radius), ty * x[..., 0] - tx * x[..., 1] - offset)
-        nx, ny = torch.where(round_, bulge * dx / far, ty), torch.where(round_, bulge * dy / far, -tx)
+        phi = torch.where(
+            round_, bulge * (far - self.radius), ty * x[..., 0] - tx * x[..., 1] - offset
+        )
+        nx, ny = (
+            torch.where(round_, bulge * dx / far, ty),
+            torch.where(round_, bulge * dy / far, -tx),
+        )
         return phi, torch.stack((nx, ny), -1)
 
     @torch.no_grad()
     def nearest(self, x: Tensor) -> Tensor:
-        """Number of the side nearest to x, or, behind the last, of the arc. An arc counts where its centre's directions to its
-        ends enclose x, a side's ends belong to arcs."""
+        """Number of the side nearest to x, or, behind the last, of the arc. An arc counts where its
+        centre's directions to its ends enclose x, a side's ends belong to arcs."""
         tx, ty, start, offset, length = self.edges.detach().unbind(-1)
         cx, cy, _ = self.arcs.detach().unbind(-1)
         x, y = x[..., 0, None], x[..., 1, None]

@@ -1,5 +1,6 @@
-"""What a rig asks of the shape of a rigid body, and what closed curves have in common: moments by Green's theorem, whether they
-cross themselves, and how far from them the nearest point stays the only one."""
+"""What a rig asks of the shape of a rigid body, and what closed curves have in common: moments by
+Green's theorem, whether they cross themselves, and how far from them the nearest point stays the
+only one."""
 
 import logging
 import math
@@ -14,8 +15,11 @@ from torchsoft.physics.arguments import number
 
 
 def parameter(value: float, trained: bool = True) -> nn.Parameter:
-    """A scalar parameter in float64, whatever torch's default is. Raises `ValueError` for what is not a number."""
-    return nn.Parameter(torch.tensor(number("a parameter", value), dtype=torch.float64), requires_grad=trained)
+    """A scalar parameter in float64, whatever torch's default is. Raises `ValueError` for what is
+    not a number."""
+    return nn.Parameter(
+        torch.tensor(number("a parameter", value), dtype=torch.float64), requires_grad=trained
+    )
 
 
 log = logging.getLogger("torchsoft")
@@ -27,18 +31,20 @@ NOTED = 1e-9
 
 
 class Shape(nn.Module):
-    """What a rig asks of a rigid body's shape; lengths are numbers in m, about the centre of mass. A `round` one looks the same
-    however it is turned, and its turning is left out of the law."""
+    """What a rig asks of a rigid body's shape; lengths are numbers in m, about the centre of mass.
+    A `round` one looks the same however it is turned, and its turning is left out of the law."""
 
     round: ClassVar[bool] = False
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Signed distance phi [m], shape (...), negative inside, and outward unit normal (..., 2), at x (..., 2) [m]."""
+        """Signed distance phi [m], shape (...), negative inside, and outward unit normal (..., 2),
+        at x (..., 2) [m]."""
         raise NotImplementedError
 
     def prepared(self) -> "Shape":
-        """The shape that a law is compiled from: the same, with everything computed already that depends on no point. Its
-        parameters are tensors with a graph, through which gradients reach this shape's."""
+        """The shape that a law is compiled from: the same, with everything computed already that
+        depends on no point. Its parameters are tensors with a graph, through which gradients reach
+        this shape's."""
         return self
 
     def area(self) -> Tensor:
@@ -50,36 +56,47 @@ class Shape(nn.Module):
         raise NotImplementedError
 
     def support(self, direction: Tensor) -> Tensor:
-        """How far the body reaches along unit vectors (..., 2) of its own frame [m], shape (...). Of a body that is not convex
-        it is its convex hull's: where a plane that comes from outside first touches."""
+        """How far the body reaches along unit vectors (..., 2) of its own frame [m], shape (...).
+        Of a body that is not convex it is its convex hull's: where a plane that comes from outside
+        first touches."""
         raise NotImplementedError
 
     def size(self) -> float:
         """Radius [m] of a circle about the centre that holds the body, the smallest to 4e-5."""
         angle = torch.linspace(0, 2 * torch.pi, 361, dtype=torch.float64)
         reach = self.support(torch.stack((angle.cos(), angle.sin()), -1)).detach().max()
-        return float(reach) / math.cos(torch.pi / 360)  # a boundary point is half a degree from one of the directions
+        return float(reach) / math.cos(
+            torch.pi / 360
+        )  # a boundary point is half a degree from one of the directions
 
     def curvature(self, x: Tensor) -> Tensor:
-        """Curvature [1/m] (...) of the boundary at its points nearest to x (..., 2) [m], positive where it bulges outwards.
+        """Curvature [1/m] (...) of the boundary at its points nearest to x (..., 2) [m], positive
+        where it bulges outwards.
 
-        The normal turns by kappa / (1 + kappa phi) a length, as that of the parallel curve at the distance phi.
+        The normal turns by kappa / (1 + kappa phi) a length, as that of the parallel curve at the
+        distance phi.
         """
         with torch.enable_grad():
             x = x.detach().requires_grad_()
             phi, n = self(x)
             t = torch.stack((-n[..., 1], n[..., 0]), -1).detach()
-            rows = [torch.autograd.grad(n[..., i].sum(), x, retain_graph=i == 0)[0] for i in range(2)]
+            rows = [
+                torch.autograd.grad(n[..., i].sum(), x, retain_graph=i == 0)[0] for i in range(2)
+            ]
         turning = (t * torch.stack([(row * t).sum(-1) for row in rows], -1)).sum(-1)
         return (turning / (1 - turning * phi)).detach()
 
     def outline(self, points: int = 181) -> Tensor:
-        """Points on the boundary of a convex body (points, 2) [m], for drawing: the support function and its slope."""
+        """Points on the boundary of a convex body (points, 2) [m], for drawing: the support
+        function and its slope."""
         angle = torch.linspace(0, 2 * torch.pi, points, dtype=torch.float64, requires_grad=True)
         with torch.enable_grad():
             h = self.support(torch.stack((angle.cos(), angle.sin()), -1))
             (slope,) = torch.autograd.grad(h.sum(), angle)
-        n, t = (torch.stack((x, y), -1) for x, y in ((angle.cos(), angle.sin()), (-angle.sin(), angle.cos())))
+        n, t = (
+            torch.stack((x, y), -1)
+            for x, y in ((angle.cos(), angle.sin()), (-angle.sin(), angle.cos()))
+        )
         return (h[:, None] * n + slope[:, None] * t).detach()
 
 
@@ -89,13 +106,16 @@ class Prepared(Shape):
     @classmethod
     def of(cls, **tensors: Tensor) -> Self:
         shape = cls()
-        parameters: dict[str, Any] = shape._parameters  # where torch itself puts leaves of graphs only
+        parameters: dict[str, Any] = (
+            shape._parameters
+        )  # where torch itself puts leaves of graphs only
         parameters.update(tensors)
         return shape
 
 
 class Outlined(Shape):
-    """A shape given by points around it, whatever point they are about: its own frame has its origin at the centre of mass."""
+    """A shape given by points around it, whatever point they are about: its own frame has its
+    origin at the centre of mass."""
 
     given: ClassVar = ""
     """Name of the constructor's argument with the points."""
@@ -109,11 +129,13 @@ class Outlined(Shape):
         raise NotImplementedError
 
     def note_centre(self) -> None:
-        """Say where among the given points the centre of mass (2,) [m] is, which poses speak of, if not at their origin."""
+        """Say where among the given points the centre of mass (2,) [m] is, which poses speak of, if
+        not at their origin."""
         x, y = self.moments().centre.tolist()
         if max(abs(x), abs(y)) > NOTED:
             log.warning(
-                "the centre of mass is at (%.9g, %.9g) m of `%s`: the body's pose is that of this point",
+                "the centre of mass is at (%.9g, %.9g) m of `%s`: the body's pose is that of this "
+                "point",
                 x,
                 y,
                 self.given,
@@ -149,8 +171,9 @@ def gauss(points: int) -> tuple[Tensor, Tensor]:
 
 
 def moments(x: Tensor, dx: Tensor) -> Moments:
-    """Of what lies to the left of a closed contour, from points x (points, 2) [m] of a quadrature along it, and its tangents
-    there times their weights, dx (points, 2) [m]: the integral of x^k dA is that of x^(k+1) dy / (k+1)."""
+    """Of what lies to the left of a closed contour, from points x (points, 2) [m] of a quadrature
+    along it, and its tangents there times their weights, dx (points, 2) [m]: the integral of x^k dA
+    is that of x^(k+1) dy / (k+1)."""
     middle = x.detach().mean(0)
     x, y = (x - middle).unbind(-1)
     dx, dy = dx.unbind(-1)
@@ -182,9 +205,10 @@ def crossing(points: Array) -> bool:
 
 
 def reach(points: Array, normals: Array, curvature: Array) -> float:
-    """How far [m] from a smooth closed curve the nearest point on it is the only one, from points of it (n, 2) [m], normals
-    (n, 2) and curvature (n,) [1/m] there: the smallest radius of a circle that touches it at one of the points and passes
-    through another (Federer 1959, Curvature measures, Theorem 4.18), or of curvature."""
+    """How far [m] from a smooth closed curve the nearest point on it is the only one, from points
+    of it (n, 2) [m], normals (n, 2) and curvature (n,) [1/m] there: the smallest radius of a circle
+    that touches it at one of the points and passes through another (Federer 1959, Curvature
+    measures, Theorem 4.18), or of curvature."""
     to = points[None] - points[:, None]
     off = np.abs((to * normals[:, None]).sum(-1))
     np.fill_diagonal(off, 0.0)

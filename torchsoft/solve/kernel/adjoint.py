@@ -1,8 +1,9 @@
 """The transposed stage: the discrete adjoint of `run`.
 
-The stage's relations are differentiated as they stand (implicit function theorem) and solved backwards. Cotangents: phi of the
-nodal forces, mu of the points' forces, nu of the free coordinates' equations, sigma of a point's displacement, omega of its
-rate; "_bar" of what it is put behind.
+The stage's relations are differentiated as they stand (implicit function theorem) and solved
+backwards. Cotangents: phi of the nodal forces, mu of the points' forces, nu of the free
+coordinates' equations, sigma of a point's displacement, omega of its rate; "_bar" of what it is put
+behind.
 """
 
 from typing import Any
@@ -21,9 +22,19 @@ from torchsoft.solve.kernel.step import GAMMA, MIX, TINY, dense_states
 
 @compiled
 def nodal_cotangent(
-    s: Any, w: Any, z: Any, pad: int, y_bar: Array, a: float, n: int, X: Array, full: Array, V_bar: Array
+    s: Any,
+    w: Any,
+    z: Any,
+    pad: int,
+    y_bar: Array,
+    a: float,
+    n: int,
+    X: Array,
+    full: Array,
+    V_bar: Array,
 ) -> None:
-    """F_bar of the touched nodes into X[:, 0], from the cotangents of the pad's state and of the touching points' stretches."""
+    """F_bar of the touched nodes into X[:, 0], from the cotangents of the pad's state and of the
+    touching points' stretches."""
     free = s.body_free
     first, at = s.pad_node_start[pad], s.pad_point_start[pad]
     b = z.surface[0, : 2 * n]
@@ -71,14 +82,22 @@ def nodal_cotangent(
             for r in range(2):
                 X[2 * i + r, 0] = rates[s.inertia_surface[2 * w.touched[first + i] + r]]
         return
-    size, chain, branches = 2 * (s.pad_node_start[pad + 1] - first), s.pad_chain_at[pad], s.pad_branches[pad]
+    size, chain, branches = (
+        2 * (s.pad_node_start[pad + 1] - first),
+        s.pad_chain_at[pad],
+        s.pad_branches[pad],
+    )
     for i in range(n):
         for r in range(2):
             dof, total = 2 * (w.touched[first + i] - first) + r, 0.0
             for m in range(2 * n):
                 total += w.P[2 * i + r, m] * b[m]
             for branch in range(branches):
-                total += a * y_bar[s.pad_y_start[pad] + branch * size + dof] / (s.p[chain + branches + branch] + a)
+                total += (
+                    a
+                    * y_bar[s.pad_y_start[pad] + branch * size + dof]
+                    / (s.p[chain + branches + branch] + a)
+                )
             X[2 * i + r, 0] = total
 
 
@@ -95,12 +114,22 @@ def pad_state(
     u_bar: Array,
     p_bar: Array,
 ) -> None:
-    """Cotangents of a massless pad's state at the stage's start, and of its material, from those of its nodal rates and
-    displacements (nodes, 2)."""
-    p, first, last, start = s.p, s.pad_node_start[pad], s.pad_node_start[pad + 1], s.pad_y_start[pad]
+    """Cotangents of a massless pad's state at the stage's start, and of its material, from those of
+    its nodal rates and displacements (nodes, 2)."""
+    p, first, last, start = (
+        s.p,
+        s.pad_node_start[pad],
+        s.pad_node_start[pad + 1],
+        s.pad_y_start[pad],
+    )
     size, chain, branches = 2 * (last - first), s.pad_chain_at[pad], s.pad_branches[pad]
     start_C, material, F = s.pad_C_start[pad], chain + 2 * branches, w.F.reshape(w.F.size)
-    by_rate, by_u, zeta, z_dot = scratch.surface[0], scratch.surface[1], scratch.surface[2], scratch.surface[3]
+    by_rate, by_u, zeta, z_dot = (
+        scratch.surface[0],
+        scratch.surface[1],
+        scratch.surface[2],
+        scratch.surface[3],
+    )
     scratch.surface[:, :size] = 0.0
     for node in range(w.low[pad], w.high[pad]):
         for r in range(2):
@@ -141,21 +170,29 @@ def pad_state(
 
 @compiled
 def inertial_state(
-    s: Any, w: Any, z: Any, pad: int, y: Array, y_bar: Array, a: float, rate: Array, full: Array, rate_bar: Array,
-    u_bar: Array, nu: Array, V_bar: Array, p_bar: Array,
+    s: Any, w: Any, z: Any, pad: int, y: Array, y_bar: Array, a: float, rate: Array, full: Array,
+    rate_bar: Array, u_bar: Array, nu: Array, V_bar: Array, p_bar: Array,
 ) -> None:  # fmt: skip
-    """The same for an inertial pad; `rate` is its taped u', `full` what `nodal_cotangent` left, V_bar of all coordinates."""
+    """The same for an inertial pad; `rate` is its taped u', `full` what `nodal_cotangent` left,
+    V_bar of all coordinates."""
     free, at = s.body_free, s.inertia_material_at[pad]
     i0, i1, base = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1], s.pad_base[pad]
     U, W, mass = s.pad_y_start[pad], s.pad_v_start[pad], s.p[s.inertia_material_at[pad] + 3]
     cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
     nx = nu[free[base], 0] if free[base] >= 0 else 0.0
     ny = nu[free[base + 1], 0] if free[base + 1] >= 0 else 0.0
-    own, strain, force, back = z.dofs[0, i0:i1], z.dofs[1, i0:i1], z.dofs[2, i0:i1], z.dofs[3, i0:i1]  # own: of u'
+    own, strain, force, back = (
+        z.dofs[0, i0:i1],
+        z.dofs[1, i0:i1],
+        z.dofs[2, i0:i1],
+        z.dofs[3, i0:i1],
+    )  # own: of u'
     reaction, local = z.pair[0], z.pair[1]
     reaction[0], reaction[1] = -(cos * nx + sin * ny), -(cos * ny - sin * nx)
     for i in range(i1 - i0):
-        own[i] = a * y_bar[U + i] + y_bar[W + i] + mass * s.inertia_area[i0 + i] / a * reaction[i % 2]
+        own[i] = (
+            a * y_bar[U + i] + y_bar[W + i] + mass * s.inertia_area[i0 + i] / a * reaction[i % 2]
+        )
     for node in range(w.low[pad], w.high[pad]):
         for r in range(2):
             own[s.inertia_surface[2 * node + r]] += rate_bar[node, r]
@@ -178,7 +215,9 @@ def inertial_state(
             p_bar[at + 1] -= s.inertia_K_mu[i0 + k, j] * product
     local[:] = 0.0
     for i in range(i1 - i0):
-        local[i % 2] += y_bar[W + i] + mass * s.inertia_area[i0 + i] / a * (reaction[i % 2] - own[i])
+        local[i % 2] += y_bar[W + i] + mass * s.inertia_area[i0 + i] / a * (
+            reaction[i % 2] - own[i]
+        )
         y_bar[U + i] -= back[i]
         y_bar[W + i] = mass * s.inertia_area[i0 + i] / a * (own[i] - reaction[i % 2])
     V_bar[base] += cos * local[0] - sin * local[1]
@@ -190,13 +229,23 @@ def inertial_state(
 
 @compiled
 def stage_adjoint(
-    s: Any, w: Any, z: Any, tape: Any, row: int, a: float, signals: Array, y_bar: Array, p_bar: Array, signals_bar: Array,
+    s: Any, w: Any, z: Any, tape: Any, row: int, a: float, signals: Array, y_bar: Array,
+    p_bar: Array, signals_bar: Array,
 ) -> None:  # fmt: skip
-    """Turn the cotangent y_bar (size,) of a stage's end into that of its y*, in place; add to p_bar and signals_bar."""
+    """Turn the cotangent y_bar (size,) of a stage's end into that of its y*, in place; add to p_bar
+    and signals_bar."""
     p = s.p
     free, count, y = s.body_coordinate.size, s.pad_base.size, tape.y[row]
     restore(s, w, tape, row, a)
-    Rv, matrix, nu, V_bar, full, rate_bar, u_bar = w.Rv, z.matrix, z.nu, z.V_bar, z.full, z.rate, z.u
+    Rv, matrix, nu, V_bar, full, rate_bar, u_bar = (
+        w.Rv,
+        z.matrix,
+        z.nu,
+        z.V_bar,
+        z.full,
+        z.rate,
+        z.u,
+    )
     balance(s, w, y, signals, a, w.r, Rv)
     matrix[:] = 0.0
     for i in range(free):
@@ -230,14 +279,24 @@ def stage_adjoint(
     q_hat, V_hat, weights, by = z.q, z.V, z.weights, z.by
     q_hat[:], V_hat[:] = 0.0, 0.0
     for pad in range(count):
-        first, n, column, at = s.pad_node_start[pad], w.counts[pad], s.pad_column[pad], s.pad_point_start[pad]
+        first, n, column, at = (
+            s.pad_node_start[pad],
+            w.counts[pad],
+            s.pad_column[pad],
+            s.pad_point_start[pad],
+        )
         X = w.X[2 * first : 2 * (first + n)]
         for i in range(2 * n):
             for j in range(free):
                 if column[j] >= 0:
                     X[i, 0] += X[i, 1 + column[j]] * nu[j, 0]
         for node in range(w.low[pad], w.high[pad]):
-            rate_bar[node, 0], rate_bar[node, 1], u_bar[node, 0], u_bar[node, 1] = 0.0, 0.0, 0.0, 0.0
+            rate_bar[node, 0], rate_bar[node, 1], u_bar[node, 0], u_bar[node, 1] = (
+                0.0,
+                0.0,
+                0.0,
+                0.0,
+            )
         for i in range(w.actives[pad]):
             k = w.active[at + i]
             c = s.point_contact[k]
@@ -264,7 +323,9 @@ def stage_adjoint(
                     position += L[row_, m] * by[row_]
                 if m < 2:
                     for j in range(2):
-                        rate_bar[s.point_node[k, j], m] += s.point_N[k, j] * (velocity + a * position)
+                        rate_bar[s.point_node[k, j], m] += s.point_N[k, j] * (
+                            velocity + a * position
+                        )
                         u_bar[s.point_node[k, j], m] += s.point_N[k, j] * position
                 else:
                     coordinate = s.contact_coordinate[c, m - 2]
@@ -276,7 +337,9 @@ def stage_adjoint(
             y_bar[s.point_y_start + k] += s_bar
         free_stretches(s, w, z, pad, y, y_bar, a, p_bar)
         if s.pad_v_start[pad] >= 0:
-            inertial_state(s, w, z, pad, y, y_bar, a, tape.rate[row], full, rate_bar, u_bar, nu, V_hat, p_bar)
+            inertial_state(
+                s, w, z, pad, y, y_bar, a, tape.rate[row], full, rate_bar, u_bar, nu, V_hat, p_bar
+            )
         else:
             pad_state(s, w, z, pad, y, y_bar, a, rate_bar, u_bar, p_bar)
 
@@ -313,7 +376,9 @@ def stage_adjoint(
 
 
 @compiled
-def free_stretches(s: Any, w: Any, z: Any, pad: int, y: Array, y_bar: Array, a: float, p_bar: Array) -> None:
+def free_stretches(
+    s: Any, w: Any, z: Any, pad: int, y: Array, y_bar: Array, a: float, p_bar: Array
+) -> None:
     """Cotangents of the stretches away from contact, which decay."""
     at, i = s.pad_point_start[pad], 0
     x, out, J, weight = z.decay_x, w.decay, z.decay_J, z.weights
@@ -335,13 +400,15 @@ def free_stretches(s: Any, w: Any, z: Any, pad: int, y: Array, y_bar: Array, a: 
 
 @entry
 def backward(
-    s: Any, w: Any, z: Any, h: Array, tape: Any, signals: Array, out_step: Any, out_part: Array, outputs_bar: Array,
-    y_bar: Array, p_bar: Array, signals_bar: Array,
+    s: Any, w: Any, z: Any, h: Array, tape: Any, signals: Array, out_step: Any, out_part: Array,
+    outputs_bar: Array, y_bar: Array, p_bar: Array, signals_bar: Array,
 ) -> int:  # fmt: skip
-    """Sweep the steps of a tape backwards; y_bar goes from the end's cotangent to the start's, in place.
+    """Sweep the steps of a tape backwards; y_bar goes from the end's cotangent to the start's, in
+    place.
 
-    outputs_bar (outputs, size) belong to the parts out_part of the steps out_step; signals and signals_bar are
-    (stages, signals, 2). Returns -1, or the step at which a cotangent stopped being finite.
+    outputs_bar (outputs, size) belong to the parts out_part of the steps out_step; signals and
+    signals_bar are (stages, signals, 2). Returns -1, or the step at which a cotangent stopped being
+    finite.
     """
     row = out_step.size - 1
     held, first_bar, start_bar = z.state[0], z.state[1], z.state[2]

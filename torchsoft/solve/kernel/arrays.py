@@ -1,8 +1,10 @@
-"""The arrays that the kernels work on: what a rig is made of, what it follows, and the tape of a run.
+"""The arrays that the kernels work on: what a rig is made of, what it follows, and the tape of a
+run.
 
-A rig has coordinates (x, y, theta) of its bodies, three each, and last those of the ground, which are zero. A coordinate is
-free (a component of the state) or follows a signal. "At" in a name is a position in the vector p of all law parameters,
-"start" one in another array. Nodes are the surface nodes of all pads, points the contact points of all contacts.
+A rig has coordinates (x, y, theta) of its bodies, three each, and last those of the ground, which
+are zero. A coordinate is free (a component of the state) or follows a signal. "At" in a name is a
+position in the vector p of all law parameters, "start" one in another array. Nodes are the surface
+nodes of all pads, points the contact points of all contacts.
 """
 
 from collections import namedtuple
@@ -15,12 +17,14 @@ Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
 INPUTS, OUTPUTS = 9, 7
-"""A contact law's inputs (w, omega, d, theta, s*, weight, a h) and outputs (f, s', F_N, F_T, power of dashpots, of slip)."""
+"""A contact law's inputs (w, omega, d, theta, s*, weight, a h) and outputs (f, s', F_N, F_T, power
+of dashpots, of slip)."""
 
 
 class Bodies(NamedTuple):
-    """free (coordinates,): number among the free ones, or -1; signal (coordinates,): the one followed, or -1; coordinate,
-    mass_at, weight (free,): coordinate, position of its mass in p, 1 where gravity pulls; gravity_at; y_start of q and V."""
+    """free (coordinates,): number among the free ones, or -1; signal (coordinates,): the one
+    followed, or -1; coordinate, mass_at, weight (free,): coordinate, position of its mass in p, 1
+    where gravity pulls; gravity_at; y_start of q and V."""
 
     free: Index
     signal: Index
@@ -33,8 +37,8 @@ class Bodies(NamedTuple):
 
 
 class Actuators(NamedTuple):
-    """Per actuator: law addresses, its parameters' ends in p, coordinate pushed, signal fed forward (-1: none), the ends of its
-    signals in setpoint and of its coordinates in measured."""
+    """Per actuator: law addresses, its parameters' ends in p, coordinate pushed, signal fed forward
+    (-1: none), the ends of its signals in setpoint and of its coordinates in measured."""
 
     linearise: Index
     pullback: Index
@@ -48,11 +52,13 @@ class Actuators(NamedTuple):
 
 
 class Pads(NamedTuple):
-    """Per pad: base (its first coordinate), node_start, point_start, y_start of its displacements' states, v_start of its
-    velocities (-1: massless), chain_at of its branches' fractions and then times in p, branches, C_start in C, reach: the
-    largest displacement per force; column, columns: free coordinates that its contacts involve, and their number.
+    """Per pad: base (its first coordinate), node_start, point_start, y_start of its displacements'
+    states, v_start of its velocities (-1: massless), chain_at of its branches' fractions and then
+    times in p, branches, C_start in C, reach: the largest displacement per force; column, columns:
+    free coordinates that its contacts involve, and their number.
 
-    C holds the surface mobilities (2 nodes, 2 nodes) one after the other: massless pads' compliance, inertial pads' mobility.
+    C holds the surface mobilities (2 nodes, 2 nodes) one after the other: massless pads'
+    compliance, inertial pads' mobility.
     """
 
     base: Index
@@ -71,10 +77,10 @@ class Pads(NamedTuple):
 
 
 class Inertia(NamedTuple):
-    """Inertial pads, dof by dof from dof_start [pad] on: X (dofs, 2) arms, M, the sparse rows of K_lambda and K_mu per
-    depth and
-    modulus (dofs, 18), with their columns, and D, the rates per velocity of the base. surface: dof of every surface dof; factor
-    (., band): the banded Cholesky factor of M/(a h) + (tau + a h) K; B (pads, 2, 2): the base's reaction per velocity.
+    """Inertial pads, dof by dof from dof_start [pad] on: X (dofs, 2) arms, M, the sparse rows of
+    K_lambda and K_mu per depth and modulus (dofs, 18), with their columns, and D, the rates per
+    velocity of the base. surface: dof of every surface dof; factor (., band): the banded Cholesky
+    factor of M/(a h) + (tau + a h) K; B (pads, 2, 2): the base's reaction per velocity.
 
     material_at (pads,): position of depth lambda, depth mu, tau, rho depth in p.
     """
@@ -94,9 +100,10 @@ class Inertia(NamedTuple):
 
 
 class Contacts(NamedTuple):
-    """Per contact: pad, body (first coordinate), free numbers of the coordinates of the body and of the pad's base (., 6) or
-    -1, and those coordinates; law addresses, p_start of its parameters, point_start, size of the body,
-    limits (x from, x to, y from, y to) of the body's centre in the base's frame."""
+    """Per contact: pad, body (first coordinate), free numbers of the coordinates of the body and of
+    the pad's base (., 6) or -1, and those coordinates; law addresses, p_start of its parameters,
+    point_start, size of the body, limits (x from, x to, y from, y to) of the body's centre in the
+    base's frame."""
 
     pad: Index
     body: Index
@@ -115,9 +122,8 @@ class Contacts(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Per contact point: its contact, undeformed place in the base's frame, weight, two surface nodes and their shape functions
-    there; y_start
-    of the stretches."""
+    """Per contact point: its contact, undeformed place in the base's frame, weight, two surface
+    nodes and their shape functions there; y_start of the stretches."""
 
     contact: Index
     X: Array
@@ -127,12 +133,21 @@ class Points(NamedTuple):
     y_start: int
 
 
-PARTS = {"body": Bodies, "act": Actuators, "pad": Pads, "inertia": Inertia, "contact": Contacts, "point": Points}
+PARTS = {
+    "body": Bodies,
+    "act": Actuators,
+    "pad": Pads,
+    "inertia": Inertia,
+    "contact": Contacts,
+    "point": Points,
+}
 
-System: Any = namedtuple("System", [*(f"{part}_{name}" for part, kind in PARTS.items() for name in kind._fields), "p"])
-"""Everything that stays while a run is on, flat: the fields of `PARTS` by part_field, and p, the vector of law
-parameters. Flat,
-because numba's compiling takes time for every array in a tuple that is taken out of another."""
+System: Any = namedtuple(
+    "System", [*(f"{part}_{name}" for part, kind in PARTS.items() for name in kind._fields), "p"]
+)
+"""Everything that stays while a run is on, flat: the fields of `PARTS` by part_field, and p, the
+vector of law parameters. Flat, because numba's compiling takes time for every array in a tuple that
+is taken out of another."""
 
 
 def system(*parts: Any, p: Array) -> Any:
@@ -141,8 +156,9 @@ def system(*parts: Any, p: Array) -> Any:
 
 
 class Signals(NamedTuple):
-    """The reference: per signal the first of its pieces (signals + 1,) and their number of control points; per piece its start
-    and span [s] and its control points. address: of a function that gives all values and rates instead, or 0; room: scratch."""
+    """The reference: per signal the first of its pieces (signals + 1,) and their number of control
+    points; per piece its start and span [s] and its control points. address: of a function that
+    gives all values and rates instead, or 0; room: scratch."""
 
     start: Index
     points: Index
@@ -154,14 +170,21 @@ class Signals(NamedTuple):
 
 
 NO_SIGNALS = Signals(
-    np.zeros(1, np.int64), np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros((0, 1)), 0, np.zeros(1)
+    np.zeros(1, np.int64),
+    np.zeros(0, np.int64),
+    np.zeros(0),
+    np.zeros(0),
+    np.zeros((0, 1)),
+    0,
+    np.zeros(1),
 )
 """What given steps follow: nothing."""
 
 
 class Errors(NamedTuple):
-    """Parts of the state whose error is judged together: first and last component, whether it is a rate, its absolute
-    tolerance, its largest size so far; origin (size,): what sizes are counted from."""
+    """Parts of the state whose error is judged together: first and last component, whether it is a
+    rate, its absolute tolerance, its largest size so far; origin (size,): what sizes are counted
+    from."""
 
     first: Index
     last: Index
@@ -172,7 +195,12 @@ class Errors(NamedTuple):
 
 
 NO_ERRORS = Errors(
-    np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, bool), np.zeros(0), np.zeros(0), np.zeros(0)
+    np.zeros(0, np.int64),
+    np.zeros(0, np.int64),
+    np.zeros(0, bool),
+    np.zeros(0),
+    np.zeros(0),
+    np.zeros(0),
 )
 """What given steps are judged by: nothing."""
 
@@ -182,8 +210,8 @@ SCRATCH: dict[str, dict[str, str]] = {
         "coordinates": "q V V_old load",
         "contacts 7": "frame",
         "dofs": "zeta zeta_rate",  # of a massless pad's chain
-        # displacement u*, rates (without contact, now, before and after a Newton step), forces by the law and by the linear
-        # relations (now, before, after)
+        # displacement u*, rates (without contact, now, before and after a Newton step), forces by
+        # the law and by the linear relations (now, before, after)
         "nodes 2": "u free u_dot u_dot_old u_dot_new F F_linear F_old F_new",
         "points 9": "x",  # the law's inputs, outputs and Jacobian
         "points 7": "out",
@@ -265,17 +293,23 @@ SCRATCH: dict[str, dict[str, str]] = {
 }
 """Arrays that the kernels write to, by name and shape: they allocate nothing."""
 
-KINDS: dict[str, Any] = {kind: namedtuple(kind, " ".join(shapes.values())) for kind, shapes in SCRATCH.items()}
+KINDS: dict[str, Any] = {
+    kind: namedtuple(kind, " ".join(shapes.values())) for kind, shapes in SCRATCH.items()
+}
 Work, Step, Cotangents, Tangents, Tape = KINDS.values()
 
 
 def room(kind: str, s: Any, state: int, **sizes: int) -> Any:
-    """Zeros for one of `SCRATCH`, of a rig whose state has so many components; `sizes` are those that it does not decide."""
-    inputs = 1 + 2 * int((np.diff(s.act_setpoint_start) + np.diff(s.act_measured_start)).max(initial=0))
+    """Zeros for one of `SCRATCH`, of a rig whose state has so many components; `sizes` are those
+    that it does not decide."""
+    inputs = 1 + 2 * int(
+        (np.diff(s.act_setpoint_start) + np.diff(s.act_measured_start)).max(initial=0)
+    )
     sizes |= {
-        "state": state, "coordinates": len(s.body_free), "free": len(s.body_coordinate), "contacts": len(s.contact_pad),
-        "points": len(s.point_X), "pads": len(s.pad_base), "nodes": int(s.pad_node_start[-1]), "inputs": inputs,
-        "dofs": 2 * int(s.pad_node_start[-1]), "widest": 2 * int(np.diff(s.pad_node_start).max(initial=0)),
+        "state": state, "coordinates": len(s.body_free), "free": len(s.body_coordinate),
+        "contacts": len(s.contact_pad), "points": len(s.point_X), "pads": len(s.pad_base),
+        "nodes": int(s.pad_node_start[-1]), "inputs": inputs, "dofs": 2 * int(s.pad_node_start[-1]),
+        "widest": 2 * int(np.diff(s.pad_node_start).max(initial=0)),
         "inertial": int(s.inertia_dof_start[-1]), "parameters": len(s.p),
     }  # fmt: skip
     made = {}
@@ -285,7 +319,9 @@ def room(kind: str, s: Any, state: int, **sizes: int) -> Any:
             sum(sizes[part] if part in sizes else int(part) for part in one.split("+"))
             for one in shape.removeprefix("int ").split()
         ]
-        made |= {name: np.zeros(lengths, np.int64 if whole else np.float64) for name in names.split()}
+        made |= {
+            name: np.zeros(lengths, np.int64 if whole else np.float64) for name in names.split()
+        }
     return KINDS[kind](**made)
 
 

@@ -1,9 +1,10 @@
 """Compiled kernels on disk, in files that are checked before they are used.
 
-numba's own cache does not notice a changed function in another file, ends every later start where one of its files is damaged,
-and unpickles what anyone may have put there. Here the folder is named after everything the machine code was made from, every
-file carries its checksum, and a file counts only if it belongs to whoever may change this program anyway. Whatever cannot be
-read is compiled again; where nothing can be written, every start compiles, and says so.
+numba's own cache does not notice a changed function in another file, ends every later start where
+one of its files is damaged, and unpickles what anyone may have put there. Here the folder is named
+after everything the machine code was made from, every file carries its checksum, and a file counts
+only if it belongs to whoever may change this program anyway. Whatever cannot be read is compiled
+again; where nothing can be written, every start compiles, and says so.
 """
 
 import logging
@@ -34,15 +35,28 @@ HERE = Path(__file__).parent
 SOURCES = HERE, HERE.parents[1] / "codegen" / "invoke.py"
 """What is compiled: the kernels, and how they call a law."""
 
-SETTINGS = "OPT", "BOUNDSCHECK", "LOOP_VECTORIZE", "SLP_VECTORIZE", "USING_SVML", "DEBUGINFO_DEFAULT"
-"""numba's own settings that change the machine code; the processor's name and features are in every file's name."""
+SETTINGS = (
+    "OPT",
+    "BOUNDSCHECK",
+    "LOOP_VECTORIZE",
+    "SLP_VECTORIZE",
+    "USING_SVML",
+    "DEBUGINFO_DEFAULT",
+)
+"""numba's own settings that change the machine code; the processor's name and features are in every
+file's name."""
 
 _said: set[str] = set()
 
 
 def digest(*sources: Path) -> str:
-    """Names files, and the modules in folders: the same for the same text, another for any change."""
-    paths = [(root, path) for root in sources for path in (sorted(root.rglob("*.py")) if root.is_dir() else [root])]
+    """Names files, and the modules in folders: the same for the same text, another for any
+    change."""
+    paths = [
+        (root, path)
+        for root in sources
+        for path in (sorted(root.rglob("*.py")) if root.is_dir() else [root])
+    ]
     texts = [(str(path.relative_to(root.parent)), path.read_bytes()) for root, path in paths]
     return sha256(repr(texts).encode()).hexdigest()[:16]
 
@@ -55,13 +69,15 @@ def made_from() -> str:
 
 
 def folders(name: str) -> list[Path]:
-    """Where the kernels called `name` may lie: in NUMBA_CACHE_DIR if that is set, else beside the sources and in the user's
-    cache. Read from all, written to the first that can be."""
+    """Where the kernels called `name` may lie: in NUMBA_CACHE_DIR if that is set, else beside the
+    sources and in the user's cache. Read from all, written to the first that can be."""
     if chosen := config.CACHE_DIR:  # pyright: ignore[reportAttributeAccessIssue]
         return [Path(chosen) / "torchsoft" / name]
     out = [HERE / "__pycache__" / name]
     with suppress(RuntimeError):  # a user without a home
-        out.append(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchsoft" / name)
+        out.append(
+            Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "torchsoft" / name
+        )
     return out
 
 
@@ -85,8 +101,8 @@ def announce() -> None:
 
 
 def trusted(status: os.stat_result) -> bool:
-    """Whether a file was written by this user, by root or by the owner of the sources, and can be changed by no one else:
-    reading machine code is running it."""
+    """Whether a file was written by this user, by root or by the owner of the sources, and can be
+    changed by no one else: reading machine code is running it."""
     if not hasattr(os, "getuid"):  # the system has no such owners
         return True
     return status.st_uid in (os.getuid(), 0, HERE.stat().st_uid) and not status.st_mode & 0o022
@@ -155,7 +171,10 @@ class KernelCache(_Cache):
             with suppress(OSError):
                 write(path, content)
                 return
-        note(f"compiled kernels cannot be kept in {' or '.join(map(str, FOLDERS))}; compiling at every start")
+        note(
+            f"compiled kernels cannot be kept in {' or '.join(map(str, FOLDERS))}; compiling at "
+            "every start"
+        )
 
     def enable(self) -> None: ...
 

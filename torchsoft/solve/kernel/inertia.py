@@ -1,7 +1,8 @@
-"""Inertial pads inside the kernels: M (u' + V_B - v*)/(a h) + K (u* + (tau + a h) u') = F on all nodes that move.
+"""Inertial pads inside the kernels: M (u' + V_B - v*)/(a h) + K (u* + (tau + a h) u') = F on all
+nodes that move.
 
-Their bases translate only. With A = M/(a h) + (tau + a h) K the nodal rates are u' = free + A^-1 F - D V_B, D = A^-1 M 1/(a h),
-and the base feels -sum of M v'.
+Their bases translate only. With A = M/(a h) + (tau + a h) K the nodal rates are u' = free + A^-1 F
+- D V_B, D = A^-1 M 1/(a h), and the base feels -sum of M v'.
 """
 
 from typing import Any
@@ -20,7 +21,9 @@ def stiffness_force(s: Any, pad: int, u: Array, out: Array) -> None:
     for i in range(u.size):
         total = 0.0
         for k in range(s.inertia_K_column.shape[1]):
-            stiffness = p[at] * s.inertia_K_lambda[first + i, k] + p[at + 1] * s.inertia_K_mu[first + i, k]
+            stiffness = (
+                p[at] * s.inertia_K_lambda[first + i, k] + p[at + 1] * s.inertia_K_mu[first + i, k]
+            )
             total += stiffness * u[s.inertia_K_column[first + i, k]]
         out[i] = total
 
@@ -36,7 +39,11 @@ def solve(s: Any, pad: int, b: Array) -> None:
 def free_rates(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
     """A^-1 (M v*/(a h) - K u*) of one pad into its part of w.full."""
     first, last = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1]
-    free, mass, v_start = w.full[first:last], s.p[s.inertia_material_at[pad] + 3], s.pad_v_start[pad]
+    free, mass, v_start = (
+        w.full[first:last],
+        s.p[s.inertia_material_at[pad] + 3],
+        s.pad_v_start[pad],
+    )
     u_start = s.pad_y_start[pad]
     stiffness_force(s, pad, y[u_start : u_start + last - first], free)
     for i in range(last - first):
@@ -90,19 +97,32 @@ def couple_base(s: Any, w: Any, pad: int, n: int, Rv: Array) -> None:
             continue
         ex, ey = (cos, -sin) if axis == 0 else (sin, cos)
         for m in range(2 * n):
-            dof = s.inertia_dof_start[pad] + s.inertia_surface[2 * w.touched[first + m // 2] + m % 2]
-            w.Rf[s.pad_column[pad, number], m] -= ex * s.inertia_D[dof, 0] + ey * s.inertia_D[dof, 1]
+            dof = (
+                s.inertia_dof_start[pad] + s.inertia_surface[2 * w.touched[first + m // 2] + m % 2]
+            )
+            w.Rf[s.pad_column[pad, number], m] -= (
+                ex * s.inertia_D[dof, 0] + ey * s.inertia_D[dof, 1]
+            )
         for other in range(2):
             towards = free[base + other]
             if towards >= 0:
                 ox, oy = (cos, -sin) if other == 0 else (sin, cos)
-                Rv[number, towards] -= ex * (B[0, 0] * ox + B[0, 1] * oy) + ey * (B[1, 0] * ox + B[1, 1] * oy)
+                Rv[number, towards] -= ex * (B[0, 0] * ox + B[0, 1] * oy) + ey * (
+                    B[1, 0] * ox + B[1, 1] * oy
+                )
 
 
 @compiled
-def inertia_force(s: Any, w: Any, pad: int, y: Array, a: float, rates: Array) -> tuple[float, float]:
-    """Sum of M v' in the base's axes for the rates u' (dofs,) of the pad's own nodes and the base's velocity in w."""
-    first, v_start, mass = s.inertia_dof_start[pad], s.pad_v_start[pad], s.p[s.inertia_material_at[pad] + 3]
+def inertia_force(
+    s: Any, w: Any, pad: int, y: Array, a: float, rates: Array
+) -> tuple[float, float]:
+    """Sum of M v' in the base's axes for the rates u' (dofs,) of the pad's own nodes and the base's
+    velocity in w."""
+    first, v_start, mass = (
+        s.inertia_dof_start[pad],
+        s.pad_v_start[pad],
+        s.p[s.inertia_material_at[pad] + 3],
+    )
     vx, vy = base_velocity(s, pad, w.V, w.q)
     x, z = 0.0, 0.0
     for i in range(0, rates.size, 2):

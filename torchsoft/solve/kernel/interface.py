@@ -1,16 +1,18 @@
-"""The interface between one pad and the bodies it touches: kinematics, the law at its points, and one block of equations.
+"""The interface between one pad and the bodies it touches: kinematics, the law at its points, and
+one block of equations.
 
-Everything is written in the frame of the pad's base. With u' the nodal rates, F the nodal forces, P the pad's mobility at this
-stage and f = law(u', V) at the touching points, spread over the nodes by N,
+Everything is written in the frame of the pad's base. With u' the nodal rates, F the nodal forces, P
+the pad's mobility at this stage and f = law(u', V) at the touching points, spread over the nodes by
+N,
 
     u' = free + P F,   F = N^T f,   f = f0 + H_u du' + H_V dV,
 
-eliminating f leaves A F = b + Hc dV with A = 1 - N^T H_u N P, and the bodies' equations get Rf F + Rv dV + r. Newton's
-iteration, the tangent and, transposed, the adjoint solve this one block.
+eliminating f leaves A F = b + Hc dV with A = 1 - N^T H_u N P, and the bodies' equations get Rf F +
+Rv dV + r. Newton's iteration, the tangent and, transposed, the adjoint solve this one block.
 
-Derivatives of a point by (u (2), body (3), base (3)): S by positions, H = T + a h S by rates of the stage, T by
-velocities; G is
-what a force does to (body, base), L the derivative of that by positions at the same force.
+Derivatives of a point by (u (2), body (3), base (3)): S by positions, H = T + a h S by rates of the
+stage, T by velocities; G is what a force does to (body, base), L the derivative of that by
+positions at the same force.
 """
 
 from typing import Any
@@ -24,12 +26,14 @@ from torchsoft.solve.kernel.inertia import couple_base, couple_point, free_rates
 from torchsoft.solve.kernel.linear import put, row_of
 
 NEGLIGIBLE = 1e-14
-"""Nodal force that has set in [N] below which a node counts as never loaded: its displacements are below rounding."""
+"""Nodal force that has set in [N] below which a node counts as never loaded: its displacements are
+below rounding."""
 
 
 @compiled
 def frames(s: Any, w: Any) -> None:
-    """Per contact, in the base's frame: cos and sin of its angle, the body's centre, its velocity less the base's, the spin."""
+    """Per contact, in the base's frame: cos and sin of its angle, the body's centre, its velocity
+    less the base's, the spin."""
     for c in range(s.contact_pad.size):
         q, V, frame, B, C = w.q, w.V, w.frame, s.pad_base[s.contact_pad[c]], s.contact_body[c]
         cos, sin = np.cos(q[B + 2]), np.sin(q[B + 2])
@@ -41,9 +45,12 @@ def frames(s: Any, w: Any) -> None:
 
 
 @compiled
-def kinematics(s: Any, w: Any, k: int, ux: float, uy: float, vx: float, vy: float, x: Array) -> None:
-    """w, omega, d and theta of point k (Eq. 4-7) into x: the body's velocity less the point's, its spin, the moment arm from
-    its centre, its angle; (ux, uy) is the displacement and (vx, vy) its rate."""
+def kinematics(
+    s: Any, w: Any, k: int, ux: float, uy: float, vx: float, vy: float, x: Array
+) -> None:
+    """w, omega, d and theta of point k (Eq. 4-7) into x: the body's velocity less the point's, its
+    spin, the moment arm from its centre, its angle; (ux, uy) is the displacement and (vx, vy) its
+    rate."""
     c = s.point_contact[k]
     frame, body, base = w.frame[c], s.contact_coordinate[c, 2], s.contact_coordinate[c, 5]
     px, py = s.point_X[k, 0] + ux, s.point_X[k, 1] + uy
@@ -60,10 +67,17 @@ def at_point(s: Any, k: int, nodal: Array) -> tuple[float, float]:
 
 @compiled
 def apply_law(s: Any, w: Any, k: int, stretch: float, a: float) -> None:
-    """The law at point k with its derivatives, into w.out and w.J, and its force at the nodes, into w.F."""
+    """The law at point k with its derivatives, into w.out and w.J, and its force at the nodes, into
+    w.F."""
     c, x = s.point_contact[k], w.x[k]
     x[6], x[7], x[8] = stretch, s.point_weight[k], a
-    call_linearise(s.contact_linearise[c], x, s.p[s.contact_p_start[c] : s.contact_p_start[c + 1]], w.out[k], w.J[k])
+    call_linearise(
+        s.contact_linearise[c],
+        x,
+        s.p[s.contact_p_start[c] : s.contact_p_start[c + 1]],
+        w.out[k],
+        w.J[k],
+    )
     for j in range(2):
         for r in range(2):
             w.F[s.point_node[k, j], r] += s.point_N[k, j] * w.out[k, r]
@@ -71,7 +85,8 @@ def apply_law(s: Any, w: Any, k: int, stretch: float, a: float) -> None:
 
 @compiled
 def mobility_scale(s: Any, pad: int, a: float) -> float:
-    """What the stored mobility is multiplied with: sum of J / (tau + a h) over the chain; 1 for inertial pads."""
+    """What the stored mobility is multiplied with: sum of J / (tau + a h) over the chain; 1 for
+    inertial pads."""
     if s.pad_v_start[pad] >= 0:
         return 1.0
     at, n, p, total = s.pad_chain_at[pad], s.pad_branches[pad], s.p, 0.0
@@ -82,8 +97,9 @@ def mobility_scale(s: Any, pad: int, a: float) -> float:
 
 @compiled
 def set_in(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
-    """What a stage starts from: zeta = sum of J z and sum of J z / (tau + a h) over a massless pad's chain and its support
-    (`w.low`, `w.high` come later); an inertial pad's u' without contact and motion of its base."""
+    """What a stage starts from: zeta = sum of J z and sum of J z / (tau + a h) over a massless
+    pad's chain and its support (`w.low`, `w.high` come later); an inertial pad's u' without contact
+    and motion of its base."""
     p = s.p
     first, last, start = s.pad_node_start[pad], s.pad_node_start[pad + 1], s.pad_y_start[pad]
     if s.pad_v_start[pad] >= 0:
@@ -103,7 +119,8 @@ def set_in(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
 
 @compiled
 def displacements(s: Any, w: Any, pad: int, y: Array, low: int, high: int) -> None:
-    """u* and the rates without contact of the surface nodes from `low` to `high`, from what `set_in` left."""
+    """u* and the rates without contact of the surface nodes from `low` to `high`, from what
+    `set_in` left."""
     first, last, start = s.pad_node_start[pad], s.pad_node_start[pad + 1], s.pad_y_start[pad]
     if s.pad_v_start[pad] >= 0:
         i0 = s.inertia_dof_start[pad]
@@ -111,7 +128,11 @@ def displacements(s: Any, w: Any, pad: int, y: Array, low: int, high: int) -> No
             dof = s.inertia_surface[i]
             w.u[i // 2, i % 2], w.free[i // 2, i % 2] = y[start + dof], w.full[i0 + dof]
         return
-    zeta, rate, size = w.zeta[2 * first : 2 * last], w.zeta_rate[2 * first : 2 * last], 2 * (last - first)
+    zeta, rate, size = (
+        w.zeta[2 * first : 2 * last],
+        w.zeta_rate[2 * first : 2 * last],
+        2 * (last - first),
+    )
     left, right = 0, size
     while left < right and abs(zeta[left]) < NEGLIGIBLE:
         left += 1
@@ -129,7 +150,8 @@ def displacements(s: Any, w: Any, pad: int, y: Array, low: int, high: int) -> No
 
 @compiled
 def scan(s: Any, w: Any, y: Array, margin: float) -> None:
-    """List the points within `margin` [m] of touching at the stage's start, w.q, in `w.window`; needs `set_in`."""
+    """List the points within `margin` [m] of touching at the stage's start, w.q, in `w.window`;
+    needs `set_in`."""
     frames(s, w)
     x, phi = w.probe, w.phi
     for pad in range(s.pad_base.size):
@@ -141,7 +163,9 @@ def scan(s: Any, w: Any, y: Array, margin: float) -> None:
             c, n0, n1 = s.point_contact[k], s.point_node[k, 0], s.point_node[k, 1]
             ux, uy = at_point(s, k, w.u)
             kinematics(s, w, k, ux, uy, 0.0, 0.0, x)
-            call_value(s.contact_distance[c], x, s.p[s.contact_p_start[c] : s.contact_p_start[c + 1]], phi)
+            call_value(
+                s.contact_distance[c], x, s.p[s.contact_p_start[c] : s.contact_p_start[c + 1]], phi
+            )
             if not phi[0] > margin:
                 w.window[at + count] = k
                 count += 1
@@ -155,10 +179,11 @@ def scan(s: Any, w: Any, y: Array, margin: float) -> None:
 
 @compiled
 def evaluate(s: Any, w: Any, pad: int, y: Array, a: float) -> tuple[float, float]:
-    """The law at the window's points with the trial rates in `w`, its forces at the nodes, and the touching points.
+    """The law at the window's points with the trial rates in `w`, its forces at the nodes, and the
+    touching points.
 
-    Returns how far these forces are from the ones that the linear relations were solved with: the largest difference [N], and
-    the sum of squares [N2].
+    Returns how far these forces are from the ones that the linear relations were solved with: the
+    largest difference [N], and the sum of squares [N2].
     """
     at, count, actives = s.pad_point_start[pad], w.windows[pad], 0
     for node in range(w.low[pad], w.high[pad]):
@@ -170,7 +195,9 @@ def evaluate(s: Any, w: Any, pad: int, y: Array, a: float) -> tuple[float, float
         ux, uy = at_point(s, k, w.u)
         vx, vy = at_point(s, k, w.u_dot)
         kinematics(s, w, k, ux + a * vx, uy + a * vy, vx, vy, w.x[k])
-        call_value(s.contact_distance[c], w.x[k], s.p[s.contact_p_start[c] : s.contact_p_start[c + 1]], phi)
+        call_value(
+            s.contact_distance[c], w.x[k], s.p[s.contact_p_start[c] : s.contact_p_start[c + 1]], phi
+        )
         if phi[0] >= 0.0:
             continue
         apply_law(s, w, k, y[s.point_y_start + k], a)
@@ -208,7 +235,14 @@ def linearise(s: Any, w: Any, pad: int, a: float) -> None:
             tx, ty = J[0] * cos - J[1] * sin, J[0] * sin + J[1] * cos
             H[r, 2], H[r, 3], H[r, 4] = a * S[r, 2] + tx, a * S[r, 3] + ty, a * S[r, 4] + J[2]
             H[r, 5], H[r, 6], H[r, 7] = -H[r, 2], -H[r, 3], a * S[r, 7] + J[0] * py - J[1] * px
-        G[0, 0], G[0, 1], G[1, 0], G[1, 1], G[2, 0], G[2, 1] = -cos, sin, -sin, -cos, dy, -dx  # (16), (18), (19)
+        G[0, 0], G[0, 1], G[1, 0], G[1, 1], G[2, 0], G[2, 1] = (
+            -cos,
+            sin,
+            -sin,
+            -cos,
+            dy,
+            -dx,
+        )  # (16), (18), (19)
         G[3, 0], G[3, 1], G[4, 0], G[4, 1], G[5, 0], G[5, 1] = cos, -sin, sin, cos, -py, px
         X, Y = cos * fx - sin * fy, sin * fx + cos * fy
         L[:] = 0.0
@@ -219,8 +253,8 @@ def linearise(s: Any, w: Any, pad: int, a: float) -> None:
 
 @compiled
 def assemble(s: Any, w: Any, pad: int, a: float, Rv: Array) -> int:
-    """The block of one pad: w.touched, w.slot, w.P, w.A, w.Hc, w.Rf, and its part in Rv (free, free). Returns how many
-    nodes."""
+    """The block of one pad: w.touched, w.slot, w.P, w.A, w.Hc, w.Rf, and its part in Rv (free,
+    free). Returns how many nodes."""
     at, first = s.pad_point_start[pad], s.pad_node_start[pad]
     size, column = 2 * (s.pad_node_start[pad + 1] - first), s.pad_column[pad]
     n = 0
@@ -241,7 +275,10 @@ def assemble(s: Any, w: Any, pad: int, a: float, Rv: Array) -> int:
             col = 2 * (w.touched[first + j] - first)
             for r in range(2):
                 line = s.pad_C_start[pad] + (row + r) * size + col
-                P[2 * i + r, 2 * j], P[2 * i + r, 2 * j + 1] = scale * s.pad_C[line], scale * s.pad_C[line + 1]
+                P[2 * i + r, 2 * j], P[2 * i + r, 2 * j + 1] = (
+                    scale * s.pad_C[line],
+                    scale * s.pad_C[line + 1],
+                )
     for i in range(2 * n):
         A[i, : 2 * n] = 0.0
         A[i, i] = 1.0
@@ -290,8 +327,9 @@ def assemble(s: Any, w: Any, pad: int, a: float, Rv: Array) -> int:
 
 @compiled
 def restore(s: Any, w: Any, tape: Any, row: int, a: float) -> None:
-    """Coordinates, touching points with the law's Jacobians there, H, S, G, L, nodal forces (w.F), displacements at the stage's
-    start (w.u) and rates (w.u_dot) of points, by point number in the first columns of w.x's scratch."""
+    """Coordinates, touching points with the law's Jacobians there, H, S, G, L, nodal forces (w.F),
+    displacements at the stage's start (w.u) and rates (w.u_dot) of points, by point number in the
+    first columns of w.x's scratch."""
     put(tape.q[row], w.q)
     put(tape.V[row], w.V)
     frames(s, w)

@@ -1,6 +1,8 @@
-"""The small linear solves of a stage and what else is done to arrays, in place and without allocation.
+"""The small linear solves of a stage and what else is done to arrays, in place and without
+allocation.
 
-Inner loops run over views from 0 on: an index that might be negative, as Python allows, keeps a loop from being vectorised.
+Inner loops run over views from 0 on: an index that might be negative, as Python allows, keeps a
+loop from being vectorised.
 """
 
 from torchsoft.solve.kernel import compiled, inlined
@@ -16,7 +18,8 @@ def put(values: Array, out: Array) -> None:
 
 @compiled
 def solve_dense(A: Array, b: Array, n: int, m: int) -> None:
-    """Gaussian elimination with row pivoting on the leading n x n block; b (n, m) becomes the solution."""
+    """Gaussian elimination with row pivoting on the leading n x n block; b (n, m) becomes the
+    solution."""
     for k in range(n):
         p = k
         for i in range(k + 1, n):

@@ -1,8 +1,10 @@
-"""Many steps in one compiled call, given or of lengths that tolerances choose: the error estimate and the controller.
+"""Many steps in one compiled call, given or of lengths that tolerances choose: the error estimate
+and the controller.
 
-The estimate is the third divided difference of the solution: the rates at the step's start and at its two stages give the
-step's leading error, C h^3 y''' where the motion is smooth. Where a law has a kink (touch-down, break-away, the onset of slip,
-a node that comes into contact) the same difference is of the order of the kink's own error, h^2 times the change of y''.
+The estimate is the third divided difference of the solution: the rates at the step's start and at
+its two stages give the step's leading error, C h^3 y''' where the motion is smooth. Where a law has
+a kink (touch-down, break-away, the onset of slip, a node that comes into contact) the same
+difference is of the order of the kink's own error, h^2 times the change of y''.
 """
 
 from typing import Any
@@ -32,14 +34,15 @@ ERROR = 2.0 * abs(3.0 * GAMMA**2 - 2.0 * GAMMA**3 - 1.0 / 6.0)
 """Twice the coefficient of h^3 y''' in the step's error."""
 
 SAFETY, LARGEST, SMALLEST = 0.9, 4.0, 0.2
-"""The controller aims at this part of the tolerance, and changes a step by these factors at most."""
+"""The controller aims at this part of the tolerance, and changes a step by these factors at
+most."""
 
 INTEGRAL, PROPORTIONAL = 0.7 / 3.0, 0.4 / 3.0
 """Exponents of the PI controller (Gustafsson, ACM TOMS 17, 1991)."""
 
 PASSED = 0.25
-"""A step that tolerances choose moves no body by more than this part of its size over a pad that it may touch: one that flies
-would else be through the pad between two steps."""
+"""A step that tolerances choose moves no body by more than this part of its size over a pad that it
+may touch: one that flies would else be through the pad between two steps."""
 
 LEAST_ERROR = 1e-6
 """Errors below this part of the tolerance count as this."""
@@ -55,7 +58,9 @@ def follow(f: Any, t_0: float, t_1: float, out: Array) -> None:
             call_value(f.address, f.room, f.room, out[row])
             continue
         for i in range(f.start.size - 1):
-            piece = f.start[i] + np.searchsorted(f.at[f.start[i] : f.start[i + 1]], t, side="right") - 1
+            piece = (
+                f.start[i] + np.searchsorted(f.at[f.start[i] : f.start[i + 1]], t, side="right") - 1
+            )
             piece = max(piece, f.start[i])
             u, n = (t - f.at[piece]) / f.span[piece], f.points[i]
             inside = 0.0 <= u <= 1.0
@@ -71,12 +76,15 @@ def follow(f: Any, t_0: float, t_1: float, out: Array) -> None:
 
 @compiled
 def estimate(e: Any, d: Any, y: Array, k: Array, h: float, rtol: float) -> tuple[float, int]:
-    """The step's error over what the tolerances allow, of the worst part of the state, and which part that is."""
+    """The step's error over what the tolerances allow, of the worst part of the state, and which
+    part that is."""
     worst, which = 0.0, -1
     for part in range(e.first.size):
         total = size = 0.0
         for i in range(e.first[part], e.last[part]):
-            error = ERROR * h * ((d.K[1, i] - d.K[0, i]) / (1.0 - GAMMA) - (d.K[0, i] - k[i]) / GAMMA)
+            error = (
+                ERROR * h * ((d.K[1, i] - d.K[0, i]) / (1.0 - GAMMA) - (d.K[0, i] - k[i]) / GAMMA)
+            )
             total += error * error
             change = y[i] - e.origin[i]
             size += change * change
@@ -115,26 +123,30 @@ def next_end(t: float, wanted: float, stops: Array, shift: bool) -> float:
 
 @entry
 def run(
-    s: Any, s0: Any, w: Any, d: Any, f: Any, e: Any, given: bool, y: Array, k: Array, clock: Array, stops: Array, t_out: Array,
-    row: int, rung: float, rtol: float, longest: float, shortest: float, tolerance: float, max_iterations: int,
-    margin: float, integrals: Array, ys: Array, forces: Array, extras: Array, tape: Any, starts: Array, h: Array,
-    signals: Array, out_step: Any, out_part: Array, out_signals: Array,
+    s: Any, s0: Any, w: Any, d: Any, f: Any, e: Any, given: bool, y: Array, k: Array, clock: Array,
+    stops: Array, t_out: Array, row: int, rung: float, rtol: float, longest: float, shortest: float,
+    tolerance: float, max_iterations: int, margin: float, integrals: Array, ys: Array,
+    forces: Array, extras: Array, tape: Any, starts: Array, h: Array, signals: Array, out_step: Any,
+    out_part: Array, out_signals: Array,
 ) -> tuple[int, int, int, int, int, int, int]:  # fmt: skip
     """Take up to h.size steps. `s` are the rig's arrays, `s0` those for a stage of no length.
 
-    starts, h (steps,) [s], signals (steps, 2, signals, 2), value and rate at the stages; output i lies at the part
-    out_part[i] of the step out_step[i], where the signals are out_signals[i]. With `given` these say what to do. Otherwise they
-    receive what is done, from the output `row` on, until the last of t_out; the tolerances choose: clock holds the time, the
-    next step's length and the last step's error, k the rates at y. No step passes a time of `stops`, whose last is t_out's. A
-    positive `rung` [s] is the only length allowed, for arrays `s` that belong to it: the call ends when the controller wants
-    half of it or twice.
+    starts, h (steps,) [s], signals (steps, 2, signals, 2), value and rate at the stages; output i
+    lies at the part out_part[i] of the step out_step[i], where the signals are out_signals[i]. With
+    `given` these say what to do. Otherwise they receive what is done, from the output `row` on,
+    until the last of t_out; the tolerances choose: clock holds the time, the next step's length and
+    the last step's error, k the rates at y. No step passes a time of `stops`, whose last is
+    t_out's. A positive `rung` [s] is the only length allowed, for arrays `s` that belong to it: the
+    call ends when the controller wants half of it or twice.
 
-    An output's state goes to `ys`, (F_N, F_T) of every point to `forces`, and integrals, the pads' moments and the generalised
-    contact forces to `extras`; `tape` has two rows a step, or none. y, `integrals` and the guesses in w are advanced in place;
-    after a failure they hold the last good step. With no steps the one output is that of y itself.
+    An output's state goes to `ys`, (F_N, F_T) of every point to `forces`, and integrals, the pads'
+    moments and the generalised contact forces to `extras`; `tape` has two rows a step, or none. y,
+    `integrals` and the guesses in w are advanced in place; after a failure they hold the last good
+    step. With no steps the one output is that of y itself.
 
-    Returns steps and outputs done, status, linear solves, steps that were refused for their error and that Newton did not
-    solve, and the part of the state whose error was largest in the last one.
+    Returns steps and outputs done, status, linear solves, steps that were refused for their error
+    and that Newton did not solve, and the part of the state whose error was largest in the last
+    one.
     """
     steps, solves, refused, failed, which, first = 0, 0, 0, 0, -1, row
     status, begin = CONVERGED, h.size == 0
@@ -155,7 +167,18 @@ def run(
                 now = rung if rung > 0.0 else end - t
                 follow(f, t + GAMMA * now, end, signals[steps])
             status, count = take_step(
-                s, w, d, y, now, signals[steps], tolerance, max_iterations, margin, integrals, tape, 2 * steps
+                s,
+                w,
+                d,
+                y,
+                now,
+                signals[steps],
+                tolerance,
+                max_iterations,
+                margin,
+                integrals,
+                tape,
+                2 * steps,
             )
             solves += count
             if status == CONVERGED and not given:
@@ -166,7 +189,9 @@ def run(
             if status == CONVERGED:
                 status = gone(s, w)
             if status == CONVERGED:
-                while last < out_step.size and (out_step[last] == steps if given else t_out[last] <= end):
+                while last < out_step.size and (
+                    out_step[last] == steps if given else t_out[last] <= end
+                ):
                     if not given:
                         part = (t_out[last] - t) / now
                         out_step[last], out_part[last] = steps, part if part < 1.0 - 1e-9 else 1.0
@@ -174,8 +199,8 @@ def run(
                     last += 1
         if status == CONVERGED:
             status, count = write_rows(
-                s, s0, w, d, y, now, out_part, out_signals, row, last, tolerance, max_iterations, margin, integrals, ys,
-                forces, extras,
+                s, s0, w, d, y, now, out_part, out_signals, row, last, tolerance, max_iterations,
+                margin, integrals, ys, forces, extras,
             )  # fmt: skip
             solves += count
         if begin:
@@ -187,12 +212,20 @@ def run(
                 put(d.K[1], k)
                 enlarge(e, y)
                 error = max(error, LEAST_ERROR)
-                longer = now * min(LARGEST, max(SMALLEST, SAFETY * error**-INTEGRAL * clock[2] ** PROPORTIONAL))
-                clock[0], clock[1], clock[2] = end, max(longer, wanted) if now < wanted else longer, error
+                longer = now * min(
+                    LARGEST, max(SMALLEST, SAFETY * error**-INTEGRAL * clock[2] ** PROPORTIONAL)
+                )
+                clock[0], clock[1], clock[2] = (
+                    end,
+                    max(longer, wanted) if now < wanted else longer,
+                    error,
+                )
             row, steps = last, steps + 1
         else:
             take_back(w, d, y, integrals)
-            again = not given and wanted > shortest  # not `now`, which rounding leaves a little longer
+            again = (
+                not given and wanted > shortest
+            )  # not `now`, which rounding leaves a little longer
             if again and status == REFUSED:
                 refused, smaller = refused + 1, SAFETY * error ** (-1.0 / 3.0)
                 clock[1] = max(now * (smaller if smaller > SMALLEST else SMALLEST), shortest)
@@ -220,10 +253,11 @@ AT_ONCE = 1e-18
 
 @entry
 def rates(
-    s: Any, w: Any, f: Any, t: float, y: Array, tolerance: float, max_iterations: int, margin: float, signals: Array,
-    powers: Array, moments: Array, out: Array,
+    s: Any, w: Any, f: Any, t: float, y: Array, tolerance: float, max_iterations: int,
+    margin: float, signals: Array, powers: Array, moments: Array, out: Array,
 ) -> bool:  # fmt: skip
-    """dy/dt of the state y at t [s] into out, of a rig whose pads are massless; False if Newton finds no forces there.
+    """dy/dt of the state y at t [s] into out, of a rig whose pads are massless; False if Newton
+    finds no forces there.
 
     A stage of no length gives all rates; those of the velocities are a difference over its length
     and come from the loads instead. signals (1, signals, 2) is scratch, as are powers and moments.
@@ -232,7 +266,9 @@ def rates(
     for i in range(s.body_coordinate.size):
         w.V[s.body_coordinate[i]] = y[s.body_V_start + i]
     w.travelled[0] = np.inf  # the last state was any other one
-    converged, _, _ = solve_near(s, w, y, signals[0], AT_ONCE, tolerance, max_iterations, margin, powers, moments)
+    converged, _, _ = solve_near(
+        s, w, y, signals[0], AT_ONCE, tolerance, max_iterations, margin, powers, moments
+    )
     put(w.k, out)
     for i in range(s.body_coordinate.size):
         c, mass = s.body_coordinate[i], s.p[s.body_mass_at[i]]

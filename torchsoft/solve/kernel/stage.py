@@ -1,7 +1,7 @@
 """One stage of the implicit step: the rates k that solve k = f(t, y* + a h k), by Newton's method.
 
-Stretches are local, pads are linear, so Newton's unknowns are the forces at the touched nodes, pad by pad, and then the
-velocities of the free coordinates.
+Stretches are local, pads are linear, so Newton's unknowns are the forces at the touched nodes, pad
+by pad, and then the velocities of the free coordinates.
 """
 
 from typing import Any
@@ -25,12 +25,14 @@ from torchsoft.solve.kernel.interface import (
 from torchsoft.solve.kernel.linear import put, row_of, solve_dense
 
 SEARCH_AFTER, SHORTEST = 2, 1.0 / 64.0
-"""After so many iterations a Newton step that does not lessen the mismatch is halved, down to this part of it."""
+"""After so many iterations a Newton step that does not lessen the mismatch is halved, down to this
+part of it."""
 
 
 @compiled
 def drive(s: Any, w: Any, y: Array, signals: Array, a: float) -> None:
-    """All coordinates at the end of the stage: those of the state for the free velocities in V, signals for the others."""
+    """All coordinates at the end of the stage: those of the state for the free velocities in V,
+    signals for the others."""
     q, V = w.q, w.V
     for c in range(s.body_free.size):
         if s.body_free[c] >= 0:
@@ -40,8 +42,11 @@ def drive(s: Any, w: Any, y: Array, signals: Array, a: float) -> None:
 
 
 @compiled
-def actuate(s: Any, i: int, q: Array, V: Array, signals: Array, x: Array, out: Array, J: Array) -> float:
-    """Effort [N or N.m] of actuator i; x receives (set-points and their rates, feed-forward, coordinates and their rates)."""
+def actuate(
+    s: Any, i: int, q: Array, V: Array, signals: Array, x: Array, out: Array, J: Array
+) -> float:
+    """Effort [N or N.m] of actuator i; x receives (set-points and their rates, feed-forward,
+    coordinates and their rates)."""
     ff, n = s.act_feed_forward[i], 0
     for k in range(s.act_setpoint_start[i], s.act_setpoint_start[i + 1]):
         x[n], x[n + 1] = signals[s.act_setpoint[k], 0], signals[s.act_setpoint[k], 1]
@@ -62,7 +67,8 @@ def coordinates_at(s: Any, i: int) -> int:
 
 @compiled
 def by_velocities(s: Any, i: int, J: Array, a: float, row: Array) -> None:
-    """Add the derivative of actuator i's effort by the free velocities (free,), which move coordinates by a."""
+    """Add the derivative of actuator i's effort by the free velocities (free,), which move
+    coordinates by a."""
     n = coordinates_at(s, i)
     for k in range(s.act_measured_start[i], s.act_measured_start[i + 1]):
         towards = s.body_free[s.act_measured[k]]
@@ -73,19 +79,23 @@ def by_velocities(s: Any, i: int, J: Array, a: float, row: Array) -> None:
 
 @compiled
 def balance(s: Any, w: Any, y: Array, signals: Array, a: float, r: Array, Rv: Array) -> None:
-    """Loads less M V' on the free coordinates without contact, r (free, 1), and their derivative by the velocities, Rv."""
+    """Loads less M V' on the free coordinates without contact, r (free, 1), and their derivative by
+    the velocities, Rv."""
     p = s.p
     Rv[:], r[:] = 0.0, 0.0
     for i in range(s.body_coordinate.size):
         mass = p[s.body_mass_at[i]]
         r[i, 0] = -mass * (
-            (w.V[s.body_coordinate[i]] - y[s.body_V_start + i]) / a + s.body_weight[i] * p[s.body_gravity_at]
+            (w.V[s.body_coordinate[i]] - y[s.body_V_start + i]) / a
+            + s.body_weight[i] * p[s.body_gravity_at]
         )
         Rv[i, i] = -mass / a  # (17)
     for i in range(s.act_pushed.size):
         number = s.body_free[s.act_pushed[i]]
         if number >= 0:
-            r[number, 0] += actuate(s, i, w.q, w.V, signals, w.effort_x, w.effort, w.effort_J)  # (32), (34)
+            r[number, 0] += actuate(
+                s, i, w.q, w.V, signals, w.effort_x, w.effort, w.effort_J
+            )  # (32), (34)
             by_velocities(s, i, w.effort_J, a, Rv[number])
 
 
@@ -120,7 +130,9 @@ def residual(s: Any, w: Any, pad: int, y: Array, a: float, n: int, r: Array) -> 
         for row in range(6):
             number = s.contact_number[c, row]
             if number >= 0:
-                r[number, 0] += G[row, 0] * fx + G[row, 1] * fy + a * (L[row, 0] * dx + L[row, 1] * dy)
+                r[number, 0] += (
+                    G[row, 0] * fx + G[row, 1] * fy + a * (L[row, 0] * dx + L[row, 1] * dy)
+                )
     if inertial:
         B, base = s.inertia_B[pad], s.pad_base[pad]
         mx, my = reaction_without_contact(s, w, pad, y, a)
@@ -147,7 +159,8 @@ def reaction_without_contact(s: Any, w: Any, pad: int, y: Array, a: float) -> tu
 
 @compiled
 def propose(s: Any, w: Any, pad: int, a: float, n: int, columns: int, dV: Array) -> None:
-    """Newton's forces and nodal rates for the change of velocity dV; w.V holds the old velocities still."""
+    """Newton's forces and nodal rates for the change of velocity dV; w.V holds the old velocities
+    still."""
     first = s.pad_node_start[pad]
     size, scale = 2 * (s.pad_node_start[pad + 1] - first), mobility_scale(s, pad, a)
     X = w.X[2 * first : 2 * (first + n)]
@@ -169,7 +182,9 @@ def propose(s: Any, w: Any, pad: int, a: float, n: int, columns: int, dV: Array)
         node = w.touched[first + i]
         for r in range(2):
             f = scale * w.F_new[node, r]
-            row = row_of(s.pad_C, s.pad_C_start[pad], 2 * (node - first) + r, size)[low - 2 * first : high - 2 * first]
+            row = row_of(s.pad_C, s.pad_C_start[pad], 2 * (node - first) + r, size)[
+                low - 2 * first : high - 2 * first
+            ]
             for m in range(row.size):
                 rates[m] += row[m] * f
     if s.pad_v_start[pad] >= 0:
@@ -185,21 +200,32 @@ def propose(s: Any, w: Any, pad: int, a: float, n: int, columns: int, dV: Array)
 
 @compiled
 def move(w: Any, pad: int, part: float) -> None:
-    """Go `part` of the way from the old iterate to the proposed one. Both satisfy the linear relations, so this does."""
+    """Go `part` of the way from the old iterate to the proposed one. Both satisfy the linear
+    relations, so this does."""
     for node in range(w.low[pad], w.high[pad]):
         for r in range(2):
             w.F_linear[node, r] = w.F_old[node, r] + part * (w.F_new[node, r] - w.F_old[node, r])
-            w.u_dot[node, r] = w.u_dot_old[node, r] + part * (w.u_dot_new[node, r] - w.u_dot_old[node, r])
+            w.u_dot[node, r] = w.u_dot_old[node, r] + part * (
+                w.u_dot_new[node, r] - w.u_dot_old[node, r]
+            )
 
 
 @compiled
 def solve_stage(
-    s: Any, w: Any, y: Array, signals: Array, a: float, tolerance: float, max_iterations: int, margin: float
+    s: Any,
+    w: Any,
+    y: Array,
+    signals: Array,
+    a: float,
+    tolerance: float,
+    max_iterations: int,
+    margin: float,
 ) -> tuple[bool, int]:
-    """Velocities (w.V, on entry the guess), nodal forces and rates at the end of the stage that starts from y.
+    """Velocities (w.V, on entry the guess), nodal forces and rates at the end of the stage that
+    starts from y.
 
-    Newton ends when the law and the linear relations agree to `tolerance` [N] at every node. Returns success and the number
-    of linear solves.
+    Newton ends when the law and the linear relations agree to `tolerance` [N] at every node.
+    Returns success and the number of linear solves.
     """
     pads, free = s.pad_base.size, s.body_coordinate.size
     drive(s, w, y, signals, a)
@@ -262,7 +288,8 @@ def solve_stage(
 
 @compiled
 def eliminate(s: Any, w: Any, pad: int, n: int, m: int, X: Array, r: Array, Rv: Array) -> None:
-    """Put the pad's forces X = A^-1 (b | Hc), m right-hand sides, into the bodies' equations r (free, m) and Rv."""
+    """Put the pad's forces X = A^-1 (b | Hc), m right-hand sides, into the bodies' equations r
+    (free, m) and Rv."""
     column = s.pad_column[pad]
     for number in range(column.size):
         if column[number] < 0:
@@ -282,8 +309,9 @@ NEGLIGIBLE_RATE = 1e-16
 
 @compiled
 def finish(s: Any, w: Any, y: Array, a: float, powers: Array, moments: Array) -> float:
-    """All rates of the accepted stage in w.k, what the pads and contacts dissipate in `powers` (pads, dashpots, slip) [W], the
-    contacts' generalised forces in w.load, the pads' moments (Eq. 35) [N.m]. Returns a bound of every surface speed [m/s]."""
+    """All rates of the accepted stage in w.k, what the pads and contacts dissipate in `powers`
+    (pads, dashpots, slip) [W], the contacts' generalised forces in w.load, the pads' moments (Eq.
+    35) [N.m]. Returns a bound of every surface speed [m/s]."""
     p, k = s.p, w.k
     count, fastest = s.pad_base.size, 0.0
     powers[: count + 2] = 0.0
@@ -317,7 +345,12 @@ def finish(s: Any, w: Any, y: Array, a: float, powers: Array, moments: Array) ->
             elif y[j] != 0.0:  # away from contact the stretch decays through the slip element
                 c = s.point_contact[n]
                 w.x[n, 6], w.x[n, 7], w.x[n, 8] = y[j], s.point_weight[n], a
-                call_value(s.contact_free[c], w.x[n, 6:], p[s.contact_p_start[c] : s.contact_p_start[c + 1]], out)
+                call_value(
+                    s.contact_free[c],
+                    w.x[n, 6:],
+                    p[s.contact_p_start[c] : s.contact_p_start[c + 1]],
+                    out,
+                )
                 k[j] = out[0]
                 powers[count] += out[1]
                 powers[count + 1] += out[2]
@@ -360,14 +393,18 @@ def finish(s: Any, w: Any, y: Array, a: float, powers: Array, moments: Array) ->
 
 
 @compiled
-def finish_inertial(s: Any, w: Any, pad: int, y: Array, a: float, powers: Array, moments: Array) -> float:
-    """Rates of an inertial pad, its part in powers, load and moment; returns its largest nodal rate [m/s]."""
+def finish_inertial(
+    s: Any, w: Any, pad: int, y: Array, a: float, powers: Array, moments: Array
+) -> float:
+    """Rates of an inertial pad, its part in powers, load and moment; returns its largest nodal rate
+    [m/s]."""
     p = s.p
     first, last = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1]
     base, at = s.pad_base[pad], s.inertia_material_at[pad]
     vx, vy = base_velocity(s, pad, w.V, w.q)
     extra, effort, forces, stiffness = (
-        w.inertial[0, first:last], w.inertial[1, first:last], w.inertial[2, first:last], w.inertial[3, first:last]
+        w.inertial[0, first:last], w.inertial[1, first:last], w.inertial[2, first:last],
+        w.inertial[3, first:last]
     )  # fmt: skip
     extra[:] = 0.0
     for node in range(w.low[pad], w.high[pad]):
@@ -391,7 +428,9 @@ def finish_inertial(s: Any, w: Any, pad: int, y: Array, a: float, powers: Array,
         effort[i] = forces[i] - p[at + 3] * s.inertia_area[first + i] * w.k[s.pad_v_start[pad] + i]
     moments[pad] = 0.0
     for i in range(0, last - first, 2):
-        moments[pad] += s.inertia_X[first + i] * effort[i + 1] - s.inertia_X[first + i + 1] * effort[i]
+        moments[pad] += (
+            s.inertia_X[first + i] * effort[i + 1] - s.inertia_X[first + i + 1] * effort[i]
+        )
     mx, my = inertia_force(s, w, pad, y, a, rates)
     cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
     w.load[base] -= cos * mx - sin * my

@@ -1,8 +1,9 @@
-"""One implicit step: SDIRK2, its running energy integrals, its dense output, and what ends a run early.
+"""One implicit step: SDIRK2, its running energy integrals, its dense output, and what ends a run
+early.
 
-SDIRK2 is Alexander's two-stage method (SIAM J. Numer. Anal. 14, 1977): L-stable, stiffly accurate, of second order,
-both stages with the same a = 1 - 1/sqrt(2), so that one mobility serves both. The second stage starts from
-y* = (1 - MIX) y + MIX Y_1 and its end is the step's.
+SDIRK2 is Alexander's two-stage method (SIAM J. Numer. Anal. 14, 1977): L-stable, stiffly accurate,
+of second order, both stages with the same a = 1 - 1/sqrt(2), so that one mobility serves both. The
+second stage starts from y* = (1 - MIX) y + MIX Y_1 and its end is the step's.
 """
 
 from typing import Any
@@ -24,7 +25,8 @@ INSTANT = 1e-13
 """Length a h [s] of the stage that gives the forces at one moment: nothing moves in it."""
 
 TINY = 1e-60
-"""Components of the state below this are set to zero, so that what decays does not end in denormal numbers."""
+"""Components of the state below this are set to zero, so that what decays does not end in denormal
+numbers."""
 
 
 @compiled
@@ -56,7 +58,10 @@ def gone(s: Any, w: Any) -> int:
     for c in range(s.contact_pad.size):
         at = s.pad_point_start[s.contact_pad[c]]
         for i in range(w.actives[s.contact_pad[c]]):
-            if w.active[at + i] == s.contact_point_start[c] or w.active[at + i] == s.contact_point_start[c + 1] - 1:
+            if (
+                w.active[at + i] == s.contact_point_start[c]
+                or w.active[at + i] == s.contact_point_start[c + 1] - 1
+            ):
                 return OFF_THE_PAD
         x, y, limit = w.frame[c, 2], w.frame[c, 3], s.contact_limits[c]
         if not (limit[0] <= x <= limit[1] and limit[2] <= y <= limit[3]):
@@ -66,7 +71,8 @@ def gone(s: Any, w: Any) -> int:
 
 @compiled
 def supply(s: Any, w: Any, signals: Array, powers: Array) -> None:
-    """Powers [W] of the actuators, of gravity, of what drives the bodies, and the sum of the positive ones."""
+    """Powers [W] of the actuators, of gravity, of what drives the bodies, and the sum of the
+    positive ones."""
     at = s.pad_base.size + 2
     x, out, J = w.effort_x, w.effort, w.effort_J
     for i in range(s.act_pushed.size):
@@ -74,14 +80,21 @@ def supply(s: Any, w: Any, signals: Array, powers: Array) -> None:
     at += s.act_pushed.size
     gravity = 0.0
     for i in range(s.body_coordinate.size):
-        gravity -= s.body_weight[i] * s.p[s.body_mass_at[i]] * s.p[s.body_gravity_at] * w.V[s.body_coordinate[i]]
+        gravity -= (
+            s.body_weight[i]
+            * s.p[s.body_mass_at[i]]
+            * s.p[s.body_gravity_at]
+            * w.V[s.body_coordinate[i]]
+        )
     powers[at] = gravity
     for b in range(s.body_free.size // 3 - 1):
         drive = 0.0
         for c in range(3 * b, 3 * b + 3):
             if s.body_free[c] < 0:
                 drive -= w.load[c] * w.V[c]
-        for i in range(s.act_pushed.size):  # what pushes a driven coordinate is held by what drives it
+        for i in range(
+            s.act_pushed.size
+        ):  # what pushes a driven coordinate is held by what drives it
             if s.act_pushed[i] // 3 == b and s.body_free[s.act_pushed[i]] < 0:
                 drive -= powers[s.pad_base.size + 2 + i]
         powers[at + 1 + b] = drive
@@ -93,7 +106,8 @@ def supply(s: Any, w: Any, signals: Array, powers: Array) -> None:
 
 @compiled
 def record(s: Any, w: Any, integrals: Array, moments: Array, forces: Array, extras: Array) -> None:
-    """One row of output: (F_N, F_T) of every point; integrals, the pads' moments and the generalised contact forces."""
+    """One row of output: (F_N, F_T) of every point; integrals, the pads' moments and the
+    generalised contact forces."""
     forces[:] = 0.0
     for pad in range(s.pad_base.size):
         at = s.pad_point_start[pad]
@@ -108,10 +122,11 @@ def record(s: Any, w: Any, integrals: Array, moments: Array, forces: Array, extr
 
 @inlined
 def solve_near(
-    s: Any, w: Any, y: Array, signals: Array, a: float, tolerance: float, max_iterations: int, margin: float, powers: Array,
-    moments: Array,
+    s: Any, w: Any, y: Array, signals: Array, a: float, tolerance: float, max_iterations: int,
+    margin: float, powers: Array, moments: Array,
 ) -> tuple[bool, int, float]:  # fmt: skip
-    """A stage from y with every point that may touch in the window: success, linear solves, a bound of all speeds [m/s]."""
+    """A stage from y with every point that may touch in the window: success, linear solves, a bound
+    of all speeds [m/s]."""
     solves, speed, reach, done, converged = 0, 0.0, margin, False, True
     while converged and not done:
         converged, count = solve_stage(s, w, y, signals, a, tolerance, max_iterations, reach)
@@ -129,11 +144,12 @@ def solve_near(
 
 @inlined
 def take_step(
-    s: Any, w: Any, d: Any, y: Array, h: float, signals: Array, tolerance: float, max_iterations: int, margin: float,
-    integrals: Array, tape: Any, row: int,
+    s: Any, w: Any, d: Any, y: Array, h: float, signals: Array, tolerance: float,
+    max_iterations: int, margin: float, integrals: Array, tape: Any, row: int,
 ) -> tuple[int, int]:  # fmt: skip
-    """One step of h [s] from y, which goes to its end with `integrals`; signals (2, signals, 2) are those of the stages. The
-    start stays in d.y, d.integrals; d.K, d.powers and d.speed receive what the stages found. Returns status and solves."""
+    """One step of h [s] from y, which goes to its end with `integrals`; signals (2, signals, 2) are
+    those of the stages. The start stays in d.y, d.integrals; d.K, d.powers and d.speed receive what
+    the stages found. Returns status and solves."""
     a, solves = GAMMA * h, 0
     put(y, d.y)
     put(integrals, d.integrals)
@@ -180,14 +196,16 @@ def take_back(w: Any, d: Any, y: Array, integrals: Array) -> None:
 
 @inlined
 def dense(part: float) -> tuple[float, float]:
-    """Weights b_1, b_2 of the stages' rates at a part of the step (0 to 1): the continuous extension of second order."""
+    """Weights b_1, b_2 of the stages' rates at a part of the step (0 to 1): the continuous
+    extension of second order."""
     second = part * (0.5 * part - GAMMA) / (1.0 - GAMMA)
     return part - second, second
 
 
 @compiled
 def dense_states(part: float) -> tuple[float, float, float]:
-    """The same as weights of the states at the step's start, its first stage and its end; (0, 0, 1) at the end."""
+    """The same as weights of the states at the step's start, its first stage and its end; (0, 0, 1)
+    at the end."""
     if part == 1.0:
         return 0.0, 0.0, 1.0
     b_1, b_2 = dense(part)
@@ -196,15 +214,19 @@ def dense_states(part: float) -> tuple[float, float, float]:
 
 @inlined
 def write_rows(
-    s: Any, s0: Any, w: Any, d: Any, y: Array, h: float, parts: Array, signals: Array, first: int, last: int,
-    tolerance: float, max_iterations: int, margin: float, integrals: Array, ys: Array, forces: Array, extras: Array,
+    s: Any, s0: Any, w: Any, d: Any, y: Array, h: float, parts: Array, signals: Array, first: int,
+    last: int, tolerance: float, max_iterations: int, margin: float, integrals: Array, ys: Array,
+    forces: Array, extras: Array,
 ) -> tuple[int, int]:  # fmt: skip
-    """The outputs at parts[first:last] of the step just taken. At its end they are what the last stage found; before it, dense
-    output with the forces that belong to it, which take a stage of no length (of `s0`). Returns status and linear solves."""
+    """The outputs at parts[first:last] of the step just taken. At its end they are what the last
+    stage found; before it, dense output with the forces that belong to it, which take a stage of no
+    length (of `s0`). Returns status and linear solves."""
     solves, here, converged = 0, w.travelled[0], True
     put(w.V, d.guess_V)
     put(w.u_dot, d.guess)
-    for i in range(last - 1, first - 1, -1):  # the end comes first: the others disturb what the last stage left
+    for i in range(
+        last - 1, first - 1, -1
+    ):  # the end comes first: the others disturb what the last stage left
         if parts[i] == 1.0:
             put(y, ys[i])
             put(integrals, d.at_row)
@@ -219,12 +241,23 @@ def write_rows(
                     j < s.pad_base.size + 2
                 ):  # what is dissipated never falls: a stage's power until its weight is used up
                     first_part, second_part = early, parts[i] - early
-                d.at_row[j] = d.integrals[j] + h * (first_part * d.powers[0, j] + second_part * d.powers[1, j])
+                d.at_row[j] = d.integrals[j] + h * (
+                    first_part * d.powers[0, j] + second_part * d.powers[1, j]
+                )
             way = d.travelled[0] + h * (abs(b_1) * d.speed[0] + abs(b_2) * d.speed[1])
             scans = w.travelled[2]
             w.travelled[0] = way if scans == d.travelled[2] else np.inf
             converged, count, _ = solve_near(
-                s0, w, ys[i], signals[i], INSTANT, tolerance, max_iterations, margin, d.scrap, d.moments
+                s0,
+                w,
+                ys[i],
+                signals[i],
+                INSTANT,
+                tolerance,
+                max_iterations,
+                margin,
+                d.scrap,
+                d.moments,
             )
             solves += count
             if not converged:

@@ -1,7 +1,7 @@
 """The tangent stage: forward sensitivities of `run` in several directions at once.
 
-One factorisation of Newton's system a stage, as many right-hand sides as there are directions. A `d` before a name is its
-derivative, the last axis counts directions.
+One factorisation of Newton's system a stage, as many right-hand sides as there are directions. A
+`d` before a name is its derivative, the last axis counts directions.
 """
 
 from typing import Any
@@ -25,7 +25,9 @@ RESCAN = 64
 
 
 @compiled
-def law_derivatives(z: Any, address: int, x: Array, p: Array, dp: Array, rows: int, out: Array) -> None:
+def law_derivatives(
+    z: Any, address: int, x: Array, p: Array, dp: Array, rows: int, out: Array
+) -> None:
     """d law / dp along dp (parameters, m), with x held, into out (rows, m)."""
     weights, gradient = z.weights, z.gradient[: p.size]
     weights[:] = 0.0
@@ -43,7 +45,8 @@ def law_derivatives(z: Any, address: int, x: Array, p: Array, dp: Array, rows: i
 
 @compiled
 def find_span(s: Any, y: Array, dy: Array, span: Array) -> None:
-    """Per pad the first surface dof that is loaded or has a derivative, and the end; what is negligible becomes zero."""
+    """Per pad the first surface dof that is loaded or has a derivative, and the end; what is
+    negligible becomes zero."""
     for pad in range(s.pad_base.size):
         size, start = 2 * (s.pad_node_start[pad + 1] - s.pad_node_start[pad]), s.pad_y_start[pad]
         span[pad, 0], span[pad, 1] = size, 0
@@ -56,19 +59,32 @@ def find_span(s: Any, y: Array, dy: Array, span: Array) -> None:
                 for i in range(size):
                     largest = max(largest, abs(rows[i, k]))
                 for i in range(size):
-                    if abs(rows[i, k]) > NEGLIGIBLE_PART * largest or abs(y[start + b * size + i]) > NEGLIGIBLE:
+                    if (
+                        abs(rows[i, k]) > NEGLIGIBLE_PART * largest
+                        or abs(y[start + b * size + i]) > NEGLIGIBLE
+                    ):
                         span[pad, 0], span[pad, 1] = min(span[pad, 0], i), max(span[pad, 1], i + 1)
                     else:
                         rows[i, k] = 0.0
 
 
 @compiled
-def massless_part(s: Any, w: Any, z: Any, pad: int, y: Array, dy: Array, dp: Array, a: float) -> None:
-    """Derivatives of u* (du) and of u' before the forces' own change (dv) at the loaded nodes, (nodes, 2, m)."""
+def massless_part(
+    s: Any, w: Any, z: Any, pad: int, y: Array, dy: Array, dp: Array, a: float
+) -> None:
+    """Derivatives of u* (du) and of u' before the forces' own change (dv) at the loaded nodes,
+    (nodes, 2, m)."""
     p, first, start, m = s.p, s.pad_node_start[pad], s.pad_y_start[pad], dy.shape[1]
-    size, chain, branches = 2 * (s.pad_node_start[pad + 1] - first), s.pad_chain_at[pad], s.pad_branches[pad]
+    size, chain, branches = (
+        2 * (s.pad_node_start[pad + 1] - first),
+        s.pad_chain_at[pad],
+        s.pad_branches[pad],
+    )
     F, material, span, du, dv = w.F.reshape(w.F.size), chain + 2 * branches, z.span, z.u, z.v
-    left, right = min(span[pad, 0], 2 * (w.low[pad] - first)), max(span[pad, 1], 2 * (w.high[pad] - first))
+    left, right = (
+        min(span[pad, 0], 2 * (w.low[pad] - first)),
+        max(span[pad, 1], 2 * (w.high[pad] - first)),
+    )
     span[pad, 0], span[pad, 1] = left, right
     zeta, rate, dzeta, drate = z.zeta, z.rate, z.dzeta, z.drate
     zeta[:], rate[:], dzeta[:], drate[:] = 0.0, 0.0, 0.0, 0.0
@@ -113,9 +129,19 @@ def massless_part(s: Any, w: Any, z: Any, pad: int, y: Array, dy: Array, dp: Arr
 
 @compiled
 def inertial_part(
-    s: Any, w: Any, z: Any, pad: int, y: Array, dy: Array, dp: Array, a: float, rate: Array, r: Array
+    s: Any,
+    w: Any,
+    z: Any,
+    pad: int,
+    y: Array,
+    dy: Array,
+    dp: Array,
+    a: float,
+    rate: Array,
+    r: Array,
 ) -> None:
-    """The same for an inertial pad; z.free (dofs, m) receives dv of all its dofs, and r the base's reaction."""
+    """The same for an inertial pad; z.free (dofs, m) receives dv of all its dofs, and r the base's
+    reaction."""
     at = s.inertia_material_at[pad]
     i0, i1, U, W, base = (
         s.inertia_dof_start[pad],
@@ -127,7 +153,12 @@ def inertial_part(
     n, mass, tau = i1 - i0, s.p[at + 3], s.p[at + 2]
     vx, vy = base_velocity(s, pad, w.V, w.q)
     cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
-    own, force, column, strain = w.inertial[0, i0:i1], w.inertial[1, i0:i1], w.inertial[2, i0:i1], w.inertial[3, i0:i1]
+    own, force, column, strain = (
+        w.inertial[0, i0:i1],
+        w.inertial[1, i0:i1],
+        w.inertial[2, i0:i1],
+        w.inertial[3, i0:i1],
+    )
     here, du, dv, free = rate[i0:i1], z.u, z.v, z.free
     stiffness_force(s, pad, here, force)
     for i in range(n):
@@ -139,7 +170,10 @@ def inertial_part(
         for i in range(n):
             total = -own[i] - force[i] * dp[at + 2, k]
             for j in range(s.inertia_K_column.shape[1]):
-                change = s.inertia_K_lambda[i0 + i, j] * dp[at, k] + s.inertia_K_mu[i0 + i, j] * dp[at + 1, k]
+                change = (
+                    s.inertia_K_lambda[i0 + i, j] * dp[at, k]
+                    + s.inertia_K_mu[i0 + i, j] * dp[at + 1, k]
+                )
                 total -= change * strain[s.inertia_K_column[i0 + i, j]]
             M = s.inertia_area[i0 + i] / a
             v_dot = here[i] + (vx if i % 2 == 0 else vy) - y[W + i]
@@ -158,7 +192,9 @@ def inertial_part(
         for axis in range(2):
             number = s.body_free[base + axis]
             if number >= 0:
-                r[number, k] -= cos * along - sin * across if axis == 0 else sin * along + cos * across
+                r[number, k] -= (
+                    cos * along - sin * across if axis == 0 else sin * along + cos * across
+                )
         for i in range(w.counts[pad]):
             node = w.touched[s.pad_node_start[pad] + i]
             for axis in range(2):
@@ -167,8 +203,11 @@ def inertial_part(
 
 
 @compiled
-def stage_tangent(s: Any, w: Any, z: Any, tape: Any, row: int, a: float, signals: Array, dy: Array, dp: Array) -> None:
-    """Turn the tangent dy (size, m) of a stage's y* into that of its end, in place; dp (parameters, m)."""
+def stage_tangent(
+    s: Any, w: Any, z: Any, tape: Any, row: int, a: float, signals: Array, dy: Array, dp: Array
+) -> None:
+    """Turn the tangent dy (size, m) of a stage's y* into that of its end, in place; dp (parameters,
+    m)."""
     p = s.p
     free, count, y, m = s.body_coordinate.size, s.pad_base.size, tape.y[row], dy.shape[1]
     restore(s, w, tape, row, a)
@@ -222,10 +261,21 @@ def stage_tangent(s: Any, w: Any, z: Any, tape: Any, row: int, a: float, signals
                 number = s.contact_number[c, o]
                 for d in range(m):
                     dq[o, d] = dy[s.body_q_start + number, d] if number >= 0 else 0.0
-            n0, n1, N0, N1 = s.point_node[k, 0], s.point_node[k, 1], s.point_N[k, 0], s.point_N[k, 1]
+            n0, n1, N0, N1 = (
+                s.point_node[k, 0],
+                s.point_node[k, 1],
+                s.point_N[k, 0],
+                s.point_N[k, 1],
+            )
             for d in range(m):
-                ux, uy = N0 * du[n0, 0, d] + N1 * du[n1, 0, d], N0 * du[n0, 1, d] + N1 * du[n1, 1, d]
-                vx, vy = N0 * dv[n0, 0, d] + N1 * dv[n1, 0, d], N0 * dv[n0, 1, d] + N1 * dv[n1, 1, d]
+                ux, uy = (
+                    N0 * du[n0, 0, d] + N1 * du[n1, 0, d],
+                    N0 * du[n0, 1, d] + N1 * du[n1, 1, d],
+                )
+                vx, vy = (
+                    N0 * dv[n0, 0, d] + N1 * dv[n1, 0, d],
+                    N0 * dv[n0, 1, d] + N1 * dv[n1, 1, d],
+                )
                 for o in range(3):
                     total = S[o, 0] * ux + S[o, 1] * uy + w.J[k, o, 6] * dy[s.point_y_start + k, d]
                     for j in range(6):
@@ -265,11 +315,18 @@ def stage_tangent(s: Any, w: Any, z: Any, tape: Any, row: int, a: float, signals
 
 @compiled
 def advance_pad(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array, dp: Array) -> None:
-    """Tangents of a pad's state and of its stretches at the stage's end, from Newton's solution in w.X and dV."""
+    """Tangents of a pad's state and of its stretches at the stage's end, from Newton's solution in
+    w.X and dV."""
     p = s.p
     first, last, n, m = s.pad_node_start[pad], s.pad_node_start[pad + 1], w.counts[pad], dy.shape[1]
     size, column = 2 * (last - first), s.pad_column[pad]
-    own_rate, base_rate, span, dV, e = z.own_rate, z.base_rate, z.span, z.V, z.e  # own_rate: of u', what is not in dv
+    own_rate, base_rate, span, dV, e = (
+        z.own_rate,
+        z.base_rate,
+        z.span,
+        z.V,
+        z.e,
+    )  # own_rate: of u', what is not in dv
     X, at, start = w.X[2 * first : 2 * (first + n)], s.pad_point_start[pad], s.pad_y_start[pad]
     inertial, scale = s.pad_v_start[pad] >= 0, mobility_scale(s, pad, a)
     chain, branches, base = s.pad_chain_at[pad], s.pad_branches[pad], s.pad_base[pad]
@@ -298,7 +355,10 @@ def advance_pad(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array,
             if inertial:
                 dof = s.inertia_dof_start[pad] + s.inertia_surface[2 * w.touched[first + i] + o]
                 for k in range(m):
-                    own_rate[i, o, k] -= s.inertia_D[dof, 0] * base_rate[0, k] + s.inertia_D[dof, 1] * base_rate[1, k]
+                    own_rate[i, o, k] -= (
+                        s.inertia_D[dof, 0] * base_rate[0, k]
+                        + s.inertia_D[dof, 1] * base_rate[1, k]
+                    )
     i, x, out, J, change = 0, z.decay_x, w.decay, z.decay_J, z.change
     for k in range(at, s.pad_point_start[pad + 1]):
         j, c = s.point_y_start + k, s.point_contact[k]
@@ -310,7 +370,9 @@ def advance_pad(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array,
                 for q in range(2):
                     if s.point_N[k, q] != 0.0:
                         slot = w.slot[s.point_node[k, q]]
-                        total += s.point_N[k, q] * (H[2, 0] * own_rate[slot, 0, d] + H[2, 1] * own_rate[slot, 1, d])
+                        total += s.point_N[k, q] * (
+                            H[2, 0] * own_rate[slot, 0, d] + H[2, 1] * own_rate[slot, 1, d]
+                        )
                 for o in range(6):
                     number = s.contact_number[c, o]
                     if number >= 0:
@@ -338,7 +400,9 @@ def advance_pad(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array,
             loaded = 2 * w.low[pad] <= 2 * first + i < 2 * w.high[pad]
             z_dot = ((F[2 * first + i] if loaded else 0.0) - y[first_z + i]) / (tau + a)
             for k in range(m):
-                dy[first_z + i, k] -= a * (dy[first_z + i, k] + z_dot * dp[chain + branches + b, k]) / (tau + a)
+                dy[first_z + i, k] -= (
+                    a * (dy[first_z + i, k] + z_dot * dp[chain + branches + b, k]) / (tau + a)
+                )
         for i in range(n):
             for o in range(2):
                 dof = first_z + 2 * (w.touched[first + i] - first) + o
@@ -360,18 +424,20 @@ def advance_inertial(s: Any, w: Any, z: Any, pad: int, a: float, dy: Array) -> N
         solve(s, pad, column)
         for i in range(i1 - i0):
             rate = free_rates[i0 + i, k] + column[i]
-            rate -= s.inertia_D[i0 + i, 0] * base_rate[0, k] + s.inertia_D[i0 + i, 1] * base_rate[1, k]
+            rate -= (
+                s.inertia_D[i0 + i, 0] * base_rate[0, k] + s.inertia_D[i0 + i, 1] * base_rate[1, k]
+            )
             dy[s.pad_y_start[pad] + i, k] += a * rate
             dy[s.pad_v_start[pad] + i, k] = rate + base_rate[i % 2, k]
 
 
 @entry
 def forward(
-    s: Any, w: Any, z: Any, h: Array, tape: Any, signals: Array, out_step: Any, out_part: Array, dy: Array, dp: Array,
-    dys: Array,
+    s: Any, w: Any, z: Any, h: Array, tape: Any, signals: Array, out_step: Any, out_part: Array,
+    dy: Array, dp: Array, dys: Array,
 ) -> None:  # fmt: skip
-    """Carry the tangent dy (size, m) through the steps of a tape, in place; dys (outputs, size, m) receives it at the parts
-    out_part of the steps out_step."""
+    """Carry the tangent dy (size, m) through the steps of a tape, in place; dys (outputs, size, m)
+    receives it at the parts out_part of the steps out_step."""
     m, row, before, first = dy.shape[1], 0, z.before, z.first
     for step in range(h.size):
         a = GAMMA * h[step]
@@ -388,5 +454,7 @@ def forward(
             at_start, at_first, at_end = dense_states(out_part[row])
             for i in range(dy.shape[0]):
                 for k in range(m):
-                    dys[row, i, k] = at_start * before[i, k] + at_first * first[i, k] + at_end * dy[i, k]
+                    dys[row, i, k] = (
+                        at_start * before[i, k] + at_first * first[i, k] + at_end * dy[i, k]
+                    )
             row += 1
