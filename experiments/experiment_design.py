@@ -8,10 +8,11 @@ estimate by F^-1 J^T of it: what an excitation is worth is the root of both squa
 frozen. Derivatives of hard slipping can be inconsistent: J is checked against a central difference
 along a random direction, and an excitation that fails is dropped.
 
-Command: .venv/bin/python experiments/experiment_design.py [--smoke] Expected: no gentle motion
-identifies mu_k (above 50 %), jerks of a light grasp do to about 1 %; K_t and R_t are the weakest,
-and three excitations together, 5.4 s of data, bring the worst of the eight (R_t) to 3 % at a step
-of 0.5 ms; harder ones would identify more, but not at that step. About two minutes on one core.
+Command: .venv/bin/python experiments/experiment_design.py [--smoke]
+Expected: no gentle motion identifies mu_k (above 50 %), jerks of a light grasp do to about 1 %; K_t
+and R_t are the weakest, and three excitations together, 5.4 s of data, bring the worst of the eight
+(R_t) to 3 % at a step of 0.5 ms; harder ones would identify more, but not at that step. About two
+minutes on one core.
 """
 
 import itertools

@@ -8,11 +8,11 @@ sensitivities, and predicts a fourth recording. The same once more without noise
 stages on finite differences: `scipy.optimize.least_squares` with a Jacobian of one more run a
 parameter, all of them at once in the workers.
 
-Command: .venv/bin/python experiments/identify_contact.py [--smoke] [--workers 2] Expected: without
-noise every parameter within a tenth of the standard deviation that noise would give it, what the
-steps shift it by; with noise within what the Fisher matrix predicts, R_t the worst of them with a
-standard deviation of 3 %; both starts end at the same place. Each identification takes some 45 runs
-with sensitivities and 20 without.
+Command: .venv/bin/python experiments/identify_contact.py [--smoke] [--workers 2]
+Expected: without noise every parameter within a tenth of the standard deviation that noise would
+give it, what the steps shift it by; with noise within what the Fisher matrix predicts, R_t the
+worst of them with a standard deviation of 3 %; both starts end at the same place. Each
+identification takes some 45 runs with sensitivities and 20 without.
 """
 
 from collections.abc import Sequence

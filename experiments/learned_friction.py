@@ -7,10 +7,11 @@ the model changes, and it runs compiled. It learns from the disc's motion alone 
 a few milliseconds after a kick that makes it slip), made by the built-in law mu(v) = mu_k + (mu_s -
 mu_k) / (1 + v / v_s), by the discrete adjoint of the run.
 
-Command: .venv/bin/python experiments/learned_friction.py [--smoke] Expected: the loss falls by more
-than 100 times in 40 runs of the model, and mu is learned to 0.01 on average over the slip speeds
-that occurred, worst (0.1) at the slowest, which leave the least trace in the motion. Beyond them
-nothing is known and nothing is claimed. About twenty seconds on one core.
+Command: .venv/bin/python experiments/learned_friction.py [--smoke]
+Expected: the loss falls by more than 100 times in 40 runs of the model, and mu is learned to 0.01
+on average over the slip speeds that occurred, worst (0.1) at the slowest, which leave the least
+trace in the motion. Beyond them nothing is known and nothing is claimed. About twenty seconds on
+one core.
 """
 
 from dataclasses import dataclass, replace

@@ -2,22 +2,26 @@
 carry it with its orientation held, within 0.1 mm and 0.5 degrees; and where do loops alone no
 longer do it?
 
-The rig is `rigs/orientation.toml`: each pad on a jaw of its own; the loop on disc.x pushes both jaws the same way, the loop
-on disc.theta pushes them against each other, the loop on disc.y lifts the lower jaw, and a force grips from above. Gains by
-design: one bandwidth w, damping 1, for the masses of rigid parts that roll. Errors count from the closed grip on.
-  kinematics  jaws under loops of their own, driven as a rigid disc would roll: what it costs not to see the disc
+The rig is `rigs/orientation.toml`: each pad on a jaw of its own; the loop on disc.x pushes both
+jaws the same way, the loop on disc.theta pushes them against each other, the loop on disc.y lifts
+the lower jaw, and a force grips from above. Gains by design: one bandwidth w, damping 1, for the
+masses of rigid parts that roll. Errors count from the closed grip on.
+  kinematics  jaws under loops of their own, driven as a rigid disc would roll: what it costs not to
+              see the disc
   speed       everything after the grip faster; rigid parts lag behind by a / w^2
-  friction    less of it: a disc asks for mu = I alpha / 2 R N and m a / 2 N, a shape between rigid plates for
-              max h'/h (1 + W / 2 N), with its support function h, grip N and weight W (the friction cone)
-  shape       ellipses of the disc's area and a rounded box: the grip turns them with F = max h'/h (N + W / 2) on either
-              jaw, for which the loop needs an error F / Kp; then with the efforts of the run before fed forward
+  friction    less of it: a disc asks for mu = I alpha / 2 R N and m a / 2 N, a shape between rigid
+              plates for max h'/h (1 + W / 2 N), with its support function h, grip N and weight W
+              (the friction cone)
+  shape       ellipses of the disc's area and a rounded box: the grip turns them with F = max h'/h
+              (N + W / 2) on either jaw, for which the loop needs an error F / Kp; then with the
+              efforts of the run before fed forward
 
-Command: .venv/bin/python experiments/orientation.py [--smoke] Expected: the disc within 0.009 mm
-and 0.09 degrees, 0.0005 mm and 0.003 degrees at rest; by kinematics 2.1 degrees off. Beyond the
-tolerance: the disc four times as fast (inertia); by loops alone the ellipse of 1.1 and all that is
-farther from a disc, which efforts fed forward mend for 1.1, 1.3 and the box; the ellipse of 1.3
-with mu near its friction cone of 0.29 or below; the ellipse of 2, which asks for 0.82 and has 0.8,
-and is lost. Little more than a minute on one core.
+Command: .venv/bin/python experiments/orientation.py [--smoke]
+Expected: the disc within 0.009 mm and 0.09 degrees, 0.0005 mm and 0.003 degrees at rest; by
+kinematics 2.1 degrees off. Beyond the tolerance: the disc four times as fast (inertia); by loops
+alone the ellipse of 1.1 and all that is farther from a disc, which efforts fed forward mend for
+1.1, 1.3 and the box; the ellipse of 1.3 with mu near its friction cone of 0.29 or below; the
+ellipse of 2, which asks for 0.82 and has 0.8, and is lost. Little more than a minute on one core.
 """
 
 from collections.abc import Mapping

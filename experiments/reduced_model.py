@@ -1,25 +1,27 @@
 """Question: how small can an ordinary differential equation for disc and bracket be, and where does
 it stop being enough?
 
-Stick. Both pads stick to the disc: each is a spring k and a dashpot c on its slip (`torchsoft.reduced.terms`), so that
-    m x_C''     =  k (x_Br - 2 x_C) + c (...)'
+Stick. Both pads stick to the disc: each is a spring k and a dashpot c on its slip
+(`torchsoft.reduced.terms`), so that
+    m x_C''     = k (x_Br - 2 x_C) + c (...)'
     I theta''   = -r [k (x_Br + 2 r theta) + c (...)'] - c_r theta'
     m_Br x_Br'' =  F_x - k (x_Br - x_C + r theta) - c (...)'
-with F_x known from the control law. What mechanics expects of k, c, r and c_r is computed from the full model, linearised in
-the grasp, with pads and stretches condensed at rest: not quite a spring and a dashpot at every frequency. The
-training motions are taps: small random velocities of disc and bracket and a broad multi-sine, some micrometres large. The
-radius comes from one roll to the other side. Held out: the paper's manipulation.
+with F_x known from the control law. What mechanics expects of k, c, r and c_r is computed from the
+full model, linearised in the grasp, with pads and stretches condensed at rest: not quite a spring
+and a dashpot at every frequency. The training motions are taps: small random velocities of disc and
+bracket and a broad multi-sine, some micrometres large. The radius comes from one roll to the other
+side. Held out: the paper's manipulation.
 
 Slip. A light grasp, the horizontal loop on the bracket, strokes ever faster: the disc rolls on the
 lower pad and the upper one slips. Held out: other strokes. Errors are root mean squares over the
 signal's range, worst of the six states.
 
-Command: .venv/bin/python experiments/reduced_model.py [--smoke] Expected: stick: 8 terms, the very
-ones above; held-out error 0.3 % of range (node transitions in the spin), more than 100 times faster
-than the full model; k, c and the masses within 10 % of the expectation but for the spin's k (-14 %)
-and c_r (-18 %). Slip: 5 terms, 1 % up to 80 m/s2, 4 % at 300 m/s2, where the normal force is no
-longer that of the training strokes; 7 % in a grasp of another depth, which is another mode. Two
-minutes on one core.
+Command: .venv/bin/python experiments/reduced_model.py [--smoke]
+Expected: stick: 8 terms, the very ones above; held-out error 0.3 % of range (node transitions in
+the spin), more than 100 times faster than the full model; k, c and the masses within 10 % of the
+expectation but for the spin's k (-14 %) and c_r (-18 %). Slip: 5 terms, 1 % up to 80 m/s2, 4 % at
+300 m/s2, where the normal force is no longer that of the training strokes; 7 % in a grasp of
+another depth, which is another mode. Two minutes on one core.
 """
 
 from collections.abc import Sequence

@@ -12,14 +12,14 @@ under a held load, at speeds over two and a half decades, beside theory (`_shape
 De = v tau / a, with tau the longest retardation time (relaxation time of a series) and a the
 contact's half-width at rest.
 
-Command: .venv/bin/python experiments/shapes_and_materials.py [--no-video] [--smoke] Expected: force
-and power agree to 6e-3 at every speed. At 20 N, where the disc sinks in by 7 % of the pad's height,
-the resistance is 1.2 % below to 3.7 % above theory's; at 5 N, near the peak, it is theory's to 0.2
-%. The peaks are higher than theory's by 1.2 to 2.7 %, at a De lower by 1 to 2.5 %: 0.0599 at 0.99
-(Kelvin-Voigt), 0.0218 at 0.75 (standard linear solid), 0.0170 at 1.8 (series). Under a held load
-Kelvin-Voigt has a peak, too: at high speed the contact stiffens and shrinks. The closed form is
-right within 4 % for the thin layer, 30 % too low for the paper's pads. The long box is refused: it
-would slide. Two and a half minutes on an idle core.
+Command: .venv/bin/python experiments/shapes_and_materials.py [--no-video] [--smoke]
+Expected: force and power agree to 6e-3 at every speed. At 20 N, where the disc sinks in by 7 % of
+the pad's height, the resistance is 1.2 % below to 3.7 % above theory's; at 5 N, near the peak, it
+is theory's to 0.2 %. The peaks are higher than theory's by 1.2 to 2.7 %, at a De lower by 1 to 2.5
+%: 0.0599 at 0.99 (Kelvin-Voigt), 0.0218 at 0.75 (standard linear solid), 0.0170 at 1.8 (series).
+Under a held load Kelvin-Voigt has a peak, too: at high speed the contact stiffens and shrinks. The
+closed form is right within 4 % for the thin layer, 30 % too low for the paper's pads. The long box
+is refused: it would slide. Two and a half minutes on an idle core.
 """
 
 import math

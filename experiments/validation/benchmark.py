@@ -12,9 +12,10 @@ noisy machine:
   the compiled right-hand side (`torchsoft.solve.rates`). Every method is run by a series of tolerances, from loose to tight,
   until it is as exact as the stepper, in the disc's place and in the nodal forces; that run is timed, without compiling.
 
-Command: .venv/bin/python experiments/validation/benchmark.py [--peers] [--smoke] Expected: the
-sweep at most 0.6 of a run and the Jacobian at most 2 by tolerances, more by equal steps; forces
-need rtol 1e-4 to be as exact as by 2 ms. About five minutes, three more with `--peers`.
+Command: .venv/bin/python experiments/validation/benchmark.py [--peers] [--smoke]
+Expected: the sweep at most 0.6 of a run and the Jacobian at most 2 by tolerances, more by equal
+steps; forces need rtol 1e-4 to be as exact as by 2 ms. About five minutes, three more with
+`--peers`.
 """
 
 import os

@@ -1,17 +1,21 @@
 """Question: should contact points stand on the nodes or between them?
 
-The paper puts one contact point on every surface node, so that a rolling disc picks nodes up and drops them one at a
-time. With `contact.points` = n they lie at n Gauss points an element, and the pad's shape functions carry displacements
-and forces between them and the nodes. Compared on 1 mm and 0.5 mm elements; a ripple is half of the peak-to-peak.
-  static    the disc pressed 0 to 1 mm beside a node, without friction: ripples of the force along the lower pad and of
-            y_C (the upper pad stays centred over the disc)
-  rolling   the manipulation: peak of F_x, its ripple between 5 and 7 s less a cubic trend, theta, energy residual
-  gradient  of y_C and theta after 0.3 s of pressing and rolling, from several places, by K_n, E and K_t: the adjoint's
-            largest difference from central differences over 1e-6 (is it exact?) and over 1 % (is it the trend?)
+The paper puts one contact point on every surface node, so that a rolling disc picks nodes up and
+drops them one at a time. With `contact.points` = n they lie at n Gauss points an element, and the
+pad's shape functions carry displacements and forces between them and the nodes. Compared on 1 mm
+and 0.5 mm elements; a ripple is half of the peak-to-peak.
+  static    the disc pressed 0 to 1 mm beside a node, without friction: ripples of the force along
+            the lower pad and of y_C (the upper pad stays centred over the disc)
+  rolling   the manipulation: peak of F_x, its ripple between 5 and 7 s less a cubic trend, theta,
+            energy residual
+  gradient  of y_C and theta after 0.3 s of pressing and rolling, from several places, by K_n, E and
+            K_t: the adjoint's largest difference from central differences over 1e-6 (is it exact?)
+            and over 1 % (is it the trend?)
 
-Command: .venv/bin/python experiments/validation/contact_points.py [--smoke] Expected, 1 mm
-elements, nodes / 2 / 3 / 4 points: ripple of F_x 121 / 49 / 25 / 19 mN; gradient off the trend by
-up to 15 / 5 / 2 / 2 %. Nodes 0.5 mm apart: 16 mN, 10 %. About seven minutes on one core.
+Command: .venv/bin/python experiments/validation/contact_points.py [--smoke]
+Expected, 1 mm elements, nodes / 2 / 3 / 4 points: ripple of F_x 121 / 49 / 25 / 19 mN; gradient off
+the trend by up to 15 / 5 / 2 / 2 %. Nodes 0.5 mm apart: 16 mN, 10 %. About seven minutes on one
+core.
 """
 
 from dataclasses import dataclass, replace

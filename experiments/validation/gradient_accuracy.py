@@ -1,14 +1,16 @@
 """Question: how exact are the two routes to a gradient, in every contact mode, and what do they
 cost?
 
-The loss over a window of outputs t_k is L = mean over k and i of (1/2 + (t_k - t_0)/(t_T - t_0)) (z_ki + z_ki^2 / 2), with
-z = (q - mean q) / std q of the nominal run, constants both, and q = (x_C, y_C, theta, v_C, omega, x_Br, y_Br, F_x, F_y).
-dL/dp for every scalar parameter p, the state at t_0 held, comes from
+The loss over a window of outputs t_k is L = mean over k and i of (1/2 + (t_k - t_0)/(t_T - t_0))
+(z_ki + z_ki^2 / 2), with z = (q - mean q) / std q of the nominal run, constants both, and q = (x_C,
+y_C, theta, v_C, omega, x_Br, y_Br, F_x, F_y). dL/dp for every scalar parameter p, the state at t_0
+held, comes from
   discrete     the discrete adjoint of the implicit stepper,
   forward      forward sensitivities of the same steps, contracted with dL/dy,
-and is judged by central differences D(d) = (L(p + d) - L(p - d)) / 2d of the stepper at a Newton tolerance of 1e-10 N. Each
-neighbouring pair of relative steps d gives a Richardson value; the three in a row that agree best are the plateau, and their
-spread is the judge's own uncertainty. No gradient is looked at to choose the step.
+and is judged by central differences D(d) = (L(p + d) - L(p - d)) / 2d of the stepper at a Newton
+tolerance of 1e-10 N. Each neighbouring pair of relative steps d gives a Richardson value; the three
+in a row that agree best are the plateau, and their spread is the judge's own uncertainty. No
+gradient is looked at to choose the step.
 
 Windows: `stick` (gentle rolling in the grasp), `slip` (a 2 mm stroke in 20 ms with mu_s = 0.3, mu_k
 = 0.2, v_s = 50 mm/s), `make-break` (rolling at 4.4 mm/s), `grasp` (the bracket coming down from 20
@@ -17,12 +19,12 @@ um above touching) and `full` (the 30 s manipulation).
 Further: the literal Coulomb law, whose force jumps at break-away unless mu_s = mu_k. How far
 gradients depend on the step is in `step_accuracy.py`.
 
-Command: .venv/bin/python experiments/validation/gradient_accuracy.py [--smoke] Expected, largest
-error of both routes among parameters whose central difference is itself known to 1e-6: 6e-7 in each
-of the short windows, 6e-6 over 30 s and 180 node events; elsewhere within the judge's uncertainty.
-With the adjoint a run takes 1.3 to 1.9 times as long. Coulomb's law with mu_s > mu_k: it calls
-dL/dmu_s 0, the loss falls with a slope of -0.105 +- 0.01; with mu_s = mu_k they agree to 2e-4.
-About seven minutes on one core.
+Command: .venv/bin/python experiments/validation/gradient_accuracy.py [--smoke]
+Expected, largest error of both routes among parameters whose central difference is itself known to
+1e-6: 6e-7 in each of the short windows, 6e-6 over 30 s and 180 node events; elsewhere within the
+judge's uncertainty. With the adjoint a run takes 1.3 to 1.9 times as long. Coulomb's law with mu_s
+> mu_k: it calls dL/dmu_s 0, the loss falls with a slope of -0.105 +- 0.01; with mu_s = mu_k they
+agree to 2e-4. About seven minutes on one core.
 """
 
 import statistics

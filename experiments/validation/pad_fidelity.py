@@ -5,8 +5,9 @@ reference and grasping force, and every output is subtracted; so is a fast strok
 Condensation is exact but for inertia, because R = tau K; inertia should matter by about 1 / (tau
 omega)^2, some 4e-4 of the pads' part, since every pad mode is overdamped.
 
-Command: .venv/bin/python experiments/validation/pad_fidelity.py [--smoke] Expected: on the
-manipulation the disc differs by some nanometres and the forces by some millinewtons. About 20 s.
+Command: .venv/bin/python experiments/validation/pad_fidelity.py [--smoke]
+Expected: on the manipulation the disc differs by some nanometres and the forces by some
+millinewtons. About 20 s.
 """
 
 from dataclasses import dataclass

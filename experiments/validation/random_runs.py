@@ -15,8 +15,9 @@ Every run should be finite to its end or raise `SimulationFailed`, `NoEquilibriu
 with one sentence. A run that takes more than `limit` of the processor's time counts as hung, and
 its process is ended.
 
-Command: .venv/bin/python experiments/validation/random_runs.py [--smoke] Expected: no run hangs,
-none ends without a sentence or with numbers that are not finite. About twenty minutes on two cores.
+Command: .venv/bin/python experiments/validation/random_runs.py [--smoke]
+Expected: no run hangs, none ends without a sentence or with numbers that are not finite. About
+twenty minutes on two cores.
 """
 
 import math

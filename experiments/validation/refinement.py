@@ -5,9 +5,10 @@ to Coulomb's limit eta = 0. The per-node contact values refer to 1 mm of surface
 node's tributary length, so that all meshes have the same contact. What the step decides is in
 `step_accuracy.py`.
 
-Command: .venv/bin/python experiments/validation/refinement.py [--smoke] Expected: x_C(10 s) does
-not depend on the mesh, y_C in the grasp changes by less than 0.03 mm, and the peak of F_x, which
-rides on node transitions, falls with the mesh. About half a minute on one core.
+Command: .venv/bin/python experiments/validation/refinement.py [--smoke]
+Expected: x_C(10 s) does not depend on the mesh, y_C in the grasp changes by less than 0.03 mm, and
+the peak of F_x, which rides on node transitions, falls with the mesh. About half a minute on one
+core.
 """
 
 from dataclasses import dataclass

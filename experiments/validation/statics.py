@@ -8,12 +8,12 @@ tributary length, so a finer mesh has the same springs per length and the force 
 that of a continuous layer of springs, with the square of the spacing. Stiffer springs should
 converge to a rigid contact, with 1 / K_n.
 
-Command: .venv/bin/python experiments/validation/statics.py [--smoke] Expected: at the full grasp
-70.16 N on the upper pad with the default 1 mm nodes and K_n, 0.5 % below the limit of fine meshes
-(70.54 N), the difference falling fourfold per mesh; y_C between 23.194 and 23.197 mm on every mesh.
-The default K_n is not stiff enough to count as a mere penalty: a rigid contact takes 79.3 N, 13 %
-more. Light grasps, in which only a few nodes touch, are far less accurate: at 0.15 mm, 0.53 N on 1
-mm nodes against 0.79 N on the finest. 15 s on one core.
+Command: .venv/bin/python experiments/validation/statics.py [--smoke]
+Expected: at the full grasp 70.16 N on the upper pad with the default 1 mm nodes and K_n, 0.5 %
+below the limit of fine meshes (70.54 N), the difference falling fourfold per mesh; y_C between
+23.194 and 23.197 mm on every mesh. The default K_n is not stiff enough to count as a mere penalty:
+a rigid contact takes 79.3 N, 13 % more. Light grasps, in which only a few nodes touch, are far less
+accurate: at 0.15 mm, 0.53 N on 1 mm nodes against 0.79 N on the finest. 15 s on one core.
 """
 
 from dataclasses import asdict, dataclass

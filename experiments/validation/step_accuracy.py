@@ -6,11 +6,11 @@ Three motions: the paper's grasp and roll out (10 s), light shaking (1 s), and a
 largest errors of the disc's pose and of the forces over their range, and the relative errors of d
 theta(end) / d parameter for eight parameters, by the discrete adjoint.
 
-Command: .venv/bin/python experiments/validation/step_accuracy.py [--smoke] Expected: rtol = 1e-3 is
-about as near as a step of 2 ms, for a third of its cost in the manipulation; gradients are right
-later: within 1 % of every parameter's at rtol = 1e-6 in the roll and in the stroke (10 and 42 % off
-at 2 ms), in shaking, where some are a thousand times smaller than others, at 1e-7 (200 % at 2 ms).
-About two minutes on one core.
+Command: .venv/bin/python experiments/validation/step_accuracy.py [--smoke]
+Expected: rtol = 1e-3 is about as near as a step of 2 ms, for a third of its cost in the
+manipulation; gradients are right later: within 1 % of every parameter's at rtol = 1e-6 in the roll
+and in the stroke (10 and 42 % off at 2 ms), in shaking, where some are a thousand times smaller
+than others, at 1e-7 (200 % at 2 ms). About two minutes on one core.
 """
 
 from dataclasses import dataclass
