@@ -221,8 +221,11 @@ def peak(v: Sequence[float], coefficient: Sequence[float]) -> tuple[float, float
 
 
 RADIUS, HEIGHT, DEPTH = 19.37e-3, 4.59e-3, 44e-3  # The paper's disc and pads [m].
-STIFFNESS = 1.2e5  # K_n and K_t [N/m] of a millimetre, as in the paper; no dashpots, so that the rubber alone dissipates.
-TAU = 0.1  # Retardation time [s] of Kelvin-Voigt and of the standard linear solid: the only scale of time.
+# K_n and K_t [N/m] of a millimetre, as in the paper; no dashpots, so that the rubber alone
+# dissipates.
+STIFFNESS = 1.2e5
+# Retardation time [s] of Kelvin-Voigt and of the standard linear solid: the only scale of time.
+TAU = 0.1
 SPRING_TIME = (
     1e-6  # Retardation time [s] of instantaneous springs: too short to show at any speed here.
 )

@@ -201,7 +201,8 @@ ENOUGH = 7.3
 @dataclass(frozen=True)
 class Config:
     out: Path = Path("out/law_comparison")
-    cases: int = 100  # in all of the motions that show the difference; an eighth as many in each of the others
+    # in all of the motions that show the difference; an eighth as many in each of the others
+    cases: int = 100
     seed: int = 0
     workers: int = 2
     smoke: bool = False  # two cases of two motions

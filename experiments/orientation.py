@@ -321,7 +321,8 @@ class Result:
     config: Config
     gains: Gains
     grip: float  # [N]
-    carrying: float  # the coefficient of friction m a / 2 N that carrying the disc asks for at `disc_speed`
+    # the coefficient of friction m a / 2 N that carrying the disc asks for at `disc_speed`
+    carrying: float
     turning: float  # and I alpha / 2 R N, turning it
     rigid: dict[str, Rigid] = field(default_factory=dict)  # predictions by shape
     alone: dict[str, Outcome] = field(default_factory=dict)  # by shape, by loops alone

@@ -86,7 +86,8 @@ SOFT: dict[str, Any] = {
 }
 """The vertical loop, two contact points an element, and a slip law that is single-valued under this
 force."""
-SLOW = 1.0  # Retardation time [s] of slow rubbers: what passes a contact of 9 mm at 4.4 mm/s is there for two.
+# Retardation time [s] of slow rubbers: what passes a contact of 9 mm at 4.4 mm/s is there for two.
+SLOW = 1.0
 MM = 1e3
 
 

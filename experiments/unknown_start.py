@@ -314,7 +314,10 @@ def main(config: Config) -> None:
                 "shown": shown, "inside": inside, "ci95": [own.low, own.high],
                 "sd_unknown": at.unknown[name], "sd_known": at.known[name],
                 "price": at.unknown[name] / at.known[name],
-                "errors": [float(np.log(one[name].last / TRUTH[name])) / one[name].relative_sd for one in found],
+                "errors": [
+                    float(np.log(one[name].last / TRUTH[name])) / one[name].relative_sd
+                    for one in found
+                ],
             }  # fmt: skip
             cells.append(
                 (case, name, f"{at.unknown[name]:.1%}", f"{at.known[name]:.1%}",

@@ -35,7 +35,8 @@ class Straight(torch.autograd.Function):
     forward = staticmethod(lambda ctx, x: x.clamp(max=0.5))
     backward = staticmethod(lambda ctx, g: g)
 try:
-    simulate(SoftGrasp(friction=lambda E, F_N, R: Straight.apply(E) / (R + 10.0)), t, y0=rest(model).detach())
+    hidden = SoftGrasp(friction=lambda E, F_N, R: Straight.apply(E) / (R + 10.0))
+    simulate(hidden, t, y0=rest(model).detach())
 except TypeError as error:
     assert "the torch.autograd.Function" in str(error), error
 else:

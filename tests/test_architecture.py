@@ -12,23 +12,28 @@ import torchsoft
 ROOT = Path(torchsoft.__file__).parent
 FLOWS = {
     "": """
-        channels diagnostic files threads tables csvfile quantity codegen physics paper cost solve scenario excitation processes
+        channels diagnostic files threads tables csvfile quantity codegen physics paper cost
+        solve scenario excitation processes
         plot materials rigs sysid reduced datasets experiment cli __main__
     """,
     "codegen": "graph derivatives operations trace pointwise emit . invoke",
     "physics": """
-        arguments mesh shapes contact material pads motion multibond state parts condensed validity rig energy statics .
+        arguments mesh shapes contact material pads motion multibond state parts condensed
+        validity rig energy statics .
     """,
     "paper": "parameters rig equilibrium .",
     "physics.mesh": "mesh compliance block quads .",
     "physics.shapes": "shape oval rounded contour .",
     "solve": """
-        grid kernel laws system progress tolerances rates stability stepper adjoint tangent trajectory
+        grid kernel laws system progress tolerances rates stability stepper adjoint
+        tangent trajectory
         ledger simulate batch torchdiffeq .
     """,
     "sysid": """
-        initial_state recording unknowns prediction noise runs problem first_samples synthetic fit plan setpoints prechecks
-        residual_tests assumptions sensitivity profile posterior nuts estimate comparison result identification compare
+        initial_state recording unknowns prediction noise runs problem first_samples
+        synthetic fit plan setpoints prechecks
+        residual_tests assumptions sensitivity profile posterior nuts estimate comparison
+        result identification compare
         columns configuration measured criterion planner design figures report .
     """,
     "rigs": "fields parts control motion geometry build course balance check written run .",

@@ -47,7 +47,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 )
 def test_neither_an_import_nor_help_waits_for_torch(code: str) -> None:
     slow = "'torch', 'scipy', 'numba', 'matplotlib', 'xarray'"
-    code = f"import sys\ntry: {code}\nexcept SystemExit: pass\nassert not sys.modules.keys() & {{{slow}}}"
+    code = (
+        f"import sys\ntry: {code}\nexcept SystemExit: pass\nassert not sys.modules.keys() & "
+        f"{{{slow}}}"
+    )
     subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
 
 

@@ -152,7 +152,10 @@ ELEMENTWISE = {  # of u, any numbers, and v, positive numbers
         + torch.eye(4).double()[0]
     ),
 }
-OF_ONE = "abs sign sgn sin cos tan atan deg2rad rad2deg tanh sinh cosh exp expm1 erf sigmoid relu square reciprocal floor"
+OF_ONE = (
+    "abs sign sgn sin cos tan atan deg2rad rad2deg tanh sinh cosh exp expm1 erf sigmoid relu "
+    "square reciprocal floor"
+)
 ELEMENTWISE |= {
     name: lambda u, v, name=name: getattr(torch, name)(u) * v for name in OF_ONE.split()
 }

@@ -157,7 +157,10 @@ def grip(
         },
         contacts={name: Contact(name, "disc", contact) for name in ("lower", "upper")},
         actuators=loops(top) if loops else None, groups={"rubber": soft, "contact": contact},
-        reference=Reference(**({} if jaw and loops else reference) | (motion(top) if callable(motion) else motion or {})),
+        reference=Reference(
+            **({} if jaw and loops else reference)
+            | (motion(top) if callable(motion) else motion or {})
+        ),
     )  # fmt: skip
     pose = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64)).pose | {
         "disc": f64(3e-4, y, 0.0)

@@ -305,7 +305,8 @@ def memory(name):
 
 unit_compliance(PadMesh(0.1, 0.01, 40, 4), 0.45)
 for mesh in (
-    PadMesh(0.1, 5e-3, 600, 4), PadMesh(0.05, 0.05, 100, 100), CurvedPadMesh(0.1, 2e-2, 400, 24, radius=0.1),
+    PadMesh(0.1, 5e-3, 600, 4), PadMesh(0.05, 0.05, 100, 100),
+    CurvedPadMesh(0.1, 2e-2, 400, 24, radius=0.1),
 ):
     _ = mesh.matrices, mesh.surface
     with open("/proc/self/clear_refs", "w") as file:

@@ -398,7 +398,10 @@ def test_a_name_that_is_no_files_is_refused(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert main(["init", name]) == 2
-    expected = f"torchsoft: error: NAME should be the name of a file, such as mine or mine.toml, not {name!r}\n"
+    expected = (
+        "torchsoft: error: NAME should be the name of a file, such as mine or mine.toml, not "
+        f"{name!r}\n"
+    )
     assert capsys.readouterr().err == expected
     assert list(tmp_path.iterdir()) == []
 

@@ -550,7 +550,8 @@ def test_a_sampled_set_point_follows_the_profile_it_was_taken_from() -> None:
 
 KILLED = """
 import sys
-from test_sysid import BASE, SENSORS, RTOL, STROKES, TRUE, Problem, Unknown, identify, record, rest_known
+from test_sysid import BASE, SENSORS, RTOL, STROKES, TRUE
+from test_sysid import Problem, Unknown, identify, record, rest_known
 
 data = record("strokes", STROKES, TRUE, BASE, SENSORS, seed=5)
 unknowns = {"pad.E": Unknown(nominal=1.4e6), "pad.tau": Unknown()} | rest_known()

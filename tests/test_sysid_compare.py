@@ -57,9 +57,7 @@ def shares(D: float, draws: list[np.ndarray]) -> dict[str, float]:
     return {one: said.count(one) / len(said) for one in ("right", "wrong", "cannot tell")}
 
 
-def test_with_white_noise_a_wrong_law_is_never_named_and_the_right_one_where_predictions_differ_enough() -> (
-    None
-):
+def test_a_wrong_law_is_never_named_and_the_right_one_where_predictions_differ() -> None:
     """As a normal distribution has it: z is (D / 2, 1) where the first law made the data."""
     rng = np.random.default_rng(0)
     draws = list(rng.standard_normal((50, len(T))))

@@ -285,7 +285,10 @@ def test_what_recordings_told_is_in_the_table(page: Page, full: IdentificationRe
 
 def test_assumptions_that_matter_stand_open_and_others_are_folded(page: Page) -> None:
     folded = page.text.index("\n1 that move nothing by more than 0.5 standard deviations\n")
-    said = "\nthe disc weighs 1 kg\nit were not\n−4.2 sd of pad.E\nyes −3.1 ± 1.2 %: the sum of squares would fall by 99\n"
+    said = (
+        "\nthe disc weighs 1 kg\nit were not\n−4.2 sd of pad.E\nyes −3.1 ± 1.2 %: the sum of "
+        "squares would fall by 99\n"
+    )
     assert page.text.index(said) < folded
     assert page.text.index("\nslip is smooth\nit were not\nnot checked: a run failed\n") < folded
     assert (

@@ -31,7 +31,10 @@ class Cost(NamedTuple):
     @property
     def sentence(self) -> str:
         disk = f", and {self.disk:.3g} GiB on the disk" if self.disk >= 1 else ""
-        return f"this takes about {duration(self.seconds)} ({self.steps:.2g} steps), {self.memory:.2g} GiB of memory{disk}"
+        return (
+            f"this takes about {duration(self.seconds)} ({self.steps:.2g} steps), "
+            f"{self.memory:.2g} GiB of memory{disk}"
+        )
 
 
 class Costly(ValueError):

@@ -110,7 +110,10 @@ def finding(one: Mapping[str, Any], data: Any, within: str) -> str:
         tag = one["ctx"]["discriminator"].strip("'")
         if "expected_tags" not in one["ctx"]:
             return f"{field}.{tag} is missing"
-        return f"{field}.{tag} should be one of {one['ctx']['expected_tags']}, not {shown(one['input'][tag])}"
+        return (
+            f"{field}.{tag} should be one of {one['ctx']['expected_tags']}, not "
+            f"{shown(one['input'][tag])}"
+        )
     if judged:
         text = line(text.removeprefix("Value error, "))
         return f"{place}: {text}" if place else text

@@ -5,12 +5,13 @@ All in one process and one run, medians of repeated timings in turns, so that th
 noisy machine:
 
 - the 30 s manipulation by two tolerances and by equal steps; errors against a run at rtol 1e-7;
-- over the run the sweep for the gradient of all parameters, and what the Jacobian for 8 parameters adds;
+- over the run the sweep for the gradient of all parameters, and what the Jacobian for 8 adds;
 - 64 trajectories of 4 s and 1,000 of 0.3 s with parameters of their own, on one and two threads;
 - growth with the surface nodes and the size of a batch, with fitted exponents;
-- with `--peers` the same equations under scipy's, torchdiffeq's and diffrax's integrators over a window in mid-roll. All call
-  the compiled right-hand side (`torchsoft.solve.rates`). Every method is run by a series of tolerances, from loose to tight,
-  until it is as exact as the stepper, in the disc's place and in the nodal forces; that run is timed, without compiling.
+- with `--peers` the same equations under scipy's, torchdiffeq's and diffrax's integrators over a
+  window in mid-roll. All call the compiled right-hand side (`torchsoft.solve.rates`). Every method
+  is run by a series of tolerances, from loose to tight, until it is as exact as the stepper, in the
+  disc's place and in the nodal forces; that run is timed, without compiling.
 
 Command: .venv/bin/python experiments/validation/benchmark.py [--peers] [--smoke]
 Expected: the sweep at most 0.6 of a run and the Jacobian at most 2 by tolerances, more by equal

@@ -10,19 +10,21 @@ from torchsoft.cli.results import add_out, failed, say, try_folder
 IDENTIFY = """\
 Which parameters explain these recordings, and how sure is that?
 
-DATA are CSV files with a heading such as `t [s], x_d [mm], y_d [mm], F_ff [N], x_C [mm], theta [deg]`, or trajectory files of
-this project (.nc). CONFIG.toml states what is known, what is unknown and how good the sensors are; examples/identify has both.
-Recordings that look wrong (a sign, a unit, set-points too far apart) are refused, or named, before anything is fitted.
-Writes answer.json and report.html, and comparison.json where there are competing laws. Interrupted, the same command continues
-where it was."""
+DATA are CSV files with a heading such as `t [s], x_d [mm], y_d [mm], F_ff [N], x_C [mm], theta
+[deg]`, or trajectory files of this project (.nc). CONFIG.toml states what is known, what is
+unknown and how good the sensors are; examples/identify has both. Recordings that look wrong (a
+sign, a unit, set-points too far apart) are refused, or named, before anything is fitted. Writes
+answer.json and report.html, and comparison.json where there are competing laws. Interrupted, the
+same command continues where it was."""
 
 
 EXPLAIN = """\
 Why does the model not explain these recordings?
 
-Identifies as `identify` does, and where a misfit is left that no test of an assumption explains to first order, fits again
-without one assumption after the other until one explains the data: minutes each, the progress names which. With
-the checkpoint of an identification it begins where that ended."""
+Identifies as `identify` does, and where a misfit is left that no test of an assumption explains
+to first order, fits again without one assumption after the other until one explains the data:
+minutes each, the progress names which. With the checkpoint of an identification it begins where
+that ended."""
 
 
 def add_commands(commands: Any) -> None:

@@ -9,12 +9,14 @@ from torchsoft.cli.results import add_out, say, try_folder
 MATERIAL_FIT = """\
 Which material relaxes, or creeps, as this one did?
 
-FILE.csv has the column `t` [s, ms, min, h], counted from when the load was put on, and one pair of these, each with its unit
-in the heading: `strain` [1, %], `stretch` [1] or `elongation` [m, mm, ...] with `stress` [Pa, kPa, MPa] or `force` [N, ...],
-nominal and along the one direction of the test; or alone `modulus` [Pa, ...], of a strain put on at t = 0 and held, or
-`compliance` [1/Pa, ...], of such a stress. The whole history counts: ramps need not be cut off.
-Fits a relaxation series (prony) to a relaxation test, a generalised Kelvin chain to a creep test, and says what the rows do
-not tell. Writes material.toml, with the names of the constructor's arguments, summary.json and fit.png."""
+FILE.csv has the column `t` [s, ms, min, h], counted from when the load was put on, and one pair
+of these, each with its unit in the heading: `strain` [1, %], `stretch` [1] or `elongation` [m,
+mm, ...] with `stress` [Pa, kPa, MPa] or `force` [N, ...], nominal and along the one direction of
+the test; or alone `modulus` [Pa, ...], of a strain put on at t = 0 and held, or `compliance`
+[1/Pa, ...], of such a stress. The whole history counts: ramps need not be cut off. Fits a
+relaxation series (prony) to a relaxation test, a generalised Kelvin chain to a creep test, and
+says what the rows do not tell. Writes material.toml, with the names of the constructor's
+arguments, summary.json and fit.png."""
 
 PRESETS = """\
 Rubbers from the literature, every coefficient marked `published`, with where, or `assumed`."""

@@ -8,18 +8,21 @@ from typing import Any
 from torchsoft.cli.results import add_out, failed, say, try_folder
 
 RUN = """\
-Simulates the rig that a TOML file describes, and writes trajectory.nc, summary.json, figures and a video to a folder.
+Simulates the rig that a TOML file describes, and writes trajectory.nc, summary.json, figures and
+a video to a folder.
 
-The file is checked first, and a rig that makes no sense is not run. Interrupted, what was simulated until then is written."""
+The file is checked first, and a rig that makes no sense is not run. Interrupted, what was
+simulated until then is written."""
 
 CHECK = """\
-Says what is wrong or dangerous in a rig file before any run: bodies that overlap or do not fit, a loop that is unstable,
-strains beyond linear elasticity, steps that are too coarse, bodies that nothing carries, recordings that end early.
-The exit status is 2 where there is an error; warnings and notes are said only."""
+Says what is wrong or dangerous in a rig file before any run: bodies that overlap or do not fit,
+a loop that is unstable, strains beyond linear elasticity, steps that are too coarse, bodies that
+nothing carries, recordings that end early. The exit status is 2 where there is an error;
+warnings and notes are said only."""
 
 INIT = """\
-Writes NAME.toml, a rig to start from: a disc between two pads, with the unit and the meaning of every number in a comment.
-A folder that is not there is made."""
+Writes NAME.toml, a rig to start from: a disc between two pads, with the unit and the meaning of
+every number in a comment. A folder that is not there is made."""
 
 
 def add_commands(commands: Any) -> None:

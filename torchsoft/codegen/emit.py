@@ -108,7 +108,9 @@ def _instruction(g: Graph, node: int, operands: list[str]) -> Iterator[str]:
     elif op in INSTRUCTIONS:
         yield f"%v{node} = {INSTRUCTIONS[op].format(*operands)}"
     else:
-        yield f"%v{node} = call double @{FUNCTIONS[op]}({', '.join('double ' + a for a in operands)})"
+        yield (
+            f"%v{node} = call double @{FUNCTIONS[op]}({', '.join('double ' + a for a in operands)})"
+        )
 
 
 def _address(g: Graph, node: int, pointer: str, name: str, operands: list[str]) -> Iterator[str]:

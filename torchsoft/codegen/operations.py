@@ -26,7 +26,10 @@ _MOVES = (
 )
 MOVES = set(_MOVES.split())
 # results that do not depend on the values of the arguments
-_CONSTANT = "zeros_like ones_like full_like empty_like new_zeros new_ones new_full new_empty new_empty_strided"
+_CONSTANT = (
+    "zeros_like ones_like full_like empty_like new_zeros new_ones new_full new_empty "
+    "new_empty_strided"
+)
 CONSTANT = set(_CONSTANT.split())
 READS = {"_local_scalar_dense", "is_nonzero", "item", "nonzero", "masked_select", "equal"}
 
@@ -69,7 +72,10 @@ def _primitive(op: str) -> Callable[..., int]:
     return lambda g, *args: g(op, *args)
 
 
-_SAME = "neg abs sqrt sin cos tan asin acos atan atan2 sinh cosh tanh exp expm1 log log1p erf floor mul lt le gt ge eq ne"
+_SAME = (
+    "neg abs sqrt sin cos tan asin acos atan atan2 sinh cosh tanh exp expm1 log log1p erf floor "
+    "mul lt le gt ge eq ne"
+)
 _RENAMED = {"where": "select", "detach": "stop"} | {
     f"{kind}_{op}": op for kind in ("logical", "bitwise") for op in ("and", "or", "not")
 }

@@ -15,7 +15,10 @@ from torchsoft.codegen.trace import Trace, UnknownOperation, traced
 POINTS = 3
 """Points that are traced side by side."""
 
-REMEDY = "a law is of one point, so leave the points' own dimension alone: mean(-1) of a stack of a point's numbers is fine"
+REMEDY = (
+    "a law is of one point, so leave the points' own dimension alone: mean(-1) of a stack of a "
+    "point's numbers is fine"
+)
 
 
 class Watch(Trace):

@@ -187,7 +187,10 @@ class Trace(TorchDispatchMode):
     def _recorded(self, name: str, func: Any, args: tuple, kwargs: Mapping[str, Any]) -> Any:
         if name in MOVES:
             if self.holds((args[1:], kwargs)):
-                remedy = "use torch.where, or torch.nn.functional.embedding to look up rows of a parameter"
+                remedy = (
+                    "use torch.where, or torch.nn.functional.embedding to look up rows of a "
+                    "parameter"
+                )
                 raise self.refused(f"{func} at places that depend on values", remedy)
             place = lambda t: (
                 torch.from_numpy(np.array(self.nodes(t))) if isinstance(t, Tensor) else t

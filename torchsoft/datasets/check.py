@@ -46,7 +46,10 @@ def findings(url: str) -> Iterator[str]:
     if not manifest.commit:
         yield f"{MANIFEST}: no commit; the dataset was made outside a repository"
     if manifest.config_hash != config.hash:
-        yield f"{MANIFEST}: config_hash is {manifest.config_hash}, but the configuration's is {config.hash}"
+        yield (
+            f"{MANIFEST}: config_hash is {manifest.config_hash}, but the configuration's is "
+            f"{config.hash}"
+        )
         return  # nothing else can be held against a configuration that was changed
     if manifest.seed != config.seed:
         yield f"{MANIFEST}: seed is {manifest.seed}, but the configuration's is {config.seed}"
@@ -59,7 +62,10 @@ def findings(url: str) -> Iterator[str]:
         yield from wrong
         return
     if unfinished := sorted(set(range(config.shards)) - store.finished):
-        yield f"{len(unfinished)} of {config.shards} shards are not finished, the first is shard {unfinished[0]}"
+        yield (
+            f"{len(unfinished)} of {config.shards} shards are not finished, the first is shard "
+            f"{unfinished[0]}"
+        )
     design = points(config)
     for shard in sorted(store.finished):
         yield from check_shard(data, config, shard, design)
@@ -151,7 +157,10 @@ def check_physics(config: Config, one: dict[str, Any]) -> Iterator[str]:
     if abs(relative - booked) > 1e-9:
         yield f"energy_residual_rel is {booked:.3g}, but the series have {relative:.3g}"
     if relative > config.ledger_tolerance:
-        yield f"energy residual is {relative:.2g} of the energy injected, above {config.ledger_tolerance}"
+        yield (
+            f"energy residual is {relative:.2g} of the energy injected, above "
+            f"{config.ledger_tolerance}"
+        )
     for pad in ("lower", "upper"):
         force = one[f"normal_force_{pad}"]
         if (force < 0).any():

@@ -167,7 +167,10 @@ def main(arguments: list[str] | None = None) -> int:
         config = Config.from_toml(given.config)
         agree(cost(config, workers), given.yes, HELP)
         if config.step is not None and config.step > COARSE:
-            note = f"note: step = {config.step:g} s is coarse: the energy balance may be off by percents"
+            note = (
+                f"note: step = {config.step:g} s is coarse: the energy balance may be off by "
+                "percents"
+            )
             print(note, file=sys.stderr)
         with (
             dask_cluster(given.scheduler) if given.scheduler else local_workers(workers) as executor

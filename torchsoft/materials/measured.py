@@ -178,4 +178,7 @@ def check_rows(path: Path, table: csvfile.Numbers) -> None:
 def hint(name: str, columns: int) -> str:
     """What helps with a column that is not known."""
     known = "; ".join(f"{column} [{', '.join(units)}]" for column, units in KNOWN.items())
-    return f"{'; separate columns with commas' if columns == 1 else ''}; columns and their units are {known}"
+    return (
+        f"{'; separate columns with commas' if columns == 1 else ''}; columns and their units are "
+        f"{known}"
+    )

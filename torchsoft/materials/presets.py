@@ -11,8 +11,14 @@ from typing import NamedTuple
 from torchsoft.paper.parameters import Parameters, Source
 from torchsoft.physics.material import KelvinVoigt
 
-GENT = "A. N. Gent, On the relation between indentation hardness and Young's modulus, Rubber Chem. Technol. 31 (1958) 896-906"
-LINDLEY = "P. B. Lindley, Engineering Design with Natural Rubber, 4th ed., Malaysian Rubber Producers' Research Association"
+GENT = (
+    "A. N. Gent, On the relation between indentation hardness and Young's modulus, Rubber Chem. "
+    "Technol. 31 (1958) 896-906"
+)
+LINDLEY = (
+    "P. B. Lindley, Engineering Design with Natural Rubber, 4th ed., Malaysian Rubber Producers' "
+    "Research Association"
+)
 JOHNSTON = (
     "I. D. Johnston et al., Mechanical characterization of bulk Sylgard 184 for microfluidics and "
     "microengineering, J. Micromech. Microeng. 24 (2014) 035017"

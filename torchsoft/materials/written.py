@@ -96,7 +96,10 @@ def printed(fit: Fit) -> str:
         f"{name:<7}{value:<12.5g}{units[name[0]]:<3}+- {196 * fit.sd[name] / value:.2g} %"
         for name, value in fit.values.items()
     ]
-    head = f"{fit.measured.path.name}: {fit.measured.test} test, {fit.kind} of {fit.terms} terms, residual {fit.rms:.2%}"
+    head = (
+        f"{fit.measured.path.name}: {fit.measured.test} test, {fit.kind} of {fit.terms} terms, "
+        f"residual {fit.rms:.2%}"
+    )
     return "\n".join([head, *rows, *(f"note: {notice}" for notice in fit.notices)])
 
 

@@ -203,7 +203,10 @@ class SoftContact(nn.Module):
         ):
             return "eta + R_t must be positive, since the slip rate is effort / (eta + R_t)"
         if isinstance(self.friction, Coulomb) and self.R_t.item() <= 0:
-            return "Coulomb's friction needs R_t > 0, since the stretch is re-anchored through the dashpot"
+            return (
+                "Coulomb's friction needs R_t > 0, since the stretch is re-anchored through the "
+                "dashpot"
+            )
         return ""
 
     def jumps(self, F_N: float) -> str:

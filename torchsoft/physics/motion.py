@@ -69,7 +69,10 @@ class Piecewise(nn.Module):
         ):
             return f"`times` must increase strictly, from one time on, but are {line(t.tolist())}"
         if self.values.shape != t.shape:
-            return f"`values` must hold one number per time ({len(t)}), but have shape {tuple(self.values.shape)}"
+            return (
+                f"`values` must hold one number per time ({len(t)}), but have shape "
+                f"{tuple(self.values.shape)}"
+            )
         return ""
 
     def control(self) -> Tensor:

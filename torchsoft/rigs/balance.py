@@ -229,10 +229,16 @@ def steps(e: Estimate, step: float, fastest: float, flies: float) -> Iterator[Di
     for name, motion in e.file.motion.items():
         if isinstance(motion, ProfileTable) and len(motion.times) > 1:
             span = min(b - a for a, b in pairwise(motion.times))
-            why = f"motion.{name} goes from value to value within {span:g} s; take {span / STEPS_PER_PROFILE:.2g} s or less"
+            why = (
+                f"motion.{name} goes from value to value within {span:g} s; take "
+                f"{span / STEPS_PER_PROFILE:.2g} s or less"
+            )
             limits.append((span / STEPS_PER_PROFILE, why))
     if flies > 0:
-        why = f"a body comes flying and may be through a pad between two of them; take {PASSED / flies:.2g} s or less"
+        why = (
+            "a body comes flying and may be through a pad between two of them; take "
+            f"{PASSED / flies:.2g} s or less"
+        )
         limits.append((PASSED / flies, why))
     swinging = {f"a mode of the rig swings with {fastest:.3g} rad/s": fastest}
     swinging |= {

@@ -213,7 +213,9 @@ def _spread(
             raise ValueError(
                 f"`parameters[{name!r}]` must have one entry a run, but is a single number"
             )
-    shared = {  # a single rig is a module, single times a vector, a single start too, a single reference a module
+    # a single rig is a module, single times a vector, a single start too, a single reference a
+    # module
+    shared = {
         "rig": (rig, isinstance(rig, nn.Module)),
         "t": (t, isinstance(t, Tensor) and t.ndim == 1),
         "y0": (y0, y0 is None or (isinstance(y0, Tensor) and y0.ndim == 1)),

@@ -245,7 +245,10 @@ def check_table(table: Columns) -> Columns:
         elif t < before:
             what = f"time goes back, from {before:g} to {t:g} s"
         else:
-            what = f"{t - before:.3g} s are missing before it; set-points are needed every {GAP} s or oftener"
+            what = (
+                f"{t - before:.3g} s are missing before it; set-points are needed every {GAP} s or "
+                "oftener"
+            )
         raise ValueError(f"{table.at(i + 1)}, column `t`: {what}")
     if (late := np.flatnonzero(np.abs(values["t"]) > LATE)).size:
         raise ValueError(

@@ -123,7 +123,10 @@ class Versus:
                 f"needed), and z = {self.z:.2g} ({APART:g} is needed)"
             )
             if self.evidence >= EVIDENCE > sure and self.z >= APART:
-                said += f", but the steps of the simulation move that by {self.numerical:.2g}: take a tighter tolerance"
+                said += (
+                    f", but the steps of the simulation move that by {self.numerical:.2g}: take a "
+                    "tighter tolerance"
+                )
             elif self.distance < 2 * APART:
                 said += (
                     f"; their predictions differ by {self.distance:.2g} times the noise over all "

@@ -187,7 +187,8 @@ def conclude(
         correlation=(C_free / np.outer(sd, sd)).tolist(),
         directions=directions(labels, values, vectors),
         chi2=chi2,
-        chi2_stated=sum(float(one.raw @ one.raw) for one in left) / max(len(exact) - int(free.sum()), 1),
+        chi2_stated=sum(float(one.raw @ one.raw) for one in left)
+        / max(len(exact) - int(free.sum()), 1),
         converged=end.at_rest,
         residuals=residual_channels(problem, at, how.fitted),
         heldout=predicted,

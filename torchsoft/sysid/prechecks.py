@@ -320,11 +320,17 @@ def disagreement(
         return None
     slow, began = np.diff(e) / np.sqrt(2), float(e[: max(2, len(e) // 20)].mean())
     if feed and rms(slow) <= max(SLOW * rms(e), white) and abs(began) <= 0.5 * rms(e):
-        words = f"{name} is {float(e.mean()):+.3g} {unit} more, on the average, than the controller gives"
+        words = (
+            f"{name} is {float(e.mean()):+.3g} {unit} more, on the average, than the controller "
+            "gives"
+        )
         return Change(
             feed, f"{words}: was a force fed forward that {feed} does not have?", slow, grave=False
         )
-    words = f"{name} is not what the controller gives: are its gains, units, zeros, times and set-points right?"
+    words = (
+        f"{name} is not what the controller gives: are its gains, units, zeros, times and "
+        "set-points right?"
+    )
     return Change(f"loop of {name}", words, e, grave=False)
 
 
@@ -425,7 +431,10 @@ def against_run(
             continue
         ratio = measured / max(run, 1e-300)
         if not 1 / LARGER < ratio < LARGER and run > 0:
-            text = f"{name} moves {ratio:.3g} times as much as in a run with the parameters of the start"
+            text = (
+                f"{name} moves {ratio:.3g} times as much as in a run with the parameters of the "
+                "start"
+            )
             known = [
                 (abs(math.log(ratio / factor)), said)
                 for factor, said in confusions(recording.units[name])
@@ -442,7 +451,10 @@ def against_run(
         elif min(measured, run) >= MOVES * noise:
             alike = float(np.mean((y - y.mean()) * (p - p.mean()))) / (measured * run)
             if alike < OPPOSITE:
-                text = f"{name} looks as if its sign were opposite: its correlation with a run from the start is {alike:.2f}"
+                text = (
+                    f"{name} looks as if its sign were opposite: its correlation with a run from "
+                    f"the start is {alike:.2f}"
+                )
                 yield found(f"sign of {name}", recording, text, grave=True)
 
 

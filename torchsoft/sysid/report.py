@@ -88,7 +88,8 @@ def picture(figure: Figure, alt: str, caption: str = "", kind: str = "") -> str:
     inside = base64.b64encode(buffer.getvalue()).decode()
     below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
     of = f' class="{kind}"' if kind else ""
-    return f'<figure{of}><img alt="{escape(alt)}" src="data:image/png;base64,{inside}">{below}</figure>'
+    image = f'<img alt="{escape(alt)}" src="data:image/png;base64,{inside}">'
+    return f"<figure{of}>{image}{below}</figure>"
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[Cell]], caption: str = "") -> str:
@@ -107,7 +108,8 @@ def table(head: Sequence[str], rows: Sequence[Sequence[Cell]], caption: str = ""
     )
     body = "".join(f"<tr>{''.join(cell(i, row[i]) for i in kept)}</tr>" for row in rows)
     above = f"<caption>{escape(caption)}</caption>" if caption else ""
-    return f'<div class="wide"><table>{above}<thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
+    inside = f"{above}<thead><tr>{top}</tr></thead><tbody>{body}</tbody>"
+    return f'<div class="wide"><table>{inside}</table></div>'
 
 
 def text_of(cell: Cell) -> str:
@@ -446,7 +448,10 @@ def data(
         shown = ""
         for trace in (trace for trace in drawn if trace.recording == one.name):
             rms = float(np.sqrt(np.mean(trace.residual**2)))
-            alt = f"{trace.channel} of {one.name}, measured and predicted: residuals are {rms:.2f} times the noise"
+            alt = (
+                f"{trace.channel} of {one.name}, measured and predicted: residuals are {rms:.2f} "
+                "times the noise"
+            )
             figure = trace_figure(
                 trace, within.get((one.name, trace.channel)), noise.get(trace.channel)
             )

@@ -177,8 +177,10 @@ class IdentificationResult:
     x: list[float]
     correlation: list[list[Number]]
     directions: list[Direction]
-    chi2: Number  # sum of squared residuals over degrees of freedom; 1 where model and noise are right
-    chi2_stated: Number  # the same over the noise that sensors state, white: colour that was found takes nothing from it
+    # sum of squared residuals over degrees of freedom; 1 where model and noise are right
+    chi2: Number
+    # the same over the noise that sensors state, white: colour that was found takes nothing from it
+    chi2_stated: Number
     converged: bool
     residuals: list[ChannelResiduals]
     heldout: dict[
@@ -221,7 +223,10 @@ class IdentificationResult:
         identifiable."""
         mine = [e for e in self.estimates if e.kind == "parameter"]
         worst = max(self.residuals, key=lambda one: one.stated, default=None)
-        text = f"{sum(e.identifiable for e in mine)} of {len(mine)} parameters identifiable, χ² = {self.chi2:.3g}"
+        text = (
+            f"{sum(e.identifiable for e in mine)} of {len(mine)} parameters identifiable, χ² = "
+            f"{self.chi2:.3g}"
+        )
         if not abs(self.chi2_stated - self.chi2) < 0.1 * self.chi2:
             text += f", {self.chi2_stated:.3g} against the stated noise"
         if worst is None or worst.stated < UNEXPLAINED:
@@ -433,7 +438,8 @@ def described(
         "contributions": contributions(problem, x, free, J, fitted),
         "combinations": seen_together(problem, free, C), "noise": noise,
         "assumptions": list(checks),
-        "versions": {"python": platform.python_version()} | {name: version(name) for name in packages}, "rigs": {recording.name: recording.rig for recording in problem.recordings},
+        "versions": {"python": platform.python_version()} | {name: version(name) for name in packages}, 
+        "rigs": {recording.name: recording.rig for recording in problem.recordings},
     }  # fmt: skip
 
 

@@ -36,7 +36,10 @@ from torchsoft.sysid.recording import Array, Recording, RunContext
 from torchsoft.sysid.unknowns import NUISANCES
 from torchsoft.threads import parallel_map, single_threaded
 
-MEANING = "Runs of an identification that is not done; torchsoft removes the .run files in this folder when it is.\n"
+MEANING = (
+    "Runs of an identification that is not done; torchsoft removes the .run files in this folder "
+    "when it is.\n"
+)
 
 RUN = re.compile(r"[0-9a-f]{64}\.run")
 """Names of the results."""

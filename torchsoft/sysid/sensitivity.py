@@ -426,7 +426,10 @@ def assumption_notices(checked: Checked) -> list[str]:
         label, move = best.most_moved
         text = f"the data contradict that {best.stated}: the sum of squares {best.falls}"
         if best.parameter:
-            text += f" with {best.parameter} = {best.value:.6g} ({best.favoured:+.3g} {best.unit}, +- {best.favoured_sd:.2g})"
+            text += (
+                f" with {best.parameter} = {best.value:.6g} ({best.favoured:+.3g} {best.unit}, +- "
+                f"{best.favoured_sd:.2g})"
+            )
         else:
             text += f" if {best.otherwise}"
             if best.kind in ("known", "sensor"):
@@ -437,7 +440,10 @@ def assumption_notices(checked: Checked) -> list[str]:
             under = ", ".join(
                 f"{name} = {value:.4g}" for name, value in list(best.under.items())[:UNDER]
             )
-            text += f"; {label} would move by {abs(move):.2g} standard deviations; estimates under it: {under}"
+            text += (
+                f"; {label} would move by {abs(move):.2g} standard deviations; estimates under it: "
+                f"{under}"
+            )
         out.append(text + (f"; so would it with others: {', '.join(rivals)}" if rivals else ""))
         out += [
             f"the data also favour another value than stated: {c.stated} (the sum of squares "

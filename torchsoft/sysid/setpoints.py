@@ -168,7 +168,10 @@ def sparse_finding(
             "time, a little off?"
         )
         return found(f"rate of {setpoint}", recording, text, worst.noises > HOPELESS)
-    size = f"{worst.error:.2g} {recording.units[worst.channel]}, {worst.noises:.2g} times the noise of {worst.channel}"
+    size = (
+        f"{worst.error:.2g} {recording.units[worst.channel]}, {worst.noises:.2g} times the noise "
+        f"of {worst.channel}"
+    )
     text = (
         f"set-points {setpoint} every {1e3 * apart:.3g} ms are too sparse for this motion"
         f"{rates}: what they leave open between them makes {size}; give them every "

@@ -137,7 +137,10 @@ class Contour(Outlined):
             phi, n = shape(points + depth * normals)
             off = max(float((phi - depth).abs().max()), float((n - normals).abs().max()))
             if not off <= EXACT:
-                return f"it is so intricate that nearest points are not found: they are off by {off:.2g}"
+                return (
+                    "it is so intricate that nearest points are not found: they are off by "
+                    f"{off:.2g}"
+                )
         return ""
 
     def cubics(self) -> Tensor:

@@ -219,8 +219,10 @@ SCRATCH: dict[str, dict[str, str]] = {
         "points 3 8": "H S",  # of the touching points in the order of `active`, see `interface`
         "points 6 2": "G",
         "points 6 8": "L",
-        "int points": "window active",  # numbers of points near and touching, from every pad's first point on
-        "int pads": "windows actives low high counts",  # numbers of those, nodes of the window, numbers of touched nodes
+        # numbers of points near and touching, from every pad's first point on
+        "int points": "window active",
+        # numbers of those, nodes of the window, numbers of touched nodes
+        "int pads": "windows actives low high counts",
         "int nodes": "slot touched",
         "widest widest": "A P",  # one pad's share of Newton's system
         "2 widest": "PB",
@@ -235,12 +237,15 @@ SCRATCH: dict[str, dict[str, str]] = {
         "inputs": "effort_x",
         "1 inputs": "effort_J",
         "9": "probe",
-        "3": "decay travelled",  # way [m] since the last scan for near points, that scan's margin [m], number of scans
+        # way [m] since the last scan for near points, that scan's margin [m], number of scans
+        "3": "decay travelled",
         "4 inertial": "inertial",
         "inertial": "full",  # u' of inertial pads
         "state": "k",
     },
-    "Step": {  # what one step leaves: its start with Newton's guesses; rates, powers, bounds of the speeds of its stages
+    # what one step leaves: its start with Newton's guesses; rates, powers, bounds of the speeds of
+    # its stages
+    "Step": {
         "state": "y",
         "integrals": "integrals at_row scrap",
         "coordinates": "V guess_V",
@@ -282,7 +287,9 @@ SCRATCH: dict[str, dict[str, str]] = {
         "1 1": "decay_J",
         "state columns": "before first",
     },
-    "Tape": {  # of every stage y*, q, V, the touching points of every pad, their numbers with u and u', inertial pads' u'
+    # of every stage y*, q, V, the touching points of every pad, their numbers with u and u',
+    # inertial pads' u'
+    "Tape": {
         "stages state": "y",
         "stages coordinates": "q V",
         "int stages pads": "count",
