@@ -23,14 +23,14 @@ ROLL = {"kind": "slow_roll"}
         ({"motion": ROLL, "duration": 1e308}, "duration should be less than or equal to 100000"),
         ({"motion": {"kind": "strokes", "stroke_time": 1e-5}, "duration": 9.0},
         "motion.stroke_time = 1e-05 s makes more than"),
-        ({"motion": {"kind": "multi_sine", "frequency": [1.0, "2"]}}, "motion.frequency.1 should "
-                                                                      "be a valid number, not '2'"),
+        ({"motion": {"kind": "multi_sine", "frequency": [1.0, "2"]}},
+         "motion.frequency.1 should be a valid number, not '2'"),
         ({"motion": ROLL, "depth": True}, "depth should be a valid number, not True"),
         ({"motion": {"kind": "hop"}}, "motion.kind should be one of"),
-        ({"motion": {"kind": "knots", "x": [[0.1, 1e-3], [0.1, 0.0]]}}, "times of motion.x must "
-                                                                        "increase, but 0.1 s"),
-        ({"motion": {"kind": "knots", "y": [[2.0, 1e-3]]}}, "duration = 2 s ends before the last "
-                                                            "knot of the motion, at 2.5 s"),
+        ({"motion": {"kind": "knots", "x": [[0.1, 1e-3], [0.1, 0.0]]}},
+         "times of motion.x must increase, but 0.1 s"),
+        ({"motion": {"kind": "knots", "y": [[2.0, 1e-3]]}},
+         "duration = 2 s ends before the last knot of the motion, at 2.5 s"),
     ],
 )  # fmt: skip
 def test_an_impossible_excitation_is_refused_by_its_field(

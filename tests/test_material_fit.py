@@ -212,56 +212,50 @@ def test_every_column_and_unit_reads_the_same(tmp_path: Path) -> None:
 ONES, ZEROS = np.ones(9), np.zeros(9)
 COUNT = np.arange(9.0)
 REFUSED: dict[str, tuple[dict[str, Array], dict[str, Any], str]] = {
-    "no strain": ({"t_[s]": COUNT, "stress_[Pa]": ONES}, {}, "needs one of the columns strain, "
-                                                             "stretch, elongation"),
-    "no stress": ({"t_[s]": COUNT, "strain_[1]": ONES}, {}, "needs one of the columns stress, "
-                                                            "force, but has none of them"),
+    "no strain": ({"t_[s]": COUNT, "stress_[Pa]": ONES}, {},
+        "needs one of the columns strain, stretch, elongation"),
+    "no stress": ({"t_[s]": COUNT, "strain_[1]": ONES}, {},
+        "needs one of the columns stress, force, but has none of them"),
     "two strains": (
         {"t_[s]": COUNT, "strain_[1]": ONES, "stretch_[1]": ONES, "stress_[Pa]": ONES}, {},
         "but has strain and stretch"
     ),
     "no time": ({"strain_[1]": ONES, "stress_[Pa]": ONES}, {}, "has no column `t`"),
-    "no unit": ({"t": COUNT, "modulus_[Pa]": ONES}, {}, "row 1, column `t` has no unit: write `t "
-                                                        "[s]`"),
-    "another unit": ({"t_[s]": COUNT, "modulus_[psi]": ONES}, {}, "column `modulus` cannot be in "
-                                                                  "'psi'; it can be in Pa, kPa"),
-    "unknown column": ({"t_[s]": COUNT, "E_[Pa]": ONES}, {}, "row 1, column `E` is not known; "
-                                                             "columns and their units"),
-    "negative time": ({"t_[s]": COUNT - 1, "modulus_[Pa]": ONES}, {}, "row 2, column `t`: -1 s is "
-                                                                      "before the load"),
-    "time goes back": ({"t_[s]": np.r_[COUNT[:-1], 3], "modulus_[Pa]": ONES}, {}, "row 10, column "
-                                                                                  "`t`: 3 s is not "
-                                                                                  "after 7 s"),
-    "time stands": ({"t_[s]": np.r_[0, COUNT[:-1]], "modulus_[Pa]": ONES}, {}, "row 3, column `t`: "
-                                                                               "0 s is not after 0 "
-                                                                               "s"),
-    "few rows": ({"t_[s]": COUNT[:5], "modulus_[Pa]": ONES[:5]}, {}, "has 5 rows of numbers, but "
-                                                                     "needs at least 8"),
-    "not a number": ({"t_[s]": COUNT, "modulus_[Pa]": ONES * np.nan}, {}, "column `modulus`: 'nan' "
-                                                                          "is not a finite number"),
-    "no load": ({"t_[s]": COUNT, "strain_[1]": ZEROS, "stress_[Pa]": ONES}, {}, "the strain is "
-                                                                                "zero throughout"),
+    "no unit": ({"t": COUNT, "modulus_[Pa]": ONES}, {},
+        "row 1, column `t` has no unit: write `t [s]`"),
+    "another unit": ({"t_[s]": COUNT, "modulus_[psi]": ONES}, {},
+        "column `modulus` cannot be in 'psi'; it can be in Pa, kPa"),
+    "unknown column": ({"t_[s]": COUNT, "E_[Pa]": ONES}, {},
+        "row 1, column `E` is not known; columns and their units"),
+    "negative time": ({"t_[s]": COUNT - 1, "modulus_[Pa]": ONES}, {},
+        "row 2, column `t`: -1 s is before the load"),
+    "time goes back": ({"t_[s]": np.r_[COUNT[:-1], 3], "modulus_[Pa]": ONES}, {},
+        "row 10, column `t`: 3 s is not after 7 s"),
+    "time stands": ({"t_[s]": np.r_[0, COUNT[:-1]], "modulus_[Pa]": ONES}, {},
+        "row 3, column `t`: 0 s is not after 0 s"),
+    "few rows": ({"t_[s]": COUNT[:5], "modulus_[Pa]": ONES[:5]}, {},
+        "has 5 rows of numbers, but needs at least 8"),
+    "not a number": ({"t_[s]": COUNT, "modulus_[Pa]": ONES * np.nan}, {},
+        "column `modulus`: 'nan' is not a finite number"),
+    "no load": ({"t_[s]": COUNT, "strain_[1]": ZEROS, "stress_[Pa]": ONES}, {},
+        "the strain is zero throughout"),
     "opposite": ({"t_[s]": COUNT, "strain_[1]": ONES, "stress_[Pa]": -ONES}, {},
     "strain and stress are opposite"),
     "no length": ({"t_[s]": COUNT, "elongation_[m]": ONES, "stress_[Pa]": ONES}, {},
     "needs the gauge length, `length` [m]"),
-    "no area": ({"t_[s]": COUNT, "strain_[1]": ONES, "force_[N]": ONES}, {}, "a force needs the "
-                                                                             "cross-section, "
-                                                                             "`area` [m2]"),
+    "no area": ({"t_[s]": COUNT, "strain_[1]": ONES, "force_[N]": ONES}, {},
+        "a force needs the cross-section, `area` [m2]"),
     "a length": ({"t_[s]": COUNT, "strain_[1]": ONES, "stress_[Pa]": ONES}, {"length": 1.0},
     "`strain` needs no `length`"), "negative area": (
-        {"t_[s]": COUNT, "strain_[1]": ONES, "force_[N]": ONES}, {"area": -1.0}, "`area` must be "
-                                                                                 "positive and "
-                                                                                 "finite, but is -1"
+        {"t_[s]": COUNT, "strain_[1]": ONES, "force_[N]": ONES}, {"area": -1.0},
+        "`area` must be positive and finite, but is -1"
     ),
     "modulus and strain": ({"t_[s]": COUNT, "modulus_[Pa]": ONES, "strain_[1]": ONES}, {},
     "`modulus` stands alone beside `t`"),
-    "modulus, creep": ({"t_[s]": COUNT, "modulus_[Pa]": ONES}, {"test": "creep"}, "`modulus` is of "
-                                                                                  "a relaxation "
-                                                                                  "test, not"),
-    "modulus, area": ({"t_[s]": COUNT, "modulus_[Pa]": ONES}, {"area": 1.0}, "nothing is to be "
-                                                                             "divided by the "
-                                                                             "`area`"),
+    "modulus, creep": ({"t_[s]": COUNT, "modulus_[Pa]": ONES}, {"test": "creep"},
+        "`modulus` is of a relaxation test, not"),
+    "modulus, area": ({"t_[s]": COUNT, "modulus_[Pa]": ONES}, {"area": 1.0},
+        "nothing is to be divided by the `area`"),
 }  # fmt: skip
 
 

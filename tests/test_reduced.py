@@ -219,8 +219,8 @@ BAD: list[tuple[Callable[[Record, dict[str, list[Term]]], object], str]] = [
      r"column `.*` of v_C' is a combination of the other columns"),
     (lambda one, terms: assemble([one], terms, replace(RECIPE, domains=40)),
      r"too little data for v_C'.*`v_C`; at least 10 rows"),
-    (lambda one, terms: assemble([one, one.part(0, 10)], terms, RECIPE), "the shortest record is "
-                                                                         "10 samples"),
+    (lambda one, terms: assemble([one, one.part(0, 10)], terms, RECIPE),
+     "the shortest record is 10 samples"),
     (lambda one, terms: assemble([one, Record(2 * one.t, one.series)], terms, RECIPE),
     "one time step"),
     (lambda one, terms: assemble([Record(one.t, {k: v for k,

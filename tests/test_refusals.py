@@ -206,18 +206,18 @@ MUST = r"the law of `actuators.x` must take five tensors .* and return the effor
 
 PARTS: list[tuple[Call, str]] = [
     # shapes
-    (lambda: resting(shape=Superellipse(20e-3, 20e-3, 1.9)), "`disc.shape.n` must be from 2 to 20, "
-                                                             "but is 1.9"),
+    (lambda: resting(shape=Superellipse(20e-3, 20e-3, 1.9)),
+     "`disc.shape.n` must be from 2 to 20, but is 1.9"),
     (lambda: resting(shape=Superellipse(20e-3, 20e-3, NAN)), "`disc.shape.n` must be finite"),
     (lambda: resting(shape=Superellipse(20e-3, 6e-3, 4.0)), "differ by more than a factor of 3"),
-    (lambda: resting(shape=RoundedBox(20e-3, 9e-3, 9.1e-3)), "corners' radius 0.0091 is larger "
-                                                             "than half of the box, 0.009"),
-    (lambda: resting(shape=RoundedBox(20e-3, 9e-3, 0.0)), "`disc.shape.radius` must be from 1e-06 "
-                                                          "to 10 m, but is 0"),
+    (lambda: resting(shape=RoundedBox(20e-3, 9e-3, 9.1e-3)),
+     "corners' radius 0.0091 is larger than half of the box, 0.009"),
+    (lambda: resting(shape=RoundedBox(20e-3, 9e-3, 0.0)),
+     "`disc.shape.radius` must be from 1e-06 to 10 m, but is 0"),
     (lambda: Contour(CIRCLE[:7]), "must be at least 8 places around a contour, but are 7"),
     (lambda: Contour([*CIRCLE, CIRCLE[-1]]), "has the same place twice: point 23"),
-    (lambda: Contour([*CIRCLE[:-1], [0.1, INF]]), r"`points` must be finite numbers of the shape "
-                                                  r"\(n, 2\)"),
+    (lambda: Contour([*CIRCLE[:-1], [0.1, INF]]),
+     r"`points` must be finite numbers of the shape \(n, 2\)"),
     (lambda: Contour([[1.0, 2.0, 3.0]]), r"of the shape \(n, 2\), but is \[\[1.0, 2.0, 3.0\]\]"),
     (lambda: Contour("pear.csv"), r"of the shape \(n, 2\), but is 'pear.csv'"),
     (lambda: Contour(FLAT), "turns by .* degrees"),
@@ -229,25 +229,25 @@ PARTS: list[tuple[Call, str]] = [
     (lambda: Contour(CIRCLE, tolerance=0), "`tolerance` must be positive and finite, but is 0"),
     (lambda: RoundedPolygon(TRIANGLE, 9e-3), "corners of radius 0.009 do not fit on side . of the "
                                              "polygon"),
-    (lambda: RoundedPolygon([[0, 0], [1, 0], [0, 0], [0, 1]], 0.01), "do not fit on side . of the "
-                                                                     "polygon"),
+    (lambda: RoundedPolygon([[0, 0], [1, 0], [0, 0], [0, 1]], 0.01),
+     "do not fit on side . of the polygon"),
     (lambda: RoundedPolygon([[0, 0], [2, 2], [2, 0], [0, 1]], 0.01), "the polygon crosses itself"),
-    (lambda: RoundedPolygon([[-2, -2], [1.6, 2], [2, -2], [-1.6, 2]], 0.1), "the polygon crosses "
-                                                                            "itself"),  # no area
+    (lambda: RoundedPolygon([[-2, -2], [1.6, 2], [2, -2], [-1.6, 2]], 0.1),
+     "the polygon crosses itself"),  # no area
     (lambda: RoundedPolygon(TRIANGLE, 0.0), "`radius` must be positive and finite, but is 0"),
     (lambda: RoundedPolygon([[0, 0], [1, 0]], 0.1), "`vertices` must be 3 to 64 places, but are 2"),
-    (lambda: RoundedPolygon([[0, 0], [1, 0], [True, "a"]], 0.1), "`vertices` must be finite "
-                                                                 "numbers"),
+    (lambda: RoundedPolygon([[0, 0], [1, 0], [True, "a"]], 0.1),
+     "`vertices` must be finite numbers"),
     (lambda: disc(phi=lambda d: 0.9 * (d - 0.02)), "phi is not a distance"),
     (lambda: disc(phi=lambda d: (d * d - 4e-4) / 0.045), "phi is not a distance"),
     (lambda: disc(n=lambda n: 1.01 * n), "its normal is not of unit length"),
     (lambda: disc(n=lambda n: -n), "its normal is not the slope of phi"),
-    (lambda: disc(support=lambda d: 0.019 * d.norm(dim=-1)), "`support` is less than how far it "
-                                                             "reaches"),
-    (lambda: disc(support=lambda d: 0.021 * d.norm(dim=-1)), "`support` is more than how far it "
-                                                             "reaches"),
-    (lambda: disc(gyration=lambda: f64(-1.0)[0]), r"`disc.inertia` must be from 1e-24 to 1e\+06 "
-                                                  r"kg.m2"),
+    (lambda: disc(support=lambda d: 0.019 * d.norm(dim=-1)),
+     "`support` is less than how far it reaches"),
+    (lambda: disc(support=lambda d: 0.021 * d.norm(dim=-1)),
+     "`support` is more than how far it reaches"),
+    (lambda: disc(gyration=lambda: f64(-1.0)[0]),
+     r"`disc.inertia` must be from 1e-24 to 1e\+06 kg.m2"),
     (lambda: check_shape("disc", Oval(0.03, 0.02)), "called `round`, but is not"),
     # meshes and pads
     (lambda: quads(quads=[]), "`quads` must be quadrilaterals of four numbers"),
@@ -270,32 +270,30 @@ PARTS: list[tuple[Call, str]] = [
     (lambda: curved(bonded_sides=True), "`bonded_sides` must be left out"),
     (lambda: FingertipMesh(8e-3, 10), "`elements_around` must be a multiple of 4, but is 10"),
     (lambda: FingertipMesh(0.0, 8), "`radius` must be positive and finite, but is 0"),
-    (lambda: small(pads=lambda pad, _: {"P": pad(points=-1)}), "`points` must be a whole number "
-                                                               "from 0 on, but is -1"),
+    (lambda: small(pads=lambda pad, _: {"P": pad(points=-1)}),
+     "`points` must be a whole number from 0 on, but is -1"),
     # materials
-    (lambda: Prony(**RUBBER, moduli=[1e5], tau=[0.1, 1.0]), "as many `moduli` as `tau`, from 1 to "
-                                                            "20, but has 1 and 2"),
-    (lambda: GeneralisedKelvin(**RUBBER, J=[], tau=[]), "as many `J` as `tau`, from 1 to 20, but "
-                                                        "has 0 and 0"),
-    (lambda: Prony(**RUBBER, moduli="12", tau=[0.1, 1.0]), "`E` must be a list of numbers, but is "
-                                                           "'12'"),
+    (lambda: Prony(**RUBBER, moduli=[1e5], tau=[0.1, 1.0]),
+     "as many `moduli` as `tau`, from 1 to 20, but has 1 and 2"),
+    (lambda: GeneralisedKelvin(**RUBBER, J=[], tau=[]),
+     "as many `J` as `tau`, from 1 to 20, but has 0 and 0"),
+    (lambda: Prony(**RUBBER, moduli="12", tau=[0.1, 1.0]),
+     "`E` must be a list of numbers, but is '12'"),
     (lambda: Prony(**RUBBER, moduli=[1e5], tau=0.1), "`tau` must be a list of numbers, but is 0.1"),
-    (lambda: GeneralisedKelvin(**RUBBER, J=[0.1, True], tau=[1, 2]), "`J_2` must be a number, but "
-                                                                     "is True"),
-    (lambda: resting(material=Prony(**RUBBER, moduli=[1e5, 2e5], tau=[0.1, 0.1])), "two relaxation "
-                                                                                   "times are equal"),
-    (lambda: resting(material=Prony(**RUBBER, moduli=[-2e5], tau=[0.1])), r"`pad.E_1` must be from "
-                                                                          r"1 to 1e\+13 Pa, but"),
-    (lambda: resting(material=Prony(**RUBBER, moduli=[1e5], tau=[5e-5])), "tau_instant = 0.0001 s "
-                                                                          "must be below the "
-                                                                          "shortest"),
+    (lambda: GeneralisedKelvin(**RUBBER, J=[0.1, True], tau=[1, 2]),
+     "`J_2` must be a number, but is True"),
+    (lambda: resting(material=Prony(**RUBBER, moduli=[1e5, 2e5], tau=[0.1, 0.1])),
+     "two relaxation times are equal"),
+    (lambda: resting(material=Prony(**RUBBER, moduli=[-2e5], tau=[0.1])),
+     r"`pad.E_1` must be from 1 to 1e\+13 Pa, but"),
+    (lambda: resting(material=Prony(**RUBBER, moduli=[1e5], tau=[5e-5])),
+     "tau_instant = 0.0001 s must be below the shortest"),
     (lambda: resting(material=GeneralisedKelvin(**RUBBER, J=[0.6, 0.5], tau=[0.1, 1])),
     "fractions J sum to 1.1, above one"),
-    (lambda: resting(material=GeneralisedKelvin(**RUBBER, J=[0.6], tau=[0.0])), "`pad.tau_1` must "
-                                                                                "be from 1e-09 to"),
-    (lambda: resting(material=GeneralisedKelvin(**RUBBER, J=[NAN], tau=[0.1])), "`pad.J_1` must be "
-                                                                                "finite, but is "
-                                                                                "nan"),
+    (lambda: resting(material=GeneralisedKelvin(**RUBBER, J=[0.6], tau=[0.0])),
+     "`pad.tau_1` must be from 1e-09 to"),
+    (lambda: resting(material=GeneralisedKelvin(**RUBBER, J=[NAN], tau=[0.1])),
+     "`pad.J_1` must be finite, but is nan"),
     (lambda: resting(material=StandardLinearSolid(**RUBBER, E_instant=1e5, tau=0.1)),
     "E_instant is below E"),
     (lambda: chain([0.7, 0.5], [0.01, 0.1]), r"must sum to one, but \[0.7, 0.5\] sum to 1.2; "
@@ -310,8 +308,8 @@ PARTS: list[tuple[Call, str]] = [
                                              "and finite"),
     (lambda: chain([0.5, 0.5], [0.01]), r"`tau` of the material of `L` must have shape "
                                         r"\(branches,\) = \(2,\)"),
-    (lambda: chain([0.2, 0.3, 0.5], [0.01, 0.1, 1.0]), r"`J` of the material of `L` must have "
-                                                       r"shape \(branches,\) = \(2,\)"),
+    (lambda: chain([0.2, 0.3, 0.5], [0.01, 0.1, 1.0]),
+     r"`J` of the material of `L` must have shape \(branches,\) = \(2,\)"),
     (lambda: chain([[0.5, 0.5]], [0.01, 0.1]), "`J` of the material of `L` must have shape"),
     (lambda: chain([0.5, 0.5], 0.01), "`tau of the material of L` must be a float64 tensor, but is "
                                       "float"),
@@ -321,28 +319,27 @@ PARTS: list[tuple[Call, str]] = [
     material=Prony(**RUBBER, moduli=[1e5], tau=[0.1])),
      r"inertial pad `L` needs a Kelvin-Voigt material \(one retardation time\), but has"),
     # laws of contact
-    (lambda: SoftContact(1e5, 1.0, 1e5, 1.0, friction=None), "`friction` must be a function or a "
-                                                             "module"),
-    (lambda: slipping(rated(lambda N: N.mean().expand_as(N))), r"aten\.mean\.default, which "
-                                                               r"couples contact points at "
-                                                               r".*test_"),
-    (lambda: slipping(rated(lambda N: N.sum() + 0 * N)), r"aten\.sum\.default, which couples "
-                                                         r"contact points at .*test_"),
+    (lambda: SoftContact(1e5, 1.0, 1e5, 1.0, friction=None),
+     "`friction` must be a function or a module"),
+    (lambda: slipping(rated(lambda N: N.mean().expand_as(N))),
+     r"aten\.mean\.default, which couples contact points at .*test_"),
+    (lambda: slipping(rated(lambda N: N.sum() + 0 * N)),
+     r"aten\.sum\.default, which couples contact points at .*test_"),
     (lambda: slipping(rated(lambda N: N.reshape(-1).cumsum(0).reshape(N.shape))), "cumsum"),
     (lambda: slipping(rated(lambda N: N.reshape(-1).flip(0).reshape(N.shape))),
     r"aten\.flip\.default, which couples contact"),
-    (lambda: slipping(rated(lambda N: N.reshape(-1)[0] + 0 * N)), "couples contact points at "
-                                                                  ".*test_refusals"),
-    (lambda: slipping(rated(lambda N: N / N.numel())), "several points at once other rates "
-                                                       ".*numel"),
-    (lambda: slipping(rated(lambda N: (-1 - N).sqrt())), "the slip law of `L` gives nan at an "
-                                                         "effort of 0.001 N"),
+    (lambda: slipping(rated(lambda N: N.reshape(-1)[0] + 0 * N)),
+     "couples contact points at .*test_refusals"),
+    (lambda: slipping(rated(lambda N: N / N.numel())),
+     "several points at once other rates .*numel"),
+    (lambda: slipping(rated(lambda N: (-1 - N).sqrt())),
+     "the slip law of `L` gives nan at an effort of 0.001 N"),
     (lambda: slipping(nn.Dropout()), r"the slip law of `L` must take three tensors .*TypeError"),
     (lambda: slipping(lambda E, F_N, R: None), "the slip law of `L` must give a tensor of shape "
                                                ".*, but gives NoneType"),
     # control laws
-    (lambda: fed(pushes={"x": "disc.x", "y": "disc.y"}), r"gives \(1,\) for one state, but must "
-                                                         r"give one effort for each of"),
+    (lambda: fed(pushes={"x": "disc.x", "y": "disc.y"}),
+     r"gives \(1,\) for one state, but must give one effort for each of"),
     (lambda: fed(measures="disc.x"), "are sequences of names"),
     (lambda: fed(feed_forward={"z": "F"}), "`feed_forward` names z, but `pushes` has x"),
     (lambda: fed(setpoints=["w", "v"]), "measures 1 coordinates and follows 2 set-points"),
@@ -358,8 +355,8 @@ PARTS: list[tuple[Call, str]] = [
     (lambda: looped(lambda w, q: w - q), MUST + "TypeError: .* takes 2 positional arguments but 5 "
                                                 "were given"),
     (lambda: looped(lambda w, w_dot, f, q, q_dot: (w - q)[3]), MUST + "IndexError"),
-    (lambda: looped(lambda w, w_dot, f, q, q_dot: next(NUMBERS) * q), "`actuators.x`: The law is "
-                                                                      "another one when it is"),
+    (lambda: looped(lambda w, w_dot, f, q, q_dot: next(NUMBERS) * q),
+     "`actuators.x`: The law is another one when it is"),
     # signals
     *((lambda kind=kind, given=given: kind(*given), sentence) for kind in (Profile,
     Sampled) for given, sentence in (
@@ -368,30 +365,30 @@ PARTS: list[tuple[Call, str]] = [
         (([0.0, NAN], [1.0, 2.0]), "increase strictly"), (([0.0, 1.0], [1.0]), "per time"),
         (([0.0], [NAN]), "finite"), (([], []), "from one time on"),
     )),
-    (lambda: Sampled([0.0, 1.0], [1.0, 2.0], [0.0]), "`rates` must hold one finite number per "
-                                                     "time"),
-    (lambda: Sampled([0.0, 1.0], [1.0, 2.0], [0.0, INF]), "`rates` must hold one finite number per "
-                                                          "time"),
+    (lambda: Sampled([0.0, 1.0], [1.0, 2.0], [0.0]),
+     "`rates` must hold one finite number per time"),
+    (lambda: Sampled([0.0, 1.0], [1.0, 2.0], [0.0, INF]),
+     "`rates` must hold one finite number per time"),
     (lambda: hold(x=0.0, y=0.0)(f64(0.0), ("z",)), "has no signal `z`; it has x, y"),
     (lambda: Reference(x=0.1), "the signal `x` must be a module such as `Profile`, but is float"),
     # bodies and rigs
-    (lambda: Body(1.0, Circle(0.1), y="loose"), "`y` must be 'free', 'driven' or a number, but is "
-                                                "'loose'"),
+    (lambda: Body(1.0, Circle(0.1), y="loose"),
+     "`y` must be 'free', 'driven' or a number, but is 'loose'"),
     (lambda: Body(1.0), "needs an `inertia`, or a `shape`"),
-    (lambda: Body.uniform(Circle(0.02), density=0, depth=0.044), "`density` must be positive and "
-                                                                 "finite, but is 0"),
-    (lambda: small(pads=lambda pad, _: {"P": pad(base="hand")}), "pad `P` is bonded to `hand`, but "
-                                                                 "the bodies are disc"),
-    (lambda: small(pads=lambda pad, _: {"P": pad(base="disc")}), "is bonded to the body `disc` "
-                                                                 "itself"),
-    (lambda: small(contacts=lambda _, c: {"d": c("Q", "disc")}), "contact `d` is between `Q` and "
-                                                                 "`disc`, which are not"),
-    (lambda: small(contacts=lambda _, c: {"d": c("P", "dish")}), "contact `d` is between `P` and "
-                                                                 "`dish`, which are not"),
-    (lambda: small(contacts=lambda _, c: {"d": c("P", "disc")}), r"contacts\.d: it is between the "
-                                                                 r"same pad and body as `c`"),
-    (lambda: small(bodies=lambda *_: {"disc": Body(0.4, theta=0.0)}), "contact `c` needs a shape, "
-                                                                      "but the body `disc` has"),
+    (lambda: Body.uniform(Circle(0.02), density=0, depth=0.044),
+     "`density` must be positive and finite, but is 0"),
+    (lambda: small(pads=lambda pad, _: {"P": pad(base="hand")}),
+     "pad `P` is bonded to `hand`, but the bodies are disc"),
+    (lambda: small(pads=lambda pad, _: {"P": pad(base="disc")}),
+     "is bonded to the body `disc` itself"),
+    (lambda: small(contacts=lambda _, c: {"d": c("Q", "disc")}),
+     "contact `d` is between `Q` and `disc`, which are not"),
+    (lambda: small(contacts=lambda _, c: {"d": c("P", "dish")}),
+     "contact `d` is between `P` and `dish`, which are not"),
+    (lambda: small(contacts=lambda _, c: {"d": c("P", "disc")}),
+     r"contacts\.d: it is between the same pad and body as `c`"),
+    (lambda: small(bodies=lambda *_: {"disc": Body(0.4, theta=0.0)}),
+     "contact `c` needs a shape, but the body `disc` has"),
     (lambda: small(
         bodies=lambda *_: {"hand": Body(0.4, inertia=1e-3)}, pads=lambda pad,
         _: {"P": pad(base="hand", inertial=True)}
@@ -400,8 +397,8 @@ PARTS: list[tuple[Call, str]] = [
                                        r"coordinate; there are disc\.x"),
     (lambda: pushed(measures="dish.x"), r"actuator `a` speaks of `dish\.x`, which is not a "
                                         r"coordinate"),
-    (lambda: pushed()(0.0, torch.zeros(33, dtype=torch.float64)), "the reference has no signal "
-                                                                  "`w`; it has none"),
+    (lambda: pushed()(0.0, torch.zeros(33, dtype=torch.float64)),
+     "the reference has no signal `w`; it has none"),
     (lambda: coarse().parameter("pad.Young"), r"`pad.Young` is not a parameter of this rig; known: "
                                               r".*pad\.E"),
     (lambda: coarse().unpack(f64(0.0)), "`y` must be float64 of shape"),
@@ -409,8 +406,8 @@ PARTS: list[tuple[Call, str]] = [
     # verbs
     (lambda: press(coarse(), 60e-3), "0.06 m is too high"),
     (lambda: press(coarse(), 50.1e-3), "0.0501 m is too high"),
-    (lambda: odeint(nn.Identity(), f64(0.0), T, method=METHOD), r"integrates a torchsoft\.Rig, but "
-                                                                r"got Identity"),
+    (lambda: odeint(nn.Identity(), f64(0.0), T, method=METHOD),
+     r"integrates a torchsoft\.Rig, but got Identity"),
     (lambda: odeint(m := coarse(), grasped(m), T, method=METHOD, options={"stepsize": 1e-3}),
     r"no option \['stepsize'\]; it"),
     (lambda: check_array("x", f64(1.0).float()), "`x` must be float64"),
@@ -502,21 +499,21 @@ RUNS: list[tuple[dict[str, Any], str]] = [
     ({"rigid": True}, "belong to gradient='forward'"),
     ({"dy0": torch.zeros(376, 1).double()}, "belong to gradient='forward'"),
     (FORWARD | {"dy0": torch.zeros(376, 1)}, "`dy0` must be float64"),
-    (FORWARD | {"dy0": torch.zeros(3, 1).double()}, r"`dy0` must have shape \(376, 1\), or more "
-                                                    r"columns, but has"),
-    (FORWARD | {"wrt": ["pad.E", "contact.K_x"]}, r"`contact.K_x` is not a parameter of this rig; "
-                                                  r"known: .*contact.K_n"),
+    (FORWARD | {"dy0": torch.zeros(3, 1).double()},
+     r"`dy0` must have shape \(376, 1\), or more columns, but has"),
+    (FORWARD | {"wrt": ["pad.E", "contact.K_x"]},
+     r"`contact.K_x` is not a parameter of this rig; known: .*contact.K_n"),
     (FORWARD | {"wrt": []}, "gradient='forward' needs the parameters' names `wrt`, or directions "
                             "`dy0`"),
     (FORWARD | {"wrt": ["contact.epsilon"]}, r"`contact\.epsilon` must be a scalar parameter that "
                                              r"requires a gradient"),
-    ({"gradient": "discrete", "wrt": ["pad.E"]}, "`wrt` names the parameters of "
-                                                 "gradient='forward'"),
+    ({"gradient": "discrete", "wrt": ["pad.E"]},
+     "`wrt` names the parameters of gradient='forward'"),
     *((signal(lambda value, t: torch.where(t > 2e-3, torch.nan, value)) | how,
        r"the signal `x_d` of the reference is not finite at t = 0\.00") for how in ({},
        {"gradient": "discrete"})),
-    (signal(lambda value, t: value + 1e-6 * torch.rand_like(t)), "gives other values when asked "
-                                                                 "again"),
+    (signal(lambda value, t: value + 1e-6 * torch.rand_like(t)),
+     "gives other values when asked again"),
     (signal(lambda value, t: value.float()), "the signal `x_d` must give float64"),
 ]  # fmt: skip
 

@@ -399,65 +399,60 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "misspelt": ({"pads__lower__lenght": 0.1}, r"pads\.lower: `lenght` is not known here; is it "
                                                r"`length`\?"),
     "unknown": ({"gadgets": {}}, r"`gadgets` is not known here; known are title, gravity, bodies"),
-    "millimetres": ({"pads__lower__length": 80.0}, r"pads\.lower\.length: should be from 1e-06 to "
-                                                   r"10 m, not 80"),
-    "incompressible": ({"materials__rubber__nu": 0.5}, r"materials\.rubber\.nu: should be from "
-                                                       r"-0\.999 to 0\.4999, not 0\.5"),
+    "millimetres": ({"pads__lower__length": 80.0},
+        r"pads\.lower\.length: should be from 1e-06 to 10 m, not 80"),
+    "incompressible": ({"materials__rubber__nu": 0.5},
+        r"materials\.rubber\.nu: should be from -0\.999 to 0\.4999, not 0\.5"),
     "text": ({"bodies__disc__mass": "heavy"}, r"bodies\.disc\.mass should be a valid number, not "
                                               r"'heavy'"),
     "freedom": ({"bodies__bracket__theta": "locked"}, r'bodies\.bracket\.theta: should be "free", '
                                                       r'"driven" or a number'),
-    "friction": ({"laws__dry__friction__mu_k": 0.9}, r"laws\.dry\.friction.*: mu_k must not .* "
-                                                     r"mu_k = 0\.9 > mu_s = 0\.8"),
-    "sort": ({"bodies__disc__shape__kind": "heart"}, r"bodies\.disc\.shape\.kind should be one of "
-                                                     r".*'circle'.*, not 'heart'"),
-    "no mass": ({"bodies__bracket__mass": None}, r"bodies\.bracket: mass is missing, but x and y "
-                                                 r"can move freely"),
-    "no start": ({"bodies__bracket__start": {"y": None}}, r"bodies\.bracket: start\.y is missing: "
-                                                          r"y is free"),
-    "start of what is fixed": ({"bodies__bracket__start__theta": 0.1}, r"bodies\.bracket: "
-                                                                       r"start\.theta has no "
-                                                                       r"meaning"),
-    "no such base": ({"pads__upper__base": "braket"}, r"pads\.upper\.base: there is no `braket` "
-                                                      r"among bodies; there is disc"),
-    "pad on its own body": ({"pads__lower__base": "disc"}, r"contacts\.lower: the pad `lower` is "
-                                                           r"bonded to the body `disc`"),
-    "nothing to touch with": ({"contacts__lower__body": "bracket"}, r"contacts\.lower\.body: "
-                                                                    r"`bracket` has no shape"),
-    "pushes what is fixed": ({"actuators__x__pushes": "bracket.theta"}, r"actuators\.x\.pushes: "
-                                                                        r"bracket\.theta is fixed "
-                                                                        r"at 0"),
-    "no such coordinate": ({"actuators__x__pushes": "bracket.z"}, r"`bracket\.z` is not a "
-                                                                  r"coordinate; free ones are "
-                                                                  r"disc\.x"),
-    "loop without a motion": ({"actuators__x__setpoint": None}, r"actuators\.x: setpoint is "
-                                                                r"missing: the gains Kp and Kd "
-                                                                r"need"),
-    "motion that nothing follows": ({"motion__wave": {"kind": "hold"}}, r"motion\.wave: nothing "
-                                                                        r"follows it"),
-    "material of nothing": ({"materials__gel": SOFT}, r"materials\.gel: no pad is made of it; name "
-                                                      r"it as the material of one"),
+    "friction": ({"laws__dry__friction__mu_k": 0.9},
+        r"laws\.dry\.friction.*: mu_k must not .* mu_k = 0\.9 > mu_s = 0\.8"),
+    "sort": ({"bodies__disc__shape__kind": "heart"},
+        r"bodies\.disc\.shape\.kind should be one of .*'circle'.*, not 'heart'"),
+    "no mass": ({"bodies__bracket__mass": None},
+        r"bodies\.bracket: mass is missing, but x and y can move freely"),
+    "no start": ({"bodies__bracket__start": {"y": None}},
+        r"bodies\.bracket: start\.y is missing: y is free"),
+    "start of what is fixed": ({"bodies__bracket__start__theta": 0.1},
+        r"bodies\.bracket: start\.theta has no meaning"),
+    "no such base": ({"pads__upper__base": "braket"},
+        r"pads\.upper\.base: there is no `braket` among bodies; there is disc"),
+    "pad on its own body": ({"pads__lower__base": "disc"},
+        r"contacts\.lower: the pad `lower` is bonded to the body `disc`"),
+    "nothing to touch with": ({"contacts__lower__body": "bracket"},
+        r"contacts\.lower\.body: `bracket` has no shape"),
+    "pushes what is fixed": ({"actuators__x__pushes": "bracket.theta"},
+        r"actuators\.x\.pushes: bracket\.theta is fixed at 0"),
+    "no such coordinate": ({"actuators__x__pushes": "bracket.z"},
+        r"`bracket\.z` is not a coordinate; free ones are disc\.x"),
+    "loop without a motion": ({"actuators__x__setpoint": None},
+        r"actuators\.x: setpoint is missing: the gains Kp and Kd need"),
+    "motion that nothing follows": ({"motion__wave": {"kind": "hold"}},
+        r"motion\.wave: nothing follows it"),
+    "material of nothing": ({"materials__gel": SOFT},
+        r"materials\.gel: no pad is made of it; name it as the material of one"),
     "law of nothing": ({"laws__wet": WET}, r"laws\.wet: no contact follows it; name it as the law "
                                            r"of one"),
-    "motion that is missing": ({"actuators__x__setpoint": "w"}, r"motion\.w is missing: bracket\.x "
-                                                                r"is to follow it"),
-    "time goes back": ({"motion__x_d__times": (1.5, 0.5)}, r"motion\.x_d.*: times must increase, "
-                                                           r"but 0\.5 s follows 1\.5 s"),
-    "two ways to step": ({"solver": {"step": 1e-3, "rtol": 1e-4}}, r"solver: step and rtol .*each "
-                                                                   r"say which steps to take"),
-    "one motion, two units": ({"actuators__y__feed_forward": "x_d"}, r"motion\.(x_d would be in "
-                                                                     r"two units|press: nothing)"),
-    "name": ({"bodies": {"my disc": {"x": 0.0, "y": 0.0, "theta": 0.0}}}, r"bodies\.my disc: the "
-                                                                          r"name should be "
-                                                                          r"letters"),
-    "taken": ({"bodies": {"keys": {"x": 0.0, "y": 0.0, "theta": 0.0}}}, r"bodies\.keys: the name "
-                                                                        r"is taken by torch"),
+    "motion that is missing": ({"actuators__x__setpoint": "w"},
+        r"motion\.w is missing: bracket\.x is to follow it"),
+    "time goes back": ({"motion__x_d__times": (1.5, 0.5)},
+        r"motion\.x_d.*: times must increase, but 0\.5 s follows 1\.5 s"),
+    "two ways to step": ({"solver": {"step": 1e-3, "rtol": 1e-4}},
+        r"solver: step and rtol .*each say which steps to take"),
+    "one motion, two units": ({"actuators__y__feed_forward": "x_d"},
+        r"motion\.(x_d would be in two units|press: nothing)"),
+    "name": ({"bodies": {"my disc": {"x": 0.0, "y": 0.0, "theta": 0.0}}},
+        r"bodies\.my disc: the name should be letters"),
+    "taken": ({"bodies": {"keys": {"x": 0.0, "y": 0.0, "theta": 0.0}}},
+        r"bodies\.keys: the name is taken by torch"),
     "overlap": ({"bodies": {"stone": STONE}}, r"error: bodies\.disc: it and bodies\.stone overlap "
                                               r"by .* mm at t = 0 s"),
-    "no room": ({"motion__y_d__values": ("start", 40e-3)}, r"error: contacts\.upper: `disc` does "
-                                                           r"not fit: at t = 0\.4 s"),
-    "strain": ({"motion__y_d__values": ("start", 45.8e-3)}, r"warning: pads\.\w+: the strain "
-                                                            r"leaves linear elasticity: at"),
+    "no room": ({"motion__y_d__values": ("start", 40e-3)},
+        r"error: contacts\.upper: `disc` does not fit: at t = 0\.4 s"),
+    "strain": ({"motion__y_d__values": ("start", 45.8e-3)},
+        r"warning: pads\.\w+: the strain leaves linear elasticity: at"),
     "steps": ({"solver": {"step": 0.05}}, r"warning: solver\.step: steps of 0\.05 s are too "
                                           r"coarse: motion\.y_d goes"),
     "nothing carries it": (
@@ -483,20 +478,20 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "never touches": ({"motion__y_d__values": ("start", 50.05e-3),
     "motion__press__values": (0.0, 0.0)},
                       r"warning: contacts\.upper: `lower` and `upper` never press `disc`"),
-    "slip": ({"laws__dry__friction__v_s": 1e-4}, r"warning: laws\.dry\.friction: slip is not "
-                                                 r"single-valued"),
+    "slip": ({"laws__dry__friction__v_s": 1e-4},
+        r"warning: laws\.dry\.friction: slip is not single-valued"),
     "out of reach": (
         {"pads__upper__origin": (5.0, 0.0)},
         r"warning: contacts\.upper: it cannot close: `disc` comes no nearer to `upper` than 4\.98 "
         r"m; change pads",
     ),
     "a meganewton": (
-        {"motion__press__values": (0.0, -1e6)}, r"error: motion\.press: at t = 2 s it pushes "
-                                                r"`bracket` with 1e\+06 N, but"
+        {"motion__press__values": (0.0, -1e6)},
+        r"error: motion\.press: at t = 2 s it pushes `bracket` with 1e\+06 N, but"
     ),
     "off the pad": (
-        {"motion__x_d__values": ("start", 50.0)}, r"warning: motion\.x_d: at t = 0\.6 s it has "
-                                                  r"taken `disc` .* m past the end"
+        {"motion__x_d__values": ("start", 50.0)},
+        r"warning: motion\.x_d: at t = 0\.6 s it has taken `disc` .* m past the end"
     ),
     "through the disc": (
         {"motion__y_d__values": ("start", -0.05)},
@@ -551,15 +546,15 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         r"bodies\.disc\.shape: `vertices` cannot be used as a polygon",
     ),
     "two masses": (
-        {"bodies": {"disc": {"density": 7800.0, "depth": 1e-2}}}, r"mass and density each say how "
-                                                                  r"heavy it is; give one"
+        {"bodies": {"disc": {"density": 7800.0, "depth": 1e-2}}},
+        r"mass and density each say how heavy it is; give one"
     ),
     "density of nothing": (
         {"bodies": {"bracket": {"mass": None, "density": 7800.0, "depth": 1e-2}}},
         r"bodies\.bracket: shape is missing"
     ),
-    "depth without density": ({"bodies": {"disc": {"depth": 1e-2}}}, r"bodies\.disc: density is "
-                                                                     r"missing: depth is given"),
+    "depth without density": ({"bodies": {"disc": {"depth": 1e-2}}},
+        r"bodies\.disc: density is missing: depth is given"),
     "more than all": (
         {"materials": {"rubber": {"kind": "generalised_kelvin", **RUBBER, "J": [0.8, 0.7],
         "tau": [0.1, 1.0]}}}, r"materials\.rubber: the fractions J sum to 1\.5, above one",

@@ -174,13 +174,13 @@ def forge(content: dict[str, Any]) -> None:
 
 
 DAMAGE: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
-    "a digit": (lambda c: c["estimates"][1].update(last=1.25), "is damaged: its content is not "
-                                                               "what was saved"),
-    "a name": (lambda c: c["recordings"][0].update(name="other"), "is damaged: its content is not "
-                                                                  "what was saved"),
+    "a digit": (lambda c: c["estimates"][1].update(last=1.25),
+        "is damaged: its content is not what was saved"),
+    "a name": (lambda c: c["recordings"][0].update(name="other"),
+        "is damaged: its content is not what was saved"),
     "no checksum": (lambda c: c.pop("checksum"), "is damaged: its content is not what was saved"),
-    "another form": (lambda c: c.update(schema="torchsoft-answer-9"), "its `schema` is "
-                                                                      "'torchsoft-answer-9'"),
+    "another form": (lambda c: c.update(schema="torchsoft-answer-9"),
+        "its `schema` is 'torchsoft-answer-9'"),
     "an old one": (lambda c: c.pop("schema"), "an older version wrote it, so identify again"),
     "forged": (forge, r"\.x\.\d+ should be a valid number, not '0'"),
 }  # fmt: skip

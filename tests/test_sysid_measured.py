@@ -108,10 +108,10 @@ T, X_D, Y_D, Y_D_DOT, F_FF, X_C, THETA, X_BR, Y_BR, F_X, F_Y = 0, 1, 3, 4, 5, 6,
 BAD: dict[str, tuple[Change, str]] = {
     "no unit": (put(1, X_C, "x_C"), r"data\.csv, row 1, column `x_C` has no unit: write `x_C "
                                     r"\[m\]`"),
-    "unknown unit": (put(1, X_C, "x_C [inch]"), r"row 1, column `x_C` cannot be in 'inch'; it can "
-                                                r"be in m, cm, mm"),
-    "wrong dimension": (put(1, THETA, "theta [mm]"), r"row 1, column `theta` cannot be in 'mm'; it "
-                                                     r"can be in rad"),
+    "unknown unit": (put(1, X_C, "x_C [inch]"),
+        r"row 1, column `x_C` cannot be in 'inch'; it can be in m, cm, mm"),
+    "wrong dimension": (put(1, THETA, "theta [mm]"),
+        r"row 1, column `theta` cannot be in 'mm'; it can be in rad"),
     "unknown column": (
         put(1, X_C, "x_c [mm]"), r"column `x_c` is not known: is it `x_C`\?.* ignore = \['x_c'\]; "
                                  r"columns are t, x_d",
@@ -134,15 +134,15 @@ BAD: dict[str, tuple[Change, str]] = {
         lambda table: table.__setitem__(slice(None), [[";".join(cells)] for cells in table]),
         "row 1.*separate columns with commas",
     ),
-    "a cell too many": (lambda table: table[6].append("1"), r"row 7 has 13 cells, but there are 12 "
-                                                            r"columns"),
+    "a cell too many": (lambda table: table[6].append("1"),
+        r"row 7 has 13 cells, but there are 12 columns"),
     "text": (put(9, X_C, "n/a"), r"data\.csv, row 9, column `x_C`: 'n/a' is not a finite number; "
                                  r"leave the cell empty"),
     "nan": (put(9, F_Y, "NaN"), r"row 9, column `F_y`: 'NaN' is not a finite number"),
     "infinity": (put(9, F_Y, "-inf"), r"row 9, column `F_y`: '-inf' is not a finite number"),
     "grouped digits": (put(9, F_Y, "1_0"), r"row 9, column `F_y`: '1_0' is not a finite number"),
-    "digits of another script": (put(9, F_Y, "１２"), r"row 9, column `F_y`: '１２' is not a finite "
-                                                    r"number"),
+    "digits of another script": (put(9, F_Y, "１２"),
+        r"row 9, column `F_y`: '１２' is not a finite number"),
     "times of a clock": (scale(T, 1.0, 1.7e9), r"row 2, column `t`: 1\.7e\+09 s is too far from "
                                                r"zero; count times from"),
     "empty time": (put(12, T, ""), r"row 12, column `t` is empty; only measured channels may have "
@@ -151,10 +151,10 @@ BAD: dict[str, tuple[Change, str]] = {
     "time twice": (put(12, T, "0.045"), r"row 12, column `t`: the time 0.045 s is there twice"),
     "time goes back": (put(12, T, "0.01"), r"row 12, column `t`: time goes back, from 0.045 to "
                                            r"0.01 s"),
-    "rows missing": (lambda table: table.__delitem__(slice(10, 40)), r"row 11, column `t`: 0.155 s "
-                                                                     r"are missing before it"),
-    "few rows": (lambda table: table.__delitem__(slice(8, None)), r"has 7 rows of numbers, but "
-                                                                  r"needs at least 10"),
+    "rows missing": (lambda table: table.__delitem__(slice(10, 40)),
+        r"row 11, column `t`: 0.155 s are missing before it"),
+    "few rows": (lambda table: table.__delitem__(slice(8, None)),
+        r"has 7 rows of numbers, but needs at least 10"),
     "mm under m": (put(1, X_C, "x_C [m]"), r"row 2, column `x_C`: 60.54 m is not plausible, .* "
                                            r"between -0.12 and 0.24 m"),
     "one spike": (put(30, Y_BR, "500"), r"row 30, column `y_Br`: 0.5 m is not plausible"),
@@ -162,8 +162,8 @@ BAD: dict[str, tuple[Change, str]] = {
                                             r"scenario.x_C0 is 0.0603 m"),
     "another sign": (scale(X_C, -1.0), r"it begins at -0.0605\d* m, but scenario.x_C0 is 0.0603 m; "
                                        r"is its sign opposite\?"),
-    "turned already": (scale(THETA, 1.0, 500.0), r"row 2, column `theta`: it begins at 0.48\d* "
-                                                 r"rad, but the start is 0 rad"),
+    "turned already": (scale(THETA, 1.0, 500.0),
+        r"row 2, column `theta`: it begins at 0.48\d* rad, but the start is 0 rad"),
     "another ground": (scale(Y_BR, 1.0, 3.0), r"row 2, column `y_Br`: it begins at .*, but the "
                                               r"set-point y_d is 0.0501 m"),
     "moving": (
@@ -202,51 +202,45 @@ def test_a_mistake_in_the_data_is_named_with_its_row_and_column(
 BAD_CONFIG = {
     "not TOML": (CONFIG + "[[", r"rig\.toml is not a TOML file"),
     "unknown table": (CONFIG + "[sensor]\n", r"rig\.toml: sensor is not known here"),
-    "unknown key": (CONFIG.replace("y_Br.noise", "y_Br.sigma"), r"y_Br\.noise is missing; "
-                                                                r"sensors\.y_Br\.sigma is not "
-                                                                r"known"),
-    "no noise": (CONFIG.replace("F_y.noise = 0.1", "F_y.noise = 0.0"), r"sensors\.F_y\.noise "
-                                                                       r"should be .* 1e-15, not "
-                                                                       r"0\.0"),
-    "unknown channel": (CONFIG.replace("F_y.noise", "F_z.noise"), r"rig\.toml: sensors: `F_z` is "
-                                                                  r"not a channel"),
-    "unknown parameter": (CONFIG.replace("contact.K_n", "contact.K"), r"rig\.toml: unknowns: "
-                                                                      r"`contact.K` cannot be "
-                                                                      r"identified"),
-    "unknown setting": (CONFIG.replace("contact.v_s", "contact.vs"), r"settings of `data`: "
-                                                                     r"contact\.vs is not known "
-                                                                     r"here"),
-    "setting out of bounds": (CONFIG.replace("v_s = 0.05", "v_s = -1"), r"of `data`: contact\.v_s "
-                                                                        r"should be .*, not -1"),
-    "not a table": ("settings.disc = 3\n" + CONFIG.split("\n\n", 1)[1], r"of `data`: disc should "
-                                                                        r"be a table, not 3"),
-    "not a number": (CONFIG.replace("60.3e-3", '"here"'), r"scenario\.x_C0 should be a valid "
-                                                          r"number, not 'here'"),
-    "other pads": (CONFIG.replace("contact.v_s", "pad.height = 3e-3\ncontact.v_s"), r"touch .* at "
-                                                                                    r"46.92 mm \(twice pad.height"),
-    "bounds": (CONFIG.replace("nominal = 1e5", "low = 2\nhigh = 1"), r"unknowns\.contact\.K_n: low "
-                                                                     r"= 2.0 must be below"),
+    "unknown key": (CONFIG.replace("y_Br.noise", "y_Br.sigma"),
+        r"y_Br\.noise is missing; sensors\.y_Br\.sigma is not known"),
+    "no noise": (CONFIG.replace("F_y.noise = 0.1", "F_y.noise = 0.0"),
+        r"sensors\.F_y\.noise should be .* 1e-15, not 0\.0"),
+    "unknown channel": (CONFIG.replace("F_y.noise", "F_z.noise"),
+        r"rig\.toml: sensors: `F_z` is not a channel"),
+    "unknown parameter": (CONFIG.replace("contact.K_n", "contact.K"),
+        r"rig\.toml: unknowns: `contact.K` cannot be identified"),
+    "unknown setting": (CONFIG.replace("contact.v_s", "contact.vs"),
+        r"settings of `data`: contact\.vs is not known here"),
+    "setting out of bounds": (CONFIG.replace("v_s = 0.05", "v_s = -1"),
+        r"of `data`: contact\.v_s should be .*, not -1"),
+    "not a table": ("settings.disc = 3\n" + CONFIG.split("\n\n", 1)[1],
+        r"of `data`: disc should be a table, not 3"),
+    "not a number": (CONFIG.replace("60.3e-3", '"here"'),
+        r"scenario\.x_C0 should be a valid number, not 'here'"),
+    "other pads": (CONFIG.replace("contact.v_s", "pad.height = 3e-3\ncontact.v_s"),
+        r"touch .* at 46.92 mm \(twice pad.height"),
+    "bounds": (CONFIG.replace("nominal = 1e5", "low = 2\nhigh = 1"),
+        r"unknowns\.contact\.K_n: low = 2.0 must be below"),
     "a prior beyond the bounds": (
         CONFIG.replace("nominal = 1e5", "low = 8e4\nhigh = 1.4e5\nprior = {median = 1e6, sd = "
                                         "1e3}"),
         r"rig\.toml: unknowns\.contact\.K_n\.prior\.median = 1e\+06 is not between low = 80000 and "
         r"high = 140000",
     ),
-    "rtol": (CONFIG.replace("rtol = 1e-3", "rtol = -1"), r"fit\.rtol should be greater than or "
-                                                         r"equal to 1e-08, not -1"),
-    "step": (CONFIG.replace("rtol = 1e-3", "step = 5e-3"), r"fit: .*tolerances choose the steps; "
-                                                           r"leave it out, or give"),
+    "rtol": (CONFIG.replace("rtol = 1e-3", "rtol = -1"),
+        r"fit\.rtol should be greater than or equal to 1e-08, not -1"),
+    "step": (CONFIG.replace("rtol = 1e-3", "step = 5e-3"),
+        r"fit: .*tolerances choose the steps; leave it out, or give"),
     "method": (CONFIG + 'method = "magic"\n', r"fit\.method should be 'gauss_newton'"),
     "a loss that the method has not": (
-        CONFIG + 'loss = "huber"\nmethod = "lbfgs"\n', r"fit: the method 'lbfgs' has no robust "
-                                                       r"loss: for loss = 'huber' take",
+        CONFIG + 'loss = "huber"\nmethod = "lbfgs"\n',
+        r"fit: the method 'lbfgs' has no robust loss: for loss = 'huber' take",
     ),
-    "text for a number": (CONFIG.replace("rtol = 1e-3", 'rtol = "1e-3"'), r"fit\.rtol should be a "
-                                                                          r"valid number, not "
-                                                                          r"'1e-3'"),
-    "truth for a number": (CONFIG.replace("nominal = 1e5", "nominal = true"), r"nominal should be "
-                                                                              r"a valid number, "
-                                                                              r"not True"),
+    "text for a number": (CONFIG.replace("rtol = 1e-3", 'rtol = "1e-3"'),
+        r"fit\.rtol should be a valid number, not '1e-3'"),
+    "truth for a number": (CONFIG.replace("nominal = 1e5", "nominal = true"),
+        r"nominal should be a valid number, not True"),
     "a disc that fits nowhere": (
         CONFIG.replace('unknowns."pad.E"]\nnominal = 0.7e6', 'unknowns."disc.radius"]'),
         r"unknowns\.disc\.radius\.low = 0\.001937 is impossible: the disc does not fit",
@@ -254,12 +248,12 @@ BAD_CONFIG = {
     "nothing to fit": ('heldout = ["data"]\n' + CONFIG, r"heldout: it names every recording"),
     "a long delay": (CONFIG + "[sensors.theta]\nnoise = 1e-3\ndelay = 0.5\n",
     r"sensors\.theta\.delay should be less than"),
-    "no such column": ('ignore = ["Temp"]\n' + CONFIG, r"rig\.toml, ignore: no file has a column "
-                                                       r"`Temp`"),
-    "another constant": (CONFIG + "[missing]\nF_x = 0.0\n", r"rig\.toml: missing\.F_x is not known "
-                                                            r"here"),
-    "another start": (CONFIG + '[start]\nkind = "flying"\n', r"start\.kind should be one of "
-                                                             r"'rest', 'moving', not 'fl"),
+    "no such column": ('ignore = ["Temp"]\n' + CONFIG,
+        r"rig\.toml, ignore: no file has a column `Temp`"),
+    "another constant": (CONFIG + "[missing]\nF_x = 0.0\n",
+        r"rig\.toml: missing\.F_x is not known here"),
+    "another start": (CONFIG + '[start]\nkind = "flying"\n',
+        r"start\.kind should be one of 'rest', 'moving', not 'fl"),
     "a start that is hardly uncertain": (
         CONFIG + '[start]\nkind = "rest"\nposition_sd = 1e-300\n',
         r"start\.position_sd: should be 0, or at least 1e-12, but is 1e-300",
@@ -293,12 +287,11 @@ BAD_CONFIG = {
                                             r"stated`",
     ),
     "file and files": (
-        CONFIG + '[[recordings]]\nfile = "b.csv"\nfiles = ["c.csv"]\n', r"recordings\.0: .*a "
-                                                                        r"`file` or `files`, not "
-                                                                        r"both",
+        CONFIG + '[[recordings]]\nfile = "b.csv"\nfiles = ["c.csv"]\n',
+        r"recordings\.0: .*a `file` or `files`, not both",
     ),
-    "held out": ('heldout = ["other"]\n' + CONFIG, r"heldout: there is no recording `other`; the "
-                                                   r"recordings' names are data"),
+    "held out": ('heldout = ["other"]\n' + CONFIG,
+        r"heldout: there is no recording `other`; the recordings' names are data"),
     "no such file": (
         CONFIG + '[[recordings]]\nname = "b"\nfiles = ["b.csv"]\n',
         r"rig\.toml, recordings: `files` of `b`: .*b\.csv: No such file or directory",
@@ -309,8 +302,8 @@ BAD_CONFIG = {
         r"recordings\.0\.settings: pad\.E is unknown, .* leave it out there, and say by "
         r"unknowns\.\"pad\.E\"\.nominal where",
     ),
-    "same name": (CONFIG + '[[recordings]]\nfile = "data.csv"\n', r"names of their own, but are "
-                                                                  r"called data, data"),
+    "same name": (CONFIG + '[[recordings]]\nfile = "data.csv"\n',
+        r"names of their own, but are called data, data"),
 }  # fmt: skip
 
 

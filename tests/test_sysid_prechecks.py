@@ -124,34 +124,34 @@ class Mistake:
 NO_F = {"F_x": None, "F_y": None}
 MISTAKES = {
     "sign of a force": Mistake(
-        "rolling", lambda r: changed(r, F_x=scaled(-1)), "sign of F_x", "F_x looks as if its sign "
-                                                                        "were opposite", True
+        "rolling", lambda r: changed(r, F_x=scaled(-1)), "sign of F_x",
+        "F_x looks as if its sign were opposite", True
     ),
     "sign of a force that only a run tells": Mistake(
-        "rolling", lambda r: changed(r, F_y=scaled(-1), y_Br=None), "sign of F_y", "correlation "
-                                                                                   "with a run from the start", True
+        "rolling", lambda r: changed(r, F_y=scaled(-1), y_Br=None), "sign of F_y",
+        "correlation with a run from the start", True
     ),
     "sign of an angle": Mistake(
-        "rolling", lambda r: changed(r, theta=scaled(-1)), "sign of theta", "theta looks as if its "
-                                                                            "sign were opposite",
+        "rolling", lambda r: changed(r, theta=scaled(-1)), "sign of theta",
+        "theta looks as if its sign were opposite",
                                                                             True
     ),
     "sign of a rate": Mistake(
-        "shaking", lambda r: changed(r, omega=scaled(-1)), "sign of omega", "omega looks as if its "
-                                                                            "sign were opposite",
+        "shaking", lambda r: changed(r, omega=scaled(-1)), "sign of omega",
+        "omega looks as if its sign were opposite",
                                                                             True
     ),
     "millinewtons": Mistake(
-        "shaking", lambda r: changed(r, F_x=scaled(1e3)), "unit of F_x", "millinewtons taken for "
-                                                                         "newtons", True
+        "shaking", lambda r: changed(r, F_x=scaled(1e3)), "unit of F_x",
+        "millinewtons taken for newtons", True
     ),
     "degrees": Mistake(
-        "rolling", lambda r: changed(r, theta=scaled(57.3)), "unit of theta", "degrees taken for "
-                                                                              "radians", True
+        "rolling", lambda r: changed(r, theta=scaled(57.3)), "unit of theta",
+        "degrees taken for radians", True
     ),
     "radians": Mistake(
-        "rolling", lambda r: changed(r, theta=scaled(1 / 57.3)), "unit of theta", "radians taken "
-                                                                                  "for degrees",
+        "rolling", lambda r: changed(r, theta=scaled(1 / 57.3)), "unit of theta",
+        "radians taken for degrees",
                                                                                   True
     ),
     "the disc's set-point taken for the bracket's": Mistake(
@@ -175,17 +175,17 @@ MISTAKES = {
         x: r.samples["x_C"][1]), "control.senses", "or are x_Br and x_C exchanged?", True,
     ),
     "no force fed forward": Mistake(
-        "rolling", lambda r: noted(r, F_ff=Profile([0.0], [0.0])), "F_ff", "was a force fed "
-                                                                           "forward that F_ff does",
+        "rolling", lambda r: noted(r, F_ff=Profile([0.0], [0.0])), "F_ff",
+        "was a force fed forward that F_ff does",
                                                                            False
     ),
     "its sign": Mistake(
-        "pressing", lambda r: noted(r, F_ff=opposite(r)), "sign of F_ff", "F_ff looks as if its "
-                                                                          "sign were opposite", True
+        "pressing", lambda r: noted(r, F_ff=opposite(r)), "sign of F_ff",
+        "F_ff looks as if its sign were opposite", True
     ),
     "a zero": Mistake(
-        "rolling", lambda r: changed(r, x_Br=lambda t, x: x + 80e-6), "loop of F_x", "zeros, times "
-                                                                                     "and set-points right?", False
+        "rolling", lambda r: changed(r, x_Br=lambda t, x: x + 80e-6), "loop of F_x",
+        "zeros, times and set-points right?", False
     ),
     "other gains": Mistake(
         "pressing", lambda r: noted(r, {"control.K_98": 0.7e5, "control.R_99": 900.0}),

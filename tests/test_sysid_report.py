@@ -250,8 +250,8 @@ def test_warnings_come_first_and_all_of_them(page: Page, full: IdentificationRes
 
 def test_starts_and_sensors_are_apart_from_parameters(page: Page) -> None:
     order = [
-        "\nEstimates\n", "\npad.E\n", "\ncontact.eta\n", "\nParameters of which each recording has "
-                                                         "its own\n",
+        "\nEstimates\n", "\npad.E\n", "\ncontact.eta\n",
+        "\nParameters of which each recording has its own\n",
         f"\ncontact.R_n\n{HOSTILE}\n", "\ncontact.R_n\nshallow\n", "\nWhere the runs began\n",
         "\nstart.disc.x\nshallow\n", "\nWhat the sensors add\n", "\nbias of y_Br\n",
         "\nContribution of each recording\n",

@@ -477,8 +477,8 @@ def worst(errors: dict[str, float]) -> dict[str, float]:
 def cost_table(config: Config, numbers: dict[str, Any]) -> str:
     """Every way with its times and errors."""
     head = (
-        "steps by", "run [s]", "error of motion [1]", "error of forces [1]", "gradient: sweep over "
-                                                                             "run", "total",
+        "steps by", "run [s]", "error of motion [1]", "error of forces [1]",
+        "gradient: sweep over run", "total",
         "Jacobian for 8: added over run", "total",
     )  # fmt: skip
     rows = []

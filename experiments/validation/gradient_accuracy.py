@@ -412,8 +412,8 @@ def table(result: Result) -> str:
             counts = f"{e['touch']} / {e['leave']} / {e['slip_onsets']}"
             largest = f"{errors[worst]:.1e} ({worst}, {unsure[worst]:.0e})"
             rows.append((name, counts, route, largest, f"{known:.1e}", f"{cost['total']:.2f}"))
-    head = ("window", "touch / leave / slip onsets", "route", "largest error (parameter, judge's "
-                                                              "own uncertainty)",
+    head = ("window", "touch / leave / slip onsets", "route",
+    "largest error (parameter, judge's own uncertainty)",
             "largest where the judge knows 1e-6", "total / forward")  # fmt: skip
     tables = [markdown(head, rows)]
     rows = [

@@ -332,9 +332,8 @@ class RigFile(Group):
             role, coordinate = who[0]
             if name not in self.motion:
                 why = {
-                    "setpoint": f"{coordinate} is to follow it", "feed_forward": f"{coordinate} is "
-                                                                                 "to be pushed by "
-                                                                                 "it",
+                    "setpoint": f"{coordinate} is to follow it", "feed_forward":
+                    f"{coordinate} is to be pushed by it",
                     "driven": "the coordinate is driven by it",
                 }[role]  # fmt: skip
                 raise ValueError(f"motion.{line(name, 80)} is missing: {why}")

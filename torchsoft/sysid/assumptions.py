@@ -68,8 +68,8 @@ class Fault(NamedTuple):
     def assumption(self, channel: str, unit: str, sensor: Sensor) -> "Variation":
         scale = {"s": (1e3, "ms"), "1": (1e2, "%"), "noise": (sensor.noise, unit)}
         factor, shown = scale.get(self.per, (sensor.noise, f"{unit} over a recording"))
-        return Variation(f"{self.verb.split()[0]} {channel}", "sensor", f"{channel} has no unknown "
-                                                                        f"{self.verb.split()[0]}",
+        return Variation(f"{self.verb.split()[0]} {channel}", "sensor",
+        f"{channel} has no unknown {self.verb.split()[0]}",
                           f"{channel} {self.verb.partition(' ')[2]}", factor * self.amount,
                           shown)  # fmt: skip
 
@@ -118,15 +118,14 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
     nx, ny, points = pad.mesh.elements_x, pad.mesh.elements_y, pad.points
     at = f"{points} points an element" if points else "on the nodes"
     out = [
-        Variation("mesh", "numerical", f"the pads have {nx} x {ny} elements", f"they had {2 * nx} "
-                                                                              f"x {2 * ny}",
+        Variation("mesh", "numerical", f"the pads have {nx} x {ny} elements",
+        f"they had {2 * nx} x {2 * ny}",
                    vary=lambda r: remeshed(r, 2, points)),
         Variation("contact points", "numerical", f"contact is computed {at}",
         f"it were at {points + 2} points an element",
                    vary=lambda r: remeshed(r, 1, points + 2)),
-        Variation("mesh phase", "numerical", "a node lies where the mesh puts it", "nodes lay a "
-                                                                                   "quarter of an "
-                                                                                   "element on",
+        Variation("mesh phase", "numerical", "a node lies where the mesh puts it",
+        "nodes lay a quarter of an element on",
                    vary=lambda r: shifted(r, 0.25)),
     ]  # fmt: skip
     ramps = {
@@ -137,20 +136,20 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
     if not ramps.keys() & unknown:
         small = ", ".join(f"{SMALLER_RAMP * value:.3g}" for value in ramps.values())
         stated = ", ".join(f"{value:.3g}" for value in ramps.values())
-        out.append(Variation("ramp", "numerical", "forces are ramped in at touch-down over "
-                                                  f"epsilon = {stated} m",
+        out.append(Variation("ramp", "numerical",
+        f"forces are ramped in at touch-down over epsilon = {stated} m",
                               f"epsilon were {small} m",
                               vary=lambda r: scaled(r, tuple(ramps), SMALLER_RAMP)))  # fmt: skip
-    out.append(Variation("ramp of the sliding", "law", "sliding stretches the tangential springs "
-                                                       "by the ramp of touch-down",
+    out.append(Variation("ramp of the sliding", "law",
+    "sliding stretches the tangential springs by the ramp of touch-down",
                           "it did in full from touch-down on, without a ramp",
                           vary=unramped))  # fmt: skip
     if any(isinstance(one, Sampled) for one in rig.reference.signals.values()):
-        out.append(Variation("set-points", "numerical", "set-points are what a smooth curve "
-                                                        "through the recorded ones says",
+        out.append(Variation("set-points", "numerical",
+        "set-points are what a smooth curve through the recorded ones says",
                               "only every second one were known", vary=sparser))  # fmt: skip
-    out.append(Variation("clock of the set-points", "known", "set-points and sensors have one "
-                                                             "clock",
+    out.append(Variation("clock of the set-points", "known",
+    "set-points and sensors have one clock",
                          "set-points came later", 1e3 * CLOCK, "ms",
                          vary=lambda r: delayed(r, CLOCK)))  # fmt: skip
     if any(actuator.feed_forward is not None for actuator in rig.actuators.values()):
@@ -169,8 +168,8 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
         ):
             continue
         part = RADIUS if name.endswith("radius") else KNOWN
-        out.append(Variation(name, "known", f"{name} is {value:.6g}", f"{name} were "
-                                                                      f"{(1 + part) * value:.6g}",
+        out.append(Variation(name, "known", f"{name} is {value:.6g}",
+        f"{name} were {(1 + part) * value:.6g}",
                               100 * part, "%", parameter=name))  # fmt: skip
     return out
 
@@ -184,8 +183,8 @@ def of_the_paper(recording: Recording, rig: SoftGrasp, unknown: set[str]) -> lis
                               1e6 * PLACE, "um", vary=placed))  # fmt: skip
     law = rig.contacts["L"].law.friction
     if isinstance(law, SmoothSlip):
-        out.append(Variation("Coulomb friction", "law", "slip is smooth (contact.friction = "
-                                                        "\"smooth\")",
+        out.append(Variation("Coulomb friction", "law",
+        "slip is smooth (contact.friction = \"smooth\")",
                               "it were Coulomb's", vary=coulomb))  # fmt: skip
     return out
 

@@ -242,8 +242,8 @@ def loop_findings(
             missing = channel(rig, actuator.measures[coordinates.index(None)])
             yield Diagnostic(
                 "note", recording.name, f"recording `{recording.name}`: {F.channel} is not "
-                f"compared with its controller, since {missing} is not recorded", "controller of "
-                                                                                  f"{F.channel}",
+                f"compared with its controller, since {missing} is not recorded",
+                f"controller of {F.channel}",
             )  # fmt: skip
         loop = windows(recording, actuator, [F, *coordinates])
         if loop is None:

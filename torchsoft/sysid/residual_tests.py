@@ -309,8 +309,8 @@ def lines_up(part: Part, beside: Sequence[Part], r: Array, Q: Array) -> list[Ver
     out, t = [], part.t
     y = spline(part)
     own = {
-        "an offset": np.ones(len(t)), "a drift": t - t.mean(), "the reading itself, as an error of "
-                                                               "its gain would be": y(t),
+        "an offset": np.ones(len(t)), "a drift": t - t.mean(),
+        "the reading itself, as an error of its gain would be": y(t),
         "its rate, as a delay would be": y(t, 1), "its acceleration": y(t, 2),
     }  # fmt: skip
     others = {}
