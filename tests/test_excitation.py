@@ -17,8 +17,8 @@ ROLL = {"kind": "slow_roll"}
 @pytest.mark.parametrize(
     ("tree", "message"),
     [
-        ({"motion": ROLL, "duration": 0.4}, "duration = 0.4 s leaves no motion: grasp_time = 0.375 "
-                                            "s and settle = 0.125 s"),
+        ({"motion": ROLL, "duration": 0.4},
+         "duration = 0.4 s leaves no motion: grasp_time = 0.375 s and settle = 0.125 s"),
         ({"motion": {"kind": "chirp"}, "duration": 0.7}, "chirp needs more than 0.3 s after them"),
         ({"motion": ROLL, "duration": 1e308}, "duration should be less than or equal to 100000"),
         ({"motion": {"kind": "strokes", "stroke_time": 1e-5}, "duration": 9.0},

@@ -222,13 +222,13 @@ PARTS: list[tuple[Call, str]] = [
     (lambda: Contour("pear.csv"), r"of the shape \(n, 2\), but is 'pear.csv'"),
     (lambda: Contour(FLAT), "turns by .* degrees"),
     (lambda: Contour(EIGHT), "a contour that crosses itself"),
-    (lambda: Contour(NECK, tolerance=1e-3), "so sharp, or so narrow, that the nearest point is the "
-                                            "only one up to"),
-    (lambda: Contour(WAVY, tolerance=1e-14), "a contour of 512 pieces still passes the points, or "
-                                             "the spline .*, at .* m"),
+    (lambda: Contour(NECK, tolerance=1e-3),
+     "so sharp, or so narrow, that the nearest point is the only one up to"),
+    (lambda: Contour(WAVY, tolerance=1e-14),
+     "a contour of 512 pieces still passes the points, or the spline .*, at .* m"),
     (lambda: Contour(CIRCLE, tolerance=0), "`tolerance` must be positive and finite, but is 0"),
-    (lambda: RoundedPolygon(TRIANGLE, 9e-3), "corners of radius 0.009 do not fit on side . of the "
-                                             "polygon"),
+    (lambda: RoundedPolygon(TRIANGLE, 9e-3),
+     "corners of radius 0.009 do not fit on side . of the polygon"),
     (lambda: RoundedPolygon([[0, 0], [1, 0], [0, 0], [0, 1]], 0.01),
      "do not fit on side . of the polygon"),
     (lambda: RoundedPolygon([[0, 0], [2, 2], [2, 0], [0, 1]], 0.01), "the polygon crosses itself"),
@@ -296,23 +296,23 @@ PARTS: list[tuple[Call, str]] = [
      "`pad.J_1` must be finite, but is nan"),
     (lambda: resting(material=StandardLinearSolid(**RUBBER, E_instant=1e5, tau=0.1)),
     "E_instant is below E"),
-    (lambda: chain([0.7, 0.5], [0.01, 0.1]), r"must sum to one, but \[0.7, 0.5\] sum to 1.2; "
-                                             r"divide both J and E by that sum"),
-    (lambda: chain([1.2, -0.2], [0.01, 0.1]), "the fractions J of the material of `L` must not be "
-                                              "negative"),
-    (lambda: chain([0.5, NAN], [0.01, 0.1]), "the fractions J of the material of `L` must not be "
-                                             "negative"),
-    (lambda: chain([0.5, 0.5], [0.01, 0.0]), "times tau of the material of `L` must be positive "
-                                             "and finite"),
-    (lambda: chain([0.5, 0.5], [0.01, INF]), "times tau of the material of `L` must be positive "
-                                             "and finite"),
-    (lambda: chain([0.5, 0.5], [0.01]), r"`tau` of the material of `L` must have shape "
-                                        r"\(branches,\) = \(2,\)"),
+    (lambda: chain([0.7, 0.5], [0.01, 0.1]),
+     r"must sum to one, but \[0.7, 0.5\] sum to 1.2; divide both J and E by that sum"),
+    (lambda: chain([1.2, -0.2], [0.01, 0.1]),
+     "the fractions J of the material of `L` must not be negative"),
+    (lambda: chain([0.5, NAN], [0.01, 0.1]),
+     "the fractions J of the material of `L` must not be negative"),
+    (lambda: chain([0.5, 0.5], [0.01, 0.0]),
+     "times tau of the material of `L` must be positive and finite"),
+    (lambda: chain([0.5, 0.5], [0.01, INF]),
+     "times tau of the material of `L` must be positive and finite"),
+    (lambda: chain([0.5, 0.5], [0.01]),
+     r"`tau` of the material of `L` must have shape \(branches,\) = \(2,\)"),
     (lambda: chain([0.2, 0.3, 0.5], [0.01, 0.1, 1.0]),
      r"`J` of the material of `L` must have shape \(branches,\) = \(2,\)"),
     (lambda: chain([[0.5, 0.5]], [0.01, 0.1]), "`J` of the material of `L` must have shape"),
-    (lambda: chain([0.5, 0.5], 0.01), "`tau of the material of L` must be a float64 tensor, but is "
-                                      "float"),
+    (lambda: chain([0.5, 0.5], 0.01),
+     "`tau of the material of L` must be a float64 tensor, but is float"),
     (lambda: chain([0.5, 0.5], torch.ones(2)), "`tau of the material of L` must be float64"),
     (lambda: chain([1.0, 0.0]), "`chain` of the material of `L` must give two tensors, J and tau"),
     (lambda: SoftGrasp(Parameters().override({"pad.fidelity": "inertial"}),
@@ -335,8 +335,8 @@ PARTS: list[tuple[Call, str]] = [
     (lambda: slipping(rated(lambda N: (-1 - N).sqrt())),
      "the slip law of `L` gives nan at an effort of 0.001 N"),
     (lambda: slipping(nn.Dropout()), r"the slip law of `L` must take three tensors .*TypeError"),
-    (lambda: slipping(lambda E, F_N, R: None), "the slip law of `L` must give a tensor of shape "
-                                               ".*, but gives NoneType"),
+    (lambda: slipping(lambda E, F_N, R: None),
+     "the slip law of `L` must give a tensor of shape .*, but gives NoneType"),
     # control laws
     (lambda: fed(pushes={"x": "disc.x", "y": "disc.y"}),
      r"gives \(1,\) for one state, but must give one effort for each of"),
@@ -393,14 +393,14 @@ PARTS: list[tuple[Call, str]] = [
         bodies=lambda *_: {"hand": Body(0.4, inertia=1e-3)}, pads=lambda pad,
         _: {"P": pad(base="hand", inertial=True)}
     ), "pad `P` is inertial and its base `hand` may turn"),
-    (lambda: pushed(pushes="disc.up"), r"actuator `a` speaks of `disc\.up`, which is not a "
-                                       r"coordinate; there are disc\.x"),
-    (lambda: pushed(measures="dish.x"), r"actuator `a` speaks of `dish\.x`, which is not a "
-                                        r"coordinate"),
+    (lambda: pushed(pushes="disc.up"),
+     r"actuator `a` speaks of `disc\.up`, which is not a coordinate; there are disc\.x"),
+    (lambda: pushed(measures="dish.x"),
+     r"actuator `a` speaks of `dish\.x`, which is not a coordinate"),
     (lambda: pushed()(0.0, torch.zeros(33, dtype=torch.float64)),
      "the reference has no signal `w`; it has none"),
-    (lambda: coarse().parameter("pad.Young"), r"`pad.Young` is not a parameter of this rig; known: "
-                                              r".*pad\.E"),
+    (lambda: coarse().parameter("pad.Young"),
+     r"`pad.Young` is not a parameter of this rig; known: .*pad\.E"),
     (lambda: coarse().unpack(f64(0.0)), "`y` must be float64 of shape"),
     (lambda: coarse()(0.0, torch.zeros(376)), "`y` must be float64 of shape"),
     # verbs
@@ -505,8 +505,8 @@ RUNS: list[tuple[dict[str, Any], str]] = [
      r"`contact.K_x` is not a parameter of this rig; known: .*contact.K_n"),
     (FORWARD | {"wrt": []}, "gradient='forward' needs the parameters' names `wrt`, or directions "
                             "`dy0`"),
-    (FORWARD | {"wrt": ["contact.epsilon"]}, r"`contact\.epsilon` must be a scalar parameter that "
-                                             r"requires a gradient"),
+    (FORWARD | {"wrt": ["contact.epsilon"]},
+     r"`contact\.epsilon` must be a scalar parameter that requires a gradient"),
     ({"gradient": "discrete", "wrt": ["pad.E"]},
      "`wrt` names the parameters of gradient='forward'"),
     *((signal(lambda value, t: torch.where(t > 2e-3, torch.nan, value)) | how,

@@ -396,15 +396,15 @@ WET = {
 STONE = {"x": 0.3e-3, "y": 30e-3, "theta": 0.0, "shape": {"kind": "circle", "radius": 5e-3}}
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "misspelt": ({"pads__lower__lenght": 0.1}, r"pads\.lower: `lenght` is not known here; is it "
-                                               r"`length`\?"),
+    "misspelt": ({"pads__lower__lenght": 0.1},
+        r"pads\.lower: `lenght` is not known here; is it `length`\?"),
     "unknown": ({"gadgets": {}}, r"`gadgets` is not known here; known are title, gravity, bodies"),
     "millimetres": ({"pads__lower__length": 80.0},
         r"pads\.lower\.length: should be from 1e-06 to 10 m, not 80"),
     "incompressible": ({"materials__rubber__nu": 0.5},
         r"materials\.rubber\.nu: should be from -0\.999 to 0\.4999, not 0\.5"),
-    "text": ({"bodies__disc__mass": "heavy"}, r"bodies\.disc\.mass should be a valid number, not "
-                                              r"'heavy'"),
+    "text": ({"bodies__disc__mass": "heavy"},
+        r"bodies\.disc\.mass should be a valid number, not 'heavy'"),
     "freedom": ({"bodies__bracket__theta": "locked"}, r'bodies\.bracket\.theta: should be "free", '
                                                       r'"driven" or a number'),
     "friction": ({"laws__dry__friction__mu_k": 0.9},
@@ -433,8 +433,8 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         r"motion\.wave: nothing follows it"),
     "material of nothing": ({"materials__gel": SOFT},
         r"materials\.gel: no pad is made of it; name it as the material of one"),
-    "law of nothing": ({"laws__wet": WET}, r"laws\.wet: no contact follows it; name it as the law "
-                                           r"of one"),
+    "law of nothing": ({"laws__wet": WET},
+        r"laws\.wet: no contact follows it; name it as the law of one"),
     "motion that is missing": ({"actuators__x__setpoint": "w"},
         r"motion\.w is missing: bracket\.x is to follow it"),
     "time goes back": ({"motion__x_d__times": (1.5, 0.5)},
@@ -447,14 +447,14 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         r"bodies\.my disc: the name should be letters"),
     "taken": ({"bodies": {"keys": {"x": 0.0, "y": 0.0, "theta": 0.0}}},
         r"bodies\.keys: the name is taken by torch"),
-    "overlap": ({"bodies": {"stone": STONE}}, r"error: bodies\.disc: it and bodies\.stone overlap "
-                                              r"by .* mm at t = 0 s"),
+    "overlap": ({"bodies": {"stone": STONE}},
+        r"error: bodies\.disc: it and bodies\.stone overlap by .* mm at t = 0 s"),
     "no room": ({"motion__y_d__values": ("start", 40e-3)},
         r"error: contacts\.upper: `disc` does not fit: at t = 0\.4 s"),
     "strain": ({"motion__y_d__values": ("start", 45.8e-3)},
         r"warning: pads\.\w+: the strain leaves linear elasticity: at"),
-    "steps": ({"solver": {"step": 0.05}}, r"warning: solver\.step: steps of 0\.05 s are too "
-                                          r"coarse: motion\.y_d goes"),
+    "steps": ({"solver": {"step": 0.05}},
+        r"warning: solver\.step: steps of 0\.05 s are too coarse: motion\.y_d goes"),
     "nothing carries it": (
         {"bodies": {"ball": {"mass": 0.1, "shape": {"kind": "circle", "radius": 5e-3},
         "start": {"x": 0.0, "y": 0.1}}}},
@@ -499,8 +499,8 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
         r"contacts\.upper through each other",
     ),
     "between points": (
-        {"bodies__disc__shape__radius": 1e-5}, r"error: bodies\.disc\.shape: 0\.02 mm wide, it "
-                                               r"falls between points of `lower`"
+        {"bodies__disc__shape__radius": 1e-5},
+        r"error: bodies\.disc\.shape: 0\.02 mm wide, it falls between points of `lower`"
     ),
     "too stiff to rest": (
         {"laws__dry__K_n": 1e9}, r"error: laws\.dry\.K_n: no rest is found with 1e\+09 N/m, .* "

@@ -385,8 +385,8 @@ def test_data_out_of_reach_name_the_recording() -> None:
 @pytest.mark.parametrize(
     ("how", "message"),
     [
-        ({"loss": "huber", "method": "lbfgs"}, "^the method 'lbfgs' has no robust loss: for loss = "
-                                               "'huber' take"),
+        ({"loss": "huber", "method": "lbfgs"},
+         "^the method 'lbfgs' has no robust loss: for loss = 'huber' take"),
         ({"loss": "cauchy", "method": "adam"}, "^the method 'adam' has no robust loss"),
         ({"loss": "Huber"}, "^loss should be 'linear', .* or 'arctan', not 'Huber'"),
         ({"method": "LBFGS"}, "^method should be 'gauss_newton', 'lbfgs' or 'adam', not 'LBFGS'"),

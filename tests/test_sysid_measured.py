@@ -106,8 +106,8 @@ def drop(column: int) -> Change:
 T, X_D, Y_D, Y_D_DOT, F_FF, X_C, THETA, X_BR, Y_BR, F_X, F_Y = 0, 1, 3, 4, 5, 6, 7, 8, 9, 10, 11
 
 BAD: dict[str, tuple[Change, str]] = {
-    "no unit": (put(1, X_C, "x_C"), r"data\.csv, row 1, column `x_C` has no unit: write `x_C "
-                                    r"\[m\]`"),
+    "no unit": (put(1, X_C, "x_C"),
+        r"data\.csv, row 1, column `x_C` has no unit: write `x_C \[m\]`"),
     "unknown unit": (put(1, X_C, "x_C [inch]"),
         r"row 1, column `x_C` cannot be in 'inch'; it can be in m, cm, mm"),
     "wrong dimension": (put(1, THETA, "theta [mm]"),
@@ -118,8 +118,8 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "misspelt column": (put(1, F_FF, "Fff [N]"), r"column `Fff` is not known: is it `F_ff`\?"),
     "time": (put(1, T, "Time [s]"), r"column `Time` is not known: is it `t`\?"),
-    "another column": (put(1, X_C, "Ventil"), r"column `Ventil` is not known; if it has nothing to "
-                                              r"do with the motion, say"),
+    "another column": (put(1, X_C, "Ventil"),
+        r"column `Ventil` is not known; if it has nothing to do with the motion, say"),
     "no feed-forward": (
         drop(F_FF),
         r"data\.csv has no column `F_ff`, and nothing says which force was fed forward.* missing = "
@@ -128,8 +128,8 @@ BAD: dict[str, tuple[Change, str]] = {
     "column twice": (put(1, X_C, "x_Br [mm]"), r"row 1, column `x_Br` is there twice"),
     "no times": (drop(T), r"data\.csv has no column `t`"),
     "no set-point": (drop(Y_D), r"data\.csv has no column `y_d`"),
-    "no sensor": (put(1, X_C, "y_C [mm]"), r"rig\.toml: sensors: no recording has samples of "
-                                           r"`x_C`"),
+    "no sensor": (put(1, X_C, "y_C [mm]"),
+        r"rig\.toml: sensors: no recording has samples of `x_C`"),
     "semicolons": (
         lambda table: table.__setitem__(slice(None), [[";".join(cells)] for cells in table]),
         "row 1.*separate columns with commas",
@@ -143,29 +143,29 @@ BAD: dict[str, tuple[Change, str]] = {
     "grouped digits": (put(9, F_Y, "1_0"), r"row 9, column `F_y`: '1_0' is not a finite number"),
     "digits of another script": (put(9, F_Y, "１２"),
         r"row 9, column `F_y`: '１２' is not a finite number"),
-    "times of a clock": (scale(T, 1.0, 1.7e9), r"row 2, column `t`: 1\.7e\+09 s is too far from "
-                                               r"zero; count times from"),
+    "times of a clock": (scale(T, 1.0, 1.7e9),
+        r"row 2, column `t`: 1\.7e\+09 s is too far from zero; count times from"),
     "empty time": (put(12, T, ""), r"row 12, column `t` is empty; only measured channels may have "
                                    r"gaps"),
     "empty set-point": (put(12, Y_D, " "), r"row 12, column `y_d` is empty"),
     "time twice": (put(12, T, "0.045"), r"row 12, column `t`: the time 0.045 s is there twice"),
-    "time goes back": (put(12, T, "0.01"), r"row 12, column `t`: time goes back, from 0.045 to "
-                                           r"0.01 s"),
+    "time goes back": (put(12, T, "0.01"),
+        r"row 12, column `t`: time goes back, from 0.045 to 0.01 s"),
     "rows missing": (lambda table: table.__delitem__(slice(10, 40)),
         r"row 11, column `t`: 0.155 s are missing before it"),
     "few rows": (lambda table: table.__delitem__(slice(8, None)),
         r"has 7 rows of numbers, but needs at least 10"),
-    "mm under m": (put(1, X_C, "x_C [m]"), r"row 2, column `x_C`: 60.54 m is not plausible, .* "
-                                           r"between -0.12 and 0.24 m"),
+    "mm under m": (put(1, X_C, "x_C [m]"),
+        r"row 2, column `x_C`: 60.54 m is not plausible, .* between -0.12 and 0.24 m"),
     "one spike": (put(30, Y_BR, "500"), r"row 30, column `y_Br`: 0.5 m is not plausible"),
-    "another start": (scale(X_C, 1.0, 5.0), r"row 2, column `x_C`: it begins at 0.065\d* m, but "
-                                            r"scenario.x_C0 is 0.0603 m"),
-    "another sign": (scale(X_C, -1.0), r"it begins at -0.0605\d* m, but scenario.x_C0 is 0.0603 m; "
-                                       r"is its sign opposite\?"),
+    "another start": (scale(X_C, 1.0, 5.0),
+        r"row 2, column `x_C`: it begins at 0.065\d* m, but scenario.x_C0 is 0.0603 m"),
+    "another sign": (scale(X_C, -1.0),
+        r"it begins at -0.0605\d* m, but scenario.x_C0 is 0.0603 m; is its sign opposite\?"),
     "turned already": (scale(THETA, 1.0, 500.0),
         r"row 2, column `theta`: it begins at 0.48\d* rad, but the start is 0 rad"),
-    "another ground": (scale(Y_BR, 1.0, 3.0), r"row 2, column `y_Br`: it begins at .*, but the "
-                                              r"set-point y_d is 0.0501 m"),
+    "another ground": (scale(Y_BR, 1.0, 3.0),
+        r"row 2, column `y_Br`: it begins at .*, but the set-point y_d is 0.0501 m"),
     "moving": (
         lambda table: [cells.__setitem__(X_C, f"{60.3 + 0.3 * i}") for i,
         cells in enumerate(table[1:])],
@@ -184,8 +184,8 @@ BAD: dict[str, tuple[Change, str]] = {
         lambda table: [cells.__setitem__(X_C, "") for cells in table[2:]],
         r"column `x_C` has 1 samples, but needs at least two",
     ),
-    "crushed": (scale(Y_D, 6.0, -250.5), r"rig\.toml, settings of `data`: the disc does not fit: "
-                                         r"scenario.y_Br_grasp"),
+    "crushed": (scale(Y_D, 6.0, -250.5),
+        r"rig\.toml, settings of `data`: the disc does not fit: scenario.y_Br_grasp"),
 }  # fmt: skip
 
 
@@ -223,8 +223,8 @@ BAD_CONFIG = {
     "bounds": (CONFIG.replace("nominal = 1e5", "low = 2\nhigh = 1"),
         r"unknowns\.contact\.K_n: low = 2.0 must be below"),
     "a prior beyond the bounds": (
-        CONFIG.replace("nominal = 1e5", "low = 8e4\nhigh = 1.4e5\nprior = {median = 1e6, sd = "
-                                        "1e3}"),
+        CONFIG.replace("nominal = 1e5",
+        "low = 8e4\nhigh = 1.4e5\nprior = {median = 1e6, sd = 1e3}"),
         r"rig\.toml: unknowns\.contact\.K_n\.prior\.median = 1e\+06 is not between low = 80000 and "
         r"high = 140000",
     ),
@@ -283,8 +283,8 @@ BAD_CONFIG = {
         r"contact\.eta may be",
     ),
     "a law of the same name": (
-        CONFIG + '[compare."as stated"]\n', r"compare: the law of the file itself is called `as "
-                                            r"stated`",
+        CONFIG + '[compare."as stated"]\n',
+        r"compare: the law of the file itself is called `as stated`",
     ),
     "file and files": (
         CONFIG + '[[recordings]]\nfile = "b.csv"\nfiles = ["c.csv"]\n',
@@ -518,7 +518,10 @@ def test_a_long_identification_is_priced(case: Callable[..., list[str]]) -> None
 def test_recordings_have_settings_of_their_own(
     case: Callable[..., list[str]], tmp_path: Path
 ) -> None:
-    more = '[[recordings]]\nname = "data"\nsettings.disc.mass = 0.5\n[[recordings]]\nfile = "second.csv"\nname = "b"\n'
+    more = (
+        '[[recordings]]\nname = "data"\nsettings.disc.mass = 0.5\n'
+        '[[recordings]]\nfile = "second.csv"\nname = "b"\n'
+    )
     data, config = case(config=CONFIG + more)
     (tmp_path / "second.csv").write_text(Path(data).read_text())
     first, second = load([data], config).problem.recordings

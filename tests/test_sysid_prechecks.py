@@ -156,7 +156,8 @@ MISTAKES = {
     ),
     "the disc's set-point taken for the bracket's": Mistake(
         "about the disc", lambda r: noted(r, {"control.senses": "bracket"}), "control.senses",
-        'x_d looks like the set-point of the disc, not of the bracket (say control.senses = "disc")', True,
+        'set-point of the disc, not of the bracket (say control.senses = "disc")',
+        True,
     ),
     "the bracket's taken for the disc's": Mistake(
         "rolling", lambda r: noted(r, {"control.senses": "disc"}), "control.senses",

@@ -360,7 +360,8 @@ def test_an_answer_to_other_data_is_refused(found: Found, tmp_path: Path) -> Non
 
 def undrawn(figure: Figure, alt: str, caption: str = "", kind: str = "") -> str:
     """What `picture` makes, without the pixels."""
-    return f'<figure><img alt="{escape(alt)}">{f"<figcaption>{caption}</figcaption>" if caption else ""}</figure>'
+    below = f"<figcaption>{caption}</figcaption>" if caption else ""
+    return f'<figure><img alt="{escape(alt)}">{below}</figure>'
 
 
 def test_a_loaded_answer_makes_the_same_page(

@@ -67,10 +67,11 @@ def direction_name(d: Direction) -> str:
     parts = list(d.components.items())
     sign = -1 if parts and parts[0][1] < 0 else 1
     parts = [(name, sign * value) for name, value in parts]
-    text = " ".join(
-        f"{'−' if v < 0 else '+' if i else ''} {f'{abs(v):.2f} ' if abs(v) < 0.995 else ''}{name}".strip()
-        for i, (name, v) in enumerate(parts[:MOST_NAMES])
-    )
+    terms = []
+    for i, (name, v) in enumerate(parts[:MOST_NAMES]):
+        factor = f"{abs(v):.2f} " if abs(v) < 0.995 else ""
+        terms.append(f"{'−' if v < 0 else '+' if i else ''} {factor}{name}".strip())
+    text = " ".join(terms)
     return text + (" …" if len(parts) > MOST_NAMES else "")
 
 

@@ -3,7 +3,7 @@
 Residuals (m,) of one channel are in units of the noise that its sensor states. An autoregression of
 order p is
 
-    u_k = phi_1 u_(k-1) + ... + phi_p u_(k-p) + scale e_k,    e_k independent, normal, of variance 1,
+    u_k = phi_1 u_(k-1) + ... + phi_p u_(k-p) + scale e_k,   e_k independent, normal, of variance 1,
 
 on a regular grid, of which samples may be missing. Its whitener W has W' W = K^-1, K the covariance
 of the samples that are there, so |W r|^2 + log det K is -2 log likelihood, but for a constant, and

@@ -107,8 +107,12 @@ class Planner:
         self._others = Runner(problem.recordings, workers)
         self._known: dict[bytes, Array] = {}
         self._idle: list[RunContext] = []
-        self._pulls = [problem.noise[ch].whitener(self.recording.samples[ch][0]) if ch in problem.noise else None
-                       for ch in problem.sensors if ch in self.recording.samples]  # fmt: skip
+        samples = self.recording.samples
+        self._pulls = [
+            problem.noise[ch].whitener(samples[ch][0]) if ch in problem.noise else None
+            for ch in problem.sensors
+            if ch in samples
+        ]
         self.cost = Counter({"runs": 0, "gradients": 0})
 
     def of(self, moves: Moves) -> Self:

@@ -228,7 +228,9 @@ def estimates(result: IdentificationResult) -> Iterator[str]:
     figure = estimates_figure(of)
     if figure is not None:
         ratios = [
-            f"{e.label} {f'{e.value / e.start:.3g} times its start' if e.value is not None else 'not identifiable'}"
+            f"{e.label} {e.value / e.start:.3g} times its start"
+            if e.value is not None
+            else f"{e.label} not identifiable"
             for e in of
             if e.start
         ]
@@ -409,6 +411,11 @@ def laws(result: IdentificationResult) -> Iterator[str]:
         yield picture(plot(compared), "Where in the motion the evidence stands.", kind="broad")
 
 
+def noise_of(model: Autoregression | None) -> str:
+    """Order and size of coloured noise."""
+    return "white" if model is None else f"order {model.order}, {model.sd:.2g} × as stated"
+
+
 def data(
     result: IdentificationResult, drawn: Sequence[Trace], lost: dict[str, str]
 ) -> Iterator[str]:
@@ -418,7 +425,7 @@ def data(
     yield heading("Data against prediction")
     rows = [
         [one.recording, one.channel, f"{one.rms:.2f}", grouped(one.lag1, 2), f"{one.p_white:.2g}",
-         f"order {noise[one.channel].order}, {noise[one.channel].sd:.2g} × as stated" if one.channel in noise else "white"]
+         noise_of(noise.get(one.channel))]
         for one in result.residuals
     ]  # fmt: skip
     head = ["recording", "channel", "rms over noise", "lag-1 correlation", "p (white)", "noise"]
