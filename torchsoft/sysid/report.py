@@ -25,6 +25,7 @@ from torchsoft.sysid.figures import (
     spectrum_figure,
     trace_figure,
 )
+from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.prediction import FailedRun, Signals
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.result import IdentificationResult

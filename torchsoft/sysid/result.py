@@ -438,7 +438,7 @@ def described(
         "contributions": contributions(problem, x, free, J, fitted),
         "combinations": seen_together(problem, free, C), "noise": noise,
         "assumptions": list(checks),
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in packages}},
+        "versions": {"python": platform.python_version()} | {one: version(one) for one in packages},
         "rigs": {recording.name: recording.rig for recording in problem.recordings},
     }  # fmt: skip
 
