@@ -2,6 +2,7 @@
 that do get none."""
 
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,6 +17,7 @@ from torchsoft import Parameters, Reference, SoftGrasp
 from torchsoft.diagnostic import Diagnostic
 from torchsoft.excitation import Excitation, MultiSine, Press, Strokes
 from torchsoft.physics.motion import Profile, Sampled
+from torchsoft.physics.parts import Actuator
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Unknown, record
 from torchsoft.sysid.measured import paper_settings
 from torchsoft.sysid.plan import LOOSE
@@ -260,6 +262,28 @@ def test_gains_that_are_unknown_still_tell_a_sign(recordings: dict[str, Recordin
         ]
     about = noted(recordings["rolling"], {"control.senses": "disc"})
     assert [f.code for f in loop_findings(about, SENSORS, ["control.K_81"])] == ["control.senses"]
+
+
+def test_a_law_of_several_coordinates_is_compared_with_its_effort_or_the_gap_is_named(
+    recordings: dict[str, Recording],
+) -> None:
+    one = recordings["rolling"]
+    rig: Any = deepcopy(one.rig)
+    loop = rig.actuators["x"]
+
+    def both(w: Any, w_dot: Any, feed: Any, q: Any, q_dot: Any) -> Any:
+        return loop.law(w[..., 0], w_dot[..., 0], feed, q[..., 0], q_dot[..., 0]) + 0.0 * q[..., 1]
+
+    rig.actuators["x"] = Actuator(
+        [loop.measured, "disc.theta"], loop.pushes, both, setpoint=[loop.setpoint]
+    )
+    same = replace(one, rig=rig)
+    assert not list(loop_findings(same, SENSORS))
+    flipped = changed(same, F_x=scaled(-1))
+    assert [f.code for f in loop_findings(flipped, SENSORS)] == ["sign of F_x"]
+    (note,) = loop_findings(changed(same, theta=None), SENSORS)
+    assert note.severity == "note"
+    assert "F_x is not compared with its controller, since theta is not recorded" in note.message
 
 
 def test_coloured_noise_is_no_mistake(
