@@ -124,7 +124,7 @@ def late(data: Recording) -> Recording:
     [
         (elsewhere, "x_C0", 30.0, "the data contradict that the disc begins at scenario.x_C0"),
         (turned, "bias theta", 2e-3, "the data contradict that theta has no unknown bias"),
-        (lambda data: delayed(data, -1e-3), "clock of the set-points", 1.0,
+        (lambda data: delayed(data, -3e-4), "clock of the set-points", 0.3,
          "the data contradict that set-points and sensors"),
         (late, "delay x_C", 1.0, "the data contradict that x_C has no unknown delay"),
         (
