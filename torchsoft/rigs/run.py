@@ -15,8 +15,6 @@ from torchsoft.physics.mesh import Mesh
 from torchsoft.physics.mesh.compliance import SMALLEST_BLOCK
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.plot import figures, general
-from torchsoft.plot.animation import animate
 from torchsoft.rigs.build import BuiltRig, RigFile
 from torchsoft.rigs.fields import at_field
 from torchsoft.solve.ledger import doubts
@@ -170,6 +168,10 @@ def cost(file: RigFile, runs: bool) -> Cost:
 def draw(file: RigFile, rig: Rig, run: Trajectory, out: Path, progress: bool) -> list[str]:
     """Write the figures and the video that a file asks for to `out`; the names of the files
     written."""
+    # matplotlib takes half a second, which `check` does not need
+    from torchsoft.plot import figures, general
+    from torchsoft.plot.animation import animate
+
     end, written = float(run.t[-1]), []
     times = [t for t in file.outputs.snapshots if t <= end] or [
         i * end / (SNAPSHOTS - 1) for i in range(SNAPSHOTS)
