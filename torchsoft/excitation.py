@@ -5,7 +5,6 @@ An `Excitation` is plain validated data, so that it can stand in a TOML file; `b
 a model at rest with the reference that its controllers follow.
 """
 
-import json
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, Self
@@ -19,7 +18,7 @@ from torchsoft.paper.equilibrium import holding_force, press, rest
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp, apart
 from torchsoft.physics.motion import FADE, Knotted, Profile, Reference, Wave, Waves, wave
-from torchsoft.tables import LISTED, SEED, Table, from_toml
+from torchsoft.tables import LISTED, SEED, Table, from_toml, toml_row
 
 MOST = 10_000
 """Strokes in one motion."""
@@ -169,16 +168,8 @@ class Excitation(Table):
         """The text of a TOML file that `from_toml` reads."""
         fields = self.model_dump(mode="json")
         motion = fields.pop("motion")
-        rows = [f"{name} = {json.dumps(value)}" for name, value in fields.items()]
-        return "\n".join(
-            [
-                *rows,
-                "",
-                "[motion]",
-                *(f"{name} = {json.dumps(value)}" for name, value in motion.items()),
-                "",
-            ]
-        )
+        rows, others = ([toml_row(*row) for row in table.items()] for table in (fields, motion))
+        return "\n".join([*rows, "", "[motion]", *others, ""])
 
     def settings(self, p: Parameters) -> Parameters:
         """The parameters p with this excitation's grasp. Raises `ValueError` for a grasp that is

@@ -4,6 +4,7 @@ sentence.
 The sentence names every field that is wrong, what was given and what is allowed.
 """
 
+import json
 import re
 import reprlib
 import tomllib
@@ -145,6 +146,9 @@ def path(loc: tuple[int | str, ...], data: Any, there: bool) -> str:
 
 
 SMALL = re.compile(r"(?<![\w.'])0\.0000\d+|(?<![\w.'])\d{6,}\.0\b")
+COLUMN = 44
+"""Where comments of a written TOML file begin."""
+
 SHORT = reprlib.Repr()
 SHORT.maxother = SHORT.maxstring = SHORT.maxlong = 40
 SHORT.maxlevel = SHORT.maxdict = SHORT.maxlist = SHORT.maxtuple = 2
@@ -171,6 +175,22 @@ def line(text: Any, length: int = 600) -> str:
     """Text as one line of limited length, without control characters."""
     one = plain(" ".join(str(text).split()))
     return one if len(one) <= length else one[: length - 3] + "..."
+
+
+def toml_value(value: Any) -> str:
+    """A value in TOML: a table in one line, a list, a number or text."""
+    if isinstance(value, Table):
+        rows = ", ".join(toml_row(name, getattr(value, name)) for name in type(value).model_fields)
+        return f"{{{rows}}}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(toml_value(one) for one in value)}]"
+    return repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False)
+
+
+def toml_row(name: str, value: Any, remark: str = "") -> str:
+    """A row of a TOML file with a comment; without a value where that is None."""
+    row = f"{name} =" if value is None else f"{name} = {toml_value(value)}"
+    return f"{row.ljust(COLUMN - 1)} # {remark}" if remark else row
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from torchsoft.files import finite, replacing, write_json
 from torchsoft.materials.fit import Fit
 from torchsoft.plot.figures import ACTUAL, OTHER, STYLE, new_figure, save
 from torchsoft.plot.scene import INK
+from torchsoft.tables import toml_row
 
 MPA = 1e-6
 
@@ -52,9 +53,9 @@ def toml(fit: Fit, assumed: Mapping[str, float]) -> str:
     rows = [f"[materials.{key}]", f'kind = "{fit.kind}"']
     for argument, value in fit.table().items():
         note = ", small: the instantaneous spring's" if argument == "tau_instant" else ""
-        rows.append(f"{argument} = {value!r}  # [{UNITS[argument]}]{note}")
+        rows.append(toml_row(argument, value, f"[{UNITS[argument]}]{note}"))
     rows += [
-        f"{name} = {value!r}  # [{UNITS[name]}] not of this test: assumed"
+        toml_row(name, value, f"[{UNITS[name]}] not of this test: assumed")
         for name, value in assumed.items()
     ]
     head = [

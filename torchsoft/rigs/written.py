@@ -1,7 +1,6 @@
 """A rig file as TOML text: every field with its unit and meaning as a comment, from the schema;
 what is left at its default is commented out."""
 
-import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, get_args
@@ -11,10 +10,7 @@ from pydantic.fields import FieldInfo
 from torchsoft.quantity import Quantity, metadata
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import Group, NumberOr
-from torchsoft.tables import read_toml
-
-COLUMN = 44
-"""Where comments begin."""
+from torchsoft.tables import read_toml, toml_row
 
 
 def to_toml(file: RigFile) -> str:
@@ -55,7 +51,7 @@ def scalars(table: Group, known: list[str], seen: set[type[Group]]) -> Iterator[
     seen.add(type(table))
     fields = type(table).model_fields
     if "kind" in fields:
-        yield commented(f"kind = {text(table.model_dump()['kind'])}", f"one of {', '.join(known)}")
+        yield toml_row("kind", table.model_dump()["kind"], f"one of {', '.join(known)}")
     for name, field in fields.items():
         value = getattr(table, name)
         if (
@@ -65,16 +61,9 @@ def scalars(table: Group, known: list[str], seen: set[type[Group]]) -> Iterator[
         ):
             continue
         if value is not None and (name in table.model_fields_set or field.is_required()):
-            yield commented(f"{name} = {text(value)}", remark(field))
+            yield toml_row(name, value, remark(field))
         elif not again:
-            yield commented(
-                f"# {name} = {text(value)}" if value is not None else f"# {name} =", remark(field)
-            )
-
-
-def commented(row: str, remark: str) -> str:
-    """A line with its comment."""
-    return f"{row.ljust(COLUMN - 1)} # {remark}" if remark else row
+            yield toml_row(f"# {name}", value, remark(field))
 
 
 def remark(field: FieldInfo) -> str:
@@ -108,20 +97,6 @@ def kinds(field: FieldInfo) -> list[str]:
         if "kind" in one.model_fields
     )
     return list(dict.fromkeys(found))
-
-
-def text(value: Any) -> str:
-    """A value in TOML."""
-    if isinstance(value, Group):
-        inner = ", ".join(
-            f"{name} = {text(getattr(value, name))}" for name in type(value).model_fields
-        )
-        return f"{{{inner}}}"
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(text(one) for one in value)}]"
-    if isinstance(value, float):
-        return repr(value)
-    return json.dumps(value, ensure_ascii=False)
 
 
 def template(title: str) -> RigFile:
