@@ -87,8 +87,8 @@ class Result:
 
 
 class FiniteDifferences(Problem):
-    """The same problem with forward differences in place of sensitivities, all perturbed runs
-    handed over at once."""
+    """The same problem with differences in place of sensitivities, inwards at an upper bound, all
+    perturbed runs handed over at once."""
 
     def residuals(
         self,
@@ -100,7 +100,9 @@ class FiniteDifferences(Problem):
     ) -> Residuals:
         if free is None:
             return super().residuals(runner, x, which, steps)
-        moved = [x, *(x + DIFFERENCE * np.eye(len(x))[i] for i in np.flatnonzero(free))]
+        inside = x + DIFFERENCE <= self.coordinates.bounds[1]
+        step = np.where(inside, DIFFERENCE, -DIFFERENCE)
+        moved = [x, *(x + step[i] * np.eye(len(x))[i] for i in np.flatnonzero(free))]
         jobs = [self.jobs(z, which, steps, None) for z in moved]
         results = iter(runner.run([job for some in jobs for job in some]))
         at, *ahead = (
@@ -108,7 +110,7 @@ class FiniteDifferences(Problem):
         )
         J = np.zeros((len(at.r), len(x)))
         for i, one in zip(np.flatnonzero(free), ahead):
-            J[:, i] = (one.r - at.r) / DIFFERENCE
+            J[:, i] = (one.r - at.r) / step[i]
         lost = at.lost | {name: loss for one in ahead for name, loss in one.lost.items()}
         return Residuals(at.r, J, lost)
 
