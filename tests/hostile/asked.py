@@ -1,4 +1,5 @@
-"""One trial of an input: accepted and finite, or refused in one sentence that names what is wrong, in good time."""
+"""One trial of an input: accepted and finite, or refused in one sentence that names what is wrong,
+in good time."""
 
 import signal
 import traceback
@@ -33,7 +34,8 @@ def in_time(limit: float = LIMIT) -> Iterator[None]:
 
 
 def names(text: str, mutant: Mutant) -> bool:
-    """Whether a refusal names the only place that was changed, by its last name (a tuple's entry by the tuple's)."""
+    """Whether a refusal names the only place that was changed, by its last name (a tuple's entry by
+    the tuple's)."""
     words = [part for part in mutant.place if isinstance(part, str)]
     if not words:
         return True
@@ -44,10 +46,14 @@ def names(text: str, mutant: Mutant) -> bool:
 
 
 def ask(
-    tally: Tally, what: str, mutant: Mutant, function: Callable[[], Any], follow: Callable[[Any], Any] | None = None
+    tally: Tally,
+    what: str,
+    mutant: Mutant,
+    function: Callable[[], Any],
+    follow: Callable[[Any], Any] | None = None,
 ) -> Any:
-    """Count one input; what `function` makes of it, or None where it was refused. `follow` raises `AssertionError` for what
-    is accepted and is nonsense, and may refuse with a sentence too."""
+    """Count one input; what `function` makes of it, or None where it was refused. `follow` raises
+    `AssertionError` for what is accepted and is nonsense, and may refuse with a sentence too."""
     shown = f"{what} {mutant.place} = {mutant.new!r:.60}"
     try:
         with in_time(), warnings.catch_warnings():

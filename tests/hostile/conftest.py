@@ -28,7 +28,12 @@ def tally(request: pytest.FixtureRequest) -> Iterator[Callable[[str], Tally]]:
     TABLE.mkdir(parents=True, exist_ok=True)
     for line in lines:
         name = "".join(c if c.isalnum() else "_" for c in line.kind)
-        content = {"kind": line.kind, "tried": line.tried, "not_held": len(line.broken), "broken": line.broken}
+        content = {
+            "kind": line.kind,
+            "tried": line.tried,
+            "not_held": len(line.broken),
+            "broken": line.broken,
+        }
         (TABLE / f"{name}.json").write_text(json.dumps(content, indent=1))
     broken = [text for line in lines for text in line.broken]
     assert all(line.tried for line in lines), "nothing was tried"
@@ -49,11 +54,16 @@ def random() -> Callable[..., np.random.Generator]:
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:
     """The table of what was tried, of every process."""
-    rows = [json.loads(file.read_text()) for file in sorted(TABLE.glob("*.json"))] if TABLE.is_dir() else []
+    rows = (
+        [json.loads(file.read_text()) for file in sorted(TABLE.glob("*.json"))]
+        if TABLE.is_dir()
+        else []
+    )
     if rows:
         terminalreporter.write_sep("-", "hostile trial")
         for row in rows:
             held = row["tried"] - row["not_held"]
             terminalreporter.write_line(
-                f"{row['kind']:<60} tried {row['tried']:>6}  held {held:>6}  not held {row['not_held']:>4}"
+                f"{row['kind']:<60} tried {row['tried']:>6}  held {held:>6}  not held "
+                f"{row['not_held']:>4}"
             )

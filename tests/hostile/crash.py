@@ -10,8 +10,18 @@ from typing import Any
 
 from hostile.small import DIED, fork, forked
 
-CHANGES = ("os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate", "shutil.rmtree")
-"""Events of Python's audit hooks that change what is in a folder; they are raised before the operation."""
+CHANGES = (
+    "os.rename",
+    "os.mkdir",
+    "os.remove",
+    "os.rmdir",
+    "os.link",
+    "os.symlink",
+    "os.truncate",
+    "shutil.rmtree",
+)
+"""Events of Python's audit hooks that change what is in a folder; they are raised before the
+operation."""
 
 
 class Torn:
@@ -51,7 +61,9 @@ class Points:
         return self.count - 1 == self.last
 
     def inside(self, path: Any) -> bool:
-        return isinstance(path, str | bytes | os.PathLike) and os.fsdecode(path).startswith(self.folder)
+        return isinstance(path, str | bytes | os.PathLike) and os.fsdecode(path).startswith(
+            self.folder
+        )
 
     def install(self) -> None:
         """For the rest of this process's life."""
@@ -81,7 +93,8 @@ class Points:
 
 
 def points(function: Callable[[], Any], folder: Path) -> list[str]:
-    """Every operation below `folder` that the function does, in order; it is done in a process of its own."""
+    """Every operation below `folder` that the function does, in order; it is done in a process of
+    its own."""
     read, write = os.pipe()
 
     def counted() -> None:

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 NUMBERS = (
-    True, False, "", "abc", "1_0", "1e3", "nan", math.nan, math.inf, -math.inf, 1e308, -1e308, 1e-300, 5e-324, -1.0, -1, 0, 0.0,
-    10**400, -(10**19), 2**63, [], [1.0], [[1.0]], {}, {"low": 1.0}, "µ°", "'", "\n", 1e5, 1e-5, 3, 0.5, 1e15,
+    True, False, "", "abc", "1_0", "1e3", "nan", math.nan, math.inf, -math.inf, 1e308, -1e308,
+    1e-300, 5e-324, -1.0, -1, 0, 0.0, 10**400, -(10**19), 2**63, [], [1.0], [[1.0]], {},
+    {"low": 1.0}, "µ°", "'", "\n", 1e5, 1e-5, 3, 0.5, 1e15,
 )  # fmt: skip
 """Values for the place of any other."""
 
@@ -18,7 +19,8 @@ NOT_NUMBERS = (bool, str, list, dict)
 
 
 class Mutant(NamedTuple):
-    """A tree, the only place in it that changed (empty where more did), and what stands there now."""
+    """A tree, the only place in it that changed (empty where more did), and what stands there
+    now."""
 
     tree: Any
     place: tuple[str | int, ...]
@@ -26,9 +28,17 @@ class Mutant(NamedTuple):
     new: Any = None
 
 
-def leaves(tree: Any, place: tuple[str | int, ...] = ()) -> Iterator[tuple[tuple[str | int, ...], Any]]:
+def leaves(
+    tree: Any, place: tuple[str | int, ...] = ()
+) -> Iterator[tuple[tuple[str | int, ...], Any]]:
     """Every value that is not a table, with its place."""
-    items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else None
+    items = (
+        tree.items()
+        if isinstance(tree, dict)
+        else enumerate(tree)
+        if isinstance(tree, list)
+        else None
+    )
     if items is None:
         yield place, tree
         return
@@ -50,13 +60,19 @@ def replaced(tree: Any, place: tuple[str | int, ...], value: Any) -> Any:
 
 
 def mutant(tree: Any, rng: np.random.Generator) -> Mutant:
-    """One of: another value, another magnitude, a swap, a missing key, one more, or a table in the place of a value."""
+    """One of: another value, another magnitude, a swap, a missing key, one more, or a table in the
+    place of a value."""
     places = list(leaves(tree))
     place, old = places[rng.integers(len(places))]
-    kind = rng.choice(["value", "scale", "swap", "delete", "misspell", "nest"], p=[0.45, 0.25, 0.08, 0.07, 0.1, 0.05])
+    kind = rng.choice(
+        ["value", "scale", "swap", "delete", "misspell", "nest"],
+        p=[0.45, 0.25, 0.08, 0.07, 0.1, 0.05],
+    )
     if kind == "scale" and isinstance(old, int | float) and not isinstance(old, bool):
         factor = float(10.0 ** rng.uniform(-12, 12) * rng.choice([1.0, 1.0, 1.0, -1.0]))
-        new: Any = round(old * factor) if isinstance(old, int) and rng.random() < 0.7 else old * factor
+        new: Any = (
+            round(old * factor) if isinstance(old, int) and rng.random() < 0.7 else old * factor
+        )
         return Mutant(replaced(tree, place, new), place, old, new)
     if kind == "swap":
         other, value = places[rng.integers(len(places))]
@@ -148,16 +164,25 @@ def encoded(data: bytes, rng: np.random.Generator) -> bytes:
     """In another encoding, with a mark of its order, or with other ends of lines."""
     words = data.decode("utf-8")
     return [
-        words.encode("utf-16"), words.encode("utf-32"), b"\xef\xbb\xbf" + data, words.replace("\n", "\r\n").encode(),
-        words.replace("\n", "\r").encode(), (words + "# µ\n").encode("latin-1"), b"",
+        words.encode("utf-16"), words.encode("utf-32"), b"\xef\xbb\xbf" + data,
+        words.replace("\n", "\r\n").encode(), words.replace("\n", "\r").encode(),
+        (words + "# µ\n").encode("latin-1"), b"",
     ][rng.integers(7)]  # fmt: skip
 
 
-TEXTS: tuple[Callable[[bytes, np.random.Generator], bytes], ...] = (cut, flip, insert, zeroed, twice, encoded)
+TEXTS: tuple[Callable[[bytes, np.random.Generator], bytes], ...] = (
+    cut,
+    flip,
+    insert,
+    zeroed,
+    twice,
+    encoded,
+)
 
 
 def written(path: Path, tree: Any, way: str, number: int, rng: np.random.Generator) -> Mutant:
-    """Write a table to a file with one of its values changed, or (`way` other than "values") its text."""
+    """Write a table to a file with one of its values changed, or (`way` other than "values") its
+    text."""
     if way == "values":
         changed = mutant(tree, rng)
         path.write_text(toml(changed.tree), encoding="utf-8")

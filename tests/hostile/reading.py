@@ -1,4 +1,5 @@
-"""Reads the trajectory files that it is given on standard input, one a line, and says what came of each in a line of JSON.
+"""Reads the trajectory files that it is given on standard input, one a line, and says what came of
+each in a line of JSON.
 
 A process of its own: damage may make the libraries crash, and that must be seen.
 """
@@ -19,7 +20,9 @@ print("ready", flush=True)
 for name in sys.stdin:
     try:
         table = read_table(Path(name.strip()))
-        values = b"".join(k.encode() + column.tobytes() for k, column in sorted(table.values.items()))
+        values = b"".join(
+            k.encode() + column.tobytes() for k, column in sorted(table.values.items())
+        )
         finite = all(bool(np.isfinite(column).all()) for column in table.values.values())
         said = {"read": hashlib.sha256(values).hexdigest(), "finite": finite}
     except (ValueError, OSError) as refusal:

@@ -54,7 +54,8 @@ _rows: dict[tuple[str, int], Any] = {}
 
 
 def remembered(config: Config, task: Any) -> Any:
-    """A simulated row: in this process, and those forked from it, the one that was simulated first."""
+    """A simulated row: in this process, and those forked from it, the one that was simulated
+    first."""
     key = (config.hash, task.index)
     if key not in _rows:
         _rows[key] = simulate_task(config, task)
@@ -62,14 +63,16 @@ def remembered(config: Config, task: Any) -> Any:
 
 
 def make(config: Config, folder: Path) -> None:
-    """Generate in this process; a row that was simulated before is written without being simulated again."""
+    """Generate in this process; a row that was simulated before is written without being simulated
+    again."""
     torch.set_num_threads(1)
     with mock.patch.object(generation, "simulate_task", remembered):
         assert generate(config, str(folder), Serial(), progress=False) == 0
 
 
 def in_memory(otherwise: Path) -> Iterator[Path]:
-    """A folder that is flushed at once, where there is one: waiting for a disk would take most of the trial's time."""
+    """A folder that is flushed at once, where there is one: waiting for a disk would take most of
+    the trial's time."""
     memory = Path("/dev/shm")
     if os.access(memory, os.W_OK):
         with TemporaryDirectory(dir=memory) as folder:
@@ -80,13 +83,18 @@ def in_memory(otherwise: Path) -> Iterator[Path]:
 
 def tree(folder: Path) -> dict[str, bytes | None]:
     """Every file with its content, every folder with None."""
-    return {str(p.relative_to(folder)): None if p.is_dir() else p.read_bytes() for p in sorted(folder.rglob("*"))}
+    return {
+        str(p.relative_to(folder)): None if p.is_dir() else p.read_bytes()
+        for p in sorted(folder.rglob("*"))
+    }
 
 
 def difference(folder: Path, expected: dict[str, bytes | None]) -> str:
     """What there is too much, too little and otherwise; empty where all is the same to the byte."""
     here = tree(folder)
-    wrong = sorted(key for key in here.keys() | expected.keys() if here.get(key, 0) != expected.get(key, 0))
+    wrong = sorted(
+        key for key in here.keys() | expected.keys() if here.get(key, 0) != expected.get(key, 0)
+    )
     return ", ".join(wrong)
 
 
@@ -102,7 +110,8 @@ DIED = 9
 
 
 def fork(function: Callable[[], Any], seconds: int = 120) -> int:
-    """The id of a process that runs the function and ends, with status 0, or 1 after its traceback; it never lasts longer."""
+    """The id of a process that runs the function and ends, with status 0, or 1 after its traceback;
+    it never lasts longer."""
     sys.stdout.flush()
     sys.stderr.flush()
     if pid := os.fork():

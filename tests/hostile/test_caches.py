@@ -1,6 +1,8 @@
-"""Caches of compiled kernels that are damaged, planted, another's, or not to be written; users and terminals of all kinds.
+"""Caches of compiled kernels that are damaged, planted, another's, or not to be written; users and
+terminals of all kinds.
 
-Kernels of a few lines stand for the real ones wherever no physics matters, since those take a minute to compile.
+Kernels of a few lines stand for the real ones wherever no physics matters, since those take a
+minute to compile.
 """
 
 import json
@@ -55,7 +57,9 @@ DAMAGES: dict[str, Damage] = {
     "longer": lambda rng, content, trap: content + b"\0",
     "zeros": lambda rng, content, trap: content[:200] + bytes(64) + content[264:],
     "a pickle": lambda rng, content, trap: pickle.dumps(trap),
-    "a pickle with a checksum of its own": lambda rng, content, trap: bytes(32) + pickle.dumps(trap),
+    "a pickle with a checksum of its own": lambda rng, content, trap: (
+        bytes(32) + pickle.dumps(trap)
+    ),
 }
 
 
@@ -71,7 +75,9 @@ def damage(path: Path, kind: str, rng: np.random.Generator, trap: Trap) -> None:
     elif kind == "others may write":
         path.chmod(0o666)
     elif kind == "another kernel's":
-        others = sorted(other for other in path.parent.iterdir() if other != path and other.is_file())
+        others = sorted(
+            other for other in path.parent.iterdir() if other != path and other.is_file()
+        )
         path.write_bytes(others[int(rng.integers(len(others)))].read_bytes())
     else:
         path.unlink()
@@ -85,7 +91,12 @@ KINDS = [*DAMAGES, "others may write", "another kernel's", "a folder", "a pipe",
 
 
 def test_damaged_kernels_are_made_again(
-    folder: Path, tally: Callable[[str], Tally], count: Any, random: Any, tmp_path: Path, capsys: Any
+    folder: Path,
+    tally: Callable[[str], Tally],
+    count: Any,
+    random: Any,
+    tmp_path: Path,
+    capsys: Any,
 ) -> None:
     line, trap = tally("damaged and planted files of small kernels"), Trap(tmp_path / "executed")
     for number in range(count(280)):
@@ -93,7 +104,9 @@ def test_damaged_kernels_are_made_again(
         shutil.rmtree(folder, ignore_errors=True)
         assert kernels()(3.0, 4.0) == 25.0
         paths = sorted(folder.iterdir())
-        chosen = {"entry": [p for p in paths if "hypotenuse" in p.name], "all": paths}["entry" if number % 2 else "all"]
+        chosen = {"entry": [p for p in paths if "hypotenuse" in p.name], "all": paths}[
+            "entry" if number % 2 else "all"
+        ]
         kind = KINDS[number // 2 % len(KINDS)]
         for path in chosen:
             damage(path, kind, rng, trap)
@@ -105,7 +118,8 @@ def test_damaged_kernels_are_made_again(
                 right, said = again(3.0, 4.0) == 25.0, capsys.readouterr().err
             healed = remembered(again) == 1 or kind == "a folder"
             line.held(
-                right and healed and not trap.path.exists() and said.count("\n") <= 1, f"{number}, {kind}: {said}"
+                right and healed and not trap.path.exists() and said.count("\n") <= 1,
+                f"{number}, {kind}: {said}",
             )
         except BaseException as error:
             line.held(False, f"{number}, {kind}: {error!r}")
@@ -142,7 +156,9 @@ for folder in sys.argv[1:]:
         line.held(held and not trap.path.exists(), f"{kind}: {status} {out[-500:]} {err[-1000:]}")
 
 
-def test_changed_sources_give_changed_physics(tally: Callable[[str], Tally], rolled: list[str], tmp_path: Path) -> None:
+def test_changed_sources_give_changed_physics(
+    tally: Callable[[str], Tally], rolled: list[str], tmp_path: Path
+) -> None:
     """Where the package cannot be written, and the kernels of before lie in the user's cache."""
     need_users()
     line, home = tally("upgrades of a package that cannot be written"), tmp_path / "home"
@@ -150,39 +166,64 @@ def test_changed_sources_give_changed_physics(tally: Callable[[str], Tally], rol
     shutil.copytree(cache.FOLDERS[0], home / ".cache" / "torchsoft" / cache.NAME)
     for path in (home, *home.rglob("*")):
         os.chown(path, USER, USER)
-    program = ROLLING + "from torchsoft.solve.kernel import cache\nprint(json.dumps([roll(), cache.NAME]))"
-    surroundings: dict[str, str | None] = {"HOME": str(home), "XDG_CACHE_HOME": None, "NUMBA_CACHE_DIR": None}
+    program = (
+        ROLLING
+        + "from torchsoft.solve.kernel import cache\nprint(json.dumps([roll(), cache.NAME]))"
+    )
+    surroundings: dict[str, str | None] = {
+        "HOME": str(home),
+        "XDG_CACHE_HOME": None,
+        "NUMBA_CACHE_DIR": None,
+    }
     status, out, err = python(program, USER, old, **surroundings)
-    line.held(status == 0 and json.loads(out) == [rolled, cache.NAME] and err == "", f"before: {out} {err}")
+    line.held(
+        status == 0 and json.loads(out) == [rolled, cache.NAME] and err == "",
+        f"before: {out} {err}",
+    )
     source = old / "torchsoft" / "solve" / "kernel" / "interface.py"
     text = source.read_text(encoding="utf-8")
     changed = text.replace("u += row[j] * zeta[j]", "u += 3.0 * row[j] * zeta[j]")
     assert changed != text
     source.write_text(changed, encoding="utf-8")
     status, out, err = python(program, USER, old, **surroundings)
-    line.held(status == 0 and rolled not in json.loads(out) and cache.NAME not in out, f"after: {status} {out} {err}")
-    line.held(len(list((home / ".cache" / "torchsoft").iterdir())) == 2, "the kernels of both are kept, apart")
+    line.held(
+        status == 0 and rolled not in json.loads(out) and cache.NAME not in out,
+        f"after: {status} {out} {err}",
+    )
+    line.held(
+        len(list((home / ".cache" / "torchsoft").iterdir())) == 2,
+        "the kernels of both are kept, apart",
+    )
 
 
-def test_users_without_rights(tally: Callable[[str], Tally], rolled: list[str], tmp_path: Path) -> None:
+def test_users_without_rights(
+    tally: Callable[[str], Tally], rolled: list[str], tmp_path: Path
+) -> None:
     """With root's cache they simulate at once; without any they compile, and one line says so."""
     need_users()
     line = tally("users who can write neither the package nor a home")
     warm, cold = package(tmp_path / "warm", warm=True), package(tmp_path / "cold", warm=False)
     nowhere: list[dict[str, str | None]] = [
-        {"HOME": "/nonexistent"}, {"HOME": None}, {"HOME": ""}, {"HOME": "/", "XDG_CACHE_HOME": "/proc/nothing"},
-        {"HOME": None, "MPLCONFIGDIR": None, "TMPDIR": "/nonexistent"}, {"NUMBA_CACHE_DIR": "/nonexistent"},
+        {"HOME": "/nonexistent"}, {"HOME": None}, {"HOME": ""},
+        {"HOME": "/", "XDG_CACHE_HOME": "/proc/nothing"},
+        {"HOME": None, "MPLCONFIGDIR": None, "TMPDIR": "/nonexistent"},
+        {"NUMBA_CACHE_DIR": "/nonexistent"},
     ]  # fmt: skip
     for surroundings in nowhere:
         status, out, err = python(TINY, USER, cold, **surroundings)
         said = err.splitlines()
-        note = [text for text in said if text.startswith("torchsoft: note: compiled kernels cannot be kept in ")]
+        note = [
+            text
+            for text in said
+            if text.startswith("torchsoft: note: compiled kernels cannot be kept in ")
+        ]
         held = status == 0 and json.loads(out) == [25.0, 0] and len(note) == 1 and len(said) <= 2
         line.held(held, f"cold, {surroundings}: {status} {out} {err}")
     for surroundings in nowhere[:3]:
         status, out, err = python(ROLLING + "print(json.dumps(roll()))", USER, warm, **surroundings)
         line.held(
-            status == 0 and json.loads(out) == rolled and err == "", f"warm, {surroundings}: {status} {out} {err}"
+            status == 0 and json.loads(out) == rolled and err == "",
+            f"warm, {surroundings}: {status} {out} {err}",
         )
 
 
@@ -191,8 +232,8 @@ def test_caches_of_other_users(tally: Callable[[str], Tally], tmp_path: Path) ->
     need_users()
     line, theirs = tally("caches of other users"), tmp_path / "cache"
     for owner, mode, used in (
-        (0, 0o644, True), (USER, 0o644, True), (USER, 0o400, True), (54321, 0o644, False), (0, 0o666, False), (0, 0o664, False),
-        (USER, 0o646, False),
+        (0, 0o644, True), (USER, 0o644, True), (USER, 0o400, True), (54321, 0o644, False),
+        (0, 0o666, False), (0, 0o664, False), (USER, 0o646, False),
     ):  # fmt: skip
         shutil.rmtree(theirs, ignore_errors=True)
         assert python(TINY, NUMBA_CACHE_DIR=str(theirs))[0] == 0
@@ -220,7 +261,9 @@ def test_full_disk(tally: Callable[[str], Tally], tmp_path: Path) -> None:
             status, out, err = python(TINY, NUMBA_CACHE_DIR=str(disk))
             left = [path.name for path in disk.rglob("*.partial")]
             noted = "torchsoft: note: compiled kernels cannot be kept in " in err
-            held = status == 0 and json.loads(out) == [25.0, 0] and not left and (noted or filled < 36)
+            held = (
+                status == 0 and json.loads(out) == [25.0, 0] and not left and (noted or filled < 36)
+            )
             line.held(held and "Traceback" not in err, f"{filled} kB: {status} {out} {err} {left}")
     finally:
         subprocess.run(["umount", str(disk)], check=True)
@@ -229,7 +272,8 @@ def test_full_disk(tally: Callable[[str], Tally], tmp_path: Path) -> None:
 def test_many_at_one_cache(
     folder: Path, tally: Callable[[str], Tally], count: Any, random: Any, tmp_path: Path
 ) -> None:
-    """Processes that compile at once, some of them killed at it: every other has what it needs, and nothing is left."""
+    """Processes that compile at once, some of them killed at it: every other has what it needs, and
+    nothing is left."""
     line = tally("processes at one cache, a third of them killed")
     for number in range(count(20)):
         rng, children = random(98, number), {}
@@ -253,11 +297,16 @@ def test_many_at_one_cache(
             for path in folder.glob("*.kernel"):
                 path.unlink()
             kernels()(3.0, 4.0)
-            line.held(not list(folder.glob("*.partial")), f"{number}: {[path.name for path in folder.iterdir()]}")
+            line.held(
+                not list(folder.glob("*.partial")),
+                f"{number}: {[path.name for path in folder.iterdir()]}",
+            )
             shutil.rmtree(folder)
 
 
-def test_first_use_in_many_threads(tally: Callable[[str], Tally], count: Any, rolled: list[str]) -> None:
+def test_first_use_in_many_threads(
+    tally: Callable[[str], Tally], count: Any, rolled: list[str]
+) -> None:
     """Kernels and laws are loaded and compiled once, whoever comes first."""
     line = tally("threads whose first runs are at once")
     program = f"""{ROLLING}
@@ -286,7 +335,12 @@ COMMANDS = {
 def test_terminals_that_know_ascii_only(tally: Callable[[str], Tally], tmp_path: Path) -> None:
     """Files are read and written as ever, and a sign that cannot be shown ends no command."""
     line = tally("commands where everything is ASCII")
-    ascii_only = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "OMP_NUM_THREADS": "1"}
+    ascii_only = {
+        "LC_ALL": "C",
+        "PYTHONUTF8": "0",
+        "PYTHONCOERCECLOCALE": "0",
+        "OMP_NUM_THREADS": "1",
+    }
 
     def command(*arguments: str) -> subprocess.CompletedProcess[bytes]:
         return subprocess.run(
@@ -300,7 +354,10 @@ def test_terminals_that_know_ascii_only(tally: Callable[[str], Tally], tmp_path:
 
     for name, arguments in COMMANDS.items():
         ended = command(*arguments)
-        line.held(ended.returncode == 0 and ended.stdout != b"", f"{name}: {ended.stderr.decode()[-1000:]}")
+        line.held(
+            ended.returncode == 0 and ended.stdout != b"",
+            f"{name}: {ended.stderr.decode()[-1000:]}",
+        )
     from test_sysid_measured import CONFIG, EXAMPLE
 
     rows = (EXAMPLE / "rolling.csv").read_text(encoding="utf-8").splitlines()[:42]
@@ -308,7 +365,14 @@ def test_terminals_that_know_ascii_only(tally: Callable[[str], Tally], tmp_path:
     data.write_text("\n".join(rows) + "\n", encoding="utf-8")
     config.write_text("# Reibung µ, Größe θ\n" + CONFIG, encoding="utf-8")
     ended = command(
-        "-m", "torchsoft", "identify", str(data), str(config), "--out", str(tmp_path / "ö"), "--no-progress"
+        "-m",
+        "torchsoft",
+        "identify",
+        str(data),
+        str(config),
+        "--out",
+        str(tmp_path / "ö"),
+        "--no-progress",
     )
     held = ended.returncode == 0 and b"Traceback" not in ended.stderr
     line.held(held, f"identify: {ended.returncode} {ended.stdout!r} {ended.stderr!r}")
@@ -316,7 +380,18 @@ def test_terminals_that_know_ascii_only(tally: Callable[[str], Tally], tmp_path:
     line.held("größe µ" in str(json.loads(written)), f"the name is lost: {written[-500:]}")
     config.write_text("[unknowns.'pad.µ']\n" + CONFIG, encoding="utf-8")
     ended = command(
-        "-m", "torchsoft", "identify", str(data), str(config), "--out", str(tmp_path / "ö"), "--no-progress"
+        "-m",
+        "torchsoft",
+        "identify",
+        str(data),
+        str(config),
+        "--out",
+        str(tmp_path / "ö"),
+        "--no-progress",
     )
-    held = ended.returncode == 2 and ended.stderr.count(b"\n") == 1 and b"Traceback" not in ended.stderr
+    held = (
+        ended.returncode == 2
+        and ended.stderr.count(b"\n") == 1
+        and b"Traceback" not in ended.stderr
+    )
     line.held(held, f"an error: {ended.returncode} {ended.stdout!r} {ended.stderr!r}")

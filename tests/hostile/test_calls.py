@@ -1,4 +1,5 @@
-"""Odd calls of the public names: wrong types, shapes, dtypes, names and numbers. Every one is refused with one sentence.
+"""Odd calls of the public names: wrong types, shapes, dtypes, names and numbers. Every one is
+refused with one sentence.
 
 What is built of odd parts may be refused where it is built or where it is run.
 """
@@ -50,7 +51,21 @@ pytestmark = pytest.mark.slow
 REFUSALS = (ValueError, TypeError, KeyError, NotImplementedError, SimulationFailed, NoEquilibrium)
 T = times(4e-3, 3)
 NAN, INF = float("nan"), float("inf")
-NOT_A_NUMBER: list[Any] = [None, "3", "abc", True, [], {}, object(), 1j, NAN, INF, -INF, np.zeros(2), f64(1.0, 2.0)]
+NOT_A_NUMBER: list[Any] = [
+    None,
+    "3",
+    "abc",
+    True,
+    [],
+    {},
+    object(),
+    1j,
+    NAN,
+    INF,
+    -INF,
+    np.zeros(2),
+    f64(1.0, 2.0),
+]
 NOT_POSITIVE: list[Any] = [*NOT_A_NUMBER, 0.0, -1.0]
 
 Call = tuple[str, Callable[[], Any]]
@@ -60,17 +75,29 @@ def of_simulate() -> Iterator[Call]:
     model = coarse(pad__elements_x=24)
     y0, model.reference = grasp(model, (0.01, 0.0))
     size = model.layout.size
-    run = lambda **changes: simulate(changes.pop("rig", model), changes.pop("t", T), **({"y0": y0} | changes))
+    run = lambda **changes: simulate(
+        changes.pop("rig", model), changes.pop("t", T), **({"y0": y0} | changes)
+    )
     tensors: list[Any] = [
         3, "x", [0.0, 1.0], {}, object(), True, np.linspace(0, 1, size), y0.float(), y0.half(),
         y0.to(torch.complex128), y0.to("meta"),
-        y0.to_sparse(), f64(), f64(1.0), y0[None], y0 * NAN, y0 / 0, y0.long(), y0.bool(), torch.stack((y0,
-        y0)), y0[:-1], torch.tensor(1.0),
+        y0.to_sparse(), f64(), f64(1.0), y0[None], y0 * NAN, y0 / 0, y0.long(), y0.bool(),
+        torch.stack((y0, y0)), y0[:-1], torch.tensor(1.0),
     ]  # fmt: skip
     for i, odd in enumerate(tensors):
         yield f"y0 #{i}", lambda odd=odd: run(y0=odd)
     for i, odd in enumerate(
-        [*tensors, None, T.flip(0), T[:1], T[[0, 0, 1]], T.clone().requires_grad_(), T * 1e300, T + 1e16, T * 1e-320]
+        [
+            *tensors,
+            None,
+            T.flip(0),
+            T[:1],
+            T[[0, 0, 1]],
+            T.clone().requires_grad_(),
+            T * 1e300,
+            T + 1e16,
+            T * 1e-320,
+        ]
     ):
         yield f"t #{i}", lambda odd=odd: run(t=odd)
     for i, odd in enumerate(
@@ -113,7 +140,10 @@ def of_simulate() -> Iterator[Call]:
         yield f"wrt = {odd!r:.30}", lambda odd=odd: run(gradient="forward", wrt=odd)
     for route in ("none", "discrete"):
         yield f"wrt with {route}", lambda route=route: run(gradient=route, wrt=["pad.E"])
-        yield f"dy0 with {route}", lambda route=route: run(gradient=route, dy0=torch.zeros(size, 1).double())
+        yield (
+            f"dy0 with {route}",
+            lambda route=route: run(gradient=route, dy0=torch.zeros(size, 1).double()),
+        )
         yield f"rigid with {route}", lambda route=route: run(gradient=route, rigid=True)
     for i, odd in enumerate(
         [
@@ -132,10 +162,15 @@ def of_simulate() -> Iterator[Call]:
         with context:
             return run(**options)
 
-    yield "forward under inference_mode", lambda: inside(torch.inference_mode(), gradient="forward", wrt=["pad.E"])
+    yield (
+        "forward under inference_mode",
+        lambda: inside(torch.inference_mode(), gradient="forward", wrt=["pad.E"]),
+    )
 
     def of_E(E: torch.Tensor) -> torch.Tensor:
-        call = lambda value: torch.func.functional_call(_Simulated(model, y0), {"model.pad.E": value}, ())
+        call = lambda value: torch.func.functional_call(
+            _Simulated(model, y0), {"model.pad.E": value}, ()
+        )
         return call(E)
 
     yield "torch.func.grad", lambda: torch.func.grad(of_E)(f64(7e5)[0])
@@ -158,7 +193,10 @@ def of_simulate() -> Iterator[Call]:
                 f"a cotangent {odd} at {row}",
                 lambda w=weights: _ours(lambda: ended["theta"].backward(w, retain_graph=True)),
             )
-    yield "the gradient of a moment", lambda: _ours(lambda: ended["bracket_moment"].sum().backward(retain_graph=True))
+    yield (
+        "the gradient of a moment",
+        lambda: _ours(lambda: ended["bracket_moment"].sum().backward(retain_graph=True)),
+    )
     for odd in ("", "x", "xC", 3, None, "theta_"):
         yield f"channel {odd!r}", lambda odd=odd: ended[odd]
 
@@ -217,7 +255,10 @@ def of_parts() -> Iterator[Call]:
         for i in range(5):
             values: list[Any] = [p.E, p.nu, p.rho, p.tau, p.depth]
             values[i] = 0.5 if i == 1 and isinstance(odd, float) else odd
-            yield f"KelvinVoigt #{i} = {odd!r:.20}", lambda v=values: grasping(material=KelvinVoigt(*v))
+            yield (
+                f"KelvinVoigt #{i} = {odd!r:.20}",
+                lambda v=values: grasping(material=KelvinVoigt(*v)),
+            )
         for i in range(2):
             series = [1e5, 1.0]
             series[i] = odd
@@ -236,21 +277,33 @@ def of_parts() -> Iterator[Call]:
             values = [c.K_n, c.R_n, c.K_t, c.R_t]
             values[i] = odd
             yield f"SoftContact #{i} = {odd!r:.20}", lambda v=values: contact(*v)
-        yield f"v_s = {odd!r:.20}", lambda odd=odd: grasping(friction=SmoothSlip(0.8, 0.7, odd, 10.0))
+        yield (
+            f"v_s = {odd!r:.20}",
+            lambda odd=odd: grasping(friction=SmoothSlip(0.8, 0.7, odd, 10.0)),
+        )
         yield f"Body mass {odd!r:.20}", lambda odd=odd: _falling(Body(odd, Circle(0.02)))
-        yield f"node_spacing = {odd!r:.20}", lambda odd=odd: contact(c.K_n, c.R_n, c.K_t, c.R_t, node_spacing=odd)
+        yield (
+            f"node_spacing = {odd!r:.20}",
+            lambda odd=odd: contact(c.K_n, c.R_n, c.K_t, c.R_t, node_spacing=odd),
+        )
     yield "an ellipse too slim", lambda: grasping(shape=Ellipse(5e-3, 20e-3))
     yield (
         "E_instant below E",
         lambda: grasping(material=StandardLinearSolid(p.E, 0.5 * p.E, p.nu, p.rho, p.tau, p.depth)),
     )
     yield "mu_k above mu_s", lambda: grasping(friction=Coulomb(0.4, 0.5))
-    yield "eta + R_t = 0", lambda: contact(c.K_n, c.R_n, c.K_t, 0.0, friction=SmoothSlip(0.8, 0.7, 0.05, 0.0))
+    yield (
+        "eta + R_t = 0",
+        lambda: contact(c.K_n, c.R_n, c.K_t, 0.0, friction=SmoothSlip(0.8, 0.7, 0.05, 0.0)),
+    )
     for shape in (Bulged(), Stretched(), Short(), Turned(), Flat()):
         yield f"shape {type(shape).__name__}", lambda shape=shape: grasping(shape=shape)
     yield "a law in training", lambda: grasping(friction=Dropping())
     yield "a law in float32", lambda: grasping(friction=Learned())
-    yield "a law that branches", lambda: grasping(friction=lambda E, F_N, R: E / R if E > F_N else 0 * E)
+    yield (
+        "a law that branches",
+        lambda: grasping(friction=lambda E, F_N, R: E / R if E > F_N else 0 * E),
+    )
     yield "a law of two numbers", lambda: grasping(friction=lambda E, F_N: E)
     yield "no law", lambda: grasping(friction=3)
     yield "no shape", lambda: grasping(shape="disc")
@@ -258,7 +311,9 @@ def of_parts() -> Iterator[Call]:
         if odd != "free":
             yield (
                 f"a coordinate {odd!r}",
-                lambda odd=odd: _falling(Body(0.4, Circle(0.02), theta=odd, x="drivn" if odd == 3 else "free")),
+                lambda odd=odd: _falling(
+                    Body(0.4, Circle(0.02), theta=odd, x="drivn" if odd == 3 else "free")
+                ),
             )
 
 
@@ -266,7 +321,11 @@ def _falling(body: Body) -> Any:
     """A body over a pad."""
     mesh, rubber = PadMesh(0.04, 4e-3, 8, 2), KelvinVoigt(7e5, 0.45, 1100.0, 0.01, 0.044)
     law = SoftContact(1e5, 400.0, 1e5, 400.0, friction=SmoothSlip(0.8, 0.7, 0.05, 10.0))
-    rig = Rig(bodies={"disc": body}, pads={"P": Pad(mesh, rubber)}, contacts={"c": Contact("P", "disc", law)})
+    rig = Rig(
+        bodies={"disc": body},
+        pads={"P": Pad(mesh, rubber)},
+        contacts={"c": Contact("P", "disc", law)},
+    )
     return simulate(rig, T, y0=torch.zeros(rig.layout.size, dtype=torch.float64))
 
 
@@ -343,13 +402,13 @@ def of_values() -> Iterator[Call]:
     model = coarse(pad__elements_x=24)
     y0, model.reference = grasp(model)
     bad: dict[str, list[float]] = {
-        "pad.E": [0.0, -1.0], "pad.nu": [0.5, -1.0, 0.7], "pad.rho": [0.0], "pad.tau": [0.0, -1e-3], "pad.depth": [0.0],
-        "contact.K_n": [0.0, -1e5], "contact.R_n": [-1.0], "contact.K_t": [0.0, -1.0], "contact.R_t": [-1.0],
-        "contact.epsilon": [0.0],
-        "contact.mu_s": [-0.1], "contact.mu_k": [-0.1], "contact.v_s": [0.0, -1.0], "contact.eta": [-1.0],
-        "control.K_81": [-1.0],
-        "control.R_80": [-1.0], "control.K_98": [-1.0], "control.R_99": [-1.0], "disc.radius": [0.0, -1e-3],
-        "disc.mass": [0.0, -1.0],
+        "pad.E": [0.0, -1.0], "pad.nu": [0.5, -1.0, 0.7], "pad.rho": [0.0], "pad.tau": [0.0, -1e-3],
+        "pad.depth": [0.0], "contact.K_n": [0.0, -1e5], "contact.R_n": [-1.0],
+        "contact.K_t": [0.0, -1.0], "contact.R_t": [-1.0], "contact.epsilon": [0.0],
+        "contact.mu_s": [-0.1], "contact.mu_k": [-0.1], "contact.v_s": [0.0, -1.0],
+        "contact.eta": [-1.0], "control.K_81": [-1.0],
+        "control.R_80": [-1.0], "control.K_98": [-1.0], "control.R_99": [-1.0],
+        "disc.radius": [0.0, -1e-3], "disc.mass": [0.0, -1.0],
         "bracket.mass": [0.0, -1.0], "scenario.gravity": [-9.81],
     }  # fmt: skip
     for name, values in bad.items():
@@ -362,17 +421,29 @@ def of_values() -> Iterator[Call]:
 
             yield f"{name} = {value} in place", put
             if value == values[0]:
-                yield f"{name} = {value}, statics", lambda name=name, value=value: rest(_with(model, name, value))
+                yield (
+                    f"{name} = {value}, statics",
+                    lambda name=name, value=value: rest(_with(model, name, value)),
+                )
     for name in ("pad.E", "contact.K_n", "disc.mass", "control.x.Kp"):
-        yield f"{name} of two numbers", lambda name=name: simulate(_with(model, name, f64(1.0, 2.0)), T, y0=y0)
-        yield f"{name} in float32", lambda name=name: simulate(_with(model, name, torch.tensor(1.0)), T, y0=y0)
+        yield (
+            f"{name} of two numbers",
+            lambda name=name: simulate(_with(model, name, f64(1.0, 2.0)), T, y0=y0),
+        )
+        yield (
+            f"{name} in float32",
+            lambda name=name: simulate(_with(model, name, torch.tensor(1.0)), T, y0=y0),
+        )
 
     def lone(group: str, part: nn.Module) -> Any:
         other = copy.deepcopy(model)
         setattr(other, group, part)
         return simulate(other, T, y0=y0)
 
-    yield "a material in the group only", lambda: lone("pad", KelvinVoigt(7e5, 0.45, 1100.0, 0.01, 0.044))
+    yield (
+        "a material in the group only",
+        lambda: lone("pad", KelvinVoigt(7e5, 0.45, 1100.0, 0.01, 0.044)),
+    )
     yield "a contact in the group only", lambda: lone("contact", copy.deepcopy(model.contact))
     yield "a disc in the group only", lambda: lone("disc", Body(0.4, Circle(0.019)))
     for odd in ("pad.Young", "", "E", 3, None):
@@ -417,22 +488,34 @@ def of_lists() -> Iterator[Call]:
         (NAN, 1e-3, 8, 2),
         ("a", 1, 1, 1),
     ):
-        yield f"PadMesh{odd}", lambda odd=odd: Pad(PadMesh(*odd), KelvinVoigt(7e5, 0.45, 1100.0, 0.01, 0.044))
+        yield (
+            f"PadMesh{odd}",
+            lambda odd=odd: Pad(PadMesh(*odd), KelvinVoigt(7e5, 0.45, 1100.0, 0.01, 0.044)),
+        )
     for odd in (-1, 1.5, "2", None):
         yield (
             f"points = {odd!r}",
-            lambda odd=odd: Pad(PadMesh(0.04, 4e-3, 8, 2), KelvinVoigt(7e5, 0.45, 1100.0, 0.01, 0.044), points=odd),
+            lambda odd=odd: Pad(
+                PadMesh(0.04, 4e-3, 8, 2), KelvinVoigt(7e5, 0.45, 1100.0, 0.01, 0.044), points=odd
+            ),
         )
     model = coarse(pad__elements_x=24)
     for odd in (None, 3, "disc", "disc.up", "dish.x", ""):
         yield (
             f"measures {odd!r}",
-            lambda odd=odd: _acting(model, Actuator(odd, "bracket.x", PD(1.0, 1.0), setpoint="x_d")),
+            lambda odd=odd: _acting(
+                model, Actuator(odd, "bracket.x", PD(1.0, 1.0), setpoint="x_d")
+            ),
         )
-        yield f"pushes {odd!r}", lambda odd=odd: _acting(model, Actuator("disc.x", odd, PD(1.0, 1.0), setpoint="x_d"))
+        yield (
+            f"pushes {odd!r}",
+            lambda odd=odd: _acting(model, Actuator("disc.x", odd, PD(1.0, 1.0), setpoint="x_d")),
+        )
         yield (
             f"setpoint {odd!r}",
-            lambda odd=odd: _acting(model, Actuator("disc.x", "bracket.x", PD(1.0, 1.0), setpoint=odd)),
+            lambda odd=odd: _acting(
+                model, Actuator("disc.x", "bracket.x", PD(1.0, 1.0), setpoint=odd)
+            ),
         )
     for odd in (None, 3, "law", lambda w: w):
         yield (

@@ -1,4 +1,5 @@
-"""Checkpoints that are damaged, planted or another's: never executed, always noticed, and the answer keeps its bits."""
+"""Checkpoints that are damaged, planted or another's: never executed, always noticed, and the
+answer keeps its bits."""
 
 import os
 import pickle
@@ -28,7 +29,8 @@ RTOL = 1e-3
 
 
 class Done(NamedTuple):
-    """An identification, the folder that its runs are kept in, and the runs and results by file name."""
+    """An identification, the folder that its runs are kept in, and the runs and results by file
+    name."""
 
     problem: Problem
     answer: IdentificationResult
@@ -38,8 +40,12 @@ class Done(NamedTuple):
 
 @pytest.fixture(scope="module")
 def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
-    recorded = record("strokes", STROKES, BASE.override({"pad.E": 0.9e6}), BASE, SENSORS, rtol=RTOL, seed=3)
-    problem = Problem([recorded], SENSORS, {"pad.E": Unknown(nominal=1.1e6), "contact.K_n": Unknown()})
+    recorded = record(
+        "strokes", STROKES, BASE.override({"pad.E": 0.9e6}), BASE, SENSORS, rtol=RTOL, seed=3
+    )
+    problem = Problem(
+        [recorded], SENSORS, {"pad.E": Unknown(nominal=1.1e6), "contact.K_n": Unknown()}
+    )
     folder, runs = tmp_path_factory.mktemp("checkpoint") / "runs", {}
     inner = Journal.keep
 
@@ -55,7 +61,8 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
 
 
 def of_the_same(folder: Path, own: str) -> Journal:
-    """The journal of the recordings that it says are its own: those of a problem, or of one with another assumption."""
+    """The journal of the recordings that it says are its own: those of a problem, or of one with
+    another assumption."""
     journal = Journal(folder, [])
     journal._own = own
     return journal
@@ -63,7 +70,14 @@ def of_the_same(folder: Path, own: str) -> Journal:
 
 def bits(answer: IdentificationResult) -> Any:
     """All that the data decide."""
-    return answer.x, answer.estimates, answer.covariance, answer.chi2, answer.residuals, answer.notices
+    return (
+        answer.x,
+        answer.estimates,
+        answer.covariance,
+        answer.chi2,
+        answer.residuals,
+        answer.notices,
+    )
 
 
 def flipped(rng: np.random.Generator, content: bytes, count: int = 1) -> bytes:
@@ -84,7 +98,9 @@ Damage = Callable[[np.random.Generator, bytes, bytes, Trap], bytes]
 BYTES: dict[str, Damage] = {
     "one bit": lambda rng, name, content, trap: flipped(rng, content),
     "some bits": lambda rng, name, content, trap: flipped(rng, content, 9),
-    "a bit of the checksum": lambda rng, name, content, trap: flipped(rng, content[:32]) + content[32:],
+    "a bit of the checksum": lambda rng, name, content, trap: (
+        flipped(rng, content[:32]) + content[32:]
+    ),
     "cut": lambda rng, name, content, trap: content[: rng.integers(len(content))],
     "empty": lambda rng, name, content, trap: b"",
     "longer": lambda rng, name, content, trap: content + rng.bytes(int(rng.integers(1, 5000))),
@@ -102,10 +118,18 @@ BYTES: dict[str, Damage] = {
         + pickle.dumps(trap),
     ),
     "a header that is code": lambda rng, name, content, trap: forged(
-        name, np.lib.format.magic(1, 0) + b"\x30\0__import__('os').mkdir(" + repr(str(trap.path)).encode() + b")"
+        name,
+        np.lib.format.magic(1, 0)
+        + b"\x30\0__import__('os').mkdir("
+        + repr(str(trap.path)).encode()
+        + b")",
     ),
-    "no result": lambda rng, name, content, trap: forged(name, other_archive(kind=np.asarray("Trap"), x=np.zeros(2))),
-    "damage that has a checksum": lambda rng, name, content, trap: forged(name, zeroed(rng, content[32:])),
+    "no result": lambda rng, name, content, trap: forged(
+        name, other_archive(kind=np.asarray("Trap"), x=np.zeros(2))
+    ),
+    "damage that has a checksum": lambda rng, name, content, trap: forged(
+        name, zeroed(rng, content[32:])
+    ),
 }
 
 
@@ -121,17 +145,30 @@ def plant(done: Done, path: Path, kind: str, rng: np.random.Generator, trap: Tra
         if kind == "a pipe":
             os.mkfifo(path)
         else:
-            target = {"a link to another run's": done.folder / str(rng.choice(others)), "a link to itself": path}
+            target = {
+                "a link to another run's": done.folder / str(rng.choice(others)),
+                "a link to itself": path,
+            }
             path.symlink_to(target.get(kind, path.parent / "nothing"))
 
 
-KINDS = [*BYTES, "another run's", "a pipe", "a link to another run's", "a link to itself", "a link to nothing"]
+KINDS = [
+    *BYTES,
+    "another run's",
+    "a pipe",
+    "a link to another run's",
+    "a link to itself",
+    "a link to nothing",
+]
 
 
 def test_every_damaged_file_is_noticed(
     done: Done, tally: Callable[[str], Tally], count: Any, random: Any, tmp_path: Path
 ) -> None:
-    noticed, executed = tally("damaged, planted and foreign checkpoint files"), tally("of them executed: none")
+    noticed, executed = (
+        tally("damaged, planted and foreign checkpoint files"),
+        tally("of them executed: none"),
+    )
     for number in range(count(420)):
         kind, rng = KINDS[number % len(KINDS)], random(91, number)
         trap, folder = Trap(tmp_path / "executed"), tmp_path / "runs"
@@ -145,7 +182,9 @@ def test_every_damaged_file_is_noticed(
                 got = of_the_same(folder, own).recall(run)
             quiet = kind in ("a pipe", "a link to itself", "a link to nothing")  # there is no file
             held = got is None and (quiet or (len(said) == 1 and "\n" not in str(said[0].message)))
-            if kind == "damage that has a checksum" and got is not None:  # what a forger gets: data, nothing else
+            if (
+                kind == "damage that has a checksum" and got is not None
+            ):  # what a forger gets: data, nothing else
                 held = type(got) is type(expected)
             noticed.held(held, f"{number}, {kind}: {got!r:.200}, {[str(x.message) for x in said]}")
         except BaseException as error:
@@ -172,7 +211,9 @@ def test_the_answer_keeps_its_bits(
         held = bits(answer) == bits(done.answer) and not trap.path.exists()
         for name, (own, run, expected) in done.runs.items():
             held = held and same(of_the_same(folder, own).recall(run), expected)
-            held = held and (folder / name).read_bytes()[32:] == (done.folder / name).read_bytes()[32:]
+            held = (
+                held and (folder / name).read_bytes()[32:] == (done.folder / name).read_bytes()[32:]
+            )
         line.held(held, f"{number}: {chosen[: 1 + number % len(chosen)]}")
         shutil.rmtree(folder)
 
@@ -180,8 +221,12 @@ def test_the_answer_keeps_its_bits(
 def test_folders_of_others_are_left_alone(
     tally: Callable[[str], Tally], count: Any, random: Any, tmp_path: Path
 ) -> None:
-    """Refused in one sentence where they are not ours; where they are, what others put in them stays."""
-    refused, kept = tally("checkpoint folders of others"), tally("others' files in a checkpoint folder")
+    """Refused in one sentence where they are not ours; where they are, what others put in them
+    stays."""
+    refused, kept = (
+        tally("checkpoint folders of others"),
+        tally("others' files in a checkpoint folder"),
+    )
     names = [
         "a.pickle",
         "b.partial",
@@ -202,9 +247,13 @@ def test_folders_of_others_are_left_alone(
             for run in range(3):
                 Journal(folder, []).keep(run, other(rng))
         for name in others:
-            (folder / name).mkdir() if rng.random() < 0.3 else (folder / name).write_bytes(rng.bytes(9))
+            (folder / name).mkdir() if rng.random() < 0.3 else (folder / name).write_bytes(
+                rng.bytes(9)
+            )
         if not ours:
-            refused.call(f"{number}", lambda folder=folder: Runner([], journal=folder), (ValueError,))
+            refused.call(
+                f"{number}", lambda folder=folder: Runner([], journal=folder), (ValueError,)
+            )
             refused.held(not (folder / CHECKPOINT).exists(), f"{number}: marked")
         forget(folder)
         left = sorted(path.name for path in folder.iterdir() if path.name != CHECKPOINT)

@@ -1,4 +1,5 @@
-"""Every operation on files is once the last thing that a process does; then a normal start ends in the same bytes."""
+"""Every operation on files is once the last thing that a process does; then a normal start ends in
+the same bytes."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -32,10 +33,16 @@ def tmp_path(tmp_path: Path) -> Iterator[Path]:
 
 
 def crash(
-    line: Tally, function: Callable[[], Any], out: Path, begin: Path, number: int, rng: np.random.Generator
+    line: Tally,
+    function: Callable[[], Any],
+    out: Path,
+    begin: Path,
+    number: int,
+    rng: np.random.Generator,
 ) -> None:
-    """Die at `number` of the function's operations on `out`, or at all if there are fewer, begun from the folder `begin`; each
-    time the function done again must leave what it leaves undisturbed."""
+    """Die at `number` of the function's operations on `out`, or at all if there are fewer, begun
+    from the folder `begin`; each time the function done again must leave what it leaves
+    undisturbed."""
     restore(out, begin)
     operations = points(function, out.parent)
     assert operations
@@ -62,9 +69,15 @@ def crash(
 
 @pytest.mark.parametrize(("begun", "number"), [("nothing", 270), ("half", 200)])
 def test_generation(
-    begun: str, number: int, tmp_path: Path, tally: Callable[[str], Tally], random: Any, count: Callable[[int], int]
+    begun: str,
+    number: int,
+    tmp_path: Path,
+    tally: Callable[[str], Tally],
+    random: Any,
+    count: Callable[[int], int],
 ) -> None:
-    """From an empty place; and from a folder in which one shard of two is finished and the other half written."""
+    """From an empty place; and from a folder in which one shard of two is finished and the other
+    half written."""
     small, _ = config(tmp_path)
     place = tmp_path / "place"
     place.mkdir()
@@ -77,7 +90,14 @@ def test_generation(
         restore(begin, place / "set")
         assert sorted(p.name for p in (begin / "finished").iterdir()) == ["0.sha256"]
     line = tally(f"crash points of a generation begun from {begun}")
-    crash(line, lambda: make(small, place / "set"), place / "set", begin, count(number), random(200, number))
+    crash(
+        line,
+        lambda: make(small, place / "set"),
+        place / "set",
+        begin,
+        count(number),
+        random(200, number),
+    )
     assert difference(place / "set", tree(tmp_path / "whole")) == ""
 
 
@@ -97,14 +117,25 @@ def test_check(
     line = tally("crash points of a check")
     command = [str(tmp_path / "set"), "--picture", str(place / "out" / "coverage.png")]
     with dask.config.set(scheduler="synchronous"):  # whose threads would be missing after a fork
-        crash(line, lambda: check.main(command), place / "out", tmp_path / "none", count(20), random(201))
+        crash(
+            line,
+            lambda: check.main(command),
+            place / "out",
+            tmp_path / "none",
+            count(20),
+            random(201),
+        )
 
 
 def test_trajectory_files(
     tmp_path: Path, tally: Callable[[str], Tally], random: Any, count: Callable[[int], int]
 ) -> None:
-    model = SoftGrasp(Parameters().override({"pad.elements_x": 40, "pad.elements_y": 1, "contact.v_s": 0.05}))
-    run = simulate(model, torch.linspace(0, 0.05, 11, dtype=torch.float64), y0=rest(model).detach(), step=5e-3)
+    model = SoftGrasp(
+        Parameters().override({"pad.elements_x": 40, "pad.elements_y": 1, "contact.v_s": 0.05})
+    )
+    run = simulate(
+        model, torch.linspace(0, 0.05, 11, dtype=torch.float64), y0=rest(model).detach(), step=5e-3
+    )
     (tmp_path / "place").mkdir()
     out = tmp_path / "place" / "out"
     crash(
@@ -137,8 +168,12 @@ def test_results_of_an_identification(
     """Its answer, and its page."""
     p = Parameters().override({"contact.v_s": 0.05, "pad.elements_x": 40, "pad.elements_y": 1})
     sensors = {"theta": Sensor(noise=5e-4), "F_y": Sensor(noise=0.1)}
-    grasp = Excitation(motion=Strokes(), duration=0.25, depth=1.2e-3, senses="bracket", grasp_time=0.15)
-    recordings = [record("grasp", grasp, p.override({"pad.E": 0.9e6}), p, sensors, rtol=1e-3, seed=1)]
+    grasp = Excitation(
+        motion=Strokes(), duration=0.25, depth=1.2e-3, senses="bracket", grasp_time=0.15
+    )
+    recordings = [
+        record("grasp", grasp, p.override({"pad.E": 0.9e6}), p, sensors, rtol=1e-3, seed=1)
+    ]
     problem = Problem(recordings, sensors, {"pad.E": Unknown()})
     result = identify(problem, rtol=1e-3)
     text = page.page(result, problem, *page.traces(result, problem, None))
@@ -151,4 +186,11 @@ def test_results_of_an_identification(
         result.save(out / "answer.json")
         page.report(result, problem, out / "report.html")
 
-    crash(tally("crash points of an identification's results"), write, out, tmp_path / "none", count(60), random(204))
+    crash(
+        tally("crash points of an identification's results"),
+        write,
+        out,
+        tmp_path / "none",
+        count(60),
+        random(204),
+    )

@@ -1,4 +1,5 @@
-"""Damage to every kind of file that is read back: it is noticed, or what is read is what was written."""
+"""Damage to every kind of file that is read back: it is noticed, or what is read is what was
+written."""
 
 import shutil
 from collections.abc import Callable
@@ -101,7 +102,8 @@ KINDS: dict[str, tuple[str, int]] = {
     "series": ("*/c/*/*", 240),
     "records of shards": ("finished/*", 90),
 }
-"""Files by what they hold: a pattern, and how often they are damaged. The coordinates are those of `COORDINATES`."""
+"""Files by what they hold: a pattern, and how often they are damaged. The coordinates are those of
+`COORDINATES`."""
 
 COORDINATES = ("time", "trajectory", "axis", "lower_surface", "upper_surface")
 
@@ -131,12 +133,16 @@ def repair(path: Path, data: bytes) -> None:
 
 def everything(root: Path) -> tuple[Any, Any]:
     """All that there is to read, in both ways of reading it."""
-    numbers = Trajectories(str(root), ["disc_position", "feed_forward", "grasp_force", "contact_upper", "steps"])
+    numbers = Trajectories(
+        str(root), ["disc_position", "feed_forward", "grasp_force", "contact_upper", "steps"]
+    )
     return open_dataset(str(root)).load(), [numbers[i] for i in range(len(numbers))]
 
 
 def same(a: tuple[Any, Any], b: tuple[Any, Any]) -> bool:
-    windows = len(a[1]) == len(b[1]) and all(torch.equal(x[k], y[k]) for x, y in zip(a[1], b[1]) for k in y)
+    windows = len(a[1]) == len(b[1]) and all(
+        torch.equal(x[k], y[k]) for x, y in zip(a[1], b[1]) for k in y
+    )
     return bool(a[0].identical(b[0])) and windows
 
 
@@ -147,9 +153,15 @@ def one_line(text: str) -> bool:
 @pytest.mark.filterwarnings("ignore::zarr.errors.ZarrUserWarning")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_damaged_dataset_is_noticed(
-    kind: str, sound: Path, tmp_path: Path, tally: Callable[[str], Tally], random: Any, count: Callable[[int], int]
+    kind: str,
+    sound: Path,
+    tmp_path: Path,
+    tally: Callable[[str], Tally],
+    random: Any,
+    count: Callable[[int], int],
 ) -> None:
-    """By the check, which never raises, and by either way of reading: refused in one sentence, or the very same values."""
+    """By the check, which never raises, and by either way of reading: refused in one sentence, or
+    the very same values."""
     line, truth, out = tally(f"damaged {kind}"), everything(sound), tmp_path / "set"
     assert [x for x in check(str(sound)) if "no commit" not in x] == []
     restore(out, sound)
@@ -182,8 +194,12 @@ def test_a_damaged_trajectory_file_is_noticed(
     tmp_path: Path, tally: Callable[[str], Tally], random: Any, count: Callable[[int], int]
 ) -> None:
     """Refused in one sentence, or the very same values."""
-    model = SoftGrasp(Parameters().override({"pad.elements_x": 40, "pad.elements_y": 1, "contact.v_s": 0.05}))
-    run = simulate(model, torch.linspace(0, 0.05, 11, dtype=torch.float64), y0=rest(model).detach(), step=5e-3)
+    model = SoftGrasp(
+        Parameters().override({"pad.elements_x": 40, "pad.elements_y": 1, "contact.v_s": 0.05})
+    )
+    run = simulate(
+        model, torch.linspace(0, 0.05, 11, dtype=torch.float64), y0=rest(model).detach(), step=5e-3
+    )
     good, path, line = tmp_path / "good.nc", tmp_path / "run.nc", tally("damaged trajectory files")
     run.save(good)
     truth = read_table(good).values
@@ -200,5 +216,7 @@ def test_a_damaged_trajectory_file_is_noticed(
         except Exception as error:
             line.held(False, f"{what}: {error!r}")
         else:
-            equal = found.keys() == truth.keys() and all(np.array_equal(found[k], truth[k]) for k in truth)
+            equal = found.keys() == truth.keys() and all(
+                np.array_equal(found[k], truth[k]) for k in truth
+            )
             line.held(equal, f"{what}: other values were read")

@@ -1,4 +1,5 @@
-"""Mutated configurations of every kind: accepted and then finite, or refused in a sentence that names the field."""
+"""Mutated configurations of every kind: accepted and then finite, or refused in a sentence that
+names the field."""
 
 import tomllib
 from collections.abc import Callable
@@ -52,14 +53,26 @@ Follow = Callable[[Any], None]
 
 
 def excitations() -> list[dict[str, Any]]:
-    common = {"duration": 1.0, "depth": 1.5e-3, "senses": "bracket", "grasp_time": 0.3, "settle": 0.1, "x_C0": 60.3e-3}
+    common = {
+        "duration": 1.0,
+        "depth": 1.5e-3,
+        "senses": "bracket",
+        "grasp_time": 0.3,
+        "settle": 0.1,
+        "x_C0": 60.3e-3,
+    }
     return [{**common, "motion": motion} for motion in MOTIONS]
 
 
 def datasets() -> list[dict[str, Any]]:
-    out = [tomllib.loads(path.read_text()) for path in sorted((ROOT / "data_gen" / "configs").glob("*.toml"))]
+    out = [
+        tomllib.loads(path.read_text())
+        for path in sorted((ROOT / "data_gen" / "configs").glob("*.toml"))
+    ]
     for tree in out:
-        tree.setdefault("fixed", {}).update({"pad.elements_x": 20, "pad.elements_y": 1, "pad.height": 4.6e-3})
+        tree.setdefault("fixed", {}).update(
+            {"pad.elements_x": 20, "pad.elements_y": 1, "pad.height": 4.6e-3}
+        )
         tree["kinds"].append({"kind": "jerk", "depth": {"low": 2e-4, "high": 4e-4}})
     return out
 
@@ -90,7 +103,8 @@ def excite_briefly(e: Excitation) -> None:
 
 
 def design_briefly(config: Config) -> None:
-    """The cost, the first tasks of the design, and one of their references; a costly set needs the user's word."""
+    """The cost, the first tasks of the design, and one of their references; a costly set needs the
+    user's word."""
     expected = cost(config, 2)
     assert np.isfinite(expected).all(), f"no estimate: {expected}"
     try:
@@ -100,7 +114,9 @@ def design_briefly(config: Config) -> None:
     few = config.model_copy(update={"trajectories": min(config.trajectories, 4)})
     for i, u in enumerate(points(few)):
         one = task(few, i, u)
-        assert np.isfinite([value for value in one.labels.values() if not isinstance(value, str)]).all()
+        assert np.isfinite(
+            [value for value in one.labels.values() if not isinstance(value, str)]
+        ).all()
     if one.parameters.pad.memory <= SMALL:
         excite_briefly(one.excitation)
 
@@ -110,7 +126,8 @@ KINDS: dict[str, tuple[type[Table], Callable[[], list[dict[str, Any]]], int, int
     "excitations": (Excitation, excitations, 3000, 3, excite_briefly),
     "dataset configurations": (Config, datasets, 4000, 3, design_briefly),
 }
-"""Of every kind of table what reads it, valid ones, how many mutants, the share of the accepted that is followed, and how."""
+"""Of every kind of table what reads it, valid ones, how many mutants, the share of the accepted
+that is followed, and how."""
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -130,13 +147,15 @@ def test_a_mutated_table_is_finite_or_refused_by_its_field(
 
 def scalars() -> st.SearchStrategy[Any]:
     return st.one_of(
-        st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=20), st.binary(max_size=5),
-        st.lists(st.floats(), max_size=3), st.dictionaries(st.text(max_size=5), st.floats(), max_size=2),
+        st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=20),
+        st.binary(max_size=5), st.lists(st.floats(), max_size=3),
+        st.dictionaries(st.text(max_size=5), st.floats(), max_size=2),
     )  # fmt: skip
 
 
 def from_schema(schema: dict[str, Any], root: dict[str, Any]) -> st.SearchStrategy[Any]:
-    """Values near those of a JSON schema: mostly of the right kind and near the bounds, sometimes anything."""
+    """Values near those of a JSON schema: mostly of the right kind and near the bounds, sometimes
+    anything."""
     if "$ref" in schema:
         schema = root["$defs"][schema["$ref"].rpartition("/")[2]]
     match schema:
@@ -147,18 +166,26 @@ def from_schema(schema: dict[str, Any], root: dict[str, Any]) -> st.SearchStrate
         case {"enum": options}:
             right = st.sampled_from(options)
         case {"type": "object", "properties": fields}:
-            right = st.fixed_dictionaries({}, optional={name: from_schema(one, root) for name, one in fields.items()})
+            right = st.fixed_dictionaries(
+                {}, optional={name: from_schema(one, root) for name, one in fields.items()}
+            )
             needed = schema.get("required", [])
             if needed:
                 right = st.fixed_dictionaries(
                     {name: from_schema(fields[name], root) for name in needed},
-                    optional={name: from_schema(one, root) for name, one in fields.items() if name not in needed},
+                    optional={
+                        name: from_schema(one, root)
+                        for name, one in fields.items()
+                        if name not in needed
+                    },
                 )
         case {"type": "object"}:
             inner = schema.get("additionalProperties")
             known = st.sampled_from([*Parameters().table(), "pad.Young"])
             right = st.dictionaries(
-                known, from_schema(inner, root) if isinstance(inner, dict) else scalars(), max_size=3
+                known,
+                from_schema(inner, root) if isinstance(inner, dict) else scalars(),
+                max_size=3,
             )
         case {"type": "array"}:
             inner = schema.get("items") or schema.get("prefixItems", [{}])[0]

@@ -1,4 +1,5 @@
-"""Command lines that make no sense: the status is 2 and the last line says why; nothing is begun and no traceback shown."""
+"""Command lines that make no sense: the status is 2 and the last line says why; nothing is begun
+and no traceback shown."""
 
 import os
 import subprocess
@@ -67,13 +68,20 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_random_arguments(folder: Path, tally: Callable[[str], Tally], capsys: pytest.CaptureFixture[str]) -> None:
+def test_random_arguments(
+    folder: Path, tally: Callable[[str], Tally], capsys: pytest.CaptureFixture[str]
+) -> None:
     """In this process, with the work itself left out."""
     rng = random(5)
     begun = RuntimeError("begun")
     both = ("--workers", "--out", "--yes", "--seed")
     for name, line, run, options in (
-        ("identify", tally("command lines: identify"), cli.main, (*both, "--rtol", "--checkpoint", "--no-progress")),
+        (
+            "identify",
+            tally("command lines: identify"),
+            cli.main,
+            (*both, "--rtol", "--checkpoint", "--no-progress"),
+        ),
         ("generate", tally("command lines: generate"), generation.main, both),
     ):
         with (
@@ -85,7 +93,11 @@ def test_random_arguments(folder: Path, tally: Callable[[str], Tally], capsys: p
                 for option in rng.choice(options, rng.integers(0, 3)):
                     arguments += [
                         str(option),
-                        str(rng.choice(NUMBERS if option != "--out" else ["o", "data.csv", "none/x"])),
+                        str(
+                            rng.choice(
+                                NUMBERS if option != "--out" else ["o", "data.csv", "none/x"]
+                            )
+                        ),
                     ]
                 if name == "identify":
                     arguments = ["identify", *arguments]
@@ -100,7 +112,10 @@ def test_random_arguments(folder: Path, tally: Callable[[str], Tally], capsys: p
                     status = f"{type(error).__name__}: {error}"
                 said = capsys.readouterr().err
                 one_line = said.startswith("usage") or len(said.strip().splitlines()) <= 1
-                line.held(status in (0, 2) and one_line and "Traceback" not in said, f"{arguments}: {status}: {said}")
+                line.held(
+                    status in (0, 2) and one_line and "Traceback" not in said,
+                    f"{arguments}: {status}: {said}",
+                )
 
 
 COMMANDS: tuple[tuple[list[str], str], ...] = (
@@ -149,12 +164,16 @@ def test_commands_as_processes(folder: Path, tally: Callable[[str], Tally]) -> N
         extra = LOCALES[(i + i // len(COMMANDS)) % len(LOCALES)]
         environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"} | extra
         ended = subprocess.run(
-            [sys.executable, "-m", module, *arguments], capture_output=True, stdin=subprocess.DEVNULL, env=environment,
-            check=False, timeout=120,
+            [sys.executable, "-m", module, *arguments], capture_output=True,
+            stdin=subprocess.DEVNULL, env=environment, check=False, timeout=120,
         )  # fmt: skip
         said = ended.stderr.decode("utf-8", "replace")
         last = said.strip().splitlines()[-1] if said.strip() else ""
-        shown = word in last or word.encode("ascii", "backslashreplace").decode() in last or "\\udc" in last
+        shown = (
+            word in last
+            or word.encode("ascii", "backslashreplace").decode() in last
+            or "\\udc" in last
+        )
         holds = ended.returncode == 2 and "Traceback" not in said and shown and ended.stdout == b""
         line.held(holds, f"{extra} {module} {arguments}: {ended.returncode}: {said[-600:]}")
     assert sorted(path.name for path in folder.iterdir()) == before, "something was begun"

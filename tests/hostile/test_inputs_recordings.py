@@ -1,4 +1,5 @@
-"""Mutated recordings and identification files: accepted and then finite, or refused by file, row, column and field."""
+"""Mutated recordings and identification files: accepted and then finite, or refused by file, row,
+column and field."""
 
 import csv
 import io
@@ -43,7 +44,8 @@ def table() -> Table:
 
 
 def config(whole: bool = True) -> dict[str, Any]:
-    """What a file may state; `whole` with what takes longer, a recording that begins in motion and competing laws."""
+    """What a file may state; `whole` with what takes longer, a recording that begins in motion and
+    competing laws."""
     tree = tomllib.loads((EXAMPLE / "rolling.toml").read_text())
     tree["settings"]["pad"] = {"elements_x": 20, "elements_y": 1, "height": 4.59e-3, "nu": 0.45}
     tree["settings"]["disc"] = {"radius": 19.37e-3}
@@ -59,19 +61,48 @@ def config(whole: bool = True) -> dict[str, Any]:
     tree["unknowns"]["contact.mu_s"] |= {"nominal": 0.9, "low": 0.5, "high": 2.0}
     tree["unknowns"]["pad.nu"] = {"scale": "linear", "low": 0.3, "high": 0.49}
     tree["sensors"]["theta"] = {"noise": 0.5e-3, "bias": 1e-3, "delay": 2e-3, "per": "all"}
-    tree["sensors"]["F_y"] = {"noise": 0.1, "gain": 0.02, "drift": 0.1, "low": -500.0, "high": 500.0, "colour": "white"}
-    tree["fit"] = {"rtol": RTOL, "starts": 1, "loss": "linear", "method": "gauss_newton", "workers": 1, "seed": 0}
-    second = {"files": ["second.csv", "force.csv"], "name": "second", "settings": {"contact.v_s": 0.06}}
+    tree["sensors"]["F_y"] = {
+        "noise": 0.1,
+        "gain": 0.02,
+        "drift": 0.1,
+        "low": -500.0,
+        "high": 500.0,
+        "colour": "white",
+    }
+    tree["fit"] = {
+        "rtol": RTOL,
+        "starts": 1,
+        "loss": "linear",
+        "method": "gauss_newton",
+        "workers": 1,
+        "seed": 0,
+    }
+    second = {
+        "files": ["second.csv", "force.csv"],
+        "name": "second",
+        "settings": {"contact.v_s": 0.06},
+    }
     tree["recordings"] = [second | {"missing": {"F_ff": 0.0}}]
-    tree |= {"heldout": ["second"], "ignore": ["Temp"], "acknowledged": ["sign of F_x"], "missing": {"F_ff": -1.0}}
+    tree |= {
+        "heldout": ["second"],
+        "ignore": ["Temp"],
+        "acknowledged": ["sign of F_x"],
+        "missing": {"F_ff": -1.0},
+    }
     tree["start"] = {"kind": "rest", "position_sd": 1e-5}
     if whole:
-        moving = {"kind": "moving", "lead": 40e-3, "given": {"disc.y": {"mean": 23.5e-3, "sd": 1e-4}}}
+        moving = {
+            "kind": "moving",
+            "lead": 40e-3,
+            "given": {"disc.y": {"mean": 23.5e-3, "sd": 1e-4}},
+        }
         tree["recordings"].append({"file": "third.csv", "name": "third", "start": moving})
         tree["pads"] = {"kind": "kelvin_voigt"}
         tree["compare"] = {
             "coulomb": {"settings": {"contact.friction": "coulomb"}, "without": ["contact.R_t"]},
-            "solid": {"pads": {"kind": "standard_linear_solid", "E_instant": 2e6, "tau_instant": 1e-4}},
+            "solid": {
+                "pads": {"kind": "standard_linear_solid", "E_instant": 2e6, "tau_instant": 1e-4}
+            },
         }
     return tree
 
@@ -83,14 +114,20 @@ def written(cells: Table, delimiter: str = ",", end: str = "\n") -> bytes:
 
 
 def one_run(case: measured.Case) -> None:
-    """The estimate, and one run from the start: residuals are finite, or the reason is a sentence."""
+    """The estimate, and one run from the start: residuals are finite, or the reason is a
+    sentence."""
     problem, fit = case.problem, case.config.fit
     expected = cost(problem, fit.rtol, fit.starts, fit.workers, case.config.heldout)
     assert np.isfinite(expected).all(), f"no estimate: {expected}"
-    if max(paper_settings(r).pad.memory for r in problem.recordings) > 1e-3 or cost(problem, RTOL, 1, 1).steps > 1e5:
+    if (
+        max(paper_settings(r).pad.memory for r in problem.recordings) > 1e-3
+        or cost(problem, RTOL, 1, 1).steps > 1e5
+    ):
         return
     runner = Runner(problem.recordings)
-    out = problem.residuals(runner, problem.coordinates.start, problem.names[:1], RTOL, problem.coordinates.free)
+    out = problem.residuals(
+        runner, problem.coordinates.start, problem.names[:1], RTOL, problem.coordinates.free
+    )
     if out.lost:
         assert all(sentence(lost.reason) for lost in out.lost.values()), out.lost
     else:
@@ -119,7 +156,13 @@ def test_a_mutated_identification(way: str, folder: Path, tally: Callable[[str],
     for i in range(count(4000 if way == "values" else 1000)):
         changed = mutation.written(path, whole if i % 10 == 5 else some, way, i, rng)
         follow = one_run if i % 10 == 0 else None
-        ask(line, "identification", changed, lambda: measured.load([folder / "data.csv"], path), follow)
+        ask(
+            line,
+            "identification",
+            changed,
+            lambda: measured.load([folder / "data.csv"], path),
+            follow,
+        )
 
 
 CELLS = (
@@ -177,7 +220,9 @@ def mutated_cells(cells: Table, rng: np.random.Generator) -> tuple[bytes, Mutant
             return written(cells), Mutant(None, (name,), old=1.0, new=number)
         case 3:
             cells[row][column] = repr(
-                float(cells[row][column] or 0) * float(10.0 ** rng.uniform(-6, 6)) * float(rng.choice([1, -1]))
+                float(cells[row][column] or 0)
+                * float(10.0 ** rng.uniform(-6, 6))
+                * float(rng.choice([1, -1]))
             )
             return written(cells), Mutant(None, (name,), new=f"row {row + 1}: {cells[row][column]}")
         case 4:
@@ -187,7 +232,9 @@ def mutated_cells(cells: Table, rng: np.random.Generator) -> tuple[bytes, Mutant
                 del one[column]
         case 6:
             cells[row] = (
-                cells[row][: int(rng.integers(1, len(cells[row])))] if rng.random() < 0.5 else [*cells[row], "1"]
+                cells[row][: int(rng.integers(1, len(cells[row])))]
+                if rng.random() < 0.5
+                else [*cells[row], "1"]
             )
         case 7:
             other = int(rng.integers(1, len(cells)))
@@ -209,7 +256,12 @@ def mutated_cells(cells: Table, rng: np.random.Generator) -> tuple[bytes, Mutant
 
 
 def test_a_mutated_table_of_measurements(folder: Path, tally: Callable[[str], Tally]) -> None:
-    line, rng, cells, path = tally("tables of measurements"), random(3), table(), folder / "data.csv"
+    line, rng, cells, path = (
+        tally("tables of measurements"),
+        random(3),
+        table(),
+        folder / "data.csv",
+    )
     for i in range(count(3000)):
         if i % 4 < 3:
             data, changed = mutated_cells(cells, rng)
@@ -221,14 +273,20 @@ def test_a_mutated_table_of_measurements(folder: Path, tally: Callable[[str], Ta
 
 
 def test_a_long_table_is_read_in_seconds(folder: Path, tally: Callable[[str], Tally]) -> None:
-    """1e5 rows, at the example's 0.2 s: the estimate is of minutes, because dense samples are interpolated."""
+    """1e5 rows, at the example's 0.2 s: the estimate is of minutes, because dense samples are
+    interpolated."""
     line, cells = tally("long tables"), table()
     numbers = np.array([[float(x) for x in row] for row in cells[1:]])
     t = np.linspace(numbers[0, 0], numbers[-1, 0], 100_000)
     columns = [np.interp(t, numbers[:, 0], one) for one in numbers.T]
     with (folder / "data.csv").open("w", newline="") as file:
         csv.writer(file).writerows([cells[0], *np.stack(columns, 1).tolist()])
-    case = ask(line, "1e5 rows", Mutant(None, ()), lambda: measured.load([folder / "data.csv"], folder / "rig.toml"))
+    case = ask(
+        line,
+        "1e5 rows",
+        Mutant(None, ()),
+        lambda: measured.load([folder / "data.csv"], folder / "rig.toml"),
+    )
     expected = cost(case.problem, 1e-3, 1, 1)
     line.held(expected.seconds < 600 and expected.memory < 0.5, f"1e5 rows: {expected.sentence}")
 
@@ -238,8 +296,8 @@ class Reader:
 
     def __init__(self) -> None:
         self.process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).with_name("reading.py"))], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL, text=True, bufsize=1,
+            [sys.executable, str(Path(__file__).with_name("reading.py"))], stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True, bufsize=1,
         )  # fmt: skip
         assert self._line(120.0) == "ready\n"
 
@@ -254,7 +312,11 @@ class Reader:
         said = self._line(LIMIT)
         if said == "hang":
             return {"raised": f"still busy after {LIMIT} s"}
-        return json.loads(said) if said else {"raised": f"the process ended with {self.process.wait()}"}
+        return (
+            json.loads(said)
+            if said
+            else {"raised": f"the process ended with {self.process.wait()}"}
+        )
 
     def end(self) -> None:
         self.process.kill()
@@ -273,7 +335,8 @@ def trajectory(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def remake(path: Path, content: bytes, rng: np.random.Generator) -> None:
-    """Another well-formed file: an array missing, renamed, of another type, shape or unit, or with values that cannot be."""
+    """Another well-formed file: an array missing, renamed, of another type, shape or unit, or with
+    values that cannot be."""
     path.write_bytes(content)
     with h5py.File(path, "r+") as file:
         name = str(rng.choice([k for k in file if k != "axis"]))
@@ -298,7 +361,9 @@ def remake(path: Path, content: bytes, rng: np.random.Generator) -> None:
     path.write_bytes(sealed(path.read_bytes()))
 
 
-def test_a_mutated_trajectory_file(trajectory: Path, tmp_path: Path, tally: Callable[[str], Tally]) -> None:
+def test_a_mutated_trajectory_file(
+    trajectory: Path, tmp_path: Path, tally: Callable[[str], Tally]
+) -> None:
     damaged, remade, others = (
         tally("trajectory files: damaged"),
         tally("trajectory files: remade"),
@@ -315,9 +380,14 @@ def test_a_mutated_trajectory_file(trajectory: Path, tmp_path: Path, tally: Call
             reader.end()
             reader = Reader()
         if "refused" in said:
-            line.held(sentence(said["refused"]) and "mutant.nc" in said["refused"], f"{what}: {said}")
+            line.held(
+                sentence(said["refused"]) and "mutant.nc" in said["refused"], f"{what}: {said}"
+            )
         else:
-            line.held("read" in said and said["finite"] and (not unharmed or said == same), f"{what}: {said}")
+            line.held(
+                "read" in said and said["finite"] and (not unharmed or said == same),
+                f"{what}: {said}",
+            )
 
     for i in range(count(1200)):
         path.write_bytes((cut, flip, flip, zeroed)[i % 4](whole, rng))

@@ -1,4 +1,5 @@
-"""SIGKILL at random moments of a generation; started again it ends in the same bytes, and nothing is left over."""
+"""SIGKILL at random moments of a generation; started again it ends in the same bytes, and nothing
+is left over."""
 
 import os
 import shutil
@@ -57,7 +58,9 @@ def test_killed_generations(
         make(small, out)
         wrong = difference(out, expected)
         for _ in range(killed):
-            line.held(not wrong, f"trial {trial}, killed after {times} s: not as undisturbed: {wrong}")
+            line.held(
+                not wrong, f"trial {trial}, killed after {times} s: not as undisturbed: {wrong}"
+            )
 
 
 def test_killed_generators_at_once(
@@ -66,7 +69,11 @@ def test_killed_generators_at_once(
     """Two on one folder, begun at nearly the same time; one is killed and the other ends well."""
     small, _ = config(tmp_path)
     make(small, tmp_path / "whole")
-    expected, out, line = tree(tmp_path / "whole"), tmp_path / "set", tally("kills of one of two generators at once")
+    expected, out, line = (
+        tree(tmp_path / "whole"),
+        tmp_path / "set",
+        tally("kills of one of two generators at once"),
+    )
     rng, trial = random(301), 0
     while line.tried < count(14):
         trial += 1
@@ -83,20 +90,39 @@ def test_killed_generators_at_once(
         wrong = difference(out, expected)
         if killed:
             line.held(
-                status == 0 and not wrong, f"trial {trial}: the other ended with {status}; not as undisturbed: {wrong}"
+                status == 0 and not wrong,
+                f"trial {trial}: the other ended with {status}; not as undisturbed: {wrong}",
             )
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_killed_commands(
-    workers: int, tmp_path: Path, tally: Callable[[str], Tally], random: Any, count: Callable[[int], int]
+    workers: int,
+    tmp_path: Path,
+    tally: Callable[[str], Tally],
+    random: Any,
+    count: Callable[[int], int],
 ) -> None:
-    """The command with its worker processes, killed again and again on one folder, most times soon after it wrote something."""
+    """The command with its worker processes, killed again and again on one folder, most times soon
+    after it wrote something."""
     small, path = config(tmp_path, trajectories=16)
     out, line = tmp_path / "set", tally(f"kills of the command with {workers} workers")
-    command = [sys.executable, "-m", "data_gen.generate", str(path), "--out", str(out), "--workers", str(workers)]
+    command = [
+        sys.executable,
+        "-m",
+        "data_gen.generate",
+        str(path),
+        "--out",
+        str(out),
+        "--workers",
+        str(workers),
+    ]
     rng: np.random.Generator = random(302, workers)
-    quiet: dict[str, Any] = {"cwd": ROOT, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    quiet: dict[str, Any] = {
+        "cwd": ROOT,
+        "stdout": subprocess.DEVNULL,
+        "stderr": subprocess.DEVNULL,
+    }
     killed = 0
     for trial in range(count(8)):
         before = sum(1 for _ in out.rglob("*"))
@@ -111,4 +137,7 @@ def test_killed_commands(
     wrong = difference(out, tree(tmp_path / "whole"))
     assert killed
     for _ in range(killed):
-        line.held(status == 0 and not wrong, f"the last start ended with {status}; not as undisturbed: {wrong}")
+        line.held(
+            status == 0 and not wrong,
+            f"the last start ended with {status}; not as undisturbed: {wrong}",
+        )

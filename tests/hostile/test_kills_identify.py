@@ -1,4 +1,5 @@
-"""`torchsoft identify` killed and interrupted at random moments: the same answer in the end, nothing left, nobody orphaned."""
+"""`torchsoft identify` killed and interrupted at random moments: the same answer in the end,
+nothing left, nobody orphaned."""
 
 import csv
 import json
@@ -23,7 +24,8 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
 
 COMMAND = """
 import signal, sys
-signal.signal(signal.SIGINT, signal.default_int_handler)  # test runners may ignore it, which a child inherits
+# test runners may ignore it, which a child inherits
+signal.signal(signal.SIGINT, signal.default_int_handler)
 if __name__ == "__main__":
     from torchsoft.cli import main
     sys.exit(main(sys.argv[1:]))
@@ -31,7 +33,8 @@ if __name__ == "__main__":
 
 
 class Case(NamedTuple):
-    """Folder of the data, number of workers, and of an undisturbed command the answer and the time it took [s]."""
+    """Folder of the data, number of workers, and of an undisturbed command the answer and the time
+    it took [s]."""
 
     folder: Path
     workers: int
@@ -40,24 +43,35 @@ class Case(NamedTuple):
 
 
 class Command:
-    """The command with workers, in a process of its own, known by a word in the environment of it and its children.
+    """The command with workers, in a process of its own, known by a word in the environment of it
+    and its children.
 
-    Without workers it is forked from this process, which has imported everything, and begins at once.
+    Without workers it is forked from this process, which has imported everything, and begins at
+    once.
     """
 
     def __init__(self, folder: Path, out: Path, workers: int) -> None:
         self.word, self.began, self.out = uuid4().hex, time.monotonic(), out
         self.said, self.kept_before = folder / f"{self.word}.txt", self.kept
         files = [str(folder / name) for name in ("data.csv", "more.csv", "rig.toml")]
-        command = ["identify", *files, "--out", str(out), "--workers", str(workers), "--no-progress"]
+        command = [
+            "identify",
+            *files,
+            "--out",
+            str(out),
+            "--workers",
+            str(workers),
+            "--no-progress",
+        ]
         self.process: subprocess.Popen[bytes] | None = None
         self.status: int | None = None
         if workers > 1:
             (folder / "command.py").write_text(COMMAND, encoding="utf-8")
             with self.said.open("wb") as said:
                 self.process = subprocess.Popen(
-                    [sys.executable, str(folder / "command.py"), *command], stdout=said, stderr=said,
-                    env=os.environ | {"OMP_NUM_THREADS": "1", "HOSTILE_WORD": self.word},
+                    [sys.executable, str(folder / "command.py"), *command], stdout=said,
+                    stderr=said, env=os.environ | {"OMP_NUM_THREADS": "1",
+                    "HOSTILE_WORD": self.word},
                 )  # fmt: skip
             self.id = self.process.pid
         else:
@@ -91,8 +105,11 @@ class Command:
         return len(list(self.out.glob("unfinished/*.run")))
 
     def wait(self, seconds: float, runs: int) -> None:
-        """Until so many seconds have passed since the start, and so many more runs are kept, or it has ended."""
-        while self.running and (time.monotonic() - self.began < seconds or self.kept < self.kept_before + runs):
+        """Until so many seconds have passed since the start, and so many more runs are kept, or it
+        has ended."""
+        while self.running and (
+            time.monotonic() - self.began < seconds or self.kept < self.kept_before + runs
+        ):
             time.sleep(0.002)
 
     def end(self) -> tuple[int | None, str]:
@@ -103,7 +120,11 @@ class Command:
     def survivors(self) -> list[int]:
         """Processes with its word, half a minute after its end at the latest."""
         for _ in range(300):
-            left = [int(p.name) for p in Path("/proc").iterdir() if p.name.isdigit() and self._is_mine(p)]
+            left = [
+                int(p.name)
+                for p in Path("/proc").iterdir()
+                if p.name.isdigit() and self._is_mine(p)
+            ]
             if not left:
                 return []
             time.sleep(0.1)
@@ -117,8 +138,8 @@ class Command:
 
 
 def answer(out: Path) -> str:
-    """The answer without what depends on how it was come by: times, how much was remembered, the command with its folder, and
-    the checksum of all that."""
+    """The answer without what depends on how it was come by: times, how much was remembered, the
+    command with its folder, and the checksum of all that."""
     content = json.loads((out / "answer.json").read_text(encoding="utf-8"))
     for key in ("checksum", "command"):
         content.pop(key)
@@ -131,11 +152,19 @@ def answer(out: Path) -> str:
 def difference(one: str, other: str) -> str:
     """The parts of two answers that are not the same; empty where all are."""
     a, b = json.loads(one), json.loads(other)
-    return "" if one == other else f"another answer: {[(key, a[key], b.get(key)) for key in a if a[key] != b.get(key)]}"
+    return (
+        ""
+        if one == other
+        else f"another answer: {[(key, a[key], b.get(key)) for key in a if a[key] != b.get(key)]}"
+    )
 
 
 def left_over(out: Path) -> str:
-    return ", ".join(sorted(path.name for path in out.iterdir() if path.name not in ("answer.json", "report.html")))
+    return ", ".join(
+        sorted(
+            path.name for path in out.iterdir() if path.name not in ("answer.json", "report.html")
+        )
+    )
 
 
 @pytest.fixture(scope="module", params=[1, 2], ids=["alone", "two workers"])
@@ -160,8 +189,11 @@ def moment(rng: np.random.Generator, seconds: float) -> tuple[float, int]:
     return (seconds * rng.random(), 0) if rng.integers(2) else (0.0, int(rng.integers(1, 16)))
 
 
-def rounds(case: Case, times: int, rng: np.random.Generator, line: Tally, ends: Callable[[Command], str]) -> None:
-    """End the command `times` times as `ends` does, which says what did not hold; after a few it comes to its answer."""
+def rounds(
+    case: Case, times: int, rng: np.random.Generator, line: Tally, ends: Callable[[Command], str]
+) -> None:
+    """End the command `times` times as `ends` does, which says what did not hold; after a few it
+    comes to its answer."""
     number = 0
     while number < times:
         out, ended = case.folder / f"out-{uuid4().hex[:8]}", 0
@@ -179,7 +211,9 @@ def rounds(case: Case, times: int, rng: np.random.Generator, line: Tally, ends: 
         line.held(not (wrong or left_over(out)), f"after {ended}: {wrong or left_over(out)}")
 
 
-def test_killed_it_ends_the_same(whole: Case, tally: Callable[[str], Tally], count: Any, random: Any) -> None:
+def test_killed_it_ends_the_same(
+    whole: Case, tally: Callable[[str], Tally], count: Any, random: Any
+) -> None:
     """Nothing that it began outlives it, whenever it is killed."""
 
     def killed(command: Command) -> str:
@@ -192,11 +226,15 @@ def test_killed_it_ends_the_same(whole: Case, tally: Callable[[str], Tally], cou
     rounds(whole, count(20 if whole.workers == 1 else 10), random(94, whole.workers), line, killed)
 
 
-def test_interrupted_it_ends_the_same(whole: Case, tally: Callable[[str], Tally], count: Any, random: Any) -> None:
+def test_interrupted_it_ends_the_same(
+    whole: Case, tally: Callable[[str], Tally], count: Any, random: Any
+) -> None:
     """With one line that says how to go on, and with what was done kept."""
 
     def interrupted(command: Command) -> str:
-        command.wait(0.0, 1)  # from then on it is the command that is interrupted, and not Python that is starting
+        command.wait(
+            0.0, 1
+        )  # from then on it is the command that is interrupted, and not Python that is starting
         kept = command.kept
         if not command.running:
             return ""
@@ -206,7 +244,13 @@ def test_interrupted_it_ends_the_same(whole: Case, tally: Callable[[str], Tally]
             return ""
         if status != 130 or "Traceback" in said or "the same command continues" not in said:
             return f"{status}, {said[-1000:]}"
-        return "" if command.kept >= kept and not command.survivors() else "something was lost, or is left"
+        return (
+            ""
+            if command.kept >= kept and not command.survivors()
+            else "something was lost, or is left"
+        )
 
     line = tally(f"identifications interrupted, {whole.workers} workers, and their answers")
-    rounds(whole, count(6 if whole.workers == 1 else 3), random(95, whole.workers), line, interrupted)
+    rounds(
+        whole, count(6 if whole.workers == 1 else 3), random(95, whole.workers), line, interrupted
+    )

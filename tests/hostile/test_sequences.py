@@ -1,10 +1,11 @@
-"""Random sequences of what people do to models: every gradient equals differences of what ran, or is refused with a sentence.
+"""Random sequences of what people do to models: every gradient equals differences of what ran, or
+is refused with a sentence.
 
-A sequence does some operations to a model, runs it once or twice, does some more to it before `backward`, and compares
-the gradient along two directions with central differences of a copy that was made when it ran. Differences at
-several steps, of which two that follow each other must agree, tell the points where one of the runs straddles a
-touch-down, and a run that halves a step jumps where another would not: there is no derivative to compare with, and such
-sequences may only be few.
+A sequence does some operations to a model, runs it once or twice, does some more to it before
+`backward`, and compares the gradient along two directions with central differences of a copy that
+was made when it ran. Differences at several steps, of which two that follow each other must agree,
+tell the points where one of the runs straddles a touch-down, and a run that halves a step jumps
+where another would not: there is no derivative to compare with, and such sequences may only be few.
 """
 
 import copy
@@ -20,7 +21,16 @@ from conftest import coarse, f64, grasp, times
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from torchsoft import Coulomb, Profile, Reference, SimulationFailed, SmoothSlip, SoftGrasp, hold, simulate
+from torchsoft import (
+    Coulomb,
+    Profile,
+    Reference,
+    SimulationFailed,
+    SmoothSlip,
+    SoftGrasp,
+    hold,
+    simulate,
+)
 from torchsoft.solve.adjoint import GradientFailed
 
 pytestmark = pytest.mark.slow
@@ -29,10 +39,10 @@ T = times(6e-3, 4)
 REFUSALS = (ValueError, TypeError, SimulationFailed, GradientFailed)
 SETTINGS = {"pad__elements_x": 48, "contact__mu_s": 0.4, "contact__mu_k": 0.3}
 NAMES = (
-    "pad.E", "pad.nu", "pad.tau", "pad.depth", "contact.K_n", "contact.R_n", "contact.K_t", "contact.R_t",
-    "contact.friction.mu_s",
-    "contact.friction.mu_k", "contact.friction.eta", "disc.mass", "bracket.mass", "disc.shape.radius",
-    "control.x.Kp", "control.x.Kd",
+    "pad.E", "pad.nu", "pad.tau", "pad.depth", "contact.K_n", "contact.R_n", "contact.K_t",
+    "contact.R_t", "contact.friction.mu_s",
+    "contact.friction.mu_k", "contact.friction.eta", "disc.mass", "bracket.mass",
+    "disc.shape.radius", "control.x.Kp", "control.x.Kd",
     "control.y.Kp", "control.y.Kd", "gravity",
 )  # fmt: skip
 WEIGHTS = {
@@ -48,8 +58,9 @@ WEIGHTS = {
 STEPS = (1e-4, 3e-5, 1e-5, 1e-6)
 """Of the differences, relative to the values; taken until two that follow each other agree."""
 ALIKE, CLEAR, SMALL = 1e-5, 1e-4, 1e-4
-"""Relative difference that a gradient may have, beside what the differences have among themselves, which is at most `CLEAR`; of
-derivatives of the loss by relative changes below `SMALL` that size is taken."""
+"""Relative difference that a gradient may have, beside what the differences have among themselves,
+which is at most `CLEAR`; of derivatives of the loss by relative changes below `SMALL` that size is
+taken."""
 PART = 0.3
 """What each of the values may add to the derivative: those that matter more are changed less."""
 
@@ -68,7 +79,8 @@ class Exp(nn.Module):
 
 
 class Own(nn.Module):
-    """A friction law of one's own, which reads a global number, has a dropout, and learns its coefficient."""
+    """A friction law of one's own, which reads a global number, has a dropout, and learns its
+    coefficient."""
 
     def __init__(self, mu: float) -> None:
         super().__init__()
@@ -84,7 +96,9 @@ class Bench:
     def __init__(self, rng: np.random.Generator) -> None:
         self.rng = rng
         self.model = coarse(**SETTINGS)
-        self.y0, self.model.reference = grasp(self.model, (0.05 * rng.uniform(-1, 1), 0.01 * rng.uniform(-1, 1)))
+        self.y0, self.model.reference = grasp(
+            self.model, (0.05 * rng.uniform(-1, 1), 0.01 * rng.uniform(-1, 1))
+        )
         self.nominal = {name: self.model.get_parameter(name).item() for name in NAMES}
 
     def some(self, *choices: Any) -> Any:
@@ -92,13 +106,18 @@ class Bench:
 
     def plain(self) -> list[str]:
         """Names that are parameters still: neither parametrised nor gone with a law."""
-        return [name for name in NAMES if name in dict(self.model.named_parameters(remove_duplicate=False))]
+        return [
+            name
+            for name in NAMES
+            if name in dict(self.model.named_parameters(remove_duplicate=False))
+        ]
 
     def near(self, name: str) -> Tensor:
         low, high = (0.95, 1.04) if name.endswith(("nu", "radius")) else (0.7, 1.4)
         return f64(self.nominal[name] * self.rng.uniform(low, high))[0]
 
-    # operations ---------------------------------------------------------------------------------------------------------
+    # operations
+    # ------------------------------------------------------------
 
     def set_in_place(self) -> None:
         name = self.some(*self.plain())
@@ -130,7 +149,9 @@ class Bench:
 
     def tie(self) -> None:
         a, b = self.some(
-            ("contact.R_t", "contact.R_n"), ("contact.K_t", "contact.K_n"), ("control.y.Kp", "control.x.Kp")
+            ("contact.R_t", "contact.R_n"),
+            ("contact.K_t", "contact.K_n"),
+            ("control.y.Kp", "control.x.Kp"),
         )
         if {a, b} <= set(self.plain()):
             owner, _, last = a.rpartition(".")
@@ -153,17 +174,26 @@ class Bench:
             self.model.get_parameter(name).requires_grad_(bool(self.some(True, False)))
 
     def change_dtype(self) -> None:
-        torch.set_default_dtype(self.some(torch.float16, torch.bfloat16, torch.float32, torch.float64))
+        torch.set_default_dtype(
+            self.some(torch.float16, torch.bfloat16, torch.float32, torch.float64)
+        )
 
     def run_without_grad(self) -> None:
         with self.some(torch.no_grad, torch.inference_mode)():
             run = simulate(self.model, T, y0=self.y0, gradient="discrete")
-        assert not any(x.requires_grad for x in (run.y, run["F_x"])), "torch.no_grad() is not honoured"
+        assert not any(x.requires_grad for x in (run.y, run["F_x"])), (
+            "torch.no_grad() is not honoured"
+        )
 
     def replace_law(self) -> None:
         own = Own(self.rng.uniform(0.2, 0.5)).eval()
         frozen = SmoothSlip(0.5, 0.4, 0.05, 20.0).requires_grad_(False)
-        law = self.some(SmoothSlip(0.5, 0.4, 0.08, 20.0), Coulomb(0.4, 0.38), own, lambda E, F_N, R: frozen(E, F_N, R))
+        law = self.some(
+            SmoothSlip(0.5, 0.4, 0.08, 20.0),
+            Coulomb(0.4, 0.38),
+            own,
+            lambda E, F_N, R: frozen(E, F_N, R),
+        )
         self.model.contact.friction = law
 
     def change_a_global(self) -> None:
@@ -175,7 +205,9 @@ class Bench:
     def optimise(self) -> None:
         leaves = [p for p in self.model.parameters() if p.requires_grad]
         if leaves:
-            groups = [{"params": [p], "lr": 1e-2 * abs(float(p.detach().flatten()[0]))} for p in leaves]
+            groups = [
+                {"params": [p], "lr": 1e-2 * abs(float(p.detach().flatten()[0]))} for p in leaves
+            ]
             optimiser = torch.optim.Adam(groups)
             loss(run(self.model, self.y0)).backward()
             optimiser.step()
@@ -203,16 +235,17 @@ class Bench:
 
 
 BEFORE = (
-    Bench.set_in_place, Bench.set_data, Bench.set_parameter, Bench.load, Bench.tie, Bench.parametrise,
-    Bench.copy_deep, Bench.pickled,
-    Bench.toggle, Bench.change_dtype, Bench.run_without_grad, Bench.replace_law, Bench.change_a_global,
-    Bench.train, Bench.optimise,
+    Bench.set_in_place, Bench.set_data, Bench.set_parameter, Bench.load, Bench.tie,
+    Bench.parametrise, Bench.copy_deep, Bench.pickled,
+    Bench.toggle, Bench.change_dtype, Bench.run_without_grad, Bench.replace_law,
+    Bench.change_a_global, Bench.train, Bench.optimise,
     Bench.change_reference, Bench.move_knots,
 )  # fmt: skip
 BETWEEN = (
-    Bench.set_in_place, Bench.set_data, Bench.load, Bench.replace_law, Bench.change_a_global, Bench.change_dtype,
-    Bench.toggle,
-    Bench.change_reference, Bench.move_knots, Bench.lose_reference, Bench.lose_model, Bench.set_parameter,
+    Bench.set_in_place, Bench.set_data, Bench.load, Bench.replace_law, Bench.change_a_global,
+    Bench.change_dtype, Bench.toggle,
+    Bench.change_reference, Bench.move_knots, Bench.lose_reference, Bench.lose_model,
+    Bench.set_parameter,
 )  # fmt: skip
 
 
@@ -236,13 +269,17 @@ def loss(trajectory: Any) -> Tensor:
 
 
 class Ran:
-    """What ran: a copy of the model for differences, the tensors whose gradients are wanted and where they are in the copy."""
+    """What ran: a copy of the model for differences, the tensors whose gradients are wanted and
+    where they are in the copy."""
 
     def __init__(self, bench: Bench) -> None:
         self.y0, self.shared = bench.y0.clone().requires_grad_(), SHARE
         put_in: dict[str, Tensor] = {}
         if bench.some(True, False, False):
-            put_in = {name: bench.near(name).requires_grad_() for name in bench.rng.permutation(bench.plain())[:3]}
+            put_in = {
+                name: bench.near(name).requires_grad_()
+                for name in bench.rng.permutation(bench.plain())[:3]
+            }
         self.copy = copy.deepcopy(bench.model)
         tied = {id(p): q for p, q in zip(bench.model.parameters(), self.copy.parameters())}
         self.leaves = [p for p in bench.model.parameters() if p.requires_grad]
@@ -250,7 +287,12 @@ class Ran:
         for name, value in put_in.items():
             owner, _, last = name.rpartition(".")
             place = nn.Parameter(value.detach().clone())
-            for path, module in self.copy.named_modules():  # functional_call replaces one name, not what is tied to it
+            for (
+                path,
+                module,
+            ) in (
+                self.copy.named_modules()
+            ):  # functional_call replaces one name, not what is tied to it
                 if path == owner:
                     setattr(module, last, place)
             self.leaves.append(value)
@@ -285,8 +327,11 @@ class Ran:
         return (ends[0] - ends[1]) / (2 * h)
 
 
-def compare(rans: list[Ran], leaves: list[Tensor], gradients: list[Tensor], rng: np.random.Generator) -> str | None:
-    """Empty if the gradients are those of the differences, what is wrong if not; None where there is nothing to compare."""
+def compare(
+    rans: list[Ran], leaves: list[Tensor], gradients: list[Tensor], rng: np.random.Generator
+) -> str | None:
+    """Empty if the gradients are those of the differences, what is wrong if not; None where there
+    is nothing to compare."""
     if not all(ran.smooth for ran in rans):
         return None
     y_bar, bars = gradients[0], gradients[1:]
@@ -294,22 +339,33 @@ def compare(rans: list[Ran], leaves: list[Tensor], gradients: list[Tensor], rng:
         chosen = rng.integers(len(leaves)) if leaves and single else -1
         directions = []
         for i, leaf in enumerate(leaves):
-            d = leaf.detach().abs().clamp(min=1e-12) * torch.from_numpy(rng.standard_normal(tuple(leaf.shape)))
+            d = leaf.detach().abs().clamp(min=1e-12) * torch.from_numpy(
+                rng.standard_normal(tuple(leaf.shape))
+            )
             d = d * min(1.0, PART / max(abs(float((bars[i] * d).sum())), 1e-300))
             directions.append(d if not single or i == chosen else torch.zeros_like(d))
         y_direction = torch.zeros_like(y_bar)
         if not single or chosen < 0:
             y_direction = y_bar.sign() * rans[0].base.abs()
-            y_direction = y_direction * min(1e-3, PART / max(float((y_bar * y_direction).sum()), 1e-300))
-        expected = float((y_bar * y_direction).sum()) + sum(float((b * d).sum()) for b, d in zip(bars, directions))
+            y_direction = y_direction * min(
+                1e-3, PART / max(float((y_bar * y_direction).sum()), 1e-300)
+            )
+        expected = float((y_bar * y_direction).sum()) + sum(
+            float((b * d).sum()) for b, d in zip(bars, directions)
+        )
         found: list[float] = []
         for h in STEPS:
             total = 0.0
             for ran in rans:
                 mine = {id(leaf): d for leaf, d in zip(leaves, directions)}
-                total += ran.difference([mine.get(id(x), torch.zeros_like(x)) for x in ran.leaves], y_direction, h)
+                total += ran.difference(
+                    [mine.get(id(x), torch.zeros_like(x)) for x in ran.leaves], y_direction, h
+                )
             found.append(total)
-            spread, size = abs(found[-1] - found[-2]) if found[1:] else np.inf, max(abs(total), SMALL)
+            spread, size = (
+                abs(found[-1] - found[-2]) if found[1:] else np.inf,
+                max(abs(total), SMALL),
+            )
             if spread <= CLEAR * size:  # never where one is not a number
                 break
         else:
@@ -320,7 +376,8 @@ def compare(rans: list[Ran], leaves: list[Tensor], gradients: list[Tensor], rng:
 
 
 def sequence(number: int, rng: np.random.Generator) -> tuple[str, str | None]:
-    """What was done in one sequence, and what came of it: empty if right or refused, what is wrong if not."""
+    """What was done in one sequence, and what came of it: empty if right or refused, what is wrong
+    if not."""
     done: list[str] = []
 
     def do(bench: Bench, operations: tuple[Callable[[Bench], None], ...], most: int) -> None:
@@ -339,9 +396,13 @@ def sequence(number: int, rng: np.random.Generator) -> tuple[str, str | None]:
             rans.append(Ran(bench))
         done.append("|")
         do(bench, BETWEEN, 3)
-        leaves = list({id(leaf): leaf for ran in rans for leaf in ran.leaves if leaf.requires_grad}.values())
+        leaves = list(
+            {id(leaf): leaf for ran in rans for leaf in ran.leaves if leaf.requires_grad}.values()
+        )
         value = sum(ran.value for ran in rans)
-        gradients = torch.autograd.grad(value, [*(ran.y0 for ran in rans), *leaves], allow_unused=True)  # pyright: ignore
+        gradients = torch.autograd.grad(
+            value, [*(ran.y0 for ran in rans), *leaves], allow_unused=True
+        )  # pyright: ignore
     except REFUSALS as refusal:
         text = str(refusal)
         return " ".join(done), "" if text and "\n" not in text else f"not one sentence: {text!r}"
@@ -355,7 +416,9 @@ def sequence(number: int, rng: np.random.Generator) -> tuple[str, str | None]:
 @pytest.mark.timeout(1800)
 @pytest.mark.filterwarnings("ignore:the energies of the run", "ignore:the slip law of")
 def test_gradients_after_any_sequence_are_those_of_what_ran(
-    tally: Callable[[str], Any], count: Callable[[int], int], random: Callable[..., np.random.Generator]
+    tally: Callable[[str], Any],
+    count: Callable[[int], int],
+    random: Callable[..., np.random.Generator],
 ) -> None:
     line, unclear = tally("sequences of model operations, gradients"), 0
     for number in range(count(1000)):
@@ -365,4 +428,6 @@ def test_gradients_after_any_sequence_are_those_of_what_ran(
             done, wrong = "?", f"{type(error).__name__}: {error}"
         unclear += wrong is None
         line.held(not wrong, f"sequence {number} ({done}): {wrong}")
-    assert unclear <= 0.05 * line.tried + 1, f"{unclear} of {line.tried} sequences had nothing to compare with"
+    assert unclear <= 0.05 * line.tried + 1, (
+        f"{unclear} of {line.tried} sequences had nothing to compare with"
+    )

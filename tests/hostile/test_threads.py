@@ -35,18 +35,24 @@ def model_of(kind: int) -> SoftGrasp:
 def answer(model: SoftGrasp, y0: Tensor, reference: Reference, route: str) -> list[Tensor]:
     """States, forces and gradients of one run."""
     if route == "forward":
-        run = simulate(model, T, y0=y0, reference=reference, gradient="forward", wrt=["pad.E", "contact.K_n"])
+        run = simulate(
+            model, T, y0=y0, reference=reference, gradient="forward", wrt=["pad.E", "contact.K_n"]
+        )
         assert run.sensitivities is not None
         return [run.y, run.force["L"], run.sensitivities]
     run = simulate(model, T, y0=y0, reference=reference, gradient="discrete")
     leaves = [p for p in model.parameters() if p.requires_grad]
-    gradients = torch.autograd.grad(run["theta"][-1] + 1e2 * run["x_C"][-1], leaves, allow_unused=True)
+    gradients = torch.autograd.grad(
+        run["theta"][-1] + 1e2 * run["x_C"][-1], leaves, allow_unused=True
+    )
     return [run.y.detach(), run.force["L"], *(g for g in gradients if g is not None)]
 
 
 @pytest.mark.filterwarnings("ignore:the energies of the run")
 def test_threads_give_the_bits_of_runs_alone(
-    tally: Callable[[str], Any], count: Callable[[int], int], random: Callable[..., np.random.Generator]
+    tally: Callable[[str], Any],
+    count: Callable[[int], int],
+    random: Callable[..., np.random.Generator],
 ) -> None:
     line, rng = tally("runs with gradients in threads"), random(72)
     models = [model_of(kind) for kind in range(4)]
@@ -57,7 +63,9 @@ def test_threads_give_the_bits_of_runs_alone(
         for _ in range(MOTIONS):
             x = Profile([0.0, 6e-3], [0.06, 0.06 + 1e-4 * float(rng.standard_normal())])
             reference = Reference(x_d=x, y_d=held["y_d"], F_ff=held["F_ff"])
-            motions.append((models[kind], y0, reference, "forward" if rng.random() < 0.25 else "discrete"))
+            motions.append(
+                (models[kind], y0, reference, "forward" if rng.random() < 0.25 else "discrete")
+            )
     alone = [answer(*motion) for motion in motions]
     found: list[tuple[bool, str]] = []
     together = threading.Barrier(THREADS)
@@ -67,7 +75,10 @@ def test_threads_give_the_bits_of_runs_alone(
         for i in range(count(RUNS)):
             number = MOTIONS * (thread % 4) + (thread + i) % MOTIONS
             try:
-                same = all(torch.equal(a, b) for a, b in zip(answer(*motions[number]), alone[number], strict=True))
+                same = all(
+                    torch.equal(a, b)
+                    for a, b in zip(answer(*motions[number]), alone[number], strict=True)
+                )
                 found.append((same, f"thread {thread}, run {i}: other bits"))
             except Exception as error:
                 found.append((False, f"thread {thread}, run {i}: {type(error).__name__}: {error}"))
@@ -91,7 +102,9 @@ def test_laws_first_compiled_in_many_threads_are_right(
     y0, reference = grasp(base, (0.05, 0.0))
 
     def law(number: int) -> Callable[..., Tensor]:
-        return lambda E, F_N, R: (E - (0.2 + 0.01 * number) * F_N).clamp(min=0.0) / (R + 10.0 + number)
+        return lambda E, F_N, R: (
+            (E - (0.2 + 0.01 * number) * F_N).clamp(min=0.0) / (R + 10.0 + number)
+        )
 
     for number in range(count(15)):
         models = [SoftGrasp(base.settings, friction=law(number)) for _ in range(THREADS)]

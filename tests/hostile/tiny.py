@@ -1,4 +1,5 @@
-"""Two small kernels that stand for the simulator's where no physics matters; of a module, as everything that is cached."""
+"""Two small kernels that stand for the simulator's where no physics matters; of a module, as
+everything that is cached."""
 
 from typing import Any
 

@@ -1,6 +1,7 @@
 """What the hostile trial counts with: how many, at random from which seed, and what did not hold.
 
-`HOSTILE_SCALE` (1 by default) multiplies every count, `HOSTILE_SEED` (0) begins every random choice.
+`HOSTILE_SCALE` (1 by default) multiplies every count, `HOSTILE_SEED` (0) begins every random
+choice.
 """
 
 import os
@@ -28,13 +29,18 @@ class Tally:
         if not holds:
             self.broken.append(otherwise[:2000])
 
-    def call(self, what: str, function: Callable[[], Any], refusals: tuple[type[BaseException], ...]) -> Any:
-        """Count one call, which must return or be refused with one sentence of a kind in `refusals`; None when refused."""
+    def call(
+        self, what: str, function: Callable[[], Any], refusals: tuple[type[BaseException], ...]
+    ) -> Any:
+        """Count one call, which must return or be refused with one sentence of a kind in
+        `refusals`; None when refused."""
         try:
             result = function()
         except refusals as refusal:
             raw = isinstance(refusal, np.linalg.LinAlgError | torch.linalg.LinAlgError)
-            self.held(sentence(str(refusal)) and not raw, f"{what}: not one sentence: {str(refusal)!r}")
+            self.held(
+                sentence(str(refusal)) and not raw, f"{what}: not one sentence: {str(refusal)!r}"
+            )
         except BaseException as error:
             if isinstance(error, KeyboardInterrupt | SystemExit):
                 raise
@@ -47,7 +53,12 @@ class Tally:
 
 def sentence(text: str) -> bool:
     """Whether a refusal is one sentence of this project's."""
-    return 0 < len(text) < 2000 and "\n" not in text and "Traceback" not in text and "validation error" not in text
+    return (
+        0 < len(text) < 2000
+        and "\n" not in text
+        and "Traceback" not in text
+        and "validation error" not in text
+    )
 
 
 def count(number: int) -> int:
