@@ -190,6 +190,13 @@ def rated(change: Callable[..., Tensor], eta: float | None = None) -> Callable[.
     return lambda E, F_N, R: (E - 0.5 * change(F_N)).clamp(min=0.0) / (R + own)
 
 
+def of_one_point(E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
+    """A law that several points at once break."""
+    W, b = torch.eye(4, 2, dtype=torch.float64), torch.ones(4, dtype=torch.float64)
+    mu = torch.tanh(W @ torch.stack((E, F_N)) + b)
+    return (E - mu.sum() * F_N).clamp(min=0.0) / R
+
+
 def slipping(law: Any) -> object:
     return ran(friction=law)
 
@@ -334,6 +341,8 @@ PARTS: list[tuple[Call, str]] = [
      "several points at once other rates .*numel"),
     (lambda: slipping(rated(lambda N: (-1 - N).sqrt())),
      "the slip law of `L` gives nan at an effort of 0.001 N"),
+    (lambda: rest(SoftGrasp(friction=of_one_point)),
+     "the slip law of `L` must take three tensors .*RuntimeError"),
     (lambda: slipping(nn.Dropout()), r"the slip law of `L` must take three tensors .*TypeError"),
     (lambda: slipping(lambda E, F_N, R: None),
      "the slip law of `L` must give a tensor of shape .*, but gives NoneType"),

@@ -17,7 +17,7 @@ from torchsoft.physics.multibond import net_efforts
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
-from torchsoft.physics.validity import check_array, check_values
+from torchsoft.physics.validity import check_array, check_points, check_values
 
 RESIDUAL = 1e-13
 """Residual of an equilibrium [m], forces counted by the compliance they meet."""
@@ -64,6 +64,7 @@ def settled(
             "torch.no_grad()"
         )
     check_values(rig)
+    check_points(rig)
     for name, pad in rig.pads.items():
         if pad.inertial:
             raise NotImplementedError(
@@ -182,6 +183,7 @@ def resting(
     pose and in the rig's parameters, by the implicit function theorem. Raises `NoEquilibrium` where
     there is no balance, and what `settled` does.
     """
+    check_points(rig)
     soft = massless(rig)
     sought = {
         k: torch.tensor(axes, dtype=torch.long)

@@ -233,6 +233,13 @@ def check_shape(where: str, shape: Shape) -> None:
             )
 
 
+def check_points(rig: Any) -> None:
+    """Raises `ValueError` for a slip law that does not take several contact points at once."""
+    several = torch.ones(3, dtype=torch.float64)
+    for name, contact in rig.contacts.items():
+        slip_rates(name, contact.law.friction, several, several, 1.0)
+
+
 def check_slip(where: str, law: Any, R: float) -> str:
     """What is wrong with a slip law at some efforts and normal forces, with the dashpot R [N.s/m];
     empty if nothing is.
