@@ -176,7 +176,7 @@ def test_results_of_an_identification(
     ]
     problem = Problem(recordings, sensors, {"pad.E": Unknown()})
     result = identify(problem, rtol=1e-3)
-    text = page.page(result, problem, *page.traces(result, problem, None))
+    text = page.page(result, *page.traces(result, problem, None))
     monkeypatch.setattr(page, "page", lambda *_: text)  # drawn once
     monkeypatch.setattr(page, "traces", lambda *_: ([], {}))
     (tmp_path / "place").mkdir()
