@@ -411,7 +411,7 @@ def assumption_notices(checked: Checked) -> list[str]:
     out, checks = [], checked.checks
     if checked.candidates:
         out.append(
-            "no assumption explains to first order what the fit left: `explain` looks for the "
+            "no assumption explains to first order all that the fit left: `explain` looks for the "
             f"cause, with a new fit without each of {', '.join(checked.candidates)}"
         )
     if checked.untried:
