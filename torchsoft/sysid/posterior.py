@@ -71,14 +71,6 @@ class Posterior:
         """All draws (draws, n) and their weights (draws,)."""
         return self.draws.reshape(-1, len(self.labels)), self.weights.ravel()
 
-    def pick(self, count: int, rng: np.random.Generator) -> Array:
-        """So many draws (count, n) by their weights: equally far apart in the chains where these
-        are equal."""
-        draws, weights = self.flat
-        if np.ptp(weights) == 0:
-            return draws[np.linspace(0, len(draws) - 1, count).round().astype(int)]
-        return draws[rng.choice(len(draws), count, p=weights)]
-
     @property
     def marginals(self) -> list[MarginalSummary]:
         (draws, weights), known, out = self.flat, diagnostics(), []
