@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 OUT    ?= out/grasp_and_roll
 
-.PHONY: run test test-slow test-hostile test-newest lint clean
+.PHONY: run test test-slow test-hostile test-newest lint wheel clean
 
 run: $(STAMP)
 	$(BIN)/python experiments/grasp_and_roll.py --out $(OUT)
@@ -35,8 +35,15 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "setting up $(VENV) (once, about two minutes)"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m torchsoft.solve.kernel.build
 	@touch $(STAMP)
 
+# with the compiled kernels of every level of processors
+LEVELS := linux-x86-64-v3 linux-x86-64-v2 linux-aarch64
+wheel: $(STAMP)
+	$(BIN)/python -m torchsoft.solve.kernel.build $(addprefix --level ,$(LEVELS))
+	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
+
 clean:
-	rm -rf $(VENV) out build *.egg-info .pytest_cache .ruff_cache
+	rm -rf $(VENV) out build dist torchsoft/solve/kernel/objects *.egg-info .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

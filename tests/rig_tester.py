@@ -14,7 +14,7 @@ from torchsoft import Rig, Trajectory, simulate
 from torchsoft.physics.contact import turned
 from torchsoft.physics.energy import dissipated, stored, supplied
 from torchsoft.physics.multibond import net_efforts
-from torchsoft.solve.kernel.step import GAMMA
+from torchsoft.solve.kernel.arrays import GAMMA
 from torchsoft.solve.progress import Segment
 from torchsoft.solve.rates import Rates
 from torchsoft.solve.stepper import ImplicitStepper

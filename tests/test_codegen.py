@@ -12,7 +12,7 @@ import torch
 from torch.nn import functional as F
 
 from torchsoft.codegen import UnknownOperation, compile_law, emit
-from torchsoft.codegen.invoke import call_linearise, call_pullback, call_value
+from torchsoft.solve.kernel.invoke import call_linearise, call_pullback, call_value
 
 
 @numba.njit(nogil=True)

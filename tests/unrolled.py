@@ -16,7 +16,7 @@ from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
 from torchsoft.solve.grid import check_times, equal_steps
-from torchsoft.solve.kernel.step import GAMMA, MIX
+from torchsoft.solve.kernel.arrays import GAMMA, MIX
 
 WINDOW = 3e-4
 """How near to touching [m] a point has to be at the start of a stage to be an unknown of it."""

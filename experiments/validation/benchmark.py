@@ -36,7 +36,7 @@ from tqdm import tqdm
 from torchsoft import Parameters, SoftGrasp, simulate, simulate_batch
 from torchsoft.experiment import grid, markdown, options, timed, write
 from torchsoft.scenario import Manipulation, grasp_and_roll
-from torchsoft.solve.kernel.arrays import Array
+from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.rates import Rates
 
 GRASP_FORCE = 80.66  # That holds the grasp of the usual rig [N]; it need not be searched for.

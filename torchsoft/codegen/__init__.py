@@ -2,7 +2,7 @@
 to the parameters.
 
 `compile_law` runs the function once, records its scalar expressions, differentiates them and
-compiles all three. `torchsoft.codegen.invoke` calls the result from functions that numba compiles.
+compiles all three. `torchsoft.solve.kernel.invoke` calls the result from kernels.
 """
 
 import itertools

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from torchsoft.channels import CHANNELS
 from torchsoft.codegen import compile_law
-from torchsoft.codegen.invoke import call_linearise, call_value
+from torchsoft.solve.kernel.invoke import call_linearise, call_value
 
 ALIASES = {"v_C": "v_x", "v_Br": "v_x_Br"}
 """Channels by a reduced model's name for them, which leaves the only direction out."""

@@ -17,7 +17,7 @@ from torchsoft.physics.statics import NoEquilibrium, massless, standing
 from torchsoft.rigs.course import Estimate, at, signals
 from torchsoft.rigs.geometry import Scene, tied
 from torchsoft.rigs.motion import ProfileTable
-from torchsoft.solve.kernel.run import PASSED
+from torchsoft.solve.kernel.arrays import PASSED
 from torchsoft.solve.ledger import COMPRESSED
 from torchsoft.solve.stability import NEUTRAL, modes
 

@@ -13,8 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.solve.kernel.adjoint import backward
-from torchsoft.solve.kernel.arrays import Array, room
+from torchsoft.solve.kernel.arrays import Backward, room
+from torchsoft.solve.kernel.objects import call
+from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.progress import Progress, Segment
 from torchsoft.solve.stepper import ImplicitStepper
 from torchsoft.threads import parallel_map
@@ -122,13 +123,16 @@ def run_adjoint(
         segment = segments[number]
         plan, tape = segment.plan, stepper.tape(segment)
         s = stepper.compiled.system(float(plan.h[0]))
-        failed = backward(
-            s, room("Work", s, size, columns=1), room("Cotangents", s, size), plan.h, tape,
+        failed = np.zeros(1, np.int64)
+        sweep = Backward(
+            s, room("Work", s, size, columns=1), room("Cotangents", s, size), tape, plan.h,
             segment.signals, plan.out_step, plan.out_part, rows[segment.rows], carried, p_bar,
-            signals_bar[number],
+            signals_bar[number], failed,
         )  # fmt: skip
-        if failed >= 0:
-            raise GradientFailed(f"the gradient is not finite at t = {plan.starts[failed]:.4f} s")
+        call("backward", sweep)
+        if failed[0] >= 0:
+            time = plan.starts[failed[0]]
+            raise GradientFailed(f"the gradient is not finite at t = {time:.4f} s")
     return (
         torch.from_numpy(carried) + y_bar[0],
         torch.from_numpy(p_bar),

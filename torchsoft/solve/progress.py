@@ -7,7 +7,8 @@ import numpy as np
 
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.grid import Plan
-from torchsoft.solve.kernel.arrays import Array, first_stages
+from torchsoft.solve.kernel.arrays import first_stages
+from torchsoft.solve.kernel.table import Array
 
 
 class SimulationFailed(RuntimeError):

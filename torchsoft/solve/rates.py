@@ -5,8 +5,10 @@ import numpy as np
 
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
-from torchsoft.solve.kernel.arrays import Array, room
-from torchsoft.solve.kernel.run import rates
+from torchsoft.solve.kernel import arrays
+from torchsoft.solve.kernel.arrays import Limits, room
+from torchsoft.solve.kernel.objects import call
+from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.progress import Integrals, SimulationFailed
 from torchsoft.solve.system import Compiled
 from torchsoft.solve.tolerances import Followed
@@ -36,7 +38,7 @@ class Rates:
             raise NotImplementedError(
                 "the rates of inertial pads are not compiled for single states; use `rig.forward`"
             )
-        self._system, self._limits = compiled.system(1.0), (tolerance, 40, margin)
+        self._system, self._limits = compiled.system(1.0), Limits(tolerance, 40, margin)
         self._work = room("Work", self._system, compiled.size, columns=1)
         followed = rig.reference if reference is None else reference
         self._followed = Followed(lambda t: compiled.signals(t, followed), rig, followed)
@@ -63,7 +65,10 @@ class Rates:
 
     def _solve(self, t: float, y: Array, out: Array) -> bool:
         """Whether Newton found the forces; the rates go to `out`."""
-        return rates(
-            self._system, self._work, self._followed.arrays, float(t), y, *self._limits,
-            self._signals, self._powers, self._moments, out,
+        converged = np.zeros(1, np.int64)
+        table = arrays.Rates(
+            self._system, self._work, self._followed.arrays, self._limits, float(t), y,
+            self._signals, self._powers, self._moments, out, converged,
         )  # fmt: skip
+        call("rates", table)
+        return bool(converged[0])

@@ -22,20 +22,26 @@ from torchsoft.solve.grid import (
     equal_steps,
     given_steps,
 )
-from torchsoft.solve.kernel.arrays import NO_ERRORS, NO_SIGNALS, Array, room
-from torchsoft.solve.kernel.run import run
-from torchsoft.solve.kernel.step import (
+from torchsoft.solve.kernel.arrays import (
     CONVERGED,
     GAMMA,
     INSTANT,
     LOST,
     NEWTON_FAILED,
+    NO_ERRORS,
+    NO_SIGNALS,
     NOT_FINITE,
     OFF_THE_PAD,
     OFF_THE_RUNG,
     REFUSED,
     TAPE_FULL,
+    Limits,
+    Outputs,
+    Run,
+    room,
 )
+from torchsoft.solve.kernel.objects import call
+from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.progress import Integrals, Marching, Progress, Segment, SimulationFailed
 from torchsoft.solve.system import Compiled
 from torchsoft.solve.tolerances import Followed, error_parts, part_name
@@ -49,6 +55,9 @@ FIRST, SHORTEST = 1e-3, 1e-9
 SMALLEST_TOLERANCE = 1e-10
 """Newton tolerance [N] that the ready excitations can meet: at a tenth of it one step in ten is
 halved because of rounding."""
+
+NONE, START = np.zeros(0), np.zeros(3)
+"""What given steps do without: an array, and a clock."""
 
 METHOD = "sdirk2"
 """Name under which `torchdiffeq.odeint` knows the stepper once torchsoft is imported."""
@@ -116,9 +125,21 @@ class ImplicitStepper:
         other.step, other.knots = None, knots
         return other
 
-    @property
-    def _limits(self) -> tuple[float, float, float, float, int, float]:
-        return self.rtol, self.longest, SHORTEST, self.tolerance, self.max_iterations, self.window
+    def _call(
+        self, s: Any, now: "Marching", outputs: Any, tape: Any, *, given: bool = True,
+        follow: Any = NO_SIGNALS, errors: Any = NO_ERRORS, k: Array = NONE, clock: Array = START,
+        stops: Array = NONE, times: Array = NONE, row: int = 0, rung: float = 0.0,
+        starts: Array = NONE, h: Array = NONE, signals: Array,
+    ) -> list[int]:  # fmt: skip
+        """One call of the compiled run; what it counted."""
+        counts = np.zeros(7, np.int64)
+        limits = Limits(self.tolerance, self.max_iterations, self.window)
+        call("run", Run(
+            s, self._still, now.work, now.step, follow, errors, limits, outputs, tape, given,
+            now.y, k, clock, stops, times, row, rung, self.rtol, self.longest, SHORTEST,
+            now.integrals, starts, h, signals, counts,
+        ))  # fmt: skip
+        return counts.tolist()
 
     @property
     def signals_at_start(self) -> Tensor:
@@ -165,9 +186,9 @@ class ImplicitStepper:
         step = room("Step", s, self.layout.size, integrals=len(names))
         y, integrals = y0.numpy().copy(), np.zeros(len(names))
         set_velocities(s, work, y)
-        self._start(y, t[0], work, step, out)
-        set_velocities(s, work, y)
         state = Marching(y, work, step, integrals, out, segments, tape_bytes)
+        self._start(t[0], state)
+        set_velocities(s, work, y)
         yield from (
             self._by_tolerance(t, state)
             if self.step is None and self.knots is None
@@ -253,10 +274,11 @@ class ImplicitStepper:
             tape = self._empty_tape(2 * CHUNK if now.taping else 0)
             now.work.travelled[0] = np.inf
             now.work.low[:] = now.work.high[:] = 0
-            steps, done, status, solves, refused, failed, which = run(
-                s, self._still, now.work, now.step, followed.arrays, errors, False, now.y, k, clock,
-                stops, times, out.rows, rung, *self._limits, now.integrals, out.y, out.forces,
-                out.extras, tape, starts, h, signals, row_step, row_part, at_rows,
+            outputs = Outputs(row_step, row_part, at_rows, out.y, out.forces, out.extras)
+            steps, done, status, solves, refused, failed, which = self._call(
+                s, now, outputs, tape, given=False, follow=followed.arrays, errors=errors, k=k,
+                clock=clock, stops=stops, times=times, row=out.rows, rung=rung, starts=starts, h=h,
+                signals=signals,
             )  # fmt: skip
             if followed.error is not None:
                 raise followed.error
@@ -273,17 +295,15 @@ class ImplicitStepper:
                 worst = part_name(self.rig, errors, which) if which >= 0 else "the state"
                 raise self._failure(status, float(clock[0]), float(clock[1]), worst)
 
-    def _start(self, y0: Array, time: Tensor, work: Any, step: Any, out: Progress) -> None:
+    def _start(self, time: Tensor, now: "Marching") -> None:
         """Nodal forces, moments and loads at the start, the first row, and the rates there. Raises
         `SimulationFailed`."""
-        signals = self.compiled.signals(time[None], self.reference).numpy()
-        none = np.zeros(0)
-        *_, status, _, _, _, _ = run(
-            self._still, self._still, work, step, NO_SIGNALS, NO_ERRORS, True, y0, none, none, none,
-            none, 0, 0.0, *self._limits, np.zeros(len(self.integrals.names)), out.y, out.forces,
-            out.extras, self._empty_tape(0), none, none, np.zeros((0, 2, *signals.shape[1:])),
-            np.zeros(1, np.int64), np.zeros(1), signals,
-        )  # fmt: skip
+        signals, out = self.compiled.signals(time[None], self.reference).numpy(), now.out
+        outputs = Outputs(
+            np.zeros(1, np.int64), np.zeros(1), signals, out.y, out.forces, out.extras
+        )
+        none = np.zeros((0, 2, *signals.shape[1:]))
+        status = self._call(self._still, now, outputs, self._empty_tape(0), signals=none)[2]
         if status != CONVERGED:
             raise self._failure(status, float(time), INSTANT)
 
@@ -345,12 +365,13 @@ class ImplicitStepper:
             )  # look for near points afresh, so that a segment made again has the same bits
             now.work.low[:] = now.work.high[:] = 0
             tape = self._empty_tape(2 * steps if taping else 0)
-            done, rows_done, status, solves, *_ = run(
-                s, self._still, now.work, now.step, NO_SIGNALS, NO_ERRORS, True, now.y,
-                *[np.zeros(3)] * 4, 0, 0.0, *self._limits, now.integrals, now.out.y[rows],
-                now.out.forces[rows], now.out.extras[rows], tape, plan.starts, plan.h,
-                signals.reshape(steps, 2, *signals.shape[1:]), plan.out_step, plan.out_part,
-                at_outputs,
+            outputs = Outputs(
+                plan.out_step, plan.out_part, at_outputs,
+                now.out.y[rows], now.out.forces[rows], now.out.extras[rows],
+            )  # fmt: skip
+            done, rows_done, status, solves, *_ = self._call(
+                s, now, outputs, tape, starts=plan.starts, h=plan.h,
+                signals=signals.reshape(steps, 2, *signals.shape[1:]),
             )  # fmt: skip
             if status != TAPE_FULL:
                 return done, rows_done, status, solves, tape if taping else None

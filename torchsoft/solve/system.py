@@ -30,16 +30,16 @@ from torchsoft.physics.validity import (
     slip_rates,
 )
 from torchsoft.solve.kernel.arrays import (
+    GAMMA,
     Actuators,
     Bodies,
     Contacts,
-    Index,
     Inertia,
     Pads,
     Points,
     system,
 )
-from torchsoft.solve.kernel.step import GAMMA
+from torchsoft.solve.kernel.table import Index
 from torchsoft.solve.laws import LawSet, actuator_law, contact_laws, structure
 
 NOMINAL = 1e-3

@@ -7,8 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchsoft.solve.kernel.arrays import Array, room
-from torchsoft.solve.kernel.tangent import forward
+from torchsoft.solve.kernel.arrays import Forward, room
+from torchsoft.solve.kernel.objects import call
+from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.progress import Progress, Segment
 from torchsoft.solve.stepper import ImplicitStepper
 
@@ -54,23 +55,13 @@ def iterate(
         while segments:  # none if the first step of a chunk was not solved, and is to be halved
             segment = segments.pop()
             plan, tape = segment.plan, stepper.tape(segment)
-            s, rows = (
-                stepper.compiled.system(float(plan.h[0])),
-                np.empty((len(plan.out_step), size, n)),
-            )
+            s = stepper.compiled.system(float(plan.h[0]))
+            rows = np.empty((len(plan.out_step), size, n))
             work, tangents = (room(kind, s, size, columns=n) for kind in ("Work", "Tangents"))
-            forward(
-                s,
-                work,
-                tangents,
-                plan.h,
-                tape,
-                segment.signals,
-                plan.out_step,
-                plan.out_part,
-                dy,
-                dp,
-                rows,
-            )
+            sweep = Forward(
+                s, work, tangents, tape, plan.h, segment.signals, plan.out_step, plan.out_part,
+                dy, dp, rows,
+            )  # fmt: skip
+            call("forward", sweep)
             kept[segment.rows] = rows[:, columns]
         yield torch.from_numpy(kept), out

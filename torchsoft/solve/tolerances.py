@@ -12,7 +12,8 @@ from torch import Tensor
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.solve.kernel.arrays import NO_SIGNALS, Array, Errors, Signals
+from torchsoft.solve.kernel.arrays import NO_SIGNALS, Errors, Signals
+from torchsoft.solve.kernel.table import Array
 
 UNITS = {"force": 1.0, "length": 1e-3, "angle": 1.0}
 """What `atol` is counted in: nodal forces [N], displacements, stretches and positions [m], angles
@@ -48,8 +49,8 @@ def error_parts(rig: Rig, y0: Array, atol: float) -> Errors:
                 unit.append(UNITS[what])
                 size.append(np.linalg.norm(y0[begin:end] - origin[begin:end]))
     return Errors(
-        np.array(first, np.int64), np.array(last, np.int64), np.array(rate), atol * np.array(unit),
-        np.array(size), origin,
+        *(np.array(numbers, np.int64) for numbers in (first, last, rate)),
+        atol * np.array(unit), np.array(size), origin,
     )  # fmt: skip
 
 

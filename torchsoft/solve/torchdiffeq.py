@@ -22,7 +22,7 @@ from torch import Tensor
 
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.adjoint import Solved, attached, march, run_adjoint
-from torchsoft.solve.kernel.arrays import Array
+from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.progress import Segment
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
 from torchsoft.threads import cores, parallel_map

@@ -430,7 +430,7 @@ def described(
         ChannelNoise(channel, model, list(tried.get(channel, ())))
         for channel, model in problem.noise.items()
     ]
-    packages = ("torchsoft", "torch", "numpy", "scipy", "numba")
+    packages = ("torchsoft", "torch", "numpy", "scipy", "llvmlite")
     return {
         "recordings": recorded_rigs(problem, x, fitted), "unknowns": dict(problem.unknowns),
         "sensors": dict(problem.sensors),

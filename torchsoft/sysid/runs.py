@@ -18,7 +18,7 @@ import numpy as np
 
 from torchsoft.cost import steps_per_second
 from torchsoft.files import CHECKPOINT, SEALED, check_file, make_folder, remove_partials, replacing
-from torchsoft.solve.kernel.cache import digest
+from torchsoft.solve.kernel.objects import digest
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.prediction import (
@@ -49,7 +49,7 @@ KINDS = {kind.__name__: kind for kind in (Prediction, Misfit, FailedRun)}
 
 PROGRAM = (
     digest(Path(__file__).parents[2]),
-    *(version(name) for name in ("torchsoft", "torch", "numpy", "scipy", "numba")),
+    *(version(name) for name in ("torchsoft", "torch", "numpy", "scipy", "llvmlite")),
 )
 """Everything but the data that decides a run."""
 

@@ -10,14 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from torchsoft.codegen.invoke import call_linearise, call_pullback
-from torchsoft.solve.kernel import compiled, entry
-from torchsoft.solve.kernel.arrays import Array
+from torchsoft.solve.kernel import compiled
+from torchsoft.solve.kernel.arrays import GAMMA, MIX
 from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
 from torchsoft.solve.kernel.interface import NEGLIGIBLE, assemble, restore
+from torchsoft.solve.kernel.invoke import call_linearise, call_pullback
 from torchsoft.solve.kernel.linear import put, row_of, solve_dense
 from torchsoft.solve.kernel.stage import actuate, balance
-from torchsoft.solve.kernel.step import GAMMA, MIX, TINY, dense_states
+from torchsoft.solve.kernel.step import TINY, dense_states
+from torchsoft.solve.kernel.table import Array
 
 
 @compiled
@@ -123,7 +124,7 @@ def pad_state(
         s.pad_y_start[pad],
     )
     size, chain, branches = 2 * (last - first), s.pad_chain_at[pad], s.pad_branches[pad]
-    start_C, material, F = s.pad_C_start[pad], chain + 2 * branches, w.F.reshape(w.F.size)
+    start_C, material, F = s.pad_C_start[pad], chain + 2 * branches, w.F.flat
     by_rate, by_u, zeta, z_dot = (
         scratch.surface[0],
         scratch.surface[1],
@@ -398,18 +399,19 @@ def free_stretches(
                 y_bar[j] = 0.0
 
 
-@entry
-def backward(
-    s: Any, w: Any, z: Any, h: Array, tape: Any, signals: Array, out_step: Any, out_part: Array,
-    outputs_bar: Array, y_bar: Array, p_bar: Array, signals_bar: Array,
-) -> int:  # fmt: skip
-    """Sweep the steps of a tape backwards; y_bar goes from the end's cotangent to the start's, in
+@compiled
+def backward(r: Any) -> None:
+    """Sweep the steps h of a tape backwards; y_bar goes from the end's cotangent to the start's, in
     place.
 
     outputs_bar (outputs, size) belong to the parts out_part of the steps out_step; signals and
-    signals_bar are (stages, signals, 2). Returns -1, or the step at which a cotangent stopped being
-    finite.
+    signals_bar are (stages, signals, 2). failed receives -1, or the step at which a cotangent
+    stopped being finite.
     """
+    s, w, z, tape, h, signals = r.s, r.w, r.z, r.tape, r.h, r.signals
+    out_step, out_part, outputs_bar = r.out_step, r.out_part, r.outputs_bar
+    y_bar, p_bar, signals_bar = r.y_bar, r.p_bar, r.signals_bar
+    r.failed[0] = -1
     row = out_step.size - 1
     held, first_bar, start_bar = z.state[0], z.state[1], z.state[2]
     for step in range(h.size - 1, -1, -1):
@@ -432,5 +434,5 @@ def backward(
         for i in range(y_bar.size):
             y_bar[i] += held[i]
         if not np.isfinite(y_bar.sum()):
-            return step
-    return -1
+            r.failed[0] = step
+            return

@@ -7,14 +7,32 @@ position in the vector p of all law parameters, "start" one in another array. No
 nodes of all pads, points the contact points of all contacts.
 """
 
-from collections import namedtuple
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from torchsoft.solve.kernel.table import (
+    Array,
+    Cube,
+    Hypercube,
+    Index,
+    IndexMatrix,
+    Matrix,
+    table,
+)
+
+GAMMA = 1.0 - 1.0 / np.sqrt(2.0)
+MIX = (1.0 - GAMMA) / GAMMA
+
+CONVERGED, NEWTON_FAILED, OFF_THE_PAD, LOST, TAPE_FULL, NOT_FINITE, REFUSED, OFF_THE_RUNG = range(8)
+"""Why a run ended."""
+
+INSTANT = 1e-13
+"""Length a h [s] of the stage that gives the forces at one moment: nothing moves in it."""
+
+PASSED = 0.25
+"""A step that tolerances choose moves no body by more than this part of its size over a pad that it
+may touch: one that flies would else be through the pad between two steps."""
 
 INPUTS, OUTPUTS = 9, 7
 """A contact law's inputs (w, omega, d, theta, s*, weight, a h) and outputs (f, s', F_N, F_T, power
@@ -72,7 +90,7 @@ class Pads(NamedTuple):
     C: Array
     dC: Array
     reach: Array
-    column: Index
+    column: IndexMatrix
     columns: Index
 
 
@@ -87,15 +105,15 @@ class Inertia(NamedTuple):
 
     dof_start: Index
     surface: Index
-    factor: Array
+    factor: Matrix
     band: Index
     X: Array
     area: Array
-    K_column: Index
-    K_lambda: Array
-    K_mu: Array
-    D: Array
-    B: Array
+    K_column: IndexMatrix
+    K_lambda: Matrix
+    K_mu: Matrix
+    D: Matrix
+    B: Cube
     material_at: Index
 
 
@@ -107,8 +125,8 @@ class Contacts(NamedTuple):
 
     pad: Index
     body: Index
-    number: Index
-    coordinate: Index
+    number: IndexMatrix
+    coordinate: IndexMatrix
     distance: Index
     linearise: Index
     pullback: Index
@@ -118,7 +136,7 @@ class Contacts(NamedTuple):
     p_start: Index
     point_start: Index
     size: Array
-    limits: Array
+    limits: Matrix
 
 
 class Points(NamedTuple):
@@ -126,10 +144,10 @@ class Points(NamedTuple):
     nodes and their shape functions there; y_start of the stretches."""
 
     contact: Index
-    X: Array
+    X: Matrix
     weight: Array
-    node: Index
-    N: Array
+    node: IndexMatrix
+    N: Matrix
     y_start: int
 
 
@@ -142,12 +160,19 @@ PARTS = {
     "point": Points,
 }
 
-System: Any = namedtuple(
-    "System", [*(f"{part}_{name}" for part, kind in PARTS.items() for name in kind._fields), "p"]
+System: Any = table(
+    NamedTuple(
+        "System",
+        [
+            (f"{part}_{name}", hint)
+            for part, kind in PARTS.items()
+            for name, hint in kind.__annotations__.items()
+        ]
+        + [("p", Array)],
+    )
 )
 """Everything that stays while a run is on, flat: the fields of `PARTS` by part_field, and p, the
-vector of law parameters. Flat, because numba's compiling takes time for every array in a tuple that
-is taken out of another."""
+vector of law parameters."""
 
 
 def system(*parts: Any, p: Array) -> Any:
@@ -155,6 +180,7 @@ def system(*parts: Any, p: Array) -> Any:
     return System(*(field for part in parts for field in part), p)
 
 
+@table
 class Signals(NamedTuple):
     """The reference: per signal the first of its pieces (signals + 1,) and their number of control
     points; per piece its start and span [s] and its control points. address: of a function that
@@ -164,7 +190,7 @@ class Signals(NamedTuple):
     points: Index
     at: Array
     span: Array
-    control: Array
+    control: Matrix
     address: int
     room: Array
 
@@ -181,14 +207,14 @@ NO_SIGNALS = Signals(
 """What given steps follow: nothing."""
 
 
+@table
 class Errors(NamedTuple):
-    """Parts of the state whose error is judged together: first and last component, whether it is a
-    rate, its absolute tolerance, its largest size so far; origin (size,): what sizes are counted
-    from."""
+    """Parts of the state whose error is judged together: first and last component, 1 for a rate,
+    its absolute tolerance, its largest size so far; origin (size,): what sizes are counted from."""
 
     first: Index
     last: Index
-    rate: Any
+    rate: Index
     atol: Array
     size: Array
     origin: Array
@@ -197,7 +223,7 @@ class Errors(NamedTuple):
 NO_ERRORS = Errors(
     np.zeros(0, np.int64),
     np.zeros(0, np.int64),
-    np.zeros(0, bool),
+    np.zeros(0, np.int64),
     np.zeros(0),
     np.zeros(0),
     np.zeros(0),
@@ -209,10 +235,10 @@ SCRATCH: dict[str, dict[str, str]] = {
     "Work": {  # of a stage
         "coordinates": "q V V_old load",
         "contacts 7": "frame",
-        "dofs": "zeta zeta_rate",  # of a massless pad's chain
+        "dofs": "zeta zeta_rate u_dot_new",  # zeta: of a massless pad's chain
         # displacement u*, rates (without contact, now, before and after a Newton step), forces by
         # the law and by the linear relations (now, before, after)
-        "nodes 2": "u free u_dot u_dot_old u_dot_new F F_linear F_old F_new",
+        "nodes 2": "u free u_dot u_dot_old F F_linear F_old F_new",
         "points 9": "x",  # the law's inputs, outputs and Jacobian
         "points 7": "out",
         "points 3 7": "J",
@@ -300,10 +326,132 @@ SCRATCH: dict[str, dict[str, str]] = {
 }
 """Arrays that the kernels write to, by name and shape: they allocate nothing."""
 
-KINDS: dict[str, Any] = {
-    kind: namedtuple(kind, " ".join(shapes.values())) for kind, shapes in SCRATCH.items()
-}
+DIMENSIONS = (Array, Matrix, Cube), (Index, IndexMatrix)
+
+
+def declared(kind: str) -> Any:
+    """The table of one of `SCRATCH`."""
+    fields = []
+    for shape, names in SCRATCH[kind].items():
+        hints = DIMENSIONS[shape.startswith("int ")]
+        hint = hints[len(shape.removeprefix("int ").split()) - 1]
+        fields += [(name, hint) for name in names.split()]
+    return table(NamedTuple(kind, fields))
+
+
+KINDS: dict[str, Any] = {kind: declared(kind) for kind in SCRATCH}
 Work, Step, Cotangents, Tangents, Tape = KINDS.values()
+
+
+@table
+class Limits(NamedTuple):
+    """Of Newton's iteration: its tolerance [N], its iterations, and how near a point has to be
+    [m] to be looked at."""
+
+    tolerance: float
+    max_iterations: int
+    margin: float
+
+
+@table
+class Outputs(NamedTuple):
+    """Of a run: output i lies at the part out_part[i] of the step out_step[i], where the signals
+    are signals[i].
+
+    Its state goes to y, (F_N, F_T) of every point to forces, and integrals, the pads' moments and
+    the generalised contact forces to extras.
+    """
+
+    step: Index
+    part: Array
+    signals: Cube
+    y: Matrix
+    forces: Cube
+    extras: Matrix
+
+
+@table
+class Run(NamedTuple):
+    """Arguments of `run`, whose docstring says what they are."""
+
+    s: System
+    s0: System
+    w: Work
+    d: Step
+    f: Signals
+    e: Errors
+    limits: Limits
+    out: Outputs
+    tape: Tape
+    given: int
+    y: Array
+    k: Array
+    clock: Array
+    stops: Array
+    t_out: Array
+    row: int
+    rung: float
+    rtol: float
+    longest: float
+    shortest: float
+    integrals: Array
+    starts: Array
+    h: Array
+    signals: Hypercube
+    counts: Index
+
+
+@table
+class Rates(NamedTuple):
+    """Arguments of `rates`."""
+
+    s: System
+    w: Work
+    f: Signals
+    limits: Limits
+    t: float
+    y: Array
+    signals: Cube
+    powers: Array
+    moments: Array
+    out: Array
+    converged: Index
+
+
+@table
+class Backward(NamedTuple):
+    """Arguments of `backward`."""
+
+    s: System
+    w: Work
+    z: Cotangents
+    tape: Tape
+    h: Array
+    signals: Cube
+    out_step: Index
+    out_part: Array
+    outputs_bar: Matrix
+    y_bar: Array
+    p_bar: Array
+    signals_bar: Cube
+    failed: Index
+
+
+@table
+class Forward(NamedTuple):
+    """Arguments of `forward`."""
+
+    s: System
+    w: Work
+    z: Tangents
+    tape: Tape
+    h: Array
+    signals: Cube
+    out_step: Index
+    out_part: Array
+    dy: Matrix
+    dp: Matrix
+    dys: Cube
 
 
 def room(kind: str, s: Any, state: int, **sizes: int) -> Any:

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from torchsoft.solve.kernel import compiled
-from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.linear import solve_banded
+from torchsoft.solve.kernel.table import Array
 
 
 @compiled

@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from torchsoft.codegen.invoke import call_linearise, call_value
 from torchsoft.solve.kernel import compiled
-from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.inertia import couple_base, couple_point, free_rates
+from torchsoft.solve.kernel.invoke import call_linearise, call_value
 from torchsoft.solve.kernel.linear import put, row_of
+from torchsoft.solve.kernel.table import Array
 
 NEGLIGIBLE = 1e-14
 """Nodal force that has set in [N] below which a node counts as never loaded: its displacements are

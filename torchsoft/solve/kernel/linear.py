@@ -6,7 +6,7 @@ loop from being vectorised.
 """
 
 from torchsoft.solve.kernel import compiled, inlined
-from torchsoft.solve.kernel.arrays import Array
+from torchsoft.solve.kernel.table import Array
 
 
 @compiled

@@ -11,24 +11,21 @@ from typing import Any
 
 import numpy as np
 
-from torchsoft.codegen.invoke import call_value
-from torchsoft.solve.kernel import compiled, entry
-from torchsoft.solve.kernel.arrays import Array
-from torchsoft.solve.kernel.linear import put
-from torchsoft.solve.kernel.stage import actuate
-from torchsoft.solve.kernel.step import (
+from torchsoft.solve.kernel import compiled
+from torchsoft.solve.kernel.arrays import (
     CONVERGED,
     GAMMA,
     NEWTON_FAILED,
     NOT_FINITE,
     OFF_THE_RUNG,
+    PASSED,
     REFUSED,
-    gone,
-    solve_near,
-    take_back,
-    take_step,
-    write_rows,
 )
+from torchsoft.solve.kernel.invoke import call_value
+from torchsoft.solve.kernel.linear import put
+from torchsoft.solve.kernel.stage import actuate
+from torchsoft.solve.kernel.step import gone, solve_near, take_back, take_step, write_rows
+from torchsoft.solve.kernel.table import Array
 
 ERROR = 2.0 * abs(3.0 * GAMMA**2 - 2.0 * GAMMA**3 - 1.0 / 6.0)
 """Twice the coefficient of h^3 y''' in the step's error."""
@@ -39,10 +36,6 @@ most."""
 
 INTEGRAL, PROPORTIONAL = 0.7 / 3.0, 0.4 / 3.0
 """Exponents of the PI controller (Gustafsson, ACM TOMS 17, 1991)."""
-
-PASSED = 0.25
-"""A step that tolerances choose moves no body by more than this part of its size over a pad that it
-may touch: one that flies would else be through the pad between two steps."""
 
 LEAST_ERROR = 1e-6
 """Errors below this part of the tolerance count as this."""
@@ -89,7 +82,7 @@ def estimate(e: Any, d: Any, y: Array, k: Array, h: float, rtol: float) -> tuple
             change = y[i] - e.origin[i]
             size += change * change
         size = max(np.sqrt(size), e.size[part])
-        if e.rate[part]:  # an error of a rate counts by what it displaces within the step
+        if e.rate[part] != 0:  # an error of a rate counts by what it displaces within the step
             total *= h * h
             size *= h
         ratio = np.sqrt(total) / (e.atol[part] + rtol * size)
@@ -121,41 +114,34 @@ def next_end(t: float, wanted: float, stops: Array, shift: bool) -> float:
     return t + (0.5 * left if wanted > 0.5 * left else wanted)
 
 
-@entry
-def run(
-    s: Any, s0: Any, w: Any, d: Any, f: Any, e: Any, given: bool, y: Array, k: Array, clock: Array,
-    stops: Array, t_out: Array, row: int, rung: float, rtol: float, longest: float, shortest: float,
-    tolerance: float, max_iterations: int, margin: float, integrals: Array, ys: Array,
-    forces: Array, extras: Array, tape: Any, starts: Array, h: Array, signals: Array, out_step: Any,
-    out_part: Array, out_signals: Array,
-) -> tuple[int, int, int, int, int, int, int]:  # fmt: skip
+@compiled
+def run(r: Any) -> None:
     """Take up to h.size steps. `s` are the rig's arrays, `s0` those for a stage of no length.
 
-    starts, h (steps,) [s], signals (steps, 2, signals, 2), value and rate at the stages; output i
-    lies at the part out_part[i] of the step out_step[i], where the signals are out_signals[i]. With
-    `given` these say what to do. Otherwise they receive what is done, from the output `row` on,
-    until the last of t_out; the tolerances choose: clock holds the time, the next step's length and
-    the last step's error, k the rates at y. No step passes a time of `stops`, whose last is
-    t_out's. A positive `rung` [s] is the only length allowed, for arrays `s` that belong to it: the
-    call ends when the controller wants half of it or twice.
+    starts, h (steps,) [s], signals (steps, 2, signals, 2), value and rate at the stages, and the
+    steps and parts of the outputs. With `given` these say what to do. Otherwise they receive what
+    is done, from the output `row` on, until the last of t_out; the tolerances choose: clock holds
+    the time, the next step's length and the last step's error, k the rates at y. No step passes a
+    time of `stops`, whose last is t_out's. A positive `rung` [s] is the only length allowed, for
+    arrays `s` that belong to it: the call ends when the controller wants half of it or twice.
 
-    An output's state goes to `ys`, (F_N, F_T) of every point to `forces`, and integrals, the pads'
-    moments and the generalised contact forces to `extras`; `tape` has two rows a step, or none. y,
-    `integrals` and the guesses in w are advanced in place; after a failure they hold the last good
-    step. With no steps the one output is that of y itself.
+    `tape` has two rows a step, or none. y, `integrals` and the guesses in w are advanced in place;
+    after a failure they hold the last good step. With no steps the one output is that of y itself.
 
-    Returns steps and outputs done, status, linear solves, steps that were refused for their error
-    and that Newton did not solve, and the part of the state whose error was largest in the last
-    one.
+    counts receives steps and outputs done, status, linear solves, steps that were refused for their
+    error and that Newton did not solve, and the part of the state whose error was largest in the
+    last one.
     """
-    steps, solves, refused, failed, which, first = 0, 0, 0, 0, -1, row
+    s, w, d, y, out, given = r.s, r.w, r.d, r.y, r.out, r.given != 0
+    clock, counts, h, t_out, rung = r.clock, r.counts, r.h, r.t_out, r.rung
+    steps, row, solves, refused, failed, which = 0, r.row, 0, 0, 0, -1
     status, begin = CONVERGED, h.size == 0
     while (steps < h.size and (given or row < t_out.size)) or begin:
-        t, wanted, end, error, last = clock[0], min(clock[1], longest), 0.0, 0.0, row
+        t, wanted, end, error, last = clock[0], min(clock[1], r.longest), 0.0, 0.0, row
         if begin:  # the output at the start, where nothing has moved
             d.K[:], d.powers[:], w.travelled[0], now, last = 0.0, 0.0, np.inf, 0.0, row + 1
             put(y, d.y)
-            put(integrals, d.integrals)
+            put(r.integrals, d.integrals)
             put(w.travelled, d.travelled)
         else:
             now = h[steps]
@@ -163,78 +149,59 @@ def run(
                 if rung > 0.0 and not rung * (1.0 - 1e-9) <= wanted < 2.0 * rung:
                     status = OFF_THE_RUNG
                     break
-                end = next_end(t, rung if rung > 0.0 else wanted, stops, rung == 0.0)
+                end = next_end(t, rung if rung > 0.0 else wanted, r.stops, rung == 0.0)
                 now = rung if rung > 0.0 else end - t
-                follow(f, t + GAMMA * now, end, signals[steps])
-            status, count = take_step(
-                s,
-                w,
-                d,
-                y,
-                now,
-                signals[steps],
-                tolerance,
-                max_iterations,
-                margin,
-                integrals,
-                tape,
-                2 * steps,
-            )
+                follow(r.f, t + GAMMA * now, end, r.signals[steps])
+            status, count = take_step(r, now, r.signals[steps], 2 * steps)
             solves += count
             if status == CONVERGED and not given:
-                error, which = estimate(e, d, y, k, now, rtol)
+                error, which = estimate(r.e, d, y, r.k, now, r.rtol)
                 error = max(error, (now * passing(s, w) / PASSED) ** 3)
                 if not error <= 1.0:
                     status = REFUSED
             if status == CONVERGED:
                 status = gone(s, w)
             if status == CONVERGED:
-                while last < out_step.size and (
-                    out_step[last] == steps if given else t_out[last] <= end
+                while last < out.step.size and (
+                    out.step[last] == steps if given else t_out[last] <= end
                 ):
                     if not given:
                         part = (t_out[last] - t) / now
-                        out_step[last], out_part[last] = steps, part if part < 1.0 - 1e-9 else 1.0
-                        follow(f, t_out[last], t_out[last], out_signals[last : last + 1])
+                        out.step[last], out.part[last] = steps, part if part < 1.0 - 1e-9 else 1.0
+                        follow(r.f, t_out[last], t_out[last], out.signals[last : last + 1])
                     last += 1
         if status == CONVERGED:
-            status, count = write_rows(
-                s, s0, w, d, y, now, out_part, out_signals, row, last, tolerance, max_iterations,
-                margin, integrals, ys, forces, extras,
-            )  # fmt: skip
+            status, count = write_rows(r, now, row, last)
             solves += count
         if begin:
             put(w.k, d.K[0])
             begin, row = False, last
         elif status == CONVERGED:
             if not given:
-                starts[steps], h[steps] = t, now
-                put(d.K[1], k)
-                enlarge(e, y)
+                r.starts[steps], h[steps] = t, now
+                put(d.K[1], r.k)
+                enlarge(r.e, y)
                 error = max(error, LEAST_ERROR)
                 longer = now * min(
                     LARGEST, max(SMALLEST, SAFETY * error**-INTEGRAL * clock[2] ** PROPORTIONAL)
                 )
-                clock[0], clock[1], clock[2] = (
-                    end,
-                    max(longer, wanted) if now < wanted else longer,
-                    error,
-                )
+                wanted = max(longer, wanted) if now < wanted else longer
+                clock[0], clock[1], clock[2] = end, wanted, error
             row, steps = last, steps + 1
         else:
-            take_back(w, d, y, integrals)
-            again = (
-                not given and wanted > shortest
-            )  # not `now`, which rounding leaves a little longer
+            take_back(r)
+            # not `now`, which rounding leaves a little longer
+            again = not given and wanted > r.shortest
             if again and status == REFUSED:
                 refused, smaller = refused + 1, SAFETY * error ** (-1.0 / 3.0)
-                clock[1] = max(now * (smaller if smaller > SMALLEST else SMALLEST), shortest)
+                clock[1] = max(now * (smaller if smaller > SMALLEST else SMALLEST), r.shortest)
             elif again and status in (NEWTON_FAILED, NOT_FINITE):
-                failed, clock[1] = failed + 1, max(now * SMALLEST, shortest)
+                failed, clock[1] = failed + 1, max(now * SMALLEST, r.shortest)
             else:
                 break
             status = CONVERGED
-    return steps, row - first, status, solves, refused, failed, which
+    counts[0], counts[1], counts[2] = steps, row - r.row, status
+    counts[3], counts[4], counts[5], counts[6] = solves, refused, failed, which
 
 
 @compiled
@@ -251,31 +218,27 @@ AT_ONCE = 1e-18
 """Length a h [s] of the stage: no velocity changes in it by more than rounding does."""
 
 
-@entry
-def rates(
-    s: Any, w: Any, f: Any, t: float, y: Array, tolerance: float, max_iterations: int,
-    margin: float, signals: Array, powers: Array, moments: Array, out: Array,
-) -> bool:  # fmt: skip
-    """dy/dt of the state y at t [s] into out, of a rig whose pads are massless; False if Newton
-    finds no forces there.
+@compiled
+def rates(r: Any) -> None:
+    """dy/dt of the state y at t [s] into out, of a rig whose pads are massless; converged receives
+    0 if Newton finds no forces there.
 
     A stage of no length gives all rates; those of the velocities are a difference over its length
     and come from the loads instead. signals (1, signals, 2) is scratch, as are powers and moments.
     """
-    follow(f, t, t, signals)
+    s, w, y, out = r.s, r.w, r.y, r.out
+    follow(r.f, r.t, r.t, r.signals)
     for i in range(s.body_coordinate.size):
         w.V[s.body_coordinate[i]] = y[s.body_V_start + i]
     w.travelled[0] = np.inf  # the last state was any other one
-    converged, _, _ = solve_near(
-        s, w, y, signals[0], AT_ONCE, tolerance, max_iterations, margin, powers, moments
-    )
+    converged, _, _ = solve_near(s, w, r.limits, y, r.signals[0], AT_ONCE, r.powers, r.moments)
     put(w.k, out)
     for i in range(s.body_coordinate.size):
         c, mass = s.body_coordinate[i], s.p[s.body_mass_at[i]]
         load = w.load[c] - s.body_weight[i] * mass * s.p[s.body_gravity_at]
         for a in range(s.act_pushed.size):
             if s.act_pushed[a] == c:
-                load += actuate(s, a, w.q, w.V, signals[0], w.effort_x, w.effort, w.effort_J)
+                load += actuate(s, a, w.q, w.V, r.signals[0], w.effort_x, w.effort, w.effort_J)
         out[s.body_V_start + i] = load / mass  # (17), (18)
         out[s.body_q_start + i] = y[s.body_V_start + i]
-    return converged
+    r.converged[0] = 1 if converged else 0

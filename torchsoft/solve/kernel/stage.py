@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from torchsoft.codegen.invoke import call_linearise, call_value
 from torchsoft.solve.kernel import compiled
-from torchsoft.solve.kernel.arrays import Array
 from torchsoft.solve.kernel.inertia import base_velocity, inertia_force, solve, stiffness_force
 from torchsoft.solve.kernel.interface import (
     assemble,
@@ -22,7 +20,9 @@ from torchsoft.solve.kernel.interface import (
     scan,
     set_in,
 )
+from torchsoft.solve.kernel.invoke import call_linearise, call_value
 from torchsoft.solve.kernel.linear import put, row_of, solve_dense
+from torchsoft.solve.kernel.table import Array
 
 SEARCH_AFTER, SHORTEST = 2, 1.0 / 64.0
 """After so many iterations a Newton step that does not lessen the mismatch is halved, down to this
@@ -167,7 +167,7 @@ def propose(s: Any, w: Any, pad: int, a: float, n: int, columns: int, dV: Array)
     for node in range(w.low[pad], w.high[pad]):
         for r in range(2):
             w.F_old[node, r], w.u_dot_old[node, r] = w.F_linear[node, r], w.u_dot[node, r]
-            w.F_new[node, r], w.u_dot_new[node, r] = 0.0, w.free[node, r]
+            w.F_new[node, r], w.u_dot_new[2 * node + r] = 0.0, w.free[node, r]
     for i in range(n):
         node = w.touched[first + i]
         for r in range(2):
@@ -177,7 +177,7 @@ def propose(s: Any, w: Any, pad: int, a: float, n: int, columns: int, dV: Array)
                     f += X[2 * i + r, columns + s.pad_column[pad, number]] * dV[number]
             w.F_new[node, r] = f
     low, high = 2 * w.low[pad], 2 * w.high[pad]
-    rates = w.u_dot_new.reshape(w.u_dot_new.size)[low:high]
+    rates = w.u_dot_new[low:high]
     for i in range(n):
         node = w.touched[first + i]
         for r in range(2):
@@ -206,26 +206,19 @@ def move(w: Any, pad: int, part: float) -> None:
         for r in range(2):
             w.F_linear[node, r] = w.F_old[node, r] + part * (w.F_new[node, r] - w.F_old[node, r])
             w.u_dot[node, r] = w.u_dot_old[node, r] + part * (
-                w.u_dot_new[node, r] - w.u_dot_old[node, r]
+                w.u_dot_new[2 * node + r] - w.u_dot_old[node, r]
             )
 
 
 @compiled
 def solve_stage(
-    s: Any,
-    w: Any,
-    y: Array,
-    signals: Array,
-    a: float,
-    tolerance: float,
-    max_iterations: int,
-    margin: float,
+    s: Any, w: Any, limits: Any, y: Array, signals: Array, a: float, margin: float
 ) -> tuple[bool, int]:
     """Velocities (w.V, on entry the guess), nodal forces and rates at the end of the stage that
     starts from y.
 
-    Newton ends when the law and the linear relations agree to `tolerance` [N] at every node.
-    Returns success and the number of linear solves.
+    Newton ends when the law and the linear relations agree to the tolerance at every node. Returns
+    success and the number of linear solves.
     """
     pads, free = s.pad_base.size, s.body_coordinate.size
     drive(s, w, y, signals, a)
@@ -253,9 +246,9 @@ def solve_stage(
                 w.V[c] = V_old[c] + part * dV[i]
             drive(s, w, y, signals, a)
             continue
-        if iteration > 0 and mismatch <= tolerance:
+        if iteration > 0 and mismatch <= limits.tolerance:
             return True, iteration
-        if not np.isfinite(mismatch) or iteration == max_iterations:
+        if not np.isfinite(mismatch) or iteration == limits.max_iterations:
             return False, iteration
         balance(s, w, y, signals, a, r, Rv)
         for pad in range(pads):
@@ -360,7 +353,7 @@ def finish(s: Any, w: Any, y: Array, a: float, powers: Array, moments: Array) ->
             fastest = max(fastest, finish_inertial(s, w, pad, y, a, powers, moments))
             continue
         chain, branches, size = s.pad_chain_at[pad], s.pad_branches[pad], 2 * (last - first)
-        F, total = w.F_linear.reshape(w.F_linear.size), 0.0
+        F, total = w.F_linear.flat, 0.0
         for b in range(branches):
             J, tau, z = p[chain + b], p[chain + branches + b], start + b * size
             low, high = size, 0

@@ -10,19 +10,22 @@ from typing import Any
 
 import numpy as np
 
-from torchsoft.solve.kernel import compiled, inlined
-from torchsoft.solve.kernel.arrays import Array
+from torchsoft.solve.kernel import compiled
+from torchsoft.solve.kernel.arrays import (
+    CONVERGED,
+    GAMMA,
+    INSTANT,
+    LOST,
+    MIX,
+    NEWTON_FAILED,
+    NOT_FINITE,
+    OFF_THE_PAD,
+    TAPE_FULL,
+)
 from torchsoft.solve.kernel.interface import at_point
 from torchsoft.solve.kernel.linear import put
 from torchsoft.solve.kernel.stage import actuate, finish, solve_stage
-
-GAMMA = 1.0 - 1.0 / np.sqrt(2.0)
-MIX = (1.0 - GAMMA) / GAMMA
-
-CONVERGED, NEWTON_FAILED, OFF_THE_PAD, LOST, TAPE_FULL, NOT_FINITE, REFUSED, OFF_THE_RUNG = range(8)
-
-INSTANT = 1e-13
-"""Length a h [s] of the stage that gives the forces at one moment: nothing moves in it."""
+from torchsoft.solve.kernel.table import Array
 
 TINY = 1e-60
 """Components of the state below this are set to zero, so that what decays does not end in denormal
@@ -120,16 +123,16 @@ def record(s: Any, w: Any, integrals: Array, moments: Array, forces: Array, extr
     put(w.load, extras[n + m :])
 
 
-@inlined
+@compiled
 def solve_near(
-    s: Any, w: Any, y: Array, signals: Array, a: float, tolerance: float, max_iterations: int,
-    margin: float, powers: Array, moments: Array,
-) -> tuple[bool, int, float]:  # fmt: skip
+    s: Any, w: Any, limits: Any, y: Array, signals: Array, a: float, powers: Array, moments: Array
+) -> tuple[bool, int, float]:
     """A stage from y with every point that may touch in the window: success, linear solves, a bound
     of all speeds [m/s]."""
-    solves, speed, reach, done, converged = 0, 0.0, margin, False, True
+    solves, speed, margin, done, converged = 0, 0.0, limits.margin, False, True
+    reach = margin
     while converged and not done:
-        converged, count = solve_stage(s, w, y, signals, a, tolerance, max_iterations, reach)
+        converged, count = solve_stage(s, w, limits, y, signals, a, reach)
         solves += count
         if converged:
             speed = finish(s, w, y, a, powers, moments)
@@ -142,14 +145,12 @@ def solve_near(
     return converged, solves, speed
 
 
-@inlined
-def take_step(
-    s: Any, w: Any, d: Any, y: Array, h: float, signals: Array, tolerance: float,
-    max_iterations: int, margin: float, integrals: Array, tape: Any, row: int,
-) -> tuple[int, int]:  # fmt: skip
+@compiled
+def take_step(r: Any, h: float, signals: Array, row: int) -> tuple[int, int]:
     """One step of h [s] from y, which goes to its end with `integrals`; signals (2, signals, 2) are
-    those of the stages. The start stays in d.y, d.integrals; d.K, d.powers and d.speed receive what
-    the stages found. Returns status and solves."""
+    those of the stages, `row` the first one's on the tape. The start stays in d.y, d.integrals;
+    d.K, d.powers and d.speed receive what the stages found. Returns status and solves."""
+    s, w, d, y, integrals, tape = r.s, r.w, r.d, r.y, r.integrals, r.tape
     a, solves = GAMMA * h, 0
     put(y, d.y)
     put(integrals, d.integrals)
@@ -160,7 +161,7 @@ def take_step(
     for stage in range(2):
         powers = d.powers[stage]
         converged, count, speed = solve_near(
-            s, w, y, signals[stage], a, tolerance, max_iterations, margin, powers, d.moments
+            s, w, r.limits, y, signals[stage], a, powers, d.moments
         )
         solves += count
         if not converged:
@@ -185,16 +186,17 @@ def take_step(
 
 
 @compiled
-def take_back(w: Any, d: Any, y: Array, integrals: Array) -> None:
+def take_back(r: Any) -> None:
     """Return to where `take_step` began."""
-    put(d.y, y)
-    put(d.integrals, integrals)
+    w, d = r.w, r.d
+    put(d.y, r.y)
+    put(d.integrals, r.integrals)
     put(d.V, w.V)
     put(d.u_dot, w.u_dot)
     w.travelled[0] = np.inf
 
 
-@inlined
+@compiled
 def dense(part: float) -> tuple[float, float]:
     """Weights b_1, b_2 of the stages' rates at a part of the step (0 to 1): the continuous
     extension of second order."""
@@ -212,15 +214,13 @@ def dense_states(part: float) -> tuple[float, float, float]:
     return 1.0 - b_1 / GAMMA - b_2 * (1.0 - MIX) / GAMMA, (b_1 - b_2 * MIX) / GAMMA, b_2 / GAMMA
 
 
-@inlined
-def write_rows(
-    s: Any, s0: Any, w: Any, d: Any, y: Array, h: float, parts: Array, signals: Array, first: int,
-    last: int, tolerance: float, max_iterations: int, margin: float, integrals: Array, ys: Array,
-    forces: Array, extras: Array,
-) -> tuple[int, int]:  # fmt: skip
-    """The outputs at parts[first:last] of the step just taken. At its end they are what the last
+@compiled
+def write_rows(r: Any, h: float, first: int, last: int) -> tuple[int, int]:
+    """The outputs from `first` to `last` of the step just taken. At its end they are what the last
     stage found; before it, dense output with the forces that belong to it, which take a stage of no
     length (of `s0`). Returns status and linear solves."""
+    s, w, d, y, integrals, out = r.s, r.w, r.d, r.y, r.integrals, r.out
+    parts, ys = out.part, out.y
     solves, here, converged = 0, w.travelled[0], True
     put(w.V, d.guess_V)
     put(w.u_dot, d.guess)
@@ -248,16 +248,7 @@ def write_rows(
             scans = w.travelled[2]
             w.travelled[0] = way if scans == d.travelled[2] else np.inf
             converged, count, _ = solve_near(
-                s0,
-                w,
-                ys[i],
-                signals[i],
-                INSTANT,
-                tolerance,
-                max_iterations,
-                margin,
-                d.scrap,
-                d.moments,
+                r.s0, w, r.limits, ys[i], out.signals[i], INSTANT, d.scrap, d.moments
             )
             solves += count
             if not converged:
@@ -265,5 +256,5 @@ def write_rows(
             put(d.guess_V, w.V)
             put(d.guess, w.u_dot)
             w.travelled[0] = here if w.travelled[2] == scans else np.inf
-        record(s, w, d.at_row, d.moments, forces[i], extras[i])
+        record(s, w, d.at_row, d.moments, out.forces[i], out.extras[i])
     return CONVERGED if converged else NEWTON_FAILED, solves

@@ -8,14 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from torchsoft.codegen.invoke import call_linearise, call_pullback
-from torchsoft.solve.kernel import compiled, entry
-from torchsoft.solve.kernel.arrays import Array
+from torchsoft.solve.kernel import compiled
+from torchsoft.solve.kernel.arrays import GAMMA, MIX
 from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
 from torchsoft.solve.kernel.interface import NEGLIGIBLE, assemble, mobility_scale, restore
+from torchsoft.solve.kernel.invoke import call_linearise, call_pullback
 from torchsoft.solve.kernel.linear import put, row_of, solve_dense
 from torchsoft.solve.kernel.stage import actuate, balance, coordinates_at, eliminate
-from torchsoft.solve.kernel.step import GAMMA, MIX, dense_states
+from torchsoft.solve.kernel.step import dense_states
+from torchsoft.solve.kernel.table import Array
 
 NEGLIGIBLE_PART = 1e-17
 """Part of the largest derivative of nodal forces below which a node's counts as none."""
@@ -80,7 +81,7 @@ def massless_part(
         s.pad_chain_at[pad],
         s.pad_branches[pad],
     )
-    F, material, span, du, dv = w.F.reshape(w.F.size), chain + 2 * branches, z.span, z.u, z.v
+    F, material, span, du, dv = w.F.flat, chain + 2 * branches, z.span, z.u, z.v
     left, right = (
         min(span[pad, 0], 2 * (w.low[pad] - first)),
         max(span[pad, 1], 2 * (w.high[pad] - first)),
@@ -393,7 +394,7 @@ def advance_pad(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array,
     if inertial:
         advance_inertial(s, w, z, pad, a, dy)
         return
-    F = w.F.reshape(w.F.size)
+    F = w.F.flat
     for b in range(branches):
         tau, first_z = p[chain + branches + b], start + b * size
         for i in range(span[pad, 0], span[pad, 1]):
@@ -431,13 +432,12 @@ def advance_inertial(s: Any, w: Any, z: Any, pad: int, a: float, dy: Array) -> N
             dy[s.pad_v_start[pad] + i, k] = rate + base_rate[i % 2, k]
 
 
-@entry
-def forward(
-    s: Any, w: Any, z: Any, h: Array, tape: Any, signals: Array, out_step: Any, out_part: Array,
-    dy: Array, dp: Array, dys: Array,
-) -> None:  # fmt: skip
-    """Carry the tangent dy (size, m) through the steps of a tape, in place; dys (outputs, size, m)
-    receives it at the parts out_part of the steps out_step."""
+@compiled
+def forward(r: Any) -> None:
+    """Carry the tangent dy (size, m) through the steps h of a tape, in place; dys (outputs, size,
+    m) receives it at the parts out_part of the steps out_step."""
+    s, w, z, tape, h, signals = r.s, r.w, r.z, r.tape, r.h, r.signals
+    out_step, out_part, dy, dp, dys = r.out_step, r.out_part, r.dy, r.dp, r.dys
     m, row, before, first = dy.shape[1], 0, z.before, z.first
     for step in range(h.size):
         a = GAMMA * h[step]

@@ -1,0 +1,173 @@
+"""Machine code of the kernels, made ahead: numba types them, LLVM compiles them once, all together.
+
+    python -m torchsoft.solve.kernel.build [ENTRY ...] [--level LEVEL ...] [--out DIR]
+
+numba alone links every kernel into each of its callers and compiles it again there. Here it writes
+unoptimised code only, of which every entry becomes one module that is compiled once. This module
+changes numba for its process, so nothing else imports it.
+"""
+
+import argparse
+import importlib
+import time
+from pathlib import Path
+from typing import Any
+
+import llvmlite.binding as llvm
+import numba
+from llvmlite import ir
+from numba import types
+from numba.core import codegen
+from numba.core.cpu import CPUContext
+from numba.core.datamodel import models, register_default
+from numba.core.imputils import lower_getattr_generic
+from numba.core.typing.templates import AttributeTemplate
+from numba.extending import infer_getattr
+from numba.np.arrayobj import make_array, populate_array
+
+from torchsoft.solve import kernel
+from torchsoft.solve.kernel.objects import ENTRIES, LEVELS, NAME, keep, level, remove_old
+from torchsoft.solve.kernel.table import layout
+
+KNOWN = {"sin", "cos", "sqrt", "hypot", "pow"}
+"""Functions of the mathematics library that kernels may call."""
+
+
+class TableType(types.Type):
+    """A table of one kind, whose value is its address."""
+
+    def __init__(self, kind: Any) -> None:
+        self.kind = kind
+        self.fields = {field.name: field for field in layout(kind)}
+        super().__init__(f"Table({kind.__name__})")
+
+
+@register_default(TableType)
+class TableModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: TableType) -> None:
+        super().__init__(manager, kind, ir.IntType(64))
+
+
+def field_type(field: Any) -> Any:
+    """numba's type of a field."""
+    if field.ndim:
+        return types.Array(numba.from_dtype(field.kind), field.ndim, "C")
+    return {int: types.int64, float: types.float64}.get(field.kind) or TableType(field.kind)
+
+
+@infer_getattr
+class TableFields(AttributeTemplate):
+    key = TableType
+
+    def generic_resolve(self, table: TableType, name: str) -> Any:
+        return field_type(table.fields[name])
+
+
+@lower_getattr_generic(TableType)
+def get_field(context: Any, builder: Any, table: TableType, address: Any, name: str) -> Any:
+    """Load a field. Tables stay as they are while a kernel runs, so loads may be moved."""
+    field, kind = table.fields[name], field_type(table.fields[name])
+    size = ir.IntType(64)
+    invariant = builder.module.add_metadata([])
+
+    def word(number: int, of: Any = size) -> Any:
+        place = builder.add(address, ir.Constant(size, 8 * (field.word + number)))
+        value = builder.load(builder.inttoptr(place, of.as_pointer()))
+        value.set_metadata("invariant.load", invariant)
+        return value
+
+    if not field.ndim:
+        return word(0, ir.DoubleType() if field.kind is float else size)
+    array = make_array(kind)(context, builder)
+    shape = [word(1 + i) for i in range(field.ndim)]
+    strides = [ir.Constant(size, 8)]
+    for length in reversed(shape[1:]):
+        strides.insert(0, builder.mul(strides[0], length))
+    data = builder.inttoptr(word(0), context.get_data_type(kind.dtype).as_pointer())
+    populate_array(array, data, shape, strides, ir.Constant(size, 8), meminfo=None)
+    return array._getvalue()
+
+
+OPTIONS: dict[str, Any] = {
+    "nogil": True, "_nrt": False, "error_model": "numpy", "fastmath": {"contract", "reassoc"},
+    "no_cpython_wrapper": True, "no_cfunc_wrapper": True,
+}  # fmt: skip
+"""How numba compiles a kernel: nothing is allocated, counted or called from Python."""
+
+
+def finalize(self: Any) -> None:
+    """In place of numba's: leave the code as it is."""
+    self._finalized = True
+
+
+def entry_module(name: str) -> llvm.ModuleRef:
+    """The unoptimised code of an entry and of all that it calls; `name` is a
+    void(void*, void*, table's address) in it, every other function is internal."""
+    module, kind = ENTRIES[name]
+    dispatcher = getattr(importlib.import_module(module), name)
+    dispatcher.compile((TableType(kind),))
+    (result,) = dispatcher.overloads.values()
+    linked, todo = {}, [result.library]
+    while todo:
+        if (library := todo.pop()) not in linked:
+            linked[library] = None
+            todo += library._linking_libraries
+    whole = llvm.parse_assembly("")
+    whole.data_layout, whole.name = str(result.library._final_module.data_layout), name
+    for library in linked:
+        whole.link_in(library._final_module, preserve=True)
+    for number, inside in enumerate([*whole.functions, *whole.global_variables]):
+        if inside.name == result.fndesc.llvm_func_name:
+            inside.name = name
+        elif not inside.is_declaration:  # numba's names count what was compiled before
+            inside.name, inside.linkage = f"{name}.{number}", "internal"
+    whole.verify()
+    return whole
+
+
+def compiled_object(module: str, target: str) -> bytes:
+    """The object file of a module for a level of processors."""
+    triple, cpu, features = LEVELS[target]
+    own = llvm.parse_assembly(module)
+    own.triple = triple
+    machine = llvm.Target.from_triple(triple).create_target_machine(
+        cpu=cpu, features=features, opt=3, reloc="pic", codemodel="small"
+    )
+    options = llvm.create_pipeline_tuning_options(speed_level=3)
+    options.loop_vectorization = options.slp_vectorization = True
+    passes = llvm.create_pass_builder(machine, options)
+    passes.getModulePassManager().run(own, passes)
+    outside = {f.name for f in own.functions if f.is_declaration and f.name[:5] != "llvm."}
+    if outside - KNOWN:
+        raise ValueError(f"a kernel needs {sorted(outside - KNOWN)}, which no library has")
+    return machine.emit_object(own)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("entries", nargs="*", default=list(ENTRIES))
+    parser.add_argument("--level", action="append", choices=LEVELS)
+    parser.add_argument("--out", type=Path)
+    asked = parser.parse_args()
+    llvm.initialize_all_targets()
+    llvm.initialize_all_asmprinters()
+    codegen.CPUCodeLibrary.finalize = finalize
+    CPUContext.get_executable = lambda *_: [].append  # a new object, which nobody calls
+    kernel.compiled = numba.njit(**OPTIONS)
+    kernel.inlined = numba.njit(inline="always", **OPTIONS)
+    if asked.out is None:
+        remove_old()
+    for name in asked.entries:
+        start, module = time.perf_counter(), str(entry_module(name))
+        for target in asked.level or [level()]:
+            content = compiled_object(module, target)
+            if asked.out is None:
+                keep(name, target, content)
+            else:
+                (asked.out / NAME).mkdir(exist_ok=True)
+                (asked.out / NAME / f"{name}-{target}.o").write_bytes(content)
+        print(f"{name}: {time.perf_counter() - start:.1f} s")
+
+
+if __name__ == "__main__":
+    main()
