@@ -48,10 +48,8 @@ def error_parts(rig: Rig, y0: Array, atol: float) -> Errors:
                 rate.append(kind in ("rates", "velocity"))
                 unit.append(UNITS[what])
                 size.append(np.linalg.norm(y0[begin:end] - origin[begin:end]))
-    return Errors(
-        *(np.array(numbers, np.int64) for numbers in (first, last, rate)),
-        atol * np.array(unit), np.array(size), origin,
-    )  # fmt: skip
+    whole = [np.array(numbers, np.int64) for numbers in (first, last, rate)]
+    return Errors(whole[0], whole[1], whole[2], atol * np.array(unit), np.array(size), origin)
 
 
 def part_name(rig: Rig, errors: Errors, number: int) -> str:

@@ -7,7 +7,7 @@ position in the vector p of all law parameters, "start" one in another array. No
 nodes of all pads, points the contact points of all contacts.
 """
 
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -374,15 +374,15 @@ class Outputs(NamedTuple):
 class Run(NamedTuple):
     """Arguments of `run`, whose docstring says what they are."""
 
-    s: System
-    s0: System
-    w: Work
-    d: Step
+    s: Annotated[Any, System]
+    s0: Annotated[Any, System]
+    w: Annotated[Any, Work]
+    d: Annotated[Any, Step]
     f: Signals
     e: Errors
     limits: Limits
     out: Outputs
-    tape: Tape
+    tape: Annotated[Any, Tape]
     given: int
     y: Array
     k: Array
@@ -405,8 +405,8 @@ class Run(NamedTuple):
 class Rates(NamedTuple):
     """Arguments of `rates`."""
 
-    s: System
-    w: Work
+    s: Annotated[Any, System]
+    w: Annotated[Any, Work]
     f: Signals
     limits: Limits
     t: float
@@ -422,10 +422,10 @@ class Rates(NamedTuple):
 class Backward(NamedTuple):
     """Arguments of `backward`."""
 
-    s: System
-    w: Work
-    z: Cotangents
-    tape: Tape
+    s: Annotated[Any, System]
+    w: Annotated[Any, Work]
+    z: Annotated[Any, Cotangents]
+    tape: Annotated[Any, Tape]
     h: Array
     signals: Cube
     out_step: Index
@@ -441,10 +441,10 @@ class Backward(NamedTuple):
 class Forward(NamedTuple):
     """Arguments of `forward`."""
 
-    s: System
-    w: Work
-    z: Tangents
-    tape: Tape
+    s: Annotated[Any, System]
+    w: Annotated[Any, Work]
+    z: Annotated[Any, Tangents]
+    tape: Annotated[Any, Tape]
     h: Array
     signals: Cube
     out_step: Index

@@ -19,7 +19,8 @@ from llvmlite import ir
 from numba import types
 from numba.core import codegen
 from numba.core.cpu import CPUContext
-from numba.core.datamodel import models, register_default
+from numba.core.datamodel import models
+from numba.core.datamodel.registry import register_default
 from numba.core.imputils import lower_getattr_generic
 from numba.core.typing.templates import AttributeTemplate
 from numba.extending import infer_getattr
@@ -151,8 +152,10 @@ def main() -> None:
     asked = parser.parse_args()
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
-    codegen.CPUCodeLibrary.finalize = finalize
-    CPUContext.get_executable = lambda *_: [].append  # a new object, which nobody calls
+    library: Any = codegen.CPUCodeLibrary
+    context: Any = CPUContext
+    library.finalize = finalize
+    context.get_executable = lambda *_: [].append  # a new object each time, which nobody calls
     kernel.compiled = numba.njit(**OPTIONS)
     kernel.inlined = numba.njit(inline="always", **OPTIONS)
     if asked.out is None:

@@ -8,7 +8,16 @@ annotations of the tuple are the only declaration; the builder reads the same on
 import struct
 from array import array
 from functools import cache, cached_property
-from typing import Annotated, Any, NamedTuple, TypeVar, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    NamedTuple,
+    TypeAlias,
+    TypeVar,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +26,12 @@ Kind = TypeVar("Kind", bound=type)
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
-Matrix, Cube, Hypercube = Annotated[Array, 2], Annotated[Array, 3], Annotated[Array, 4]
-IndexMatrix = Annotated[Index, 2]
-"""Types of the fields: C-contiguous arrays of so many dimensions."""
+Matrix: TypeAlias = Annotated[Array, 2]
+Cube: TypeAlias = Annotated[Array, 3]
+Hypercube: TypeAlias = Annotated[Array, 4]
+IndexMatrix: TypeAlias = Annotated[Index, 2]
+"""Types of the fields: C-contiguous arrays of so many dimensions. Another table whose class is made
+at the start is `Annotated[Any, Table]`."""
 
 
 class Field(NamedTuple):
@@ -47,7 +59,9 @@ def layout(kind: Any) -> tuple[Field, ...]:
     fields, word = [], 0
     for name, hint in get_type_hints(kind, include_extras=True).items():
         ndim = 0
-        if get_origin(hint) is Annotated:
+        if get_origin(hint) is Annotated and get_args(hint)[0] is Any:
+            hint = get_args(hint)[1]
+        elif get_origin(hint) is Annotated:
             hint, ndim = get_args(hint)
         elif get_origin(hint) is not None:
             ndim = 1
