@@ -145,9 +145,12 @@ class SoftGrasp(Rig):
         left out."""
         own, said = self._values(), super().description()
         absent = {name for name in (*NAMES, "contact.friction") if name not in own}
-        values = {
-            name: row["value"] for name, row in self.settings.table().items() if name not in absent
+        given = {
+            f"{group}.{field}": value
+            for group in Parameters.model_fields
+            for field, value in getattr(self._settings, group)
         }
+        values = {name: own.get(name, x) for name, x in given.items() if name not in absent}
         others = {
             name: x for name, x in said["parameters"].items() if name not in self.aliases.values()
         }

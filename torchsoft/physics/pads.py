@@ -5,6 +5,7 @@ parts z_b (nodes, 2) [N] of its nodal forces that have set in, branch by branch 
 chain; an inertial pad's its displacements and velocities.
 """
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,24 @@ from torch import Tensor, nn
 from torchsoft.physics.arguments import whole
 from torchsoft.physics.material import Material
 from torchsoft.physics.mesh import Array, Mesh, lame_moduli, unit_compliance
+
+
+@lru_cache(maxsize=16)
+def turned_compliance(mesh: Mesh, nu: float, axes: tuple[float, ...]) -> tuple[Tensor, Tensor]:
+    """C of a mesh for E depth = 1 and its derivative by nu, turned from the pad's own axes into the
+    base's."""
+    R = np.array(axes).reshape(2, 2)
+
+    def turned(blocks: Array) -> Tensor:
+        n = len(blocks) // 2
+        if R[0, 1] == R[1, 0] == 0.0:  # turned by nothing but a mirror
+            signs = np.tile(np.diag(R), n)
+            return torch.from_numpy(blocks * np.outer(signs, signs))
+        out = np.einsum("ij,ajbk,lk->aibl", R, blocks.reshape(n, 2, n, 2), R)
+        return torch.from_numpy(out.reshape(blocks.shape))
+
+    C, dC = unit_compliance(mesh, nu)
+    return turned(C), turned(dC)
 
 
 class Pad(nn.Module):
@@ -104,18 +123,11 @@ class Pad(nn.Module):
         """Undeformed places of the contact points in the base's frame (points, 2) [m]."""
         return self.spread @ self.positions
 
-    def rotated(self, blocks: Array) -> Array:
-        """A matrix of (rows, 2, columns, 2) blocks from the pad's own axes into the base's."""
-        R, n, m = self.axes.numpy(), len(blocks) // 2, blocks.shape[1] // 2
-        if R[0, 1] == R[1, 0] == 0.0:  # turned by nothing but a mirror
-            return blocks * np.outer(np.tile(np.diag(R), n), np.tile(np.diag(R), m))
-        return np.einsum("ij,ajbk,lk->aibl", R, blocks.reshape(n, 2, m, 2), R).reshape(blocks.shape)
-
     def unit_compliance(self) -> tuple[Tensor, Tensor]:
         """C for E depth = 1 and its derivative by nu, at the material's own nu, in the base's
-        frame."""
-        C, dC = unit_compliance(self.mesh, self.material.nu.item())
-        return torch.from_numpy(self.rotated(C)), torch.from_numpy(self.rotated(dC))
+        frame. Shared between calls; not to be written to."""
+        axes = tuple(self.axes.flatten().tolist())
+        return turned_compliance(self.mesh, self.material.nu.item(), axes)
 
     def compliance(self) -> Tensor:
         """Static displacement of the surface nodes per force on them [m/N], (2 surface, 2 surface):
@@ -126,7 +138,7 @@ class Pad(nn.Module):
         """
         C, dC = self.unit_compliance()
         material = self.material
-        if material.nu.requires_grad:
+        if material.nu.requires_grad and torch.is_grad_enabled():
             C = C + dC * (material.nu - material.nu.detach())
         return C / (material.E * material.depth)
 

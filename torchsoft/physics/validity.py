@@ -6,6 +6,7 @@ take no more than the effort. Every refusal is one sentence that names what is w
 import math
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch._C._functorch import is_functorch_wrapped_tensor  # private, and the only way to tell
@@ -92,15 +93,12 @@ def check_values(rig: Any) -> None:
                     f"parameter `{path}{name}` was made under torch.inference_mode(); make it "
                     "outside"
                 )
-            for must, fine in (
-                ("finite", value.isfinite()),
-                (f"below {LARGEST:g}", value.abs() < LARGEST),
-            ):
-                if not bool(fine.all()):
-                    raise ValueError(
-                        f"parameter `{path}{name}` must be {must}, but is "
-                        f"{value[~fine][0].item():g}"
-                    )
+            numbers = value.detach().numpy()
+            if not (np.abs(numbers) < LARGEST).all():
+                finite = np.isfinite(numbers)
+                must = f"below {LARGEST:g}" if finite.all() else "finite"
+                bad = numbers[~(finite if must == "finite" else np.abs(numbers) < LARGEST)][0]
+                raise ValueError(f"parameter `{path}{name}` must be {must}, but is {bad:g}")
         for name, value in module.named_buffers(recurse=False):
             if value.is_floating_point():
                 check_array(f"{path}{name}", value)
@@ -110,17 +108,16 @@ def check_values(rig: Any) -> None:
             declared, value = quantity_of(module, name), getattr(module, name, None)
             if declared is None or not isinstance(value, Tensor | float):
                 continue
-            numbers = torch.as_tensor(value, dtype=torch.float64).detach()
+            numbers = value.detach().numpy() if isinstance(value, Tensor) else np.array(value)
             if numbers.ndim and not isinstance(module, Shape):
                 raise ValueError(
                     f"parameter `{path}{name}` must be one number, but has shape "
                     f"{tuple(numbers.shape)}"
                 )
             wrong = numbers[~((declared.low <= numbers) & (numbers <= declared.high))]
-            if wrong.numel():
+            if wrong.size:
                 raise ValueError(
-                    f"parameter `{path}{name}` must be {declared.range}, but is "
-                    f"{wrong.flatten()[0].item():g}"
+                    f"parameter `{path}{name}` must be {declared.range}, but is {wrong[0]:g}"
                 )
     for owner, module in rig.named_modules():
         well_posed = getattr(module, "well_posed", None)

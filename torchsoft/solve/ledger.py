@@ -40,6 +40,12 @@ def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
                 f"`{name}` is to dissipate energy, but gave {back:.3g} J back between two outputs; "
                 "check its law"
             )
+    if run.stats.failed_steps and "knots" in run.made_by["steps"]:
+        found["knots"] = (
+            f"Newton did not converge in {run.stats.failed_steps} of the steps between the given "
+            "`knots`, which were halved: the run is not one of the same steps; its own `knots` are "
+            "those that it took"
+        )
     for name, u in run.displacement.items():
         deepest, height = float(u.detach().norm(dim=-1).max()), rig.pads[name].mesh.height
         if not deepest <= COMPRESSED * height:

@@ -224,9 +224,8 @@ class Compiled:
                 continue
             with torch.no_grad():
                 unit, by_nu = pad.unit_compliance()
-                scale = 1 / (pad.material.E * pad.material.depth)
-                C[C_start[i] : C_start[i + 1]] = (unit * scale).numpy().ravel()
-                dC[C_start[i] : C_start[i + 1]] = (by_nu * scale).numpy().ravel()
+                C[C_start[i] : C_start[i + 1]] = unit.numpy().ravel()
+                dC[C_start[i] : C_start[i + 1]] = by_nu.numpy().ravel()
             reach.append(1.5 * np.abs(C[C_start[i] : C_start[i + 1]]).max())
         pads = Pads(
             _ints(rows["base"]), _ints(node_start), _ints(point_start), _ints(rows["y_start"]),

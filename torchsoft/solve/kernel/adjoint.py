@@ -13,7 +13,7 @@ import numpy as np
 from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.arrays import GAMMA, MIX
 from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
-from torchsoft.solve.kernel.interface import NEGLIGIBLE, assemble, restore
+from torchsoft.solve.kernel.interface import NEGLIGIBLE, assemble, restore, softness
 from torchsoft.solve.kernel.invoke import call_linearise, call_pullback
 from torchsoft.solve.kernel.linear import put, row_of, solve_dense
 from torchsoft.solve.kernel.stage import actuate, balance
@@ -125,6 +125,7 @@ def pad_state(
     )
     size, chain, branches = 2 * (last - first), s.pad_chain_at[pad], s.pad_branches[pad]
     start_C, material, F = s.pad_C_start[pad], chain + 2 * branches, w.F.flat
+    soft = softness(s, pad)
     by_rate, by_u, zeta, z_dot = (
         scratch.surface[0],
         scratch.surface[1],
@@ -134,7 +135,7 @@ def pad_state(
     scratch.surface[:, :size] = 0.0
     for node in range(w.low[pad], w.high[pad]):
         for r in range(2):
-            c, d = rate_bar[node, r], u_bar[node, r]
+            c, d = soft * rate_bar[node, r], soft * u_bar[node, r]
             if c != 0.0 or d != 0.0:
                 row = row_of(s.pad_C, start_C, 2 * (node - first) + r, size)
                 for m in range(size):
@@ -161,7 +162,7 @@ def pad_state(
     p_bar[material] += scale_bar / p[material]
     for node in range(w.low[pad], w.high[pad]):
         for r in range(2):
-            c, d = rate_bar[node, r], u_bar[node, r]
+            c, d = soft * rate_bar[node, r], soft * u_bar[node, r]
             if c != 0.0 or d != 0.0:
                 row, by_nu = row_of(s.pad_dC, start_C, 2 * (node - first) + r, size), 0.0
                 for m in range(left, right):

@@ -72,11 +72,11 @@ class Actuators(NamedTuple):
 class Pads(NamedTuple):
     """Per pad: base (its first coordinate), node_start, point_start, y_start of its displacements'
     states, v_start of its velocities (-1: massless), chain_at of its branches' fractions and then
-    times in p, branches, C_start in C, reach: the largest displacement per force; column, columns:
+    times in p, branches, C_start in C, reach: the largest entry of C; column, columns:
     free coordinates that its contacts involve, and their number.
 
     C holds the surface mobilities (2 nodes, 2 nodes) one after the other: massless pads'
-    compliance, inertial pads' mobility.
+    compliance for E depth = 1, inertial pads' mobility.
     """
 
     base: Index

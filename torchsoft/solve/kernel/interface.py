@@ -85,14 +85,20 @@ def apply_law(s: Any, w: Any, k: int, stretch: float, a: float) -> None:
 
 @compiled
 def mobility_scale(s: Any, pad: int, a: float) -> float:
-    """What the stored mobility is multiplied with: sum of J / (tau + a h) over the chain; 1 for
-    inertial pads."""
+    """What the stored mobility is multiplied with: sum of J / (tau + a h) over the chain, by 1 / (E
+    depth); 1 for inertial pads."""
     if s.pad_v_start[pad] >= 0:
         return 1.0
     at, n, p, total = s.pad_chain_at[pad], s.pad_branches[pad], s.p, 0.0
     for b in range(n):
         total += p[at + b] / (p[at + n + b] + a)
-    return total
+    return total * softness(s, pad)
+
+
+@compiled
+def softness(s: Any, pad: int) -> float:
+    """1 / (E depth) of a massless pad [m/N]; its stored compliance is that for E depth = 1."""
+    return s.p[s.pad_chain_at[pad] + 2 * s.pad_branches[pad]]
 
 
 @compiled
@@ -138,14 +144,14 @@ def displacements(s: Any, w: Any, pad: int, y: Array, low: int, high: int) -> No
         left += 1
     while right > left and abs(zeta[right - 1]) < NEGLIGIBLE:
         right -= 1
-    zeta, rate = zeta[left:right], rate[left:right]
+    zeta, rate, soft = zeta[left:right], rate[left:right], softness(s, pad)
     for i in range(2 * low, 2 * high):
         u = free = 0.0
         row = row_of(s.pad_C, s.pad_C_start[pad], i - 2 * first, size)[left:right]
         for j in range(row.size):
             u += row[j] * zeta[j]
             free -= row[j] * rate[j]
-        w.u[i // 2, i % 2], w.free[i // 2, i % 2] = u, free
+        w.u[i // 2, i % 2], w.free[i // 2, i % 2] = soft * u, soft * free
 
 
 @compiled

@@ -19,6 +19,7 @@ from torchsoft.solve.kernel.interface import (
     mobility_scale,
     scan,
     set_in,
+    softness,
 )
 from torchsoft.solve.kernel.invoke import call_linearise, call_value
 from torchsoft.solve.kernel.linear import put, row_of, solve_dense
@@ -27,6 +28,10 @@ from torchsoft.solve.kernel.table import Array
 SEARCH_AFTER, SHORTEST = 2, 1.0 / 64.0
 """After so many iterations a Newton step that does not lessen the mismatch is halved, down to this
 part of it."""
+
+ROUNDED = 10.0
+"""Where no shorter step lessens the mismatch, rounding has stopped Newton: so many tolerances are
+then enough."""
 
 
 @compiled
@@ -237,7 +242,8 @@ def solve_stage(
         for pad in range(pads):
             worst, total = evaluate(s, w, pad, y, a)
             mismatch, squares = worst if not worst <= mismatch else mismatch, squares + total
-        if iteration > SEARCH_AFTER and not squares < previous and part > SHORTEST:
+        stuck = iteration > SEARCH_AFTER and not squares < previous
+        if stuck and part > SHORTEST:
             part *= 0.5
             for pad in range(pads):
                 move(w, pad, part)
@@ -248,8 +254,9 @@ def solve_stage(
             continue
         if iteration > 0 and mismatch <= limits.tolerance:
             return True, iteration
-        if not np.isfinite(mismatch) or iteration == limits.max_iterations:
-            return False, iteration
+        rounded = mismatch <= ROUNDED * limits.tolerance
+        if not np.isfinite(mismatch) or iteration == limits.max_iterations or (stuck and rounded):
+            return rounded, iteration
         balance(s, w, y, signals, a, r, Rv)
         for pad in range(pads):
             n = 0
@@ -370,8 +377,8 @@ def finish(s: Any, w: Any, y: Array, a: float, powers: Array, moments: Array) ->
                 for other in range(row.size):
                     u += row[other] * changes[other]
                 power += changes[m] * u
-            powers[pad] += J * tau * power
-        fastest = max(fastest, total * s.pad_reach[pad])
+            powers[pad] += J * tau * power * softness(s, pad)
+        fastest = max(fastest, total * s.pad_reach[pad] * softness(s, pad))
     for i in range(s.body_coordinate.size):
         c = s.body_coordinate[i]
         k[s.body_q_start + i] = w.V[c]

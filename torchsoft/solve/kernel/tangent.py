@@ -11,7 +11,13 @@ import numpy as np
 from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.arrays import GAMMA, MIX
 from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
-from torchsoft.solve.kernel.interface import NEGLIGIBLE, assemble, mobility_scale, restore
+from torchsoft.solve.kernel.interface import (
+    NEGLIGIBLE,
+    assemble,
+    mobility_scale,
+    restore,
+    softness,
+)
 from torchsoft.solve.kernel.invoke import call_linearise, call_pullback
 from torchsoft.solve.kernel.linear import put, row_of, solve_dense
 from torchsoft.solve.kernel.stage import actuate, balance, coordinates_at, eliminate
@@ -100,7 +106,7 @@ def massless_part(
                 change = (dy[at + i, k] + z_dot * dp[chain + branches + b, k]) / (tau + a)
                 dzeta[i, k] += J * dy[at + i, k] + dp[chain + b, k] * y[at + i]
                 drate[i, k] += dp[chain + b, k] * z_dot - J * change
-    stiffer = False
+    stiffer, soft = False, softness(s, pad)
     for k in range(m):
         softer = dp[material, k] / p[material]  # C is proportional to the material's first entry
         stiffer |= dp[material + 1, k] != 0.0
@@ -114,15 +120,15 @@ def massless_part(
             row, u, v = row_of(s.pad_C, s.pad_C_start[pad], dof, size), du[node, r], dv[node, r]
             u[:], v[:] = 0.0, 0.0
             for j in range(left, right):
-                c = row[j]
+                c = soft * row[j]
                 for k in range(m):
                     u[k] += c * dzeta[j, k]
                     v[k] += c * drate[j, k]
             if stiffer:
                 row, by_u, by_rate = row_of(s.pad_dC, s.pad_C_start[pad], dof, size), 0.0, 0.0
                 for j in range(left, right):
-                    by_u += row[j] * zeta[j]
-                    by_rate += row[j] * rate[j]
+                    by_u += soft * row[j] * zeta[j]
+                    by_rate += soft * row[j] * rate[j]
                 for k in range(m):
                     u[k] += by_u * dp[material + 1, k]
                     v[k] += by_rate * dp[material + 1, k]
