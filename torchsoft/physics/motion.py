@@ -2,7 +2,6 @@
 20-29)."""
 
 from collections.abc import Sequence
-from itertools import pairwise
 from math import ceil, comb, perm
 from typing import Any, ClassVar, NamedTuple
 
@@ -109,16 +108,13 @@ def evaluate(pieces: Pieces, t: Tensor, order: int = 1) -> list[Tensor]:
     u = (t - at[i]) / span[i]
     inside = ((u >= 0) & (u <= 1)).to(t.dtype)
     u = u.clamp(0.0, 1.0)
-    points = list(control[i].unbind(-1))
-    degree, out = len(points) - 1, [torch.zeros_like(u)] * (order + 1)
+    points, before, after = control[i], (1 - u)[..., None], u[..., None]
+    degree, out = points.shape[-1] - 1, [torch.zeros_like(u)] * (order + 1)
     for left in range(degree, -1, -1):
         if left <= order:
-            differences = points
-            for _ in range(left):
-                differences = [b - a for a, b in pairwise(differences)]
             scale = perm(degree, left) / span[i] ** left * inside if left else 1.0
-            out[left] = differences[0] * scale
-        points = [(1 - u) * a + u * b for a, b in pairwise(points)]
+            out[left] = points.diff(left)[..., 0] * scale
+        points = before * points[..., :-1] + after * points[..., 1:]
     return out
 
 

@@ -39,7 +39,7 @@ class Rates:
                 "the rates of inertial pads are not compiled for single states; use `rig.forward`"
             )
         self._system, self._limits = compiled.system(1.0), Limits(tolerance, 40, margin)
-        self._work = room("Work", self._system, compiled.size, columns=1)
+        self._work = room("Work", self._system, compiled.layout.size, columns=1)
         followed = rig.reference if reference is None else reference
         self._followed = Followed(lambda t: compiled.signals(t, followed), rig, followed)
         self._signals = np.zeros((1, compiled.signal_count, 2))

@@ -115,7 +115,7 @@ class ImplicitStepper:
         self.compiled = Compiled(rig)
         if landing and step is None and self.compiled.inertial:
             raise ValueError("inertial pads need equal steps here: give `step_size` [s]")
-        self.layout, self.integrals = rig.layout, Integrals(rig)
+        self.layout, self.integrals = self.compiled.layout, Integrals(rig)
         self._cap = 64
         self._still: Any = None
 

@@ -66,7 +66,7 @@ class Compiled:
             self._read(rig)
 
     def _read(self, rig: Rig) -> None:
-        self.rig, self.size = rig, rig.layout.size
+        self.rig, self.layout = rig, rig.layout
         self._entries: list[Tensor] = []
         self._known: dict[tuple[int, int], LawSet] = {}
         self._count = 0
@@ -119,7 +119,7 @@ class Compiled:
                     coordinate.append(3 * b + i)
                     masses.append(mass_at[b][i])
                     weight.append(float(axis == "y" and body.weighted))
-        slices = self.rig.layout.slices
+        slices = self.layout.slices
         starts = [
             min((s.start for (part, _), s in slices.items() if part == kind), default=0)
             for kind in ("pose", "velocity")
@@ -170,7 +170,7 @@ class Compiled:
         return torch.cat((followed, held.expand(*t.shape, -1, -1)), -2)
 
     def _make_pads(self) -> tuple[Pads, Inertia]:
-        rig, slices = self.rig, self.rig.layout.slices
+        rig, slices = self.rig, self.layout.slices
         rows: dict[str, list[Any]] = {name: [] for name in Pads._fields}
         node_start, C_start, dofs, material_at = [0], [0], [0], []
         contact_pads = [list(rig.pads).index(contact.pad) for contact in rig.contacts.values()]
@@ -356,7 +356,7 @@ class Compiled:
             np.array(limits).reshape(-1, 4),
         )
         start = min(
-            (s.start for (part, _), s in rig.layout.slices.items() if part == "stretch"), default=0
+            (s.start for (part, _), s in self.layout.slices.items() if part == "stretch"), default=0
         )
         points = Points(
             np.repeat(np.arange(len(rows)), np.diff(point_start)),

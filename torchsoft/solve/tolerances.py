@@ -25,7 +25,8 @@ def error_parts(rig: Rig, y0: Array, atol: float) -> Errors:
     stretches, a body's position, its angle. A rate's error counts by what it displaces within a
     step. A position's size is how far it has come from y0."""
     first, last, rate, unit, size, origin = [], [], [], [], [], np.zeros(len(y0))
-    for (kind, name), here in rig.layout.slices.items():
+    layout = rig.layout
+    for (kind, name), here in layout.slices.items():
         if kind in ("pads", "stretch", "rates"):
             parts = [
                 (
@@ -35,7 +36,7 @@ def error_parts(rig: Rig, y0: Array, atol: float) -> Errors:
                 )
             ]
         else:
-            axes = rig.layout.free[name]
+            axes = layout.free[name]
             turning = "theta" in [COORDINATES[i] for i in axes]
             split = here.stop - turning
             parts = [(here.start, split, "length"), (split, here.stop, "angle")]
