@@ -13,9 +13,9 @@ import numpy as np
 from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.arrays import GAMMA, MIX
 from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
-from torchsoft.solve.kernel.interface import NEGLIGIBLE, assemble, restore, softness
+from torchsoft.solve.kernel.interface import NEGLIGIBLE, assemble, branch_rate, restore, softness
 from torchsoft.solve.kernel.invoke import call_linearise, call_pullback
-from torchsoft.solve.kernel.linear import put, row_of, solve_dense
+from torchsoft.solve.kernel.linear import add, dot, put, row_of, solve_dense
 from torchsoft.solve.kernel.stage import actuate, balance
 from torchsoft.solve.kernel.step import TINY, dense_states
 from torchsoft.solve.kernel.table import Array
@@ -90,15 +90,10 @@ def nodal_cotangent(
     )
     for i in range(n):
         for r in range(2):
-            dof, total = 2 * (w.touched[first + i] - first) + r, 0.0
-            for m in range(2 * n):
-                total += w.P[2 * i + r, m] * b[m]
+            dof, total = 2 * (w.touched[first + i] - first) + r, dot(b, w.P[2 * i + r])
             for branch in range(branches):
-                total += (
-                    a
-                    * y_bar[s.pad_y_start[pad] + branch * size + dof]
-                    / (s.p[chain + branches + branch] + a)
-                )
+                z_bar = y_bar[s.pad_y_start[pad] + branch * size + dof]
+                total += a * z_bar / (s.p[chain + branches + branch] + a)
             X[2 * i + r, 0] = total
 
 
@@ -124,7 +119,7 @@ def pad_state(
         s.pad_y_start[pad],
     )
     size, chain, branches = 2 * (last - first), s.pad_chain_at[pad], s.pad_branches[pad]
-    start_C, material, F = s.pad_C_start[pad], chain + 2 * branches, w.F.flat
+    start_C, material = s.pad_C_start[pad], chain + 2 * branches
     soft = softness(s, pad)
     by_rate, by_u, zeta, z_dot = (
         scratch.surface[0],
@@ -138,18 +133,16 @@ def pad_state(
             c, d = soft * rate_bar[node, r], soft * u_bar[node, r]
             if c != 0.0 or d != 0.0:
                 row = row_of(s.pad_C, start_C, 2 * (node - first) + r, size)
-                for m in range(size):
-                    by_rate[m] += row[m] * c
-                    by_u[m] += row[m] * d
+                add(c, row, by_rate[:size])
+                add(d, row, by_u[:size])
     scale_bar, left, right = 0.0, size, 0
     for b in range(branches):
         J, rest, z = p[chain + b], p[chain + branches + b] + a, start + b * size
         J_bar = tau_bar = 0.0
         for m in range(size):
-            loaded = 2 * w.low[pad] <= 2 * first + m < 2 * w.high[pad]
             total = (a * y_bar[z + m] + J * by_rate[m]) / rest
-            if loaded or abs(y[z + m]) > NEGLIGIBLE:
-                rate = ((F[2 * first + m] if loaded else 0.0) - y[z + m]) / rest
+            rate = branch_rate(s, w, pad, b, m, w.F, y, a)
+            if abs(rate) * rest > NEGLIGIBLE or abs(y[z + m]) > NEGLIGIBLE:
                 left, right = min(left, m), m + 1 if m + 1 > right else right
                 zeta[m] += J * y[z + m]
                 z_dot[m] += J * rate
@@ -164,10 +157,8 @@ def pad_state(
         for r in range(2):
             c, d = soft * rate_bar[node, r], soft * u_bar[node, r]
             if c != 0.0 or d != 0.0:
-                row, by_nu = row_of(s.pad_dC, start_C, 2 * (node - first) + r, size), 0.0
-                for m in range(left, right):
-                    by_nu += row[m] * (c * z_dot[m] + d * zeta[m])
-                p_bar[material + 1] += by_nu
+                row = row_of(s.pad_dC, start_C, 2 * (node - first) + r, size)[left:right]
+                p_bar[material + 1] += c * dot(row, z_dot[left:]) + d * dot(row, zeta[left:])
 
 
 @compiled

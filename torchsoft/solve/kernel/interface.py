@@ -22,7 +22,7 @@ import numpy as np
 from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.inertia import couple_base, couple_point, free_rates
 from torchsoft.solve.kernel.invoke import call_linearise, call_value
-from torchsoft.solve.kernel.linear import put, row_of
+from torchsoft.solve.kernel.linear import add, dot, put, row_of
 from torchsoft.solve.kernel.table import Array
 
 NEGLIGIBLE = 1e-14
@@ -124,6 +124,17 @@ def set_in(s: Any, w: Any, pad: int, y: Array, a: float) -> None:
 
 
 @compiled
+def branch_rate(s: Any, w: Any, pad: int, b: int, i: int, F: Array, y: Array, a: float) -> float:
+    """Rate of the force that has set in at surface dof i of a massless pad, in branch b of its
+    chain, under the nodal forces F (nodes, 2)."""
+    first = s.pad_node_start[pad]
+    size, node = 2 * (s.pad_node_start[pad + 1] - first), first + i // 2
+    force = F[node, i % 2] if w.low[pad] <= node < w.high[pad] else 0.0
+    tau = s.p[s.pad_chain_at[pad] + s.pad_branches[pad] + b]
+    return (force - y[s.pad_y_start[pad] + b * size + i]) / (tau + a)
+
+
+@compiled
 def displacements(s: Any, w: Any, pad: int, y: Array, low: int, high: int) -> None:
     """u* and the rates without contact of the surface nodes from `low` to `high`, from what
     `set_in` left."""
@@ -146,12 +157,8 @@ def displacements(s: Any, w: Any, pad: int, y: Array, low: int, high: int) -> No
         right -= 1
     zeta, rate, soft = zeta[left:right], rate[left:right], softness(s, pad)
     for i in range(2 * low, 2 * high):
-        u = free = 0.0
         row = row_of(s.pad_C, s.pad_C_start[pad], i - 2 * first, size)[left:right]
-        for j in range(row.size):
-            u += row[j] * zeta[j]
-            free -= row[j] * rate[j]
-        w.u[i // 2, i % 2], w.free[i // 2, i % 2] = soft * u, soft * free
+        w.u[i // 2, i % 2], w.free[i // 2, i % 2] = soft * dot(row, zeta), -soft * dot(row, rate)
 
 
 @compiled
@@ -300,16 +307,14 @@ def assemble(s: Any, w: Any, pad: int, a: float, Rv: Array) -> int:
             if N != 0.0:
                 row = 2 * w.slot[s.point_node[k, j]]
                 for r in range(2):
-                    for m in range(2 * n):
-                        PB[r, m] += N * P[row + r, m]
+                    add(N, P[row + r], PB[r, : 2 * n])
         for row in range(6):
             if number[row] < 0:
                 continue
             for m in range(8):
                 K[row, m] = G[row, 0] * H[0, m] + G[row, 1] * H[1, m] + a * L[row, m]
-            line = Rf[column[number[row]]]
-            for m in range(2 * n):
-                line[m] += K[row, 0] * PB[0, m] + K[row, 1] * PB[1, m]
+            for r in range(2):
+                add(K[row, r], PB[r], Rf[column[number[row]], : 2 * n])
             for other in range(6):
                 if number[other] >= 0:
                     Rv[number[row], number[other]] += K[row, 2 + other]
@@ -319,8 +324,8 @@ def assemble(s: Any, w: Any, pad: int, a: float, Rv: Array) -> int:
                 continue
             row = 2 * w.slot[s.point_node[k, j]]
             for r in range(2):
-                for m in range(2 * n):
-                    A[row + r, m] -= N * (H[r, 0] * PB[0, m] + H[r, 1] * PB[1, m])
+                for q in range(2):
+                    add(-N * H[r, q], PB[q], A[row + r, : 2 * n])
                 for other in range(6):
                     if number[other] >= 0:
                         Hc[row + r, column[number[other]]] += N * H[r, 2 + other]

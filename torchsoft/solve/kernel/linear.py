@@ -17,6 +17,22 @@ def put(values: Array, out: Array) -> None:
 
 
 @compiled
+def add(factor: float, x: Array, out: Array) -> None:
+    """Add a multiple of a vector to another one, of out's length."""
+    for i in range(out.size):
+        out[i] += factor * x[i]
+
+
+@compiled
+def dot(x: Array, y: Array) -> float:
+    """Product of two vectors, of x's length."""
+    total = 0.0
+    for i in range(x.size):
+        total += x[i] * y[i]
+    return total
+
+
+@compiled
 def solve_dense(A: Array, b: Array, n: int, m: int) -> None:
     """Gaussian elimination with row pivoting on the leading n x n block; b (n, m) becomes the
     solution."""
@@ -35,16 +51,12 @@ def solve_dense(A: Array, b: Array, n: int, m: int) -> None:
             factor = A[i, k] * inverse
             if factor != 0.0:
                 row, other = A[i, k + 1 : n], b[i, :m]
-                for j in range(own.size):
-                    row[j] -= factor * own[j]
-                for j in range(m):
-                    other[j] -= factor * right[j]
+                add(-factor, own, row)
+                add(-factor, right, other)
     for k in range(n - 1, -1, -1):
         inverse, right = 1.0 / A[k, k], b[k, :m]
         for i in range(k + 1, n):
-            factor, other = A[k, i], b[i, :m]
-            for j in range(m):
-                right[j] -= factor * other[j]
+            add(-A[k, i], b[i], right)
         for j in range(m):
             right[j] *= inverse
 

@@ -12,6 +12,7 @@ from torchsoft.solve.kernel import compiled
 from torchsoft.solve.kernel.inertia import base_velocity, inertia_force, solve, stiffness_force
 from torchsoft.solve.kernel.interface import (
     assemble,
+    branch_rate,
     displacements,
     evaluate,
     frames,
@@ -22,7 +23,7 @@ from torchsoft.solve.kernel.interface import (
     softness,
 )
 from torchsoft.solve.kernel.invoke import call_linearise, call_value
-from torchsoft.solve.kernel.linear import put, row_of, solve_dense
+from torchsoft.solve.kernel.linear import add, dot, put, row_of, solve_dense
 from torchsoft.solve.kernel.table import Array
 
 SEARCH_AFTER, SHORTEST = 2, 1.0 / 64.0
@@ -187,11 +188,8 @@ def propose(s: Any, w: Any, pad: int, a: float, n: int, columns: int, dV: Array)
         node = w.touched[first + i]
         for r in range(2):
             f = scale * w.F_new[node, r]
-            row = row_of(s.pad_C, s.pad_C_start[pad], 2 * (node - first) + r, size)[
-                low - 2 * first : high - 2 * first
-            ]
-            for m in range(row.size):
-                rates[m] += row[m] * f
+            row = row_of(s.pad_C, s.pad_C_start[pad], 2 * (node - first) + r, size)
+            add(f, row[low - 2 * first :], rates)
     if s.pad_v_start[pad] >= 0:
         base, free = s.pad_base[pad], s.body_free
         cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
@@ -296,8 +294,7 @@ def eliminate(s: Any, w: Any, pad: int, n: int, m: int, X: Array, r: Array, Rv: 
             continue
         line = w.Rf[column[number]]
         for i in range(2 * n):
-            for j in range(m):
-                r[number, j] += line[i] * X[i, j]
+            add(line[i], X[i], r[number, :m])
             for other in range(column.size):
                 if column[other] >= 0:
                     Rv[number, other] += line[i] * X[i, m + column[other]]
@@ -360,23 +357,20 @@ def finish(s: Any, w: Any, y: Array, a: float, powers: Array, moments: Array) ->
             fastest = max(fastest, finish_inertial(s, w, pad, y, a, powers, moments))
             continue
         chain, branches, size = s.pad_chain_at[pad], s.pad_branches[pad], 2 * (last - first)
-        F, total = w.F_linear.flat, 0.0
+        total = 0.0
         for b in range(branches):
             J, tau, z = p[chain + b], p[chain + branches + b], start + b * size
             low, high = size, 0
             for m in range(size):
-                loaded = 2 * w.low[pad] <= 2 * first + m < 2 * w.high[pad]
-                rate = ((F[2 * first + m] if loaded else 0.0) - y[z + m]) / (tau + a)
+                rate = branch_rate(s, w, pad, b, m, w.F_linear, y, a)
                 k[z + m] = rate
                 if abs(rate) * a > NEGLIGIBLE_RATE:
                     low, high = min(low, m), m + 1
                     total += J * abs(rate)
             power, changes = 0.0, k[z + low : z + high]
             for m in range(changes.size):
-                row, u = row_of(s.pad_C, s.pad_C_start[pad], low + m, size)[low:high], 0.0
-                for other in range(row.size):
-                    u += row[other] * changes[other]
-                power += changes[m] * u
+                row = row_of(s.pad_C, s.pad_C_start[pad], low + m, size)
+                power += changes[m] * dot(changes, row[low:])
             powers[pad] += J * tau * power * softness(s, pad)
         fastest = max(fastest, total * s.pad_reach[pad] * softness(s, pad))
     for i in range(s.body_coordinate.size):

@@ -14,12 +14,13 @@ from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
 from torchsoft.solve.kernel.interface import (
     NEGLIGIBLE,
     assemble,
+    branch_rate,
     mobility_scale,
     restore,
     softness,
 )
 from torchsoft.solve.kernel.invoke import call_linearise, call_pullback
-from torchsoft.solve.kernel.linear import put, row_of, solve_dense
+from torchsoft.solve.kernel.linear import add, dot, put, row_of, solve_dense
 from torchsoft.solve.kernel.stage import actuate, balance, coordinates_at, eliminate
 from torchsoft.solve.kernel.step import dense_states
 from torchsoft.solve.kernel.table import Array
@@ -43,11 +44,9 @@ def law_derivatives(
         weights[r] = 1.0
         call_pullback(address, x, p, weights, gradient)
         weights[r] = 0.0
-        for m in range(dp.shape[1]):
-            total = 0.0
-            for j in range(p.size):
-                total += gradient[j] * dp[j, m]
-            out[r, m] = total
+        out[r] = 0.0
+        for j in range(p.size):
+            add(gradient[j], dp[j], out[r])
 
 
 @compiled
@@ -87,32 +86,29 @@ def massless_part(
         s.pad_chain_at[pad],
         s.pad_branches[pad],
     )
-    F, material, span, du, dv = w.F.flat, chain + 2 * branches, z.span, z.u, z.v
-    left, right = (
-        min(span[pad, 0], 2 * (w.low[pad] - first)),
-        max(span[pad, 1], 2 * (w.high[pad] - first)),
-    )
+    material, span, du, dv = chain + 2 * branches, z.span, z.u, z.v
+    left = min(span[pad, 0], 2 * (w.low[pad] - first))
+    right = max(span[pad, 1], 2 * (w.high[pad] - first))
     span[pad, 0], span[pad, 1] = left, right
     zeta, rate, dzeta, drate = z.zeta, z.rate, z.dzeta, z.drate
     zeta[:], rate[:], dzeta[:], drate[:] = 0.0, 0.0, 0.0, 0.0
     for b in range(branches):
-        J, tau, at = p[chain + b], p[chain + branches + b], start + b * size
+        J, rest, at = p[chain + b], p[chain + branches + b] + a, start + b * size
         for i in range(left, right):
-            loaded = 2 * w.low[pad] <= 2 * first + i < 2 * w.high[pad]
-            z_dot = ((F[2 * first + i] if loaded else 0.0) - y[at + i]) / (tau + a)
+            z_dot = branch_rate(s, w, pad, b, i, w.F, y, a)
             zeta[i] += J * y[at + i]
             rate[i] += J * z_dot
-            for k in range(m):
-                change = (dy[at + i, k] + z_dot * dp[chain + branches + b, k]) / (tau + a)
-                dzeta[i, k] += J * dy[at + i, k] + dp[chain + b, k] * y[at + i]
-                drate[i, k] += dp[chain + b, k] * z_dot - J * change
+            add(J, dy[at + i], dzeta[i])
+            add(y[at + i], dp[chain + b], dzeta[i])
+            add(z_dot, dp[chain + b], drate[i])
+            add(-J / rest, dy[at + i], drate[i])
+            add(-J / rest * z_dot, dp[chain + branches + b], drate[i])
     stiffer, soft = False, softness(s, pad)
     for k in range(m):
-        softer = dp[material, k] / p[material]  # C is proportional to the material's first entry
         stiffer |= dp[material + 1, k] != 0.0
-        for i in range(left, right):
-            dzeta[i, k] += softer * zeta[i]
-            drate[i, k] += softer * rate[i]
+    for i in range(left, right):  # C is proportional to the material's first entry
+        add(zeta[i] / p[material], dp[material], dzeta[i])
+        add(rate[i] / p[material], dp[material], drate[i])
     for i in range(w.counts[pad]):
         node = w.touched[first + i]
         for r in range(2):
@@ -120,18 +116,12 @@ def massless_part(
             row, u, v = row_of(s.pad_C, s.pad_C_start[pad], dof, size), du[node, r], dv[node, r]
             u[:], v[:] = 0.0, 0.0
             for j in range(left, right):
-                c = soft * row[j]
-                for k in range(m):
-                    u[k] += c * dzeta[j, k]
-                    v[k] += c * drate[j, k]
+                add(soft * row[j], dzeta[j], u)
+                add(soft * row[j], drate[j], v)
             if stiffer:
-                row, by_u, by_rate = row_of(s.pad_dC, s.pad_C_start[pad], dof, size), 0.0, 0.0
-                for j in range(left, right):
-                    by_u += soft * row[j] * zeta[j]
-                    by_rate += soft * row[j] * rate[j]
-                for k in range(m):
-                    u[k] += by_u * dp[material + 1, k]
-                    v[k] += by_rate * dp[material + 1, k]
+                row = row_of(s.pad_dC, s.pad_C_start[pad], dof, size)[left:right]
+                add(soft * dot(row, zeta[left:]), dp[material + 1], u)
+                add(soft * dot(row, rate[left:]), dp[material + 1], v)
 
 
 @compiled
@@ -236,17 +226,15 @@ def stage_tangent(
         actuate(s, i, w.q, w.V, signals, x, out, J)
         own = slice(s.act_p_start[i], s.act_p_start[i + 1])
         law_derivatives(z, s.act_pullback[i], x, p[own], dp[own], 1, change)
-        for k in range(m):
-            r[number, k] += change[0, k]
+        add(1.0, change[0], r[number])
         n = coordinates_at(s, i)
         for j in range(s.act_measured_start[i], s.act_measured_start[i + 1]):
             measured = s.body_free[s.act_measured[j]]
             if measured >= 0:
-                for k in range(m):
-                    r[number, k] += J[0, n] * dy[s.body_q_start + measured, k]
+                add(J[0, n], dy[s.body_q_start + measured], r[number])
             n += 2
 
-    e, known, dq = z.e, z.known, z.q
+    e, moved, v = z.e, z.moved, z.at_point
     for pad in range(count):
         n = assemble(s, w, pad, a, Rv)
         w.counts[pad] = n
@@ -264,60 +252,50 @@ def stage_tangent(
             own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
             law_derivatives(z, s.contact_pullback[c], w.x[k], p[own], dp[own], 3, e[k])
             H, S, G, L = w.H[at + i], w.S[at + i], w.G[at + i], w.L[at + i]
+            moved[:], v[:] = 0.0, 0.0
+            for j in range(2):
+                node, N = s.point_node[k, j], s.point_N[k, j]
+                for o in range(2 if N != 0.0 else 0):
+                    add(N, du[node, o], moved[o])
+                    add(N, dv[node, o], v[o])
             for o in range(6):
                 number = s.contact_number[c, o]
-                for d in range(m):
-                    dq[o, d] = dy[s.body_q_start + number, d] if number >= 0 else 0.0
-            n0, n1, N0, N1 = (
-                s.point_node[k, 0],
-                s.point_node[k, 1],
-                s.point_N[k, 0],
-                s.point_N[k, 1],
-            )
-            for d in range(m):
-                ux, uy = (
-                    N0 * du[n0, 0, d] + N1 * du[n1, 0, d],
-                    N0 * du[n0, 1, d] + N1 * du[n1, 1, d],
-                )
-                vx, vy = (
-                    N0 * dv[n0, 0, d] + N1 * dv[n1, 0, d],
-                    N0 * dv[n0, 1, d] + N1 * dv[n1, 1, d],
-                )
-                for o in range(3):
-                    total = S[o, 0] * ux + S[o, 1] * uy + w.J[k, o, 6] * dy[s.point_y_start + k, d]
-                    for j in range(6):
-                        total += S[o, 2 + j] * dq[j, d]
-                    e[k, o, d] += total + H[o, 0] * vx + H[o, 1] * vy
-                for o in range(2):
-                    known[o, d] = e[k, o, d]
+                if number >= 0:
+                    put(dy[s.body_q_start + number], moved[2 + o])
+            for o in range(3):
+                add(w.J[k, o, 6], dy[s.point_y_start + k], e[k, o])
+                for j in range(8):
+                    add(S[o, j], moved[j], e[k, o])
+                for j in range(2):
+                    add(H[o, j], v[j], e[k, o])
+            for j in range(2):
+                N, slot = s.point_N[k, j], 2 * w.slot[s.point_node[k, j]]
+                for o in range(2 if N != 0.0 else 0):
+                    add(N, e[k, o], X[slot + o, :m])
+            for o in range(6):
+                number = s.contact_number[c, o]
+                if number >= 0:
                     for j in range(2):
-                        if s.point_N[k, j] != 0.0:
-                            X[2 * w.slot[s.point_node[k, j]] + o, d] += s.point_N[k, j] * e[k, o, d]
-                for o in range(6):
-                    number = s.contact_number[c, o]
-                    if number >= 0:
-                        total = G[o, 0] * known[0, d] + G[o, 1] * known[1, d]
-                        total += L[o, 0] * (ux + a * vx) + L[o, 1] * (uy + a * vy)
-                        for j in range(6):
-                            total += L[o, 2 + j] * dq[j, d]
-                        r[number, d] += total
+                        add(G[o, j], e[k, j], r[number])
+                        add(a * L[o, j], v[j], r[number])
+                    for j in range(8):
+                        add(L[o, j], moved[j], r[number])
         for i in range(2 * n):
             for j in range(columns):
                 X[i, m + j] = w.Hc[i, j]
         solve_dense(w.A, X, 2 * n, m + columns)
         eliminate(s, w, pad, n, m, X, r, Rv)
     dV = z.V
+    dV[:] = 0.0
     for i in range(free):
-        for k in range(m):
-            dV[i, k] = -r[i, k]
+        add(-1.0, r[i], dV[i])
     solve_dense(Rv, dV, free, m)
 
     for pad in range(count):
         advance_pad(s, w, z, pad, y, a, dy, dp)
     for i in range(free):
-        for k in range(m):
-            dy[s.body_q_start + i, k] += a * dV[i, k]
-            dy[s.body_V_start + i, k] = dV[i, k]
+        add(a, dV[i], dy[s.body_q_start + i])
+        put(dV[i], dy[s.body_V_start + i])
 
 
 @compiled
@@ -327,64 +305,49 @@ def advance_pad(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array,
     p = s.p
     first, last, n, m = s.pad_node_start[pad], s.pad_node_start[pad + 1], w.counts[pad], dy.shape[1]
     size, column = 2 * (last - first), s.pad_column[pad]
-    own_rate, base_rate, span, dV, e = (
-        z.own_rate,
-        z.base_rate,
-        z.span,
-        z.V,
-        z.e,
-    )  # own_rate: of u', what is not in dv
+    own_rate, base_rate, span, dV = z.own_rate, z.base_rate, z.span, z.V
+    # own_rate: of u', what is not in dv
     X, at, start = w.X[2 * first : 2 * (first + n)], s.pad_point_start[pad], s.pad_y_start[pad]
     inertial, scale = s.pad_v_start[pad] >= 0, mobility_scale(s, pad, a)
     chain, branches, base = s.pad_chain_at[pad], s.pad_branches[pad], s.pad_base[pad]
     for number in range(column.size):
         if column[number] >= 0:
             for i in range(2 * n):
-                for k in range(m):
-                    X[i, k] += X[i, m + column[number]] * dV[number, k]
+                add(X[i, m + column[number]], dV[number], X[i, :m])
     own_rate[:n], base_rate[:] = 0.0, 0.0
     cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
     if inertial:
         for axis in range(2):
             number = s.body_free[base + axis]
             if number >= 0:
-                for k in range(m):
-                    base_rate[0, k] += (cos if axis == 0 else sin) * dV[number, k]
-                    base_rate[1, k] += (-sin if axis == 0 else cos) * dV[number, k]
+                add(cos if axis == 0 else sin, dV[number], base_rate[0])
+                add(-sin if axis == 0 else cos, dV[number], base_rate[1])
     for i in range(n):
         for o in range(2):
             row = row_of(s.pad_C, s.pad_C_start[pad], 2 * (w.touched[first + i] - first) + o, size)
             for j in range(n):
                 for q in range(2):
                     c = scale * row[2 * (w.touched[first + j] - first) + q]
-                    for k in range(m):
-                        own_rate[i, o, k] += c * X[2 * j + q, k]
+                    add(c, X[2 * j + q], own_rate[i, o])
             if inertial:
                 dof = s.inertia_dof_start[pad] + s.inertia_surface[2 * w.touched[first + i] + o]
-                for k in range(m):
-                    own_rate[i, o, k] -= (
-                        s.inertia_D[dof, 0] * base_rate[0, k]
-                        + s.inertia_D[dof, 1] * base_rate[1, k]
-                    )
+                for q in range(2):
+                    add(-s.inertia_D[dof, q], base_rate[q], own_rate[i, o])
     i, x, out, J, change = 0, z.decay_x, w.decay, z.decay_J, z.change
     for k in range(at, s.pad_point_start[pad + 1]):
         j, c = s.point_y_start + k, s.point_contact[k]
         own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
         if i < w.actives[pad] and w.active[at + i] == k:
             H = w.H[at + i]
-            for d in range(m):
-                total = e[k, 2, d]
-                for q in range(2):
-                    if s.point_N[k, q] != 0.0:
-                        slot = w.slot[s.point_node[k, q]]
-                        total += s.point_N[k, q] * (
-                            H[2, 0] * own_rate[slot, 0, d] + H[2, 1] * own_rate[slot, 1, d]
-                        )
-                for o in range(6):
-                    number = s.contact_number[c, o]
-                    if number >= 0:
-                        total += H[2, 2 + o] * dV[number, d]
-                dy[j, d] += a * total
+            add(a, z.e[k, 2], dy[j])
+            for q in range(2):
+                N, slot = s.point_N[k, q], w.slot[s.point_node[k, q]]
+                for o in range(2 if N != 0.0 else 0):
+                    add(a * N * H[2, o], own_rate[slot, o], dy[j])
+            for o in range(6):
+                number = s.contact_number[c, o]
+                if number >= 0:
+                    add(a * H[2, 2 + o], dV[number], dy[j])
             i += 1
             continue
         moved = False
@@ -400,21 +363,16 @@ def advance_pad(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array,
     if inertial:
         advance_inertial(s, w, z, pad, a, dy)
         return
-    F = w.F.flat
     for b in range(branches):
-        tau, first_z = p[chain + branches + b], start + b * size
+        part, first_z = a / (p[chain + branches + b] + a), start + b * size
         for i in range(span[pad, 0], span[pad, 1]):
-            loaded = 2 * w.low[pad] <= 2 * first + i < 2 * w.high[pad]
-            z_dot = ((F[2 * first + i] if loaded else 0.0) - y[first_z + i]) / (tau + a)
-            for k in range(m):
-                dy[first_z + i, k] -= (
-                    a * (dy[first_z + i, k] + z_dot * dp[chain + branches + b, k]) / (tau + a)
-                )
+            z_dot = branch_rate(s, w, pad, b, i, w.F, y, a)
+            add(-part, dy[first_z + i], dy[first_z + i])
+            add(-part * z_dot, dp[chain + branches + b], dy[first_z + i])
         for i in range(n):
             for o in range(2):
                 dof = first_z + 2 * (w.touched[first + i] - first) + o
-                for k in range(m):
-                    dy[dof, k] += a * X[2 * i + o, k] / (tau + a)
+                add(part, X[2 * i + o], dy[dof])
 
 
 @compiled
