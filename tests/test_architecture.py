@@ -34,7 +34,7 @@ FLOWS = {
         synthetic fit plan setpoints prechecks
         residual_tests assumptions sensitivity profile posterior nuts estimate comparison
         result identification compare
-        columns configuration measured criterion planner design figures report .
+        columns configuration rig_recordings measured criterion planner design figures report .
     """,
     "rigs": "fields parts control motion geometry build course balance check written run .",
     "cli": "results rigs identify material .",
@@ -46,7 +46,7 @@ FLOWS = {
 own file imports."""
 APART = ("plot", "materials", "rigs", "sysid", "reduced", "datasets")
 """Folders over the engine; of these, only what is `SHARED` may be imported by another."""
-SHARED = ("plot", "materials.presets")
+SHARED = ("plot", "materials.presets", "rigs.build", "rigs.fields")
 LONGEST = 600
 """Lines; a file that grows past them holds more than one idea."""
 OUTSIDE = ("data_gen", "experiments", "examples")

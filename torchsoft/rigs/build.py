@@ -370,7 +370,7 @@ class RigFile(Group):
         materials, laws = (
             made(group, lambda one: one.build(folder)) for group in ("materials", "laws")
         )
-        return Rig(
+        rig = Rig(
             bodies=made("bodies", lambda one: one.build(folder)),
             pads=made("pads", lambda one: one.build(materials[one.material], folder)),
             contacts=made("contacts", lambda one: one.build(laws)),
@@ -378,6 +378,20 @@ class RigFile(Group):
             gravity=self.gravity,
             symbols={name: one.symbol or name for name, one in self.bodies.items()},
         )
+        named = {self._own_name(*name.split(".")): name for name, _ in rig.named_parameters()}
+        rig.aliases = {alias: name for alias, name in named.items() if alias != name}
+        return rig
+
+    def _own_name(self, group: str, part: str = "", *rest: str) -> str:
+        """What this file calls a parameter of its rig, such as "materials.silicone.E"."""
+        if group == "pads" and rest[:1] == ("material",):
+            group, part, rest = "materials", self.pads[part].material, rest[1:]
+        elif group == "contacts" and rest[:1] == ("law",):
+            group, part, rest = "laws", self.contacts[part].law, rest[1:]
+        elif group == "actuators" and part in self.actuators and rest[:1] == ("law",):
+            rest = rest[1:]
+        last = ["inertia" if name == "own_inertia" else name for name in rest]
+        return ".".join([group, part, *last] if part else [group])
 
     @torch.no_grad()
     def build(self) -> BuiltRig:

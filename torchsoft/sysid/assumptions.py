@@ -9,6 +9,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import suppress
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -21,7 +22,7 @@ from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact, at_once
 from torchsoft.physics.motion import Piecewise, Reference, Sampled
 from torchsoft.physics.rig import Rig
 from torchsoft.sysid.fit import Fit, Loss, Notify, Unreachable
-from torchsoft.sysid.initial_state import AtRest
+from torchsoft.sysid.initial_state import AtRest, Standing
 from torchsoft.sysid.plan import SCANNED, USUAL, Stage, default_plan, run_plan
 from torchsoft.sysid.prediction import Frozen, set_parameters
 from torchsoft.sysid.problem import Problem, Residuals, check_value
@@ -158,6 +159,15 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
                               vary=lambda r: raised(r, FORCE)))  # fmt: skip
     if isinstance(rig, SoftGrasp):
         out += of_the_paper(first, rig, unknown)
+    pushed = {one.pushes for one in rig.actuators.values()}
+    for name, axes in rig.layout.free.items() if isinstance(first.start, Standing) else ():
+        if 0 in axes and f"{name}.x" not in pushed:
+            stated = f"{name} begins where the rig file says"
+            otherwise, by = f"it began {1e6 * PLACE:g} um further right", partial(moved, body=name)
+            out.append(
+                Variation(f"start of {name}.x", "known", stated, otherwise, 1e6 * PLACE, "um",
+                          vary=by)
+            )  # fmt: skip
     for name, value in first.parameters.items():
         if (
             name in unknown
@@ -199,7 +209,7 @@ def with_rig(recording: Recording, change: Callable[[Rig], None]) -> Recording:
 def remeshed(recording: Recording, finer: int, points: int) -> Recording | None:
     """Every pad of more elements, or with more contact points; None where the start is a state of
     this mesh."""
-    if not isinstance(recording.start, AtRest):
+    if not isinstance(recording.start, AtRest | Standing):
         return None
 
     def change(rig: Rig) -> None:
@@ -236,6 +246,15 @@ def placed(recording: Recording) -> Recording | None:
     if not isinstance(start, AtRest) or not isinstance(rig, SoftGrasp):
         return None
     return replace(recording, start=start._replace(x=start.place(rig) + PLACE))
+
+
+def moved(recording: Recording, body: str) -> Recording:
+    """A body that stands a little further right."""
+    start = recording.start
+    assert isinstance(start, Standing)
+    (x, *others), velocity = start.bodies[body]
+    bodies = {**start.bodies, body: ((x + PLACE, *others), velocity)}
+    return replace(recording, start=start._replace(bodies=bodies))
 
 
 def laws(rig: Rig) -> list[SoftContact]:

@@ -9,6 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -20,7 +21,34 @@ from torchsoft.sysid.recording import Array
 from torchsoft.tables import shown
 
 COLUMNS = ("t", *SETPOINTS, *FEED_FORWARD, *MEASURED)
-"""Names that a column may have."""
+"""Names that a column of a recording of the paper's rig may have."""
+
+
+class Vocabulary(NamedTuple):
+    """Columns of the recordings of a rig: `units` by column, the names of signals, those of them
+    that a recording must have, and what `headings` of other names stand for."""
+
+    units: Mapping[str, str]
+    signals: tuple[str, ...]
+    needed: tuple[str, ...] = ()
+    headings: Mapping[str, str] = {}
+
+    @property
+    def measured(self) -> tuple[str, ...]:
+        """Channels that sensors measure."""
+        rates = tuple(f"{name}_dot" for name in self.signals)
+        return tuple(name for name in self.units if name not in ("t", *self.signals, *rates))
+
+    @property
+    def asked(self) -> tuple[str, ...]:
+        """Signals and their rates."""
+        return tuple(name for name in self.units if name not in ("t", *self.measured))
+
+
+PAPER = Vocabulary(
+    {name: CHANNELS[name].unit for name in COLUMNS}, (*SETPOINTS, "F_ff"), (*SETPOINTS, "F_ff")
+)
+"""Of the paper's rig."""
 
 ROWS = 10
 """A table with set-points has at least as many rows."""
@@ -62,6 +90,7 @@ class Tables:
 
     tables: tuple[Columns, ...]
     constants: tuple[str, ...] = ()
+    known: Vocabulary = PAPER
 
     def __contains__(self, column: str) -> bool:
         return any(column in table.values for table in self.tables)
@@ -84,24 +113,26 @@ class Tables:
     @property
     def begin(self) -> float:
         """When the first sample was taken [s]."""
-        measured = [t[np.isfinite(y)] for name, (t, y) in self.columns.items() if name in MEASURED]
+        columns = {name: self.columns[name] for name in self.known.measured if name in self}
+        measured = [t[np.isfinite(y)] for t, y in columns.values()]
         return min(
             (float(t[0]) for t in measured if len(t)), default=float(self.tables[0].values["t"][0])
         )
 
     def near(self, time: float) -> str:
         """Names the file with the set-points, and the first row at or after a time [s]."""
-        table = self.of("y_d")
+        table = next((self.of(name) for name in self.known.needed), self.tables[0])
         return f"{table.path}, {table.near(time)}"
 
 
 def read_tables(
-    paths: Sequence[Path], ignore: Collection[str], constants: Mapping[str, float]
-) -> Tables:
+    paths: Sequence[Path], ignore: Collection[str], constants: Mapping[str, float],
+    known: Vocabulary = PAPER,
+) -> Tables:  # fmt: skip
     """The tables of one recording; a column that none has is a constant, where one is stated.
     Raises `ValueError` for a column that is there twice, or is needed and missing, and for samples
     at times without set-points."""
-    tables = [read_table(path, ignore) for path in paths]
+    tables = [read_table(path, ignore, known) for path in paths]
     names = ", ".join(str(path) for path in paths)
     for i, table in enumerate(tables):
         for other in tables[:i]:
@@ -111,35 +142,35 @@ def read_tables(
                     "has it once"
                 )
     there = {name for table in tables for name in table.values}
-    for name in SETPOINTS:
-        if name not in there and name not in constants:
+    for name in known.signals:
+        if name not in there and name not in constants and name in known.needed:
+            if name in FEED_FORWARD:
+                raise ValueError(
+                    f"{names} has no column `{name}`, and nothing says which force was fed forward "
+                    "to the bracket: give the column, or state a constant [N], missing = {"
+                    f"{name} = 0.0}} where there was none"
+                )
             raise ValueError(
                 f"{names} has no column `{name}`; it needs t, x_d, y_d and at least one of "
-                f"{', '.join(MEASURED)}"
+                f"{', '.join(known.measured)}"
             )
         if f"{name}_dot" in there and not any(
             {name, f"{name}_dot"} <= table.values.keys() for table in tables
         ):
             raise ValueError(f"{names}: the columns `{name}` and `{name}_dot` must be in one file")
-    if "F_ff" not in there and "F_ff" not in constants:
-        raise ValueError(
-            f"{names} has no column `F_ff`, and nothing says which force was fed forward to the "
-            f"bracket: give the column, or state a constant [N], missing = {{F_ff = 0.0}} where "
-            "there was none"
-        )
-    most = max(range(len(tables)), key=lambda i: len({*SETPOINTS} & tables[i].values.keys()))
+    most = max(range(len(tables)), key=lambda i: len({*known.signals} & tables[i].values.keys()))
     stated = {name: value for name, value in constants.items() if name not in there}
     table = tables[most]
     filled = {name: np.full(len(table.rows), value) for name, value in stated.items()}
-    tables[most] = check_table(replace(table, values=table.values | filled))
-    made = Tables(tuple(tables), tuple(stated))
+    tables[most] = check_table(replace(table, values=table.values | filled), known)
+    made = Tables(tuple(tables), tuple(stated), known)
     check_times(made)
     return made
 
 
 def check_times(tables: Tables) -> None:
     """Raises `ValueError` for samples that were taken where a set-point is not known."""
-    asked = {name: tables.of(name) for name in (*SETPOINTS, "F_ff")}
+    asked = {name: tables.of(name) for name in tables.known.signals if name in tables}
     for name, known in asked.items():
         t = known.values["t"]
         slack = float(np.diff(t).max())
@@ -154,43 +185,62 @@ def check_times(tables: Tables) -> None:
                     )
 
 
-def read_table(path: Path, ignore: Collection[str] = ()) -> Columns:
+def read_table(path: Path, ignore: Collection[str] = (), known: Vocabulary = PAPER) -> Columns:
     """A CSV or NetCDF file, by its suffix, without the columns `ignore`."""
-    return (
-        read_trajectory(path, ignore) if path.suffix in (".nc", ".h5") else read_csv(path, ignore)
-    )
+    if path.suffix in (".nc", ".h5"):
+        return read_trajectory(path, ignore, known)
+    return read_csv(path, ignore, known)
 
 
-def hint(name: str, columns: int) -> str:
+def hint(name: str, columns: int, names: Collection[str]) -> str:
     """What helps with a column that is not known: the nearest name, and how to leave it out."""
-    known = f"columns are {', '.join(COLUMNS)}, each with its unit in brackets"
+    known = f"columns are {', '.join(names)}, each with its unit in brackets"
     if columns == 1:
         return f"; separate columns with commas; {known}"
-    plain = {re.sub(r"[^a-z]", "", one.lower()): one for one in COLUMNS} | {"time": "t"}
+    plain = {re.sub(r"[^a-z]", "", one.lower()): one for one in names} | {"time": "t"}
     near = get_close_matches(re.sub(r"[^a-z]", "", name.lower()), plain, n=1, cutoff=0.6)
     meant = f": is it `{plain[near[0]]}`? If" if near else "; if"
     return f"{meant} it has nothing to do with the motion, say ignore = [{shown(name)}]; {known}"
 
 
-def read_csv(path: Path, ignore: Collection[str] = ()) -> Columns:
+def read_csv(path: Path, ignore: Collection[str] = (), known: Vocabulary = PAPER) -> Columns:
     """A table of numbers under `name [unit]`. Raises `ValueError` naming the row (the heading is
     row 1) and the column."""
-    table = csvfile.read(path, {name: UNITS[CHANNELS[name].unit] for name in COLUMNS}, hint, ignore)
-    return check_table(Columns(path, table.values, table.rows, ignored=table.ignored))
+    renamed = {of: heading for heading, of in known.headings.items()}
+    units = {renamed.get(name, name): UNITS[unit] for name, unit in known.units.items()}
+    table = csvfile.read(path, units, lambda name, n: hint(name, n, units), ignore)
+    values = {known.headings.get(heading, heading): x for heading, x in table.values.items()}
+    return check_table(Columns(path, values, table.rows, ignored=table.ignored), known)
 
 
-def read_trajectory(path: Path, ignore: Collection[str] = ()) -> Columns:
+def read_trajectory(path: Path, ignore: Collection[str] = (), known: Vocabulary = PAPER) -> Columns:
     """The table in a file of `Trajectory.save`; rows are called samples, counted from 0. Raises
     `ValueError`."""
     data = load(path)
-    values = read_columns(data, path)
+    values = read_columns(data, path) if known is PAPER else read_channels(data, path, known)
     left_out = tuple(name for name in values if name in ignore)
     values = {name: column for name, column in values.items() if name not in ignore}
     table = Columns(path, values, list(range(len(values.get("t", ())))), "sample", left_out)
     for name, column in values.items():
         if (bad := np.flatnonzero(~np.isfinite(column))).size:
             raise ValueError(f"{table.at(bad[0])}, `{name}` is not a finite number")
-    return check_table(table)
+    return check_table(table, known)
+
+
+def read_channels(data: xr.Dataset, path: Path, known: Vocabulary) -> dict[str, Array]:
+    """The channels of a trajectory of another rig than the paper's. Raises `ValueError` for those
+    in other units than the rig's."""
+    there = {name: data[name] for name in known.units if name in data and name != "t"}
+    for name, one in there.items():
+        if one.dims != ("time",) or one.attrs.get("units") != known.units[name]:
+            raise ValueError(
+                f"{path}, `{name}` should be in {known.units[name]} over time, not "
+                f"{shown(one.attrs.get('units'))} over {' and '.join(map(str, one.dims))}"
+            )
+    if "time" not in data.coords:
+        raise ValueError(f"{path} is not a trajectory file: it has no time")
+    values = {"t": data["time"], **there}
+    return {name: np.array(one.values, float) for name, one in values.items()}
 
 
 def read_columns(data: xr.Dataset, path: Path) -> dict[str, Array]:
@@ -220,13 +270,13 @@ def read_columns(data: xr.Dataset, path: Path) -> dict[str, Array]:
     return {name: np.array(c.of(data[c.variable].values), float) for name, c in columns.items()}
 
 
-def check_table(table: Columns) -> Columns:
+def check_table(table: Columns, known: Vocabulary = PAPER) -> Columns:
     """The table, where its times and set-points can be used. Raises `ValueError` naming row and
     column."""
     path, values = table.path, table.values
     if "t" not in values:
         raise ValueError(f"{path} has no column `t`")
-    asked = [name for name in (*SETPOINTS, *FEED_FORWARD) if name in values]
+    asked = [name for name in known.asked if name in values]
     if len(table.rows) < (least := ROWS if asked else 2):
         raise ValueError(
             f"{path} has {len(table.rows)} rows of numbers, but needs at least {least}"

@@ -1,7 +1,7 @@
 """What a TOML file states of an identification: what is known, what is unknown, and how good the
 sensors are."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,7 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 from torchsoft.paper.rig import NAMES
 from torchsoft.physics.material import INSTANT
 from torchsoft.sysid.identification import Settings
-from torchsoft.sysid.initial_state import LEAD
+from torchsoft.sysid.initial_state import LEAD, SETTLE
 from torchsoft.sysid.unknowns import Sensor, Unknown
 from torchsoft.tables import LISTED, Table, from_toml
 
@@ -36,10 +36,12 @@ def told_apart(sd: float, value: float = 1.0) -> float:
 
 
 class Rest(Table):
-    """A recording that begins at rest, the disc on the lower pad at `scenario.x_C0`, known to
-    `position_sd` [m], and the bracket clear of it."""
+    """A recording that begins at rest, `lead` [s] after its bodies were put where they stand. In
+    the paper's rig the disc stands on the lower pad at `scenario.x_C0`, known to `position_sd` [m],
+    and the bracket clear of it; in another one they stand where the rig file has them start."""
 
     kind: Literal["rest"] = "rest"
+    lead: float = Field(default=SETTLE, ge=0, le=10)
     position_sd: Annotated[float, AfterValidator(told_apart)] = Field(default=0.0, ge=0, le=0.1)
 
 
@@ -167,7 +169,9 @@ class Config(Table):
     """An identification as a TOML file states it.
 
     `settings` are known numbers, by the groups and names of `Parameters`; `unknowns` and `sensors`
-    are tables by the dotted names of parameters and by channels; `heldout` names recordings that
+    are tables by the dotted names of parameters and by channels. With a `rig` file the names are
+    those of its tables, `settings` replaces fields of it, and `columns` has channels and signals by
+    headings of another name; `heldout` names recordings that
     are predicted and not fitted, `ignore` columns that are left out, and `acknowledged` findings
     that are no mistakes. `missing` and `start` hold for all recordings that say nothing else.
     `compare` has competing laws by name.
@@ -175,6 +179,8 @@ class Config(Table):
 
     unknowns: dict[str, Unknown]
     sensors: dict[str, Sensor]
+    rig: File | None = None
+    columns: dict[Name, Name] = Field(default_factory=dict)
     settings: dict[str, Any] = Field(default_factory=dict)
     pads: Pads = KelvinVoigtPads()
     start: Beginning = Rest()
@@ -186,23 +192,44 @@ class Config(Table):
     ignore: Annotated[tuple[str, ...], LISTED] = ()
     acknowledged: Annotated[tuple[str, ...], LISTED] = ()
 
+    def understood(self, name: str) -> str:
+        """A parameter's name among `Parameters`, where the paper's rig has it by its own."""
+        return VOCABULARY.get(name, name) if self.rig is None else name
+
+    @model_validator(mode="after")
+    def _the_rig_says_what_it_is_made_of(self) -> "Config":
+        if self.rig is None:
+            if self.columns:
+                raise ValueError("columns rename those of a `rig` file, and there is none")
+            return self
+        for field in ("pads", "missing"):
+            if field in self.model_fields_set:
+                raise ValueError(f"{field} are of the paper's rig; say it in the rig file")
+        for name, law in self.compare.items():
+            if law.pads is not None:
+                raise ValueError(
+                    f"compare.{name}.pads are of the paper's rig; say it by compare.{name}.settings"
+                )
+        return self
+
     @model_validator(mode="after")
     def _laws_have_likelihoods(self) -> "Config":
         if self.compare and self.fit.loss != "linear":
             raise ValueError(
                 f"compare needs likelihoods: fit.loss must be 'linear', not '{self.fit.loss}'"
             )
-        known = {understood(name) for name in self.unknowns}
+        known = {self.understood(name) for name in self.unknowns}
         for law, one in self.compare.items():
-            if strange := [name for name in one.without if understood(name) not in known]:
+            if strange := [name for name in one.without if self.understood(name) not in known]:
                 raise ValueError(f"compare.{law}.without: `{strange[0]}` is not an unknown")
         return self
 
     @model_validator(mode="after")
     def _recordings_state_what_is_known(self) -> "Config":
-        unknown = {understood(name): name for name in self.unknowns}
+        unknown = {self.understood(name): name for name in self.unknowns}
         for i, entry in enumerate(self.recordings):
-            if strange := [name for name, _ in flattened(entry.settings) if name in unknown]:
+            stated = [self.understood(name) for name, _ in flattened(entry.settings)]
+            if strange := [name for name in stated if name in unknown]:
                 raise ValueError(
                     f"recordings.{i}.settings: {strange[0]} is unknown, so that no recording can "
                     "state it: leave it out there, "
@@ -217,14 +244,11 @@ def read_config(path: str | Path) -> Config:
     return from_toml(path, Config.model_validate)
 
 
-def understood(name: str) -> str:
-    """A parameter's name among `Parameters`, where it is called by the rig's own."""
-    return VOCABULARY.get(name, name)
-
-
-def in_one_vocabulary(unknowns: Mapping[str, Unknown]) -> dict[str, Unknown]:
-    """Unknowns by their names among `Parameters`, where they have one. Raises `ValueError` for one
-    that is there by both."""
+def in_one_vocabulary(
+    unknowns: Mapping[str, Unknown], understood: Callable[[str], str]
+) -> dict[str, Unknown]:
+    """Unknowns by the names that are `understood`. Raises `ValueError` for one that is there by
+    two."""
     out: dict[str, Unknown] = {}
     for name, one in unknowns.items():
         if understood(name) in out:
@@ -237,12 +261,12 @@ def in_one_vocabulary(unknowns: Mapping[str, Unknown]) -> dict[str, Unknown]:
 
 
 def flattened(settings: Mapping[str, Any], within: str = "") -> Iterator[tuple[str, Any]]:
-    """Values by their dotted names among `Parameters`."""
+    """Values by their dotted names."""
     for key, value in settings.items():
         if isinstance(value, dict) and value:
             yield from flattened(value, f"{within}{key}.")
         else:
-            yield understood(within + key), value
+            yield within + key, value
 
 
 def groups(*settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -250,7 +274,7 @@ def groups(*settings: Mapping[str, Any]) -> dict[str, Any]:
     tree: dict[str, Any] = {}
     for given in settings:
         for name, value in flattened(given):
-            group, _, field = name.partition(".")
+            group, _, field = VOCABULARY.get(name, name).partition(".")
             if not field:
                 tree[group] = value
             else:

@@ -21,7 +21,7 @@ from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.statics import NoEquilibrium, settled
+from torchsoft.physics.statics import NoEquilibrium, settled, standing
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.tangent import directions
 
@@ -110,7 +110,42 @@ class AtRest(NamedTuple):
 
     def begin(self, rig: Rig, samples: Samples) -> Begin:
         assert isinstance(rig, SoftGrasp)
-        return RestState(rig, rig, self.place(rig))
+        return held(rig, self.place(rig), rig)
+
+
+class Standing(NamedTuple):
+    """Bodies are at known places, `lead` [s] before the first sample, and pads have settled around
+    them.
+
+    `bodies` holds coordinates and rates of every body, 3 each [m, rad, m/s, rad/s]. The
+    displacements of the pads are those at the nominal parameters, whatever the others are.
+    """
+
+    bodies: Mapping[str, tuple[tuple[float, ...], tuple[float, ...]]]
+    lead: float = SETTLE
+
+    @classmethod
+    def of(cls, rig: Rig, y0: Tensor, lead: float = SETTLE) -> "Standing":
+        """The places of the state y0 (size,)."""
+        state = rig.unpack(y0.detach())
+        pairs = zip(state.pose.items(), state.velocity.values())
+        return cls({k: (tuple(q.tolist()), tuple(v.tolist())) for (k, q), v in pairs}, lead)
+
+    def coordinates(self, rig: Rig, samples: Samples) -> tuple[StartCoordinate, ...]:
+        if self.lead > 0:
+            warn_of_memory(rig, self.lead)
+        return ()
+
+    def begin(self, rig: Rig, samples: Samples) -> Begin:
+        pose, velocity = (
+            {name: torch.tensor(one[k], dtype=torch.float64) for name, one in self.bodies.items()}
+            for k in range(2)
+        )
+        with torch.no_grad():
+            state = rig.unpack(standing(rig, pose))
+            moving = {name: velocity[name] for name in state.velocity}
+            y0 = rig.pack(state._replace(velocity=moving))
+        return HeldPads(rig, rig, lambda values: y0)
 
 
 class Known(NamedTuple):
@@ -130,23 +165,15 @@ class Known(NamedTuple):
         return f"Known({self.y0.tolist()}, {self.lead})"
 
 
-class RestState:
-    """The state of `AtRest`: displacements stay when parameters change, and massless pads get the
-    forces that hold them so."""
+class HeldPads:
+    """A nominal state, given by the start's coordinates: displacements stay when parameters change,
+    and massless pads get the forces that hold them so."""
 
-    def __init__(self, nominal: SoftGrasp, rig: SoftGrasp, x: float) -> None:
-        self.rig, self.nominal = rig, deepcopy(nominal).requires_grad_(False)
-        self.x0 = torch.tensor(x, dtype=torch.float64)
-        self.x: float | None = None
+    def __init__(self, nominal: Rig, rig: Rig, state: Begin) -> None:
+        self.rig, self.nominal, self.state = rig, deepcopy(nominal).requires_grad_(False), state
 
     def __call__(self, values: Mapping[str, Tensor]) -> Tensor:
-        x = values.get("start.disc.x", self.x0)
-        if float(x.detach()) != self.x:
-            at = x.detach().clone().requires_grad_(True)
-            y = start(self.nominal, at)
-            self.x, self.y = float(at.detach()), y.detach()
-            self.slope = torch.from_numpy(directions(y, [at])[:, 0])
-        state = self.rig.unpack(self.y + self.slope * (x - x.detach()))
+        state = self.rig.unpack(self.state(values))
         pads = dict(state.pads)
         for name, pad in self.rig.pads.items():
             if not pad.inertial:
@@ -154,10 +181,27 @@ class RestState:
         return self.rig.pack(state._replace(pads=pads))
 
 
+def held(nominal: SoftGrasp, place: float, rig: SoftGrasp) -> HeldPads:
+    """The state of `AtRest`, the disc at `place` [m] unless its coordinate says otherwise."""
+    own, known = deepcopy(nominal).requires_grad_(False), dict[float, tuple[Tensor, Tensor]]()
+
+    def state(values: Mapping[str, Tensor]) -> Tensor:
+        x = values.get("start.disc.x", torch.tensor(place, dtype=torch.float64))
+        if float(x.detach()) not in known:
+            at = x.detach().clone().requires_grad_(True)
+            y = start(own, at)
+            known.clear()
+            known[float(at.detach())] = y.detach(), torch.from_numpy(directions(y, [at])[:, 0])
+        y, slope = known[float(x.detach())]
+        return y + slope * (x - x.detach())
+
+    return HeldPads(nominal, rig, state)
+
+
 def held_start(nominal: SoftGrasp, rig: SoftGrasp) -> Tensor:
     """The state (size,) of `AtRest` for a rig that may have other parameters than the nominal
     one."""
-    return RestState(nominal, rig, AtRest().place(nominal))({})
+    return held(nominal, AtRest().place(nominal), rig)({})
 
 
 def warn_of_memory(rig: Rig, lead: float) -> None:

@@ -7,20 +7,24 @@ field.
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import reduce
+from operator import or_
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from pydantic import TypeAdapter
 
 from torchsoft.channels import CHANNELS, MEASURED, SETPOINTS
-from torchsoft.cost import RUN, Cost, row_memory, step_seconds, steps_per_second
+from torchsoft.cost import DIFFERENTIATED, RUN, Cost, row_bytes, step_time, steps_per_second
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp, apart
 from torchsoft.physics.material import KINDS, StandardLinearSolid
-from torchsoft.physics.motion import Reference, Sampled
-from torchsoft.sysid.columns import Tables, read_tables
+from torchsoft.physics.motion import Reference
+from torchsoft.physics.rig import Rig
+from torchsoft.rigs.build import RigFile
+from torchsoft.rigs.fields import at_field
+from torchsoft.sysid.columns import PAPER, Tables, read_tables
 from torchsoft.sysid.configuration import (
     Beginning,
     Config,
@@ -35,14 +39,19 @@ from torchsoft.sysid.configuration import (
     groups,
     in_one_vocabulary,
     read_config,
-    understood,
 )
-from torchsoft.sysid.first_samples import estimate_initial_state
 from torchsoft.sysid.fit import Unreachable
 from torchsoft.sysid.initial_state import BOUNDS, AtRest
 from torchsoft.sysid.plan import ALL, FINER, FIRST, FREE, LAST, LOOSE, USUAL
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Recording
+from torchsoft.sysid.rig_recordings import (
+    measured_samples,
+    moving,
+    rig_recording,
+    sampled,
+    vocabulary,
+)
 from torchsoft.sysid.unknowns import Sensor, Unknown
 from torchsoft.tables import InvalidTable, line, refusing, shown
 
@@ -64,7 +73,7 @@ def cost(
 ) -> Cost:
     """Of `default_plan` where every stage takes all its evaluations, and of the checks before and
     after it; descents on the adjoint take more of them, and memory for a matrix that interpolates
-    between the rows. For the paper's rig."""
+    between the rows."""
     fitted = [r for r in problem.recordings if r.name not in heldout]
     slowest = min(fitted, key=lambda r: r.speed)
     rows = {r.name: len(r.grid(problem.interpolated).t) for r in problem.recordings}
@@ -101,14 +110,11 @@ def cost(
             ]
             number *= 4 if descent and differentiated else 1
             steps += number * length
-            step = step_seconds(paper_settings(recording), differentiated) * (
-                more if differentiated else 1.0
-            )
+            step = rig_step(recording.rig, differentiated) * (more if differentiated else 1.0)
             seconds[-1] += number * (length * step + RUN)
     matrix = 3 * 8 / 2**30 if descent else 0.0
     memory = sorted(
-        rows[r.name] * (row_memory(paper_settings(r)) + matrix * rows[r.name])
-        for r in problem.recordings
+        rows[r.name] * (rig_row(r.rig) + matrix * rows[r.name]) for r in problem.recordings
     )
     at_once = max(1, min(workers, len(fitted)))
     return Cost(
@@ -116,6 +122,23 @@ def cost(
         seconds=max(sum(seconds) / at_once, max(seconds)),
         memory=sum(memory[-at_once:]),
     )
+
+
+def rig_step(rig: Rig, differentiated: bool) -> float:
+    """Time of one step [s] of a rig; `differentiated` with sensitivities by a few parameters."""
+    seconds = 0.0
+    for pad in rig.pads.values():
+        points = len(pad.point_nodes) if pad.points else 0
+        inertial = len(pad.mesh.free) if pad.inertial else 0
+        own = 0.5 * step_time(len(pad.mesh.surface), points, inertial)
+        seconds += own * (DIFFERENTIATED[pad.inertial] if differentiated else 1.0)
+    return seconds
+
+
+def rig_row(rig: Rig) -> float:
+    """Memory [GiB] of one row of a run of a rig."""
+    pads = [(pad.nodes, len(pad.point_nodes)) for pad in rig.pads.values()]
+    return 0.5 * sum(row_bytes(*one) for one in pads) / 2**30
 
 
 def one_by_one(costs: Iterable[Cost]) -> Cost:
@@ -302,39 +325,15 @@ def recording(
     check_plausible(tables, p, sensors)
     if isinstance(start, Rest):
         check_rest(tables, p, sensors, start.position_sd)
-    columns, samples, files = (
-        tables.columns,
-        {},
-        ", ".join(str(table.path) for table in tables.tables),
-    )
-    for channel in (c for c in MEASURED if c in columns):
-        t, y = columns[channel]
-        here = np.isfinite(y)
-        if here.sum() >= 2:
-            samples[channel] = (t[here], y[here])
-        elif channel in sensors:
-            raise ValueError(
-                f"{tables.of(channel).path}, column `{channel}` has {here.sum()} samples, but "
-                "needs at least two"
-            )
-    if not set(samples) & set(sensors):
-        raise ValueError(f"{files} has no column for any of the sensors {', '.join(sensors)}")
+    columns, samples = tables.columns, measured_samples(tables, sensors)
     rates = {f"{name}_dot": columns.get(f"{name}_dot") for name in SETPOINTS}
     signals = {
         name: sampled(*columns[name], rates.get(f"{name}_dot")) for name in (*SETPOINTS, "F_ff")
     }
     made = Recording(name, rig(p, Reference(**signals), pads), samples)
     if isinstance(start, Moving):
-        given = {coordinate: (one.mean, one.sd) for coordinate, one in start.given.items()}
-        used = {channel: sensors[channel] for channel in sensors if channel in samples}
-        return estimate_initial_state(made, used, lead=start.lead, given=given)
-    return replace(made, start=AtRest(position_sd=start.position_sd))
-
-
-def sampled(t: np.ndarray, y: np.ndarray, rate: tuple[np.ndarray, np.ndarray] | None) -> Sampled:
-    """A set-point, with the rate of its column, if there is one."""
-    times, values = torch.tensor(t), torch.tensor(y)
-    return Sampled(times, values, None if rate is None else torch.tensor(rate[1]))
+        return moving(made, sensors, start)
+    return replace(made, start=AtRest(position_sd=start.position_sd, lead=start.lead))
 
 
 def rig(p: Parameters, reference: Reference, pads: Pads) -> SoftGrasp:
@@ -404,9 +403,19 @@ def load(data: Sequence[str | Path], config: str | Path) -> Case:
     config = Path(config)
     stated = read_config(config)
     entries, tables = sources(data, config, stated), dict[str, Tables]()
+    file, columns = None, PAPER
+    if stated.rig is not None:
+        try:
+            file = RigFile.from_toml(config.parent / stated.rig)
+            columns = vocabulary(file.assemble(), stated.columns)
+        except ValueError as error:
+            raise ValueError(f"{config}, rig: {error}") from None
+        except OSError as error:
+            raise ValueError(f"{config}, rig: {stated.rig}: {error.strerror}") from None
     for name, (entry, paths) in entries.items():
         try:
-            tables[name] = read_tables(paths, stated.ignore, entry.missing.over(stated.missing))
+            constants = entry.missing.over(stated.missing)
+            tables[name] = read_tables(paths, stated.ignore, constants, columns)
         except OSError as error:
             if not entry.paths:
                 raise
@@ -435,20 +444,18 @@ def load(data: Sequence[str | Path], config: str | Path) -> Case:
     def problem(law: Law, what: str) -> Problem:
         made = []
         for name, (entry, _) in entries.items():
-            p = known_parameters(
-                config, name, tables[name], stated.settings, entry.settings, law.settings
-            )
+            settings, start = (stated.settings, entry.settings, law.settings), entry.start
+            start = start or stated.start
+            if file is None:
+                p = known_parameters(config, name, tables[name], *settings)
             try:
-                made.append(
-                    recording(
-                        tables[name],
-                        name,
-                        p,
-                        stated.sensors,
-                        entry.start or stated.start,
-                        law.pads or stated.pads,
-                    )
-                )
+                if file is not None:
+                    with at_field("settings"):
+                        mine = reduce(lambda one, given: one.override(**given), settings, file)
+                    made.append(rig_recording(mine, tables[name], name, stated.sensors, start))
+                    continue
+                pads = law.pads or stated.pads
+                made.append(recording(tables[name], name, p, stated.sensors, start, pads))
             except ValueError as error:
                 known = any(str(table.path) in str(error) for table in tables[name].tables)
                 raise (
@@ -471,8 +478,9 @@ def load(data: Sequence[str | Path], config: str | Path) -> Case:
 
 def unknowns_of(stated: Config, law: Law) -> dict[str, Unknown]:
     """What a law has to be found."""
-    without = {understood(name) for name in law.without}
-    mine = in_one_vocabulary(stated.unknowns) | in_one_vocabulary(law.unknowns)
+    without = {stated.understood(name) for name in law.without}
+    both = (in_one_vocabulary(x, stated.understood) for x in (stated.unknowns, law.unknowns))
+    mine = reduce(or_, both)
     return {name: one for name, one in mine.items() if name not in without}
 
 

@@ -96,6 +96,13 @@ OPTIONS: dict[str, Any] = {
 """How numba compiles a kernel: nothing is allocated, counted or called from Python."""
 
 
+def placeless(function: Any) -> Any:
+    """The function without its file's folder, which numba would write into the code."""
+    name = Path(function.__code__.co_filename).name
+    function.__code__ = function.__code__.replace(co_filename=name)
+    return function
+
+
 def finalize(self: Any) -> None:
     """In place of numba's: leave the code as it is."""
     self._finalized = True
@@ -156,8 +163,8 @@ def main() -> None:
     context: Any = CPUContext
     library.finalize = finalize
     context.get_executable = lambda *_: [].append  # a new object each time, which nobody calls
-    kernel.compiled = numba.njit(**OPTIONS)
-    kernel.inlined = numba.njit(inline="always", **OPTIONS)
+    kernel.compiled = lambda function: numba.njit(**OPTIONS)(placeless(function))
+    kernel.inlined = lambda function: numba.njit(inline="always", **OPTIONS)(placeless(function))
     if asked.out is None:
         remove_old()
     for name in asked.entries:

@@ -1,0 +1,169 @@
+"""Question: how long does a newcomer wait for a first result, and what does a short run cost?
+
+A wheel is built from this checkout and unpacked into an empty folder, and every figure comes from
+Python processes that import it from there, medians of repeats:
+
+- imports, and commands that need no simulation;
+- from the end of `import torch`: the first run of 0.3 s, then the first gradient and the first
+  sensitivities, with the kernels of the wheel and, once, with none: then they are compiled;
+- the second run, a run of 0.1 s from a state at hand, and 1,000 runs of 0.3 s on one and two
+  threads, each with parameters of its own.
+
+Command: .venv/bin/python experiments/startup.py [--smoke]
+Expected: a first result 1.5 s after `import torch`, 15 s where the kernels are compiled. Two
+minutes on two cores.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from tqdm import tqdm
+
+from torchsoft.experiment import numbers, options, timed, write
+from torchsoft.solve.kernel.objects import level
+
+ROOT = Path(__file__).resolve().parents[1]
+
+FIRST = """
+import json, sys, time
+import torch
+torch.set_num_threads(1)
+start = last = time.perf_counter()
+def passed():
+    global last
+    now = time.perf_counter()
+    out, last = now - last, now
+    return out
+from torchsoft import SoftGrasp, simulate
+from torchsoft.scenario import grasp_and_roll
+m = grasp_and_roll(SoftGrasp(), grasp_force=80.66)
+t = torch.linspace(0, 0.3, 31, dtype=torch.float64)
+prepared = passed()
+simulate(m.model, t, y0=m.y0, rtol=1e-3)
+times = {"model": prepared, "first run": passed(), "first result": time.perf_counter() - start}
+simulate(m.model, t, y0=m.y0, rtol=1e-3)
+times["second run"] = passed()
+simulate(m.model, t, y0=m.y0, rtol=1e-3, gradient="discrete")["theta"].sum().backward()
+times["first gradient"] = passed()
+simulate(m.model, t, y0=m.y0, rtol=1e-3, gradient="forward", wrt=["contact.K_n"])
+times["first sensitivities"] = passed()
+print(json.dumps(times))
+"""
+
+SHORT = """
+import json, statistics, sys, time
+import torch
+torch.set_num_threads(1)
+from torchsoft import SoftGrasp, simulate, simulate_batch
+from torchsoft.scenario import grasp_and_roll
+count, m = int(sys.argv[1]), grasp_and_roll(SoftGrasp(), grasp_force=80.66)
+def timed(function):
+    start = time.perf_counter()
+    function()
+    return time.perf_counter() - start
+t, short = (torch.linspace(0, x, n, dtype=torch.float64) for x, n in ((0.3, 31), (0.1, 11)))
+one = [timed(lambda: simulate(m.model, short, y0=m.y0, rtol=1e-3)) for _ in range(21)]
+K_n = m.model.parameter("contact.K_n").detach() * torch.linspace(0.8, 1.2, count).double()
+def batch(threads):
+    simulate_batch(
+        m.model, t, y0=m.y0, rtol=1e-3, parameters={"contact.K_n": K_n}, threads=threads
+    )
+runs = {f"{count} runs, {n} threads": timed(lambda: batch(n)) for n in (1, 2)}
+print(json.dumps({"0.1 s run": statistics.median(one[1:])} | runs))
+"""
+
+
+@dataclass(frozen=True)
+class Config:
+    out: Path = Path("out/startup")
+    repeats: int = 5  # processes of which the median is taken
+    runs: int = 1000  # of the batch of short runs
+    smoke: bool = False  # a size that takes seconds
+
+
+def unpacked(folder: Path) -> Path:
+    """The wheel of this checkout, unpacked; where to import it from."""
+    build = [sys.executable, "-m", "torchsoft.solve.kernel.build"]
+    subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    made, site = folder / "wheel", folder / "site"
+    wheel = [*pip, "wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", made, ROOT]
+    subprocess.run(wheel, check=True)
+    install = [*pip, "install", "--no-deps", "--target", site, *made.glob("*.whl")]
+    subprocess.run(install, check=True)
+    return site
+
+
+def python(site: Path, *arguments: object, **environment: str) -> str:
+    """What a new process prints that imports the package from `site`."""
+    command = [sys.executable, *map(str, arguments)]
+    given = os.environ | {"PYTHONPATH": str(site), "OMP_NUM_THREADS": "1"} | environment
+    ended = subprocess.run(
+        command, env=given, cwd=site.parent, capture_output=True, text=True, check=False
+    )
+    if ended.returncode not in (0, 1):
+        raise RuntimeError(ended.stderr)
+    return ended.stdout
+
+
+def medians(rows: Iterable[dict[str, float]]) -> dict[str, float]:
+    """Of every figure."""
+    every = list(rows)
+    return {name: median(row[name] for row in every) for name in every[0]}
+
+
+def main(config: Config) -> None:
+    repeats, runs = (1, 20) if config.smoke else (config.repeats, config.runs)
+    result: dict[str, Any] = {"level": level()}
+    with TemporaryDirectory() as name, tqdm(total=2 * repeats + 3) as bar:
+        folder = Path(name)
+        site = unpacked(folder)
+        wrong = folder / "wrong.toml"
+        wrong.write_text("[bodies.disc]\nradius = 0.02\n", encoding="utf-8")
+        commands = {
+            "import torch": ("-c", "import torch"),
+            "import torchsoft": ("-c", "import torchsoft"),
+            "--help": ("-m", "torchsoft.cli", "--help"),
+            "--version": ("-m", "torchsoft.cli", "--version"),
+            "check of a wrong file": ("-m", "torchsoft.cli", "check", wrong),
+        }
+        bar.update()
+        rows, firsts = [], []
+        for _ in range(repeats):
+            rows.append({k: timed(lambda v=v: python(site, *v))[1] for k, v in commands.items()})
+            bar.update()
+        for _ in range(repeats):
+            firsts.append(json.loads(python(site, "-c", FIRST)))
+            bar.update()
+        result |= {"processes_s": medians(rows), "wheel_s": medians(firsts)}
+        result["short_runs_s"] = json.loads(python(site, "-c", SHORT, runs))
+        bar.update()
+        for path in (site / "torchsoft/solve/kernel/objects").rglob("*.o"):
+            path.unlink()
+        empty = {"TORCHSOFT_CACHE_DIR": str(folder / "cache")}
+        result["fallback_s"] = json.loads(python(site, "-c", FIRST, **empty))
+        bar.update()
+    table = "\n\n".join(
+        [
+            numbers("process, wall time [s]", {"median": result["processes_s"]}, 3),
+            numbers(
+                "kernels, wall time [s]",
+                {"of the wheel": result["wheel_s"], "compiled": result["fallback_s"]},
+                3,
+            ),
+            numbers("short runs, wall time [s]", {"": result["short_runs_s"]}, 3),
+        ]
+    )
+    write(config, result, table=table)
+
+
+if __name__ == "__main__":
+    main(options(Config, __doc__))

@@ -1,0 +1,169 @@
+"""Identification of the rig that a rig file describes, by the names of that file."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from torchsoft import simulate
+from torchsoft.physics.motion import Sampled
+from torchsoft.rigs.build import RigFile
+from torchsoft.solve.trajectory import Trajectory
+from torchsoft.sysid import identify
+from torchsoft.sysid.measured import load
+from torchsoft.sysid.rig_recordings import vocabulary
+
+RIG = Path(__file__).parents[1] / "rigs" / "two_fingers.toml"
+SENSORS = {"x_disc": 10e-6, "y_disc": 10e-6, "x_left": 10e-6, "F_left_x": 0.05}
+TRUTH: dict[str, float] = {"materials.silicone.E": 0.45e6, "actuators.left_x.Kd": 180.0}
+FIT = """
+rig = "rig.toml"
+start = {kind = "rest", lead = 0.0}
+columns.camera = "x_disc"
+[settings]
+pads.table.elements_x = 25
+pads.left_tip.elements_x = 18
+pads.right_tip.elements_x = 18
+[unknowns]
+"materials.silicone.E" = {}
+"actuators.left_x.Kd" = {}
+[sensors]
+x_disc.noise = 1e-5
+y_disc.noise = 1e-5
+x_left.noise = 1e-5
+F_left_x.noise = 0.05
+"""
+
+
+def coarse(**groups: Any) -> RigFile:
+    tips = {name: {"elements_x": 18} for name in ("left_tip", "right_tip")}
+    file = RigFile.from_toml(RIG).override(pads={"table": {"elements_x": 25}, **tips})
+    return file.override(**groups)
+
+
+@pytest.fixture(scope="module")
+def run() -> Trajectory:
+    """The truth: the fingers close and lift the disc."""
+    rig, y0, _ = coarse(
+        materials={"silicone": {"E": TRUTH["materials.silicone.E"]}},
+        actuators={"left_x": {"Kd": TRUTH["actuators.left_x.Kd"]}},
+    ).build()
+    return simulate(rig, torch.linspace(0, 1.2, 241, dtype=torch.float64), y0=y0, rtol=1e-6)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, run: Trajectory) -> Path:
+    """The rig's file, a recording, and what is to be found."""
+    noise = np.random.default_rng(1)
+    (tmp_path / "rig.toml").write_text(RIG.read_text(encoding="utf-8"), encoding="utf-8")
+    (tmp_path / "fit.toml").write_text(FIT, encoding="utf-8")
+    columns = [run[name].numpy() + sd * noise.standard_normal(241) for name, sd in SENSORS.items()]
+    head = "t [s],camera [mm],y_disc [mm],x_left [mm],F_left_x [N]"
+    table = np.stack([run.t.numpy(), *(1e3 * x for x in columns[:3]), columns[3]], 1)
+    np.savetxt(tmp_path / "run.csv", table, "%.9g", ",", header=head, comments="")
+    return tmp_path
+
+
+def test_numbers_of_a_rig_file_are_found_by_their_names(folder: Path) -> None:
+    case = load([folder / "run.csv"], folder / "fit.toml")
+    result = identify(case.problem, **case.config.fit.model_dump() | {"assumptions": "trusted"})
+    for one in result.estimates:
+        assert one.value == pytest.approx(TRUTH[one.name], rel=4 * one.relative_sd)
+        assert one.relative_sd < 0.05
+    assert result.chi2 == pytest.approx(1.0, abs=0.15)
+
+
+def test_parameters_have_the_names_of_their_tables() -> None:
+    rig, y0, _ = coarse().build()
+    assert rig.parameter("materials.silicone.E") is rig.pads["left_tip"].material.E
+    assert rig.parameter("laws.dry.friction.mu_s") is rig.contacts["left"].law.friction.mu_s
+    assert rig.parameter("bodies.left.inertia").item() == 1e-4
+    assert (declared := rig.quantity("laws.dry.K_n")) is not None
+    assert declared.unit == "N/m"
+    t = torch.linspace(0, 0.05, 6, dtype=torch.float64)
+    by = simulate(rig, t, y0=y0, gradient="forward", wrt=["materials.silicone.E"], rigid=True)
+    own = simulate(rig, t, y0=y0, gradient="forward", wrt=["pads.table.material.E"], rigid=True)
+    assert by.sensitivities is not None
+    assert torch.equal(by.sensitivities, own.sensitivities)  # pyright: ignore[reportArgumentType]
+
+
+def test_a_recorded_signal_takes_the_place_of_the_files_motion(folder: Path) -> None:
+    rows = (folder / "run.csv").read_text(encoding="utf-8").splitlines()
+    wave = [f"{row},{-24 + 0.001 * i:.4f}" for i, row in enumerate(rows[1:])]
+    text = "\n".join([f"{rows[0]},left_close [mm]", *wave])
+    (folder / "run.csv").write_text(text, encoding="utf-8")
+    rig = load([folder / "run.csv"], folder / "fit.toml").problem.recordings[0].rig
+    at = torch.tensor([0.5], dtype=torch.float64)
+    assert isinstance(rig.reference["left_close"], Sampled)
+    assert float(rig.follow(at)[0, 0, 0]) == pytest.approx(-23.9e-3)
+    motion = coarse().build().rig.reference["right_close"]
+    assert torch.equal(rig.reference["right_close"](at)[0], motion(at)[0])
+
+
+def test_a_trajectory_file_of_the_rig_is_a_recording(folder: Path, run: Trajectory) -> None:
+    run.save(folder / "run.nc")
+    fit = (folder / "fit.toml").read_text(encoding="utf-8").replace('columns.camera = "x_disc"', "")
+    (folder / "fit.toml").write_text(fit, encoding="utf-8")
+    recording = load([folder / "run.nc"], folder / "fit.toml").problem.recordings[0]
+    assert np.array_equal(recording.samples["x_disc"][1], run["x_disc"].numpy())
+    assert isinstance(recording.rig.reference["lean"], Sampled)
+
+
+def replaced(old: str, new: str) -> Callable[[str], str]:
+    return lambda text: text.replace(old, new)
+
+
+CSV, TOML = "run.csv", "fit.toml"
+REFUSALS: dict[str, tuple[str, Callable[[str], str], str]] = {
+    "sensor": (TOML, replaced("x_left.n", "x_lft.n"), "`x_lft` is not a channel; known: x_disc"),
+    "heading": (TOML, replaced('"x_disc"', '"x_dsc"'), "columns.camera = 'x_dsc' is no channel"),
+    "unknown": (TOML, replaced("left_x.Kd", "left_x.Ki"), "`actuators.left_x.Ki` cannot be"),
+    "paper's pads": (
+        TOML,
+        lambda text: text + '[pads]\nkind = "kelvin_voigt"\n',
+        "pads are of the paper's rig; say it in the rig file",
+    ),
+    "missing": (
+        TOML,
+        lambda text: text + "[missing]\nF_ff = 0.0\n",
+        "missing are of the paper's rig",
+    ),
+    "no file": (TOML, replaced('"rig.toml"', '"none.toml"'), "rig: none.toml: No such file"),
+    "bad file": ("rig.toml", replaced("mass = 0.25", "mas = 0.25"), "rig: .*`mas` is not known"),
+    "settings": (TOML, replaced("table.elements_x", "table.elements"), "settings.*`elements`"),
+    "known place": (
+        TOML,
+        replaced("lead = 0.0", "position_sd = 1e-3"),
+        "position_sd is of the paper's rig",
+    ),
+    "columns alone": (TOML, replaced('rig = "rig.toml"', ""), "columns rename those of a `rig`"),
+    "unit": (CSV, replaced("camera [mm]", "camera [kg]"), "column `camera` cannot be in 'kg'"),
+    "column": (CSV, replaced("y_disc", "y_dsk"), "`y_dsk` is not known: is it `y_disc`"),
+    "own name": (CSV, replaced("camera", "x_disc"), "`x_disc` is not known"),
+    "elsewhere": (
+        CSV,
+        replaced(",19.8", ",24.8"),
+        "column `y_disc`: it begins at .*, but the rig file at",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_what_a_rig_cannot_be_identified_from_is_refused(folder: Path, case: str) -> None:
+    name, change, words = REFUSALS[case]
+    text = (folder / name).read_text(encoding="utf-8")
+    assert change(text) != text
+    (folder / name).write_text(change(text), encoding="utf-8")
+    with pytest.raises(ValueError, match=words):
+        load([folder / "run.csv"], folder / "fit.toml")
+
+
+def test_columns_are_channels_and_signals_with_a_unit() -> None:
+    known = vocabulary(coarse().assemble(), {})
+    assert known.units["lean"] == "rad"
+    assert known.units["right_lift_dot"] == "m/s"
+    assert "theta_disc" in known.measured
+    assert "lean" not in known.measured

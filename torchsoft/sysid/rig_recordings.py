@@ -1,0 +1,126 @@
+"""Recordings of the rig that a rig file describes.
+
+Columns are the rig's own channels and signals, by the names that a run of the file writes. A signal
+without a column is the file's own motion, counted from the same zero of time.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+
+from torchsoft.channels import UNITS
+from torchsoft.physics.motion import Reference, Sampled
+from torchsoft.physics.rig import Rig
+from torchsoft.rigs.build import RigFile
+from torchsoft.solve.trajectory import channels, measurable, units
+from torchsoft.sysid.columns import Tables, Vocabulary
+from torchsoft.sysid.configuration import Beginning, Moving
+from torchsoft.sysid.first_samples import estimate_initial_state
+from torchsoft.sysid.initial_state import Standing
+from torchsoft.sysid.recording import Recording
+from torchsoft.sysid.unknowns import Sensor
+from torchsoft.tables import shown
+
+APART = {"m": 1e-3, "rad": 0.05}
+"""How far [m, rad] the first sample of a coordinate may be from the file's start, besides what its
+sensor does."""
+
+
+def vocabulary(rig: Rig, headings: Mapping[str, str]) -> Vocabulary:
+    """Columns that recordings of a rig may have. Raises `ValueError` for a heading that stands for
+    something else."""
+    known, signals = units(rig), rig.signals
+    names = (*signals, *(f"{name}_dot" for name in signals), *measurable(rig))
+    columns = {"t": "s"} | {name: known[name] for name in names if known[name] in UNITS}
+    for heading, name in headings.items():
+        if name not in columns:
+            raise ValueError(
+                f"columns.{heading} = {shown(name)} is no channel of the rig; there are "
+                f"{', '.join(columns)}"
+            )
+    return Vocabulary(columns, signals, headings=headings)
+
+
+def sampled(t: np.ndarray, y: np.ndarray, rate: tuple[np.ndarray, np.ndarray] | None) -> Sampled:
+    """A set-point, with the rate of its column, if there is one."""
+    times, values = torch.tensor(t), torch.tensor(y)
+    return Sampled(times, values, None if rate is None else torch.tensor(rate[1]))
+
+
+def measured_samples(
+    tables: Tables, sensors: Mapping[str, Sensor]
+) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Times [s] and values of every measured channel, without gaps. Raises `ValueError` for a
+    sensor with fewer than two samples, and where no sensor has any."""
+    samples = {}
+    for channel in (c for c in tables.known.measured if c in tables):
+        t, y = tables.columns[channel]
+        here = np.isfinite(y)
+        if here.sum() >= 2:
+            samples[channel] = (t[here], y[here])
+        elif channel in sensors:
+            raise ValueError(
+                f"{tables.of(channel).path}, column `{channel}` has {here.sum()} samples, but "
+                "needs at least two"
+            )
+    if not set(samples) & set(sensors):
+        files = ", ".join(str(table.path) for table in tables.tables)
+        raise ValueError(f"{files} has no column for any of the sensors {', '.join(sensors)}")
+    return samples
+
+
+def moving(made: Recording, sensors: Mapping[str, Sensor], start: Moving) -> Recording:
+    """The recording with a start in motion, which its first samples tell."""
+    given = {coordinate: (one.mean, one.sd) for coordinate, one in start.given.items()}
+    used = {channel: sensors[channel] for channel in sensors if channel in made.samples}
+    return estimate_initial_state(made, used, lead=start.lead, given=given)
+
+
+def rig_recording(
+    file: RigFile, tables: Tables, name: str, sensors: Mapping[str, Sensor], start: Beginning
+) -> Recording:
+    """The recording that tables hold, of the rig of a file. Raises `ValueError` naming row and
+    column, or the file's field."""
+    rig, y0, _ = file.build()
+    columns, samples = tables.columns, measured_samples(tables, sensors)
+    rig.reference = Reference(
+        **{
+            signal: sampled(*columns[signal], columns.get(f"{signal}_dot"))
+            if signal in columns
+            else rig.reference[signal]
+            for signal in rig.signals
+        }
+    )
+    made = Recording(name, rig, samples, Standing.of(rig, y0, start.lead))
+    if isinstance(start, Moving):
+        return moving(made, sensors, start)
+    if start.position_sd:
+        raise ValueError(
+            "start.position_sd is of the paper's rig; where the places of bodies are not known, "
+            'say start = {kind = "moving"}'
+        )
+    check_start(made, y0, tables, sensors)
+    return made
+
+
+def check_start(
+    made: Recording, y0: torch.Tensor, tables: Tables, sensors: Mapping[str, Sensor]
+) -> None:
+    """Raises `ValueError` naming row and column for a coordinate that does not begin where the rig
+    file says."""
+    rig = made.rig
+    with torch.no_grad():
+        signals = rig.follow(made.times[0])
+        here = channels(rig, rig.unpack(y0, signals), signals)
+    for channel, (t, y) in made.samples.items():
+        unit, sensor = made.units[channel], sensors.get(channel)
+        slack = 8 * sensor.noise + sensor.bias if sensor else 0.0
+        if unit in APART and abs(y[0] - float(here[channel])) > APART[unit] + slack:
+            table = tables.of(channel)
+            row = int(np.searchsorted(table.values["t"], t[0]))
+            raise ValueError(
+                f"{table.at(row)}, column `{channel}`: it begins at {y[0]:.5g} {unit}, but the "
+                f"rig file at {float(here[channel]):.5g} {unit}; say so there, or say start = "
+                '{kind = "moving"} for a recording that begins elsewhere'
+            )
