@@ -34,7 +34,8 @@ FLOWS = {
         synthetic fit plan setpoints prechecks
         residual_tests assumptions sensitivity profile posterior nuts estimate comparison
         result identification compare
-        columns configuration rig_recordings measured criterion planner design figures report .
+        columns configuration rig_recordings rehearsal measured
+        criterion planner design figures report .
     """,
     "rigs": "fields parts control motion geometry build course balance check written run .",
     "cli": "results rigs identify material .",

@@ -72,6 +72,7 @@ def test_help_names_every_command_argument_and_option(capsys: Any) -> None:
         (["material", "presets", "--help"], ("published",)),
         (["identify", "--help"], ("DATA.csv", "CONFIG.toml", *OPTIONS)),
         (["explain", "--help"], ("DATA.csv", "CONFIG.toml", *OPTIONS)),
+        (["rehearse", "--help"], ("CONFIG.toml", *OPTIONS)),
         (["--version"], ("torchsoft 0.",)),
     ):
         with pytest.raises(SystemExit) as end:

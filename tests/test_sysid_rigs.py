@@ -1,5 +1,6 @@
 """Identification of the rig that a rig file describes, by the names of that file."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,10 +10,11 @@ import pytest
 import torch
 
 from torchsoft import simulate
+from torchsoft.cli import main
 from torchsoft.physics.motion import Sampled
 from torchsoft.rigs.build import RigFile
 from torchsoft.solve.trajectory import Trajectory
-from torchsoft.sysid import identify
+from torchsoft.sysid import identify, load_answer
 from torchsoft.sysid.measured import load
 from torchsoft.sysid.rig_recordings import vocabulary
 
@@ -167,3 +169,53 @@ def test_columns_are_channels_and_signals_with_a_unit() -> None:
     assert known.units["right_lift_dot"] == "m/s"
     assert "theta_disc" in known.measured
     assert "lean" not in known.measured
+
+
+PLAN = FIT.replace(
+    'start = {kind = "rest", lead = 0.0}',
+    'rehearsal = {duration = 0.6, seed = 3}\nfit = {assumptions = "trusted"}',
+)
+
+
+def test_a_rehearsal_says_what_an_experiment_would_identify(folder: Path) -> None:
+    """Its recording is a template of the real one: the same configuration takes it."""
+    (folder / "plan.toml").write_text(PLAN, encoding="utf-8")
+    out = folder / "out"
+    asked = ["rehearse", str(folder / "plan.toml"), "--out", str(out), "--no-progress"]
+    assert main(asked) == 0
+    answer = load_answer(out / "answer.json")
+    truth = {"materials.silicone.E": 0.5e6, "actuators.left_x.Kd": 150.0}
+    for one in answer.estimates:
+        assert one.start is not None
+        assert one.value is not None
+        assert abs(np.log(one.start / truth[one.name])) == pytest.approx(np.log(1.3))
+        assert one.value == pytest.approx(truth[one.name], rel=4 * one.relative_sd)
+    head, first, *rows = (out / "rehearsal.csv").read_text(encoding="utf-8").splitlines()
+    assert head.startswith("t [s],left_close [m],left_lift [m],lean [rad]")
+    assert "camera [m]" in head
+    assert first.startswith("0,-0.024,")
+    assert len(rows) == 120
+    made = load([out / "rehearsal.csv"], folder / "plan.toml").problem.recordings[0]
+    assert made.samples["x_disc"][1].std() > 0
+
+
+@pytest.mark.parametrize(
+    ("change", "more", "words"),
+    [
+        (replaced('rig = "rig.toml"', ""), (), "columns rename those of a `rig` file"),
+        (
+            lambda text: text,
+            ("run.csv",),
+            "a rehearsal makes its own data: leave .*run.csv out",
+        ),
+        (replaced("F_left_x.n", "F_lft_x.n"), (), "the rig has no channel `F_lft_x`"),
+        (replaced("duration = 0.6", "duration = 0"), (), "rehearsal.duration"),
+    ],
+)
+def test_what_cannot_be_rehearsed_is_refused(
+    folder: Path, change: Callable[[str], str], more: tuple[str, ...], words: str, capsys: Any
+) -> None:
+    (folder / "plan.toml").write_text(change(PLAN), encoding="utf-8")
+    files = [str(folder / name) for name in ("plan.toml", *more)]
+    assert main(["rehearse", *files, "--out", str(folder / "out"), "--no-progress"]) == 2
+    assert re.search(words, capsys.readouterr().err)

@@ -27,11 +27,20 @@ minutes each, the progress names which. With the checkpoint of an identification
 that ended."""
 
 
+REHEARSE = """\
+What would this experiment identify?
+
+Simulates the recordings that CONFIG.toml plans (a rig file, its motions, sensors with their noise,
+[rehearsal] with the rate), identifies from them, and shows which numbers would come out, with which
+intervals. The CSV files it writes are templates of those to record."""
+
+
 def add_commands(commands: Any) -> None:
-    """The commands that identify and that explain a misfit."""
+    """The commands that identify, that explain a misfit, and that rehearse."""
     for name, help, description in (
         ("identify", "find parameters in recordings", IDENTIFY),
         ("explain", "find what is wrong where a model does not explain recordings", EXPLAIN),
+        ("rehearse", "find what an experiment would identify, before it is done", REHEARSE),
     ):
         add_command(commands.add_parser(
             name, help=help, description=description,
@@ -45,7 +54,7 @@ def add_command(one: argparse.ArgumentParser) -> None:
         "files",
         nargs="+",
         type=Path,
-        metavar="DATA.csv ... CONFIG.toml",
+        metavar="CONFIG.toml" if one.prog.endswith("rehearse") else "DATA.csv ... CONFIG.toml",
         help="data files and one configuration",
     )
     add_out(one, default=Path("out/identify"), help="folder for the results (%(default)s)")
@@ -62,7 +71,8 @@ def add_command(one: argparse.ArgumentParser) -> None:
         "--yes", action="store_true", help="begin even what takes hours, or much memory"
     )
     one.add_argument("--no-progress", action="store_true", help="show no progress")
-    one.set_defaults(run=identify, explains=one.prog.endswith("explain"))
+    verb = one.prog.split()[-1]
+    one.set_defaults(run=identify, explains=verb == "explain", rehearses=verb == "rehearse")
 
 
 def identify(options: argparse.Namespace) -> int:
@@ -83,7 +93,16 @@ def identify(options: argparse.Namespace) -> int:
 
         tables: dict[str, Any] = {}
         try:
-            case = measured.load(data, configs[0])
+            stated = None
+            if options.rehearses:
+                from torchsoft.sysid.rehearsal import rehearsed
+
+                if data:
+                    return failed(f"a rehearsal makes its own data: leave {data[0]} out")
+                try_folder(options.out, options.force)
+                planned = measured.read_config(configs[0])
+                stated, data = rehearsed(configs[0], planned, options.out)
+            case = measured.load(data, configs[0], stated)
             fit, tables = case.config.fit, case.tables
             changed = {
                 "rtol": options.rtol, "workers": options.workers,
@@ -96,7 +115,8 @@ def identify(options: argparse.Namespace) -> int:
             priced = (fit.rtol, fit.starts, fit.workers, heldout, fit.method)
             expected = one_by_one(cost(problem, *priced) for problem in problems)
             agree(expected, options.yes, "take a larger rtol, fewer starts or less data")
-            try_folder(options.out, options.force)
+            if stated is None:
+                try_folder(options.out, options.force)
             result = identify(
                 case.problem, heldout=heldout, acknowledged=case.config.acknowledged,
                 checkpoint=unfinished, progress=not options.no_progress, **fit.model_dump(),

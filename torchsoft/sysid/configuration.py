@@ -165,6 +165,17 @@ class Law(Table):
     without: Annotated[tuple[str, ...], LISTED] = ()
 
 
+class Rehearsal(Table):
+    """Of a rehearsal: samples a second, the recordings' `duration` [s] (that of the rig file if not
+    given), the `seed` of the noise, and the factor by which the search begins `away` from the
+    truth."""
+
+    rate: float = Field(default=200.0, ge=1.0, le=1e5)
+    duration: float | None = Field(default=None, ge=1e-2, le=1e4)
+    seed: int = Field(default=0, ge=0)
+    away: float = Field(default=1.3, ge=1.0, le=3.0)
+
+
 class Config(Table):
     """An identification as a TOML file states it.
 
@@ -188,6 +199,7 @@ class Config(Table):
     fit: Settings = Field(default_factory=lambda: Settings.model_validate({}))
     recordings: Annotated[tuple[Entry, ...], LISTED] = ()
     compare: dict[Name, Law] = Field(default_factory=dict)
+    rehearsal: Rehearsal = Rehearsal()
     heldout: Annotated[tuple[str, ...], LISTED] = ()
     ignore: Annotated[tuple[str, ...], LISTED] = ()
     acknowledged: Annotated[tuple[str, ...], LISTED] = ()

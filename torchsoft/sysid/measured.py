@@ -397,11 +397,12 @@ def sources(
     return {name: (own.get(name, Entry(name=name)), paths) for name, paths in files}
 
 
-def load(data: Sequence[str | Path], config: str | Path) -> Case:
-    """The problem that data files and a configuration state. Raises `ValueError`, and `OSError` for
+def load(data: Sequence[str | Path], config: str | Path, stated: Config | None = None) -> Case:
+    """The problem that data files and a configuration state; `stated` is what the file says, where
+    that is known already. Raises `ValueError`, and `OSError` for
     what cannot be read."""
     config = Path(config)
-    stated = read_config(config)
+    stated = read_config(config) if stated is None else stated
     entries, tables = sources(data, config, stated), dict[str, Tables]()
     file, columns = None, PAPER
     if stated.rig is not None:
