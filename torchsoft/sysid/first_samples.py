@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.contact import cross
-from torchsoft.physics.parts import Contact
+from torchsoft.physics.parts import PD, Contact
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
 from torchsoft.physics.statics import NoEquilibrium, settled
@@ -90,7 +90,10 @@ def estimate_initial_state(
     }
     samples = {c: (t[late[c]], y[late[c]]) for c, (t, y) in recording.samples.items()}
     lead = min(float(t[0]) for t, _ in samples.values()) - first
-    bodies = completed(rig, measured(rig, early, sensors, whose) | dict(given or {}), first)
+    efforts = [abs(y).max() for c, (_, y) in early.items() if recording.units[c] == "N"]
+    weight = sum(one.mass.item() for one in rig.bodies.values()) * rig.gravity.item()
+    load = float(max(efforts, default=weight))
+    bodies = completed(rig, measured(rig, early, sensors, whose) | dict(given or {}), first, load)
     return replace(
         recording,
         samples=samples,
@@ -146,8 +149,9 @@ def beginning(what: str, t: Array, y: Array, sensor: Sensor, other: float) -> tu
     )
 
 
-def completed(rig: Rig, known: Mapping[str, Normal], at: float) -> dict[str, Normal]:
-    """All coordinates of the bodies at a time [s], where some are known. Raises `ValueError` for
+def completed(rig: Rig, known: Mapping[str, Normal], at: float, load: float) -> dict[str, Normal]:
+    """All coordinates of the bodies at a time [s], where some are known; loops give way under a
+    `load` [N]. Raises `ValueError` for
     one that nothing tells."""
     out, names, signals = dict(known), free_coordinates(rig), rig.follow(at).detach()
     pairs = [pair for a in rig.actuators.values() for pair in a.follows]
@@ -159,9 +163,8 @@ def completed(rig: Rig, known: Mapping[str, Normal], at: float) -> dict[str, Nor
             continue
         if name in followed:
             value, rate = signals[followed[name]].tolist()
-            out = (
-                {f"{body}.v_{axis}": (rate, SPEED / size)} | out | {name: (value, FOLLOWED / size)}
-            )
+            sd = float(np.hypot(FOLLOWED / size, load * yielding(rig, name)))
+            out = {f"{body}.v_{axis}": (rate, SPEED / size)} | out | {name: (value, sd)}
         elif axis == "theta" and shape is not None and shape.round:
             out[name] = 0.0, 0.0
         elif isinstance(rig, SoftGrasp) and name == "disc.y" and "bracket.y" in out:
@@ -178,11 +181,26 @@ def completed(rig: Rig, known: Mapping[str, Normal], at: float) -> dict[str, Nor
     return {name: out[name] for name in names}
 
 
+def yielding(rig: Rig, coordinate: str) -> float:
+    """How far a coordinate's loop gives way to a force [m/N or rad/N], at the moment arm of its
+    body for an angle; zero where no stiffness is known."""
+    arm = reach(rig, *coordinate.split(".")) if coordinate.endswith(".theta") else 1.0
+    gains = [
+        actuator.law.Kp.item()
+        for actuator in rig.actuators.values()
+        if isinstance(actuator.law, PD) and coordinate in dict(actuator.follows)
+    ]
+    return max((arm / gain for gain in gains if gain > 0), default=0.0)
+
+
 def reach(rig: Rig, body: str, axis: str) -> float:
-    """What a standard deviation in metres is divided by for a coordinate: the size of the body [m]
-    for an angle, else one."""
+    """What a standard deviation in metres is divided by for a coordinate: the size of the body [m],
+    or half of its longest pad, for an angle, else one."""
     shape = rig.bodies[body].shape
-    return shape.size() if axis == "theta" and shape is not None else 1.0
+    pads = [0.5 * float(pad.mesh.length) for pad in rig.pads.values() if pad.base == body]
+    if axis != "theta":
+        return 1.0
+    return shape.size() if shape is not None else max(pads, default=1.0)
 
 
 def rolling(
