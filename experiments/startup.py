@@ -32,6 +32,8 @@ from torchsoft.solve.kernel.objects import level
 
 ROOT = Path(__file__).resolve().parents[1]
 
+COMMAND = "from torchsoft.cli import main; raise SystemExit(main())"
+
 FIRST = """
 import json, sys, time
 import torch
@@ -109,7 +111,7 @@ def python(site: Path, *arguments: object, **environment: str) -> str:
     ended = subprocess.run(
         command, env=given, cwd=site.parent, capture_output=True, text=True, check=False
     )
-    if ended.returncode not in (0, 1):
+    if ended.returncode not in (0, 2):  # 2: a file that is refused
         raise RuntimeError(ended.stderr)
     return ended.stdout
 
@@ -131,9 +133,9 @@ def main(config: Config) -> None:
         commands = {
             "import torch": ("-c", "import torch"),
             "import torchsoft": ("-c", "import torchsoft"),
-            "--help": ("-m", "torchsoft.cli", "--help"),
-            "--version": ("-m", "torchsoft.cli", "--version"),
-            "check of a wrong file": ("-m", "torchsoft.cli", "check", wrong),
+            "--help": ("-c", COMMAND, "--help"),
+            "--version": ("-c", COMMAND, "--version"),
+            "check of a wrong file": ("-c", COMMAND, "check", wrong),
         }
         bar.update()
         rows, firsts = [], []

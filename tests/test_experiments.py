@@ -298,3 +298,13 @@ def test_the_theories_of_rolling_meet() -> None:
     thin = [theory.winkler(at, rubber, 5.0, v)[0] for v in speeds]
     assert moving == pytest.approx(thin, rel=0.03)
     assert theory.peak(speeds, moving)[0] == pytest.approx(theory.peak(speeds, thin)[0], rel=0.03)
+
+
+@pytest.mark.slow
+def test_startup_smoke(tmp_path: Path) -> None:
+    """Kernels of the wheel are as good as loaded; those that are missing are compiled."""
+    module = experiment("startup")
+    module.main(module.Config(out=tmp_path, smoke=True))
+    found = json.loads((tmp_path / "summary.json").read_text())
+    assert found["wheel_s"]["first run"] < 0.2 * found["fallback_s"]["first run"]
+    assert found["processes_s"]["import torchsoft"] < found["processes_s"]["import torch"]
