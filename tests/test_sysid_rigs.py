@@ -145,6 +145,16 @@ REFUSALS: dict[str, tuple[str, Callable[[str], str], str]] = {
     "unit": (CSV, replaced("camera [mm]", "camera [kg]"), "column `camera` cannot be in 'kg'"),
     "column": (CSV, replaced("y_disc", "y_dsk"), "`y_dsk` is not known: is it `y_disc`"),
     "own name": (CSV, replaced("camera", "x_disc"), "`x_disc` is not known"),
+    "too long": (
+        TOML,
+        replaced("[settings]", "[settings]\noutputs = {duration = 0.5, snapshots = []}"),
+        "row 242, column `t`: 1.2 s is after the end of the file's own motions, 0.5 s",
+    ),
+    "begun before": (
+        CSV,
+        lambda text: re.sub(r"(?m)^0\.?[01]?\d*,.*\n", "", text),
+        "column `t`: a recording that begins at rest .* at 0 s, not at 1 s",
+    ),
     "elsewhere": (
         CSV,
         replaced(",19.8", ",24.8"),

@@ -26,6 +26,9 @@ APART = {"m": 1e-3, "rad": 0.05}
 """How far [m, rad] the first sample of a coordinate may be from the file's start, besides what its
 sensor does."""
 
+SLACK = 0.05
+"""Time [s] by which a recording may begin after the file's own motions, or end after them."""
+
 
 def vocabulary(rig: Rig, headings: Mapping[str, str]) -> Vocabulary:
     """Columns that recordings of a rig may have. Raises `ValueError` for a heading that stands for
@@ -84,6 +87,7 @@ def rig_recording(
     column, or the file's field."""
     rig, y0, _ = file.build()
     columns, samples = tables.columns, measured_samples(tables, sensors)
+    check_clock(file, rig, tables, start)
     rig.reference = Reference(
         **{
             signal: sampled(*columns[signal], columns.get(f"{signal}_dot"))
@@ -102,6 +106,27 @@ def rig_recording(
         )
     check_start(made, y0, tables, sensors)
     return made
+
+
+def check_clock(file: RigFile, rig: Rig, tables: Tables, start: Beginning) -> None:
+    """Raises `ValueError` naming row and column for times outside the file's own motions, where a
+    signal has no column, and for a recording at rest that begins after their start."""
+    own = [signal for signal in rig.signals if signal not in tables]
+    end = file.outputs.duration
+    for table in tables.tables if own else ():
+        t = table.values["t"]
+        if t[-1] > end + SLACK:
+            raise ValueError(
+                f"{table.at(-1)}, column `t`: {t[-1]:g} s is after the end of the file's own "
+                f"motions, {end:g} s, which `{own[0]}` follows; count times from their start, give "
+                "a column of it, or say in the settings how long they last, outputs.duration"
+            )
+        if not isinstance(start, Moving) and t[0] > SLACK:
+            raise ValueError(
+                f"{table.at(0)}, column `t`: a recording that begins at rest begins with the "
+                f"file's own motions, at 0 s, not at {t[0]:g} s; count times from there, or say "
+                'start = {kind = "moving"}'
+            )
 
 
 def check_start(
