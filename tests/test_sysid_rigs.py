@@ -63,7 +63,7 @@ def folder(tmp_path: Path, run: Trajectory) -> Path:
     (tmp_path / "rig.toml").write_text(RIG.read_text(encoding="utf-8"), encoding="utf-8")
     (tmp_path / "fit.toml").write_text(FIT, encoding="utf-8")
     columns = [run[name].numpy() + sd * noise.standard_normal(241) for name, sd in SENSORS.items()]
-    head = "t [s],camera [mm],y_disc [mm],x_left [mm],F_left_x [N]"
+    head = "t (s),camera (mm),y_disc [mm],x_left [mm],F_left_x [N]"
     table = np.stack([run.t.numpy(), *(1e3 * x for x in columns[:3]), columns[3]], 1)
     np.savetxt(tmp_path / "run.csv", table, "%.9g", ",", header=head, comments="")
     return tmp_path
@@ -142,7 +142,7 @@ REFUSALS: dict[str, tuple[str, Callable[[str], str], str]] = {
         "position_sd is of the paper's rig",
     ),
     "columns alone": (TOML, replaced('rig = "rig.toml"', ""), "columns rename those of a `rig`"),
-    "unit": (CSV, replaced("camera [mm]", "camera [kg]"), "column `camera` cannot be in 'kg'"),
+    "unit": (CSV, replaced("camera (mm)", "camera (kg)"), "column `camera` cannot be in 'kg'"),
     "column": (CSV, replaced("y_disc", "y_dsk"), "`y_dsk` is not known: is it `y_disc`"),
     "own name": (CSV, replaced("camera", "x_disc"), "`x_disc` is not known"),
     "too long": (

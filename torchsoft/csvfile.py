@@ -1,4 +1,4 @@
-"""CSV files of numbers under headings `name [unit]`, read in SI units.
+"""CSV files of numbers under headings `name [unit]` or `name (unit)`, read in SI units.
 
 Every error is a `ValueError` in a sentence that names the file, the row (the heading is row 1) and
 the column.
@@ -64,10 +64,14 @@ def read(
         raise ValueError(f"{path} is not a CSV file in UTF-8: {line(error)}") from None
     names = [one[0] for one in head if one]
     columns = np.array(values).reshape(len(rows), len(names)).T
-    left_out = tuple(
-        cell.partition("[")[0].strip() for cell, one in zip(first, head) if one is None
-    )
+    left_out = tuple(name_and_unit(cell)[0] for cell, one in zip(first, head) if one is None)
     return Numbers(dict(zip(names, columns)), rows, left_out)
+
+
+def name_and_unit(cell: str) -> tuple[str, str | None]:
+    """What a heading `name [unit]` or `name (unit)` says; None where it has no unit."""
+    match = re.fullmatch(r"\s*([^\[\]()]*?)\s*(?:[\[(]\s*([^\[\]()]*?)\s*[\])])?\s*", cell)
+    return (match[1], match[2]) if match else (cell.strip(), None)
 
 
 def heading(
@@ -81,8 +85,7 @@ def heading(
     naming the column."""
     out: list[tuple[str, float] | None] = []
     for cell in cells:
-        match = re.fullmatch(r"\s*([^\[\]]*?)\s*(?:\[\s*([^\[\]]*?)\s*\])?\s*", cell)
-        name, unit = (match[1], match[2]) if match else (cell.strip(), None)
+        name, unit = name_and_unit(cell)
         where = f"{path}, row 1, column `{line(name, 80)}`"
         if name in ignore:
             out.append(None)

@@ -269,7 +269,7 @@ def names(path: Path) -> list[str]:
     """The names in the heading of a file, without their units."""
     try:
         with check_file(path, csvfile.LARGEST).open(newline="", encoding="utf-8-sig") as file:
-            return [cell.partition("[")[0].strip() for cell in next(csv.reader(file), [])]
+            return [csvfile.name_and_unit(cell)[0] for cell in next(csv.reader(file), [])]
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path} is not a CSV file in UTF-8: {line(error)}") from None
 
