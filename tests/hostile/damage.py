@@ -244,28 +244,29 @@ def leaves(tree: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
         yield place, tree
 
 
+def put(tree: Any, place: Place, value: Any) -> Any:
+    """Set a value in a tree; the table that holds it."""
+    for key in place[:-1]:
+        tree = tree[key]
+    tree[place[-1]] = value
+    return tree
+
+
 def mutant(tree: Any, rng: np.random.Generator) -> Mutant:
     """A copy of a tree with one of `CHANGES`."""
     tree = copy.deepcopy(tree)
     places = list(leaves(tree))
-
-    def put(place: Place, value: Any) -> Any:
-        table = tree
-        for key in place[:-1]:
-            table = table[key]
-        table[place[-1]] = value
-        return table
-
-    place, old = places[rng.integers(len(places))]
-    kind = rng.choice(list(CHANGES), p=list(CHANGES.values()))
-    new = VALUES[rng.integers(len(VALUES))]
+    (place, old), (other, value) = (places[rng.integers(len(places))] for _ in range(2))
+    kind, new = (
+        rng.choice(list(CHANGES), p=list(CHANGES.values())),
+        VALUES[rng.integers(len(VALUES))],
+    )
     if kind == "swap":
-        other, value = places[rng.integers(len(places))]
-        put(place, value)
-        put(other, old)
+        put(tree, place, value)
+        put(tree, other, old)
         return Mutant(tree)
     if kind in ("delete", "misspell") and isinstance(place[-1], str):
-        table = put(place, old)
+        table = put(tree, place, old)
         del table[place[-1]]
         if kind == "misspell":
             table[place[-1] + str(rng.choice(["x", "_", " ", "é", ".E"]))] = old
@@ -273,10 +274,8 @@ def mutant(tree: Any, rng: np.random.Generator) -> Mutant:
     if kind == "nest":
         new = {str(place[-1]): old}
     elif kind == "scale" and isinstance(old, int | float) and not isinstance(old, bool):
-        new = old * float(10.0 ** rng.uniform(-12, 12) * rng.choice([1.0, 1.0, 1.0, -1.0]))
-        if isinstance(old, int) and rng.random() < 0.7:
-            new = round(new)
-    put(place, new)
+        new = type(old)(old * float(10.0 ** rng.uniform(-12, 12) * rng.choice([1, 1, 1, -1])))
+    put(tree, place, new)
     return Mutant(tree, place, old, new)
 
 

@@ -69,12 +69,6 @@ def alive(pid: int) -> bool:
     return os.waitid(os.P_PID, pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
 
 
-def kill(pid: int) -> bool:
-    """Whether the process was still there to be killed."""
-    os.kill(pid, signal.SIGKILL)
-    return ended(pid) == -signal.SIGKILL
-
-
 class Torn:
     """A file opened for writing: each `write` may be the last operation, half done."""
 

@@ -2,7 +2,6 @@
 are those that were written."""
 
 import io
-import shutil
 import warnings
 from collections.abc import Callable
 from contextlib import redirect_stderr
@@ -11,10 +10,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from unittest import mock
 
-import h5py
 import numpy as np
 import pytest
 import torch
+import xarray as xr
 
 from hostile.damage import (
     BYTES,
@@ -29,14 +28,15 @@ from hostile.damage import (
     damage,
     forged,
 )
-from hostile.processes import ended, fork, kernels, remembered, restore, start
-from hostile.specimens import ROLL, cells, csv_text, dataset, make, problem, run
+from hostile.processes import ended, fork, kernels, remembered, restore
+from hostile.specimens import cells, csv_text, dataset, make, problem, run
 from hostile.trial import LIMIT, Tally, count, random, sentence
 from torchsoft.datasets import Trajectories, open_dataset
 from torchsoft.datasets.check import check
 from torchsoft.datasets.files import StoreError
-from torchsoft.files import sealed, unsealed
+from torchsoft.files import sealed
 from torchsoft.solve.kernel import cache
+from torchsoft.solve.trajectory import load, save
 from torchsoft.sysid import IdentificationResult, Problem, identify
 from torchsoft.sysid.columns import COLUMNS, read_table
 from torchsoft.sysid.prediction import FailedRun
@@ -94,30 +94,6 @@ def kernel(tmp_path_factory: Make) -> Specimen:
     unsealed = lambda path, content: bytes(32) + content
     pipe = {"a pipe": SPECIAL["a pipe"]}
     return Specimen(sound, wrong, unsealed, PLANTED | FOREIGN | RIGHTS | pipe)
-
-
-@pytest.fixture(scope="module")
-def rolled() -> str:
-    """What the rolling gives; its kernels are in the package's cache from then on."""
-    status, out, err = start("-c", ROLL)
-    assert status == 0, err
-    return out
-
-
-def test_damaged_kernels_of_the_simulator_are_made_again(
-    tally: Callable[[str], Tally], rolled: str, tmp_path: Path
-) -> None:
-    """In a start of its own for every damage; the simulator's own results keep their bits."""
-    line, trap = tally("damaged files of the simulator's kernels"), Trap(tmp_path / "executed")
-    for kind in ("empty", "a bit", "all noise", "a folder", "another's"):
-        place = tmp_path / kind
-        kept = shutil.copytree(cache.FOLDERS[0], place / "torchsoft" / cache.NAME)
-        (path,) = kept.glob("torchsoft.solve.kernel.run.run-*.kernel")
-        other = next(file for file in sorted(kept.iterdir()) if file != path)
-        damage(kind, Victim(path, random(kind), other, trap))
-        status, out, err = start("-c", ROLL, NUMBA_CACHE_DIR=str(place))
-        held = status == 0 and out == rolled and not trap.path.exists()
-        line.held(held, f"{kind}: {status} {out[-500:]} {err[-1000:]}")
 
 
 # identifications
@@ -305,44 +281,33 @@ def trajectory(tmp_path_factory: Make) -> Specimen:
     return Specimen(sound, wrong, seal, PLANTED | SPECIAL)
 
 
-def remake(path: Path, content: bytes, rng: np.random.Generator) -> None:
-    """Another well-formed file: an array missing, renamed, of another type, shape or unit, or with
-    values that cannot be."""
-    path.write_bytes(content)
-    with h5py.File(path, "r+") as file:
-        name = str(rng.choice([k for k in file if k != "axis"]))
-        values = file[name][...]
-        match rng.integers(4):
-            case 0:
-                file.move(name, name + "_")
-            case 1:
-                file[name].attrs["units"] = "furlong"
-            case 2:
-                values = values.astype(np.float64)
-                values[rng.integers(len(values))] = rng.choice([np.nan, np.inf, 1e308, -1.0, 1e3])
-                file[name][...] = values
-            case 3:
-                del file[name]
-                others = [None, values.astype("S8"), np.zeros((3, 2, 2))]
-                if (other := others[rng.integers(3)]) is not None:
-                    file[name] = other
-    path.write_bytes(sealed(path.read_bytes()))
+REMADE: tuple[Callable[[xr.Dataset, str], xr.Dataset], ...] = (
+    lambda data, name: data.drop_vars(name),
+    lambda data, name: data.rename({name: f"{name}_"}),
+    lambda data, name: data.assign({name: data[name].assign_attrs(units="furlong")}),
+    lambda data, name: data.assign({name: data[name] * np.inf}),
+    lambda data, name: data.assign({name: data[name].where(data[name] < 0, 1e308)}),
+    lambda data, name: data.assign({name: data[name].astype(str)}),
+    lambda data, name: data.assign({name: (("one", "two"), np.zeros((3, 2)))}),
+)
+"""Other well-formed files: an array is missing, renamed, of another unit, type or shape, or has
+values that cannot be."""
 
 
 def test_other_trajectory_files(
     trajectory: Specimen, tmp_path: Path, tally: Callable[[str], Tally]
 ) -> None:
     line, path = tally("trajectory files of other content"), tmp_path / "other.nc"
-    content = unsealed(trajectory.sound / "run.nc")
-    for number in range(count(600)):
-        remake(path, content, random("remade", number))
-        line.held(not misread_table(path, None), f"remade {number}")
-    with h5py.File(path, "w") as file:
-        file["time"] = np.arange(5.0)
+    data = load(trajectory.sound / "run.nc")
+    for name in [*data.variables][: count(len(data.variables))]:
+        for number, change in enumerate(REMADE):
+            if name != "axis":
+                save(change(data, str(name)), path)
+                line.held(not misread_table(path, None), f"{name} remade {number}")
     heads = b"", b"CDF\x01", b"\x89HDF\r\n\x1a\n", b"PK\x03\x04", bytes(1000)
-    foreign = *heads, csv_text(cells()).encode(), path.read_bytes()
-    for number, data in enumerate((*foreign, *map(sealed, foreign))):
-        path.write_bytes(data)
+    foreign = *heads, csv_text(cells()).encode(), bytes(data[["time"]].to_netcdf())
+    for number, content in enumerate((*foreign, *map(sealed, foreign))):
+        path.write_bytes(content)
         line.held(not misread_table(path, None), f"foreign {number}")
 
 

@@ -28,11 +28,9 @@ from hostile.processes import (
     execute,
     fork,
     kernels,
-    kill,
     memory,
     performed,
     restore,
-    start,
     tree,
 )
 from hostile.specimens import IDENTIFICATION, cells, csv_text, dataset, make, problem, run
@@ -127,102 +125,49 @@ def test_results(memory: Path, tally: Lines) -> None:
             crash(line, lambda: ran.save(out / "run.nc"), out, 30, memory / begin)
 
 
-# generations
+# at random moments
 # ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("generators", "number"), [(1, 40), (2, 14)])
-def test_killed_generations(generators: int, number: int, memory: Path, tally: Lines) -> None:
-    """Killed up to three times and then started again; or two at once on one folder, of which one
-    is killed and the other ends well."""
-    small, out = dataset(memory), memory / "set"
-    line = tally(f"kills of one of {generators} generators at once")
-    make(small, memory / "whole")
-    expected, begun = tree(memory / "whole"), time.perf_counter()
-    generate = partial(fork, partial(make, small, out))
-    ended(generate())
-    longest, trial = time.perf_counter() - begun, 0
-    while line.tried < count(number):
-        trial += 1
-        assert trial < 10 * count(number), "most end before they are killed"
-        rng, killed, statuses = random(line.kind, trial), 0, []
-        shutil.rmtree(out, ignore_errors=True)
-        for moment in rng.uniform(0, longest, rng.integers(1, 4) if generators == 1 else 1):
-            pids = [generate()]
-            while len(pids) < generators:
-                time.sleep(rng.uniform(0, 0.1))
-                pids.append(generate())
-            time.sleep(moment)
-            killed += kill(pids.pop(rng.integers(len(pids))))
-            statuses += map(ended, pids)
-        make(small, out)
-        wrong = difference(out, expected)
-        for _ in range(killed):
-            held = not wrong and not any(statuses)
-            line.held(held, f"{trial}: others ended with {statuses}; differs in {wrong}")
+class Work(NamedTuple):
+    """A process that works into a folder: how it begins, how far it came, and what it leaves."""
+
+    begin: Callable[[Path], int]
+    progress: Callable[[Path], int]
+    result: Callable[[Path], Any]
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_killed_commands(workers: int, memory: Path, tally: Lines) -> None:
-    """The command with its worker processes, killed again and again on one folder, most times soon
-    after it wrote something."""
-    line, out = tally(f"kills of the command with {workers} workers"), memory / "set"
-    small, rng, killed = dataset(memory, 16), random("commands", workers), 0
-    command = "-m", "data_gen.generate", str(small), "--out", str(out), "--workers", str(workers)
-    written = lambda: sum(1 for _ in out.rglob("*"))
-    for trial in range(count(8)):
-        before, pid = written(), fork(lambda: execute(*command))
-        while trial % 4 and written() == before and alive(pid):
-            time.sleep(0.01)
-        time.sleep(rng.uniform(0, 0.3 if trial % 4 else 5.0))
-        killed += kill(pid)
-    status, _, err = start(*command)
-    make(small, memory / "whole")
-    wrong = difference(out, tree(memory / "whole"))
-    assert killed
-    for _ in range(killed):
-        line.held(status == 0 and not wrong, f"{status} {err[-500:]}; differs in {wrong}")
+def generation(folder: Path, workers: int = 0) -> Work:
+    """In a fork, or by the command with its worker processes."""
+    small = dataset(folder, 16 if workers else 3)
+    command = "-m", "data_gen.generate", str(small), "--workers", str(workers), "--out"
+    begin = lambda out: fork(lambda: execute(*command, str(out)) if workers else make(small, out))
+    return Work(begin, lambda out: sum(1 for _ in out.rglob("*")), tree)
 
 
-# identifications
-# ----------------------------------------------------------------------
+def identification(folder: Path, workers: int) -> Work:
+    for name, rows in (("data", 42), ("more", 32)):
+        (folder / f"{name}.csv").write_text(csv_text(cells(rows)), encoding="utf-8")
+    (folder / "rig.toml").write_text(IDENTIFICATION, encoding="utf-8")
+    files = [str(folder / name) for name in ("data.csv", "more.csv", "rig.toml")]
+    how = ["--workers", str(workers), "--no-progress"]
 
+    def command(out: Path) -> int:
+        sys.stdout = sys.stderr = out.with_suffix(".txt").open("w", encoding="utf-8")
+        # test runners may ignore it, which a child inherits
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        return main(["identify", *files, "--out", str(out), *how])
 
-class Case(NamedTuple):
-    """Folder of the data, number of workers, and of an undisturbed command the answer and the time
-    it took [s]."""
+    def answer(out: Path) -> Any:
+        """Without times, numbers of remembered runs, the command, and the checksum of all that."""
+        content = json.loads((out / "answer.json").read_text(encoding="utf-8"))
+        for entry in (content, content["cost"], *content["stages"]):
+            for key in ("checksum", "command", "wall_s", "remembered"):
+                entry.pop(key, None)
+        return content, sorted(path.name for path in out.iterdir())
 
-    folder: Path
-    workers: int
-    answer: dict[str, Any]
-    seconds: float
-
-    def begin(self, out: Path) -> int:
-        """The id of a process of the command."""
-        files = [str(self.folder / name) for name in ("data.csv", "more.csv", "rig.toml")]
-        how = ["--out", str(out), "--workers", str(self.workers), "--no-progress"]
-
-        def command() -> int:
-            sys.stdout = sys.stderr = out.with_suffix(".txt").open("w", encoding="utf-8")
-            # test runners may ignore it, which a child inherits
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-            return main(["identify", *files, *how])
-
-        return fork(command, 300)
-
-
-def answer(out: Path) -> dict[str, Any]:
-    """The answer without times, numbers of remembered runs, the command with its folder, and the
-    checksum of all that."""
-    content = json.loads((out / "answer.json").read_text(encoding="utf-8"))
-    for entry in (content, content["cost"], *content["stages"]):
-        for key in ("checksum", "command", "wall_s", "remembered"):
-            entry.pop(key, None)
-    return content
-
-
-def runs(out: Path) -> int:
-    return len(list(out.glob("unfinished/*.run")))
+    runs = lambda out: len(list(out.glob("unfinished/*.run")))
+    return Work(lambda out: fork(lambda: command(out), 300), runs, answer)
 
 
 def survivors(group: int) -> bool:
@@ -235,58 +180,60 @@ def survivors(group: int) -> bool:
     return False
 
 
-@pytest.fixture(scope="module", params=[1, 2], ids=["alone", "two workers"])
-def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Case:
-    folder = tmp_path_factory.mktemp("kills")
-    for name, rows in (("data", 42), ("more", 32)):
-        (folder / f"{name}.csv").write_text(csv_text(cells(rows)), encoding="utf-8")
-    (folder / "rig.toml").write_text(IDENTIFICATION, encoding="utf-8")
-    case = Case(folder, request.param, {}, 0.0)
-    for out in (folder / "first", folder / "second"):  # kernels are compiled once
+STOPS: dict[str, tuple[Callable[[Path], Work], int, signal.Signals, int]] = {
+    "generations": (generation, 1, signal.SIGKILL, 40),
+    "one of two generations at once": (generation, 2, signal.SIGKILL, 14),
+    "commands of a generation": (partial(generation, workers=1), 1, signal.SIGKILL, 8),
+    "commands with two workers": (partial(generation, workers=2), 1, signal.SIGKILL, 8),
+    "identifications": (partial(identification, workers=1), 1, signal.SIGKILL, 20),
+    "identifications in two threads": (partial(identification, workers=2), 1, signal.SIGKILL, 10),
+    "identifications interrupted": (partial(identification, workers=1), 1, signal.SIGINT, 6),
+    "interrupted in two threads": (partial(identification, workers=2), 1, signal.SIGINT, 3),
+}
+"""The work, how many work on one folder at once, the signal that ends one, and how often."""
+
+
+@pytest.mark.parametrize("stops", STOPS)
+def test_stopped_it_ends_the_same(stops: str, memory: Path, tally: Lines) -> None:
+    """Stopped up to three times at any moment, or soon after it went on, and then started again.
+    Nothing that it began outlives it; interrupted it says in one line how to go on, and keeps what
+    was done."""
+    make_work, at_once, sign, number = STOPS[stops]
+    work, line, rng = make_work(memory), tally(f"stopped: {stops}"), random(stops)
+    for out in (memory / "first", memory / "whole"):  # kernels are compiled once
         began = time.monotonic()
-        assert ended(case.begin(out)) == 0, out.with_suffix(".txt").read_text()
-    return case._replace(answer=answer(out), seconds=time.monotonic() - began)
-
-
-def wait(pid: int, out: Path, seconds: float, more: int) -> None:
-    """Until so many seconds have passed, and so many more runs are kept, or the process has
-    ended."""
-    before, began = runs(out), time.monotonic()
-    while alive(pid) and (time.monotonic() - began < seconds or runs(out) < before + more):
-        time.sleep(0.002)
-
-
-@pytest.mark.parametrize(
-    ("sign", "number"), [(signal.SIGKILL, (20, 10)), (signal.SIGINT, (6, 3))], ids=["kill", "int"]
-)
-def test_stopped_it_ends_the_same(
-    sign: signal.Signals, number: tuple[int, int], whole: Case, tally: Lines
-) -> None:
-    """Nothing that it began outlives it; interrupted it says in one line how to go on, and keeps
-    what was done."""
-    line = tally(f"identifications stopped by {sign.name}, {whole.workers} workers, and answers")
-    rng, interrupted = random(line.kind), sign == signal.SIGINT
-    while line.tried < count(number[whole.workers - 1]):
-        out = whole.folder / f"out-{sign.name}-{line.tried}"
-        for _ in range(int(rng.integers(1, 6))):
-            pid, some = whole.begin(out), int(rng.integers(1, 16))
-            moment = (whole.seconds * rng.random(), 0) if rng.integers(2) else (0.0, some)
-            wait(pid, out, *moment)
-            wait(pid, out, 0.02 * rng.random(), int(interrupted))
-            kept, running = runs(out), alive(pid)
-            if running:
+        assert ended(work.begin(out)) == 0
+    seconds, expected, trial = time.monotonic() - began, work.result(memory / "whole"), 0
+    while line.tried < count(number):
+        trial += 1
+        assert trial < 10 * count(number), "most end before they are stopped"
+        out = memory / f"out-{trial}"
+        for _ in range(int(rng.integers(1, 4))):
+            pids, soon = [work.begin(out)], rng.random() < 0.6 or sign == signal.SIGINT
+            if at_once > 1:
+                time.sleep(rng.uniform(0, 0.1))
+                pids.append(work.begin(out))
+            pid, before = pids.pop(rng.integers(at_once)), work.progress(out)
+            while soon and alive(pid) and work.progress(out) == before:
+                time.sleep(0.002)
+            time.sleep(rng.uniform(0, min(seconds, 0.3) if soon else seconds))
+            kept = work.progress(out)
+            if alive(pid):
                 os.kill(pid, sign)
-            status, said = ended(pid), out.with_suffix(".txt").read_text(encoding="utf-8")
-            told = "the same command continues" in said and "Traceback" not in said
-            right = runs(out) >= kept and status == 130 and told if interrupted else True
-            held = (right or status == 0) and not survivors(pid)
-            line.held(held, f"{status}, {kept} of {runs(out)} runs: {said[-1000:]}")
-            if not running:
-                break
-        status = ended(whole.begin(out))
-        left = {path.name for path in out.iterdir()} - {"answer.json", "report.html"}
-        held = status == 0 and not left and answer(out) == whole.answer
-        line.held(held, f"after the last start: {status}, another answer, or left: {left}")
+            status, others = ended(pid), [*map(ended, pids)]
+            held = not any(others) and not survivors(pid)
+            if status == 130 and sign == signal.SIGINT:
+                said = out.with_suffix(".txt").read_text(encoding="utf-8")
+                told = "the same command continues" in said and "Traceback" not in said
+                held = held and told and work.progress(out) >= kept
+            else:
+                held = held and status in (0, -signal.SIGKILL)
+            if status:
+                line.held(held, f"{trial}: {status}, others {others}, {kept} kept")
+        status = ended(work.begin(out))
+        same = status == 0 and work.result(out) == expected
+        line.held(same, f"{trial}: the last start ended with {status}, or left something else")
+        shutil.rmtree(out)
 
 
 # kernels
@@ -298,7 +245,6 @@ def test_many_at_one_cache(tmp_path: Path, tally: Lines, monkeypatch: pytest.Mon
     nothing is left."""
     line, folder = tally("processes at one cache, a third of them killed"), tmp_path / "kernels"
     monkeypatch.setattr(cache, "FOLDERS", [folder])
-    monkeypatch.setattr(cache, "announce", lambda: None)
     monkeypatch.setattr(cache, "_said", set())
     wrong = lambda: int(kernels()(3.0, 4.0) != 25.0)
     for number in range(count(20)):

@@ -15,7 +15,7 @@ from unittest import mock
 
 import pytest
 
-from hostile.damage import document
+from hostile.damage import Trap, Victim, damage, document
 from hostile.processes import ROOT, USER, start
 from hostile.specimens import IDENTIFICATION, ROLL, ROLLING, cells, csv_text
 from hostile.trial import Tally, count, random
@@ -47,6 +47,22 @@ def rolled() -> str:
     status, out, err = start("-c", ROLL)
     assert status == 0, err
     return out
+
+
+def test_damaged_kernels_of_the_simulator_are_made_again(
+    tally: Lines, rolled: str, tmp_path: Path
+) -> None:
+    """In a start of its own for every damage; the simulator's own results keep their bits."""
+    line, trap = tally("damaged files of the simulator's kernels"), Trap(tmp_path / "executed")
+    for kind in ("empty", "a bit", "all noise", "a folder", "another's"):
+        place = tmp_path / kind
+        kept = shutil.copytree(cache.FOLDERS[0], place / "torchsoft" / cache.NAME)
+        (path,) = kept.glob("torchsoft.solve.kernel.run.run-*.kernel")
+        other = next(file for file in sorted(kept.iterdir()) if file != path)
+        damage(kind, Victim(path, random(kind), other, trap))
+        status, out, err = start("-c", ROLL, NUMBA_CACHE_DIR=str(place))
+        held = status == 0 and out == rolled and not trap.path.exists()
+        line.held(held, f"{kind}: {status} {out[-500:]} {err[-1000:]}")
 
 
 @pytest.fixture(scope="module")
