@@ -79,88 +79,65 @@ def grasping(**parts: Any) -> Any:
     return simulate(SoftGrasp(coarse(pad__elements_x=24).settings, **parts), T)
 
 
-def falling(body: Body, mesh: PadMesh | None = None, points: Any = 0, **law: Any) -> Any:
+def falling(body: Any = None, law: Any = None, mesh: Any = None, points: Any = 0) -> Any:
     """A body over a pad."""
     pad = Pad(mesh or PadMesh(**MESH), KelvinVoigt(**RUBBER, tau=0.01), points=points)
-    touch = SoftContact(**SPRINGS | law)
-    rig = Rig(bodies={"disc": body}, pads={"P": pad}, contacts={"c": Contact("P", "disc", touch)})
+    touch = Contact("P", "disc", law or SoftContact(**SPRINGS))
+    rig = Rig(bodies={"disc": body or DISC}, pads={"P": pad}, contacts={"c": touch})
     return simulate(rig, T, y0=torch.zeros(rig.layout.size, dtype=torch.float64))
 
 
 def acting(**how: Any) -> Any:
     model = coarse(pad__elements_x=24)
-    model.actuators["x"] = Actuator(**how)  # pyright: ignore
+    model.actuators["x"] = Actuator(**PUSH | how)  # pyright: ignore
     del model.control["x"]  # pyright: ignore
     return simulate(model, T)
 
 
 DISC = Body(0.4, Circle(0.02))
-PARTS: list[tuple[type, dict[str, Any], Callable[[Any], Any]]] = [
-    (Circle, {"radius": 0.019}, lambda part: grasping(shape=part)),
-    (Ellipse, {"a": 0.019, "b": 0.019}, lambda part: grasping(shape=part)),
-    (RoundedBox, {"half_width": 0.019, "half_height": 0.019, "radius": 0.01},
-     lambda part: grasping(shape=part)),
-    (KelvinVoigt, RUBBER | {"tau": 0.01}, lambda part: grasping(material=part)),
-    (StandardLinearSolid, RUBBER | {"tau": 0.01, "E_instant": 1e6},
-     lambda part: grasping(material=part)),
-    (Prony, SERIES | {"moduli": [1e5, 1e5]}, lambda part: grasping(material=part)),
-    (GeneralisedKelvin, SERIES | {"J": [0.1, 0.1]}, lambda part: grasping(material=part)),
-    (SmoothSlip, SLIP, lambda part: grasping(friction=part)),
-    (Coulomb, {"mu_s": 0.8, "mu_k": 0.7}, lambda part: grasping(friction=part)),
-    (Body, {"mass": 0.4, "shape": Circle(0.02), "inertia": 1e-4}, falling),
-    (PD, {"Kp": 1.0, "Kd": 1.0}, lambda part: acting(**PUSH | {"law": part})),
-    (dict, SPRINGS, lambda law: falling(DISC, **law)),
-]  # fmt: skip
-"""Constructors, right arguments, and a run with the part."""
+PARTS: list[tuple[type, dict[str, Any], str, Callable[..., Any]]] = [
+    (Circle, {"radius": 0.019}, "shape", grasping),
+    (Ellipse, {"a": 0.019, "b": 0.019}, "shape", grasping),
+    (RoundedBox, {"half_width": 0.019, "half_height": 0.019, "radius": 0.01}, "shape", grasping),
+    (KelvinVoigt, RUBBER | {"tau": 0.01}, "material", grasping),
+    (StandardLinearSolid, RUBBER | {"tau": 0.01, "E_instant": 1e6}, "material", grasping),
+    (Prony, SERIES | {"moduli": [1e5, 1e5]}, "material", grasping),
+    (GeneralisedKelvin, SERIES | {"J": [0.1, 0.1]}, "material", grasping),
+    (SmoothSlip, SLIP, "friction", grasping),
+    (Coulomb, {"mu_s": 0.8, "mu_k": 0.7}, "friction", grasping),
+    (SoftContact, SPRINGS, "law", falling),
+    (Body, {"mass": 0.4, "shape": Circle(0.02), "inertia": 1e-4}, "body", falling),
+    (PD, {"Kp": 1.0, "Kd": 1.0}, "law", acting),
+]
+"""Constructors, right arguments, and a run with the part under a name."""
 
 
 def of_constructors() -> Iterator[Attack]:
     """Every declared quantity: no number, or just beyond its bounds."""
-    for part, right, used in PARTS:
-        declared = quantities(SoftContact if part is dict else part)
-        for name in declared.keys() & right.keys():
-            low, high = declared[name].low, declared[name].high
-            odds = [*NO_NUMBER, low - 1.0, 1.1 * high]
+    for part, right, role, used in PARTS:
+        for name in quantities(part).keys() & right.keys():
+            declared = quantities(part)[name]
+            odds = [*NO_NUMBER, declared.low - 1.0, 1.1 * declared.high]
             if isinstance(right[name], list):
                 odds = [[odd, right[name][1]] for odd in odds]
-            build: Any = lambda part=part, used=used, **given: used(part(**given))
-            build.__name__ = part.__name__
+            build = lambda part=part, role=role, used=used, **given: used(**{role: part(**given)})
             yield build, right, {name: odds}
 
 
 def of_parts() -> Iterator[Attack]:
-    branching = lambda E, F_N, R: E / R if E > F_N else 0 * E
-    yield (
-        grasping,
-        {},
-        {
-            "shape": ["disc", Ellipse(5e-3, 20e-3)],
-            "friction": [3, Learned(), branching, lambda E, F_N: E],
-        },
-    )
-    yield lambda **mesh: falling(DISC, PadMesh(**mesh)), MESH, dict.fromkeys(MESH, NOT_POSITIVE)
-    yield falling, {"body": DISC}, {"node_spacing": NOT_POSITIVE, "points": [-1, 1.5, "2", None]}
-    fixed: Any = lambda x: falling(Body(0.4, Circle(0.02), x=x))
-    yield fixed, {}, {"x": [None, NAN, "drive", "drivn"]}
-    laws = [None, 3, "law", lambda w: w]
-    yield acting, PUSH, dict.fromkeys(("measures", "pushes", "setpoint"), NO_NAME) | {"law": laws}
-    lists = [[], [1.0], [NAN, 1.0], [0.0, INF], None, [[0.0, 1.0]], ["a", "b"], 3, [0.0, 1.0, 2.0]]
-    odds = {"times": [*lists, [1.0, 0.0], [0.0, 0.0], "01"], "values": lists}
+    yield lambda **mesh: falling(mesh=PadMesh(**mesh)), MESH, dict.fromkeys(MESH, NOT_POSITIVE)
+    yield lambda x: falling(Body(0.4, Circle(0.02), x=x)), {}, {"x": [None, NAN, "drive", ""]}
+    spacing = lambda **how: falling(law=SoftContact(**SPRINGS, **how))
+    yield spacing, {}, {"node_spacing": NOT_POSITIVE}
+    yield falling, {}, {"points": [-1, 1.5, "2", None]}
+    yield grasping, {}, {"shape": ["disc"], "friction": [3, lambda E, F_N: E]}
+    names = dict.fromkeys(("measures", "pushes", "setpoint"), NO_NAME)
+    yield acting, {}, names | {"law": [None, 3, "law", lambda w: w]}
+    lists = [[], [1.0], [NAN, 1.0], [0.0, INF], None, [[0.0, 1.0]], ["a", "b"], "01", 3]
     for kind in (Profile, Sampled):
-        yield kind, {"times": [0.0, 1.0], "values": [0.0, 1.0]}, odds
+        yield kind, {"times": [0.0, 1.0], "values": [0.0, 1.0]}, {"times": lists, "values": lists}
     yield Reference, {}, {"x_d": [3, None, "x", [0.0, 1.0], lambda t: t]}
     yield press, {"model": coarse(pad__elements_x=24)}, {"bracket_height": [*NO_NUMBER, 1.0]}
-
-
-class Learned(nn.Module):
-    """A law with a layer in torch's default dtype."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.layer = nn.Linear(2, 1, dtype=torch.float32)
-
-    def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
-        return self.layer(torch.stack((E, F_N), -1))[..., 0] / R
 
 
 # runs
@@ -171,64 +148,45 @@ def of_runs() -> Iterator[Attack]:
     model = coarse(pad__elements_x=24)
     y0, model.reference = grasp(model, (0.01, 0.0))
     right = {"rig": model, "t": T, "y0": y0}
-    size, zeros = len(y0), torch.zeros(len(y0), 1, dtype=torch.float64)
+    zeros, ones = torch.zeros(len(y0), 1, dtype=torch.float64), torch.ones_like(y0)
     tensors: list[Any] = [
-        3, "x", [0.0, 1.0], {}, object(), True, np.linspace(0, 1, size), y0.half(), y0 / 0,
+        3, "x", [0.0, 1.0], {}, object(), True, y0.numpy(), y0.half(), y0 / 0,
         y0.to(torch.complex128), y0.to("meta"), y0.to_sparse(), f64(), f64(1.0), y0[None],
         y0.long(), y0.bool(), torch.stack((y0, y0)), y0[:-1], torch.tensor(1.0),
-        grasp(coarse(pad__elements_x=26))[0],
     ]  # fmt: skip
-    rigs = None, 3, "model", Parameters(), nn.Linear(1, 1), model.pads["L"], model.forward
-    references = 3, "x", Profile([0.0], [1.0]), Reference(), hold(x_d=0.06), Reference, model
     lengths = [*NOT_POSITIVE[1:], f64(1.0)[0], 1e-300]
     yield (
         simulate,
         right,
         {
             "y0": tensors,
-            "t": [*tensors, None, T.flip(0), T * 1e300, T + 1e16, T * 1e-320],
-            "rig": [*rigs],
-            "reference": [*references],
+            "t": [*tensors, None, T * 1e300, T + 1e16, T * 1e-320],
+            "rig": [
+                None,
+                3,
+                "model",
+                Parameters(),
+                nn.Linear(1, 1),
+                model.pads["L"],
+                model.forward,
+            ],
+            "reference": [3, "x", Profile([0.0], [1.0]), Reference(), hold(x_d=0.06), model],
             "gradient": [None, "", "adjoint", "forwards", 3, True, ["none"], ("discrete",), {}],
             **dict.fromkeys(("step", "tolerance", "rtol", "atol"), lengths),
         },
     )
     known = [None, 3, [3], ["pad.Q"], ["E"], [""], [model.pad.E], {"pad.E": 1}, ["pad.e"]]
     rows = [y0, zeros.float(), zeros.numpy(), zeros / 0, 3, "x", torch.cat((zeros, zeros))]
-    forward = right | {"gradient": "forward", "wrt": ["pad.E"]}
-    yield simulate, forward, {"wrt": known, "dy0": rows}
-    for route in ("none", "discrete"):
-        odds = {"wrt": [["pad.E"]], "dy0": [zeros], "rigid": [True]}
-        yield simulate, right | {"gradient": route}, odds
-
-    class Run(nn.Module):
-        """A run as a module, for functional_call."""
-
-        def __init__(self) -> None:
-            super().__init__()
-            self.model = model
-
-        def forward(self) -> Tensor:
-            return simulate(model, T, y0=y0, gradient="discrete")["theta"][-1]
-
-    def of_E(E: Tensor) -> Tensor:
-        return torch.func.functional_call(Run(), {"model.pad.E": E}, ())
-
-    def twice(E: Tensor) -> Any:
-        (slope,) = torch.autograd.grad(of_E(E.requires_grad_()), E, create_graph=True)
-        return torch.autograd.grad(slope, E)
-
-    def dual(y: Tensor) -> Any:
-        with torch.autograd.forward_ad.dual_level():
-            tangent = torch.autograd.forward_ad.make_dual(y, torch.ones_like(y))
-            return simulate(model, T, y0=tangent)
-
-    E = f64(7e5)[0]
-    yield lambda E: torch.func.grad(of_E)(E), {}, {"E": [E]}
-    yield lambda E: torch.func.vmap(of_E)(E), {}, {"E": [f64(7e5, 8e5)]}
-    yield lambda E: torch.func.jvp(of_E, (E,), (E,)), {}, {"E": [E]}
-    yield twice, {}, {"E": [E]}
-    yield dual, {}, {"y": [y0]}
+    yield simulate, right | {"gradient": "forward", "wrt": ["pad.E"]}, {"wrt": known, "dy0": rows}
+    discrete = right | {"gradient": "discrete"}
+    yield simulate, discrete, {"wrt": [["pad.E"]], "dy0": [zeros], "rigid": [True]}
+    of_y0 = lambda y: simulate(**discrete | {"y0": y})["theta"][-1]
+    for transformed in (
+        lambda y: torch.func.grad(of_y0)(y),
+        lambda y: torch.func.vmap(of_y0)(torch.stack((y, y))),
+        lambda y: torch.func.jvp(of_y0, (y,), (ones,)),
+    ):
+        yield transformed, {}, {"y": [y0]}
     kinds = [torch.float16, torch.bfloat16, torch.complex128]
     yield lambda dtype: simulate(copy.deepcopy(model).to(dtype), T, y0=y0), {}, {"dtype": kinds}
     ended = simulate(**right)
@@ -274,11 +232,11 @@ def test_odd_calls_are_refused_with_a_sentence(
     line = tally(f"odd calls {attacks.__name__.replace('_', ' ')}")
     for call, right, odds in attacks():
         for name, values in odds.items():
-            for i, odd in enumerate(values):
+            for odd in values:
 
                 def refused(call: Any = call, given: dict[str, Any] = right | {name: odd}) -> None:
                     call(**given)
                     raise Accepted
 
-                attack = f"{getattr(call, '__name__', call)}: {name} #{i} = {odd!r:.40}"
+                attack = f"{call.__name__} {[*right]}: {name} = {odd!r:.40}"
                 line.call(attack, refused, REFUSALS)
