@@ -47,6 +47,7 @@ pytestmark = pytest.mark.slow
 
 REFUSALS = ValueError, SimulationFailed, NoEquilibrium, GradientFailed, NotImplementedError
 WILD = 0.0, -1.0, float("nan"), float("inf"), -float("inf"), 1e-300, 1e308, 1e30, -1e5
+grad = partial(torch.autograd.grad, allow_unused=True, materialize_grads=True)
 SIZES = "pad.length", "pad.height", "disc.radius", "bracket.cm_height", "contact.node_spacing"
 """Numbers that leave no rig if they are changed much."""
 
@@ -54,14 +55,12 @@ SIZES = "pad.length", "pad.height", "disc.radius", "bracket.cm_height", "contact
 class Network(nn.Module):
     """A slip rate by a small network."""
 
-    def __init__(self, rng: np.random.Generator) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        draw = lambda *shape: nn.Parameter(torch.from_numpy(rng.standard_normal(shape)))
-        self.W, self.b, self.w = draw(4, 2), draw(4), draw(4)
+        self.mu = nn.Sequential(nn.Linear(2, 4), nn.Tanh(), nn.Linear(4, 1), nn.Tanh()).double()
 
     def forward(self, E: Tensor, F_N: Tensor, R: Tensor) -> Tensor:
-        hidden = torch.tanh(self.W @ torch.stack((E, F_N)) / 10 + self.b)
-        mu = 0.3 + 0.2 * torch.tanh(self.w @ hidden)
+        mu = 0.3 + 0.2 * self.mu(torch.stack((E, F_N), -1) / 10)[..., 0]
         return (E - mu * F_N).clamp(min=0.0) / (R + 10.0)
 
 
@@ -79,57 +78,55 @@ def settings(rng: np.random.Generator) -> Parameters:
     values: dict[str, Any] = {
         name: spread(rng, row["value"], min(decades, 0.02) if name in SIZES else decades)
         for name, row in base.table().items()
-        if isinstance(row["value"], float)
-        and not name.startswith("scenario.")
-        and rng.random() < 0.4
+        if isinstance(row["value"], float) and "scenario" not in name and rng.random() < 0.4
     }
-    values |= {
-        "pad.nu": float(rng.uniform(-0.9, 0.499)), "pad.elements_x": int(rng.integers(8, 33)),
-        "pad.elements_y": int(rng.integers(1, 4)),
-        "pad.fidelity": str(rng.choice(["massless", "massless", "inertial"])),
-        "pad.enclosed": bool(rng.random() < 0.2),
-        "contact.friction": str(rng.choice(["smooth", "smooth", "coulomb"])),
-        "contact.points": int(rng.integers(0, 3)),
-        "contact.mu_k": values.get("contact.mu_s", base.contact.mu_s) * rng.uniform(0.3, 1.0),
-    }  # fmt: skip
+    values |= {name: choices[rng.integers(len(choices))] for name, choices in CHOICES.items()}
+    values["pad.nu"] = float(rng.uniform(-0.9, 0.499))
+    values["contact.mu_k"] = values.get("contact.mu_s", base.contact.mu_s) * rng.uniform(0.3, 1.0)
     return base.override(values)
 
 
-def excitation(rng: np.random.Generator) -> Excitation:
-    wide = float(rng.choice([0.3, 1.0]))
-    near = partial(spread, rng, decades=wide)
-    x, y, frequency = near(2e-3), near(1e-4), (5.0, 40.0)
-    motions = [
+CHOICES: dict[str, Any] = {
+    "pad.elements_x": range(8, 33),
+    "pad.elements_y": (1, 2, 3),
+    "pad.fidelity": ("massless", "massless", "inertial"),
+    "pad.enclosed": (False, False, False, False, True),
+    "contact.friction": ("smooth", "smooth", "coulomb"),
+    "contact.points": (0, 1, 2),
+}
+
+
+def build(rng: np.random.Generator) -> tuple[Excitation, SoftGrasp]:
+    """A motion, and a rig of random parts; of one rig in seven a number is set to what it cannot
+    be."""
+    near = partial(spread, rng, decades=float(rng.choice([0.3, 1.0])))
+    some = lambda *options: options[rng.integers(len(options))]
+    motion = some(
         Roll(travel=near(5e-3)),
         Strokes(travel=near(5e-3), stroke_time=0.05),
-        MultiSine(amplitude_x=x, amplitude_y=y, frequency=frequency, seed=int(rng.integers(99))),
-        Chirp(amplitude_x=x, start=2.0, end=30.0),
-        Press(amplitude=2 * y, frequency=20.0),
-    ]
-    return Excitation(
-        motion=motions[rng.integers(5)], duration=0.45, depth=spread(rng, 1e-3, 0.5),
-        grasp_time=0.06, settle=0.02, senses=("disc", "bracket")[rng.integers(2)],
+        MultiSine(amplitude_x=near(2e-3), frequency=(5.0, 40.0), seed=int(rng.integers(99))),
+        Chirp(amplitude_x=near(1e-3), start=2.0, end=30.0),
+        Press(amplitude=near(2e-4), frequency=20.0),
+    )
+    excitation = Excitation(
+        motion=motion, duration=0.45, depth=spread(rng, 1e-3, 0.5), grasp_time=0.06, settle=0.02,
+        senses=some("disc", "bracket"),
     )  # fmt: skip
-
-
-def build(rng: np.random.Generator, motion: Excitation) -> SoftGrasp:
-    """A rig of random parts; one number in seven rigs is set to what it cannot be."""
-    p = motion.settings(settings(rng))
+    p = excitation.settings(settings(rng))
     r, rubber = p.disc.radius, (p.pad.nu, p.pad.rho, p.pad.tau, p.pad.depth)
-    shapes = [
-        Ellipse(spread(rng, r, 0.05), spread(rng, r, 0.05)),
-        RoundedBox(r, r, r * float(rng.uniform(0.3, 0.9))),
-    ]
-    solids = [StandardLinearSolid(p.pad.E, p.pad.E * float(rng.uniform(0.9, 4.0)), *rubber)]
-    laws = [Network(rng), lambda E, F_N, R: (E - 0.3 * F_N).clamp(min=0.0) / R]
-    some = lambda usual, *others: [*[usual] * 3, *others][rng.integers(3 + len(others))]
-    shape, material = some(Circle(r), *shapes), some(KelvinVoigt(p.pad.E, *rubber), *solids)
-    model = SoftGrasp(p, friction=some(None, *laws), shape=shape, material=material)
-    known = dict(model.named_parameters(remove_duplicate=False))
-    names = [own for own in model.aliases.values() if own in known]
+    box = RoundedBox(r, r, r * float(rng.uniform(0.3, 0.9)))
+    oval = Ellipse(spread(rng, r, 0.05), spread(rng, r, 0.05))
+    usual = KelvinVoigt(p.pad.E, *rubber)
+    solid = StandardLinearSolid(p.pad.E, p.pad.E * float(rng.uniform(0.9, 4.0)), *rubber)
+    torch.manual_seed(int(rng.integers(99)))
+    law = some(None, None, None, Network(), lambda E, F_N, R: (E - 0.3 * F_N).clamp(min=0.0) / R)
+    model = SoftGrasp(
+        p, friction=law, shape=some(*[Circle(r)] * 4, oval, box), material=some(*[usual] * 5, solid)
+    )
+    numbers = [x for x in model.parameters() if x.ndim == 0]
     if rng.random() < 0.15:
-        known[names[rng.integers(len(names))]].data.fill_(float(rng.choice(WILD)))
-    return model
+        some(*numbers).data.fill_(float(rng.choice(WILD)))
+    return excitation, model
 
 
 def balanced(run: Trajectory, said: list[str]) -> None:
@@ -149,8 +146,7 @@ def balanced(run: Trajectory, said: list[str]) -> None:
 
 def run_randomly(rng: np.random.Generator) -> bool:
     """A run of a random model, at times with gradients; true at its end."""
-    motion = excitation(rng)
-    model = build(rng, motion)
+    motion, model = build(rng)
     t = torch.linspace(0, motion.duration, int(rng.integers(3, 40)), dtype=torch.float64)
     steps = float(rng.choice([5e-4, 1e-3, 2e-3, 2e-3, 5e-3, 2e-2]))
     how = {"step": steps, "tolerance": float(rng.choice([1e-10, 1e-9, 1e-7]))}
@@ -164,9 +160,7 @@ def run_randomly(rng: np.random.Generator) -> bool:
     if rng.random() < 0.1:
         leaves = [p for p in model.parameters() if p.requires_grad]
         again = simulate(model, t[:5], y0=y0, gradient="discrete", **how)
-        gradients = torch.autograd.grad(
-            again["x_C"][-1], leaves, allow_unused=True, materialize_grads=True
-        )
+        gradients = grad(again["x_C"][-1], leaves)
         assert all(bool(torch.isfinite(g).all()) for g in gradients), "a gradient is not finite"
     return True
 
@@ -193,61 +187,50 @@ def law(number: int) -> Callable[..., Tensor]:
     return lambda E, F_N, R: (E - mu * F_N).clamp(min=0.0) / (R + 10.0 + number)
 
 
-def together(function: Callable[[int], Any]) -> list[Any]:
-    """Results of a function in `THREADS` threads that begin at once; exceptions in their place."""
+def together(line: Tally, run: Callable[[int, int], list[Tensor]], runs: int) -> None:
+    """Runs in `THREADS` threads that begin at once have the bits of the same runs alone."""
     barrier = Barrier(THREADS)
 
-    def work(thread: int) -> Any:
+    def work(thread: int) -> list[Any]:
         barrier.wait()
-        try:
-            return function(thread)
-        except Exception as error:
-            return error
+        return [run(thread, i) for i in range(runs)]
 
     with ThreadPoolExecutor(THREADS) as pool:
-        return list(pool.map(work, range(THREADS)))
-
-
-def same(one: Any, other: list[Tensor]) -> bool:
-    return isinstance(one, list) and all(map(torch.equal, one, other))
-
-
-def results(model: SoftGrasp, how: dict[str, Any]) -> list[Tensor]:
-    """States, forces and derivatives of one run."""
-    run = simulate(model, T, **how)
-    if run.sensitivities is not None:
-        return [run.y, run.force["L"], run.sensitivities]
-    leaves = [p for p in model.parameters() if p.requires_grad]
-    loss = run["theta"][-1] + 1e2 * run["x_C"][-1]
-    gradients = torch.autograd.grad(loss, leaves, allow_unused=True, materialize_grads=True)
-    return [run.y.detach(), run.force["L"], *gradients]
+        done = [pool.submit(work, thread) for thread in range(THREADS)]
+    for thread, future in enumerate(done):
+        results = future.result() if future.exception() is None else [[]] * runs
+        for i, found in enumerate(results):
+            alone = run(thread, i)
+            same = len(found) == len(alone) and all(map(torch.equal, found, alone))
+            line.held(same, f"thread {thread}, run {i}: other bits, or {future.exception()!r}")
 
 
 @pytest.mark.filterwarnings("ignore:the energies of the run")
 def test_threads_give_the_bits_of_runs_alone(tally: Callable[[str], Tally]) -> None:
     """Eight threads, a hundred runs with gradients in each; two threads share a model."""
-    line, rng, runs = tally("runs with gradients in threads"), random("threads"), []
-    for changes in ({}, {"pad__fidelity": "inertial"}, {"contact__points": 2}, None):
-        model = coarse(pad__elements_x=24, **changes or {})
-        if changes is None:
-            model = SoftGrasp(model.settings, friction=law(20))
-        y0, held = grasp(model, (0.05, 0.0))
-        for _ in range(MOTIONS):
-            x = Profile([0.0, 6e-3], [0.06, 0.06 + 1e-4 * float(rng.standard_normal())])
-            how: dict[str, Any] = {"gradient": "discrete"}
-            if rng.random() < 0.25:
-                how = {"gradient": "forward", "wrt": ["pad.E", "contact.K_n"]}
-            moved = Reference(x_d=x, y_d=held["y_d"], F_ff=held["F_ff"])
-            runs.append((model, how | {"y0": y0, "reference": moved}))
-    alone = [results(*one) for one in runs]
+    models = [
+        coarse(pad__elements_x=24),
+        coarse(pad__elements_x=24, pad__fidelity="inertial"),
+        coarse(pad__elements_x=24, contact__points=2),
+        SoftGrasp(coarse(pad__elements_x=24).settings, friction=law(20)),
+    ]
+    starts = [grasp(model, (0.05, 0.0)) for model in models]
 
-    def work(thread: int) -> list[bool]:
-        numbers = [MOTIONS * (thread % 4) + (thread + i) % MOTIONS for i in range(count(RUNS))]
-        return [same(results(*runs[number]), alone[number]) for number in numbers]
+    def run(thread: int, number: int) -> list[Tensor]:
+        """States, forces and derivatives."""
+        model, (y0, held) = models[thread % 4], starts[thread % 4]
+        x = Profile([0.0, 6e-3], [0.06, 0.06 + 2e-5 * ((thread + number) % MOTIONS)])
+        moved = Reference(x_d=x, y_d=held["y_d"], F_ff=held["F_ff"])
+        how = {"y0": y0, "reference": moved}
+        if number % 4 == 3:
+            run = simulate(model, T, **how, gradient="forward", wrt=["pad.E", "contact.K_n"])
+            return [run.y, run.force["L"], run.sensitivities]
+        run = simulate(model, T, **how, gradient="discrete")
+        loss = run["theta"][-1] + 1e2 * run["x_C"][-1]
+        leaves = [p for p in model.parameters() if p.requires_grad]
+        return [run.y.detach(), run.force["L"], *grad(loss, leaves)]
 
-    for thread, found in enumerate(together(work)):
-        for right in found if isinstance(found, list) else [False]:
-            line.held(right, f"thread {thread}: other bits, or {found!r:.300}")
+    together(tally("runs with gradients in threads"), run, count(RUNS))
 
 
 def test_laws_first_compiled_in_many_threads_are_right(tally: Callable[[str], Tally]) -> None:
@@ -256,7 +239,5 @@ def test_laws_first_compiled_in_many_threads_are_right(tally: Callable[[str], Ta
     y0, held = grasp(base, (0.05, 0.0))
     for number in range(count(15)):
         models = [SoftGrasp(base.settings, friction=law(number)) for _ in range(THREADS)]
-        run = lambda k, models=models: [simulate(models[k], T, y0=y0, reference=held).y]
-        found, alone = together(run), run(0)
-        for one in found:
-            line.held(same(one, alone), f"law {number}: {one!r:.300}")
+        run = lambda k, _, models=models: [simulate(models[k], T, y0=y0, reference=held).y]
+        together(line, run, 1)
