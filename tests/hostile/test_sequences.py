@@ -10,10 +10,11 @@ derivative to compare with, and such sequences may only be few.
 
 import copy
 import pickle
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import wraps
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -94,6 +95,14 @@ class Own(nn.Module):
         return self.dropout(SHARE * (E - self.mu_s * F_N).clamp(min=0.0) / (R + 10.0))
 
 
+def run(model: SoftGrasp, y0: Tensor, gradient: Any = "discrete") -> Any:
+    return simulate(model, T, y0=y0, gradient=gradient, step=1e-3, tolerance=1e-10)
+
+
+def loss(ended: Any) -> Any:
+    return sum((w * (ended[name] - ended[name][0])).sum() for name, w in WEIGHTS.items())
+
+
 class Simulated(nn.Module):
     """A run as a module, for functional_call."""
 
@@ -103,16 +112,6 @@ class Simulated(nn.Module):
 
     def forward(self, y0: Tensor) -> Tensor:
         return loss(run(self.model, y0))
-
-
-def run(model: SoftGrasp, y0: Tensor, gradient: Any = "discrete") -> Any:
-    return simulate(model, T, y0=y0, gradient=gradient, step=1e-3, tolerance=1e-10)
-
-
-def loss(trajectory: Any) -> Tensor:
-    return torch.stack([
-        (w * (trajectory[name] - trajectory[name][0])).sum() for name, w in WEIGHTS.items()
-    ]).sum()  # fmt: skip
 
 
 def attribute(model: nn.Module, name: str) -> tuple[nn.Module, str]:
@@ -128,33 +127,28 @@ class Ran:
     def __init__(self, model: SoftGrasp, y0: Tensor, put: dict[str, Tensor]) -> None:
         self.y0, self.base, self.share = y0.clone().requires_grad_(), y0.clone(), SHARE
         self.copy = copy.deepcopy(model)
-        twins = {id(p): q for p, q in zip(model.parameters(), self.copy.parameters())}
-        self.leaves = [p for p in model.parameters() if p.requires_grad]
-        self.places = [twins[id(p)] for p in self.leaves]
+        twins = zip(model.parameters(), self.copy.parameters())
+        self.places = [(p, twin) for p, twin in twins if p.requires_grad]
         for name, value in put.items():  # replaces one name, not what is tied to it
-            self.leaves.append(value)
-            self.places.append(nn.Parameter(value.detach().clone()))
-            setattr(*attribute(self.copy, name), self.places[-1])
+            self.places.append((value, nn.Parameter(value.detach().clone())))
+            setattr(*attribute(self.copy, name), self.places[-1][1])
         values = {f"model.{name}": x for name, x in put.items()}
         self.value = torch.func.functional_call(
             Simulated(model), values, (self.y0,), tie_weights=False
         )
-        self.smooth = run(self.copy, self.base, "none").stats.failed_steps == 0
 
-    def difference(self, directions: dict[int, Tensor], y_direction: Tensor, h: float) -> float:
-        """Central difference of the loss along the directions of leaves, by their id, and of y0."""
+    def shifted(self, directions: dict[int, Tensor], y_direction: Tensor) -> float:
+        """The loss of the copy with tensors moved along directions, by the tensor's id; NaN where a
+        step was halved."""
         global SHARE
-        ends, old = [], [place.detach().clone() for place in self.places]
-        now, SHARE = SHARE, self.share
+        now, SHARE, moved = SHARE, self.share, copy.deepcopy(self.copy)
+        by_place = {id(place): directions.get(id(leaf), 0.0) for leaf, place in self.places}
         with torch.no_grad():
-            for step in (h, -h, 0.0):
-                for leaf, place, value in zip(self.leaves, self.places, old):
-                    place.copy_(value + step * directions.get(id(leaf), torch.zeros(())))
-                if step:
-                    end = run(self.copy, self.base + step * y_direction, "none")
-                    ends.append(float(loss(end)) if end.stats.failed_steps == 0 else np.nan)
+            for place, twin in zip(self.copy.parameters(), moved.parameters()):
+                twin.add_(by_place.get(id(place), 0.0))
+            ended = run(moved, self.base + y_direction, "none")
         SHARE = now
-        return (ends[0] - ends[1]) / (2 * h)
+        return float(loss(ended)) if ended.stats.failed_steps == 0 else np.nan
 
 
 @contextmanager
@@ -182,7 +176,7 @@ def step_by_step(operation: Callable[["ModelInUse"], object]) -> Any:
 class ModelInUse(RuleBasedStateMachine):
     """A model in use, and the runs whose gradients are asked for."""
 
-    compared = unclear = 0
+    tally: ClassVar = Counter[str]()
 
     @initialize(key=st.integers(0, 2**32 - 1), before=st.integers(0, 5))
     def begin(self, key: int, before: int) -> None:
@@ -195,7 +189,7 @@ class ModelInUse(RuleBasedStateMachine):
     def some(self, *choices: Any) -> Any:
         return choices[self.rng.integers(len(choices))]
 
-    def names(self, number: int = 1) -> list[str]:
+    def names(self, number: int) -> list[str]:
         """Of parameters that are neither parametrised nor gone with a law."""
         known = dict(self.model.named_parameters(remove_duplicate=False))
         return self.rng.permutation([name for name in CHANGED if name in known])[:number].tolist()
@@ -209,19 +203,19 @@ class ModelInUse(RuleBasedStateMachine):
 
     @step_by_step
     def set_in_place(self) -> None:
-        (name,) = self.names()
-        with torch.no_grad():
-            self.model.get_parameter(name).copy_(self.near(name))
+        for name in self.names(1):
+            with torch.no_grad():
+                self.model.get_parameter(name).copy_(self.near(name))
 
     @step_by_step
     def set_data(self) -> None:
-        (name,) = self.names()
-        self.model.get_parameter(name).data = self.near(name)
+        for name in self.names(1):
+            self.model.get_parameter(name).data = self.near(name)
 
     @step_by_step
     def set_parameter(self) -> None:
-        (name,) = self.names()
-        setattr(*attribute(self.model, name), nn.Parameter(self.near(name)))
+        for name in self.names(1):
+            setattr(*attribute(self.model, name), nn.Parameter(self.near(name)))
 
     @step_by_step
     def load(self) -> None:
@@ -231,19 +225,14 @@ class ModelInUse(RuleBasedStateMachine):
 
     @step_by_step
     def tie(self) -> None:
-        one, other = self.some(
-            ("contact.R_t", "contact.R_n"),
-            ("contact.K_t", "contact.K_n"),
-            ("control.y.Kp", "control.x.Kp"),
-        )
-        if {one, other} <= set(self.names(99)):
-            setattr(*attribute(self.model, one), self.model.get_parameter(other))
+        if {"contact.R_t", "contact.R_n"} <= set(self.names(99)):
+            self.model.contact.R_t = self.model.contact.R_n
 
     @precondition(lambda self: not self.rans)  # torch drops the gradient of what ran before
     @step_by_step
     def parametrise(self) -> None:
-        (name,) = self.names()
-        parametrize.register_parametrization(*attribute(self.model, name), Exp())
+        for name in self.names(1):
+            parametrize.register_parametrization(*attribute(self.model, name), Exp())
 
     @step_by_step
     def copy_deep(self) -> None:
@@ -347,65 +336,54 @@ class ModelInUse(RuleBasedStateMachine):
         """The gradient of the sum of the runs, beside differences."""
         global SHARE
         try:
-            with suppress(AttributeError):  # not begun
+            if not self.rans:
+                self.run()
+            if self.rans:
                 self.differentiate()
         finally:
             SHARE = 0.7
             torch.set_default_dtype(torch.float32)
 
     def differentiate(self) -> None:
-        if not self.rans:
-            self.run()
-        rans = self.rans
-        leaves = [
-            leaf
-            for leaf in {id(leaf): leaf for ran in rans for leaf in ran.leaves}.values()
-            if leaf.requires_grad
-        ]
-        if not rans:
-            return
-        wanted = [*(ran.y0 for ran in rans), *leaves]
-        found: tuple[Tensor, ...] = ()
+        found = {id(leaf): leaf for ran in self.rans for leaf, _ in ran.places}
+        leaves = [leaf for leaf in found.values() if leaf.requires_grad]
+        bars: tuple[Tensor, ...] = ()
         with told():
-            total = torch.stack([ran.value for ran in rans]).sum()
-            found = torch.autograd.grad(total, wanted, allow_unused=True, materialize_grads=True)
-        if not found:
-            return
-        ModelInUse.compared += 1
-        bars, y_bar = found[len(rans) :], torch.stack(found[: len(rans)]).sum(0)
-        clear = all(ran.smooth for ran in rans)
-        for single in (True, False):
-            clear = clear and self.compare(leaves, bars, y_bar, single)
-        ModelInUse.unclear += not clear
+            total = torch.stack([ran.value for ran in self.rans]).sum()
+            wanted = [*leaves, *(ran.y0 for ran in self.rans)]
+            bars = torch.autograd.grad(total, wanted, allow_unused=True, materialize_grads=True)
+        if bars:
+            y_bar = torch.stack(bars[len(leaves) :]).sum(0)
+            self.tally["compared"] += 1
+            self.tally["unclear"] += not self.compare(leaves, bars, y_bar)
 
-    def compare(
-        self, leaves: list[Tensor], bars: tuple[Tensor, ...], y_bar: Tensor, single: bool
-    ) -> bool:
-        """Whether differences are clear; raises `AssertionError` where they are and the gradient is
-        another. Along a random direction of all leaves and y0, or of a single leaf."""
-        chosen = self.rng.integers(len(leaves)) if leaves and single else -1
+    def compare(self, leaves: list[Tensor], bars: tuple[Tensor, ...], y_bar: Tensor) -> bool:
+        """Whether differences along a random direction are clear; raises `AssertionError` where
+        they are and the gradient is another."""
         directions, expected = dict[int, Tensor](), 0.0
-        for i, (leaf, bar) in enumerate(zip(leaves, bars)):
+        some = self.rng.permutation(len(leaves))[: self.some(1, len(leaves))]
+        for leaf, bar in ((leaves[i], bars[i]) for i in some):
             noise = torch.from_numpy(self.rng.standard_normal(tuple(leaf.shape)))
             d = leaf.detach().abs().clamp(min=1e-12) * noise
-            d = d * min(1.0, PART / max(abs(float((bar * d).sum())), 1e-300))
-            if not single or i == chosen:
-                directions[id(leaf)] = d
-                expected += float((bar * d).sum())
-        y_direction = torch.zeros_like(y_bar)
-        if not single or chosen < 0:
-            y_direction = y_bar.sign() * self.rans[0].base.abs()
-            slope = float((y_bar * y_direction).sum())
-            y_direction = y_direction * min(1e-3, PART / max(slope, 1e-300))
-            expected += float((y_bar * y_direction).sum())
-        found: list[float] = []
-        for h in STEPS:
-            found.append(sum(ran.difference(directions, y_direction, h) for ran in self.rans))
+            directions[id(leaf)] = d * min(1.0, PART / max(abs(float((bar * d).sum())), 1e-300))
+            expected += float((bar * directions[id(leaf)]).sum())
+        y_direction = y_bar.sign() * self.rans[0].base.abs()
+        slope = float((y_bar * y_direction).sum())
+        part = min(1e-3, PART / max(slope, 1e-300)) * self.some(0.0, 1.0)
+        expected += part * slope
+
+        def total(x: float) -> float:
+            moved = {key: x * d for key, d in directions.items()}
+            return sum(ran.shifted(moved, x * part * y_direction) for ran in self.rans)
+
+        found = [total(0.0)]  # not a number where a step was halved
+        for h in STEPS if np.isfinite(found[0]) else ():
+            found.append((total(h) - total(-h)) / (2 * h))
             size = max(abs(found[-1]), SMALL)
-            spread = abs(found[-1] - found[-2]) if found[1:] else np.inf
+            spread = abs(found[-1] - found[-2]) if found[2:] else np.inf
             if spread <= CLEAR * size:  # never where one is not a number
                 right = abs(expected - found[-1]) <= ALIKE * size + 2 * spread
-                assert right, f"gradient {expected!r}, differences {found} along {chosen}"
+                assert right, f"gradient {expected!r}, loss and differences {found} along {some}"
                 return True
         return False
 
@@ -420,11 +398,10 @@ def test_gradients_after_any_sequence_are_those_of_what_ran(tally: Callable[[str
         max_examples=sequences, stateful_step_count=10, database=None, deadline=None,
         phases=[Phase.generate, Phase.shrink], suppress_health_check=list(HealthCheck),
     )  # fmt: skip
-    ModelInUse.compared = ModelInUse.unclear = 0
+    ModelInUse.tally.clear()
     line.call(
         "sequence", lambda: run_state_machine_as_test(ModelInUse, settings=how), (), limit=1e5
     )
-    line.tried += ModelInUse.compared - 1
-    few = ModelInUse.unclear <= 0.05 * line.tried + 1
-    line.held(few, f"{ModelInUse.unclear} of {line.tried} sequences had nothing to compare with")
-    line.held(line.tried >= 0.3 * sequences, f"only {line.tried} were compared")
+    line.tried, unclear = ModelInUse.tally["compared"], ModelInUse.tally["unclear"]
+    enough = line.tried >= 0.3 * sequences and unclear <= 0.05 * line.tried + 1
+    line.held(enough, f"of {line.tried} sequences {unclear} had nothing to compare with")
