@@ -120,6 +120,8 @@ PLANTED: Damages = {
     "a sealed header that is code": lambda v: v.seal(
         array(f"__import__('os').mkdir({str(v.trap.path)!r})".encode())
     ),
+    "a sealed beginning of HDF5": lambda v: v.seal(b"\x89HDF\r\n\x1a\n"),
+    "a sealed beginning of NetCDF": lambda v: v.seal(b"CDF\x01"),
     "a sealed archive of others": lambda v: v.seal(archive(kind=np.asarray("Trap"), x=np.zeros(2))),
 }
 SEALED: Damages = {
@@ -178,18 +180,20 @@ TEXT: Damages = {
     "a line twice": repeated,
     "another encoding": encoded,
 }
-DAMAGES = BYTES | PLANTED | SEALED | GONE | FOREIGN | SPECIAL | RIGHTS | TEXT
 
 
-def damage(kind: str, victim: Victim) -> None:
-    """Damage a file as `DAMAGES` says: by other bytes, or by what becomes of its place."""
-    if (content := DAMAGES[kind](victim)) is not None:
+def damage(how: Callable[[Victim], bytes | None], victim: Victim) -> None:
+    """Damage a file by other bytes, or by what becomes of its place."""
+    if (content := how(victim)) is not None:
         victim.path.write_bytes(content)
 
 
 def forged(name: bytes, content: bytes) -> bytes:
     """With the checksum that a journal or a cache would write."""
     return sha256(name + content).digest() + content
+
+
+TEXTS = [*TEXT.values(), *BYTES.values()]
 
 
 # trees
@@ -301,6 +305,5 @@ def written(path: Path, tree: Any, way: str, number: int, rng: np.random.Generat
     changed = mutant(tree, rng) if way == "values" else Mutant(tree, new=number)
     path.write_text(document(changed.tree), encoding="utf-8")
     if way == "text":
-        kinds = [*TEXT, *BYTES]
-        damage(kinds[number % len(kinds)], Victim(path, rng))
+        damage(TEXTS[number % len(TEXTS)], Victim(path, rng))
     return changed

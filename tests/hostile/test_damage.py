@@ -22,13 +22,14 @@ from hostile.damage import (
     RIGHTS,
     SEALED,
     SPECIAL,
+    Damages,
     Trap,
     Victim,
     damage,
     forged,
 )
 from hostile.processes import ended, fork, kernels, remembered, restore
-from hostile.specimens import cells, csv_text, dataset, make, problem, run
+from hostile.specimens import dataset, make, problem, run
 from hostile.trial import LIMIT, Tally, count, random, sentence
 from torchsoft.datasets import Trajectories, open_dataset
 from torchsoft.datasets.check import check
@@ -55,7 +56,7 @@ class Specimen(NamedTuple):
     sound: Path
     wrong: Callable[[Path, str], str]
     seal: Callable[[Path, bytes], bytes] = lambda path, content: content
-    damages: dict[str, Any] = FOREIGN
+    damages: Damages = FOREIGN
 
 
 def misread(read: Callable[[], bool], name: str = "") -> str:
@@ -165,7 +166,8 @@ def test_the_answer_keeps_its_bits(
 ) -> None:
     """Whatever happened to however many files, and afterwards every file is whole again."""
     line, folder = tally("identifications resumed from damaged checkpoints"), tmp_path / "runs"
-    kinds = sorted((BYTES | GONE | checkpoint.damages).keys() - {*SEALED, "a folder"})
+    damages = BYTES | GONE | checkpoint.damages
+    kinds = sorted(damages.keys() - {*SEALED, "a folder"})
     names, trap = sorted(identified.runs), Trap(tmp_path / "executed")
     for number in range(count(24)):
         rng = random("resumed", number)
@@ -173,7 +175,7 @@ def test_the_answer_keeps_its_bits(
         for name in rng.permutation(names)[: 1 + number % len(names)].tolist():
             path, other = folder / name, identified.folder / str(rng.choice(names))
             seal = partial(checkpoint.seal, path)
-            damage(str(rng.choice(kinds)), Victim(path, rng, other, trap, seal))
+            damage(damages[str(rng.choice(kinds))], Victim(path, rng, other, trap, seal))
         again = identify(identified.problem, rtol=RTOL, checkpoint=folder)
         whole = [encoded(identified.recalled(folder / name)) for name in names]
         held = whole == [encoded(result) for _, (*_, result) in sorted(identified.runs.items())]
@@ -233,18 +235,14 @@ def generated(tmp_path_factory: Make) -> Specimen:
     return Specimen(place / "sound", wrong)
 
 
-def raw(values: dict[str, Any]) -> dict[str, bytes]:
-    return {name: column.tobytes() for name, column in values.items()}
-
-
-def misread_table(path: Path, truth: dict[str, bytes] | None) -> str:
+def misread_table(path: Path, truth: xr.Dataset | None) -> str:
     """What is wrong with how a trajectory file is read, in a process of its own: damage may make
     libraries crash."""
 
     def read() -> bool:
-        values = read_table(path).values
-        finite = all(bool(np.isfinite(column).all()) for column in values.values())
-        return finite and (truth is None or raw(values) == truth)
+        values = read_table(path).values.values()
+        finite = all(bool(np.isfinite(column).all()) for column in values)
+        return finite and (truth is None or load(path).identical(truth))
 
     def child() -> int:
         print(said := misread(read, path.name))
@@ -254,45 +252,38 @@ def misread_table(path: Path, truth: dict[str, bytes] | None) -> str:
     return f"the reader ended with {status}" if status else ""
 
 
+def remade(change: Callable[[xr.Dataset, str], xr.Dataset]) -> Callable[[Victim], None]:
+    """Another well-formed file."""
+
+    def remake(v: Victim) -> None:
+        data = load(v.path)
+        names = sorted({str(name) for name in data.variables} - {"axis"})
+        save(change(data, names[v.rng.integers(len(names))]), v.path)
+
+    return remake
+
+
+REMADE: Damages = {
+    "missing": remade(lambda data, name: data.drop_vars(name)),
+    "renamed": remade(lambda data, name: data.rename({name: f"{name}_"})),
+    "in furlong": remade(lambda data, name: data.assign({name: data[name].assign_attrs(units="")})),
+    "infinite": remade(lambda data, name: data.assign({name: data[name] * np.inf})),
+    "huge": remade(lambda data, name: data.assign({name: data[name].where(data[name] < 0, 1e308)})),
+    "text": remade(lambda data, name: data.assign({name: data[name].astype(str)})),
+    "reshaped": remade(lambda data, name: data.assign({name: (("i", "k"), np.zeros((3, 2)))})),
+}
+"""What an array of another trajectory file may be."""
+
+
 @pytest.fixture(scope="module")
 def trajectory(tmp_path_factory: Make) -> Specimen:
     sound = tmp_path_factory.mktemp("runs")
     run().save(sound / "run.nc")
-    truth = read_table(sound / "run.nc").values
-    assert set(truth) == set(COLUMNS)
+    truth = load(sound / "run.nc")
+    assert set(read_table(sound / "run.nc").values) == set(COLUMNS)
+    wrong = lambda path, kind: misread_table(path, None if kind in REMADE else truth)
     seal = lambda path, content: sealed(content)
-    wrong = lambda path, kind: misread_table(path, raw(truth))
-    return Specimen(sound, wrong, seal, PLANTED | SPECIAL)
-
-
-REMADE: tuple[Callable[[xr.Dataset, str], xr.Dataset], ...] = (
-    lambda data, name: data.drop_vars(name),
-    lambda data, name: data.rename({name: f"{name}_"}),
-    lambda data, name: data.assign({name: data[name].assign_attrs(units="furlong")}),
-    lambda data, name: data.assign({name: data[name] * np.inf}),
-    lambda data, name: data.assign({name: data[name].where(data[name] < 0, 1e308)}),
-    lambda data, name: data.assign({name: data[name].astype(str)}),
-    lambda data, name: data.assign({name: (("one", "two"), np.zeros((3, 2)))}),
-)
-"""Other well-formed files: an array is missing, renamed, of another unit, type or shape, or has
-values that cannot be."""
-
-
-def test_other_trajectory_files(
-    trajectory: Specimen, tmp_path: Path, tally: Callable[[str], Tally]
-) -> None:
-    line, path = tally("trajectory files of other content"), tmp_path / "other.nc"
-    data = load(trajectory.sound / "run.nc")
-    for name in [*data.variables][: count(len(data.variables))]:
-        for number, change in enumerate(REMADE):
-            if name != "axis":
-                save(change(data, str(name)), path)
-                line.held(not misread_table(path, None), f"{name} remade {number}")
-    heads = b"", b"CDF\x01", b"\x89HDF\r\n\x1a\n", b"PK\x03\x04", bytes(1000)
-    foreign = *heads, csv_text(cells()).encode(), bytes(data[["time"]].to_netcdf())
-    for number, content in enumerate((*foreign, *map(sealed, foreign))):
-        path.write_bytes(content)
-        line.held(not misread_table(path, None), f"foreign {number}")
+    return Specimen(sound, wrong, seal, PLANTED | SPECIAL | REMADE)
 
 
 # all
@@ -320,18 +311,18 @@ def test_a_damaged_file_is_noticed(
     fixture, pattern, number = FILES[files]
     specimen: Specimen = request.getfixturevalue(fixture)
     line, copy, trap = tally(f"damaged {files}"), tmp_path / "copy", Trap(tmp_path / "executed")
+    damages = BYTES | GONE | specimen.damages
     for trial in range(count(number)):
         rng = random(files, trial)
         restore(copy, specimen.sound)
         paths = [path for path in sorted(copy.glob(pattern)) if path.is_file()]
         path = paths[rng.integers(len(paths))]
         others = [other for other in paths if other.read_bytes() != path.read_bytes()]
-        kinds = list(BYTES | GONE | specimen.damages)
-        kind = kinds[trial % len(kinds)]
+        kind = [*damages][trial % len(damages)]
         if not others and kind in FOREIGN:
             kind = "a bit"
         other = others[rng.integers(len(others))] if others else path
-        damage(kind, Victim(path, rng, other, trap, partial(specimen.seal, path)))
+        damage(damages[kind], Victim(path, rng, other, trap, partial(specimen.seal, path)))
 
         def judged(path: Path = path, kind: str = kind) -> None:
             assert not (wrong := specimen.wrong(path, kind)), wrong

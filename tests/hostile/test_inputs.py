@@ -13,18 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-from hostile.damage import (
-    BYTES,
-    TEXT,
-    Mutant,
-    Victim,
-    damage,
-    document,
-    leaves,
-    mutant,
-    put,
-    written,
-)
+from hostile.damage import TEXTS, Mutant, Victim, damage, document, leaves, mutant, put, written
 from hostile.processes import ROOT
 from hostile.specimens import Table, cells, csv_text
 from hostile.trial import LIMIT, Tally, count, random, sentence
@@ -369,13 +358,13 @@ def mutated(table: Table, rng: np.random.Generator) -> tuple[str, Mutant]:
 
 def test_a_mutated_table_of_measurements(folder: Path, tally: Lines) -> None:
     line, rng, table = tally("tables of measurements"), random("cells"), cells()
-    path, kinds = folder / "data.csv", [*TEXT, *BYTES]
+    path = folder / "data.csv"
     load = partial(measured.load, [path], folder / "rig.toml")
     for i in range(count(3000)):
         text, changed = mutated(table, rng) if i % 4 < 3 else (csv_text(table), Mutant(new=i))
         path.write_text(text, encoding="utf-8")
         if i % 4 == 3:
-            damage(kinds[i // 4 % len(kinds)], Victim(path, rng))
+            damage(TEXTS[i // 4 % len(TEXTS)], Victim(path, rng))
         attack(line, changed, load, run_once if i % 10 == 0 else None)
 
 

@@ -203,8 +203,9 @@ def test_stopped_it_ends_the_same(stops: str, memory: Path, tally: Lines) -> Non
     for out in (memory / "first", memory / "whole"):  # kernels are compiled once
         began = time.monotonic()
         assert ended(work.begin(out)) == 0
-    seconds, expected, trial = time.monotonic() - began, work.result(memory / "whole"), 0
-    while line.tried < count(number):
+    seconds, expected = time.monotonic() - began, work.result(memory / "whole")
+    stopped = trial = 0
+    while stopped < count(number):
         trial += 1
         assert trial < 10 * count(number), "most end before they are stopped"
         out = memory / f"out-{trial}"
@@ -228,8 +229,8 @@ def test_stopped_it_ends_the_same(stops: str, memory: Path, tally: Lines) -> Non
                 held = held and told and work.progress(out) >= kept
             else:
                 held = held and status in (0, -signal.SIGKILL)
-            if status:
-                line.held(held, f"{trial}: {status}, others {others}, {kept} kept")
+            stopped += status != 0
+            line.held(held, f"{trial}: {status}, others {others}, {kept} kept")
         status = ended(work.begin(out))
         same = status == 0 and work.result(out) == expected
         line.held(same, f"{trial}: the last start ended with {status}, or left something else")

@@ -17,7 +17,7 @@ from unittest import mock
 
 import pytest
 
-from hostile.damage import Trap, Victim, damage, document
+from hostile.damage import BYTES, FOREIGN, GONE, Trap, Victim, damage, document
 from hostile.processes import ROOT, USER, start
 from hostile.specimens import IDENTIFICATION, ROLL, ROLLING, cells, csv_text
 from hostile.trial import Tally, count, random
@@ -84,12 +84,13 @@ def test_damaged_kernels_of_the_simulator_are_made_again(
 ) -> None:
     """In a start of its own for every damage; the simulator's own results keep their bits."""
     line, trap = tally("damaged files of the simulator's kernels"), Trap(tmp_path / "executed")
+    kinds = BYTES | GONE | FOREIGN
     for kind in ("empty", "a bit", "all noise", "a folder", "another's"):
         kept = tmp_path / kind / "torchsoft" / cache.NAME
         shutil.copytree(cache.FOLDERS[0], kept)
         (path,) = kept.glob("torchsoft.solve.kernel.run.run-*.kernel")
         (other, *_) = sorted({*kept.iterdir()} - {path})
-        damage(kind, Victim(path, random(kind), other, trap))
+        damage(kinds[kind], Victim(path, random(kind), other, trap))
         expect(line, "-c", ROLL, out=rolled, err=".*", NUMBA_CACHE_DIR=str(tmp_path / kind))
     line.held(not trap.path.exists(), "executed")
 
