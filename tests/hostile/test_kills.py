@@ -28,7 +28,6 @@ from hostile.processes import (
     execute,
     fork,
     kernels,
-    memory,
     performed,
     restore,
     tree,
@@ -41,7 +40,6 @@ from torchsoft.solve.kernel import cache
 from torchsoft.sysid import identify
 from torchsoft.sysid import report as page
 
-__all__ = ["memory"]
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
 
 Lines = Callable[[str], Tally]
