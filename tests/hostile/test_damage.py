@@ -1,222 +1,331 @@
-"""Damage to every kind of file that is read back: it is noticed, or what is read is what was
-written."""
+"""Damage to every kind of file that is read back: it is never executed, and noticed, or the values
+are those that were written."""
 
-import shutil
+import io
+import warnings
 from collections.abc import Callable
+from contextlib import redirect_stderr
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+from unittest import mock
 
 import numpy as np
 import pytest
-import torch
+import xarray as xr
 
-from hostile.small import config, make, restore
-from hostile.trial import Tally
+from hostile.damage import (
+    BYTES,
+    FOREIGN,
+    GONE,
+    PLANTED,
+    RIGHTS,
+    SEALED,
+    SPECIAL,
+    Damages,
+    Trap,
+    Victim,
+    damage,
+    forged,
+)
+from hostile.processes import ended, fork, kernels, remembered, restore
+from hostile.specimens import dataset, make, problem, run
+from hostile.trial import LIMIT, Tally, count, random, sentence
 from torchsoft.datasets import Trajectories, open_dataset
 from torchsoft.datasets.check import check
 from torchsoft.datasets.files import StoreError
-from torchsoft.paper.equilibrium import rest
-from torchsoft.paper.parameters import Parameters
-from torchsoft.paper.rig import SoftGrasp
-from torchsoft.solve.simulate import simulate
-from torchsoft.sysid.columns import read_table
+from torchsoft.files import sealed
+from torchsoft.solve.kernel import cache
+from torchsoft.solve.trajectory import load, save
+from torchsoft.sysid import IdentificationResult, Problem, identify
+from torchsoft.sysid.columns import COLUMNS, read_table
+from torchsoft.sysid.prediction import FailedRun
+from torchsoft.sysid.result import load_answer
+from torchsoft.sysid.runs import CHECKPOINT, Journal, Runner, encoded, forget
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore::zarr.errors.ZarrUserWarning")]
 
-Damage = Callable[[Path, np.random.Generator, list[Path]], None]
-
-
-def flip(path: Path, rng: np.random.Generator, others: list[Path]) -> None:
-    """One bit."""
-    data = bytearray(path.read_bytes())
-    data[rng.integers(len(data))] ^= 1 << int(rng.integers(8))
-    path.write_bytes(data)
+RTOL = 1e-3
+Make = pytest.TempPathFactory
 
 
-def zero(path: Path, rng: np.random.Generator, others: list[Path]) -> None:
-    """64 bytes, or all that there are; of which one is not zero before."""
-    data = bytearray(path.read_bytes())
-    somewhere = int(rng.choice(np.flatnonzero(np.frombuffer(data, np.uint8))))
-    begin = max(0, somewhere - int(rng.integers(min(64, len(data)))))
-    data[begin : begin + 64] = bytes(len(data[begin : begin + 64]))
-    path.write_bytes(data)
+class Specimen(NamedTuple):
+    """A folder of sound files; what is wrong with a copy of it in which a file was damaged, empty
+    if nothing is; how a content is sealed for a file; and damages beyond those to bytes."""
+
+    sound: Path
+    wrong: Callable[[Path, str], str]
+    seal: Callable[[Path, bytes], bytes] = lambda path, content: content
+    damages: Damages = FOREIGN
 
 
-def scramble(path: Path, rng: np.random.Generator, others: list[Path]) -> None:
-    """Up to 4096 bytes at random."""
-    data = bytearray(path.read_bytes())
-    begin = int(rng.integers(len(data)))
-    length = len(data[begin : begin + int(rng.integers(8, 4097))])
-    data[begin : begin + length] = rng.integers(0, 256, length, np.uint8).tobytes()
-    path.write_bytes(data)
+def misread(read: Callable[[], bool], name: str = "") -> str:
+    """What is wrong with how a file is read: neither refused in a sentence, nor as it was."""
+    try:
+        return "" if read() else "other values were read"
+    except (ValueError, OSError, StoreError) as refusal:
+        fine = sentence(str(refusal)) and name in str(refusal)
+        return "" if fine else f"not one sentence with the file's name: {refusal}"
 
 
-def truncate(path: Path, rng: np.random.Generator, others: list[Path]) -> None:
-    data = path.read_bytes()
-    path.write_bytes(data[: rng.integers(len(data))])
-
-
-def empty(path: Path, rng: np.random.Generator, others: list[Path]) -> None:
-    path.write_bytes(b"")
-
-
-def append(path: Path, rng: np.random.Generator, others: list[Path]) -> None:
-    """A few bytes, white space among them."""
-    more = (b" ", b"\n", b"\0", b"{}", bytes(64), b"0" * 5000)
-    path.write_bytes(path.read_bytes() + more[rng.integers(len(more))])
-
-
-def delete(path: Path, rng: np.random.Generator, others: list[Path]) -> None:
-    path.unlink()
-
-
-def folder(path: Path, rng: np.random.Generator, others: list[Path]) -> None:
-    """A folder of the same name in its place."""
-    path.unlink()
-    path.mkdir()
-
-
-def swap(path: Path, rng: np.random.Generator, others: list[Path]) -> None:
-    """With a file of the same kind."""
-    other = others[rng.integers(len(others))]
-    a, b = path.read_bytes(), other.read_bytes()
-    path.write_bytes(b)
-    other.write_bytes(a)
-
-
-def duplicate(path: Path, rng: np.random.Generator, others: list[Path]) -> None:
-    """A file of the same kind over it."""
-    shutil.copyfile(others[rng.integers(len(others))], path)
-
-
-ANY: tuple[Damage, ...] = (flip, flip, zero, scramble, truncate, empty, append, delete, folder)
-SEVERAL: tuple[Damage, ...] = (*ANY, swap, duplicate)
-"""Where there are others of its kind."""
-
-KINDS: dict[str, tuple[str, int]] = {
-    "manifest": ("manifest.json", 90),
-    "metadata of the group": ("zarr.json", 70),
-    "metadata of arrays": ("*/zarr.json", 120),
-    "coordinates": ("*/c/0", 60),
-    "numbers of trajectories": ("*/c/[0-9]", 150),
-    "series": ("*/c/*/*", 240),
-    "records of shards": ("finished/*", 90),
-}
-"""Files by what they hold: a pattern, and how often they are damaged. The coordinates are those of
-`COORDINATES`."""
-
-COORDINATES = ("time", "trajectory", "axis", "lower_surface", "upper_surface")
-
-
-def matching(root: Path, kind: str) -> list[Path]:
-    found = [p for p in sorted(root.glob(KINDS[kind][0])) if p.is_file()]
-    if kind in ("coordinates", "numbers of trajectories"):
-        found = [p for p in found if (p.parts[-3] in COORDINATES) == (kind == "coordinates")]
-    return found
+# kernels
+# ----------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
-def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def kernel(tmp_path_factory: Make) -> Specimen:
+    def wrong(path: Path, kind: str) -> str:
+        for _ in range(2):
+            cache._said.clear()
+            with (
+                mock.patch.object(cache, "FOLDERS", [path.parent]),
+                redirect_stderr(io.StringIO()) as said,
+            ):
+                again = kernels()
+                right = again(3.0, 4.0) == 25.0
+            right = right and said.getvalue().count("\n") <= 1
+        healed = remembered(again) == 1 or kind == "a folder"
+        return "" if right and healed else f"{right}, {healed}: {said.getvalue()}"
+
+    sound = tmp_path_factory.mktemp("compiled") / "kernels"
+    with mock.patch.object(cache, "FOLDERS", [sound]):
+        kernels()(3.0, 4.0)
+    kinds = PLANTED | FOREIGN | RIGHTS | {"a pipe": SPECIAL["a pipe"]}
+    return Specimen(sound, wrong, lambda path, content: bytes(32) + content, kinds)
+
+
+# identifications
+# ----------------------------------------------------------------------
+
+
+class Identified(NamedTuple):
+    """An identification, the folder that its runs are kept in, and the fingerprint of their
+    recordings, the runs and their results by file name."""
+
+    problem: Problem
+    answer: IdentificationResult
+    folder: Path
+    runs: dict[str, tuple[str, Any, Any]]
+
+    def recalled(self, path: Path) -> Any:
+        """The result of a run as the journal in a folder has it."""
+        journal = Journal(path.parent, [])
+        journal._own, run, _ = self.runs[path.name]
+        return journal.recall(run)
+
+
+@pytest.fixture(scope="module")
+def identified(tmp_path_factory: Make) -> Identified:
+    recorded, runs, inner = problem(), {}, Journal.keep
+
+    def noticed(self: Journal, run: Any, result: Any) -> None:
+        runs[self._place(run)[1].name] = self._own, run, result
+        inner(self, run, result)
+
+    folder = tmp_path_factory.mktemp("checkpoint") / "runs"
+    with mock.patch.object(Journal, "keep", noticed):
+        answer = identify(recorded, rtol=RTOL, checkpoint=folder)
+    assert len(runs) >= 5
+    return Identified(recorded, answer, folder, runs)
+
+
+@pytest.fixture(scope="module")
+def checkpoint(identified: Identified) -> Specimen:
+    def wrong(path: Path, kind: str) -> str:
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            got = identified.recalled(path)
+        if kind == "damage that is sealed" and got is not None:  # data, and nothing else
+            return "" if type(got) is type(identified.runs[path.name][2]) else repr(got)
+        quiet = not path.is_file() or kind in GONE  # there is no file
+        told = len(said) == 1 and "\n" not in str(said[0].message)
+        return "" if got is None and (told or quiet) else f"{got!r:.200}, {[*map(str, said)]}"
+
+    seal = lambda path, content: forged(bytes.fromhex(path.stem), content)
+    return Specimen(identified.folder, wrong, seal, PLANTED | SEALED | FOREIGN | SPECIAL)
+
+
+@pytest.fixture(scope="module")
+def answer(identified: Identified, tmp_path_factory: Make) -> Specimen:
+    sound, truth = tmp_path_factory.mktemp("answer"), identified.answer.to_json()
+    identified.answer.save(sound / "answer.json")
+    read = lambda path: load_answer(path).to_json() == truth
+    wrong = lambda path, kind: misread(partial(read, path), path.name)
+    return Specimen(sound, wrong, damages=PLANTED | SPECIAL)
+
+
+def bits(answer: IdentificationResult) -> Any:
+    """All that the data decide."""
+    found = answer.x, answer.estimates, answer.covariance, answer.chi2, answer.residuals
+    return *found, answer.notices
+
+
+@pytest.mark.filterwarnings("ignore:the checkpoint")
+def test_the_answer_keeps_its_bits(
+    identified: Identified, checkpoint: Specimen, tally: Callable[[str], Tally], tmp_path: Path
+) -> None:
+    """Whatever happened to however many files, and afterwards every file is whole again."""
+    line, folder = tally("identifications resumed from damaged checkpoints"), tmp_path / "runs"
+    damages = BYTES | GONE | checkpoint.damages
+    kinds = sorted(damages.keys() - {*SEALED, "a folder"})
+    names, trap = sorted(identified.runs), Trap(tmp_path / "executed")
+    for number in range(count(24)):
+        rng = random("resumed", number)
+        restore(folder, identified.folder)
+        for name in rng.permutation(names)[: 1 + number % len(names)].tolist():
+            path, other = folder / name, identified.folder / str(rng.choice(names))
+            seal = partial(checkpoint.seal, path)
+            damage(damages[str(rng.choice(kinds))], Victim(path, rng, other, trap, seal))
+        again = identify(identified.problem, rtol=RTOL, checkpoint=folder)
+        whole = [encoded(identified.recalled(folder / name)) for name in names]
+        held = whole == [encoded(result) for _, (*_, result) in sorted(identified.runs.items())]
+        held = held and bits(again) == bits(identified.answer) and not trap.path.exists()
+        line.held(held, f"{number}: {bits(again)}")
+
+
+def test_folders_of_others_are_left_alone(tally: Callable[[str], Tally], tmp_path: Path) -> None:
+    """Refused in one sentence where they are not ours; where they are, what others put in them
+    stays."""
+    kept = tally("others' files in a checkpoint folder, or in its place")
+    names = ["a.pickle", "b.partial", "c.run", "answer.json", ".hidden", "é.npz"]
+    names += ["x.run.partial", f"{'0' * 64}.run.old"]
+    for number in range(count(100)):
+        rng, folder = random("others", number), tmp_path / f"{number}"
+        folder.mkdir()
+        others = rng.choice(names, int(rng.integers(1, 5)), replace=False).tolist()
+        if ours := number % 2:
+            Journal(folder, []).keep("a run", FailedRun("lost", float(rng.random())))
+        for name in others:
+            (folder / name).mkdir() if rng.random() < 0.3 else (folder / name).write_bytes(b"mine")
+        if not ours:
+            kept.call(f"{number}", lambda folder=folder: Runner([], journal=folder), (ValueError,))
+        forget(folder)
+        left = {path.name for path in folder.iterdir()} - ({CHECKPOINT} if ours else set())
+        kept.held(left == {*others}, f"{number}: {left} of {others}")
+
+
+# datasets and trajectories
+# ----------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def generated(tmp_path_factory: Make) -> Specimen:
+    """By the check, which never raises, and by either way of reading."""
     place = tmp_path_factory.mktemp("damage")
-    small, _ = config(place)
-    make(small, place / "sound")
-    return place / "sound"
+    make(dataset(place), place / "sound")
+    names = ["disc_position", "feed_forward", "grasp_force", "contact_upper", "steps"]
+
+    def windows(root: Path) -> list[bytes]:
+        numbers = Trajectories(str(root), names)
+        return [x.numpy().tobytes() for i in range(len(numbers)) for x in numbers[i].values()]
+
+    def findings(root: Path) -> list[str]:
+        return [x for x in check(str(root)) if "no commit" not in x]
+
+    data, truth = open_dataset(str(place / "sound")).load(), windows(place / "sound")
+    assert findings(place / "sound") == []
+
+    def wrong(path: Path, kind: str) -> str:
+        root = next(folder for folder in path.parents if folder.name == "copy")
+        found = findings(root)
+        noticed = "" if found and all(map(sentence, found)) else f"findings: {found}"
+        same = lambda: data.identical(open_dataset(str(root)).load()) and windows(root) == truth
+        return noticed + misread(same)
+
+    return Specimen(place / "sound", wrong)
 
 
-def repair(path: Path, data: bytes) -> None:
-    """Make the file what it was."""
-    if path.is_dir():
-        path.rmdir()
-    if not path.exists() or path.read_bytes() != data:
-        path.write_bytes(data)
+def misread_table(path: Path, truth: xr.Dataset | None) -> str:
+    """What is wrong with how a trajectory file is read, in a process of its own: damage may make
+    libraries crash."""
+
+    def read() -> bool:
+        values = read_table(path).values.values()
+        finite = all(bool(np.isfinite(column).all()) for column in values)
+        return finite and (truth is None or load(path).identical(truth))
+
+    def child() -> int:
+        print(said := misread(read, path.name))
+        return 2 if said else 0
+
+    status = ended(fork(child, int(LIMIT)))
+    return f"the reader ended with {status}" if status else ""
 
 
-def everything(root: Path) -> tuple[Any, Any]:
-    """All that there is to read, in both ways of reading it."""
-    numbers = Trajectories(
-        str(root), ["disc_position", "feed_forward", "grasp_force", "contact_upper", "steps"]
-    )
-    return open_dataset(str(root)).load(), [numbers[i] for i in range(len(numbers))]
+def remade(change: Callable[[xr.Dataset, str], xr.Dataset]) -> Callable[[Victim], None]:
+    """Another well-formed file."""
+
+    def remake(v: Victim) -> None:
+        data = load(v.path)
+        names = sorted({str(name) for name in data.variables} - {"axis"})
+        save(change(data, names[v.rng.integers(len(names))]), v.path)
+
+    return remake
 
 
-def same(a: tuple[Any, Any], b: tuple[Any, Any]) -> bool:
-    windows = len(a[1]) == len(b[1]) and all(
-        torch.equal(x[k], y[k]) for x, y in zip(a[1], b[1]) for k in y
-    )
-    return bool(a[0].identical(b[0])) and windows
+REMADE: Damages = {
+    "missing": remade(lambda data, name: data.drop_vars(name)),
+    "renamed": remade(lambda data, name: data.rename({name: f"{name}_"})),
+    "in furlong": remade(lambda data, name: data.assign({name: data[name].assign_attrs(units="")})),
+    "infinite": remade(lambda data, name: data.assign({name: data[name] * np.inf})),
+    "huge": remade(lambda data, name: data.assign({name: data[name].where(data[name] < 0, 1e308)})),
+    "text": remade(lambda data, name: data.assign({name: data[name].astype(str)})),
+    "reshaped": remade(lambda data, name: data.assign({name: (("i", "k"), np.zeros((3, 2)))})),
+}
+"""What an array of another trajectory file may be."""
 
 
-def one_line(text: str) -> bool:
-    return bool(text) and "\n" not in text and len(text) < 2000
+@pytest.fixture(scope="module")
+def trajectory(tmp_path_factory: Make) -> Specimen:
+    sound = tmp_path_factory.mktemp("runs")
+    run().save(sound / "run.nc")
+    truth = load(sound / "run.nc")
+    assert set(read_table(sound / "run.nc").values) == set(COLUMNS)
+    wrong = lambda path, kind: misread_table(path, None if kind in REMADE else truth)
+    seal = lambda path, content: sealed(content)
+    return Specimen(sound, wrong, seal, PLANTED | SPECIAL | REMADE)
 
 
-@pytest.mark.filterwarnings("ignore::zarr.errors.ZarrUserWarning")
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_damaged_dataset_is_noticed(
-    kind: str,
-    sound: Path,
-    tmp_path: Path,
-    tally: Callable[[str], Tally],
-    random: Any,
-    count: Callable[[int], int],
+# all
+# ----------------------------------------------------------------------
+
+FILES: dict[str, tuple[str, str, int]] = {
+    "compiled kernels": ("kernel", "*.kernel", 280),
+    "runs of a checkpoint": ("checkpoint", "*.run", 420),
+    "answers": ("answer", "*.json", 200),
+    "trajectory files": ("trajectory", "*.nc", 1400),
+    "manifest of a dataset": ("generated", "manifest.json", 90),
+    "metadata of its group": ("generated", "zarr.json", 70),
+    "metadata of its arrays": ("generated", "*/zarr.json", 120),
+    "coordinates and numbers of its trajectories": ("generated", "*/c/[0-9]", 210),
+    "series of its trajectories": ("generated", "*/c/*/*", 240),
+    "records of its shards": ("generated", "finished/*", 90),
+}
+"""Kinds of files: the specimen, the pattern of names, and how often one is damaged."""
+
+
+@pytest.mark.parametrize("files", FILES)
+def test_a_damaged_file_is_noticed(
+    files: str, request: pytest.FixtureRequest, tmp_path: Path, tally: Callable[[str], Tally]
 ) -> None:
-    """By the check, which never raises, and by either way of reading: refused in one sentence, or
-    the very same values."""
-    line, truth, out = tally(f"damaged {kind}"), everything(sound), tmp_path / "set"
-    assert [x for x in check(str(sound)) if "no commit" not in x] == []
-    restore(out, sound)
-    files = {path: path.read_bytes() for path in matching(out, kind)}
-    for trial in range(count(KINDS[kind][1])):
-        rng = random(trial, list(KINDS).index(kind))
-        for path, data in files.items():
-            repair(path, data)
-        path = list(files)[rng.integers(len(files))]
-        kinds = [other for other, data in files.items() if data != files[path]]
-        damage = (SEVERAL if kinds else ANY)[rng.integers(len(SEVERAL if kinds else ANY))]
-        what = f"trial {trial}, {damage.__name__} {path.relative_to(out)}"
-        damage(path, rng, kinds)
-        try:
-            findings = [x for x in check(str(out)) if "no commit" not in x]
-        except Exception as error:
-            line.held(False, f"{what}: the check raised {error!r}")
-            continue
-        try:
-            reads = "" if same(everything(out), truth) else "other values were read"
-        except StoreError as error:
-            reads = "" if one_line(str(error)) else f"not one sentence: {error}"
-        except Exception as error:
-            reads = f"reading raised {error!r}"
-        noticed = bool(findings) and all(map(one_line, findings))
-        line.held(noticed and not reads, f"{what}: findings {findings}; {reads}")
+    fixture, pattern, number = FILES[files]
+    specimen: Specimen = request.getfixturevalue(fixture)
+    line, copy, trap = tally(f"damaged {files}"), tmp_path / "copy", Trap(tmp_path / "executed")
+    damages = BYTES | GONE | specimen.damages
+    for trial in range(count(number)):
+        rng = random(files, trial)
+        restore(copy, specimen.sound)
+        paths = [path for path in sorted(copy.glob(pattern)) if path.is_file()]
+        path = paths[rng.integers(len(paths))]
+        others = [other for other in paths if other.read_bytes() != path.read_bytes()]
+        kind = [*damages][trial % len(damages)]
+        if not others and kind in FOREIGN:
+            kind = "a bit"
+        other = others[rng.integers(len(others))] if others else path
+        damage(damages[kind], Victim(path, rng, other, trap, partial(specimen.seal, path)))
 
+        def judged(path: Path = path, kind: str = kind) -> None:
+            assert not (wrong := specimen.wrong(path, kind)), wrong
+            assert not trap.path.exists(), "executed"
 
-def test_a_damaged_trajectory_file_is_noticed(
-    tmp_path: Path, tally: Callable[[str], Tally], random: Any, count: Callable[[int], int]
-) -> None:
-    """Refused in one sentence, or the very same values."""
-    model = SoftGrasp(
-        Parameters().override({"pad.elements_x": 40, "pad.elements_y": 1, "contact.v_s": 0.05})
-    )
-    run = simulate(
-        model, torch.linspace(0, 0.05, 11, dtype=torch.float64), y0=rest(model).detach(), step=5e-3
-    )
-    good, path, line = tmp_path / "good.nc", tmp_path / "run.nc", tally("damaged trajectory files")
-    run.save(good)
-    truth = read_table(good).values
-    for trial in range(count(200)):
-        rng = random(trial, 100)
-        repair(path, good.read_bytes())
-        damage = ANY[rng.integers(len(ANY))]
-        damage(path, rng, [])
-        what = f"trial {trial}, {damage.__name__}"
-        try:
-            found = read_table(path).values
-        except (ValueError, OSError) as error:
-            line.held(one_line(str(error)), f"{what}: not one sentence: {error}")
-        except Exception as error:
-            line.held(False, f"{what}: {error!r}")
-        else:
-            equal = found.keys() == truth.keys() and all(
-                np.array_equal(found[k], truth[k]) for k in truth
-            )
-            line.held(equal, f"{what}: other values were read")
+        line.call(f"{trial}, {kind}, {path.name}", judged, ())

@@ -1,84 +1,112 @@
-"""Mutated configurations of every kind: accepted and then finite, or refused in a sentence that
-names the field."""
+"""Mutated configurations, identification files and tables of measurements: accepted and then
+finite, or refused in a sentence that names the field, or file, row and column."""
 
+import copy
+import re
 import tomllib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, Phase, given, settings
-from hypothesis import seed as seeded
-from hypothesis import strategies as st
 
-from hostile.asked import ask
-from hostile.mutation import Mutant, written
-from hostile.trial import SEED, Tally, count, random
+from hostile.damage import TEXTS, Mutant, Victim, damage, document, leaves, mutant, put, written
+from hostile.processes import ROOT
+from hostile.specimens import Table, cells, csv_text
+from hostile.trial import LIMIT, Tally, count, random, sentence
 from torchsoft import Parameters, SoftGrasp, rest, simulate
 from torchsoft.cost import Costly, agree
 from torchsoft.datasets.config import Config
-from torchsoft.datasets.generate import cost
+from torchsoft.datasets.generate import cost as dataset_cost
 from torchsoft.datasets.simulation import points, task
 from torchsoft.excitation import Excitation, begin
-from torchsoft.tables import Table, from_toml
+from torchsoft.sysid import measured
+from torchsoft.sysid.measured import cost, paper_settings
+from torchsoft.sysid.runs import Runner
+from torchsoft.tables import from_toml
 
 pytestmark = pytest.mark.slow
 
-ROOT = Path(__file__).parents[2]
-COARSE = {"elements_x": 20, "elements_y": 1}
 SMALL = 1e-3
 """Meshes whose stiffness takes more memory than this [GiB] are not built here."""
 
-PARAMETERS: dict[str, Any] = Parameters().model_dump()
-PARAMETERS["pad"] |= COARSE
+COARSE = {"pad.elements_x": 20, "pad.elements_y": 1}
+BRIEFLY = torch.tensor([0.0, 2e-3, 6e-3], dtype=torch.float64)
 
-MOTIONS: tuple[dict[str, Any], ...] = (
-    {"kind": "slow_roll", "travel": 5e-3},
-    {"kind": "strokes", "travel": 5e-3, "stroke_time": 0.2},
-    {
-        "kind": "multi_sine",
-        "amplitude_x": 1e-3,
-        "amplitude_y": 1e-4,
-        "frequency": [0.5, 8.0],
-        "components": 3,
-        "seed": 1,
-    },
-    {"kind": "chirp", "amplitude_x": 1e-3, "amplitude_y": 1e-4, "start": 0.3, "end": 8.0},
-    {"kind": "press", "amplitude": 2e-4, "frequency": 2.0, "travel": 5e-3},
-)
+Lines = Callable[[str], Tally]
 
-Follow = Callable[[Any], None]
+
+def attack(
+    line: Tally, changed: Mutant, make: Callable[[], Any], follow: Callable[[Any], Any] | None
+) -> Any:
+    """Count one input; what is made of it, or None where it was refused. `follow` raises
+    `AssertionError` for what is accepted and is nonsense, and may refuse with a sentence too."""
+    shown = f"{line.kind} {changed.place} = {changed.new!r:.60}"
+    made = line.call(shown, make, blamed=changed.named)
+    if made is not None and changed.no_number:
+        line.held(False, f"{shown}: accepted in the place of a number")
+    elif made is not None and follow:
+        later = partial(follow, made)
+        line.call(f"{shown}, later", later, (ValueError, RuntimeError), limit=6 * LIMIT)
+    return made
+
+
+def finite(*tensors: torch.Tensor) -> None:
+    assert all(bool(torch.isfinite(x).all()) for x in tensors), "not finite"
+
+
+# configurations
+# ----------------------------------------------------------------------
+
+MOTIONS = """
+[[motion]]
+kind = "slow_roll"
+travel = 5e-3
+[[motion]]
+kind = "strokes"
+travel = 5e-3
+stroke_time = 0.2
+[[motion]]
+kind = "multi_sine"
+amplitude_x = 1e-3
+amplitude_y = 1e-4
+frequency = [0.5, 8.0]
+components = 3
+seed = 1
+[[motion]]
+kind = "chirp"
+amplitude_x = 1e-3
+amplitude_y = 1e-4
+start = 0.3
+end = 8.0
+[[motion]]
+kind = "press"
+amplitude = 2e-4
+frequency = 2.0
+travel = 5e-3
+"""
+GRASP = {"duration": 1.0, "depth": 1.5e-3, "senses": "bracket", "grasp_time": 0.3, "settle": 0.1}
+
+
+def parameters() -> list[dict[str, Any]]:
+    return [Parameters().override(COARSE).model_dump()]
 
 
 def excitations() -> list[dict[str, Any]]:
-    common = {
-        "duration": 1.0,
-        "depth": 1.5e-3,
-        "senses": "bracket",
-        "grasp_time": 0.3,
-        "settle": 0.1,
-        "x_C0": 60.3e-3,
-    }
-    return [{**common, "motion": motion} for motion in MOTIONS]
+    common = GRASP | {"x_C0": 60.3e-3}
+    return [common | {"motion": motion} for motion in tomllib.loads(MOTIONS)["motion"]]
 
 
 def datasets() -> list[dict[str, Any]]:
-    out = [
-        tomllib.loads(path.read_text())
-        for path in sorted((ROOT / "data_gen" / "configs").glob("*.toml"))
-    ]
-    for tree in out:
-        tree.setdefault("fixed", {}).update(
-            {"pad.elements_x": 20, "pad.elements_y": 1, "pad.height": 4.6e-3}
-        )
+    files = sorted((ROOT / "data_gen" / "configs").glob("*.toml"))
+    trees = [tomllib.loads(path.read_text()) for path in files]
+    for tree in trees:
+        tree["fixed"] = tree.get("fixed", {}) | COARSE | {"pad.height": 4.6e-3}
         tree["kinds"].append({"kind": "jerk", "depth": {"low": 2e-4, "high": 4e-4}})
-    return out
-
-
-def is_finite(*tensors: torch.Tensor) -> bool:
-    return all(bool(torch.isfinite(x).all()) for x in tensors)
+    return trees
 
 
 def run_briefly(p: Parameters) -> None:
@@ -87,25 +115,21 @@ def run_briefly(p: Parameters) -> None:
         return
     model = SoftGrasp(p)
     y0 = rest(model).detach()
-    assert is_finite(y0), "the state at rest is not finite"
-    run = simulate(model, torch.tensor([0.0, 2e-3, 6e-3], dtype=torch.float64), y0=y0, step=2e-3)
-    assert is_finite(run.y, *run.channels.values()), "the run is not finite"
+    run = simulate(model, BRIEFLY, y0=y0, step=2e-3)
+    finite(y0, run.y, *run.channels.values())
 
 
 def excite_briefly(e: Excitation) -> None:
     """The grasp, and its reference to the end."""
-    p = Parameters().override({f"pad.{name}": value for name, value in COARSE.items()})
-    begun = begin(e, p)
-    t = torch.linspace(0, e.duration, 101, dtype=torch.float64)
-    assert is_finite(begun.y0, begun.model.follow(t)), "the reference is not finite"
-    run = simulate(begun.model, t[:1].new_tensor([0.0, 2e-3, 6e-3]), y0=begun.y0, step=2e-3)
-    assert is_finite(run.y), "the run is not finite"
+    begun = begin(e, Parameters().override(COARSE))
+    follow = begun.model.follow(torch.linspace(0, e.duration, 101, dtype=torch.float64))
+    finite(begun.y0, follow, simulate(begun.model, BRIEFLY, y0=begun.y0, step=2e-3).y)
 
 
 def design_briefly(config: Config) -> None:
     """The cost, the first tasks of the design, and one of their references; a costly set needs the
     user's word."""
-    expected = cost(config, 2)
+    expected = dataset_cost(config, 2)
     assert np.isfinite(expected).all(), f"no estimate: {expected}"
     try:
         agree(expected, False, "take less")
@@ -114,117 +138,244 @@ def design_briefly(config: Config) -> None:
     few = config.model_copy(update={"trajectories": min(config.trajectories, 4)})
     for i, u in enumerate(points(few)):
         one = task(few, i, u)
-        assert np.isfinite(
-            [value for value in one.labels.values() if not isinstance(value, str)]
-        ).all()
+        assert np.isfinite([x for x in one.labels.values() if not isinstance(x, str)]).all()
     if one.parameters.pad.memory <= SMALL:
         excite_briefly(one.excitation)
 
 
-KINDS: dict[str, tuple[type[Table], Callable[[], list[dict[str, Any]]], int, int, Follow]] = {
-    "parameters": (Parameters, lambda: [PARAMETERS], 6000, 3, run_briefly),
-    "excitations": (Excitation, excitations, 3000, 3, excite_briefly),
-    "dataset configurations": (Config, datasets, 4000, 3, design_briefly),
+class Kind(NamedTuple):
+    """What reads a configuration, valid ones, how many mutants, and how every third of the accepted
+    is followed."""
+
+    table: Any
+    valid: Callable[[], list[dict[str, Any]]]
+    number: int
+    follow: Callable[[Any], None]
+
+
+KINDS = {
+    "parameters": Kind(Parameters, parameters, 6000, run_briefly),
+    "excitations": Kind(Excitation, excitations, 3000, excite_briefly),
+    "dataset configurations": Kind(Config, datasets, 4000, design_briefly),
 }
-"""Of every kind of table what reads it, valid ones, how many mutants, the share of the accepted
-that is followed, and how."""
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("way", ["values", "text"])
-def test_a_mutated_table_is_finite_or_refused_by_its_field(
-    kind: str, way: str, tally: Callable[[str], Tally], tmp_path: Path
-) -> None:
-    table, valid, number, every, follow = KINDS[kind]
-    line, rng, trees = tally(f"{kind}: {way}"), random(1, *map(ord, kind + way)), valid()
-    path = tmp_path / "mutant.toml"
-    for i in range(count(number if way == "values" else number // 4)):
-        tree = trees[i % len(trees)]
-        changed = written(path, tree, way, i, rng)
-        check = follow if i % every == 0 else None
-        ask(line, kind, changed, lambda: from_toml(path, table.model_validate), check)
-
-
-def scalars() -> st.SearchStrategy[Any]:
-    return st.one_of(
-        st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=20),
-        st.binary(max_size=5), st.lists(st.floats(), max_size=3),
-        st.dictionaries(st.text(max_size=5), st.floats(), max_size=2),
-    )  # fmt: skip
-
-
-def from_schema(schema: dict[str, Any], root: dict[str, Any]) -> st.SearchStrategy[Any]:
-    """Values near those of a JSON schema: mostly of the right kind and near the bounds, sometimes
-    anything."""
-    if "$ref" in schema:
-        schema = root["$defs"][schema["$ref"].rpartition("/")[2]]
-    match schema:
-        case {"oneOf": options} | {"anyOf": options}:
-            right = st.one_of(*(from_schema(one, root) for one in options))
-        case {"const": only}:
-            right = st.just(only)
-        case {"enum": options}:
-            right = st.sampled_from(options)
-        case {"type": "object", "properties": fields}:
-            right = st.fixed_dictionaries(
-                {}, optional={name: from_schema(one, root) for name, one in fields.items()}
-            )
-            needed = schema.get("required", [])
-            if needed:
-                right = st.fixed_dictionaries(
-                    {name: from_schema(fields[name], root) for name in needed},
-                    optional={
-                        name: from_schema(one, root)
-                        for name, one in fields.items()
-                        if name not in needed
-                    },
-                )
-        case {"type": "object"}:
-            inner = schema.get("additionalProperties")
-            known = st.sampled_from([*Parameters().table(), "pad.Young"])
-            right = st.dictionaries(
-                known,
-                from_schema(inner, root) if isinstance(inner, dict) else scalars(),
-                max_size=3,
-            )
-        case {"type": "array"}:
-            inner = schema.get("items") or schema.get("prefixItems", [{}])[0]
-            right = st.lists(from_schema(inner, root), min_size=1, max_size=3)
-        case {"type": "number"}:
-            low, high = schema.get("minimum", -1.0), schema.get("maximum", 1e3)
-            right = st.one_of(st.sampled_from([low, high]), st.floats(low, high))
-        case {"type": "integer"}:
-            low, high = schema.get("minimum", 0), schema.get("maximum", 1000)
-            right = st.one_of(st.sampled_from([low, high]), st.integers(low, high))
-        case {"type": "boolean"}:
-            right = st.booleans()
-        case _:
-            right = st.text(max_size=10)
-    return st.integers(0, 19).flatmap(lambda odd: scalars() if odd == 0 else right)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_tables_from_their_schema(kind: str, tally: Callable[[str], Tally]) -> None:
-    table, _, number, every, follow = KINDS[kind]
-    line = tally(f"{kind}: from the schema")
+def bounds(table: Any) -> dict[str, list[Any]]:
+    """Least and largest values of the fields of a table, by name."""
     schema = table.model_json_schema()
-    tried = 0
+    fields = [one.get("properties", {}) for one in (schema, *schema["$defs"].values())]
+    return {
+        name: [field["minimum"], field["maximum"]]
+        for named in fields
+        for name, field in named.items()
+        if {"minimum", "maximum"} <= field.keys()
+    }
 
-    @seeded(SEED)
-    @settings(
-        max_examples=count(number // 3), database=None, deadline=None, phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )  # fmt: skip
-    @given(tree=from_schema(schema, schema))
-    def every_one(tree: Any) -> None:
-        nonlocal tried
-        tried += 1
-        ask(
-            line,
-            kind,
-            Mutant(tree, (), new=tree),
-            lambda: table.model_validate(tree),
-            follow if tried % every == 0 else None,
-        )
 
-    every_one()
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(("way", "share"), [("values", 1.0), ("text", 0.25), ("bounds", 0.1)])
+def test_a_mutated_table_is_finite_or_refused_by_its_field(
+    kind: str, way: str, share: float, tally: Lines, tmp_path: Path
+) -> None:
+    """With one value changed, its text damaged, or many values at their bounds."""
+    table, valid, number, follow = KINDS[kind]
+    line, rng, trees, ends = tally(f"{kind}: {way}"), random(kind + way), valid(), bounds(table)
+    path = tmp_path / "mutant.toml"
+    assert all(map(table.model_validate, trees))
+    for i in range(count(share * number)):
+        tree = trees[i % len(trees)]
+        if way == "bounds":
+            changed = Mutant(copy.deepcopy(tree), new=i)
+            for place, _ in leaves(tree):
+                if place[-1] in ends and rng.random() < 0.2:
+                    put(changed.tree, place, ends[place[-1]][rng.integers(2)])
+            path.write_text(document(changed.tree), encoding="utf-8")
+        else:
+            changed = written(path, tree, way, i, rng)
+        read = partial(from_toml, path, table.model_validate)
+        attack(line, changed, read, follow if i % 3 == 0 else None)
+
+
+# identifications
+# ----------------------------------------------------------------------
+
+RTOL = 1e-3
+STATED = """
+heldout = ["second"]
+ignore = ["Temp"]
+acknowledged = ["sign of F_x"]
+missing = { F_ff = -1.0 }
+start = { kind = "rest", position_sd = 1e-5 }
+[settings]
+contact = { v_s = 0.05, mu_k = 0.5 }
+control = { senses = "bracket" }
+scenario = { x_C0 = 60.3e-3 }
+pad = { elements_x = 20, elements_y = 1, height = 4.59e-3, nu = 0.45 }
+disc = { radius = 19.37e-3 }
+[unknowns]
+"contact.K_n" = { nominal = 8e4 }
+"pad.E" = { nominal = 0.45e6 }
+"pad.tau" = { nominal = 20e-3 }
+"contact.mu_s" = { nominal = 0.9, low = 0.5, high = 2.0 }
+"pad.nu" = { scale = "linear", low = 0.3, high = 0.49 }
+[unknowns."contact.R_t"]
+nominal = 400.0
+low = 100.0
+high = 1e3
+scale = "log"
+per = "recording"
+prior = { median = 400.0, sd = 0.5, kind = "log-normal" }
+fixed = false
+[sensors]
+x_C = { noise = 10e-6 }
+theta = { noise = 0.5e-3, bias = 1e-3, delay = 2e-3, per = "all" }
+x_Br = { noise = 10e-6 }
+y_Br = { noise = 10e-6 }
+F_x = { noise = 0.1 }
+[sensors.F_y]
+noise = 0.1
+gain = 0.02
+drift = 0.1
+low = -500.0
+high = 500.0
+colour = "white"
+[fit]
+rtol = 1e-3
+starts = 1
+loss = "linear"
+method = "gauss_newton"
+workers = 1
+seed = 0
+[[recordings]]
+files = ["second.csv", "force.csv"]
+name = "second"
+settings = { "contact.v_s" = 0.06 }
+missing = { F_ff = 0.0 }
+"""
+SLOW = """
+[[recordings]]
+file = "third.csv"
+name = "third"
+[recordings.start]
+kind = "moving"
+lead = 40e-3
+given = { "disc.y" = { mean = 23.5e-3, sd = 1e-4 } }
+[pads]
+kind = "kelvin_voigt"
+[compare.coulomb]
+settings = { "contact.friction" = "coulomb" }
+without = ["contact.R_t"]
+[compare.solid]
+pads = { kind = "standard_linear_solid", E_instant = 2e6, tau_instant = 1e-4 }
+"""
+"""What a file may state; and what takes longer, a recording that begins in motion and competing
+laws."""
+
+
+def identification(slow: bool) -> dict[str, Any]:
+    return tomllib.loads(STATED + SLOW if slow else STATED)
+
+
+def run_once(case: measured.Case) -> None:
+    """The estimate, and one run from the start: residuals are finite, or the reason is a
+    sentence."""
+    problem, fit = case.problem, case.config.fit
+    expected = cost(problem, fit.rtol, fit.starts, fit.workers, case.config.heldout)
+    assert np.isfinite(expected).all(), f"no estimate: {expected}"
+    memory = max(paper_settings(r).pad.memory for r in problem.recordings)
+    if memory > SMALL or cost(problem, RTOL, 1, 1).steps > 1e5:
+        return
+    start, free = problem.coordinates.start, problem.coordinates.free
+    runner = Runner(problem.recordings)
+    out = problem.residuals(runner, start, problem.names[:1], RTOL, free)
+    assert all(sentence(lost.reason) for lost in out.lost.values()), out.lost
+    assert out.lost or (np.isfinite(out.r).all() and np.isfinite(out.J).all()), "not finite"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    table = cells()
+    parts = {"data": table, "third": table, "second": [row[:5] + row[6:10] for row in table]}
+    parts["force"] = [[row[0], *row[10:12], "Temp [K]"] for row in table]
+    for name, rows in parts.items():
+        (tmp_path / f"{name}.csv").write_text(csv_text(rows), encoding="utf-8")
+    (tmp_path / "rig.toml").write_text(document(identification(True)), encoding="utf-8")
+    return tmp_path
+
+
+@pytest.mark.parametrize(("way", "number"), [("values", 4000), ("text", 1000)])
+def test_a_mutated_identification(way: str, number: int, folder: Path, tally: Lines) -> None:
+    line, rng, path = tally(f"identifications: {way}"), random(way), folder / "rig.toml"
+    load = partial(measured.load, [folder / "data.csv"], path)
+    trees = identification(False), identification(True)
+    assert attack(line, Mutant(), load, run_once)
+    for i in range(count(number)):
+        changed = written(path, trees[i % 10 == 5], way, i, rng)
+        attack(line, changed, load, run_once if i % 10 == 0 else None)
+
+
+# tables of measurements
+# ----------------------------------------------------------------------
+
+HEADINGS = (
+    "", "x_c [mm]", "x_C", "x_C [inch]", "x_C [m", "[mm]", "t [s]", "t [ms]", "x_C [deg]",
+    "y_C [mm]", "F_x [N]", "x_C [mm] [mm]", "\x00", "µ" * 300,
+)  # fmt: skip
+NUMBER = re.compile(r"\s*|[-+]?[\d.]+(e[-+]?\d+)?", re.ASCII)
+"""What a cell may hold: a number, or none."""
+
+
+def mutated(table: Table, rng: np.random.Generator) -> tuple[str, Mutant]:
+    """A table with one thing changed, as text; the place names its column where only that
+    changed."""
+    head, *body = table
+    row, column = int(rng.integers(len(body))), int(rng.integers(len(head)))
+    name, delimiter = (head[column].partition(" ")[0],), ","
+    factor = float(10.0 ** rng.uniform(-6, 6))
+    match int(rng.integers(10)):
+        case 0:
+            head = [*head]
+            head[column] = HEADINGS[rng.integers(len(HEADINGS))]
+        case 1:
+            delimiter = str(rng.choice([";", "\t", " ", "|"]))
+        case 2:
+            head, *body = ([*row[:column], *row[column + 1 :]] for row in table)
+        case 3:
+            body = [*body[:row], body[row][:column] or ["1"] * 20, *body[row + 1 :]]
+        case 4:
+            body = body[:row] + body[row + int(rng.integers(39)) :]
+        case 5:
+            values = [repr(float(row[column] or 0) * factor) for row in body]
+            body = [[*row[:column], x, *row[column + 1 :]] for row, x in zip(body, values)]
+            return csv_text([head, *body]), Mutant(place=name, new=f"times {factor}")
+        case _:
+            changed = mutant([[float(x or 0) for x in row] for row in body], rng)
+            place = (head[changed.place[1]].partition(" ")[0],) if changed.place else ()
+            wrong = changed.new if not NUMBER.fullmatch(str(changed.new)) else None
+            return csv_text([head, *changed.tree]), Mutant(None, place, 1.0, wrong and str(wrong))
+    return csv_text([head, *body], delimiter), Mutant(new=(row, column))
+
+
+def test_a_mutated_table_of_measurements(folder: Path, tally: Lines) -> None:
+    line, rng, table = tally("tables of measurements"), random("cells"), cells()
+    path = folder / "data.csv"
+    load = partial(measured.load, [path], folder / "rig.toml")
+    for i in range(count(3000)):
+        text, changed = mutated(table, rng) if i % 4 < 3 else (csv_text(table), Mutant(new=i))
+        path.write_text(text, encoding="utf-8")
+        if i % 4 == 3:
+            damage(TEXTS[i // 4 % len(TEXTS)], Victim(path, rng))
+        attack(line, changed, load, run_once if i % 10 == 0 else None)
+
+
+def test_a_long_table_is_read_in_seconds(folder: Path, tally: Lines) -> None:
+    """1e5 rows, at the example's 0.2 s: the estimate is of minutes, because dense samples are
+    interpolated."""
+    line, (head, *body) = tally("long tables"), cells()
+    numbers = np.array(body, float)
+    t = np.linspace(numbers[0, 0], numbers[-1, 0], 100_000)
+    rows = np.stack([np.interp(t, numbers[:, 0], one) for one in numbers.T], 1).astype(str)
+    (folder / "data.csv").write_text(csv_text([head, *rows.tolist()]), encoding="utf-8")
+    load = partial(measured.load, [folder / "data.csv"], folder / "rig.toml")
+    expected = cost(attack(line, Mutant(), load, None).problem, RTOL, 1, 1)
+    line.held(expected.seconds < 600 and expected.memory < 0.5, f"1e5 rows: {expected.sentence}")

@@ -1,143 +1,261 @@
-"""SIGKILL at random moments of a generation; started again it ends in the same bytes, and nothing
-is left over."""
+"""Death at any moment: at every operation on files, and by SIGKILL or Ctrl-C at random. A normal
+start then ends in the same bytes, and nothing is left over."""
 
+import json
 import os
 import shutil
 import signal
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+from unittest import mock
 
-import numpy as np
+import dask
 import pytest
+from matplotlib.figure import Figure
 
-from hostile.small import config, difference, fork, in_memory, make, tree
-from hostile.trial import Tally
+from hostile.processes import (
+    DIED,
+    alive,
+    difference,
+    ended,
+    execute,
+    fork,
+    kernels,
+    performed,
+    restore,
+    tree,
+)
+from hostile.specimens import IDENTIFICATION, cells, csv_text, dataset, make, problem, run
+from hostile.trial import Tally, count, random
+from torchsoft.cli import main
+from torchsoft.datasets import check
+from torchsoft.solve.kernel import cache
+from torchsoft.sysid import identify
+from torchsoft.sysid import report as page
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(1500)]
+
+Lines = Callable[[str], Tally]
+
+# at every operation on files
+# ----------------------------------------------------------------------
 
 
-@pytest.fixture
-def tmp_path(tmp_path: Path) -> Iterator[Path]:
-    yield from in_memory(tmp_path)
-
-
-ROOT = Path(__file__).parent.parent.parent
-
-
-def kill(pid: int) -> bool:
-    """Whether the process was still there to be killed."""
-    os.kill(pid, signal.SIGKILL)
-    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == -signal.SIGKILL
-
-
-def test_killed_generations(
-    tmp_path: Path, tally: Callable[[str], Tally], random: Any, count: Callable[[int], int]
+def crash(
+    line: Tally, function: Callable[[], Any], out: Path, number: int, begin: Path = Path("none")
 ) -> None:
-    """Killed once, twice or three times, and then started again."""
-    small, _ = config(tmp_path)
-    make(small, tmp_path / "whole")
-    expected, out, line = tree(tmp_path / "whole"), tmp_path / "set", tally("kills of a generation")
-    began = time.perf_counter()
-    os.waitpid(fork(lambda: make(small, tmp_path / "again")), 0)
-    duration = time.perf_counter() - began
-    rng, trial = random(300), 0
-    while line.tried < count(40):
+    """Die at `number` of the function's operations on `out`, or at all if there are fewer, begun
+    from the folder `begin`; each time the function done again must leave what it leaves
+    undisturbed."""
+    out.parent.mkdir(exist_ok=True)
+    restore(out, begin)
+    status, operations = performed(function, out.parent)
+    assert status == 0
+    assert operations
+    expected, seen = tree(out.parent), Counter[str]()
+    for point in random(line.kind).permutation(len(operations))[: count(number)].tolist():
+        restore(out, begin)
+        seen[operations[point]] += 1
+        status, _ = performed(function, out.parent, point)
+
+        def again(status: int = status) -> None:
+            assert status == DIED
+            function()
+            assert not (wrong := difference(out.parent, expected)), wrong
+
+        line.call(f"died at {point} of {len(operations)}, {operations[point]}", again, ())
+    kinds = {"open", "os.fsync", "os.rename", "half a write"}
+    assert count(number) < 50 or kinds <= seen.keys(), seen
+
+
+@pytest.mark.parametrize(("begun", "number"), [("nothing", 270), ("half", 200)])
+def test_generation(begun: str, number: int, memory: Path, tally: Lines) -> None:
+    """From an empty place; and from a folder in which one shard of two is finished and the other
+    half written."""
+    generate = partial(make, dataset(memory), memory / "place" / "set")
+    place, begin = memory / "place", memory / "begin"
+    if begun == "half":
+        place.mkdir()
+        _, operations = performed(generate, place)
+        restore(place / "set", begin)
+        assert performed(generate, place, len(operations) * 9 // 10)[0] == DIED
+        restore(begin, place / "set")
+        assert sorted(p.name for p in (begin / "finished").iterdir()) == ["0.sha256"]
+    line = tally(f"crash points of a generation begun from {begun}")
+    crash(line, generate, place / "set", number, begin)
+    make(dataset(memory), memory / "whole")
+    assert difference(place / "set", tree(memory / "whole")) == ""
+
+
+def test_results(memory: Path, tally: Lines) -> None:
+    """The picture of a check, trajectory files, new and written over, and the answer and the page
+    of an identification."""
+    make(dataset(memory), memory / "set")
+    out, ran, recorded = memory / "place" / "out", run(), problem()
+    result = identify(recorded, rtol=1e-3)
+    text = page.page(result, *page.traces(result, recorded, None))
+    shifted = replace(ran, channels=ran.channels | {"F_x": ran.channels["F_x"] + 1.0})
+    shifted.save(memory / "old" / "run.nc")
+    picture = ["--picture", str(out / "coverage.png")]
+
+    def report() -> None:
+        result.save(out / "answer.json")
+        page.report(result, recorded, out / "report.html")
+
+    with (
+        dask.config.set(scheduler="synchronous"),  # whose threads would be missing after a fork
+        mock.patch.object(check, "figure", return_value=Figure(figsize=(1, 1))),  # is drawn slowly
+        mock.patch.object(page, "page", return_value=text),
+        mock.patch.object(page, "traces", return_value=([], {})),
+    ):
+        checked = lambda: check.main([str(memory / "set"), *picture])
+        crash(tally("crash points of a check"), checked, out, 20)
+        crash(tally("crash points of an identification's results"), report, out, 60)
+        for begin in ("none", "old"):
+            line = tally(f"crash points of a trajectory file, over {begin}")
+            crash(line, lambda: ran.save(out / "run.nc"), out, 30, memory / begin)
+
+
+# at random moments
+# ----------------------------------------------------------------------
+
+
+class Work(NamedTuple):
+    """A process that works into a folder: how it begins, how far it came, and what it leaves."""
+
+    begin: Callable[[Path], int]
+    progress: Callable[[Path], int]
+    result: Callable[[Path], Any]
+
+
+def generation(folder: Path, workers: int = 0) -> Work:
+    """In a fork, or by the command with its worker processes."""
+    small = dataset(folder, 16 if workers else 3)
+    command = "-m", "data_gen.generate", str(small), "--workers", str(workers), "--out"
+    begin = lambda out: fork(lambda: execute(*command, str(out)) if workers else make(small, out))
+    return Work(begin, lambda out: sum(1 for _ in out.rglob("*")), tree)
+
+
+def identification(folder: Path, workers: int) -> Work:
+    for name, rows in (("data", 42), ("more", 32)):
+        (folder / f"{name}.csv").write_text(csv_text(cells(rows)), encoding="utf-8")
+    (folder / "rig.toml").write_text(IDENTIFICATION, encoding="utf-8")
+    files = [str(folder / name) for name in ("data.csv", "more.csv", "rig.toml")]
+    how = ["--workers", str(workers), "--no-progress"]
+
+    def command(out: Path) -> int:
+        sys.stdout = sys.stderr = out.with_suffix(".txt").open("w", encoding="utf-8")
+        # test runners may ignore it, which a child inherits
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        return main(["identify", *files, "--out", str(out), *how])
+
+    def answer(out: Path) -> Any:
+        """Without times, numbers of remembered runs, the command, and the checksum of all that."""
+        content = json.loads((out / "answer.json").read_text(encoding="utf-8"))
+        for entry in (content, content["cost"], *content["stages"]):
+            for key in ("checksum", "command", "wall_s", "remembered"):
+                entry.pop(key, None)
+        return content, sorted(path.name for path in out.iterdir())
+
+    runs = lambda out: len(list(out.glob("unfinished/*.run")))
+    return Work(lambda out: fork(lambda: command(out), 300), runs, answer)
+
+
+def survivors(group: int) -> bool:
+    """Whether any process of a group is left, half a minute after its end at the latest."""
+    with suppress(ProcessLookupError):
+        for _ in range(300):
+            os.killpg(group, 0)
+            time.sleep(0.1)
+        return True
+    return False
+
+
+STOPS: dict[str, tuple[Callable[[Path], Work], int, signal.Signals, int]] = {
+    "generations": (generation, 1, signal.SIGKILL, 40),
+    "one of two generations at once": (generation, 2, signal.SIGKILL, 14),
+    "commands of a generation": (partial(generation, workers=1), 1, signal.SIGKILL, 8),
+    "commands with two workers": (partial(generation, workers=2), 1, signal.SIGKILL, 8),
+    "identifications": (partial(identification, workers=1), 1, signal.SIGKILL, 20),
+    "identifications in two threads": (partial(identification, workers=2), 1, signal.SIGKILL, 10),
+    "identifications interrupted": (partial(identification, workers=1), 1, signal.SIGINT, 6),
+    "interrupted in two threads": (partial(identification, workers=2), 1, signal.SIGINT, 3),
+}
+"""The work, how many work on one folder at once, the signal that ends one, and how often."""
+
+
+@pytest.mark.parametrize("stops", STOPS)
+def test_stopped_it_ends_the_same(stops: str, memory: Path, tally: Lines) -> None:
+    """Stopped up to three times at any moment, or soon after it went on, and then started again.
+    Nothing that it began outlives it; interrupted it says in one line how to go on, and keeps what
+    was done."""
+    make_work, at_once, sign, number = STOPS[stops]
+    work, line, rng = make_work(memory), tally(f"stopped: {stops}"), random(stops)
+    for out in (memory / "first", memory / "whole"):  # kernels are compiled once
+        began = time.monotonic()
+        assert ended(work.begin(out)) == 0
+    seconds, expected = time.monotonic() - began, work.result(memory / "whole")
+    stopped = trial = 0
+    while stopped < count(number):
         trial += 1
-        assert trial < 10 * count(40), "most end before they are killed"
-        times = rng.uniform(0, duration, rng.integers(1, 4))
-        shutil.rmtree(out, ignore_errors=True)
-        killed = 0
-        for moment in times:
-            pid = fork(lambda: make(small, out))
-            time.sleep(moment)
-            killed += kill(pid)
-        make(small, out)
-        wrong = difference(out, expected)
-        for _ in range(killed):
-            line.held(
-                not wrong, f"trial {trial}, killed after {times} s: not as undisturbed: {wrong}"
-            )
+        assert trial < 10 * count(number), "most end before they are stopped"
+        out = memory / f"out-{trial}"
+        for _ in range(int(rng.integers(1, 4))):
+            pids, soon = [work.begin(out)], rng.random() < 0.6 or sign == signal.SIGINT
+            if at_once > 1:
+                time.sleep(rng.uniform(0, 0.1))
+                pids.append(work.begin(out))
+            pid, before = pids.pop(rng.integers(at_once)), work.progress(out)
+            while soon and alive(pid) and work.progress(out) == before:
+                time.sleep(0.002)
+            time.sleep(rng.uniform(0, min(seconds, 0.3) if soon else seconds))
+            kept = work.progress(out)
+            if alive(pid):
+                os.kill(pid, sign)
+            status, others = ended(pid), [*map(ended, pids)]
+            held = not any(others) and not survivors(pid)
+            if status == 130 and sign == signal.SIGINT:
+                said = out.with_suffix(".txt").read_text(encoding="utf-8")
+                told = "the same command continues" in said and "Traceback" not in said
+                held = held and told and work.progress(out) >= kept
+            else:
+                held = held and status in (0, -signal.SIGKILL)
+            stopped += status != 0
+            line.held(held, f"{trial}: {status}, others {others}, {kept} kept")
+        status = ended(work.begin(out))
+        same = status == 0 and work.result(out) == expected
+        line.held(same, f"{trial}: the last start ended with {status}, or left something else")
+        shutil.rmtree(out)
 
 
-def test_killed_generators_at_once(
-    tmp_path: Path, tally: Callable[[str], Tally], random: Any, count: Callable[[int], int]
-) -> None:
-    """Two on one folder, begun at nearly the same time; one is killed and the other ends well."""
-    small, _ = config(tmp_path)
-    make(small, tmp_path / "whole")
-    expected, out, line = (
-        tree(tmp_path / "whole"),
-        tmp_path / "set",
-        tally("kills of one of two generators at once"),
-    )
-    rng, trial = random(301), 0
-    while line.tried < count(14):
-        trial += 1
-        assert trial < 10 * count(14), "most end before they are killed"
-        shutil.rmtree(out, ignore_errors=True)
-        first = fork(lambda: make(small, out))
-        time.sleep(rng.uniform(0, 0.1))
-        second = fork(lambda: make(small, out))
-        time.sleep(rng.uniform(0, 0.6))
-        died, other = (first, second) if rng.random() < 0.5 else (second, first)
-        killed = kill(died)
-        status = os.waitstatus_to_exitcode(os.waitpid(other, 0)[1])
-        make(small, out)
-        wrong = difference(out, expected)
-        if killed:
-            line.held(
-                status == 0 and not wrong,
-                f"trial {trial}: the other ended with {status}; not as undisturbed: {wrong}",
-            )
+# kernels
+# ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("workers", [1, 2])
-def test_killed_commands(
-    workers: int,
-    tmp_path: Path,
-    tally: Callable[[str], Tally],
-    random: Any,
-    count: Callable[[int], int],
-) -> None:
-    """The command with its worker processes, killed again and again on one folder, most times soon
-    after it wrote something."""
-    small, path = config(tmp_path, trajectories=16)
-    out, line = tmp_path / "set", tally(f"kills of the command with {workers} workers")
-    command = [
-        sys.executable,
-        "-m",
-        "data_gen.generate",
-        str(path),
-        "--out",
-        str(out),
-        "--workers",
-        str(workers),
-    ]
-    rng: np.random.Generator = random(302, workers)
-    quiet: dict[str, Any] = {
-        "cwd": ROOT,
-        "stdout": subprocess.DEVNULL,
-        "stderr": subprocess.DEVNULL,
-    }
-    killed = 0
-    for trial in range(count(8)):
-        before = sum(1 for _ in out.rglob("*"))
-        process = subprocess.Popen(command, **quiet)
-        while trial % 4 and process.poll() is None and sum(1 for _ in out.rglob("*")) == before:
-            time.sleep(0.01)
-        time.sleep(rng.uniform(0, 0.3 if trial % 4 else 5.0))
-        process.kill()
-        killed += process.wait() == -signal.SIGKILL
-    status = subprocess.run(command, check=False, **quiet).returncode
-    make(small, tmp_path / "whole")
-    wrong = difference(out, tree(tmp_path / "whole"))
-    assert killed
-    for _ in range(killed):
-        line.held(
-            status == 0 and not wrong,
-            f"the last start ended with {status}; not as undisturbed: {wrong}",
-        )
+def test_many_at_one_cache(tmp_path: Path, tally: Lines, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Processes that compile at once, some of them killed at it: every other has what it needs, and
+    nothing is left."""
+    line, folder = tally("processes at one cache, a third of them killed"), tmp_path / "kernels"
+    monkeypatch.setattr(cache, "FOLDERS", [folder])
+    monkeypatch.setattr(cache, "_said", set())
+    wrong = lambda: int(kernels()(3.0, 4.0) != 25.0)
+    for number in range(count(20)):
+        pids = [fork(wrong) for _ in range(6)]
+        time.sleep(0.4 * random("cache", number).random())
+        for pid in pids[::3]:
+            os.kill(pid, signal.SIGKILL)
+        for k, status in enumerate(map(ended, pids)):
+            line.held(status == 0 or (k % 3 == 0 and status == -signal.SIGKILL), f"{status}")
+        line.held(not wrong(), f"{number}: wrong")
+        if number % 4 == 3:
+            for path in folder.glob("*.kernel"):
+                path.unlink()
+            line.held(not wrong() and not list(folder.glob("*.partial")), f"{number}: left over")
+            shutil.rmtree(folder)

@@ -1,0 +1,309 @@
+"""Damages: to the bytes and the place of a file, and to a tree of TOML."""
+
+import copy
+import json
+import math
+import os
+import pickle
+from collections.abc import Callable, Iterator
+from hashlib import sha256
+from io import BytesIO
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+# files
+# ----------------------------------------------------------------------
+
+
+class Trap:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> Any:
+        return os.mkdir, (str(self.path),)
+
+
+class Victim(NamedTuple):
+    """A file to be damaged, another of its kind, and how its reader would seal a content; the trap
+    shows whether anything was executed."""
+
+    path: Path
+    rng: np.random.Generator
+    other: Path = Path("none")
+    trap: Trap = Trap(Path("executed"))
+    seal: Callable[[bytes], bytes] = bytes
+
+    @property
+    def content(self) -> bytes:
+        return self.path.read_bytes()
+
+    def place(self, length: int = 0) -> int:
+        return int(self.rng.integers(max(len(self.content) - length, 1)))
+
+
+Damages = dict[str, Callable[[Victim], bytes | None]]
+"""By what is done: the new content, or None where the file was changed already."""
+
+
+def flipped(content: bytes, rng: np.random.Generator, bits: int) -> bytes:
+    out = bytearray(content)
+    for at in rng.choice(8 * len(out), bits, replace=False):
+        out[at // 8] ^= 1 << at % 8
+    return bytes(out)
+
+
+def overwritten(v: Victim, begin: int, new: bytes) -> bytes:
+    """Never longer than before, and never the same."""
+    out = (v.content[:begin] + new)[: len(v.content)] + v.content[begin + len(new) :]
+    return out if out != v.content else overwritten(v, v.place(), new)
+
+
+def archive(**arrays: Any) -> bytes:
+    out = BytesIO()
+    np.savez(out, **arrays)
+    return out.getvalue()
+
+
+def objects(trap: Trap) -> bytes:
+    """An archive of numpy that holds a pickle."""
+    held = np.empty(1, dtype=object)
+    held[0] = trap
+    return archive(kind=np.asarray("Prediction"), t=held)
+
+
+def array(header: bytes, content: bytes = b"") -> bytes:
+    """A file of numpy with any header."""
+    return np.lib.format.magic(1, 0) + len(header).to_bytes(2, "little") + header + content
+
+
+def linked(v: Victim, target: Path) -> None:
+    v.path.unlink()
+    v.path.symlink_to(target)
+
+
+def unlinked(v: Victim, then: Callable[[Path], object] = bool) -> None:
+    v.path.unlink()
+    then(v.path)
+
+
+def exchanged(v: Victim) -> bytes:
+    mine, other = v.content, v.other.read_bytes()
+    v.other.write_bytes(mine)
+    return other
+
+
+BYTES: Damages = {
+    "a bit": lambda v: flipped(v.content, v.rng, 1),
+    "some bits": lambda v: flipped(v.content, v.rng, 9),
+    "a bit of the beginning": lambda v: flipped(v.content[:32], v.rng, 1) + v.content[32:],
+    "zeros": lambda v: overwritten(v, v.place(64), bytes(64)),
+    "all zeros": lambda v: bytes(len(v.content)),
+    "noise": lambda v: overwritten(v, v.place(), v.rng.bytes(int(v.rng.integers(8, 4097)))),
+    "all noise": lambda v: v.rng.bytes(len(v.content)),
+    "cut": lambda v: v.content[: v.place()],
+    "empty": lambda v: b"",
+    "longer": lambda v: v.content + v.rng.bytes(int(v.rng.integers(1, 5000))),
+    "white space": lambda v: v.content + (b" ", b"\n", b"\0", b"{}", bytes(64))[v.rng.integers(5)],
+    "text": lambda v: b"t [s], x_C [mm]\n0, 1\n",
+}
+PLANTED: Damages = {
+    "a pickle": lambda v: pickle.dumps(v.trap),
+    "a sealed pickle": lambda v: v.seal(pickle.dumps(v.trap)),
+    "a sealed pickle within an archive": lambda v: v.seal(objects(v.trap)),
+    "a sealed file of objects": lambda v: v.seal(
+        array(b"{'descr': '|O', 'fortran_order': False, 'shape': ()}\n", pickle.dumps(v.trap))
+    ),
+    "a sealed header that is code": lambda v: v.seal(
+        array(f"__import__('os').mkdir({str(v.trap.path)!r})".encode())
+    ),
+    "a sealed beginning of HDF5": lambda v: v.seal(b"\x89HDF\r\n\x1a\n"),
+    "a sealed beginning of NetCDF": lambda v: v.seal(b"CDF\x01"),
+    "a sealed archive of others": lambda v: v.seal(archive(kind=np.asarray("Trap"), x=np.zeros(2))),
+}
+SEALED: Damages = {
+    "damage that is sealed": lambda v: v.seal(flipped(v.content[32:], v.rng, 9)),
+}
+GONE: Damages = {
+    "gone": unlinked,
+    "a folder": lambda v: unlinked(v, Path.mkdir),
+}
+FOREIGN: Damages = {
+    "another's": lambda v: v.other.read_bytes(),
+    "exchanged": exchanged,
+}
+SPECIAL: Damages = {
+    "a pipe": lambda v: unlinked(v, os.mkfifo),
+    "a link to another's": lambda v: linked(v, v.other),
+    "a link to itself": lambda v: linked(v, v.path),
+    "a link to nothing": lambda v: linked(v, v.path.parent / "nothing"),
+}
+RIGHTS: Damages = {
+    "others may write": lambda v: v.path.chmod(0o666),
+}
+
+
+def inserted(v: Victim) -> bytes:
+    """Bytes that do not belong there."""
+    at = int(v.rng.integers(len(v.content) + 1))
+    return v.content[:at] + ODD[v.rng.integers(len(ODD))] + v.content[at:]
+
+
+ODD = (
+    b"\xff\xfe", b"\x00", b"\xc3(", b"[" * 5000, b"[[[", b'"""', b"=", b"9" * 5000, b"\r",
+    b"\xe9", b"a.b.c.d=1\n",
+)  # fmt: skip
+
+
+def repeated(v: Victim) -> bytes:
+    """A line again, elsewhere."""
+    lines = v.content.splitlines(keepends=True)
+    lines.insert(int(v.rng.integers(len(lines))), lines[v.rng.integers(len(lines))])
+    return b"".join(lines)
+
+
+def encoded(v: Victim) -> bytes:
+    """In another encoding, with a mark of its order, or with other ends of lines."""
+    text, coding = v.content.decode(), CODINGS[v.rng.integers(len(CODINGS))]
+    return text.replace("\n", coding[1]).encode(coding[0])
+
+
+CODINGS = (
+    ("utf-16", "\n"), ("utf-32", "\n"), ("utf-8-sig", "\n"), ("utf-8", "\r\n"), ("utf-8", "\r"),
+    ("latin-1", "# \xb5\n"),
+)  # fmt: skip
+TEXT: Damages = {
+    "inserted": inserted,
+    "a line twice": repeated,
+    "another encoding": encoded,
+}
+
+
+def damage(how: Callable[[Victim], bytes | None], victim: Victim) -> None:
+    """Damage a file by other bytes, or by what becomes of its place."""
+    if (content := how(victim)) is not None:
+        victim.path.write_bytes(content)
+
+
+def forged(name: bytes, content: bytes) -> bytes:
+    """With the checksum that a journal or a cache would write."""
+    return sha256(name + content).digest() + content
+
+
+TEXTS = [*TEXT.values(), *BYTES.values()]
+
+
+# trees
+# ----------------------------------------------------------------------
+
+VALUES = (
+    True, False, "", "abc", "1_0", "1e3", "nan", math.nan, math.inf, -math.inf, 1e308, -1e308,
+    1e-300, 5e-324, -1.0, -1, 0, 0.0, 10**400, -(10**19), 2**63, [], [1.0], [[1.0]], {},
+    {"low": 1.0}, "µ°", "'", "\n", 1e5, 1e-5, 3, 0.5, 1e15,
+)  # fmt: skip
+"""For the place of any other."""
+
+CHANGES = {
+    "value": 0.45, "scale": 0.25, "swap": 0.08, "delete": 0.07, "misspell": 0.1, "nest": 0.05
+}  # fmt: skip
+"""What becomes of a leaf of a tree, with its probability."""
+
+Place = tuple[str | int, ...]
+
+
+class Mutant(NamedTuple):
+    """A tree, the only place in it that changed (empty where more did), and what stood and stands
+    there."""
+
+    tree: Any = None
+    place: Place = ()
+    old: Any = None
+    new: Any = None
+
+    @property
+    def no_number(self) -> bool:
+        """Whether a number was replaced by what is none."""
+        number = isinstance(self.old, int | float) and not isinstance(self.old, bool)
+        return number and isinstance(self.new, bool | str | list | dict)
+
+    def named(self, text: str) -> bool:
+        """Whether a refusal names the changed place, by its last name; a range or a table is named
+        by itself."""
+        names = [part for part in self.place if isinstance(part, str)]
+        if names and names[-1] not in ("kind", "low", "high"):
+            names = [names[-1], names[-1].rpartition(".")[2]]
+        return not names or any(name in text for name in names)
+
+
+def leaves(tree: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
+    """Every value that is neither a table nor a list, with its place."""
+    if isinstance(tree, dict | list):
+        items = tree.items() if isinstance(tree, dict) else enumerate(tree)
+        for key, value in items:
+            yield from leaves(value, (*place, key))
+    else:
+        yield place, tree
+
+
+def put(tree: Any, place: Place, value: Any) -> Any:
+    """Set a value in a tree; the table that holds it."""
+    for key in place[:-1]:
+        tree = tree[key]
+    tree[place[-1]] = value
+    return tree
+
+
+def mutant(tree: Any, rng: np.random.Generator) -> Mutant:
+    """A copy of a tree with one of `CHANGES`."""
+    tree = copy.deepcopy(tree)
+    places = list(leaves(tree))
+    (place, old), (other, value) = (places[rng.integers(len(places))] for _ in range(2))
+    kind, new = (
+        rng.choice(list(CHANGES), p=list(CHANGES.values())),
+        VALUES[rng.integers(len(VALUES))],
+    )
+    if kind == "swap":
+        put(tree, place, value)
+        put(tree, other, old)
+        return Mutant(tree)
+    if kind in ("delete", "misspell") and isinstance(place[-1], str):
+        table = put(tree, place, old)
+        del table[place[-1]]
+        if kind == "misspell":
+            table[place[-1] + str(rng.choice(["x", "_", " ", "é", ".E"]))] = old
+        return Mutant(tree)
+    if kind == "nest":
+        new = {str(place[-1]): old}
+    elif kind == "scale" and isinstance(old, int | float) and not isinstance(old, bool):
+        new = type(old)(old * float(10.0 ** rng.uniform(-12, 12) * rng.choice([1, 1, 1, -1])))
+    put(tree, place, new)
+    return Mutant(tree, place, old, new)
+
+
+def toml(value: Any) -> str:
+    """A value as TOML; a table within braces."""
+    match value:
+        case dict():
+            return "{" + ", ".join(f"{toml(k)} = {toml(v)}" for k, v in value.items()) + "}"
+        case list():
+            return "[" + ", ".join(map(toml, value)) + "]"
+        case float():
+            return repr(value)
+    return json.dumps(value, ensure_ascii=False)
+
+
+def document(tree: dict[str, Any]) -> str:
+    """A tree as a TOML file, every value in one line."""
+    return "".join(f"{toml(name)} = {toml(value)}\n" for name, value in tree.items())
+
+
+def written(path: Path, tree: Any, way: str, number: int, rng: np.random.Generator) -> Mutant:
+    """Write a tree to a file with one of its values changed, or (`way` "text") its text damaged."""
+    changed = mutant(tree, rng) if way == "values" else Mutant(tree, new=number)
+    path.write_text(document(changed.tree), encoding="utf-8")
+    if way == "text":
+        damage(TEXTS[number % len(TEXTS)], Victim(path, rng))
+    return changed

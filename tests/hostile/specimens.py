@@ -1,0 +1,137 @@
+"""Small rigs, runs, recordings and datasets, quick enough to be made hundreds of times."""
+
+import csv
+import io
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import torch
+
+from hostile.processes import ROOT
+from torchsoft import Parameters, SoftGrasp, Trajectory, rest, simulate
+from torchsoft.datasets import generate as generation
+from torchsoft.datasets.config import Config
+from torchsoft.datasets.generate import Serial, generate
+from torchsoft.datasets.simulation import simulate_task
+from torchsoft.excitation import Excitation, Strokes
+from torchsoft.sysid import Problem, Sensor, Unknown, record
+
+EXAMPLE = ROOT / "examples" / "identify"
+
+SMALL = {"pad.elements_x": 40, "pad.elements_y": 1, "contact.v_s": 0.05}
+
+DATASET = """
+title = "Small"
+seed = 5
+trajectories = 3
+trajectories_per_shard = 2
+duration = 0.5
+sample_interval = 0.025
+step = 0.005
+samples_per_chunk = 16
+settle = 0.0
+grasp_depth = { low = 1.3e-3, high = 1.5e-3 }
+[fixed]
+"pad.elements_x" = 40
+"pad.elements_y" = 1
+"contact.v_s" = 0.05
+"scenario.grasp_time" = 0.1
+[parameters]
+"pad.E" = { low = 7e5, high = 8e5, scale = "log" }
+[[kinds]]
+kind = "multi_sine"
+amplitude_x = { low = 2e-4, high = 4e-4 }
+amplitude_y = { low = 1e-5, high = 3e-5 }
+"""
+
+IDENTIFICATION = """
+[settings]
+contact.v_s = 0.05
+control.senses = "bracket"
+scenario.x_C0 = 60.3e-3
+[unknowns."contact.K_n"]
+nominal = 1e5
+[unknowns."pad.E"]
+nominal = 0.7e6
+[sensors]
+x_C.noise = 10e-6
+y_Br.noise = 10e-6
+F_y.noise = 0.1
+[fit]
+rtol = 1e-3
+"""
+
+ROLLING = """
+import json, threading, torch
+from torchsoft import Parameters, SoftGrasp, simulate
+from torchsoft.scenario import grasp_and_roll
+torch.set_num_threads(1)
+def roll(_=0):
+    coarse = {"pad.elements_x": 40, "pad.elements_y": 1, "contact.v_s": 0.05}
+    model = SoftGrasp(Parameters().override(coarse))
+    rig = grasp_and_roll(model, grasp_force=75.0)
+    run = simulate(model, torch.linspace(0, 0.3, 7, dtype=torch.float64), y0=rig.y0)
+    return [float(value).hex() for value in run["y_Br"]]
+"""
+"""A program that can roll the disc, to the bit."""
+
+ROLL = ROLLING + "print(json.dumps(roll()))\n"
+
+Table = list[list[str]]
+
+
+def dataset(folder: Path, trajectories: int = 3) -> Path:
+    """A file that describes a small dataset."""
+    path = folder / f"small-{trajectories}.toml"
+    path.write_text(DATASET.replace("trajectories = 3", f"trajectories = {trajectories}"))
+    return path
+
+
+_rows: dict[tuple[str, int], Any] = {}
+
+
+def remembered(config: Config, task: Any) -> Any:
+    """A row of a dataset, simulated once in this process and those forked from it."""
+    key = config.hash, task.index
+    if key not in _rows:
+        _rows[key] = simulate_task(config, task)
+    return dict(_rows[key])
+
+
+def make(description: Path, folder: Path) -> None:
+    """Generate a dataset in this process."""
+    torch.set_num_threads(1)
+    with mock.patch.object(generation, "simulate_task", remembered):
+        config = Config.from_toml(description)
+        assert generate(config, str(folder), Serial(), progress=False) == 0
+
+
+def run() -> Trajectory:
+    """The disc at rest, for 50 ms."""
+    model = SoftGrasp(Parameters().override(SMALL))
+    t = torch.linspace(0, 0.05, 11, dtype=torch.float64)
+    return simulate(model, t, y0=rest(model).detach(), step=5e-3)
+
+
+def problem() -> Problem:
+    """Stiffnesses of pads and contacts, from strokes of 0.4 s."""
+    p = Parameters().override(SMALL)
+    sensors = {"x_C": Sensor(noise=1e-5), "y_Br": Sensor(noise=1e-5), "F_y": Sensor(noise=0.1)}
+    strokes = Strokes(travel=5e-3, stroke_time=0.15)
+    motion = Excitation(motion=strokes, duration=0.4, senses="bracket")
+    stiffer = p.override({"pad.E": 0.9e6})
+    recorded = record("strokes", motion, stiffer, p, sensors, rtol=1e-3, seed=3)
+    return Problem([recorded], sensors, {"pad.E": Unknown(nominal=1.1e6), "contact.K_n": Unknown()})
+
+
+def cells(rows: int = 42) -> Table:
+    """The heading and first rows of the example's recording, 0.2 s."""
+    with (EXAMPLE / "rolling.csv").open(newline="", encoding="utf-8") as file:
+        return list(csv.reader(file))[:rows]
+
+
+def csv_text(table: Table, delimiter: str = ",") -> str:
+    out = io.StringIO()
+    csv.writer(out, delimiter=delimiter, lineterminator="\n").writerows(table)
+    return out.getvalue()
