@@ -28,14 +28,14 @@ from hostile.damage import (
     damage,
     forged,
 )
-from hostile.processes import ended, fork, kernels, remembered, restore
+from hostile.processes import ended, fork, kernel, restore
 from hostile.specimens import dataset, make, problem, run
 from hostile.trial import LIMIT, Tally, count, random, sentence
 from torchsoft.datasets import Trajectories, open_dataset
 from torchsoft.datasets.check import check
 from torchsoft.datasets.files import StoreError
 from torchsoft.files import sealed
-from torchsoft.solve.kernel import cache
+from torchsoft.solve.kernel import objects
 from torchsoft.solve.trajectory import load, save
 from torchsoft.sysid import IdentificationResult, Problem, identify
 from torchsoft.sysid.columns import COLUMNS, read_table
@@ -73,23 +73,22 @@ def misread(read: Callable[[], bool], name: str = "") -> str:
 
 
 @pytest.fixture(scope="module")
-def kernel(tmp_path_factory: Make) -> Specimen:
+def compiled(tmp_path_factory: Make) -> Specimen:
     def wrong(path: Path, kind: str) -> str:
         for _ in range(2):
-            cache._said.clear()
+            objects._said.clear()
             with (
-                mock.patch.object(cache, "FOLDERS", [path.parent]),
+                mock.patch.object(objects, "FOLDERS", [path.parent]),
                 redirect_stderr(io.StringIO()) as said,
             ):
-                again = kernels()
-                right = again(3.0, 4.0) == 25.0
+                right, found = kernel()
             right = right and said.getvalue().count("\n") <= 1
-        healed = remembered(again) == 1 or kind == "a folder"
+        healed = found or kind == "a folder"
         return "" if right and healed else f"{right}, {healed}: {said.getvalue()}"
 
     sound = tmp_path_factory.mktemp("compiled") / "kernels"
-    with mock.patch.object(cache, "FOLDERS", [sound]):
-        kernels()(3.0, 4.0)
+    with mock.patch.object(objects, "FOLDERS", [sound]):
+        kernel()
     kinds = PLANTED | FOREIGN | RIGHTS | {"a pipe": SPECIAL["a pipe"]}
     return Specimen(sound, wrong, lambda path, content: bytes(32) + content, kinds)
 
@@ -290,7 +289,7 @@ def trajectory(tmp_path_factory: Make) -> Specimen:
 # ----------------------------------------------------------------------
 
 FILES: dict[str, tuple[str, str, int]] = {
-    "compiled kernels": ("kernel", "*.kernel", 280),
+    "compiled kernels": ("compiled", "*.o", 280),
     "runs of a checkpoint": ("checkpoint", "*.run", 420),
     "answers": ("answer", "*.json", 200),
     "trajectory files": ("trajectory", "*.nc", 1400),

@@ -27,7 +27,7 @@ from hostile.processes import (
     ended,
     execute,
     fork,
-    kernels,
+    kernel,
     performed,
     restore,
     tree,
@@ -36,7 +36,7 @@ from hostile.specimens import IDENTIFICATION, cells, csv_text, dataset, make, pr
 from hostile.trial import Tally, count, random
 from torchsoft.cli import main
 from torchsoft.datasets import check
-from torchsoft.solve.kernel import cache
+from torchsoft.solve.kernel import objects
 from torchsoft.sysid import identify
 from torchsoft.sysid import report as page
 
@@ -243,9 +243,9 @@ def test_many_at_one_cache(tmp_path: Path, tally: Lines, monkeypatch: pytest.Mon
     """Processes that compile at once, some of them killed at it: every other has what it needs, and
     nothing is left."""
     line, folder = tally("processes at one cache, a third of them killed"), tmp_path / "kernels"
-    monkeypatch.setattr(cache, "FOLDERS", [folder])
-    monkeypatch.setattr(cache, "_said", set())
-    wrong = lambda: int(kernels()(3.0, 4.0) != 25.0)
+    monkeypatch.setattr(objects, "FOLDERS", [folder])
+    monkeypatch.setattr(objects, "_said", set())
+    wrong = lambda: int(not kernel()[0])
     for number in range(count(20)):
         pids = [fork(wrong) for _ in range(6)]
         time.sleep(0.4 * random("cache", number).random())
@@ -255,7 +255,7 @@ def test_many_at_one_cache(tmp_path: Path, tally: Lines, monkeypatch: pytest.Mon
             line.held(status == 0 or (k % 3 == 0 and status == -signal.SIGKILL), f"{status}")
         line.held(not wrong(), f"{number}: wrong")
         if number % 4 == 3:
-            for path in folder.glob("*.kernel"):
+            for path in folder.glob("*.o"):
                 path.unlink()
             line.held(not wrong() and not list(folder.glob("*.partial")), f"{number}: left over")
             shutil.rmtree(folder)

@@ -23,18 +23,17 @@ from hostile.specimens import IDENTIFICATION, ROLL, ROLLING, cells, csv_text
 from hostile.trial import Tally, count, random
 from torchsoft import cli
 from torchsoft.datasets import generate as generation
-from torchsoft.solve.kernel import cache
+from torchsoft.solve.kernel import objects
 from torchsoft.sysid import identification
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1200)]
 
 TINY = """
 import json
-from hostile.processes import kernels, remembered
-kernel = kernels()
-print(json.dumps([kernel(3.0, 4.0), remembered(kernel)]))
+from hostile.processes import kernel
+print(json.dumps(kernel()))
 """
-COMPILED, REMEMBERED = r"\[25.0, 0\]\n", r"\[25.0, 1\]\n"
+COMPILED, REMEMBERED = r"\[true, false\]\n", r"\[true, true\]\n"
 KEPT_NOWHERE = "torchsoft: note: compiled kernels cannot be kept in [^\n]*\n"
 
 Lines = Callable[[str], Tally]
@@ -74,7 +73,7 @@ def other_user() -> int:
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
     """A copy of the package without compiled kernels; the folder to import it from."""
-    ignored = shutil.ignore_patterns("__pycache__")
+    ignored = shutil.ignore_patterns("__pycache__", "objects")
     shutil.copytree(ROOT / "torchsoft", tmp_path / "package" / "torchsoft", ignore=ignored)
     return tmp_path / "package"
 
@@ -86,12 +85,12 @@ def test_damaged_kernels_of_the_simulator_are_made_again(
     line, trap = tally("damaged files of the simulator's kernels"), Trap(tmp_path / "executed")
     kinds = BYTES | GONE | FOREIGN
     for kind in ("empty", "a bit", "all noise", "a folder", "another's"):
-        kept = tmp_path / kind / "torchsoft" / cache.NAME
-        shutil.copytree(cache.FOLDERS[0], kept)
-        (path,) = kept.glob("torchsoft.solve.kernel.run.run-*.kernel")
+        kept = tmp_path / kind / objects.NAME
+        shutil.copytree(objects.FOLDERS[0], kept)
+        path = kept / f"run-{objects.level()}.o"
         (other, *_) = sorted({*kept.iterdir()} - {path})
         damage(kinds[kind], Victim(path, random(kind), other, trap))
-        expect(line, "-c", ROLL, out=rolled, err=".*", NUMBA_CACHE_DIR=str(tmp_path / kind))
+        expect(line, "-c", ROLL, out=rolled, err=".*", TORCHSOFT_CACHE_DIR=str(tmp_path / kind))
     line.held(not trap.path.exists(), "executed")
 
 
@@ -101,15 +100,15 @@ def test_changed_sources_give_changed_physics(
     """Where the package cannot be written, and the kernels of before lie in the user's cache."""
     line, home = tally("upgrades of a package that cannot be written"), tmp_path / "home"
     kept = home / ".cache" / "torchsoft"
-    shutil.copytree(cache.FOLDERS[0], kept / cache.NAME)
+    shutil.copytree(objects.FOLDERS[0], kept / objects.NAME)
     for path in (home, *home.rglob("*")):
         os.chown(path, other_user, other_user)
     where = {"user": other_user, "package": package, "HOME": str(home)}
-    where |= dict.fromkeys(("XDG_CACHE_HOME", "NUMBA_CACHE_DIR"))
+    where |= dict.fromkeys(("XDG_CACHE_HOME", "TORCHSOFT_CACHE_DIR"))
     expect(line, "-c", ROLL, out=rolled, **where)
     source = package / "torchsoft" / "solve" / "kernel" / "interface.py"
     text = source.read_text(encoding="utf-8")
-    changed = text.replace("u += row[j] * zeta[j]", "u += 3.0 * row[j] * zeta[j]")
+    changed = text.replace("= soft * dot(row, zeta)", "= 3.0 * soft * dot(row, zeta)")
     assert changed != text
     source.write_text(changed, encoding="utf-8")
     expect(line, "-c", ROLL, out=f"(?!{rolled}).+", err=".*", **where)
@@ -123,28 +122,28 @@ def test_users_without_rights(tally: Lines, rolled: str, other_user: int, packag
         {"HOME": "/nonexistent"}, {"HOME": None}, {"HOME": ""},
         {"HOME": "/", "XDG_CACHE_HOME": "/proc/nothing"},
         {"HOME": None, "MPLCONFIGDIR": None, "TMPDIR": "/nonexistent"},
-        {"NUMBA_CACHE_DIR": "/nonexistent"},
+        {"TORCHSOFT_CACHE_DIR": "/nonexistent"},
     ]  # fmt: skip
     user = {"user": other_user, "package": package}
     for where in nowhere:
         expect(line, "-c", TINY, out=COMPILED, err=f"(.*\n)?{KEPT_NOWHERE}", **user, **where)
-    warm = package / "torchsoft" / "solve" / "kernel" / "__pycache__" / cache.NAME
-    shutil.copytree(cache.FOLDERS[0], warm)
+    warm = package / "torchsoft" / "solve" / "kernel" / "objects" / objects.NAME
+    shutil.copytree(objects.FOLDERS[0], warm)
     for where in nowhere[:3]:
         expect(line, "-c", ROLL, out=rolled, **user, **where)
 
 
 def test_caches_of_other_users(tally: Lines, other_user: int, tmp_path: Path) -> None:
     """Are not used, and one line says so; those of root and of the package's owner are."""
-    line, theirs = tally("caches of other users"), {"NUMBA_CACHE_DIR": str(tmp_path)}
+    line, theirs = tally("caches of other users"), {"TORCHSOFT_CACHE_DIR": str(tmp_path)}
     warned = ".*holds kernels that other users may change, which are not used\n"
     for owner, mode, used in (
         (0, 0o644, True), (USER, 0o644, True), (USER, 0o400, True), (54321, 0o644, False),
         (0, 0o666, False), (0, 0o664, False), (USER, 0o646, False),
     ):  # fmt: skip
-        shutil.rmtree(tmp_path / "torchsoft", ignore_errors=True)
+        shutil.rmtree(tmp_path / objects.NAME, ignore_errors=True)
         expect(line, "-c", TINY, out=COMPILED, err=".*", **theirs)
-        for path in tmp_path.rglob("*.kernel"):
+        for path in tmp_path.rglob("*.o"):
             path.chmod(mode)
             os.chown(path, owner, owner)
         said = {"out": REMEMBERED} if used else {"out": COMPILED, "err": f"{warned}.*"}
@@ -159,10 +158,10 @@ def test_full_disk(tally: Lines, tmp_path: Path) -> None:
         pytest.skip("a small disk cannot be mounted")
     try:
         for filled in (0, 8, 20, 30, 36, 40):
-            shutil.rmtree(disk / "torchsoft", ignore_errors=True)
+            shutil.rmtree(disk / objects.NAME, ignore_errors=True)
             (disk / "filler").write_bytes(bytes(1024 * filled))
             told = f"(.*\n)?{KEPT_NOWHERE}" if filled >= 36 else ".*"
-            expect(line, "-c", TINY, out=COMPILED, err=told, NUMBA_CACHE_DIR=str(disk))
+            expect(line, "-c", TINY, out=COMPILED, err=told, TORCHSOFT_CACHE_DIR=str(disk))
             line.held(not [*disk.rglob("*.partial")], f"{filled} kB: a partial file is left")
     finally:
         subprocess.run(["umount", str(disk)], check=True)
