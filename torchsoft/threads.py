@@ -8,7 +8,7 @@ import os
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any, TypeVar
 
 import torch
@@ -54,13 +54,32 @@ def executor(threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, "torchsoft", torch.set_num_threads, (1,))
 
 
+_own = threading.local()
+
+
+@contextmanager
+def others_turn() -> Iterator[None]:
+    """Let the other threads of a batch compute in Python while compiled code runs in this one."""
+    turn: threading.Lock | None = getattr(_own, "turn", None)
+    if turn is None:
+        yield
+        return
+    turn.release()
+    try:
+        yield
+    finally:
+        turn.acquire()
+
+
 def parallel_map(
-    work: Callable[[int], T], count: int, threads: int | None = None
+    work: Callable[[int], T], count: int, threads: int | None = None, *, turns: bool = False
 ) -> Iterator[tuple[int, T]]:
     """`work(i)` for i below `count`, in so many threads (one a core by default), as (i, result) in
     the order of their ends.
 
-    The threads inherit torch's grad mode; each computes on one core. An exception ends what has not
+    The threads inherit torch's grad mode; each computes on one core. With `turns` one thread at a
+    time computes in Python: torch releases the interpreter's lock at every operation, and threads
+    that hand it over each time are slower than one alone. An exception ends what has not
     begun, and so does Ctrl-C; what runs is waited for.
     """
     threads = min(count, cores() if threads is None else threads)
@@ -70,9 +89,15 @@ def parallel_map(
         return
     mode = torch.is_grad_enabled()
 
+    turn = threading.Lock() if turns else None
+
     def one(i: int) -> T:
-        with torch.set_grad_enabled(mode):
-            return work(i)
+        with turn or nullcontext(), torch.set_grad_enabled(mode):
+            _own.turn = turn
+            try:
+                return work(i)
+            finally:
+                _own.turn = None
 
     with single_threaded(), executor(threads) as pool:
         futures = {pool.submit(one, i): i for i in range(count)}

@@ -18,7 +18,7 @@ from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.progress import Progress, Segment
 from torchsoft.solve.stepper import ImplicitStepper
-from torchsoft.threads import parallel_map
+from torchsoft.threads import others_turn, parallel_map
 
 TAPE_BYTES = 1e9
 """Tapes kept of one run [bytes]; beyond that the backward sweep makes each segment's again from
@@ -101,7 +101,7 @@ class _Solutions(torch.autograd.Function):
             i, y_bar = asked[k]
             return run_adjoint(ctx.runs[i].stepper, ctx.runs[i].segments, y_bar)
 
-        for k, result in parallel_map(sweep, len(asked), ctx.threads):
+        for k, result in parallel_map(sweep, len(asked), ctx.threads, turns=True):
             bars[3 * asked[k][0] : 3 * asked[k][0] + 3] = result
         return None, None, *bars
 
@@ -129,7 +129,8 @@ def run_adjoint(
             segment.signals, plan.out_step, plan.out_part, rows[segment.rows], carried, p_bar,
             signals_bar[number], failed,
         )  # fmt: skip
-        call("backward", sweep)
+        with others_turn():
+            call("backward", sweep)
         if failed[0] >= 0:
             time = plan.starts[failed[0]]
             raise GradientFailed(f"the gradient is not finite at t = {time:.4f} s")

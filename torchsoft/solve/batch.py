@@ -137,39 +137,37 @@ def simulate_batch(
     )
     budget = TAPE_BYTES / count
 
-    def work(i: int) -> RunOutcome | Exception:
+    def work(i: int) -> RunOutcome | Trajectory | Exception:
         try:
             task = prepare(
                 _own(rigs[i], parameters or {}, i), ts[i], y0=y0s[i], reference=references[i],
                 knots=every_knots[i], dy0=dy0s[i], **options,
             )  # fmt: skip
-            return run(task, budget, explained=False)
+            outcome = run(task, budget, explained=False)
+            return outcome.trajectory() if outcome.solved.segments is None else outcome
         except (SimulationFailed, ValueError, np.linalg.LinAlgError) as failure:
             return failure
 
-    results: list[RunOutcome | Exception] = [ValueError("not run")] * count
+    results: list[RunOutcome | Trajectory | Exception] = [ValueError("not run")] * count
     with single_threaded(), tqdm(total=count, unit="run", disable=not progress) as bar:
-        for i, result in parallel_map(work, count, threads):
+        for i, result in parallel_map(work, count, threads, turns=True):
             results[i] = result
             bar.update()
     done = {i: result for i, result in enumerate(results) if isinstance(result, RunOutcome)}
     failures = {i: result for i, result in enumerate(results) if isinstance(result, Exception)}
     if failures:
         first = min(failures)
-        if not done and all(
+        if len(failures) == count and all(
             isinstance(one, ValueError) and str(one) == str(failures[first])
             for one in failures.values()
         ):
             raise failures[first]  # nothing of a single run
         message = f"{len(failures)} of {count} runs failed; run {first}: {failures[first]}"
         warnings.warn(message, SamplesFailed, stacklevel=2)
-    states = dict(zip(done, attached([one.solved for one in done.values()], threads)))
-    numbers = list(done)
-    trajectories: list[Trajectory | None] = [None] * count
-    for k, trajectory in parallel_map(
-        lambda k: done[numbers[k]].trajectory(states[numbers[k]]), len(numbers), threads
-    ):
-        trajectories[numbers[k]] = trajectory
+    states = attached([one.solved for one in done.values()], threads)
+    trajectories = [one if isinstance(one, Trajectory) else None for one in results]
+    for (i, outcome), y in zip(done.items(), states):
+        trajectories[i] = outcome.trajectory(y)
     _doubt(rigs, trajectories)
     return Batch(
         tuple(trajectories), failures, tuple(len(one) for one in ts), clock.perf_counter() - began

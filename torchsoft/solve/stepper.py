@@ -45,6 +45,7 @@ from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.progress import Integrals, Marching, Progress, Segment, SimulationFailed
 from torchsoft.solve.system import Compiled
 from torchsoft.solve.tolerances import Followed, error_parts, part_name
+from torchsoft.threads import others_turn
 
 HALVINGS = 6
 """How often a step that Newton does not solve is halved before the run is given up."""
@@ -134,11 +135,13 @@ class ImplicitStepper:
         """One call of the compiled run; what it counted."""
         counts = np.zeros(7, np.int64)
         limits = Limits(self.tolerance, self.max_iterations, self.window)
-        call("run", Run(
+        run = Run(
             s, self._still, now.work, now.step, follow, errors, limits, outputs, tape, given,
             now.y, k, clock, stops, times, row, rung, self.rtol, self.longest, SHORTEST,
             now.integrals, starts, h, signals, counts,
-        ))  # fmt: skip
+        )  # fmt: skip
+        with others_turn():
+            call("run", run)
         return counts.tolist()
 
     @property

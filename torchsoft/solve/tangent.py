@@ -12,6 +12,7 @@ from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.progress import Progress, Segment
 from torchsoft.solve.stepper import ImplicitStepper
+from torchsoft.threads import others_turn
 
 
 def directions(value: Tensor, wanted: Sequence[Tensor]) -> Array:
@@ -62,6 +63,7 @@ def iterate(
                 s, work, tangents, tape, plan.h, segment.signals, plan.out_step, plan.out_part,
                 dy, dp, rows,
             )  # fmt: skip
-            call("forward", sweep)
+            with others_turn():
+                call("forward", sweep)
             kept[segment.rows] = rows[:, columns]
         yield torch.from_numpy(kept), out
