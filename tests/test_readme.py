@@ -18,6 +18,7 @@ LINKED = [
 SHORTER = {
     "torch.linspace(0, 30, 3001": "torch.linspace(0, 0.5, 101",
     'theta"][1000]': 'theta"][50]',
+    '"contact.v_s": 0.05}': '"contact.v_s": 0.05, "pad.elements_x": 60, "pad.elements_y": 2}',
 }
 LONGEST = 150
 """Lines of the README."""

@@ -37,6 +37,8 @@ from torchsoft.sysid.runs import Runner
 
 BASE = Parameters().override(COARSE)
 RTOL = 1e-4
+TRUSTED: dict[str, Any] = {"assumptions": "trusted"}
+"""Nothing but the fit."""
 NOISE = {
     "x_C": 1e-5,
     "y_C": 1e-5,
@@ -136,7 +138,7 @@ def test_jacobian_of_either_kind_of_pads_at_the_start_of_a_grasp(fidelity: str) 
 def test_noise_free_data_give_the_truth_back_and_intervals_hold_it(
     strokes: Recording, shake: Recording
 ) -> None:
-    answer = identify(Problem([strokes, shake], SENSORS, four()), heldout=["shake"])
+    answer = identify(Problem([strokes, shake], SENSORS, four()), heldout=["shake"], **TRUSTED)
     for name in FOUR:
         e = answer[name]
         assert e.identifiable
@@ -183,6 +185,7 @@ def test_what_the_data_do_not_determine_is_not_a_number() -> None:
     answer = identify(
         Problem([data], SENSORS, {"pad.E": Unknown(), "contact.mu_k": Unknown()}), rtol=RTOL,
         plan=[Stage("all", ("gentle",), ("pad.E", "contact.mu_k"), RTOL)],
+        **TRUSTED,
     )  # fmt: skip
     mu_k, E = answer["contact.mu_k"], answer["pad.E"]
     assert not mu_k.identifiable
@@ -209,7 +212,7 @@ def test_bias_and_delay_are_found_and_missing_samples_do_not_matter(strokes: Rec
     data = replace(strokes, name="gaps", samples=samples)
     sensors = SENSORS | {"theta": Sensor(noise=5e-4, bias=0.02, delay=5e-3)}
     unknowns = {"pad.E": Unknown()} | rest_known() | {"pad.tau": known("pad.tau")}
-    answer = identify(Problem([data], sensors, unknowns), rtol=RTOL)
+    answer = identify(Problem([data], sensors, unknowns), rtol=RTOL, **TRUSTED)
     assert answer["pad.E"].value == pytest.approx(TRUTH["pad.E"], rel=2e-3)
     assert answer["bias of theta"].value == pytest.approx(2e-3, abs=1e-4)
     assert answer["delay of theta"].value == pytest.approx(1.5e-3, abs=1e-4)
@@ -238,7 +241,7 @@ def shaking() -> Recording:
 def test_a_tolerance_too_coarse_for_the_data_is_found_and_tightened(shaking: Recording) -> None:
     problem = Problem([shaking], SENSORS, {"pad.E": Unknown(), "pad.tau": Unknown()})
     plan = [Stage("all", ("shaking",), ("pad.E", "pad.tau"), 8e-3)]
-    coarse = identify(problem, plan=plan, tightenings=0, assumptions="trusted")
+    coarse = identify(problem, plan=plan, tightenings=0, **TRUSTED)
     assert any(
         "rtol = 0.008 is too coarse" in notice and "take rtol = 0.0008" in notice
         for notice in coarse.notices
@@ -249,7 +252,7 @@ def test_a_tolerance_too_coarse_for_the_data_is_found_and_tightened(shaking: Rec
     assert worst.step_bias_sd * worst.relative_sd == pytest.approx(
         error, rel=0.5
     )  # and its size is about right
-    better = identify(problem, plan=plan)
+    better = identify(problem, plan=plan, **TRUSTED)
     assert not any("too coarse" in notice for notice in better.notices)
     assert better.made_by["rtol"] < 8e-3
     assert abs(np.log(better[worst.name].last / BASE.table()[worst.name]["value"])) < 0.2 * abs(
@@ -282,7 +285,7 @@ def test_a_fit_that_went_far_goes_on_with_steps_of_its_own(strokes: Recording) -
     }
     unknowns |= {"contact.mu_s": Unknown(nominal=0.9)}
     problem = Problem([strokes], SENSORS, unknowns)
-    answer = identify(problem, plan=[Stage("all", ("strokes",), FOUR, 1e-3)])
+    answer = identify(problem, plan=[Stage("all", ("strokes",), FOUR, 1e-3)], **TRUSTED)
     assert [stage["name"] for stage in answer.stages][:2] == ["all", "steps chosen anew"]
     assert {stage["rtol"] for stage in answer.stages} == {1e-3}
     assert answer.converged
@@ -297,7 +300,7 @@ def test_interrupted_it_continues_and_ends_the_same(
     problem = Problem(
         [strokes], SENSORS, {"pad.E": Unknown(nominal=1.4e6), "pad.tau": Unknown()} | rest_known()
     )
-    whole = identify(problem, rtol=RTOL)
+    whole = identify(problem, rtol=RTOL, **TRUSTED)
     inner, left = Runner.run, [4]
 
     def interrupted(self: Runner, jobs: list) -> list:
@@ -309,13 +312,13 @@ def test_interrupted_it_continues_and_ends_the_same(
     with monkeypatch.context() as patch:
         patch.setattr(Runner, "run", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            identify(problem, rtol=RTOL, checkpoint=tmp_path / "runs")
+            identify(problem, rtol=RTOL, checkpoint=tmp_path / "runs", **TRUSTED)
     kept = len(list((tmp_path / "runs").glob("*.run")))
     assert kept >= 3  # runs asked for twice are made once
-    again = identify(problem, rtol=RTOL, checkpoint=tmp_path / "runs")
+    again = identify(problem, rtol=RTOL, checkpoint=tmp_path / "runs", **TRUSTED)
     assert again.cost["remembered"] >= kept
     assert again.x == whole.x
-    third = identify(problem, rtol=RTOL, checkpoint=tmp_path / "runs")
+    third = identify(problem, rtol=RTOL, checkpoint=tmp_path / "runs", **TRUSTED)
     assert third.cost["remembered"] == third.cost["simulations"] + third.cost["jacobians"]
 
 
@@ -413,7 +416,7 @@ def test_sobol_starts_stay_within_bounds_and_the_best_end_is_kept(strokes: Recor
     assert len(points) == 3
     assert all((low <= p).all() and (p <= high).all() for p in points)
     assert len({p.tobytes() for p in points}) == 3
-    answer = identify(problem, plan=[stage])
+    answer = identify(problem, plan=[stage], **TRUSTED)
     assert answer["pad.E"].last == pytest.approx(TRUTH["pad.E"], rel=0.05)
 
 
