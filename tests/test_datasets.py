@@ -20,8 +20,10 @@ import pytest
 import torch
 import xarray as xr
 import zarr
+from torch import Tensor
 from torch.utils.data import DataLoader
 
+from torchsoft import SoftGrasp, simulate
 from torchsoft.datasets import simulation
 from torchsoft.datasets.check import check
 from torchsoft.datasets.config import Config
@@ -31,6 +33,7 @@ from torchsoft.datasets.reader import Trajectories, open_dataset
 from torchsoft.datasets.simulation import points, simulate_task, split, task
 from torchsoft.datasets.writer import Store, create, laid_out, open_or_create
 from torchsoft.files import replacing
+from torchsoft.solve.progress import SimulationFailed
 
 ROOT = Path(__file__).parent.parent
 CONFIGS = sorted((ROOT / "data_gen" / "configs").glob("*.toml"))
@@ -520,15 +523,19 @@ def test_check_draws_its_picture(
     assert (tmp_path / "coverage.png").stat().st_size > 10_000
 
 
-def test_a_failed_simulation_is_recorded(tmp_path: Path) -> None:
-    path = write_config(
-        tmp_path, trajectories=1, change=('"contact.v_s" = 0.05', '"pad.tau" = 1e-4')
-    )
-    config = Config.from_toml(path)
+def test_a_failed_simulation_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def failing(model: SoftGrasp, t: Tensor, **options: Any) -> None:
+        failure = SimulationFailed("the disc was lost at t = 0.1 s", 0.1)
+        failure.trajectory = simulate(model, t[:11], **options)
+        raise failure
+
+    monkeypatch.setattr("torchsoft.datasets.simulation.simulate", failing)
+    config = Config.from_toml(write_config(tmp_path, trajectories=1))
     generate(config, str(tmp_path / "set"), Serial(), progress=False)
     data = xr.open_zarr(tmp_path / "set").load()
     assert data.failed.values.tolist() == [1]
-    assert "at t = " in str(data.reason.values[0])
+    assert str(data.reason.values[0]) == "the disc was lost at t = 0.1 s"
+    assert data.failure_time.values.tolist() == [0.1]
     assert np.isnan(data.disc_position).all()
     assert data["pad.E"].values[0] > 0
     assert [x for x in check(str(tmp_path / "set")) if "commit" not in x] == []

@@ -29,6 +29,7 @@ from torchsoft.sysid.assumptions import (
 )
 from torchsoft.sysid.identification import notices_on
 from torchsoft.sysid.prediction import predict
+from torchsoft.sysid.problem import Residuals
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import (
     AssumptionTest,
@@ -61,7 +62,8 @@ def checked(
 ) -> Checked:
     problem = Problem([data], sensors, {name: Unknown() for name in TRUTH})
     free, runner = problem.coordinates.free, Runner(problem.recordings)
-    answer = identify(problem, plan=[Stage("all", problem.names, problem.coordinates.labels, RTOL)])
+    stages = [Stage("all", problem.names, problem.coordinates.labels, RTOL)]
+    answer = identify(problem, plan=stages, assumptions="trusted")
     x = np.array(answer.x)
     at, _ = problem.freeze(runner, x, problem.names, RTOL, free)
     return check_assumptions(
@@ -203,22 +205,26 @@ def test_another_ramp_is_asked_for_by_data_that_it_made(
     assert any("ramp" in sentence for sentence in assumption_notices(found))
 
 
-def far_off() -> tuple[Problem, Runner, np.ndarray]:
-    """Data of Coulomb's friction, and coordinates at which a fit with smooth friction has ended
-    where nothing can be learnt."""
+@pytest.fixture(scope="module")
+def far_off() -> tuple[Problem, np.ndarray, Residuals]:
+    """Data of Coulomb's friction, with coordinates and residuals at which a fit with smooth
+    friction has ended where nothing can be learnt."""
     known = BASE.override(
         {"contact.mu_s": 0.1, "contact.mu_k": 0.07, "contact.v_s": 0.1, "contact.eta": 100.0}
     )
     data = record("light", LIGHT, known.override(TRUTH), known, SENSORS, rtol=1e-5, noise=0.0)
     problem = Problem([made_by(coulomb(data), data)], SENSORS, {name: Unknown() for name in TRUTH})
-    return problem, Runner(problem.recordings), problem.coordinates.start + [0.5, -0.7]
+    x, free = problem.coordinates.start + [0.5, -0.7], problem.coordinates.free
+    at, _ = problem.freeze(Runner(problem.recordings), x, problem.names, RTOL, free)
+    return problem, x, at
 
 
-def test_what_no_test_explains_has_candidates() -> None:
+def test_what_no_test_explains_has_candidates(
+    far_off: tuple[Problem, np.ndarray, Residuals],
+) -> None:
     """Nothing is fitted again: a notice says what `explain` would try."""
-    problem, runner, x = far_off()
+    problem, x, at = far_off
     free = problem.coordinates.free
-    at, _ = problem.freeze(runner, x, problem.names, RTOL, free)
     found = check_assumptions(problem, x, at, free, problem.names, RTOL, doubtful=True)
     assert not any(one.refitted for one in found.checks)
     assert "Coulomb friction" in found.candidates
@@ -228,11 +234,11 @@ def test_what_no_test_explains_has_candidates() -> None:
     )
 
 
-def test_under_another_law_a_fit_that_is_far_off_begins_anew() -> None:
-    problem, runner, x = far_off()
-    free = problem.coordinates.free
-    at, _ = problem.freeze(runner, x, problem.names, RTOL, free)
-    end = ended(problem, x, at, free, problem.names, RTOL, 1, None)
+def test_under_another_law_a_fit_that_is_far_off_begins_anew(
+    far_off: tuple[Problem, np.ndarray, Residuals],
+) -> None:
+    problem, x, at = far_off
+    end = ended(problem, x, at, problem.coordinates.free, problem.names, RTOL, 1, None)
     law = next(
         one for one in assumptions(problem.recordings, set(TRUTH)) if one.name == "Coulomb friction"
     )

@@ -7,9 +7,9 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 from conftest import COARSE
+from test_sysid import check_derivatives
 from torch import Tensor, nn
 
 from torchsoft import Parameters, Reference, SoftGrasp
@@ -17,7 +17,6 @@ from torchsoft.excitation import Excitation, Strokes
 from torchsoft.physics.contact import SlipLaw
 from torchsoft.physics.shapes import parameter
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
-from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.synthetic import Build
 
 BASE = Parameters().override(COARSE)
@@ -79,22 +78,7 @@ def test_its_derivatives_by_both_routes_are_those_of_differences(jerks: Recordin
     slack = {"contact.friction.beta": Unknown(scale="linear", nominal=1.0, low=0.0, high=100.0)}
     ratio = {"control.K_98": Unknown(ratio_to="control.K_81")}
     problem = Problem([jerks], SENSORS, {"contact.friction.alpha": Unknown()} | slack | ratio)
-    x, free, h = problem.coordinates.start, problem.coordinates.free, 1e-5
-    runner = Runner(problem.recordings)
-    _, steps = problem.freeze(runner, x, ["jerks"], 3e-5)
-    at = problem.residuals(runner, x, ["jerks"], steps, free)
-    for i, label in enumerate(problem.coordinates.labels):
-        ahead, behind = (
-            problem.residuals(runner, x + s * h * np.eye(3)[i], ["jerks"], steps).r for s in (1, -1)
-        )
-        slope = (ahead - behind) / (2 * h)
-        assert np.linalg.norm(at.J[:, i] - slope) < 2e-4 * np.linalg.norm(slope), label
-    loss, gradient, lost = problem.misfit(runner, x, ["jerks"], steps, free)
-    assert not lost
-    assert loss == pytest.approx(0.5 * at.r @ at.r, rel=1e-12)
-    np.testing.assert_allclose(
-        gradient, at.J.T @ at.r, rtol=1e-8, atol=1e-8 * np.abs(gradient).max()
-    )
+    check_derivatives(problem, problem.coordinates.start, 3e-5, 2e-4)
 
 
 def test_it_can_be_sent_to_another_process(jerks: Recording) -> None:

@@ -116,6 +116,7 @@ def test_profile_and_combination_of_stiffnesses_in_series(tmp_path: Path) -> Non
         rtol=1e-4,
         plan=[Stage("all", ("roll",), problem.coordinates.labels, 1e-4)],
         tightenings=0,
+        assumptions="trusted",
     )
     o = Optimum.of(problem, result)
     np.testing.assert_allclose(o.x, result.x)

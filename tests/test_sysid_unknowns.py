@@ -81,6 +81,12 @@ def test_bounds_that_are_not_given_end_where_the_parameters_do() -> None:
             },
             r"prior\.median = 1\.5e\+06 is not between low = 80000 and high = 1\.4e\+06$",
         ),
+        ({"pad__E": {"low": 1e6, "high": 2e6}}, r"pad\.E\.nominal = 750000 is not between"),
+        ({"pad__E": {"low": 2e6, "high": 1e6}}, "low = 2000000.0 must be below"),
+        ({"pad__E": {"scale": "linear"}}, "needs `low` and `high`"),
+        ({"pad__E": {"nominal": -1.0}}, "needs nominal > 0"),
+        ({"contact__mu_k": {"ratio_to": "friction"}}, "ratio_to = 'friction'"),
+        ({"pad__E": {"young": 1.0}}, "young"),
         ({"pad__Young": {}}, r"^unknowns: `pad\.Young` cannot be identified; what can: pad\.E, "),
     ],
 )
