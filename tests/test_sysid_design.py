@@ -217,7 +217,7 @@ def test_bounds_and_criteria_are_checked() -> None:
 def found(problem: Problem) -> Design:
     return design(
         problem, "plan", BOUNDS, limits={"F_y": (-60.0, 60.0)}, at=draws(problem, 2, spread=0.1),
-        iterations=24, rate=0.6, criterion=Criterion("worst", (0.01, 0.08)),
+        iterations=60, rate=0.3, criterion=Criterion("worst", (0.01, 0.08)),
     )  # fmt: skip
 
 
