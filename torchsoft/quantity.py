@@ -106,6 +106,8 @@ InertiaRatio = Annotated[
     float, Quantity("1", 1e-3, 1e3, "moment of inertia over that of a body of uniform density")
 ]
 
+Ratio = Annotated[float, Quantity("1", 1e-3, 1e3)]
+
 Depth = Annotated[float, Quantity("m", 1e-6, 10.0, "depth out of the plane")]
 
 Modulus = Annotated[

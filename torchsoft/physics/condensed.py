@@ -19,7 +19,7 @@ HALVINGS = 12
 def free_rates(pad: Pad, z: Tensor, stage: float) -> tuple[Tensor, Tensor]:
     """Rates of a massless pad's nodes without contact (..., nodes, 2) [m/s] and its mobility P
     [m/(N.s)], for the forces z (..., branches, nodes, 2) that have set in at the stage's start."""
-    fractions, times = pad.material.chain()
+    fractions, times = pad.chain()
     C, rest = pad.compliance(), fractions / (times + stage)
     free = -((rest[:, None, None] * z).sum(-3).flatten(-2) @ C.mT).unflatten(-1, (-1, 2))
     return free, rest.sum() * C

@@ -74,10 +74,10 @@ def ramp(g: Tensor, epsilon: Tensor) -> Tensor:
     return depth / (depth + epsilon)
 
 
-def normal_force(g: Tensor, g_dot: Tensor, rho: Tensor, K_n: Tensor, R_n: Tensor) -> Tensor:
-    """F_N = max(0, K_n g + R_n g' rho) while g > 0 (Eq. 8, 9) [N]. Not smooth at g = 0 and where
-    the max cuts."""
-    return (K_n * g.clamp(min=0.0) + R_n * rho * g_dot).clamp(min=0.0)
+def normal_force(spring: Tensor, g_dot: Tensor, rho: Tensor, R_n: Tensor) -> Tensor:
+    """F_N = max(0, K_n g + R_n g' rho) while g > 0 (Eq. 8, 9) [N], of the spring's force K_n g. Not
+    smooth at g = 0 and where the max cuts."""
+    return (spring + R_n * rho * g_dot).clamp(min=0.0)
 
 
 StaticFriction = Annotated[FrictionCoefficient, "static coefficient of friction"]
@@ -145,6 +145,9 @@ class Coulomb(Friction):
         return torch.where(self.mu_s * F_N <= E, (E - self.mu_k * F_N) / R, 0.0)
 
 
+REFERENCE_DEPTH = 1e-4
+"""Penetration g_0 [m] at which the normal spring's force is K_n g_0, whatever its power."""
+
 Sliding = Callable[[Tensor], Tensor]
 """The part [1] of the sliding that stretches the tangential elements, where the ramp is rho [1]."""
 
@@ -164,7 +167,8 @@ def at_once(rho: Tensor) -> Tensor:
 class SoftContact(nn.Module):
     """The contact elements of one point, per reference spacing: springs K_n, K_t [N/m], dashpots
     R_n, R_t [N.s/m], the ramp's depth epsilon [m], and a friction law. `weight` scales them to the
-    length of surface that a point stands for. `sliding` other than `ramped` breaks the power
+    length of surface that a point stands for. With a `power` m [1] the normal spring's force is K_n
+    g_0 (g / g_0)^m, g_0 being `REFERENCE_DEPTH`. `sliding` other than `ramped` breaks the power
     balance."""
 
     def __init__(
@@ -181,12 +185,17 @@ class SoftContact(nn.Module):
         node_spacing: Annotated[
             float, Quantity("m", 1e-7, 1.0, "length of surface that the four numbers belong to")
         ] = 1e-3,
+        power: Annotated[
+            float, Quantity("1", 0.5, 4.0, "power of the normal spring's force; linear without one")
+        ]
+        | None = None,
     ) -> None:
         super().__init__()
         self.K_n, self.R_n, self.K_t, self.R_t = (
             parameter(value) for value in (K_n, R_n, K_t, R_t)
         )
         self.epsilon = parameter(epsilon, trained=False)
+        self.power = None if power is None else parameter(power)
         if not callable(friction):
             raise ValueError(
                 "`friction` must be a function or a module of (effort, normal force, dashpot), "
@@ -208,6 +217,16 @@ class SoftContact(nn.Module):
                 "dashpot"
             )
         return ""
+
+    def spring(self, g: Tensor) -> Tensor:
+        """Force of the normal spring [N] per reference spacing at penetrations g (...) [m]."""
+        depth = g.clamp(min=0.0)
+        if self.power is None:
+            return self.K_n * depth
+        over = torch.where(depth > 0, depth, REFERENCE_DEPTH) / REFERENCE_DEPTH
+        return torch.where(
+            depth > 0, self.K_n * REFERENCE_DEPTH * torch.exp(self.power * torch.log(over)), 0.0
+        )
 
     def jumps(self, F_N: float) -> str:
         """Why the slip rate jumps under a normal force F_N [N] per reference spacing: friction
@@ -245,7 +264,7 @@ class SoftContact(nn.Module):
         R = self.R_t + stage * self.K_t
         rho = ramp(g, self.epsilon)
         part = self.sliding(rho)
-        F_N = normal_force(g, g_dot, rho, self.K_n, self.R_n)  # (8), (9)
+        F_N = normal_force(self.spring(g), g_dot, rho, self.R_n)  # (8), (9)
         trial = self.K_t * s + R * part * v_T  # (10), (11): the effort if nothing slipped
         one = torch.ones_like(trial)
         sign = torch.where(trial >= 0, one, -one)
@@ -258,12 +277,12 @@ class SoftContact(nn.Module):
         self, at: ContactState, g: Tensor, g_dot: Tensor, weight: Tensor | float
     ) -> tuple[Tensor, Tensor]:
         """Powers [W] that dashpots and slip take out, shape (...), never negative."""
-        spring = weight * self.K_n * g.clamp(min=0.0)
-        return (at.F_N - spring) * g_dot + weight * self.R_t * at.s_dot**2, at.e * at.gamma_dot
+        return (at.F_N - weight * self.spring(g)) * g_dot + weight * self.R_t * at.s_dot**2, at.e * at.gamma_dot
 
     def stored(self, g: Tensor, s: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         """Energies [J] of the normal and the tangential springs, shape (...)."""
-        return 0.5 * weight * self.K_n * g.clamp(min=0.0) ** 2, 0.5 * weight * self.K_t * s**2
+        m = 1.0 if self.power is None else self.power
+        return weight * self.spring(g) * g.clamp(min=0.0) / (m + 1), 0.5 * weight * self.K_t * s**2
 
 
 def interface_law(contact: SoftContact, shape: Shape, x: Tensor) -> Tensor:

@@ -30,7 +30,7 @@ def stored(
         if pad.inertial:
             energies[f"strain_{name}"] = 0.5 * (part * pad.elastic_force(part)).sum((-2, -1))
         else:
-            fractions, _ = pad.material.chain()
+            fractions, _ = pad.chain()
             if len(fractions) == 1:
                 u = known[name] if name in known else rig.displacement(name, state)
                 energies[f"strain_{name}"] = 0.5 * (part[..., 0, :, :] * u).sum((-2, -1))
@@ -78,7 +78,7 @@ def dissipated(rig: Rig, state: State, graph: Evaluation) -> dict[str, Tensor]:
                 pad.retardation_time(name) * u_dot * pad.elastic_force(u_dot)
             ).sum((-2, -1))
         else:
-            fractions, times = pad.material.chain()
+            fractions, times = pad.chain()
             rate = (
                 (port.effort[..., None, :, :] - state.pads[name]) / times[:, None, None]
             ).flatten(-2)

@@ -14,7 +14,6 @@ from scipy.linalg.lapack import dlasd4  # pyright: ignore[reportAttributeAccessI
 from torch import Tensor, nn
 
 from torchsoft.physics.arguments import number
-from torchsoft.physics.mesh import lame_moduli
 from torchsoft.physics.shapes import parameter
 from torchsoft.quantity import Density, Depth, Modulus, PoissonRatio, Quantity, Retardation
 
@@ -39,41 +38,61 @@ TOO_MUCH = 1e-12
 """By how much fractions that sum to one may exceed it: rounding."""
 
 
+class SlowBranch(nn.Module):
+    """One more Kelvin element of a material: a `fraction` [1] of the relaxed compliance that sets
+    in with a retardation `time` [s] of its own."""
+
+    def __init__(
+        self,
+        fraction: Annotated[float, Quantity("1", 0.0, 0.9, "fraction of the relaxed compliance")],
+        time: Retardation,
+    ) -> None:
+        super().__init__()
+        self.fraction, self.time = parameter(fraction), parameter(time)
+
+
 class Material(nn.Module):
     """What a pad asks of its material: E [Pa] (relaxed), nu [1], rho [kg/m3], the out-of-plane
-    depth [m], and a chain."""
+    depth [m], and a chain, to which a `slow` branch may be added."""
+
+    slow: SlowBranch | None
 
     def __init__(self, E: Modulus, nu: PoissonRatio, rho: Density, depth: Depth) -> None:
         super().__init__()
         self.E, self.nu, self.rho, self.depth = (parameter(value) for value in (E, nu, rho, depth))
+        self.slow = None
 
     def chain(self) -> tuple[Tensor, Tensor]:
         """Fractions J [1], which sum to one, and retardation times tau [s] > 0, shape (branches,)
         each."""
         raise NotImplementedError
 
+    def whole_chain(self) -> tuple[Tensor, Tensor]:
+        """The chain with the slow branch, which takes its fraction from every other element."""
+        J, tau = self.chain()
+        if self.slow is None:
+            return J, tau
+        f, t = self.slow.fraction, self.slow.time
+        return torch.cat((J * (1 - f), f[None])), torch.cat((tau, t[None]))
+
     @property
     def branches(self) -> int:
-        """Elements of the chain."""
+        """Elements of the chain, without the slow branch."""
         return len(self.chain()[0].detach())
 
     def creep(self, t: Tensor) -> Tensor:
         """Strain per held stress [1/Pa] at times t (...) [s] after it was put on."""
-        J, tau = self.chain()
+        J, tau = self.whole_chain()
         return (J * -torch.expm1(-t[..., None] / tau)).sum(-1) / self.E
 
     def complex_modulus(self, omega: Tensor) -> Tensor:
         """Storage modulus + i loss modulus [Pa] at angular frequencies omega (...) [rad/s]."""
-        J, tau = self.chain()
+        J, tau = self.whole_chain()
         return self.E / (J / (1 + 1j * omega[..., None] * tau)).sum(-1)
 
     def well_posed(self) -> str:
         """What is wrong with the parameters together; empty if nothing is."""
         return ""
-
-    def lame(self) -> tuple[Tensor, Tensor]:
-        """Lame moduli (lambda, mu) [Pa]."""
-        return lame_moduli(self.E, self.nu)
 
 
 class KelvinVoigt(Material):

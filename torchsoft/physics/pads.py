@@ -6,7 +6,7 @@ chain; an inertial pad's its displacements and velocities.
 """
 
 from functools import lru_cache
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -17,6 +17,8 @@ from torch import Tensor, nn
 from torchsoft.physics.arguments import whole
 from torchsoft.physics.material import Material
 from torchsoft.physics.mesh import Array, Mesh, lame_moduli, unit_compliance
+from torchsoft.physics.shapes import parameter
+from torchsoft.quantity import Ratio
 
 
 @lru_cache(maxsize=16)
@@ -44,7 +46,8 @@ class Pad(nn.Module):
 
     `points` contact points an element of the surface lie at Gauss places; 0 puts one on every node,
     as in the paper. `positions` are the undeformed places of the nodes in the state (nodes, 2) [m],
-    `surface` numbers those on the surface. Raises `ValueError` for a negative number of points.
+    `surface` numbers those on the surface. `E_ratio` and `tau_ratio` [1] make the pad differ from
+    others of its material. Raises `ValueError` for a negative number of points.
     """
 
     positions: Tensor
@@ -56,9 +59,14 @@ class Pad(nn.Module):
         self, mesh: Mesh, material: Material, *, base: str | None = None,
         origin: tuple[float, float] = (0.0, 0.0), angle: float = 0.0, mirrored: bool = False,
         inertial: bool = False, points: int = 0,
+        E_ratio: Annotated[Ratio, "Young's modulus over the material's"] | None = None,
+        tau_ratio: Annotated[Ratio, "retardation times over the material's"] | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         self.points = whole("points", points, 0)
+        self.E_ratio, self.tau_ratio = (
+            None if ratio is None else parameter(ratio) for ratio in (E_ratio, tau_ratio)
+        )
         self.mesh, self.material, self.base, self.inertial = mesh, material, base, inertial
         kept = np.arange(len(mesh.free)) if inertial else mesh.surface
         c, s = np.cos(angle), np.sin(angle)
@@ -91,11 +99,32 @@ class Pad(nn.Module):
 
     def _again(self, mesh: Mesh, inertial: bool, points: int) -> "Pad":
         c, s = self.axes[:, 0].tolist()
-        return Pad(
+        pad = Pad(
             mesh, self.material, base=self.base,
             origin=(float(self.origin[0]), float(self.origin[1])), angle=float(np.arctan2(s, c)),
             mirrored=float(self.axes.det()) < 0, inertial=inertial, points=points,
         )  # fmt: skip
+        pad.E_ratio, pad.tau_ratio = self.E_ratio, self.tau_ratio
+        return pad
+
+    @property
+    def E(self) -> Tensor:
+        """Relaxed Young's modulus [Pa]."""
+        return self.material.E if self.E_ratio is None else self.E_ratio * self.material.E
+
+    def chain(self) -> tuple[Tensor, Tensor]:
+        """Fractions J [1] and retardation times tau [s], shape (branches,) each."""
+        fractions, times = self.material.whole_chain()
+        return fractions, times if self.tau_ratio is None else self.tau_ratio * times
+
+    def lame(self) -> tuple[Tensor, Tensor]:
+        """Lame moduli (lambda, mu) [Pa]."""
+        return lame_moduli(self.E, self.material.nu)
+
+    @property
+    def branches(self) -> int:
+        """Kelvin elements of the chain."""
+        return self.material.branches + (self.material.slow is not None)
 
     spread: Tensor
     """Shape functions of the nodes in the state at the contact points (points, nodes)."""
@@ -112,7 +141,7 @@ class Pad(nn.Module):
     def state_shape(self) -> tuple[int, ...]:
         """Of its part of the state: displacements (nodes, 2), or forces that have set in (branches,
         nodes, 2)."""
-        return (self.nodes, 2) if self.inertial else (self.material.branches, self.nodes, 2)
+        return (self.nodes, 2) if self.inertial else (self.branches, self.nodes, 2)
 
     def placed(self, own: Array) -> Array:
         """Places (..., 2) in the pad's own frame, in the base's."""
@@ -140,12 +169,12 @@ class Pad(nn.Module):
         material = self.material
         if material.nu.requires_grad and torch.is_grad_enabled():
             C = C + dC * (material.nu - material.nu.detach())
-        return C / (material.E * material.depth)
+        return C / (self.E * material.depth)
 
     def retardation_time(self, name: str) -> Tensor:
         """tau [s] of an inertial pad, R = tau K. Raises `NotImplementedError` naming the pad for a
         material with several."""
-        _, tau = self.material.chain()
+        _, tau = self.chain()
         if len(tau) != 1:
             raise NotImplementedError(
                 f"the inertial pad `{name}` needs a Kelvin-Voigt material (one retardation time), "
@@ -156,7 +185,7 @@ class Pad(nn.Module):
     def elements(self, name: str) -> tuple[str, ...]:
         """The pad of this name in the multibond graph: a C and an R field, those of all Kelvin
         elements of its chain."""
-        own = name if self.material.branches == 1 else f"{name},1..{self.material.branches}"
+        own = name if self.branches == 1 else f"{name},1..{self.branches}"
         return f"C: [K_{own}]^-1", f"R: [R_{own}]"
 
     def masses(self) -> Tensor:
@@ -178,14 +207,14 @@ class Pad(nn.Module):
         loads = np.zeros((2 * self.nodes, len(columns)))
         loads[columns.numpy(), np.arange(len(columns))] = 1.0
         everywhere = torch.from_numpy(splu(K).solve(loads))
-        u = everywhere @ F.flatten() / (self.material.E * self.material.depth)
+        u = everywhere @ F.flatten() / (self.E * self.material.depth)
         return u.unflatten(0, (-1, 2))
 
     def elastic_force(self, u: Tensor) -> Tensor:
         """K u of an inertial pad: displacements u (..., nodes, 2) [m] to forces of the same shape
         [N]."""
         mesh, material = self.mesh, self.material
-        lame_lambda, lame_mu = material.lame()
+        lame_lambda, lame_mu = self.lame()
         K_lambda, K_mu = (torch.from_numpy(K) for K in mesh.matrices[:2])
         K_e = material.depth * (lame_lambda * K_lambda + lame_mu * K_mu)
         # bonded nodes do not move: they read, and write to, one spare slot behind the free ones

@@ -2,7 +2,7 @@
 laws."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import torch
 from torch import Tensor, nn
@@ -11,7 +11,14 @@ from torchsoft.physics.arguments import positive
 from torchsoft.physics.contact import SoftContact
 from torchsoft.physics.shapes import Shape, parameter
 from torchsoft.physics.state import State
-from torchsoft.quantity import DerivativeGain, Inertia, InertiaRatio, Mass, ProportionalGain
+from torchsoft.quantity import (
+    DerivativeGain,
+    Inertia,
+    InertiaRatio,
+    Mass,
+    ProportionalGain,
+    Quantity,
+)
 
 COORDINATES = ("x", "y", "theta")
 """The coordinates of a body [m, m, rad]."""
@@ -126,6 +133,45 @@ class ReversedPD(PD):
         self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor
     ) -> Tensor:
         return feed_forward - self.Kp * (w - q) - self.Kd * (w_dot - q_dot)
+
+
+class Guide(nn.Module):
+    """Resistance of a guide to its coordinate's rate v: F = -friction v / sqrt(v^2 + v_0^2) -
+    damping v; dry friction is smooth below the speed v_0."""
+
+    def __init__(
+        self,
+        friction: Annotated[float, Quantity("N, N.m", 0.0, 1e6, "dry friction of the guide")] = 0.0,
+        damping: Annotated[
+            float, Quantity("N.s/m, N.m.s/rad", 0.0, 1e6, "viscous damping of the guide")
+        ] = 0.0,
+        v_0: Annotated[
+            float, Quantity("m/s, rad/s", 1e-9, 1e3, "rate below which dry friction is smooth")
+        ] = 1e-3,
+    ) -> None:
+        super().__init__()
+        self.friction, self.damping = parameter(friction), parameter(damping)
+        self.v_0 = parameter(v_0, trained=False)
+
+    def forward(
+        self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor
+    ) -> Tensor:
+        return -(self.friction / torch.sqrt(q_dot**2 + self.v_0**2) + self.damping) * q_dot
+
+
+class Tilt(nn.Module):
+    """Change of a body's weight [N] along one `axis` where gravity is turned anticlockwise by a
+    `tilt` [rad] from -y; `mass` and `gravity` are the body's and the rig's own parameters."""
+
+    def __init__(self, axis: str, tilt: Tensor, mass: Tensor, gravity: Tensor) -> None:
+        super().__init__()
+        self.axis, self.tilt, self.mass, self.gravity = axis, tilt, mass, gravity
+
+    def forward(
+        self, w: Tensor, w_dot: Tensor, feed_forward: Tensor, q: Tensor, q_dot: Tensor
+    ) -> Tensor:
+        part = torch.sin(self.tilt) if self.axis == "x" else 1 - torch.cos(self.tilt)
+        return self.mass * self.gravity * part + 0.0 * q
 
 
 class Actuator(nn.Module):

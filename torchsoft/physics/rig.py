@@ -174,6 +174,14 @@ class Rig(nn.Module):
     renamed: Mapping[str, str] = {}
     """Other names of channels and energies."""
 
+    extended: Mapping[str, str] = {}
+    """Parameters that were added to the rig, by what they are called."""
+
+    @property
+    def names(self) -> dict[str, str]:
+        """Names of parameters by their other names."""
+        return {**self.aliases, **self.extended}
+
     def description(self) -> dict[str, Any]:
         """The numbers and laws of the rig as they are now, for what is saved with a run."""
         mine = {
@@ -203,15 +211,15 @@ class Rig(nn.Module):
         """A parameter by its name, or by another one in `aliases`. Raises `ValueError` for one that
         is not there."""
         known = dict(self.named_parameters(remove_duplicate=False))
-        found = known.get(self.aliases.get(name, name), known.get(name))
+        found = known.get(self.names.get(name, name), known.get(name))
         if found is None:
-            shown = dict.fromkeys((*self.aliases, *dict(self.named_parameters())))
+            shown = dict.fromkeys((*self.names, *dict(self.named_parameters())))
             raise ValueError(f"`{name}` is not a parameter of this rig; known: {', '.join(shown)}")
         return found
 
     def quantity(self, name: str) -> Quantity | None:
         """Unit, bounds and meaning of a parameter by its name, where its part declares them."""
-        owner, _, last = self.aliases.get(name, name).rpartition(".")
+        owner, _, last = self.names.get(name, name).rpartition(".")
         part = self.get_submodule(owner)
         found = quantity_of(part, last)
         loop = next((one for one in self.actuators.values() if one.law is part), None)
@@ -224,7 +232,7 @@ class Rig(nn.Module):
     @property
     def ordered(self) -> dict[str, str]:
         """Parameters that must not exceed another one, with the name of that one."""
-        names = {own: name for name, own in self.aliases.items()}
+        names = {own: name for name, own in self.names.items()}
         pairs = [
             [f"{k}.{one}" for one in m.ordered]
             for k, m in self.named_modules()
@@ -307,7 +315,7 @@ class Rig(nn.Module):
         pad, part = self.pads[name], state.pads[name]
         if pad.inertial:
             return part
-        fractions, _ = pad.material.chain()
+        fractions, _ = pad.chain()
         zeta = (fractions[:, None, None] * part).sum(-3)
         return (zeta.flatten(-2) @ pad.compliance().mT).unflatten(-1, (-1, 2))
 
@@ -348,7 +356,7 @@ class Rig(nn.Module):
                     turned(effort[f"pad_{name}"], -angle[..., None]) / pad.masses()[:, None]
                 )
             else:
-                f, (_, times) = graph.ports[f"pad_{name}"].effort, pad.material.chain()
+                f, (_, times) = graph.ports[f"pad_{name}"].effort, pad.chain()
                 pads[name] = (f[..., None, :, :] - state.pads[name]) / times[:, None, None]
         loads = self.loads(graph, effort)
         velocity = {

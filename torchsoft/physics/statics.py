@@ -126,7 +126,7 @@ def carried(rig: Rig, name: str, state: State) -> Tensor:
             f"the massless pad `{name}` does not settle (residual {left:.2g} m after {SETTLING} "
             "iterations); is a body deep in it, or are the stretches large?"
         )
-    return F[..., None, :, :].expand(*batch, pad.material.branches, -1, -1)
+    return F[..., None, :, :].expand(*batch, pad.branches, -1, -1)
 
 
 def massless(rig: Rig) -> Rig:

@@ -177,7 +177,7 @@ class Compiled:
         columns = np.full((len(rig.pads), len(self._bodies.coordinate)), -1, np.int64)
         for number, (name, pad) in enumerate(rig.pads.items()):
             material, n = pad.material, len(pad.mesh.surface)
-            fractions, times = material.chain()
+            fractions, times = pad.chain()
             rows["base"].append(
                 3 * (len(rig.bodies) if pad.base is None else list(rig.bodies).index(pad.base))
             )
@@ -185,7 +185,7 @@ class Compiled:
             rows["chain_at"].append(self._add(fractions))
             self._add(times)
             if pad.inertial:
-                lame_lambda, lame_mu = material.lame()
+                lame_lambda, lame_mu = pad.lame()
                 density = material.rho * material.depth
                 material_at.append(
                     self._add(
@@ -201,7 +201,7 @@ class Compiled:
                 )
             else:
                 material_at.append(
-                    self._add(torch.stack((1 / (material.E * material.depth), material.nu)))
+                    self._add(torch.stack((1 / (pad.E * material.depth), material.nu)))
                 )
             rows["y_start"].append(slices["pads", name].start)
             rows["v_start"].append(slices["rates", name].start if pad.inertial else -1)

@@ -208,7 +208,7 @@ def warn_of_memory(rig: Rig, lead: float) -> None:
     """Warns of massless pads that do not forget their beginning before the first sample, `lead` [s]
     later."""
     for name, pad in rig.pads.items():
-        longest = float(pad.material.chain()[1].detach().max())
+        longest = float(pad.chain()[1].detach().max())
         if not pad.inertial and lead < FORGOTTEN * longest:
             warnings.warn(
                 f"the run begins {lead:g} s before the first sample, but the pad `{name}` creeps "
@@ -227,12 +227,12 @@ def held_forces(pad: Pad, z: Tensor, nominal: Pad) -> Tensor:
     """
     material, was = pad.material, nominal.material
     if float(material.nu.detach()) != float(was.nu):
-        fractions, _ = was.chain()
+        fractions, _ = nominal.chain()
         u = nominal.compliance() @ (fractions[:, None, None] * z).sum(-3).flatten()
         f = torch.linalg.solve(pad.compliance(), u)
         f = torch.round(f.detach(), decimals=9) + (f - f.detach())
         return f.unflatten(0, (-1, 2)).expand(z.shape)
-    scaled = z * (material.E * material.depth / float(was.E * was.depth))
+    scaled = z * (pad.E * material.depth / float(nominal.E * was.depth))
     C, dC = pad.unit_compliance()
     by_nu = -torch.linalg.solve(C, dC @ scaled.detach().flatten(-2).mT).mT.reshape(z.shape)
     return scaled + by_nu * (material.nu - material.nu.detach())

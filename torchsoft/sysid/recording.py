@@ -128,7 +128,7 @@ class Recording:
     def parameters(self) -> dict[str, float]:
         """Every number that can be identified: the rig's scalar parameters, by their aliases where
         they have one, and the start's coordinates."""
-        names = {own: name for name, own in self.rig.aliases.items()}
+        names = {own: name for name, own in self.rig.names.items()}
         mine = [
             (own, value)
             for own, value in self.rig.named_parameters()

@@ -1,0 +1,171 @@
+"""Extensions of a rig: numbers that its model holds at a neutral value, without a parameter for
+them until one is added.
+
+With all of them at their neutral values a rig moves as it did before. An identification takes them
+for granted; each may be one of its unknowns.
+"""
+
+from collections.abc import Callable, Collection
+from functools import partial
+from typing import NamedTuple, TypeVar
+
+from torch import nn
+
+from torchsoft.physics.contact import REFERENCE_DEPTH, SoftContact
+from torchsoft.physics.material import Material, SlowBranch
+from torchsoft.physics.parts import Actuator, Guide, Tilt
+from torchsoft.physics.rig import Rig
+from torchsoft.physics.shapes import parameter
+
+M = TypeVar("M", bound=nn.Module)
+
+SLOWER = (10.0, 100.0)
+"""Retardation times of a slow branch over the longest one of the material."""
+
+
+class Extension(NamedTuple):
+    """A number that may be added: its `neutral` value, the `amount` of a variation and the interval
+    of a search [`unit`], clauses that say what is so at the neutral value and what else could be,
+    and the function that adds the parameter and returns it."""
+
+    neutral: float
+    amount: float
+    low: float
+    high: float
+    unit: str
+    stated: str
+    otherwise: str
+    add: Callable[[Rig], nn.Parameter]
+
+
+def extensions(rig: Rig) -> dict[str, Extension]:
+    """Numbers that may be added to a rig, by the name of the parameter."""
+    out: dict[str, Extension] = {}
+    for name in rig.pads if len(rig.pads) > 1 else ():
+        for ratio, what, reach in (("E_ratio", "as stiff", 2.0), ("tau_ratio", "as viscous", 4.0)):
+            out[f"pads.{name}.{ratio}"] = Extension(
+                1.0, 0.01, 1 / reach, reach, "", f"the pad {name} is {what} as its material",
+                f"the pad {name} were 1.01 times {what} as its material",
+                partial(_pad_ratio, name=name, ratio=ratio),
+            )  # fmt: skip
+    for stem, material in _shared(rig, Material):
+        pads = [pad for pad in rig.pads.values() if pad.material is material]
+        if material.slow is None and not any(pad.inertial for pad in pads):
+            longest = float(material.chain()[1].detach().max())
+            for factor in SLOWER:
+                out[f"{stem}.slow({factor * longest:.3g} s)"] = Extension(
+                    0.0, 0.01, 0.0, 0.5, "", f"{stem} has no slower branch",
+                    f"0.01 of the compliance of {stem} set in over {factor * longest:.3g} s",
+                    partial(_slow_branch, stem=stem, time=factor * longest),
+                )  # fmt: skip
+    for stem, law in _shared(rig, SoftContact):
+        if law.power is None:
+            out[f"{stem}.power"] = Extension(
+                1.0, 0.01, 0.6, 2.5, "", f"the penalty force of {stem} is linear in the depth",
+                f"it grew with the depth to the power 1.01, the same at {REFERENCE_DEPTH:g} m",
+                partial(_power, stem=stem),
+            )  # fmt: skip
+    for coordinate in _guided(rig):
+        turns = coordinate.endswith(".theta")
+        for kind, size, most in (("friction", 0.1, 50.0), ("damping", 1.0, 500.0)):
+            unit = ("N.m" if turns else "N") + ("" if kind == "friction" else ".s/rad" if turns
+                    else ".s/m")  # fmt: skip
+            part = 0.02 if turns else 1.0  # m: of the arm at which a guide acts
+            out[f"guides.{coordinate}.{kind}"] = Extension(
+                0.0, part * size, 0.0, part * most, unit, f"{coordinate} has no {kind}",
+                f"its guide had a {kind} of {part * size:g} {unit}",
+                partial(_guide, coordinate=coordinate, kind=kind),
+            )  # fmt: skip
+    tilted = [name for name, body in rig.bodies.items() if body.weighted and _free(rig, name, "x")]
+    if tilted and rig.gravity.item() > 0:
+        out["gravity_tilt"] = Extension(
+            0.0, 1e-3, -0.2, 0.2, "rad", "gravity acts along -y",
+            "it were turned by 1 mrad, anticlockwise", partial(_tilt, bodies=tilted),
+        )  # fmt: skip
+    return {name: one for name, one in out.items() if name not in rig.names}
+
+
+def extend(rig: Rig, names: Collection[str]) -> None:
+    """Add parameters to a rig, at their neutral values, by the names of its `extensions`; those
+    that it has are left alone. Raises `ValueError` for a name that is neither."""
+    for name in names:
+        known = extensions(rig)
+        if name in known:
+            made = known[name].add(rig)
+            own = next(own for own, value in rig.named_parameters() if value is made)
+            rig.extended = {**rig.extended, name: own}
+        else:
+            rig.parameter(name)
+
+
+def _shared(rig: Rig, kind: type[M]) -> list[tuple[str, M]]:
+    """The rig's parts of a kind, each once, with the stem of their parameters' names."""
+    aliases = {own: name for name, own in rig.aliases.items()}
+    found = []
+    for own, module in rig.named_modules():
+        if isinstance(module, kind):
+            mine = (f"{own}.{key}" for key, _ in module.named_parameters(recurse=False))
+            name = next((aliases[one] for one in mine if one in aliases), f"{own}.")
+            found.append((name.rpartition(".")[0], module))
+    return found
+
+
+def _part(rig: Rig, kind: type[M], stem: str) -> M:
+    return next(module for name, module in _shared(rig, kind) if name == stem)
+
+
+def _free(rig: Rig, body: str, axis: str) -> bool:
+    return rig.bodies[body].freedom[axis] == "free"
+
+
+def _guided(rig: Rig) -> list[str]:
+    """Free coordinates that actuators push, other than by resistance of a guide."""
+    pushed = [
+        one.pushes for one in rig.actuators.values() if not isinstance(one.law, Guide | Tilt)
+    ]
+    return [one for one in dict.fromkeys(pushed) if _free(rig, *one.split("."))]
+
+
+def _added(rig: Rig, name: str, actuator: Actuator) -> None:
+    actuators: nn.ModuleDict = rig.actuators  # pyright: ignore[reportAssignmentType]
+    actuators[name] = actuator
+
+
+def _pad_ratio(rig: Rig, name: str, ratio: str) -> nn.Parameter:
+    setattr(rig.pads[name], ratio, parameter(1.0))
+    return getattr(rig.pads[name], ratio)
+
+
+def _slow_branch(rig: Rig, stem: str, time: float) -> nn.Parameter:
+    material = _part(rig, Material, stem)
+    material.slow = SlowBranch(0.0, time)
+    return material.slow.fraction
+
+
+def _power(rig: Rig, stem: str) -> nn.Parameter:
+    law = _part(rig, SoftContact, stem)
+    law.power = parameter(1.0)
+    return law.power
+
+
+def _guide(rig: Rig, coordinate: str, kind: str) -> nn.Parameter:
+    name = f"guide_{coordinate.replace('.', '_')}"
+    if name not in rig.actuators:
+        _added(rig, name, Actuator(coordinate, coordinate, Guide(), setpoint=(),
+                                   elements=(f"R: guide of {coordinate}",)))  # fmt: skip
+    return getattr(rig.actuators[name].law, kind)
+
+
+def _tilt(rig: Rig, bodies: Collection[str]) -> nn.Parameter:
+    tilt = parameter(0.0)
+    for name in bodies:
+        body = rig.bodies[name]
+        for axis in ("x", "y"):
+            if _free(rig, name, axis):
+                law = Tilt(axis, tilt, body.mass, rig.gravity)
+                coordinate = f"{name}.{axis}"
+                _added(rig, f"tilt_{name}_{axis}", Actuator(coordinate, coordinate, law,
+                       setpoint=(), elements=("Se: m g",)))  # fmt: skip
+    return tilt
+
+
