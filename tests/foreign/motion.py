@@ -70,7 +70,7 @@ def simulate(p: Numbers, t: Array, signals: Array, every: int = 1) -> Run:
     """
     C_L = compliance(p)
     mirror = np.tile([1.0, -1.0], len(C_L) // 2)
-    C = np.stack((C_L, mirror[:, None] * C_L * mirror))
+    C = np.stack((C_L, mirror[:, None] * C_L * mirror / p.upper))
     x = np.linspace(0.0, p.length, p.across + 1)
     lower, upper = np.full_like(x, p.height), np.full_like(x, -p.cm_height - p.height)
     X = np.stack((np.stack((x, lower), -1), np.stack((x - p.length / 2, upper), -1)))

@@ -10,6 +10,11 @@ class Numbers(NamedTuple):
     first contact until the force in them is above mu_s F_N, then mu_k F_N against the sliding, and
     the spring goes on stretching. `ramp_stretch` brings the sliding that stretches the spring in
     with g / (g + epsilon). `senses_disc`: the horizontal loop measures the disc.
+
+    `upper` is the stiffness of the upper pad over that of the lower one; the penalty force grows
+    with the depth to a `power`, from the same force at the depth `same`; a part `slow` of the pads'
+    compliance sets in over `slow_tau`; the horizontal guide of the bracket has a dry `friction`,
+    smooth below the speed `creep`; `inertia` is the disc's over that of a uniform one.
     """
 
     K_n: float = 1.2e5
@@ -43,3 +48,11 @@ class Numbers(NamedTuple):
     R_y: float = 441.7149
     senses_disc: bool = True
     x_C0: float = 60e-3
+    upper: float = 1.0
+    power: float = 1.0
+    same: float = 1e-4
+    slow: float = 0.0
+    slow_tau: float = 0.15
+    friction: float = 0.0
+    creep: float = 1e-3
+    inertia: float = 1.0

@@ -39,7 +39,8 @@ def node(p, h, rx, ry, omega, dx, dy, s, slipping):
     if g <= 0.0:
         return 0.0, 0.0, 0.0, relaxed(p, h, s), False, 0.0
     ramp = g / (g + p.epsilon)
-    F_N = max(0.0, p.K_n * g + p.R_n * g_dot * ramp)
+    spring = p.K_n * g if p.power == 1.0 else p.K_n * p.same * (g / p.same) ** p.power
+    F_N = max(0.0, spring + p.R_n * g_dot * ramp)
     drive = ramp * v if p.ramp_stretch else v
     if p.literal:
         stretch = s + h * drive
@@ -109,7 +110,14 @@ def near_nodes(p, X, share, q, u, margin):
 
 
 @njit(cache=True, nogil=True)
-def balance(p, h, C, which, d, shares, q, v, u, s, slipping, w, z, r, J):
+def resistance(p, v):
+    """Force of the horizontal guide at a speed v, and its slope."""
+    fast = np.sqrt(v * v + p.creep * p.creep)
+    return -p.friction * v / fast, -p.friction * p.creep * p.creep / fast**3
+
+
+@njit(cache=True, nogil=True)
+def balance(p, h, C, which, d, shares, q, v, u, u_slow, s, slipping, w, z, r, J):
     """What is left over of all equations, r (n,), and its derivatives J (n, n), for the velocities
     z at the end of the step.
 
@@ -122,7 +130,7 @@ def balance(p, h, C, which, d, shares, q, v, u, s, slipping, w, z, r, J):
         [
             h / p.mass,
             h / p.mass,
-            h / (0.5 * p.mass * p.radius**2),
+            h / (0.5 * p.inertia * p.mass * p.radius**2),
             h / p.bracket_mass,
             h / p.bracket_mass,
         ]
@@ -131,13 +139,18 @@ def balance(p, h, C, which, d, shares, q, v, u, s, slipping, w, z, r, J):
     for a in range(5):
         r[a] = z[a] - v[a]
     r[1] += h * p.gravity
-    r[3] -= gain[3] * F_x
+    held, by_held = resistance(p, z[3])
+    r[3] -= gain[3] * (F_x + held)
+    J[3, 3] -= gain[3] * by_held
     r[4] -= gain[4] * F_y
     J[3, 0 if p.senses_disc else 3] += gain[3] * by_x
     J[4, 4] += gain[4] * by_y
     for j in range(len(which)):
         for a in range(2):
-            r[5 + 2 * j + a] = z[5 + 2 * j + a] + u[which[j, 0], which[j, 1], a] / (p.tau + h)
+            late = u_slow[which[j, 0], which[j, 1], a]
+            fast = u[which[j, 0], which[j, 1], a] - late
+            r[5 + 2 * j + a] = z[5 + 2 * j + a] + fast / (p.tau + h) + late / (p.slow_tau + h)
+    give = (1 - p.slow) / (p.tau + h) + p.slow / (p.slow_tau + h)
     f, slope = np.empty(3), np.empty((3, 3))
     for j in range(len(which)):
         k, i = which[j]
@@ -154,7 +167,7 @@ def balance(p, h, C, which, d, shares, q, v, u, s, slipping, w, z, r, J):
             if which[other, 0] == k:
                 for a in range(2):
                     for b in range(2):
-                        moves = C[k, 2 * which[other, 1] + a, 2 * i + b] / (p.tau + h)
+                        moves = C[k, 2 * which[other, 1] + a, 2 * i + b] * give
                         load(r, J, 5 + 2 * other + a, -moves, f[b], slope[b], j, k)
 
 
@@ -181,11 +194,11 @@ def largest(p, x):
 
 
 @njit(cache=True, nogil=True)
-def step(p, h, C, X, share, q, v, u, u_dot, s, slipping, w, margin):
+def step(p, h, C, X, share, q, v, u, u_slow, u_dot, s, slipping, w, margin):
     """One step in place: poses q and velocities v (5,) of disc and bracket, and by pad (2, ...)
-    displacements u (nodes, 2) with their rates, stretches s and the literal law's flags. Returns
-    whether it was solved, the fastest slip, and how many nodes touch. Newton's change is halved
-    where it would leave more over than there was."""
+    displacements u (nodes, 2) with the slow part of them and their rates, stretches s and the literal
+    law's flags. Returns whether it was solved, the fastest slip, and how many nodes touch. Newton's
+    change is halved where it would leave more over than there was."""
     which, d, shares = near_nodes(p, X, share, q, u, margin)
     n = 5 + 2 * len(which)
     z, r, J, scale, change, before = (
@@ -200,7 +213,7 @@ def step(p, h, C, X, share, q, v, u, u_dot, s, slipping, w, margin):
     for j in range(len(which)):
         z[5 + 2 * j : 7 + 2 * j] = u_dot[which[j, 0], which[j, 1]]
     for _ in range(MOST):
-        balance(p, h, C, which, d, shares, q, v, u, s, slipping, w, z, r, J)
+        balance(p, h, C, which, d, shares, q, v, u, u_slow, s, slipping, w, z, r, J)
         left = largest(p, r)
         if left > before and scale > SHORTEST:
             scale *= 0.5
@@ -211,12 +224,14 @@ def step(p, h, C, X, share, q, v, u, u_dot, s, slipping, w, margin):
         for a in range(n):
             z[a] -= change[a]
         if largest(p, change) < SOLVED:
-            return finish(p, h, C, X, shares, q, v, u, u_dot, s, slipping, z, which, d)
+            return finish(
+                p, h, C, X, shares, q, v, u, u_slow, u_dot, s, slipping, z, which, d
+            )
     return False, 0.0, 0
 
 
 @njit(cache=True, nogil=True)
-def finish(p, h, C, X, shares, q, v, u, u_dot, s, slipping, z, which, d):
+def finish(p, h, C, X, shares, q, v, u, u_slow, u_dot, s, slipping, z, which, d):
     """Takes the velocities z over, unless a node touches the disc that was not looked at."""
     forces, m, fastest, touching = np.empty((len(which), 2)), len(which), 0.0, 0
     stretches, flags, looked = (
@@ -234,17 +249,19 @@ def finish(p, h, C, X, shares, q, v, u, u_dot, s, slipping, z, which, d):
         forces[j, 0], forces[j, 1] = shares[j] * law[0], shares[j] * law[1]
         stretches[k, i], flags[k, i], looked[k, i] = law[3], law[4], True
         fastest, touching = max(fastest, law[5]), touching + (law[0] != 0.0 or law[1] != 0.0)
-    rates = np.empty(u.shape)
+    rates, late = np.empty(u.shape), np.empty(u.shape)
     for k in range(2):
         for i in range(s.shape[1]):
             far = 0.0
             for a in range(2):
-                total = -u[k, i, a]
+                total = 0.0
                 for j in range(m):
                     if which[j, 0] == k:
                         for b in range(2):
                             total += C[k, 2 * i + a, 2 * which[j, 1] + b] * forces[j, b]
-                rates[k, i, a] = total / (p.tau + h)
+                late[k, i, a] = (p.slow * total - u_slow[k, i, a]) / (p.slow_tau + h)
+                fast = (1 - p.slow) * total - (u[k, i, a] - u_slow[k, i, a])
+                rates[k, i, a] = fast / (p.tau + h) + late[k, i, a]
                 speed = rates[k, i, a] + k * z[3 + a] - z[a]
                 far += (X[k, i, a] + u[k, i, a] + k * q[3 + a] - q[a] + h * speed) ** 2
             if not looked[k, i] and far < p.radius**2:
@@ -254,6 +271,7 @@ def finish(p, h, C, X, shares, q, v, u, u_dot, s, slipping, z, which, d):
             u_dot[k, i], s[k, i], slipping[k, i] = rates[k, i], stretches[k, i], flags[k, i]
             for a in range(2):
                 u[k, i, a] += h * rates[k, i, a]
+                u_slow[k, i, a] += h * late[k, i, a]
     for a in range(5):
         q[a] += h * z[a]
         v[a] = z[a]
@@ -267,14 +285,14 @@ def march(p, h, C, X, share, q, v, u, signals, every):
     the step that could not be solved, or -1."""
     steps, count = len(signals) - 1, X.shape[1]
     u_dot, s, slipping = np.zeros(u.shape), np.zeros((2, count)), np.zeros((2, count), np.bool_)
-    rows, fastest = np.zeros((steps // every + 1, 14)), 0.0
+    rows, fastest, u_slow = np.zeros((steps // every + 1, 14)), 0.0, p.slow * u
     for i in range(steps + 1):
         touching = 0
         if i > 0:
             solved, margin = False, MARGIN
             for _ in range(4):
                 solved, slip, touching = step(
-                    p, h, C, X, share, q, v, u, u_dot, s, slipping, signals[i], margin
+                    p, h, C, X, share, q, v, u, u_slow, u_dot, s, slipping, signals[i], margin
                 )
                 if solved:
                     break
