@@ -13,23 +13,19 @@ from torchsoft import Parameters
 from torchsoft.excitation import Excitation, Strokes
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
 from torchsoft.sysid.assumptions import (
-    AMOUNTS,
     PLACE,
     Variation,
     assumptions,
     coulomb,
     delayed,
-    difference,
-    ended,
-    refit,
     remeshed,
     scaled,
     unramped,
-    varied,
 )
 from torchsoft.sysid.identification import notices_on
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.problem import Residuals
+from torchsoft.sysid.refits import AMOUNTS, difference, ended, refit, varied
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import (
     AssumptionTest,

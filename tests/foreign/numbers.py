@@ -14,7 +14,8 @@ class Numbers(NamedTuple):
     `upper` is the stiffness of the upper pad over that of the lower one; the penalty force grows
     with the depth to a `power`, from the same force at the depth `same`; a part `slow` of the pads'
     compliance sets in over `slow_tau`; the horizontal guide of the bracket has a dry `friction`,
-    smooth below the speed `creep`; `inertia` is the disc's over that of a uniform one.
+    smooth below the speed `creep`; `inertia` is the disc's over that of a uniform one; gravity is
+    turned by a `tilt`.
     """
 
     K_n: float = 1.2e5
@@ -56,3 +57,4 @@ class Numbers(NamedTuple):
     friction: float = 0.0
     creep: float = 1e-3
     inertia: float = 1.0
+    tilt: float = 0.0

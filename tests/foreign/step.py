@@ -138,7 +138,8 @@ def balance(p, h, C, which, d, shares, q, v, u, u_slow, s, slipping, w, z, r, J)
     F_x, F_y, by_x, by_y = control(p, q, w, z, h)
     for a in range(5):
         r[a] = z[a] - v[a]
-    r[1] += h * p.gravity
+    r[0] -= h * p.gravity * np.sin(p.tilt)
+    r[1] += h * p.gravity * np.cos(p.tilt)
     held, by_held = resistance(p, z[3])
     r[3] -= gain[3] * (F_x + held)
     J[3, 3] -= gain[3] * by_held
@@ -196,9 +197,9 @@ def largest(p, x):
 @njit(cache=True, nogil=True)
 def step(p, h, C, X, share, q, v, u, u_slow, u_dot, s, slipping, w, margin):
     """One step in place: poses q and velocities v (5,) of disc and bracket, and by pad (2, ...)
-    displacements u (nodes, 2) with the slow part of them and their rates, stretches s and the literal
-    law's flags. Returns whether it was solved, the fastest slip, and how many nodes touch. Newton's
-    change is halved where it would leave more over than there was."""
+    displacements u (nodes, 2) with the slow part of them and their rates, stretches s and the
+    literal law's flags. Returns whether it was solved, the fastest slip, and how many nodes touch.
+    Newton's change is halved where it would leave more over than there was."""
     which, d, shares = near_nodes(p, X, share, q, u, margin)
     n = 5 + 2 * len(which)
     z, r, J, scale, change, before = (
@@ -224,9 +225,7 @@ def step(p, h, C, X, share, q, v, u, u_slow, u_dot, s, slipping, w, margin):
         for a in range(n):
             z[a] -= change[a]
         if largest(p, change) < SOLVED:
-            return finish(
-                p, h, C, X, shares, q, v, u, u_slow, u_dot, s, slipping, z, which, d
-            )
+            return finish(p, h, C, X, shares, q, v, u, u_slow, u_dot, s, slipping, z, which, d)
     return False, 0.0, 0
 
 

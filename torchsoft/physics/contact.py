@@ -277,7 +277,9 @@ class SoftContact(nn.Module):
         self, at: ContactState, g: Tensor, g_dot: Tensor, weight: Tensor | float
     ) -> tuple[Tensor, Tensor]:
         """Powers [W] that dashpots and slip take out, shape (...), never negative."""
-        return (at.F_N - weight * self.spring(g)) * g_dot + weight * self.R_t * at.s_dot**2, at.e * at.gamma_dot
+        return (
+            at.F_N - weight * self.spring(g)
+        ) * g_dot + weight * self.R_t * at.s_dot**2, at.e * at.gamma_dot
 
     def stored(self, g: Tensor, s: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         """Energies [J] of the normal and the tangential springs, shape (...)."""

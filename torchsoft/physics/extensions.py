@@ -120,9 +120,7 @@ def _free(rig: Rig, body: str, axis: str) -> bool:
 
 def _guided(rig: Rig) -> list[str]:
     """Free coordinates that actuators push, other than by resistance of a guide."""
-    pushed = [
-        one.pushes for one in rig.actuators.values() if not isinstance(one.law, Guide | Tilt)
-    ]
+    pushed = [one.pushes for one in rig.actuators.values() if not isinstance(one.law, Guide | Tilt)]
     return [one for one in dict.fromkeys(pushed) if _free(rig, *one.split("."))]
 
 
@@ -167,5 +165,3 @@ def _tilt(rig: Rig, bodies: Collection[str]) -> nn.Parameter:
                 _added(rig, f"tilt_{name}_{axis}", Actuator(coordinate, coordinate, law,
                        setpoint=(), elements=("Se: m g",)))  # fmt: skip
     return tilt
-
-

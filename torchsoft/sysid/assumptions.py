@@ -5,30 +5,24 @@ A variation makes the recordings, or their parameters, as they would be if one t
 by a stated amount.
 """
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterable
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact, at_once
+from torchsoft.physics.extensions import extensions
 from torchsoft.physics.motion import Piecewise, Reference, Sampled
 from torchsoft.physics.rig import Rig
-from torchsoft.sysid.fit import Fit, Loss, Notify, Unreachable
 from torchsoft.sysid.initial_state import AtRest, Standing
-from torchsoft.sysid.plan import SCANNED, USUAL, Stage, default_plan, run_plan
-from torchsoft.sysid.prediction import Frozen, set_parameters
-from torchsoft.sysid.problem import Problem, Residuals, check_value
-from torchsoft.sysid.recording import Array, Recording
-from torchsoft.sysid.runs import Runner
-from torchsoft.sysid.unknowns import Nuisance, Sensor, Unknown
+from torchsoft.sysid.prediction import set_parameters
+from torchsoft.sysid.recording import Recording
+from torchsoft.sysid.unknowns import Nuisance, Sensor
+from torchsoft.tables import Number
 
 Kind = Literal["numerical", "known", "sensor", "law"]
 """A constant of the computation; a number of the rig that is called known; what a sensor is taken
@@ -46,8 +40,8 @@ KNOWN = 1e-2
 FORCE = 0.5
 """Variation of forces that are fed forward [N]."""
 
-CLOCK = 1e-4
-"""Variation of the time at which set-points are given [s]."""
+CLOCK, SLOWER = 1e-4, 1e-4
+"""Variation of the time at which set-points are given [s], and of the rate of their clock [1]."""
 
 SMALLER_RAMP = 0.1
 """Factor by which the depth epsilon of the touch-down ramp is made smaller."""
@@ -66,20 +60,23 @@ class Fault(NamedTuple):
         noise = {"noise": sensor.noise, "noise/s": sensor.noise / max(recording.duration, 1e-9)}
         return self.amount * noise.get(self.per, 1.0)
 
-    def assumption(self, channel: str, unit: str, sensor: Sensor) -> "Variation":
+    def assumption(
+        self, channel: str, kind: Nuisance, unit: str, sensor: Sensor, recording: Recording
+    ) -> "Variation":
         scale = {"s": (1e3, "ms"), "1": (1e2, "%"), "noise": (sensor.noise, unit)}
         factor, shown = scale.get(self.per, (sensor.noise, f"{unit} over a recording"))
-        return Variation(f"{self.verb.split()[0]} {channel}", "sensor",
-        f"{channel} has no unknown {self.verb.split()[0]}",
-                          f"{channel} {self.verb.partition(' ')[2]}", factor * self.amount,
-                          shown)  # fmt: skip
+        return Variation(f"{kind} {channel}", "sensor", f"{channel} has no unknown {kind}",
+                          f"{channel} {self.verb}", factor * self.amount, shown,
+                          nominal=float(kind == "gain"), step=self.size(sensor, recording),
+                          fault=(channel, kind))  # fmt: skip
 
 
 FAULTS: dict[Nuisance, Fault] = {
-    "bias": Fault(0.1, "noise", "bias read too much"),
-    "delay": Fault(1e-4, "s", "delay came late"),
-    "gain": Fault(1e-3, "1", "gain were too sensitive"),
-    "drift": Fault(0.1, "noise/s", "drift drifted upwards"),
+    "bias": Fault(0.1, "noise", "read too much"),
+    "delay": Fault(1e-4, "s", "came late"),
+    "gain": Fault(1e-3, "1", "were too sensitive"),
+    "drift": Fault(0.1, "noise/s", "drifted upwards"),
+    "clock": Fault(1e-4, "1", "ran too fast"),
 }
 """Faults of sensors that are looked for where they are not unknown."""
 
@@ -89,8 +86,9 @@ class Assumption:
     """An assumption of a fit as the clause `stated`, and its variation as the clause `otherwise`.
 
     A known number, or a property of a sensor, may differ by any part of the `amount` [unit], to
-    either side; a law or a constant of the computation holds or does not. `parameter` is the number
-    that is varied, by the amount [%].
+    either side unless it is `one_sided`; a law or a constant of the computation holds or does not.
+    `parameter` is the number that is varied: stated as `nominal`, and changed by `step` in a
+    variation by the amount.
     """
 
     name: str
@@ -100,20 +98,31 @@ class Assumption:
     amount: float = 1.0
     unit: str = ""
     parameter: str = ""
+    nominal: Number = float("nan")
+    step: Number = float("nan")
+    one_sided: bool = False
 
 
 @dataclass(frozen=True)
 class Variation(Assumption):
     """An assumption with its variation: `vary` gives another recording, None where that has no
-    meaning for it."""
+    meaning for it. An `extension` is a parameter that the rig does not have yet; a `fault` is one
+    of a channel's sensor."""
 
     vary: Callable[[Recording], Recording | None] | None = None
+    extension: bool = False
+    fault: tuple[str, Any] | None = None
+
+    @property
+    def label(self) -> str:
+        """Label of the coordinate that it would be, if it were unknown; empty for a law."""
+        return f"{self.fault[1]} of {self.fault[0]}" if self.fault is not None else self.parameter
 
 
 def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Variation]:
     """Everything that the runs of some recordings take for granted and that can be varied;
     `unknown` are the parameters, and coordinates of starts, that are identified."""
-    first, *_ = recordings
+    first, *others = recordings
     rig = first.rig
     pad = next(iter(rig.pads.values()))
     nx, ny, points = pad.mesh.elements_x, pad.mesh.elements_y, pad.points
@@ -149,10 +158,13 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
         out.append(Variation("set-points", "numerical",
         "set-points are what a smooth curve through the recorded ones says",
                               "only every second one were known", vary=sparser))  # fmt: skip
-    out.append(Variation("clock of the set-points", "known",
-    "set-points and sensors have one clock",
-                         "set-points came later", 1e3 * CLOCK, "ms",
-                         vary=lambda r: delayed(r, CLOCK)))  # fmt: skip
+    out += [
+        Variation("clock of the set-points", "known", "set-points and sensors have one clock",
+                  "set-points came later", 1e3 * CLOCK, "ms", vary=lambda r: delayed(r, CLOCK)),
+        Variation("scale of the clock", "known", "clocks of set-points and sensors run alike",
+                  "that of the set-points ran slower", 100 * SLOWER, "%",
+                  vary=lambda r: stretched(r, SLOWER)),
+    ]  # fmt: skip
     if any(actuator.feed_forward is not None for actuator in rig.actuators.values()):
         out.append(Variation("feed-forward", "known", "what was fed forward is known",
             f"it were {FORCE} N more", FORCE, "N",
@@ -179,8 +191,15 @@ def assumptions(recordings: Iterable[Recording], unknown: set[str]) -> list[Vari
             continue
         part = RADIUS if name.endswith("radius") else KNOWN
         out.append(Variation(name, "known", f"{name} is {value:.6g}",
-        f"{name} were {(1 + part) * value:.6g}",
-                              100 * part, "%", parameter=name))  # fmt: skip
+        f"{name} were {(1 + part) * value:.6g}", 100 * part, "%", parameter=name, nominal=value,
+                              step=part * value))  # fmt: skip
+    for name, one in extensions(rig).items():
+        if ".slow(" not in name or all(
+            isinstance(r.start, AtRest | Standing) for r in (first, *others)
+        ):
+            out.append(Variation(name, "known", one.stated, one.otherwise, one.amount, one.unit,
+            parameter=name, nominal=one.neutral, step=one.amount,
+                                  one_sided=one.low == one.neutral, extension=True))  # fmt: skip
     return out
 
 
@@ -303,18 +322,30 @@ def sparser(recording: Recording) -> Recording:
     return with_reference(recording, **signals)
 
 
-def delayed(recording: Recording, by: float) -> Recording | None:
-    """Every signal later by a time [s]; None where a signal has no times."""
+def retimed(recording: Recording, times: Callable[[Tensor], Tensor]) -> Recording | None:
+    """Every signal at other times [s]; None where a signal has no times."""
     signals = {
         name.replace(":", "."): deepcopy(one)
         for name, one in recording.rig.reference.signals.items()
     }
     for one in signals.values():
-        times = dict(one.named_buffers()).get("times")
-        if times is None:
+        own = dict(one.named_buffers()).get("times")
+        if own is None:
             return None
-        times += by
+        own.copy_(times(own))
     return with_reference(recording, **signals)
+
+
+def delayed(recording: Recording, by: float) -> Recording | None:
+    """Every signal later by a time [s]; None where a signal has no times."""
+    return retimed(recording, lambda t: t + by)
+
+
+def stretched(recording: Recording, part: float) -> Recording | None:
+    """Every signal slower by a part [1], from the first sample on; None where a signal has no
+    times."""
+    begin = float(recording.times[0])
+    return retimed(recording, lambda t: begin + (1 + part) * (t - begin))
 
 
 def raised(recording: Recording, by: float) -> Recording | None:
@@ -329,167 +360,3 @@ def raised(recording: Recording, by: float) -> Recording | None:
         values: Tensor = one.values  # pyright: ignore[reportAssignmentType]
         values.data.add_(by)
     return with_reference(recording, **signals)
-
-
-# Problems with one assumption varied
-
-
-REFITS, ROUGH = 20, 1e-3
-"""Evaluations that a fit under another assumption may take, and its relative tolerance: it has to
-find out whether the misfit goes away, not where exactly."""
-
-
-FAR = 2.0
-"""Misfit per sample from which where a fit ended tells nothing: under another assumption it begins
-where the first one began, too."""
-
-AMOUNTS = 10.0
-"""How many amounts of a variation a number of the rig may be off where a fit is repeated."""
-
-HALVINGS = 10
-"""How often that is halved where there is no such rig."""
-
-
-class End(NamedTuple):
-    """A fit in whose place another is held: coordinates x (n,), residuals there, the free
-    coordinates (n,), the recordings that were fitted, residuals and steps of runs by the tolerance
-    `rtol`, and how runs are made and kept."""
-
-    x: Array
-    at: Residuals
-    free: NDArray[np.bool_]
-    which: tuple[str, ...]
-    base: Residuals
-    steps: dict[str, Frozen]
-    rtol: float
-    workers: int
-    journal: Path | None
-
-    @property
-    def far(self) -> bool:
-        """Whether the fit left so much that what is so to first order where it ended says
-        nothing."""
-        return float(np.mean(self.base.r**2)) > FAR
-
-
-def ended(
-    problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_], which: Sequence[str],
-    rtol: float, workers: int, journal: Path | None,
-) -> End:  # fmt: skip
-    """The end of a fit, which took steps by `rtol`, with a run a recording by the tolerance of the
-    variations: `USUAL`, or that of the fit, if runs are lost with it."""
-    runner = Runner(problem.recordings, workers, journal)
-    usual = max(rtol, USUAL)
-    base, steps = problem.freeze(runner, x, which, usual)
-    if base.lost and usual > rtol:
-        base, steps = problem.freeze(runner, x, which, rtol)
-    else:
-        rtol = usual
-    return End(x, at, free, tuple(which), base, steps, rtol, workers, journal)
-
-
-def varied(problem: Problem, which: Sequence[str], one: Variation) -> Problem | str:
-    """The problem with one assumption otherwise in the recordings `which`, or why there is none. A
-    parameter that is called known becomes one more unknown."""
-    made, unknowns = [], dict(problem.unknowns)
-    for recording in problem.recordings:
-        other = (
-            one.vary(recording) if one.vary is not None and recording.name in which else recording
-        )
-        if other is None:
-            return f"it has no meaning where recording `{recording.name}` begins"
-        made.append(other)
-    try:
-        if one.parameter:
-            value, reach = (
-                problem.recordings[0].parameters[one.parameter],
-                AMOUNTS * one.amount / 100,
-            )
-            low, high = sorted(
-                farthest(problem.recordings, one.parameter, value, part) for part in (-reach, reach)
-            )
-            unknowns[one.parameter] = Unknown(nominal=value, low=low, high=high)
-        return Problem(made, problem.sensors, unknowns, problem.noise)
-    except ValueError as error:  # an unknown that the varied rig has not, or that cannot be one
-        return str(error)
-
-
-def farthest(recordings: Sequence[Recording], name: str, value: float, part: float) -> float:
-    """A number of the rig that is off by a relative `part`, or by half of that, a quarter and so on
-    until there is such a rig: a smaller disc may leave the pads apart. Raises `ValueError` where
-    there is none."""
-    for _ in range(HALVINGS):
-        with suppress(ValueError):
-            for recording in recordings:
-                check_value(recording, name, value * (1 + part))
-            return value * (1 + part)
-        part /= 2
-    raise ValueError(f"{name} = {value:g} can hardly be varied")
-
-
-def difference(problem: Problem, end: End, one: Variation) -> tuple[Array | None, str]:
-    """What a variation adds to the residuals (m,), on the same steps, or None and why that is not
-    known."""
-    if end.base.lost:
-        return None, "the estimates cannot be simulated by the tolerance of the checks"
-    other = varied(problem, end.which, one)
-    if isinstance(other, str):
-        return None, other
-    got = other.residuals(
-        Runner(other.recordings, end.workers, end.journal), end.x, end.which, end.steps
-    )
-    if got.lost:
-        return None, f"a run failed: {next(iter(got.lost.values())).reason}"
-    return got.r - end.base.r, ""
-
-
-class Refit(NamedTuple):
-    """A fit that was repeated: the problem, its end, and which of its coordinates were free."""
-
-    problem: Problem
-    fit: Fit
-    free: NDArray[np.bool_]
-
-    def of(self, label: str) -> float:
-        """A coordinate at the end."""
-        return float(self.fit.x[self.problem.coordinates.labels.index(label)])
-
-
-def refit(
-    problem: Problem, end: End, one: Variation | None, loss: Loss, notify: Notify
-) -> Refit | None:
-    """The fit with one assumption otherwise, or with all as stated, on steps of its own; None where
-    it cannot begin.
-
-    It begins where the fit ended; ratios that ended at a bound are looked for again over all of
-    their range. With another law or number, and a misfit above `FAR`, it begins where the first fit
-    began as well, and the better end counts.
-    """
-    other = varied(problem, end.which, one) if one is not None else problem
-    if isinstance(other, str):
-        return None
-    c, at = other.coordinates, dict(zip(problem.coordinates.labels, end.x))
-    fitted = {label for label, is_free in zip(problem.coordinates.labels, end.free) if is_free}
-    x = np.array([at.get(label, own) for label, own in zip(c.labels, c.start)])
-    free = np.array([label in fitted or label not in at for label in c.labels])
-    stuck = [one for one, is_stuck in zip(c.all, free & c.at_bound(x)) if is_stuck and one.ratio_to]
-    scans = tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in stuck)
-    labels = tuple(label for label, is_free in zip(c.labels, free) if is_free)
-    runner = Runner(other.recordings, end.workers, end.journal)
-
-    def carried_out(plan: Sequence[Stage], x: Array) -> Iterator[Fit]:
-        """The fit of the last stage, if none is lost."""
-        with suppress(Unreachable):
-            yield run_plan(other, runner, plan, x, loss=loss, notify=notify)[0]
-
-    fits = [
-        *carried_out(
-            [Stage("once more", end.which, labels, end.rtol, REFITS, ROUGH, scanned=scans)], x
-        )
-    ]
-    if one is not None and one.kind in ("law", "known") and end.far:
-        with suppress(Unreachable):
-            plan = default_plan(other, runner, end.rtol, end.which)
-            if set(plan[-1].free) == set(labels):
-                fits += carried_out(plan, c.start)
-    return Refit(other, min(fits, key=lambda fit: fit.chi2), free) if fits else None

@@ -68,7 +68,7 @@ def density(
         )
     log = -0.5 * (float(r @ s) + wider)
     for one in mine:
-        log -= len(one.t) * np.log(problem.sensors[one.channel].noise * (2 * np.pi) ** 0.5)
+        log -= len(one.t) * np.log(problem.sensors[one.channel].sd * (2 * np.pi) ** 0.5)
         if one.noise is not None:
             log -= 0.5 * log_det(one.noise.whitener(one.t))
     return Density(mine, r, s, float(log))

@@ -222,7 +222,7 @@ def nrmse(problem: Problem, r: Array, which: list[str]) -> dict[str, dict[str, f
     measured = {recording.name: recording.samples for recording in problem.recordings}
     for part in parts(problem.with_noise({}), r, which):
         y = measured[part.recording][part.channel][1]
-        rms = float(np.sqrt(np.mean(part.raw**2))) * problem.sensors[part.channel].noise
+        rms = float(np.sqrt(np.mean(part.raw**2))) * problem.sensors[part.channel].sd
         out[part.recording][part.channel] = rms / max(float(np.ptp(y)), 1e-300)
     return out
 

@@ -136,7 +136,7 @@ def beginning(what: str, t: Array, y: Array, sensor: Sensor, other: float) -> tu
     degree, span = min(DEGREE, len(t) - 2), float(t[-1])
     V = np.vander(t / span, degree + 1, increasing=True)
     fit, *_ = np.linalg.lstsq(V, y, rcond=None)
-    noise = max(sensor.noise, float(np.sqrt(np.sum((V @ fit - y) ** 2) / (len(t) - degree - 1))))
+    noise = max(sensor.sd, float(np.sqrt(np.sum((V @ fit - y) ** 2) / (len(t) - degree - 1))))
     sd = WIDER * noise * np.sqrt(np.diag(np.linalg.inv(V.T @ V)))
     value, rate, bend = fit[0], fit[1] / span, 2 * fit[2] / span**2
     wrong = sensor.bias + sensor.gain * abs(value) + sensor.delay * abs(rate)

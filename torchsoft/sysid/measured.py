@@ -265,7 +265,7 @@ def check_rest(
         if not here.size or unit == "N" or (not asked and t[here[0]] > first + BEGINNING):
             continue
         sensor, size = sensors.get(name), 1 / p.disc.radius if unit.startswith("rad") else 1.0
-        slack, bias = (8 * sensor.noise, sensor.bias) if sensor else (0.0, 0.0)
+        slack, bias = (8 * sensor.sd, sensor.bias) if sensor else (0.0, 0.0)
         reach = (APART + BOUNDS * position_sd) * size + slack + bias
         if name in begin and abs(column[here[0]] - begin[name]) > reach:
             what = (

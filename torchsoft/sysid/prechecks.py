@@ -398,6 +398,7 @@ def findings(
     """Diagnostics on one recording, beside a run from the start, if there is one; `unknown` are the
     names of unknown parameters. A recording with an error is not held against the run."""
     every = [*setpoint_findings(recording, sensors), *loop_findings(recording, sensors, unknown)]
+    every += rounded(recording, sensors)
     if not any(one.severity == "error" for one in every):
         every += another_body(recording, sensors, expected)
     if any(one.severity == "error" for one in every):
@@ -406,6 +407,27 @@ def findings(
     return every + [
         one for one in against_run(recording, sensors, expected) if one.code not in codes
     ]
+
+
+COARSE = 1.2
+"""Steps of a sensor over its noise from which they widen the noise by 6 % and more."""
+
+
+def rounded(recording: Recording, sensors: Mapping[str, Sensor]) -> Iterator[Diagnostic]:
+    """Readings in steps that the stated noise and resolution leave out."""
+    for name, sensor in sensors.items() if recording.samples else ():
+        if name not in recording.samples:
+            continue
+        apart = np.diff(np.unique(unsaturated(recording, sensors, name)[1]))
+        q = float(apart.min(initial=math.inf))
+        if not COARSE * max(sensor.noise, sensor.resolution) < q < math.inf:
+            continue
+        if np.abs(apart / q - np.round(apart / q)).max() < 1e-3:
+            text = (
+                f"{name} comes in steps of {q:.3g} {recording.units[name]}, "
+                f"{q / sensor.noise:.2g} times its noise: say so by its `resolution`"
+            )
+            yield found(f"resolution of {name}", recording, text)
 
 
 def unsaturated(
@@ -422,7 +444,7 @@ def against_run(
 ) -> Iterator[Diagnostic]:
     """Signs and units of channels that cannot be those of the run."""
     for name, (one, signals) in expected.items():
-        (t, y), noise = unsaturated(recording, sensors, name), sensors[name].noise
+        (t, y), noise = unsaturated(recording, sensors, name), sensors[name].sd
         if len(t) < 2 * MOVES:
             continue
         p = one.expected(signals, t)[0]
@@ -512,4 +534,4 @@ def apart(
         y = one.expected(signals, t)[0]
     asked = recording.rig.reference(torch.from_numpy(t), [setpoint]).detach().numpy()[:, 0, 0]
     moved = float(np.std(asked))
-    return float(np.std(asked - y)) / moved if moved > MOVES * sensors[name].noise else None
+    return float(np.std(asked - y)) / moved if moved > MOVES * sensors[name].sd else None

@@ -17,7 +17,7 @@ from torchsoft.solve.simulate import simulate
 from torchsoft.solve.tangent import directions
 from torchsoft.solve.trajectory import Trajectory, channels, measurable, rate_channel
 from torchsoft.sysid.initial_state import PREFIX
-from torchsoft.sysid.recording import Array, Grid, RunContext
+from torchsoft.sysid.recording import REACH, Array, Grid, RunContext
 from torchsoft.sysid.unknowns import NUISANCES, Nuisance, Sensor
 
 
@@ -55,6 +55,7 @@ class Readout:
     drift: float
     delay: float
     middle: float
+    clock: float
     terms: tuple[Term, ...]
 
     def expected(
@@ -65,7 +66,7 @@ class Readout:
         y, rate, slopes = np.zeros(len(times)), np.zeros(len(times)), None
         by: dict[Nuisance, Array] = {}
         for term in self.terms:
-            j, at = signals.names.index(term.channel), times - self.delay
+            j, at = signals.names.index(term.channel), self.own_times(times)
             spline = CubicSpline(signals.t, signals.values[:, j])
             part = spline(at, term.order)
             y, rate = y + term.factor * part, rate + term.factor * spline(at, term.order + 1)
@@ -82,6 +83,7 @@ class Readout:
             "bias": np.ones(len(times)),
             "drift": times - self.middle,
             "delay": -self.gain * rate,
+            "clock": self.gain * rate * (self.middle - times),
         }
         y = self.gain * y + self.bias + self.drift * (times - self.middle)
         return y, None if slopes is None else self.gain * slopes, by
@@ -106,8 +108,14 @@ class Readout:
         for term in self.terms:
             if term.factor != 0.0:
                 j = signals.names.index(term.channel)
-                out[:, j] += self.gain * term.factor * (v @ spline(times - self.delay, term.order))
+                out[:, j] += (
+                    self.gain * term.factor * (v @ spline(self.own_times(times), term.order))
+                )
         return out
+
+    def own_times(self, times: Array) -> Array:
+        """Times (k,) [s] at which the sensor reads what it notes at `times`."""
+        return times - self.delay - self.clock * (times - self.middle)
 
 
 def censored(z: Array) -> tuple[Array, Array]:
@@ -187,11 +195,16 @@ def readout(
         ]
     else:
         terms = [Term(channel, 0, 1.0)]
+    if sensor.clock * 0.5 * (span[1] - span[0]) + sensor.delay > REACH:
+        raise ValueError(
+            f"sensors.{channel}.clock = {sensor.clock:g} is more than {REACH:g} s at the ends of a "
+            f"recording of {span[1] - span[0]:g} s, with its delay; take less"
+        )
     if sensor.inertia > 0:
         terms.append(Term(pushed(rig, channel), 1, -at["inertia"], ("inertia", -1.0)))
     return Readout(
-        channel, sensor.noise, sensor.low, sensor.high, at["gain"], at["bias"], at["drift"],
-        at["delay"], 0.5 * (span[0] + span[1]), tuple(terms),
+        channel, sensor.sd, sensor.low, sensor.high, at["gain"], at["bias"], at["drift"],
+        at["delay"], 0.5 * (span[0] + span[1]), at["clock"], tuple(terms),
     )  # fmt: skip
 
 

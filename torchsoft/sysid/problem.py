@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchsoft.paper.rig import NAMES, SoftGrasp
+from torchsoft.physics.extensions import extensions
 from torchsoft.physics.validity import check_values
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.prediction import (
@@ -21,7 +22,7 @@ from torchsoft.sysid.prediction import (
     readout,
     set_parameters,
 )
-from torchsoft.sysid.recording import Array, Recording
+from torchsoft.sysid.recording import Array, Recording, extended
 from torchsoft.sysid.runs import Job, Runner
 from torchsoft.sysid.unknowns import NUISANCES, Coordinates, Nuisance, Sensor, Unknown
 from torchsoft.tables import line
@@ -40,6 +41,24 @@ class Residuals(NamedTuple):
     r: Array
     J: Array
     lost: dict[str, FailedRun]
+
+
+def with_extensions(
+    recordings: Sequence[Recording], unknowns: dict[str, Unknown]
+) -> tuple[Sequence[Recording], dict[str, Unknown]]:
+    """Recordings whose rigs have the parameters that are unknown, and the unknowns, those that are
+    extensions with the bounds of their search where none are given."""
+    added, out = [], dict(unknowns)
+    for recording in recordings:
+        known = extensions(recording.rig)
+        mine = [name for name in unknowns if name in known]
+        for name in mine:
+            one, u = known[name], out[name]
+            scale = "log" if one.low > 0 else "linear"
+            given = {"nominal": one.neutral, "low": one.low, "high": one.high, "scale": scale}
+            out[name] = u.model_copy(update=given | u.model_dump(exclude_unset=True))
+        added.append(extended(recording, mine) if mine else recording)
+    return added, out
 
 
 def check_ends(coordinates: Coordinates, recordings: Sequence[Recording]) -> None:
@@ -76,8 +95,8 @@ class Problem:
     """Which parameters explain these recordings?
 
     `recordings` have names of their own; `sensors` are the channels that count, with their noise;
-    `unknowns` the parameters; `noise` the colour of a channel's noise, white where there is none.
-    Raises `ValueError` where these do not fit together.
+    `unknowns` the parameters, `extensions` of the rigs among them; `noise` the colour of a
+    channel's noise, white where there is none. Raises `ValueError` where these do not fit together.
     """
 
     def __init__(
@@ -101,13 +120,15 @@ class Problem:
                     f"recording `{recording.name}` has samples of none of the sensors "
                     f"{list(sensors)}"
                 )
+        recordings, unknowns = with_extensions(recordings, unknowns)
         self.recordings, self.sensors, self.unknowns = tuple(recordings), sensors, unknowns
         self.coordinates = Coordinates(unknowns, sensors, recordings)
         if not self.coordinates.free.any():
             raise ValueError("there is nothing to identify: no unknown is free")
         check_ends(self.coordinates, recordings)
         self.interpolated = any(
-            sensor.delay > 0 or sensor.inertia > 0 for sensor in sensors.values()
+            sensor.delay > 0 or sensor.inertia > 0 or sensor.clock > 0
+            for sensor in sensors.values()
         )
         self.noise = dict(noise or {})
         self._whiteners: dict[tuple[str, str], Any] = {}

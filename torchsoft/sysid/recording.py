@@ -2,8 +2,9 @@
 may have gaps."""
 
 import inspect
+from collections.abc import Collection
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
@@ -14,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from torchsoft.physics.extensions import extend
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.trajectory import measurable, units
@@ -172,6 +174,14 @@ class Recording:
         return sha256(
             identity(self.rig) + signals + measured + repr(self.start).encode()
         ).hexdigest()
+
+
+def extended(recording: Recording, names: Collection[str]) -> Recording:
+    """The recording of a rig with more parameters, at their neutral values. Raises `ValueError` for
+    a name that the rig has no extension of."""
+    rig = deepcopy(recording.rig)
+    extend(rig, names)
+    return replace(recording, rig=rig)
 
 
 def identity(rig: Rig) -> bytes:

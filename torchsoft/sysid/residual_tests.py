@@ -88,8 +88,8 @@ def parts(problem: Problem, r: Array, which: Sequence[str]) -> list[Part]:
             reading, found = predicted(sensor, measured, raw), noise is not None
             saturated = int(sensor.saturated(measured).sum())
             if saturated:
-                near = sensor.saturated(reading - CLEAR * sensor.noise) | sensor.saturated(
-                    reading + CLEAR * sensor.noise
+                near = sensor.saturated(reading - CLEAR * sensor.sd) | sensor.saturated(
+                    reading + CLEAR * sensor.sd
                 )
                 kept = ~near | (np.abs(raw) > CLEAR)
                 if kept.sum() < FEWEST:
@@ -116,11 +116,11 @@ def parts(problem: Problem, r: Array, which: Sequence[str]) -> list[Part]:
 def predicted(sensor: Sensor, measured: Array, raw: Array) -> Array:
     """Readings without noise (m,), from samples and residuals over the noise: infinite where a
     saturated one leaves nothing."""
-    y = measured + sensor.noise * raw
+    y = measured + sensor.sd * raw
     for limit, sign in ((sensor.high, 1.0), (sensor.low, -1.0)):
         if limit is not None:
             at = sign * measured >= sign * limit
-            y[at] = limit + sign * sensor.noise * ndtri_exp(-0.5 * raw[at] ** 2)
+            y[at] = limit + sign * sensor.sd * ndtri_exp(-0.5 * raw[at] ** 2)
     return y
 
 

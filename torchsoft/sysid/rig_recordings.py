@@ -140,7 +140,7 @@ def check_start(
         here = channels(rig, rig.unpack(y0, signals), signals)
     for channel, (t, y) in made.samples.items():
         unit, sensor = made.units[channel], sensors.get(channel)
-        slack = 8 * sensor.noise + sensor.bias if sensor else 0.0
+        slack = 8 * sensor.sd + sensor.bias if sensor else 0.0
         if unit in APART and abs(y[0] - float(here[channel])) > APART[unit] + slack:
             table = tables.of(channel)
             row = int(np.searchsorted(table.values["t"], t[0]))

@@ -8,8 +8,11 @@ constant of the computation is not known to be right: it enters the intervals as
 with a standard normal prior on its amplitude, so that data that cannot tell it cost certainty.
 """
 
+import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from contextlib import contextmanager
+from copy import deepcopy
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,24 +21,15 @@ from numpy.typing import NDArray
 from scipy import stats
 from tqdm import tqdm
 
-from torchsoft.sysid.assumptions import (
-    FAULTS,
-    Assumption,
-    End,
-    Refit,
-    Variation,
-    assumptions,
-    difference,
-    ended,
-    refit,
-)
+from torchsoft.physics.extensions import extend, extensions
+from torchsoft.sysid.assumptions import FAULTS, Assumption, Variation, assumptions
 from torchsoft.sysid.fit import Loss, fisher, shift, standard_deviations
 from torchsoft.sysid.prediction import FailedRun, Signals
 from torchsoft.sysid.problem import Problem, Residuals
-from torchsoft.sysid.recording import Array
+from torchsoft.sysid.recording import Array, extended
+from torchsoft.sysid.refits import End, Refit, difference, ended, refit
 from torchsoft.sysid.residual_tests import LEVEL, parts
 from torchsoft.sysid.runs import Runner
-from torchsoft.sysid.unknowns import Nuisance
 from torchsoft.tables import Number, plain
 
 EVIDENT = 20.0
@@ -52,9 +46,17 @@ LAGS = 10
 BY_CHANCE = 2.0
 """What the statistic of Box and Pierce may be by chance, over its expectation."""
 
-RIVALS = 3
-"""Numbers of the rig that are taken to be unknown where a doubtful fit is repeated, one at a
-time."""
+MOST = 24
+"""Suspects with which a fit is repeated."""
+
+RIVAL = 0.3
+"""Part of the gain to first order of what explains a misfit from which a suspect is its rival."""
+
+LIKELY = 0.01
+"""Odds from which a suspect is named."""
+
+UNEXPLAINED = 1.15
+"""RMS residual of a channel over its noise that is said to be left."""
 
 UNDER = 8
 """Estimates that a sentence states under an alternative."""
@@ -72,10 +74,11 @@ class AssumptionTest(Assumption):
     the sum of squares, to `left`, by the amplitude that the data favour: `favoured` [unit] with the
     standard deviation `favoured_sd`. `significance` is the gain over the misfit per sample that
     would be left, `pattern` the part of the residuals' autocorrelation that would be left, 0 where
-    there is none. With `refitted` that is the result of a new fit, else it is to first order.
-    `unchecked` is the reason why there is no test. `value` is the favoured value of the
-    `parameter`, `under` are the estimates with the favoured amplitude, by label. `suspected`: the
-    data favour the variation.
+    there is none, `remaining` the RMS residual that would be left of every channel, over its noise.
+    With `refitted` that is the result of a new fit, else it is to first order. `unchecked` is the
+    reason why there is no test. `value` is the favoured value of the `parameter`, `under` are the
+    estimates with the favoured amplitude, by label. `suspected`: the data favour the variation, and
+    `odds` are its part of the evidence among all suspects.
     """
 
     moves: dict[str, Number] = field(default_factory=dict)
@@ -89,11 +92,13 @@ class AssumptionTest(Assumption):
     unchecked: str = ""
     value: Number = float("nan")
     under: dict[str, Number] = field(default_factory=dict)
+    remaining: dict[str, Number] = field(default_factory=dict)
+    odds: Number = 0.0
     suspected: bool | None = None
 
     def __post_init__(self) -> None:
         if self.suspected is None:
-            either_side = self.kind in ("known", "sensor")
+            either_side = self.kind in ("known", "sensor") and not self.one_sided
             enough = (
                 self.significance > EVIDENT
                 and self.pattern < PATTERN
@@ -120,6 +125,21 @@ class AssumptionTest(Assumption):
             if self.refitted
             else f"would fall by {self.gain:.0f}"
         )
+
+    @property
+    def found(self) -> str:
+        """What explains the data best, as the end of a sentence."""
+        amount = f"{self.favoured:+.3g} {self.unit}".rstrip()
+        if self.parameter and self.unit == "%":
+            return (
+                f" with {self.parameter} = {self.value:.6g} ({amount}, +- {self.favoured_sd:.2g})"
+            )
+        if self.parameter:
+            sd = self.favoured_sd * self.step / self.amount
+            return f" with {self.parameter} = {self.value:.4g} +- {sd:.2g} {self.unit}".rstrip()
+        if self.kind in ("known", "sensor"):
+            return f" if {self.otherwise} ({amount} fit best, +- {self.favoured_sd:.2g})"
+        return f" if {self.otherwise}"
 
     @property
     def most_moved(self) -> tuple[str, float]:
@@ -178,8 +198,10 @@ def check_assumptions(
     judge, checks, columns = Judge(problem, end), dict[str, AssumptionTest](), []
     untried = [one.name for one in taken if one.vary is not None]
     try:
-        linear = columns_of(problem, Runner(problem.recordings, workers, journal), end, taken)
-        checks |= {one.name: judge.column(one, d) for one, d in linear if d.any()}
+        runner = Runner(problem.recordings, workers, journal)
+        with quiet():
+            first = columns_of(problem, runner, end, taken)
+        checks |= {one.name: judge.column(one, d) for one, d in first if d.any()}
         for one in taken:
             if one.vary is None:
                 continue
@@ -189,7 +211,8 @@ def check_assumptions(
                 columns.append(d)
             untried.remove(one.name)
         unexplained = doubtful and not end.base.lost and not judge.explained(checks.values())
-        candidates = doubted(taken, checks, end.far) if unexplained else []
+        suspects = {one.name: one for one in (*taken, *(one for one, _ in first))}
+        candidates = doubted(suspects.values(), checks) if unexplained else []
         if explain and candidates:
             untried = [f"a new fit with another {one.name}" for one in candidates]
             for one in new_fits(problem, end, candidates, loss, judge, checks, progress):
@@ -199,7 +222,11 @@ def check_assumptions(
         candidates = []
     rows = np.stack(columns, 1) if columns else np.zeros((len(at.r), 0))
     return Checked(
-        list(checks.values()), rows, judge.J, tuple(untried), tuple(one.name for one in candidates)
+        compared(checks.values(), judge),
+        rows,
+        judge.J,
+        tuple(untried),
+        tuple(one.name for one in candidates),
     )
 
 
@@ -207,9 +234,10 @@ def new_fits(
     problem: Problem, end: End, candidates: Sequence[Variation], loss: Loss, judge: "Judge",
     checks: dict[str, AssumptionTest], progress: bool,
 ) -> Iterator[Variation]:  # fmt: skip
-    """Repeats the fit without one assumption after the other, whose `checks` it replaces, until one
-    explains the misfit."""
-    with tqdm(total=len(candidates) + 1, unit="fit", disable=not progress) as bar:
+    """Repeats the fit with one suspect after the other, whose `checks` it replaces. Once one
+    explains the misfit, those that are worth much less to first order are left out."""
+    first, count = dict(checks), len(candidates)
+    with quiet(), tqdm(total=count + 1, unit="fit", disable=not progress) as bar:
 
         def notify(chi2: float) -> None:
             bar.set_postfix_str(f"chi2 = {chi2:.4g}")
@@ -217,32 +245,52 @@ def new_fits(
         bar.set_description("new fit with all assumptions")
         as_stated = refit(problem, end, None, loss, notify)
         bar.update()
-        for one in candidates if as_stated is not None else ():
-            bar.set_description(plain(f"new fit with another {one.name}"))
+        enough = 0.0
+        for number, one in enumerate(candidates if as_stated is not None else (), 1):
+            if first[one.name].gain < enough:
+                return
+            bar.set_description(plain(f"new fit with another {one.name} ({number} of {count})"))
             other = refit(problem, end, one, loss, notify)
             if other is not None and as_stated is not None:
                 checks[one.name] = judge.fit(one, other, as_stated, checks[one.name])
             bar.update()
             yield one
-            if judge.explained(checks.values()):
-                return
+            if judge.explained([checks[one.name]]):
+                enough = max(enough, RIVAL * first[one.name].gain)
 
 
-def doubted(
-    taken: Sequence[Variation], checks: Mapping[str, AssumptionTest], far: bool
-) -> list[Variation]:
-    """What a fit is repeated without, the likeliest first: all that either is so or is not, and
-    `RIVALS` of the rig's numbers, those that would explain most or, where a fit ended `far` off,
-    those whose variation would make the greatest misfit."""
-    by_gain = sorted(
-        (one for one in taken if one.name in checks), key=lambda one: -checks[one.name].gain
+@contextmanager
+def quiet() -> Iterator[None]:
+    """No warnings: of pads that creep longer than a run begins before its samples, for one."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def doubted(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest]) -> list[Variation]:
+    """Suspects with which a fit is repeated, those that would explain most first: `MOST` of them,
+    and every law."""
+    known = [one for one in suspects if one.name in checks and not checks[one.name].unchecked]
+    known.sort(key=lambda one: -checks[one.name].gain)
+    return [one for k, one in enumerate(known) if k < MOST or one.kind in ("law", "numerical")]
+
+
+def compared(checks: Iterable[AssumptionTest], judge: "Judge") -> list[AssumptionTest]:
+    """Tests with their odds: parts of the evidence, by Schwarz's criterion, of those that the data
+    favour; a new fit with a law that holds or does not has no amplitude."""
+    out = list(checks)
+    favoured = [one for one in out if one.suspected]
+    if not favoured:
+        return out
+    rest = max(1.0, min(one.left for one in favoured) / judge.dof)
+    amplitudes = [float(not one.refitted or one.kind in ("known", "sensor")) for one in favoured]
+    score = np.array([one.left / rest for one in favoured]) + np.log(judge.dof) * np.array(
+        amplitudes
     )
-    numbers = [
-        one for one in by_gain if one.parameter and (far or checks[one.name].significance > EVIDENT)
-    ]
-    if far:
-        numbers.sort(key=lambda one: checks[one.name].favoured_sd / one.amount)
-    return [one for one in by_gain if one.vary is not None or one in numbers[:RIVALS]]
+    odds = np.exp(-0.5 * (score - score.min()))
+    for one, share in zip(favoured, odds / odds.sum()):
+        out[out.index(one)] = replace(one, odds=float(share))
+    return out
 
 
 class Judge:
@@ -256,8 +304,8 @@ class Judge:
             one for one, is_free in zip(problem.coordinates.all, end.free) if is_free
         ]
         self.labels = [one.label for one in self.coordinates]
-        self.given = problem.recordings[0].parameters
-        self.places = [part.rows for part in parts(problem, self.r, end.which)]
+        self.parts = parts(problem, self.r, end.which)
+        self.places = [part.rows for part in self.parts]
         self.dof = max(sum(map(len, self.places)) - len(self.labels), 1)
         self.square = float(self.r @ self.r)
 
@@ -271,9 +319,10 @@ class Judge:
 
     def made(
         self, one: Assumption, moves: Array, gain: float, left: float, favoured: float,
-        favoured_sd: float, rest: float, pattern: float, refitted: bool = False,
+        favoured_sd: float, rest: float, after: Array, before: Array, refitted: bool = False,
     ) -> AssumptionTest:  # fmt: skip
-        """Of a variation that leaves a sum of squares `left`, a misfit `rest` per sample."""
+        """Of a variation that leaves residuals `after` (m,) of those `before`, with a sum of
+        squares `left`, a misfit `rest` per sample."""
         by_label = dict(zip(self.labels, moves.tolist()))
         x = self.end.x[self.end.free] + moves * self.sd * (
             1.0 if refitted else favoured / one.amount
@@ -281,11 +330,22 @@ class Judge:
         under = {
             c.label: c.to_value(v) for c, v in zip(self.coordinates, x.clip(-700, 700).tolist())
         }
-        value = (1 + favoured / 100) * self.given[one.parameter] if one.parameter else float("nan")
         return assumption_test(
             one, moves=by_label, gain=gain, left=left, favoured=favoured, favoured_sd=favoured_sd,
-            significance=gain / rest, pattern=pattern, refitted=refitted, value=value, under=under,
+            significance=gain / rest, pattern=pattern_of(self.places, after, before),
+            refitted=refitted, value=one.nominal + favoured / one.amount * one.step, under=under,
+            remaining=self.remaining(after) if gain / rest > EVIDENT else {},
         )  # fmt: skip
+
+    def remaining(self, r: Array) -> dict[str, float]:
+        """RMS of residuals r (m,) by channel."""
+        rows: dict[str, list[Array]] = {}
+        for part in self.parts:
+            rows.setdefault(part.channel, []).append(r[part.rows])
+        return {
+            channel: float(np.sqrt(np.mean(np.concatenate(some) ** 2)))
+            for channel, some in rows.items()
+        }
 
     def column(self, one: Assumption, d: Array) -> AssumptionTest:
         """Of what a variation adds to the residuals (m,), to first order in its amplitude."""
@@ -293,47 +353,40 @@ class Judge:
         size, along = float(across @ across), float(across @ self.r)
         moves = -shift(self.J, d) / self.sd
         if size < 1e-12 * max(float(d @ d), 1e-300) or size == 0.0:
-            return self.made(one, moves, 0.0, self.square, 0.0, float("inf"), 1.0, 0.0)
+            return self.made(one, moves, 0.0, self.square, 0.0, float("inf"), 1.0, self.r, self.r)
         gain, alpha = along**2 / size, -along / size
         rest = max(1.0, (self.square - gain) / max(self.dof - 1, 1))
-        pattern, sd = (
-            pattern_of(self.places, self.r + alpha * across, self.r),
-            (max(1.0, self.square / self.dof) / size) ** 0.5,
-        )
+        sd = (max(1.0, self.square / self.dof) / size) ** 0.5
         return self.made(
-            one, moves, gain, self.square - gain, alpha * one.amount, sd * one.amount, rest, pattern
-        )
+            one, moves, gain, self.square - gain, alpha * one.amount, sd * one.amount, rest,
+            self.r + alpha * across, self.r,
+        )  # fmt: skip
 
     def fit(
-        self, one: Assumption, again: Refit, as_stated: Refit, linear: AssumptionTest
+        self, one: Variation, again: Refit, as_stated: Refit, linear: AssumptionTest
     ) -> AssumptionTest:
-        """Of a fit that was repeated with it, beside one that was repeated without; or what is
-        known to first order, if that is worth more."""
+        """Of a fit that was repeated with it, beside one that was repeated without; or to first
+        order, where the new fit did not come as far."""
         at, before = again.fit.at, as_stated.fit.at
         assert at is not None
         assert before is not None
         gain = float(before.r @ before.r - at.r @ at.r)
-        if gain <= linear.gain:
+        if gain <= linear.gain and not again.fit.converged:
             return linear
         left = float(at.r @ at.r)
         rest = max(1.0, left / self.dof)
         moves = np.array([again.of(label) for label in self.labels]) - self.end.x[self.end.free]
-        favoured, sd = one.amount, (rest / gain) ** 0.5 * one.amount
-        if one.parameter:
-            labels = [
-                label
-                for label, is_free in zip(again.problem.coordinates.labels, again.free)
-                if is_free
-            ]
-            k = again.problem.coordinates.labels.index(one.parameter)
-            favoured = 100 * (np.exp(again.fit.x[k] - again.problem.coordinates.start[k]) - 1)
-            sd = (
-                100
-                * rest**0.5
-                * float(standard_deviations(at.J[:, again.free])[labels.index(one.parameter)])
-            )
-        pattern = pattern_of(self.places, at.r, before.r)
-        return self.made(one, moves / self.sd, gain, left, favoured, sd, rest, pattern, True)
+        favoured, sd = one.amount, (rest / max(gain, 1e-300)) ** 0.5 * one.amount
+        if one.label:
+            c, free = again.problem.coordinates, again.free
+            k = c.labels.index(one.label)
+            mine = c.all[k]
+            value, slope = mine.to_value(again.fit.x[k]), mine.slope(again.fit.x[k])
+            place = int(np.flatnonzero(free).tolist().index(k))
+            own = rest**0.5 * float(standard_deviations(at.J[:, free])[place]) * slope
+            scale = one.amount / one.step
+            favoured, sd = (value - one.nominal) * scale, own * scale
+        return self.made(one, moves / self.sd, gain, left, favoured, sd, rest, at.r, before.r, True)
 
 
 def pattern_of(places: Sequence[NDArray[np.int_]], left: Array, r: Array) -> float:
@@ -360,49 +413,69 @@ def pattern_of(places: Sequence[NDArray[np.int_]], left: Array, r: Array) -> flo
 def columns_of(
     problem: Problem, runner: Runner, end: End, taken: Sequence[Variation]
 ) -> list[tuple[Variation, Array]]:
-    """What other values of known parameters, and faults of sensors that are not unknown, would add
-    to the residuals, to first order: of one run a recording, with its derivatives. Nothing where a
-    run fails."""
+    """Effects on the residuals of other values of known parameters, of extensions of the rigs, and
+    of faults of sensors that are not unknown, to first order: of a run a recording with its
+    derivatives, and one more for extensions that exclude each other. Nothing where a run fails."""
     if end.base.lost:
         return []
-    known = [one for one in taken if one.parameter]
-    names = tuple(one.parameter for one in known)
-    jobs = [job._replace(names=names) for job in problem.jobs(end.x, end.which, end.steps, None)]
-    runs = runner.run(jobs)
-    if any(isinstance(run, FailedRun) for run in runs):
-        return []
-    faults: list[tuple[str, Nuisance]] = [
-        (channel, kind) for channel in problem.sensors for kind in FAULTS
-    ]
+    out: list[tuple[Variation, Array]] = []
+    for number, known in enumerate(batches(problem, [one for one in taken if one.parameter])):
+        names = tuple(one.parameter for one in known)
+        added = [one.parameter for one in known if one.extension]
+        recordings = [extended(recording, added) for recording in problem.recordings]
+        jobs = [
+            job._replace(names=names) for job in problem.jobs(end.x, end.which, end.steps, None)
+        ]
+        runs = Runner(recordings, runner.workers, runner.folder).run(jobs)
+        if any(isinstance(run, FailedRun) for run in runs):
+            return out
+        faults = faults_of(problem) if number == 0 else []
+        blocks = []
+        for job, run in zip(jobs, runs):
+            recording = problem.recordings[job.recording]
+            signals = Signals(run.t, recording.channels, run.signals, run.derivatives)
+            for channel, one in problem.readouts(end.x, job.recording).items():
+                t, measured = recording.samples[channel]
+                y, slopes, by = one.expected(signals, t)
+                _, weight = one.residuals(y, measured)
+                block = np.zeros((len(t), len(known) + len(faults)))
+                if slopes is not None:
+                    block[:, : len(known)] = slopes * [float(each.step) for each in known]
+                for k, fault in enumerate(faults, len(known)):
+                    assert fault.fault is not None
+                    if fault.fault[0] == channel:
+                        block[:, k] = by[fault.fault[1]] * fault.step
+                rows = problem.whitened(recording, channel, weight[:, None] * block)
+                blocks.append(np.asarray(rows))
+        blocks.append(np.zeros((len(problem.coordinates.priors), len(known) + len(faults))))
+        out += zip((*known, *faults), np.concatenate(blocks).T)
+    return out
+
+
+def batches(problem: Problem, known: Sequence[Variation]) -> Iterator[list[Variation]]:
+    """Parameters that one rig can have, those that it has already in the first batch."""
+    left = list(known)
+    while left:
+        rig, mine = deepcopy(problem.recordings[0].rig), list[Variation]()
+        for one in left:
+            if not one.extension:
+                mine.append(one)
+            elif one.parameter in extensions(rig):
+                extend(rig, [one.parameter])
+                mine.append(one)
+        yield mine
+        left = [one for one in left if one not in mine]
+
+
+def faults_of(problem: Problem) -> list[Variation]:
+    """Faults of sensors that are not unknown."""
     have = {(one.name, one.kind) for one in problem.coordinates.all}
-    rows = np.zeros((len(problem.coordinates.priors), len(names) + len(faults)))
-    blocks = []
-    for job, run in zip(jobs, runs):
-        recording = problem.recordings[job.recording]
-        signals = Signals(run.t, recording.channels, run.signals, run.derivatives)
-        sizes = [one.amount / 100 * recording.parameters[one.parameter] for one in known]
-        for channel, one in problem.readouts(end.x, job.recording).items():
-            t, measured = recording.samples[channel]
-            y, slopes, by = one.expected(signals, t)
-            _, weight = one.residuals(y, measured)
-            block = np.zeros((len(t), len(names) + len(faults)))
-            if slopes is not None:
-                block[:, : len(names)] = slopes * sizes
-            for k, (other, kind) in enumerate(faults):
-                if other == channel:
-                    block[:, len(names) + k] = by[kind] * FAULTS[kind].size(
-                        problem.sensors[channel], recording
-                    )
-            blocks.append(problem.whitened(recording, channel, weight[:, None] * block))
-    D = np.concatenate([*blocks, rows])
-    sensors = [
-        FAULTS[kind].assumption(channel, problem.unit(channel), problem.sensors[channel])
-        for channel, kind in faults
-    ]
-    out = [(one, d) for one, d in zip((*known, *sensors), D.T)]
+    first = problem.recordings[0]
     return [
-        pair for k, pair in enumerate(out) if k < len(known) or faults[k - len(known)] not in have
-    ]
+        FAULTS[kind].assumption(channel, kind, problem.unit(channel), sensor, first)
+        for channel, sensor in problem.sensors.items() for kind in FAULTS
+        if (channel, kind) not in have
+    ]  # fmt: skip
 
 
 def assumption_notices(checked: Checked) -> list[str]:
@@ -419,38 +492,9 @@ def assumption_notices(checked: Checked) -> list[str]:
             f"interrupted, so these were not tried: {', '.join(checked.untried)}; the same command "
             "tries them"
         )
-    favoured = sorted((c for c in checks if c.suspected), key=lambda c: -c.gain)
+    favoured = sorted((c for c in checks if c.odds > 0), key=lambda c: -c.odds)
     if favoured:
-        best = favoured[0]
-        rivals = [c.name for c in favoured[1:] if c.gain > 0.5 * best.gain]
-        label, move = best.most_moved
-        text = f"the data contradict that {best.stated}: the sum of squares {best.falls}"
-        if best.parameter:
-            text += (
-                f" with {best.parameter} = {best.value:.6g} ({best.favoured:+.3g} {best.unit}, +- "
-                f"{best.favoured_sd:.2g})"
-            )
-        else:
-            text += f" if {best.otherwise}"
-            if best.kind in ("known", "sensor"):
-                text += f" ({best.favoured:+.3g} {best.unit} fit best, +- {best.favoured_sd:.2g})"
-        if best.kind in ("known", "sensor"):
-            move *= 1.0 if best.refitted else best.favoured / best.amount
-        if label:
-            under = ", ".join(
-                f"{name} = {value:.4g}" for name, value in list(best.under.items())[:UNDER]
-            )
-            text += (
-                f"; {label} would move by {abs(move):.2g} standard deviations; estimates under it: "
-                f"{under}"
-            )
-        out.append(text + (f"; so would it with others: {', '.join(rivals)}" if rivals else ""))
-        out += [
-            f"the data also favour another value than stated: {c.stated} (the sum of squares "
-            f"{c.falls})"
-            for c in favoured[1:4]
-            if c.gain <= 0.5 * best.gain and c.gain > 0.1 * best.gain
-        ]
+        out += contradictions(favoured, len(checks))
     for c in checks:
         if c.kind == "numerical" and c.unchecked:
             out.append(f"it could not be checked what it does that {c.stated}: {c.unchecked}")
@@ -462,4 +506,41 @@ def assumption_notices(checked: Checked) -> list[str]:
                     f"it would move by {abs(move):.2g} standard deviations, and the data cannot "
                     "tell: the interval allows for that"
                 )
+    return out
+
+
+def contradictions(favoured: Sequence[AssumptionTest], count: int) -> list[str]:
+    """Sentences on the suspect of the best odds, on those that the data cannot tell from it, on the
+    misfit that is left, and on what else the data favour; `count` were compared."""
+    best = favoured[0]
+    label, move = best.most_moved
+    text = f"the data contradict that {best.stated}: the sum of squares {best.falls}{best.found}"
+    if best.kind in ("known", "sensor") and not best.refitted:
+        move *= best.favoured / best.amount
+    if label:
+        under = ", ".join(
+            f"{name} = {value:.4g}" for name, value in list(best.under.items())[:UNDER]
+        )
+        text += (
+            f"; {label} would move by {abs(move):.2g} standard deviations; estimates under it: "
+            f"{under}"
+        )
+    rivals = [c for c in favoured[1:] if c.odds > LIKELY]
+    if rivals:
+        said = "; ".join(f"{c.name}{c.found}, odds {c.odds:.2g}" for c in rivals)
+        text += f". The data cannot tell it (odds {best.odds:.2g}) from: {said}"
+    out = [text]
+    left = {channel: size for channel, size in best.remaining.items() if size > UNEXPLAINED}
+    if left:
+        sizes = ", ".join(
+            f"{channel}: {size:.2g} times the noise left"
+            for channel, size in sorted(left.items(), key=lambda item: -item[1])
+        )
+        out.append(f"none of {count} suspects explains {sizes}, after {best.name}")
+    out += [
+        f"the data also favour another value than stated: {c.stated} (the sum of squares {c.falls}"
+        f"{c.found})"
+        for c in favoured[1:4]
+        if c not in rivals and c.gain > 0.1 * best.gain
+    ]
     return out

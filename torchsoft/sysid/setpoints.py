@@ -107,7 +107,7 @@ def gaps(recording: Recording, sensors: Mapping[str, Sensor], name: str) -> list
     for own, by in ((channel(rig, actuator.measured), places), (channel(rig, name), efforts)):
         if own in sensors and own in recording.samples:
             error, order = extrapolated(by)
-            out.append(Gap(own, error, error / sensors[own].noise, order))
+            out.append(Gap(own, error, error / sensors[own].sd, order))
     return out
 
 

@@ -89,7 +89,7 @@ class Unknown(Table):
         return self
 
 
-Nuisance = Literal["bias", "delay", "gain", "drift", "misalignment", "inertia"]
+Nuisance = Literal["bias", "delay", "gain", "drift", "misalignment", "inertia", "clock"]
 NUISANCES: tuple[Nuisance, ...] = get_args(Nuisance)
 """What may be wrong with a sensor, in the order of a problem's coordinates."""
 
@@ -101,9 +101,11 @@ class Sensor(Table):
     How large may be a constant `bias` [unit], a `delay` [s], the error of its `gain` [1], a `drift`
     [unit/s] from the middle of the recording on, its `misalignment` [rad] about the axis out of the
     plane; the `inertia` [kg] between a force sensor and what it pushes, whose acceleration it does
-    not feel. Zero leaves them out, otherwise they are identified too, one for all recordings or one
+    not feel; the `clock` [1] that runs too fast, counted from the middle of the recording. Zero
+    leaves them out, otherwise they are identified too, one for all recordings or one
     for each (`per`). Samples at `low` or `high` [unit] or beyond are saturated: they only say that
     value and noise together are there or beyond (Tobin's likelihood), and that noise must be white.
+    Readings in steps of a `resolution` [unit] have its variance, a twelfth of its square, besides.
     `colour` says whether the noise is known to be independent ("white"), or may be an
     autoregression ("ar"), whose order and coefficients are then found.
     """
@@ -115,6 +117,8 @@ class Sensor(Table):
     drift: float = Field(default=0.0, ge=0, le=1e6)
     misalignment: float = Field(default=0.0, ge=0, le=0.5)
     inertia: float = Field(default=0.0, ge=0, le=1e5)
+    clock: float = Field(default=0.0, ge=0, le=0.1)
+    resolution: float = Field(default=0.0, ge=0, le=1e6)
     per: Per = "all"
     low: float | None = None
     high: float | None = None
@@ -125,6 +129,11 @@ class Sensor(Table):
         if self.low is not None and self.high is not None and self.low >= self.high:
             raise ValueError(f"low = {self.low} must be below high = {self.high}")
         return self
+
+    @property
+    def sd(self) -> float:
+        """Standard deviation [unit] of noise and rounding together."""
+        return math.hypot(self.noise, self.resolution / math.sqrt(12))
 
     def saturated(self, y: Array) -> NDArray[np.bool_]:
         """Which samples y (k,) [unit] are at the end of its range, or beyond."""

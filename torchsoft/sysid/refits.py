@@ -1,0 +1,189 @@
+"""Problems with one assumption otherwise: its effect on residuals, and fits repeated with it."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchsoft.sysid.assumptions import Variation
+from torchsoft.sysid.fit import Fit, Loss, Notify, Unreachable
+from torchsoft.sysid.plan import SCANNED, USUAL, Stage, default_plan, run_plan
+from torchsoft.sysid.prediction import Frozen
+from torchsoft.sysid.problem import Problem, Residuals, check_value
+from torchsoft.sysid.recording import Array, Recording
+from torchsoft.sysid.runs import Runner
+from torchsoft.sysid.unknowns import Unknown
+
+REFITS, ROUGH = 20, 1e-3
+"""Evaluations that a fit under another assumption may take, and its relative tolerance: it has to
+find out whether the misfit goes away, not where exactly."""
+
+
+FAR = 2.0
+"""Misfit per sample from which where a fit ended tells nothing: under another assumption it begins
+where the first one began, too."""
+
+AMOUNTS = 10.0
+"""How many amounts of a variation a number of the rig may be off where a fit is repeated."""
+
+HALVINGS = 10
+"""How often that is halved where there is no such rig."""
+
+
+class End(NamedTuple):
+    """A fit in whose place another is held: coordinates x (n,), residuals there, the free
+    coordinates (n,), the recordings that were fitted, residuals and steps of runs by the tolerance
+    `rtol`, and how runs are made and kept."""
+
+    x: Array
+    at: Residuals
+    free: NDArray[np.bool_]
+    which: tuple[str, ...]
+    base: Residuals
+    steps: dict[str, Frozen]
+    rtol: float
+    workers: int
+    journal: Path | None
+
+    @property
+    def far(self) -> bool:
+        """Whether the fit left so much that what is so to first order where it ended says
+        nothing."""
+        return float(np.mean(self.base.r**2)) > FAR
+
+
+def ended(
+    problem: Problem, x: Array, at: Residuals, free: NDArray[np.bool_], which: Sequence[str],
+    rtol: float, workers: int, journal: Path | None,
+) -> End:  # fmt: skip
+    """The end of a fit, which took steps by `rtol`, with a run a recording by the tolerance of the
+    variations: `USUAL`, or that of the fit, if runs are lost with it."""
+    runner = Runner(problem.recordings, workers, journal)
+    usual = max(rtol, USUAL)
+    base, steps = problem.freeze(runner, x, which, usual)
+    if base.lost and usual > rtol:
+        base, steps = problem.freeze(runner, x, which, rtol)
+    else:
+        rtol = usual
+    return End(x, at, free, tuple(which), base, steps, rtol, workers, journal)
+
+
+WRONG = {"bias": 1e4, "delay": 0.02, "gain": 0.5, "drift": 1e4, "clock": 0.05}
+"""How far a fault of a sensor is looked for: bias and drift [/s] over the noise, delay [s], gain
+[1], clock [1]."""
+
+
+def varied(problem: Problem, which: Sequence[str], one: Variation) -> Problem | str:
+    """The problem with one assumption otherwise in the recordings `which`, or why there is none. A
+    parameter that is called known, or a fault of a sensor, becomes one more unknown."""
+    made, unknowns, sensors = [], dict(problem.unknowns), dict(problem.sensors)
+    for recording in problem.recordings:
+        other = (
+            one.vary(recording) if one.vary is not None and recording.name in which else recording
+        )
+        if other is None:
+            return f"it has no meaning where recording `{recording.name}` begins"
+        made.append(other)
+    try:
+        if one.extension:
+            unknowns[one.parameter] = Unknown()
+        elif one.parameter:
+            reach = AMOUNTS * one.step / one.nominal
+            low, high = sorted(
+                farthest(problem.recordings, one.parameter, one.nominal, part)
+                for part in (-reach, reach)
+            )
+            unknowns[one.parameter] = Unknown(nominal=one.nominal, low=low, high=high)
+        if one.fault is not None:
+            channel, kind = one.fault
+            scale = sensors[channel].noise if kind in ("bias", "drift") else 1.0
+            if kind == "clock":
+                scale = 1.0 / max(1.0, *(recording.duration for recording in made))
+            sensors[channel] = sensors[channel].model_copy(update={kind: WRONG[kind] * scale})
+        return Problem(made, sensors, unknowns, problem.noise)
+    except ValueError as error:  # an unknown that the varied rig has not, or that cannot be one
+        return str(error)
+
+
+def farthest(recordings: Sequence[Recording], name: str, value: float, part: float) -> float:
+    """A number of the rig that is off by a relative `part`, or by half of that, a quarter and so on
+    until there is such a rig: a smaller disc may leave the pads apart. Raises `ValueError` where
+    there is none."""
+    for _ in range(HALVINGS):
+        with suppress(ValueError):
+            for recording in recordings:
+                check_value(recording, name, value * (1 + part))
+            return value * (1 + part)
+        part /= 2
+    raise ValueError(f"{name} = {value:g} can hardly be varied")
+
+
+def difference(problem: Problem, end: End, one: Variation) -> tuple[Array | None, str]:
+    """What a variation adds to the residuals (m,), on the same steps, or None and why that is not
+    known."""
+    if end.base.lost:
+        return None, "the estimates cannot be simulated by the tolerance of the checks"
+    other = varied(problem, end.which, one)
+    if isinstance(other, str):
+        return None, other
+    got = other.residuals(
+        Runner(other.recordings, end.workers, end.journal), end.x, end.which, end.steps
+    )
+    if got.lost:
+        return None, f"a run failed: {next(iter(got.lost.values())).reason}"
+    return got.r - end.base.r, ""
+
+
+class Refit(NamedTuple):
+    """A fit that was repeated: the problem, its end, and which of its coordinates were free."""
+
+    problem: Problem
+    fit: Fit
+    free: NDArray[np.bool_]
+
+    def of(self, label: str) -> float:
+        """A coordinate at the end."""
+        return float(self.fit.x[self.problem.coordinates.labels.index(label)])
+
+
+def refit(
+    problem: Problem, end: End, one: Variation | None, loss: Loss, notify: Notify,
+) -> Refit | None:  # fmt: skip
+    """The fit with one assumption otherwise, or with all as stated, on steps of its own; None where
+    it cannot begin.
+
+    It begins where the fit ended; ratios that ended at a bound are looked for again over all of
+    their range. With another law or number, and a misfit above `FAR`, it begins where the first fit
+    began as well, and the better end counts.
+    """
+    other = varied(problem, end.which, one) if one is not None else problem
+    if isinstance(other, str):
+        return None
+    c, at = other.coordinates, dict(zip(problem.coordinates.labels, end.x))
+    fitted = {label for label, is_free in zip(problem.coordinates.labels, end.free) if is_free}
+    x = np.array([at.get(label, own) for label, own in zip(c.labels, c.start)])
+    free = np.array([label in fitted or label not in at for label in c.labels])
+    stuck = [one for one, is_stuck in zip(c.all, free & c.at_bound(x)) if is_stuck and one.ratio_to]
+    scans = tuple((one.label, tuple(part * one.high for part in SCANNED)) for one in stuck)
+    labels = tuple(label for label, is_free in zip(c.labels, free) if is_free)
+    runner = Runner(other.recordings, end.workers, end.journal)
+
+    def carried_out(plan: Sequence[Stage], x: Array) -> Iterator[Fit]:
+        """The fit of the last stage, if none is lost."""
+        with suppress(Unreachable):
+            yield run_plan(other, runner, plan, x, loss=loss, notify=notify)[0]
+
+    fits = [
+        *carried_out(
+            [Stage("once more", end.which, labels, end.rtol, REFITS, ROUGH, scanned=scans)], x
+        )
+    ]
+    if one is not None and one.kind in ("law", "known") and end.far:
+        with suppress(Unreachable):
+            plan = default_plan(other, runner, end.rtol, end.which)
+            if set(plan[-1].free) == set(labels):
+                fits += carried_out(plan, c.start)
+    return Refit(other, min(fits, key=lambda fit: fit.chi2), free) if fits else None
