@@ -93,6 +93,12 @@ def excitations(smoke: bool) -> dict[str, Excitation]:
             duration=1.2,
             depth=3e-4,
         ),
+        "long shaking": Excitation(
+            motion=MultiSine(amplitude_x=12.5e-3, amplitude_y=2e-4, frequency=(4.0, 20.0)),
+            duration=1.5,
+            depth=3e-4,
+        ),
+        "gentle roll": Excitation(motion=Strokes(travel=10e-3, stroke_time=0.6), duration=1.5),
     }
 
 

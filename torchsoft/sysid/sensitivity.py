@@ -284,9 +284,8 @@ def compared(checks: Iterable[AssumptionTest], judge: "Judge") -> list[Assumptio
         return out
     rest = max(1.0, min(one.left for one in favoured) / judge.dof)
     amplitudes = [float(not one.refitted or one.kind in ("known", "sensor")) for one in favoured]
-    score = np.array([one.left / rest for one in favoured]) + np.log(judge.dof) * np.array(
-        amplitudes
-    )
+    left = np.array([one.left for one in favoured])
+    score = left / rest + np.log(judge.dof) * np.array(amplitudes)
     odds = np.exp(-0.5 * (score - score.min()))
     for one, share in zip(favoured, odds / odds.sum()):
         out[out.index(one)] = replace(one, odds=float(share))
