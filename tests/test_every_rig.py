@@ -49,6 +49,7 @@ from torchsoft import (
     controller,
     simulate,
 )
+from torchsoft.physics.extensions import extend, extensions
 from torchsoft.physics.mesh import Mesh
 from torchsoft.physics.statics import standing
 
@@ -223,6 +224,19 @@ def feedback(coupling: float = 0.0) -> dict[str, Actuator]:
     )  # fmt: skip
 
 
+def extended_loops() -> Start:
+    """Everything that a rig may be extended by, away from its neutral value."""
+    rig, _ = loops(pd)
+    for name, one in extensions(rig).items():
+        if name in extensions(rig):  # of two slow branches, one
+            extend(rig, [name])
+            torch.nn.init.constant_(rig.parameter(name), one.neutral + 2 * one.amount)
+    pose = rig.unpack(torch.zeros(rig.layout.size, dtype=torch.float64)).pose
+    top = rig.follow(0.0)[rig.signals.index("y_d"), 0]
+    pose |= {"disc": f64(3e-4, MESH.height - DEPTH + R, 0.0), "jaw": f64(0.0, float(top), 0.0)}
+    return rig, standing(rig, pose).detach()
+
+
 RIGS: dict[str, Callable[[], Start]] = {
     "circle": grip,
     "ellipse": lambda: grip(Ellipse(R, 18.5e-3)),
@@ -263,6 +277,7 @@ RIGS: dict[str, Callable[[], Start]] = {
     "loop about the disc": lambda: loops(lambda: pd("disc.x", PD(2e4, 100.0))),
     "saturated loop": lambda: loops(lambda: pd(x_law=Saturated(3.0))),
     "coupled feedback": lambda: loops(lambda: feedback(10.0)),
+    "extended": extended_loops,
     "policy": lambda: loops(lambda: controller(
         Policy(), measures=WHOLE, setpoints=SETPOINTS, pushes=PUSHES, feed_forward={"y": "F"}),
         theta="free"),

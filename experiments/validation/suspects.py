@@ -35,7 +35,7 @@ from torchsoft.sysid import (
 )
 from torchsoft.sysid.assumptions import delayed
 from torchsoft.sysid.runs import forget
-from torchsoft.sysid.sensitivity import LIKELY
+from torchsoft.sysid.suspects import LIKELY
 from torchsoft.threads import parallel_map
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -52,7 +52,8 @@ from torchsoft.sysid.residual_tests import (
 )
 from torchsoft.sysid.result import IdentificationResult, described, undetermined
 from torchsoft.sysid.runs import Runner
-from torchsoft.sysid.sensitivity import Checked, assumption_notices, check_assumptions
+from torchsoft.sysid.sensitivity import Checked, check_assumptions
+from torchsoft.sysid.suspects import assumption_notices
 from torchsoft.tables import SEED, Table, plain
 
 RTOL = 1e-5

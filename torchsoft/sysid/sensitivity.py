@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -52,18 +53,8 @@ MOST = 24
 RIVAL = 0.3
 """Part of the gain to first order of what explains a misfit from which a suspect is its rival."""
 
-LIKELY = 0.01
-"""Odds from which a suspect is named."""
-
-UNEXPLAINED = 1.15
-"""RMS residual of a channel over its noise that is said to be left."""
-
-UNDER = 8
-"""Estimates that a sentence states under an alternative."""
-
-MOVED = 0.5
-"""Standard deviations by which a constant of the computation may move an estimate without a
-word."""
+BESIDES = 3
+"""Things that are looked for besides the likeliest suspect."""
 
 
 @dataclass(frozen=True)
@@ -74,11 +65,10 @@ class AssumptionTest(Assumption):
     the sum of squares, to `left`, by the amplitude that the data favour: `favoured` [unit] with the
     standard deviation `favoured_sd`. `significance` is the gain over the misfit per sample that
     would be left, `pattern` the part of the residuals' autocorrelation that would be left, 0 where
-    there is none, `remaining` the RMS residual that would be left of every channel, over its noise.
-    With `refitted` that is the result of a new fit, else it is to first order. `unchecked` is the
-    reason why there is no test. `value` is the favoured value of the `parameter`, `under` are the
-    estimates with the favoured amplitude, by label. `suspected`: the data favour the variation, and
-    `odds` are its part of the evidence among all suspects.
+    there is none. With `refitted` that is the result of a new fit, else it is to first order.
+    `unchecked` is the reason why there is no test. `value` is the favoured value of the
+    `parameter`, `under` are the estimates with the favoured amplitude, by label. `suspected`: the
+    data favour the variation, and `odds` are its part of the evidence among all suspects.
     """
 
     moves: dict[str, Number] = field(default_factory=dict)
@@ -92,7 +82,6 @@ class AssumptionTest(Assumption):
     unchecked: str = ""
     value: Number = float("nan")
     under: dict[str, Number] = field(default_factory=dict)
-    remaining: dict[str, Number] = field(default_factory=dict)
     odds: Number = 0.0
     suspected: bool | None = None
 
@@ -164,8 +153,12 @@ class Checked(NamedTuple):
     untried: tuple[str, ...] = ()
     """What an interrupt left out."""
     candidates: tuple[str, ...] = ()
-    """Assumptions without which a new fit may explain a misfit that no check explains to first
-    order."""
+    """Suspects with which a new fit may explain a misfit that none explains to first order."""
+    besides: tuple[AssumptionTest, ...] = ()
+    """What the data favour to first order besides the likeliest suspect, one after the other."""
+    left: Mapping[str, float] = MappingProxyType({})
+    """RMS residual of every channel, over its noise, with the likeliest suspect and what is
+    besides."""
 
     def covariance(self) -> Array:
         """Covariance (n, n) of the free coordinates, which the constants of the computation
@@ -221,13 +214,9 @@ def check_assumptions(
     except KeyboardInterrupt:  # the fit is done: what was tried is kept
         candidates = []
     rows = np.stack(columns, 1) if columns else np.zeros((len(at.r), 0))
-    return Checked(
-        compared(checks.values(), judge),
-        rows,
-        judge.J,
-        tuple(untried),
-        tuple(one.name for one in candidates),
-    )
+    names = tuple(one.name for one in candidates)
+    done = Checked([*checks.values()], rows, judge.J, tuple(untried), names)
+    return done if candidates else compared(done, judge)
 
 
 def new_fits(
@@ -275,13 +264,13 @@ def doubted(suspects: Iterable[Variation], checks: Mapping[str, AssumptionTest])
     return [one for k, one in enumerate(known) if k < MOST or one.kind in ("law", "numerical")]
 
 
-def compared(checks: Iterable[AssumptionTest], judge: "Judge") -> list[AssumptionTest]:
+def compared(checked: Checked, judge: "Judge") -> Checked:
     """Tests with their odds: parts of the evidence, by Schwarz's criterion, of those that the data
     favour; a new fit with a law that holds or does not has no amplitude."""
-    out = list(checks)
+    out = list(checked.checks)
     favoured = [one for one in out if one.suspected]
     if not favoured:
-        return out
+        return checked._replace(left=judge.remaining(judge.r))
     rest = max(1.0, min(one.left for one in favoured) / judge.dof)
     amplitudes = [float(not one.refitted or one.kind in ("known", "sensor")) for one in favoured]
     left = np.array([one.left for one in favoured])
@@ -289,7 +278,8 @@ def compared(checks: Iterable[AssumptionTest], judge: "Judge") -> list[Assumptio
     odds = np.exp(-0.5 * (score - score.min()))
     for one, share in zip(favoured, odds / odds.sum()):
         out[out.index(one)] = replace(one, odds=float(share))
-    return out
+    besides, r = judge.besides(favoured[int(score.argmin())], out)
+    return checked._replace(checks=out, besides=besides, left=judge.remaining(r))
 
 
 class Judge:
@@ -303,6 +293,7 @@ class Judge:
             one for one, is_free in zip(problem.coordinates.all, end.free) if is_free
         ]
         self.labels = [one.label for one in self.coordinates]
+        self.columns, self.ends = dict[str, Array](), dict[str, tuple[Array, Array]]()
         self.parts = parts(problem, self.r, end.which)
         self.places = [part.rows for part in self.parts]
         self.dof = max(sum(map(len, self.places)) - len(self.labels), 1)
@@ -333,7 +324,6 @@ class Judge:
             one, moves=by_label, gain=gain, left=left, favoured=favoured, favoured_sd=favoured_sd,
             significance=gain / rest, pattern=pattern_of(self.places, after, before),
             refitted=refitted, value=one.nominal + favoured / one.amount * one.step, under=under,
-            remaining=self.remaining(after) if gain / rest > EVIDENT else {},
         )  # fmt: skip
 
     def remaining(self, r: Array) -> dict[str, float]:
@@ -348,6 +338,7 @@ class Judge:
 
     def column(self, one: Assumption, d: Array) -> AssumptionTest:
         """Of what a variation adds to the residuals (m,), to first order in its amplitude."""
+        self.columns[one.name] = d
         across = d - self.Q @ (self.Q.T @ d)
         size, along = float(across @ across), float(across @ self.r)
         moves = -shift(self.J, d) / self.sd
@@ -385,7 +376,50 @@ class Judge:
             own = rest**0.5 * float(standard_deviations(at.J[:, free])[place]) * slope
             scale = one.amount / one.step
             favoured, sd = (value - one.nominal) * scale, own * scale
+        self.ends[one.name] = at.r, at.J[:, again.free]
         return self.made(one, moves / self.sd, gain, left, favoured, sd, rest, at.r, before.r, True)
+
+    def besides(
+        self, best: AssumptionTest, checks: Sequence[AssumptionTest]
+    ) -> tuple[tuple[AssumptionTest, ...], Array]:
+        """Tests to first order of what the data favour besides one suspect, `BESIDES` at the most,
+        each with those before it; and the residuals (m,) that all of them leave."""
+        out: list[AssumptionTest] = []
+        r, J = self.r, self.J
+        if best.refitted:
+            r, J = self.ends[best.name]
+        else:
+            J = np.column_stack((J, self.columns[best.name]))
+            r = r - J @ shift(J, r)
+        left = [one for one in checks if one.name in self.columns and one.name != best.name]
+        while left and len(out) < BESIDES:
+            Q, square = np.linalg.qr(J)[0], float(r @ r)
+            tests, taken = [], {}
+            for one in left:
+                d = self.columns[one.name]
+                across = d - Q @ (Q.T @ d)
+                size = float(across @ across)
+                if size <= 1e-6 * float(d @ d):  # it is what is taken in already
+                    continue
+                alpha, gain = -float(across @ r) / size, float(across @ r) ** 2 / size
+                rest = max(1.0, (square - gain) / self.dof)
+                taken[one.name] = r + alpha * across
+                tests.append(
+                    replace(
+                        one, gain=gain, left=square - gain, favoured=alpha * one.amount,
+                        favoured_sd=(rest / size) ** 0.5 * one.amount, significance=gain / rest,
+                        pattern=pattern_of(self.places, taken[one.name], r), refitted=False,
+                        value=one.nominal + alpha * one.step, suspected=None,
+                    )
+                )  # fmt: skip
+            found = max((one for one in tests if one.suspected), key=lambda one: one.gain,
+                        default=None)  # fmt: skip
+            if found is None:
+                break
+            out.append(found)
+            r, J = taken[found.name], np.column_stack((J, self.columns[found.name]))
+            left = [one for one in left if one.name != found.name]
+        return tuple(out), r
 
 
 def pattern_of(places: Sequence[NDArray[np.int_]], left: Array, r: Array) -> float:
@@ -475,71 +509,3 @@ def faults_of(problem: Problem) -> list[Variation]:
         for channel, sensor in problem.sensors.items() for kind in FAULTS
         if (channel, kind) not in have
     ]  # fmt: skip
-
-
-def assumption_notices(checked: Checked) -> list[str]:
-    """Sentences on what the data favour, the strongest first, and on constants of the computation
-    that estimates hang on."""
-    out, checks = [], checked.checks
-    if checked.candidates:
-        out.append(
-            "no assumption explains to first order all that the fit left: `explain` looks for the "
-            f"cause, with a new fit without each of {', '.join(checked.candidates)}"
-        )
-    if checked.untried:
-        out.append(
-            f"interrupted, so these were not tried: {', '.join(checked.untried)}; the same command "
-            "tries them"
-        )
-    favoured = sorted((c for c in checks if c.odds > 0), key=lambda c: -c.odds)
-    if favoured:
-        out += contradictions(favoured, len(checks))
-    for c in checks:
-        if c.kind == "numerical" and c.unchecked:
-            out.append(f"it could not be checked what it does that {c.stated}: {c.unchecked}")
-        elif c.kind == "numerical" and not c.suspected and c.favoured_sd > MOVED:
-            label, move = c.most_moved
-            if abs(move) > MOVED:
-                out.append(
-                    f"{label} hangs on a constant of the computation: {c.stated}; if {c.otherwise} "
-                    f"it would move by {abs(move):.2g} standard deviations, and the data cannot "
-                    "tell: the interval allows for that"
-                )
-    return out
-
-
-def contradictions(favoured: Sequence[AssumptionTest], count: int) -> list[str]:
-    """Sentences on the suspect of the best odds, on those that the data cannot tell from it, on the
-    misfit that is left, and on what else the data favour; `count` were compared."""
-    best = favoured[0]
-    label, move = best.most_moved
-    text = f"the data contradict that {best.stated}: the sum of squares {best.falls}{best.found}"
-    if best.kind in ("known", "sensor") and not best.refitted:
-        move *= best.favoured / best.amount
-    if label:
-        under = ", ".join(
-            f"{name} = {value:.4g}" for name, value in list(best.under.items())[:UNDER]
-        )
-        text += (
-            f"; {label} would move by {abs(move):.2g} standard deviations; estimates under it: "
-            f"{under}"
-        )
-    rivals = [c for c in favoured[1:] if c.odds > LIKELY]
-    if rivals:
-        said = "; ".join(f"{c.name}{c.found}, odds {c.odds:.2g}" for c in rivals)
-        text += f". The data cannot tell it (odds {best.odds:.2g}) from: {said}"
-    out = [text]
-    left = {channel: size for channel, size in best.remaining.items() if size > UNEXPLAINED}
-    if left:
-        sizes = ", ".join(
-            f"{channel}: {size:.2g} times the noise left"
-            for channel, size in sorted(left.items(), key=lambda item: -item[1])
-        )
-        out.append(f"none of {count} suspects explains {sizes}, after {best.name}")
-    out += [
-        f"the data also favour another value than stated: {c.stated} (the sum of squares {c.falls}"
-        f"{c.found})"
-        for c in favoured[1:4]
-        if c not in rivals and c.gain > 0.1 * best.gain
-    ]
-    return out

@@ -1,0 +1,85 @@
+"""Extensions of a rig: neutral until they are moved, named like its own parameters, and unknowns of
+an identification."""
+
+from copy import deepcopy
+
+import pytest
+import torch
+from conftest import COARSE
+
+from torchsoft import Parameters, SoftGrasp, simulate
+from torchsoft.paper.equilibrium import rest
+from torchsoft.physics.extensions import extend, extensions
+from torchsoft.rigs.build import RigFile
+from torchsoft.scenario import grasp_and_roll
+from torchsoft.sysid import Problem, Recording, Sensor, Unknown
+
+MODEL = SoftGrasp(Parameters().override(COARSE))
+NAMES = tuple(extensions(MODEL))
+
+
+def test_what_a_rig_may_be_extended_by() -> None:
+    assert NAMES == (
+        "pads.L.E_ratio", "pads.L.tau_ratio", "pads.U.E_ratio", "pads.U.tau_ratio",
+        "pad.slow(0.1 s)", "pad.slow(1 s)", "contact.power", "guides.bracket.x.friction",
+        "guides.bracket.x.damping", "guides.bracket.y.friction", "guides.bracket.y.damping",
+        "gravity_tilt",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_neutral_extension_changes_nothing(name: str) -> None:
+    model = deepcopy(MODEL)
+    manipulation = grasp_and_roll(model)
+    t = torch.linspace(0, 0.3, 31, dtype=torch.float64)
+    before = simulate(model, t, y0=rest(model), reference=manipulation.model.reference)
+    extend(model, [name])
+    after = simulate(
+        model, t, y0=rest(model), reference=manipulation.model.reference, knots=before.knots
+    )
+    for channel in ("x_C", "y_C", "theta", "F_x", "F_y"):
+        moved = (after[channel] - before[channel]).abs().max()
+        assert float(moved) <= 1e-8 * float(before[channel].abs().max() + 1e-3), channel
+    assert model.parameter(name).item() == extensions(MODEL)[name].neutral
+    assert name not in extensions(model)
+
+
+def test_parts_that_are_shared_are_extended_once() -> None:
+    model = deepcopy(MODEL)
+    extend(model, ["contact.power", "pad.slow(1 s)", "gravity_tilt"])
+    assert model.contacts["L"].law.power is model.contacts["U"].law.power
+    assert model.pads["L"].branches == model.pads["U"].branches == 2
+    assert not any(".slow(" in name for name in extensions(model))
+    assert model.quantity("contact.power") is not None
+    extend(model, ["contact.power"])  # is there already
+    with pytest.raises(ValueError, match=r"`contact.colour` is not a parameter of this rig"):
+        extend(model, ["contact.colour"])
+
+
+def test_names_are_those_of_a_rig_file() -> None:
+    rig = RigFile.from_toml("rigs/two_fingers.toml").assemble()
+    groups = {name.partition(".")[0] for name in extensions(rig)}
+    assert groups == {"materials", "laws", "pads", "guides", "gravity_tilt"}
+    names = dict.fromkeys(name for name in extensions(rig) if name.endswith(".power"))
+    extend(rig, list(names))
+    for name in names:
+        assert rig.parameter(name).item() == 1.0
+
+
+def test_an_extension_may_be_unknown() -> None:
+    """With the bounds of its own search, or with those that are given."""
+    t = torch.linspace(0.0, 0.1, 11, dtype=torch.float64).numpy()
+    recording = Recording("one", deepcopy(MODEL), {"F_y": (t, 0 * t)})
+    unknowns = {
+        "guides.bracket.x.friction": Unknown(),
+        "pads.U.E_ratio": Unknown(low=0.8, high=1.2),
+        "gravity_tilt": Unknown(low=-0.01, high=0.01, scale="linear"),
+    }
+    problem = Problem([recording], {"F_y": Sensor(noise=0.1)}, unknowns)
+    found = {c.name: (c.low, c.nominal, c.high, c.scale) for c in problem.coordinates.all}
+    assert found == {
+        "guides.bracket.x.friction": (0.0, 0.0, 50.0, "linear"),
+        "pads.U.E_ratio": (0.8, 1.0, 1.2, "log"),
+        "gravity_tilt": (-0.01, 0.0, 0.01, "linear"),
+    }
+    assert recording.rig.extended == {}  # the recording's own rig is left alone

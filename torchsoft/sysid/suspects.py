@@ -1,0 +1,89 @@
+"""Sentences on what the data say of assumptions: the likeliest suspects, what else they favour, the
+misfit that stays, and the constants of the computation that estimates hang on."""
+
+from collections.abc import Sequence
+
+from torchsoft.sysid.sensitivity import AssumptionTest, Checked
+
+LIKELY = 0.01
+"""Odds from which a suspect is named."""
+
+UNEXPLAINED = 1.15
+"""RMS residual of a channel over its noise that is said to be left."""
+
+UNDER = 8
+"""Estimates that a sentence states under an alternative."""
+
+MOVED = 0.5
+"""Standard deviations by which a constant of the computation may move an estimate without a
+word."""
+
+
+def assumption_notices(checked: Checked) -> list[str]:
+    """Sentences on what the data favour, the strongest first, and on constants of the computation
+    that estimates hang on."""
+    out, checks = [], checked.checks
+    if checked.candidates:
+        square = max((c.left + c.gain for c in checks), default=1.0)
+        near = ", ".join(
+            f"{c.name} ({c.gain / square:.0%} of the sum of squares)"
+            for c in sorted((c for c in checks if c.suspected), key=lambda c: -c.gain)[:4]
+        )
+        out.append(
+            f"no suspect explains to first order all that the fit left; nearest come {near or '-'}"
+            f": `explain` fits again with each of {len(checked.candidates)} and compares them"
+        )
+    if checked.untried:
+        out.append(
+            f"interrupted, so these were not tried: {', '.join(checked.untried)}; the same command "
+            "tries them"
+        )
+    favoured = sorted((c for c in checks if c.odds > 0), key=lambda c: -c.odds)
+    if favoured:
+        out += contradictions(favoured)
+    out += [
+        f"besides, the data contradict that {c.stated}: the sum of squares would fall by another "
+        f"{c.gain:.0f}{c.found}"
+        for c in checked.besides
+    ]
+    left = {channel: size for channel, size in checked.left.items() if size > UNEXPLAINED}
+    if left and any(c.refitted for c in checks):
+        sizes = ", ".join(
+            f"{channel}: {size:.2g} times the noise left"
+            for channel, size in sorted(left.items(), key=lambda item: -item[1])
+        )
+        out.append(f"none of {len(checks)} suspects explains {sizes}")
+    for c in checks:
+        if c.kind == "numerical" and c.unchecked:
+            out.append(f"it could not be checked what it does that {c.stated}: {c.unchecked}")
+        elif c.kind == "numerical" and not c.suspected and c.favoured_sd > MOVED:
+            label, move = c.most_moved
+            if abs(move) > MOVED:
+                out.append(
+                    f"{label} hangs on a constant of the computation: {c.stated}; if {c.otherwise} "
+                    f"it would move by {abs(move):.2g} standard deviations, and the data cannot "
+                    "tell: the interval allows for that"
+                )
+    return out
+
+
+def contradictions(favoured: Sequence[AssumptionTest]) -> list[str]:
+    """Sentence on the suspect of the best odds, and on those that the data cannot tell from it."""
+    best = favoured[0]
+    label, move = best.most_moved
+    text = f"the data contradict that {best.stated}: the sum of squares {best.falls}{best.found}"
+    if best.kind in ("known", "sensor") and not best.refitted:
+        move *= best.favoured / best.amount
+    if label:
+        under = ", ".join(
+            f"{name} = {value:.4g}" for name, value in list(best.under.items())[:UNDER]
+        )
+        text += (
+            f"; {label} would move by {abs(move):.2g} standard deviations; estimates under it: "
+            f"{under}"
+        )
+    rivals = [c for c in favoured[1:] if c.odds > LIKELY]
+    if rivals:
+        said = "; ".join(f"{c.name}{c.found}, odds {c.odds:.2g}" for c in rivals)
+        text += f". The data cannot tell it (odds {best.odds:.2g}) from: {said}"
+    return [text]
