@@ -14,8 +14,8 @@ from zarr.abc.store import ByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import FsspecStore, LocalStore, WrapperStore
 
-from torchsoft.datasets.config import SPLITS
 from torchsoft.datasets.files import Manifest, StoreError, digest, folder, read_record, record_key
+from torchsoft.datasets.subject import SPLITS
 from torchsoft.physics.arguments import whole
 
 DTYPES = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
