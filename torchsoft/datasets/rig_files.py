@@ -265,7 +265,7 @@ class RigOfFile(Subject):
     @property
     def constants(self) -> dict[str, Any]:
         rig = self.template
-        names = {own: name for name, own in rig.aliases.items()}
+        names: dict[str, str] = {own: name for name, own in rig.aliases.items()}
         values = {names.get(own, own): x for own, x in rig.description()["parameters"].items()}
         return {name: x for name, x in values.items() if name not in self.config.parameters}
 
