@@ -265,8 +265,9 @@ class RigOfFile(Subject):
     @property
     def constants(self) -> dict[str, Any]:
         rig = self.template
-        names: dict[str, str] = {own: name for name, own in rig.aliases.items()}
-        values = {names.get(own, own): x for own, x in rig.description()["parameters"].items()}
+        names = {own: name for name, own in rig.aliases.items()}
+        parameters: dict[str, Any] = rig.description()["parameters"]
+        values = {names.get(own, own): x for own, x in parameters.items()}
         return {name: x for name, x in values.items() if name not in self.config.parameters}
 
     @property
