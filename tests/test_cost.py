@@ -10,9 +10,9 @@ from unittest import mock
 
 import pytest
 
-from torchsoft import PadMesh, Parameters
+from torchsoft import PadMesh, Parameters, SoftGrasp
 from torchsoft.cli import main
-from torchsoft.cost import Cost, Costly, agree, duration, row_memory, step_seconds
+from torchsoft.cost import Cost, Costly, agree, duration, rig_row, rig_step
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.generate import cost
 from torchsoft.physics.mesh import unit_compliance
@@ -58,12 +58,12 @@ def test_times_are_said_in_their_unit() -> None:
 
 
 def test_a_step_costs_more_on_a_finer_mesh_and_with_derivatives() -> None:
-    usual = step_seconds(Parameters())
+    usual = rig_step(SoftGrasp())
     assert 1e-4 < usual < 2e-4
-    assert step_seconds(Parameters().override({"pad.elements_x": 480})) > 8 * usual
-    assert step_seconds(Parameters(), differentiated=True) > 2 * usual
-    assert step_seconds(Parameters().override({"pad.fidelity": "inertial"})) > 5 * usual
-    assert row_memory(Parameters()) * 2**30 > 8 * 4 * 242
+    assert rig_step(SoftGrasp(Parameters().override({"pad.elements_x": 480}))) > 8 * usual
+    assert rig_step(SoftGrasp(), differentiated=True) > 2 * usual
+    assert rig_step(SoftGrasp(Parameters().override({"pad.fidelity": "inertial"}))) > 5 * usual
+    assert rig_row(SoftGrasp()) * 2**30 > 8 * 4 * 242
 
 
 @pytest.mark.parametrize(

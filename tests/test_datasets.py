@@ -750,9 +750,45 @@ def test_it_pickles_small_and_is_read_by_forked_workers_from_any_store(partial: 
             torch.testing.assert_close(got, torch.stack([x[name] for x in plain]))
 
 
+def test_windows_in_memory_streamed_and_read_one_by_one_are_the_same(partial: str) -> None:
+    """With each sweep in another order, and with workers that share the shards out."""
+    names, how = ["disc_position", "pad.E"], {"window": 5, "stride": 3, "dtype": torch.float32}
+    held, read = reading(partial, names, **how), reading(partial, names, **how, memory=0.0)
+    assert (held.fits, read.fits) == (True, False)
+    assert held.size == 3 * 4 * (91 * 2 + 1)
+    for i in range(0, len(held), 7):
+        torch.testing.assert_close(held[i], read[i], rtol=0, atol=0)
+    held[0]["disc_position"].zero_()
+    assert bool(held[0]["disc_position"].any())  # what is given is the user's own
+    wanted = {(int(x["trajectory"]), int(x["start"])): x["disc_position"] for x in held}
+    stream = read.streamed(shards=1, seed=3)
+    for workers in (0, 2):
+        loader = DataLoader(stream, num_workers=workers, timeout=60 * (workers > 0))
+        orders = []
+        for _ in range(2):
+            sweep = list(loader)
+            found = [(int(x["trajectory"]), int(x["start"])) for x in sweep]
+            assert sorted(found) == sorted(wanted)
+            for one, x in zip(found, sweep):
+                torch.testing.assert_close(x["disc_position"][0], wanted[one], rtol=0, atol=0)
+            orders.append(found)
+        assert orders[0] != orders[1]
+
+
+def test_windows_come_fast_from_memory(partial: str) -> None:
+    """Shuffled, two thousand a second and more on one core."""
+    windows = reading(partial, ["disc_position", "control_force", "pad.E"], window=20, stride=1)
+    began, count = time.process_time(), 0
+    while time.process_time() - began < 0.5:
+        for batch in DataLoader(windows, batch_size=64, shuffle=True):
+            count += len(batch["start"])
+    assert count / (time.process_time() - began) > 2000
+
+
 @pytest.mark.parametrize(
     ("names", "how", "message"),
     [
+        ([], {"memory": -1.0}, "`memory` must be a number of GiB, 0 or more"),
         (["disc_pose"], {}, r"no numbers named 'disc_pose'; known: .*disc_position"),
         ([], {"window": 92}, "`window` must be 1 to 91"),
         *(([], {name: value}, f"`{name}` must be a whole number from 1 on, but is {value}")

@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from torchsoft.datasets.config import Config, Range
+from torchsoft.datasets.config import Config
+from torchsoft.datasets.distributions import Range
 from torchsoft.datasets.generate import main
 from torchsoft.tables import InvalidTable
 

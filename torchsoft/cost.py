@@ -8,7 +8,7 @@ import os
 import sys
 from typing import NamedTuple
 
-from torchsoft.paper.parameters import Parameters
+from torchsoft.physics.rig import Rig
 
 LONG = 3600.0
 """Work that takes longer than this [s] needs the user's word."""
@@ -60,13 +60,15 @@ def agree(cost: Cost, yes: bool, help: str) -> None:
     raise Costly(f"{cost.sentence}; {help}, or say --yes to begin")
 
 
-def step_seconds(p: Parameters, differentiated: bool = False) -> float:
-    """Time of one step [s] of the paper's rig; `differentiated` with sensitivities by a few
-    parameters."""
-    surface, free, _ = p.pad.mesh.counts()
-    inertial = p.pad.fidelity == "inertial"
-    plain = step_time(surface, p.pad.elements_x * p.contact.points, free if inertial else 0)
-    return plain * (DIFFERENTIATED[inertial] if differentiated else 1.0)
+def rig_step(rig: Rig, differentiated: bool = False) -> float:
+    """Time of one step [s] of a rig; `differentiated` with sensitivities by a few parameters."""
+    seconds = 0.0
+    for pad in rig.pads.values():
+        points = len(pad.point_nodes) if pad.points else 0
+        inertial = len(pad.mesh.free) if pad.inertial else 0
+        own = 0.5 * step_time(len(pad.mesh.surface), points, inertial)
+        seconds += own * (DIFFERENTIATED[pad.inertial] if differentiated else 1.0)
+    return seconds
 
 
 def step_time(surface: int, points: int, inertial: int) -> float:
@@ -82,10 +84,10 @@ def steps_per_second(rtol: float) -> float:
     return 3700.0 * (1e-5 / rtol) ** 0.3
 
 
-def row_memory(p: Parameters) -> float:
-    """Memory [GiB] of one row of a run: states, forces, displacements and energies."""
-    nodes = (p.pad.elements_x + 1) * (p.pad.elements_y if p.pad.fidelity == "inertial" else 1)
-    return row_bytes(nodes, p.pad.elements_x * p.contact.points) / 2**30
+def rig_row(rig: Rig) -> float:
+    """Memory [GiB] of one row of a run of a rig: states, forces, displacements and energies."""
+    pads = [(pad.nodes, len(pad.point_nodes)) for pad in rig.pads.values()]
+    return 0.5 * sum(row_bytes(*one) for one in pads) / 2**30
 
 
 def row_bytes(nodes: int, points: int) -> float:

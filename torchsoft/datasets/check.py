@@ -12,17 +12,21 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from torchsoft.datasets.config import SPLITS, Config
+from torchsoft.datasets.config import Config
 from torchsoft.datasets.files import MANIFEST, Manifest, StoreError, filesystem, keys, record_key
 from torchsoft.datasets.reader import Vouched, open_dataset
 from torchsoft.datasets.schema import not_finite, variables
 from torchsoft.datasets.simulation import points, task
+from torchsoft.datasets.subject import SPLITS
 from torchsoft.files import PARTIAL
 from torchsoft.plot.figures import save
 from torchsoft.tables import line
 
 MOTIONS = {"disc_position": 0, "bracket_position": 1, "control_force": 1}
 """Variables that the picture shows over time, and which of their components."""
+
+MOST = 3
+"""Trajectories that it shows, of every kind of motion."""
 
 
 def check(url: str) -> Iterator[str]:
@@ -161,12 +165,12 @@ def check_physics(config: Config, one: dict[str, Any]) -> Iterator[str]:
             f"energy residual is {relative:.2g} of the energy injected, above "
             f"{config.ledger_tolerance}"
         )
-    for pad in ("lower", "upper"):
-        force = one[f"normal_force_{pad}"]
+    for name in (name for name in one if name.startswith("normal_force_")):
+        force, contact = one[name], f"contact_{name.removeprefix('normal_force_')}"
         if (force < 0).any():
-            yield f"normal_force_{pad} pulls"
-        if ((force > 0) & (one[f"contact_{pad}"] == 0)).any():
-            yield f"normal_force_{pad} acts where contact_{pad} is 0"
+            yield f"{name} pulls"
+        if ((force > 0) & (one[contact] == 0)).any():
+            yield f"{name} acts where {contact} is 0"
 
 
 def summary(url: str, data: xr.Dataset) -> str:
@@ -182,13 +186,16 @@ def summary(url: str, data: xr.Dataset) -> str:
 
 
 def figure(data: xr.Dataset, config: Config) -> Figure:
-    """Each parameter over the next by split, failures crossed; trajectories of each kind; some
-    sound motions of each kind."""
-    ranged = {name.replace("/", "_over_"): r for name, r in config.parameters.items()} | {
-        "grasp_depth": config.grasp_depth
+    """Each parameter over the next by split, failures crossed; trajectories of each kind of motion
+    and split; some sound motions."""
+    ranged: dict[str, Any] = {
+        name.replace("/", "_over_"): r for name, r in config.parameters.items()
     }
+    if config.rig is None:
+        ranged["grasp_depth"] = config.grasp_depth
+    by = [name for name in ("kind", "split") if name in data]
     names, rows = list(ranged), -(-len(ranged) // 4)
-    table = data[[*names, "kind", "split", "failed"]].to_dataframe().reset_index()
+    table = data[[*names, *by, "failed"]].to_dataframe()[[*names, *by, "failed"]].reset_index()
     table["split"] = table["split"].where(table["failed"] == 0, "failed")
     fig = Figure(figsize=(13, 2.9 * (rows + 1)), layout="constrained")
     fig.suptitle(f"{config.title}: {len(table)} trajectories, {table['failed'].sum()} failed")
@@ -202,16 +209,33 @@ def figure(data: xr.Dataset, config: Config) -> Figure:
         ax.set(xlabel=label, ylabel=other, xscale=ranged[x].scale, yscale=ranged[y].scale)
     for ax in panels.flat[len(names) : -4]:
         ax.set_axis_off()
-    table.groupby(["kind", "split"]).size().unstack().plot.bar(
+    counts = table.groupby(by).size()
+    (counts.unstack() if len(by) > 1 else counts).plot.bar(
         stacked=True, ax=panels[-1, 0], ylabel="trajectories [1]"
     )
-    some = table[table["failed"] == 0].groupby("kind").head(3).index
-    for ax, (name, axis) in zip(panels[-1, 1:], MOTIONS.items()):
-        ax.plot(data.time, data[name][some, :, axis].T, lw=0.7)
-        ax.set(xlabel="time [s]", ylabel=f"{name}, {'xy'[axis]} [{data[name].units}]")
+    sound = table[table["failed"] == 0]
+    some = (sound.groupby("kind").head(MOST) if "kind" in by else sound.head(MOST)).index
+    for ax, name in zip(panels[-1, 1:], moving(data, config)):
+        series, axis = data[name], "xy"[MOTIONS.get(name, 0)]
+        series = series.sel(axis=axis) if "axis" in series.dims else series
+        ax.plot(data.time, series[some].T, lw=0.7)
+        ax.set(xlabel="time [s]", ylabel=f"{name}, {axis} [{data[name].units}]" if name in MOTIONS
+               else f"{name} [{data[name].units}]")  # fmt: skip
     for ax in fig.axes:
         ax.tick_params(axis="x", labelsize=7, which="both", rotation=20)
     return fig
+
+
+def moving(data: xr.Dataset, config: Config) -> list[str]:
+    """Names of the three series that the picture shows: of a rig file the liveliest, each over its
+    own largest value."""
+    if config.rig is None:
+        return list(MOTIONS)
+    names = list(config.subject.signals)
+    values = data[names].isel(trajectory=np.flatnonzero(data.failed == 0)[:MOST])
+    spread = {name: float(one.std() / max(float(abs(one).max()), 1e-300))
+              for name, one in values.items()}  # fmt: skip
+    return sorted(names, key=lambda name: -spread[name])[:3]
 
 
 def main(arguments: list[str] | None = None) -> int:

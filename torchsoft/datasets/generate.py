@@ -18,14 +18,13 @@ from typing import Any
 from tqdm import tqdm
 
 from torchsoft import threads
-from torchsoft.cost import RUN, Cost, agree, row_memory, step_seconds, steps_per_second
+from torchsoft.cost import RUN, Cost, agree, rig_row, rig_step, steps_per_second
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.files import StoreError
 from torchsoft.datasets.schema import variables
 from torchsoft.datasets.simulation import points, simulate_task, task
 from torchsoft.datasets.writer import Store, open_or_create
 from torchsoft.processes import local_processes
-from torchsoft.scenario import SETTLE
 from torchsoft.tables import line
 
 CLUSTER = 16
@@ -41,32 +40,28 @@ interpreter's lock."""
 COARSE = 5e-3
 """Steps longer than this [s] get a note."""
 
-FOUND = 6
-"""Runs of the grasp that finding its force takes."""
-
 HELP = "take fewer trajectories, a looser rtol or a shorter duration"
 
 
 def cost(config: Config, workers: int) -> Cost:
     """Of the whole dataset, made by that many workers."""
-    p, at_once = config.physics({}, config.grasp_depth.low), max(min(workers, config.shards), 1)
-    seconds = config.duration
-    if config.feed_forward == "found":
-        seconds += FOUND * (p.scenario.grasp_time + SETTLE)
-    if config.step is not None:
-        steps = seconds / config.sample_interval * math.ceil(config.sample_interval / config.step)
+    subject, at_once = config.subject, max(min(workers, config.shards), 1)
+    seconds, step = config.duration + subject.prelude, subject.steps.get("step")
+    if step is not None:
+        steps = seconds / config.sample_interval * math.ceil(config.sample_interval / step)
     else:  # an output between two steps takes half the time of a step
-        steps = seconds * steps_per_second(config.steps["rtol"]) + 0.5 * config.samples
+        rtol = subject.steps.get("rtol") or 10 * subject.steps["atol"]
+        steps = seconds * steps_per_second(rtol) + 0.5 * config.samples
     kept = sum(  # of one trajectory [GiB]
         v.kept.itemsize * math.prod(v.shape[1:]) / 2**30 for v in variables(config).values()
     )
     shard = 2 * kept * min(
         config.trajectories_per_shard, config.trajectories
-    ) + config.samples * row_memory(p)
-    design = 8 * 2 * config.trajectories * (len(config.parameters) + 8) / 2**30
+    ) + config.samples * rig_row(subject.template)
+    design = 8 * 2 * config.trajectories * subject.drawn / 2**30
     return Cost(
         steps=config.trajectories * steps,
-        seconds=config.trajectories * (steps * step_seconds(p) + RUN) / at_once,
+        seconds=config.trajectories * (steps * rig_step(subject.template) + RUN) / at_once,
         memory=design + shard * at_once,
         disk=kept * config.trajectories,
     )

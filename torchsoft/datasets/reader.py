@@ -2,24 +2,31 @@
 written so is refused."""
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import torch
 import xarray as xr
 from torch import Tensor
-from torch.utils.data import Dataset
+from torch.utils.data import Dataset, IterableDataset, get_worker_info
 from zarr.abc.store import ByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import FsspecStore, LocalStore, WrapperStore
 
-from torchsoft.datasets.config import SPLITS
+from torchsoft.cost import machine_memory
 from torchsoft.datasets.files import Manifest, StoreError, digest, folder, read_record, record_key
+from torchsoft.datasets.subject import SPLITS
 from torchsoft.physics.arguments import whole
 
 DTYPES = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
 """What numbers may be given as."""
+
+HELD = 0.25
+"""Part of the machine's memory that windows take by default at the most."""
+
+ALL = slice(None)
 
 
 class Vouched(WrapperStore[Store]):
@@ -97,26 +104,29 @@ def open_dataset(url: str, *, unfinished: bool = False) -> xr.Dataset:
 
 
 class Trajectories(Dataset[dict[str, Tensor]]):
-    """Windows of the trajectories of one split, read on access.
+    """Windows of the trajectories of one split, from memory where they fit.
 
     Item i holds every variable of `variables` in SI units, a series as (window, ...) and a number
     of the trajectory as (), in one of `DTYPES`, besides `trajectory` and `start`, its origin.
     `window` is a number of samples, the whole run by default; windows of a trajectory begin every
     `stride` samples, `window` by default. Failed simulations are left out, and trajectories of
-    unfinished shards too where `unfinished` says so. The object is small, can be pickled, and opens
-    the store in each process for itself, forked ones included. Each of these reads a file whole
-    when it first touches it, to hold it against its digest.
+    unfinished shards too where `unfinished` says so.
+
+    Variables that take less than `memory` [GiB], a quarter of the machine's by default, are read
+    at once, and forked processes share them; others are read item by item, which is slow in any
+    order, or in one sweep by `streamed`. The object is small when it is pickled, and opens the
+    store in each process for itself, forked ones included. Each of these reads a file whole when
+    it first touches it, to hold it against its digest.
 
     Raises `ValueError` for an unknown variable or split, another dtype, or a window or stride that
     does not fit, and `StoreError` for a dataset that is damaged or unfinished; the same when a
-    damaged file is first touched, and `ValueError` for an item with a number that is too large for
-    the dtype.
+    damaged file is first touched, and `ValueError` for a number that is too large for the dtype.
     """
 
     def __init__(
         self, url: str, variables: Sequence[str], *, split: str | None = None,
         window: int | None = None, stride: int | None = None, dtype: torch.dtype = torch.float64,
-        unfinished: bool = False,
+        unfinished: bool = False, memory: float | None = None,
     ) -> None:  # fmt: skip
         self.url, self.variables, self.dtype, self.unfinished = (
             str(url),
@@ -155,6 +165,17 @@ class Trajectories(Dataset[dict[str, Tensor]]):
         if split is not None:
             usable &= arrays["split"].values == split
         self.trajectories = np.flatnonzero(usable)
+        if memory is not None and not memory >= 0:
+            raise ValueError(f"`memory` must be a number of GiB, 0 or more, but is {memory!r}")
+        most = HELD * machine_memory() if memory is None else memory
+        self.fits = self.size <= most * 2**30
+        self._held = self._read(self.trajectories) if self.fits else None
+
+    @property
+    def size(self) -> int:
+        """Memory [B] of the variables of all its trajectories."""
+        one = sum(int(np.prod(self.data.variables[name].shape[1:])) for name in self.variables)
+        return one * len(self.trajectories) * self.dtype.itemsize
 
     @property
     def data(self) -> xr.Dataset:
@@ -167,7 +188,7 @@ class Trajectories(Dataset[dict[str, Tensor]]):
         return self._opened[os.getpid()]
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_opened": {}}
+        return self.__dict__ | {"_opened": {}, "_held": None}
 
     def __len__(self) -> int:
         return len(self.trajectories) * len(self.starts)
@@ -176,18 +197,84 @@ class Trajectories(Dataset[dict[str, Tensor]]):
         if not -len(self) <= index < len(self):
             raise IndexError(f"index {index} is out of range for {len(self)} windows")
         which, window = divmod(index % len(self), len(self.starts))
+        if self.fits and self._held is None:  # in a process that was spawned
+            self._held = self._read(self.trajectories)
         trajectory, start = int(self.trajectories[which]), self.starts[window]
+        if self._held is not None:
+            return self._item(self._held, which, trajectory, start)
+        at = slice(start, start + self.window)
+        return self._item(self._read(self.trajectories[[which]], at), 0, trajectory, start, 0)
+
+    def streamed(self, *, shards: int = 4, seed: int = 0) -> "Streamed":
+        """All windows once a sweep, each file read once, for sets that do not fit in memory: so
+        many `shards` are read at a time, in random order, and their windows shuffled."""
+        return Streamed(self, whole("shards", shards, 1), whole("seed", seed, 0))
+
+    def _item(
+        self, held: dict[str, Tensor], row: int, trajectory: int, start: int, at: int | None = None
+    ) -> dict[str, Tensor]:
+        """A window of row `row` of what was read, which begins there at `at`, `start` by
+        default."""
+        first = start if at is None else at
         item = {"trajectory": torch.tensor(trajectory), "start": torch.tensor(start)}
-        at = {"trajectory": trajectory, "time": slice(start, start + self.window)}
-        for name in self.variables:
-            given = torch.from_numpy(
-                np.array(self.data.variables[name].isel(at, missing_dims="ignore"), dtype=float)
-            )
-            item[name] = given.to(self.dtype)
-            lost = given[item[name].isinf() & given.isfinite()]
-            if len(lost):
-                raise ValueError(
-                    f"`{name}` of trajectory {trajectory} holds {float(lost[0]):.3g}, which "
-                    f"{self.dtype} cannot; take a wider `dtype`"
-                )
+        for name, values in held.items():
+            part = values[row]
+            item[name] = (part[first : first + self.window] if self._timed[name] else part).clone()
         return item
+
+    @cached_property
+    def _timed(self) -> dict[str, bool]:
+        return {name: "time" in self.data.variables[name].dims for name in self.variables}
+
+    def _read(self, trajectories: np.ndarray[Any, Any], at: slice = ALL) -> dict[str, Tensor]:
+        """Variables of some trajectories, of a stretch of time, shard by shard. Raises `ValueError`
+        for a number that the dtype cannot hold."""
+        size, out = self._shard_size, dict[str, Tensor]()
+        for name in self.variables:
+            variable, parts = self.data.variables[name], list[Tensor]()
+            for shard in np.unique(trajectories // size):
+                here = trajectories[trajectories // size == shard]
+                where = {"trajectory": slice(int(here[0]), int(here[-1]) + 1), "time": at}
+                rows = np.asarray(variable.isel(where, missing_dims="ignore").values)
+                given = torch.from_numpy(np.array(rows[here - here[0]], dtype=float))
+                parts.append(given.to(self.dtype))
+                lost = parts[-1].isinf() & given.isfinite()
+                if bool(lost.any()):
+                    raise ValueError(
+                        f"`{name}` of trajectory {int(here[lost.nonzero()[0, 0]])} holds "
+                        f"{float(given[lost][0]):.3g}, which {self.dtype} cannot; take a wider "
+                        "`dtype`"
+                    )
+            out[name] = torch.cat(parts) if parts else torch.empty(0, dtype=self.dtype)
+        return out
+
+    @cached_property
+    def _shard_size(self) -> int:
+        return Manifest.read(self.url).layout.trajectories_per_shard
+
+
+class Streamed(IterableDataset[dict[str, Tensor]]):
+    """The windows of `Trajectories` in one sweep, shuffled within some shards at a time; workers of
+    a `DataLoader` share the shards out. Every sweep has an order of its own, which follows from
+    `seed`, and with workers from torch's seed too."""
+
+    def __init__(self, windows: Trajectories, shards: int, seed: int) -> None:
+        self.windows, self.shards, self.seed, self.sweep = windows, shards, seed, 0
+
+    def __len__(self) -> int:
+        return len(self.windows)
+
+    def __iter__(self) -> Iterator[dict[str, Tensor]]:
+        windows, info = self.windows, get_worker_info()
+        worker, of = (0, 1) if info is None else (info.id, info.num_workers)
+        sweep = self.sweep if info is None else info.seed - info.id  # torch's, anew every sweep
+        shuffle = np.random.default_rng((self.seed, sweep))
+        self.sweep += 1
+        shard = windows.trajectories // windows._shard_size
+        order = shuffle.permutation(np.unique(shard))[worker::of]
+        for i in range(0, len(order), self.shards):
+            here = windows.trajectories[np.isin(shard, order[i : i + self.shards])]
+            held, count = windows._read(here), len(windows.starts)
+            for k in shuffle.permutation(len(here) * count).tolist():
+                row, window = divmod(k, count)
+                yield windows._item(held, row, int(here[row]), windows.starts[window])

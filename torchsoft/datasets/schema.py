@@ -1,34 +1,44 @@
 """Every array of a dataset: name, dimensions, unit, meaning and type."""
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from torchsoft.channels import PADS, VARIABLES
-from torchsoft.datasets.config import RATIO, Config
-from torchsoft.paper.parameters import Parameters
+from torchsoft.physics.energy import stores
+from torchsoft.solve.progress import Integrals
 
-KEPT = tuple(name for name in VARIABLES if name not in ("time", "angular_momentum"))
-"""Variables of the rig's channels that a dataset keeps of every trajectory."""
+if TYPE_CHECKING:
+    from torchsoft.datasets.config import Config
+    from torchsoft.datasets.subject import Subject
 
-STORES = ("strain_L", "strain_U", "normal_springs", "tangential_springs", "disc", "spin", "bracket")
 
-SERIES = ("trajectory", "time")
+class Signal(NamedTuple):
+    """A series of every trajectory: unit, meaning, and the channels that are its components."""
 
-SINGLE = {
-    "grasp_depth": ("m", "set-point of the compression of both pads together in the grasp"),
-    "grasp_force": ("N", "grasping force fed forward"),
-    "steps": ("1", "steps of the stepper", "int64"),
-    "newton_iterations": ("1", "Newton iterations of all steps", "int64"),
-    "energy_residual_rel": ("1", "largest energy residual over the energy injected"),
-    "failed": ("1", "1 where the simulation failed: its series are NaN", "uint8"),
-    "failure_time": ("s", "when it failed; NaN where it did not, or could not begin"),
-    "reason": ("1", "why it failed; empty where it did not", "str"),
-    "kind": ("1", "kind of motion", "str"),
-    "split": ("1", "train, validation or test", "str"),
+    unit: str
+    meaning: str
+    channels: tuple[str, ...]
+
+
+class Label(NamedTuple):
+    """A number or text of every trajectory: unit, meaning and type."""
+
+    unit: str
+    meaning: str
+    dtype: str = "float64"
+
+
+RUN = {
+    "steps": Label("1", "steps of the stepper", "int64"),
+    "newton_iterations": Label("1", "Newton iterations of all steps", "int64"),
+    "energy_residual_rel": Label("1", "largest energy residual over the energy injected"),
+    "failed": Label("1", "1 where the simulation failed: its series are NaN", "uint8"),
+    "failure_time": Label("s", "when it failed; NaN where it did not, or could not begin"),
+    "reason": Label("1", "why it failed; empty where it did not", "str"),
 }
-"""Unit, meaning and type of the numbers and texts of a trajectory, parameters aside."""
+SPLIT = {"split": Label("1", "train, validation or test", "str")}
+"""Numbers and texts of every trajectory of any rig."""
 
 
 @dataclass(frozen=True)
@@ -57,59 +67,86 @@ class Variable:
         return {"O": "", "f": np.nan}.get(self.kept.kind, 0)
 
 
-def energies(config: Config) -> dict[str, tuple[str, tuple[str, ...]]]:
+def energies(subject: "Subject") -> dict[str, tuple[str, tuple[str, ...]]]:
     """Dimension of each kind of energy, and its parts by their names in a run."""
-    kinetic = ("kinetic_L", "kinetic_U") if config.fixed.get("pad.fidelity") == "inertial" else ()
+    integrals = Integrals(subject.template)
+    active = tuple(name for name in integrals.supplied if name in integrals.active)
     return {
-        "stored": ("store", (*STORES, *kinetic)),
-        "dissipated": ("resistor", ("pad_L", "pad_U", "contact_dashpots", "slip")),
-        "supplied": ("source", ("control_x", "control_y", "gravity")),
+        "stored": ("store", stores(subject.template)),
+        "dissipated": ("resistor", integrals.dissipated),
+        "supplied": ("source", active),
     }
 
 
-def variables(config: Config) -> dict[str, Variable]:
-    """Everything that is kept of a trajectory, by name."""
-    elements = int(config.fixed.get("pad.elements_x", Parameters().pad.elements_x))
-    points = int(config.fixed.get("contact.points", 0))
-    nodes, node = (elements * points, "contact point") if points else (elements + 1, "surface node")
+def nodal(subject: "Subject") -> dict[str, Variable]:
+    """What is kept of every contact point: forces by contacts, displacements by pads."""
+    config, rig, out = subject.config, subject.template, dict[str, Variable]()
+    series = {"trajectory": config.trajectories, "time": config.samples}
+    precision = config.node_precision
+    for pad, surface in subject.surfaces.items():
+        point = "contact point" if rig.pads[pad].points else "surface node"
+        per = f"each {point} of the {surface} pad"
+        where = series | {f"{surface}_surface": len(rig.pads[pad].point_nodes)}
+        for contact, name in subject.touching(pad).items():
+            out[f"normal_force_{name}"] = Variable(where, "N", f"normal force at {per}", precision)
+            out[f"friction_force_{name}"] = Variable(
+                where, "N", f"friction force at {per}", precision
+            )
+            body = rig.contacts[contact].body
+            meaning = f"1 where the {body} penetrates {per}, else 0"
+            out[f"contact_{name}"] = Variable(where, "1", meaning, "uint8")
+        meaning = f"displacement of {per}"
+        out[f"displacement_{surface}"] = Variable(where | {"axis": 2}, "m", meaning, precision)
+    return out
+
+
+def arrays(subject: "Subject") -> dict[str, Variable]:
+    """Everything that is kept of a trajectory, by name. Raises `ValueError` for names that two
+    arrays would have."""
+    config, out = subject.config, dict[str, Variable]()
     single = {"trajectory": config.trajectories}
     series = single | {"time": config.samples}
-    axis, precision = {"axis": 2}, config.node_precision
-    out = dict[str, Variable]()
-    for name in KEPT:
-        unit, meaning, symbols = VARIABLES[name]
-        out[name] = Variable(series | axis if len(symbols) > 1 else series, unit, meaning)
-    for pad in PADS.values():
-        per, where = f"each {node} of the {pad} pad", series | {f"{pad}_surface": nodes}
-        out[f"normal_force_{pad}"] = Variable(where, "N", f"normal force at {per}", precision)
-        out[f"friction_force_{pad}"] = Variable(where, "N", f"friction force at {per}", precision)
-        out[f"contact_{pad}"] = Variable(
-            where, "1", f"1 where the disc penetrates {per}, else 0", "uint8"
-        )
-        out[f"displacement_{pad}"] = Variable(
-            where | axis, "m", f"displacement of {per}", precision
-        )
-    for kind, (dimension, parts) in energies(config).items():
+    for name, (unit, meaning, keys) in subject.signals.items():
+        out[name] = Variable(series | {"axis": 2} if len(keys) > 1 else series, unit, meaning)
+    more = nodal(subject) if config.nodal else {}
+    for kind, (dimension, parts) in energies(subject).items():
         meaning = "energy stored" if kind == "stored" else f"{kind} since t = 0"
-        out[f"{kind}_energy"] = Variable(
+        more[f"{kind}_energy"] = Variable(
             series | {dimension: len(parts)}, "J", meaning, components=parts
         )
-    out["injected_energy"] = Variable(
+    more["injected_energy"] = Variable(
         series, "J", "positive part of what the sources supplied since t = 0"
     )
-    out["energy_residual"] = Variable(series, "J", "stored - supplied + dissipated since t = 0")
-    table = Parameters().table() | {
-        RATIO: {"unit": "1", "meaning": "ratio of the friction coefficients"}
-    }
-    for name in (*config.parameters, *(["contact.mu_k"] if RATIO in config.parameters else [])):
-        row = table[name]
-        out[name.replace("/", "_over_")] = Variable(
-            single, row["unit"], f"parameter: {row['meaning']}"
-        )
-    return out | {name: Variable(single, *rest) for name, rest in SINGLE.items()}
+    more["energy_residual"] = Variable(series, "J", "stored - supplied + dissipated since t = 0")
+    labels = (subject.labels, RUN, subject.words, SPLIT)
+    rows = [
+        more,
+        *({name: Variable(single, *one) for name, one in some.items()} for some in labels),
+    ]
+    coordinates = {"time", "trajectory", "axis", *subject.columns()}
+    for some in rows:
+        for name, variable in some.items():
+            if name in out:
+                raise ValueError(taken(name))
+            out[name] = variable
+    if twice := sorted(coordinates & out.keys()):
+        raise ValueError(taken(twice[0]))
+    return out
 
 
-def not_finite(config: Config, row: dict[str, Any]) -> list[str]:
+def taken(name: str) -> str:
+    return (
+        f"two arrays of the dataset would be called `{name}`; call the body's symbol, the "
+        "actuator, the contact or the motion otherwise in the rig file"
+    )
+
+
+def variables(config: "Config") -> dict[str, Variable]:
+    """Everything that is kept of a trajectory, by name."""
+    return config.subject.variables
+
+
+def not_finite(config: "Config", row: dict[str, Any]) -> list[str]:
     """Names of the arrays that are not finite in a trajectory, unless it is marked as failed."""
     known = (
         name

@@ -14,7 +14,6 @@ from zarr.core.buffer import Buffer
 from zarr.core.buffer.cpu import Buffer as Content
 from zarr.storage import MemoryStore
 
-from torchsoft.channels import PADS
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.files import (
     MANIFEST,
@@ -33,8 +32,6 @@ from torchsoft.datasets.files import (
 )  # fmt: skip
 from torchsoft.datasets.schema import not_finite, variables
 from torchsoft.files import PARTIAL, finite, remove_partials
-from torchsoft.paper.parameters import Parameters
-from torchsoft.paper.rig import SoftGrasp
 
 SMALL = (ZstdCodec(level=3), Crc32cCodec())
 LARGE = (BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"), Crc32cCodec())
@@ -171,22 +168,23 @@ def laid_out(config: Config) -> dict[str, bytes]:
             attributes=attributes, fill_value=int(name == "failed") or variable.empty, **how,
             # what was never written counts as failed
         )  # fmt: skip
-    pads = SoftGrasp(Parameters().override(config.fixed)).pads
-    lower, upper = (pads[key].point_positions[:, 0].numpy() for key in PADS)
-    columns: dict[str, tuple[Any, str, str]] = {
-        "time": (np.arange(config.samples) * config.sample_interval, "s", "time since the start"),
-        "lower_surface": (lower, "m", "x of the lower pad's surface nodes, undeformed"),
-        "upper_surface": (upper, "m", "x of the upper pad's, relative to the bracket's centre"),
-        "trajectory": (
-            np.arange(config.trajectories),
-            "1",
-            "number of the trajectory in the design",
+    trajectories = np.arange(config.trajectories)
+    columns: dict[str, tuple[tuple[str, ...], Any, str, str]] = {
+        "time": (
+            ("time",), np.arange(config.samples) * config.sample_interval, "s",
+            "time since the start",
         ),
-        "axis": (np.array(["x", "y"], np.dtypes.StringDType()), "1", "names of the axes"),
-    }
-    for name, (values, unit, meaning) in columns.items():
+        **config.subject.columns(),
+        "trajectory": (
+            ("trajectory",), trajectories, "1", "number of the trajectory in the design"
+        ),
+        "axis": (
+            ("axis",), np.array(["x", "y"], np.dtypes.StringDType()), "1", "names of the axes"
+        ),
+    }  # fmt: skip
+    for name, (dimensions, values, unit, meaning) in columns.items():
         group.create_array(
-            name, data=values, chunks=values.shape, dimension_names=(name,), compressors=SMALL,
+            name, data=values, chunks=values.shape, dimension_names=dimensions, compressors=SMALL,
             attributes={"units": unit, "long_name": meaning}, config={"write_empty_chunks": True},
         )  # fmt: skip
     with warnings.catch_warnings():
@@ -210,12 +208,7 @@ def manifest(config: Config, content: dict[str, bytes]) -> Manifest:
         seed=config.seed,
         config_hash=config.hash,
         config=finite(config.model_dump(mode="json")),
-        parameters=finite(
-            {
-                name: row["value"]
-                for name, row in Parameters().override(config.fixed).table().items()
-            }
-        ),
+        parameters=finite(config.subject.constants),
         layout=Layout(shards=config.shards, trajectories_per_shard=size, files=tuple(files)),
         digests={key: digest(data) for key, data in sorted(content.items())},
     )

@@ -67,6 +67,15 @@ def stored(
     return {rig.renamed.get(name, name): value for name, value in energies.items()}
 
 
+def stores(rig: Rig) -> tuple[str, ...]:
+    """Names of what `stored` gives, in its order."""
+    names = [f"strain_{name}" for name in rig.pads] + ["normal_springs", "tangential_springs"]
+    for name, axes in rig.layout.free.items():
+        names += [name] * any(axis < 2 for axis in axes) + [f"{name}_spin"] * (2 in axes)
+    names += [f"kinetic_{name}" for name, pad in rig.pads.items() if pad.inertial]
+    return tuple(rig.renamed.get(name, name) for name in names)
+
+
 def dissipated(rig: Rig, state: State, graph: Evaluation) -> dict[str, Tensor]:
     """Powers [W] that the R elements take out, each shaped like the batch and never negative."""
     powers, dashpots, slip = {}, 0.0, 0.0

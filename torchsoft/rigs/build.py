@@ -162,16 +162,16 @@ class RigFile(Group):
     def from_toml(cls, path: str | Path) -> Self:
         """Read from a TOML file. Raises `ValueError` in one sentence with the file and the field,
         and `OSError`."""
-        file = from_toml(path, cls.from_tree)
-        file._folder = Path(path).parent
-        return file
+        return from_toml(path, lambda tree: cls.from_tree(tree, Path(path).parent))
 
     @classmethod
-    def from_tree(cls, tree: Any) -> Self:
-        """From what TOML makes of a file. Raises `ValueError`."""
+    def from_tree(cls, tree: Any, folder: Path = Path()) -> Self:
+        """From what TOML makes of a file that lies in a folder. Raises `ValueError`."""
         if isinstance(tree, dict) and "motion" in tree:
             tree = tree | {"motion": flattened(tree["motion"])}
-        return cls.model_validate(tree)
+        file = cls.model_validate(tree)
+        file._folder = folder
+        return file
 
     def override(self, **groups: dict[str, Any]) -> Self:
         """Another file with some fields replaced: `override(outputs={"duration": 0.1},

@@ -16,12 +16,11 @@ import numpy as np
 from pydantic import TypeAdapter
 
 from torchsoft.channels import CHANNELS, MEASURED, SETPOINTS
-from torchsoft.cost import DIFFERENTIATED, RUN, Cost, row_bytes, step_time, steps_per_second
+from torchsoft.cost import RUN, Cost, rig_row, rig_step, steps_per_second
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp, apart
 from torchsoft.physics.material import KINDS, StandardLinearSolid
 from torchsoft.physics.motion import Reference
-from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
 from torchsoft.sysid.columns import PAPER, Tables, read_tables
@@ -122,23 +121,6 @@ def cost(
         seconds=max(sum(seconds) / at_once, max(seconds)),
         memory=sum(memory[-at_once:]),
     )
-
-
-def rig_step(rig: Rig, differentiated: bool) -> float:
-    """Time of one step [s] of a rig; `differentiated` with sensitivities by a few parameters."""
-    seconds = 0.0
-    for pad in rig.pads.values():
-        points = len(pad.point_nodes) if pad.points else 0
-        inertial = len(pad.mesh.free) if pad.inertial else 0
-        own = 0.5 * step_time(len(pad.mesh.surface), points, inertial)
-        seconds += own * (DIFFERENTIATED[pad.inertial] if differentiated else 1.0)
-    return seconds
-
-
-def rig_row(rig: Rig) -> float:
-    """Memory [GiB] of one row of a run of a rig."""
-    pads = [(pad.nodes, len(pad.point_nodes)) for pad in rig.pads.values()]
-    return 0.5 * sum(row_bytes(*one) for one in pads) / 2**30
 
 
 def one_by_one(costs: Iterable[Cost]) -> Cost:

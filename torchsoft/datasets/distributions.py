@@ -1,0 +1,167 @@
+"""Distributions of the numbers that differ between trajectories: functions of a place u in [0, 1]
+of the design."""
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
+
+from pydantic import (
+    Discriminator,
+    Field,
+    SerializerFunctionWrapHandler,
+    Tag,
+    model_serializer,
+    model_validator,
+)
+from scipy.special import ndtr, ndtri
+
+from torchsoft.excitation import Frequency, Time
+from torchsoft.tables import LISTED, Table
+
+T = TypeVar("T", bound=float)
+
+WIDTH = 4.0
+"""Standard deviations from the mean at which a normal distribution is cut by default."""
+
+SURE = 1e-12
+"""Standard deviation over the width of the interval below which quantiles are rounding."""
+
+
+class Range(Table, Generic[T]):
+    """From `low` to `high`, uniformly in the value or in its logarithm."""
+
+    low: T
+    high: T
+    scale: Literal["linear", "log"] = "linear"
+
+    @model_validator(mode="after")
+    def _is_ordered(self) -> Self:
+        if self.low > self.high:
+            raise ValueError(f"low = {self.low} exceeds high = {self.high}")
+        if self.scale == "log" and self.low <= 0:
+            raise ValueError(f"a logarithmic range needs low > 0, but low = {self.low}")
+        return self
+
+    def at(self, u: float) -> float:
+        """The value at u in [0, 1]."""
+        low, high = self.low, self.high
+        if self.scale == "log":
+            value = math.exp(math.log(low) + u * (math.log(high) - math.log(low)))
+            return min(max(value, low), high)  # the ends are not rounded beyond themselves
+        return low + u * (high - low)
+
+    def ends(self, where: str) -> dict[str, float]:
+        """Both ends by what messages call them."""
+        return {f"{where}.low": self.low, f"{where}.high": self.high}
+
+
+class Lengths(Range[Annotated[float, Field(ge=1e-9, le=10.0)]]):
+    """A range of lengths [m]."""
+
+
+class Times(Range[Time]):
+    """A range of times [s]."""
+
+
+class Frequencies(Range[Frequency]):
+    """A range of frequencies [Hz]."""
+
+
+class Related(Table):
+    """A number that is drawn; with `ratio_to` the parameter is so many times the one of that
+    name."""
+
+    ratio_to: str | None = None
+
+    @model_serializer(mode="wrap")
+    def _only_what_is_said(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {key: x for key, x in handler(self).items() if key != "ratio_to" or x is not None}
+
+
+class Uniform(Range[float], Related):
+    """From `low` to `high`, uniformly in the value or in its logarithm."""
+
+
+class Normal(Related):
+    """About `mean` with the standard deviation `sd`, cut at `low` and `high`, four standard
+    deviations away if not given."""
+
+    mean: float
+    sd: float = Field(gt=0)
+    low: float = math.nan
+    high: float = math.nan
+    scale: ClassVar[Literal["linear"]] = "linear"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _is_cut(cls, data: Any) -> Any:
+        given = data if isinstance(data, Mapping) else {}
+        mean, sd = (given.get(key) for key in ("mean", "sd"))
+        if not isinstance(mean, int | float) or not isinstance(sd, int | float):
+            return data
+        return {"low": mean - WIDTH * sd, "high": mean + WIDTH * sd} | dict(data)
+
+    @model_validator(mode="after")
+    def _is_ordered(self) -> Self:
+        if not self.low < self.high:
+            raise ValueError(f"low = {self.low} should be below high = {self.high}")
+        below, above = self._tails
+        if not above - below > SURE:
+            raise ValueError(
+                f"next to nothing of mean = {self.mean}, sd = {self.sd} lies between low = "
+                f"{self.low} and high = {self.high}"
+            )
+        return self
+
+    @property
+    def _tails(self) -> tuple[float, float]:
+        """Probabilities of the normal distribution below both ends."""
+        ends = (self.low - self.mean) / self.sd, (self.high - self.mean) / self.sd
+        return float(ndtr(ends[0])), float(ndtr(ends[1]))
+
+    def at(self, u: float) -> float:
+        """The quantile at u in [0, 1]."""
+        below, above = self._tails
+        value = self.mean + self.sd * float(ndtri(below + u * (above - below)))
+        return min(max(value, self.low), self.high)
+
+    def ends(self, where: str) -> dict[str, float]:
+        """Both ends by what messages call them."""
+        return {f"{where}.low": self.low, f"{where}.high": self.high}
+
+
+class Choice(Related):
+    """One of the numbers `choices`, each as likely as the others."""
+
+    choices: Annotated[tuple[float, ...], LISTED] = Field(min_length=1, max_length=10_000)
+    scale: ClassVar[Literal["linear"]] = "linear"
+
+    @property
+    def low(self) -> float:
+        return min(self.choices)
+
+    @property
+    def high(self) -> float:
+        return max(self.choices)
+
+    def at(self, u: float) -> float:
+        """The number at u in [0, 1]."""
+        return self.choices[min(int(u * len(self.choices)), len(self.choices) - 1)]
+
+    def ends(self, where: str) -> dict[str, float]:
+        """Every number by what messages call it."""
+        return {f"{where}.choices.{i}": x for i, x in enumerate(self.choices)}
+
+
+def distribution(given: Any) -> str:
+    """Which distribution a table states, by its keys."""
+    keys = given if isinstance(given, Mapping) else getattr(type(given), "model_fields", ())
+    return "choice" if "choices" in keys else "normal" if {"mean", "sd"} & {*keys} else "uniform"
+
+
+Distribution = Annotated[
+    Annotated[Uniform, Tag("uniform")]
+    | Annotated[Normal, Tag("normal")]
+    | Annotated[Choice, Tag("choice")],
+    Discriminator(distribution),
+]
