@@ -4,7 +4,7 @@ reference, its state at the start, and the times of its outputs."""
 import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Piecewise, Reference
 from torchsoft.physics.parts import COORDINATES, coordinate_unit
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.statics import NoEquilibrium, resting, standing
+from torchsoft.physics.statics import BuiltRig, NoEquilibrium, resting, standing
 from torchsoft.physics.validity import sound
 from torchsoft.quantity import Gravity, Quantity, Time
 from torchsoft.rigs.control import ActuatorTable, ControllerTable, Loop
@@ -129,15 +129,6 @@ class SolverTable(Group):
                 "step and rtol (or atol) each say which steps to take; give one of them"
             )
         return self
-
-
-class BuiltRig(NamedTuple):
-    """A rig with what it follows, its state y0 (size,) at the start, and the times t (T,) [s] of
-    the outputs."""
-
-    rig: Rig
-    y0: Tensor
-    t: Tensor
 
 
 class RigFile(Group):
@@ -394,7 +385,7 @@ class RigFile(Group):
         return ".".join([group, part, *last] if part else [group])
 
     @torch.no_grad()
-    def build(self) -> BuiltRig:
+    def build(self) -> BuiltRig[Rig]:
         """What the file describes, ready for `simulate(rig, t, y0=y0)`.
 
         Pads are settled around the bodies where these start. Raises `ValueError` with the field's
