@@ -218,7 +218,11 @@ def test_a_rehearsal_says_what_an_experiment_would_identify(folder: Path) -> Non
             ("run.csv",),
             "a rehearsal makes its own data: leave .*run.csv out",
         ),
-        (replaced("F_left_x.n", "F_lft_x.n"), (), "`F_lft_x` is not a channel of the rig of `rehearsal`; known: x_disc"),
+        (
+            replaced("F_left_x.n", "F_lft_x.n"),
+            (),
+            "`F_lft_x` is not a channel of the rig of `rehearsal`; known: x_disc",
+        ),
         (replaced("duration = 0.6", "duration = 0"), (), "rehearsal.duration"),
     ],
 )

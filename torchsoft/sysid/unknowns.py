@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from torchsoft.quantity import near
 from torchsoft.sysid.initial_state import BOUNDS, PREFIX
 from torchsoft.sysid.recording import REACH, Array, Recording
 from torchsoft.tables import Table, line, shown
@@ -256,8 +257,7 @@ class Coordinates:
                     )
             if name not in given:
                 raise ValueError(
-                    f"unknowns: `{line(name, 80)}` cannot be identified; what can: "
-                    f"{', '.join(given)}"
+                    f"unknowns: `{line(name, 80)}` cannot be identified; {near(name, given)}"
                 )
             if u.ratio_to is not None and (u.ratio_to not in given or u.ratio_to == name):
                 raise ValueError(
