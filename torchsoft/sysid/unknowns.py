@@ -256,6 +256,13 @@ class Coordinates:
                         f"unknowns: the rig of recording `{without}` has no `{line(one, 80)}`"
                     )
             if name not in given:
+                tensors = dict(recordings[0].rig.named_parameters())
+                several = tensors.get(recordings[0].rig.aliases.get(name, name))
+                if several is not None and several.ndim:
+                    raise ValueError(
+                        f"unknowns: `{line(name, 80)}` cannot be identified: it has "
+                        f"{several.numel()} numbers, and an unknown is one"
+                    )
                 raise ValueError(
                     f"unknowns: `{line(name, 80)}` cannot be identified; {near(name, given)}"
                 )
