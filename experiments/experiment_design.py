@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from torchsoft import Parameters
-from torchsoft.excitation import CATALOGUE, Excitation, Strokes
+from torchsoft.excitation import CATALOGUE, Excitation, Strokes, begin
 from torchsoft.experiment import markdown, options, write
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import RIG, Problem, Unknown, record
@@ -123,7 +123,7 @@ def assess(excitation: Excitation, p: Parameters, config: Config) -> tuple[Array
     """Whitened Jacobian (m, parameters), what finer steps add to the residuals (m,), and how far
     the Jacobian is, relatively, from a central difference along one direction. Raises
     `SimulationFailed`."""
-    recording = record("one", excitation, p, p, RIG, rtol=config.rtol, noise=0.0)
+    recording = record("one", begin(excitation, p), {}, RIG, rtol=config.rtol, noise=0.0)
     friction = 0.5 * (
         p.contact.mu_k + p.contact.mu_s
     )  # bounds that do not cross; nothing is searched here

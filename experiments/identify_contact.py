@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from torchsoft import Parameters
-from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes
+from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
 from torchsoft.experiment import COARSE, markdown, options, write
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, identify, record
 from torchsoft.sysid.problem import Residuals, StepsByName
@@ -136,15 +136,13 @@ def record_all(config: Config, noise: float) -> list[Recording]:
     """What the rig gives; the last one is to be predicted."""
     coarse = COARSE if config.smoke else {}
     nominal = Parameters().override({"contact.v_s": config.v_s} | coarse)
-    rig = nominal.override({**truths(config), **({"contact.mu_k": 0.5} if config.smoke else {})})
     if config.smoke:
         nominal = nominal.override({"contact.mu_k": 0.5})
     return [
         record(
             name,
-            e,
-            rig,
-            nominal,
+            begin(e, nominal),
+            truths(config),
             RIG,
             rtol=config.data_rtol,
             noise=noise,

@@ -31,7 +31,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from torchsoft import Coulomb, Parameters, Reference, SoftGrasp, StandardLinearSolid
-from torchsoft.excitation import Excitation, MultiSine, Press, Roll, Strokes
+from torchsoft.excitation import Excitation, MultiSine, Press, Roll, Strokes, begin
 from torchsoft.experiment import COARSE, markdown, options, timed, write
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Stage, Unknown, record
 from torchsoft.sysid.compare import Evidence, FittedLaw, compare, fitted
@@ -165,10 +165,11 @@ def draw(setting: str, number: int, seed: int) -> Case:
 def data(case: Case, noise: float) -> Recording:
     """What a rig with the true law gives; the true law's nominal rig is in it."""
     setting = SETTINGS[case.setting]
+    planned = begin(setting.excitation, NOMINAL)
+    planned = planned._replace(rig=BUILDS[case.law](planned.rig.settings, planned.rig.reference))
     return record(
-        "motion", setting.excitation, NOMINAL, NOMINAL, setting.sensors, rtol=DATA_RTOL,
-        noise=noise, seed=case.seed, build=BUILDS[case.law], values=case.truth,
-    )  # fmt: skip
+        "motion", planned, case.truth, setting.sensors, rtol=DATA_RTOL, noise=noise, seed=case.seed
+    )
 
 
 def problems(case: Case, recording: Recording, kind: type[Problem] = Problem) -> dict[str, Problem]:

@@ -367,7 +367,7 @@ def strokes(
         senses="bracket",
     )  # pyright: ignore[reportCallIssue]
     changes: dict[str, Any] = {"contact.v_s": 0.05} | (COARSE if config.smoke else {})
-    model, y0 = begin(e, Parameters().override(changes))
+    model, y0, _ = begin(e, Parameters().override(changes))
     t, start = grid(e.duration, 5e-4), 1000
     run = simulate(model, t[: start + 1], y0=y0, step=5e-4)
     rest = simulate(model, t[start:], y0=run.y[-1], step=5e-4)

@@ -111,13 +111,13 @@ def cut(case: str, config: Config) -> Cut:
     name, since = CUTS[case]
     nominal = Parameters().override({"contact.v_s": 0.05} | COARSE)
     planned = begin(CATALOGUE[name], nominal)
-    real = SoftGrasp(CATALOGUE[name].settings(nominal.override(TRUTH)), planned.model.reference)
+    real = SoftGrasp(CATALOGUE[name].settings(nominal.override(TRUTH)), planned.rig.reference)
     until = since + 0.5 if config.smoke else CATALOGUE[name].duration
     at = since + np.arange(0.0, until - since + 0.5 / RATE, 1.0 / RATE)
     t = torch.from_numpy(np.append(-AtRest().lead, at))
     run = simulate(real, t, y0=planned.y0, rtol=1e-2 * config.rtol)
     samples = {channel: (at, run[channel][1:].detach().numpy()) for channel in RIG}
-    given = SoftGrasp(planned.model.settings.override(known(config)), planned.model.reference)
+    given = SoftGrasp(planned.rig.settings.override(known(config)), planned.rig.reference)
     return Cut(Recording(case, given, samples), run.y[1].detach())
 
 

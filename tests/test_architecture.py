@@ -34,11 +34,11 @@ FLOWS = {
         synthetic fit plan setpoints prechecks
         residual_tests assumptions sensitivity profile posterior nuts estimate comparison
         result identification compare
-        columns configuration rig_recordings rehearsal measured
-        criterion planner design figures report .
+        criterion planner design
+        columns configuration rig_recordings rehearsal measured rig_design figures report .
     """,
     "rigs": "fields parts control motion geometry build course balance check written run .",
-    "cli": "results rigs identify material .",
+    "cli": "results rigs identify design material .",
     "solve.kernel": """
         table arrays objects . invoke linear inertia interface stage step run adjoint tangent build
     """,

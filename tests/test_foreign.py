@@ -14,9 +14,10 @@ from foreign import Numbers, Run
 from foreign.pad import compliance
 from foreign.step import CREEP, node
 
-from torchsoft import PadMesh, Parameters, Trajectory, simulate
-from torchsoft.excitation import Excitation, MultiSine, RunContext, begin
+from torchsoft import PadMesh, Parameters, SoftGrasp, Trajectory, simulate
+from torchsoft.excitation import Excitation, MultiSine, begin
 from torchsoft.physics.mesh import unit_compliance
+from torchsoft.physics.statics import BuiltRig
 
 SETTLE, STEP = 0.02, 20e-6
 SHAKEN = Excitation(
@@ -36,7 +37,7 @@ CHANNELS = (*POSES, "v_x", "omega", "F_x", "F_y")
 
 
 @cache
-def begun() -> RunContext:
+def begun() -> BuiltRig[SoftGrasp]:
     return begin(SHAKEN, Parameters().override(RIG))
 
 
@@ -44,13 +45,13 @@ def begun() -> RunContext:
 def strange(step: float, p: Numbers = OWN) -> Run:
     """The stranger's run, rows every millisecond; it begins shortly before the reference does."""
     t = step * np.arange(-round(SETTLE / step), round(SHAKEN.duration / step) + 1)
-    signals = begun().model.reference(torch.from_numpy(t), ("x_d", "y_d", "F_ff")).detach().numpy()
+    signals = begun().rig.reference(torch.from_numpy(t), ("x_d", "y_d", "F_ff")).detach().numpy()
     return foreign.simulate(p, t, signals, round(1e-3 / step))
 
 
 @cache
 def ours() -> Trajectory:
-    model, y0 = begun()
+    model, y0, _ = begun()
     return simulate(model, torch.from_numpy(strange(STEP).t), y0=y0, rtol=1e-7)
 
 

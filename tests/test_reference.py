@@ -99,7 +99,7 @@ def test_light_shaking_is_the_reference() -> None:
         CATALOGUE["light shaking"],
         reference["y_Br_start"],
     )  # to seven digits `apart`
-    model, y0 = begin(
+    model, y0, _ = begin(
         excitation,
         Parameters().override({"contact.v_s": 0.05}),
         grasp_force=reference["grasp_force"],

@@ -409,7 +409,7 @@ PARTS: list[tuple[Call, str]] = [
     (lambda: pushed()(0.0, torch.zeros(33, dtype=torch.float64)),
      "the reference has no signal `w`; it has none"),
     (lambda: coarse().parameter("pad.Young"),
-     r"`pad.Young` is not a parameter of this rig; known: .*pad\.E"),
+     r"`pad.Young` is not a parameter of this rig; near it: .*pad\.E"),
     (lambda: coarse().unpack(f64(0.0)), "`y` must be float64 of shape"),
     (lambda: coarse()(0.0, torch.zeros(376)), "`y` must be float64 of shape"),
     # verbs
@@ -511,7 +511,7 @@ RUNS: list[tuple[dict[str, Any], str]] = [
     (FORWARD | {"dy0": torch.zeros(3, 1).double()},
      r"`dy0` must have shape \(376, 1\), or more columns, but has"),
     (FORWARD | {"wrt": ["pad.E", "contact.K_x"]},
-     r"`contact.K_x` is not a parameter of this rig; known: .*contact.K_n"),
+     r"`contact.K_x` is not a parameter of this rig; near it: .*contact.K_n"),
     (FORWARD | {"wrt": []}, "gradient='forward' needs the parameters' names `wrt`, or directions "
                             "`dy0`"),
     (FORWARD | {"wrt": ["contact.epsilon"]},

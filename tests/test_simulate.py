@@ -294,15 +294,13 @@ def test_torchs_default_dtype_does_not_matter(dtype: torch.dtype) -> None:
         begun = begin(
             Excitation(motion=motion, duration=0.5, grasp_time=0.05, settle=0.02), coarse().settings
         )
-        run = simulate(begun.model, times(0.1, 6), y0=begun.y0, gradient="discrete")
+        run = simulate(begun.rig, times(0.1, 6), y0=begun.y0, gradient="discrete")
         forward = simulate(
-            begun.model, run.t, y0=begun.y0, gradient="forward", wrt=["pad.E", "pad.nu"]
+            begun.rig, run.t, y0=begun.y0, gradient="forward", wrt=["pad.E", "pad.nu"]
         )
-        gradients = torch.autograd.grad(
-            run["y_C"][-1], [begun.model.pad.E, begun.model.contact.K_t]
-        )
+        gradients = torch.autograd.grad(run["y_C"][-1], [begun.rig.pad.E, begun.rig.contact.K_t])
         oval = SoftGrasp(
-            begun.model.settings, shape=Ellipse(19.8e-3, 19.1e-3), friction=Coulomb(0.5, 0.4)
+            begun.rig.settings, shape=Ellipse(19.8e-3, 19.1e-3), friction=Coulomb(0.5, 0.4)
         )
         parts = [
             rest(oval),

@@ -70,12 +70,12 @@ FOUR = ("pad.E", "pad.tau", "contact.K_n", "contact.mu_s")
 @pytest.fixture(scope="module")
 def strokes() -> Recording:
     """Without noise, of parameters up to a half away from the nominal ones."""
-    return record("strokes", STROKES, TRUE, BASE, SENSORS, noise=0.0)
+    return record("strokes", begin(STROKES, BASE), TRUTH, SENSORS, noise=0.0)
 
 
 @pytest.fixture(scope="module")
 def shake() -> Recording:
-    return record("shake", SHAKE, TRUE, BASE, SENSORS, noise=0.0)
+    return record("shake", begin(SHAKE, BASE), TRUTH, SENSORS, noise=0.0)
 
 
 def four(**changes: Unknown) -> dict[str, Unknown]:
@@ -128,7 +128,7 @@ def test_jacobian_of_either_kind_of_pads_at_the_start_of_a_grasp(fidelity: str) 
     short = Excitation(
         motion=Strokes(travel=8e-3, stroke_time=0.1), duration=0.25, grasp_time=0.1, settle=0.0
     )
-    data = record("short", short, p.override({"pad.E": 0.9e6}), p, SENSORS)
+    data = record("short", begin(short, p), {"pad.E": 0.9e6}, SENSORS)
     unknowns = {"pad.E": Unknown(), "pad.nu": Unknown(low=0.4, high=0.49), "pad.tau": Unknown()}
     problem = Problem([data], SENSORS, unknowns)
     check_derivatives(problem, problem.coordinates.start, RTOL, 1e-5, h=3e-6)
@@ -181,7 +181,7 @@ def test_what_the_data_do_not_determine_is_not_a_number() -> None:
     gentle = Excitation(
         motion=Strokes(travel=1e-3, stroke_time=0.4), duration=0.9, senses="bracket"
     )
-    data = record("gentle", gentle, BASE, BASE, SENSORS, seed=1)
+    data = record("gentle", begin(gentle, BASE), {}, SENSORS, seed=1)
     answer = identify(
         Problem([data], SENSORS, {"pad.E": Unknown(), "contact.mu_k": Unknown()}), rtol=RTOL,
         plan=[Stage("all", ("gentle",), ("pad.E", "contact.mu_k"), RTOL)],
@@ -235,7 +235,7 @@ def shaking() -> Recording:
         duration=0.9,
         senses="bracket",
     )
-    return record("shaking", hard, BASE, BASE, SENSORS, rtol=1e-7, noise=0.0)
+    return record("shaking", begin(hard, BASE), {}, SENSORS, rtol=1e-7, noise=0.0)
 
 
 def test_a_tolerance_too_coarse_for_the_data_is_found_and_tightened(shaking: Recording) -> None:
@@ -370,7 +370,7 @@ def test_wrong_recordings_sensors_and_unknowns_are_refused(strokes: Recording) -
 
 def test_data_out_of_reach_name_the_recording() -> None:
     about_disc = STROKES.model_copy(update={"senses": "disc", "x_C0": 60e-3})
-    data = record("strokes", about_disc, BASE, BASE, SENSORS)
+    data = record("strokes", begin(about_disc, BASE), {}, SENSORS)
     problem = Problem(
         [data], SENSORS, {"pad.E": Unknown(nominal=4e4)}
     )  # so soft that the loop is unstable
@@ -455,7 +455,7 @@ def test_visible_drops_what_cannot_be_separated_from_the_others() -> None:
 def test_catalogue_begins_at_rest_and_can_be_written_down() -> None:
     for name, excitation in CATALOGUE.items():
         assert Excitation.model_validate_json(excitation.model_dump_json()) == excitation, name
-        model, y0 = begin(excitation, BASE, grasp_force=10.0)
+        model, y0, _ = begin(excitation, BASE, grasp_force=10.0)
         state = model.unpack(y0)
         assert not model.penetration("U", state).gt(0).any(), name
         assert model.penetration("L", state).gt(0).any(), name

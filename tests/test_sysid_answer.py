@@ -18,7 +18,7 @@ from conftest import COARSE
 from test_sysid_friction import Viscous
 
 from torchsoft import Parameters, SoftGrasp, simulate
-from torchsoft.excitation import Excitation, Strokes
+from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.physics.motion import Reference
 from torchsoft.sysid import (
     AtRest,
@@ -84,9 +84,8 @@ def example(kind: Any) -> Any:
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     """Two short grasps, one of them from a place that is not known well."""
-    truth = BASE.override({"contact.K_n": 1.6e5})
     recordings = [
-        record(name, GRASP, truth, BASE, SENSORS, rtol=1e-3, seed=seed)
+        record(name, begin(GRASP, BASE), {"contact.K_n": 1.6e5}, SENSORS, rtol=1e-3, seed=seed)
         for seed, name in enumerate(("first", "second"))
     ]
     recordings[1] = replace(recordings[1], start=AtRest(position_sd=2e-5))

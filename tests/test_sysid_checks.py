@@ -12,7 +12,7 @@ import torch
 from conftest import COARSE
 
 from torchsoft import Parameters
-from torchsoft.excitation import Excitation, Strokes
+from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
 from torchsoft.sysid.assumptions import (
     PLACE,
@@ -51,8 +51,10 @@ SENSORS = {
 RTOL = 1e-4
 
 
-def recorded(truth: Parameters = BASE, excitation: Excitation = STROKES) -> Recording:
-    return record("strokes", excitation, truth.override(TRUTH), BASE, SENSORS, rtol=1e-6, seed=4)
+def recorded(truth: dict[str, float] | None = None, excitation: Excitation = STROKES) -> Recording:
+    return record(
+        "strokes", begin(excitation, BASE), TRUTH | (truth or {}), SENSORS, rtol=1e-6, seed=4
+    )
 
 
 def checked(
@@ -132,12 +134,12 @@ def late(data: Recording) -> Recording:
         (late, "delay x_C", 1.0, "the data contradict that x_C has no unknown delay"),
         (
             lambda data: replace(data,
-            samples=recorded(BASE.override({"disc.inertia_ratio": 1.2})).samples),
+            samples=recorded({"disc.inertia_ratio": 1.2}).samples),
             "disc.inertia_ratio", 20.0, "the data contradict that disc.inertia_ratio is 1",
         ),
         pytest.param(
             lambda data: replace(data,
-            samples=recorded(BASE.override({"disc.radius": 19.39e-3})).samples), "disc.radius",
+            samples=recorded({"disc.radius": 19.39e-3}).samples), "disc.radius",
             0.103, "the data contradict that disc.radius is 0.01937", marks=pytest.mark.slow,
         ),
     ],
@@ -214,7 +216,7 @@ def far_off() -> tuple[Problem, np.ndarray, Residuals]:
     known = BASE.override(
         {"contact.mu_s": 0.1, "contact.mu_k": 0.07, "contact.v_s": 0.1, "contact.eta": 100.0}
     )
-    data = record("light", LIGHT, known.override(TRUTH), known, SENSORS, rtol=1e-5, noise=0.0)
+    data = record("light", begin(LIGHT, known), TRUTH, SENSORS, rtol=1e-5, noise=0.0)
     problem = Problem([made_by(coulomb(data), data)], SENSORS, {name: Unknown() for name in TRUTH})
     x, free = problem.coordinates.start + [0.5, -0.7], problem.coordinates.free
     at, _ = problem.freeze(Runner(problem.recordings), x, problem.names, RTOL, free)

@@ -9,7 +9,7 @@ from conftest import COARSE
 from test_sysid_noise import made
 
 from torchsoft import Parameters
-from torchsoft.excitation import Excitation, Strokes
+from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.residual_tests import parts, rewhitened
@@ -29,7 +29,7 @@ def sensors(colour: str = "white") -> dict[str, Sensor]:
 
 @pytest.fixture(scope="module")
 def exact() -> Recording:
-    return record("strokes", STROKES, BASE.override(TRUTH), BASE, sensors(), rtol=1e-6, noise=0.0)
+    return record("strokes", begin(STROKES, BASE), TRUTH, sensors(), rtol=1e-6, noise=0.0)
 
 
 def noisy(

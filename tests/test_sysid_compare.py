@@ -15,7 +15,7 @@ from test_experiments import experiment
 from test_sysid_friction import Viscous
 
 from torchsoft import Parameters, Profile, Reference, SoftGrasp
-from torchsoft.excitation import Excitation, Roll, Strokes
+from torchsoft.excitation import Excitation, Roll, Strokes, begin
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, record
 from torchsoft.sysid.compare import Density, compare, density, ratio, versus
 from torchsoft.sysid.comparison import LawFit, judged
@@ -180,18 +180,9 @@ def laws(recording: Recording, excitation: Excitation) -> dict[str, Problem]:
 def made(
     excitation: Excitation, build: Any, values: dict[str, float], noise: float = 1.0
 ) -> dict[str, Problem]:
-    recording = record(
-        "one",
-        excitation,
-        BASE,
-        BASE,
-        SENSORS,
-        build=build,
-        values=values,
-        rtol=1e-5,
-        noise=noise,
-        seed=1,
-    )
+    planned = begin(excitation, BASE)
+    planned = planned._replace(rig=build(planned.rig.settings, planned.rig.reference))
+    recording = record("one", planned, values, SENSORS, rtol=1e-5, noise=noise, seed=1)
     return laws(recording, excitation)
 
 

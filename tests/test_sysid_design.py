@@ -45,7 +45,7 @@ SENSORS = {name: RIG[name] for name in ("x_C", "theta", "y_Br", "F_x", "F_y")}
 
 @pytest.fixture(scope="session")
 def plan() -> Recording:
-    return record("plan", PLAN, P, P, SENSORS, rtol=1e-3, noise=0.0)
+    return record("plan", begin(PLAN, P), {}, SENSORS, rtol=1e-3, noise=0.0)
 
 
 @pytest.fixture(scope="session")
@@ -241,7 +241,7 @@ def test_a_designed_motion_tells_more(found: Design, problem: Problem) -> None:
 def test_a_design_is_an_excitation_in_a_file(found: Design, tmp_path: Path) -> None:
     excitation, path = found.excitation(PLAN), tmp_path / "motion.toml"
     path.write_text(excitation.to_toml(), encoding="utf-8")
-    again = begin(Excitation.from_toml(path), P).model.reference
+    again = begin(Excitation.from_toml(path), P).rig.reference
     t = torch.linspace(0, 0.3, 200, dtype=torch.float64)
     off = again(t, ["x_d", "y_d", "F_ff"]) - found.recording.rig.reference(
         t, ["x_d", "y_d", "F_ff"]
@@ -332,15 +332,8 @@ def test_draws_come_from_priors(plan: Recording, problem: Problem) -> None:
 
 def test_the_next_recording_is_predicted(plan: Recording, problem: Problem) -> None:
     """What a recording would add is what it does add; one that cannot be made comes last."""
-    roll = record(
-        "roll",
-        PLAN.model_copy(update={"motion": Strokes(travel=2e-3, stroke_time=0.1)}),
-        P,
-        P,
-        SENSORS,
-        rtol=1e-3,
-        noise=0.0,
-    )
+    strokes = PLAN.model_copy(update={"motion": Strokes(travel=2e-3, stroke_time=0.1)})
+    roll = record("roll", begin(strokes, P), {}, SENSORS, rtol=1e-3, noise=0.0)
     same, x = replace(plan, name="same"), problem.coordinates.start
     first, second = next_recording(problem, x, [roll, same], rtol=1e-3)
     assert first.gain >= second.gain > 0

@@ -3,6 +3,7 @@ like any other."""
 
 import importlib.util
 import pickle
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,11 +14,10 @@ from test_sysid import check_derivatives
 from torch import Tensor, nn
 
 from torchsoft import Parameters, Reference, SoftGrasp
-from torchsoft.excitation import Excitation, Strokes
+from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.physics.contact import SlipLaw
 from torchsoft.physics.shapes import parameter
 from torchsoft.sysid import Problem, Recording, Sensor, Stage, Unknown, identify, record
-from torchsoft.sysid.synthetic import Build
 
 BASE = Parameters().override(COARSE)
 SENSORS = {"x_C": Sensor(noise=1e-5), "theta": Sensor(noise=5e-4), "F_x": Sensor(noise=0.1)}
@@ -46,7 +46,7 @@ def rig(settings: Parameters, reference: Reference, alpha: float = 0.6) -> SoftG
     return SoftGrasp(settings, reference, friction=Viscous(alpha, 30.0))
 
 
-def built(recording: Recording, build: Build) -> Recording:
+def built(recording: Recording, build: Callable[[Parameters, Reference], SoftGrasp]) -> Recording:
     """The same samples, of another rig."""
     assert isinstance(recording.rig, SoftGrasp)
     return replace(recording, rig=build(recording.rig.settings, recording.rig.reference))
@@ -55,8 +55,9 @@ def built(recording: Recording, build: Build) -> Recording:
 @pytest.fixture(scope="module")
 def jerks() -> Recording:
     """Without noise, of the true law; the recording's own model has other numbers."""
-    truth = BASE.override({"pad.E": 0.9e6})
-    return record("jerks", JERKS, truth, BASE, SENSORS, noise=0.0, build=rig, values=TRUTH)
+    planned = begin(JERKS, BASE)
+    planned = planned._replace(rig=rig(planned.rig.settings, planned.rig.reference))
+    return record("jerks", planned, TRUTH | {"pad.E": 0.9e6}, SENSORS, noise=0.0)
 
 
 def test_its_parameters_are_found_beside_those_of_the_pads(jerks: Recording) -> None:

@@ -350,7 +350,9 @@ def made() -> tuple[Any, Recording]:
     excitation = Excitation(motion=Strokes(travel=4e-3, stroke_time=0.15), duration=0.4,
         depth=1.2e-3, senses="bracket",
                             grasp_time=0.15, settle=0.0)  # fmt: skip
-    return script, record("short", excitation, script.TRUTH, script.NOMINAL, sensors, rtol=1e-4)
+    return script, record(
+        "short", begin(excitation, script.NOMINAL), script.TRUTH, sensors, rtol=1e-4
+    )
 
 
 def test_a_recording_survives_the_way_through_csv(
@@ -379,7 +381,10 @@ def test_the_examples_files_are_what_its_script_makes(made: tuple[Any, Recording
     case = load([EXAMPLE / "rolling.csv"], EXAMPLE / "rolling.toml")
     assert case.problem.names == ("rolling", "checking")
     assert {k: s.noise for k, s in case.problem.sensors.items()} == script.SENSORS
-    known_by_file, truth = paper_settings(case.problem.recordings[0]).table(), script.TRUTH.table()
+    known_by_file, truth = (
+        paper_settings(case.problem.recordings[0]).table(),
+        script.NOMINAL.override(script.TRUTH).table(),
+    )
     own = {"scenario.y_Br_grasp", "scenario.travel", "scenario.x_C0", "control.senses"}
     for name, row in truth.items():  # the configuration tells the truth, but for what is unknown
         if name not in case.problem.unknowns and name not in own:
@@ -397,7 +402,7 @@ def run() -> Trajectory:
     excitation = Excitation(
         motion=Strokes(), senses="bracket", grasp_time=0.05, settle=0.0, depth=1e-3
     )
-    model, y0 = begin(excitation, Parameters().override({"contact.v_s": 0.05}))
+    model, y0, _ = begin(excitation, Parameters().override({"contact.v_s": 0.05}))
     return simulate(model, torch.linspace(0, 0.06, 31, dtype=torch.float64), y0=y0, step=2e-3)
 
 

@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 
 from torchsoft import Parameters, Reference, SoftGrasp
 from torchsoft.diagnostic import Diagnostic
-from torchsoft.excitation import Excitation, MultiSine, Press, Strokes
+from torchsoft.excitation import Excitation, MultiSine, Press, Strokes, begin
 from torchsoft.physics.motion import Profile, Sampled
 from torchsoft.physics.parts import Actuator
 from torchsoft.sysid import RIG, Problem, Recording, Sensor, Unknown, record
@@ -52,9 +52,9 @@ MOTIONS = {
 def recordings() -> dict[str, Recording]:
     """What rigs with parameters far from the nominal ones give."""
     table = NOMINAL.table()
-    truth = NOMINAL.override({name: factor * table[name]["value"] for name, factor in FAR.items()})
+    truth = {name: factor * table[name]["value"] for name, factor in FAR.items()}
     return {
-        name: record(name, motion, truth, NOMINAL, SENSORS, seed=k, rtol=1e-4)
+        name: record(name, begin(motion, NOMINAL), truth, SENSORS, seed=k, rtol=1e-4)
         for k, (name, motion) in enumerate(MOTIONS.items())
     }
 

@@ -9,7 +9,7 @@ from closed_forms import WALL, ClosedForm, optimum
 from conftest import COARSE
 
 from torchsoft import Parameters
-from torchsoft.excitation import Excitation, Roll
+from torchsoft.excitation import Excitation, Roll, begin
 from torchsoft.sysid import RIG, Problem, Stage, Unknown, identify, record
 from torchsoft.sysid.fit import Combination, combinations
 from torchsoft.sysid.posterior import laplace
@@ -109,7 +109,7 @@ def test_profile_and_combination_of_stiffnesses_in_series(tmp_path: Path) -> Non
     sensors = {
         name: sensor.model_copy(update={"noise": 3 * sensor.noise}) for name, sensor in RIG.items()
     }
-    data = record("roll", roll, base, base, sensors, seed=1)
+    data = record("roll", begin(roll, base), {}, sensors, seed=1)
     problem = Problem([data], sensors, {"pad.E": Unknown(), "contact.K_n": Unknown()})
     result = identify(
         problem,

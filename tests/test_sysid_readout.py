@@ -27,7 +27,7 @@ from torchsoft import (
     SoftContact,
     simulate,
 )
-from torchsoft.excitation import Excitation, Strokes
+from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.sysid import (
     AtRest,
     Known,
@@ -59,7 +59,7 @@ FAULTY = {
 
 @pytest.fixture(scope="module")
 def strokes() -> Recording:
-    return record("strokes", STROKES, BASE.override({"pad.E": 0.9e6}), BASE, FAULTY)
+    return record("strokes", begin(STROKES, BASE), {"pad.E": 0.9e6}, FAULTY)
 
 
 def test_every_kind_of_coordinate_has_its_derivative(strokes: Recording) -> None:

@@ -20,7 +20,7 @@ from matplotlib.text import Text
 from test_sysid_answer import HOSTILE, example
 
 from torchsoft import Parameters
-from torchsoft.excitation import Excitation, Strokes
+from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.sysid import (
     AtRest,
     IdentificationResult,
@@ -65,7 +65,7 @@ def found() -> Found:
     """Two grasps, from which the viscosity of slip is not identifiable, and another one held
     out."""
     p = Parameters().override(COARSE)
-    truth = p.override({"contact.K_n": 1.6e5, "pad.E": 0.9e6})
+    truth = {"contact.K_n": 1.6e5, "pad.E": 0.9e6}
     sensors = {
         "theta": Sensor(noise=5e-4),
         "y_Br": Sensor(noise=1e-5, bias=1e-3),
@@ -77,7 +77,12 @@ def found() -> Found:
     depths = {HOSTILE: 1.2e-3, "shallow": 0.9e-3, "held": 1e-3}
     recordings = [
         record(
-            name, grasp.model_copy(update={"depth": depth}), truth, p, sensors, rtol=1e-3, seed=seed
+            name,
+            begin(grasp.model_copy(update={"depth": depth}), p),
+            truth,
+            sensors,
+            rtol=1e-3,
+            seed=seed,
         )
         for seed, (name, depth) in enumerate(depths.items())
     ]

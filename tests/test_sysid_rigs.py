@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,15 @@ from torchsoft.cli import main
 from torchsoft.physics.motion import Sampled
 from torchsoft.rigs.build import RigFile
 from torchsoft.solve.trajectory import Trajectory
-from torchsoft.sysid import identify, load_answer
+from torchsoft.sysid import (
+    Problem,
+    Sensor,
+    Unknown,
+    estimate_initial_state,
+    identify,
+    load_answer,
+    record,
+)
 from torchsoft.sysid.measured import load
 from torchsoft.sysid.rig_recordings import vocabulary
 
@@ -218,7 +227,11 @@ def test_a_rehearsal_says_what_an_experiment_would_identify(folder: Path) -> Non
             ("run.csv",),
             "a rehearsal makes its own data: leave .*run.csv out",
         ),
-        (replaced("F_left_x.n", "F_lft_x.n"), (), "the rig has no channel `F_lft_x`"),
+        (
+            replaced("F_left_x.n", "F_lft_x.n"),
+            (),
+            "`F_lft_x` is not a channel of the rig of `rehearsal`; known: x_disc",
+        ),
         (replaced("duration = 0.6", "duration = 0"), (), "rehearsal.duration"),
     ],
 )
@@ -229,3 +242,23 @@ def test_what_cannot_be_rehearsed_is_refused(
     files = [str(folder / name) for name in ("plan.toml", *more)]
     assert main(["rehearse", *files, "--out", str(folder / "out"), "--no-progress"]) == 2
     assert re.search(words, capsys.readouterr().err)
+
+
+@pytest.mark.slow
+def test_a_grasp_in_mid_air_says_that_its_poses_are_to_be_measured() -> None:
+    """Contact points touch and slip within the intervals of where it begins: finer steps are not
+    tried in vain."""
+    sensors = {name: Sensor(noise=sd) for name, sd in SENSORS.items()}
+    built = coarse(outputs={"duration": 2.0, "snapshots": []}).build()
+    made = record("lift", built, TRUTH, sensors, seed=1)
+    late = {c: (t[t >= 0.8], y[t >= 0.8]) for c, (t, y) in made.samples.items()}
+    begun = estimate_initial_state(replace(made, samples=late), sensors)
+    problem = Problem([begun], sensors, {name: Unknown() for name in TRUTH})
+    result = identify(problem, assumptions="trusted")
+    for name, value in TRUTH.items():
+        assert result[name].value == pytest.approx(value, rel=4 * result[name].relative_sd)
+    assert not result.converged
+    assert len(result.stages) <= 7
+    (said,) = result.notices
+    assert "not smooth in start." in said
+    assert "measure every coordinate of the bodies when the recording begins" in said

@@ -48,7 +48,7 @@ Cut = tuple[Recording, Tensor]
 @pytest.fixture(scope="module")
 def cut() -> Cut:
     """A recording without noise that begins in mid-roll, as though at rest, and the state there."""
-    model, y0 = begin(MOTION, Parameters().override(COARSE))
+    model, y0, _ = begin(MOTION, Parameters().override(COARSE))
     at = np.arange(SINCE, MOTION.duration, 5e-3)
     run = simulate(model, torch.from_numpy(np.append(-AtRest().lead, at)), y0=y0, rtol=1e-6)
     samples = {channel: (at, run[channel][1:].detach().numpy()) for channel in RIG}

@@ -7,7 +7,7 @@ a model at rest with the reference that its controllers follow.
 
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import torch
@@ -18,10 +18,14 @@ from torchsoft.paper.equilibrium import holding_force, press, rest
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp, apart
 from torchsoft.physics.motion import FADE, Knotted, Profile, Reference, Wave, Waves, wave
+from torchsoft.physics.statics import BuiltRig
 from torchsoft.tables import LISTED, SEED, Table, from_toml, toml_row
 
 MOST = 10_000
 """Strokes in one motion."""
+
+INTERVAL = 0.01
+"""Time [s] between outputs."""
 
 
 Length = Annotated[float, Field(ge=-10.0, le=10.0)]
@@ -218,13 +222,6 @@ CATALOGUE = {
 """Ready excitations by name, from gentle to hard; `experiments/experiment_design.py` ranks them."""
 
 
-class RunContext(NamedTuple):
-    """A model with its reference, and its state (size,) at the start."""
-
-    model: SoftGrasp
-    y0: Tensor
-
-
 def start(model: SoftGrasp, x: Tensor | None = None) -> Tensor:
     """State (size,): the disc at rest under its weight, the bracket at `apart`, so that its pad is
     clear of the disc by what the disc has sunk in. Differentiable in the model's parameters, and in
@@ -234,9 +231,11 @@ def start(model: SoftGrasp, x: Tensor | None = None) -> Tensor:
     return model.pack(state._replace(pose=state.pose | {"bracket": clear}))
 
 
-def begin(excitation: Excitation, p: Parameters, *, grasp_force: float | None = None) -> RunContext:
-    """A model with the parameters p about to be excited; `grasp_force` [N] is fed forward, by
-    default that of statics.
+def begin(
+    excitation: Excitation, p: Parameters, *, grasp_force: float | None = None
+) -> BuiltRig[SoftGrasp]:
+    """The rig with the parameters p about to be excited, with outputs every `INTERVAL`;
+    `grasp_force` [N] is fed forward, by default that of statics.
 
     Raises `ValueError` for an impossible grasp, `NoEquilibrium` where the disc finds no rest.
     """
@@ -247,7 +246,9 @@ def begin(excitation: Excitation, p: Parameters, *, grasp_force: float | None = 
     model.reference = reference(
         excitation, model, float(model.unpack(y0).pose["bracket"][1]), grasp_force
     )
-    return RunContext(model, y0)
+    end = excitation.duration
+    t = torch.linspace(0, end, max(1, round(end / INTERVAL)) + 1, dtype=torch.float64)
+    return BuiltRig(model, y0, t)
 
 
 def reference(

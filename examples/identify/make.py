@@ -12,16 +12,16 @@ import torch
 
 from torchsoft import Parameters
 from torchsoft.channels import CHANNELS
-from torchsoft.excitation import Chirp, Excitation, Strokes
+from torchsoft.excitation import Chirp, Excitation, Strokes, begin
 from torchsoft.sysid import Recording, Sensor, record
 
 HERE = Path(__file__).parent
 
 NOMINAL = Parameters().override({"contact.v_s": 0.05})
-TRUTH = NOMINAL.override(
-    {"contact.K_n": 1.6e5, "contact.mu_s": 0.6, "contact.mu_k": 0.5, "contact.R_t": 300.0,
-    "pad.E": 0.9e6, "pad.tau": 12e-3}
-)  # fmt: skip
+TRUTH = {
+    "contact.K_n": 1.6e5, "contact.mu_s": 0.6, "contact.mu_k": 0.5, "contact.R_t": 300.0,
+    "pad.E": 0.9e6, "pad.tau": 12e-3,
+}  # fmt: skip
 SENSORS = {"x_C": 10e-6, "theta": 0.5e-3, "x_Br": 10e-6, "y_Br": 10e-6, "F_x": 0.1, "F_y": 0.1}
 GRASP = {"duration": 1.2, "depth": 1.2e-3, "grasp_time": 0.25, "settle": 0.05, "senses": "bracket"}
 RECORDINGS = {
@@ -63,7 +63,7 @@ def write(recording: Recording, path: Path, digits: int = 7) -> None:
 
 def make(name: str, seed: int) -> Recording:
     sensors = {channel: Sensor(noise=noise) for channel, noise in SENSORS.items()}
-    return record(name, RECORDINGS[name], TRUTH, NOMINAL, sensors, seed=seed)
+    return record(name, begin(RECORDINGS[name], NOMINAL), TRUTH, sensors, seed=seed)
 
 
 if __name__ == "__main__":

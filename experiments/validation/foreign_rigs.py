@@ -127,7 +127,7 @@ class Order(NamedTuple):
 
 def planned(excitation: Excitation, smoke: bool) -> tuple[Parameters, Reference]:
     """What the laboratory has planned with the nominal numbers: settings and reference."""
-    model = begin(excitation, nominal(smoke)).model
+    model = begin(excitation, nominal(smoke)).rig
     return model.settings, model.reference
 
 

@@ -28,7 +28,7 @@ from scipy.signal import lfilter
 from tqdm import tqdm
 
 from torchsoft import Parameters
-from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes
+from torchsoft.excitation import CATALOGUE, Excitation, MultiSine, Strokes, begin
 from torchsoft.experiment import COARSE, markdown, options, write
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Stage, identify, record
 from torchsoft.sysid.estimate import Estimate, estimates
@@ -110,10 +110,9 @@ def exact(config: Config, truth: dict[str, float]) -> list[Recording]:
         name: CATALOGUE[name].model_copy(update={"duration": duration})
         for name, duration in shorter.items()
     }
-    rig = nominal.override(truth)
     motions = SHORT if config.smoke else motions
     return [
-        record(name, e, rig, nominal, RIG, rtol=1e-2 * config.rtol, noise=0.0)
+        record(name, begin(e, nominal), truth, RIG, rtol=1e-2 * config.rtol, noise=0.0)
         for name, e in motions.items()
     ]
 

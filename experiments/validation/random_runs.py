@@ -37,7 +37,6 @@ from time import monotonic, process_time, sleep
 from typing import Any, NamedTuple
 
 import numpy as np
-from torch import Tensor
 from tqdm import tqdm
 
 from torchsoft import NoEquilibrium, Parameters, SimulationFailed, SoftGrasp, simulate
@@ -47,13 +46,13 @@ from torchsoft.excitation import (
     MultiSine,
     Press,
     Roll,
-    RunContext,
     Strokes,
     begin,
 )
 from torchsoft.experiment import grid, markdown, options, write
 from torchsoft.paper.equilibrium import holding_force, press, rest
 from torchsoft.physics.motion import FADE
+from torchsoft.physics.statics import BuiltRig
 from torchsoft.processes import local_processes
 from torchsoft.scenario import reference
 from torchsoft.threads import parallel_map
@@ -124,10 +123,9 @@ def excitation(rng: np.random.Generator) -> Excitation:
 
 
 class Drawn(NamedTuple):
-    """A model and its start, its output times (T,) [s], and what it does."""
+    """A model, its start and its output times, and what it does."""
 
-    begun: RunContext
-    t: Tensor
+    begun: BuiltRig[SoftGrasp]
     motion: str
 
 
@@ -135,13 +133,13 @@ def draw(rng: np.random.Generator) -> Drawn:
     """A random run; raises `ValueError` or `NoEquilibrium` if it has no start."""
     wanted, p = excitation(rng), settings(rng)
     if rng.random() < 0.8:
-        return Drawn(begin(wanted, p), grid(wanted.duration), wanted.motion.kind)
+        return Drawn(begin(wanted, p), wanted.motion.kind)
     own = {"scenario.grasp_time": GRASP, "scenario.roll_time": 0.5, "scenario.travel": -2e-3}
     model = SoftGrasp(p.override(own))
     force = holding_force(model, press(model, model.settings.scenario.y_Br_grasp))
     y0 = rest(model).detach()
     model.reference = reference(model, y0, force)
-    return Drawn(RunContext(model, y0), grid(GRASP + SETTLE + MOVING), "grasp_and_roll")
+    return Drawn(BuiltRig(model, y0, grid(GRASP + SETTLE + MOVING)), "grasp_and_roll")
 
 
 REASONS = {
@@ -242,7 +240,7 @@ def outcome(drawn: Drawn, steps: dict[str, Any]) -> Outcome:
         began, ticked = monotonic(), process_time()
         try:
             run, end, said = (
-                simulate(drawn.begun.model, drawn.t, y0=drawn.begun.y0, **steps),
+                simulate(drawn.begun.rig, drawn.begun.t, y0=drawn.begun.y0, **steps),
                 FINISHED,
                 "",
             )

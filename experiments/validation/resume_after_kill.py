@@ -39,7 +39,7 @@ from tqdm import tqdm
 
 from torchsoft import Parameters
 from torchsoft.channels import CHANNELS
-from torchsoft.excitation import Excitation, Roll, Strokes
+from torchsoft.excitation import Excitation, Roll, Strokes, begin
 from torchsoft.experiment import COARSE, markdown, options, write
 from torchsoft.sysid import Recording, Sensor, record
 
@@ -55,7 +55,7 @@ MOTIONS = {
     "rolling": Excitation(motion=Roll(travel=6e-3), **GRASP),
 }
 NOMINAL = Parameters().override({"contact.v_s": 0.05, "contact.mu_k": 0.5} | COARSE)
-TRUTH = NOMINAL.override({"pad.E": 0.9e6, "pad.tau": 0.012, "contact.K_n": 1.6e5})
+TRUTH = {"pad.E": 0.9e6, "pad.tau": 0.012, "contact.K_n": 1.6e5}
 CONFIG = """
 [settings]
 pad.elements_x = 60
@@ -276,7 +276,7 @@ def run(config: Config) -> Result:
     config.out.mkdir(parents=True, exist_ok=True)
     for seed, (name, excitation) in enumerate(MOTIONS.items()):
         table(
-            record(name, excitation, TRUTH, NOMINAL, SENSORS, rtol=1e-5, seed=seed),
+            record(name, begin(excitation, NOMINAL), TRUTH, SENSORS, rtol=1e-5, seed=seed),
             config.out / f"{name}.csv",
         )
     (config.out / "rig.toml").write_text(CONFIG, encoding="utf-8")

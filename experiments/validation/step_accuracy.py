@@ -76,7 +76,7 @@ def motions(config: Config) -> dict[str, Motion]:
     stroke = Excitation(motion=Strokes(travel=2e-3, stroke_time=0.02), duration=0.54)
     if config.smoke:
         begun = begin(stroke, Parameters().override({"pad.elements_x": 60, "pad.elements_y": 2}))
-        return {"stroke of 2 mm in 20 ms": Motion(begun.model, begun.y0, grid(0.54, 0.005))}
+        return {"stroke of 2 mm in 20 ms": Motion(begun.rig, begun.y0, grid(0.54, 0.005))}
     made = grasp_and_roll(SoftGrasp(Parameters()), grasp_force=80.66)
     out = {"grasp and roll out": Motion(made.model, made.y0, grid(config.roll))}
     shaking = Excitation(
@@ -84,7 +84,7 @@ def motions(config: Config) -> dict[str, Motion]:
     )
     for name, excitation in (("light shaking", shaking), ("stroke of 2 mm in 20 ms", stroke)):
         begun = begin(excitation, Parameters())
-        out[name] = Motion(begun.model, begun.y0, grid(excitation.duration, 0.005))
+        out[name] = Motion(begun.rig, begun.y0, grid(excitation.duration, 0.005))
     return out
 
 

@@ -14,7 +14,7 @@ from torchsoft.datasets import generate as generation
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.generate import Serial, generate
 from torchsoft.datasets.simulation import simulate_task
-from torchsoft.excitation import Excitation, Strokes
+from torchsoft.excitation import Excitation, Strokes, begin
 from torchsoft.sysid import Problem, Sensor, Unknown, record
 
 EXAMPLE = ROOT / "examples" / "identify"
@@ -120,8 +120,7 @@ def problem() -> Problem:
     sensors = {"x_C": Sensor(noise=1e-5), "y_Br": Sensor(noise=1e-5), "F_y": Sensor(noise=0.1)}
     strokes = Strokes(travel=5e-3, stroke_time=0.15)
     motion = Excitation(motion=strokes, duration=0.4, senses="bracket")
-    stiffer = p.override({"pad.E": 0.9e6})
-    recorded = record("strokes", motion, stiffer, p, sensors, rtol=1e-3, seed=3)
+    recorded = record("strokes", begin(motion, p), {"pad.E": 0.9e6}, sensors, rtol=1e-3, seed=3)
     return Problem([recorded], sensors, {"pad.E": Unknown(nominal=1.1e6), "contact.K_n": Unknown()})
 
 

@@ -122,8 +122,8 @@ def run_briefly(p: Parameters) -> None:
 def excite_briefly(e: Excitation) -> None:
     """The grasp, and its reference to the end."""
     begun = begin(e, Parameters().override(COARSE))
-    follow = begun.model.follow(torch.linspace(0, e.duration, 101, dtype=torch.float64))
-    finite(begun.y0, follow, simulate(begun.model, BRIEFLY, y0=begun.y0, step=2e-3).y)
+    follow = begun.rig.follow(torch.linspace(0, e.duration, 101, dtype=torch.float64))
+    finite(begun.y0, follow, simulate(begun.rig, BRIEFLY, y0=begun.y0, step=2e-3).y)
 
 
 def design_briefly(config: Config) -> None:

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 
-from torchsoft.cli import identify, material, rigs
+from torchsoft.cli import design, identify, material, rigs
 from torchsoft.cli.results import failed, say
 
 GRACE = 1.5
@@ -63,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--version", action="version", version=f"torchsoft {version('torchsoft')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (rigs, identify, material):
+    for group in (rigs, identify, design, material):
         group.add_commands(commands)
     for stream in (sys.stdout, sys.stderr):  # a terminal that cannot show a sign gets its number
         if isinstance(stream, io.TextIOWrapper):

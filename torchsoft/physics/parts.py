@@ -236,9 +236,9 @@ class Actuator(nn.Module):
         (name,) = self.setpoints
         return name
 
-    def gain_unit(self, rate: bool) -> str:
-        """Unit of the effort per measured coordinate, or per its rate."""
-        return f"{self.effort_unit}{'.s' if rate else ''}/{coordinate_unit(self.measured)}"
+    def gain_unit(self, rate: bool, number: int = 0) -> str:
+        """Unit of the effort per measured coordinate `number`, or per its rate."""
+        return f"{self.effort_unit}{'.s' if rate else ''}/{coordinate_unit(self.measures[number])}"
 
     @property
     def effort_unit(self) -> str:
@@ -296,30 +296,47 @@ def names_of(field: str, given: str | Sequence[str]) -> tuple[str, ...]:
     return names
 
 
+Gains = Annotated[
+    Sequence[Sequence[float]],
+    Quantity("N/m, N.m/rad, N.s/m, N.m.s/rad", -1e12, 1e12, "gain of an effort"),
+]
+
+
 class StateFeedback(nn.Module):
     """Efforts K e of the errors e: set-points less coordinates, and their rates; without a
     set-point, less the coordinate.
 
     `gain` K (k, 2 m) has a row for each effort, and columns for the m coordinates and then their
-    rates: a regulator of linear theory. Raises `ValueError` for another shape.
+    rates: a regulator of linear theory. Its entries are scalar parameters, gain_1_1, gain_1_2, ...
+    of the first row. Raises `ValueError` for another shape.
     """
 
-    def __init__(self, gain: Sequence[Sequence[float]]) -> None:
+    def __init__(self, gain: Gains) -> None:
         super().__init__()
         rows = {len(row) for row in gain}
         if len(rows) != 1 or rows.pop() % 2:
             raise ValueError(
                 "a gain has rows of one length, of a number for each coordinate and for each rate"
             )
-        self.gain = nn.Parameter(
-            torch.tensor([[float(one) for one in row] for row in gain], dtype=torch.float64)
-        )
+        self.rows, self.columns = len(gain), len(gain[0])
+        for i, row in enumerate(gain, 1):
+            for j, one in enumerate(row, 1):
+                self.register_parameter(f"gain_{i}_{j}", parameter(one))
+
+    def matrix(self) -> Tensor:
+        """The matrix K (k, 2 m)."""
+        entries = [
+            getattr(self, f"gain_{i}_{j}")
+            for i in range(1, self.rows + 1)
+            for j in range(1, self.columns + 1)
+        ]
+        return torch.stack(entries).unflatten(0, (self.rows, self.columns))
 
     def forward(self, setpoints: Tensor, state: Tensor) -> Tensor:
         given, there = setpoints.unflatten(-1, (2, -1)), state.unflatten(-1, (2, -1))
         missing = there.shape[-1] - given.shape[-1]
         wanted = torch.cat((given, torch.zeros_like(there[..., :missing])), -1)
-        return (wanted - there).flatten(-2) @ self.gain.mT
+        return (wanted - there).flatten(-2) @ self.matrix().mT
 
 
 class OneEffort(nn.Module):

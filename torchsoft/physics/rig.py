@@ -17,10 +17,18 @@ from torchsoft.physics.contact import Frame, cross, interface_law, moving_frame,
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import Block, Junction, Port, Transformer, identity, net_efforts
 from torchsoft.physics.pads import Pad
-from torchsoft.physics.parts import COORDINATES, PD, Actuator, Body, Contact, law_name
+from torchsoft.physics.parts import (
+    COORDINATES,
+    PD,
+    Actuator,
+    Body,
+    Contact,
+    StateFeedback,
+    law_name,
+)
 from torchsoft.physics.shapes import parameter
 from torchsoft.physics.state import Layout, State
-from torchsoft.quantity import Gravity, Quantity, quantity_of
+from torchsoft.quantity import Gravity, Quantity, near, quantity_of
 
 GROUND = "ground"
 
@@ -213,8 +221,9 @@ class Rig(nn.Module):
         known = dict(self.named_parameters(remove_duplicate=False))
         found = known.get(self.names.get(name, name), known.get(name))
         if found is None:
-            shown = dict.fromkeys((*self.names, *dict(self.named_parameters())))
-            raise ValueError(f"`{name}` is not a parameter of this rig; known: {', '.join(shown)}")
+            mine = {own: other for other, own in self.names.items()}
+            names = [mine.get(own, own) for own, _ in self.named_parameters()]
+            raise ValueError(f"`{name}` is not a parameter of this rig; {near(name, names)}")
         return found
 
     def quantity(self, name: str) -> Quantity | None:
@@ -222,12 +231,16 @@ class Rig(nn.Module):
         owner, _, last = self.names.get(name, name).rpartition(".")
         part = self.get_submodule(owner)
         found = quantity_of(part, last)
-        loop = next((one for one in self.actuators.values() if one.law is part), None)
-        return found and (
-            replace(found, unit=loop.gain_unit(last == "Kd"))
-            if isinstance(part, PD) and loop
-            else found
-        )
+        users = [one for one in self.actuators.values() if part in one.modules()]
+        if found is None or not users:
+            return found
+        if isinstance(part, PD):
+            return replace(found, unit=users[0].gain_unit(last == "Kd"))
+        if not isinstance(part, StateFeedback):
+            return found
+        row, column = (int(one) - 1 for one in last.split("_")[-2:])
+        rate, number = divmod(column, len(users[row].measures))
+        return replace(found, unit=users[row].gain_unit(bool(rate), number))
 
     @property
     def ordered(self) -> dict[str, str]:

@@ -8,6 +8,7 @@ points' given stretches.
 """
 
 from collections.abc import Container, Mapping, Sequence
+from typing import Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -18,6 +19,8 @@ from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import State
 from torchsoft.physics.validity import check_array, check_points, check_values
+
+R = TypeVar("R", bound=Rig)
 
 RESIDUAL = 1e-13
 """Residual of an equilibrium [m], forces counted by the compliance they meet."""
@@ -34,6 +37,15 @@ the edge of a contact."""
 
 ITERATIONS = 200
 """Steps of the search at the most: a body may start that many strides above its pad."""
+
+
+class BuiltRig(NamedTuple, Generic[R]):
+    """A rig with the reference that it follows, its state y0 (size,) at the start, and the times t
+    (T,) [s] of the outputs, the last of which is the end of the motion."""
+
+    rig: R
+    y0: Tensor
+    t: Tensor
 
 
 class NoEquilibrium(RuntimeError):

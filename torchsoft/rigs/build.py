@@ -4,18 +4,19 @@ reference, its state at the start, and the times of its outputs."""
 import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple, Self, TypeVar
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 import torch
 from pydantic import Field, PrivateAttr, model_validator
 from torch import Tensor, nn
 
+from torchsoft.physics.material import Series
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.motion import Piecewise, Reference
 from torchsoft.physics.parts import COORDINATES, coordinate_unit
 from torchsoft.physics.rig import Rig
-from torchsoft.physics.statics import NoEquilibrium, resting, standing
+from torchsoft.physics.statics import BuiltRig, NoEquilibrium, resting, standing
 from torchsoft.physics.validity import sound
 from torchsoft.quantity import Gravity, Quantity, Time
 from torchsoft.rigs.control import ActuatorTable, ControllerTable, Loop
@@ -28,6 +29,9 @@ from torchsoft.tables import LISTED, from_toml, line
 M = TypeVar("M")
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+ENTRY = re.compile(r"(.+?)((?:_\d+)+)")
+"""Name of an entry of a list."""
+
 TAKEN = frozenset(dir(nn.ModuleDict()))
 """Names that parts of a torch module cannot have."""
 
@@ -131,15 +135,6 @@ class SolverTable(Group):
         return self
 
 
-class BuiltRig(NamedTuple):
-    """A rig with what it follows, its state y0 (size,) at the start, and the times t (T,) [s] of
-    the outputs."""
-
-    rig: Rig
-    y0: Tensor
-    t: Tensor
-
-
 class RigFile(Group):
     """A rig and its run. SI units throughout: m, kg, s, N, rad, Pa; 4.59e-3 is 4.59 mm. The model
     is planar: x to the right, y upwards, theta anticlockwise."""
@@ -175,14 +170,23 @@ class RigFile(Group):
 
     def override(self, **groups: dict[str, Any]) -> Self:
         """Another file with some fields replaced: `override(outputs={"duration": 0.1},
-        pads={"lower": {"elements_x": 30}})`. A table of another kind replaces the whole of the old
+        pads={"lower": {"elements_x": 30}})`. Entries of lists are counted from one: tau_2, or
+        gain_1_3, the third of the first row. A table of another kind replaces the whole of the old
         one. Raises `ValueError`."""
 
         def merged(old: Any, new: Any) -> Any:
             both = isinstance(old, dict) and isinstance(new, dict)
             if not both or new.get("kind", old.get("kind")) != old.get("kind"):
                 return new
-            return old | {key: merged(old.get(key), value) for key, value in new.items()}
+            out = dict(old)
+            for key, value in new.items():
+                entry = ENTRY.fullmatch(key)
+                if entry and key not in old and isinstance(old.get(entry[1]), list | tuple):
+                    places = [int(one) for one in entry[2].split("_")[1:]]
+                    out[entry[1]] = with_entry(key, out[entry[1]], places, value)
+                else:
+                    out[key] = merged(old.get(key), value)
+            return out
 
         file = type(self).model_validate(merged(self.model_dump(exclude_unset=True), groups))
         file._folder = self._folder
@@ -378,23 +382,31 @@ class RigFile(Group):
             gravity=self.gravity,
             symbols={name: one.symbol or name for name, one in self.bodies.items()},
         )
-        named = {self._own_name(*name.split(".")): name for name, _ in rig.named_parameters()}
+        named = {self._own_name(rig, *name.split(".")): name for name, _ in rig.named_parameters()}
         rig.aliases = {alias: name for alias, name in named.items() if alias != name}
         return rig
 
-    def _own_name(self, group: str, part: str = "", *rest: str) -> str:
+    def _own_name(self, rig: Rig, group: str, part: str = "", *rest: str) -> str:
         """What this file calls a parameter of its rig, such as "materials.silicone.E"."""
+        made = {a: name for name, one in self.controllers.items() for a in one.actuators(name)}
         if group == "pads" and rest[:1] == ("material",):
+            material = rig.pads[part].material
             group, part, rest = "materials", self.pads[part].material, rest[1:]
+            if isinstance(material, Series):
+                last = re.sub(rf"^{material.symbol}(?=_\d)", material.strength, rest[-1])
+                rest = (*rest[:-1], last)
         elif group == "contacts" and rest[:1] == ("law",):
             group, part, rest = "laws", self.contacts[part].law, rest[1:]
-        elif group == "actuators" and part in self.actuators and rest[:1] == ("law",):
-            rest = rest[1:]
+        elif part in made:
+            group, part = "controllers", made[part]
+            rest = tuple(one for one in rest if one not in ("law", "module", "feedback"))
+        elif group in ("actuators", "bodies"):
+            rest = tuple(one for one in rest if one not in ("law", "fixed"))
         last = ["inertia" if name == "own_inertia" else name for name in rest]
         return ".".join([group, part, *last] if part else [group])
 
     @torch.no_grad()
-    def build(self) -> BuiltRig:
+    def build(self) -> BuiltRig[Rig]:
         """What the file describes, ready for `simulate(rig, t, y0=y0)`.
 
         Pads are settled around the bodies where these start. Raises `ValueError` with the field's
@@ -469,6 +481,15 @@ class RigFile(Group):
                 too_stiff(self, rig) or f"bodies.{name}.start.{COORDINATES[axis]}: {error}"
             ) from None
         return {name: at.numpy() for name, at in found.items()}
+
+
+def with_entry(key: str, values: Any, places: list[int], value: Any) -> list[Any]:
+    """A list with another entry at `places`, counted from one. Raises `ValueError`."""
+    if not isinstance(values, list | tuple) or not 1 <= places[0] <= len(values):
+        raise ValueError(f"{key}: there is no such entry")
+    out, (first, *rest) = list(values), places
+    out[first - 1] = with_entry(key, values[first - 1], rest, value) if rest else value
+    return out
 
 
 def too_stiff(file: RigFile, rig: Rig) -> str:

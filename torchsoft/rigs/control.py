@@ -18,8 +18,8 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 
 from torchsoft.files import check_file
-from torchsoft.physics.parts import PD, Actuator, ReversedPD, StateFeedback, controller
-from torchsoft.quantity import DerivativeGain, ProportionalGain, Quantity
+from torchsoft.physics.parts import PD, Actuator, Gains, ReversedPD, StateFeedback, controller
+from torchsoft.quantity import DerivativeGain, ProportionalGain, quantity
 from torchsoft.rigs.fields import Group, at_field
 from torchsoft.tables import LISTED, line
 
@@ -163,8 +163,8 @@ def layers(arrays: dict[str, np.ndarray], inputs: Sequence[str], efforts: int) -
 
 
 Names = Annotated[tuple[str, ...], LISTED]
-Gains = Annotated[float, Quantity("N/m, N.m/rad, N.s/m, N.m.s/rad", -1e12, 1e12)]
-Rows = Annotated[tuple[Annotated[tuple[Gains, ...], LISTED], ...], LISTED]
+Gain = Annotated[float, quantity(Gains)]
+Rows = Annotated[tuple[Annotated[tuple[Gain, ...], LISTED], ...], LISTED]
 
 
 class Loop(NamedTuple):

@@ -15,7 +15,8 @@ from torchsoft.physics.mesh import Mesh
 from torchsoft.physics.mesh.compliance import SMALLEST_BLOCK
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
-from torchsoft.rigs.build import BuiltRig, RigFile
+from torchsoft.physics.statics import BuiltRig
+from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
 from torchsoft.solve.ledger import doubts
 from torchsoft.solve.progress import SimulationFailed
@@ -33,7 +34,7 @@ FLOPS = 1e10
 class RunOutcome(NamedTuple):
     """A run, as far as it went, and what ended it early, if anything did."""
 
-    ready: BuiltRig
+    ready: BuiltRig[Rig]
     trajectory: Trajectory
     stopped: SimulationFailed | Interrupted | None
 

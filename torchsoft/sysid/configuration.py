@@ -9,10 +9,12 @@ from pydantic import AfterValidator, Field, model_validator
 
 from torchsoft.paper.rig import NAMES
 from torchsoft.physics.material import INSTANT
+from torchsoft.sysid.criterion import Bounds, Optimality
+from torchsoft.sysid.design import RTOL
 from torchsoft.sysid.identification import Settings
 from torchsoft.sysid.initial_state import LEAD, SETTLE
 from torchsoft.sysid.unknowns import Sensor, Unknown
-from torchsoft.tables import LISTED, Table, from_toml
+from torchsoft.tables import LISTED, SEED, Table, from_toml
 
 VOCABULARY = {own: name for name, own in NAMES.items()}
 """The rig's own names of parameters, by which they are understood too, with those of
@@ -176,6 +178,21 @@ class Rehearsal(Table):
     away: float = Field(default=1.3, ge=1.0, le=3.0)
 
 
+class DesignTable(Table):
+    """Of a design of motions: settings of the rig file by the name of a candidate, `bounds` of
+    signals whose knots may move, `limits` (low, high) [SI] of channels, the `criterion` of the
+    unknowns, or of the `parameters` alone."""
+
+    candidates: dict[Name, dict[str, Any]] = Field(default_factory=dict)
+    bounds: dict[Name, Bounds] = Field(default_factory=dict)
+    limits: dict[Name, Annotated[tuple[float, float], LISTED]] = Field(default_factory=dict)
+    criterion: Optimality = "D"
+    parameters: Annotated[tuple[Name, ...], LISTED] = ()
+    iterations: int = Field(default=40, ge=0, le=100_000)
+    rtol: float = Field(default=RTOL, ge=1e-8, le=1e-2)
+    seed: int = Field(default=0, ge=0, le=SEED)
+
+
 class Config(Table):
     """An identification as a TOML file states it.
 
@@ -200,6 +217,7 @@ class Config(Table):
     recordings: Annotated[tuple[Entry, ...], LISTED] = ()
     compare: dict[Name, Law] = Field(default_factory=dict)
     rehearsal: Rehearsal = Rehearsal()
+    design: DesignTable = DesignTable()
     heldout: Annotated[tuple[str, ...], LISTED] = ()
     ignore: Annotated[tuple[str, ...], LISTED] = ()
     acknowledged: Annotated[tuple[str, ...], LISTED] = ()

@@ -223,19 +223,17 @@ def profile(reference: Reference, name: str) -> Profile:
 
 class Moves:
     """The variables z (n,) of a motion: values, and times where they are free, of the free knots of
-    some signals, which end by `end` [s]; each over a unit of its own, the way or the time between
-    two knots that are as far apart as speed allows.
+    some signals, which end by `end` [s]; none where `bounds` names no signal. Each is over a unit
+    of its own, the way or the time between two knots that are as far apart as speed allows.
 
     Raises `ValueError` for signals without free knots, and where the motion given is more than the
     bounds leave to it.
     """
 
     def __init__(self, reference: Reference, bounds: Mapping[str, Bounds], end: float) -> None:
-        if not bounds:
-            raise ValueError("`bounds` names no signal whose knots may move")
         self.given, self.bounds, self.end = reference, dict(bounds), end
         self.knots: dict[str, tuple[Array, Array, int]] = {}  # times, values, the first free one
-        units, z = [], []
+        units, z = [np.zeros(0)], [np.zeros(0)]
         for name, one in bounds.items():
             signal = profile(reference, name)
             times, values = signal.times.numpy(), signal.values.detach().numpy()
@@ -256,9 +254,8 @@ class Moves:
                 z.append(times[first:])
         self.unit, flat = np.concatenate(units), np.concatenate(z)
         self.n, origin = len(flat), self._excess(np.zeros(len(flat)))
-        self.A = np.stack(
-            [self._excess(e) - origin for e in np.eye(self.n)], -1
-        )  # excess is affine in z
+        columns = [self._excess(e) - origin for e in np.eye(self.n)]  # excess is affine in z
+        self.A = np.array(columns).reshape(self.n, len(origin)).T
         self.b = -origin
         self.start = self.nearest(flat / self.unit)
 
@@ -294,7 +291,7 @@ class Moves:
     def _excess(self, z: Array) -> Array:
         """What must not be positive: beyond the bounds, faster than allowed, closer than
         `shortest`, too late."""
-        rows = []
+        rows = [np.zeros(0)]
         for name, (times, values) in self.split(z).items():
             one, (known_times, known_values, first) = self.bounds[name], self.knots[name]
             t = np.concatenate((known_times[first - 1 : first], times))
@@ -308,7 +305,7 @@ class Moves:
     def nearest(self, z: Array) -> Array:
         """The motion within the bounds that is nearest to z, by the sum of what variables move.
         Raises `ValueError` where there is none."""
-        if (self.A @ z <= self.b + 1e-9 * np.abs(self.A).max(1)).all():
+        if not self.n or (self.A @ z <= self.b + 1e-9 * np.abs(self.A).max(1)).all():
             return z
         I, scale = np.eye(self.n), np.abs(self.A).max(1)
         A = np.block(

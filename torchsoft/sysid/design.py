@@ -263,13 +263,8 @@ def design(
     )
     if not points or any(x.shape != problem.coordinates.start.shape for x in points):
         raise ValueError(f"`at` must hold points of the {len(problem.coordinates)} coordinates")
-    for channel, (low, high) in (limits or {}).items():
-        if channel not in recording.channels or not low < high:
-            known = ", ".join(recording.channels)
-            raise ValueError(
-                f"limits.{channel} = ({low}, {high}): a limit is (low, high) of a channel of the "
-                f"rig: {known}"
-            )
+    if not bounds:
+        raise ValueError("`bounds` names no signal whose knots may move")
     began = clock.perf_counter()
     moves = Moves(recording.rig.reference, bounds, float(recording.times[-1]))
     planner = Planner(problem, plan, moves, limits or {}, criterion, names, rtol, workers)

@@ -54,6 +54,7 @@ from torchsoft.sysid.result import IdentificationResult, described, undetermined
 from torchsoft.sysid.runs import Runner
 from torchsoft.sysid.sensitivity import Checked, check_assumptions
 from torchsoft.sysid.suspects import assumption_notices
+from torchsoft.sysid.unknowns import Coordinates
 from torchsoft.tables import SEED, Table, plain
 
 RTOL = 1e-5
@@ -147,7 +148,7 @@ def conclude(
     chi2 = float(at.r[rows] @ at.r[rows]) / max(len(rows) - int(free.sum()), 1)
     verdicts = judge_residuals(
         left, at.r, J, robust=how.loss != "linear",
-        priors=[c.labels[i] for i, _ in c.priors],
+        priors=[c.labels[i] for i, _ in c.priors] if end.at_rest else (),
     )  # fmt: skip
     declared = [name for name, one in problem.sensors.items() if one.colour == "ar"]
     colour, bound = bool(coloured.found.keys() - set(declared)), bool((free & c.at_bound(x)).any())
@@ -177,7 +178,8 @@ def conclude(
             predicted = nrmse(problem, held.r, list(how.heldout))
             notices += guesses(problem, x, how.heldout)
     sd = np.sqrt(np.diag(C_free))
-    notices += notices_on(found, end.at_rest, rtol, end.bias is None)
+    notices += notices_on(found, end.at_rest or bool(end.rough), rtol, end.bias is None)
+    notices += rough_notices(c, end.rough)
     notices += assumption_notices(checked) if checked is not None else []
     notices += residual_notices(verdicts, max(1.0, chi2) ** 0.5 if how.loss == "linear" else 1.0)
     notices += colour_notices(coloured.found, declared)
@@ -293,6 +295,23 @@ def notices_on(found: list[Any], converged: bool, rtol: float, unchecked: bool) 
     if not converged:
         out.append("the last stage stopped before it converged: give it more evaluations")
     return out
+
+
+def rough_notices(c: Coordinates, rough: Sequence[str]) -> list[str]:
+    """That samples are not smooth in some coordinates where a fit has ended, and the remedy."""
+    if not rough:
+        return []
+    remedy = "judge the intervals by profile likelihoods (torchsoft.sysid.profile)"
+    if any(one.kind == "start" for one in c.all if one.label in rough):
+        remedy = (
+            "measure every coordinate of the bodies when the recording begins, say what is known "
+            "of it by start.given, or begin at rest"
+        )
+    return [
+        f"contact points touch, leave or begin to slip where the fit ended, and samples are not "
+        f"smooth in {', '.join(rough[:3])}{', ...' if len(rough) > 3 else ''}: the fit has not "
+        f"come to rest, and intervals may be too narrow; {remedy}"
+    ]
 
 
 # Identification and explanation

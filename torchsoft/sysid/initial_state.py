@@ -198,12 +198,6 @@ def held(nominal: SoftGrasp, place: float, rig: SoftGrasp) -> HeldPads:
     return HeldPads(nominal, rig, state)
 
 
-def held_start(nominal: SoftGrasp, rig: SoftGrasp) -> Tensor:
-    """The state (size,) of `AtRest` for a rig that may have other parameters than the nominal
-    one."""
-    return held(nominal, AtRest().place(nominal), rig)({})
-
-
 def warn_of_memory(rig: Rig, lead: float) -> None:
     """Warns of massless pads that do not forget their beginning before the first sample, `lead` [s]
     later."""

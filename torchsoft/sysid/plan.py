@@ -19,6 +19,7 @@ from scipy.stats import qmc
 from tqdm import tqdm
 
 from torchsoft.sysid.fit import (
+    SETTLED,
     Fit,
     Loss,
     Notify,
@@ -26,6 +27,7 @@ from torchsoft.sysid.fit import (
     chord,
     descend,
     gauss_newton,
+    newton_step,
     settled,
     shift,
     standard_deviations,
@@ -338,7 +340,8 @@ class Settled(NamedTuple):
     be checked; the fits on other steps since; the residuals by a tenth of the tolerance, those of
     `at` where these could not be had; and whether the fit is `at_rest`: with steps chosen anew no
     coordinate would move by more than `SETTLED` standard deviations (where steps are only checked:
-    whether the fit has converged)."""
+    whether the fit has converged). `rough` names the coordinates that would move although steps do
+    not matter: samples are not smooth in them."""
 
     x: Array
     at: Residuals
@@ -347,6 +350,7 @@ class Settled(NamedTuple):
     fits: list[tuple[float, Fit]]
     finer: Residuals
     at_rest: bool
+    rough: tuple[str, ...] = ()
 
 
 def settle(
@@ -360,7 +364,8 @@ def settle(
 ) -> Settled:
     """Go on from a fit, by its Jacobian and a few runs: with steps chosen anew until they do not
     matter, and with a tighter tolerance, at most so many times, where a tenth of it shifts an
-    estimate by more than `STEP_BIAS`. With none the steps are kept, and only checked."""
+    estimate by more than `STEP_BIAS`, or steps are what keeps the fit from its rest. With none the
+    steps are kept, and only checked."""
     x, which, rtol, left, fits = fit.x, stage.recordings, stage.rtol, tightenings, []
     at = fit.at or problem.residuals(runner, x, which, fit.steps, free)
     rounds = ROUNDS if tightenings else 0
@@ -395,12 +400,15 @@ def settle(
         if finer.lost:
             return Settled(x, end, rtol, None, fits, end, at_rest)
         J, bias = at.J[:, free], np.zeros(len(x))
-        bias[free] = shift(J, finer.r - at.r)
-        if left and not (
-            at_rest and (np.abs(bias[free]) <= STEP_BIAS * standard_deviations(J)).all()
-        ):
+        bias[free], sd = shift(J, finer.r - at.r), standard_deviations(J)
+        anew = np.abs(shift(J, fresh.r - at.r)) / sd
+        shifts, rough = np.abs(bias[free]) / sd, tuple[str, ...]()
+        if not at_rest and tightenings and max(anew.max(), shifts.max()) <= SETTLED:
+            far = np.abs(newton_step(problem, x, end, free)) > SETTLED * sd
+            rough = tuple(np.array(problem.coordinates.labels)[free][far].tolist())
+        elif left and not (at_rest and shifts.max() <= STEP_BIAS):
             left, rounds, rtol = left - 1, ROUNDS, FINER * rtol
             if along(finer, steps):
                 continue
             rtol /= FINER
-        return Settled(x, end, rtol, bias, fits, finer._replace(J=at.J), at_rest)
+        return Settled(x, end, rtol, bias, fits, finer._replace(J=at.J), at_rest, rough)

@@ -27,6 +27,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchsoft.quantity import near
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import simulate
 from torchsoft.sysid.criterion import Criterion, Moves, chosen, deviations
@@ -103,6 +104,12 @@ class Planner:
         )
         self.names, _ = chosen(problem, problem.coordinates.start, names)
         criterion.check(self.names)
+        for channel, (low, high) in limits.items():
+            if channel not in self.recording.channels or not low < high:
+                raise ValueError(
+                    f"limits.{channel} = ({low:g}, {high:g}): a limit is (low, high) of a channel "
+                    f"of the rig; {near(channel, self.recording.channels)}"
+                )
         self.grid = self.recording.grid(problem.interpolated)
         self._others = Runner(problem.recordings, workers)
         self._known: dict[bytes, Array] = {}

@@ -10,9 +10,10 @@ import torch
 from torchsoft.files import replacing
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
-from torchsoft.solve.simulate import simulate
 from torchsoft.sysid.configuration import Config, Entry, Rest
+from torchsoft.sysid.initial_state import Standing
 from torchsoft.sysid.rig_recordings import vocabulary
+from torchsoft.sysid.synthetic import record
 from torchsoft.sysid.unknowns import Unknown
 
 FINER = 0.1
@@ -37,20 +38,21 @@ def rehearsed(config: Path, stated: Config, out: Path) -> tuple[Config, list[Pat
         name = entry.name or Path(entry.paths[0]).stem
         with at_field("settings"):
             mine = file.override(**stated.settings).override(**entry.settings)
-        rig, y0, _ = mine.build()
-        known, start = vocabulary(rig, stated.columns), entry.start or stated.start
-        duration = mine.outputs.duration if plan.duration is None else plan.duration
-        at = np.arange(0.0, duration + 0.5 / plan.rate, 1.0 / plan.rate)
+        planned, start = mine.build(), entry.start or stated.start
+        known = vocabulary(planned.rig, stated.columns)
+        if plan.duration is not None:
+            planned = planned._replace(t=torch.tensor([0.0, plan.duration]).double())
         lead = start.lead if isinstance(start, Rest) else 0.0
-        t = torch.from_numpy(np.append([-lead] if lead else [], at))
-        run = simulate(rig, t, y0=y0, rtol=FINER * stated.fit.rtol)
-        columns = {"t": at}
-        for channel in (*known.signals, *stated.sensors):
-            if channel not in run.channels:
-                raise ValueError(f"{config}: sensors: the rig has no channel `{channel}`")
-            columns[channel] = run[channel].detach().numpy()[-len(at) :].copy()
-        for channel, sensor in stated.sensors.items():
-            columns[channel] += sensor.noise * random.standard_normal(len(at))
+        try:
+            made = record(
+                name, planned, {}, stated.sensors, start=Standing.of(planned.rig, planned.y0, lead),
+                rate=plan.rate, rtol=FINER * stated.fit.rtol, seed=random,
+            )  # fmt: skip
+        except ValueError as error:
+            raise ValueError(f"{config}: {error}") from None
+        followed = planned.rig.follow(torch.from_numpy(made.times)).detach()[..., 0].numpy().T
+        columns = {"t": made.times} | dict(zip(planned.rig.signals, followed))
+        columns |= {channel: y for channel, (_, y) in made.samples.items()}
         headings = {of: heading for heading, of in known.headings.items()}
         head = ",".join(f"{headings.get(one, one)} [{known.units[one]}]" for one in columns)
         paths.append(out / f"{name}.csv")

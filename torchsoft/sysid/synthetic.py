@@ -1,23 +1,21 @@
 """Recordings made by the simulator itself: a known truth to identify."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import torch
 
-from torchsoft.excitation import Excitation, begin
-from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp
-from torchsoft.physics.motion import Reference
-from torchsoft.solve.simulate import simulate
-from torchsoft.sysid.initial_state import AtRest, held_start
-from torchsoft.sysid.prediction import choice, set_parameters
-from torchsoft.sysid.recording import Recording
+from torchsoft.physics.rig import Rig
+from torchsoft.physics.statics import BuiltRig
+from torchsoft.sysid.initial_state import AtRest, HeldPads, Standing, Start
+from torchsoft.sysid.prediction import predict
+from torchsoft.sysid.recording import Grid, Recording
 from torchsoft.sysid.unknowns import Sensor
-
-Build = Callable[[Parameters, Reference], SoftGrasp]
-"""Makes a rig from settings and a reference: `SoftGrasp` itself, or a function that gives it laws
-of the user's own, such as a friction law."""
 
 RIG = {
     channel: Sensor(noise=noise)
@@ -31,30 +29,39 @@ RIG = {
 RTOL = 1e-6
 """Relative tolerance of the runs that recordings are made of: a tenth of what a fit takes."""
 
+AS_STATED: Mapping[str, float] = MappingProxyType({})
+
 
 def record(
-    name: str, excitation: Excitation, truth: Parameters, nominal: Parameters,
-    sensors: dict[str, Sensor], *, rate: float = 200.0, rtol: float = RTOL, noise: float = 1.0,
-    seed: int = 0, build: Build = SoftGrasp, values: Mapping[str, float] | None = None,
+    name: str, planned: BuiltRig[Any], truth: Mapping[str, float] | Rig,
+    sensors: Mapping[str, Sensor], *, start: Start | None = None, rate: float = 200.0,
+    rtol: float = RTOL, noise: float = 1.0, seed: int | np.random.Generator = 0,
 ) -> Recording:  # fmt: skip
-    """What a rig with the parameters `truth` gives under an excitation that was planned with the
-    `nominal` ones.
+    """What sensors see of a rig that follows the motion `planned`, while its numbers are those of
+    the `truth`.
 
-    The disc is set down, as the nominal parameters would have it lie, before the first sample, as
-    `AtRest` assumes. Sampled at `rate` [Hz] from a run whose steps `rtol` chooses, with Gaussian
-    noise of `noise` times each sensor's own. `build` makes the rig, and `values` are the truth of
-    what `Parameters` does not have. The recording holds nothing of the truth but the samples.
-    Raises `SimulationFailed`.
+    `planned` is what `RigFile.build` or, of the paper's rig, `excitation.begin` gives; `truth` are
+    numbers that differ, by the names that `Rig.parameter` knows, or a rig of other laws with the
+    same pads. The run begins as `start` says, by default at rest: in the paper's rig `AtRest`, in
+    another one where it is planned to. Sampled at `rate` [Hz] from a run whose steps `rtol`
+    chooses, with Gaussian noise of `noise` times each sensor's own. The recording holds nothing of
+    the truth but the samples. Raises `ValueError` for a name or channel that is not there, and
+    `SimulationFailed`.
     """
-    planned = begin(excitation, nominal).model
-    rig = build(planned.settings, planned.reference)
-    real = build(excitation.settings(truth), planned.reference)
-    set_parameters(real, values or {})
-    at, start = np.arange(0.0, excitation.duration + 0.5 / rate, 1.0 / rate), AtRest()
-    t = torch.from_numpy(np.concatenate(([at[0] - start.lead], at)))
-    run = simulate(real, t, y0=held_start(rig, real).detach(), **choice(rtol))
-    rng, samples = np.random.default_rng(seed), {}
+    rig, y0, t = planned
+    begins = start or (AtRest() if isinstance(rig, SoftGrasp) else Standing.of(rig, y0))
+    at = np.arange(float(t[0]), float(t[-1]) + 0.5 / rate, 1.0 / rate)
+    made = Recording(name, rig, {one: (at, np.zeros_like(at)) for one in sensors}, begins)
+    begun, early = made.begin(), int(begins.lead > 0)
+    if isinstance(truth, Rig):
+        begun, truth = begun._replace(rig=deepcopy(truth)), AS_STATED
+        if isinstance(begun.y0, HeldPads):
+            begun.y0.rig = begun.rig
+        begun.rig.reference = rig.reference
+    grid = Grid(torch.from_numpy(np.append([at[0] - begins.lead] * early, at)), early)
+    exact, rng = predict(begun, truth, grid, (), rtol).signals, np.random.default_rng(seed)
+    samples = {}
     for channel, sensor in sensors.items():
-        exact = run[channel][1:].detach().numpy()
-        samples[channel] = (at, exact + noise * sensor.noise * rng.standard_normal(len(at)))
-    return Recording(name, rig, samples, start)
+        error = noise * sensor.noise * rng.standard_normal(len(at))
+        samples[channel] = at, exact[:, made.channels.index(channel)] + error
+    return replace(made, samples=samples)

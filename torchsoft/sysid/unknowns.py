@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from torchsoft.quantity import near
 from torchsoft.sysid.initial_state import BOUNDS, PREFIX
 from torchsoft.sysid.recording import REACH, Array, Recording
 from torchsoft.tables import Table, line, shown
@@ -264,9 +265,15 @@ class Coordinates:
                         f"unknowns: the rig of recording `{without}` has no `{line(one, 80)}`"
                     )
             if name not in given:
+                tensors = dict(recordings[0].rig.named_parameters())
+                several = tensors.get(recordings[0].rig.aliases.get(name, name))
+                if several is not None and several.ndim:
+                    raise ValueError(
+                        f"unknowns: `{line(name, 80)}` cannot be identified: it has "
+                        f"{several.numel()} numbers, and an unknown is one"
+                    )
                 raise ValueError(
-                    f"unknowns: `{line(name, 80)}` cannot be identified; what can: "
-                    f"{', '.join(given)}"
+                    f"unknowns: `{line(name, 80)}` cannot be identified; {near(name, given)}"
                 )
             if u.ratio_to is not None and (u.ratio_to not in given or u.ratio_to == name):
                 raise ValueError(

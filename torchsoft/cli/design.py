@@ -1,0 +1,64 @@
+"""Design of motions for an identification."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from torchsoft.cli.results import add_out, failed, say, try_folder
+
+DESIGN = """\
+Which motion of the rig should be recorded?
+
+CONFIG.toml plans an identification (a rig file, unknowns, sensors with their noise), and has in
+[design] candidates for the motion, and bounds within which the knots of profiles may move. Ranks
+the candidates by what identifies the unknowns best, moves the knots of the best one by gradient,
+and writes it as motion.toml, a rig file that runs, with design.json. DATA are recordings that
+there are already."""
+
+
+def add_commands(commands: Any) -> None:
+    """The command that designs motions."""
+    one = commands.add_parser(
+        "design", help="find a motion that identifies parameters", description=DESIGN,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    one.add_argument(
+        "files", nargs="+", type=Path, metavar="DATA.csv ... CONFIG.toml",
+        help="recordings, if there are any, and one configuration",
+    )  # fmt: skip
+    add_out(one, default=Path("out/design"), help="folder for the results (%(default)s)")
+    one.add_argument("--workers", type=int, default=1, help="threads of the search (%(default)s)")
+    one.add_argument("--no-progress", action="store_true", help="show no progress")
+    one.set_defaults(run=design)
+
+
+def design(options: argparse.Namespace) -> int:
+    """Choose a motion, and write it."""
+    configs = [file for file in options.files if file.suffix == ".toml"]
+    data = [file for file in options.files if file.suffix != ".toml"]
+    if len(configs) != 1:
+        return failed(f"one CONFIG.toml is needed, but {len(configs)} were given")
+    from torchsoft.files import replacing, write_json
+    from torchsoft.plot.figures import save
+    from torchsoft.rigs.written import to_toml
+    from torchsoft.sysid import measured
+    from torchsoft.sysid.figures import design_figure
+    from torchsoft.sysid.rig_design import choose, located
+
+    stated = measured.read_config(configs[0])
+    recorded = measured.load(data, configs[0]).problem.recordings if data else ()
+    try_folder(options.out, options.force)
+    chosen = choose(
+        configs[0], stated, recorded, workers=options.workers, progress=not options.no_progress
+    )
+    with replacing(options.out / "motion.toml") as partial:
+        partial.write_text(to_toml(located(chosen.file)), encoding="utf-8")
+    write_json(options.out / "design.json", chosen.summary())
+    say(chosen.table())
+    if chosen.found is not None:
+        save(design_figure(chosen.found), options.out / "design.png")
+        say(f"\n{chosen.rated[0].name}, its knots moved:\n{chosen.found.table()}")
+        for notice in (*chosen.found.limits, *chosen.found.notices):
+            say(f"note: {notice}")
+    say(f"written to {options.out / 'motion.toml'} and {options.out / 'design.json'}")
+    return 0

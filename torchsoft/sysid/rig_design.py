@@ -1,0 +1,185 @@
+"""Motions of a rig file for an identification: candidates ranked, and the knots of the best moved
+by gradient, both by one criterion."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from torchsoft.physics.motion import Reference
+from torchsoft.rigs.build import RigFile
+from torchsoft.rigs.fields import at_field
+from torchsoft.solve.progress import SimulationFailed
+from torchsoft.sysid.configuration import Config, Rest
+from torchsoft.sysid.criterion import Criterion, Moves, profile
+from torchsoft.sysid.design import Design, design
+from torchsoft.sysid.initial_state import Standing
+from torchsoft.sysid.planner import Planner
+from torchsoft.sysid.problem import Problem
+from torchsoft.sysid.recording import Recording
+from torchsoft.sysid.synthetic import record
+from torchsoft.tables import line
+
+AS_STATED = "as stated"
+"""The name of the motion of the rig file itself, which is a candidate too."""
+
+FILES = ("file", "network")
+"""Fields of a rig file that name another file."""
+
+
+@dataclass(frozen=True)
+class Rated:
+    """A candidate: the criterion, a logarithm of standard deviations, the smaller the better; the
+    relative standard deviations of the parameters, and how much of the way to their limits channels
+    go. `lost` says why it cannot be made."""
+
+    name: str
+    value: float
+    deviations: dict[str, float]
+    peaks: dict[str, float]
+    lost: str = ""
+
+    @property
+    def score(self) -> float:
+        """The criterion; infinite beyond a limit."""
+        beyond = self.lost or max(self.peaks.values(), default=0.0) > 1
+        return np.inf if beyond else self.value
+
+
+class Chosen(NamedTuple):
+    """The candidates, the best first; the rig file with the best motion, and how its knots were
+    moved, if any might."""
+
+    rated: list[Rated]
+    file: RigFile
+    found: Design | None
+
+    def table(self) -> str:
+        """One line a candidate."""
+        names = list(next((one.deviations for one in self.rated if not one.lost), {}))
+        width = max([len(one.name) for one in self.rated] + [9])
+        rows = [f"{'candidate':{width}s} criterion  {'  '.join(names)}"]
+        for one in self.rated:
+            cells = [f"{one.deviations.get(name, np.nan):{len(name)}.2%}" for name in names]
+            said = f"cannot be made: {line(one.lost, 120)}" if one.lost else "  ".join(cells)
+            limit = [f"{k} goes beyond its limits" for k, part in one.peaks.items() if part > 1]
+            rows.append("  ".join([f"{one.name:{width}s} {one.value:9.3f}", said, *limit]))
+        return "\n".join(rows)
+
+    def summary(self) -> dict[str, Any]:
+        """What is written as JSON."""
+        out: dict[str, Any] = {"candidates": [asdict(one) for one in self.rated]}
+        if self.found is not None:
+            one = self.found
+            out |= {
+                "before": one.before, "after": one.after, "limits": one.limits,
+                "history": [asdict(visit) for visit in one.history], "notices": one.notices,
+                "made_by": one.made_by,
+            }  # fmt: skip
+        return out
+
+
+def planned(
+    stated: Config, file: RigFile, name: str, settings: Mapping[str, Any]
+) -> tuple[RigFile, Recording | str]:
+    """The rig file with a candidate's settings, and what would be recorded, without noise, or why
+    it cannot be. Raises `ValueError`."""
+    plan = stated.rehearsal
+    with at_field(f"design.candidates.{name}"):
+        mine = file.override(**settings)
+        built = mine.build()
+    if plan.duration is not None:
+        built = built._replace(t=torch.tensor([0.0, plan.duration]).double())
+    lead = stated.start.lead if isinstance(stated.start, Rest) else 0.0
+    start = Standing.of(built.rig, built.y0, lead)
+    try:
+        return mine, record(
+            name, built, {}, stated.sensors, start=start, rate=plan.rate, rtol=stated.design.rtol,
+            noise=0.0,
+        )  # fmt: skip
+    except SimulationFailed as failure:
+        return mine, str(failure)
+
+
+def choose(
+    config: Path, stated: Config, recorded: Sequence[Recording] = (), *, workers: int = 1,
+    progress: bool = False,
+) -> Chosen:  # fmt: skip
+    """Rank the motions that a configuration has as candidates by what identifies its unknowns
+    best, beside what has been `recorded`, and move the knots of the best of those that `bounds`
+    name.
+
+    The rig is as its file has it. Raises `ValueError` for what does not fit together, or where no
+    candidate can be made.
+    """
+    if stated.rig is None:
+        raise ValueError(f'{config}: a design is of the rig of a file: say rig = "FILE.toml"')
+    plan, criterion = stated.design, Criterion(stated.design.criterion)
+    with at_field("settings"):
+        file = RigFile.from_toml(config.parent / stated.rig).override(**stated.settings)
+    names = plan.parameters or None
+    files: dict[str, RigFile] = {}
+    problems: dict[str, Problem] = {}
+    rated = list[Rated]()
+    for name, settings in ({AS_STATED: {}} | plan.candidates).items():
+        files[name], made = planned(stated, file, name, settings)
+        try:
+            if isinstance(made, str):
+                raise SimulationFailed(made, 0.0)
+            problem = Problem([*recorded, made], stated.sensors, stated.unknowns)
+            planner = Planner(
+                problem, name, Moves(made.rig.reference, {}, 0.0), plan.limits, criterion, names,
+                plan.rtol, workers,
+            )  # fmt: skip
+            x = problem.coordinates.start
+            seen = planner.evaluate(np.zeros(0), x)
+            problems[name] = problem
+            rated.append(Rated(name, seen.value, planner.deviations(x, seen), seen.peaks))
+        except SimulationFailed as failure:
+            why = made if isinstance(made, str) else str(failure)
+            rated.append(Rated(name, np.inf, {}, {}, why))
+    rated.sort(key=lambda one: (one.score, one.value))
+    best = rated[0].name
+    if best not in problems:
+        raise ValueError(f"{config}: no candidate can be made: {rated[0].lost}")
+    found, chosen = None, files[best]
+    if plan.bounds:
+        found = design(
+            problems[best], best, plan.bounds, limits=plan.limits, criterion=criterion,
+            names=names, iterations=plan.iterations, rtol=plan.rtol, seed=plan.seed,
+            workers=workers, progress=progress,
+        )  # fmt: skip
+        chosen = chosen.override(motion=knots(found.recording.rig.reference, plan.bounds))
+    return Chosen(rated, chosen, found)
+
+
+def knots(reference: Reference, names: Mapping[str, Any]) -> dict[str, Any]:
+    """Tables of a rig file of the profiles of some signals."""
+    signals = {name: profile(reference, name) for name in names}
+    return {
+        name: {
+            "kind": "profile",
+            "times": one.times.detach().tolist(),
+            "values": one.values.detach().tolist(),
+        }
+        for name, one in signals.items()
+    }
+
+
+def located(file: RigFile) -> RigFile:
+    """The same file, wherever it is written to: files that it names by whole paths."""
+
+    def whole(tree: Any) -> Any:
+        if not isinstance(tree, dict):
+            return tree
+        return {
+            key: str((file.folder / value).resolve())
+            if key in FILES and isinstance(value, str)
+            else whole(value)
+            for key, value in tree.items()
+        }
+
+    return RigFile.model_validate(whole(file.model_dump(exclude_unset=True)))
