@@ -33,8 +33,9 @@ numbers."""
 
 
 @compiled
-def write_tape(s: Any, w: Any, tape: Any, row: int, y: Array) -> bool:
-    """Put one solved stage on the tape; False if more points touch than it has room for."""
+def write_tape(s: Any, w: Any, tape: Any, row: int, y: Array, way: float) -> bool:
+    """Put one solved stage on the tape, its displacements after `way` [s] at its rates; False if
+    more points touch than it has room for."""
     put(y, tape.y[row])
     put(w.q, tape.q[row])
     put(w.V, tape.V[row])
@@ -49,8 +50,9 @@ def write_tape(s: Any, w: Any, tape: Any, row: int, y: Array) -> bool:
             k = w.active[at + i]
             tape.point[row, slot] = k
             state = tape.state[row, slot]
-            state[0], state[1] = at_point(s, k, w.u)
+            ux, uy = at_point(s, k, w.u)
             state[2], state[3] = at_point(s, k, w.u_dot)
+            state[0], state[1] = ux + way * state[2], uy + way * state[3]
             slot += 1
     return True
 
@@ -108,24 +110,22 @@ def supply(s: Any, w: Any, signals: Array, powers: Array) -> None:
 
 
 @compiled
-def record(s: Any, w: Any, integrals: Array, moments: Array, forces: Array, extras: Array) -> None:
-    """One row of output: (F_N, F_T) of every point; integrals, the pads' moments and the
-    generalised contact forces."""
-    forces[:] = 0.0
+def record(s: Any, w: Any, wrenches: Array, out: Array) -> None:
+    """One row of forces, as `recorded_size` orders them."""
+    out[:] = 0.0
     for pad in range(s.pad_base.size):
         at = s.pad_point_start[pad]
         for i in range(w.actives[pad]):
             k = w.active[at + i]
-            forces[k, 0], forces[k, 1] = w.out[k, 3], w.out[k, 4]
-    n, m = integrals.size, moments.size
-    put(integrals, extras[:n])
-    put(moments, extras[n : n + m])
-    put(w.load, extras[n + m :])
+            out[2 * k], out[2 * k + 1] = w.out[k, 3], w.out[k, 4]
+    first = 2 * s.point_contact.size
+    put(wrenches, out[first : first + wrenches.size])
+    put(w.load, out[first + wrenches.size :])
 
 
 @compiled
 def solve_near(
-    s: Any, w: Any, limits: Any, y: Array, signals: Array, a: float, powers: Array, moments: Array
+    s: Any, w: Any, limits: Any, y: Array, signals: Array, a: float, powers: Array, wrenches: Array
 ) -> tuple[bool, int, float]:
     """A stage from y with every point that may touch in the window: success, linear solves, a bound
     of all speeds [m/s]."""
@@ -135,7 +135,7 @@ def solve_near(
         converged, count = solve_stage(s, w, limits, y, signals, a, reach)
         solves += count
         if converged:
-            speed = finish(s, w, y, a, powers, moments)
+            speed = finish(s, w, y, a, powers, wrenches)
             done = w.travelled[0] + a * speed <= w.travelled[1]
             if not done:  # a point may have come near that was not looked at
                 converged = reach == margin  # one look further must do
@@ -161,13 +161,13 @@ def take_step(r: Any, h: float, signals: Array, row: int) -> tuple[int, int]:
     for stage in range(2):
         powers = d.powers[stage]
         converged, count, speed = solve_near(
-            s, w, r.limits, y, signals[stage], a, powers, d.moments
+            s, w, r.limits, y, signals[stage], a, powers, d.wrenches
         )
         solves += count
         if not converged:
             status = NEWTON_FAILED
             break
-        if tape.y.shape[0] > 0 and not write_tape(s, w, tape, row + stage, y):
+        if tape.y.shape[0] > 0 and not write_tape(s, w, tape, row + stage, y, 0.0):
             status = TAPE_FULL
             break
         supply(s, w, signals[stage], powers)
@@ -218,15 +218,17 @@ def dense_states(part: float) -> tuple[float, float, float]:
 def write_rows(r: Any, h: float, first: int, last: int) -> tuple[int, int]:
     """The outputs from `first` to `last` of the step just taken. At its end they are what the last
     stage found; before it, dense output with the forces that belong to it, which take a stage of no
-    length (of `s0`). Returns status and linear solves."""
+    length (of `s0`); that is what `out.tape` holds, if it has rows. Returns status and linear
+    solves."""
     s, w, d, y, integrals, out = r.s, r.w, r.d, r.y, r.integrals, r.out
-    parts, ys = out.part, out.y
-    solves, here, converged = 0, w.travelled[0], True
+    parts, ys, tape = out.part, out.y, out.tape
+    solves, here = 0, w.travelled[0]
     put(w.V, d.guess_V)
     put(w.u_dot, d.guess)
     for i in range(
         last - 1, first - 1, -1
     ):  # the end comes first: the others disturb what the last stage left
+        way, scans = GAMMA * h if parts[i] == 1.0 else 0.0, w.travelled[2]
         if parts[i] == 1.0:
             put(y, ys[i])
             put(integrals, d.at_row)
@@ -244,17 +246,19 @@ def write_rows(r: Any, h: float, first: int, last: int) -> tuple[int, int]:
                 d.at_row[j] = d.integrals[j] + h * (
                     first_part * d.powers[0, j] + second_part * d.powers[1, j]
                 )
-            way = d.travelled[0] + h * (abs(b_1) * d.speed[0] + abs(b_2) * d.speed[1])
-            scans = w.travelled[2]
-            w.travelled[0] = way if scans == d.travelled[2] else np.inf
+            gone_by = d.travelled[0] + h * (abs(b_1) * d.speed[0] + abs(b_2) * d.speed[1])
+            w.travelled[0] = gone_by if scans == d.travelled[2] else np.inf
             converged, count, _ = solve_near(
-                r.s0, w, r.limits, ys[i], out.signals[i], INSTANT, d.scrap, d.moments
+                r.s0, w, r.limits, ys[i], out.signals[i], INSTANT, d.scrap, d.wrenches
             )
             solves += count
             if not converged:
-                break
-            put(d.guess_V, w.V)
-            put(d.guess, w.u_dot)
-            w.travelled[0] = here if w.travelled[2] == scans else np.inf
-        record(s, w, d.at_row, d.moments, out.forces[i], out.extras[i])
-    return CONVERGED if converged else NEWTON_FAILED, solves
+                return NEWTON_FAILED, solves
+        if tape.count.shape[0] > 0 and not write_tape(s, w, tape, i, ys[i], way):
+            return TAPE_FULL, solves
+        put(d.at_row, out.integrals[i])
+        record(s, w, d.wrenches, out.recorded[i])
+        put(d.guess_V, w.V)
+        put(d.guess, w.u_dot)
+        w.travelled[0] = here if w.travelled[2] == scans else np.inf
+    return CONVERGED, solves
