@@ -204,9 +204,7 @@ def assert_gradients_exact(
     for (part, _), where in rig.layout.slices.items():
         weights[:, where] *= {"pose": 1e3, "velocity": 10.0}.get(part, 0.0)  # [1/m, s/m]
     touch = Touch(rig)
-    felt = [
-        name for name in touch.expanded([*touch.arrays, *touch.single]) if "centre" not in name
-    ]
+    felt = [name for name in touch.expanded([*touch.arrays, *touch.single]) if "centre" not in name]
     pulls = torch.randn(len(t), len(felt), generator=generator, dtype=torch.float64)
 
     def run(**how: Any) -> tuple[Trajectory, dict[str, Tensor]]:

@@ -47,8 +47,8 @@ class Progress:
 
 @dataclass
 class Segment:
-    """One chunk of a taped run, or its start, which has no steps: where it began, the signals at its
-    stages and outputs, and the tapes of both, or None where they are to be made again when
+    """One chunk of a taped run, or its start, which has no steps: where it began, the signals at
+    its stages and outputs, and the tapes of both, or None where they are to be made again when
     needed."""
 
     plan: Plan

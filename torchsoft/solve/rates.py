@@ -43,7 +43,10 @@ class Rates:
         followed = rig.reference if reference is None else reference
         self._followed = Followed(lambda t: compiled.signals(t, followed), rig, followed)
         self._signals = np.zeros((1, compiled.signal_count, 2))
-        self._powers, self._wrenches = np.zeros(len(Integrals(rig).names)), np.zeros((len(rig.pads), 3))
+        self._powers, self._wrenches = (
+            np.zeros(len(Integrals(rig).names)),
+            np.zeros((len(rig.pads), 3)),
+        )
         self.calls = 0
 
     def __call__(self, t: float, y: Array) -> Array:

@@ -218,7 +218,9 @@ def _check_wanted(
             "gradient='forward' needs the parameters' names `wrt`, or directions `dy0` of the start"
         )
     if gradient != "forward" and (dy0 is not None or rigid or touch):
-        raise ValueError("`dy0`, `rigid` and `touch` belong to gradient='forward', and to that only")
+        raise ValueError(
+            "`dy0`, `rigid` and `touch` belong to gradient='forward', and to that only"
+        )
     if gradient == "forward" and torch.is_inference_mode_enabled():
         raise ValueError(
             "gradient='forward' needs torch's graphs, which torch.inference_mode() has not; use "
@@ -239,9 +241,7 @@ def _channels_of_touch(rig: Rig, names: Sequence[str]) -> tuple[str, ...]:
     return expanded
 
 
-def _rows(
-    task: Task, tape_bytes: float
-) -> Iterator[tuple[Solved, tuple[Tensor, Tensor] | None]]:
+def _rows(task: Task, tape_bytes: float) -> Iterator[tuple[Solved, tuple[Tensor, Tensor] | None]]:
     """The growing run."""
     stepper, wrt, dy0 = task.stepper, task.wrt, task.dy0
     if task.gradient != "forward":

@@ -277,7 +277,9 @@ class ImplicitStepper:
             now.work.travelled[0] = np.inf
             now.work.low[:] = now.work.high[:] = 0
             tape, out_tape = tapes or self._no_tapes
-            outputs = Outputs(row_step, row_part, at_rows, out.y, out.integrals, out.recorded, out_tape)
+            outputs = Outputs(
+                row_step, row_part, at_rows, out.y, out.integrals, out.recorded, out_tape
+            )
             steps, done, status, solves, refused, failed, which = self._call(
                 s, now, outputs, tape, given=False, follow=followed.arrays, errors=errors, k=k,
                 clock=clock, stops=stops, times=times, row=out.rows, rung=rung, starts=starts, h=h,

@@ -39,8 +39,8 @@ def iterate(
 ) -> Iterator[tuple[Tensor, Tensor, Progress]]:  # fmt: skip
     """Derivatives (T, components, n) of the states by the scalar tensors `wanted`, and those of
     sums of forces (T, sums, n), as the run grows; `columns` are the components of the state that
-    are kept. dy0 (size, n) is the derivative of the initial state, zero by default; its columns beyond
-    those of `wanted` are directions of the start alone."""
+    are kept. dy0 (size, n) is the derivative of the initial state, zero by default; its columns
+    beyond those of `wanted` are directions of the start alone."""
     size, count = stepper.layout.size, len(sums.start) - 1
     dy = np.zeros((size, len(wanted))) if dy0 is None else dy0.detach().numpy().copy()
     n = dy.shape[1]

@@ -7,7 +7,7 @@ base's axes; its moment is the channel M_NAME), normal and shear of a contact's 
 taxels, and the centre of their normal forces.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -51,6 +51,15 @@ class Sums(NamedTuple):
     start: Index
     at: Index
     weight: Array
+
+
+def enumerated(names: Iterable[str]) -> str:
+    """Names one after the other, those of an array as one, for messages."""
+    last: dict[str, str] = {}
+    for name in names:
+        array, _, number = name.rpartition(".")
+        last[array if number.isdecimal() else name] = number if number.isdecimal() else ""
+    return ", ".join(f"{name}.0 to {number}" if number else name for name, number in last.items())
 
 
 class Touch:
@@ -110,17 +119,19 @@ class Touch:
         sizes = {name: len(places) for name, (_, places) in self._arrays.items()}
         return {f"{name}.{kind}": size for name, size in sizes.items() for kind in KINDS}
 
+    def __iter__(self) -> Iterator[str]:
+        yield from self.single
+        yield from self.expanded([*self.arrays])
+
     @property
     def shown(self) -> str:
         """The names, for messages."""
-        return ", ".join(
-            [*self.single, *(f"{name}.0 to {size - 1}" for name, size in self.arrays.items())]
-        )
+        return enumerated(self)
 
     def __contains__(self, name: object) -> bool:
         array, _, number = str(name).rpartition(".")
         inside = number.isdecimal() and int(number) < self.arrays.get(array, 0)
-        return inside and str(int(number)) == number or name in self.single
+        return name in self.single or (inside and str(int(number)) == number)
 
     def __getitem__(self, name: str) -> Felt:
         """Raises `KeyError` naming what there is."""

@@ -13,7 +13,7 @@ from torchsoft.rigs.fields import at_field
 from torchsoft.solve.simulate import simulate
 from torchsoft.sysid.configuration import Config, Entry, Rest
 from torchsoft.sysid.rig_recordings import vocabulary
-from torchsoft.sysid.unknowns import Unknown
+from torchsoft.sysid.unknowns import Unknown, by_channel
 
 FINER = 0.1
 """Tolerance of the simulated experiment, in parts of the fit's."""
@@ -45,11 +45,12 @@ def rehearsed(config: Path, stated: Config, out: Path) -> tuple[Config, list[Pat
         t = torch.from_numpy(np.append([-lead] if lead else [], at))
         run = simulate(rig, t, y0=y0, rtol=FINER * stated.fit.rtol)
         columns = {"t": at}
-        for channel in (*known.signals, *stated.sensors):
-            if channel not in run.channels:
+        sensors = by_channel([rig], stated.sensors)
+        for channel in (*known.signals, *sensors):
+            if channel not in run.channels and channel not in run.touch:
                 raise ValueError(f"{config}: sensors: the rig has no channel `{channel}`")
             columns[channel] = run[channel].detach().numpy()[-len(at) :].copy()
-        for channel, sensor in stated.sensors.items():
+        for channel, sensor in sensors.items():
             columns[channel] += sensor.noise * random.standard_normal(len(at))
         headings = {of: heading for heading, of in known.headings.items()}
         head = ",".join(f"{headings.get(one, one)} [{known.units[one]}]" for one in columns)

@@ -395,7 +395,7 @@ def finish(s: Any, w: Any, y: Array, a: float, powers: Array, wrenches: Array) -
 def finish_inertial(
     s: Any, w: Any, pad: int, y: Array, a: float, powers: Array, wrenches: Array
 ) -> float:
-    """Rates of an inertial pad, its part in powers, load and moment; returns its largest nodal rate
+    """Rates of an inertial pad, its part in powers, load and force; returns its largest nodal rate
     [m/s]."""
     p = s.p
     first, last = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1]
@@ -425,12 +425,9 @@ def finish_inertial(
     for i in range(0, last - first):
         powers[pad] += p[at + 2] * rates[i] * stiffness[i]
         effort[i] = forces[i] - p[at + 3] * s.inertia_area[first + i] * w.k[s.pad_v_start[pad] + i]
-    wrench = wrenches[pad]
-    wrench[:] = 0.0
-    for i in range(0, last - first, 2):
-        wrench[0] += effort[i]
-        wrench[1] += effort[i + 1]
-        wrench[2] += s.inertia_X[first + i] * effort[i + 1] - s.inertia_X[first + i + 1] * effort[i]
+    wrenches[pad] = 0.0
+    for i in range(last - first):
+        wrenches[pad, i % 2] += effort[i]
     mx, my = inertia_force(s, w, pad, y, a, rates)
     cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
     w.load[base] -= cos * mx - sin * my

@@ -22,6 +22,7 @@ from torchsoft.solve.kernel.arrays import (
     OFF_THE_PAD,
     TAPE_FULL,
 )
+from torchsoft.solve.kernel.inertia import elastic_wrench
 from torchsoft.solve.kernel.interface import at_point
 from torchsoft.solve.kernel.linear import put
 from torchsoft.solve.kernel.stage import actuate, finish, solve_stage
@@ -110,8 +111,8 @@ def supply(s: Any, w: Any, signals: Array, powers: Array) -> None:
 
 
 @compiled
-def record(s: Any, w: Any, wrenches: Array, out: Array) -> None:
-    """One row of forces, as `recorded_size` orders them."""
+def record(s: Any, w: Any, y: Array, wrenches: Array, out: Array) -> None:
+    """One row of forces at the state y, as `recorded_size` orders them."""
     out[:] = 0.0
     for pad in range(s.pad_base.size):
         at = s.pad_point_start[pad]
@@ -119,8 +120,17 @@ def record(s: Any, w: Any, wrenches: Array, out: Array) -> None:
             k = w.active[at + i]
             out[2 * k], out[2 * k + 1] = w.out[k, 3], w.out[k, 4]
     first = 2 * s.point_contact.size
-    put(wrenches, out[first : first + wrenches.size])
-    put(w.load, out[first + wrenches.size :])
+    loads = out[first + wrenches.size :]
+    put(w.load, loads)
+    for pad in range(s.pad_base.size):
+        wrench, base = out[first + 3 * pad : first + 3 * pad + 3], s.pad_base[pad]
+        put(wrenches[pad], wrench)
+        if s.pad_v_start[pad] >= 0:
+            elastic_wrench(s, w, pad, y, wrench)
+            x, y_axis = wrench[0] - wrenches[pad, 0], wrench[1] - wrenches[pad, 1]
+            cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
+            loads[base] += cos * x - sin * y_axis
+            loads[base + 1] += sin * x + cos * y_axis
 
 
 @compiled
@@ -257,7 +267,7 @@ def write_rows(r: Any, h: float, first: int, last: int) -> tuple[int, int]:
         if tape.count.shape[0] > 0 and not write_tape(s, w, tape, i, ys[i], way):
             return TAPE_FULL, solves
         put(d.at_row, out.integrals[i])
-        record(s, w, d.wrenches, out.recorded[i])
+        record(s, w, ys[i], d.wrenches, out.recorded[i])
         put(d.guess_V, w.V)
         put(d.guess, w.u_dot)
         w.travelled[0] = here if w.travelled[2] == scans else np.inf

@@ -359,15 +359,14 @@ def add_loads(s: Any, z: Any, k: int, by: Array, change: Array) -> None:
     """Add the loads `by` (6, n) times `change` (n, m) of point k on its body and its pad's base to
     z.recorded. What moves an inertial pad's base is the force in the pad."""
     c, start = s.point_contact[k], 2 * s.point_contact.size + 3 * s.pad_base.size
-    for o in range(3 if s.pad_v_start[s.contact_pad[c]] >= 0 else 6):
-        for j in range(by.shape[1]):
+    inertial = s.pad_v_start[s.contact_pad[c]] >= 0
+    for o in range(6):
+        for j in range(0 if inertial and 3 <= o < 5 else by.shape[1]):
             add(by[o, j], change[j], z.recorded[start + s.contact_coordinate[c, o]])
 
 
 @compiled
-def feel_pad(
-    s: Any, w: Any, z: Any, pad: int, y: Array, rate: Array, dy: Array, dp: Array
-) -> None:
+def feel_pad(s: Any, w: Any, z: Any, pad: int, y: Array, rate: Array, dy: Array, dp: Array) -> None:
     """Tangents of a pad's forces into z.recorded, whose loads hold the part at the same forces."""
     at, wrench = s.pad_point_start[pad], 2 * s.point_contact.size + 3 * pad
     inertial, into = s.pad_v_start[pad] >= 0, z.recorded
@@ -399,8 +398,9 @@ def feel_inertial(
         s.pad_v_start[pad],
     )
     i0, i1, tau = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1], s.p[at + 2]
-    wrench, load = 2 * s.point_contact.size + 3 * pad, 2 * s.point_contact.size + 3 * (
-        s.pad_base.size
+    wrench, load = (
+        2 * s.point_contact.size + 3 * pad,
+        2 * s.point_contact.size + 3 * (s.pad_base.size),
     )
     cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
     strain, force, into = w.inertial[0, i0:i1], w.inertial[1, i0:i1], z.recorded
@@ -498,9 +498,7 @@ def read(r: Any, i: int) -> None:
     out = r.dsums[i]
     if out.shape[0] == 0:
         return
-    stage_tangent(
-        r.s0, r.w, r.z, r.out_tape, i, INSTANT, r.out_signals[i], r.dys[i], r.dp, True
-    )
+    stage_tangent(r.s0, r.w, r.z, r.out_tape, i, INSTANT, r.out_signals[i], r.dys[i], r.dp, True)
     for c in range(out.shape[0]):
         out[c] = 0.0
         for j in range(r.sum_start[c], r.sum_start[c + 1]):
