@@ -128,11 +128,10 @@ def run_adjoint(
     felt: Array = np.zeros((len(run.t), 0))
     if recorded_bar is not None:
         felt = np.ascontiguousarray(recorded_bar.numpy())
-    for kind, bar in ("state", rows), ("forces", felt):
+    for bar in rows, felt:
         if not np.isfinite(bar).all():
             raise GradientFailed(
-                f"the cotangent of the {kind} at output {np.argwhere(~np.isfinite(bar))[0][0]} is "
-                "not finite"
+                f"the cotangent of output {np.argwhere(~np.isfinite(bar))[0][0]} is not finite"
             )
     carried, p_bar = np.zeros(size), np.zeros(len(stepper.compiled.p))
     signals_bar = [np.zeros(segment.signals.shape) for segment in run.segments or []]
