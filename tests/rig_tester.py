@@ -18,6 +18,7 @@ from torchsoft.solve.kernel.arrays import GAMMA
 from torchsoft.solve.progress import Segment
 from torchsoft.solve.rates import Rates
 from torchsoft.solve.stepper import ImplicitStepper
+from torchsoft.solve.touch import Touch
 
 NEWTON = 1e-10
 """Newton's tolerance of the compiled steps [N]; 1e-11 is rounding, and not reached at every
@@ -154,7 +155,7 @@ def assert_compiled_is_the_module(start: Start, seed: int, h: float = 2e-4) -> N
     *_, last = stepper.integrate(y, f64(0.0, h), segments, float("inf"))
     assert last.steps == 1
     star, a, end = (
-        torch.from_numpy(stepper.tape(segments[0]).y),
+        torch.from_numpy(stepper.tapes(segments[-1])[0].y),
         GAMMA * h,
         torch.from_numpy(last.y[-1]),
     )
@@ -185,9 +186,9 @@ def assert_compiled_is_the_module(start: Start, seed: int, h: float = 2e-4) -> N
 def assert_gradients_exact(
     start: Start, t: Tensor, rtol: float = 1e-4, bound: float = 2e-6
 ) -> Trajectory:
-    """A run whose ledger closes. Its discrete adjoint by the start, every parameter and every value
-    of the reference is the difference along the same steps, and its forward sensitivities are the
-    adjoint.
+    """A run whose ledger closes. The discrete adjoint of its motion, and that of its forces, loads
+    and moments, by the start, every parameter and every value of the reference is the difference
+    along the same steps, and its forward sensitivities are the adjoint.
 
     Differences are taken along one direction, in which all of these weigh alike as far as they
     weigh at all.
@@ -202,14 +203,17 @@ def assert_gradients_exact(
     weights = torch.randn(len(t) - 1, rig.layout.size, generator=generator, dtype=torch.float64)
     for (part, _), where in rig.layout.slices.items():
         weights[:, where] *= {"pose": 1e3, "velocity": 10.0}.get(part, 0.0)  # [1/m, s/m]
+    touch = Touch(rig)
+    felt = [name for name in touch.expanded([*touch.arrays, *touch.single]) if "centre" not in name]
+    pulls = torch.randn(len(t), len(felt), generator=generator, dtype=torch.float64)
 
-    def run(**how: Any) -> tuple[Trajectory, Tensor]:
+    def run(**how: Any) -> tuple[Trajectory, dict[str, Tensor]]:
         made = simulate(rig, t, y0=y0 + kick * shake, tolerance=NEWTON, **how)
-        return made, (weights * (made.y[1:] - y0)).sum()
+        motion = (weights * (made.y[1:] - y0)).sum()
+        return made, {"motion": motion, "forces": (pulls * made.together(*felt)).sum()}
 
-    made, value = run(rtol=rtol, gradient="discrete")
+    made, values = run(rtol=rtol, gradient="discrete")
     assert made.energy_residual_rel < 2e-3
-    slopes = torch.autograd.grad(value, list(leaves.values()), allow_unused=True)
     wanted = [
         name
         for name, p in leaves.items()
@@ -217,39 +221,43 @@ def assert_gradients_exact(
     ]
     forward = simulate(
         rig, t, y0=y0, knots=made.knots, tolerance=NEWTON, gradient="forward", wrt=wanted,
-        dy0=torch.cat(
+        touch=felt, dy0=torch.cat(
             (torch.zeros(len(y0), len(wanted), dtype=torch.float64), shake[:, None]), -1),
     )  # fmt: skip
     assert forward.sensitivities is not None
-    by_forward = dict(
-        zip([*wanted, "start"], torch.einsum("ti,tin->n", weights, forward.sensitivities[1:]))
-    )
-    ways, shares = {}, {}
-    for (name, p), slope in zip(leaves.items(), slopes):
-        if slope is None:
-            continue
-        way = torch.randn(p.shape, generator=generator, dtype=torch.float64).sign()
-        ways[name] = way * (1.0 if name == "start" else p.detach().abs().mean() + 1e-6)
-        shares[name] = float((slope * ways[name]).sum())
-    largest, kept = (
-        max(map(abs, shares.values())),
-        {name: leaves[name].detach().clone() for name in ways},
-    )
-    for name, slope in by_forward.items():
-        found = float(slope * ways.get(name, torch.ones(())))
-        assert found == pytest.approx(shares.get(name, 0.0), rel=1e-7, abs=1e-8 * largest), name
-    for name, share in shares.items():  # lengths decide when points touch, and are hardly changed
-        most = 10.0 if "shape" in name or "reference" in name else 100.0
-        ways[name] *= (factor := min(largest / (abs(share) + 1e-300), most))
-        shares[name] = share * factor
-    ends = []
-    for h in (2e-9, -2e-9):
-        with torch.no_grad():
-            for name, way in ways.items():
-                leaves[name].add_(h * way)
-            ends.append(float(run(knots=made.knots)[1]))
-            for name, value in kept.items():
-                leaves[name].copy_(value)
-    slope, scale = (ends[0] - ends[1]) / 4e-9, sum(map(abs, shares.values()))
-    assert slope == pytest.approx(sum(shares.values()), abs=bound * scale), shares
+    of_forces = torch.stack([forward.touch_sensitivities[name] for name in felt], 1)
+    by_forward = {
+        "motion": torch.einsum("ti,tin->n", weights, forward.sensitivities[1:]),
+        "forces": torch.einsum("ti,tin->n", pulls, of_forces),
+    }
+    kept = {name: p.detach().clone() for name, p in leaves.items()}
+    for kind, value in values.items():
+        slopes = torch.autograd.grad(
+            value, list(leaves.values()), allow_unused=True, retain_graph=True
+        )
+        ways, shares = {}, {}
+        for (name, p), slope in zip(leaves.items(), slopes):
+            if slope is None:
+                continue
+            way = torch.randn(p.shape, generator=generator, dtype=torch.float64).sign()
+            ways[name] = way * (1.0 if name == "start" else p.detach().abs().mean() + 1e-6)
+            shares[name] = float((slope * ways[name]).sum())
+        largest = max(map(abs, shares.values()))
+        for name, slope in zip([*wanted, "start"], by_forward[kind]):
+            found = float(slope * ways.get(name, torch.ones(())))
+            assert found == pytest.approx(shares.get(name, 0.0), rel=1e-7, abs=1e-8 * largest), name
+        for name, share in shares.items():  # lengths decide when points touch: hardly changed
+            most = 10.0 if "shape" in name or "reference" in name else 100.0
+            ways[name] *= (factor := min(largest / (abs(share) + 1e-300), most))
+            shares[name] = share * factor
+        ends = []
+        for h in (2e-9, -2e-9):
+            with torch.no_grad():
+                for name, way in ways.items():
+                    leaves[name].add_(h * way)
+                ends.append(float(run(knots=made.knots)[1][kind]))
+                for name, one in kept.items():
+                    leaves[name].copy_(one)
+        slope, scale = (ends[0] - ends[1]) / 4e-9, sum(map(abs, shares.values()))
+        assert slope == pytest.approx(sum(shares.values()), abs=bound * scale), (kind, shares)
     return made

@@ -18,7 +18,7 @@ FLOWS = {
     """,
     "codegen": "graph derivatives operations trace pointwise emit .",
     "physics": """
-        arguments mesh shapes contact material pads motion multibond state parts condensed
+        arguments mesh shapes contact material pads taxels motion multibond state parts condensed
         validity rig energy statics .
     """,
     "paper": "parameters rig equilibrium .",
@@ -26,7 +26,7 @@ FLOWS = {
     "physics.shapes": "shape oval rounded contour .",
     "solve": """
         grid kernel laws system progress tolerances rates stability stepper adjoint
-        tangent trajectory
+        touch tangent trajectory
         ledger simulate batch torchdiffeq .
     """,
     "sysid": """

@@ -20,6 +20,7 @@ from .physics.shapes import (
     Superellipse,
 )
 from .physics.statics import NoEquilibrium
+from .physics.taxels import Taxels
 from .solve.batch import Batch, SamplesFailed, simulate_batch
 from .solve.progress import SimulationFailed
 from .solve.simulate import Interrupted, simulate
@@ -64,6 +65,7 @@ __all__ = [
     "StandardLinearSolid",
     "StateFeedback",
     "Superellipse",
+    "Taxels",
     "Trajectory",
     "controller",
     "hold",

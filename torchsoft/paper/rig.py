@@ -17,6 +17,7 @@ from torchsoft.physics.pads import Pad
 from torchsoft.physics.parts import PD, Actuator, Body, Contact
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.shapes import Circle, Shape
+from torchsoft.physics.taxels import Taxels
 
 NAMES = {
     **{f"pad.{name}": f"pad.{name}" for name in ("E", "nu", "rho", "tau", "depth")},
@@ -41,8 +42,9 @@ class SoftGrasp(Rig):
 
     The reference's signals are x_d of the disc (or of the bracket, `control.senses`), y_d of the
     bracket and F_ff, the vertical effort fed forward; by default the bracket and the disc stay
-    where they start. `friction`, `shape` and `material` replace those of the settings. Parts that
-    both pads share are `pad` (the material), `contact`, `disc`, `bracket` and `control`.
+    where they start. `friction`, `shape` and `material` replace those of the settings; `taxels` lie
+    on the pads "L" and "U". Parts that both pads share are `pad` (the material), `contact`, `disc`,
+    `bracket` and `control`.
     """
 
     renamed: Mapping[str, str] = {
@@ -55,7 +57,7 @@ class SoftGrasp(Rig):
     def __init__(
         self, settings: Parameters | None = None, reference: Reference | None = None, *,
         friction: SlipLaw | None = None, shape: Shape | None = None,
-        material: Material | None = None,
+        material: Material | None = None, taxels: Mapping[str, Taxels] | None = None,
     ) -> None:  # fmt: skip
         p = settings or Parameters()
         c, k = p.contact, p.control
@@ -91,6 +93,7 @@ class SoftGrasp(Rig):
             reference=reference or hold(x_d=p.scenario.x_C0, y_d=apart(p), F_ff=0.0),
             gravity=p.scenario.gravity,
             symbols={"disc": "C", "bracket": "Br"},
+            taxels=taxels,
         )  # fmt: skip
         self._settings = p
 

@@ -152,6 +152,16 @@ class Pad(nn.Module):
         """Undeformed places of the contact points in the base's frame (points, 2) [m]."""
         return self.spread @ self.positions
 
+    @property
+    def point_coordinates(self) -> Array:
+        """Coordinates of the contact points along the undeformed surface, from its middle
+        (points,) [m]."""
+        face = self.mesh.face
+        way = np.linalg.norm(np.diff(self.mesh.nodes[face], axis=0), axis=1).cumsum()
+        along = np.concatenate(([0.0], way)) - 0.5 * way[-1]
+        own = along[~self.mesh.bonded[face]]
+        return (self.point_shares * own[self.point_nodes]).sum(-1)
+
     def unit_compliance(self) -> tuple[Tensor, Tensor]:
         """C for E depth = 1 and its derivative by nu, at the material's own nu, in the base's
         frame. Shared between calls; not to be written to."""

@@ -28,6 +28,7 @@ from torchsoft.physics.parts import (
 )
 from torchsoft.physics.shapes import parameter
 from torchsoft.physics.state import Layout, State
+from torchsoft.physics.taxels import Taxels
 from torchsoft.quantity import Gravity, Quantity, near, quantity_of
 
 GROUND = "ground"
@@ -73,7 +74,8 @@ class Rig(nn.Module):
     `nn.Parameter` that gradients reach. `reference` gives the signals that actuators and driven
     coordinates follow; a run may be given another. `symbols` are the suffixes of the bodies'
     channels, the name by default; `groups` are parts that several of the lists share, whose
-    parameters are then called by the group's name.
+    parameters are then called by the group's name. `taxels` are arrays of areas that feel the
+    forces on pads.
 
     `forward(t, y)` follows torchdiffeq: y has shape (..., `layout.size`), float64, any batch
     dimensions. Not smooth where a point touches, where the normal force is cut at zero and where a
@@ -87,6 +89,7 @@ class Rig(nn.Module):
         contacts: Mapping[str, Contact], actuators: Mapping[str, Actuator] | None = None,
         reference: Reference | None = None, gravity: Gravity = 9.81,
         symbols: Mapping[str, str] | None = None, groups: Mapping[str, nn.Module] | None = None,
+        taxels: Mapping[str, Taxels] | None = None,
     ) -> None:  # fmt: skip
         super().__init__()
         self.groups = tuple(groups or {})
@@ -103,6 +106,7 @@ class Rig(nn.Module):
             self.add_module(name, nn.ModuleDict(parts))
         self.gravity = parameter(gravity)
         self.reference = reference or Reference()
+        self.taxels = dict(taxels or {})
         self.symbols = {name: (symbols or {}).get(name, name) for name in bodies}
         self.check_names()
 
@@ -148,6 +152,17 @@ class Rig(nn.Module):
                 raise ValueError(
                     f"contact `{name}`: the pad `{contact.pad}` is bonded to the body "
                     f"`{contact.body}` itself"
+                )
+        for name, taxels in self.taxels.items():
+            if taxels.pad not in self.pads:
+                raise ValueError(
+                    f"taxels.{name}: they lie on `{taxels.pad}`, but the pads are "
+                    f"{', '.join(self.pads)}"
+                )
+            if name in self.contacts:
+                raise ValueError(
+                    f"taxels.{name}: a contact is called `{name}` too, whose forces have the same "
+                    "names; call one of them otherwise"
                 )
         for name, actuator in self.actuators.items():
             for coordinate in (*actuator.measures, actuator.pushes):

@@ -149,7 +149,7 @@ def massless(rig: Rig) -> Rig:
     return Rig(
         bodies=rig.bodies, pads={name: pad.condensed() for name, pad in rig.pads.items()},
         contacts=rig.contacts, actuators=rig.actuators, reference=rig.reference,
-        gravity=float(rig.gravity.detach()), symbols=rig.symbols,
+        gravity=float(rig.gravity.detach()), symbols=rig.symbols, taxels=rig.taxels,
     )  # fmt: skip
 
 

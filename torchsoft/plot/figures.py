@@ -316,7 +316,11 @@ def snapshots(
 def energy_groups(trajectory: Trajectory) -> list[tuple[str, Array, str]]:
     """Label, energy [mJ] (T,) and colour of what is stored (pads, springs, motion) and dissipated
     (pads, dashpots, slip)."""
-    stored, lost, groups = dict(trajectory.energy), dict(trajectory.dissipated), []
+    stored, lost = (
+        {name: energy.detach() for name, energy in energies.items()}
+        for energies in (trajectory.energy, trajectory.dissipated)
+    )
+    groups = []
     for energies, prefix, label, colours in (
         (stored, "strain_", "stored: {} pad, strain", STRAIN),
         (lost, "pad_", "dissipated: {} pad, damping", DAMPING),
@@ -350,8 +354,8 @@ def energy_balance(trajectory: Trajectory) -> Figure:
     t = timeline(stack, "energy [mJ]", trajectory)
     labels, parts, colours = zip(*energy_groups(trajectory))
     stack.stackplot(t, *parts, labels=labels, colors=colours, lw=0)
-    start = MM * sum(float(value[0]) for value in trajectory.energy.values())
-    supplied = start + MM * sum(value.numpy() for value in trajectory.supplied.values())
+    start = MM * sum(float(value[0].detach()) for value in trajectory.energy.values())
+    supplied = start + MM * sum(x.detach().numpy() for x in trajectory.supplied.values())
     stack.plot(
         t, supplied, color="black", lw=1.4, ls=(0, (4, 2)), label="stored at the start + supplied"
     )
@@ -362,7 +366,7 @@ def energy_balance(trajectory: Trajectory) -> Figure:
     )  # in the order of the stack
     residual.plot(
         timeline(residual, "residual [mJ]", trajectory),
-        MM * trajectory.energy_residual.numpy(),
+        MM * trajectory.energy_residual.detach().numpy(),
         color=INK,
     )
     residual.set_title(
@@ -376,7 +380,7 @@ def friction_ratio(trajectory: Trajectory) -> Array:
     """Sum of |F_T| over sum of F_N, all contacts, in %; zero where nothing touches."""
     forces = torch.cat(list(trajectory.force.values()), 1)
     normal, friction = forces[..., 0].sum(-1), forces[..., 1].abs().sum(-1)
-    return (100 * friction / normal.clamp(min=1e-12)).numpy()
+    return (100 * friction / normal.clamp(min=1e-12)).detach().numpy()
 
 
 @rc_context(STYLE)

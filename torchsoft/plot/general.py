@@ -116,7 +116,11 @@ def efforts(trajectory: Trajectory, rig: Rig) -> Figure:
         values = force[..., 0].sum(-1), force[..., 1].sum(-1), (force[..., 0] > 0).sum(-1)
         for axes, label, value in zip(panels, labels, values):
             axes.plot(
-                timeline(axes, label, trajectory), value.numpy(), color=colour, lw=1.1, label=name
+                timeline(axes, label, trajectory),
+                value.detach().numpy(),
+                color=colour,
+                lw=1.1,
+                label=name,
             )
     for kind, axes in zip(kinds, panels[3:]):
         turns = kind == "turns"

@@ -109,7 +109,7 @@ class Instant(NamedTuple):
 def instants(rig: Rig, trajectory: Trajectory, times: Sequence[float]) -> list[Instant]:
     """The samples of `trajectory` nearest to `times` [s], as drawn."""
     rows = [trajectory.at(time) for time in times]
-    displacement = {name: trajectory.displacement[name][rows] for name in rig.pads}
+    displacement = {name: trajectory.displacement[name][rows].detach() for name in rig.pads}
     meshes = {name: MM * deformed_mesh(pad, displacement[name]) for name, pad in rig.pads.items()}
     shown = []
     for i, row in enumerate(rows):
@@ -129,7 +129,7 @@ def instants(rig: Rig, trajectory: Trajectory, times: Sequence[float]) -> list[I
             )
             direction, (_, y) = along_surface(pad, own), own_axes(pad, own)
             t = np.array([y[1], -y[0]])  # of the moving frame, whose normal points into the pad
-            force[key] = trajectory.force[key][row].numpy() * [1.0, np.sign(direction @ t)]
+            force[key] = trajectory.force[key][row].detach().numpy() * [1.0, np.sign(direction @ t)]
             along[key] = points[key] @ direction
         mesh = {name: in_world(meshes[name][i], base[name]) for name in meshes}
         shown.append(Instant(float(trajectory.t[row]), pose, base, mesh, points, force, along))

@@ -23,7 +23,15 @@ from torchsoft.rigs.control import ActuatorTable, ControllerTable, Loop
 from torchsoft.rigs.fields import Group, at_field
 from torchsoft.rigs.geometry import Scene
 from torchsoft.rigs.motion import MotionContext, MotionTable, flattened
-from torchsoft.rigs.parts import REST, AnyPad, BodyTable, ContactTable, LawTable, MaterialTable
+from torchsoft.rigs.parts import (
+    REST,
+    AnyPad,
+    BodyTable,
+    ContactTable,
+    LawTable,
+    MaterialTable,
+    TaxelsTable,
+)
 from torchsoft.tables import LISTED, from_toml, line
 
 M = TypeVar("M")
@@ -47,7 +55,7 @@ balance."""
 
 REFERENCES = (
     ("pads", "material", "materials"), ("pads", "base", "bodies"), ("contacts", "pad", "pads"),
-    ("contacts", "body", "bodies"), ("contacts", "law", "laws"),
+    ("contacts", "body", "bodies"), ("contacts", "law", "laws"), ("taxels", "pad", "pads"),
 )  # fmt: skip
 """Tables and fields that name another table, and where that is."""
 
@@ -146,6 +154,7 @@ class RigFile(Group):
     pads: dict[str, AnyPad] = Field(min_length=1)
     laws: dict[str, LawTable] = Field(min_length=1)
     contacts: dict[str, ContactTable] = Field(min_length=1)
+    taxels: dict[str, TaxelsTable] = Field(default_factory=dict)
     actuators: dict[str, ActuatorTable] = Field(default_factory=dict)
     controllers: dict[str, ControllerTable] = Field(default_factory=dict)
     motion: dict[str, MotionTable] = Field(default_factory=dict)
@@ -244,6 +253,7 @@ class RigFile(Group):
             "pads",
             "laws",
             "contacts",
+            "taxels",
             "actuators",
             "controllers",
         ):
@@ -291,6 +301,11 @@ class RigFile(Group):
                     f"contacts.{name}: the pad `{contact.pad}` is bonded to the body "
                     f"`{contact.body}` itself"
                 )
+        for name in sorted(self.taxels.keys() & self.contacts.keys()):
+            raise ValueError(
+                f"taxels.{name}: a contact is called `{name}` too, whose forces have the same "
+                "names; call one of them otherwise"
+            )
         for group, (others, field, why) in USED.items():
             named = {getattr(other, field) for other in getattr(self, others).values()}
             for name in sorted(getattr(self, group).keys() - named):
@@ -381,6 +396,7 @@ class RigFile(Group):
             actuators=actuators,
             gravity=self.gravity,
             symbols={name: one.symbol or name for name, one in self.bodies.items()},
+            taxels=made("taxels", lambda one: one.build(folder)),
         )
         named = {self._own_name(rig, *name.split(".")): name for name, _ in rig.named_parameters()}
         rig.aliases = {alias: name for alias, name in named.items() if alias != name}

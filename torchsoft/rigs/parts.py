@@ -22,6 +22,7 @@ from torchsoft.physics.shapes import (
     Superellipse,
 )
 from torchsoft.physics.shapes.contour import read_points
+from torchsoft.physics.taxels import Taxels
 from torchsoft.quantity import Angle, Density, Depth, Inertia, InertiaRatio, Mass, Place, Quantity
 from torchsoft.rigs.fields import Group, NumberOr, PartTable, at_field, one_of, table_of
 from torchsoft.tables import LISTED, line, read_toml, refusing
@@ -371,6 +372,9 @@ else:
     LawTable = table_of(
         SoftContact, friction=one_of(table_of(SmoothSlip, "smooth"), table_of(Coulomb, "coulomb"))
     )
+
+
+TaxelsTable = table_of(Taxels)
 
 
 class ContactTable(Group):

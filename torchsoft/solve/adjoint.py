@@ -29,19 +29,28 @@ class GradientFailed(RuntimeError):
     """A gradient that there is not, or that is not finite: when [s] it ceased to be."""
 
 
+class Rows(NamedTuple):
+    """What of a run has a gradient at its outputs: states (T, size), and forces (T, recorded) as
+    `recorded_size` orders them."""
+
+    y: Tensor
+    recorded: Tensor
+
+
 class Solved(NamedTuple):
     """A run, finished or growing: what it was made with, what it left, and its segments if anything
     wants a gradient."""
 
     stepper: ImplicitStepper
     y0: Tensor
+    t: Tensor
     out: Progress
     segments: list[Segment] | None
 
     @property
-    def y(self) -> Tensor:
-        """States (T, size), without a graph."""
-        return torch.from_numpy(self.out.y)
+    def rows(self) -> Rows:
+        """What it left, without a graph."""
+        return Rows(torch.from_numpy(self.out.y), torch.from_numpy(self.out.recorded))
 
 
 def march(
@@ -53,20 +62,23 @@ def march(
         [] if torch.is_grad_enabled() and wants_gradient(stepper, y0) else None
     )
     for out in stepper.integrate(y0.detach(), t, segments, tape_bytes):
-        yield Solved(stepper, y0, out, segments)
+        yield Solved(stepper, y0, t, out, segments)
 
 
-def attached(runs: Sequence[Solved], threads: int = 1) -> list[Tensor]:
-    """The states (T, size) of finished runs with the discrete adjoint behind them, by y0,
-    parameters and signals, but not by the times, where anything wants it. The backward sweeps of
-    several runs go side by side in so many threads."""
+def attached(runs: Sequence[Solved], threads: int = 1) -> list[Rows]:
+    """The rows of finished runs with the discrete adjoint behind them, by y0, parameters and
+    signals, but not by the times, where anything wants it. The backward sweeps of several runs go
+    side by side in so many threads."""
     wanted = [run for run in runs if run.segments is not None]
     inputs: list[Tensor] = []
     for run in wanted:
-        signals = run.stepper.signals([segment.plan for segment in run.segments or []])
-        inputs += [run.y0, run.stepper.compiled.p, signals]
-    solutions = iter(_Solutions.apply(wanted, threads, *inputs) if wanted else ())
-    return [run.y if run.segments is None else next(solutions) for run in runs]
+        stepper = run.stepper
+        at_stages = stepper.signals([segment.plan for segment in run.segments or []])
+        at_outputs = stepper.compiled.signals(run.t, stepper.reference)
+        inputs += [run.y0, stepper.compiled.p, at_stages, at_outputs]
+    flat = iter(_Solutions.apply(wanted, threads, *inputs) if wanted else ())
+    solutions = map(Rows, flat, flat)
+    return [run.rows if run.segments is None else next(solutions) for run in runs]
 
 
 def wants_gradient(stepper: ImplicitStepper, y0: Tensor) -> bool:
@@ -84,66 +96,67 @@ class _Solutions(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         ctx.runs, ctx.threads = runs, threads
         ctx.set_materialize_grads(False)
-        return tuple(run.y.clone() for run in runs)
+        return tuple(part.clone() for run in runs for part in run.rows)
 
     @staticmethod
-    def backward(ctx: Any, *y_bars: Tensor | None) -> Any:
+    def backward(ctx: Any, *given: Tensor | None) -> Any:
         if (
             torch.is_grad_enabled()
         ):  # a graph of it would lack how the cotangents depend on what ran
             raise GradientFailed(
                 "a run has no second derivative; ask for its gradient without create_graph"
             )
-        bars: list[Tensor | None] = [None] * (3 * len(y_bars))
-        asked = [(i, y_bar) for i, y_bar in enumerate(y_bars) if y_bar is not None]
+        bars: list[Tensor | None] = [None] * (4 * len(ctx.runs))
+        pairs = list(zip(given[::2], given[1::2]))
+        asked = [i for i, (y, felt) in enumerate(pairs) if y is not None or felt is not None]
 
-        def sweep(k: int) -> tuple[Tensor, Tensor, Tensor]:
-            i, y_bar = asked[k]
-            return run_adjoint(ctx.runs[i].stepper, ctx.runs[i].segments, y_bar)
+        def sweep(k: int) -> tuple[Tensor, ...]:
+            return run_adjoint(ctx.runs[asked[k]], *pairs[asked[k]])
 
         for k, result in parallel_map(sweep, len(asked), ctx.threads, turns=True):
-            bars[3 * asked[k][0] : 3 * asked[k][0] + 3] = result
+            bars[4 * asked[k] : 4 * asked[k] + 4] = result
         return None, None, *bars
 
 
 def run_adjoint(
-    stepper: ImplicitStepper, segments: list[Segment], y_bar: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Cotangents of y0 (size,), of the parameters' vector and of the signals (stages, signals, 2),
-    from those of the outputs, y_bar (T, size). Raises `GradientFailed` where one is not finite."""
-    rows: Array = np.ascontiguousarray(y_bar.numpy())
-    if not np.isfinite(rows).all():
-        raise GradientFailed(
-            f"the cotangent of output {int(np.argwhere(~np.isfinite(rows))[0][0])} is not finite"
-        )
-    size = stepper.layout.size
+    run: Solved, y_bar: Tensor | None, recorded_bar: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Cotangents of y0 (size,), of the parameters' vector and of the signals at stages and outputs
+    (., signals, 2), from those of the rows. Raises `GradientFailed` where one is not finite."""
+    stepper, size = run.stepper, run.stepper.layout.size
+    rows: Array = np.zeros((len(run.t), size)) if y_bar is None else y_bar.numpy().copy()
+    felt: Array = np.zeros((len(run.t), 0))
+    if recorded_bar is not None:
+        felt = np.ascontiguousarray(recorded_bar.numpy())
+    for bar in rows, felt:
+        if not np.isfinite(bar).all():
+            raise GradientFailed(
+                f"the cotangent of output {np.argwhere(~np.isfinite(bar))[0][0]} is not finite"
+            )
     carried, p_bar = np.zeros(size), np.zeros(len(stepper.compiled.p))
-    signals_bar = [np.zeros(segment.signals.shape) for segment in segments]
-    for number in range(len(segments) - 1, -1, -1):
-        segment = segments[number]
-        plan, tape = segment.plan, stepper.tape(segment)
-        s = stepper.compiled.system(float(plan.h[0]))
-        failed = np.zeros(1, np.int64)
+    signals_bar = [np.zeros(segment.signals.shape) for segment in run.segments or []]
+    outputs_bar = np.zeros((len(run.t), *signals_bar[0].shape[1:]))
+    for number in range(len(signals_bar) - 1, -1, -1):
+        segment = (run.segments or [])[number]
+        plan, (tape, out_tape), s = segment.plan, stepper.tapes(segment), stepper.system(segment)
+        failed, here = np.zeros(1, np.int64), segment.rows
         sweep = Backward(
-            s, room("Work", s, size, columns=1), room("Cotangents", s, size), tape, plan.h,
-            segment.signals, plan.out_step, plan.out_part, rows[segment.rows], carried, p_bar,
-            signals_bar[number], failed,
+            s, stepper.still, room("Work", s, size, columns=1), room("Cotangents", s, size), tape,
+            plan.h, segment.signals, plan.out_step, plan.out_part, out_tape, segment.at_outputs,
+            rows[here], felt[here], outputs_bar[here], carried, p_bar, signals_bar[number], failed,
         )  # fmt: skip
         with others_turn():
             call("backward", sweep)
         if failed[0] >= 0:
             time = plan.starts[failed[0]]
             raise GradientFailed(f"the gradient is not finite at t = {time:.4f} s")
-    return (
-        torch.from_numpy(carried) + y_bar[0],
-        torch.from_numpy(p_bar),
-        torch.from_numpy(np.concatenate(signals_bar)),
-    )
+    parts = carried, p_bar, np.concatenate(signals_bar), outputs_bar
+    return tuple(torch.from_numpy(part) for part in parts)  # pyright: ignore[reportReturnType]
 
 
 class _Recorded(torch.autograd.Function):
-    """A recorded series beside the states that have a gradient: it has none, and says so when one
-    is asked for."""
+    """A series beside the states that have a gradient: it has none, and says so when one is asked
+    for."""
 
     @staticmethod
     def forward(ctx: Any, name: str, series: Tensor, y: Tensor) -> Tensor:
@@ -154,12 +167,13 @@ class _Recorded(torch.autograd.Function):
     def backward(ctx: Any, bar: Tensor) -> Any:  # pyright: ignore[reportIncompatibleMethodOverride]
         if bool((bar != 0).any()):
             raise GradientFailed(
-                f"the channel `{ctx.name}` is recorded and has no gradient; detach() it"
+                f"the integral `{ctx.name}` is a sum over the steps and has no gradient; detach() "
+                "it, or take powers of channels, which have one"
             )
         return None, None, None
 
 
-def recorded(name: str, series: Tensor, y: Tensor) -> Tensor:
+def without_gradient(name: str, series: Tensor, y: Tensor) -> Tensor:
     """A series (T,) that came out of the run of states y (T, size), whose gradient would be wrong
     rather than zero."""
     return _Recorded.apply(name, series, y) if y.requires_grad else series  # pyright: ignore[reportReturnType]

@@ -166,8 +166,8 @@ def simulate_batch(
         warnings.warn(message, SamplesFailed, stacklevel=2)
     states = attached([one.solved for one in done.values()], threads)
     trajectories = [one if isinstance(one, Trajectory) else None for one in results]
-    for (i, outcome), y in zip(done.items(), states):
-        trajectories[i] = outcome.trajectory(y)
+    for (i, outcome), rows in zip(done.items(), states):
+        trajectories[i] = outcome.trajectory(rows)
     _doubt(rigs, trajectories)
     return Batch(
         tuple(trajectories), failures, tuple(len(one) for one in ts), clock.perf_counter() - began

@@ -19,7 +19,7 @@ from torchsoft.codegen.pointwise import check_pointwise
 from torchsoft.codegen.trace import check_backward, traced
 from torchsoft.physics.contact import distance_law, free_law, interface_law
 from torchsoft.physics.parts import Actuator
-from torchsoft.solve.kernel.arrays import INPUTS
+from torchsoft.solve.kernel.arrays import FELT, INPUTS
 
 
 class LawSet(NamedTuple):
@@ -205,7 +205,7 @@ def contact_laws(law: Any, shape: Any) -> LawSet:
     )
     return LawSet(
         compiled_law(parameters, distance_law, INPUTS, 0, 0, shape=shape),
-        compiled_law(parameters, interface_law, INPUTS, 3, 7, points=True, law=law, shape=shape),
+        compiled_law(parameters, interface_law, INPUTS, FELT, 7, points=True, law=law, shape=shape),
         compiled_law(parameters, free_law, 3, 1, 1, law=law),
         parameters,
     )

@@ -23,7 +23,7 @@ def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
     none if nothing is."""
     run, found = trajectory, {}
     stored = sum(float(part[0].detach()) for part in run.energy.values())
-    scale = max(stored + float(run.injected[-1]), NEGLIGIBLE)
+    scale = max(stored + float(run.injected[-1].detach()), NEGLIGIBLE)
     part = float(run.energy_residual.detach().abs().max()) / scale
     if not part <= RESIDUAL:
         longest = float(run.knots.diff().max())
@@ -34,7 +34,7 @@ def doubts(trajectory: Trajectory, rig: Rig) -> dict[str, str]:
             f"of {better:.2g} s"
         )
     for name, work in run.dissipated.items():
-        back = -float(work.diff().min())
+        back = -float(work.detach().diff().min())
         if back > SUPPLIED * scale:
             found[f"dissipated {name}"] = (
                 f"`{name}` is to dissipate energy, but gave {back:.3g} J back between two outputs; "

@@ -7,7 +7,7 @@ import numpy as np
 
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.grid import Plan
-from torchsoft.solve.kernel.arrays import first_stages
+from torchsoft.solve.kernel.arrays import first_rows
 from torchsoft.solve.kernel.table import Array
 
 
@@ -25,13 +25,12 @@ class SimulationFailed(RuntimeError):
 class Progress:
     """What the stepper has produced so far: rows of the output grid, its steps, and its counters.
 
-    extras: running integrals, the pads' moments, the generalised contact forces on all coordinates
-    (`Integrals` names them).
+    integrals: as `Integrals` names them; recorded: forces, as `recorded_size` orders them.
     """
 
     y: Array
-    forces: Array
-    extras: Array
+    integrals: Array
+    recorded: Array
     rows: int = 1
     steps: int = 0
     solves: int = 0
@@ -48,8 +47,9 @@ class Progress:
 
 @dataclass
 class Segment:
-    """One chunk of a taped run: where it began, the signals at its stages and outputs, and its
-    tape, or None where it is to be made again when needed."""
+    """One chunk of a taped run, or its start, which has no steps: where it began, the signals at
+    its stages and outputs, and the tapes of both, or None where they are to be made again when
+    needed."""
 
     plan: Plan
     signals: Array
@@ -58,7 +58,7 @@ class Segment:
     V: Array
     u_dot: Array
     rows: slice
-    tape: Any
+    tapes: tuple[Any, Any] | None
 
 
 class Integrals:
@@ -90,6 +90,7 @@ class Marching:
     out: Progress
     segments: list[Segment] | None
     tape_bytes: float
+    outputs_too: bool = True
     taped: int = 0
 
     @property
@@ -104,14 +105,18 @@ class Marching:
 
     def keep(
         self, plan: Plan, signals: Array, at_outputs: Array,
-        before: tuple[Array, Array, Array, Array], rows: slice, tape: Any,
+        before: tuple[Array, Array, Array, Array], rows: slice, tapes: tuple[Any, Any] | None,
     ) -> None:  # fmt: skip
         """Note the steps that were taken, and what their derivatives need."""
-        if len(plan.h) == 0:
+        if len(plan.h) > 0:
+            self.out.starts.append(plan.starts)
+            self.out.end = float(plan.starts[-1] + plan.h[-1])
+        elif len(plan.out_step) == 0:
             return
-        self.out.starts.append(plan.starts)
-        self.out.end = float(plan.starts[-1] + plan.h[-1])
         if self.segments is not None:
-            kept = None if tape is None else first_stages(tape, 2 * len(plan.h))
+            kept = None
+            if tapes is not None:
+                counts = 2 * len(plan.h), len(plan.out_step) if self.outputs_too else 0
+                kept = first_rows(tapes[0], counts[0]), first_rows(tapes[1], counts[1])
+                self.taped += sum(x.nbytes for tape in kept for x in tape)
             self.segments.append(Segment(plan, signals, at_outputs, *before[:3], rows, kept))
-            self.taped += 0 if kept is None else sum(x.nbytes for x in kept)

@@ -43,7 +43,10 @@ class Rates:
         followed = rig.reference if reference is None else reference
         self._followed = Followed(lambda t: compiled.signals(t, followed), rig, followed)
         self._signals = np.zeros((1, compiled.signal_count, 2))
-        self._powers, self._moments = np.zeros(len(Integrals(rig).names)), np.zeros(len(rig.pads))
+        self._powers, self._wrenches = (
+            np.zeros(len(Integrals(rig).names)),
+            np.zeros((len(rig.pads), 3)),
+        )
         self.calls = 0
 
     def __call__(self, t: float, y: Array) -> Array:
@@ -68,7 +71,7 @@ class Rates:
         converged = np.zeros(1, np.int64)
         table = arrays.Rates(
             self._system, self._work, self._followed.arrays, self._limits, float(t), y,
-            self._signals, self._powers, self._moments, out, converged,
+            self._signals, self._powers, self._wrenches, out, converged,
         )  # fmt: skip
         call("rates", table)
         return bool(converged[0])

@@ -18,13 +18,14 @@ from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
 from torchsoft.solve import tangent
-from torchsoft.solve.adjoint import TAPE_BYTES, Solved, attached, march, recorded
+from torchsoft.solve.adjoint import TAPE_BYTES, Rows, Solved, attached, march, without_gradient
 from torchsoft.solve.grid import check_times
 from torchsoft.solve.ledger import doubts
 from torchsoft.solve.progress import Progress, SimulationFailed
 from torchsoft.solve.stability import describe_instability
 from torchsoft.solve.stepper import METHOD, ImplicitStepper
 from torchsoft.solve.system import independent
+from torchsoft.solve.touch import Touch
 from torchsoft.solve.trajectory import Stats, Trajectory, channels, units
 
 Route = Literal["none", "discrete", "forward"]
@@ -53,7 +54,8 @@ def simulate(
     rig: Rig, t: Tensor, *, y0: Tensor | None = None, reference: Reference | None = None,
     rtol: float | None = None, atol: float | None = None, step: float | None = None,
     knots: Tensor | None = None, tolerance: float = 1e-9, gradient: Route = "none",
-    wrt: Sequence[str] = (), dy0: Tensor | None = None, rigid: bool = False, progress: bool = False,
+    wrt: Sequence[str] = (), dy0: Tensor | None = None, rigid: bool = False,
+    touch: Sequence[str] = (), progress: bool = False,
 ) -> Trajectory:  # fmt: skip
     """Integrate `rig` from y0 (size,) at t[0] through the times t (T,) [s].
 
@@ -67,12 +69,14 @@ def simulate(
     longer than it. `knots` are the steps of another run (its `knots`), frozen: what a fit needs,
     whose residuals are then smooth in the parameters. `tolerance` [N] is Newton's.
 
-    gradient: with "discrete" the states and channels of the result carry the exact gradient of the
-    discrete run (of the steps that were taken, which are not differentiated) by y0, every parameter
-    and the reference; recorded nodal forces and energies do not. With "forward" `sensitivities`
-    holds the derivatives by the n scalar parameters `wrt`, and dy0 (size, n) is that of the start;
-    columns of dy0 beyond the n are directions of the start alone. `rigid` keeps the derivatives of
-    the free coordinates and their rates only. Under `torch.no_grad()` no route records a graph.
+    gradient: with "discrete" the states, channels, forces, loads and stored energies of the result
+    carry the exact gradient of the discrete run (of the steps that were taken, which are not
+    differentiated) by y0, every parameter and the reference; energies dissipated and supplied
+    refuse one. With "forward" `sensitivities` holds the derivatives by the n scalar parameters
+    `wrt`, and dy0 (size, n) is that of the start; columns of dy0 beyond the n are directions of the
+    start alone. `rigid` keeps the derivatives of the free coordinates and their rates only, and
+    `touch` names channels of touch, or arrays of them, whose derivatives are wanted too. Under
+    `torch.no_grad()` no route records a graph.
 
     Raises `ValueError` for times that do not increase, a state of the wrong shape or dtype, an
     unknown route or parameter, two ways to choose steps at once; `SimulationFailed` (with the
@@ -80,7 +84,7 @@ def simulate(
     """
     task = prepare(
         rig, t, y0=y0, reference=reference, rtol=rtol, atol=atol, step=step, knots=knots,
-        tolerance=tolerance, gradient=gradient, wrt=wrt, dy0=dy0, rigid=rigid,
+        tolerance=tolerance, gradient=gradient, wrt=wrt, dy0=dy0, rigid=rigid, touch=touch,
     )  # fmt: skip
     trajectory = run(task, TAPE_BYTES, progress).trajectory()
     for doubt in doubts(trajectory, rig).values():
@@ -98,6 +102,7 @@ class Task(NamedTuple):
     wrt: tuple[str, ...]
     dy0: Tensor | None
     rigid: bool
+    touch: tuple[str, ...]
 
 
 def prepare(
@@ -105,9 +110,10 @@ def prepare(
     rtol: float | None = None, atol: float | None = None, step: float | None = None,
     knots: Tensor | None = None, tolerance: float = 1e-9, gradient: Route = "none",
     wrt: Sequence[str] = (), dy0: Tensor | None = None, rigid: bool = False,
+    touch: Sequence[str] = (),
 ) -> Task:  # fmt: skip
     """Checks what `simulate` is asked for; raises its `ValueError`s."""
-    _check_wanted(gradient, wrt, dy0, rigid)
+    _check_wanted(gradient, wrt, dy0, rigid, touch)
     ways = {"step": step, "knots": knots, "rtol or atol": rtol if rtol is not None else atol}
     given = [f"`{name}`" for name, value in ways.items() if value is not None]
     if len(given) > 1:
@@ -129,23 +135,22 @@ def prepare(
             raise ValueError("`y0` is needed: only the paper's rig has a start of its own")
         y0 = rest(rig)
     stepper.check_start(y0)
-    return Task(stepper, t, y0, gradient, tuple(wrt), dy0, rigid)
+    return Task(stepper, t, y0, gradient, tuple(wrt), dy0, rigid, _channels_of_touch(rig, touch))
 
 
 class RunOutcome(NamedTuple):
-    """A finished run: the states with what is needed to differentiate them, sensitivities where
-    asked for, and its time [s]."""
+    """A finished run: the states with what is needed to differentiate them, sensitivities of states
+    and of sums of forces where asked for, and its time [s]."""
 
     task: Task
     solved: Solved
-    dy: Tensor | None
+    slopes: tuple[Tensor, Tensor] | None
     wall: float
 
-    def trajectory(self, y: Tensor | None = None) -> Trajectory:
-        """The trajectory of the states y (T, size), by default with the adjoint of this run behind
-        them."""
-        y = attached([self.solved])[0] if y is None else y
-        return gather(self.task, y, self.solved.out, self.wall, self.dy)
+    def trajectory(self, rows: Rows | None = None) -> Trajectory:
+        """The trajectory of the rows, by default with the adjoint of this run behind them."""
+        rows = attached([self.solved])[0] if rows is None else rows
+        return gather(self.task, rows, self.solved.out, self.wall, self.slopes)
 
 
 def run(
@@ -168,15 +173,15 @@ def run(
         with torch.set_grad_enabled(
             task.gradient == "forward" or (task.gradient == "discrete" and torch.is_grad_enabled())
         ):
-            for solved, dy in _rows(task, tape_bytes):
-                done = RunOutcome(task, solved, dy, clock.perf_counter() - began)
+            for solved, slopes in _rows(task, tape_bytes):
+                done = RunOutcome(task, solved, slopes, clock.perf_counter() - began)
                 if bar is not None:
                     bar.n = float(t[solved.out.rows - 1] - t[0])
                     bar.refresh()
     except SimulationFailed as failure:
         if done is None:
             raise
-        so_far = done.trajectory(done.solved.y)
+        so_far = done.trajectory(done.solved.rows)
         if explained:
             raise diagnose(stepper.rig, failure, so_far) from None
         failure.trajectory = so_far
@@ -184,7 +189,7 @@ def run(
     except KeyboardInterrupt:
         if done is None:
             raise
-        raise Interrupted(done.trajectory(done.solved.y)) from None
+        raise Interrupted(done.trajectory(done.solved.rows)) from None
     finally:
         if bar is not None:
             bar.close()
@@ -192,7 +197,9 @@ def run(
     return done
 
 
-def _check_wanted(gradient: Route, wrt: Sequence[str], dy0: Tensor | None, rigid: bool) -> None:
+def _check_wanted(
+    gradient: Route, wrt: Sequence[str], dy0: Tensor | None, rigid: bool, touch: Sequence[str]
+) -> None:
     """Raises `ValueError` for a route that there is not, and for what belongs to another route."""
     if gradient not in get_args(Route):
         raise ValueError(
@@ -210,8 +217,10 @@ def _check_wanted(gradient: Route, wrt: Sequence[str], dy0: Tensor | None, rigid
         raise ValueError(
             "gradient='forward' needs the parameters' names `wrt`, or directions `dy0` of the start"
         )
-    if gradient != "forward" and (dy0 is not None or rigid):
-        raise ValueError("`dy0` and `rigid` belong to gradient='forward', and to that only")
+    if gradient != "forward" and (dy0 is not None or rigid or touch):
+        raise ValueError(
+            "`dy0`, `rigid` and `touch` belong to gradient='forward', and to that only"
+        )
     if gradient == "forward" and torch.is_inference_mode_enabled():
         raise ValueError(
             "gradient='forward' needs torch's graphs, which torch.inference_mode() has not; use "
@@ -219,7 +228,20 @@ def _check_wanted(gradient: Route, wrt: Sequence[str], dy0: Tensor | None, rigid
         )
 
 
-def _rows(task: Task, tape_bytes: float) -> Iterator[tuple[Solved, Tensor | None]]:
+def _channels_of_touch(rig: Rig, names: Sequence[str]) -> tuple[str, ...]:
+    """Raises `ValueError` for what are no names of channels of touch, or of arrays of them."""
+    known = Touch(rig)
+    if not names:
+        return ()
+    if isinstance(names, str):
+        raise ValueError(f"`touch` must be a list of channels' names, but is {names!r}")
+    for name in (expanded := known.expanded(names)):
+        if name not in known:
+            raise ValueError(f"`touch` names {name!r}, but channels of touch are {known.shown}")
+    return expanded
+
+
+def _rows(task: Task, tape_bytes: float) -> Iterator[tuple[Solved, tuple[Tensor, Tensor] | None]]:
     """The growing run."""
     stepper, wrt, dy0 = task.stepper, task.wrt, task.dy0
     if task.gradient != "forward":
@@ -241,8 +263,9 @@ def _rows(task: Task, tape_bytes: float) -> Iterator[tuple[Solved, Tensor | None
         if not bool(torch.isfinite(dy0).all()):
             raise ValueError("`dy0` must be finite, but has a component that is not")
     kept = stepper.layout.rigid if task.rigid else list(range(size))
-    for dy, out in tangent.iterate(stepper, task.y0, task.t, wanted, dy0, kept):
-        yield Solved(stepper, task.y0, out, None), dy
+    sums = Touch(stepper.rig).sums(task.touch)
+    for dy, felt, out in tangent.iterate(stepper, task.y0, task.t, wanted, dy0, kept, sums):
+        yield Solved(stepper, task.y0, task.t, out, None), (dy, felt)
 
 
 def diagnose(rig: Rig, failure: SimulationFailed, trajectory: Trajectory) -> SimulationFailed:
@@ -268,42 +291,45 @@ def made_by(rig: Rig, method: str) -> dict[str, object]:
 
 
 def gather(
-    task: Task, y: Tensor, out: Progress, wall: float, dy: Tensor | None = None
-) -> Trajectory:
-    """The trajectory of the rows that the stepper has finished; y (T, size) carries the gradient,
-    if any is wanted."""
-    stepper, t = task.stepper, task.t
-    rig, rows = stepper.rig, out.rows
-    t, y, forces, extras = (
-        t[:rows],
-        y[:rows],
-        *(torch.from_numpy(x[:rows]) for x in (out.forces, out.extras)),
-    )
-    names = stepper.integrals
-    columns = dict(zip((*names.names, *rig.pads), extras.unbind(-1)))
-    loads = extras[:, len(columns) :].unflatten(-1, (-1, 3))
+    task: Task, rows: Rows, out: Progress, wall: float,
+    slopes: tuple[Tensor, Tensor] | None = None,
+) -> Trajectory:  # fmt: skip
+    """The trajectory of the rows that the stepper has finished, which carry the gradient, if any is
+    wanted."""
+    stepper, count, touch = task.stepper, out.rows, Touch(task.stepper.rig)
+    rig, names, t = stepper.rig, stepper.integrals, task.t[:count]
+    y, felt = (part[:count] for part in rows)
+    integrals = dict(zip(names.names, torch.from_numpy(out.integrals[:count]).unbind(-1)))
+    sizes = [2 * len(rig.pads[contact.pad].point_nodes) for contact in rig.contacts.values()]
     with torch.set_grad_enabled(y.requires_grad), independent():
+        *forces, wrenches, loads = felt.split(
+            [*sizes, 3 * len(rig.pads), 3 * len(rig.bodies) + 3], -1
+        )
         signals = rig.follow(t, stepper.reference)
         state = rig.unpack(y, signals)
-        moments = {name: recorded(f"M_{name}", columns[name], y) for name in rig.pads}
+        moments = dict(zip(rig.pads, wrenches[:, 2::3].unbind(-1)))
         measured = channels(rig, state, signals, moments)
-    given = "step_s" if stepper.step is not None else "knots" if stepper.knots is not None else ""
-    steps = {given: stepper.step} if given else {"rtol": stepper.rtol, "atol": stepper.atol}
-    with torch.no_grad():
         displacement = {name: rig.displacement(name, state) for name in rig.pads}
         energy = stored(rig, state, displacement)
-        force, at = {}, 0
-        for name, contact in rig.contacts.items():
-            count = len(rig.pads[contact.pad].point_nodes)
-            force[name], at = forces[:, at : at + count], at + count
+        integrals = {name: without_gradient(name, x, y) for name, x in integrals.items()}
+        force = {name: part.unflatten(-1, (-1, 2)) for name, part in zip(rig.contacts, forces)}
+        load = dict(zip(rig.bodies, loads.unflatten(-1, (-1, 3)).unbind(1)))
+    given = "step_s" if stepper.step is not None else "knots" if stepper.knots is not None else ""
+    steps = {given: stepper.step} if given else {"rtol": stepper.rtol, "atol": stepper.atol}
     return Trajectory(
-        t=t, y=y, state=state, channels=measured, force=force,
-        load=dict(zip(rig.bodies, loads.unbind(1))), displacement=displacement, energy=energy,
-        dissipated={name: columns[name] for name in names.dissipated},
-        supplied={name: columns[name] for name in names.supplied if name in names.active},
-        injected=columns["injected"],
+        t=t, y=y, state=state, channels=measured, force=force, load=load, recorded=felt,
+        displacement=displacement, energy=energy,
+        dissipated={name: integrals[name] for name in names.dissipated},
+        supplied={name: integrals[name] for name in names.supplied if name in names.active},
+        injected=integrals["injected"],
         stats=Stats(out.steps, out.solves, out.failed, out.refused, wall),
-        knots=torch.from_numpy(out.knots), layout=rig.layout,
+        knots=torch.from_numpy(out.knots), layout=rig.layout, touch=touch,
         made_by=made_by(rig, METHOD) | {"steps": steps}, wrt=task.wrt,
-        sensitivities=None if dy is None else dy[:rows], units=units(rig),
+        sensitivities=None if slopes is None else slopes[0][:count],
+        touch_sensitivities={}
+        if slopes is None
+        else dict(
+            zip(task.touch, touch.slopes(task.touch, slopes[1][:count], felt).unbind(1))
+        ),
+        units=units(rig),
     )  # fmt: skip

@@ -38,6 +38,8 @@ from torchsoft.solve.kernel.arrays import (
     Limits,
     Outputs,
     Run,
+    Tape,
+    recorded_size,
     room,
 )
 from torchsoft.solve.kernel.objects import call
@@ -118,7 +120,7 @@ class ImplicitStepper:
             raise ValueError("inertial pads need equal steps here: give `step_size` [s]")
         self.layout, self.integrals = self.compiled.layout, Integrals(rig)
         self._cap = 64
-        self._still: Any = None
+        self.still: Any = None
 
     def along(self, knots: Array) -> "ImplicitStepper":
         """The same with the steps between `knots` [s]."""
@@ -136,7 +138,7 @@ class ImplicitStepper:
         counts = np.zeros(7, np.int64)
         limits = Limits(self.tolerance, self.max_iterations, self.window)
         run = Run(
-            s, self._still, now.work, now.step, follow, errors, limits, outputs, tape, given,
+            s, self.still, now.work, now.step, follow, errors, limits, outputs, tape, given,
             now.y, k, clock, stops, times, row, rung, self.rtol, self.longest, SHORTEST,
             now.integrals, starts, h, signals, counts,
         )  # fmt: skip
@@ -166,30 +168,27 @@ class ImplicitStepper:
 
     @torch.no_grad()
     def integrate(
-        self, y0: Tensor, t: Tensor, segments: list[Segment] | None = None, tape_bytes: float = 0.0
-    ) -> Iterator[Progress]:
+        self, y0: Tensor, t: Tensor, segments: list[Segment] | None = None,
+        tape_bytes: float = 0.0, outputs_too: bool = True,
+    ) -> Iterator[Progress]:  # fmt: skip
         """Step from y0 (size,) through t (T,), yielding the same growing `Progress` after every
         compiled call.
 
         The last yield is the complete run. With `segments` given, what the derivatives need is
-        appended to it, tapes for as long as they take less than `tape_bytes`. Raises
-        `SimulationFailed`, and `ValueError` for a start that is not finite.
+        appended to it, tapes for as long as they take less than `tape_bytes`, of the outputs only
+        where the forces there are to be differentiated. Raises `SimulationFailed`, and `ValueError`
+        for a start that is not finite.
         """
         self.check_start(y0)
         check_times(t, self.step)
-        self._still = self.compiled.system(INSTANT / GAMMA)
-        s, names = self._still, self.integrals.names
-        extras = len(names) + len(s.pad_base) + len(s.body_free)
-        out = Progress(
-            np.zeros((len(t), len(y0))),
-            np.zeros((len(t), len(s.point_X), 2)),
-            np.zeros((len(t), extras)),
-        )
+        self.still = self.compiled.system(INSTANT / GAMMA)
+        s, names = self.still, self.integrals.names
+        out = self._room(len(t))
         work = room("Work", s, self.layout.size, columns=1)
         step = room("Step", s, self.layout.size, integrals=len(names))
         y, integrals = y0.numpy().copy(), np.zeros(len(names))
         set_velocities(s, work, y)
-        state = Marching(y, work, step, integrals, out, segments, tape_bytes)
+        state = Marching(y, work, step, integrals, out, segments, tape_bytes, outputs_too)
         self._start(t[0], state)
         set_velocities(s, work, y)
         yield from (
@@ -223,12 +222,12 @@ class ImplicitStepper:
             plan, follow, at_rows, halvings = pending.pop()
             before = now.copy()
             here = slice(out.rows, out.rows + len(plan.out_step))
-            steps, rows_done, status, solves, tape = self._run(
+            steps, rows_done, status, solves, tapes = self._run(
                 plan, follow, at_rows, now, here, now.taping
             )
             here = slice(out.rows, out.rows + rows_done)
             now.keep(
-                plan.part(0, steps), follow[: 2 * steps], at_rows[:rows_done], before, here, tape
+                plan.part(0, steps), follow[: 2 * steps], at_rows[:rows_done], before, here, tapes
             )
             out.rows, out.steps, out.solves = (
                 out.rows + rows_done,
@@ -274,10 +273,13 @@ class ImplicitStepper:
             starts, h = np.zeros(CHUNK), np.zeros(CHUNK)
             signals, at_rows = np.zeros((CHUNK, 2, count, 2)), np.zeros((len(t), count, 2))
             before = now.copy()
-            tape = self._empty_tape(2 * CHUNK if now.taping else 0)
+            tapes = self._empty_tapes(2 * CHUNK, out.y, now) if now.taping else None
             now.work.travelled[0] = np.inf
             now.work.low[:] = now.work.high[:] = 0
-            outputs = Outputs(row_step, row_part, at_rows, out.y, out.forces, out.extras)
+            tape, out_tape = tapes or self._no_tapes
+            outputs = Outputs(
+                row_step, row_part, at_rows, out.y, out.integrals, out.recorded, out_tape
+            )
             steps, done, status, solves, refused, failed, which = self._call(
                 s, now, outputs, tape, given=False, follow=followed.arrays, errors=errors, k=k,
                 clock=clock, stops=stops, times=times, row=out.rows, rung=rung, starts=starts, h=h,
@@ -288,7 +290,9 @@ class ImplicitStepper:
             here = slice(out.rows, out.rows + done)
             plan = Plan(starts[:steps], h[:steps], row_step[here].copy(), row_part[here].copy())
             flat = signals[:steps].reshape(2 * steps, count, 2)
-            now.keep(plan, flat, at_rows[here], before, here, tape if now.taping else None)
+            if tapes is not None:
+                tapes = tape, Tape(*(part[here] for part in out_tape))
+            now.keep(plan, flat, at_rows[here], before, here, tapes)
             out.rows, out.steps, out.solves = here.stop, out.steps + steps, out.solves + solves
             out.refused, out.failed = out.refused + refused, out.failed + failed
             yield out
@@ -301,14 +305,14 @@ class ImplicitStepper:
     def _start(self, time: Tensor, now: "Marching") -> None:
         """Nodal forces, moments and loads at the start, the first row, and the rates there. Raises
         `SimulationFailed`."""
-        signals, out = self.compiled.signals(time[None], self.reference).numpy(), now.out
-        outputs = Outputs(
-            np.zeros(1, np.int64), np.zeros(1), signals, out.y, out.forces, out.extras
-        )
-        none = np.zeros((0, 2, *signals.shape[1:]))
-        status = self._call(self._still, now, outputs, self._empty_tape(0), signals=none)[2]
+        signals = self.compiled.signals(time[None], self.reference).numpy()
+        none = np.zeros((0, *signals.shape[1:]))
+        plan = Plan(time[None].numpy(), np.zeros(0), np.zeros(1, np.int64), np.zeros(1))
+        before, here = now.copy(), slice(0, 1)
+        _, _, status, _, tapes = self._run(plan, none, signals, now, here, now.taping)
         if status != CONVERGED:
             raise self._failure(status, float(time), INSTANT)
+        now.keep(plan, none, signals, before, here, tapes)
 
     def signals(self, todo: Sequence[Plan]) -> Tensor:
         """The signals at all stages of some plans (stages, signals, 2)."""
@@ -321,34 +325,52 @@ class ImplicitStepper:
         times = np.concatenate([np.zeros(0), *(plan.output_times for plan in todo)])
         return self.compiled.signals(torch.from_numpy(times), self.reference)
 
-    def tape(self, segment: Segment) -> Any:
-        """The segment's tape, made again from where it began if it was not kept."""
-        if segment.tape is not None:
-            return segment.tape
-        s, n = self.compiled.system(float(segment.plan.h[0])), len(segment.plan.out_step)
+    def _room(self, rows: int) -> Progress:
+        """Room for so many outputs."""
+        s = self.still
+        widths = self.layout.size, len(self.integrals.names), recorded_size(s)
+        return Progress(*(np.zeros((rows, width)) for width in widths))
+
+    def system(self, segment: Segment) -> Any:
+        """The arrays for the steps of a segment."""
+        h = segment.plan.h
+        return self.compiled.system(float(h[0])) if len(h) else self.still
+
+    def tapes(self, segment: Segment) -> tuple[Any, Any]:
+        """The tapes of a segment's stages and outputs, made again from where it began if they were
+        not kept."""
+        if segment.tapes is not None:
+            return segment.tapes
+        s, n = self.system(segment), len(segment.plan.out_step)
         work, names = room("Work", s, self.layout.size, columns=1), len(self.integrals.names)
         work.V[:], work.u_dot[:] = segment.V, segment.u_dot
-        extras = names + len(s.pad_base) + len(s.body_free)
-        out = Progress(
-            np.empty((n, self.layout.size)), np.empty((n, len(s.point_X), 2)), np.empty((n, extras))
-        )
         again = Marching(
             segment.y.copy(),
             work,
             room("Step", s, self.layout.size, integrals=names),
             np.zeros(names),
-            out,
+            self._room(n),
             None,
             0.0,
         )
-        *_, tape = self._run(
+        *_, tapes = self._run(
             segment.plan, segment.signals, segment.at_outputs, again, slice(0, n), True
         )
-        assert tape is not None
-        return tape
+        assert tapes is not None
+        return tapes
 
-    def _empty_tape(self, stages: int) -> Any:
-        return room("Tape", self._still, self.layout.size, stages=stages, cap=self._cap)
+    @property
+    def _no_tapes(self) -> tuple[Any, Any]:
+        none = room("Tape", self.still, self.layout.size, stages=0, cap=0)
+        return none, none
+
+    def _empty_tapes(self, stages: int, y: Array, now: Marching) -> tuple[Any, Any]:
+        """Tapes of so many stages and of the outputs whose states go to y (outputs, size)."""
+        tape, outputs = (
+            room("Tape", self.still, self.layout.size, stages=n, cap=self._cap)
+            for n in (stages, len(y) if now.outputs_too else 0)
+        )
+        return tape, outputs._replace(y=y) if now.outputs_too else outputs
 
     def _run(
         self,
@@ -358,26 +380,28 @@ class ImplicitStepper:
         now: "Marching",
         rows: slice,
         taping: bool,
-    ) -> tuple[int, int, int, int, Any]:
-        """One compiled call; with `taping` once more with a longer tape if more points touch than
-        it has room for."""
-        s, steps, before = self.compiled.system(float(plan.h[0])), len(plan.h), now.copy()
+    ) -> tuple[int, int, int, int, tuple[Any, Any] | None]:
+        """One compiled call; with `taping` once more with longer tapes if more points touch than
+        they have room for."""
+        steps, before = len(plan.h), now.copy()
+        s = self.compiled.system(float(plan.h[0])) if steps else self.still
         while True:
             now.work.travelled[0] = (
                 np.inf
             )  # look for near points afresh, so that a segment made again has the same bits
             now.work.low[:] = now.work.high[:] = 0
-            tape = self._empty_tape(2 * steps if taping else 0)
+            tapes = self._empty_tapes(2 * steps, now.out.y[rows], now) if taping else None
+            tape, out_tape = tapes or self._no_tapes
             outputs = Outputs(
                 plan.out_step, plan.out_part, at_outputs,
-                now.out.y[rows], now.out.forces[rows], now.out.extras[rows],
+                now.out.y[rows], now.out.integrals[rows], now.out.recorded[rows], out_tape,
             )  # fmt: skip
             done, rows_done, status, solves, *_ = self._call(
                 s, now, outputs, tape, starts=plan.starts, h=plan.h,
                 signals=signals.reshape(steps, 2, *signals.shape[1:]),
             )  # fmt: skip
             if status != TAPE_FULL:
-                return done, rows_done, status, solves, tape if taping else None
+                return done, rows_done, status, solves, tapes
             self._cap *= 2
             now.back(before)
 

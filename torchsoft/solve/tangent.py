@@ -12,6 +12,7 @@ from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.progress import Progress, Segment
 from torchsoft.solve.stepper import ImplicitStepper
+from torchsoft.solve.touch import Sums
 from torchsoft.threads import others_turn
 
 
@@ -33,37 +34,36 @@ def directions(value: Tensor, wanted: Sequence[Tensor]) -> Array:
 
 
 def iterate(
-    stepper: ImplicitStepper,
-    y0: Tensor,
-    t: Tensor,
-    wanted: Sequence[Tensor],
-    dy0: Tensor | None,
-    columns: list[int],
-) -> Iterator[tuple[Tensor, Progress]]:
-    """Derivatives (T, components, n) of the states by the scalar tensors `wanted`, as the run
-    grows; `columns` are the components of the state that are kept. dy0 (size, n) is the derivative
-    of the initial state, zero by default; its columns beyond those of `wanted` are directions of
-    the start alone."""
-    size = stepper.layout.size
+    stepper: ImplicitStepper, y0: Tensor, t: Tensor, wanted: Sequence[Tensor], dy0: Tensor | None,
+    columns: list[int], sums: Sums,
+) -> Iterator[tuple[Tensor, Tensor, Progress]]:  # fmt: skip
+    """Derivatives (T, components, n) of the states by the scalar tensors `wanted`, and those of
+    sums of forces (T, sums, n), as the run grows; `columns` are the components of the state that
+    are kept. dy0 (size, n) is the derivative of the initial state, zero by default; its columns
+    beyond those of `wanted` are directions of the start alone."""
+    size, count = stepper.layout.size, len(sums.start) - 1
     dy = np.zeros((size, len(wanted))) if dy0 is None else dy0.detach().numpy().copy()
     n = dy.shape[1]
     dp = np.zeros((len(stepper.compiled.p), n))
     dp[:, : len(wanted)] = directions(stepper.compiled.p, wanted)
-    kept = np.zeros((len(t), len(columns), n))
-    kept[0] = dy[columns]
+    kept, felt = np.zeros((len(t), len(columns), n)), np.zeros((len(t), count, n))
     segments: list[Segment] = []
-    for out in stepper.integrate(y0.detach(), t, segments, tape_bytes=float("inf")):
+    for out in stepper.integrate(y0.detach(), t, segments, float("inf"), outputs_too=count > 0):
         while segments:  # none if the first step of a chunk was not solved, and is to be halved
-            segment = segments.pop()
-            plan, tape = segment.plan, stepper.tape(segment)
-            s = stepper.compiled.system(float(plan.h[0]))
+            segment = segments.pop(0)
+            plan, (tape, out_tape), s = (
+                segment.plan,
+                stepper.tapes(segment),
+                stepper.system(segment),
+            )
             rows = np.empty((len(plan.out_step), size, n))
             work, tangents = (room(kind, s, size, columns=n) for kind in ("Work", "Tangents"))
             sweep = Forward(
-                s, work, tangents, tape, plan.h, segment.signals, plan.out_step, plan.out_part,
-                dy, dp, rows,
+                s, stepper.still, work, tangents, tape, plan.h, segment.signals, plan.out_step,
+                plan.out_part, out_tape, segment.at_outputs, *sums, dy, dp, rows,
+                felt[segment.rows],
             )  # fmt: skip
             with others_turn():
                 call("forward", sweep)
             kept[segment.rows] = rows[:, columns]
-        yield torch.from_numpy(kept), out
+        yield torch.from_numpy(kept), torch.from_numpy(felt), out

@@ -17,6 +17,7 @@ from torchsoft.files import replacing, sealed, unsealed
 from torchsoft.physics.parts import COORDINATES, coordinate_unit
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.state import Layout, State
+from torchsoft.solve.touch import Touch
 
 if TYPE_CHECKING:  # takes as long to import as all of this package
     import xarray as xr
@@ -44,7 +45,8 @@ class Trajectory:
 
     y: flat states (T, size). channels: what can be measured or was asked for, by key, (T,) each.
     force: normal and friction force (T, points, 2) [N] on the points of each contact, along n and t
-    of their moving frames. load: what the contacts and pads do to each body (T, 3), a force [N] and
+    of their moving frames. recorded (T, recorded): all forces, of which `touch` makes its channels,
+    `run["skin.normal.7"]`. load: what the contacts and pads do to each body (T, 3), a force [N] and
     a moment about its centre [N.m], world axes. displacement: of the nodes of each pad (T, nodes,
     2) [m], in its base's frame. energy: stored [J]; dissipated, supplied and `injected` [J] since
     t[0].
@@ -55,7 +57,8 @@ class Trajectory:
     same ones.
 
     sensitivities (T, components, n): derivatives of the state's last `components` by the n
-    parameters `wrt`, and along the further directions of the start, where asked for.
+    parameters `wrt`, and along the further directions of the start, where asked for;
+    touch_sensitivities: those of channels of touch (T, n), by key.
     """
 
     t: Tensor
@@ -64,6 +67,7 @@ class Trajectory:
     channels: dict[str, Tensor] = field(repr=False)
     force: dict[str, Tensor] = field(repr=False)
     load: dict[str, Tensor] = field(repr=False)
+    recorded: Tensor = field(repr=False)
     displacement: dict[str, Tensor] = field(repr=False)
     energy: dict[str, Tensor] = field(repr=False)
     dissipated: dict[str, Tensor] = field(repr=False)
@@ -72,16 +76,23 @@ class Trajectory:
     stats: Stats
     knots: Tensor = field(repr=False)
     layout: Layout = field(repr=False)
+    touch: Touch = field(repr=False)
     made_by: dict[str, Any] = field(repr=False)
     wrt: tuple[str, ...] = ()
     sensitivities: Tensor | None = field(default=None, repr=False)
+    touch_sensitivities: dict[str, Tensor] = field(default_factory=dict, repr=False)
     units: dict[str, str] = field(default_factory=dict, repr=False)
 
     def __getitem__(self, channel: str) -> Tensor:
         """A channel (T,). Raises `KeyError` naming those that are there."""
-        if channel not in self.channels:
-            raise KeyError(f"the run has no channel `{channel}`; it has {', '.join(self.channels)}")
-        return self.channels[channel]
+        if channel in self.channels:
+            return self.channels[channel]
+        if channel in self.touch:
+            return self.touch[channel].value(self.recorded)
+        raise KeyError(
+            f"the run has no channel `{channel}`; it has {', '.join(self.channels)}, and of touch "
+            f"{self.touch.shown}"
+        )
 
     def together(self, *channels: str) -> Tensor:
         """Channels side by side (T, channels)."""
@@ -103,7 +114,8 @@ class Trajectory:
     @property
     def energy_residual_rel(self) -> float:
         """Largest energy residual over the energy that the sources injected."""
-        return float(self.energy_residual.abs().max() / self.injected[-1].clamp(min=1e-300))
+        scale = self.injected[-1].detach().clamp(min=1e-300)
+        return float(self.energy_residual.detach().abs().max() / scale)
 
     def at(self, time: float) -> int:
         """Index of the sample nearest to `time` [s]."""

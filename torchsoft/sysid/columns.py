@@ -16,6 +16,7 @@ import xarray as xr
 
 from torchsoft import csvfile
 from torchsoft.channels import CHANNELS, FEED_FORWARD, MEASURED, SETPOINTS, UNITS, VARIABLES
+from torchsoft.solve.touch import enumerated
 from torchsoft.solve.trajectory import load
 from torchsoft.sysid.recording import Array
 from torchsoft.tables import shown
@@ -152,7 +153,7 @@ def read_tables(
                 )
             raise ValueError(
                 f"{names} has no column `{name}`; it needs t, x_d, y_d and at least one of "
-                f"{', '.join(known.measured)}"
+                f"{enumerated(known.measured)}"
             )
         if f"{name}_dot" in there and not any(
             {name, f"{name}_dot"} <= table.values.keys() for table in tables
@@ -194,7 +195,7 @@ def read_table(path: Path, ignore: Collection[str] = (), known: Vocabulary = PAP
 
 def hint(name: str, columns: int, names: Collection[str]) -> str:
     """What helps with a column that is not known: the nearest name, and how to leave it out."""
-    known = f"columns are {', '.join(names)}, each with its unit in brackets"
+    known = f"columns are {enumerated(names)}, each with its unit in brackets"
     if columns == 1:
         return f"; separate columns with commas; {known}"
     plain = {re.sub(r"[^a-z]", "", one.lower()): one for one in names} | {"time": "t"}

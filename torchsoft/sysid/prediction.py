@@ -299,8 +299,9 @@ def prepared(begun: RunContext, values: Mapping[str, float], names: Sequence[str
 
 
 def derivatives(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
-    """Derivatives (T, channels, n) of the channels `names` by the run's parameters and start: along
-    the motion of the bodies, and of the controllers' own parameters."""
+    """Derivatives (T, channels, n) of the channels `names` by the run's parameters and start: of
+    touch those of the run, of others along the motion of the bodies, and of the controllers' own
+    parameters."""
     assert run.sensitivities is not None
     bodies, signals = Layout({}, {}, rig.layout.free, {}), rig.follow(run.t, rig.reference).detach()
     along = [
@@ -309,10 +310,15 @@ def derivatives(rig: Rig, run: Trajectory, names: Sequence[str]) -> Array:
     ]
     q = run.y[:, rig.layout.rigid].detach() + run.sensitivities @ torch.stack(along)
     known = channels(rig, bodies.unpack(q, *rig.held(signals)), signals)
-    measured = torch.stack([known[name] for name in names], -1)
-    out = directions(measured, along)
-    out[..., : len(run.wrt)] += directions(measured, [rig.parameter(name) for name in run.wrt])
-    return out
+    moved = [name for name in names if name not in run.touch_sensitivities]
+    measured = torch.stack([known[name] for name in moved], -1)
+    by_motion = directions(measured, along)
+    by_motion[..., : len(run.wrt)] += directions(
+        measured, [rig.parameter(name) for name in run.wrt]
+    )
+    felt = [slope.numpy() for slope in run.touch_sensitivities.values()]
+    every = dict(zip((*moved, *run.touch_sensitivities), (*by_motion.swapaxes(0, 1), *felt)))
+    return np.stack([every[name] for name in names], 1)
 
 
 def choice(steps: Steps) -> dict[str, Any]:
@@ -328,13 +334,14 @@ def predict(
 ) -> Prediction:
     """Signals on the grid, and their derivatives by `names`, if there are any. Raises
     `SimulationFailed`."""
-    rig, run = begun.rig, prepared(begun, values, names)
+    rig, run, keys = begun.rig, prepared(begun, values, names), begun.channels
+    touch = [key for key in keys if key not in measurable(rig)] if names else ()
     dy0 = torch.from_numpy(directions(run.y0, run.wanted)) if names else None
     out = simulate(
         rig, grid.t, y0=run.y0, gradient="forward" if names else "none", wrt=run.parameters,
-        dy0=dy0, rigid=bool(names), **choice(steps),
+        dy0=dy0, rigid=bool(names), touch=touch, **choice(steps),
     )  # fmt: skip
-    keys, rows = measurable(rig), slice(grid.early, None)
+    rows = slice(grid.early, None)
     slopes = derivatives(rig, out, keys)[rows] if names else None
     knots = None if isinstance(steps, Frozen) else out.knots.numpy()
     return Prediction(
@@ -358,7 +365,7 @@ def misfit(
     `SimulationFailed`."""
     rig, run = begun.rig, prepared(begun, values, names)
     out = simulate(rig, grid.t, y0=run.y0, gradient="discrete", **choice(steps))
-    keys, rows = measurable(rig), slice(grid.early, None)
+    keys, rows = begun.channels, slice(grid.early, None)
     signals = out.together(*keys)[rows]
     loss, weights, nuisances = judge(
         Signals(grid.t[rows].numpy(), keys, signals.detach().numpy(), None)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torchsoft.paper.rig import NAMES, SoftGrasp
 from torchsoft.physics.extensions import extensions
 from torchsoft.physics.validity import check_values
+from torchsoft.solve.touch import Touch
 from torchsoft.sysid.noise import Autoregression
 from torchsoft.sysid.prediction import (
     FailedRun,
@@ -24,7 +25,7 @@ from torchsoft.sysid.prediction import (
 )
 from torchsoft.sysid.recording import Array, Recording, extended
 from torchsoft.sysid.runs import Job, Runner
-from torchsoft.sysid.unknowns import NUISANCES, Coordinates, Nuisance, Sensor, Unknown
+from torchsoft.sysid.unknowns import NUISANCES, Coordinates, Nuisance, Sensor, Unknown, by_channel
 from torchsoft.tables import line
 
 StepsByName = float | Mapping[str, Frozen]
@@ -104,10 +105,11 @@ class Problem:
         unknowns: dict[str, Unknown], noise: Mapping[str, Autoregression] | None = None,
     ) -> None:  # fmt: skip
         names = [recording.name for recording in recordings]
+        sensors = by_channel([recording.rig for recording in recordings], sensors)
         if not recordings or len(set(names)) < len(names):
             raise ValueError(f"recordings need names of their own, but are called {names}")
         for channel in sensors:
-            if not any(channel in recording.channels for recording in recordings):
+            if not any(channel in one.channels or channel in Touch(one.rig) for one in recordings):
                 known = ", ".join(
                     dict.fromkeys(c for recording in recordings for c in recording.channels)
                 )

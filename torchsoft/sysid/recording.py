@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from torchsoft.physics.extensions import extend
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.rig import Rig
+from torchsoft.solve.touch import Touch
 from torchsoft.solve.trajectory import measurable, units
 from torchsoft.sysid.initial_state import AtRest, Begin, Start, StartCoordinate
 
@@ -36,10 +37,11 @@ SAME = 1e-9
 
 
 class RunContext(NamedTuple):
-    """A rig of a run's own, and where the run begins."""
+    """A rig of a run's own, where the run begins, and the channels that are looked at."""
 
     rig: Rig
     y0: Begin
+    channels: tuple[str, ...]
 
 
 class Grid(NamedTuple):
@@ -59,8 +61,8 @@ class Recording:
     `rig` has the known numbers and the nominal ones of what is unknown, the laws, and the reference
     that the run followed; runs are made of copies of it. `samples` holds times (k,) [s] and values
     (k,) by channel, each with times of its own; channels are those of the rig's trajectories that
-    `measurable` names. `start` says where the run begins. `dataclasses.replace` makes variants,
-    with another law, say.
+    `measurable` names, and those of touch. `start` says where the run begins. `dataclasses.replace`
+    makes variants, with another law, say.
     """
 
     name: str
@@ -71,12 +73,12 @@ class Recording:
     def __post_init__(self) -> None:
         if not self.samples:
             raise ValueError(f"recording `{self.name}` has no samples")
-        known = measurable(self.rig)
+        known, touch = measurable(self.rig), Touch(self.rig)
         for channel, (t, y) in self.samples.items():
-            if channel not in known:
+            if channel not in known and channel not in touch:
                 raise ValueError(
                     f"`{channel}` is not a channel of the rig of `{self.name}`; known: "
-                    f"{', '.join(known)}"
+                    f"{', '.join(known)}, and of touch {touch.shown}"
                 )
             if t.shape != y.shape or t.ndim != 1 or len(t) < 2:
                 raise ValueError(
@@ -90,13 +92,16 @@ class Recording:
 
     @cached_property
     def channels(self) -> tuple[str, ...]:
-        """What a sensor of this rig can measure."""
-        return measurable(self.rig)
+        """What runs are looked at for: what any sensor of this rig can measure of the motion, and
+        the channels of touch that were sampled."""
+        motion = measurable(self.rig)
+        return (*motion, *(channel for channel in self.samples if channel not in motion))
 
     @cached_property
     def units(self) -> dict[str, str]:
         """SI units of the rig's channels and signals."""
-        return units(self.rig)
+        touch = Touch(self.rig)
+        return units(self.rig) | {name: touch.unit(name) for name in self.samples if name in touch}
 
     @cached_property
     def times(self) -> Array:
@@ -145,7 +150,7 @@ class Recording:
         rig = deepcopy(self.rig)
         for name, value in rig.named_parameters():
             value.requires_grad_(not name.startswith("reference."))
-        return RunContext(rig, self.start.begin(rig, self.samples))
+        return RunContext(rig, self.start.begin(rig, self.samples), self.channels)
 
     def on_a_grid(self, interpolated: bool) -> bool:
         """Whether a regular grid is simulated, every `BETWEEN`, in place of the samples' own times:
@@ -191,6 +196,7 @@ def identity(rig: Rig) -> bytes:
         (name, part) for name, part in rig.named_modules() if name.split(".")[0] != "reference"
     ]
     text = [f"{name} {type(part).__qualname__} {plain(part)}" for name, part in parts]
+    text += [f"{name} {taxels}" for name, taxels in rig.taxels.items()]
     functions = [
         value for _, part in parts for value in vars(part).values() if inspect.isfunction(value)
     ]

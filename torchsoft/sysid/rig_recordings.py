@@ -13,13 +13,14 @@ from torchsoft.channels import UNITS
 from torchsoft.physics.motion import Reference, Sampled
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import RigFile
+from torchsoft.solve.touch import Touch, enumerated
 from torchsoft.solve.trajectory import channels, measurable, units
 from torchsoft.sysid.columns import Tables, Vocabulary
 from torchsoft.sysid.configuration import Beginning, Moving
 from torchsoft.sysid.first_samples import estimate_initial_state
 from torchsoft.sysid.initial_state import Standing
 from torchsoft.sysid.recording import Recording
-from torchsoft.sysid.unknowns import Sensor
+from torchsoft.sysid.unknowns import Sensor, by_channel
 from torchsoft.tables import shown
 
 APART = {"m": 1e-3, "rad": 0.05}
@@ -33,14 +34,15 @@ SLACK = 0.05
 def vocabulary(rig: Rig, headings: Mapping[str, str]) -> Vocabulary:
     """Columns that recordings of a rig may have. Raises `ValueError` for a heading that stands for
     something else."""
-    known, signals = units(rig), rig.signals
-    names = (*signals, *(f"{name}_dot" for name in signals), *measurable(rig))
+    known, signals, touch = units(rig), rig.signals, Touch(rig)
+    known |= {name: touch.unit(name) for name in touch}
+    names = (*signals, *(f"{name}_dot" for name in signals), *measurable(rig), *touch)
     columns = {"t": "s"} | {name: known[name] for name in names if known[name] in UNITS}
     for heading, name in headings.items():
         if name not in columns:
             raise ValueError(
                 f"columns.{heading} = {shown(name)} is no channel of the rig; there are "
-                f"{', '.join(columns)}"
+                f"{enumerated(columns)}"
             )
     return Vocabulary(columns, signals, headings=headings)
 
@@ -86,6 +88,7 @@ def rig_recording(
     """The recording that tables hold, of the rig of a file. Raises `ValueError` naming row and
     column, or the file's field."""
     rig, y0, _ = file.build()
+    sensors = by_channel([rig], sensors)
     columns, samples = tables.columns, measured_samples(tables, sensors)
     check_clock(file, rig, tables, start)
     rig.reference = Reference(
@@ -140,8 +143,10 @@ def check_start(
         here = channels(rig, rig.unpack(y0, signals), signals)
     for channel, (t, y) in made.samples.items():
         unit, sensor = made.units[channel], sensors.get(channel)
-        slack = 8 * sensor.sd + sensor.bias if sensor else 0.0
-        if unit in APART and abs(y[0] - float(here[channel])) > APART[unit] + slack:
+        if channel not in here or unit not in APART:
+            continue
+        slack = APART[unit] + (8 * sensor.sd + sensor.bias if sensor else 0.0)
+        if abs(y[0] - float(here[channel])) > slack:
             table = tables.of(channel)
             row = int(np.searchsorted(table.values["t"], t[0]))
             raise ValueError(

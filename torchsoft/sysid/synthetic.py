@@ -15,7 +15,7 @@ from torchsoft.physics.statics import BuiltRig
 from torchsoft.sysid.initial_state import AtRest, HeldPads, Standing, Start
 from torchsoft.sysid.prediction import predict
 from torchsoft.sysid.recording import Grid, Recording
-from torchsoft.sysid.unknowns import Sensor
+from torchsoft.sysid.unknowns import Sensor, by_channel
 
 RIG = {
     channel: Sensor(noise=noise)
@@ -49,6 +49,7 @@ def record(
     `SimulationFailed`.
     """
     rig, y0, t = planned
+    sensors = by_channel([rig], sensors)
     begins = start or (AtRest() if isinstance(rig, SoftGrasp) else Standing.of(rig, y0))
     at = np.arange(float(t[0]), float(t[-1]) + 0.5 / rate, 1.0 / rate)
     made = Recording(name, rig, {one: (at, np.zeros_like(at)) for one in sensors}, begins)

@@ -6,7 +6,7 @@ coordinate's standard deviation is a relative one either way.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Self, get_args
 
@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from torchsoft.physics.rig import Rig
 from torchsoft.quantity import near
+from torchsoft.solve.touch import Touch
 from torchsoft.sysid.initial_state import BOUNDS, PREFIX
 from torchsoft.sysid.recording import REACH, Array, Recording
 from torchsoft.tables import Table, line, shown
@@ -153,6 +155,15 @@ class Sensor(Table):
             if nominal + reach > nominal:
                 out[kind] = nominal - reach, nominal, nominal + reach
         return out
+
+
+def by_channel(rigs: Iterable[Rig], sensors: Mapping[str, Sensor]) -> dict[str, Sensor]:
+    """Sensors by channel: one that is called by an array of touch of the rigs, such as
+    "skin.normal", is one of each of its channels that has none of its own."""
+    arrays = {name: size for rig in rigs for name, size in Touch(rig).arrays.items()}
+    numbered = lambda name: (f"{name}.{i}" for i in range(arrays.get(name, 0)))
+    out = {one: sensor for name, sensor in sensors.items() for one in numbered(name)}
+    return out | {name: sensor for name, sensor in sensors.items() if name not in arrays}
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from torchsoft.solve.kernel import compiled
-from torchsoft.solve.kernel.arrays import GAMMA, MIX
+from torchsoft.solve.kernel.arrays import FELT, GAMMA, INSTANT, MIX, STEPPED
 from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
 from torchsoft.solve.kernel.interface import NEGLIGIBLE, assemble, branch_rate, restore, softness
 from torchsoft.solve.kernel.invoke import call_linearise, call_pullback
@@ -33,9 +33,10 @@ def nodal_cotangent(
     X: Array,
     full: Array,
     V_bar: Array,
+    outputs: int,
 ) -> None:
     """F_bar of the touched nodes into X[:, 0], from the cotangents of the pad's state and of the
-    touching points' stretches."""
+    law's outputs at the touching points, z.out."""
     free = s.body_free
     first, at = s.pad_node_start[pad], s.pad_point_start[pad]
     b = z.surface[0, : 2 * n]
@@ -43,16 +44,19 @@ def nodal_cotangent(
     for i in range(w.actives[pad]):
         k = w.active[at + i]
         c = s.point_contact[k]
-        s_bar = a * y_bar[s.point_y_start + k]
-        for j in range(2):
-            if s.point_N[k, j] != 0.0:
-                row = 2 * w.slot[s.point_node[k, j]]
-                b[row] += s.point_N[k, j] * w.H[at + i, 2, 0] * s_bar
-                b[row + 1] += s.point_N[k, j] * w.H[at + i, 2, 1] * s_bar
-        for row in range(6):
-            number = s.contact_number[c, row]
-            if number >= 0:
-                V_bar[number] += w.H[at + i, 2, 2 + row] * s_bar
+        for r in range(outputs):
+            H, bar = w.H[at + i, r], z.out[k, r]
+            if bar == 0.0:
+                continue
+            for j in range(2):
+                if s.point_N[k, j] != 0.0:
+                    row = 2 * w.slot[s.point_node[k, j]]
+                    b[row] += s.point_N[k, j] * H[0] * bar
+                    b[row + 1] += s.point_N[k, j] * H[1] * bar
+            for row in range(6):
+                number = s.contact_number[c, row]
+                if number >= 0:
+                    V_bar[number] += H[2 + row] * bar
     if s.pad_v_start[pad] >= 0:
         i0, i1 = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1]
         u_bar, v_bar = y_bar[s.pad_y_start[pad] :], y_bar[s.pad_v_start[pad] :]
@@ -221,15 +225,94 @@ def inertial_state(
 
 
 @compiled
+def load_cotangent(s: Any, z: Any, c: int, row: int) -> float:
+    """Of the load that contact c puts on coordinate `row` of its body and its pad's base. What
+    moves an inertial pad's base is the force in the pad."""
+    if s.pad_v_start[s.contact_pad[c]] >= 0 and 3 <= row < 5:
+        return 0.0
+    return z.load[s.contact_coordinate[c, row]]
+
+
+@compiled
+def seed(
+    s: Any, w: Any, z: Any, tape: Any, row: int, a: float, y_bar: Array, p_bar: Array,
+    signals_bar: Array, forces_bar: Array,
+) -> None:  # fmt: skip
+    """Cotangents of the law's outputs at the touching points into z.out, of loads and of the pads'
+    forces and moments into z.load and z.wrenches; those of the forces in inertial pads go on to
+    what they are made of."""
+    z.load[:], z.wrenches[:] = 0.0, 0.0
+    felt, points, pads = forces_bar.size > 0, s.point_contact.size, s.pad_base.size
+    if felt:
+        put(forces_bar[2 * points + 3 * pads :], z.load)
+        put(forces_bar[2 * points : 2 * points + 3 * pads], z.wrenches)
+    for pad in range(pads):
+        at, inertial, wrench = s.pad_point_start[pad], s.pad_v_start[pad] >= 0, z.wrenches[pad]
+        for i in range(w.actives[pad]):
+            k, G = w.active[at + i], w.G[at + i]
+            bar = z.out[k]
+            bar[:] = 0.0
+            bar[2] = a * y_bar[s.point_y_start + k]
+            if not felt:
+                continue
+            bar[3], bar[4] = forces_bar[2 * k], forces_bar[2 * k + 1]
+            for o in range(6):
+                load = load_cotangent(s, z, s.point_contact[k], o)
+                bar[0] += G[o, 0] * load
+                bar[1] += G[o, 1] * load
+            if not inertial:
+                bar[0] += wrench[0] - s.point_X[k, 1] * wrench[2]
+                bar[1] += wrench[1] + s.point_X[k, 0] * wrench[2]
+        if felt and inertial:
+            elastic_adjoint(s, w, z, pad, tape.y[row], tape.rate[row], y_bar, p_bar, signals_bar)
+
+
+@compiled
+def elastic_adjoint(
+    s: Any, w: Any, z: Any, pad: int, y: Array, rate: Array, y_bar: Array, p_bar: Array,
+    signals_bar: Array,
+) -> None:  # fmt: skip
+    """Adjoint of the force and the moment in an inertial pad, sums of K (u + tau u')."""
+    i0, i1, at = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1], s.inertia_material_at[pad]
+    base, tau, wrench, V_bar = s.pad_base[pad], s.p[at + 2], z.wrenches[pad], z.pair[0]
+    cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
+    x, y_axis = z.load[base], z.load[base + 1]
+    bar, back = z.dofs[0, i0:i1], z.dofs[1, i0:i1]
+    for i in range(0, i1 - i0, 2):
+        bar[i] = wrench[0] + cos * x + sin * y_axis - s.inertia_X[i0 + i + 1] * wrench[2]
+        bar[i + 1] = wrench[1] + cos * y_axis - sin * x + s.inertia_X[i0 + i] * wrench[2]
+    stiffness_force(s, pad, bar, back)
+    V_bar[:] = 0.0
+    for i in range(i1 - i0):
+        y_bar[s.pad_y_start[pad] + i] += back[i]
+        y_bar[s.pad_v_start[pad] + i] += tau * back[i]
+        V_bar[i % 2] -= tau * back[i]
+        p_bar[at + 2] += back[i] * rate[i0 + i]
+        for j in range(s.inertia_K_column.shape[1]):
+            column = s.inertia_K_column[i0 + i, j]
+            strain = bar[i] * (y[s.pad_y_start[pad] + column] + tau * rate[i0 + column])
+            p_bar[at] += s.inertia_K_lambda[i0 + i, j] * strain
+            p_bar[at + 1] += s.inertia_K_mu[i0 + i, j] * strain
+    for axis in range(2):
+        own = cos * V_bar[0] - sin * V_bar[1] if axis == 0 else sin * V_bar[0] + cos * V_bar[1]
+        if s.body_free[base + axis] >= 0:
+            y_bar[s.body_V_start + s.body_free[base + axis]] += own
+        elif s.body_signal[base + axis] >= 0:
+            signals_bar[s.body_signal[base + axis], 1] += own
+
+
+@compiled
 def stage_adjoint(
     s: Any, w: Any, z: Any, tape: Any, row: int, a: float, signals: Array, y_bar: Array,
-    p_bar: Array, signals_bar: Array,
+    p_bar: Array, signals_bar: Array, forces_bar: Array,
 ) -> None:  # fmt: skip
     """Turn the cotangent y_bar (size,) of a stage's end into that of its y*, in place; add to p_bar
-    and signals_bar."""
+    and signals_bar. forces_bar (recorded,) are those of its forces, or empty."""
     p = s.p
     free, count, y = s.body_coordinate.size, s.pad_base.size, tape.y[row]
-    restore(s, w, tape, row, a)
+    outputs = FELT if forces_bar.size > 0 else STEPPED
+    restore(s, w, tape, row, a, outputs)
+    seed(s, w, z, tape, row, a, y_bar, p_bar, signals_bar, forces_bar)
     Rv, matrix, nu, V_bar, full, rate_bar, u_bar = (
         w.Rv,
         z.matrix,
@@ -247,7 +330,7 @@ def stage_adjoint(
         n = assemble(s, w, pad, a, Rv)
         first, columns, column = s.pad_node_start[pad], s.pad_columns[pad], s.pad_column[pad]
         X = w.X[2 * first : 2 * (first + n)]
-        nodal_cotangent(s, w, z, pad, y_bar, a, n, X, full, V_bar)
+        nodal_cotangent(s, w, z, pad, y_bar, a, n, X, full, V_bar, outputs)
         for i in range(2 * n):
             for j in range(columns):
                 X[i, 1 + j] = w.Rf[j, i]
@@ -297,19 +380,20 @@ def stage_adjoint(
             for row_ in range(6):
                 number = s.contact_number[c, row_]
                 by[row_] = nu[number, 0] if number >= 0 else 0.0
+            put(z.out[k], weights)
             for r in range(2):
-                weights[r] = 0.0
                 for j in range(2):
                     if s.point_N[k, j] != 0.0:
                         weights[r] += s.point_N[k, j] * X[2 * w.slot[s.point_node[k, j]] + r, 0]
                 for row_ in range(6):
                     weights[r] += G[row_, r] * by[row_]
-            weights[2] = a * y_bar[s.point_y_start + k]
+            for row_ in range(6):
+                by[row_] += load_cotangent(s, z, c, row_)
             own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
             call_pullback(s.contact_pullback[c], w.x[k], p[own], weights, p_bar[own])
             for m in range(8):
                 position = velocity = 0.0
-                for r in range(3):
+                for r in range(outputs):
                     position += S[r, m] * weights[r]
                     velocity += (H[r, m] - a * S[r, m]) * weights[r]
                 for row_ in range(6):
@@ -325,7 +409,7 @@ def stage_adjoint(
                     q_hat[coordinate] += position
                     V_hat[coordinate] += velocity
             s_bar = 0.0
-            for r in range(3):
+            for r in range(outputs):
                 s_bar += w.J[k, r, 6] * weights[r]
             y_bar[s.point_y_start + k] += s_bar
         free_stretches(s, w, z, pad, y, y_bar, a, p_bar)
@@ -392,20 +476,45 @@ def free_stretches(
 
 
 @compiled
+def feel(r: Any, i: int) -> None:
+    """Add to the cotangents of output i's state, parameters and signals the share of its forces:
+    the adjoint of the stage of no length that gives them."""
+    bar, state = r.recorded_bar[i], r.z.state[3]
+    some = False
+    for j in range(bar.size):
+        some |= bar[j] != 0.0
+    if some:
+        state[:] = 0.0
+        stage_adjoint(
+            r.s0, r.w, r.z, r.out_tape, i, INSTANT, r.out_signals[i], state, r.p_bar,
+            r.out_signals_bar[i], bar,
+        )  # fmt: skip
+        for j in range(state.size):
+            r.outputs_bar[i, j] += state[j]
+
+
+@compiled
 def backward(r: Any) -> None:
     """Sweep the steps h of a tape backwards; y_bar goes from the end's cotangent to the start's, in
     place.
 
-    outputs_bar (outputs, size) belong to the parts out_part of the steps out_step; signals and
-    signals_bar are (stages, signals, 2). failed receives -1, or the step at which a cotangent
+    outputs_bar (outputs, size) belong to the parts out_part of the steps out_step; where
+    recorded_bar (outputs, recorded) of the forces there is not zero, they receive its share.
+    Without steps the one output is the start. signals and signals_bar are (stages, signals, 2),
+    those of the outputs (outputs, signals, 2). failed receives -1, or the step at which a cotangent
     stopped being finite.
     """
-    s, w, z, tape, h, signals = r.s, r.w, r.z, r.tape, r.h, r.signals
+    s, w, z, tape, h, signals, none = r.s, r.w, r.z, r.tape, r.h, r.signals, r.z.by[:0]
     out_step, out_part, outputs_bar = r.out_step, r.out_part, r.outputs_bar
     y_bar, p_bar, signals_bar = r.y_bar, r.p_bar, r.signals_bar
     r.failed[0] = -1
     row = out_step.size - 1
     held, first_bar, start_bar = z.state[0], z.state[1], z.state[2]
+    for i in range(out_step.size):
+        feel(r, i)
+    if h.size == 0:
+        for i in range(y_bar.size):
+            y_bar[i] += outputs_bar[0, i]
     for step in range(h.size - 1, -1, -1):
         a = GAMMA * h[step]
         first_bar[:], start_bar[:] = 0.0, 0.0
@@ -417,12 +526,12 @@ def backward(r: Any) -> None:
                 start_bar[i] += at_start * outputs_bar[row, i]
             row -= 1
         k = 2 * step + 1
-        stage_adjoint(s, w, z, tape, k, a, signals[k], y_bar, p_bar, signals_bar[k])
+        stage_adjoint(s, w, z, tape, k, a, signals[k], y_bar, p_bar, signals_bar[k], none)
         for i in range(y_bar.size):
             held[i] = (1.0 - MIX) * y_bar[i] + start_bar[i]
             y_bar[i] = MIX * y_bar[i] + first_bar[i]
         k = 2 * step
-        stage_adjoint(s, w, z, tape, k, a, signals[k], y_bar, p_bar, signals_bar[k])
+        stage_adjoint(s, w, z, tape, k, a, signals[k], y_bar, p_bar, signals_bar[k], none)
         for i in range(y_bar.size):
             y_bar[i] += held[i]
         if not np.isfinite(y_bar.sum()):

@@ -34,9 +34,9 @@ PASSED = 0.25
 """A step that tolerances choose moves no body by more than this part of its size over a pad that it
 may touch: one that flies would else be through the pad between two steps."""
 
-INPUTS, OUTPUTS = 9, 7
+INPUTS, OUTPUTS, STEPPED, FELT = 9, 7, 3, 5
 """A contact law's inputs (w, omega, d, theta, s*, weight, a h) and outputs (f, s', F_N, F_T, power
-of dashpots, of slip)."""
+of dashpots, of slip); how many of the outputs a stage needs, and how many are differentiated."""
 
 
 class Bodies(NamedTuple):
@@ -241,8 +241,8 @@ SCRATCH: dict[str, dict[str, str]] = {
         "nodes 2": "u free u_dot u_dot_old F F_linear F_old F_new",
         "points 9": "x",  # the law's inputs, outputs and Jacobian
         "points 7": "out",
-        "points 3 7": "J",
-        "points 3 8": "H S",  # of the touching points in the order of `active`, see `interface`
+        "points 5 7": "J",
+        "points 5 8": "H S",  # of the touching points in the order of `active`, see `interface`
         "points 6 2": "G",
         "points 6 8": "L",
         # numbers of points near and touching, from every pad's first point on
@@ -280,7 +280,7 @@ SCRATCH: dict[str, dict[str, str]] = {
         "2 state": "K",
         "2 integrals": "powers",
         "2": "speed",
-        "pads": "moments",
+        "pads 3": "wrenches",
     },
     "Cotangents": {  # of u', rate and u, q and V, of a law's outputs and a point's bodies (by)
         "4 widest": "surface",
@@ -291,14 +291,18 @@ SCRATCH: dict[str, dict[str, str]] = {
         "free": "V_bar",
         "inertial": "full",
         "nodes 2": "rate u",
-        "coordinates": "q V",
-        "3": "weights decay_x",
+        "coordinates": "q V load",  # of an output's loads, and of the pads' forces and moments
+        "pads 3": "wrenches",
+        "points 5": "out",
+        "5": "weights",
+        "3": "decay_x",
         "6": "by",
         "1 1": "decay_J",
-        "3 state": "state",
+        "4 state": "state",
     },
     "Tangents": {  # in so many directions (columns); span: dofs of every pad that count
-        "3": "weights decay_x",
+        "5": "weights",
+        "3": "decay_x",
         "parameters": "gradient",
         "3 columns": "change",
         "free columns": "r V",
@@ -308,7 +312,8 @@ SCRATCH: dict[str, dict[str, str]] = {
         "widest": "zeta rate",
         "widest columns": "dzeta drate",
         "2 columns": "base_rate at_point",
-        "points 3 columns": "e",
+        "points 5 columns": "e",
+        "recorded columns": "recorded",  # as `recorded_size` orders it
         "8 columns": "moved",
         "1 1": "decay_J",
         "state columns": "before first",
@@ -358,16 +363,18 @@ class Outputs(NamedTuple):
     """Of a run: output i lies at the part out_part[i] of the step out_step[i], where the signals
     are signals[i].
 
-    Its state goes to y, (F_N, F_T) of every point to forces, and integrals, the pads' moments and
-    the generalised contact forces to extras.
+    Its state goes to y, its integrals to integrals, its forces to recorded (as `recorded_size`
+    orders them); tape has one row an output, or none, each a stage of no length there, whose y it
+    shares.
     """
 
     step: Index
     part: Array
     signals: Cube
     y: Matrix
-    forces: Cube
-    extras: Matrix
+    integrals: Matrix
+    recorded: Matrix
+    tape: Annotated[Any, Tape]
 
 
 @table
@@ -413,7 +420,7 @@ class Rates(NamedTuple):
     y: Array
     signals: Cube
     powers: Array
-    moments: Array
+    wrenches: Matrix
     out: Array
     converged: Index
 
@@ -423,6 +430,7 @@ class Backward(NamedTuple):
     """Arguments of `backward`."""
 
     s: Annotated[Any, System]
+    s0: Annotated[Any, System]
     w: Annotated[Any, Work]
     z: Annotated[Any, Cotangents]
     tape: Annotated[Any, Tape]
@@ -430,7 +438,11 @@ class Backward(NamedTuple):
     signals: Cube
     out_step: Index
     out_part: Array
+    out_tape: Annotated[Any, Tape]
+    out_signals: Cube
     outputs_bar: Matrix
+    recorded_bar: Matrix
+    out_signals_bar: Cube
     y_bar: Array
     p_bar: Array
     signals_bar: Cube
@@ -442,6 +454,7 @@ class Forward(NamedTuple):
     """Arguments of `forward`."""
 
     s: Annotated[Any, System]
+    s0: Annotated[Any, System]
     w: Annotated[Any, Work]
     z: Annotated[Any, Tangents]
     tape: Annotated[Any, Tape]
@@ -449,9 +462,21 @@ class Forward(NamedTuple):
     signals: Cube
     out_step: Index
     out_part: Array
+    out_tape: Annotated[Any, Tape]
+    out_signals: Cube
+    sum_start: Index
+    sum_at: Index
+    sum_weight: Array
     dy: Matrix
     dp: Matrix
     dys: Cube
+    dsums: Cube
+
+
+def recorded_size(s: Any) -> int:
+    """How many forces one output has: (F_N, F_T) of every point, force and moment of every pad,
+    loads on all coordinates, in this order."""
+    return 2 * len(s.point_X) + 3 * len(s.pad_base) + len(s.body_free)
 
 
 def room(kind: str, s: Any, state: int, **sizes: int) -> Any:
@@ -466,6 +491,7 @@ def room(kind: str, s: Any, state: int, **sizes: int) -> Any:
         "nodes": int(s.pad_node_start[-1]), "inputs": inputs, "dofs": 2 * int(s.pad_node_start[-1]),
         "widest": 2 * int(np.diff(s.pad_node_start).max(initial=0)),
         "inertial": int(s.inertia_dof_start[-1]), "parameters": len(s.p),
+        "recorded": recorded_size(s),
     }  # fmt: skip
     made = {}
     for shape, names in SCRATCH[kind].items():
@@ -480,6 +506,6 @@ def room(kind: str, s: Any, state: int, **sizes: int) -> Any:
     return KINDS[kind](**made)
 
 
-def first_stages(tape: Any, stages: int) -> Any:
+def first_rows(tape: Any, rows: int) -> Any:
     """The beginning of a tape, of a run that ended early."""
-    return Tape(*(part if len(part) == stages else part[:stages].copy() for part in tape))
+    return Tape(*(part if len(part) == rows else part[:rows].copy() for part in tape))

@@ -29,6 +29,22 @@ def stiffness_force(s: Any, pad: int, u: Array, out: Array) -> None:
 
 
 @compiled
+def elastic_wrench(s: Any, w: Any, pad: int, y: Array, wrench: Array) -> None:
+    """Force and moment in a pad, sums of K (u + tau u') at the state y with the rates in w.k: in a
+    stage of no length F - M v' would be what rounding leaves of them."""
+    first, last, U = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1], s.pad_y_start[pad]
+    strain, force = w.inertial[0, first:last], w.inertial[1, first:last]
+    for i in range(last - first):
+        strain[i] = y[U + i] + s.p[s.inertia_material_at[pad] + 2] * w.k[U + i]
+    stiffness_force(s, pad, strain, force)
+    wrench[:] = 0.0
+    for i in range(0, last - first, 2):
+        wrench[0] += force[i]
+        wrench[1] += force[i + 1]
+        wrench[2] += s.inertia_X[first + i] * force[i + 1] - s.inertia_X[first + i + 1] * force[i]
+
+
+@compiled
 def solve(s: Any, pad: int, b: Array) -> None:
     """A^-1 b in place."""
     first, last = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1]

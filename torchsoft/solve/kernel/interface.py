@@ -228,8 +228,9 @@ def evaluate(s: Any, w: Any, pad: int, y: Array, a: float) -> tuple[float, float
 
 
 @compiled
-def linearise(s: Any, w: Any, pad: int, a: float) -> None:
-    """H, S, G and L of the touching points of a pad, from the law's Jacobians in `w.J`."""
+def linearise(s: Any, w: Any, pad: int, a: float, outputs: int) -> None:
+    """H and S of the law's first outputs, G and L of the touching points of a pad, from the law's
+    Jacobians in `w.J`."""
     at = s.pad_point_start[pad]
     for i in range(w.actives[pad]):
         k = w.active[at + i]
@@ -238,7 +239,7 @@ def linearise(s: Any, w: Any, pad: int, a: float) -> None:
         dx, dy, fx, fy = w.x[k, 3], w.x[k, 4], w.out[k, 0], w.out[k, 1]
         px, py = dx + rx, dy + ry
         H, S, G, L = w.H[at + i], w.S[at + i], w.G[at + i], w.L[at + i]
-        for r in range(3):
+        for r in range(outputs):
             J = w.J[k, r]
             S[r, 0], S[r, 1] = J[3] - spin * J[1], J[4] + spin * J[0]
             S[r, 2], S[r, 3], S[r, 4] = J[4] * sin - J[3] * cos, -J[3] * sin - J[4] * cos, J[5]
@@ -337,7 +338,7 @@ def assemble(s: Any, w: Any, pad: int, a: float, Rv: Array) -> int:
 
 
 @compiled
-def restore(s: Any, w: Any, tape: Any, row: int, a: float) -> None:
+def restore(s: Any, w: Any, tape: Any, row: int, a: float, outputs: int) -> None:
     """Coordinates, touching points with the law's Jacobians there, H, S, G, L, nodal forces (w.F),
     displacements at the stage's start (w.u) and rates (w.u_dot) of points, by point number in the
     first columns of w.x's scratch."""
@@ -363,4 +364,4 @@ def restore(s: Any, w: Any, tape: Any, row: int, a: float) -> None:
             apply_law(s, w, k, tape.y[row, s.point_y_start + k], a)
             w.active[at + i] = k
             slot += 1
-        linearise(s, w, pad, a)
+        linearise(s, w, pad, a, outputs)

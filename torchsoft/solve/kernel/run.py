@@ -224,14 +224,14 @@ def rates(r: Any) -> None:
     0 if Newton finds no forces there.
 
     A stage of no length gives all rates; those of the velocities are a difference over its length
-    and come from the loads instead. signals (1, signals, 2) is scratch, as are powers and moments.
+    and come from the loads instead. signals (1, signals, 2) is scratch, as are powers and wrenches.
     """
     s, w, y, out = r.s, r.w, r.y, r.out
     follow(r.f, r.t, r.t, r.signals)
     for i in range(s.body_coordinate.size):
         w.V[s.body_coordinate[i]] = y[s.body_V_start + i]
     w.travelled[0] = np.inf  # the last state was any other one
-    converged, _, _ = solve_near(s, w, r.limits, y, r.signals[0], AT_ONCE, r.powers, r.moments)
+    converged, _, _ = solve_near(s, w, r.limits, y, r.signals[0], AT_ONCE, r.powers, r.wrenches)
     put(w.k, out)
     for i in range(s.body_coordinate.size):
         c, mass = s.body_coordinate[i], s.p[s.body_mass_at[i]]

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchsoft.solve.kernel import compiled
+from torchsoft.solve.kernel.arrays import STEPPED
 from torchsoft.solve.kernel.inertia import base_velocity, inertia_force, solve, stiffness_force
 from torchsoft.solve.kernel.interface import (
     assemble,
@@ -258,7 +259,7 @@ def solve_stage(
         balance(s, w, y, signals, a, r, Rv)
         for pad in range(pads):
             n = 0
-            linearise(s, w, pad, a)
+            linearise(s, w, pad, a, STEPPED)
             n = assemble(s, w, pad, a, Rv)
             residual(s, w, pad, y, a, n, r)
             first, columns = s.pad_node_start[pad], s.pad_columns[pad]
@@ -305,10 +306,11 @@ NEGLIGIBLE_RATE = 1e-16
 
 
 @compiled
-def finish(s: Any, w: Any, y: Array, a: float, powers: Array, moments: Array) -> float:
+def finish(s: Any, w: Any, y: Array, a: float, powers: Array, wrenches: Array) -> float:
     """All rates of the accepted stage in w.k, what the pads and contacts dissipate in `powers`
-    (pads, dashpots, slip) [W], the contacts' generalised forces in w.load, the pads' moments (Eq.
-    35) [N.m]. Returns a bound of every surface speed [m/s]."""
+    (pads, dashpots, slip) [W], the contacts' generalised forces in w.load, the force on every pad
+    [N] and its moment (Eq. 35) [N.m] in its base's axes. Returns a bound of every surface speed
+    [m/s]."""
     p, k = s.p, w.k
     count, fastest = s.pad_base.size, 0.0
     powers[: count + 2] = 0.0
@@ -317,12 +319,15 @@ def finish(s: Any, w: Any, y: Array, a: float, powers: Array, moments: Array) ->
     for pad in range(count):
         at = s.pad_point_start[pad]
         first, last, start = s.pad_node_start[pad], s.pad_node_start[pad + 1], s.pad_y_start[pad]
-        moments[pad] = 0.0
+        wrench = wrenches[pad]
+        wrench[:] = 0.0
         for i in range(w.actives[pad]):
             n = w.active[at + i]
             c = s.point_contact[n]
             fx, fy = w.out[n, 0], w.out[n, 1]
-            moments[pad] += s.point_X[n, 0] * fy - s.point_X[n, 1] * fx
+            wrench[0] += fx
+            wrench[1] += fy
+            wrench[2] += s.point_X[n, 0] * fy - s.point_X[n, 1] * fx
             frame, x, body, base = w.frame[c], w.x[n], s.contact_body[c], s.pad_base[pad]
             X, Y = frame[0] * fx - frame[1] * fy, frame[1] * fx + frame[0] * fy
             w.load[body] -= X
@@ -354,7 +359,7 @@ def finish(s: Any, w: Any, y: Array, a: float, powers: Array, moments: Array) ->
             else:
                 k[j] = 0.0
         if s.pad_v_start[pad] >= 0:
-            fastest = max(fastest, finish_inertial(s, w, pad, y, a, powers, moments))
+            fastest = max(fastest, finish_inertial(s, w, pad, y, a, powers, wrenches))
             continue
         chain, branches, size = s.pad_chain_at[pad], s.pad_branches[pad], 2 * (last - first)
         total = 0.0
@@ -388,9 +393,9 @@ def finish(s: Any, w: Any, y: Array, a: float, powers: Array, moments: Array) ->
 
 @compiled
 def finish_inertial(
-    s: Any, w: Any, pad: int, y: Array, a: float, powers: Array, moments: Array
+    s: Any, w: Any, pad: int, y: Array, a: float, powers: Array, wrenches: Array
 ) -> float:
-    """Rates of an inertial pad, its part in powers, load and moment; returns its largest nodal rate
+    """Rates of an inertial pad, its part in powers, load and force; returns its largest nodal rate
     [m/s]."""
     p = s.p
     first, last = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1]
@@ -420,11 +425,9 @@ def finish_inertial(
     for i in range(0, last - first):
         powers[pad] += p[at + 2] * rates[i] * stiffness[i]
         effort[i] = forces[i] - p[at + 3] * s.inertia_area[first + i] * w.k[s.pad_v_start[pad] + i]
-    moments[pad] = 0.0
-    for i in range(0, last - first, 2):
-        moments[pad] += (
-            s.inertia_X[first + i] * effort[i + 1] - s.inertia_X[first + i + 1] * effort[i]
-        )
+    wrenches[pad] = 0.0
+    for i in range(last - first):
+        wrenches[pad, i % 2] += effort[i]
     mx, my = inertia_force(s, w, pad, y, a, rates)
     cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
     w.load[base] -= cos * mx - sin * my

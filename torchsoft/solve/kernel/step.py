@@ -22,6 +22,7 @@ from torchsoft.solve.kernel.arrays import (
     OFF_THE_PAD,
     TAPE_FULL,
 )
+from torchsoft.solve.kernel.inertia import elastic_wrench
 from torchsoft.solve.kernel.interface import at_point
 from torchsoft.solve.kernel.linear import put
 from torchsoft.solve.kernel.stage import actuate, finish, solve_stage
@@ -33,8 +34,9 @@ numbers."""
 
 
 @compiled
-def write_tape(s: Any, w: Any, tape: Any, row: int, y: Array) -> bool:
-    """Put one solved stage on the tape; False if more points touch than it has room for."""
+def write_tape(s: Any, w: Any, tape: Any, row: int, y: Array, way: float) -> bool:
+    """Put one solved stage on the tape, its displacements after `way` [s] at its rates; False if
+    more points touch than it has room for."""
     put(y, tape.y[row])
     put(w.q, tape.q[row])
     put(w.V, tape.V[row])
@@ -49,8 +51,9 @@ def write_tape(s: Any, w: Any, tape: Any, row: int, y: Array) -> bool:
             k = w.active[at + i]
             tape.point[row, slot] = k
             state = tape.state[row, slot]
-            state[0], state[1] = at_point(s, k, w.u)
+            ux, uy = at_point(s, k, w.u)
             state[2], state[3] = at_point(s, k, w.u_dot)
+            state[0], state[1] = ux + way * state[2], uy + way * state[3]
             slot += 1
     return True
 
@@ -108,24 +111,31 @@ def supply(s: Any, w: Any, signals: Array, powers: Array) -> None:
 
 
 @compiled
-def record(s: Any, w: Any, integrals: Array, moments: Array, forces: Array, extras: Array) -> None:
-    """One row of output: (F_N, F_T) of every point; integrals, the pads' moments and the
-    generalised contact forces."""
-    forces[:] = 0.0
+def record(s: Any, w: Any, y: Array, wrenches: Array, out: Array) -> None:
+    """One row of forces at the state y, as `recorded_size` orders them."""
+    out[:] = 0.0
     for pad in range(s.pad_base.size):
         at = s.pad_point_start[pad]
         for i in range(w.actives[pad]):
             k = w.active[at + i]
-            forces[k, 0], forces[k, 1] = w.out[k, 3], w.out[k, 4]
-    n, m = integrals.size, moments.size
-    put(integrals, extras[:n])
-    put(moments, extras[n : n + m])
-    put(w.load, extras[n + m :])
+            out[2 * k], out[2 * k + 1] = w.out[k, 3], w.out[k, 4]
+    first = 2 * s.point_contact.size
+    loads = out[first + wrenches.size :]
+    put(w.load, loads)
+    for pad in range(s.pad_base.size):
+        wrench, base = out[first + 3 * pad : first + 3 * pad + 3], s.pad_base[pad]
+        put(wrenches[pad], wrench)
+        if s.pad_v_start[pad] >= 0:
+            elastic_wrench(s, w, pad, y, wrench)
+            x, y_axis = wrench[0] - wrenches[pad, 0], wrench[1] - wrenches[pad, 1]
+            cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
+            loads[base] += cos * x - sin * y_axis
+            loads[base + 1] += sin * x + cos * y_axis
 
 
 @compiled
 def solve_near(
-    s: Any, w: Any, limits: Any, y: Array, signals: Array, a: float, powers: Array, moments: Array
+    s: Any, w: Any, limits: Any, y: Array, signals: Array, a: float, powers: Array, wrenches: Array
 ) -> tuple[bool, int, float]:
     """A stage from y with every point that may touch in the window: success, linear solves, a bound
     of all speeds [m/s]."""
@@ -135,7 +145,7 @@ def solve_near(
         converged, count = solve_stage(s, w, limits, y, signals, a, reach)
         solves += count
         if converged:
-            speed = finish(s, w, y, a, powers, moments)
+            speed = finish(s, w, y, a, powers, wrenches)
             done = w.travelled[0] + a * speed <= w.travelled[1]
             if not done:  # a point may have come near that was not looked at
                 converged = reach == margin  # one look further must do
@@ -161,13 +171,13 @@ def take_step(r: Any, h: float, signals: Array, row: int) -> tuple[int, int]:
     for stage in range(2):
         powers = d.powers[stage]
         converged, count, speed = solve_near(
-            s, w, r.limits, y, signals[stage], a, powers, d.moments
+            s, w, r.limits, y, signals[stage], a, powers, d.wrenches
         )
         solves += count
         if not converged:
             status = NEWTON_FAILED
             break
-        if tape.y.shape[0] > 0 and not write_tape(s, w, tape, row + stage, y):
+        if tape.y.shape[0] > 0 and not write_tape(s, w, tape, row + stage, y, 0.0):
             status = TAPE_FULL
             break
         supply(s, w, signals[stage], powers)
@@ -218,15 +228,17 @@ def dense_states(part: float) -> tuple[float, float, float]:
 def write_rows(r: Any, h: float, first: int, last: int) -> tuple[int, int]:
     """The outputs from `first` to `last` of the step just taken. At its end they are what the last
     stage found; before it, dense output with the forces that belong to it, which take a stage of no
-    length (of `s0`). Returns status and linear solves."""
+    length (of `s0`); that is what `out.tape` holds, if it has rows. Returns status and linear
+    solves."""
     s, w, d, y, integrals, out = r.s, r.w, r.d, r.y, r.integrals, r.out
-    parts, ys = out.part, out.y
-    solves, here, converged = 0, w.travelled[0], True
+    parts, ys, tape = out.part, out.y, out.tape
+    solves, here = 0, w.travelled[0]
     put(w.V, d.guess_V)
     put(w.u_dot, d.guess)
     for i in range(
         last - 1, first - 1, -1
     ):  # the end comes first: the others disturb what the last stage left
+        way, scans = GAMMA * h if parts[i] == 1.0 else 0.0, w.travelled[2]
         if parts[i] == 1.0:
             put(y, ys[i])
             put(integrals, d.at_row)
@@ -244,17 +256,19 @@ def write_rows(r: Any, h: float, first: int, last: int) -> tuple[int, int]:
                 d.at_row[j] = d.integrals[j] + h * (
                     first_part * d.powers[0, j] + second_part * d.powers[1, j]
                 )
-            way = d.travelled[0] + h * (abs(b_1) * d.speed[0] + abs(b_2) * d.speed[1])
-            scans = w.travelled[2]
-            w.travelled[0] = way if scans == d.travelled[2] else np.inf
+            gone_by = d.travelled[0] + h * (abs(b_1) * d.speed[0] + abs(b_2) * d.speed[1])
+            w.travelled[0] = gone_by if scans == d.travelled[2] else np.inf
             converged, count, _ = solve_near(
-                r.s0, w, r.limits, ys[i], out.signals[i], INSTANT, d.scrap, d.moments
+                r.s0, w, r.limits, ys[i], out.signals[i], INSTANT, d.scrap, d.wrenches
             )
             solves += count
             if not converged:
-                break
-            put(d.guess_V, w.V)
-            put(d.guess, w.u_dot)
-            w.travelled[0] = here if w.travelled[2] == scans else np.inf
-        record(s, w, d.at_row, d.moments, out.forces[i], out.extras[i])
-    return CONVERGED if converged else NEWTON_FAILED, solves
+                return NEWTON_FAILED, solves
+        if tape.count.shape[0] > 0 and not write_tape(s, w, tape, i, ys[i], way):
+            return TAPE_FULL, solves
+        put(d.at_row, out.integrals[i])
+        record(s, w, ys[i], d.wrenches, out.recorded[i])
+        put(d.guess_V, w.V)
+        put(d.guess, w.u_dot)
+        w.travelled[0] = here if w.travelled[2] == scans else np.inf
+    return CONVERGED, solves

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from torchsoft.solve.kernel import compiled
-from torchsoft.solve.kernel.arrays import GAMMA, MIX
+from torchsoft.solve.kernel.arrays import FELT, GAMMA, INSTANT, MIX, STEPPED
 from torchsoft.solve.kernel.inertia import base_velocity, solve, stiffness_force
 from torchsoft.solve.kernel.interface import (
     NEGLIGIBLE,
@@ -201,13 +201,16 @@ def inertial_part(
 
 @compiled
 def stage_tangent(
-    s: Any, w: Any, z: Any, tape: Any, row: int, a: float, signals: Array, dy: Array, dp: Array
-) -> None:
-    """Turn the tangent dy (size, m) of a stage's y* into that of its end, in place; dp (parameters,
-    m)."""
-    p = s.p
+    s: Any, w: Any, z: Any, tape: Any, row: int, a: float, signals: Array, dy: Array, dp: Array,
+    felt: bool,
+) -> None:  # fmt: skip
+    """Turn the tangent dy (size, m) of a stage's y* into that of its end, in place, or if `felt`
+    leave it and put those of its forces into z.recorded; dp (parameters, m)."""
+    p, outputs = s.p, FELT if felt else STEPPED
     free, count, y, m = s.body_coordinate.size, s.pad_base.size, tape.y[row], dy.shape[1]
-    restore(s, w, tape, row, a)
+    restore(s, w, tape, row, a, outputs)
+    if felt:
+        z.recorded[:] = 0.0
     Rv, r, du, dv = w.Rv, z.r, z.u, z.v
     balance(s, w, y, signals, a, w.r, Rv)
     for i in range(free):
@@ -250,7 +253,7 @@ def stage_tangent(
             k = w.active[at + i]
             c = s.point_contact[k]
             own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
-            law_derivatives(z, s.contact_pullback[c], w.x[k], p[own], dp[own], 3, e[k])
+            law_derivatives(z, s.contact_pullback[c], w.x[k], p[own], dp[own], outputs, e[k])
             H, S, G, L = w.H[at + i], w.S[at + i], w.G[at + i], w.L[at + i]
             moved[:], v[:] = 0.0, 0.0
             for j in range(2):
@@ -262,7 +265,7 @@ def stage_tangent(
                 number = s.contact_number[c, o]
                 if number >= 0:
                     put(dy[s.body_q_start + number], moved[2 + o])
-            for o in range(3):
+            for o in range(outputs):
                 add(w.J[k, o, 6], dy[s.point_y_start + k], e[k, o])
                 for j in range(8):
                     add(S[o, j], moved[j], e[k, o])
@@ -280,6 +283,8 @@ def stage_tangent(
                         add(a * L[o, j], v[j], r[number])
                     for j in range(8):
                         add(L[o, j], moved[j], r[number])
+            if felt:
+                add_loads(s, z, k, L, moved)
         for i in range(2 * n):
             for j in range(columns):
                 X[i, m + j] = w.Hc[i, j]
@@ -292,24 +297,24 @@ def stage_tangent(
     solve_dense(Rv, dV, free, m)
 
     for pad in range(count):
-        advance_pad(s, w, z, pad, y, a, dy, dp)
-    for i in range(free):
+        nodal_rates(s, w, z, pad, a, m)
+        if felt:
+            feel_pad(s, w, z, pad, y, tape.rate[row], dy, dp)
+        else:
+            advance_pad(s, w, z, pad, y, a, dy, dp)
+    for i in range(0 if felt else free):
         add(a, dV[i], dy[s.body_q_start + i])
         put(dV[i], dy[s.body_V_start + i])
 
 
 @compiled
-def advance_pad(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array, dp: Array) -> None:
-    """Tangents of a pad's state and of its stretches at the stage's end, from Newton's solution in
-    w.X and dV."""
-    p = s.p
-    first, last, n, m = s.pad_node_start[pad], s.pad_node_start[pad + 1], w.counts[pad], dy.shape[1]
-    size, column = 2 * (last - first), s.pad_column[pad]
-    own_rate, base_rate, span, dV = z.own_rate, z.base_rate, z.span, z.V
-    # own_rate: of u', what is not in dv
-    X, at, start = w.X[2 * first : 2 * (first + n)], s.pad_point_start[pad], s.pad_y_start[pad]
-    inertial, scale = s.pad_v_start[pad] >= 0, mobility_scale(s, pad, a)
-    chain, branches, base = s.pad_chain_at[pad], s.pad_branches[pad], s.pad_base[pad]
+def nodal_rates(s: Any, w: Any, z: Any, pad: int, a: float, m: int) -> None:
+    """Tangents of the nodal forces, in w.X, and of the nodal rates less what is in dv, from
+    Newton's solution in w.X and dV."""
+    first, n, column = s.pad_node_start[pad], w.counts[pad], s.pad_column[pad]
+    size, base, dV = 2 * (s.pad_node_start[pad + 1] - first), s.pad_base[pad], z.V
+    own_rate, base_rate, scale = z.own_rate, z.base_rate, mobility_scale(s, pad, a)
+    X, inertial = w.X[2 * first : 2 * (first + n)], s.pad_v_start[pad] >= 0
     for number in range(column.size):
         if column[number] >= 0:
             for i in range(2 * n):
@@ -333,21 +338,112 @@ def advance_pad(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array,
                 dof = s.inertia_dof_start[pad] + s.inertia_surface[2 * w.touched[first + i] + o]
                 for q in range(2):
                     add(-s.inertia_D[dof, q], base_rate[q], own_rate[i, o])
+
+
+@compiled
+def add_output(s: Any, w: Any, z: Any, k: int, H: Array, factor: float, out: Array) -> None:
+    """Add to `out` (m,) what the nodal rates and the velocities do to an output of the law at point
+    k, whose derivatives by them are H (8,)."""
+    for j in range(2):
+        N, slot = s.point_N[k, j], w.slot[s.point_node[k, j]]
+        for o in range(2 if N != 0.0 else 0):
+            add(factor * N * H[o], z.own_rate[slot, o], out)
+    for o in range(6):
+        number = s.contact_number[s.point_contact[k], o]
+        if number >= 0:
+            add(factor * H[2 + o], z.V[number], out)
+
+
+@compiled
+def add_loads(s: Any, z: Any, k: int, by: Array, change: Array) -> None:
+    """Add the loads `by` (6, n) times `change` (n, m) of point k on its body and its pad's base to
+    z.recorded. What moves an inertial pad's base is the force in the pad."""
+    c, start = s.point_contact[k], 2 * s.point_contact.size + 3 * s.pad_base.size
+    inertial = s.pad_v_start[s.contact_pad[c]] >= 0
+    for o in range(6):
+        for j in range(0 if inertial and 3 <= o < 5 else by.shape[1]):
+            add(by[o, j], change[j], z.recorded[start + s.contact_coordinate[c, o]])
+
+
+@compiled
+def feel_pad(s: Any, w: Any, z: Any, pad: int, y: Array, rate: Array, dy: Array, dp: Array) -> None:
+    """Tangents of a pad's forces into z.recorded, whose loads hold the part at the same forces."""
+    at, wrench = s.pad_point_start[pad], 2 * s.point_contact.size + 3 * pad
+    inertial, into = s.pad_v_start[pad] >= 0, z.recorded
+    for i in range(w.actives[pad]):
+        k, e = w.active[at + i], z.e[w.active[at + i]]
+        for o in range(FELT):
+            add_output(s, w, z, k, w.H[at + i, o], 1.0, e[o])
+        put(e[3], into[2 * k])
+        put(e[4], into[2 * k + 1])
+        add_loads(s, z, k, w.G[at + i], e)
+        if not inertial:
+            add(1.0, e[0], into[wrench])
+            add(1.0, e[1], into[wrench + 1])
+            add(s.point_X[k, 0], e[1], into[wrench + 2])
+            add(-s.point_X[k, 1], e[0], into[wrench + 2])
+    if inertial:
+        feel_inertial(s, w, z, pad, y, rate, dy, dp)
+
+
+@compiled
+def feel_inertial(
+    s: Any, w: Any, z: Any, pad: int, y: Array, rate: Array, dy: Array, dp: Array
+) -> None:
+    """The same of the force and the moment in an inertial pad, sums of K (u + tau u')."""
+    at, base, U, W = (
+        s.inertia_material_at[pad],
+        s.pad_base[pad],
+        s.pad_y_start[pad],
+        s.pad_v_start[pad],
+    )
+    i0, i1, tau = s.inertia_dof_start[pad], s.inertia_dof_start[pad + 1], s.p[at + 2]
+    wrench, load = (
+        2 * s.point_contact.size + 3 * pad,
+        2 * s.point_contact.size + 3 * (s.pad_base.size),
+    )
+    cos, sin = np.cos(w.q[base + 2]), np.sin(w.q[base + 2])
+    strain, force, into = w.inertial[0, i0:i1], w.inertial[1, i0:i1], z.recorded
+    for k in range(dy.shape[1]):
+        for i in range(i1 - i0):
+            change = tau * (dy[W + i, k] - z.base_rate[i % 2, k]) + dp[at + 2, k] * rate[i0 + i]
+            strain[i] = dy[U + i, k] + change
+        stiffness_force(s, pad, strain, force)
+        x = y_axis = moment = 0.0
+        for i in range(i1 - i0):
+            change = force[i]
+            for j in range(s.inertia_K_column.shape[1]):
+                column = s.inertia_K_column[i0 + i, j]
+                stiffness = (
+                    s.inertia_K_lambda[i0 + i, j] * dp[at, k]
+                    + s.inertia_K_mu[i0 + i, j] * dp[at + 1, k]
+                )
+                change += stiffness * (y[U + column] + tau * rate[i0 + column])
+            if i % 2 == 0:
+                x += change
+                moment -= s.inertia_X[i0 + i + 1] * change
+            else:
+                y_axis += change
+                moment += s.inertia_X[i0 + i - 1] * change
+        into[wrench, k], into[wrench + 1, k], into[wrench + 2, k] = x, y_axis, moment
+        into[load + base, k] += cos * x - sin * y_axis
+        into[load + base + 1, k] += sin * x + cos * y_axis
+
+
+@compiled
+def advance_pad(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array, dp: Array) -> None:
+    """Tangents of a pad's state and of its stretches at the stage's end, after `nodal_rates`."""
+    p = s.p
+    first, last, n, m = s.pad_node_start[pad], s.pad_node_start[pad + 1], w.counts[pad], dy.shape[1]
+    size, span, at, start = 2 * (last - first), z.span, s.pad_point_start[pad], s.pad_y_start[pad]
+    chain, branches, X = s.pad_chain_at[pad], s.pad_branches[pad], w.X[2 * first : 2 * (first + n)]
     i, x, out, J, change = 0, z.decay_x, w.decay, z.decay_J, z.change
     for k in range(at, s.pad_point_start[pad + 1]):
         j, c = s.point_y_start + k, s.point_contact[k]
         own = slice(s.contact_p_start[c], s.contact_p_start[c + 1])
         if i < w.actives[pad] and w.active[at + i] == k:
-            H = w.H[at + i]
             add(a, z.e[k, 2], dy[j])
-            for q in range(2):
-                N, slot = s.point_N[k, q], w.slot[s.point_node[k, q]]
-                for o in range(2 if N != 0.0 else 0):
-                    add(a * N * H[2, o], own_rate[slot, o], dy[j])
-            for o in range(6):
-                number = s.contact_number[c, o]
-                if number >= 0:
-                    add(a * H[2, 2 + o], dV[number], dy[j])
+            add_output(s, w, z, k, w.H[at + i, 2], a, dy[j])
             i += 1
             continue
         moved = False
@@ -360,7 +456,7 @@ def advance_pad(s: Any, w: Any, z: Any, pad: int, y: Array, a: float, dy: Array,
             for d in range(m):
                 new = dy[j, d] + a * (J[0, 0] * dy[j, d] + change[0, d])
                 dy[j, d] = new if abs(new) > 1e-200 else 0.0
-    if inertial:
+    if s.pad_v_start[pad] >= 0:
         advance_inertial(s, w, z, pad, a, dy)
         return
     for b in range(branches):
@@ -397,23 +493,42 @@ def advance_inertial(s: Any, w: Any, z: Any, pad: int, a: float, dy: Array) -> N
 
 
 @compiled
+def read(r: Any, i: int) -> None:
+    """Tangents of the sums of forces at output i into r.dsums."""
+    out = r.dsums[i]
+    if out.shape[0] == 0:
+        return
+    stage_tangent(r.s0, r.w, r.z, r.out_tape, i, INSTANT, r.out_signals[i], r.dys[i], r.dp, True)
+    for c in range(out.shape[0]):
+        out[c] = 0.0
+        for j in range(r.sum_start[c], r.sum_start[c + 1]):
+            add(r.sum_weight[j], r.z.recorded[r.sum_at[j]], out[c])
+
+
+@compiled
 def forward(r: Any) -> None:
     """Carry the tangent dy (size, m) through the steps h of a tape, in place; dys (outputs, size,
-    m) receives it at the parts out_part of the steps out_step."""
+    m) receives it at the parts out_part of the steps out_step, dsums (outputs, sums, m)
+    those of the sums of forces, `Sums`. Without steps the one output is the start."""
     s, w, z, tape, h, signals = r.s, r.w, r.z, r.tape, r.h, r.signals
     out_step, out_part, dy, dp, dys = r.out_step, r.out_part, r.dy, r.dp, r.dys
     m, row, before, first = dy.shape[1], 0, z.before, z.first
+    if h.size == 0:
+        put(dy, dys[0])
+        if r.out_tape.count.shape[0] > 0:
+            find_span(s, r.out_tape.y[0], dy, z.span)
+        read(r, 0)
     for step in range(h.size):
         a = GAMMA * h[step]
         if step % RESCAN == 0:
             find_span(s, tape.y[2 * step], dy, z.span)
         put(dy, before)
-        stage_tangent(s, w, z, tape, 2 * step, a, signals[2 * step], dy, dp)
+        stage_tangent(s, w, z, tape, 2 * step, a, signals[2 * step], dy, dp, False)
         put(dy, first)
         for i in range(dy.shape[0]):
             for k in range(m):
                 dy[i, k] = before[i, k] + MIX * (dy[i, k] - before[i, k])
-        stage_tangent(s, w, z, tape, 2 * step + 1, a, signals[2 * step + 1], dy, dp)
+        stage_tangent(s, w, z, tape, 2 * step + 1, a, signals[2 * step + 1], dy, dp, False)
         while row < out_step.size and out_step[row] == step:
             at_start, at_first, at_end = dense_states(out_part[row])
             for i in range(dy.shape[0]):
@@ -421,4 +536,5 @@ def forward(r: Any) -> None:
                     dys[row, i, k] = (
                         at_start * before[i, k] + at_first * first[i, k] + at_end * dy[i, k]
                     )
+            read(r, row)
             row += 1
