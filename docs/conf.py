@@ -1,6 +1,7 @@
 """Sphinx configuration: `make docs` executes chapters and gallery, and needs no network to be built
 or read."""
 
+import re
 import sys
 from importlib.metadata import version as installed
 from pathlib import Path
@@ -25,7 +26,7 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_gallery.gen_gallery",
 ]
-nitpicky = False
+suppress_warnings = ["config.cache"]
 exclude_patterns = ["_build", "gallery/*.ipynb", "gallery/*.py", "gallery/*.md5", "**/*.zip"]
 
 html_theme = "furo"
@@ -44,7 +45,6 @@ nb_execution_raise_on_error = True
 nb_execution_timeout = 300
 nb_merge_streams = True
 
-default_role = "code"
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
@@ -65,7 +65,26 @@ def figures(block: Any, found: dict[str, Any], configuration: dict[str, Any]) ->
     return text + figure_rst(paths, configuration["src_dir"])
 
 
+GALLERY = (
+    "first_run", "own_rig", "rig_from_a_file", "shapes", "fingertips", "relaxation", "friction_law",
+    "gradient_check", "sensitivities", "batch", "torchdiffeq_adjoint", "which_motion", "identify",
+    "plan_a_motion", "train_a_policy", "reduced_model", "energy",
+)  # fmt: skip
+"""Programs of the gallery, in their order."""
+
+
+class Order:
+    """Sorts the gallery's files."""
+
+    def __init__(self, folder: str) -> None:
+        self.folder = folder
+
+    def __call__(self, name: str) -> int:
+        return GALLERY.index(Path(name).stem)
+
+
 sphinx_gallery_conf = {
+    "within_subsection_order": Order,
     "examples_dirs": [str(ROOT / "examples" / "gallery")],
     "gallery_dirs": ["gallery"],
     "filename_pattern": r"\.py$",
@@ -109,7 +128,16 @@ def mathml(writer: Any, node: nodes.Node) -> None:
     raise nodes.SkipNode
 
 
+def plain(app: Sphinx, kind: str, name: str, thing: Any, options: Any, lines: list[str]) -> None:
+    """Docstrings are plain text, whose only markup is code between backticks."""
+    parts = re.split(r"`([^`]+)`", "\n".join(lines))
+    parts[::2] = [re.sub(r"[\\*|]|(?<=\w)_(?!\w)", r"\\\g<0>", part) for part in parts[::2]]
+    parts[1::2] = [f"``{code}``\\ " for code in parts[1::2]]
+    lines[:] = "".join(parts).split("\n")
+
+
 def setup(app: Sphinx) -> None:
+    app.connect("autodoc-process-docstring", plain)
     app.add_html_math_renderer("mathml", (mathml, None), (mathml, None))
     app.connect("source-read", retarget)
     app.connect("include-read", retarget)

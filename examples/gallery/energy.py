@@ -20,7 +20,7 @@ print(f"injected {1e3 * run.injected[-1]:.1f} mJ, residual {run.energy_residual_
 
 # the power balance holds bond by bond at any state, not only along a run
 with torch.no_grad():
-    graph = model.evaluate(t[300], model.unpack(run.y[300]))
+    graph = model.evaluate(t[250], model.unpack(run.y[250]))
     for name, port in graph.ports.items():
         power = 1e3 * float(port.power(graph.flows))
         way = "from" if port.source else "into"

@@ -14,8 +14,8 @@ import torchsoft as ts
 from torchsoft.excitation import CATALOGUE, begin
 
 torch.manual_seed(0)
-p = ts.Parameters().override({"pad.elements_x": 60, "pad.elements_y": 3})
-paper, y0 = begin(CATALOGUE["strokes"], p)
+coarse = {"pad.elements_x": 60, "pad.elements_y": 3}
+paper, y0 = begin(CATALOGUE["strokes"], ts.Parameters().override(coarse))
 
 
 class Policy(nn.Module):
@@ -55,9 +55,7 @@ for i in range(25):
         print(f"{i:2d}: root mean square error {loss.sqrt().item():.3f} mm")
 
 _, axes = plt.subplots(figsize=(7, 3), layout="constrained")
-axes.plot(t, 1e3 * run["x_d"].detach(), label="set-point")
-axes.plot(t, 1e3 * history[0], label="first")
-axes.plot(t, 1e3 * history[-1], label="trained")
+axes.plot(t, 1e3 * torch.stack((run["x_d"].detach(), history[0], history[-1]), -1))
+axes.legend(["set-point", "first run", "trained"])
 axes.set(xlabel="time [s]", ylabel="x of the disc [mm]")
-axes.legend()
 plt.show()
