@@ -22,11 +22,10 @@ version = release = installed("torchsoft")
 extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
-    "sphinx.ext.viewcode",
     "sphinx_copybutton",
     "sphinx_gallery.gen_gallery",
 ]
-suppress_warnings = ["config.cache"]
+suppress_warnings = ["config.cache", "myst-nb.lexer"]
 exclude_patterns = ["_build", "gallery/*.ipynb", "gallery/*.py", "gallery/*.md5", "**/*.zip"]
 
 html_theme = "furo"
@@ -103,6 +102,7 @@ RETARGETED = {
     "](validation/README.md": "](validation.md",
     "](../data_gen/README.md": "](datasets.md",
     "](../examples/identify/README.md": "](files.md",
+    "](../examples/gallery/README.txt": "](gallery/index",
     "](../docs/": "](",
     "](../../docs/": "](",
     "](docs/": "](",
@@ -115,6 +115,7 @@ def retarget(app: Sphinx, *where: Any) -> None:
     content = where[-1]
     for there, here in RETARGETED.items():
         content[0] = content[0].replace(there, here)
+    content[0] = re.sub(r"\]\(\.\./examples/gallery/(\w+)\.py", r"](gallery/\1", content[0])
 
 
 def mathml(writer: Any, node: nodes.Node) -> None:

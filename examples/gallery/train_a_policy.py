@@ -36,10 +36,8 @@ actuators = ts.controller(
     policy, measures=["disc.x", "bracket.x"], setpoints=["x_d"], pushes={"x": "bracket.x"}
 )
 actuators["y"] = paper.actuators["y"]  # the vertical loop stays
-rig = ts.Rig(
-    bodies=dict(paper.bodies), pads=dict(paper.pads), contacts=dict(paper.contacts),
-    actuators=actuators, symbols={"disc": "C", "bracket": "Br"},
-)  # fmt: skip
+parts = {name: dict(getattr(paper, name)) for name in ("bodies", "pads", "contacts")}
+rig = ts.Rig(**parts, actuators=actuators, symbols={"disc": "C", "bracket": "Br"})
 wanted = ts.Profile([0.5, 0.9], [60.3e-3, 57.3e-3])
 reference = ts.Reference(x_d=wanted, y_d=paper.reference["y_d"], F_ff=paper.reference["F_ff"])
 t = torch.linspace(0, 1.2, 241, dtype=torch.float64)
