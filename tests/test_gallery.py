@@ -38,6 +38,10 @@ ANSWERS: dict[str, Callable[[dict[str, Any]], bool]] = {
         n["result"][name].ci95[0] < truth < n["result"][name].ci95[1]
         for name, truth in {"pad.E": 9e5, "pad.tau": 0.012, "contact.mu_s": 0.6}.items()
     ),
+    "identify_friction": lambda n: all(
+        n["result"][name].ci95[0] < truth < n["result"][name].ci95[1]
+        for name, truth in n["truth"].items()
+    ),
     "plan_a_motion": lambda n: abs(float(n["run"]["x_C"][-1]) - 52.3e-3) < 1e-4,
     "train_a_policy": lambda n: float(n["loss"]) < 0.05,
     "reduced_model": lambda n: n["score"](n["reduced"], n["other"]).worst < 0.01,

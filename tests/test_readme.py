@@ -167,7 +167,7 @@ def test_the_api_is_documented() -> None:
     text = "".join(
         page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "api").glob("*.md")
     )
-    documented = set(re.findall(r"auto\w+:: torchsoft(?:\.\w+)*?\.(\w+)$", text, re.MULTILINE))
+    documented = set(re.findall(r"(?:auto|py:)\w+:: torchsoft(?:\.\w+)*?\.(\w+)$", text, re.MULTILINE))
     wanted = {
         *torchsoft.__all__,
         *datasets.__all__,
