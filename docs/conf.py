@@ -94,6 +94,7 @@ sphinx_gallery_conf = {
     "show_signature": False,
     "remove_config_comments": True,
     "min_reported_time": 10**6,
+    "write_computation_times": False,
 }
 
 RETARGETED = {
@@ -122,6 +123,7 @@ def mathml(writer: Any, node: nodes.Node) -> None:
     """Formulas in MathML, which browsers draw by themselves."""
     block = isinstance(node, nodes.math_block)
     formula = latex2mathml.tex2mathml(node.astext(), as_block=block)
+    formula = re.sub(r"<mo[^>]*>\|</mo>", '<mo lspace="0" rspace="0">|</mo>', formula)
     if block:
         number = f'<span class="eqno">({node["number"]})</span>' if node.get("number") else ""
         formula = f'<div class="math-block">{number}{formula}</div>'

@@ -28,7 +28,7 @@ ANSWERS: dict[str, Callable[[dict[str, Any]], bool]] = {
     "relaxation": lambda n: (
         n["found"].terms == 2 and abs(n["found"].values["E"] / 0.5e6 - 1) < 0.01
     ),
-    "friction_law": lambda n: float(n["model"].parameter("contact.friction.mu").grad) < 0,
+    "friction_law": lambda n: float(n["model"].parameter("contact.friction.fall").grad) != 0,
     "gradient_check": lambda n: abs(n["adjoint"] / n["difference"] - 1) < 1e-5,
     "sensitivities": lambda n: n["run"].sensitivities.shape == (601, 10, 4),
     "batch": lambda n: not n["batch"].failures and bool(n["mu"].grad.isfinite().all()),

@@ -29,9 +29,9 @@ class Pressed(nn.Module):
         return (E - mu * F_N).clamp(min=0.0) / (R + self.eta)
 
 
-# a motion in which the disc slips: a light grasp, shaken
-context = begin(CATALOGUE["light shaking"], Parameters())
-t = torch.linspace(0, 1.0, 401, dtype=torch.float64)
+# a motion in which the disc slips: a light grasp, jerked
+context = begin(CATALOGUE["light jerks"], Parameters())
+t = torch.linspace(0, 1.4, 401, dtype=torch.float64)
 model = SoftGrasp(context.model.settings, friction=Pressed(mu=0.7, fall=0.05))
 run = simulate(model, t, y0=context.y0, reference=context.model.reference, gradient="discrete")
 
@@ -45,7 +45,8 @@ _, axes = plt.subplots(figsize=(7, 3), layout="constrained")
 for fall in (0.0, 0.05, 0.2):
     other = SoftGrasp(context.model.settings, friction=Pressed(mu=0.7, fall=fall))
     again = simulate(other, t, y0=context.y0, reference=context.model.reference)
-    axes.plot(again.t, again["theta"], label=f"fall = {fall:g} 1/N")
-axes.set(xlabel="time [s]", ylabel="angle of the disc [rad]")
+    change = 1e3 * (again["theta"] - run["theta"].detach())
+    axes.plot(again.t, change, label=f"fall = {fall:g} 1/N")
+axes.set(xlabel="time [s]", ylabel="angle beside 0.05 1/N [mrad]")
 axes.legend()
 plt.show()

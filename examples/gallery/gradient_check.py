@@ -6,6 +6,7 @@ Is the gradient of a run right? The adjoint gives all of them at once; a central
 runs on the same steps checks one after the other.
 """
 
+import matplotlib.pyplot as plt
 import torch
 
 from torchsoft import Parameters, SoftGrasp, simulate
@@ -37,6 +38,7 @@ names = (
     "disc.mass",
 )
 print("parameter      adjoint       difference    apart")
+pairs = []
 for name in names:
     value = float(model.parameter(name).detach())
     sides = []
@@ -45,4 +47,12 @@ for name in names:
         sides.append(float(loss(moved, knots=knots, tolerance=1e-10)))
     difference = (sides[0] - sides[1]) / (2 * h)  # by the logarithm of the parameter
     adjoint = value * float(model.parameter(name).grad)
+    pairs.append((abs(difference), abs(adjoint)))
     print(f"{name:12s}  {adjoint:+.6e}  {difference:+.6e}  {abs(adjoint / difference - 1):.0e}")
+
+x, y = zip(*pairs)
+plt.figure(figsize=(5, 3.5), layout="constrained")
+plt.axline((1e-4, 1e-4), (1e-3, 1e-3), color="grey", lw=0.8)
+plt.loglog(x, y, "o")
+plt.gca().set(xlabel="|central difference|", ylabel="|adjoint|")
+plt.show()

@@ -21,7 +21,7 @@ x_0, times = 60.3e-3, torch.linspace(0.5, 1.1, 9, dtype=torch.float64)
 t = torch.linspace(0, 1.3, 261, dtype=torch.float64)
 
 u = torch.zeros(8, dtype=torch.float64, requires_grad=True)  # of the set-point at the knots [cm]
-optimiser = torch.optim.LBFGS([u], max_iter=15, line_search_fn="strong_wolfe")
+optimiser = torch.optim.LBFGS([u], max_iter=20, line_search_fn="strong_wolfe")
 runs, history = [], []
 
 
@@ -33,7 +33,7 @@ def loss() -> torch.Tensor:
     run = simulate(model, t, y0=y0, reference=reference, rtol=1e-3, gradient="discrete")
     miss = 1e3 * (run["x_C"] - (x_0 - 8e-3))[t > 1.1]
     bend = knots.diff().diff().square().sum()
-    value = miss.square().mean() + 1e-3 * run["F_x"].square().mean() + 0.1 * bend
+    value = miss.square().mean() + 1e-3 * run["F_x"].square().mean() + bend
     value.backward()
     runs.append(run)
     history.append(value.item())

@@ -8,6 +8,7 @@ Can the model stand in a program that is built on torchdiffeq? A rig is a right-
 
 import time
 
+import matplotlib.pyplot as plt
 import torch
 from torchdiffeq import odeint, odeint_adjoint
 
@@ -24,6 +25,9 @@ with torch.no_grad():
     print(f"rates of {model.layout.size} states: {tuple(model(t[0], y0).shape)}")
 
 
+walls = {}
+
+
 def timed(name: str, solve) -> None:
     model.zero_grad()
     began = time.perf_counter()
@@ -33,6 +37,7 @@ def timed(name: str, solve) -> None:
     wall = time.perf_counter() - began
     moved = 1e9 * float(y[-1, height] - y0[height])
     print(f"{name:20s} moved by {moved:.0f} nm, slope by ln(K_n) {slope:+.0f} nm, {wall:.2f} s")
+    walls[name] = wall
 
 
 register_method()  # adds the stepper to torchdiffeq's methods
@@ -45,3 +50,8 @@ timed(
 )
 timed("odeint, sdirk2", lambda: odeint(model, y0, t, method="sdirk2", rtol=1e-7, atol=1e-8))
 timed("simulate, discrete", lambda: simulate(model, t, y0=y0, rtol=1e-7, gradient="discrete").y)
+
+plt.figure(figsize=(6, 2), layout="constrained")
+plt.barh(list(walls), list(walls.values()))
+plt.gca().set(xscale="log", xlabel="value and gradient over 0.4 ms [s]")
+plt.show()
