@@ -1,6 +1,7 @@
 """Sphinx configuration: `make docs` executes chapters and gallery, and needs no network to be built
 or read."""
 
+import os
 import re
 import sys
 from importlib.metadata import version as installed
@@ -15,6 +16,7 @@ from sphinx_gallery.scrapers import figure_rst, matplotlib_scraper
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
+os.environ.pop("MPLBACKEND", None)  # chapters show figures by their kernel's own
 
 project, author, copyright = "torchsoft", "the torchsoft authors", "the torchsoft authors"
 version = release = installed("torchsoft")

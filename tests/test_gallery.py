@@ -19,7 +19,7 @@ QUICK = (
 
 ANSWERS: dict[str, Callable[[dict[str, Any]], bool]] = {
     "first_run": lambda n: abs(float(n["run"]["x_C"][1000]) - 40e-3) < 1e-6,
-    "own_rig": lambda n: abs(float(n["x"][-1] - n["x"][0]) - 5e-3) < 1e-4,
+    "own_rig": lambda n: abs((n["x"][-1] - n["x"][0]).item() - 5e-3) < 1e-4,
     "rig_from_a_file": lambda n: (
         float(n["soft_run"]["y_ellipse"].min()) < float(n["run"]["y_ellipse"].min())
     ),
@@ -42,8 +42,8 @@ ANSWERS: dict[str, Callable[[dict[str, Any]], bool]] = {
         n["result"][name].ci95[0] < truth < n["result"][name].ci95[1]
         for name, truth in n["truth"].items()
     ),
-    "plan_a_motion": lambda n: abs(float(n["run"]["x_C"][-1]) - 52.3e-3) < 1e-4,
-    "train_a_policy": lambda n: float(n["loss"]) < 0.05,
+    "plan_a_motion": lambda n: abs(n["run"]["x_C"][-1].item() - 52.3e-3) < 1e-4,
+    "train_a_policy": lambda n: n["loss"].item() < 0.05,
     "reduced_model": lambda n: n["score"](n["reduced"], n["other"]).worst < 0.01,
     "energy": lambda n: n["run"].energy_residual_rel < 1e-4,
 }
