@@ -16,7 +16,6 @@ from sphinx_gallery.scrapers import figure_rst, matplotlib_scraper
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
-os.environ.pop("MPLBACKEND", None)  # chapters show figures by their kernel's own
 
 project, author, copyright = "torchsoft", "the torchsoft authors", "the torchsoft authors"
 version = release = installed("torchsoft")
@@ -141,7 +140,13 @@ def plain(app: Sphinx, kind: str, name: str, thing: Any, options: Any, lines: li
     lines[:] = "".join(parts).split("\n")
 
 
+def unset(app: Sphinx) -> None:
+    """After the gallery, which sets it: kernels of chapters show figures by their own backend."""
+    os.environ.pop("MPLBACKEND", None)
+
+
 def setup(app: Sphinx) -> None:
+    app.connect("builder-inited", unset, priority=900)
     app.connect("autodoc-process-docstring", plain)
     app.add_html_math_renderer("mathml", (mathml, None), (mathml, None))
     app.connect("source-read", retarget)
