@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 STAMP  := $(VENV)/.installed
 OUT    ?= out/grasp_and_roll
 
-.PHONY: run test test-slow test-hostile test-newest lint wheel clean
+.PHONY: run test test-slow test-hostile test-newest lint docs wheel clean
 
 run: $(STAMP)
 	$(BIN)/python experiments/grasp_and_roll.py --out $(OUT)
@@ -29,12 +29,19 @@ lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/basedpyright
+	$(BIN)/codespell
+
+# chapters and gallery executed, about four minutes on one core; readable offline
+DOCS ?= out/docs
+docs: $(STAMP)
+	OMP_NUM_THREADS=1 $(BIN)/python -m sphinx -W --keep-going --quiet docs $(DOCS)
+	@echo "open $(DOCS)/index.html"
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit("torchsoft needs Python 3.11 or newer; set PYTHON=..." if sys.version_info < (3, 11) else 0)'
 	@echo "setting up $(VENV) (once, about two minutes)"
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev,docs]'
 	$(BIN)/python -m torchsoft.solve.kernel.build
 	@touch $(STAMP)
 
@@ -45,5 +52,5 @@ wheel: $(STAMP)
 	$(BIN)/python -m pip wheel --quiet --no-deps --wheel-dir dist .
 
 clean:
-	rm -rf $(VENV) out build dist torchsoft/solve/kernel/objects *.egg-info .pytest_cache .ruff_cache
+	rm -rf $(VENV) out docs/gallery build dist torchsoft/solve/kernel/objects *.egg-info .pytest_cache .ruff_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,50 +1,145 @@
-"""Python of the README and of every page of the documentation, run as it stands but for a shorter
-manipulation, fewer elements and a looser tolerance; links exist."""
+"""Every block of the README and of every page of the documentation: Python as it stands but for a
+shorter manipulation, fewer elements and a looser tolerance, commands, TOML; links exist, and so do
+quoted messages."""
 
+import os
 import re
+import shlex
+import subprocess
+import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-LINKED = [
-    *PAGES,
+PAGES = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").rglob("*.md")),
     *(
         ROOT / folder / "README.md"
-        for folder in ("experiments", "experiments/validation", "data_gen")
+        for folder in ("experiments", "experiments/validation", "data_gen", "examples/identify")
     ),
 ]
 SHORTER = {
     "torch.linspace(0, 30, 3001": "torch.linspace(0, 0.5, 101",
     'theta"][1000]': 'theta"][50]',
+    "x[1000]": "x[100]",
+    "[500, :": "[50, :",
+    "times=(0.375, 5.0, 10.0)": "times=(0.375,)",
     '"contact.v_s": 0.05}': '"contact.v_s": 0.05, "pad.elements_x": 60, "pad.elements_y": 2}',
     "identify(problem, ": 'identify(problem, rtol=1e-3, assumptions="trusted", ',
 }
+ELSEWHERE = {
+    "make ": "a target of the Makefile",
+    "pip install": "an installation",
+    "rehearse fit.toml": "test_sysid_rigs.py",
+    "tcp://head": "test_datasets.py",
+    "dask_jobqueue": "a cluster",
+}
+"""Parts of blocks that need more than a test has, and where they are tried instead."""
+DATASET = "data_gen"
+"""Page whose Python reads what its commands have made."""
 LONGEST = 150
 """Lines of the README."""
+CLI = (".venv/bin/torchsoft", ".venv/bin/python")
+FENCE = re.compile(r"```(?:\{code-cell\} )?(python|sh|toml)\n(.*?)```", re.DOTALL)
+
+
+def blocks(page: Path, *kinds: str) -> list[str]:
+    return [text for kind, text in FENCE.findall(page.read_text(encoding="utf-8")) if kind in kinds]
 
 
 def code(page: Path) -> str:
-    blocks = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-    text = "\n".join(blocks)
+    text = "\n".join(
+        block for block in blocks(page, "python") if not any(part in block for part in ELSEWHERE)
+    )
+    text = re.sub(r"^%.*$", "", text, flags=re.MULTILINE)  # of notebooks
     for long, short in SHORTER.items():
         text = text.replace(long, short)
     return text
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if code(page)], ids=lambda page: page.stem)
-def test_the_examples_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "rigs").symlink_to(ROOT / "rigs")
+def commands(page: Path) -> list[str]:
+    lines = [line for block in blocks(page, "sh") for line in block.splitlines()]
+    return [line for line in lines if not any(part in line for part in ELSEWHERE)]
+
+
+def having(content: object) -> list[Path]:
+    return [page for page in PAGES if content(page)]  # pyright: ignore[reportCallIssue]
+
+
+def name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with what the repository has, where results do no harm."""
+    for one in ("rigs", "examples", "data_gen", "experiments"):
+        (tmp_path / one).symlink_to(ROOT / one)
     monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("page", having(lambda p: code(p) and DATASET not in str(p)), ids=name)
+def test_python_runs(page: Path, folder: Path) -> None:
+    if "IPython" in code(page):
+        pytest.importorskip("IPython")
     names: dict[str, object] = {}
     exec(code(page), names)
     if page.stem == "running":
         assert names["s"].sensitivities.shape == (101, 10, 2)  # pyright: ignore[reportAttributeAccessIssue]
-        assert (tmp_path / "rolling.nc").stat().st_size > 0
+        assert (folder / "rolling.nc").stat().st_size > 0
 
 
-@pytest.mark.parametrize("page", LINKED, ids=lambda page: str(page.relative_to(ROOT)))
+@pytest.mark.slow
+@pytest.mark.parametrize("page", having(commands), ids=name)
+def test_commands_run(page: Path, folder: Path) -> None:
+    rows = "".join(f"{t / 10},2,{10 + 5 * 0.8**t + 0.1 * (t % 3)}\n" for t in range(60))
+    (folder / "relaxation.csv").write_text(f"t [s],strain [%],stress [kPa]\n{rows}")
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    for line in commands(page):
+        program, *rest = shlex.split(line, comments=True)
+        assert program in CLI, line
+        module = ["-m", "torchsoft"] if program == CLI[0] else []
+        done = subprocess.run(
+            [sys.executable, *module, *rest], env=environment, capture_output=True, text=True,
+            check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
+    if DATASET in str(page):
+        exec(code(page), {"__name__": "page"})
+
+
+@pytest.mark.parametrize("page", having(lambda p: blocks(p, "toml")), ids=name)
+def test_toml_is_toml(page: Path) -> None:
+    for block in blocks(page, "toml"):
+        assert tomllib.loads(block)
+
+
+def test_every_block_is_tried() -> None:
+    """No other kind of block than those, and no command that only looks like one."""
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        kinds = set(re.findall(r"^```(\S+)", text, re.MULTILINE))
+        assert kinds <= {
+            "python",
+            "sh",
+            "toml",
+            "{code-cell}",
+            "{toctree}",
+            "{include}",
+            "{eval-rst}",
+        }
+        assert not re.findall(r"^ {4}\S*torchsoft .*", text, re.MULTILINE), page
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for page in PAGES:
+        for target in re.findall(r"^make ([\w-]+)", "\n".join(blocks(page, "sh")), re.MULTILINE):
+            assert f"\n{target}:" in makefile, target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
 def test_links_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8")):
         assert target.startswith("http") or (page.parent / target).exists(), target
@@ -52,3 +147,55 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 def test_the_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= LONGEST
+
+
+def test_messages_are_said() -> None:
+    """Every message that the documentation explains is a part of one in the sources."""
+    sources = "".join(
+        re.sub(r'"\s*\n\s*f?"', "", path.read_text(encoding="utf-8"))
+        for path in (ROOT / "torchsoft").rglob("*.py")
+    )
+    table = (ROOT / "docs" / "messages.md").read_text(encoding="utf-8")
+    cells = re.findall(r"^\| (`.*?`) \|", table, re.MULTILINE)
+    quoted = [part for cell in cells for part in re.findall(r"`([^`]+)`", cell)]
+    assert len(quoted) > 50
+    assert not [part for part in quoted if part not in sources]
+
+
+def test_the_api_is_documented() -> None:
+    """Public names of the package, and of its namespaces for users, stand on a page of the API."""
+    import torchsoft
+    from torchsoft import datasets, reduced, rigs, sysid
+
+    text = "".join(
+        page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "api").glob("*.md")
+    )
+    documented = set(
+        re.findall(r"(?:auto|py:)\w+:: torchsoft(?:\.\w+)*?\.(\w+)$", text, re.MULTILINE)
+    )
+    wanted = {
+        *torchsoft.__all__,
+        *datasets.__all__,
+        *rigs.__all__,
+        *sysid.__all__,
+        *reduced.__all__,
+    }
+    for module in re.findall(r"automodule:: (torchsoft\S+)", text):
+        documented |= set(vars(__import__(module, fromlist=["_"])))
+    assert sorted(wanted - documented) == []
+
+
+@pytest.mark.slow
+def test_pages_are_built_without_a_warning(tmp_path: Path) -> None:
+    """Chapters and gallery unexecuted: references, docstrings, tables of contents."""
+    pytest.importorskip("sphinx")
+    asked = ["-q", "-W", "--keep-going", "-D", "plot_gallery=0", "-D", "nb_execution_mode=off"]
+    done = subprocess.run(
+        [sys.executable, "-m", "sphinx", *asked, ROOT / "docs", tmp_path / "html"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    pages = "".join(
+        path.read_text(encoding="utf-8") for path in (tmp_path / "html").rglob("*.html")
+    )
+    assert not re.findall(r'(?:src|href)="https?://[^"]+\.(?:js|css|woff2?)"', pages)

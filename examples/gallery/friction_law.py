@@ -1,0 +1,52 @@
+"""
+A friction law of your own
+==========================
+
+How does a run depend on a number that only your law has? In the law below friction falls with the
+pressure, as rubber's does; it is compiled, with its derivatives, when the run begins.
+"""
+
+import matplotlib.pyplot as plt
+import torch
+from torch import nn
+
+from torchsoft import Parameters, SoftGrasp, simulate
+from torchsoft.excitation import CATALOGUE, begin
+
+
+class Pressed(nn.Module):
+    """Slip rate [m/s] of an effort E [N] under a normal force F_N [N] with a dashpot R [N.s/m]:
+    (eta + R) |rate| = E - mu F_N above it, where mu falls with the pressure of the point."""
+
+    def __init__(self, mu: float, fall: float, eta: float = 10.0) -> None:
+        super().__init__()
+        self.mu, self.fall, self.eta = (
+            nn.Parameter(torch.tensor(x, dtype=torch.float64)) for x in (mu, fall, eta)
+        )
+
+    def forward(self, E: torch.Tensor, F_N: torch.Tensor, R: torch.Tensor) -> torch.Tensor:
+        mu = self.mu * torch.exp(-self.fall * F_N)
+        return (E - mu * F_N).clamp(min=0.0) / (R + self.eta)
+
+
+# a motion in which the disc slips: a light grasp, jerked
+context = begin(CATALOGUE["light jerks"], Parameters())
+t = torch.linspace(0, 1.4, 401, dtype=torch.float64)
+model = SoftGrasp(context.model.settings, friction=Pressed(mu=0.7, fall=0.05))
+run = simulate(model, t, y0=context.y0, reference=context.model.reference, gradient="discrete")
+
+loss = run["theta"].square().mean()
+loss.backward()
+for name in ("mu", "fall", "eta"):
+    value = model.parameter(f"contact.friction.{name}")
+    print(f"{name:4s} = {float(value.detach()):6.3f}: d(loss)/d({name}) = {float(value.grad):+.3e}")
+
+_, axes = plt.subplots(figsize=(7, 3), layout="constrained")
+for fall in (0.0, 0.05, 0.2):
+    other = SoftGrasp(context.model.settings, friction=Pressed(mu=0.7, fall=fall))
+    again = simulate(other, t, y0=context.y0, reference=context.model.reference)
+    change = 1e3 * (again["theta"] - run["theta"].detach())
+    axes.plot(again.t, change, label=f"fall = {fall:g} 1/N")
+axes.set(xlabel="time [s]", ylabel="angle beside 0.05 1/N [mrad]")
+axes.legend()
+plt.show()

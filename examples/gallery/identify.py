@@ -1,0 +1,54 @@
+"""
+Identification from a CSV file
+==============================
+
+How stiff and how grippy are the pads of the rig on the bench? Its recording is a CSV file with
+units in the headings; what is unknown is said in a few lines, and intervals come with the
+estimates.
+"""
+
+import tempfile
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+
+from torchsoft.sysid import identify
+from torchsoft.sysid.measured import load
+
+folder = next(
+    path / "examples" / "identify" for path in (Path.cwd(), *Path.cwd().parents)
+    if (path / "examples" / "identify" / "rolling.csv").exists()
+)  # fmt: skip
+print((folder / "rolling.csv").read_text().splitlines()[0])
+
+question = """
+[settings]                       # known numbers that differ from the defaults
+contact.v_s = 0.05
+contact.mu_k = 0.5
+contact.K_n = 1.6e5
+contact.R_t = 300.0
+control.senses = "bracket"
+scenario.x_C0 = 60.3e-3
+[unknowns]                       # where the search begins
+"pad.E" = {nominal = 0.45e6}
+"pad.tau" = {nominal = 20e-3}
+"contact.mu_s" = {nominal = 0.9, low = 0.5}
+[sensors]                        # standard deviation of the noise
+x_C.noise = 10e-6
+theta.noise = 0.5e-3
+F_y.noise = 0.1
+"""
+config = Path(tempfile.mkdtemp()) / "question.toml"
+config.write_text(question)
+
+case = load([folder / "rolling.csv"], config)
+result = identify(case.problem, rtol=1e-4, assumptions="trusted")
+print(result.table())
+print("truth:  pad.E 900000,  pad.tau 0.012,  contact.mu_s 0.6")
+
+recording = case.problem.recordings[0]
+_, axes = plt.subplots(figsize=(7, 3), layout="constrained")
+t, x = recording.samples["theta"]
+axes.plot(t, x, ".", ms=2)
+axes.set(xlabel="time [s]", ylabel="recorded angle [rad]")
+plt.show()

@@ -1,0 +1,58 @@
+"""
+A friction law of your own, identified
+======================================
+
+Does friction fall with pressure, and how fast? The law has two numbers that no table of torchsoft
+knows; they are unknowns like any other, by their names in the module.
+"""
+
+import matplotlib.pyplot as plt
+import torch
+from torch import nn
+
+from torchsoft import Parameters, Reference, SoftGrasp
+from torchsoft.excitation import CATALOGUE
+from torchsoft.sysid import Problem, Recording, Sensor, Unknown, identify, record
+
+
+class Pressed(nn.Module):
+    """Friction whose coefficient falls with the normal force."""
+
+    def __init__(self, mu: float, fall: float) -> None:
+        super().__init__()
+        self.mu, self.fall = (
+            nn.Parameter(torch.tensor(x, dtype=torch.float64)) for x in (mu, fall)
+        )
+
+    def forward(self, E: torch.Tensor, F_N: torch.Tensor, R: torch.Tensor) -> torch.Tensor:
+        return (E - self.mu * torch.exp(-self.fall * F_N) * F_N).clamp(min=0.0) / (R + 10.0)
+
+
+def build(settings: Parameters, reference: Reference) -> SoftGrasp:
+    return SoftGrasp(settings, reference, friction=Pressed(mu=0.5, fall=0.02))  # where to begin
+
+
+# a bench is stood in for by the simulator: a light grasp, shaken, with noise of the sensors
+p = Parameters().override({"pad.elements_x": 60, "pad.elements_y": 2})
+motion = CATALOGUE["light shaking"].model_copy(update={"duration": 1.2})
+sensors = {"x_C": Sensor(noise=1e-5), "theta": Sensor(noise=5e-4), "F_x": Sensor(noise=0.1)}
+truth = {"contact.friction.mu": 0.7, "contact.friction.fall": 0.05}
+made = record("bench", motion, p, p, sensors, build=build, values=truth)
+
+# a recording is a rig with the reference that it followed, and samples (times, values) by channel
+recording = Recording("bench", made.rig, made.samples)
+problem = Problem([recording], sensors, {name: Unknown() for name in truth})
+result = identify(problem, rtol=1e-4, assumptions="trusted")
+print(result.table())
+print("truth:", truth)
+
+force = torch.linspace(0, 12, 100)
+for label, (mu, fall) in {
+    "truth": truth.values(),
+    "identified": [result[name].value for name in truth],
+    "begin": (0.5, 0.02),
+}.items():
+    plt.plot(force, mu * torch.exp(-fall * force), label=label)
+plt.gca().set(xlabel="normal force of a node [N]", ylabel="coefficient of friction", ylim=(0, None))
+plt.legend()
+plt.show()

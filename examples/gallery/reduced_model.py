@@ -1,0 +1,55 @@
+"""
+A reduced model
+===============
+
+How few terms describe the disc in the grip? Small taps of a settled grasp are fitted with pysindy
+in the terms of mechanics, and a motion that was held out is rolled out.
+"""
+
+import matplotlib.pyplot as plt
+import torch
+
+from torchsoft import Profile, Reference, SoftGrasp, simulate
+from torchsoft.physics.motion import Waves, wave
+from torchsoft.reduced import Recipe, assemble, fit, mechanics, record, rollout_of, score
+from torchsoft.scenario import grasp_and_roll
+
+model = SoftGrasp()
+grasp = grasp_and_roll(model)
+held = {"y_d": Profile([0.0], [48.6e-3]), "F_ff": Profile([0.0], [-grasp.grasp_force])}
+still = Reference(
+    x_d=Profile([0.0], [60e-3]), y_d=model.reference["y_d"], F_ff=model.reference["F_ff"]
+)
+begin = simulate(model, torch.tensor([0.0, 1.0]).double(), y0=grasp.y0, reference=still).y[-1]
+
+
+def tapped(seed: int, size: float, end: float) -> object:
+    """A record of the settled grasp under a multi-sine of the set-point about where it is."""
+    torch.manual_seed(seed)
+    f = torch.logspace(0.5, 2.1, 10).tolist()
+    sines = wave([size] * 10, f, [0.0] * 10, (6.28 * torch.rand(10)).tolist())
+    y = begin.clone()
+    for body, kick in (("disc", [2e-3, 0.0, 0.1]), ("bracket", [2e-3, 0.0])):
+        at = model.layout.slices["velocity", body]
+        y[at] += (torch.randn(len(kick)) * torch.tensor(kick)).double()
+    t = torch.arange(0, end, 2.5e-4, dtype=torch.float64)
+    reference = Reference(x_d=Waves(([0.0], [60e-3]), -1.0, end + 1.0, sines), **held)
+    return record(simulate(model, t, y0=y, reference=reference, step=2.5e-4))
+
+
+taps = [tapped(seed, 3e-6, 0.3) for seed in range(8)]
+K, R = model.settings.control.K_81, model.settings.control.R_80
+law = {"F_x": {"x_d": K, "x_d_dot": R, "x_C": -K, "v_C": -R}}  # Eq. 33, 34
+recipe = Recipe(threshold=0.05, width=0.004, window=0.3)
+reduced = fit(assemble(taps, mechanics(r=18.35e-3), recipe), recipe, law)
+print(*reduced.text(), sep="\n")
+
+other = tapped(99, 6e-6, 0.3)
+out = rollout_of(reduced, other)
+print(f"held out: within {score(reduced, other).worst:.2%} of the range, {1e3 * out.wall_s:.1f} ms")
+plt.figure(figsize=(7, 3), layout="constrained")
+plt.plot(other.t, 1e6 * other.series["x_C"], label="full model")
+plt.plot(out.t, 1e6 * out.y[:, 0], "--", label="reduced model")
+plt.gca().set(xlabel="time [s]", ylabel="x of the disc [µm]")
+plt.legend()
+plt.show()

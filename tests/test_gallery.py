@@ -1,0 +1,74 @@
+"""Programs of the gallery: short, with a question, and with the answer that their picture shows."""
+
+import ast
+import runpy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PROGRAMS = sorted((ROOT / "examples" / "gallery").glob("*.py"))
+LONGEST = 60
+"""Lines of a program."""
+
+QUICK = (
+    "first_run", "own_rig", "rig_from_a_file", "fingertips", "relaxation", "energy",
+)  # fmt: skip
+
+ANSWERS: dict[str, Callable[[dict[str, Any]], bool]] = {
+    "first_run": lambda n: abs(float(n["run"]["x_C"][1000]) - 40e-3) < 1e-6,
+    "own_rig": lambda n: abs((n["x"][-1] - n["x"][0]).item() - 5e-3) < 1e-4,
+    "rig_from_a_file": lambda n: (
+        float(n["soft_run"]["y_ellipse"].min()) < float(n["run"]["y_ellipse"].min())
+    ),
+    "shapes": lambda n: 0.5 < float(n["run"]["theta"][-1]) < 0.53,
+    "fingertips": lambda n: 9.0 < float(n["force"][-1]) < 13.0,
+    "relaxation": lambda n: (
+        n["found"].terms == 2 and abs(n["found"].values["E"] / 0.5e6 - 1) < 0.01
+    ),
+    "friction_law": lambda n: float(n["model"].parameter("contact.friction.fall").grad) != 0,
+    "gradient_check": lambda n: abs(n["adjoint"] / n["difference"] - 1) < 1e-5,
+    "sensitivities": lambda n: n["run"].sensitivities.shape == (601, 10, 4),
+    "batch": lambda n: not n["batch"].failures and bool(n["mu"].grad.isfinite().all()),
+    "torchdiffeq_adjoint": lambda n: n["model"].parameter("contact.K_n").grad is not None,
+    "which_motion": lambda n: n["table"][3, 4] < n["table"][:3, 4].min(),  # mu_k by shaking
+    "identify": lambda n: all(
+        n["result"][name].ci95[0] < truth < n["result"][name].ci95[1]
+        for name, truth in {"pad.E": 9e5, "pad.tau": 0.012, "contact.mu_s": 0.6}.items()
+    ),
+    "identify_friction": lambda n: all(
+        n["result"][name].ci95[0] < truth < n["result"][name].ci95[1]
+        for name, truth in n["truth"].items()
+    ),
+    "plan_a_motion": lambda n: abs(n["run"]["x_C"][-1].item() - 52.3e-3) < 1e-4,
+    "train_a_policy": lambda n: n["loss"].item() < 0.05,
+    "reduced_model": lambda n: n["score"](n["reduced"], n["other"]).worst < 0.01,
+    "energy": lambda n: n["run"].energy_residual_rel < 1e-4,
+}
+
+
+@pytest.mark.parametrize(
+    "program",
+    [
+        pytest.param(p, marks=[] if p.stem in QUICK else pytest.mark.slow, id=p.stem)
+        for p in PROGRAMS
+    ],
+)
+def test_a_program_answers_its_question(program: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import matplotlib.pyplot as plt
+
+    monkeypatch.setenv("MPLBACKEND", "agg")
+    monkeypatch.setattr(plt, "show", lambda: plt.close("all"))
+    monkeypatch.chdir(program.parent)
+    names = runpy.run_path(str(program))
+    plt.close("all")
+    assert ANSWERS[program.stem](names)
+
+
+def test_programs_are_short_and_ask_a_question() -> None:
+    for program in PROGRAMS:
+        text = program.read_text(encoding="utf-8")
+        assert len(text.splitlines()) <= LONGEST, program
+        assert "?" in (ast.get_docstring(ast.parse(text)) or ""), program
