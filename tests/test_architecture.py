@@ -19,7 +19,7 @@ FLOWS = {
     "codegen": "graph derivatives operations trace pointwise emit .",
     "physics": """
         arguments mesh shapes contact material pads taxels motion multibond state parts condensed
-        validity rig energy statics .
+        validity rig extensions energy statics .
     """,
     "paper": "parameters rig equilibrium .",
     "physics.mesh": "mesh compliance block quads .",
@@ -32,7 +32,7 @@ FLOWS = {
     "sysid": """
         initial_state recording unknowns prediction noise runs problem first_samples
         synthetic fit plan setpoints prechecks
-        residual_tests assumptions sensitivity profile posterior nuts estimate comparison
+        residual_tests assumptions refits sensitivity suspects profile posterior nuts estimate comparison
         result identification compare
         criterion planner design
         columns configuration rig_recordings rehearsal measured rig_design figures report .

@@ -19,7 +19,7 @@ folder = next(
     path / "examples" / "identify" for path in (Path.cwd(), *Path.cwd().parents)
     if (path / "examples" / "identify" / "rolling.csv").exists()
 )  # fmt: skip
-print((folder / "rolling.csv").read_text().splitlines()[0])
+print((folder / "rolling.csv").read_text(encoding="utf-8").splitlines()[0])
 
 question = """
 [settings]                       # known numbers that differ from the defaults
@@ -39,7 +39,7 @@ theta.noise = 0.5e-3
 F_y.noise = 0.1
 """
 config = Path(tempfile.mkdtemp()) / "question.toml"
-config.write_text(question)
+config.write_text(question, encoding="utf-8")
 
 case = load([folder / "rolling.csv"], config)
 result = identify(case.problem, rtol=1e-4, assumptions="trusted")

@@ -23,7 +23,7 @@ modulus = 0.5e6 + 0.2e6 * np.exp(-seconds / 0.1) + 0.15e6 * np.exp(-seconds / 2.
 stress = 0.02 * modulus * (1 + 0.005 * rng.standard_normal(200))
 path = Path(tempfile.mkdtemp()) / "relaxation.csv"
 rows = [f"{a:.6g},2,{1e-3 * b:.6g}" for a, b in zip(seconds, stress)]
-path.write_text("\n".join(["t [s],strain [%],stress [kPa]", *rows]))
+path.write_text("\n".join(["t [s],strain [%],stress [kPa]", *rows]), encoding="utf-8")
 
 found = fit(read(path))
 for name, value in found.values.items():

@@ -185,7 +185,9 @@ def found(
     with replacing(path) as partial:
         np.savetxt(partial, np.stack(columns, 1), "%.12g", ",", header=head, comments="")
     one = load([path], folder / "fit.toml")
-    how = one.config.fit.model_dump() | ({} if checked else {"assumptions": "trusted"})
+    how: dict[str, Any] = one.config.fit.model_dump() | (
+        {} if checked else {"assumptions": "trusted"}
+    )
     answer = identify(one.problem, **how)
     path.unlink()
     out = {}

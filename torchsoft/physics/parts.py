@@ -339,6 +339,18 @@ class StateFeedback(nn.Module):
         return (wanted - there).flatten(-2) @ self.matrix().mT
 
 
+def gain_unit(law: nn.Module, name: str, users: Sequence[Actuator]) -> str | None:
+    """Unit of a gain of a control law by its name in the law, which belongs to some actuators; None
+    for what is no gain."""
+    if isinstance(law, PD):
+        return users[0].gain_unit(name == "Kd")
+    if not isinstance(law, StateFeedback):
+        return None
+    row, column = (int(one) - 1 for one in name.split("_")[-2:])
+    rate, number = divmod(column, len(users[row].measures))
+    return users[row].gain_unit(bool(rate), number)
+
+
 class OneEffort(nn.Module):
     """One of the efforts of a controller, and what is fed forward: a law of several coordinates."""
 

@@ -17,15 +17,7 @@ from torchsoft.physics.contact import Frame, cross, interface_law, moving_frame,
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import Block, Junction, Port, Transformer, identity, net_efforts
 from torchsoft.physics.pads import Pad
-from torchsoft.physics.parts import (
-    COORDINATES,
-    PD,
-    Actuator,
-    Body,
-    Contact,
-    StateFeedback,
-    law_name,
-)
+from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, gain_unit, law_name
 from torchsoft.physics.shapes import parameter
 from torchsoft.physics.state import Layout, State
 from torchsoft.physics.taxels import Taxels
@@ -214,9 +206,7 @@ class Rig(nn.Module):
         }
         return {
             "parameters": {name: value.detach().tolist() for name, value in mine.items()},
-            "friction": {
-                name: law_name(contact.law.friction) for name, contact in self.contacts.items()
-            },
+            "friction": {k: law_name(one.law.friction) for k, one in self.contacts.items()},
             "control": {name: law_name(actuator.law) for name, actuator in self.actuators.items()},
             "shape": {
                 name: type(body.shape).__name__
@@ -247,15 +237,8 @@ class Rig(nn.Module):
         part = self.get_submodule(owner)
         found = quantity_of(part, last)
         users = [one for one in self.actuators.values() if part in one.modules()]
-        if found is None or not users:
-            return found
-        if isinstance(part, PD):
-            return replace(found, unit=users[0].gain_unit(last == "Kd"))
-        if not isinstance(part, StateFeedback):
-            return found
-        row, column = (int(one) - 1 for one in last.split("_")[-2:])
-        rate, number = divmod(column, len(users[row].measures))
-        return replace(found, unit=users[row].gain_unit(bool(rate), number))
+        unit = gain_unit(part, last, users) if users else None
+        return found if found is None or unit is None else replace(found, unit=unit)
 
     @property
     def ordered(self) -> dict[str, str]:

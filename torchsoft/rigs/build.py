@@ -154,7 +154,7 @@ class RigFile(Group):
     pads: dict[str, AnyPad] = Field(min_length=1)
     laws: dict[str, LawTable] = Field(min_length=1)
     contacts: dict[str, ContactTable] = Field(min_length=1)
-    taxels: dict[str, TaxelsTable] = Field(default_factory=dict)
+    taxels: dict[str, TaxelsTable] = Field(default_factory=dict)  # pyright: ignore[reportInvalidTypeForm]
     actuators: dict[str, ActuatorTable] = Field(default_factory=dict)
     controllers: dict[str, ControllerTable] = Field(default_factory=dict)
     motion: dict[str, MotionTable] = Field(default_factory=dict)

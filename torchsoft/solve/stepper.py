@@ -328,8 +328,11 @@ class ImplicitStepper:
     def _room(self, rows: int) -> Progress:
         """Room for so many outputs."""
         s = self.still
-        widths = self.layout.size, len(self.integrals.names), recorded_size(s)
-        return Progress(*(np.zeros((rows, width)) for width in widths))
+        y, integrals, recorded = (
+            np.zeros((rows, width))
+            for width in (self.layout.size, len(self.integrals.names), recorded_size(s))
+        )
+        return Progress(y, integrals, recorded)
 
     def system(self, segment: Segment) -> Any:
         """The arrays for the steps of a segment."""
