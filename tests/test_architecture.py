@@ -32,8 +32,8 @@ FLOWS = {
     "sysid": """
         initial_state recording unknowns prediction noise runs problem first_samples
         synthetic fit plan setpoints prechecks
-        residual_tests assumptions refits sensitivity suspects profile posterior nuts estimate comparison
-        result identification compare
+        residual_tests assumptions refits sensitivity suspects profile posterior nuts estimate
+        comparison result identification compare
         criterion planner design
         columns configuration rig_recordings rehearsal measured rig_design figures report .
     """,

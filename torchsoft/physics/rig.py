@@ -89,9 +89,7 @@ class Rig(nn.Module):
             self.add_module(name, module)
         order = sorted(
             contacts,
-            key=lambda name: (
-                list(pads).index(contacts[name].pad) if contacts[name].pad in pads else -1
-            ),
+            key=lambda k: list(pads).index(contacts[k].pad) if contacts[k].pad in pads else -1,
         )
         lists: Any = bodies, pads, {name: contacts[name] for name in order}, actuators or {}
         for name, parts in zip(("bodies", "pads", "contacts", "actuators"), lists):
@@ -252,8 +250,7 @@ class Rig(nn.Module):
         return {names.get(lower, lower): names.get(upper, upper) for lower, upper in pairs}
 
     def weight(self, name: str) -> Tensor:
-        """What scales a contact's law at its points: the length of surface that each stands for
-        over the law's spacing."""
+        """Factors of a contact's law at its points: their lengths of surface over its spacing."""
         contact = self.contacts[name]
         return torch.from_numpy(self.pads[contact.pad].point_lengths / contact.law.node_spacing)
 

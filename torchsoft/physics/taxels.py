@@ -55,7 +55,7 @@ class Taxels:
         """Coordinates of the middles along the surface (taxels,) [m]."""
         if self.count is None:
             return np.array(self.centres)
-        return (np.arange(self.count) - 0.5 * (self.count - 1)) * self.width
+        return np.asarray((np.arange(self.count) - 0.5 * (self.count - 1)) * self.width, float)
 
     def weights(self, pad: Pad) -> Array:
         """Part of a force at every contact point of the pad that each taxel takes (taxels,
