@@ -106,7 +106,7 @@ class TorchdiffeqSolver:
 
         for i, solved in parallel_map(run, len(samples)):
             runs[i] = solved
-        solution = torch.stack(attached(runs, cores()), 1)
+        solution = torch.stack([rows.y for rows in attached(runs, cores())], 1)
         knots = [solved.out.knots for solved in runs]
         _runs.setdefault(self.model, deque(maxlen=REMEMBERED)).append(
             _Run(t.detach().clone(), solution.detach(), knots)
@@ -125,10 +125,12 @@ class TorchdiffeqSolver:
         for sample in range(len(y_bars)):
             segments: list[Segment] = []
             again = self.stepper.along(knots[sample])
-            for _ in again.integrate(y_start[sample], interval, segments, float("inf")):
-                pass
+            *_, out = again.integrate(
+                y_start[sample], interval, segments, float("inf"), outputs_too=False
+            )
+            run = Solved(again, y_start[sample], interval, out, segments)
             outputs = torch.stack((torch.zeros_like(y_bars[sample]), y_bars[sample]))
-            y_bars[sample], *cotangents = run_adjoint(again, segments, outputs)
+            y_bars[sample], *cotangents = run_adjoint(run, outputs, None)
             if parameters:
                 with torch.enable_grad():
                     made_of = (
