@@ -125,12 +125,12 @@ class TorchdiffeqSolver:
         for sample in range(len(y_bars)):
             segments: list[Segment] = []
             again = self.stepper.along(knots[sample])
-            (done,) = deque(
-                again.integrate(y_start[sample], interval, segments, float("inf")), maxlen=1
+            *_, out = again.integrate(
+                y_start[sample], interval, segments, float("inf"), outputs_too=False
             )
+            run = Solved(again, y_start[sample], interval, out, segments)
             outputs = torch.stack((torch.zeros_like(y_bars[sample]), y_bars[sample]))
-            solved = Solved(again, y_start[sample], interval, done, segments)
-            y_bars[sample], *cotangents = run_adjoint(solved, outputs, None)
+            y_bars[sample], *cotangents = run_adjoint(run, outputs, None)
             if parameters:
                 with torch.enable_grad():
                     made_of = (

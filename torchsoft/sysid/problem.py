@@ -105,16 +105,21 @@ class Problem:
         unknowns: dict[str, Unknown], noise: Mapping[str, Autoregression] | None = None,
     ) -> None:  # fmt: skip
         names = [recording.name for recording in recordings]
-        sensors = by_channel([recording.rig for recording in recordings], sensors)
+        sampled = {channel for recording in recordings for channel in recording.samples}
+        sensors = by_channel([recording.rig for recording in recordings], sensors, sampled)
         if not recordings or len(set(names)) < len(names):
             raise ValueError(f"recordings need names of their own, but are called {names}")
         for channel in sensors:
-            if not any(channel in one.channels or channel in Touch(one.rig) for one in recordings):
+            touch = [Touch(recording.rig) for recording in recordings]
+            if not any(
+                channel in recording.channels or channel in one or channel in one.arrays
+                for recording, one in zip(recordings, touch)
+            ):
                 known = ", ".join(
                     dict.fromkeys(c for recording in recordings for c in recording.channels)
                 )
                 raise ValueError(f"sensors: `{line(channel, 80)}` is not a channel; known: {known}")
-            if not any(channel in recording.samples for recording in recordings):
+            if channel not in sampled:
                 raise ValueError(f"sensors: no recording has samples of `{channel}`")
         for recording in recordings:
             if not set(sensors) & set(recording.samples):

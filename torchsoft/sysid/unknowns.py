@@ -6,7 +6,7 @@ coordinate's standard deviation is a relative one either way.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, Self, get_args
 
@@ -157,13 +157,20 @@ class Sensor(Table):
         return out
 
 
-def by_channel(rigs: Iterable[Rig], sensors: Mapping[str, Sensor]) -> dict[str, Sensor]:
+def by_channel(
+    rigs: Iterable[Rig], sensors: Mapping[str, Sensor], sampled: Collection[str] | None = None
+) -> dict[str, Sensor]:
     """Sensors by channel: one that is called by an array of touch of the rigs, such as
-    "skin.normal", is one of each of its channels that has none of its own."""
+    "skin.normal", is one of each of its channels (of those `sampled`, if that is given) that has
+    none of its own."""
     arrays = {name: size for rig in rigs for name, size in Touch(rig).arrays.items()}
-    numbered = lambda name: (f"{name}.{i}" for i in range(arrays.get(name, 0)))
-    out = {one: sensor for name, sensor in sensors.items() for one in numbered(name)}
-    return out | {name: sensor for name, sensor in sensors.items() if name not in arrays}
+    shared, own = dict[str, Sensor](), dict[str, Sensor]()
+    for name, sensor in sensors.items():
+        every = [f"{name}.{i}" for i in range(arrays.get(name, 0))]
+        there = [one for one in every if sampled is None or one in sampled]
+        shared |= dict.fromkeys(there, sensor)
+        own |= {} if there else {name: sensor}
+    return shared | own
 
 
 @dataclass(frozen=True)
