@@ -205,6 +205,20 @@ def test_interval_coverage_smoke(tmp_path: Path) -> None:
     assert (tmp_path / "interval_coverage.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
+def test_rig_files_smoke(tmp_path: Path) -> None:
+    """Errors of a few standard deviations, of the numbers of both rigs."""
+    module = experiment("rig_files")
+    module.main(module.Config(out=tmp_path, smoke=True))
+    rigs = json.loads((tmp_path / "summary.json").read_text())["rigs"]
+    assert set(rigs) == {"two fingers", "two jaws"}
+    for name, row in rigs.items():
+        assert set(row["unknowns"]) == set(module.CASES[name].few)
+        assert all(abs(e) < 4 for one in row["unknowns"].values() for e in one["errors"])
+        assert row["chi2"] == pytest.approx([1.0, 1.0], abs=0.15)
+    assert (tmp_path / "rig_files.png").stat().st_size > 10_000
+
+
 def test_contact_points_smoke(tmp_path: Path) -> None:
     """Two points an element take most of the nodes out of the force along the pad; gradients are
     exact with either."""

@@ -6,14 +6,15 @@ than their files state, and recorded with the noise of sensors. `identify` gets 
 CSV file, the rig's file, and eight unknowns by the names of that file: the pads' material, the
 contact, friction, a mass, gains of controllers. It begins at the numbers that the file states. Only
 the noise differs from seed to seed; the share of intervals that hold is binomial, and so is its own
-interval (Clopper-Pearson).
+interval (Clopper-Pearson). Assumptions are tested for the first seed only: the model is right.
 
 The fingers do what their file says. The jaws of `orientation.toml` never slip, so that friction
 could not be told to better than a half: here they grip lightly and twist the disc to and fro until
 it slips.
 
 Command: .venv/bin/python experiments/validation/rig_files.py [--seeds 50] [--workers 2] [--smoke]
-Expected: between 90 and 99 % for every unknown, no notice.
+Expected: between 86 and 100 % of 50 seeds, about 94 % of all intervals; no notice. Some twenty
+minutes on one core.
 """
 
 from collections import Counter
@@ -157,10 +158,9 @@ def exact(case: Case, file: RigFile, truth: Mapping[str, float]) -> Recording:
     return record("measured", file.build(), truth, sensors, rate=RATE, rtol=EXACT, noise=0.0)
 
 
-def stated(case: Case, config: Config, settings: Mapping[str, Any], truth: list[str]) -> str:
+def stated(case: Case, settings: Mapping[str, Any], truth: list[str]) -> str:
     """The identification, as a user would write it."""
     lines = [f'rig = "{(RIGS / case.file).as_posix()}"']
-    lines += ["fit.rtol = 1e-4"] if config.smoke else []
     lines += ["[settings]", *(f"{name} = {literal(one)}" for name, one in settings.items())]
     lines += ["[unknowns]", *(f'"{name}" = {{}}' for name in truth)]
     return "\n".join([*lines, "[sensors]", *(f"{k}.noise = {v}" for k, v in case.noise.items())])
@@ -185,9 +185,8 @@ def found(
     with replacing(path) as partial:
         np.savetxt(partial, np.stack(columns, 1), "%.12g", ",", header=head, comments="")
     one = load([path], folder / "fit.toml")
-    how: dict[str, Any] = one.config.fit.model_dump() | (
-        {} if checked else {"assumptions": "trusted"}
-    )
+    how: dict[str, Any] = one.config.fit.model_dump()
+    how |= {} if checked else {"assumptions": "trusted"}
     answer = identify(one.problem, **how)
     path.unlink()
     out = {}
@@ -211,7 +210,7 @@ def run(config: Config) -> Result:
         truths[name] = {k: v for k, v in truth.items() if k in case.few or not config.smoke}
         folder = config.out / name.replace(" ", "_")
         folder.mkdir(parents=True, exist_ok=True)
-        text = stated(case, config, settings, list(truths[name]))
+        text = stated(case, settings, list(truths[name]))
         (folder / "fit.toml").write_text(text, encoding="utf-8")
         data = exact(case, file, truths[name])
         work = parallel_map(
