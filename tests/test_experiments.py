@@ -186,6 +186,21 @@ def test_identify_contact_smoke(tmp_path: Path) -> None:
     assert {"report.html", "identify_contact.png"} <= {path.name for path in tmp_path.iterdir()}
 
 
+def test_identify_by_touch_smoke(tmp_path: Path) -> None:
+    """Taxels shrink every interval, shear shrinks it further, and the fits are within theirs."""
+    module = experiment("identify_by_touch")
+    module.main(module.Config(out=tmp_path, smoke=True))
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    without, _, normal, shear = summary["relative_sd"]["strokes"].values()
+    for name, sd in without.items():
+        assert sd > 1.5 * normal[name] > 2 * shear[name], name
+    for fit in summary["fits"].values():
+        assert max(abs(one["error_in_sd"]) for one in fit.values()) < 3.5
+    assert max(summary["chi2"].values()) == pytest.approx(1.0, abs=0.1)
+    assert summary["jacobian"]["ratio"] < 2.0  # one timing in a test
+    assert (tmp_path / "identify_by_touch.png").exists()
+
+
 @pytest.mark.slow
 def test_interval_coverage_smoke(tmp_path: Path) -> None:
     """Errors of a few standard deviations, not of many: two seeds are too few for a share. Colour
