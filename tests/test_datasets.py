@@ -182,11 +182,11 @@ def test_another_shard_size_makes_the_same_data(made: tuple[Path, Config], tmp_p
 
 def test_xarray_opens_it_with_units(made: tuple[Path, Config]) -> None:
     data = xr.open_zarr(made[0])
-    assert dict(data.normal_force_lower.sizes) == {"trajectory": 5, "time": 91, "lower_surface": 61}
-    assert data.normal_force_lower.attrs["units"] == "N"
+    assert dict(data.normal_force_L.sizes) == {"trajectory": 5, "time": 91, "L_point": 61}
+    assert data.normal_force_L.attrs["units"] == "N"
     assert data.displacement_upper.dims == ("trajectory", "time", "upper_surface", "axis")
     assert all("units" in data[name].attrs for name in data.data_vars)
-    rest, grasp = (float(data.normal_force_lower.isel(trajectory=0, time=i).sum()) for i in (0, 50))
+    rest, grasp = (float(data.normal_force_L.isel(trajectory=0, time=i).sum()) for i in (0, 50))
     assert rest == pytest.approx(0.4065 * 9.81, rel=2e-3)  # [N], the disc's weight
     assert 20 < grasp < 120
 
@@ -209,8 +209,8 @@ def test_other_pads_and_contacts_are_kept_whole(
     generate(Config.from_toml(path), str(tmp_path / "set"), Serial(), progress=False)
     assert [x for x in check(str(tmp_path / "set")) if "commit" not in x] == []
     data = xr.open_zarr(tmp_path / "set")
-    assert (data.sizes["lower_surface"], data.sizes["store"]) == (points, stores)
-    assert float(data.normal_force_lower[0, 0].sum()) == pytest.approx(0.4065 * 9.81, rel=2e-3)
+    assert (data.sizes["L_point"], data.sizes["store"]) == (points, stores)
+    assert float(data.normal_force_L[0, 0].sum()) == pytest.approx(0.4065 * 9.81, rel=2e-3)
 
 
 def set_value(name: str, where: tuple[Any, ...], value: Any) -> Callable[[Path], None]:
@@ -332,13 +332,13 @@ def open_ledger(folder: Path) -> None:
             r"manifest\.json: .*duration",
         ),
         (
-            set_value("normal_force_upper", (4, 60, 30), -1.0),
-            "trajectory 4: normal_force_upper pulls",
+            set_value("normal_force_U", (4, 60, 30), -1.0),
+            "trajectory 4: normal_force_U pulls",
         ),
         (set_value("disc_position", (0, 3, 1), np.inf), "trajectory 0: not finite: disc_position"),
         (set_value("disc_angle", (1, 7), np.nan), "trajectory 1: not finite: disc_angle"),
         (set_value("stored_energy", (1, 7, 2), 1.0), "trajectory 1: energy_residual is not"),
-        (set_value("contact_lower", (0, 60), 0), "acts where contact_lower is 0"),
+        (set_value("contact_L", (0, 60), 0), "acts where contact_L is 0"),
         (set_value("pad.E", (2,), 7.5e5), r"trajectory 2: pad\.E is 750000.0"),
         (set_value("failed", (3,), 1), "failed without a reason"),
     ],

@@ -15,14 +15,14 @@ from matplotlib.figure import Figure
 from torchsoft.datasets.config import SPLITS, Config
 from torchsoft.datasets.files import MANIFEST, Manifest, StoreError, filesystem, keys, record_key
 from torchsoft.datasets.reader import Vouched, open_dataset
-from torchsoft.datasets.schema import not_finite, variables
+from torchsoft.datasets.schema import PADS, not_finite, variables
 from torchsoft.datasets.simulation import points, task
 from torchsoft.files import PARTIAL
 from torchsoft.plot.figures import save
 from torchsoft.tables import line
 
-MOTIONS = {"disc_position": 0, "bracket_position": 1, "control_force": 1}
-"""Variables that the picture shows over time, and which of their components."""
+MOTIONS = ("x_C", "y_Br", "F_y")
+"""Channels that the picture shows over time."""
 
 
 def check(url: str) -> Iterator[str]:
@@ -161,7 +161,7 @@ def check_physics(config: Config, one: dict[str, Any]) -> Iterator[str]:
             f"energy residual is {relative:.2g} of the energy injected, above "
             f"{config.ledger_tolerance}"
         )
-    for pad in ("lower", "upper"):
+    for pad in PADS:
         force = one[f"normal_force_{pad}"]
         if (force < 0).any():
             yield f"normal_force_{pad} pulls"
@@ -206,9 +206,9 @@ def figure(data: xr.Dataset, config: Config) -> Figure:
         stacked=True, ax=panels[-1, 0], ylabel="trajectories [1]"
     )
     some = table[table["failed"] == 0].groupby("kind").head(3).index
-    for ax, (name, axis) in zip(panels[-1, 1:], MOTIONS.items()):
-        ax.plot(data.time, data[name][some, :, axis].T, lw=0.7)
-        ax.set(xlabel="time [s]", ylabel=f"{name}, {'xy'[axis]} [{data[name].units}]")
+    for ax, name in zip(panels[-1, 1:], MOTIONS):
+        ax.plot(data.time, data[name][some].T, lw=0.7)
+        ax.set(xlabel="time [s]", ylabel=f"{name} [{data[name].units}]")
     for ax in fig.axes:
         ax.tick_params(axis="x", labelsize=7, which="both", rotation=20)
     return fig

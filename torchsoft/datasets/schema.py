@@ -5,12 +5,15 @@ from typing import Any
 
 import numpy as np
 
-from torchsoft.channels import PADS, VARIABLES
+from torchsoft.channels import CHANNELS
 from torchsoft.datasets.config import RATIO, Config
 from torchsoft.paper.parameters import Parameters
 
-KEPT = tuple(name for name in VARIABLES if name not in ("time", "angular_momentum"))
-"""Variables of the rig's channels that a dataset keeps of every trajectory."""
+KEPT = tuple(name for name in CHANNELS if name not in ("t", "angular_momentum"))
+"""Channels that a dataset keeps of every trajectory."""
+
+PADS = {"L": "lower", "U": "upper"}
+"""Pads by their names, in words."""
 
 STORES = ("strain_L", "strain_U", "normal_springs", "tangential_springs", "disc", "spin", "bracket")
 
@@ -77,10 +80,9 @@ def variables(config: Config) -> dict[str, Variable]:
     axis, precision = {"axis": 2}, config.node_precision
     out = dict[str, Variable]()
     for name in KEPT:
-        unit, meaning, symbols = VARIABLES[name]
-        out[name] = Variable(series | axis if len(symbols) > 1 else series, unit, meaning)
-    for pad in PADS.values():
-        per, where = f"each {node} of the {pad} pad", series | {f"{pad}_surface": nodes}
+        out[name] = Variable(series, CHANNELS[name].unit, CHANNELS[name].meaning)
+    for pad, words in PADS.items():
+        per, where = f"each {node} of the {words} pad", series | {f"{pad}_point": nodes}
         out[f"normal_force_{pad}"] = Variable(where, "N", f"normal force at {per}", precision)
         out[f"friction_force_{pad}"] = Variable(where, "N", f"friction force at {per}", precision)
         out[f"contact_{pad}"] = Variable(

@@ -8,9 +8,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import qmc
 
-from torchsoft.channels import PADS
 from torchsoft.datasets.config import RATIO, SPLITS, Config, MultiSine
-from torchsoft.datasets.schema import KEPT, energies, not_finite, variables
+from torchsoft.datasets.schema import KEPT, PADS, energies, not_finite, variables
 from torchsoft.excitation import Excitation, reference
 from torchsoft.paper.equilibrium import holding_force, press, rest
 from torchsoft.paper.parameters import Parameters
@@ -147,20 +146,18 @@ def start(model: SoftGrasp) -> torch.Tensor:
 @torch.no_grad()
 def series(config: Config, model: SoftGrasp, run: Trajectory) -> Row:
     """The series and numbers of a finished run."""
-    data = run.to_dataset()
-    kept = [
-        *KEPT,
-        *(f"{force}_force_{pad}" for force in ("normal", "friction") for pad in PADS.values()),
-    ]
-    out: Row = {name: data[name].values for name in (*kept, "energy_residual")}
-    out["injected_energy"], out["energy_residual_rel"] = (
+    out: Row = {name: run[name].numpy() for name in KEPT}
+    out["injected_energy"], out["energy_residual"] = (
         run.injected.numpy(),
-        run.energy_residual_rel,
+        run.energy_residual.numpy(),
     )
+    out["energy_residual_rel"] = run.energy_residual_rel
     for kind, (_, parts) in energies(config).items():
-        prefix = "energy" if kind == "stored" else kind
-        out[f"{kind}_energy"] = np.stack([data[f"{prefix}_{part}"].values for part in parts], -1)
-    for key, pad in PADS.items():
-        out[f"displacement_{pad}"] = (model.pads[key].spread @ run.displacement[key]).numpy()
-        out[f"contact_{pad}"] = (model.penetration(key, run.state) > 0).numpy().astype(np.uint8)
+        of = run.energy if kind == "stored" else getattr(run, kind)
+        out[f"{kind}_energy"] = np.stack([of[part].numpy() for part in parts], -1)
+    for pad in PADS:
+        for i, kind in enumerate(("normal", "friction")):
+            out[f"{kind}_force_{pad}"] = run.force[pad][..., i].numpy()
+        out[f"displacement_{pad}"] = (model.pads[pad].spread @ run.displacement[pad]).numpy()
+        out[f"contact_{pad}"] = (model.penetration(pad, run.state) > 0).numpy().astype(np.uint8)
     return out | {name: getattr(run.stats, name) for name in COUNTS}

@@ -14,7 +14,6 @@ from zarr.core.buffer import Buffer
 from zarr.core.buffer.cpu import Buffer as Content
 from zarr.storage import MemoryStore
 
-from torchsoft.channels import PADS
 from torchsoft.datasets.config import Config
 from torchsoft.datasets.files import (
     MANIFEST,
@@ -31,7 +30,7 @@ from torchsoft.datasets.files import (
     store_errors,
     write_bytes,
 )  # fmt: skip
-from torchsoft.datasets.schema import not_finite, variables
+from torchsoft.datasets.schema import PADS, not_finite, variables
 from torchsoft.files import PARTIAL, finite, remove_partials
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp
@@ -172,11 +171,15 @@ def laid_out(config: Config) -> dict[str, bytes]:
             # what was never written counts as failed
         )  # fmt: skip
     pads = SoftGrasp(Parameters().override(config.fixed)).pads
-    lower, upper = (pads[key].point_positions[:, 0].numpy() for key in PADS)
     columns: dict[str, tuple[Any, str, str]] = {
         "time": (np.arange(config.samples) * config.sample_interval, "s", "time since the start"),
-        "lower_surface": (lower, "m", "x of the lower pad's surface nodes, undeformed"),
-        "upper_surface": (upper, "m", "x of the upper pad's, relative to the bracket's centre"),
+        **{
+            f"{pad}_point": (
+                pads[pad].point_positions[:, 0].numpy(), "m",
+                f"x of the {words} pad's contact points in its base's frame, undeformed",
+            )
+            for pad, words in PADS.items()
+        },
         "trajectory": (
             np.arange(config.trajectories),
             "1",

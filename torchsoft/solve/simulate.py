@@ -16,6 +16,7 @@ from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.energy import stored
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
+from torchsoft.physics.setup import Setup
 from torchsoft.physics.validity import check_array
 from torchsoft.solve import tangent
 from torchsoft.solve.adjoint import TAPE_BYTES, Solved, attached, march, recorded
@@ -298,12 +299,13 @@ def gather(
             force[name], at = forces[:, at : at + count], at + count
     return Trajectory(
         t=t, y=y, state=state, channels=measured, force=force,
-        load=dict(zip(rig.bodies, loads.unbind(1))), displacement=displacement, energy=energy,
+        loads=dict(zip(rig.bodies, loads.unbind(1))), displacement=displacement, energy=energy,
         dissipated={name: columns[name] for name in names.dissipated},
         supplied={name: columns[name] for name in names.supplied if name in names.active},
         injected=columns["injected"],
         stats=Stats(out.steps, out.solves, out.failed, out.refused, wall),
         knots=torch.from_numpy(out.knots), layout=rig.layout,
         made_by=made_by(rig, METHOD) | {"steps": steps}, wrt=task.wrt,
-        sensitivities=None if dy is None else dy[:rows], units=units(rig),
+        sensitivities=None if dy is None else dy[:rows], units=units(rig), setup=Setup.of(rig),
+        rig=rig,
     )  # fmt: skip

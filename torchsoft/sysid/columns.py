@@ -15,7 +15,7 @@ import numpy as np
 import xarray as xr
 
 from torchsoft import csvfile
-from torchsoft.channels import CHANNELS, FEED_FORWARD, MEASURED, SETPOINTS, UNITS, VARIABLES
+from torchsoft.channels import CHANNELS, FEED_FORWARD, MEASURED, SETPOINTS, UNITS
 from torchsoft.solve.trajectory import load
 from torchsoft.sysid.recording import Array
 from torchsoft.tables import shown
@@ -217,7 +217,7 @@ def read_trajectory(path: Path, ignore: Collection[str] = (), known: Vocabulary 
     """The table in a file of `Trajectory.save`; rows are called samples, counted from 0. Raises
     `ValueError`."""
     data = load(path)
-    values = read_columns(data, path) if known is PAPER else read_channels(data, path, known)
+    values = read_channels(data, path, known)
     left_out = tuple(name for name in values if name in ignore)
     values = {name: column for name, column in values.items() if name not in ignore}
     table = Columns(path, values, list(range(len(values.get("t", ())))), "sample", left_out)
@@ -228,46 +228,23 @@ def read_trajectory(path: Path, ignore: Collection[str] = (), known: Vocabulary 
 
 
 def read_channels(data: xr.Dataset, path: Path, known: Vocabulary) -> dict[str, Array]:
-    """The channels of a trajectory of another rig than the paper's. Raises `ValueError` for those
-    in other units than the rig's."""
+    """The channels of a trajectory. Raises `ValueError` where it has none of them, or has one in
+    another unit or form than the rig's."""
     there = {name: data[name] for name in known.units if name in data and name != "t"}
+    if "time" not in data.coords or not there:
+        raise ValueError(f"{path} is not a trajectory file of this rig: it has no time and channels")
     for name, one in there.items():
-        if one.dims != ("time",) or one.attrs.get("units") != known.units[name]:
+        if one.dims != ("time",) or one.dtype != np.float64:
             raise ValueError(
-                f"{path}, `{name}` should be in {known.units[name]} over time, not "
-                f"{shown(one.attrs.get('units'))} over {' and '.join(map(str, one.dims))}"
+                f"{path} is not a trajectory file: `{name}` should be float64 over time"
             )
-    if "time" not in data.coords:
-        raise ValueError(f"{path} is not a trajectory file: it has no time")
-    values = {"t": data["time"], **there}
-    return {name: np.array(one.values, float) for name, one in values.items()}
-
-
-def read_columns(data: xr.Dataset, path: Path) -> dict[str, Array]:
-    """The columns of a trajectory. Raises `ValueError` where it has not what a trajectory has."""
-    columns = {name: CHANNELS[name] for name in COLUMNS}
-    if CHANNELS["y_d_dot"].variable not in data:  # as in files of the first edition
-        del columns["y_d_dot"]
-    variables = {c.variable: VARIABLES[c.variable] for c in columns.values()}
-    if missing := [name for name in variables if name not in data]:
-        raise ValueError(f"{path} is not a trajectory file: it has no {', '.join(missing)}")
-    for name, variable in variables.items():
-        one, axes = data[name], ("time", "axis")[: 1 if len(variable.symbols) == 1 else 2]
-        if (
-            one.dims != axes
-            or one.dtype != np.float64
-            or ("axis" in axes and one.sizes["axis"] != 2)
-        ):
+        if one.attrs.get("units") != known.units[name]:
             raise ValueError(
-                f"{path} is not a trajectory file: `{name}` should be float64 over "
-                f"{' and '.join(axes)}"
-            )
-        if one.attrs.get("units") != variable.unit:
-            raise ValueError(
-                f"{path}, `{name}` should be in {variable.unit}, not "
+                f"{path}, `{name}` should be in {known.units[name]}, not "
                 f"{shown(one.attrs.get('units'))}"
             )
-    return {name: np.array(c.of(data[c.variable].values), float) for name, c in columns.items()}
+    values = {"t": data["time"], **there}
+    return {name: np.array(one.values, float) for name, one in values.items()}
 
 
 def check_table(table: Columns, known: Vocabulary = PAPER) -> Columns:
