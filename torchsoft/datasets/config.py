@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeVar
 
 from pydantic import Field, model_validator
 
+from torchsoft.display import suggestion
 from torchsoft.excitation import MOST, Frequency, Time
 from torchsoft.paper.parameters import Parameters, check
 from torchsoft.tables import LISTED, SEED, Table, from_toml, line
@@ -265,7 +266,8 @@ class Config(Table):
                 )
             if name not in DEFAULTS and where != f"parameters.{RATIO}":
                 raise ValueError(
-                    f"{where} is not a parameter; known: {', '.join(DEFAULTS)}, {RATIO}"
+                    f"{where} is not a parameter; "
+                    f"{suggestion(name, (*DEFAULTS, RATIO), 'known:')}"
                 )
             if name in self.parameters and name in self.fixed:
                 raise ValueError(f"{where} is in `fixed` as well; leave one of them out")

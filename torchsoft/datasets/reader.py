@@ -16,6 +16,7 @@ from zarr.storage import FsspecStore, LocalStore, WrapperStore
 
 from torchsoft.datasets.config import SPLITS
 from torchsoft.datasets.files import Manifest, StoreError, digest, folder, read_record, record_key
+from torchsoft.display import suggestion
 from torchsoft.physics.arguments import whole
 
 DTYPES = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
@@ -140,8 +141,8 @@ class Trajectories(Dataset[dict[str, Tensor]]):
         for name in self.variables:
             if name not in known:
                 raise ValueError(
-                    f"`variables` has no numbers named {name!r}; known: "
-                    f"{', '.join(sorted(map(str, known)))}"
+                    f"`variables` has no numbers named {name!r}; "
+                    f"{suggestion(name, sorted(map(str, known)), 'known:')}"
                 )
         self.window = samples if window is None else whole("window", window, 1)
         if self.window > samples:

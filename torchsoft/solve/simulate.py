@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from torchsoft.paper.equilibrium import rest
 from torchsoft.paper.rig import SoftGrasp
+from torchsoft.physics.arguments import Numbers, tensor
 from torchsoft.physics.energy import stored
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
@@ -21,6 +22,7 @@ from torchsoft.physics.validity import check_array
 from torchsoft.solve import tangent
 from torchsoft.solve.adjoint import TAPE_BYTES, Solved, attached, march, recorded
 from torchsoft.solve.grid import check_times
+from torchsoft.solve.inputs import shared
 from torchsoft.solve.ledger import doubts
 from torchsoft.solve.progress import Progress, SimulationFailed
 from torchsoft.solve.stability import describe_instability
@@ -51,12 +53,13 @@ class Interrupted(KeyboardInterrupt):
 
 
 def simulate(
-    rig: Rig, t: Tensor, *, y0: Tensor | None = None, reference: Reference | None = None,
+    rig: Rig, t: Numbers, *, y0: Numbers | None = None, reference: Reference | None = None,
     rtol: float | None = None, atol: float | None = None, step: float | None = None,
-    knots: Tensor | None = None, tolerance: float = 1e-9, gradient: Route = "none",
-    wrt: Sequence[str] = (), dy0: Tensor | None = None, rigid: bool = False, progress: bool = False,
+    knots: Numbers | None = None, tolerance: float = 1e-9, gradient: Route = "none",
+    wrt: Sequence[str] = (), dy0: Numbers | None = None, rigid: bool = False, progress: bool = False,
 ) -> Trajectory:  # fmt: skip
-    """Integrate `rig` from y0 (size,) at t[0] through the times t (T,) [s].
+    """Integrate `rig` from y0 (size,) at t[0] through the times t (T,) [s]: tensors, numpy's arrays
+    or lists, which are computed with in float64.
 
     y0 defaults to the paper's rig at rest. `reference` is what the rig follows, its own by default.
 
@@ -102,12 +105,17 @@ class Task(NamedTuple):
 
 
 def prepare(
-    rig: Rig, t: Tensor, *, y0: Tensor | None = None, reference: Reference | None = None,
+    rig: Rig, t: Numbers, *, y0: Numbers | None = None, reference: Reference | None = None,
     rtol: float | None = None, atol: float | None = None, step: float | None = None,
-    knots: Tensor | None = None, tolerance: float = 1e-9, gradient: Route = "none",
-    wrt: Sequence[str] = (), dy0: Tensor | None = None, rigid: bool = False,
+    knots: Numbers | None = None, tolerance: float = 1e-9, gradient: Route = "none",
+    wrt: Sequence[str] = (), dy0: Numbers | None = None, rigid: bool = False,
 ) -> Task:  # fmt: skip
     """Checks what `simulate` is asked for; raises its `ValueError`s."""
+    t = tensor("t", t)
+    y0, knots, dy0 = (
+        None if x is None else tensor(name, x)
+        for name, x in (("y0", y0), ("knots", knots), ("dy0", dy0))
+    )
     _check_wanted(gradient, wrt, dy0, rigid)
     ways = {"step": step, "knots": knots, "rtol or atol": rtol if rtol is not None else atol}
     given = [f"`{name}`" for name, value in ways.items() if value is not None]
@@ -130,7 +138,7 @@ def prepare(
             raise ValueError("`y0` is needed: only the paper's rig has a start of its own")
         y0 = rest(rig)
     stepper.check_start(y0)
-    return Task(stepper, t, y0, gradient, tuple(wrt), dy0, rigid)
+    return Task(stepper, t, shared(y0), gradient, tuple(wrt), dy0, rigid)
 
 
 class RunOutcome(NamedTuple):

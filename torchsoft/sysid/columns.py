@@ -7,7 +7,6 @@ Every error is a `ValueError` in a sentence that names the file, the row and the
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +15,7 @@ import xarray as xr
 
 from torchsoft import csvfile
 from torchsoft.channels import CHANNELS, FEED_FORWARD, MEASURED, SETPOINTS, UNITS
+from torchsoft.display import nearest
 from torchsoft.solve.trajectory import load
 from torchsoft.sysid.recording import Array
 from torchsoft.tables import shown
@@ -198,8 +198,8 @@ def hint(name: str, columns: int, names: Collection[str]) -> str:
     if columns == 1:
         return f"; separate columns with commas; {known}"
     plain = {re.sub(r"[^a-z]", "", one.lower()): one for one in names} | {"time": "t"}
-    near = get_close_matches(re.sub(r"[^a-z]", "", name.lower()), plain, n=1, cutoff=0.6)
-    meant = f": is it `{plain[near[0]]}`? If" if near else "; if"
+    near = nearest(re.sub(r"[^a-z]", "", name.lower()), plain)
+    meant = f": did you mean `{plain[near]}`? If" if near else "; if"
     return f"{meant} it has nothing to do with the motion, say ignore = [{shown(name)}]; {known}"
 
 

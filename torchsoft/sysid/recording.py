@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from torchsoft.display import suggestion
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.trajectory import measurable, units
@@ -73,8 +74,8 @@ class Recording:
         for channel, (t, y) in self.samples.items():
             if channel not in known:
                 raise ValueError(
-                    f"`{channel}` is not a channel of the rig of `{self.name}`; known: "
-                    f"{', '.join(known)}"
+                    f"`{channel}` is not a channel of the rig of `{self.name}`; "
+                    f"{suggestion(channel, known, 'known:')}"
                 )
             if t.shape != y.shape or t.ndim != 1 or len(t) < 2:
                 raise ValueError(

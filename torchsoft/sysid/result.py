@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, TypeAdapter
 
+from torchsoft.display import suggestion
 from torchsoft.files import check_file, finite, replacing
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp
@@ -214,7 +215,8 @@ class IdentificationResult:
             if estimate.name == name:
                 return estimate
         raise KeyError(
-            f"no estimate of `{name}`; there are {', '.join(e.name for e in self.estimates)}"
+            f"no estimate of `{name}`; "
+            f"{suggestion(name, [e.name for e in self.estimates], 'there are')}"
         )
 
     @property

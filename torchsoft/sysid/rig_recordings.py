@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from torchsoft.channels import UNITS
+from torchsoft.display import suggestion
 from torchsoft.physics.motion import Reference, Sampled
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import RigFile
@@ -39,8 +40,8 @@ def vocabulary(rig: Rig, headings: Mapping[str, str]) -> Vocabulary:
     for heading, name in headings.items():
         if name not in columns:
             raise ValueError(
-                f"columns.{heading} = {shown(name)} is no channel of the rig; there are "
-                f"{', '.join(columns)}"
+                f"columns.{heading} = {shown(name)} is no channel of the rig; "
+                f"{suggestion(name, columns, 'there are')}"
             )
     return Vocabulary(columns, signals, headings=headings)
 
