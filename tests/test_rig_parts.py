@@ -397,7 +397,7 @@ STONE = {"x": 0.3e-3, "y": 30e-3, "theta": 0.0, "shape": {"kind": "circle", "rad
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "misspelt": ({"pads__lower__lenght": 0.1},
-        r"pads\.lower: `lenght` is not known here; is it `length`\?"),
+        r"pads\.lower: `lenght` is not known here; did you mean `length`\?"),
     "unknown": ({"gadgets": {}}, r"`gadgets` is not known here; known are title, gravity, bodies"),
     "millimetres": ({"pads__lower__length": 80.0},
         r"pads\.lower\.length: should be from 1e-06 to 10 m, not 80"),

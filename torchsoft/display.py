@@ -3,6 +3,7 @@
 from collections.abc import Iterable
 from difflib import SequenceMatcher
 from html import escape
+from os.path import commonprefix
 
 ALIKE = 0.6
 """Least ratio of common letters of two names that are alike."""
@@ -10,13 +11,14 @@ ALIKE = 0.6
 
 def nearest(name: object, known: Iterable[str]) -> str | None:
     """The known name that is most like another one, capitals aside first; None where none is."""
+
+    def alike(one: str, other: str) -> float:
+        shared = commonprefix((one, other)).rpartition(".")[0]  # what both are in says nothing
+        return SequenceMatcher(None, one[len(shared) :], other[len(shared) :]).ratio()
+
     given = str(name)
-    alike = [
-        (SequenceMatcher(None, given.casefold(), one.casefold()).ratio(),
-         SequenceMatcher(None, given, one).ratio(), one)
-        for one in known
-    ]  # fmt: skip
-    best = max(alike, default=(0.0, 0.0, ""))
+    ranked = [(alike(given.casefold(), one.casefold()), alike(given, one), one) for one in known]
+    best = max(ranked, default=(0.0, 0.0, ""))
     return best[2] if best[0] >= ALIKE else None
 
 

@@ -109,8 +109,8 @@ class Rig(Shown, nn.Module):
         for name, pad in self.pads.items():
             if pad.base is not None and pad.base not in self.bodies:
                 raise ValueError(
-                    f"pad `{name}` is bonded to `{pad.base}`, which is no body; "
-                    f"{suggestion(pad.base, self.bodies, 'the bodies are')}"
+                    f"pad `{name}` is bonded to `{pad.base}`, "
+                    f"{suggestion(pad.base, self.bodies, 'but the bodies are')}"
                 )
             if not pad.inertial:
                 continue

@@ -170,6 +170,7 @@ class Setup:
     actuators: dict[str, ActuatorSetup] = field(default_factory=dict)
 
     @classmethod
+    @torch.inference_mode(False)  # outlines need torch's graphs
     @torch.no_grad()
     def of(cls, rig: Rig) -> Self:
         """A rig as it is now."""
@@ -189,7 +190,7 @@ class Setup:
             pads={
                 name: PadSetup(
                     pad.mesh, pad.axes.numpy(), pad.origin.numpy(), pad.base, pad.inertial,
-                    pad.points, *(pad.material.__getattr__(x).item() for x in ("E", "nu", "depth")),
+                    pad.points, *(getattr(pad.material, x).item() for x in ("E", "nu", "depth")),
                 )
                 for name, pad in rig.pads.items()
             },

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from torchsoft.channels import MEASURED
 from torchsoft.reduced.ode import ALIASES
 from torchsoft.solve.trajectory import Trajectory
 
@@ -55,7 +56,9 @@ def record(
     without any of them, such as the run of a rig that is not the paper's.
     """
     if isinstance(source, Trajectory):
-        source, t = source.channels, source.t if t is None else t
+        t = source.t if t is None else t
+        # another rig may call by these names what is something else
+        source = source.channels if all(name in source for name in MEASURED) else {}
     times = np.asarray(source["time"] if t is None else t, dtype=float)
     keep = times >= (times[0] if begin is None else begin)
     if keep.sum() < 3 or not np.allclose(np.diff(times), times[1] - times[0], rtol=1e-6, atol=0):
