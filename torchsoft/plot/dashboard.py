@@ -5,7 +5,7 @@ Times in s, lengths in mm, angles in rad, forces in N, moments in N mm, stresses
 mJ.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,9 +13,10 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from torchsoft.display import suggestion
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.parts import COORDINATES
-from torchsoft.physics.setup import von_mises
+from torchsoft.physics.setup import ActuatorSetup, von_mises
 from torchsoft.physics.sticking import SLIPPING
 from torchsoft.plot.figures import (
     ACTUAL,
@@ -52,7 +53,8 @@ RIPPLES = 6
 """Changes of the number of touching points from which on a ripple is explained."""
 
 RIPPLE = (
-    "ripple: points touch and part one by one;\nmore contact points an element smooth it"
+    "Ripples of forces: points touch and part one by one; more contact points an element smooth "
+    "them."
 )
 """What is known about a zigzag of the forces."""
 
@@ -115,18 +117,27 @@ def contact_forces(axes: Axes, run: Trajectory) -> None:
 
 
 def friction(axes: Axes, run: Trajectory) -> None:
-    """Sums of the friction, in the cones that bound them."""
+    """Sums of the friction."""
     for (name, force), colour in zip(run.force.items(), COLOURS * len(run.force)):
-        t = timeline(axes, "friction [N]", run)
-        mu, total = run.setup.contacts[name].friction.get("mu_s"), force[..., 1].sum(-1).numpy()
-        axes.plot(t, total, color=colour, label=name)
-        if mu is not None:
-            cone = mu * force[..., 0].sum(-1).numpy()
-            axes.fill_between(t, -cone, cone, color=colour, alpha=0.1, lw=0)
-            axes.plot(t, cone, ":", color=colour, lw=0.8, label=f"cone, mu_s = {mu:g}")
-            axes.plot(t, -cone, ":", color=colour, lw=0.8)
+        total = force[..., 1].sum(-1).numpy()
+        axes.plot(timeline(axes, "friction [N]", run), total, color=colour, label=name)
     axes.axhline(0, color=INK, lw=0.5, zorder=1)
     axes.legend(ncols=2)
+
+
+def mobilised(axes: Axes, run: Trajectory) -> None:
+    """How much of the friction cone is used: sum of |friction| over mu_s times that of the normal
+    forces."""
+    for (name, force), colour in zip(run.force.items(), COLOURS * len(run.force)):
+        t = timeline(axes, "|friction| / cone [%]", run)
+        mu, normal = run.setup.contacts[name].friction.get("mu_s", 1.0), force[..., 0].sum(-1)
+        share = force[..., 1].abs().sum(-1) / (mu * normal)
+        share = torch.where(normal > 1e-9, share, torch.nan)
+        label = f"{name}, mu_s = {mu:g}" if run.setup.contacts[name].friction else f"{name} / normal"
+        axes.plot(t, 100 * share.numpy(), color=colour, label=label)
+    axes.axhline(100, color=INK, lw=0.8, ls=":")
+    axes.set_ylim(0, 108)
+    axes.legend()
 
 
 def points(axes: Axes, run: Trajectory) -> None:
@@ -144,16 +155,11 @@ def points(axes: Axes, run: Trajectory) -> None:
     axes.legend(ncols=2)
 
 
-def efforts(axes: Axes, run: Trajectory, unit: str) -> None:
-    """What the actuators push with, in one unit."""
-    chosen = {name: one for name, one in run.setup.actuators.items() if one.unit == unit}
-    scale, label = (MM, "efforts [N mm]") if unit == "N.m" else (1.0, "efforts [N]")
-    for one, colour in zip(chosen.values(), COLOURS * len(chosen)):
-        values = scale * run[one.channel].detach().numpy()
-        text = f"{one.channel} on {one.pushes}"
-        axes.plot(timeline(axes, label, run), values, color=colour, label=text)
-    axes.axhline(0, color=INK, lw=0.5, zorder=1)
-    axes.legend()
+def effort(axes: Axes, run: Trajectory, one: ActuatorSetup) -> None:
+    """What an actuator pushes with."""
+    scale, unit = (MM, "N mm") if one.unit == "N.m" else (1.0, "N")
+    t = timeline(axes, f"{one.channel} on {one.pushes} [{unit}]", run)
+    axes.plot(t, scale * run[one.channel].detach().numpy(), color=ACTUAL)
 
 
 def stresses(axes: Axes, run: Trajectory) -> None:
@@ -162,7 +168,7 @@ def stresses(axes: Axes, run: Trajectory) -> None:
     for (name, pad), colour in zip(run.setup.pads.items(), COLOURS * len(run.setup.pads)):
         whole = pad.displacement(run.displacement[name][rows].detach().numpy())
         peak = 1e-3 * von_mises(pad.stress(pad.strain(whole))).max(-1)
-        timeline(axes, "largest von Mises\nstress [kPa]", run)
+        timeline(axes, "von Mises, elastic [kPa]", run)
         axes.plot(run.t.numpy()[rows], peak, color=colour, label=f"pad {name}")
     axes.set_ylim(0, None)
     axes.legend(ncols=2)
@@ -198,7 +204,10 @@ def energies(axes: Axes, run: Trajectory) -> None:
     supplied = MM * sum((x.numpy() for x in run.supplied.values()), np.zeros(len(t)))
     axes.plot(t, start + supplied, color=INK, ls=(0, (4, 2)), label="at the start + supplied")
     axes.set_ylim(0, None)
-    axes.legend(*(one[::-1] for one in axes.get_legend_handles_labels()), fontsize="x-small")
+    axes.legend(
+        *(one[::-1] for one in axes.get_legend_handles_labels()), fontsize="x-small",
+        frameon=True, framealpha=0.85, edgecolor="none",
+    )  # fmt: skip
 
 
 def cones(axes: Axes, run: Trajectory, instant: Instant, contact: str) -> None:
@@ -210,21 +219,22 @@ def cones(axes: Axes, run: Trajectory, instant: Instant, contact: str) -> None:
     axes.legend(fontsize="x-small")
 
 
-def panels(run: Trajectory) -> Iterator[tuple[str, Callable[[Axes], None]]]:
+def panels(run: Trajectory) -> dict[str, Callable[[Axes], None]]:
     """What is drawn over time, by its title."""
     moving = [one for one in curves(run) if np.ptp(one.values) > STILL] or list(curves(run))[:1]
-    for curve in moving:
-        yield curve.name, lambda axes, curve=curve: motion(axes, run, curve)
+    out: dict[str, Callable[[Axes], None]] = {
+        curve.name: lambda axes, curve=curve: motion(axes, run, curve) for curve in moving
+    }
     if run.force:
-        yield "normal force of each contact", lambda axes: contact_forces(axes, run)
-        yield "friction in its cone", lambda axes: friction(axes, run)
-        yield "points that touch and slip", lambda axes: points(axes, run)
-    for unit in dict.fromkeys(one.unit for one in run.setup.actuators.values()):
-        yield "actuators", lambda axes, unit=unit: efforts(axes, run, unit)
+        out["normal force"] = lambda axes: contact_forces(axes, run)
+        out["friction"] = lambda axes: friction(axes, run)
+        out["friction in its cone"] = lambda axes: mobilised(axes, run)
+        out["points in contact"] = lambda axes: points(axes, run)
+    for one in run.setup.actuators.values():
+        out[one.channel] = lambda axes, one=one: effort(axes, run, one)
     if run.setup.pads:
-        yield "stress in the pads, elastic part", lambda axes: stresses(axes, run)
-    part = run.energy_residual_rel
-    yield f"energy; {part:.0e} of that injected is missing", lambda axes: energies(axes, run)
+        out["stress"] = lambda axes: stresses(axes, run)
+    return out | {"energy": lambda axes: energies(axes, run)}
 
 
 def ripples(run: Trajectory) -> bool:
@@ -235,76 +245,82 @@ def ripples(run: Trajectory) -> bool:
     return on_nodes and any(int((one != 0).sum()) >= RIPPLES for one in counts)
 
 
+def chosen(only: Sequence[str], known: Iterable[str]) -> list[str]:
+    """The panels asked for, all by default. Raises `ValueError`."""
+    names = list(known)
+    for name in only:
+        if name not in names:
+            raise ValueError(f"there is no panel `{name}`; {suggestion(name, names, 'there are')}")
+    return list(only) or names
+
+
 def dashboard(
-    run: Trajectory, *, time: float | None = None, title: str = "", look: Look = "screen"
-) -> Figure:
+    run: Trajectory, *, only: Sequence[str] = (), time: float | None = None, title: str = "",
+    look: Look = "screen",
+) -> Figure:  # fmt: skip
     """The whole run in one figure, with the instant `time` [s], by default that of the largest
-    normal force.
+    normal force. `only` names some of the panels: "scene", contacts, coordinates such as "disc.x",
+    "friction", and so on.
 
     `look` "page" or "column" is camera-ready: that wide, without a title. Raises `ValueError` for
-    another one.
+    another one, and for a panel that is not there.
     """
     if time is None:
         total = sum((force[..., 0].sum(-1) for force in run.force.values()), torch.zeros_like(run.t))
         time = float(run.t[int(total.argmax())])
     (instant,) = instants(run, [time])
-    shown = list(panels(run))
-    contacts = list(run.setup.contacts)
+    contacts = {
+        f"contact {key}": lambda axes, key=key: cones(axes, run, instant, key)
+        for key in list(run.setup.contacts)[::-1]
+    }
+    drawn = contacts | panels(run)
+    wanted = chosen(only, ("scene", *drawn))
+    pictured = "scene" in wanted
+    wanted = [name for name in wanted if name != "scene"]
     with looking(look) as size:
-        columns = size.columns
-        width = size.width / columns
+        columns = min(size.columns, max(1, len(wanted))) if not pictured else size.columns
+        width = size.width / size.columns
+        each, span, tall, beside = 0.5 * width + 0.03 * size.font, max(1, columns - 1), 0.0, 0
         curves_, stress = force_scale(run.setup, [instant]), largest_stress([instant])
-        scene = Scene(Figure().subplots(), run.setup, curves=curves_)
-        (left, right), (low, high) = scene.limits([instant])
-        span = max(1, columns - 1)
-        tall = min((high - low) / (right - left), 1.1) * 0.86 * width * span + 0.5
-        beside = min(len(contacts), 3) if columns > 1 else 0
-        below = contacts[: len(contacts) - beside]
-        rows = -(-(len(shown) + len(below)) // columns)
-        each = 0.5 * width + 0.35
-        tall = max(tall, 0.95 * each * beside)
-        top = max(1, beside)
+        (left, right), (low, high) = Scene(Figure().subplots(), run.setup, curves=curves_).limits(
+            [instant]
+        )
+        if pictured:
+            tall = min((high - low) / (right - left), 1.1) * 0.86 * width * span + 0.5
+            beside = min(len(contacts), len(wanted), round(tall / each)) if columns > 1 else 0
+        top = max(1, beside) if pictured else 0
+        rows = -(-(len(wanted) - beside) // columns)
         heading = (title or "Run") if size.titled else ""
-        figure = new_figure(heading, size.width, tall + rows * each + 0.6)
-        heights = [*[tall / top] * top, *[each] * rows]
+        figure = new_figure(heading, width * columns, tall + rows * each + 0.06 * size.font)
+        heights = [*[tall / max(top, 1)] * top, *[each] * rows]
         grid = figure.add_gridspec(top + rows, columns, height_ratios=heights)
-        whole = figure.add_subplot(grid[:top, :span])
-        scene = Scene(
-            whole, run.setup, columns=5, curves=curves_, stress=stress, size=0.1 * size.font
-        )
-        scene.show(instant)
-        whole.set(
-            xlim=(left, right), ylim=(low, high), xlabel="x [mm]", ylabel="y [mm]",
-            title=f"a) t = {instant.time:g} s",
-        )  # fmt: skip
-        whole.grid(False)
-        if contacts:
-            scene.scale_bar(whole)
-        stress_bar(figure, [whole], stress, size)
-        figure.legend(
-            handles=keys(run.setup, [instant]), loc="outside upper right", ncols=min(5, 2 * columns)
-        )
-        number = 1
-        for row, key in enumerate(contacts[::-1][:beside]):
-            axes = figure.add_subplot(grid[row, -1])
-            cones(axes, run, instant, key)
-            axes.set_title(f"{letter(number)} contact {key}, t = {instant.time:g} s")
-            number += 1
-        drawn: list[tuple[str, Callable[[Axes], None]]] = [
-            *((f"contact {key}, t = {instant.time:g} s",
-               lambda axes, key=key: cones(axes, run, instant, key)) for key in below), *shown,
-        ]  # fmt: skip
-        explained = ripples(run)
-        for i, (name, draw) in enumerate(drawn):
-            axes = figure.add_subplot(grid[top + i // columns, i % columns])
-            draw(axes)
-            axes.set_title(f"{letter(number + i)} {name}")
+        if pictured:
+            whole = figure.add_subplot(grid[:top, :span])
+            scene = Scene(
+                whole, run.setup, columns=5, curves=curves_, stress=stress, size=0.1 * size.font
+            )
+            scene.show(instant)
+            whole.set(
+                xlim=(left, right), ylim=(low, high), xlabel="x [mm]", ylabel="y [mm]",
+                title=f"a) t = {instant.time:g} s",
+            )  # fmt: skip
+            whole.grid(False)
+            if contacts:
+                scene.scale_bar(whole)
+            stress_bar(figure, [whole], stress, size)
+            handles = keys(run.setup, [instant])
+            figure.legend(
+                handles=handles, loc="outside upper right", ncols=5 if columns > 1 else 2
+            )
+        if ripples(run):
+            figure.supxlabel(RIPPLE, fontsize="small", color="#666666")
+        for i, name in enumerate(wanted):
+            k = i - beside
+            place = grid[i, -1] if k < 0 else grid[top + k // columns, k % columns]
+            axes = figure.add_subplot(place)
+            drawn[name](axes)
+            axes.set_title(f"{letter(i + pictured)} {name}")
             if not axes.get_xlabel():
                 axes.set_xlabel("time [s]")
-            if explained and name in ("actuators", "friction in its cone"):
-                axes.text(
-                    0.99, 0.02, RIPPLE, transform=axes.transAxes, fontsize="x-small", ha="right",
-                    color="#666666", va="bottom", in_layout=False,
-                )  # fmt: skip
         figure.align_ylabels()
     return figure

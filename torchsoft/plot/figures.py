@@ -86,7 +86,7 @@ class Size(NamedTuple):
 
 SIZES: dict[str, Size] = {
     "screen": Size(13.0, 10.0, 3, True),
-    "page": Size(7.1, 7.5, 2, False),
+    "page": Size(7.1, 7.0, 3, False),
     "column": Size(3.46, 7.5, 1, False),
 }
 
@@ -201,21 +201,21 @@ def force_distribution(run: Trajectory, time: float, *, title: str = "", look: L
         whole.set_ylabel("y [mm]")
         whole.grid(False)
         panels = []
+        order = lambda i, row: 1 + (row * len(contacts) + i if wide else 2 * i + row)
         for i, key in enumerate(contacts):
             places = [grid[row, i + 1] if wide else grid[2 * i + 1 + row, 0] for row in (0, 1)]
             near, forces = (figure.add_subplot(place) for place in places)
-            near.set_title(f"{letter(2 * i + 1)} contact {key}, close up")
+            near.set_title(f"{letter(order(i, 0))} contact {key}, close up")
             close_up(near, setup, instant, key, stress)
-            forces.set_title(f"{letter(2 * i + 2)} forces on the pad at {key}")
+            forces.set_title(f"{letter(order(i, 1))} forces on the pad at {key}")
             forces_on(forces, setup, instant, key)
             pad = setup.pads[setup.contacts[key].pad]
             level = along_surface(pad, instant.base[setup.contacts[key].pad])[0] > 0.999
             forces.set_xlabel("x [mm]" if level else "along the surface [mm]")
             panels.append(forces)
-        spread = [around_contact(instant, key)[1] for key in contacts]
-        low, high = (f(f(one) for one in spread if one.size) for f in (min_of, max_of))
+        ends = [forces.get_ylim() for forces in panels]
         for forces in panels:
-            forces.set_ylim(low - 0.08 * (high - low), high + 0.12 * (high - low))
+            forces.set_ylim(min(low for low, _ in ends), max(high for _, high in ends))
         stress_bar(figure, [whole], stress, size)
         lines = panels[-1].get_legend_handles_labels()
         points = keys(setup, [instant], forces=False)
@@ -224,16 +224,6 @@ def force_distribution(run: Trajectory, time: float, *, title: str = "", look: L
             loc="outside lower center", ncols=6 if wide else 2,
         )  # fmt: skip
     return figure
-
-
-def min_of(values: Any) -> float:
-    """The least of arrays, or of numbers; 0 of none."""
-    return min((float(np.min(one)) for one in values), default=0.0)
-
-
-def max_of(values: Any) -> float:
-    """The largest of them; 1 of none."""
-    return max((float(np.max(one)) for one in values), default=1.0)
 
 
 def snapshots(
