@@ -38,6 +38,9 @@ CHART_SAMPLES = 1500
 
 LEVELS = 65535
 
+DENSER = 0.3
+"""Part of the frames that follows the steps, not the time."""
+
 
 def packed(values: Array) -> dict[str, Any]:
     """Numbers in 16 bits between their ends, in base 64; their shape is told beside them."""
@@ -54,10 +57,12 @@ def encoded(values: NDArray[Any]) -> str:
 
 
 def frame_rows(run: Trajectory, frames: int) -> list[int]:
-    """Rows of the run at frames that are equally far apart in time, each once."""
-    t = run.t.numpy()
-    times = np.linspace(t[0], t[-1], frames)
-    return sorted({int(np.abs(t - time).argmin()) for time in times})
+    """Rows of the run at so many frames or less, each once: denser where the stepper took shorter
+    steps."""
+    t, knots = run.t.numpy(), run.knots.numpy()
+    count = np.interp(t, knots, np.linspace(0.0, 1.0, len(knots)))
+    clock = (1 - DENSER) * (t - t[0]) / (t[-1] - t[0]) + DENSER * count
+    return sorted({int(np.abs(clock - x).argmin()) for x in np.linspace(0.0, clock[-1], frames)})
 
 
 def pads(run: Trajectory, rows: list[int]) -> dict[str, Any]:
