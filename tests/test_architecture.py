@@ -12,7 +12,7 @@ import torchsoft
 ROOT = Path(torchsoft.__file__).parent
 FLOWS = {
     "": """
-        channels display diagnostic files threads tables csvfile quantity codegen physics paper cost
+        channels display extras diagnostic files threads tables csvfile quantity codegen physics paper cost
         solve scenario excitation processes
         plot materials rigs sysid reduced datasets experiment cli __main__
     """,
@@ -38,7 +38,7 @@ FLOWS = {
         criterion planner design figures report .
     """,
     "rigs": "fields parts control motion geometry build course balance check written run .",
-    "cli": "results rigs identify material .",
+    "cli": "results rigs identify material plot .",
     "solve.kernel": """
         table arrays objects . invoke linear inertia interface stage step run adjoint tangent build
     """,

@@ -591,7 +591,7 @@ def test_a_file_size_limit_is_said_and_costs_nothing(
     open_or_create(str(tmp_path / "set"), made[1])
     command = [
         "-m",
-        "data_gen.generate",
+        "torchsoft.datasets.generate",
         str(path),
         "--out",
         str(tmp_path / "set"),
@@ -632,7 +632,7 @@ def kill_and_resume(folder: Path, config: Path, kills: range) -> None:
     command = [
         sys.executable,
         "-m",
-        "data_gen.generate",
+        "torchsoft.datasets.generate",
         str(config),
         "--out",
         str(out),

@@ -1,9 +1,10 @@
-"""Re-read a dataset and list what is wrong with it: `python -m data_gen.check DIR`.
+"""Re-read a dataset and list what is wrong with it: `python -m torchsoft.datasets.check DIR`.
 
 One line a finding; exit status 1 if there is any. `--picture FILE` draws what the set covers.
 """
 
 import argparse
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -215,7 +216,7 @@ def figure(data: xr.Dataset, config: Config) -> Figure:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m data_gen.check", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m torchsoft.datasets.check", description=__doc__)
     parser.add_argument("store", help="folder or fsspec URL")
     parser.add_argument(
         "--picture", type=Path, help="where to write a picture of what the set covers"
@@ -238,3 +239,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(line(f"no summary or picture: {type(error).__name__}: {error}"))
     print("sound" if count == 0 else f"{count} findings")
     return int(count > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

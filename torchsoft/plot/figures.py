@@ -201,13 +201,14 @@ def force_distribution(run: Trajectory, time: float, *, title: str = "", look: L
         whole.set_ylabel("y [mm]")
         whole.grid(False)
         panels = []
-        order = lambda i, row: 1 + (row * len(contacts) + i if wide else 2 * i + row)
         for i, key in enumerate(contacts):
-            places = [grid[row, i + 1] if wide else grid[2 * i + 1 + row, 0] for row in (0, 1)]
-            near, forces = (figure.add_subplot(place) for place in places)
-            near.set_title(f"{letter(order(i, 0))} contact {key}, close up")
+            near = figure.add_subplot(grid[0, i + 1] if wide else grid[i + 1, 0])
+            near.set_title(f"{letter(i + 1)} contact {key}, close up")
             close_up(near, setup, instant, key, stress)
-            forces.set_title(f"{letter(order(i, 1))} forces on the pad at {key}")
+        for i, key in enumerate(contacts, len(contacts)):
+            place = grid[1, i + 1 - len(contacts)] if wide else grid[i + 1, 0]
+            forces = figure.add_subplot(place)
+            forces.set_title(f"{letter(i + 1)} forces on the pad at {key}")
             forces_on(forces, setup, instant, key)
             pad = setup.pads[setup.contacts[key].pad]
             level = along_surface(pad, instant.base[setup.contacts[key].pad])[0] > 0.999
