@@ -12,7 +12,8 @@ import torchsoft
 ROOT = Path(torchsoft.__file__).parent
 FLOWS = {
     "": """
-        channels display extras diagnostic files threads tables csvfile quantity codegen physics paper cost
+        channels display extras diagnostic files threads tables csvfile quantity codegen
+        physics paper cost
         solve scenario excitation processes
         plot materials rigs sysid reduced datasets experiment cli __main__
     """,
@@ -125,7 +126,9 @@ def test_physics_does_not_know_how_it_is_solved() -> None:
         own, others = layer(name, ""), {layer(other, "") for other in imports(path)}
         if own in ("physics", "codegen"):
             assert others <= (
-                {"physics", "quantity", "csvfile", "files", "display"} if own == "physics" else {"codegen"}
+                {"physics", "quantity", "csvfile", "files", "display"}
+                if own == "physics"
+                else {"codegen"}
             ), name
 
 

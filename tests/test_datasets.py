@@ -139,9 +139,7 @@ def read_everywhere(url: str, folder: Path) -> None:
     """The check, xarray and torch see behind `url` what they see in `folder`."""
     assert [x for x in check(url) if "commit" not in x] == []
     assert open_dataset(url).load().identical(open_dataset(str(folder)).load())
-    here, there = (
-        Trajectories(place, ["x_C", "pad.E"], window=7) for place in (url, str(folder))
-    )
+    here, there = (Trajectories(place, ["x_C", "pad.E"], window=7) for place in (url, str(folder)))
     assert len(here) == len(there) == 5 * 13
     torch.testing.assert_close(here[20], there[20], rtol=0, atol=0)
 
@@ -304,9 +302,7 @@ def open_ledger(folder: Path) -> None:
             "theta: units are 'deg', not 'rad'",
         ),
         (
-            change_json(
-                "zarr.json", lambda g: g["consolidated_metadata"]["metadata"].pop("omega")
-            ),
+            change_json("zarr.json", lambda g: g["consolidated_metadata"]["metadata"].pop("omega")),
             "omega: missing",
         ),
         (set_value("split", (1,), "test"), "trajectory 1: split is test, but the design has"),
@@ -414,9 +410,7 @@ def every_window(url: str, names: list[str]) -> list[dict[str, torch.Tensor]]:
     return [windows[i] for i in range(len(windows))]
 
 
-@pytest.mark.parametrize(
-    "damage", [edit("omega/zarr.json", flipped), write("omega/copy", b"x")]
-)
+@pytest.mark.parametrize("damage", [edit("omega/zarr.json", flipped), write("omega/copy", b"x")])
 def test_damage_to_what_readers_do_not_open_is_found_by_the_check(
     made: tuple[Path, Config], tmp_path: Path, damage: Any
 ) -> None:

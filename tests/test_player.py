@@ -21,7 +21,8 @@ SLIDE = """const s = document.getElementById('slider'); s.value = arguments[0];
 s.dispatchEvent(new Event('input')); return document.getElementById('clock').textContent"""
 SPOT = """const c = data.contacts[arguments[0]], i = arguments[1], o = 2 * (frame * c.count + i);
 const at = place(pose(data.pads[c.pad].base, frame), c.points[o], c.points[o + 1]);
-const r = document.getElementById('scene').getBoundingClientRect(), q = toScreen(at, r.width, r.height);
+const r = document.getElementById('scene').getBoundingClientRect();
+const q = toScreen(at, r.width, r.height);
 return [r.x + q[0], r.y + q[1]]"""
 
 

@@ -512,7 +512,8 @@ RUNS: list[tuple[dict[str, Any], str]] = [
     (FORWARD | {"dy0": torch.zeros(3, 1).double()},
      r"`dy0` must have shape \(376, 1\), or more columns, but has"),
     (FORWARD | {"wrt": ["pad.E", "contact.K_x"]},
-     r"`contact.K_x` is not a parameter of this rig; did you mean `contact.K_t`\? .known: .*contact.K_n"),
+     r"`contact.K_x` is not a parameter of this rig; "
+     r"did you mean `contact.K_t`\? .known: .*contact.K_n"),
     (FORWARD | {"wrt": []}, "gradient='forward' needs the parameters' names `wrt`, or directions "
                             "`dy0`"),
     (FORWARD | {"wrt": ["contact.epsilon"]},

@@ -124,10 +124,10 @@ BAD: dict[str, tuple[Change, str]] = {
     "wrong dimension": (put(1, THETA, "theta [mm]"),
         r"row 1, column `theta` cannot be in 'mm'; it can be in rad"),
     "unknown column": (
-        put(1, X_C, "x_c [mm]"), r"column `x_c` is not known: did you mean `x_C`\?.* ignore = \['x_c'\]; "
-                                 r"columns are t, x_d",
+        put(1, X_C, "x_c [mm]"),
+        r"`x_c` is not known: did you mean `x_C`\?.* ignore = \['x_c'\]; columns are t, x_d",
     ),
-    "misspelt column": (put(1, F_FF, "Fff [N]"), r"column `Fff` is not known: did you mean `F_ff`\?"),
+    "misspelt column": (put(1, F_FF, "Fff [N]"), r"`Fff` is not known: did you mean `F_ff`\?"),
     "another column": (put(1, X_C, "Ventil"),
         r"column `Ventil` is not known; if it has nothing to do with the motion, say"),
     "no feed-forward": (

@@ -64,7 +64,7 @@ def test_a_run_is_loaded_as_it_was(tmp_path: Path, fidelity: str) -> None:
         assert equal(getattr(run, name), getattr(again, name)), name
     assert again.energy_residual_rel == run.energy_residual_rel
     assert again.layout.slices == run.layout.slices
-    assert again.units == run.units
+    assert again.units == {name: run.units[name] for name in run}
     assert again.rig is None
     assert str(again) == str(run)
     resumed = simulate(model, T + T[-1], y0=again.y[-1])
@@ -113,7 +113,7 @@ def test_channels_have_one_name_everywhere(done: tuple[SoftGrasp, Trajectory]) -
     run = done[1]
     data, table = run.to_xarray(), run.to_pandas()
     assert run.keys() == list(run) == list(table.columns) == run._ipython_key_completions_()
-    for name in run.keys():
+    for name in run:
         assert name in run
         np.testing.assert_array_equal(data[name], run[name].detach())
         np.testing.assert_array_equal(table[name], run[name].detach())
@@ -204,7 +204,7 @@ def test_objects_show_themselves(done: tuple[SoftGrasp, Trajectory]) -> None:
 def test_a_start_is_stated_by_coordinates() -> None:
     model = coarse()
     y0 = rest(model).detach()
-    x, y, theta = model.unpack(y0).pose["disc"].tolist()
+    x, y, _ = model.unpack(y0).pose["disc"].tolist()
     height = float(model.unpack(y0).pose["bracket"][1]) + 1e-3
     stated = model.state(disc={"x": x, "y": "rest"}, bracket={"x": x, "y": height}).detach()
     expected, found = model.unpack(y0), model.unpack(stated)

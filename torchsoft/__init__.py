@@ -3,7 +3,7 @@
     import torch
     from torchsoft import SoftGrasp, simulate
 
-    rig = SoftGrasp()                                 # the paper's rig; help(SoftGrasp), print(rig)
+    rig = SoftGrasp()                                 # the paper's rig; print(rig)
     y0 = rig.state(disc={"x": 0.06, "y": "rest"}, bracket={"x": 0.06, "y": 0.051})
     run = simulate(rig, torch.linspace(0, 0.1, 11), y0=y0, gradient="discrete")
     run["y_C"], run.force["L"]                        # channels, forces of every node, SI units
@@ -12,8 +12,8 @@
 
 What there is, each with a page of its own in help():
 
-rigs        SoftGrasp, Parameters; Rig, Body, Pad, Contact, SoftContact, Actuator, PD, StateFeedback,
-            controller; rig files: torchsoft.rigs.RigFile
+rigs        SoftGrasp, Parameters; Rig, Body, Pad, Contact, SoftContact, Actuator, PD,
+            StateFeedback, controller; rig files: torchsoft.rigs.RigFile
 meshes      PadMesh, CurvedPadMesh, FingertipMesh, QuadMesh
 materials   KelvinVoigt, StandardLinearSolid, GeneralisedKelvin, Prony
 shapes      Circle, Ellipse, Superellipse, RoundedBox, RoundedPolygon, Contour

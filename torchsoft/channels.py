@@ -27,9 +27,7 @@ CHANNELS = {
     "F_x": Channel("N", "controller's force on the bracket, x (Eq. 32)", "F_x"),
     "F_y": Channel("N", "controller's force on the bracket, y, with what is fed forward", "F_y"),
     "bracket_moment": Channel("N.m", "moment on the bracket about its centre (Eq. 35)", "M_{Br}"),
-    "angular_momentum": Channel(
-        "kg.m2/s", "angular momentum of the disc (Fig. 17)", r"I_C \omega"
-    ),
+    "angular_momentum": Channel("kg.m2/s", "angular momentum of the disc (Fig. 17)", r"I_C \omega"),
     "x_d": Channel("m", "set-point of the disc's x", "x_d"),
     "x_d_dot": Channel("m/s", "rate of x_d", r"\dot x_d"),
     "y_d": Channel("m", "set-point of the bracket's y", "y_d"),

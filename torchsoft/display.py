@@ -3,7 +3,6 @@
 from collections.abc import Iterable
 from difflib import SequenceMatcher
 from html import escape
-from os.path import commonprefix
 
 ALIKE = 0.6
 """Least ratio of common letters of two names that are alike."""
@@ -13,8 +12,11 @@ def nearest(name: object, known: Iterable[str]) -> str | None:
     """The known name that is most like another one, capitals aside first; None where none is."""
 
     def alike(one: str, other: str) -> float:
-        shared = commonprefix((one, other)).rpartition(".")[0]  # what both are in says nothing
-        return SequenceMatcher(None, one[len(shared) :], other[len(shared) :]).ratio()
+        shared = max(  # what both are in says nothing
+            (i + 1 for i, c in enumerate(one) if c == "." and other.startswith(one[: i + 1])),
+            default=0,
+        )
+        return SequenceMatcher(None, one[shared:], other[shared:]).ratio()
 
     given = str(name)
     ranked = [(alike(given.casefold(), one.casefold()), alike(given, one), one) for one in known]

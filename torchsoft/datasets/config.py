@@ -266,8 +266,7 @@ class Config(Table):
                 )
             if name not in DEFAULTS and where != f"parameters.{RATIO}":
                 raise ValueError(
-                    f"{where} is not a parameter; "
-                    f"{suggestion(name, (*DEFAULTS, RATIO), 'known:')}"
+                    f"{where} is not a parameter; {suggestion(name, (*DEFAULTS, RATIO), 'known:')}"
                 )
             if name in self.parameters and name in self.fixed:
                 raise ValueError(f"{where} is in `fixed` as well; leave one of them out")

@@ -1,5 +1,5 @@
-"""Make a dataset: `python -m torchsoft.datasets.generate CONFIG.toml --out DIR [--workers N] [--scheduler
-tcp://...]`.
+"""Make a dataset: `python -m torchsoft.datasets.generate CONFIG.toml --out DIR [--workers N]
+[--scheduler tcp://...]`.
 
 Started again on the same folder it makes what is missing. Ctrl-C and kill are safe at any moment.
 """
@@ -150,7 +150,9 @@ def dask_cluster(address: str) -> Iterator[Executor]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m torchsoft.datasets.generate", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m torchsoft.datasets.generate", description=__doc__
+    )
     parser.add_argument("config", type=Path, help="TOML file, see data_gen/configs")
     parser.add_argument("--out", required=True, help="folder or fsspec URL of the store")
     workers = "threads, or processes if more than a few"

@@ -38,8 +38,8 @@ class Vouched(WrapperStore[Store]):
         if (lacking := self.layout.shards - len(self.finished)) and not unfinished:
             raise StoreError(
                 f"{url}: {lacking} of {self.layout.shards} shards are not finished; start `python "
-                "-m torchsoft.datasets.generate` again to make them, or give `unfinished=True` to leave "
-                "their trajectories out"
+                "-m torchsoft.datasets.generate` again to make them, or give `unfinished=True` to "
+                "leave their trajectories out"
             )
         here = folder(url)
         super().__init__(

@@ -175,7 +175,8 @@ def laid_out(config: Config) -> dict[str, bytes]:
         "time": (np.arange(config.samples) * config.sample_interval, "s", "time since the start"),
         **{
             f"{pad}_point": (
-                pads[pad].point_positions[:, 0].numpy(), "m",
+                pads[pad].point_positions[:, 0].numpy(),
+                "m",
                 f"x of the {words} pad's contact points in its base's frame, undeformed",
             )
             for pad, words in PADS.items()

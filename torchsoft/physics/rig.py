@@ -185,8 +185,8 @@ class Rig(Shown, nn.Module):
     def state(
         self, bodies: Mapping[str, Mapping[str, Any]] | None = None, /, **more: Mapping[str, Any]
     ) -> Tensor:
-        """A start (size,) from coordinates x, y [m] and theta [rad] and rates v_x, v_y, omega of the
-        bodies, with massless pads settled around them:
+        """A start (size,) from coordinates x, y [m] and theta [rad] and rates v_x, v_y, omega of
+        the bodies, with massless pads settled around them:
         `rig.state(disc={"x": 0.06, "y": "rest"}, bracket={"x": 0.06, "y": 0.05})`.
 
         y and theta may be "rest": where the body lies under its weight, the loops open. theta and

@@ -1,5 +1,5 @@
-"""What stood where in a run: meshes, outlines, contacts and actuators as they were, in plain numbers
-that files and pictures take; and the fields inside of pads, from their own elements."""
+"""What stood where in a run: meshes, outlines, contacts and actuators as they were, in plain
+numbers that files and pictures take; and the fields inside of pads, from their own elements."""
 
 from __future__ import annotations
 
@@ -200,7 +200,8 @@ class Setup:
                     {
                         mu: float(value)
                         for mu in ("mu_s", "mu_k")
-                        if isinstance(value := getattr(contact.law.friction, mu, None), torch.Tensor)
+                        for value in [getattr(contact.law.friction, mu, None)]
+                        if isinstance(value, torch.Tensor)
                     },
                 )
                 for name, contact in rig.contacts.items()

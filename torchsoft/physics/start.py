@@ -1,4 +1,4 @@
-"""A rig's state from coordinates of its bodies: placed, moving, or at rest on the pads under them."""
+"""A rig's state from coordinates of its bodies: placed, moving, or at rest on pads."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -46,7 +46,7 @@ def start(rig: Rig, bodies: Mapping[str, Mapping[str, Any]]) -> Tensor:
                 continue
             if axis not in given and axis != "theta":
                 raise ValueError(
-                    f'`{axis}` of `{name}` is missing: it is free, so say where it starts [m]'
+                    f"`{axis}` of `{name}` is missing: it is free, so say where it starts [m]"
                     + (f', or "{REST}"' if axis == "y" else "")
                 )
             if isinstance(place := given.get(axis, 0.0), str):
@@ -74,8 +74,8 @@ def checked(body: str, given: Any) -> Mapping[str, Any]:
     """Coordinates and rates of a body by name. Raises `ValueError` for other names and values."""
     if not isinstance(given, Mapping):
         raise ValueError(
-            f"`{body}` must be given coordinates by name, such as {{'x': 0.06, 'y': '{REST}'}}, but "
-            f"is {given!r}"
+            f"`{body}` must be given coordinates by name, such as {{'x': 0.06, 'y': '{REST}'}}, "
+            f"but is {given!r}"
         )
     for key, value in given.items():
         if key not in (*COORDINATES, *RATES):
@@ -83,19 +83,17 @@ def checked(body: str, given: Any) -> Mapping[str, Any]:
                 f"`{key}` is no coordinate of `{body}`; {suggestion(key, (*COORDINATES, *RATES))}"
             )
         if isinstance(value, str) and (value != REST or key not in ("y", "theta")):
-            raise ValueError(
-                f"`{key}` of `{body}` must be a number{f' or {REST!r}' if key in ('y', 'theta') else ''}"
-                f", but is {value!r}"
-            )
+            allowed = f"a number or {REST!r}" if key in ("y", "theta") else "a number"
+            raise ValueError(f"`{key}` of `{body}` must be {allowed}, but is {value!r}")
     return given
 
 
 def scalar(name: str, value: Any) -> Tensor:
     """A finite number as a tensor, with its graph. Raises `ValueError`."""
-    out = tensor(name, value) if isinstance(value, Tensor) else torch.tensor(number(name, value))
+    out = tensor(name, value if isinstance(value, Tensor) else [number(name, value)]).squeeze()
     if out.ndim or not bool(out.isfinite()):
         raise ValueError(f"`{name}` must be one finite number, but is {value!r}")
-    return out.double()
+    return out
 
 
 @torch.no_grad()

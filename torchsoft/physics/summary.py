@@ -20,7 +20,9 @@ def numbers(rig: Rig, owner: str, part: object, names: Iterable[str]) -> str:
         value = getattr(part, name, None)
         if isinstance(value, Tensor) and not value.ndim:
             quantity = rig.quantity(f"{owner}.{name}")
-            shown.append(f"{name} {amount(float(value.detach()), quantity.unit if quantity else '')}")
+            shown.append(
+                f"{name} {amount(float(value.detach()), quantity.unit if quantity else '')}"
+            )
     return ", ".join(shown)
 
 
@@ -35,7 +37,9 @@ def summary(rig: Rig) -> tuple[str, list[tuple[str, str]]]:
         shape = "no shape" if body.shape is None else type(body.shape).__name__
         if body.shape is not None:
             shape += f" of radius {amount(body.shape.size(), 'm')}"
-        rows.append((f"body {name}", f"{shape}, {amount(float(body.mass.detach()), 'kg')}; {freedom}"))
+        rows.append(
+            (f"body {name}", f"{shape}, {amount(float(body.mass.detach()), 'kg')}; {freedom}")
+        )
     for name, pad in rig.pads.items():
         mesh, material = pad.mesh, pad.material
         sizes = f"{1e3 * mesh.length:g} x {1e3 * mesh.height:g} mm"
@@ -70,10 +74,10 @@ def summary(rig: Rig) -> tuple[str, list[tuple[str, str]]]:
         )
     rows.append(("reference", ", ".join(rig.signals) or "no signals"))
     counts = ", ".join(
-        f"{len(parts)} {name if len(parts) != 1 else name.removesuffix('s').replace('bodie', 'body')}"
-        for name, parts in (
-            ("bodies", rig.bodies), ("pads", rig.pads), ("contacts", rig.contacts),
-            ("actuators", rig.actuators),
+        f"{len(parts)} {one if len(parts) == 1 else several}"
+        for one, several, parts in (
+            ("body", "bodies", rig.bodies), ("pad", "pads", rig.pads),
+            ("contact", "contacts", rig.contacts), ("actuator", "actuators", rig.actuators),
         )
     )  # fmt: skip
     return f"{type(rig).__name__}: {counts}, a state of {rig.layout.size} numbers", rows
@@ -82,9 +86,7 @@ def summary(rig: Rig) -> tuple[str, list[tuple[str, str]]]:
 def description(rig: Rig) -> dict[str, Any]:
     """What `Rig.description` gives."""
     mine = {
-        name: value
-        for name, value in rig.named_parameters()
-        if not name.startswith("reference.")
+        name: value for name, value in rig.named_parameters() if not name.startswith("reference.")
     }
     return {
         "parameters": {name: value.detach().tolist() for name, value in mine.items()},

@@ -53,9 +53,7 @@ def frame_times(run: Trajectory, frames: int, slow: float) -> Array:
     )
 
 
-def render(
-    run: Trajectory, times: Array, dpi: int, title: str, follow: str
-) -> Iterator[Picture]:
+def render(run: Trajectory, times: Array, dpi: int, title: str, follow: str) -> Iterator[Picture]:
     """RGB pictures (height, width, 3) at `times` [s]: the scene, and a coordinate over time under
     it. The axes are drawn once; per picture only what moves."""
     setup, shown = run.setup, instants(run, times.tolist())

@@ -1,5 +1,5 @@
-"""One figure of a whole run: an instant of it, motions with their set-points, contact forces with the
-friction cone, points that stick and slip, efforts, stress in the pads, energies.
+"""One figure of a whole run: an instant of it, motions with their set-points, contact forces with
+the friction cone, points that stick and slip, efforts, stress in the pads, energies.
 
 Times in s, lengths in mm, angles in rad, forces in N, moments in N mm, stresses in kPa, energies in
 mJ.
@@ -113,7 +113,7 @@ def contact_forces(axes: Axes, run: Trajectory) -> None:
     for (name, force), colour in zip(run.force.items(), COLOURS * len(run.force)):
         t = timeline(axes, "normal force [N]", run)
         axes.plot(t, force[..., 0].sum(-1).numpy(), color=colour, label=name)
-    axes.legend(ncols=2)
+    axes.legend(ncols=2, fontsize="x-small")
 
 
 def friction(axes: Axes, run: Trajectory) -> None:
@@ -122,7 +122,7 @@ def friction(axes: Axes, run: Trajectory) -> None:
         total = force[..., 1].sum(-1).numpy()
         axes.plot(timeline(axes, "friction [N]", run), total, color=colour, label=name)
     axes.axhline(0, color=INK, lw=0.5, zorder=1)
-    axes.legend(ncols=2)
+    axes.legend(ncols=2, fontsize="x-small")
 
 
 def mobilised(axes: Axes, run: Trajectory) -> None:
@@ -133,11 +133,13 @@ def mobilised(axes: Axes, run: Trajectory) -> None:
         mu, normal = run.setup.contacts[name].friction.get("mu_s", 1.0), force[..., 0].sum(-1)
         share = force[..., 1].abs().sum(-1) / (mu * normal)
         share = torch.where(normal > 1e-9, share, torch.nan)
-        label = f"{name}, mu_s = {mu:g}" if run.setup.contacts[name].friction else f"{name} / normal"
+        label = (
+            f"{name}, mu_s = {mu:g}" if run.setup.contacts[name].friction else f"{name} / normal"
+        )
         axes.plot(t, 100 * share.numpy(), color=colour, label=label)
     axes.axhline(100, color=INK, lw=0.8, ls=":")
-    axes.set_ylim(0, 108)
-    axes.legend()
+    axes.set_ylim(0, max(108.0, 1.04 * axes.dataLim.y1))
+    axes.legend(fontsize="x-small")
 
 
 def points(axes: Axes, run: Trajectory) -> None:
@@ -152,7 +154,7 @@ def points(axes: Axes, run: Trajectory) -> None:
     if any(bool((state < 0).any()) for state in run.contact_state.values()):
         axes.set_title("slip not known: the rig has changed since", fontsize="small", loc="right")
     axes.set_ylim(0, None)
-    axes.legend(ncols=2)
+    axes.legend(ncols=2, fontsize="x-small")
 
 
 def effort(axes: Axes, run: Trajectory, one: ActuatorSetup) -> None:
@@ -171,7 +173,7 @@ def stresses(axes: Axes, run: Trajectory) -> None:
         timeline(axes, "von Mises, elastic [kPa]", run)
         axes.plot(run.t.numpy()[rows], peak, color=colour, label=f"pad {name}")
     axes.set_ylim(0, None)
-    axes.legend(ncols=2)
+    axes.legend(ncols=2, fontsize="x-small")
 
 
 def energy_groups(run: Trajectory) -> list[tuple[str, Array, str]]:
@@ -266,7 +268,9 @@ def dashboard(
     another one, and for a panel that is not there.
     """
     if time is None:
-        total = sum((force[..., 0].sum(-1) for force in run.force.values()), torch.zeros_like(run.t))
+        total = sum(
+            (force[..., 0].sum(-1) for force in run.force.values()), torch.zeros_like(run.t)
+        )
         time = float(run.t[int(total.argmax())])
     (instant,) = instants(run, [time])
     contacts = {
@@ -309,9 +313,7 @@ def dashboard(
                 scene.scale_bar(whole)
             stress_bar(figure, [whole], stress, size)
             handles = keys(run.setup, [instant])
-            figure.legend(
-                handles=handles, loc="outside upper right", ncols=5 if columns > 1 else 2
-            )
+            figure.legend(handles=handles, loc="outside upper right", ncols=5 if columns > 1 else 2)
         if ripples(run):
             figure.supxlabel(RIPPLE, fontsize="small", color="#666666")
         for i, name in enumerate(wanted):

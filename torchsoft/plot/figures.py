@@ -25,7 +25,6 @@ from torchsoft.physics.setup import Setup
 from torchsoft.plot.scene import (
     FRICTION,
     INK,
-    MM,
     NORMAL,
     STATES,
     STRESS,
@@ -180,7 +179,9 @@ def close_up(axes: Axes, setup: Setup, instant: Instant, contact: str, stress: f
     axes.grid(False)
 
 
-def force_distribution(run: Trajectory, time: float, *, title: str = "", look: Look = "screen") -> Figure:
+def force_distribution(
+    run: Trajectory, time: float, *, title: str = "", look: Look = "screen"
+) -> Figure:
     """At the sample nearest to `time` [s]: the whole, then every contact close up, over its normal
     force and its friction with the cone."""
     (instant,) = instants(run, [time])
@@ -191,7 +192,8 @@ def force_distribution(run: Trajectory, time: float, *, title: str = "", look: L
         columns, rows = (len(contacts) + 1, 2) if wide else (1, 2 * len(contacts) + 1)
         heading = (title or f"Contact forces at t = {instant.time:g} s") if size.titled else ""
         height = 0.42 * size.width if wide else size.width * 0.62 * rows
-        figure = new_figure(heading, size.width, height)
+        width = size.width * (max(1.0, (len(contacts) + 1) / 3) if size.titled else 1.0)
+        figure = new_figure(heading, width, height)
         grid = figure.add_gridspec(rows, columns)
         whole = figure.add_subplot(grid[:, 0] if wide else grid[0, 0])
         scene = Scene(whole, setup, columns=2, stress=stress, size=0.1 * size.font)
@@ -203,12 +205,12 @@ def force_distribution(run: Trajectory, time: float, *, title: str = "", look: L
         panels = []
         for i, key in enumerate(contacts):
             near = figure.add_subplot(grid[0, i + 1] if wide else grid[i + 1, 0])
-            near.set_title(f"{letter(i + 1)} contact {key}, close up")
+            near.set_title(f"{letter(i + 1)} contact {key}")
             close_up(near, setup, instant, key, stress)
         for i, key in enumerate(contacts, len(contacts)):
             place = grid[1, i + 1 - len(contacts)] if wide else grid[i + 1, 0]
             forces = figure.add_subplot(place)
-            forces.set_title(f"{letter(i + 1)} forces on the pad at {key}")
+            forces.set_title(f"{letter(i + 1)} forces at {key}")
             forces_on(forces, setup, instant, key)
             pad = setup.pads[setup.contacts[key].pad]
             level = along_surface(pad, instant.base[setup.contacts[key].pad])[0] > 0.999
@@ -221,7 +223,7 @@ def force_distribution(run: Trajectory, time: float, *, title: str = "", look: L
         lines = panels[-1].get_legend_handles_labels()
         points = keys(setup, [instant], forces=False)
         figure.legend(
-            [*lines[0], *points], [*lines[1], *(one.get_label() for one in points)],
+            [*lines[0], *points], [*lines[1], *(str(one.get_label()) for one in points)],
             loc="outside lower center", ncols=6 if wide else 2,
         )  # fmt: skip
     return figure

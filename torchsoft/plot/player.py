@@ -23,7 +23,6 @@ from torchsoft.plot.scene import (
     MM,
     along_surface,
     force_scale,
-    in_world,
     instants,
     own_axes,
     plates,

@@ -96,9 +96,7 @@ def instants(run: Trajectory, times: Sequence[float]) -> list[Instant]:
     }
     shown = []
     for i, row in enumerate(rows):
-        pose = {
-            name: x[row].detach().numpy() * [MM, MM, 1.0] for name, x in run.state.pose.items()
-        }
+        pose = {name: x[row].detach().numpy() * [MM, MM, 1.0] for name, x in run.state.pose.items()}
         base = {
             name: np.zeros(3) if pad.base is None else pose[pad.base]
             for name, pad in setup.pads.items()
@@ -198,8 +196,8 @@ class Scene:
     another instant has them.
 
     `columns` is the spacing, in elements, of the vertical mesh lines; every layer is drawn. With
-    `curves` = (mm per N, scale bar in N) the contact forces stand behind the pads, normal force red,
-    friction blue. `stress` [kPa] is the one that the darkest colour stands for; pads are plain
+    `curves` = (mm per N, scale bar in N) the contact forces stand behind the pads, normal force
+    red, friction blue. `stress` [kPa] is the one that the darkest colour stands for; pads are plain
     without it. `size` scales markers and lines.
     """
 

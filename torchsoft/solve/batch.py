@@ -68,8 +68,13 @@ class Batch(Shown):
         if done:
             steps = [run.stats.steps for run in done]
             worst = max(run.energy_residual_rel for run in done)
-            rows.append(("times", f"up to {max(float(run.t[-1]) for run in done):g} s, at most "
-                                  f"{max(self.lengths)} samples"))
+            rows.append(
+                (
+                    "times",
+                    f"up to {max(float(run.t[-1]) for run in done):g} s, at most "
+                    f"{max(self.lengths)} samples",
+                )
+            )
             rows.append(("steps", f"{min(steps)} to {max(steps)} a run"))
             rows.append(("energy", f"at most {worst:.1e} of what was injected is missing"))
         rows += [(f"run {i} failed", str(why)) for i, why in list(self.failures.items())[:3]]
@@ -228,7 +233,7 @@ def _doubt(rigs: Sequence[Rig], trajectories: Sequence[Trajectory | None]) -> No
 def _rows(name: str, given: Any) -> Any:
     """One tensor of numbers, or the entries of a list of several."""
     several = isinstance(given, list | tuple) and any(
-        isinstance(one, Tensor | np.ndarray) or isinstance(one, Sequence) for one in given
+        isinstance(one, Tensor | np.ndarray | Sequence) for one in given
     )
     if several and any(getattr(one, "ndim", 1) for one in given):
         return [tensor(name, one) for one in given]

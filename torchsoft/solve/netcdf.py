@@ -1,5 +1,5 @@
-"""A run as an xarray Dataset, and back: everything that a `Trajectory` holds but its graph, under the
-names that it has there."""
+"""A run as an xarray Dataset, and back: everything that a `Trajectory` holds but its graph, under
+the names that it has there."""
 
 import json
 from pathlib import Path
@@ -196,7 +196,8 @@ def from_xarray(data: xr.Dataset, source: str = "the dataset") -> Trajectory:
             for name in contacts
         },
         loads=loads, displacement=displacement,
-        **{kind: by(kind, parts[kind]) for kind in PARTS[1:]},
+        energy=by("energy", parts["energy"]), dissipated=by("dissipated", parts["dissipated"]),
+        supplied=by("supplied", parts["supplied"]),
         injected=of("injected"), stats=Stats(**stats), knots=of("knots"), layout=layout,
         made_by=about, wrt=tuple(wrt),
         sensitivities=of("sensitivities") if "sensitivities" in data else None,

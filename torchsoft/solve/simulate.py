@@ -56,7 +56,8 @@ def simulate(
     rig: Rig, t: Numbers, *, y0: Numbers | None = None, reference: Reference | None = None,
     rtol: float | None = None, atol: float | None = None, step: float | None = None,
     knots: Numbers | None = None, tolerance: float = 1e-9, gradient: Route = "none",
-    wrt: Sequence[str] = (), dy0: Numbers | None = None, rigid: bool = False, progress: bool = False,
+    wrt: Sequence[str] = (), dy0: Numbers | None = None, rigid: bool = False,
+    progress: bool = False,
 ) -> Trajectory:  # fmt: skip
     """Integrate `rig` from y0 (size,) at t[0] through the times t (T,) [s]: tensors, numpy's arrays
     or lists, which are computed with in float64.

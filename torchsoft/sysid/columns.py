@@ -232,7 +232,9 @@ def read_channels(data: xr.Dataset, path: Path, known: Vocabulary) -> dict[str, 
     another unit or form than the rig's."""
     there = {name: data[name] for name in known.units if name in data and name != "t"}
     if "time" not in data.coords or not there:
-        raise ValueError(f"{path} is not a trajectory file of this rig: it has no time and channels")
+        raise ValueError(
+            f"{path} is not a trajectory file of this rig: it has no time and channels"
+        )
     for name, one in there.items():
         if one.dims != ("time",) or one.dtype != np.float64:
             raise ValueError(
