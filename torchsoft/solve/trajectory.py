@@ -51,8 +51,8 @@ class Trajectory(Shown):
     force: normal and friction force (T, points, 2) [N] on the points of each contact, along n and t
     of their moving frames. loads: what the contacts and pads do to each body (T, 3), a force [N]
     and a moment about its centre [N.m], world axes. displacement: of the nodes of each pad (T,
-    nodes, 2) [m], in its base's frame. energy: stored [J]; dissipated, supplied and `injected` [J] since
-    t[0].
+    nodes, 2) [m], in its base's frame. energy: stored [J]; dissipated, supplied and `injected` [J]
+    since t[0].
 
     units: of the channels, by key, as far as the rig knows them.
 
