@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchsoft.display import suggestion
 from torchsoft.paper.rig import NAMES, SoftGrasp
 from torchsoft.physics.extensions import extensions
 from torchsoft.physics.validity import check_values
@@ -110,10 +111,11 @@ class Problem:
             raise ValueError(f"recordings need names of their own, but are called {names}")
         for channel in sensors:
             if not any(channel in one.channels or channel in Touch(one.rig) for one in recordings):
-                known = ", ".join(
-                    dict.fromkeys(c for recording in recordings for c in recording.channels)
+                known = dict.fromkeys(c for recording in recordings for c in recording.channels)
+                raise ValueError(
+                    f"sensors: `{line(channel, 80)}` is not a channel; "
+                    f"{suggestion(channel, known, 'known:')}"
                 )
-                raise ValueError(f"sensors: `{line(channel, 80)}` is not a channel; known: {known}")
             if not any(channel in recording.samples for recording in recordings):
                 raise ValueError(f"sensors: no recording has samples of `{channel}`")
         for recording in recordings:
