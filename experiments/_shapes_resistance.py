@@ -342,7 +342,7 @@ def roll(case: Case, v: float, pad_length: float, rtol: float) -> Roll:
     run = simulate(made, torch.cat((torch.zeros(1, dtype=torch.float64), read)), y0=y0, rtol=rtol)
     x, work = run["x_disc"][1:], case.load * way
     power = sum((energy[-1] - energy[1]).item() / work for energy in run.dissipated.values())
-    force = torch.trapezoid(-run.load["disc"][1:, 0], x).item() / work
+    force = torch.trapezoid(-run.loads["disc"][1:, 0], x).item() / work
     surface = case.at.height + case.at.radius
     theory = moving_contact(case.at, case.material, case.load, v).coefficient
     return Roll(

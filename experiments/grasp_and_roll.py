@@ -35,12 +35,13 @@ from torchsoft import (
     Trajectory,
     simulate,
 )
-from torchsoft.channels import PADS
 from torchsoft.experiment import COARSE, markdown, options
 from torchsoft.experiment import write as write_files
 from torchsoft.plot import diagram as drawn
 from torchsoft.plot import figures as draw
 from torchsoft.plot.animation import animate
+from torchsoft.plot.dashboard import dashboard as draw_run
+from torchsoft.plot.player import player
 from torchsoft.scenario import grasp_and_roll
 
 
@@ -147,7 +148,8 @@ def summary(run: Run) -> dict[str, Any]:
 
     held = r["y_Br"][r.t >= 0.5]
     rolling_out = (r.t >= 1) & (r.t <= 9)
-    touching = {PADS[name]: (force[..., 0] > 0).sum(-1) for name, force in r.force.items()}
+    pads = {"L": "lower", "U": "upper"}
+    touching = {pads[name]: (force[..., 0] > 0).sum(-1) for name, force in r.force.items()}
     return {
         "x_C_mm": {str(time): at(time, r["x_C"], 1e3) for time in (0, 10, 15, 25, 30)},
         "y_C_grasp_mm": at(0.375, r["y_C"], 1e3),
@@ -232,22 +234,20 @@ def table(numbers: Mapping[str, Any]) -> str:
 def figures(result: Result) -> dict[str, Figure]:
     """Every figure by its file's name."""
     first = next(iter(result.runs.values()))
-    model, trajectory = first.model, first.trajectory
+    trajectory = first.trajectory
     out = {
-        "motion": draw.motion(trajectory),
-        "control_forces": draw.control_forces(trajectory),
-        "bracket_moment": draw.bracket_moment(trajectory),
-        "snapshots": draw.snapshots(trajectory, model),
-        "angular_momentum": draw.angular_momentum(trajectory),
-        "energy": draw.energy_balance(trajectory),
-        "multibond": drawn.multibond_graph(model),
+        "dashboard": draw_run(trajectory, title="Grasp and roll"),
+        "snapshots": draw.snapshots(trajectory, title="Grasp and roll (paper: Fig. 16)"),
+        "multibond": drawn.multibond_graph(first.model),
     }
-    for time in (0.125, 5.0):
+    for time, number in ((0.125, 14), (5.0, 15)):
         if time <= trajectory.t[-1]:
-            out[f"force_distribution_{time:g}s"] = draw.force_distribution(trajectory, model, time)
+            out[f"force_distribution_{time:g}s"] = draw.force_distribution(
+                trajectory, time, title=f"Contact forces at {time:g} s (paper: Fig. {number})"
+            )
     if len(result.runs) > 1:
-        pairs = {name: (run.model, run.trajectory) for name, run in result.runs.items()}
-        out["friction_sets"] = draw.friction_comparison(pairs)
+        runs = {name: run.trajectory for name, run in result.runs.items()}
+        out["friction_sets"] = draw.friction_comparison(runs, (0.375, 5.0), "F_x")
     return out
 
 
@@ -266,7 +266,12 @@ def write(result: Result) -> None:
     write_files(config, content, figures(result), table(content))
     if config.animation:
         frames = 12 if config.smoke else 150
-        animate(first.trajectory, first.model, config.out / "animation.gif", frames=frames)
+        title = "Grasp and roll; the first half second in slow motion"
+        animate(
+            first.trajectory, config.out / "animation.gif", frames=frames, title=title,
+            follow="disc.x", slow=0.5, progress=True,
+        )  # fmt: skip
+        player(first.trajectory, config.out / "player.html", title="Grasp and roll")
 
 
 def main() -> None:

@@ -26,7 +26,7 @@ from identify_contact import TRUTH
 from matplotlib.figure import Figure
 
 from torchsoft import Parameters, SoftGrasp, Taxels
-from torchsoft.excitation import CATALOGUE, Excitation, Strokes
+from torchsoft.excitation import CATALOGUE, Excitation, Strokes, begin
 from torchsoft.experiment import COARSE, markdown, options, timed, write
 from torchsoft.physics.motion import Reference
 from torchsoft.sysid import RIG, IdentificationResult, Problem, Recording, Unknown, identify, record
@@ -91,10 +91,9 @@ def sensors(*sets: str) -> dict[str, Sensor]:
 def recording(config: Config, truth: dict[str, float], name: str, motion: Excitation) -> Recording:
     """What all sensors give, with noise."""
     nominal = Parameters().override({"contact.v_s": config.v_s} | (COARSE if config.smoke else {}))
-    return record(
-        name, motion, nominal.override(dict(truth)), nominal, sensors(*SETS), seed=config.seed,
-        build=rig,
-    )  # fmt: skip
+    planned = begin(motion, nominal)
+    felt = rig(planned.rig.settings, planned.rig.reference)
+    return record(name, planned._replace(rig=felt), truth, sensors(*SETS), seed=config.seed)
 
 
 def problem(data: Recording, sets: tuple[str, ...], start: dict[str, float]) -> Problem:

@@ -519,9 +519,9 @@ def summary(result: Result) -> dict[str, Any]:
 
 def main(config: Config) -> None:
     result, wall = timed(lambda: run(config))
-    case, done = result.runs[DISC]
+    _, done = result.runs[DISC]
     stills = snapshots(
-        done, case.rig, (0.5, 1.1, 1.5, 2.5, 3.5, 4.5), "Turned by 90 degrees, then carried"
+        done, (0.5, 1.1, 1.5, 2.5, 3.5, 4.5), title="Turned by 90 degrees, then carried"
     )
     figures = {"orientation": figure(result), "snapshots": stills}
     write(result.config, summary(result) | {"wall_s": wall}, figures, table(result))
@@ -535,10 +535,8 @@ def main(config: Config) -> None:
     }
     for file, (name, title) in videos.items():
         if config.animation and name in result.runs:
-            (case, done), path, frames = result.runs[name], config.out / file, result.config.frames
-            animate(
-                done, case.rig, path, frames=frames, title=title, follow="disc.theta", even=True
-            )
+            (_, done), path, frames = result.runs[name], config.out / file, result.config.frames
+            animate(done, path, frames=frames, title=title, follow="disc.theta")
 
 
 if __name__ == "__main__":

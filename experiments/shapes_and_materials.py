@@ -70,8 +70,7 @@ from torchsoft.experiment import COARSE, markdown, options, timed, write
 from torchsoft.materials.presets import PRESETS
 from torchsoft.physics.material import Material
 from torchsoft.plot.animation import animate
-from torchsoft.plot.figures import STYLE, new_figure
-from torchsoft.plot.general import COLOURS
+from torchsoft.plot.figures import COLOURS, STYLE, new_figure
 from torchsoft.plot.scene import FRICTION, INK, NORMAL, Scene, instants
 from torchsoft.rigs.balance import LINEAR
 from torchsoft.solve.stability import loop_modes
@@ -243,10 +242,8 @@ def distributions(rolled: Mapping[str, Rolled], moments: Sequence[float], title:
         height_ratios=(1.3, *[1] * len(moments)),
     )
     for (top, *below), (name, one) in zip(grid.T, rolled.items()):
-        (instant,) = instants(
-            one.model, one.run, moments[len(moments) // 2 : len(moments) // 2 + 1]
-        )
-        Scene(top, one.model, columns=4).show(instant)
+        (instant,) = instants(one.run, moments[len(moments) // 2 : len(moments) // 2 + 1])
+        Scene(top, one.run.setup, columns=4).show(instant)
         x, y = instant.pose["disc"][:2]
         top.set(xlim=(x - 26, x + 26), ylim=(y - 30, y + 30), title=name)
         top.set_axis_off()
@@ -518,7 +515,7 @@ def main(config: Config) -> None:
             config.out / f"{name.replace(' ', '_')}.gif",
             f"{name.capitalize()}, {FORCE:g} N",
         )
-        animate(one.run, one.model, path, frames=72, title=title, follow="disc.theta", even=True)
+        animate(one.run, path, frames=72, title=title, follow="disc.theta")
 
 
 if __name__ == "__main__":

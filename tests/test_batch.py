@@ -167,7 +167,7 @@ def test_a_run_that_fails_leaves_the_others_alone(start: tuple[SoftGrasp, Tensor
             r"`contact.K_n` has shape \(\), but is given rows of shape \(1,\)",
         ),
         ({"parameters": {"contact.K_n": K_n[0]}}, "must have one entry a run"),
-        ({"parameters": {"contact.K_n": K_n.float()}}, "float64"),
+        ({"parameters": {"contact.K_n": K_n + 0j}}, "float64"),
         (
             {"parameters": {"contact.K_n": K_n}, "gradient": "continuous"},
             "a batch takes gradient='none'",

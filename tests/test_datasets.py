@@ -139,9 +139,7 @@ def read_everywhere(url: str, folder: Path) -> None:
     """The check, xarray and torch see behind `url` what they see in `folder`."""
     assert [x for x in check(url) if "commit" not in x] == []
     assert open_dataset(url).load().identical(open_dataset(str(folder)).load())
-    here, there = (
-        Trajectories(place, ["disc_position", "pad.E"], window=7) for place in (url, str(folder))
-    )
+    here, there = (Trajectories(place, ["x_C", "pad.E"], window=7) for place in (url, str(folder)))
     assert len(here) == len(there) == 5 * 13
     torch.testing.assert_close(here[20], there[20], rtol=0, atol=0)
 
@@ -154,7 +152,7 @@ def test_an_object_store_holds_the_same_bytes(made: tuple[Path, Config]) -> None
     read_everywhere(url, folder)
     fs = fsspec.filesystem("memory")
     fs.rm_file("/sets/rolling/finished/1.sha256")
-    fs.rm_file("/sets/rolling/disc_angle/c/1/0")
+    fs.rm_file("/sets/rolling/theta/c/1/0")
     assert Store(url, config).unfinished() == [1]
     generate(config, url, Serial(), progress=False)
     assert objects(url) == files(folder)
@@ -182,11 +180,11 @@ def test_another_shard_size_makes_the_same_data(made: tuple[Path, Config], tmp_p
 
 def test_xarray_opens_it_with_units(made: tuple[Path, Config]) -> None:
     data = xr.open_zarr(made[0])
-    assert dict(data.normal_force_lower.sizes) == {"trajectory": 5, "time": 91, "lower_surface": 61}
-    assert data.normal_force_lower.attrs["units"] == "N"
-    assert data.displacement_upper.dims == ("trajectory", "time", "upper_surface", "axis")
+    assert dict(data.normal_force_L.sizes) == {"trajectory": 5, "time": 91, "L_point": 61}
+    assert data.normal_force_L.attrs["units"] == "N"
+    assert data.displacement_U.dims == ("trajectory", "time", "U_point", "axis")
     assert all("units" in data[name].attrs for name in data.data_vars)
-    rest, grasp = (float(data.normal_force_lower.isel(trajectory=0, time=i).sum()) for i in (0, 50))
+    rest, grasp = (float(data.normal_force_L.isel(trajectory=0, time=i).sum()) for i in (0, 50))
     assert rest == pytest.approx(0.4065 * 9.81, rel=2e-3)  # [N], the disc's weight
     assert 20 < grasp < 120
 
@@ -209,8 +207,8 @@ def test_other_pads_and_contacts_are_kept_whole(
     generate(Config.from_toml(path), str(tmp_path / "set"), Serial(), progress=False)
     assert [x for x in check(str(tmp_path / "set")) if "commit" not in x] == []
     data = xr.open_zarr(tmp_path / "set")
-    assert (data.sizes["lower_surface"], data.sizes["store"]) == (points, stores)
-    assert float(data.normal_force_lower[0, 0].sum()) == pytest.approx(0.4065 * 9.81, rel=2e-3)
+    assert (data.sizes["L_point"], data.sizes["store"]) == (points, stores)
+    assert float(data.normal_force_L[0, 0].sum()) == pytest.approx(0.4065 * 9.81, rel=2e-3)
 
 
 def set_value(name: str, where: tuple[Any, ...], value: Any) -> Callable[[Path], None]:
@@ -300,14 +298,12 @@ def open_ledger(folder: Path) -> None:
     ("change", "message"),
     [
         (
-            consolidated("disc_angle", lambda a: a["attributes"].update(units="deg")),
-            "disc_angle: units are 'deg', not 'rad'",
+            consolidated("theta", lambda a: a["attributes"].update(units="deg")),
+            "theta: units are 'deg', not 'rad'",
         ),
         (
-            change_json(
-                "zarr.json", lambda g: g["consolidated_metadata"]["metadata"].pop("disc_spin")
-            ),
-            "disc_spin: missing",
+            change_json("zarr.json", lambda g: g["consolidated_metadata"]["metadata"].pop("omega")),
+            "omega: missing",
         ),
         (set_value("split", (1,), "test"), "trajectory 1: split is test, but the design has"),
         (set_value("split", (2,), "all"), "trajectory 2: split is"),
@@ -332,13 +328,13 @@ def open_ledger(folder: Path) -> None:
             r"manifest\.json: .*duration",
         ),
         (
-            set_value("normal_force_upper", (4, 60, 30), -1.0),
-            "trajectory 4: normal_force_upper pulls",
+            set_value("normal_force_U", (4, 60, 30), -1.0),
+            "trajectory 4: normal_force_U pulls",
         ),
-        (set_value("disc_position", (0, 3, 1), np.inf), "trajectory 0: not finite: disc_position"),
-        (set_value("disc_angle", (1, 7), np.nan), "trajectory 1: not finite: disc_angle"),
+        (set_value("x_C", (0, 3), np.inf), "trajectory 0: not finite: x_C"),
+        (set_value("theta", (1, 7), np.nan), "trajectory 1: not finite: theta"),
         (set_value("stored_energy", (1, 7, 2), 1.0), "trajectory 1: energy_residual is not"),
-        (set_value("contact_lower", (0, 60), 0), "acts where contact_lower is 0"),
+        (set_value("contact_L", (0, 60), 0), "acts where contact_L is 0"),
         (set_value("pad.E", (2,), 7.5e5), r"trajectory 2: pad\.E is 750000.0"),
         (set_value("failed", (3,), 1), "failed without a reason"),
     ],
@@ -359,17 +355,17 @@ def test_wrong_content_is_found(
     ("damage", "message"),
     [
         (
-            edit("disc_angle/c/0/0", flipped),
-            r"disc_angle/c/0/0 is damaged.*remove .*finished/0\.sha256 and start",
+            edit("theta/c/0/0", flipped),
+            r"theta/c/0/0 is damaged.*remove .*finished/0\.sha256 and start",
         ),
-        (edit("disc_angle/c/0/0", lambda data: data[:-40]), "disc_angle/c/0/0 is damaged"),
+        (edit("theta/c/0/0", lambda data: data[:-40]), "theta/c/0/0 is damaged"),
         (
             edit("feed_forward/c/1/0", lambda data: data[:9] + bytes(64) + data[73:]),
             "feed_forward/c/1/0 is damaged",
         ),
         (edit("grasp_force/c/2", flipped), "grasp_force/c/2 is damaged"),
-        (remove("disc_spin/c/1/0"), "disc_spin/c/1/0 is missing"),
-        (swap("disc_spin/c/0/0", "disc_spin/c/1/0"), "disc_spin/c/0/0 is damaged"),
+        (remove("omega/c/1/0"), "omega/c/1/0 is missing"),
+        (swap("omega/c/0/0", "omega/c/1/0"), "omega/c/0/0 is damaged"),
         (write("finished/1.sha256", b""), r"finished/1\.sha256 is damaged"),
         (edit("finished/1.sha256", flipped), r"finished/1\.sha256 is damaged|/c/1\S* is damaged"),
         (remove("finished/1.sha256"), "1 of 3 shards are not finished"),
@@ -401,7 +397,7 @@ def test_damage_is_found(
     with pytest.raises(StoreError, match=r"is damaged|is missing|are not finished") as refused:
         open_dataset(str(folder)).load()
     assert "\n" not in str(refused.value)
-    names = ["disc_angle", "feed_forward", "grasp_force", "disc_spin"]
+    names = ["theta", "F_ff", "grasp_force", "omega"]
     if (
         "time" not in message and "/c/1" not in message
     ):  # what is damaged may be of an array that it does not read
@@ -414,9 +410,7 @@ def every_window(url: str, names: list[str]) -> list[dict[str, torch.Tensor]]:
     return [windows[i] for i in range(len(windows))]
 
 
-@pytest.mark.parametrize(
-    "damage", [edit("disc_spin/zarr.json", flipped), write("disc_spin/copy", b"x")]
-)
+@pytest.mark.parametrize("damage", [edit("omega/zarr.json", flipped), write("omega/copy", b"x")])
 def test_damage_to_what_readers_do_not_open_is_found_by_the_check(
     made: tuple[Path, Config], tmp_path: Path, damage: Any
 ) -> None:
@@ -430,7 +424,7 @@ def test_a_file_behind_the_back_of_others_is_found_by_zarr_itself(
 ) -> None:
     """By the checksums of the arrays, without this package's reader."""
     folder = copy(made[0], tmp_path / "set")
-    for name in ("disc_angle/c/0/0", "grasp_force/c/1"):
+    for name in ("theta/c/0/0", "grasp_force/c/1"):
         edit(name, flipped)(folder)
         with pytest.raises(ValueError, match="checksum"):
             np.asarray(zarr.open_group(str(folder))[name.partition("/")[0]][:])
@@ -442,7 +436,7 @@ def test_standard_tools_check_the_shards(made: tuple[Path, Config], tmp_path: Pa
     folder = copy(made[0], tmp_path / "set")
     command = [tool, "--check", "--quiet", *(str(path) for path in (folder / "finished").iterdir())]
     assert subprocess.run(command, cwd=folder, capture_output=True, check=False).returncode == 0
-    edit("disc_angle/c/0/0", flipped)(folder)
+    edit("theta/c/0/0", flipped)(folder)
     assert subprocess.run(command, cwd=folder, capture_output=True, check=False).returncode != 0
 
 
@@ -465,18 +459,18 @@ def test_what_is_not_finite_is_not_written(
     config = made[1]
     store, design = open_or_create(str(tmp_path / "set"), config), points(config)
     row = simulate_task(config, task(config, 4, design[4]))
-    angle = row["disc_angle"].copy()
+    angle = row["theta"].copy()
     angle[3] = np.nan
     with pytest.raises(
-        ValueError, match="trajectory 4 is not marked as failed, but not finite: disc_angle"
+        ValueError, match="trajectory 4 is not marked as failed, but not finite: theta"
     ):
-        store.write(2, [row | {"disc_angle": angle}])
+        store.write(2, [row | {"theta": angle}])
     assert store.unfinished() == [0, 1, 2]
     series = simulation.series
-    monkeypatch.setattr(simulation, "series", lambda *given: series(*given) | {"disc_angle": angle})
+    monkeypatch.setattr(simulation, "series", lambda *given: series(*given) | {"theta": angle})
     row = simulate_task(config, task(config, 4, design[4]))
-    assert (row["failed"], row["reason"]) == (1, "not finite: disc_angle")
-    assert np.isnan(row["disc_angle"]).all()
+    assert (row["failed"], row["reason"]) == (1, "not finite: theta")
+    assert np.isnan(row["theta"]).all()
 
 
 def test_leftovers_of_the_dead_are_removed_and_files_of_the_living_are_not(
@@ -491,8 +485,8 @@ def test_leftovers_of_the_dead_are_removed_and_files_of_the_living_are_not(
     (folder / "zarr.json.0123456789abcdef.partial").write_bytes(b"half")
     (folder / "time/c/0.0123456789abcdef.partial").parent.mkdir(parents=True)
     (folder / "time/c/0.0123456789abcdef.partial").write_bytes(b"half")
-    with replacing(folder / "disc_angle/zarr.json") as partial:
-        partial.write_bytes(content["disc_angle/zarr.json"])
+    with replacing(folder / "theta/zarr.json") as partial:
+        partial.write_bytes(content["theta/zarr.json"])
         open_or_create(str(folder), config)
         assert list(folder.rglob("*.partial")) == [partial]
     generate(config, str(folder), Serial(), progress=False)
@@ -536,7 +530,7 @@ def test_a_failed_simulation_is_recorded(tmp_path: Path, monkeypatch: pytest.Mon
     assert data.failed.values.tolist() == [1]
     assert str(data.reason.values[0]) == "the disc was lost at t = 0.1 s"
     assert data.failure_time.values.tolist() == [0.1]
-    assert np.isnan(data.disc_position).all()
+    assert np.isnan(data.x_C).all()
     assert data["pad.E"].values[0] > 0
     assert [x for x in check(str(tmp_path / "set")) if "commit" not in x] == []
 
@@ -544,8 +538,8 @@ def test_a_failed_simulation_is_recorded(tmp_path: Path, monkeypatch: pytest.Mon
 def test_only_unfinished_shards_are_made_again(made: tuple[Path, Config], tmp_path: Path) -> None:
     folder, config = copy(made[0], tmp_path / "set"), made[1]
     remove("finished/1.sha256")(folder)
-    (folder / "disc_angle/c/1/0").unlink()
-    (folder / "disc_angle/c/1/0.0123456789abcdef.partial").write_bytes(b"half")
+    (folder / "theta/c/1/0").unlink()
+    (folder / "theta/c/1/0.0123456789abcdef.partial").write_bytes(b"half")
     before = {p: p.stat().st_mtime_ns for p in folder.rglob("c/**/*") if p.is_file()}
     generate(config, str(folder), Serial(), progress=False)
     assert files(folder) == files(made[0])
@@ -591,7 +585,7 @@ def test_a_file_size_limit_is_said_and_costs_nothing(
     open_or_create(str(tmp_path / "set"), made[1])
     command = [
         "-m",
-        "data_gen.generate",
+        "torchsoft.datasets.generate",
         str(path),
         "--out",
         str(tmp_path / "set"),
@@ -632,7 +626,7 @@ def kill_and_resume(folder: Path, config: Path, kills: range) -> None:
     command = [
         sys.executable,
         "-m",
-        "data_gen.generate",
+        "torchsoft.datasets.generate",
         str(config),
         "--out",
         str(out),
@@ -713,14 +707,14 @@ def reading(url: str, *what: Any, **how: Any) -> Trajectories:
 
 def test_windows_hold_what_the_store_holds(partial: str) -> None:
     data, stored = (
-        reading(partial, ["disc_position", "pad.E"], window=5, stride=40),
+        reading(partial, ["x_C", "pad.E"], window=5, stride=40),
         xr.open_zarr(partial),
     )
     assert data.trajectories.tolist() == [0, 1, 3]  # 2 failed, 4 is unfinished
     assert len(data) == 3 * 3
     item = data[4]  # the second window of trajectory 1
     assert (int(item["trajectory"]), int(item["start"])) == (1, 40)
-    np.testing.assert_array_equal(item["disc_position"], stored["disc_position"][1, 40:45])
+    np.testing.assert_array_equal(item["x_C"], stored["x_C"][1, 40:45])
     assert item["pad.E"] == float(stored["pad.E"][1])
     assert int(data[-1]["start"]) == 80
 
@@ -734,9 +728,9 @@ def test_splits_are_those_of_the_design(partial: str, made: tuple[Path, Config])
 
 def test_it_pickles_small_and_is_read_by_forked_workers_from_any_store(partial: str) -> None:
     fsspec.filesystem("memory").put(partial, "/copy/set", recursive=True)
-    plain = reading(partial, ["disc_position", "pad.E"], window=30, dtype=torch.float32)
+    plain = reading(partial, ["x_C", "pad.E"], window=30, dtype=torch.float32)
     for url in (partial, "memory://copy/set"):
-        data = reading(url, ["disc_position", "pad.E"], window=30, dtype=torch.float32)
+        data = reading(url, ["x_C", "pad.E"], window=30, dtype=torch.float32)
         data[0]  # opened before the fork
         assert len(pickle.dumps(data)) < 2000
         batches = list(
@@ -752,15 +746,15 @@ def test_it_pickles_small_and_is_read_by_forked_workers_from_any_store(partial: 
 
 def test_windows_in_memory_streamed_and_read_one_by_one_are_the_same(partial: str) -> None:
     """With each sweep in another order, and with workers that share the shards out."""
-    names, how = ["disc_position", "pad.E"], {"window": 5, "stride": 3, "dtype": torch.float32}
+    names, how = ["x_C", "pad.E"], {"window": 5, "stride": 3, "dtype": torch.float32}
     held, read = reading(partial, names, **how), reading(partial, names, **how, memory=0.0)
     assert (held.fits, read.fits) == (True, False)
     assert held.size == 3 * 4 * (91 * 2 + 1)
     for i in range(0, len(held), 7):
         torch.testing.assert_close(held[i], read[i], rtol=0, atol=0)
-    held[0]["disc_position"].zero_()
-    assert bool(held[0]["disc_position"].any())  # what is given is the user's own
-    wanted = {(int(x["trajectory"]), int(x["start"])): x["disc_position"] for x in held}
+    held[0]["x_C"].zero_()
+    assert bool(held[0]["x_C"].any())  # what is given is the user's own
+    wanted = {(int(x["trajectory"]), int(x["start"])): x["x_C"] for x in held}
     stream = read.streamed(shards=1, seed=3)
     for workers in (0, 2):
         loader = DataLoader(stream, num_workers=workers, timeout=60 * (workers > 0))
@@ -770,14 +764,14 @@ def test_windows_in_memory_streamed_and_read_one_by_one_are_the_same(partial: st
             found = [(int(x["trajectory"]), int(x["start"])) for x in sweep]
             assert sorted(found) == sorted(wanted)
             for one, x in zip(found, sweep):
-                torch.testing.assert_close(x["disc_position"][0], wanted[one], rtol=0, atol=0)
+                torch.testing.assert_close(x["x_C"][0], wanted[one], rtol=0, atol=0)
             orders.append(found)
         assert orders[0] != orders[1]
 
 
 def test_windows_come_fast_from_memory(partial: str) -> None:
     """Shuffled, two thousand a second and more on one core."""
-    windows = reading(partial, ["disc_position", "control_force", "pad.E"], window=20, stride=1)
+    windows = reading(partial, ["x_C", "F_y", "pad.E"], window=20, stride=1)
     began, count = time.process_time(), 0
     while time.process_time() - began < 0.5:
         for batch in DataLoader(windows, batch_size=64, shuffle=True):
@@ -789,7 +783,7 @@ def test_windows_come_fast_from_memory(partial: str) -> None:
     ("names", "how", "message"),
     [
         ([], {"memory": -1.0}, "`memory` must be a number of GiB, 0 or more"),
-        (["disc_pose"], {}, r"no numbers named 'disc_pose'; known: .*disc_position"),
+        (["disc_pose"], {}, r"no numbers named 'disc_pose'; known: .*x_C"),
         ([], {"window": 92}, "`window` must be 1 to 91"),
         *(([], {name: value}, f"`{name}` must be a whole number from 1 on, but is {value}")
           for name in ("window", "stride") for value in (0, 2.5)),

@@ -180,11 +180,11 @@ def test_arrays_have_the_names_of_the_rigs_parts_and_their_units(
     made: tuple[Path, Config],
 ) -> None:
     data = xr.open_zarr(made[0])
-    assert data.normal_force_below.dims == ("trajectory", "time", "lower_surface")
-    assert data.displacement_upper.dims == ("trajectory", "time", "upper_surface", "axis")
-    assert dict(data.lower_points.sizes) == {"lower_surface": 21, "axis": 2}
-    np.testing.assert_allclose(data.lower_surface, np.linspace(0, 80e-3, 21), atol=1e-15)
-    np.testing.assert_allclose(data.upper_points[:, 1], 5e-3)
+    assert data.normal_force_below.dims == ("trajectory", "time", "lower_point")
+    assert data.displacement_upper.dims == ("trajectory", "time", "upper_point", "axis")
+    assert dict(data.lower_places.sizes) == {"lower_point": 21, "axis": 2}
+    np.testing.assert_allclose(data.lower_point, np.linspace(0, 80e-3, 21), atol=1e-15)
+    np.testing.assert_allclose(data.upper_places[:, 1], 5e-3)
     units = {name: data[name].attrs["units"] for name in data.data_vars}
     wanted = {
         "omega_disc": "rad/s", "F_x": "N", "actuators.x.Kp": "N/m", "motion.y_d.values.1": "m",
@@ -193,7 +193,7 @@ def test_arrays_have_the_names_of_the_rigs_parts_and_their_units(
     }  # fmt: skip
     assert {name: units[name] for name in wanted} == wanted
     assert all("units" in data[name].attrs for name in data.variables if name in data.data_vars)
-    rest = data.normal_force_below[:, 0].sum("lower_surface").values
+    rest = data.normal_force_below[:, 0].sum("lower_point").values
     np.testing.assert_allclose(rest, data["bodies.disc.mass"] * 9.81, rtol=2e-3)
 
 

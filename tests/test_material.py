@@ -219,7 +219,9 @@ def test_relaxation_under_a_held_indentation_is_the_closed_form(material: Materi
     run = simulate(rig, SAMPLED, y0=y0, rtol=TIGHT, atol=1e-14)
     J, tau = material.chain()
     closed(
-        run, run.load["punch"][:, 1], 5e-5 * relaxed(1 / STIFFNESS, softness(rig) * J, tau, SAMPLED)
+        run,
+        run.loads["punch"][:, 1],
+        5e-5 * relaxed(1 / STIFFNESS, softness(rig) * J, tau, SAMPLED),
     )
 
 

@@ -3,6 +3,7 @@ draws something."""
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -30,10 +31,12 @@ from torchsoft import (
     simulate,
 )
 from torchsoft.physics.mesh import lame_moduli
+from torchsoft.physics.setup import von_mises
 from torchsoft.plot import figures
 from torchsoft.plot.animation import animate
+from torchsoft.plot.dashboard import dashboard, energy_groups, panels
 from torchsoft.plot.diagram import dot, graph_of, multibond_graph, positions
-from torchsoft.plot.scene import deformed_mesh, instants, straight_up
+from torchsoft.plot.scene import instants, straight_up
 from torchsoft.scenario import grasp_and_roll
 
 Done = tuple[SoftGrasp, Trajectory]
@@ -65,7 +68,7 @@ def test_deformed_mesh_is_the_surface_and_an_interior_in_equilibrium(
 ) -> None:
     model, run = manipulated(pad__enclosed=enclosed)
     pad, u = model.pads[which], run.displacement[which]
-    mesh = deformed_mesh(pad, u)
+    mesh = run.setup.pads[which].deformed(u.numpy())
     assert mesh.shape == (21, 61 * 3, 2)
     nodes = mesh.reshape(21, -1, 2)
     surface = nodes[:, pad.mesh.free[pad.mesh.surface]]
@@ -84,10 +87,43 @@ def test_deformed_mesh_is_the_surface_and_an_interior_in_equilibrium(
     assert np.abs(interior).max() < 1e-11 * np.abs(force).max()
 
 
+@pytest.mark.parametrize("which", ["L", "U"])
+def test_stress_of_a_uniform_strain_is_hookes(done: Done, which: str) -> None:
+    """Plane strain: every element of a pad that is stretched and sheared alike."""
+    pad = done[1].setup.pads[which]
+    gradient = np.array([[0.01, 0.004], [0.002, -0.02]])
+    strain = pad.strain(pad.mesh.nodes @ gradient.T)
+    np.testing.assert_allclose(strain, np.tile([0.01, -0.02, 0.003], (len(strain), 1)), atol=1e-14)
+    E, nu = pad.E, pad.nu
+    stiff = E / ((1 + nu) * (1 - 2 * nu))
+    xx = stiff * ((1 - nu) * 0.01 + nu * -0.02)
+    yy = stiff * (nu * 0.01 + (1 - nu) * -0.02)
+    zz, xy = nu * (xx + yy), E / (1 + nu) * 0.003
+    np.testing.assert_allclose(pad.stress(strain)[3], [xx, yy, zz, xy], rtol=1e-10)
+    deviator = np.array([[xx, xy, 0], [xy, yy, 0], [0, 0, zz]])
+    deviator -= np.eye(3) * np.trace(deviator) / 3
+    expected = np.sqrt(1.5 * (deviator**2).sum())
+    np.testing.assert_allclose(von_mises(pad.stress(strain)), expected, rtol=1e-10)
+
+
+def test_the_stress_under_a_contact_carries_its_force(done: Done) -> None:
+    """In a held grasp s_yy, summed along the bonded layer, balances the nodal forces."""
+    model = coarse(pad__elements_x=120, pad__elements_y=6)
+    start = grasp_and_roll(model, grasp_force=80.0)
+    run = simulate(model, torch.linspace(0, 0.6, 4, dtype=torch.float64), y0=start.y0)
+    pad = run.setup.pads["L"]
+    stress = pad.stress(pad.strain(pad.displacement(run.displacement["L"][-1].numpy())))
+    nodes = pad.mesh.nodes[pad.mesh.elements]
+    lowest = nodes[..., 1].min(1) == 0.0
+    width = np.ptp(nodes[lowest][..., 0], axis=1)
+    carried = -float((stress[lowest, 1] * width).sum()) * pad.depth
+    assert carried == pytest.approx(-float(run.state.pads["L"][-1, 0, :, 1].sum()), rel=1e-3)
+
+
 def test_friction_is_drawn_towards_the_right(done: Done) -> None:
     """In the grasp the pads are squeezed outwards, so friction on them points inwards, whichever
     pad."""
-    (instant,) = instants(*done, [0.2])
+    (instant,) = instants(done[1], [0.2])
     for k in "LU":
         x, friction = instant.points[k][:, 0], instant.force[k][:, 1]
         left, right = friction[x < 59], friction[x > 61]
@@ -139,7 +175,7 @@ def held() -> tuple[Rig, Trajectory]:
 
 def test_any_rig_is_drawn_where_its_bodies_are(held: tuple[Rig, Trajectory]) -> None:
     rig, run = held
-    (instant,) = instants(rig, run, [0.12])
+    (instant,) = instants(run, [0.12])
     assert all(bool((force[:, 0] > 0).any()) for force in instant.force.values())
     x, y, angle = run.state.pose["finger"][-1].tolist()
     c, s = np.cos(angle), np.sin(angle)
@@ -162,61 +198,74 @@ def test_any_rig_is_drawn_where_its_bodies_are(held: tuple[Rig, Trajectory]) -> 
     assert bool(
         ((d / [20.0, 14.0]) ** 2).sum(-1).max() < 1
     )  # a point that is loaded is inside the egg
-    figure = figures.snapshots(run, rig, [0.0, 0.12])
+    figure = figures.snapshots(run, [0.0, 0.12])
     axes = figure.axes[0]
     (left, right), (low, high) = axes.get_xlim(), axes.get_ylim()
     for mesh in instant.mesh.values():
         assert left <= mesh[..., 0].min() < mesh[..., 0].max() <= right
         assert low <= mesh[..., 1].min() < mesh[..., 1].max() <= high
-    assert len(axes.patches) == 3 + 2 + 3  # pads, bodies with a shape, plates behind the pads
+    assert len(axes.patches) == 3 + 2 + 3 + 2 * 4  # pads, bodies with a shape, plates, curves
 
 
 def test_energies_of_any_rig_are_all_in_the_balance(held: tuple[Rig, Trajectory]) -> None:
     _, run = held
-    drawn = sum(part for _, part, _ in figures.energy_groups(run))
+    drawn = sum(part for _, part, _ in energy_groups(run))
     total = sum([*run.energy.values(), *run.dissipated.values()])
     np.testing.assert_allclose(drawn, 1e3 * total.numpy(), rtol=1e-12)
 
 
 DRAWN: dict[str, Callable[[Rig, Trajectory], Figure]] = {
-    "motion": lambda m, r: figures.motion(r),
-    "control_forces": lambda m, r: figures.control_forces(r),
-    "bracket_moment": lambda m, r: figures.bracket_moment(r),
-    "angular_momentum": lambda m, r: figures.angular_momentum(r),
-    "force_distribution": lambda m, r: figures.force_distribution(r, m, 0.125),
-    "snapshots": lambda m, r: figures.snapshots(r, m, (0.05, 0.1, 0.15, 0.2)),
-    "snapshots_of_the_end": lambda m, r: figures.snapshots(r, m),
-    "energy_balance": lambda m, r: figures.energy_balance(r),
-    "friction_comparison": lambda m, r: figures.friction_comparison({"one": (m, r), "two": (m, r)}),
+    "dashboard": lambda m, r: dashboard(r),
+    "page": lambda m, r: dashboard(r, look="page"),
+    "column": lambda m, r: dashboard(r, look="column", only=("scene", *list(panels(r))[:2])),
+    "force_distribution": lambda m, r: figures.force_distribution(r, 0.125),
+    "snapshots": lambda m, r: figures.snapshots(r, (0.05, 0.1, 0.15, 0.2)),
+    "snapshots_of_the_end": lambda m, r: figures.snapshots(r),
+    "friction_comparison": lambda m, r: figures.friction_comparison(
+        {"one": r, "two": r}, (0.1, 0.2), next(iter(r))
+    ),
     "multibond_graph": lambda m, r: multibond_graph(m),
 }
 
 
-@pytest.mark.parametrize(
-    ("rig", "name"),
-    [*(("done", name) for name in DRAWN)]
-    + [
-        ("held", name)
-        for name in ("snapshots", "force_distribution", "energy_balance", "multibond_graph")
-    ],
-)
+@pytest.mark.parametrize("name", DRAWN)
+@pytest.mark.parametrize("rig", ["done", "held"])
 def test_figure_draws_something(rig: str, name: str, request: pytest.FixtureRequest) -> None:
+    """All of it within the figure, axes with labels, without a title where it is for print."""
     figure = DRAWN[name](*request.getfixturevalue(rig))
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     assert float(np.asarray(canvas.buffer_rgba())[..., :3].std()) > 5
-    if rig == "held":
+    assert bool(figure.get_suptitle()) == (name not in ("page", "column"))
+    if name == "multibond_graph":
         return
+    titles = [axes.get_title(loc="left") for axes in figure.axes if axes.get_title(loc="left")]
+    assert [title[0] for title in titles] == sorted(title[0] for title in titles)
     for axes in figure.axes:
-        if axes.get_visible() and axes.axison:
+        if axes.get_visible() and axes.get_label() != "<colorbar>":
             assert axes.has_data()
-            assert axes.get_ylabel() or name == "snapshots"
-    assert figure.get_suptitle()
-    assert name == "energy_balance" or "paper: Fig" in figure.get_suptitle()
+    width, height = figure.bbox.size
+    box = figure.get_tightbbox(canvas.get_renderer()).transformed(figure.dpi_scale_trans)
+    assert -2 <= box.x0 < box.x1 <= width + 2
+    assert -2 <= box.y0 < box.y1 <= height + 2
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ({"look": "pgae"}, "`look` must be one of screen, page, column.* did you mean `page`"),
+        ({"only": ["disc.yy"]}, "there is no panel `disc.yy`; did you mean `disc.y`"),
+    ],
+)
+def test_a_dashboard_that_there_is_not_is_refused(
+    done: Done, how: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        dashboard(done[1], **how)
 
 
 def test_save_writes_the_whole_file_or_none(done: Done, tmp_path: Path) -> None:
-    figures.save(figures.bracket_moment(done[1]), tmp_path / "moment.png", dpi=50)
+    figures.save(dashboard(done[1], only=["F_y"]), tmp_path / "moment.png", dpi=50)
     assert [path.name for path in tmp_path.iterdir()] == ["moment.png"]
     with Image.open(tmp_path / "moment.png") as picture:
         assert picture.format == "PNG"
@@ -238,8 +287,7 @@ def test_diagram_places_every_node_of_the_graph_by_itself(build: Callable[[], Ri
 
 
 def test_animation_moves(done: Done, tmp_path: Path) -> None:
-    model, run = done
-    animate(run, model, tmp_path / "run.gif", frames=4, dpi=40, progress=False)
+    animate(done[1], tmp_path / "run.gif", frames=4, dpi=40)
     assert [path.name for path in tmp_path.iterdir()] == ["run.gif"]
     with Image.open(tmp_path / "run.gif") as gif:
         assert gif.n_frames == 4
@@ -252,4 +300,6 @@ def test_animation_moves(done: Done, tmp_path: Path) -> None:
 
 def test_animation_in_an_unknown_format_is_refused(done: Done, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"must end in \.gif or \.mp4"):
-        animate(done[1], done[0], tmp_path / "run.avi")
+        animate(done[1], tmp_path / "run.avi")
+    with pytest.raises(ValueError, match=r"`follow` is `disk\.x`.* did you mean `disc\.x`"):
+        animate(done[1], tmp_path / "run.gif", follow="disk.x")

@@ -270,7 +270,7 @@ def test_records_of_a_run_and_of_a_dataset_are_the_same() -> None:
     run = simulate(
         model, torch.linspace(0, 0.2, 101, dtype=torch.float64), y0=y0, reference=reference
     )
-    one, series = record(run), run.to_dataset()
+    one, series = record(run), run.to_xarray()
     other = record({name: torch.from_numpy(series[name].values) for name in series}, run.t)
     assert all(np.array_equal(one.series[name], other.series[name]) for name in one.series)
     assert one.series["x_C"][0] == 0.0
@@ -283,10 +283,10 @@ def test_records_of_a_run_and_of_a_dataset_are_the_same() -> None:
     assert np.std(rough.series["v_C"] - one.series["v_C"]) == pytest.approx(
         0.05 * one.series["v_C"].std(), rel=0.3
     )
-    values = series["disc_spin"].values.copy()
+    values = series["omega"].values.copy()
     values[50] = np.nan
-    with pytest.raises(ValueError, match=r"'omega' \(disc_spin\) .* first at t = 0.1 s"):
-        record({name: series[name].values for name in series} | {"disc_spin": values}, run.t)
+    with pytest.raises(ValueError, match=r"'omega' \(omega\) .* first at t = 0.1 s"):
+        record({name: series[name].values for name in series} | {"omega": values}, run.t)
 
 
 def test_a_run_without_any_series_of_a_record_is_refused() -> None:
@@ -298,7 +298,7 @@ def test_a_run_without_any_series_of_a_record_is_refused() -> None:
     run = simulate(ready.rig, ready.t, y0=ready.y0)
     with pytest.raises(
         ValueError,
-        match=r"`source` has none of disc_position, .*, desired_x.*; take a run of `SoftGrasp`",
+        match=r"`source` has none of x_C, .*, x_d.*; take a run of `SoftGrasp`",
     ):
         record(run)
 

@@ -409,7 +409,7 @@ PARTS: list[tuple[Call, str]] = [
     (lambda: pushed()(0.0, torch.zeros(33, dtype=torch.float64)),
      "the reference has no signal `w`; it has none"),
     (lambda: coarse().parameter("pad.Young"),
-     r"`pad.Young` is not a parameter of this rig; near it: .*pad\.E"),
+     r"`pad.Young` is not a parameter of this rig; known: .*pad\.E"),
     (lambda: coarse().unpack(f64(0.0)), "`y` must be float64 of shape"),
     (lambda: coarse()(0.0, torch.zeros(376)), "`y` must be float64 of shape"),
     # verbs
@@ -478,7 +478,8 @@ def signal(change: Callable[[Tensor, Tensor], Tensor]) -> dict[str, Any]:
 
 FORWARD = {"gradient": "forward", "wrt": ["pad.E"]}
 RUNS: list[tuple[dict[str, Any], str]] = [
-    ({"t": [0.0, 1.0]}, "`t` must be a float64 tensor, but is list"),
+    ({"t": "soon"}, "`t` must be numbers .*, but is 'soon'"),
+    ({"t": [[0.0], [1.0, 2.0]]}, "`t` must be numbers"),
     ({"t": f64(0.0, 0.1, 0.1)}, "increase strictly"),
     ({"t": f64(0.0, 0.2, 0.1)}, r"t\[1:3\]"),
     ({"t": f64(0.0)}, "two times or more"),
@@ -487,10 +488,10 @@ RUNS: list[tuple[dict[str, Any], str]] = [
     ({"t": 1e-300 * T}, "must be further apart than 1e-12 s"),
     ({"t": f64(0.0, 1e299)}, r"ask for 1e\+300 steps, .*by tolerance no step is longer than 0\.1 "
                              r"s"),
-    ({"y0": torch.zeros(376)}, "must be float64"),
+    ({"y0": torch.zeros(376, dtype=torch.complex128)}, "must be float64"),
     ({"y0": f64(0.0, 0.0, 0.0)}, "must be float64 of shape"),
     ({"y0": torch.full((376,), NAN).double()}, "must be finite, but component 0"),
-    ({"y0": np.zeros(376)}, "`y0` must be a float64 tensor, but is ndarray"),
+    ({"y0": np.full(376, "0")}, "`y0` must be numbers"),
     ({"rig": SoftGrasp}, "`rig` must be a Rig"),
     ({"reference": {}}, "`reference` must be a Reference, but is dict"),
     *(({name: value}, f"`{name}` must be positive") for name in ("step",
@@ -507,11 +508,12 @@ RUNS: list[tuple[dict[str, Any], str]] = [
     ({"wrt": "pad.E", "gradient": "forward"}, "`wrt` must be a list of parameters' names"),
     ({"rigid": True}, "belong to gradient='forward'"),
     ({"dy0": torch.zeros(376, 1).double()}, "belong to gradient='forward'"),
-    (FORWARD | {"dy0": torch.zeros(376, 1)}, "`dy0` must be float64"),
+    (FORWARD | {"dy0": torch.zeros(376, 1) > 0}, "`dy0` must be float64"),
     (FORWARD | {"dy0": torch.zeros(3, 1).double()},
      r"`dy0` must have shape \(376, 1\), or more columns, but has"),
     (FORWARD | {"wrt": ["pad.E", "contact.K_x"]},
-     r"`contact.K_x` is not a parameter of this rig; near it: .*contact.K_n"),
+     r"`contact.K_x` is not a parameter of this rig; "
+     r"did you mean `contact.K_t`\? .known: .*contact.K_n"),
     (FORWARD | {"wrt": []}, "gradient='forward' needs the parameters' names `wrt`, or directions "
                             "`dy0`"),
     (FORWARD | {"wrt": ["contact.epsilon"]},

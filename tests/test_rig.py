@@ -77,7 +77,7 @@ def test_parameters_have_the_names_of_the_settings() -> None:
             is model.get_parameter(module_name)
         )
     with pytest.raises(
-        ValueError, match=r"`pad.Young` is not a parameter of this rig; near it: .*pad\.E"
+        ValueError, match=r"`pad.Young` is not a parameter of this rig; known: .*pad\.E"
     ):
         model.parameter("pad.Young")
     rolling = SoftGrasp(Parameters().override({"contact.friction": "coulomb"}))

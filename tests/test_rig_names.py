@@ -112,7 +112,7 @@ def test_gains_are_unknowns() -> None:
     assert problem.values(problem.coordinates.start, 0)[gain] == pytest.approx(400.0)
     with pytest.raises(ValueError, match=r"gain_1_2 = 0 is not on a logarithmic scale"):
         Problem([one], sensors, {"controllers.jaw.gain_1_2": Unknown()})
-    with pytest.raises(ValueError, match=r"near it: .*controllers\.jaw\.gain_1_1") as refused:
+    with pytest.raises(ValueError, match=r"known: .*controllers\.jaw\.gain_1_1") as refused:
         Problem([one], sensors, {"controllers.jaw.gain_1": Unknown()})
     assert len(str(refused.value)) < 300
 

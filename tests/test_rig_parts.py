@@ -213,7 +213,7 @@ def test_every_kind_of_part_is_built_written_and_runs(kind: str, folder: Path) -
         )
         assert kind != "file" or pad.material.get_parameter("E_1").item() == 1e5
     else:
-        assert float(runs(file).load["disc"][0, 1]) == pytest.approx(
+        assert float(runs(file).loads["disc"][0, 1]) == pytest.approx(
             disc.mass.item() * 9.81, rel=1e-3
         )  # it rests
 
@@ -397,7 +397,7 @@ STONE = {"x": 0.3e-3, "y": 30e-3, "theta": 0.0, "shape": {"kind": "circle", "rad
 
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "misspelt": ({"pads__lower__lenght": 0.1},
-        r"pads\.lower: `lenght` is not known here; is it `length`\?"),
+        r"pads\.lower: `lenght` is not known here; did you mean `length`\?"),
     "unknown": ({"gadgets": {}}, r"`gadgets` is not known here; known are title, gravity, bodies"),
     "millimetres": ({"pads__lower__length": 80.0},
         r"pads\.lower\.length: should be from 1e-06 to 10 m, not 80"),

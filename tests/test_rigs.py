@@ -420,8 +420,8 @@ def test_run_writes_everything(small: Path, tmp_path: Path, capsys: Any) -> None
     assert "0.1 s simulated" in out
     assert "note: actuators: stable" in err
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    figures = {f"{name}.png" for name in ("snapshots", "motion", "forces", "energy")}
-    assert names == {"trajectory.nc", "summary.json", "video.gif"} | figures
+    figures = {f"{name}.png" for name in ("snapshots", "dashboard")}
+    assert names == {"trajectory.nc", "summary.json", "video.gif", "player.html"} | figures
     for name in figures:
         with Image.open(tmp_path / "out" / name) as picture:
             assert np.ptp(np.asarray(picture.convert("L"))) > 100

@@ -59,8 +59,8 @@ def test_values_set_on_the_module_run_and_are_saved(tmp_path: Path) -> None:
     run.save(tmp_path / "run.nc")
     with xr.open_dataset(tmp_path / "run.nc", engine="h5netcdf") as saved:
         assert '"contact.K_n": 200000.0' in saved.attrs["parameters"]
-        np.testing.assert_array_equal(saved["disc_position"][:, 0], run["x_C"])
-        np.testing.assert_array_equal(saved["disc_angle"], run["theta"])
+        np.testing.assert_array_equal(saved["x_C"], run["x_C"])
+        np.testing.assert_array_equal(saved["theta"], run["theta"])
 
 
 class Polygonal(Shape):

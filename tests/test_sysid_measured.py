@@ -124,10 +124,10 @@ BAD: dict[str, tuple[Change, str]] = {
     "wrong dimension": (put(1, THETA, "theta [mm]"),
         r"row 1, column `theta` cannot be in 'mm'; it can be in rad"),
     "unknown column": (
-        put(1, X_C, "x_c [mm]"), r"column `x_c` is not known: is it `x_C`\?.* ignore = \['x_c'\]; "
-                                 r"columns are t, x_d",
+        put(1, X_C, "x_c [mm]"),
+        r"`x_c` is not known: did you mean `x_C`\?.* ignore = \['x_c'\]; columns are t, x_d",
     ),
-    "misspelt column": (put(1, F_FF, "Fff [N]"), r"column `Fff` is not known: is it `F_ff`\?"),
+    "misspelt column": (put(1, F_FF, "Fff [N]"), r"`Fff` is not known: did you mean `F_ff`\?"),
     "another column": (put(1, X_C, "Ventil"),
         r"column `Ventil` is not known; if it has nothing to do with the motion, say"),
     "no feed-forward": (
@@ -427,7 +427,7 @@ def test_a_trajectory_file_is_a_recording(run: Trajectory, tmp_path: Path) -> No
     np.testing.assert_allclose(got, desired, atol=1e-12)
     assert paper_settings(one).scenario.y_Br_grasp == pytest.approx(float(desired[:, 2].min()))
     older = tmp_path / "older.nc"  # without the rate of y_d
-    save(run.to_dataset().drop_vars("desired_y_velocity"), older)
+    save(run.to_xarray().drop_vars("y_d_dot"), older)
     table = read_table(older)
     assert "y_d_dot" not in table.values
     with torch.no_grad():
@@ -438,12 +438,12 @@ def test_a_trajectory_file_is_a_recording(run: Trajectory, tmp_path: Path) -> No
 
 
 def not_finite(data: xr.Dataset) -> xr.Dataset:
-    data["disc_angle"][7] = np.nan
+    data["theta"][7] = np.nan
     return data
 
 
 def in_degrees(data: xr.Dataset) -> xr.Dataset:
-    data["disc_angle"].attrs["units"] = "deg"
+    data["theta"].attrs["units"] = "deg"
     return data
 
 
@@ -451,11 +451,11 @@ def in_degrees(data: xr.Dataset) -> xr.Dataset:
     ("change", "message"),
     [
         (lambda data: xr.Dataset({"time": ("time", [0.0, 1.0])}),
-         r"is not a trajectory file: it has no desired_x, "),
+         r"is not a trajectory file of this rig: it has no time and channels"),
         (not_finite, r", sample 7, `theta` is not a finite number"),
-        (in_degrees, r", `disc_angle` should be in rad, not 'deg'"),
-        (lambda data: data.assign(desired_x=("time", ["here"] * 31)),
-         r"is not a trajectory file: `desired_x` should be float64 over time"),
+        (in_degrees, r", `theta` should be in rad, not 'deg'"),
+        (lambda data: data.assign(x_d=("time", ["here"] * 31)),
+         r"is not a trajectory file: `x_d` should be float64 over time"),
         (lambda data: data.isel(time=[0, 1, 2, 2, *range(3, 31)]),
          r", sample 3, column `t`: the time 0.004 s is there twice"),
         (None, "has no checksum at its end"),
@@ -468,7 +468,7 @@ def test_a_mistake_in_a_trajectory_file_is_named(
     if change is None:
         path.write_text("not a file of this kind")
     else:
-        save(change(run.to_dataset().copy(deep=True)), path)
+        save(change(run.to_xarray().copy(deep=True)), path)
     with pytest.raises(ValueError, match=rf"bad\.nc ?{message}"):
         read_table(path)
 

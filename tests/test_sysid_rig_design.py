@@ -115,7 +115,7 @@ def replaced(old: str, new: str) -> Callable[[str], str]:
     ("change", "words"),
     [
         (lambda text: text.replace(text.splitlines()[1], ""), "a design is of the rig of a file"),
-        (replaced("x_upper = ", "x_uper = "), "limits.x_uper = .* near it: x_upper"),
+        (replaced("x_upper = ", "x_uper = "), "limits.x_uper = .* did you mean `x_upper`\\?"),
         (replaced("twist.motion", "twist.motions"), "design.candidates.twist: `motions` is not"),
         (replaced("theta_d = {low", "theta = {low"), "no Profile called `theta`"),
         (replaced("[design.bounds]", "[design.bound]"), "bound"),

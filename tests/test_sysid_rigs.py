@@ -152,7 +152,7 @@ REFUSALS: dict[str, tuple[str, Callable[[str], str], str]] = {
     ),
     "columns alone": (TOML, replaced('rig = "rig.toml"', ""), "columns rename those of a `rig`"),
     "unit": (CSV, replaced("camera (mm)", "camera (kg)"), "column `camera` cannot be in 'kg'"),
-    "column": (CSV, replaced("y_disc", "y_dsk"), "`y_dsk` is not known: is it `y_disc`"),
+    "column": (CSV, replaced("y_disc", "y_dsk"), "`y_dsk` is not known: did you mean `y_disc`"),
     "own name": (CSV, replaced("camera", "x_disc"), "`x_disc` is not known"),
     "too long": (
         TOML,

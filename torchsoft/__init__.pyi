@@ -28,6 +28,8 @@ from .solve.stepper import METHOD
 from .solve.torchdiffeq import register_method
 from .solve.trajectory import Trajectory
 
+__version__: str
+
 __all__ = [
     "METHOD",
     "PD",

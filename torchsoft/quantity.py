@@ -9,7 +9,6 @@ import inspect
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from functools import cache
 from types import MappingProxyType
 from typing import Annotated, Any, get_args, get_origin
@@ -84,18 +83,6 @@ def quantity_of(part: object, name: str) -> Quantity | None:
     entry of "tau", "gain_1_3" of "gain", "own_inertia" the argument "inertia"."""
     known, name = quantities(type(part)), name.removeprefix("own_")
     return known.get(name, known.get(re.sub(r"(_\d+)+$", "", name)))
-
-
-SHOWN = 5
-"""Names in a message at the most."""
-
-
-def near(name: str, known: Iterable[str]) -> str:
-    """The known names that may be meant, in the words of a message."""
-    every = list(known)
-    found = get_close_matches(name, every, n=SHOWN, cutoff=0.4)
-    rest = ", ..." if len(every) > SHOWN else ""
-    return f"near it: {', '.join(found)}" if found else f"known: {', '.join(every[:SHOWN])}{rest}"
 
 
 Length = Annotated[float, Quantity("m", 1e-6, 10.0)]

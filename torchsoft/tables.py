@@ -8,9 +8,8 @@ import json
 import re
 import reprlib
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self, TypeVar
 from unicodedata import category
@@ -176,13 +175,6 @@ def line(text: Any, length: int = 600) -> str:
     """Text as one line of limited length, without control characters."""
     one = plain(" ".join(str(text).split()))
     return one if len(one) <= length else one[: length - 3] + "..."
-
-
-def near(name: str, known: Iterable[str]) -> str:
-    """The known names that may be meant, in the words of a message."""
-    every = list(known)
-    found = get_close_matches(name, every, n=5, cutoff=0.4)
-    return f"near it: {', '.join(found)}" if found else line(f"known: {', '.join(every)}")
 
 
 def toml_value(value: Any) -> str:

@@ -134,7 +134,7 @@ def balanced(run: Trajectory, said: list[str]) -> None:
     stored, out, put_in = (
         torch.stack(list(x.values())).sum(0) for x in (run.energy, run.dissipated, run.supplied)
     )
-    kinds = run.channels, run.force, run.load, run.energy, run.dissipated, run.supplied
+    kinds = run.channels, run.force, run.loads, run.energy, run.dissipated, run.supplied
     parts = [run.y, run.injected, *(x for kind in kinds for x in kind.values())]
     assert all(bool(torch.isfinite(x).all()) for x in parts), "not finite"
     scale = max(float(stored[0] + run.injected[-1]), NEGLIGIBLE)

@@ -203,7 +203,7 @@ PATHS = (
     "a\nb.csv", "x" * 300, "é.toml", "",
 )  # fmt: skip
 OPTIONS = "--workers", "--out", "--yes", "--seed", "--rtol", "--checkpoint", "--no-progress"
-IDENTIFY, GENERATE = ("torchsoft", "identify"), ("data_gen.generate",)
+IDENTIFY, GENERATE = ("torchsoft", "identify"), ("torchsoft.datasets.generate",)
 COMMANDS: tuple[tuple[tuple[str, ...], str, str], ...] = (
     (IDENTIFY, "data.csv rig.toml --rtol 1e-300", "rtol"),
     (IDENTIFY, "data.csv many.toml", "--yes"),
@@ -299,7 +299,7 @@ def test_terminals_that_know_ascii_only(tally: Lines, tmp_path: Path) -> None:
     data.write_text(csv_text(cells()), encoding="utf-8")
     identify = "-m", "torchsoft", "identify"
     experiment = str(ROOT / "experiments" / "grasp_and_roll.py")
-    for command in (identify, ("-m", "data_gen.generate"), (experiment,)):
+    for command in (identify, ("-m", "torchsoft.datasets.generate"), (experiment,)):
         expect(line, *command, "--help", **LOCALES[-1])
     command = *identify, str(data), str(config), "--out", str(out), "--no-progress"
     config.write_text("# Reibung µ, Größe θ\n" + IDENTIFICATION, encoding="utf-8")

@@ -1,4 +1,5 @@
-"""The command `torchsoft`: rigs in files, identification from files, and materials from tests."""
+"""The command `torchsoft`: rigs in files, identification from files, materials from tests, and
+pictures of runs."""
 
 import argparse
 import io
@@ -12,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 
-from torchsoft.cli import design, identify, material, rigs
+from torchsoft.cli import design, identify, material, plot, rigs
 from torchsoft.cli.results import failed, say
 
 GRACE = 1.5
@@ -63,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--version", action="version", version=f"torchsoft {version('torchsoft')}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (rigs, identify, design, material):
+    for group in (rigs, identify, design, material, plot):
         group.add_commands(commands)
     for stream in (sys.stdout, sys.stderr):  # a terminal that cannot show a sign gets its number
         if isinstance(stream, io.TextIOWrapper):
@@ -79,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         try:
             return options.run(options)
-        except (ValueError, RuntimeError) as error:
+        except (ValueError, RuntimeError, ModuleNotFoundError) as error:
             return failed(str(error))
         except OSError as error:
             return failed(f"{error.filename}: {error.strerror}" if error.filename else str(error))

@@ -1,6 +1,10 @@
 """Synthetic rolling datasets: designed, simulated, written shard by shard, checked, and read for
 training."""
 
-from torchsoft.datasets.reader import Trajectories, open_dataset
+from torchsoft.extras import needed
+
+needed("zarr", "datasets")
+
+from torchsoft.datasets.reader import Trajectories, open_dataset  # noqa: E402
 
 __all__ = ["Trajectories", "open_dataset"]

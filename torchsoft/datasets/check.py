@@ -1,9 +1,10 @@
-"""Re-read a dataset and list what is wrong with it: `python -m data_gen.check DIR`.
+"""Re-read a dataset and list what is wrong with it: `python -m torchsoft.datasets.check DIR`.
 
 One line a finding; exit status 1 if there is any. `--picture FILE` draws what the set covers.
 """
 
 import argparse
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,8 +23,8 @@ from torchsoft.files import PARTIAL
 from torchsoft.plot.figures import save
 from torchsoft.tables import line
 
-MOTIONS = {"disc_position": 0, "bracket_position": 1, "control_force": 1}
-"""Variables that the picture shows over time, and which of their components."""
+MOTIONS = ("x_C", "y_Br", "F_y")
+"""Channels that the picture shows over time."""
 
 MOST = 3
 """Trajectories that it shows, of every kind of motion."""
@@ -216,11 +217,8 @@ def figure(data: xr.Dataset, config: Config) -> Figure:
     sound = table[table["failed"] == 0]
     some = (sound.groupby("kind").head(MOST) if "kind" in by else sound.head(MOST)).index
     for ax, name in zip(panels[-1, 1:], moving(data, config)):
-        series, axis = data[name], "xy"[MOTIONS.get(name, 0)]
-        series = series.sel(axis=axis) if "axis" in series.dims else series
-        ax.plot(data.time, series[some].T, lw=0.7)
-        ax.set(xlabel="time [s]", ylabel=f"{name}, {axis} [{data[name].units}]" if name in MOTIONS
-               else f"{name} [{data[name].units}]")  # fmt: skip
+        ax.plot(data.time, data[name][some].T, lw=0.7)
+        ax.set(xlabel="time [s]", ylabel=f"{name} [{data[name].units}]")
     for ax in fig.axes:
         ax.tick_params(axis="x", labelsize=7, which="both", rotation=20)
     return fig
@@ -239,7 +237,7 @@ def moving(data: xr.Dataset, config: Config) -> list[str]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m data_gen.check", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m torchsoft.datasets.check", description=__doc__)
     parser.add_argument("store", help="folder or fsspec URL")
     parser.add_argument(
         "--picture", type=Path, help="where to write a picture of what the set covers"
@@ -262,3 +260,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(line(f"no summary or picture: {type(error).__name__}: {error}"))
     print("sound" if count == 0 else f"{count} findings")
     return int(count > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

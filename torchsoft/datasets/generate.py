@@ -1,5 +1,5 @@
-"""Make a dataset: `python -m data_gen.generate CONFIG.toml --out DIR [--workers N] [--scheduler
-tcp://...]`.
+"""Make a dataset: `python -m torchsoft.datasets.generate CONFIG.toml --out DIR [--workers N]
+[--scheduler tcp://...]`.
 
 Started again on the same folder it makes what is missing. Ctrl-C and kill are safe at any moment.
 """
@@ -145,7 +145,9 @@ def dask_cluster(address: str) -> Iterator[Executor]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m data_gen.generate", description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog="python -m torchsoft.datasets.generate", description=__doc__
+    )
     parser.add_argument("config", type=Path, help="TOML file, see data_gen/configs")
     parser.add_argument("--out", required=True, help="folder or fsspec URL of the store")
     workers = "threads, or processes if more than a few"
@@ -196,3 +198,7 @@ def main(arguments: list[str] | None = None) -> int:
         "each with its reason"
     )
     return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from torchsoft.channels import PADS, VARIABLES
+from torchsoft.channels import CHANNELS
 from torchsoft.datasets.distributions import Frequencies, Lengths, Range, Times
 from torchsoft.datasets.schema import Label, Signal
 from torchsoft.datasets.subject import (
@@ -23,6 +23,7 @@ from torchsoft.datasets.subject import (
     split,
     stated_steps,
 )
+from torchsoft.display import suggestion
 from torchsoft.excitation import MOST, Excitation, reference
 from torchsoft.paper.equilibrium import holding_force, press, rest
 from torchsoft.paper.parameters import Parameters, check
@@ -54,11 +55,14 @@ FORCE = 4
 """Decimals that grasping forces [N] are rounded to."""
 
 SIGNALS = {
-    name: Signal(one.unit, one.meaning, tuple(one.symbols))
-    for name, one in VARIABLES.items()
-    if name not in ("time", "angular_momentum")
+    name: Signal(one.unit, one.meaning)
+    for name, one in CHANNELS.items()
+    if name not in ("t", "angular_momentum")
 }
-"""Series of the rig's channels that a dataset keeps of every trajectory."""
+"""Channels that a dataset keeps of every trajectory."""
+
+PADS = {"L": "lower", "U": "upper"}
+"""Pads by their names, in words."""
 
 
 class RandomMotion(Table):
@@ -154,25 +158,13 @@ class PaperGrasp(Subject):
     def template(self) -> SoftGrasp:  # pyright: ignore[reportIncompatibleVariableOverride]
         return SoftGrasp(Parameters().override(self.config.fixed))
 
-    @property
-    def surfaces(self) -> dict[str, str]:
-        return PADS
-
-    def touching(self, pad: str) -> dict[str, str]:
-        return {pad: PADS[pad]}
-
     def columns(self) -> dict[str, tuple[tuple[str, ...], NDArray[np.float64], str, str]]:
-        lower, upper = (
-            self.template.pads[key].point_positions[:, 0].numpy() for key in self.surfaces
-        )
         return {
-            "lower_surface": (
-                ("lower_surface",), lower, "m", "x of the lower pad's surface nodes, undeformed"
-            ),
-            "upper_surface": (
-                ("upper_surface",), upper, "m",
-                "x of the upper pad's, relative to the bracket's centre",
-            ),
+            f"{pad}_point": (
+                (f"{pad}_point",), self.template.pads[pad].point_positions[:, 0].numpy(), "m",
+                f"x of the {words} pad's contact points in its base's frame, undeformed",
+            )
+            for pad, words in PADS.items()
         }  # fmt: skip
 
     @property
@@ -299,7 +291,7 @@ class PaperGrasp(Subject):
                 )
             if name not in DEFAULTS and where != f"parameters.{RATIO}":
                 raise ValueError(
-                    f"{where} is not a parameter; known: {', '.join(DEFAULTS)}, {RATIO}"
+                    f"{where} is not a parameter; {suggestion(name, (*DEFAULTS, RATIO), 'known:')}"
                 )
             if name in config.parameters and name in config.fixed:
                 raise ValueError(f"{where} is in `fixed` as well; leave one of them out")

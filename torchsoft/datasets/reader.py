@@ -18,6 +18,7 @@ from zarr.storage import FsspecStore, LocalStore, WrapperStore
 from torchsoft.cost import machine_memory
 from torchsoft.datasets.files import Manifest, StoreError, digest, folder, read_record, record_key
 from torchsoft.datasets.subject import SPLITS
+from torchsoft.display import suggestion
 from torchsoft.physics.arguments import whole
 
 DTYPES = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
@@ -44,8 +45,8 @@ class Vouched(WrapperStore[Store]):
         if (lacking := self.layout.shards - len(self.finished)) and not unfinished:
             raise StoreError(
                 f"{url}: {lacking} of {self.layout.shards} shards are not finished; start `python "
-                "-m data_gen.generate` again to make them, or give `unfinished=True` to leave "
-                "their trajectories out"
+                "-m torchsoft.datasets.generate` again to make them, or give `unfinished=True` to "
+                "leave their trajectories out"
             )
         here = folder(url)
         super().__init__(
@@ -150,8 +151,8 @@ class Trajectories(Dataset[dict[str, Tensor]]):
         for name in self.variables:
             if name not in known:
                 raise ValueError(
-                    f"`variables` has no numbers named {name!r}; known: "
-                    f"{', '.join(sorted(map(str, known)))}"
+                    f"`variables` has no numbers named {name!r}; "
+                    f"{suggestion(name, sorted(map(str, known)), 'known:')}"
                 )
         self.window = samples if window is None else whole("window", window, 1)
         if self.window > samples:

@@ -213,7 +213,7 @@ class RigOfFile(Subject):
         with torch.no_grad():
             known = channels(rig, state, nothing, moments)
         meanings, of = dict(channel_meanings(rig)), units(rig)
-        return {key: Signal(of[key], meanings[key], (key,)) for key in known}
+        return {key: Signal(of[key], meanings[key]) for key in known}
 
     @property
     def signals(self) -> dict[str, Signal]:  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -223,13 +223,13 @@ class RigOfFile(Subject):
     def columns(self) -> dict[str, tuple[tuple[str, ...], NDArray[np.float64], str, str]]:
         out = {}
         for pad, name in self.surfaces.items() if self.config.nodal else ():
-            at, surface = own_points(self.template, pad), f"{name}_surface"
+            at, surface = own_points(self.template, pad), f"{name}_point"
             along = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(at, axis=0), axis=1)))
             out[surface] = (
                 (surface,), along, "m",
                 f"way along the surface of the {name} pad from its first contact point, undeformed",
             )  # fmt: skip
-            out[f"{name}_points"] = (
+            out[f"{name}_places"] = (
                 (surface, "axis"), at, "m",
                 f"places of the contact points in the {name} pad's own frame, undeformed",
             )  # fmt: skip

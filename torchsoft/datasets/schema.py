@@ -14,11 +14,10 @@ if TYPE_CHECKING:
 
 
 class Signal(NamedTuple):
-    """A series of every trajectory: unit, meaning, and the channels that are its components."""
+    """A channel of every trajectory: unit and meaning."""
 
     unit: str
     meaning: str
-    channels: tuple[str, ...]
 
 
 class Label(NamedTuple):
@@ -86,7 +85,7 @@ def nodal(subject: "Subject") -> dict[str, Variable]:
     for pad, surface in subject.surfaces.items():
         point = "contact point" if rig.pads[pad].points else "surface node"
         per = f"each {point} of the {surface} pad"
-        where = series | {f"{surface}_surface": len(rig.pads[pad].point_nodes)}
+        where = series | {f"{surface}_point": len(rig.pads[pad].point_nodes)}
         for contact, name in subject.touching(pad).items():
             out[f"normal_force_{name}"] = Variable(where, "N", f"normal force at {per}", precision)
             out[f"friction_force_{name}"] = Variable(
@@ -106,8 +105,8 @@ def arrays(subject: "Subject") -> dict[str, Variable]:
     config, out = subject.config, dict[str, Variable]()
     single = {"trajectory": config.trajectories}
     series = single | {"time": config.samples}
-    for name, (unit, meaning, keys) in subject.signals.items():
-        out[name] = Variable(series | {"axis": 2} if len(keys) > 1 else series, unit, meaning)
+    for name, (unit, meaning) in subject.signals.items():
+        out[name] = Variable(series, unit, meaning)
     more = nodal(subject) if config.nodal else {}
     for kind, (dimension, parts) in energies(subject).items():
         meaning = "energy stored" if kind == "stored" else f"{kind} since t = 0"

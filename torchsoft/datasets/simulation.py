@@ -69,10 +69,7 @@ def simulate_task(config: Config, task: Task) -> Row:
 @torch.no_grad()
 def series(subject: Subject, rig: Rig, run: Trajectory) -> Row:
     """The series and numbers of a finished run."""
-    out: Row = {}
-    for name, (_, _, keys) in subject.signals.items():
-        values = run.together(*keys)
-        out[name] = (values if len(keys) > 1 else values[:, 0]).numpy()
+    out: Row = {name: run[name].numpy() for name in subject.signals}
     for pad, surface in subject.surfaces.items() if subject.config.nodal else ():
         for contact, name in subject.touching(pad).items():
             out[f"normal_force_{name}"] = run.force[contact][..., 0].numpy()

@@ -1,12 +1,16 @@
 """Numbers given by the caller: taken as they are, or refused with a sentence that names them."""
 
 import math
+from collections.abc import Sequence
 from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+
+Numbers = Tensor | np.ndarray[Any, Any] | Sequence[Any]
+"""Numbers in any usual form."""
 
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 """Units [m] in which files may give lengths."""
@@ -35,6 +39,24 @@ def whole(name: str, value: Any, least: int) -> int:
     if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
         raise ValueError(f"`{name}` must be a whole number from {least} on, but is {value!r}")
     return int(value)
+
+
+def tensor(name: str, value: Any) -> Tensor:
+    """Numbers as a float64 tensor: a tensor with its graph, numpy's arrays, lists. Raises
+    `ValueError` for what are no numbers; tensors that no run can take stay as they are."""
+    if isinstance(value, Tensor):
+        usual = value.device.type == "cpu" and value.layout == torch.strided
+        real = not value.dtype.is_complex and value.dtype != torch.bool
+        return value.double() if usual and real and value.dtype != torch.float64 else value
+    try:
+        given = np.asarray(value)
+    except (TypeError, ValueError, RuntimeError):  # of several lengths, or tensors with graphs
+        given = np.zeros(0, object)
+    if given.dtype.kind not in "iuf":
+        raise ValueError(
+            f"`{name}` must be numbers (a tensor, an array or a list), but is {line(value)}"
+        )
+    return torch.from_numpy(given.astype(np.float64))
 
 
 def places(name: str, value: Any) -> Tensor:

@@ -10,6 +10,7 @@ import torch
 from scipy.linalg import solve_banded
 from torch import Tensor, nn
 
+from torchsoft.display import suggestion
 from torchsoft.physics.arguments import line
 
 FADE = 0.15
@@ -320,8 +321,10 @@ class Reference(nn.Module):
         rows = []
         for name in names:
             if name.replace(".", ":") not in self.signals:
-                known = ", ".join(key.replace(":", ".") for key in self.signals) or "none"
-                raise ValueError(f"the reference has no signal `{name}`; it has {known}")
+                known = [key.replace(":", ".") for key in self.signals]
+                raise ValueError(
+                    f"the reference has no signal `{name}`; {suggestion(name, known, 'it has')}"
+                )
             rows.append(self._asked(name, t))
         return torch.stack(rows, -2) if rows else t.new_zeros((*t.shape, 0, 2))
 

@@ -12,16 +12,17 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
+from torchsoft.display import Shown, suggestion
 from torchsoft.physics.condensed import free_rates, nodal, nodal_forces
 from torchsoft.physics.contact import Frame, cross, interface_law, moving_frame, turned
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.multibond import Block, Junction, Port, Transformer, identity, net_efforts
 from torchsoft.physics.pads import Pad
-from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, gain_unit, law_name
+from torchsoft.physics.parts import COORDINATES, Actuator, Body, Contact, gain_unit
 from torchsoft.physics.shapes import parameter
 from torchsoft.physics.state import Layout, State
-from torchsoft.physics.taxels import Taxels
-from torchsoft.quantity import Gravity, Quantity, near, quantity_of
+from torchsoft.physics.taxels import Taxels, check_taxels
+from torchsoft.quantity import Gravity, Quantity, quantity_of
 
 GROUND = "ground"
 
@@ -59,7 +60,7 @@ class Evaluation(NamedTuple):
     interfaces: dict[str, Interface]
 
 
-class Rig(nn.Module):
+class Rig(Shown, nn.Module):
     """Rigid bodies, soft pads, contacts between them, and actuators.
 
     Names are the mappings' keys; contacts are ordered by their pad. Every physical parameter is an
@@ -110,8 +111,8 @@ class Rig(nn.Module):
         for name, pad in self.pads.items():
             if pad.base is not None and pad.base not in self.bodies:
                 raise ValueError(
-                    f"pad `{name}` is bonded to `{pad.base}`, but the bodies are "
-                    f"{', '.join(self.bodies)}"
+                    f"pad `{name}` is bonded to `{pad.base}`, "
+                    f"{suggestion(pad.base, self.bodies, 'but the bodies are')}"
                 )
             if not pad.inertial:
                 continue
@@ -143,17 +144,7 @@ class Rig(nn.Module):
                     f"contact `{name}`: the pad `{contact.pad}` is bonded to the body "
                     f"`{contact.body}` itself"
                 )
-        for name, taxels in self.taxels.items():
-            if taxels.pad not in self.pads:
-                raise ValueError(
-                    f"taxels.{name}: they lie on `{taxels.pad}`, but the pads are "
-                    f"{', '.join(self.pads)}"
-                )
-            if name in self.contacts:
-                raise ValueError(
-                    f"taxels.{name}: a contact is called `{name}` too, whose forces have the same "
-                    "names; call one of them otherwise"
-                )
+        check_taxels(self.taxels, self.pads, self.contacts)
         for name, actuator in self.actuators.items():
             for coordinate in (*actuator.measures, actuator.pushes):
                 self.coordinate(coordinate, f"actuator `{name}`")
@@ -163,9 +154,10 @@ class Rig(nn.Module):
         `ValueError`."""
         body, _, axis = name.partition(".")
         if body not in self.bodies or axis not in COORDINATES:
-            known = ", ".join(f"{b}.{axis}" for b in self.bodies for axis in COORDINATES)
+            known = [f"{b}.{axis}" for b in self.bodies for axis in COORDINATES]
             raise ValueError(
-                f"{owner} speaks of `{name}`, which is not a coordinate; there are {known}"
+                f"{owner} speaks of `{name}`, which is not a coordinate; "
+                f"{suggestion(name, known, 'there are')}"
             )
         return 3 * list(self.bodies).index(body) + COORDINATES.index(axis)
 
@@ -197,26 +189,29 @@ class Rig(nn.Module):
 
     def description(self) -> dict[str, Any]:
         """The numbers and laws of the rig as they are now, for what is saved with a run."""
-        mine = {
-            name: value
-            for name, value in self.named_parameters()
-            if not name.startswith("reference.")
-        }
-        return {
-            "parameters": {name: value.detach().tolist() for name, value in mine.items()},
-            "friction": {k: law_name(one.law.friction) for k, one in self.contacts.items()},
-            "control": {name: law_name(actuator.law) for name, actuator in self.actuators.items()},
-            "shape": {
-                name: type(body.shape).__name__
-                for name, body in self.bodies.items()
-                if body.shape is not None
-            },
-            "material": {name: type(pad.material).__name__ for name, pad in self.pads.items()},
-            "mesh": {
-                k: f"{type(pad.mesh).__name__}, {len(pad.mesh.nodes)} nodes"
-                for k, pad in self.pads.items()
-            },
-        }
+        from torchsoft.physics.summary import description
+
+        return description(self)
+
+    def state(
+        self, bodies: Mapping[str, Mapping[str, Any]] | None = None, /, **more: Mapping[str, Any]
+    ) -> Tensor:
+        """A start (size,) from coordinates x, y [m] and theta [rad] and rates v_x, v_y, omega of
+        the bodies, with massless pads settled around them:
+        `rig.state(disc={"x": 0.06, "y": "rest"}, bracket={"x": 0.06, "y": 0.05})`.
+
+        y and theta may be "rest": where the body lies under its weight, the loops open. theta and
+        the rates are zero where they are not given. Differentiable. Raises `ValueError` for names
+        and coordinates that do not fit, `NoEquilibrium` where there is no rest.
+        """
+        from torchsoft.physics.start import start
+
+        return start(self, {**(bodies or {}), **more})
+
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+        from torchsoft.physics.summary import summary
+
+        return summary(self)
 
     def parameter(self, name: str) -> Tensor:
         """A parameter by its name, or by another one in `aliases`. Raises `ValueError` for one that
@@ -225,8 +220,10 @@ class Rig(nn.Module):
         found = known.get(self.names.get(name, name), known.get(name))
         if found is None:
             mine = {own: other for other, own in self.names.items()}
-            names = [mine.get(own, own) for own, _ in self.named_parameters()]
-            raise ValueError(f"`{name}` is not a parameter of this rig; {near(name, names)}")
+            names = dict.fromkeys(mine.get(own, own) for own, _ in self.named_parameters())
+            raise ValueError(
+                f"`{name}` is not a parameter of this rig; {suggestion(name, names, 'known:')}"
+            )
         return found
 
     def quantity(self, name: str) -> Quantity | None:

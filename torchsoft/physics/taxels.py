@@ -1,6 +1,6 @@
 """Taxels: an array of sensitive areas on the surface of a pad."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from typing import Annotated
@@ -8,6 +8,7 @@ from typing import Annotated
 import numpy as np
 from scipy.special import ndtr
 
+from torchsoft.display import suggestion
 from torchsoft.physics.arguments import whole
 from torchsoft.physics.mesh import Array
 from torchsoft.physics.pads import Pad
@@ -55,7 +56,7 @@ class Taxels:
         """Coordinates of the middles along the surface (taxels,) [m]."""
         if self.count is None:
             return np.array(self.centres)
-        return np.asarray((np.arange(self.count) - 0.5 * (self.count - 1)) * self.width, float)
+        return (np.arange(float(self.count)) - 0.5 * (self.count - 1)) * self.width
 
     def weights(self, pad: Pad) -> Array:
         """Part of a force at every contact point of the pad that each taxel takes (taxels,
@@ -65,3 +66,20 @@ class Taxels:
         if self.spread == 0.0:
             return 0.5 * (np.sign(left) - np.sign(right))
         return ndtr(left / self.spread) - ndtr(right / self.spread)
+
+
+def check_taxels(
+    taxels: Mapping[str, Taxels], pads: Mapping[str, Pad], contacts: Iterable[str]
+) -> None:
+    """Raises `ValueError` for taxels on no pad, and for those that are called like a contact."""
+    for name, one in taxels.items():
+        if one.pad not in pads:
+            raise ValueError(
+                f"taxels.{name}: they lie on `{one.pad}`, "
+                f"{suggestion(one.pad, pads, 'but the pads are')}"
+            )
+        if name in contacts:
+            raise ValueError(
+                f"taxels.{name}: a contact is called `{name}` too, whose forces have the same "
+                "names; call one of them otherwise"
+            )

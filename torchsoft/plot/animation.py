@@ -1,5 +1,4 @@
-"""Videos: bodies, deformed pads and contact forces over the whole run, of any rig; the paper's
-among them."""
+"""Videos: bodies, deformed pads with their stress and contact forces over a whole run."""
 
 import importlib.util
 from collections.abc import Iterable, Iterator
@@ -14,11 +13,11 @@ from numpy.typing import NDArray
 from PIL import Image
 from tqdm import tqdm
 
+from torchsoft.display import suggestion
 from torchsoft.files import replacing
 from torchsoft.physics.mesh import Array
-from torchsoft.physics.rig import Rig
+from torchsoft.plot.dashboard import curves, liveliest
 from torchsoft.plot.figures import ACTUAL, DESIRED, STYLE, timeline
-from torchsoft.plot.general import curves
 from torchsoft.plot.scene import (
     DISC,
     FRICTION,
@@ -30,40 +29,37 @@ from torchsoft.plot.scene import (
     Scene,
     force_scale,
     instants,
-    outwards,
+    keys,
+    largest_stress,
 )
 from torchsoft.solve.trajectory import Trajectory
 
 FRAMES_PER_SECOND = 12
 
-PAPER = "Bodies, pads and contact forces (paper: the video); the first half second in slow motion"
-"""Title of the paper's video."""
-
 Picture = NDArray[np.uint8]
 
 
-def frame_times(trajectory: Trajectory, frames: int, even: bool = False) -> Array:
-    """Times [s] of the frames; unless they are to be `even`, one in eight goes to the first half
-    second, where the grasp is."""
-    start, end = float(trajectory.t[0]), float(trajectory.t[-1])
-    if even:
+def frame_times(run: Trajectory, frames: int, slow: float) -> Array:
+    """Times [s] of the frames; one in eight goes to the first `slow` [s], unless that is zero."""
+    start, end = float(run.t[0]), float(run.t[-1])
+    if not 0 < slow < end - start:
         return np.linspace(start, end, frames)
-    slow = min(start + 0.5, end)
-    grasp = frames if slow == end else max(2, frames // 8)
+    first = max(2, frames // 8)
     return np.concatenate(
-        (np.linspace(start, slow, grasp), np.linspace(slow, end, frames - grasp + 1)[1:])
+        (
+            np.linspace(start, start + slow, first),
+            np.linspace(start + slow, end, frames - first + 1)[1:],
+        )
     )
 
 
-def render(
-    trajectory: Trajectory, rig: Rig, times: Array, dpi: int, title: str, follow: str
-) -> Iterator[Picture]:
+def render(run: Trajectory, times: Array, dpi: int, title: str, follow: str) -> Iterator[Picture]:
     """RGB pictures (height, width, 3) at `times` [s]: the scene, and a coordinate over time under
     it. The axes are drawn once; per picture only what moves."""
-    shown = instants(rig, trajectory, times.tolist())
-    curve = next(curve for curve in curves(trajectory, rig) if curve.name == follow)
-    scale = force_scale(rig, shown)
-    x_limits, y_limits = Scene(Figure().subplots(), rig, curves=scale).limits(shown)
+    setup, shown = run.setup, instants(run, times.tolist())
+    curve = next(curve for curve in curves(run) if curve.name == follow)
+    scale = force_scale(setup, shown)
+    x_limits, y_limits = Scene(Figure().subplots(), setup, curves=scale).limits(shown)
     tall = (y_limits[1] - y_limits[0]) / (x_limits[1] - x_limits[0])
     with rc_context(STYLE):
         figure = Figure(
@@ -71,14 +67,13 @@ def render(
         )
         canvas = FigureCanvasAgg(figure)
         whole, strip = figure.subplots(2, 1, height_ratios=(figure.get_figheight() - 1.26, 1.26))
-        scene = Scene(whole, rig, columns=5, curves=scale)
+        scene = Scene(whole, setup, columns=5, curves=scale, stress=largest_stress(shown))
         whole.set(xlim=x_limits, ylim=y_limits, xlabel="x [mm]", ylabel="y [mm]", title=title)
         scene.scale_bar(whole)
         whole.grid(False)
-        whole.plot([], [], "o-", color=NORMAL, ms=3, label="normal force")
-        whole.plot([], [], color=FRICTION, label=f"friction ({outwards(rig, shown[0])})")
-        whole.legend(loc="lower left")
-        t = timeline(strip, curve.label, trajectory)
+        figure.legend(handles=keys(setup, shown), loc="outside lower center", ncols=3)
+        t = timeline(strip, curve.label, run)
+        strip.set_xlabel("time [s]")
         if curve.setpoint is not None:
             strip.plot(t, curve.setpoint, color=DESIRED, lw=3, label="desired")
         strip.plot(t, curve.values, color=ACTUAL, lw=1, label="actual")
@@ -96,7 +91,7 @@ def render(
     background = canvas.copy_from_bbox(figure.bbox)
     for instant in shown:
         scene.show(instant)
-        cursor.set_data([instant.time], [curve.values[trajectory.at(instant.time)]])
+        cursor.set_data([instant.time], [curve.values[run.at(instant.time)]])
         clock.set_text(f"t = {instant.time:6.3f} s")
         canvas.restore_region(background)
         for artist in moving:
@@ -106,15 +101,16 @@ def render(
 
 
 def animate(
-    trajectory: Trajectory, rig: Rig, path: Path, *, frames: int = 150, dpi: int = 110,
-    progress: bool = True, title: str = PAPER, follow: str = "", even: bool = False,
+    run: Trajectory, path: Path, *, frames: int = 150, dpi: int = 110, progress: bool = False,
+    title: str = "", follow: str = "", slow: float = 0.0,
 ) -> None:  # fmt: skip
     """Write `frames` pictures of the whole run as .gif, or as .mp4 where imageio-ffmpeg is
     installed.
 
-    `follow` is the coordinate under the picture, by default x of the first body; with `even` all
-    pictures are equally far apart in time. The file appears whole or not at all. Raises
-    `ValueError` for another suffix, and `ModuleNotFoundError` for .mp4 without imageio-ffmpeg.
+    `follow` is the coordinate under the picture, by default the liveliest one; the first `slow` [s]
+    take an eighth of the pictures, which are else equally far apart in time. The file appears whole
+    or not at all. Raises `ValueError` for another suffix or coordinate, and `ModuleNotFoundError`
+    for .mp4 without imageio-ffmpeg.
     """
     if path.suffix not in (".gif", ".mp4"):
         raise ValueError(f"`path` must end in .gif or .mp4, but is {path}")
@@ -122,10 +118,15 @@ def animate(
         raise ModuleNotFoundError(
             f"{path} needs imageio-ffmpeg: pip install 'torchsoft[video]', or write a .gif"
         )
-    times = frame_times(trajectory, frames, even)
-    followed = follow or f"{next(iter(rig.bodies))}.x"
+    times, known = frame_times(run, frames, slow), [curve.name for curve in curves(run)]
+    followed = follow or liveliest(run)
+    if followed not in known:
+        raise ValueError(
+            f"`follow` is `{followed}`, no coordinate that moves; "
+            f"{suggestion(followed, known, 'there are')}"
+        )
     bar = tqdm(
-        render(trajectory, rig, times, dpi, title, followed),
+        render(run, times, dpi, title, followed),
         "animation",
         len(times),
         unit="frame",

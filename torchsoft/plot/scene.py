@@ -1,71 +1,43 @@
-"""The picture of one instant of any rig: deformed pads on their bases, bodies with a spoke, and the
-contact forces as curves.
+"""The picture of one instant of any run: deformed pads on their bases, coloured by their stress,
+bodies with a spoke, contact points by their state, and the contact forces as curves.
 
 Figures and animation share it. Everything on axes is in millimetres and newtons.
 """
 
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import Normalize
+from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
-from scipy.sparse.linalg import SuperLU, splu
-from torch import Tensor
 
-from torchsoft.physics.mesh import Array, Mesh, lame_moduli
-from torchsoft.physics.pads import Pad
-from torchsoft.physics.rig import Rig
+from torchsoft.physics.mesh import Array
+from torchsoft.physics.setup import PadSetup, Setup, von_mises
+from torchsoft.physics.sticking import SEPARATED, SLIPPING, STICKING
 from torchsoft.solve.trajectory import Trajectory
 
 NORMAL, FRICTION, INK = "#cc3311", "#0077bb", "#333333"
 """Red and blue as in the paper, a pair that colour-blind readers can distinguish."""
 
-PAD, LAYER, DISC, STEEL = "#f2e3c2", "#8a6d3b", "#dfe5ea", "#b8bec4"
+PAD, LAYER, DISC, STEEL = "#f6ecd6", "#8a6d3b", "#dfe5ea", "#b8bec4"
+
+STRESS = "YlOrBr"
+"""Colours of von Mises' stress, from none to the largest shown."""
+
+STATES = {
+    STICKING: ("sticks", "o", "#222222"),
+    SLIPPING: ("slips", "^", "#ee7733"),
+    SEPARATED: ("apart", ".", "#9aa0a6"),
+    -1: ("touches", "s", "#666666"),
+}
+"""Words, marker and colour of the states of contact points; of -1 nobody knows more."""
 
 MM = 1e3
-
-
-@lru_cache(maxsize=4)
-def interior_solver(mesh: Mesh, nu: float) -> tuple[SuperLU, NDArray[np.int64], Array]:
-    """Factorised K_ii, the free dofs that are interior, and K_is (dense), for the surface dofs in
-    `mesh.surface` order.
-
-    The interior follows the surface whatever E and depth, so both are taken as 1.
-    """
-    K_lambda, K_mu, _ = mesh.matrices
-    lame_lambda, lame_mu = lame_moduli(1.0, nu)
-    K = mesh.assemble(lame_lambda * K_lambda + lame_mu * K_mu).tocsc()
-    surface = (2 * mesh.surface[:, None] + np.arange(2)).ravel()
-    inside = np.ones(2 * len(mesh.free), np.bool_)
-    inside[surface] = False
-    interior = np.flatnonzero(inside)
-    return splu(K[interior][:, interior]), interior, K[interior][:, surface].toarray()
-
-
-def deformed_mesh(pad: Pad, u: Tensor) -> Array:
-    """Places (..., mesh nodes, 2) [m] of all nodes of the mesh, bonded ones too, in the frame of
-    the pad's base.
-
-    u (..., nodes, 2) [m]: displacements as a run records them. A massless pad has only its surface
-    there; the interior is in equilibrium with it, u_i = -K_ii^-1 K_is u_s.
-    """
-    mesh, batch = pad.mesh, tuple(u.shape[:-2])
-    own = (u.detach().reshape(-1, pad.nodes, 2) @ pad.axes).flatten(1).numpy()
-    free = np.zeros((len(own), 2 * len(mesh.free)))
-    if pad.inertial:
-        free[:] = own
-    else:
-        factor, interior, K_is = interior_solver(mesh, pad.material.nu.item())
-        free[:, (2 * mesh.surface[:, None] + np.arange(2)).ravel()] = own
-        free[:, interior] = -factor.solve(K_is @ own.T).T
-    displacement = np.zeros((len(own), len(mesh.nodes), 2))
-    displacement[:, mesh.free] = free.reshape(len(own), -1, 2)
-    return pad.placed(mesh.nodes + displacement).reshape(*batch, -1, 2)
 
 
 def in_world(places: Array, pose: Array) -> Array:
@@ -88,75 +60,84 @@ class Instant(NamedTuple):
     """One sample as drawn: time [s], poses of the bodies and of the pads' bases (3,) [mm, mm, rad],
     places [mm], forces [N].
 
-    mesh: pad -> (mesh nodes, 2); points: contact -> (points, 2); force: contact -> (points, 2),
-    normal force and friction on the pad, the latter positive along `along_surface`; along: contact
-    -> (points,), how far the points are in that direction.
+    mesh: pad -> (mesh nodes, 2); stress: pad -> von Mises' (elements,) [kPa]; points: contact ->
+    (points, 2); force: contact -> (points, 2), normal force and friction on the pad, the latter
+    positive along `along_surface`; along: contact -> (points,), how far the points are in that
+    direction; state: contact -> (points,).
     """
 
     time: float
     pose: dict[str, Array]
     base: dict[str, Array]
     mesh: dict[str, Array]
+    stress: dict[str, Array]
     points: dict[str, Array]
     force: dict[str, Array]
     along: dict[str, Array]
+    state: dict[str, NDArray[np.int8]]
 
-    def near(self, contact: str) -> NDArray[np.int64]:
-        """Numbers of the points under a normal force, and of one more on each side."""
-        return np.flatnonzero(np.convolve(self.force[contact][:, 0] > 0, np.ones(3), "same") > 0)
+    def near(self, contact: str, margin: int = 1) -> NDArray[np.int64]:
+        """Numbers of the points under a normal force, and of `margin` more on each side."""
+        around = np.ones(2 * margin + 1)
+        return np.flatnonzero(np.convolve(self.force[contact][:, 0] > 0, around, "same") > 0)
 
 
-def instants(rig: Rig, trajectory: Trajectory, times: Sequence[float]) -> list[Instant]:
-    """The samples of `trajectory` nearest to `times` [s], as drawn."""
-    rows = [trajectory.at(time) for time in times]
-    displacement = {name: trajectory.displacement[name][rows].detach() for name in rig.pads}
-    meshes = {name: MM * deformed_mesh(pad, displacement[name]) for name, pad in rig.pads.items()}
+def instants(run: Trajectory, times: Sequence[float]) -> list[Instant]:
+    """The samples of a run nearest to `times` [s], as drawn."""
+    rows, setup = [run.at(time) for time in times], run.setup
+    u = {name: run.displacement[name][rows].detach().numpy() for name in setup.pads}
+    whole = {name: pad.displacement(u[name]) for name, pad in setup.pads.items()}
+    stresses = {
+        name: 1e-3 * von_mises(pad.stress(pad.strain(whole[name])))
+        for name, pad in setup.pads.items()
+    }
+    meshes = {
+        name: MM * pad.placed(pad.mesh.nodes + whole[name]) for name, pad in setup.pads.items()
+    }
     shown = []
     for i, row in enumerate(rows):
-        pose = {
-            name: x[row].detach().numpy() * [MM, MM, 1.0]
-            for name, x in trajectory.state.pose.items()
-        }
+        pose = {name: x[row].detach().numpy() * [MM, MM, 1.0] for name, x in run.state.pose.items()}
         base = {
             name: np.zeros(3) if pad.base is None else pose[pad.base]
-            for name, pad in rig.pads.items()
+            for name, pad in setup.pads.items()
         }
         points, force, along = {}, {}, {}
-        for key, contact in rig.contacts.items():
-            pad, own = rig.pads[contact.pad], base[contact.pad]
-            points[key] = in_world(
-                MM * (pad.spread @ (pad.positions + displacement[contact.pad][i])).numpy(), own
-            )
+        for key, contact in setup.contacts.items():
+            pad, own = setup.pads[contact.pad], base[contact.pad]
+            points[key] = in_world(MM * pad.surface_points(u[contact.pad][i]), own)
             direction, (_, y) = along_surface(pad, own), own_axes(pad, own)
             t = np.array([y[1], -y[0]])  # of the moving frame, whose normal points into the pad
-            force[key] = trajectory.force[key][row].detach().numpy() * [1.0, np.sign(direction @ t)]
+            force[key] = run.force[key][row].detach().numpy() * [1.0, np.sign(direction @ t)]
             along[key] = points[key] @ direction
         mesh = {name: in_world(meshes[name][i], base[name]) for name in meshes}
-        shown.append(Instant(float(trajectory.t[row]), pose, base, mesh, points, force, along))
+        stress = {name: stresses[name][i] for name in stresses}
+        state = {key: run.contact_state[key][row].numpy() for key in setup.contacts}
+        time = float(run.t[row])
+        shown.append(Instant(time, pose, base, mesh, stress, points, force, along, state))
     return shown
 
 
-def own_axes(pad: Pad, base: Array) -> Array:
+def own_axes(pad: PadSetup, base: Array) -> Array:
     """A pad's own x and y (2, 2) as unit vectors of the world; base (3,) is the pose of what it is
     bonded to."""
-    return in_world(pad.axes.numpy().T, base) - base[:2]
+    return in_world(pad.axes.T, base) - base[:2]
 
 
-def along_surface(pad: Pad, base: Array) -> Array:
+def along_surface(pad: PadSetup, base: Array) -> Array:
     """The direction (2,) along a pad's surface that points to the right, or straight up."""
     x = own_axes(pad, base)[0]
     return x if x[0] + 1e-6 * x[1] > 0 else -x
 
 
-def outwards(rig: Rig, instant: Instant) -> str:
+def outwards(setup: Setup, instant: Instant) -> str:
     """Where friction points that is drawn outwards."""
     steep = any(
-        abs(along_surface(pad, instant.base[name])[0]) < 0.7 for name, pad in rig.pads.items()
+        abs(along_surface(pad, instant.base[name])[0]) < 0.7 for name, pad in setup.pads.items()
     )
     return "outwards: to the right or up" if steep else "outwards: to the right"
 
 
-def own_places(pad: Pad, base: Array, own: Array) -> Array:
+def own_places(pad: PadSetup, base: Array, own: Array) -> Array:
     """Places (..., 2) [mm] in the pad's own frame, in the world [mm]."""
     return in_world(MM * pad.placed(own / MM), base)
 
@@ -168,17 +149,17 @@ def around_contact(instant: Instant, contact: str) -> tuple[Array, Array]:
     return instant.along[contact][rows], instant.force[contact][rows]
 
 
-def unit(rig: Rig) -> float:
+def unit(setup: Setup) -> float:
     """What margins and curves are measured in [mm]: one for the paper's pads of 120 mm."""
-    return MM * max((pad.mesh.length for pad in rig.pads.values()), default=0.12) / 120
+    return MM * max((pad.mesh.length for pad in setup.pads.values()), default=0.12) / 120
 
 
-def curve_height(rig: Rig) -> float:
+def curve_height(setup: Setup) -> float:
     """Height [mm] of the largest force's curve."""
-    return 13.0 * unit(rig)
+    return 16.0 * unit(setup)
 
 
-def force_scale(rig: Rig, shown: Sequence[Instant]) -> tuple[float, float]:
+def force_scale(setup: Setup, shown: Sequence[Instant]) -> tuple[float, float]:
     """mm per N at which the largest force is as high as `curve_height`, and a round force [N] for
     the scale bar."""
     largest = max(
@@ -188,26 +169,26 @@ def force_scale(rig: Rig, shown: Sequence[Instant]) -> tuple[float, float]:
     if largest == 0:
         return 1.0, 1.0
     decade = 10.0 ** np.floor(np.log10(largest))
-    return curve_height(rig) / largest, float(
+    return curve_height(setup) / largest, float(
         max(m * decade for m in (1, 2, 5) if m * decade <= largest)
     )
 
 
-def plates(rig: Rig) -> dict[str, float]:
+def plates(setup: Setup) -> dict[str, float]:
     """Thickness [mm] of the plate behind each pad: symmetric about its base's centre, none on a
     base that has a shape, that of the others where the centre is not behind the pad."""
     out = {}
-    for name, pad in rig.pads.items():
+    for name, pad in setup.pads.items():
         if pad.base is not None:
             behind = (
-                2 * MM * float((pad.placed(np.zeros(2)) @ pad.axes.numpy())[1])
+                2 * MM * float((pad.placed(np.zeros(2)) @ pad.axes)[1])
             )  # height of the face over the base's centre
-            if rig.bodies[pad.base].shape is not None:
+            if setup.bodies[pad.base].outline is not None:
                 out[name] = 0.0
             elif behind > 1e-6:
                 out[name] = behind
-    thickest = max(out.values(), default=0.0) or 4 * unit(rig)
-    return {name: out.get(name, thickest) for name in rig.pads}
+    thickest = max(out.values(), default=0.0) or 4 * unit(setup)
+    return {name: out.get(name, thickest) for name in setup.pads}
 
 
 class Scene:
@@ -215,26 +196,28 @@ class Scene:
     another instant has them.
 
     `columns` is the spacing, in elements, of the vertical mesh lines; every layer is drawn. With
-    `curves` = (mm per N, scale bar in N) the contact forces stand behind the pads, normal force red
-    with filled circles, friction blue.
+    `curves` = (mm per N, scale bar in N) the contact forces stand behind the pads, normal force
+    red, friction blue. `stress` [kPa] is the one that the darkest colour stands for; pads are plain
+    without it. `size` scales markers and lines.
     """
 
     def __init__(
-        self, axes: Axes, rig: Rig, *, columns: int = 5, curves: tuple[float, float] | None = None
+        self, axes: Axes, setup: Setup, *, columns: int = 5,
+        curves: tuple[float, float] | None = None, stress: float | None = None, size: float = 1.0,
     ) -> None:  # fmt: skip
-        self.rig, self.columns, self.curves = rig, columns, curves
-        self.thickness = plates(rig)
+        self.setup, self.columns, self.curves = setup, columns, curves
+        self.thickness = plates(setup)
         self.shapes = {
-            name: MM * body.shape.outline().numpy()
-            for name, body in rig.bodies.items()
-            if body.shape is not None
+            name: MM * body.outline
+            for name, body in setup.bodies.items()
+            if body.outline is not None
         }
 
         def polygons(
             names: Sequence[str], face: str, edge: str, width: float
         ) -> dict[str, Polygon]:
             out = {
-                k: Polygon(np.zeros((3, 2)), facecolor=face, edgecolor=edge, lw=width)
+                k: Polygon(np.zeros((3, 2)), facecolor=face, edgecolor=edge, lw=size * width)
                 for k in names
             }
             for polygon in out.values():
@@ -242,39 +225,55 @@ class Scene:
             return out
 
         self.plates = polygons(
-            [name for name, size in self.thickness.items() if size], STEEL, INK, 0.6
+            [name for name, thick in self.thickness.items() if thick], STEEL, INK, 0.6
         )
-        self.outlines = polygons(list(rig.pads), PAD, "none", 0.0)
-        self.layers = {k: LineCollection([], colors=LAYER, linewidths=0.5) for k in rig.pads}
-        for lines in self.layers.values():
-            axes.add_collection(lines, autolim=False)
+        self.outlines = polygons(list(setup.pads), PAD, LAYER, 0.6)
+        self.fields, self.layers = {}, {}
+        for k in setup.pads:
+            if stress:
+                self.fields[k] = PolyCollection(
+                    [], cmap=STRESS, norm=Normalize(0.0, stress), lw=0.3, edgecolors="face"
+                )
+                axes.add_collection(self.fields[k], autolim=False)
+            self.layers[k] = LineCollection([], colors=LAYER, linewidths=0.35 * size, alpha=0.6)
+            axes.add_collection(self.layers[k], autolim=False)
         self.bodies = polygons(list(self.shapes), DISC, INK, 1.0)
         self.spokes, self.hubs, self.friction, self.normal = {}, {}, {}, {}
         for k in self.shapes:
-            (self.spokes[k],) = axes.plot([], [], color=INK, lw=1.6, solid_capstyle="butt")
-            (self.hubs[k],) = axes.plot([], [], "o", color=INK, ms=3)
-        for k in rig.contacts if curves else ():
-            (self.friction[k],) = axes.plot([], [], color=FRICTION, lw=1.1)
-            (self.normal[k],) = axes.plot([], [], color=NORMAL, lw=1.1, marker="o", ms=1.8)
+            (self.spokes[k],) = axes.plot([], [], color=INK, lw=1.6 * size, solid_capstyle="butt")
+            (self.hubs[k],) = axes.plot([], [], "o", color=INK, ms=3 * size)
+        self.states: dict[tuple[str, int], Line2D] = {}
+        for k in setup.contacts:
+            for state, (_, marker, colour) in STATES.items():
+                ms = size * (2.0 if state == SEPARATED else 3.6 if state == SLIPPING else 2.8)
+                (self.states[k, state],) = axes.plot(
+                    [], [], marker, color=colour, ms=ms, mec="white", mew=0.25 * size
+                )
+        for k in setup.contacts if curves else ():
+            self.friction[k] = Polygon(
+                np.zeros((3, 2)), facecolor=FRICTION, edgecolor=FRICTION, alpha=0.75, lw=0.8 * size
+            )
+            self.normal[k] = Polygon(
+                np.zeros((3, 2)), facecolor=f"{NORMAL}33", edgecolor=NORMAL, lw=1.2 * size
+            )
+            axes.add_patch(self.normal[k])
+            axes.add_patch(self.friction[k])
         groups = (
-            self.plates,
-            self.outlines,
-            self.layers,
-            self.bodies,
-            self.spokes,
-            self.hubs,
-            self.friction,
-            self.normal,
-        )
+            self.plates, self.outlines, self.fields, self.layers, self.bodies, self.spokes,
+            self.hubs, self.normal, self.friction, self.states,
+        )  # fmt: skip
         self.moving: list[Artist] = [artist for group in groups for artist in group.values()]
         axes.set_aspect("equal")
 
     def show(self, instant: Instant) -> None:
         """Put everything where it is at `instant`."""
         for k, nodes in instant.mesh.items():
-            mesh = self.rig.pads[k].mesh
+            mesh = self.setup.pads[k].mesh
             self.outlines[k].set_xy(nodes[mesh.outline])
             self.layers[k].set_segments([nodes[line] for line in mesh.lines(self.columns)])
+            if k in self.fields:
+                self.fields[k].set_verts(nodes[mesh.elements])
+                self.fields[k].set_array(instant.stress[k])
         for k, plate in self.plates.items():
             plate.set_xy(self.behind(instant, k, 0.0, self.thickness[k]))
         for k, outline in self.shapes.items():
@@ -282,23 +281,27 @@ class Scene:
             self.bodies[k].set_xy(in_world(outline, pose))
             self.spokes[k].set_data(*np.stack((pose[:2], in_world(straight_up(outline), pose)), -1))
             self.hubs[k].set_data(*pose[:2, None])
+        for (k, state), line in self.states.items():
+            rows = instant.near(k, 8)
+            line.set_data(*instant.points[k][rows[instant.state[k][rows] == state]].T)
         for k in self.normal:
-            name, rows = self.rig.contacts[k].pad, instant.near(k)
-            pad, base, force = self.rig.pads[name], instant.base[name], instant.force[k][rows]
+            name, rows = self.setup.contacts[k].pad, instant.near(k)
+            pad, base, force = self.setup.pads[name], instant.base[name], instant.force[k][rows]
             x = (instant.points[k][rows] - own_places(pad, base, np.zeros(2))) @ own_axes(
                 pad, base
             )[0]
-            foot = -self.thickness[name] - 5.0 * unit(self.rig)
-            for line, values in ((self.normal[k], force[:, 0]), (self.friction[k], force[:, 1])):
+            foot = -self.thickness[name] - 5.0 * unit(self.setup)
+            for area, values in ((self.normal[k], force[:, 0]), (self.friction[k], force[:, 1])):
                 assert self.curves
-                line.set_data(
-                    *own_places(pad, base, np.stack((x, foot - self.curves[0] * values), -1)).T
-                )
+                row = np.stack((x, foot - self.curves[0] * values), -1)
+                ends = np.stack((x, np.full_like(x, foot)), -1)[[0, -1]] if len(x) else row
+                around = np.concatenate((ends[:1], row, ends[1:]))
+                area.set_xy(own_places(pad, base, around) if len(x) else np.zeros((1, 2)))
 
     def behind(self, instant: Instant, name: str, side: float, depth: float) -> Array:
         """Corners (4, 2) [mm] of the rectangle behind a pad's bonded face, wider than it by `side`
         [mm] on each side."""
-        pad = self.rig.pads[name]
+        pad = self.setup.pads[name]
         (left, face), (right, _) = MM * pad.mesh.base + [[-side, 0.0], [side, 0.0]]
         corners = np.array(
             [[left, face - depth], [right, face - depth], [right, face], [left, face]]
@@ -308,14 +311,14 @@ class Scene:
     def limits(self, shown: Sequence[Instant]) -> tuple[tuple[float, float], tuple[float, float]]:
         """Limits of x and y [mm] that hold every instant shown, with the force curves behind the
         pads."""
-        step, rows = unit(self.rig), []
+        step, rows = unit(self.setup), []
         for instant in shown:
             for k, outline in self.shapes.items():
                 around = in_world(outline, instant.pose[k])
                 rows += [around - 2.0 * step, around + 2.0 * step]
             for k, mesh in instant.mesh.items():
                 depth = self.thickness[k] + (
-                    curve_height(self.rig) + 7.0 * step if self.curves else 4.0 * step
+                    curve_height(self.setup) + 7.0 * step if self.curves else 4.0 * step
                 )
                 rows += [mesh.reshape(-1, 2), self.behind(instant, k, 4.0 * step, depth)]
         every = np.concatenate(rows)
@@ -326,8 +329,8 @@ class Scene:
         """A vertical bar in the upper right corner, as long as the scale's force."""
         assert self.curves
         millimetres, force = self.curves
-        step, (_, right), (_, high) = unit(self.rig), axes.get_xlim(), axes.get_ylim()
-        x, y = right - 6.0 * step, high - curve_height(self.rig) - 2.0 * step
+        step, (_, right), (_, high) = unit(self.setup), axes.get_xlim(), axes.get_ylim()
+        x, y = right - 6.0 * step, high - curve_height(self.setup) - 2.0 * step
         axes.plot([x, x], [y, y + millimetres * force], color=INK, lw=1.5, solid_capstyle="butt")
         axes.text(
             x - 2.0 * step,
@@ -335,5 +338,25 @@ class Scene:
             f"{force:g} N",
             ha="right",
             va="center",
-            fontsize=8,
+            fontsize="small",
         )
+
+
+def largest_stress(shown: Sequence[Instant]) -> float:
+    """Von Mises' stress [kPa] that the darkest colour stands for."""
+    return max((float(one.max()) for at in shown for one in at.stress.values()), default=0.0)
+
+
+def keys(setup: Setup, shown: Sequence[Instant], forces: bool = True) -> list[Artist]:
+    """Handles of a legend: forces, and the states of points that occur."""
+    there = {int(x) for at in shown for one in at.state.values() for x in np.unique(one)}
+    out: list[Artist] = [
+        Line2D([], [], ls="", marker=marker, color=colour, ms=5, label=f"point {word}")
+        for state, (word, marker, colour) in STATES.items() if state in there
+    ]  # fmt: skip
+    if forces and setup.contacts:
+        out += [
+            Line2D([], [], color=NORMAL, lw=1.4, label="normal force"),
+            Line2D([], [], color=FRICTION, lw=1.4, label=f"friction ({outwards(setup, shown[0])})"),
+        ]
+    return out

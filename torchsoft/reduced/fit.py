@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg
 
+from torchsoft.extras import needed
 from torchsoft.reduced.ode import ReducedModel, Rollout, Term
 from torchsoft.reduced.records import KINEMATICS, STATES, Record
 from torchsoft.reduced.terms import Candidates
@@ -298,8 +299,7 @@ def _weak(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Integrals of columns and rates against pysindy's test functions, over windows of one
     length."""
-    import pysindy
-
+    pysindy = needed("pysindy", "reduced")
     length = min(round(recipe.window / step) + 1, *(len(one) for one in columns))
     if 2 * recipe.width > 0.9 * (length - 1) * step:
         raise ValueError(
@@ -326,8 +326,7 @@ def _weak(
 
 
 def _optimizer(recipe: Recipe) -> Any:
-    import pysindy
-
+    pysindy = needed("pysindy", "reduced")
     one: Any = pysindy.STLSQ(threshold=recipe.threshold, alpha=1e-10)
     return (
         pysindy.EnsembleOptimizer(one, bagging=True, n_models=recipe.models)

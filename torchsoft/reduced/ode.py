@@ -22,6 +22,7 @@ from torch import Tensor, nn
 
 from torchsoft.channels import CHANNELS
 from torchsoft.codegen import compile_law
+from torchsoft.display import Shown
 from torchsoft.solve.kernel.invoke import call_linearise, call_value
 
 ALIASES = {"v_C": "v_x", "v_Br": "v_x_Br"}
@@ -151,7 +152,7 @@ class Rollout:
         )
 
 
-class ReducedModel(nn.Module):
+class ReducedModel(Shown, nn.Module):
     """y' = S y + C phi(y, u). `forward(t, y)` follows torchdiffeq, y (..., states); inputs come
     from `signal(t)`.
 
@@ -212,6 +213,11 @@ class ReducedModel(nn.Module):
         self._law = (
             tuple(torch.tensor(index, dtype=torch.long) for index in zip(*law)) if law else None
         )
+
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+        rows = [tuple(line.split(" = ", 1)) for line in self.text()]
+        inputs = f", inputs {', '.join(self.outer)}" if self.outer else ""
+        return f"ReducedModel: {len(self.terms)} terms{inputs}", rows  # pyright: ignore[reportReturnType]
 
     @property
     def linear(self) -> bool:

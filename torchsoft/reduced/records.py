@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from torchsoft.channels import CHANNELS
+from torchsoft.channels import MEASURED
 from torchsoft.reduced.ode import ALIASES
 from torchsoft.solve.trajectory import Trajectory
 
@@ -55,26 +55,29 @@ def record(
     that are not equally spaced, for a value that is not finite, naming the series, and for a source
     without any of them, such as the run of a rig that is not the paper's.
     """
-    data: Mapping[Any, Any] = source.to_dataset() if isinstance(source, Trajectory) else source
-    times = np.asarray(data["time"] if t is None else t, dtype=float)
+    if isinstance(source, Trajectory):
+        t = source.t if t is None else t
+        # another rig may call by these names what is something else
+        source = source.channels if all(name in source for name in MEASURED) else {}
+    times = np.asarray(source["time"] if t is None else t, dtype=float)
     keep = times >= (times[0] if begin is None else begin)
     if keep.sum() < 3 or not np.allclose(np.diff(times), times[1] - times[0], rtol=1e-6, atol=0):
         raise ValueError("`t` must hold at least three equally spaced times")
     series = {}
-    channels = {name: CHANNELS[ALIASES.get(name, name)] for name in VARIABLES}
+    channels = {name: ALIASES.get(name, name) for name in VARIABLES}
     for name, channel in channels.items():
-        if channel.variable not in data:
+        if channel not in source:
             continue
-        x = channel.of(np.asarray(data[channel.variable], dtype=float)[keep])
+        x = np.asarray(source[channel], dtype=float)[keep]
         if not np.isfinite(x).all():
             first = times[keep][~np.isfinite(x)][0]
             raise ValueError(
-                f"series {name!r} ({channel.variable}) has values that are not finite, first at t "
+                f"series {name!r} ({channel}) has values that are not finite, first at t "
                 f"= {first:g} s"
             )
         series[name] = x
     if not series:
-        known = ", ".join(dict.fromkeys(channel.variable for channel in channels.values()))
+        known = ", ".join(dict.fromkeys(channels.values()))
         raise ValueError(
             f"`source` has none of {known}; take a run of `SoftGrasp`, or give series by these "
             "names"

@@ -5,7 +5,6 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import deepcopy
-from difflib import get_close_matches
 from functools import lru_cache, reduce
 from inspect import signature
 from operator import or_
@@ -21,6 +20,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, core_schema
 
+from torchsoft.display import suggestion
 from torchsoft.physics.validity import sound
 from torchsoft.quantity import metadata, quantity
 from torchsoft.tables import LISTED, Table, shown
@@ -83,13 +83,9 @@ class Group(Table):
         if isinstance(data, Mapping):
             for key in data:
                 if key not in cls.model_fields:
-                    near = get_close_matches(str(key), cls.model_fields, n=1)
-                    meant = (
-                        f"is it `{near[0]}`?"
-                        if near
-                        else f"known are {', '.join(cls.model_fields)}"
+                    raise ValueError(
+                        f"`{key}` is not known here; {suggestion(key, cls.model_fields)}"
                     )
-                    raise ValueError(f"`{key}` is not known here; {meant}")
         return data
 
     @model_validator(mode="after")

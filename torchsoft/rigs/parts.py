@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, TypeAdapter, model_validator
 
+from torchsoft.display import suggestion
 from torchsoft.materials.presets import PRESETS
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact
 from torchsoft.physics.material import KINDS, Material
@@ -213,7 +214,8 @@ class PresetTable(Group):
     def _is_known(self) -> Self:
         if self.name not in PRESETS:
             raise ValueError(
-                f"name: there is no preset `{line(self.name, 80)}`; there are {', '.join(PRESETS)}"
+                f"name: there is no preset `{line(self.name, 80)}`; "
+                f"{suggestion(self.name, PRESETS, 'there are')}"
             )
         return self
 

@@ -71,7 +71,7 @@ def run(
     numbers = summary(file, done, found or []) | {"wall_s": time.perf_counter() - began}
     write_json(out / "summary.json", numbers)
     if done.stopped is None:
-        draw(file, done.ready.rig, done.trajectory, out, progress)
+        draw(file, done.trajectory, out, progress)
     return done
 
 
@@ -166,33 +166,35 @@ def cost(file: RigFile, runs: bool) -> Cost:
     return Cost(steps, seconds, memory)
 
 
-def draw(file: RigFile, rig: Rig, run: Trajectory, out: Path, progress: bool) -> list[str]:
-    """Write the figures and the video that a file asks for to `out`; the names of the files
-    written."""
+def draw(file: RigFile, run: Trajectory, out: Path, progress: bool) -> list[str]:
+    """Write the figures, the player and the video that a file asks for to `out`; the names of the
+    files written."""
     # matplotlib takes half a second, which `check` does not need
-    from torchsoft.plot import figures, general
+    from torchsoft.plot import figures
     from torchsoft.plot.animation import animate
+    from torchsoft.plot.dashboard import dashboard, liveliest
+    from torchsoft.plot.player import player
 
     end, written = float(run.t[-1]), []
     times = [t for t in file.outputs.snapshots if t <= end] or [
         i * end / (SNAPSHOTS - 1) for i in range(SNAPSHOTS)
     ]
-    title = plain(file.title) or "Bodies, pads and contact forces"
+    title = plain(file.title)
     made = {
-        "snapshots": lambda: figures.snapshots(run, rig, times, title),
-        "motion": lambda: general.motions(run, rig),
-        "forces": lambda: general.efforts(run, rig),
-        "energy": lambda: figures.energy_balance(run),
+        "dashboard": lambda: dashboard(run, title=title),
+        "snapshots": lambda: figures.snapshots(run, times, title=title),
     }
     if file.outputs.figures:
         for name, figure in tqdm(made.items(), "figures", unit="figure", disable=not progress):
             figures.save(figure(), out / f"{name}.png")
             written.append(f"{name}.png")
+        player(run, out / "player.html", title=title)
+        written.append("player.html")
     if file.outputs.video != "none":
         name = f"video.{file.outputs.video}"
         animate(
-            run, rig, out / name, frames=file.outputs.frames, progress=progress, title=title,
-            even=True, follow=file.outputs.follow or general.liveliest(run, rig),
+            run, out / name, frames=file.outputs.frames, progress=progress, title=title,
+            follow=file.outputs.follow or liveliest(run),
         )  # fmt: skip
         written.append(name)
     return written

@@ -3,7 +3,7 @@ in threads."""
 
 import time as clock
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,7 +12,8 @@ import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from torchsoft.physics.arguments import whole
+from torchsoft.display import Shown
+from torchsoft.physics.arguments import Numbers, tensor, whole
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.validity import check_array
@@ -29,8 +30,8 @@ class SamplesFailed(UserWarning):
     """Some runs of a batch could not be carried out."""
 
 
-@dataclass(frozen=True)
-class Batch:
+@dataclass(frozen=True, repr=False)
+class Batch(Shown):
     """The runs of a batch: their trajectories, None where a run failed, and why those failed, by
     number.
 
@@ -46,6 +47,39 @@ class Batch:
 
     def __len__(self) -> int:
         return len(self.trajectories)
+
+    def keys(self) -> Sequence[str]:
+        """Names of the channels that every run has."""
+        done = [run for run in self.trajectories if run is not None]
+        return [name for name in done[0] if all(name in run for run in done)] if done else []
+
+    def __contains__(self, channel: object) -> bool:
+        return channel in self.keys()
+
+    def __iter__(self) -> Iterator[Trajectory | None]:
+        return iter(self.trajectories)
+
+    def _ipython_key_completions_(self) -> Sequence[str]:
+        return self.keys()
+
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+        done = [run for run in self.trajectories if run is not None]
+        rows = [("channels", ", ".join(self.keys()) or "none")]
+        if done:
+            steps = [run.stats.steps for run in done]
+            worst = max(run.energy_residual_rel for run in done)
+            rows.append(
+                (
+                    "times",
+                    f"up to {max(float(run.t[-1]) for run in done):g} s, at most "
+                    f"{max(self.lengths)} samples",
+                )
+            )
+            rows.append(("steps", f"{min(steps)} to {max(steps)} a run"))
+            rows.append(("energy", f"at most {worst:.1e} of what was injected is missing"))
+        rows += [(f"run {i} failed", str(why)) for i, why in list(self.failures.items())[:3]]
+        count, wall = len(self), self.wall_s
+        return f"Batch: {count} runs, {len(self.failures)} failed, {wall:.2g} s", rows
 
     def __getitem__(self, channel: str) -> Tensor:
         """A channel (runs, T). Raises `KeyError` for one that a run has not."""
@@ -101,10 +135,10 @@ class Batch:
 
 
 def simulate_batch(
-    rig: Rig | Sequence[Rig], t: Tensor | Sequence[Tensor], *,
-    parameters: Mapping[str, Tensor] | None = None, y0: Tensor | Sequence[Tensor] | None = None,
+    rig: Rig | Sequence[Rig], t: Numbers, *,
+    parameters: Mapping[str, Numbers] | None = None, y0: Numbers | None = None,
     reference: Reference | Sequence[Reference] | None = None, knots: Sequence[Tensor] | None = None,
-    dy0: Tensor | Sequence[Tensor] | None = None, threads: int | None = None,
+    dy0: Numbers | None = None, threads: int | None = None,
     progress: bool = False, **options: Any,
 ) -> Batch:  # fmt: skip
     """`simulate` for many runs at once, in `threads` threads, one a core by default.
@@ -123,6 +157,11 @@ def simulate_batch(
     Raises `ValueError` for counts that do not agree and for options that no run could have. Ctrl-C
     ends the batch when the runs on their way have ended.
     """
+    if isinstance(parameters, Mapping):
+        parameters = {k: tensor(f"parameters[{k!r}]", x) for k, x in parameters.items()}
+        for name, values in parameters.items():
+            check_array(f"parameters[{name!r}]", values)
+    t, y0, dy0 = (_rows(name, x) for name, x in (("t", t), ("y0", y0), ("dy0", dy0)))
     rigs, ts, y0s, references, every_knots, dy0s, count = _spread(
         rig, t, parameters, y0, reference, knots, dy0
     )
@@ -191,6 +230,16 @@ def _doubt(rigs: Sequence[Rig], trajectories: Sequence[Trajectory | None]) -> No
         warnings.warn(f"{who}: {runs[first]}", stacklevel=3)
 
 
+def _rows(name: str, given: Any) -> Any:
+    """One tensor of numbers, or the entries of a list of several."""
+    several = isinstance(given, list | tuple) and any(
+        isinstance(one, Tensor | np.ndarray | Sequence) for one in given
+    )
+    if several and any(getattr(one, "ndim", 1) for one in given):
+        return [tensor(name, one) for one in given]
+    return None if given is None else tensor(name, given)
+
+
 def _spread(
     rig: Any,
     t: Any,
@@ -206,7 +255,6 @@ def _spread(
             f"`parameters` must give tensors by name, but is {type(parameters).__name__}"
         )
     for name, values in (parameters or {}).items():
-        check_array(f"parameters[{name!r}]", values)
         if values.ndim == 0:
             raise ValueError(
                 f"`parameters[{name!r}]` must have one entry a run, but is a single number"

@@ -13,13 +13,16 @@ from tqdm import tqdm
 
 from torchsoft.paper.equilibrium import rest
 from torchsoft.paper.rig import SoftGrasp
+from torchsoft.physics.arguments import Numbers, tensor
 from torchsoft.physics.energy import stored
 from torchsoft.physics.motion import Reference
 from torchsoft.physics.rig import Rig
+from torchsoft.physics.setup import Setup
 from torchsoft.physics.validity import check_array
 from torchsoft.solve import tangent
 from torchsoft.solve.adjoint import TAPE_BYTES, Rows, Solved, attached, march, without_gradient
 from torchsoft.solve.grid import check_times
+from torchsoft.solve.inputs import shared
 from torchsoft.solve.ledger import doubts
 from torchsoft.solve.progress import Progress, SimulationFailed
 from torchsoft.solve.stability import describe_instability
@@ -51,13 +54,14 @@ class Interrupted(KeyboardInterrupt):
 
 
 def simulate(
-    rig: Rig, t: Tensor, *, y0: Tensor | None = None, reference: Reference | None = None,
+    rig: Rig, t: Numbers, *, y0: Numbers | None = None, reference: Reference | None = None,
     rtol: float | None = None, atol: float | None = None, step: float | None = None,
-    knots: Tensor | None = None, tolerance: float = 1e-9, gradient: Route = "none",
-    wrt: Sequence[str] = (), dy0: Tensor | None = None, rigid: bool = False,
+    knots: Numbers | None = None, tolerance: float = 1e-9, gradient: Route = "none",
+    wrt: Sequence[str] = (), dy0: Numbers | None = None, rigid: bool = False,
     touch: Sequence[str] = (), progress: bool = False,
 ) -> Trajectory:  # fmt: skip
-    """Integrate `rig` from y0 (size,) at t[0] through the times t (T,) [s].
+    """Integrate `rig` from y0 (size,) at t[0] through the times t (T,) [s]: tensors, numpy's arrays
+    or lists, which are computed with in float64.
 
     y0 defaults to the paper's rig at rest. `reference` is what the rig follows, its own by default.
 
@@ -106,13 +110,18 @@ class Task(NamedTuple):
 
 
 def prepare(
-    rig: Rig, t: Tensor, *, y0: Tensor | None = None, reference: Reference | None = None,
+    rig: Rig, t: Numbers, *, y0: Numbers | None = None, reference: Reference | None = None,
     rtol: float | None = None, atol: float | None = None, step: float | None = None,
-    knots: Tensor | None = None, tolerance: float = 1e-9, gradient: Route = "none",
-    wrt: Sequence[str] = (), dy0: Tensor | None = None, rigid: bool = False,
+    knots: Numbers | None = None, tolerance: float = 1e-9, gradient: Route = "none",
+    wrt: Sequence[str] = (), dy0: Numbers | None = None, rigid: bool = False,
     touch: Sequence[str] = (),
 ) -> Task:  # fmt: skip
     """Checks what `simulate` is asked for; raises its `ValueError`s."""
+    t = tensor("t", t)
+    y0, knots, dy0 = (
+        None if x is None else tensor(name, x)
+        for name, x in (("y0", y0), ("knots", knots), ("dy0", dy0))
+    )
     _check_wanted(gradient, wrt, dy0, rigid, touch)
     ways = {"step": step, "knots": knots, "rtol or atol": rtol if rtol is not None else atol}
     given = [f"`{name}`" for name, value in ways.items() if value is not None]
@@ -135,7 +144,8 @@ def prepare(
             raise ValueError("`y0` is needed: only the paper's rig has a start of its own")
         y0 = rest(rig)
     stepper.check_start(y0)
-    return Task(stepper, t, y0, gradient, tuple(wrt), dy0, rigid, _channels_of_touch(rig, touch))
+    felt = _channels_of_touch(rig, touch)
+    return Task(stepper, t, shared(y0), gradient, tuple(wrt), dy0, rigid, felt)
 
 
 class RunOutcome(NamedTuple):
@@ -317,7 +327,7 @@ def gather(
     given = "step_s" if stepper.step is not None else "knots" if stepper.knots is not None else ""
     steps = {given: stepper.step} if given else {"rtol": stepper.rtol, "atol": stepper.atol}
     return Trajectory(
-        t=t, y=y, state=state, channels=measured, force=force, load=load, recorded=felt,
+        t=t, y=y, state=state, channels=measured, force=force, loads=load, recorded=felt,
         displacement=displacement, energy=energy,
         dissipated={name: integrals[name] for name in names.dissipated},
         supplied={name: integrals[name] for name in names.supplied if name in names.active},
@@ -331,5 +341,5 @@ def gather(
         else dict(
             zip(task.touch, touch.slopes(task.touch, slopes[1][:count], felt).unbind(1))
         ),
-        units=units(rig),
+        units=units(rig), setup=Setup.of(rig), rig=rig,
     )  # fmt: skip

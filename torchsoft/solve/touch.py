@@ -7,7 +7,7 @@ base's axes; its moment is the channel M_NAME), normal and shear of a contact's 
 taxels, and the centre of their normal forces.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ import torch
 from scipy import sparse
 from torch import Tensor
 
+from torchsoft.display import enumerated
 from torchsoft.physics.rig import Rig
 from torchsoft.solve.kernel.table import Array, Index
 
@@ -51,15 +52,6 @@ class Sums(NamedTuple):
     start: Index
     at: Index
     weight: Array
-
-
-def enumerated(names: Iterable[str]) -> str:
-    """Names one after the other, those of an array as one, for messages."""
-    last: dict[str, str] = {}
-    for name in names:
-        array, _, number = name.rpartition(".")
-        last[array if number.isdecimal() else name] = number if number.isdecimal() else ""
-    return ", ".join(f"{name}.0 to {number}" if number else name for name, number in last.items())
 
 
 class Touch:

@@ -3,8 +3,9 @@ made."""
 
 from __future__ import annotations
 
-import json
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,15 +13,19 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchsoft.channels import MEASURED, PADS, VARIABLES
+from torchsoft.display import Shown, amount, suggestion
 from torchsoft.files import replacing, sealed, unsealed
 from torchsoft.physics.parts import COORDINATES, coordinate_unit
 from torchsoft.physics.rig import Rig
+from torchsoft.physics.setup import Setup
 from torchsoft.physics.state import Layout, State
+from torchsoft.physics.sticking import contact_states
 from torchsoft.solve.touch import Touch
 
-if TYPE_CHECKING:  # takes as long to import as all of this package
+if TYPE_CHECKING:  # these take as long to import as all of this package
+    import pandas as pd
     import xarray as xr
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -39,19 +44,22 @@ class Stats:
         return self.newton_iterations / max(self.steps, 1)
 
 
-@dataclass(frozen=True)
-class Trajectory:
+@dataclass(frozen=True, repr=False)
+class Trajectory(Shown):
     """A run sampled at t (T,) [s]. SI units, every tensor float64 and shaped (T, ...).
 
     y: flat states (T, size). channels: what can be measured or was asked for, by key, (T,) each.
     force: normal and friction force (T, points, 2) [N] on the points of each contact, along n and t
     of their moving frames. recorded (T, recorded): all forces, of which `touch` makes its channels,
-    `run["skin.normal.7"]`. load: what the contacts and pads do to each body (T, 3), a force [N] and
-    a moment about its centre [N.m], world axes. displacement: of the nodes of each pad (T, nodes,
-    2) [m], in its base's frame. energy: stored [J]; dissipated, supplied and `injected` [J] since
-    t[0].
+    `run["skin.normal.7"]`; both None in a run that was loaded. loads: what the contacts and pads do
+    to each body (T, 3), a force [N] and a moment about its centre [N.m], world axes. displacement:
+    of the nodes of each pad (T, nodes, 2) [m], in its base's frame. energy: stored [J]; dissipated,
+    supplied and `injected` [J] since t[0].
 
     units: of the channels, by key, as far as the rig knows them.
+
+    setup: meshes, outlines, contacts and actuators as they were, for pictures and files; rig: what
+    ran, None in a run that was loaded.
 
     knots (steps + 1,): where the steps began and ended [s]; given to another run, that takes the
     same ones.
@@ -66,8 +74,7 @@ class Trajectory:
     state: State = field(repr=False)
     channels: dict[str, Tensor] = field(repr=False)
     force: dict[str, Tensor] = field(repr=False)
-    load: dict[str, Tensor] = field(repr=False)
-    recorded: Tensor = field(repr=False)
+    loads: dict[str, Tensor] = field(repr=False)
     displacement: dict[str, Tensor] = field(repr=False)
     energy: dict[str, Tensor] = field(repr=False)
     dissipated: dict[str, Tensor] = field(repr=False)
@@ -76,23 +83,70 @@ class Trajectory:
     stats: Stats
     knots: Tensor = field(repr=False)
     layout: Layout = field(repr=False)
-    touch: Touch = field(repr=False)
     made_by: dict[str, Any] = field(repr=False)
     wrt: tuple[str, ...] = ()
     sensitivities: Tensor | None = field(default=None, repr=False)
     touch_sensitivities: dict[str, Tensor] = field(default_factory=dict, repr=False)
     units: dict[str, str] = field(default_factory=dict, repr=False)
+    setup: Setup = field(default_factory=Setup, repr=False)
+    rig: Rig | None = field(default=None, repr=False, compare=False)
+    recorded: Tensor | None = field(default=None, repr=False)
+    touch: Touch | None = field(default=None, repr=False)
+    known_contact_state: dict[str, Tensor] | None = field(default=None, repr=False, compare=False)
 
     def __getitem__(self, channel: str) -> Tensor:
         """A channel (T,). Raises `KeyError` naming those that are there."""
         if channel in self.channels:
             return self.channels[channel]
-        if channel in self.touch:
-            return self.touch[channel].value(self.recorded)
-        raise KeyError(
-            f"the run has no channel `{channel}`; it has {', '.join(self.channels)}, and of touch "
-            f"{self.touch.shown}"
+        touch = self.touch
+        if touch is not None and self.recorded is not None and channel in touch:
+            return touch[channel].value(self.recorded)
+        known = suggestion(channel, (*self.channels, *(touch or ())), "it has")
+        lost = "; it was loaded, without its rig and the channels of touch" if touch is None else ""
+        raise KeyError(f"the run has no channel `{channel}`; {known}{lost}")
+
+    def __contains__(self, channel: object) -> bool:
+        return channel in self.channels or (self.touch is not None and channel in self.touch)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.channels)
+
+    def keys(self) -> Sequence[str]:
+        """Names of the channels, without those of touch."""
+        return list(self.channels)
+
+    def _ipython_key_completions_(self) -> Sequence[str]:
+        return self.keys()
+
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+        t, stats = self.t, self.stats
+        title = (
+            f"Trajectory: {float(t[0]):g} to {float(t[-1]):g} s, {len(t)} samples, "
+            f"{len(self.channels)} channels"
         )
+        rows = []
+        for name, body in self.setup.bodies.items():
+            for axis, channel in body.channels.items():
+                if body.freedom[axis] != "fixed":
+                    x = self[channel].detach()
+                    end = amount(float(x[-1]), self.units.get(channel, ""))
+                    rows.append((channel, f"{float(x[0]):.4g} to {end}, {axis} of {name}"))
+        forces = ", ".join(
+            f"{name} {float(F_N.detach().sum()):.3g} N on {int((F_N > 0).sum())} points"
+            for name, force in self.force.items()
+            for F_N in [force[-1, :, 0]]
+        )
+        rows.append(("contacts at the end", forces or "none"))
+        rows.append(("energy", f"{self.energy_residual_rel:.1e} of what was injected is missing"))
+        rows.append(
+            ("steps", f"{stats.steps}, {stats.newton_per_step:.2g} Newton iterations each, "
+                      f"{stats.wall_s:.2g} s")
+        )  # fmt: skip
+        if self.y.requires_grad:
+            rows.append(("gradient", "of every channel, by the discrete adjoint"))
+        if self.wrt:
+            rows.append(("sensitivities", f"by {', '.join(self.wrt)}"))
+        return title, rows
 
     def together(self, *channels: str) -> Tensor:
         """Channels side by side (T, channels)."""
@@ -121,83 +175,73 @@ class Trajectory:
         """Index of the sample nearest to `time` [s]."""
         return int((self.t - time).abs().argmin())
 
-    def to_dataset(self) -> xr.Dataset:
-        """The run as an xarray Dataset with named dimensions, units, and how it was made."""
-        import xarray as xr
+    @cached_property
+    def contact_state(self) -> dict[str, Tensor]:
+        """State of every contact point by contact, int8 (T, points): 0 separated, 1 sticking, 2
+        slipping; -1 where a point touches and nobody knows, since the rig's parameters are no
+        longer those of the run."""
+        if self.known_contact_state is not None:
+            return self.known_contact_state
+        rig = self.rig
+        if rig is not None and rig.description()["parameters"] == self.made_by["parameters"]:
+            state = State(*({k: x.detach() for k, x in part.items()} for part in self.state))
+            return contact_states(rig, state, self.force)
+        touching = {name: force[..., 0] > 0 for name, force in self.force.items()}
+        return {name: -there.to(torch.int8) for name, there in touching.items()}
 
-        columns: dict[str, tuple[tuple[str, ...], Tensor, str, str]] = {}
-        left = dict(self.channels)
-        papers = all(
-            name in left for name in MEASURED
-        )  # another rig may call by these names what is something else
-        for name, variable in VARIABLES.items() if papers else ():
-            keys = list(variable.symbols)
-            if all(key in left for key in keys):
-                parts = [left.pop(key) for key in keys]
-                dims = ("time", "axis") if len(parts) == 2 else ("time",)
-                value = torch.stack(parts, -1) if len(parts) == 2 else parts[0]
-                columns[name] = (dims, value, variable.unit, variable.meaning)
-        columns |= {
-            name: (("time",), value, self.units.get(name, ""), "channel of the rig")
-            for name, value in left.items()
-        }
-        columns["energy_injected"] = (
-            ("time",),
-            self.injected,
-            "J",
-            "positive part of the sources' work",
-        )
-        columns["energy_residual"] = (
-            ("time",),
-            self.energy_residual,
-            "J",
-            "stored - supplied + dissipated",
-        )
-        for key, force in self.force.items():
-            name = PADS.get(key, key)
-            points = ("time", f"{name}_surface")
-            columns[f"normal_force_{name}"] = (
-                points,
-                force[..., 0],
-                "N",
-                f"normal force at the contact {name}",
-            )
-            columns[f"friction_force_{name}"] = (
-                points,
-                force[..., 1],
-                "N",
-                f"friction at the contact {name}",
-            )
-            stretch = self.state.stretch[key]
-            columns[f"stretch_{name}"] = (points, stretch, "m", "stretch of the momentary springs")
-        for key, u in self.displacement.items():
-            name = PADS.get(key, key)
-            nodes = ("time", f"{name}_node", "axis")
-            columns[f"displacement_{name}"] = (nodes, u, "m", f"displacements of the pad {name}")
-            if key in self.state.rates:
-                columns[f"velocity_{name}"] = (
-                    nodes,
-                    self.state.rates[key],
-                    "m/s",
-                    f"nodal velocities of the pad {name}",
-                )
-        for kind in ("energy", "dissipated", "supplied"):
-            for name, value in getattr(self, kind).items():
-                columns[f"{kind}_{name}"] = (("time",), value, "J", f"{kind}: {name}")
-        data = {
-            name: (dims, value.detach().numpy(), {"units": unit, "long_name": meaning})
-            for name, (dims, value, unit, meaning) in columns.items()
-        }
-        coords = {"time": ("time", self.t.numpy(), {"units": "s"}), "axis": ["x", "y"]}
-        attrs = {
-            "stats": json.dumps(vars(self.stats)),
-            **{k: json.dumps(v) for k, v in self.made_by.items()},
-        }
-        return xr.Dataset(data, coords, attrs)
+    def plot(self, **how: Any) -> Figure:
+        """A dashboard of the run as a matplotlib figure; options of
+        `torchsoft.plot.dashboard.dashboard`."""
+        from torchsoft.plot.dashboard import dashboard
+
+        return dashboard(self, **how)
+
+    def animate(self, path: str | Path, **how: Any) -> None:
+        """Write a video, .mp4 or .gif, or the interactive player, .html; options of
+        `torchsoft.plot.animation.animate` or `torchsoft.plot.player.player`."""
+        if Path(path).suffix == ".html":
+            from torchsoft.plot.player import player
+
+            player(self, Path(path), **how)
+            return
+        from torchsoft.plot.animation import animate
+
+        animate(self, Path(path), **how)
+
+    def to_xarray(self) -> xr.Dataset:
+        """The run as an xarray Dataset with named dimensions, units, and how it was made."""
+        from torchsoft.solve.netcdf import to_xarray
+
+        return to_xarray(self)
+
+    def to_pandas(self) -> pd.DataFrame:
+        """The channels as columns over time [s]; their units are in `attrs`."""
+        import pandas as pd
+
+        columns = {name: x.detach().numpy() for name, x in self.channels.items()}
+        table = pd.DataFrame(columns, index=pd.Index(self.t.numpy(), name="t"))
+        table.attrs["units"] = dict(self.units)
+        return table
+
+    def to_vtk(self, path: str | Path, times: Sequence[float] | None = None) -> list[Path]:
+        """Write the pads for ParaView and meshio: displacements [m], strains, stresses [Pa], one
+        .vtu a sample and a .pvd that lists them; the files written. See
+        `torchsoft.solve.vtk.write`."""
+        from torchsoft.solve.vtk import write
+
+        return write(self, Path(path), times)
 
     def save(self, path: str | Path) -> None:
         """Write NetCDF with a checksum. The file appears whole or not at all."""
-        save(self.to_dataset(), path)
+        save(self.to_xarray(), path)
+
+    @staticmethod
+    def load(path: str | Path) -> Trajectory:
+        """The run that `save` wrote, without its rig. Raises `ValueError` for any other file and
+        for one that is damaged, and `OSError`."""
+        from torchsoft.solve.netcdf import read
+
+        return read(path)
 
 
 def save(data: xr.Dataset, path: str | Path) -> None:

@@ -7,7 +7,6 @@ Every error is a `ValueError` in a sentence that names the file, the row and the
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,8 +14,8 @@ import numpy as np
 import xarray as xr
 
 from torchsoft import csvfile
-from torchsoft.channels import CHANNELS, FEED_FORWARD, MEASURED, SETPOINTS, UNITS, VARIABLES
-from torchsoft.solve.touch import enumerated
+from torchsoft.channels import CHANNELS, FEED_FORWARD, MEASURED, SETPOINTS, UNITS
+from torchsoft.display import enumerated, nearest
 from torchsoft.solve.trajectory import load
 from torchsoft.sysid.recording import Array
 from torchsoft.tables import shown
@@ -199,8 +198,8 @@ def hint(name: str, columns: int, names: Collection[str]) -> str:
     if columns == 1:
         return f"; separate columns with commas; {known}"
     plain = {re.sub(r"[^a-z]", "", one.lower()): one for one in names} | {"time": "t"}
-    near = get_close_matches(re.sub(r"[^a-z]", "", name.lower()), plain, n=1, cutoff=0.6)
-    meant = f": is it `{plain[near[0]]}`? If" if near else "; if"
+    near = nearest(re.sub(r"[^a-z]", "", name.lower()), plain)
+    meant = f": did you mean `{plain[near]}`? If" if near else "; if"
     return f"{meant} it has nothing to do with the motion, say ignore = [{shown(name)}]; {known}"
 
 
@@ -218,7 +217,7 @@ def read_trajectory(path: Path, ignore: Collection[str] = (), known: Vocabulary 
     """The table in a file of `Trajectory.save`; rows are called samples, counted from 0. Raises
     `ValueError`."""
     data = load(path)
-    values = read_columns(data, path) if known is PAPER else read_channels(data, path, known)
+    values = read_channels(data, path, known)
     left_out = tuple(name for name in values if name in ignore)
     values = {name: column for name, column in values.items() if name not in ignore}
     table = Columns(path, values, list(range(len(values.get("t", ())))), "sample", left_out)
@@ -229,46 +228,25 @@ def read_trajectory(path: Path, ignore: Collection[str] = (), known: Vocabulary 
 
 
 def read_channels(data: xr.Dataset, path: Path, known: Vocabulary) -> dict[str, Array]:
-    """The channels of a trajectory of another rig than the paper's. Raises `ValueError` for those
-    in other units than the rig's."""
+    """The channels of a trajectory. Raises `ValueError` where it has none of them, or has one in
+    another unit or form than the rig's."""
     there = {name: data[name] for name in known.units if name in data and name != "t"}
+    if "time" not in data.coords or not there:
+        raise ValueError(
+            f"{path} is not a trajectory file of this rig: it has no time and channels"
+        )
     for name, one in there.items():
-        if one.dims != ("time",) or one.attrs.get("units") != known.units[name]:
+        if one.dims != ("time",) or one.dtype != np.float64:
             raise ValueError(
-                f"{path}, `{name}` should be in {known.units[name]} over time, not "
-                f"{shown(one.attrs.get('units'))} over {' and '.join(map(str, one.dims))}"
+                f"{path} is not a trajectory file: `{name}` should be float64 over time"
             )
-    if "time" not in data.coords:
-        raise ValueError(f"{path} is not a trajectory file: it has no time")
-    values = {"t": data["time"], **there}
-    return {name: np.array(one.values, float) for name, one in values.items()}
-
-
-def read_columns(data: xr.Dataset, path: Path) -> dict[str, Array]:
-    """The columns of a trajectory. Raises `ValueError` where it has not what a trajectory has."""
-    columns = {name: CHANNELS[name] for name in COLUMNS}
-    if CHANNELS["y_d_dot"].variable not in data:  # as in files of the first edition
-        del columns["y_d_dot"]
-    variables = {c.variable: VARIABLES[c.variable] for c in columns.values()}
-    if missing := [name for name in variables if name not in data]:
-        raise ValueError(f"{path} is not a trajectory file: it has no {', '.join(missing)}")
-    for name, variable in variables.items():
-        one, axes = data[name], ("time", "axis")[: 1 if len(variable.symbols) == 1 else 2]
-        if (
-            one.dims != axes
-            or one.dtype != np.float64
-            or ("axis" in axes and one.sizes["axis"] != 2)
-        ):
+        if one.attrs.get("units") != known.units[name]:
             raise ValueError(
-                f"{path} is not a trajectory file: `{name}` should be float64 over "
-                f"{' and '.join(axes)}"
-            )
-        if one.attrs.get("units") != variable.unit:
-            raise ValueError(
-                f"{path}, `{name}` should be in {variable.unit}, not "
+                f"{path}, `{name}` should be in {known.units[name]}, not "
                 f"{shown(one.attrs.get('units'))}"
             )
-    return {name: np.array(c.of(data[c.variable].values), float) for name, c in columns.items()}
+    values = {"t": data["time"], **there}
+    return {name: np.array(one.values, float) for name, one in values.items()}
 
 
 def check_table(table: Columns, known: Vocabulary = PAPER) -> Columns:

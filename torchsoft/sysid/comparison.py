@@ -27,6 +27,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from torchsoft.display import suggestion
 from torchsoft.files import finite, replacing
 
 EVIDENCE = 5.0
@@ -168,7 +169,8 @@ class Comparison:
             if one.name == name:
                 return one
         raise KeyError(
-            f"no law `{name}` was compared; there are {', '.join(one.name for one in self.laws)}"
+            f"no law `{name}` was compared; "
+            f"{suggestion(name, [one.name for one in self.laws], 'there are')}"
         )
 
     def to_json(self) -> str:

@@ -14,6 +14,7 @@ import torch
 from scipy.optimize import brentq
 from torch import Tensor
 
+from torchsoft.display import suggestion
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.contact import cross
 from torchsoft.physics.parts import PD, Contact
@@ -72,7 +73,8 @@ def estimate_initial_state(
     late = {channel: t >= first + lead - SAME for channel, (t, _) in recording.samples.items()}
     if strange := [name for name in given or {} if name not in free_coordinates(rig)]:
         raise ValueError(
-            f"`given` speaks of `{strange[0]}`; there are {', '.join(free_coordinates(rig))}"
+            f"`given` speaks of `{strange[0]}`; "
+            f"{suggestion(strange[0], free_coordinates(rig), 'there are')}"
         )
     if slow := [channel for channel, sensor in sensors.items() if sensor.delay > lead]:
         raise ValueError(

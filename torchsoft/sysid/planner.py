@@ -27,7 +27,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchsoft.quantity import near
+from torchsoft.display import suggestion
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import simulate
 from torchsoft.sysid.criterion import Criterion, Moves, chosen, deviations
@@ -108,7 +108,7 @@ class Planner:
             if channel not in self.recording.channels or not low < high:
                 raise ValueError(
                     f"limits.{channel} = ({low:g}, {high:g}): a limit is (low, high) of a channel "
-                    f"of the rig; {near(channel, self.recording.channels)}"
+                    f"of the rig; {suggestion(channel, self.recording.channels, 'known:')}"
                 )
         self.grid = self.recording.grid(problem.interpolated)
         self._others = Runner(problem.recordings, workers)

@@ -5,7 +5,6 @@ The density is that of the coordinates: exp(-|r|^2 / 2), priors being rows of r,
 A coordinate without a prior is uniform between its bounds.
 """
 
-import importlib
 import json
 import time as clock
 from collections.abc import Sequence
@@ -16,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from tqdm import tqdm
 
+from torchsoft.extras import needed
 from torchsoft.files import finite, replacing
 from torchsoft.sysid.profile import CHOSEN_ANEW, MarginalSummary, Optimum, PosteriorSummary
 from torchsoft.sysid.recording import Array
@@ -112,8 +112,9 @@ def halves(chains: Array) -> Array:
 
 
 def diagnostics() -> Any:
-    """ArviZ's functions of arrays; their import takes a second."""
-    return importlib.import_module("arviz_stats.base").array_stats
+    """ArviZ's functions of arrays; their import takes a second. Raises `ModuleNotFoundError` with
+    the remedy where they are missing."""
+    return needed("arviz_stats.base", "posterior").array_stats
 
 
 def quantile(values: Array, weights: Array, part: float) -> float:

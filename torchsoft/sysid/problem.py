@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchsoft.display import suggestion
 from torchsoft.paper.rig import NAMES, SoftGrasp
 from torchsoft.physics.extensions import extensions
 from torchsoft.physics.validity import check_values
@@ -115,10 +116,11 @@ class Problem:
                 channel in recording.channels or channel in one or channel in one.arrays
                 for recording, one in zip(recordings, touch)
             ):
-                known = ", ".join(
-                    dict.fromkeys(c for recording in recordings for c in recording.channels)
+                known = dict.fromkeys(c for recording in recordings for c in recording.channels)
+                raise ValueError(
+                    f"sensors: `{line(channel, 80)}` is not a channel; "
+                    f"{suggestion(channel, known, 'known:')}"
                 )
-                raise ValueError(f"sensors: `{line(channel, 80)}` is not a channel; known: {known}")
             if channel not in sampled:
                 raise ValueError(f"sensors: no recording has samples of `{channel}`")
         for recording in recordings:

@@ -10,6 +10,7 @@ from scipy import stats
 from scipy.interpolate import PchipInterpolator
 from tqdm import tqdm
 
+from torchsoft.display import suggestion
 from torchsoft.sysid.fit import Unreachable, fisher, gauss_newton, newton_step
 from torchsoft.sysid.problem import Problem, Residuals
 from torchsoft.sysid.recording import Array
@@ -223,7 +224,8 @@ def profiles(
     for label in labels or ():
         if label not in known:
             raise ValueError(
-                f"there is no free coordinate {label!r} to profile; there are {', '.join(known)}"
+                f"there is no free coordinate {label!r} to profile; "
+                f"{suggestion(label, known, 'there are')}"
             )
     chosen = list(known if labels is None else labels)
     where = {label: i for i, label in enumerate(optimum.problem.coordinates.labels)}

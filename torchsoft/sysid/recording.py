@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from torchsoft.display import suggestion
 from torchsoft.physics.extensions import extend
 from torchsoft.physics.pads import Pad
 from torchsoft.physics.rig import Rig
@@ -77,8 +78,8 @@ class Recording:
         for channel, (t, y) in self.samples.items():
             if channel not in known and channel not in touch:
                 raise ValueError(
-                    f"`{channel}` is not a channel of the rig of `{self.name}`; known: "
-                    f"{', '.join(known)}, and of touch {touch.shown}"
+                    f"`{channel}` is not a channel of the rig of `{self.name}`; "
+                    f"{suggestion(channel, (*known, *touch), 'known:')}"
                 )
             if t.shape != y.shape or t.ndim != 1 or len(t) < 2:
                 raise ValueError(

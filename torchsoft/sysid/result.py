@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, TypeAdapter
 
+from torchsoft.display import Shown, suggestion
 from torchsoft.files import check_file, finite, replacing
 from torchsoft.paper.parameters import Parameters
 from torchsoft.paper.rig import SoftGrasp
@@ -161,8 +162,8 @@ class ChannelNoise:
     tried: list[Score]
 
 
-@dataclass(frozen=True)
-class IdentificationResult:
+@dataclass(frozen=True, repr=False)
+class IdentificationResult(Shown):
     """Estimates, correlations, directions, residuals, predictions, and how they were made.
 
     `x` and `covariance` are in `coordinates`, `correlation` and `directions` in those of them that
@@ -214,8 +215,23 @@ class IdentificationResult:
             if estimate.name == name:
                 return estimate
         raise KeyError(
-            f"no estimate of `{name}`; there are {', '.join(e.name for e in self.estimates)}"
+            f"no estimate of `{name}`; "
+            f"{suggestion(name, [e.name for e in self.estimates], 'there are')}"
         )
+
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+        rows = []
+        for one in self.estimates:
+            unit = "" if one.unit == "1" else f" {one.unit}"
+            if one.value is None or one.ci95 is None:
+                rows.append(
+                    (one.label, f"not determined by the data; ended at {one.last:.4g}{unit}")
+                )
+            else:
+                low, high = one.ci95
+                rows.append((one.label, f"{one.value:.4g}{unit}, 95 % {low:.4g} to {high:.4g}"))
+        rows += [("note", notice) for notice in self.notices]
+        return self.headline, rows
 
     @property
     def headline(self) -> str:

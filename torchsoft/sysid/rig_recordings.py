@@ -10,10 +10,11 @@ import numpy as np
 import torch
 
 from torchsoft.channels import UNITS
+from torchsoft.display import suggestion
 from torchsoft.physics.motion import Reference, Sampled
 from torchsoft.physics.rig import Rig
 from torchsoft.rigs.build import RigFile
-from torchsoft.solve.touch import Touch, enumerated
+from torchsoft.solve.touch import Touch
 from torchsoft.solve.trajectory import channels, measurable, units
 from torchsoft.sysid.columns import Tables, Vocabulary
 from torchsoft.sysid.configuration import Beginning, Moving
@@ -41,8 +42,8 @@ def vocabulary(rig: Rig, headings: Mapping[str, str]) -> Vocabulary:
     for heading, name in headings.items():
         if name not in columns:
             raise ValueError(
-                f"columns.{heading} = {shown(name)} is no channel of the rig; there are "
-                f"{enumerated(columns)}"
+                f"columns.{heading} = {shown(name)} is no channel of the rig; "
+                f"{suggestion(name, columns, 'there are')}"
             )
     return Vocabulary(columns, signals, headings=headings)
 

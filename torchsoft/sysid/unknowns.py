@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from torchsoft.display import suggestion
 from torchsoft.physics.rig import Rig
-from torchsoft.quantity import near
 from torchsoft.solve.touch import Touch
 from torchsoft.sysid.initial_state import BOUNDS, PREFIX
 from torchsoft.sysid.recording import REACH, Array, Recording
@@ -291,7 +291,8 @@ class Coordinates:
                         f"{several.numel()} numbers, and an unknown is one"
                     )
                 raise ValueError(
-                    f"unknowns: `{line(name, 80)}` cannot be identified; {near(name, given)}"
+                    f"unknowns: `{line(name, 80)}` cannot be identified; "
+                    f"{suggestion(name, given, 'known:')}"
                 )
             if u.ratio_to is not None and (u.ratio_to not in given or u.ratio_to == name):
                 raise ValueError(

@@ -8,10 +8,10 @@ dilatational part is integrated at the element's centre and the shear part at 2 
 
 from torchsoft.physics.mesh.block import CurvedPadMesh, FingertipMesh, PadMesh
 from torchsoft.physics.mesh.compliance import banded, unit_compliance
-from torchsoft.physics.mesh.mesh import Array, Mesh, element_matrices, lame_moduli
+from torchsoft.physics.mesh.mesh import Array, Mesh, StoredMesh, element_matrices, lame_moduli
 from torchsoft.physics.mesh.quads import QuadMesh
 
 __all__ = [
-    "Array", "CurvedPadMesh", "FingertipMesh", "Mesh", "PadMesh", "QuadMesh", "banded",
-    "element_matrices", "lame_moduli", "unit_compliance",
+    "Array", "CurvedPadMesh", "FingertipMesh", "Mesh", "PadMesh", "QuadMesh",
+    "StoredMesh", "banded", "element_matrices", "lame_moduli", "unit_compliance",
 ]  # fmt: skip

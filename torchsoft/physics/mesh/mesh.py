@@ -1,5 +1,6 @@
 """What a pad asks of its mesh, and its element, a bilinear quadrilateral."""
 
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, TypeVar
 
@@ -199,6 +200,16 @@ class FreeMesh(Mesh):
     @property
     def elements_y(self) -> int:
         return max(1, round(len(self.elements) / self.elements_x))
+
+
+@dataclass(frozen=True, eq=False)
+class StoredMesh(FreeMesh):
+    """The numbers of a mesh, as files keep them."""
+
+    nodes: Array
+    elements: Index
+    bonded: NDArray[np.bool_]
+    face: Index
 
 
 def edges(elements: Index) -> Index:

@@ -1,0 +1,158 @@
+"""The interactive player, in a real browser where there is one."""
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from browser import MISSING, Page, browser
+from conftest import coarse
+from PIL import Image
+
+from torchsoft import Trajectory, simulate
+from torchsoft.plot.player import frame_rows, player
+from torchsoft.scenario import grasp_and_roll
+
+SEEN = "return [...document.querySelectorAll('.chart span')].map(x => x.textContent)"
+SLIDE = """const s = document.getElementById('slider'); s.value = arguments[0];
+s.dispatchEvent(new Event('input')); return document.getElementById('clock').textContent"""
+SPOT = """const c = data.contacts[arguments[0]], i = arguments[1], o = 2 * (frame * c.count + i);
+const at = place(pose(data.pads[c.pad].base, frame), c.points[o], c.points[o + 1]);
+const r = document.getElementById('scene').getBoundingClientRect();
+const q = toScreen(at, r.width, r.height);
+return [r.x + q[0], r.y + q[1]]"""
+
+
+@pytest.fixture(scope="module")
+def run() -> Trajectory:
+    model = coarse()
+    start = grasp_and_roll(model, grasp_force=80.0)
+    return simulate(model, torch.linspace(0, 0.5, 51, dtype=torch.float64), y0=start.y0)
+
+
+@pytest.fixture(scope="module")
+def page(run: Trajectory, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    if MISSING:
+        pytest.skip(MISSING)
+    path = tmp_path_factory.mktemp("player") / "run.html"
+    player(run, path, frames=30, title="A grasp & </script> more")
+    with browser() as page:
+        page.open(path)
+        yield page
+
+
+def test_the_file_holds_everything(run: Trajectory, tmp_path: Path) -> None:
+    """And asks for nothing: no address, no module, no other file."""
+    run.animate(tmp_path / "run.html", frames=20, title="</script><script>alert(1)</script>")
+    text = (tmp_path / "run.html").read_text(encoding="utf-8")
+    data = json.loads(re.search(r"const data = (\{.*\});\n", text)[1])  # pyright: ignore[reportOptionalSubscript]
+    shell = text.replace(json.dumps(data), "")
+    assert text.count("</script>") == 1
+    assert not re.search(r"https?://|src=|import |fetch\(|XMLHttp|@import|url\(", shell)
+    assert len(data["times"]) <= 20
+    assert {"disc", "bracket"} == set(data["bodies"])
+    with pytest.raises(ValueError, match="`frames` must be 2 or more"):
+        player(run, tmp_path / "run.html", frames=1)
+
+
+def test_frames_are_denser_where_steps_are_short(run: Trajectory) -> None:
+    rows = frame_rows(run, 20)
+    assert (rows[0], rows[-1]) == (0, 50)
+    assert np.all(np.diff(rows) > 0)
+    t, knots = run.t.numpy()[rows], run.knots.numpy()
+    middle = np.median(knots)
+    assert (t < middle).sum() / middle > (t >= middle).sum() / (0.5 - middle)
+
+
+def test_the_page_opens_without_errors_and_without_a_network(page: Page) -> None:
+    assert page.run("return document.title") == "A grasp & </script> more"
+    assert [one for one in page.log("browser") if one["level"] == "SEVERE"] == []
+    asked = [json.loads(one["message"])["message"] for one in page.log("performance")]
+    urls = [
+        one["params"]["request"]["url"]
+        for one in asked if one["method"] == "Network.requestWillBeSent"
+    ]  # fmt: skip
+    assert all(url.startswith(("file:", "data:")) for url in urls), urls
+
+
+def test_charts_follow_the_slider(page: Page, run: Trajectory) -> None:
+    choose = """const s = document.querySelector('.chart select');
+    s.value = [...s.options].findIndex(o => o.textContent.startsWith(arguments[0]));
+    s.dispatchEvent(new Event('change'))"""
+    page.run(choose, "y of bracket")
+    for frame in (0, 12, 29):
+        clock = page.run(SLIDE, frame)
+        time = float(clock.removeprefix("t = ").removesuffix(" s"))
+        shown = {x.rsplit(" ", 1)[0]: float(x.rsplit(" ", 1)[1]) for x in page.run(SEEN)[:2]}
+        row = run.at(time)
+        assert shown["actual"] == pytest.approx(1e3 * float(run["y_Br"][row]), rel=1e-3)
+        assert shown["set-point"] == pytest.approx(1e3 * float(run["y_d"][row]), rel=1e-3)
+
+
+def test_a_point_tells_its_forces(page: Page, run: Trajectory) -> None:
+    page.run(SLIDE, 29)
+    point = int(run.force["L"][-1, :, 0].argmax())
+    x, y = page.run(SPOT, "L", point)
+    page.act({"type": "pointerMove", "x": round(x), "y": round(y), "origin": "viewport"})
+    tip = page.run("return document.getElementById('tip').textContent")
+    normal, friction = run.force["L"][-1, point].tolist()
+    said = dict(re.findall(r"^(.*?)\s\s+([-\d.e]+) N", tip, re.M))
+    assert f"contact L, point {point}: sticks" in tip
+    assert float(said["normal force"]) == pytest.approx(normal, rel=1e-3)
+    assert abs(float(said["friction"])) == pytest.approx(abs(friction), abs=1e-3 * normal)
+    assert float(said["cone"]) == pytest.approx(0.8 * normal, rel=1e-3)
+
+
+def test_an_element_tells_its_stress(page: Page, run: Trajectory) -> None:
+    page.run(SLIDE, 29)
+    middle = """const p = data.pads.L, c = [0, 0], e = arguments[0];
+    for (let k = 0; k < 4; k++) { const o = 2 * (frame * p.count + p.elements[4 * e + k]);
+      c[0] += p.nodes[o] / 4; c[1] += p.nodes[o + 1] / 4; }
+    const r = document.getElementById('scene').getBoundingClientRect();
+    for (let i = 0; i < 6; i++) { const q = toScreen(c, r.width, r.height); view.x = c[0]; view.y = c[1]; view.k = 40; }
+    drawScene(); return [r.x + r.width / 2, r.y + r.height / 2]"""  # noqa: E501
+    pad = run.setup.pads["L"]
+    stress = pad.stress(pad.strain(pad.displacement(run.displacement["L"][-1].numpy())))
+    centres = pad.mesh.nodes[pad.mesh.elements].mean(1)
+    low = np.where(centres[:, 1] < pad.mesh.nodes[:, 1].max() / 2)[0]  # away from contact points
+    element = int(low[np.abs(stress[low, 1]).argmax()])
+    x, y = page.run(middle, element)
+    page.act({"type": "pointerMove", "x": round(x), "y": round(y), "origin": "viewport"})
+    tip = page.run("return document.getElementById('tip').textContent")
+    assert f"pad L, element {element}" in tip
+    pressure = float(re.search(r"pressure\s+([-\d.e]+) kPa", tip)[1])  # pyright: ignore[reportOptionalSubscript]
+    assert pressure == pytest.approx(-1e-3 * stress[element, :3].mean(), rel=1e-3, abs=0.01)
+    page.run("document.getElementById('fit').click()")
+
+
+def test_it_plays_zooms_and_switches(page: Page, tmp_path: Path) -> None:
+    page.run(SLIDE, 0)
+    before = page.run("return view.k")
+    turn = {"type": "scroll", "x": 300, "y": 300, "deltaX": 0, "deltaY": -240, "origin": "viewport"}
+    page.act(turn)
+    assert page.run("return view.k") > 1.3 * before
+    page.run("document.getElementById('fit').click()")
+    assert page.run("return view.k") == pytest.approx(before)
+    pictures = []
+    for quantity in ("von Mises stress", "displacement", "plain"):
+        page.run(SLIDE, 29)
+        page.run("const q = document.getElementById('quantity'); q.value = arguments[0]; "
+                 "q.onchange()", quantity)  # fmt: skip
+        (tmp_path / "page.png").write_bytes(page.picture())
+        with Image.open(tmp_path / "page.png") as picture:
+            pictures.append(np.asarray(picture.convert("RGB"), dtype=float))
+    for one, other in ((0, 1), (1, 2)):
+        assert np.abs(pictures[one] - pictures[other]).max() > 50
+    page.run(SLIDE, 0)
+    page.run("document.getElementById('speed').value = '0.5'; toggle()")
+    frame = 0
+    for _ in range(40):
+        frame = page.run("return frame")
+        if frame > 3:
+            break
+    assert frame > 3
+    page.run("stop()")
+    assert [one for one in page.log("browser") if one["level"] == "SEVERE"] == []

@@ -1,0 +1,73 @@
+"""Pictures of a run that was saved, and the version."""
+
+import argparse
+import platform
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from torchsoft.cli.results import say
+
+PLOT = """\
+Draws a run that `torchsoft run` or Trajectory.save wrote: FILE.png, a dashboard of motions, contact
+forces with the friction cone, points that stick and slip, stress and energies. --html writes the
+interactive player, one file for any browser that needs no network; --pdf a camera-ready dashboard,
+as wide as a page or a column, with --only for some of its panels."""
+
+
+def add_commands(commands: Any) -> None:
+    """The commands `plot` and `version`."""
+    one = commands.add_parser(
+        "plot", help="draw a saved run", description=PLOT,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    one.add_argument("file", type=Path, metavar="FILE.nc", help="the run")
+    one.add_argument("--html", action="store_true", help="write the interactive player")
+    one.add_argument("--pdf", action="store_true", help="write a camera-ready dashboard")
+    one.add_argument("--vtk", action="store_true", help="write the pads for ParaView")
+    one.add_argument(
+        "--width", choices=("page", "column"), default="page", help="of the PDF (%(default)s)"
+    )
+    one.add_argument("--only", nargs="+", default=(), metavar="PANEL", help="some panels only")
+    one.add_argument("--time", type=float, help="instant that is shown [s] (largest force)")
+    one.add_argument("--title", default="", help="title (the file's name)")
+    one.add_argument("--out", type=Path, help="folder for what is written (the file's)")
+    one.set_defaults(run=plot)
+    one = commands.add_parser("version", help="say which versions are at work")
+    one.set_defaults(run=versions)
+
+
+def plot(options: argparse.Namespace) -> int:
+    """Draw a saved run."""
+    from torchsoft.plot.dashboard import dashboard
+    from torchsoft.plot.figures import save
+    from torchsoft.plot.player import player
+    from torchsoft.solve.trajectory import Trajectory
+
+    run, title = Trajectory.load(options.file), options.title or options.file.stem
+    made = (options.out or options.file.parent) / options.file.with_suffix("").name
+    common: dict[str, Any] = {"only": options.only, "time": options.time}
+    written = []
+    if options.html:
+        written.append(made.with_name(f"{made.name}.html"))
+        player(run, written[-1], title=title)
+    if options.pdf:
+        written.append(made.with_name(f"{made.name}.pdf"))
+        save(dashboard(run, look=options.width, **common), written[-1])
+    if options.vtk:
+        listed = made.with_name(f"{made.name}.pvd")
+        run.to_vtk(listed, None if options.time is None else [options.time])
+        written.append(listed)
+    if not written:
+        written.append(made.with_name(f"{made.name}.png"))
+        save(dashboard(run, title=title, **common), written[-1])
+    say(f"written to {', '.join(map(str, written))}")
+    return 0
+
+
+def versions(options: argparse.Namespace) -> int:
+    """Say which versions are at work."""
+    names = ("torchsoft", "torch", "numpy", "numba")
+    listed = ", ".join(f"{name} {version(name)}" for name in names)
+    say(f"{listed}, Python {platform.python_version()}, {platform.system()} {platform.machine()}")
+    return 0

@@ -1,0 +1,80 @@
+"""What objects show of themselves at a prompt and in a notebook, and near names for wrong ones."""
+
+from collections.abc import Iterable
+from difflib import SequenceMatcher
+from html import escape
+
+ALIKE = 0.6
+"""Least ratio of common letters of two names that are alike."""
+
+FEW, SHOWN = 20, 6
+"""So many names are all shown besides the nearest one; of more, so many."""
+
+
+def enumerated(names: Iterable[str]) -> str:
+    """Names one after the other, those of an array as one, for messages."""
+    last: dict[str, str] = {}
+    for name in names:
+        array, _, number = name.rpartition(".")
+        last[array if number.isdecimal() else name] = number if number.isdecimal() else ""
+    return ", ".join(f"{name}.0 to {number}" if number else name for name, number in last.items())
+
+
+def ranked(name: object, known: Iterable[str]) -> list[tuple[float, float, str]]:
+    """Known names by how much they are like another one, capitals aside first, the best first."""
+
+    def alike(one: str, other: str) -> float:
+        shared = max(  # what both are in says nothing
+            (i + 1 for i, c in enumerate(one) if c == "." and other.startswith(one[: i + 1])),
+            default=0,
+        )
+        return SequenceMatcher(None, one[shared:], other[shared:]).ratio()
+
+    given = str(name)
+    every = ((alike(given.casefold(), one.casefold()), alike(given, one), one) for one in known)
+    return sorted(every, reverse=True)
+
+
+def nearest(name: object, known: Iterable[str]) -> str | None:
+    """The known name that is most like another one; None where none is."""
+    best, _, one = next(iter(ranked(name, known)), (0.0, 0.0, ""))
+    return one if best >= ALIKE else None
+
+
+def suggestion(name: object, known: Iterable[str], listed: str = "known are") -> str:
+    """The end of a refusal of `name`: the nearest of the known names, and after the words `listed`
+    all of them, or those next to it where they are many."""
+    names = list(dict.fromkeys(known))
+    near = nearest(name, names)
+    if near is None:
+        return f"{listed} {enumerated(names) or 'none'}"
+    many = len(names) > FEW
+    some = [one for *_, one in ranked(name, names)[:SHOWN]] + ["..."] if many else names
+    return f"did you mean `{near}`? ({listed} {', '.join(some)})"
+
+
+def amount(x: float, unit: str) -> str:
+    """A number with its unit, in four digits."""
+    return f"{x:.4g} {unit}" if unit and unit != "1" else f"{x:.4g}"
+
+
+class Shown:
+    """An object that shows itself as a title and rows of two columns."""
+
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+        """Title and rows."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        title, rows = self.shown()
+        width = max((len(name) for name, _ in rows), default=0)
+        return "\n".join([title, *(f"  {name.ljust(width)}  {text}" for name, text in rows)])
+
+    def _repr_html_(self) -> str:
+        title, rows = self.shown()
+        cells = "".join(
+            f'<tr><th style="text-align:left">{escape(name)}</th>'
+            f'<td style="text-align:left">{escape(text)}</td></tr>'
+            for name, text in rows
+        )
+        return f"<div><b>{escape(title)}</b><table>{cells}</table></div>"

@@ -1,0 +1,252 @@
+"""What stood where in a run: meshes, outlines, contacts and actuators as they were, in plain
+numbers that files and pictures take; and the fields inside of pads, from their own elements."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
+from typing import Any, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.sparse.linalg import SuperLU, splu
+
+from torchsoft.physics.mesh import Array, Mesh, StoredMesh, lame_moduli
+from torchsoft.physics.mesh.mesh import gradients, strains
+from torchsoft.physics.pads import contact_points
+from torchsoft.physics.rig import Rig
+
+
+@lru_cache(maxsize=8)
+def interior_solver(mesh: Mesh, nu: float) -> tuple[SuperLU, NDArray[np.int64], Array]:
+    """Factorised K_ii, the free dofs that are interior, and K_is (dense), for the surface dofs in
+    `mesh.surface` order.
+
+    The interior follows the surface whatever E and depth, so both are taken as 1.
+    """
+    K_lambda, K_mu, _ = mesh.matrices
+    lame_lambda, lame_mu = lame_moduli(1.0, nu)
+    K = mesh.assemble(lame_lambda * K_lambda + lame_mu * K_mu).tocsc()
+    surface = (2 * mesh.surface[:, None] + np.arange(2)).ravel()
+    inside = np.ones(2 * len(mesh.free), np.bool_)
+    inside[surface] = False
+    interior = np.flatnonzero(inside)
+    return splu(K[interior][:, interior]), interior, K[interior][:, surface].toarray()
+
+
+@lru_cache(maxsize=8)
+def strain_operator(mesh: Mesh) -> Array:
+    """B (elements, 3, 8): (e_xx, e_yy, 2 e_xy) at the centres of the elements."""
+    return strains(gradients(mesh.nodes[mesh.elements], 0.0, 0.0)[1])
+
+
+@dataclass(frozen=True)
+class PadSetup:
+    """A pad as it was: its mesh, own axes (2, 2) and origin [m] in the frame of its base (a body's
+    name, or the ground), relaxed modulus E [Pa], nu and depth [m], contact points an element.
+
+    Fields are (..., mesh nodes or elements, components), in the pad's own axes.
+    """
+
+    mesh: Mesh
+    axes: Array
+    origin: Array
+    base: str | None
+    inertial: bool
+    points: int
+    E: float
+    nu: float
+    depth: float
+
+    def placed(self, own: Array) -> Array:
+        """Places (..., 2) in the pad's own frame, in the base's."""
+        return own @ self.axes.T + self.origin
+
+    @cached_property
+    def spread(self) -> Array:
+        """Shape functions of the surface nodes at the contact points (points, surface nodes)."""
+        nodes, shares, _ = contact_points(self.mesh, self.points)
+        spread = np.zeros((len(nodes), len(self.mesh.surface)))
+        for j in (0, 1):
+            spread[np.arange(len(nodes)), nodes[:, j]] += shares[:, j]
+        return spread
+
+    def displacement(self, u: Array) -> Array:
+        """Displacements of all nodes of the mesh (..., mesh nodes, 2) [m], bonded ones too.
+
+        u (..., nodes, 2) [m]: displacements as a run records them, in the base's frame. A massless
+        pad has only its surface there; the interior is in equilibrium with it, u_i = -K_ii^-1 K_is
+        u_s.
+        """
+        mesh = self.mesh
+        own = (u.reshape(-1, *u.shape[-2:]) @ self.axes).reshape(-1, 2 * u.shape[-2])
+        free = np.zeros((len(own), 2 * len(mesh.free)))
+        if self.inertial:
+            free[:] = own
+        else:
+            factor, interior, K_is = interior_solver(mesh, self.nu)
+            free[:, (2 * mesh.surface[:, None] + np.arange(2)).ravel()] = own
+            free[:, interior] = -factor.solve(K_is @ own.T).T
+        out = np.zeros((len(own), len(mesh.nodes), 2))
+        out[:, mesh.free] = free.reshape(len(own), -1, 2)
+        return out.reshape(*u.shape[:-2], -1, 2)
+
+    def deformed(self, u: Array) -> Array:
+        """Places (..., mesh nodes, 2) [m] of all nodes in the frame of the base; u as for
+        `displacement`."""
+        return self.placed(self.mesh.nodes + self.displacement(u))
+
+    def surface_points(self, u: Array) -> Array:
+        """Places (..., points, 2) [m] of the contact points in the frame of the base."""
+        own = u[..., self.mesh.surface, :] if self.inertial else u
+        nodes = self.placed(self.mesh.nodes[self.mesh.free[self.mesh.surface]]) + own
+        return self.spread @ nodes
+
+    def strain(self, displacement: Array) -> Array:
+        """Strains (e_xx, e_yy, e_xy) at the centres of the elements (..., elements, 3), of
+        displacements of all nodes."""
+        nodes = displacement[..., self.mesh.elements, :]
+        flat = nodes.reshape(*nodes.shape[:-2], 8)
+        return np.einsum("eij,...ej->...ei", strain_operator(self.mesh), flat) * [1.0, 1.0, 0.5]
+
+    def stress(self, strain: Array) -> Array:
+        """Elastic stresses (s_xx, s_yy, s_zz, s_xy) [Pa] (..., elements, 4) of the relaxed material
+        in plane strain: the part that the dashpots carry is not in them."""
+        lame_lambda, lame_mu = lame_moduli(self.E, self.nu)
+        mean = lame_lambda * (strain[..., 0] + strain[..., 1])
+        parts = [mean + 2 * lame_mu * strain[..., i] for i in (0, 1)]
+        return np.stack((*parts, mean, 2 * lame_mu * strain[..., 2]), -1)
+
+
+def von_mises(stress: Array) -> Array:
+    """Von Mises' equivalent stress [Pa] (...) of stresses (..., 4)."""
+    xx, yy, zz, xy = (stress[..., i] for i in range(4))
+    return np.sqrt(0.5 * ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2) + 3 * xy**2)
+
+
+@dataclass(frozen=True)
+class BodySetup:
+    """A body as it was: its outline (points, 2) [m] about its centre, None where nothing touches
+    it, how each of its coordinates was free, and the channel that it is."""
+
+    outline: Array | None
+    freedom: dict[str, str]
+    channels: dict[str, str]
+
+    @property
+    def size(self) -> float:
+        """Largest distance of the outline from the centre [m]; 0 without one."""
+        return 0.0 if self.outline is None else float(np.linalg.norm(self.outline, axis=1).max())
+
+
+@dataclass(frozen=True)
+class ContactSetup:
+    """A contact: its pad, its body, and the coefficients of friction that its law has, by name."""
+
+    pad: str
+    body: str
+    friction: dict[str, float]
+
+
+@dataclass(frozen=True)
+class ActuatorSetup:
+    """An actuator: the coordinate that it pushes, its channel, the unit of its effort, and the
+    set-points that coordinates follow, by coordinate."""
+
+    pushes: str
+    channel: str
+    unit: str
+    follows: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Bodies, pads, contacts and actuators as a run had them."""
+
+    bodies: dict[str, BodySetup] = field(default_factory=dict)
+    pads: dict[str, PadSetup] = field(default_factory=dict)
+    contacts: dict[str, ContactSetup] = field(default_factory=dict)
+    actuators: dict[str, ActuatorSetup] = field(default_factory=dict)
+
+    @classmethod
+    @torch.inference_mode(False)  # outlines need torch's graphs
+    @torch.no_grad()
+    def of(cls, rig: Rig) -> Self:
+        """A rig as it is now."""
+        return cls(
+            bodies={
+                name: BodySetup(
+                    None if body.shape is None else body.shape.outline().detach().numpy().copy(),
+                    dict(body.freedom),
+                    {
+                        axis: rig.renamed.get(key, key)
+                        for axis in body.freedom
+                        for key in [f"{axis}_{rig.symbols[name]}"]
+                    },
+                )
+                for name, body in rig.bodies.items()
+            },
+            pads={
+                name: PadSetup(
+                    pad.mesh, pad.axes.numpy(), pad.origin.numpy(), pad.base, pad.inertial,
+                    pad.points, *(getattr(pad.material, x).item() for x in ("E", "nu", "depth")),
+                )
+                for name, pad in rig.pads.items()
+            },
+            contacts={
+                name: ContactSetup(
+                    contact.pad, contact.body,
+                    {
+                        mu: float(value)
+                        for mu in ("mu_s", "mu_k")
+                        for value in [getattr(contact.law.friction, mu, None)]
+                        if isinstance(value, torch.Tensor)
+                    },
+                )
+                for name, contact in rig.contacts.items()
+            },
+            actuators={
+                name: ActuatorSetup(
+                    one.pushes, rig.renamed.get(f"F_{name}", f"F_{name}"), one.effort_unit,
+                    {at: signal for at, signal in one.follows if signal != one.feed_forward},
+                )
+                for name, one in rig.actuators.items()
+            },
+        )  # fmt: skip
+
+    def plain(self) -> dict[str, Any]:
+        """Everything but arrays, for JSON."""
+
+        def rest(part: Any, without: tuple[str, ...] = ()) -> dict[str, Any]:
+            return {
+                name: x.tolist() if isinstance(x, np.ndarray) else x
+                for name, x in vars(part).items()
+                if name in part.__dataclass_fields__ and name not in without
+            }
+
+        return {
+            "bodies": {name: rest(one, ("outline",)) for name, one in self.bodies.items()},
+            "pads": {name: rest(one, ("mesh",)) for name, one in self.pads.items()},
+            "contacts": {name: rest(one) for name, one in self.contacts.items()},
+            "actuators": {name: rest(one) for name, one in self.actuators.items()},
+        }
+
+    @classmethod
+    def again(
+        cls, plain: dict[str, Any], outlines: dict[str, Array], meshes: dict[str, StoredMesh]
+    ) -> Self:
+        """The setup of `plain` and its arrays."""
+        pads = {}
+        for name, one in plain["pads"].items():
+            arrays = {key: np.array(one[key]) for key in ("axes", "origin")}
+            pads[name] = PadSetup(**one | arrays | {"mesh": meshes[name]})
+        return cls(
+            {
+                name: BodySetup(outline=outlines.get(name), **one)
+                for name, one in plain["bodies"].items()
+            },
+            pads,
+            {name: ContactSetup(**one) for name, one in plain["contacts"].items()},
+            {name: ActuatorSetup(**one) for name, one in plain["actuators"].items()},
+        )

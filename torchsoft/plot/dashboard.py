@@ -1,0 +1,328 @@
+"""One figure of a whole run: an instant of it, motions with their set-points, contact forces with
+the friction cone, points that stick and slip, efforts, stress in the pads, energies.
+
+Times in s, lengths in mm, angles in rad, forces in N, moments in N mm, stresses in kPa, energies in
+mJ.
+"""
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from torchsoft.display import suggestion
+from torchsoft.physics.mesh import Array
+from torchsoft.physics.parts import COORDINATES
+from torchsoft.physics.setup import ActuatorSetup, von_mises
+from torchsoft.physics.sticking import SLIPPING
+from torchsoft.plot.figures import (
+    ACTUAL,
+    COLOURS,
+    DESIRED,
+    Look,
+    forces_on,
+    letter,
+    looking,
+    new_figure,
+    stress_bar,
+    timeline,
+)
+from torchsoft.plot.scene import (
+    INK,
+    MM,
+    Instant,
+    Scene,
+    along_surface,
+    force_scale,
+    instants,
+    keys,
+    largest_stress,
+)
+from torchsoft.solve.trajectory import Trajectory
+
+STILL = 1e-3
+"""Range [mm, or rad] below which a coordinate has not moved."""
+
+SAMPLES = 400
+"""Samples at which stresses are taken at the most."""
+
+RIPPLES = 6
+"""Changes of the number of touching points from which on a ripple is explained."""
+
+RIPPLE = (
+    "Ripples of forces: points touch and part one by one; more contact points an element smooth "
+    "them."
+)
+"""What is known about a zigzag of the forces."""
+
+
+class Curve(NamedTuple):
+    """A coordinate over the run: its name, its label and its values (T,) as drawn; the set-point,
+    where a loop has one."""
+
+    name: str
+    label: str
+    values: Array
+    setpoint: Array | None
+
+
+def curves(run: Trajectory) -> Iterator[Curve]:
+    """Every coordinate that is not fixed."""
+    wanted = {at: name for one in run.setup.actuators.values() for at, name in one.follows.items()}
+    for name, body in run.setup.bodies.items():
+        for axis, place in zip(COORDINATES, run.state.pose[name].detach().numpy().T):
+            if body.freedom[axis] == "fixed":
+                continue
+            scale, unit = (1.0, "rad") if axis == "theta" else (MM, "mm")
+            coordinate, setpoint = f"{name}.{axis}", None
+            if coordinate in wanted:
+                setpoint = scale * run[wanted[coordinate]].detach().numpy()
+            yield Curve(coordinate, f"{axis} of {name} [{unit}]", scale * place, setpoint)
+
+
+def liveliest(run: Trajectory) -> str:
+    """The free coordinate that moves most, an angle counting by the body's size; one without a loop
+    if there is any."""
+    looped = {one.pushes for one in run.setup.actuators.values()}
+
+    def way(curve: Curve) -> tuple[bool, float]:
+        name, _, axis = curve.name.partition(".")
+        body = run.setup.bodies[name]
+        size = MM * body.size if axis == "theta" and body.size else 1.0
+        free = body.freedom[axis] == "free" and curve.name not in looped
+        return free, size * float(np.ptp(curve.values))
+
+    return max(curves(run), key=way).name
+
+
+def motion(axes: Axes, run: Trajectory, curve: Curve) -> None:
+    """A coordinate, with its set-point."""
+    t = timeline(axes, curve.label, run)
+    if curve.setpoint is not None:
+        axes.plot(t, curve.setpoint, color=DESIRED, lw=3, label="set-point")
+    axes.plot(t, curve.values, color=ACTUAL, lw=1.1, label="actual")
+    if curve.setpoint is not None:
+        axes.legend()
+
+
+def contact_forces(axes: Axes, run: Trajectory) -> None:
+    """Sums of the normal forces."""
+    for (name, force), colour in zip(run.force.items(), COLOURS * len(run.force)):
+        t = timeline(axes, "normal force [N]", run)
+        axes.plot(t, force[..., 0].sum(-1).detach().numpy(), color=colour, label=name)
+    axes.legend(ncols=2, fontsize="x-small")
+
+
+def friction(axes: Axes, run: Trajectory) -> None:
+    """Sums of the friction."""
+    for (name, force), colour in zip(run.force.items(), COLOURS * len(run.force)):
+        total = force[..., 1].sum(-1).detach().numpy()
+        axes.plot(timeline(axes, "friction [N]", run), total, color=colour, label=name)
+    axes.axhline(0, color=INK, lw=0.5, zorder=1)
+    axes.legend(ncols=2, fontsize="x-small")
+
+
+def mobilised(axes: Axes, run: Trajectory) -> None:
+    """How much of the friction cone is used: sum of |friction| over mu_s times that of the normal
+    forces."""
+    for (name, force), colour in zip(run.force.items(), COLOURS * len(run.force)):
+        t = timeline(axes, "|friction| / cone [%]", run)
+        mu, normal = run.setup.contacts[name].friction.get("mu_s", 1.0), force[..., 0].sum(-1)
+        share = force[..., 1].abs().sum(-1) / (mu * normal)
+        share = torch.where(normal > 1e-9, share, torch.nan)
+        label = (
+            f"{name}, mu_s = {mu:g}" if run.setup.contacts[name].friction else f"{name} / normal"
+        )
+        axes.plot(t, 100 * share.detach().numpy(), color=colour, label=label)
+    axes.axhline(100, color=INK, lw=0.8, ls=":")
+    axes.set_ylim(0, max(108.0, 1.04 * axes.dataLim.y1))
+    axes.legend(fontsize="x-small")
+
+
+def points(axes: Axes, run: Trajectory) -> None:
+    """How many points touch, and how many of these slip."""
+    for (name, state), colour in zip(run.contact_state.items(), COLOURS * len(run.force)):
+        t = timeline(axes, "contact points", run)
+        touching, slipping = (state != 0).sum(-1).numpy(), (state == SLIPPING).sum(-1).numpy()
+        axes.step(t, touching, where="mid", color=colour, label=f"{name}: touch")
+        axes.fill_between(
+            t, 0, slipping, step="mid", color=colour, alpha=0.45, lw=0, label=f"{name}: slip"
+        )
+    if any(bool((state < 0).any()) for state in run.contact_state.values()):
+        axes.set_title("slip not known: the rig has changed since", fontsize="small", loc="right")
+    axes.set_ylim(0, None)
+    axes.legend(ncols=2, fontsize="x-small")
+
+
+def effort(axes: Axes, run: Trajectory, one: ActuatorSetup) -> None:
+    """What an actuator pushes with."""
+    scale, unit = (MM, "N mm") if one.unit == "N.m" else (1.0, "N")
+    t = timeline(axes, f"{one.channel} on {one.pushes} [{unit}]", run)
+    axes.plot(t, scale * run[one.channel].detach().numpy(), color=ACTUAL)
+
+
+def stresses(axes: Axes, run: Trajectory) -> None:
+    """Largest von Mises stress in every pad."""
+    rows = np.unique(np.linspace(0, len(run.t) - 1, SAMPLES).round().astype(int))
+    for (name, pad), colour in zip(run.setup.pads.items(), COLOURS * len(run.setup.pads)):
+        whole = pad.displacement(run.displacement[name][rows].detach().numpy())
+        peak = 1e-3 * von_mises(pad.stress(pad.strain(whole))).max(-1)
+        timeline(axes, "von Mises, elastic [kPa]", run)
+        axes.plot(run.t.numpy()[rows], peak, color=colour, label=f"pad {name}")
+    axes.set_ylim(0, None)
+    axes.legend(ncols=2, fontsize="x-small")
+
+
+def energy_groups(run: Trajectory) -> list[tuple[str, Array, str]]:
+    """Label, energy [mJ] (T,) and colour of what is stored and dissipated, that is all of it."""
+    zero = torch.zeros_like(run.t)
+    stored, lost = dict(run.energy), dict(run.dissipated)
+
+    def taken(energies: dict[str, torch.Tensor], prefix: str) -> Array:
+        names = [name for name in energies if name.startswith(prefix)]
+        return MM * sum((energies.pop(name) for name in names), zero).detach().numpy()
+
+    groups = [
+        ("stored in pads", taken(stored, "strain_"), "#2171b5"),
+        ("in contact springs", taken(stored, "normal_springs") + taken(stored, "tangential"),
+         "#9ecae1"),
+        ("kinetic", taken(stored, ""), "#deebf7"),
+        ("dissipated in pads", taken(lost, "pad_"), "#d94801"),
+        ("by slip", taken(lost, "slip"), "#fdae6b"),
+        ("by dashpots", taken(lost, ""), "#fee6ce"),
+    ]  # fmt: skip
+    return groups
+
+
+def energies(axes: Axes, run: Trajectory) -> None:
+    """Energy stored and dissipated, stacked, against what the sources supplied."""
+    t = timeline(axes, "energy [mJ]", run)
+    labels, parts, colours = zip(*energy_groups(run))
+    axes.stackplot(t, *parts, labels=labels, colors=colours, lw=0)
+    start = MM * sum(float(value[0].detach()) for value in run.energy.values())
+    supplied = MM * sum((x.detach().numpy() for x in run.supplied.values()), np.zeros(len(t)))
+    axes.plot(t, start + supplied, color=INK, ls=(0, (4, 2)), label="at the start + supplied")
+    axes.set_ylim(0, None)
+    axes.legend(
+        *(one[::-1] for one in axes.get_legend_handles_labels()), fontsize="x-small",
+        frameon=True, framealpha=0.85, edgecolor="none",
+    )  # fmt: skip
+
+
+def cones(axes: Axes, run: Trajectory, instant: Instant, contact: str) -> None:
+    """Forces along one contact at an instant, with the cone."""
+    forces_on(axes, run.setup, instant, contact)
+    name = run.setup.contacts[contact].pad
+    level = along_surface(run.setup.pads[name], instant.base[name])[0] > 0.999
+    axes.set_xlabel("x [mm]" if level else "along the surface [mm]")
+    axes.legend(fontsize="x-small")
+
+
+def panels(run: Trajectory) -> dict[str, Callable[[Axes], None]]:
+    """What is drawn over time, by its title."""
+    moving = [one for one in curves(run) if np.ptp(one.values) > STILL] or list(curves(run))[:1]
+    out: dict[str, Callable[[Axes], None]] = {
+        curve.name: lambda axes, curve=curve: motion(axes, run, curve) for curve in moving
+    }
+    if run.force:
+        out["normal force"] = lambda axes: contact_forces(axes, run)
+        out["friction"] = lambda axes: friction(axes, run)
+        out["friction in its cone"] = lambda axes: mobilised(axes, run)
+        out["points in contact"] = lambda axes: points(axes, run)
+    for one in run.setup.actuators.values():
+        out[one.channel] = lambda axes, one=one: effort(axes, run, one)
+    if run.setup.pads:
+        out["stress"] = lambda axes: stresses(axes, run)
+    return out | {"energy": lambda axes: energies(axes, run)}
+
+
+def ripples(run: Trajectory) -> bool:
+    """Whether points touch and part often enough for forces to show it."""
+    late = run.t >= run.t[0] + 0.05 * (run.t[-1] - run.t[0])
+    counts = [(state[late] != 0).sum(-1).diff() for state in run.contact_state.values()]
+    on_nodes = any(pad.points == 0 for pad in run.setup.pads.values())
+    return on_nodes and any(int((one != 0).sum()) >= RIPPLES for one in counts)
+
+
+def chosen(only: Sequence[str], known: Iterable[str]) -> list[str]:
+    """The panels asked for, all by default. Raises `ValueError`."""
+    names = list(known)
+    for name in only:
+        if name not in names:
+            raise ValueError(f"there is no panel `{name}`; {suggestion(name, names, 'there are')}")
+    return list(only) or names
+
+
+def dashboard(
+    run: Trajectory, *, only: Sequence[str] = (), time: float | None = None, title: str = "",
+    look: Look = "screen",
+) -> Figure:  # fmt: skip
+    """The whole run in one figure, with the instant `time` [s], by default that of the largest
+    normal force. `only` names some of the panels: "scene", contacts, coordinates such as "disc.x",
+    "friction", and so on.
+
+    `look` "page" or "column" is camera-ready: that wide, without a title. Raises `ValueError` for
+    another one, and for a panel that is not there.
+    """
+    if time is None:
+        total = sum(
+            (force[..., 0].sum(-1) for force in run.force.values()), torch.zeros_like(run.t)
+        )
+        time = float(run.t[int(total.argmax())])
+    (instant,) = instants(run, [time])
+    contacts = {
+        f"contact {key}": lambda axes, key=key: cones(axes, run, instant, key)
+        for key in list(run.setup.contacts)[::-1]
+    }
+    drawn = contacts | panels(run)
+    wanted = chosen(only, ("scene", *drawn))
+    pictured = "scene" in wanted
+    wanted = [name for name in wanted if name != "scene"]
+    with looking(look) as size:
+        columns = min(size.columns, max(1, len(wanted))) if not pictured else size.columns
+        width = size.width / size.columns
+        each, span, tall, beside = 0.5 * width + 0.03 * size.font, max(1, columns - 1), 0.0, 0
+        curves_, stress = force_scale(run.setup, [instant]), largest_stress([instant])
+        (left, right), (low, high) = Scene(Figure().subplots(), run.setup, curves=curves_).limits(
+            [instant]
+        )
+        if pictured:
+            tall = min((high - low) / (right - left), 1.1) * 0.86 * width * span + 0.5
+            beside = min(len(contacts), len(wanted), round(tall / each)) if columns > 1 else 0
+        top = max(1, beside) if pictured else 0
+        rows = -(-(len(wanted) - beside) // columns)
+        heading = (title or "Run") if size.titled else ""
+        figure = new_figure(heading, width * columns, tall + rows * each + 0.06 * size.font)
+        heights = [*[tall / max(top, 1)] * top, *[each] * rows]
+        grid = figure.add_gridspec(top + rows, columns, height_ratios=heights)
+        if pictured:
+            whole = figure.add_subplot(grid[:top, :span])
+            scene = Scene(
+                whole, run.setup, columns=5, curves=curves_, stress=stress, size=0.1 * size.font
+            )
+            scene.show(instant)
+            whole.set(
+                xlim=(left, right), ylim=(low, high), xlabel="x [mm]", ylabel="y [mm]",
+                title=f"a) t = {instant.time:g} s",
+            )  # fmt: skip
+            whole.grid(False)
+            if contacts:
+                scene.scale_bar(whole)
+            stress_bar(figure, [whole], stress, size)
+            handles = keys(run.setup, [instant])
+            figure.legend(handles=handles, loc="outside upper right", ncols=5 if columns > 1 else 2)
+        if ripples(run):
+            figure.supxlabel(RIPPLE, fontsize="small", color="#666666")
+        for i, name in enumerate(wanted):
+            k = i - beside
+            place = grid[i, -1] if k < 0 else grid[top + k // columns, k % columns]
+            axes = figure.add_subplot(place)
+            drawn[name](axes)
+            axes.set_title(f"{letter(i + pictured)} {name}")
+            if not axes.get_xlabel():
+                axes.set_xlabel("time [s]")
+        figure.align_ylabels()
+    return figure

@@ -1,0 +1,187 @@
+"""The interactive player: a run as one HTML file with everything in it, for any browser, without a
+network.
+
+Pads deform and show a quantity, bodies move, contact points show their state and forces; charts
+follow the time.
+"""
+
+import base64
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchsoft.channels import CHANNELS
+from torchsoft.files import replacing
+from torchsoft.physics.mesh import Array
+from torchsoft.physics.setup import von_mises
+from torchsoft.plot.dashboard import RIPPLE, curves, ripples
+from torchsoft.plot.figures import COLOURS
+from torchsoft.plot.scene import (
+    MM,
+    along_surface,
+    force_scale,
+    instants,
+    own_axes,
+    plates,
+    straight_up,
+)
+from torchsoft.solve.trajectory import Trajectory
+
+TEMPLATE = Path(__file__).with_name("player.html")
+
+CHART_SAMPLES = 1500
+"""Samples of a chart at the most."""
+
+LEVELS = 65535
+
+DENSER = 0.3
+"""Part of the frames that follows the steps, not the time."""
+
+
+def packed(values: Array) -> dict[str, Any]:
+    """Numbers in 16 bits between their ends, in base 64; their shape is told beside them."""
+    low, high = float(np.min(values, initial=np.inf)), float(np.max(values, initial=-np.inf))
+    if not values.size:
+        low = high = 0.0
+    step = (high - low) / LEVELS or 1.0
+    codes = np.round((values - low) / step).astype("<u2")
+    return {"low": low, "step": step, "codes": encoded(codes), "shape": list(values.shape)}
+
+
+def encoded(values: NDArray[Any]) -> str:
+    return base64.b64encode(np.ascontiguousarray(values).tobytes()).decode()
+
+
+def frame_rows(run: Trajectory, frames: int) -> list[int]:
+    """Rows of the run at so many frames or less, each once: denser where the stepper took shorter
+    steps."""
+    t, knots = run.t.numpy(), run.knots.numpy()
+    count = np.interp(t, knots, np.linspace(0.0, 1.0, len(knots)))
+    clock = (1 - DENSER) * (t - t[0]) / (t[-1] - t[0]) + DENSER * count
+    return sorted({int(np.abs(clock - x).argmin()) for x in np.linspace(0.0, clock[-1], frames)})
+
+
+def pads(run: Trajectory, rows: list[int]) -> dict[str, Any]:
+    """Meshes, their places in the frame of the base [mm] and quantities of the elements [kPa]."""
+    out = {}
+    for name, pad in run.setup.pads.items():
+        whole = pad.displacement(run.displacement[name][rows].detach().numpy())
+        stress = 1e-3 * pad.stress(pad.strain(whole))
+        direct = {
+            "von Mises stress": von_mises(stress),
+            "pressure": -stress[..., :3].mean(-1),
+            "shear stress": stress[..., 3],
+        }
+        out[name] = {
+            "base": pad.base, "nodes": packed(MM * pad.placed(pad.mesh.nodes + whole)),
+            "still": (MM * pad.placed(pad.mesh.nodes)).round(6).ravel().tolist(),
+            "elements": pad.mesh.elements.ravel().tolist(),
+            "outline": pad.mesh.outline.tolist(),
+            "fields": {key: packed(values) for key, values in direct.items()},
+        }  # fmt: skip
+        left, right = MM * pad.mesh.base
+        thickness = plates(run.setup)[name]
+        if thickness:
+            corners = np.array([left, [right[0], left[1]], [right[0], left[1] - thickness],
+                                [left[0], left[1] - thickness]])  # fmt: skip
+            out[name]["plate"] = (MM * pad.placed(corners / MM)).ravel().tolist()
+    return out
+
+
+def contacts(run: Trajectory, rows: list[int]) -> dict[str, Any]:
+    """Places of the points in the frame of the base [mm], forces [N] and states; `into` is the
+    direction into the pad there."""
+    out = {}
+    for name, contact in run.setup.contacts.items():
+        pad = run.setup.pads[contact.pad]
+        u = run.displacement[contact.pad][rows].detach().numpy()
+        still = np.zeros(3)
+        direction, (_, up) = along_surface(pad, still), own_axes(pad, still)
+        turn = float(np.sign(direction @ np.array([up[1], -up[0]])))
+        force = run.force[name][rows].detach().numpy() * [1.0, turn]
+        out[name] = {
+            "pad": contact.pad, "body": contact.body, "mu": contact.friction.get("mu_s"),
+            "along": direction.tolist(), "up": up.tolist(),
+            "points": packed(MM * pad.surface_points(u)), "force": packed(force),
+            "state": encoded(run.contact_state[name][rows].numpy().astype(np.int8)),
+        }  # fmt: skip
+    return out
+
+
+def charts(run: Trajectory) -> list[dict[str, Any]]:
+    """Groups of curves over time, each group in one unit."""
+    rows = np.unique(np.linspace(0, len(run.t) - 1, CHART_SAMPLES).round().astype(int))
+    t = run.t.numpy()[rows].round(9).tolist()
+    out: list[dict[str, Any]] = []
+
+    def group(name: str, unit: str, lines: list[tuple[str, Array, str]]) -> None:
+        series = [
+            {"name": one, "colour": colour, "values": packed(np.nan_to_num(values[rows]))}
+            for one, values, colour in lines
+        ]
+        out.append({"name": name, "unit": unit, "series": series})
+
+    for curve in curves(run):
+        name, _, unit = curve.label.rpartition(" [")
+        lines = [("actual", curve.values, COLOURS[0])]
+        if curve.setpoint is not None:
+            lines.insert(0, ("set-point", curve.setpoint, "#999999"))
+        group(name, unit.rstrip("]"), lines)
+    forces = list(zip(run.force.items(), COLOURS * len(run.force)))
+    if forces:
+        for kind, i in (("normal force", 0), ("friction", 1)):
+            group(kind, "N", [(k, x[..., i].sum(-1).detach().numpy(), c) for (k, x), c in forces])
+        share = []
+        for (key, force), colour in forces:
+            mu, normal = run.setup.contacts[key].friction.get("mu_s", 1.0), force[..., 0].sum(-1)
+            part = 100 * force[..., 1].abs().sum(-1) / (mu * normal).clamp(min=1e-9)
+            share.append((key, part.where(normal > 1e-9, 0.0).detach().numpy(), colour))
+        group("friction in its cone", "%", share)
+        states = list(zip(run.contact_state.items(), COLOURS * len(run.force)))
+        for word, of in (("points in contact", lambda s: s != 0), ("slipping", lambda s: s == 2)):
+            group(
+                word,
+                "1",
+                [(k, of(s).sum(-1).detach().numpy().astype(float), c) for (k, s), c in states],
+            )
+    shown = {one for body in run.setup.bodies.values() for one in body.channels.values()}
+    for name, values in run.channels.items():
+        if name not in shown and float(values.detach().abs().max()) > 0:
+            unit = run.units.get(name) or (CHANNELS[name].unit if name in CHANNELS else "")
+            group(name, unit, [(name, values.detach().numpy(), COLOURS[0])])
+    return [{"t": t}, *out]
+
+
+def player(
+    run: Trajectory, path: Path, *, frames: int = 300, title: str = "", progress: bool = False
+) -> None:
+    """Write the player with `frames` frames, a megabyte a hundred for pads like the paper's. The
+    file appears whole or not at all. Raises `ValueError` for less than two frames."""
+    if frames < 2:
+        raise ValueError(f"`frames` must be 2 or more, but is {frames}")
+    rows = frame_rows(run, frames)
+    times = run.t.numpy()[rows]
+    shown = instants(run, [times[0], times[len(times) // 2], times[-1]])
+    (first, *curves_) = charts(run)
+    about = {
+        "title": title or "torchsoft", "times": times.round(9).tolist(),
+        "bodies": {
+            name: {
+                "pose": packed(run.state.pose[name][rows].detach().numpy() * [MM, MM, 1.0]),
+                "outline": None if body.outline is None else (MM * body.outline).ravel().tolist(),
+                "spoke": None if body.outline is None else straight_up(MM * body.outline).tolist(),
+            }
+            for name, body in run.setup.bodies.items()
+        },
+        "pads": pads(run, rows), "contacts": contacts(run, rows),
+        "scale": force_scale(run.setup, shown)[0], "thickness": plates(run.setup),
+        "t": first["t"], "charts": curves_, "note": RIPPLE if ripples(run) else "",
+        "made": {k: str(v) for k, v in run.made_by.items() if isinstance(v, str)},
+    }  # fmt: skip
+    data = json.dumps(about, allow_nan=False).replace("</", "<\\/")
+    page = TEMPLATE.read_text(encoding="utf-8").replace("/*DATA*/null", data)
+    with replacing(path) as partial:
+        partial.write_text(page, encoding="utf-8")
