@@ -209,15 +209,16 @@ def test_tied_parameters_get_the_sum_of_their_gradients() -> None:
 
 
 def test_what_has_no_gradient_says_so() -> None:
-    """The recorded moments, and second derivatives; a moment of no weight in a sum is none."""
+    """Energies that left, and second derivatives; an energy of no weight in a sum is none."""
     model = coarse()
     run = rolled(model, gradient="discrete")
-    with pytest.raises(GradientFailed, match=r"the channel `M_U` is recorded and has no gradient"):
-        (run["theta"][-1] + run["bracket_moment"][-1]).backward(retain_graph=True)
-    (run["theta"][-1] + 0.0 * run["bracket_moment"][-1]).backward(retain_graph=True)
+    slipped = run.dissipated["slip"][-1]
+    with pytest.raises(GradientFailed, match="has no gradient"):
+        (run["theta"][-1] + slipped).backward(retain_graph=True)
+    (run["theta"][-1] + 0.0 * slipped).backward(retain_graph=True)
     with pytest.raises(GradientFailed, match="has no second derivative"):
         torch.autograd.grad(run["theta"][-1], model.pad.E, create_graph=True)
-    assert not rolled(model)["bracket_moment"].requires_grad
+    assert not rolled(model).dissipated["slip"].requires_grad
 
 
 SHARE = 0.5
