@@ -137,7 +137,7 @@ def test_weights_of_a_network_are_tensors_by_name(tmp_path: Path) -> None:
         ({"gain_3_1": 1.0}, "gain_3_1: there is no such entry"),
         ({"gain_1_5": 1.0}, "gain_1_5: there is no such entry"),
         ({"gain_0_1": 1.0}, "gain_0_1: there is no such entry"),
-        ({"gains_1_1": 1.0}, "`gains_1_1` is not known here; is it `gain`"),
+        ({"gains_1_1": 1.0}, "`gains_1_1` is not known here; did you mean `gain`"),
     ],
 )
 def test_an_entry_that_is_not_there_is_refused(settings: dict[str, float], words: str) -> None:

@@ -101,9 +101,9 @@ class Trajectory(Shown):
         touch = self.touch
         if touch is not None and self.recorded is not None and channel in touch:
             return touch[channel].value(self.recorded)
-        known = suggestion(channel, (*self.channels, *(touch or ())), "it has")
-        lost = "; it was loaded, without its rig and the channels of touch" if touch is None else ""
-        raise KeyError(f"the run has no channel `{channel}`; {known}{lost}")
+        known = suggestion(channel, self.channels, "it has")
+        more = "none, since it was loaded, without its rig" if touch is None else touch.shown
+        raise KeyError(f"the run has no channel `{channel}`; {known}, and of touch {more}")
 
     def __contains__(self, channel: object) -> bool:
         return channel in self.channels or (self.touch is not None and channel in self.touch)

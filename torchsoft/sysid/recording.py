@@ -79,7 +79,7 @@ class Recording:
             if channel not in known and channel not in touch:
                 raise ValueError(
                     f"`{channel}` is not a channel of the rig of `{self.name}`; "
-                    f"{suggestion(channel, (*known, *touch), 'known:')}"
+                    f"{suggestion(channel, known, 'known:')}, and of touch {touch.shown}"
                 )
             if t.shape != y.shape or t.ndim != 1 or len(t) < 2:
                 raise ValueError(
