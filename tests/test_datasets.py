@@ -360,8 +360,8 @@ def test_wrong_content_is_found(
         ),
         (edit("theta/c/0/0", lambda data: data[:-40]), "theta/c/0/0 is damaged"),
         (
-            edit("feed_forward/c/1/0", lambda data: data[:9] + bytes(64) + data[73:]),
-            "feed_forward/c/1/0 is damaged",
+            edit("F_ff/c/1/0", lambda data: data[:9] + bytes(64) + data[73:]),
+            "F_ff/c/1/0 is damaged",
         ),
         (edit("grasp_force/c/2", flipped), "grasp_force/c/2 is damaged"),
         (remove("omega/c/1/0"), "omega/c/1/0 is missing"),

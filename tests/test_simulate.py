@@ -209,7 +209,6 @@ def test_tied_parameters_get_the_sum_of_their_gradients() -> None:
 
 
 def test_what_has_no_gradient_says_so() -> None:
-<<<<<<< HEAD
     """Integrals over the steps, and second derivatives; one of no weight in a sum is none."""
     model = coarse()
     run = rolled(model, gradient="discrete")
@@ -217,15 +216,6 @@ def test_what_has_no_gradient_says_so() -> None:
     with pytest.raises(GradientFailed, match=r"the integral `slip` .* has no gradient"):
         (run["theta"][-1] + lost).backward(retain_graph=True)
     (run["theta"][-1] + 0.0 * lost).backward(retain_graph=True)
-=======
-    """Energies that left, and second derivatives; an energy of no weight in a sum is none."""
-    model = coarse()
-    run = rolled(model, gradient="discrete")
-    slipped = run.dissipated["slip"][-1]
-    with pytest.raises(GradientFailed, match="has no gradient"):
-        (run["theta"][-1] + slipped).backward(retain_graph=True)
-    (run["theta"][-1] + 0.0 * slipped).backward(retain_graph=True)
->>>>>>> joined
     with pytest.raises(GradientFailed, match="has no second derivative"):
         torch.autograd.grad(run["theta"][-1], model.pad.E, create_graph=True)
     assert not rolled(model).dissipated["slip"].requires_grad
