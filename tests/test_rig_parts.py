@@ -566,7 +566,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "no such rubber": (
         {"materials": {"rubber": {"kind": "preset", "name": "Dragon", "depth": 1e-2}}},
-        r"there is no preset `Dragon`; there are Dragon Skin 20, Dragon Skin 30",
+        r"there is no preset `Dragon`; did you mean `Dragon Skin 30`?",
     ),
     "an inertial series": (
         {"materials": {"rubber": {"kind": "prony", **RUBBER, "moduli": [1e5], "tau": [0.1]}},

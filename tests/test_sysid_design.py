@@ -188,7 +188,7 @@ def test_motions_keep_within_their_bounds_between_knots_too(plan: Recording) -> 
             {"bounds": {"x_d": Bounds(low=0, high=0.001, speed=1, after=0.13)}},
             "no motion of these knots",
         ),
-        ({"limits": {"F_x": (1.0, -1.0)}}, r"limits.F_x = \(1.0, -1.0\)"),
+        ({"limits": {"F_x": (1.0, -1.0)}}, r"limits.F_x = \(1, -1\)"),
         ({"limits": {"Fx": (-1.0, 1.0)}}, "limits.Fx"),
         ({"names": ["pad.nu"]}, "`names` must be some of the parameters pad.E, contact.K_n"),
         ({"criterion": Criterion("A", (1.0,))}, "`targets` has 1 standard deviations for the 2"),

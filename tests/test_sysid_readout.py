@@ -185,7 +185,7 @@ def test_another_rig_is_identified_by_its_own_names(jaws: Rig) -> None:
         low, high = answer[name].ci95 or (0.0, 0.0)
         assert low < truth < high, name
     with pytest.raises(
-        ValueError, match="`x_C` is not a channel of the rig of `jaws`; known: x_disc, y_disc"
+        ValueError, match="`x_C` is not a channel of the rig of `jaws`; did you mean `x_disc`"
     ):
         replace(data, samples={"x_C": samples["x_disc"]})
     with pytest.raises(ValueError, match="only the paper's rig has a rest of its own"):

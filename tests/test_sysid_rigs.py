@@ -129,7 +129,11 @@ def replaced(old: str, new: str) -> Callable[[str], str]:
 
 CSV, TOML = "run.csv", "fit.toml"
 REFUSALS: dict[str, tuple[str, Callable[[str], str], str]] = {
-    "sensor": (TOML, replaced("x_left.n", "x_lft.n"), "`x_lft` is not a channel; known: x_disc"),
+    "sensor": (
+        TOML,
+        replaced("x_left.n", "x_lft.n"),
+        "`x_lft` is not a channel; did you mean `x_left`",
+    ),
     "heading": (TOML, replaced('"x_disc"', '"x_dsc"'), "columns.camera = 'x_dsc' is no channel"),
     "unknown": (TOML, replaced("left_x.Kd", "left_x.Ki"), "`actuators.left_x.Ki` cannot be"),
     "paper's pads": (
@@ -230,7 +234,7 @@ def test_a_rehearsal_says_what_an_experiment_would_identify(folder: Path) -> Non
         (
             replaced("F_left_x.n", "F_lft_x.n"),
             (),
-            "`F_lft_x` is not a channel of the rig of `rehearsal`; known: x_disc",
+            "`F_lft_x` is not a channel of the rig of `rehearsal`; did you mean",
         ),
         (replaced("duration = 0.6", "duration = 0"), (), "rehearsal.duration"),
     ],

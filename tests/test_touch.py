@@ -13,7 +13,7 @@ import torch
 from conftest import coarse, f64, grasped, times
 from scipy.integrate import quad
 from scipy.stats import norm
-from test_sysid import BASE, SENSORS, SHAKE, TRUE, check_derivatives
+from test_sysid import BASE, SENSORS, SHAKE, TRUTH, check_derivatives
 from test_sysid_rigs import FIT, RIG
 from test_sysid_rigs import coarse as fingers
 from torch import Tensor
@@ -34,6 +34,7 @@ from torchsoft import (
     simulate,
     simulate_batch,
 )
+from torchsoft.excitation import begin
 from torchsoft.rigs.build import RigFile
 from torchsoft.solve.touch import LIGHT, Touch, enumerated
 from torchsoft.sysid import Problem, Sensor, Unknown, record
@@ -141,7 +142,7 @@ def test_channels_are_sums_of_what_is_recorded() -> None:
     centre = (normal @ along) / (normal.sum(-1) + LIGHT)
     assert torch.allclose(run["L.centre"], centre, rtol=1e-12)
     assert float((run["skin.centre"] - centre).abs().max()) < 2e-5
-    assert torch.allclose(run["bracket.load_y"], run.load["bracket"][:, 1], rtol=1e-12)
+    assert torch.allclose(run["bracket.load_y"], run.loads["bracket"][:, 1], rtol=1e-12)
     assert torch.allclose(run["U.force_y"], run["bracket.load_y"], rtol=1e-12)
     assert torch.allclose(run["L.force_y"], -run["disc.load_y"] - run["U.force_y"], rtol=1e-9)
     for name, part in (("no.normal.0", "no.normal.0"), ("L.normal.999", "L.normal.0 to 60")):
@@ -237,10 +238,11 @@ def test_stored_energies_have_gradients() -> None:
 def test_taxels_are_sensors_of_a_fit() -> None:
     """Jacobian and gradient of the misfit; an array's sensor stands for its taxels, one with a
     delay and a gain of its own but one."""
-    build = lambda settings, reference: SoftGrasp(settings, reference, taxels=SKIN)
     felt = {f"skin.normal.{i}": Sensor(noise=0.02) for i in range(18, 22)}
     centre = {"L.centre": Sensor(noise=1e-4), "bracket_moment": Sensor(noise=1e-3)}
-    data = record("shake", SHAKE, TRUE, BASE, SENSORS | felt | centre, noise=0.0, build=build)
+    planned = begin(SHAKE, BASE)
+    rig = SoftGrasp(planned.rig.settings, planned.rig.reference, taxels=SKIN)
+    data = record("shake", planned._replace(rig=rig), TRUTH, SENSORS | felt | centre, noise=0.0)
     assert data.channels[-6:] == (*felt, *centre)
     sensors = (
         SENSORS

@@ -10,8 +10,8 @@ import torch
 
 from torchsoft import Parameters, simulate
 from torchsoft.excitation import CATALOGUE, begin
+from torchsoft.plot.dashboard import dashboard
 from torchsoft.plot.diagram import multibond_graph
-from torchsoft.plot.figures import energy_balance
 
 model, y0 = begin(CATALOGUE["fast strokes"], Parameters())
 t = torch.linspace(0, 1.5, 601, dtype=torch.float64)
@@ -26,5 +26,5 @@ with torch.no_grad():
         way = "from" if port.source else "into"
         print(f"{power:+8.3f} mW {way} {name}: {', '.join(port.elements)}")
 
-balance = energy_balance(run)
+balance = dashboard(run)
 graph_figure = multibond_graph(model)

@@ -42,4 +42,4 @@ for name, mesh in faces.items():
 axes.set(xlabel="travel of the base [mm]", ylabel="normal force [N]")
 axes.legend()
 
-figure = snapshots(run, rig, times=(0.0, 0.5), title="The fingertip, before and after")
+figure = snapshots(run, times=(0.0, 0.5), title="The fingertip, before and after")

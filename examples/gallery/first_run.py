@@ -21,4 +21,4 @@ for time in (0, 1000, 3000):
     print(f"t = {t[time]:4.0f} s: x_C = {1e3 * run['x_C'][time]:.3f} mm")
 print(f"the disc turns by {run['theta'][1000]:.3f} rad; {manipulation.grasp_force:.1f} N hold it")
 
-figure = force_distribution(run, model, 5.0)
+figure = force_distribution(run, 5.0)

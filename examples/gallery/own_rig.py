@@ -49,4 +49,4 @@ print(f"the disc moves by {1e3 * (x[-1] - x[0]):.2f} mm and turns by {theta[-1]:
 theta[-1].backward()
 print(f"a pad 1 % stiffer: {1e-2 * 0.75e6 * rig.parameter('rubber.E').grad:+.1e} rad more")
 
-figure = snapshots(run, rig, times=(0.0, 0.3, 0.6), title="Pressed, then rolled")
+figure = snapshots(run, times=(0.0, 0.3, 0.6), title="Pressed, then rolled")

@@ -22,7 +22,7 @@ print(file.title)
 file = file.override(outputs={"duration": 0.5, "interval": 2e-3, "snapshots": []})
 ready = file.build()  # the rig, its state at the start, the times of the outputs
 run = simulate(ready.rig, ready.t, y0=ready.y0)
-figure = snapshots(run, ready.rig, times=(0.0, 0.06, 0.12), title="The fall")
+figure = snapshots(run, times=(0.0, 0.06, 0.12), title="The fall")
 
 softer = file.override(materials={"gel": {"E": 5e4}}).build()
 soft_run = simulate(softer.rig, softer.t, y0=softer.y0)

@@ -48,6 +48,10 @@ class BuiltRig(NamedTuple, Generic[R]):
     t: Tensor
 
 
+ROUNDED = 1e-8
+"""Load [N] that rounding leaves of the forces of a grasp."""
+
+
 class NoEquilibrium(RuntimeError):
     """Newton's iteration found no static equilibrium."""
 
@@ -249,7 +253,7 @@ def resting(
             (rows,) = torch.autograd.grad(F.diagonal().sum(), x, materialize_grads=True)
         F, K = F[0].detach(), -rows
         size = float(F.norm())
-        if size * softest <= residual:
+        if size * softest <= residual or (path and size <= ROUNDED):
             return poses(q + torch.linalg.solve(K, loads(q)) if torch.is_grad_enabled() else q)
         path.append((size, q))
         # as stiff as keeps the step short, which vanishes with the load: quadratic at the end

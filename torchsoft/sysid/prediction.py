@@ -55,8 +55,8 @@ class Readout:
     drift: float
     delay: float
     middle: float
-    clock: float
     terms: tuple[Term, ...]
+    clock: float = 0.0
 
     def expected(
         self, signals: Signals, times: Array
@@ -204,7 +204,7 @@ def readout(
         terms.append(Term(pushed(rig, channel), 1, -at["inertia"], ("inertia", -1.0)))
     return Readout(
         channel, sensor.sd, sensor.low, sensor.high, at["gain"], at["bias"], at["drift"],
-        at["delay"], 0.5 * (span[0] + span[1]), at["clock"], tuple(terms),
+        at["delay"], 0.5 * (span[0] + span[1]), tuple(terms), at["clock"],
     )  # fmt: skip
 
 
