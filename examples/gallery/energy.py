@@ -13,7 +13,7 @@ from torchsoft.excitation import CATALOGUE, begin
 from torchsoft.plot.dashboard import dashboard
 from torchsoft.plot.diagram import multibond_graph
 
-model, y0 = begin(CATALOGUE["fast strokes"], Parameters())
+model, y0, _ = begin(CATALOGUE["fast strokes"], Parameters())
 t = torch.linspace(0, 1.5, 601, dtype=torch.float64)
 run = simulate(model, t, y0=y0)
 print(f"injected {1e3 * run.injected[-1]:.1f} mJ, residual {run.energy_residual_rel:.1e} of that")
