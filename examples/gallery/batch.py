@@ -18,7 +18,7 @@ mu = torch.full((16,), 0.5, dtype=torch.float64, requires_grad=True)
 t = torch.linspace(0, 1.0, 201, dtype=torch.float64)
 
 batch = simulate_batch(
-    SoftGrasp(context.model.settings), t, y0=context.y0, reference=context.model.reference,
+    SoftGrasp(context.rig.settings), t, y0=context.y0, reference=context.rig.reference,
     parameters={"pad.E": E, "contact.mu_s": mu, "contact.mu_k": 0.9 * mu}, gradient="discrete",
 )  # fmt: skip
 print(f"{len(batch)} runs in {batch.wall_s:.1f} s; failed: {batch.failures or 'none'}")

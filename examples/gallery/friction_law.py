@@ -32,8 +32,8 @@ class Pressed(nn.Module):
 # a motion in which the disc slips: a light grasp, jerked
 context = begin(CATALOGUE["light jerks"], Parameters())
 t = torch.linspace(0, 1.4, 401, dtype=torch.float64)
-model = SoftGrasp(context.model.settings, friction=Pressed(mu=0.7, fall=0.05))
-run = simulate(model, t, y0=context.y0, reference=context.model.reference, gradient="discrete")
+model = SoftGrasp(context.rig.settings, friction=Pressed(mu=0.7, fall=0.05))
+run = simulate(model, t, y0=context.y0, reference=context.rig.reference, gradient="discrete")
 
 loss = run["theta"].square().mean()
 loss.backward()
@@ -43,8 +43,8 @@ for name in ("mu", "fall", "eta"):
 
 _, axes = plt.subplots(figsize=(7, 3), layout="constrained")
 for fall in (0.0, 0.05, 0.2):
-    other = SoftGrasp(context.model.settings, friction=Pressed(mu=0.7, fall=fall))
-    again = simulate(other, t, y0=context.y0, reference=context.model.reference)
+    other = SoftGrasp(context.rig.settings, friction=Pressed(mu=0.7, fall=fall))
+    again = simulate(other, t, y0=context.y0, reference=context.rig.reference)
     change = 1e3 * (again["theta"] - run["theta"].detach())
     axes.plot(again.t, change, label=f"fall = {fall:g} 1/N")
 axes.set(xlabel="time [s]", ylabel="angle beside 0.05 1/N [mrad]")

@@ -18,12 +18,12 @@ t = torch.linspace(0, 0.8, 161, dtype=torch.float64)
 
 def loss(model: SoftGrasp, **steps: object) -> torch.Tensor:
     """Mean square of the disc's angle over the strokes."""
-    run = simulate(model, t, y0=context.y0, reference=context.model.reference, **steps)
+    run = simulate(model, t, y0=context.y0, reference=context.rig.reference, **steps)
     loss.knots = run.knots
     return run["theta"].square().mean()
 
 
-model = context.model
+model = context.rig
 loss(model, gradient="discrete", tolerance=1e-10).backward()
 knots = loss.knots  # the steps of that run, which the differences take as well
 

@@ -15,7 +15,7 @@ from torchsoft.excitation import CATALOGUE, begin
 from torchsoft.physics.motion import Sampled
 
 p = Parameters().override({"pad.elements_x": 60, "pad.elements_y": 3, "contact.v_s": 0.05})
-model, y0 = begin(CATALOGUE["strokes"], p)  # the loop measures the bracket
+model, y0, _ = begin(CATALOGUE["strokes"], p)  # the loop measures the bracket
 grasp = {name: model.reference[name] for name in ("y_d", "F_ff")}
 x_0, times = 60.3e-3, torch.linspace(0.5, 1.1, 9, dtype=torch.float64)
 t = torch.linspace(0, 1.3, 261, dtype=torch.float64)

@@ -15,18 +15,18 @@ from torchsoft.excitation import CATALOGUE, begin
 context = begin(CATALOGUE["deep pressing"], Parameters())
 names = ["contact.K_n", "contact.R_n", "pad.E", "pad.tau"]
 t = torch.linspace(0, 1.5, 601, dtype=torch.float64)
-run = simulate(context.model, t, y0=context.y0, gradient="forward", wrt=names, rigid=True)
+run = simulate(context.rig, t, y0=context.y0, gradient="forward", wrt=names, rigid=True)
 print("derivatives:", tuple(run.sensitivities.shape), "= times, coordinates and rates, parameters")
 
 # the columns are those of `layout.rigid`: poses and velocities of the bodies
-layout = context.model.layout
+layout = context.rig.layout
 angle = layout.rigid.index(layout.slices["pose", "disc"].start + 2)
 
 _, (above, below) = plt.subplots(2, 1, figsize=(7, 5), sharex=True, layout="constrained")
 above.plot(t, run["theta"].detach())
 above.set_ylabel("angle [rad]")
 for i, name in enumerate(names):
-    size = float(context.model.parameter(name).detach())
+    size = float(context.rig.parameter(name).detach())
     below.plot(t, 1e3 * 0.01 * size * run.sensitivities[:, angle, i], label=name)
 below.set(xlabel="time [s]", ylabel="change for 1 % [mrad]")
 below.legend(ncols=2)

@@ -15,7 +15,7 @@ from torchsoft.excitation import CATALOGUE, begin
 
 torch.manual_seed(0)
 coarse = {"pad.elements_x": 60, "pad.elements_y": 3}
-paper, y0 = begin(CATALOGUE["strokes"], ts.Parameters().override(coarse))
+paper, y0, _ = begin(CATALOGUE["strokes"], ts.Parameters().override(coarse))
 
 
 class Policy(nn.Module):

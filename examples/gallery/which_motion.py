@@ -28,7 +28,7 @@ p = Parameters().override({"contact.v_s": 0.05, "pad.elements_x": 60, "pad.eleme
 
 table = np.zeros((len(motions), len(names)))
 for row, motion in enumerate(motions):
-    model, y0 = begin(CATALOGUE[motion], p)
+    model, y0, _ = begin(CATALOGUE[motion], p)
     t = torch.arange(0, 1.5, 0.005, dtype=torch.float64)
     run = simulate(model, t, y0=y0, gradient="forward", wrt=names, rigid=True)
     sizes = torch.stack([model.parameter(name).detach() for name in names])
