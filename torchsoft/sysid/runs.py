@@ -48,7 +48,7 @@ KINDS = {kind.__name__: kind for kind in (Prediction, Misfit, FailedRun)}
 """What can be the result of a run."""
 
 PROGRAM = (
-    digest(Path(__file__).parents[2]),
+    digest(Path(__file__).parents[1]),
     *(version(name) for name in ("torchsoft", "torch", "numpy", "scipy", "llvmlite")),
 )
 """Everything but the data that decides a run."""
