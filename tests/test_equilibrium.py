@@ -162,7 +162,7 @@ def test_a_bracket_above_the_sunken_disc_is_refused() -> None:
 def test_no_equilibrium_is_reported_when_newton_does_not_converge(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("torchsoft.paper.equilibrium.RESIDUAL", -1.0)
+    monkeypatch.setattr("torchsoft.physics.statics.ITERATIONS", 2)
     with pytest.raises(NoEquilibrium, match="no static equilibrium found"):
         press(build(), GRASP)
 

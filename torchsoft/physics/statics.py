@@ -23,7 +23,7 @@ from torchsoft.physics.validity import check_array, check_points, check_values
 R = TypeVar("R", bound=Rig)
 
 RESIDUAL = 1e-13
-"""Residual of an equilibrium [m], forces counted by the compliance they meet."""
+"""Residual of an equilibrium [m]: the way that the loads left over would push."""
 
 SETTLING = 30
 """Iterations of Newton's method for a pad; from undeformed pads it takes about ten."""
@@ -46,10 +46,6 @@ class BuiltRig(NamedTuple, Generic[R]):
     rig: R
     y0: Tensor
     t: Tensor
-
-
-ROUNDED = 1e-8
-"""Load [N] that rounding leaves of the forces of a grasp."""
 
 
 class NoEquilibrium(RuntimeError):
@@ -193,8 +189,7 @@ def resting(
     stay as given.
 
     Newton's method on the net loads of the free coordinates, each step no longer than `STRIDE`: a
-    body above its pad comes down to it. Done when net loads, counted by the compliance of the
-    softest pad, are below `residual` [m]. `actuators` names those that push, by default all, by
+    body above its pad comes down to it. Done when a step is below `residual` [m]. `actuators` names those that push, by default all, by
     `signals` (signals, 2), by default the reference's at t = 0. Differentiable once in the given
     pose and in the rig's parameters, by the implicit function theorem. Raises `NoEquilibrium` where
     there is no balance, and what `settled` does.
@@ -224,7 +219,6 @@ def resting(
         scale = torch.cat([sizes[name][axes] for name, axes in sought.items()])
         q = torch.cat([pose[name][axes] for name, axes in sought.items()]) * scale
         stride = STRIDE * min(pad.mesh.height for pad in soft.pads.values())
-        softest = max(float(pad.compliance().diagonal().max()) for pad in soft.pads.values())
     counts = [len(axes) for axes in sought.values()]
 
     def poses(q: Tensor) -> dict[str, Tensor]:
@@ -253,11 +247,13 @@ def resting(
             (rows,) = torch.autograd.grad(F.diagonal().sum(), x, materialize_grads=True)
         F, K = F[0].detach(), -rows
         size = float(F.norm())
-        if size * softest <= residual or (path and size <= ROUNDED):
+        # as stiff as keeps the step short, which vanishes with the load: quadratic at the end
+        held = max(size / stride, torch.finfo(q.dtype).tiny)  # of a body without load, too
+        step = torch.linalg.solve(K + held * torch.eye(len(q), dtype=q.dtype), F)
+        if float(step.norm()) <= residual:
             return poses(q + torch.linalg.solve(K, loads(q)) if torch.is_grad_enabled() else q)
         path.append((size, q))
-        # as stiff as keeps the step short, which vanishes with the load: quadratic at the end
-        q = q + torch.linalg.solve(K + size / stride * torch.eye(len(q), dtype=q.dtype), F)
+        q = q + step
     worst = int(F.abs().argmax())
     names = [f"{name}.{COORDINATES[int(axis)]}" for name, axes in sought.items() for axis in axes]
     raise NoEquilibrium(
