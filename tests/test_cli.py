@@ -215,6 +215,7 @@ def test_a_checkpoint_folder_of_others_is_refused_and_left_alone(folder: Path, c
     assert sorted(path.name for path in mine.iterdir()) == ["a.pickle", "b.partial"]
 
 
+@pytest.mark.slow
 def test_a_trajectory_that_the_model_cannot_reach_is_named_with_its_row(
     folder: Path, capsys: Any
 ) -> None:
@@ -306,6 +307,7 @@ def test_options_come_before_the_configuration(
     assert err == ""
 
 
+@pytest.mark.slow
 @pytest.mark.xdist_group("identify-command")
 def test_an_interrupted_command_continues_and_ends_the_same(
     answered: tuple[Path, list[str]], capsys: Any

@@ -118,7 +118,9 @@ def test_a_sobol_design_is_a_prefix_of_a_longer_one(tmp_path: Path) -> None:
     np.testing.assert_array_equal(points(short), points(long)[:5])
 
 
-@pytest.mark.parametrize("workers", [local_workers, local_processes])
+@pytest.mark.parametrize(
+    "workers", [local_workers, pytest.param(local_processes, marks=pytest.mark.slow)]
+)
 def test_threads_and_processes_make_the_same_bytes_behind_a_url(
     made: tuple[Path, Config], tmp_path: Path, workers: Callable[[int], Any]
 ) -> None:
@@ -170,6 +172,7 @@ def test_urls_that_are_refused(
     assert "Protocol not known: nowhere" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_another_shard_size_makes_the_same_data(made: tuple[Path, Config], tmp_path: Path) -> None:
     folder, _ = made
     config = Config.from_toml(write_config(tmp_path, shard=3))
@@ -573,6 +576,7 @@ def test_an_unwritable_folder_is_refused(made: tuple[Path, Config]) -> None:
         open_or_create("/sys/torchsoft-set", made[1])
 
 
+@pytest.mark.slow
 def test_a_file_size_limit_is_said_and_costs_nothing(
     made: tuple[Path, Config], tmp_path: Path
 ) -> None:

@@ -234,6 +234,7 @@ def test_rig_files_smoke(tmp_path: Path) -> None:
     assert (tmp_path / "rig_files.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_contact_points_smoke(tmp_path: Path) -> None:
     """Two points an element take most of the nodes out of the force along the pad; gradients are
     exact with either."""

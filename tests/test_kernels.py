@@ -192,6 +192,7 @@ def test_a_processor_gets_the_best_level_that_it_can_run(
     assert objects.level.__wrapped__() == name
 
 
+@pytest.mark.slow
 def test_kernels_are_built_for_every_level_and_here_to_the_same_bytes(tmp_path: Path) -> None:
     """So that a run from an object has the bits of one that was compiled for it."""
     levels = [name for name in objects.LEVELS if name != "native" or objects.level() == name]

@@ -140,7 +140,11 @@ def test_light_shaking_is_the_reference() -> None:
         assert gradient == pytest.approx(reference["theta_end_by"][name], rel=RELATIVE), name
 
 
-@pytest.mark.parametrize(("case", "changes"), [("default", {}), ("E = 60e3", {"pad.E": 60e3})])
+@pytest.mark.parametrize(
+    ("case", "changes"), [
+        pytest.param("default", {}, marks=pytest.mark.slow), ("E = 60e3", {"pad.E": 60e3})
+    ],
+)  # fmt: skip
 def test_statics_and_loop_modes_are_the_references(case: str, changes: dict[str, Any]) -> None:
     expected, model = REFERENCE["statics"][case], SoftGrasp(Parameters().override(changes))
     with torch.no_grad():

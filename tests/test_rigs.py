@@ -132,6 +132,7 @@ STONE = {"x": 0.3e-3, "y": 30e-3, "theta": 0.0, "shape": {"kind": "circle", "rad
 # loops and steps -------
 
 
+@pytest.mark.slow
 def test_a_loop_is_unstable_as_the_papers_modes_say() -> None:
     """The leading mode is that of the paper's own equilibrium: the friction-free grasp."""
     changes = {"pad.elements_x": 60, "pad.elements_y": 2, "pad.tau": 1e-3}

@@ -121,7 +121,7 @@ def check_derivatives(
     )
 
 
-@pytest.mark.parametrize("fidelity", ["massless", "inertial"])
+@pytest.mark.parametrize("fidelity", ["massless", pytest.param("inertial", marks=pytest.mark.slow)])
 def test_jacobian_of_either_kind_of_pads_at_the_start_of_a_grasp(fidelity: str) -> None:
     """The starting displacements are held, also where a pad's elasticity changes."""
     p = BASE.override({"pad.fidelity": fidelity})
@@ -368,6 +368,7 @@ def test_wrong_recordings_sensors_and_unknowns_are_refused(strokes: Recording) -
             made()
 
 
+@pytest.mark.slow
 def test_data_out_of_reach_name_the_recording() -> None:
     about_disc = STROKES.model_copy(update={"senses": "disc", "x_C0": 60e-3})
     data = record("strokes", begin(about_disc, BASE), {}, SENSORS)

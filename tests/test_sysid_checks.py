@@ -127,11 +127,17 @@ def late(data: Recording) -> Recording:
 @pytest.mark.parametrize(
     ("made", "name", "favoured", "says"),
     [
-        (elsewhere, "x_C0", 30.0, "the data contradict that the disc begins at scenario.x_C0"),
+        pytest.param(
+            elsewhere, "x_C0", 30.0, "the data contradict that the disc begins at scenario.x_C0",
+            marks=pytest.mark.slow,
+        ),
         (turned, "bias theta", 2e-3, "the data contradict that theta has no unknown bias"),
         (lambda data: delayed(data, -3e-4), "clock of the set-points", 0.3,
          "the data contradict that set-points and sensors"),
-        (late, "delay x_C", 1.0, "the data contradict that x_C has no unknown delay"),
+        pytest.param(
+            late, "delay x_C", 1.0, "the data contradict that x_C has no unknown delay",
+            marks=pytest.mark.slow,
+        ),
         (
             lambda data: replace(data,
             samples=recorded({"disc.inertia_ratio": 1.2}).samples),
@@ -223,6 +229,7 @@ def far_off() -> tuple[Problem, np.ndarray, Residuals]:
     return problem, x, at
 
 
+@pytest.mark.slow
 def test_what_no_test_explains_has_candidates(
     far_off: tuple[Problem, np.ndarray, Residuals],
 ) -> None:
@@ -235,6 +242,7 @@ def test_what_no_test_explains_has_candidates(
     assert any(": `explain` fits again with each of " in text for text in assumption_notices(found))
 
 
+@pytest.mark.slow
 def test_under_another_law_a_fit_that_is_far_off_begins_anew(
     far_off: tuple[Problem, np.ndarray, Residuals],
 ) -> None:
@@ -318,6 +326,7 @@ def test_two_causes_are_both_named() -> None:
     )
 
 
+@pytest.mark.slow
 def test_extensions_are_suspects() -> None:
     """A pad that is stiffer than its material, and dry friction of a guide."""
     data = recorded()
