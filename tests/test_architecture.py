@@ -14,7 +14,7 @@ FLOWS = {
     "": """
         channels display extras diagnostic files threads tables csvfile quantity codegen
         physics paper cost
-        solve scenario excitation processes
+        solve scenario excitation processes plan
         plot materials rigs sysid reduced datasets experiment cli __main__
     """,
     "codegen": "graph derivatives operations trace pointwise emit .",
@@ -38,6 +38,7 @@ FLOWS = {
         criterion planner design
         columns configuration rig_recordings rehearsal measured rig_design figures report .
     """,
+    "plan": "knots variables goals evaluation search planning .",
     "rigs": "fields parts control motion geometry build course balance check written run .",
     "cli": "results rigs identify design material plot .",
     "solve.kernel": """

@@ -12,17 +12,15 @@ from conftest import COARSE, grasp, turning
 
 from torchsoft import Parameters, Profile, Reference
 from torchsoft.excitation import Excitation, Knots, Strokes, begin
+from torchsoft.plan.knots import Bounds, Moves, profile
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid import RIG, Known, Problem, Recording, Sensor, Unknown, record
 from torchsoft.sysid.criterion import (
-    Bounds,
     Criterion,
-    Moves,
     Outlook,
     chosen,
     deviations,
     next_recording,
-    profile,
 )
 from torchsoft.sysid.design import BENT, Design, design, draws
 from torchsoft.sysid.figures import design_figure

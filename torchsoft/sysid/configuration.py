@@ -9,7 +9,8 @@ from pydantic import AfterValidator, Field, model_validator
 
 from torchsoft.paper.rig import NAMES
 from torchsoft.physics.material import INSTANT
-from torchsoft.sysid.criterion import Bounds, Optimality
+from torchsoft.plan.knots import Bounds
+from torchsoft.sysid.criterion import Optimality
 from torchsoft.sysid.design import RTOL
 from torchsoft.sysid.identification import Settings
 from torchsoft.sysid.initial_state import LEAD, SETTLE

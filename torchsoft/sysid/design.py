@@ -11,9 +11,10 @@ import torch
 from tqdm import tqdm
 
 from torchsoft.excitation import Excitation, Knots
+from torchsoft.plan.knots import Bounds, Moves, profile
 from torchsoft.solve.adjoint import GradientFailed
 from torchsoft.solve.progress import SimulationFailed
-from torchsoft.sysid.criterion import VOLUME, Bounds, Criterion, Moves, profile
+from torchsoft.sysid.criterion import VOLUME, Criterion
 from torchsoft.sysid.planner import PRICE, DesignEvaluation, Planner, Range
 from torchsoft.sysid.problem import Problem
 from torchsoft.sysid.recording import Array, Recording

@@ -28,9 +28,10 @@ import torch
 from numpy.typing import NDArray
 
 from torchsoft.display import suggestion
+from torchsoft.plan.knots import Moves
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.solve.simulate import simulate
-from torchsoft.sysid.criterion import Criterion, Moves, chosen, deviations
+from torchsoft.sysid.criterion import Criterion, chosen, deviations
 from torchsoft.sysid.fit import fisher
 from torchsoft.sysid.prediction import Frozen, Prediction, Signals, Steps, choice, predict, prepared
 from torchsoft.sysid.problem import Problem, Residuals

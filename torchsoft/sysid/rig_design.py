@@ -10,11 +10,12 @@ import numpy as np
 import torch
 
 from torchsoft.physics.motion import Reference
+from torchsoft.plan.knots import Moves, profile
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
 from torchsoft.solve.progress import SimulationFailed
 from torchsoft.sysid.configuration import Config, Rest
-from torchsoft.sysid.criterion import Criterion, Moves, profile
+from torchsoft.sysid.criterion import Criterion
 from torchsoft.sysid.design import Design, design
 from torchsoft.sysid.initial_state import Standing
 from torchsoft.sysid.planner import Planner

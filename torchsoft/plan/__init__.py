@@ -1,0 +1,8 @@
+"""Plans: motions, gains, networks and shapes of any rig that reach targets within limits, by exact
+gradients through contact and friction."""
+
+from torchsoft.plan.goals import Limit, Target
+from torchsoft.plan.knots import Bounds
+from torchsoft.plan.planning import Plan, plan
+
+__all__ = ["Bounds", "Limit", "Plan", "Target", "plan"]

@@ -1,0 +1,221 @@
+"""`plan`: free variables of a rig that reach targets within limits, by exact gradients."""
+
+import time as clock
+from collections.abc import Mapping
+from copy import deepcopy
+from dataclasses import dataclass, field
+from functools import partial
+from importlib.metadata import version
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from torchsoft.display import Shown
+from torchsoft.physics.arguments import Numbers, tensor, whole
+from torchsoft.physics.motion import Reference
+from torchsoft.physics.rig import Rig
+from torchsoft.physics.sticking import SLIPPING
+from torchsoft.plan.evaluation import Evaluator, Look, Terms
+from torchsoft.plan.goals import Term
+from torchsoft.plan.search import SLACK, Search, Stopped, Visit
+from torchsoft.plan.variables import Free, Variables
+from torchsoft.solve.trajectory import Trajectory
+
+RTOL = 1e-4
+"""Relative tolerance of the search's runs."""
+
+CHECK = 0.01
+"""Tolerance of the run that checks a plan, over that of the search."""
+
+POLISH = 0.1
+"""Tolerance of a second search, over that of the first, where the check fails."""
+
+Method = Literal["slsqp", "adam"]
+Robust = Literal["mean", "worst"]
+
+
+@dataclass(frozen=True, repr=False)
+class Plan(Shown):
+    """A plan, and how it was found.
+
+    `reference` and `parameters` are the free variables as they are now. `reached` says whether
+    every target and limit is kept in the first draw, by runs of a hundredth of the tolerance;
+    `holds` is the part of draws in which they are. `errors` holds the errors of targets over their
+    tolerance and `excess` that of limits over their scale, (draws,) by name. `trajectory` is the
+    run of the first draw. `reasons` says what is not reached and what holds it back, `notices`
+    what else a reader must know.
+    """
+
+    rig: Rig = field(repr=False)
+    reference: Reference
+    parameters: dict[str, Tensor]
+    trajectory: Trajectory
+    value: float
+    errors: dict[str, Tensor]
+    excess: dict[str, Tensor]
+    reached: bool
+    holds: float
+    reasons: tuple[str, ...]
+    notices: tuple[str, ...]
+    history: tuple[Visit, ...]
+    made_by: dict[str, Any]
+
+    def shown(self) -> tuple[str, list[tuple[str, str]]]:
+        rows = [
+            *((name, f"{float(e[0]):+.2f} tolerances off") for name, e in self.errors.items()),
+            *((name, f"{float(e[0]):+.2%} beyond") for name, e in self.excess.items() if e[0] > 0),
+            *(("not reached", reason) for reason in self.reasons),
+            *(("note", notice) for notice in self.notices),
+        ]
+        kept = "reached" if self.reached else "NOT reached"
+        cost = f"{self.made_by['looks']} evaluations, {self.made_by['wall_s']:.1f} s"
+        return f"Plan: {kept}, holds in {self.holds:.0%} of draws; {cost}", rows
+
+
+def plan(
+    rig: Rig, t: Numbers, free: Free, *, objective: Term | None = None,
+    targets: Mapping[str, Term] | None = None, limits: Mapping[str, Term] | None = None,
+    y0: Numbers, reference: Reference | None = None, over: Mapping[str, Numbers] | None = None,
+    robust: Robust = "mean", method: Method = "slsqp", iterations: int = 50, rate: float = 0.02,
+    starts: int = 1, change: float | None = None, seconds: float = float("inf"),
+    rtol: float = RTOL, threads: int | None = None, seed: int = 0, progress: bool = False,
+) -> Plan:  # fmt: skip
+    """Choose the free variables of a rig so that its run from y0 (size,) over the times t (T,) [s]
+    reaches all targets within all limits.
+
+    `free` names motions, with `Bounds` of their knots, and parameters of any shape, with their
+    least and largest value (infinite ones are allowed). `objective` (a number, which is lowered),
+    `targets` (errors over a tolerance, which are brought to zero) and `limits` (excess over a
+    scale, which is kept from being positive) are functions in torch of a `Trajectory`, such as
+    `Target` and `Limit`, by name. `change` weighs half the squared change of the variables, in
+    units of what speed or range allows: by default 1 without an objective, so that the plan is the
+    one nearest to the motion given, else 0.
+
+    `over` holds draws of uncertain parameters by name (draws, ...), y0 their starts (draws, size)
+    if these differ, the first draw being the nominal one. With `robust` "mean" the mean error of
+    every target is brought to zero, and the spread of errors lowered with the objective's mean;
+    with "worst" the worst draw is. Limits are kept in every draw.
+
+    "slsqp" takes up to `iterations` steps of sequential quadratic programming; "adam" as many
+    steps of Adam at `rate`, projected onto the bounds, with squared errors and excess as a price:
+    for networks. It begins at the best of `starts`: the values given, and points of Sobol's
+    sequence. A run that fails is worse than any other. The search ends after `seconds`, and on
+    Ctrl-C, with the best plan so far.
+
+    Raises `ValueError` for what does not fit together, and where no start can be run.
+    """
+    t, y0 = tensor("t", t), tensor("y0", y0)
+    for name, given, known in (("method", method, ("slsqp", "adam")),
+                               ("robust", robust, ("mean", "worst"))):  # fmt: skip
+        if given not in known:
+            raise ValueError(f"`{name}` must be one of {', '.join(known)}, not {given!r}")
+    whole("iterations", iterations, 1)
+    whole("starts", starts, 1)
+    if objective is None and not targets:
+        raise ValueError("nothing to plan for: give an `objective`, `targets` or both")
+    drawn = {name: tensor(f"over[{name!r}]", values) for name, values in (over or {}).items()}
+    followed = rig.reference if reference is None else reference
+    variables = Variables(rig, followed, free, float(t[-1]))
+    terms = Terms(objective, targets or {}, limits or {})
+    evaluator = Evaluator(rig, t, variables, terms, y0, drawn, rtol, threads)
+    weight = (1.0 if objective is None else 0.0) if change is None else change
+    notices = []
+    with tqdm(desc="plan", unit=" evaluations", disable=not progress) as bar:
+        search = Search(evaluator, robust, weight, seconds, bar)
+        try:
+            search.begin(starts, seed)
+            go = search.slsqp if method == "slsqp" else partial(search.adam, rate=rate)
+            go(search.found.z, iterations)
+            checked = evaluator.look(search.found.z, CHECK * rtol, gradient=False)
+            if method == "slsqp" and not kept(checked)[:1].all():
+                search.refine(POLISH * rtol)
+                search.slsqp(search.found.z, iterations)
+        except KeyboardInterrupt:
+            if search.best is None:
+                raise
+            notices.append(f"interrupted after {evaluator.looks} evaluations")
+        except Stopped:
+            notices.append(f"ended after {seconds:g} s, as was asked for")
+    if search.lost:
+        notices.append(f"{len(search.lost)} plans could not be run, the first: {search.lost[0]}")
+    return finished(search, rig, notices, {
+        "torchsoft": version("torchsoft"), "method": method, "robust": robust,
+        "free": {k: tuple(v) if isinstance(v, tuple) else v.model_dump() for k, v in free.items()},
+        "draws": evaluator.draws, "iterations": iterations, "starts": starts, "change": weight,
+        "rtol": rtol, "seed": seed,
+    })  # fmt: skip
+
+
+def kept(look: Look) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    """Draws (draws,) in which every target and limit is kept; none of a lost look."""
+    if look.lost:
+        return np.zeros(1, bool)
+    return (np.abs(look.errors) <= 1).all(1) & (look.excess <= SLACK).all(1)
+
+
+def finished(search: Search, rig: Rig, notices: list[str], made_by: dict[str, Any]) -> Plan:
+    """The best plan of a search, checked by a run of a finer tolerance."""
+    evaluator, z = search.evaluator, search.found.z
+    rtol = CHECK * made_by["rtol"]
+    look = evaluator.look(z, rtol, gradient=False)
+    if look.lost:
+        notices.append(f"by rtol = {rtol:g} a run fails: {look.lost}")
+        look = search.found
+    assert look.batch is not None
+    run = next(one for one in look.batch.trajectories if one is not None)
+    names = evaluator.terms.labels(run)
+    errors, excess = (
+        {name: torch.from_numpy(column) for name, column in zip(those, values.T)}
+        for those, values in zip(names, (look.errors, look.excess))
+    )
+    held = kept(look)
+    reasons: list[str] = []
+    if not held[0]:
+        reasons += [
+            f"{name} is {float(e[0]):+.3g} tolerances off"
+            for name, e in errors.items()
+            if abs(float(e[0])) > 1
+        ]
+        reasons += [
+            f"{name} is exceeded by {float(e[0]):.2%}"
+            for name, e in excess.items()
+            if float(e[0]) > SLACK
+        ]
+        reasons += [*search.evaluator.variables.active(z), *slips(run)]
+        reasons += [f"further on a run fails: {why}" for why in search.lost[-1:]]
+    now = torch.from_numpy(z)
+    reference = evaluator.variables.reference(now)
+    parameters = evaluator.variables.parameters(now)
+    planned = deepcopy(rig)
+    planned.reference = reference
+    with torch.no_grad():
+        for name, value in parameters.items():
+            planned.parameter(name).copy_(value)
+    return Plan(
+        rig=planned, reference=reference, parameters=parameters, trajectory=run,
+        value=float(look.value.max() if search.robust == "worst" else look.value.mean()),
+        errors=errors, excess=excess, reached=bool(held[0]), holds=float(held.mean()),
+        reasons=tuple(reasons), notices=tuple(notices), history=tuple(search.history),
+        made_by=made_by | {
+            "looks": evaluator.looks, "wall_s": clock.perf_counter() - search.began,
+            "checked_rtol": rtol,
+        },
+    )  # fmt: skip
+
+
+def slips(run: Trajectory) -> list[str]:
+    """Contacts whose points all slip at some time, in words."""
+    out = []
+    for name, state in run.contact_state.items():
+        touching = state > 0
+        gross = touching.any(-1) & ((state == SLIPPING) | ~touching).all(-1)
+        if bool(gross.any()):
+            first, last = run.t[gross][[0, -1]].tolist()
+            out.append(
+                f"every touching point of the contact `{name}` slips at some time from "
+                f"{first:.3g} to {last:.3g} s: press harder, go slower, or take more friction"
+            )
+    return out

@@ -1,0 +1,334 @@
+"""Searches for the variables of a plan: SLSQP by SciPy, and projected Adam by torch for many
+variables."""
+
+import time as clock
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from scipy.stats import qmc
+from tqdm import tqdm
+
+from torchsoft.plan.evaluation import Evaluator, Look
+from torchsoft.plan.knots import Array
+from torchsoft.solve.adjoint import GradientFailed
+
+WITHIN = 0.5
+"""Part of a target's tolerance that a search keeps: runs by a finer tolerance differ a little."""
+
+SLACK = 1e-3
+"""Excess of a limit, over its scale, that counts as kept."""
+
+EXCESS = 100.0
+"""Weight of excess over its scale beside errors over their tolerance."""
+
+UNIT = 0.3
+"""Length of the first step along the objective, over the units of the variables."""
+
+PRICE = 30.0
+"""Weight of squared excess for Adam."""
+
+CLIPPED = 1.0
+"""Norm of a slope at the most, for Adam."""
+
+STAGES, SHORTER, SHORTEST = 30, 0.4, 0.01
+"""Stages of SLSQP at the most; the part of the way to the targets that is aimed at when a run
+fails, over the part before; and the least."""
+
+DONE = 0.1
+"""Errors, over those at its start, with which a stage on the way to the targets is done."""
+
+ACCURACY = 1e-4
+"""Change of the value and excess below which SLSQP ends."""
+
+
+class Visit(NamedTuple):
+    """An evaluation: its time [s], the value, and what targets and limits miss, 0 if nothing."""
+
+    seconds: float
+    value: float
+    missed: float
+
+
+PATIENCE, BETTER = 6, 3e-3
+"""SLSQP ends after so many evaluations without a value lower by this part of it: runs whose steps
+are chosen by a tolerance are not smooth beyond that."""
+
+
+SAME = 1e-12
+"""Difference of variables, over their units, that rounding makes."""
+
+
+class Stopped(Exception):
+    """The time is over."""
+
+
+class Settled(Exception):
+    """No evaluation is any better, or a stage is done."""
+
+
+class Failed(Exception):
+    """A run of a step of the search failed."""
+
+
+class Search:
+    """Looks at plans, and keeps the best: what misses less, then the lower value.
+
+    With one draw, or `robust` "mean", the mean of the objective is lowered, the mean errors of the
+    draws are brought to zero, and their spread is lowered; with "worst" the largest sum of the
+    objective and half the squared errors.
+    """
+
+    def __init__(
+        self, evaluator: Evaluator, robust: str, change: float, seconds: float, bar: tqdm
+    ) -> None:
+        self.evaluator, self.robust, self.change, self.bar = evaluator, robust, change, bar
+        self.began, self.seconds = clock.perf_counter(), seconds
+        self.origin = evaluator.variables.start
+        self.best: Look | None = None
+        self.best_visit = Visit(0.0, np.inf, np.inf)
+        self.history: list[Visit] = []
+        self.lost: list[str] = []
+        self.scale = 1.0
+        self.at = 0  # number of the last evaluation that was clearly better
+        self.aim: Array | None = None  # mean errors that a stage is to end with
+        self._inverse: Array = np.linalg.inv(evaluator.variables.D)
+        self._way = 0.0
+        self.reached: Look | None = None  # the end of a stage
+        self._last: Look | None = None
+
+    def look(self, z: Array, *, gradient: bool = True) -> Look:
+        """The plan at z, counted. Raises `Stopped`."""
+        for known in (self._last, self.best):
+            if known is not None and np.allclose(known.z, z, rtol=0, atol=SAME):
+                return known
+        if clock.perf_counter() - self.began > self.seconds and self.best is not None:
+            raise Stopped
+        try:
+            look = self.evaluator.look(z, gradient=gradient)
+        except ValueError as refused:
+            if self.best is None:
+                raise
+            look = Look(z, torch.zeros(0), None, self.evaluator.terms, str(refused))
+        if look.lost:
+            self.lost.append(look.lost)
+        else:
+            visit = Visit(clock.perf_counter() - self.began, self.value(look), self.missed(look))
+            self.history.append(visit)
+            old = self.best_visit
+            if visit.missed < (1 - BETTER) * old.missed or (
+                visit.missed <= old.missed and visit.value < old.value - BETTER * abs(old.value)
+            ):
+                self.at = len(self.history)
+            if (visit.missed, visit.value) < (old.missed, old.value):
+                self.best, self.best_visit = look, visit
+        self._last = look
+        best = self.best_visit
+        said = f"missed {best.missed:.3g}" if best.missed else f"value {best.value:.4g}"
+        self.bar.set_postfix_str(f"best: {said}", refresh=False)
+        self.bar.update()
+        return look
+
+    def value(self, look: Look) -> float:
+        """What is lowered while targets and limits are kept."""
+        spread = look.errors if self.robust == "worst" else look.errors - look.errors.mean(0)
+        each = self.scale * look.value + 0.5 * np.square(spread).sum(1)
+        combined = each.max() if self.robust == "worst" else each.mean()
+        return float(combined) + self.changed(look.z)[0]
+
+    def changed(self, z: Array) -> tuple[float, Array]:
+        """Price of the change of ways and parameters since the start, and its slope (n,)."""
+        D = self.evaluator.variables.D
+        way = D @ (z - self.origin)
+        return 0.5 * self.change * float(way @ way), self.change * D.T @ way
+
+    def missed(self, look: Look) -> float:
+        """What targets miss beyond a part of their tolerance, and limits beyond their slack."""
+        errors = np.abs(look.errors).max(initial=0.0)
+        excess = look.excess.max(initial=0.0)
+        return float(max(errors - WITHIN, 0.0) + EXCESS * max(excess - SLACK, 0.0))
+
+    @property
+    def found(self) -> Look:
+        """The best plan so far."""
+        assert self.best is not None
+        return self.best
+
+    def refine(self, rtol: float) -> None:
+        """Go on by another relative tolerance, from the best plan so far."""
+        self.evaluator.rtol, z = rtol, self.found.z
+        self.best, self._last, self.best_visit = None, None, Visit(0.0, np.inf, np.inf)
+        self.look(z)
+
+    def begin(self, starts: int, seed: int) -> None:
+        """Look at so many starts: the plan as it is given, and Sobol points of all bounds. Raises
+        `ValueError` where none can be run."""
+        variables = self.evaluator.variables
+        self.look(self.origin, gradient=starts == 1)
+        if starts > 1:
+            sampler = qmc.Sobol(variables.n, rng=np.random.default_rng(seed))
+            for u in sampler.random_base2((starts - 1).bit_length())[: starts - 1]:
+                self.look(variables.spread(u), gradient=False)
+            self._last = None
+        if self.best is None:
+            raise ValueError(f"no start of the plan can be run: {self.lost[0]}")
+        if self.evaluator.terms.objective is not None:
+            slope = float(np.linalg.norm(self.look(self.best.z).slopes[0].mean(0)))
+            self.scale = UNIT / slope if slope > 0 else 1.0
+            self.best_visit = self.best_visit._replace(value=self.value(self.best))
+
+    def slsqp(self, z: Array, iterations: int) -> None:
+        """Sequential quadratic programming from z on. Where a step leads to a run that fails, only
+        a part of the way to the targets is aimed at, and then the rest."""
+        share = 1.0
+        for _ in range(STAGES):
+            start = self.look(z)
+            errors = start.errors.mean(0)
+            self.aim = (1 - share) * errors if share < 1 and len(errors) else None
+            self._way = share * float(np.abs(errors).max(initial=0.0))
+            self.reached = None
+            self.at, before = len(self.history), self.best_visit
+            try:
+                minimize(
+                    self._objective, self._x(z), jac=self._gradient, method="SLSQP",
+                    bounds=self._bounds(), constraints=self._constraints(),
+                    options={"maxiter": iterations, "ftol": ACCURACY},
+                )  # fmt: skip
+            except Settled:
+                z = self.found.z if self.reached is None else self.reached.z
+            except (Failed, GradientFailed):
+                z = self.found.z if self.best_visit != before else z
+                share *= SHORTER
+                if share < SHORTEST:
+                    return
+                continue
+            if share == 1.0 and (self.best_visit.missed == 0 or self.best_visit == before):
+                return
+            share = min(1.0, share / SHORTER)
+
+    def adam(self, z: Array, iterations: int, rate: float) -> None:
+        """Projected Adam from z on, with squared errors and excess as a price."""
+        variables = self.evaluator.variables
+        now = torch.from_numpy(z.copy()).requires_grad_()
+        optimizer = torch.optim.Adam([now], lr=rate)
+        for i in range(iterations):
+            look = self.look(now.detach().numpy().copy())
+            try:
+                slope = None if look.lost else self._priced(look)
+            except GradientFailed as failure:
+                self.lost.append(str(failure))
+                slope = None
+            if slope is None or not np.isfinite(slope).all():
+                assert self.best is not None
+                now.data.copy_(torch.from_numpy(self.best.z))
+                optimizer.param_groups[0]["lr"] *= 0.5
+                continue
+            norm = float(np.linalg.norm(slope))
+            now.grad = torch.from_numpy(slope * min(1.0, CLIPPED / max(norm, 1e-300)))
+            optimizer.param_groups[0]["lr"] *= 0.1 ** (1 / iterations)
+            optimizer.step()
+            now.data.copy_(torch.from_numpy(variables.nearest(now.detach().numpy())))
+        self.look(now.detach().numpy().copy(), gradient=False)
+
+    def _priced(self, look: Look) -> Array:
+        """Slope (n,) of the value with squared errors and excess beside it."""
+        dx = look.slopes[2]
+        over = 2 * PRICE * np.maximum(look.excess, 0.0)
+        each = self._cost_slopes(look) + np.einsum("dm,dmn->dn", over, dx)
+        k = int(np.argmax(self._costs(look)))
+        of = each[k] if self.robust == "worst" else each.mean(0)
+        return of + self.changed(look.z)[1]
+
+    # SLSQP sees x = (ways, s): in these the price of change is round; s bounds what the worst draw
+    # costs
+    # ----------------------------------------------------------------------
+
+    def _x(self, z: Array) -> Array:
+        ways = self.evaluator.variables.D @ z
+        return np.append(ways, self._costs(self.look(z)).max()) if self._worst else ways
+
+    def _by_x(self, slopes: Array, s: float = 0.0) -> Array:
+        """Derivatives (..., n) by z as those by x."""
+        by_ways = slopes @ self._inverse
+        pad = [(0, 0)] * (slopes.ndim - 1) + [(0, int(self._worst))]
+        return np.pad(by_ways, pad, constant_values=s)
+
+    def _step(self, x: Array) -> Look:
+        """The plan at x. Raises `Failed`."""
+        look = self.look(self._inverse @ x[: self.evaluator.variables.n])
+        if look.lost:
+            raise Failed
+        return look
+
+    def _objective(self, x: Array) -> float:
+        look = self._step(x)
+        if len(self.history) - self.at > PATIENCE:
+            raise Settled
+        if self.aim is not None:
+            left = look.errors.mean(0) - self.aim
+            over = look.excess.max(initial=0.0)
+            if over <= DONE and np.abs(left).max() <= max(WITHIN, DONE * self._way):
+                self.reached = look
+                raise Settled
+        return float(x[-1]) + self.changed(look.z)[0] if self._worst else self.value(look)
+
+    def _gradient(self, x: Array) -> Array:
+        look = self._step(x)
+        out = self.changed(look.z)[1]
+        if self._worst:
+            return self._by_x(out, 1.0)
+        dv, de, _ = look.slopes
+        spread = look.errors - look.errors.mean(0)
+        return self._by_x(
+            out + self.scale * dv.mean(0) + np.einsum("dk,dkn->n", spread, de) / len(dv)
+        )
+
+    def _constraints(self) -> list[dict[str, Any]]:
+        variables, terms = self.evaluator.variables, self.evaluator.terms
+        n, aim = variables.n, 0.0 if self.aim is None else self.aim
+        out = []
+
+        def add(kind: str, of: Callable[[Look], Array], by: Callable[[Look], Array]) -> None:
+            out.append({
+                "type": kind, "fun": lambda x: of(self._step(x)),
+                "jac": lambda x: self._by_x(by(self._step(x))),
+            })  # fmt: skip
+
+        if len(variables.b):
+            rows = self._by_x(-variables.A)
+            out.append({
+                "type": "ineq", "fun": lambda x: variables.b + rows @ x, "jac": lambda x: rows,
+            })  # fmt: skip
+        if terms.targets and not self._worst:
+            add("eq", lambda one: one.errors.mean(0) - aim, lambda one: one.slopes[1].mean(0))
+        if terms.limits:
+            add("ineq", lambda one: -one.excess.ravel(), lambda one: -one.slopes[2].reshape(-1, n))
+        if self._worst:
+            out.append({
+                "type": "ineq", "fun": lambda x: x[-1] - self._costs(self._step(x)),
+                "jac": lambda x: self._by_x(-self._cost_slopes(self._step(x)), 1.0),
+            })  # fmt: skip
+        return out
+
+    @property
+    def _worst(self) -> bool:
+        return self.robust == "worst"
+
+    def _costs(self, look: Look) -> Array:
+        """Cost (draws,) of every draw."""
+        return self.scale * look.value + 0.5 * np.square(look.errors).sum(1)
+
+    def _cost_slopes(self, look: Look) -> Array:
+        """Its slopes (draws, n)."""
+        dv, de, _ = look.slopes
+        return self.scale * dv + np.einsum("dk,dkn->dn", look.errors, de)
+
+    def _bounds(self) -> list[tuple[float | None, float | None]]:
+        variables = self.evaluator.variables
+        ends = [
+            (None if np.isinf(low) else low, None if np.isinf(high) else high)
+            for low, high in zip(variables.low, variables.high)
+        ]
+        return [*ends, *([(None, None)] if self._worst else [])]
