@@ -39,8 +39,8 @@ FLOWS = {
         columns configuration rig_recordings rehearsal measured rig_design figures report .
     """,
     "plan": "knots variables goals evaluation search planning .",
-    "rigs": "fields parts control motion geometry build course balance check written run .",
-    "cli": "results rigs identify design material plot .",
+    "rigs": "fields parts control motion geometry build course balance check written goal run .",
+    "cli": "results rigs plan identify design material plot .",
     "solve.kernel": """
         table arrays objects . invoke linear inertia interface stage step run adjoint tangent build
     """,

@@ -40,10 +40,10 @@ def design(options: argparse.Namespace) -> int:
         return failed(f"one CONFIG.toml is needed, but {len(configs)} were given")
     from torchsoft.files import replacing, write_json
     from torchsoft.plot.figures import save
-    from torchsoft.rigs.written import to_toml
+    from torchsoft.rigs.written import located, to_toml
     from torchsoft.sysid import measured
     from torchsoft.sysid.figures import design_figure
-    from torchsoft.sysid.rig_design import choose, located
+    from torchsoft.sysid.rig_design import choose
 
     stated = measured.read_config(configs[0])
     recorded = measured.load(data, configs[0]).problem.recordings if data else ()

@@ -1,6 +1,6 @@
 """Motions whose knots may move: their bounds, and the variables that a search moves."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Self
 
 import numpy as np
@@ -56,6 +56,19 @@ def profile(reference: Reference, name: str) -> Profile:
             f"{suggestion(name, known, 'it has')}"
         )
     return found
+
+
+def knots(reference: Reference, names: Iterable[str]) -> dict[str, Any]:
+    """Tables of a rig file of the profiles of some signals."""
+    signals = {name: profile(reference, name) for name in names}
+    return {
+        name: {
+            "kind": "profile",
+            "times": one.times.detach().tolist(),
+            "values": one.values.detach().tolist(),
+        }
+        for name, one in signals.items()
+    }
 
 
 class Moves:

@@ -63,6 +63,17 @@ class Plan(Shown):
     history: tuple[Visit, ...]
     made_by: dict[str, Any]
 
+    def summary(self) -> dict[str, Any]:
+        """What is written as JSON."""
+        return {
+            "reached": self.reached, "holds": self.holds, "value": self.value,
+            "errors": {name: e.tolist() for name, e in self.errors.items()},
+            "excess": {name: e.tolist() for name, e in self.excess.items()},
+            "reasons": self.reasons, "notices": self.notices,
+            "parameters": {name: value.tolist() for name, value in self.parameters.items()},
+            "history": [one._asdict() for one in self.history], "made_by": self.made_by,
+        }  # fmt: skip
+
     def shown(self) -> tuple[str, list[tuple[str, str]]]:
         rows = [
             *((name, f"{float(e[0]):+.2f} tolerances off") for name, e in self.errors.items()),

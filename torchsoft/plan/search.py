@@ -52,9 +52,9 @@ class Visit(NamedTuple):
     missed: float
 
 
-PATIENCE, BETTER = 6, 3e-3
-"""SLSQP ends after so many evaluations without a value lower by this part of it: runs whose steps
-are chosen by a tolerance are not smooth beyond that."""
+PATIENCE, ENOUGH, BETTER = 6, 3, 3e-3
+"""SLSQP ends after so many evaluations, or so many where all is kept, without a value lower by this
+part of it: runs whose steps are chosen by a tolerance are not smooth beyond that."""
 
 
 SAME = 1e-12
@@ -264,7 +264,7 @@ class Search:
 
     def _objective(self, x: Array) -> float:
         look = self._step(x)
-        if len(self.history) - self.at > PATIENCE:
+        if len(self.history) - self.at > (PATIENCE if self.best_visit.missed else ENOUGH):
             raise Settled
         if self.aim is not None:
             left = look.errors.mean(0) - self.aim

@@ -12,6 +12,9 @@ from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import Group, NumberOr
 from torchsoft.tables import read_toml, toml_row
 
+FILES = ("file", "network")
+"""Fields of a rig file that name another file."""
+
 
 def to_toml(file: RigFile) -> str:
     """The text of a TOML file that `RigFile.from_toml` reads."""
@@ -104,3 +107,19 @@ def template(title: str) -> RigFile:
     return RigFile.from_tree(
         read_toml(Path(__file__).with_name("template.toml")) | {"title": title}
     )
+
+
+def located(file: RigFile) -> RigFile:
+    """The same file, wherever it is written to: files that it names by whole paths."""
+
+    def whole(tree: Any) -> Any:
+        if not isinstance(tree, dict):
+            return tree
+        return {
+            key: str((file.folder / value).resolve())
+            if key in FILES and isinstance(value, str)
+            else whole(value)
+            for key, value in tree.items()
+        }
+
+    return RigFile.model_validate(whole(file.model_dump(exclude_unset=True)))

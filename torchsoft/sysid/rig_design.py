@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from torchsoft.physics.motion import Reference
-from torchsoft.plan.knots import Moves, profile
+from torchsoft.plan.knots import Moves
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
 from torchsoft.solve.progress import SimulationFailed
@@ -26,9 +25,6 @@ from torchsoft.tables import line
 
 AS_STATED = "as stated"
 """The name of the motion of the rig file itself, which is a candidate too."""
-
-FILES = ("file", "network")
-"""Fields of a rig file that name another file."""
 
 
 @dataclass(frozen=True)
@@ -155,32 +151,3 @@ def choose(
         )  # fmt: skip
         chosen = chosen.override(motion=knots(found.recording.rig.reference, plan.bounds))
     return Chosen(rated, chosen, found)
-
-
-def knots(reference: Reference, names: Mapping[str, Any]) -> dict[str, Any]:
-    """Tables of a rig file of the profiles of some signals."""
-    signals = {name: profile(reference, name) for name in names}
-    return {
-        name: {
-            "kind": "profile",
-            "times": one.times.detach().tolist(),
-            "values": one.values.detach().tolist(),
-        }
-        for name, one in signals.items()
-    }
-
-
-def located(file: RigFile) -> RigFile:
-    """The same file, wherever it is written to: files that it names by whole paths."""
-
-    def whole(tree: Any) -> Any:
-        if not isinstance(tree, dict):
-            return tree
-        return {
-            key: str((file.folder / value).resolve())
-            if key in FILES and isinstance(value, str)
-            else whole(value)
-            for key, value in tree.items()
-        }
-
-    return RigFile.model_validate(whole(file.model_dump(exclude_unset=True)))

@@ -1,0 +1,49 @@
+"""Plans: a goal of a rig file reached by gradient."""
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from torchsoft.cli.results import add_out, say, try_folder
+
+PLAN = """\
+Which motion brings the rig where it is wanted?
+
+RIG.toml is a rig file that runs, with a motion to begin with. GOAL.toml has [free.NAME] for every
+motion whose knots may move (low, high, speed, after) and every number of the file that may change
+(low, high), [targets.NAME] (channel, value, tolerance, at) and [limits.NAME] (channel, low, high,
+since, until). With [uncertain."NUMBER"] (low, high) the plan is made for draws of them. Writes the
+rig file that carries the plan out as motion.toml, with plan.json and run.nc; the exit status is 1
+where a target or limit is not kept."""
+
+
+def add_commands(commands: Any) -> None:
+    """The command that plans motions."""
+    one = commands.add_parser(
+        "plan", help="find a motion that reaches a goal", description=PLAN,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
+    one.add_argument("rig", type=Path, metavar="RIG.toml")
+    one.add_argument("goal", type=Path, metavar="GOAL.toml")
+    add_out(one, default=Path("out/plan"), help="folder for the results (%(default)s)")
+    one.add_argument("--no-progress", action="store_true", help="show no progress")
+    one.set_defaults(run=plan)
+
+
+def plan(options: argparse.Namespace) -> int:
+    """Plan, and write the motion."""
+    from torchsoft.files import replacing, write_json
+    from torchsoft.rigs.build import RigFile
+    from torchsoft.rigs.goal import Goal, plan_file
+    from torchsoft.rigs.written import located, to_toml
+
+    file, goal = RigFile.from_toml(options.rig), Goal.from_toml(options.goal)
+    try_folder(options.out, options.force)
+    found, written = plan_file(file, goal, progress=not options.no_progress)
+    with replacing(options.out / "motion.toml") as partial:
+        partial.write_text(to_toml(located(written)), encoding="utf-8")
+    write_json(options.out / "plan.json", found.summary())
+    found.trajectory.save(options.out / "run.nc")
+    say(found)
+    say(f"written to {options.out / 'motion.toml'}, plan.json and run.nc")
+    return 0 if found.reached else 1

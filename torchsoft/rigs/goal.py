@@ -1,0 +1,112 @@
+"""Goal of a rig file's motion, as a TOML file states it, and the plan that reaches it."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, Self
+
+import numpy as np
+import torch
+from pydantic import Field, model_validator
+
+from torchsoft.plan import Bounds, Limit, Plan, Target, plan
+from torchsoft.plan.knots import knots
+from torchsoft.plan.planning import RTOL, Method, Robust
+from torchsoft.rigs.build import RigFile
+from torchsoft.rigs.fields import at_field
+from torchsoft.tables import SEED, Table, from_toml
+
+
+class Range(Table):
+    """Values of a parameter of the rig, from `low` to `high` [its unit]."""
+
+    low: float
+    high: float
+
+    @model_validator(mode="after")
+    def _is_ordered(self) -> Self:
+        if self.low >= self.high:
+            raise ValueError(f"low = {self.low:g} must be below high = {self.high:g}")
+        return self
+
+
+Name = Annotated[str, Field(min_length=1)]
+
+
+class Goal(Table):
+    """What a run of a rig file is to reach: `free` motions and numbers of the file, by their names;
+    `targets` and `limits` of channels; `uncertain` numbers of the file, of which the plan sees
+    `draws` besides the stated ones."""
+
+    free: dict[Name, Bounds | Range] = Field(min_length=1)
+    targets: dict[Name, Target] = Field(min_length=1)
+    limits: dict[Name, Limit] = Field(default_factory=dict)
+    uncertain: dict[Name, Range] = Field(default_factory=dict)
+    draws: int = Field(default=8, ge=1, le=10_000)
+    robust: Robust = "mean"
+    method: Method = "slsqp"
+    iterations: int = Field(default=50, ge=1, le=100_000)
+    starts: int = Field(default=1, ge=1, le=4096)
+    seconds: float = Field(default=1e6, gt=0)
+    rtol: float = Field(default=RTOL, ge=1e-7, le=1e-2)
+    seed: int = Field(default=0, ge=0, le=SEED)
+
+    @classmethod
+    def from_toml(cls, path: str | Path) -> Self:
+        """Read from a TOML file. Raises `InvalidTable` in one sentence."""
+        return from_toml(path, cls.model_validate)
+
+
+class Planned(NamedTuple):
+    """A plan, and the rig file that carries it out."""
+
+    plan: Plan
+    file: RigFile
+
+
+def nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Tables within tables of values by dotted names."""
+    out: dict[str, Any] = {}
+    for name, value in values.items():
+        *tables, last = name.split(".")
+        inner = out
+        for table in tables:
+            inner = inner.setdefault(table, {})
+        inner[last] = value
+    return out
+
+
+def drawn(file: RigFile, goal: Goal, count: int, seed: int) -> tuple[dict[str, Any], Any]:
+    """Uncertain numbers by name (1 + count, ...), the stated ones first, and the starts (1 + count,
+    size) of rigs that have them. Raises `ValueError`."""
+    rng, rows, starts = np.random.default_rng(seed), [], []
+    for i in range(1 + count):
+        values = {name: rng.uniform(one.low, one.high) for name, one in goal.uncertain.items()}
+        with at_field("uncertain"):
+            built = (file.override(**nested(values)) if i else file).build()
+        rows.append({name: built.rig.parameter(name).detach() for name in goal.uncertain})
+        starts.append(built.y0)
+    over = {name: torch.stack([row[name] for row in rows]) for name in goal.uncertain}
+    return over, torch.stack(starts)
+
+
+def plan_file(file: RigFile, goal: Goal, *, progress: bool = False) -> Planned:
+    """The plan that reaches a goal, and the rig file with it. Numbers of materials and laws that
+    are free leave the start as the file has it.
+
+    Raises `ValueError` for names that the rig or its run has not, and where no start can be run.
+    """
+    built = file.build()
+    over, y0 = drawn(file, goal, goal.draws, goal.seed) if goal.uncertain else ({}, built.y0)
+    free = {
+        name: one if isinstance(one, Bounds) else (one.low, one.high)
+        for name, one in goal.free.items()
+    }
+    found = plan(
+        built.rig, built.t, free, targets=goal.targets, limits=goal.limits, y0=y0, over=over,
+        robust=goal.robust, method=goal.method, iterations=goal.iterations, starts=goal.starts,
+        seconds=goal.seconds, rtol=goal.rtol, seed=goal.seed, progress=progress,
+    )  # fmt: skip
+    moved = [name for name, one in goal.free.items() if isinstance(one, Bounds)]
+    numbers = {name: value.tolist() for name, value in found.parameters.items()}
+    written = file.override(motion=knots(found.reference, moved), **nested(numbers))
+    return Planned(found, written)
