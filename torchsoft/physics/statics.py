@@ -189,10 +189,10 @@ def resting(
     stay as given.
 
     Newton's method on the net loads of the free coordinates, each step no longer than `STRIDE`: a
-    body above its pad comes down to it. Done when a step is below `residual` [m]. `actuators` names those that push, by default all, by
-    `signals` (signals, 2), by default the reference's at t = 0. Differentiable once in the given
-    pose and in the rig's parameters, by the implicit function theorem. Raises `NoEquilibrium` where
-    there is no balance, and what `settled` does.
+    body above its pad comes down to it. Done when a step is below `residual` [m]. `actuators` names
+    those that push, by default all, by `signals` (signals, 2), by default the reference's at t = 0.
+    Differentiable once in the given pose and in the rig's parameters, by the implicit function
+    theorem. Raises `NoEquilibrium` where there is no balance, and what `settled` does.
     """
     check_points(rig)
     soft = massless(rig)

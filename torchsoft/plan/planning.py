@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
@@ -160,11 +161,13 @@ def plan(
     })  # fmt: skip
 
 
-def kept(look: Look) -> np.ndarray[Any, np.dtype[np.bool_]]:
+def kept(look: Look) -> NDArray[np.bool_]:
     """Draws (draws,) in which every target and limit is kept; none of a lost look."""
     if look.lost:
         return np.zeros(1, bool)
-    return (np.abs(look.errors) <= 1).all(1) & (look.excess <= SLACK).all(1)
+    return np.logical_and(
+        (np.abs(look.errors) <= 1).all(axis=1), (look.excess <= SLACK).all(axis=1)
+    )
 
 
 def finished(search: Search, rig: Rig, notices: list[str], made_by: dict[str, Any]) -> Plan:

@@ -94,7 +94,7 @@ class Search:
         self.scale = 1.0
         self.at = 0  # number of the last evaluation that was clearly better
         self.aim: Array | None = None  # mean errors that a stage is to end with
-        self._inverse: Array = np.linalg.inv(evaluator.variables.D)
+        self._inverse: Array = np.linalg.inv(evaluator.variables.D).astype(np.float64)
         self._way = 0.0
         self.reached: Look | None = None  # the end of a stage
         self._last: Look | None = None

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from torchsoft.plan.knots import Moves
+from torchsoft.plan.knots import Moves, knots
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import at_field
 from torchsoft.solve.progress import SimulationFailed
