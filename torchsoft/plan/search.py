@@ -96,6 +96,7 @@ class Search:
         self.aim: Array | None = None  # mean errors that a stage is to end with
         self._inverse: Array = np.linalg.inv(evaluator.variables.D).astype(np.float64)
         self._way = 0.0
+        self.damping = 1.0  # of the objective, so that steps along it are shorter
         self.reached: Look | None = None  # the end of a stage
         self._last: Look | None = None
 
@@ -191,22 +192,30 @@ class Search:
             self.reached = None
             self.at, before = len(self.history), self.best_visit
             try:
-                minimize(
+                found = minimize(
                     self._objective, self._x(z), jac=self._gradient, method="SLSQP",
                     bounds=self._bounds(), constraints=self._constraints(),
                     options={"maxiter": iterations, "ftol": ACCURACY},
                 )  # fmt: skip
+                failed, done = False, found.status == 0
             except Settled:
-                z = self.found.z if self.reached is None else self.reached.z
+                failed, done = False, False
             except (Failed, GradientFailed):
-                z = self.found.z if self.best_visit != before else z
-                share *= SHORTER
+                failed, done = True, False
+            better = self.best_visit != before
+            if self.reached is not None:
+                z = self.reached.z
+            elif better:
+                z = self.found.z
+            if failed:
+                share, self.damping = share * SHORTER, self.damping * SHORTER
                 if share < SHORTEST:
                     return
                 continue
-            if share == 1.0 and (self.best_visit.missed == 0 or self.best_visit == before):
+            if self.aim is None and (done or not better or self.best_visit.missed == 0):
                 return
             share = min(1.0, share / SHORTER)
+            self.damping = min(1.0, self.damping / SHORTER)
 
     def adam(self, z: Array, iterations: int, rate: float) -> None:
         """Projected Adam from z on, with squared errors and excess as a price."""
@@ -272,16 +281,17 @@ class Search:
             if over <= DONE and np.abs(left).max() <= max(WITHIN, DONE * self._way):
                 self.reached = look
                 raise Settled
-        return float(x[-1]) + self.changed(look.z)[0] if self._worst else self.value(look)
+        value = float(x[-1]) + self.changed(look.z)[0] if self._worst else self.value(look)
+        return self.damping * value
 
     def _gradient(self, x: Array) -> Array:
         look = self._step(x)
         out = self.changed(look.z)[1]
         if self._worst:
-            return self._by_x(out, 1.0)
+            return self.damping * self._by_x(out, 1.0)
         dv, de, _ = look.slopes
         spread = look.errors - look.errors.mean(0)
-        return self._by_x(
+        return self.damping * self._by_x(
             out + self.scale * dv.mean(0) + np.einsum("dk,dkn->n", spread, de) / len(dv)
         )
 

@@ -1,0 +1,284 @@
+"""Plans: slopes against differences, targets within limits, draws, refusals, and the command."""
+
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from torchsoft import simulate
+from torchsoft.cli import main
+from torchsoft.plan import Bounds, Limit, Plan, Target, plan
+from torchsoft.plan.evaluation import Evaluator, Terms
+from torchsoft.plan.variables import Free, Variables
+from torchsoft.rigs import RigFile
+from torchsoft.rigs.goal import Goal, drawn
+
+ROOT = Path(__file__).parents[1]
+FILE = RigFile.from_toml(ROOT / "experiments" / "reorient.toml").override(
+    pads={"left_tip": {"elements_x": 40, "elements_y": 2, "points": 1},
+          "right_tip": {"elements_x": 40, "elements_y": 2, "points": 1}},
+    motion={"left_x": {"times": [0.0, 0.2, 0.5], "values": ["start"] * 3},
+            "right_x": {"times": [0.0, 0.2, 0.5], "values": ["start"] * 3},
+            "left_y": {"times": [0.2, 0.5], "values": ["start"] * 2},
+            "right_y": {"times": [0.2, 0.5], "values": ["start"] * 2},
+            "lean": {"times": [0.2, 0.5], "values": [0.0] * 2}},
+    outputs={"duration": 0.6},
+)  # fmt: skip
+BUILT = FILE.build()
+FREE: dict[str, Bounds | tuple[float, float]] = {
+    "left_y": Bounds(low=-25e-3, high=25e-3, speed=0.3, after=0.2),
+    "right_y": Bounds(low=-25e-3, high=25e-3, speed=0.3, after=0.2),
+    "right_x": Bounds(low=15e-3, high=25e-3, speed=0.1, after=0.2),
+}
+TURN = Target(channel="theta_object", value=math.radians(10), tolerance=math.radians(0.5))
+PLACE = {
+    "x": Target(channel="x_object", value=0.0, tolerance=1e-4),
+    "y": Target(channel="y_object", value=0.0, tolerance=1e-4),
+}
+GOAL = {
+    "free": {name: one.model_dump() for name, one in FREE.items() if isinstance(one, Bounds)},
+    "targets": {k: one.model_dump() for k, one in ({"turn": TURN} | PLACE).items()},
+    "rtol": 1e-3,
+}  # fmt: skip
+
+
+def planned(free: Free = FREE, **how: Any) -> Plan:
+    options: dict[str, Any] = {"y0": BUILT.y0, "rtol": 1e-3} | how
+    return plan(BUILT.rig, BUILT.t, free, **options)
+
+
+@pytest.fixture(scope="module")
+def turned() -> Plan:
+    return planned(targets={"turn": TURN} | PLACE)
+
+
+# derivatives
+# ----------------------------------------------------------------------
+
+
+def test_slopes_are_the_differences() -> None:
+    """By knots, a gain and a coefficient of friction, of every draw."""
+    free = FREE | {"actuators.left_y.Kp": (1e4, 1e5), "laws.dry.K_n": (5e4, 2e5)}
+    variables = Variables(BUILT.rig, BUILT.rig.reference, free, 0.6)
+    limits = {"grip": Limit(channel="F_left_x", low=4.0, high=50.0, since=0.1)}
+    terms = Terms(lambda run: run["F_left_y"].square().mean(), {"turn": TURN} | PLACE, limits)
+    over = {"materials.silicone.E": torch.tensor([5e5, 5.2e5]).double()}
+    evaluator = Evaluator(BUILT.rig, BUILT.t, variables, terms, BUILT.y0, over, 1e-8, None)
+    z = variables.start.copy()
+    z[:3] += [-0.1, 0.12, -0.05]
+    look = evaluator.look(z)
+    assert look.errors.shape == (2, 3)
+    slopes = np.concatenate([look.slopes[0][:, None], look.slopes[1], look.slopes[2]], 1)
+    for i in range(variables.n):
+        h = 1e-4 * np.eye(variables.n)[i]
+        ahead, behind = (evaluator.look(z + s * h, gradient=False) for s in (1, -1))
+        differences = [
+            (getattr(ahead, part) - getattr(behind, part)).reshape(2, -1) / 2e-4
+            for part in ("value", "errors", "excess")
+        ]
+        np.testing.assert_allclose(
+            slopes[:, :, i], np.concatenate(differences, 1), rtol=1e-3, atol=2e-3
+        )
+
+
+# what is found
+# ----------------------------------------------------------------------
+
+
+def test_the_target_is_reached_and_the_rig_carries_it_out(turned: Plan) -> None:
+    assert turned.reached
+    assert turned.holds == 1.0
+    again = simulate(turned.rig, BUILT.t, y0=BUILT.y0, rtol=1e-6)
+    assert abs(float(again["theta_object"][-1]) - TURN.value) < TURN.tolerance
+    assert abs(float(again["y_object"][-1])) < 1e-4
+    assert "reached" in repr(turned)
+    assert turned.made_by["looks"] >= len(turned.history)
+
+
+def test_a_limit_is_kept_at_a_price(turned: Plan) -> None:
+    """Without the limit the grip falls below it; with it fingers close."""
+    low = float(turned.trajectory["F_left_x"][30:].min()) + 1.0
+    limits = {"grip": Limit(channel="F_left_x", low=low, since=0.5)}
+    free = FREE | {"left_x": Bounds(low=-25e-3, high=-15e-3, speed=0.1, after=0.2)}
+    found = planned(free, targets={"turn": TURN} | PLACE, limits=limits)
+    assert found.reached
+    assert float(found.trajectory["F_left_x"][50:].min()) >= low * (1 - 2e-3)
+
+
+def test_an_objective_is_lowered_within_targets() -> None:
+    """The least work of a finger that may choose its gain, by the worst of two draws."""
+    objective = lambda run: run["F_left_y"].square().mean()
+    over = {"laws.dry.K_n": torch.tensor([1e5, 1.1e5])}
+    found = planned(
+        FREE, objective=objective, targets={"turn": TURN}, over=over, robust="worst",
+        iterations=3,
+    )  # fmt: skip
+    assert found.made_by["draws"] == 2
+    assert found.holds == 1.0
+    assert found.value <= found.history[0].value or found.history[0].missed > 0
+
+
+def test_adam_lowers_squared_errors() -> None:
+    found = planned(targets={"turn": TURN}, method="adam", iterations=25, rate=0.02)
+    assert abs(float(found.errors["turn"][0])) < 0.5 * 20.0  # from 20 tolerances
+    assert found.history[-1].missed < found.history[0].missed
+
+
+def test_several_starts_begin_with_the_best() -> None:
+    free = {"left_y": Bounds(low=-6e-3, high=6e-3, speed=0.3, after=0.2)}
+    found = planned(free, targets={"turn": TURN}, starts=4, iterations=1)
+    assert min(one.missed for one in found.history) < found.history[0].missed
+    with pytest.raises(ValueError, match="finite bounds"):
+        planned({"actuators.left_y.Kp": (0.0, math.inf)}, targets={"turn": TURN}, starts=3)
+
+
+def test_what_cannot_be_reached_says_why() -> None:
+    """A turn by 170 degrees ends where the body leaves a pad; what was found until then is kept."""
+    far = TURN.model_copy(update={"value": math.radians(170)})
+    found = planned(targets={"turn": far} | PLACE, iterations=10, seconds=20)
+    assert not found.reached
+    assert found.holds == 0.0
+    assert any("turn is -" in reason for reason in found.reasons)
+    assert "NOT reached" in repr(found)
+
+
+def test_a_run_that_fails_is_worse_and_an_interrupt_keeps_the_best(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    look, count = Evaluator.look, 0
+
+    def failing(self: Evaluator, z: Any, rtol: float | None = None, **how: Any) -> Any:
+        nonlocal count
+        count += 1
+        found = look(self, z, rtol, **how)
+        if count == 2:
+            found.lost = "draw 0: made to fail"
+        if count == 5:
+            raise KeyboardInterrupt
+        return found
+
+    monkeypatch.setattr(Evaluator, "look", failing)
+    found = planned(targets={"turn": TURN} | PLACE)
+    assert any("made to fail" in notice for notice in found.notices)
+    assert any("interrupted after" in notice for notice in found.notices)
+    assert found.history[-1].missed < found.history[0].missed
+
+
+def test_seconds_end_a_search() -> None:
+    found = planned(targets={"turn": TURN} | PLACE, seconds=1e-9)
+    assert any("as was asked for" in notice for notice in found.notices)
+    assert len(found.history) == 1
+
+
+# refusals
+# ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        (lambda: planned({}, targets={"turn": TURN}), "nothing to plan"),
+        (lambda: planned(), "give an `objective`, `targets` or both"),
+        (lambda: planned({"left_z": FREE["left_y"]}, targets={"turn": TURN}),
+         "no Profile called `left_z`.*did you mean `left_y`"),
+        (lambda: planned({"actuators.left_y.K": (1.0, 2.0)}, targets={"turn": TURN}),
+         "`actuators.left_y.K` is not a parameter of this rig; did you mean"),
+        (lambda: planned({"actuators.left_y.Kp": (2.0, 1.0)}, targets={"turn": TURN}), "low must be below"),
+        (lambda: planned({"actuators.left_y.Kp": (1.0, 2.0)}, targets={"turn": TURN}), "begin within"),
+        (lambda: planned(targets={"turn": TURN.model_copy(update={"channel": "theta"})}),
+         "targets.turn: there is no channel `theta`; did you mean"),
+        (lambda: planned(targets={"turn": TURN.model_copy(update={"at": 2.0})}), "outside the run"),
+        (lambda: planned(objective=lambda run: torch.tensor(math.nan)), "is not finite"),
+        (lambda: planned(objective=lambda run: 1.0), "as a tensor"),
+        (lambda: planned(objective=lambda run: run["x_object"]), "must give one number"),
+        (lambda: planned(targets={"turn": TURN}, method="newton"), "`method` must be one of"),
+        (lambda: planned({"actuators.left_y.Kp": (1e4, 1e5)}, targets={"turn": TURN},
+                         over={"actuators.left_y.Kp": [5e4, 5e4]}), "both free and drawn"),
+        (lambda: planned(targets={"turn": TURN}, over={"laws.dry.K_n": [1e5], "gravity": [1., 2.]}),
+         "one entry"),
+        (lambda: Limit(channel="x"), "needs `low`, `high` or both"),
+        (lambda: Target(channel="x", value=math.nan, tolerance=1.0), "value"),
+    ],
+)  # fmt: skip
+def test_what_makes_no_sense_is_refused(how: Callable[[], Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        how()
+
+
+def test_a_start_that_cannot_be_run_is_refused() -> None:
+    """A body that nothing holds."""
+    slippery = FILE.override(
+        laws={"dry": {"friction": {"kind": "smooth", "mu_s": 0.02, "mu_k": 0.02, "v_s": 0.05}}}
+    ).build()
+    limits = {"up": Limit(channel="y_object", low=-1e-3)}
+    found = None
+    with pytest.raises(ValueError, match=r"no start of the plan can be run: draw 0"):
+        found = plan(
+            slippery.rig, torch.linspace(0, 3.0, 61), FREE, targets={"turn": TURN}, limits=limits,
+            y0=slippery.y0, rtol=1e-3,
+        )  # fmt: skip
+    assert found is None
+
+
+# the command
+# ----------------------------------------------------------------------
+
+
+def as_toml(goal: dict[str, Any]) -> str:
+    lines = [f"{name} = {value}" for name, value in goal.items() if not isinstance(value, dict)]
+    for field, tables in goal.items():
+        for name, table in tables.items() if isinstance(tables, dict) else ():
+            lines.append(f'[{field}."{name}"]')
+            lines += [
+                f"{key} = {json.dumps(value)}" for key, value in table.items() if value is not None
+            ]
+    return "\n".join(lines) + "\n"
+
+
+def test_the_command_writes_a_rig_file_that_runs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from torchsoft.rigs.written import to_toml
+
+    (tmp_path / "rig.toml").write_text(to_toml(FILE), encoding="utf-8")
+    (tmp_path / "goal.toml").write_text(as_toml(GOAL), encoding="utf-8")
+    files = [str(tmp_path / name) for name in ("rig.toml", "goal.toml")]
+    assert main(["plan", *files, "--out", str(tmp_path / "out"), "--no-progress"]) == 0
+    assert "Plan: reached" in capsys.readouterr().out
+    built = RigFile.from_toml(tmp_path / "out" / "motion.toml").build()
+    again = simulate(built.rig, built.t, y0=built.y0, rtol=1e-5)
+    assert abs(float(again["theta_object"][-1]) - TURN.value) < TURN.tolerance
+    said = json.loads((tmp_path / "out" / "plan.json").read_text())
+    assert said["reached"]
+    assert said["made_by"]["rtol"] == 1e-3
+    (tmp_path / "goal.toml").write_text(as_toml(GOAL | {"drws": 3}), encoding="utf-8")
+    assert main(["plan", *files, "--out", str(tmp_path / "out"), "--force"]) == 2
+    assert "drws" in capsys.readouterr().err
+
+
+def test_draws_of_a_goal_begin_with_the_stated_numbers() -> None:
+    name = "materials.silicone.E"
+    goal = Goal.model_validate(GOAL | {"uncertain": {name: {"low": 4e5, "high": 6e5}}})
+    over, y0 = drawn(FILE, goal, 3, seed=0)
+    assert over[name].shape == (4,)
+    assert float(over[name][0]) == 5e5
+    assert bool(((over[name] > 4e5) & (over[name] < 6e5)).all())
+    assert y0.shape == (4, BUILT.rig.layout.size)
+    assert not torch.equal(y0[0], y0[1])
+
+
+def test_the_search_scales_an_objective() -> None:
+    """A plan does not depend on the unit of its objective."""
+    ends = []
+    for unit in (1.0, 1e3):
+        found = planned(
+            objective=lambda run, unit=unit: unit * (run["theta_object"][-1] - 0.1) ** 2,
+            iterations=10,
+        )
+        ends.append(float(found.trajectory["theta_object"][-1]))
+    assert ends == pytest.approx([0.1, 0.1], abs=0.01)
