@@ -13,9 +13,10 @@ import torch
 from torchsoft import simulate
 from torchsoft.cli import main
 from torchsoft.rigs import RigFile
+from torchsoft.rigs.written import located
 from torchsoft.sysid import Problem
 from torchsoft.sysid.configuration import read_config
-from torchsoft.sysid.rig_design import AS_STATED, located, planned
+from torchsoft.sysid.rig_design import AS_STATED, planned
 from torchsoft.sysid.runs import Runner
 
 RIG = Path(__file__).parents[1] / "rigs" / "orientation.toml"
