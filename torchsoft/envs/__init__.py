@@ -22,17 +22,17 @@ __all__ = ["Dynamics", "Goal", "Moment", "RigEnv", "RigVectorEnv", "Transition",
 def reorient(**changes: Any) -> RigEnv:
     """The environment "torchsoft/Reorient-v0"; `changes` are other arguments of `RigEnv`."""
     jaws = ("lower", "upper")
-    stated: dict[str, Any] = dict(
-        rig=Path(__file__).with_name("reorient.toml"),
-        actions={"lower_x": (-12e-3, 12e-3), "upper_x": (-12e-3, 12e-3), "grip": (-20.0, -6.0)},
-        observations={
+    stated: dict[str, Any] = {
+        "rig": Path(__file__).with_name("reorient.toml"),
+        "actions": {"lower_x": (-12e-3, 12e-3), "upper_x": (-12e-3, 12e-3), "grip": (-20.0, -6.0)},
+        "observations": {
             "x_disc": (-10e-3, 10e-3), "theta_disc": (-1.0, 1.0), "omega_disc": (-3.0, 3.0),
             **{f"x_{jaw}": (-12e-3, 12e-3) for jaw in jaws},
             **{f"{jaw}_skin.normal": (0.0, 10.0) for jaw in jaws},
         },
-        goal=Goal("disc", {"theta": (-0.6, 0.6), "x": 0.0}, {"theta": 0.1, "x": 2e-3}),
-        begin=0.3, bounds={"disc.x": (-20e-3, 20e-3)}, held=["disc"],
-    )  # fmt: skip
+        "goal": Goal("disc", {"theta": (-0.6, 0.6), "x": 0.0}, {"theta": 0.1, "x": 2e-3}),
+        "begin": 0.3, "bounds": {"disc.x": (-20e-3, 20e-3)}, "held": ["disc"],
+    }  # fmt: skip
     return RigEnv(**stated | changes)
 
 

@@ -10,11 +10,12 @@ from torch import Tensor
 
 from torchsoft.display import suggestion
 from torchsoft.physics.arguments import positive, whole
-from torchsoft.physics.motion import Reference, Sampled
+from torchsoft.physics.motion import Lines, Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import BuiltRig
 from torchsoft.solve.adjoint import TAPE_BYTES, attached
+from torchsoft.solve.grid import check_knots
 from torchsoft.solve.simulate import RunOutcome, Task, prepare, run
 from torchsoft.solve.touch import Touch
 from torchsoft.solve.trajectory import Trajectory, channels, measurable
@@ -180,11 +181,8 @@ class Dynamics:
         end = self.start + (now.steps + 1) * self.interval
         t = torch.linspace(begin, end, self.samples + 1, dtype=torch.float64)
         before, after = (self._low + self._half * (1 + a) for a in (now.action, action))
-        rates, values = (after - before) / (end - begin), torch.stack((before, after), -1)
-        times = torch.tensor([begin, end], dtype=torch.float64)
-        reference = self._following(
-            Sampled(times, value, rate.expand(2)) for value, rate in zip(values, rates)
-        )
+        ends = torch.tensor([begin, end], dtype=torch.float64)
+        reference = self._following(Lines(ends, both) for both in torch.stack((before, after), -1))
         outcome = self._run(t, now.y, reference, knots)
         rows = attached([outcome.solved])[0]
         moment = Moment(rows.y[-1], action, now.steps + 1, now.target, rows.recorded[-1])
@@ -202,7 +200,7 @@ class Dynamics:
         """A short run that begins at a moment, whose first sample shows it."""
         t = self.start + now.steps * self.interval + torch.tensor([0.0, LOOK]).double()
         held = self._low + self._half * (1 + now.action)
-        reference = self._following(Sampled([0.0], value[None]) for value in held)
+        reference = self._following(Lines([0.0], value[None]) for value in held)
         with torch.no_grad():
             return self._run(t, now.y, reference).trajectory()
 
@@ -239,7 +237,7 @@ class Dynamics:
                     "wrap the environment in gymnasium.wrappers.ClipAction"
                 )
 
-    def _following(self, set_by_action: Iterable[Sampled]) -> Reference:
+    def _following(self, set_by_action: Iterable[Lines]) -> Reference:
         """The rig's own reference with other signals where actions set them."""
         own = {name: self.rig.reference[name] for name in self.rig.signals}
         return Reference(**own | dict(zip(self.actions, set_by_action)))
@@ -248,7 +246,7 @@ class Dynamics:
         self, t: Tensor, y: Tensor, reference: Reference, knots: Tensor | None = None
     ) -> RunOutcome:
         stepper = self._stepper.following(reference)
-        stepper = stepper if knots is None else stepper.along(knots)
+        stepper = stepper if knots is None else stepper.along(check_knots(knots))
         task = Task(stepper, t, y, "discrete", (), None, False, ())
         return run(task, TAPE_BYTES, explained=False)
 

@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
-from math import inf
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -70,10 +69,10 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         if isinstance(self._file, RigFile):
             solver = self._file.solver.model_dump(exclude_none=True)
             solver = solver if solver.keys() - {"tolerance"} else solver | SOLVER
-        self._how: dict[str, Any] = dict(
-            actions=actions, observations=observations, interval=interval, goal=goal,
-            reward=reward, begin=begin, samples=samples, solver=solver,
-        )  # fmt: skip
+        self._how: dict[str, Any] = {
+            "actions": actions, "observations": observations, "interval": interval, "goal": goal,
+            "reward": reward, "begin": begin, "samples": samples, "solver": solver,
+        }  # fmt: skip
         self.dynamics = Dynamics(built, **self._how)
         left = float(built.t[-1]) - begin if duration is None else duration
         self.limit = round(left / interval)

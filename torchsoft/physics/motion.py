@@ -147,6 +147,14 @@ class Profile(Piecewise):
         )
 
 
+class Lines(Piecewise):
+    """A signal on straight lines from value to value, whose rate jumps at the knots."""
+
+    def control(self) -> Tensor:
+        """Control points of every piece (k - 1, 2): its ends."""
+        return torch.stack((self.values[:-1], self.values[1:]), -1)
+
+
 class Wave(NamedTuple):
     """Amplitudes [m], frequencies [Hz], sweeps [Hz/s] and phases [rad], each (components,)."""
 
