@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchsoft.display import suggestion
-from torchsoft.physics.arguments import positive, whole
+from torchsoft.physics.arguments import number, positive, whole
 from torchsoft.physics.motion import Lines, Reference
 from torchsoft.physics.parts import COORDINATES
 from torchsoft.physics.rig import Rig
@@ -102,12 +102,14 @@ class Dynamics:
                 f"`interval` must be at least {SHORTEST:g} s, but is {interval:g} s; every control "
                 "interval is a run of its own"
             )
-        self.start = float(begin)
+        self.start = number("begin", begin)
         if not 0 <= self.start < float("inf"):
             raise ValueError(f"`begin` must be a time from 0 s on, but is {begin} s")
         if (goal is None) == (reward is None):
             raise ValueError("give either a `goal` or a `reward`, which each make the reward")
         rig = self.rig
+        if not actions:
+            raise ValueError(f"`actions` is empty; name signals of {', '.join(rig.signals)}")
         self.actions = checked("actions", actions, rig.signals, "signals are")
         self._low, self._half = limits(self.actions)
         at = dict(zip(measurable(rig), rig.layout.rigid))
@@ -187,9 +189,10 @@ class Dynamics:
         rows = attached([outcome.solved])[0]
         moment = Moment(rows.y[-1], action, now.steps + 1, now.target, rows.recorded[-1])
         if self.reward is not None:
-            value = torch.as_tensor(
-                self.reward(outcome.trajectory(rows), action), dtype=torch.float64
-            )
+            given = self.reward(outcome.trajectory(rows), action)
+            value = torch.as_tensor(given, dtype=torch.float64)
+            if value.ndim or not bool(value.isfinite()):
+                raise ValueError(f"`reward` must give one finite number, but gives {given!r}")
         else:
             assert self.goal is not None
             value = 1 / (1 + self.distance(moment).square().sum())

@@ -1,5 +1,6 @@
 """A rig file as an environment of gymnasium."""
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,10 +15,11 @@ from torch import Tensor
 
 from torchsoft.display import suggestion
 from torchsoft.envs.dynamics import Dynamics, Goal, Moment, Ranges, Reward, checked
+from torchsoft.physics.arguments import number
 from torchsoft.physics.rig import Rig
 from torchsoft.physics.statics import BuiltRig
 from torchsoft.rigs.build import RigFile
-from torchsoft.rigs.places import place, replaced
+from torchsoft.rigs.places import replaced
 from torchsoft.solve.progress import SimulationFailed
 
 Mode = Literal["rgb_array", "human"]
@@ -64,7 +66,15 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         parameters: Ranges | None = None, samples: int = 1, render_mode: Mode | None = None,
     ) -> None:  # fmt: skip
         self._file = RigFile.from_toml(rig) if isinstance(rig, str | Path) else rig
-        self.parameters, self.lost = self._checked_parameters(parameters or {}), float(lost)
+        if not isinstance(self._file, RigFile | BuiltRig):
+            raise ValueError(
+                "`rig` must be a rig file, its path, or a rig with its start (`BuiltRig`), but is "
+                f"{type(rig).__name__}"
+            )
+        self.parameters, self.lost = (
+            self._checked_parameters(parameters or {}),
+            number("lost", lost),
+        )
         built, solver = self._built({}), SOLVER
         if isinstance(self._file, RigFile):
             solver = self._file.solver.model_dump(exclude_none=True)
@@ -74,11 +84,13 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             "reward": reward, "begin": begin, "samples": samples, "solver": solver,
         }  # fmt: skip
         self.dynamics = Dynamics(built, **self._how)
-        left = float(built.t[-1]) - begin if duration is None else duration
-        self.limit = round(left / interval)
+        left = float(built.t[-1]) - begin if duration is None else number("duration", duration)
+        self.limit = int(left / interval + 1e-9) if math.isfinite(left) else 0
         if self.limit < 1 or (duration is not None and abs(self.limit * interval - left) > 1e-9):
+            rest = "" if duration is not None else ", the rest of the run after `begin`"
             raise ValueError(
                 f"`duration` must be a multiple of `interval` = {interval:g} s, but is {left:g} s"
+                f"{rest}"
             )
         free = self.dynamics.coordinates
         self.bounds = checked("bounds", bounds or {}, free, "free are")
@@ -96,13 +108,16 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._over = False
 
     def _checked_parameters(self, ranges: Ranges) -> Ranges:
-        if ranges and not isinstance(self._file, RigFile):
+        file = self._file
+        if ranges and not isinstance(file, RigFile):
             raise ValueError("`parameters` are numbers of a rig file; give the file as `rig`")
-        for name in ranges:
-            found = place(self._file, name)  # pyright: ignore[reportArgumentType]
-            if isinstance(found.value, dict | tuple | int) or hasattr(found.value, "model_fields"):
-                raise ValueError(f"`parameters` names `{name}`, which is no number that may vary")
-        return checked("parameters", ranges, ranges, "")
+        for name, ends in checked("parameters", ranges, ranges, "").items():
+            for end in ends:
+                try:
+                    replaced(file, {name: float(end)})  # pyright: ignore[reportArgumentType]
+                except ValueError as error:
+                    raise ValueError(f"`parameters[{name!r}]` = {end:g}: {error}") from None
+        return dict(ranges)
 
     def _checked_held(self, held: Sequence[str]) -> dict[str, list[slice]]:
         """The recorded forces of the contacts of each body that is to be held."""
