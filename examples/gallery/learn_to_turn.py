@@ -12,10 +12,9 @@ import matplotlib.pyplot as plt
 import torch
 from torch import nn
 
-import torchsoft.envs
-
 torch.manual_seed(0)
-env = gymnasium.make("torchsoft/Reorient-v0", render_mode="rgb_array").unwrapped
+env = gymnasium.make("torchsoft.envs:torchsoft/Reorient-v0", render_mode="rgb_array")
+env = env.unwrapped  # its step is also one in torch
 dynamics, (seen,), (actions,) = env.dynamics, env.observation_space.shape, env.action_space.shape
 policy = nn.Sequential(nn.Linear(seen, 30), nn.Tanh(), nn.Linear(30, actions), nn.Tanh()).double()
 
