@@ -88,15 +88,13 @@ def test_any_channel_is_observed() -> None:
         seen.append(run)
         return float(run["theta_disc"][-1]) - float(action[0])
 
-    env = small(
-        observations=dict.fromkeys(("lower_x", "F_grip", "lower_x_dot", "y_upper"), (-1.0, 1.0)),
-        goal=None, reward=reward, samples=5,
-    )  # fmt: skip
+    names = ("lower_x", "upper.force_y", "F_grip", "lower_skin.centre", "y_upper", "lower_x_dot")
+    ranges = dict.fromkeys(names, (-1.0, 1.0))
+    env = small(observations=ranges, goal=None, reward=reward, samples=5)
     env.reset(seed=0)
     observation, given, *_ = env.step(TURN)
     (run,) = seen
     assert len(run.t) == 6
-    names = ("lower_x", "F_grip", "lower_x_dot", "y_upper")
     assert observation == pytest.approx([*(float(run[k][-1]) for k in names), *TURN], rel=1e-6)
     assert run["lower_x"].diff(n=2).abs().max() < 1e-15
     assert given == pytest.approx(float(run["theta_disc"][-1]) - 0.4, rel=1e-6)

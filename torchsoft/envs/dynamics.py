@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import torch
+from scipy import sparse
 from torch import Tensor
 
 from torchsoft.display import suggestion
@@ -112,32 +113,33 @@ class Dynamics:
             raise ValueError(f"`actions` is empty; name signals of {', '.join(rig.signals)}")
         self.actions = checked("actions", actions, rig.signals, "signals are")
         self._low, self._half = limits(self.actions)
-        at = dict(zip(measurable(rig), rig.layout.rigid))
-        names = (f"{b}.{COORDINATES[i]}" for b, axes in rig.layout.free.items() for i in axes)
+        free = ((body, i) for body, axes in rig.layout.free.items() for i in axes)
+        names = (f"{body}.{COORDINATES[i]}" for body, i in free)
         self.coordinates = dict(zip(names, rig.layout.rigid))
-        self._touch = Touch(rig)
+        self._set_observed(observations)
+        self._set_goal()
+        self.size = len(self._order) + len(self._goal_at) + len(self.actions)
+        self._read()
+
+    def _set_observed(self, ranges: Ranges) -> None:
+        """Channels by where they are read: in the state, as sums of forces, each by itself."""
+        rig, self._touch = self.rig, Touch(self.rig)
+        at = dict(zip(measurable(rig), rig.layout.rigid))
         with torch.no_grad():
             signals = rig.follow(0.0)
             every = list(channels(rig, rig.unpack(self._y0, signals), signals))
-        spread = {
-            one: span for name, span in observations.items() for one in self._touch.expanded([name])
-        }
+        spread = {one: x for name, x in ranges.items() for one in self._touch.expanded([name])}
         checked("observations", spread, [*every, *self._touch], "channels are")
-        self.observed = tuple(spread)
         self._origin, self._span = limits(spread)
-        self._state = [(i, at[name]) for i, name in enumerate(spread) if name in at]
-        self._felt = [
-            (i, self._touch[name])
-            for i, name in enumerate(spread)
-            if name not in at and name in self._touch
-        ]
-        known = {i for i, _ in (*self._state, *self._felt)}
-        self._other = [(i, name) for i, name in enumerate(spread) if i not in known]
-        order = [i for part in (self._state, self._felt, self._other) for i, _ in part]
-        self._order = torch.tensor(order, dtype=torch.long).argsort()
-        self._set_goal()
-        self.size = len(spread) + len(self._goal_at) + len(self.actions)
-        self._read()
+        state = [name for name in spread if name in at]
+        felt = [name for name in spread if name in self._touch and self._touch[name].over is None]
+        self._other = [name for name in spread if name not in (*state, *felt)]
+        self._state = [at[name] for name in state]
+        start, places, weight = self._touch.sums(felt)
+        sums = sparse.csr_array((weight, places, start), (len(felt), places.max(initial=0) + 1))
+        self._sums = torch.from_numpy(sums.toarray())
+        order = [*state, *felt, *self._other]
+        self._order = [order.index(name) for name in spread]
 
     def _set_goal(self) -> None:
         goal, free = self.goal, self.coordinates
@@ -214,13 +216,14 @@ class Dynamics:
     def observe(self, now: Moment, reference: Reference | None = None) -> Tensor:
         """The observation (n,) of a moment, which `reference` led to, by default the rig's own."""
         y, rig = now.y, self.rig
-        parts = [y[[k for _, k in self._state]]]
-        parts += [felt.value(now.recorded[None]) for _, felt in self._felt]
+        parts = [y[self._state], self._sums @ now.recorded[: self._sums.shape[1]]]
         if self._other:
-            time = self.start + now.steps * self.interval
-            signals = rig.follow(time, reference)
+            signals = rig.follow(self.start + now.steps * self.interval, reference)
             named = channels(rig, rig.unpack(y, signals), signals)
-            parts.append(torch.stack([named[name] for _, name in self._other]))
+            for name in self._other:
+                touch = name not in named
+                x = self._touch[name].value(now.recorded[None])[0] if touch else named[name]
+                parts.append(x[None])
         seen = (torch.cat(parts)[self._order] - self._origin) / self._span - 1
         return torch.cat((seen, self.distance(now), now.action))
 

@@ -110,7 +110,8 @@ def evaluate(pieces: Pieces, t: Tensor, order: int = 1) -> list[Tensor]:
         if left <= order:
             scale = perm(degree, left) / span[i] ** left * inside if left else 1.0
             out[left] = points.diff(left)[..., 0] * scale
-        points = before * points[..., :-1] + after * points[..., 1:]
+        if left:
+            points = before * points[..., :-1] + after * points[..., 1:]
     return out
 
 
