@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 import torchsoft.envs
 from torchsoft import Trajectory, simulate
-from torchsoft.envs import Goal, RigEnv, RigVectorEnv, reorient
+from torchsoft.envs import Goal, Moment, RigEnv, RigVectorEnv, reorient
 from torchsoft.envs.rig_env import RedrawnStart
 from torchsoft.envs.view import View
 from torchsoft.physics.motion import Lines, Reference
@@ -205,6 +205,34 @@ def test_gradients_of_a_step(ready: RigEnv) -> None:
         assert float(slope @ way) == pytest.approx(expected, rel=1e-5)
 
 
+def test_parameters_are_read_at_the_begin() -> None:
+    """By torch and by gymnasium, with their gradient."""
+    env = small()
+    dynamics, E = env.dynamics, env.dynamics.rig.parameter("materials.rubber.E")
+    action, start, frozen = f64(0.2, -0.3, 0.1), dynamics.begin(), list[Tensor]()
+    start = Moment(*(x.detach() if isinstance(x, Tensor) else x for x in start))
+
+    def total(value: float) -> Tensor:
+        with torch.no_grad():
+            E.fill_(value)
+        dynamics.begin()
+        done = dynamics.step(start, action, frozen[0] if frozen else None)
+        frozen[:] = frozen or [done.knots]
+        return done.observation.sum()
+
+    total(0.5e6).backward()
+    expected = differs(lambda x: total(x.item()), f64(0.5e6)[0], f64(1.0)[0], 5.0)
+    assert E.grad.item() == pytest.approx(expected, rel=1e-4)
+    seen = []
+    for value in (0.5e6, 0.6e6, 0.5e6):
+        with torch.no_grad():
+            E.fill_(value)
+        env.reset(seed=0)
+        seen.append(env.step(TURN)[0])
+    assert np.array_equal(seen[0], seen[2])
+    assert not np.array_equal(seen[0], seen[1])
+
+
 def test_gradient_of_an_episode_by_a_policy(ready: RigEnv) -> None:
     dynamics = ready.dynamics
     torch.manual_seed(0)
@@ -302,10 +330,24 @@ def test_actions_are_checked(ready: RigEnv, action: list[float], sentence: str) 
         ready.step(np.array(action, np.float32))
 
 
-def test_a_window_is_needed_for_one() -> None:
+def test_human_needs_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    from matplotlib import pyplot
+
+    pyplot.switch_backend("agg")
     env = small(render_mode="human")
     with pytest.raises(ValueError, match="needs a window, which matplotlib's `agg` has not"):
         env.reset(seed=0)
+    shown: list[Any] = []
+    monkeypatch.setattr("matplotlib.get_backend", lambda: "tkagg")
+    for name in ("show", "pause"):
+        monkeypatch.setattr(pyplot, name, lambda *_, **how: shown.append(how))
+    env.reset(seed=0)
+    first = pyplot.gcf().images[0].get_array().copy()
+    env.step(TURN)
+    assert shown == [{"block": False}, {}, {}]
+    assert (pyplot.gcf().images[0].get_array() != first).any()
+    env.close()
+    assert pyplot.get_fignums() == []
 
 
 def test_pictures_follow_the_episode() -> None:

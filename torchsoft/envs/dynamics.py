@@ -119,7 +119,6 @@ class Dynamics:
         self._set_observed(observations)
         self._set_goal()
         self.size = len(self._order) + len(self._goal_at) + len(self.actions)
-        self._read()
 
     def _set_observed(self, ranges: Ranges) -> None:
         """Channels by where they are read: in the state, as sums of forces, each by itself."""
@@ -157,16 +156,11 @@ class Dynamics:
         scale = [positive(f"goal.scale[{x!r}]", goal.scale[x]) for x in wanted] if goal else []
         self._scale = torch.tensor(scale, dtype=torch.float64)
 
-    def _read(self) -> None:
-        """Read the parameters of the rig."""
+    def begin(self, target: Tensor | None = None) -> Moment:
+        """The moment at `begin`, after the rig's own motion. An episode has the parameters as they
+        are now, whose graph serves one backward pass. Raises `SimulationFailed`."""
         task = prepare(self.rig, [0.0, 1.0], y0=self._y0, **self.solver)
         self._stepper = task.stepper
-
-    def begin(self, target: Tensor | None = None) -> Moment:
-        """The moment at `begin`, after the rig's own motion, with the parameters as they are now;
-        to be called again after a backward pass. Raises `SimulationFailed`."""
-        if torch.is_grad_enabled():  # a graph of the parameters serves one backward pass
-            self._read()
         own, t = self.rig.reference, torch.tensor([0.0, self.start or LOOK], dtype=torch.float64)
         rows = attached([self._run(t, self._y0, own).solved])[0]
         there = -1 if self.start else 0

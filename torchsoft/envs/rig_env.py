@@ -104,6 +104,7 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self.action_space = Box(-1.0, 1.0, (len(actions),), np.float32)
         self.observation_space = Box(-most, most, (self.dynamics.size,), np.float32)
         self._begun: Moment | None = None
+        self._versions: list[int] = []
         self.moment: Moment | None = None
         self._over = False
 
@@ -144,8 +145,9 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """Begin an episode. `options` may give the "target" of the goal [m, rad] by coordinate."""
         super().reset(seed=seed)
-        if self.parameters or self._begun is None:
-            self._begun = self._drawn_start()
+        versions = [x._version for x in self.dynamics.rig.parameters()]
+        if self.parameters or self._begun is None or versions != self._versions:
+            self._begun, self._versions = self._drawn_start(), versions
         low, high = self.dynamics.targets.numpy().T
         target = torch.from_numpy(self.np_random.uniform(low, high))
         goal = self.dynamics.goal
@@ -166,7 +168,8 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             values = {k: float(self.np_random.uniform(*x)) for k, x in self.parameters.items()}
             try:
                 if values:
-                    self.dynamics, self._view = Dynamics(self._built(values), **self._how), None
+                    self.close()
+                    self.dynamics = Dynamics(self._built(values), **self._how)
                 start = self.dynamics.begin()
             except (SimulationFailed, ValueError, np.linalg.LinAlgError) as error:
                 said = ", ".join(f"{name} = {x:.4g}" for name, x in values.items())
