@@ -18,6 +18,7 @@ from torchsoft.physics.statics import BuiltRig
 from torchsoft.solve.adjoint import TAPE_BYTES, attached
 from torchsoft.solve.grid import check_knots
 from torchsoft.solve.simulate import RunOutcome, Task, prepare, run
+from torchsoft.solve.stepper import ImplicitStepper
 from torchsoft.solve.touch import Touch
 from torchsoft.solve.trajectory import Trajectory, channels, measurable
 
@@ -96,6 +97,7 @@ class Dynamics:
         solver: Mapping[str, Any],
     ) -> None:  # fmt: skip
         self.rig, self._y0, self.solver = built.rig, built.y0, dict(solver)
+        self._stepper: ImplicitStepper | None = None
         self.goal, self.reward = goal, reward
         self.interval, self.samples = positive("interval", interval), whole("samples", samples, 1)
         if self.interval < SHORTEST:
@@ -159,8 +161,7 @@ class Dynamics:
     def begin(self, target: Tensor | None = None) -> Moment:
         """The moment at `begin`, after the rig's own motion. An episode has the parameters as they
         are now, whose graph serves one backward pass. Raises `SimulationFailed`."""
-        task = prepare(self.rig, [0.0, 1.0], y0=self._y0, **self.solver)
-        self._stepper = task.stepper
+        self._stepper = prepare(self.rig, [0.0, 1.0], y0=self._y0, **self.solver).stepper
         own, t = self.rig.reference, torch.tensor([0.0, self.start or LOOK], dtype=torch.float64)
         rows = attached([self._run(t, self._y0, own).solved])[0]
         there = -1 if self.start else 0
@@ -245,6 +246,8 @@ class Dynamics:
     def _run(
         self, t: Tensor, y: Tensor, reference: Reference, knots: Tensor | None = None
     ) -> RunOutcome:
+        if self._stepper is None:
+            raise ValueError("the parameters have not been read; call `begin` first")
         stepper = self._stepper.following(reference)
         stepper = stepper if knots is None else stepper.along(check_knots(knots))
         task = Task(stepper, t, y, "discrete", (), None, False, ())
