@@ -1,5 +1,7 @@
 """Environments of rig files: gymnasium's contract, states handed on, gradients, refusals."""
 
+import importlib
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -328,6 +330,25 @@ def test_actions_are_checked(ready: RigEnv, action: list[float], sentence: str) 
     ready.reset(seed=0)
     with pytest.raises(ValueError, match=sentence):
         ready.step(np.array(action, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"taget": {}}, "`options` names `taget`; did you mean `target`"),
+        ({"target": {"y": 0.0}}, "`target` names `y`; the goal has theta, x"),
+        ({"target": {"x": np.inf}}, "`target` must be finite"),
+    ],
+)
+def test_options_are_checked(ready: RigEnv, options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
+        ready.reset(options=options)
+
+
+def test_gymnasium_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    with pytest.raises(ModuleNotFoundError, match=r"pip install 'torchsoft\[learn\]'"):
+        importlib.reload(torchsoft.envs)
 
 
 def test_human_needs_a_window(monkeypatch: pytest.MonkeyPatch) -> None:

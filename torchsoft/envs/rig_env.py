@@ -127,12 +127,8 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
             size = 2 * len(rig.pads[contact.pad].point_nodes)
             slices.setdefault(contact.body, []).append(slice(at, at + size, 2))
             at += size
-        for body in [held] if isinstance(held, str) else held:
-            if body not in slices:
-                raise ValueError(
-                    f"`held` names `{body}`; {suggestion(body, slices, 'bodies with contacts are')}"
-                )
-        return {body: slices[body] for body in ([held] if isinstance(held, str) else held)}
+        names = dict.fromkeys([held] if isinstance(held, str) else held, (0.0, 1.0))
+        return {body: slices[body] for body in checked("held", names, slices, "there are")}
 
     def _built(self, values: Mapping[str, float]) -> BuiltRig[Rig]:
         if isinstance(self._file, RigFile):
@@ -148,18 +144,25 @@ class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         versions = [x._version for x in self.dynamics.rig.parameters()]
         if self.parameters or self._begun is None or versions != self._versions:
             self._begun, self._versions = self._drawn_start(), versions
-        low, high = self.dynamics.targets.numpy().T
-        target = torch.from_numpy(self.np_random.uniform(low, high))
-        goal = self.dynamics.goal
-        for name, given in ((options or {}).get("target") or {}).items():
-            axes = list(goal.target) if goal else []
-            if name not in axes:
-                raise ValueError(f"`target` names `{name}`; {suggestion(name, axes, 'it has')}")
-            target[axes.index(name)] = float(given)
-        self.moment, self._over = self._begun._replace(target=target), False
+        self.moment, self._over = (
+            self._begun._replace(target=self._drawn_target(options or {})),
+            False,
+        )
         if self.render_mode == "human":
             self.render()
         return self._seen(self.dynamics.observe(self.moment)), self._info(self.moment)
+
+    def _drawn_target(self, options: Mapping[str, Any]) -> Tensor:
+        """The target of an episode, as far as it is not given."""
+        checked("options", dict.fromkeys(options, (0.0, 1.0)), ["target"], "known is")
+        goal, (low, high) = self.dynamics.goal, self.dynamics.targets.numpy().T
+        target, axes = self.np_random.uniform(low, high), list(goal.target) if goal else []
+        given = options.get("target") or {}
+        for name in checked("target", dict.fromkeys(given, (0.0, 1.0)), axes, "the goal has"):
+            target[axes.index(name)] = number("target", given[name])
+        if not np.isfinite(target).all():
+            raise ValueError(f"`target` must be finite, but is {given}")
+        return torch.from_numpy(target)
 
     def _drawn_start(self) -> Moment:
         """The begin with parameters drawn anew."""
