@@ -15,7 +15,7 @@ FLOWS = {
         channels display extras diagnostic files threads tables csvfile quantity codegen
         physics paper cost
         solve scenario excitation processes plan
-        plot materials rigs sysid reduced datasets experiment cli __main__
+        plot materials rigs sysid reduced datasets envs experiment cli __main__
     """,
     "codegen": "graph derivatives operations trace pointwise emit .",
     "physics": """
@@ -39,7 +39,7 @@ FLOWS = {
         columns configuration rig_recordings rehearsal measured rig_design figures report .
     """,
     "plan": "knots variables goals evaluation search planning .",
-    "rigs": "fields parts control motion geometry build course balance check written goal run .",
+    "rigs": "fields parts control motion geometry build places course balance check written goal run .",
     "cli": "results rigs plan identify design material plot .",
     "solve.kernel": """
         table arrays objects . invoke linear inertia interface stage step run adjoint tangent build
@@ -47,9 +47,9 @@ FLOWS = {
 }
 """For every folder with layers its modules and folders from the top down; "." is what the folder's
 own file imports."""
-APART = ("plot", "materials", "rigs", "sysid", "reduced", "datasets")
+APART = ("plot", "materials", "rigs", "sysid", "reduced", "datasets", "envs")
 """Folders over the engine; of these, only what is `SHARED` may be imported by another."""
-SHARED = ("plot", "materials.presets", "rigs.build", "rigs.fields")
+SHARED = ("plot", "materials.presets", "rigs.build", "rigs.fields", "rigs.places")
 LONGEST = 600
 """Lines; a file that grows past them holds more than one idea."""
 OUTSIDE = ("data_gen", "experiments", "examples")

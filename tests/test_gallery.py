@@ -44,6 +44,7 @@ ANSWERS: dict[str, Callable[[dict[str, Any]], bool]] = {
     ),
     "plan_a_motion": lambda n: abs(n["run"]["x_C"][-1].item() - 52.3e-3) < 1e-4,
     "train_a_policy": lambda n: n["loss"].item() < 0.05,
+    "learn_to_turn": lambda n: max(n["trained"]) < 0.1 < max(n["untrained"]),
     "reduced_model": lambda n: n["score"](n["reduced"], n["other"]).worst < 0.01,
     "energy": lambda n: n["run"].energy_residual_rel < 1e-4,
 }

@@ -9,6 +9,7 @@ from scipy.interpolate import CubicSpline
 from torch.autograd import gradcheck
 
 from torchsoft import Profile, Reference, Sampled, hold
+from torchsoft.physics.motion import Lines
 
 TIMES = [0.0, 0.4, 1.0, 1.5]
 VALUES = [0.06, 0.04, 0.05, 0.01]
@@ -39,6 +40,11 @@ def test_profile_goes_through_its_knots_and_stays_outside_them() -> None:
     value, rate = profile(f64(-1.0, *TIMES, 9.0))
     assert value.tolist() == pytest.approx([VALUES[0], *VALUES, VALUES[-1]], abs=1e-16)
     assert torch.equal(rate, torch.zeros_like(rate))
+
+
+def test_lines_interpolate() -> None:
+    signal, t = Lines(TIMES, VALUES), torch.linspace(-0.5, 2.0, 301, dtype=torch.float64)
+    np.testing.assert_allclose(signal(t)[0], np.interp(t, TIMES, VALUES), rtol=0, atol=1e-16)
 
 
 @pytest.mark.parametrize("knots", [2, 3, 4])
@@ -92,7 +98,7 @@ def test_one_knot_is_a_constant(signal: Profile) -> None:
     assert rate.tolist() == [0.0] * 3
 
 
-@pytest.mark.parametrize("kind", [Profile, Sampled])
+@pytest.mark.parametrize("kind", [Profile, Sampled, Lines])
 def test_signals_by_gradcheck(kind: type[Profile]) -> None:
     """By the values of the knots, and by time where the signal is smooth."""
     signal = kind([0.0, 0.4, 1.0], [0.06, 0.04, 0.05])

@@ -165,7 +165,7 @@ def test_messages_are_said() -> None:
 def test_the_api_is_documented() -> None:
     """Public names of the package, and of its namespaces for users, stand on a page of the API."""
     import torchsoft
-    from torchsoft import datasets, plan, reduced, rigs, sysid
+    from torchsoft import datasets, envs, plan, reduced, rigs, sysid
 
     text = "".join(
         page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "api").glob("*.md")
@@ -177,6 +177,7 @@ def test_the_api_is_documented() -> None:
         *dir(torchsoft),
         *datasets.__all__,
         *plan.__all__,
+        *envs.__all__,
         *rigs.__all__,
         *sysid.__all__,
         *reduced.__all__,

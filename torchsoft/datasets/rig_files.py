@@ -10,7 +10,7 @@ from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from tempfile import mkdtemp
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -32,11 +32,13 @@ from torchsoft.physics.energy import stores
 from torchsoft.physics.parts import COORDINATES, PD, Actuator
 from torchsoft.physics.rig import Rig
 from torchsoft.quantity import metadata, quantity
+from torchsoft.rigs import places
 from torchsoft.rigs.build import RigFile
 from torchsoft.rigs.fields import NumberOr
+from torchsoft.rigs.places import Place, replaced
 from torchsoft.solve.progress import Integrals
 from torchsoft.solve.trajectory import channels, units
-from torchsoft.tables import Table, line, read_toml, shown
+from torchsoft.tables import line, read_toml, shown
 
 NAMED = ("file", "network")
 """Fields of tables that name a file."""
@@ -93,69 +95,13 @@ def outputs_of(rig: Any) -> dict[str, Any]:
     return {name: x for name, x in named.items() if x is not None}
 
 
-class Place(NamedTuple):
-    """Where a name leads in a rig file: keys of its tables, the value there, and its field."""
-
-    keys: tuple[str | int, ...]
-    value: Any
-    field: FieldInfo
-
-
 def place(file: RigFile, name: str) -> Place:
-    """The place of a name such as "materials.silicone.E" or "motion.lift.values.2". Raises
-    `ValueError` for one that leads nowhere."""
-    at: Any = file
-    keys, left, field = list[str | int](), name.split("."), FieldInfo()
-    while left:
-        here = ".".join(map(str, keys)) or "the rig file"
-        if isinstance(at, Table):
-            known, n = list(type(at).model_fields), 1
-            key: str | int = left[0]
-            if key in known:
-                field, at = type(at).model_fields[key], getattr(at, key)
-        elif isinstance(at, Mapping):  # names of motions may have dots in them
-            known = list(at)
-            n = next((n for n in range(len(left), 0, -1) if ".".join(left[:n]) in at), 1)
-            key = ".".join(left[:n])
-            at = at.get(key)
-        elif isinstance(at, tuple):
-            known, n = [str(i) for i in range(len(at))], 1
-            key = int(left[0]) if left[0] in known else left[0]
-            at = at[key] if isinstance(key, int) else at
-        else:
-            known, n, key = [], 1, left[0]
-        if str(key) not in known:
-            there = ", ".join(known[:20]) + (", ..." if len(known) > 20 else "")
-            raise ValueError(
-                f"`{line(name, 80)}` is not in the rig file: {here} has {there or 'no parts'}"
-            )
-        keys, left = [*keys, key], left[n:]
-    if str(keys[0]) in OWN:
-        raise ValueError(
-            f"`{line(name, 80)}` has no part in a dataset, whose own {OWN[str(keys[0])]} decide it"
-        )
-    return Place(tuple(keys), at, field)
-
-
-def replaced(file: RigFile, values: Mapping[str, Any]) -> RigFile:
-    """The rig file with other values at the places of these names. Raises `ValueError`."""
-    tree, whole = (listed(file.model_dump(exclude_unset=some)) for some in (True, False))
-    for name, value in values.items():
-        *way, last = place(file, name).keys
-        node, full = tree, whole
-        for key in way:
-            if isinstance(node, dict) and key not in node:
-                node[key] = full[key]
-            node, full = node[key], full[key]
-        node[last] = value
-    return RigFile.from_tree(tree, file.folder)
-
-
-def listed(value: Any) -> Any:
-    """Tables and lists that can be changed."""
-    if isinstance(value, dict):
-        return {key: listed(x) for key, x in value.items()}
-    return [listed(x) for x in value] if isinstance(value, list | tuple) else value
+    """The place of a name in the rig file of a dataset. Raises `ValueError` for one that leads
+    nowhere, and for what the dataset decides."""
+    found = places.place(file, name)
+    if (own := OWN.get(str(found.keys[0]))) is not None:
+        raise ValueError(f"`{line(name, 80)}` has no part in a dataset, whose own {own} decide it")
+    return found
 
 
 class RigOfFile(Subject):
@@ -191,6 +137,7 @@ class RigOfFile(Subject):
             raise ValueError(f"rig: {error}") from None
         for name, value in config.fixed.items():
             try:
+                place(file, name)
                 file = replaced(file, {name: value})
             except ValueError as error:
                 raise ValueError(f"fixed.{line(name, 80)}: {error}") from None

@@ -17,7 +17,7 @@ from torchsoft.solve.kernel.arrays import Backward, room
 from torchsoft.solve.kernel.objects import call
 from torchsoft.solve.kernel.table import Array
 from torchsoft.solve.progress import Progress, Segment
-from torchsoft.solve.stepper import ImplicitStepper
+from torchsoft.solve.stepper import ImplicitStepper, stage_times
 from torchsoft.threads import others_turn, parallel_map
 
 TAPE_BYTES = 1e9
@@ -73,8 +73,9 @@ def attached(runs: Sequence[Solved], threads: int = 1) -> list[Rows]:
     inputs: list[Tensor] = []
     for run in wanted:
         stepper = run.stepper
-        at_stages = stepper.signals([segment.plan for segment in run.segments or []])
-        at_outputs = stepper.compiled.signals(run.t, stepper.reference)
+        times = [stage_times(segment.plan) for segment in run.segments or []]
+        signals = stepper.compiled.signals(torch.cat([*times, run.t]), stepper.reference)
+        at_stages, at_outputs = signals[: -len(run.t)], signals[-len(run.t) :]
         inputs += [run.y0, stepper.compiled.p, at_stages, at_outputs]
     flat = iter(_Solutions.apply(wanted, threads, *inputs) if wanted else ())
     solutions = map(Rows, flat, flat)
@@ -83,8 +84,8 @@ def attached(runs: Sequence[Solved], threads: int = 1) -> list[Rows]:
 
 def wants_gradient(stepper: ImplicitStepper, y0: Tensor) -> bool:
     """Whether anything that a run is made with requires a gradient."""
-    tensors = (y0, stepper.compiled.p, *stepper.reference.parameters(), stepper.signals_at_start)
-    return any(tensor.requires_grad for tensor in tensors)
+    tensors = (y0, stepper.compiled.p, *stepper.reference.parameters())
+    return any(x.requires_grad for x in tensors) or stepper.signals_at_start.requires_grad
 
 
 class _Solutions(torch.autograd.Function):

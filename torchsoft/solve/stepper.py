@@ -128,6 +128,12 @@ class ImplicitStepper:
         other.step, other.knots = None, knots
         return other
 
+    def following(self, reference: Reference) -> "ImplicitStepper":
+        """The same on another reference; the rig stays as it was read."""
+        other = copy(self)
+        other.reference = reference
+        return other
+
     def _call(
         self, s: Any, now: "Marching", outputs: Any, tape: Any, *, given: bool = True,
         follow: Any = NO_SIGNALS, errors: Any = NO_ERRORS, k: Array = NONE, clock: Array = START,

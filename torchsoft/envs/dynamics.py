@@ -1,0 +1,279 @@
+"""A rig under actions at a control rate, in torch: from a state and an action to the next state, an
+observation and a reward, with gradients through all of them."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from scipy import sparse
+from torch import Tensor
+
+from torchsoft.display import suggestion
+from torchsoft.physics.arguments import number, positive, whole
+from torchsoft.physics.motion import Lines, Reference
+from torchsoft.physics.parts import COORDINATES
+from torchsoft.physics.rig import Rig
+from torchsoft.physics.statics import BuiltRig
+from torchsoft.solve.adjoint import TAPE_BYTES, attached
+from torchsoft.solve.grid import check_knots
+from torchsoft.solve.simulate import RunOutcome, Task, prepare, run
+from torchsoft.solve.stepper import ImplicitStepper
+from torchsoft.solve.touch import Touch
+from torchsoft.solve.trajectory import Trajectory, channels, measurable
+
+Ranges = Mapping[str, tuple[float, float]]
+"""Low and high by name, in SI units."""
+
+Reward = Callable[[Trajectory, Tensor], Any]
+"""Reward of the run over one control interval and the action (actions,) at its end."""
+
+SHORTEST = 1e-4
+"""Control interval [s] at the least."""
+
+LOOK = 1e-3
+"""Length [s] of the run whose first sample shows a moment."""
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A pose of a body to be reached: the reward of a step is 1 / (1 + d^2), d^2 being the sum of
+    the squares of the distances of its coordinates over their `scale` [m, rad], less `changes`
+    times the sum of the squared changes of the action.
+
+    target: by coordinate ("x", "y", "theta"), a number [m, rad], or a low and a high between which
+    each episode draws one.
+    """
+
+    body: str
+    target: Mapping[str, float | tuple[float, float]]
+    scale: Mapping[str, float]
+    changes: float = 0.01
+
+
+class Moment(NamedTuple):
+    """Everything that the next step starts from: the state y (size,), the action (actions,) that
+    was reached, the control intervals since the begin, and the target (coordinates,) [m, rad] of
+    the goal; and the forces recorded there (recorded,), which observations read."""
+
+    y: Tensor
+    action: Tensor
+    steps: int
+    target: Tensor
+    recorded: Tensor
+
+
+class Transition(NamedTuple):
+    """What an action led to: the next moment, the observation (n,) and the reward (), both float64
+    with their graph, and the run between."""
+
+    moment: Moment
+    observation: Tensor
+    reward: Tensor
+    outcome: RunOutcome
+
+    @property
+    def knots(self) -> Tensor:
+        """Steps that were taken [s], to be frozen in another run."""
+        return torch.from_numpy(self.outcome.solved.out.knots)
+
+
+class Dynamics:
+    """A built rig under actions. `actions` are the ranges of the signals of the reference that an
+    action in [-1, 1] sets, `observations` those of channels, by which they are scaled to [-1, 1]
+    (not clipped); an array of touch such as "skin.normal" stands for all of its channels.
+
+    An observation holds the channels, then the distances to the goal over their scales, then the
+    action that was reached. Between two control times, `interval` [s] apart, a signal goes linearly
+    from one action to the next. Until `begin` [s] the rig follows its own motion, and all other
+    signals always do. `samples` are the outputs of the run that a reward of one's own is given.
+
+    Raises `ValueError` naming the field.
+    """
+
+    def __init__(
+        self, built: BuiltRig[Rig], *, actions: Ranges, observations: Ranges, interval: float,
+        goal: Goal | None, reward: Reward | None, begin: float, samples: int,
+        solver: Mapping[str, Any],
+    ) -> None:  # fmt: skip
+        self.rig, self._y0, self.solver = built.rig, built.y0, dict(solver)
+        self._stepper: ImplicitStepper | None = None
+        self.goal, self.reward = goal, reward
+        self.interval, self.samples = positive("interval", interval), whole("samples", samples, 1)
+        if self.interval < SHORTEST:
+            raise ValueError(
+                f"`interval` must be at least {SHORTEST:g} s, but is {interval:g} s; every control "
+                "interval is a run of its own"
+            )
+        self.start = number("begin", begin)
+        if not 0 <= self.start < float("inf"):
+            raise ValueError(f"`begin` must be a time from 0 s on, but is {begin} s")
+        if (goal is None) == (reward is None):
+            raise ValueError("give either a `goal` or a `reward`, which each make the reward")
+        rig = self.rig
+        if not actions:
+            raise ValueError(f"`actions` is empty; name signals of {', '.join(rig.signals)}")
+        self.actions = checked("actions", actions, rig.signals, "signals are")
+        self._low, self._half = limits(self.actions)
+        free = ((body, i) for body, axes in rig.layout.free.items() for i in axes)
+        names = (f"{body}.{COORDINATES[i]}" for body, i in free)
+        self.coordinates = dict(zip(names, rig.layout.rigid))
+        self._set_observed(observations)
+        self._set_goal()
+        self.size = len(self._order) + len(self._goal_at) + len(self.actions)
+
+    def _set_observed(self, ranges: Ranges) -> None:
+        """Channels by where they are read: in the state, as sums of forces, each by itself."""
+        rig, self._touch = self.rig, Touch(self.rig)
+        at = dict(zip(measurable(rig), rig.layout.rigid))
+        with torch.no_grad():
+            signals = rig.follow(0.0)
+            every = list(channels(rig, rig.unpack(self._y0, signals), signals))
+        spread = {one: x for name, x in ranges.items() for one in self._touch.expanded([name])}
+        checked("observations", spread, [*every, *self._touch], "channels are")
+        self._origin, self._span = limits(spread)
+        state = [name for name in spread if name in at]
+        felt = [name for name in spread if name in self._touch and self._touch[name].over is None]
+        self._other = [name for name in spread if name not in (*state, *felt)]
+        self._state = [at[name] for name in state]
+        start, places, weight = self._touch.sums(felt)
+        sums = sparse.csr_array((weight, places, start), (len(felt), places.max(initial=0) + 1))
+        self._sums = torch.from_numpy(sums.toarray())
+        order = [*state, *felt, *self._other]
+        self._order = [order.index(name) for name in spread]
+
+    def _set_goal(self) -> None:
+        goal, free = self.goal, self.coordinates
+        wanted = dict(goal.target) if goal else {}
+        body = goal.body if goal else ""
+        checked("goal.target", {f"{body}.{x}": (0.0, 1.0) for x in wanted}, free, "free are")
+        if goal and wanted.keys() != goal.scale.keys():
+            raise ValueError(
+                f"`goal.scale` must have the coordinates of `goal.target`, {', '.join(wanted)}, "
+                f"but has {', '.join(goal.scale) or 'none'}"
+            )
+        self._goal_at = [free[f"{body}.{axis}"] for axis in wanted]
+        ends = [x if isinstance(x, tuple) else (x, x) for x in wanted.values()]
+        self.targets = torch.tensor(ends, dtype=torch.float64).reshape(-1, 2)
+        scale = [positive(f"goal.scale[{x!r}]", goal.scale[x]) for x in wanted] if goal else []
+        self._scale = torch.tensor(scale, dtype=torch.float64)
+
+    def begin(self, target: Tensor | None = None) -> Moment:
+        """The moment at `begin`, after the rig's own motion. An episode has the parameters as they
+        are now, whose graph serves one backward pass. Raises `SimulationFailed`."""
+        self._stepper = prepare(self.rig, [0.0, 1.0], y0=self._y0, **self.solver).stepper
+        own, t = self.rig.reference, torch.tensor([0.0, self.start or LOOK], dtype=torch.float64)
+        rows = attached([self._run(t, self._y0, own).solved])[0]
+        there = -1 if self.start else 0
+        with torch.no_grad():
+            now = own(torch.tensor(self.start, dtype=torch.float64), list(self.actions))[:, 0]
+        target = self.targets.mean(1) if target is None else target
+        reached = (now - self._low) / self._half - 1
+        return Moment(rows.y[there], reached, 0, target, rows.recorded[there])
+
+    def step(self, now: Moment, action: Tensor, knots: Tensor | None = None) -> Transition:
+        """From a moment to the next control time, with an action (actions,) in [-1, 1]; `knots` are
+        the steps of another run, frozen. Under `torch.no_grad()` without any graph. Raises
+        `ValueError` for an action outside, and `SimulationFailed`."""
+        self.check_action(action)
+        begin = self.start + now.steps * self.interval
+        end = self.start + (now.steps + 1) * self.interval
+        t = torch.linspace(begin, end, self.samples + 1, dtype=torch.float64)
+        before, after = (self._low + self._half * (1 + a) for a in (now.action, action))
+        ends = torch.tensor([begin, end], dtype=torch.float64)
+        reference = self._following(Lines(ends, both) for both in torch.stack((before, after), -1))
+        outcome = self._run(t, now.y, reference, knots)
+        rows = attached([outcome.solved])[0]
+        moment = Moment(rows.y[-1], action, now.steps + 1, now.target, rows.recorded[-1])
+        if self.reward is not None:
+            given = self.reward(outcome.trajectory(rows), action)
+            value = torch.as_tensor(given, dtype=torch.float64)
+            if value.ndim or not bool(value.isfinite()):
+                raise ValueError(f"`reward` must give one finite number, but gives {given!r}")
+        else:
+            assert self.goal is not None
+            value = 1 / (1 + self.distance(moment).square().sum())
+            value = value - self.goal.changes * (action - now.action).square().sum()
+        return Transition(moment, self.observe(moment, reference), value, outcome)
+
+    def look(self, now: Moment) -> Trajectory:
+        """A short run that begins at a moment, whose first sample shows it."""
+        t = self.start + now.steps * self.interval + torch.tensor([0.0, LOOK]).double()
+        held = self._low + self._half * (1 + now.action)
+        reference = self._following(Lines([0.0], value[None]) for value in held)
+        with torch.no_grad():
+            return self._run(t, now.y, reference).trajectory()
+
+    def distance(self, now: Moment) -> Tensor:
+        """Distances of the goal's coordinates to their targets, over their scales."""
+        return (now.target - now.y[self._goal_at]) / self._scale
+
+    def observe(self, now: Moment, reference: Reference | None = None) -> Tensor:
+        """The observation (n,) of a moment, which `reference` led to, by default the rig's own."""
+        y, rig = now.y, self.rig
+        parts = [y[self._state], self._sums @ now.recorded[: self._sums.shape[1]]]
+        if self._other:
+            signals = rig.follow(self.start + now.steps * self.interval, reference)
+            named = channels(rig, rig.unpack(y, signals), signals)
+            for name in self._other:
+                touch = name not in named
+                x = self._touch[name].value(now.recorded[None])[0] if touch else named[name]
+                parts.append(x[None])
+        seen = (torch.cat(parts)[self._order] - self._origin) / self._span - 1
+        return torch.cat((seen, self.distance(now), now.action))
+
+    def check_action(self, action: Tensor) -> None:
+        """Raises `ValueError` for an action of another shape, one that is not finite and one
+        outside of [-1, 1]."""
+        names = list(self.actions)
+        if action.shape != (len(names),):
+            raise ValueError(
+                f"`action` must hold {len(names)} numbers, for {', '.join(names)}, but has shape "
+                f"{tuple(action.shape)}"
+            )
+        for name, value in zip(names, action.tolist()):
+            if not abs(value) <= 1 + 1e-6:
+                raise ValueError(
+                    f"`action` sets `{name}` to {value:g}, but must be from -1 to 1; clip it, or "
+                    "wrap the environment in gymnasium.wrappers.ClipAction"
+                )
+
+    def _following(self, set_by_action: Iterable[Lines]) -> Reference:
+        """The rig's own reference with other signals where actions set them."""
+        own = {name: self.rig.reference[name] for name in self.rig.signals}
+        return Reference(**own | dict(zip(self.actions, set_by_action)))
+
+    def _run(
+        self, t: Tensor, y: Tensor, reference: Reference, knots: Tensor | None = None
+    ) -> RunOutcome:
+        if self._stepper is None:
+            raise ValueError("the parameters have not been read; call `begin` first")
+        stepper = self._stepper.following(reference)
+        stepper = stepper if knots is None else stepper.along(check_knots(knots))
+        task = Task(stepper, t, y, "discrete", (), None, False, ())
+        return run(task, TAPE_BYTES, explained=False)
+
+
+def checked(field: str, ranges: Ranges, known: Iterable[str], listed: str) -> Ranges:
+    """Ranges as they are. Raises `ValueError` for a name that is not known, and a range that is
+    none."""
+    names = list(known)
+    for name, given in ranges.items():
+        if name not in names:
+            raise ValueError(f"`{field}` names `{name}`; {suggestion(name, names, listed)}")
+        try:
+            low, high = map(float, given)
+        except (TypeError, ValueError):
+            low, high = 0.0, 0.0
+        if not -float("inf") < low < high < float("inf"):
+            raise ValueError(
+                f"`{field}[{name!r}]` must be a pair of finite numbers, low and high, but is "
+                f"{given!r}"
+            )
+    return dict(ranges)
+
+
+def limits(ranges: Ranges) -> tuple[Tensor, Tensor]:
+    """Low ends (n,) and half widths (n,)."""
+    ends = torch.tensor([tuple(x) for x in ranges.values()], dtype=torch.float64).reshape(-1, 2)
+    return ends[:, 0], 0.5 * (ends[:, 1] - ends[:, 0])

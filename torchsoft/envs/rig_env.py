@@ -1,0 +1,253 @@
+"""A rig file as an environment of gymnasium."""
+
+import math
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import gymnasium
+import numpy as np
+import torch
+from gymnasium.spaces import Box
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchsoft.display import suggestion
+from torchsoft.envs.dynamics import Dynamics, Goal, Moment, Ranges, Reward, checked
+from torchsoft.physics.arguments import number
+from torchsoft.physics.rig import Rig
+from torchsoft.physics.statics import BuiltRig
+from torchsoft.rigs.build import RigFile
+from torchsoft.rigs.places import replaced
+from torchsoft.solve.progress import SimulationFailed
+
+Mode = Literal["rgb_array", "human"]
+
+FRAMES_PER_SECOND = 10
+
+DRAWS = 10
+"""Draws of parameters that are tried for one episode."""
+
+SOLVER = {"rtol": 1e-3}
+"""How steps are chosen where a rig file leaves it open."""
+
+
+class RedrawnStart(UserWarning):
+    """An episode began with other parameters than those first drawn, which no start exists for."""
+
+
+class RigEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
+    """The rig of a file, or one built in Python, under actions at a control rate.
+
+    What `actions`, `observations`, `interval`, `goal`, `reward`, `begin` and `samples` are,
+    `torchsoft.envs.dynamics.Dynamics` says; `env.dynamics` and `env.moment` are the environment in
+    torch, with gradients.
+
+    duration: time limit [s] after `begin`, a multiple of `interval`; by default the rest of the
+    file's. bounds: by coordinate such as "disc.y", beyond which an episode terminates [m, rad].
+    held: bodies that terminate it when no contact touches them at a control time. lost: what the
+    reward of such an end, and of a failed run, is. parameters: ranges between which each episode
+    draws numbers of the rig file by name, such as "materials.rubber.E" [Pa] or
+    "bodies.disc.start.x" [m]; the rig is then built anew each time, which takes some tenths of a
+    second.
+
+    `info` has the time [s], and "ended" or, where the simulation failed, "failure", as a sentence.
+    Raises `ValueError` naming the field and the remedy.
+    """
+
+    metadata = {"render_modes": list(get_args(Mode)), "render_fps": FRAMES_PER_SECOND}  # noqa: RUF012
+
+    def __init__(
+        self, rig: RigFile | BuiltRig[Rig] | str | Path, *, actions: Ranges,
+        observations: Ranges, interval: float = 0.1, goal: Goal | None = None,
+        reward: Reward | None = None, begin: float = 0.0, duration: float | None = None,
+        bounds: Ranges | None = None, held: Sequence[str] = (), lost: float = -1.0,
+        parameters: Ranges | None = None, samples: int = 1, render_mode: Mode | None = None,
+    ) -> None:  # fmt: skip
+        self._file = RigFile.from_toml(rig) if isinstance(rig, str | Path) else rig
+        if not isinstance(self._file, RigFile | BuiltRig):
+            raise ValueError(
+                "`rig` must be a rig file, its path, or a rig with its start (`BuiltRig`), but is "
+                f"{type(rig).__name__}"
+            )
+        self.parameters, self.lost = (
+            self._checked_parameters(parameters or {}),
+            number("lost", lost),
+        )
+        built, solver = self._built({}), SOLVER
+        if isinstance(self._file, RigFile):
+            solver = self._file.solver.model_dump(exclude_none=True)
+            solver = solver if solver.keys() - {"tolerance"} else solver | SOLVER
+        self._how: dict[str, Any] = {
+            "actions": actions, "observations": observations, "interval": interval, "goal": goal,
+            "reward": reward, "begin": begin, "samples": samples, "solver": solver,
+        }  # fmt: skip
+        self.dynamics = Dynamics(built, **self._how)
+        left = float(built.t[-1]) - begin if duration is None else number("duration", duration)
+        self.limit = int(left / interval + 1e-9) if math.isfinite(left) else 0
+        if self.limit < 1 or (duration is not None and abs(self.limit * interval - left) > 1e-9):
+            rest = "" if duration is not None else ", the rest of the run after `begin`"
+            raise ValueError(
+                f"`duration` must be a multiple of `interval` = {interval:g} s, but is {left:g} s"
+                f"{rest}"
+            )
+        free = self.dynamics.coordinates
+        self.bounds = checked("bounds", bounds or {}, free, "free are")
+        self.held = self._checked_held(held)
+        if render_mode is not None and render_mode not in get_args(Mode):
+            raise ValueError(
+                f"`render_mode` is {render_mode!r}; {suggestion(render_mode, get_args(Mode))}"
+            )
+        self.render_mode, self._view = render_mode, None
+        most = float(np.finfo(np.float32).max)
+        self.action_space = Box(-1.0, 1.0, (len(actions),), np.float32)
+        self.observation_space = Box(-most, most, (self.dynamics.size,), np.float32)
+        self._begun: Moment | None = None
+        self._versions: list[int] = []
+        self.moment: Moment | None = None
+        self._over = False
+
+    def _checked_parameters(self, ranges: Ranges) -> Ranges:
+        file = self._file
+        if ranges and not isinstance(file, RigFile):
+            raise ValueError("`parameters` are numbers of a rig file; give the file as `rig`")
+        for name, ends in checked("parameters", ranges, ranges, "").items():
+            for end in ends:
+                try:
+                    replaced(file, {name: float(end)})  # pyright: ignore[reportArgumentType]
+                except ValueError as error:
+                    raise ValueError(f"`parameters[{name!r}]` = {end:g}: {error}") from None
+        return dict(ranges)
+
+    def _checked_held(self, held: Sequence[str]) -> dict[str, list[slice]]:
+        """The recorded forces of the contacts of each body that is to be held."""
+        rig, at, slices = self.dynamics.rig, 0, dict[str, list[slice]]()
+        for contact in rig.contacts.values():
+            size = 2 * len(rig.pads[contact.pad].point_nodes)
+            slices.setdefault(contact.body, []).append(slice(at, at + size, 2))
+            at += size
+        names = dict.fromkeys([held] if isinstance(held, str) else held, (0.0, 1.0))
+        return {body: slices[body] for body in checked("held", names, slices, "there are")}
+
+    def _built(self, values: Mapping[str, float]) -> BuiltRig[Rig]:
+        if isinstance(self._file, RigFile):
+            return (replaced(self._file, values) if values else self._file).build()
+        return self._file
+
+    @torch.no_grad()
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.float32], dict[str, Any]]:
+        """Begin an episode. `options` may give the "target" of the goal [m, rad] by coordinate."""
+        super().reset(seed=seed)
+        versions = [x._version for x in self.dynamics.rig.parameters()]
+        if self.parameters or self._begun is None or versions != self._versions:
+            self._begun, self._versions = self._drawn_start(), versions
+        self.moment, self._over = (
+            self._begun._replace(target=self._drawn_target(options or {})),
+            False,
+        )
+        if self.render_mode == "human":
+            self.render()
+        return self._seen(self.dynamics.observe(self.moment)), self._info(self.moment)
+
+    def _drawn_target(self, options: Mapping[str, Any]) -> Tensor:
+        """The target of an episode, as far as it is not given."""
+        checked("options", dict.fromkeys(options, (0.0, 1.0)), ["target"], "known is")
+        goal, (low, high) = self.dynamics.goal, self.dynamics.targets.numpy().T
+        target, axes = self.np_random.uniform(low, high), list(goal.target) if goal else []
+        given = options.get("target") or {}
+        for name in checked("target", dict.fromkeys(given, (0.0, 1.0)), axes, "the goal has"):
+            target[axes.index(name)] = number("target", given[name])
+        if not np.isfinite(target).all():
+            raise ValueError(f"`target` must be finite, but is {given}")
+        return torch.from_numpy(target)
+
+    def _drawn_start(self) -> Moment:
+        """The begin with parameters drawn anew."""
+        why = ""
+        for _ in range(DRAWS):
+            values = {k: float(self.np_random.uniform(*x)) for k, x in self.parameters.items()}
+            try:
+                if values:
+                    self.close()
+                    self.dynamics = Dynamics(self._built(values), **self._how)
+                start = self.dynamics.begin()
+            except (SimulationFailed, ValueError, np.linalg.LinAlgError) as error:
+                said = ", ".join(f"{name} = {x:.4g}" for name, x in values.items())
+                why = f"no episode begins with {said or 'this rig'}: {error}"
+                if not values:
+                    raise ValueError(f"{why}; see `begin`") from None
+                continue
+            if why:
+                warnings.warn(f"{why}; others were drawn", RedrawnStart, stacklevel=3)
+            return start
+        raise ValueError(f"{why}; narrow the ranges of `parameters`")
+
+    @torch.no_grad()
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
+        """Carry out an action over one control interval. Raises `ValueError` for one that is not
+        finite or outside of [-1, 1], and before `reset`."""
+        now, dynamics = self.moment, self.dynamics
+        if now is None or self._over:
+            raise ValueError("the episode is over, or has not begun; call `reset` first")
+        wanted = torch.as_tensor(np.asarray(action), dtype=torch.float64)
+        dynamics.check_action(wanted)
+        try:
+            done = dynamics.step(now, wanted)
+        except (SimulationFailed, np.linalg.LinAlgError) as failure:
+            self._over = True
+            info = self._info(now) | {"failure": str(failure)}
+            return self._seen(dynamics.observe(now)), self.lost, True, False, info
+        self.moment = done.moment
+        ended = self._ended(done.moment)
+        truncated = done.moment.steps >= self.limit
+        self._over = bool(ended) or truncated
+        info = self._info(done.moment) | ({"ended": ended} if ended else {})
+        if self.render_mode == "human":
+            self.render()
+        reward = self.lost if ended else float(done.reward)
+        return self._seen(done.observation), reward, bool(ended), truncated, info
+
+    def _ended(self, now: Moment) -> str:
+        """Why an episode is over, empty where it goes on."""
+        for name, (low, high) in self.bounds.items():
+            x = float(now.y[self.dynamics.coordinates[name]])
+            if not low <= x <= high:
+                return f"{name} = {x:.4g} left its bounds, {low:g} to {high:g}"
+        for body, slices in self.held.items():
+            if not any(bool((now.recorded[at] > 0).any()) for at in slices):
+                return f"{body} was dropped: no contact touches it"
+        return ""
+
+    def _seen(self, observation: Tensor) -> NDArray[np.float32]:
+        return observation.numpy().astype(np.float32)
+
+    def _info(self, now: Moment) -> dict[str, Any]:
+        goal = {}
+        if self.dynamics.goal is not None:
+            goal = {"distance": float(self.dynamics.distance(now).norm())}
+        return {"time": self.dynamics.start + now.steps * self.dynamics.interval} | goal
+
+    def render(self) -> NDArray[np.uint8] | None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The picture (height, width, 3), or None where it is shown in a window."""
+        from torchsoft.envs.view import View
+
+        if self.moment is None or self.render_mode is None:
+            raise ValueError("nothing to render: give a `render_mode`, and call `reset` first")
+        if self._view is None:
+            self._view = View(self.dynamics.look(self.moment))
+        picture = self._view.picture(self.dynamics.look(self.moment))
+        if self.render_mode == "human":
+            self._view.show(picture)
+            return None
+        return picture
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._view is not None:
+            self._view.close()
+        self._view = None

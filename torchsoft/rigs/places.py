@@ -1,0 +1,70 @@
+"""Numbers of a rig file by name: where they stand, and the file with others in their place."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from pydantic.fields import FieldInfo
+
+from torchsoft.rigs.build import RigFile
+from torchsoft.tables import Table, line
+
+
+class Place(NamedTuple):
+    """Where a name leads in a rig file: keys of its tables, the value there, and its field."""
+
+    keys: tuple[str | int, ...]
+    value: Any
+    field: FieldInfo
+
+
+def place(file: RigFile, name: str) -> Place:
+    """The place of a name such as "materials.silicone.E" or "motion.lift.values.2". Raises
+    `ValueError` for one that leads nowhere."""
+    at: Any = file
+    keys, left, field = list[str | int](), name.split("."), FieldInfo()
+    while left:
+        here = ".".join(map(str, keys)) or "the rig file"
+        if isinstance(at, Table):
+            known, n = list(type(at).model_fields), 1
+            key: str | int = left[0]
+            if key in known:
+                field, at = type(at).model_fields[key], getattr(at, key)
+        elif isinstance(at, Mapping):  # names of motions may have dots in them
+            known = list(at)
+            n = next((n for n in range(len(left), 0, -1) if ".".join(left[:n]) in at), 1)
+            key = ".".join(left[:n])
+            at = at.get(key)
+        elif isinstance(at, tuple):
+            known, n = [str(i) for i in range(len(at))], 1
+            key = int(left[0]) if left[0] in known else left[0]
+            at = at[key] if isinstance(key, int) else at
+        else:
+            known, n, key = [], 1, left[0]
+        if str(key) not in known:
+            there = ", ".join(known[:20]) + (", ..." if len(known) > 20 else "")
+            raise ValueError(
+                f"`{line(name, 80)}` is not in the rig file: {here} has {there or 'no parts'}"
+            )
+        keys, left = [*keys, key], left[n:]
+    return Place(tuple(keys), at, field)
+
+
+def replaced(file: RigFile, values: Mapping[str, Any]) -> RigFile:
+    """The rig file with other values at the places of these names. Raises `ValueError`."""
+    tree, whole = (listed(file.model_dump(exclude_unset=some)) for some in (True, False))
+    for name, value in values.items():
+        *way, last = place(file, name).keys
+        node, full = tree, whole
+        for key in way:
+            if isinstance(node, dict) and key not in node:
+                node[key] = full[key]
+            node, full = node[key], full[key]
+        node[last] = value
+    return RigFile.from_tree(tree, file.folder)
+
+
+def listed(value: Any) -> Any:
+    """Tables and lists that can be changed."""
+    if isinstance(value, dict):
+        return {key: listed(x) for key, x in value.items()}
+    return [listed(x) for x in value] if isinstance(value, list | tuple) else value
