@@ -39,7 +39,9 @@ FLOWS = {
         columns configuration rig_recordings rehearsal measured rig_design figures report .
     """,
     "plan": "knots variables goals evaluation search planning .",
-    "rigs": "fields parts control motion geometry build places course balance check written goal run .",
+    "rigs": """
+        fields parts control motion geometry build places course balance check written goal run .
+    """,
     "cli": "results rigs plan identify design material plot .",
     "solve.kernel": """
         table arrays objects . invoke linear inertia interface stage step run adjoint tangent build
