@@ -207,12 +207,12 @@ class Search:
                 z = self.reached.z
             elif better:
                 z = self.found.z
-            if failed:
+            if failed or not (better or done or self.reached is not None):
                 share, self.damping = share * SHORTER, self.damping * SHORTER
                 if share < SHORTEST:
                     return
                 continue
-            if self.aim is None and (done or not better or self.best_visit.missed == 0):
+            if self.aim is None and (done or self.best_visit.missed == 0):
                 return
             share = min(1.0, share / SHORTER)
             self.damping = min(1.0, self.damping / SHORTER)
@@ -278,7 +278,7 @@ class Search:
         if self.aim is not None:
             left = look.errors.mean(0) - self.aim
             over = look.excess.max(initial=0.0)
-            if over <= DONE and np.abs(left).max() <= max(WITHIN, DONE * self._way):
+            if over <= DONE and np.abs(left).max() <= DONE * self._way:
                 self.reached = look
                 raise Settled
         value = float(x[-1]) + self.changed(look.z)[0] if self._worst else self.value(look)
