@@ -275,6 +275,7 @@ def test_it_writes_answer_and_page(answered: tuple[Path, list[str]]) -> None:
     assert all(notice in page or "&" in notice for notice in answer["notices"])
 
 
+@pytest.mark.slow
 @pytest.mark.xdist_group("identify-command")
 def test_options_come_before_the_configuration(
     answered: tuple[Path, list[str]], capsys: Any

@@ -146,6 +146,7 @@ def read_everywhere(url: str, folder: Path) -> None:
     torch.testing.assert_close(here[20], there[20], rtol=0, atol=0)
 
 
+@pytest.mark.slow
 def test_an_object_store_holds_the_same_bytes(made: tuple[Path, Config]) -> None:
     folder, config = made
     url = "memory://sets/rolling"

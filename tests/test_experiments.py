@@ -186,6 +186,7 @@ def test_identify_contact_smoke(tmp_path: Path) -> None:
     assert {"report.html", "identify_contact.png"} <= {path.name for path in tmp_path.iterdir()}
 
 
+@pytest.mark.slow
 def test_identify_by_touch_smoke(tmp_path: Path) -> None:
     """Taxels shrink every interval, shear shrinks it further, and the fits are within theirs."""
     module = experiment("identify_by_touch")

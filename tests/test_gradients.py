@@ -140,7 +140,10 @@ def test_windows_are_what_they_are_called(name: str) -> None:
     assert bool(slipping.any()) == (name != "stick")
 
 
-@pytest.mark.parametrize("name", WINDOWS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(name, marks=[pytest.mark.slow] * (name == "jerk")) for name in WINDOWS],
+)
 def test_adjoint_equals_backpropagation_through_the_plain_step(name: str) -> None:
     """The initial state and every parameter; a gradient that is small by cancellation is held to
     the larger ones."""

@@ -110,6 +110,7 @@ def test_a_limit_is_kept_at_a_price(turned: Plan) -> None:
     assert float(found.trajectory["F_left_x"][50:].min()) >= low * (1 - 2e-3)
 
 
+@pytest.mark.slow
 def test_an_objective_is_lowered_within_targets() -> None:
     """The least work of a finger that may choose its gain, by the worst of two draws."""
     objective = lambda run: run["F_left_y"].square().mean()

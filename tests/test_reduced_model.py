@@ -8,6 +8,7 @@ import pytest
 from test_experiments import experiment
 
 
+@pytest.mark.slow
 @pytest.mark.xdist_group("reduced_model")
 def test_reduced_model_smoke(tmp_path: Path) -> None:
     module = experiment("reduced_model")

@@ -318,6 +318,7 @@ for mesh in (
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(
     not Path("/proc/self/clear_refs").exists(), reason="the peak of memory is Linux's"
 )

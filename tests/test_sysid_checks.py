@@ -131,17 +131,21 @@ def late(data: Recording) -> Recording:
             elsewhere, "x_C0", 30.0, "the data contradict that the disc begins at scenario.x_C0",
             marks=pytest.mark.slow,
         ),
-        (turned, "bias theta", 2e-3, "the data contradict that theta has no unknown bias"),
+        pytest.param(
+            turned, "bias theta", 2e-3, "the data contradict that theta has no unknown bias",
+            marks=pytest.mark.slow,
+        ),
         (lambda data: delayed(data, -3e-4), "clock of the set-points", 0.3,
          "the data contradict that set-points and sensors"),
         pytest.param(
             late, "delay x_C", 1.0, "the data contradict that x_C has no unknown delay",
             marks=pytest.mark.slow,
         ),
-        (
+        pytest.param(
             lambda data: replace(data,
             samples=recorded({"disc.inertia_ratio": 1.2}).samples),
             "disc.inertia_ratio", 20.0, "the data contradict that disc.inertia_ratio is 1",
+            marks=pytest.mark.slow,
         ),
         pytest.param(
             lambda data: replace(data,

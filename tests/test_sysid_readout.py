@@ -62,6 +62,7 @@ def strokes() -> Recording:
     return record("strokes", begin(STROKES, BASE), {"pad.E": 0.9e6}, FAULTY)
 
 
+@pytest.mark.slow
 def test_every_kind_of_coordinate_has_its_derivative(strokes: Recording) -> None:
     """Of parameters, a place of the disc, and of everything that a sensor may have; by differences,
     and by the adjoint."""
