@@ -72,7 +72,7 @@ SLIPPERY, TOO_SLIPPERY = 0.2, 0.04
 class Config:
     out: Path = Path("out/reorient")
     draws: int = 200  # of uncertain rigs
-    planned_draws: int = 8  # that the robust plan sees
+    planned_draws: int = 24  # that the robust plan sees
     rtol: float = 1e-4  # of the search's runs
     smoke: bool = False  # one turn by 20 degrees, few draws, no comparison
 
