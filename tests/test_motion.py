@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline
 from torch.autograd import gradcheck
 
 from torchsoft import Profile, Reference, Sampled, hold
-from torchsoft.physics.motion import Lines
+from torchsoft.physics.motion import Lines, Piecewise, Retimed, Waves, wave
 
 TIMES = [0.0, 0.4, 1.0, 1.5]
 VALUES = [0.06, 0.04, 0.05, 0.01]
@@ -137,3 +137,26 @@ def test_reference_gives_named_signals_side_by_side() -> None:
     assert torch.equal(got[:, 0], got[:, 2])
     assert reference(t, ()).shape == (5, 0, 2)
     assert hold(x=1.0, y=-2.0)(f64(3.0), ("x", "y"))[0].tolist() == [[1.0, 0.0], [-2.0, 0.0]]
+
+
+@pytest.mark.parametrize(
+    "signal",
+    [
+        Profile([0.1, 0.5, 0.9], [0.0, 1.0, -0.5]),
+        Waves(([0.0, 0.2], [0.0, 1e-3]), 0.3, 1.2, wave(1e-3, 7.0, 2.0, 0.3)),
+        Sampled([0.0, 0.4, 0.7], [0.0, 1.0, 0.5], [0.0, 2.0, -1.0]),
+        Profile([0.2], [3.0]),
+    ],
+    ids=["profile", "waves", "sampled", "constant"],
+)
+def test_a_signal_at_other_times(signal: Piecewise) -> None:
+    """All of it moves: knots, waves and their window, given rates."""
+    rate, shift = 1.02, -0.03
+    moved = Retimed(signal, rate, shift)
+    t = torch.linspace(-0.1, 1.4, 301, dtype=torch.float64)
+    value, slope = signal(t)
+    value_there, slope_there = moved(rate * t + shift)
+    torch.testing.assert_close(value_there, value, rtol=0, atol=1e-12)
+    torch.testing.assert_close(rate * slope_there, slope, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(moved.stops, rate * signal.stops + shift, rtol=0, atol=0)
+    assert not moved.ill_posed()

@@ -219,6 +219,34 @@ class Waves(Profile):
         return [(amplitude * jet).sum(-1) for jet in jets]
 
 
+class Retimed(Piecewise):
+    """Another signal, what it does at t [s] being done at rate * t + shift."""
+
+    def __init__(self, signal: Piecewise, rate: float = 1.0, shift: float = 0.0) -> None:
+        nn.Module.__init__(self)
+        self.signal, self.rate, self.shift = signal, rate, shift
+
+    @property
+    def times(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Times [s] of the knots."""
+        return self.rate * self.signal.times + self.shift
+
+    @property
+    def values(self) -> Tensor:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Values at the knots."""
+        return self.signal.values
+
+    @property
+    def stops(self) -> Tensor:
+        """Times [s] that no step chosen by tolerances passes."""
+        return self.rate * self.signal.stops + self.shift
+
+    def pieces(self) -> Pieces:
+        """The polynomials, at their new times."""
+        at, span, control = self.signal.pieces()
+        return self.rate * at + self.shift, self.rate * span, control
+
+
 class Sampled(Piecewise):
     """A recorded set-point: the cubic through values (k,) at times (k,) [s] with the given rates
     (k,), or with those of the natural choice, a cubic spline; constant before the first and after

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torchsoft.paper.rig import SoftGrasp
 from torchsoft.physics.contact import Coulomb, SmoothSlip, SoftContact, at_once
 from torchsoft.physics.extensions import extensions
-from torchsoft.physics.motion import Piecewise, Reference, Sampled
+from torchsoft.physics.motion import Piecewise, Reference, Retimed, Sampled
 from torchsoft.physics.rig import Rig
 from torchsoft.sysid.initial_state import AtRest, Standing
 from torchsoft.sysid.prediction import set_parameters
@@ -322,30 +322,26 @@ def sparser(recording: Recording) -> Recording:
     return with_reference(recording, **signals)
 
 
-def retimed(recording: Recording, times: Callable[[Tensor], Tensor]) -> Recording | None:
-    """Every signal at other times [s]; None where a signal has no times."""
-    signals = {
-        name.replace(":", "."): deepcopy(one)
-        for name, one in recording.rig.reference.signals.items()
-    }
-    for one in signals.values():
-        own = dict(one.named_buffers()).get("times")
-        if own is None:
-            return None
-        own.copy_(times(own))
-    return with_reference(recording, **signals)
+def retimed(recording: Recording, rate: float, shift: float) -> Recording | None:
+    """Every signal at rate * t + shift [s]; None where a signal is not made of polynomials."""
+    signals = {name.replace(":", "."): one for name, one in recording.rig.reference.signals.items()}
+    known = {name: one for name, one in signals.items() if isinstance(one, Piecewise)}
+    if len(known) < len(signals):
+        return None
+    return with_reference(
+        recording, **{name: Retimed(deepcopy(one), rate, shift) for name, one in known.items()}
+    )
 
 
 def delayed(recording: Recording, by: float) -> Recording | None:
-    """Every signal later by a time [s]; None where a signal has no times."""
-    return retimed(recording, lambda t: t + by)
+    """Every signal later by a time [s]; None where a signal is not made of polynomials."""
+    return retimed(recording, 1.0, by)
 
 
 def stretched(recording: Recording, part: float) -> Recording | None:
-    """Every signal slower by a part [1], from the first sample on; None where a signal has no
-    times."""
-    begin = float(recording.times[0])
-    return retimed(recording, lambda t: begin + (1 + part) * (t - begin))
+    """Every signal slower by a part [1], from the first sample on; None where a signal is not made
+    of polynomials."""
+    return retimed(recording, 1 + part, -part * float(recording.times[0]))
 
 
 def raised(recording: Recording, by: float) -> Recording | None:
