@@ -9,7 +9,7 @@ among all of them are 1 % at least.
 
 Command: .venv/bin/python experiments/validation/suspects.py [--seeds 5] [--only "tilt of 2 mrad"]
 [--smoke] Expected: no estimate is off by three deviations without the true suspect among those
-named. About an hour on two cores.
+named. About two hours on two cores.
 """
 
 import sys
